@@ -1,0 +1,65 @@
+# `make train` and `make test` need nothing but Python 3.11 or newer and a package index.
+# Variables: PYTHON (interpreter that makes the environment), VENV, EXTRAS, TRAIN_ARGS, TEST_ARGS.
+
+PYTHON ?= python3
+VENV ?= .venv
+BIN := $(VENV)/bin
+READY := $(VENV)/.ready
+
+# The major version of CUDA that the driver offers names the extra: cuda12, cuda13; or nothing.
+CUDA ?= $(shell nvidia-smi 2>/dev/null | sed -nE 's/.*CUDA[^:]*Version: *([0-9]+).*/cuda\1/p' | head -n 1)
+GPUS := $(shell nvidia-smi -L 2>/dev/null | grep -c '^GPU ')
+comma := ,
+EXTRAS ?= test,dev$(if $(CUDA),$(comma)$(CUDA)$(comma)warp)
+
+# Two GMIs: on two GPUs (virtual ones where there is none), or sharing the only one.
+PLAN := $(if $(filter 1,$(GPUS)),plan.gpus=1 plan.gmis_per_gpu=2,plan.gpus=2 plan.gmis_per_gpu=1)
+TRAIN_ARGS ?= env=ball_balance $(PLAN)
+TEST_ARGS ?=
+
+.DEFAULT_GOAL := help
+.PHONY: help venv train test test-all wheel-test lint types imports format check clean
+
+help:  ## this list
+	@sed -nE 's/^([a-z-]+):.*## (.*)/\1|\2/p' Makefile | awk -F'|' '{printf "make %-11s %s\n", $$1, $$2}'
+
+venv: $(READY)  ## the virtual environment with gmijax and its tools, made once
+
+$(READY): pyproject.toml
+	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || \
+	  { echo "PYTHON=$(PYTHON): gmijax needs Python 3.11 or newer" >&2; exit 2; }
+	$(PYTHON) -m venv $(VENV)
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -e '.[$(EXTRAS)]'
+	@touch $@
+
+train: $(READY)  ## a short training run with two GMIs on whatever this machine has
+	$(BIN)/python -m gmijax.train $(TRAIN_ARGS)
+
+test: $(READY)  ## the tests that are not slow
+	$(BIN)/python -m pytest $(TEST_ARGS)
+
+test-all: $(READY)  ## all tests, slow ones too
+	$(BIN)/python -m pytest -m '' $(TEST_ARGS)
+
+wheel-test: $(READY)  ## builds the wheel and tries it outside the checkout
+	$(BIN)/python -m pytest tests/process/test_wheel.py $(TEST_ARGS)
+
+lint: $(READY)  ## ruff: rules and format
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+
+types: $(READY)  ## pyright
+	$(BIN)/pyright --pythonpath $(BIN)/python
+
+imports: $(READY)  ## import-linter: who may import whom
+	$(BIN)/lint-imports --no-cache --no-logo
+
+format: $(READY)  ## rewrites the sources: order of imports, layout
+	$(BIN)/ruff check --fix .
+	$(BIN)/ruff format .
+
+check: lint types imports  ## everything but the tests
+
+clean:  ## removes the environment, caches and build artefacts; keeps runs/
+	rm -rf $(VENV) build dist .pytest_cache .ruff_cache .import_linter_cache .hypothesis
+	find . -name __pycache__ -type d -not -path './.git/*' -prune -exec rm -rf {} +

@@ -1,0 +1,119 @@
+"""Checkpoints of the full state, written with orbax.
+
+`<run>/checkpoints/<12-digit env steps>/{learner,gmi_0,gmi_1,...,meta.json}`: what all GMIs share
+is written by the leader, each GMI's environments by itself. Everything goes to a hidden folder
+that is renamed when all GMIs have finished, so a checkpoint is there as a whole or not at all.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+from collections.abc import Callable
+from pathlib import Path
+from typing import TypeVar
+
+import jax
+import numpy as np
+import orbax.checkpoint as ocp
+
+from gmijax.errors import ConfigError
+from gmijax.resume import META, CheckpointMeta
+from gmijax.rundir import RunPaths, write_json
+from gmijax.types import PyTree
+
+T = TypeVar("T")
+
+LEARNER = "learner"
+
+
+def save_checkpoint(
+    paths: RunPaths,
+    meta: CheckpointMeta,
+    learner_state: PyTree,
+    env_state: PyTree,
+    *,
+    gmi: int,
+    leader: bool,
+    barrier: Callable[[], None],
+) -> Path:
+    """Writes this GMI's part of a checkpoint; every GMI of the job must call it.
+
+    Args:
+      paths: the run folder.
+      meta: what the checkpoint holds.
+      learner_state: equal on all GMIs, written by the leader only.
+      env_state: this GMI's environments.
+      gmi: id of this GMI.
+      leader: whether this GMI writes the shared part.
+      barrier: returns when all GMIs have called it.
+
+    Returns:
+      The checkpoint's folder.
+    """
+    final = paths.checkpoint(meta.env_steps)
+    if final.exists():  # Already written by an earlier call with the same step: same state.
+        return final
+    partial = final.with_name(f".{final.name}.partial")
+    partial.mkdir(parents=True, exist_ok=True)
+    _save(partial / f"gmi_{gmi}", env_state)
+    if leader:
+        _save(partial / LEARNER, learner_state)
+    barrier()
+    if leader:
+        write_json(partial / META, meta.to_dict())
+        os.replace(partial, final)
+    # Nobody may look for the folder before it has its name.
+    barrier()
+    return final
+
+
+def restore_learner(checkpoint: Path, template: T) -> T:
+    """The learner's state; `template` gives structure, shapes and dtypes.
+
+    Raises:
+      ConfigError: the checkpoint does not fit the template.
+    """
+    return _restore(checkpoint / LEARNER, template)
+
+
+def restore_envs(checkpoint: Path, gmi: int, template: T) -> T:
+    """The environments of one GMI; `template` gives structure, shapes and dtypes."""
+    return _restore(checkpoint / f"gmi_{gmi}", template)
+
+
+def digest(tree: PyTree) -> np.ndarray:
+    """SHA-256 of all bytes of a tree as [16] float32 of 16-bit numbers, exact in float32."""
+    sha = hashlib.sha256()
+    for leaf in jax.tree.leaves(tree):
+        sha.update(np.ascontiguousarray(leaf).tobytes())
+    return np.frombuffer(sha.digest(), np.uint16).astype(np.float32)
+
+
+def _save(folder: Path, tree: PyTree) -> None:
+    with ocp.StandardCheckpointer() as checkpointer:
+        checkpointer.save(folder.resolve(), _without_keys(tree))
+
+
+def _restore(folder: Path, template: T) -> T:
+    plain = _without_keys(template)
+    try:
+        with ocp.StandardCheckpointer() as checkpointer:
+            restored = checkpointer.restore(folder.resolve(), plain)
+    except (ValueError, KeyError, FileNotFoundError) as error:
+        line = str(error).strip().splitlines()[0]
+        raise ConfigError(f"checkpoint {folder} does not fit this job: {line}") from error
+    return jax.tree.map(_with_key, template, restored)
+
+
+def _is_key(leaf: jax.Array) -> bool:
+    return jax.dtypes.issubdtype(leaf.dtype, jax.dtypes.prng_key)
+
+
+def _without_keys(tree: PyTree) -> PyTree:
+    # Orbax does not take typed random keys; their bits are plain uint32 arrays.
+    return jax.tree.map(lambda x: jax.random.key_data(x) if _is_key(x) else x, tree)
+
+
+def _with_key(like: jax.Array, leaf: jax.Array) -> jax.Array:
+    return jax.random.wrap_key_data(leaf) if _is_key(like) else leaf

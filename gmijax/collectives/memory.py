@@ -1,0 +1,205 @@
+"""The block of shared memory through which the GMIs of one host exchange numbers.
+
+The controller makes an anonymous file (`create_exchange`); its GMIs inherit the descriptor and
+map the file (`attach`). The file has no name, so nothing is left behind whoever gets killed, and
+it does not count against the size of /dev/shm. `docs/decisions/shared-memory-exchange.md` says
+why, and which guarantees about memory order the protocol needs.
+
+This file is the only one that knows the wire format (K ranks, P floats, native byte order):
+
+| offset | content |
+|---|---|
+| 0 | K lines of 64 bytes, `LINE`, each written by its own rank only |
+| 64 K | [2, K, MAX_GATHER_FLOATS] float32, values to gather, by parity of the step |
+| next page | [K, P] float32, one slot a rank, rows padded to whole cache lines |
+| after the slots | [P] float32, the result |
+"""
+
+from __future__ import annotations
+
+import mmap
+import os
+from collections.abc import Mapping
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from gmijax.collectives.liveness import ProcessIdentity, own_process
+from gmijax.errors import CollectiveError, ConfigError
+
+EXCHANGE_FD_VARIABLE = "GMIJAX_EXCHANGE_FD"
+"""Environment variable of a GMI: number of the inherited descriptor of the block."""
+
+MAGIC = 0x58494D47  # "GMIX" in memory on a little-endian machine
+VERSION = 1
+MAX_GATHER_FLOATS = 16384  # 64 KiB a rank
+FLOATS_PER_LINE = 16
+PAGE_BYTES = 4096
+
+LINE = np.dtype(
+    [
+        ("magic", np.uint32),
+        ("version", np.uint32),
+        ("world_size", np.uint32),
+        ("rank", np.uint32),
+        ("num_floats", np.uint64),
+        ("pid", np.uint64),  # 0 once the rank has closed its reducer
+        ("start_ticks", np.uint64),
+        ("call", np.uint64, (2,)),  # what the rank is calling, by parity of the step
+        ("sequence", np.uint64),  # 0: not attached; 1: attached; then one up per arrival
+    ]
+)
+"""What one rank tells the others; exactly one cache line, so that ranks do not share any."""
+
+SHAPE_FIELDS = ("magic", "version", "world_size", "rank", "num_floats")
+
+
+class Geometry(NamedTuple):
+    """Where the parts of a block begin, in bytes, and how large the whole is."""
+
+    gathered: int
+    slots: int
+    row_floats: int
+    result: int
+    size: int
+
+    @classmethod
+    def of(cls, world_size: int, num_floats: int) -> Geometry:
+        """The geometry for K ranks and P floats."""
+        row_floats = _round_up(max(num_floats, 1), FLOATS_PER_LINE)
+        gathered = world_size * LINE.itemsize
+        slots = _round_up(gathered + 2 * world_size * MAX_GATHER_FLOATS * 4, PAGE_BYTES)
+        result = slots + world_size * row_floats * 4
+        return cls(gathered, slots, row_floats, result, result + row_floats * 4)
+
+
+class ExchangeBlock(NamedTuple):
+    """The mapped block as arrays; the mapping lives as long as one of them does.
+
+    Attributes:
+      rank: whose view this is.
+      lines: [K] of `LINE`.
+      gathered: [2, K, MAX_GATHER_FLOATS] float32.
+      slots: [K, P] float32.
+      result: [P] float32.
+    """
+
+    rank: int
+    lines: npt.NDArray[np.void]
+    gathered: npt.NDArray[np.float32]
+    slots: npt.NDArray[np.float32]
+    result: npt.NDArray[np.float32]
+
+
+def create_exchange() -> int:
+    """Makes an empty block and returns its descriptor, for the controller.
+
+    Pass the descriptor to every GMI (`pass_fds`, `EXCHANGE_FD_VARIABLE`), then close it.
+    """
+    fd = os.memfd_create("gmijax-exchange", os.MFD_CLOEXEC)
+    # Another user who may look into /proc/<pid>/fd must not read or change gradients.
+    os.fchmod(fd, 0o600)
+    return fd
+
+
+def inherited_exchange(environ: Mapping[str, str]) -> int:
+    """Returns the descriptor that the controller passed to this process.
+
+    The descriptor becomes non-inheritable: processes that a GMI starts have no use for it.
+
+    Raises:
+      ConfigError: the variable is missing, or does not name an open descriptor.
+    """
+    shown = environ.get(EXCHANGE_FD_VARIABLE, "")
+    try:
+        fd = int(shown)
+        os.set_inheritable(fd, False)
+    except (ValueError, OverflowError, OSError):
+        raise ConfigError(
+            f"{EXCHANGE_FD_VARIABLE}={shown!r}: expected the number of an open descriptor"
+        ) from None
+    return fd
+
+
+def attach(fd: int, rank: int, world_size: int, num_floats: int) -> ExchangeBlock:
+    """Maps the block and makes this process known as `rank`.
+
+    The block gets its size here, from whoever comes first; the caller keeps `fd` and may close
+    it at once. Ranks that attach with other numbers are found out by `check_peer`.
+
+    Args:
+      fd: descriptor from `create_exchange`.
+      rank: 0 to `world_size - 1`.
+      world_size: K, number of ranks.
+      num_floats: P, length of the buffers whose mean is taken.
+
+    Raises:
+      ConfigError: numbers that make no sense.
+      CollectiveError: no memory, not such a descriptor, or the rank is taken.
+    """
+    if not 0 <= rank < world_size:
+        raise ConfigError(f"rank={rank}: must be between 0 and world_size - 1 = {world_size - 1}")
+    if num_floats < 1:
+        raise ConfigError(f"num_floats={num_floats}: must be at least 1")
+    block = _map(fd, rank, world_size, num_floats)
+    line = block.lines[rank]
+    if line["sequence"]:
+        raise CollectiveError(f"rank {rank} is taken already by process {line['pid']}")
+    line["magic"], line["version"] = MAGIC, VERSION
+    line["world_size"], line["rank"], line["num_floats"] = world_size, rank, num_floats
+    line["pid"], line["start_ticks"] = own_process()
+    return block
+
+
+def check_peer(block: ExchangeBlock, peer: int) -> None:
+    """Checks that an attached `peer` sees the block as this rank does.
+
+    Raises:
+      CollectiveError: it does not; the message names both ranks and what differs.
+    """
+    own, other = block.lines[block.rank], block.lines[peer]
+    for field in SHAPE_FIELDS:
+        expected = peer if field == "rank" else own[field]
+        if other[field] != expected:
+            raise CollectiveError(
+                f"rank {block.rank} and rank {peer} do not fit together: {field} is "
+                f"{expected} for rank {block.rank}, and {other[field]} for rank {peer}"
+            )
+
+
+def process_of(block: ExchangeBlock, peer: int) -> ProcessIdentity:
+    """The process behind an attached `peer`."""
+    line = block.lines[peer]
+    return ProcessIdentity(int(line["pid"]), int(line["start_ticks"]))
+
+
+def _map(fd: int, rank: int, world_size: int, num_floats: int) -> ExchangeBlock:
+    geometry = Geometry.of(world_size, num_floats)
+    try:
+        # Unlike ftruncate this never shrinks the file, which would crash (SIGBUS) ranks that
+        # have mapped more of it, and it fails here, not at first touch, if memory is short.
+        os.posix_fallocate(fd, 0, geometry.size)
+        mapping = mmap.mmap(fd, geometry.size, flags=mmap.MAP_SHARED | mmap.MAP_POPULATE)
+    except OSError as error:
+        raise CollectiveError(
+            f"rank {rank}: cannot map {geometry.size / 2**20:.1f} MiB of shared memory "
+            f"at descriptor {fd} ({error.strerror})"
+        ) from None
+
+    def floats(offset: int, count: int) -> npt.NDArray[np.float32]:
+        return np.frombuffer(mapping, np.float32, count, offset)
+
+    gathered = floats(geometry.gathered, 2 * world_size * MAX_GATHER_FLOATS)
+    slots = floats(geometry.slots, world_size * geometry.row_floats)
+    return ExchangeBlock(
+        rank=rank,
+        lines=np.frombuffer(mapping, LINE, world_size),
+        gathered=gathered.reshape(2, world_size, MAX_GATHER_FLOATS),
+        slots=slots.reshape(world_size, geometry.row_floats)[:, :num_floats],
+        result=floats(geometry.result, num_floats),
+    )
+
+
+def _round_up(value: int, multiple: int) -> int:
+    return -(-value // multiple) * multiple

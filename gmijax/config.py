@@ -1,0 +1,291 @@
+"""The configuration of a run: frozen dataclasses and their checks.
+
+No hydra and no jax here. Default values live in `configs/`, meanings live here: `--help` prints
+the `doc` of every field. `from_dict` is the one constructor from outside data; it rejects
+unknown keys and wrong types with one clear line.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import difflib
+import types
+import typing
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, Literal, TypeVar
+
+from gmijax.errors import ConfigError
+
+T = TypeVar("T")
+
+
+def doc(text: str) -> Any:
+    """A dataclass field whose meaning `--help` prints."""
+    return dataclasses.field(metadata={"doc": text})
+
+
+@dataclass(frozen=True, kw_only=True)
+class EnvConfig:
+    """The task."""
+
+    name: str = doc("task name, see `python -m gmijax.train --help`")
+    episode_length: int = doc("steps after which an episode is truncated (time limit)")
+
+    def __post_init__(self) -> None:
+        require_at_least("env.episode_length", self.episode_length, 1)
+
+
+@dataclass(frozen=True, kw_only=True)
+class PhysicsConfig:
+    """The simulator."""
+
+    impl: Literal["auto", "jax", "warp"] = doc("MJX implementation")
+
+
+@dataclass(frozen=True, kw_only=True)
+class PpoConfig:
+    """Hyper-parameters of PPO, with Brax's names."""
+
+    name: Literal["ppo"] = doc("training algorithm")
+    unroll_length: int = doc("T, environment steps per environment and iteration")
+    num_minibatches: int = doc("minibatches per pass over the rollout")
+    num_updates_per_batch: int = doc("passes over the rollout (epochs)")
+    discounting: float = doc("discount factor per step, 0 to 1")
+    gae_lambda: float = doc("lambda of generalised advantage estimation, 0 to 1")
+    clipping_epsilon: float = doc("clip range of the probability ratio")
+    clip_value_loss: bool = doc("clip the value loss with clipping_epsilon too")
+    value_cost: float = doc("weight of the value loss")
+    entropy_cost: float = doc("weight of the entropy bonus")
+    bound_cost: float = doc("weight of the penalty on action means outside [-1.1, 1.1]")
+    learning_rate: float = doc("step size of Adam (the first one, if the schedule is adaptive)")
+    learning_rate_schedule: Literal["fixed", "adaptive_kl"] = doc(
+        "fixed, or steered to keep the policy's KL divergence per update near desired_kl"
+    )
+    desired_kl: float = doc("target of the adaptive schedule")
+    max_grad_norm: float = doc("gradients are scaled down to this global norm")
+    reward_scaling: float = doc("factor on rewards before learning (logged returns are unscaled)")
+    normalize_observations: bool = doc("normalise observations with running statistics")
+    normalize_advantage: bool = doc("normalise advantages over all samples of all GMIs")
+    policy_hidden_layer_sizes: tuple[int, ...] = doc("widths of the policy network")
+    value_hidden_layer_sizes: tuple[int, ...] = doc("widths of the value network")
+    init_noise_std: float = doc("standard deviation of the first policy")
+
+    def __post_init__(self) -> None:
+        for key in ("unroll_length", "num_minibatches", "num_updates_per_batch"):
+            require_at_least(f"algo.{key}", getattr(self, key), 1)
+        for key in ("discounting", "gae_lambda"):
+            require_between(f"algo.{key}", getattr(self, key), 0.0, 1.0)
+        for key in ("value_cost", "entropy_cost", "bound_cost"):
+            require_at_least(f"algo.{key}", getattr(self, key), 0.0)
+        for key in (
+            *("clipping_epsilon", "learning_rate", "desired_kl", "max_grad_norm"),
+            *("reward_scaling", "init_noise_std"),
+        ):
+            require_positive(f"algo.{key}", getattr(self, key))
+        for key in ("policy_hidden_layer_sizes", "value_hidden_layer_sizes"):
+            for width in getattr(self, key):
+                require_at_least(f"algo.{key}", width, 1)
+
+
+@dataclass(frozen=True, kw_only=True)
+class PlanConfig:
+    """How the job is spread over GPUs."""
+
+    gpus: int | tuple[int, ...] = doc("number of GPUs, or their indices as nvidia-smi lists them")
+    gmis_per_gpu: int = doc("GMIs on every GPU")
+    layout: tuple[tuple[int, ...], ...] | None = doc(
+        "GMI ids of every GPU, e.g. [[0,1],[2]]; overrides gpus and gmis_per_gpu"
+    )
+    backend: Literal["auto", "mps", "mig", "share", "cpu"] = doc(
+        "how a GMI gets its share of a GPU"
+    )
+    sm_percent: float | None = doc("cap on a GMI's share of SMs in percent (MPS); null: no cap")
+    memory_fraction: float | None = doc(
+        "fraction of a GPU's memory that each GMI reserves; null: 0.8 split evenly"
+    )
+    template: Literal["auto", "tcg_ex"] = doc("how roles map to GMIs")
+
+    def __post_init__(self) -> None:
+        if isinstance(self.gpus, int):
+            require_at_least("plan.gpus", self.gpus, 1)
+        elif not self.gpus or len(set(self.gpus)) != len(self.gpus) or min(self.gpus) < 0:
+            raise ConfigError(
+                f"plan.gpus={list(self.gpus)}: expected a number of GPUs or distinct indices"
+            )
+        require_at_least("plan.gmis_per_gpu", self.gmis_per_gpu, 1)
+        if self.sm_percent is not None:
+            require_between("plan.sm_percent", self.sm_percent, 1.0, 100.0)
+        if self.memory_fraction is not None:
+            require_between("plan.memory_fraction", self.memory_fraction, 0.01, 1.0)
+
+
+@dataclass(frozen=True, kw_only=True)
+class ReduceConfig:
+    """How gradients are averaged over GMIs."""
+
+    strategy: Literal["auto", "mpr"] = doc("reduction strategy")
+    intra: Literal["auto", "host"] = doc("exchange inside one GPU")
+    timeout_s: float = doc("longest wait for another GMI in one exchange, seconds")
+
+    def __post_init__(self) -> None:
+        require_positive("reduce.timeout_s", self.timeout_s)
+
+
+@dataclass(frozen=True, kw_only=True)
+class RunConfig:
+    """The run folder and the job's life."""
+
+    dir: str | None = doc("run folder; null: runs/<env>-<algo>-<date>-<time>")
+    name: str | None = doc("name of the run folder below runs/ (ignored if run.dir is given)")
+    resume: str | None = doc(
+        "continue from a run folder, from one of its checkpoints, or from `last`"
+    )
+    checkpoint_every: int = doc("iterations between checkpoints; 0: only at the end")
+    measure_throughput: bool = doc(
+        "after training, also measure simulation alone and simulation with inference"
+    )
+    start_timeout_s: float = doc("longest wait for a GMI to start and compile, seconds")
+    stall_timeout_s: float = doc("a GMI with no progress for this long has failed, seconds")
+    grace_s: float = doc("time a GMI gets to end by itself before it is killed, seconds")
+
+    def __post_init__(self) -> None:
+        require_at_least("run.checkpoint_every", self.checkpoint_every, 0)
+        for key in ("start_timeout_s", "stall_timeout_s", "grace_s"):
+            require_positive(f"run.{key}", getattr(self, key))
+
+
+@dataclass(frozen=True, kw_only=True)
+class TrainConfig:
+    """Everything that `python -m gmijax.train` can be told."""
+
+    env: EnvConfig
+    algo: PpoConfig
+    physics: PhysicsConfig
+    plan: PlanConfig
+    reduce: ReduceConfig
+    run: RunConfig
+    num_envs: int = doc("N, environments per GMI")
+    num_timesteps: int = doc("environment steps of the whole job, all GMIs together")
+    seed: int = doc("seed of every random number in the job")
+
+    def __post_init__(self) -> None:
+        require_at_least("num_envs", self.num_envs, 1)
+        require_at_least("num_timesteps", self.num_timesteps, 1)
+        require_between("seed", self.seed, 0, 2**31 - 1)
+        samples = self.num_envs * self.algo.unroll_length
+        if samples % self.algo.num_minibatches:
+            raise ConfigError(
+                f"num_envs={self.num_envs}: num_envs x algo.unroll_length = {samples} samples "
+                f"do not divide into algo.num_minibatches={self.algo.num_minibatches} minibatches"
+            )
+
+
+def require_at_least(key: str, value: float, low: float) -> None:
+    """Raises ConfigError unless `value >= low`."""
+    if not value >= low:
+        raise ConfigError(f"{key}={value!r}: must be at least {low}")
+
+
+def require_positive(key: str, value: float) -> None:
+    """Raises ConfigError unless `value > 0`."""
+    if not value > 0:
+        raise ConfigError(f"{key}={value!r}: must be greater than 0")
+
+
+def require_between(key: str, value: float, low: float, high: float) -> None:
+    """Raises ConfigError unless `low <= value <= high`."""
+    if not low <= value <= high:
+        raise ConfigError(f"{key}={value!r}: must be between {low} and {high}")
+
+
+def from_dict(cls: type[T], data: Mapping[str, Any], path: str = "") -> T:
+    """Builds a frozen config tree from plain data, checking names and types.
+
+    Lists become tuples, and a float with a whole value is accepted for an integer (`30e6`).
+
+    Raises:
+      ConfigError: an unknown or missing key, a wrong type, or a value out of range.
+    """
+    hints = typing.get_type_hints(cls)
+    for key in data:
+        if key not in hints:
+            raise ConfigError(f"unknown key {path}{key}{suggestion(key, hints)}")
+    if missing := [key for key in hints if key not in data]:
+        raise ConfigError(f"missing key {path}{missing[0]}")
+    return cls(**{key: _convert(kind, data[key], path + key) for key, kind in hints.items()})
+
+
+def to_dict(config: Any) -> dict[str, Any]:
+    """The plain data of a config tree; `from_dict` inverts it."""
+    return dataclasses.asdict(config)
+
+
+def suggestion(key: str, allowed: typing.Iterable[str]) -> str:
+    """`: did you mean ...` where a name is close, else `: allowed are ...`."""
+    names = sorted(allowed)
+    close = difflib.get_close_matches(key, names, n=1)
+    return f": did you mean {close[0]}?" if close else f": allowed are {', '.join(names)}"
+
+
+def _convert(kind: Any, value: Any, key: str) -> Any:
+    if dataclasses.is_dataclass(kind):
+        if not isinstance(value, Mapping):
+            raise ConfigError(f"{key}={value!r}: expected a group of keys")
+        return from_dict(typing.cast(type, kind), value, f"{key}.")
+    for option in _options(kind):
+        converted = _accept(option, value, key)
+        if converted is not _REJECTED:
+            return converted
+    raise ConfigError(f"{key}={_shown(value)}: expected {_describe(kind)}")
+
+
+_REJECTED = object()
+
+
+def _options(kind: Any) -> tuple[Any, ...]:
+    if typing.get_origin(kind) in (types.UnionType, typing.Union):
+        return typing.get_args(kind)
+    return (kind,)
+
+
+def _accept(kind: Any, value: Any, key: str) -> Any:
+    if typing.get_origin(kind) is Literal:
+        # YAML reads a bare `off` or `on` as a boolean; none of our choices is one.
+        return value if value in typing.get_args(kind) else _REJECTED
+    if typing.get_origin(kind) is tuple:
+        if not isinstance(value, list | tuple):
+            return _REJECTED
+        return tuple(_convert(typing.get_args(kind)[0], item, key) for item in value)
+    if kind is type(None):
+        return None if value is None else _REJECTED
+    if isinstance(value, bool):
+        return value if kind is bool else _REJECTED
+    if kind is int and isinstance(value, float) and value.is_integer():
+        return int(value)
+    if kind is float and isinstance(value, int):
+        return float(value)
+    if kind is str and isinstance(value, int):
+        return str(value)
+    return value if isinstance(kind, type) and isinstance(value, kind) else _REJECTED
+
+
+def _describe(kind: Any) -> str:
+    names = {int: "an integer", float: "a number", bool: "true or false", str: "text"}
+    parts: list[str] = []
+    for option in _options(kind):
+        if typing.get_origin(option) is Literal:
+            parts.append("one of " + ", ".join(map(str, typing.get_args(option))))
+        elif typing.get_origin(option) is tuple:
+            inner = typing.get_args(option)[0]
+            nested = typing.get_origin(inner) is tuple
+            parts.append("a list of lists of integers" if nested else "a list of integers")
+        elif option is type(None):
+            parts.append("null")
+        else:
+            parts.append(names[option])
+    return " or ".join(parts)
+
+
+def _shown(value: Any) -> str:
+    return str(value) if isinstance(value, str) else repr(value)

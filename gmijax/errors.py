@@ -1,0 +1,89 @@
+"""Every exception gmijax raises on purpose.
+
+GmijaxError
+├── ConfigError              bad input; commands print one line and exit with code 2
+│   └── BackendUnavailable   the wanted backend cannot be had on this machine
+├── GmiFailed                a GMI ended with an error or a signal, or stopped making progress
+├── CollectiveError          an exchange between GMIs failed
+│   ├── PeerLost             the process of another GMI is gone
+│   └── CollectiveTimeout    another GMI did not arrive in time
+├── ParameterMismatch        GMIs that must hold equal parameters do not
+├── NonFiniteError           a loss, gradient or simulation became NaN or infinite
+└── JobInterrupted           the user asked the job to stop; commands exit with code 130
+"""
+
+from __future__ import annotations
+
+
+class GmijaxError(Exception):
+    """Base of all errors that gmijax raises on purpose."""
+
+
+class ConfigError(GmijaxError):
+    """Bad input: the message says what, which value, and which values are allowed."""
+
+
+class BackendUnavailable(ConfigError):
+    """The wanted backend cannot be had on this machine; the message says what is missing."""
+
+
+class GmiFailed(GmijaxError):
+    """A GMI ended with an error or a signal, or stopped making progress.
+
+    Attributes:
+      gmi: id of the first GMI that failed.
+      reason: one line: the GMI's own error, its exit code, or the signal that ended it.
+    """
+
+    def __init__(self, gmi: int, reason: str) -> None:
+        super().__init__(f"GMI {gmi} failed: {reason}")
+        self.gmi = gmi
+        self.reason = reason
+
+
+class CollectiveError(GmijaxError):
+    """An exchange between GMIs failed."""
+
+
+class PeerLost(CollectiveError):
+    """The process of another GMI is gone.
+
+    Attributes:
+      rank: the rank that noticed.
+      peer: the rank that is gone.
+    """
+
+    def __init__(self, rank: int, peer: int, operation: str, step: int) -> None:
+        super().__init__(f"rank {rank}: peer {peer} is gone during {operation}, step {step}")
+        self.rank, self.peer, self.operation, self.step = rank, peer, operation, step
+
+
+class CollectiveTimeout(CollectiveError):
+    """Other GMIs did not arrive in time.
+
+    Attributes:
+      rank: the rank that waited.
+      missing: the ranks that did not arrive.
+    """
+
+    def __init__(
+        self, rank: int, missing: tuple[int, ...], operation: str, step: int, timeout_s: float
+    ) -> None:
+        super().__init__(
+            f"rank {rank}: waited {timeout_s:g} s in {operation}, step {step}, "
+            f"for ranks {list(missing)}"
+        )
+        self.rank, self.missing, self.operation, self.step = rank, missing, operation, step
+        self.timeout_s = timeout_s
+
+
+class ParameterMismatch(GmijaxError):
+    """GMIs that must hold bit-identical parameters do not."""
+
+
+class NonFiniteError(GmijaxError):
+    """A loss, gradient or simulation became NaN or infinite; the message says where."""
+
+
+class JobInterrupted(GmijaxError):
+    """The user asked the job to stop, and it did, after writing a checkpoint."""

@@ -1,0 +1,249 @@
+"""The controller: from a configuration to a finished run. No jax here.
+
+Checks everything that can be checked before anything is started, then makes the run folder,
+enters the backend, runs the GMIs, and writes the summary however the job ends.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import os
+import signal
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from rich.console import Console
+
+from gmijax.collectives.memory import create_exchange
+from gmijax.config import TrainConfig, to_dict
+from gmijax.errors import ConfigError, GmijaxError, JobInterrupted
+from gmijax.partition.backends import open_backend
+from gmijax.partition.environment import gmi_environment
+from gmijax.partition.machine import Machine, detect_machine
+from gmijax.partition.plan import Plan
+from gmijax.partition.planner import make_plan
+from gmijax.partition.supervisor import Job, Patience, Supervisor
+from gmijax.progress import ConsoleProgress, Progress, SilentProgress
+from gmijax.results import MetricsReader, copy_history, draw_returns
+from gmijax.resume import CheckpointMeta, check_fits, find_checkpoint
+from gmijax.rundir import RunPaths, create_run, read_json, write_json
+from gmijax.sim.registry import require_task
+
+_VERSIONS = ("gmijax", "jax", "jaxlib", "mujoco-mjx", "flax", "optax", "orbax-checkpoint")
+
+
+class Result(NamedTuple):
+    """What a training job leaves.
+
+    Attributes:
+      run_dir: the run folder.
+      summary: the content of its `summary.json`.
+    """
+
+    run_dir: Path
+    summary: dict[str, Any]
+
+
+def train(config: TrainConfig, *, show: bool = False) -> Result:
+    """Trains a policy in the GMIs of a plan, and returns when all have ended.
+
+    Args:
+      config: see `gmijax.compose`.
+      show: print the plan, live progress and the outcome.
+
+    Raises:
+      ConfigError: bad input, before anything was started.
+      GmiFailed: a GMI failed; the run folder holds the logs and the last checkpoint.
+      JobInterrupted: SIGINT or SIGTERM came; a checkpoint was written.
+    """
+    started = time.monotonic()
+    require_task(config.env.name)
+    config = _with_checkpoint(config)
+    machine = detect_machine()
+    plan = make_plan(config.plan, config.reduce, config.num_envs, machine)
+    run = create_run(config.run.dir, config.run.name, f"{config.env.name}-{config.algo.name}")
+    write_json(run.config, to_dict(config))
+    write_json(run.plan, plan.to_dict())
+    console = Console(stderr=False, quiet=not show, soft_wrap=True, highlight=False)
+    _announce(console, plan, run)
+    if config.run.resume:
+        history = Path(config.run.resume).parent.parent
+        steps = CheckpointMeta.read(Path(config.run.resume)).env_steps
+        copy_history(RunPaths(history).metrics, run.metrics, steps)
+    progress = (
+        ConsoleProgress(console, MetricsReader(run.metrics), config.num_timesteps)
+        if show
+        else SilentProgress()
+    )
+    status = "failed"
+    try:
+        _run_gmis(config, plan, machine, run, progress)
+        status = "completed"
+    except JobInterrupted as error:
+        status = "interrupted"
+        raise JobInterrupted(f"{error}; continue with run.resume={run.root}") from None
+    except ConfigError:
+        raise
+    except GmijaxError as error:
+        error.add_note(f"run folder: {run.root}")
+        raise
+    finally:
+        summary = _summarise(config, plan, run, status, time.monotonic() - started)
+        write_json(run.summary, summary)
+        draw_returns(run.metrics, run.returns_png, f"{config.env.name}, {config.algo.name}")
+    console.print(_outcome(summary, run))
+    return Result(run.root, summary)
+
+
+def _with_checkpoint(config: TrainConfig) -> TrainConfig:
+    """The configuration with `run.resume` as the path of a checkpoint that fits."""
+    wanted = config.run.resume
+    if wanted is None:
+        return config
+    checkpoint = find_checkpoint(wanted, "run.resume")
+    meta = CheckpointMeta.read(checkpoint)
+    algo = config.algo
+    expected = dataclasses.replace(
+        meta,
+        env=config.env.name,
+        algo=algo.name,
+        hidden=(algo.policy_hidden_layer_sizes, algo.value_hidden_layer_sizes),
+    )
+    check_fits(meta, expected, "run.resume", wanted)
+    if meta.env_steps >= config.num_timesteps:
+        raise ConfigError(
+            f"num_timesteps={config.num_timesteps}: the checkpoint has {meta.env_steps} "
+            "steps already; give more in all"
+        )
+    return dataclasses.replace(
+        config, run=dataclasses.replace(config.run, resume=str(checkpoint))
+    )
+
+
+def _run_gmis(
+    config: TrainConfig, plan: Plan, machine: Machine, run: RunPaths, progress: Progress
+) -> None:
+    exchange_fd = create_exchange() if plan.layout.num_gmis > 1 else None
+    try:
+        with open_backend(plan, machine, run) as backend:
+            supervisor = Supervisor(
+                Job(
+                    run=run,
+                    gmis=plan.layout.gmis,
+                    command=lambda _: [sys.executable, "-m", "gmijax.worker"],
+                    environment=lambda gmi: gmi_environment(
+                        plan,
+                        gmi,
+                        dict(os.environ),
+                        compilation_cache_dir(),
+                        backend.environment(gmi),
+                    ),
+                    backend=backend,
+                    patience=Patience(
+                        start_timeout_s=config.run.start_timeout_s,
+                        stall_timeout_s=config.run.stall_timeout_s,
+                        stop_timeout_s=config.run.stall_timeout_s,
+                        grace_s=config.run.grace_s,
+                    ),
+                    exchange_fd=exchange_fd,
+                )
+            )
+            with progress, _stopping_on_signals(supervisor.request_stop):
+                supervisor.run(progress.update)
+    finally:
+        if exchange_fd is not None:
+            os.close(exchange_fd)
+
+
+def compilation_cache_dir() -> Path:
+    """Where compiled programs stay between runs, unless JAX_COMPILATION_CACHE_DIR says else."""
+    base = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
+    return Path(base) / "gmijax" / "xla"
+
+
+@contextmanager
+def _stopping_on_signals(request_stop: Callable[[], None]) -> Iterator[None]:
+    previous = {
+        number: signal.signal(number, lambda *_: request_stop())
+        for number in (signal.SIGINT, signal.SIGTERM)
+    }
+    try:
+        yield
+    finally:
+        for number, handler in previous.items():
+            signal.signal(number, handler)
+
+
+def _announce(console: Console, plan: Plan, run: RunPaths) -> None:
+    layout = [list(gmis) for gmis in plan.layout.gmis_of_gpu]
+    console.print(f"run folder: {run.root}")
+    console.print(
+        f"plan: layout {layout}, backend {plan.backend}, {plan.num_envs_per_gmi} environments "
+        f"per GMI, template {plan.template}, reduction {plan.strategy}",
+        markup=False,
+    )
+    for reason in plan.reasons:
+        console.print(f"  {reason}", markup=False)
+
+
+def _summarise(
+    config: TrainConfig, plan: Plan, run: RunPaths, status: str, wall_s: float
+) -> dict[str, Any]:
+    result = read_json(run.gmi(0).result) if run.gmi(0).result.exists() else {}
+    checkpoints = sorted(run.checkpoints.glob("[0-9]*"))
+    return {
+        "status": status,
+        "env": config.env.name,
+        "algo": config.algo.name,
+        "plan": {
+            "backend": plan.backend,
+            "layout": [list(gmis) for gmis in plan.layout.gmis_of_gpu],
+            "num_envs_per_gmi": plan.num_envs_per_gmi,
+            "strategy": plan.strategy,
+            "intra": plan.intra,
+        },
+        "env_steps": result.get("env_steps"),
+        "wall_s": wall_s,
+        "train_wall_s": result.get("train_wall_s"),
+        "compile_s": result.get("compile_s"),
+        "env_steps_per_s": result.get("env_steps_per_s"),
+        "step_per_s_sim": result.get("step_per_s_sim"),
+        "step_per_s_inference": result.get("step_per_s_inference"),
+        "step_per_s_train": result.get("step_per_s_train"),
+        "final_return": result.get("final_return"),
+        "checkpoint": str(checkpoints[-1]) if checkpoints else None,
+        "versions": {"python": sys.version.split()[0]} | _installed_versions(),
+        "device": result.get("device"),
+        "impl": result.get("impl"),
+    }
+
+
+def _installed_versions() -> dict[str, str | None]:
+    found: dict[str, str | None] = {}
+    for name in _VERSIONS:
+        try:
+            found[name] = version(name)
+        except PackageNotFoundError:
+            found[name] = None
+    return found
+
+
+def _outcome(summary: dict[str, Any], run: RunPaths) -> str:
+    def rate(key: str) -> str:
+        value = summary[key]
+        return "-" if value is None else f"{value:,.0f}"
+
+    final = summary["final_return"]
+    return (
+        f"{summary['status']}: {summary['env_steps']:,} env steps in {summary['wall_s']:.0f} s, "
+        f"final return {'-' if final is None else format(final, '.2f')}\n"
+        f"env steps/s: {rate('step_per_s_sim')} simulation, "
+        f"{rate('step_per_s_inference')} with inference, "
+        f"{rate('step_per_s_train')} with training\n"
+        f"checkpoint: {summary['checkpoint']}\nsummary: {run.summary}"
+    )

@@ -1,0 +1,130 @@
+"""What a run says of itself: one flat dict of numbers per iteration, and where it goes."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections import deque
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import NamedTuple, Protocol
+
+from tensorboardX import SummaryWriter
+
+WINDOW_EPISODES = 100
+"""Means over episodes are taken over at least this many of the latest ones."""
+
+Line = Mapping[str, float | int | None]
+
+
+class Episodes(NamedTuple):
+    """Sums over episodes that ended.
+
+    Attributes:
+      count: number of episodes.
+      return_sum: sum of their returns, unscaled.
+      length_sum: sum of their lengths in steps.
+      term_sums: sums of every reward term.
+    """
+
+    count: float
+    return_sum: float
+    length_sum: float
+    term_sums: Mapping[str, float]
+
+
+class EpisodeWindow:
+    """Means over the latest episodes: the fewest iterations that hold WINDOW_EPISODES."""
+
+    def __init__(self) -> None:
+        self._latest: deque[Episodes] = deque()
+        self._count = 0.0
+
+    def add(self, episodes: Episodes) -> None:
+        """Takes in the episodes that ended in one iteration."""
+        self._latest.append(episodes)
+        self._count += episodes.count
+        while self._count - self._latest[0].count >= WINDOW_EPISODES:
+            self._count -= self._latest.popleft().count
+
+    def means(self) -> dict[str, float | None]:
+        """`return`, `episode_length` and `reward/<term>`; None while no episode has ended."""
+        names = self._latest[-1].term_sums if self._latest else {}
+        count = self._count
+        if not count:
+            return {"return": None, "episode_length": None}
+        return {
+            "return": sum(e.return_sum for e in self._latest) / count,
+            "episode_length": sum(e.length_sum for e in self._latest) / count,
+            **{
+                f"reward/{name}": sum(e.term_sums[name] for e in self._latest) / count
+                for name in names
+            },
+        }
+
+
+class Sink(Protocol):
+    """Where lines of metrics go."""
+
+    def write(self, line: Line) -> None:
+        """Takes one iteration's metrics; `env_steps` is the x axis."""
+        ...
+
+    def close(self) -> None:
+        """Flushes; no write may follow."""
+        ...
+
+
+class JsonlSink:
+    """Appends one JSON object a line; None stands for a number that is not there yet."""
+
+    def __init__(self, path: Path) -> None:
+        self._file = path.open("a", buffering=1)
+
+    def write(self, line: Line) -> None:
+        """See `Sink`."""
+        self._file.write(json.dumps({k: _finite(v) for k, v in line.items()}) + "\n")
+
+    def close(self) -> None:
+        """See `Sink`."""
+        self._file.close()
+
+
+class TensorBoardSink:
+    """Writes every number as a scalar over environment steps."""
+
+    def __init__(self, folder: Path) -> None:
+        self._writer = SummaryWriter(str(folder))
+
+    def write(self, line: Line) -> None:
+        """See `Sink`."""
+        for name, value in line.items():
+            if value is not None and name != "env_steps":
+                tag = name if "/" in name else f"train/{name}"
+                self._writer.add_scalar(tag, value, line["env_steps"])
+
+    def close(self) -> None:
+        """See `Sink`."""
+        self._writer.close()
+
+
+class MetricsLog:
+    """Several sinks as one."""
+
+    def __init__(self, sinks: Iterable[Sink]) -> None:
+        self._sinks = tuple(sinks)
+
+    def write(self, line: Line) -> None:
+        """See `Sink`."""
+        for sink in self._sinks:
+            sink.write(line)
+
+    def close(self) -> None:
+        """See `Sink`."""
+        for sink in self._sinks:
+            sink.close()
+
+
+def _finite(value: float | int | None) -> float | int | None:
+    # JSON has no NaN; a reader in another language must not choke on a diverged run.
+    return None if isinstance(value, float) and not math.isfinite(value) else value

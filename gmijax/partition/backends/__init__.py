@@ -1,0 +1,34 @@
+"""Ways to give a GMI its share of a GPU. A new one is one file and one line in `BACKENDS`."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from types import MappingProxyType
+from typing import TypeAlias
+
+from gmijax.partition.backends.cpu import CpuBackend
+from gmijax.partition.backends.interface import Backend
+from gmijax.partition.backends.mps import MpsBackend
+from gmijax.partition.backends.share import ShareBackend
+from gmijax.partition.machine import Machine
+from gmijax.partition.plan import Plan
+from gmijax.rundir import RunPaths
+
+BackendFactory: TypeAlias = Callable[[Plan, Machine, RunPaths], Backend]
+
+BACKENDS: Mapping[str, BackendFactory] = MappingProxyType(
+    {
+        "cpu": CpuBackend,
+        "mps": MpsBackend,
+        "share": ShareBackend,
+    }
+)
+
+
+def open_backend(plan: Plan, machine: Machine, run: RunPaths) -> Backend:
+    """The backend of a plan, to be entered with `with`.
+
+    Raises:
+      BackendUnavailable: it cannot be had on this machine.
+    """
+    return BACKENDS[plan.backend](plan, machine, run)

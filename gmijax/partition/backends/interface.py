@@ -1,0 +1,54 @@
+"""The seam between the supervisor and the ways to give a GMI its share of a GPU."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from types import TracebackType
+from typing import Protocol, Self
+
+
+class Backend(Protocol):
+    """Enforces the shares of a plan while it is entered; leaving it undoes what it did.
+
+    Leave it only after every GMI has ended.
+    """
+
+    def __enter__(self) -> Self:
+        """Sets up what the GMIs need.
+
+        Raises:
+          BackendUnavailable: it cannot be had on this machine; nothing is left behind.
+        """
+        ...
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        """Takes down what `__enter__` set up, and nothing else."""
+        ...
+
+    def environment(self, gmi: int) -> Mapping[str, str]:
+        """The backend's own environment variables of a GMI.
+
+        `XLA_FLAGS` among them are added to the user's, see `gmi_environment`.
+        """
+        ...
+
+    def started(self, gmi: int, pid: int) -> None:
+        """Tells the backend that a GMI runs as the process group `pid`."""
+        ...
+
+    def verify(self, pids: Mapping[int, int]) -> None:
+        """Checks that every GMI really has its share; `pids` is GMI -> process.
+
+        Raises:
+          BackendUnavailable: a GMI runs without it.
+        """
+        ...
+
+    def terminate(self, gmi: int, pid: int) -> None:
+        """Detaches a GMI from its GPU before it is killed; best effort, returns in seconds."""
+        ...

@@ -1,0 +1,168 @@
+"""Backend `mps`: the GMIs of a GPU run at the same time under NVIDIA's Multi-Process Service.
+
+One daemon per GPU, with a pipe directory of its own: a fatal fault of one client ends every
+client of its server, so GPUs must not share a server. A daemon that somebody else has started
+is used and never stopped.
+"""
+
+from __future__ import annotations
+
+import os
+import tempfile
+import time
+from collections.abc import Mapping
+from contextlib import suppress
+from pathlib import Path
+from types import TracebackType
+from typing import Self
+
+from gmijax.errors import BackendUnavailable
+from gmijax.partition.janitor import JanitorLink, quit_daemon
+from gmijax.partition.machine import Machine
+from gmijax.partition.nvidia import PIPE_VARIABLE, MpsControl
+from gmijax.partition.plan import Plan
+from gmijax.rundir import RunPaths
+
+_ANSWER_S = 10.0
+_CLIENTS_LEAVE_S = 5.0
+_CLIENTS_APPEAR_S = 3.0
+_POLL_S = 0.1
+
+# A pipe directory holds sockets, whose paths may have 107 characters.
+_LONGEST_PARENT = 60
+
+
+class MpsBackend:
+    """Runs the daemons of a job while it is entered.
+
+    Args:
+      plan: its slices name the GPUs.
+      machine: where the control program is, and whether somebody's daemon runs.
+      run: logs go below its `mps` folder.
+
+    Raises:
+      BackendUnavailable: the control program is not installed.
+    """
+
+    def __init__(self, plan: Plan, machine: Machine, run: RunPaths) -> None:
+        if machine.mps_control is None:
+            raise BackendUnavailable("plan.backend=mps: nvidia-cuda-mps-control was not found")
+        self._plan = plan
+        self._program = machine.mps_control
+        self._operator = machine.operator_daemon
+        self._logs = run.mps
+        self._controls: dict[int, MpsControl] = {}
+        self._janitor: JanitorLink | None = None
+        self._unresponsive: set[int] = set()
+
+    def __enter__(self) -> Self:
+        """Starts a daemon per GPU, or attaches to the one that runs."""
+        if self._operator is not None:
+            control = MpsControl(self._program, self._operator)
+            self._controls = dict.fromkeys(range(self._plan.layout.num_gpus), control)
+            return self
+        try:
+            self._janitor = JanitorLink(self._logs)
+            for gpu, gmis in enumerate(self._plan.layout.gmis_of_gpu):
+                self._start_daemon(gpu, self._plan.slices[gmis[0]].device)
+        except BaseException:
+            self._quit_all()
+            raise
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        """Quits the own daemons once their clients have left."""
+        if self._operator is None:
+            deadline_s = time.monotonic() + _CLIENTS_LEAVE_S
+            for control in self._controls.values():
+                _wait_for_no_clients(control, deadline_s)
+            self._quit_all()
+
+    def environment(self, gmi: int) -> Mapping[str, str]:
+        """Where the GMI's daemon listens."""
+        return {PIPE_VARIABLE: str(self._control_of(gmi).pipe_directory)}
+
+    def started(self, gmi: int, pid: int) -> None:
+        """Tells the janitor."""
+        del gmi
+        if self._janitor is not None:
+            self._janitor.watch_gmi(pid)
+
+    def verify(self, pids: Mapping[int, int]) -> None:
+        """Checks with the daemons that every GMI is a client.
+
+        CUDA falls back to taking turns, silently, when it does not reach the daemon.
+        """
+        deadline_s = time.monotonic() + _CLIENTS_APPEAR_S
+        while strangers := self._strangers(pids):
+            if time.monotonic() > deadline_s:
+                gmi, pid = next(iter(strangers.items()))
+                raise BackendUnavailable(
+                    f"plan.backend=mps: GMI {gmi} (process {pid}) is no client of the MPS daemon "
+                    f"in {self._control_of(gmi).pipe_directory}; see its logs in {self._logs}, "
+                    "or use plan.backend=share"
+                )
+            time.sleep(_POLL_S)
+
+    def terminate(self, gmi: int, pid: int) -> None:
+        """Takes the GMI off the GPU: killing a busy client can fault its neighbours."""
+        gpu = self._plan.layout.gpu_of(gmi)
+        control = self._controls[gpu]
+        if gpu in self._unresponsive:
+            return
+        try:
+            server = control.all_client_pids().get(pid)
+            if server is not None:
+                control.terminate_client(server, pid)
+        except BackendUnavailable:
+            # Each attempt could cost a time limit; the other GMIs are killed without it.
+            self._unresponsive.add(gpu)
+
+    def _control_of(self, gmi: int) -> MpsControl:
+        return self._controls[self._plan.layout.gpu_of(gmi)]
+
+    def _start_daemon(self, gpu: int, gpu_uuid: str) -> None:
+        # mkdtemp makes it readable for nobody else.
+        directory = Path(tempfile.mkdtemp(prefix="gmijax-", dir=_short_parent()))
+        control = MpsControl(self._program, directory)
+        self._controls[gpu] = control
+        if self._janitor is not None:
+            self._janitor.watch_daemon(control)
+        log_directory = self._logs / f"gpu_{gpu}"
+        control.start(gpu_uuid, log_directory)
+        deadline_s = time.monotonic() + _ANSWER_S
+        while not control.is_answering():
+            if time.monotonic() > deadline_s:
+                raise BackendUnavailable(
+                    f"plan.backend=mps: the daemon of GPU {gpu} does not answer within "
+                    f"{_ANSWER_S:g} s; see {log_directory}"
+                )
+            time.sleep(_POLL_S)
+
+    def _strangers(self, pids: Mapping[int, int]) -> dict[int, int]:
+        clients = {control: control.all_client_pids() for control in set(self._controls.values())}
+        return {gmi: pid for gmi, pid in pids.items() if pid not in clients[self._control_of(gmi)]}
+
+    def _quit_all(self) -> None:
+        for control in self._controls.values():
+            quit_daemon(control)
+        self._controls = {}
+        if self._janitor is not None:
+            self._janitor.dismiss()
+            self._janitor = None
+
+
+def _wait_for_no_clients(control: MpsControl, deadline_s: float) -> None:
+    with suppress(BackendUnavailable):
+        while control.all_client_pids() and time.monotonic() < deadline_s:
+            time.sleep(_POLL_S)
+
+
+def _short_parent() -> str:
+    parent = tempfile.gettempdir()
+    return parent if len(parent) <= _LONGEST_PARENT or os.name != "posix" else "/tmp"

@@ -1,0 +1,137 @@
+"""The GMI's side of supervision; stdlib only, so that it runs before jax is imported.
+
+The controller holds the write end of a pipe per GMI, the *lifeline*. One byte asks the GMI to
+finish; end of file means that the controller is gone, however it ended, and so must the GMI be.
+"""
+
+from __future__ import annotations
+
+import os
+import signal
+import threading
+import time
+import traceback
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Final
+
+from gmijax.errors import ConfigError
+from gmijax.partition.heartbeat import GmiState, Heartbeat, write_heartbeat
+from gmijax.rundir import GmiPaths, RunPaths, write_json
+
+ENV_GMI: Final = "GMIJAX_GMI"
+ENV_CPUS: Final = "GMIJAX_CPUS"
+ENV_RUN_DIR: Final = "GMIJAX_RUN_DIR"
+ENV_LIFELINE_FD: Final = "GMIJAX_LIFELINE_FD"
+ENV_EXCHANGE_FD: Final = "GMIJAX_EXCHANGE_FD"
+
+STOP_BYTE: Final = b"s"
+
+_BEAT_INTERVAL_S: Final = 0.2
+
+
+class ChildLink:
+    """The link of this process to the controller.
+
+    Attributes:
+      gmi: id of this GMI.
+      run: files of the run.
+      paths: files of this GMI.
+      exchange_fd: inherited file of the gradient exchange, None where there is none.
+    """
+
+    def __init__(
+        self, gmi: int, run: RunPaths, lifeline_fd: int | None, exchange_fd: int | None
+    ) -> None:
+        self.gmi = gmi
+        self.run = run
+        self.exchange_fd = exchange_fd
+        self.paths: GmiPaths = run.gmi(gmi)
+        self._stop = threading.Event()
+        self._last_beat: tuple[GmiState, float] | None = None
+        if lifeline_fd is not None:
+            threading.Thread(
+                target=self._hold_lifeline, args=(lifeline_fd,), name="lifeline", daemon=True
+            ).start()
+
+    @classmethod
+    def from_environment(cls, environment: Mapping[str, str] = os.environ) -> ChildLink:
+        """Pins this process to its CPU cores and takes up the link; call it before jax starts.
+
+        Without a lifeline in the environment (a worker started by hand, to debug it) nothing
+        can ask the process to stop, and everything else works.
+
+        Raises:
+          ConfigError: the process was not started as a GMI.
+        """
+        try:
+            gmi, run_dir = int(environment[ENV_GMI]), environment[ENV_RUN_DIR]
+        except (KeyError, ValueError):
+            raise ConfigError(
+                f"{ENV_GMI} and {ENV_RUN_DIR} must be set: GMIs are started by gmijax.train"
+            ) from None
+        pin_to_cpus(environment.get(ENV_CPUS, ""))
+        return cls(
+            gmi,
+            RunPaths(Path(run_dir)),
+            _inherited_fd(environment, ENV_LIFELINE_FD),
+            _inherited_fd(environment, ENV_EXCHANGE_FD),
+        )
+
+    @property
+    def stop_requested(self) -> bool:
+        """Whether the controller asked for an end: finish the iteration, save, return."""
+        return self._stop.is_set()
+
+    def beat(self, state: GmiState, iteration: int) -> None:
+        """Reports progress; cheap enough for every iteration.
+
+        Beats in an unchanged state are written at most five times a second.
+        """
+        now_s = time.monotonic()
+        if self._last_beat is not None:
+            last_state, last_s = self._last_beat
+            if state == last_state and now_s - last_s < _BEAT_INTERVAL_S:
+                return
+        write_heartbeat(self.paths.heartbeat, Heartbeat(state, iteration, os.getpid()))
+        self._last_beat = state, now_s
+
+    def report_error(self, error: BaseException) -> None:
+        """Writes why this GMI fails; end with a non-zero exit code after it."""
+        write_json(
+            self.paths.error,
+            {
+                "type": type(error).__name__,
+                "message": str(error),
+                "traceback": "".join(traceback.format_exception(error)),
+            },
+        )
+
+    def _hold_lifeline(self, lifeline_fd: int) -> None:
+        while True:
+            try:
+                received = os.read(lifeline_fd, 16)
+            except OSError:
+                received = b""
+            if not received:
+                _end_now()
+            if STOP_BYTE in received:
+                self._stop.set()
+
+
+def pin_to_cpus(cpus: str) -> None:
+    """Restricts this process to the cores in `cpus`, e.g. `0,1,5`; empty for no restriction."""
+    if cpus and hasattr(os, "sched_setaffinity"):
+        os.sched_setaffinity(0, {int(cpu) for cpu in cpus.split(",")})
+
+
+def _end_now() -> None:
+    # No clean-up: it could wait for a peer or a GPU for ever, and nobody is left who would
+    # read the outcome. Helper processes must not stay behind either.
+    if os.getpgrp() == os.getpid():
+        os.killpg(0, signal.SIGKILL)
+    os._exit(1)
+
+
+def _inherited_fd(environment: Mapping[str, str], name: str) -> int | None:
+    return int(environment[name]) if name in environment else None

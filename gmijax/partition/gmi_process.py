@@ -1,0 +1,177 @@
+"""One GMI's process as the controller sees it: start, heartbeat, signals, end."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import time
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
+from typing import NamedTuple
+
+from gmijax.errors import GmiFailed
+from gmijax.partition.child import ENV_EXCHANGE_FD, ENV_LIFELINE_FD, ENV_RUN_DIR, STOP_BYTE
+from gmijax.partition.heartbeat import Heartbeat, read_heartbeat
+from gmijax.rundir import GmiPaths, RunPaths
+
+
+class GmiStatus(NamedTuple):
+    """Where a GMI stands.
+
+    Attributes:
+      gmi: its id.
+      state: `waiting` before its process is started, then what it says (see `heartbeat`).
+      iteration: training iterations done.
+      pid: its process, None before the start.
+      exit_code: None while it runs; negative for the signal that ended it.
+    """
+
+    gmi: int
+    state: str
+    iteration: int
+    pid: int | None
+    exit_code: int | None
+
+
+class GmiProcess:
+    """A started GMI, the leader of its own session and process group.
+
+    Attributes:
+      gmi: its id.
+      exit_code: None while it runs; negative for the signal that ended it.
+      started_s: when it was started, `time.monotonic`.
+      progress_s: when its heartbeat was last seen to be a new one.
+    """
+
+    def __init__(
+        self, gmi: int, process: subprocess.Popen[bytes], lifeline: int, paths: GmiPaths
+    ) -> None:
+        self.gmi = gmi
+        self.exit_code: int | None = None
+        self.started_s = self.progress_s = time.monotonic()
+        self._process = process
+        self._lifeline = lifeline
+        self._paths = paths
+        self._beat = Heartbeat("starting", 0, process.pid)
+        self._beat_stamp: tuple[int, int] | None = None
+        self._was_ready = False
+
+    @classmethod
+    def start(
+        cls,
+        gmi: int,
+        command: Sequence[str],
+        environment: Mapping[str, str],
+        run: RunPaths,
+        exchange_fd: int | None = None,
+    ) -> GmiProcess:
+        """Starts a fresh interpreter that inherits its lifeline and nothing else of ours.
+
+        Raises:
+          GmiFailed: the program cannot be started.
+        """
+        paths = run.gmi(gmi)
+        paths.root.mkdir(parents=True, exist_ok=True)
+        for stale in (paths.heartbeat, paths.error, paths.result):
+            stale.unlink(missing_ok=True)
+        read_end, write_end = os.pipe()
+        inherited = {ENV_LIFELINE_FD: read_end}
+        if exchange_fd is not None:
+            inherited[ENV_EXCHANGE_FD] = exchange_fd
+        # Files, not pipes: a child that floods a pipe which nobody reads would block.
+        try:
+            with paths.stdout.open("wb") as stdout, paths.stderr.open("wb") as stderr:
+                process = subprocess.Popen(
+                    command,
+                    env={
+                        **environment,
+                        **{name: str(fd) for name, fd in inherited.items()},
+                        ENV_RUN_DIR: str(run.root),
+                    },
+                    stdin=subprocess.DEVNULL,
+                    stdout=stdout,
+                    stderr=stderr,
+                    start_new_session=True,
+                    pass_fds=tuple(inherited.values()),
+                )
+        except OSError as error:
+            os.close(write_end)
+            raise GmiFailed(gmi, f"cannot start {command[0]}: {error.strerror}") from error
+        except BaseException:
+            os.close(write_end)
+            raise
+        finally:
+            os.close(read_end)
+        return cls(gmi, process, write_end, paths)
+
+    @property
+    def pid(self) -> int:
+        """The process that was started, leader of its group."""
+        return self._process.pid
+
+    @property
+    def beat(self) -> Heartbeat:
+        """The newest heartbeat that `poll` saw."""
+        return self._beat
+
+    @property
+    def is_ready(self) -> bool:
+        """Whether the GMI has once been ready, or has ended well without saying so."""
+        return self._was_ready or self.exit_code == 0
+
+    @property
+    def paths(self) -> GmiPaths:
+        """Files of this GMI."""
+        return self._paths
+
+    def status(self) -> GmiStatus:
+        """A snapshot for progress displays."""
+        beat = self._beat
+        return GmiStatus(self.gmi, beat.state, beat.iteration, beat.pid, self.exit_code)
+
+    def poll(self) -> int | None:
+        """Reads the heartbeat and the exit code; ends what is left of an ended GMI's group."""
+        self._refresh()
+        if self.exit_code is None and self._has_ended():
+            # Before the zombie is reaped its group's number cannot go to somebody else.
+            self.send(signal.SIGKILL)
+            self.exit_code = self._process.wait()
+            self._refresh()
+        return self.exit_code
+
+    def ask_to_stop(self) -> None:
+        """Asks the GMI to finish its iteration, save and end."""
+        with suppress(OSError):
+            os.write(self._lifeline, STOP_BYTE)
+
+    def send(self, number: signal.Signals) -> None:
+        """Sends a signal to the GMI and to everything it started; nothing once it is reaped."""
+        if self.exit_code is None:
+            with suppress(ProcessLookupError, PermissionError):
+                os.killpg(self.pid, number)
+
+    def close(self) -> None:
+        """Drops the lifeline: a process that is still there ends itself."""
+        if self._lifeline >= 0:
+            os.close(self._lifeline)
+            self._lifeline = -1
+
+    def _has_ended(self) -> bool:
+        flags = os.WEXITED | os.WNOHANG | os.WNOWAIT
+        try:
+            return os.waitid(os.P_PID, self.pid, flags) is not None
+        except ChildProcessError:
+            return True
+
+    def _refresh(self) -> None:
+        try:
+            stat = self._paths.heartbeat.stat()
+        except OSError:
+            return
+        # Every beat is a new file, so a beat with equal content counts as progress too.
+        stamp = (stat.st_mtime_ns, stat.st_ino)
+        if stamp != self._beat_stamp and (beat := read_heartbeat(self._paths.heartbeat)):
+            self._beat, self._beat_stamp = beat, stamp
+            self._was_ready |= beat.is_ready
+            self.progress_s = time.monotonic()

@@ -1,0 +1,64 @@
+"""Which GMI lives on which GPU: pure data, checked when it is made."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from gmijax.errors import ConfigError
+
+
+@dataclass(frozen=True)
+class Layout:
+    """GMI ids of every GPU, the mapping list of the paper's Algorithm 1.
+
+    `Layout(((0, 1, 2), (3, 4, 5)))` is two GPUs with three GMIs each. Positions count GPUs of
+    the job (0 is its first), not the machine's indices. Uneven layouts are allowed.
+
+    Raises:
+      ConfigError: no GPU, a GPU without a GMI, or ids that are not 0 .. K-1, each once.
+    """
+
+    gmis_of_gpu: tuple[tuple[int, ...], ...]
+
+    def __post_init__(self) -> None:
+        shown = [list(gmis) for gmis in self.gmis_of_gpu]
+        if not self.gmis_of_gpu or any(not gmis for gmis in self.gmis_of_gpu):
+            raise ConfigError(f"plan.layout={shown}: every GPU needs at least one GMI")
+        ids = sorted(gmi for gmis in self.gmis_of_gpu for gmi in gmis)
+        if ids != list(range(len(ids))):
+            raise ConfigError(
+                f"plan.layout={shown}: GMI ids must be 0 to {len(ids) - 1}, each exactly once"
+            )
+
+    @classmethod
+    def even(cls, num_gpus: int, gmis_per_gpu: int) -> Layout:
+        """The layout with `gmis_per_gpu` consecutive ids on each of `num_gpus` GPUs."""
+        return cls(
+            tuple(
+                tuple(range(gpu * gmis_per_gpu, (gpu + 1) * gmis_per_gpu))
+                for gpu in range(num_gpus)
+            )
+        )
+
+    @property
+    def num_gpus(self) -> int:
+        """Number of GPUs, g in the paper's Table 2."""
+        return len(self.gmis_of_gpu)
+
+    @property
+    def num_gmis(self) -> int:
+        """K, number of GMIs on all GPUs."""
+        return sum(len(gmis) for gmis in self.gmis_of_gpu)
+
+    @property
+    def gmis(self) -> range:
+        """All GMI ids in order."""
+        return range(self.num_gmis)
+
+    def gpu_of(self, gmi: int) -> int:
+        """Position of the GPU that holds `gmi`."""
+        return next(gpu for gpu, gmis in enumerate(self.gmis_of_gpu) if gmi in gmis)
+
+    def neighbours_of(self, gmi: int) -> tuple[int, ...]:
+        """All GMIs on the GPU of `gmi`, itself included."""
+        return self.gmis_of_gpu[self.gpu_of(gmi)]

@@ -1,0 +1,96 @@
+"""The plan: all that is needed to launch a job, as pure data.
+
+A plan is made by `gmijax.partition.planner` from the configuration and the machine, written to
+`plan.json`, and never changed after that.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from typing import Any, Literal
+
+from gmijax.errors import ConfigError
+from gmijax.partition.layout import Layout
+
+BackendName = Literal["mps", "mig", "share", "cpu"]
+
+MAX_MEMORY_FRACTION = 0.9
+"""Limit of the sum of memory fractions on one GPU: CUDA contexts, NCCL and Warp need the rest."""
+
+
+@dataclass(frozen=True)
+class Slice:
+    """The share of one GMI.
+
+    Attributes:
+      gmi: its id.
+      gpu: position of its GPU in the job.
+      device: what the GMI's process sees: a GPU's UUID, or `cpu`.
+      sm_percent: cap on SMs in percent, None for no cap.
+      memory_fraction: fraction of the GPU's memory, None where memory is not partitioned.
+      cpus: CPU cores that the process is pinned to; empty for no pinning.
+    """
+
+    gmi: int
+    gpu: int
+    device: str
+    sm_percent: float | None
+    memory_fraction: float | None
+    cpus: tuple[int, ...]
+
+
+@dataclass(frozen=True)
+class Plan:
+    """All that is needed to launch a job.
+
+    Attributes:
+      layout: GPU -> GMIs.
+      slices: one per GMI, in order of id.
+      backend: how shares are enforced.
+      template: how roles map to GMIs.
+      num_envs_per_gmi: N.
+      strategy: gradient reduction, `none` for one GMI.
+      intra: exchange inside one GPU.
+      reasons: what was decided for an `auto`, and why, one sentence each.
+
+    Raises:
+      ConfigError: slices that do not fit the layout, or memory fractions over the limit.
+    """
+
+    layout: Layout
+    slices: tuple[Slice, ...]
+    backend: BackendName
+    template: str
+    num_envs_per_gmi: int
+    strategy: str
+    intra: str
+    reasons: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        if [s.gmi for s in self.slices] != list(self.layout.gmis):
+            raise ConfigError(f"plan: slices {self.slices} do not match layout {self.layout}")
+        for gpu, gmis in enumerate(self.layout.gmis_of_gpu):
+            total = sum(self.slices[gmi].memory_fraction or 0.0 for gmi in gmis)
+            if total > MAX_MEMORY_FRACTION + 1e-9:
+                raise ConfigError(
+                    f"plan.memory_fraction: {len(gmis)} GMIs on GPU {gpu} would reserve "
+                    f"{total:.2f} of its memory; at most {MAX_MEMORY_FRACTION} in sum"
+                )
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain data for `plan.json`."""
+        data = asdict(self)
+        data["layout"] = [list(gmis) for gmis in self.layout.gmis_of_gpu]
+        return data
+
+    @classmethod
+    def from_dict(cls, data: Mapping[str, Any]) -> Plan:
+        """Inverts `to_dict`, after a round trip through JSON too."""
+        fields = dict(data)
+        fields["layout"] = Layout(tuple(tuple(gmis) for gmis in data["layout"]))
+        fields["slices"] = tuple(
+            Slice(**{**item, "cpus": tuple(item["cpus"])}) for item in data["slices"]
+        )
+        fields["reasons"] = tuple(data["reasons"])
+        return cls(**fields)

@@ -1,0 +1,235 @@
+"""Starts the GMIs of a job, watches them, and ends them all, whatever happens.
+
+All or nothing: the first failure ends the job, and no process is left when `run` returns or
+raises. There is no restart; a job continues from a checkpoint instead.
+"""
+
+from __future__ import annotations
+
+import signal
+import time
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+
+from gmijax.errors import GmiFailed, JobInterrupted
+from gmijax.partition.backends.interface import Backend
+from gmijax.partition.failures import Failure, describe_exit, first_cause
+from gmijax.partition.gmi_process import GmiProcess, GmiStatus
+from gmijax.rundir import RunPaths
+
+_POLL_S = 0.05
+_SETTLE_S = 1.0
+_SWEEP_S = 10.0
+
+
+@dataclass(frozen=True, kw_only=True)
+class Patience:
+    """How long the supervisor waits.
+
+    Attributes:
+      start_timeout_s: for a GMI to compile, counted from its start or from its last beat.
+      stall_timeout_s: between two beats of a GMI that is past compiling.
+      stop_timeout_s: for all GMIs to finish by themselves after a request to stop.
+      grace_s: between SIGTERM and SIGKILL.
+    """
+
+    start_timeout_s: float
+    stall_timeout_s: float
+    stop_timeout_s: float
+    grace_s: float
+
+
+@dataclass(frozen=True, kw_only=True)
+class Job:
+    """What to start and how.
+
+    Attributes:
+      run: the run folder.
+      gmis: ids of the GMIs, in the order of their start.
+      command: program and arguments of a GMI.
+      environment: all environment variables of a GMI (see `gmi_environment`); the supervisor
+        adds the run folder, the lifeline and the exchange.
+      backend: an entered backend.
+      patience: time limits.
+      exchange_fd: open file that every GMI inherits for the exchange of gradients.
+      compile_once: start the first GMI alone and the others when it has compiled, so that
+        they find its program in the compilation cache.
+    """
+
+    run: RunPaths
+    gmis: Sequence[int]
+    command: Callable[[int], Sequence[str]]
+    environment: Callable[[int], Mapping[str, str]]
+    backend: Backend
+    patience: Patience
+    exchange_fd: int | None = None
+    compile_once: bool = True
+
+
+class Supervisor:
+    """Runs one job once."""
+
+    def __init__(self, job: Job) -> None:
+        self._job = job
+        self._waiting = list(job.gmis)
+        self._started: dict[int, GmiProcess] = {}
+        self._all_ready_s: float | None = None
+        self._stop_requests = 0
+        self._stop_deadline_s: float | None = None
+
+    def request_stop(self) -> None:
+        """Asks for an end; may be called from a signal handler.
+
+        The first request lets the GMIs finish their iteration and save; the second ends them.
+        """
+        self._stop_requests += 1
+
+    def status(self) -> tuple[GmiStatus, ...]:
+        """Where every GMI stands, in the order of `Job.gmis`."""
+        return tuple(
+            self._started[gmi].status()
+            if gmi in self._started
+            else GmiStatus(gmi, "waiting", 0, None, None)
+            for gmi in self._job.gmis
+        )
+
+    def run(self, on_tick: Callable[[tuple[GmiStatus, ...]], None] | None = None) -> None:
+        """Runs the job to its end; calls `on_tick` about 20 times a second.
+
+        Raises:
+          GmiFailed: a GMI failed, did not start in time or stalled; names the first one.
+          ConfigError: a GMI rejected its input, or the backend is not what the plan says.
+          JobInterrupted: a stop was requested, and every GMI has ended.
+        """
+        try:
+            while self._waiting or self._alive():
+                self._start_due()
+                self._raise_failure()
+                self._handle_stop()
+                self._check_ready()
+                self._check_progress()
+                if on_tick is not None:
+                    on_tick(self.status())
+                time.sleep(_POLL_S)
+            self._raise_failure()
+        finally:
+            self._end_all()
+        if self._stop_requests:
+            raise JobInterrupted("stopped on request; every GMI has finished by itself")
+
+    def _alive(self) -> list[GmiProcess]:
+        return [process for process in self._started.values() if process.exit_code is None]
+
+    def _start_due(self) -> None:
+        """Starts what may start now: the first GMI, or all the rest."""
+        if self._stop_requests or not self._waiting:
+            return
+        if not self._job.compile_once or all(p.is_ready for p in self._started.values()):
+            due = self._waiting[:1] if self._starts_alone() else self._waiting[:]
+            for gmi in due:
+                self._start(gmi)
+
+    def _starts_alone(self) -> bool:
+        return self._job.compile_once and not self._started
+
+    def _start(self, gmi: int) -> None:
+        job = self._job
+        process = GmiProcess.start(
+            gmi, job.command(gmi), job.environment(gmi), job.run, job.exchange_fd
+        )
+        self._started[gmi] = process
+        self._waiting.remove(gmi)
+        job.backend.started(gmi, process.pid)
+
+    def _raise_failure(self) -> None:
+        """Reads heartbeats and exit codes; raises for the GMI that failed first."""
+        failures = self._poll_failures()
+        if not failures:
+            return
+        # A GMI that lost its peer can be quicker to end than that peer is to be seen dead.
+        deadline_s = time.monotonic() + _SETTLE_S
+        while first_cause(failures).is_consequence and time.monotonic() < deadline_s:
+            time.sleep(_POLL_S)
+            failures = self._poll_failures()
+        raise first_cause(failures).to_error()
+
+    def _poll_failures(self) -> list[Failure]:
+        return [
+            describe_exit(process.gmi, process.exit_code, process.paths)
+            for process in self._started.values()
+            if process.poll() and process.exit_code is not None
+        ]
+
+    def _handle_stop(self) -> None:
+        if not self._stop_requests:
+            return
+        if self._stop_requests > 1:
+            raise JobInterrupted("stopped at once on a second request; the last work is not saved")
+        if self._waiting or not all(p.is_ready for p in self._started.values()):
+            raise JobInterrupted("stopped before training began")
+        now_s = time.monotonic()
+        if self._stop_deadline_s is None:
+            self._stop_deadline_s = now_s + self._job.patience.stop_timeout_s
+            for process in self._alive():
+                process.ask_to_stop()
+        elif now_s > self._stop_deadline_s:
+            late = [process.gmi for process in self._alive()]
+            raise JobInterrupted(
+                f"stopped on request; GMIs {late} did not finish within "
+                f"{self._job.patience.stop_timeout_s:g} s and were ended"
+            )
+
+    def _check_ready(self) -> None:
+        """Checks the backend once, when every GMI holds its share."""
+        if self._all_ready_s is None and not self._waiting:
+            processes = self._started.values()
+            if all(process.is_ready for process in processes):
+                self._all_ready_s = time.monotonic()
+                # One that has ended already cannot be asked for any more.
+                self._job.backend.verify({p.gmi: p.beat.pid for p in self._alive()})
+
+    def _check_progress(self) -> None:
+        now_s = time.monotonic()
+        for process in self._alive():
+            state = process.beat.state
+            if state in ("starting", "compiling"):
+                limit_s, since_s = self._job.patience.start_timeout_s, process.progress_s
+                what = "did not start and compile"
+            elif self._all_ready_s is not None:
+                # A GMI that is ready waits for the others without a beat: its clock starts
+                # when the last one is ready.
+                limit_s = self._job.patience.stall_timeout_s
+                since_s = max(process.progress_s, self._all_ready_s)
+                what = f"made no progress after iteration {process.beat.iteration}"
+            else:
+                continue
+            if now_s - since_s > limit_s:
+                raise GmiFailed(process.gmi, f"{what} within {limit_s:g} s (state: {state})")
+
+    def _end_all(self) -> None:
+        """Ends every process that is left: backend, SIGTERM, grace, SIGKILL, lifeline."""
+        alive = [process for process in self._started.values() if process.poll() is None]
+        for process in alive:
+            # Whatever is wrong with the backend, the processes must end.
+            with suppress(Exception):
+                self._job.backend.terminate(process.gmi, process.beat.pid)
+        for number, wait_s in (
+            (signal.SIGTERM, self._job.patience.grace_s),
+            (signal.SIGKILL, _SWEEP_S),
+        ):
+            for process in alive:
+                process.send(number)
+            alive = _wait_for_end(alive, wait_s)
+        for process in self._started.values():
+            process.close()
+
+
+def _wait_for_end(processes: Sequence[GmiProcess], timeout_s: float) -> list[GmiProcess]:
+    """Waits until all have ended; returns those that have not."""
+    deadline_s = time.monotonic() + timeout_s
+    alive = [process for process in processes if process.poll() is None]
+    while alive and time.monotonic() < deadline_s:
+        time.sleep(_POLL_S)
+        alive = [process for process in alive if process.poll() is None]
+    return alive

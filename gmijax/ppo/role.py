@@ -1,0 +1,223 @@
+"""The role of a GMI in synchronous training: simulator, agent and trainer in one (TCG_EX).
+
+Every GMI runs this same routine; the reducer keeps them in step and makes their learner states
+equal. The leader (rank 0) alone writes metrics and the shared part of checkpoints.
+"""
+
+from __future__ import annotations
+
+import statistics
+import time
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from gmijax.checkpoint import digest, restore_envs, restore_learner, save_checkpoint
+from gmijax.collectives.interface import Reducer
+from gmijax.config import TrainConfig
+from gmijax.errors import NonFiniteError, ParameterMismatch
+from gmijax.metrics import JsonlSink, MetricsLog, TensorBoardSink
+from gmijax.partition.child import ChildLink
+from gmijax.ppo.learner import Learner, LearnerState, init_learner, make_learner
+from gmijax.ppo.programs import FusedIteration, Iteration, IterationMetrics, SplitIteration
+from gmijax.ppo.report import Reporter
+from gmijax.ppo.throughput import measure_throughput
+from gmijax.resume import CheckpointMeta
+from gmijax.sim.wrappers import BatchedEnv, BatchState, env_keys
+
+
+def train(
+    config: TrainConfig, env: BatchedEnv, impl: str, reducer: Reducer, link: ChildLink
+) -> dict[str, Any]:
+    """Trains until `num_timesteps` or until the controller asks for an end.
+
+    Returns:
+      The outcome for `result.json`.
+
+    Raises:
+      NonFiniteError: simulation or learning produced NaN or infinity.
+      ParameterMismatch: the GMIs' parameters differ.
+      CollectiveError: another GMI is gone or stuck.
+    """
+    return _SyncTrainer(config, env, impl, reducer, link).run()
+
+
+class _SyncTrainer:
+    """One GMI's training run; see `train`."""
+
+    def __init__(
+        self, config: TrainConfig, env: BatchedEnv, impl: str, reducer: Reducer, link: ChildLink
+    ) -> None:
+        self._config = config
+        self._env = env
+        self._impl = impl
+        self._reducer = reducer
+        self._link = link
+        self._leader = reducer.rank == 0
+        self._steps_per_iteration = (
+            config.num_envs * config.algo.unroll_length * reducer.world_size
+        )
+        self._learner: Learner = make_learner(env.spec, config.algo)
+        self._iteration: Iteration = (
+            FusedIteration(env, self._learner)
+            if reducer.world_size == 1
+            else SplitIteration(env, self._learner, reducer)
+        )
+        self._env_steps = 0
+        self._iterations = 0
+        self._checkpoint: Path | None = None
+
+    def run(self) -> dict[str, Any]:
+        """See `train`."""
+        self._link.beat("compiling", 0)
+        started = time.monotonic()
+        state, env_state = self._first_state()
+        self._iteration.compile(state, env_state)
+        compile_s = time.monotonic() - started
+        self._link.beat("ready", 0)
+        self._reducer.all_gather(np.zeros(1, np.float32))  # Everybody is there: start the clock.
+        reporter = Reporter(self._config.env.name, self._open_log(), self._env_steps)
+        first_steps = self._env_steps
+        started = time.monotonic()
+        try:
+            state, env_state, stopped = self._loop(state, env_state, reporter)
+        finally:
+            reporter.close()
+        wall_s = time.monotonic() - started
+        done = {
+            "status": "stopped" if stopped else "completed",
+            "env_steps": self._env_steps,
+            "iterations": self._iterations,
+            "train_wall_s": wall_s,
+            "compile_s": compile_s,
+            "env_steps_per_s": (self._env_steps - first_steps) / wall_s,
+            "step_per_s_train": self._median_rate(reporter.iteration_s),
+            "final_return": reporter.last_return,
+            "checkpoint": str(self._checkpoint) if self._checkpoint else None,
+            "impl": self._impl,
+            "device": _device(),
+        }
+        if self._config.run.measure_throughput and not stopped:
+            self._link.beat("running", self._iterations)
+            rates = measure_throughput(
+                self._env, self._learner, self._config, state, env_state, self._reducer
+            )
+            done |= rates._asdict()
+        return done
+
+    def _first_state(self) -> tuple[LearnerState, BatchState]:
+        base = jax.random.key(self._config.seed)
+        learner_key, env_key = jax.random.split(base)
+        spec = self._env.spec
+        state = jax.jit(lambda key: init_learner(self._learner, spec.obs_size, key))(learner_key)
+        resume = self._config.run.resume
+        if resume is None:
+            return state, self._reset_envs(env_key)
+        meta = CheckpointMeta.read(Path(resume))
+        self._env_steps = meta.env_steps
+        state = restore_learner(Path(resume), state)
+        # Other environments than the first run's: these never saw the first run's start.
+        env_state = self._reset_envs(jax.random.fold_in(env_key, meta.env_steps % 2**31))
+        same = (self._reducer.world_size, self._config.num_envs, self._impl)
+        if (meta.num_gmis, meta.num_envs, meta.impl) == same:
+            env_state = restore_envs(Path(resume), self._link.gmi, env_state)
+        return state, env_state
+
+    def _reset_envs(self, key: jax.Array) -> BatchState:
+        # The key of an environment comes from its number in the whole job, so that k GMIs of n
+        # environments and one of k * n simulate the same ones.
+        num_envs = self._config.num_envs
+        keys = env_keys(key, self._reducer.rank * num_envs, num_envs)
+        return jax.jit(self._env.init)(self._env.model, keys)
+
+    def _loop(
+        self, state: LearnerState, env_state: BatchState, reporter: Reporter
+    ) -> tuple[LearnerState, BatchState, bool]:
+        every = self._config.run.checkpoint_every
+        pending: tuple[int, IterationMetrics] | None = None
+        stop = False
+        while self._env_steps < self._config.num_timesteps and not stop:
+            state, env_state, metrics = self._iteration(state, env_state)
+            self._env_steps += self._steps_per_iteration
+            self._iterations += 1
+            if self._iteration.is_asynchronous:
+                # The metrics of the iteration before are fetched while this one runs.
+                self._report(reporter, pending)
+                pending = (self._env_steps, metrics)
+            else:
+                self._report(reporter, (self._env_steps, metrics))
+            stop = self._agree_to_stop()
+            if every and self._iterations % every == 0:
+                self._save(state, env_state)
+        self._report(reporter, pending)
+        self._save(state, env_state)
+        return state, env_state, stop
+
+    def _report(self, reporter: Reporter, pending: tuple[int, IterationMetrics] | None) -> None:
+        if pending is not None:
+            reporter.report(*pending)
+            self._link.beat("running", self._iterations)
+
+    def _agree_to_stop(self) -> bool:
+        # Only one GMI may have heard of it yet; all must leave after the same iteration.
+        mine = np.array([self._link.stop_requested], np.float32)
+        return bool(self._reducer.all_gather(mine).any())
+
+    def _save(self, state: LearnerState, env_state: BatchState) -> None:
+        digests = self._reducer.all_gather(digest(state.params))
+        if different := [r for r in range(len(digests)) if (digests[r] != digests[0]).any()]:
+            raise ParameterMismatch(
+                f"after {self._env_steps} env steps the parameters of GMIs {different} differ "
+                "from those of GMI 0"
+            )
+        if not all(bool(jnp.all(jnp.isfinite(leaf))) for leaf in jax.tree.leaves(state.params)):
+            raise NonFiniteError(
+                f"{self._config.env.name}: parameters are not finite after "
+                f"{self._env_steps} env steps; nothing was saved"
+            )
+        self._checkpoint = save_checkpoint(
+            self._link.run,
+            self._meta(),
+            state,
+            env_state,
+            gmi=self._link.gmi,
+            leader=self._leader,
+            barrier=lambda: self._reducer.all_gather(np.zeros(1, np.float32)),
+        )
+
+    def _meta(self) -> CheckpointMeta:
+        algo = self._config.algo
+        return CheckpointMeta(
+            env=self._config.env.name,
+            algo=algo.name,
+            env_steps=self._env_steps,
+            num_gmis=self._reducer.world_size,
+            num_envs=self._config.num_envs,
+            hidden=(algo.policy_hidden_layer_sizes, algo.value_hidden_layer_sizes),
+            impl=self._impl,
+        )
+
+    def _median_rate(self, iteration_s: list[float]) -> float | None:
+        # The first iteration fills caches and pools, and its metrics come late.
+        steady = iteration_s[1:] or iteration_s
+        return self._steps_per_iteration / statistics.median(steady) if steady else None
+
+    def _open_log(self) -> MetricsLog:
+        if not self._leader:
+            return MetricsLog(())
+        run = self._link.run
+        return MetricsLog((JsonlSink(run.metrics), TensorBoardSink(run.tensorboard)))
+
+
+def _device() -> dict[str, Any]:
+    device = jax.local_devices()[0]
+    stats = device.memory_stats() or {}
+    peak = stats.get("peak_bytes_in_use")
+    return {
+        "platform": device.platform,
+        "kind": device.device_kind,
+        "peak_memory_mib": peak / 2**20 if peak else None,
+    }

@@ -1,0 +1,47 @@
+"""The two ways a task makes an `EnvState`: at the start of an episode and after a step."""
+
+from __future__ import annotations
+
+import jax.numpy as jnp
+
+from gmijax.sim.interface import EnvSpec, EnvState
+from gmijax.types import Array, PRNGKey, PyTree
+
+
+def begin(spec: EnvSpec, physics: PyTree, task: PyTree, obs: Array, key: PRNGKey) -> EnvState:
+    """The state after a reset: nothing earned, nothing ended, no steps."""
+    zero, false = jnp.zeros(()), jnp.zeros((), bool)
+    return EnvState(
+        physics=physics,
+        task=task,
+        obs=obs,
+        reward=zero,
+        reward_terms=dict.fromkeys(spec.reward_terms, zero),
+        terminated=false,
+        truncated=false,
+        steps=jnp.zeros((), jnp.int32),
+        key=key,
+    )
+
+
+def advance(
+    before: EnvState,
+    physics: PyTree,
+    task: PyTree,
+    obs: Array,
+    reward: tuple[Array, dict[str, Array]],
+    terminated: Array,
+) -> EnvState:
+    """The state one step after `before`; `reward` is what `rewards.total_reward` returns."""
+    return EnvState(
+        physics=physics,
+        task=task,
+        obs=obs,
+        reward=reward[0],
+        reward_terms=reward[1],
+        terminated=terminated,
+        # Time is the business of `wrappers.time_limit`.
+        truncated=jnp.zeros((), bool),
+        steps=before.steps + 1,
+        key=before.key,
+    )

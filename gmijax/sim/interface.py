@@ -1,0 +1,82 @@
+"""The environment interface: one world per function, worlds are added by `jax.vmap`.
+
+An `Env` is a value: two pure functions, a model and a description. Wrappers take an `Env` and
+return an `Env`. The model is an argument of both functions, never a closure, so that domain
+randomisation is an `in_axes` over some of its leaves.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+from gmijax.types import Array, PRNGKey, PyTree
+
+
+class EnvSpec(NamedTuple):
+    """What an environment is, in numbers.
+
+    Attributes:
+      name: the task's name in the registry.
+      obs_size: O, length of an observation vector.
+      action_size: A, length of an action vector; actions are clipped to [-1, 1].
+      control_dt_s: seconds of simulated time per step.
+      episode_length: steps after which an episode is truncated.
+      reward_terms: names of the addends of the reward, in order.
+    """
+
+    name: str
+    obs_size: int
+    action_size: int
+    control_dt_s: float
+    episode_length: int
+    reward_terms: tuple[str, ...]
+
+
+class EnvState(NamedTuple):
+    """State of one world and the outcome of its last step.
+
+    Attributes:
+      physics: what the simulator must remember between steps (see `gmijax.sim.physics`).
+      task: the task's own typed memory (a NamedTuple of arrays, or `()`).
+      obs: [O] float32.
+      reward: [] float32, the sum of `reward_terms`.
+      reward_terms: every addend of the reward by name, weight included, [] float32 each.
+      terminated: [] bool, the task has ended: the value of what follows is zero.
+      truncated: [] bool, time ran out: bootstrap from the value of this observation.
+      steps: [] int32, steps since the last reset.
+      key: the world's own random key; the next reset and the policy's noise come from it.
+    """
+
+    physics: PyTree
+    task: PyTree
+    obs: Array
+    reward: Array
+    reward_terms: dict[str, Array]
+    terminated: Array
+    truncated: Array
+    steps: Array
+    key: PRNGKey
+
+
+class Env(NamedTuple):
+    """A simulated task.
+
+    Attributes:
+      spec: sizes and names.
+      model: the physics model (`mjx.Model`); pass it, or a randomised copy, to the functions.
+      reset: `(model, key) -> EnvState`, a fresh episode of one world; consumes `key`.
+      step: `(model, state, action [A]) -> EnvState`, one control step of one world.
+      mj_model: the `mujoco.MjModel` behind `model`, for rendering and for the C oracle.
+      qpos: `EnvState -> [nq]`, joint positions for rendering.
+      max_envs: most worlds that may be stepped at once, None for no limit. Worlds of MJX-Warp
+        share a contact buffer of fixed size, and lose contacts, silently, when it is full.
+    """
+
+    spec: EnvSpec
+    model: PyTree
+    reset: Callable[[PyTree, PRNGKey], EnvState]
+    step: Callable[[PyTree, EnvState, Array], EnvState]
+    mj_model: Any
+    qpos: Callable[[EnvState], Array]
+    max_envs: int | None = None

@@ -1,0 +1,72 @@
+"""Rewards as named, weighted terms.
+
+A task lists its terms as data, so that logs show every addend and a weight of zero costs
+nothing. The logged addends always sum to the reward.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import Generic, NamedTuple, TypeVar
+
+import jax.numpy as jnp
+
+from gmijax.types import Array
+
+View = TypeVar("View")
+"""What the terms of one task may read: a NamedTuple of that task."""
+
+
+class RewardTerm(NamedTuple, Generic[View]):
+    """One addend of a reward.
+
+    Attributes:
+      fn: `view -> [] float32`, without the weight.
+      weight: factor; its sign makes the term a reward or a cost.
+    """
+
+    fn: Callable[[View], Array]
+    weight: float
+
+
+class Replacement(NamedTuple):
+    """A value that takes the place of the whole reward in some steps, such as a death penalty.
+
+    Attributes:
+      name: under which it is logged; it is a term like any other, zero while `when` is false.
+      when: [] bool, whether it applies; all other terms are then zero.
+      value: the reward where it applies.
+    """
+
+    name: str
+    when: Array
+    value: float
+
+
+def total_reward(
+    terms: Mapping[str, RewardTerm[View]], view: View, replacement: Replacement | None = None
+) -> tuple[Array, dict[str, Array]]:
+    """Returns the reward [] and its addends by name; terms of weight 0 are not traced.
+
+    Args:
+      terms: the task's terms, in the order in which they are logged.
+      view: what they read.
+      replacement: takes the place of all terms where it applies.
+    """
+    values = {
+        name: term.weight * term.fn(view) for name, term in terms.items() if term.weight != 0.0
+    }
+    if replacement is not None:
+        values = {
+            name: jnp.where(replacement.when, 0.0, value) for name, value in values.items()
+        }
+        values[replacement.name] = jnp.where(replacement.when, replacement.value, 0.0)
+    return sum(values.values(), jnp.zeros(())), values
+
+
+def term_names(
+    terms: Mapping[str, RewardTerm[View]], replacement: str | None = None
+) -> tuple[str, ...]:
+    """The names that `total_reward` logs, in its order."""
+    names = tuple(name for name, term in terms.items() if term.weight != 0.0)
+    return names if replacement is None else (*names, replacement)

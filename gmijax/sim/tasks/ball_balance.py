@@ -1,0 +1,189 @@
+"""Ball balance: catch a falling ball with a tray on three legs and hold it in the middle.
+
+Paper Table 5; figures of Isaac Gym's BallBalance (arXiv:2108.10470).
+Observation [24], each value clipped to +-5: knee positions 3 and velocities 3; ball position 3
+and velocity 3; at the three hips the upward force 3 and the torque 9.
+Action [3]: speed of the knees' position targets.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+import numpy.typing as npt
+
+from gmijax.sim import episode, lookup, physics
+from gmijax.sim.interface import Env, EnvSpec, EnvState
+from gmijax.sim.rewards import RewardTerm, term_names, total_reward
+from gmijax.types import Array, PRNGKey, PyTree
+
+DEFAULT_EPISODE_LENGTH = 500
+SUBSTEPS = 2
+OBS_SIZE = 24
+ACTION_SIZE = 3
+OBS_LIMIT = 5.0
+ACTION_SPEED_RAD_PER_S = 20.0
+SENSOR_SCALE = 0.05
+GOAL_M = (0.0, 0.0, 0.7)
+FALLEN_HEIGHT_M = 0.15
+START_DISTANCE_M = (0.001, 0.5)
+START_HEIGHT_M = (1.0, 2.0)
+START_SPEED_M_PER_S = 5.0
+
+LEGS = (1, 2, 3)
+KNEES = tuple(f"knee_{leg}" for leg in LEGS)
+
+
+class BallBalanceTask(NamedTuple):
+    """The task's memory.
+
+    Attributes:
+      targets: [3] position targets of the knees, radians.
+    """
+
+    targets: Array
+
+
+@dataclass(frozen=True)
+class BallBalanceIds:
+    """Addresses in the model and the knees' limits.
+
+    Attributes:
+      knee_qpos: [3] where the knees lie in `qpos`.
+      knee_qvel: [3] where they lie in `qvel`.
+      ball_qpos: where the ball's position starts in `qpos`.
+      ball_qvel: where the ball's velocity starts in `qvel`.
+      sensors: [12] three upward forces, then three torques, in `sensordata`.
+      lower: [3] lower limits, radians.
+      upper: [3] upper limits, radians.
+    """
+
+    knee_qpos: lookup.Addresses
+    knee_qvel: lookup.Addresses
+    ball_qpos: int
+    ball_qvel: int
+    sensors: lookup.Addresses
+    lower: npt.NDArray[np.float32]
+    upper: npt.NDArray[np.float32]
+
+
+class BallBalanceView(NamedTuple):
+    """What the reward reads: the ball's position [3] in metres and velocity [3] in m/s."""
+
+    ball: Array
+    ball_velocity: Array
+
+
+def balance(view: BallBalanceView) -> Array:
+    """1 for a ball at rest in the goal, less with distance and with speed."""
+    distance = jnp.linalg.norm(view.ball - jnp.array(GOAL_M))
+    return 1.0 / (1.0 + distance) / (1.0 + jnp.linalg.norm(view.ball_velocity))
+
+
+TERMS = {"balance": RewardTerm[BallBalanceView](balance, 1.0)}
+
+
+def make(*, impl: str = "auto", max_envs: int | None = None) -> Env:
+    """Makes the task without its time limit; see `gmijax.sim.registry.make_env`."""
+    world = physics.load("ball_balance", impl=impl, substeps=SUBSTEPS, max_envs=max_envs)
+    ids = look_up(world.mj_model)
+    spec = EnvSpec(
+        name="ball_balance",
+        obs_size=OBS_SIZE,
+        action_size=ACTION_SIZE,
+        control_dt_s=world.control_dt_s,
+        episode_length=DEFAULT_EPISODE_LENGTH,
+        reward_terms=term_names(TERMS),
+    )
+
+    def reset(model: PyTree, key: PRNGKey) -> EnvState:
+        del model  # nothing that a reset draws depends on it
+        key, draw = jax.random.split(key)
+        start = world.start(*draw_start(ids, world.mj_model, draw))
+        # The hips' sensors read zero: to fill them in would take a whole physics step, and an
+        # automatic reset happens, under `where`, in every step of every world.
+        obs = observe(ids, start, jnp.zeros(len(ids.sensors)))
+        return episode.begin(spec, start, BallBalanceTask(jnp.zeros(ACTION_SIZE)), obs, key)
+
+    def step(model: PyTree, state: EnvState, action: Array) -> EnvState:
+        change = ACTION_SPEED_RAD_PER_S * world.control_dt_s * jnp.clip(action, -1.0, 1.0)
+        targets = jnp.clip(state.task.targets + change, ids.lower, ids.upper)
+        moved, sensordata = world.step(model, state.physics, targets)
+        ball, ball_velocity = ball_of(ids, moved)
+        reward = total_reward(TERMS, BallBalanceView(ball, ball_velocity))
+        obs = observe(ids, moved, sensordata[ids.sensors])
+        fallen = ball[2] < FALLEN_HEIGHT_M
+        return episode.advance(state, moved, BallBalanceTask(targets), obs, reward, fallen)
+
+    return Env(
+        spec=spec,
+        model=world.model,
+        reset=reset,
+        step=step,
+        mj_model=world.mj_model,
+        qpos=lambda state: state.physics.qpos,
+        max_envs=world.max_envs,
+    )
+
+
+def look_up(mj_model: mujoco.MjModel) -> BallBalanceIds:
+    """Finds the model's addresses by name."""
+    forces = lookup.sensor_addresses(mj_model, [f"hip_{leg}_force" for leg in LEGS])
+    torques = lookup.sensor_addresses(mj_model, [f"hip_{leg}_torque" for leg in LEGS])
+    return BallBalanceIds(
+        *lookup.joint_addresses(mj_model, KNEES),
+        *lookup.free_joint_addresses(mj_model, "ball"),
+        # Of each force only z, along which the leg carries: the load on three legs says where
+        # the ball is and how hard it lands. The task's size leaves room for three forces.
+        np.concatenate([forces[2::3], torques]),
+        *lookup.joint_ranges(mj_model, KNEES),
+    )
+
+
+def draw_start(
+    ids: BallBalanceIds, mj_model: mujoco.MjModel, key: PRNGKey
+) -> tuple[Array, Array]:
+    """Random `qpos` [20] and `qvel` [18]: the tray at rest, the ball above it, falling inwards."""
+    direction_key, distance_key, height_key, speed_key = jax.random.split(key, 4)
+    direction = jax.random.uniform(direction_key, maxval=2.0 * jnp.pi)
+    outwards = jnp.stack([jnp.cos(direction), jnp.sin(direction)])
+    nearest, farthest = START_DISTANCE_M
+    distance = jax.random.uniform(distance_key, minval=nearest, maxval=farthest)
+    height = jax.random.uniform(height_key, minval=START_HEIGHT_M[0], maxval=START_HEIGHT_M[1])
+    # The farther out, the faster inwards, so that a ball crosses the tray but seldom misses it.
+    speed = jax.random.uniform(speed_key, maxval=START_SPEED_M_PER_S)
+    speed = speed * (distance - nearest) / (farthest - nearest)
+    ball = jnp.append(distance * outwards, height)
+    velocity = jnp.append(-speed * outwards, -START_SPEED_M_PER_S)
+    qpos = jax.lax.dynamic_update_slice(
+        jnp.array(mj_model.qpos0, jnp.float32), ball, (ids.ball_qpos,)
+    )
+    return qpos, jax.lax.dynamic_update_slice(
+        jnp.zeros(mj_model.nv), velocity, (ids.ball_qvel,)
+    )
+
+
+def ball_of(ids: BallBalanceIds, state: physics.PhysicsState) -> tuple[Array, Array]:
+    """The ball's position [3] in metres and velocity [3] in m/s, in the world."""
+    return (
+        state.qpos[ids.ball_qpos : ids.ball_qpos + 3],
+        state.qvel[ids.ball_qvel : ids.ball_qvel + 3],
+    )
+
+
+def observe(ids: BallBalanceIds, state: physics.PhysicsState, hip_sensors: Array) -> Array:
+    """The observation [24] from the state and raw hip sensors [12]."""
+    values = jnp.concatenate(
+        [
+            state.qpos[ids.knee_qpos],
+            state.qvel[ids.knee_qvel],
+            *ball_of(ids, state),
+            SENSOR_SCALE * hip_sensors,
+        ]
+    )
+    return jnp.clip(values, -OBS_LIMIT, OBS_LIMIT)

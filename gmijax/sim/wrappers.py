@@ -1,0 +1,191 @@
+"""What stands between a task and the training loop: time limit, batch, auto-reset, statistics.
+
+`training_env` puts them together. Results of environment j depend on its own random key only, so
+k processes with n environments each see the samples of one process with k x n, given the keys of
+`env_keys`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from gmijax.errors import ConfigError
+from gmijax.sim.interface import Env, EnvSpec, EnvState
+from gmijax.types import Array, PRNGKey, PyTree
+
+
+class EpisodeSums(NamedTuple):
+    """Sums over the episodes that ended in one step; add those of several steps or GMIs.
+
+    Attributes:
+      count: [] int32, how many ended.
+      return_sum: [] float32, of their undiscounted returns.
+      length_sum: [] int32, of their lengths in steps.
+      term_sums: of what every term added to their returns, [] float32 each.
+    """
+
+    count: Array
+    return_sum: Array
+    length_sum: Array
+    term_sums: dict[str, Array]
+
+
+class BatchState(NamedTuple):
+    """State of N environments.
+
+    Attributes:
+      env: all worlds; its `obs` [N, O] is the one after auto-reset, to act on next.
+      return_sum: [N] float32, return of the running episode so far.
+      term_sums: [N] float32 each, what every term has added to it.
+    """
+
+    env: EnvState
+    return_sum: Array
+    term_sums: dict[str, Array]
+
+    @property
+    def length(self) -> Array:
+        """[N] int32, steps of the running episode so far."""
+        return self.env.steps
+
+
+class StepOutput(NamedTuple):
+    """Outcome of one step of N environments.
+
+    Attributes:
+      next_obs: [N, O] float32, what the action led to, before any auto-reset.
+      reward: [N] float32.
+      terminated: [N] bool, the task has ended.
+      truncated: [N] bool, time ran out.
+      finished: the episodes that ended in this step.
+    """
+
+    next_obs: Array
+    reward: Array
+    terminated: Array
+    truncated: Array
+    finished: EpisodeSums
+
+
+class BatchedEnv(NamedTuple):
+    """N environments that start over by themselves.
+
+    Attributes:
+      spec: sizes and names of one environment.
+      model: the physics model; pass it, or a randomised copy, to the functions.
+      init: `(model, keys [N]) -> BatchState`; `env_keys` makes the keys, which it consumes.
+      step: `(model, state, actions [N, A]) -> (BatchState, StepOutput)`.
+    """
+
+    spec: EnvSpec
+    model: PyTree
+    init: Callable[[PyTree, PRNGKey], BatchState]
+    step: Callable[[PyTree, BatchState, Array], tuple[BatchState, StepOutput]]
+
+
+def time_limit(env: Env, episode_length: int) -> Env:
+    """Truncates episodes after `episode_length` steps; an episode that ends by itself is not."""
+
+    def step(model: PyTree, state: EnvState, action: Array) -> EnvState:
+        state = env.step(model, state, action)
+        out_of_time = state.steps >= episode_length
+        return state._replace(
+            truncated=(state.truncated | out_of_time) & ~state.terminated,
+        )
+
+    return env._replace(step=step, spec=env.spec._replace(episode_length=episode_length))
+
+
+def vectorise(env: Env) -> Env:
+    """The same environment for N worlds at once; all of them share the model."""
+    return env._replace(
+        reset=jax.vmap(env.reset, in_axes=(None, 0)),
+        step=jax.vmap(env.step, in_axes=(None, 0, 0)),
+    )
+
+
+def auto_reset(env: Env, model: PyTree, state: EnvState) -> EnvState:
+    """Starts new random episodes where `state` [N] has ended; `env` is vectorised.
+
+    A world's key moves on only if the world is reset, so when other worlds end does not matter.
+    """
+    done = state.terminated | state.truncated
+    fresh = env.reset(model, state.key)
+
+    def pick(new: Array, old: Array) -> Array:
+        return jnp.where(jnp.expand_dims(done, range(1, old.ndim)), new, old)
+
+    return jax.tree.map(pick, fresh, state)
+
+
+def episode_statistics(
+    before: BatchState, state: EnvState
+) -> tuple[Array, dict[str, Array], EpisodeSums]:
+    """Adds the step that led to `state` [N] to the sums of `before`.
+
+    Returns:
+      Returns [N] and term sums [N] of the episodes that go on (zero where one ended), and the
+      sums over those that ended.
+    """
+    done = state.terminated | state.truncated
+    returns = before.return_sum + state.reward
+    terms = {name: before.term_sums[name] + state.reward_terms[name] for name in before.term_sums}
+    finished = EpisodeSums(
+        count=done.sum(dtype=jnp.int32),
+        return_sum=jnp.where(done, returns, 0.0).sum(),
+        length_sum=jnp.where(done, state.steps, 0).sum(dtype=jnp.int32),
+        term_sums={name: jnp.where(done, value, 0.0).sum() for name, value in terms.items()},
+    )
+    going_on = {name: jnp.where(done, 0.0, value) for name, value in terms.items()}
+    return jnp.where(done, 0.0, returns), going_on, finished
+
+
+def training_env(env: Env) -> BatchedEnv:
+    """N auto-resetting copies of `env`, with statistics of the episodes that end.
+
+    `init` raises ConfigError for more environments than `env.max_envs`.
+    """
+    batched = vectorise(env)
+
+    def init(model: PyTree, keys: PRNGKey) -> BatchState:
+        if env.max_envs is not None and len(keys) > env.max_envs:
+            raise ConfigError(
+                f"num_envs={len(keys)}: {env.spec.name} was made for at most {env.max_envs}"
+            )
+        zero = jnp.zeros(keys.shape)
+        return BatchState(
+            batched.reset(model, keys), zero, dict.fromkeys(env.spec.reward_terms, zero)
+        )
+
+    def step(
+        model: PyTree, state: BatchState, actions: Array
+    ) -> tuple[BatchState, StepOutput]:
+        stepped = batched.step(model, state.env, actions)
+        returns, terms, finished = episode_statistics(state, stepped)
+        output = StepOutput(
+            stepped.obs, stepped.reward, stepped.terminated, stepped.truncated, finished
+        )
+        return BatchState(auto_reset(batched, model, stepped), returns, terms), output
+
+    return BatchedEnv(env.spec, env.model, init, step)
+
+
+def env_keys(key: PRNGKey, first_env: int, num_envs: int) -> PRNGKey:
+    """Keys [N] of environments `first_env` to `first_env + num_envs - 1` of a whole job.
+
+    Args:
+      key: the job's key, the same on every GMI.
+      first_env: global number of this GMI's first environment.
+      num_envs: N.
+    """
+    return jax.vmap(lambda env: jax.random.fold_in(key, env))(first_env + jnp.arange(num_envs))
+
+
+def split_keys(state: BatchState) -> tuple[BatchState, PRNGKey]:
+    """Draws one key [N] from every environment's own, for the policy's noise."""
+    pairs = jax.vmap(jax.random.split)(state.env.key)
+    return state._replace(env=state.env._replace(key=pairs[:, 0])), pairs[:, 1]

@@ -1,0 +1,25 @@
+"""Array aliases and the legend of size letters that docstrings use.
+
+T: steps of one rollout.  N: environments of one GMI.  O: size of an observation.
+A: size of an action.  K: number of GMIs.  P: number of parameters.
+B: samples of one minibatch.  [] is a scalar.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, TypeAlias
+
+import jax
+
+Array: TypeAlias = jax.Array
+"""One array on a device."""
+
+PRNGKey: TypeAlias = jax.Array
+"""A typed JAX random key (`jax.random.key`), one use only."""
+
+PyTree: TypeAlias = Any
+"""Any nesting of tuples, dicts and NamedTuples with arrays as leaves."""
+
+Metrics: TypeAlias = Mapping[str, Array]
+"""Scalars by name."""

@@ -1,0 +1,70 @@
+"""Main of one GMI: `python -m gmijax.worker`, started by the supervisor and by nobody else.
+
+Reads the run folder, builds the role that the plan gives to this GMI, plugs in the concrete
+reducer, runs it, and writes `result.json` or `error.json`.
+"""
+
+from __future__ import annotations
+
+import sys
+from typing import Any
+
+from gmijax.config import TrainConfig, from_dict
+from gmijax.partition.child import ChildLink
+from gmijax.partition.plan import Plan
+from gmijax.rundir import read_json, write_json
+
+
+def main() -> int:
+    """Runs this process's GMI; returns the exit code."""
+    link = ChildLink.from_environment()  # Pins the cores, so it comes before jax.
+    link.beat("starting", 0)
+    try:
+        write_json(link.paths.result, _run(link))
+    except BaseException as error:  # The controller must learn of every way to fail.
+        link.report_error(error)
+        raise
+    link.beat("done", 0)
+    return 0
+
+
+def _run(link: ChildLink) -> dict[str, Any]:
+    config = from_dict(TrainConfig, read_json(link.run.config))
+    plan = Plan.from_dict(read_json(link.run.plan))
+    # jax starts here, in the environment that the plan prepared.
+    import jax
+
+    from gmijax.collectives.build import Membership, build_reducer
+    from gmijax.ppo.programs import exchange_size
+    from gmijax.ppo.role import train
+    from gmijax.sim.physics import choose_impl
+    from gmijax.sim.registry import make_env
+    from gmijax.sim.wrappers import training_env
+
+    impl, why = choose_impl(config.physics.impl, jax.default_backend())
+    sys.stdout.write(f"physics.impl={impl}: {why}\n")
+    env = make_env(
+        config.env.name,
+        impl=impl,
+        episode_length=config.env.episode_length,
+        max_envs=config.num_envs,
+    )
+    reducer = build_reducer(
+        plan.strategy,
+        Membership(
+            layout=plan.layout,
+            rank=link.gmi,
+            num_floats=exchange_size(env.spec, config.algo),
+            exchange_fd=link.exchange_fd,
+            timeout_s=config.reduce.timeout_s,
+            rendezvous_timeout_s=config.run.start_timeout_s,
+        ),
+    )
+    try:
+        return train(config, training_env(env), impl, reducer, link)
+    finally:
+        reducer.close()
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,55 @@
+"""What every test needs: the environment of jax, set before its import, and given back after."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from pathlib import Path
+
+import pynvml
+import pytest
+
+# Of XLA:CPU, read when jax starts, so it is set before any test module is imported.
+# A thread pool of exactly two threads, as on a machine with two cores, can hang.
+os.environ.setdefault("PJRT_NPROC", "4")
+
+# Compiling is most of what these tests cost. The folder lies outside of the checkout, so that
+# it survives `make clean` and serves several checkouts; gmijax hands it on to the GMIs.
+_CACHE_HOME = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
+os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(_CACHE_HOME / "gmijax-tests"))
+
+
+def _has_gpu() -> bool:
+    try:
+        pynvml.nvmlInit()
+    except pynvml.NVMLError:
+        return False
+    try:
+        return pynvml.nvmlDeviceGetCount() > 0
+    finally:
+        pynvml.nvmlShutdown()
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Skips tests marked `gpu` where there is no NVIDIA GPU."""
+    marked = [item for item in items if item.get_closest_marker("gpu")]
+    if marked and not _has_gpu():
+        for item in marked:
+            item.add_marker(pytest.mark.skip(reason="no NVIDIA GPU"))
+
+
+@pytest.fixture(autouse=True)
+def environment_restored() -> Iterator[None]:
+    """Undoes what a test does to `os.environ`, and no more.
+
+    Only differences are written back: threads of jax may read the environment meanwhile, and
+    `setenv` under a concurrent `getenv` is undefined in C.
+    """
+    before = dict(os.environ)
+    yield
+    after = dict(os.environ)
+    for key in (before.keys() | after.keys()) - {"PYTEST_CURRENT_TEST"}:
+        if key not in before:
+            del os.environ[key]
+        elif before[key] != after.get(key):
+            os.environ[key] = before[key]

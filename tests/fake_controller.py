@@ -1,0 +1,27 @@
+"""A controller to be killed: `python fake_controller.py RUN_DIR cpu|mps MODE...`."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+from gmijax.partition.backends import open_backend
+from gmijax.partition.nvidia import find_mps_control
+from gmijax.partition.planner import make_plan
+from gmijax.partition.supervisor import Supervisor
+from gmijax.rundir import RunPaths
+from supervision import machine, make_job, plan_config, reduce_config
+
+
+def main() -> None:
+    run, backend_name, modes = RunPaths(Path(sys.argv[1])), sys.argv[2], sys.argv[3:]
+    num_gpus = 0 if backend_name == "cpu" else 1
+    here = machine(num_gpus, mps_control=find_mps_control())
+    config = plan_config(gmis_per_gpu=len(modes), backend=backend_name)
+    plan = make_plan(config, reduce_config(), 8, here)
+    with open_backend(plan, here, run) as backend:
+        Supervisor(make_job(run, modes, backend, plan)).run()
+
+
+if __name__ == "__main__":
+    main()

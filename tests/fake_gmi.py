@@ -1,0 +1,145 @@
+"""A GMI without jax: `python fake_gmi.py MODE...`; the tests' stand-in for the real worker."""
+
+from __future__ import annotations
+
+import os
+import signal
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+from gmijax.errors import ConfigError, PeerLost
+from gmijax.partition.child import ChildLink
+from gmijax.partition.nvidia import PIPE_VARIABLE
+from gmijax.partition.process_table import identify
+from gmijax.rundir import read_json, write_json
+
+TICK_S = 0.02
+
+
+def clean(link: ChildLink) -> None:
+    """Three iterations and out."""
+    for iteration in range(3):
+        link.beat("running", iteration)
+        time.sleep(TICK_S)
+    link.beat("done", 3)
+
+
+def train(link: ChildLink) -> None:
+    """Iterates until asked to stop, then saves."""
+    iteration = 0
+    while not link.stop_requested:
+        iteration += 1
+        link.beat("running", iteration)
+        time.sleep(TICK_S)
+    (link.paths.root / "saved").write_text(str(iteration))
+    link.beat("done", iteration)
+
+
+def deaf(link: ChildLink) -> None:
+    """Never looks at requests to stop, beats on."""
+    while True:
+        link.beat("running", 1)
+        time.sleep(TICK_S)
+
+
+def stubborn(link: ChildLink) -> None:
+    """Ignores SIGTERM."""
+    signal.signal(signal.SIGTERM, signal.SIG_IGN)
+    (link.paths.root / "ignoring").touch()
+    deaf(link)
+
+
+def busy(link: ChildLink) -> None:
+    """Computes without a pause, and has a child process."""
+    helper = os.fork()
+    if helper == 0:
+        time.sleep(600)
+    write_json(link.paths.root / "helper.json", {"pid": helper})
+    link.beat("running", 1)
+    while True:
+        pass
+
+
+def exit_3(link: ChildLink) -> None:
+    """Fails without error.json."""
+    sys.stderr.write("first line\nthe last line\n\n")
+    sys.exit(3)
+
+
+def raise_value_error(link: ChildLink) -> None:
+    """Fails with error.json."""
+    error = ValueError("the sum is off\nby one")
+    link.report_error(error)
+    sys.exit(1)
+
+
+def raise_config_error(link: ChildLink) -> None:
+    """Finds that the input is bad."""
+    link.report_error(ConfigError("env.name=antt: did you mean ant?"))
+    sys.exit(1)
+
+
+def lose_peer(link: ChildLink) -> None:
+    """Fails like a reducer does, at once when GMI 1 is gone."""
+    peer = link.run.gmi(1).root / "helper.json"
+    while not peer.exists() or identify(read_json(peer)["pid"]):
+        link.beat("running", 1)
+    link.report_error(PeerLost(rank=link.gmi, peer=1, operation="mean", step=7))
+    sys.exit(1)
+
+
+def die_late(link: ChildLink) -> None:
+    """Names a helper as its process; that is gone half a second before this one."""
+    helper = os.fork()
+    if helper == 0:
+        time.sleep(0.2)
+        os._exit(0)
+    write_json(link.paths.root / "helper.json", {"pid": helper})
+    os.waitpid(helper, 0)
+    time.sleep(0.5)
+    os.kill(os.getpid(), signal.SIGSEGV)
+
+
+def stall(link: ChildLink) -> None:
+    """Stops to make progress."""
+    link.beat("running", 5)
+    time.sleep(600)
+
+
+def silent(link: ChildLink) -> None:
+    """Never says anything."""
+    time.sleep(600)
+
+
+def mps_client(link: ChildLink) -> None:
+    """Trains as a client of the fake MPS daemon."""
+    client = Path(os.environ[PIPE_VARIABLE]) / "clients" / str(os.getpid())
+    client.touch()
+    link.beat("ready", 0)
+    train(link)
+
+
+MODES: dict[str, Callable[[ChildLink], None]] = {
+    mode.__name__: mode
+    for mode in (
+        *(clean, train, deaf, stubborn, busy, exit_3, raise_value_error, raise_config_error),
+        *(lose_peer, die_late, stall, silent, mps_client),
+    )
+}
+
+
+def main() -> None:
+    link = ChildLink.from_environment()
+    mode = MODES[sys.argv[1]]
+    if mode is not silent:
+        link.beat("starting", 0)
+        link.beat("compiling", 0)
+        if mode is not mps_client:
+            link.beat("ready", 0)
+    mode(link)
+
+
+if __name__ == "__main__":
+    main()

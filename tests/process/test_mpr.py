@@ -1,0 +1,121 @@
+"""MPR between real processes: how ranks find each other, the wire format, mistakes."""
+
+from __future__ import annotations
+
+import mmap
+import os
+import signal
+import struct
+from pathlib import Path
+
+import numpy as np
+
+from gmijax.collectives.liveness import is_alive
+from gmijax.collectives.memory import Geometry, attach, process_of
+from tests.rank_processes import Ranks
+
+
+def test_a_late_rank_is_waited_for_beyond_the_timeout_of_later_calls(tmp_path: Path) -> None:
+    with Ranks(tmp_path, 2, "call_once", timeout_s=0.2) as job:
+        job.start(0)
+        job.wait_for("attached")
+        job.start(1, pause_s=0.6)
+        assert [result.get("mean") for result in job.results()] == [1.5, 1.5]
+
+
+def test_a_rank_that_never_comes_is_missing_not_lost(tmp_path: Path) -> None:
+    with Ranks(tmp_path, 3, "call_once", start_s=0.6).start(0, 2) as job:
+        results = job.results(0, 2)
+    assert [result["error"] for result in results] == ["CollectiveTimeout"] * 2
+    assert all(1 in result["missing"] for result in results)
+
+
+def test_a_rank_killed_before_its_first_call_is_lost(tmp_path: Path) -> None:
+    with Ranks(tmp_path, 2, "call_once").start(1, pause_s=20.0) as job:
+        job.wait_for("attached")
+        job.signal(1, signal.SIGKILL)
+        job.start(0)
+        (result,) = job.results(0)
+    assert (result["error"], result["peer"]) == ("PeerLost", 1)
+
+
+def test_a_rank_that_has_closed_is_lost_to_those_who_still_call(tmp_path: Path) -> None:
+    with Ranks(tmp_path, 2, "call_once").start(0) as job:
+        job.start(1, body="close_at_once", stay_s=20.0)
+        (result,) = job.results(0)
+    assert (result["error"], result["peer"]) == ("PeerLost", 1)
+
+
+def test_ranks_with_different_lengths_name_both(tmp_path: Path) -> None:
+    with Ranks(tmp_path, 2, "call_once").start(0, num_floats=100) as job:
+        job.start(1, num_floats=200_000)
+        messages = [result["message"] for result in job.results()]
+    assert messages == [
+        "rank 0 and rank 1 do not fit together: num_floats is 100 for rank 0, "
+        "and 200000 for rank 1",
+        "rank 1 and rank 0 do not fit together: num_floats is 200000 for rank 1, "
+        "and 100 for rank 0",
+    ]
+
+
+def test_ranks_that_make_different_calls_name_both(tmp_path: Path) -> None:
+    with Ranks(tmp_path, 2, "call_once").start(0) as job:
+        job.start(1, body="gather_once", num_gather=3)
+        messages = [result["message"] for result in job.results()]
+    assert (
+        messages[0]
+        == "step 1: rank 0 calls mean of 100 floats, rank 1 calls all_gather of 3 floats"
+    )
+    assert (
+        messages[1]
+        == "step 1: rank 1 calls all_gather of 3 floats, rank 0 calls mean of 100 floats"
+    )
+
+
+def test_one_rank_number_is_given_once(tmp_path: Path) -> None:
+    with Ranks(tmp_path, 2, "call_once").start(1, pause_s=20.0) as job:
+        job.wait_for("attached")
+        holder = job.processes[1]
+        (tmp_path / "attached_1").unlink()
+        job.start(1)
+        (result,) = job.results(1)
+        holder.kill()
+        holder.wait()
+    assert result["message"] == f"rank 1 is taken already by process {holder.pid}"
+
+
+def test_a_buffer_written_by_another_process_is_read_by_the_documented_format(
+    tmp_path: Path,
+) -> None:
+    with Ranks(tmp_path, 2, "call_once", num_floats=20, stay_s=20.0).start() as job:
+        job.wait_for("called")
+        raw = mmap.mmap(job.fd, os.fstat(job.fd).st_size, prot=mmap.PROT_READ)
+        magic, version, world_size, rank, num_floats, pid = struct.unpack_from("=4sIIIQQ", raw, 64)
+        (sequence,) = struct.unpack_from("=Q", raw, 64 + 56)
+        at = Geometry.of(2, 20)
+        slot = np.frombuffer(raw, np.float32, 20, at.slots + at.row_floats * 4).copy()
+        result = np.frombuffer(raw, np.float32, 20, at.result).copy()
+    assert (magic, version, world_size, rank, num_floats) == (b"GMIX", 1, 2, 1, 20)
+    assert pid == job.processes[1].pid
+    assert sequence == 3  # attached, then the two meetings of one mean
+    assert slot.tolist() == [2.0] * 20
+    assert result.tolist() == [1.5] * 20
+
+
+def test_a_rank_sees_whether_the_process_of_another_one_lives(tmp_path: Path) -> None:
+    with Ranks(tmp_path, 2, "call_once", pause_s=20.0).start(1) as job:
+        job.wait_for("attached")
+        peer = process_of(attach(job.fd, 0, 2, 100), 1)
+        assert peer.pid == job.processes[1].pid
+        assert is_alive(peer)
+        job.signal(1, signal.SIGKILL)
+        os.waitid(os.P_PID, peer.pid, os.WEXITED | os.WNOWAIT)
+        assert not is_alive(peer)  # a zombie still
+
+
+def test_the_block_has_no_name_so_that_no_kill_leaves_it_behind(tmp_path: Path) -> None:
+    with Ranks(tmp_path, 2, "call_forever").start() as job:
+        job.wait_for("running")
+        assert job.named_memory() == set()
+        maps = Path(f"/proc/{job.processes[0].pid}/maps").read_text()
+    assert "/memfd:gmijax-exchange (deleted)" in maps

@@ -1,0 +1,222 @@
+"""The mps backend against a fake control program: what it starts, it takes down again."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from gmijax.errors import BackendUnavailable, GmiFailed, JobInterrupted
+from gmijax.partition.backends import open_backend
+from gmijax.partition.gmi_process import GmiStatus
+from gmijax.partition.machine import Machine, detect_machine
+from gmijax.partition.nvidia import PIPE_VARIABLE, MpsControl, find_mps_control
+from gmijax.partition.plan import Plan
+from gmijax.partition.planner import make_plan
+from gmijax.partition.process_table import ProcessId, identify, wait_until_gone
+from gmijax.partition.supervisor import Supervisor
+from gmijax.rundir import RunPaths
+from supervision import CHECKOUT, TESTS, gpu, machine, make_job, plan_config, reduce_config
+
+pytestmark = pytest.mark.timeout(60)
+
+
+class FakeMps:
+    """The fake program and what it was told."""
+
+    def __init__(self, program: Path, journal: Path) -> None:
+        self.program = program
+        self.journal = journal
+
+    def told(self, command: str) -> list[list[str]]:
+        """Arguments of every `command` so far."""
+        lines = self.journal.read_text().splitlines() if self.journal.exists() else []
+        return [line.split()[1:] for line in lines if line.split()[0] == command]
+
+    def pipe_directories(self) -> list[Path]:
+        """Of all daemons that were started."""
+        return [Path(directory) for _, directory in self.told("start")]
+
+
+@pytest.fixture
+def mps(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> FakeMps:
+    folder = tmp_path / "bin"
+    folder.mkdir()
+    program = folder / "nvidia-cuda-mps-control"
+    source = (TESTS / "fake_mps_control.py").read_text()
+    program.write_text(f"#!{sys.executable} -IS\n{source}")
+    program.chmod(0o755)
+    journal = tmp_path / "journal"
+    monkeypatch.setenv("PATH", f"{folder}{os.pathsep}{os.environ['PATH']}")
+    monkeypatch.setenv("FAKE_MPS_JOURNAL", str(journal))
+    monkeypatch.setenv("PYTHONPATH", str(CHECKOUT))
+    return FakeMps(program, journal)
+
+
+@pytest.fixture
+def run(tmp_path: Path) -> RunPaths:
+    (tmp_path / "run").mkdir()
+    return RunPaths(tmp_path / "run")
+
+
+def mps_plan(here: Machine, num_gpus: int, gmis_per_gpu: int) -> Plan:
+    config = plan_config(gpus=num_gpus, gmis_per_gpu=gmis_per_gpu, backend="mps")
+    return make_plan(config, reduce_config(), 8, here)
+
+
+def train_and_stop(run: RunPaths, here: Machine, plan: Plan, modes: list[str]) -> list[Path]:
+    """Runs a job until all GMIs iterate, then stops it; returns its daemons' directories."""
+    with open_backend(plan, here, run) as backend:
+        directories = [Path(backend.environment(gmi)[PIPE_VARIABLE]) for gmi in plan.layout.gmis]
+        supervisor = Supervisor(make_job(run, modes, backend, plan))
+        stopped: list[bool] = []
+
+        def stop_once(status: tuple[GmiStatus, ...]) -> None:
+            if not stopped and all(s.state == "running" for s in status):
+                supervisor.request_stop()
+                stopped.append(True)
+
+        with pytest.raises(JobInterrupted):
+            supervisor.run(stop_once)
+    return directories
+
+
+def test_one_private_daemon_per_gpu_that_is_gone_afterwards(mps: FakeMps, run: RunPaths):
+    here = machine(2, mps_control=find_mps_control())
+    plan = mps_plan(here, num_gpus=2, gmis_per_gpu=2)
+    with open_backend(plan, here, run) as backend:
+        directories = [Path(backend.environment(gmi)[PIPE_VARIABLE]) for gmi in range(4)]
+        assert directories[0] == directories[1] != directories[2] == directories[3]
+        assert all(path.stat().st_mode & 0o777 == 0o700 for path in directories)
+        daemons = [MpsControl(mps.program, path).daemon_pid() for path in set(directories)]
+        assert all(pid and identify(pid) for pid in daemons)
+    assert [uuid for uuid, _ in mps.told("start")] == [gpu(0).uuid, gpu(1).uuid]
+    assert len(mps.told("quit")) == 2
+    assert not [pid for pid in daemons if pid and identify(pid)]
+    assert not [path for path in directories if path.exists()]
+
+
+def test_job_of_clients_is_verified_and_stops(mps: FakeMps, run: RunPaths):
+    here = machine(1, mps_control=find_mps_control())
+    plan = mps_plan(here, num_gpus=1, gmis_per_gpu=2)
+    directories = train_and_stop(run, here, plan, ["mps_client", "mps_client"])
+    assert (run.gmi(0).root / "saved").exists()
+    assert not mps.told("terminate_client")
+    assert not directories[0].exists()
+    assert (run.mps / "janitor.log").read_text() == ""
+
+
+def test_gmi_that_is_no_client_is_refused(mps: FakeMps, run: RunPaths):
+    here = machine(1, mps_control=find_mps_control())
+    plan = mps_plan(here, num_gpus=1, gmis_per_gpu=2)
+    with (
+        pytest.raises(BackendUnavailable, match=r"GMI 1 \(process \d+\) is no client of the MPS"),
+        open_backend(plan, here, run) as backend,
+    ):
+        Supervisor(make_job(run, ["mps_client", "train"], backend, plan)).run()
+    assert not [path for path in mps.pipe_directories() if path.exists()]
+
+
+def test_clients_are_terminated_before_they_are_killed(mps: FakeMps, run: RunPaths):
+    here = machine(1, mps_control=find_mps_control())
+    plan = mps_plan(here, num_gpus=1, gmis_per_gpu=2)
+    pids: list[int | None] = []
+
+    def kill_first(status: tuple[GmiStatus, ...]) -> None:
+        if all(s.state == "running" for s in status) and not pids:
+            pids.extend(s.pid for s in status)
+            assert pids[0] is not None
+            os.kill(pids[0], 9)
+
+    with (
+        pytest.raises(GmiFailed, match="GMI 0 failed: ended by SIGKILL"),
+        open_backend(plan, here, run) as backend,
+    ):
+        Supervisor(make_job(run, ["mps_client", "mps_client"], backend, plan)).run(kill_first)
+    assert [int(client) for _, client in mps.told("terminate_client")] == [pids[1]]
+
+
+def test_daemon_that_does_not_start_leaves_nothing(
+    mps: FakeMps, run: RunPaths, monkeypatch: pytest.MonkeyPatch
+):
+    monkeypatch.setenv("FAKE_MPS_BROKEN", "1")
+    here = machine(1, mps_control=find_mps_control())
+    plan = mps_plan(here, num_gpus=1, gmis_per_gpu=2)
+    with (
+        pytest.raises(BackendUnavailable, match="exit code 1: An instance of this daemon"),
+        open_backend(plan, here, run),
+    ):
+        pass
+    assert not [path for path in mps.pipe_directories() if path.exists()]
+
+
+def test_daemon_of_somebody_else_is_used_and_left_alone(
+    mps: FakeMps, run: RunPaths, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    pipe_directory = tmp_path / "operator"
+    pipe_directory.mkdir()
+    control = MpsControl(mps.program, pipe_directory)
+    control.start(gpu(0).uuid, tmp_path / "operator-logs")
+    daemon = control.daemon_pid()
+    assert daemon is not None
+    monkeypatch.setenv(PIPE_VARIABLE, str(pipe_directory))
+    monkeypatch.setattr("gmijax.partition.machine.list_gpus", lambda: (gpu(0),))
+    monkeypatch.delenv("CUDA_VISIBLE_DEVICES", raising=False)
+    try:
+        here = detect_machine()
+        assert here.operator_daemon == pipe_directory
+        plan = mps_plan(here, num_gpus=1, gmis_per_gpu=2)
+        directories = train_and_stop(run, here, plan, ["mps_client", "mps_client"])
+        assert set(directories) == {pipe_directory}
+        assert len(mps.told("start")) == 1
+        assert not mps.told("quit")
+        assert identify(daemon) is not None
+    finally:
+        control.quit()
+
+
+@pytest.mark.parametrize("is_stuck", [False, True])
+def test_janitor_cleans_up_after_a_killed_controller(
+    mps: FakeMps, run: RunPaths, tmp_path: Path, is_stuck: bool
+):
+    with (tmp_path / "controller.log").open("wb") as log:
+        controller = subprocess.Popen(
+            [
+                *(sys.executable, str(TESTS / "fake_controller.py"), str(run.root), "mps"),
+                *("mps_client", "mps_client"),
+            ],
+            stderr=log,
+        )
+    try:
+        clients = _wait_for_clients(mps, 2)
+        [directory] = mps.pipe_directories()
+        daemon = identify(MpsControl(mps.program, directory).daemon_pid() or 0)
+        assert daemon is not None
+        if is_stuck:
+            os.kill(clients[0].pid, signal.SIGSTOP)
+    finally:
+        controller.kill()
+        controller.wait()
+    # A stuck GMI gets 8 s to end by itself before the janitor kills it.
+    assert not wait_until_gone([*clients, daemon], timeout_s=20)
+    deadline_s = time.monotonic() + 10
+    while directory.exists() and time.monotonic() < deadline_s:
+        time.sleep(0.05)
+    assert not directory.exists()
+    assert len(mps.told("quit")) == 1
+    terminated = [int(client) for _, client in mps.told("terminate_client")]
+    assert terminated == ([clients[0].pid] if is_stuck else [])
+
+
+def _wait_for_clients(mps: FakeMps, number: int) -> list[ProcessId]:
+    clients: list[ProcessId] = []
+    while len(clients) < number:
+        time.sleep(0.05)
+        found = [pid for path in mps.pipe_directories() for pid in (path / "clients").glob("*")]
+        clients = [process for path in found if (process := identify(int(path.name)))]
+    return clients

@@ -1,0 +1,231 @@
+"""Runs small bodies of code in several real processes that share one reducer.
+
+`Ranks` starts this file as a script, once a rank. A child builds its reducer, runs the body
+named in its options and writes what the body returns, or how it failed, to a JSON file.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from gmijax.collectives.build import Membership, build_reducer
+from gmijax.collectives.interface import Reducer
+from gmijax.collectives.memory import (
+    EXCHANGE_FD_VARIABLE,
+    create_exchange,
+    inherited_exchange,
+)
+from gmijax.errors import CollectiveTimeout, GmijaxError, PeerLost
+from gmijax.partition.layout import Layout
+
+Options = dict[str, Any]
+WAIT_S = 30.0
+REPOSITORY = Path(__file__).resolve().parents[1]
+
+
+class Ranks:
+    """Processes of one job: a context manager that leaves none behind.
+
+    `results()` waits for all that were not killed; each result has `error` (class name or
+    None), `failed_at_s` (monotonic clock, the same for all processes) and the body's own keys.
+    """
+
+    def __init__(self, folder: Path, world_size: int, body: str, **options: Any) -> None:
+        self.folder, self.world_size = folder, world_size
+        self.fd = create_exchange()
+        self.processes: dict[int, subprocess.Popen[bytes]] = {}
+        defaults = {"strategy": "mpr", "num_floats": 100, "timeout_s": 20.0, "start_s": 20.0}
+        self._options = {**defaults, "body": body, "world_size": world_size, **options}
+
+    def __enter__(self) -> Ranks:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        for process in self.processes.values():
+            process.kill()
+            process.wait()
+        os.close(self.fd)
+
+    def start(self, *ranks: int, **options: Any) -> Ranks:
+        """Starts `ranks` (default: all), with `options` on top of the common ones."""
+        for rank in ranks or range(self.world_size):
+            given = {**self._options, "rank": rank, "folder": str(self.folder), **options}
+            with (self.folder / f"stderr_{rank}").open("wb") as stderr:
+                self.processes[rank] = subprocess.Popen(
+                    [sys.executable, __file__, json.dumps(given)],
+                    env=dict(
+                        os.environ, **{EXCHANGE_FD_VARIABLE: str(self.fd)}, PYTHONPATH=REPOSITORY
+                    ),
+                    pass_fds=[self.fd],
+                    stdin=subprocess.DEVNULL,
+                    stdout=stderr,
+                    stderr=stderr,
+                )
+        return self
+
+    def wait_for(self, mark: str) -> None:
+        """Waits until every rank has left the file `mark`."""
+        deadline = time.monotonic() + WAIT_S
+        while any(not (self.folder / f"{mark}_{rank}").exists() for rank in self.processes):
+            assert time.monotonic() < deadline, f"no {mark}"
+            time.sleep(0.01)
+
+    def named_memory(self) -> set[Path]:
+        """Files below /dev/shm that the running ranks have mapped."""
+        maps = [Path(f"/proc/{p.pid}/maps").read_text() for p in self.processes.values()]
+        return {
+            Path("/dev/shm" + line.partition("/dev/shm")[2])
+            for line in "".join(maps).splitlines()
+            if "/dev/shm" in line
+        }
+
+    def signal(self, rank: int, number: signal.Signals) -> float:
+        """Sends a signal to `rank`; returns when, monotonic clock."""
+        self.processes[rank].send_signal(number)
+        return time.monotonic()
+
+    def results(self, *ranks: int) -> list[dict[str, Any]]:
+        """What `ranks` (default: all) came to, once their processes have ended."""
+        found = []
+        for rank in ranks or range(self.world_size):
+            self.processes[rank].wait(WAIT_S)
+            path = self.folder / f"result_{rank}"
+            assert path.exists(), (self.folder / f"stderr_{rank}").read_text()
+            found.append(json.loads(path.read_text()))
+        return found
+
+
+def check_means(reducer: Reducer, options: Options) -> Options:
+    """Compares `mean` and `all_gather` with numpy on buffers that every rank can compute."""
+    digest, worst = hashlib.sha256(), 0.0
+    for call in range(options["num_calls"]):
+        buffers = [
+            np.random.default_rng([call, rank])
+            .normal(scale=10.0**call, size=options["num_floats"])
+            .astype(np.float32)
+            for rank in range(reducer.world_size)
+        ]
+        buffers[0][0] = np.nan
+        buffers[-1][-1] = np.inf
+        mean = reducer.mean(buffers[reducer.rank])
+        digest.update(mean.tobytes())
+        expected = np.mean(buffers, axis=0, dtype=np.float64)
+        np.testing.assert_allclose(mean, expected, rtol=1e-5, atol=1e-6 * 10.0**call)
+        assert not mean.flags.writeable
+        finite = np.isfinite(expected)
+        worst = max(worst, float(np.abs(mean - expected)[finite].max(initial=0.0)) / 10.0**call)
+        heads = [buffer[:5] for buffer in buffers]
+        np.testing.assert_array_equal(reducer.all_gather(heads[reducer.rank]), heads)
+    return {"digest": digest.hexdigest(), "worst": worst}
+
+
+def check_order(reducer: Reducer, options: Options) -> Options:
+    """Makes many calls of both kinds with random pauses; every value tells its step."""
+    kinds = np.random.default_rng(0).random(options["num_calls"])
+    pauses = np.random.default_rng([1, reducer.rank])
+    ranks = np.arange(reducer.world_size)
+    for step, kind in enumerate(kinds):
+        if pauses.random() < 0.1:
+            time.sleep(pauses.random() * 2e-3)
+        if kind < 0.5:
+            buffer = np.full(options["num_floats"], 8 * step + reducer.rank, np.float32)
+            mean = reducer.mean(buffer)
+            if pauses.random() < 0.1:
+                time.sleep(pauses.random() * 2e-3)
+            # Sums of small whole numbers are exact, and so is the mean over 1, 2 or 4 ranks.
+            assert (mean == 8 * step + ranks.mean()).all(), step
+        else:
+            values = np.full(1 + step % 7, 8 * step + reducer.rank, np.float32)
+            gathered = reducer.all_gather(values)
+            assert (gathered == (8 * step + ranks)[:, None]).all(), step
+    return {}
+
+
+def call_forever(reducer: Reducer, options: Options) -> Options:
+    """Calls `mean` until something happens; marks `running` after the first calls."""
+    buffer = np.ones(options["num_floats"], np.float32)
+    for step in range(10**9):
+        reducer.mean(buffer)
+        if step == 3:
+            leave_mark("running", options)
+    return {}
+
+
+def call_once(reducer: Reducer, options: Options) -> Options:
+    """One `mean` of ones times rank + 1, after a pause; then waits until told to end."""
+    leave_mark("attached", options)
+    time.sleep(options.get("pause_s", 0.0))
+    mean = reducer.mean(np.full(options["num_floats"], reducer.rank + 1, np.float32))
+    first = float(mean[0])
+    leave_mark("called", options)
+    time.sleep(options.get("stay_s", 0.0))
+    return {"mean": first}
+
+
+def gather_once(reducer: Reducer, options: Options) -> Options:
+    """One `all_gather`."""
+    reducer.all_gather(np.zeros(options["num_gather"], np.float32))
+    return {}
+
+
+def close_at_once(reducer: Reducer, options: Options) -> Options:
+    """Closes, but stays alive for a while."""
+    reducer.close()
+    time.sleep(options["stay_s"])
+    return {}
+
+
+BODIES: dict[str, Callable[[Reducer, Options], Options]] = {
+    body.__name__: body
+    for body in (check_means, check_order, call_forever, call_once, gather_once, close_at_once)
+}
+
+
+def leave_mark(mark: str, options: Options) -> None:
+    """Leaves a file that `Ranks.wait_for` sees."""
+    (Path(options["folder"]) / f"{mark}_{options['rank']}").touch()
+
+
+def main(options: Options) -> None:
+    """One rank: builds its reducer, runs the body, writes the result."""
+    result: Options = {"error": None}
+    try:
+        reducer = build_reducer(
+            options["strategy"],
+            Membership(
+                layout=Layout.even(1, options["world_size"]),
+                rank=options["rank"],
+                num_floats=options["num_floats"],
+                exchange_fd=inherited_exchange(os.environ),
+                timeout_s=options["timeout_s"],
+                rendezvous_timeout_s=options["start_s"],
+            ),
+        )
+        result |= BODIES[options["body"]](reducer, options)
+        reducer.close()
+        reducer.close()
+    except GmijaxError as error:
+        result |= {"error": type(error).__name__, "message": str(error)}
+        result["failed_at_s"] = time.monotonic()
+        if isinstance(error, PeerLost):
+            result["peer"] = error.peer
+        if isinstance(error, CollectiveTimeout):
+            result["missing"] = list(error.missing)
+    path = Path(options["folder"]) / f"result_{options['rank']}"
+    path.with_suffix(".part").write_text(json.dumps(result))
+    path.with_suffix(".part").rename(path)
+
+
+if __name__ == "__main__":
+    main(json.loads(sys.argv[1]))

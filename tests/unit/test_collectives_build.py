@@ -1,0 +1,64 @@
+"""Strategies by name."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+from gmijax.collectives.build import STRATEGIES, Membership, build_reducer
+from gmijax.errors import CollectiveError, ConfigError
+from gmijax.partition.layout import Layout
+
+
+def membership(num_gmis: int, num_floats: int = 4) -> Membership:
+    return Membership(
+        layout=Layout.even(1, num_gmis),
+        rank=0,
+        num_floats=num_floats,
+        exchange_fd=None,
+        timeout_s=1.0,
+        rendezvous_timeout_s=1.0,
+    )
+
+
+@pytest.mark.parametrize(("num_gmis", "usable"), [(1, {"none", "mpr"}), (2, {"mpr"})])
+def test_which_strategies_a_layout_allows(num_gmis: int, usable: set[str]) -> None:
+    layout = Layout.even(1, num_gmis)
+    assert {name for name, entry in STRATEGIES.items() if not entry.why_not(layout)} == usable
+
+
+def test_an_unknown_strategy_names_the_known_ones() -> None:
+    with pytest.raises(ConfigError, match=r"reduce.strategy=ring: expected one of none, mpr"):
+        build_reducer("ring", membership(2))
+
+
+def test_an_unusable_strategy_says_why() -> None:
+    with pytest.raises(ConfigError, match="only for a job with one GMI, this one has 3"):
+        build_reducer("none", membership(3))
+
+
+def test_mpr_needs_a_shared_block() -> None:
+    with pytest.raises(ConfigError, match="needs the shared block"):
+        build_reducer("mpr", membership(2))
+
+
+def test_one_gmi_keeps_its_own_numbers() -> None:
+    reducer = build_reducer("none", membership(1))
+    buffer = np.array([1.0, np.nan, -0.0, np.inf], np.float32)
+    mean = reducer.mean(buffer)
+    assert mean.tobytes() == buffer.tobytes()
+    assert not mean.flags.writeable
+    assert buffer.flags.writeable
+    np.testing.assert_array_equal(reducer.all_gather(buffer[2:]), [buffer[2:]])
+    with pytest.raises(CollectiveError, match="expected 4"):
+        reducer.mean(buffer[1:])
+    reducer.close()
+    reducer.close()
+
+
+def test_the_collectives_import_no_jax() -> None:
+    code = "import sys, gmijax.collectives.build; sys.exit('jax' in sys.modules)"
+    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0

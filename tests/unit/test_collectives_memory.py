@@ -1,0 +1,109 @@
+"""The shared block: its geometry, its descriptor, who may attach."""
+
+from __future__ import annotations
+
+import os
+import stat
+from collections.abc import Iterator
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from gmijax.collectives.liveness import ProcessIdentity, is_alive, own_process
+from gmijax.collectives.memory import (
+    EXCHANGE_FD_VARIABLE,
+    LINE,
+    Geometry,
+    attach,
+    create_exchange,
+    inherited_exchange,
+)
+from gmijax.errors import CollectiveError, ConfigError
+
+
+@pytest.fixture
+def exchange_fd() -> Iterator[int]:
+    fd = create_exchange()
+    yield fd
+    os.close(fd)
+
+
+@given(st.integers(1, 64), st.integers(1, 10_000_000))
+def test_parts_of_the_block_do_not_overlap_and_begin_at_cache_lines(
+    world_size: int, num_floats: int
+) -> None:
+    at = Geometry.of(world_size, num_floats)
+    assert at.gathered >= world_size * 64
+    assert at.slots >= at.gathered + 2 * world_size * 65536
+    assert at.row_floats >= num_floats
+    assert at.result == at.slots + world_size * at.row_floats * 4
+    assert at.size >= at.result + num_floats * 4
+    assert [offset % 64 for offset in (at.gathered, at.slots, at.result)] == [0, 0, 0]
+    assert at.row_floats % 16 == 0
+
+
+def test_a_line_is_one_cache_line_and_its_counters_are_aligned() -> None:
+    assert LINE.itemsize == 64
+    line = np.zeros(1, LINE)
+    start = line.ctypes.data
+    offsets = [line[name].ctypes.data - start for name in ("call", "sequence")]
+    assert offsets == [40, 56]
+
+
+def test_the_file_is_private_and_not_inherited_by_accident(exchange_fd: int) -> None:
+    assert stat.S_IMODE(os.fstat(exchange_fd).st_mode) == 0o600
+    assert not os.get_inheritable(exchange_fd)
+
+
+def test_a_smaller_rank_does_not_shrink_the_file(exchange_fd: int) -> None:
+    large = attach(exchange_fd, 0, 2, 100_000)
+    size = os.fstat(exchange_fd).st_size
+    attach(exchange_fd, 1, 2, 10)
+    assert os.fstat(exchange_fd).st_size == size
+    assert large.result[-1] == 0.0
+
+
+def test_the_block_outlives_its_descriptor() -> None:
+    fd = create_exchange()
+    block = attach(fd, 0, 1, 10)
+    os.close(fd)
+    block.slots[0, 9] = 3.0
+    assert block.slots[0].sum() == 3.0
+
+
+@pytest.mark.parametrize(("rank", "num_floats"), [(-1, 1), (2, 1), (0, 0)])
+def test_senseless_numbers_are_refused(rank: int, num_floats: int, exchange_fd: int) -> None:
+    with pytest.raises(ConfigError, match="must be"):
+        attach(exchange_fd, rank, 2, num_floats)
+
+
+def test_a_descriptor_that_is_no_memory_is_refused() -> None:
+    reader, writer = os.pipe()
+    try:
+        with pytest.raises(CollectiveError, match=f"MiB of shared memory at descriptor {reader}"):
+            attach(reader, 0, 1, 10)
+    finally:
+        os.close(reader)
+        os.close(writer)
+
+
+def test_the_descriptor_comes_from_the_environment_and_goes_no_further(exchange_fd: int) -> None:
+    os.set_inheritable(exchange_fd, True)
+    assert inherited_exchange({EXCHANGE_FD_VARIABLE: str(exchange_fd)}) == exchange_fd
+    assert not os.get_inheritable(exchange_fd)
+
+
+@pytest.mark.parametrize("shown", ["", "seven", "-1", "999999", "99999999999999999999"])
+def test_a_bad_descriptor_in_the_environment_is_named(shown: str) -> None:
+    with pytest.raises(ConfigError, match=f"GMIJAX_EXCHANGE_FD='{shown}'"):
+        inherited_exchange({EXCHANGE_FD_VARIABLE: shown})
+
+
+def test_a_process_is_known_by_number_and_start() -> None:
+    own = own_process()
+    assert own.pid == os.getpid()
+    assert is_alive(own)
+    assert not is_alive(own._replace(start_ticks=own.start_ticks + 1))
+    assert not is_alive(ProcessIdentity(0, 0))

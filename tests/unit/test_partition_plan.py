@@ -1,0 +1,180 @@
+"""Layout, plan and planner: pure data and pure decisions."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from gmijax.errors import BackendUnavailable, ConfigError
+from gmijax.partition.layout import Layout
+from gmijax.partition.machine import Machine
+from gmijax.partition.plan import Plan, Slice
+from gmijax.partition.planner import make_plan, split_cores
+from supervision import gpu, machine, plan_config, reduce_config
+
+MPS = Path("/usr/bin/nvidia-cuda-mps-control")
+
+
+def planned(here: Machine, **changes: Any) -> Plan:
+    return make_plan(plan_config(**changes), reduce_config(), 64, here)
+
+
+def test_even_layout_numbers_gmis_gpu_by_gpu():
+    layout = Layout.even(num_gpus=2, gmis_per_gpu=3)
+    assert layout.gmis_of_gpu == ((0, 1, 2), (3, 4, 5))
+    assert (layout.num_gpus, layout.num_gmis) == (2, 6)
+    assert layout.gpu_of(4) == 1
+    assert layout.neighbours_of(4) == (3, 4, 5)
+
+
+@pytest.mark.parametrize("bad", [(), ((0,), ()), ((0, 0),), ((1, 2),), ((0, 2),)])
+def test_layout_with_wrong_ids_is_refused(bad: tuple[tuple[int, ...], ...]):
+    with pytest.raises(ConfigError, match="plan.layout="):
+        Layout(bad)
+
+
+@pytest.mark.parametrize("num_gpus", [0, 2])
+def test_plan_survives_json(num_gpus: int):
+    plan = planned(machine(num_gpus, mps_control=MPS), gpus=2, gmis_per_gpu=2)
+    assert Plan.from_dict(json.loads(json.dumps(plan.to_dict()))) == plan
+
+
+def test_plan_refuses_slices_that_do_not_fit_the_layout():
+    slices = (Slice(1, 0, "cpu", None, None, ()),)
+    with pytest.raises(ConfigError, match="do not match layout"):
+        Plan(Layout(((0,),)), slices, "cpu", "tcg_ex", 8, "none", "host")
+
+
+@pytest.mark.parametrize(
+    ("num_gpus", "control", "gmis_per_gpu", "backend", "reason"),
+    [
+        (0, None, 2, "cpu", "GPUs are virtual"),
+        (1, MPS, 1, "share", "nothing to share"),
+        (1, MPS, 2, "mps", "with an own daemon"),
+        (1, None, 2, "share", "2.0 to 2.9 times as fast"),
+    ],
+)
+def test_auto_backend(
+    num_gpus: int, control: Path | None, gmis_per_gpu: int, backend: str, reason: str
+):
+    plan = planned(machine(num_gpus, mps_control=control), gmis_per_gpu=gmis_per_gpu)
+    assert plan.backend == backend
+    assert reason in plan.reasons[0]
+
+
+def test_running_daemon_is_named_in_the_reason():
+    here = machine(1, mps_control=MPS, operator_daemon=Path("/tmp/nvidia-mps"))
+    assert "the daemon that runs here" in planned(here, gmis_per_gpu=2).reasons[0]
+
+
+def test_every_auto_has_a_reason_and_explicit_choices_have_none():
+    plan = planned(machine(0), gmis_per_gpu=2)
+    assert [reason.split()[0] for reason in plan.reasons] == [
+        *("backend", "template", "strategy", "intra")
+    ]
+    explicit = make_plan(
+        plan_config(gmis_per_gpu=2, backend="cpu", template="tcg_ex"),
+        reduce_config(strategy="mpr", intra="host"),
+        64,
+        machine(0),
+    )
+    assert explicit.reasons == ()
+
+
+@pytest.mark.parametrize(("gmis", "strategy"), [(1, "none"), (2, "mpr")])
+def test_strategy_of_one_gmi_is_none(gmis: int, strategy: str):
+    assert planned(machine(0), gmis_per_gpu=gmis).strategy == strategy
+
+
+@pytest.mark.parametrize(
+    ("here", "changes", "message"),
+    [
+        (machine(1), {"gpus": 2}, "plan.gpus=2: this machine has 1 usable GPUs"),
+        (machine(1), {"gpus": (0, 3)}, r"no usable GPU 3; usable are \[0\]"),
+        (machine(1), {"layout": ((0,), (1,))}, "GPUs of plan.layout=2: this machine has 1"),
+        (machine(2), {"gpus": (0,), "layout": ((0,), (1,))}, "plan.layout has 2 GPUs"),
+        (machine(1), {"sm_percent": 50.0, "backend": "share"}, "only the mps backend"),
+        (machine(0), {"sm_percent": 50.0}, "only the mps backend can cap SMs, the backend is cpu"),
+        (machine(1), {"gmis_per_gpu": 2, "memory_fraction": 0.5}, "would reserve 1.00"),
+        (
+            machine(1, mps_control=MPS),
+            {"gmis_per_gpu": 49},
+            "MPS of driver 580.159.03 allows at most 48",
+        ),
+    ],
+)
+def test_values_that_do_not_fit_are_refused(here: Machine, changes: dict[str, Any], message: str):
+    with pytest.raises(ConfigError, match=message):
+        planned(here, **changes)
+
+
+@pytest.mark.parametrize(
+    ("here", "backend", "message"),
+    [
+        (machine(0), "mps", "no usable NVIDIA GPU here; available here: auto, cpu$"),
+        (machine(0), "share", "no usable NVIDIA GPU here; available here: auto, cpu$"),
+        (machine(1), "mps", "was not found in PATH .*available here: auto, cpu, share$"),
+        (machine(1, mps_control=MPS), "mig", "not supported yet; .*: auto, cpu, share, mps$"),
+    ],
+)
+def test_backend_that_cannot_be_had_is_refused(here: Machine, backend: str, message: str):
+    with pytest.raises(BackendUnavailable, match=message):
+        planned(here, backend=backend)
+
+
+def test_gpu_in_mig_mode_is_refused():
+    here = machine(0, gpus=(gpu(0), gpu(1, mig_enabled=True)))
+    assert planned(here, gpus=1).slices[0].device == gpu(0).uuid
+    with pytest.raises(BackendUnavailable, match="GPU 1 is in MIG mode"):
+        planned(here, gpus=(1,))
+
+
+def test_new_drivers_allow_more_clients():
+    here = machine(1, mps_control=MPS, driver_version="590.44")
+    assert planned(here, gmis_per_gpu=60).layout.num_gmis == 60
+    with pytest.raises(ConfigError, match="at most 60"):
+        planned(here, gmis_per_gpu=61)
+
+
+@pytest.mark.parametrize(
+    ("percent", "warned"), [(12.0, False), (20.0, True), (25.0, False), (33.0, True), (66.0, True)]
+)
+def test_sm_caps_with_reported_wrong_results_are_warned_about(percent: float, warned: bool):
+    plan = planned(machine(1, mps_control=MPS), gmis_per_gpu=2, sm_percent=percent)
+    assert any(reason.startswith("warning") for reason in plan.reasons) == warned
+    assert plan.slices[0].sm_percent == percent
+
+
+def test_memory_is_split_over_the_gmis_of_a_gpu():
+    plan = planned(machine(2), layout=((0, 1), (2,)))
+    assert [share.memory_fraction for share in plan.slices] == [0.4, 0.4, 0.8]
+    assert [share.device for share in plan.slices] == [gpu(0).uuid, gpu(0).uuid, gpu(1).uuid]
+
+
+def test_gpus_can_be_chosen_by_index():
+    plan = planned(machine(3), gpus=(2, 0))
+    assert [share.device for share in plan.slices] == [gpu(2).uuid, gpu(0).uuid]
+
+
+def test_any_number_of_gpus_is_virtual_on_cpu():
+    plan = planned(machine(1, cpu_cores=(0, 1)), gpus=4, gmis_per_gpu=2, backend="cpu")
+    assert plan.layout.num_gmis == 8
+    assert [share.cpus for share in plan.slices] == [(0,), (1,)] * 4
+    assert {share.device for share in plan.slices} == {"cpu"}
+
+
+@given(st.sets(st.integers(0, 200), min_size=1), st.integers(1, 40))
+def test_cores_are_disjoint_complete_and_even(cores: set[int], num_gmis: int):
+    split = split_cores(sorted(cores), num_gmis)
+    assert len(split) == num_gmis
+    if len(cores) >= num_gmis:
+        assert [core for part in split for core in part] == sorted(cores)
+        sizes = [len(part) for part in split]
+        assert max(sizes) - min(sizes) <= 1
+    else:
+        assert {core for part in split for core in part} == cores
