@@ -23,7 +23,7 @@ from omegaconf.errors import OmegaConfBaseException
 from rich.console import Console
 from rich.table import Table
 
-from gmijax.config import TrainConfig, from_dict, suggestion
+from gmijax.config import TrainConfig, from_dict, suggestion, to_dict
 from gmijax.errors import ConfigError, GmijaxError, JobInterrupted
 from gmijax.resume import find_checkpoint
 from gmijax.rundir import RunPaths, read_json
@@ -55,7 +55,7 @@ def command(name: str, cls: type[C], run: Callable[[C], int], argv: Sequence[str
         overrides, show = _split_options(argv)
         config = _build(name, cls, overrides)
         if show:
-            sys.stdout.write(OmegaConf.to_yaml(OmegaConf.create(dataclasses.asdict(config))))
+            sys.stdout.write(OmegaConf.to_yaml(OmegaConf.create(to_dict(config))))
             return EXIT_OK
         return run(config)
     except ConfigError as error:
@@ -114,7 +114,9 @@ def _parse(overrides: Sequence[str]) -> list[Any]:
         raise ConfigError(" ".join(str(error).split())) from None
 
 
-def _on_top_of_saved(data: dict[str, Any], overrides: Sequence[str], resume: str) -> dict[str, Any]:
+def _on_top_of_saved(
+    data: dict[str, Any], overrides: Sequence[str], resume: str
+) -> dict[str, Any]:
     """The saved configuration of the resumed run, changed where the command line says so."""
     checkpoint = find_checkpoint(resume, "run.resume")
     saved = read_json(RunPaths(checkpoint.parent.parent).config)
@@ -197,5 +199,5 @@ def _documented(cls: type[Any], prefix: str = "") -> Iterator[tuple[str, str, st
 
 
 def _complain(name: str, what: object) -> None:
-    sys.stderr.write(f"gmijax.{name}: {what}\n")
-
+    notes = getattr(what, "__notes__", [])
+    sys.stderr.write(f"gmijax.{name}: {'; '.join([str(what), *notes])}\n")

@@ -120,9 +120,7 @@ def _with_checkpoint(config: TrainConfig) -> TrainConfig:
             f"num_timesteps={config.num_timesteps}: the checkpoint has {meta.env_steps} "
             "steps already; give more in all"
         )
-    return dataclasses.replace(
-        config, run=dataclasses.replace(config.run, resume=str(checkpoint))
-    )
+    return dataclasses.replace(config, run=dataclasses.replace(config.run, resume=str(checkpoint)))
 
 
 def _run_gmis(

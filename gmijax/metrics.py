@@ -98,10 +98,11 @@ class TensorBoardSink:
 
     def write(self, line: Line) -> None:
         """See `Sink`."""
+        steps = int(line["env_steps"] or 0)
         for name, value in line.items():
             if value is not None and name != "env_steps":
                 tag = name if "/" in name else f"train/{name}"
-                self._writer.add_scalar(tag, value, line["env_steps"])
+                self._writer.add_scalar(tag, value, steps)
 
     def close(self) -> None:
         """See `Sink`."""

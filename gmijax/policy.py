@@ -71,11 +71,11 @@ class ActorCritic(NamedTuple):
 
     def action_mean(self, params: ActorCriticParams, obs: Array) -> Array:
         """Mean action [..., A] for normalised observations [..., O]."""
-        return self.policy.apply(params.policy, obs)
+        return jnp.asarray(self.policy.apply(params.policy, obs))
 
     def state_value(self, params: ActorCriticParams, obs: Array) -> Array:
         """Value estimates [...] for normalised observations [..., O]."""
-        return self.value.apply(params.value, obs)[..., 0]
+        return jnp.asarray(self.value.apply(params.value, obs))[..., 0]
 
 
 def make_actor_critic(

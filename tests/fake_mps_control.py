@@ -46,6 +46,8 @@ def answer(daemon: int, command: str, *numbers: str) -> int:
         lines = [daemon] if clients() else []
     elif command == "get_client_list":
         lines = clients()
+    elif command == "get_default_active_thread_percentage":
+        lines = [100.0]
     else:
         lines = []
         journal(" ".join([command, *numbers]))

@@ -48,17 +48,7 @@ def gmi_environment(
     for name in (_OLD_MEMORY_FRACTION, _MEMORY_FRACTION, _SM_PERCENT):
         environment.pop(name, None)
     environment.update(_cpu(share) if plan.backend == "cpu" else _gpu(share))
-    environment.update(
-        {
-            ENV_GMI: str(gmi),
-            ENV_CPUS: ",".join(map(str, share.cpus)),
-            "PYTHONUNBUFFERED": "1",
-            # Every program is cached, also quick ones: all GMIs compile the same ones.
-            "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0",
-            # NVLink multicast is unsafe on hosts that are shared with others.
-            "NCCL_NVLS_ENABLE": "0",
-        }
-    )
+    environment.update(_common(share))
     environment.setdefault(_COMPILATION_CACHE, str(cache_dir))
     for name in _THREAD_LIMITS:
         # One thread beside a GPU: there the host only moves small arrays, and the GMIs of all
@@ -76,6 +66,18 @@ def extend_xla_flags(users: str, added: str) -> str:
     taken = {flag.partition("=")[0] for flag in users.split()}
     more = [flag for flag in added.split() if flag.partition("=")[0] not in taken]
     return " ".join([*users.split(), *more])
+
+
+def _common(share: Slice) -> dict[str, str]:
+    return {
+        ENV_GMI: str(share.gmi),
+        ENV_CPUS: ",".join(map(str, share.cpus)),
+        "PYTHONUNBUFFERED": "1",
+        # Every program is cached, also quick ones: all GMIs compile the same ones.
+        "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0",
+        # NVLink multicast is unsafe on hosts that are shared with others.
+        "NCCL_NVLS_ENABLE": "0",
+    }
 
 
 def _cpu(share: Slice) -> dict[str, str]:

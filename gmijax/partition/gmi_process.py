@@ -79,27 +79,19 @@ class GmiProcess:
         inherited = {ENV_LIFELINE_FD: read_end}
         if exchange_fd is not None:
             inherited[ENV_EXCHANGE_FD] = exchange_fd
-        # Files, not pipes: a child that floods a pipe which nobody reads would block.
+        variables = {name: str(fd) for name, fd in inherited.items()}
         try:
-            with paths.stdout.open("wb") as stdout, paths.stderr.open("wb") as stderr:
-                process = subprocess.Popen(
-                    command,
-                    env={
-                        **environment,
-                        **{name: str(fd) for name, fd in inherited.items()},
-                        ENV_RUN_DIR: str(run.root),
-                    },
-                    stdin=subprocess.DEVNULL,
-                    stdout=stdout,
-                    stderr=stderr,
-                    start_new_session=True,
-                    pass_fds=tuple(inherited.values()),
-                )
-        except OSError as error:
+            process = _spawn(
+                command,
+                {**environment, **variables, ENV_RUN_DIR: str(run.root)},
+                paths,
+                tuple(inherited.values()),
+            )
+        except BaseException as error:
             os.close(write_end)
-            raise GmiFailed(gmi, f"cannot start {command[0]}: {error.strerror}") from error
-        except BaseException:
-            os.close(write_end)
+            if isinstance(error, OSError):
+                what = f"cannot start {command[0]}: {error.strerror}"
+                raise GmiFailed(gmi, what) from error
             raise
         finally:
             os.close(read_end)
@@ -175,3 +167,19 @@ class GmiProcess:
             self._beat, self._beat_stamp = beat, stamp
             self._was_ready |= beat.is_ready
             self.progress_s = time.monotonic()
+
+
+def _spawn(
+    command: Sequence[str], environment: Mapping[str, str], paths: GmiPaths, fds: tuple[int, ...]
+) -> subprocess.Popen[bytes]:
+    # Files, not pipes: a child that floods a pipe which nobody reads would block.
+    with paths.stdout.open("wb") as stdout, paths.stderr.open("wb") as stderr:
+        return subprocess.Popen(
+            command,
+            env=environment,
+            stdin=subprocess.DEVNULL,
+            stdout=stdout,
+            stderr=stderr,
+            start_new_session=True,
+            pass_fds=fds,
+        )

@@ -148,7 +148,8 @@ class MpsControl:
     def is_answering(self) -> bool:
         """Whether a daemon listens."""
         try:
-            self.server_pids()
+            # A question about the daemon itself: there is no server before the first client.
+            self._command("get_default_active_thread_percentage")
         except BackendUnavailable:
             return False
         return True

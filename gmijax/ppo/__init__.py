@@ -1,0 +1,1 @@
+"""Proximal policy optimisation: pure update functions, and the role that runs them."""

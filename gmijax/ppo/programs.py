@@ -11,6 +11,8 @@ one entry of the compilation cache.
 from __future__ import annotations
 
 import functools
+import time
+from collections.abc import Mapping
 from typing import Any, NamedTuple, Protocol
 
 import jax
@@ -35,6 +37,7 @@ from gmijax.ppo.learner import (
 )
 from gmijax.ppo.losses import LossMetrics, Samples, UpdateContext
 from gmijax.ppo.rollout import RolloutStats, collect, merge_stats
+from gmijax.sim.divergence import sources
 from gmijax.sim.interface import EnvSpec
 from gmijax.sim.wrappers import BatchedEnv, BatchState, EpisodeSums
 from gmijax.types import Array, PyTree
@@ -61,9 +64,12 @@ class Iteration(Protocol):
 
     Attributes:
       is_asynchronous: whether a call returns before the device has finished the iteration.
+      times: seconds that parts of the last iteration took on this GMI, where they can be told
+        apart; waiting for other GMIs is part of an exchange.
     """
 
     is_asynchronous: bool
+    times: Mapping[str, float]
 
     def compile(self, state: LearnerState, env_state: BatchState) -> None:
         """Compiles all programs for these shapes (or takes them from the cache)."""
@@ -100,6 +106,7 @@ class FusedIteration:
     is_asynchronous = True
 
     def __init__(self, env: BatchedEnv, learner: Learner) -> None:
+        self.times: Mapping[str, float] = {}
         self._env = env
         self._program: Any = jax.jit(
             functools.partial(_fused, env, learner), donate_argnums=(1, 2)
@@ -147,6 +154,7 @@ class SplitIteration:
     is_asynchronous = False
 
     def __init__(self, env: BatchedEnv, learner: Learner, reducer: Reducer) -> None:
+        self.times: Mapping[str, float] = {}
         self._env = env
         self._learner = learner
         self._reducer = reducer
@@ -178,20 +186,27 @@ class SplitIteration:
         self, state: LearnerState, env_state: BatchState
     ) -> tuple[LearnerState, BatchState, IterationMetrics]:
         """See `Iteration`."""
+        started = time.monotonic()
         env_state, samples, order, packed = self._rollout(
             self._env.model, state, env_state, self._rank
         )
-        gathered = jnp.array(self._reducer.all_gather(np.asarray(packed)))
-        context, stats = self._begin(state, gathered)
+        mine = np.asarray(packed)  # Waits for the rollout.
+        rollout_s = time.monotonic() - started
+        context, stats = self._begin(state, np.array(self._reducer.all_gather(mine)))
         losses: list[FloatBuffer] = []
+        reduce_s = 0.0
         for index in range(order.shape[0]):
             buffer = self._gradient(state.params, samples, order, np.int32(index), context)
+            mine = np.asarray(buffer)  # Waits for the gradient.
+            exchanged = time.monotonic()
             # A copy: the reducer's view is overwritten by the next exchange, which may start
             # before the asynchronous update has read it.
-            mean = np.array(self._reducer.mean(np.asarray(buffer)))
+            mean = np.array(self._reducer.mean(mine))
+            reduce_s += time.monotonic() - exchanged
             losses.append(mean[-len(LossMetrics._fields) :])
             state = self._apply(state, mean)
         state, metrics = self._finish(state, stats, np.stack(losses))
+        self.times = {"time/rollout_s": rollout_s, "time/reduce_s": reduce_s}
         return state, env_state, metrics
 
     def _rollout_fn(
@@ -245,6 +260,5 @@ def _stats_example(obs_size: int, terms: tuple[str, ...]) -> RolloutStats:
         advantage=no_samples(()),
         episodes=EpisodeSums(zero, zero, zero, dict.fromkeys(terms, zero)),
         reward_sum=zero,
-        nonfinite_obs=zero,
-        nonfinite_reward=zero,
+        diverged=dict.fromkeys(("any", *sources(terms)), zero),
     )

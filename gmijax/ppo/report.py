@@ -3,12 +3,20 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Mapping
+from typing import Any
 
 import jax
 
 from gmijax.errors import NonFiniteError
 from gmijax.metrics import Episodes, EpisodeWindow, MetricsLog
 from gmijax.ppo.programs import IterationMetrics
+
+TOLERATED_FRACTION = 1e-3
+"""Fraction of an iteration's steps that may diverge: rare, and nothing that is learnt."""
+
+TOLERATED_STEPS = 10
+"""The same in steps, for iterations so short that one step is a large fraction."""
 
 
 class Reporter:
@@ -28,20 +36,24 @@ class Reporter:
         self.iteration_s: list[float] = []
         self.last_return: float | None = None
 
-    def report(self, env_steps: int, metrics: IterationMetrics) -> None:
+    def report(
+        self, env_steps: int, metrics: IterationMetrics, times: Mapping[str, float]
+    ) -> None:
         """Waits for the iteration that ended at `env_steps` and writes its line.
+
+        `times` are seconds by name, written as they are.
 
         Raises:
           NonFiniteError: an observation, a reward or a loss is NaN or infinite.
         """
-        host: IterationMetrics = jax.tree.map(float, metrics._replace(stats=_scalars(metrics)))
+        # Scalars only: the moments have O numbers each and are of no use in a log.
+        scalars = metrics._replace(stats=metrics.stats._replace(obs=0.0, advantage=0.0))
+        host: Any = jax.tree.map(float, scalars)
         now = time.monotonic()
         self._check_finite(host, env_steps)
         episodes = host.stats.episodes
         self._window.add(
-            Episodes(
-                episodes.count, episodes.return_sum, episodes.length_sum, episodes.term_sums
-            )
+            Episodes(episodes.count, episodes.return_sum, episodes.length_sum, episodes.term_sums)
         )
         means = self._window.means()
         self.last_return = means["return"]
@@ -54,10 +66,12 @@ class Reporter:
                 "wall_s": now - self._started,
                 "env_steps_per_s": steps / duration,
                 **means,
+                "diverged_steps": host.stats.diverged["any"],
                 "reward_per_step": host.stats.reward_sum / steps,
                 **{f"loss/{name}": value for name, value in host.losses._asdict().items()},
                 "policy/learning_rate": host.learning_rate,
                 "policy/noise_std": host.noise_std,
+                **times,
             }
         )
         self._last, self._env_steps = now, env_steps
@@ -66,18 +80,16 @@ class Reporter:
         """Flushes the log."""
         self._log.close()
 
-    def _check_finite(self, host: IterationMetrics, env_steps: int) -> None:
+    def _check_finite(self, host: Any, env_steps: int) -> None:
         where = f"{self._env_name}, up to env step {env_steps}"
-        if bad := host.stats.nonfinite_obs:
-            raise NonFiniteError(f"{where}: {bad:.0f} steps gave a non-finite observation")
-        if bad := host.stats.nonfinite_reward:
-            raise NonFiniteError(f"{where}: {bad:.0f} steps gave a non-finite reward")
+        diverged = host.stats.diverged
+        limit = max(TOLERATED_STEPS, TOLERATED_FRACTION * (env_steps - self._env_steps))
+        if diverged["any"] > limit:
+            places = [name for name, count in diverged.items() if count and name != "any"]
+            raise NonFiniteError(
+                f"{where}: {diverged['any']:.0f} steps of one iteration gave numbers that are "
+                f"not finite or beyond all bounds, in {', '.join(places)}"
+            )
         losses = host.losses._asdict()
         if names := [name for name, value in losses.items() if not abs(value) < float("inf")]:
             raise NonFiniteError(f"{where}: {', '.join(names)} of the update is not finite")
-
-
-def _scalars(metrics: IterationMetrics) -> object:
-    # The moments have O numbers each and are of no use in a log.
-    zero = 0.0
-    return metrics.stats._replace(obs=zero, advantage=zero)

@@ -78,7 +78,7 @@ class _SyncTrainer:
         self._iteration.compile(state, env_state)
         compile_s = time.monotonic() - started
         self._link.beat("ready", 0)
-        self._reducer.all_gather(np.zeros(1, np.float32))  # Everybody is there: start the clock.
+        self._meet()  # Everybody has compiled: the clock may start.
         reporter = Reporter(self._config.env.name, self._open_log(), self._env_steps)
         first_steps = self._env_steps
         started = time.monotonic()
@@ -158,7 +158,7 @@ class _SyncTrainer:
 
     def _report(self, reporter: Reporter, pending: tuple[int, IterationMetrics] | None) -> None:
         if pending is not None:
-            reporter.report(*pending)
+            reporter.report(*pending, self._iteration.times)
             self._link.beat("running", self._iterations)
 
     def _agree_to_stop(self) -> bool:
@@ -185,8 +185,12 @@ class _SyncTrainer:
             env_state,
             gmi=self._link.gmi,
             leader=self._leader,
-            barrier=lambda: self._reducer.all_gather(np.zeros(1, np.float32)),
+            barrier=self._meet,
         )
+
+    def _meet(self) -> None:
+        """Returns when all GMIs have called it."""
+        self._reducer.all_gather(np.zeros(1, np.float32))
 
     def _meta(self) -> CheckpointMeta:
         algo = self._config.algo

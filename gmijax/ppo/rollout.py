@@ -24,16 +24,14 @@ class RolloutStats(NamedTuple):
       advantage: moments of the advantages, [].
       episodes: sums over the episodes that ended.
       reward_sum: [] sum of all rewards, unscaled.
-      nonfinite_obs: [] number of steps with a NaN or infinite observation.
-      nonfinite_reward: [] number of steps with a NaN or infinite reward.
+      diverged: [] steps that ended a world because of a bad number, by where it was.
     """
 
     obs: Moments
     advantage: Moments
     episodes: EpisodeSums
     reward_sum: Array
-    nonfinite_obs: Array
-    nonfinite_reward: Array
+    diverged: dict[str, Array]
 
 
 class Transition(NamedTuple):
@@ -46,6 +44,13 @@ class Transition(NamedTuple):
     next_obs: Array
     terminated: Array
     truncated: Array
+
+
+class Counts(NamedTuple):
+    """What a step of all environments counts, [] each."""
+
+    episodes: EpisodeSums
+    diverged: dict[str, Array]
 
 
 def policy_noise(keys: PRNGKey, action_size: int) -> Array:
@@ -63,17 +68,12 @@ def act(
     moments: Moments,
     env_state: BatchState,
     action_size: int,
-) -> tuple[BatchState, Array, Array, Array]:
-    """Draws one action per environment: `(env_state, normalised obs, mean, action)`."""
+) -> tuple[BatchState, Array, Array]:
+    """Draws one action per environment: `(env_state, mean [N, A], action [N, A])`."""
     env_state, keys = split_keys(env_state)
-    obs = normalize(moments, env_state.env.obs)
-    mean = networks.action_mean(params, obs)
-    return (
-        env_state,
-        obs,
-        mean,
-        mean + jnp.exp(params.log_std) * policy_noise(keys, action_size),
-    )
+    mean = networks.action_mean(params, normalize(moments, env_state.env.obs))
+    noise = policy_noise(keys, action_size)
+    return env_state, mean, mean + jnp.exp(params.log_std) * noise
 
 
 def collect(
@@ -91,26 +91,24 @@ def collect(
       The environments' state, samples [T, N], and this GMI's statistics.
     """
 
-    def step(state: BatchState, _: None) -> tuple[BatchState, tuple[Transition, EpisodeSums]]:
+    def step(state: BatchState, _: None) -> tuple[BatchState, tuple[Transition, Counts]]:
         raw_obs = state.env.obs
-        state, _, mean, action = act(networks, params, moments, state, env.spec.action_size)
+        state, mean, action = act(networks, params, moments, state, env.spec.action_size)
         state, out = env.step(model, state, action)
         kept = Transition(
             raw_obs, action, mean, out.reward, out.next_obs, out.terminated, out.truncated
         )
-        return state, (kept, out.finished)
+        return state, (kept, Counts(out.finished, out.diverged))
 
-    env_state, (rollout, finished) = jax.lax.scan(
-        step, env_state, None, length=config.unroll_length
-    )
+    env_state, (rollout, counts) = jax.lax.scan(step, env_state, None, length=config.unroll_length)
     samples = _with_advantages(networks, config, params, moments, rollout)
+    totals = jax.tree.map(lambda x: jnp.sum(x, axis=0, dtype=jnp.float32), counts)
     stats = RolloutStats(
         obs=moments_of(rollout.obs, 2),
         advantage=moments_of(samples.advantage, 2),
-        episodes=jax.tree.map(lambda x: jnp.sum(x, axis=0), finished),
+        episodes=totals.episodes,
         reward_sum=jnp.sum(rollout.reward),
-        nonfinite_obs=_count_nonfinite(rollout.next_obs),
-        nonfinite_reward=_count_nonfinite(rollout.reward[..., None]),
+        diverged=totals.diverged,
     )
     return env_state, samples, stats
 
@@ -150,8 +148,3 @@ def _with_advantages(
         value=values,
         advantage=advantage,
     )
-
-
-def _count_nonfinite(values: Array) -> Array:
-    bad = ~jnp.all(jnp.isfinite(values), axis=-1)
-    return jnp.sum(bad.astype(jnp.float32))

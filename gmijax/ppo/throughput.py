@@ -12,7 +12,6 @@ from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 from gmijax.collectives.interface import Reducer
@@ -52,7 +51,7 @@ def measure_throughput(
 
     def policy_actions(learned: LearnerState, envs: BatchState) -> tuple[BatchState, Array]:
         moments = acting_moments(learner, learned)
-        envs, _, _, action = act(
+        envs, _, action = act(
             learner.networks, learned.params, moments, envs, env.spec.action_size
         )
         return envs, action
@@ -62,13 +61,12 @@ def measure_throughput(
 
         def unroll(
             model: PyTree, learned: LearnerState, envs: BatchState, choose: Any = choose
-        ) -> tuple[BatchState, Array]:
-            def step(envs: BatchState, _: None) -> tuple[BatchState, Array]:
+        ) -> BatchState:
+            def step(_: int, envs: BatchState) -> BatchState:
                 envs, action = choose(learned, envs)
-                envs, out = env.step(model, envs, action)
-                return envs, jnp.sum(out.reward)
+                return env.step(model, envs, action)[0]
 
-            return jax.lax.scan(step, envs, None, length=config.algo.unroll_length)
+            return jax.lax.fori_loop(0, config.algo.unroll_length, step, envs)
 
         program = _compile_once(unroll, (env.model, state, env_state), reducer)
         rate, env_state = _rate(program, env.model, state, env_state, config, reducer)
@@ -96,8 +94,8 @@ def _rate(
         reducer.all_gather(np.zeros(1, np.float32))
         started = time.monotonic()
         for _ in range(repeats):
-            envs, rewards = program(model, state, envs)
-        jax.block_until_ready((envs, rewards))
+            envs = program(model, state, envs)
+        jax.block_until_ready(envs)
         return time.monotonic() - started, envs
 
     _, env_state = timed(1, env_state)

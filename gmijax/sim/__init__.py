@@ -1,0 +1,1 @@
+"""Environments: tasks simulated by MuJoCo MJX, and what wraps them."""

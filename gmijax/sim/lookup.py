@@ -17,9 +17,7 @@ def sensor_addresses(mj_model: mujoco.MjModel, names: Sequence[str]) -> Addresse
     return np.concatenate([np.arange(start, start + size) for start, size in spans])
 
 
-def joint_addresses(
-    mj_model: mujoco.MjModel, names: Sequence[str]
-) -> tuple[Addresses, Addresses]:
+def joint_addresses(mj_model: mujoco.MjModel, names: Sequence[str]) -> tuple[Addresses, Addresses]:
     """Where hinge and slide joints `names` lie in `qpos` and in `qvel`."""
     joints = [mj_model.joint(name) for name in names]
     return (

@@ -57,9 +57,7 @@ def total_reward(
         name: term.weight * term.fn(view) for name, term in terms.items() if term.weight != 0.0
     }
     if replacement is not None:
-        values = {
-            name: jnp.where(replacement.when, 0.0, value) for name, value in values.items()
-        }
+        values = {name: jnp.where(replacement.when, 0.0, value) for name, value in values.items()}
         values[replacement.name] = jnp.where(replacement.when, replacement.value, 0.0)
     return sum(values.values(), jnp.zeros(())), values
 

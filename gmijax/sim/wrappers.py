@@ -8,12 +8,14 @@ k processes with n environments each see the samples of one process with k x n, 
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import reduce
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 
 from gmijax.errors import ConfigError
+from gmijax.sim.divergence import diverged_by_source, end_diverged
 from gmijax.sim.interface import Env, EnvSpec, EnvState
 from gmijax.types import Array, PRNGKey, PyTree
 
@@ -62,6 +64,8 @@ class StepOutput(NamedTuple):
       terminated: [N] bool, the task has ended.
       truncated: [N] bool, time ran out.
       finished: the episodes that ended in this step.
+      diverged: [] int32, worlds that were ended because of a bad number (they count as
+        terminated), and by where it was: `any` and `gmijax.sim.divergence.sources`.
     """
 
     next_obs: Array
@@ -69,6 +73,7 @@ class StepOutput(NamedTuple):
     terminated: Array
     truncated: Array
     finished: EpisodeSums
+    diverged: dict[str, Array]
 
 
 class BatchedEnv(NamedTuple):
@@ -161,13 +166,19 @@ def training_env(env: Env) -> BatchedEnv:
             batched.reset(model, keys), zero, dict.fromkeys(env.spec.reward_terms, zero)
         )
 
-    def step(
-        model: PyTree, state: BatchState, actions: Array
-    ) -> tuple[BatchState, StepOutput]:
+    def step(model: PyTree, state: BatchState, actions: Array) -> tuple[BatchState, StepOutput]:
         stepped = batched.step(model, state.env, actions)
+        bad = diverged_by_source(env, stepped)
+        bad["any"] = reduce(jnp.logical_or, bad.values())
+        stepped = end_diverged(state.env, stepped, bad["any"])
         returns, terms, finished = episode_statistics(state, stepped)
         output = StepOutput(
-            stepped.obs, stepped.reward, stepped.terminated, stepped.truncated, finished
+            next_obs=stepped.obs,
+            reward=stepped.reward,
+            terminated=stepped.terminated,
+            truncated=stepped.truncated,
+            finished=finished,
+            diverged={name: jnp.sum(where, dtype=jnp.int32) for name, where in bad.items()},
         )
         return BatchState(auto_reset(batched, model, stepped), returns, terms), output
 

@@ -10,6 +10,7 @@ import time
 from pathlib import Path
 
 import pytest
+from supervision import CHECKOUT, TESTS, gpu, machine, make_job, plan_config, reduce_config
 
 from gmijax.errors import BackendUnavailable, GmiFailed, JobInterrupted
 from gmijax.partition.backends import open_backend
@@ -21,7 +22,6 @@ from gmijax.partition.planner import make_plan
 from gmijax.partition.process_table import ProcessId, identify, wait_until_gone
 from gmijax.partition.supervisor import Supervisor
 from gmijax.rundir import RunPaths
-from supervision import CHECKOUT, TESTS, gpu, machine, make_job, plan_config, reduce_config
 
 pytestmark = pytest.mark.timeout(60)
 

@@ -11,13 +11,13 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+from supervision import CHECKOUT, TESTS, cpu_job
 
 from gmijax.errors import ConfigError, GmiFailed, JobInterrupted
 from gmijax.partition.gmi_process import GmiStatus
 from gmijax.partition.process_table import ProcessId, identify, wait_until_gone
 from gmijax.partition.supervisor import Job, Supervisor
 from gmijax.rundir import RunPaths, read_json
-from supervision import CHECKOUT, TESTS, cpu_job
 
 pytestmark = pytest.mark.timeout(30)
 
@@ -69,7 +69,7 @@ def test_failing_gmi_is_named_with_exit_code_and_last_line(run: RunPaths):
 
 
 def test_failing_gmi_is_named_with_its_own_error(run: RunPaths):
-    with pytest.raises(GmiFailed, match="GMI 0 failed: exit code 1: ValueError: the sum is off$"):
+    with pytest.raises(GmiFailed, match=r"GMI 0 failed: exit code 1: ValueError: the sum is off$"):
         run_job(cpu_job(run, ["raise_value_error", "deaf"]))
     assert "ValueError" in read_json(run.gmi(0).error)["traceback"]
 
@@ -105,13 +105,13 @@ def test_gmi_that_ignores_sigterm_is_killed_after_the_grace_time(run: RunPaths):
 
 
 def test_gmi_that_never_beats_fails_the_start(run: RunPaths):
-    with pytest.raises(GmiFailed, match="GMI 0 failed: did not start and compile within 0.5 s"):
+    with pytest.raises(GmiFailed, match=r"GMI 0 failed: did not start and compile within 0.5 s"):
         run_job(cpu_job(run, ["silent", "clean"], start=0.5))
 
 
 def test_gmi_without_progress_fails(run: RunPaths):
     with pytest.raises(
-        GmiFailed, match="GMI 1 failed: made no progress after iteration 5 within 0.5 s"
+        GmiFailed, match=r"GMI 1 failed: made no progress after iteration 5 within 0.5 s"
     ):
         run_job(cpu_job(run, ["train", "stall"], stall=0.5))
 

@@ -7,13 +7,13 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from supervision import machine, plan_config, reduce_config
 
 from gmijax.partition.backends import BACKENDS
 from gmijax.partition.backends.cpu import NO_FUSION_EMITTERS, cpu_environment
 from gmijax.partition.environment import extend_xla_flags, gmi_environment
 from gmijax.partition.plan import Plan
 from gmijax.partition.planner import make_plan
-from supervision import machine, plan_config, reduce_config
 
 GOLDEN = Path(__file__).parents[1] / "golden"
 INHERITED = {
@@ -52,7 +52,7 @@ def test_environment_is_the_golden_one(backend: str):
 
 def test_users_choices_are_kept():
     users = {"JAX_COMPILATION_CACHE_DIR": "/mine", "OMP_NUM_THREADS": "7"}
-    found = environment(planned("cpu"), **users)
+    found = environment(planned("cpu"), 0, **users)
     assert {name: found[name] for name in users} == users
 
 

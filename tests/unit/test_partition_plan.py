@@ -9,13 +9,13 @@ from typing import Any
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from supervision import gpu, machine, plan_config, reduce_config
 
 from gmijax.errors import BackendUnavailable, ConfigError
 from gmijax.partition.layout import Layout
 from gmijax.partition.machine import Machine
 from gmijax.partition.plan import Plan, Slice
 from gmijax.partition.planner import make_plan, split_cores
-from supervision import gpu, machine, plan_config, reduce_config
 
 MPS = Path("/usr/bin/nvidia-cuda-mps-control")
 
@@ -34,7 +34,7 @@ def test_even_layout_numbers_gmis_gpu_by_gpu():
 
 @pytest.mark.parametrize("bad", [(), ((0,), ()), ((0, 0),), ((1, 2),), ((0, 2),)])
 def test_layout_with_wrong_ids_is_refused(bad: tuple[tuple[int, ...], ...]):
-    with pytest.raises(ConfigError, match="plan.layout="):
+    with pytest.raises(ConfigError, match=r"plan.layout="):
         Layout(bad)
 
 

@@ -145,9 +145,7 @@ def look_up(mj_model: mujoco.MjModel) -> BallBalanceIds:
     )
 
 
-def draw_start(
-    ids: BallBalanceIds, mj_model: mujoco.MjModel, key: PRNGKey
-) -> tuple[Array, Array]:
+def draw_start(ids: BallBalanceIds, mj_model: mujoco.MjModel, key: PRNGKey) -> tuple[Array, Array]:
     """Random `qpos` [20] and `qvel` [18]: the tray at rest, the ball above it, falling inwards."""
     direction_key, distance_key, height_key, speed_key = jax.random.split(key, 4)
     direction = jax.random.uniform(direction_key, maxval=2.0 * jnp.pi)
@@ -163,9 +161,7 @@ def draw_start(
     qpos = jax.lax.dynamic_update_slice(
         jnp.array(mj_model.qpos0, jnp.float32), ball, (ids.ball_qpos,)
     )
-    return qpos, jax.lax.dynamic_update_slice(
-        jnp.zeros(mj_model.nv), velocity, (ids.ball_qvel,)
-    )
+    return qpos, jax.lax.dynamic_update_slice(jnp.zeros(mj_model.nv), velocity, (ids.ball_qvel,))
 
 
 def ball_of(ids: BallBalanceIds, state: physics.PhysicsState) -> tuple[Array, Array]:

@@ -1,0 +1,249 @@
+"""The controller of `gmijax.play`: from a checkpoint to returns and a film. No jax here.
+
+Two children do the work, each a fresh interpreter: `gmijax.playback` runs the episodes as the one
+GMI of a small plan, `gmijax.sim.render` films them.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import os
+import subprocess
+import sys
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, Final, NamedTuple
+
+from rich.console import Console
+from rich.table import Table
+
+from gmijax.config import PlanConfig, PlayConfig, ReduceConfig, to_dict
+from gmijax.errors import ConfigError, GmijaxError
+from gmijax.job import compilation_cache_dir
+from gmijax.partition.backends import open_backend
+from gmijax.partition.environment import gmi_environment
+from gmijax.partition.failures import last_line
+from gmijax.partition.machine import Machine, detect_machine
+from gmijax.partition.plan import Plan
+from gmijax.partition.planner import make_plan
+from gmijax.partition.supervisor import Job, Patience, Supervisor
+from gmijax.playdir import EXIT_NO_GL, PlayPaths
+from gmijax.resume import META, CheckpointMeta, find_checkpoint
+from gmijax.rundir import STEP_DIGITS, RunPaths, read_json, write_json
+from gmijax.sim.registry import require_task
+
+MEMORY_FRACTION: Final = 0.1
+"""Most of a GPU's memory that playing takes: beside a training job that reserves 0.8."""
+
+_PATIENCE: Final = Patience(
+    start_timeout_s=1200.0, stall_timeout_s=600.0, stop_timeout_s=60.0, grace_s=10.0
+)
+_GL: Final = "MUJOCO_GL"
+_FALLBACK_GLS: Final = ("egl", "osmesa")
+
+
+class Evaluation(NamedTuple):
+    """What playing a checkpoint leaves.
+
+    Attributes:
+      returns: the content of `returns.json`.
+      returns_json: that file.
+      videos: the films that were made.
+    """
+
+    returns: dict[str, Any]
+    returns_json: Path
+    videos: tuple[Path, ...]
+
+
+def play(config: PlayConfig, *, show: bool = False) -> Evaluation:
+    """Runs one episode per environment with the policy of a checkpoint, and films some of them.
+
+    Args:
+      config: what to play; see `python -m gmijax.play --help`.
+      show: print a table of the returns, and the paths of the files.
+
+    Raises:
+      ConfigError: bad input, e.g. no such run or checkpoint.
+      GmiFailed: the evaluation failed.
+      GmijaxError: a film was asked for and could not be made; the returns are there.
+    """
+    checkpoint = _find(config)
+    config = dataclasses.replace(
+        config,
+        checkpoint=str(checkpoint),
+        run=dataclasses.replace(config.run, dir=str(_run_of(checkpoint))),
+    )
+    meta = CheckpointMeta.read(checkpoint)
+    require_task(meta.env)
+    paths = _prepare(config, meta.env_steps)
+    console = Console(quiet=not show, soft_wrap=True, highlight=False)
+    console.print(f"checkpoint: {checkpoint}", markup=False)
+    with console.status(f"playing {config.num_envs} episodes"):
+        _evaluate(config, paths)
+    returns = read_json(paths.returns)
+    console.print(_table(returns))
+    console.print(f"returns: {paths.returns}", markup=False)
+    videos = () if config.video == "none" else _film(config, paths, console)
+    return Evaluation(returns, paths.returns, videos)
+
+
+def _find(config: PlayConfig) -> Path:
+    """The checkpoint that the configuration names."""
+    wanted, run_dir = config.checkpoint, config.run.dir
+    if wanted is None or wanted.isdecimal():
+        latest = _latest(run_dir or "last")
+        return latest if wanted is None else _at_step(_run_of(latest), int(wanted))
+    if not (Path(wanted) / META).is_file():
+        raise ConfigError(
+            f"checkpoint={wanted}: expected the folder of a checkpoint, or its env steps"
+        )
+    checkpoint = Path(wanted).resolve()
+    if run_dir is not None and _run_of(_latest(run_dir)) != _run_of(checkpoint):
+        raise ConfigError(f"checkpoint={wanted}: not of run.dir={run_dir}; leave out one of them")
+    return checkpoint
+
+
+def _latest(run_dir: str) -> Path:
+    try:
+        checkpoint = find_checkpoint(run_dir, "run.dir")
+    except ConfigError as error:
+        if run_dir != "last":
+            raise
+        raise ConfigError(str(error).replace("run.resume", "run.dir")) from None
+    if not RunPaths(_run_of(checkpoint)).config.is_file():
+        raise ConfigError(f"run.dir={run_dir}: no config.json in {_run_of(checkpoint)}")
+    return checkpoint
+
+
+def _at_step(run: Path, env_steps: int) -> Path:
+    checkpoint = RunPaths(run).checkpoint(env_steps)
+    if not (checkpoint / META).is_file():
+        found = sorted(RunPaths(run).checkpoints.glob(f"[0-9]*/{META}"))
+        steps = ", ".join(str(int(meta.parent.name)) for meta in found)
+        raise ConfigError(
+            f"checkpoint={env_steps}: no such checkpoint in {run}; there are {steps}"
+        )
+    return checkpoint
+
+
+def _run_of(checkpoint: Path) -> Path:
+    return checkpoint.parent.parent
+
+
+def _prepare(config: PlayConfig, env_steps: int) -> PlayPaths:
+    run = Path(str(config.run.dir))
+    root = run / "play" / f"{env_steps:0{STEP_DIGITS}d}"
+    paths = PlayPaths(root)
+    try:
+        write_json(RunPaths(root).config, to_dict(config))
+        # A film of an earlier evaluation must not lie beside the returns of this one.
+        for path in paths.results():
+            path.unlink(missing_ok=True)
+    except OSError as error:
+        raise ConfigError(f"run.dir={run}: cannot write to {root} ({error.strerror})") from None
+    return paths
+
+
+def _evaluate(config: PlayConfig, paths: PlayPaths) -> None:
+    machine = detect_machine()
+    plan = _light_plan(config.num_envs, machine)
+    run = RunPaths(paths.root)
+    with open_backend(plan, machine, run) as backend:
+        added = backend.environment(0)
+        Supervisor(
+            Job(
+                run=run,
+                gmis=plan.layout.gmis,
+                command=lambda _: [sys.executable, "-m", "gmijax.playback"],
+                environment=lambda gmi: _light_environment(plan, gmi, added),
+                backend=backend,
+                patience=_PATIENCE,
+            )
+        ).run()
+
+
+def _light_plan(num_envs: int, machine: Machine) -> Plan:
+    one = PlanConfig(
+        gpus=1,
+        gmis_per_gpu=1,
+        layout=None,
+        backend="auto",
+        sm_percent=None,
+        memory_fraction=MEMORY_FRACTION if machine.gpus else None,
+        template="auto",
+    )
+    nobody = ReduceConfig(strategy="auto", intra="auto", timeout_s=1.0)
+    return make_plan(one, nobody, num_envs, machine)
+
+
+def _light_environment(plan: Plan, gmi: int, added: Mapping[str, str]) -> dict[str, str]:
+    environment = gmi_environment(plan, gmi, dict(os.environ), compilation_cache_dir(), added)
+    # The GPU may be training: take what is needed when it is needed, up to the fraction.
+    return {**environment, "XLA_PYTHON_CLIENT_PREALLOCATE": "false"}
+
+
+def _film(config: PlayConfig, paths: PlayPaths, console: Console) -> tuple[Path, ...]:
+    """Films with the first OpenGL that works; each is tried in a fresh interpreter."""
+    users = os.environ.get(_GL)
+    tried = tuple(dict.fromkeys((users, *_FALLBACK_GLS) if users else _FALLBACK_GLS))
+    for gl in tried:
+        with console.status(f"filming with {gl}"):
+            exit_code = _render(gl, paths)
+        if exit_code == 0:
+            videos = tuple(path for path in (paths.mp4, paths.gif) if path.exists())
+            for video in videos:
+                console.print(f"video: {video}", markup=False)
+            return videos
+        # A broken driver may end the process with a signal instead of an error.
+        if exit_code != EXIT_NO_GL and exit_code > 0:
+            raise GmijaxError(
+                f"no video: {last_line(paths.render_log)} (log: {paths.render_log}); the returns "
+                "were evaluated"
+            )
+    reason = (
+        f"no video: no headless OpenGL (EGL or OSMesa) is to be had, tried {', '.join(tried)}; "
+        "install it with `apt-get install libegl1` or `apt-get install libosmesa6`; "
+        "the returns were evaluated"
+    )
+    if config.video != "auto":
+        raise GmijaxError(reason)
+    console.print(reason, markup=False)
+    return ()
+
+
+def _render(gl: str, paths: PlayPaths) -> int:
+    environment = {**os.environ, _GL: gl}
+    # MuJoCo sets it to what fits MUJOCO_GL, and refuses any other value.
+    environment.pop("PYOPENGL_PLATFORM", None)
+    with paths.render_log.open("ab") as log:
+        return subprocess.run(
+            [sys.executable, "-m", "gmijax.sim.render", str(paths.root)],
+            env=environment,
+            stdin=subprocess.DEVNULL,
+            stdout=log,
+            stderr=log,
+            check=False,
+        ).returncode
+
+
+def _table(returns: Mapping[str, Any]) -> Table:
+    how = "mean actions" if returns["deterministic"] else "sampled actions"
+    diverged = returns["num_diverged"]
+    table = Table(
+        title=f"{returns['env']} after {returns['env_steps']:,} env steps, {how}",
+        caption=(
+            f"{returns['num_envs']} episodes: {returns['num_terminated']} terminated"
+            f"{f' ({diverged} of them diverged)' if diverged else ''}, "
+            f"{returns['num_truncated']} ran out of time, {returns['num_cut_off']} cut off; "
+            f"{returns['compile_s']:.1f} s compiling, {returns['run_s']:.1f} s running"
+        ),
+    )
+    table.add_column("per episode")
+    for heading in ("mean", "std", "min", "max"):
+        table.add_column(heading, justify="right")
+    rows = {"return": returns["return"], "length": returns["length"]}
+    rows |= {f"  {name}": term for name, term in returns["terms"].items()}
+    for name, row in rows.items():
+        table.add_row(name, *(f"{row[key]:.2f}" for key in ("mean", "std", "min", "max")))
+    return table

@@ -1,0 +1,151 @@
+"""Main of the evaluating child of `gmijax.play`, started by `gmijax.evaluation` and nobody else.
+
+Restores a policy, runs episodes with it, and writes their returns and a trajectory to film.
+"""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from gmijax.config import EnvConfig, PlayConfig, PpoConfig, from_dict
+from gmijax.errors import ConfigError
+from gmijax.partition.child import ChildLink
+from gmijax.playdir import PlayPaths
+from gmijax.resume import CheckpointMeta
+from gmijax.rundir import RunPaths, read_json, write_json
+
+if TYPE_CHECKING:
+    import numpy as np
+    import numpy.typing as npt
+
+    from gmijax.ppo.episodes import Episodes
+    from gmijax.sim.interface import Env
+
+
+def main() -> int:
+    """Runs the evaluation; returns the exit code."""
+    link = ChildLink.from_environment()  # Pins the cores, so it comes before jax.
+    link.beat("starting", 0)
+    try:
+        _run(link)
+    except BaseException as error:  # The controller must learn of every way to fail.
+        link.report_error(error)
+        raise
+    link.beat("done", 0)
+    return 0
+
+
+def _run(link: ChildLink) -> None:
+    config = from_dict(PlayConfig, read_json(link.run.config))
+    checkpoint = Path(str(config.checkpoint))
+    trained = read_json(RunPaths(checkpoint.parent.parent).config)
+    env_config = from_dict(EnvConfig, trained["env"], "env.")
+    algo = from_dict(PpoConfig, trained["algo"], "algo.")
+    # jax starts here, in the environment that the plan prepared.
+    import jax
+
+    from gmijax.checkpoint import restore_learner
+    from gmijax.ppo.episodes import Options, run_episodes
+    from gmijax.ppo.learner import init_learner, make_learner
+    from gmijax.sim.physics import choose_impl
+    from gmijax.sim.registry import make_env
+
+    impl, why = choose_impl(config.physics.impl, jax.default_backend())
+    sys.stdout.write(f"{why}\n")
+    env = make_env(
+        env_config.name,
+        impl=impl,
+        episode_length=env_config.episode_length,
+        max_envs=config.num_envs,
+    )
+    _check_camera(config.camera, env)
+    learner = make_learner(env.spec, algo)
+    state = jax.jit(lambda key: init_learner(learner, env.spec.obs_size, key))(jax.random.key(0))
+    state = restore_learner(checkpoint, state)
+    link.beat("compiling", 0)
+    episodes = run_episodes(
+        env,
+        learner,
+        state,
+        Options(
+            num_envs=config.num_envs,
+            num_shown=config.video_envs,
+            seed=config.seed,
+            deterministic=config.deterministic,
+            max_steps=config.max_steps,
+        ),
+    )
+    paths = PlayPaths(link.run.root)
+    _write_trajectory(paths, env, episodes, config.video_envs)
+    device = jax.local_devices()[0]
+    about = {"impl": impl, "device": f"{device.platform}: {device.device_kind}"}
+    # Written last: whoever sees it finds the trajectory complete.
+    write_json(paths.returns, {**summarise(config, env.spec.name, episodes), **about})
+
+
+def summarise(config: PlayConfig, env_name: str, episodes: Episodes) -> dict[str, Any]:
+    """The content of `returns.json`, without the device."""
+    checkpoint = Path(str(config.checkpoint))
+    ended = episodes.terminated | episodes.truncated
+    return {
+        "env": env_name,
+        "checkpoint": str(checkpoint),
+        "env_steps": CheckpointMeta.read(checkpoint).env_steps,
+        "num_envs": config.num_envs,
+        "seed": config.seed,
+        "deterministic": config.deterministic,
+        "max_steps": config.max_steps,
+        "return": statistics(episodes.returns),
+        "length": statistics(episodes.lengths),
+        "terms": {name: statistics(sums) for name, sums in episodes.terms.items()},
+        "num_terminated": int(episodes.terminated.sum()),
+        "num_truncated": int(episodes.truncated.sum()),
+        "num_cut_off": int((~ended).sum()),
+        "num_diverged": int(episodes.diverged.sum()),
+        "compile_s": episodes.compile_s,
+        "run_s": episodes.run_s,
+        "episodes": [
+            {
+                "return": float(episodes.returns[i]),
+                "length": int(episodes.lengths[i]),
+                "terminated": bool(episodes.terminated[i]),
+                "truncated": bool(episodes.truncated[i]),
+                "diverged": bool(episodes.diverged[i]),
+                "terms": {name: float(sums[i]) for name, sums in episodes.terms.items()},
+            }
+            for i in range(config.num_envs)
+        ],
+    }
+
+
+def statistics(values: npt.NDArray[np.generic]) -> dict[str, float]:
+    """Mean, standard deviation (of the population), least and greatest of `values` [N]."""
+    return {name: float(getattr(values, name)()) for name in ("mean", "std", "min", "max")}
+
+
+def _check_camera(camera: str | None, env: Env) -> None:
+    names = [env.mj_model.camera(i).name for i in range(env.mj_model.ncam)]
+    if camera is not None and camera not in names:
+        allowed = ", ".join(["null", *filter(None, names)])
+        raise ConfigError(
+            f"camera={camera}: unknown camera of {env.spec.name}; allowed: {allowed}"
+        )
+
+
+def _write_trajectory(paths: PlayPaths, env: Env, episodes: Episodes, num_shown: int) -> None:
+    import mujoco
+    import numpy as np
+
+    mujoco.mj_saveModel(env.mj_model, str(paths.model))
+    np.savez(
+        paths.trajectory,
+        qpos=episodes.qpos,
+        lengths=episodes.lengths[:num_shown],
+        control_dt_s=env.spec.control_dt_s,
+    )
+
+
+if __name__ == "__main__":
+    sys.exit(main())

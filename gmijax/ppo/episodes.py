@@ -1,0 +1,169 @@
+"""Whole episodes with a trained policy: one per environment, nothing learned.
+
+An episode runs in chunks of one compiled program. A world whose episode is over stands still
+until the last one has ended, so no automatic reset is needed.
+"""
+
+from __future__ import annotations
+
+import time
+from functools import partial, reduce
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import numpy.typing as npt
+
+from gmijax.ppo.learner import Learner, LearnerState, acting_moments
+from gmijax.ppo.rollout import act
+from gmijax.sim.divergence import diverged_by_source, end_diverged
+from gmijax.sim.interface import Env, EnvState
+from gmijax.sim.wrappers import BatchState, env_keys, vectorise
+from gmijax.types import Array, PRNGKey, PyTree
+
+CHUNK_STEPS = 50
+"""Steps of the compiled program: at most so many are wasted after the last episode's end."""
+
+
+class Options(NamedTuple):
+    """How to run episodes.
+
+    Attributes:
+      num_envs: N.
+      num_shown: E, of how many environments the positions are kept.
+      seed: seed of starts and noise.
+      deterministic: act with the policy's mean instead of sampling.
+      max_steps: where episodes are cut off, None for nowhere.
+    """
+
+    num_envs: int
+    num_shown: int
+    seed: int
+    deterministic: bool
+    max_steps: int | None
+
+
+class Episodes(NamedTuple):
+    """What N episodes came to.
+
+    Attributes:
+      returns: [N] undiscounted returns.
+      lengths: [N] steps.
+      terminated: [N] bool, ended by the task.
+      truncated: [N] bool, ended by the time limit; neither means cut off.
+      diverged: [N] bool, terminated because of a bad number (see `gmijax.sim.divergence`).
+      terms: [N] each, what every reward term added to the returns.
+      qpos: [L + 1, E, nq] positions of the first E worlds, from the start to the end of the
+        longest of their episodes; L is that episode's length.
+      compile_s: seconds until the first step could run.
+      run_s: seconds of simulation.
+    """
+
+    returns: npt.NDArray[np.float32]
+    lengths: npt.NDArray[np.int32]
+    terminated: npt.NDArray[np.bool_]
+    truncated: npt.NDArray[np.bool_]
+    diverged: npt.NDArray[np.bool_]
+    terms: dict[str, npt.NDArray[np.float32]]
+    qpos: npt.NDArray[np.float32]
+    compile_s: float
+    run_s: float
+
+
+def run_episodes(env: Env, learner: Learner, state: LearnerState, options: Options) -> Episodes:
+    """Runs `options.num_envs` episodes of `env` (one world, with its time limit) to their ends."""
+    started = time.monotonic()
+    length = env.spec.episode_length
+    limit = length if options.max_steps is None else min(options.max_steps, length)
+    keys = env_keys(jax.random.key(options.seed), 0, options.num_envs)
+    batch = jax.jit(partial(_start, env))(env.model, keys)
+    arguments = (env.model, state, jnp.asarray(limit, jnp.int32))
+    chunk = jax.jit(partial(_run_chunk, env, learner, options))
+    compiled = chunk.lower(*arguments, batch).compile()
+    qpos = [np.asarray(_shown_qpos(env, batch.env, options.num_shown))[None]]
+    diverged = np.zeros(options.num_envs, bool)
+    compile_s = time.monotonic() - started
+    for _ in range(0, limit, CHUNK_STEPS):
+        batch, moved, bad = compiled(*arguments, batch)
+        qpos.append(np.asarray(moved))
+        diverged |= np.asarray(bad)
+        if not np.asarray(_is_running(batch.env, limit)).any():
+            break
+    run_s = time.monotonic() - started - compile_s
+    lengths = np.asarray(batch.env.steps)
+    return Episodes(
+        returns=np.asarray(batch.return_sum),
+        lengths=lengths,
+        terminated=np.asarray(batch.env.terminated),
+        truncated=np.asarray(batch.env.truncated),
+        diverged=diverged,
+        terms={name: np.asarray(sums) for name, sums in batch.term_sums.items()},
+        qpos=np.concatenate(qpos)[: int(lengths[: options.num_shown].max()) + 1],
+        compile_s=compile_s,
+        run_s=run_s,
+    )
+
+
+def _start(env: Env, model: PyTree, keys: PRNGKey) -> BatchState:
+    zero = jnp.zeros(keys.shape)
+    terms = dict.fromkeys(env.spec.reward_terms, zero)
+    return BatchState(vectorise(env).reset(model, keys), zero, terms)
+
+
+def _run_chunk(
+    env: Env,
+    learner: Learner,
+    options: Options,
+    model: PyTree,
+    state: LearnerState,
+    limit: Array,
+    batch: BatchState,
+) -> tuple[BatchState, Array, Array]:
+    """Moves every world by up to `CHUNK_STEPS`.
+
+    Returns:
+      The state, qpos [CHUNK_STEPS, E, nq], and which worlds diverged meanwhile, [N] bool.
+    """
+    step_all = vectorise(env).step
+    moments = acting_moments(learner, state)
+
+    def step(before: BatchState, _: None) -> tuple[BatchState, tuple[Array, Array]]:
+        drawn, _obs, mean, noisy = act(
+            learner.networks, state.params, moments, before, env.spec.action_size
+        )
+        moved = step_all(model, drawn.env, mean if options.deterministic else noisy)
+        moved, bad = _without_bad_numbers(env, before.env, moved)
+        after = BatchState(
+            moved,
+            before.return_sum + moved.reward,
+            {name: sums + moved.reward_terms[name] for name, sums in before.term_sums.items()},
+        )
+        running = _is_running(before.env, limit)
+        kept = _where(running, after, before)
+        return kept, (_shown_qpos(env, kept.env, options.num_shown), running & bad)
+
+    batch, (qpos, diverged) = jax.lax.scan(step, batch, None, length=CHUNK_STEPS)
+    return batch, qpos, jnp.any(diverged, axis=0)
+
+
+def _without_bad_numbers(env: Env, before: EnvState, state: EnvState) -> tuple[EnvState, Array]:
+    """Ends diverged worlds as training does, where they last were: they may be filmed."""
+    bad = reduce(jnp.logical_or, diverged_by_source(env, state).values())
+    ended = end_diverged(before, state, bad)
+    return ended._replace(physics=_where(bad, before.physics, ended.physics)), bad
+
+
+def _is_running(state: EnvState, limit: Array | int) -> Array:
+    return ~(state.terminated | state.truncated) & (state.steps < limit)
+
+
+def _where(chosen: Array, new: PyTree, old: PyTree) -> PyTree:
+    def pick(a: Array, b: Array) -> Array:
+        return jnp.where(jnp.expand_dims(chosen, range(1, a.ndim)), a, b)
+
+    return jax.tree.map(pick, new, old)
+
+
+def _shown_qpos(env: Env, state: EnvState, num_shown: int) -> Array:
+    return jax.vmap(env.qpos)(jax.tree.map(lambda leaf: leaf[:num_shown], state))

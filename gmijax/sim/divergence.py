@@ -1,0 +1,57 @@
+"""Worlds whose numbers left every bound: noticed, ended, and counted.
+
+MuJoCo in C resets a world by itself when its state is not finite or beyond 1e10
+(`mj_checkPos` and its kin); MJX does not, and one such world in 10^8 steps would poison the
+statistics and the weights of the whole job. Here such a step ends the episode with reward 0 and
+the last good observation. It is counted by where the bad number was, so that a task that makes
+them by mistake is not mistaken for a rare failure of the solver.
+"""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+
+from gmijax.sim.interface import Env, EnvState
+from gmijax.types import Array
+
+MAX_POSITION = 1e10
+"""Bound of positions, MuJoCo's own."""
+
+MAX_OBSERVATION = 1e5
+"""Bound of observations; one value beyond it would spoil their running variance."""
+
+
+def sources(term_names: tuple[str, ...]) -> tuple[str, ...]:
+    """Where a bad number can be: physics, observation, or a term of the reward."""
+    return ("physics", "observation", *(f"reward/{name}" for name in term_names))
+
+
+def diverged_by_source(env: Env, state: EnvState) -> dict[str, Array]:
+    """For worlds [N]: which of `sources` hold bad numbers, [N] bool each."""
+
+    def within(values: Array, bound: float) -> Array:
+        return jnp.all(jnp.abs(values) < bound, axis=-1)
+
+    bad = {
+        "physics": ~within(jax.vmap(env.qpos)(state), MAX_POSITION),
+        "observation": ~within(state.obs, MAX_OBSERVATION),
+    }
+    return bad | {
+        f"reward/{name}": ~jnp.isfinite(value) for name, value in state.reward_terms.items()
+    }
+
+
+def end_diverged(before: EnvState, state: EnvState, diverged: Array) -> EnvState:
+    """Ends the worlds [N] that `diverged`, with numbers that others can compute with."""
+
+    def zero(values: Array) -> Array:
+        return jnp.where(diverged, 0.0, values)
+
+    return state._replace(
+        obs=jnp.where(diverged[:, None], before.obs, state.obs),
+        reward=zero(state.reward),
+        reward_terms={name: zero(value) for name, value in state.reward_terms.items()},
+        terminated=state.terminated | diverged,
+        truncated=state.truncated & ~diverged,
+    )

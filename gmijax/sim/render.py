@@ -1,0 +1,246 @@
+"""Main of the filming child of `gmijax.play`: `python -m gmijax.sim.render PLAY_FOLDER`. No jax.
+
+Draws a trajectory with MuJoCo, without a display, through the OpenGL that MUJOCO_GL names. That
+choice is made when mujoco is imported and cannot be changed after, hence a child of its own.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+import sys
+from collections.abc import Generator, Iterator, Mapping
+from contextlib import ExitStack, contextmanager
+from itertools import chain
+from pathlib import Path
+from types import MappingProxyType
+from typing import Any, NamedTuple, TypeAlias
+
+import imageio_ffmpeg
+import numpy as np
+import numpy.typing as npt
+
+from gmijax.config import PlayConfig, from_dict
+from gmijax.playdir import EXIT_NO_GL, PlayPaths
+from gmijax.rundir import RunPaths, read_json
+
+MP4_MAX_FPS, GIF_MAX_FPS = 30.0, 15.0
+
+_H264_CRF = "20"
+_GIF_MAX_WIDTH = 480
+# GIF packs badly: a smaller picture, one palette for the whole film, chosen for what moves, and
+# a dither that stands still from frame to frame.
+_GIF_FILTER = (
+    f"scale=w='min(iw,{_GIF_MAX_WIDTH})':h=-2:flags=area,split[a][b];"
+    "[a]palettegen=max_colors=128:stats_mode=diff[p];"
+    "[b][p]paletteuse=dither=bayer:bayer_scale=5:diff_mode=rectangle"
+)
+_OUTPUT: Mapping[str, Mapping[str, Any]] = MappingProxyType(
+    {
+        ".mp4": {
+            "codec": "libx264",
+            "output_params": ["-crf", _H264_CRF, "-movflags", "+faststart"],
+        },
+        ".gif": {
+            "codec": "gif",
+            "pix_fmt_out": "pal8",
+            "output_params": ["-vf", _GIF_FILTER, "-loop", "0"],
+        },
+    }
+)
+_ENDED_BRIGHTNESS = 0.55
+
+Image: TypeAlias = npt.NDArray[np.uint8]
+Writer: TypeAlias = Generator[None, Image | None, None]
+
+
+class Timing(NamedTuple):
+    """Which steps of a trajectory become frames, so that a film plays in real time.
+
+    Attributes:
+      stride: steps per frame.
+      fps: frames per second.
+    """
+
+    stride: int
+    fps: float
+
+
+class Trajectory(NamedTuple):
+    """What is filmed; see `gmijax.playdir.PlayPaths.trajectory`.
+
+    Attributes:
+      qpos: [L + 1, E, nq].
+      lengths: [E] steps of every episode.
+      control_dt_s: seconds per step.
+    """
+
+    qpos: npt.NDArray[np.float32]
+    lengths: npt.NDArray[np.int32]
+    control_dt_s: float
+
+
+def main() -> int:
+    """Films the folder's trajectory; returns the exit code."""
+    folder = Path(sys.argv[1])
+    config = from_dict(PlayConfig, read_json(RunPaths(folder).config))
+    paths = PlayPaths(folder)
+    grid = grid_of(config.video_envs)
+    tile = tile_size(config.width, config.height, grid)
+    try:
+        # Whatever goes wrong up to the first picture is the fault of this OpenGL: a library
+        # that is missing shows as any of half a dozen errors, at import or later.
+        stage = Stage(paths.model, tile, config.camera)
+    except Exception as error:
+        sys.stderr.write(f"{type(error).__name__}: {error}\n")
+        return EXIT_NO_GL
+    film(paths, load_trajectory(paths.trajectory), stage, grid, config.video)
+    return 0
+
+
+class Stage:
+    """A model, a camera, and an off-screen OpenGL context.
+
+    Raises:
+      Exception: of any type, where OpenGL cannot be had.
+    """
+
+    def __init__(self, model: Path, tile: tuple[int, int], camera: str | None) -> None:
+        import mujoco
+
+        self._mujoco = mujoco
+        self._model = mujoco.MjModel.from_binary_path(str(model))
+        self._data = mujoco.MjData(self._model)
+        width, height = tile
+        # The buffer of the model's author need not hold the picture that is wanted.
+        self._model.vis.global_.offwidth = max(self._model.vis.global_.offwidth, width)
+        self._model.vis.global_.offheight = max(self._model.vis.global_.offheight, height)
+        self._camera = choose_camera(self._model, camera)
+        self._renderer = mujoco.Renderer(self._model, height, width)
+        self.picture(self._model.qpos0)
+
+    def picture(self, qpos: npt.NDArray[Any]) -> Image:
+        """The picture [height, width, 3] of one world at `qpos` [nq]."""
+        self._data.qpos[:] = qpos
+        self._mujoco.mj_fwdPosition(self._model, self._data)
+        self._renderer.update_scene(self._data, self._camera)
+        return self._renderer.render()
+
+
+def choose_camera(model: Any, wanted: str | None) -> int:
+    """Index of the camera: `wanted`, else `track`, else one that follows a body, else any.
+
+    A model without cameras gives -1, MuJoCo's free camera.
+    """
+    import mujoco
+
+    names = [model.camera(i).name for i in range(model.ncam)]
+    if wanted is not None:
+        return names.index(wanted)
+    if "track" in names:
+        return names.index("track")
+    modes = mujoco.mjtCamLight
+    tracking = (int(modes.mjCAMLIGHT_TRACK), int(modes.mjCAMLIGHT_TRACKCOM))
+    following = [i for i in range(model.ncam) if int(model.cam_mode[i]) in tracking]
+    return next(iter(following), 0 if names else -1)
+
+
+def load_trajectory(path: Path) -> Trajectory:
+    """Reads what `gmijax.playback` wrote."""
+    with np.load(path) as data:
+        return Trajectory(data["qpos"], data["lengths"], float(data["control_dt_s"]))
+
+
+def real_time(control_dt_s: float, max_fps: float) -> Timing:
+    """The finest timing with at most `max_fps` frames per second.
+
+    Example:
+      >>> real_time(0.01, 30.0)
+      Timing(stride=4, fps=25.0)
+    """
+    # Without the margin 60 steps a second at 30 frames could round up to a stride of 3.
+    stride = max(1, math.ceil(1.0 / (control_dt_s * max_fps) - 1e-6))
+    return Timing(stride, 1.0 / (control_dt_s * stride))
+
+
+def grid_of(num_tiles: int) -> tuple[int, int]:
+    """Columns and rows of a grid, as square as possible, with room for `num_tiles`."""
+    columns = math.ceil(math.sqrt(num_tiles))
+    return columns, math.ceil(num_tiles / columns)
+
+
+def tile_size(width: int, height: int, grid: tuple[int, int]) -> tuple[int, int]:
+    """Width and height of a tile, even numbers: H.264 takes no others."""
+    columns, rows = grid
+    return max(2, width // columns // 2 * 2), max(2, height // rows // 2 * 2)
+
+
+def compose(tiles: list[Image], grid: tuple[int, int]) -> Image:
+    """The tiles side by side, row by row; places without a tile are black."""
+    columns, rows = grid
+    tiles = tiles + [np.zeros_like(tiles[0])] * (columns * rows - len(tiles))
+    strips = [np.concatenate(tiles[row * columns : (row + 1) * columns], 1) for row in range(rows)]
+    return np.concatenate(strips, 0)
+
+
+def frames(
+    trajectory: Trajectory, stage: Stage, grid: tuple[int, int], stride: int
+) -> Iterator[Image]:
+    """Every `stride`-th step as a picture; a world whose episode is over is dimmed."""
+    last: dict[int, Image] = {}
+    for step in range(0, len(trajectory.qpos), stride):
+        tiles: list[Image] = []
+        for world, length in enumerate(trajectory.lengths):
+            if world not in last:
+                picture = stage.picture(trajectory.qpos[step, world])
+                if step > length:
+                    picture = (picture * _ENDED_BRIGHTNESS).astype(np.uint8)
+                    last[world] = picture
+                tiles.append(picture)
+            else:
+                tiles.append(last[world])
+        yield compose(tiles, grid)
+
+
+def film(
+    paths: PlayPaths, trajectory: Trajectory, stage: Stage, grid: tuple[int, int], video: str
+) -> None:
+    """Writes the film as mp4, as gif or as both; every picture is drawn once."""
+    mp4, gif = video in ("auto", "mp4", "both"), video in ("gif", "both")
+    timing = real_time(trajectory.control_dt_s, MP4_MAX_FPS if mp4 else GIF_MAX_FPS)
+    slower = real_time(1.0 / timing.fps, GIF_MAX_FPS)
+    drawn = frames(trajectory, stage, grid, timing.stride)
+    first = next(drawn)
+    with ExitStack() as stack:
+        writers: list[tuple[Writer, int]] = []
+        if mp4:
+            writers.append((stack.enter_context(_writer(paths.mp4, first, timing.fps)), 1))
+        if gif:
+            writer = stack.enter_context(_writer(paths.gif, first, slower.fps))
+            writers.append((writer, slower.stride))
+        for number, frame in enumerate(chain([first], drawn)):
+            for writer, every in writers:
+                if number % every == 0:
+                    writer.send(np.ascontiguousarray(frame))
+
+
+@contextmanager
+def _writer(path: Path, first: Image, fps: float) -> Iterator[Writer]:
+    """Pictures sent to it become a film at `path`, which appears when it is complete."""
+    partial = path.with_name(f".{path.name}")
+    writer: Writer = imageio_ffmpeg.write_frames(
+        str(partial),
+        (first.shape[1], first.shape[0]),
+        macro_block_size=1,
+        **{**_OUTPUT[path.suffix], "fps": fps, "quality": None},
+    )
+    writer.send(None)
+    try:
+        yield writer
+    finally:
+        writer.close()
+    os.replace(partial, path)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

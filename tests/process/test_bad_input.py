@@ -1,0 +1,54 @@
+"""Bad input: one line on standard error, exit code 2, nothing started."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+from training_jobs import train
+
+
+@pytest.mark.parametrize(
+    ("overrides", "said"),
+    [
+        (["env=antt"], "env=antt: unknown: did you mean ant?"),
+        (["num_env=3"], "unknown key num_env: did you mean num_envs?"),
+        (["algo.gamma=0.9"], "unknown key algo.gamma"),
+        (["num_envs=many"], "num_envs=many: expected an integer"),
+        (["num_envs=0"], "num_envs=0: must be at least 1"),
+        (["num_envs=3", "algo.unroll_length=1"], "do not divide into algo.num_minibatches=4"),
+        (["plan.backend=mps"], "plan.backend=mps"),
+        (["plan.backend=mig"], "plan.backend=mig"),
+        (["plan.backend=share"], "plan.backend=share"),
+        (["plan.backend=fpga"], "expected one of auto, mps, mig, share, cpu"),
+        (["plan.gpus=0"], "plan.gpus=0: must be at least 1"),
+        (["plan.layout=[[0,2]]"], "GMI ids must be 0 to 1"),
+        (["reduce.strategy=telepathy"], "expected one of auto, mpr"),
+        (["run.dir=."], "the run folder exists already"),
+        (["run.resume=nowhere"], "run.resume=nowhere: no such folder"),
+        (["run.resume=last"], "no run with a checkpoint"),
+        (["--verbose"], "unknown option --verbose"),
+        (["ant"], "ant: expected key=value"),
+    ],
+)
+def test_one_line_and_exit_code_two(overrides: list[str], said: str, tmp_path: Path) -> None:
+    done = train(*overrides, cwd=tmp_path)
+    assert done.returncode == 2, done.stderr
+    assert said in done.stderr
+    assert len(done.stderr.strip().splitlines()) == 1
+    assert done.stdout == ""
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_help_lists_every_key(tmp_path: Path) -> None:
+    done = train("--help", cwd=tmp_path)
+    assert done.returncode == 0
+    for key in ("num_envs", "plan.gmis_per_gpu", "algo.learning_rate", "run.resume", "seed"):
+        assert f"\n{key} " in done.stdout
+
+
+def test_cfg_job_prints_the_composed_configuration(tmp_path: Path) -> None:
+    done = train("--cfg", "job", "env=ant", "num_timesteps=30e6", cwd=tmp_path)
+    assert done.returncode == 0
+    assert "num_timesteps: 30000000" in done.stdout
+    assert "name: ant" in done.stdout

@@ -1,0 +1,118 @@
+"""Runs of `python -m gmijax.train` that are as small as they can be, for process tests."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+TINY = (
+    *("env=ball_balance", "num_envs=16", "algo.unroll_length=4", "algo.num_minibatches=2"),
+    *("algo.num_updates_per_batch=2", "run.measure_throughput=false", "run.grace_s=3"),
+)
+STEPS = 16 * 4
+"""Environment steps of one iteration of one GMI in a TINY run."""
+
+FOREVER = "num_timesteps=1000000000"
+
+
+def train(
+    *overrides: str, cwd: Path, timeout_s: float = 240.0
+) -> subprocess.CompletedProcess[str]:
+    """Runs a command to its end."""
+    return subprocess.run(
+        [sys.executable, "-m", "gmijax.train", *overrides],
+        cwd=cwd,
+        env=child_environment(),
+        capture_output=True,
+        text=True,
+        timeout=timeout_s,
+        check=False,
+    )
+
+
+def start(*overrides: str, cwd: Path) -> subprocess.Popen[bytes]:
+    """Starts a command; its output goes to files in `cwd`."""
+    with (cwd / "stdout.txt").open("wb") as out, (cwd / "stderr.txt").open("wb") as err:
+        return subprocess.Popen(
+            [sys.executable, "-m", "gmijax.train", *overrides],
+            cwd=cwd,
+            env=child_environment(),
+            stdout=out,
+            stderr=err,
+            start_new_session=True,
+        )
+
+
+def child_environment() -> dict[str, str]:
+    """The environment of a user who has gmijax installed or its checkout on the path."""
+    import gmijax
+
+    package = str(Path(gmijax.__file__).resolve().parent.parent)
+    path = os.pathsep.join(filter(None, (package, os.environ.get("PYTHONPATH"))))
+    return {**os.environ, "PYTHONPATH": path}
+
+
+def wait_until(condition: Callable[[], Any], timeout_s: float, what: str) -> Any:
+    """The first true value of `condition`; an assertion error with `what` if there is none."""
+    deadline = time.monotonic() + timeout_s
+    while time.monotonic() < deadline:
+        if value := condition():
+            return value
+        time.sleep(0.02)
+    raise AssertionError(f"not within {timeout_s} s: {what}")
+
+
+def iteration_of(run: Path, gmi: int) -> int:
+    """Iterations that a GMI says it has done."""
+    try:
+        return int(json.loads((run / f"gmi_{gmi}" / "heartbeat.json").read_text())["iteration"])
+    except (OSError, ValueError):
+        return 0
+
+
+def pids_of(run: Path) -> list[int]:
+    """Processes that belong to a run: their environment names its folder."""
+    marker = f"GMIJAX_RUN_DIR={run}".encode()
+    found = []
+    for entry in Path("/proc").iterdir():
+        if entry.name.isdigit():
+            try:
+                variables = (entry / "environ").read_bytes().split(b"\0")
+            except OSError:
+                continue
+            if marker in variables:
+                found.append(int(entry.name))
+    return found
+
+
+def gmi_pid(run: Path, gmi: int) -> int | None:
+    """The process of a GMI, None if it has not said so yet."""
+    try:
+        return int(json.loads((run / f"gmi_{gmi}" / "heartbeat.json").read_text())["pid"])
+    except (OSError, ValueError):
+        return None
+
+
+def kill(pid: int) -> None:
+    """SIGKILL, to a process that may just have ended by itself."""
+    try:
+        os.kill(pid, signal.SIGKILL)
+    except ProcessLookupError:
+        return
+
+
+def shared_memory() -> set[str]:
+    """Names in /dev/shm."""
+    return set(os.listdir("/dev/shm"))
+
+
+def mps_directories() -> set[str]:
+    """Pipe directories that a job might have left."""
+    return {path.name for path in Path("/tmp").glob("gmijax*")}

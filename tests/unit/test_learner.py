@@ -1,0 +1,154 @@
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from toy_env import point_mass
+
+from gmijax.cli import compose
+from gmijax.collectives.solo import SoloReducer
+from gmijax.ppo.learner import (
+    adapted_learning_rate,
+    apply_gradients,
+    gradients,
+    init_learner,
+    make_learner,
+    minibatch_order,
+    update_context,
+)
+from gmijax.ppo.programs import FusedIteration, SplitIteration, exchange_size
+from gmijax.ppo.rollout import collect, merge_stats
+from gmijax.sim.wrappers import env_keys
+
+N, T = 12, 8
+ENV = point_mass()
+
+
+@pytest.fixture(scope="module")
+def config():
+    return dataclasses.replace(
+        compose().algo,
+        unroll_length=T,
+        num_minibatches=4,
+        num_updates_per_batch=3,
+        policy_hidden_layer_sizes=(16,),
+        value_hidden_layer_sizes=(16,),
+    )
+
+
+@pytest.fixture(scope="module")
+def learner(config):
+    return make_learner(ENV.spec, config)
+
+
+def _start(learner, num_envs: int = N, first: int = 0):
+    state = init_learner(learner, ENV.spec.obs_size, jax.random.key(0))
+    keys = env_keys(jax.random.key(1), first, num_envs)
+    # In one jit, so that no two leaves share a buffer: iterations donate them.
+    return state, jax.jit(ENV.init)(ENV.model, keys)
+
+
+def _close(a, b, atol=1e-6):
+    jax.tree.map(lambda x, y: np.testing.assert_allclose(x, y, rtol=1e-4, atol=atol), a, b)
+
+
+def test_every_sample_is_visited_once_per_epoch(learner) -> None:
+    state, _ = _start(learner)
+    order = minibatch_order(learner, state, jnp.int32(0), T * N)
+    epochs = np.asarray(order).reshape(3, -1)
+    for epoch in epochs:
+        np.testing.assert_array_equal(np.sort(epoch), np.arange(T * N))
+    assert not np.array_equal(epochs[0], epochs[1])
+
+
+def test_orders_differ_between_ranks_and_iterations(learner) -> None:
+    state, _ = _start(learner)
+    first = minibatch_order(learner, state, jnp.int32(0), T * N)
+    other_rank = minibatch_order(learner, state, jnp.int32(1), T * N)
+    later = minibatch_order(learner, state._replace(iteration=jnp.int32(1)), jnp.int32(0), T * N)
+    assert not np.array_equal(first, other_rank)
+    assert not np.array_equal(first, later)
+
+
+def test_the_learning_rate_follows_the_divergence() -> None:
+    rate = jnp.float32(3e-4)
+    assert float(adapted_learning_rate(rate, jnp.float32(0.1), 0.01)) == pytest.approx(2e-4)
+    assert float(adapted_learning_rate(rate, jnp.float32(0.001), 0.01)) == pytest.approx(4.5e-4)
+    assert float(adapted_learning_rate(rate, jnp.float32(0.01), 0.01)) == pytest.approx(3e-4)
+    assert float(adapted_learning_rate(rate, jnp.float32(0.0), 0.01)) == pytest.approx(3e-4)
+    slowest = adapted_learning_rate(jnp.float32(1e-5), jnp.float32(1.0), 0.01)
+    assert float(slowest) == pytest.approx(1e-5)
+
+
+def test_both_paths_compute_the_same(learner, config) -> None:
+    fused = FusedIteration(ENV, learner)
+    split = SplitIteration(ENV, learner, SoloReducer(exchange_size(ENV.spec, config)))
+    results = []
+    for iteration in (fused, split):
+        state, envs = _start(learner)
+        iteration.compile(state, envs)
+        for _ in range(3):
+            state, envs, metrics = iteration(state, envs)
+        results.append((state.params, state.obs_moments, envs.env.obs, metrics))
+    # The second result carries counts as floats.
+    _close(results[0], jax.tree.map(lambda x: x, results[1]), atol=1e-4)
+
+
+def test_shards_of_minibatches_give_the_update_of_the_whole(learner) -> None:
+    """Two GMIs with N environments against one process with 2 N, on the same samples."""
+    state, _ = _start(learner)
+    collected = [
+        collect(
+            ENV, learner.networks, learner.config, ENV.model, state.params, state.obs_moments, envs
+        )
+        for envs in (_start(learner, first=0)[1], _start(learner, first=N)[1])
+    ]
+    whole_envs = _start(learner, num_envs=2 * N)[1]
+    _, whole, whole_stats = collect(
+        ENV, learner.networks, learner.config, ENV.model, state.params, state.obs_moments,
+        whole_envs,
+    )  # fmt: skip
+    stats = merge_stats(jax.tree.map(lambda *x: jnp.stack(x), *[c[2] for c in collected]))
+    _close(stats.advantage, whole_stats.advantage, atol=1e-4)
+    _close(stats.obs, whole_stats.obs, atol=1e-3)
+    _close(stats.episodes, whole_stats.episodes)
+
+    context = update_context(learner, state, stats)
+    shards = [jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), c[1]) for c in collected]
+    whole = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), whole)
+    order = [minibatch_order(learner, state, jnp.int32(rank), T * N) for rank in range(2)]
+    sharded = single = state
+    for k in range(order[0].shape[0]):
+        parts = [
+            gradients(learner, sharded.params, shards[r], order[r][k], context) for r in range(2)
+        ]
+        mean = jax.tree.map(lambda *x: sum(x) / 2, *parts)
+        sharded = apply_gradients(learner, sharded, *mean)
+        # Sample (t, env) of shard r is row t * 2N + r * N + env of the whole.
+        rows = [(o[k] // N) * 2 * N + r * N + o[k] % N for r, o in enumerate(order)]
+        union = gradients(learner, single.params, whole, jnp.concatenate(rows), context)
+        single = apply_gradients(learner, single, *union)
+    _close(sharded.params, single.params, atol=2e-5)
+    np.testing.assert_allclose(sharded.learning_rate, single.learning_rate)
+
+
+def test_it_compiles_once_and_learns_to_stand_still(learner) -> None:
+    iteration = FusedIteration(ENV, learner)
+    state, envs = _start(learner, num_envs=64)
+    iteration.compile(state, envs)  # A compiled program cannot be traced again.
+    returns = []
+    for _ in range(40):
+        state, envs, metrics = iteration(state, envs)
+        returns.append(float(metrics.stats.reward_sum) / (T * 64))
+    assert np.mean(returns[-5:]) > np.mean(returns[:5]) + 0.2
+
+
+def test_the_normaliser_changes_only_between_iterations(learner) -> None:
+    iteration = FusedIteration(ENV, learner)
+    state, envs = _start(learner)
+    new, _, metrics = iteration(state, envs)
+    assert float(new.obs_moments.count) == T * N
+    assert int(new.iteration) == 1
+    # The first ratio of every iteration is 1, so the first losses see no clipping at all.
+    assert float(metrics.losses.clip_fraction) < 1.0

@@ -1,0 +1,53 @@
+import jax
+import jax.numpy as jnp
+import numpy as np
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from gmijax.normalize import OBS_CLIP, merge, merge_all, moments_of, no_samples, normalize, std_of
+
+
+def _samples(seed: int, count: int) -> np.ndarray:
+    rng = np.random.default_rng(seed)
+    return rng.normal(rng.normal(), 1.0 + rng.random(), size=(count, 4)).astype(np.float32)
+
+
+@settings(deadline=None, max_examples=25)
+@given(st.integers(0, 1000), st.lists(st.integers(1, 50), min_size=1, max_size=5))
+def test_moments_of_parts_merge_to_the_moments_of_all(seed: int, sizes: list[int]) -> None:
+    parts = [_samples(seed + k, size) for k, size in enumerate(sizes)]
+    merged = no_samples((4,))
+    for part in parts:
+        merged = merge(merged, moments_of(jnp.asarray(part), 1))
+    everything = np.concatenate(parts).astype(np.float64)
+    np.testing.assert_allclose(merged.count, len(everything))
+    np.testing.assert_allclose(merged.mean, everything.mean(0), atol=1e-4)
+    np.testing.assert_allclose(
+        merged.m2, ((everything - everything.mean(0)) ** 2).sum(0), rtol=1e-3, atol=1e-3
+    )
+
+
+@settings(deadline=None, max_examples=25)
+@given(st.integers(0, 1000))
+def test_merge_is_associative(seed: int) -> None:
+    a, b, c = (moments_of(jnp.asarray(_samples(seed + k, 5 + k)), 1) for k in range(3))
+    left, right = merge(merge(a, b), c), merge(a, merge(b, c))
+    jax.tree.map(lambda x, y: np.testing.assert_allclose(x, y, rtol=1e-3, atol=1e-3), left, right)
+
+
+def test_merge_all_equals_merging_one_by_one() -> None:
+    parts = [moments_of(jnp.asarray(_samples(k, 9)), 1) for k in range(3)]
+    stacked = jax.tree.map(lambda *x: jnp.stack(x), *parts)
+    expected = merge(merge(parts[0], parts[1]), parts[2])
+    jax.tree.map(np.testing.assert_array_equal, merge_all(stacked), expected)
+
+
+def test_without_samples_observations_pass_unchanged() -> None:
+    obs = jnp.array([1.0, -2.0, 3.0, 0.0])
+    np.testing.assert_array_equal(normalize(no_samples((4,)), obs), obs)
+
+
+def test_constant_inputs_and_outliers_stay_finite() -> None:
+    moments = moments_of(jnp.ones((10, 4)), 1)
+    assert np.all(std_of(moments) > 0)
+    np.testing.assert_array_equal(normalize(moments, jnp.full(4, 100.0)), OBS_CLIP)

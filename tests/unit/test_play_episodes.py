@@ -1,0 +1,115 @@
+"""Whole episodes on a world that can be worked out by hand."""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from gmijax.config import PpoConfig
+from gmijax.ppo.episodes import CHUNK_STEPS, Options, run_episodes
+from gmijax.ppo.learner import init_learner, make_learner
+from gmijax.sim import episode
+from gmijax.sim.interface import Env, EnvSpec, EnvState
+from gmijax.sim.wrappers import time_limit
+from gmijax.types import Array, PRNGKey, PyTree
+
+TIME_LIMIT = CHUNK_STEPS + 20
+SPEC = EnvSpec("counter", 1, 1, 0.1, TIME_LIMIT, ("plus", "minus"))
+
+
+def counting_env(reward: float = 1.0) -> Env:
+    """A world that counts steps, earns `reward` and pays 0.25 a step, ends by chance."""
+
+    def reset(model: PyTree, key: PRNGKey) -> EnvState:
+        key, draw = jax.random.split(key)
+        end = jax.random.randint(draw, (), 5, 2 * TIME_LIMIT)
+        return episode.begin(SPEC, jnp.zeros(1), end, jnp.zeros(1), key)
+
+    def step(model: PyTree, state: EnvState, action: Array) -> EnvState:
+        count = state.physics + 1.0
+        terms = {"plus": jnp.asarray(reward), "minus": jnp.asarray(-0.25)}
+        total = sum(terms.values(), jnp.zeros(()))
+        ended = count[0] >= state.task
+        return episode.advance(state, count, state.task, count / 100, (total, terms), ended)
+
+    env = Env(SPEC, (), reset, step, None, lambda state: state.physics)
+    return time_limit(env, TIME_LIMIT)
+
+
+@pytest.fixture(scope="module")
+def algo() -> PpoConfig:
+    return PpoConfig(
+        name="ppo",
+        unroll_length=4,
+        num_minibatches=1,
+        num_updates_per_batch=1,
+        discounting=0.99,
+        gae_lambda=0.95,
+        clipping_epsilon=0.2,
+        clip_value_loss=True,
+        value_cost=1.0,
+        entropy_cost=0.0,
+        bound_cost=0.0,
+        learning_rate=1e-3,
+        learning_rate_schedule="fixed",
+        desired_kl=0.01,
+        max_grad_norm=1.0,
+        reward_scaling=1.0,
+        normalize_observations=True,
+        normalize_advantage=True,
+        policy_hidden_layer_sizes=(4,),
+        value_hidden_layer_sizes=(4,),
+        init_noise_std=1.0,
+    )
+
+
+def episodes_of(algo: PpoConfig, env: Env, **changes: object):
+    learner = make_learner(SPEC, algo)
+    state = init_learner(learner, SPEC.obs_size, jax.random.key(1))
+    options = Options(num_envs=8, num_shown=3, seed=0, deterministic=True, max_steps=None)
+    return run_episodes(env, learner, state, options._replace(**changes))
+
+
+def test_every_environment_plays_one_episode_and_no_more(algo: PpoConfig):
+    played = episodes_of(algo, counting_env())
+    assert played.terminated.any()
+    assert played.truncated.any()
+    assert not played.diverged.any()
+    # Each ended in exactly one way, and time ran out at the limit and nowhere else.
+    assert (played.terminated ^ played.truncated).all()
+    np.testing.assert_array_equal(played.lengths == TIME_LIMIT, played.truncated)
+    np.testing.assert_allclose(played.returns, 0.75 * played.lengths)
+    np.testing.assert_allclose(played.terms["plus"], played.lengths)
+    np.testing.assert_allclose(played.terms["minus"], -0.25 * played.lengths)
+
+
+def test_positions_go_from_start_to_the_longest_shown_end(algo: PpoConfig):
+    played = episodes_of(algo, counting_env())
+    steps = np.arange(played.lengths[:3].max() + 1)[:, None]
+    # The world's one position is its step count, and it stands still after its end.
+    np.testing.assert_array_equal(played.qpos[..., 0], np.minimum(steps, played.lengths[:3]))
+
+
+def test_max_steps_cuts_episodes_off(algo: PpoConfig):
+    played = episodes_of(algo, counting_env(), max_steps=3)
+    assert played.lengths.tolist() == [3] * 8
+    assert not played.terminated.any()
+    assert not played.truncated.any()
+
+
+def test_environments_do_not_depend_on_how_many_there_are(algo: PpoConfig):
+    few = episodes_of(algo, counting_env(), num_envs=3, deterministic=False)
+    many = episodes_of(algo, counting_env(), deterministic=False)
+    np.testing.assert_array_equal(few.lengths, many.lengths[:3])
+
+
+def test_a_world_with_a_bad_number_ends_without_reward(algo: PpoConfig):
+    played = episodes_of(algo, counting_env(reward=float("nan")))
+    assert played.diverged.all()
+    assert played.terminated.all()
+    assert played.lengths.tolist() == [1] * 8
+    np.testing.assert_array_equal(played.returns, 0.0)
+    # It is shown where it was last all right.
+    np.testing.assert_array_equal(played.qpos, 0.0)

@@ -1,0 +1,148 @@
+"""What the controller of `play` decides before and after its children run."""
+
+from __future__ import annotations
+
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from rich.console import Console
+
+from gmijax import evaluation
+from gmijax.cli import command
+from gmijax.config import PlayConfig, to_dict
+from gmijax.errors import ConfigError, GmijaxError
+from gmijax.partition.machine import Machine
+from gmijax.partition.nvidia import Gpu
+from gmijax.playdir import EXIT_NO_GL, PlayPaths
+from gmijax.resume import META, CheckpointMeta
+from gmijax.rundir import RunPaths, write_json
+
+
+def config_of(*overrides: str) -> PlayConfig:
+    found: list[PlayConfig] = []
+    assert command("play", PlayConfig, lambda c: found.append(c) or 0, overrides) == 0
+    return found[0]
+
+
+@pytest.fixture
+def run(tmp_path: Path) -> RunPaths:
+    """A run folder with two checkpoints that hold nothing."""
+    paths = RunPaths(tmp_path / "runs" / "x")
+    write_json(paths.config, {})
+    for env_steps in (100, 2000):
+        meta = CheckpointMeta("ant", "ppo", env_steps, 1, 4, ((8,), (8,)), "jax")
+        write_json(paths.checkpoint(env_steps) / META, meta.to_dict())
+    return paths
+
+
+def test_the_latest_checkpoint_is_played_unless_one_is_named(
+    run: RunPaths, monkeypatch: pytest.MonkeyPatch
+):
+    monkeypatch.chdir(run.root.parents[1])
+    first, latest = run.checkpoint(100), run.checkpoint(2000)
+    for overrides, expected in (
+        ((), latest),
+        (("run.dir=last",), latest),
+        ((f"run.dir={run.root}",), latest),
+        ((f"run.dir={run.root}", "checkpoint=100"), first),
+        ((f"checkpoint={first}",), first),
+        ((f"run.dir={run.root}", f"checkpoint={first}"), first),
+    ):
+        assert evaluation._find(config_of(*overrides)) == expected
+
+
+@pytest.mark.parametrize(
+    ("overrides", "message"),
+    [
+        (("run.dir=nowhere",), "run.dir=nowhere: no such folder"),
+        (("run.dir=last",), "run.dir=last: no run with a checkpoint in runs/"),
+        (("run.dir={run}", "checkpoint=7"), "checkpoint=7: no such checkpoint.*are 100, 2000"),
+        (("checkpoint=nowhere",), "checkpoint=nowhere: expected the folder of a checkpoint"),
+    ],
+)
+def test_a_checkpoint_that_is_not_there_is_bad_input(
+    run: RunPaths,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    overrides: tuple[str, ...],
+    message: str,
+):
+    (tmp_path / "empty").mkdir()
+    monkeypatch.chdir(tmp_path / "empty")
+    config = config_of(*(text.format(run=run.root) for text in overrides))
+    with pytest.raises(ConfigError, match=message):
+        evaluation._find(config)
+
+
+def test_a_checkpoint_of_another_run_is_bad_input(run: RunPaths, tmp_path: Path):
+    other = tmp_path / "runs" / "y"
+    shutil.copytree(run.root, other)
+    config = config_of(f"run.dir={other}", f"checkpoint={run.checkpoint(100)}")
+    with pytest.raises(ConfigError, match=r"not of run\.dir"):
+        evaluation._find(config)
+
+
+def test_playing_leaves_a_gpu_to_the_job_that_trains_on_it():
+    machine = Machine(gpus=(Gpu(0, "GPU-1", "some GPU", 80000, (9, 0), False),), cpu_cores=(0, 1))
+    plan = evaluation._light_plan(4, machine)
+    environment = evaluation._light_environment(plan, 0, {})
+    assert environment["XLA_CLIENT_MEM_FRACTION"] == "0.1"
+    assert environment["XLA_PYTHON_CLIENT_PREALLOCATE"] == "false"
+
+
+@pytest.fixture
+def quiet() -> Console:
+    return Console(quiet=True)
+
+
+def test_every_opengl_is_tried_the_users_first(
+    tmp_path: Path, quiet: Console, monkeypatch: pytest.MonkeyPatch
+):
+    tried: list[str] = []
+    monkeypatch.setenv("MUJOCO_GL", "glfw")
+
+    def render(gl: str, paths: PlayPaths) -> int:
+        tried.append(gl)
+        # -11: a driver that crashes is no reason to give up either.
+        return {"glfw": EXIT_NO_GL, "egl": -11, "osmesa": 0}[gl]
+
+    monkeypatch.setattr(evaluation, "_render", render)
+    assert evaluation._film(config_of(), PlayPaths(tmp_path), quiet) == ()
+    assert tried == ["glfw", "egl", "osmesa"]
+
+
+def test_without_opengl_only_a_film_that_was_asked_for_is_an_error(
+    tmp_path: Path, quiet: Console, monkeypatch: pytest.MonkeyPatch
+):
+    monkeypatch.delenv("MUJOCO_GL", raising=False)
+    monkeypatch.setattr(evaluation, "_render", lambda *_: EXIT_NO_GL)
+    paths = PlayPaths(tmp_path)
+    assert evaluation._film(config_of("video=auto"), paths, quiet) == ()
+    with pytest.raises(GmijaxError, match=r"egl, osmesa.*libegl1.*libosmesa6.*were evaluated"):
+        evaluation._film(config_of("video=gif"), paths, quiet)
+
+
+def test_a_renderer_that_fails_for_another_reason_says_why(
+    tmp_path: Path, quiet: Console, monkeypatch: pytest.MonkeyPatch
+):
+    paths = PlayPaths(tmp_path)
+    paths.render_log.write_text("Traceback\nOSError: disk full\n")
+    monkeypatch.setattr(evaluation, "_render", lambda *_: 1)
+    with pytest.raises(GmijaxError, match="no video: OSError: disk full"):
+        evaluation._film(config_of("video=auto"), paths, quiet)
+
+
+def test_a_missing_opengl_is_noticed_by_the_child(tmp_path: Path):
+    pytest.importorskip("mujoco")
+    write_json(RunPaths(tmp_path).config, to_dict(config_of()))
+    code = evaluation._render("no-such-gl", PlayPaths(tmp_path))
+    assert code == EXIT_NO_GL, PlayPaths(tmp_path).render_log.read_text()
+
+
+def test_the_controller_loads_no_jax():
+    code = "import sys, gmijax.play; print(sorted({'jax', 'mujoco', 'flax'} & sys.modules.keys()))"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "[]"

@@ -1,0 +1,92 @@
+"""Geometry and timing of films; nothing is drawn."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from gmijax.sim import render
+
+
+@pytest.mark.parametrize(
+    ("control_dt_s", "max_fps", "stride", "fps"),
+    [
+        (1 / 60, 30.0, 2, 30.0),  # exactly the limit: no rounding to a stride of 3
+        (0.01, 30.0, 4, 25.0),
+        (0.1, 30.0, 1, 10.0),  # slower than the limit: every step
+        (1 / 30, 15.0, 2, 15.0),
+    ],
+)
+def test_films_play_in_real_time(control_dt_s: float, max_fps: float, stride: int, fps: float):
+    timing = render.real_time(control_dt_s, max_fps)
+    assert timing.stride == stride
+    assert timing.fps == pytest.approx(fps)
+
+
+@pytest.mark.parametrize(
+    ("num_tiles", "grid"), [(1, (1, 1)), (2, (2, 1)), (3, (2, 2)), (5, (3, 2)), (9, (3, 3))]
+)
+def test_grid_is_as_square_as_possible(num_tiles: int, grid: tuple[int, int]):
+    assert render.grid_of(num_tiles) == grid
+
+
+def test_tiles_have_even_sides_and_fit_the_picture():
+    assert render.tile_size(641, 481, (1, 1)) == (640, 480)
+    assert render.tile_size(640, 480, (3, 2)) == (212, 240)
+
+
+def test_tiles_are_laid_row_by_row_and_gaps_are_black():
+    tiles = [np.full((2, 4, 3), value, np.uint8) for value in (10, 20, 30)]
+    picture = render.compose(tiles, (2, 2))
+    assert picture.shape == (4, 8, 3)
+    assert picture[::2, ::4, 0].tolist() == [[10, 20], [30, 0]]
+
+
+class PaintedStage:
+    """Stands in for OpenGL: a picture is one pixel, as bright as the world's first position."""
+
+    def picture(self, qpos: np.ndarray) -> np.ndarray:
+        return np.full((1, 1, 3), qpos[0], np.uint8)
+
+
+def test_worlds_whose_episode_is_over_stand_still_and_dim():
+    qpos = np.array([[[100.0], [200.0]]] * 5, np.float32)
+    trajectory = render.Trajectory(qpos, np.array([4, 1]), 0.1)
+    pictures = list(render.frames(trajectory, PaintedStage(), (2, 1), 1))
+    assert [picture[0, :, 0].tolist() for picture in pictures] == [
+        [100, 200],
+        [100, 200],
+        *[[100, 110]] * 3,  # 0.55 x 200
+    ]
+
+
+def test_trajectory_is_read_back(tmp_path: Path):
+    qpos = np.arange(12, dtype=np.float32).reshape(3, 2, 2)
+    np.savez(tmp_path / "t.npz", qpos=qpos, lengths=[2, 1], control_dt_s=0.02)
+    trajectory = render.load_trajectory(tmp_path / "t.npz")
+    np.testing.assert_array_equal(trajectory.qpos, qpos)
+    assert trajectory.lengths.tolist() == [2, 1]
+    assert trajectory.control_dt_s == 0.02
+
+
+MODEL = """<mujoco><worldbody>
+  <camera name="still"/>{camera}<body><geom size="1"/></body>
+</worldbody></mujoco>"""
+
+
+@pytest.mark.parametrize(
+    ("camera", "wanted", "index"),
+    [
+        ("", None, 0),
+        ('<camera name="behind" mode="trackcom"/>', None, 1),
+        ('<camera name="behind" mode="trackcom"/><camera name="track"/>', None, 2),
+        ('<camera name="behind" mode="trackcom"/>', "still", 0),
+    ],
+)
+def test_a_tracking_camera_is_preferred(camera: str, wanted: str | None, index: int):
+    import mujoco
+
+    model = mujoco.MjModel.from_xml_string(MODEL.format(camera=camera))
+    assert render.choose_camera(model, wanted) == index
