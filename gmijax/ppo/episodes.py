@@ -129,7 +129,7 @@ def _run_chunk(
     moments = acting_moments(learner, state)
 
     def step(before: BatchState, _: None) -> tuple[BatchState, tuple[Array, Array]]:
-        drawn, _obs, mean, noisy = act(
+        drawn, mean, noisy = act(
             learner.networks, state.params, moments, before, env.spec.action_size
         )
         moved = step_all(model, drawn.env, mean if options.deterministic else noisy)
