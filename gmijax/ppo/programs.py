@@ -19,6 +19,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
+from jax.sharding import Sharding, SingleDeviceSharding
 
 from gmijax.collectives.interface import FloatBuffer, Reducer
 from gmijax.config import PpoConfig
@@ -88,6 +89,18 @@ def exchange_size(spec: EnvSpec, config: PpoConfig) -> int:
     key = jax.eval_shape(lambda: jax.random.key(0))
     state = jax.eval_shape(functools.partial(init_learner, learner, spec.obs_size), key)
     return sum(leaf.size for leaf in jax.tree.leaves(state.params)) + len(LossMetrics._fields)
+
+
+def _quick_to_read() -> Sharding | None:
+    """Where a GPU puts an output that the host reads next: into pinned host memory.
+
+    The program then ends with one transfer at full speed. Reading a device array instead goes
+    through pageable memory: 0.9 ms against 0.07 ms for 0.11M float32 on an H200.
+    """
+    device = jax.local_devices()[0]
+    if device.platform != "gpu":
+        return None
+    return SingleDeviceSharding(device, memory_kind="pinned_host")
 
 
 def _flat(samples: Samples) -> Samples:
@@ -161,7 +174,7 @@ class SplitIteration:
         self._rank = jnp.asarray(reducer.rank, jnp.int32)
         self._rollout: Any = jax.jit(self._rollout_fn, donate_argnums=(2,))
         self._begin: Any = jax.jit(self._begin_fn)
-        self._gradient: Any = jax.jit(self._gradient_fn)
+        self._gradient: Any = jax.jit(self._gradient_fn, out_shardings=_quick_to_read())
         self._apply: Any = jax.jit(self._apply_fn, donate_argnums=(0,))
         self._finish: Any = jax.jit(self._finish_fn, donate_argnums=(0,))
 

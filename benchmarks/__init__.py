@@ -1,0 +1,1 @@
+"""Benchmarks: cases as data (`cases`), one runner (`python -m benchmarks.run`)."""

@@ -1,0 +1,58 @@
+"""What is measured: suites of named training commands. Data only."""
+
+from __future__ import annotations
+
+from types import MappingProxyType
+from typing import NamedTuple
+
+
+class Case(NamedTuple):
+    """One command line of `python -m gmijax.train`.
+
+    Attributes:
+      name: what tables call it.
+      overrides: its hydra overrides.
+    """
+
+    name: str
+    overrides: tuple[str, ...]
+
+
+_ANT = ("env=ant", "physics.impl=jax", "run.checkpoint_every=0")
+_THIRTY = (*_ANT, "num_timesteps=30e6")
+
+SUITES = MappingProxyType(
+    {
+        # The same 8192 environments on one GPU: together, and in four GMIs.
+        "ant-1gpu": (
+            Case("1 GMI x 8192", (*_THIRTY, "num_envs=8192")),
+            Case(
+                "4 GMIs x 2048, mps",
+                (*_THIRTY, "num_envs=2048", "plan.gmis_per_gpu=4", "plan.backend=mps"),
+            ),
+            Case(
+                "4 GMIs x 2048, share",
+                (*_THIRTY, "num_envs=2048", "plan.gmis_per_gpu=4", "plan.backend=share"),
+            ),
+        ),
+        # What one GMI does with the environments that each of the four had.
+        "ant-small": (Case("1 GMI x 2048", (*_THIRTY, "num_envs=2048")),),
+        "ant-2gpu": (
+            Case(
+                "2 GPUs x 2 GMIs x 2048, mps",
+                (*_THIRTY, "num_envs=2048", "plan.gpus=2", "plan.gmis_per_gpu=2"),
+            ),
+            Case(
+                "2 GPUs x 2 GMIs x 2048, share",
+                (
+                    *(*_THIRTY, "num_envs=2048", "plan.gpus=2", "plan.gmis_per_gpu=2"),
+                    "plan.backend=share",
+                ),
+            ),
+            Case("2 GPUs x 1 GMI x 4096", (*_THIRTY, "num_envs=4096", "plan.gpus=2")),
+        ),
+        "ant-learns": (Case("1 GMI x 8192", (*_ANT, "num_envs=8192", "num_timesteps=150e6")),),
+        "ball-cpu": (Case("2 GMIs x 512", ("env=ball_balance", "plan.gpus=2")),),
+    }
+)
+"""Suite -> cases. Ratios are taken within a suite, whose cases run in turn."""
