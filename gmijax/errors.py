@@ -86,4 +86,4 @@ class NonFiniteError(GmijaxError):
 
 
 class JobInterrupted(GmijaxError):
-    """The user asked the job to stop, and it did, after writing a checkpoint."""
+    """The user asked the job to stop, and it did; once trained a little, it saved first."""

@@ -10,9 +10,10 @@ import dataclasses
 import os
 import signal
 import sys
+import threading
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -29,9 +30,10 @@ from gmijax.partition.plan import Plan
 from gmijax.partition.planner import make_plan
 from gmijax.partition.supervisor import Job, Patience, Supervisor
 from gmijax.progress import ConsoleProgress, Progress, SilentProgress
-from gmijax.results import MetricsReader, copy_history, draw_returns
+from gmijax.results import MetricsReader, copy_history, draw_returns, read_metrics
 from gmijax.resume import CheckpointMeta, check_fits, find_checkpoint
 from gmijax.rundir import RunPaths, create_run, read_json, write_json
+from gmijax.sim.impl import choose_impl
 from gmijax.sim.registry import require_task
 
 _VERSIONS = ("gmijax", "jax", "jaxlib", "mujoco-mjx", "flax", "optax", "orbax-checkpoint")
@@ -66,15 +68,12 @@ def train(config: TrainConfig, *, show: bool = False) -> Result:
     config = _with_checkpoint(config)
     machine = detect_machine()
     plan = make_plan(config.plan, config.reduce, config.num_envs, machine)
+    config, reason = _with_impl(config, plan)
     run = create_run(config.run.dir, config.run.name, f"{config.env.name}-{config.algo.name}")
     write_json(run.config, to_dict(config))
     write_json(run.plan, plan.to_dict())
     console = Console(stderr=False, quiet=not show, soft_wrap=True, highlight=False)
-    _announce(console, plan, run)
-    if config.run.resume:
-        history = Path(config.run.resume).parent.parent
-        steps = CheckpointMeta.read(Path(config.run.resume)).env_steps
-        copy_history(RunPaths(history).metrics, run.metrics, steps)
+    _announce(console, plan, reason, run)
     progress = (
         ConsoleProgress(console, MetricsReader(run.metrics), config.num_timesteps)
         if show
@@ -82,22 +81,49 @@ def train(config: TrainConfig, *, show: bool = False) -> Result:
     )
     status = "failed"
     try:
+        _copy_history(config, run)
         _run_gmis(config, plan, machine, run, progress)
         status = "completed"
     except JobInterrupted as error:
         status = "interrupted"
-        raise JobInterrupted(f"{error}; continue with run.resume={run.root}") from None
-    except ConfigError:
+        error.add_note(_what_is_left(run))
         raise
     except GmijaxError as error:
         error.add_note(f"run folder: {run.root}")
         raise
     finally:
-        summary = _summarise(config, plan, run, status, time.monotonic() - started)
-        write_json(run.summary, summary)
-        draw_returns(run.metrics, run.returns_png, f"{config.env.name}, {config.algo.name}")
+        # A full disk must not hide why the job failed.
+        with suppress(OSError):
+            summary = _summarise(config, plan, run, status, time.monotonic() - started)
+            write_json(run.summary, summary)
+            draw_returns(run.metrics, run.returns_png, f"{config.env.name}, {config.algo.name}")
+    summary = read_json(run.summary)
     console.print(_outcome(summary, run))
     return Result(run.root, summary)
+
+
+def _with_impl(config: TrainConfig, plan: Plan) -> tuple[TrainConfig, str]:
+    """The configuration with `physics.impl` decided, and the reason in words."""
+    platform = "cpu" if plan.backend == "cpu" else "gpu"
+    impl, why = choose_impl(config.physics.impl, platform)
+    decided = dataclasses.replace(config, physics=dataclasses.replace(config.physics, impl=impl))
+    return decided, f"physics.impl {impl}: {why}"
+
+
+def _what_is_left(run: RunPaths) -> str:
+    """What an interrupted job leaves, in words."""
+    if run.gmi(0).result.exists() and read_json(run.gmi(0).result)["status"] == "completed":
+        return f"training was complete: {run.root}"
+    if any(run.checkpoints.glob("[0-9]*")):
+        return f"continue with run.resume={run.root}"
+    return "there is no checkpoint yet"
+
+
+def _copy_history(config: TrainConfig, run: RunPaths) -> None:
+    if config.run.resume:
+        checkpoint = Path(config.run.resume)
+        steps = CheckpointMeta.read(checkpoint).env_steps
+        copy_history(RunPaths(checkpoint.parent.parent).metrics, run.metrics, steps)
 
 
 def _with_checkpoint(config: TrainConfig) -> TrainConfig:
@@ -115,6 +141,9 @@ def _with_checkpoint(config: TrainConfig) -> TrainConfig:
         hidden=(algo.policy_hidden_layer_sizes, algo.value_hidden_layer_sizes),
     )
     check_fits(meta, expected, "run.resume", wanted)
+    seed = read_json(RunPaths(checkpoint.parent.parent).config)["seed"]
+    if config.seed != seed:
+        raise ConfigError(f"seed={config.seed}: a resumed run keeps its seed {seed}")
     if meta.env_steps >= config.num_timesteps:
         raise ConfigError(
             f"num_timesteps={config.num_timesteps}: the checkpoint has {meta.env_steps} "
@@ -166,9 +195,12 @@ def compilation_cache_dir() -> Path:
 
 @contextmanager
 def _stopping_on_signals(request_stop: Callable[[], None]) -> Iterator[None]:
+    # Python delivers signals to the main thread only; elsewhere they are the caller's business.
+    is_main = threading.current_thread() is threading.main_thread()
     previous = {
         number: signal.signal(number, lambda *_: request_stop())
-        for number in (signal.SIGINT, signal.SIGTERM)
+        for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+        if is_main
     }
     try:
         yield
@@ -177,7 +209,7 @@ def _stopping_on_signals(request_stop: Callable[[], None]) -> Iterator[None]:
             signal.signal(number, handler)
 
 
-def _announce(console: Console, plan: Plan, run: RunPaths) -> None:
+def _announce(console: Console, plan: Plan, reason: str, run: RunPaths) -> None:
     layout = [list(gmis) for gmis in plan.layout.gmis_of_gpu]
     console.print(f"run folder: {run.root}")
     console.print(
@@ -185,14 +217,14 @@ def _announce(console: Console, plan: Plan, run: RunPaths) -> None:
         f"per GMI, template {plan.template}, reduction {plan.strategy}",
         markup=False,
     )
-    for reason in plan.reasons:
-        console.print(f"  {reason}", markup=False)
+    for text in (*plan.reasons, reason):
+        console.print(f"  {text}", markup=False)
 
 
 def _summarise(
     config: TrainConfig, plan: Plan, run: RunPaths, status: str, wall_s: float
 ) -> dict[str, Any]:
-    result = read_json(run.gmi(0).result) if run.gmi(0).result.exists() else {}
+    result = read_json(run.gmi(0).result) if run.gmi(0).result.exists() else _last_known(run)
     checkpoints = sorted(run.checkpoints.glob("[0-9]*"))
     return {
         "status": status,
@@ -217,8 +249,16 @@ def _summarise(
         "checkpoint": str(checkpoints[-1]) if checkpoints else None,
         "versions": {"python": sys.version.split()[0]} | _installed_versions(),
         "device": result.get("device"),
-        "impl": result.get("impl"),
+        "impl": config.physics.impl,
     }
+
+
+def _last_known(run: RunPaths) -> dict[str, Any]:
+    """What the metrics say of a job that did not end by itself."""
+    lines = read_metrics(run.metrics)
+    if not lines:
+        return {}
+    return {"env_steps": lines[-1]["env_steps"], "final_return": lines[-1]["return"]}
 
 
 def _installed_versions() -> dict[str, str | None]:

@@ -32,20 +32,15 @@ def _run(link: ChildLink) -> dict[str, Any]:
     config = from_dict(TrainConfig, read_json(link.run.config))
     plan = Plan.from_dict(read_json(link.run.plan))
     # jax starts here, in the environment that the plan prepared.
-    import jax
-
     from gmijax.collectives.build import Membership, build_reducer
     from gmijax.ppo.programs import exchange_size
     from gmijax.ppo.role import train
-    from gmijax.sim.physics import choose_impl
     from gmijax.sim.registry import make_env
     from gmijax.sim.wrappers import training_env
 
-    impl, why = choose_impl(config.physics.impl, jax.default_backend())
-    sys.stdout.write(f"physics.impl={impl}: {why}\n")
     env = make_env(
         config.env.name,
-        impl=impl,
+        impl=config.physics.impl,
         episode_length=config.env.episode_length,
         max_envs=config.num_envs,
     )
@@ -61,7 +56,7 @@ def _run(link: ChildLink) -> dict[str, Any]:
         ),
     )
     try:
-        return train(config, training_env(env), impl, reducer, link)
+        return train(config, training_env(env), reducer, link)
     finally:
         reducer.close()
 

@@ -29,7 +29,7 @@ def point_mass(episode_length: int = 20) -> BatchedEnv:
 
     def reset(model, key):
         key, draw = jax.random.split(key)
-        x = jax.random.uniform(draw, minval=-1.0, maxval=1.0)
+        x = jax.random.uniform(draw, minval=-2.0, maxval=2.0)
         state = outcome(x, jnp.zeros(()), jnp.zeros(1), jnp.zeros((), jnp.int32), key)
         zeros = {name: jnp.zeros(()) for name in state.reward_terms}
         return state._replace(

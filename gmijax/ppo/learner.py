@@ -22,6 +22,7 @@ from gmijax.types import Array, PRNGKey, PyTree
 
 _LEARNING_RATE_STEP = 1.5
 _LEARNING_RATE_RANGE = (1e-5, 1e-2)
+_UNMOVED_KL = 1e-6
 
 
 class LearnerState(NamedTuple):
@@ -149,11 +150,11 @@ def adapted_learning_rate(rate: Array, kl: Array, desired_kl: float) -> Array:
     """Steers the rate to keep the KL divergence per update near `desired_kl`.
 
     Divided by 1.5 above twice the target, multiplied by 1.5 below half of it (the rule of
-    Isaac Gym's trainers), within [1e-5, 1e-2]. No change at exactly 0: that is the first update
-    on a rollout, where the policy has not moved yet.
+    Isaac Gym's trainers), within [1e-5, 1e-2]. No change below 1e-6: that is the first update
+    on a rollout, where the policy has not moved yet and the rest is rounding.
     """
     low, high = _LEARNING_RATE_RANGE
     slower = jnp.maximum(rate / _LEARNING_RATE_STEP, low)
     faster = jnp.minimum(rate * _LEARNING_RATE_STEP, high)
-    too_slow = (kl < 0.5 * desired_kl) & (kl > 0.0)
+    too_slow = (kl < 0.5 * desired_kl) & (kl > _UNMOVED_KL)
     return jnp.where(kl > 2.0 * desired_kl, slower, jnp.where(too_slow, faster, rate))

@@ -175,6 +175,9 @@ class SplitIteration:
         self._rollout: Any = jax.jit(self._rollout_fn, donate_argnums=(2,))
         self._begin: Any = jax.jit(self._begin_fn)
         self._gradient: Any = jax.jit(self._gradient_fn, out_shardings=_quick_to_read())
+        self._update: Any = jax.jit(
+            self._update_fn, donate_argnums=(0,), out_shardings=(None, _quick_to_read())
+        )
         self._apply: Any = jax.jit(self._apply_fn, donate_argnums=(0,))
         self._finish: Any = jax.jit(self._finish_fn, donate_argnums=(0,))
 
@@ -192,6 +195,7 @@ class SplitIteration:
         self._rollout = self._rollout.lower(model, state, env_state, self._rank).compile()
         self._begin = self._begin.lower(state, gathered).compile()
         self._gradient = self._gradient.lower(*gradient_args).compile()
+        self._update = self._update.lower(state, buffer, *gradient_args[1:]).compile()
         self._apply = self._apply.lower(state, buffer).compile()
         self._finish = self._finish.lower(state, stats, losses).compile()
 
@@ -208,8 +212,8 @@ class SplitIteration:
         context, stats = self._begin(state, np.array(self._reducer.all_gather(mine)))
         losses: list[FloatBuffer] = []
         reduce_s = 0.0
-        for index in range(order.shape[0]):
-            buffer = self._gradient(state.params, samples, order, np.int32(index), context)
+        buffer = self._gradient(state.params, samples, order, np.int32(0), context)
+        for index in range(1, order.shape[0] + 1):
             mine = np.asarray(buffer)  # Waits for the gradient.
             exchanged = time.monotonic()
             # A copy: the reducer's view is overwritten by the next exchange, which may start
@@ -217,7 +221,10 @@ class SplitIteration:
             mean = np.array(self._reducer.mean(mine))
             reduce_s += time.monotonic() - exchanged
             losses.append(mean[-len(LossMetrics._fields) :])
-            state = self._apply(state, mean)
+            if index < order.shape[0]:
+                state, buffer = self._update(state, mean, samples, order, np.int32(index), context)
+            else:
+                state = self._apply(state, mean)
         state, metrics = self._finish(state, stats, np.stack(losses))
         self.times = {"time/rollout_s": rollout_s, "time/reduce_s": reduce_s}
         return state, env_state, metrics
@@ -251,6 +258,20 @@ class SplitIteration:
         count = len(LossMetrics._fields)
         losses = LossMetrics(*buffer[-count:])
         return apply_gradients(self._learner, state, unravel(buffer[:-count]), losses)
+
+    def _update_fn(
+        self,
+        state: LearnerState,
+        buffer: Array,
+        samples: Samples,
+        order: Array,
+        index: Array,
+        context: UpdateContext,
+    ) -> tuple[LearnerState, Array]:
+        # Between two exchanges there is one program, not two: each start of one costs time on
+        # the host, and that is most of what a small network's update takes.
+        state = self._apply_fn(state, buffer)
+        return state, self._gradient_fn(state.params, samples, order, index, context)
 
     def _finish_fn(
         self, state: LearnerState, stats: RolloutStats, losses: Array

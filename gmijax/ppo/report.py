@@ -27,12 +27,16 @@ class Reporter:
       last_return: mean return of the latest episodes, None while none has ended.
     """
 
-    def __init__(self, env_name: str, log: MetricsLog, env_steps: int) -> None:
+    def __init__(
+        self, env_name: str, log: MetricsLog, env_steps: int, wall_s: float = 0.0
+    ) -> None:
+        """Starts at `env_steps` and `wall_s` of training, those of the resumed run if any."""
         self._env_name = env_name
         self._log = log
         self._window = EpisodeWindow()
         self._env_steps = env_steps
-        self._started = self._last = time.monotonic()
+        self._last = time.monotonic()
+        self._started = self._last - wall_s
         self.iteration_s: list[float] = []
         self.last_return: float | None = None
 
@@ -48,7 +52,7 @@ class Reporter:
         """
         # Scalars only: the moments have O numbers each and are of no use in a log.
         scalars = metrics._replace(stats=metrics.stats._replace(obs=0.0, advantage=0.0))
-        host: Any = jax.tree.map(float, scalars)
+        host: Any = jax.tree.map(float, jax.device_get(scalars))
         now = time.monotonic()
         self._check_finite(host, env_steps)
         episodes = host.stats.episodes

@@ -24,13 +24,15 @@ from gmijax.partition.child import ChildLink
 from gmijax.ppo.learner import Learner, LearnerState, init_learner, make_learner
 from gmijax.ppo.programs import FusedIteration, Iteration, IterationMetrics, SplitIteration
 from gmijax.ppo.report import Reporter
-from gmijax.ppo.throughput import measure_throughput
+from gmijax.ppo.throughput import ThroughputMeter
+from gmijax.results import read_metrics
 from gmijax.resume import CheckpointMeta
+from gmijax.rundir import RunPaths, read_json, write_json
 from gmijax.sim.wrappers import BatchedEnv, BatchState, env_keys
 
 
 def train(
-    config: TrainConfig, env: BatchedEnv, impl: str, reducer: Reducer, link: ChildLink
+    config: TrainConfig, env: BatchedEnv, reducer: Reducer, link: ChildLink
 ) -> dict[str, Any]:
     """Trains until `num_timesteps` or until the controller asks for an end.
 
@@ -42,18 +44,17 @@ def train(
       ParameterMismatch: the GMIs' parameters differ.
       CollectiveError: another GMI is gone or stuck.
     """
-    return _SyncTrainer(config, env, impl, reducer, link).run()
+    return _SyncTrainer(config, env, reducer, link).run()
 
 
 class _SyncTrainer:
     """One GMI's training run; see `train`."""
 
     def __init__(
-        self, config: TrainConfig, env: BatchedEnv, impl: str, reducer: Reducer, link: ChildLink
+        self, config: TrainConfig, env: BatchedEnv, reducer: Reducer, link: ChildLink
     ) -> None:
         self._config = config
         self._env = env
-        self._impl = impl
         self._reducer = reducer
         self._link = link
         self._leader = reducer.rank == 0
@@ -76,10 +77,19 @@ class _SyncTrainer:
         started = time.monotonic()
         state, env_state = self._first_state()
         self._iteration.compile(state, env_state)
+        meter = ThroughputMeter(self._env, self._learner, self._config, self._reducer)
+        if self._config.run.measure_throughput:
+            meter.compile(state, env_state)
         compile_s = time.monotonic() - started
         self._link.beat("ready", 0)
         self._meet()  # Everybody has compiled: the clock may start.
-        reporter = Reporter(self._config.env.name, self._open_log(), self._env_steps)
+        history = read_metrics(self._link.run.metrics)
+        reporter = Reporter(
+            self._config.env.name,
+            self._open_log(history),
+            self._env_steps,
+            history[-1]["wall_s"] if history else 0.0,
+        )
         first_steps = self._env_steps
         started = time.monotonic()
         try:
@@ -97,13 +107,13 @@ class _SyncTrainer:
             "step_per_s_train": self._median_rate(reporter.iteration_s),
             "final_return": reporter.last_return,
             "checkpoint": str(self._checkpoint) if self._checkpoint else None,
-            "impl": self._impl,
             "device": _device(),
         }
         if self._config.run.measure_throughput and not stopped:
-            self._link.beat("running", self._iterations)
-            rates = measure_throughput(
-                self._env, self._learner, self._config, state, env_state, self._reducer
+            # Written before: whatever happens to the measurement, the training is done.
+            write_json(self._link.paths.result, done)
+            rates = meter.measure(
+                state, env_state, lambda: self._link.beat("running", self._iterations)
             )
             done |= rates._asdict()
         return done
@@ -118,13 +128,21 @@ class _SyncTrainer:
             return state, self._reset_envs(env_key)
         meta = CheckpointMeta.read(Path(resume))
         self._env_steps = meta.env_steps
-        state = restore_learner(Path(resume), state)
+        state = self._with_wanted_rate(restore_learner(Path(resume), state), Path(resume))
         # Other environments than the first run's: these never saw the first run's start.
         env_state = self._reset_envs(jax.random.fold_in(env_key, meta.env_steps % 2**31))
-        same = (self._reducer.world_size, self._config.num_envs, self._impl)
+        same = (self._reducer.world_size, self._config.num_envs, self._config.physics.impl)
         if (meta.num_gmis, meta.num_envs, meta.impl) == same:
             env_state = restore_envs(Path(resume), self._link.gmi, env_state)
         return state, env_state
+
+    def _with_wanted_rate(self, state: LearnerState, checkpoint: Path) -> LearnerState:
+        # The schedule's rate is part of the state, unless the user asks for another one now.
+        wanted = self._config.algo.learning_rate
+        saved = read_json(RunPaths(checkpoint.parent.parent).config)["algo"]["learning_rate"]
+        if wanted == saved:
+            return state
+        return state._replace(learning_rate=jnp.asarray(wanted, jnp.float32))
 
     def _reset_envs(self, key: jax.Array) -> BatchState:
         # The key of an environment comes from its number in the whole job, so that k GMIs of n
@@ -201,7 +219,7 @@ class _SyncTrainer:
             num_gmis=self._reducer.world_size,
             num_envs=self._config.num_envs,
             hidden=(algo.policy_hidden_layer_sizes, algo.value_hidden_layer_sizes),
-            impl=self._impl,
+            impl=self._config.physics.impl,
         )
 
     def _median_rate(self, iteration_s: list[float]) -> float | None:
@@ -209,11 +227,14 @@ class _SyncTrainer:
         steady = iteration_s[1:] or iteration_s
         return self._steps_per_iteration / statistics.median(steady) if steady else None
 
-    def _open_log(self) -> MetricsLog:
+    def _open_log(self, history: list[dict[str, Any]]) -> MetricsLog:
         if not self._leader:
             return MetricsLog(())
         run = self._link.run
-        return MetricsLog((JsonlSink(run.metrics), TensorBoardSink(run.tensorboard)))
+        board = TensorBoardSink(run.tensorboard)
+        for line in history:  # A resumed run starts with the lines of the one before.
+            board.write(line)
+        return MetricsLog((JsonlSink(run.metrics), board))
 
 
 def _device() -> dict[str, Any]:

@@ -9,6 +9,7 @@ from __future__ import annotations
 import statistics
 import time
 from collections.abc import Callable
+from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -24,7 +25,7 @@ from gmijax.types import Array, PyTree
 _BLOCKS = 3
 _BLOCK_S = 1.0
 
-Policy = Callable[[BatchState], tuple[BatchState, Array]]
+Choose = Callable[[LearnerState, BatchState], tuple[BatchState, Array]]
 
 
 class Throughput(NamedTuple):
@@ -34,78 +35,90 @@ class Throughput(NamedTuple):
     step_per_s_inference: float
 
 
-def measure_throughput(
+class ThroughputMeter:
+    """Measures both rates; every GMI of the job must use it in the same way."""
+
+    def __init__(
+        self, env: BatchedEnv, learner: Learner, config: TrainConfig, reducer: Reducer
+    ) -> None:
+        self._model = env.model
+        self._num_envs = config.num_envs
+        self._steps = config.algo.unroll_length
+        self._reducer = reducer
+        self._programs: list[Any] = [
+            jax.jit(partial(_unroll, env, choose, self._steps), donate_argnums=(2,))
+            for choose in (partial(_random, env), partial(_policy, env, learner))
+        ]
+
+    def compile(self, state: LearnerState, env_state: BatchState) -> None:
+        """Compiles both programs; part of the start, whose time limit it needs."""
+        self._programs = [
+            program.lower(self._model, state, env_state).compile() for program in self._programs
+        ]
+
+    def measure(
+        self, state: LearnerState, env_state: BatchState, beat: Callable[[], None]
+    ) -> Throughput:
+        """Measures; `env_state` is donated, `beat` is called after every unroll."""
+        rates = []
+        for program in self._programs:
+            rate, env_state = self._rate(partial(program, self._model, state), env_state, beat)
+            rates.append(rate)
+        return Throughput(*rates)
+
+    def _rate(
+        self,
+        unroll: Callable[[BatchState], BatchState],
+        env_state: BatchState,
+        beat: Callable[[], None],
+    ) -> tuple[float, BatchState]:
+        def timed(repeats: int, envs: BatchState) -> tuple[float, BatchState]:
+            self._reducer.all_gather(np.zeros(1, np.float32))
+            started = time.monotonic()
+            for _ in range(repeats):
+                envs = unroll(envs)
+            jax.block_until_ready(envs)
+            seconds = time.monotonic() - started
+            beat()
+            return seconds, envs
+
+        _, env_state = timed(1, env_state)
+        once_s, env_state = timed(1, env_state)
+        slowest_s = float(self._reducer.all_gather(np.array([once_s], np.float32)).max())
+        repeats = max(1, min(1000, round(_BLOCK_S / slowest_s)))
+        seconds = []
+        for _ in range(_BLOCKS):
+            block_s, env_state = timed(repeats, env_state)
+            seconds.append(block_s)
+        steps = self._num_envs * self._steps * repeats
+        mine = np.array([steps / statistics.median(seconds)], np.float32)
+        return float(self._reducer.all_gather(mine).sum()), env_state
+
+
+def _unroll(
     env: BatchedEnv,
-    learner: Learner,
-    config: TrainConfig,
-    state: LearnerState,
-    env_state: BatchState,
-    reducer: Reducer,
-) -> Throughput:
-    """Measures both rates; every GMI of the job must call it. `env_state` is donated."""
-
-    def random_actions(_: LearnerState, envs: BatchState) -> tuple[BatchState, Array]:
-        envs, keys = split_keys(envs)
-        size = (env.spec.action_size,)
-        return envs, jax.vmap(lambda k: jax.random.uniform(k, size, minval=-1.0))(keys)
-
-    def policy_actions(learned: LearnerState, envs: BatchState) -> tuple[BatchState, Array]:
-        moments = acting_moments(learner, learned)
-        envs, _, action = act(
-            learner.networks, learned.params, moments, envs, env.spec.action_size
-        )
-        return envs, action
-
-    rates = []
-    for choose in (random_actions, policy_actions):
-
-        def unroll(
-            model: PyTree, learned: LearnerState, envs: BatchState, choose: Any = choose
-        ) -> BatchState:
-            def step(_: int, envs: BatchState) -> BatchState:
-                envs, action = choose(learned, envs)
-                return env.step(model, envs, action)[0]
-
-            return jax.lax.fori_loop(0, config.algo.unroll_length, step, envs)
-
-        program = _compile_once(unroll, (env.model, state, env_state), reducer)
-        rate, env_state = _rate(program, env.model, state, env_state, config, reducer)
-        rates.append(rate)
-    return Throughput(*rates)
-
-
-def _compile_once(function: Any, arguments: tuple[PyTree, ...], reducer: Reducer) -> Any:
-    """Compiles on the leader first, so that the others find the program in the cache."""
-    lowered = jax.jit(function, donate_argnums=(2,)).lower(*arguments)
-    program = lowered.compile() if reducer.rank == 0 else None
-    reducer.all_gather(np.zeros(1, np.float32))
-    return program or lowered.compile()
-
-
-def _rate(
-    program: Any,
+    choose: Choose,
+    length: int,
     model: PyTree,
     state: LearnerState,
     env_state: BatchState,
-    config: TrainConfig,
-    reducer: Reducer,
-) -> tuple[float, BatchState]:
-    def timed(repeats: int, envs: BatchState) -> tuple[float, BatchState]:
-        reducer.all_gather(np.zeros(1, np.float32))
-        started = time.monotonic()
-        for _ in range(repeats):
-            envs = program(model, state, envs)
-        jax.block_until_ready(envs)
-        return time.monotonic() - started, envs
+) -> BatchState:
+    def step(_: int, envs: BatchState) -> BatchState:
+        envs, action = choose(state, envs)
+        return env.step(model, envs, action)[0]
 
-    _, env_state = timed(1, env_state)
-    once_s, env_state = timed(1, env_state)
-    slowest_s = float(reducer.all_gather(np.array([once_s], np.float32)).max())
-    repeats = max(1, min(1000, round(_BLOCK_S / slowest_s)))
-    seconds = []
-    for _ in range(_BLOCKS):
-        block_s, env_state = timed(repeats, env_state)
-        seconds.append(block_s)
-    steps = config.num_envs * config.algo.unroll_length * repeats
-    mine = np.array([steps / statistics.median(seconds)], np.float32)
-    return float(reducer.all_gather(mine).sum()), env_state
+    return jax.lax.fori_loop(0, length, step, env_state)
+
+
+def _random(env: BatchedEnv, _: LearnerState, envs: BatchState) -> tuple[BatchState, Array]:
+    envs, keys = split_keys(envs)
+    size = (env.spec.action_size,)
+    return envs, jax.vmap(lambda k: jax.random.uniform(k, size, minval=-1.0))(keys)
+
+
+def _policy(
+    env: BatchedEnv, learner: Learner, state: LearnerState, envs: BatchState
+) -> tuple[BatchState, Array]:
+    moments = acting_moments(learner, state)
+    envs, _, action = act(learner.networks, state.params, moments, envs, env.spec.action_size)
+    return envs, action

@@ -7,11 +7,10 @@ vectors, checkpoints stay small, and XLA sees which intermediate results nobody 
 
 from __future__ import annotations
 
-import importlib.util
 from collections.abc import Callable
 from dataclasses import dataclass
 from importlib import resources
-from typing import Literal, NamedTuple, TypeVar
+from typing import NamedTuple, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -19,9 +18,9 @@ import mujoco
 from mujoco import mjx
 
 from gmijax.errors import ConfigError
+from gmijax.sim.impl import Impl, choose_impl
 from gmijax.types import Array, PyTree
 
-Impl = Literal["jax", "warp"]
 T = TypeVar("T")
 
 WARP_MAX_ENVS = 16384
@@ -94,39 +93,6 @@ class Physics:
         # without sensors takes half as long again to compile, and did not run faster.
         state, readings = jax.lax.scan(substep, state, length=self.substeps)
         return state, jax.tree.map(lambda reading: reading[-1], readings)
-
-
-def choose_impl(
-    impl: str, device_platform: str, *, warp_installed: bool | None = None
-) -> tuple[Impl, str]:
-    """Decides which MJX implementation runs, and says why in a sentence.
-
-    Args:
-      impl: `auto`, `jax` or `warp`.
-      device_platform: JAX's name of the device: `cpu`, `gpu` or `cuda`.
-      warp_installed: whether warp-lang can be imported; None to find out.
-
-    Raises:
-      ConfigError: an unknown implementation, or `warp` without warp-lang.
-    """
-    if impl not in ("auto", "jax", "warp"):
-        raise ConfigError(f"physics.impl={impl}: allowed are auto, jax, warp")
-    if warp_installed is None:
-        warp_installed = importlib.util.find_spec("warp") is not None
-    if impl == "jax":
-        return "jax", "physics.impl=jax: asked for"
-    if impl == "warp":
-        if not warp_installed:
-            raise ConfigError(
-                "physics.impl=warp: needs the package warp-lang (pip install 'gmijax[warp]'); "
-                "allowed without it are auto, jax"
-            )
-        return "warp", "physics.impl=warp: asked for"
-    if device_platform not in ("gpu", "cuda"):
-        return "jax", f"physics.impl=jax: MJX-Warp is slow on {device_platform}"
-    if not warp_installed:
-        return "jax", "physics.impl=jax: warp-lang is not installed"
-    return "warp", "physics.impl=warp: on a GPU it is faster than MJX-JAX, and it is installed"
 
 
 def load(asset: str, *, impl: str, substeps: int, max_envs: int | None = None) -> Physics:

@@ -1,0 +1,62 @@
+"""Questions about processes that are not our children, answered by /proc; stdlib only."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterable
+from pathlib import Path
+from typing import NamedTuple
+
+_POLL_S = 0.02
+
+
+class ProcessId(NamedTuple):
+    """One process, told apart from a later one that got the same number.
+
+    Attributes:
+      pid: the process's number.
+      start_ticks: when it started, clock ticks since the machine booted.
+    """
+
+    pid: int
+    start_ticks: int
+
+    def is_running(self) -> bool:
+        """Whether exactly this process runs; a zombie does not."""
+        return identify(self.pid) == self
+
+
+def identify(pid: int | str) -> ProcessId | None:
+    """The running process with number `pid`, or None (also for a zombie).
+
+    `self` is the calling process, with its number in /proc. Where that is the one of another PID
+    namespace, `os.getpid` is not what other processes see there.
+    """
+    try:
+        stat = Path(f"/proc/{pid}/stat").read_bytes()
+    except OSError:
+        return None
+    # The second field is the program's name in brackets, which may itself hold blanks and
+    # brackets: count from the last one.
+    number, _, rest = stat.partition(b" ")
+    fields = rest.rpartition(b")")[2].split()
+    state, start_ticks = fields[0], int(fields[19])
+    return None if state in (b"Z", b"X") else ProcessId(int(number), start_ticks)
+
+
+def own_process() -> ProcessId:
+    """The calling process."""
+    own = identify("self")
+    if own is None:
+        raise OSError("/proc/self/stat: not readable")
+    return own
+
+
+def wait_until_gone(processes: Iterable[ProcessId], timeout_s: float) -> tuple[ProcessId, ...]:
+    """Waits until all have ended; returns those that still run after `timeout_s`."""
+    deadline_s = time.monotonic() + timeout_s
+    left = tuple(process for process in processes if process.is_running())
+    while left and time.monotonic() < deadline_s:
+        time.sleep(_POLL_S)
+        left = tuple(process for process in left if process.is_running())
+    return left

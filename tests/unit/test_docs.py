@@ -1,0 +1,73 @@
+"""The documents tell the truth about the files of the checkout and the terms of the rewards."""
+
+from __future__ import annotations
+
+import importlib
+import re
+from collections.abc import Mapping
+from pathlib import Path
+
+import pytest
+
+from gmijax.sim.registry import TASKS
+
+ROOT = Path(__file__).parents[2]
+ARCHITECTURE = ROOT / "docs" / "architecture.md"
+ENVIRONMENTS = ROOT / "docs" / "environments.md"
+FOLDERS = ("gmijax", "configs", "tests", "docs", "benchmarks", "examples", ".ci")
+
+QUOTED_PATH = re.compile(rf"`((?:{'|'.join(map(re.escape, FOLDERS))})/[\w./-]*)`")
+LINK = re.compile(r"!?\[[^\]]*\]\(([^)\s]+)\)")
+REWARD_ROW = re.compile(r"^\| `(\w+)` \|.*\| (-?[\d.]+) \|$", re.MULTILINE)
+
+
+def documents() -> list[Path]:
+    alone = [path for name in ("README.md", "CONTRIBUTING.md") if (path := ROOT / name).is_file()]
+    return [*alone, *sorted((ROOT / "docs").rglob("*.md"))]
+
+
+def linked_paths(text: str) -> list[str]:
+    """Targets of the links of a document that are paths, without the part behind `#`."""
+    prose = re.sub(r"```.*?```", "", text, flags=re.DOTALL)
+    targets = [target.partition("#")[0] for target in LINK.findall(prose)]
+    return [target for target in targets if target and not re.match(r"[a-z]+:", target)]
+
+
+def documented_weights(task: str) -> Mapping[str, float]:
+    """The table of rewards in the section of a task."""
+    sections = re.split(r"^## ", ENVIRONMENTS.read_text(), flags=re.MULTILINE)
+    section = next(text for text in sections if text.startswith(f"`{task}`"))
+    return {name: float(weight) for name, weight in REWARD_ROW.findall(section)}
+
+
+def test_every_file_of_the_package_is_in_the_architecture():
+    quoted = set(QUOTED_PATH.findall(ARCHITECTURE.read_text()))
+    files = {
+        path.relative_to(ROOT).as_posix()
+        for path in (ROOT / "gmijax").rglob("*")
+        if path.is_file() and "__pycache__" not in path.parts
+    }
+    assert sorted(files - quoted) == []
+
+
+@pytest.mark.parametrize("document", documents(), ids=lambda path: path.stem)
+def test_paths_that_a_document_names_exist(document: Path):
+    quoted = QUOTED_PATH.findall(document.read_text())
+    assert [path for path in quoted if not (ROOT / path).exists()] == []
+
+
+@pytest.mark.parametrize("document", documents(), ids=lambda path: path.stem)
+def test_relative_links_point_somewhere(document: Path):
+    linked = linked_paths(document.read_text())
+    assert [path for path in linked if not (document.parent / path).exists()] == []
+
+
+def test_only_relative_links_outside_of_code_are_looked_at():
+    text = "[a](b.md#c) ![d](img/e.png) [f](https://g.org) [h](#i)\n```\n[j](k.md)\n```"
+    assert linked_paths(text) == ["b.md", "img/e.png"]
+
+
+@pytest.mark.parametrize("task", sorted(TASKS))
+def test_reward_terms_and_weights_are_those_of_the_code(task: str):
+    terms = importlib.import_module(TASKS[task]).TERMS
+    assert documented_weights(task) == {name: term.weight for name, term in terms.items()}
