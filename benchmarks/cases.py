@@ -20,6 +20,7 @@ class Case(NamedTuple):
 
 _ANT = ("env=ant", "physics.impl=jax", "run.checkpoint_every=0")
 _THIRTY = (*_ANT, "num_timesteps=30e6")
+_TWO_GPUS = (*_THIRTY, "plan.gpus=2", "run.measure_throughput=false")
 
 SUITES = MappingProxyType(
     {
@@ -38,18 +39,15 @@ SUITES = MappingProxyType(
         # What one GMI does with the environments that each of the four had.
         "ant-small": (Case("1 GMI x 2048", (*_THIRTY, "num_envs=2048")),),
         "ant-2gpu": (
+            Case("2 GPUs x 1 GMI x 4096", (*_TWO_GPUS, "num_envs=4096")),
             Case(
                 "2 GPUs x 2 GMIs x 2048, mps",
-                (*_THIRTY, "num_envs=2048", "plan.gpus=2", "plan.gmis_per_gpu=2"),
+                (*_TWO_GPUS, "num_envs=2048", "plan.gmis_per_gpu=2", "plan.backend=mps"),
             ),
             Case(
                 "2 GPUs x 2 GMIs x 2048, share",
-                (
-                    *(*_THIRTY, "num_envs=2048", "plan.gpus=2", "plan.gmis_per_gpu=2"),
-                    "plan.backend=share",
-                ),
+                (*_TWO_GPUS, "num_envs=2048", "plan.gmis_per_gpu=2", "plan.backend=share"),
             ),
-            Case("2 GPUs x 1 GMI x 4096", (*_THIRTY, "num_envs=4096", "plan.gpus=2")),
         ),
         "ant-learns": (Case("1 GMI x 8192", (*_ANT, "num_envs=8192", "num_timesteps=150e6")),),
         "ball-cpu": (Case("2 GMIs x 512", ("env=ball_balance", "plan.gpus=2")),),

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import math
 import statistics
 import subprocess
 import sys
@@ -19,7 +20,7 @@ from benchmarks.cases import SUITES, Case
 from gmijax.results import read_metrics
 
 RESULTS = Path(__file__).parent / "results"
-RATES = ("step_per_s_sim", "step_per_s_inference", "step_per_s_train", "env_steps_per_s")
+RATES = ("step_per_s_sim", "step_per_s_inference", "step_per_s_train")
 CURVE_POINTS = 60
 
 
@@ -94,18 +95,18 @@ def table(results: dict[str, Any]) -> str:
     first: float | None = None
     for name, case in results["cases"].items():
         summaries = [run["summary"] for run in case["runs"]]
-        sim, inference, train = (median(summaries, rate) for rate in RATES[:3])
-        first = first or train
-        rows.append(
-            f"{name:32} {sim:10,.0f} {inference:10,.0f} {train:10,.0f} "
-            f"{train / first:6.2f} {median(summaries, 'final_return'):8,.0f}"
-        )
+        rates = [median(summaries, rate) for rate in RATES]
+        first = first or rates[-1]
+        shown = " ".join(f"{rate:10,.0f}" for rate in rates)
+        final = median(summaries, "final_return")
+        rows.append(f"{name:32} {shown} {rates[-1] / first:6.2f} {final:8,.0f}")
     return "\n".join(rows)
 
 
 def median(summaries: list[dict[str, Any]], key: str) -> float:
-    """Median of a figure over runs."""
-    return statistics.median(summary[key] for summary in summaries)
+    """Median of a figure over runs, NaN where it was not measured."""
+    values = [summary[key] for summary in summaries]
+    return math.nan if None in values else statistics.median(values)
 
 
 if __name__ == "__main__":
