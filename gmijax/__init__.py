@@ -9,14 +9,14 @@ from __future__ import annotations
 import importlib
 from typing import TYPE_CHECKING, Any
 
+from gmijax.version import __version__
+
 if TYPE_CHECKING:
     from gmijax.cli import compose
     from gmijax.job import Result, train
     from gmijax.sim.registry import make_env, task_names
 
-__version__ = "0.1.0"
-
-__all__ = ["Result", "compose", "make_env", "task_names", "train"]
+__all__ = ["Result", "__version__", "compose", "make_env", "task_names", "train"]
 
 _HOMES = {
     "Result": "gmijax.job",

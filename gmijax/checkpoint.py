@@ -19,8 +19,8 @@ import numpy as np
 import orbax.checkpoint as ocp
 
 from gmijax.errors import ConfigError
-from gmijax.resume import META, CheckpointMeta
-from gmijax.rundir import RunPaths, write_json
+from gmijax.resume import CheckpointMeta
+from gmijax.rundir import META, RunPaths, write_json
 from gmijax.types import PyTree
 
 T = TypeVar("T")
@@ -101,9 +101,13 @@ def _restore(folder: Path, template: T) -> T:
     try:
         with ocp.StandardCheckpointer() as checkpointer:
             restored = checkpointer.restore(folder.resolve(), plain)
-    except (ValueError, KeyError, FileNotFoundError) as error:
-        line = str(error).strip().splitlines()[0]
-        raise ConfigError(f"checkpoint {folder} does not fit this job: {line}") from error
+    except Exception as error:
+        # Orbax raises a plain `Exception` for an array that it cannot read. Anything else, such
+        # as a device without enough memory, does not say that the checkpoint is bad.
+        if not isinstance(error, ValueError | KeyError | OSError) and type(error) is not Exception:
+            raise
+        lines = str(error).strip().splitlines() or [type(error).__name__]
+        raise ConfigError(f"checkpoint {folder} does not fit this job: {lines[0]}") from error
     return jax.tree.map(_with_key, template, restored)
 
 

@@ -10,13 +10,14 @@ import dataclasses
 import re
 import sys
 import typing
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, TypeVar
 
 from hydra import compose as hydra_compose
 from hydra import initialize_config_dir
 from hydra.core.override_parser.overrides_parser import OverridesParser
+from hydra.core.override_parser.types import Override
 from hydra.errors import HydraException
 from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
@@ -25,8 +26,7 @@ from rich.table import Table
 
 from gmijax.config import TrainConfig, from_dict, suggestion, to_dict
 from gmijax.errors import ConfigError, GmijaxError, JobInterrupted
-from gmijax.resume import find_checkpoint
-from gmijax.rundir import RunPaths, read_json
+from gmijax.resume import find_checkpoint, saved_config
 
 C = TypeVar("C")
 
@@ -83,18 +83,16 @@ def choices(group: str) -> list[str]:
 
 def _build(name: str, cls: type[C], overrides: Sequence[str]) -> C:
     data = _compose_dict(name, overrides)
-    resume = data["run"].get("resume") if cls is TrainConfig else None
-    if resume:
-        data = _on_top_of_saved(data, overrides, str(resume))
+    if cls is TrainConfig:
+        _check_task_key(_parse(overrides))
+        if isinstance(data["run"], dict) and data["run"].get("resume"):
+            data = _on_top_of_saved(data, overrides, str(data["run"]["resume"]))
     return from_dict(cls, data)
 
 
 def _compose_dict(name: str, overrides: Sequence[str]) -> dict[str, Any]:
-    parsed = _parse(overrides)
-    for item in parsed:
-        if (options := choices(item.key_or_group)) and item.value() not in options:
-            close = suggestion(str(item.value()), options)
-            raise ConfigError(f"{item.key_or_group}={item.value()}: unknown{close}")
+    for item in _parse(overrides):
+        _check_override(name, item)
     try:
         with initialize_config_dir(str(config_dir()), version_base=None):
             config = hydra_compose(name, overrides=list(overrides))
@@ -104,7 +102,32 @@ def _compose_dict(name: str, overrides: Sequence[str]) -> dict[str, Any]:
     return typing.cast("dict[str, Any]", data)
 
 
-def _parse(overrides: Sequence[str]) -> list[Any]:
+def _check_override(name: str, item: Override) -> None:
+    key = item.key_or_group
+    # Hydra's own settings are for jobs that hydra runs; here they would do nothing.
+    if re.split(r"[./]", key)[0] == "hydra":
+        raise _unknown_key(key, _known_keys(name))
+    if item.is_sweep_override():
+        raise ConfigError(f"{item.input_line}: expected one value (a list stands in brackets)")
+    options = choices(key)
+    if options and not item.is_delete() and item.value() not in options:
+        close = suggestion(str(item.value()), options)
+        raise ConfigError(f"{key}={item.value()}: unknown{close}")
+
+
+def _check_task_key(items: Sequence[Override]) -> None:
+    """Refuses `env.name` alone: it would run a task with the settings tuned for another one."""
+    groups = [item.value() for item in items if item.key_or_group == "env"]
+    for item in items:
+        if item.key_or_group == "env.name" and item.value() not in groups:
+            raise ConfigError(f"env.name={item.value()}: choose the task with env={item.value()}")
+
+
+def _unknown_key(key: str, known: Iterable[str]) -> ConfigError:
+    return ConfigError(f"unknown key {key}{suggestion(key, known)}")
+
+
+def _parse(overrides: Sequence[str]) -> list[Override]:
     try:
         return OverridesParser.create().parse_overrides(list(overrides))
     except HydraException as error:
@@ -117,26 +140,59 @@ def _parse(overrides: Sequence[str]) -> list[Any]:
 def _on_top_of_saved(
     data: dict[str, Any], overrides: Sequence[str], resume: str
 ) -> dict[str, Any]:
-    """The saved configuration of the resumed run, changed where the command line says so."""
+    """The saved configuration of the resumed run, changed where the command line says so.
+
+    What an older version did not save comes from the defaults for the run's own task.
+    """
     checkpoint = find_checkpoint(resume, "run.resume")
-    saved = read_json(RunPaths(checkpoint.parent.parent).config)
+    saved = saved_config(checkpoint)
     saved["run"].update(dir=None, name=None)
-    for item in _parse(overrides):
-        path = item.key_or_group.split(".")
-        source, target = data, saved
-        for part in path[:-1]:
-            source, target = source[part], target[part]
-        target[path[-1]] = source[path[-1]]
-    saved["run"]["resume"] = str(checkpoint)
-    return saved
+    items = _parse(overrides)
+    task = saved["env"].get("name")
+    if task in choices("env") and all(item.key_or_group != "env" for item in items):
+        data = _compose_dict("train", [f"env={task}", *overrides])
+    merged = _merged(data, saved)
+    for item in items:
+        key = item.key_or_group
+        if _copy_key(key, data, merged):
+            continue
+        if item.is_delete() or choices(key):
+            raise ConfigError(
+                f"{item.input_line}: a run that is resumed keeps its settings; "
+                "change single keys with key=value"
+            )
+        raise _unknown_key(key, _flatten(data))
+    merged["run"]["resume"] = str(checkpoint)
+    return merged
+
+
+def _merged(base: Mapping[str, Any], top: Mapping[str, Any]) -> dict[str, Any]:
+    """`base` with the values of `top`, group by group."""
+    merged = {**base, **top}
+    for key in base.keys() & top.keys():
+        if isinstance(base[key], Mapping) and isinstance(top[key], Mapping):
+            merged[key] = _merged(base[key], top[key])
+    return merged
+
+
+def _copy_key(key: str, source: dict[str, Any], target: dict[str, Any]) -> bool:
+    """Copies the value or group of a dotted key; returns whether `source` has it."""
+    *groups, last = key.split(".")
+    for group in groups:
+        source, target = source.get(group, {}), target.get(group, {})
+        if not (isinstance(source, dict) and isinstance(target, dict)):
+            return False
+    if last in source:
+        target[last] = source[last]
+    return last in source
 
 
 def _one_line(name: str, error: Exception) -> str:
     text = " ".join(str(error).split())
     if match := re.search(r"Key '([^']+)' is not in struct full_key: (\S+)", text):
-        return f"unknown key {match[2]}{suggestion(match[2], _known_keys(name))}"
+        return str(_unknown_key(match[2], _known_keys(name)))
     if match := re.search(r"Could not override '([^']+)'", text):
-        return f"unknown key {match[1]}{suggestion(match[1], _known_keys(name))}"
+        return str(_unknown_key(match[1], _known_keys(name)))
     return text
 
 

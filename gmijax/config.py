@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import dataclasses
 import difflib
+import sys
 import types
 import typing
 from collections.abc import Mapping
@@ -18,6 +19,9 @@ from typing import Any, Literal, TypeVar
 from gmijax.errors import ConfigError
 
 T = TypeVar("T")
+
+ADAPTIVE_LEARNING_RATE_RANGE = (1e-5, 1e-2)
+"""Where the adaptive schedule keeps the learning rate, and so where it must begin."""
 
 
 def doc(text: str) -> Any:
@@ -86,6 +90,12 @@ class PpoConfig:
         for key in ("policy_hidden_layer_sizes", "value_hidden_layer_sizes"):
             for width in getattr(self, key):
                 require_at_least(f"algo.{key}", width, 1)
+        low, high = ADAPTIVE_LEARNING_RATE_RANGE
+        if self.learning_rate_schedule == "adaptive_kl" and not low <= self.learning_rate <= high:
+            raise ConfigError(
+                f"algo.learning_rate={self.learning_rate!r}: must be between {low} and {high} "
+                "with algo.learning_rate_schedule=adaptive_kl"
+            )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -299,15 +309,16 @@ def _accept(kind: Any, value: Any, key: str) -> Any:
         return value if kind is bool else _REJECTED
     if kind is int and isinstance(value, float) and value.is_integer():
         return int(value)
-    if kind is float and isinstance(value, int):
-        return float(value)
+    if kind is float and isinstance(value, int | float):
+        # Neither not-a-number nor infinite, nor an integer that is larger than any float.
+        return float(value) if abs(value) <= sys.float_info.max else _REJECTED
     if kind is str and isinstance(value, int):
         return str(value)
     return value if isinstance(kind, type) and isinstance(value, kind) else _REJECTED
 
 
 def _describe(kind: Any) -> str:
-    names = {int: "an integer", float: "a number", bool: "true or false", str: "text"}
+    names = {int: "an integer", float: "a finite number", bool: "true or false", str: "text"}
     parts: list[str] = []
     for option in _options(kind):
         if typing.get_origin(option) is Literal:

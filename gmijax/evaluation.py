@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 import os
+import signal
 import subprocess
 import sys
 from collections.abc import Mapping
@@ -22,14 +23,14 @@ from gmijax.errors import ConfigError, GmijaxError
 from gmijax.job import compilation_cache_dir
 from gmijax.partition.backends import open_backend
 from gmijax.partition.environment import gmi_environment
-from gmijax.partition.failures import last_line
+from gmijax.partition.failures import last_line, signal_name
 from gmijax.partition.machine import Machine, detect_machine
 from gmijax.partition.plan import Plan
 from gmijax.partition.planner import make_plan
 from gmijax.partition.supervisor import Job, Patience, Supervisor
 from gmijax.playdir import EXIT_NO_GL, PlayPaths
-from gmijax.resume import META, CheckpointMeta, find_checkpoint
-from gmijax.rundir import STEP_DIGITS, RunPaths, read_json, write_json
+from gmijax.resume import CheckpointMeta, find_checkpoint, trained_config
+from gmijax.rundir import META, STEP_DIGITS, RunPaths, read_json, write_json
 from gmijax.sim.registry import require_task
 
 MEMORY_FRACTION: Final = 0.1
@@ -76,6 +77,7 @@ def play(config: PlayConfig, *, show: bool = False) -> Evaluation:
     )
     meta = CheckpointMeta.read(checkpoint)
     require_task(meta.env)
+    trained_config(checkpoint)  # Before a process is started, which would find it bad too.
     paths = _prepare(config, meta.env_steps)
     console = Console(quiet=not show, soft_wrap=True, highlight=False)
     console.print(f"checkpoint: {checkpoint}", markup=False)
@@ -92,27 +94,19 @@ def _find(config: PlayConfig) -> Path:
     """The checkpoint that the configuration names."""
     wanted, run_dir = config.checkpoint, config.run.dir
     if wanted is None or wanted.isdecimal():
-        latest = _latest(run_dir or "last")
+        latest = find_checkpoint(run_dir or "last", "run.dir")
         return latest if wanted is None else _at_step(_run_of(latest), int(wanted))
     if not (Path(wanted) / META).is_file():
         raise ConfigError(
             f"checkpoint={wanted}: expected the folder of a checkpoint, or its env steps"
         )
     checkpoint = Path(wanted).resolve()
-    if run_dir is not None and _run_of(_latest(run_dir)) != _run_of(checkpoint):
-        raise ConfigError(f"checkpoint={wanted}: not of run.dir={run_dir}; leave out one of them")
-    return checkpoint
-
-
-def _latest(run_dir: str) -> Path:
-    try:
-        checkpoint = find_checkpoint(run_dir, "run.dir")
-    except ConfigError as error:
-        if run_dir != "last":
-            raise
-        raise ConfigError(str(error).replace("run.resume", "run.dir")) from None
-    if not RunPaths(_run_of(checkpoint)).config.is_file():
-        raise ConfigError(f"run.dir={run_dir}: no config.json in {_run_of(checkpoint)}")
+    if run_dir is not None:
+        latest = find_checkpoint(run_dir, "run.dir")
+        if _run_of(latest) != _run_of(checkpoint):
+            raise ConfigError(
+                f"checkpoint={wanted}: not of run.dir={run_dir}; leave out one of them"
+            )
     return checkpoint
 
 
@@ -187,6 +181,7 @@ def _film(config: PlayConfig, paths: PlayPaths, console: Console) -> tuple[Path,
     """Films with the first OpenGL that works; each is tried in a fresh interpreter."""
     users = os.environ.get(_GL)
     tried = tuple(dict.fromkeys((users, *_FALLBACK_GLS) if users else _FALLBACK_GLS))
+    exit_code = EXIT_NO_GL
     for gl in tried:
         with console.status(f"filming with {gl}"):
             exit_code = _render(gl, paths)
@@ -195,21 +190,30 @@ def _film(config: PlayConfig, paths: PlayPaths, console: Console) -> tuple[Path,
             for video in videos:
                 console.print(f"video: {video}", markup=False)
             return videos
-        # A broken driver may end the process with a signal instead of an error.
-        if exit_code != EXIT_NO_GL and exit_code > 0:
-            raise GmijaxError(
-                f"no video: {last_line(paths.render_log)} (log: {paths.render_log}); the returns "
-                "were evaluated"
-            )
+        if not _is_for_want_of_gl(exit_code):
+            raise GmijaxError(f"no video: {_why(exit_code, paths)}; the returns were evaluated")
     reason = (
         f"no video: no headless OpenGL (EGL or OSMesa) is to be had, tried {', '.join(tried)}; "
         "install it with `apt-get install libegl1` or `apt-get install libosmesa6`; "
-        "the returns were evaluated"
+        f"the last one: {_why(exit_code, paths)}; the returns were evaluated"
     )
     if config.video != "auto":
         raise GmijaxError(reason)
     console.print(reason, markup=False)
     return ()
+
+
+def _is_for_want_of_gl(exit_code: int) -> bool:
+    # A broken driver may end the process with a signal instead of an error. These two come from
+    # somebody else: the user, a batch system, or the machine when it runs out of memory.
+    sent = (-signal.SIGKILL, -signal.SIGTERM)
+    return exit_code == EXIT_NO_GL or (exit_code < 0 and exit_code not in sent)
+
+
+def _why(exit_code: int, paths: PlayPaths) -> str:
+    ended = f"the renderer was ended by {signal_name(-exit_code)}" if exit_code < 0 else ""
+    said = last_line(paths.render_log)
+    return f"{': '.join(filter(None, (ended, said)))} (log: {paths.render_log})"
 
 
 def _render(gl: str, paths: PlayPaths) -> int:

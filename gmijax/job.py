@@ -35,8 +35,9 @@ from gmijax.resume import CheckpointMeta, check_fits, find_checkpoint
 from gmijax.rundir import RunPaths, create_run, read_json, write_json
 from gmijax.sim.impl import choose_impl
 from gmijax.sim.registry import require_task
+from gmijax.version import __version__
 
-_VERSIONS = ("gmijax", "jax", "jaxlib", "mujoco-mjx", "flax", "optax", "orbax-checkpoint")
+_VERSIONS = ("jax", "jaxlib", "mujoco-mjx", "flax", "optax", "orbax-checkpoint")
 
 
 class Result(NamedTuple):
@@ -247,7 +248,8 @@ def _summarise(
         "step_per_s_train": result.get("step_per_s_train"),
         "final_return": result.get("final_return"),
         "checkpoint": str(checkpoints[-1]) if checkpoints else None,
-        "versions": {"python": sys.version.split()[0]} | _installed_versions(),
+        "versions": {"gmijax": __version__, "python": sys.version.split()[0]}
+        | _installed_versions(),
         "device": result.get("device"),
         "impl": config.physics.impl,
     }

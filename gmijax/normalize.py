@@ -18,6 +18,9 @@ from gmijax.types import Array
 OBS_CLIP = 10.0
 """Normalised observations are clipped to [-OBS_CLIP, OBS_CLIP] standard deviations."""
 
+OUTLIER_STD = 20.0
+"""What is farther from the mean than this counts as this far in the statistics."""
+
 _MIN_STD = 1e-4
 
 
@@ -33,6 +36,17 @@ class Moments(NamedTuple):
     count: Array
     mean: Array
     m2: Array
+
+
+def without_outliers(moments: Moments, samples: Array) -> Array:
+    """`samples` [..., S], clipped to OUTLIER_STD around the mean that `moments` know.
+
+    A world about to diverge shows values thousands of times the usual; a few of them would
+    widen the variance for good and blind the policy. Real changes are not held up: the variance
+    may grow 400-fold in one merge. Nothing is clipped while there are no statistics.
+    """
+    bound = jnp.where(moments.count > 0, OUTLIER_STD * std_of(moments), jnp.inf)
+    return jnp.clip(samples, moments.mean - bound, moments.mean + bound)
 
 
 def no_samples(shape: tuple[int, ...]) -> Moments:

@@ -9,12 +9,12 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from gmijax.config import EnvConfig, PlayConfig, PpoConfig, from_dict
+from gmijax.config import PlayConfig, from_dict
 from gmijax.errors import ConfigError
 from gmijax.partition.child import ChildLink
 from gmijax.playdir import PlayPaths
-from gmijax.resume import CheckpointMeta
-from gmijax.rundir import RunPaths, read_json, write_json
+from gmijax.resume import CheckpointMeta, trained_config
+from gmijax.rundir import read_json, write_json
 
 if TYPE_CHECKING:
     import numpy as np
@@ -40,20 +40,18 @@ def main() -> int:
 def _run(link: ChildLink) -> None:
     config = from_dict(PlayConfig, read_json(link.run.config))
     checkpoint = Path(str(config.checkpoint))
-    trained = read_json(RunPaths(checkpoint.parent.parent).config)
-    env_config = from_dict(EnvConfig, trained["env"], "env.")
-    algo = from_dict(PpoConfig, trained["algo"], "algo.")
+    env_config, algo = trained_config(checkpoint)
     # jax starts here, in the environment that the plan prepared.
     import jax
 
     from gmijax.checkpoint import restore_learner
     from gmijax.ppo.episodes import Options, run_episodes
     from gmijax.ppo.learner import init_learner, make_learner
-    from gmijax.sim.physics import choose_impl
+    from gmijax.sim.impl import choose_impl
     from gmijax.sim.registry import make_env
 
     impl, why = choose_impl(config.physics.impl, jax.default_backend())
-    sys.stdout.write(f"{why}\n")
+    sys.stdout.write(f"physics.impl={impl}: {why}\n")
     env = make_env(
         env_config.name,
         impl=impl,
@@ -76,6 +74,7 @@ def _run(link: ChildLink) -> None:
             deterministic=config.deterministic,
             max_steps=config.max_steps,
         ),
+        lambda chunks: link.beat("running", chunks),
     )
     paths = PlayPaths(link.run.root)
     _write_trajectory(paths, env, episodes, config.video_envs)

@@ -26,30 +26,19 @@ class ProcessId(NamedTuple):
         return identify(self.pid) == self
 
 
-def identify(pid: int | str) -> ProcessId | None:
-    """The running process with number `pid`, or None (also for a zombie).
-
-    `self` is the calling process, with its number in /proc. Where that is the one of another PID
-    namespace, `os.getpid` is not what other processes see there.
-    """
+def identify(pid: int) -> ProcessId | None:
+    """The running process with number `pid`, or None (also for a zombie)."""
     try:
-        stat = Path(f"/proc/{pid}/stat").read_bytes()
+        process, state = _parse(Path(f"/proc/{pid}/stat").read_bytes())
     except OSError:
         return None
-    # The second field is the program's name in brackets, which may itself hold blanks and
-    # brackets: count from the last one.
-    number, _, rest = stat.partition(b" ")
-    fields = rest.rpartition(b")")[2].split()
-    state, start_ticks = fields[0], int(fields[19])
-    return None if state in (b"Z", b"X") else ProcessId(int(number), start_ticks)
+    return None if state in (b"Z", b"X") else process
 
 
 def own_process() -> ProcessId:
     """The calling process."""
-    own = identify("self")
-    if own is None:
-        raise OSError("/proc/self/stat: not readable")
-    return own
+    # Not os.getpid(): processes look at each other through /proc, which may number differently.
+    return _parse(Path("/proc/self/stat").read_bytes())[0]
 
 
 def wait_until_gone(processes: Iterable[ProcessId], timeout_s: float) -> tuple[ProcessId, ...]:
@@ -60,3 +49,11 @@ def wait_until_gone(processes: Iterable[ProcessId], timeout_s: float) -> tuple[P
         time.sleep(_POLL_S)
         left = tuple(process for process in left if process.is_running())
     return left
+
+
+def _parse(stat: bytes) -> tuple[ProcessId, bytes]:
+    """The process that a line of /proc/<pid>/stat is about, and its state."""
+    # The second field is the program's name in brackets, which may itself hold blanks and
+    # brackets: count from the last one.
+    fields = stat.rpartition(b")")[2].split()
+    return ProcessId(int(stat.partition(b" ")[0]), int(fields[19])), fields[0]

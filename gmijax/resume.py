@@ -4,12 +4,11 @@ from __future__ import annotations
 
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import Any
 
+from gmijax.config import EnvConfig, PpoConfig, from_dict
 from gmijax.errors import ConfigError
-from gmijax.rundir import last_run, read_json
-
-META = "meta.json"
-"""Written last into a checkpoint: a folder without it is not one."""
+from gmijax.rundir import META, RunPaths, last_run, read_json
 
 
 @dataclass(frozen=True)
@@ -40,16 +39,21 @@ class CheckpointMeta:
 
     @classmethod
     def read(cls, checkpoint: Path) -> CheckpointMeta:
-        """Reads the meta data of a checkpoint folder."""
-        data = read_json(checkpoint / META)
-        policy, value = data["hidden"]
-        return cls(**{**data, "hidden": (tuple(policy), tuple(value))})
+        """Reads the meta data of a checkpoint folder.
+
+        Raises:
+          ConfigError: they are not those of a checkpoint.
+        """
+        try:
+            return from_dict(cls, _read_object(checkpoint / META))
+        except ConfigError as error:
+            raise ConfigError(f"checkpoint {checkpoint}: broken {META} ({error})") from None
 
 
 def find_checkpoint(wanted: str, key: str) -> Path:
     """The checkpoint that `wanted` names: `last`, a run folder, or a checkpoint folder.
 
-    `last` is the newest run below `runs/`; a run folder means its latest checkpoint.
+    `last` is the run below `runs/` with the newest checkpoint; a run folder means its latest one.
 
     Args:
       wanted: value of the key.
@@ -58,7 +62,7 @@ def find_checkpoint(wanted: str, key: str) -> Path:
     Raises:
       ConfigError: there is none.
     """
-    folder = last_run() if wanted == "last" else Path(wanted)
+    folder = last_run(key) if wanted == "last" else Path(wanted)
     if (folder / META).is_file():
         return folder.resolve()
     if not folder.is_dir():
@@ -67,6 +71,39 @@ def find_checkpoint(wanted: str, key: str) -> Path:
     if not found:
         raise ConfigError(f"{key}={wanted}: no checkpoint in this folder")
     return found[-1].resolve()
+
+
+def saved_config(checkpoint: Path) -> dict[str, Any]:
+    """The configuration of the run that a checkpoint lies in, as plain data.
+
+    Keys that its version of gmijax did not know are missing.
+
+    Raises:
+      ConfigError: the checkpoint does not lie in the folder of a training run.
+    """
+    path = RunPaths(checkpoint.parent.parent).config
+    if not path.is_file():
+        raise ConfigError(
+            f"checkpoint {checkpoint}: no config.json in {path.parent}; "
+            "a checkpoint can only be used in its run folder"
+        )
+    try:
+        saved = _read_object(path)
+    except ConfigError as error:
+        raise ConfigError(f"{path}: broken ({error})") from None
+    if not all(isinstance(saved.get(group), dict) for group in ("env", "algo", "run")):
+        raise ConfigError(f"{path}: not the configuration of a training run")
+    return saved
+
+
+def trained_config(checkpoint: Path) -> tuple[EnvConfig, PpoConfig]:
+    """Task and algorithm of the run that a checkpoint lies in.
+
+    Raises:
+      ConfigError: the checkpoint does not lie in the folder of a training run.
+    """
+    saved = saved_config(checkpoint)
+    return from_dict(EnvConfig, saved["env"], "env."), from_dict(PpoConfig, saved["algo"], "algo.")
 
 
 def check_fits(meta: CheckpointMeta, wanted: CheckpointMeta, key: str, value: str) -> None:
@@ -82,3 +119,15 @@ def check_fits(meta: CheckpointMeta, wanted: CheckpointMeta, key: str, value: st
 
 def _shown(hidden: tuple[tuple[int, ...], ...]) -> str:
     return " and ".join(":".join(map(str, widths)) for widths in hidden)
+
+
+def _read_object(path: Path) -> dict[str, Any]:
+    try:
+        data: object = read_json(path)
+    except OSError as error:
+        raise ConfigError(f"cannot read it: {error.strerror}") from None
+    except ValueError as error:  # Not JSON, or not even text.
+        raise ConfigError(f"not JSON: {error}") from None
+    if not isinstance(data, dict):
+        raise ConfigError("not a JSON object")
+    return data

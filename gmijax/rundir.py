@@ -1,7 +1,7 @@
 """Every file name of a run folder, and how files in it are written. No jax here.
 
 `<run>/config.json plan.json summary.json metrics.jsonl returns.png tensorboard/`
-`<run>/checkpoints/<12-digit env steps>/`
+`<run>/checkpoints/<12-digit env steps>/meta.json`
 `<run>/gmi_<id>/{stdout.log,stderr.log,heartbeat.json,error.json,result.json}`
 """
 
@@ -22,6 +22,9 @@ RUNS = Path("runs")
 """Where run folders go unless `run.dir` names one; relative to the working directory."""
 
 STEP_DIGITS = 12
+
+META = "meta.json"
+"""Written last into a checkpoint: a folder without it is not one."""
 
 
 @dataclass(frozen=True)
@@ -158,13 +161,18 @@ def read_json(path: Path) -> dict[str, Any]:
     return json.loads(path.read_text())
 
 
-def last_run(runs: Path = RUNS) -> Path:
-    """The newest run folder below `runs` that has a checkpoint.
+def last_run(key: str, runs: Path = RUNS) -> Path:
+    """The run folder below `runs` with the newest checkpoint.
+
+    Args:
+      key: the configuration key that asks for it, for the message.
+      runs: where to look.
 
     Raises:
       ConfigError: there is none.
     """
-    found = [path.parent for path in runs.glob("*/checkpoints") if any(path.glob("[0-9]*"))]
+    # Not the time of a folder: that changes with whatever is put into it later, e.g. films.
+    found = list(runs.glob(f"*/checkpoints/[0-9]*/{META}"))
     if not found:
-        raise ConfigError(f"run.resume=last: no run with a checkpoint in {runs}/")
-    return max(found, key=lambda path: path.stat().st_mtime)
+        raise ConfigError(f"{key}=last: no run with a checkpoint in {runs}/")
+    return max(found, key=lambda meta: meta.stat().st_mtime).parents[2]

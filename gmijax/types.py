@@ -7,7 +7,6 @@ B: samples of one minibatch.  [] is a scalar.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from typing import Any, TypeAlias
 
 import jax
@@ -20,6 +19,3 @@ PRNGKey: TypeAlias = jax.Array
 
 PyTree: TypeAlias = Any
 """Any nesting of tuples, dicts and NamedTuples with arrays as leaves."""
-
-Metrics: TypeAlias = Mapping[str, Array]
-"""Scalars by name."""

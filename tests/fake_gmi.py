@@ -12,7 +12,7 @@ from pathlib import Path
 from gmijax.errors import ConfigError, PeerLost
 from gmijax.partition.child import ChildLink
 from gmijax.partition.nvidia import PIPE_VARIABLE
-from gmijax.partition.process_table import identify
+from gmijax.processes import identify
 from gmijax.rundir import read_json, write_json
 
 TICK_S = 0.02

@@ -21,12 +21,9 @@ import numpy as np
 
 from gmijax.collectives.build import Membership, build_reducer
 from gmijax.collectives.interface import Reducer
-from gmijax.collectives.memory import (
-    EXCHANGE_FD_VARIABLE,
-    create_exchange,
-    inherited_exchange,
-)
+from gmijax.collectives.memory import create_exchange
 from gmijax.errors import CollectiveTimeout, GmijaxError, PeerLost
+from gmijax.partition.child import ENV_EXCHANGE_FD
 from gmijax.partition.layout import Layout
 
 Options = dict[str, Any]
@@ -64,9 +61,11 @@ class Ranks:
             with (self.folder / f"stderr_{rank}").open("wb") as stderr:
                 self.processes[rank] = subprocess.Popen(
                     [sys.executable, __file__, json.dumps(given)],
-                    env=dict(
-                        os.environ, **{EXCHANGE_FD_VARIABLE: str(self.fd)}, PYTHONPATH=REPOSITORY
-                    ),
+                    env={
+                        **os.environ,
+                        ENV_EXCHANGE_FD: str(self.fd),
+                        "PYTHONPATH": str(REPOSITORY),
+                    },
                     pass_fds=[self.fd],
                     stdin=subprocess.DEVNULL,
                     stdout=stderr,
@@ -207,7 +206,7 @@ def main(options: Options) -> None:
                 layout=Layout.even(1, options["world_size"]),
                 rank=options["rank"],
                 num_floats=options["num_floats"],
-                exchange_fd=inherited_exchange(os.environ),
+                exchange_fd=int(os.environ[ENV_EXCHANGE_FD]),
                 timeout_s=options["timeout_s"],
                 rendezvous_timeout_s=options["start_s"],
             ),

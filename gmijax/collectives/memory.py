@@ -19,17 +19,13 @@ from __future__ import annotations
 
 import mmap
 import os
-from collections.abc import Mapping
 from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
-from gmijax.collectives.liveness import ProcessIdentity, own_process
 from gmijax.errors import CollectiveError, ConfigError
-
-EXCHANGE_FD_VARIABLE = "GMIJAX_EXCHANGE_FD"
-"""Environment variable of a GMI: number of the inherited descriptor of the block."""
+from gmijax.processes import ProcessId, own_process
 
 MAGIC = 0x58494D47  # "GMIX" in memory on a little-endian machine
 VERSION = 1
@@ -95,30 +91,11 @@ class ExchangeBlock(NamedTuple):
 def create_exchange() -> int:
     """Makes an empty block and returns its descriptor, for the controller.
 
-    Pass the descriptor to every GMI (`pass_fds`, `EXCHANGE_FD_VARIABLE`), then close it.
+    Pass the descriptor to every GMI (`Job.exchange_fd` of the supervisor), then close it.
     """
     fd = os.memfd_create("gmijax-exchange", os.MFD_CLOEXEC)
     # Another user who may look into /proc/<pid>/fd must not read or change gradients.
     os.fchmod(fd, 0o600)
-    return fd
-
-
-def inherited_exchange(environ: Mapping[str, str]) -> int:
-    """Returns the descriptor that the controller passed to this process.
-
-    The descriptor becomes non-inheritable: processes that a GMI starts have no use for it.
-
-    Raises:
-      ConfigError: the variable is missing, or does not name an open descriptor.
-    """
-    shown = environ.get(EXCHANGE_FD_VARIABLE, "")
-    try:
-        fd = int(shown)
-        os.set_inheritable(fd, False)
-    except (ValueError, OverflowError, OSError):
-        raise ConfigError(
-            f"{EXCHANGE_FD_VARIABLE}={shown!r}: expected the number of an open descriptor"
-        ) from None
     return fd
 
 
@@ -168,10 +145,10 @@ def check_peer(block: ExchangeBlock, peer: int) -> None:
             )
 
 
-def process_of(block: ExchangeBlock, peer: int) -> ProcessIdentity:
+def process_of(block: ExchangeBlock, peer: int) -> ProcessId:
     """The process behind an attached `peer`."""
     line = block.lines[peer]
-    return ProcessIdentity(int(line["pid"]), int(line["start_ticks"]))
+    return ProcessId(int(line["pid"]), int(line["start_ticks"]))
 
 
 def _map(fd: int, rank: int, world_size: int, num_floats: int) -> ExchangeBlock:

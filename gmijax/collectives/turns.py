@@ -11,7 +11,6 @@ import os
 import threading
 import time
 
-from gmijax.collectives.liveness import is_alive
 from gmijax.collectives.memory import ExchangeBlock, check_peer, process_of
 from gmijax.errors import CollectiveError, CollectiveTimeout, PeerLost
 
@@ -146,7 +145,7 @@ class Turns:
     def _check_alive(self, missing: list[int], target: int) -> None:
         for peer in missing:
             # A rank that has not attached cannot be told from one that is still starting.
-            if not self._sequence[peer] or is_alive(process_of(self._block, peer)):
+            if not self._sequence[peer] or process_of(self._block, peer).is_running():
                 continue
             # It may have arrived and ended, in this order, since it was found missing.
             if self._missing([peer], target):

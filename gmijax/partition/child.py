@@ -62,7 +62,7 @@ class ChildLink:
         can ask the process to stop, and everything else works.
 
         Raises:
-          ConfigError: the process was not started as a GMI.
+          ConfigError: the process was not started as a GMI, or inherited no such descriptor.
         """
         try:
             gmi, run_dir = int(environment[ENV_GMI]), environment[ENV_RUN_DIR]
@@ -134,4 +134,14 @@ def _end_now() -> None:
 
 
 def _inherited_fd(environment: Mapping[str, str], name: str) -> int | None:
-    return int(environment[name]) if name in environment else None
+    if name not in environment:
+        return None
+    try:
+        fd = int(environment[name])
+        # Processes that a GMI starts have no use for it.
+        os.set_inheritable(fd, False)
+    except (ValueError, OverflowError, OSError):
+        raise ConfigError(
+            f"{name}={environment[name]!r}: expected the number of an open descriptor"
+        ) from None
+    return fd

@@ -23,7 +23,7 @@ from typing import Any
 
 from gmijax.errors import BackendUnavailable
 from gmijax.partition.nvidia import MpsControl
-from gmijax.partition.process_table import ProcessId, identify, wait_until_gone
+from gmijax.processes import ProcessId, identify, wait_until_gone
 
 _GMIS_END_THEMSELVES_S = 8.0
 _DAEMON_ENDS_S = 10.0

@@ -24,6 +24,7 @@ LOG_VARIABLE = "CUDA_MPS_LOG_DIRECTORY"
 DEFAULT_PIPE_DIRECTORY = Path("/tmp/nvidia-mps")
 """Where CUDA looks for a daemon when `CUDA_MPS_PIPE_DIRECTORY` is not set."""
 
+_PREFIX = "CUDA_MPS_"
 _CONTROL = "nvidia-cuda-mps-control"
 # Container runtimes mount the driver's programs here without extending PATH.
 _MORE_FOLDERS = ("/usr/local/nvidia/bin", "/usr/bin")
@@ -53,15 +54,24 @@ class Gpu(NamedTuple):
 
 
 def list_gpus() -> tuple[Gpu, ...]:
-    """All GPUs of the machine, whatever `CUDA_VISIBLE_DEVICES` says; none without a driver."""
+    """All GPUs of the machine, whatever `CUDA_VISIBLE_DEVICES` says; none without a driver.
+
+    A GPU that NVML cannot describe (fallen off the bus, not permitted) is left out.
+    """
     try:
         pynvml.nvmlInit()
     except pynvml.NVMLError:
         return ()
+    gpus: list[Gpu] = []
     try:
-        return tuple(_describe(index) for index in range(pynvml.nvmlDeviceGetCount()))
+        for index in range(pynvml.nvmlDeviceGetCount()):
+            with suppress(pynvml.NVMLError):
+                gpus.append(_describe(index))
+    except pynvml.NVMLError:
+        return ()
     finally:
         pynvml.nvmlShutdown()
+    return tuple(gpus)
 
 
 def driver_version() -> str | None:
@@ -72,6 +82,8 @@ def driver_version() -> str | None:
         return None
     try:
         return str(pynvml.nvmlSystemGetDriverVersion())
+    except pynvml.NVMLError:
+        return None
     finally:
         pynvml.nvmlShutdown()
 
@@ -208,7 +220,10 @@ class MpsControl:
         return done.stdout
 
     def _environment(self, more: Mapping[str, str]) -> dict[str, str]:
-        return {**os.environ, PIPE_VARIABLE: str(self.pipe_directory), **more}
+        # The user's own settings for MPS (limits of memory and SMs, other folders) are for other
+        # clients: a daemon would make them the defaults of the GMIs.
+        users = {key: value for key, value in os.environ.items() if not key.startswith(_PREFIX)}
+        return {**users, PIPE_VARIABLE: str(self.pipe_directory), **more}
 
 
 def _numbers(answer: str) -> tuple[int, ...]:

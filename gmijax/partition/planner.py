@@ -40,7 +40,7 @@ def make_plan(plan: PlanConfig, reduce: ReduceConfig, num_envs: int, machine: Ma
     layout = _layout(plan)
     reasons: list[str] = []
     backend = _backend(plan, layout, machine, reasons)
-    gpus = _choose_gpus(plan, layout, machine) if backend != "cpu" else ()
+    gpus = _choose_gpus(plan, layout, machine, reasons) if backend != "cpu" else ()
     _check_sm_percent(plan.sm_percent, backend, reasons)
     if backend == "mps":
         _check_num_clients(layout, machine)
@@ -121,17 +121,13 @@ def _check_backend(backend: BackendName, machine: Machine) -> None:
     )
 
 
-def _choose_gpus(plan: PlanConfig, layout: Layout, machine: Machine) -> tuple[Gpu, ...]:
-    by_index = {gpu.index: gpu for gpu in machine.gpus}
+def _choose_gpus(
+    plan: PlanConfig, layout: Layout, machine: Machine, reasons: list[str]
+) -> tuple[Gpu, ...]:
     if isinstance(plan.gpus, int):
-        if layout.num_gpus > len(machine.gpus):
-            key = "plan.gpus" if plan.layout is None else "GPUs of plan.layout"
-            raise ConfigError(
-                f"{key}={layout.num_gpus}: this machine has {len(machine.gpus)} usable GPUs "
-                "(any number is allowed with plan.backend=cpu)"
-            )
-        chosen = machine.gpus[: layout.num_gpus]
+        chosen = _first_gpus(plan, layout.num_gpus, machine, reasons)
     else:
+        by_index = {gpu.index: gpu for gpu in machine.gpus}
         if missing := [index for index in plan.gpus if index not in by_index]:
             raise ConfigError(
                 f"plan.gpus={list(plan.gpus)}: no usable GPU {missing[0]}; "
@@ -142,6 +138,25 @@ def _choose_gpus(plan: PlanConfig, layout: Layout, machine: Machine) -> tuple[Gp
         raise BackendUnavailable(
             f"plan.gpus: GPU {in_mig[0]} is in MIG mode, which is not supported yet; "
             "choose other GPUs or switch MIG off"
+        )
+    return chosen
+
+
+def _first_gpus(
+    plan: PlanConfig, num_gpus: int, machine: Machine, reasons: list[str]
+) -> tuple[Gpu, ...]:
+    """The first GPUs, those in MIG mode only if there are not enough others."""
+    if num_gpus > len(machine.gpus):
+        key = "plan.gpus" if plan.layout is None else "GPUs of plan.layout"
+        raise ConfigError(
+            f"{key}={num_gpus}: this machine has {len(machine.gpus)} usable GPUs "
+            "(any number is allowed with plan.backend=cpu)"
+        )
+    chosen = tuple(sorted(machine.gpus, key=lambda gpu: gpu.mig_enabled))[:num_gpus]
+    passed_over = [gpu.index for gpu in machine.gpus[:num_gpus] if gpu not in chosen]
+    if passed_over:
+        reasons.append(
+            f"GPUs {[gpu.index for gpu in chosen]}: not {passed_over}, which are in MIG mode"
         )
     return chosen
 

@@ -98,8 +98,9 @@ class Supervisor:
         """Runs the job to its end; calls `on_tick` about 20 times a second.
 
         Raises:
-          GmiFailed: a GMI failed, did not start in time or stalled; names the first one.
-          ConfigError: a GMI rejected its input, or the backend is not what the plan says.
+          GmiFailed: a GMI failed, did not start in time, stalled, or runs without the share
+            that the plan gives it; names the first one.
+          ConfigError: a GMI rejected its input.
           JobInterrupted: a stop was requested, and every GMI has ended.
         """
         try:
@@ -186,8 +187,20 @@ class Supervisor:
             processes = self._started.values()
             if all(process.is_ready for process in processes):
                 self._all_ready_s = time.monotonic()
-                # One that has ended already cannot be asked for any more.
-                self._job.backend.verify({p.gmi: p.beat.pid for p in self._alive()})
+                self._verify_shares()
+
+    def _verify_shares(self) -> None:
+        # One that has ended already cannot be asked for any more.
+        alive = {process.gmi: process.beat.pid for process in self._alive()}
+        try:
+            self._job.backend.verify(alive)
+        except GmiFailed as error:
+            # One that failed meanwhile has lost its share by that, and may have taken the
+            # others' with it.
+            self._raise_failure()
+            if self._started[error.gmi].exit_code is None:
+                raise
+            self._verify_shares()
 
     def _check_progress(self) -> None:
         now_s = time.monotonic()

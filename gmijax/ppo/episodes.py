@@ -7,6 +7,7 @@ until the last one has ended, so no automatic reset is needed.
 from __future__ import annotations
 
 import time
+from collections.abc import Callable
 from functools import partial, reduce
 from typing import NamedTuple
 
@@ -71,8 +72,23 @@ class Episodes(NamedTuple):
     run_s: float
 
 
-def run_episodes(env: Env, learner: Learner, state: LearnerState, options: Options) -> Episodes:
-    """Runs `options.num_envs` episodes of `env` (one world, with its time limit) to their ends."""
+def run_episodes(
+    env: Env,
+    learner: Learner,
+    state: LearnerState,
+    options: Options,
+    on_progress: Callable[[int], None],
+) -> Episodes:
+    """Runs episodes to their ends.
+
+    Args:
+      env: one world, with its time limit.
+      learner: the networks.
+      state: their weights and the observations' statistics.
+      options: how to run, and how many episodes.
+      on_progress: called with 0 when the program has been compiled, and with the number of
+        chunks of `CHUNK_STEPS` done after every one.
+    """
     started = time.monotonic()
     length = env.spec.episode_length
     limit = length if options.max_steps is None else min(options.max_steps, length)
@@ -84,10 +100,12 @@ def run_episodes(env: Env, learner: Learner, state: LearnerState, options: Optio
     qpos = [np.asarray(_shown_qpos(env, batch.env, options.num_shown))[None]]
     diverged = np.zeros(options.num_envs, bool)
     compile_s = time.monotonic() - started
-    for _ in range(0, limit, CHUNK_STEPS):
+    on_progress(0)
+    for done in range(1, -(-limit // CHUNK_STEPS) + 1):
         batch, moved, bad = compiled(*arguments, batch)
         qpos.append(np.asarray(moved))
         diverged |= np.asarray(bad)
+        on_progress(done)
         if not np.asarray(_is_running(batch.env, limit)).any():
             break
     run_s = time.monotonic() - started - compile_s

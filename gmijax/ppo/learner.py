@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 import optax
 
-from gmijax.config import PpoConfig
+from gmijax.config import ADAPTIVE_LEARNING_RATE_RANGE, PpoConfig
 from gmijax.normalize import Moments, merge, no_samples, std_of
 from gmijax.policy import ActorCritic, ActorCriticParams, make_actor_critic
 from gmijax.ppo.losses import LossMetrics, Samples, UpdateContext, ppo_loss
@@ -21,7 +21,6 @@ from gmijax.sim.interface import EnvSpec
 from gmijax.types import Array, PRNGKey, PyTree
 
 _LEARNING_RATE_STEP = 1.5
-_LEARNING_RATE_RANGE = (1e-5, 1e-2)
 _UNMOVED_KL = 1e-6
 
 
@@ -153,7 +152,7 @@ def adapted_learning_rate(rate: Array, kl: Array, desired_kl: float) -> Array:
     Isaac Gym's trainers), within [1e-5, 1e-2]. No change below 1e-6: that is the first update
     on a rollout, where the policy has not moved yet and the rest is rounding.
     """
-    low, high = _LEARNING_RATE_RANGE
+    low, high = ADAPTIVE_LEARNING_RATE_RANGE
     slower = jnp.maximum(rate / _LEARNING_RATE_STEP, low)
     faster = jnp.minimum(rate * _LEARNING_RATE_STEP, high)
     too_slow = (kl < 0.5 * desired_kl) & (kl > _UNMOVED_KL)

@@ -283,11 +283,12 @@ class SplitIteration:
     def _unpack_stats(self) -> Any:
         """[M] float32 to `RolloutStats`, the inverse of the packing in `_rollout_fn`."""
         spec = self._env.spec
-        example = _stats_example(spec.obs_size, spec.reward_terms)
+        example = stats_example(spec.obs_size, spec.reward_terms)
         return ravel_pytree(example)[1]
 
 
-def _stats_example(obs_size: int, terms: tuple[str, ...]) -> RolloutStats:
+def stats_example(obs_size: int, terms: tuple[str, ...]) -> RolloutStats:
+    """Zeros in the structure of `RolloutStats`."""
     zero = jnp.zeros(())
     return RolloutStats(
         obs=no_samples((obs_size,)),

@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 
 from gmijax.config import PpoConfig
-from gmijax.normalize import Moments, merge_all, moments_of, normalize
+from gmijax.normalize import Moments, merge_all, moments_of, normalize, without_outliers
 from gmijax.policy import ActorCritic, ActorCriticParams, log_prob
 from gmijax.ppo.advantages import gae
 from gmijax.ppo.losses import Samples
@@ -104,7 +104,7 @@ def collect(
     samples = _with_advantages(networks, config, params, moments, rollout)
     totals = jax.tree.map(lambda x: jnp.sum(x, axis=0, dtype=jnp.float32), counts)
     stats = RolloutStats(
-        obs=moments_of(rollout.obs, 2),
+        obs=moments_of(without_outliers(moments, rollout.obs), 2),
         advantage=moments_of(samples.advantage, 2),
         episodes=totals.episodes,
         reward_sum=jnp.sum(rollout.reward),

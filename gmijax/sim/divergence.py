@@ -18,9 +18,6 @@ from gmijax.types import Array
 MAX_POSITION = 1e10
 """Bound of positions, MuJoCo's own."""
 
-MAX_OBSERVATION = 1e5
-"""Bound of observations; one value beyond it would spoil their running variance."""
-
 
 def sources(term_names: tuple[str, ...]) -> tuple[str, ...]:
     """Where a bad number can be: physics, observation, or a term of the reward."""
@@ -35,7 +32,7 @@ def diverged_by_source(env: Env, state: EnvState) -> dict[str, Array]:
 
     bad = {
         "physics": ~within(jax.vmap(env.qpos)(state), MAX_POSITION),
-        "observation": ~within(state.obs, MAX_OBSERVATION),
+        "observation": ~within(state.obs, env.spec.max_abs_obs),
     }
     return bad | {
         f"reward/{name}": ~jnp.isfinite(value) for name, value in state.reward_terms.items()

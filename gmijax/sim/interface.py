@@ -23,6 +23,8 @@ class EnvSpec(NamedTuple):
       control_dt_s: seconds of simulated time per step.
       episode_length: steps after which an episode is truncated.
       reward_terms: names of the addends of the reward, in order.
+      max_abs_obs: an observation beyond this tells that the physics diverges; the world is ended
+        (see `gmijax.sim.divergence`).
     """
 
     name: str
@@ -31,6 +33,7 @@ class EnvSpec(NamedTuple):
     control_dt_s: float
     episode_length: int
     reward_terms: tuple[str, ...]
+    max_abs_obs: float = 1e5
 
 
 class EnvState(NamedTuple):

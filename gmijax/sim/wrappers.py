@@ -49,11 +49,6 @@ class BatchState(NamedTuple):
     return_sum: Array
     term_sums: dict[str, Array]
 
-    @property
-    def length(self) -> Array:
-        """[N] int32, steps of the running episode so far."""
-        return self.env.steps
-
 
 class StepOutput(NamedTuple):
     """Outcome of one step of N environments.

@@ -10,7 +10,6 @@ from pathlib import Path
 
 import numpy as np
 
-from gmijax.collectives.liveness import is_alive
 from gmijax.collectives.memory import Geometry, attach, process_of
 from tests.rank_processes import Ranks
 
@@ -107,10 +106,10 @@ def test_a_rank_sees_whether_the_process_of_another_one_lives(tmp_path: Path) ->
         job.wait_for("attached")
         peer = process_of(attach(job.fd, 0, 2, 100), 1)
         assert peer.pid == job.processes[1].pid
-        assert is_alive(peer)
+        assert peer.is_running()
         job.signal(1, signal.SIGKILL)
         os.waitid(os.P_PID, peer.pid, os.WEXITED | os.WNOWAIT)
-        assert not is_alive(peer)  # a zombie still
+        assert not peer.is_running()  # a zombie still
 
 
 def test_the_block_has_no_name_so_that_no_kill_leaves_it_behind(tmp_path: Path) -> None:

@@ -19,8 +19,8 @@ from gmijax.partition.machine import Machine, detect_machine
 from gmijax.partition.nvidia import PIPE_VARIABLE, MpsControl, find_mps_control
 from gmijax.partition.plan import Plan
 from gmijax.partition.planner import make_plan
-from gmijax.partition.process_table import ProcessId, identify, wait_until_gone
 from gmijax.partition.supervisor import Supervisor
+from gmijax.processes import ProcessId, identify, wait_until_gone
 from gmijax.rundir import RunPaths
 
 pytestmark = pytest.mark.timeout(60)
@@ -115,11 +115,55 @@ def test_gmi_that_is_no_client_is_refused(mps: FakeMps, run: RunPaths):
     here = machine(1, mps_control=find_mps_control())
     plan = mps_plan(here, num_gpus=1, gmis_per_gpu=2)
     with (
-        pytest.raises(BackendUnavailable, match=r"GMI 1 \(process \d+\) is no client of the MPS"),
+        pytest.raises(
+            GmiFailed,
+            match=r"GMI 1 failed: its process \d+ is no client of .*plan\.backend=share$",
+        ),
         open_backend(plan, here, run) as backend,
     ):
         Supervisor(make_job(run, ["mps_client", "train"], backend, plan)).run()
     assert not [path for path in mps.pipe_directories() if path.exists()]
+
+
+def test_gmi_that_fails_while_shares_are_verified_is_the_one_to_blame(mps: FakeMps, run: RunPaths):
+    here = machine(1, mps_control=find_mps_control())
+    plan = mps_plan(here, num_gpus=1, gmis_per_gpu=2)
+    # GMI 1 is no client, fails half a second later, and the daemon is asked for three.
+    with (
+        pytest.raises(GmiFailed, match="GMI 1 failed: ended by SIGSEGV"),
+        open_backend(plan, here, run) as backend,
+    ):
+        Supervisor(make_job(run, ["mps_client", "die_late"], backend, plan)).run()
+
+
+def test_daemon_that_is_gone_when_shares_are_verified_is_a_failure(mps: FakeMps, run: RunPaths):
+    here = machine(1, mps_control=find_mps_control())
+    plan = mps_plan(here, num_gpus=1, gmis_per_gpu=2)
+    with open_backend(plan, here, run) as backend:
+        MpsControl(mps.program, mps.pipe_directories()[0]).quit()
+        with pytest.raises(
+            GmiFailed, match="GMI 0 failed: cannot ask whether it is an MPS client"
+        ):
+            backend.verify({0: os.getpid(), 1: os.getpid()})
+
+
+def test_stranger_to_somebodys_daemon_may_be_of_another_namespace(
+    mps: FakeMps, run: RunPaths, tmp_path: Path
+):
+    pipe_directory = tmp_path / "operator"
+    pipe_directory.mkdir()
+    control = MpsControl(mps.program, pipe_directory)
+    control.start(gpu(0).uuid, tmp_path / "operator-logs")
+    here = machine(1, mps_control=mps.program, operator_daemon=pipe_directory)
+    plan = mps_plan(here, num_gpus=1, gmis_per_gpu=1)
+    try:
+        with (
+            open_backend(plan, here, run) as backend,
+            pytest.raises(GmiFailed, match=r"GMI 0 failed: .* PID namespace"),
+        ):
+            backend.verify({0: os.getpid()})
+    finally:
+        control.quit()
 
 
 def test_clients_are_terminated_before_they_are_killed(mps: FakeMps, run: RunPaths):

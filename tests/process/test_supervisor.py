@@ -15,8 +15,8 @@ from supervision import CHECKOUT, TESTS, cpu_job
 
 from gmijax.errors import ConfigError, GmiFailed, JobInterrupted
 from gmijax.partition.gmi_process import GmiStatus
-from gmijax.partition.process_table import ProcessId, identify, wait_until_gone
 from gmijax.partition.supervisor import Job, Supervisor
+from gmijax.processes import ProcessId, identify, wait_until_gone
 from gmijax.rundir import RunPaths, read_json
 
 pytestmark = pytest.mark.timeout(30)

@@ -13,6 +13,7 @@ from collections.abc import Sequence
 from pathlib import Path, PurePosixPath
 
 import pytest
+from training_jobs import STEPS, TINY
 
 CHECKOUT = Path(__file__).resolve().parents[2]
 COMMAND_TIMEOUT_S = 180
@@ -109,3 +110,11 @@ def test_train_help_lists_keys_outside_the_checkout(python: Path, tmp_path: Path
     for key in ("num_timesteps", "plan.gmis_per_gpu", "algo.learning_rate", "run.dir"):
         assert key in text
     assert list(tmp_path.iterdir()) == [], "--help must leave nothing behind"
+
+
+def test_it_trains_outside_the_checkout(python: Path, tmp_path: Path):
+    steps = f"num_timesteps={2 * STEPS}"
+    said = run([python, "-m", "gmijax.train", *TINY, steps, "run.dir=run"], tmp_path)
+    assert "completed" in said
+    assert (tmp_path / "run" / "summary.json").is_file()
+    assert any((tmp_path / "run" / "checkpoints").iterdir())

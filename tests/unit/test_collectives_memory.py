@@ -11,15 +11,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gmijax.collectives.liveness import ProcessIdentity, is_alive, own_process
-from gmijax.collectives.memory import (
-    EXCHANGE_FD_VARIABLE,
-    LINE,
-    Geometry,
-    attach,
-    create_exchange,
-    inherited_exchange,
-)
+from gmijax.collectives.memory import LINE, Geometry, attach, create_exchange
 from gmijax.errors import CollectiveError, ConfigError
 
 
@@ -87,23 +79,3 @@ def test_a_descriptor_that_is_no_memory_is_refused() -> None:
     finally:
         os.close(reader)
         os.close(writer)
-
-
-def test_the_descriptor_comes_from_the_environment_and_goes_no_further(exchange_fd: int) -> None:
-    os.set_inheritable(exchange_fd, True)
-    assert inherited_exchange({EXCHANGE_FD_VARIABLE: str(exchange_fd)}) == exchange_fd
-    assert not os.get_inheritable(exchange_fd)
-
-
-@pytest.mark.parametrize("shown", ["", "seven", "-1", "999999", "99999999999999999999"])
-def test_a_bad_descriptor_in_the_environment_is_named(shown: str) -> None:
-    with pytest.raises(ConfigError, match=f"GMIJAX_EXCHANGE_FD='{shown}'"):
-        inherited_exchange({EXCHANGE_FD_VARIABLE: shown})
-
-
-def test_a_process_is_known_by_number_and_start() -> None:
-    own = own_process()
-    assert own.pid == os.getpid()
-    assert is_alive(own)
-    assert not is_alive(own._replace(start_ticks=own.start_ticks + 1))
-    assert not is_alive(ProcessIdentity(0, 0))

@@ -4,7 +4,16 @@ import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from gmijax.normalize import OBS_CLIP, merge, merge_all, moments_of, no_samples, normalize, std_of
+from gmijax.normalize import (
+    OBS_CLIP,
+    merge,
+    merge_all,
+    moments_of,
+    no_samples,
+    normalize,
+    std_of,
+    without_outliers,
+)
 
 
 def _samples(seed: int, count: int) -> np.ndarray:
@@ -45,6 +54,18 @@ def test_merge_all_equals_merging_one_by_one() -> None:
 def test_without_samples_observations_pass_unchanged() -> None:
     obs = jnp.array([1.0, -2.0, 3.0, 0.0])
     np.testing.assert_array_equal(normalize(no_samples((4,)), obs), obs)
+
+
+def test_outliers_do_not_widen_the_statistics_but_changes_do() -> None:
+    usual = jnp.asarray(_samples(0, 1000))
+    moments = moments_of(usual, 1)
+    wild = usual.at[3].set(1e6)
+    clipped = merge(moments, moments_of(without_outliers(moments, wild), 1))
+    np.testing.assert_allclose(std_of(clipped), std_of(moments), rtol=0.3)
+    shifted = merge(moments, moments_of(without_outliers(moments, usual + 5.0), 1))
+    exact = merge(moments, moments_of(usual + 5.0, 1))
+    jax.tree.map(np.testing.assert_array_equal, shifted, exact)
+    np.testing.assert_array_equal(without_outliers(no_samples((4,)), wild), wild)
 
 
 def test_constant_inputs_and_outliers_stay_finite() -> None:

@@ -14,7 +14,6 @@ from gmijax.errors import CollectiveTimeout, ConfigError, GmiFailed
 from gmijax.partition.child import ChildLink
 from gmijax.partition.failures import describe_exit, first_cause, last_line
 from gmijax.partition.heartbeat import Heartbeat, read_heartbeat
-from gmijax.partition.process_table import ProcessId, identify, wait_until_gone
 from gmijax.rundir import GmiPaths, RunPaths, read_json, write_json
 
 pytestmark = pytest.mark.timeout(20)
@@ -26,11 +25,22 @@ def link(tmp_path: Path) -> ChildLink:
 
 
 def test_link_is_read_from_the_environment(tmp_path: Path):
-    link = ChildLink.from_environment(
-        {"GMIJAX_GMI": "2", "GMIJAX_RUN_DIR": str(tmp_path), "GMIJAX_EXCHANGE_FD": "9"}
-    )
-    assert (link.gmi, link.exchange_fd, link.stop_requested) == (2, 9, False)
+    with (tmp_path / "exchange").open("wb") as exchange:
+        fd = exchange.fileno()
+        os.set_inheritable(fd, True)
+        link = ChildLink.from_environment(
+            {"GMIJAX_GMI": "2", "GMIJAX_RUN_DIR": str(tmp_path), "GMIJAX_EXCHANGE_FD": str(fd)}
+        )
+        assert not os.get_inheritable(fd)
+    assert (link.gmi, link.exchange_fd, link.stop_requested) == (2, fd, False)
     assert link.paths.root == tmp_path / "gmi_2"
+
+
+@pytest.mark.parametrize("shown", ["", "seven", "-1", "999999", "99999999999999999999"])
+def test_bad_descriptor_in_the_environment_is_named(tmp_path: Path, shown: str):
+    variables = {"GMIJAX_GMI": "2", "GMIJAX_RUN_DIR": str(tmp_path), "GMIJAX_EXCHANGE_FD": shown}
+    with pytest.raises(ConfigError, match=f"GMIJAX_EXCHANGE_FD='{shown}'"):
+        ChildLink.from_environment(variables)
 
 
 def test_process_that_is_no_gmi_is_told():
@@ -123,15 +133,3 @@ def test_only_the_end_of_a_long_log_is_read(tmp_path: Path):
     log.write_text("y" * 100_000)
     assert last_line(log) == "y" * 300
     assert last_line(tmp_path / "none") == ""
-
-
-def test_zombie_and_reused_number_are_not_running():
-    child = subprocess.Popen(["sleep", "0"])
-    os.waitid(os.P_PID, child.pid, os.WEXITED | os.WNOWAIT)
-    assert identify(child.pid) is None
-    child.wait()
-    process = identify(os.getpid())
-    assert process is not None
-    assert process.is_running()
-    assert not ProcessId(process.pid, process.start_ticks + 1).is_running()
-    assert wait_until_gone([process], timeout_s=0.05) == (process,)

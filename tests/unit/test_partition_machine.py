@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 from pathlib import Path
 from types import SimpleNamespace
+from typing import NoReturn
 
 import pynvml
 import pytest
@@ -79,6 +80,24 @@ def test_gpus_are_described(monkeypatch: pytest.MonkeyPatch):
     assert list_gpus()[0].mig_enabled
 
 
+def test_gpu_that_nvml_cannot_describe_is_left_out(monkeypatch: pytest.MonkeyPatch):
+    def lost(*_: object) -> NoReturn:
+        raise pynvml.NVMLError(pynvml.NVML_ERROR_GPU_IS_LOST)
+
+    def describe(index: int) -> Gpu:
+        return gpu(index) if index else lost()
+
+    monkeypatch.setattr(pynvml, "nvmlInit", lambda: None)
+    monkeypatch.setattr(pynvml, "nvmlShutdown", lambda: None)
+    monkeypatch.setattr(pynvml, "nvmlDeviceGetCount", lambda: 2)
+    monkeypatch.setattr(pynvml, "nvmlSystemGetDriverVersion", lost)
+    monkeypatch.setattr("gmijax.partition.nvidia._describe", describe)
+    assert list_gpus() == (gpu(1),)
+    assert driver_version() is None
+    monkeypatch.setattr(pynvml, "nvmlDeviceGetCount", lost)
+    assert list_gpus() == ()
+
+
 def script(folder: Path, text: str) -> Path:
     folder.mkdir(exist_ok=True)
     program = folder / "nvidia-cuda-mps-control"
@@ -98,6 +117,21 @@ def test_answers_of_the_daemon_are_read(tmp_path: Path):
     control = MpsControl(program, tmp_path)
     assert control.server_pids() == (12, 34)
     assert control.daemon_pid() is None
+
+
+def test_daemon_gets_none_of_the_users_settings_for_mps(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    for name in ("ACTIVE_THREAD_PERCENTAGE", "PINNED_DEVICE_MEM_LIMIT", "LOG_DIRECTORY"):
+        monkeypatch.setenv(f"CUDA_MPS_{name}", "the user's")
+    control = MpsControl(script(tmp_path, "env | grep ^CUDA_ | sort; exit 1"), tmp_path / "pipe")
+    logs = tmp_path / "logs"
+    with pytest.raises(BackendUnavailable) as error:
+        control.start("GPU-a", logs)
+    assert str(error.value).endswith(
+        f"exit code 1: CUDA_MPS_LOG_DIRECTORY={logs}; "
+        f"CUDA_MPS_PIPE_DIRECTORY={tmp_path / 'pipe'}; CUDA_VISIBLE_DEVICES=GPU-a"
+    )
 
 
 def test_daemon_that_is_not_there_is_told_in_one_line(tmp_path: Path):

@@ -134,6 +134,16 @@ def test_gpu_in_mig_mode_is_refused():
         planned(here, gpus=(1,))
 
 
+def test_gpus_in_mig_mode_are_passed_over():
+    here = machine(0, gpus=(gpu(0, mig_enabled=True), gpu(1), gpu(2)))
+    plan = planned(here, gpus=1)
+    assert plan.slices[0].device == gpu(1).uuid
+    assert "GPUs [1]: not [0], which are in MIG mode" in plan.reasons
+    assert [share.device for share in planned(here, gpus=2).slices] == [gpu(1).uuid, gpu(2).uuid]
+    with pytest.raises(BackendUnavailable, match="GPU 0 is in MIG mode"):
+        planned(here, gpus=3)
+
+
 def test_new_drivers_allow_more_clients():
     here = machine(1, mps_control=MPS, driver_version="590.44")
     assert planned(here, gmis_per_gpu=60).layout.num_gmis == 60

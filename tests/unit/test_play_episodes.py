@@ -69,7 +69,10 @@ def episodes_of(algo: PpoConfig, env: Env, **changes: object):
     learner = make_learner(SPEC, algo)
     state = init_learner(learner, SPEC.obs_size, jax.random.key(1))
     options = Options(num_envs=8, num_shown=3, seed=0, deterministic=True, max_steps=None)
-    return run_episodes(env, learner, state, options._replace(**changes))
+    chunks: list[int] = []
+    played = run_episodes(env, learner, state, options._replace(**changes), chunks.append)
+    assert chunks == list(range(-(-int(played.lengths.max()) // CHUNK_STEPS) + 1))
+    return played
 
 
 def test_every_environment_plays_one_episode_and_no_more(algo: PpoConfig):

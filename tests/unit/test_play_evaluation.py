@@ -17,8 +17,8 @@ from gmijax.errors import ConfigError, GmijaxError
 from gmijax.partition.machine import Machine
 from gmijax.partition.nvidia import Gpu
 from gmijax.playdir import EXIT_NO_GL, PlayPaths
-from gmijax.resume import META, CheckpointMeta
-from gmijax.rundir import RunPaths, write_json
+from gmijax.resume import CheckpointMeta
+from gmijax.rundir import META, RunPaths, write_json
 
 
 def config_of(*overrides: str) -> PlayConfig:
@@ -52,6 +52,16 @@ def test_the_latest_checkpoint_is_played_unless_one_is_named(
         ((f"run.dir={run.root}", f"checkpoint={first}"), first),
     ):
         assert evaluation._find(config_of(*overrides)) == expected
+
+
+def test_a_checkpoint_outside_of_its_run_is_bad_input(run: RunPaths, tmp_path: Path):
+    copied = tmp_path / "elsewhere" / "copied"
+    shutil.copytree(run.checkpoint(100), copied)
+    with pytest.raises(
+        ConfigError, match=r"no config\.json .* can only be used in its run folder"
+    ):
+        evaluation.play(config_of(f"checkpoint={copied}"))
+    assert list(copied.parent.iterdir()) == [copied]
 
 
 @pytest.mark.parametrize(
@@ -114,14 +124,24 @@ def test_every_opengl_is_tried_the_users_first(
     assert tried == ["glfw", "egl", "osmesa"]
 
 
+@pytest.mark.parametrize(("exit_code", "name"), [(-9, "SIGKILL"), (-15, "SIGTERM")])
+def test_a_renderer_that_somebody_ended_is_no_missing_opengl(
+    tmp_path: Path, quiet: Console, monkeypatch: pytest.MonkeyPatch, exit_code: int, name: str
+):
+    monkeypatch.setattr(evaluation, "_render", lambda *_: exit_code)
+    with pytest.raises(GmijaxError, match=f"no video: the renderer was ended by {name} .*log: "):
+        evaluation._film(config_of("video=auto"), PlayPaths(tmp_path), quiet)
+
+
 def test_without_opengl_only_a_film_that_was_asked_for_is_an_error(
     tmp_path: Path, quiet: Console, monkeypatch: pytest.MonkeyPatch
 ):
     monkeypatch.delenv("MUJOCO_GL", raising=False)
     monkeypatch.setattr(evaluation, "_render", lambda *_: EXIT_NO_GL)
     paths = PlayPaths(tmp_path)
+    paths.render_log.write_text("Traceback\nImportError: no library\n")
     assert evaluation._film(config_of("video=auto"), paths, quiet) == ()
-    with pytest.raises(GmijaxError, match=r"egl, osmesa.*libegl1.*libosmesa6.*were evaluated"):
+    with pytest.raises(GmijaxError, match=r"egl, osmesa.*libegl1.*libosmesa6.*no library.*log: "):
         evaluation._film(config_of("video=gif"), paths, quiet)
 
 

@@ -54,7 +54,7 @@ def test_time_limit_truncates_and_statistics_are_of_the_finished_episodes():
     assert {k: float(v) for k, v in finished.term_sums.items()} == {"walk": 4.0, "push": 20.0}
     assert int(outputs[0].finished.count) == 0
     assert state.return_sum.tolist() == [0.0, 0.0]
-    assert state.length.tolist() == [0, 0]
+    assert state.env.steps.tolist() == [0, 0]
 
 
 def test_an_episode_that_ends_by_itself_at_the_limit_is_not_truncated():
@@ -75,7 +75,7 @@ def test_running_sums_go_on_until_the_episode_ends():
     state, _ = run(episode_length=5, steps=2)
     assert state.return_sum.tolist() == [12.0, 12.0]
     assert state.term_sums["push"].tolist() == [10.0, 10.0]
-    assert state.length.tolist() == [2, 2]
+    assert state.env.steps.tolist() == [2, 2]
 
 
 def test_two_halves_see_what_the_whole_sees():

@@ -45,7 +45,7 @@ class Backend(Protocol):
         """Checks that every GMI really has its share; `pids` is GMI -> process.
 
         Raises:
-          BackendUnavailable: a GMI runs without it.
+          GmiFailed: a GMI runs without it, or that cannot be found out.
         """
         ...
 

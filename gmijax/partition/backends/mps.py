@@ -16,7 +16,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import Self
 
-from gmijax.errors import BackendUnavailable
+from gmijax.errors import BackendUnavailable, GmiFailed
 from gmijax.partition.janitor import JanitorLink, quit_daemon
 from gmijax.partition.machine import Machine
 from gmijax.partition.nvidia import PIPE_VARIABLE, MpsControl
@@ -102,10 +102,10 @@ class MpsBackend:
         while strangers := self._strangers(pids):
             if time.monotonic() > deadline_s:
                 gmi, pid = next(iter(strangers.items()))
-                raise BackendUnavailable(
-                    f"plan.backend=mps: GMI {gmi} (process {pid}) is no client of the MPS daemon "
-                    f"in {self._control_of(gmi).pipe_directory}; see its logs in {self._logs}, "
-                    "or use plan.backend=share"
+                raise GmiFailed(
+                    gmi,
+                    f"its process {pid} is no client of the MPS daemon in "
+                    f"{self._control_of(gmi).pipe_directory}; {self._advice()}",
                 )
             time.sleep(_POLL_S)
 
@@ -145,8 +145,23 @@ class MpsBackend:
             time.sleep(_POLL_S)
 
     def _strangers(self, pids: Mapping[int, int]) -> dict[int, int]:
-        clients = {control: control.all_client_pids() for control in set(self._controls.values())}
+        clients: dict[MpsControl, Mapping[int, int]] = {}
+        for gmi in pids:
+            control = self._control_of(gmi)
+            try:
+                clients[control] = clients.get(control) or control.all_client_pids()
+            except BackendUnavailable as error:
+                raise GmiFailed(gmi, f"cannot ask whether it is an MPS client: {error}") from error
         return {gmi: pid for gmi, pid in pids.items() if pid not in clients[self._control_of(gmi)]}
+
+    def _advice(self) -> str:
+        if self._operator is None:
+            return f"see its logs in {self._logs}, or use plan.backend=share"
+        return (
+            "gmijax did not start this daemon: if it runs in another PID namespace (outside of "
+            "this container), it knows its clients by other numbers and they cannot be checked; "
+            "share its PID namespace, or use plan.backend=share"
+        )
 
     def _quit_all(self) -> None:
         for control in self._controls.values():

@@ -23,7 +23,9 @@ from gmijax.sim.rewards import Replacement, RewardTerm, term_names, total_reward
 from gmijax.types import Array, PRNGKey, PyTree
 
 DEFAULT_EPISODE_LENGTH = 1000
-SUBSTEPS = 2
+SUBSTEPS = 3
+# A running ant stays below 100, the sensors of a landing foot included.
+MAX_ABS_OBS = 500.0
 OBS_SIZE = 60
 ACTION_SIZE = 8
 TARGET_M = (1000.0, 0.0)
@@ -120,6 +122,7 @@ def make(*, impl: str = "auto", max_envs: int | None = None) -> Env:
         control_dt_s=world.control_dt_s,
         episode_length=DEFAULT_EPISODE_LENGTH,
         reward_terms=term_names(TERMS, DEATH),
+        max_abs_obs=MAX_ABS_OBS,
     )
 
     def reset(model: PyTree, key: PRNGKey) -> EnvState:

@@ -24,6 +24,8 @@ from gmijax.types import Array, PRNGKey, PyTree
 
 DEFAULT_EPISODE_LENGTH = 500
 SUBSTEPS = 2
+# A ball in play stays below 50, the impact of its fall included.
+MAX_ABS_OBS = 500.0
 OBS_SIZE = 24
 ACTION_SIZE = 3
 OBS_LIMIT = 5.0
@@ -99,6 +101,7 @@ def make(*, impl: str = "auto", max_envs: int | None = None) -> Env:
         control_dt_s=world.control_dt_s,
         episode_length=DEFAULT_EPISODE_LENGTH,
         reward_terms=term_names(TERMS),
+        max_abs_obs=MAX_ABS_OBS,
     )
 
     def reset(model: PyTree, key: PRNGKey) -> EnvState:

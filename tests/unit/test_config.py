@@ -1,0 +1,45 @@
+"""Checks of the configuration that need more than a range."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any
+
+import jax.numpy as jnp
+import pytest
+
+from gmijax.cli import compose
+from gmijax.config import ADAPTIVE_LEARNING_RATE_RANGE, TrainConfig, from_dict, to_dict
+from gmijax.errors import ConfigError
+from gmijax.ppo.learner import adapted_learning_rate
+
+
+@pytest.mark.parametrize("value", [float("inf"), float("-inf"), float("nan"), 10**400])
+def test_numbers_are_finite(value: float):
+    data: dict[str, Any] = to_dict(compose())
+    data["reduce"]["timeout_s"] = value
+    with pytest.raises(ConfigError, match=r"^reduce\.timeout_s=.*: expected a finite number$"):
+        from_dict(TrainConfig, data)
+
+
+@pytest.mark.parametrize("value", [float("inf"), float("nan")])
+def test_integers_are_finite(value: float):
+    with pytest.raises(ConfigError, match=r"^seed=.*: expected an integer$"):
+        from_dict(TrainConfig, {**to_dict(compose()), "seed": value})
+
+
+@pytest.mark.parametrize("rate", [9e-6, 0.011])
+def test_adaptive_learning_rate_begins_where_it_is_kept(rate: float):
+    algo = compose("algo.learning_rate_schedule=adaptive_kl").algo
+    with pytest.raises(
+        ConfigError, match=r"learning_rate=.* must be between 1e-05 and 0\.01 with"
+    ):
+        dataclasses.replace(algo, learning_rate=rate)
+    dataclasses.replace(algo, learning_rate=rate, learning_rate_schedule="fixed")
+
+
+@pytest.mark.parametrize("end", [0, 1])
+def test_limits_are_those_of_the_learner(end: int):
+    limit, kl = ADAPTIVE_LEARNING_RATE_RANGE[end], (1.0, 1e-9)[end]
+    kept = adapted_learning_rate(jnp.float32(limit), jnp.float32(kl), 0.01)
+    assert float(kept) == pytest.approx(limit)

@@ -1,0 +1,71 @@
+"""Worlds with bad numbers are ended, counted, and do no harm."""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from toy_env import point_mass
+
+from gmijax.errors import NonFiniteError
+from gmijax.metrics import MetricsLog
+from gmijax.ppo.losses import LossMetrics
+from gmijax.ppo.programs import IterationMetrics, stats_example
+from gmijax.ppo.report import TOLERATED_STEPS, Reporter
+from gmijax.sim.wrappers import env_keys
+
+ENV = point_mass()
+N = 4
+
+
+def _step_from(x: list[float]):
+    state = jax.jit(ENV.init)(ENV.model, env_keys(jax.random.key(0), 0, N))
+    position, velocity = jnp.asarray(x), state.env.physics[1]
+    state = state._replace(
+        env=state.env._replace(physics=(position, velocity), obs=jnp.ones((N, 2)))
+    )
+    return jax.jit(ENV.step)(ENV.model, state, jnp.zeros((N, 1)))
+
+
+def test_a_bad_world_ends_with_its_last_good_observation_and_no_reward() -> None:
+    _, out = _step_from([0.0, float("nan"), 1e12, 0.5])
+    np.testing.assert_array_equal(out.terminated, [False, True, True, False])
+    np.testing.assert_array_equal(out.next_obs[1:3], 1.0)
+    np.testing.assert_array_equal(out.reward[1:3], 0.0)
+    assert np.isfinite(out.reward).all()
+
+
+def test_bad_worlds_are_counted_by_where_the_number_was() -> None:
+    _, out = _step_from([0.0, float("nan"), 1e7, 0.5])
+    # 1e7 is a possible position, but no observation; its square is finite too.
+    counts = {name: int(count) for name, count in out.diverged.items()}
+    assert counts == {
+        "any": 2,
+        "physics": 1,
+        "observation": 2,
+        "reward/near": 1,
+        "reward/effort": 0,
+    }
+
+
+def test_a_bad_world_starts_over_and_the_others_go_on() -> None:
+    state, _ = _step_from([0.0, float("nan"), 0.0, 0.5])
+    np.testing.assert_array_equal(state.env.steps, [1, 0, 1, 1])
+    assert np.isfinite(state.env.obs).all()
+
+
+@pytest.mark.parametrize("count", [TOLERATED_STEPS, TOLERATED_STEPS + 1])
+def test_few_bad_steps_are_tolerated_and_many_are_named(count: int) -> None:
+    stats = stats_example(2, ENV.spec.reward_terms)
+    stats = stats._replace(
+        diverged=stats.diverged | {"any": jnp.asarray(count), "reward/near": jnp.asarray(count)}
+    )
+    zero = jnp.zeros(())
+    metrics = IterationMetrics(stats, LossMetrics(*[zero] * 5), zero, zero)
+    reporter = Reporter("point_mass", MetricsLog(()), 0)
+    if count <= TOLERATED_STEPS:
+        reporter.report(64, metrics, {})
+    else:
+        with pytest.raises(NonFiniteError, match=r"point_mass, up to env step 64: .* reward/near"):
+            reporter.report(64, metrics, {})

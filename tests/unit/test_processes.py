@@ -1,0 +1,45 @@
+"""Processes by number and start time."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import subprocess
+from pathlib import Path
+
+from gmijax.processes import ProcessId, identify, own_process, wait_until_gone
+
+
+def test_zombie_is_not_running():
+    child = subprocess.Popen(["sleep", "0"])
+    os.waitid(os.P_PID, child.pid, os.WEXITED | os.WNOWAIT)
+    assert identify(child.pid) is None
+    child.wait()
+
+
+def test_reused_number_is_another_process():
+    own = own_process()
+    assert own == identify(os.getpid())
+    assert own.is_running()
+    assert not own._replace(start_ticks=own.start_ticks + 1).is_running()
+    assert not ProcessId(0, 0).is_running()
+
+
+def test_name_of_a_program_may_hold_brackets_and_bytes_that_are_no_text(tmp_path: Path):
+    program = tmp_path / os.fsdecode(b"a) Z 1 \xff")
+    shutil.copy("/bin/sleep", program)
+    child = subprocess.Popen([program, "60"])
+    try:
+        process = identify(child.pid)
+        assert process is not None
+        assert process.is_running()
+    finally:
+        child.kill()
+        child.wait()
+    assert not process.is_running()
+
+
+def test_waiting_ends_in_time_and_returns_what_still_runs():
+    own = own_process()
+    assert wait_until_gone([own], timeout_s=0.05) == (own,)
+    assert wait_until_gone([ProcessId(0, 0)], timeout_s=10) == ()

@@ -1,0 +1,135 @@
+"""Which checkpoint is meant, and what of its run is used."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+from pathlib import Path
+
+import pytest
+
+from gmijax.cli import compose
+from gmijax.config import to_dict
+from gmijax.errors import ConfigError
+from gmijax.resume import CheckpointMeta, find_checkpoint
+from gmijax.rundir import META, RunPaths, last_run, read_json, write_json
+
+
+def make_run(root: Path, *env_steps: int) -> RunPaths:
+    """A run of `ant` with other settings than the defaults, and checkpoints that hold nothing."""
+    paths = RunPaths(root)
+    write_json(paths.config, to_dict(compose("env=ant", "num_envs=8", "seed=5", "run.name=x")))
+    for steps in env_steps:
+        meta = CheckpointMeta("ant", "ppo", steps, 1, 8, ((8,), (8, 4)), "jax")
+        write_json(paths.checkpoint(steps) / META, meta.to_dict())
+    return paths
+
+
+@pytest.fixture
+def run(tmp_path: Path) -> RunPaths:
+    return make_run(tmp_path / "runs" / "x", 100, 2000)
+
+
+def test_last_is_the_run_with_the_newest_checkpoint(tmp_path: Path):
+    runs = tmp_path / "runs"
+    old, new = make_run(runs / "b", 900), make_run(runs / "a", 100)
+    make_run(runs / "none")
+    (runs / "file").touch()
+    os.utime(old.checkpoint(900) / META, (1e9, 1e9))
+    os.utime(new.checkpoint(100) / META, (2e9, 2e9))
+    # What is put into an old run later does not make it the last one.
+    (old.root / "play").mkdir()
+    (old.checkpoint(900) / "note").touch()
+    (old.checkpoints / "000000001000").mkdir()
+    assert last_run("run.dir", runs) == new.root
+
+
+def test_without_a_checkpoint_there_is_no_last_run(tmp_path: Path):
+    make_run(tmp_path / "x")
+    with pytest.raises(ConfigError, match=r"^run\.dir=last: no run with a checkpoint in .*/$"):
+        last_run("run.dir", tmp_path)
+
+
+def test_meta_data_survive_the_file(run: RunPaths):
+    meta = CheckpointMeta.read(run.checkpoint(100))
+    assert meta == CheckpointMeta("ant", "ppo", 100, 1, 8, ((8,), (8, 4)), "jax")
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        *("", "{", "[]", "null", "{}", '{"env": "ant"}', "\udcff"),
+        '{"env": 1.5, "algo": "ppo", "env_steps": 1, "num_gmis": 1, "num_envs": 1, "hidden": [], '
+        '"impl": "jax"}',
+        '{"env": "a", "algo": "ppo", "env_steps": 1, "num_gmis": 1, "num_envs": 1, "hidden": 7, '
+        '"impl": "jax"}',
+    ],
+)
+def test_broken_meta_data_are_bad_input(run: RunPaths, text: str):
+    (run.checkpoint(2000) / META).write_text(text, errors="surrogateescape")
+    checkpoint = find_checkpoint(str(run.root), "run.resume")
+    with pytest.raises(
+        ConfigError, match=r"checkpoint .*/000000002000: broken meta\.json \(.+\)$"
+    ):
+        CheckpointMeta.read(checkpoint)
+
+
+def test_a_resumed_run_keeps_its_settings_but_those_given_again(run: RunPaths):
+    config = compose(f"run.resume={run.root}", "num_envs=16", "plan=default", "run.grace_s=3")
+    assert (config.env.name, config.seed, config.num_envs, config.run.grace_s) == ("ant", 5, 16, 3)
+    assert config.run.resume == str(run.checkpoint(2000))
+    assert config.run.name is None
+
+
+def test_what_an_older_version_did_not_save_is_filled_in_for_the_runs_own_task(run: RunPaths):
+    saved = read_json(run.config)
+    del saved["reduce"], saved["algo"]["reward_scaling"], saved["algo"]["bound_cost"]
+    write_json(run.config, saved)
+    config = compose(f"run.resume={run.root}")
+    assert config.algo.reward_scaling == compose("env=ant").algo.reward_scaling
+    assert config.algo.reward_scaling != compose("env=ball_balance").algo.reward_scaling
+    assert config.reduce == compose().reduce
+    assert config.num_envs == 8
+
+
+@pytest.mark.parametrize(
+    ("override", "message"),
+    [
+        ("+foo.bar=1", "unknown key foo"),
+        ("+algo.foo=1", "unknown key algo.foo"),
+        ("tuned=ant_ppo", "tuned=ant_ppo: a run that is resumed keeps its settings"),
+        ("~num_envs", "~num_envs: a run that is resumed keeps its settings"),
+        ("~tuned", "~tuned: a run that is resumed keeps its settings"),
+        ("hydra.run.dir=x", r"unknown key hydra\.run\.dir"),
+        ("hydra/launcher=basic", "unknown key hydra/launcher"),
+        ("num_envs=8,16", "num_envs=8,16: expected one value"),
+        ("env.name=ball_balance", "choose the task with env=ball_balance"),
+        ("+run={a: 1}", r"unknown key run\.a"),
+        ("run=5", "."),
+    ],
+)
+def test_overrides_that_a_resumed_run_cannot_take(run: RunPaths, override: str, message: str):
+    with pytest.raises(ConfigError, match=message):
+        compose(f"run.resume={run.root}", override)
+
+
+def test_a_checkpoint_outside_of_its_run_is_bad_input(run: RunPaths, tmp_path: Path):
+    copied = tmp_path / "elsewhere" / "copied"
+    shutil.copytree(run.checkpoint(100), copied)
+    with pytest.raises(ConfigError, match=r"no config\.json in .*only be used in its run folder$"):
+        compose(f"run.resume={copied}")
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("{", r"config\.json: broken \(not JSON"),
+        ("[]", r"config\.json: broken \(not a JSON object\)"),
+        (json.dumps({"env": {}, "algo": 3}), "not the configuration of a training run"),
+    ],
+)
+def test_a_broken_configuration_is_bad_input(run: RunPaths, text: str, message: str):
+    run.config.write_text(text)
+    with pytest.raises(ConfigError, match=message):
+        compose(f"run.resume={run.root}")
