@@ -39,7 +39,6 @@ SUITES = MappingProxyType(
         # What one GMI does with the environments that each of the four had.
         "ant-small": (Case("1 GMI x 2048", (*_THIRTY, "num_envs=2048")),),
         "ant-2gpu": (
-            Case("2 GPUs x 1 GMI x 4096", (*_TWO_GPUS, "num_envs=4096")),
             Case(
                 "2 GPUs x 2 GMIs x 2048, mps",
                 (*_TWO_GPUS, "num_envs=2048", "plan.gmis_per_gpu=2", "plan.backend=mps"),
@@ -49,6 +48,8 @@ SUITES = MappingProxyType(
                 (*_TWO_GPUS, "num_envs=2048", "plan.gmis_per_gpu=2", "plan.backend=share"),
             ),
         ),
+        # Plain data parallelism: the same environments with one GMI on each GPU.
+        "ant-2gpu-one-each": (Case("2 GPUs x 1 GMI x 4096", (*_TWO_GPUS, "num_envs=4096")),),
         "ant-learns": (Case("1 GMI x 8192", (*_ANT, "num_envs=8192", "num_timesteps=150e6")),),
         "ball-cpu": (Case("2 GMIs x 512", ("env=ball_balance", "plan.gpus=2")),),
     }
