@@ -24,9 +24,10 @@ from omegaconf.errors import OmegaConfBaseException
 from rich.console import Console
 from rich.table import Table
 
-from gmijax.config import TrainConfig, from_dict, suggestion, to_dict
+from gmijax.config import TrainConfig
 from gmijax.errors import ConfigError, GmijaxError, JobInterrupted
 from gmijax.resume import find_checkpoint, saved_config
+from gmijax.schema import from_dict, suggestion, to_dict
 
 C = TypeVar("C")
 

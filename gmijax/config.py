@@ -1,32 +1,19 @@
 """The configuration of a run: frozen dataclasses and their checks.
 
 No hydra and no jax here. Default values live in `configs/`, meanings live here: `--help` prints
-the `doc` of every field. `from_dict` is the one constructor from outside data; it rejects
-unknown keys and wrong types with one clear line.
+the `doc` of every field. `gmijax.schema.from_dict` makes them from outside data.
 """
 
 from __future__ import annotations
 
-import dataclasses
-import difflib
-import sys
-import types
-import typing
-from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, Literal, TypeVar
+from typing import Literal
 
 from gmijax.errors import ConfigError
-
-T = TypeVar("T")
+from gmijax.schema import doc, require_at_least, require_between, require_positive
 
 ADAPTIVE_LEARNING_RATE_RANGE = (1e-5, 1e-2)
 """Where the adaptive schedule keeps the learning rate, and so where it must begin."""
-
-
-def doc(text: str) -> Any:
-    """A dataclass field whose meaning `--help` prints."""
-    return dataclasses.field(metadata={"doc": text})
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -225,114 +212,3 @@ class PlayConfig:
             require_at_least("max_steps", self.max_steps, 1)
         for key in ("width", "height"):
             require_between(key, getattr(self, key), 64, 4096)
-
-
-def require_at_least(key: str, value: float, low: float) -> None:
-    """Raises ConfigError unless `value >= low`."""
-    if not value >= low:
-        raise ConfigError(f"{key}={value!r}: must be at least {low}")
-
-
-def require_positive(key: str, value: float) -> None:
-    """Raises ConfigError unless `value > 0`."""
-    if not value > 0:
-        raise ConfigError(f"{key}={value!r}: must be greater than 0")
-
-
-def require_between(key: str, value: float, low: float, high: float) -> None:
-    """Raises ConfigError unless `low <= value <= high`."""
-    if not low <= value <= high:
-        raise ConfigError(f"{key}={value!r}: must be between {low} and {high}")
-
-
-def from_dict(cls: type[T], data: Mapping[str, Any], path: str = "") -> T:
-    """Builds a frozen config tree from plain data, checking names and types.
-
-    Lists become tuples, and a float with a whole value is accepted for an integer (`30e6`).
-
-    Raises:
-      ConfigError: an unknown or missing key, a wrong type, or a value out of range.
-    """
-    hints = typing.get_type_hints(cls)
-    for key in data:
-        if key not in hints:
-            raise ConfigError(f"unknown key {path}{key}{suggestion(key, hints)}")
-    if missing := [key for key in hints if key not in data]:
-        raise ConfigError(f"missing key {path}{missing[0]}")
-    return cls(**{key: _convert(kind, data[key], path + key) for key, kind in hints.items()})
-
-
-def to_dict(config: Any) -> dict[str, Any]:
-    """The plain data of a config tree; `from_dict` inverts it."""
-    return dataclasses.asdict(config)
-
-
-def suggestion(key: str, allowed: typing.Iterable[str]) -> str:
-    """`: did you mean ...` where a name is close, else `: allowed are ...`."""
-    names = sorted(allowed)
-    close = difflib.get_close_matches(key, names, n=1)
-    return f": did you mean {close[0]}?" if close else f": allowed are {', '.join(names)}"
-
-
-def _convert(kind: Any, value: Any, key: str) -> Any:
-    if dataclasses.is_dataclass(kind):
-        if not isinstance(value, Mapping):
-            raise ConfigError(f"{key}={value!r}: expected a group of keys")
-        return from_dict(typing.cast(type, kind), value, f"{key}.")
-    for option in _options(kind):
-        converted = _accept(option, value, key)
-        if converted is not _REJECTED:
-            return converted
-    raise ConfigError(f"{key}={_shown(value)}: expected {_describe(kind)}")
-
-
-_REJECTED = object()
-
-
-def _options(kind: Any) -> tuple[Any, ...]:
-    if typing.get_origin(kind) in (types.UnionType, typing.Union):
-        return typing.get_args(kind)
-    return (kind,)
-
-
-def _accept(kind: Any, value: Any, key: str) -> Any:
-    if typing.get_origin(kind) is Literal:
-        # YAML reads a bare `off` or `on` as a boolean; none of our choices is one.
-        return value if value in typing.get_args(kind) else _REJECTED
-    if typing.get_origin(kind) is tuple:
-        if not isinstance(value, list | tuple):
-            return _REJECTED
-        return tuple(_convert(typing.get_args(kind)[0], item, key) for item in value)
-    if kind is type(None):
-        return None if value is None else _REJECTED
-    if isinstance(value, bool):
-        return value if kind is bool else _REJECTED
-    if kind is int and isinstance(value, float) and value.is_integer():
-        return int(value)
-    if kind is float and isinstance(value, int | float):
-        # Neither not-a-number nor infinite, nor an integer that is larger than any float.
-        return float(value) if abs(value) <= sys.float_info.max else _REJECTED
-    if kind is str and isinstance(value, int):
-        return str(value)
-    return value if isinstance(kind, type) and isinstance(value, kind) else _REJECTED
-
-
-def _describe(kind: Any) -> str:
-    names = {int: "an integer", float: "a finite number", bool: "true or false", str: "text"}
-    parts: list[str] = []
-    for option in _options(kind):
-        if typing.get_origin(option) is Literal:
-            parts.append("one of " + ", ".join(map(str, typing.get_args(option))))
-        elif typing.get_origin(option) is tuple:
-            inner = typing.get_args(option)[0]
-            nested = typing.get_origin(inner) is tuple
-            parts.append("a list of lists of integers" if nested else "a list of integers")
-        elif option is type(None):
-            parts.append("null")
-        else:
-            parts.append(names[option])
-    return " or ".join(parts)
-
-
-def _shown(value: Any) -> str:
-    return str(value) if isinstance(value, str) else repr(value)

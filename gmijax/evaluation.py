@@ -18,7 +18,7 @@ from typing import Any, Final, NamedTuple
 from rich.console import Console
 from rich.table import Table
 
-from gmijax.config import PlanConfig, PlayConfig, ReduceConfig, to_dict
+from gmijax.config import PlanConfig, PlayConfig, ReduceConfig
 from gmijax.errors import ConfigError, GmijaxError
 from gmijax.job import compilation_cache_dir
 from gmijax.partition.backends import open_backend
@@ -31,6 +31,7 @@ from gmijax.partition.supervisor import Job, Patience, Supervisor
 from gmijax.playdir import EXIT_NO_GL, PlayPaths
 from gmijax.resume import CheckpointMeta, find_checkpoint, trained_config
 from gmijax.rundir import META, STEP_DIGITS, RunPaths, read_json, write_json
+from gmijax.schema import to_dict
 from gmijax.sim.registry import require_task
 
 MEMORY_FRACTION: Final = 0.1

@@ -21,7 +21,7 @@ from typing import Any, NamedTuple
 from rich.console import Console
 
 from gmijax.collectives.memory import create_exchange
-from gmijax.config import TrainConfig, to_dict
+from gmijax.config import TrainConfig
 from gmijax.errors import ConfigError, GmijaxError, JobInterrupted
 from gmijax.partition.backends import open_backend
 from gmijax.partition.environment import gmi_environment
@@ -33,6 +33,7 @@ from gmijax.progress import ConsoleProgress, Progress, SilentProgress
 from gmijax.results import MetricsReader, copy_history, draw_returns, read_metrics
 from gmijax.resume import CheckpointMeta, check_fits, find_checkpoint
 from gmijax.rundir import RunPaths, create_run, read_json, write_json
+from gmijax.schema import to_dict
 from gmijax.sim.impl import choose_impl
 from gmijax.sim.registry import require_task
 from gmijax.version import __version__

@@ -9,12 +9,13 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from gmijax.config import PlayConfig, from_dict
+from gmijax.config import PlayConfig
 from gmijax.errors import ConfigError
 from gmijax.partition.child import ChildLink
 from gmijax.playdir import PlayPaths
 from gmijax.resume import CheckpointMeta, trained_config
 from gmijax.rundir import read_json, write_json
+from gmijax.schema import from_dict
 
 if TYPE_CHECKING:
     import numpy as np

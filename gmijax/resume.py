@@ -6,9 +6,10 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from gmijax.config import EnvConfig, PpoConfig, from_dict
+from gmijax.config import EnvConfig, PpoConfig
 from gmijax.errors import ConfigError
 from gmijax.rundir import META, RunPaths, last_run, read_json
+from gmijax.schema import from_dict
 
 
 @dataclass(frozen=True)

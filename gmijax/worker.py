@@ -9,10 +9,11 @@ from __future__ import annotations
 import sys
 from typing import Any
 
-from gmijax.config import TrainConfig, from_dict
+from gmijax.config import TrainConfig
 from gmijax.partition.child import ChildLink
 from gmijax.partition.plan import Plan
 from gmijax.rundir import read_json, write_json
+from gmijax.schema import from_dict
 
 
 def main() -> int:

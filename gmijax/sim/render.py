@@ -20,9 +20,10 @@ import imageio_ffmpeg
 import numpy as np
 import numpy.typing as npt
 
-from gmijax.config import PlayConfig, from_dict
+from gmijax.config import PlayConfig
 from gmijax.playdir import EXIT_NO_GL, PlayPaths
 from gmijax.rundir import RunPaths, read_json
+from gmijax.schema import from_dict
 
 MP4_MAX_FPS, GIF_MAX_FPS = 30.0, 15.0
 

@@ -9,9 +9,10 @@ import jax.numpy as jnp
 import pytest
 
 from gmijax.cli import compose
-from gmijax.config import ADAPTIVE_LEARNING_RATE_RANGE, TrainConfig, from_dict, to_dict
+from gmijax.config import ADAPTIVE_LEARNING_RATE_RANGE, TrainConfig
 from gmijax.errors import ConfigError
 from gmijax.ppo.learner import adapted_learning_rate
+from gmijax.schema import from_dict, to_dict
 
 
 @pytest.mark.parametrize("value", [float("inf"), float("-inf"), float("nan"), 10**400])

@@ -12,13 +12,14 @@ from rich.console import Console
 
 from gmijax import evaluation
 from gmijax.cli import command
-from gmijax.config import PlayConfig, to_dict
+from gmijax.config import PlayConfig
 from gmijax.errors import ConfigError, GmijaxError
 from gmijax.partition.machine import Machine
 from gmijax.partition.nvidia import Gpu
 from gmijax.playdir import EXIT_NO_GL, PlayPaths
 from gmijax.resume import CheckpointMeta
 from gmijax.rundir import META, RunPaths, write_json
+from gmijax.schema import to_dict
 
 
 def config_of(*overrides: str) -> PlayConfig:

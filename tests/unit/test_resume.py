@@ -10,10 +10,10 @@ from pathlib import Path
 import pytest
 
 from gmijax.cli import compose
-from gmijax.config import to_dict
 from gmijax.errors import ConfigError
 from gmijax.resume import CheckpointMeta, find_checkpoint
 from gmijax.rundir import META, RunPaths, last_run, read_json, write_json
+from gmijax.schema import to_dict
 
 
 def make_run(root: Path, *env_steps: int) -> RunPaths:
