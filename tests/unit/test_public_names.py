@@ -1,0 +1,28 @@
+"""The names that users import."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+
+import pytest
+
+import gmijax
+
+
+def test_every_public_name_can_be_had() -> None:
+    assert sorted(gmijax.__all__) == dir(gmijax)
+    for name in gmijax.__all__:
+        assert getattr(gmijax, name) is not None
+
+
+def test_an_unknown_name_is_an_attribute_error() -> None:
+    with pytest.raises(AttributeError, match="no attribute 'trian'"):
+        _ = getattr(gmijax, "trian")  # noqa: B009
+
+
+@pytest.mark.parametrize("module", ["gmijax", "gmijax.cli", "gmijax.job", "gmijax.evaluation"])
+def test_the_controller_loads_neither_jax_nor_mujoco(module: str) -> None:
+    code = f"import {module}, sys; print(sorted({{'jax', 'mujoco', 'flax'}} & sys.modules.keys()))"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "[]"
