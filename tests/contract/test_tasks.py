@@ -13,6 +13,7 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
+from compile_options import CPU_OPTIONS
 
 from gmijax.sim import physics
 from gmijax.sim.interface import Env
@@ -22,7 +23,6 @@ from gmijax.sim.wrappers import BatchedEnv, BatchState, StepOutput, env_keys, tr
 NUM_ENVS = 8
 EPISODE_LENGTH = 25
 # Halves the time to compile; other devices do not know the option.
-CPU_OPTIONS = {"xla_cpu_use_fusion_emitters": False} if jax.default_backend() == "cpu" else None
 
 
 class Task(NamedTuple):

@@ -3,13 +3,13 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
+from compile_options import CPU_OPTIONS
 from mujoco import mjx
 
 from gmijax.errors import ConfigError
 from gmijax.sim.physics import PhysicsState, choose_impl, from_mj_model
 
 # Halves the time to compile; other devices do not know the option.
-CPU_OPTIONS = {"xla_cpu_use_fusion_emitters": False} if jax.default_backend() == "cpu" else None
 
 PENDULUM_OVER_FLOOR = """
 <mujoco>
