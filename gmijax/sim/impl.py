@@ -40,4 +40,5 @@ def choose_impl(
         return "jax", f"MJX-Warp is slow on {device_platform}"
     if not warp_installed:
         return "jax", "warp-lang is not installed"
-    return "warp", "on a GPU it is faster than MJX-JAX, and it is installed"
+    # No task has been trained with MJX-Warp on a GPU yet, and solver settings are tuned for jax.
+    return "jax", "no task is tuned for MJX-Warp yet; ask for it with physics.impl=warp"

@@ -35,8 +35,8 @@ PENDULUM_OVER_FLOOR = """
     [
         ("auto", "cpu", True, "jax", "slow on cpu"),
         ("auto", "gpu", False, "jax", "not installed"),
-        ("auto", "gpu", True, "warp", "faster"),
-        ("auto", "cuda", True, "warp", "faster"),
+        ("auto", "gpu", True, "jax", "physics.impl=warp"),
+        ("auto", "cuda", True, "jax", "physics.impl=warp"),
         ("jax", "gpu", True, "jax", "asked for"),
         ("warp", "cpu", True, "warp", "asked for"),
     ],
