@@ -14,7 +14,8 @@ def main() -> None:
     """Two GMIs on the first GPU, or on this machine's CPU cores where there is none."""
     config = gmijax.compose("env=ball_balance", "plan.gmis_per_gpu=2", *sys.argv[1:])
     result = gmijax.train(config, show=True)
-    print(f"mean return {result.summary['final_return']:.1f}, files in {result.run_dir}")
+    # None if no episode ended, which takes a few thousand steps.
+    print(f"mean return {result.summary['final_return']}, files in {result.run_dir}")
 
 
 if __name__ == "__main__":
