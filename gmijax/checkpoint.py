@@ -53,8 +53,6 @@ def save_checkpoint(
       The checkpoint's folder.
     """
     final = paths.checkpoint(meta.env_steps)
-    if final.exists():  # Already written by an earlier call with the same step: same state.
-        return final
     partial = final.with_name(f".{final.name}.partial")
     partial.mkdir(parents=True, exist_ok=True)
     _save(partial / f"gmi_{gmi}", env_state)

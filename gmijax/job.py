@@ -63,7 +63,7 @@ def train(config: TrainConfig, *, show: bool = False) -> Result:
     Raises:
       ConfigError: bad input, before anything was started.
       GmiFailed: a GMI failed; the run folder holds the logs and the last checkpoint.
-      JobInterrupted: SIGINT or SIGTERM came; a checkpoint was written.
+      JobInterrupted: SIGINT, SIGTERM or SIGHUP came; its note says what is left to resume.
     """
     started = time.monotonic()
     require_task(config.env.name)

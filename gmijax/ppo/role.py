@@ -83,7 +83,7 @@ class _SyncTrainer:
         compile_s = time.monotonic() - started
         self._link.beat("ready", 0)
         self._meet()  # Everybody has compiled: the clock may start.
-        history = read_metrics(self._link.run.metrics)
+        history = read_metrics(self._link.run.metrics) if self._leader else []
         reporter = Reporter(
             self._config.env.name,
             self._open_log(history),
@@ -168,7 +168,8 @@ class _SyncTrainer:
             else:
                 self._report(reporter, (self._env_steps, metrics))
             stop = self._agree_to_stop()
-            if every and self._iterations % every == 0:
+            is_last = stop or self._env_steps >= self._config.num_timesteps
+            if not is_last and every and self._iterations % every == 0:
                 self._save(state, env_state)
         self._report(reporter, pending)
         self._save(state, env_state)
