@@ -25,12 +25,14 @@ class Episodes(NamedTuple):
       return_sum: sum of their returns, unscaled.
       length_sum: sum of their lengths in steps.
       term_sums: sums of every reward term.
+      metric_sums: sums of every metric of the task at the episodes' ends.
     """
 
     count: float
     return_sum: float
     length_sum: float
     term_sums: Mapping[str, float]
+    metric_sums: Mapping[str, float]
 
 
 class EpisodeWindow:
@@ -48,8 +50,10 @@ class EpisodeWindow:
             self._count -= self._latest.popleft().count
 
     def means(self) -> dict[str, float | None]:
-        """`return`, `episode_length` and `reward/<term>`; None while no episode has ended."""
-        names = self._latest[-1].term_sums if self._latest else {}
+        """`return`, `episode_length`, `reward/<term>` and `metric/<name>`.
+
+        The first two are None, and the others missing, while no episode has ended.
+        """
         count = self._count
         if not count:
             return {"return": None, "episode_length": None}
@@ -58,7 +62,11 @@ class EpisodeWindow:
             "episode_length": sum(e.length_sum for e in self._latest) / count,
             **{
                 f"reward/{name}": sum(e.term_sums[name] for e in self._latest) / count
-                for name in names
+                for name in self._latest[-1].term_sums
+            },
+            **{
+                f"metric/{name}": sum(e.metric_sums[name] for e in self._latest) / count
+                for name in self._latest[-1].metric_sums
             },
         }
 

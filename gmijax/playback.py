@@ -100,6 +100,7 @@ def summarise(config: PlayConfig, env_name: str, episodes: Episodes) -> dict[str
         "return": statistics(episodes.returns),
         "length": statistics(episodes.lengths),
         "terms": {name: statistics(sums) for name, sums in episodes.terms.items()},
+        "metrics": {name: statistics(values) for name, values in episodes.metrics.items()},
         "num_terminated": int(episodes.terminated.sum()),
         "num_truncated": int(episodes.truncated.sum()),
         "num_cut_off": int((~ended).sum()),
@@ -114,6 +115,7 @@ def summarise(config: PlayConfig, env_name: str, episodes: Episodes) -> dict[str
                 "truncated": bool(episodes.truncated[i]),
                 "diverged": bool(episodes.diverged[i]),
                 "terms": {name: float(sums[i]) for name, sums in episodes.terms.items()},
+                "metrics": {name: float(values[i]) for name, values in episodes.metrics.items()},
             }
             for i in range(config.num_envs)
         ],

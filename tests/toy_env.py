@@ -11,7 +11,9 @@ from gmijax.sim.wrappers import BatchedEnv, time_limit, training_env
 
 def point_mass(episode_length: int = 20) -> BatchedEnv:
     """A point on a line that is rewarded for standing at 0; it ends beyond +-3."""
-    spec = EnvSpec("point_mass", 2, 1, 0.1, episode_length, ("near", "effort"))
+    spec = EnvSpec(
+        "point_mass", 2, 1, 0.1, episode_length, ("near", "effort"), metrics=("distance",)
+    )
 
     def outcome(x, v, action, steps, key):
         terms = {"near": 1.0 - x**2, "effort": -0.01 * jnp.sum(action**2)}
@@ -21,6 +23,7 @@ def point_mass(episode_length: int = 20) -> BatchedEnv:
             obs=jnp.stack([x, v]),
             reward=sum(terms.values()),
             reward_terms=terms,
+            metrics={"distance": jnp.abs(x)},
             terminated=jnp.abs(x) > 3.0,
             truncated=jnp.zeros((), bool),
             steps=steps,

@@ -55,6 +55,7 @@ class Episodes(NamedTuple):
       truncated: [N] bool, ended by the time limit; neither means cut off.
       diverged: [N] bool, terminated because of a bad number (see `gmijax.sim.divergence`).
       terms: [N] each, what every reward term added to the returns.
+      metrics: [N] each, the task's metrics at the end.
       qpos: [L + 1, E, nq] positions of the first E worlds, from the start to the end of the
         longest of their episodes; L is that episode's length.
       compile_s: seconds until the first step could run.
@@ -67,6 +68,7 @@ class Episodes(NamedTuple):
     truncated: npt.NDArray[np.bool_]
     diverged: npt.NDArray[np.bool_]
     terms: dict[str, npt.NDArray[np.float32]]
+    metrics: dict[str, npt.NDArray[np.float32]]
     qpos: npt.NDArray[np.float32]
     compile_s: float
     run_s: float
@@ -117,6 +119,7 @@ def run_episodes(
         truncated=np.asarray(batch.env.truncated),
         diverged=diverged,
         terms={name: np.asarray(sums) for name, sums in batch.term_sums.items()},
+        metrics={name: np.asarray(values) for name, values in batch.env.metrics.items()},
         qpos=np.concatenate(qpos)[: int(lengths[: options.num_shown].max()) + 1],
         compile_s=compile_s,
         run_s=run_s,

@@ -283,17 +283,18 @@ class SplitIteration:
     def _unpack_stats(self) -> Any:
         """[M] float32 to `RolloutStats`, the inverse of the packing in `_rollout_fn`."""
         spec = self._env.spec
-        example = stats_example(spec.obs_size, spec.reward_terms)
+        example = stats_example(spec)
         return ravel_pytree(example)[1]
 
 
-def stats_example(obs_size: int, terms: tuple[str, ...]) -> RolloutStats:
+def stats_example(spec: EnvSpec) -> RolloutStats:
     """Zeros in the structure of `RolloutStats`."""
     zero = jnp.zeros(())
+    terms, metrics = dict.fromkeys(spec.reward_terms, zero), dict.fromkeys(spec.metrics, zero)
     return RolloutStats(
-        obs=no_samples((obs_size,)),
+        obs=no_samples((spec.obs_size,)),
         advantage=no_samples(()),
-        episodes=EpisodeSums(zero, zero, zero, dict.fromkeys(terms, zero)),
+        episodes=EpisodeSums(zero, zero, zero, terms, metrics),
         reward_sum=zero,
-        diverged=dict.fromkeys(("any", *sources(terms)), zero),
+        diverged=dict.fromkeys(("any", *sources(spec.reward_terms)), zero),
     )

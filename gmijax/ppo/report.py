@@ -56,9 +56,7 @@ class Reporter:
         now = time.monotonic()
         self._check_finite(host, env_steps)
         episodes = host.stats.episodes
-        self._window.add(
-            Episodes(episodes.count, episodes.return_sum, episodes.length_sum, episodes.term_sums)
-        )
+        self._window.add(Episodes(**episodes._asdict()))
         means = self._window.means()
         self.last_return = means["return"]
         duration = now - self._last

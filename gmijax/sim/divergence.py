@@ -49,6 +49,10 @@ def end_diverged(before: EnvState, state: EnvState, diverged: Array) -> EnvState
         obs=jnp.where(diverged[:, None], before.obs, state.obs),
         reward=zero(state.reward),
         reward_terms={name: zero(value) for name, value in state.reward_terms.items()},
+        metrics={
+            name: jnp.where(diverged, before.metrics[name], value)
+            for name, value in state.metrics.items()
+        },
         terminated=state.terminated | diverged,
         truncated=state.truncated & ~diverged,
     )

@@ -17,6 +17,7 @@ def begin(spec: EnvSpec, physics: PyTree, task: PyTree, obs: Array, key: PRNGKey
         obs=obs,
         reward=zero,
         reward_terms=dict.fromkeys(spec.reward_terms, zero),
+        metrics=dict.fromkeys(spec.metrics, zero),
         terminated=false,
         truncated=false,
         steps=jnp.zeros((), jnp.int32),
@@ -31,6 +32,7 @@ def advance(
     obs: Array,
     reward: tuple[Array, dict[str, Array]],
     terminated: Array,
+    metrics: dict[str, Array] | None = None,
 ) -> EnvState:
     """The state one step after `before`; `reward` is what `rewards.total_reward` returns."""
     return EnvState(
@@ -39,6 +41,7 @@ def advance(
         obs=obs,
         reward=reward[0],
         reward_terms=reward[1],
+        metrics=metrics or {},
         terminated=terminated,
         # Time is the business of `wrappers.time_limit`.
         truncated=jnp.zeros((), bool),

@@ -25,6 +25,7 @@ class EnvSpec(NamedTuple):
       reward_terms: names of the addends of the reward, in order.
       max_abs_obs: an observation beyond this tells that the physics diverges; the world is ended
         (see `gmijax.sim.divergence`).
+      metrics: names of the numbers that judge an episode beside its return, such as successes.
     """
 
     name: str
@@ -34,6 +35,7 @@ class EnvSpec(NamedTuple):
     episode_length: int
     reward_terms: tuple[str, ...]
     max_abs_obs: float = 1e5
+    metrics: tuple[str, ...] = ()
 
 
 class EnvState(NamedTuple):
@@ -45,6 +47,8 @@ class EnvState(NamedTuple):
       obs: [O] float32.
       reward: [] float32, the sum of `reward_terms`.
       reward_terms: every addend of the reward by name, weight included, [] float32 each.
+      metrics: what the episode has come to by now, [] float32 each; the values of its last step
+        are logged. Sums and means over an episode are kept in `task`.
       terminated: [] bool, the task has ended: the value of what follows is zero.
       truncated: [] bool, time ran out: bootstrap from the value of this observation.
       steps: [] int32, steps since the last reset.
@@ -56,6 +60,7 @@ class EnvState(NamedTuple):
     obs: Array
     reward: Array
     reward_terms: dict[str, Array]
+    metrics: dict[str, Array]
     terminated: Array
     truncated: Array
     steps: Array

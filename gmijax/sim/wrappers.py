@@ -28,12 +28,14 @@ class EpisodeSums(NamedTuple):
       return_sum: [] float32, of their undiscounted returns.
       length_sum: [] int32, of their lengths in steps.
       term_sums: of what every term added to their returns, [] float32 each.
+      metric_sums: of every metric's value at their ends, [] float32 each.
     """
 
     count: Array
     return_sum: Array
     length_sum: Array
     term_sums: dict[str, Array]
+    metric_sums: dict[str, Array]
 
 
 class BatchState(NamedTuple):
@@ -139,6 +141,9 @@ def episode_statistics(
         return_sum=jnp.where(done, returns, 0.0).sum(),
         length_sum=jnp.where(done, state.steps, 0).sum(dtype=jnp.int32),
         term_sums={name: jnp.where(done, value, 0.0).sum() for name, value in terms.items()},
+        metric_sums={
+            name: jnp.where(done, value, 0.0).sum() for name, value in state.metrics.items()
+        },
     )
     going_on = {name: jnp.where(done, 0.0, value) for name, value in terms.items()}
     return jnp.where(done, 0.0, returns), going_on, finished

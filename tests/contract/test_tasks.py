@@ -14,6 +14,7 @@ import mujoco
 import numpy as np
 import pytest
 from compile_options import CPU_OPTIONS
+from task_cases import CASES, OracleLimit
 
 from gmijax.sim import physics
 from gmijax.sim.interface import Env
@@ -67,6 +68,7 @@ def test_shapes_and_dtypes_are_those_of_the_spec(task: Task):
     assert spec.action_size == task.env.mj_model.nu
     assert set(state.env.reward_terms) == set(spec.reward_terms)
     assert set(out.finished.term_sums) == set(spec.reward_terms)
+    assert set(state.env.metrics) == set(spec.metrics) == set(out.finished.metric_sums)
     assert spec.episode_length == EPISODE_LENGTH
     assert jax.eval_shape(task.env.qpos, state.env).shape == (NUM_ENVS, task.env.mj_model.nq)
 
@@ -117,20 +119,12 @@ def test_time_limit_truncates_and_a_new_random_episode_begins(task: Task):
     assert int(out.finished.length_sum) == alive.sum() * EPISODE_LENGTH
 
 
-def lowered_ant(qpos: jax.Array) -> jax.Array:
-    return qpos.at[0, 2].set(0.25)
-
-
-def dropped_ball(qpos: jax.Array) -> jax.Array:
-    return qpos.at[0, 13:16].set(jnp.array([2.0, 0.0, 0.1]))
-
-
-HAZARDS = {"ant": lowered_ant, "ball_balance": dropped_ball}
-
-
 def test_a_fatal_position_terminates_its_own_world_only(task: Task):
+    hazard = CASES[task.env.spec.name].hazard
+    if hazard is None:
+        pytest.skip("only time ends this task")
     state = task.start()
-    moved = state.env.physics._replace(qpos=HAZARDS[task.env.spec.name](state.env.physics.qpos))
+    moved = state.env.physics._replace(qpos=hazard(state.env.physics.qpos))
     actions = task.actions(0)
     _, untouched = task.step(task.env.model, state, actions)
     fallen = state._replace(env=state.env._replace(physics=moved))
@@ -151,35 +145,8 @@ def test_step_is_traced_once(task: Task):
     assert len(task.traces) == 1
 
 
-class OracleLimit(NamedTuple):
-    """Largest allowed difference from C MuJoCo in one step, and the controls that it holds for.
-
-    Attributes:
-      qvel: rad/s or m/s, after one physics step.
-      sensors: N or N m.
-      ctrl: controls are drawn from -ctrl to ctrl.
-      steps: length of the trajectory.
-    """
-
-    qvel: float
-    sensors: float
-    ctrl: float
-    steps: int
-
-
-ORACLE_LIMITS = {
-    # The trajectory ends before the first foot touches the floor: C turns the edges of that
-    # contact's friction pyramid by another angle about the normal than MJX 3.17 does.
-    "ant": OracleLimit(qvel=1e-4, sensors=1e-3, ctrl=0.3, steps=7),
-    # MuJoCo 4 in C predicts how a `connect` will move with the bodies' rotation (the term with
-    # the Jacobian's time derivative), MJX 3.17 does not: they part with the legs' speed squared.
-    # The ball lands on the tray in step 84.
-    "ball_balance": OracleLimit(qvel=0.02, sensors=4.0, ctrl=0.02, steps=96),
-}
-
-
 def test_one_physics_step_is_that_of_mujoco_in_c(task: Task):
-    limit = ORACLE_LIMITS[task.env.spec.name]
+    limit = CASES[task.env.spec.name].oracle
     # Both solvers are run to the end: cut off early, as in training, they stop at different
     # places on the way to the same answer.
     mj_model = physics.load(task.env.spec.name, impl="jax", substeps=1).mj_model

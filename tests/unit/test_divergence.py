@@ -57,7 +57,7 @@ def test_a_bad_world_starts_over_and_the_others_go_on() -> None:
 
 @pytest.mark.parametrize("count", [TOLERATED_STEPS, TOLERATED_STEPS + 1])
 def test_few_bad_steps_are_tolerated_and_many_are_named(count: int) -> None:
-    stats = stats_example(2, ENV.spec.reward_terms)
+    stats = stats_example(ENV.spec)
     stats = stats._replace(
         diverged=stats.diverged | {"any": jnp.asarray(count), "reward/near": jnp.asarray(count)}
     )

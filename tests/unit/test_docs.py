@@ -13,7 +13,7 @@ from gmijax.sim.registry import TASKS
 
 ROOT = Path(__file__).parents[2]
 ARCHITECTURE = ROOT / "docs" / "architecture.md"
-ENVIRONMENTS = ROOT / "docs" / "environments.md"
+TASKS_PAGE = ROOT / "docs" / "tasks.md"
 FOLDERS = ("gmijax", "configs", "tests", "docs", "benchmarks", "examples", ".ci")
 
 QUOTED_PATH = re.compile(rf"`((?:{'|'.join(map(re.escape, FOLDERS))})/[\w./-]*)`")
@@ -35,7 +35,7 @@ def linked_paths(text: str) -> list[str]:
 
 def documented_weights(task: str) -> Mapping[str, float]:
     """The table of rewards in the section of a task."""
-    sections = re.split(r"^## ", ENVIRONMENTS.read_text(), flags=re.MULTILINE)
+    sections = re.split(r"^## ", TASKS_PAGE.read_text(), flags=re.MULTILINE)
     section = next(text for text in sections if text.startswith(f"`{task}`"))
     return {name: float(weight) for name, weight in REWARD_ROW.findall(section)}
 
