@@ -11,11 +11,29 @@ class Case(NamedTuple):
 
     Attributes:
       name: what tables call it.
-      overrides: its hydra overrides.
+      overrides: its hydra overrides; `{run}` in them is the number of the repeat, 0 for the first.
     """
 
     name: str
     overrides: tuple[str, ...]
+
+
+TASKS = ("ant", "anymal", "ball_balance", "franka_cabinet", "humanoid", "shadow_hand")
+
+
+def _throughput(task: str, impl: str, num_envs: int) -> Case:
+    # A dozen iterations of the longest rollout: their median is the training rate.
+    steps = 12 * 32 * num_envs
+    return Case(
+        f"{task} {impl} {num_envs}",
+        (
+            f"env={task}",
+            f"physics.impl={impl}",
+            f"num_envs={num_envs}",
+            f"num_timesteps={steps}",
+            "run.checkpoint_every=0",
+        ),
+    )
 
 
 _ANT = ("env=ant", "physics.impl=jax", "run.checkpoint_every=0")
@@ -51,6 +69,22 @@ SUITES = MappingProxyType(
         # Plain data parallelism: the same environments with one GMI on each GPU.
         "ant-2gpu-one-each": (Case("2 GPUs x 1 GMI x 4096", (*_TWO_GPUS, "num_envs=4096")),),
         "ant-learns": (Case("1 GMI x 8192", (*_ANT, "num_envs=8192", "num_timesteps=150e6")),),
+        # Every task, both implementations of MJX, one GMI.
+        **{
+            f"tasks-{impl}": tuple(
+                _throughput(task, impl, num_envs)
+                for num_envs in (2048, 8192, 32768)
+                for task in TASKS
+            )
+            for impl in ("jax", "warp")
+        },
+        # Every task with its own settings, another seed in every repeat.
+        **{
+            f"learn-{task}": (
+                Case(task, (f"env={task}", "seed={run}", "run.measure_throughput=false")),
+            )
+            for task in TASKS
+        },
         "ball-cpu": (Case("2 GMIs x 512", ("env=ball_balance", "plan.gpus=2")),),
     }
 )

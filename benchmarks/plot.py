@@ -24,7 +24,8 @@ def main(picture: str, suites: list[str]) -> None:
     for suite in suites:
         results = json.loads((RESULTS / f"{suite}.json").read_text())
         for name, case in results["cases"].items():
-            for k, run in enumerate(case["runs"]):
+            done = [run for run in case["runs"] if "curve" in run]
+            for k, run in enumerate(done):
                 points = [point for point in run["curve"] if point[2] is not None]
                 steps, seconds, returns = zip(*points, strict=True)
                 style = {"color": f"C{number}", "alpha": 0.8, "label": None if k else name}

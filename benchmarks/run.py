@@ -1,7 +1,8 @@
-"""Runs a suite of training commands and keeps what they measured.
+"""Runs suites of training commands and keeps what they measured.
 
 `python -m benchmarks.run ant-1gpu --repeats 3` runs the cases in turn (A B C A B C ...), prints
-the medians, and writes `benchmarks/results/<suite>.json` with every run in it.
+the medians, and writes `benchmarks/results/<suite>.json` with every run in it. With `--gpus 4`
+four runs go on at a time, each alone on one GPU: for cases that need no more than one.
 """
 
 from __future__ import annotations
@@ -13,7 +14,11 @@ import statistics
 import subprocess
 import sys
 import tempfile
+import threading
+from collections.abc import Mapping
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
+from queue import SimpleQueue
 from typing import Any
 
 from benchmarks.cases import SUITES, Case
@@ -25,50 +30,110 @@ CURVE_POINTS = 60
 
 
 def main() -> int:
-    """Runs what the command line asks for; returns the exit code."""
+    """Runs what the command line asks for; returns 1 if a run failed, else 0."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("suite", choices=sorted(SUITES))
+    parser.add_argument("suites", nargs="+", choices=sorted(SUITES), metavar="SUITE")
     parser.add_argument("--repeats", type=int, default=3)
-    parser.add_argument("--out", type=Path, default=RESULTS, help="folder of the JSON file")
+    parser.add_argument("--gpus", type=int, help="run so many cases at a time, one on each GPU")
+    parser.add_argument("--out", type=Path, default=RESULTS, help="folder of the JSON files")
     parser.add_argument("--runs", type=Path, help="keep the run folders here")
     parser.add_argument("--resume", action="store_true", help="add to the runs in the JSON file")
     arguments = parser.parse_args()
     arguments.out.mkdir(parents=True, exist_ok=True)
-    path = arguments.out / f"{arguments.suite}.json"
-    kept = json.loads(path.read_text())["cases"] if arguments.resume and path.exists() else {}
-    with tempfile.TemporaryDirectory() as scratch:
-        results = run_suite(
-            arguments.suite, arguments.repeats, arguments.runs or Path(scratch), path, kept
-        )
-    sys.stdout.write(f"{table(results)}\nwritten: {path}\n")
-    return 0
-
-
-def run_suite(
-    suite: str, repeats: int, runs: Path, path: Path, kept: dict[str, Any]
-) -> dict[str, Any]:
-    """Runs the cases of a suite in turn until each has `repeats` runs; all must succeed.
-
-    The JSON file at `path` is written after every run: an interruption loses one run at most.
-    """
-    cases = {
-        case.name: kept.get(case.name, {"command": command(case), "runs": []})
-        for case in SUITES[suite]
+    books = {
+        suite: ResultsFile(arguments.out / f"{suite}.json", suite, resume=arguments.resume)
+        for suite in arguments.suites
     }
-    results = {"suite": suite, "cases": cases}
-    for repeat in range(repeats):
-        for number, case in enumerate(SUITES[suite]):
-            if len(cases[case.name]["runs"]) > repeat:
-                continue
-            folder = runs / f"{suite}-{number}-{repeat}"
-            subprocess.run(
-                [sys.executable, "-m", "gmijax.train", *case.overrides, f"run.dir={folder}"],
-                check=True,
-                stdout=subprocess.DEVNULL,
-            )
-            cases[case.name]["runs"].append(outcome(folder))
-            path.write_text(json.dumps(results, indent=1) + "\n")
-    return results
+    with tempfile.TemporaryDirectory() as scratch:
+        run_all(books, arguments.repeats, arguments.runs or Path(scratch), arguments.gpus)
+    for book in books.values():
+        sys.stdout.write(f"{table(book.results)}\nwritten: {book.path}\n")
+    return int(any(book.failures() for book in books.values()))
+
+
+class ResultsFile:
+    """The runs of a suite, in memory and on disk: an interruption loses the running ones only.
+
+    Attributes:
+      path: the JSON file, written after every run.
+      results: its content.
+    """
+
+    def __init__(self, path: Path, suite: str, *, resume: bool) -> None:
+        kept = json.loads(path.read_text())["cases"] if resume and path.exists() else {}
+        self.path = path
+        self.results: dict[str, Any] = {
+            "suite": suite,
+            "cases": {
+                case.name: kept.get(case.name, {"command": command(case), "runs": []})
+                for case in SUITES[suite]
+            },
+        }
+        self._lock = threading.Lock()
+
+    def missing(self, repeats: int) -> list[tuple[int, Case]]:
+        """Runs that are still to be made, every case once before any case again."""
+        cases = self.results["cases"]
+        return [
+            (repeat, case)
+            for repeat in range(repeats)
+            for case in SUITES[self.results["suite"]]
+            if len(cases[case.name]["runs"]) <= repeat
+        ]
+
+    def add(self, case: Case, run: Mapping[str, Any]) -> None:
+        """Takes in one run; may be called from any thread."""
+        with self._lock:
+            self.results["cases"][case.name]["runs"].append(run)
+            self.path.write_text(json.dumps(self.results, indent=1) + "\n")
+
+    def failures(self) -> list[str]:
+        """Names of the cases of which a run failed."""
+        cases = self.results["cases"].items()
+        return [name for name, case in cases if any("failed" in run for run in case["runs"])]
+
+
+def run_all(books: Mapping[str, ResultsFile], repeats: int, runs: Path, gpus: int | None) -> None:
+    """Runs the cases of all suites in turn until each has `repeats` runs."""
+    free: SimpleQueue[int] = SimpleQueue()
+    for gpu in range(gpus or 1):
+        free.put(gpu)
+
+    def run(book: ResultsFile, repeat: int, case: Case) -> None:
+        gpu = free.get()
+        alone = (f"plan.gpus=[{gpu}]",) if gpus else ()
+        folder = runs / f"{case.name.replace(' ', '-')}-{repeat}"
+        book.add(case, run_case(case, repeat, (*alone, f"run.dir={folder}"), folder))
+        free.put(gpu)
+
+    with ThreadPoolExecutor(gpus or 1) as pool:
+        started = [
+            pool.submit(run, book, repeat, case)
+            for book in books.values()
+            for repeat, case in book.missing(repeats)
+        ]
+        for one in started:
+            one.result()
+
+
+def run_case(case: Case, repeat: int, overrides: tuple[str, ...], folder: Path) -> dict[str, Any]:
+    """One run: its `outcome`, or what its command said when it failed."""
+    done = subprocess.run(
+        [
+            *(sys.executable, "-m", "gmijax.train"),
+            *(text.format(run=repeat) for text in case.overrides),
+            *overrides,
+        ],
+        check=False,
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+    if done.returncode == 0:
+        return outcome(folder)
+    said = done.stderr.strip().splitlines() or [f"exit code {done.returncode}"]
+    sys.stderr.write(f"{case.name}: {said[-1]}\n")
+    return {"failed": said[-1]}
 
 
 def command(case: Case) -> str:
@@ -84,6 +149,7 @@ def outcome(folder: Path) -> dict[str, Any]:
     return {
         "summary": json.loads((folder / "summary.json").read_text()),
         "curve": [[line["env_steps"], line["wall_s"], line["return"]] for line in kept],
+        "metrics": {k: v for k, v in lines[-1].items() if k.startswith("metric/")},
         "diverged_steps": sum(line["diverged_steps"] for line in lines),
         "times": {key: statistics.median(line[key] for line in lines) for key in times},
     }
@@ -91,22 +157,29 @@ def outcome(folder: Path) -> dict[str, Any]:
 
 def table(results: dict[str, Any]) -> str:
     """Medians over the runs, one row per case, with the ratio to the first case."""
-    rows = [f"{'case':32} {'sim':>10} {'inference':>10} {'train':>10} {'ratio':>6} {'return':>8}"]
+    rows = [
+        f"{'case':32} {'sim':>10} {'inference':>10} {'train':>10} {'ratio':>6} {'return':>8} "
+        f"{'MiB':>7}"
+    ]
     first: float | None = None
     for name, case in results["cases"].items():
-        summaries = [run["summary"] for run in case["runs"]]
+        summaries = [run["summary"] for run in case["runs"] if "summary" in run]
+        if not summaries:
+            rows.append(f"{name:32} {case['runs'][-1]['failed'] if case['runs'] else 'not run'}")
+            continue
         rates = [median(summaries, rate) for rate in RATES]
         first = first or rates[-1]
         shown = " ".join(f"{rate:10,.0f}" for rate in rates)
         final = median(summaries, "final_return")
-        rows.append(f"{name:32} {shown} {rates[-1] / first:6.2f} {final:8,.0f}")
+        memory = median([summary["device"] for summary in summaries], "peak_memory_mib")
+        rows.append(f"{name:32} {shown} {rates[-1] / first:6.2f} {final:8,.0f} {memory:7,.0f}")
     return "\n".join(rows)
 
 
 def median(summaries: list[dict[str, Any]], key: str) -> float:
     """Median of a figure over runs, NaN where it was not measured."""
-    values = [summary[key] for summary in summaries]
-    return math.nan if None in values else statistics.median(values)
+    values = [summary[key] for summary in summaries if summary.get(key) is not None]
+    return statistics.median(values) if len(values) == len(summaries) else math.nan
 
 
 if __name__ == "__main__":
