@@ -1,0 +1,75 @@
+"""Prints Markdown tables of results: `python -m benchmarks.tables throughput|learning`.
+
+They are made from the JSON files in `benchmarks/results`, and pasted into the documents.
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+from collections.abc import Iterator
+from typing import Any
+
+from benchmarks.cases import TASKS
+from benchmarks.run import RATES, RESULTS, median
+
+
+def main(which: str) -> int:
+    """Prints the table `which`; returns the exit code."""
+    tables = {"throughput": throughput, "learning": learning}
+    if which not in tables:
+        sys.stderr.write(f"table {which}: allowed are {', '.join(tables)}\n")
+        return 2
+    sys.stdout.write("\n".join(tables[which]()) + "\n")
+    return 0
+
+
+def throughput() -> Iterator[str]:
+    """Environment steps per second of every task, size and implementation, with memory."""
+    cases = {**load("tasks-jax"), **load("tasks-warp")}
+    yield "| task | environments | MJX | simulation | with inference | with training | MiB |"
+    yield "|---|---|---|---|---|---|---|"
+    for task in TASKS:
+        for num_envs in (2048, 8192, 32768):
+            for impl in ("jax", "warp"):
+                case = cases.get(f"{task} {impl} {num_envs}")
+                if case is None:
+                    continue
+                summaries = [run["summary"] for run in case["runs"] if "summary" in run]
+                if not summaries:
+                    shown = ["failed"] * 4
+                else:
+                    memory = median([s["device"] for s in summaries], "peak_memory_mib")
+                    rates = [f"{median(summaries, rate):,.0f}" for rate in RATES]
+                    shown = [*rates, f"{memory:,.0f}"]
+                yield f"| `{task}` | {num_envs:,} | {impl} | {' | '.join(shown)} |"
+
+
+def learning() -> Iterator[str]:
+    """What every task reached over its seeds, and how long that took."""
+    yield "| task | million steps | seconds | return of every seed | metrics, means over seeds |"
+    yield "|---|---|---|---|---|"
+    for task in TASKS:
+        case = load(f"learn-{task}").get(task)
+        runs = [run for run in case["runs"] if "summary" in run] if case else []
+        if not runs:
+            continue
+        steps = runs[0]["summary"]["env_steps"] / 1e6
+        seconds = median([run["summary"] for run in runs], "train_wall_s")
+        returns = ", ".join(f"{run['summary']['final_return']:,.1f}" for run in runs)
+        means = {
+            name.removeprefix("metric/"): sum(run["metrics"][name] for run in runs) / len(runs)
+            for name in runs[0]["metrics"]
+        }
+        metrics = ", ".join(f"{name} {mean:.3g}" for name, mean in means.items())
+        yield f"| `{task}` | {steps:,.0f} | {seconds:,.0f} | {returns} | {metrics} |"
+
+
+def load(suite: str) -> dict[str, Any]:
+    """The cases of a suite by name; none if it has not been run."""
+    path = RESULTS / f"{suite}.json"
+    return json.loads(path.read_text())["cases"] if path.exists() else {}
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1] if len(sys.argv) > 1 else ""))
