@@ -91,11 +91,11 @@ def digest(tree: PyTree) -> np.ndarray:
 
 def _save(folder: Path, tree: PyTree) -> None:
     with ocp.StandardCheckpointer() as checkpointer:
-        checkpointer.save(folder.resolve(), _without_keys(tree))
+        checkpointer.save(folder.resolve(), _storable(tree))
 
 
 def _restore(folder: Path, template: T) -> T:
-    plain = _without_keys(template)
+    plain = _storable(template)
     try:
         with ocp.StandardCheckpointer() as checkpointer:
             restored = checkpointer.restore(folder.resolve(), plain)
@@ -106,17 +106,25 @@ def _restore(folder: Path, template: T) -> T:
             raise
         lines = str(error).strip().splitlines() or [type(error).__name__]
         raise ConfigError(f"checkpoint {folder} does not fit this job: {lines[0]}") from error
-    return jax.tree.map(_with_key, template, restored)
+    return jax.tree.map(_restored, template, restored)
 
 
 def _is_key(leaf: jax.Array) -> bool:
     return jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key)
 
 
-def _without_keys(tree: PyTree) -> PyTree:
-    # Orbax does not take typed random keys; their bits are plain uint32 arrays.
-    return jax.tree.map(lambda x: jax.random.key_data(x) if _is_key(x) else x, tree)
+def _storable(tree: PyTree) -> PyTree:
+    # Orbax takes neither typed random keys, whose bits are plain uint32 arrays, nor arrays
+    # without elements, such as the activations of a model that has none.
+    def plain(leaf: jax.Array) -> jax.Array:
+        if leaf.size == 0:
+            return jnp.zeros(1)
+        return jax.random.key_data(leaf) if _is_key(leaf) else leaf
+
+    return jax.tree.map(plain, tree)
 
 
-def _with_key(like: jax.Array, leaf: jax.Array) -> jax.Array:
+def _restored(like: jax.Array, leaf: jax.Array) -> jax.Array:
+    if like.size == 0:
+        return like
     return jax.random.wrap_key_data(leaf) if _is_key(like) else leaf

@@ -28,23 +28,31 @@ from gmijax.config import TrainConfig
 from gmijax.errors import ConfigError, GmijaxError, JobInterrupted
 from gmijax.resume import find_checkpoint, saved_config
 from gmijax.schema import from_dict, suggestion, to_dict
+from gmijax.sim.registry import SUITES
+from gmijax.sim.source import reference
 
 C = TypeVar("C")
 
 EXIT_OK, EXIT_FAILED, EXIT_BAD_INPUT, EXIT_INTERRUPTED = 0, 1, 2, 130
 
 
-def compose(*overrides: str) -> TrainConfig:
+def compose(*overrides: str, env: Callable[..., Any] | None = None) -> TrainConfig:
     """The training configuration that `python -m gmijax.train OVERRIDES` would run.
+
+    Args:
+      overrides: `key=value`.
+      env: a function `make(*, impl, max_envs) -> gmijax.sim.interface.Env` at the top level of a
+        file, in place of `env=path/to/file.py:make`.
 
     Example:
       >>> compose("env=ant", "num_envs=512").num_envs
       512
 
     Raises:
-      ConfigError: an unknown key, a wrong type or value.
+      ConfigError: an unknown key, a wrong type or value, or a function that is in no file.
     """
-    return _build("train", TrainConfig, overrides)
+    chosen = () if env is None else (f"env={reference(env)}",)
+    return _build("train", TrainConfig, (*chosen, *overrides))
 
 
 def command(name: str, cls: type[C], run: Callable[[C], int], argv: Sequence[str]) -> int:
@@ -83,6 +91,8 @@ def choices(group: str) -> list[str]:
 
 
 def _build(name: str, cls: type[C], overrides: Sequence[str]) -> C:
+    if name == "train":
+        overrides = [part for text in overrides for part in _with_custom_task(text)]
     data = _compose_dict(name, overrides)
     if cls is TrainConfig:
         _check_task_key(_parse(overrides))
@@ -116,12 +126,24 @@ def _check_override(name: str, item: Override) -> None:
         raise ConfigError(f"{key}={item.value()}: unknown{close}")
 
 
+def _with_custom_task(override: str) -> tuple[str, ...]:
+    """`env=path/to/file.py:make` in words that hydra knows; anything else as it is."""
+    key, _, value = override.partition("=")
+    if key != "env" or not re.search(r"\.py(:|$)", value):
+        return (override,)
+    quoted = value.replace("\\", "\\\\").replace("'", "\\'")
+    return "env=custom", f"env.name='{quoted}'"
+
+
 def _check_task_key(items: Sequence[Override]) -> None:
     """Refuses `env.name` alone: it would run a task with the settings tuned for another one."""
-    groups = [item.value() for item in items if item.key_or_group == "env"]
+    groups = {str(item.value()) for item in items if item.key_or_group == "env"}
     for item in items:
-        if item.key_or_group == "env.name" and item.value() not in groups:
-            raise ConfigError(f"env.name={item.value()}: choose the task with env={item.value()}")
+        name = str(item.value())
+        if item.key_or_group == "env.suite" and name not in groups:
+            raise ConfigError(f"env.suite={name}: choose it with env=")
+        if item.key_or_group == "env.name" and not groups & {name, *SUITES}:
+            raise ConfigError(f"env.name={name}: choose the task with env={name}")
 
 
 def _unknown_key(key: str, known: Iterable[str]) -> ConfigError:
@@ -149,12 +171,17 @@ def _on_top_of_saved(
     saved = saved_config(checkpoint)
     saved["run"].update(dir=None, name=None)
     items = _parse(overrides)
-    task = saved["env"].get("name")
+    suite = saved["env"].get("suite", "gmijax")
+    task = saved["env"].get("name") if suite == "gmijax" else suite
     if task in choices("env") and all(item.key_or_group != "env" for item in items):
         data = _compose_dict("train", [f"env={task}", *overrides])
     merged = _merged(data, saved)
+    if "randomization" in saved["env"]:  # A leaf that the run left out stays out.
+        merged["env"]["randomization"] = saved["env"]["randomization"]
     for item in items:
         key = item.key_or_group
+        if (key, item.value()) == ("env", "custom") and suite == "custom":
+            continue  # The file may have moved; `env.name` says where to.
         if _copy_key(key, data, merged):
             continue
         if item.is_delete() or choices(key):
@@ -232,15 +259,25 @@ def _print_help(name: str, cls: type[Any]) -> None:
     for heading in ("key", "default", "meaning"):
         table.add_column(heading, overflow="fold", no_wrap=heading == "key")
     for key, meaning, allowed in _documented(cls):
-        shown = "null" if values[key] is None else str(values[key])
+        shown = _shown_default(key, values)
         table.add_row(key, shown, f"{meaning}{f' ({allowed})' if allowed else ''}")
     console = Console(width=None if sys.stdout.isatty() else 140, highlight=False, markup=False)
     console.print(f"usage: python -m gmijax.{name} [key=value ...] [--cfg job] [--help]\n")
     for group in ("env", "algo", "plan"):
         if group in {key.split(".")[0] for key in values} and choices(group):
             console.print(f"{group}= one of: {', '.join(choices(group))}")
+            if group == "env":
+                console.print("or env=PATH.py:FUNCTION, a task of your own (docs/custom-task.md)")
     console.print()
     console.print(table)
+
+
+def _shown_default(key: str, values: Mapping[str, Any]) -> str:
+    if key in values:
+        return "null" if values[key] is None else str(values[key])
+    # A group whose keys are the user's to choose: their names tell more than all their values.
+    names = {name.removeprefix(f"{key}.").split(".")[0] for name in values if f"{key}." in name}
+    return ", ".join(sorted(names)) or "{}"
 
 
 def _documented(cls: type[Any], prefix: str = "") -> Iterator[tuple[str, str, str]]:
@@ -252,7 +289,8 @@ def _documented(cls: type[Any], prefix: str = "") -> Iterator[tuple[str, str, st
             continue
         literal = typing.get_origin(kind) is typing.Literal
         allowed = "|".join(map(str, typing.get_args(kind))) if literal else ""
-        yield prefix + field.name, field.metadata["doc"], allowed
+        if "doc" in field.metadata:  # Others are not for users to set.
+            yield prefix + field.name, field.metadata["doc"], allowed
 
 
 def _complain(name: str, what: object) -> None:

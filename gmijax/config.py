@@ -6,25 +6,76 @@ the `doc` of every field. `gmijax.schema.from_dict` makes them from outside data
 
 from __future__ import annotations
 
+import dataclasses
+from collections.abc import Mapping
 from dataclasses import dataclass
+from pathlib import PurePath
+from types import MappingProxyType
 from typing import Literal
 
 from gmijax.errors import ConfigError
+from gmijax.randomization import LeafRange
 from gmijax.schema import doc, require_at_least, require_between, require_positive
 
 ADAPTIVE_LEARNING_RATE_RANGE = (1e-5, 1e-2)
 """Where the adaptive schedule keeps the learning rate, and so where it must begin."""
 
 
+_EXAMPLES: Mapping[str, str] = MappingProxyType(
+    {"brax": "ant", "playground": "CartpoleBalance", "custom": "path/to/cart.py:make"}
+)
+
+
 @dataclass(frozen=True, kw_only=True)
 class EnvConfig:
     """The task."""
 
-    name: str = doc("task name, see `python -m gmijax.train --help`")
-    episode_length: int = doc("steps after which an episode is truncated (time limit)")
+    # Whose task it is: env= sets it.
+    suite: Literal["gmijax", "brax", "playground", "custom"] = "gmijax"
+    name: str | None = doc(
+        "name of the task; with env=brax or env=playground one of theirs (Playground downloads "
+        "robot models at first use), with env=custom PATH.py:FUNCTION"
+    )
+    episode_length: int | None = doc(
+        "steps after which an episode is truncated (time limit); null: the task's own"
+    )
+    # Digest of a custom task's file: the run itself notes it.
+    source_sha256: str | None = None
+    randomize: Literal["off", "on"] = doc(
+        "whether every world has a physics model of its own, drawn from env.randomization",
+        default="off",
+    )
+    randomization: Mapping[str, LeafRange] = dataclasses.field(
+        default_factory=dict,
+        metadata={"doc": "leaves of the physics model: operation, range, names, draw"},
+    )
 
     def __post_init__(self) -> None:
-        require_at_least("env.episode_length", self.episode_length, 1)
+        if self.name is None:
+            example = _EXAMPLES.get(self.suite, "ant")
+            raise ConfigError(
+                f"env.name: must be given with env={self.suite}, e.g. env.name={example}"
+            )
+        if self.episode_length is not None:
+            require_at_least("env.episode_length", self.episode_length, 1)
+        for leaf, drawn in self.randomization.items():
+            drawn.check(leaf)
+        if self.randomize == "on" and not self.randomization:
+            raise ConfigError("env.randomize=on: env.randomization names nothing to draw")
+
+    @property
+    def label(self) -> str:
+        """What a task is called in files and messages: `ant`, `brax/ant`, `cart.py:make`."""
+        if self.suite == "custom":
+            return PurePath(str(self.name)).name
+        return str(self.name) if self.suite == "gmijax" else f"{self.suite}/{self.name}"
+
+    @property
+    def slug(self) -> str:
+        """The task in the name of a run folder: `ant`, `brax-ant`, `cart`."""
+        if self.suite == "custom":
+            return PurePath(self.label.rpartition(":")[0]).stem
+        return self.label.replace("/", "-")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -195,11 +246,19 @@ class PlayConfig:
     num_envs: int = doc("N, environments, one episode each")
     seed: int = doc("seed of the episodes' starts and of sampled actions")
     deterministic: bool = doc("act with the policy's mean; false: sample actions")
+    randomize: Literal["off", "on"] = doc(
+        "play in worlds drawn from the run's env.randomization; off: in the model as it is",
+        default="off",
+    )
     max_steps: int | None = doc("cut episodes off after this many steps; null: only the task does")
     video: Literal["auto", "mp4", "gif", "both", "none"] = doc(
         "what to film; auto: mp4, or nothing where there is no headless OpenGL"
     )
     video_envs: int = doc("how many of the environments are shown, in a grid")
+    html: Literal["auto", "on", "off"] = doc(
+        "write a page with the first environment in 3D, with Brax's viewer, which a browser loads "
+        "from the internet; auto: where brax is installed and knows the model's shapes"
+    )
     width: int = doc("width of the picture in pixels")
     height: int = doc("height of the picture in pixels")
     camera: str | None = doc("name of a camera of the model; null: one that tracks the robot")

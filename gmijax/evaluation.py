@@ -7,13 +7,14 @@ GMI of a small plan, `gmijax.sim.render` films them.
 from __future__ import annotations
 
 import dataclasses
+import importlib.util
 import os
 import signal
 import subprocess
 import sys
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, Final, NamedTuple
+from typing import IO, Any, Final, NamedTuple
 
 from rich.console import Console
 from rich.table import Table
@@ -32,6 +33,7 @@ from gmijax.playdir import EXIT_NO_GL, PlayPaths
 from gmijax.resume import CheckpointMeta, find_checkpoint, trained_config
 from gmijax.rundir import META, STEP_DIGITS, RunPaths, read_json, write_json
 from gmijax.schema import to_dict
+from gmijax.sim import source
 from gmijax.sim.registry import require_task
 
 MEMORY_FRACTION: Final = 0.1
@@ -51,11 +53,13 @@ class Evaluation(NamedTuple):
       returns: the content of `returns.json`.
       returns_json: that file.
       videos: the films that were made.
+      html: the page that was written, None if there is none.
     """
 
     returns: dict[str, Any]
     returns_json: Path
     videos: tuple[Path, ...]
+    html: Path | None
 
 
 def play(config: PlayConfig, *, show: bool = False) -> Evaluation:
@@ -70,6 +74,11 @@ def play(config: PlayConfig, *, show: bool = False) -> Evaluation:
       GmiFailed: the evaluation failed.
       GmijaxError: a film was asked for and could not be made; the returns are there.
     """
+    if config.html == "on" and not _has_brax():
+        raise ConfigError(
+            "html=on: needs the package brax (pip install 'gmijax[brax]'); "
+            "allowed without it are auto, off"
+        )
     checkpoint = _find(config)
     config = dataclasses.replace(
         config,
@@ -77,18 +86,25 @@ def play(config: PlayConfig, *, show: bool = False) -> Evaluation:
         run=dataclasses.replace(config.run, dir=str(_run_of(checkpoint))),
     )
     meta = CheckpointMeta.read(checkpoint)
-    require_task(meta.env)
-    trained_config(checkpoint)  # Before a process is started, which would find it bad too.
+    # Before a process is started, which would find it bad too.
+    env, _ = trained_config(checkpoint)
+    require_task(str(env.name), env.suite)
     paths = _prepare(config, meta.env_steps)
     console = Console(quiet=not show, soft_wrap=True, highlight=False)
     console.print(f"checkpoint: {checkpoint}", markup=False)
+    if changed := source.changes(source.pinned(env), dataclasses.asdict(env)):
+        console.print(changed, markup=False)
     with console.status(f"playing {config.num_envs} episodes"):
         _evaluate(config, paths)
     returns = read_json(paths.returns)
     console.print(_table(returns))
     console.print(f"returns: {paths.returns}", markup=False)
+    if not paths.model.exists():
+        _accept_nothing_to_see(config, returns["env"], console)
+        return Evaluation(returns, paths.returns, (), None)
+    html = None if config.html == "off" else _write_page(config, paths, console)
     videos = () if config.video == "none" else _film(config, paths, console)
-    return Evaluation(returns, paths.returns, videos)
+    return Evaluation(returns, paths.returns, videos, html)
 
 
 def _find(config: PlayConfig) -> Path:
@@ -178,6 +194,37 @@ def _light_environment(plan: Plan, gmi: int, added: Mapping[str, str]) -> dict[s
     return {**environment, "XLA_PYTHON_CLIENT_PREALLOCATE": "false"}
 
 
+def _accept_nothing_to_see(config: PlayConfig, env: str, console: Console) -> None:
+    """Says that there is no film of an environment without a model, if one was wanted."""
+    reason = f"{env} has no model that could be filmed; the returns were evaluated"
+    if config.video not in ("auto", "none") or config.html == "on":
+        raise GmijaxError(reason)
+    if config.video == "auto":
+        console.print(reason, markup=False)
+
+
+def _write_page(config: PlayConfig, paths: PlayPaths, console: Console) -> Path | None:
+    """Writes the page in a child of its own: Brax's libraries may fail as they like."""
+    if not _has_brax():
+        return None
+    # A page is quickly made, and the GPU may be training.
+    environment = {"PJRT_NPROC": "4", **os.environ, "JAX_PLATFORMS": "cpu"}
+    with console.status("writing the page"), paths.page_log.open("wb") as log:
+        exit_code = _child("gmijax.sim.page", paths, environment, log)
+    if exit_code == 0:
+        console.print(f"page: {paths.html}", markup=False)
+        return paths.html
+    reason = f"no page: {last_line(paths.page_log)} (log: {paths.page_log})"
+    if config.html == "on":
+        raise GmijaxError(f"{reason}; the returns were evaluated")
+    console.print(reason, markup=False)
+    return None
+
+
+def _has_brax() -> bool:
+    return importlib.util.find_spec("brax") is not None
+
+
 def _film(config: PlayConfig, paths: PlayPaths, console: Console) -> tuple[Path, ...]:
     """Films with the first OpenGL that works; each is tried in a fresh interpreter."""
     users = os.environ.get(_GL)
@@ -222,14 +269,19 @@ def _render(gl: str, paths: PlayPaths) -> int:
     # MuJoCo sets it to what fits MUJOCO_GL, and refuses any other value.
     environment.pop("PYOPENGL_PLATFORM", None)
     with paths.render_log.open("ab") as log:
-        return subprocess.run(
-            [sys.executable, "-m", "gmijax.sim.render", str(paths.root)],
-            env=environment,
-            stdin=subprocess.DEVNULL,
-            stdout=log,
-            stderr=log,
-            check=False,
-        ).returncode
+        return _child("gmijax.sim.render", paths, environment, log)
+
+
+def _child(module: str, paths: PlayPaths, environment: Mapping[str, str], log: IO[bytes]) -> int:
+    """Runs a module on the folder of a played checkpoint; returns its exit code."""
+    return subprocess.run(
+        [sys.executable, "-m", module, str(paths.root)],
+        env=environment,
+        stdin=subprocess.DEVNULL,
+        stdout=log,
+        stderr=log,
+        check=False,
+    ).returncode
 
 
 def _table(returns: Mapping[str, Any]) -> Table:

@@ -12,7 +12,7 @@ import signal
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
@@ -31,9 +31,10 @@ from gmijax.partition.planner import make_plan
 from gmijax.partition.supervisor import Job, Patience, Supervisor
 from gmijax.progress import ConsoleProgress, Progress, SilentProgress
 from gmijax.results import MetricsReader, copy_history, draw_returns, read_metrics
-from gmijax.resume import CheckpointMeta, check_fits, find_checkpoint
+from gmijax.resume import CheckpointMeta, check_fits, find_checkpoint, saved_config
 from gmijax.rundir import RunPaths, create_run, read_json, write_json
 from gmijax.schema import to_dict
+from gmijax.sim import source
 from gmijax.sim.impl import choose_impl
 from gmijax.sim.registry import require_task
 from gmijax.version import __version__
@@ -66,16 +67,18 @@ def train(config: TrainConfig, *, show: bool = False) -> Result:
       JobInterrupted: SIGINT, SIGTERM or SIGHUP came; its note says what is left to resume.
     """
     started = time.monotonic()
-    require_task(config.env.name)
+    require_task(str(config.env.name), config.env.suite)
+    config = dataclasses.replace(config, env=source.pinned(config.env))
     config = _with_checkpoint(config)
     machine = detect_machine()
     plan = make_plan(config.plan, config.reduce, config.num_envs, machine)
     config, reason = _with_impl(config, plan)
-    run = create_run(config.run.dir, config.run.name, f"{config.env.name}-{config.algo.name}")
+    run = create_run(config.run.dir, config.run.name, f"{config.env.slug}-{config.algo.name}")
     write_json(run.config, to_dict(config))
     write_json(run.plan, plan.to_dict())
     console = Console(stderr=False, quiet=not show, soft_wrap=True, highlight=False)
-    _announce(console, plan, reason, run)
+    changed = _what_changed(config)
+    _announce(console, plan, (reason, changed) if changed else (reason,), run)
     progress = (
         ConsoleProgress(console, MetricsReader(run.metrics), config.num_timesteps)
         if show
@@ -98,7 +101,7 @@ def train(config: TrainConfig, *, show: bool = False) -> Result:
         with suppress(OSError):
             summary = _summarise(config, plan, run, status, time.monotonic() - started)
             write_json(run.summary, summary)
-            draw_returns(run.metrics, run.returns_png, f"{config.env.name}, {config.algo.name}")
+            draw_returns(run.metrics, run.returns_png, f"{config.env.label}, {config.algo.name}")
     summary = read_json(run.summary)
     console.print(_outcome(summary, run))
     return Result(run.root, summary)
@@ -107,9 +110,16 @@ def train(config: TrainConfig, *, show: bool = False) -> Result:
 def _with_impl(config: TrainConfig, plan: Plan) -> tuple[TrainConfig, str]:
     """The configuration with `physics.impl` decided, and the reason in words."""
     platform = "cpu" if plan.backend == "cpu" else "gpu"
-    impl, why = choose_impl(config.physics.impl, platform)
+    impl, why = choose_impl(config.physics.impl, platform, config.env.label)
     decided = dataclasses.replace(config, physics=dataclasses.replace(config.physics, impl=impl))
     return decided, f"physics.impl {impl}: {why}"
+
+
+def _what_changed(config: TrainConfig) -> str | None:
+    """Says that a resumed run's custom task is no longer the same, None where nothing changed."""
+    if config.run.resume is None:
+        return None
+    return source.changes(config.env, saved_config(Path(config.run.resume))["env"])
 
 
 def _what_is_left(run: RunPaths) -> str:
@@ -138,7 +148,7 @@ def _with_checkpoint(config: TrainConfig) -> TrainConfig:
     algo = config.algo
     expected = dataclasses.replace(
         meta,
-        env=config.env.name,
+        env=config.env.label,
         algo=algo.name,
         hidden=(algo.policy_hidden_layer_sizes, algo.value_hidden_layer_sizes),
     )
@@ -211,7 +221,7 @@ def _stopping_on_signals(request_stop: Callable[[], None]) -> Iterator[None]:
             signal.signal(number, handler)
 
 
-def _announce(console: Console, plan: Plan, reason: str, run: RunPaths) -> None:
+def _announce(console: Console, plan: Plan, more: Sequence[str], run: RunPaths) -> None:
     layout = [list(gmis) for gmis in plan.layout.gmis_of_gpu]
     console.print(f"run folder: {run.root}")
     console.print(
@@ -219,7 +229,7 @@ def _announce(console: Console, plan: Plan, reason: str, run: RunPaths) -> None:
         f"per GMI, template {plan.template}, reduction {plan.strategy}",
         markup=False,
     )
-    for text in (*plan.reasons, reason):
+    for text in (*plan.reasons, *more):
         console.print(f"  {text}", markup=False)
 
 
@@ -230,7 +240,7 @@ def _summarise(
     checkpoints = sorted(run.checkpoints.glob("[0-9]*"))
     return {
         "status": status,
-        "env": config.env.name,
+        "env": config.env.label,
         "algo": config.algo.name,
         "plan": {
             "backend": plan.backend,
@@ -248,6 +258,7 @@ def _summarise(
         "step_per_s_inference": result.get("step_per_s_inference"),
         "step_per_s_train": result.get("step_per_s_train"),
         "final_return": result.get("final_return"),
+        "overflow_steps": result.get("overflow_steps") or {},
         "checkpoint": str(checkpoints[-1]) if checkpoints else None,
         "versions": {"gmijax": __version__, "python": sys.version.split()[0]}
         | _installed_versions(),
@@ -287,4 +298,8 @@ def _outcome(summary: dict[str, Any], run: RunPaths) -> str:
         f"{rate('step_per_s_inference')} with inference, "
         f"{rate('step_per_s_train')} with training\n"
         f"checkpoint: {summary['checkpoint']}\nsummary: {run.summary}"
+    ) + "".join(
+        f"\nwarning: MJX-Warp's {name} buffer was too small in {count:,.0f} environment steps"
+        for name, count in summary["overflow_steps"].items()
+        if count
     )

@@ -49,17 +49,27 @@ def _run(link: ChildLink) -> None:
     from gmijax.ppo.episodes import Options, run_episodes
     from gmijax.ppo.learner import init_learner, make_learner
     from gmijax.sim.impl import choose_impl
+    from gmijax.sim.randomize import randomized
     from gmijax.sim.registry import make_env
 
-    impl, why = choose_impl(config.physics.impl, jax.default_backend())
+    impl, why = choose_impl(config.physics.impl, jax.default_backend(), env_config.label)
     sys.stdout.write(f"physics.impl={impl}: {why}\n")
     env = make_env(
-        env_config.name,
+        str(env_config.name),
+        suite=env_config.suite,
         impl=impl,
         episode_length=env_config.episode_length,
         max_envs=config.num_envs,
     )
     _check_camera(config.camera, env)
+    if config.randomize == "on":
+        env = randomized(
+            env,
+            env_config.randomization,
+            seed=config.seed,
+            first_env=0,
+            num_envs=config.num_envs,
+        )
     learner = make_learner(env.spec, algo)
     state = jax.jit(lambda key: init_learner(learner, env.spec.obs_size, key))(jax.random.key(0))
     state = restore_learner(checkpoint, state)
@@ -128,7 +138,13 @@ def statistics(values: npt.NDArray[np.generic]) -> dict[str, float]:
 
 
 def _check_camera(camera: str | None, env: Env) -> None:
-    names = [env.mj_model.camera(i).name for i in range(env.mj_model.ncam)]
+    if camera is not None and env.mj_model is None:
+        raise ConfigError(f"camera={camera}: {env.spec.name} has no model that could be filmed")
+    names = (
+        []
+        if env.mj_model is None
+        else [env.mj_model.camera(i).name for i in range(env.mj_model.ncam)]
+    )
     if camera is not None and camera not in names:
         allowed = ", ".join(["null", *filter(None, names)])
         raise ConfigError(
@@ -140,6 +156,8 @@ def _write_trajectory(paths: PlayPaths, env: Env, episodes: Episodes, num_shown:
     import mujoco
     import numpy as np
 
+    if env.mj_model is None:  # The controller sees that there is nothing to film.
+        return
     mujoco.mj_saveModel(env.mj_model, str(paths.model))
     np.savez(
         paths.trajectory,

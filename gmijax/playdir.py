@@ -46,10 +46,21 @@ class PlayPaths:
         return self.root / "video.gif"
 
     @property
+    def html(self) -> Path:
+        """The first shown environment as a page that moves in 3D."""
+        return self.root / "view.html"
+
+    @property
+    def page_log(self) -> Path:
+        """What the writer of the page and its libraries complain about."""
+        return self.root / "page.log"
+
+    @property
     def render_log(self) -> Path:
         """What the renderer and its libraries complain about."""
         return self.root / "render.log"
 
     def results(self) -> tuple[Path, ...]:
         """All files that a new evaluation replaces."""
-        return self.returns, self.trajectory, self.model, self.mp4, self.gif, self.render_log
+        watched = self.mp4, self.gif, self.html
+        return self.returns, self.trajectory, self.model, *watched, self.render_log, self.page_log

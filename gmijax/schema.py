@@ -19,9 +19,9 @@ from gmijax.errors import ConfigError
 T = TypeVar("T")
 
 
-def doc(text: str) -> Any:
-    """A dataclass field whose meaning `--help` prints."""
-    return dataclasses.field(metadata={"doc": text})
+def doc(text: str, default: Any = dataclasses.MISSING) -> Any:
+    """A dataclass field whose meaning `--help` prints; one with a default may be left out."""
+    return dataclasses.field(metadata={"doc": text}, default=default)
 
 
 def require_at_least(key: str, value: float, low: float) -> None:
@@ -54,9 +54,10 @@ def from_dict(cls: type[T], data: Mapping[str, Any], path: str = "") -> T:
     for key in data:
         if key not in hints:
             raise ConfigError(f"unknown key {path}{key}{suggestion(key, hints)}")
-    if missing := [key for key in hints if key not in data]:
+    if missing := [key for key in hints if key not in data and not _has_default(cls, key)]:
         raise ConfigError(f"missing key {path}{missing[0]}")
-    return cls(**{key: _convert(kind, data[key], path + key) for key, kind in hints.items()})
+    given = {key: kind for key, kind in hints.items() if key in data}
+    return cls(**{key: _convert(kind, data[key], path + key) for key, kind in given.items()})
 
 
 def to_dict(config: Any) -> dict[str, Any]:
@@ -69,6 +70,11 @@ def suggestion(key: str, allowed: typing.Iterable[str]) -> str:
     names = sorted(allowed)
     close = difflib.get_close_matches(key, names, n=1)
     return f": did you mean {close[0]}?" if close else f": allowed are {', '.join(names)}"
+
+
+def _has_default(cls: Any, key: str) -> bool:
+    field = cls.__dataclass_fields__[key]
+    return (field.default, field.default_factory) != (dataclasses.MISSING, dataclasses.MISSING)
 
 
 def _convert(kind: Any, value: Any, key: str) -> Any:
@@ -93,13 +99,8 @@ def _options(kind: Any) -> tuple[Any, ...]:
 
 
 def _accept(kind: Any, value: Any, key: str) -> Any:
-    if typing.get_origin(kind) is Literal:
-        # YAML reads a bare `off` or `on` as a boolean; none of our choices is one.
-        return value if value in typing.get_args(kind) else _REJECTED
-    if typing.get_origin(kind) is tuple:
-        if not isinstance(value, list | tuple):
-            return _REJECTED
-        return tuple(_convert(typing.get_args(kind)[0], item, key) for item in value)
+    if typing.get_origin(kind) is not None:
+        return _accept_generic(kind, value, key)
     if kind is type(None):
         return None if value is None else _REJECTED
     if isinstance(value, bool):
@@ -114,6 +115,21 @@ def _accept(kind: Any, value: Any, key: str) -> Any:
     return value if isinstance(kind, type) and isinstance(value, kind) else _REJECTED
 
 
+def _accept_generic(kind: Any, value: Any, key: str) -> Any:
+    inner = typing.get_args(kind)
+    if typing.get_origin(kind) is Literal:
+        if isinstance(value, bool):  # YAML reads a bare `off` or `on` as a boolean.
+            value = "on" if value else "off"
+        return value if value in inner else _REJECTED
+    if typing.get_origin(kind) is Mapping and isinstance(value, Mapping):
+        return {
+            str(name): _convert(inner[1], item, f"{key}.{name}") for name, item in value.items()
+        }
+    if typing.get_origin(kind) is tuple and isinstance(value, list | tuple):
+        return tuple(_convert(inner[0], item, key) for item in value)
+    return _REJECTED
+
+
 def _describe(kind: Any) -> str:
     names = {int: "an integer", float: "a finite number", bool: "true or false", str: "text"}
     parts: list[str] = []
@@ -123,7 +139,10 @@ def _describe(kind: Any) -> str:
         elif typing.get_origin(option) is tuple:
             inner = typing.get_args(option)[0]
             nested = typing.get_origin(inner) is tuple
-            parts.append("a list of lists of integers" if nested else "a list of integers")
+            items = {float: "numbers", str: "names"}.get(inner, "integers")
+            parts.append("a list of lists of integers" if nested else f"a list of {items}")
+        elif typing.get_origin(option) is Mapping:
+            parts.append("a group of keys")
         elif option is type(None):
             parts.append("null")
         else:

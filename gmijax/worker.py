@@ -36,15 +36,25 @@ def _run(link: ChildLink) -> dict[str, Any]:
     from gmijax.collectives.build import Membership, build_reducer
     from gmijax.ppo.programs import exchange_size
     from gmijax.ppo.role import train
+    from gmijax.sim.randomize import randomized
     from gmijax.sim.registry import make_env
     from gmijax.sim.wrappers import training_env
 
     env = make_env(
-        config.env.name,
+        str(config.env.name),
+        suite=config.env.suite,
         impl=config.physics.impl,
         episode_length=config.env.episode_length,
         max_envs=config.num_envs,
     )
+    if config.env.randomize == "on":
+        env = randomized(
+            env,
+            config.env.randomization,
+            seed=config.seed,
+            first_env=link.gmi * config.num_envs,
+            num_envs=config.num_envs,
+        )
     reducer = build_reducer(
         plan.strategy,
         Membership(

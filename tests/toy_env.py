@@ -10,6 +10,11 @@ from gmijax.sim.wrappers import BatchedEnv, time_limit, training_env
 
 
 def point_mass(episode_length: int = 20) -> BatchedEnv:
+    """Many worlds of `point_mass_env`."""
+    return training_env(point_mass_env(episode_length))
+
+
+def point_mass_env(episode_length: int = 20) -> Env:
     """A point on a line that is rewarded for standing at 0; it ends beyond +-3."""
     spec = EnvSpec(
         "point_mass", 2, 1, 0.1, episode_length, ("near", "effort"), metrics=("distance",)
@@ -46,4 +51,4 @@ def point_mass(episode_length: int = 20) -> BatchedEnv:
         return outcome(x + 0.3 * v, v, action, state.steps + 1, state.key)
 
     env = Env(spec, jnp.ones(()), reset, step, None, lambda state: state.physics[0][None])
-    return training_env(time_limit(env, episode_length))
+    return time_limit(env, episode_length)

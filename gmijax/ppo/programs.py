@@ -282,12 +282,10 @@ class SplitIteration:
     @functools.cached_property
     def _unpack_stats(self) -> Any:
         """[M] float32 to `RolloutStats`, the inverse of the packing in `_rollout_fn`."""
-        spec = self._env.spec
-        example = stats_example(spec)
-        return ravel_pytree(example)[1]
+        return ravel_pytree(stats_example(self._env.spec, self._env.overflows))[1]
 
 
-def stats_example(spec: EnvSpec) -> RolloutStats:
+def stats_example(spec: EnvSpec, overflows: tuple[str, ...] = ()) -> RolloutStats:
     """Zeros in the structure of `RolloutStats`."""
     zero = jnp.zeros(())
     terms, metrics = dict.fromkeys(spec.reward_terms, zero), dict.fromkeys(spec.metrics, zero)
@@ -297,4 +295,5 @@ def stats_example(spec: EnvSpec) -> RolloutStats:
         episodes=EpisodeSums(zero, zero, zero, terms, metrics),
         reward_sum=zero,
         diverged=dict.fromkeys(("any", *sources(spec.reward_terms)), zero),
+        overflowed=dict.fromkeys(overflows, zero),
     )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 import time
 from collections.abc import Mapping
 from typing import Any
@@ -25,6 +26,8 @@ class Reporter:
     Attributes:
       iteration_s: seconds between the ends of consecutive iterations.
       last_return: mean return of the latest episodes, None while none has ended.
+      overflow_steps: environment steps, so far, for which a buffer of the simulator was too
+        small, by which; empty if nothing can overflow.
     """
 
     def __init__(
@@ -39,6 +42,7 @@ class Reporter:
         self._started = self._last - wall_s
         self.iteration_s: list[float] = []
         self.last_return: float | None = None
+        self.overflow_steps: dict[str, float] = {}
 
     def report(
         self, env_steps: int, metrics: IterationMetrics, times: Mapping[str, float]
@@ -55,6 +59,7 @@ class Reporter:
         host: Any = jax.tree.map(float, jax.device_get(scalars))
         now = time.monotonic()
         self._check_finite(host, env_steps)
+        self._count_overflows(host.stats.overflowed)
         episodes = host.stats.episodes
         self._window.add(Episodes(**episodes._asdict()))
         means = self._window.means()
@@ -69,6 +74,10 @@ class Reporter:
                 "env_steps_per_s": steps / duration,
                 **means,
                 "diverged_steps": host.stats.diverged["any"],
+                **{
+                    f"physics/{name}_overflow_steps": count
+                    for name, count in host.stats.overflowed.items()
+                },
                 "reward_per_step": host.stats.reward_sum / steps,
                 **{f"loss/{name}": value for name, value in host.losses._asdict().items()},
                 "policy/learning_rate": host.learning_rate,
@@ -81,6 +90,17 @@ class Reporter:
     def close(self) -> None:
         """Flushes the log."""
         self._log.close()
+
+    def _count_overflows(self, overflowed: Mapping[str, float]) -> None:
+        for name, count in overflowed.items():
+            before = self.overflow_steps.get(name, 0.0)
+            if count and not before:
+                sys.stderr.write(
+                    f"{self._env_name}: MJX-Warp's {name} buffer was too small in {count:.0f} "
+                    "environment steps of one iteration; what did not fit was left out "
+                    f"(counted in physics/{name}_overflow_steps)\n"
+                )
+            self.overflow_steps[name] = before + count
 
     def _check_finite(self, host: Any, env_steps: int) -> None:
         where = f"{self._env_name}, up to env step {env_steps}"

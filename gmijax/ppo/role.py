@@ -85,7 +85,7 @@ class _SyncTrainer:
         self._meet()  # Everybody has compiled: the clock may start.
         history = read_metrics(self._link.run.metrics) if self._leader else []
         reporter = Reporter(
-            self._config.env.name,
+            self._config.env.label,
             self._open_log(history),
             self._env_steps,
             history[-1]["wall_s"] if history else 0.0,
@@ -106,6 +106,7 @@ class _SyncTrainer:
             "env_steps_per_s": (self._env_steps - first_steps) / wall_s,
             "step_per_s_train": self._median_rate(reporter.iteration_s),
             "final_return": reporter.last_return,
+            "overflow_steps": reporter.overflow_steps,
             "checkpoint": str(self._checkpoint) if self._checkpoint else None,
             "device": _device(),
         }
@@ -194,7 +195,7 @@ class _SyncTrainer:
             )
         if not all(bool(jnp.all(jnp.isfinite(leaf))) for leaf in jax.tree.leaves(state.params)):
             raise NonFiniteError(
-                f"{self._config.env.name}: parameters are not finite after "
+                f"{self._config.env.label}: parameters are not finite after "
                 f"{self._env_steps} env steps; nothing was saved"
             )
         self._checkpoint = save_checkpoint(
@@ -214,7 +215,7 @@ class _SyncTrainer:
     def _meta(self) -> CheckpointMeta:
         algo = self._config.algo
         return CheckpointMeta(
-            env=self._config.env.name,
+            env=self._config.env.label,
             algo=algo.name,
             env_steps=self._env_steps,
             num_gmis=self._reducer.world_size,

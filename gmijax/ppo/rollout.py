@@ -25,6 +25,7 @@ class RolloutStats(NamedTuple):
       episodes: sums over the episodes that ended.
       reward_sum: [] sum of all rewards, unscaled.
       diverged: [] steps that ended a world because of a bad number, by where it was.
+      overflowed: [] steps for which a buffer of the simulator was too small, by which.
     """
 
     obs: Moments
@@ -32,6 +33,7 @@ class RolloutStats(NamedTuple):
     episodes: EpisodeSums
     reward_sum: Array
     diverged: dict[str, Array]
+    overflowed: dict[str, Array]
 
 
 class Transition(NamedTuple):
@@ -51,6 +53,7 @@ class Counts(NamedTuple):
 
     episodes: EpisodeSums
     diverged: dict[str, Array]
+    overflowed: dict[str, Array]
 
 
 def policy_noise(keys: PRNGKey, action_size: int) -> Array:
@@ -98,7 +101,7 @@ def collect(
         kept = Transition(
             raw_obs, action, mean, out.reward, out.next_obs, out.terminated, out.truncated
         )
-        return state, (kept, Counts(out.finished, out.diverged))
+        return state, (kept, Counts(out.finished, out.diverged, out.overflowed))
 
     env_state, (rollout, counts) = jax.lax.scan(step, env_state, None, length=config.unroll_length)
     samples = _with_advantages(networks, config, params, moments, rollout)
@@ -109,6 +112,7 @@ def collect(
         episodes=totals.episodes,
         reward_sum=jnp.sum(rollout.reward),
         diverged=totals.diverged,
+        overflowed=totals.overflowed,
     )
     return env_state, samples, stats
 

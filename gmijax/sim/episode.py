@@ -33,6 +33,7 @@ def advance(
     reward: tuple[Array, dict[str, Array]],
     terminated: Array,
     metrics: dict[str, Array] | None = None,
+    truncated: Array | None = None,
 ) -> EnvState:
     """The state one step after `before`; `reward` is what `rewards.total_reward` returns."""
     return EnvState(
@@ -44,7 +45,7 @@ def advance(
         metrics=metrics or {},
         terminated=terminated,
         # Time is the business of `wrappers.time_limit`.
-        truncated=jnp.zeros((), bool),
+        truncated=jnp.zeros((), bool) if truncated is None else truncated,
         steps=before.steps + 1,
         key=before.key,
     )

@@ -3,25 +3,76 @@
 from __future__ import annotations
 
 import importlib.util
-from typing import Literal
+from collections.abc import Mapping
+from types import MappingProxyType
+from typing import Literal, NamedTuple
 
 from gmijax.errors import ConfigError
 
 Impl = Literal["jax", "warp"]
 
 
+class WarpSizes(NamedTuple):
+    """Sizes of MJX-Warp's buffers.
+
+    Attributes:
+      contacts_per_env: the buffer that all worlds share holds so many for each of them.
+      constraints_per_env: rows of the constraint solver in one world.
+    """
+
+    contacts_per_env: int
+    constraints_per_env: int
+
+
+class OnGpu(NamedTuple):
+    """How a task runs on a GPU.
+
+    Attributes:
+      auto: what `physics.impl=auto` chooses.
+      warp_sizes: None for the sizes of MJX-JAX, which hold all that can ever be unless the model
+        limits them (`max_contact_points`, `max_geom_pairs`).
+      why_no_warp: why MJX-Warp is refused on a GPU; None where it works.
+    """
+
+    auto: Impl
+    warp_sizes: WarpSizes | None = None
+    why_no_warp: str | None = None
+
+
+ON_GPU: Mapping[str, OnGpu] = MappingProxyType(
+    {
+        "ant": OnGpu("warp"),
+        "anymal": OnGpu("warp"),
+        "ball_balance": OnGpu("jax"),
+        "franka_cabinet": OnGpu(
+            "jax", why_no_warp="its arm moves wrongly there, on a GPU (docs/warp.md)"
+        ),
+        "humanoid": OnGpu("warp"),
+        # MJX-JAX keeps the 12 deepest contacts, Warp all: up to 10 under random actions, 20 fit.
+        "shadow_hand": OnGpu("warp", WarpSizes(contacts_per_env=12, constraints_per_env=108)),
+    }
+)
+"""The tasks by name; a task that is not here runs in JAX, with the sizes of MJX-JAX."""
+
+
 def choose_impl(
-    impl: str, device_platform: str, *, warp_installed: bool | None = None
+    impl: str,
+    device_platform: str,
+    task: str | None = None,
+    *,
+    warp_installed: bool | None = None,
 ) -> tuple[Impl, str]:
     """Decides which MJX implementation runs, and says why in a sentence.
 
     Args:
       impl: `auto`, `jax` or `warp`.
       device_platform: JAX's name of the device: `cpu`, `gpu` or `cuda`.
+      task: its name; None, or one that `ON_GPU` does not have, for a task of somebody else.
       warp_installed: whether warp-lang can be imported; None to find out.
 
     Raises:
-      ConfigError: an unknown implementation, or `warp` without warp-lang.
+      ConfigError: an unknown implementation, `warp` without warp-lang, or `warp` on a GPU for a
+        task that is wrong with it.
     """
     if impl not in ("auto", "jax", "warp"):
         raise ConfigError(f"physics.impl={impl}: allowed are auto, jax, warp")
@@ -29,16 +80,23 @@ def choose_impl(
         warp_installed = importlib.util.find_spec("warp") is not None
     if impl == "jax":
         return "jax", "asked for"
+    is_gpu = device_platform in ("gpu", "cuda")
+    on_gpu = ON_GPU.get(task or "")
     if impl == "warp":
+        if is_gpu and on_gpu is not None and on_gpu.why_no_warp:
+            raise ConfigError(
+                f"physics.impl=warp: not for {task}, {on_gpu.why_no_warp}; allowed are auto, jax"
+            )
         if not warp_installed:
             raise ConfigError(
                 "physics.impl=warp: needs the package warp-lang (pip install 'gmijax[warp]'); "
                 "allowed without it are auto, jax"
             )
         return "warp", "asked for"
-    if device_platform not in ("gpu", "cuda"):
+    if not is_gpu:
         return "jax", f"MJX-Warp is slow on {device_platform}"
     if not warp_installed:
         return "jax", "warp-lang is not installed"
-    # No task has been trained with MJX-Warp on a GPU yet, and solver settings are tuned for jax.
-    return "jax", "no task is tuned for MJX-Warp yet; ask for it with physics.impl=warp"
+    if on_gpu is not None and on_gpu.auto == "warp":
+        return "warp", f"the faster one for {task} on a GPU"
+    return "jax", "not tuned for MJX-Warp; ask for it with physics.impl=warp"

@@ -12,6 +12,9 @@ from typing import Any, NamedTuple
 
 from gmijax.types import Array, PRNGKey, PyTree
 
+OVERFLOWS = ("contact", "constraint")
+"""Buffers of MJX-Warp that can be too small: contacts of all worlds, constraints of one."""
+
 
 class EnvSpec(NamedTuple):
     """What an environment is, in numbers.
@@ -78,7 +81,11 @@ class Env(NamedTuple):
       mj_model: the `mujoco.MjModel` behind `model`, for rendering and for the C oracle.
       qpos: `EnvState -> [nq]`, joint positions for rendering.
       max_envs: most worlds that may be stepped at once, None for no limit. Worlds of MJX-Warp
-        share a contact buffer of fixed size, and lose contacts, silently, when it is full.
+        share a contact buffer of fixed size, and lose contacts when it is full.
+      overflow: `EnvState -> [2]` bool, which of `OVERFLOWS` were too small in the last step; None
+        if nothing can overflow.
+      model_axes: `in_axes` of `model` for `vmap` over worlds: None if they share it, else a tree
+        with 0 at the leaves that have a leading axis [N] (see `gmijax.sim.randomize`).
     """
 
     spec: EnvSpec
@@ -88,3 +95,5 @@ class Env(NamedTuple):
     mj_model: Any
     qpos: Callable[[EnvState], Array]
     max_envs: int | None = None
+    overflow: Callable[[EnvState], Array] | None = None
+    model_axes: PyTree = None

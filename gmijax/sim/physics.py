@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from importlib import resources
 from typing import NamedTuple, TypeVar
 
@@ -18,13 +19,18 @@ import mujoco
 from mujoco import mjx
 
 from gmijax.errors import ConfigError
-from gmijax.sim.impl import Impl, choose_impl
+from gmijax.sim.impl import ON_GPU, Impl, WarpSizes, choose_impl
+from gmijax.sim.interface import OVERFLOWS, EnvState
 from gmijax.types import Array, PyTree
 
 T = TypeVar("T")
 
 WARP_MAX_ENVS = 16384
 """Environments that Warp's contact buffer has room for unless `make_env` is told a number."""
+
+# Bits of MJX-Warp's `overflow`: what did not fit, and limits of iterations, which are meant.
+_CONSTRAINT_BITS, _ITERATION_BITS, _ALL_BITS = 0x003, 0x600, 0xFFF
+_CONTACT_BITS = _ALL_BITS & ~(_CONSTRAINT_BITS | _ITERATION_BITS)
 
 
 class PhysicsState(NamedTuple):
@@ -34,11 +40,14 @@ class PhysicsState(NamedTuple):
       qpos: [nq] float32, joint positions.
       qvel: [nv] float32, joint velocities.
       qacc_warmstart: [nv] float32, the last acceleration, where the solver starts from.
+      overflow: [2] bool, which buffers of `OVERFLOWS` were too small in the last control step;
+        None with MJX-JAX, whose buffers hold all that can ever be.
     """
 
     qpos: Array
     qvel: Array
     qacc_warmstart: Array
+    overflow: Array | None = None
 
 
 @dataclass(frozen=True)
@@ -49,6 +58,7 @@ class Physics:
       impl: which MJX implementation runs.
       mj_model: the model as MuJoCo in C has it.
       model: the model on the device; pass it, or a randomised copy, to `step`.
+      jax_model: the same for MJX-JAX, whichever implementation runs; `poses` computes with it.
       blank: builds the `mjx.Data` of one world at the model's reference position.
       substeps: physics steps per control step.
       max_envs: most worlds that may be stepped at once, None for no limit.
@@ -57,6 +67,7 @@ class Physics:
     impl: Impl
     mj_model: mujoco.MjModel
     model: mjx.Model
+    jax_model: mjx.Model
     blank: Callable[[], mjx.Data]
     substeps: int
     max_envs: int | None = None
@@ -68,7 +79,22 @@ class Physics:
 
     def start(self, qpos: Array, qvel: Array) -> PhysicsState:
         """The state of a world at `qpos` [nq], `qvel` [nv] with no history."""
-        return PhysicsState(qpos, qvel, jnp.zeros_like(qvel))
+        overflow = None if self.impl == "jax" else jnp.zeros(len(OVERFLOWS), bool)
+        return PhysicsState(qpos, qvel, jnp.zeros_like(qvel), overflow)
+
+    def poses(self, qpos: Array) -> tuple[Array, Array]:
+        """Where all bodies are at `qpos` [nq]: for resets, which run no physics.
+
+        Always in MJX-JAX and with the model as it was loaded: what nobody reads of it is never
+        computed.
+
+        Returns:
+          Positions [nbody, 3] in metres and unit quaternions [nbody, 4], both in the world, as
+          `xpos` and `xquat` of the data that `step` lets its caller read.
+        """
+        data = mjx.make_data(self.jax_model).replace(qpos=qpos)
+        data = mjx.kinematics(self.jax_model, data)
+        return data.xpos, data.xquat
 
     def step(
         self,
@@ -85,14 +111,31 @@ class Physics:
           integration, `qpos` and `qvel` to the moment after it.
         """
 
-        def substep(state: PhysicsState, _: None) -> tuple[PhysicsState, T]:
-            data = mjx.step(model, self.blank().replace(ctrl=ctrl, **state._asdict()))
-            return PhysicsState(data.qpos, data.qvel, data.qacc_warmstart), read(data)
+        def substep(state: PhysicsState, _: None) -> tuple[PhysicsState, tuple[T, Array | None]]:
+            data = self.blank().replace(
+                ctrl=ctrl,
+                qpos=state.qpos,
+                qvel=state.qvel,
+                qacc_warmstart=state.qacc_warmstart,
+            )
+            data = mjx.step(model, data)
+            bits = None if self.impl == "jax" else data._impl.overflow
+            return PhysicsState(data.qpos, data.qvel, data.qacc_warmstart), (read(data), bits)
 
         # One traced physics step, though only the last one's sensors are wanted: a second copy
         # without sensors takes half as long again to compile, and did not run faster.
-        state, readings = jax.lax.scan(substep, state, length=self.substeps)
-        return state, jax.tree.map(lambda reading: reading[-1], readings)
+        moved, (readings, bits) = jax.lax.scan(
+            substep, state._replace(overflow=None), length=self.substeps
+        )
+        if bits is not None:
+            masks = jnp.array([_CONTACT_BITS, _CONSTRAINT_BITS])
+            moved = moved._replace(overflow=jnp.any(bits[:, None] & masks, axis=0))
+        return moved, jax.tree.map(lambda reading: reading[-1], readings)
+
+    @property
+    def overflow(self) -> Callable[[EnvState], Array] | None:
+        """`EnvState -> [2]` bool as in `PhysicsState.overflow`; None if nothing can overflow."""
+        return None if self.impl == "jax" else lambda state: state.physics.overflow
 
 
 def load(asset: str, *, impl: str, substeps: int, max_envs: int | None = None) -> Physics:
@@ -109,15 +152,26 @@ def load(asset: str, *, impl: str, substeps: int, max_envs: int | None = None) -
       ConfigError: `impl` cannot be had, or the model needs state that is not carried.
     """
     text = resources.files("gmijax.sim").joinpath("assets", f"{asset}.xml").read_text()
+    mj_model = mujoco.MjModel.from_xml_string(text)
+    chosen, _ = choose_impl(impl, jax.default_backend(), asset)
+    sizes = ON_GPU[asset].warp_sizes if asset in ON_GPU else None
     return from_mj_model(
-        mujoco.MjModel.from_xml_string(text), impl=impl, substeps=substeps, max_envs=max_envs
+        mj_model, impl=chosen, substeps=substeps, max_envs=max_envs, warp_sizes=sizes
     )
 
 
 def from_mj_model(
-    mj_model: mujoco.MjModel, *, impl: str, substeps: int, max_envs: int | None = None
+    mj_model: mujoco.MjModel,
+    *,
+    impl: str,
+    substeps: int,
+    max_envs: int | None = None,
+    warp_sizes: WarpSizes | None = None,
 ) -> Physics:
-    """Like `load`, for a model that is already in memory."""
+    """Like `load`, for a model that is already in memory.
+
+    Without `warp_sizes` Warp's buffers are as large as those of MJX-JAX.
+    """
     if mj_model.na or mj_model.nplugin or mj_model.nhistory:
         raise ConfigError(
             f"model: {mj_model.na} activations, {mj_model.nplugin} plugins, "
@@ -125,25 +179,45 @@ def from_mj_model(
             "allowed are actuators without memory (motor, position, velocity)"
         )
     chosen, _ = choose_impl(impl, jax.default_backend())
-    model = mjx.put_model(mj_model, impl=chosen)
+    jax_model = _put(mj_model, "jax")
     if chosen == "jax":
-        return Physics(chosen, mj_model, model, lambda: mjx.make_data(model), substeps)
+        blank = partial(mjx.make_data, jax_model)
+        return Physics(chosen, mj_model, jax_model, jax_model, blank, substeps)
+    model = _put(mj_model, chosen)
     # Warp prints a line per world and step when the solver meets its iteration limit. Here it is
     # meant to meet it, and printing that costs more time than simulating.
     model = model.tree_replace({"opt._impl.warn_overflow": 0})
     max_envs = max_envs or WARP_MAX_ENVS
-    return Physics(chosen, mj_model, model, _warp_blank(mj_model, max_envs), substeps, max_envs)
+    blank = _warp_blank(mj_model, max_envs, warp_sizes or _jax_sizes(mj_model))
+    return Physics(chosen, mj_model, model, jax_model, blank, substeps, max_envs)
 
 
-def _warp_blank(mj_model: mujoco.MjModel, max_envs: int) -> Callable[[], mjx.Data]:
-    # MJX-JAX keeps a row for every contact and constraint that can ever be, so its sizes are
-    # the bounds of Warp's buffers: contacts are shared by all worlds, rows are per world.
+def _put(mj_model: mujoco.MjModel, impl: Impl) -> mjx.Model:
+    try:
+        return mjx.put_model(mj_model, impl=impl)
+    except (NotImplementedError, ValueError) as error:
+        name = mj_model.names.split(b"\0")[0].decode()  # The model's own name comes first.
+        raise ConfigError(
+            f"physics.impl={impl}: MJX cannot simulate the model {name} with it: "
+            f"{' '.join(str(error).split())}"
+        ) from None
+
+
+def _jax_sizes(mj_model: mujoco.MjModel) -> WarpSizes:
+    """MJX-JAX's sizes: a row for every contact and constraint that can ever be."""
     bounds = mjx.make_data(mj_model, impl="jax")._impl
+    return WarpSizes(bounds.ncon, bounds.nefc)
+
+
+def _warp_blank(
+    mj_model: mujoco.MjModel, max_envs: int, sizes: WarpSizes
+) -> Callable[[], mjx.Data]:
+    # Contacts are shared by all worlds, rows are per world.
     template = mjx.make_data(
         mj_model,
         impl="warp",
-        naconmax=max(bounds.ncon, 1) * max_envs,
-        njmax=max(bounds.nefc, 1),
+        naconmax=max(sizes.contacts_per_env, 1) * max_envs,
+        njmax=max(sizes.constraints_per_env, 1),
     )
     leaves, tree = jax.tree.flatten(template)
     # Zeros are made where they are used: as constants of the compiled program they would be
@@ -154,14 +228,12 @@ def _warp_blank(mj_model: mujoco.MjModel, max_envs: int) -> Callable[[], mjx.Dat
     ]
 
     def blank() -> mjx.Data:
-        return jax.tree.unflatten(
-            tree,
-            [
-                jnp.zeros(leaf.shape, leaf.dtype)
-                if isinstance(leaf, jax.ShapeDtypeStruct)
-                else leaf
-                for leaf in kept
-            ],
-        )
+        fresh = [
+            jnp.zeros(leaf.shape, leaf.dtype) if isinstance(leaf, jax.ShapeDtypeStruct) else leaf
+            for leaf in kept
+        ]
+        # Warp writes into these buffers. Without the barrier XLA takes zeros of one shape for
+        # one value, and on a GPU gives them one buffer (docs/decisions/sim-warp-blank-data.md).
+        return jax.tree.unflatten(tree, jax.lax.optimization_barrier(fresh))
 
     return blank

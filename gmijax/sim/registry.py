@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import importlib
+import importlib.util
 from collections.abc import Mapping
 from types import MappingProxyType
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any, Literal, overload
 
 from gmijax.errors import ConfigError
+from gmijax.sim import source
 
 if TYPE_CHECKING:
     from gmijax.sim.interface import Env
@@ -15,47 +17,120 @@ if TYPE_CHECKING:
 TASKS: Mapping[str, str] = MappingProxyType(
     {
         "ant": "gmijax.sim.tasks.ant",
+        "anymal": "gmijax.sim.tasks.anymal",
         "ball_balance": "gmijax.sim.tasks.ball_balance",
+        "franka_cabinet": "gmijax.sim.tasks.franka_cabinet",
+        "humanoid": "gmijax.sim.tasks.humanoid",
+        "shadow_hand": "gmijax.sim.tasks.shadow_hand",
     }
 )
 """Name -> module with `make(*, impl, max_envs) -> Env` and `DEFAULT_EPISODE_LENGTH`."""
 
+SUITES: Mapping[str, str] = MappingProxyType(
+    {
+        "brax": "gmijax.sim.adapters.brax",
+        "playground": "gmijax.sim.adapters.playground",
+        "custom": "gmijax.sim.adapters.custom",
+    }
+)
+"""Whose tasks there are beside ours -> module with `make(name, *, impl, max_envs) -> Env`."""
+
+_PACKAGES: Mapping[str, str] = MappingProxyType(
+    {"brax": "brax", "playground": "mujoco_playground"}
+)
+
 
 def task_names() -> tuple[str, ...]:
-    """All names that `make_env` knows, sorted."""
+    """The names of our own tasks, sorted."""
     return tuple(sorted(TASKS))
 
 
-def require_task(name: str) -> None:
-    """Raises ConfigError unless `name` is a task; needs no jax."""
-    if name not in TASKS:
+def require_task(name: str, suite: str = "gmijax") -> None:
+    """Raises ConfigError unless `name` may be a task of `suite`; needs no jax.
+
+    Which names a package has is known when it is imported, and that is left to the GMIs.
+    """
+    package = _PACKAGES.get(suite)
+    if package is not None and importlib.util.find_spec(package) is None:
+        raise ConfigError(
+            f"env={suite}: needs the package {package} (pip install 'gmijax[{suite}]')"
+        )
+    if suite == "custom":
+        source.split(name)
+    if suite == "gmijax" and name not in TASKS:
         raise ConfigError(f"env={name}: unknown task; allowed are {', '.join(task_names())}")
+
+
+@overload
+def make_env(
+    name: str,
+    *,
+    suite: str = ...,
+    impl: str = ...,
+    episode_length: int | None = ...,
+    max_envs: int | None = ...,
+    api: Literal["gmijax"] = ...,
+) -> Env: ...
+
+
+@overload
+def make_env(
+    name: str,
+    *,
+    suite: str = ...,
+    impl: str = ...,
+    episode_length: int | None = ...,
+    max_envs: int | None = ...,
+    api: Literal["brax"],
+) -> Any: ...
 
 
 def make_env(
     name: str,
     *,
+    suite: str = "gmijax",
     impl: str = "auto",
     episode_length: int | None = None,
     max_envs: int | None = None,
-) -> Env:
+    api: Literal["gmijax", "brax"] = "gmijax",
+) -> Any:
     """Makes a task, with its time limit.
 
     Args:
-      name: one of `task_names()`.
+      name: one of `task_names()`, a name that `suite` knows, or `PATH.py:FUNCTION`.
+      suite: whose task: `gmijax`, `brax`, `playground` or `custom`.
       impl: MJX implementation, `auto`, `jax` or `warp`.
       episode_length: steps after which an episode is truncated; None: the task's own.
       max_envs: upper bound of environments stepped at once; only `warp` needs it, to size the
         contact buffer that they share. None: `gmijax.sim.physics.WARP_MAX_ENVS`.
+      api: `gmijax` for an `Env`, `brax` for a `brax.envs.Env` without a time limit, as Brax's
+        wrappers want it.
 
     Raises:
-      ConfigError: an unknown name, an implementation that cannot be had, or a length below 1.
+      ConfigError: an unknown name, a package or implementation that cannot be had, a length
+        below 1, or a length for `brax`, whose `EpisodeWrapper` takes it.
     """
-    require_task(name)
+    if api not in ("gmijax", "brax"):
+        raise ConfigError(f"api={api}: allowed are gmijax, brax")
+    if episode_length is not None and api == "brax":
+        raise ConfigError("episode_length: give it to Brax's EpisodeWrapper with api=brax")
     if episode_length is not None and episode_length < 1:
         raise ConfigError(f"env.episode_length={episode_length}: must be at least 1")
+    if suite == "gmijax" and ".py:" in name:
+        suite = "custom"
+    env = _make(name, suite, impl, max_envs)
+    if api == "brax":
+        require_task("", "brax")
+        return importlib.import_module("gmijax.sim.adapters.to_brax").BraxEnv(env)
     from gmijax.sim.wrappers import time_limit
 
-    task = importlib.import_module(TASKS[name])
-    env: Env = task.make(impl=impl, max_envs=max_envs)
-    return time_limit(env, episode_length or task.DEFAULT_EPISODE_LENGTH)
+    return time_limit(env, episode_length or env.spec.episode_length)
+
+
+def _make(name: str, suite: str, impl: str, max_envs: int | None) -> Env:
+    if suite not in ("gmijax", *SUITES):
+        raise ConfigError(f"suite={suite}: allowed are gmijax, {', '.join(SUITES)}")
+    require_task(name, suite)
+    if suite == "gmijax":
+        return importlib.import_module(TASKS[name]).make(impl=impl, max_envs=max_envs)
+    return importlib.import_module(SUITES[suite]).make(name, impl=impl, max_envs=max_envs)

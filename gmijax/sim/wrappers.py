@@ -16,7 +16,7 @@ import jax.numpy as jnp
 
 from gmijax.errors import ConfigError
 from gmijax.sim.divergence import diverged_by_source, end_diverged
-from gmijax.sim.interface import Env, EnvSpec, EnvState
+from gmijax.sim.interface import OVERFLOWS, Env, EnvSpec, EnvState
 from gmijax.types import Array, PRNGKey, PyTree
 
 
@@ -63,6 +63,8 @@ class StepOutput(NamedTuple):
       finished: the episodes that ended in this step.
       diverged: [] int32, worlds that were ended because of a bad number (they count as
         terminated), and by where it was: `any` and `gmijax.sim.divergence.sources`.
+      overflowed: [] int32, worlds for which a buffer was too small, by `OVERFLOWS`; empty if
+        nothing can overflow.
     """
 
     next_obs: Array
@@ -71,6 +73,7 @@ class StepOutput(NamedTuple):
     truncated: Array
     finished: EpisodeSums
     diverged: dict[str, Array]
+    overflowed: dict[str, Array]
 
 
 class BatchedEnv(NamedTuple):
@@ -81,12 +84,14 @@ class BatchedEnv(NamedTuple):
       model: the physics model; pass it, or a randomised copy, to the functions.
       init: `(model, keys [N]) -> BatchState`; `env_keys` makes the keys, which it consumes.
       step: `(model, state, actions [N, A]) -> (BatchState, StepOutput)`.
+      overflows: the names in `StepOutput.overflowed`.
     """
 
     spec: EnvSpec
     model: PyTree
     init: Callable[[PyTree, PRNGKey], BatchState]
     step: Callable[[PyTree, BatchState, Array], tuple[BatchState, StepOutput]]
+    overflows: tuple[str, ...] = ()
 
 
 def time_limit(env: Env, episode_length: int) -> Env:
@@ -103,10 +108,10 @@ def time_limit(env: Env, episode_length: int) -> Env:
 
 
 def vectorise(env: Env) -> Env:
-    """The same environment for N worlds at once; all of them share the model."""
+    """The same environment for N worlds at once; they share the model, or most of its leaves."""
     return env._replace(
-        reset=jax.vmap(env.reset, in_axes=(None, 0)),
-        step=jax.vmap(env.step, in_axes=(None, 0, 0)),
+        reset=jax.vmap(env.reset, in_axes=(env.model_axes, 0)),
+        step=jax.vmap(env.step, in_axes=(env.model_axes, 0, 0)),
     )
 
 
@@ -149,6 +154,14 @@ def episode_statistics(
     return jnp.where(done, 0.0, returns), going_on, finished
 
 
+def overflowed(env: Env, state: EnvState) -> dict[str, Array]:
+    """For worlds [N]: how many of them met a buffer that was too small, by `OVERFLOWS`."""
+    if env.overflow is None:
+        return {}
+    counts = jnp.sum(jax.vmap(env.overflow)(state), axis=0, dtype=jnp.int32)
+    return dict(zip(OVERFLOWS, counts, strict=True))
+
+
 def training_env(env: Env) -> BatchedEnv:
     """N auto-resetting copies of `env`, with statistics of the episodes that end.
 
@@ -179,10 +192,12 @@ def training_env(env: Env) -> BatchedEnv:
             truncated=stepped.truncated,
             finished=finished,
             diverged={name: jnp.sum(where, dtype=jnp.int32) for name, where in bad.items()},
+            overflowed=overflowed(env, stepped),
         )
         return BatchState(auto_reset(batched, model, stepped), returns, terms), output
 
-    return BatchedEnv(env.spec, env.model, init, step)
+    overflows = () if env.overflow is None else OVERFLOWS
+    return BatchedEnv(env.spec, env.model, init, step, overflows)
 
 
 def env_keys(key: PRNGKey, first_env: int, num_envs: int) -> PRNGKey:

@@ -47,7 +47,7 @@ def home(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_returns_are_shown_and_written(home: Path):
-    done = gmijax("play", "run.dir=last", "num_envs=4", "video=none", cwd=home)
+    done = gmijax("play", "run.dir=last", "num_envs=4", "video=none", "html=off", cwd=home)
     assert done.returncode == 0, done.stderr
     folder = home / "runs" / "tiny" / "play" / "000000000256"
     assert str(folder / "returns.json") in done.stdout
@@ -63,14 +63,16 @@ def test_returns_are_shown_and_written(home: Path):
         assert item["terminated"] != item["truncated"]
         assert item["return"] == pytest.approx(sum(item["terms"].values()), rel=1e-4)
     assert not (folder / "video.mp4").exists()
+    assert not (folder / "view.html").exists()
 
 
 def test_the_same_seed_gives_the_same_returns(home: Path):
-    shared = ("checkpoint=128", "num_envs=4", "video=none", "deterministic=false", "max_steps=40")
+    shared = ("checkpoint=128", "num_envs=4", "deterministic=false", "max_steps=40")
+    nothing = ("video=none", "html=off")
     folder = home / "runs" / "tiny" / "play" / "000000000128"
     played: list[list[float]] = []
     for _ in range(2):
-        done = gmijax("play", "run.dir=runs/tiny", "seed=1", *shared, cwd=home)
+        done = gmijax("play", "run.dir=runs/tiny", "seed=1", *shared, *nothing, cwd=home)
         assert done.returncode == 0, done.stderr
         episodes = json.loads((folder / "returns.json").read_text())["episodes"]
         played.append([item["return"] for item in episodes])
@@ -88,6 +90,8 @@ def test_films_have_the_wanted_size_and_play_in_real_time(home: Path):
     longest = max(
         item["length"] for item in json.loads((folder / "returns.json").read_text())["episodes"]
     )
+    assert f"page: {folder / 'view.html'}" in done.stdout
+    assert "brax-viewer" in (folder / "view.html").read_text()
     for name, fps in (("video.mp4", 25.0), ("video.gif", 12.5)):
         assert f"video: {folder / name}" in done.stdout
         num_frames, duration_s = imageio_ffmpeg.count_frames_and_secs(str(folder / name))

@@ -133,3 +133,12 @@ def test_a_broken_configuration_is_bad_input(run: RunPaths, text: str, message: 
     run.config.write_text(text)
     with pytest.raises(ConfigError, match=message):
         compose(f"run.resume={run.root}")
+
+
+def test_a_leaf_that_the_run_did_not_randomize_stays_as_it_is(run: RunPaths):
+    saved = read_json(run.config)
+    del saved["env"]["randomization"]["dof_damping"]
+    write_json(run.config, saved)
+    config = compose(f"run.resume={run.root}", "env.randomization.body_mass.range=[0.5,1.5]")
+    assert set(config.env.randomization) == set(saved["env"]["randomization"])
+    assert config.env.randomization["body_mass"].range == (0.5, 1.5)

@@ -1,3 +1,5 @@
+import importlib
+
 import jax
 import jax.numpy as jnp
 import mujoco
@@ -7,7 +9,11 @@ from compile_options import CPU_OPTIONS
 from mujoco import mjx
 
 from gmijax.errors import ConfigError
+from gmijax.sim import impl as implementations
+from gmijax.sim import physics
+from gmijax.sim.impl import OnGpu, WarpSizes
 from gmijax.sim.physics import PhysicsState, choose_impl, from_mj_model
+from gmijax.sim.registry import TASKS
 
 # Halves the time to compile; other devices do not know the option.
 
@@ -79,7 +85,8 @@ def test_the_small_state_forgets_nothing_that_the_next_step_needs():
     for ctrl in np.random.default_rng(0).uniform(-1, 1, (100, 1)).astype(np.float32):
         whole = step(whole.replace(ctrl=jnp.array(ctrl)))
         carried = PhysicsState(small.qpos, small.qvel, small.qacc_warmstart)
-        small = step(world.blank().replace(ctrl=jnp.array(ctrl), **carried._asdict()))
+        kept = {name: value for name, value in carried._asdict().items() if value is not None}
+        small = step(world.blank().replace(ctrl=jnp.array(ctrl), **kept))
         for name in ("qpos", "qvel", "qacc_warmstart", "sensordata"):
             np.testing.assert_array_equal(getattr(whole, name), getattr(small, name))
 
@@ -99,3 +106,120 @@ def test_substeps_are_steps_in_a_row():
     np.testing.assert_allclose(at_once.qpos, state.qpos, rtol=1e-5)
     np.testing.assert_allclose(last_sensors, sensors, rtol=1e-4, atol=1e-5)
     assert three.control_dt_s == pytest.approx(0.03)
+
+
+ARM_AND_FREE_BOX = """
+<mujoco>
+  <worldbody>
+    <body pos="0.1 0.2 0.5" quat="1 1 0 0">
+      <joint axis="0 1 0" pos="0 0 0.1" ref="0.3"/>
+      <geom size="0.1"/>
+      <body pos="0 0.3 0" euler="20 30 40">
+        <joint type="slide" axis="1 0 1"/>
+        <geom size="0.1"/>
+        <body pos="0.2 0 0"><joint type="ball"/><geom size="0.1"/></body>
+      </body>
+    </body>
+    <body pos="1 0 0.5"><freejoint/><geom type="box" size="0.1 0.1 0.1"/></body>
+  </worldbody>
+</mujoco>
+"""
+
+
+@pytest.mark.parametrize("impl", ["jax", "warp"])
+def test_poses_are_those_of_mujoco_in_c(impl: str):
+    if impl == "warp":
+        pytest.importorskip("warp")
+    mj_model = mujoco.MjModel.from_xml_string(ARM_AND_FREE_BOX)
+    world = from_mj_model(mj_model, impl=impl, substeps=1, max_envs=1)
+    poses = jax.jit(world.poses, compiler_options=CPU_OPTIONS)
+    data, rng = mujoco.MjData(mj_model), np.random.default_rng(0)
+    for _ in range(5):
+        # Quaternions of any length: C normalises them too.
+        data.qpos = rng.uniform(-1, 1, mj_model.nq)
+        mujoco.mj_kinematics(mj_model, data)
+        xpos, xquat = poses(jnp.array(data.qpos, jnp.float32))
+        np.testing.assert_allclose(xpos, data.xpos, atol=1e-5)
+        np.testing.assert_allclose(xquat, data.xquat, atol=1e-5)
+
+
+def test_a_task_that_is_wrong_with_warp_on_a_gpu_is_refused_there():
+    with pytest.raises(ConfigError, match=r"physics\.impl=warp: not for franka_cabinet, its arm"):
+        choose_impl("warp", "cuda", "franka_cabinet", warp_installed=True)
+    assert choose_impl("warp", "cpu", "franka_cabinet", warp_installed=True)[0] == "warp"
+
+
+def test_auto_chooses_by_task(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(implementations, "ON_GPU", {"ant": OnGpu("warp")})
+    assert choose_impl("auto", "gpu", "ant", warp_installed=True)[0] == "warp"
+    assert choose_impl("auto", "gpu", "ball_balance", warp_installed=True)[0] == "jax"
+    assert choose_impl("auto", "gpu", "franka_cabinet", warp_installed=True)[0] == "jax"
+    assert choose_impl("auto", "gpu", warp_installed=True)[0] == "jax"
+    assert choose_impl("auto", "cpu", "ant", warp_installed=True)[0] == "jax"
+
+
+def test_every_task_has_an_entry_for_gpus():
+    assert set(implementations.ON_GPU) == set(TASKS)
+
+
+@pytest.mark.parametrize("impl", ["jax", "warp"])
+def test_a_model_that_an_implementation_refuses_is_told_in_one_line(impl: str):
+    if impl == "warp":
+        pytest.importorskip("warp")
+    # 70 degrees of freedom with dense matrices: too many for MJX-Warp. JAX has no noslip solver.
+    balls = "<body><freejoint/><geom size='0.1'/></body>" * 12
+    option = "jacobian='dense'" if impl == "warp" else "integrator='implicit'"
+    text = f"<mujoco model='balls'><option {option}/><worldbody>{balls}</worldbody></mujoco>"
+    said = rf"^physics\.impl={impl}: MJX cannot simulate the model balls with it: .+"
+    with pytest.raises(ConfigError, match=said) as error:
+        from_mj_model(mujoco.MjModel.from_xml_string(text), impl=impl, substeps=1, max_envs=1)
+    assert "\n" not in str(error.value)
+
+
+DROPPED_BALLS = """
+<mujoco>
+  <worldbody>
+    <geom name="floor" type="plane" size="0 0 1"/>
+    <body pos="0 0 0.09"><freejoint/><geom size="0.1"/></body>
+    <body pos="1 0 0.09"><freejoint/><geom size="0.1"/></body>
+  </worldbody>
+</mujoco>
+"""
+
+
+@pytest.mark.parametrize(
+    ("sizes", "overflow"),
+    [
+        (WarpSizes(2, 8), [False, False]),
+        (WarpSizes(1, 8), [True, False]),
+        (WarpSizes(2, 7), [False, True]),
+        (None, [False, False]),
+    ],
+)
+def test_a_buffer_of_warp_that_is_too_small_is_noticed(
+    sizes: WarpSizes | None, overflow: list[bool]
+):
+    pytest.importorskip("warp")
+    world = from_mj_model(
+        mujoco.MjModel.from_xml_string(DROPPED_BALLS),
+        impl="warp",
+        substeps=2,
+        max_envs=3,
+        warp_sizes=sizes,
+    )
+    qpos = jnp.tile(jnp.array(world.mj_model.qpos0, jnp.float32), (3, 1))
+    start = jax.vmap(world.start)(qpos, jnp.zeros((3, world.mj_model.nv)))
+    assert start.overflow is not None
+    assert not start.overflow.any()
+    step = jax.jit(jax.vmap(world.step, in_axes=(None, 0, None)))
+    moved, _ = step(world.model, start, jnp.zeros(0))
+    assert moved.overflow is not None
+    assert moved.overflow.tolist() == [overflow] * 3
+
+
+def test_bits_of_overflow_are_those_of_warp():
+    pytest.importorskip("warp")
+    kinds = importlib.import_module("mujoco.mjx.third_party.mujoco_warp._src.types").OverflowType
+    assert physics._CONSTRAINT_BITS == kinds.NEFC | kinds.NJMAX_NNZ
+    assert physics._ITERATION_BITS == kinds.ITERATIONS | kinds.LS_ITERATIONS
+    assert physics._ALL_BITS == kinds.ALL

@@ -9,7 +9,7 @@ from gmijax.sim.registry import make_env, task_names
 
 def test_unknown_task_lists_the_names():
     with pytest.raises(
-        ConfigError, match=r"env=antt: unknown task; allowed are ant, ball_balance"
+        ConfigError, match=r"env=antt: unknown task; allowed are ant, anymal, ball_balance, "
     ):
         make_env("antt")
 

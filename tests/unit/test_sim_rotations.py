@@ -26,3 +26,29 @@ def test_wrap_brings_angles_into_one_turn():
     angles = jnp.array([0.0, 4.0, -4.0, 7.0])
     expected = [0.0, 4.0 - 2 * np.pi, 2 * np.pi - 4.0, 7.0 - 2 * np.pi]
     np.testing.assert_allclose(rotations.wrap(angles), expected, atol=1e-5)
+
+
+def test_product_turns_by_the_first_and_then_by_the_second():
+    x, z = jnp.array([1.0, 0.0, 0.0]), jnp.array([0.0, 0.0, 1.0])
+    left, over = rotations.turn(z, np.pi / 2), rotations.turn(x, np.pi / 2)
+    np.testing.assert_allclose(left, QUARTER_TURN_LEFT, atol=1e-6)
+    # Left takes x to y, then over takes y to z; over leaves x, then left takes x to y.
+    both = rotations.rotate(rotations.product(over, left), x)
+    np.testing.assert_allclose(both, [0.0, 0.0, 1.0], atol=1e-6)
+    both = rotations.rotate(rotations.product(left, over), x)
+    np.testing.assert_allclose(both, [0.0, 1.0, 0.0], atol=1e-6)
+
+
+def test_a_rotation_and_its_conjugate_cancel():
+    quat = jnp.array([0.1, -0.7, 0.5, 0.5])
+    none = rotations.product(quat, rotations.conjugate(quat))
+    np.testing.assert_allclose(none, [1.0, 0.0, 0.0, 0.0], atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("turned", "expected"), [(0.0, 0.0), (0.002, 0.002), (-2.0, 2.0), (3.1, 3.1), (4.0, 2.283185)]
+)
+def test_angle_is_that_of_the_shorter_way_round_whatever_the_sign(turned: float, expected: float):
+    quat = rotations.turn(jnp.array([0.6, 0.0, -0.8]), turned)
+    for same in (quat, -quat):
+        assert float(rotations.angle(same)) == pytest.approx(expected, abs=1e-5)

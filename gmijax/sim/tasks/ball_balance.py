@@ -131,6 +131,7 @@ def make(*, impl: str = "auto", max_envs: int | None = None) -> Env:
         mj_model=world.mj_model,
         qpos=lambda state: state.physics.qpos,
         max_envs=world.max_envs,
+        overflow=world.overflow,
     )
 
 

@@ -1,0 +1,1 @@
+"""Environments of others as ours, ours as Brax's, and tasks from the user's own files."""

@@ -1,0 +1,131 @@
+"""Is this an environment? Asked when one comes from outside, before anything is compiled for long.
+
+Reset and step are traced, not run: that takes a second or two, and tells shapes and dtypes.
+"""
+
+from __future__ import annotations
+
+import traceback
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from gmijax.errors import ConfigError
+from gmijax.sim.interface import Env, EnvState
+from gmijax.types import PyTree
+
+
+def check_env(env: Any, what: str) -> None:
+    """Raises ConfigError with one line if `env` is none; `what` says which, for the line."""
+    if not isinstance(env, Env):
+        raise ConfigError(f"{what}: expected a gmijax.sim.interface.Env, got {_kind(env)}")
+    spec = env.spec
+    for name in ("obs_size", "action_size", "episode_length"):
+        size = getattr(spec, name)
+        if not isinstance(size, int) or size < 1:
+            raise ConfigError(f"{what}: spec.{name}={size!r}: must be an integer of at least 1")
+    key = jax.eval_shape(lambda: jax.random.key(0))
+    action = jax.ShapeDtypeStruct((spec.action_size,), jnp.float32)
+    state = attempt(f"{what}: reset", jax.eval_shape, env.reset, env.model, key)
+    _check_state(env, state, key, f"{what}: reset")
+    moved = attempt(f"{what}: step", jax.eval_shape, env.step, env.model, state, action)
+    _check_state(env, moved, key, f"{what}: step")
+    if change := _change(state, moved):
+        raise ConfigError(f"{what}: step must keep all shapes and dtypes, but {change}")
+    _check_qpos(env, state, what)
+
+
+def check_start(env: Env, what: str) -> None:
+    """Raises ConfigError unless one reset, which is run, gives finite numbers in bounds."""
+    state = attempt(f"{what}: reset", jax.jit(env.reset), env.model, jax.random.key(0))
+    for at, leaf in jax.tree.leaves_with_path(state):
+        if jnp.issubdtype(leaf.dtype, jnp.floating) and not np.isfinite(leaf).all():
+            raise ConfigError(f"{what}: reset gives numbers that are not finite in {_path(at)}")
+    largest = float(jnp.max(jnp.abs(state.obs)))
+    if largest >= env.spec.max_abs_obs:
+        raise ConfigError(
+            f"{what}: reset gives an observation of {largest:g}, and spec.max_abs_obs="
+            f"{env.spec.max_abs_obs:g} would end the world"
+        )
+
+
+def attempt(what: str, function: Callable[..., Any], *arguments: Any, **named: Any) -> Any:
+    """Calls somebody else's code.
+
+    Raises:
+      ConfigError: it raised anything; the line has the innermost place, the cause the rest.
+    """
+    try:
+        return function(*arguments, **named)
+    except ConfigError:
+        raise
+    except Exception as error:
+        lines = str(error).strip().splitlines() or [""]
+        raise ConfigError(
+            f"{what} fails: {type(error).__name__}: {lines[0]}{_place(error)}"
+        ) from error
+
+
+def _place(error: Exception) -> str:
+    if isinstance(error, SyntaxError):
+        return ""  # Its message has the line.
+    ours = str(Path(__file__).parents[2])
+    outside = [
+        frame
+        for frame in traceback.extract_tb(error.__traceback__)
+        if not frame.filename.startswith((ours, "<frozen"))
+        and "/site-packages/" not in frame.filename
+    ]
+    return f" ({outside[-1].filename}:{outside[-1].lineno})" if outside else ""
+
+
+def _check_state(env: Env, state: Any, key: jax.ShapeDtypeStruct, what: str) -> None:
+    if not isinstance(state, EnvState):
+        raise ConfigError(f"{what} must return an EnvState, got {_kind(state)}")
+    spec = env.spec
+    scalar, flag = jax.ShapeDtypeStruct((), jnp.float32), jax.ShapeDtypeStruct((), jnp.bool_)
+    wanted = {
+        "obs": jax.ShapeDtypeStruct((spec.obs_size,), jnp.float32),
+        "reward": scalar,
+        "reward_terms": dict.fromkeys(spec.reward_terms, scalar),
+        "metrics": dict.fromkeys(spec.metrics, scalar),
+        "terminated": flag,
+        "truncated": flag,
+        "steps": jax.ShapeDtypeStruct((), jnp.int32),
+        "key": key,
+    }
+    if change := _change(wanted, {name: getattr(state, name) for name in wanted}):
+        raise ConfigError(f"{what} does not give what spec says: {change}")
+
+
+def _check_qpos(env: Env, state: EnvState, what: str) -> None:
+    qpos = attempt(f"{what}: qpos", jax.eval_shape, env.qpos, state)
+    if len(qpos.shape) != 1 or (env.mj_model is not None and qpos.shape != (env.mj_model.nq,)):
+        wanted = "a vector" if env.mj_model is None else f"({env.mj_model.nq},)"
+        raise ConfigError(f"{what}: qpos has shape {qpos.shape}, not {wanted}")
+
+
+def _change(before: PyTree, after: PyTree) -> str:
+    """The first leaf that is different, in words; empty where none is."""
+    old, new = (
+        {_path(at): f"{leaf.dtype}{list(leaf.shape)}" for at, leaf in jax.tree.leaves_with_path(t)}
+        for t in (before, after)
+    )
+    for at in sorted(old.keys() | new.keys()):
+        was, now = old.get(at), new.get(at)
+        if was != now:
+            return f"{at} is {now or 'missing'}, not {was or 'there'}"
+    same = jax.tree.structure(before) == jax.tree.structure(after)
+    return "" if same else "its nesting is another one"
+
+
+def _path(at: Any) -> str:
+    return jax.tree_util.keystr(at, simple=True, separator=".")
+
+
+def _kind(value: Any) -> str:
+    return type(value).__name__

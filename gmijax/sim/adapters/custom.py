@@ -1,0 +1,50 @@
+"""Tasks in files of the user's own: `env=path/to/file.py:make`."""
+
+from __future__ import annotations
+
+import importlib.util
+import inspect
+import sys
+from pathlib import Path
+from types import ModuleType
+
+from gmijax.errors import ConfigError
+from gmijax.schema import suggestion
+from gmijax.sim.adapters.checks import attempt, check_env, check_start
+from gmijax.sim.interface import Env
+from gmijax.sim.source import split
+
+
+def make(name: str, *, impl: str = "auto", max_envs: int | None = None) -> Env:
+    """Calls `FUNCTION(impl=..., max_envs=...)` of `PATH.py:FUNCTION`, and checks what it returns.
+
+    Raises:
+      ConfigError: the file or the function cannot be had, it fails, or what it returns is no
+        environment; one line, with the place.
+    """
+    path, function = split(name)
+    module = attempt(f"env={path}", _load, path)
+    found = getattr(module, function, None)
+    if not callable(found):
+        names = [key for key, value in vars(module).items() if inspect.isfunction(value)]
+        raise ConfigError(f"env={name}: no function {function} there{suggestion(function, names)}")
+    what = f"env={path.name}:{function}"
+    env = attempt(what, found, impl=impl, max_envs=max_envs)
+    check_env(env, what)
+    check_start(env, what)
+    return env
+
+
+def _load(path: Path) -> ModuleType:
+    """Runs the file as a module; it may import what lies beside it, as a script may."""
+    if str(path.parent) not in sys.path:
+        sys.path.append(str(path.parent))
+    # A name of its own: a file called brax.py must not take the place of a package.
+    name = f"gmijax_custom_{path.stem}"
+    spec = importlib.util.spec_from_file_location(name, path)
+    if spec is None or spec.loader is None:
+        raise ConfigError(f"env={path}: not a Python file")
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[name] = module
+    spec.loader.exec_module(module)
+    return module

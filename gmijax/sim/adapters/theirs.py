@@ -1,0 +1,137 @@
+"""An environment with the interface of Brax and MuJoCo Playground as one of ours.
+
+Theirs is an object with `reset(rng) -> state` and `step(state, action) -> state`, whose states
+have `obs`, `reward`, `done`, `metrics` and `info`. Time limit, automatic reset and statistics are
+our wrappers' business, so theirs must come without wrappers.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+from gmijax.errors import ConfigError
+from gmijax.sim import episode
+from gmijax.sim.adapters.checks import check_env
+from gmijax.sim.interface import Env, EnvSpec, EnvState
+from gmijax.types import Array, PRNGKey, PyTree
+
+REWARD = "reward"
+"""The one term of the reward: theirs come as a sum."""
+
+
+def adapt(
+    theirs: Any,
+    *,
+    name: str,
+    episode_length: int,
+    mj_model: Any = None,
+    qpos: Callable[[Any], Array] | None = None,
+) -> Env:
+    """Makes an `Env` of theirs.
+
+    Observations that are dicts: the entry `state` where there is one (what their PPO gives to
+    the policy; what only their critic may see is left out), else all entries in the order of
+    their names. Scalars of `metrics` are summed over the episode, as Brax's `EpisodeWrapper`
+    does. `done` terminates, unless `info["truncation"]` says that time ran out.
+
+    Args:
+      theirs: their environment, one world, without wrappers.
+      name: for messages and logs.
+      episode_length: steps after which an episode is truncated.
+      mj_model: the MuJoCo model to film it with, None for no films.
+      qpos: their state -> [nq], joint positions of that model; None for no films.
+
+    Raises:
+      ConfigError: observations that are no vectors, or a state that changes its shape.
+    """
+    start = jax.eval_shape(theirs.reset, jax.random.key_data(jax.random.key(0)))
+    if mj_model is not None and (qpos is None or _shape(qpos, start) != (mj_model.nq,)):
+        mj_model = qpos = None
+    spec = EnvSpec(
+        name=name,
+        obs_size=_obs_size(start.obs, name),
+        action_size=int(theirs.action_size),
+        control_dt_s=float(getattr(theirs, "dt", math.nan)),
+        episode_length=episode_length,
+        reward_terms=(REWARD,),
+        metrics=tuple(sorted(key for key, value in start.metrics.items() if value.shape == ())),
+    )
+
+    def reset(model: PyTree, key: PRNGKey) -> EnvState:
+        del model  # They keep their model to themselves.
+        key, draw = jax.random.split(key)
+        # They were written for keys that are plain integers.
+        state = jax.tree.map(jnp.asarray, theirs.reset(jax.random.key_data(draw)))
+        return episode.begin(spec, state, (), observation(state.obs), key)
+
+    def step(model: PyTree, state: EnvState, action: Array) -> EnvState:
+        del model
+        before = jax.tree.map(lambda leaf: leaf, state.physics)  # They write into their dicts.
+        after = _alike(state.physics, theirs.step(before, jnp.clip(action, -1.0, 1.0)))
+        done = after.done > 0
+        out_of_time = done & (jnp.asarray(after.info.get("truncation", 0)) > 0)
+        reward = after.reward.astype(jnp.float32)
+        sums = {
+            key: total + after.metrics[key].astype(jnp.float32)
+            for key, total in state.metrics.items()
+        }
+        obs = observation(after.obs)
+        terms = (reward, {REWARD: reward})
+        moved = episode.advance(state, after, (), obs, terms, done & ~out_of_time, sums)
+        return moved._replace(truncated=out_of_time)
+
+    def positions(state: EnvState) -> Array:
+        return jnp.zeros(0) if qpos is None else qpos(state.physics)
+
+    env = Env(spec, (), reset, step, mj_model, positions)
+    check_env(env, f"env.name={name}")
+    return env
+
+
+def require_jax(impl: str, suite: str) -> None:
+    """Raises ConfigError for MJX-Warp, whose states our automatic reset cannot select from."""
+    if impl == "warp":
+        raise ConfigError(
+            f"physics.impl=warp: environments of {suite} run in JAX here; allowed are auto, jax"
+        )
+
+
+def observation(obs: Any) -> Array:
+    """The vector [O] that is learnt from, see `adapt`."""
+    return jnp.concatenate([jnp.ravel(part).astype(jnp.float32) for part in _parts(obs).values()])
+
+
+def _parts(obs: Any) -> dict[str, Any]:
+    if isinstance(obs, Mapping) and "state" in obs:
+        obs = {"state": obs["state"]}
+    return {jax.tree_util.keystr(at): leaf for at, leaf in jax.tree.leaves_with_path(obs)}
+
+
+def _obs_size(obs: Any, name: str) -> int:
+    for at, leaf in _parts(obs).items():
+        if leaf.ndim > 1:
+            raise ConfigError(
+                f"env.name={name}: the observation{at} has shape {leaf.shape}; allowed are vectors"
+            )
+    return sum(leaf.size for leaf in _parts(obs).values())
+
+
+def _shape(function: Callable[[Any], Array], state: Any) -> tuple[int, ...]:
+    return jax.eval_shape(function, state).shape
+
+
+def _alike(before: PyTree, after: PyTree) -> PyTree:
+    """`after` with the dtypes of `before`: some of theirs return plain Python numbers."""
+    if jax.tree.structure(before) != jax.tree.structure(after):
+        return after  # `check_env` says what is different.
+    return jax.tree.map(_with_dtype, before, after)
+
+
+def _with_dtype(before: Array, after: Any) -> Array:
+    is_key = jnp.issubdtype(before.dtype, jax.dtypes.prng_key)
+    return after if is_key else jnp.asarray(after, before.dtype)

@@ -1,0 +1,77 @@
+"""Custom tasks by file and name: `path/to/file.py:make`. No jax here: the controller checks them.
+
+Every GMI is a process of its own and loads the task anew, so a task must be something that a file
+and a name can tell.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import sys
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+from gmijax.config import EnvConfig
+from gmijax.errors import ConfigError
+
+
+def split(name: str) -> tuple[Path, str]:
+    """File and function of `PATH.py:FUNCTION`.
+
+    Raises:
+      ConfigError: `name` has another form, or there is no such file.
+    """
+    path, colon, function = name.rpartition(":")
+    if not (colon and path.endswith(".py") and function.isidentifier()):
+        raise ConfigError(f"env={name}: expected PATH.py:FUNCTION, e.g. path/to/cart.py:make")
+    if not Path(path).is_file():
+        raise ConfigError(f"env={name}: no such file {Path(path).absolute()}")
+    return Path(path).resolve(), function
+
+
+def reference(make: Callable[..., Any]) -> str:
+    """`PATH.py:FUNCTION` of a function at the top level of a file.
+
+    Raises:
+      ConfigError: other processes could not find it: a lambda, a method, a function inside of
+        another one, or one that was typed into a notebook or an interpreter.
+    """
+    name = getattr(make, "__qualname__", repr(make))
+    module = sys.modules.get(getattr(make, "__module__", ""))
+    file = getattr(module, "__file__", None)
+    if file is None or not Path(file).is_file():
+        raise ConfigError(
+            f"env={name}: not in a file; GMIs are processes of their own, so write the function "
+            "into a file and give path/to/file.py:NAME"
+        )
+    if getattr(module, name, None) is not make:
+        raise ConfigError(
+            f"env={name}: not a function at the top level of {file}; GMIs find it there by name"
+        )
+    return f"{Path(file).resolve()}:{name}"
+
+
+def pinned(env: EnvConfig) -> EnvConfig:
+    """The same task; a custom one by its absolute path, with the digest of its file."""
+    if env.suite != "custom":
+        return env
+    path, function = split(str(env.name))
+    digest = hashlib.sha256(path.read_bytes()).hexdigest()
+    return dataclasses.replace(env, name=f"{path}:{function}", source_sha256=digest)
+
+
+def changes(env: EnvConfig, saved: Mapping[str, Any]) -> str | None:
+    """Says that the file of a pinned custom task is another one than that of a saved run.
+
+    Args:
+      env: the task, `pinned`.
+      saved: the group `env` of that run's configuration, as plain data.
+
+    Returns:
+      A sentence, None where nothing has changed.
+    """
+    if env.source_sha256 in (None, saved.get("source_sha256")):
+        return None
+    return f"custom task: {env.name} has changed since the run was started"

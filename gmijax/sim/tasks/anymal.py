@@ -1,0 +1,242 @@
+"""Anymal: a four-legged robot follows a commanded velocity (paper Table 5; figures of Isaac Gym).
+
+Observation [48], each value clipped to +-5: linear and angular velocity in the base's frame
+3 + 3; direction of gravity in it 3; commanded forward, sideways and yaw speed 3; joint positions
+relative to standing 12; joint velocities 12; last action 12.
+Action [12]: position targets of the joints relative to standing, HAA, HFE, KFE of the legs LF,
+LH, RF, RH. Isaac Gym's paper: arXiv:2108.10470.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+import numpy.typing as npt
+
+from gmijax.sim import episode, lookup, physics, rotations
+from gmijax.sim.interface import Env, EnvSpec, EnvState
+from gmijax.sim.rewards import RewardTerm, term_names, total_reward
+from gmijax.types import Array, PRNGKey, PyTree
+
+DEFAULT_EPISODE_LENGTH = 2500
+SUBSTEPS = 4
+OBS_SIZE = 48
+ACTION_SIZE = 12
+OBS_LIMIT = 5.0
+ACTION_SCALE_RAD = 0.5
+VELOCITY_SCALE = 2.0
+ANGULAR_VELOCITY_SCALE = 0.25
+JOINT_VELOCITY_SCALE = 0.05
+COMMAND_LIMITS = (2.0, 1.0, 1.0)  # m/s forwards, m/s to the left, rad/s
+KNEE_RADIUS_M = 0.065
+BASE_HALF_SIZE_M = (0.525, 0.16, 0.09)
+START_FACTOR = (0.5, 1.5)
+VELOCITY_NOISE_RAD_PER_S = 0.1
+
+LEGS = ("LF", "LH", "RF", "RH")
+JOINTS = tuple(f"{leg}_{joint}" for leg in LEGS for joint in ("HAA", "HFE", "KFE"))
+SHANKS = tuple(f"{leg}_SHANK" for leg in LEGS)
+
+
+class AnymalTask(NamedTuple):
+    """The task's memory.
+
+    Attributes:
+      command: [3] wanted speed forwards and to the left, m/s, and of yaw, rad/s.
+      velocity_error_sum: [] of the episode's steps so far, m/s.
+      yaw_rate_error_sum: [] of the episode's steps so far, rad/s.
+    """
+
+    command: Array
+    velocity_error_sum: Array
+    yaw_rate_error_sum: Array
+
+
+@dataclass(frozen=True)
+class AnymalIds:
+    """Addresses in the model and the pose in which the robot stands.
+
+    Attributes:
+      joint_qpos: [12] where the joints lie in `qpos`.
+      joint_qvel: [12] where they lie in `qvel`.
+      shanks: [4] bodies whose origins are the knees.
+      standing: [12] joint positions, radians.
+    """
+
+    joint_qpos: lookup.Addresses
+    joint_qvel: lookup.Addresses
+    shanks: lookup.Addresses
+    standing: npt.NDArray[np.float32]
+
+
+class AnymalView(NamedTuple):
+    """What the reward terms read.
+
+    Attributes:
+      velocity_error: [] distance of the horizontal velocity from the commanded one, m/s.
+      yaw_rate_error: [] rad/s, not negative.
+      torques: [12] of the joints' servos, N m.
+    """
+
+    velocity_error: Array
+    yaw_rate_error: Array
+    torques: Array
+
+
+# The figures' source has weights of 1, 0.5 and 0.000025 per second; a step takes 0.02 s.
+TERMS = {
+    "velocity": RewardTerm[AnymalView](lambda v: jnp.exp(-(v.velocity_error**2) / 0.25), 0.02),
+    "yaw_rate": RewardTerm[AnymalView](lambda v: jnp.exp(-(v.yaw_rate_error**2) / 0.25), 0.01),
+    "torque": RewardTerm[AnymalView](lambda v: jnp.sum(v.torques**2), -0.0000005),
+}
+FLOOR = "floor"
+METRICS: tuple[str, ...] = ("velocity_error_m_per_s", "yaw_rate_error_rad_per_s")
+
+
+def make(*, impl: str = "auto", max_envs: int | None = None) -> Env:
+    """Makes the task without its time limit; see `gmijax.sim.registry.make_env`."""
+    world = physics.load("anymal", impl=impl, substeps=SUBSTEPS, max_envs=max_envs)
+    ids = look_up(world.mj_model)
+    # A number that is not finite outlives the clipping of observations or shows in `qpos`, so
+    # `max_abs_obs` need not be told.
+    spec = EnvSpec(
+        name="anymal",
+        obs_size=OBS_SIZE,
+        action_size=ACTION_SIZE,
+        control_dt_s=world.control_dt_s,
+        episode_length=DEFAULT_EPISODE_LENGTH,
+        reward_terms=term_names(TERMS, FLOOR),
+        metrics=METRICS,
+    )
+
+    def reset(model: PyTree, key: PRNGKey) -> EnvState:
+        del model  # nothing that a reset draws depends on it
+        key, start_key, command_key = jax.random.split(key, 3)
+        start = world.start(*draw_start(ids, world.mj_model, start_key))
+        task = AnymalTask(draw_command(command_key), jnp.zeros(()), jnp.zeros(()))
+        obs = observe(ids, start, task.command, jnp.zeros(ACTION_SIZE))
+        return episode.begin(spec, start, task, obs, key)
+
+    def step(model: PyTree, state: EnvState, action: Array) -> EnvState:
+        action = jnp.clip(action, -1.0, 1.0)
+        moved, (torques, knees) = world.step(
+            model,
+            state.physics,
+            jnp.asarray(ids.standing) + ACTION_SCALE_RAD * action,
+            lambda data: (data.qfrc_actuator[ids.joint_qvel], data.xpos[ids.shanks]),
+        )
+        view = AnymalView(*errors(moved, state.task.command), torques)
+        task, metrics = add_errors(state, view)
+        reward = not_below_zero(total_reward(TERMS, view))
+        obs = observe(ids, moved, task.command, action)
+        down = has_fallen(moved, knees)
+        return episode.advance(state, moved, task, obs, reward, down, metrics)
+
+    return Env(
+        spec=spec,
+        model=world.model,
+        reset=reset,
+        step=step,
+        mj_model=world.mj_model,
+        qpos=lambda state: state.physics.qpos,
+        max_envs=world.max_envs,
+        overflow=world.overflow,
+    )
+
+
+def look_up(mj_model: mujoco.MjModel) -> AnymalIds:
+    """Finds the model's addresses by name, and the pose of its keyframe `stand`."""
+    joint_qpos, joint_qvel = lookup.joint_addresses(mj_model, JOINTS)
+    return AnymalIds(
+        joint_qpos,
+        joint_qvel,
+        np.array([mj_model.body(name).id for name in SHANKS]),
+        mj_model.key("stand").qpos[joint_qpos].astype(np.float32),
+    )
+
+
+def draw_start(ids: AnymalIds, mj_model: mujoco.MjModel, key: PRNGKey) -> tuple[Array, Array]:
+    """Random `qpos` [19] and `qvel` [18]: the base in its place, the legs near standing."""
+    position_key, velocity_key = jax.random.split(key)
+    shape, noise = (ACTION_SIZE,), VELOCITY_NOISE_RAD_PER_S
+    least, most = START_FACTOR
+    factors = jax.random.uniform(position_key, shape, minval=least, maxval=most)
+    velocities = jax.random.uniform(velocity_key, shape, minval=-noise, maxval=noise)
+    qpos = jnp.array(mj_model.key("stand").qpos, jnp.float32)
+    return (
+        qpos.at[ids.joint_qpos].set(factors * ids.standing),
+        jnp.zeros(mj_model.nv).at[ids.joint_qvel].set(velocities),
+    )
+
+
+def draw_command(key: PRNGKey) -> Array:
+    """Wanted speed forwards and to the left, m/s, and of yaw, rad/s [3]."""
+    limits = jnp.array(COMMAND_LIMITS)
+    return jax.random.uniform(key, (3,), minval=-limits, maxval=limits)
+
+
+def gravity_direction(state: physics.PhysicsState) -> Array:
+    """Unit vector [3] of gravity in the base's frame, (0, 0, -1) when level.
+
+    The figures' source turns the vector the other way round, from the base's frame to the world,
+    which swaps the signs of its horizontal components, and more once the robot has yawed.
+    """
+    return rotations.rotate_back(state.qpos[3:7], jnp.array([0.0, 0.0, -1.0]))
+
+
+def errors(state: physics.PhysicsState, command: Array) -> tuple[Array, Array]:
+    """Distances from `command` [3]: of the horizontal velocity, m/s, and of yaw's, rad/s."""
+    velocity = rotations.rotate_back(state.qpos[3:7], state.qvel[:3])
+    return jnp.linalg.norm(command[:2] - velocity[:2]), jnp.abs(command[2] - state.qvel[5])
+
+
+def add_errors(before: EnvState, view: AnymalView) -> tuple[AnymalTask, dict[str, Array]]:
+    """The task's memory after one more step, and the episode's mean errors by then."""
+    task = AnymalTask(
+        before.task.command,
+        before.task.velocity_error_sum + view.velocity_error,
+        before.task.yaw_rate_error_sum + view.yaw_rate_error,
+    )
+    means = jnp.stack([task.velocity_error_sum, task.yaw_rate_error_sum]) / (before.steps + 1)
+    return task, dict(zip(METRICS, means, strict=True))
+
+
+def not_below_zero(reward: tuple[Array, dict[str, Array]]) -> tuple[Array, dict[str, Array]]:
+    """Lifts a negative reward to 0 by one more term, so that the terms still sum to it."""
+    total, terms = reward
+    lift = jnp.maximum(-total, 0.0)
+    return total + lift, terms | {FLOOR: lift}
+
+
+def has_fallen(state: physics.PhysicsState, knees: Array) -> Array:
+    """Whether a knee or the base touches the floor, or the robot lies on its back.
+
+    Args:
+      state: the base's position is that of after the step.
+      knees: [4, 3] positions in the world, metres. They are those of one physics step earlier,
+        which at 1 m/s is 5 mm.
+    """
+    down = gravity_direction(state)
+    lowest = state.qpos[2] - jnp.abs(down) @ jnp.array(BASE_HALF_SIZE_M)
+    return jnp.any(knees[:, 2] < KNEE_RADIUS_M) | (lowest < 0.0) | (down[2] > 0.0)
+
+
+def observe(ids: AnymalIds, state: physics.PhysicsState, command: Array, action: Array) -> Array:
+    """The observation [48] from the state, the command [3] and the last action [12]."""
+    values = jnp.concatenate(
+        [
+            VELOCITY_SCALE * rotations.rotate_back(state.qpos[3:7], state.qvel[:3]),
+            ANGULAR_VELOCITY_SCALE * state.qvel[3:6],
+            gravity_direction(state),
+            command * jnp.array([VELOCITY_SCALE, VELOCITY_SCALE, ANGULAR_VELOCITY_SCALE]),
+            state.qpos[ids.joint_qpos] - ids.standing,
+            JOINT_VELOCITY_SCALE * state.qvel[ids.joint_qvel],
+            action,
+        ]
+    )
+    return jnp.clip(values, -OBS_LIMIT, OBS_LIMIT)

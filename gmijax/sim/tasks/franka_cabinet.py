@@ -1,0 +1,273 @@
+"""Franka cabinet: open a drawer with an arm and a two-finger gripper.
+
+Paper Table 5; figures of Isaac Gym's FrankaCabinet (arXiv:2108.10470).
+Observation [23], each value clipped to +-5: joint positions, -1 to 1 between their limits 9;
+joint velocities 9; way from the gripper to the handle 3; opening of the drawer 1; its speed 1.
+Action [9]: speed of the position targets of arm 7 and fingers 2.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+import numpy.typing as npt
+
+from gmijax.sim import episode, lookup, physics, rotations
+from gmijax.sim.interface import Env, EnvSpec, EnvState
+from gmijax.sim.rewards import Replacement, RewardTerm, term_names, total_reward
+from gmijax.types import Array, PRNGKey, PyTree
+
+DEFAULT_EPISODE_LENGTH = 500
+SUBSTEPS = 2
+OBS_SIZE = 23
+ACTION_SIZE = 9
+OBS_LIMIT = 5.0
+# rad/s of the arm's targets and m/s of the fingers' at full action.
+ACTION_SPEEDS = np.array([7.5] * 7 + [0.75] * 2, np.float32)
+JOINT_VELOCITY_SCALE = 0.1
+# Of every driven joint, the fingers' too: 0.125 m, so that most start wide open or closed.
+JOINT_NOISE = 0.125
+# Between the fingers' pads. The figures' source has a point where the fingers begin, and 0.04 m
+# askew from there; a gripper that holds the handle is 0.06 m away from it.
+GRASP_IN_HAND_M = (0.0, 0.0, 0.0584 + 0.045)
+# In a finger's frame: the middle of its pad. The source takes where the finger begins.
+PAD_IN_FINGER_M = (0.0, 0.0, 0.045)
+HANDLE_IN_DRAWER_M = (0.3, 0.01, 0.0)
+NEAR_M = 0.02
+FINGER_REACH_M = 0.04
+BEHIND_M = 0.04
+BEHIND_REWARD = -1.0
+OPEN_M = 0.39
+
+JOINTS = (*(f"joint_{i}" for i in range(1, 8)), "finger_left", "finger_right")
+
+
+class FrankaCabinetTask(NamedTuple):
+    """The task's memory.
+
+    Attributes:
+      targets: [9] position targets of arm and fingers, radians and metres.
+    """
+
+    targets: Array
+
+
+@dataclass(frozen=True)
+class FrankaCabinetIds:
+    """Addresses in the model and the driven joints' limits.
+
+    Attributes:
+      joint_qpos: [9] where the driven joints lie in `qpos`.
+      joint_qvel: [9] where they lie in `qvel`.
+      drawer_qpos: [1] where the drawer's opening lies in `qpos`.
+      drawer_qvel: [1] where its speed lies in `qvel`.
+      hand: the hand's number among the bodies.
+      fingers: [2] numbers of the left and the right finger.
+      drawer: number of the drawer.
+      lower: [9] lower limits, radians and metres.
+      upper: [9] upper limits, radians and metres.
+    """
+
+    joint_qpos: lookup.Addresses
+    joint_qvel: lookup.Addresses
+    drawer_qpos: lookup.Addresses
+    drawer_qvel: lookup.Addresses
+    hand: int
+    fingers: lookup.Addresses
+    drawer: int
+    lower: npt.NDArray[np.float32]
+    upper: npt.NDArray[np.float32]
+
+
+class FrankaCabinetPose(NamedTuple):
+    """Where gripper and handle are, in the world.
+
+    Attributes:
+      grasp: [3] the gripper's point that is to meet the handle, metres.
+      handle: [3] the handle's point, metres.
+      forward: [3] unit vector along which the fingers point.
+      up: [3] unit vector from the right finger to the left one.
+      fingers: [2, 3] middles of the left and the right finger's pad, metres.
+    """
+
+    grasp: Array
+    handle: Array
+    forward: Array
+    up: Array
+    fingers: Array
+
+
+class FrankaCabinetView(NamedTuple):
+    """What the reward terms read: the poses, the drawer's opening in metres, the action."""
+
+    pose: FrankaCabinetPose
+    drawer_m: Array
+    action: Array
+
+
+def closeness(view: FrankaCabinetView) -> Array:
+    """1 where the gripper meets the handle, less with distance; doubled when near."""
+    way = view.pose.handle - view.pose.grasp
+    squared = way @ way
+    return (1.0 + squared) ** -2 * jnp.where(squared <= NEAR_M**2, 2.0, 1.0)
+
+
+def alignment(view: FrankaCabinetView) -> Array:
+    """1 for a gripper that points into the cabinet with one finger above the other, else less."""
+    inward, up = -view.pose.forward[0], view.pose.up[2]
+    return 0.5 * (inward * jnp.abs(inward) + up * jnp.abs(up))
+
+
+def finger_heights(view: FrankaCabinetView) -> Array:
+    """Heights [2] of the fingers above the handle, metres."""
+    return view.pose.fingers[:, 2] - view.pose.handle[2]
+
+
+def around(view: FrankaCabinetView) -> Array:
+    """0.5 with the left finger above the handle and the right one below it, else 0."""
+    left, right = finger_heights(view)
+    return jnp.where((left > 0.0) & (right < 0.0), 0.5, 0.0)
+
+
+def pinch(view: FrankaCabinetView) -> Array:
+    """Metres by which fingers around the handle are nearer to its height than fully open."""
+    reach = jnp.sum(FINGER_REACH_M - jnp.abs(finger_heights(view)))
+    return jnp.where(around(view) > 0.0, reach, 0.0)
+
+
+def beyond(opening_m: float, view: FrankaCabinetView) -> Array:
+    """1 when the drawer is open by more than `opening_m`, else 0."""
+    return (view.drawer_m > opening_m).astype(jnp.float32)
+
+
+TERMS = {
+    "distance": RewardTerm[FrankaCabinetView](closeness, 2.0),
+    "alignment": RewardTerm[FrankaCabinetView](alignment, 0.5),
+    "around": RewardTerm[FrankaCabinetView](around, 0.25),
+    "pinch": RewardTerm[FrankaCabinetView](pinch, 5.0),
+    "opening": RewardTerm[FrankaCabinetView](lambda v: v.drawer_m * (1.0 + around(v)), 7.5),
+    "action": RewardTerm[FrankaCabinetView](lambda v: jnp.sum(v.action**2), -0.01),
+    "ajar": RewardTerm[FrankaCabinetView](lambda v: beyond(0.01, v), 0.5),
+    "half_open": RewardTerm[FrankaCabinetView](lambda v: beyond(0.2, v) * around(v), 1.0),
+    "open": RewardTerm[FrankaCabinetView](lambda v: beyond(OPEN_M, v) * around(v), 2.0),
+}
+BEHIND = "behind"
+
+
+def make(*, impl: str = "auto", max_envs: int | None = None) -> Env:
+    """Makes the task without its time limit; see `gmijax.sim.registry.make_env`."""
+    world = physics.load("franka_cabinet", impl=impl, substeps=SUBSTEPS, max_envs=max_envs)
+    ids = look_up(world.mj_model)
+    spec = EnvSpec(
+        name="franka_cabinet",
+        obs_size=OBS_SIZE,
+        action_size=ACTION_SIZE,
+        control_dt_s=world.control_dt_s,
+        episode_length=DEFAULT_EPISODE_LENGTH,
+        reward_terms=term_names(TERMS, BEHIND),
+        metrics=("drawer_m", "opened"),
+    )
+
+    def reset(model: PyTree, key: PRNGKey) -> EnvState:
+        del model  # nothing that a reset draws depends on it
+        key, draw = jax.random.split(key)
+        start = world.start(draw_start(ids, world.mj_model, draw), jnp.zeros(world.mj_model.nv))
+        obs = observe(ids, start, pose_of(ids, *world.poses(start.qpos)))
+        task = FrankaCabinetTask(start.qpos[ids.joint_qpos])
+        return episode.begin(spec, start, task, obs, key)
+
+    def step(model: PyTree, state: EnvState, action: Array) -> EnvState:
+        action = jnp.clip(action, -1.0, 1.0)
+        change = ACTION_SPEEDS * world.control_dt_s * action
+        targets = jnp.clip(state.task.targets + change, ids.lower, ids.upper)
+        moved, poses = world.step(
+            model, state.physics, targets, lambda data: (data.xpos, data.xquat)
+        )
+        pose, drawer_m = pose_of(ids, *poses), moved.qpos[ids.drawer_qpos[0]]
+        opened = drawer_m > OPEN_M
+        reward = total_reward(
+            TERMS,
+            FrankaCabinetView(pose, drawer_m, action),
+            Replacement(BEHIND, is_behind(pose), BEHIND_REWARD),
+        )
+        metrics = {"drawer_m": drawer_m, "opened": opened.astype(jnp.float32)}
+        task, obs = FrankaCabinetTask(targets), observe(ids, moved, pose)
+        # Nothing is lost by an open drawer: as a termination it would cost all that could still
+        # be earned, and policies learn to stop just short of it.
+        never = jnp.zeros((), bool)
+        return episode.advance(state, moved, task, obs, reward, never, metrics, opened)
+
+    return Env(
+        spec=spec,
+        model=world.model,
+        reset=reset,
+        step=step,
+        mj_model=world.mj_model,
+        qpos=lambda state: state.physics.qpos,
+        max_envs=world.max_envs,
+        overflow=world.overflow,
+    )
+
+
+def look_up(mj_model: mujoco.MjModel) -> FrankaCabinetIds:
+    """Finds the model's addresses by name."""
+    return FrankaCabinetIds(
+        *lookup.joint_addresses(mj_model, JOINTS),
+        *lookup.joint_addresses(mj_model, ["drawer"]),
+        mj_model.body("hand").id,
+        bodies(mj_model, ("finger_left", "finger_right")),
+        mj_model.body("drawer").id,
+        *lookup.joint_ranges(mj_model, JOINTS),
+    )
+
+
+def draw_start(ids: FrankaCabinetIds, mj_model: mujoco.MjModel, key: PRNGKey) -> Array:
+    """Random `qpos` [10]: noise on arm and fingers, the drawer closed."""
+    start = np.asarray(mj_model.key("start").qpos, np.float32)
+    noise = jax.random.uniform(key, (ACTION_SIZE,), minval=-JOINT_NOISE, maxval=JOINT_NOISE)
+    joints = jnp.clip(start[ids.joint_qpos] + noise, ids.lower, ids.upper)
+    return jnp.array(start).at[ids.joint_qpos].set(joints)
+
+
+def pose_of(ids: FrankaCabinetIds, xpos: Array, xquat: Array) -> FrankaCabinetPose:
+    """Gripper and handle from all bodies' positions [nbody, 3] and quaternions [nbody, 4]."""
+    hand = xquat[ids.hand]
+    handle = rotations.rotate(xquat[ids.drawer], jnp.array(HANDLE_IN_DRAWER_M))
+    return FrankaCabinetPose(
+        grasp=xpos[ids.hand] + rotations.rotate(hand, jnp.array(GRASP_IN_HAND_M)),
+        handle=xpos[ids.drawer] + handle,
+        forward=rotations.rotate(hand, jnp.array([0.0, 0.0, 1.0])),
+        up=rotations.rotate(hand, jnp.array([0.0, 1.0, 0.0])),
+        fingers=xpos[ids.fingers] + rotations.rotate(hand, jnp.array(PAD_IN_FINGER_M)),
+    )
+
+
+def is_behind(pose: FrankaCabinetPose) -> Array:
+    """Whether a finger went through the drawer's front instead of taking the handle."""
+    return jnp.any(pose.fingers[:, 0] < pose.handle[0] - BEHIND_M)
+
+
+def observe(ids: FrankaCabinetIds, state: physics.PhysicsState, pose: FrankaCabinetPose) -> Array:
+    """The observation [23] from the state and the poses."""
+    joints = state.qpos[ids.joint_qpos]
+    values = jnp.concatenate(
+        [
+            (2.0 * joints - ids.upper - ids.lower) / (ids.upper - ids.lower),
+            JOINT_VELOCITY_SCALE * state.qvel[ids.joint_qvel],
+            pose.handle - pose.grasp,
+            state.qpos[ids.drawer_qpos],
+            state.qvel[ids.drawer_qvel],
+        ]
+    )
+    return jnp.clip(values, -OBS_LIMIT, OBS_LIMIT)
+
+
+def bodies(mj_model: mujoco.MjModel, names: Sequence[str]) -> lookup.Addresses:
+    """Numbers of bodies `names` in the model."""
+    return np.array([mj_model.body(name).id for name in names])

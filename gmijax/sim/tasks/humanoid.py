@@ -1,0 +1,176 @@
+"""Humanoid: run along +x on two legs (paper Table 5; figures of Isaac Gym, arXiv:2108.10470).
+
+Observation [108]: torso height 1; linear and angular velocity in the torso's frame 3 + 3; yaw,
+roll, angle to target 3; upright projection 1; heading projection 1; joint positions, -1 to 1
+between their limits 21; joint velocities 21; joint forces 21; forces and torques at the feet 12;
+last action 21.
+Action [21]: joint torques, each joint with a gear of its own.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+import numpy.typing as npt
+
+from gmijax.sim import episode, physics
+from gmijax.sim.interface import Env, EnvSpec, EnvState
+from gmijax.sim.rewards import Replacement, RewardTerm, term_names, total_reward
+from gmijax.sim.tasks import runner
+from gmijax.sim.tasks.runner import RunnerIds, RunnerPose
+from gmijax.types import Array, PRNGKey, PyTree
+
+DEFAULT_EPISODE_LENGTH = 1000
+SUBSTEPS = 4
+# Random actions stay below 100, the sensors of a landing foot included.
+MAX_ABS_OBS = 500.0
+OBS_SIZE = 108
+ACTION_SIZE = 21
+DEATH_HEIGHT_M = 0.8
+DEATH_REWARD = -1.0
+ANGULAR_VELOCITY_SCALE = 0.25
+JOINT_VELOCITY_SCALE = 0.1
+FORCE_SCALE = 0.01
+NEAR_LIMIT = 0.98
+
+SIDES = ("right", "left")
+LEG = ("hip_x", "hip_z", "hip_y", "knee", "ankle_y", "ankle_x")
+ARM = ("shoulder1", "shoulder2", "elbow")
+JOINTS = (
+    *("abdomen_z", "abdomen_y", "abdomen_x"),
+    *(f"{side}_{joint}" for limb in (LEG, ARM) for side in SIDES for joint in limb),
+)
+SENSORS = tuple(f"{side}_foot_{kind}" for side in SIDES for kind in ("force", "torque"))
+
+
+class HumanoidView(NamedTuple):
+    """What the reward terms read.
+
+    Attributes:
+      pose: where the step led to.
+      action: [21] clipped.
+      speed_m_per_s: [] towards the target.
+      strength: [21] gear of every joint's motor, as a share of the strongest one's.
+    """
+
+    pose: RunnerPose
+    action: Array
+    speed_m_per_s: Array
+    strength: Array
+
+
+def energy(view: HumanoidView) -> Array:
+    """Sum over the joints of what their motors do, in units of the strongest motor."""
+    velocities = JOINT_VELOCITY_SCALE * view.pose.joint_velocities
+    return jnp.sum(jnp.abs(view.action * velocities) * view.strength)
+
+
+def joint_limits(view: HumanoidView) -> Array:
+    """Sum over the joints of how deep they are in the last 2 % before a limit, 1 at the limit."""
+    depth = jnp.maximum(jnp.abs(view.pose.joints) - NEAR_LIMIT, 0.0) / (1.0 - NEAR_LIMIT)
+    return jnp.sum(depth * view.strength)
+
+
+TERMS = {
+    "progress": RewardTerm[HumanoidView](lambda v: v.speed_m_per_s, 1.0),
+    "alive": RewardTerm[HumanoidView](lambda v: jnp.ones(()), 2.0),
+    "upright": RewardTerm[HumanoidView](lambda v: runner.upright_bonus(v.pose), 0.1),
+    "heading": RewardTerm[HumanoidView](lambda v: runner.heading_bonus(v.pose), 0.5),
+    "action": RewardTerm[HumanoidView](lambda v: jnp.sum(v.action**2), -0.01),
+    "energy": RewardTerm[HumanoidView](energy, -0.05),
+    "joint_limits": RewardTerm[HumanoidView](joint_limits, -0.25),
+}
+DEATH = "death"
+
+
+def make(*, impl: str = "auto", max_envs: int | None = None) -> Env:
+    """Makes the task without its time limit; see `gmijax.sim.registry.make_env`."""
+    world = physics.load("humanoid", impl=impl, substeps=SUBSTEPS, max_envs=max_envs)
+    ids, strength = look_up(world.mj_model), motor_strength(world.mj_model)
+    spec = EnvSpec(
+        name="humanoid",
+        obs_size=OBS_SIZE,
+        action_size=ACTION_SIZE,
+        control_dt_s=world.control_dt_s,
+        episode_length=DEFAULT_EPISODE_LENGTH,
+        reward_terms=term_names(TERMS, DEATH),
+        max_abs_obs=MAX_ABS_OBS,
+        metrics=(runner.SPEED,),
+    )
+
+    def reset(model: PyTree, key: PRNGKey) -> EnvState:
+        del model  # nothing that a reset draws depends on it
+        key, draw = jax.random.split(key)
+        start = world.start(*runner.draw_start(ids, world.mj_model, draw))
+        # Forces read zero: to fill them in would take a whole physics step, and an automatic
+        # reset happens, under `where`, in every step of every world.
+        forces, sensors = jnp.zeros(ACTION_SIZE), jnp.zeros(len(ids.sensors))
+        obs = observe(runner.pose_of(ids, start), forces, sensors, jnp.zeros(ACTION_SIZE))
+        return episode.begin(spec, start, (), obs, key)
+
+    def step(model: PyTree, state: EnvState, action: Array) -> EnvState:
+        action = jnp.clip(action, -1.0, 1.0)
+        moved, (forces, sensors) = world.step(
+            model,
+            state.physics,
+            action,
+            lambda data: (data.qfrc_actuator[ids.joint_qvel], data.sensordata[ids.sensors]),
+        )
+        pose = runner.pose_of(ids, moved)
+        speed = runner.speed_to_target(state.physics, moved, world.control_dt_s)
+        view = HumanoidView(pose, action, speed, jnp.asarray(strength))
+        dead = pose.position[2] < DEATH_HEIGHT_M
+        reward = total_reward(TERMS, view, Replacement(DEATH, dead, DEATH_REWARD))
+        obs = observe(pose, forces, sensors, action)
+        metrics = {runner.SPEED: runner.mean_speed(pose, state.steps + 1, world.control_dt_s)}
+        return episode.advance(state, moved, (), obs, reward, dead, metrics)
+
+    return Env(
+        spec=spec,
+        model=world.model,
+        reset=reset,
+        step=step,
+        mj_model=world.mj_model,
+        qpos=lambda state: state.physics.qpos,
+        max_envs=world.max_envs,
+        overflow=world.overflow,
+    )
+
+
+def look_up(mj_model: mujoco.MjModel) -> RunnerIds:
+    """Finds the model's addresses by name."""
+    return runner.look_up(mj_model, JOINTS, SENSORS)
+
+
+def motor_strength(mj_model: mujoco.MjModel) -> npt.NDArray[np.float32]:
+    """Gear of every joint's motor [21], as a share of the strongest one's."""
+    gears = np.array([mj_model.actuator(joint).gear[0] for joint in JOINTS], np.float32)
+    return gears / gears.max()
+
+
+def observe(pose: RunnerPose, joint_forces: Array, foot_sensors: Array, action: Array) -> Array:
+    """The observation [108].
+
+    Args:
+      pose: of the torso and the joints.
+      joint_forces: [21] torques of the motors, N m.
+      foot_sensors: [12] force and torque at either foot, N and N m.
+      action: [21] the last action.
+    """
+    return jnp.concatenate(
+        [
+            pose.position[2:],
+            pose.velocity,
+            ANGULAR_VELOCITY_SCALE * pose.angular_velocity,
+            jnp.stack([pose.yaw, pose.roll, pose.angle_to_target, pose.upright, pose.heading]),
+            pose.joints,
+            JOINT_VELOCITY_SCALE * pose.joint_velocities,
+            FORCE_SCALE * joint_forces,
+            FORCE_SCALE * foot_sensors,
+            action,
+        ]
+    )

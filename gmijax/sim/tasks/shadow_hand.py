@@ -1,0 +1,302 @@
+"""Shadow hand: turn a cube in the palm until it lies as the goal does, again and again.
+
+Paper Table 5; figures of Isaac Gym's ShadowHand with full state (arXiv:2108.10470).
+Observation [211], each value clipped to +-5, quaternions (w, x, y, z): joint positions, -1 to 1
+between their limits 24; joint velocities 24; servos' torques on the joints 24; cube: position 3,
+quaternion 4, velocity 3, angular velocity 3; goal: position 3, quaternion 4; rotation from goal
+to cube 4; each fingertip's position, quaternion, velocity, angular velocity 5 x 13; each
+fingertip's force and torque 5 x 6; last action 20.
+Action [20]: position targets of the driven joints, -1 to 1 between their limits.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+import numpy.typing as npt
+from mujoco import mjx
+
+from gmijax.sim import episode, lookup, physics, rotations
+from gmijax.sim.interface import Env, EnvSpec, EnvState
+from gmijax.sim.rewards import RewardTerm, term_names, total_reward
+from gmijax.types import Array, PRNGKey, PyTree
+
+DEFAULT_EPISODE_LENGTH = 600
+SUBSTEPS = 2
+OBS_SIZE = 211
+ACTION_SIZE = 20
+OBS_LIMIT = 5.0
+VELOCITY_SCALE = 0.2
+JOINT_TORQUE_SCALE = 10.0
+TIP_SENSOR_SCALE = 10.0
+GOAL_M = (0.0, -0.39, 0.56)
+REACHED_RAD = 0.1
+FALLEN_M = 0.24
+CUBE_NOISE_M = 0.01
+JOINT_NOISE = 0.2
+
+JOINTS = (
+    *("WRJ1", "WRJ0"),
+    *(f"{finger}J{i}" for finger in ("FF", "MF", "RF") for i in (3, 2, 1, 0)),
+    *(f"{finger}J{i}" for finger in ("LF", "TH") for i in (4, 3, 2, 1, 0)),
+)
+# Numbers among the joints: J0 of a finger is not driven, it follows J1, the one before it.
+FOLLOWERS = np.array([JOINTS.index(finger + "J0") for finger in ("FF", "MF", "RF", "LF")])
+DRIVEN = np.setdiff1d(np.arange(len(JOINTS)), FOLLOWERS)
+TIPS = ("FF", "MF", "RF", "LF", "TH")
+NUM_TIPS = len(TIPS)
+SENSORS = (
+    *(f"{tip}_{kind}" for tip in TIPS for kind in ("velocity", "angular_velocity")),
+    *(f"{tip}_{kind}" for tip in TIPS for kind in ("force", "torque")),
+)
+
+
+class ShadowHandTask(NamedTuple):
+    """The task's memory.
+
+    Attributes:
+      goal: [4] the quaternion that the cube shall have.
+      successes: [] float32, goals reached in this episode.
+    """
+
+    goal: Array
+    successes: Array
+
+
+@dataclass(frozen=True)
+class ShadowHandIds:
+    """Addresses in the model and the joints' limits.
+
+    Attributes:
+      joint_qpos: [24] where the joints lie in `qpos`.
+      joint_qvel: [24] where they lie in `qvel`.
+      cube_qpos: where the cube's position and quaternion start in `qpos`.
+      cube_qvel: where its velocities start in `qvel`.
+      tip_bodies: [5] numbers of the fingers' last links.
+      tip_offsets: [5, 3] where on these links the tips are, metres.
+      sensors: [60] `SENSORS` in `sensordata`.
+      lower: [24] lower limits, radians.
+      upper: [24] upper limits, radians.
+    """
+
+    joint_qpos: lookup.Addresses
+    joint_qvel: lookup.Addresses
+    cube_qpos: int
+    cube_qvel: int
+    tip_bodies: lookup.Addresses
+    tip_offsets: npt.NDArray[np.float32]
+    sensors: lookup.Addresses
+    lower: npt.NDArray[np.float32]
+    upper: npt.NDArray[np.float32]
+
+
+class Touch(NamedTuple):
+    """What a physics step knows beside positions and velocities.
+
+    Attributes:
+      joint_torques: [24] of the servos on the joints, N m.
+      tips: [5, 13] per fingertip position (m), quaternion, velocity (m/s) and angular velocity
+        (rad/s), all in the world.
+      tip_forces: [5, 6] N, then N m, in the tip's frame: what the last link hands on.
+    """
+
+    joint_torques: Array
+    tips: Array
+    tip_forces: Array
+
+
+class CubePose(NamedTuple):
+    """The cube in the world: m, quaternion [4], m/s, rad/s, [3] each but for the quaternion."""
+
+    position: Array
+    quat: Array
+    velocity: Array
+    angular_velocity: Array
+
+
+class ShadowHandView(NamedTuple):
+    """What the reward terms read.
+
+    Attributes:
+      distance_m: [] from the cube to the goal's position.
+      error_rad: [] angle of the rotation from goal to cube, 0 to pi.
+      reached: [] bool, whether that is small enough.
+      action: [20].
+    """
+
+    distance_m: Array
+    error_rad: Array
+    reached: Array
+    action: Array
+
+
+TERMS = {
+    "distance": RewardTerm[ShadowHandView](lambda v: v.distance_m, -10.0),
+    "rotation": RewardTerm[ShadowHandView](lambda v: 1.0 / (v.error_rad + 0.1), 1.0),
+    "action": RewardTerm[ShadowHandView](lambda v: jnp.sum(v.action**2), -0.0002),
+    "success": RewardTerm[ShadowHandView](lambda v: v.reached.astype(jnp.float32), 250.0),
+}
+
+
+def make(*, impl: str = "auto", max_envs: int | None = None) -> Env:
+    """Makes the task without its time limit; see `gmijax.sim.registry.make_env`."""
+    world = physics.load("shadow_hand", impl=impl, substeps=SUBSTEPS, max_envs=max_envs)
+    ids = look_up(world.mj_model)
+    spec = EnvSpec(
+        name="shadow_hand",
+        obs_size=OBS_SIZE,
+        action_size=ACTION_SIZE,
+        control_dt_s=world.control_dt_s,
+        episode_length=DEFAULT_EPISODE_LENGTH,
+        reward_terms=term_names(TERMS),
+        metrics=("successes", "rotation_error_rad"),
+    )
+
+    def reset(model: PyTree, key: PRNGKey) -> EnvState:
+        del model  # nothing that a reset draws depends on it
+        key, start_key, goal_key = jax.random.split(key, 3)
+        qpos = draw_start(ids, world.mj_model, start_key)
+        start = world.start(qpos, jnp.zeros(world.mj_model.nv))
+        task = ShadowHandTask(draw_rotation(goal_key), jnp.zeros(()))
+        touch = touch_at_rest(ids, *world.poses(qpos))
+        obs = observe(ids, start, touch, task.goal, jnp.zeros(ACTION_SIZE))
+        return episode.begin(spec, start, task, obs, key)
+
+    def step(model: PyTree, state: EnvState, action: Array) -> EnvState:
+        action = jnp.clip(action, -1.0, 1.0)
+        targets = targets_of(ids, action)
+        moved, touch = world.step(model, state.physics, targets, lambda data: touch_of(ids, data))
+        view = view_of(ids, moved, state.task.goal, action)
+        reward = total_reward(TERMS, view)
+        task, key = next_goal(state.task, view.reached, state.key)
+        metrics = {"successes": task.successes, "rotation_error_rad": view.error_rad}
+        obs = observe(ids, moved, touch, task.goal, action)
+        fallen = view.distance_m >= FALLEN_M
+        after = episode.advance(state, moved, task, obs, reward, fallen, metrics)
+        return after._replace(key=key)
+
+    return Env(
+        spec=spec,
+        model=world.model,
+        reset=reset,
+        step=step,
+        mj_model=world.mj_model,
+        qpos=lambda state: state.physics.qpos,
+        max_envs=world.max_envs,
+        overflow=world.overflow,
+    )
+
+
+def look_up(mj_model: mujoco.MjModel) -> ShadowHandIds:
+    """Finds the model's addresses by name."""
+    sites = [mj_model.site(f"{tip}_tip") for tip in TIPS]
+    return ShadowHandIds(
+        *lookup.joint_addresses(mj_model, JOINTS),
+        *lookup.free_joint_addresses(mj_model, "cube"),
+        np.array([site.bodyid[0] for site in sites]),
+        np.array([site.pos for site in sites], np.float32),
+        lookup.sensor_addresses(mj_model, SENSORS),
+        *lookup.joint_ranges(mj_model, JOINTS),
+    )
+
+
+def draw_rotation(key: PRNGKey) -> Array:
+    """A random quaternion [4]: a turn about y, then one about x, each uniform over a circle."""
+    about_x, about_y = jax.random.uniform(key, (2,), minval=-jnp.pi, maxval=jnp.pi)
+    x, y = jnp.array([1.0, 0.0, 0.0]), jnp.array([0.0, 1.0, 0.0])
+    return rotations.product(rotations.turn(x, about_x), rotations.turn(y, about_y))
+
+
+def draw_start(ids: ShadowHandIds, mj_model: mujoco.MjModel, key: PRNGKey) -> Array:
+    """Random `qpos` [31]: a hand nearly flat, the cube above it in any rotation."""
+    joint_key, position_key, rotation_key = jax.random.split(key, 3)
+    lower, upper = JOINT_NOISE * ids.lower, JOINT_NOISE * ids.upper
+    joints = jax.random.uniform(joint_key, lower.shape, minval=lower, maxval=upper)
+    # Drawn apart from each other, two coupled joints would snap together in the first step.
+    joints = joints.at[FOLLOWERS].set(joints[FOLLOWERS - 1])
+    qpos = jnp.array(mj_model.qpos0, jnp.float32).at[ids.joint_qpos].set(joints)
+    noise = jax.random.uniform(position_key, (3,), minval=-CUBE_NOISE_M, maxval=CUBE_NOISE_M)
+    position = qpos[ids.cube_qpos : ids.cube_qpos + 3] + noise
+    cube = jnp.concatenate([position, draw_rotation(rotation_key)])
+    return jax.lax.dynamic_update_slice(qpos, cube, (ids.cube_qpos,))
+
+
+def next_goal(task: ShadowHandTask, reached: Array, key: PRNGKey) -> tuple[ShadowHandTask, Array]:
+    """Another goal where the last one is reached; only then the world's key moves on."""
+    moved_on, draw = jax.random.split(key)
+    goal = jnp.where(reached, draw_rotation(draw), task.goal)
+    return ShadowHandTask(goal, task.successes + reached), jnp.where(reached, moved_on, key)
+
+
+def targets_of(ids: ShadowHandIds, action: Array) -> Array:
+    """Position targets [20], radians: the driven joints' lower limits at -1, upper at 1."""
+    lower, upper = ids.lower[DRIVEN], ids.upper[DRIVEN]
+    return 0.5 * (action + 1.0) * (upper - lower) + lower
+
+
+def tips_of(ids: ShadowHandIds, xpos: Array, xquat: Array, velocities: Array) -> Array:
+    """Fingertips [5, 13] from all bodies' poses [nbody, 3], [nbody, 4] and velocities [5, 6]."""
+    quats = xquat[ids.tip_bodies]
+    offsets = jax.vmap(rotations.rotate)(quats, jnp.array(ids.tip_offsets))
+    return jnp.concatenate([xpos[ids.tip_bodies] + offsets, quats, velocities], axis=1)
+
+
+def touch_at_rest(ids: ShadowHandIds, xpos: Array, xquat: Array) -> Touch:
+    """A start: nothing moves, and the servos' targets are where the joints are.
+
+    The tips' sensors read zero: to fill them in would take a whole physics step, and an
+    automatic reset happens, under `where`, in every step of every world.
+    """
+    zeros = jnp.zeros((NUM_TIPS, 6))
+    return Touch(jnp.zeros(len(JOINTS)), tips_of(ids, xpos, xquat, zeros), zeros)
+
+
+def touch_of(ids: ShadowHandIds, data: mjx.Data) -> Touch:
+    """What a physics step left in its data."""
+    velocities, forces = data.sensordata[ids.sensors].reshape(2, NUM_TIPS, 6)
+    torques = data.qfrc_actuator[ids.joint_qvel]
+    return Touch(torques, tips_of(ids, data.xpos, data.xquat, velocities), forces)
+
+
+def cube_of(ids: ShadowHandIds, state: physics.PhysicsState) -> CubePose:
+    """The cube's pose and velocities, all seen from the world."""
+    pose = state.qpos[ids.cube_qpos : ids.cube_qpos + 7]
+    velocity = state.qvel[ids.cube_qvel : ids.cube_qvel + 6]
+    # MuJoCo has the angular velocity of a free body in the body's own frame.
+    return CubePose(pose[:3], pose[3:], velocity[:3], rotations.rotate(pose[3:], velocity[3:]))
+
+
+def view_of(
+    ids: ShadowHandIds, state: physics.PhysicsState, goal: Array, action: Array
+) -> ShadowHandView:
+    """What the reward of a step reads, with the goal [4] that the step was to reach."""
+    cube = cube_of(ids, state)
+    error = rotations.angle(rotations.product(cube.quat, rotations.conjugate(goal)))
+    distance = jnp.linalg.norm(cube.position - jnp.array(GOAL_M))
+    return ShadowHandView(distance, error, error <= REACHED_RAD, action)
+
+
+def observe(
+    ids: ShadowHandIds, state: physics.PhysicsState, touch: Touch, goal: Array, action: Array
+) -> Array:
+    """The observation [211] from the state, the goal [4] and the last action [20]."""
+    joints, cube = state.qpos[ids.joint_qpos], cube_of(ids, state)
+    to_cube = rotations.product(cube.quat, rotations.conjugate(goal))
+    values = jnp.concatenate(
+        [
+            (2.0 * joints - ids.upper - ids.lower) / (ids.upper - ids.lower),
+            VELOCITY_SCALE * state.qvel[ids.joint_qvel],
+            JOINT_TORQUE_SCALE * touch.joint_torques,
+            *(cube.position, cube.quat, cube.velocity, VELOCITY_SCALE * cube.angular_velocity),
+            *(jnp.array(GOAL_M), goal, to_cube),
+            touch.tips.ravel(),
+            TIP_SENSOR_SCALE * touch.tip_forces.ravel(),
+            action,
+        ]
+    )
+    return jnp.clip(values, -OBS_LIMIT, OBS_LIMIT)

@@ -1,0 +1,67 @@
+"""A task with its compiled programs, which all contract tests of one pytest process share."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import cached_property
+from typing import Any
+
+import jax
+import mujoco
+from compile_options import CPU_OPTIONS
+
+from gmijax.sim import physics
+from gmijax.sim.registry import make_env
+from gmijax.sim.wrappers import BatchState, StepOutput, env_keys, training_env
+
+NUM_ENVS = 8
+EPISODE_LENGTH = 25
+MOST_WORLDS = 256
+"""Worlds that `converged_step` may be called with."""
+
+
+class CompiledTask:
+    """One task with one MJX implementation; `traces` grows by one whenever step is traced."""
+
+    def __init__(self, name: str, impl: str) -> None:
+        self.impl = impl
+        self.env = make_env(name, impl=impl, episode_length=EPISODE_LENGTH, max_envs=NUM_ENVS)
+        self.batch = training_env(self.env)
+        self.traces: list[int] = []
+        self.init: Callable[[Any, jax.Array], BatchState] = jax.jit(self.batch.init)
+        self.step: Callable[[Any, BatchState, jax.Array], tuple[BatchState, StepOutput]] = jax.jit(
+            self._counted, compiler_options=CPU_OPTIONS
+        )
+
+    def _counted(self, model: Any, state: BatchState, actions: jax.Array) -> Any:
+        self.traces.append(1)
+        return self.batch.step(model, state, actions)
+
+    def start(self, seed: int = 0) -> BatchState:
+        return self.init(self.env.model, env_keys(jax.random.key(seed), 0, NUM_ENVS))
+
+    def actions(self, seed: int) -> jax.Array:
+        shape = (NUM_ENVS, self.env.spec.action_size)
+        return jax.random.uniform(jax.random.key(seed), shape, minval=-1.0, maxval=1.0)
+
+    @cached_property
+    def converged(self) -> physics.Physics:
+        """The physics with solvers that run to the end.
+
+        Cut off early, as in training, they stop at different places on the way to one answer.
+        """
+        mj_model = physics.load(self.env.spec.name, impl="jax", substeps=1).mj_model
+        mj_model.opt.iterations = mj_model.opt.ls_iterations = 50
+        return physics.from_mj_model(mj_model, impl=self.impl, substeps=1, max_envs=MOST_WORLDS)
+
+    @cached_property
+    def converged_step(
+        self,
+    ) -> Callable[..., tuple[physics.PhysicsState, jax.Array]]:
+        """`(model, state [T], ctrl [T, nu]) -> (state, sensordata)` of `converged`."""
+        step = jax.vmap(self.converged.step, in_axes=(None, 0, 0))
+        return jax.jit(step, compiler_options=CPU_OPTIONS)
+
+    @property
+    def mj_model(self) -> mujoco.MjModel:
+        return self.env.mj_model

@@ -1,0 +1,58 @@
+"""Every task with MJX-Warp on a real GPU. Run with `pytest -m gpu tests/gpu/test_warp.py`."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+from training_jobs import train
+
+from gmijax.sim.impl import ON_GPU
+
+pytest.importorskip("warp", reason="warp-lang is not installed")
+
+# The first run of a task compiles its kernels, for minutes.
+pytestmark = [pytest.mark.gpu, pytest.mark.timeout(1200)]
+
+SMALL = (
+    *("physics.impl=warp", "num_envs=512", "algo.unroll_length=16", "algo.num_minibatches=4"),
+    *("run.measure_throughput=false", "run.checkpoint_every=0", "run.dir=run"),
+)
+ITERATION = 512 * 16
+
+
+@pytest.mark.parametrize("randomize", ["off", "on"])
+@pytest.mark.parametrize("task", sorted(t for t in ON_GPU if not ON_GPU[t].why_no_warp))
+def test_a_task_trains_and_no_buffer_is_too_small(
+    task: str, randomize: str, tmp_path: Path
+) -> None:
+    steps = 20 * ITERATION
+    done = train(
+        *SMALL,
+        f"env={task}",
+        f"env.randomize={randomize}",
+        f"num_timesteps={steps}",
+        cwd=tmp_path,
+        timeout_s=1100.0,
+    )
+    assert done.returncode == 0, done.stderr
+    assert "physics.impl warp: asked for" in done.stdout
+    summary = json.loads((tmp_path / "run" / "summary.json").read_text())
+    assert summary["impl"] == "warp"
+    assert summary["env_steps"] == steps
+    assert summary["overflow_steps"] == {"contact": 0.0, "constraint": 0.0}
+    lines = (tmp_path / "run" / "metrics.jsonl").read_text().splitlines()
+    assert sum(json.loads(line)["diverged_steps"] for line in lines) < 1e-3 * steps
+
+
+def test_two_gmis_share_a_gpu(tmp_path: Path) -> None:
+    done = train(
+        *SMALL,
+        *("env=ant", "plan.gmis_per_gpu=2", "plan.backend=mps", f"num_timesteps={8 * ITERATION}"),
+        cwd=tmp_path,
+        timeout_s=1100.0,
+    )
+    assert done.returncode == 0, done.stderr
+    lines = (tmp_path / "run" / "metrics.jsonl").read_text().splitlines()
+    assert all(json.loads(line)["physics/contact_overflow_steps"] == 0.0 for line in lines)

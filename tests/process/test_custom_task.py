@@ -1,0 +1,109 @@
+"""Tasks of the user's own and of Brax, trained and played as users do it."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from training_jobs import child_environment, train
+
+pytestmark = pytest.mark.timeout(600)
+
+TASK = """
+import jax
+import jax.numpy as jnp
+from gmijax.sim import episode
+from gmijax.sim.interface import Env, EnvSpec
+
+SPEC = EnvSpec("point", 1, 1, 0.1, 5, ("near", "effort"))
+
+def make(*, impl, max_envs):
+    def reset(model, key):
+        key, draw = jax.random.split(key)
+        start = jax.random.uniform(draw, (1,))
+        return episode.begin(SPEC, start, (), start, key)
+
+    def step(model, state, action):
+        moved = state.physics + 0.1 * action
+        terms = {"near": -jnp.abs(moved[0]), "effort": -0.1 * action[0] ** 2}
+        reward = terms["near"] + terms["effort"], terms
+        return episode.advance(state, moved, (), moved, reward, moved[0] > 3.0)
+
+    return Env(SPEC, (), reset, step, None, lambda state: state.physics)
+"""
+SMALL = (
+    *("num_envs=16", "algo.unroll_length=4", "run.measure_throughput=false", "run.grace_s=3"),
+    *("algo.policy_hidden_layer_sizes=[8]", "algo.value_hidden_layer_sizes=[8]"),
+)
+
+
+def play(*overrides: str, cwd: Path) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(
+        [sys.executable, "-m", "gmijax.play", *overrides],
+        cwd=cwd,
+        env=child_environment(),
+        capture_output=True,
+        text=True,
+        timeout=240,
+        check=False,
+    )
+
+
+def test_a_task_of_ones_own_trains_in_two_gmis_resumes_and_plays(tmp_path: Path):
+    file = tmp_path / "point.py"
+    file.write_text(TASK)
+    task = ("env=point.py:make", *SMALL, "num_timesteps=256", "plan.gpus=2")
+    done = train(*task, cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    (run,) = (tmp_path / "runs").iterdir()
+    assert run.name.startswith("point-ppo-")
+    config = json.loads((run / "config.json").read_text())
+    assert config["env"]["name"] == f"{file}:make"
+    assert len(config["env"]["source_sha256"]) == 64
+    line = json.loads((run / "metrics.jsonl").read_text().splitlines()[-1])
+    assert line["episode_length"] == 5.0
+    assert line["return"] == pytest.approx(line["reward/near"] + line["reward/effort"], rel=1e-4)
+
+    file.write_text(TASK.replace('{"near": -', '{"near": jnp.log(-1.0 - 0 * moved[0]) - '))
+    done = train("run.resume=last", "num_timesteps=512", "run.name=second", cwd=tmp_path)
+    assert f"custom task: {file}:make has changed since the run was started" in done.stdout
+    # The change makes one term not a number: the error names task, step and term.
+    assert done.returncode == 1, done.stderr
+    assert "NonFiniteError: point.py:make, up to env step 384: 128 steps" in done.stderr
+    assert "in reward/near" in done.stderr
+
+    file.write_text(TASK)
+    done = play(f"run.dir={run}", "num_envs=2", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert "point has no model that could be filmed" in done.stdout
+    done = play(f"run.dir={run}", "video=gif", cwd=tmp_path)
+    assert done.returncode == 1
+    assert "point has no model that could be filmed; the returns were evaluated" in done.stderr
+
+
+def test_an_environment_of_brax_trains(tmp_path: Path):
+    done = train("env=brax", "env.name=fast", *SMALL, "num_timesteps=64", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    (run,) = (tmp_path / "runs").iterdir()
+    assert run.name.startswith("brax-fast-ppo-")
+    assert json.loads((run / "summary.json").read_text())["env"] == "brax/fast"
+
+
+@pytest.mark.parametrize(
+    ("overrides", "said"),
+    [
+        (("env=brax", "env.name=antt"), "env.name=antt: Brax has no such env"),
+        (("env=point.py:mak",), "no function mak there: did you mean make?"),
+    ],
+)
+def test_what_only_a_gmi_can_know_is_still_bad_input(
+    overrides: tuple[str, ...], said: str, tmp_path: Path
+):
+    (tmp_path / "point.py").write_text(TASK)
+    done = train(*overrides, cwd=tmp_path)
+    assert done.returncode == 2
+    assert said in done.stderr
+    assert len(done.stderr.strip().splitlines()) == 1

@@ -1,0 +1,236 @@
+"""Environments with the interface of Brax as ours, and ours as Brax's."""
+
+from __future__ import annotations
+
+import importlib.util
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from brax import envs
+from brax.envs.wrappers import training
+from compile_options import CPU_OPTIONS
+
+from gmijax.errors import ConfigError
+from gmijax.sim.adapters.theirs import adapt, observation
+from gmijax.sim.registry import make_env
+from gmijax.sim.wrappers import env_keys, time_limit, training_env
+
+SWING_UP = f"{Path(__file__).parents[2] / 'examples' / 'custom_task.py'}:make"
+NUM_ENVS = 3
+
+
+class Counter:
+    """Theirs, in miniature: writes into its dicts and returns plain numbers, as theirs do.
+
+    It ends after `limit` steps, by truncation if `by_time`.
+    """
+
+    action_size = 2
+    dt = 0.5
+
+    def __init__(self, limit: int = 4, by_time: bool = False) -> None:
+        self.limit, self.by_time = limit, by_time
+
+    def reset(self, rng: jax.Array) -> Any:
+        rng, draw = jax.random.split(rng)
+        assert rng.dtype == jnp.uint32
+        info = {"rng": rng, "count": jnp.zeros((), jnp.int32), "truncation": jnp.zeros(())}
+        metrics = {"double": jnp.zeros(()), "pair": jnp.zeros(2)}
+        obs = {"state": jax.random.uniform(draw, (3,)), "privileged_state": jnp.ones(5)}
+        return envs.State(None, obs, jnp.zeros(()), jnp.zeros(()), metrics, info)
+
+    def step(self, state: Any, action: jax.Array) -> Any:
+        state.info["count"] += 1
+        ended = state.info["count"] >= self.limit
+        state.info["truncation"] = ended * 1 if self.by_time else 0
+        state.metrics.update(double=2.0, pair=jnp.ones(2))
+        return state.replace(reward=jnp.sum(action), done=ended.astype(float))
+
+
+def unrolled(theirs: Counter, steps: int, action: float) -> list[Any]:
+    env = training_env(time_limit(adapt(theirs, name="theirs", episode_length=9), 9))
+    state = jax.jit(env.init)(env.model, env_keys(jax.random.key(0), 0, NUM_ENVS))
+    step = jax.jit(env.step)
+    outputs = []
+    for _ in range(steps):
+        state, out = step(env.model, state, jnp.full((NUM_ENVS, 2), action))
+        outputs.append((state, out))
+    return outputs
+
+
+def test_the_policy_sees_the_entry_state_or_all_entries_by_name():
+    some, more = jnp.arange(2), jnp.array(5.0)
+    assert observation({"b": some, "state": more, "a": some}).tolist() == [5.0]
+    assert observation({"b": more, "a": some}).tolist() == [0.0, 1.0, 5.0]
+    assert observation(some).dtype == jnp.float32
+
+
+def test_pictures_are_refused():
+    class Seeing(Counter):
+        def reset(self, rng: jax.Array) -> Any:
+            return super().reset(rng).replace(obs={"pixels": jnp.zeros((4, 4, 3))})
+
+    with pytest.raises(ConfigError, match=r"\['pixels'\] has shape \(4, 4, 3\); allowed are vec"):
+        adapt(Seeing(), name="theirs", episode_length=9)
+
+
+def test_rewards_actions_and_metrics_of_an_episode():
+    outputs = unrolled(Counter(), 4, action=3.0)
+    for _, out in outputs:
+        assert out.reward.tolist() == [2.0] * NUM_ENVS, "actions are clipped to 1"
+    assert not outputs[2][1].terminated.any()
+    last = outputs[3][1]
+    assert last.terminated.all()
+    assert int(last.finished.count) == NUM_ENVS
+    assert float(last.finished.return_sum) == NUM_ENVS * 8.0
+    # As Brax's own wrapper sums them; a pair is no number that could be logged.
+    assert {k: float(v) for k, v in last.finished.metric_sums.items()} == {"double": 24.0}
+
+
+def test_all_of_their_state_starts_over_with_a_new_key():
+    outputs = unrolled(Counter(), 5, action=0.0)
+    before, after = (outputs[i][0].env.physics for i in (2, 3))
+    assert before.info["count"].tolist() == [3] * NUM_ENVS
+    assert after.info["count"].tolist() == [0] * NUM_ENVS
+    assert not np.isin(after.info["rng"], before.info["rng"]).any()
+    assert outputs[4][0].env.physics.info["count"].tolist() == [1] * NUM_ENVS
+
+
+@pytest.mark.parametrize(("by_time", "ended"), [(True, "truncated"), (False, "terminated")])
+def test_their_own_time_limit_truncates(by_time: bool, ended: str):
+    out = unrolled(Counter(by_time=by_time), 4, action=0.0)[-1][1]
+    assert [name for name in ("truncated", "terminated") if getattr(out, name).all()] == [ended]
+
+
+def test_a_step_leaves_the_state_that_it_is_given_alone():
+    env = adapt(Counter(), name="theirs", episode_length=9)
+    state = env.reset(env.model, jax.random.key(0))
+    env.step(env.model, state, jnp.zeros(2))
+    assert int(state.physics.info["count"]) == 0
+
+
+def test_a_state_that_changes_is_told_by_the_leaf():
+    class Growing(Counter):
+        def step(self, state: Any, action: jax.Array) -> Any:
+            return state.replace(info={**state.info, "rng": jnp.zeros(3, jnp.uint32)})
+
+    with pytest.raises(ConfigError, match=r"physics\.info\.rng is uint32\[3\], not uint32\[2\]$"):
+        adapt(Growing(), name="theirs", episode_length=9)
+
+
+def test_an_environment_of_brax_without_a_model_still_trains():
+    env = make_env("fast", suite="brax", episode_length=5)
+    assert env.mj_model is None
+    assert (env.spec.name, env.spec.obs_size, env.spec.episode_length) == ("brax/fast", 2, 5)
+    batch = training_env(env)
+    state = batch.init(batch.model, env_keys(jax.random.key(0), 0, NUM_ENVS))
+    for _ in range(5):
+        state, out = jax.jit(batch.step)(batch.model, state, jnp.ones((NUM_ENVS, 1)))
+    assert out.truncated.all()
+    assert float(out.reward[0]) > 0.0
+
+
+def test_an_environment_of_brax_brings_its_model_and_length():
+    env = make_env("inverted_pendulum", suite="brax")
+    assert env.mj_model.nq == 2
+    assert env.spec[1:5] == (4, 1, pytest.approx(0.04), 1000)
+
+
+@pytest.mark.parametrize(
+    ("name", "options", "message"),
+    [
+        ("antt", {"suite": "brax"}, r"^env\.name=antt: Brax has .*did you mean ant\?$"),
+        (
+            "ant",
+            {"suite": "brax", "impl": "warp"},
+            r"^physics\.impl=warp: .*allowed are auto, jax",
+        ),
+        ("ant", {"suite": "gym"}, "^suite=gym: allowed are gmijax, brax, playground, custom$"),
+        ("ant", {"api": "gym"}, "^api=gym: allowed are gmijax, brax$"),
+        ("ant", {"api": "brax", "episode_length": 3}, "give it to Brax's EpisodeWrapper"),
+    ],
+)
+def test_what_cannot_be_made_is_told_in_one_line(name: str, options: Any, message: str):
+    with pytest.raises(ConfigError, match=message):
+        make_env(name, **options)
+
+
+@pytest.mark.skipif(
+    importlib.util.find_spec("mujoco_playground") is not None, reason="Playground is installed"
+)
+def test_a_package_that_is_missing_is_told_with_its_command():
+    message = r"needs the package mujoco_playground \(pip install 'gmijax\[playground\]'\)$"
+    with pytest.raises(ConfigError, match=message):
+        make_env("CartpoleBalance", suite="playground")
+
+
+def test_playground_as_ours():
+    pytest.importorskip("mujoco_playground")
+    env = make_env("CartpoleBalance", suite="playground")
+    assert env.spec[:5] == ("playground/CartpoleBalance", 5, 1, 0.01, 1000)
+    assert "reward/upright" in env.spec.metrics
+    assert env.mj_model.nq == 2
+    with pytest.raises(ConfigError, match="did you mean CartpoleBalance"):
+        make_env("CartpoleBalanc", suite="playground")
+
+
+class Theirs(NamedTuple):
+    """Our task under Brax's wrappers, as Brax's training makes it."""
+
+    env: Any
+    states: list[Any]
+
+
+@pytest.fixture(scope="module")
+def swing_up() -> Theirs:
+    env = make_env(SWING_UP, api="brax")
+    wrapped = training.wrap(env, episode_length=5)
+    keys = jax.random.split(jax.random.PRNGKey(0), NUM_ENVS)
+    states = [jax.jit(wrapped.reset)(keys)]
+    step = jax.jit(wrapped.step, compiler_options=CPU_OPTIONS)
+    for _ in range(6):
+        states.append(step(states[-1], jnp.full((NUM_ENVS, 1), 0.3)))
+    return Theirs(env, states)
+
+
+def test_ours_is_an_environment_of_brax(swing_up: Theirs):
+    env = swing_up.env
+    assert envs.Env in type(env).mro()
+    assert (env.observation_size, env.action_size, env.backend) == (5, 1, "mjx")
+    assert (env.episode_length, env.dt, env.mj_model.nq) == (500, pytest.approx(0.02), 2)
+    for state in swing_up.states:
+        assert state.obs.shape == (NUM_ENVS, 5)
+        assert (state.reward.shape, state.done.shape) == ((NUM_ENVS,), (NUM_ENVS,))
+
+
+def test_terms_of_the_reward_are_brax_metrics_and_sum_to_it(swing_up: Theirs):
+    for state in swing_up.states[1:]:
+        assert set(state.metrics) == {"reward/upright", "reward/centre", "reward/effort"}
+        np.testing.assert_allclose(sum(state.metrics.values()), state.reward, atol=1e-6)
+    summed = swing_up.states[5].info["episode_metrics"]
+    total = sum(np.asarray(summed[name]) for name in swing_up.states[5].metrics)
+    np.testing.assert_allclose(total, summed["sum_reward"], rtol=1e-5)
+
+
+def test_brax_truncates_ours_at_its_own_limit_and_starts_over(swing_up: Theirs):
+    ends = [np.asarray(state.done).tolist() for state in swing_up.states]
+    assert ends == [[0.0] * NUM_ENVS] * 5 + [[1.0] * NUM_ENVS, [0.0] * NUM_ENVS]
+    assert swing_up.states[5].info["truncation"].tolist() == [1.0] * NUM_ENVS
+    np.testing.assert_array_equal(swing_up.states[5].obs, swing_up.states[0].obs)
+    assert swing_up.states[6].pipeline_state.steps.tolist() == [1] * NUM_ENVS
+
+
+def test_an_end_by_the_task_is_no_truncation():
+    env = make_env(SWING_UP, api="brax")
+    wrapped = training.wrap(env, episode_length=5)
+    state: Any = wrapped.reset(jax.random.split(jax.random.PRNGKey(0), NUM_ENVS))
+    ours = state.pipeline_state
+    thrown = ours.physics._replace(qvel=ours.physics.qvel.at[0, 0].set(500.0))
+    state = state.replace(pipeline_state=ours._replace(physics=thrown))
+    state = jax.jit(wrapped.step, compiler_options=CPU_OPTIONS)(state, jnp.zeros((NUM_ENVS, 1)))
+    assert state.done.tolist() == [1.0, 0.0, 0.0]
+    assert state.info["truncation"].tolist() == [0.0] * NUM_ENVS
