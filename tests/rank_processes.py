@@ -50,10 +50,10 @@ class Ranks:
         layout = [list(range(world_size))]
         self._options = {**defaults, "body": body, "layout": layout, **options}
         self._held = ExitStack()
-
-    def __enter__(self) -> Ranks:
         if needs_ring(self._options["strategy"], layout_of(self._options)):
             self._options["address"] = self._held.enter_context(reserved_address())
+
+    def __enter__(self) -> Ranks:
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -86,9 +86,15 @@ class Ranks:
     def wait_for(self, mark: str) -> None:
         """Waits until every rank has left the file `mark`."""
         deadline = time.monotonic() + WAIT_S
-        while any(not (self.folder / f"{mark}_{rank}").exists() for rank in self.processes):
-            assert time.monotonic() < deadline, f"no {mark}"
-            time.sleep(0.01)
+        for rank, process in self.processes.items():
+            while not (self.folder / f"{mark}_{rank}").exists():
+                said = self.folder / f"stderr_{rank}"
+                assert time.monotonic() < deadline, f"no {mark}: {said.read_text()}"
+                # It may leave the mark and end, in this order, since we looked.
+                assert process.poll() is None or (self.folder / f"{mark}_{rank}").exists(), (
+                    f"no {mark}: {said.read_text()}"
+                )
+                time.sleep(0.01)
 
     def named_memory(self) -> set[Path]:
         """Files below /dev/shm that the running ranks have mapped."""
@@ -135,7 +141,8 @@ def check_means(reducer: Reducer, options: Options) -> Options:
         np.testing.assert_allclose(mean, expected, rtol=1e-5, atol=1e-6 * 10.0**call)
         assert not mean.flags.writeable
         finite = np.isfinite(expected)
-        worst = max(worst, float(np.abs(mean - expected)[finite].max(initial=0.0)) / 10.0**call)
+        errors = np.abs(mean[finite] - expected[finite])
+        worst = max(worst, float(errors.max(initial=0.0)) / 10.0**call)
         heads = [buffer[:5] for buffer in buffers]
         np.testing.assert_array_equal(reducer.all_gather(heads[reducer.rank]), heads)
     return {"digest": digest.hexdigest(), "worst": worst}

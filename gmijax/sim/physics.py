@@ -7,6 +7,7 @@ vectors, checkpoints stay small, and XLA sees which intermediate results nobody 
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable
 from dataclasses import dataclass
 from importlib import resources
@@ -125,9 +126,12 @@ def from_mj_model(
             "allowed are actuators without memory (motor, position, velocity)"
         )
     chosen, _ = choose_impl(impl, jax.default_backend())
-    model = mjx.put_model(mj_model, impl=chosen)
+    # By itself MJX takes the first device of all processes, which may be another GMI's.
+    device = jax.local_devices()[0]
+    model = mjx.put_model(mj_model, device=device, impl=chosen)
     if chosen == "jax":
-        return Physics(chosen, mj_model, model, lambda: mjx.make_data(model), substeps)
+        blank = functools.partial(mjx.make_data, model, device=device, impl=chosen)
+        return Physics(chosen, mj_model, model, blank, substeps)
     # Warp prints a line per world and step when the solver meets its iteration limit. Here it is
     # meant to meet it, and printing that costs more time than simulating.
     model = model.tree_replace({"opt._impl.warn_overflow": 0})
@@ -138,9 +142,11 @@ def from_mj_model(
 def _warp_blank(mj_model: mujoco.MjModel, max_envs: int) -> Callable[[], mjx.Data]:
     # MJX-JAX keeps a row for every contact and constraint that can ever be, so its sizes are
     # the bounds of Warp's buffers: contacts are shared by all worlds, rows are per world.
-    bounds = mjx.make_data(mj_model, impl="jax")._impl
+    device = jax.local_devices()[0]
+    bounds = mjx.make_data(mj_model, device=device, impl="jax")._impl
     template = mjx.make_data(
         mj_model,
+        device=device,
         impl="warp",
         naconmax=max(bounds.ncon, 1) * max_envs,
         njmax=max(bounds.nefc, 1),
