@@ -7,6 +7,7 @@ own device alone. `docs/reduction.md` says why the world is left again as soon a
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -66,7 +67,7 @@ class World:
                 num_processes=layout.num_gmis,
                 process_id=world._process_ids[rank],
                 local_device_ids=[0],
-                initialization_timeout=int(timeout_s),
+                initialization_timeout=math.ceil(timeout_s),
                 coordinator_bind_address=address,
                 shutdown_timeout_seconds=_LEAVE_TIMEOUT_S,
             )

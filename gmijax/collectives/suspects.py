@@ -37,6 +37,11 @@ class Suspects:
         self._start_s = self._next_look_s = time.monotonic()
         self._heard: dict[int, tuple[int, float]] = {}
 
+    @property
+    def is_late(self) -> bool:
+        """Whether the time is up."""
+        return time.monotonic() - self._start_s >= self._timeout_s
+
     def look(self, missing: Callable[[], list[int]], *, now: bool = False) -> None:
         """Looks at those who are missing, five times a second at most unless `now`.
 
@@ -48,8 +53,7 @@ class Suspects:
           PeerLost: the process of one of them is gone.
           CollectiveTimeout: the time is up.
         """
-        now_s = time.monotonic()
-        late = now_s - self._start_s >= self._timeout_s
+        now_s, late = time.monotonic(), self.is_late
         if not (now or late or now_s >= self._next_look_s):
             return
         self._next_look_s = now_s + LIVENESS_PERIOD_S
@@ -61,9 +65,12 @@ class Suspects:
 
     def give_up(self, missing: list[int]) -> NoReturn:
         """Raises CollectiveTimeout for those of `missing` who do not wait themselves."""
+        self._raise_timeout(self.silent(missing) or missing, time.monotonic() - self._start_s)
+
+    def silent(self, missing: list[int]) -> list[int]:
+        """Those of `missing` who do not wait themselves, as far as this rank has heard."""
         now_s = time.monotonic()
-        stuck = [peer for peer in missing if self._silence_s(peer, now_s) > SILENCE_S]
-        self._raise_timeout(stuck or missing, now_s - self._start_s)
+        return [peer for peer in missing if self._silence_s(peer, now_s) > SILENCE_S]
 
     def _check_alive(self, missing: Callable[[], list[int]]) -> None:
         gone = [peer for peer in missing() if self._is_gone(peer)]

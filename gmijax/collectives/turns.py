@@ -113,6 +113,8 @@ class Turns:
         suspects = self._suspects()
         while not done.wait(LIVENESS_PERIOD_S):
             suspects.look(self._behind, now=True)
+            if suspects.is_late:  # All have come out of it but this rank.
+                suspects.give_up(self._peers)
 
     def explain_failure(self) -> None:
         """Raises for the peer whose end made a transfer of this rank fail, if there is one.
@@ -125,6 +127,8 @@ class Turns:
         while time.monotonic() < deadline_s:
             suspects.look(self._behind, now=True)
             time.sleep(0.02)
+        if silent := suspects.silent(self._behind()):
+            suspects.give_up(silent)
 
     def where(self) -> str:
         """Rank, operation and step, for messages."""
