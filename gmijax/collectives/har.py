@@ -6,7 +6,7 @@ import jax
 import numpy as np
 
 from gmijax.collectives.buffers import chunk_bounds
-from gmijax.collectives.helper import Helper
+from gmijax.collectives.courier import Courier
 from gmijax.collectives.host import HostExchange
 from gmijax.collectives.interface import FloatBuffer
 from gmijax.collectives.memory import ExchangeBlock
@@ -46,14 +46,14 @@ class HarReducer:
         self._leader = self._leaders[layout.gpu_of(self.rank)]
         self._part = _chunk(num_floats, self._neighbours.index(self.rank), len(self._neighbours))
         self._ring: Ring | None = None
-        self._helper: Helper | None = None
+        self._courier: Courier | None = None
         if world is not None:
-            self._helper = Helper("ring")
+            self._courier = Courier("ring")
             if self.rank == self._leader:
                 self._ring = world.ring(self._leaders, num_floats)
             host.rendezvous()
             use = self._ring_mean if self._ring is not None else None
-            open_rings(world, self._helper, use, num_floats)
+            open_rings(world, self._courier, use, num_floats)
 
     def mean(self, buffer: FloatBuffer) -> FloatBuffer:
         """Returns the mean over ranks of `buffer` [P] float32, see `Reducer.mean`.
@@ -83,8 +83,8 @@ class HarReducer:
 
     def close(self) -> None:
         """Gives thread and memory back, once no result is in use; calling it twice is fine."""
-        if self._helper is not None:
-            self._helper.close()
+        if self._courier is not None:
+            self._courier.close()
         self._host.close()
 
     def _sum_on_gpu(self, block: ExchangeBlock) -> None:
@@ -97,14 +97,10 @@ class HarReducer:
 
     def _mean_of_gpus(self, block: ExchangeBlock, turns: Turns) -> None:
         total = block.slots[self._leader]
-        if self._ring is None or self._helper is None:
+        if self._ring is None or self._courier is None:
             np.multiply(total, np.float32(1.0 / self.world_size), out=block.result)
             return
-        # A copy: on the CPU jax may use the memory of an array as it is, and this is not ours
-        # any more after the call.
-        mean = run_watched(
-            self._helper, turns, lambda: self._ring_mean(jax.device_put(total.copy()))
-        )
+        mean = run_watched(self._courier, turns, lambda: self._ring_mean(jax.device_put(total)))
         place = self._leaders.index(self.rank)
         part = _chunk(total.size, place, len(self._leaders))
         block.result[part] = np.asarray(mean)[part]

@@ -14,7 +14,7 @@ import jax
 import numpy as np
 
 from gmijax.collectives.buffers import require_mean_input
-from gmijax.collectives.helper import Helper
+from gmijax.collectives.courier import Courier
 from gmijax.collectives.host import HostExchange
 from gmijax.collectives.interface import FloatBuffer
 from gmijax.collectives.ring import World
@@ -43,9 +43,9 @@ class RingReducer:
         self._host = host
         self._num_floats = num_floats
         self._rings = RingMean(world, num_floats)
-        self._helper = Helper("ring")
+        self._courier = Courier("ring")
         host.rendezvous()
-        open_rings(world, self._helper, self._rings, num_floats)
+        open_rings(world, self._courier, self._rings, num_floats)
 
     def mean_on_device(self, buffer: jax.Array) -> jax.Array:
         """Returns the mean over ranks of `buffer` [P] float32, see `DeviceReducer`.
@@ -63,7 +63,7 @@ class RingReducer:
         _, turns = self._host.begin("mean", self._num_floats)
         turns.meet()
         turns.check_same_call()
-        mean = run_watched(self._helper, turns, lambda: self._rings(buffer))
+        mean = run_watched(self._courier, turns, lambda: self._rings(buffer))
         turns.arrive()
         turns.end()
         return mean
@@ -79,7 +79,7 @@ class RingReducer:
 
     def close(self) -> None:
         """Gives thread and memory back; calling it twice is fine."""
-        self._helper.close()
+        self._courier.close()
         self._host.close()
 
 
@@ -117,7 +117,7 @@ class RingMean:
 
 def open_rings(
     world: World,
-    helper: Helper,
+    courier: Courier,
     mean: Callable[[jax.Array], jax.Array] | None,
     num_floats: int,
 ) -> None:
@@ -129,18 +129,18 @@ def open_rings(
         world.leave()
 
     # Without a limit: the controller ends a GMI that does not get through its start.
-    helper.run(first_use, lambda done: done.wait())
+    courier.run(first_use, lambda done: done.wait())
 
 
-def run_watched(helper: Helper, turns: Turns, program: Callable[[], jax.Array]) -> jax.Array:
-    """Runs a program over several GMIs in the helper's thread, to its end.
+def run_watched(courier: Courier, turns: Turns, program: Callable[[], jax.Array]) -> jax.Array:
+    """Runs a program over several GMIs in the courier's thread, to its end.
 
     Raises:
       PeerLost, CollectiveTimeout: see `Turns.watch`.
       CollectiveError: the transfer failed although all peers are there.
     """
     try:
-        return helper.run(lambda: program().block_until_ready(), turns.watch)
+        return courier.run(lambda: program().block_until_ready(), turns.watch)
     except jax.errors.JaxRuntimeError as error:
         turns.explain_failure()
         raise CollectiveError(f"{turns.where()}: {str(error).splitlines()[0]}") from error

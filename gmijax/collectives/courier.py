@@ -34,7 +34,7 @@ class _Call(Generic[T]):
         self.done.set()
 
 
-class Helper:
+class Courier:
     """One daemon thread that runs one call at a time.
 
     A call that its owner gives up is left alone, and with it the thread. The process can still
@@ -51,7 +51,7 @@ class Helper:
         """Returns what `function` returns, or raises what it raises.
 
         Args:
-          function: runs in the helper's thread.
+          function: runs in the courier's thread.
           wait: returns when the event is set, or raises, which gives the call up.
         """
         call = _Call(function)
