@@ -61,6 +61,7 @@ def _run(link: ChildLink) -> dict[str, Any]:
             timeout_s=config.reduce.timeout_s,
             rendezvous_timeout_s=config.run.start_timeout_s,
             world=world,
+            intra=plan.intra,
         ),
     )
     try:

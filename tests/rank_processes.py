@@ -137,7 +137,7 @@ def check_means(reducer: Reducer, options: Options) -> Options:
         digest.update(mean.tobytes())
         if stays_on_device(reducer):
             check_device(reducer, buffers[reducer.rank], mean)
-        expected = np.mean(buffers, axis=0, dtype=np.float64)
+        expected = np.asarray(np.mean(buffers, axis=0, dtype=np.float64))
         np.testing.assert_allclose(mean, expected, rtol=1e-5, atol=1e-6 * 10.0**call)
         assert not mean.flags.writeable
         finite = np.isfinite(expected)

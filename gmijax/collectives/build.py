@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 from gmijax.collectives.host import HostExchange
 from gmijax.collectives.interface import Reducer
+from gmijax.collectives.intra import INTRA
 from gmijax.collectives.mpr import MprReducer
 from gmijax.collectives.solo import SoloReducer
 from gmijax.errors import ConfigError
@@ -30,6 +31,7 @@ class Membership:
       timeout_s: longest wait for other ranks.
       rendezvous_timeout_s: the same in the first call, when others may still start or compile.
       world: this process among those of all GMIs, None where no strategy needs rings.
+      intra: how the GMIs of one GPU exchange numbers in HAR.
     """
 
     layout: Layout
@@ -39,6 +41,7 @@ class Membership:
     timeout_s: float
     rendezvous_timeout_s: float
     world: World | None = None
+    intra: str = "host"
 
 
 def build_reducer(name: str, membership: Membership) -> Reducer:
@@ -80,9 +83,12 @@ def _rings(name: str, membership: Membership) -> Reducer:
 def _har(membership: Membership) -> Reducer:
     from gmijax.collectives.har import HarReducer  # Imports jax.
 
-    layout = membership.layout
+    layout, num_floats = membership.layout, membership.num_floats
     world = _world("har", membership) if needs_ring("har", layout) else None
-    return HarReducer(_host("har", membership), layout, world, membership.num_floats)
+    if membership.intra not in INTRA:
+        raise ConfigError(f"reduce.intra={membership.intra}: expected one of {', '.join(INTRA)}")
+    intra = INTRA[membership.intra](layout, membership.rank, num_floats)
+    return HarReducer(_host("har", membership), intra, world, num_floats)
 
 
 def _host(name: str, membership: Membership) -> HostExchange:

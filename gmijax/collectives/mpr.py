@@ -2,17 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 import numpy as np
 
 from gmijax.collectives.buffers import chunk_bounds
 from gmijax.collectives.host import HostExchange
 from gmijax.collectives.interface import FloatBuffer
 from gmijax.collectives.memory import ExchangeBlock
-
-BLOCK_FLOATS = 32768
-"""Floats reduced at a time: 128 KiB of sums stay in the second-level cache over all ranks."""
+from gmijax.collectives.slots import add_slots, read_only
 
 
 class MprReducer:
@@ -37,7 +33,7 @@ class MprReducer:
         self.rank = host.rank
         self.world_size = host.world_size
         self._host = host
-        self._bounds = chunk_bounds(num_floats, host.world_size, host.rank)
+        self._part = slice(*chunk_bounds(num_floats, host.world_size, host.rank))
 
     def mean(self, buffer: FloatBuffer) -> FloatBuffer:
         """Returns the mean over ranks of `buffer` [P] float32, see `Reducer.mean`.
@@ -67,29 +63,7 @@ class MprReducer:
         self._host.close()
 
     def _reduce_chunk(self, block: ExchangeBlock) -> None:
-        scale = np.float32(1.0 / self.world_size)
-        low, high = self._bounds
+        total = block.result[self._part]
         # Overflow and NaN are for the caller to judge, not worth a warning here.
         with np.errstate(over="ignore", invalid="ignore"):
-            for start in range(low, high, BLOCK_FLOATS):
-                part = slice(start, min(start + BLOCK_FLOATS, high))
-                total = block.result[part]
-                add_slots(block, range(self.world_size), part, total)
-                total *= scale
-
-
-def add_slots(block: ExchangeBlock, ranks: Sequence[int], part: slice, total: FloatBuffer) -> None:
-    """Writes the sum of the slots of `ranks`, in this order, to `total`; only within `part`.
-
-    `total` may be the part of the first rank's own slot.
-    """
-    total[:] = block.slots[ranks[0], part]
-    for rank in ranks[1:]:
-        total += block.slots[rank, part]
-
-
-def read_only(array: FloatBuffer) -> FloatBuffer:
-    """A view of `array` that cannot be written."""
-    view = array.view()
-    view.flags.writeable = False
-    return view
+            add_slots(block, range(self.world_size), self._part, total, 1.0 / self.world_size)

@@ -63,6 +63,11 @@ def test_rings_need_a_world(strategy: str) -> None:
         build_reducer(strategy, two_gpus)
 
 
+def test_an_exchange_inside_a_gpu_that_is_not_there_is_refused() -> None:
+    with pytest.raises(ConfigError, match=r"reduce\.intra=ipc: expected one of host"):
+        build_reducer("har", dataclasses.replace(membership(1), intra="ipc"))
+
+
 def test_one_gmi_keeps_its_own_numbers() -> None:
     reducer = build_reducer("none", membership(1))
     buffer = np.array([1.0, np.nan, -0.0, np.inf], np.float32)
