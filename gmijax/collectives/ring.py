@@ -132,7 +132,7 @@ class Ring:
     def _program(self, source: int | None, scale: float) -> Callable[[jax.Array], jax.Array]:
         def total(x: jax.Array) -> jax.Array:
             if source is not None:
-                # The others add zeros, which leaves all bits as they are.
+                # The others add zeros, which changes no value.
                 x = jnp.where(jax.lax.axis_index(AXIS) == source, x, 0.0)
             return jax.lax.psum(x, AXIS) * np.float32(scale)
 
