@@ -78,10 +78,11 @@ class Courier:
         if not self._is_stuck:
             self._is_stuck = True
             # Runs first of all such functions, because they run in reverse order.
-            atexit.register(_end_at_once)
+            atexit.register(end_at_once)
 
 
-def _end_at_once() -> None:
+def end_at_once() -> None:
+    """Ends this process with exit code 1; for `atexit`, where libraries would wait for peers."""
     sys.stdout.flush()
     sys.stderr.flush()
     os._exit(1)

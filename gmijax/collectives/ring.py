@@ -7,6 +7,7 @@ own device alone. `docs/reduction.md` says why the world is left again as soon a
 
 from __future__ import annotations
 
+import atexit
 import math
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -20,6 +21,7 @@ import numpy as np
 from jax._src import distributed, xla_bridge
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
+from gmijax.collectives.courier import end_at_once
 from gmijax.errors import CollectiveError
 from gmijax.partition.layout import Layout
 
@@ -59,6 +61,8 @@ class World:
           CollectiveError: they cannot be met.
         """
         world = cls(layout, rank)
+        # Who fails before it has left must not wait for the others when it ends.
+        atexit.register(end_at_once)
         # Its handler would keep SIGTERM from ending a GMI.
         jax.config.update("jax_enable_preemption_service", False)
         try:
@@ -93,6 +97,7 @@ class World:
         which. All GMIs must call it; rings that have been used go on working.
         """
         jax.distributed.shutdown()
+        atexit.unregister(end_at_once)
         if jax.devices()[0].platform == "cpu":
             # Only process 0 writes to the compilation cache. On the CPU a program belongs to one
             # device of the world, so the others would compile theirs anew in every job.
