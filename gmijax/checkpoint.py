@@ -9,7 +9,8 @@ from __future__ import annotations
 
 import hashlib
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TypeVar
 
@@ -90,14 +91,16 @@ def digest(tree: PyTree) -> np.ndarray:
 
 
 def _save(folder: Path, tree: PyTree) -> None:
-    with ocp.StandardCheckpointer() as checkpointer:
-        checkpointer.save(folder.resolve(), _storable(tree))
+    # Orbax takes device arrays for parts of arrays of the whole jax world.
+    arrays = jax.tree.map(np.asarray, _storable(tree))
+    with _as_one_process(), ocp.StandardCheckpointer() as checkpointer:
+        checkpointer.save(folder.resolve(), arrays)
 
 
 def _restore(folder: Path, template: T) -> T:
-    plain = _storable(template)
+    plain = jax.tree.map(np.asarray, _storable(template))
     try:
-        with ocp.StandardCheckpointer() as checkpointer:
+        with _as_one_process(), ocp.StandardCheckpointer() as checkpointer:
             restored = checkpointer.restore(folder.resolve(), plain)
     except Exception as error:
         # Orbax raises a plain `Exception` for an array that it cannot read. Anything else, such
@@ -107,6 +110,22 @@ def _restore(folder: Path, template: T) -> T:
         lines = str(error).strip().splitlines() or [type(error).__name__]
         raise ConfigError(f"checkpoint {folder} does not fit this job: {lines[0]}") from error
     return jax.tree.map(_restored, template, restored)
+
+
+@contextmanager
+def _as_one_process() -> Iterator[None]:
+    """Lets orbax see this process alone.
+
+    GMIs that form rings are processes of one jax world, in which orbax would have them write one
+    checkpoint together, through a service of jax that is gone by then. Here each writes folders
+    of its own, and `save_checkpoint` has a barrier.
+    """
+    count, index = jax.process_count, jax.process_index
+    jax.process_count, jax.process_index = lambda *_: 1, lambda *_: 0
+    try:
+        yield
+    finally:
+        jax.process_count, jax.process_index = count, index
 
 
 def _is_key(leaf: jax.Array) -> bool:
@@ -127,4 +146,5 @@ def _storable(tree: PyTree) -> PyTree:
 def _restored(like: jax.Array, leaf: jax.Array) -> jax.Array:
     if like.size == 0:
         return like
-    return jax.random.wrap_key_data(leaf) if _is_key(like) else leaf
+    array = jnp.array(leaf)
+    return jax.random.wrap_key_data(array) if _is_key(like) else array

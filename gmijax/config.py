@@ -172,8 +172,10 @@ class PlanConfig:
 class ReduceConfig:
     """How gradients are averaged over GMIs."""
 
-    strategy: Literal["auto", "mpr"] = doc("reduction strategy")
-    intra: Literal["auto", "host"] = doc("exchange inside one GPU")
+    strategy: Literal["auto", "mpr", "mrr", "har", "flat"] = doc(
+        "reduction strategy; auto: by the layout (Algorithm 1 of the paper)"
+    )
+    intra: Literal["auto", "host", "ipc"] = doc("exchange inside one GPU, for har; auto: host")
     timeout_s: float = doc("longest wait for another GMI in one exchange, seconds")
 
     def __post_init__(self) -> None:

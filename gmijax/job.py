@@ -13,7 +13,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager, nullcontext, suppress
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -28,6 +28,8 @@ from gmijax.partition.environment import gmi_environment
 from gmijax.partition.machine import Machine, detect_machine
 from gmijax.partition.plan import Plan
 from gmijax.partition.planner import make_plan
+from gmijax.partition.reduction import needs_ring
+from gmijax.partition.rendezvous import reserved_address
 from gmijax.partition.supervisor import Job, Patience, Supervisor
 from gmijax.progress import ConsoleProgress, Progress, SilentProgress
 from gmijax.results import MetricsReader, copy_history, draw_returns, read_metrics
@@ -168,8 +170,12 @@ def _run_gmis(
     config: TrainConfig, plan: Plan, machine: Machine, run: RunPaths, progress: Progress
 ) -> None:
     exchange_fd = create_exchange() if plan.layout.num_gmis > 1 else None
+    has_rings = needs_ring(plan.strategy, plan.layout)
     try:
-        with open_backend(plan, machine, run) as backend:
+        with (
+            reserved_address() if has_rings else nullcontext() as rendezvous,
+            open_backend(plan, machine, run) as backend,
+        ):
             supervisor = Supervisor(
                 Job(
                     run=run,
@@ -181,6 +187,7 @@ def _run_gmis(
                         dict(os.environ),
                         compilation_cache_dir(),
                         backend.environment(gmi),
+                        rendezvous,
                     ),
                     backend=backend,
                     patience=Patience(
@@ -190,6 +197,8 @@ def _run_gmis(
                         grace_s=config.run.grace_s,
                     ),
                     exchange_fd=exchange_fd,
+                    # GMIs that form rings meet before they compile.
+                    compile_once=not has_rings,
                 )
             )
             with progress, _stopping_on_signals(supervisor.request_stop):

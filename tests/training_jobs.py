@@ -12,6 +12,10 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
+from gmijax.resume import find_checkpoint
+
 TINY = (
     *("env=ball_balance", "num_envs=16", "algo.unroll_length=4", "algo.num_minibatches=2"),
     *("algo.num_updates_per_batch=2", "run.measure_throughput=false", "run.grace_s=3"),
@@ -98,6 +102,18 @@ def gmi_pid(run: Path, gmi: int) -> int | None:
         return int(json.loads((run / f"gmi_{gmi}" / "heartbeat.json").read_text())["pid"])
     except (OSError, ValueError):
         return None
+
+
+def learner_arrays(run: Path) -> list[np.ndarray]:
+    """All arrays of the shared part of a run's last checkpoint."""
+    import jax
+    import orbax.checkpoint as ocp
+
+    folder = find_checkpoint(str(run), "test") / "learner"
+    with ocp.StandardCheckpointer() as checkpointer:
+        metadata = checkpointer.metadata(folder).item_metadata
+        target = jax.tree.map(lambda x: np.zeros(x.shape, x.dtype), metadata)
+        return jax.tree.leaves(checkpointer.restore(folder, target))
 
 
 def kill(pid: int) -> None:

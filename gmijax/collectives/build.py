@@ -4,13 +4,19 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import TYPE_CHECKING
 
+from gmijax.collectives.host import HostExchange
 from gmijax.collectives.interface import Reducer
+from gmijax.collectives.intra import INTRA
 from gmijax.collectives.mpr import MprReducer
 from gmijax.collectives.solo import SoloReducer
 from gmijax.errors import ConfigError
 from gmijax.partition.layout import Layout
+from gmijax.partition.reduction import needs_ring, require_strategy
+
+if TYPE_CHECKING:
+    from gmijax.collectives.ring import World
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -24,6 +30,8 @@ class Membership:
       exchange_fd: descriptor of the shared block, None where no strategy needs it.
       timeout_s: longest wait for other ranks.
       rendezvous_timeout_s: the same in the first call, when others may still start or compile.
+      world: this process among those of all GMIs, None where no strategy needs rings.
+      intra: how the GMIs of one GPU exchange numbers in HAR.
     """
 
     layout: Layout
@@ -32,54 +40,63 @@ class Membership:
     exchange_fd: int | None
     timeout_s: float
     rendezvous_timeout_s: float
-
-
-class Strategy(NamedTuple):
-    """One way to reduce.
-
-    Attributes:
-      why_not: None if the strategy works for a layout, else the reason in words.
-      build: makes the reducer of one rank.
-    """
-
-    why_not: Callable[[Layout], str | None]
-    build: Callable[[Membership], Reducer]
+    world: World | None = None
+    intra: str = "host"
 
 
 def build_reducer(name: str, membership: Membership) -> Reducer:
     """Makes the reducer of one rank with the strategy `name`.
 
+    Those that need rings wait here until all ranks have come.
+
     Raises:
-      ConfigError: no such strategy, or it does not work for this layout.
-      CollectiveError: the shared memory cannot be had.
+      ConfigError: no such strategy, or it does not work for this layout, or lacks something.
+      CollectiveError: the shared memory cannot be had, or another rank is gone or does not come.
     """
-    if name not in STRATEGIES:
-        raise ConfigError(f"reduce.strategy={name}: expected one of {', '.join(STRATEGIES)}")
-    strategy = STRATEGIES[name]
-    if reason := strategy.why_not(membership.layout):
-        raise ConfigError(f"reduce.strategy={name}: {reason}")
-    return strategy.build(membership)
+    require_strategy(name, membership.layout)
+    return STRATEGIES[name](membership)
 
 
-def _why_not_solo(layout: Layout) -> str | None:
-    if layout.num_gmis == 1:
-        return None
-    return f"only for a job with one GMI, this one has {layout.num_gmis}"
-
-
-def _build_solo(membership: Membership) -> Reducer:
+def _none(membership: Membership) -> Reducer:
     return SoloReducer(membership.num_floats)
 
 
-def _why_not_mpr(layout: Layout) -> str | None:
-    del layout  # host memory is there whatever the GPUs are
-    return None
+def _mpr(membership: Membership) -> Reducer:
+    return MprReducer(_host("mpr", membership), membership.num_floats)
 
 
-def _build_mpr(membership: Membership) -> Reducer:
+def _mrr(membership: Membership) -> Reducer:
+    return _rings("mrr", membership)
+
+
+def _flat(membership: Membership) -> Reducer:
+    return _rings("flat", membership)
+
+
+def _rings(name: str, membership: Membership) -> Reducer:
+    from gmijax.collectives.mrr import RingReducer  # Imports jax.
+
+    world = _world(name, membership)
+    return RingReducer(_host(name, membership), world, membership.num_floats)
+
+
+def _har(membership: Membership) -> Reducer:
+    from gmijax.collectives.har import HarReducer  # Imports jax.
+
+    layout, num_floats = membership.layout, membership.num_floats
+    world = _world("har", membership) if needs_ring("har", layout) else None
+    if membership.intra not in INTRA:
+        raise ConfigError(f"reduce.intra={membership.intra}: expected one of {', '.join(INTRA)}")
+    intra = INTRA[membership.intra](layout, membership.rank, num_floats)
+    return HarReducer(_host("har", membership), intra, world, num_floats)
+
+
+def _host(name: str, membership: Membership) -> HostExchange:
     if membership.exchange_fd is None:
-        raise ConfigError("reduce.strategy=mpr: needs the shared block of the job's controller")
-    return MprReducer(
+        raise ConfigError(
+            f"reduce.strategy={name}: needs the shared block of the job's controller"
+        )
+    return HostExchange(
         membership.exchange_fd,
         membership.rank,
         membership.layout.num_gmis,
@@ -89,8 +106,20 @@ def _build_mpr(membership: Membership) -> Reducer:
     )
 
 
-STRATEGIES: Mapping[str, Strategy] = {
-    "none": Strategy(why_not=_why_not_solo, build=_build_solo),
-    "mpr": Strategy(why_not=_why_not_mpr, build=_build_mpr),
+def _world(name: str, membership: Membership) -> World:
+    if membership.world is None:
+        raise ConfigError(f"reduce.strategy={name}: needs a jax world of all GMIs; see World.join")
+    return membership.world
+
+
+STRATEGIES: Mapping[str, Callable[[Membership], Reducer]] = {
+    "none": _none,
+    "mpr": _mpr,
+    "mrr": _mrr,
+    "har": _har,
+    "flat": _flat,
 }
-"""Every strategy; `none` is what a plan with a single GMI uses."""
+"""How the reducer of one rank is made; `none` is what a plan with a single GMI uses.
+
+Which layouts each of them takes: `gmijax.partition.reduction`.
+"""

@@ -28,7 +28,7 @@ from gmijax.errors import CollectiveError, ConfigError
 from gmijax.processes import ProcessId, own_process
 
 MAGIC = 0x58494D47  # "GMIX" in memory on a little-endian machine
-VERSION = 1
+VERSION = 2
 MAX_GATHER_FLOATS = 16384  # 64 KiB a rank
 FLOATS_PER_LINE = 16
 PAGE_BYTES = 4096
@@ -36,9 +36,11 @@ PAGE_BYTES = 4096
 LINE = np.dtype(
     [
         ("magic", np.uint32),
-        ("version", np.uint32),
-        ("world_size", np.uint32),
-        ("rank", np.uint32),
+        ("version", np.uint16),
+        ("world_size", np.uint16),
+        ("rank", np.uint16),
+        ("blamed", np.uint16),  # 1 + the rank for which this one gave up; 0: it has not
+        ("beats", np.uint32),  # goes up while the rank waits for others
         ("num_floats", np.uint64),
         ("pid", np.uint64),  # 0 once the rank has closed its reducer
         ("start_ticks", np.uint64),

@@ -13,6 +13,8 @@ class SoloReducer:
       num_floats: P, length of the buffers for `mean`.
     """
 
+    is_device_resident = False
+
     def __init__(self, num_floats: int) -> None:
         self.rank = 0
         self.world_size = 1

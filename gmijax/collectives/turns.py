@@ -11,8 +11,9 @@ import os
 import threading
 import time
 
-from gmijax.collectives.memory import ExchangeBlock, check_peer, process_of
-from gmijax.errors import CollectiveError, CollectiveTimeout, PeerLost
+from gmijax.collectives.memory import ExchangeBlock, check_peer
+from gmijax.collectives.suspects import LIVENESS_PERIOD_S, Suspects
+from gmijax.errors import CollectiveError
 
 OPERATIONS = ("mean", "all_gather")
 """What a rank can be calling; the wire format holds the position in this tuple."""
@@ -26,7 +27,9 @@ GMIs that do equal work arrive within microseconds of each other if every one ha
 """
 
 MIN_SLEEP_S, MAX_SLEEP_S = 10e-6, 100e-6
-LIVENESS_PERIOD_S = 0.2
+
+SETTLE_S = 2.0
+"""How long to look for a dead peer after a transfer failed: the error comes before the death."""
 
 
 class Turns:
@@ -52,7 +55,17 @@ class Turns:
         self._thread: int | None = None
         self._fence_lock = threading.Lock()
         self._fence_lock.acquire()
-        self._arrive()
+        self.arrive()
+
+    def rendezvous(self) -> None:
+        """Waits until all ranks have attached; the first call does so too.
+
+        Raises:
+          CollectiveError: ranks attached with different numbers.
+          PeerLost, CollectiveTimeout: as in `meet`.
+        """
+        self._operation = "start"
+        self._wait_for_all()
 
     def begin(self, operation: str, count: int) -> None:
         """Opens a call of `operation` with `count` floats.
@@ -71,9 +84,7 @@ class Turns:
         self._thread, self._operation, self._unfinished = thread, operation, True
         self.step += 1
         if self.step == 1:
-            self._wait()  # counters of 1: all have attached
-            for peer in self._peers:
-                check_peer(self._block, peer)
+            self._wait_for_all()
         word = OPERATIONS.index(operation) | count << COUNT_SHIFT
         self._block.lines["call"][rank, self.step % 2] = word
 
@@ -86,8 +97,47 @@ class Turns:
           PeerLost: the process of a rank that has not arrived is gone.
           CollectiveTimeout: ranks did not arrive in time.
         """
-        self._arrive()
+        self.arrive()
         self._wait()
+
+    def watch(self, done: threading.Event) -> None:
+        """Waits for a thread of this rank that exchanges numbers with peers in its own way.
+
+        Returns when `done` is set. Until then peers are looked at that have not arrived where
+        this rank arrives next.
+
+        Raises:
+          PeerLost: the process of such a peer is gone.
+          CollectiveTimeout: the thread did not finish in time.
+        """
+        suspects = self._suspects()
+        while not done.wait(LIVENESS_PERIOD_S):
+            suspects.look(self._behind, now=True)
+            if suspects.is_late:  # All have come out of it but this rank.
+                suspects.give_up(self._peers)
+
+    def explain_failure(self) -> None:
+        """Raises for the peer whose end made a transfer of this rank fail, if there is one.
+
+        Raises:
+          PeerLost, CollectiveTimeout: as in `watch`.
+        """
+        suspects = self._suspects()
+        deadline_s = time.monotonic() + SETTLE_S
+        while time.monotonic() < deadline_s:
+            suspects.look(self._behind, now=True)
+            time.sleep(0.02)
+        if silent := suspects.silent(self._behind()):
+            suspects.give_up(silent)
+
+    def where(self) -> str:
+        """Rank, operation and step, for messages."""
+        return f"rank {self._block.rank}: {self._operation}, step {self.step}"
+
+    def arrive(self) -> None:
+        """Says that this rank has got here, without waiting for the others."""
+        self._fence()
+        self._sequence[self._block.rank] += 1
 
     def check_same_call(self) -> None:
         """Raises CollectiveError unless all ranks make the same call; only after `meet`."""
@@ -110,46 +160,37 @@ class Turns:
         """Tells the others that this rank will not come again."""
         self._block.lines["pid"][self._block.rank] = 0
 
-    def _arrive(self) -> None:
-        self._fence()
-        self._sequence[self._block.rank] += 1
+    def _wait_for_all(self) -> None:
+        self._wait()  # counters of 1: all have attached
+        for peer in self._peers:
+            check_peer(self._block, peer)
 
     def _wait(self) -> None:
         target = int(self._sequence[self._block.rank])
-        timeout_s = self._rendezvous_timeout_s if self.step == 1 else self._timeout_s
         start = time.monotonic()
-        next_check, pause_s = start + LIVENESS_PERIOD_S, MIN_SLEEP_S
+        suspects, pause_s = self._suspects(), MIN_SLEEP_S
         missing = self._missing(self._peers, target)
         while missing:
-            waited_s = time.monotonic() - start
-            if waited_s < SPIN_S:
+            if time.monotonic() - start < SPIN_S:
                 os.sched_yield()
             else:
                 time.sleep(pause_s)
                 pause_s = min(2 * pause_s, MAX_SLEEP_S)
+                suspects.look(lambda: self._missing(self._peers, target))
             missing = self._missing(missing, target)
-            late = waited_s >= timeout_s
-            if missing and (late or start + waited_s >= next_check):
-                next_check += LIVENESS_PERIOD_S
-                self._check_alive(missing, target)
-                if late:
-                    raise CollectiveTimeout(
-                        self._block.rank, tuple(missing), self._operation, self.step, timeout_s
-                    )
         self._fence()
+
+    def _suspects(self) -> Suspects:
+        timeout_s = self._rendezvous_timeout_s if self.step <= 1 else self._timeout_s
+        return Suspects(self._block, self._operation, self.step, timeout_s)
+
+    def _behind(self) -> list[int]:
+        """Peers that have not arrived where this rank arrives next."""
+        return self._missing(self._peers, int(self._sequence[self._block.rank]) + 1)
 
     def _missing(self, peers: list[int], target: int) -> list[int]:
         counter_of = self._sequence.item
         return [peer for peer in peers if counter_of(peer) < target]
-
-    def _check_alive(self, missing: list[int], target: int) -> None:
-        for peer in missing:
-            # A rank that has not attached cannot be told from one that is still starting.
-            if not self._sequence[peer] or process_of(self._block, peer).is_running():
-                continue
-            # It may have arrived and ended, in this order, since it was found missing.
-            if self._missing([peer], target):
-                raise PeerLost(self._block.rank, peer, self._operation, self.step)
 
     def _fence(self) -> None:
         """Keeps the processor from moving memory accesses across this point.

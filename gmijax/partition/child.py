@@ -24,6 +24,7 @@ ENV_CPUS: Final = "GMIJAX_CPUS"
 ENV_RUN_DIR: Final = "GMIJAX_RUN_DIR"
 ENV_LIFELINE_FD: Final = "GMIJAX_LIFELINE_FD"
 ENV_EXCHANGE_FD: Final = "GMIJAX_EXCHANGE_FD"
+ENV_RENDEZVOUS: Final = "GMIJAX_RENDEZVOUS"
 
 STOP_BYTE: Final = b"s"
 
@@ -38,14 +39,21 @@ class ChildLink:
       run: files of the run.
       paths: files of this GMI.
       exchange_fd: inherited file of the gradient exchange, None where there is none.
+      rendezvous: address where GMIs that form rings meet, None where they need not.
     """
 
     def __init__(
-        self, gmi: int, run: RunPaths, lifeline_fd: int | None, exchange_fd: int | None
+        self,
+        gmi: int,
+        run: RunPaths,
+        lifeline_fd: int | None,
+        exchange_fd: int | None,
+        rendezvous: str | None = None,
     ) -> None:
         self.gmi = gmi
         self.run = run
         self.exchange_fd = exchange_fd
+        self.rendezvous = rendezvous
         self.paths: GmiPaths = run.gmi(gmi)
         self._stop = threading.Event()
         self._last_beat: tuple[GmiState, float] | None = None
@@ -76,6 +84,7 @@ class ChildLink:
             RunPaths(Path(run_dir)),
             _inherited_fd(environment, ENV_LIFELINE_FD),
             _inherited_fd(environment, ENV_EXCHANGE_FD),
+            environment.get(ENV_RENDEZVOUS),
         )
 
     @property

@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from pathlib import Path
 
-from gmijax.partition.child import ENV_CPUS, ENV_GMI
+from gmijax.partition.child import ENV_CPUS, ENV_GMI, ENV_RENDEZVOUS
 from gmijax.partition.plan import Plan, Slice
 
 # The old and the new name of one JAX setting; JAX refuses to start when both are set.
@@ -22,6 +22,11 @@ _COMPILATION_CACHE = "JAX_COMPILATION_CACHE_DIR"
 _THREAD_LIMITS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 
 _SMALLEST_POOL = 4
+_LOCAL_HOST = "127.0.0.1"
+
+# Processes of one jax world would tune kernels together and wait for each other, although they
+# compile different programs.
+_NO_SHARED_AUTOTUNING = "--xla_gpu_shard_autotuning=false"
 
 
 def gmi_environment(
@@ -30,6 +35,7 @@ def gmi_environment(
     inherited: Mapping[str, str],
     cache_dir: Path,
     backend_environment: Mapping[str, str],
+    rendezvous: str | None = None,
 ) -> dict[str, str]:
     """All environment variables of one GMI.
 
@@ -42,6 +48,7 @@ def gmi_environment(
       inherited: the controller's own variables.
       cache_dir: compilation cache, unless the user has set one.
       backend_environment: what the backend adds; its `XLA_FLAGS` are appended to the user's.
+      rendezvous: address where GMIs that form rings meet, None if they need not.
     """
     share = plan.slices[gmi]
     environment = dict(inherited)
@@ -56,6 +63,12 @@ def gmi_environment(
         environment.setdefault(name, str(len(share.cpus) or 1))
     added = dict(backend_environment)
     flags = extend_xla_flags(environment.get(_XLA_FLAGS, ""), added.pop(_XLA_FLAGS, ""))
+    environment.pop(ENV_RENDEZVOUS, None)
+    if rendezvous is not None:
+        # A proxy that the user needs for other things must not get between the GMIs.
+        environment.update({ENV_RENDEZVOUS: rendezvous, "no_grpc_proxy": _LOCAL_HOST})
+        if plan.backend != "cpu":
+            flags = extend_xla_flags(flags, _NO_SHARED_AUTOTUNING)
     if flags:
         environment[_XLA_FLAGS] = flags
     return {**environment, **added}

@@ -60,9 +60,17 @@ def first_cause(failures: Sequence[Failure]) -> Failure:
     """The failure that most likely caused the others.
 
     A GMI that lost its peer may be seen to fail before that peer is; so a signal, and any
-    error that is not about a peer, goes before errors of the exchange.
+    error that is not about a peer, goes before errors of the exchange. While GMIs meet to form
+    rings, jax aborts those whose peer is gone; so SIGABRT comes after all other causes.
     """
-    return min(failures, key=lambda failure: (failure.is_consequence, failure.exit_code >= 0))
+    return min(
+        failures,
+        key=lambda failure: (
+            failure.is_consequence,
+            failure.exit_code == -signal.SIGABRT,
+            failure.exit_code >= 0,
+        ),
+    )
 
 
 def signal_name(number: int) -> str:

@@ -21,13 +21,12 @@ class Layout:
     gmis_of_gpu: tuple[tuple[int, ...], ...]
 
     def __post_init__(self) -> None:
-        shown = [list(gmis) for gmis in self.gmis_of_gpu]
         if not self.gmis_of_gpu or any(not gmis for gmis in self.gmis_of_gpu):
-            raise ConfigError(f"plan.layout={shown}: every GPU needs at least one GMI")
+            raise ConfigError(f"plan.layout={self}: every GPU needs at least one GMI")
         ids = sorted(gmi for gmis in self.gmis_of_gpu for gmi in gmis)
         if ids != list(range(len(ids))):
             raise ConfigError(
-                f"plan.layout={shown}: GMI ids must be 0 to {len(ids) - 1}, each exactly once"
+                f"plan.layout={self}: GMI ids must be 0 to {len(ids) - 1}, each exactly once"
             )
 
     @classmethod
@@ -39,6 +38,10 @@ class Layout:
                 for gpu in range(num_gpus)
             )
         )
+
+    def __str__(self) -> str:
+        """As the user writes it: `[[0,1],[2]]`."""
+        return "[" + ",".join(f"[{','.join(map(str, g))}]" for g in self.gmis_of_gpu) + "]"
 
     @property
     def num_gpus(self) -> int:

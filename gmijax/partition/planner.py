@@ -11,6 +11,12 @@ from gmijax.partition.layout import Layout
 from gmijax.partition.machine import Machine
 from gmijax.partition.nvidia import Gpu
 from gmijax.partition.plan import BackendName, Plan, Slice
+from gmijax.partition.reduction import (
+    needs_ring,
+    require_strategy,
+    select_strategy,
+    why_not_intra,
+)
 
 DEFAULT_MEMORY_FRACTION = 0.8
 """Part of a GPU's memory that its GMIs reserve together."""
@@ -51,7 +57,7 @@ def make_plan(plan: PlanConfig, reduce: ReduceConfig, num_envs: int, machine: Ma
         template=_template(plan, reasons),
         num_envs_per_gmi=num_envs,
         strategy=_strategy(reduce, layout, reasons),
-        intra=_intra(reduce, reasons),
+        intra=_intra(reduce, layout, backend, reasons),
         reasons=tuple(reasons),
     )
 
@@ -222,13 +228,26 @@ def _strategy(reduce: ReduceConfig, layout: Layout, reasons: list[str]) -> str:
         reasons.append("strategy none: one GMI has nobody to average gradients with")
         return "none"
     if reduce.strategy != "auto":
+        require_strategy(reduce.strategy, layout)
         return reduce.strategy
-    reasons.append(f"strategy mpr: {layout.num_gmis} GMIs average gradients in host memory")
-    return "mpr"
+    choice = select_strategy(layout)
+    if needs_ring(choice.strategy, layout):
+        # Shown on CPUs only so far, and there host memory is faster (docs/reduction.md).
+        reasons.append(
+            f"strategy mpr: Algorithm 1 says {choice.strategy} ({choice.why}); rings are not "
+            f"measured on GPUs yet, ask for them with reduce.strategy={choice.strategy}"
+        )
+        return "mpr"
+    reasons.append(f"strategy {choice.strategy}: {choice.why} (Algorithm 1)")
+    return choice.strategy
 
 
-def _intra(reduce: ReduceConfig, reasons: list[str]) -> str:
+def _intra(reduce: ReduceConfig, layout: Layout, backend: BackendName, reasons: list[str]) -> str:
     if reduce.intra != "auto":
+        if reason := why_not_intra(reduce.intra, backend):
+            raise ConfigError(
+                f"reduce.intra={reduce.intra}: cannot run on layout {layout}: {reason}; use host"
+            )
         return reduce.intra
     reasons.append("intra host: GMIs of a GPU exchange through shared host memory")
     return "host"

@@ -8,10 +8,19 @@ import jax
 import jax.numpy as jnp
 
 from gmijax.config import PpoConfig
-from gmijax.normalize import Moments, merge_all, moments_of, normalize, without_outliers
+from gmijax.normalize import (
+    Moments,
+    merge_all,
+    moments_of,
+    no_samples,
+    normalize,
+    without_outliers,
+)
 from gmijax.policy import ActorCritic, ActorCriticParams, log_prob
 from gmijax.ppo.advantages import gae
 from gmijax.ppo.losses import Samples
+from gmijax.sim.divergence import sources
+from gmijax.sim.interface import EnvSpec
 from gmijax.sim.wrappers import BatchedEnv, BatchState, EpisodeSums, split_keys
 from gmijax.types import Array, PRNGKey, PyTree
 
@@ -151,4 +160,18 @@ def _with_advantages(
         mean=rollout.mean,
         value=values,
         advantage=advantage,
+    )
+
+
+def stats_example(spec: EnvSpec, overflows: tuple[str, ...] = ()) -> RolloutStats:
+    """Zeros in the structure of `RolloutStats`."""
+    zero = jnp.zeros(())
+    terms, metrics = dict.fromkeys(spec.reward_terms, zero), dict.fromkeys(spec.metrics, zero)
+    return RolloutStats(
+        obs=no_samples((spec.obs_size,)),
+        advantage=no_samples(()),
+        episodes=EpisodeSums(zero, zero, zero, terms, metrics),
+        reward_sum=zero,
+        diverged=dict.fromkeys(("any", *sources(spec.reward_terms)), zero),
+        overflowed=dict.fromkeys(overflows, zero),
     )

@@ -89,13 +89,14 @@ def test_a_buffer_written_by_another_process_is_read_by_the_documented_format(
     with Ranks(tmp_path, 2, "call_once", num_floats=20, stay_s=20.0).start() as job:
         job.wait_for("called")
         raw = mmap.mmap(job.fd, os.fstat(job.fd).st_size, prot=mmap.PROT_READ)
-        magic, version, world_size, rank, num_floats, pid = struct.unpack_from("=4sIIIQQ", raw, 64)
+        head = struct.unpack_from("=4sHHHHIQQ", raw, 64)
         (sequence,) = struct.unpack_from("=Q", raw, 64 + 56)
         at = Geometry.of(2, 20)
         slot = np.frombuffer(raw, np.float32, 20, at.slots + at.row_floats * 4).copy()
         result = np.frombuffer(raw, np.float32, 20, at.result).copy()
-    assert (magic, version, world_size, rank, num_floats) == (b"GMIX", 1, 2, 1, 20)
-    assert pid == job.processes[1].pid
+    magic, version, world_size, rank, blamed, _, num_floats, pid = head
+    assert (magic, version, world_size, rank, blamed) == (b"GMIX", 2, 2, 1, 0)
+    assert (num_floats, pid) == (20, job.processes[1].pid)
     assert sequence == 3  # attached, then the two meetings of one mean
     assert slot.tolist() == [2.0] * 20
     assert result.tolist() == [1.5] * 20

@@ -18,6 +18,7 @@ from training_jobs import (
     gmi_pid,
     iteration_of,
     kill,
+    learner_arrays,
     mps_directories,
     pids_of,
     shared_memory,
@@ -27,18 +28,6 @@ from training_jobs import (
 )
 
 from gmijax.resume import find_checkpoint
-
-
-def _learner(run: Path) -> list[np.ndarray]:
-    """All arrays of the shared part of a run's last checkpoint."""
-    import jax
-    import orbax.checkpoint as ocp
-
-    folder = find_checkpoint(str(run), "test") / "learner"
-    with ocp.StandardCheckpointer() as checkpointer:
-        metadata = checkpointer.metadata(folder).item_metadata
-        target = jax.tree.map(lambda x: np.zeros(x.shape, x.dtype), metadata)
-        return jax.tree.leaves(checkpointer.restore(folder, target))
 
 
 def _read(path: Path) -> dict[str, Any]:
@@ -104,7 +93,7 @@ def test_resuming_gives_bit_equal_parameters(two_gmis: Path) -> None:
     # `last` is runs/half; only what changes is given again.
     second = train("run.resume=last", f"num_timesteps={6 * 2 * STEPS}", "run.dir=resumed", cwd=cwd)
     assert second.returncode == 0, second.stderr
-    whole, resumed = _learner(two_gmis), _learner(cwd / "resumed")
+    whole, resumed = learner_arrays(two_gmis), learner_arrays(cwd / "resumed")
     assert len(whole) == len(resumed) > 10
     for a, b in zip(whole, resumed, strict=True):
         np.testing.assert_array_equal(a, b)
@@ -122,7 +111,9 @@ def test_two_gmis_compute_what_one_process_with_all_environments_does(tmp_path: 
     ):
         done = train(*TINY, *same, *plan, f"run.dir={name}", cwd=tmp_path)
         assert done.returncode == 0, done.stderr
-    for two, one in zip(_learner(tmp_path / "two"), _learner(tmp_path / "one"), strict=True):
+    for two, one in zip(
+        learner_arrays(tmp_path / "two"), learner_arrays(tmp_path / "one"), strict=True
+    ):
         # Twelve updates of Adam at 3e-4: a wrong gradient would move parameters by 4e-3.
         np.testing.assert_allclose(two, one, rtol=2e-3, atol=2e-4)
 

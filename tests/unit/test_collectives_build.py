@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import subprocess
 import sys
 
@@ -11,6 +12,7 @@ import pytest
 from gmijax.collectives.build import STRATEGIES, Membership, build_reducer
 from gmijax.errors import CollectiveError, ConfigError
 from gmijax.partition.layout import Layout
+from gmijax.partition.reduction import why_not_strategy
 
 
 def membership(num_gmis: int, num_floats: int = 4) -> Membership:
@@ -24,10 +26,19 @@ def membership(num_gmis: int, num_floats: int = 4) -> Membership:
     )
 
 
-@pytest.mark.parametrize(("num_gmis", "usable"), [(1, {"none", "mpr"}), (2, {"mpr"})])
-def test_which_strategies_a_layout_allows(num_gmis: int, usable: set[str]) -> None:
-    layout = Layout.even(1, num_gmis)
-    assert {name for name, entry in STRATEGIES.items() if not entry.why_not(layout)} == usable
+@pytest.mark.parametrize(
+    ("layout", "usable"),
+    [
+        (Layout.even(1, 1), {"none", "mpr", "har"}),
+        (Layout.even(1, 2), {"mpr", "har"}),
+        (Layout.even(2, 1), {"mpr", "mrr", "har", "flat"}),
+        (Layout.even(2, 2), {"mpr", "mrr", "har"}),
+        (Layout.even(2, 3), {"mpr", "har"}),
+        (Layout(((0, 1), (2,))), {"mpr", "har"}),
+    ],
+)
+def test_which_strategies_a_layout_allows(layout: Layout, usable: set[str]) -> None:
+    assert {name for name in STRATEGIES if not why_not_strategy(name, layout)} == usable
 
 
 def test_an_unknown_strategy_names_the_known_ones() -> None:
@@ -43,6 +54,18 @@ def test_an_unusable_strategy_says_why() -> None:
 def test_mpr_needs_a_shared_block() -> None:
     with pytest.raises(ConfigError, match="needs the shared block"):
         build_reducer("mpr", membership(2))
+
+
+@pytest.mark.parametrize("strategy", ["mrr", "har", "flat"])
+def test_rings_need_a_world(strategy: str) -> None:
+    two_gpus = dataclasses.replace(membership(2), layout=Layout.even(2, 1))
+    with pytest.raises(ConfigError, match=f"strategy={strategy}: needs a jax world"):
+        build_reducer(strategy, two_gpus)
+
+
+def test_an_exchange_inside_a_gpu_that_is_not_there_is_refused() -> None:
+    with pytest.raises(ConfigError, match=r"reduce\.intra=ipc: expected one of host"):
+        build_reducer("har", dataclasses.replace(membership(1), intra="ipc"))
 
 
 def test_one_gmi_keeps_its_own_numbers() -> None:

@@ -12,6 +12,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from gmijax.collectives.host import HostExchange
 from gmijax.collectives.interface import FloatBuffer
 from gmijax.collectives.memory import create_exchange
 from gmijax.collectives.mpr import MprReducer
@@ -31,7 +32,12 @@ def make_reducers(
     fd = create_exchange()
     reducers = [
         MprReducer(
-            fd, rank, world_size, num_floats, timeout_s=timeout_s, rendezvous_timeout_s=timeout_s
+            HostExchange(
+                *(fd, rank, world_size, num_floats),
+                timeout_s=timeout_s,
+                rendezvous_timeout_s=timeout_s,
+            ),
+            num_floats,
         )
         for rank in range(world_size)
     ]

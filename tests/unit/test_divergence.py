@@ -11,8 +11,9 @@ from toy_env import point_mass
 from gmijax.errors import NonFiniteError
 from gmijax.metrics import MetricsLog
 from gmijax.ppo.losses import LossMetrics
-from gmijax.ppo.programs import IterationMetrics, stats_example
+from gmijax.ppo.programs import IterationMetrics
 from gmijax.ppo.report import TOLERATED_STEPS, Reporter
+from gmijax.ppo.rollout import stats_example
 from gmijax.sim.wrappers import env_keys
 
 ENV = point_mass()

@@ -99,6 +99,33 @@ def test_both_paths_compute_the_same(learner, config) -> None:
     _close(results[0], jax.tree.map(lambda x: x, results[1]), atol=1e-4)
 
 
+class OnDevice(SoloReducer):
+    """Keeps the gradient where it is, as rings do."""
+
+    is_device_resident = True
+
+    def mean_on_device(self, buffer: jax.Array) -> jax.Array:
+        assert isinstance(buffer, jax.Array)
+        return buffer
+
+    def mean(self, buffer):
+        raise AssertionError("through the host")
+
+
+def test_gradients_can_stay_on_the_device(learner, config) -> None:
+    size = exchange_size(ENV.spec, config)
+    results = []
+    for reducer in (SoloReducer(size), OnDevice(size)):
+        iteration = SplitIteration(ENV, learner, reducer)
+        state, envs = _start(learner)
+        iteration.compile(state, envs)
+        for _ in range(2):
+            state, envs, metrics = iteration(state, envs)
+        results.append((state.params, envs.env.obs, metrics))
+        assert iteration.times["time/reduce_s"] > 0
+    jax.tree.map(np.testing.assert_array_equal, *results)
+
+
 def test_shards_of_minibatches_give_the_update_of_the_whole(learner) -> None:
     """Two GMIs with N environments against one process with 2 N, on the same samples."""
     state, _ = _start(learner)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import signal
 import subprocess
 import sys
 import time
@@ -114,6 +115,15 @@ def test_end_without_an_error_file_is_described(
     paths = GmiPaths(tmp_path)
     paths.stderr.write_text(stderr)
     assert describe_exit(0, exit_code, paths).reason == reason
+
+
+def test_an_abort_comes_after_other_causes(tmp_path: Path):
+    bad_input, aborted = (GmiPaths(tmp_path / name) for name in "ab")
+    write_json(bad_input.error, {"type": "ConfigError", "message": "num_envs=7: too odd"})
+    failures = [describe_exit(1, -signal.SIGABRT, aborted), describe_exit(2, 1, bad_input)]
+    assert first_cause(failures).gmi == 2
+    assert first_cause(failures[:1]).gmi == 1
+    assert first_cause([failures[0], describe_exit(0, -signal.SIGKILL, aborted)]).gmi == 0
 
 
 def test_cause_goes_before_consequence(tmp_path: Path):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import socket
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +15,7 @@ from gmijax.partition.backends.cpu import NO_FUSION_EMITTERS, cpu_environment
 from gmijax.partition.environment import extend_xla_flags, gmi_environment
 from gmijax.partition.plan import Plan
 from gmijax.partition.planner import make_plan
+from gmijax.partition.rendezvous import reserved_address
 
 GOLDEN = Path(__file__).parents[1] / "golden"
 INHERITED = {
@@ -107,6 +109,30 @@ def test_xla_flag_is_left_out_where_xla_would_abort(
     jaxlib: tuple[int, ...] | None, accepted: bool
 ):
     assert (cpu_environment(jaxlib) == {"XLA_FLAGS": NO_FUSION_EMITTERS}) == accepted
+
+
+@pytest.mark.parametrize(("backend", "has_flag"), [("cpu", False), ("share", True)])
+def test_gmis_that_form_rings_are_told_where_to_meet(backend: str, has_flag: bool):
+    inherited = {"GMIJAX_RENDEZVOUS": "of another job"}
+    plan, cache, address = planned(backend), Path("/cache"), "127.0.0.1:4321"
+    found = gmi_environment(plan, 0, inherited, cache, {}, address)
+    assert (found["GMIJAX_RENDEZVOUS"], found["no_grpc_proxy"]) == (address, "127.0.0.1")
+    assert ("--xla_gpu_shard_autotuning=false" in found.get("XLA_FLAGS", "")) == has_flag
+    assert "GMIJAX_RENDEZVOUS" not in gmi_environment(plan, 0, inherited, cache, {})
+
+
+def test_a_reserved_address_can_be_listened_at_by_one_of_us_and_not_be_chosen_again():
+    with reserved_address() as address:
+        host, port = address.split(":")
+        assert host == "127.0.0.1"
+        with socket.socket() as stranger, pytest.raises(OSError, match="in use"):
+            stranger.bind((host, int(port)))
+        with socket.socket() as server:
+            server.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEPORT, 1)
+            server.bind((host, int(port)))
+            server.listen()
+            with socket.create_connection((host, int(port)), timeout=5):
+                server.accept()[0].close()
 
 
 def test_inputs_are_not_changed():

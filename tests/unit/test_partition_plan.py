@@ -86,9 +86,43 @@ def test_every_auto_has_a_reason_and_explicit_choices_have_none():
     assert explicit.reasons == ()
 
 
-@pytest.mark.parametrize(("gmis", "strategy"), [(1, "none"), (2, "mpr")])
-def test_strategy_of_one_gmi_is_none(gmis: int, strategy: str):
-    assert planned(machine(0), gmis_per_gpu=gmis).strategy == strategy
+@pytest.mark.parametrize(
+    ("changes", "strategy", "why"),
+    [
+        ({}, "none", "one GMI"),
+        ({"gmis_per_gpu": 2}, "mpr", "(Algorithm 1)"),
+        ({"gpus": 2, "gmis_per_gpu": 2}, "mpr", "Algorithm 1 says mrr"),
+        ({"gpus": 2, "gmis_per_gpu": 3}, "mpr", "Algorithm 1 says har"),
+        ({"layout": ((0, 1), (2,))}, "mpr", "Algorithm 1 says har"),
+    ],
+)
+def test_auto_tells_what_algorithm_1_says_and_keeps_to_host_memory(
+    changes: dict[str, Any], strategy: str, why: str
+):
+    plan = planned(machine(0), **changes)
+    assert plan.strategy == strategy
+    (reason,) = [text for text in plan.reasons if text.startswith("strategy")]
+    assert reason.startswith(f"strategy {strategy}: ")
+    assert why in reason
+
+
+@pytest.mark.parametrize(
+    ("reduce", "changes", "message"),
+    [
+        (
+            {"strategy": "mrr"},
+            {"layout": ((0, 1), (2,))},
+            r"mrr: .* \[\[0,1\],\[2\]\]: every",
+        ),
+        ({"strategy": "flat"}, {"gpus": 2, "gmis_per_gpu": 2}, r"flat: .*NCCL before 2\.30"),
+        ({"intra": "ipc"}, {"gmis_per_gpu": 2}, r"intra=ipc: .*\[\[0,1\]\]: CUDA IPC needs"),
+    ],
+)
+def test_a_reduction_that_cannot_run_is_refused(
+    reduce: dict[str, Any], changes: dict[str, Any], message: str
+):
+    with pytest.raises(ConfigError, match=message):
+        make_plan(plan_config(**changes), reduce_config(**reduce), 64, machine(0))
 
 
 @pytest.mark.parametrize(

@@ -1,0 +1,88 @@
+"""A thread for calls that may never come back.
+
+A collective in a GPU library or in gloo waits for a peer that died or hangs, and Python cannot
+interrupt it. So such a call runs in this thread, and the rank's own thread looks at the peers.
+"""
+
+from __future__ import annotations
+
+import atexit
+import os
+import sys
+import threading
+from collections.abc import Callable
+from queue import SimpleQueue
+from typing import Generic, TypeVar, cast
+
+T = TypeVar("T")
+
+
+class _Call(Generic[T]):
+    """One call and what came of it."""
+
+    def __init__(self, function: Callable[[], T]) -> None:
+        self.done = threading.Event()
+        self.error: BaseException | None = None
+        self.value: T | None = None
+        self._function = function
+
+    def run(self) -> None:
+        try:
+            self.value = self._function()
+        except BaseException as error:  # Raised again in the thread that waits.
+            self.error = error
+        self.done.set()
+
+
+class Courier:
+    """One daemon thread that runs one call at a time.
+
+    A call that its owner gives up is left alone, and with it the thread. The process can still
+    raise, report and clean up, but it ends without the shutdown of the libraries that the thread
+    is stuck in, which could wait for ever (exit code 1).
+    """
+
+    def __init__(self, name: str) -> None:
+        self._calls: SimpleQueue[_Call | None] = SimpleQueue()
+        self._is_stuck = False
+        threading.Thread(target=self._serve, name=name, daemon=True).start()
+
+    def run(self, function: Callable[[], T], wait: Callable[[threading.Event], object]) -> T:
+        """Returns what `function` returns, or raises what it raises.
+
+        Args:
+          function: runs in the courier's thread.
+          wait: returns when the event is set, or raises, which gives the call up.
+        """
+        call = _Call(function)
+        self._calls.put(call)
+        try:
+            wait(call.done)
+        except BaseException:
+            self._give_up()
+            raise
+        if call.error is not None:
+            raise call.error
+        return cast(T, call.value)  # There is a value where there is no error.
+
+    def close(self) -> None:
+        """Ends the thread; calling it twice is fine."""
+        self._calls.put(None)
+
+    def _serve(self) -> None:
+        while (call := self._calls.get()) is not None:
+            call.run()
+            del call  # Nothing of it may outlive the caller's interest.
+
+    def _give_up(self) -> None:
+        if not self._is_stuck:
+            self._is_stuck = True
+            # Runs first of all such functions, because they run in reverse order.
+            atexit.register(end_at_once)
+
+
+def end_at_once() -> None:
+    """Ends this process with exit code 1; for `atexit`, where libraries would wait for peers."""
+    sys.stdout.flush()
+    sys.stderr.flush()
+    os._exit(1)

@@ -1,0 +1,146 @@
+"""MRR and flat: the mean over rings of GPUs, without leaving them (paper section 4.1).
+
+MRR has one ring for every place on a GPU: the k-th GMIs of all GPUs. They sum at the same time;
+then one GMI of each ring, each on another GPU, sums the partial results in a last ring; then each
+of these gives the total to the members of its first ring. With one GMI on each GPU there is one
+ring, and nothing more to do: that is `flat`, plain data parallelism.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import jax
+import numpy as np
+
+from gmijax.collectives.buffers import require_mean_input
+from gmijax.collectives.courier import Courier
+from gmijax.collectives.host import HostExchange
+from gmijax.collectives.interface import FloatBuffer
+from gmijax.collectives.ring import World
+from gmijax.collectives.turns import Turns
+from gmijax.errors import CollectiveError
+
+
+class RingReducer:
+    """A `DeviceReducer` over rings of GPUs; the layout must be even.
+
+    `mean` first meets all ranks on the host: that finds peers that are missing, and calls that
+    do not match, before anybody is caught in a library's collective. The shared block also
+    carries `all_gather`.
+
+    Args:
+      host: this rank's use of the shared block.
+      world: this process among those of all GMIs.
+      num_floats: P, length of the buffers for `mean`.
+    """
+
+    is_device_resident = True
+
+    def __init__(self, host: HostExchange, world: World, num_floats: int) -> None:
+        self.rank = host.rank
+        self.world_size = host.world_size
+        self._host = host
+        self._num_floats = num_floats
+        self._rings = RingMean(world, num_floats)
+        self._courier = Courier("ring")
+        host.rendezvous()
+        open_rings(world, self._courier, self._rings, num_floats)
+
+    def mean_on_device(self, buffer: jax.Array) -> jax.Array:
+        """Returns the mean over ranks of `buffer` [P] float32, see `DeviceReducer`.
+
+        Raises:
+          PeerLost: the process of another rank is gone.
+          CollectiveTimeout: another rank did not arrive in time.
+          CollectiveError: ranks make different calls, or this one is not allowed.
+        """
+        if buffer.dtype != np.float32 or buffer.shape != (self._num_floats,):
+            raise CollectiveError(
+                f"mean: got {buffer.dtype} of shape {list(buffer.shape)}, expected float32 of "
+                f"shape [{self._num_floats}]"
+            )
+        _, turns = self._host.begin("mean", self._num_floats)
+        turns.meet()
+        turns.check_same_call()
+        mean = run_watched(self._courier, turns, lambda: self._rings(buffer))
+        turns.arrive()
+        turns.end()
+        return mean
+
+    def mean(self, buffer: FloatBuffer) -> FloatBuffer:
+        """The same for a buffer in host memory, with a copy each way; the result is read-only."""
+        require_mean_input(buffer, self._num_floats)
+        return np.asarray(self.mean_on_device(jax.device_put(buffer)))
+
+    def all_gather(self, values: FloatBuffer) -> FloatBuffer:
+        """See `HostExchange.all_gather`."""
+        return self._host.all_gather(values)
+
+    def close(self) -> None:
+        """Gives thread and memory back; calling it twice is fine."""
+        self._courier.close()
+        self._host.close()
+
+
+class RingMean:
+    """The programs of one rank: its first ring, perhaps the last one, and the way back.
+
+    Args:
+      world: this process among those of all GMIs.
+      num_floats: P, length of the buffers.
+    """
+
+    def __init__(self, world: World, num_floats: int) -> None:
+        gmis_of_gpu, rank = world.layout.gmis_of_gpu, world.rank
+        self._scale = 1.0 / world.layout.num_gmis
+        self._place = world.layout.neighbours_of(rank).index(rank)
+        self._num_rings = len(gmis_of_gpu[0])
+        self._first = world.ring([gmis[self._place] for gmis in gmis_of_gpu], num_floats)
+        # The ring of place k ends on GPU k: the endpoints are on different GPUs, as NCCL asks.
+        endpoints = [gmis_of_gpu[place][place] for place in range(self._num_rings)]
+        self._last = (
+            world.ring(endpoints, num_floats)
+            if self._num_rings > 1 and rank in endpoints
+            else None
+        )
+
+    def __call__(self, buffer: jax.Array) -> jax.Array:
+        """The mean over all GMIs of `buffer` [P]; every rank must call it."""
+        if self._num_rings == 1:
+            return self._first.sum(buffer, self._scale)
+        total = self._first.sum(buffer)
+        if self._last is not None:
+            total = self._last.sum(total, self._scale)
+        return self._first.broadcast(total, source=self._place)
+
+
+def open_rings(
+    world: World,
+    courier: Courier,
+    mean: Callable[[jax.Array], jax.Array] | None,
+    num_floats: int,
+) -> None:
+    """Uses all rings once, which connects and compiles them, and leaves the coordination."""
+
+    def first_use() -> None:
+        if mean is not None:
+            mean(jax.device_put(np.zeros(num_floats, np.float32))).block_until_ready()
+        world.leave()
+
+    # Without a limit: the controller ends a GMI that does not get through its start.
+    courier.run(first_use, lambda done: done.wait())
+
+
+def run_watched(courier: Courier, turns: Turns, program: Callable[[], jax.Array]) -> jax.Array:
+    """Runs a program over several GMIs in the courier's thread, to its end.
+
+    Raises:
+      PeerLost, CollectiveTimeout: see `Turns.watch`.
+      CollectiveError: the transfer failed although all peers are there.
+    """
+    try:
+        return courier.run(lambda: program().block_until_ready(), turns.watch)
+    except jax.errors.JaxRuntimeError as error:
+        turns.explain_failure()
+        raise CollectiveError(f"{turns.where()}: {str(error).splitlines()[0]}") from error

@@ -1,0 +1,168 @@
+"""Rings between GPUs: the only owner of `jax.distributed`, and of what jax keeps private about it.
+
+All GMIs of a job become processes of one jax world, which gives programs over the devices of
+several GMIs: NCCL between GPUs, gloo between processes on the CPU. Each GMI still computes on its
+own device alone. `docs/reduction.md` says why the world is left again as soon as it stands.
+"""
+
+from __future__ import annotations
+
+import atexit
+import math
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import jaxlib._jax as _jax
+import numpy as np
+
+# Private: jax offers no other way to choose gloo's address, or who writes compiled programs.
+from jax._src import distributed, xla_bridge
+from jax.sharding import Mesh, NamedSharding, PartitionSpec
+
+from gmijax.collectives.courier import end_at_once
+from gmijax.errors import CollectiveError
+from gmijax.partition.layout import Layout
+
+AXIS = "ring"
+_LOCAL_HOST = "127.0.0.1"
+_LEAVE_TIMEOUT_S = 300
+
+
+class World:
+    """This process among those of all GMIs.
+
+    Args:
+      layout: where all GMIs live.
+      rank: this one.
+
+    Attributes:
+      layout: the same.
+      rank: the same.
+    """
+
+    def __init__(self, layout: Layout, rank: int) -> None:
+        self.layout = layout
+        self.rank = rank
+        self._process_ids = process_ids(layout)
+
+    @classmethod
+    def join(cls, layout: Layout, rank: int, address: str, timeout_s: float) -> World:
+        """Meets the other GMIs; call it before anything else uses jax.
+
+        Args:
+          layout: where all GMIs live.
+          rank: this one.
+          address: `127.0.0.1:port`, the same for all; one of them listens there for a while.
+          timeout_s: longest wait for the others.
+
+        Raises:
+          CollectiveError: they cannot be met.
+        """
+        world = cls(layout, rank)
+        # Who fails before it has left must not wait for the others when it ends.
+        atexit.register(end_at_once)
+        # Its handler would keep SIGTERM from ending a GMI.
+        jax.config.update("jax_enable_preemption_service", False)
+        try:
+            jax.distributed.initialize(
+                coordinator_address=address,
+                num_processes=layout.num_gmis,
+                process_id=world._process_ids[rank],
+                local_device_ids=[0],
+                initialization_timeout=math.ceil(timeout_s),
+                coordinator_bind_address=address,
+                shutdown_timeout_seconds=_LEAVE_TIMEOUT_S,
+            )
+        except (RuntimeError, ValueError) as error:
+            lines = str(error).strip().splitlines() or [type(error).__name__]
+            raise CollectiveError(
+                f"rank {rank}: cannot meet the other GMIs at {address}: {lines[0]}"
+            ) from error
+        xla_bridge.register_backend_factory("cpu", _cpu_client, priority=0, fail_quietly=False)
+        # Devices are exchanged when jax makes its client, and that waits for all processes.
+        jax.devices()
+        return world
+
+    def ring(self, ranks: Sequence[int], num_floats: int) -> Ring:
+        """A ring of the GMIs `ranks`, of which this one must be one; no communication yet."""
+        by_process = {device.process_index: device for device in jax.devices()}
+        return Ring([by_process[self._process_ids[rank]] for rank in ranks], num_floats)
+
+    def leave(self) -> None:
+        """Leaves the coordination service, when all rings have been used once.
+
+        A connection to it would end this process when another one dies, before it could say
+        which. All GMIs must call it; rings that have been used go on working.
+        """
+        jax.distributed.shutdown()
+        atexit.unregister(end_at_once)
+        if jax.devices()[0].platform == "cpu":
+            # Only process 0 writes to the compilation cache. On the CPU a program belongs to one
+            # device of the world, so the others would compile theirs anew in every job.
+            distributed.global_state.process_id = 0
+
+
+class Ring:
+    """A sum over the devices of some GMIs, as one compiled program.
+
+    Args:
+      devices: one of each GMI, each on another GPU.
+      num_floats: P, length of the buffers.
+    """
+
+    def __init__(self, devices: Sequence[Any], num_floats: int) -> None:
+        self._mesh = Mesh(np.array(devices), (AXIS,))
+        self._sharding = NamedSharding(self._mesh, PartitionSpec(AXIS))
+        self._global_shape = (len(devices) * num_floats,)
+        self._programs: dict[tuple[int | None, float], Callable[[jax.Array], jax.Array]] = {}
+
+    def sum(self, buffer: jax.Array, scale: float = 1.0) -> jax.Array:
+        """The sum over the ring of `buffer` [P] float32, times `scale`; on this GMI's device."""
+        return self._run(buffer, None, scale)
+
+    def broadcast(self, buffer: jax.Array, source: int) -> jax.Array:
+        """The `buffer` [P] of the member at place `source`, on the device of every member."""
+        return self._run(buffer, source, 1.0)
+
+    def _run(self, buffer: jax.Array, source: int | None, scale: float) -> jax.Array:
+        if (source, scale) not in self._programs:
+            self._programs[source, scale] = self._program(source, scale)
+        whole = jax.make_array_from_single_device_arrays(
+            self._global_shape, self._sharding, [buffer]
+        )
+        return self._programs[source, scale](whole).addressable_data(0)
+
+    def _program(self, source: int | None, scale: float) -> Callable[[jax.Array], jax.Array]:
+        def total(x: jax.Array) -> jax.Array:
+            if source is not None:
+                # The others add zeros, which changes no value.
+                x = jnp.where(jax.lax.axis_index(AXIS) == source, x, 0.0)
+            return jax.lax.psum(x, AXIS) * np.float32(scale)
+
+        inside = jax.shard_map(
+            total, mesh=self._mesh, in_specs=PartitionSpec(AXIS), out_specs=PartitionSpec()
+        )
+        return jax.jit(inside)
+
+
+def process_ids(layout: Layout) -> tuple[int, ...]:
+    """The number of every rank's process in the world, ring by ring.
+
+    Members of a ring, the k-th GMI of every GPU, get consecutive numbers: XLA complains about
+    rings that skip some.
+    """
+    most = max(len(gmis) for gmis in layout.gmis_of_gpu)
+    in_order = [
+        gmis[place] for place in range(most) for gmis in layout.gmis_of_gpu if place < len(gmis)
+    ]
+    return tuple(in_order.index(gmi) for gmi in layout.gmis)
+
+
+def _cpu_client() -> object:
+    # By itself gloo would listen at the address of the host's name, which others may reach.
+    collectives = _jax.make_gloo_tcp_collectives(
+        distributed_client=distributed.global_state.client, hostname=_LOCAL_HOST
+    )
+    return xla_bridge.make_cpu_client(collectives)

@@ -1,0 +1,112 @@
+"""Who is to blame when a rank waits too long: the dead, the silent, and those who merely wait.
+
+A rank that waits says so by raising its `beats` now and then. So when time is up a peer that
+waits as well is told from one that is stuck, wherever each of them waits. A rank that gives up
+notes for whom, so that its own end is not taken for the cause.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from typing import NoReturn
+
+from gmijax.collectives.memory import ExchangeBlock, process_of
+from gmijax.errors import CollectiveTimeout, PeerLost
+
+LIVENESS_PERIOD_S = 0.2
+SILENCE_S = 0.7
+"""A rank that has not beaten for so long does not wait: three beats are missing."""
+
+
+class Suspects:
+    """One wait of one rank, from its start.
+
+    Args:
+      block: the shared block.
+      operation: what the rank is calling.
+      step: number of the call.
+      timeout_s: longest wait.
+    """
+
+    def __init__(self, block: ExchangeBlock, operation: str, step: int, timeout_s: float) -> None:
+        self._block = block
+        self._operation = operation
+        self._step = step
+        self._timeout_s = timeout_s
+        self._start_s = self._next_look_s = time.monotonic()
+        self._heard: dict[int, tuple[int, float]] = {}
+
+    @property
+    def is_late(self) -> bool:
+        """Whether the time is up."""
+        return time.monotonic() - self._start_s >= self._timeout_s
+
+    def look(self, missing: Callable[[], list[int]], *, now: bool = False) -> None:
+        """Looks at those who are missing, five times a second at most unless `now`.
+
+        Args:
+          missing: ranks that have not arrived, read anew at every call.
+          now: look even if the last time was a moment ago.
+
+        Raises:
+          PeerLost: the process of one of them is gone.
+          CollectiveTimeout: the time is up.
+        """
+        now_s, late = time.monotonic(), self.is_late
+        if not (now or late or now_s >= self._next_look_s):
+            return
+        self._next_look_s = now_s + LIVENESS_PERIOD_S
+        self._block.lines["beats"][self._block.rank] += 1
+        self._check_alive(missing)
+        self._listen(now_s)
+        if late and (left := missing()):
+            self.give_up(left)
+
+    def give_up(self, missing: list[int]) -> NoReturn:
+        """Raises CollectiveTimeout for those of `missing` who do not wait themselves."""
+        self._raise_timeout(self.silent(missing) or missing, time.monotonic() - self._start_s)
+
+    def silent(self, missing: list[int]) -> list[int]:
+        """Those of `missing` who do not wait themselves, as far as this rank has heard."""
+        now_s = time.monotonic()
+        return [peer for peer in missing if self._silence_s(peer, now_s) > SILENCE_S]
+
+    def _check_alive(self, missing: Callable[[], list[int]]) -> None:
+        gone = [peer for peer in missing() if self._is_gone(peer)]
+        # One may have arrived and ended, in this order, since it was found missing.
+        gone = [peer for peer in missing() if peer in gone]
+        if not gone:
+            return
+        blamed = self._block.lines["blamed"].item
+        for peer in gone:
+            if not blamed(peer):
+                self._raise_lost(peer)
+        cause = blamed(gone[0]) - 1
+        if cause in (self._block.rank, *gone) or self._is_gone(cause):
+            self._raise_lost(gone[0] if cause == self._block.rank else cause)
+        self._raise_timeout([cause], time.monotonic() - self._start_s)
+
+    def _is_gone(self, peer: int) -> bool:
+        # A rank that has not attached cannot be told from one that is still starting.
+        attached = self._block.lines["sequence"][peer]
+        return bool(attached) and not process_of(self._block, peer).is_running()
+
+    def _listen(self, now_s: float) -> None:
+        for peer, beats in enumerate(self._block.lines["beats"].tolist()):
+            if self._heard.get(peer, (None,))[0] != beats:
+                self._heard[peer] = beats, now_s
+
+    def _silence_s(self, peer: int, now_s: float) -> float:
+        return now_s - self._heard.get(peer, (0, self._start_s))[1]
+
+    def _raise_lost(self, peer: int) -> NoReturn:
+        self._block.lines["blamed"][self._block.rank] = peer + 1
+        raise PeerLost(self._block.rank, peer, self._operation, self._step)
+
+    def _raise_timeout(self, missing: list[int], waited_s: float) -> NoReturn:
+        self._block.lines["blamed"][self._block.rank] = missing[0] + 1
+        waited_s = min(round(waited_s, 2), self._timeout_s)
+        raise CollectiveTimeout(
+            self._block.rank, tuple(missing), self._operation, self._step, waited_s
+        )

@@ -1,0 +1,140 @@
+"""Which reduction strategies a layout allows, and which one it gets: pure rules, no jax.
+
+The controller checks a plan with them before it starts anything, and `gmijax.collectives.build`
+refuses by the same rules in a GMI.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import NamedTuple
+
+from gmijax.errors import ConfigError
+from gmijax.partition.layout import Layout
+
+
+class Choice(NamedTuple):
+    """A strategy and why it was chosen, in words."""
+
+    strategy: str
+    why: str
+
+
+def select_strategy(layout: Layout) -> Choice:
+    """Algorithm 1 of the paper (section 4.1), exactly as printed.
+
+    It looks at the layout alone: how many GPUs, and how many GMIs each of them has.
+    """
+    num_gpus = layout.num_gpus
+    if num_gpus <= 1:
+        return Choice("mpr", "all GMIs are on one GPU, so they average in host memory")
+    gmis_per_gpu = {len(gmis) for gmis in layout.gmis_of_gpu}
+    if len(gmis_per_gpu) > 1:
+        return Choice(
+            "har", "GPUs have different numbers of GMIs, so each GPU sends a leader to one ring"
+        )
+    per_gpu = gmis_per_gpu.pop()
+    if per_gpu > num_gpus:
+        return Choice(
+            "har",
+            f"{per_gpu} GMIs on each of only {num_gpus} GPUs, so each GPU sends a leader to one "
+            "ring",
+        )
+    return Choice(
+        "mrr",
+        f"{per_gpu} GMIs on each of {num_gpus} GPUs, so as many rings that share no GMI",
+    )
+
+
+def why_not_strategy(strategy: str, layout: Layout) -> str | None:
+    """None if `strategy` can run on `layout`, else the reason in words."""
+    return _RULES[strategy](layout)
+
+
+def why_not_intra(intra: str, backend: str) -> str | None:
+    """None if `intra` can move numbers inside one GPU under `backend`, else the reason."""
+    if intra == "host":
+        return None
+    if backend == "cpu":
+        return (
+            "CUDA IPC needs an NVIDIA GPU whose GMIs share it by mps or share; the backend is cpu"
+        )
+    if backend == "mig":
+        return "there is no CUDA IPC between the instances of a GPU in MIG mode"
+    return "exchange through CUDA IPC is not supported yet"
+
+
+def require_strategy(strategy: str, layout: Layout) -> None:
+    """Raises ConfigError with strategy, layout and reason if they do not go together."""
+    if strategy not in _RULES:
+        raise ConfigError(f"reduce.strategy={strategy}: expected one of {', '.join(_RULES)}")
+    if reason := why_not_strategy(strategy, layout):
+        raise ConfigError(f"reduce.strategy={strategy}: cannot run on layout {layout}: {reason}")
+
+
+def needs_ring(strategy: str, layout: Layout) -> bool:
+    """Whether GMIs of several GPUs talk to each other past the host's memory.
+
+    They must all be started before any of them can use jax.
+    """
+    return strategy in ("mrr", "flat") or (strategy == "har" and layout.num_gpus > 1)
+
+
+def leaders(layout: Layout) -> tuple[int, ...]:
+    """The GMI of every GPU that speaks for it in HAR.
+
+    The paper's rule is `id % M == t` with M GMIs on every GPU; t is 0 here. Where it does not
+    give every GPU exactly one leader (uneven layouts, ids in another order), the smallest id of
+    each GPU leads.
+    """
+    most = max(len(gmis) for gmis in layout.gmis_of_gpu)
+    found = [[gmi for gmi in gmis if gmi % most == 0] for gmis in layout.gmis_of_gpu]
+    if all(len(gmis) == 1 for gmis in found):
+        return tuple(gmis[0] for gmis in found)
+    return tuple(min(gmis) for gmis in layout.gmis_of_gpu)
+
+
+def _none(layout: Layout) -> str | None:
+    if layout.num_gmis == 1:
+        return None
+    return f"only for a job with one GMI, this one has {layout.num_gmis}"
+
+
+def _anywhere(layout: Layout) -> str | None:
+    del layout  # Host memory is there whatever the GPUs are.
+    return None
+
+
+def _mrr(layout: Layout) -> str | None:
+    sizes = [len(gmis) for gmis in layout.gmis_of_gpu]
+    if layout.num_gpus < 2:
+        return "its rings go from GPU to GPU, and there is only one"
+    if len(set(sizes)) > 1:
+        return f"every ring takes one GMI of each GPU, and the GPUs have {sizes} GMIs"
+    if sizes[0] > layout.num_gpus:
+        return (
+            f"the last ring takes one GMI of each of the {sizes[0]} first rings, each on another "
+            f"GPU, and there are only {layout.num_gpus}"
+        )
+    return None
+
+
+def _flat(layout: Layout) -> str | None:
+    sizes = [len(gmis) for gmis in layout.gmis_of_gpu]
+    if max(sizes) > 1:
+        return (
+            f"one communicator over all GMIs, and the GPUs have {sizes}: NCCL before 2.30 takes "
+            "one process of a GPU, and later versions are not supported yet"
+        )
+    if layout.num_gpus < 2:
+        return "its ring goes from GPU to GPU, and there is only one"
+    return None
+
+
+_RULES: Mapping[str, Callable[[Layout], str | None]] = {
+    "none": _none,
+    "mpr": _anywhere,
+    "mrr": _mrr,
+    "har": _anywhere,
+    "flat": _flat,
+}

@@ -1,0 +1,35 @@
+"""GMIs that meet to form rings, and one of them fails on the way."""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+
+import pytest
+
+from tests.rank_processes import Ranks
+
+
+@pytest.mark.timeout(120)
+@pytest.mark.parametrize("rank", [0, 1])
+def test_one_that_fails_while_the_others_wait_ends_at_once(rank: int, tmp_path: Path) -> None:
+    # Its library would wait five minutes for the others to say goodbye.
+    layout = [[0], [1]]
+    with Ranks(tmp_path, 2, "call_once", strategy="mrr", layout=layout) as job:
+        started_s = time.monotonic()
+        job.start(1 - rank)
+        job.start(rank, num_floats=0)
+        (result,) = job.results(rank)
+        assert time.monotonic() - started_s < 60
+    assert (result["error"], result["message"]) == (
+        "ConfigError",
+        "num_floats=0: must be at least 1",
+    )
+
+
+@pytest.mark.timeout(120)
+def test_ranks_with_different_lengths_name_both(tmp_path: Path) -> None:
+    with Ranks(tmp_path, 2, "call_once", strategy="mrr", layout=[[0], [1]]) as job:
+        job.start(0, num_floats=100).start(1, num_floats=200)
+        messages = [result["message"] for result in job.results()]
+    assert all("do not fit together: num_floats is" in message for message in messages)

@@ -1,0 +1,91 @@
+"""Who is named when a wait goes wrong: ranks as threads or as mere lines of the block."""
+
+from __future__ import annotations
+
+import os
+import threading
+import time
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+
+import pytest
+
+from gmijax.collectives.memory import ExchangeBlock, attach, create_exchange
+from gmijax.collectives.turns import Turns
+from gmijax.errors import CollectiveTimeout, PeerLost
+
+NEVER = threading.Event()
+
+
+@pytest.fixture
+def blocks() -> Iterator[list[ExchangeBlock]]:
+    """The block as three ranks see it."""
+    fd = create_exchange()
+    yield [attach(fd, rank, 3, 10) for rank in range(3)]
+    os.close(fd)
+
+
+def turns_of(blocks: list[ExchangeBlock], *timeouts_s: float) -> list[Turns]:
+    """All three ranks, attached."""
+    return [Turns(block, t, t) for block, t in zip(blocks, timeouts_s, strict=True)]
+
+
+def end(blocks: list[ExchangeBlock], rank: int, blamed: int | None = None) -> None:
+    """Makes `rank` look as if its process had ended, having given up for `blamed`."""
+    line = blocks[rank].lines[rank]
+    line["pid"], line["blamed"] = 0, 0 if blamed is None else blamed + 1
+
+
+def test_a_watch_ends_with_the_call(blocks: list[ExchangeBlock]) -> None:
+    turns = turns_of(blocks, 5, 5, 5)[0]
+    done = threading.Event()
+    threading.Timer(0.3, done.set).start()
+    started = time.monotonic()
+    turns.watch(done)
+    assert 0.2 < time.monotonic() - started < 2.0
+
+
+def test_who_waits_too_is_not_named(blocks: list[ExchangeBlock]) -> None:
+    first, second, _ = turns_of(blocks, 1.2, 3.0, 3.0)
+    with ThreadPoolExecutor(1) as pool:
+        other = pool.submit(second.watch, NEVER)
+        with pytest.raises(CollectiveTimeout, match=r"waited 1\.2 s .* for ranks \[2\]"):
+            first.watch(NEVER)
+        end(blocks, 0, blamed=2)
+        with pytest.raises(CollectiveTimeout, match=r"rank 1: .* for ranks \[2\]"):
+            other.result()
+
+
+def test_a_call_that_only_this_rank_does_not_finish_times_out(blocks: list[ExchangeBlock]) -> None:
+    first, *others = turns_of(blocks, 0.3, 3.0, 3.0)
+    for other in others:
+        other.arrive()
+    with pytest.raises(CollectiveTimeout, match=r"for ranks \[1, 2\]"):
+        first.watch(NEVER)
+
+
+def test_the_dead_are_named_and_not_those_who_gave_up_for_them(
+    blocks: list[ExchangeBlock],
+) -> None:
+    first = turns_of(blocks, 3.0, 3.0, 3.0)[0]
+    end(blocks, 1, blamed=2)
+    end(blocks, 2)
+    with pytest.raises(PeerLost) as lost:
+        first.watch(NEVER)
+    assert lost.value.peer == 2
+    assert blocks[0].lines["blamed"][0] == 3
+
+
+def test_one_that_gave_up_for_a_stuck_rank_points_at_it(blocks: list[ExchangeBlock]) -> None:
+    first = turns_of(blocks, 3.0, 3.0, 3.0)[0]
+    end(blocks, 1, blamed=2)
+    with pytest.raises(CollectiveTimeout, match=r"for ranks \[2\]"):
+        first.watch(NEVER)
+
+
+def test_a_failed_transfer_is_blamed_on_the_dead(blocks: list[ExchangeBlock]) -> None:
+    first = turns_of(blocks, 30, 30, 30)[0]
+    threading.Timer(0.4, end, (blocks, 1)).start()
+    with pytest.raises(PeerLost) as lost:
+        first.explain_failure()
+    assert lost.value.peer == 1
