@@ -10,7 +10,7 @@ READY := $(VENV)/.ready
 CUDA ?= $(shell nvidia-smi 2>/dev/null | sed -nE 's/.*CUDA[^:]*Version: *([0-9]+).*/cuda\1/p' | head -n 1)
 GPUS := $(shell nvidia-smi -L 2>/dev/null | grep -c '^GPU ')
 comma := ,
-EXTRAS ?= test,dev$(if $(CUDA),$(comma)$(CUDA))
+EXTRAS ?= test,dev$(if $(CUDA),$(comma)warp$(comma)$(CUDA))
 
 # Two GMIs: on two GPUs (virtual ones where there is none), or sharing the only one.
 PLAN := $(if $(filter 1,$(GPUS)),plan.gpus=1 plan.gmis_per_gpu=2,plan.gpus=2 plan.gmis_per_gpu=1)

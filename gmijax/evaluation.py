@@ -301,6 +301,7 @@ def _table(returns: Mapping[str, Any]) -> Table:
         table.add_column(heading, justify="right")
     rows = {"return": returns["return"], "length": returns["length"]}
     rows |= {f"  {name}": term for name, term in returns["terms"].items()}
+    rows |= returns["metrics"]
     for name, row in rows.items():
         table.add_row(name, *(f"{row[key]:.2f}" for key in ("mean", "std", "min", "max")))
     return table
