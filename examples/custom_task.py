@@ -49,8 +49,7 @@ def make(*, impl="auto", max_envs=None) -> Env:
         reward = total_reward(TERMS, View(now.qpos, action))
         return episode.advance(state, now, (), observe(now), reward, jnp.abs(now.qpos[0]) > 2.2)
 
-    limits = world.max_envs, world.overflow  # Of MJX-Warp; None for MJX-JAX.
-    return Env(spec, world.model, reset, step, mj_model, lambda s: s.physics.qpos, *limits)
+    return world.env(spec, reset, step)
 
 
 if __name__ == "__main__":

@@ -20,8 +20,8 @@ from mujoco import mjx
 
 from gmijax.errors import ConfigError
 from gmijax.sim.impl import ON_GPU, Impl, WarpSizes, choose_impl
-from gmijax.sim.interface import OVERFLOWS, EnvState
-from gmijax.types import Array, PyTree
+from gmijax.sim.interface import OVERFLOWS, Env, EnvSpec, EnvState
+from gmijax.types import Array, PRNGKey, PyTree
 
 T = TypeVar("T")
 
@@ -132,10 +132,23 @@ class Physics:
             moved = moved._replace(overflow=jnp.any(bits[:, None] & masks, axis=0))
         return moved, jax.tree.map(lambda reading: reading[-1], readings)
 
-    @property
-    def overflow(self) -> Callable[[EnvState], Array] | None:
-        """`EnvState -> [2]` bool as in `PhysicsState.overflow`; None if nothing can overflow."""
-        return None if self.impl == "jax" else lambda state: state.physics.overflow
+    def env(
+        self,
+        spec: EnvSpec,
+        reset: Callable[[PyTree, PRNGKey], EnvState],
+        step: Callable[[PyTree, EnvState, Array], EnvState],
+    ) -> Env:
+        """The environment whose `EnvState.physics` is this world's `PhysicsState`."""
+        return Env(
+            spec=spec,
+            model=self.model,
+            reset=reset,
+            step=step,
+            mj_model=self.mj_model,
+            qpos=lambda state: state.physics.qpos,
+            max_envs=self.max_envs,
+            overflow=None if self.impl == "jax" else lambda state: state.physics.overflow,
+        )
 
 
 def load(asset: str, *, impl: str, substeps: int, max_envs: int | None = None) -> Physics:

@@ -96,16 +96,7 @@ def make(*, impl: str = "auto", max_envs: int | None = None) -> Env:
         metrics = {runner.SPEED: runner.mean_speed(pose, state.steps + 1, world.control_dt_s)}
         return episode.advance(state, moved, (), obs, reward, dead, metrics)
 
-    return Env(
-        spec=spec,
-        model=world.model,
-        reset=reset,
-        step=step,
-        mj_model=world.mj_model,
-        qpos=lambda state: state.physics.qpos,
-        max_envs=world.max_envs,
-        overflow=world.overflow,
-    )
+    return world.env(spec, reset, step)
 
 
 def look_up(mj_model: mujoco.MjModel) -> RunnerIds:

@@ -203,16 +203,7 @@ def make(*, impl: str = "auto", max_envs: int | None = None) -> Env:
         never = jnp.zeros((), bool)
         return episode.advance(state, moved, task, obs, reward, never, metrics, opened)
 
-    return Env(
-        spec=spec,
-        model=world.model,
-        reset=reset,
-        step=step,
-        mj_model=world.mj_model,
-        qpos=lambda state: state.physics.qpos,
-        max_envs=world.max_envs,
-        overflow=world.overflow,
-    )
+    return world.env(spec, reset, step)
 
 
 def look_up(mj_model: mujoco.MjModel) -> FrankaCabinetIds:
