@@ -5,6 +5,8 @@ from __future__ import annotations
 from types import MappingProxyType
 from typing import NamedTuple
 
+from gmijax.sim.impl import ON_GPU
+
 
 class Case(NamedTuple):
     """One command line of `python -m gmijax.train`.
@@ -89,6 +91,7 @@ SUITES = MappingProxyType(
                 _throughput(task, impl, num_envs)
                 for num_envs in (2048, 8192, 32768)
                 for task in TASKS
+                if impl == "jax" or not ON_GPU[task].why_no_warp
             )
             for impl in ("jax", "warp")
         },

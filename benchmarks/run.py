@@ -61,6 +61,8 @@ class ResultsFile:
 
     def __init__(self, path: Path, suite: str, *, resume: bool) -> None:
         kept = json.loads(path.read_text())["cases"] if resume and path.exists() else {}
+        for case in kept.values():  # What failed is tried again.
+            case["runs"] = [run for run in case["runs"] if "summary" in run]
         self.path = path
         self.results: dict[str, Any] = {
             "suite": suite,
@@ -102,9 +104,11 @@ def run_all(books: Mapping[str, ResultsFile], repeats: int, runs: Path, gpus: in
     def run(book: ResultsFile, repeat: int, case: Case) -> None:
         gpu = free.get()
         alone = (f"plan.gpus=[{gpu}]",) if gpus else ()
-        folder = runs / f"{case.name.replace(' ', '-')}-{repeat}"
-        book.add(case, run_case(case, repeat, (*alone, f"run.dir={folder}"), folder))
-        free.put(gpu)
+        folder = runs / f"{book.results['suite']}-{case.name.replace(' ', '-')}-{repeat}"
+        try:
+            book.add(case, run_case(case, repeat, (*alone, f"run.dir={folder}"), folder))
+        finally:
+            free.put(gpu)
 
     with ThreadPoolExecutor(gpus or 1) as pool:
         started = [
@@ -112,8 +116,12 @@ def run_all(books: Mapping[str, ResultsFile], repeats: int, runs: Path, gpus: in
             for book in books.values()
             for repeat, case in book.missing(repeats)
         ]
-        for one in started:
-            one.result()
+        try:
+            for one in started:
+                one.result()
+        except BaseException:
+            pool.shutdown(wait=False, cancel_futures=True)
+            raise
 
 
 def run_case(case: Case, repeat: int, overrides: tuple[str, ...], folder: Path) -> dict[str, Any]:
@@ -145,6 +153,7 @@ def outcome(folder: Path) -> dict[str, Any]:
     """The summary of a run, its curve thinned out, and the median times of its parts."""
     lines = read_metrics(folder / "metrics.jsonl")
     kept = lines[:: max(1, len(lines) // CURVE_POINTS)]
+    kept += [] if kept[-1] is lines[-1] else lines[-1:]
     times = [key for key in lines[-1] if key.startswith("time/")]
     return {
         "summary": json.loads((folder / "summary.json").read_text()),

@@ -89,6 +89,8 @@ def play(config: PlayConfig, *, show: bool = False) -> Evaluation:
     # Before a process is started, which would find it bad too.
     env, _ = trained_config(checkpoint)
     require_task(str(env.name), env.suite)
+    if config.randomize == "on" and not env.randomization:
+        raise ConfigError("randomize=on: env.randomization of the run names nothing to draw")
     paths = _prepare(config, meta.env_steps)
     console = Console(quiet=not show, soft_wrap=True, highlight=False)
     console.print(f"checkpoint: {checkpoint}", markup=False)

@@ -52,7 +52,11 @@ def _run(link: ChildLink) -> None:
     from gmijax.sim.randomize import randomized
     from gmijax.sim.registry import make_env
 
-    impl, why = choose_impl(config.physics.impl, jax.default_backend(), env_config.label)
+    wanted = config.physics.impl
+    if wanted == "auto" and CheckpointMeta.read(checkpoint).impl == "jax":
+        # A policy may depend on what it was trained with.
+        wanted = "jax"
+    impl, why = choose_impl(wanted, jax.default_backend(), env_config.label)
     sys.stdout.write(f"physics.impl={impl}: {why}\n")
     env = make_env(
         str(env_config.name),

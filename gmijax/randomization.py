@@ -25,6 +25,10 @@ RANDOMIZED_LEAVES: Mapping[str, str] = MappingProxyType(
 """Leaves of the physics model that may differ from world to world, and what their names name."""
 
 
+NEVER_ZERO = ("body_mass", "geom_friction", "pair_friction")
+"""Leaves that MJX divides by."""
+
+
 @dataclass(frozen=True, kw_only=True)
 class LeafRange:
     """How one leaf of the physics model is drawn, once for every world of the job."""
@@ -47,7 +51,7 @@ class LeafRange:
             raise ConfigError(f"{key}.range={list(self.range)}: expected [lowest, highest]")
         if self.names is not None and not self.names:
             raise ConfigError(f"{key}.names=[]: expected at least one name, or null for all")
-        if self.operation != "add" and leaf == "body_mass":
+        if self.operation != "add" and leaf in NEVER_ZERO:
             require_positive(f"{key}.range[0]", self.range[0])
         elif self.operation != "add":
             require_at_least(f"{key}.range[0]", self.range[0], 0.0)

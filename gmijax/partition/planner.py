@@ -224,11 +224,12 @@ def _template(plan: PlanConfig, reasons: list[str]) -> str:
 
 
 def _strategy(reduce: ReduceConfig, layout: Layout, reasons: list[str]) -> str:
+    if reduce.strategy != "auto":
+        require_strategy(reduce.strategy, layout)
     if layout.num_gmis == 1:
         reasons.append("strategy none: one GMI has nobody to average gradients with")
         return "none"
     if reduce.strategy != "auto":
-        require_strategy(reduce.strategy, layout)
         return reduce.strategy
     choice = select_strategy(layout)
     if needs_ring(choice.strategy, layout):

@@ -20,7 +20,7 @@ import numpy.typing as npt
 from mujoco import mjx
 
 from gmijax.errors import ConfigError
-from gmijax.randomization import RANDOMIZED_LEAVES, LeafRange
+from gmijax.randomization import NEVER_ZERO, RANDOMIZED_LEAVES, LeafRange
 from gmijax.sim.interface import Env
 from gmijax.sim.wrappers import env_keys
 from gmijax.types import PRNGKey
@@ -178,7 +178,7 @@ def _check_values(env: Env, leaf: str, drawn: LeafRange, values: Floats) -> None
     if drawn.operation != "scale" and leaf == "dof_frictionloss" and not values.all():
         raise ConfigError(f"{key}: MJX keeps joints of {task} without friction free of it")
     least = values.min() + drawn.range[0]
-    if drawn.operation == "add" and (least < 0 or (leaf == "body_mass" and least == 0)):
+    if drawn.operation == "add" and (least < 0 or (leaf in NEVER_ZERO and least == 0)):
         raise ConfigError(
             f"{key}.range={list(drawn.range)}: {task} has values as low as {values.min():g}, "
             f"which would become {least:g}"

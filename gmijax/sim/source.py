@@ -58,7 +58,10 @@ def pinned(env: EnvConfig) -> EnvConfig:
     if env.suite != "custom":
         return env
     path, function = split(str(env.name))
-    digest = hashlib.sha256(path.read_bytes()).hexdigest()
+    try:
+        digest = hashlib.sha256(path.read_bytes()).hexdigest()
+    except OSError as error:
+        raise ConfigError(f"env={path}: cannot be read ({error.strerror})") from None
     return dataclasses.replace(env, name=f"{path}:{function}", source_sha256=digest)
 
 

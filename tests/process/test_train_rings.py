@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import random
 import signal
 import time
@@ -65,7 +66,8 @@ def test_kills_at_any_moment_leave_nothing_of_a_job_with_rings(tmp_path: Path) -
         cwd = tmp_path / str(number)
         cwd.mkdir()
         run = cwd / "run"
-        job = start(*TINY, FOREVER, "plan.gpus=2", "run.dir=run", cwd=cwd)
+        rings = ("plan.gpus=2", "reduce.strategy=mrr")
+        job = start(*TINY, FOREVER, *rings, "run.dir=run", cwd=cwd)
         time.sleep(draw.uniform(1.0, 10.0))
         victims = [job.pid, *filter(None, (gmi_pid(run, gmi) for gmi in range(2)))]
         kill(draw.choice(victims))
@@ -73,3 +75,5 @@ def test_kills_at_any_moment_leave_nothing_of_a_job_with_rings(tmp_path: Path) -
         assert code in (1, -signal.SIGKILL), (cwd / "stderr.txt").read_text()
         wait_until(lambda run=run: not pids_of(run), 10, f"all GMIs of kill {number} gone")
     assert shared_memory() <= shm
+    plan = json.loads((tmp_path / "7" / "run" / "plan.json").read_text())
+    assert plan["strategy"] == "mrr"

@@ -6,6 +6,7 @@ import shutil
 import subprocess
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 from rich.console import Console
@@ -86,6 +87,14 @@ def test_a_checkpoint_that_is_not_there_is_bad_input(
     config = config_of(*(text.format(run=run.root) for text in overrides))
     with pytest.raises(ConfigError, match=message):
         evaluation._find(config)
+
+
+def test_worlds_cannot_be_drawn_from_no_ranges(run: RunPaths, monkeypatch: pytest.MonkeyPatch):
+    env = SimpleNamespace(name="ant", suite="gmijax", randomization={})
+    monkeypatch.setattr(evaluation, "trained_config", lambda checkpoint: (env, None))
+    config = config_of(f"run.dir={run.root}", "randomize=on")
+    with pytest.raises(ConfigError, match="names nothing to draw"):
+        evaluation.play(config)
 
 
 def test_a_checkpoint_of_another_run_is_bad_input(run: RunPaths, tmp_path: Path):

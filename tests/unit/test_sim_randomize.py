@@ -265,6 +265,7 @@ def test_the_ranges_of_every_task_fit_its_model(task: str):
         ({"body_mass": (2, 1)}, r"body_mass.range=\[2.0, 1.0\]: expected \[lowest, highest\]"),
         ({"body_mass": ()}, r"body_mass.range=\[\]: expected \[lowest, highest\]"),
         ({"body_mass": (0, 1)}, r"body_mass.range\[0\]=0.0: must be greater than 0"),
+        ({"pair_friction": (0, 1)}, r"pair_friction.range\[0\]=0.0: must be greater than 0"),
         ({"dof_damping": (-1, 1)}, r"dof_damping.range\[0\]=-1.0: must be at least 0"),
         ({"body_mass": (float("nan"), 1)}, "expected a list of numbers|expected a finite number"),
     ],

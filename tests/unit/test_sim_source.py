@@ -76,6 +76,7 @@ def test_a_task_may_import_what_lies_beside_it(tmp_path: Path, monkeypatch: pyte
         ("def make(", "def make(:", r"point\.py fails: SyntaxError: .*line 8\)$"),
         ("import jax.", "import jaxx.", r"ModuleNotFoundError: .*'jaxx'.*point\.py:2\)$"),
         ("impl, max_envs", "impl", r"TypeError: .*unexpected keyword argument 'max_envs'$"),
+        ("return Env(SPEC", "return Env(None", r"spec: expected an EnvSpec, got NoneType"),
         ("return Env(", "return (", r"expected a gmijax\.sim\.interface\.Env, got tuple$"),
         ('"point", 2', '"point", 0', r"spec\.obs_size=0: must be an integer of at least 1$"),
         ('"point", 2', '"point", 3', r"obs is float32\[2\], not float32\[3\]$"),

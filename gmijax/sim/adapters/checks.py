@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from gmijax.errors import ConfigError
-from gmijax.sim.interface import Env, EnvState
+from gmijax.sim.interface import Env, EnvSpec, EnvState
 from gmijax.types import PyTree
 
 
@@ -24,6 +24,8 @@ def check_env(env: Any, what: str) -> None:
     if not isinstance(env, Env):
         raise ConfigError(f"{what}: expected a gmijax.sim.interface.Env, got {_kind(env)}")
     spec = env.spec
+    if not isinstance(spec, EnvSpec):
+        raise ConfigError(f"{what}: spec: expected an EnvSpec, got {_kind(spec)}")
     for name in ("obs_size", "action_size", "episode_length"):
         size = getattr(spec, name)
         if not isinstance(size, int) or size < 1:
@@ -63,14 +65,14 @@ def attempt(what: str, function: Callable[..., Any], *arguments: Any, **named: A
         return function(*arguments, **named)
     except ConfigError:
         raise
-    except Exception as error:
+    except (Exception, SystemExit) as error:
         lines = str(error).strip().splitlines() or [""]
         raise ConfigError(
             f"{what} fails: {type(error).__name__}: {lines[0]}{_place(error)}"
         ) from error
 
 
-def _place(error: Exception) -> str:
+def _place(error: BaseException) -> str:
     if isinstance(error, SyntaxError):
         return ""  # Its message has the line.
     ours = str(Path(__file__).parents[2])

@@ -36,7 +36,7 @@ JOINT_NOISE = 0.125
 # Between the fingers' pads. The figures' source has a point where the fingers begin, and 0.04 m
 # askew from there; a gripper that holds the handle is 0.06 m away from it.
 GRASP_IN_HAND_M = (0.0, 0.0, 0.0584 + 0.045)
-# In a finger's frame: the middle of its pad. The source takes where the finger begins.
+# In a finger's frame: the inner face of its pad, near the tip. The source takes the root.
 PAD_IN_FINGER_M = (0.0, 0.0, 0.045)
 HANDLE_IN_DRAWER_M = (0.3, 0.01, 0.0)
 NEAR_M = 0.02
@@ -93,7 +93,7 @@ class FrankaCabinetPose(NamedTuple):
       handle: [3] the handle's point, metres.
       forward: [3] unit vector along which the fingers point.
       up: [3] unit vector from the right finger to the left one.
-      fingers: [2, 3] middles of the left and the right finger's pad, metres.
+      fingers: [2, 3] inner faces of the left and the right finger's pad, metres.
     """
 
     grasp: Array
