@@ -46,6 +46,7 @@ def test_two_gmis_learn_the_same_bits_under_every_strategy(tmp_path: Path) -> No
             np.testing.assert_array_equal(other, expected)
 
 
+@pytest.mark.slow
 @pytest.mark.timeout(400)
 def test_four_gmis_learn_the_same_under_every_strategy(tmp_path: Path) -> None:
     mpr = _trained("mpr", 2, tmp_path)
