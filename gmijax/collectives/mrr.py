@@ -141,6 +141,7 @@ def run_watched(courier: Courier, turns: Turns, program: Callable[[], jax.Array]
     """
     try:
         return courier.run(lambda: program().block_until_ready(), turns.watch)
-    except jax.errors.JaxRuntimeError as error:
+    # A transfer that fails while jax still dispatches it comes as a plain ValueError.
+    except (jax.errors.JaxRuntimeError, ValueError) as error:
         turns.explain_failure()
         raise CollectiveError(f"{turns.where()}: {str(error).splitlines()[0]}") from error
