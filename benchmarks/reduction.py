@@ -13,25 +13,19 @@ import os
 import sys
 import tempfile
 from collections.abc import Iterator
-from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
 
 from benchmarks.run import RESULTS
 from gmijax.collectives.cost_model import BYTES_PER_FLOAT, COSTS, predicted_s
-from gmijax.collectives.memory import create_exchange
 from gmijax.config import PlanConfig, ReduceConfig
 from gmijax.errors import ConfigError
-from gmijax.job import compilation_cache_dir
-from gmijax.partition.backends import open_backend
-from gmijax.partition.environment import gmi_environment
+from gmijax.launcher import Launch, run_gmis
 from gmijax.partition.layout import Layout
 from gmijax.partition.machine import detect_machine
-from gmijax.partition.plan import Plan
 from gmijax.partition.planner import make_plan
-from gmijax.partition.reduction import needs_ring, select_strategy, why_not_strategy
-from gmijax.partition.rendezvous import reserved_address
-from gmijax.partition.supervisor import Job, Patience, Supervisor
+from gmijax.partition.reduction import select_strategy, why_not_strategy
+from gmijax.partition.supervisor import Patience
 from gmijax.rundir import RunPaths, read_json, write_json
 
 SIZES = (110_000, 290_000, 1_500_000)
@@ -114,7 +108,16 @@ def measure(strategy: str, layout: Layout, num_floats: int, calls: int) -> dict[
         run = RunPaths(Path(scratch))
         write_json(run.plan, plan.to_dict())
         write_json(run.config, {"num_floats": num_floats, "calls": calls})
-        _run(plan, run)
+        run_gmis(
+            Launch(
+                plan=plan,
+                machine=machine,
+                run=run,
+                module="benchmarks.reduction_rank",
+                patience=PATIENCE,
+                compile_once=False,
+            )
+        )
         found = [read_json(run.gmi(gmi).result) for gmi in layout.gmis]
     return max(found, key=lambda result: result["median_s"])
 
@@ -127,37 +130,6 @@ def line(row: dict[str, Any]) -> str:
         f" ({row['p10_s'] * 1e3:.3f} to {row['p90_s'] * 1e3:.3f}),"
         f" predicted {row['predicted_s'] * 1e3:.3f} ms"
     )
-
-
-def _run(plan: Plan, run: RunPaths) -> None:
-    has_rings = needs_ring(plan.strategy, plan.layout)
-    exchange_fd = create_exchange()
-    try:
-        with (
-            reserved_address() if has_rings else nullcontext() as rendezvous,
-            open_backend(plan, detect_machine(), run) as backend,
-        ):
-            Supervisor(
-                Job(
-                    run=run,
-                    gmis=plan.layout.gmis,
-                    command=lambda _: [sys.executable, "-m", "benchmarks.reduction_rank"],
-                    environment=lambda gmi: gmi_environment(
-                        plan,
-                        gmi,
-                        dict(os.environ),
-                        compilation_cache_dir(),
-                        backend.environment(gmi),
-                        rendezvous,
-                    ),
-                    backend=backend,
-                    patience=PATIENCE,
-                    exchange_fd=exchange_fd,
-                    compile_once=False,
-                )
-            ).run()
-    finally:
-        os.close(exchange_fd)
 
 
 def _known(strategy: str) -> Any:

@@ -9,12 +9,11 @@ from typing import Any
 
 import numpy as np
 
-from gmijax.collectives.build import Membership, build_reducer
+from gmijax.collectives.build import Membership, build_reducer, join_world
 from gmijax.collectives.interface import Reducer, stays_on_device
-from gmijax.partition.child import ChildLink
+from gmijax.partition.child import ChildLink, run_gmi
 from gmijax.partition.plan import Plan
-from gmijax.partition.reduction import needs_ring
-from gmijax.rundir import read_json, write_json
+from gmijax.rundir import read_json
 
 WARM_UP_CALLS = 20
 TIMEOUT_S = 60.0
@@ -22,24 +21,12 @@ TIMEOUT_S = 60.0
 
 def main() -> int:
     """Measures and writes `result.json`; returns 0."""
-    link = ChildLink.from_environment()
-    link.beat("starting", 0)
-    try:
-        write_json(link.paths.result, _measure(link))
-    except BaseException as error:
-        link.report_error(error)
-        raise
-    link.beat("done", 0)
-    return 0
+    return run_gmi(_measure)
 
 
 def _measure(link: ChildLink) -> dict[str, Any]:
     plan, task = Plan.from_dict(read_json(link.run.plan)), read_json(link.run.config)
-    world = None
-    if needs_ring(plan.strategy, plan.layout):
-        from gmijax.collectives.ring import World
-
-        world = World.join(plan.layout, link.gmi, link.rendezvous or "", TIMEOUT_S)
+    world = join_world(plan.strategy, plan.layout, link.gmi, link.rendezvous, TIMEOUT_S)
     reducer = build_reducer(
         plan.strategy,
         Membership(

@@ -21,14 +21,12 @@ from rich.table import Table
 
 from gmijax.config import PlanConfig, PlayConfig, ReduceConfig
 from gmijax.errors import ConfigError, GmijaxError
-from gmijax.job import compilation_cache_dir
-from gmijax.partition.backends import open_backend
-from gmijax.partition.environment import gmi_environment
+from gmijax.launcher import Launch, run_gmis
 from gmijax.partition.failures import last_line, signal_name
 from gmijax.partition.machine import Machine, detect_machine
 from gmijax.partition.plan import Plan
 from gmijax.partition.planner import make_plan
-from gmijax.partition.supervisor import Job, Patience, Supervisor
+from gmijax.partition.supervisor import Patience
 from gmijax.playdir import EXIT_NO_GL, PlayPaths
 from gmijax.resume import CheckpointMeta, find_checkpoint, trained_config
 from gmijax.rundir import META, STEP_DIGITS, RunPaths, read_json, write_json
@@ -97,7 +95,7 @@ def play(config: PlayConfig, *, show: bool = False) -> Evaluation:
     if changed := source.changes(source.pinned(env), dataclasses.asdict(env)):
         console.print(changed, markup=False)
     with console.status(f"playing {config.num_envs} episodes"):
-        _evaluate(config, paths)
+        run_gmis(_launch(config, paths, detect_machine()))
     returns = read_json(paths.returns)
     console.print(_table(returns))
     console.print(f"returns: {paths.returns}", markup=False)
@@ -158,22 +156,17 @@ def _prepare(config: PlayConfig, env_steps: int) -> PlayPaths:
     return paths
 
 
-def _evaluate(config: PlayConfig, paths: PlayPaths) -> None:
-    machine = detect_machine()
-    plan = _light_plan(config.num_envs, machine)
-    run = RunPaths(paths.root)
-    with open_backend(plan, machine, run) as backend:
-        added = backend.environment(0)
-        Supervisor(
-            Job(
-                run=run,
-                gmis=plan.layout.gmis,
-                command=lambda _: [sys.executable, "-m", "gmijax.playback"],
-                environment=lambda gmi: _light_environment(plan, gmi, added),
-                backend=backend,
-                patience=_PATIENCE,
-            )
-        ).run()
+def _launch(config: PlayConfig, paths: PlayPaths, machine: Machine) -> Launch:
+    return Launch(
+        plan=_light_plan(config.num_envs, machine),
+        machine=machine,
+        run=RunPaths(paths.root),
+        module="gmijax.playback",
+        patience=_PATIENCE,
+        stops_gracefully=False,
+        # The GPU may be training: take what is needed when it is needed, up to the fraction.
+        variables={"XLA_PYTHON_CLIENT_PREALLOCATE": "false"},
+    )
 
 
 def _light_plan(num_envs: int, machine: Machine) -> Plan:
@@ -188,12 +181,6 @@ def _light_plan(num_envs: int, machine: Machine) -> Plan:
     )
     nobody = ReduceConfig(strategy="auto", intra="auto", timeout_s=1.0)
     return make_plan(one, nobody, num_envs, machine)
-
-
-def _light_environment(plan: Plan, gmi: int, added: Mapping[str, str]) -> dict[str, str]:
-    environment = gmi_environment(plan, gmi, dict(os.environ), compilation_cache_dir(), added)
-    # The GPU may be training: take what is needed when it is needed, up to the fraction.
-    return {**environment, "XLA_PYTHON_CLIENT_PREALLOCATE": "false"}
 
 
 def _accept_nothing_to_see(config: PlayConfig, env: str, console: Console) -> None:

@@ -7,31 +7,24 @@ enters the backend, runs the GMIs, and writes the summary however the job ends.
 from __future__ import annotations
 
 import dataclasses
-import os
-import signal
 import sys
-import threading
 import time
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager, nullcontext, suppress
+from collections.abc import Sequence
+from contextlib import suppress
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any, NamedTuple
 
 from rich.console import Console
 
-from gmijax.collectives.memory import create_exchange
 from gmijax.config import TrainConfig
 from gmijax.errors import ConfigError, GmijaxError, JobInterrupted
-from gmijax.partition.backends import open_backend
-from gmijax.partition.environment import gmi_environment
+from gmijax.launcher import Launch, run_gmis
 from gmijax.partition.machine import Machine, detect_machine
 from gmijax.partition.plan import Plan
 from gmijax.partition.planner import make_plan
-from gmijax.partition.reduction import needs_ring
-from gmijax.partition.rendezvous import reserved_address
-from gmijax.partition.supervisor import Job, Patience, Supervisor
-from gmijax.progress import ConsoleProgress, Progress, SilentProgress
+from gmijax.partition.supervisor import Patience
+from gmijax.progress import ConsoleProgress, SilentProgress
 from gmijax.results import MetricsReader, copy_history, draw_returns, read_metrics
 from gmijax.resume import CheckpointMeta, check_fits, find_checkpoint, saved_config
 from gmijax.rundir import RunPaths, create_run, read_json, write_json
@@ -89,7 +82,8 @@ def train(config: TrainConfig, *, show: bool = False) -> Result:
     status = "failed"
     try:
         _copy_history(config, run)
-        _run_gmis(config, plan, machine, run, progress)
+        with progress:
+            run_gmis(_launch(config, plan, machine, run), progress.update)
         status = "completed"
     except JobInterrupted as error:
         status = "interrupted"
@@ -166,68 +160,20 @@ def _with_checkpoint(config: TrainConfig) -> TrainConfig:
     return dataclasses.replace(config, run=dataclasses.replace(config.run, resume=str(checkpoint)))
 
 
-def _run_gmis(
-    config: TrainConfig, plan: Plan, machine: Machine, run: RunPaths, progress: Progress
-) -> None:
-    exchange_fd = create_exchange() if plan.layout.num_gmis > 1 else None
-    has_rings = needs_ring(plan.strategy, plan.layout)
-    try:
-        with (
-            reserved_address() if has_rings else nullcontext() as rendezvous,
-            open_backend(plan, machine, run) as backend,
-        ):
-            supervisor = Supervisor(
-                Job(
-                    run=run,
-                    gmis=plan.layout.gmis,
-                    command=lambda _: [sys.executable, "-m", "gmijax.worker"],
-                    environment=lambda gmi: gmi_environment(
-                        plan,
-                        gmi,
-                        dict(os.environ),
-                        compilation_cache_dir(),
-                        backend.environment(gmi),
-                        rendezvous,
-                    ),
-                    backend=backend,
-                    patience=Patience(
-                        start_timeout_s=config.run.start_timeout_s,
-                        stall_timeout_s=config.run.stall_timeout_s,
-                        stop_timeout_s=config.run.stall_timeout_s,
-                        grace_s=config.run.grace_s,
-                    ),
-                    exchange_fd=exchange_fd,
-                    # GMIs that form rings meet before they compile.
-                    compile_once=not has_rings,
-                )
-            )
-            with progress, _stopping_on_signals(supervisor.request_stop):
-                supervisor.run(progress.update)
-    finally:
-        if exchange_fd is not None:
-            os.close(exchange_fd)
-
-
-def compilation_cache_dir() -> Path:
-    """Where compiled programs stay between runs, unless JAX_COMPILATION_CACHE_DIR says else."""
-    base = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
-    return Path(base) / "gmijax" / "xla"
-
-
-@contextmanager
-def _stopping_on_signals(request_stop: Callable[[], None]) -> Iterator[None]:
-    # Python delivers signals to the main thread only; elsewhere they are the caller's business.
-    is_main = threading.current_thread() is threading.main_thread()
-    previous = {
-        number: signal.signal(number, lambda *_: request_stop())
-        for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
-        if is_main
-    }
-    try:
-        yield
-    finally:
-        for number, handler in previous.items():
-            signal.signal(number, handler)
+def _launch(config: TrainConfig, plan: Plan, machine: Machine, run: RunPaths) -> Launch:
+    times = config.run
+    return Launch(
+        plan=plan,
+        machine=machine,
+        run=run,
+        module="gmijax.worker",
+        patience=Patience(
+            start_timeout_s=times.start_timeout_s,
+            stall_timeout_s=times.stall_timeout_s,
+            stop_timeout_s=times.stall_timeout_s,
+            grace_s=times.grace_s,
+        ),
+    )
 
 
 def _announce(console: Console, plan: Plan, more: Sequence[str], run: RunPaths) -> None:

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 from gmijax.config import PlayConfig
 from gmijax.errors import ConfigError
-from gmijax.partition.child import ChildLink
+from gmijax.partition.child import ChildLink, run_gmi
 from gmijax.playdir import PlayPaths
 from gmijax.resume import CheckpointMeta, trained_config
 from gmijax.rundir import read_json, write_json
@@ -27,15 +27,7 @@ if TYPE_CHECKING:
 
 def main() -> int:
     """Runs the evaluation; returns the exit code."""
-    link = ChildLink.from_environment()  # Pins the cores, so it comes before jax.
-    link.beat("starting", 0)
-    try:
-        _run(link)
-    except BaseException as error:  # The controller must learn of every way to fail.
-        link.report_error(error)
-        raise
-    link.beat("done", 0)
-    return 0
+    return run_gmi(_run)
 
 
 def _run(link: ChildLink) -> None:

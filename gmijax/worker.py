@@ -10,36 +10,28 @@ import sys
 from typing import TYPE_CHECKING, Any
 
 from gmijax.config import TrainConfig
-from gmijax.errors import ConfigError
-from gmijax.partition.child import ENV_RENDEZVOUS, ChildLink
+from gmijax.partition.child import ChildLink, run_gmi
 from gmijax.partition.plan import Plan
-from gmijax.partition.reduction import needs_ring
-from gmijax.rundir import read_json, write_json
+from gmijax.rundir import read_json
 from gmijax.schema import from_dict
 
 if TYPE_CHECKING:
-    from gmijax.collectives.ring import World
+    pass
 
 
 def main() -> int:
     """Runs this process's GMI; returns the exit code."""
-    link = ChildLink.from_environment()  # Pins the cores, so it comes before jax.
-    link.beat("starting", 0)
-    try:
-        write_json(link.paths.result, _run(link))
-    except BaseException as error:  # The controller must learn of every way to fail.
-        link.report_error(error)
-        raise
-    link.beat("done", 0)
-    return 0
+    return run_gmi(_run)
 
 
 def _run(link: ChildLink) -> dict[str, Any]:
     config = from_dict(TrainConfig, read_json(link.run.config))
     plan = Plan.from_dict(read_json(link.run.plan))
     # jax starts here, in the environment that the plan prepared.
-    world = _join_world(link, config, plan)  # Comes before all other use of jax.
-    from gmijax.collectives.build import Membership, build_reducer
+    from gmijax.collectives.build import Membership, build_reducer, join_world
+
+    start_timeout_s = config.run.start_timeout_s
+    world = join_world(plan.strategy, plan.layout, link.gmi, link.rendezvous, start_timeout_s)
     from gmijax.ppo.programs import exchange_size
     from gmijax.ppo.role import train
     from gmijax.sim.randomize import randomized
@@ -69,7 +61,7 @@ def _run(link: ChildLink) -> dict[str, Any]:
             num_floats=exchange_size(env.spec, config.algo),
             exchange_fd=link.exchange_fd,
             timeout_s=config.reduce.timeout_s,
-            rendezvous_timeout_s=config.run.start_timeout_s,
+            rendezvous_timeout_s=start_timeout_s,
             world=world,
             intra=plan.intra,
         ),
@@ -78,20 +70,6 @@ def _run(link: ChildLink) -> dict[str, Any]:
         return train(config, training_env(env), reducer, link)
     finally:
         reducer.close()
-
-
-def _join_world(link: ChildLink, config: TrainConfig, plan: Plan) -> World | None:
-    """This process among those of all GMIs, None if the strategy needs no rings."""
-    if not needs_ring(plan.strategy, plan.layout):
-        return None
-    if link.rendezvous is None:
-        raise ConfigError(
-            f"{ENV_RENDEZVOUS} is not set: reduce.strategy={plan.strategy} needs an address "
-            "where GMIs meet"
-        )
-    from gmijax.collectives.ring import World
-
-    return World.join(plan.layout, link.gmi, link.rendezvous, config.run.start_timeout_s)
 
 
 if __name__ == "__main__":

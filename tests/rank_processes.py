@@ -20,7 +20,7 @@ from typing import Any
 
 import numpy as np
 
-from gmijax.collectives.build import Membership, build_reducer
+from gmijax.collectives.build import Membership, build_reducer, join_world
 from gmijax.collectives.interface import DeviceReducer, FloatBuffer, Reducer, stays_on_device
 from gmijax.collectives.memory import create_exchange
 from gmijax.errors import CollectiveTimeout, GmijaxError, PeerLost
@@ -245,21 +245,17 @@ def layout_of(options: Options) -> Layout:
 
 def make_reducer(options: Options) -> Reducer:
     """The reducer of one rank."""
-    layout, world = layout_of(options), None
-    if needs_ring(options["strategy"], layout):
-        from gmijax.collectives.ring import World
-
-        world = World.join(layout, options["rank"], options["address"], options["start_s"])
+    strategy, rank, layout = options["strategy"], options["rank"], layout_of(options)
     return build_reducer(
-        options["strategy"],
+        strategy,
         Membership(
             layout=layout,
-            rank=options["rank"],
+            rank=rank,
             num_floats=options["num_floats"],
             exchange_fd=int(os.environ[ENV_EXCHANGE_FD]),
             timeout_s=options["timeout_s"],
             rendezvous_timeout_s=options["start_s"],
-            world=world,
+            world=join_world(strategy, layout, rank, options.get("address"), options["start_s"]),
         ),
     )
 

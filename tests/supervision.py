@@ -66,7 +66,7 @@ def make_job(
     *,
     command: Callable[[int], list[str]] | None = None,
     compile_once: bool = True,
-    exchange_fd: int | None = None,
+    inherited_fds: Mapping[str, int] | None = None,
     **patience_s: float,
 ) -> Job:
     """A job whose GMI i runs `fake_gmi.py modes[i]`."""
@@ -88,7 +88,7 @@ def make_job(
             stop_timeout_s=limits["stop"],
             grace_s=limits["grace"],
         ),
-        exchange_fd=exchange_fd,
+        inherited_fds=inherited_fds or {},
         compile_once=compile_once,
     )
 

@@ -44,6 +44,26 @@ class Membership:
     intra: str = "host"
 
 
+def join_world(
+    strategy: str, layout: Layout, rank: int, address: str | None, timeout_s: float
+) -> World | None:
+    """This process among those of all GMIs; None if the strategy needs no rings.
+
+    Comes before all other use of jax.
+
+    Raises:
+      ConfigError: no address where the GMIs meet.
+      CollectiveError: the others did not come.
+    """
+    if not needs_ring(strategy, layout):
+        return None
+    if address is None:
+        raise ConfigError(f"reduce.strategy={strategy}: needs an address where GMIs meet")
+    from gmijax.collectives.ring import World  # Imports jax.
+
+    return World.join(layout, rank, address, timeout_s)
+
+
 def build_reducer(name: str, membership: Membership) -> Reducer:
     """Makes the reducer of one rank with the strategy `name`.
 

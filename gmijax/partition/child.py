@@ -11,9 +11,9 @@ import signal
 import threading
 import time
 import traceback
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 from gmijax.errors import ConfigError
 from gmijax.partition.heartbeat import GmiState, Heartbeat, write_heartbeat
@@ -82,8 +82,8 @@ class ChildLink:
         return cls(
             gmi,
             RunPaths(Path(run_dir)),
-            _inherited_fd(environment, ENV_LIFELINE_FD),
-            _inherited_fd(environment, ENV_EXCHANGE_FD),
+            inherited_fd(environment, ENV_LIFELINE_FD),
+            inherited_fd(environment, ENV_EXCHANGE_FD),
             environment.get(ENV_RENDEZVOUS),
         )
 
@@ -128,6 +128,24 @@ class ChildLink:
                 self._stop.set()
 
 
+def run_gmi(routine: Callable[[ChildLink], Mapping[str, Any] | None]) -> int:
+    """Main of a GMI: its routine between the first beat and the last; returns the exit code.
+
+    What the routine returns is the content of `result.json`; None writes none.
+    """
+    link = ChildLink.from_environment()  # Pins the cores, so it comes before jax.
+    link.beat("starting", 0)
+    try:
+        result = routine(link)
+        if result is not None:
+            write_json(link.paths.result, result)
+    except BaseException as error:  # The controller must learn of every way to fail.
+        link.report_error(error)
+        raise
+    link.beat("done", 0)
+    return 0
+
+
 def pin_to_cpus(cpus: str) -> None:
     """Restricts this process to the cores in `cpus`, e.g. `0,1,5`; empty for no restriction."""
     if cpus and hasattr(os, "sched_setaffinity"):
@@ -142,7 +160,12 @@ def _end_now() -> None:
     os._exit(1)
 
 
-def _inherited_fd(environment: Mapping[str, str], name: str) -> int | None:
+def inherited_fd(environment: Mapping[str, str], name: str) -> int | None:
+    """The open descriptor whose number stands in the variable `name`, None if it is not set.
+
+    Raises:
+      ConfigError: it is not a number, or not of an open file.
+    """
     if name not in environment:
         return None
     try:

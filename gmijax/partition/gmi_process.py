@@ -11,7 +11,7 @@ from contextlib import suppress
 from typing import NamedTuple
 
 from gmijax.errors import GmiFailed
-from gmijax.partition.child import ENV_EXCHANGE_FD, ENV_LIFELINE_FD, ENV_RUN_DIR, STOP_BYTE
+from gmijax.partition.child import ENV_LIFELINE_FD, ENV_RUN_DIR, STOP_BYTE
 from gmijax.partition.heartbeat import Heartbeat, read_heartbeat
 from gmijax.rundir import GmiPaths, RunPaths
 
@@ -64,9 +64,9 @@ class GmiProcess:
         command: Sequence[str],
         environment: Mapping[str, str],
         run: RunPaths,
-        exchange_fd: int | None = None,
+        inherited_fds: Mapping[str, int],
     ) -> GmiProcess:
-        """Starts a fresh interpreter that inherits its lifeline and nothing else of ours.
+        """Starts a fresh interpreter that inherits its lifeline, `inherited_fds`, nothing else.
 
         Raises:
           GmiFailed: the program cannot be started.
@@ -76,9 +76,7 @@ class GmiProcess:
         for stale in (paths.heartbeat, paths.error, paths.result):
             stale.unlink(missing_ok=True)
         read_end, write_end = os.pipe()
-        inherited = {ENV_LIFELINE_FD: read_end}
-        if exchange_fd is not None:
-            inherited[ENV_EXCHANGE_FD] = exchange_fd
+        inherited = {ENV_LIFELINE_FD: read_end, **inherited_fds}
         variables = {name: str(fd) for name, fd in inherited.items()}
         try:
             process = _spawn(

@@ -10,7 +10,7 @@ import signal
 import time
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 from gmijax.errors import GmiFailed, JobInterrupted
 from gmijax.partition.backends.interface import Backend
@@ -52,7 +52,8 @@ class Job:
         adds the run folder, the lifeline and the exchange.
       backend: an entered backend.
       patience: time limits.
-      exchange_fd: open file that every GMI inherits for the exchange of gradients.
+      inherited_fds: open files that every GMI inherits, by the environment variable that will
+        hold the number of the descriptor.
       compile_once: start the first GMI alone and the others when it has compiled, so that
         they find its program in the compilation cache.
     """
@@ -63,7 +64,7 @@ class Job:
     environment: Callable[[int], Mapping[str, str]]
     backend: Backend
     patience: Patience
-    exchange_fd: int | None = None
+    inherited_fds: Mapping[str, int] = field(default_factory=dict)
     compile_once: bool = True
 
 
@@ -137,7 +138,7 @@ class Supervisor:
     def _start(self, gmi: int) -> None:
         job = self._job
         process = GmiProcess.start(
-            gmi, job.command(gmi), job.environment(gmi), job.run, job.exchange_fd
+            gmi, job.command(gmi), job.environment(gmi), job.run, job.inherited_fds
         )
         self._started[gmi] = process
         self._waiting.remove(gmi)

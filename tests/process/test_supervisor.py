@@ -14,6 +14,7 @@ import pytest
 from supervision import CHECKOUT, TESTS, cpu_job
 
 from gmijax.errors import ConfigError, GmiFailed, JobInterrupted
+from gmijax.partition.child import ENV_EXCHANGE_FD
 from gmijax.partition.gmi_process import GmiStatus
 from gmijax.partition.supervisor import Job, Supervisor
 from gmijax.processes import ProcessId, identify, wait_until_gone
@@ -191,7 +192,7 @@ def test_exchange_file_reaches_every_gmi(run: RunPaths):
                 run,
                 ["clean"] * 3,
                 command=lambda gmi: [sys.executable, "-c", code],
-                exchange_fd=exchange,
+                inherited_fds={ENV_EXCHANGE_FD: exchange},
             )
         )
         assert os.pread(exchange, 10, 0) == b"xxx"

@@ -15,6 +15,7 @@ from gmijax import evaluation
 from gmijax.cli import command
 from gmijax.config import PlayConfig
 from gmijax.errors import ConfigError, GmijaxError
+from gmijax.launcher import environment_of
 from gmijax.partition.machine import Machine
 from gmijax.partition.nvidia import Gpu
 from gmijax.playdir import EXIT_NO_GL, PlayPaths
@@ -105,10 +106,11 @@ def test_a_checkpoint_of_another_run_is_bad_input(run: RunPaths, tmp_path: Path)
         evaluation._find(config)
 
 
-def test_playing_leaves_a_gpu_to_the_job_that_trains_on_it():
+def test_playing_leaves_a_gpu_to_the_job_that_trains_on_it(run: RunPaths):
     machine = Machine(gpus=(Gpu(0, "GPU-1", "some GPU", 80000, (9, 0), False),), cpu_cores=(0, 1))
-    plan = evaluation._light_plan(4, machine)
-    environment = evaluation._light_environment(plan, 0, {})
+    config = config_of(f"run.dir={run.root}", "num_envs=4", "video_envs=1")
+    launch = evaluation._launch(config, PlayPaths(run.root), machine)
+    environment = environment_of(launch, 0, {})
     assert environment["XLA_CLIENT_MEM_FRACTION"] == "0.1"
     assert environment["XLA_PYTHON_CLIENT_PREALLOCATE"] == "false"
 

@@ -1,0 +1,132 @@
+"""Starts the GMIs of a plan and watches them to their end, with all that they share. No jax here.
+
+What GMIs share is made here and gone when `run_gmis` returns: blocks of memory without a name,
+a reserved port for those that form rings, the backend with its daemons.
+"""
+
+from __future__ import annotations
+
+import os
+import signal
+import sys
+import threading
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from gmijax.collectives.memory import create_exchange
+from gmijax.partition.backends import open_backend
+from gmijax.partition.child import ENV_EXCHANGE_FD
+from gmijax.partition.environment import gmi_environment
+from gmijax.partition.gmi_process import GmiStatus
+from gmijax.partition.machine import Machine
+from gmijax.partition.plan import Plan
+from gmijax.partition.reduction import needs_ring
+from gmijax.partition.rendezvous import reserved_address
+from gmijax.partition.supervisor import Job, Patience, Supervisor
+from gmijax.rundir import RunPaths
+
+
+@dataclass(frozen=True, kw_only=True)
+class Launch:
+    """What to run in the GMIs of a plan.
+
+    Attributes:
+      plan: where GMIs live and what they share.
+      machine: where this is; see `detect_machine`.
+      run: the run folder; what the GMIs read from it is there already.
+      module: main of every GMI, started by name: `python -m module`.
+      patience: time limits.
+      stops_gracefully: a first SIGINT, SIGTERM or SIGHUP asks the GMIs to finish by themselves;
+        otherwise signals do what Python does with them.
+      compile_once: see `Job`; never where GMIs form rings, which meet before they compile.
+      shared: blocks of memory for all GMIs, by the environment variable that names the
+        descriptor, and what makes one; beside the block that reducers use.
+      variables: more environment variables of every GMI.
+    """
+
+    plan: Plan
+    machine: Machine
+    run: RunPaths
+    module: str
+    patience: Patience
+    stops_gracefully: bool = True
+    compile_once: bool = True
+    shared: Mapping[str, Callable[[], int]] = field(default_factory=dict)
+    variables: Mapping[str, str] = field(default_factory=dict)
+
+
+def run_gmis(
+    launch: Launch, on_tick: Callable[[tuple[GmiStatus, ...]], None] | None = None
+) -> None:
+    """Runs all GMIs to their end; calls `on_tick` about 20 times a second.
+
+    Raises:
+      GmiFailed: a GMI failed; names the first one.
+      ConfigError: a GMI rejected its input.
+      JobInterrupted: a signal came, and every GMI has ended.
+    """
+    plan = launch.plan
+    has_rings = needs_ring(plan.strategy, plan.layout)
+    with ExitStack() as held:
+        blocks = dict(launch.shared)
+        if plan.layout.num_gmis > 1:
+            blocks[ENV_EXCHANGE_FD] = create_exchange
+        inherited = {name: _open_block(held, create) for name, create in blocks.items()}
+        rendezvous = held.enter_context(reserved_address()) if has_rings else None
+        backend = held.enter_context(open_backend(plan, launch.machine, launch.run))
+        supervisor = Supervisor(
+            Job(
+                run=launch.run,
+                gmis=plan.layout.gmis,
+                command=lambda _: [sys.executable, "-m", launch.module],
+                environment=lambda gmi: environment_of(
+                    launch, gmi, backend.environment(gmi), rendezvous
+                ),
+                backend=backend,
+                patience=launch.patience,
+                inherited_fds=inherited,
+                compile_once=launch.compile_once and not has_rings,
+            )
+        )
+        if launch.stops_gracefully:
+            held.enter_context(_stopping_on_signals(supervisor.request_stop))
+        supervisor.run(on_tick)
+
+
+def environment_of(
+    launch: Launch, gmi: int, added: Mapping[str, str], rendezvous: str | None = None
+) -> dict[str, str]:
+    """All environment variables of a GMI; `added` are those of its backend."""
+    own, cache = dict(os.environ), compilation_cache_dir()
+    variables = gmi_environment(launch.plan, gmi, own, cache, added, rendezvous)
+    return {**variables, **launch.variables}
+
+
+def compilation_cache_dir() -> Path:
+    """Where compiled programs stay between runs, unless JAX_COMPILATION_CACHE_DIR says else."""
+    base = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
+    return Path(base) / "gmijax" / "xla"
+
+
+def _open_block(held: ExitStack, create: Callable[[], int]) -> int:
+    fd = create()
+    held.callback(os.close, fd)
+    return fd
+
+
+@contextmanager
+def _stopping_on_signals(request_stop: Callable[[], None]) -> Iterator[None]:
+    # Python delivers signals to the main thread only; elsewhere they are the caller's business.
+    is_main = threading.current_thread() is threading.main_thread()
+    previous = {
+        number: signal.signal(number, lambda *_: request_stop())
+        for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+        if is_main
+    }
+    try:
+        yield
+    finally:
+        for number, handler in previous.items():
+            signal.signal(number, handler)
