@@ -7,14 +7,9 @@ GMI of a small plan, `gmijax.sim.render` films them.
 from __future__ import annotations
 
 import dataclasses
-import importlib.util
-import os
-import signal
-import subprocess
-import sys
 from collections.abc import Mapping
 from pathlib import Path
-from typing import IO, Any, Final, NamedTuple
+from typing import Any, Final, NamedTuple
 
 from rich.console import Console
 from rich.table import Table
@@ -22,12 +17,12 @@ from rich.table import Table
 from gmijax.config import PlanConfig, PlayConfig, ReduceConfig
 from gmijax.errors import ConfigError, GmijaxError
 from gmijax.launcher import Launch, run_gmis
-from gmijax.partition.failures import last_line, signal_name
 from gmijax.partition.machine import Machine, detect_machine
 from gmijax.partition.plan import Plan
 from gmijax.partition.planner import make_plan
 from gmijax.partition.supervisor import Patience
-from gmijax.playdir import EXIT_NO_GL, PlayPaths
+from gmijax.pictures import film, has_brax, write_page
+from gmijax.playdir import PlayPaths
 from gmijax.resume import CheckpointMeta, find_checkpoint, trained_config
 from gmijax.rundir import META, STEP_DIGITS, RunPaths, read_json, write_json
 from gmijax.schema import to_dict
@@ -40,8 +35,6 @@ MEMORY_FRACTION: Final = 0.1
 _PATIENCE: Final = Patience(
     start_timeout_s=1200.0, stall_timeout_s=600.0, stop_timeout_s=60.0, grace_s=10.0
 )
-_GL: Final = "MUJOCO_GL"
-_FALLBACK_GLS: Final = ("egl", "osmesa")
 
 
 class Evaluation(NamedTuple):
@@ -72,7 +65,7 @@ def play(config: PlayConfig, *, show: bool = False) -> Evaluation:
       GmiFailed: the evaluation failed.
       GmijaxError: a film was asked for and could not be made; the returns are there.
     """
-    if config.html == "on" and not _has_brax():
+    if config.html == "on" and not has_brax():
         raise ConfigError(
             "html=on: needs the package brax (pip install 'gmijax[brax]'); "
             "allowed without it are auto, off"
@@ -102,8 +95,8 @@ def play(config: PlayConfig, *, show: bool = False) -> Evaluation:
     if not paths.model.exists():
         _accept_nothing_to_see(config, returns["env"], console)
         return Evaluation(returns, paths.returns, (), None)
-    html = None if config.html == "off" else _write_page(config, paths, console)
-    videos = () if config.video == "none" else _film(config, paths, console)
+    html = None if config.html == "off" else write_page(config, paths, console)
+    videos = () if config.video == "none" else film(config, paths, console)
     return Evaluation(returns, paths.returns, videos, html)
 
 
@@ -190,87 +183,6 @@ def _accept_nothing_to_see(config: PlayConfig, env: str, console: Console) -> No
         raise GmijaxError(reason)
     if config.video == "auto":
         console.print(reason, markup=False)
-
-
-def _write_page(config: PlayConfig, paths: PlayPaths, console: Console) -> Path | None:
-    """Writes the page in a child of its own: Brax's libraries may fail as they like."""
-    if not _has_brax():
-        return None
-    # A page is quickly made, and the GPU may be training.
-    environment = {"PJRT_NPROC": "4", **os.environ, "JAX_PLATFORMS": "cpu"}
-    with console.status("writing the page"), paths.page_log.open("wb") as log:
-        exit_code = _child("gmijax.sim.page", paths, environment, log)
-    if exit_code == 0:
-        console.print(f"page: {paths.html}", markup=False)
-        return paths.html
-    reason = f"no page: {last_line(paths.page_log)} (log: {paths.page_log})"
-    if config.html == "on":
-        raise GmijaxError(f"{reason}; the returns were evaluated")
-    console.print(reason, markup=False)
-    return None
-
-
-def _has_brax() -> bool:
-    return importlib.util.find_spec("brax") is not None
-
-
-def _film(config: PlayConfig, paths: PlayPaths, console: Console) -> tuple[Path, ...]:
-    """Films with the first OpenGL that works; each is tried in a fresh interpreter."""
-    users = os.environ.get(_GL)
-    tried = tuple(dict.fromkeys((users, *_FALLBACK_GLS) if users else _FALLBACK_GLS))
-    exit_code = EXIT_NO_GL
-    for gl in tried:
-        with console.status(f"filming with {gl}"):
-            exit_code = _render(gl, paths)
-        if exit_code == 0:
-            videos = tuple(path for path in (paths.mp4, paths.gif) if path.exists())
-            for video in videos:
-                console.print(f"video: {video}", markup=False)
-            return videos
-        if not _is_for_want_of_gl(exit_code):
-            raise GmijaxError(f"no video: {_why(exit_code, paths)}; the returns were evaluated")
-    reason = (
-        f"no video: no headless OpenGL (EGL or OSMesa) is to be had, tried {', '.join(tried)}; "
-        "install it with `apt-get install libegl1` or `apt-get install libosmesa6`; "
-        f"the last one: {_why(exit_code, paths)}; the returns were evaluated"
-    )
-    if config.video != "auto":
-        raise GmijaxError(reason)
-    console.print(reason, markup=False)
-    return ()
-
-
-def _is_for_want_of_gl(exit_code: int) -> bool:
-    # A broken driver may end the process with a signal instead of an error. These two come from
-    # somebody else: the user, a batch system, or the machine when it runs out of memory.
-    sent = (-signal.SIGKILL, -signal.SIGTERM)
-    return exit_code == EXIT_NO_GL or (exit_code < 0 and exit_code not in sent)
-
-
-def _why(exit_code: int, paths: PlayPaths) -> str:
-    ended = f"the renderer was ended by {signal_name(-exit_code)}" if exit_code < 0 else ""
-    said = last_line(paths.render_log)
-    return f"{': '.join(filter(None, (ended, said)))} (log: {paths.render_log})"
-
-
-def _render(gl: str, paths: PlayPaths) -> int:
-    environment = {**os.environ, _GL: gl}
-    # MuJoCo sets it to what fits MUJOCO_GL, and refuses any other value.
-    environment.pop("PYOPENGL_PLATFORM", None)
-    with paths.render_log.open("ab") as log:
-        return _child("gmijax.sim.render", paths, environment, log)
-
-
-def _child(module: str, paths: PlayPaths, environment: Mapping[str, str], log: IO[bytes]) -> int:
-    """Runs a module on the folder of a played checkpoint; returns its exit code."""
-    return subprocess.run(
-        [sys.executable, "-m", module, str(paths.root)],
-        env=environment,
-        stdin=subprocess.DEVNULL,
-        stdout=log,
-        stderr=log,
-        check=False,
-    ).returncode
 
 
 def _table(returns: Mapping[str, Any]) -> Table:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import random
 import signal
 import subprocess
 import sys
@@ -27,11 +28,11 @@ FOREVER = "num_timesteps=1000000000"
 
 
 def train(
-    *overrides: str, cwd: Path, timeout_s: float = 240.0
+    *overrides: str, cwd: Path, timeout_s: float = 240.0, command: str = "train"
 ) -> subprocess.CompletedProcess[str]:
     """Runs a command to its end."""
     return subprocess.run(
-        [sys.executable, "-m", "gmijax.train", *overrides],
+        [sys.executable, "-m", f"gmijax.{command}", *overrides],
         cwd=cwd,
         env=child_environment(),
         capture_output=True,
@@ -122,6 +123,20 @@ def kill(pid: int) -> None:
         os.kill(pid, signal.SIGKILL)
     except ProcessLookupError:
         return
+
+
+def kill_somebody(
+    *overrides: str, cwd: Path, draw: random.Random, within_s: tuple[float, float]
+) -> None:
+    """Kills the controller or one of two GMIs of a job at any moment; nothing may be left."""
+    cwd.mkdir()
+    run = cwd / "run"
+    job = start(*TINY, FOREVER, *overrides, "run.dir=run", cwd=cwd)
+    time.sleep(draw.uniform(*within_s))
+    kill(draw.choice([job.pid, *filter(None, (gmi_pid(run, gmi) for gmi in range(2)))]))
+    code = job.wait(timeout=30)
+    assert code in (1, -signal.SIGKILL), (cwd / "stderr.txt").read_text()
+    wait_until(lambda: not pids_of(run), 10, f"all GMIs of {cwd.name} gone")
 
 
 def shared_memory() -> set[str]:

@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 import json
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
-from training_jobs import child_environment, train
+from training_jobs import train
 
 pytestmark = pytest.mark.timeout(600)
 
@@ -40,18 +38,6 @@ SMALL = (
 )
 
 
-def play(*overrides: str, cwd: Path) -> subprocess.CompletedProcess[str]:
-    return subprocess.run(
-        [sys.executable, "-m", "gmijax.play", *overrides],
-        cwd=cwd,
-        env=child_environment(),
-        capture_output=True,
-        text=True,
-        timeout=240,
-        check=False,
-    )
-
-
 def test_a_task_of_ones_own_trains_in_two_gmis_resumes_and_plays(tmp_path: Path):
     file = tmp_path / "point.py"
     file.write_text(TASK)
@@ -76,10 +62,10 @@ def test_a_task_of_ones_own_trains_in_two_gmis_resumes_and_plays(tmp_path: Path)
     assert "in reward/near" in done.stderr
 
     file.write_text(TASK)
-    done = play(f"run.dir={run}", "num_envs=2", cwd=tmp_path)
+    done = train(f"run.dir={run}", "num_envs=2", cwd=tmp_path, command="play")
     assert done.returncode == 0, done.stderr
     assert "point has no model that could be filmed" in done.stdout
-    done = play(f"run.dir={run}", "video=gif", cwd=tmp_path)
+    done = train(f"run.dir={run}", "video=gif", cwd=tmp_path, command="play")
     assert done.returncode == 1
     assert "point has no model that could be filmed; the returns were evaluated" in done.stderr
 

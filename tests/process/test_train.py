@@ -18,6 +18,7 @@ from training_jobs import (
     gmi_pid,
     iteration_of,
     kill,
+    kill_somebody,
     learner_arrays,
     mps_directories,
     pids_of,
@@ -176,14 +177,6 @@ def test_twenty_random_kills_leave_nothing(tmp_path: Path) -> None:
     shm, pipes = shared_memory(), mps_directories()
     for number in range(20):
         cwd = tmp_path / str(number)
-        cwd.mkdir()
-        run = cwd / "run"
-        job = start(*TINY, FOREVER, "plan.gmis_per_gpu=2", "run.dir=run", cwd=cwd)
-        time.sleep(draw.uniform(0.3, 7.0))
-        victims = [job.pid, *filter(None, (gmi_pid(run, gmi) for gmi in range(2)))]
-        kill(draw.choice(victims))
-        code = job.wait(timeout=20)
-        assert code in (1, -signal.SIGKILL), (cwd / "stderr.txt").read_text()
-        wait_until(lambda run=run: not pids_of(run), 10, f"all GMIs of kill {number} gone")
+        kill_somebody("plan.gmis_per_gpu=2", cwd=cwd, draw=draw, within_s=(0.3, 7.0))
     assert shared_memory() <= shm
     assert mps_directories() <= pipes

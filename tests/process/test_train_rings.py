@@ -4,24 +4,17 @@ from __future__ import annotations
 
 import json
 import random
-import signal
-import time
 from pathlib import Path
 
 import numpy as np
 import pytest
 from training_jobs import (
-    FOREVER,
     STEPS,
     TINY,
-    gmi_pid,
-    kill,
+    kill_somebody,
     learner_arrays,
-    pids_of,
     shared_memory,
-    start,
     train,
-    wait_until,
 )
 
 ITERATIONS = 13
@@ -63,18 +56,9 @@ def test_kills_at_any_moment_leave_nothing_of_a_job_with_rings(tmp_path: Path) -
     """Also while GMIs meet, when a library would rather end them by itself."""
     draw = random.Random(0)
     shm = shared_memory()
+    rings = ("plan.gpus=2", "reduce.strategy=mrr")
     for number in range(8):
-        cwd = tmp_path / str(number)
-        cwd.mkdir()
-        run = cwd / "run"
-        rings = ("plan.gpus=2", "reduce.strategy=mrr")
-        job = start(*TINY, FOREVER, *rings, "run.dir=run", cwd=cwd)
-        time.sleep(draw.uniform(1.0, 10.0))
-        victims = [job.pid, *filter(None, (gmi_pid(run, gmi) for gmi in range(2)))]
-        kill(draw.choice(victims))
-        code = job.wait(timeout=30)
-        assert code in (1, -signal.SIGKILL), (cwd / "stderr.txt").read_text()
-        wait_until(lambda run=run: not pids_of(run), 10, f"all GMIs of kill {number} gone")
+        kill_somebody(*rings, cwd=tmp_path / str(number), draw=draw, within_s=(1.0, 10.0))
     assert shared_memory() <= shm
     plan = json.loads((tmp_path / "7" / "run" / "plan.json").read_text())
     assert plan["strategy"] == "mrr"

@@ -11,7 +11,7 @@ from types import SimpleNamespace
 import pytest
 from rich.console import Console
 
-from gmijax import evaluation
+from gmijax import evaluation, pictures
 from gmijax.cli import command
 from gmijax.config import PlayConfig
 from gmijax.errors import ConfigError, GmijaxError
@@ -131,8 +131,8 @@ def test_every_opengl_is_tried_the_users_first(
         # -11: a driver that crashes is no reason to give up either.
         return {"glfw": EXIT_NO_GL, "egl": -11, "osmesa": 0}[gl]
 
-    monkeypatch.setattr(evaluation, "_render", render)
-    assert evaluation._film(config_of(), PlayPaths(tmp_path), quiet) == ()
+    monkeypatch.setattr(pictures, "_render", render)
+    assert pictures.film(config_of(), PlayPaths(tmp_path), quiet) == ()
     assert tried == ["glfw", "egl", "osmesa"]
 
 
@@ -140,21 +140,21 @@ def test_every_opengl_is_tried_the_users_first(
 def test_a_renderer_that_somebody_ended_is_no_missing_opengl(
     tmp_path: Path, quiet: Console, monkeypatch: pytest.MonkeyPatch, exit_code: int, name: str
 ):
-    monkeypatch.setattr(evaluation, "_render", lambda *_: exit_code)
+    monkeypatch.setattr(pictures, "_render", lambda *_: exit_code)
     with pytest.raises(GmijaxError, match=f"no video: the renderer was ended by {name} .*log: "):
-        evaluation._film(config_of("video=auto"), PlayPaths(tmp_path), quiet)
+        pictures.film(config_of("video=auto"), PlayPaths(tmp_path), quiet)
 
 
 def test_without_opengl_only_a_film_that_was_asked_for_is_an_error(
     tmp_path: Path, quiet: Console, monkeypatch: pytest.MonkeyPatch
 ):
     monkeypatch.delenv("MUJOCO_GL", raising=False)
-    monkeypatch.setattr(evaluation, "_render", lambda *_: EXIT_NO_GL)
+    monkeypatch.setattr(pictures, "_render", lambda *_: EXIT_NO_GL)
     paths = PlayPaths(tmp_path)
     paths.render_log.write_text("Traceback\nImportError: no library\n")
-    assert evaluation._film(config_of("video=auto"), paths, quiet) == ()
+    assert pictures.film(config_of("video=auto"), paths, quiet) == ()
     with pytest.raises(GmijaxError, match=r"egl, osmesa.*libegl1.*libosmesa6.*no library.*log: "):
-        evaluation._film(config_of("video=gif"), paths, quiet)
+        pictures.film(config_of("video=gif"), paths, quiet)
 
 
 def test_a_renderer_that_fails_for_another_reason_says_why(
@@ -162,15 +162,15 @@ def test_a_renderer_that_fails_for_another_reason_says_why(
 ):
     paths = PlayPaths(tmp_path)
     paths.render_log.write_text("Traceback\nOSError: disk full\n")
-    monkeypatch.setattr(evaluation, "_render", lambda *_: 1)
+    monkeypatch.setattr(pictures, "_render", lambda *_: 1)
     with pytest.raises(GmijaxError, match="no video: OSError: disk full"):
-        evaluation._film(config_of("video=auto"), paths, quiet)
+        pictures.film(config_of("video=auto"), paths, quiet)
 
 
 def test_a_missing_opengl_is_noticed_by_the_child(tmp_path: Path):
     pytest.importorskip("mujoco")
     write_json(RunPaths(tmp_path).config, to_dict(config_of()))
-    code = evaluation._render("no-such-gl", PlayPaths(tmp_path))
+    code = pictures._render("no-such-gl", PlayPaths(tmp_path))
     assert code == EXIT_NO_GL, PlayPaths(tmp_path).render_log.read_text()
 
 

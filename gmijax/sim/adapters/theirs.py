@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping
+from functools import partial
 from typing import Any
 
 import jax
@@ -62,35 +63,35 @@ def adapt(
         metrics=tuple(sorted(key for key, value in start.metrics.items() if value.shape == ())),
     )
 
-    def reset(model: PyTree, key: PRNGKey) -> EnvState:
-        del model  # They keep their model to themselves.
-        key, draw = jax.random.split(key)
-        # They were written for keys that are plain integers.
-        state = jax.tree.map(jnp.asarray, theirs.reset(jax.random.key_data(draw)))
-        return episode.begin(spec, state, (), observation(state.obs), key)
-
-    def step(model: PyTree, state: EnvState, action: Array) -> EnvState:
-        del model
-        before = jax.tree.map(lambda leaf: leaf, state.physics)  # They write into their dicts.
-        after = _alike(state.physics, theirs.step(before, jnp.clip(action, -1.0, 1.0)))
-        done = after.done > 0
-        out_of_time = done & (jnp.asarray(after.info.get("truncation", 0)) > 0)
-        reward = after.reward.astype(jnp.float32)
-        sums = {
-            key: total + after.metrics[key].astype(jnp.float32)
-            for key, total in state.metrics.items()
-        }
-        obs = observation(after.obs)
-        terms = (reward, {REWARD: reward})
-        moved = episode.advance(state, after, (), obs, terms, done & ~out_of_time, sums)
-        return moved._replace(truncated=out_of_time)
-
     def positions(state: EnvState) -> Array:
         return jnp.zeros(0) if qpos is None else qpos(state.physics)
 
-    env = Env(spec, (), reset, step, mj_model, positions)
+    env = Env(spec, (), partial(_reset, theirs, spec), partial(_step, theirs), mj_model, positions)
     check_env(env, f"env.name={name}")
     return env
+
+
+def _reset(theirs: Any, spec: EnvSpec, model: PyTree, key: PRNGKey) -> EnvState:
+    del model  # They keep their model to themselves.
+    key, draw = jax.random.split(key)
+    # They were written for keys that are plain integers.
+    state = jax.tree.map(jnp.asarray, theirs.reset(jax.random.key_data(draw)))
+    return episode.begin(spec, state, (), observation(state.obs), key)
+
+
+def _step(theirs: Any, model: PyTree, state: EnvState, action: Array) -> EnvState:
+    del model
+    before = jax.tree.map(lambda leaf: leaf, state.physics)  # They write into their dicts.
+    after = _alike(state.physics, theirs.step(before, jnp.clip(action, -1.0, 1.0)))
+    done = after.done > 0
+    out_of_time = done & (jnp.asarray(after.info.get("truncation", 0)) > 0)
+    reward = after.reward.astype(jnp.float32)
+    sums = {
+        key: total + after.metrics[key].astype(jnp.float32) for key, total in state.metrics.items()
+    }
+    obs, terms = observation(after.obs), (reward, {REWARD: reward})
+    terminated = done & ~out_of_time
+    return episode.advance(state, after, (), obs, terms, terminated, sums, out_of_time)
 
 
 def require_jax(impl: str, suite: str) -> None:
