@@ -33,7 +33,7 @@ def throughput() -> Iterator[str]:
         for num_envs in (2048, 8192, 32768):
             for impl in ("jax", "warp"):
                 case = cases.get(f"{task} {impl} {num_envs}")
-                if case is None:
+                if case is None or not case["runs"]:
                     continue
                 summaries = [run["summary"] for run in case["runs"] if "summary" in run]
                 if not summaries:
