@@ -14,10 +14,12 @@ class Case(NamedTuple):
     Attributes:
       name: what tables call it.
       overrides: its hydra overrides; `{run}` in them is the number of the repeat, 0 for the first.
+      gpus: how many GPUs it needs.
     """
 
     name: str
     overrides: tuple[str, ...]
+    gpus: int = 1
 
 
 TASKS = ("ant", "anymal", "ball_balance", "franka_cabinet", "humanoid", "shadow_hand")
@@ -53,12 +55,155 @@ def _throughput(task: str, impl: str, num_envs: int) -> Case:
     )
 
 
+def _lgr(task: str, gpus: int, gmis: int, strategy: str) -> Case:
+    """A cell of the paper's table of LGR: so many GPUs with so many trainers each."""
+    return Case(
+        f"{gpus}G{gmis}T {strategy}",
+        (
+            f"env={task}",
+            "num_envs=2048",
+            # A dozen iterations of the longest rollout.
+            f"num_timesteps={12 * 32 * 2048 * gpus * gmis}",
+            f"plan.gpus={gpus}",
+            f"plan.gmis_per_gpu={gmis}",
+            "plan.backend=mps",
+            f"reduce.strategy={strategy}",
+            "run.measure_throughput=false",
+            "run.checkpoint_every=0",
+        ),
+        gpus,
+    )
+
+
+def _scaling(gpus: int, gmis: int) -> Case:
+    """8192 environments on every GPU: weak scaling."""
+    strategy = "auto" if gpus * gmis == 1 else "flat" if gmis == 1 else "har"
+    return Case(
+        f"{gpus} GPUs x {gmis} GMIs x {8192 // gmis}",
+        (
+            "env=ant",
+            f"num_envs={8192 // gmis}",
+            f"num_timesteps={40 * 16 * 8192 * gpus}",
+            f"plan.gpus={gpus}",
+            f"plan.gmis_per_gpu={gmis}",
+            f"reduce.strategy={strategy}",
+            "run.measure_throughput=false",
+            "run.checkpoint_every=0",
+        ),
+        gpus,
+    )
+
+
+def _templates(task: str, num_envs: int) -> tuple[Case, ...]:
+    """The same environments in GMIs that do everything, and in GMIs that a third one trains."""
+    # A dozen iterations of the longest rollout.
+    shared = (
+        *(f"env={task}", f"num_envs={num_envs}", f"num_timesteps={12 * 32 * 2 * num_envs}"),
+        *("plan.backend=mps", "run.measure_throughput=false", "run.checkpoint_every=0"),
+    )
+    return (
+        Case(f"2 GMIs x {num_envs}, tcg_ex", (*shared, "plan.gmis_per_gpu=2")),
+        Case(
+            f"2 + 1 GMIs x {num_envs}, tdg_ex",
+            (*shared, "plan.gmis_per_gpu=3", "plan.template=tdg_ex"),
+        ),
+    )
+
+
+_TRAINERS = ((2, 2), (2, 3), (4, 4))
+
 _ANT = ("env=ant", "physics.impl=jax", "run.checkpoint_every=0")
 _THIRTY = (*_ANT, "num_timesteps=30e6")
 _TWO_GPUS = (*_THIRTY, "plan.gpus=2", "run.measure_throughput=false")
 
+
+def _capped(percent: str) -> Case:
+    steps = 24 * 16 * 4 * 4096
+    return Case(
+        f"4 GMIs x 4096, cap {percent}",
+        (
+            *_ANT,
+            *("num_envs=4096", "plan.gmis_per_gpu=4", "plan.backend=mps"),
+            *(f"plan.sm_percent={percent}", "plan.force_sm_percent=true", "plan.self_check=off"),
+            *(f"num_timesteps={steps}", "run.measure_throughput=false"),
+        ),
+    )
+
+
+_ASYNC = (*_ANT, "algo=a3c", "plan.backend=mps", "channel.capacity_mib=256")
+
+
+def _async(name: str, gpus: int, num_envs: int, *overrides: str, steps: float = 30e6) -> Case:
+    """Agents with `num_envs` environments each, and trainers."""
+    own = (f"num_envs={num_envs}", f"num_timesteps={steps:.0f}", *overrides)
+    return Case(name, (*_ASYNC, *own), gpus)
+
+
+def _on(serving: str, training: str, agents: int, trainers: int) -> tuple[str, ...]:
+    return (
+        *(f"plan.serving_gpus={serving}", f"plan.training_gpus={training}"),
+        *(f"plan.serving_gmis_per_gpu={agents}", f"plan.training_gmis_per_gpu={trainers}"),
+    )
+
+
+def _channel_designs(task: str, num_envs: int) -> tuple[Case, ...]:
+    """The paper's table: one GPU acts, one trains; experience by channels, or tensor by tensor."""
+    shared = (
+        *(f"env={task}", "algo=a3c", f"num_envs={num_envs}", "run.checkpoint_every=0"),
+        *(f"num_timesteps={40 * 16 * num_envs}", "channel.capacity_mib=256", *_on("1", "1", 1, 1)),
+    )
+    return tuple(
+        Case(f"{task} {design}", (*shared, f"channel.design={design}"), 2)
+        for design in ("uni", "multi")
+    )
+
+
 SUITES = MappingProxyType(
     {
+        # Acting and learning on one GPU, with the same 8192 environments as in one GMI.
+        "async-1gpu": (
+            Case("sync, 1 GMI x 8192", (*_THIRTY, "num_envs=8192")),
+            _async("1 agent x 8192 + 1 trainer", 1, 8192),
+            _async("2 agents x 4096 + 1 trainer", 1, 4096, "plan.serving_gmis_per_gpu=2"),
+            _async("4 agents x 2048 + 1 trainer", 1, 2048, "plan.serving_gmis_per_gpu=4"),
+        ),
+        # The same with caps on SMs, the trainer's first, and with larger batches.
+        "async-1gpu-shares": (
+            _async("trainer 25 %", 1, 8192, "plan.sm_percent=[25,100]"),
+            _async("trainer 50 %, agent 50 %", 1, 8192, "plan.sm_percent=[50,50]"),
+            _async(
+                *("2 agents, batches of both", 1, 4096),
+                *("plan.serving_gmis_per_gpu=2", "algo.batch_size=8192"),
+            ),
+        ),
+        # One process a GPU against several, and against GPUs that do both.
+        "async-2gpu": (
+            _async("1 + 1 GPUs, one process each", 2, 8192, *_on("1", "1", 1, 1)),
+            _async("1 + 1 GPUs, 4 agents + 2 trainers", 2, 2048, *_on("1", "1", 4, 2)),
+            _async("2 GPUs, each 3 agents + 1 trainer", 2, 2048, *_on("[0,1]", "[0,1]", 3, 1)),
+        ),
+        "async-4gpu": (
+            _async("3 + 1 GPUs, one process each", 4, 8192, *_on("3", "1", 1, 1)),
+            _async("3 + 1 GPUs, 4 agents + 2 trainers", 4, 2048, *_on("3", "1", 4, 2)),
+            _async(
+                *("4 GPUs, each 3 agents + 1 trainer", 4, 2048),
+                *_on("[0,1,2,3]", "[0,1,2,3]", 3, 1),
+            ),
+        ),
+        "async-channels": (
+            *_channel_designs("ant", 4096),
+            *_channel_designs("anymal", 2048),
+            *_channel_designs("humanoid", 2048),
+        ),
+        # How fast and how far both learn.
+        "async-learns": (
+            Case("sync", (*_ANT, "num_envs=4096", "num_timesteps=100e6", "seed={run}")),
+            _async(
+                *("async, 2 agents x 2048 + 1 trainer", 1, 2048),
+                *("plan.serving_gmis_per_gpu=2", "algo.batch_size=4096", "seed={run}"),
+                steps=100e6,
+            ),
+        ),
         # The same 8192 environments on one GPU: together, and in four GMIs.
         "ant-1gpu": (
             Case("1 GMI x 8192", (*_THIRTY, "num_envs=8192")),
@@ -71,20 +216,24 @@ SUITES = MappingProxyType(
                 (*_THIRTY, "num_envs=2048", "plan.gmis_per_gpu=4", "plan.backend=share"),
             ),
         ),
+        # Trainers among their simulators, and in GMIs of their own.
+        **{f"templates-{task}": _templates(task, 2048) for task in ("ant", "humanoid")},
         # What one GMI does with the environments that each of the four had.
         "ant-small": (Case("1 GMI x 2048", (*_THIRTY, "num_envs=2048")),),
         "ant-2gpu": (
             Case(
                 "2 GPUs x 2 GMIs x 2048, mps",
                 (*_TWO_GPUS, "num_envs=2048", "plan.gmis_per_gpu=2", "plan.backend=mps"),
+                2,
             ),
             Case(
                 "2 GPUs x 2 GMIs x 2048, share",
                 (*_TWO_GPUS, "num_envs=2048", "plan.gmis_per_gpu=2", "plan.backend=share"),
+                2,
             ),
         ),
         # Plain data parallelism: the same environments with one GMI on each GPU.
-        "ant-2gpu-one-each": (Case("2 GPUs x 1 GMI x 4096", (*_TWO_GPUS, "num_envs=4096")),),
+        "ant-2gpu-one-each": (Case("2 GPUs x 1 GMI x 4096", (*_TWO_GPUS, "num_envs=4096"), 2),),
         "ant-learns": (Case("1 GMI x 8192", (*_ANT, "num_envs=8192", "num_timesteps=150e6")),),
         # Every task, both implementations of MJX, one GMI.
         **{
@@ -96,8 +245,25 @@ SUITES = MappingProxyType(
             )
             for impl in ("jax", "warp")
         },
+        # What a cap on SMs does to four GMIs; docs/shares.md.
+        "sm-shares": tuple(_capped(percent) for percent in ("null", "25", "50", "100", "33")),
         # Every task with its own settings, another seed in every repeat.
         **{f"learn-{task}": (_learning(task),) for task in TASKS},
+        # Gradients through host memory against the best layout-aware reduction.
+        **{
+            f"lgr-{task}": tuple(
+                _lgr(task, gpus, gmis, strategy)
+                for gpus, gmis in _TRAINERS
+                for strategy in ("mpr", "har")
+            )
+            for task in ("ant", "humanoid", "shadow_hand")
+        },
+        # The choice of Algorithm 1 where it is not har.
+        **{
+            f"lgr-{task}-mrr": (_lgr(task, 2, 2, "mrr"), _lgr(task, 4, 4, "mrr"))
+            for task in ("ant", "humanoid", "shadow_hand")
+        },
+        "scaling": tuple(_scaling(gpus, gmis) for gmis in (1, 2) for gpus in (1, 2, 4)),
         "ball-cpu": (Case("2 GMIs x 512", ("env=ball_balance", "plan.gpus=2")),),
     }
 )

@@ -1,8 +1,8 @@
 """Measures the mean of gradients: `python -m benchmarks.reduction`, without training anything.
 
-Every strategy runs on every layout that it takes, with buffers of three sizes, in real GMIs of
-the backend that this machine has. Two large probes give the bandwidths of the cost model, whose
-prediction stands beside each measurement. Writes `benchmarks/results/reduction-<device>.json`.
+Every strategy runs on every layout that it takes, with buffers of three sizes, in real GMIs, all
+under one backend. Two large probes give the bandwidths of the cost model, whose prediction stands
+beside each measurement. Writes `benchmarks/results/reduction-<device>.json`.
 """
 
 from __future__ import annotations
@@ -11,132 +11,193 @@ import argparse
 import json
 import os
 import sys
-import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
 from benchmarks.run import RESULTS
-from gmijax.collectives.cost_model import BYTES_PER_FLOAT, COSTS, predicted_s
+from gmijax.collectives.cost_model import BYTES_PER_FLOAT, predicted_s
 from gmijax.config import PlanConfig, ReduceConfig
 from gmijax.errors import ConfigError
-from gmijax.launcher import Launch, run_gmis
 from gmijax.partition.layout import Layout
-from gmijax.partition.machine import detect_machine
+from gmijax.partition.machine import Machine, detect_machine
+from gmijax.partition.plan import Plan
 from gmijax.partition.planner import make_plan
-from gmijax.partition.reduction import select_strategy, why_not_strategy
-from gmijax.partition.supervisor import Patience
-from gmijax.rundir import RunPaths, read_json, write_json
+from gmijax.partition.reduction import select_strategy
+from gmijax.selection import Probe, candidates, measure
 
 SIZES = (110_000, 290_000, 1_500_000)
 PROBE_FLOATS = 6_000_000
-PROBES = {"b1": ("mpr", Layout(((0, 1),))), "b2": ("flat", Layout(((0,), (1,))))}
+PROBES = {
+    "b1": (Layout.even(1, 2), Probe("mpr", "host", PROBE_FLOATS)),
+    "b2": (Layout.even(2, 1), Probe("flat", "host", PROBE_FLOATS)),
+}
 """With two members every strategy moves M_p bytes, so bandwidth is M_p over time."""
 
-LAYOUTS = ("[[0,1]]", "[[0],[1]]", "[[0,1],[2,3]]")
-PATIENCE = Patience(start_timeout_s=300, stall_timeout_s=120, stop_timeout_s=60, grace_s=5)
+BACKENDS = ("mps", "share", "cpu")
+SMALL = ("1G2T", "2G1T", "2G2T")
+LAYOUTS = (*SMALL, "2G3T", "4G1T", "4G4T")
 
 
 def main() -> int:
-    """Measures what the command line asks for; returns 0."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--layouts", nargs="+", default=LAYOUTS, metavar="[[0,1],[2,3]]")
-    parser.add_argument("--sizes", nargs="+", type=int, default=SIZES, metavar="FLOATS")
-    parser.add_argument("--calls", type=int, default=200, help="calls to take the median of")
-    parser.add_argument("--out", type=Path, default=RESULTS, help="folder of the JSON file")
-    arguments = parser.parse_args()
-    layouts = [Layout(tuple(map(tuple, json.loads(text)))) for text in arguments.layouts]
-    calls = arguments.calls
-    probes = {name: measure(*probe, PROBE_FLOATS, calls // 4) for name, probe in PROBES.items()}
-    bandwidths = {
-        name: PROBE_FLOATS * BYTES_PER_FLOAT / found["median_s"] for name, found in probes.items()
-    }
-    sys.stdout.write(", ".join(f"{k} {v / 1e9:.2f} GB/s" for k, v in bandwidths.items()) + "\n")
-    rows = []
-    for row in measure_all(layouts, arguments.sizes, calls, bandwidths):
-        rows.append(row)
-        sys.stdout.write(line(row) + "\n")
-    device = probes["b1"]["device"]
-    results = {"device": device, "cores": os.cpu_count(), "probe_floats": PROBE_FLOATS}
-    results |= {"bytes_per_s": bandwidths, "rows": rows}
+    """Measures what the command line asks for; returns the exit code."""
+    machine = detect_machine()
+    arguments = _arguments()
+    backend = arguments.backend or ("mps" if machine.gpus else "cpu")
+    try:
+        layouts = [layout_of(text) for text in arguments.layouts or _defaults(machine)]
+        if min(*arguments.sizes, arguments.calls) < 1:
+            raise ConfigError("--sizes, --calls: must be at least 1")
+        plans = {layout: plan_of(layout, backend, machine) for layout in layouts}
+        for layout, _ in PROBES.values():
+            if layout.num_gpus <= (len(machine.gpus) or layout.num_gpus):
+                plans.setdefault(layout, plan_of(layout, backend, machine))
+    except ConfigError as error:
+        sys.stderr.write(f"{error}\n")
+        return 2
+    results = measure_all(plans, set(layouts), machine, arguments)
+    device = results["device"]
     path = arguments.out / f"reduction-{device.replace(' ', '-').lower()}.json"
     arguments.out.mkdir(parents=True, exist_ok=True)
     path.write_text(json.dumps(results, indent=1) + "\n")
+    for row in results["rows"]:
+        sys.stdout.write(line(row) + "\n")
+    for text in gains(results["rows"]):
+        sys.stdout.write(text + "\n")
     sys.stdout.write(f"written: {path}\n")
     return 0
 
 
 def measure_all(
-    layouts: list[Layout], sizes: list[int], calls: int, bandwidths: dict[str, float]
-) -> Iterator[dict[str, Any]]:
-    """One row for each layout, size and strategy."""
-    for layout in layouts:
-        chosen = select_strategy(layout).strategy
-        for num_floats in sizes:
-            for strategy in COSTS:
-                if why_not_strategy(strategy, layout):
-                    continue
-                found = measure(strategy, layout, num_floats, calls)
-                yield {
-                    "layout": str(layout),
-                    "num_floats": num_floats,
-                    "strategy": strategy,
-                    "is_algorithm_1": strategy == chosen,
-                    **found,
-                    "predicted_s": predicted_s(strategy, layout, num_floats, **bandwidths),
-                }
+    plans: Mapping[Layout, Plan],
+    wanted: set[Layout],
+    machine: Machine,
+    arguments: argparse.Namespace,
+) -> dict[str, Any]:
+    """All rows; one job for each layout, and the bandwidths by two of them."""
+    found: list[tuple[Layout, Probe, dict[str, Any]]] = []
+    bandwidths: dict[str, float | None] = dict.fromkeys(PROBES)
+    device = ""
+    for layout, plan in plans.items():
+        probes = [p for size in arguments.sizes for p in candidates(plan, size)]
+        probes = probes if layout in wanted else []
+        large = {probe: name for name, (at, probe) in PROBES.items() if at == layout}
+        rows = measure(plan, machine, [*probes, *large], arguments.calls)
+        for probe, row in zip([*probes, *large], rows, strict=True):
+            if "why_not" in row:
+                sys.stderr.write(f"{layout} {probe.name}: {row['why_not']}\n")
+            elif probe in large:
+                bandwidths[large[probe]] = PROBE_FLOATS * BYTES_PER_FLOAT / row["median_s"]
+            else:
+                found.append((layout, probe, row))
+        device = rows[0]["device"]
+        sys.stderr.write(f"measured: {layout}\n")
+    first = next(iter(plans.values()))
+    return {
+        "device": device,
+        "backend": first.backend,
+        "cores": os.cpu_count(),
+        "probe_floats": PROBE_FLOATS,
+        "bytes_per_s": bandwidths,
+        "rows": [_row(layout, probe, row, bandwidths) for layout, probe, row in found],
+    }
 
 
-def measure(strategy: str, layout: Layout, num_floats: int, calls: int) -> dict[str, Any]:
-    """Runs one job of GMIs that do nothing but reduce; the times of its slowest GMI."""
-    machine = detect_machine()
-    plan = make_plan(
+def layout_of(text: str) -> Layout:
+    """`2G3T` (2 GPUs, 3 trainers on each) or `[[0,1],[2]]`.
+
+    Raises:
+      ConfigError: neither, or no layout.
+    """
+    gpus, letter, gmis = text.removesuffix("T").partition("G")
+    if letter and gpus.isdigit() and gmis.isdigit() and int(gpus) and int(gmis):
+        return Layout.even(int(gpus), int(gmis))
+    try:
+        return Layout(tuple(tuple(map(int, gmis)) for gmis in json.loads(text)))
+    except (ValueError, TypeError):
+        raise ConfigError(f"--layouts {text}: expected e.g. 2G3T or [[0,1],[2]]") from None
+
+
+def plan_of(layout: Layout, backend: Any, machine: Machine) -> Plan:
+    """A plan of GMIs that train, for `candidates` and `measure`; raises ConfigError."""
+    return make_plan(
         PlanConfig(
             gpus=layout.num_gpus,
             gmis_per_gpu=1,
             layout=layout.gmis_of_gpu,
-            backend="auto" if layout.num_gpus <= len(machine.gpus) else "cpu",
+            backend=backend,
             sm_percent=None,
             memory_fraction=None,
             template="auto",
         ),
-        ReduceConfig(strategy=_known(strategy), intra="host", timeout_s=60),
+        ReduceConfig(strategy="auto", intra="auto", timeout_s=60),
         1,
         machine,
     )
-    with tempfile.TemporaryDirectory() as scratch:
-        run = RunPaths(Path(scratch))
-        write_json(run.plan, plan.to_dict())
-        write_json(run.config, {"num_floats": num_floats, "calls": calls})
-        run_gmis(
-            Launch(
-                plan=plan,
-                machine=machine,
-                run=run,
-                module="benchmarks.reduction_rank",
-                patience=PATIENCE,
-                compile_once=False,
-            )
-        )
-        found = [read_json(run.gmi(gmi).result) for gmi in layout.gmis]
-    return max(found, key=lambda result: result["median_s"])
 
 
 def line(row: dict[str, Any]) -> str:
     """One row for people."""
+    predicted = row["predicted_s"]
     return (
-        f"{row['layout']:18} {row['num_floats']:>9,} {row['strategy']:5}"
+        f"{row['layout']:18} {row['num_floats']:>9,} {row['name']:9}"
         f"{'*' if row['is_algorithm_1'] else ' '} {row['median_s'] * 1e3:8.3f} ms"
         f" ({row['p10_s'] * 1e3:.3f} to {row['p90_s'] * 1e3:.3f}),"
-        f" predicted {row['predicted_s'] * 1e3:.3f} ms"
+        f" one of a chain {row['chained_s'] * 1e3:.3f} ms, predicted "
+        f"{'-' if predicted is None else format(predicted * 1e3, '.3f')} ms"
     )
 
 
-def _known(strategy: str) -> Any:
-    """The name as a `Literal` of the configuration."""
-    if strategy not in COSTS:
-        raise ConfigError(f"strategy={strategy}: expected one of {', '.join(COSTS)}")
-    return strategy
+def gains(rows: list[dict[str, Any]]) -> Iterator[str]:
+    """How much faster than MPR the best other way is, for every layout and size."""
+    for layout, size in dict.fromkeys((row["layout"], row["num_floats"]) for row in rows):
+        times = {
+            row["name"]: row["chained_s"]
+            for row in rows
+            if (row["layout"], row["num_floats"]) == (layout, size)
+        }
+        base = times.pop("mpr")
+        best = min(times, key=times.__getitem__)
+        yield f"{layout:18} {size:>9,} {best} is {base / times[best]:.1f} times as fast as mpr"
+
+
+def _row(
+    layout: Layout,
+    probe: Probe,
+    row: dict[str, Any],
+    bandwidths: Mapping[str, float | None],
+) -> dict[str, Any]:
+    known = {name: value for name, value in bandwidths.items() if value is not None}
+    predicted = (
+        predicted_s(probe.strategy, layout, probe.num_floats, **known)
+        if len(known) == len(PROBES)
+        else None
+    )
+    return {
+        "layout": str(layout),
+        "name": probe.name,
+        **probe._asdict(),
+        "is_algorithm_1": probe.strategy == select_strategy(layout).strategy,
+        **{key: value for key, value in row.items() if key != "device"},
+        "predicted_s": predicted,
+    }
+
+
+def _defaults(machine: Machine) -> tuple[str, ...]:
+    """What this machine has GPUs for; without any, what few cores can do."""
+    if not machine.gpus:
+        return SMALL
+    return tuple(t for t in LAYOUTS if layout_of(t).num_gpus <= len(machine.gpus))
+
+
+def _arguments() -> argparse.Namespace:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--layouts", nargs="+", metavar="LAYOUT", help="2G3T or [[0,1],[2]]")
+    parser.add_argument("--sizes", nargs="+", type=int, default=SIZES, metavar="FLOATS")
+    parser.add_argument("--calls", type=int, default=100, help="calls to take the median of")
+    parser.add_argument("--backend", choices=BACKENDS, help="of all rows; mps if there are GPUs")
+    parser.add_argument("--out", type=Path, default=RESULTS, help="folder of the JSON file")
+    return parser.parse_args()
 
 
 if __name__ == "__main__":

@@ -2,7 +2,7 @@
 
 `python -m benchmarks.run ant-1gpu --repeats 3` runs the cases in turn (A B C A B C ...), prints
 the medians, and writes `benchmarks/results/<suite>.json` with every run in it. With `--gpus 4`
-four runs go on at a time, each alone on one GPU: for cases that need no more than one.
+as many runs go on at a time as there are GPUs for, each alone on its own.
 """
 
 from __future__ import annotations
@@ -15,10 +15,10 @@ import subprocess
 import sys
 import tempfile
 import threading
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
 from pathlib import Path
-from queue import SimpleQueue
 from typing import Any
 
 from benchmarks.cases import SUITES, Case
@@ -34,11 +34,14 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("suites", nargs="+", choices=sorted(SUITES), metavar="SUITE")
     parser.add_argument("--repeats", type=int, default=3)
-    parser.add_argument("--gpus", type=int, help="run so many cases at a time, one on each GPU")
+    parser.add_argument("--gpus", type=int, help="run cases at the same time on so many GPUs")
     parser.add_argument("--out", type=Path, default=RESULTS, help="folder of the JSON files")
     parser.add_argument("--runs", type=Path, help="keep the run folders here")
     parser.add_argument("--resume", action="store_true", help="add to the runs in the JSON file")
     arguments = parser.parse_args()
+    needed = max(case.gpus for suite in arguments.suites for case in SUITES[suite])
+    if arguments.gpus is not None and arguments.gpus < needed:
+        parser.error(f"--gpus {arguments.gpus}: a case of these suites needs {needed}")
     arguments.out.mkdir(parents=True, exist_ok=True)
     books = {
         suite: ResultsFile(arguments.out / f"{suite}.json", suite, resume=arguments.resume)
@@ -95,20 +98,40 @@ class ResultsFile:
         return [name for name, case in cases if any("failed" in run for run in case["runs"])]
 
 
+class FreeGpus:
+    """The GPUs that no case runs on, by index; usable from any thread.
+
+    Args:
+      count: how many there are.
+    """
+
+    def __init__(self, count: int) -> None:
+        self._free = list(range(count))
+        self._changed = threading.Condition()
+
+    @contextmanager
+    def taken(self, count: int) -> Iterator[list[int]]:
+        """`count` of them, once there are so many."""
+        with self._changed:
+            self._changed.wait_for(lambda: len(self._free) >= count)
+            mine, self._free = self._free[:count], self._free[count:]
+        try:
+            yield mine
+        finally:
+            with self._changed:
+                self._free = sorted([*self._free, *mine])
+                self._changed.notify_all()
+
+
 def run_all(books: Mapping[str, ResultsFile], repeats: int, runs: Path, gpus: int | None) -> None:
     """Runs the cases of all suites in turn until each has `repeats` runs."""
-    free: SimpleQueue[int] = SimpleQueue()
-    for gpu in range(gpus or 1):
-        free.put(gpu)
+    free = FreeGpus(gpus or 1)
 
     def run(book: ResultsFile, repeat: int, case: Case) -> None:
-        gpu = free.get()
-        alone = (f"plan.gpus=[{gpu}]",) if gpus else ()
         folder = runs / f"{book.results['suite']}-{case.name.replace(' ', '-')}-{repeat}"
-        try:
+        with free.taken(case.gpus if gpus else 1) as taken:
+            alone = (f"plan.gpus=[{','.join(map(str, taken))}]",) if gpus else ()
             book.add(case, run_case(case, repeat, (*alone, f"run.dir={folder}"), folder))
-        finally:
-            free.put(gpu)
 
     with ThreadPoolExecutor(gpus or 1) as pool:
         started = [

@@ -1,4 +1,4 @@
-"""Prints Markdown tables of results: `python -m benchmarks.tables throughput|learning`.
+"""Prints Markdown tables of results: `python -m benchmarks.tables throughput|learning|lgr`.
 
 They are made from the JSON files in `benchmarks/results`, and pasted into the documents.
 """
@@ -13,10 +13,23 @@ from typing import Any
 from benchmarks.cases import TASKS
 from benchmarks.run import RATES, RESULTS, median
 
+PAPER_LGR = {
+    "ant": {"2G2T": (107_689, 114_734), "2G3T": (138_369, 164_655), "4G4T": (168_619, 207_834)},
+    "humanoid": {
+        **{"2G2T": (163_723, 168_300), "2G3T": (179_273, 190_919)},
+        "4G4T": (308_873, 336_591),
+    },
+    "shadow_hand": {
+        **{"2G2T": (78_270, 88_149), "2G3T": (79_545, 93_785)},
+        "4G4T": (133_044, 166_722),
+    },
+}
+"""Environment steps per second with MPR and with LGR (arXiv:2206.08482, "LGR vs MPR")."""
+
 
 def main(which: str) -> int:
     """Prints the table `which`; returns the exit code."""
-    tables = {"throughput": throughput, "learning": learning}
+    tables = {"throughput": throughput, "learning": learning, "lgr": lgr}
     if which not in tables:
         sys.stderr.write(f"table {which}: allowed are {', '.join(tables)}\n")
         return 2
@@ -63,6 +76,28 @@ def learning() -> Iterator[str]:
         }
         metrics = ", ".join(f"{name} {mean:.3g}" for name, mean in means.items())
         yield f"| `{task}` | {steps:,.0f} | {seconds:,.0f} | {returns} | {metrics} |"
+
+
+def lgr() -> Iterator[str]:
+    """Environment steps per second with MPR and with the best other reduction."""
+    yield "| task | layout | `mpr` | best other | ratio | the paper's |"
+    yield "|---|---|---|---|---|---|"
+    for task, layouts in PAPER_LGR.items():
+        cases = {**load(f"lgr-{task}"), **load(f"lgr-{task}-mrr")}
+        for layout, (base, best) in layouts.items():
+            rates = {
+                name.removeprefix(f"{layout} "): median(summaries, "step_per_s_train")
+                for name, case in cases.items()
+                if name.startswith(layout)
+                and (summaries := [run["summary"] for run in case["runs"] if "summary" in run])
+            }
+            mpr = rates.pop("mpr", None)
+            if mpr and rates:
+                way = max(rates, key=rates.__getitem__)
+                yield (
+                    f"| `{task}` | {layout} | {mpr:,.0f} | {rates[way]:,.0f} (`{way}`) | "
+                    f"{rates[way] / mpr:.2f} | {best / base:.2f} |"
+                )
 
 
 def load(suite: str) -> dict[str, Any]:

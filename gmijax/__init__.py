@@ -14,14 +14,41 @@ from gmijax.version import __version__
 if TYPE_CHECKING:
     from gmijax.cli import compose
     from gmijax.job import Result, train
+    from gmijax.roles.launch import launch
+    from gmijax.roles.manager import GMIManager
+    from gmijax.roles.planning import plan
+    from gmijax.roles.role import Role
+    from gmijax.searching import search
+    from gmijax.serving import Served, serve
     from gmijax.sim.registry import make_env, task_names
 
-__all__ = ["Result", "__version__", "compose", "make_env", "task_names", "train"]
+__all__ = [
+    "GMIManager",
+    "Result",
+    "Role",
+    "Served",
+    "__version__",
+    "compose",
+    "launch",
+    "make_env",
+    "plan",
+    "search",
+    "serve",
+    "task_names",
+    "train",
+]
 
 _HOMES = {
+    "GMIManager": "gmijax.roles.manager",
     "Result": "gmijax.job",
+    "Role": "gmijax.roles.role",
+    "Served": "gmijax.serving",
     "compose": "gmijax.cli",
+    "launch": "gmijax.roles.launch",
     "make_env": "gmijax.sim.registry",
+    "plan": "gmijax.roles.planning",
+    "search": "gmijax.searching",
+    "serve": "gmijax.serving",
     "task_names": "gmijax.sim.registry",
     "train": "gmijax.job",
 }

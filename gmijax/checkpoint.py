@@ -45,7 +45,7 @@ def save_checkpoint(
       paths: the run folder.
       meta: what the checkpoint holds.
       learner_state: equal on all GMIs, written by the leader only.
-      env_state: this GMI's environments.
+      env_state: this GMI's environments, None if it has none.
       gmi: id of this GMI.
       leader: whether this GMI writes the shared part.
       barrier: returns when all GMIs have called it.
@@ -53,19 +53,39 @@ def save_checkpoint(
     Returns:
       The checkpoint's folder.
     """
-    final = paths.checkpoint(meta.env_steps)
-    partial = final.with_name(f".{final.name}.partial")
-    partial.mkdir(parents=True, exist_ok=True)
-    _save(partial / f"gmi_{gmi}", env_state)
+    if env_state is not None:
+        save_envs(paths, meta.env_steps, gmi, env_state)
     if leader:
-        _save(partial / LEARNER, learner_state)
+        save_learner(paths, meta.env_steps, learner_state)
     barrier()
     if leader:
-        write_json(partial / META, meta.to_dict())
-        os.replace(partial, final)
+        finish_checkpoint(paths, meta)
     # Nobody may look for the folder before it has its name.
     barrier()
+    return paths.checkpoint(meta.env_steps)
+
+
+def save_learner(paths: RunPaths, env_steps: int, learner_state: PyTree) -> None:
+    """Writes the shared part of the checkpoint at `env_steps`, not yet under its name."""
+    _save(_partial(paths, env_steps) / LEARNER, learner_state)
+
+
+def save_envs(paths: RunPaths, env_steps: int, gmi: int, env_state: PyTree) -> None:
+    """Writes the environments of one GMI, as `save_learner` does the shared part."""
+    _save(_partial(paths, env_steps) / f"gmi_{gmi}", env_state)
+
+
+def finish_checkpoint(paths: RunPaths, meta: CheckpointMeta) -> Path:
+    """Gives a checkpoint its name, once all have written their parts; returns its folder."""
+    final, partial = paths.checkpoint(meta.env_steps), _partial(paths, meta.env_steps)
+    write_json(partial / META, meta.to_dict())
+    os.replace(partial, final)
     return final
+
+
+def has_envs(checkpoint: Path, gmi: int) -> bool:
+    """Whether a checkpoint holds environments of that GMI."""
+    return (checkpoint / f"gmi_{gmi}").is_dir()
 
 
 def restore_learner(checkpoint: Path, template: T) -> T:
@@ -88,6 +108,13 @@ def digest(tree: PyTree) -> np.ndarray:
     for leaf in jax.tree.leaves(tree):
         sha.update(np.ascontiguousarray(leaf).tobytes())
     return np.frombuffer(sha.digest(), np.uint16).astype(np.float32)
+
+
+def _partial(paths: RunPaths, env_steps: int) -> Path:
+    final = paths.checkpoint(env_steps)
+    partial = final.with_name(f".{final.name}.partial")
+    partial.mkdir(parents=True, exist_ok=True)
+    return partial
 
 
 def _save(folder: Path, tree: PyTree) -> None:

@@ -9,10 +9,11 @@ from __future__ import annotations
 import dataclasses
 import re
 import sys
+import types
 import typing
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, Literal, TypeVar, overload
 
 from hydra import compose as hydra_compose
 from hydra import initialize_config_dir
@@ -24,7 +25,7 @@ from omegaconf.errors import OmegaConfBaseException
 from rich.console import Console
 from rich.table import Table
 
-from gmijax.config import TrainConfig
+from gmijax.config import ServeConfig, TrainConfig
 from gmijax.errors import ConfigError, GmijaxError, JobInterrupted
 from gmijax.resume import find_checkpoint, saved_config
 from gmijax.schema import from_dict, suggestion, to_dict
@@ -33,14 +34,36 @@ from gmijax.sim.source import reference
 
 C = TypeVar("C")
 
+_COMPOSED: Mapping[str, type[Any]] = {
+    "train": TrainConfig,
+    "search": TrainConfig,
+    "serve": ServeConfig,
+}
+
 EXIT_OK, EXIT_FAILED, EXIT_BAD_INPUT, EXIT_INTERRUPTED = 0, 1, 2, 130
 
 
-def compose(*overrides: str, env: Callable[..., Any] | None = None) -> TrainConfig:
-    """The training configuration that `python -m gmijax.train OVERRIDES` would run.
+@overload
+def compose(
+    *overrides: str,
+    command: Literal["train", "search"] = ...,
+    env: Callable[..., Any] | None = ...,
+) -> TrainConfig: ...
+
+
+@overload
+def compose(
+    *overrides: str, command: Literal["serve"], env: Callable[..., Any] | None = ...
+) -> ServeConfig: ...
+
+
+def compose(*overrides: str, command: str = "train", env: Callable[..., Any] | None = None) -> Any:
+    """The configuration that `python -m gmijax.train OVERRIDES` (or another command) would run.
 
     Args:
       overrides: `key=value`.
+      command: `train`, `search` (a training job whose `num_envs` and `plan.gmis_per_gpu` are
+        `auto`) or `serve`.
       env: a function `make(*, impl, max_envs) -> gmijax.sim.interface.Env` at the top level of a
         file, in place of `env=path/to/file.py:make`.
 
@@ -52,7 +75,9 @@ def compose(*overrides: str, env: Callable[..., Any] | None = None) -> TrainConf
       ConfigError: an unknown key, a wrong type or value, or a function that is in no file.
     """
     chosen = () if env is None else (f"env={reference(env)}",)
-    return _build("train", TrainConfig, (*chosen, *overrides))
+    if command not in _COMPOSED:
+        raise ConfigError(f"command={command}: allowed are {', '.join(_COMPOSED)}")
+    return _build(command, _COMPOSED[command], (*chosen, *overrides))
 
 
 def command(name: str, cls: type[C], run: Callable[[C], int], argv: Sequence[str]) -> int:
@@ -91,14 +116,29 @@ def choices(group: str) -> list[str]:
 
 
 def _build(name: str, cls: type[C], overrides: Sequence[str]) -> C:
-    if name == "train":
+    if name != "play":
         overrides = [part for text in overrides for part in _with_custom_task(text)]
-    data = _compose_dict(name, overrides)
+    data = _compose_dict(name, [*_algorithm_of_resumed(name, overrides), *overrides])
+    if cls is ServeConfig:
+        _check_task_key(_parse(overrides))
+        data = _with_task_of_run(data, overrides)
     if cls is TrainConfig:
         _check_task_key(_parse(overrides))
         if isinstance(data["run"], dict) and data["run"].get("resume"):
             data = _on_top_of_saved(data, overrides, str(data["run"]["resume"]))
     return from_dict(cls, data)
+
+
+def _algorithm_of_resumed(name: str, overrides: Sequence[str]) -> list[str]:
+    """`algo=` of the run that `overrides` resume: its algorithm decides which keys there are."""
+    if name != "train":
+        return []
+    given = {item.key_or_group: str(item.value()) for item in _parse(overrides)}
+    resume = given.get("run.resume", "null")
+    if "algo" in given or resume in ("null", "None", ""):
+        return []
+    algo = saved_config(find_checkpoint(resume, "run.resume"))["algo"].get("name", "ppo")
+    return [f"algo={algo}"]
 
 
 def _compose_dict(name: str, overrides: Sequence[str]) -> dict[str, Any]:
@@ -174,7 +214,8 @@ def _on_top_of_saved(
     suite = saved["env"].get("suite", "gmijax")
     task = saved["env"].get("name") if suite == "gmijax" else suite
     if task in choices("env") and all(item.key_or_group != "env" for item in items):
-        data = _compose_dict("train", [f"env={task}", *overrides])
+        algo = _algorithm_of_resumed("train", overrides)
+        data = _compose_dict("train", [f"env={task}", *algo, *overrides])
     merged = _merged(data, saved)
     if "randomization" in saved["env"]:  # A leaf that the run left out stays out.
         merged["env"]["randomization"] = saved["env"]["randomization"]
@@ -191,6 +232,20 @@ def _on_top_of_saved(
             )
         raise _unknown_key(key, _flatten(data))
     merged["run"]["resume"] = str(checkpoint)
+    return merged
+
+
+def _with_task_of_run(data: dict[str, Any], overrides: Sequence[str]) -> dict[str, Any]:
+    """With `run.dir` and without `env=`: the task of that run, changed where `env.*` says so."""
+    items = _parse(overrides)
+    run_dir = data["run"].get("dir") if isinstance(data["run"], dict) else None
+    if run_dir is None or any(item.key_or_group == "env" for item in items):
+        return data
+    saved = saved_config(find_checkpoint(str(run_dir), "run.dir"))["env"]
+    merged = {**data, "env": {**data["env"], **saved}}
+    for item in items:
+        if item.key_or_group.startswith("env."):
+            _copy_key(item.key_or_group, data, merged)
     return merged
 
 
@@ -258,8 +313,14 @@ def _print_help(name: str, cls: type[Any]) -> None:
     table = Table(box=None, pad_edge=False)
     for heading in ("key", "default", "meaning"):
         table.add_column(heading, overflow="fold", no_wrap=heading == "key")
-    for key, meaning, allowed in _documented(cls):
-        shown = _shown_default(key, values)
+    last, defaults = "", values
+    for choice, key, meaning, allowed in _documented(cls):
+        if choice != last:
+            # The same key may have another default there.
+            defaults = _flatten(_compose_dict(name, (choice,))) if choice else values
+            table.add_row(f"with {choice}:" if choice else "")
+        last = choice
+        shown = _shown_default(key, defaults)
         table.add_row(key, shown, f"{meaning}{f' ({allowed})' if allowed else ''}")
     console = Console(width=None if sys.stdout.isatty() else 140, highlight=False, markup=False)
     console.print(f"usage: python -m gmijax.{name} [key=value ...] [--cfg job] [--help]\n")
@@ -280,17 +341,29 @@ def _shown_default(key: str, values: Mapping[str, Any]) -> str:
     return ", ".join(sorted(names)) or "{}"
 
 
-def _documented(cls: type[Any], prefix: str = "") -> Iterator[tuple[str, str, str]]:
+def _documented(
+    cls: type[Any], prefix: str = "", choice: str = ""
+) -> Iterator[tuple[str, str, str, str]]:
+    """Every key: the choice that it belongs to (e.g. `algo=a3c`, or none), name, meaning, type."""
     hints = typing.get_type_hints(cls)
     for field in dataclasses.fields(cls):
         kind = hints[field.name]
-        if dataclasses.is_dataclass(kind):
-            yield from _documented(typing.cast(type, kind), f"{prefix}{field.name}.")
+        is_union = isinstance(kind, types.UnionType)
+        trees = [x for x in (typing.get_args(kind) if is_union else (kind,)) if _is_tree(x)]
+        for tree in trees:
+            name = typing.get_args(typing.get_type_hints(tree).get("name"))
+            chosen = f"{field.name}={name[0]}" if len(trees) > 1 else choice
+            yield from _documented(tree, f"{prefix}{field.name}.", chosen)
+        if trees:
             continue
         literal = typing.get_origin(kind) is typing.Literal
         allowed = "|".join(map(str, typing.get_args(kind))) if literal else ""
         if "doc" in field.metadata:  # Others are not for users to set.
-            yield prefix + field.name, field.metadata["doc"], allowed
+            yield choice, prefix + field.name, field.metadata["doc"], allowed
+
+
+def _is_tree(kind: Any) -> bool:
+    return isinstance(kind, type) and dataclasses.is_dataclass(kind)
 
 
 def _complain(name: str, what: object) -> None:

@@ -6,8 +6,10 @@ GmijaxError
 ├── GmiFailed                a GMI ended with an error or a signal, or stopped making progress
 ├── CollectiveError          an exchange between GMIs failed
 │   ├── PeerLost             the process of another GMI is gone
-│   └── CollectiveTimeout    another GMI did not arrive in time
+│   ├── CollectiveTimeout    another GMI did not arrive in time
+│   └── PipeClosed           the other end of a pipe was closed on purpose
 ├── ParameterMismatch        GMIs that must hold equal parameters do not
+├── SelfCheckFailed          matrix products are wrong on the share of a GMI
 ├── NonFiniteError           a loss, gradient or simulation became NaN or infinite
 └── JobInterrupted           the user asked the job to stop; commands exit with code 130
 """
@@ -77,8 +79,25 @@ class CollectiveTimeout(CollectiveError):
         self.timeout_s = timeout_s
 
 
+class PipeClosed(CollectiveError):
+    """The other end of a pipe was closed on purpose: nothing more comes, or is wanted.
+
+    Attributes:
+      rank: the rank that noticed.
+      peer: the rank that closed.
+    """
+
+    def __init__(self, rank: int, peer: int, operation: str) -> None:
+        super().__init__(f"rank {rank}: peer {peer} has closed its pipe, in {operation}")
+        self.rank, self.peer, self.operation = rank, peer, operation
+
+
 class ParameterMismatch(GmijaxError):
     """GMIs that must hold bit-identical parameters do not."""
+
+
+class SelfCheckFailed(GmijaxError):
+    """Matrix products are wrong on the share of a GMI; the message says which, and the share."""
 
 
 class NonFiniteError(GmijaxError):

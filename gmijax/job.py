@@ -9,7 +9,7 @@ from __future__ import annotations
 import dataclasses
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
@@ -17,7 +17,9 @@ from typing import Any, NamedTuple
 
 from rich.console import Console
 
+from gmijax import dedicated
 from gmijax.config import TrainConfig
+from gmijax.decoupled import MODULE, is_decoupled, plan_decoupled, shared_blocks
 from gmijax.errors import ConfigError, GmijaxError, JobInterrupted
 from gmijax.launcher import Launch, run_gmis
 from gmijax.partition.machine import Machine, detect_machine
@@ -29,10 +31,15 @@ from gmijax.results import MetricsReader, copy_history, draw_returns, read_metri
 from gmijax.resume import CheckpointMeta, check_fits, find_checkpoint, saved_config
 from gmijax.rundir import RunPaths, create_run, read_json, write_json
 from gmijax.schema import to_dict
+from gmijax.searching import decided
+from gmijax.selection import estimated_floats, with_measured
 from gmijax.sim import source
 from gmijax.sim.impl import choose_impl
 from gmijax.sim.registry import require_task
 from gmijax.version import __version__
+
+_ASYNCHRONOUS = ("pps", "ttop", "staleness", "bytes_per_s", "dropped")
+"""Figures that only asynchronous training has."""
 
 _VERSIONS = ("jax", "jaxlib", "mujoco-mjx", "flax", "optax", "orbax-checkpoint")
 
@@ -66,14 +73,17 @@ def train(config: TrainConfig, *, show: bool = False) -> Result:
     config = dataclasses.replace(config, env=source.pinned(config.env))
     config = _with_checkpoint(config)
     machine = detect_machine()
-    plan = make_plan(config.plan, config.reduce, config.num_envs, machine)
+    console = Console(stderr=False, quiet=not show, soft_wrap=True, highlight=False)
+    config, found = decided(config, machine, console)
+    plan = _make_plan(config, machine)
+    if config.reduce.selection == "measured":
+        plan = _with_measured(config, plan, machine)
     config, reason = _with_impl(config, plan)
     run = create_run(config.run.dir, config.run.name, f"{config.env.slug}-{config.algo.name}")
     write_json(run.config, to_dict(config))
     write_json(run.plan, plan.to_dict())
-    console = Console(stderr=False, quiet=not show, soft_wrap=True, highlight=False)
     changed = _what_changed(config)
-    _announce(console, plan, (reason, changed) if changed else (reason,), run)
+    _announce(console, plan, (*found, reason, *((changed,) if changed else ())), run)
     progress = (
         ConsoleProgress(console, MetricsReader(run.metrics), config.num_timesteps)
         if show
@@ -83,7 +93,8 @@ def train(config: TrainConfig, *, show: bool = False) -> Result:
     try:
         _copy_history(config, run)
         with progress:
-            run_gmis(_launch(config, plan, machine, run), progress.update)
+            launch = _launch(config, plan, machine, run, console)
+            run_gmis(launch, progress.update)
         status = "completed"
     except JobInterrupted as error:
         status = "interrupted"
@@ -95,12 +106,26 @@ def train(config: TrainConfig, *, show: bool = False) -> Result:
     finally:
         # A full disk must not hide why the job failed.
         with suppress(OSError):
+            plan = Plan.from_dict(read_json(run.plan))  # Its backend may have been replaced.
             summary = _summarise(config, plan, run, status, time.monotonic() - started)
             write_json(run.summary, summary)
             draw_returns(run.metrics, run.returns_png, f"{config.env.label}, {config.algo.name}")
     summary = read_json(run.summary)
     console.print(_outcome(summary, run))
     return Result(run.root, summary)
+
+
+def _make_plan(config: TrainConfig, machine: Machine) -> Plan:
+    if is_decoupled(config):
+        return plan_decoupled(config, machine)
+    return make_plan(config.plan, config.reduce, config.envs_per_gmi, machine)
+
+
+def _with_measured(config: TrainConfig, plan: Plan, machine: Machine) -> Plan:
+    """The plan with the reduction that is fastest here, which may first have to be measured."""
+    algo = config.algo
+    hidden = (algo.policy_hidden_layer_sizes, algo.value_hidden_layer_sizes)
+    return with_measured(plan, machine, estimated_floats(*hidden), config.reduce.intra)
 
 
 def _with_impl(config: TrainConfig, plan: Plan) -> tuple[TrainConfig, str]:
@@ -160,20 +185,40 @@ def _with_checkpoint(config: TrainConfig) -> TrainConfig:
     return dataclasses.replace(config, run=dataclasses.replace(config.run, resume=str(checkpoint)))
 
 
-def _launch(config: TrainConfig, plan: Plan, machine: Machine, run: RunPaths) -> Launch:
+def _launch(
+    config: TrainConfig, plan: Plan, machine: Machine, run: RunPaths, console: Console
+) -> Launch:
     times = config.run
     return Launch(
         plan=plan,
         machine=machine,
         run=run,
-        module="gmijax.worker",
+        module=_module(config, plan),
+        # Agents and trainers compile different programs.
+        compile_once=not is_decoupled(config) and not dedicated.is_dedicated(plan),
+        shared=_shared(config, plan),
         patience=Patience(
             start_timeout_s=times.start_timeout_s,
             stall_timeout_s=times.stall_timeout_s,
             stop_timeout_s=times.stall_timeout_s,
             grace_s=times.grace_s,
         ),
+        on_warning=lambda text: console.print(text, markup=False),
     )
+
+
+def _module(config: TrainConfig, plan: Plan) -> str:
+    """Main of the GMIs."""
+    if is_decoupled(config):
+        return MODULE
+    return dedicated.MODULE if dedicated.is_dedicated(plan) else "gmijax.worker"
+
+
+def _shared(config: TrainConfig, plan: Plan) -> Mapping[str, Callable[[], int]]:
+    """The memory that the GMIs share, beside that of the reducer."""
+    if is_decoupled(config):
+        return shared_blocks(config, plan)
+    return dedicated.shared_blocks(plan) if dedicated.is_dedicated(plan) else {}
 
 
 def _announce(console: Console, plan: Plan, more: Sequence[str], run: RunPaths) -> None:
@@ -202,7 +247,10 @@ def _summarise(
             "layout": [list(gmis) for gmis in plan.layout.gmis_of_gpu],
             "num_envs_per_gmi": plan.num_envs_per_gmi,
             "strategy": plan.strategy,
-            "intra": plan.intra,
+            "intra": result.get("intra", plan.intra),
+            "selection": dict(plan.selection),
+            "template": plan.template,
+            "roles": list(plan.roles),
         },
         "env_steps": result.get("env_steps"),
         "wall_s": wall_s,
@@ -212,6 +260,7 @@ def _summarise(
         "step_per_s_sim": result.get("step_per_s_sim"),
         "step_per_s_inference": result.get("step_per_s_inference"),
         "step_per_s_train": result.get("step_per_s_train"),
+        **{key: result[key] for key in _ASYNCHRONOUS if key in result},
         "final_return": result.get("final_return"),
         "overflow_steps": result.get("overflow_steps") or {},
         "checkpoint": str(checkpoints[-1]) if checkpoints else None,

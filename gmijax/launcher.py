@@ -6,6 +6,7 @@ a reserved port for those that form rings, the backend with its daemons.
 
 from __future__ import annotations
 
+import dataclasses
 import os
 import signal
 import sys
@@ -16,16 +17,18 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from gmijax.collectives.memory import create_exchange
-from gmijax.partition.backends import open_backend
+from gmijax.errors import BackendUnavailable
+from gmijax.partition.backend_choice import WHAT_SHARE_LOSES
+from gmijax.partition.backends import Backend, open_backend
 from gmijax.partition.child import ENV_EXCHANGE_FD
 from gmijax.partition.environment import gmi_environment
 from gmijax.partition.gmi_process import GmiStatus
 from gmijax.partition.machine import Machine
 from gmijax.partition.plan import Plan
-from gmijax.partition.reduction import needs_ring
+from gmijax.partition.reduction import meets_at_start, needs_ring
 from gmijax.partition.rendezvous import reserved_address
 from gmijax.partition.supervisor import Job, Patience, Supervisor
-from gmijax.rundir import RunPaths
+from gmijax.rundir import RunPaths, write_json
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -40,10 +43,11 @@ class Launch:
       patience: time limits.
       stops_gracefully: a first SIGINT, SIGTERM or SIGHUP asks the GMIs to finish by themselves;
         otherwise signals do what Python does with them.
-      compile_once: see `Job`; never where GMIs form rings, which meet before they compile.
+      compile_once: see `Job`; never where GMIs meet before they compile.
       shared: blocks of memory for all GMIs, by the environment variable that names the
         descriptor, and what makes one; beside the block that reducers use.
       variables: more environment variables of every GMI.
+      on_warning: told in a sentence when the job runs otherwise than planned.
     """
 
     plan: Plan
@@ -55,6 +59,7 @@ class Launch:
     compile_once: bool = True
     shared: Mapping[str, Callable[[], int]] = field(default_factory=dict)
     variables: Mapping[str, str] = field(default_factory=dict)
+    on_warning: Callable[[str], None] = lambda _: None
 
 
 def run_gmis(
@@ -75,7 +80,7 @@ def run_gmis(
             blocks[ENV_EXCHANGE_FD] = create_exchange
         inherited = {name: _open_block(held, create) for name, create in blocks.items()}
         rendezvous = held.enter_context(reserved_address()) if has_rings else None
-        backend = held.enter_context(open_backend(plan, launch.machine, launch.run))
+        launch, backend = _enter_backend(held, launch)
         supervisor = Supervisor(
             Job(
                 run=launch.run,
@@ -87,7 +92,8 @@ def run_gmis(
                 backend=backend,
                 patience=launch.patience,
                 inherited_fds=inherited,
-                compile_once=launch.compile_once and not has_rings,
+                compile_once=launch.compile_once
+                and not meets_at_start(plan.strategy, plan.layout, plan.intra),
             )
         )
         if launch.stops_gracefully:
@@ -108,6 +114,28 @@ def compilation_cache_dir() -> Path:
     """Where compiled programs stay between runs, unless JAX_COMPILATION_CACHE_DIR says else."""
     base = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
     return Path(base) / "gmijax" / "xla"
+
+
+def _enter_backend(held: ExitStack, launch: Launch) -> tuple[Launch, Backend]:
+    """Enters the plan's backend, or `share` where the plan allows it and says so afterwards.
+
+    Whether daemons may be started here (rights, somebody else's daemon) shows only when it is
+    tried.
+    """
+    plan, machine, run = launch.plan, launch.machine, launch.run
+    try:
+        return launch, held.enter_context(open_backend(plan, machine, run))
+    except BackendUnavailable as error:
+        if not plan.may_share:
+            raise
+        warning = f"backend share: warning: {error}; so {WHAT_SHARE_LOSES}"
+    launch.on_warning(warning)
+    plan = dataclasses.replace(
+        plan, backend="share", may_share=False, reasons=(*plan.reasons, warning)
+    )
+    write_json(run.plan, plan.to_dict())
+    launch = dataclasses.replace(launch, plan=plan)
+    return launch, held.enter_context(open_backend(plan, machine, run))
 
 
 def _open_block(held: ExitStack, create: Callable[[], int]) -> int:

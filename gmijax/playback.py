@@ -38,8 +38,8 @@ def _run(link: ChildLink) -> None:
     import jax
 
     from gmijax.checkpoint import restore_learner
+    from gmijax.learner import init_learner, make_learner
     from gmijax.ppo.episodes import Options, run_episodes
-    from gmijax.ppo.learner import init_learner, make_learner
     from gmijax.sim.impl import choose_impl
     from gmijax.sim.randomize import randomized
     from gmijax.sim.registry import make_env

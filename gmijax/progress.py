@@ -12,7 +12,6 @@ from rich.live import Live
 from rich.table import Table
 
 from gmijax.partition.gmi_process import GmiStatus
-from gmijax.results import MetricsReader
 
 _LINE_EVERY_S = 5.0
 _BAR_WIDTH = 30
@@ -32,6 +31,14 @@ class Progress(Protocol):
 
     def update(self, gmis: Sequence[GmiStatus]) -> None:
         """Called about 20 times a second."""
+        ...
+
+
+class LineSource(Protocol):
+    """Where the latest line of metrics comes from: `MetricsReader`, or several as one."""
+
+    def latest(self) -> dict[str, Any] | None:
+        """The line that came since the last call, None if there is none."""
         ...
 
 
@@ -56,7 +63,7 @@ class SilentProgress:
 class ConsoleProgress:
     """Iteration, environment steps per second, return, ETA, and the state of every GMI."""
 
-    def __init__(self, console: Console, metrics: MetricsReader, num_timesteps: int) -> None:
+    def __init__(self, console: Console, metrics: LineSource, num_timesteps: int) -> None:
         self._console = console
         self._metrics = metrics
         self._num_timesteps = num_timesteps
@@ -117,7 +124,7 @@ class ConsoleProgress:
         mean = line.get("return")
         return (
             f"{100 * min(line['env_steps'] / self._num_timesteps, 1):.0f} %  "
-            f"{line['env_steps']:,} steps  {line['env_steps_per_s']:,.0f} steps/s  "
+            f"{line['env_steps']:,} steps  {_rates(line)}  "
             f"return {'-' if mean is None else format(mean, '.2f')}  ETA {self._eta()}"
         )
 
@@ -133,3 +140,14 @@ class ConsoleProgress:
 
 def _states(gmis: Sequence[GmiStatus]) -> str:
     return ", ".join(f"GMI {gmi.gmi} {gmi.state}" for gmi in gmis)
+
+
+def _rates(line: dict[str, Any]) -> str:
+    """Steps per second; of acting and of learning where other GMIs do the one and the other."""
+    if "async/pps" not in line:
+        return f"{line['env_steps_per_s']:,.0f} steps/s"
+    behind = line["async/staleness_mean"]
+    return (
+        f"PPS {line['async/pps']:,.0f}  TTOP {line['async/ttop']:,.0f}  "
+        f"staleness {'-' if behind is None else format(behind, '.1f')}"
+    )

@@ -6,10 +6,10 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from gmijax.config import EnvConfig, PpoConfig
+from gmijax.config import ALGORITHMS, AlgoConfig, EnvConfig
 from gmijax.errors import ConfigError
 from gmijax.rundir import META, RunPaths, last_run, read_json
-from gmijax.schema import from_dict
+from gmijax.schema import from_dict, from_named
 
 
 @dataclass(frozen=True)
@@ -97,14 +97,15 @@ def saved_config(checkpoint: Path) -> dict[str, Any]:
     return saved
 
 
-def trained_config(checkpoint: Path) -> tuple[EnvConfig, PpoConfig]:
+def trained_config(checkpoint: Path) -> tuple[EnvConfig, AlgoConfig]:
     """Task and algorithm of the run that a checkpoint lies in.
 
     Raises:
       ConfigError: the checkpoint does not lie in the folder of a training run.
     """
     saved = saved_config(checkpoint)
-    return from_dict(EnvConfig, saved["env"], "env."), from_dict(PpoConfig, saved["algo"], "algo.")
+    algo = from_named(ALGORITHMS, saved["algo"], "algo.")
+    return from_dict(EnvConfig, saved["env"], "env."), algo
 
 
 def check_fits(meta: CheckpointMeta, wanted: CheckpointMeta, key: str, value: str) -> None:

@@ -2,7 +2,7 @@
 
 `<run>/config.json plan.json summary.json metrics.jsonl returns.png tensorboard/`
 `<run>/checkpoints/<12-digit env steps>/meta.json`
-`<run>/gmi_<id>/{stdout.log,stderr.log,heartbeat.json,error.json,result.json}`
+`<run>/gmi_<id>/{stdout.log,stderr.log,heartbeat.json,error.json,result.json,metrics.jsonl}`
 """
 
 from __future__ import annotations
@@ -57,6 +57,21 @@ class GmiPaths:
     def result(self) -> Path:
         """What the GMI's role returned."""
         return self.root / "result.json"
+
+    @property
+    def role(self) -> Path:
+        """A role of the user's own and its arguments, pickled."""
+        return self.root / "role.pickle"
+
+    @property
+    def output(self) -> Path:
+        """What a role of the user's own returned, pickled."""
+        return self.root / "output.pickle"
+
+    @property
+    def metrics(self) -> Path:
+        """Lines of a GMI that reports for itself alone."""
+        return self.root / "metrics.jsonl"
 
 
 @dataclass(frozen=True)

@@ -11,7 +11,7 @@ import difflib
 import sys
 import types
 import typing
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any, Literal, TypeVar
 
 from gmijax.errors import ConfigError
@@ -60,6 +60,24 @@ def from_dict(cls: type[T], data: Mapping[str, Any], path: str = "") -> T:
     return cls(**{key: _convert(kind, data[key], path + key) for key, kind in given.items()})
 
 
+def from_named(classes: Sequence[type[T]], data: Mapping[str, Any], path: str = "") -> T:
+    """`from_dict` with the one of `classes` whose field `name`, a literal, allows that of `data`.
+
+    Raises:
+      ConfigError: none does, or as `from_dict`.
+    """
+    by_name = {
+        name: cls
+        for cls in classes
+        for name in typing.get_args(typing.get_type_hints(cls)["name"])
+    }
+    if data.get("name") not in by_name:
+        raise ConfigError(
+            f"{path}name={_shown(data.get('name'))}: expected one of {', '.join(by_name)}"
+        )
+    return from_dict(by_name[data["name"]], data, path)
+
+
 def to_dict(config: Any) -> dict[str, Any]:
     """The plain data of a config tree; `from_dict` inverts it."""
     return dataclasses.asdict(config)
@@ -78,10 +96,13 @@ def _has_default(cls: Any, key: str) -> bool:
 
 
 def _convert(kind: Any, value: Any, key: str) -> Any:
-    if dataclasses.is_dataclass(kind):
+    trees: list[Any] = [x for x in _options(kind) if dataclasses.is_dataclass(x)]
+    if trees:
         if not isinstance(value, Mapping):
             raise ConfigError(f"{key}={value!r}: expected a group of keys")
-        return from_dict(typing.cast(type, kind), value, f"{key}.")
+        if len(trees) > 1:
+            return from_named(trees, value, f"{key}.")
+        return from_dict(trees[0], value, f"{key}.")
     for option in _options(kind):
         converted = _accept(option, value, key)
         if converted is not _REJECTED:

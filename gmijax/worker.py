@@ -9,7 +9,7 @@ from __future__ import annotations
 import sys
 from typing import TYPE_CHECKING, Any
 
-from gmijax.config import TrainConfig
+from gmijax.config import PpoConfig, TrainConfig
 from gmijax.partition.child import ChildLink, run_gmi
 from gmijax.partition.plan import Plan
 from gmijax.rundir import read_json
@@ -32,26 +32,30 @@ def _run(link: ChildLink) -> dict[str, Any]:
 
     start_timeout_s = config.run.start_timeout_s
     world = join_world(plan.strategy, plan.layout, link.gmi, link.rendezvous, start_timeout_s)
+    from gmijax.selfcheck import check_share
+
+    check_share(plan, link.gmi)
     from gmijax.ppo.programs import exchange_size
     from gmijax.ppo.role import train
     from gmijax.sim.randomize import randomized
     from gmijax.sim.registry import make_env
     from gmijax.sim.wrappers import training_env
 
+    assert isinstance(config.algo, PpoConfig)  # Others have a main of their own.
     env = make_env(
         str(config.env.name),
         suite=config.env.suite,
         impl=config.physics.impl,
         episode_length=config.env.episode_length,
-        max_envs=config.num_envs,
+        max_envs=config.envs_per_gmi,
     )
     if config.env.randomize == "on":
         env = randomized(
             env,
             config.env.randomization,
             seed=config.seed,
-            first_env=link.gmi * config.num_envs,
-            num_envs=config.num_envs,
+            first_env=link.gmi * config.envs_per_gmi,
+            num_envs=config.envs_per_gmi,
         )
     reducer = build_reducer(
         plan.strategy,
@@ -64,10 +68,14 @@ def _run(link: ChildLink) -> dict[str, Any]:
             rendezvous_timeout_s=start_timeout_s,
             world=world,
             intra=plan.intra,
+            host_if_unavailable=config.reduce.intra == "auto",
         ),
     )
     try:
-        return train(config, training_env(env), reducer, link)
+        done = train(config, training_env(env), reducer, link)
+        if plan.strategy == "har":  # It may have come to another exchange than the plan's.
+            done["intra"] = "ipc" if reducer.is_device_resident else "host"
+        return done
     finally:
         reducer.close()
 

@@ -21,6 +21,7 @@ from typing import Any
 import numpy as np
 
 from gmijax.collectives.build import Membership, build_reducer, join_world
+from gmijax.collectives.host import HostExchange
 from gmijax.collectives.interface import DeviceReducer, FloatBuffer, Reducer, stays_on_device
 from gmijax.collectives.memory import create_exchange
 from gmijax.errors import CollectiveTimeout, GmijaxError, PeerLost
@@ -48,7 +49,9 @@ class Ranks:
         self.processes: dict[int, subprocess.Popen[bytes]] = {}
         defaults = {"strategy": "mpr", "num_floats": 100, "timeout_s": 20.0, "start_s": 60.0}
         layout = [list(range(world_size))]
-        self._options = {**defaults, "body": body, "layout": layout, **options}
+        # Devices by position of a GPU in the layout; none: the CPU.
+        defaults |= {"intra": "host", "layout": layout, "gpus": []}
+        self._options = {**defaults, "body": body, **options}
         self._held = ExitStack()
         if needs_ring(self._options["strategy"], layout_of(self._options)):
             self._options["address"] = self._held.enter_context(reserved_address())
@@ -70,12 +73,7 @@ class Ranks:
             with (self.folder / f"stderr_{rank}").open("wb") as stderr:
                 self.processes[rank] = subprocess.Popen(
                     [sys.executable, __file__, json.dumps(given)],
-                    env={
-                        **os.environ,
-                        ENV_EXCHANGE_FD: str(self.fd),
-                        "PYTHONPATH": str(REPOSITORY),
-                        "JAX_PLATFORMS": "cpu",
-                    },
+                    env={**os.environ, **environment_of(given), ENV_EXCHANGE_FD: str(self.fd)},
                     pass_fds=[self.fd],
                     stdin=subprocess.DEVNULL,
                     stdout=stderr,
@@ -154,6 +152,9 @@ def check_device(reducer: DeviceReducer, buffer: FloatBuffer, mean: FloatBuffer)
 
     on_device = reducer.mean_on_device(jax.device_put(buffer))
     assert on_device.devices() == set(jax.local_devices())
+    # One behind the other, without waiting: the mean of equal buffers is the buffer itself.
+    twice = reducer.run_on_device(lambda mean: mean(mean(jax.device_put(buffer))))
+    np.testing.assert_allclose(twice, mean, rtol=1e-5)
     assert np.asarray(on_device).tobytes() == mean.tobytes()
 
 
@@ -238,14 +239,44 @@ def leave_mark(mark: str, options: Options) -> None:
     (Path(options["folder"]) / f"{mark}_{options['rank']}").touch()
 
 
+def environment_of(options: Options) -> dict[str, str]:
+    """Variables of one rank."""
+    path = os.pathsep.join(filter(None, (str(REPOSITORY), os.environ.get("PYTHONPATH"))))
+    if not options["gpus"]:
+        return {"PYTHONPATH": path, "JAX_PLATFORMS": "cpu"}
+    return {
+        "PYTHONPATH": path,
+        "JAX_PLATFORMS": "cuda",
+        "CUDA_VISIBLE_DEVICES": str(options["gpus"][layout_of(options).gpu_of(options["rank"])]),
+        "XLA_PYTHON_CLIENT_PREALLOCATE": "false",
+        "XLA_FLAGS": "--xla_gpu_shard_autotuning=false",
+        "NCCL_NVLS_ENABLE": "0",
+    }
+
+
 def layout_of(options: Options) -> Layout:
     """The layout that the options describe."""
     return Layout(tuple(tuple(gmis) for gmis in options["layout"]))
 
 
+def use_fake_device_memory(*, is_broken: bool) -> None:
+    """Lets `intra=ipc` run on the CPU: the real exchange over memory that is not a GPU's."""
+    from fake_device_memory import BrokenDeviceMemory, FakeDeviceMemory
+
+    from gmijax.collectives import build, ipc
+
+    def fake(layout: Layout, rank: int, num_floats: int, host: HostExchange) -> ipc.IpcIntra:
+        memory = BrokenDeviceMemory if is_broken else FakeDeviceMemory
+        return ipc.IpcIntra(layout, rank, num_floats, host, memory)
+
+    build.INTRA = {**build.INTRA, "ipc": fake}
+
+
 def make_reducer(options: Options) -> Reducer:
     """The reducer of one rank."""
     strategy, rank, layout = options["strategy"], options["rank"], layout_of(options)
+    if options["intra"] == "ipc" and not options["gpus"]:
+        use_fake_device_memory(is_broken=rank == options.get("broken_rank"))
     return build_reducer(
         strategy,
         Membership(
@@ -256,6 +287,8 @@ def make_reducer(options: Options) -> Reducer:
             timeout_s=options["timeout_s"],
             rendezvous_timeout_s=options["start_s"],
             world=join_world(strategy, layout, rank, options.get("address"), options["start_s"]),
+            intra=options["intra"],
+            host_if_unavailable=options.get("host_if_unavailable", False),
         ),
     )
 

@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import numpy as np
 
 from gmijax.collectives.interface import FloatBuffer
 from gmijax.collectives.memory import FLOATS_PER_LINE, MAX_GATHER_FLOATS
 from gmijax.errors import CollectiveError
+
+if TYPE_CHECKING:
+    import jax
 
 
 def chunk_bounds(num_floats: int, world_size: int, rank: int) -> tuple[int, int]:
@@ -25,6 +30,15 @@ def require_mean_input(buffer: FloatBuffer, num_floats: int) -> None:
     _require_flat("mean", buffer)
     if buffer.size != num_floats:
         raise CollectiveError(f"mean: got {buffer.size} floats, expected {num_floats}")
+
+
+def require_device_buffer(buffer: jax.Array, num_floats: int) -> None:
+    """Raises CollectiveError unless `buffer` is [P] float32."""
+    if buffer.dtype != np.float32 or buffer.shape != (num_floats,):
+        raise CollectiveError(
+            f"mean: got {buffer.dtype} of shape {list(buffer.shape)}, expected float32 of "
+            f"shape [{num_floats}]"
+        )
 
 
 def require_gather_input(values: FloatBuffer) -> None:

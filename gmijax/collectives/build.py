@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from gmijax.collectives.host import HostExchange
 from gmijax.collectives.interface import Reducer
-from gmijax.collectives.intra import INTRA
+from gmijax.collectives.intra import INTRA, IntraExchange, IntraUnavailable
 from gmijax.collectives.mpr import MprReducer
 from gmijax.collectives.solo import SoloReducer
 from gmijax.errors import ConfigError
@@ -32,6 +33,8 @@ class Membership:
       rendezvous_timeout_s: the same in the first call, when others may still start or compile.
       world: this process among those of all GMIs, None where no strategy needs rings.
       intra: how the GMIs of one GPU exchange numbers in HAR.
+      host_if_unavailable: whether HAR goes through host memory, with a warning, where `intra`
+        turns out not to work.
     """
 
     layout: Layout
@@ -42,6 +45,7 @@ class Membership:
     rendezvous_timeout_s: float
     world: World | None = None
     intra: str = "host"
+    host_if_unavailable: bool = False
 
 
 def join_world(
@@ -101,14 +105,27 @@ def _rings(name: str, membership: Membership) -> Reducer:
 
 
 def _har(membership: Membership) -> Reducer:
-    from gmijax.collectives.har import HarReducer  # Imports jax.
+    from gmijax.collectives.har import DeviceHarReducer, HarReducer  # Imports jax.
 
     layout, num_floats = membership.layout, membership.num_floats
     world = _world("har", membership) if needs_ring("har", layout) else None
     if membership.intra not in INTRA:
         raise ConfigError(f"reduce.intra={membership.intra}: expected one of {', '.join(INTRA)}")
-    intra = INTRA[membership.intra](layout, membership.rank, num_floats)
-    return HarReducer(_host("har", membership), intra, world, num_floats)
+    host = _host("har", membership)
+    intra = _intra(membership, host)
+    reducer = DeviceHarReducer if intra.is_device_resident else HarReducer
+    return reducer(host, intra, world, num_floats)
+
+
+def _intra(membership: Membership, host: HostExchange) -> IntraExchange:
+    layout, rank, num_floats = membership.layout, membership.rank, membership.num_floats
+    try:
+        return INTRA[membership.intra](layout, rank, num_floats, host)
+    except IntraUnavailable as error:
+        if not membership.host_if_unavailable:
+            raise
+        warnings.warn(f"{error}; so through host memory", RuntimeWarning, stacklevel=2)
+    return INTRA["host"](layout, rank, num_floats, host)
 
 
 def _host(name: str, membership: Membership) -> HostExchange:

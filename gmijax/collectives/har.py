@@ -2,17 +2,23 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from typing import TypeVar
+
 import jax
 import numpy as np
 
+from gmijax.collectives.buffers import require_device_buffer, require_mean_input
 from gmijax.collectives.courier import Courier
 from gmijax.collectives.host import HostExchange
-from gmijax.collectives.interface import FloatBuffer
+from gmijax.collectives.interface import DeviceMean, FloatBuffer
 from gmijax.collectives.intra import IntraExchange
 from gmijax.collectives.mrr import open_rings, run_watched
 from gmijax.collectives.ring import Ring, World
 from gmijax.collectives.turns import Turns
 from gmijax.partition.reduction import leaders
+
+T = TypeVar("T")
 
 
 class HarReducer:
@@ -23,7 +29,7 @@ class HarReducer:
 
     Args:
       host: this rank's use of the shared block.
-      intra: the exchange inside a GPU.
+      intra: the exchange inside a GPU, through host memory.
       world: this process among those of all GMIs; None with one GPU, which needs no ring.
       num_floats: P, length of the buffers for `mean`.
     """
@@ -31,22 +37,17 @@ class HarReducer:
     is_device_resident = False
 
     def __init__(
-        self, host: HostExchange, intra: IntraExchange, world: World | None, num_floats: int
+        self,
+        host: HostExchange,
+        intra: IntraExchange[FloatBuffer],
+        world: World | None,
+        num_floats: int,
     ) -> None:
         self.rank = host.rank
         self.world_size = host.world_size
         self._host = host
         self._intra = intra
-        self._ring: Ring | None = None
-        self._courier: Courier | None = None
-        if world is not None:
-            host.rendezvous()
-            self._courier = Courier("ring")
-            members = leaders(world.layout)
-            if self.rank in members:
-                self._ring = world.ring(members, num_floats)
-            use = self._ring_mean if self._ring is not None else None
-            open_rings(world, self._courier, use, num_floats)
+        self._ring = None if world is None else LeaderRing(host, world, num_floats)
 
     def mean(self, buffer: FloatBuffer) -> FloatBuffer:
         """Returns the mean over ranks of `buffer` [P] float32, see `Reducer.mean`.
@@ -57,8 +58,10 @@ class HarReducer:
           CollectiveError: ranks make different calls, or this one is not allowed.
         """
         block, turns = self._host.begin_mean(buffer)
-        total = self._intra.sum(buffer, block, turns)
-        mean = None if total is None else self._mean_of_gpus(total, turns)
+        scale = 1.0 if self._ring else 1.0 / self.world_size
+        mean = self._intra.sum(buffer, block, turns, scale)
+        if mean is not None and self._ring is not None:
+            mean = np.asarray(self._ring.mean(jax.device_put(mean), turns))
         result = self._intra.spread(mean, block, turns)
         turns.end()
         return result
@@ -69,16 +72,108 @@ class HarReducer:
 
     def close(self) -> None:
         """Gives thread and memory back, once no result is in use; calling it twice is fine."""
-        if self._courier is not None:
-            self._courier.close()
+        if self._ring is not None:
+            self._ring.close()
         self._host.close()
 
-    def _mean_of_gpus(self, total: FloatBuffer, turns: Turns) -> FloatBuffer:
-        if self._courier is None:
-            return total * np.float32(1.0 / self.world_size)
-        mean = run_watched(self._courier, turns, lambda: self._ring_mean(jax.device_put(total)))
-        return np.asarray(mean)
 
-    def _ring_mean(self, total: jax.Array) -> jax.Array:
+class DeviceHarReducer:
+    """The same without leaving the GPUs: a `DeviceReducer`.
+
+    Args:
+      host: this rank's use of the shared block, for turns and `all_gather`.
+      intra: the exchange inside a GPU, on the device.
+      world: this process among those of all GMIs; None with one GPU, which needs no ring.
+      num_floats: P, length of the buffers for `mean`.
+    """
+
+    is_device_resident = True
+
+    def __init__(
+        self,
+        host: HostExchange,
+        intra: IntraExchange[jax.Array],
+        world: World | None,
+        num_floats: int,
+    ) -> None:
+        self.rank = host.rank
+        self.world_size = host.world_size
+        self._host = host
+        self._intra = intra
+        self._num_floats = num_floats
+        self._ring = None if world is None else LeaderRing(host, world, num_floats)
+
+    def mean_on_device(self, buffer: jax.Array) -> jax.Array:
+        """Returns the mean over ranks of `buffer` [P] float32, see `DeviceReducer`.
+
+        Raises:
+          PeerLost: the process of another rank is gone.
+          CollectiveTimeout: another rank did not arrive in time.
+          CollectiveError: ranks make different calls, or this one is not allowed.
+        """
+        require_device_buffer(buffer, self._num_floats)
+        block, turns = self._host.begin("mean", self._num_floats)
+        scale = 1.0 if self._ring else 1.0 / self.world_size
+        mean = self._intra.sum(buffer, block, turns, scale)
+        if mean is not None and self._ring is not None:
+            mean = self._ring.mean(mean, turns)
+        result = self._intra.spread(mean, block, turns)
+        turns.end()
+        return result
+
+    def run_on_device(self, program: Callable[[DeviceMean], T]) -> T:
+        """See `DeviceReducer`; raises what `mean_on_device` raises.
+
+        The host takes part in every mean: the GMIs of a GPU know only from each other that a
+        slot is written.
+        """
+        return jax.block_until_ready(program(self.mean_on_device))
+
+    def mean(self, buffer: FloatBuffer) -> FloatBuffer:
+        """The same for a buffer in host memory, with a copy each way; the result is read-only."""
+        require_mean_input(buffer, self._num_floats)
+        return np.asarray(self.mean_on_device(jax.device_put(buffer)))
+
+    def all_gather(self, values: FloatBuffer) -> FloatBuffer:
+        """See `HostExchange.all_gather`."""
+        return self._host.all_gather(values)
+
+    def close(self) -> None:
+        """Gives thread and memory back; calling it twice is fine."""
+        if self._ring is not None:
+            self._ring.close()
+        self._intra.close()
+        self._host.close()
+
+
+class LeaderRing:
+    """The ring over one GMI of every GPU; all ranks of the job make one, leaders use it.
+
+    Args:
+      host: this rank's use of the shared block.
+      world: this process among those of all GMIs.
+      num_floats: P, length of the buffers.
+    """
+
+    def __init__(self, host: HostExchange, world: World, num_floats: int) -> None:
+        host.rendezvous()
+        self._scale = 1.0 / host.world_size
+        self._courier = Courier("ring")
+        members = leaders(world.layout)
+        self._ring: Ring | None = None
+        if host.rank in members:
+            self._ring = world.ring(members, num_floats)
+        use = self._mean if self._ring is not None else None
+        open_rings(world, self._courier, use, num_floats)
+
+    def mean(self, total: jax.Array, turns: Turns) -> jax.Array:
+        """The mean over all GMIs, from the `total` [P] of every GPU; raises as `run_watched`."""
+        return run_watched(self._courier, turns, lambda: self._mean(total))
+
+    def close(self) -> None:
+        """Ends the thread; calling it twice is fine."""
+        self._courier.close()
+
+    def _mean(self, total: jax.Array) -> jax.Array:
         assert self._ring is not None
-        return self._ring.sum(total, 1.0 / self.world_size)
+        return self._ring.sum(total, self._scale)

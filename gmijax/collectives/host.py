@@ -87,6 +87,12 @@ class HostExchange:
         turns.end()
         return gathered
 
+    def introduce(self, values: FloatBuffer) -> FloatBuffer:
+        """`all_gather` as part of the start: others may still compile in the call after it."""
+        gathered = self.all_gather(values)
+        self._turns.restart()
+        return gathered
+
     def close(self) -> None:
         """Gives the memory back, once no result is in use; calling it twice is fine."""
         if self._block is not None:

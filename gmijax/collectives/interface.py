@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Protocol, TypeGuard
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Protocol, TypeGuard, TypeVar
 
 import numpy as np
 import numpy.typing as npt
@@ -11,6 +12,9 @@ if TYPE_CHECKING:
     import jax
 
 FloatBuffer = npt.NDArray[np.float32]
+DeviceMean = Callable[["jax.Array"], "jax.Array"]
+
+T = TypeVar("T")
 
 
 class Reducer(Protocol):
@@ -58,11 +62,25 @@ class Reducer(Protocol):
 class DeviceReducer(Reducer, Protocol):
     """A `Reducer` whose mean need not pass through host memory."""
 
+    def run_on_device(self, program: Callable[[DeviceMean], T]) -> T:
+        """Returns what `program(mean)` returns, when all its arrays are computed.
+
+        In it `mean(buffer)` is the mean over ranks of `buffer` [P] float32, an array on this
+        rank's device that need not be there yet: what follows is queued behind it, and the
+        device does not wait for the host between one exchange and the next. Every rank runs a
+        program with as many means.
+
+        Raises:
+          PeerLost: the process of another rank is gone.
+          CollectiveTimeout: another rank did not arrive in time.
+        """
+        ...
+
     def mean_on_device(self, buffer: jax.Array) -> jax.Array:
         """Returns the mean over ranks of `buffer` [P] float32, both on this rank's device.
 
-        The buffer may still be computed when this is called; the result is there on return,
-        and is the caller's own.
+        Both may still be computed, the buffer when this is called and the result when it
+        returns; the result is the caller's own.
 
         Raises:
           PeerLost: the process of another rank is gone.
@@ -72,5 +90,5 @@ class DeviceReducer(Reducer, Protocol):
 
 
 def stays_on_device(reducer: Reducer) -> TypeGuard[DeviceReducer]:
-    """Whether `mean_on_device` is there, and better than `mean`."""
+    """Whether means can be taken on the device, and should be."""
     return reducer.is_device_resident

@@ -1,30 +1,57 @@
-"""How the GMIs of one GPU exchange numbers in HAR: one seam, one way so far."""
+"""How the GMIs of one GPU exchange numbers in HAR: one seam, and the way through the host."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from typing import Protocol
+from typing import TYPE_CHECKING, Protocol, TypeVar
 
 import numpy as np
 
 from gmijax.collectives.buffers import chunk_bounds
+from gmijax.collectives.host import HostExchange
 from gmijax.collectives.interface import FloatBuffer
 from gmijax.collectives.memory import ExchangeBlock
 from gmijax.collectives.slots import add_slots, read_only
 from gmijax.collectives.turns import Turns
+from gmijax.errors import CollectiveError
 from gmijax.partition.layout import Layout
 from gmijax.partition.reduction import leaders
 
+if TYPE_CHECKING:
+    import jax
 
-class IntraExchange(Protocol):
-    """One rank's part in the exchange inside its GPU; all ranks of the job call both, in turn."""
+B = TypeVar("B", "FloatBuffer", "jax.Array")
 
-    def sum(self, buffer: FloatBuffer, block: ExchangeBlock, turns: Turns) -> FloatBuffer | None:
-        """The sum of `buffer` [P] over the GMIs of this GPU, for its leader; else None."""
+
+class IntraUnavailable(CollectiveError):
+    """An exchange that cannot be had here; raised on all ranks of the job alike."""
+
+
+class IntraExchange(Protocol[B]):
+    """One rank's part in the exchange inside its GPU; all ranks of the job call both, in turn.
+
+    Attributes:
+      is_device_resident: whether the buffers are those of jax, in the device's memory.
+    """
+
+    is_device_resident: bool
+
+    def sum(self, buffer: B, block: ExchangeBlock, turns: Turns, scale: float) -> B | None:
+        """The sum of `buffer` [P] over this GPU's GMIs, times `scale`, for its leader; else None.
+
+        With one GPU, whose sum is the whole, others may get it too.
+        """
         ...
 
-    def spread(self, mean: FloatBuffer | None, block: ExchangeBlock, turns: Turns) -> FloatBuffer:
-        """The `mean` [P] that every leader has, for all; read-only, valid until the next call."""
+    def spread(self, mean: B | None, block: ExchangeBlock, turns: Turns) -> B:
+        """The `mean` [P] that every leader has, for all.
+
+        In host memory it is read-only, and valid until the next call.
+        """
+        ...
+
+    def close(self) -> None:
+        """Releases what the exchange holds; calling it twice is fine."""
         ...
 
 
@@ -42,6 +69,8 @@ class HostIntra:
       num_floats: P, length of the buffers.
     """
 
+    is_device_resident = False
+
     def __init__(self, layout: Layout, rank: int, num_floats: int) -> None:
         neighbours, all_leaders = layout.neighbours_of(rank), leaders(layout)
         self._rank = rank
@@ -52,7 +81,9 @@ class HostIntra:
         place = all_leaders.index(self._leader)
         self._written = _chunk(num_floats, place, len(all_leaders))
 
-    def sum(self, buffer: FloatBuffer, block: ExchangeBlock, turns: Turns) -> FloatBuffer | None:
+    def sum(
+        self, buffer: FloatBuffer, block: ExchangeBlock, turns: Turns, scale: float
+    ) -> FloatBuffer | None:
         """See `IntraExchange`."""
         block.slots[self._rank] = buffer
         turns.meet()
@@ -60,7 +91,7 @@ class HostIntra:
         total = block.slots[self._leader]
         # Overflow and NaN are for the caller to judge, not worth a warning here.
         with np.errstate(over="ignore", invalid="ignore"):
-            add_slots(block, self._in_order, self._own, total[self._own])
+            add_slots(block, self._in_order, self._own, total[self._own], scale)
         turns.meet()
         return total if self._rank == self._leader else None
 
@@ -71,10 +102,32 @@ class HostIntra:
         turns.meet()
         return read_only(block.result)
 
+    def close(self) -> None:
+        """Does nothing: the shared block is the reducer's."""
+
 
 def _chunk(num_floats: int, place: int, num_places: int) -> slice:
     return slice(*chunk_bounds(num_floats, num_places, place))
 
 
-INTRA: Mapping[str, Callable[[Layout, int, int], IntraExchange]] = {"host": HostIntra}
+def _host(layout: Layout, rank: int, num_floats: int, host: HostExchange) -> IntraExchange:
+    del host
+    return HostIntra(layout, rank, num_floats)
+
+
+def _ipc(layout: Layout, rank: int, num_floats: int, host: HostExchange) -> IntraExchange:
+    from gmijax.collectives.ipc import DeviceMemory, IpcIntra  # Imports jax.
+
+    def cuda_memory() -> DeviceMemory:
+        from gmijax.collectives.cuda_memory import CudaMemory  # Needs cuda-bindings.
+
+        return CudaMemory()
+
+    return IpcIntra(layout, rank, num_floats, host, cuda_memory)
+
+
+INTRA: Mapping[str, Callable[[Layout, int, int, HostExchange], IntraExchange]] = {
+    "host": _host,
+    "ipc": _ipc,
+}
 """Every way; where one cannot be had: `why_not_intra` in `gmijax.partition.reduction`."""

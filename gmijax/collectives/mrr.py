@@ -8,18 +8,22 @@ ring, and nothing more to do: that is `flat`, plain data parallelism.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import TypeVar
 
 import jax
 import numpy as np
 
-from gmijax.collectives.buffers import require_mean_input
+from gmijax.collectives.buffers import require_device_buffer, require_mean_input
 from gmijax.collectives.courier import Courier
 from gmijax.collectives.host import HostExchange
-from gmijax.collectives.interface import FloatBuffer
+from gmijax.collectives.interface import DeviceMean, FloatBuffer
 from gmijax.collectives.ring import World
 from gmijax.collectives.turns import Turns
 from gmijax.errors import CollectiveError
+
+T = TypeVar("T")
 
 
 class RingReducer:
@@ -55,18 +59,18 @@ class RingReducer:
           CollectiveTimeout: another rank did not arrive in time.
           CollectiveError: ranks make different calls, or this one is not allowed.
         """
-        if buffer.dtype != np.float32 or buffer.shape != (self._num_floats,):
-            raise CollectiveError(
-                f"mean: got {buffer.dtype} of shape {list(buffer.shape)}, expected float32 of "
-                f"shape [{self._num_floats}]"
-            )
+        require_device_buffer(buffer, self._num_floats)
+        return self.run_on_device(lambda mean: mean(buffer))
+
+    def run_on_device(self, program: Callable[[DeviceMean], T]) -> T:
+        """See `DeviceReducer`; raises what `mean_on_device` raises."""
         _, turns = self._host.begin("mean", self._num_floats)
         turns.meet()
         turns.check_same_call()
-        mean = run_watched(self._courier, turns, lambda: self._rings(buffer))
+        result = run_watched(self._courier, turns, lambda: program(self._mean))
         turns.arrive()
         turns.end()
-        return mean
+        return result
 
     def mean(self, buffer: FloatBuffer) -> FloatBuffer:
         """The same for a buffer in host memory, with a copy each way; the result is read-only."""
@@ -81,6 +85,10 @@ class RingReducer:
         """Gives thread and memory back; calling it twice is fine."""
         self._courier.close()
         self._host.close()
+
+    def _mean(self, buffer: jax.Array) -> jax.Array:
+        require_device_buffer(buffer, self._num_floats)
+        return self._rings(buffer)
 
 
 class RingMean:
@@ -126,22 +134,37 @@ def open_rings(
     def first_use() -> None:
         if mean is not None:
             mean(jax.device_put(np.zeros(num_floats, np.float32))).block_until_ready()
-        world.leave()
+        if not world.is_kept:
+            world.leave()
 
     # Without a limit: the controller ends a GMI that does not get through its start.
     courier.run(first_use, lambda done: done.wait())
 
 
-def run_watched(courier: Courier, turns: Turns, program: Callable[[], jax.Array]) -> jax.Array:
+def run_watched(courier: Courier, turns: Turns, program: Callable[[], T]) -> T:
     """Runs a program over several GMIs in the courier's thread, to its end.
 
     Raises:
       PeerLost, CollectiveTimeout: see `Turns.watch`.
       CollectiveError: the transfer failed although all peers are there.
     """
+    with explained(turns):
+        return courier.run(lambda: jax.block_until_ready(program()), turns.watch)
+
+
+@contextmanager
+def explained(turns: Turns) -> Iterator[None]:
+    """Says of a transfer that fails whose end made it fail.
+
+    Raises:
+      PeerLost, CollectiveTimeout: see `Turns.explain_failure`.
+      CollectiveError: the transfer failed although all peers are there.
+    """
     try:
-        return courier.run(lambda: program().block_until_ready(), turns.watch)
-    # A transfer that fails while jax still dispatches it comes as a plain ValueError.
-    except (jax.errors.JaxRuntimeError, ValueError) as error:
+        yield
+    # A transfer that fails while jax still dispatches it comes as a plain ValueError. The errors
+    # of jax and of shared device memory are RuntimeErrors.
+    except (RuntimeError, ValueError) as error:
         turns.explain_failure()
-        raise CollectiveError(f"{turns.where()}: {str(error).splitlines()[0]}") from error
+        said = (str(error).splitlines() or [type(error).__name__])[0]
+        raise CollectiveError(f"{turns.where()}: {said}") from error

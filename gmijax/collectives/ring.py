@@ -40,9 +40,11 @@ class World:
     Attributes:
       layout: the same.
       rank: the same.
+      is_kept: more rings are to come, and who joined leaves by itself when they stand.
     """
 
     def __init__(self, layout: Layout, rank: int) -> None:
+        self.is_kept = False
         self.layout = layout
         self.rank = rank
         self._process_ids = process_ids(layout)

@@ -12,9 +12,9 @@ from collections.abc import Callable
 from typing import NoReturn
 
 from gmijax.collectives.memory import ExchangeBlock, process_of
+from gmijax.collectives.waits import LIVENESS_PERIOD_S
 from gmijax.errors import CollectiveTimeout, PeerLost
 
-LIVENESS_PERIOD_S = 0.2
 SILENCE_S = 0.7
 """A rank that has not beaten for so long does not wait: three beats are missing."""
 

@@ -12,21 +12,14 @@ import threading
 import time
 
 from gmijax.collectives.memory import ExchangeBlock, check_peer
-from gmijax.collectives.suspects import LIVENESS_PERIOD_S, Suspects
+from gmijax.collectives.suspects import Suspects
+from gmijax.collectives.waits import LIVENESS_PERIOD_S, MAX_SLEEP_S, MIN_SLEEP_S, SPIN_S, Fence
 from gmijax.errors import CollectiveError
 
 OPERATIONS = ("mean", "all_gather")
 """What a rank can be calling; the wire format holds the position in this tuple."""
 
 COUNT_SHIFT = 8  # bits of a call word below the number of floats
-
-SPIN_S = 200e-6
-"""How long a waiting rank only gives way before it sleeps.
-
-GMIs that do equal work arrive within microseconds of each other if every one has a core.
-"""
-
-MIN_SLEEP_S, MAX_SLEEP_S = 10e-6, 100e-6
 
 SETTLE_S = 2.0
 """How long to look for a dead peer after a transfer failed: the error comes before the death."""
@@ -45,6 +38,7 @@ class Turns:
         self, block: ExchangeBlock, timeout_s: float, rendezvous_timeout_s: float
     ) -> None:
         self.step = 0
+        self._first_step = 1
         self._block = block
         self._timeout_s = timeout_s
         self._rendezvous_timeout_s = rendezvous_timeout_s
@@ -53,8 +47,7 @@ class Turns:
         self._operation = ""
         self._unfinished = False
         self._thread: int | None = None
-        self._fence_lock = threading.Lock()
-        self._fence_lock.acquire()
+        self._fence = Fence()
         self.arrive()
 
     def rendezvous(self) -> None:
@@ -66,6 +59,10 @@ class Turns:
         """
         self._operation = "start"
         self._wait_for_all()
+
+    def restart(self) -> None:
+        """Says that the calls so far belong to the start: the next one is the first."""
+        self._first_step = self.step + 1
 
     def begin(self, operation: str, count: int) -> None:
         """Opens a call of `operation` with `count` floats.
@@ -181,7 +178,8 @@ class Turns:
         self._fence()
 
     def _suspects(self) -> Suspects:
-        timeout_s = self._rendezvous_timeout_s if self.step <= 1 else self._timeout_s
+        is_first = self.step <= self._first_step
+        timeout_s = self._rendezvous_timeout_s if is_first else self._timeout_s
         return Suspects(self._block, self._operation, self.step, timeout_s)
 
     def _behind(self) -> list[int]:
@@ -191,15 +189,6 @@ class Turns:
     def _missing(self, peers: list[int], target: int) -> list[int]:
         counter_of = self._sequence.item
         return [peer for peer in peers if counter_of(peer) < target]
-
-    def _fence(self) -> None:
-        """Keeps the processor from moving memory accesses across this point.
-
-        A release followed by an acquire of one lock does that on all processors of interest;
-        the lock is private and never contended, so that this costs 0.1 us.
-        """
-        self._fence_lock.release()
-        self._fence_lock.acquire()
 
 
 def _describe(word: int) -> str:

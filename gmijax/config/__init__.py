@@ -6,16 +6,26 @@ the `doc` of every field. `gmijax.schema.from_dict` makes them from outside data
 
 from __future__ import annotations
 
+from gmijax.config.a3c import A3cConfig
+from gmijax.config.channel import ChannelConfig
 from gmijax.config.env import EnvConfig, PhysicsConfig
-from gmijax.config.plan import PlanConfig, ReduceConfig
+from gmijax.config.plan import PlanConfig, ReduceConfig, TemplateName
 from gmijax.config.play import PlayConfig, PlayRunConfig
 from gmijax.config.ppo import ADAPTIVE_LEARNING_RATE_RANGE, PpoConfig
 from gmijax.config.run import RunConfig
-from gmijax.config.train import TrainConfig
+from gmijax.config.search import AUTO, SearchConfig
+from gmijax.config.serve import OutputConfig, ServeConfig, ServeRunConfig
+from gmijax.config.train import ALGORITHMS, AlgoConfig, TrainConfig
 
 __all__ = [
     "ADAPTIVE_LEARNING_RATE_RANGE",
+    "ALGORITHMS",
+    "AUTO",
+    "A3cConfig",
+    "AlgoConfig",
+    "ChannelConfig",
     "EnvConfig",
+    "OutputConfig",
     "PhysicsConfig",
     "PlanConfig",
     "PlayConfig",
@@ -23,5 +33,9 @@ __all__ = [
     "PpoConfig",
     "ReduceConfig",
     "RunConfig",
+    "SearchConfig",
+    "ServeConfig",
+    "ServeRunConfig",
+    "TemplateName",
     "TrainConfig",
 ]

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Literal
 
 from gmijax.errors import ConfigError
 from gmijax.schema import doc, require_at_least, require_between, require_positive
+
+TemplateName = Literal["tcg", "tdg", "tcg_ex", "tdg_ex", "decoupled"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -14,18 +17,46 @@ class PlanConfig:
     """How the job is spread over GPUs."""
 
     gpus: int | tuple[int, ...] = doc("number of GPUs, or their indices as nvidia-smi lists them")
-    gmis_per_gpu: int = doc("GMIs on every GPU")
+    gmis_per_gpu: int | Literal["auto"] = doc(
+        "GMIs on every GPU; auto: what a search finds (docs/search.md)"
+    )
     layout: tuple[tuple[int, ...], ...] | None = doc(
         "GMI ids of every GPU, e.g. [[0,1],[2]]; overrides gpus and gmis_per_gpu"
     )
     backend: Literal["auto", "mps", "mig", "share", "cpu"] = doc(
         "how a GMI gets its share of a GPU"
     )
-    sm_percent: float | None = doc("cap on a GMI's share of SMs in percent (MPS); null: no cap")
-    memory_fraction: float | None = doc(
-        "fraction of a GPU's memory that each GMI reserves; null: 0.8 split evenly"
+    sm_percent: float | tuple[float, ...] | Literal["even"] | None = doc(
+        "cap on a GMI's share of SMs in percent (MPS): one number, one per GMI, even (100 / GMIs "
+        "of the GPU, kept clear of docs/shares.md's bad values), or null: no cap"
     )
-    template: Literal["auto", "tcg_ex"] = doc("how roles map to GMIs")
+    memory_fraction: float | tuple[float, ...] | None = doc(
+        "fraction of a GPU's (or MIG instance's) memory that each GMI reserves: one number or one "
+        "per GMI; null: 0.8 split evenly"
+    )
+    template: Literal["auto", TemplateName] = doc("how roles map to GMIs")
+    force_sm_percent: bool = doc(
+        "take an sm_percent at which wrong matrix products were reported (docs/shares.md)",
+        default=False,
+    )
+    self_check: Literal["auto", "on", "off"] = doc(
+        "compare matrix products with float64 when a GMI starts; auto: where SMs are capped",
+        default="auto",
+    )
+    serving_gpus: int | tuple[int, ...] | None = doc(
+        "with algo=a3c: number of GPUs that act, or their indices; null: all but the training "
+        "ones, or the only one",
+        default=None,
+    )
+    training_gpus: int | tuple[int, ...] | None = doc(
+        "with algo=a3c: number of GPUs that train, or their indices (a GPU may do both); null: "
+        "the last quarter, at least one",
+        default=None,
+    )
+    serving_gmis_per_gpu: int = doc("with algo=a3c: acting GMIs on every GPU that acts", default=1)
+    training_gmis_per_gpu: int = doc(
+        "with algo=a3c: training GMIs on every GPU that trains", default=1
+    )
 
     def __post_init__(self) -> None:
         if isinstance(self.gpus, int):
@@ -34,11 +65,27 @@ class PlanConfig:
             raise ConfigError(
                 f"plan.gpus={list(self.gpus)}: expected a number of GPUs or distinct indices"
             )
-        require_at_least("plan.gmis_per_gpu", self.gmis_per_gpu, 1)
-        if self.sm_percent is not None:
-            require_between("plan.sm_percent", self.sm_percent, 1.0, 100.0)
-        if self.memory_fraction is not None:
-            require_between("plan.memory_fraction", self.memory_fraction, 0.01, 1.0)
+        if self.gmis_per_gpu != "auto":
+            require_at_least("plan.gmis_per_gpu", self.gmis_per_gpu, 1)
+        if self.sm_percent != "even":
+            for percent in _numbers(self.sm_percent):
+                require_between("plan.sm_percent", percent, 1.0, 100.0)
+        for fraction in _numbers(self.memory_fraction):
+            require_between("plan.memory_fraction", fraction, 0.01, 1.0)
+
+    def require_template(self, allowed: Iterable[TemplateName], why: str) -> None:
+        """Raises ConfigError unless `template` is `auto` or one of those `allowed`."""
+        names = ("auto", *allowed)
+        if self.template not in names:
+            raise ConfigError(
+                f"plan.template={self.template}: not for {why}; allowed are {', '.join(names)}"
+            )
+
+
+def _numbers(value: float | tuple[float, ...] | None) -> tuple[float, ...]:
+    if value is None:
+        return ()
+    return value if isinstance(value, tuple) else (value,)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -48,8 +95,20 @@ class ReduceConfig:
     strategy: Literal["auto", "mpr", "mrr", "har", "flat"] = doc(
         "reduction strategy; auto: by the layout (Algorithm 1 of the paper)"
     )
-    intra: Literal["auto", "host", "ipc"] = doc("exchange inside one GPU, for har; auto: host")
+    intra: Literal["auto", "host", "ipc"] = doc(
+        "exchange inside one GPU, for har: through host memory, or through GPU memory that GMIs "
+        "map (ipc); auto: ipc where it can be had"
+    )
     timeout_s: float = doc("longest wait for another GMI in one exchange, seconds")
+    selection: Literal["paper", "measured"] = doc(
+        "what strategy=auto goes by: the paper's Algorithm 1, or the time that every strategy "
+        "takes here, measured before the job starts and kept for the next one",
+        default="paper",
+    )
 
     def __post_init__(self) -> None:
         require_positive("reduce.timeout_s", self.timeout_s)
+        if self.selection == "measured" and self.strategy != "auto":
+            raise ConfigError(
+                f"reduce.selection=measured: needs reduce.strategy=auto, not {self.strategy}"
+            )

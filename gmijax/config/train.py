@@ -3,13 +3,22 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Literal, TypeAlias
 
+from gmijax.config.a3c import A3cConfig
+from gmijax.config.channel import ChannelConfig
 from gmijax.config.env import EnvConfig, PhysicsConfig
 from gmijax.config.plan import PlanConfig, ReduceConfig
 from gmijax.config.ppo import PpoConfig
 from gmijax.config.run import RunConfig
+from gmijax.config.search import SearchConfig
 from gmijax.errors import ConfigError
 from gmijax.schema import doc, require_at_least, require_between
+
+AlgoConfig: TypeAlias = PpoConfig | A3cConfig
+"""The training algorithms; `algo.name` says which."""
+
+ALGORITHMS: tuple[type[AlgoConfig], ...] = (PpoConfig, A3cConfig)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -17,22 +26,49 @@ class TrainConfig:
     """Everything that `python -m gmijax.train` can be told."""
 
     env: EnvConfig
-    algo: PpoConfig
+    algo: AlgoConfig
     physics: PhysicsConfig
     plan: PlanConfig
     reduce: ReduceConfig
+    channel: ChannelConfig
     run: RunConfig
-    num_envs: int = doc("N, environments per GMI")
+    search: SearchConfig
+    num_envs: int | Literal["auto"] = doc(
+        "N, environments per GMI; auto: what a search finds (docs/search.md)"
+    )
     num_timesteps: int = doc("environment steps of the whole job, all GMIs together")
     seed: int = doc("seed of every random number in the job")
 
     def __post_init__(self) -> None:
-        require_at_least("num_envs", self.num_envs, 1)
         require_at_least("num_timesteps", self.num_timesteps, 1)
         require_between("seed", self.seed, 0, 2**31 - 1)
-        samples = self.num_envs * self.algo.unroll_length
+        self.plan.require_template(
+            ("decoupled",) if isinstance(self.algo, A3cConfig) else ("tcg_ex", "tdg_ex"),
+            f"gmijax.train with algo={self.algo.name}",
+        )
+        if self.plan.template == "tdg_ex" and self.reduce.selection != "paper":
+            raise ConfigError(
+                f"reduce.selection={self.reduce.selection}: measured for jobs in which every GMI "
+                "trains; with plan.template=tdg_ex allowed is paper"
+            )
+        if self.num_envs != "auto":
+            self._check_num_envs(self.num_envs)
+
+    @property
+    def envs_per_gmi(self) -> int:
+        """`num_envs` as a number; the controller decides an `auto` before it starts a GMI."""
+        if self.num_envs == "auto":
+            raise ConfigError("num_envs=auto: not decided yet; expected an integer")
+        return self.num_envs
+
+    def _check_num_envs(self, num_envs: int) -> None:
+        require_at_least("num_envs", num_envs, 1)
+        if isinstance(self.algo, A3cConfig):
+            self.algo.batch_of(num_envs)
+            return
+        samples = num_envs * self.algo.unroll_length
         if samples % self.algo.num_minibatches:
             raise ConfigError(
-                f"num_envs={self.num_envs}: num_envs x algo.unroll_length = {samples} samples "
+                f"num_envs={num_envs}: num_envs x algo.unroll_length = {samples} samples "
                 f"do not divide into algo.num_minibatches={self.algo.num_minibatches} minibatches"
             )

@@ -63,26 +63,38 @@ def visible_gpus(gpus: tuple[Gpu, ...], selection: str | None) -> tuple[Gpu, ...
     """The GPUs that a value of `CUDA_VISIBLE_DEVICES` leaves, in its order.
 
     Numbers are taken for indices of nvidia-smi (as with `CUDA_DEVICE_ORDER=PCI_BUS_ID`), other
-    entries for (beginnings of) UUIDs. As in CUDA the first entry that fits no GPU ends the
-    list; None means no restriction, an empty value hides all GPUs.
+    entries for (beginnings of) UUIDs, of GPUs or of MIG instances; a GPU of which instances are
+    named has only those. As in CUDA the first entry that fits nothing ends the list; None means
+    no restriction, an empty value hides all GPUs.
     """
     if selection is None:
         return gpus
-    chosen: list[Gpu] = []
+    chosen: dict[int, Gpu] = {}
     for entry in selection.replace(" ", "").split(","):
-        fits = [
-            gpu
-            for gpu in gpus
-            if (
-                gpu.index == int(entry)
-                if entry.isdigit()
-                else entry and gpu.uuid.startswith(entry)
-            )
-        ]
-        if len(fits) != 1 or fits[0] in chosen:
+        fits = [part for gpu in gpus if (part := _named_part(gpu, entry))]
+        if len(fits) != 1 or not _add(chosen, fits[0]):
             break
-        chosen.append(fits[0])
-    return tuple(chosen)
+    return tuple(chosen.values())
+
+
+def _named_part(gpu: Gpu, entry: str) -> Gpu | None:
+    """The GPU, or it with one instance, if `entry` names that."""
+    if entry.isdigit():
+        return gpu if gpu.index == int(entry) else None
+    if entry and gpu.uuid.startswith(entry):
+        return gpu
+    named = tuple(one for one in gpu.instances if entry and one.uuid.startswith(entry))
+    return gpu._replace(instances=named) if len(named) == 1 else None
+
+
+def _add(chosen: dict[int, Gpu], part: Gpu) -> bool:
+    """Adds a GPU, or one more instance of it; False if that is there already."""
+    before = chosen.get(part.index)
+    if before is not None and set(part.instances) <= set(before.instances):
+        return False
+    more = before.instances if before is not None else ()
+    chosen[part.index] = part._replace(instances=(*more, *part.instances))
+    return True
 
 
 def _cpu_cores() -> tuple[int, ...]:

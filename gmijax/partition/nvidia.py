@@ -13,7 +13,7 @@ from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import pynvml
 
@@ -33,6 +33,24 @@ _START_TIMEOUT_S = 20.0
 _MIB = 1024 * 1024
 
 
+class MigInstance(NamedTuple):
+    """A MIG device as NVML lists it: a compute instance with the memory of its GPU instance.
+
+    Attributes:
+      uuid: `MIG-...`, what `CUDA_VISIBLE_DEVICES` takes.
+      profile: e.g. `3g.71gb`; `1c.3g.71gb` for a part of the SMs of a GPU instance.
+      gpu_instance: number of the GPU instance; those that share one share its memory.
+      num_sms: streaming multiprocessors.
+      memory_mib: memory of the GPU instance, MiB.
+    """
+
+    uuid: str
+    profile: str
+    gpu_instance: int
+    num_sms: int
+    memory_mib: int
+
+
 class Gpu(NamedTuple):
     """A GPU as NVML lists it.
 
@@ -43,6 +61,9 @@ class Gpu(NamedTuple):
       memory_mib: total memory, MiB.
       compute_capability: (major, minor).
       mig_enabled: the GPU can only be used through its MIG instances.
+      instances: those that exist, in the order of NVML; an administrator makes them.
+      mig_supported: it could be divided into MIG instances.
+      compute_mode: `default`, `exclusive` (one process, or one MPS server) or `prohibited`.
     """
 
     index: int
@@ -51,6 +72,9 @@ class Gpu(NamedTuple):
     memory_mib: int
     compute_capability: tuple[int, int]
     mig_enabled: bool
+    instances: tuple[MigInstance, ...] = ()
+    mig_supported: bool = False
+    compute_mode: str = "default"
 
 
 def list_gpus() -> tuple[Gpu, ...]:
@@ -74,6 +98,17 @@ def list_gpus() -> tuple[Gpu, ...]:
     return tuple(gpus)
 
 
+def nvml_problem() -> str | None:
+    """Why NVML fails although a driver is there; None where it works or there is no driver."""
+    try:
+        pynvml.nvmlInit()
+    except pynvml.NVMLError as error:
+        absent = (pynvml.NVML_ERROR_LIBRARY_NOT_FOUND, pynvml.NVML_ERROR_DRIVER_NOT_LOADED)
+        return None if getattr(error, "value", None) in absent else str(error)
+    pynvml.nvmlShutdown()
+    return None
+
+
 def driver_version() -> str | None:
     """The NVIDIA driver's version, e.g. `580.159.03`; None without a driver."""
     try:
@@ -91,10 +126,11 @@ def driver_version() -> str | None:
 def _describe(index: int) -> Gpu:
     handle = pynvml.nvmlDeviceGetHandleByIndex(index)
     major, minor = pynvml.nvmlDeviceGetCudaComputeCapability(handle)
-    mig_enabled = False
-    # GPUs without MIG answer the question with an error.
-    with suppress(pynvml.NVMLError):
+    mig_supported, mig_enabled = True, False
+    try:
         mig_enabled = pynvml.nvmlDeviceGetMigMode(handle)[0] == pynvml.NVML_DEVICE_MIG_ENABLE
+    except pynvml.NVMLError:  # GPUs without MIG answer the question with an error.
+        mig_supported = False
     return Gpu(
         index=index,
         uuid=str(pynvml.nvmlDeviceGetUUID(handle)),
@@ -102,7 +138,46 @@ def _describe(index: int) -> Gpu:
         memory_mib=int(pynvml.nvmlDeviceGetMemoryInfo(handle).total) // _MIB,
         compute_capability=(major, minor),
         mig_enabled=mig_enabled,
+        instances=_instances(handle) if mig_enabled else (),
+        mig_supported=mig_supported,
+        compute_mode=_compute_mode(handle),
     )
+
+
+def _instances(handle: Any) -> tuple[MigInstance, ...]:
+    found: list[MigInstance] = []
+    places = 0
+    with suppress(pynvml.NVMLError):
+        places = pynvml.nvmlDeviceGetMaxMigDeviceCount(handle)
+    for place in range(places):
+        # Holes are normal: instances keep their places when others go.
+        with suppress(pynvml.NVMLError):
+            found.append(_describe_instance(handle, place))
+    return tuple(found)
+
+
+def _describe_instance(handle: Any, place: int) -> MigInstance:
+    instance = pynvml.nvmlDeviceGetMigDeviceHandleByIndex(handle, place)
+    name = str(pynvml.nvmlDeviceGetName(instance))
+    return MigInstance(
+        uuid=str(pynvml.nvmlDeviceGetUUID(instance)),
+        # NVIDIA H200 MIG 3g.71gb
+        profile=name.rpartition("MIG ")[2],
+        gpu_instance=int(pynvml.nvmlDeviceGetGpuInstanceId(instance)),
+        num_sms=int(pynvml.nvmlDeviceGetAttributes(instance).multiprocessorCount),
+        memory_mib=int(pynvml.nvmlDeviceGetMemoryInfo(instance).total) // _MIB,
+    )
+
+
+def _compute_mode(handle: Any) -> str:
+    try:
+        mode = pynvml.nvmlDeviceGetComputeMode(handle)
+    except pynvml.NVMLError:
+        return "default"
+    return {
+        pynvml.NVML_COMPUTEMODE_PROHIBITED: "prohibited",
+        pynvml.NVML_COMPUTEMODE_EXCLUSIVE_PROCESS: "exclusive",
+    }.get(mode, "default")
 
 
 def find_mps_control() -> Path | None:
@@ -126,8 +201,8 @@ class MpsControl:
     program: Path
     pipe_directory: Path
 
-    def start(self, gpu_uuid: str, log_directory: Path) -> None:
-        """Starts a daemon for one GPU; it outlives this process.
+    def start(self, device: str, log_directory: Path) -> None:
+        """Starts a daemon for one GPU or MIG instance, by UUID; it outlives this process.
 
         Raises:
           BackendUnavailable: the program cannot be run or reports an error.
@@ -135,7 +210,7 @@ class MpsControl:
         log_directory.mkdir(parents=True, exist_ok=True)
         messages = log_directory / "start.log"
         environment = {
-            "CUDA_VISIBLE_DEVICES": gpu_uuid,
+            "CUDA_VISIBLE_DEVICES": device,
             LOG_VARIABLE: str(log_directory),
         }
         try:

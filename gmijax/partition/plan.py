@@ -7,11 +7,13 @@ A plan is made by `gmijax.partition.planner` from the configuration and the mach
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from typing import Any, Literal
 
+from gmijax.config import TemplateName
 from gmijax.errors import ConfigError
 from gmijax.partition.layout import Layout
+from gmijax.partition.templates import HOLISTIC
 
 BackendName = Literal["mps", "mig", "share", "cpu"]
 
@@ -26,9 +28,9 @@ class Slice:
     Attributes:
       gmi: its id.
       gpu: position of its GPU in the job.
-      device: what the GMI's process sees: a GPU's UUID, or `cpu`.
+      device: what the GMI's process sees: the UUID of a GPU or of a MIG instance, or `cpu`.
       sm_percent: cap on SMs in percent, None for no cap.
-      memory_fraction: fraction of the GPU's memory, None where memory is not partitioned.
+      memory_fraction: fraction of the device's memory, None where memory is not partitioned.
       cpus: CPU cores that the process is pinned to; empty for no pinning.
     """
 
@@ -53,28 +55,40 @@ class Plan:
       strategy: gradient reduction, `none` for one GMI.
       intra: exchange inside one GPU.
       reasons: what was decided for an `auto`, and why, one sentence each.
+      roles: what every GMI does, in order of id (see `gmijax.partition.templates`).
+      self_check: every GMI compares matrix products with float64 when it starts.
+      selection: with `reduce.selection=measured` what the paper says and what was measured.
+      may_share: where the daemons of `mps` cannot be started, the GMIs may take turns instead.
 
     Raises:
-      ConfigError: slices that do not fit the layout, or memory fractions over the limit.
+      ConfigError: slices or roles that do not fit the layout, or memory fractions over the limit.
     """
 
     layout: Layout
     slices: tuple[Slice, ...]
     backend: BackendName
-    template: str
+    template: TemplateName
     num_envs_per_gmi: int
     strategy: str
     intra: str
     reasons: tuple[str, ...] = ()
+    roles: tuple[str, ...] = ()
+    self_check: bool = False
+    may_share: bool = False
+    selection: Mapping[str, Any] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         if [s.gmi for s in self.slices] != list(self.layout.gmis):
             raise ConfigError(f"plan: slices {self.slices} do not match layout {self.layout}")
-        for gpu, gmis in enumerate(self.layout.gmis_of_gpu):
-            total = sum(self.slices[gmi].memory_fraction or 0.0 for gmi in gmis)
+        if self.roles and len(self.roles) != self.layout.num_gmis:
+            raise ConfigError(f"plan: roles {self.roles} do not match layout {self.layout}")
+        for device in dict.fromkeys((share.gpu, share.device) for share in self.slices):
+            here = [share for share in self.slices if (share.gpu, share.device) == device]
+            total = sum(share.memory_fraction or 0.0 for share in here)
             if total > MAX_MEMORY_FRACTION + 1e-9:
+                part = f"{device[1]} of GPU" if self.backend == "mig" else "GPU"
                 raise ConfigError(
-                    f"plan.memory_fraction: {len(gmis)} GMIs on GPU {gpu} would reserve "
+                    f"plan.memory_fraction: {len(here)} GMIs on {part} {device[0]} would reserve "
                     f"{total:.2f} of its memory; at most {MAX_MEMORY_FRACTION} in sum"
                 )
 
@@ -93,4 +107,6 @@ class Plan:
             Slice(**{**item, "cpus": tuple(item["cpus"])}) for item in data["slices"]
         )
         fields["reasons"] = tuple(data["reasons"])
+        # Plans had no roles when there was one template.
+        fields["roles"] = tuple(data.get("roles", ())) or (HOLISTIC,) * fields["layout"].num_gmis
         return cls(**fields)

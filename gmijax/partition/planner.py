@@ -2,11 +2,20 @@
 
 from __future__ import annotations
 
+import dataclasses
+import re
+from collections import Counter
 from collections.abc import Sequence
 from itertools import pairwise
 
-from gmijax.config import PlanConfig, ReduceConfig
-from gmijax.errors import BackendUnavailable, ConfigError
+from gmijax.config import PlanConfig, ReduceConfig, TemplateName
+from gmijax.errors import ConfigError
+from gmijax.partition.backend_choice import (
+    Purpose,
+    choose_backend,
+    choose_gpus,
+    require_backend,
+)
 from gmijax.partition.layout import Layout
 from gmijax.partition.machine import Machine
 from gmijax.partition.nvidia import Gpu
@@ -17,17 +26,23 @@ from gmijax.partition.reduction import (
     select_strategy,
     why_not_intra,
 )
-
-DEFAULT_MEMORY_FRACTION = 0.8
-"""Part of a GPU's memory that its GMIs reserve together."""
-
-HALF_PRECISION_HAZARD_PERCENT = ((14, 22), (28, 46), (52, 89))
-"""SM caps at which wrong half-precision products were reported (H200, driver 580)."""
+from gmijax.partition.shares import gpu_slices, sm_percents
+from gmijax.partition.templates import DESCRIPTIONS, TRAINER, Group, group_of, roles_of
 
 _CLIENTS_OF_OLD_DRIVERS, _CLIENTS_OF_NEW_DRIVERS, _NEW_DRIVER = 48, 60, 590
+_SLICES_OF_A_GPU = 7
 
 
-def make_plan(plan: PlanConfig, reduce: ReduceConfig, num_envs: int, machine: Machine) -> Plan:
+def make_plan(
+    plan: PlanConfig,
+    reduce: ReduceConfig,
+    num_envs: int,
+    machine: Machine,
+    *,
+    template: TemplateName = "tcg_ex",
+    trainers: Sequence[int] = (),
+    purpose: Purpose | None = None,
+) -> Plan:
     """Decides everything that is `auto` and checks the rest against the machine.
 
     Args:
@@ -35,6 +50,9 @@ def make_plan(plan: PlanConfig, reduce: ReduceConfig, num_envs: int, machine: Ma
       reduce: how gradients are to be averaged.
       num_envs: N, environments per GMI.
       machine: what there is.
+      template: what `plan.template=auto` means.
+      trainers: ids of the GMIs that train, for the template `decoupled`.
+      purpose: what `plan.backend=auto` is chosen for; None: as the template says.
 
     Returns:
       The plan; its `reasons` say what was decided and why, one sentence each.
@@ -45,20 +63,29 @@ def make_plan(plan: PlanConfig, reduce: ReduceConfig, num_envs: int, machine: Ma
     """
     layout = _layout(plan)
     reasons: list[str] = []
-    backend = _backend(plan, layout, machine, reasons)
-    gpus = _choose_gpus(plan, layout, machine, reasons) if backend != "cpu" else ()
-    _check_sm_percent(plan.sm_percent, backend, reasons)
-    if backend == "mps":
-        _check_num_clients(layout, machine)
+    if purpose is None:
+        wanted = template if plan.template == "auto" else plan.template
+        purpose = "serve" if wanted in ("tcg", "tdg") else "train"
+    backend = _backend(plan, layout, machine, purpose, reasons)
+    gpus = choose_gpus(plan, layout, machine, backend, reasons) if backend != "cpu" else ()
+    slices = _slices(plan, layout, gpus, backend, machine, reasons)
+    chosen = _template(plan, template, reasons)
+    roles = roles_of(chosen, layout, trainers)
+    training = group_of(layout, roles, TRAINER)
     return Plan(
         layout=layout,
-        slices=_slices(plan, layout, gpus, machine.cpu_cores, reasons),
+        slices=slices,
         backend=backend,
-        template=_template(plan, reasons),
+        template=chosen,
         num_envs_per_gmi=num_envs,
-        strategy=_strategy(reduce, layout, reasons),
-        intra=_intra(reduce, layout, backend, reasons),
+        strategy=_strategy(
+            _without_rings(reduce, layout, backend), training, layout, backend, reasons
+        ),
+        intra=_intra(reduce, layout, backend, reasons) if training else "host",
         reasons=tuple(reasons),
+        roles=roles,
+        self_check=_self_check(plan, slices),
+        may_share=_may_share(plan, backend, gpus),
     )
 
 
@@ -73,6 +100,8 @@ def split_cores(cores: Sequence[int], num_gmis: int) -> tuple[tuple[int, ...], .
 def _layout(plan: PlanConfig) -> Layout:
     num_gpus = plan.gpus if isinstance(plan.gpus, int) else len(plan.gpus)
     if plan.layout is None:
+        if plan.gmis_per_gpu == "auto":
+            raise ConfigError("plan.gmis_per_gpu=auto: not decided yet; expected an integer")
         return Layout.even(num_gpus, plan.gmis_per_gpu)
     layout = Layout(plan.layout)
     if not isinstance(plan.gpus, int) and num_gpus != layout.num_gpus:
@@ -84,146 +113,112 @@ def _layout(plan: PlanConfig) -> Layout:
 
 
 def _backend(
-    plan: PlanConfig, layout: Layout, machine: Machine, reasons: list[str]
+    plan: PlanConfig, layout: Layout, machine: Machine, purpose: Purpose, reasons: list[str]
 ) -> BackendName:
     if plan.backend == "auto":
-        backend, reason = _choose_backend(plan, layout, machine)
+        backend, reason = choose_backend(plan, layout, machine, purpose)
         reasons.append(f"backend {backend}: {reason}")
         return backend
-    _check_backend(plan.backend, machine)
+    require_backend(plan.backend, machine)
     return plan.backend
 
 
-def _choose_backend(plan: PlanConfig, layout: Layout, machine: Machine) -> tuple[BackendName, str]:
-    if not machine.gpus:
-        return "cpu", "no usable NVIDIA GPU here, so GPUs are virtual"
-    most = max(len(gmis) for gmis in layout.gmis_of_gpu)
-    if most == 1 and plan.sm_percent is None:
-        return "share", "one GMI on every GPU has nothing to share, and MPS would only add risk"
-    if machine.mps_control is not None:
-        daemon = "the daemon that runs here" if machine.operator_daemon else "an own daemon"
-        return "mps", f"up to {most} GMIs on a GPU run at the same time with {daemon}"
-    return "share", (
-        f"nvidia-cuda-mps-control is not installed, so the {most} GMIs of a GPU take turns; "
-        "with MPS they were 2.0 to 2.9 times as fast"
-    )
-
-
-def _check_backend(backend: BackendName, machine: Machine) -> None:
-    possible = ["auto", "cpu"]
-    if machine.gpus:
-        possible += ["share"] + (["mps"] if machine.mps_control else [])
-    if backend in possible:
+def _check_num_clients(
+    slices: Sequence[Slice], gpus: Sequence[Gpu], backend: BackendName, machine: Machine
+) -> None:
+    if backend not in ("mps", "mig"):
         return
-    why = {
-        "mig": "MIG instances are not supported yet",
-        "mps": "nvidia-cuda-mps-control was not found in PATH or /usr/local/nvidia/bin",
-        "share": "",
-    }[backend]
-    if backend != "mig" and not machine.gpus:
-        why = "no usable NVIDIA GPU here"
-    raise BackendUnavailable(
-        f"plan.backend={backend}: {why}; available here: {', '.join(possible)}"
-    )
-
-
-def _choose_gpus(
-    plan: PlanConfig, layout: Layout, machine: Machine, reasons: list[str]
-) -> tuple[Gpu, ...]:
-    if isinstance(plan.gpus, int):
-        chosen = _first_gpus(plan, layout.num_gpus, machine, reasons)
-    else:
-        by_index = {gpu.index: gpu for gpu in machine.gpus}
-        if missing := [index for index in plan.gpus if index not in by_index]:
-            raise ConfigError(
-                f"plan.gpus={list(plan.gpus)}: no usable GPU {missing[0]}; "
-                f"usable are {sorted(by_index)}"
-            )
-        chosen = tuple(by_index[index] for index in plan.gpus)
-    if in_mig := [gpu.index for gpu in chosen if gpu.mig_enabled]:
-        raise BackendUnavailable(
-            f"plan.gpus: GPU {in_mig[0]} is in MIG mode, which is not supported yet; "
-            "choose other GPUs or switch MIG off"
-        )
-    return chosen
-
-
-def _first_gpus(
-    plan: PlanConfig, num_gpus: int, machine: Machine, reasons: list[str]
-) -> tuple[Gpu, ...]:
-    """The first GPUs, those in MIG mode only if there are not enough others."""
-    if num_gpus > len(machine.gpus):
-        key = "plan.gpus" if plan.layout is None else "GPUs of plan.layout"
-        raise ConfigError(
-            f"{key}={num_gpus}: this machine has {len(machine.gpus)} usable GPUs "
-            "(any number is allowed with plan.backend=cpu)"
-        )
-    chosen = tuple(sorted(machine.gpus, key=lambda gpu: gpu.mig_enabled))[:num_gpus]
-    passed_over = [gpu.index for gpu in machine.gpus[:num_gpus] if gpu not in chosen]
-    if passed_over:
-        reasons.append(
-            f"GPUs {[gpu.index for gpu in chosen]}: not {passed_over}, which are in MIG mode"
-        )
-    return chosen
-
-
-def _check_sm_percent(sm_percent: float | None, backend: BackendName, reasons: list[str]) -> None:
-    if sm_percent is None:
-        return
-    if backend != "mps":
-        raise ConfigError(
-            f"plan.sm_percent={sm_percent:g}: only the mps backend can cap SMs, "
-            f"the backend is {backend}; use null"
-        )
-    if any(low <= sm_percent <= high for low, high in HALF_PRECISION_HAZARD_PERCENT):
-        reasons.append(
-            f"warning: with plan.sm_percent={sm_percent:g} wrong half-precision matrix products "
-            "have been reported (H200, driver 580); 12, 25, 50 and 100 were clean"
-        )
-
-
-def _check_num_clients(layout: Layout, machine: Machine) -> None:
     new = machine.driver_major >= _NEW_DRIVER
-    limit = _CLIENTS_OF_NEW_DRIVERS if new else _CLIENTS_OF_OLD_DRIVERS
-    most = max(len(gmis) for gmis in layout.gmis_of_gpu)
-    if most > limit:
-        raise ConfigError(
-            f"plan.gmis_per_gpu={most}: MPS of driver {machine.driver_version} allows at most "
-            f"{limit} processes on a GPU"
-        )
+    whole = _CLIENTS_OF_NEW_DRIVERS if new else _CLIENTS_OF_OLD_DRIVERS
+    profiles = {one.uuid: one.profile for gpu in gpus for one in gpu.instances}
+    for device, most in Counter(share.device for share in slices).items():
+        limit, where = whole, "a GPU"
+        if backend == "mig":
+            # The driver lowers the limit in proportion to the instance.
+            part = int((re.search(r"(\d)g", profiles[device]) or ["1", "1"])[1])
+            limit = max(1, whole * part // _SLICES_OF_A_GPU)
+            where = f"a MIG instance {profiles[device]}"
+        if most > limit:
+            raise ConfigError(
+                f"plan.gmis_per_gpu={most}: MPS of driver {machine.driver_version} allows at "
+                f"most {limit} processes on {where}"
+            )
 
 
 def _slices(
     plan: PlanConfig,
     layout: Layout,
     gpus: Sequence[Gpu],
-    cores: Sequence[int],
+    backend: BackendName,
+    machine: Machine,
     reasons: list[str],
 ) -> tuple[Slice, ...]:
-    if not gpus:
-        if plan.memory_fraction is not None:
-            reasons.append("plan.memory_fraction is not used on the cpu backend")
-        cores_of = split_cores(cores, layout.num_gmis)
-        return tuple(
-            Slice(gmi, layout.gpu_of(gmi), "cpu", None, None, cores_of[gmi]) for gmi in layout.gmis
-        )
-    slices: list[Slice] = []
-    for gmi in layout.gmis:
-        even = round(DEFAULT_MEMORY_FRACTION / len(layout.neighbours_of(gmi)), 4)
-        memory_fraction = even if plan.memory_fraction is None else plan.memory_fraction
-        gpu = layout.gpu_of(gmi)
-        slices.append(Slice(gmi, gpu, gpus[gpu].uuid, plan.sm_percent, memory_fraction, ()))
-    return tuple(slices)
+    caps = sm_percents(plan, layout, gpus, backend, reasons)
+    if backend != "cpu":
+        slices = gpu_slices(plan, layout, gpus, caps, backend)
+        _check_num_clients(slices, gpus, backend, machine)
+        return slices
+    if plan.memory_fraction is not None:
+        reasons.append("plan.memory_fraction is not used on the cpu backend")
+    cores_of = split_cores(machine.cpu_cores, layout.num_gmis)
+    return tuple(
+        Slice(gmi, layout.gpu_of(gmi), "cpu", None, None, cores_of[gmi]) for gmi in layout.gmis
+    )
 
 
-def _template(plan: PlanConfig, reasons: list[str]) -> str:
+def _self_check(plan: PlanConfig, slices: Sequence[Slice]) -> bool:
+    if plan.self_check == "auto":
+        return any((share.sm_percent or 100.0) < 100.0 for share in slices)
+    return plan.self_check == "on"
+
+
+def _may_share(plan: PlanConfig, backend: BackendName, gpus: Sequence[Gpu]) -> bool:
+    if plan.backend != "auto" or backend != "mps" or plan.sm_percent is not None:
+        return False
+    return all(gpu.compute_mode == "default" for gpu in gpus)
+
+
+def _template(plan: PlanConfig, default: TemplateName, reasons: list[str]) -> TemplateName:
     if plan.template != "auto":
         return plan.template
-    reasons.append("template tcg_ex: every GMI simulates, infers and trains")
-    return "tcg_ex"
+    reasons.append(f"template {default}: {DESCRIPTIONS[default]}")
+    return default
 
 
-def _strategy(reduce: ReduceConfig, layout: Layout, reasons: list[str]) -> str:
+def _without_rings(reduce: ReduceConfig, layout: Layout, backend: BackendName) -> ReduceConfig:
+    """What is left of the choice where a GPU shows itself in instances: NCCL takes one of each."""
+    if backend != "mig":
+        return reduce
+    if reduce.strategy != "auto":
+        if needs_ring(reduce.strategy, layout):
+            raise ConfigError(
+                f"reduce.strategy={reduce.strategy}: rings between MIG instances are not "
+                "supported; with plan.backend=mig allowed are auto, mpr"
+            )
+        return reduce
+    if not needs_ring(select_strategy(layout).strategy, layout):
+        return reduce
+    return dataclasses.replace(reduce, strategy="mpr")
+
+
+def _strategy(
+    reduce: ReduceConfig,
+    training: Group | None,
+    whole: Layout,
+    backend: BackendName,
+    reasons: list[str],
+) -> str:
+    """How those that train average gradients; `none` where nobody does, or only one."""
+    if training is None:
+        return "none"
+    layout = training.layout
+    if layout != whole and reduce.strategy not in ("auto", "mpr"):
+        raise ConfigError(
+            f"reduce.strategy={reduce.strategy}: needs every GMI to train; with trainers "
+            f"{list(training.gmis)} of {whole.num_gmis} GMIs allowed are auto, mpr"
+        )
+    if layout != whole:
+        return "mpr" if layout.num_gmis > 1 else "none"
     if reduce.strategy != "auto":
         require_strategy(reduce.strategy, layout)
     if layout.num_gmis == 1:
@@ -232,11 +227,11 @@ def _strategy(reduce: ReduceConfig, layout: Layout, reasons: list[str]) -> str:
     if reduce.strategy != "auto":
         return reduce.strategy
     choice = select_strategy(layout)
-    if needs_ring(choice.strategy, layout):
-        # Shown on CPUs only so far, and there host memory is faster (docs/reduction.md).
+    if backend == "cpu" and needs_ring(choice.strategy, layout):
         reasons.append(
-            f"strategy mpr: Algorithm 1 says {choice.strategy} ({choice.why}); rings are not "
-            f"measured on GPUs yet, ask for them with reduce.strategy={choice.strategy}"
+            f"strategy mpr: Algorithm 1 says {choice.strategy} ({choice.why}); between virtual "
+            "GPUs host memory is faster than any ring, ask for it with "
+            f"reduce.strategy={choice.strategy}"
         )
         return "mpr"
     reasons.append(f"strategy {choice.strategy}: {choice.why} (Algorithm 1)")
@@ -250,5 +245,8 @@ def _intra(reduce: ReduceConfig, layout: Layout, backend: BackendName, reasons: 
                 f"reduce.intra={reduce.intra}: cannot run on layout {layout}: {reason}; use host"
             )
         return reduce.intra
-    reasons.append("intra host: GMIs of a GPU exchange through shared host memory")
-    return "host"
+    if reason := why_not_intra("ipc", backend):
+        reasons.append(f"intra host: GMIs of a GPU exchange through shared host memory; {reason}")
+        return "host"
+    reasons.append("intra ipc: with har GMIs of a GPU exchange through memory of the GPU")
+    return "ipc"

@@ -1,4 +1,4 @@
-"""Which reduction strategies a layout allows, and which one it gets: pure rules, no jax.
+"""Which reduction strategies a layout allows, and which one it gets: rules, no jax.
 
 The controller checks a plan with them before it starts anything, and `gmijax.collectives.build`
 refuses by the same rules in a GMI.
@@ -6,6 +6,7 @@ refuses by the same rules in a GMI.
 
 from __future__ import annotations
 
+import importlib.util
 from collections.abc import Callable, Mapping
 from typing import NamedTuple
 
@@ -61,7 +62,9 @@ def why_not_intra(intra: str, backend: str) -> str | None:
         )
     if backend == "mig":
         return "there is no CUDA IPC between the instances of a GPU in MIG mode"
-    return "exchange through CUDA IPC is not supported yet"
+    if not _is_installed("cuda", "cuda.bindings"):
+        return "CUDA IPC needs the package cuda-bindings (pip install 'gmijax[ipc]')"
+    return None
 
 
 def require_strategy(strategy: str, layout: Layout) -> None:
@@ -80,6 +83,11 @@ def needs_ring(strategy: str, layout: Layout) -> bool:
     return strategy in ("mrr", "flat") or (strategy == "har" and layout.num_gpus > 1)
 
 
+def meets_at_start(strategy: str, layout: Layout, intra: str) -> bool:
+    """Whether no GMI can compile before all are started: for rings, or to share device memory."""
+    return needs_ring(strategy, layout) or (strategy == "har" and intra == "ipc")
+
+
 def leaders(layout: Layout) -> tuple[int, ...]:
     """The GMI of every GPU that speaks for it in HAR.
 
@@ -92,6 +100,11 @@ def leaders(layout: Layout) -> tuple[int, ...]:
     if all(len(gmis) == 1 for gmis in found):
         return tuple(gmis[0] for gmis in found)
     return tuple(min(gmis) for gmis in layout.gmis_of_gpu)
+
+
+def _is_installed(*modules: str) -> bool:
+    """Whether all modules can be imported; the packages of each come before it."""
+    return all(importlib.util.find_spec(module) is not None for module in modules)
 
 
 def _none(layout: Layout) -> str | None:

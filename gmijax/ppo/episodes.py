@@ -16,8 +16,8 @@ import jax.numpy as jnp
 import numpy as np
 import numpy.typing as npt
 
-from gmijax.ppo.learner import Learner, LearnerState, acting_moments
-from gmijax.ppo.rollout import act
+from gmijax.acting import act
+from gmijax.learner import Learner, LearnerState, acting_moments
 from gmijax.sim.divergence import diverged_by_source, end_diverged
 from gmijax.sim.interface import Env, EnvState
 from gmijax.sim.wrappers import BatchState, env_keys, vectorise

@@ -6,6 +6,7 @@ equal. The leader (rank 0) alone writes metrics and the shared part of checkpoin
 
 from __future__ import annotations
 
+import resource
 import statistics
 import time
 from pathlib import Path
@@ -15,26 +16,38 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from gmijax.checkpoint import digest, restore_envs, restore_learner, save_checkpoint
+from gmijax.checkpoint import digest, has_envs, restore_envs, restore_learner, save_checkpoint
 from gmijax.collectives.interface import Reducer
 from gmijax.config import TrainConfig
 from gmijax.errors import NonFiniteError, ParameterMismatch
+from gmijax.learner import Learner, LearnerState, init_learner, make_learner
 from gmijax.metrics import JsonlSink, MetricsLog, TensorBoardSink
 from gmijax.partition.child import ChildLink
-from gmijax.ppo.learner import Learner, LearnerState, init_learner, make_learner
 from gmijax.ppo.programs import FusedIteration, Iteration, IterationMetrics, SplitIteration
+from gmijax.ppo.remote import RemoteIteration, Servants
 from gmijax.ppo.report import Reporter
 from gmijax.ppo.throughput import ThroughputMeter
 from gmijax.results import read_metrics
 from gmijax.resume import CheckpointMeta
 from gmijax.rundir import RunPaths, read_json, write_json
-from gmijax.sim.wrappers import BatchedEnv, BatchState, env_keys
+from gmijax.sim.wrappers import BatchedEnv, env_keys
 
 
 def train(
-    config: TrainConfig, env: BatchedEnv, reducer: Reducer, link: ChildLink
+    config: TrainConfig,
+    env: BatchedEnv,
+    reducer: Reducer,
+    link: ChildLink,
+    servants: Servants | None = None,
 ) -> dict[str, Any]:
     """Trains until `num_timesteps` or until the controller asks for an end.
+
+    Args:
+      config: of the run.
+      env: the environments; where others make the rollouts, one of theirs.
+      reducer: among the GMIs that train.
+      link: to the controller.
+      servants: the GMIs that make this one's rollouts, None where it does so itself.
 
     Returns:
       The outcome for `result.json`.
@@ -44,29 +57,36 @@ def train(
       ParameterMismatch: the GMIs' parameters differ.
       CollectiveError: another GMI is gone or stuck.
     """
-    return _SyncTrainer(config, env, reducer, link).run()
+    return _SyncTrainer(config, env, reducer, link, servants).run()
 
 
 class _SyncTrainer:
     """One GMI's training run; see `train`."""
 
     def __init__(
-        self, config: TrainConfig, env: BatchedEnv, reducer: Reducer, link: ChildLink
+        self,
+        config: TrainConfig,
+        env: BatchedEnv,
+        reducer: Reducer,
+        link: ChildLink,
+        servants: Servants | None,
     ) -> None:
         self._config = config
         self._env = env
         self._reducer = reducer
         self._link = link
         self._leader = reducer.rank == 0
+        self._servants = servants
         self._steps_per_iteration = (
-            config.num_envs * config.algo.unroll_length * reducer.world_size
+            config.envs_per_gmi
+            * config.algo.unroll_length
+            * reducer.world_size
+            * (1 if servants is None else len(servants.gmis))
         )
+        # Who has no environments cannot measure how fast they are.
+        self._measures = config.run.measure_throughput and servants is None
         self._learner: Learner = make_learner(env.spec, config.algo)
-        self._iteration: Iteration = (
-            FusedIteration(env, self._learner)
-            if reducer.world_size == 1
-            else SplitIteration(env, self._learner, reducer)
-        )
+        self._iteration = self._make_iteration()
         self._env_steps = 0
         self._iterations = 0
         self._checkpoint: Path | None = None
@@ -78,7 +98,7 @@ class _SyncTrainer:
         state, env_state = self._first_state()
         self._iteration.compile(state, env_state)
         meter = ThroughputMeter(self._env, self._learner, self._config, self._reducer)
-        if self._config.run.measure_throughput:
+        if self._measures:
             meter.compile(state, env_state)
         compile_s = time.monotonic() - started
         self._link.beat("ready", 0)
@@ -96,6 +116,8 @@ class _SyncTrainer:
             state, env_state, stopped = self._loop(state, env_state, reporter)
         finally:
             reporter.close()
+        if isinstance(self._iteration, RemoteIteration):
+            self._iteration.close()
         wall_s = time.monotonic() - started
         done = {
             "status": "stopped" if stopped else "completed",
@@ -110,7 +132,7 @@ class _SyncTrainer:
             "checkpoint": str(self._checkpoint) if self._checkpoint else None,
             "device": _device(),
         }
-        if self._config.run.measure_throughput and not stopped:
+        if self._measures and not stopped:
             # Written before: whatever happens to the measurement, the training is done.
             write_json(self._link.paths.result, done)
             rates = meter.measure(
@@ -119,7 +141,15 @@ class _SyncTrainer:
             done |= rates._asdict()
         return done
 
-    def _first_state(self) -> tuple[LearnerState, BatchState]:
+    def _make_iteration(self) -> Iteration:
+        env, learner, reducer = self._env, self._learner, self._reducer
+        if self._servants is not None:
+            return RemoteIteration(env, learner, reducer, self._servants)
+        if reducer.world_size == 1:
+            return FusedIteration(env, learner)
+        return SplitIteration(env, learner, reducer)
+
+    def _first_state(self) -> tuple[LearnerState, Any]:
         base = jax.random.key(self._config.seed)
         learner_key, env_key = jax.random.split(base)
         spec = self._env.spec
@@ -132,7 +162,9 @@ class _SyncTrainer:
         state = self._with_wanted_rate(restore_learner(Path(resume), state), Path(resume))
         # Other environments than the first run's: these never saw the first run's start.
         env_state = self._reset_envs(jax.random.fold_in(env_key, meta.env_steps % 2**31))
-        same = (self._reducer.world_size, self._config.num_envs, self._config.physics.impl)
+        if self._servants is not None or not has_envs(Path(resume), self._link.gmi):
+            return state, env_state
+        same = (self._reducer.world_size, self._config.envs_per_gmi, self._config.physics.impl)
         if (meta.num_gmis, meta.num_envs, meta.impl) == same:
             env_state = restore_envs(Path(resume), self._link.gmi, env_state)
         return state, env_state
@@ -145,16 +177,18 @@ class _SyncTrainer:
             return state
         return state._replace(learning_rate=jnp.asarray(wanted, jnp.float32))
 
-    def _reset_envs(self, key: jax.Array) -> BatchState:
+    def _reset_envs(self, key: jax.Array) -> Any:
         # The key of an environment comes from its number in the whole job, so that k GMIs of n
         # environments and one of k * n simulate the same ones.
-        num_envs = self._config.num_envs
+        if self._servants is not None:
+            return None
+        num_envs = self._config.envs_per_gmi
         keys = env_keys(key, self._reducer.rank * num_envs, num_envs)
         return jax.jit(self._env.init)(self._env.model, keys)
 
     def _loop(
-        self, state: LearnerState, env_state: BatchState, reporter: Reporter
-    ) -> tuple[LearnerState, BatchState, bool]:
+        self, state: LearnerState, env_state: Any, reporter: Reporter
+    ) -> tuple[LearnerState, Any, bool]:
         every = self._config.run.checkpoint_every
         pending: tuple[int, IterationMetrics] | None = None
         stop = False
@@ -186,7 +220,7 @@ class _SyncTrainer:
         mine = np.array([self._link.stop_requested], np.float32)
         return bool(self._reducer.all_gather(mine).any())
 
-    def _save(self, state: LearnerState, env_state: BatchState) -> None:
+    def _save(self, state: LearnerState, env_state: Any) -> None:
         digests = self._reducer.all_gather(digest(state.params))
         if different := [r for r in range(len(digests)) if (digests[r] != digests[0]).any()]:
             raise ParameterMismatch(
@@ -219,7 +253,7 @@ class _SyncTrainer:
             algo=algo.name,
             env_steps=self._env_steps,
             num_gmis=self._reducer.world_size,
-            num_envs=self._config.num_envs,
+            num_envs=self._config.envs_per_gmi,
             hidden=(algo.policy_hidden_layer_sizes, algo.value_hidden_layer_sizes),
             impl=self._config.physics.impl,
         )
@@ -247,4 +281,6 @@ def _device() -> dict[str, Any]:
         "platform": device.platform,
         "kind": device.device_kind,
         "peak_memory_mib": peak / 2**20 if peak else None,
+        # All that there is where the device does not count, as on the CPU.
+        "peak_host_memory_mib": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**10,
     }

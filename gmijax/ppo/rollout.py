@@ -7,6 +7,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
+from gmijax.acting import act
 from gmijax.config import PpoConfig
 from gmijax.normalize import (
     Moments,
@@ -21,8 +22,8 @@ from gmijax.ppo.advantages import gae
 from gmijax.ppo.losses import Samples
 from gmijax.sim.divergence import sources
 from gmijax.sim.interface import EnvSpec
-from gmijax.sim.wrappers import BatchedEnv, BatchState, EpisodeSums, split_keys
-from gmijax.types import Array, PRNGKey, PyTree
+from gmijax.sim.wrappers import BatchedEnv, BatchState, EpisodeSums
+from gmijax.types import Array, PyTree
 
 
 class RolloutStats(NamedTuple):
@@ -63,29 +64,6 @@ class Counts(NamedTuple):
     episodes: EpisodeSums
     diverged: dict[str, Array]
     overflowed: dict[str, Array]
-
-
-def policy_noise(keys: PRNGKey, action_size: int) -> Array:
-    """Standard normal noise [N, A], each row from the key of its own environment.
-
-    Rows depend on the environment alone, so the way environments are spread over GMIs does not
-    change the samples.
-    """
-    return jax.vmap(lambda key: jax.random.normal(key, (action_size,)))(keys)
-
-
-def act(
-    networks: ActorCritic,
-    params: ActorCriticParams,
-    moments: Moments,
-    env_state: BatchState,
-    action_size: int,
-) -> tuple[BatchState, Array, Array]:
-    """Draws one action per environment: `(env_state, mean [N, A], action [N, A])`."""
-    env_state, keys = split_keys(env_state)
-    mean = networks.action_mean(params, normalize(moments, env_state.env.obs))
-    noise = policy_noise(keys, action_size)
-    return env_state, mean, mean + jnp.exp(params.log_std) * noise
 
 
 def collect(

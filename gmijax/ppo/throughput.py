@@ -15,10 +15,10 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
+from gmijax.acting import act
 from gmijax.collectives.interface import Reducer
 from gmijax.config import TrainConfig
-from gmijax.ppo.learner import Learner, LearnerState, acting_moments
-from gmijax.ppo.rollout import act
+from gmijax.learner import Learner, LearnerState, acting_moments
 from gmijax.sim.wrappers import BatchedEnv, BatchState, split_keys
 from gmijax.types import Array, PyTree
 
@@ -42,7 +42,7 @@ class ThroughputMeter:
         self, env: BatchedEnv, learner: Learner, config: TrainConfig, reducer: Reducer
     ) -> None:
         self._model = env.model
-        self._num_envs = config.num_envs
+        self._num_envs = config.envs_per_gmi
         self._steps = config.algo.unroll_length
         self._reducer = reducer
         self._programs: list[Any] = [

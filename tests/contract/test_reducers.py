@@ -2,97 +2,31 @@
 
 from __future__ import annotations
 
-import json
 import signal
 from pathlib import Path
-from typing import NamedTuple
 
 import pytest
 
 from gmijax.collectives.build import STRATEGIES
-from gmijax.partition.layout import Layout
-from gmijax.partition.reduction import why_not_strategy
 from tests.rank_processes import Ranks
+from tests.reducer_contract import PAIRS, Case, check_contract
 
 pytestmark = pytest.mark.timeout(200)
 
 
-class Case(NamedTuple):
-    """A layout, the length of its buffers, and how its ranks end."""
-
-    layout: Layout
-    num_floats: int
-    signal: signal.Signals | None
-    victim: int
-
-
-CASES = [
-    Case(Layout(((0,),)), 1000, None, 0),
-    Case(Layout(((0, 1),)), 17, signal.SIGSTOP, 1),
-    Case(Layout(((0,), (1,))), 100_003, signal.SIGKILL, 0),
-    Case(Layout(((0, 1), (2, 3))), 4099, signal.SIGSTOP, 0),
-    Case(Layout(((0, 1, 2), (3, 4, 5))), 100_003, signal.SIGKILL, 4),
-    Case(Layout(((0, 1), (2,))), 1, signal.SIGKILL, 2),
-]
-PAIRS = [
-    (strategy, case)
-    for strategy in STRATEGIES
-    for case in CASES
-    if why_not_strategy(strategy, case.layout) is None
-]
-TIMEOUT_S = 3.0
-
-
 def test_every_strategy_has_a_case_with_several_gmis() -> None:
-    several = {strategy for strategy, case in PAIRS if case.layout.num_gmis > 1}
+    several = {strategy for strategy, _, case in PAIRS if case.layout.num_gmis > 1}
     assert several == STRATEGIES.keys() - {"none"}
 
 
 @pytest.mark.parametrize(
-    ("strategy", "case"), PAIRS, ids=[f"{name}-{case.layout}" for name, case in PAIRS]
+    ("strategy", "intra", "case"),
+    PAIRS,
+    ids=[f"{name}-{intra}-{case.layout}" for name, intra, case in PAIRS],
 )
-def test_the_contract(strategy: str, case: Case, tmp_path: Path) -> None:
-    """The mean is numpy's, the same on all ranks; calls do not mix; the end of a rank is named.
-
-    One test and not several: starting the processes is most of what it costs.
-    """
-    ranks = case.layout.num_gmis
-    options = {
-        "strategy": strategy,
-        "layout": case.layout.gmis_of_gpu,
-        "num_floats": case.num_floats,
-        "num_calls": 6,
-        "num_ordered_calls": 200,
-        "timeout_s": TIMEOUT_S,
-        "goes_on": case.signal is not None,
-    }
-    with Ranks(tmp_path, ranks, "check_all", **options).start() as job:
-        if case.signal is None:
-            checked = results = job.results()
-        else:
-            job.wait_for("running")
-            checked = [
-                json.loads((tmp_path / f"checked_{rank}").read_text()) for rank in range(ranks)
-            ]
-            named_memory = job.named_memory()
-            sent_s = job.signal(case.victim, case.signal)
-            results = job.results(*(rank for rank in range(ranks) if rank != case.victim))
-            assert not [path for path in named_memory if path.exists()]
-    assert len({result["digest"] for result in checked}) == 1
-    for result in results:
-        if case.signal is None:
-            assert result["error"] is None, result
-            continue
-        after_s = result["failed_at_s"] - sent_s
-        if case.signal == signal.SIGKILL:
-            assert (result["error"], result.get("peer")) == ("PeerLost", case.victim), result
-            assert after_s < 2.0
-        else:
-            assert result["error"] == "CollectiveTimeout", result
-            assert result["missing"] == [case.victim]
-            # A rank that met the victim a moment before may count from there.
-            assert TIMEOUT_S - 0.2 < after_s < TIMEOUT_S + 1.5
-        assert "mean, step" in result["message"]
+def test_the_contract(strategy: str, intra: str, case: Case, tmp_path: Path) -> None:
+    # Here `ipc` has the real exchange, and a file without a name as memory of the device.
+    check_contract(strategy, intra, case, tmp_path)
 
 
 @pytest.mark.parametrize("num_floats", [1, 17, 100_003])
@@ -115,3 +49,25 @@ def test_a_killed_peer_is_named_by_all_others_within_two_seconds(
         results = job.results(*(rank for rank in range(4) if rank != victim))
     assert [(r["error"], r.get("peer")) for r in results] == [("PeerLost", victim)] * 3
     assert max(result["failed_at_s"] for result in results) - killed_at_s < 2.0
+
+
+@pytest.mark.parametrize("host_if_unavailable", [True, False])
+def test_device_memory_that_does_not_work_is_found_by_all(
+    host_if_unavailable: bool, tmp_path: Path
+) -> None:
+    options = {
+        "strategy": "har",
+        "intra": "ipc",
+        "num_calls": 2,
+        "broken_rank": 1,
+        "host_if_unavailable": host_if_unavailable,
+    }
+    with Ranks(tmp_path, 2, "check_means", **options).start() as job:
+        results = job.results()
+    said = "reduce.intra=ipc: rank 0: shared GPU memory does not hold what was written into it"
+    for rank, result in enumerate(results):
+        if host_if_unavailable:
+            assert result["error"] is None
+            assert said in (tmp_path / f"stderr_{rank}").read_text()
+        else:
+            assert (result["error"], result["message"]) == ("IntraUnavailable", said)

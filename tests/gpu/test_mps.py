@@ -125,6 +125,26 @@ def test_an_operators_daemon_is_used_and_left_alone(tmp_path: Path) -> None:
         subprocess.run([control], input=b"quit\n", env=environment, check=True, timeout=30)
 
 
+def test_capped_gmis_check_their_products_and_train(tmp_path: Path) -> None:
+    done = train(
+        *TINY, *MPS, "plan.sm_percent=[50,25]", f"num_timesteps={2 * 2 * STEPS}", "run.dir=run",
+        cwd=tmp_path,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    plan = json.loads((tmp_path / "run" / "plan.json").read_text())
+    assert plan["self_check"]
+    assert [share["sm_percent"] for share in plan["slices"]] == [50.0, 25.0]
+
+
+def test_the_doctor_finds_gpu_and_mps_usable(tmp_path: Path) -> None:
+    done = train("--json", cwd=tmp_path, command="doctor")
+    found = json.loads(done.stdout)
+    assert done.returncode == 0, found["problems"]
+    usable = {one["name"] for one in found["abilities"] if one["usable"]}
+    assert {"mps", "share", "mpr"} <= usable
+    assert found["jax"]["platform"] == "gpu"
+
+
 def test_memory_fractions_over_the_limit_are_refused(tmp_path: Path) -> None:
     done = train(*TINY, *MPS, "plan.memory_fraction=0.6", cwd=tmp_path)
     assert done.returncode == 2

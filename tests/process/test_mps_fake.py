@@ -13,15 +13,16 @@ import pytest
 from supervision import CHECKOUT, TESTS, gpu, machine, make_job, plan_config, reduce_config
 
 from gmijax.errors import BackendUnavailable, GmiFailed, JobInterrupted
+from gmijax.launcher import Launch, run_gmis
 from gmijax.partition.backends import open_backend
 from gmijax.partition.gmi_process import GmiStatus
 from gmijax.partition.machine import Machine, detect_machine
-from gmijax.partition.nvidia import PIPE_VARIABLE, MpsControl, find_mps_control
+from gmijax.partition.nvidia import PIPE_VARIABLE, MigInstance, MpsControl, find_mps_control
 from gmijax.partition.plan import Plan
 from gmijax.partition.planner import make_plan
-from gmijax.partition.supervisor import Supervisor
+from gmijax.partition.supervisor import Patience, Supervisor
 from gmijax.processes import ProcessId, identify, wait_until_gone
-from gmijax.rundir import RunPaths
+from gmijax.rundir import RunPaths, read_json, write_json
 
 pytestmark = pytest.mark.timeout(60)
 
@@ -197,6 +198,72 @@ def test_daemon_that_does_not_start_leaves_nothing(
     ):
         pass
     assert not [path for path in mps.pipe_directories() if path.exists()]
+
+
+def small_job(run: RunPaths, here: Machine, plan: Plan, told: list[str]) -> Launch:
+    """Its GMIs end at once: `this` is the module of the standard library."""
+    write_json(run.plan, plan.to_dict())
+    patience = Patience(start_timeout_s=20, stall_timeout_s=20, stop_timeout_s=20, grace_s=2)
+    return Launch(
+        plan=plan, machine=here, run=run, module="this", patience=patience, on_warning=told.append
+    )
+
+
+def test_job_takes_turns_where_no_daemon_can_be_started(
+    mps: FakeMps, run: RunPaths, monkeypatch: pytest.MonkeyPatch
+):
+    monkeypatch.setenv("FAKE_MPS_BROKEN", "1")
+    here = machine(1, mps_control=find_mps_control())
+    plan = make_plan(plan_config(gmis_per_gpu=2), reduce_config(), 8, here)
+    assert plan.backend == "mps"
+    told: list[str] = []
+    run_gmis(small_job(run, here, plan, told))
+    [warning] = told
+    assert "An instance of this daemon is already running" in warning
+    assert warning.endswith("so the GMIs of a GPU take turns; with MPS they were 2.0 to 2.9 times "
+                            "as fast")  # fmt: skip
+    written = Plan.from_dict(read_json(run.plan))
+    assert (written.backend, written.reasons[-1]) == ("share", warning)
+    assert not [path for path in mps.pipe_directories() if path.exists()]
+
+
+def test_daemon_that_was_asked_for_and_does_not_start_ends_the_job(
+    mps: FakeMps, run: RunPaths, monkeypatch: pytest.MonkeyPatch
+):
+    monkeypatch.setenv("FAKE_MPS_BROKEN", "1")
+    here = machine(1, mps_control=mps.program)
+    with pytest.raises(BackendUnavailable, match="exit code 1: An instance of this daemon"):
+        run_gmis(small_job(run, here, mps_plan(here, num_gpus=1, gmis_per_gpu=2), []))
+
+
+def test_gmis_that_share_a_mig_instance_get_a_daemon_for_it(mps: FakeMps, run: RunPaths):
+    instances = (
+        MigInstance("MIG-large", "3g.71gb", 1, 60, 71424),
+        MigInstance("MIG-small", "1g.18gb", 9, 16, 17856),
+    )
+    divided = gpu(0, mig_enabled=True)._replace(instances=instances)
+    here = machine(1, gpus=(divided,), mps_control=mps.program, operator_daemon=Path("/other"))
+    config = plan_config(gmis_per_gpu=3, backend="mig")
+    plan = make_plan(config, reduce_config(), 8, here)
+    assert [share.device for share in plan.slices] == ["MIG-large", "MIG-small", "MIG-large"]
+    directories = train_and_stop(run, here, plan, ["mps_client", "train", "mps_client"])
+    assert directories[0] == directories[2] != directories[1]
+    assert [device for device, _ in mps.told("start")] == ["MIG-large"]
+    assert len(mps.told("quit")) == 1
+    assert not directories[0].exists()
+
+
+def test_gmi_of_a_shared_instance_that_is_no_client_is_named(mps: FakeMps, run: RunPaths):
+    divided = gpu(0, mig_enabled=True)._replace(
+        instances=(MigInstance("MIG-only", "7g.141gb", 0, 132, 143000),)
+    )
+    here = machine(1, gpus=(divided,), mps_control=mps.program)
+    plan = make_plan(plan_config(gmis_per_gpu=2, backend="mig"), reduce_config(), 8, here)
+    with (
+        pytest.raises(GmiFailed, match=r"GMI 1 failed: its process \d+ is no client of"),
+        open_backend(plan, here, run) as backend,
+    ):
+        Supervisor(make_job(run, ["mps_client", "train"], backend, plan)).run()
 
 
 def test_daemon_of_somebody_else_is_used_and_left_alone(

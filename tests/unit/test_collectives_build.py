@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import os
 import subprocess
 import sys
 
@@ -10,8 +11,10 @@ import numpy as np
 import pytest
 
 from gmijax.collectives.build import STRATEGIES, Membership, build_reducer
+from gmijax.collectives.memory import create_exchange
 from gmijax.errors import CollectiveError, ConfigError
 from gmijax.partition.layout import Layout
+from gmijax.partition.nvidia import list_gpus
 from gmijax.partition.reduction import why_not_strategy
 
 
@@ -63,9 +66,9 @@ def test_rings_need_a_world(strategy: str) -> None:
         build_reducer(strategy, two_gpus)
 
 
-def test_an_exchange_inside_a_gpu_that_is_not_there_is_refused() -> None:
-    with pytest.raises(ConfigError, match=r"reduce\.intra=ipc: expected one of host"):
-        build_reducer("har", dataclasses.replace(membership(1), intra="ipc"))
+def test_an_unknown_exchange_inside_a_gpu_names_the_known_ones() -> None:
+    with pytest.raises(ConfigError, match=r"reduce\.intra=usb: expected one of host, ipc"):
+        build_reducer("har", dataclasses.replace(membership(1), intra="usb"))
 
 
 def test_one_gmi_keeps_its_own_numbers() -> None:
@@ -85,3 +88,14 @@ def test_one_gmi_keeps_its_own_numbers() -> None:
 def test_the_collectives_import_no_jax() -> None:
     code = "import sys, gmijax.collectives.build; sys.exit('jax' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
+
+
+def test_cuda_says_why_a_gpu_cannot_be_shared() -> None:
+    pytest.importorskip("cuda.bindings.runtime", reason="cuda-bindings is not installed")
+    if list_gpus():
+        pytest.skip("there is a GPU: tests/gpu has the rest")
+    fd = create_exchange()
+    given = dataclasses.replace(membership(1), intra="ipc", exchange_fd=fd)
+    with pytest.raises(CollectiveError, match="cannot use the GPU: cudaError"):
+        build_reducer("har", given)
+    os.close(fd)

@@ -11,7 +11,7 @@ import pytest
 from gmijax.cli import compose
 from gmijax.config import ADAPTIVE_LEARNING_RATE_RANGE, TrainConfig
 from gmijax.errors import ConfigError
-from gmijax.ppo.learner import adapted_learning_rate
+from gmijax.learner import adapted_learning_rate
 from gmijax.schema import from_dict, to_dict
 
 

@@ -8,11 +8,12 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from supervision import machine, plan_config, reduce_config
+from supervision import gpu, machine, plan_config, reduce_config
 
 from gmijax.partition.backends import BACKENDS
 from gmijax.partition.backends.cpu import NO_FUSION_EMITTERS, cpu_environment
 from gmijax.partition.environment import extend_xla_flags, gmi_environment
+from gmijax.partition.nvidia import Gpu, MigInstance
 from gmijax.partition.plan import Plan
 from gmijax.partition.planner import make_plan
 from gmijax.partition.rendezvous import reserved_address
@@ -27,15 +28,31 @@ INHERITED = {
 FROM_BACKEND = {
     "cpu": cpu_environment((0, 10, 2)),
     "share": {"CUDA_MPS_PIPE_DIRECTORY": "/runs/a/mps/none"},
+    "mig": {"CUDA_MPS_PIPE_DIRECTORY": "/runs/a/mps/none"},
     "mps": {"CUDA_MPS_PIPE_DIRECTORY": "/tmp/gmijax-1"},
 }
 
 
+def divided_gpus() -> tuple[Gpu, ...]:
+    """Two GPUs with a large and a small MIG instance each."""
+    return tuple(
+        gpu(index, mig_enabled=True)._replace(
+            instances=(
+                MigInstance(f"MIG-{index}-small", "1g.18gb", 9, 16, 17856),
+                MigInstance(f"MIG-{index}-large", "3g.71gb", 1, 60, 71424),
+            )
+        )
+        for index in range(2)
+    )
+
+
 def planned(backend: str, **changes: Any) -> Plan:
+    changes_of_machine = {"gpus": divided_gpus()} if backend == "mig" else {}
     here = machine(
         0 if backend == "cpu" else 2,
         mps_control=Path("/usr/bin/nvidia-cuda-mps-control"),
         cpu_cores=tuple(range(8)),
+        **changes_of_machine,
     )
     config = plan_config(gpus=2, gmis_per_gpu=2, backend=backend, **changes)
     return make_plan(config, reduce_config(), 64, here)

@@ -153,7 +153,7 @@ def test_values_that_do_not_fit_are_refused(here: Machine, changes: dict[str, An
         (machine(0), "mps", "no usable NVIDIA GPU here; available here: auto, cpu$"),
         (machine(0), "share", "no usable NVIDIA GPU here; available here: auto, cpu$"),
         (machine(1), "mps", "was not found in PATH .*available here: auto, cpu, share$"),
-        (machine(1, mps_control=MPS), "mig", "not supported yet; .*: auto, cpu, share, mps$"),
+        (machine(1, mps_control=MPS), "mig", "have no MIG; .*: auto, cpu, share, mps$"),
     ],
 )
 def test_backend_that_cannot_be_had_is_refused(here: Machine, backend: str, message: str):
@@ -183,15 +183,6 @@ def test_new_drivers_allow_more_clients():
     assert planned(here, gmis_per_gpu=60).layout.num_gmis == 60
     with pytest.raises(ConfigError, match="at most 60"):
         planned(here, gmis_per_gpu=61)
-
-
-@pytest.mark.parametrize(
-    ("percent", "warned"), [(12.0, False), (20.0, True), (25.0, False), (33.0, True), (66.0, True)]
-)
-def test_sm_caps_with_reported_wrong_results_are_warned_about(percent: float, warned: bool):
-    plan = planned(machine(1, mps_control=MPS), gmis_per_gpu=2, sm_percent=percent)
-    assert any(reason.startswith("warning") for reason in plan.reasons) == warned
-    assert plan.slices[0].sm_percent == percent
 
 
 def test_memory_is_split_over_the_gmis_of_a_gpu():

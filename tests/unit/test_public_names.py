@@ -21,7 +21,9 @@ def test_an_unknown_name_is_an_attribute_error() -> None:
         _ = getattr(gmijax, "trian")  # noqa: B009
 
 
-@pytest.mark.parametrize("module", ["gmijax", "gmijax.cli", "gmijax.job", "gmijax.evaluation"])
+@pytest.mark.parametrize(
+    "module", ["gmijax", "gmijax.cli", "gmijax.job", "gmijax.evaluation", "gmijax.serving"]
+)
 def test_the_controller_loads_neither_jax_nor_mujoco(module: str) -> None:
     code = f"import {module}, sys; print(sorted({{'jax', 'mujoco', 'flax'}} & sys.modules.keys()))"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)

@@ -8,6 +8,7 @@ from hypothesis import strategies as st
 
 from gmijax.collectives.cost_model import COSTS, flat_s, har_s, mpr_s, mrr_s, predicted_s
 from gmijax.errors import ConfigError
+from gmijax.partition import reduction
 from gmijax.partition.layout import Layout
 from gmijax.partition.reduction import (
     leaders,
@@ -90,11 +91,16 @@ def test_what_cannot_run_names_strategy_layout_and_reason(
 
 @pytest.mark.parametrize(
     ("backend", "reason"),
-    [("cpu", "NVIDIA GPU"), ("mig", "MIG"), ("mps", "not supported yet"), ("share", "not supp")],
+    [("cpu", "NVIDIA GPU"), ("mig", "MIG"), ("mps", "cuda-bindings"), ("share", "cuda-bindings")],
 )
-def test_device_exchange_says_why_it_is_not_to_be_had(backend: str, reason: str) -> None:
+def test_device_exchange_says_why_it_is_not_to_be_had(
+    backend: str, reason: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(reduction, "_is_installed", lambda *_: False)
     assert reason in (why_not_intra("ipc", backend) or "")
     assert why_not_intra("host", backend) is None
+    monkeypatch.setattr(reduction, "_is_installed", lambda *_: True)
+    assert (why_not_intra("ipc", backend) is None) == (backend in ("mps", "share"))
 
 
 @pytest.mark.parametrize(

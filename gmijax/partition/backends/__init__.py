@@ -8,6 +8,7 @@ from typing import TypeAlias
 
 from gmijax.partition.backends.cpu import CpuBackend
 from gmijax.partition.backends.interface import Backend
+from gmijax.partition.backends.mig import MigBackend
 from gmijax.partition.backends.mps import MpsBackend
 from gmijax.partition.backends.share import ShareBackend
 from gmijax.partition.machine import Machine
@@ -19,6 +20,7 @@ BackendFactory: TypeAlias = Callable[[Plan, Machine, RunPaths], Backend]
 BACKENDS: Mapping[str, BackendFactory] = MappingProxyType(
     {
         "cpu": CpuBackend,
+        "mig": MigBackend,
         "mps": MpsBackend,
         "share": ShareBackend,
     }

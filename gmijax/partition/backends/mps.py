@@ -1,8 +1,8 @@
 """Backend `mps`: the GMIs of a GPU run at the same time under NVIDIA's Multi-Process Service.
 
-One daemon per GPU, with a pipe directory of its own: a fatal fault of one client ends every
-client of its server, so GPUs must not share a server. A daemon that somebody else has started
-is used and never stopped.
+One daemon per GPU (or MIG instance), with a pipe directory of its own: a fatal fault of one
+client ends every client of its server, so GPUs must not share a server. A daemon that somebody
+else has started is used and never stopped.
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ from __future__ import annotations
 import os
 import tempfile
 import time
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from contextlib import suppress
 from pathlib import Path
 from types import TracebackType
@@ -36,35 +36,42 @@ class MpsBackend:
     """Runs the daemons of a job while it is entered.
 
     Args:
-      plan: its slices name the GPUs.
+      plan: its slices name the devices.
       machine: where the control program is, and whether somebody's daemon runs.
       run: logs go below its `mps` folder.
+      gmis: those that are clients; None for all.
 
     Raises:
       BackendUnavailable: the control program is not installed.
     """
 
-    def __init__(self, plan: Plan, machine: Machine, run: RunPaths) -> None:
+    def __init__(
+        self, plan: Plan, machine: Machine, run: RunPaths, gmis: Collection[int] | None = None
+    ) -> None:
         if machine.mps_control is None:
-            raise BackendUnavailable("plan.backend=mps: nvidia-cuda-mps-control was not found")
-        self._plan = plan
+            raise BackendUnavailable(
+                f"plan.backend={plan.backend}: nvidia-cuda-mps-control was not found"
+            )
+        self._backend = plan.backend
         self._program = machine.mps_control
         self._operator = machine.operator_daemon
         self._logs = run.mps
-        self._controls: dict[int, MpsControl] = {}
+        clients = plan.layout.gmis if gmis is None else gmis
+        self._devices = {gmi: plan.slices[gmi].device for gmi in clients}
+        self._controls: dict[str, MpsControl] = {}
         self._janitor: JanitorLink | None = None
-        self._unresponsive: set[int] = set()
+        self._unresponsive: set[str] = set()
 
     def __enter__(self) -> Self:
         """Starts a daemon per GPU, or attaches to the one that runs."""
         if self._operator is not None:
             control = MpsControl(self._program, self._operator)
-            self._controls = dict.fromkeys(range(self._plan.layout.num_gpus), control)
+            self._controls = dict.fromkeys(self._devices.values(), control)
             return self
         try:
             self._janitor = JanitorLink(self._logs)
-            for gpu, gmis in enumerate(self._plan.layout.gmis_of_gpu):
-                self._start_daemon(gpu, self._plan.slices[gmis[0]].device)
+            for place, device in enumerate(dict.fromkeys(self._devices.values())):
+                self._start_daemon(device, self._logs / f"gpu_{place}")
         except BaseException:
             self._quit_all()
             raise
@@ -111,9 +118,9 @@ class MpsBackend:
 
     def terminate(self, gmi: int, pid: int) -> None:
         """Takes the GMI off the GPU: killing a busy client can fault its neighbours."""
-        gpu = self._plan.layout.gpu_of(gmi)
-        control = self._controls[gpu]
-        if gpu in self._unresponsive:
+        device = self._devices[gmi]
+        control = self._controls[device]
+        if device in self._unresponsive:
             return
         try:
             server = control.all_client_pids().get(pid)
@@ -121,26 +128,25 @@ class MpsBackend:
                 control.terminate_client(server, pid)
         except BackendUnavailable:
             # Each attempt could cost a time limit; the other GMIs are killed without it.
-            self._unresponsive.add(gpu)
+            self._unresponsive.add(device)
 
     def _control_of(self, gmi: int) -> MpsControl:
-        return self._controls[self._plan.layout.gpu_of(gmi)]
+        return self._controls[self._devices[gmi]]
 
-    def _start_daemon(self, gpu: int, gpu_uuid: str) -> None:
+    def _start_daemon(self, device: str, log_directory: Path) -> None:
         # mkdtemp makes it readable for nobody else.
         directory = Path(tempfile.mkdtemp(prefix="gmijax-", dir=_short_parent()))
         control = MpsControl(self._program, directory)
-        self._controls[gpu] = control
+        self._controls[device] = control
         if self._janitor is not None:
             self._janitor.watch_daemon(control)
-        log_directory = self._logs / f"gpu_{gpu}"
-        control.start(gpu_uuid, log_directory)
+        control.start(device, log_directory)
         deadline_s = time.monotonic() + _ANSWER_S
         while not control.is_answering():
             if time.monotonic() > deadline_s:
                 raise BackendUnavailable(
-                    f"plan.backend=mps: the daemon of GPU {gpu} does not answer within "
-                    f"{_ANSWER_S:g} s; see {log_directory}"
+                    f"plan.backend={self._backend}: the daemon of {device} does not answer "
+                    f"within {_ANSWER_S:g} s; see {log_directory}"
                 )
             time.sleep(_POLL_S)
 

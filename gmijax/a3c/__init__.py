@@ -1,0 +1,1 @@
+"""Asynchronous actor-critic training: agents act, trainers learn, and neither waits its turn."""

@@ -1,0 +1,266 @@
+"""The role of a serving GMI: simulator and agent in one.
+
+It acts with the newest weights on the board, sends what came of it, and goes on. Trainers never
+make it wait, except for room where experience is not to be dropped.
+"""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+import numpy.typing as npt
+from jax.flatten_util import ravel_pytree
+
+from gmijax.a3c.board import Board, Orders, Report, pack_report, unpack_orders
+from gmijax.a3c.learner import ActingWeights, acting_weights, unpack_weights
+from gmijax.a3c.losses import Unrolls
+from gmijax.a3c.rollout import UnrollStats, collect, stats_example
+from gmijax.checkpoint import has_envs, restore_envs, save_envs
+from gmijax.collectives.channel.interface import ExperienceSender
+from gmijax.config import A3cConfig, TrainConfig
+from gmijax.errors import CollectiveTimeout, PipeClosed
+from gmijax.learner import LearnerState, host_sharding, init_learner, make_learner
+from gmijax.partition.child import ChildLink
+from gmijax.resume import CheckpointMeta
+from gmijax.sim.wrappers import BatchedEnv, BatchState, env_keys
+from gmijax.types import PyTree
+
+_PAUSE_S = 0.02
+_POLL_S = 0.0002
+_SLICE_S = 0.5
+"""Longest wait for room before the agent looks at the board again."""
+
+
+class Serving(NamedTuple):
+    """What an agent is made of.
+
+    Attributes:
+      config: of the run.
+      env: its environments.
+      algo: of the run, too.
+      index: place among the agents, 0 for the first.
+      trainers: ids of the GMIs that train, for messages.
+    """
+
+    config: TrainConfig
+    algo: A3cConfig
+    env: BatchedEnv
+    index: int
+    trainers: tuple[int, ...]
+
+
+class _Sent(NamedTuple):
+    """An unroll that is being computed: what it will be, and the policy that makes it."""
+
+    experience: Unrolls
+    stats: UnrollStats
+    version: int
+
+
+def act_until_told(
+    serving: Serving, board: Board, sender: ExperienceSender, link: ChildLink
+) -> dict[str, Any]:
+    """Acts until the leading trainer ends the job.
+
+    Returns:
+      The outcome for `result.json`.
+
+    Raises:
+      CollectiveTimeout: trainers do not start, or take nothing any more.
+    """
+    return _Agent(serving, board, sender, link).run()
+
+
+class _Agent:
+    """One serving GMI; see `act_until_told`."""
+
+    def __init__(
+        self, serving: Serving, board: Board, sender: ExperienceSender, link: ChildLink
+    ) -> None:
+        self._config = serving.config
+        self._algo = serving.algo
+        self._env = serving.env
+        self._index = serving.index
+        self._trainers = serving.trainers
+        self._board = board
+        self._sender = sender
+        self._link = link
+        self._learner = make_learner(self._env.spec, serving.algo)
+        example = ravel_pytree(stats_example(self._env.spec, self._env.overflows))[0]
+        self._report = Report(None, 0.0, 0.0, 0.0, 0.0, 0.0, np.zeros(example.size, np.float64))
+        self._orders_seen = 0
+        self._orders = Orders(None, is_ending=False)
+        self._weights_seen = 0
+        self._version = 0
+        self._unrolls = 0
+
+    def run(self) -> dict[str, Any]:
+        """See `act_until_told`."""
+        self._link.beat("compiling", 0)
+        started = time.monotonic()
+        weights = self._first_weights()
+        env_state = self._first_envs()
+        program = self._compile(weights, env_state)
+        compile_s = time.monotonic() - started
+        self._link.beat("ready", 0)
+        self._wait_for_start()
+        started = time.monotonic()
+        self._loop(program, weights, env_state)
+        return {
+            "status": "completed",
+            "env_steps": int(self._report.env_steps),
+            "unrolls": self._unrolls,
+            "wall_s": time.monotonic() - started,
+            "send_s": self._report.send_s,
+            "dropped": int(self._report.dropped),
+            "compile_s": compile_s,
+        }
+
+    def _first_weights(self) -> ActingWeights:
+        """Weights of the right shapes; those to act with come from the board."""
+        state: LearnerState = jax.jit(
+            lambda key: init_learner(self._learner, self._env.spec.obs_size, key)
+        )(jax.random.key(0))
+        return acting_weights(self._learner, state)
+
+    def _first_envs(self) -> BatchState:
+        config = self._config
+        key = jax.random.split(jax.random.key(config.seed))[1]
+        resume = config.run.resume
+        meta = None if resume is None else CheckpointMeta.read(Path(resume))
+        if meta is not None:  # Other ones than the first run's start.
+            key = jax.random.fold_in(key, meta.env_steps % 2**31)
+        keys = env_keys(key, self._index * config.envs_per_gmi, config.envs_per_gmi)
+        env_state = jax.jit(self._env.init)(self._env.model, keys)
+        if meta is None or not has_envs(Path(str(resume)), self._link.gmi):
+            return env_state
+        if (meta.num_envs, meta.impl) != (config.envs_per_gmi, config.physics.impl):
+            return env_state
+        return restore_envs(Path(str(resume)), self._link.gmi, env_state)
+
+    def _compile(self, weights: ActingWeights, env_state: BatchState) -> Any:
+        def unroll(
+            model: PyTree, weights: ActingWeights, env_state: BatchState
+        ) -> tuple[BatchState, Unrolls, Any]:
+            env_state, experience, stats = collect(
+                self._env, self._learner.networks, self._algo.unroll_length, model, weights,
+                env_state,
+            )  # fmt: skip
+            return env_state, experience, ravel_pytree(stats)[0]
+
+        where = host_sharding()
+        jitted = jax.jit(
+            unroll, donate_argnums=(2,), out_shardings=(None, where, where) if where else None
+        )
+        return jitted.lower(self._env.model, weights, env_state).compile()
+
+    def _wait_for_start(self) -> None:
+        """Returns when the leading trainer has written its first orders and weights."""
+        limit_s = self._config.run.start_timeout_s
+        started = time.monotonic()
+        while not self._look():
+            if time.monotonic() - started > limit_s:
+                raise self._late("the start", limit_s)
+            time.sleep(_PAUSE_S)
+
+    def _loop(self, program: Any, weights: ActingWeights, env_state: BatchState) -> None:
+        pending: _Sent | None = None
+        unpack = jax.jit(lambda packed: unpack_weights(weights, packed))
+        while True:
+            if self._orders.checkpoint not in (None, self._report.checkpoint):
+                self._save(env_state)
+            if self._orders.is_ending:
+                break
+            if (posted := self._board.weights.read(self._weights_seen)) is not None:
+                self._weights_seen, self._version = posted.count, posted.tag
+                weights = unpack(posted.values.view(np.float32))
+            env_state, experience, stats = program(self._env.model, weights, env_state)
+            # While the device computes this unroll, the one before is sent.
+            if pending is not None:
+                self._send(pending)
+            pending = _Sent(experience, stats, self._version)
+            self._look()
+        self._publish()
+
+    def _send(self, unroll: _Sent) -> None:
+        arrays = {name: np.asarray(x) for name, x in unroll.experience._asdict().items()}
+        stats = np.asarray(unroll.stats, np.float64)
+        started = time.monotonic()
+        if not self._hand_over(arrays, unroll.version, started):
+            return
+        counts = self._sender.stats()
+        if not counts.least_occupancy:  # A trainer has nothing to do: what waits must go.
+            self._sender.flush()
+        self._unrolls += 1
+        self._report = self._report._replace(
+            env_steps=self._report.env_steps + arrays["reward"].size,
+            bytes_sent=float(counts.num_bytes),
+            dropped=float(counts.dropped),
+            send_s=self._report.send_s + time.monotonic() - started,
+            occupancy=counts.occupancy,
+            stats=self._report.stats + stats,
+        )
+        self._publish()
+        self._link.beat("running", self._unrolls)
+
+    def _hand_over(
+        self, arrays: dict[str, npt.NDArray[Any]], version: int, started: float
+    ) -> bool:
+        """Sends an unroll; False if the job ends and nobody wants it any more."""
+        limit_s = self._config.reduce.timeout_s
+        try:
+            while self._is_ahead(arrays) or not self._sender.send(arrays, version, _SLICE_S):
+                if self._is_ending():
+                    return False
+                if time.monotonic() - started > limit_s:
+                    raise self._late("send", limit_s)
+                self._link.beat("running", self._unrolls)
+        except PipeClosed:
+            if not self._is_ending():
+                raise
+            return False
+        return True
+
+    def _is_ahead(self, arrays: dict[str, npt.NDArray[Any]]) -> bool:
+        """Waits a moment while `max_ahead` unrolls wait for every trainer; whether they still do.
+
+        More of them in the channel would only make experience older.
+        """
+        channel = self._config.channel
+        if channel.when_full != "block":
+            return False
+        size = sum(array.nbytes for array in arrays.values())
+        most = (self._algo.max_ahead - 0.5) * size / channel.capacity_bytes
+        deadline_s = time.monotonic() + _SLICE_S
+        while self._sender.stats().least_occupancy > most:
+            if time.monotonic() > deadline_s:
+                return True
+            time.sleep(_POLL_S)
+        return False
+
+    def _save(self, env_state: BatchState) -> None:
+        steps = self._orders.checkpoint
+        assert steps is not None
+        save_envs(self._link.run, steps, self._link.gmi, env_state)
+        self._report = self._report._replace(checkpoint=steps)
+        self._publish()
+
+    def _look(self) -> bool:
+        """Takes up new orders; returns whether there ever were any."""
+        if (posted := self._board.orders.read(self._orders_seen)) is not None:
+            self._orders_seen, self._orders = posted.count, unpack_orders(posted)
+        return self._orders_seen > 0
+
+    def _is_ending(self) -> bool:
+        self._look()
+        return self._orders.is_ending
+
+    def _publish(self) -> None:
+        self._board.reports[self._index].publish(pack_report(self._report))
+
+    def _late(self, what: str, limit_s: float) -> CollectiveTimeout:
+        return CollectiveTimeout(self._link.gmi, self._trainers, what, self._unrolls, limit_s)

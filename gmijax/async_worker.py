@@ -1,0 +1,143 @@
+"""Main of a GMI in asynchronous training: `python -m gmijax.async_worker`.
+
+Started by the supervisor and by nobody else. Builds the role that the plan gives to this GMI,
+agent or trainer, plugs in the board, the channels and the reducer among the trainers, runs it,
+and writes `result.json` or `error.json`.
+"""
+
+from __future__ import annotations
+
+import os
+import sys
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+from gmijax.config import A3cConfig, TrainConfig
+from gmijax.decoupled import ENV_BOARD_FD, ENV_CHANNELS_FD, groups_of, places_of
+from gmijax.errors import ConfigError
+from gmijax.partition.child import ChildLink, inherited_fd, run_gmi
+from gmijax.partition.plan import Plan
+from gmijax.rundir import read_json
+from gmijax.schema import from_dict
+
+if TYPE_CHECKING:
+    from gmijax.a3c.board import Board
+    from gmijax.collectives.interface import Reducer
+    from gmijax.sim.wrappers import BatchedEnv
+
+
+class _Parts(NamedTuple):
+    """What both roles are made of."""
+
+    config: TrainConfig
+    algo: A3cConfig
+    plan: Plan
+    env: BatchedEnv
+    board: Board
+    link: ChildLink
+
+
+def main() -> int:
+    """Runs this process's GMI; returns the exit code."""
+    return run_gmi(_run)
+
+
+def _run(link: ChildLink) -> dict[str, Any]:
+    config = from_dict(TrainConfig, read_json(link.run.config))
+    plan = Plan.from_dict(read_json(link.run.plan))
+    algo = config.algo
+    if not isinstance(algo, A3cConfig):
+        raise ConfigError(f"algo={algo.name}: allowed here is a3c")
+    # jax starts here, in the environment that the plan prepared.
+    from gmijax.selfcheck import check_share
+    from gmijax.sim.build import make_training_env
+
+    check_share(plan, link.gmi)
+    agents, trainers = groups_of(plan)
+    env = make_training_env(
+        config.env,
+        config.physics.impl,
+        seed=config.seed,
+        first_env=_index(agents.gmis, link.gmi) * config.envs_per_gmi,
+        num_envs=config.envs_per_gmi,
+    )
+    parts = _Parts(config, algo, plan, env, _board(algo, env, len(agents.gmis)), link)
+    return _train(parts) if link.gmi in trainers.gmis else _act(parts)
+
+
+def _act(parts: _Parts) -> dict[str, Any]:
+    from gmijax.a3c.agent import Serving, act_until_told
+    from gmijax.collectives.channel.build import open_sender
+
+    config, plan, link = parts.config, parts.plan, parts.link
+    agents, trainers = groups_of(plan)
+    index = _index(agents.gmis, link.gmi)
+    serving = Serving(config, parts.algo, parts.env, index, trainers.gmis)
+    sender = open_sender(config.channel, places_of(plan), link.gmi, _channels_fd())
+    try:
+        return act_until_told(serving, parts.board, sender, link)
+    finally:
+        sender.close()
+
+
+def _train(parts: _Parts) -> dict[str, Any]:
+    from gmijax.a3c.trainer import Training, learn_until_done
+    from gmijax.collectives.channel.build import open_receiver
+
+    config, plan, link = parts.config, parts.plan, parts.link
+    training = Training(config, parts.algo, parts.env, groups_of(plan)[0].gmis)
+    receiver = open_receiver(config.channel, places_of(plan), link.gmi, _channels_fd())
+    reducer = _reducer(parts)
+    try:
+        return learn_until_done(training, parts.board, receiver, reducer, link)
+    finally:
+        receiver.close()
+        reducer.close()
+
+
+def _reducer(parts: _Parts) -> Reducer:
+    """The reducer among the trainers, whose ranks are their places among them."""
+    from gmijax.a3c.programs import exchange_size
+    from gmijax.collectives.build import Membership, build_reducer
+
+    config, plan = parts.config, parts.plan
+    trainers = groups_of(plan)[1]
+    membership = Membership(
+        layout=trainers.layout,
+        rank=trainers.gmis.index(parts.link.gmi),
+        num_floats=exchange_size(parts.env.spec, parts.algo),
+        exchange_fd=parts.link.exchange_fd,
+        timeout_s=config.reduce.timeout_s,
+        rendezvous_timeout_s=config.run.start_timeout_s,
+        intra=plan.intra,
+    )
+    return build_reducer(plan.strategy, membership)
+
+
+def _board(algo: A3cConfig, env: BatchedEnv, num_agents: int) -> Board:
+    from gmijax.a3c.board import board_of, note_sizes
+    from gmijax.a3c.learner import num_weights
+    from gmijax.a3c.rollout import num_stats
+    from gmijax.collectives.board import attach_board
+
+    sizes = note_sizes(num_weights(env.spec, algo), num_stats(env), num_agents)
+    return board_of(attach_board(_required_fd(ENV_BOARD_FD), sizes))
+
+
+def _channels_fd() -> int:
+    return _required_fd(ENV_CHANNELS_FD)
+
+
+def _required_fd(name: str) -> int:
+    fd = inherited_fd(os.environ, name)
+    if fd is None:
+        raise ConfigError(f"{name} must be set: GMIs are started by gmijax.train")
+    return fd
+
+
+def _index(gmis: tuple[int, ...], gmi: int) -> int:
+    """Place of an agent among the agents; 0 for a trainer, which steps no environment."""
+    return gmis.index(gmi) if gmi in gmis else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

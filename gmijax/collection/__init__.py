@@ -1,0 +1,1 @@
+"""Collecting experience without learning: what the GMIs of `gmijax.serve` run."""

@@ -1,0 +1,153 @@
+"""The compiled parts of collecting: a whole unroll, one step, and the halves of a step.
+
+Where simulator and agent share a GMI, T steps are one program. Where they do not, a step is cut
+where data leaves the GMI: `simulate` ends with what the agent must know, `infer` is the agent's.
+Both draw the policy's noise from the environments' own keys, so that they collect the same
+experience.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from gmijax.collection.policy import ActingPolicy
+from gmijax.sim.wrappers import BatchedEnv, BatchState, EpisodeSums, split_keys
+from gmijax.types import Array, PyTree
+
+
+class Step(NamedTuple):
+    """One step of N environments, as it is kept; over an unroll with a leading axis [T].
+
+    Attributes:
+      obs: [N, O] what was observed before the action.
+      action: [N, A] as chosen, before the task clips it.
+      log_prob: [N] log density of the action under the policy.
+      reward: [N].
+      terminated: [N] bool, the task has ended.
+      truncated: [N] bool, time ran out.
+      next_obs: [N, O] what the action led to, before any reset; None where it is not kept.
+    """
+
+    obs: Array
+    action: Array
+    log_prob: Array
+    reward: Array
+    terminated: Array
+    truncated: Array
+    next_obs: Array | None
+
+
+class Counts(NamedTuple):
+    """What happened in some steps; add those of several.
+
+    Attributes:
+      episodes: sums over the episodes that ended.
+      diverged: [] worlds that were ended because of a bad number.
+    """
+
+    episodes: EpisodeSums
+    diverged: Array
+
+
+class Keep(NamedTuple):
+    """What of every step a program hands out."""
+
+    steps: bool
+    next_obs: bool
+
+
+def unroll(
+    env: BatchedEnv,
+    policy: ActingPolicy,
+    length: int,
+    keep: Keep,
+    model: PyTree,
+    weights: PyTree,
+    state: BatchState,
+) -> tuple[BatchState, Step | None, Counts]:
+    """T steps; returns the state, the steps [T, N] (None if not kept), and sums over all."""
+
+    def step(before: BatchState, _: None) -> tuple[BatchState, tuple[Step | None, Counts]]:
+        drawn, keys = split_keys(before)
+        action, log_prob = policy.choose(weights, before.env.obs, keys)
+        after, counts, kept = _advance(env, model, drawn, action, log_prob, keep)
+        return after, (kept, counts)
+
+    state, (steps, counts) = jax.lax.scan(step, state, None, length=length)
+    return state, steps, jax.tree.map(lambda x: jnp.sum(x, axis=0, dtype=jnp.float32), counts)
+
+
+def simulate(
+    env: BatchedEnv,
+    keep: Keep,
+    model: PyTree,
+    state: BatchState,
+    counts: Counts,
+    action: Array,
+    log_prob: Array,
+) -> tuple[BatchState, Array, Counts, Step | None]:
+    """The simulator's half of a step: physics, then keys for the next action.
+
+    Args:
+      env: the environments.
+      keep: what of the step is handed out.
+      model: their physics model.
+      state: after `next_keys`, so that its keys are those of this step.
+      counts: of the steps before.
+      action: [N, A] of the agent.
+      log_prob: [N] of the agent.
+
+    Returns:
+      The state, random bits [N, ...] uint32 for the agent's next draw, the counts with those of
+      this step, and the step.
+    """
+    after, new, step = _advance(env, model, state, action, log_prob, keep)
+    after, bits = next_keys(after)
+    return after, bits, jax.tree.map(lambda a, b: a + b.astype(jnp.float32), counts, new), step
+
+
+def no_counts(env: BatchedEnv) -> Counts:
+    """Counts before the first step."""
+    zero = jnp.zeros(())
+    terms = dict.fromkeys(env.spec.reward_terms, zero)
+    metrics = dict.fromkeys(env.spec.metrics, zero)
+    return Counts(EpisodeSums(zero, zero, zero, terms, metrics), zero)
+
+
+def next_keys(state: BatchState) -> tuple[BatchState, Array]:
+    """Draws a key per environment for the agent, as bits [N, ...] that can be sent."""
+    state, keys = split_keys(state)
+    return state, jax.random.key_data(keys)
+
+
+def infer(policy: ActingPolicy, weights: PyTree, obs: Array, bits: Array) -> tuple[Array, Array]:
+    """The agent's half of a step: actions [N, A] and log densities [N]."""
+    return policy.choose(weights, obs, jax.random.wrap_key_data(bits))
+
+
+def _advance(
+    env: BatchedEnv,
+    model: PyTree,
+    state: BatchState,
+    action: Array,
+    log_prob: Array,
+    keep: Keep,
+) -> tuple[BatchState, Counts, Step | None]:
+    after, out = env.step(model, state, action)
+    kept = (
+        Step(
+            state.env.obs,
+            action,
+            log_prob,
+            out.reward,
+            out.terminated,
+            out.truncated,
+            out.next_obs if keep.next_obs else None,
+        )
+        if keep.steps
+        else None
+    )
+    return after, Counts(out.finished, out.diverged["any"]), kept

@@ -1,0 +1,86 @@
+"""Dispenser, on the agent's side: categorises experience into channels (paper, section 4.2)."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterator, Mapping
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from gmijax.collectives.channel.interface import Array, Experience
+from gmijax.collectives.channel.spec import Spec, spec_of
+from gmijax.errors import ConfigError
+
+
+class Piece(NamedTuple):
+    """Experience of some environments, by channel.
+
+    Attributes:
+      spec: the channels.
+      num_envs: N.
+      version: of the policy that acted.
+      channels: arrays by channel, views of what the agent gave.
+    """
+
+    spec: Spec
+    num_envs: int
+    version: int
+    channels: dict[str, Array]
+
+    def copy(self) -> Piece:
+        """The same with arrays of its own."""
+        return self._replace(channels={name: a.copy() for name, a in self.channels.items()})
+
+
+class Dispenser:
+    """Splits what an agent sends into pieces with one array a channel.
+
+    Args:
+      max_piece_bytes: largest piece; a rollout beyond it is cut between environments.
+      float16: channels that travel as float16; the others as they are.
+    """
+
+    def __init__(self, max_piece_bytes: int, float16: Collection[str] = ()) -> None:
+        self._max_piece_bytes = max_piece_bytes
+        self._float16 = frozenset(float16)
+        self._spec: Spec | None = None
+
+    def split(self, experience: Experience | Any, version: int) -> Iterator[Piece]:
+        """The pieces of one rollout, in order of environment.
+
+        Args:
+          experience: arrays by channel, as a mapping or a NamedTuple.
+          version: of the policy that acted.
+
+        Raises:
+          ConfigError: not such arrays, others than the first time, or too large ones.
+        """
+        by_channel = experience if isinstance(experience, Mapping) else experience._asdict()
+        channels = {name: np.asarray(values) for name, values in by_channel.items()}
+        spec, num_envs = spec_of(channels, self._float16)
+        if self._spec is None:
+            self._check_names(spec)
+            self._spec = spec
+        if spec != self._spec:
+            raise ConfigError(f"experience: got {spec}, the first was {self._spec}")
+        pieces = -(-num_envs // self._envs_per_piece(spec))
+        step = -(-num_envs // pieces)  # As equal as can be.
+        for low in range(0, num_envs, step):
+            high = min(low + step, num_envs)
+            part = {name: array[:, low:high] for name, array in channels.items()}
+            yield Piece(self._spec, high - low, version, part)
+
+    def _envs_per_piece(self, spec: Spec) -> int:
+        one = sum(spec.sizes(1))
+        if one > self._max_piece_bytes:
+            raise ConfigError(
+                f"experience: {one} bytes for one environment, at most {self._max_piece_bytes}; "
+                "channel.capacity_mib must be larger, or the unroll shorter"
+            )
+        return self._max_piece_bytes // one
+
+    def _check_names(self, spec: Spec) -> None:
+        allowed = [channel.name for channel in spec.channels if channel.dtype == "float32"]
+        unknown = self._float16.difference(allowed)
+        if unknown:
+            raise ConfigError(f"channel.float16={sorted(unknown)}: expected some of {allowed}")

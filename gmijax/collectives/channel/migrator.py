@@ -1,0 +1,85 @@
+"""Migrator: which trainer gets the next transfer (paper, section 4.2).
+
+A trainer on the agent's own GPU gets it directly. If there is none, experience is gathered by
+channel (the compressor's transfers) and goes to the trainer with the least outstanding work.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping, Sequence
+
+from gmijax.collectives.channel.interface import Outlet
+from gmijax.collectives.pipe import Bytes
+from gmijax.collectives.waits import LIVENESS_PERIOD_S
+from gmijax.errors import GmijaxError
+
+
+class Migrator:
+    """Routes the transfers of one agent.
+
+    Args:
+      outlets: the ways to all trainers.
+      gpu: index of the agent's GPU.
+      gpu_of: GPUs of the trainers by rank.
+    """
+
+    def __init__(self, outlets: Sequence[Outlet], gpu: int, gpu_of: Mapping[int, int]) -> None:
+        near = [outlet for outlet in outlets if gpu_of[outlet.peer] == gpu]
+        self._outlets = tuple(outlets)
+        self._candidates = near or list(outlets)
+        self._transfers = 0
+        self._next_look_s = time.monotonic()
+
+    @property
+    def sent_items(self) -> int:
+        """Pieces committed to all trainers, by predecessors of this process too."""
+        return sum(outlet.sent_items for outlet in self._outlets)
+
+    def try_open(self, sizes: Sequence[int]) -> tuple[Outlet, list[Bytes]] | None:
+        """A way for a transfer with parts of `sizes` bytes and its memory; None: no room now.
+
+        Raises:
+          PipeClosed: a trainer has closed its end.
+        """
+        for outlet in self._by_load():
+            views = outlet.try_reserve(sizes)
+            if views is not None:
+                self._transfers += 1
+                return outlet, views
+        return None
+
+    def why_lost(self) -> GmijaxError | None:
+        """Why some trainer will never read again, None if all may."""
+        found = (outlet.why_lost("send", self._transfers) for outlet in self._outlets)
+        return next((error for error in found if error is not None), None)
+
+    def check(self) -> None:
+        """Looks at all trainers, five times a second at most; raises what `why_lost` finds."""
+        now_s = time.monotonic()
+        if now_s >= self._next_look_s:
+            self._next_look_s = now_s + LIVENESS_PERIOD_S
+            if (error := self.why_lost()) is not None:
+                raise error
+
+    def occupancy(self) -> float:
+        """How full the fullest way is, 0 to 1."""
+        return max(outlet.occupancy() for outlet in self._outlets)
+
+    def least_occupancy(self) -> float:
+        """How full the emptiest way is that the next transfer may take, 0 to 1."""
+        return min(outlet.occupancy() for outlet in self._candidates)
+
+    def close(self) -> None:
+        """Tells all trainers that nothing more comes."""
+        for outlet in self._outlets:
+            outlet.close()
+
+    def _by_load(self) -> list[Outlet]:
+        """The least loaded first; among equals in turn, so that idle trainers get the same."""
+        count = len(self._candidates)
+        if count == 1:
+            return self._candidates
+        turn = self._transfers % count
+        in_turn = self._candidates[turn:] + self._candidates[:turn]
+        return sorted(in_turn, key=lambda outlet: outlet.load_bytes())

@@ -1,0 +1,303 @@
+"""Channels between hosts: one TCP connection for every pair of agent and trainer, by pyzmq.
+
+The trainer listens, the agent connects. Messages carry a sequence number, an epoch that tells a
+restarted agent from its predecessor, and a CRC-32 of all parts. The trainer acknowledges what it
+has released, which bounds what is on the way. The end of a connection without a goodbye means that
+the peer is gone; so do ten seconds without ZeroMQ's own heartbeats. What a killed agent had not
+yet put on the wire is lost, and nothing else.
+
+Nothing is encrypted and nobody proves who he is: for loopback and networks of one's own.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import socket
+import struct
+import time
+import zlib
+from collections import deque
+from collections.abc import Sequence
+from typing import Any, Final
+
+import numpy as np
+
+from gmijax.collectives.pipe import Bytes, Message
+from gmijax.collectives.pipe_format import message_bytes
+from gmijax.errors import CollectiveError, ConfigError, GmijaxError, PeerLost, PipeClosed
+
+try:
+    import zmq
+    from zmq.utils.monitor import recv_monitor_message
+except ImportError:
+    raise ConfigError(
+        "channel.transport=zmq: pyzmq is not installed; the package extra zmq brings it"
+    ) from None
+
+MAGIC: Final = 0x5A494D47  # "GMIZ" in memory on a little-endian machine
+DATA, GOODBYE, RELEASED = 1, 2, 3
+
+_HEADER: Final = struct.Struct("<IIQQqQI")
+"""magic, kind, epoch, sequence, tag, items, checksum of the parts."""
+
+_LINGER_MS: Final = 2000
+"""How long an end waits for what it has not yet put on the wire, at its close or exit."""
+
+_OPTIONS: Final = {
+    zmq.SNDHWM: 0,  # Acknowledgements bound what waits, not a number of messages.
+    zmq.RCVHWM: 0,
+    zmq.LINGER: _LINGER_MS,
+    zmq.HEARTBEAT_IVL: 2000,
+    zmq.HEARTBEAT_TIMEOUT: 10000,
+}
+
+_HANDSHAKE_FAILED: Final = (
+    zmq.EVENT_HANDSHAKE_FAILED_NO_DETAIL
+    | zmq.EVENT_HANDSHAKE_FAILED_PROTOCOL
+    | zmq.EVENT_HANDSHAKE_FAILED_AUTH
+)
+
+
+class _Connection:
+    """One end of a connection: frames in and out, and whether the other end is there."""
+
+    def __init__(self, address: str, rank: int, peer: int, *, listens: bool) -> None:
+        self.rank, self.peer = rank, peer
+        self.is_closed = False
+        self._connections = self._failures = 0
+        self._was_up = False
+        self._context = zmq.Context()
+        self._socket = self._context.socket(zmq.DEALER)
+        for option, value in _OPTIONS.items():
+            self._socket.setsockopt(option, value)
+        self._monitor = self._socket.get_monitor_socket(
+            zmq.EVENT_HANDSHAKE_SUCCEEDED | zmq.EVENT_DISCONNECTED | _HANDSHAKE_FAILED
+        )
+        try:
+            if listens:
+                self._socket.setsockopt(zmq.USE_FD, _listening(address))
+                self._socket.bind(f"tcp://{address}")
+            else:
+                self._socket.connect(f"tcp://{address}")
+        except (OSError, ValueError, OverflowError, zmq.ZMQError) as error:
+            self.close()
+            raise CollectiveError(
+                f"rank {rank}: no connection with rank {peer} at {address} ({error})"
+            ) from None
+
+    def send(self, frames: Sequence[Any]) -> None:
+        self._socket.send_multipart(frames, flags=zmq.NOBLOCK, copy=False)
+
+    def tell(self, kind: int, epoch: int, sequence: int) -> None:
+        """Sends a message without parts, if there is somebody who could want it."""
+        with contextlib.suppress(zmq.Again):
+            self.send([_HEADER.pack(MAGIC, kind, epoch, sequence, 0, 0, 0)])
+
+    def try_receive(self) -> list[Any] | None:
+        """The next message as buffers, without a copy; None if there is none."""
+        if self.is_closed:
+            return None
+        try:
+            return [f.buffer for f in self._socket.recv_multipart(zmq.NOBLOCK, copy=False)]
+        except zmq.Again:
+            return None
+
+    def is_cut(self) -> bool:
+        """Whether there was a connection and is none now."""
+        while not self.is_closed and self._monitor.poll(0):
+            event = recv_monitor_message(self._monitor)["event"]
+            if event == zmq.EVENT_HANDSHAKE_SUCCEEDED:
+                self._connections += 1
+                self._was_up = True
+            elif event & _HANDSHAKE_FAILED:
+                self._failures += 1
+            elif self._failures:  # The end of a connection that was none, of whomever.
+                self._failures -= 1
+            else:
+                self._connections = max(0, self._connections - 1)
+        return self._was_up and not self._connections
+
+    def close(self) -> None:
+        if not self.is_closed:
+            linger_ms = 0 if self.is_cut() else _LINGER_MS
+            self.is_closed = True
+            self._socket.disable_monitor()
+            self._monitor.close()
+            self._socket.close(linger_ms)
+            self._context.term()
+
+
+class RemoteOutlet:
+    """The way to trainer `peer`, which listens at `address`; see `Outlet`.
+
+    Of its load only what comes from this agent is known.
+    """
+
+    def __init__(self, address: str, rank: int, peer: int, capacity_bytes: int) -> None:
+        self.peer = peer
+        self.max_message_bytes = capacity_bytes // 2
+        self.sent_items = 0
+        self._capacity_bytes = capacity_bytes
+        self._connection = _Connection(address, rank, peer, listens=False)
+        self._epoch = time.time_ns()
+        self._sequence = self._released = 0
+        self._lengths: deque[int] = deque()
+        self._on_the_way = 0
+        self._has_left = False
+        self._open: list[Bytes] = []
+
+    def try_reserve(self, sizes: Sequence[int]) -> list[Bytes] | None:
+        """See `Outlet`."""
+        self._read_answers()
+        if self._has_left:
+            raise PipeClosed(self._connection.rank, self.peer, "send")
+        if message_bytes(sizes) > self.max_message_bytes:
+            raise CollectiveError(
+                f"rank {self._connection.rank}: a message of {message_bytes(sizes)} bytes to rank "
+                f"{self.peer}, at most {self.max_message_bytes}"
+            )
+        if self._on_the_way + message_bytes(sizes) > self._capacity_bytes:
+            return None
+        # ZeroMQ sends from this memory later, so it is not used again.
+        self._open = [np.empty(size, np.uint8) for size in sizes]
+        return self._open
+
+    def commit(self, *, tag: int = 0, items: int = 1) -> None:
+        """See `Outlet`."""
+        parts, self._open = self._open, []
+        head = MAGIC, DATA, self._epoch, self._sequence, tag, items, _crc(parts)
+        self._connection.send([_HEADER.pack(*head), *parts])
+        length = message_bytes([part.size for part in parts])
+        self._lengths.append(length)
+        self._on_the_way += length
+        self._sequence += 1
+        self.sent_items += items
+
+    def load_bytes(self) -> int:
+        """See `Outlet`."""
+        self._read_answers()
+        return self._on_the_way
+
+    def occupancy(self) -> float:
+        """See `Outlet`."""
+        self._read_answers()
+        return self._on_the_way / self._capacity_bytes
+
+    def why_lost(self, operation: str, step: int) -> GmijaxError | None:
+        """See `Outlet`."""
+        is_cut = self._connection.is_cut()
+        self._read_answers()  # A goodbye came before the end.
+        if self._has_left:
+            return PipeClosed(self._connection.rank, self.peer, operation)
+        return PeerLost(self._connection.rank, self.peer, operation, step) if is_cut else None
+
+    def close(self) -> None:
+        """See `Outlet`."""
+        if not self._connection.is_closed:
+            self._connection.tell(GOODBYE, self._epoch, self._sequence)
+            self._connection.close()
+
+    def _read_answers(self) -> None:
+        while (frames := self._connection.try_receive()) is not None:
+            _, kind, epoch, sequence, *_ = _unpack(self._connection, frames)
+            if kind == GOODBYE:
+                self._has_left = True
+            if kind != RELEASED or epoch != self._epoch:
+                continue
+            while self._released < sequence:
+                self._released += 1
+                self._on_the_way -= self._lengths.popleft()
+
+
+class RemoteInlet:
+    """The way from agent `peer`, for which the trainer listens at `address`; see `Inlet`."""
+
+    def __init__(self, address: str, rank: int, peer: int) -> None:
+        self.peer = peer
+        self._connection = _Connection(address, rank, peer, listens=True)
+        self._next: dict[int, int] = {}  # By epoch: what a killed agent sent may be read later.
+        self._held_epoch: int | None = None
+        self._has_left = False
+        self._is_cut = self._is_empty = False
+
+    def try_get(self) -> Message | None:
+        """See `Inlet`."""
+        self.release()
+        frames = self._connection.try_receive()
+        if frames is None:
+            self._is_empty = True
+            if self._has_left:
+                raise PipeClosed(self._connection.rank, self.peer, "receive")
+            return None
+        _, kind, epoch, sequence, tag, items, checksum = _unpack(self._connection, frames)
+        if epoch not in self._next:  # Another process took the agent's rank.
+            self._next[epoch], self._has_left = 0, False
+        parts = tuple(np.frombuffer(frame, np.uint8) for frame in frames[1:])
+        if sequence != self._next[epoch] or checksum != _crc(parts):
+            raise CollectiveError(
+                f"rank {self._connection.rank}: message {self._next[epoch]} from rank {self.peer} "
+                f"is damaged, or it is message {sequence}"
+            )
+        if kind == GOODBYE:
+            self._has_left = epoch == max(self._next)
+            return self.try_get()
+        self._next[epoch] += 1
+        self._held_epoch = epoch
+        return Message(sequence, tag, items, parts)
+
+    def release(self) -> None:
+        """See `Inlet`."""
+        if self._held_epoch is not None:
+            epoch, self._held_epoch = self._held_epoch, None
+            self._connection.tell(RELEASED, epoch, self._next[epoch])
+
+    def occupancy(self) -> float:
+        """Not known on this side: 0."""
+        return 0.0
+
+    def why_lost(self, operation: str, step: int) -> GmijaxError | None:
+        """See `Inlet`."""
+        if self._has_left:
+            return PipeClosed(self._connection.rank, self.peer, operation)
+        is_cut, was_cut = self._connection.is_cut(), self._is_cut
+        self._is_cut = is_cut
+        if not (was_cut and is_cut):
+            # Not before all has been read that came until the end, perhaps a goodbye.
+            self._is_empty = False
+        if is_cut and self._is_empty:
+            return PeerLost(self._connection.rank, self.peer, operation, step)
+        return None
+
+    def close(self) -> None:
+        """See `Inlet`."""
+        if not self._connection.is_closed:
+            self._connection.tell(GOODBYE, 0, 0)
+            self._connection.close()
+
+
+def _listening(address: str) -> int:
+    """A listening socket, which may share its port with who reserved it."""
+    host, _, port = address.rpartition(":")
+    with socket.socket(socket.AF_INET, socket.SOCK_STREAM) as listener:
+        listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEPORT, 1)
+        listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        listener.bind((host, int(port)))
+        listener.listen()
+        return listener.detach()
+
+
+def _unpack(connection: _Connection, frames: Sequence[Any]) -> tuple[int, ...]:
+    if len(frames[0]) == _HEADER.size:
+        header = _HEADER.unpack(frames[0])
+        if header[0] == MAGIC:
+            return header
+    raise CollectiveError(
+        f"rank {connection.rank}: what came from rank {connection.peer} is not from a channel"
+    )
+
+
+def _crc(parts: Sequence[Bytes]) -> int:
+    checksum = 0
+    for part in parts:
+        checksum = zlib.crc32(part.data, checksum)
+    return checksum

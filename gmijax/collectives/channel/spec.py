@@ -1,0 +1,121 @@
+"""What all experience of one agent has in common: channels, numbers of steps, shapes, dtypes.
+
+It travels with every message, so that trainers need not be told before.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Collection, Mapping
+from functools import lru_cache
+from typing import NamedTuple
+
+import numpy as np
+
+from gmijax.collectives.channel.interface import Array, Experience
+from gmijax.collectives.pipe import Bytes
+from gmijax.errors import ConfigError
+
+DTYPES = ("float32", "bool")
+
+
+class Channel(NamedTuple):
+    """One kind of data.
+
+    Attributes:
+      name: e.g. `state`.
+      steps: S, number of steps.
+      shape: what follows S and N.
+      dtype: on both sides, `float32` or `bool`.
+      wire_dtype: on the way, `float16` where that was asked for.
+    """
+
+    name: str
+    steps: int
+    shape: tuple[int, ...]
+    dtype: str
+    wire_dtype: str
+
+    def full_shape(self, num_envs: int) -> tuple[int, ...]:
+        """[S, N, ...]."""
+        return (self.steps, num_envs, *self.shape)
+
+    def wire_bytes(self, num_envs: int) -> int:
+        """Bytes of such an array on the way."""
+        return math.prod(self.full_shape(num_envs)) * np.dtype(self.wire_dtype).itemsize
+
+
+class Spec(NamedTuple):
+    """The channels, in the order they travel."""
+
+    channels: tuple[Channel, ...]
+
+    def sizes(self, num_envs: int) -> list[int]:
+        """Bytes of every channel on the way."""
+        return [channel.wire_bytes(num_envs) for channel in self.channels]
+
+    def unpacked(self) -> Spec:
+        """The same as it is before and after the way."""
+        return Spec(tuple(c._replace(wire_dtype=c.dtype) for c in self.channels))
+
+    def encode(self) -> bytes:
+        """As text; `decode` is the way back."""
+        return json.dumps(self).encode()
+
+    @staticmethod
+    @lru_cache(maxsize=64)
+    def decode(text: bytes) -> Spec:
+        """The spec that `encode` wrote."""
+        (channels,) = json.loads(text)
+        return Spec(
+            tuple(
+                Channel(name, steps, tuple(shape), *rest) for name, steps, shape, *rest in channels
+            )
+        )
+
+
+def spec_of(experience: Experience, float16: Collection[str]) -> tuple[Spec, int]:
+    """The spec of `experience` and its number of environments.
+
+    Args:
+      experience: arrays by channel.
+      float16: channels that travel as float16.
+
+    Raises:
+      ConfigError: arrays that are not [S, N, ...] float32 or bool, or differ in N.
+    """
+    num_envs = next((array.shape[1] for array in experience.values() if array.ndim > 1), 0)
+    channels = []
+    for name, array in experience.items():
+        is_right = array.ndim > 1 and array.shape[1] == num_envs and array.size
+        if not is_right or array.dtype.name not in DTYPES:
+            raise ConfigError(
+                f"experience.{name}: got {array.dtype} {list(array.shape)}, expected float32 or "
+                f"bool [S, {num_envs or 'N'}, ...]"
+            )
+        dtype = array.dtype.name
+        wire_dtype = "float16" if name in float16 and dtype == "float32" else dtype
+        channels.append(Channel(name, array.shape[0], array.shape[2:], dtype, wire_dtype))
+    if not channels:
+        raise ConfigError("experience: has no channels")
+    return Spec(tuple(channels)), num_envs
+
+
+def write_channel(into: Array, values: Array) -> None:
+    """Copies values, to float16 where `into` is: then what is too large becomes the largest."""
+    if into.dtype == np.float16 and values.dtype != np.float16:
+        largest = float(np.finfo(np.float16).max)
+        np.clip(values, -largest, largest, out=into, casting="same_kind")
+    else:
+        into[...] = values
+
+
+def arrays_of(spec: Spec, parts: Mapping[str, Bytes], num_envs: int) -> dict[str, Array]:
+    """Arrays by channel that lie in `parts`, bytes by channel."""
+    return {
+        channel.name: parts[channel.name]
+        .view(channel.wire_dtype)
+        .reshape(channel.full_shape(num_envs))
+        for channel in spec.channels
+    }

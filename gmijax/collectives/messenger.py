@@ -1,0 +1,133 @@
+"""Messages between the GMIs of a host: nested data over pipes in shared memory.
+
+Sending is asynchronous: what does not fit into the pipe at once is copied, and a thread passes it
+on piece by piece, so that GMIs which send to each other before they receive never block each
+other, however large the messages. Receiving waits, with a timeout.
+"""
+
+from __future__ import annotations
+
+import time
+from typing import Any, Final
+
+import numpy as np
+
+from gmijax.collectives.mailboxes import DATA, Inbox, Outbox, frames_of
+from gmijax.collectives.pipe import PipeReader, PipeWriter
+from gmijax.collectives.pipe_block import PipeBlock
+from gmijax.errors import CollectiveTimeout, ConfigError, PeerLost
+
+MIN_CAPACITY_BYTES: Final = 1 << 18
+"""Least capacity of the pipes, so that a frame fits."""
+
+
+class Messenger:
+    """One rank's messages to all others, and theirs to it.
+
+    Messages from one rank to another arrive in order, each tag in an order of its own. One
+    thread only may use it.
+
+    Args:
+      block: this process's view of the pipes, of at least `MIN_CAPACITY_BYTES` each.
+      timeout_s: longest wait for a message, unless `recv` says else.
+
+    Attributes:
+      rank: this rank.
+      world_size: K, number of ranks.
+    """
+
+    def __init__(self, block: PipeBlock, timeout_s: float) -> None:
+        if block.capacity_bytes < MIN_CAPACITY_BYTES:
+            raise ConfigError(
+                f"capacity_bytes={block.capacity_bytes}: messages need {MIN_CAPACITY_BYTES}"
+            )
+        self.rank = block.rank
+        self.world_size = block.world_size
+        self._timeout_s = timeout_s
+        self._block = block
+        # Half of the longest message of the pipe, so that a frame can wait behind another.
+        self._frame_bytes = block.capacity_bytes // 4
+        self._outboxes: dict[int, Outbox] = {}
+        self._readers: dict[int, PipeReader] = {}
+        self._inboxes: dict[int, Inbox] = {}
+
+    def send(self, tree: Any, dst: int, *, tag: int = DATA) -> None:
+        """Sends `tree` to rank `dst` and does not wait for it; the caller may change it then.
+
+        Args:
+          tree: nested data with arrays, see `gmijax.collectives.trees`.
+          dst: a rank; sending to oneself is fine.
+          tag: `DATA` or `COLLECTIVE`.
+
+        Raises:
+          ConfigError: no such rank.
+          PeerLost: its process is gone, and what was sent before could not be passed on.
+          CollectiveTimeout: `MAX_WAITING_BYTES` wait already, for the whole of `timeout_s`.
+        """
+        self._check(dst, "dst")
+        frames = frames_of(tree, tag, self._frame_bytes)
+        if dst == self.rank:
+            for frame in frames:
+                self._inbox(dst).feed(frame)
+            return
+        if dst not in self._outboxes:
+            self._outboxes[dst] = Outbox(PipeWriter(self._block, dst), self.rank)
+        self._outboxes[dst].post(frames, self._timeout_s)
+
+    def recv(self, src: int, *, tag: int = DATA, timeout_s: float | None = None) -> Any:
+        """Returns the next message with this tag from rank `src`; its arrays are the caller's.
+
+        After a timeout the same message can be waited for again.
+
+        Raises:
+          ConfigError: no such rank.
+          PeerLost: its process is gone, and has left no message.
+          CollectiveTimeout: none came in time.
+        """
+        self._check(src, "src")
+        inbox = self._inbox(src)
+        allowed_s = self._timeout_s if timeout_s is None else timeout_s
+        deadline_s = time.monotonic() + allowed_s
+        while not inbox.ready[tag]:
+            if src == self.rank:  # Nobody else would send it.
+                raise CollectiveTimeout(self.rank, (src,), "recv", inbox.received, 0.0)
+            reader = self._reader(src)
+            try:
+                message = reader.get(max(0.0, deadline_s - time.monotonic()))
+            except CollectiveTimeout:
+                step = inbox.received
+                raise CollectiveTimeout(self.rank, (src,), "recv", step, allowed_s) from None
+            except PeerLost:
+                raise PeerLost(self.rank, src, "recv", inbox.received) from None
+            inbox.feed(message.parts)
+            reader.release()
+        return inbox.ready[tag].popleft()
+
+    def flush(self, timeout_s: float | None = None) -> None:
+        """Waits until all that was sent lies in shared memory, where it outlives this process.
+
+        Raises:
+          PeerLost: a receiver is gone, and has not taken all.
+          CollectiveTimeout: receivers have not made room in time; names them.
+        """
+        allowed_s = self._timeout_s if timeout_s is None else timeout_s
+        deadline_s = time.monotonic() + allowed_s
+        late = [
+            dst
+            for dst, outbox in self._outboxes.items()
+            if not outbox.wait_until_empty(deadline_s - time.monotonic())
+        ]
+        if late:
+            raise CollectiveTimeout(self.rank, tuple(late), "flush", 0, allowed_s)
+
+    def _check(self, rank: int, what: str) -> None:
+        if not (isinstance(rank, int | np.integer) and 0 <= rank < self.world_size):
+            raise ConfigError(f"{what}={rank!r}: allowed are GMIs 0 to {self.world_size - 1}")
+
+    def _reader(self, src: int) -> PipeReader:
+        if src not in self._readers:
+            self._readers[src] = PipeReader(self._block, src)
+        return self._readers[src]
+
+    def _inbox(self, src: int) -> Inbox:
+        return self._inboxes.setdefault(src, Inbox())

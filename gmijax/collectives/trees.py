@@ -1,0 +1,106 @@
+"""Nested Python data as a skeleton and its arrays, and back; without jax.
+
+A skeleton is a pickle in which arrays stand as references. So whatever can be pickled can hold
+arrays (dicts, lists, tuples, NamedTuples, dataclasses, what others build of them), arrays travel
+as raw bytes, and a process that has no use for jax need not load it.
+"""
+
+from __future__ import annotations
+
+import io
+import pickle
+import sys
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from gmijax.collectives.pipe import Bytes
+
+
+class FlatTree(NamedTuple):
+    """Nested data without its arrays, and the arrays.
+
+    Attributes:
+      skeleton: everything else, pickled.
+      arrays: in the order in which they were met; C-contiguous, of any shape. They may be views
+        of what was flattened.
+    """
+
+    skeleton: bytes
+    arrays: list[npt.NDArray[Any]]
+
+
+def flatten(tree: Any, *, scalars: bool = False) -> FlatTree:
+    """Takes the arrays out of `tree`.
+
+    Args:
+      tree: nested data with arrays of numpy or jax; those of jax are fetched to host memory.
+      scalars: count Python floats and scalars of numpy among the arrays.
+
+    Raises:
+      TypeError, AttributeError, pickle.PicklingError: something cannot be pickled, e.g. a lambda.
+    """
+    file = io.BytesIO()
+    pickler = _Pickler(file, scalars)
+    pickler.dump(tree)
+    return FlatTree(file.getvalue(), pickler.arrays)
+
+
+def unflatten(skeleton: bytes | memoryview, buffers: Sequence[Bytes]) -> Any:
+    """The tree with a skeleton, and these bytes in place of its arrays.
+
+    Args:
+      skeleton: of `flatten`, in a process of the same job: unpickling runs code.
+      buffers: one per array, [number of its bytes] uint8; the arrays of the tree are views of
+        them. Arrays of jax come back as arrays of numpy.
+    """
+    return _Unpickler(skeleton, buffers).load()
+
+
+def as_bytes(array: npt.NDArray[Any]) -> Bytes:
+    """The memory of a C-contiguous array as [number of its bytes] uint8."""
+    # Not memoryview: that does not know the number formats that jax adds to numpy's.
+    return array.reshape(-1).view(np.uint8)
+
+
+def on_host(value: Any) -> npt.NDArray[Any] | None:
+    """The numbers of an array of numpy or jax in host memory; None for anything else.
+
+    The one place where arrays leave a device on their way to another GMI.
+    """
+    if type(value) is np.ndarray:  # Masked arrays and the like are more than their numbers.
+        return value
+    jax = sys.modules.get("jax")
+    if jax is not None and isinstance(value, jax.Array):
+        return np.asarray(value)
+    return None
+
+
+class _Pickler(pickle.Pickler):
+    def __init__(self, file: io.BytesIO, scalars: bool) -> None:
+        super().__init__(file, protocol=5)
+        self.arrays: list[npt.NDArray[Any]] = []
+        self._scalars = (float, np.generic) if scalars else ()
+
+    def persistent_id(self, obj: Any) -> Any:
+        array, is_scalar = on_host(obj), False
+        if array is None and isinstance(obj, self._scalars):
+            array, is_scalar = np.asarray(obj), True
+        # Arrays of Python objects are pickled like any other data.
+        if array is None or array.dtype.hasobject:
+            return None
+        self.arrays.append(np.ascontiguousarray(array))
+        return len(self.arrays) - 1, array.dtype, array.shape, is_scalar
+
+
+class _Unpickler(pickle.Unpickler):
+    def __init__(self, skeleton: bytes | memoryview, buffers: Sequence[Bytes]) -> None:
+        super().__init__(io.BytesIO(skeleton))
+        self._buffers = buffers
+
+    def persistent_load(self, pid: Any) -> Any:
+        index, dtype, shape, is_scalar = pid
+        array = self._buffers[index].view(dtype).reshape(shape)
+        return array[()] if is_scalar else array

@@ -1,0 +1,58 @@
+"""How experience gets from agents to trainers in asynchronous training."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+from gmijax.errors import ConfigError
+from gmijax.schema import doc, require_at_least
+
+
+@dataclass(frozen=True, kw_only=True)
+class ChannelConfig:
+    """How experience gets from agents to trainers (docs/channels.md)."""
+
+    design: Literal["multi", "uni"] = doc(
+        "multi: transfers by channel; uni: every step's tensors alone, the paper's baseline",
+        default="multi",
+    )
+    transport: Literal["memory", "zmq"] = doc(
+        "memory: shared memory of this host; zmq: TCP by pyzmq (package extra zmq)",
+        default="memory",
+    )
+    capacity_mib: int = doc(
+        "room between every agent and every trainer, MiB; a transfer may take a quarter of it",
+        default=64,
+    )
+    transfer_kib: int | None = doc(
+        "experience that travels at once, KiB, one rollout at least; null: found by trying",
+        default=None,
+    )
+    when_full: Literal["block", "drop_oldest"] = doc(
+        "what an agent does without room: wait, or queue and drop the oldest", default="block"
+    )
+    max_waiting: int = doc("most pieces in that queue (when_full=drop_oldest)", default=4)
+    float16: tuple[str, ...] = doc(
+        "channels that travel with half the bits, e.g. [state]; they lose precision", default=()
+    )
+
+    def __post_init__(self) -> None:
+        require_at_least("channel.capacity_mib", self.capacity_mib, 1)
+        require_at_least("channel.max_waiting", self.max_waiting, 1)
+        if self.transfer_kib is not None:
+            require_at_least("channel.transfer_kib", self.transfer_kib, 1)
+            if self.transfer_kib * 4 > self.capacity_mib * 1024:
+                raise ConfigError(
+                    f"channel.transfer_kib={self.transfer_kib}: must be at most a quarter of "
+                    f"channel.capacity_mib={self.capacity_mib}"
+                )
+        if self.design == "uni" and self.when_full != "block":
+            raise ConfigError(
+                "channel.when_full=drop_oldest: channel.design=uni allows only block"
+            )
+
+    @property
+    def capacity_bytes(self) -> int:
+        """Bytes between one agent and one trainer."""
+        return self.capacity_mib * 2**20

@@ -1,0 +1,64 @@
+"""How environments per GMI and GMIs per GPU are found where they are `auto`."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+from gmijax.errors import ConfigError
+from gmijax.schema import doc, require_at_least, require_between
+
+AUTO = "auto"
+"""The value of `num_envs` and `plan.gmis_per_gpu` that the search is to find."""
+
+SHORTEST_BUDGET_S = 10.0
+"""No GMI starts, compiles and trains in less."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class SearchConfig:
+    """The search of `gmijax.search`, and of `num_envs=auto plan.gmis_per_gpu=auto`."""
+
+    gmis_per_gpu: tuple[int, ...] = doc("numbers of GMIs per GPU to choose from")
+    num_envs: tuple[int, ...] = doc("environments per GMI to choose from")
+    impls: tuple[str, ...] = doc(
+        "MJX implementations to choose from, e.g. [jax,warp]; []: the one of physics.impl"
+    )
+    mode: Literal["corun", "isolated", "both"] = doc(
+        "profile all GMIs of a GPU at once, or one alone with its share (as the paper prints); "
+        "both: choose by corun, then profile what was run isolated too and tell the difference"
+    )
+    order: Literal["coarse_first", "as_printed"] = doc(
+        "every third row and size, then the neighbours of the best point; or the whole grid in "
+        "the order of the paper's Algorithm 2"
+    )
+    alpha: float = doc(
+        "a row of sizes ends when the gain of throughput by the growth of memory is below this"
+    )
+    tolerance: float = doc("relative difference of throughput that counts as none")
+    iterations: int = doc("training iterations of one profile; the first is not counted")
+    budget_s: float = doc("seconds for the whole search; the best point so far is the answer")
+    profile_timeout_s: float = doc("a profile that takes longer is not runnable, seconds")
+    store: str | None = doc(
+        "folder of the profiles of earlier searches; null: gmijax/profiles in the user's cache"
+    )
+
+    def __post_init__(self) -> None:
+        for key in ("gmis_per_gpu", "num_envs"):
+            values = getattr(self, key)
+            if not values or len(set(values)) != len(values):
+                raise ConfigError(f"search.{key}={list(values)}: expected distinct numbers")
+            require_at_least(f"search.{key}", min(values), 1)
+        if bad := [impl for impl in self.impls if impl not in ("jax", "warp")]:
+            raise ConfigError(f"search.impls={bad[0]}: allowed are jax, warp")
+        if len(set(self.impls)) != len(self.impls):
+            raise ConfigError(f"search.impls={list(self.impls)}: expected distinct names")
+        require_at_least("search.alpha", self.alpha, 0.0)
+        require_between("search.tolerance", self.tolerance, 0.0, 0.5)
+        require_at_least("search.iterations", self.iterations, 2)
+        if not self.budget_s >= SHORTEST_BUDGET_S:  # Not a number is refused too.
+            raise ConfigError(
+                f"search.budget_s={self.budget_s:g}: too small for one profile; must be at least "
+                f"{SHORTEST_BUDGET_S:g}"
+            )
+        require_at_least("search.profile_timeout_s", self.profile_timeout_s, 1.0)

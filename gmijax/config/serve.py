@@ -1,0 +1,103 @@
+"""Everything that `python -m gmijax.serve` can be told."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+from gmijax.config.env import EnvConfig, PhysicsConfig
+from gmijax.config.plan import PlanConfig
+from gmijax.config.search import AUTO, SearchConfig
+from gmijax.errors import ConfigError
+from gmijax.schema import doc, require_at_least, require_between, require_positive
+
+_MIN_PIPE_BYTES = 1 << 20
+_PIPE_BYTES_PER_ENV = 8192
+
+
+@dataclass(frozen=True, kw_only=True)
+class ServeRunConfig:
+    """Where the policy comes from, and the life of the job."""
+
+    dir: str | None = doc(
+        "trained run whose policy acts: its folder, one of its checkpoints, or `last`"
+    )
+    name: str | None = doc(
+        "name of the job's own folder below runs/; null: <env>-serve-<date>-<time>"
+    )
+    start_timeout_s: float = doc("longest wait for a GMI to start and compile, seconds")
+    stall_timeout_s: float = doc("a GMI with no progress for this long has failed, seconds")
+    exchange_timeout_s: float = doc("longest wait for another GMI in one exchange, seconds")
+    grace_s: float = doc("time a GMI gets to end by itself before it is killed, seconds")
+
+    def __post_init__(self) -> None:
+        for key in ("start_timeout_s", "stall_timeout_s", "exchange_timeout_s", "grace_s"):
+            require_positive(f"run.{key}", getattr(self, key))
+
+
+@dataclass(frozen=True, kw_only=True)
+class OutputConfig:
+    """What is written of the experience."""
+
+    dir: str | None = doc("folder for the experience, made or continued; null: nothing is written")
+    next_obs: bool = doc("write the observation before any reset too, to bootstrap from it")
+    compress: bool = doc("compress the shards (slower by far, smaller by little)")
+
+
+@dataclass(frozen=True, kw_only=True)
+class ServeConfig:
+    """Everything that `python -m gmijax.serve` can be told."""
+
+    env: EnvConfig
+    physics: PhysicsConfig
+    plan: PlanConfig
+    run: ServeRunConfig
+    output: OutputConfig
+    search: SearchConfig
+    policy: Literal["trained", "random"] = doc(
+        "who acts: the policy of run.dir, or uniformly random actions"
+    )
+    deterministic: bool = doc("act with the policy's mean; false: sample actions")
+    num_envs: int | Literal["auto"] = doc(
+        "N, environments of every GMI that simulates; auto: what a search finds (docs/search.md)"
+    )
+    num_timesteps: int = doc("environment steps of the whole job, all GMIs together")
+    unroll_length: int = doc("T, steps of one unroll, and of one shard of experience")
+    latency_steps: int = doc("steps timed one by one for the latency; 0: not measured")
+    seed: int = doc("seed of every random number in the job")
+
+    def __post_init__(self) -> None:
+        for key in ("num_timesteps", "unroll_length"):
+            require_at_least(key, getattr(self, key), 1)
+        if self.num_envs != AUTO:
+            require_at_least("num_envs", self.num_envs, 1)
+        require_between("latency_steps", self.latency_steps, 0, 100_000)
+        require_between("seed", self.seed, 0, 2**31 - 1)
+        self.plan.require_template(("tcg", "tdg"), "gmijax.serve")
+        if self.policy == "trained" and self.run.dir is None:
+            raise ConfigError(
+                "policy=trained: needs run.dir=RUN (a trained run, or `last`); "
+                "policy=random needs none"
+            )
+        if self.policy == "random" and self.run.dir is not None:
+            raise ConfigError(
+                f"policy=random: acts without the policy of run.dir={self.run.dir}; leave out one"
+            )
+        if self.policy == "random" and self.deterministic:
+            raise ConfigError("deterministic=true: random actions have no mean to act with")
+
+    @property
+    def envs_per_gmi(self) -> int:
+        """`num_envs` as a number; the controller decides an `auto` before it starts a GMI."""
+        if self.num_envs == AUTO:
+            raise ConfigError("num_envs=auto: not decided yet; expected an integer")
+        return self.num_envs
+
+    @property
+    def pipe_bytes(self) -> int:
+        """Capacity of a pipe between simulator and agent; a step's message may take half of it."""
+        return max(_MIN_PIPE_BYTES, self.envs_per_gmi * _PIPE_BYTES_PER_ENV)
+
+    def unrolls_per_gmi(self, num_simulators: int) -> int:
+        """Unrolls of each GMI that simulates, enough for `num_timesteps` in all."""
+        return -(-self.num_timesteps // (num_simulators * self.envs_per_gmi * self.unroll_length))

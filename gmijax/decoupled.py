@@ -1,0 +1,112 @@
+"""An asynchronous job as data: its plan, who sends experience to whom, what its GMIs share.
+
+Used by the controller and by the GMIs. No jax here.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Mapping
+from functools import partial
+from types import MappingProxyType
+from typing import Final
+
+from gmijax.collectives.board import create_board
+from gmijax.collectives.channel.build import Places, create_channels, require_channels
+from gmijax.config import A3cConfig, TrainConfig
+from gmijax.errors import ConfigError
+from gmijax.partition.machine import Machine
+from gmijax.partition.placement import place
+from gmijax.partition.plan import Plan
+from gmijax.partition.planner import make_plan
+from gmijax.partition.templates import AGENT, TRAINER, Group, group_of
+
+MODULE: Final = "gmijax.async_worker"
+"""Main of every GMI, started by name."""
+
+ENV_BOARD_FD: Final = "GMIJAX_BOARD_FD"
+ENV_CHANNELS_FD: Final = "GMIJAX_CHANNELS_FD"
+
+
+def is_decoupled(config: TrainConfig) -> bool:
+    """Whether some GMIs act and others train."""
+    return isinstance(config.algo, A3cConfig)
+
+
+def plan_decoupled(config: TrainConfig, machine: Machine) -> Plan:
+    """The plan of an asynchronous job; see `make_plan`.
+
+    Raises:
+      ConfigError: no serving or no training GMI, too little memory for the channels, or what
+        `make_plan` refuses.
+      BackendUnavailable: the wanted backend cannot be had on this machine.
+    """
+    if config.channel.transport != "memory":
+        raise ConfigError(
+            f"channel.transport={config.channel.transport}: the GMIs of a job are on one host; "
+            "allowed is memory"
+        )
+    if config.reduce.selection != "paper":
+        raise ConfigError(
+            f"reduce.selection={config.reduce.selection}: measured for jobs in which every GMI "
+            "trains; with algo=a3c allowed is paper"
+        )
+    placed = place(config.plan)
+    plan = make_plan(
+        placed.plan,
+        config.reduce,
+        config.envs_per_gmi,
+        machine,
+        template="decoupled",
+        trainers=placed.trainers,
+    )
+    plan = dataclasses.replace(plan, reasons=(placed.reason, *plan.reasons))
+    _require_experience_for_all(places_of(plan))
+    # How large an unroll is shows only when the task is loaded: the GMIs check that.
+    require_channels(config.channel, places_of(plan), unroll_bytes=0)
+    return plan
+
+
+def _require_experience_for_all(places: Places) -> None:
+    """Refuses a placement in which a trainer gets nothing: all trainers learn in step.
+
+    An agent with trainers on its own GPU sends to these only.
+    """
+    serving = {places.gpu_of[gmi] for gmi in places.agents}
+    training = {places.gpu_of[gmi] for gmi in places.trainers}
+    if serving <= training and (idle := sorted(training - serving)):
+        raise ConfigError(
+            f"plan.training_gpus: trainers on GPU {idle[0]} of the job would get no experience, "
+            "because every agent has a trainer on its own GPU; let GPUs both act and train, or "
+            "keep the two apart"
+        )
+
+
+def groups_of(plan: Plan) -> tuple[Group, Group]:
+    """The agents and the trainers of a plan.
+
+    Raises:
+      ConfigError: there are none of a kind.
+    """
+    agents = group_of(plan.layout, plan.roles, AGENT)
+    trainers = group_of(plan.layout, plan.roles, TRAINER)
+    if agents is None or trainers is None:
+        raise ConfigError(f"plan: roles {list(plan.roles)} lack agents or trainers")
+    return agents, trainers
+
+
+def places_of(plan: Plan) -> Places:
+    """Who sends experience, who receives it, and on which GPU of the job each is."""
+    agents, trainers = groups_of(plan)
+    layout = plan.layout
+    return Places(
+        agents=agents.gmis,
+        trainers=trainers.gmis,
+        gpu_of=tuple(layout.gpu_of(gmi) for gmi in layout.gmis),
+    )
+
+
+def shared_blocks(config: TrainConfig, plan: Plan) -> Mapping[str, Callable[[], int]]:
+    """What makes the memory that the GMIs share, by the variable that names its descriptor."""
+    channels = partial(create_channels, config.channel, places_of(plan))
+    return MappingProxyType({ENV_BOARD_FD: create_board, ENV_CHANNELS_FD: channels})

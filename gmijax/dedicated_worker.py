@@ -1,0 +1,152 @@
+"""Main of a GMI where trainers have GMIs of their own: `python -m gmijax.dedicated_worker`.
+
+Started by the supervisor and by nobody else. On every GPU one GMI trains, the others make its
+rollouts; the trainers of all GPUs average their gradients.
+"""
+
+from __future__ import annotations
+
+import os
+import sys
+from typing import TYPE_CHECKING, Any
+
+from gmijax.config import PpoConfig, TrainConfig
+from gmijax.dedicated import PIPE_BYTES
+from gmijax.errors import ConfigError
+from gmijax.partition.child import ENV_PIPES_FD, ChildLink, inherited_fd, run_gmi
+from gmijax.partition.plan import Plan
+from gmijax.partition.templates import AGENT, TRAINER, Group, group_of, has_role
+from gmijax.rundir import read_json
+from gmijax.schema import from_dict
+
+if TYPE_CHECKING:
+    from gmijax.collectives.interface import Reducer
+    from gmijax.collectives.pipe_block import PipeBlock
+    from gmijax.sim.wrappers import BatchedEnv, BatchState
+
+
+def main() -> int:
+    """Runs this process's GMI; returns the exit code."""
+    return run_gmi(_run)
+
+
+def _run(link: ChildLink) -> dict[str, Any]:
+    config = from_dict(TrainConfig, read_json(link.run.config))
+    plan = Plan.from_dict(read_json(link.run.plan))
+    trainers = group_of(plan.layout, plan.roles, TRAINER)
+    servants = group_of(plan.layout, plan.roles, AGENT)
+    fd = inherited_fd(os.environ, ENV_PIPES_FD)
+    if trainers is None or servants is None or fd is None:
+        raise ConfigError(f"plan: roles {list(plan.roles)} need trainers, agents and pipes")
+    # jax starts here, in the environment that the plan prepared.
+    from gmijax.collectives.pipe_block import PipeBlock
+    from gmijax.selfcheck import check_share
+    from gmijax.sim.build import make_training_env
+
+    check_share(plan, link.gmi)
+    trains = link.gmi in trainers.gmis
+    env = make_training_env(
+        config.env,
+        config.physics.impl,
+        seed=config.seed,
+        first_env=0 if trains else servants.gmis.index(link.gmi) * config.envs_per_gmi,
+        num_envs=config.envs_per_gmi,
+    )
+    block = PipeBlock.attach(fd, link.gmi, plan.layout.num_gmis, PIPE_BYTES)
+    try:
+        if trains:
+            return _train(config, plan, trainers, env, block, link)
+        return _serve(config, plan, servants, env, block, link)
+    finally:
+        block.close()
+
+
+def _train(
+    config: TrainConfig,
+    plan: Plan,
+    trainers: Group,
+    env: BatchedEnv,
+    block: PipeBlock,
+    link: ChildLink,
+) -> dict[str, Any]:
+    from gmijax.collectives.messenger import Messenger
+    from gmijax.ppo.remote import Servants
+    from gmijax.ppo.role import train
+
+    mail = Messenger(block, config.reduce.timeout_s)
+    servants = _neighbours(plan, link.gmi, AGENT)
+    reducer = _reducer(config, plan, trainers, env, link)
+    try:
+        remote = Servants(mail, servants, config.run.start_timeout_s)
+        return train(config, env, reducer, link, remote)
+    finally:
+        reducer.close()
+
+
+def _serve(
+    config: TrainConfig,
+    plan: Plan,
+    servants: Group,
+    env: BatchedEnv,
+    block: PipeBlock,
+    link: ChildLink,
+) -> dict[str, Any]:
+    from gmijax.collectives.messenger import Messenger
+    from gmijax.learner import make_learner
+    from gmijax.ppo.remote import serve_rollouts
+
+    [trainer] = _neighbours(plan, link.gmi, TRAINER)
+    # The first weights come when the trainer is there, which may still start.
+    mail = Messenger(block, max(config.reduce.timeout_s, config.run.start_timeout_s))
+    learner = make_learner(env.spec, config.algo)
+    state = _first_envs(config, env, servants.gmis.index(link.gmi))
+    rollouts = serve_rollouts(env, learner, state, mail, trainer, link.beat)
+    mail.flush()
+    return {"status": "completed", "rollouts": rollouts}
+
+
+def _first_envs(config: TrainConfig, env: BatchedEnv, rank: int) -> BatchState:
+    """Environments at their starts; those of a resumed run never saw the first run's."""
+    from pathlib import Path
+
+    import jax
+
+    from gmijax.resume import CheckpointMeta
+    from gmijax.sim.wrappers import env_keys
+
+    _, key = jax.random.split(jax.random.key(config.seed))
+    if config.run.resume is not None:
+        steps = CheckpointMeta.read(Path(config.run.resume)).env_steps
+        key = jax.random.fold_in(key, steps % 2**31)
+    keys = env_keys(key, rank * config.envs_per_gmi, config.envs_per_gmi)
+    return jax.jit(env.init)(env.model, keys)
+
+
+def _reducer(
+    config: TrainConfig, plan: Plan, trainers: Group, env: BatchedEnv, link: ChildLink
+) -> Reducer:
+    from gmijax.collectives.build import Membership, build_reducer
+    from gmijax.ppo.programs import exchange_size
+
+    assert isinstance(config.algo, PpoConfig)
+    return build_reducer(
+        plan.strategy,
+        Membership(
+            layout=trainers.layout,
+            rank=trainers.gmis.index(link.gmi),
+            num_floats=exchange_size(env.spec, config.algo),
+            exchange_fd=link.exchange_fd,
+            timeout_s=config.reduce.timeout_s,
+            rendezvous_timeout_s=config.run.start_timeout_s,
+        ),
+    )
+
+
+def _neighbours(plan: Plan, gmi: int, role: str) -> tuple[int, ...]:
+    """The GMIs on the same GPU that have a role, in order."""
+    here = sorted(plan.layout.neighbours_of(gmi))
+    return tuple(other for other in here if has_role(plan.roles[other], role))
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,221 @@
+"""What this machine can do for gmijax, what it cannot, and why: a pure function of its sight."""
+
+from __future__ import annotations
+
+import sys
+import typing
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any, Final, NamedTuple
+
+from gmijax.config import ReduceConfig
+from gmijax.errors import ConfigError
+from gmijax.partition.backend_choice import why_not_backend
+from gmijax.partition.layout import Layout
+from gmijax.partition.machine import Machine
+from gmijax.partition.nvidia import PIPE_VARIABLE, Gpu
+from gmijax.partition.plan import BackendName
+from gmijax.partition.reduction import why_not_intra, why_not_strategy
+from gmijax.sight import REQUIRED, Sight, device_of
+from gmijax.sim.impl import choose_impl
+from gmijax.sim.registry import SUITES, require_task, task_names
+from gmijax.version import __version__
+
+_BACKENDS: Final[tuple[BackendName, ...]] = ("mps", "mig", "share", "cpu")
+
+
+class Ability(NamedTuple):
+    """Something that gmijax has, and whether it can be used here.
+
+    Attributes:
+      kind: `backend`, `reducer`, `intra`, `physics` or `env`.
+      name: as the configuration has it.
+      usable: whether it can be used.
+      why: the reason, or what to know about it.
+    """
+
+    kind: str
+    name: str
+    usable: bool
+    why: str
+
+
+@dataclass(frozen=True)
+class Diagnosis:
+    """The answer.
+
+    Attributes:
+      sight: what it is made from.
+      abilities: what can be used and what not.
+      problems: what is broken and should work, one sentence each; none on a healthy machine.
+      notes: what is worth knowing.
+    """
+
+    sight: Sight
+    abilities: tuple[Ability, ...]
+    problems: tuple[str, ...]
+    notes: tuple[str, ...]
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain data for `--json`."""
+        machine = self.sight.machine
+        return {
+            "ok": not self.problems,
+            "gmijax": __version__,
+            "python": sys.version.split()[0],
+            "cpu_cores": len(machine.cpu_cores),
+            "driver": machine.driver_version,
+            "gpus": [
+                gpu._asdict() | {"instances": [one._asdict() for one in gpu.instances]}
+                for gpu in machine.gpus
+            ],
+            "mps": {
+                "control": str(machine.mps_control) if machine.mps_control else None,
+                "daemon": str(machine.operator_daemon) if machine.operator_daemon else None,
+                "error": self.sight.mps_error,
+            },
+            "jax": self.sight.jax._asdict(),
+            "versions": dict(self.sight.versions),
+            "abilities": [ability._asdict() for ability in self.abilities],
+            "problems": list(self.problems),
+            "notes": list(self.notes),
+        }
+
+
+def diagnose(sight: Sight) -> Diagnosis:
+    """What can be used, what is broken, what is worth knowing."""
+    return Diagnosis(
+        sight, tuple(_abilities(sight)), tuple(_problems(sight)), tuple(_notes(sight))
+    )
+
+
+def _abilities(sight: Sight) -> Iterator[Ability]:
+    machine = sight.machine
+    usable: list[BackendName] = []
+    for name in _BACKENDS:
+        reason = why_not_backend(name, machine)
+        if name == "mps" and reason is None:
+            reason = sight.mps_error
+        if reason is None:
+            usable.append(name)
+        yield Ability("backend", name, reason is None, reason or _about_backend(name, machine))
+    for name in _allowed("strategy"):
+        yield _reducer(name, len(machine.gpus) or 2)
+    for name in _allowed("intra"):
+        reasons = {backend: why_not_intra(name, backend) for backend in usable}
+        fine = [backend for backend, reason in reasons.items() if reason is None]
+        why = f"with {', '.join(fine)}" if fine else next(iter(reasons.values())) or ""
+        yield Ability("intra", name, bool(fine), why)
+    platform = "gpu" if machine.gpus else "cpu"
+    for name in ("jax", "warp"):
+        yield _physics(name, platform, sight.versions["warp-lang"] is not None)
+    yield Ability("env", "gmijax", True, ", ".join(task_names()))
+    for suite in SUITES:
+        yield _suite(suite)
+
+
+def _about_backend(name: str, machine: Machine) -> str:
+    if name == "mps":
+        return f"daemon: {machine.operator_daemon or 'an own one for each GPU'}"
+    if name == "mig":
+        parts = [f"GPU {gpu.index}: {_profiles(gpu)}" for gpu in machine.gpus if gpu.instances]
+        return "; ".join(parts)
+    if name == "cpu":
+        return f"virtual GPUs on {len(machine.cpu_cores)} cores"
+    return "GMIs of a GPU take turns"
+
+
+def _reducer(name: str, num_gpus: int) -> Ability:
+    layouts = [Layout.even(num_gpus, per_gpu) for per_gpu in (2, 1)]
+    fitting = [layout for layout in layouts if why_not_strategy(name, layout) is None]
+    if fitting:
+        return Ability("reducer", name, True, f"e.g. with layout {fitting[0]}")
+    reason = why_not_strategy(name, layouts[-1])
+    return Ability("reducer", name, False, f"with layout {layouts[-1]}: {reason}")
+
+
+def _physics(name: str, platform: str, has_warp: bool) -> Ability:
+    try:
+        choose_impl(name, platform, warp_installed=has_warp)
+    except ConfigError as error:
+        return Ability("physics", name, False, str(error).partition(": ")[2])
+    tasks = [
+        task
+        for task in task_names()
+        if choose_impl("auto", platform, task, warp_installed=has_warp)[0] == name
+    ]
+    return Ability("physics", name, True, f"auto takes it for {', '.join(tasks) or 'no task'}")
+
+
+def _suite(suite: str) -> Ability:
+    if suite == "custom":
+        return Ability("env", suite, True, "env=PATH.py:FUNCTION")
+    try:
+        require_task("", suite)
+    except ConfigError as error:
+        return Ability("env", suite, False, str(error).partition(": ")[2])
+    return Ability("env", suite, True, f"env={suite} env.name=...")
+
+
+def _problems(sight: Sight) -> Iterator[str]:
+    if sight.nvml_error:
+        yield f"NVML is installed and does not work: {sight.nvml_error}"
+    for name in REQUIRED:
+        if sight.versions[name] is None:
+            yield f"the package {name} is not installed (pip install gmijax)"
+    yield from _jax_problems(sight)
+    for gpu in sight.machine.gpus:
+        if gpu.mig_enabled and not gpu.instances:
+            yield (
+                f"GPU {gpu.index} is in MIG mode and has no instance, so nothing can use it "
+                "(python -m gmijax.doctor mig=3g,2g,1g,1g prints how to make some)"
+            )
+        if gpu.compute_mode == "prohibited":
+            yield f"GPU {gpu.index} is in compute mode PROHIBITED (nvidia-smi -c 0)"
+
+
+def _jax_problems(sight: Sight) -> Iterator[str]:
+    usable = [gpu for gpu in sight.machine.gpus if device_of(gpu)]
+    num_seen = len(sight.jax.devices)
+    if sight.jax.error and usable:
+        yield f"jax cannot use the GPUs that NVML lists: {sight.jax.error}{_cuda_advice(sight)}"
+    elif sight.jax.error:
+        yield f"jax does not work: {sight.jax.error}"
+    elif usable and not any(gpu.instances for gpu in usable) and num_seen != len(usable):
+        yield f"jax sees {num_seen} GPUs, and NVML lists {len(usable)}"
+
+
+def _cuda_advice(sight: Sight) -> str:
+    if any(sight.versions[f"jax-cuda{cuda}-plugin"] for cuda in (12, 13)):
+        return ""
+    # CUDA 13 needs a driver of the 580 branch.
+    cuda = 13 if sight.machine.driver_major >= 580 else 12
+    return f" (pip install 'gmijax[cuda{cuda}]')"
+
+
+def _notes(sight: Sight) -> Iterator[str]:
+    machine, variables = sight.machine, sight.variables
+    if "CUDA_VISIBLE_DEVICES" in variables:
+        indices = [gpu.index for gpu in machine.gpus]
+        yield (
+            f"CUDA_VISIBLE_DEVICES={variables['CUDA_VISIBLE_DEVICES']} leaves the GPUs {indices}"
+        )
+    if variables.get(PIPE_VARIABLE) and machine.gpus and machine.operator_daemon is None:
+        yield (
+            f"{PIPE_VARIABLE}={variables[PIPE_VARIABLE]}: no daemon answers there; jobs start "
+            "their own"
+        )
+    if sight.mps_error:
+        yield "with plan.backend=auto jobs fall back to share, because MPS does not start"
+    for gpu in machine.gpus:
+        if gpu.compute_mode == "exclusive":
+            yield f"GPU {gpu.index} is in compute mode EXCLUSIVE_PROCESS: several GMIs need MPS"
+
+
+def _profiles(gpu: Gpu) -> str:
+    return ", ".join(one.profile for one in gpu.instances)
+
+
+def _allowed(key: str) -> tuple[str, ...]:
+    names = typing.get_args(typing.get_type_hints(ReduceConfig)[key])
+    return tuple(name for name in names if name != "auto")

@@ -1,0 +1,157 @@
+"""`python -m gmijax.doctor`: what this machine can do for gmijax, what it cannot, and why."""
+
+from __future__ import annotations
+
+import json
+import sys
+from collections.abc import Sequence
+from typing import Final, NamedTuple
+
+from rich.console import Console
+from rich.table import Table
+
+from gmijax.diagnosis import Diagnosis, diagnose
+from gmijax.errors import ConfigError
+from gmijax.partition.machine import Machine, detect_machine
+from gmijax.partition.mig_split import split_commands
+from gmijax.sight import look
+from gmijax.version import __version__
+
+USAGE: Final = """usage: python -m gmijax.doctor [--json] [--help]
+       python -m gmijax.doctor mig=SIZES [gpu=INDEX]
+
+Without mig=, looks at GPUs, driver, MPS, MIG, versions, and at what jax sees; says which backends,
+reducers, physics and environments can be used, and why the others cannot.
+With mig=3g,2g,1g,1g, prints the commands with which an administrator would divide a GPU so
+(gpu=INDEX as nvidia-smi lists it; else the first that can be divided). It runs none of them.
+Exit codes: 0 healthy, 1 something is broken that should work, 2 bad input.
+"""
+
+# Not those of gmijax.cli, whose import needs packages that may be what is broken.
+EXIT_OK, EXIT_BROKEN, EXIT_BAD_INPUT, EXIT_INTERRUPTED = 0, 1, 2, 130
+
+
+class Options(NamedTuple):
+    """What the command line asks for."""
+
+    as_json: bool = False
+    mig: str | None = None
+    gpu: int | None = None
+
+
+def main(argv: Sequence[str]) -> int:
+    """Runs the command; returns the exit code."""
+    if "--help" in argv or "-h" in argv:
+        sys.stdout.write(USAGE)
+        return EXIT_OK
+    try:
+        options = parse(argv)
+        if options.mig is not None:
+            sys.stdout.write(split_text(options.mig, options.gpu, detect_machine()))
+            return EXIT_OK
+        found = diagnose(look())
+    except ConfigError as error:
+        sys.stderr.write(f"gmijax.doctor: {error}\n")
+        return EXIT_BAD_INPUT
+    except KeyboardInterrupt:
+        return EXIT_INTERRUPTED
+    if options.as_json:
+        sys.stdout.write(json.dumps(found.to_dict(), indent=2) + "\n")
+    else:
+        width = None if sys.stdout.isatty() else 140
+        show(found, Console(highlight=False, soft_wrap=True, width=width))
+    return EXIT_BROKEN if found.problems else EXIT_OK
+
+
+def parse(argv: Sequence[str]) -> Options:
+    """Raises ConfigError for what it does not know."""
+    options = Options()
+    for text in argv:
+        key, _, value = text.partition("=")
+        if text == "--json":
+            options = options._replace(as_json=True)
+        elif key == "mig" and value:
+            options = options._replace(mig=value)
+        elif key == "gpu" and value.isdecimal():
+            options = options._replace(gpu=int(value))
+        else:
+            raise ConfigError(
+                f"{text}: allowed are --json, mig=SIZES (e.g. mig=3g,2g,1g,1g), gpu=INDEX, --help"
+            )
+    if options.mig is None and options.gpu is not None:
+        raise ConfigError(f"gpu={options.gpu}: only together with mig=SIZES")
+    if options.mig is not None and options.as_json:
+        raise ConfigError("--json: not together with mig=SIZES")
+    return options
+
+
+def split_text(wanted: str, index: int | None, machine: Machine) -> str:
+    """The commands that divide a GPU, with what to know about them.
+
+    Raises:
+      ConfigError: no such GPU, or one that cannot be divided so.
+    """
+    if not machine.gpus:
+        raise ConfigError(f"mig={wanted}: no usable NVIDIA GPU here")
+    if index is None:
+        gpu = next((gpu for gpu in machine.gpus if gpu.mig_supported), machine.gpus[0])
+    else:
+        found = [gpu for gpu in machine.gpus if gpu.index == index]
+        if not found:
+            indices = [gpu.index for gpu in machine.gpus]
+            raise ConfigError(f"gpu={index}: no such GPU; usable are {indices}")
+        gpu = found[0]
+    lines = [
+        f"# Divides GPU {gpu.index} ({gpu.name}); nobody may use it meanwhile.",
+        "# If a name is refused, nvidia-smi mig -lgip lists those of this GPU.",
+        *split_commands(gpu, wanted),
+    ]
+    return "\n".join(lines) + "\n"
+
+
+def show(found: Diagnosis, console: Console) -> None:
+    """Prints the diagnosis for people."""
+    sight = found.sight
+    machine = sight.machine
+    console.print(
+        f"gmijax {__version__}, Python {sys.version.split()[0]}, {len(machine.cpu_cores)} CPU "
+        f"cores, NVIDIA driver {machine.driver_version or 'none'}",
+        markup=False,
+    )
+    for gpu in machine.gpus:
+        mig = "on" if gpu.mig_enabled else "off" if gpu.mig_supported else "none"
+        console.print(
+            f"GPU {gpu.index}: {gpu.name}, {gpu.memory_mib} MiB, compute capability "
+            f"{gpu.compute_capability[0]}.{gpu.compute_capability[1]}, MIG {mig}",
+            markup=False,
+        )
+        for one in gpu.instances:
+            console.print(
+                f"  {one.profile}: {one.num_sms} SMs, {one.memory_mib} MiB, {one.uuid}",
+                markup=False,
+            )
+    devices = ", ".join(sight.jax.devices)
+    console.print(f"jax sees: {devices or sight.jax.error}", markup=False)
+    installed = [f"{name} {number}" for name, number in sight.versions.items() if number]
+    console.print(f"packages: {', '.join(installed)}\n", markup=False)
+    console.print(_table(found))
+    for note in found.notes:
+        console.print(f"note: {note}", markup=False)
+    for problem in found.problems:
+        console.print(f"problem: {problem}", markup=False)
+    if not found.problems:
+        console.print("nothing is broken")
+
+
+def _table(found: Diagnosis) -> Table:
+    table = Table(box=None, pad_edge=False)
+    for heading in ("kind", "name", "usable", "why"):
+        table.add_column(heading, overflow="fold", no_wrap=heading != "why")
+    for ability in found.abilities:
+        usable = "yes" if ability.usable else "no"
+        table.add_row(ability.kind, ability.name, usable, ability.why.replace("[", r"\["))
+    return table
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

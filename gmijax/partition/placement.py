@@ -1,0 +1,131 @@
+"""Where serving and training GMIs of an asynchronous job live (paper, sec. 5.1, decoupled).
+
+Trainers have the lowest ids, so that GMI 0 is the one that leads them and writes the metrics.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import NamedTuple
+
+from gmijax.config import PlanConfig
+from gmijax.errors import ConfigError
+
+_TRAINING_SHARE = 4
+"""With several GPUs one in four trains, at least one: physics takes much longer than updates."""
+
+
+class Placement(NamedTuple):
+    """Which GMIs an asynchronous job has.
+
+    Attributes:
+      plan: the user's wishes with GPUs and layout written out.
+      trainers: ids of the GMIs that train.
+      reason: what was decided, in words.
+    """
+
+    plan: PlanConfig
+    trainers: tuple[int, ...]
+    reason: str
+
+
+def place(plan: PlanConfig) -> Placement:
+    """Decides which GPUs serve and which train, and numbers their GMIs.
+
+    `plan.serving_gpus` and `plan.training_gpus` are both numbers of GPUs, of which the first
+    serve and the next train, or both lists of indices; a GPU in both lists does both. Without
+    them one GPU does both, and of several the last quarter (at least one) trains.
+
+    Raises:
+      ConfigError: no serving or no training GMI, or wishes that contradict each other.
+    """
+    if plan.layout is not None:
+        raise ConfigError(
+            f"plan.layout={[list(g) for g in plan.layout]}: with the decoupled template give "
+            "plan.serving_gpus and plan.training_gpus, and the GMIs on each"
+        )
+    serving_gmis, training_gmis = _counts(plan)
+    serving, training, indices = _gpus(plan)
+    num_gpus = 1 + max(*serving, *training)
+    layout: list[list[int]] = [[] for _ in range(num_gpus)]
+    for number in range(len(training) * training_gmis):
+        layout[training[number // training_gmis]].append(number)
+    trainers = tuple(range(len(training) * training_gmis))
+    for number in range(len(serving) * serving_gmis):
+        layout[serving[number // serving_gmis]].append(len(trainers) + number)
+    placed = dataclasses.replace(
+        plan,
+        gpus=num_gpus if indices is None else indices,
+        gmis_per_gpu=1,
+        layout=tuple(map(tuple, layout)),
+        serving_gpus=None,
+        training_gpus=None,
+    )
+    reason = (
+        f"placement: {serving_gmis} serving GMIs on each of GPUs {_shown(serving, indices)}, "
+        f"{training_gmis} training GMIs on each of GPUs {_shown(training, indices)}"
+    )
+    return Placement(placed, trainers, reason)
+
+
+def _counts(plan: PlanConfig) -> tuple[int, int]:
+    for key, what in (("serving_gmis_per_gpu", "act"), ("training_gmis_per_gpu", "train")):
+        if getattr(plan, key) < 1:
+            raise ConfigError(
+                f"plan.{key}={getattr(plan, key)}: at least one GMI must {what}, so at least 1"
+            )
+    return plan.serving_gmis_per_gpu, plan.training_gmis_per_gpu
+
+
+def _gpus(plan: PlanConfig) -> tuple[list[int], list[int], tuple[int, ...] | None]:
+    """Positions of the GPUs that serve and that train, and the machine's indices if given."""
+    serving, training = plan.serving_gpus, plan.training_gpus
+    if serving is None and training is None:
+        return _by_default(plan)
+    for key, value in (("serving_gpus", serving), ("training_gpus", training)):
+        if value is None or not value:
+            raise ConfigError(
+                f"plan.{key}={'null' if value is None else value}: there must be serving and "
+                "training GPUs; give both keys, numbers of at least 1 or lists of indices"
+            )
+    if isinstance(serving, int) and isinstance(training, int):
+        return _in_turn(plan, serving, training)
+    if isinstance(serving, int) or isinstance(training, int):
+        raise ConfigError(
+            f"plan.serving_gpus={serving}, plan.training_gpus={training}: expected two numbers "
+            "or two lists of indices"
+        )
+    assert serving is not None
+    assert training is not None
+    for key, value in (("serving_gpus", serving), ("training_gpus", training)):
+        if len(set(value)) != len(value) or min(value) < 0:
+            raise ConfigError(f"plan.{key}={list(value)}: expected distinct indices of GPUs")
+    indices = tuple(sorted({*serving, *training}))
+    return [indices.index(i) for i in serving], [indices.index(i) for i in training], indices
+
+
+def _in_turn(
+    plan: PlanConfig, serving: int, training: int
+) -> tuple[list[int], list[int], tuple[int, ...] | None]:
+    """The first GPUs serve, the next train; those of `plan.gpus` if it lists them."""
+    total = serving + training
+    if not isinstance(plan.gpus, int) and len(plan.gpus) != total:
+        raise ConfigError(
+            f"plan.gpus={list(plan.gpus)}: plan.serving_gpus={serving} and "
+            f"plan.training_gpus={training} take {total}"
+        )
+    indices = None if isinstance(plan.gpus, int) else plan.gpus
+    return list(range(serving)), list(range(serving, total)), indices
+
+
+def _by_default(plan: PlanConfig) -> tuple[list[int], list[int], tuple[int, ...] | None]:
+    indices = None if isinstance(plan.gpus, int) else plan.gpus
+    count = plan.gpus if isinstance(plan.gpus, int) else len(plan.gpus)
+    if count == 1:
+        return [0], [0], indices
+    training = max(1, count // _TRAINING_SHARE)
+    return list(range(count - training)), list(range(count - training, count)), indices
+
+
+def _shown(positions: list[int], indices: tuple[int, ...] | None) -> list[int]:
+    return [indices[i] if indices else i for i in positions]

@@ -1,0 +1,293 @@
+"""Algorithm 2 of the paper (section 5.2): which environments per GMI and GMIs per GPU. No jax.
+
+Pure rules over a `profile` function that measures one point; `gmijax.searching` gives it one that
+runs training jobs, tests give it a formula. What the lines of the paper became:
+
+- 2, 4: every number of GMIs, 10 ... 1, with every num_env, 128 ... 16384. The same grid, and the
+  same order inside a row; which rows and sizes come first is for `Rules.coarse_first` to say.
+- 5: `profile` says whether a point runs, its throughput and memory. The same, and physics
+  implementations are a further dimension.
+- 6-8: what cannot run is skipped. The same.
+- 9-12: the first point of a row that runs starts the comparison and is no candidate. Here it is
+  one: it was measured, and a row may have no other.
+- 13-16: Sat = R_top / R_mem, against the last point of the row that ran. The same; where memory
+  did not grow, Sat is infinite with a gain and 0 without.
+- 18-19: Sat < alpha ends the row, and that point is no candidate. The row ends here too, but the
+  point is a candidate: a gain below alpha is still one.
+- 20: `estimate`, which the paper does not print, is `estimate` below.
+- 21-24: the highest projection wins. Here the simplest does of those within `Rules.tolerance` of
+  it: with the fewest GMIs, then with the fewest environments.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from typing import Final, NamedTuple
+
+_STRIDE: Final = 3
+
+
+class OutOfBudget(Exception):
+    """Raised by a profile function when there is no time left to measure a point."""
+
+
+class Point(NamedTuple):
+    """What is to be measured.
+
+    Attributes:
+      gmis_per_gpu: GMIs on every GPU.
+      num_envs: environments per GMI.
+      impl: physics implementation.
+    """
+
+    gmis_per_gpu: int
+    num_envs: int
+    impl: str
+
+    def __str__(self) -> str:
+        """`4 x 2048, jax`."""
+        return f"{self.gmis_per_gpu} x {self.num_envs}, {self.impl}"
+
+
+class Measured(NamedTuple):
+    """What one GMI did.
+
+    Attributes:
+      env_steps_per_s: environment steps a second of one GMI, the paper's `top`.
+      memory_mib: its peak memory, MiB, the paper's `mem`.
+      iteration_s: seconds of one iteration.
+      reduce_s: those of them in the exchange of gradients; 0 where that was not measured.
+    """
+
+    env_steps_per_s: float
+    memory_mib: float
+    iteration_s: float
+    reduce_s: float = 0.0
+
+
+class NotRunnable(NamedTuple):
+    """A point that cannot run.
+
+    Attributes:
+      reason: why, in one line.
+      limit_s: the time within which it did not end; None where something else was the matter.
+    """
+
+    reason: str
+    limit_s: float | None = None
+
+
+Profile = Callable[[int, int, str], Measured | NotRunnable]
+"""(gmis_per_gpu, num_envs, impl) -> what one GMI did, or why it cannot; may raise OutOfBudget."""
+
+
+class Grid(NamedTuple):
+    """All points that may be looked at."""
+
+    gmis_per_gpu: tuple[int, ...]
+    num_envs: tuple[int, ...]
+    impls: tuple[str, ...]
+
+
+class Rules(NamedTuple):
+    """How the grid is searched.
+
+    Attributes:
+      num_gpus: GPUs of the whole job, to which measurements on one are projected.
+      alpha: a row ends when Sat falls below it; the paper has below 0.1.
+      tolerance: relative difference of throughput that counts as none.
+      coarse_first: first every third row and every third size, then the neighbours of the best
+        point, until none of them is better; else the whole grid in the paper's order.
+    """
+
+    num_gpus: int
+    alpha: float
+    tolerance: float
+    coarse_first: bool
+
+
+class Visited(NamedTuple):
+    """A point that was looked at.
+
+    Attributes:
+      point: which one.
+      result: what it did, or why it cannot run.
+      saturation: Sat, None for the first of its row that ran.
+      projected: environment steps a second of the whole job; 0 where it cannot run.
+    """
+
+    point: Point
+    result: Measured | NotRunnable
+    saturation: float | None
+    projected: float
+
+
+class Outcome(NamedTuple):
+    """What a search found.
+
+    Attributes:
+      visited: all points that were looked at, in order.
+      best: the best of them, None where nothing ran.
+      complete: whether the search ended by its rules, and not for want of time.
+    """
+
+    visited: tuple[Visited, ...]
+    best: Visited | None
+    complete: bool
+
+
+def saturation(before: Measured, now: Measured) -> float:
+    """Sat, lines 13 to 15: relative gain of throughput per relative growth of memory."""
+    gain = (now.env_steps_per_s - before.env_steps_per_s) / before.env_steps_per_s
+    growth = (now.memory_mib - before.memory_mib) / before.memory_mib
+    if growth <= 0:  # Nothing is paid: any gain is welcome, and without one there is no point.
+        return math.inf if gain > 0 else 0.0
+    return gain / growth
+
+
+def estimate(gmis_per_gpu: int, num_gpus: int, measured: Measured) -> float:
+    """Environment steps a second of the whole job, line 20.
+
+    GMIs x GPUs x throughput of one GMI, less what gradients cost that cross GPUs: the exchange of
+    t GMIs on one GPU was measured, and by the cost model of MPR (section 4.1, Table 2) it grows
+    with 2 (k - 1) / k, from k = t to k = t GPUs. With one GMI a GPU no exchange was measured, so
+    that the projection to several GPUs is an upper limit.
+    """
+    total = gmis_per_gpu * num_gpus
+    together = total * measured.env_steps_per_s
+    if num_gpus == 1 or gmis_per_gpu == 1 or not measured.reduce_s:
+        return together
+    growth = ((total - 1) / total) / ((gmis_per_gpu - 1) / gmis_per_gpu)
+    longer_s = measured.iteration_s + measured.reduce_s * (growth - 1.0)
+    return together * measured.iteration_s / longer_s
+
+
+def search(grid: Grid, profile: Profile, rules: Rules) -> Outcome:
+    """Looks for the point with the highest projected throughput; see `Rules.coarse_first`."""
+    book = _Book(profile, rules)
+    complete = True
+    try:
+        if rules.coarse_first:
+            _rows(book, coarse(grid))
+            _climb(book, grid)
+        else:
+            _rows(book, as_printed(grid))
+    except OutOfBudget:
+        complete = False
+    return Outcome(tuple(book.visited.values()), best(book.visited, rules.tolerance), complete)
+
+
+def as_printed(grid: Grid) -> Grid:
+    """The grid in the paper's order: from the most GMIs down, from the smallest size up."""
+    rows = tuple(sorted(grid.gmis_per_gpu, reverse=True))
+    return Grid(rows, tuple(sorted(grid.num_envs)), grid.impls)
+
+
+def coarse(grid: Grid) -> Grid:
+    """Every third row, and every third size from the largest down.
+
+    The row with the fewest GMIs is among them: it is the measure of all others. It comes first,
+    because the fewer GMIs, the sooner they have started, and time may run out.
+    """
+    rows = sorted(grid.gmis_per_gpu, reverse=True)
+    sizes = sorted(grid.num_envs, reverse=True)
+    return Grid(
+        tuple(sorted({*rows[::_STRIDE], rows[-1]})),
+        tuple(sorted(sizes[::_STRIDE])),
+        grid.impls,
+    )
+
+
+def best(visited: Mapping[Point, Visited], tolerance: float) -> Visited | None:
+    """Lines 21 to 24: the simplest of the points that are within `tolerance` of the highest."""
+    runnable = [one for one in visited.values() if isinstance(one.result, Measured)]
+    if not runnable:
+        return None
+    highest = max(one.projected for one in runnable)
+    good = [one for one in runnable if one.projected >= highest * (1.0 - tolerance)]
+    return min(good, key=lambda v: (v.point.gmis_per_gpu, v.point.num_envs, -v.projected))
+
+
+class _Book:
+    """What was measured so far; measures no point twice."""
+
+    def __init__(self, profile: Profile, rules: Rules) -> None:
+        self.visited: dict[Point, Visited] = {}
+        self.rules = rules
+        self._profile = profile
+
+    def visit(self, point: Point) -> Visited:
+        """Measures a point, if it was not, and compares it with its row."""
+        if point not in self.visited:
+            result = self._profile(*point)
+            projected, sat = 0.0, None
+            if isinstance(result, Measured):
+                projected = estimate(point.gmis_per_gpu, self.rules.num_gpus, result)
+                before = self._before(point)
+                sat = None if before is None else saturation(before, result)
+            self.visited[point] = Visited(point, result, sat, projected)
+        return self.visited[point]
+
+    def is_saturated(self, one: Visited) -> bool:
+        """Line 18."""
+        return one.saturation is not None and one.saturation < self.rules.alpha
+
+    def has_ended(self, point: Point) -> bool:
+        """Whether the point's row ended, by saturation, at a smaller size."""
+        return any(self.is_saturated(one) for one in self._smaller(point))
+
+    def best(self) -> Visited | None:
+        """Lines 21 to 24, so far."""
+        return best(self.visited, self.rules.tolerance)
+
+    def _before(self, point: Point) -> Measured | None:
+        """The last point of the row, before this one, that ran."""
+        ran = [
+            (one.point.num_envs, one.result)
+            for one in self._smaller(point)
+            if isinstance(one.result, Measured)
+        ]
+        return max(ran, key=lambda item: item[0])[1] if ran else None
+
+    def _smaller(self, point: Point) -> Iterator[Visited]:
+        row = point.gmis_per_gpu, point.impl
+        for other, one in self.visited.items():
+            if (other.gmis_per_gpu, other.impl) == row and other.num_envs < point.num_envs:
+                yield one
+
+
+def _rows(book: _Book, grid: Grid) -> None:
+    """Lines 2 to 26 over a grid, in its order."""
+    for impl in grid.impls:
+        for gmis_per_gpu in grid.gmis_per_gpu:
+            for num_envs in grid.num_envs:
+                if book.is_saturated(book.visit(Point(gmis_per_gpu, num_envs, impl))):
+                    break
+
+
+def _climb(book: _Book, grid: Grid) -> None:
+    """Measures the neighbours of the best point until all of them are known."""
+    while (top := book.best()) is not None:
+        fresh = [
+            point
+            for point in neighbours(top.point, grid)
+            if point not in book.visited and not book.has_ended(point)
+        ]
+        if not fresh:
+            return
+        book.visit(fresh[0])
+
+
+def neighbours(point: Point, grid: Grid) -> list[Point]:
+    """The points one step away in the grid: in GMIs, then in environments."""
+    rows = _beside(point.gmis_per_gpu, sorted(grid.gmis_per_gpu))
+    sizes = _beside(point.num_envs, sorted(grid.num_envs))
+    return [point._replace(gmis_per_gpu=row) for row in rows] + [
+        point._replace(num_envs=size) for size in sizes
+    ]
+
+
+def _beside(value: int, values: Sequence[int]) -> list[int]:
+    at = values.index(value)
+    return [values[i] for i in (at + 1, at - 1) if 0 <= i < len(values)]

@@ -1,0 +1,115 @@
+"""Templates: which roles the GMIs of a layout get (paper, sec. 5.1). Pure data.
+
+A GMI has one role or several in one process, written with `+` between them: `simulator`, `agent`
+(infers actions with the policy), `trainer`.
+
+| template | for | GMIs |
+|---|---|---|
+| `tcg` | serving | `simulator+agent`, all |
+| `tdg` | serving | on every GPU one `agent`, the others `simulator` |
+| `tcg_ex` | synchronous training | `simulator+agent+trainer`, all |
+| `tdg_ex` | synchronous training | on every GPU one `trainer`, the others `simulator+agent` |
+| `decoupled` | asynchronous training | some `trainer`, the others `simulator+agent` |
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from types import MappingProxyType
+from typing import Final, NamedTuple
+
+from gmijax.config import TemplateName
+from gmijax.errors import ConfigError
+from gmijax.partition.layout import Layout
+
+SIMULATOR: Final = "simulator"
+AGENT: Final = "agent"
+TRAINER: Final = "trainer"
+
+SERVING: Final = f"{SIMULATOR}+{AGENT}"
+HOLISTIC: Final = f"{SIMULATOR}+{AGENT}+{TRAINER}"
+
+DESCRIPTIONS: Mapping[TemplateName, str] = MappingProxyType(
+    {
+        "tcg": "every GMI simulates and infers",
+        "tdg": "one GMI of every GPU infers, the others simulate",
+        "tcg_ex": "every GMI simulates, infers and trains",
+        "tdg_ex": "one GMI of every GPU trains, the others simulate and infer",
+        "decoupled": "some GMIs train, the others simulate and infer",
+    }
+)
+"""What the GMIs do, in words, by template."""
+
+
+class Group(NamedTuple):
+    """The GMIs of a layout that have a role, as ranks of their own.
+
+    Attributes:
+      gmis: their ids in order; a GMI's rank in the group is its position here.
+      layout: where they are, with ranks in place of ids; GPUs without one of them are left out.
+    """
+
+    gmis: tuple[int, ...]
+    layout: Layout
+
+
+def roles_of(
+    template: TemplateName, layout: Layout, trainers: Iterable[int] = ()
+) -> tuple[str, ...]:
+    """The roles of every GMI, in order of id.
+
+    Args:
+      template: its name.
+      layout: which GMI is where.
+      trainers: ids of the GMIs that train; for `decoupled` only.
+
+    Raises:
+      ConfigError: a template that this layout is too small for, or no trainer or nobody else
+        in `decoupled`.
+    """
+    if template == "tcg":
+        return (SERVING,) * layout.num_gmis
+    if template == "tcg_ex":
+        return (HOLISTIC,) * layout.num_gmis
+    if template == "decoupled":
+        return _with_some(layout, trainers)
+    if small := [gpu for gpu, gmis in enumerate(layout.gmis_of_gpu) if len(gmis) < 2]:
+        raise ConfigError(
+            f"plan.template={template}: GPU {small[0]} of layout {layout} has one GMI; "
+            f"{DESCRIPTIONS[template]}, so every GPU needs at least 2 GMIs (plan.gmis_per_gpu=2)"
+        )
+    firsts = {min(gmis) for gmis in layout.gmis_of_gpu}
+    first, others = (AGENT, SIMULATOR) if template == "tdg" else (TRAINER, SERVING)
+    return tuple(first if gmi in firsts else others for gmi in layout.gmis)
+
+
+def has_role(roles: str, role: str) -> bool:
+    """Whether `role` is among `roles`, as they stand in a plan."""
+    return role in roles.split("+")
+
+
+def group_of(layout: Layout, roles: Iterable[str], role: str) -> Group | None:
+    """The GMIs whose roles include `role`, None if nobody has it."""
+    gmis = tuple(gmi for gmi, theirs in enumerate(roles) if has_role(theirs, role))
+    if not gmis:
+        return None
+    ranks = (
+        tuple(rank for rank, gmi in enumerate(gmis) if gmi in here) for here in layout.gmis_of_gpu
+    )
+    return Group(gmis, Layout(tuple(here for here in ranks if here)))
+
+
+def _with_some(layout: Layout, trainers: Iterable[int]) -> tuple[str, ...]:
+    training = set(trainers)
+    if unknown := training - set(layout.gmis):
+        raise ConfigError(
+            f"plan.template=decoupled: no GMI {min(unknown)} in layout {layout} to train"
+        )
+    if not training:
+        raise ConfigError("plan.template=decoupled: no GMI trains; give at least one trainer")
+    if len(training) == layout.num_gmis:
+        raise ConfigError(
+            f"plan.template=decoupled: all {layout.num_gmis} GMIs train; at least one must "
+            "simulate and infer"
+        )
+    return tuple(TRAINER if gmi in training else SERVING for gmi in layout.gmis)

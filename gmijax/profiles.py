@@ -1,0 +1,153 @@
+"""The profile store: what points of a search did, kept between searches. No jax here.
+
+One JSON file for a device, a task with its settings, and the versions of what computes. A search
+writes it after every profile: what was interrupted goes on from there, and a second search of the
+same job measures nothing.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import re
+from collections.abc import Callable, Mapping
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+from gmijax.errors import ConfigError
+from gmijax.partition.search import Measured, NotRunnable, Point
+from gmijax.rundir import read_json, write_json
+from gmijax.schema import from_dict, require_positive
+
+_DIGEST_LENGTH = 10
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Record:
+    """A profile in the file; `not_runnable` and `limit_s` are None, or the four above are."""
+
+    env_steps_per_s: float | None = None
+    memory_mib: float | None = None
+    iteration_s: float | None = None
+    reduce_s: float | None = None
+    not_runnable: str | None = None
+    limit_s: float | None = None
+    wall_s: float
+
+    def __post_init__(self) -> None:
+        if self.not_runnable is None:
+            for key in ("env_steps_per_s", "memory_mib", "iteration_s"):
+                require_positive(key, getattr(self, key) or 0.0)
+
+    @classmethod
+    def of(cls, result: Measured | NotRunnable, wall_s: float) -> _Record:
+        if isinstance(result, NotRunnable):
+            return cls(not_runnable=result.reason, limit_s=result.limit_s, wall_s=wall_s)
+        return cls(**result._asdict(), wall_s=wall_s)
+
+    def result(self) -> Measured | NotRunnable:
+        if self.not_runnable is not None:
+            return NotRunnable(self.not_runnable, self.limit_s)
+        return Measured(
+            self.env_steps_per_s or 0.0,
+            self.memory_mib or 0.0,
+            self.iteration_s or 0.0,
+            self.reduce_s or 0.0,
+        )
+
+
+class ProfileStore:
+    """The profiles of one device, task and version.
+
+    Attributes:
+      path: the file; it is made with the first profile.
+    """
+
+    def __init__(self, folder: Path, key: Mapping[str, Any], note: Callable[[str], None]) -> None:
+        """Reads what there is.
+
+        Args:
+          folder: where the files of all devices and tasks are.
+          key: everything that decides what a point does; `device` and `task` name the file.
+          note: is told, in a sentence, that a broken file was moved aside.
+
+        Raises:
+          ConfigError: the folder cannot be used.
+        """
+        self._key = dict(key)
+        digest = hashlib.sha256(json.dumps(self._key, sort_keys=True).encode()).hexdigest()
+        name = f"{_slug(key['device'])}-{_slug(key['task'])}-{digest[:_DIGEST_LENGTH]}.json"
+        self.path = folder / name
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise ConfigError(
+                f"search.store={folder}: cannot be used ({error.strerror})"
+            ) from None
+        self._records = self._load(note)
+
+    def get(self, mode: str, point: Point) -> Measured | NotRunnable | None:
+        """What a point did, None where it was not profiled yet."""
+        record = self._records.get(_name(mode, point))
+        return record.result() if record else None
+
+    def put(self, mode: str, point: Point, result: Measured | NotRunnable, wall_s: float) -> None:
+        """Keeps what a point did; the file is written at once, as a whole.
+
+        Raises:
+          ConfigError: it cannot be written.
+        """
+        self._records[_name(mode, point)] = _Record.of(result, wall_s)
+        profiles = {name: _without_none(record) for name, record in self._records.items()}
+        try:
+            write_json(self.path, {"key": self._key, "profiles": profiles})
+        except OSError as error:
+            raise ConfigError(
+                f"search.store={self.path.parent}: cannot be written ({error.strerror})"
+            ) from None
+
+    def _load(self, note: Callable[[str], None]) -> dict[str, _Record]:
+        if not self.path.exists():
+            return {}
+        try:
+            profiles = read_json(self.path)["profiles"]
+            return {name: from_dict(_Record, item) for name, item in profiles.items()}
+        except (OSError, ValueError, KeyError, TypeError, AttributeError, ConfigError) as error:
+            aside = _moved_aside(self.path)
+            what = " ".join(str(error).split()) or type(error).__name__
+            note(f"profile store {self.path} is broken ({what}): moved to {aside}")
+            return {}
+
+
+def default_folder() -> Path:
+    """Where profiles are kept unless `search.store` names a folder."""
+    base = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
+    return Path(base) / "gmijax" / "profiles"
+
+
+def _moved_aside(path: Path) -> Path:
+    for number in range(1000):
+        aside = path.with_name(f"{path.name}.broken{number or ''}")
+        if not aside.exists():
+            try:
+                os.replace(path, aside)
+            except OSError as error:
+                raise ConfigError(
+                    f"search.store={path.parent}: cannot move {path.name} ({error.strerror})"
+                ) from None
+            return aside
+    raise ConfigError(f"search.store={path.parent}: too many broken files of {path.name}")
+
+
+def _name(mode: str, point: Point) -> str:
+    return f"{mode} {point.gmis_per_gpu}x{point.num_envs} {point.impl}"
+
+
+def _slug(text: object) -> str:
+    return re.sub(r"[^a-z0-9]+", "-", str(text).lower()).strip("-")
+
+
+def _without_none(record: _Record) -> dict[str, Any]:
+    return {key: value for key, value in asdict(record).items() if value is not None}

@@ -1,0 +1,285 @@
+"""One profile of a search: a real short job in child GMIs. No jax here.
+
+`corun` runs all GMIs of a GPU at once; `isolated` runs one of them alone, with the share that it
+would have among the others. Whatever goes wrong in the job is an answer, not an error.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import platform
+import shutil
+import statistics
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from importlib.metadata import PackageNotFoundError, version
+from typing import Any, Literal
+
+from gmijax.config import EnvConfig, PlanConfig, PpoConfig, ReduceConfig, TemplateName, TrainConfig
+from gmijax.errors import ConfigError, GmijaxError, JobInterrupted
+from gmijax.launcher import Launch, run_gmis
+from gmijax.partition.gmi_process import GmiStatus
+from gmijax.partition.layout import Layout
+from gmijax.partition.machine import Machine
+from gmijax.partition.plan import Plan
+from gmijax.partition.planner import make_plan
+from gmijax.partition.search import Measured, NotRunnable, Point
+from gmijax.partition.supervisor import Patience
+from gmijax.results import read_metrics
+from gmijax.rundir import RunPaths, read_json, write_json
+from gmijax.schema import to_dict
+from gmijax.version import __version__
+
+Mode = Literal["corun", "isolated"]
+
+_GRACE_S = 3.0
+_VERSIONS = ("jax", "jaxlib", "mujoco-mjx", "warp-lang")
+
+
+class ProfileLate(Exception):
+    """A profile did not end within its time limit; says how far its GMIs were."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Workload:
+    """A kind of job that can be profiled, and what is `auto` in it.
+
+    Attributes:
+      env: the task, pinned.
+      plan: how the whole job is to be spread.
+      reduce: how it is to reduce.
+      num_envs: environments per GMI, or `auto`.
+      impl: physics implementation, or `auto`.
+      template: what `plan.template=auto` means.
+      module: main of its GMIs.
+      config_at: the configuration of the short job that profiles a point with so many GMIs; it
+        is what the GMIs read from the run folder. Raises ConfigError if there can be none.
+      read: what one GMI did, from the run folder of that job.
+      key: what else decides how fast it is, plain data.
+    """
+
+    env: EnvConfig
+    plan: PlanConfig
+    reduce: ReduceConfig
+    num_envs: int | Literal["auto"]
+    impl: str
+    template: TemplateName
+    module: str
+    config_at: Callable[[Point, int], Any]
+    read: Callable[[Plan, RunPaths], Measured]
+    key: Mapping[str, Any]
+
+    @property
+    def num_gpus(self) -> int:
+        """GPUs of the whole job."""
+        if self.plan.layout is not None:
+            return len(self.plan.layout)
+        return self.plan.gpus if isinstance(self.plan.gpus, int) else len(self.plan.gpus)
+
+
+def training(config: TrainConfig) -> Workload:
+    """Synchronous training as a workload.
+
+    Raises:
+      ConfigError: a job whose template the search cannot profile.
+    """
+    if not isinstance(config.algo, PpoConfig) or config.plan.template not in ("auto", "tcg_ex"):
+        raise ConfigError(
+            "num_envs=auto, plan.gmis_per_gpu=auto: can be found for algo=ppo with "
+            "plan.template=tcg_ex only; give numbers"
+        )
+
+    def config_at(point: Point, num_gmis: int) -> TrainConfig:
+        steps = point.num_envs * config.algo.unroll_length * num_gmis
+        return dataclasses.replace(
+            config,
+            num_envs=point.num_envs,
+            num_timesteps=config.search.iterations * steps,
+            physics=dataclasses.replace(config.physics, impl=point.impl),
+            run=dataclasses.replace(
+                config.run, resume=None, checkpoint_every=0, measure_throughput=False
+            ),
+        )
+
+    return Workload(
+        env=config.env,
+        plan=config.plan,
+        reduce=config.reduce,
+        num_envs=config.num_envs,
+        impl=config.physics.impl,
+        template="tcg_ex",
+        module="gmijax.worker",
+        config_at=config_at,
+        read=_read_training,
+        key={"job": "train", "algo": to_dict(config.algo), "iterations": config.search.iterations},
+    )
+
+
+def profile(
+    workload: Workload,
+    point: Point,
+    mode: Mode,
+    machine: Machine,
+    run: RunPaths,
+    *,
+    limit_s: float,
+    on_tick: Callable[[Sequence[GmiStatus]], None],
+    on_warning: Callable[[str], None],
+) -> Measured | NotRunnable:
+    """Runs a short job at a point; `run` is its folder, of which logs are kept.
+
+    Raises:
+      ProfileLate: it did not end within `limit_s`.
+      JobInterrupted: a signal came.
+    """
+    try:
+        plan = plan_at(workload, point, mode, machine)
+        config = workload.config_at(point, plan.layout.num_gmis)
+    except ConfigError as error:
+        return NotRunnable(str(error))
+    write_json(run.config, to_dict(config))
+    write_json(run.plan, plan.to_dict())
+    deadline_s = time.monotonic() + limit_s
+
+    def watch(gmis: tuple[GmiStatus, ...]) -> None:
+        on_tick(gmis)
+        if time.monotonic() > deadline_s:
+            states = ", ".join(f"GMI {gmi.gmi} {gmi.state}" for gmi in gmis)
+            raise ProfileLate(f"no end within {limit_s:.0f} s ({states})")
+
+    # The supervisor's own limits are for jobs of unknown length.
+    patience = Patience(
+        start_timeout_s=2 * limit_s,
+        stall_timeout_s=2 * limit_s,
+        stop_timeout_s=_GRACE_S,
+        grace_s=_GRACE_S,
+    )
+    launch = Launch(
+        plan=plan,
+        machine=machine,
+        run=run,
+        module=workload.module,
+        patience=patience,
+        on_warning=on_warning,
+    )
+    try:
+        run_gmis(launch, watch)
+        return _read(workload, plan, run)
+    except JobInterrupted:
+        raise
+    except GmijaxError as error:
+        return NotRunnable(" ".join(str(error).split()))
+    finally:
+        shutil.rmtree(run.checkpoints, ignore_errors=True)
+
+
+def plan_at(workload: Workload, point: Point, mode: Mode, machine: Machine) -> Plan:
+    """The plan of a profile, on the first GPU of the job.
+
+    `isolated` is the first GMI of the plan that `corun` has, with its memory and cores; where the
+    backend can cap SMs, with an even part of them.
+
+    Raises:
+      ConfigError: a point that the machine or the backend does not allow.
+    """
+    gpus = workload.plan.gpus
+    one_gpu = dataclasses.replace(
+        workload.plan,
+        gpus=1 if isinstance(gpus, int) else gpus[:1],
+        gmis_per_gpu=point.gmis_per_gpu,
+        layout=None,
+    )
+
+    def planned(config: PlanConfig) -> Plan:
+        return make_plan(
+            config, workload.reduce, point.num_envs, machine, template=workload.template
+        )
+
+    plan = planned(one_gpu)
+    if mode == "corun" or point.gmis_per_gpu == 1:
+        return plan
+    if plan.backend == "mps" and one_gpu.sm_percent is None:
+        plan = planned(dataclasses.replace(one_gpu, sm_percent="even"))
+    return dataclasses.replace(
+        plan,
+        layout=Layout(((0,),)),
+        slices=plan.slices[:1],
+        roles=plan.roles[:1],
+        strategy="none",
+    )
+
+
+def platform_of(workload: Workload, machine: Machine) -> Literal["cpu", "gpu"]:
+    """What the GMIs of a job will run on."""
+    return "gpu" if machine.gpus and workload.plan.backend != "cpu" else "cpu"
+
+
+def device_of(workload: Workload, machine: Machine) -> str:
+    """What is profiled: the model of the job's first GPU, or the CPU's architecture and cores."""
+    if platform_of(workload, machine) == "cpu":
+        return f"{platform.machine()} CPU, {len(machine.cpu_cores)} cores"
+    gpus = workload.plan.gpus
+    wanted = None if isinstance(gpus, int) else gpus[0]
+    chosen = next((gpu for gpu in machine.gpus if gpu.index == wanted), machine.gpus[0])
+    return f"{chosen.name}, {chosen.memory_mib} MiB"
+
+
+def store_key(workload: Workload, machine: Machine) -> dict[str, Any]:
+    """Everything but the point that decides what a profile says; see `ProfileStore`."""
+    plan = {
+        name: value
+        for name, value in to_dict(workload.plan).items()
+        if name not in ("gpus", "gmis_per_gpu", "layout")
+    }
+    reduce = to_dict(workload.reduce)
+    del reduce["timeout_s"]
+    return {
+        "device": device_of(workload, machine),
+        "task": workload.env.slug,
+        "env": to_dict(workload.env),
+        "plan": plan,
+        "reduce": reduce,
+        "mps": machine.mps_control is not None,
+        "driver": machine.driver_version,
+        "versions": installed_versions(),
+        **workload.key,
+    }
+
+
+def installed_versions() -> dict[str, str | None]:
+    """Versions of what computes, None for what is not installed."""
+    found: dict[str, str | None] = {"gmijax": __version__}
+    for name in _VERSIONS:
+        try:
+            found[name] = version(name)
+        except PackageNotFoundError:
+            found[name] = None
+    return found
+
+
+def _read(workload: Workload, plan: Plan, run: RunPaths) -> Measured | NotRunnable:
+    try:
+        return workload.read(plan, run)
+    # All GMIs ended well, and still their results do not say what they should.
+    except (OSError, ArithmeticError, LookupError, TypeError, ValueError) as error:
+        return NotRunnable(f"no result to read: {type(error).__name__}: {error}")
+
+
+def _read_training(plan: Plan, run: RunPaths) -> Measured:
+    results = [read_json(run.gmi(gmi).result) for gmi in plan.layout.gmis]
+    all_steps_per_s = results[0]["step_per_s_train"]  # The median, of all GMIs together.
+    steps = results[0]["env_steps"] / results[0]["iterations"]
+    # The first iteration fills caches and pools.
+    lines = read_metrics(run.metrics)[1:]
+    return Measured(
+        env_steps_per_s=all_steps_per_s / plan.layout.num_gmis,
+        memory_mib=max(_peak_memory_mib(result["device"]) for result in results),
+        iteration_s=steps / all_steps_per_s,
+        reduce_s=statistics.median(line.get("time/reduce_s", 0.0) for line in lines),
+    )
+
+
+def _peak_memory_mib(device: Mapping[str, Any]) -> float:
+    """Of the device, as its allocator counts; where it does not (the CPU), of the process."""
+    return float(device["peak_memory_mib"] or device["peak_host_memory_mib"])

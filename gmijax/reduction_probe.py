@@ -1,0 +1,130 @@
+"""Main of a GMI that does nothing but reduce: `python -m gmijax.reduction_probe`.
+
+One process measures all strategies and sizes one after the other, because starting is most of
+what a measurement costs. `gmijax.selection` starts it.
+"""
+
+from __future__ import annotations
+
+import os
+import sys
+import time
+from collections.abc import Callable, Mapping
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from gmijax.collectives.build import Membership, build_reducer, join_world
+from gmijax.collectives.interface import DeviceMean, Reducer, stays_on_device
+from gmijax.collectives.intra import IntraUnavailable
+from gmijax.partition.child import ChildLink, inherited_fd, run_gmi
+from gmijax.partition.plan import Plan
+from gmijax.rundir import read_json
+from gmijax.selection import CHAIN, TIMEOUT_S, block_variable
+
+if TYPE_CHECKING:
+    import jax
+
+    from gmijax.collectives.ring import World
+
+WARM_UP_CALLS = 10
+
+
+def main() -> int:
+    """Measures and writes `result.json`; returns 0."""
+    return run_gmi(_measure)
+
+
+def _measure(link: ChildLink) -> dict[str, Any]:
+    plan, task = Plan.from_dict(read_json(link.run.plan)), read_json(link.run.config)
+    world = join_world(plan.strategy, plan.layout, link.gmi, link.rendezvous, TIMEOUT_S)
+    if world is not None:
+        world.is_kept = True
+    link.beat("ready", 0)
+    rows: list[dict[str, Any]] = []
+    for number, probe in enumerate(task["probes"]):
+        try:
+            reducer = _reducer(plan, link.gmi, world, number, probe)
+        except IntraUnavailable as error:  # On all ranks alike, so all go on.
+            rows.append({"why_not": str(error)})
+        else:
+            rows.append(_times(reducer, probe["num_floats"], task["calls"]))
+            reducer.close()
+        link.beat("running", number)
+    if world is not None:
+        world.leave()
+    import jax
+
+    return {"rows": rows, "device": jax.local_devices()[0].device_kind}
+
+
+def _reducer(
+    plan: Plan, gmi: int, world: World | None, number: int, probe: Mapping[str, Any]
+) -> Reducer:
+    """The reducer of one probe, with a shared block of its own."""
+    return build_reducer(
+        probe["strategy"],
+        Membership(
+            layout=plan.layout,
+            rank=gmi,
+            num_floats=probe["num_floats"],
+            exchange_fd=inherited_fd(os.environ, block_variable(number)),
+            timeout_s=TIMEOUT_S,
+            rendezvous_timeout_s=TIMEOUT_S,
+            world=world,
+            intra=probe["intra"],
+        ),
+    )
+
+
+def _times(reducer: Reducer, num_floats: int, calls: int) -> dict[str, float]:
+    """Seconds of a mean alone, and of one of `CHAIN` that need each other, as in training."""
+    call = _exchange(reducer, num_floats)
+    for _ in range(WARM_UP_CALLS):
+        call(CHAIN)
+    alone_s = [_timed(call, 1) for _ in range(calls)]
+    chained_s = [_timed(call, CHAIN) / CHAIN for _ in range(-(-calls // CHAIN))]
+    low, middle, high = np.quantile(alone_s, (0.1, 0.5, 0.9)).tolist()
+    chained = float(np.median(chained_s))
+    return {"median_s": middle, "p10_s": low, "p90_s": high, "chained_s": chained}
+
+
+def _exchange(reducer: Reducer, num_floats: int) -> Callable[[int], Any]:
+    """Takes means one of the other, from a gradient on the device to the mean on the device."""
+    import jax
+
+    from gmijax.learner import gradient_sharding
+
+    gradient = jax.device_put(np.ones(num_floats, np.float32))
+    if stays_on_device(reducer):
+
+        def on_device(times: int) -> jax.Array:
+            def chain(mean: DeviceMean) -> jax.Array:
+                buffer = gradient
+                for _ in range(times):
+                    buffer = mean(buffer)
+                return buffer
+
+            return reducer.run_on_device(chain)
+
+        return on_device
+    fetch = jax.jit(lambda x: x + 0.0, out_shardings=gradient_sharding(reducer))
+
+    def through_host(times: int) -> jax.Array:
+        buffer = gradient
+        for _ in range(times):
+            mean = reducer.mean(np.asarray(fetch(buffer)))
+            buffer = jax.device_put(np.array(mean))
+        return buffer.block_until_ready()
+
+    return through_host
+
+
+def _timed(call: Callable[[int], Any], times: int) -> float:
+    started = time.perf_counter()
+    call(times)
+    return time.perf_counter() - started
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,174 @@
+"""The controller of roles: from a plan and roles to what they return. No jax here."""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import warnings
+from collections.abc import Sequence
+from functools import partial
+from typing import Any
+
+from gmijax.collectives.messenger import MIN_CAPACITY_BYTES
+from gmijax.collectives.pipe_block import create_pipes
+from gmijax.errors import ConfigError, GmiFailed, GmijaxError
+from gmijax.launcher import Launch, run_gmis
+from gmijax.partition.child import ENV_GMI, ENV_PIPES_FD
+from gmijax.partition.machine import detect_machine
+from gmijax.partition.plan import Plan
+from gmijax.partition.supervisor import Patience
+from gmijax.roles import shipping
+from gmijax.roles.manager import GMIManager
+from gmijax.roles.role import Role
+from gmijax.rundir import RunPaths, create_run, read_json, write_json
+from gmijax.schema import require_at_least, require_positive
+
+
+def launch(
+    plan: Plan | GMIManager,
+    role: Role | Sequence[Role],
+    *args: Any,
+    timeout_s: float = 60.0,
+    run_dir: str | None = None,
+    pipe_mib: float = 2.0,
+    start_timeout_s: float = 600.0,
+    stall_timeout_s: float | None = None,
+    grace_s: float = 10.0,
+) -> list[Any]:
+    """Runs a role in every GMI of a plan, each a process of its own, until all have ended.
+
+    Args:
+      plan: where the GMIs live; from `gmijax.plan`, or a manager with its GMIs.
+      role: what every GMI runs (a copy each), or one role per GMI, in order of id.
+      args: what every role's `run` gets.
+      timeout_s: longest wait of a role for a message or in a collective call.
+      run_dir: the run folder; None: `runs/<class>-<date>-<time>`.
+      pipe_mib: shared memory for each ordered pair of GMIs that talk, MiB. Larger messages
+        travel in pieces.
+      start_timeout_s: longest wait for a GMI to start and take up its share.
+      stall_timeout_s: a GMI without progress for this long has failed (see `Role.progress`);
+        None: never.
+      grace_s: time that GMIs get to end by themselves, after Ctrl-C or a failure.
+
+    Returns:
+      What every GMI's `run` returned, in order of id.
+
+    Raises:
+      ConfigError: bad input, before anything was started; or a role asked for a GMI or an
+        operation that there is not.
+      GmiFailed: a role raised, or its process ended; names the first. Its notes have the
+        traceback and the run folder.
+      JobInterrupted: SIGINT, SIGTERM or SIGHUP came, and all GMIs have ended.
+    """
+    # Before anything else: the module of a GMI's role starts jobs without end otherwise.
+    _require_no_gmi()
+    plan = plan.plan() if isinstance(plan, GMIManager) else plan
+    if not isinstance(plan, Plan):
+        raise ConfigError(f"plan={plan!r}: expected a plan of gmijax.plan, or a GMIManager")
+    roles = _roles(role, plan)
+    _check_numbers(timeout_s, pipe_mib, start_timeout_s, stall_timeout_s, grace_s)
+    parcels = [_parcel(each, args) for each in roles]
+    run = create_run(run_dir, None, type(roles[0]).__name__.lower())
+    config = {
+        "roles": [type(each).__qualname__ for each in roles],
+        "timeout_s": timeout_s,
+        "start_timeout_s": start_timeout_s,
+        "capacity_bytes": int(pipe_mib * 2**20),
+        "script": shipping.own_script(),
+    }
+    _write(run, plan, config, parcels)
+    job = Launch(
+        plan=plan,
+        machine=detect_machine(),
+        run=run,
+        module="gmijax.roles.worker",
+        patience=Patience(
+            start_timeout_s=start_timeout_s,
+            stall_timeout_s=math.inf if stall_timeout_s is None else stall_timeout_s,
+            stop_timeout_s=grace_s,
+            grace_s=grace_s,
+        ),
+        # Roles wait for each other, so they start together.
+        compile_once=False,
+        on_warning=lambda text: warnings.warn(text, RuntimeWarning, stacklevel=2),
+        shared={ENV_PIPES_FD: partial(create_pipes, len(roles), config["capacity_bytes"])},
+    )
+    try:
+        run_gmis(job)
+    except GmijaxError as error:
+        _explain(error, run)
+        raise
+    return [shipping.load(run.gmi(gmi).output.read_bytes()) for gmi in plan.layout.gmis]
+
+
+def _require_no_gmi() -> None:
+    if ENV_GMI in os.environ:
+        raise ConfigError(
+            "gmijax.launch: called inside a GMI; in the file of a role, call it below "
+            'if __name__ == "__main__":'
+        )
+
+
+def _roles(role: Role | Sequence[Role], plan: Plan) -> list[Role]:
+    num_gmis = plan.layout.num_gmis
+    if isinstance(role, type):
+        raise ConfigError(f"role={role.__name__}: a class; give an object, {role.__name__}(...)")
+    roles = list(role) if isinstance(role, Sequence) else [role] * num_gmis
+    for each in roles:
+        if not isinstance(each, Role):
+            raise ConfigError(f"role={each!r}: expected a gmijax.Role, got {type(each).__name__}")
+        shipping.require_findable(type(each))
+    if len(roles) != num_gmis:
+        raise ConfigError(f"role: {len(roles)} roles for the {num_gmis} GMIs of {plan.layout}")
+    return roles
+
+
+def _check_numbers(
+    timeout_s: float,
+    pipe_mib: float,
+    start_timeout_s: float,
+    stall_timeout_s: float | None,
+    grace_s: float,
+) -> None:
+    require_positive("timeout_s", timeout_s)
+    require_at_least("pipe_mib", pipe_mib, MIN_CAPACITY_BYTES / 2**20)
+    require_positive("start_timeout_s", start_timeout_s)
+    require_positive("grace_s", grace_s)
+    if stall_timeout_s is not None:
+        require_positive("stall_timeout_s", stall_timeout_s)
+
+
+def _parcel(role: Role, args: tuple[Any, ...]) -> bytes:
+    try:
+        return shipping.dump((role, args))
+    except Exception as error:
+        # Pickling calls code of the user's, which may raise anything.
+        raise ConfigError(
+            f"role={type(role).__qualname__}: cannot be sent to a GMI: "
+            f"{str(error).splitlines()[0] if str(error) else type(error).__name__}; it is pickled "
+            "when the job starts, so make what is no plain data in run"
+        ) from error
+
+
+def _write(run: RunPaths, plan: Plan, config: dict[str, Any], parcels: Sequence[bytes]) -> None:
+    write_json(run.plan, plan.to_dict())
+    write_json(run.config, config)
+    for gmi, parcel in enumerate(parcels):
+        run.gmi(gmi).root.mkdir()
+        run.gmi(gmi).role.write_bytes(parcel)
+
+
+def _explain(error: GmijaxError, run: RunPaths) -> None:
+    """Adds the traceback of the GMI that failed, and the run folder, to the error."""
+    failed = [error.gmi] if isinstance(error, GmiFailed) else []
+    if isinstance(error, ConfigError):
+        failed = [
+            int(path.parent.name.partition("_")[2]) for path in run.root.glob("gmi_*/error.json")
+        ]
+    for gmi in failed:
+        try:
+            error.add_note(f"in GMI {gmi}:\n{read_json(run.gmi(gmi).error)['traceback'].rstrip()}")
+        except (OSError, json.JSONDecodeError, KeyError):
+            continue
+    error.add_note(f"run folder: {run.root}")

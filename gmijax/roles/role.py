@@ -1,0 +1,126 @@
+"""The base class of roles: what a GMI runs (the paper's `DRL_role`, section 3, Listing 1)."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Iterable
+from typing import Any
+
+from gmijax.collectives.group import Operation
+from gmijax.roles.gmi import here
+
+
+class Role(ABC):
+    """What a GMI runs. Write `run`; the other methods are there for it.
+
+    As with `multiprocessing.Process`, the constructor runs where the job is started and `run` in
+    the GMI: the object is pickled in between. So it may hold numbers, names and numpy arrays;
+    environments and other things of jax are made in `run`. The class must be at the top level of
+    a file or a module, where the GMI finds it by name.
+
+    Example:
+      >>> class Average(Role):
+      ...     def run(self):
+      ...         return self.collective(float(self.rank))
+
+      With `gmijax.launch(gmijax.plan(gmis_per_gpu=3), Average())` that gives [1.0, 1.0, 1.0].
+    """
+
+    @abstractmethod
+    def run(self, *args: Any) -> Any:
+        """The routine of the GMI.
+
+        Args:
+          args: what `gmijax.launch` got after the role.
+
+        Returns:
+          Anything that can be pickled; `launch` returns it. Arrays of jax come back as numpy's.
+        """
+
+    @property
+    def rank(self) -> int:
+        """Id of this GMI, 0 to `world_size - 1`."""
+        return here("rank").rank
+
+    @property
+    def world_size(self) -> int:
+        """K, number of GMIs of the job."""
+        return here("world_size").layout.num_gmis
+
+    @property
+    def gpu(self) -> int:
+        """Position of this GMI's GPU in the job; 0 is its first."""
+        return here("gpu").layout.gpu_of(self.rank)
+
+    @property
+    def neighbours(self) -> tuple[int, ...]:
+        """The GMIs on the same GPU, this one included."""
+        return here("neighbours").layout.neighbours_of(self.rank)
+
+    @property
+    def stop_requested(self) -> bool:
+        """Whether the user wants the job to stop (Ctrl-C): return soon.
+
+        GMIs see it at different times; those that exchange data agree first, for example by
+        `self.collective(float(self.stop_requested), "sum") > 0`.
+        """
+        return here("stop_requested").stop_requested
+
+    def collective(
+        self, data: Any, op: Operation = "mean", group: Iterable[int] | None = None
+    ) -> Any:
+        """The mean or the sum of `data` over GMIs, bit-identical on all of them.
+
+        Every GMI of the group makes the same calls in the same order, with data of the same
+        nesting, shapes and dtypes.
+
+        Args:
+          data: dicts, lists, tuples, NamedTuples, dataclasses with arrays of numpy or jax and
+            floats. Anything else in it stays this GMI's own.
+          op: `mean` or `sum`. Integers have no mean.
+          group: ids of GMIs, this one included; None: all.
+
+        Returns:
+          The same nesting with arrays of numpy.
+
+        Raises:
+          PeerLost: the process of a GMI of the group is gone.
+          CollectiveTimeout: a GMI did not come in time; names it.
+          CollectiveError: GMIs came with different data.
+        """
+        return here("collective").reduce(data, op, group)
+
+    def send(self, data: Any, dst: int) -> None:
+        """Sends `data` to GMI `dst` and goes on; `data` may be changed at once.
+
+        Args:
+          data: anything that can be pickled; arrays (of any size) travel as raw bytes.
+          dst: id of a GMI. Messages from one GMI to another arrive in order.
+
+        Raises:
+          PeerLost: that GMI is gone, and an earlier message could not be delivered.
+        """
+        here("send").send(data, dst)
+
+    def recv(self, src: int, timeout_s: float | None = None) -> Any:
+        """Waits for the next message of GMI `src`, and returns it.
+
+        Args:
+          src: id of a GMI.
+          timeout_s: longest wait; None: what `gmijax.launch` was told.
+
+        Returns:
+          What was sent; its arrays are this GMI's own, and those of jax have become numpy's.
+
+        Raises:
+          PeerLost: that GMI is gone, and has left no message.
+          CollectiveTimeout: none came in time; names the GMI.
+        """
+        return here("recv").recv(src, timeout_s)
+
+    def progress(self, step: int) -> None:
+        """Tells the controller how far this GMI is; cheap enough for every step.
+
+        Messages and collective calls count as progress by themselves.
+        """
+        here("progress").progress(step)

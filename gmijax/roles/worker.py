@@ -1,0 +1,87 @@
+"""Main of a GMI that runs a role of the user's own: `python -m gmijax.roles.worker`."""
+
+from __future__ import annotations
+
+import os
+import sys
+from typing import TYPE_CHECKING, Any
+
+from gmijax.collectives.build import Membership, build_reducer, join_world
+from gmijax.collectives.group import GroupReducer
+from gmijax.collectives.interface import Reducer
+from gmijax.collectives.messenger import Messenger
+from gmijax.collectives.pipe_block import PipeBlock
+from gmijax.errors import ConfigError
+from gmijax.partition.child import ENV_PIPES_FD, ChildLink, inherited_fd, run_gmi
+from gmijax.partition.plan import Plan
+from gmijax.roles import shipping
+from gmijax.roles.gmi import Gmi, enter
+from gmijax.rundir import read_json
+
+if TYPE_CHECKING:
+    from gmijax.collectives.ring import World
+
+
+def main() -> int:
+    """Runs this process's GMI; returns the exit code."""
+    return run_gmi(_run)
+
+
+def _run(link: ChildLink) -> dict[str, Any]:
+    config = read_json(link.run.config)
+    plan = Plan.from_dict(read_json(link.run.plan))
+    # Before the role's own modules, which may use jax.
+    world = _take_up_share(plan, link, config["start_timeout_s"])
+    messenger = Messenger(_attach(plan, link, config["capacity_bytes"]), config["timeout_s"])
+    shipping.prepare_imports(config["script"])
+    role, args = shipping.load(link.paths.role.read_bytes(), config["script"])
+
+    def build(num_floats: int) -> Reducer:
+        return build_reducer(
+            plan.strategy,
+            Membership(
+                layout=plan.layout,
+                rank=link.gmi,
+                num_floats=num_floats,
+                exchange_fd=link.exchange_fd,
+                timeout_s=config["timeout_s"],
+                rendezvous_timeout_s=config["timeout_s"],
+                world=world,
+                intra=plan.intra,
+            ),
+        )
+
+    reducer = GroupReducer(messenger, build)
+    enter(Gmi(plan.layout, messenger, reducer, link))
+    link.beat("ready", 0)
+    output = shipping.dump(role.run(*args))
+    # What was sent must be in shared memory before this process is gone.
+    messenger.flush()
+    reducer.close()
+    link.paths.output.write_bytes(output)
+    return {"status": "completed"}
+
+
+def _take_up_share(plan: Plan, link: ChildLink, timeout_s: float) -> World | None:
+    """Opens the GPU, with jax's pool of memory; on a CPU jax is left to the role."""
+    world = join_world(plan.strategy, plan.layout, link.gmi, link.rendezvous, timeout_s)
+    if plan.backend != "cpu":
+        import jax
+
+        from gmijax.selfcheck import check_share
+
+        # Backends look for it once all GMIs are ready.
+        jax.devices()
+        check_share(plan, link.gmi)
+    return world
+
+
+def _attach(plan: Plan, link: ChildLink, capacity_bytes: int) -> PipeBlock:
+    fd = inherited_fd(os.environ, ENV_PIPES_FD)
+    if fd is None:
+        raise ConfigError(f"{ENV_PIPES_FD} must be set: GMIs are started by gmijax.launch")
+    return PipeBlock.attach(fd, link.gmi, plan.layout.num_gmis, capacity_bytes)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

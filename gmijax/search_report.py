@@ -1,0 +1,230 @@
+"""What a search shows and leaves: progress, table, sentence, report, plot. No jax here."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from types import TracebackType
+from typing import Any
+
+from rich.console import Console
+from rich.markup import escape
+from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
+from rich.table import Table
+
+from gmijax.partition.gmi_process import GmiStatus
+from gmijax.partition.search import Grid, Measured, NotRunnable, Outcome, Point, Visited
+
+Results = Mapping[Point, Measured | NotRunnable]
+
+_LONGEST_REASON = 90
+
+
+@dataclass(frozen=True)
+class SearchPaths:
+    """Files of a search, beside its `config.json`."""
+
+    root: Path
+
+    @property
+    def report(self) -> Path:
+        """All points and the answer."""
+        return self.root / "search.json"
+
+    @property
+    def picture(self) -> Path:
+        """Throughput and memory over environments."""
+        return self.root / "search.png"
+
+    @property
+    def profiles(self) -> Path:
+        """Run folders of the profiles, without their checkpoints."""
+        return self.root / "profiles"
+
+
+class SearchDisplay:
+    """A bar of the time budget on a terminal, a line per profile everywhere."""
+
+    def __init__(self, console: Console, budget_s: float) -> None:
+        self._console = console
+        self._started_s = time.monotonic()
+        self._bar = Progress(
+            TextColumn("{task.description}"),
+            BarColumn(),
+            TimeElapsedColumn(),
+            TextColumn(f"of at most {budget_s:.0f} s"),
+            console=console,
+            transient=True,
+            disable=not console.is_terminal,
+        )
+        self._task = self._bar.add_task("search", total=budget_s)
+
+    def __enter__(self) -> SearchDisplay:
+        self._started_s = time.monotonic()
+        self._bar.start()
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self._bar.stop()
+
+    def watch(self, what: str, gmis: Sequence[GmiStatus]) -> None:
+        """Shows how far the running profile is; called about 20 times a second."""
+        slowest = min(gmis, key=lambda gmi: gmi.iteration)
+        self._bar.update(
+            self._task,
+            completed=time.monotonic() - self._started_s,
+            description=f"{what}: GMI {slowest.gmi} {slowest.state}",
+        )
+
+    def done(self, what: str, point: Point, result: Measured | NotRunnable, wall_s: float) -> None:
+        """Prints what a profile found."""
+        self._console.print(f"{what}: {_found(point, result)} ({wall_s:.0f} s)", markup=False)
+
+
+def verdict(outcome: Outcome, grid: Grid, num_gpus: int) -> str:
+    """The answer and what it is worth, in words; only for an outcome with a best point."""
+    if outcome.best is None:
+        raise ValueError("an outcome without a best point")
+    top = outcome.best
+    several = _highest(outcome, lambda gmis: gmis > 1)
+    one = _highest(outcome, lambda gmis: gmis == 1)
+    gpus = "" if num_gpus == 1 else f" on {num_gpus} GPUs (projected from one)"
+    number = f"{top.point.gmis_per_gpu} GMI{'s' * (top.point.gmis_per_gpu > 1)}"
+    said = (
+        f"{number} per GPU with {top.point.num_envs} environments each, {top.point.impl}: "
+        f"{top.projected:,.0f} env steps/s{gpus}"
+    )
+    if top.point.gmis_per_gpu == 1 and several is not None:
+        said += (
+            f"; one GMI is enough here: the best with several, {several.point}, makes "
+            f"{several.projected / top.projected:.2f} of that"
+        )
+    elif top.point.gmis_per_gpu > 1 and one is not None:
+        said += f"; {top.projected / one.projected:.2f} times the best with one GMI, {one.point}"
+        if one.point.num_envs == max(grid.num_envs):
+            said += (
+                ", the most environments that it was given: with more it may come closer "
+                "(search.num_envs)"
+            )
+    if not outcome.complete:
+        said += f"; the budget ended the search after {len(outcome.visited)} points"
+    return said
+
+
+def table(outcome: Outcome, isolated: Results) -> Table:
+    """One row per point, best marked; with the isolated profile beside it where there is one."""
+    shown = Table(title="environment steps per second")
+    for heading in ("GMIs", "envs", "MJX", "one GMI", "whole job", "MiB", "Sat"):
+        shown.add_column(heading, justify="right")
+    if isolated:
+        shown.add_column("corun/isolated", justify="right")
+    shown.add_column("")
+    for one in sorted(outcome.visited, key=lambda one: one.point):
+        point, result = one.point, one.result
+        cells = [str(point.gmis_per_gpu), str(point.num_envs), point.impl]
+        note = "best" if one == outcome.best else ""
+        if isinstance(result, NotRunnable):
+            cells += ["-"] * 4
+            note = escape(result.reason[:_LONGEST_REASON])
+        else:
+            sat = "" if one.saturation is None else f"{one.saturation:.2f}"
+            cells += [f"{result.env_steps_per_s:,.0f}", f"{one.projected:,.0f}"]
+            cells += [f"{result.memory_mib:,.0f}", sat]
+        if isolated:
+            ratio = contention(result, isolated.get(point))
+            cells.append("" if ratio is None else f"{ratio:.2f}")
+        shown.add_row(*cells, note, style="bold" if one == outcome.best else None)
+    return shown
+
+
+def contention(
+    corun: Measured | NotRunnable, isolated: Measured | NotRunnable | None
+) -> float | None:
+    """Throughput of a GMI among others over that of one alone with its share; None if unknown."""
+    if isinstance(corun, Measured) and isinstance(isolated, Measured):
+        return corun.env_steps_per_s / isolated.env_steps_per_s
+    return None
+
+
+def plain_data(outcome: Outcome, isolated: Results, reason: str) -> dict[str, Any]:
+    """The outcome for `search.json`."""
+    best = outcome.best
+    return {
+        "best": None if best is None else {**best.point._asdict(), "projected": best.projected},
+        "reason": reason,
+        "complete": outcome.complete,
+        "points": [
+            {
+                **one.point._asdict(),
+                **one.result._asdict(),
+                "saturation": _json_number(one.saturation),
+                "projected": one.projected,
+                "corun_over_isolated": contention(one.result, isolated.get(one.point)),
+            }
+            for one in outcome.visited
+        ],
+        "isolated": [
+            {**point._asdict(), **result._asdict()} for point, result in isolated.items()
+        ],
+    }
+
+
+def draw(outcome: Outcome, picture: Path, title: str) -> None:
+    """Draws throughput of a GPU and memory of a GMI over environments, a line per GMIs per GPU."""
+    # Imported here: it costs half a second that no other use of this module should pay.
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(10, 4), layout="constrained")
+    FigureCanvasAgg(figure)
+    left, right = figure.subplots(1, 2)
+    rows = sorted({(one.point.impl, one.point.gmis_per_gpu) for one in outcome.visited})
+    impls = sorted({impl for impl, _ in rows})
+    for impl, gmis in rows:
+        ran = sorted(
+            (one.point.num_envs, one.result)
+            for one in outcome.visited
+            if (one.point.impl, one.point.gmis_per_gpu) == (impl, gmis)
+            and isinstance(one.result, Measured)
+        )
+        style = {
+            "color": f"C{gmis - 1}",
+            "linestyle": ("-", "--")[impls.index(impl)],
+            "marker": "o",
+            "label": f"{gmis}, {impl}",
+        }
+        sizes = [size for size, _ in ran]
+        left.plot(sizes, [gmis * one.env_steps_per_s for _, one in ran], **style)
+        right.plot(sizes, [one.memory_mib for _, one in ran], **style)
+    for axes, what in ((left, "env steps/s of one GPU"), (right, "peak memory of a GMI, MiB")):
+        axes.set(xlabel="environments per GMI", ylabel=what, xscale="log", ylim=(0, None))
+        axes.grid(alpha=0.3)
+    left.legend(title="GMIs per GPU", fontsize="small")
+    figure.suptitle(title)
+    figure.savefig(picture, dpi=120)
+
+
+def _found(point: Point, result: Measured | NotRunnable) -> str:
+    if isinstance(result, NotRunnable):
+        return f"not runnable: {result.reason}"
+    return (
+        f"{result.env_steps_per_s:,.0f} env steps/s a GMI, "
+        f"{point.gmis_per_gpu * result.env_steps_per_s:,.0f} a GPU, {result.memory_mib:,.0f} MiB"
+    )
+
+
+def _highest(outcome: Outcome, wanted: Any) -> Visited | None:
+    fitting = [one for one in outcome.visited if one.projected and wanted(one.point.gmis_per_gpu)]
+    return max(fitting, key=lambda one: one.projected) if fitting else None
+
+
+def _json_number(value: float | None) -> float | str | None:
+    return "infinite" if value is not None and math.isinf(value) else value

@@ -1,0 +1,283 @@
+"""The controller of `gmijax.serve`: from a policy to throughput, latency and experience.
+
+No jax here. Like `gmijax.job`, it checks everything that can be checked before anything is
+started, runs the GMIs of a plan, and writes the summary however the job ends.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import json
+import time
+from collections.abc import Sequence
+from contextlib import ExitStack, suppress
+from functools import partial
+from pathlib import Path
+from typing import Any, Literal, NamedTuple
+
+from rich.console import Console
+
+from gmijax import served
+from gmijax.collectives.pipe_block import create_pipes
+from gmijax.config import PhysicsConfig, ServeConfig
+from gmijax.datadir import DataPaths, locked, open_dataset
+from gmijax.errors import ConfigError, GmijaxError, JobInterrupted
+from gmijax.launcher import Launch, run_gmis
+from gmijax.partition.child import ENV_PIPES_FD
+from gmijax.partition.machine import Machine, detect_machine
+from gmijax.partition.plan import Plan
+from gmijax.partition.planner import make_plan
+from gmijax.partition.supervisor import Patience
+from gmijax.partition.templates import SIMULATOR, group_of
+from gmijax.progress import ConsoleProgress, SilentProgress
+from gmijax.resume import CheckpointMeta, find_checkpoint, trained_config
+from gmijax.rundir import RunPaths, create_run, read_json, write_json
+from gmijax.schema import to_dict
+from gmijax.serving_search import NO_REDUCTION, decided
+from gmijax.sim import source
+from gmijax.sim.impl import choose_impl
+from gmijax.sim.registry import require_task
+
+
+class Served(NamedTuple):
+    """What a serving job leaves.
+
+    Attributes:
+      run_dir: the folder of the job.
+      summary: the content of its `summary.json`.
+      data_dir: the folder of the experience, None where nothing was written.
+    """
+
+    run_dir: Path
+    summary: dict[str, Any]
+    data_dir: Path | None
+
+
+class _Job(NamedTuple):
+    """A serving job that is ready to start."""
+
+    config: ServeConfig
+    plan: Plan
+    machine: Machine
+    simulators: tuple[int, ...]
+    data: DataPaths | None
+    reasons: tuple[str, ...]
+
+    @property
+    def steps_per_unroll(self) -> int:
+        return self.config.envs_per_gmi * self.config.unroll_length
+
+    @property
+    def wanted_unrolls(self) -> int:
+        return len(self.simulators) * self.config.unrolls_per_gmi(len(self.simulators))
+
+    def finished_unrolls(self) -> int:
+        """Of the wanted ones, how many are in the output folder."""
+        each = self.config.unrolls_per_gmi(len(self.simulators))
+        if self.data is None:
+            return 0
+        return sum(min(self.data.num_finished(r), each) for r in range(len(self.simulators)))
+
+
+def serve(config: ServeConfig, *, show: bool = False) -> Served:
+    """Collects experience in the GMIs of a plan, and returns when all have ended.
+
+    Args:
+      config: see `gmijax.compose(..., command="serve")`.
+      show: print the plan, live progress and the outcome.
+
+    Raises:
+      ConfigError: bad input, before anything was started.
+      GmiFailed: a GMI failed; finished shards of experience stay.
+      JobInterrupted: SIGINT, SIGTERM or SIGHUP came; the same command goes on with what is there.
+    """
+    console = Console(stderr=False, quiet=not show, soft_wrap=True, highlight=False)
+    job = _prepared(config, console)
+    with ExitStack() as held:
+        if job.data is not None:
+            open_dataset(job.data, _about(job))
+            held.enter_context(locked(job.data))
+        kept = job.finished_unrolls()
+        if kept and kept == job.wanted_unrolls:
+            raise ConfigError(
+                f"num_timesteps={job.config.num_timesteps}: output.dir={job.config.output.dir} "
+                f"has {kept * job.steps_per_unroll} steps already; give more in all"
+            )
+        env = job.config.env
+        run = create_run(None, job.config.run.name, f"{env.slug}-serve")
+        write_json(run.config, to_dict(job.config))
+        write_json(run.plan, job.plan.to_dict())
+        _announce(console, job, kept, run)
+        summary = _run(job, kept, run, console)
+    console.print(served.outcome(summary, run), markup=False)
+    return Served(run.root, summary, None if job.data is None else job.data.root)
+
+
+def _prepared(config: ServeConfig, console: Console) -> _Job:
+    """Everything that can be checked and decided without starting anything."""
+    require_task(str(config.env.name), config.env.suite)
+    config = dataclasses.replace(config, env=source.pinned(config.env))
+    config, wanted_impl = _with_checkpoint(config)
+    machine = detect_machine()
+    config, found = decided(
+        dataclasses.replace(config, physics=PhysicsConfig(impl=wanted_impl)), machine, console
+    )
+    plan = make_plan(config.plan, NO_REDUCTION, config.envs_per_gmi, machine, template="tcg")
+    platform = "cpu" if plan.backend == "cpu" else "gpu"
+    impl, why = choose_impl(config.physics.impl, platform, config.env.label)
+    data = None
+    output = config.output
+    if output.dir is not None:
+        data = DataPaths(Path(output.dir).resolve())
+        output = dataclasses.replace(output, dir=str(data.root))
+    config = dataclasses.replace(
+        config, physics=dataclasses.replace(config.physics, impl=impl), output=output
+    )
+    group = group_of(plan.layout, plan.roles, SIMULATOR)
+    assert group is not None
+    reasons = (*plan.reasons, *found, f"physics.impl {impl}: {why}")
+    return _Job(config, plan, machine, group.gmis, data, reasons)
+
+
+def _with_checkpoint(config: ServeConfig) -> tuple[ServeConfig, Literal["auto", "jax", "warp"]]:
+    """The configuration with `run.dir` as the path of a checkpoint, and which MJX is wanted."""
+    wanted = config.physics.impl
+    if config.run.dir is None:
+        return config, wanted
+    checkpoint = find_checkpoint(config.run.dir, "run.dir")
+    meta = CheckpointMeta.read(checkpoint)
+    trained_config(checkpoint)  # What is broken shows here, and not in every GMI.
+    if meta.env != config.env.label:
+        raise ConfigError(
+            f"env={config.env.label}: run.dir={config.run.dir} was trained on {meta.env}"
+        )
+    if wanted == "auto" and meta.impl == "jax":
+        wanted = "jax"  # A policy may depend on what it was trained with.
+    run = dataclasses.replace(config.run, dir=str(checkpoint))
+    return dataclasses.replace(config, run=run), wanted
+
+
+def _about(job: _Job) -> dict[str, Any]:
+    """What all experience in one folder has in common, as it comes back from JSON."""
+    config = job.config
+    about = {
+        "env": dataclasses.asdict(config.env),
+        "impl": config.physics.impl,
+        "policy": config.policy,
+        "checkpoint_sha256": None if config.run.dir is None else _sha256(Path(config.run.dir)),
+        "deterministic": config.deterministic,
+        "seed": config.seed,
+        "num_simulators": len(job.simulators),
+        "num_envs": config.envs_per_gmi,
+        "unroll_length": config.unroll_length,
+        "next_obs": config.output.next_obs,
+    }
+    return json.loads(json.dumps(about))
+
+
+def _sha256(checkpoint: Path) -> str:
+    """Of the learner's files in a checkpoint, wherever it lies."""
+    sha = hashlib.sha256()
+    folder = checkpoint / "learner"
+    for path in sorted(folder.rglob("*")):
+        if path.is_file():
+            sha.update(path.relative_to(folder).as_posix().encode())
+            sha.update(path.read_bytes())
+    return sha.hexdigest()
+
+
+def _run(job: _Job, kept: int, run: RunPaths, console: Console) -> dict[str, Any]:
+    """Runs the GMIs; returns the summary, which is written however they end."""
+    started_s = time.monotonic()
+    lines = served.CollectedLines(run, job.simulators, kept * job.steps_per_unroll)
+    total = job.wanted_unrolls * job.steps_per_unroll
+    progress = SilentProgress() if console.quiet else ConsoleProgress(console, lines, total)
+    status = "failed"
+    try:
+        with progress:
+            run_gmis(_launch(job, run, console), progress.update)
+        status = "completed"
+    except JobInterrupted as error:
+        status = "interrupted"
+        error.add_note(_what_is_left(job))
+        raise
+    except GmijaxError as error:
+        error.add_note(f"run folder: {run.root}")
+        raise
+    finally:
+        # A full disk must not hide why the job failed.
+        with suppress(OSError):
+            wall_s = time.monotonic() - started_s
+            plan = Plan.from_dict(read_json(run.plan))  # Its backend may have been replaced.
+            summary = served.summarise(job.config, plan, run, status, wall_s)
+            write_json(run.summary, summary | {"output": _output(job, kept)})
+    return read_json(run.summary)
+
+
+def _launch(job: _Job, run: RunPaths, console: Console) -> Launch:
+    times = job.config.run
+    pipes = partial(create_pipes, job.plan.layout.num_gmis, job.config.pipe_bytes)
+    return Launch(
+        plan=job.plan,
+        machine=job.machine,
+        run=run,
+        module="gmijax.serving_worker",
+        patience=Patience(
+            start_timeout_s=times.start_timeout_s,
+            stall_timeout_s=times.stall_timeout_s,
+            stop_timeout_s=times.stall_timeout_s,
+            grace_s=times.grace_s,
+        ),
+        shared={ENV_PIPES_FD: pipes} if job.plan.template == "tdg" else {},
+        on_warning=lambda text: console.print(text, markup=False),
+    )
+
+
+def _output(job: _Job, kept: int) -> dict[str, Any] | None:
+    """What is in the output folder now, None without one."""
+    if job.data is None:
+        return None
+    finished = list(job.data.finished())
+    return {
+        "dir": str(job.data.root),
+        "shards": len(finished),
+        "shards_kept": kept,
+        "env_steps": len(finished) * job.steps_per_unroll,
+        "bytes": sum(shard.arrays.stat().st_size for shard in finished),
+    }
+
+
+def _what_is_left(job: _Job) -> str:
+    if job.data is None:
+        return "nothing was to be written"
+    done = job.finished_unrolls()
+    return (
+        f"{done} of {job.wanted_unrolls} shards are in {job.data.root}; "
+        "the same command makes the rest"
+    )
+
+
+def _announce(console: Console, job: _Job, kept: int, run: RunPaths) -> None:
+    plan = job.plan
+    layout = [list(gmis) for gmis in plan.layout.gmis_of_gpu]
+    console.print(f"run folder: {run.root}", markup=False)
+    console.print(
+        f"plan: layout {layout}, backend {plan.backend}, template {plan.template}, "
+        f"{plan.num_envs_per_gmi} environments in each of {len(job.simulators)} GMIs",
+        markup=False,
+    )
+    _print_all(console, job.reasons)
+    if job.config.run.dir is not None:
+        console.print(f"policy: {job.config.run.dir}", markup=False)
+    if kept:
+        console.print(
+            f"continuing {job.data and job.data.root}: {kept} of {job.wanted_unrolls} shards are "
+            "there",
+            markup=False,
+        )
+
+
+def _print_all(console: Console, lines: Sequence[str]) -> None:
+    for line in lines:
+        console.print(f"  {line}", markup=False)

@@ -1,0 +1,174 @@
+"""Main of one serving GMI: `python -m gmijax.serving_worker`, started by `gmijax.serving`.
+
+Reads the run folder, does what the plan gives to this GMI, and writes `result.json`.
+"""
+
+from __future__ import annotations
+
+import os
+import resource
+import sys
+from contextlib import ExitStack
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from gmijax.config import ServeConfig
+from gmijax.datadir import DataPaths
+from gmijax.partition.child import ENV_PIPES_FD, ChildLink, inherited_fd, run_gmi
+from gmijax.partition.layout import Layout
+from gmijax.partition.plan import Plan
+from gmijax.partition.templates import AGENT, SIMULATOR, group_of, has_role
+from gmijax.rundir import read_json
+from gmijax.schema import from_dict
+
+if TYPE_CHECKING:
+    from gmijax.collection.policy import ActingPolicy
+    from gmijax.collection.shards import ShardWriter
+    from gmijax.collection.share import Share
+    from gmijax.collectives.interface import Reducer
+    from gmijax.sim.interface import EnvSpec
+
+
+def main() -> int:
+    """Runs this process's GMI; returns the exit code."""
+    return run_gmi(_run)
+
+
+def _run(link: ChildLink) -> dict[str, Any]:
+    config = from_dict(ServeConfig, read_json(link.run.config))
+    plan = Plan.from_dict(read_json(link.run.plan))
+    roles = plan.roles[link.gmi]
+    own = SIMULATOR if has_role(roles, SIMULATOR) else AGENT
+    group = group_of(plan.layout, plan.roles, own)
+    assert group is not None
+    rank = group.gmis.index(link.gmi)
+    # jax starts here, in the environment that the plan prepared.
+    from gmijax.collection.share import Share
+    from gmijax.selfcheck import check_share
+    from gmijax.sim.build import make_training_env
+
+    check_share(plan, link.gmi)
+    env = make_training_env(
+        config.env,
+        config.physics.impl,
+        seed=config.seed,
+        first_env=rank * config.envs_per_gmi,
+        num_envs=config.envs_per_gmi,
+    )
+    policy = _policy(config, env.spec)
+    first, num_unrolls = _unrolls(config, rank, len(group.gmis)) if own == SIMULATOR else (0, 0)
+    with ExitStack() as held:
+        reducer = _barrier(config, plan.layout, link)
+        held.callback(reducer.close)
+        writer = None
+        if own == SIMULATOR and config.output.dir is not None:
+            writer = _writer(config, rank, first, policy)
+            held.callback(writer.close)
+        share = Share(
+            config, link, env, policy, rank, first, num_unrolls, writer, _meeting(reducer)
+        )
+        result = _work(share, plan, roles, held)
+    written = {} if writer is None else {"shards": writer.num_written, "bytes": writer.num_bytes}
+    return {
+        **{"roles": roles, "policy_digest": policy.digest, "device": _device()},
+        **{"first_unroll": first, "written": written},
+        **result,
+    }
+
+
+def _work(share: Share, plan: Plan, roles: str, held: ExitStack) -> dict[str, Any]:
+    """Runs the part that the template gives to this GMI."""
+    from gmijax.collection import colocated, dedicated
+    from gmijax.collectives.pipe_block import PipeBlock
+
+    if has_role(roles, SIMULATOR) and has_role(roles, AGENT):
+        return colocated.collect(share)
+    gmi, layout = share.link.gmi, plan.layout
+    fd = inherited_fd(os.environ, ENV_PIPES_FD)
+    assert fd is not None  # The controller makes pipes for this template.
+    block = PipeBlock.attach(fd, gmi, layout.num_gmis, share.config.pipe_bytes)
+    held.callback(block.close)
+    wanted = AGENT if has_role(roles, SIMULATOR) else SIMULATOR
+    peers = [
+        dedicated.Peer(block, other, share.config.run.exchange_timeout_s)
+        for other in sorted(layout.neighbours_of(gmi))
+        if has_role(plan.roles[other], wanted)
+    ]
+    if wanted == AGENT:
+        return dedicated.run_simulator(share, peers[0])
+    return dedicated.run_agent(share, peers)
+
+
+def _policy(config: ServeConfig, spec: EnvSpec) -> ActingPolicy:
+    from gmijax.collection.policy import random_policy, trained_policy
+
+    if config.policy == "random":
+        return random_policy(spec)
+    return trained_policy(Path(str(config.run.dir)), spec, deterministic=config.deterministic)
+
+
+def _unrolls(config: ServeConfig, rank: int, num_simulators: int) -> tuple[int, int]:
+    """How many unrolls of GMI `rank` are there already, and how many are left."""
+    wanted = config.unrolls_per_gmi(num_simulators)
+    if config.output.dir is None:
+        return 0, wanted
+    first = DataPaths(Path(config.output.dir)).num_finished(rank)
+    return first, max(0, wanted - first)
+
+
+def _writer(config: ServeConfig, rank: int, first: int, policy: ActingPolicy) -> ShardWriter:
+    from gmijax.collection.shards import ShardWriter
+
+    about = {
+        "env": config.env.label,
+        "seed": config.seed,
+        "first_env": rank * config.envs_per_gmi,
+        "num_envs": config.envs_per_gmi,
+        "first_unroll_of_job": first,
+        "policy": policy.digest,
+        "deterministic": config.deterministic,
+    }
+    paths = DataPaths(Path(str(config.output.dir)))
+    return ShardWriter(paths, rank, first, about, compress=config.output.compress)
+
+
+def _barrier(config: ServeConfig, layout: Layout, link: ChildLink) -> Reducer:
+    """What the GMIs meet with; it needs no gradients."""
+    from gmijax.collectives.build import Membership, build_reducer
+
+    return build_reducer(
+        "mpr" if layout.num_gmis > 1 else "none",
+        Membership(
+            layout=layout,
+            rank=link.gmi,
+            num_floats=1,
+            exchange_fd=link.exchange_fd,
+            timeout_s=config.run.exchange_timeout_s,
+            rendezvous_timeout_s=config.run.start_timeout_s,
+            world=None,
+            intra="host",
+        ),
+    )
+
+
+def _meeting(reducer: Reducer) -> Any:
+    import numpy as np
+
+    return lambda: reducer.all_gather(np.zeros(1, np.float32))
+
+
+def _device() -> dict[str, Any]:
+    import jax
+
+    device = jax.local_devices()[0]
+    peak = (device.memory_stats() or {}).get("peak_bytes_in_use")
+    return {
+        "platform": device.platform,
+        "kind": device.device_kind,
+        "peak_memory_mib": peak / 2**20 if peak else None,
+        "peak_host_memory_mib": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**10,
+    }
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,122 @@
+"""What the experience channels promise, checked with real processes; no jax in them."""
+
+from __future__ import annotations
+
+import signal
+import time
+from itertools import product
+from pathlib import Path
+from typing import Any, get_args, get_type_hints
+
+import numpy as np
+import pytest
+
+from benchmarks.channel_job import ChannelJob
+from gmijax.collectives.channel.build import Places
+from gmijax.config.channel import ChannelConfig
+
+pytestmark = pytest.mark.timeout(120)
+
+TIMEOUT_S = 3.0
+KINDS = get_type_hints(ChannelConfig)
+DESIGNS, TRANSPORTS = get_args(KINDS["design"]), get_args(KINDS["transport"])
+PLACES = Places(agents=(0, 1, 2), trainers=(3, 4), gpu_of=(0, 0, 1, 2, 3))
+
+
+def config(**keys: Any) -> ChannelConfig:
+    return ChannelConfig(**{"capacity_mib": 1, **keys})
+
+
+def require_zmq(transport: str) -> None:
+    if transport == "zmq":
+        pytest.importorskip("zmq")
+
+
+def require_all_once(job: ChannelJob, count: int) -> None:
+    """Every unroll of every agent reached one trainer, once; each trainer got them in order."""
+    for agent in job.places.agents:
+        parts = [job.numbers(trainer, agent) for trainer in job.places.trainers]
+        for part in parts:
+            assert (np.diff(part) > 0).all()
+        np.testing.assert_array_equal(np.sort(np.concatenate(parts)), np.arange(count))
+
+
+@pytest.mark.parametrize(("design", "transport"), list(product(DESIGNS, TRANSPORTS)))
+def test_nothing_is_lost_doubled_torn_or_out_of_order(
+    design: Any, transport: Any, tmp_path: Path
+) -> None:
+    """10^5 unrolls with pauses; batches neither fit into transfers nor the other way round."""
+    require_zmq(transport)
+    count = 33_600
+    task = {"count": count, "envs": 200, "batch": 77, "steps": 2, "pause_chance": 0.1}
+    settings = config(design=design, transport=transport)
+    with ChannelJob(tmp_path, settings, PLACES, **task).start() as job:
+        for rank in job.ranks:
+            assert job.result(rank)["error"] is None
+        require_all_once(job, count)
+        assert sum(job.result(trainer)["unrolls"] for trainer in (3, 4)) >= 3 * count
+
+
+@pytest.mark.parametrize("transport", TRANSPORTS)
+def test_the_trainer_with_less_to_do_gets_more(transport: Any, tmp_path: Path) -> None:
+    require_zmq(transport)
+    places = Places(agents=(0,), trainers=(1, 2), gpu_of=(0, 1, 2))
+    task = {"count": 20_000, "envs": 100, "batch": 100, "sizes": (50, 2), "pause_chance": 1.0}
+    # Room for all of it, so that only the load can tell.
+    settings = config(transport=transport, capacity_mib=32)
+    with ChannelJob(tmp_path, settings, places, **task) as job:
+        job.start(1, busy_s=0.05).start(2).wait_for("open")
+        job.start(0)
+        slow, quick = (job.result(rank)["unrolls"] for rank in (1, 2))
+        assert slow + quick == 20_000
+        assert quick > 3 * slow
+
+
+@pytest.mark.parametrize("transport", TRANSPORTS)
+def test_an_agent_that_finds_no_room_waits_as_told(transport: Any, tmp_path: Path) -> None:
+    require_zmq(transport)
+    places = Places(agents=(0,), trainers=(1,), gpu_of=(0, 0))
+    task = {"count": 10**6, "envs": 100, "batch": 100, "sizes": (50, 2), "timeout_s": 1.0}
+    with ChannelJob(tmp_path, config(transport=transport), places, **task) as job:
+        job.start(1, timeout_s=30.0).wait_for("open")
+        started_s = job.signal(1, signal.SIGSTOP)
+        job.start(0)
+        result = job.result(0)
+        # `send` said False; the process of the test makes an error of it.
+        assert (result["error"], result["peers"]) == ("CollectiveTimeout", [1])
+        assert result["ended_s"] - started_s < 10.0
+
+
+@pytest.mark.parametrize(
+    ("transport", "victim"), [("memory", 0), ("memory", 4), ("zmq", 0), ("zmq", 4)]
+)
+def test_a_killed_process_is_named_and_leaves_nothing(
+    transport: Any, victim: int, tmp_path: Path
+) -> None:
+    require_zmq(transport)
+    before = set(Path("/dev/shm").iterdir())
+    task = {"count": 10**7, "envs": 50, "pause_chance": 0.5, "timeout_s": 20.0}
+    with ChannelJob(tmp_path, config(transport=transport), PLACES, **task).start() as job:
+        job.wait_for("open")
+        time.sleep(0.3)
+        killed_s = job.signal(victim, signal.SIGKILL)
+        others = PLACES.trainers if victim in PLACES.agents else PLACES.agents
+        for rank in others:
+            result = job.result(rank)
+            assert (result["error"], result["peers"]) == ("PeerLost", [victim])
+            assert result["ended_s"] - killed_s < TIMEOUT_S
+    assert set(Path("/dev/shm").iterdir()) <= before
+
+
+def test_a_successor_of_a_killed_agent_goes_on_where_it_was(tmp_path: Path) -> None:
+    count, victim = 20_000, 1
+    task = {"count": count, "envs": 50, "batch": 33, "pause_chance": 0.5, "goes_on": True}
+    with ChannelJob(tmp_path, config(), PLACES, **task).start() as job:
+        job.wait_for("third", victim)
+        job.end(victim)
+        time.sleep(0.3)
+        job.start(victim)
+        assert [job.result(rank)["error"] for rank in job.ranks] == [None] * 5
+        assert count // 6 < job.result(victim)["first"] < count
+        assert victim in {peer for trainer in (3, 4) for peer in job.result(trainer)["lost"]}
+        require_all_once(job, count)

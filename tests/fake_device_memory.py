@@ -1,0 +1,58 @@
+"""Device memory for `gmijax.collectives.ipc` without a device: a file without a name.
+
+jax reads it in place, as it reads memory of a GPU: a program sees what is there when it runs.
+"""
+
+from __future__ import annotations
+
+import mmap
+import os
+import struct
+
+import jax
+import numpy as np
+
+from gmijax.collectives.ipc import TICKET_BYTES
+
+
+class FakeDeviceMemory:
+    """A `DeviceMemory` that processes of one user share."""
+
+    def __init__(self) -> None:
+        self._mapping: mmap.mmap | None = None
+
+    def create(self, num_bytes: int) -> bytes:
+        fd = os.memfd_create("fake-device-memory", os.MFD_CLOEXEC)
+        os.ftruncate(fd, num_bytes)
+        self._mapping = mmap.mmap(fd, num_bytes)
+        return struct.pack("=qqq", os.getpid(), fd, num_bytes).ljust(TICKET_BYTES, b"\xff")
+
+    def open(self, ticket: bytes) -> None:
+        pid, fd, num_bytes = struct.unpack_from("=qqq", ticket)
+        opened = os.open(f"/proc/{pid}/fd/{fd}", os.O_RDWR)
+        self._mapping = mmap.mmap(opened, num_bytes)
+        os.close(opened)
+
+    def write(self, offset: int, values: jax.Array) -> None:
+        place = self._floats(offset, values.size)
+        place[:] = np.asarray(values)
+
+    def view(self, offset: int, shape: tuple[int, ...]) -> jax.Array:
+        floats = self._floats(offset, int(np.prod(shape))).reshape(shape)
+        view = jax.dlpack.from_dlpack(floats, copy=False)
+        assert view.unsafe_buffer_pointer() == floats.ctypes.data
+        return view
+
+    def close(self) -> None:
+        self._mapping = None
+
+    def _floats(self, offset: int, count: int) -> np.ndarray:
+        assert self._mapping is not None
+        return np.frombuffer(self._mapping, np.float32, count, offset)
+
+
+class BrokenDeviceMemory(FakeDeviceMemory):
+    """Takes what is written and forgets it: the others see nothing of it."""
+
+    def write(self, offset: int, values: jax.Array) -> None:
+        del offset, values

@@ -1,0 +1,93 @@
+"""Every reduction strategy on real GPUs. Run with `pytest -m gpu tests/gpu/test_reducers_gpu.py`.
+
+With pytest-xdist (`-n 4`) the cases run at the same time, from another GPU on in each worker.
+"""
+
+from __future__ import annotations
+
+import os
+import signal
+from pathlib import Path
+
+import numpy as np
+import pytest
+from training_jobs import STEPS, TINY, learner_arrays, train
+
+from gmijax.partition.layout import Layout
+from gmijax.partition.nvidia import list_gpus
+from gmijax.partition.reduction import why_not_intra
+from tests.reducer_contract import PAIRS, Case, check_contract
+
+pytestmark = [pytest.mark.gpu, pytest.mark.timeout(200)]
+
+STRATEGIES = ("mrr", "har", "flat")
+FOUR = Case(Layout.even(4, 1), 100_003, signal.SIGKILL, 2)
+FOUR_BY_FOUR = Case(Layout.even(4, 4), 290_000, signal.SIGSTOP, 5)
+ALL = [
+    # Through host memory alone there is no GPU in it.
+    *((strategy, intra, case) for strategy, intra, case in PAIRS if strategy in STRATEGIES),
+    *((strategy, "host", FOUR) for strategy in ("mrr", "flat")),
+    *(("mrr", "host", FOUR_BY_FOUR), ("har", "ipc", FOUR_BY_FOUR)),
+]
+ITERATIONS = 13
+"""Of four updates each: 52 updates."""
+
+WAYS = {
+    1: ("mrr", "flat", "har reduce.intra=ipc"),
+    2: ("mrr", "har reduce.intra=host", "har reduce.intra=ipc"),
+}
+"""What is compared with mpr, by GMIs on each of two GPUs."""
+
+
+def _gpus(count: int) -> list[int]:
+    """Indices of `count` GPUs."""
+    found = [gpu.index for gpu in list_gpus()]
+    if len(found) < count:
+        pytest.skip(f"needs {count} GPUs")
+    worker = int(os.environ.get("PYTEST_XDIST_WORKER", "gw0").removeprefix("gw"))
+    return [found[(worker * count + k) % len(found)] for k in range(count)]
+
+
+def _require(intra: str) -> None:
+    if reason := why_not_intra(intra, "share"):
+        pytest.skip(reason)
+
+
+@pytest.mark.parametrize(
+    ("strategy", "intra", "case"),
+    ALL,
+    ids=[f"{name}-{intra}-{case.layout}" for name, intra, case in ALL],
+)
+def test_the_contract(strategy: str, intra: str, case: Case, tmp_path: Path) -> None:
+    _require(intra)
+    check_contract(strategy, intra, case, tmp_path, _gpus(case.layout.num_gpus))
+
+
+@pytest.mark.timeout(400)
+@pytest.mark.parametrize("gmis_per_gpu", WAYS)
+def test_learning_does_not_depend_on_the_strategy(
+    gmis_per_gpu: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Parameters after 52 updates agree to the order of sums, on two GPUs."""
+    _require("ipc")
+    # Otherwise a job differs from itself: sums with atomic operations, products in TF32.
+    monkeypatch.setenv("XLA_FLAGS", "--xla_gpu_deterministic_ops=true")
+    monkeypatch.setenv("JAX_DEFAULT_MATMUL_PRECISION", "highest")
+    gpus = ",".join(map(str, _gpus(2)))
+    backend = "mps" if gmis_per_gpu > 1 else "share"
+    plan = (f"plan.gpus=[{gpus}]", f"plan.gmis_per_gpu={gmis_per_gpu}", f"plan.backend={backend}")
+    steps = ITERATIONS * 2 * gmis_per_gpu * STEPS
+
+    def trained(way: str) -> list[np.ndarray]:
+        run = tmp_path / way.replace(" ", "-")
+        overrides = f"reduce.strategy={way} num_timesteps={steps} run.dir={run}".split()
+        done = train(*TINY, *plan, *overrides, cwd=tmp_path)
+        assert done.returncode == 0, done.stderr
+        return learner_arrays(run)
+
+    expected = trained("mpr")
+    assert len(expected) > 10
+    for way in WAYS[gmis_per_gpu]:
+        for found, array in zip(trained(way), expected, strict=True):
+            # Each update moves a parameter by 3e-4 at most.
+            np.testing.assert_allclose(found, array, rtol=1e-4, atol=1e-5, err_msg=way)

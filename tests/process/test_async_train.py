@@ -1,0 +1,178 @@
+"""Real asynchronous jobs in real processes, on a task that compiles in a second."""
+
+from __future__ import annotations
+
+import json
+import signal
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from training_jobs import (
+    FOREVER,
+    gmi_pid,
+    iteration_of,
+    kill,
+    learner_arrays,
+    pids_of,
+    shared_memory,
+    start,
+    train,
+    wait_until,
+)
+
+from gmijax.resume import find_checkpoint
+
+TESTS = Path(__file__).parents[1]
+TASK = f"""
+import sys
+sys.path.insert(0, {str(TESTS)!r})
+from toy_env import point_mass_env
+
+def make(*, impl, max_envs):
+    return point_mass_env()
+"""
+N, T = 16, 4
+UPDATE = N * T
+"""Environment steps of one batch of one trainer."""
+
+SMALL = (
+    *("env=point.py:make", "algo=a3c", f"num_envs={N}", f"algo.unroll_length={T}"),
+    *("algo.num_minibatches=2", "algo.num_updates_per_batch=2", "run.grace_s=3"),
+    *("algo.policy_hidden_layer_sizes=[16]", "algo.value_hidden_layer_sizes=[16]"),
+    "reduce.timeout_s=30",
+)
+
+
+def _folder(path: Path) -> Path:
+    path.mkdir(exist_ok=True)
+    (path / "point.py").write_text(TASK)
+    return path
+
+
+def _read(path: Path) -> dict[str, Any]:
+    return json.loads(path.read_text())
+
+
+@pytest.fixture(scope="module")
+def two_and_two(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Two agents and two trainers, 150 updates."""
+    cwd = _folder(tmp_path_factory.mktemp("async"))
+    done = train(
+        *SMALL, "plan.serving_gmis_per_gpu=2", "plan.training_gmis_per_gpu=2",
+        f"num_timesteps={150 * 2 * UPDATE}", "run.checkpoint_every=50", "run.dir=run", cwd=cwd,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    return cwd / "run"
+
+
+@pytest.mark.timeout(300)
+def test_the_summary_has_the_figures_of_the_paper(two_and_two: Path) -> None:
+    summary = _read(two_and_two / "summary.json")
+    assert (summary["status"], summary["algo"]) == ("completed", "a3c")
+    # Unrolls that were too old do not count: a few updates more may have been needed.
+    assert 0 <= summary["env_steps"] - 150 * 2 * UPDATE < 2 * UPDATE
+    plan = summary["plan"]
+    assert (plan["template"], plan["strategy"], plan["layout"]) == (
+        "decoupled",
+        "mpr",
+        [[0, 1, 2, 3]],
+    )
+    assert plan["roles"] == ["trainer"] * 2 + ["simulator+agent"] * 2
+    assert summary["pps"] > 0
+    assert summary["ttop"] > 0
+    assert 0 <= summary["staleness"]["mean"] <= summary["staleness"]["p99"] <= 32
+    assert summary["dropped"] == 0
+    assert Path(summary["checkpoint"]).is_dir()
+
+
+def test_lines_tell_of_acting_learning_and_what_lies_between(two_and_two: Path) -> None:
+    lines = [json.loads(text) for text in (two_and_two / "metrics.jsonl").read_text().splitlines()]
+    assert lines[-1]["env_steps"] == _read(two_and_two / "summary.json")["env_steps"]
+    assert {
+        *("async/pps", "async/ttop", "async/staleness_mean", "async/staleness_p99"),
+        *("channel/occupancy", "channel/bytes_per_s", "channel/dropped", "time/receive_s"),
+        *("loss/behaviour_kl", "return", "policy/learning_rate"),
+    } <= lines[-1].keys()
+    # What was acted upon was learnt from, is too old, or still on its way.
+    agents = [_read(two_and_two / f"gmi_{gmi}" / "result.json") for gmi in (2, 3)]
+    acted = sum(result["env_steps"] for result in agents)
+    assert acted >= lines[-1]["env_steps"]
+
+
+def test_every_agent_adds_its_environments_to_the_checkpoint(two_and_two: Path) -> None:
+    checkpoint = find_checkpoint(str(two_and_two), "test")
+    assert sorted(p.name for p in checkpoint.iterdir()) == [
+        "gmi_2",
+        "gmi_3",
+        "learner",
+        "meta.json",
+    ]
+
+
+@pytest.mark.timeout(300)
+def test_a_job_goes_on_from_its_checkpoint(two_and_two: Path) -> None:
+    cwd, before = two_and_two.parent, _read(two_and_two / "summary.json")["env_steps"]
+    more = before + 20 * 2 * UPDATE
+    done = train(f"run.resume={two_and_two}", f"num_timesteps={more}", "run.dir=on", cwd=cwd)
+    assert done.returncode == 0, done.stderr
+    assert _read(cwd / "on" / "summary.json")["env_steps"] >= more
+    old, new = learner_arrays(two_and_two), learner_arrays(cwd / "on")
+    assert [a.shape for a in old] == [a.shape for a in new]
+    assert not all(np.array_equal(a, b) for a, b in zip(old, new, strict=True))
+    lines = [json.loads(text) for text in (cwd / "on" / "metrics.jsonl").read_text().splitlines()]
+    assert lines[0]["env_steps"] < before < lines[-1]["env_steps"]
+
+
+@pytest.mark.timeout(120)
+def test_a_killed_agent_ends_the_job_and_is_named(tmp_path: Path) -> None:
+    cwd, shm = _folder(tmp_path), shared_memory()
+    run = cwd / "run"
+    job = start(*SMALL, FOREVER, "plan.serving_gmis_per_gpu=2", "run.dir=run", cwd=cwd)
+    wait_until(lambda: iteration_of(run, 0) and iteration_of(run, 2), 90, "updates")
+    pid = gmi_pid(run, 2)
+    assert pid is not None
+    killed = time.monotonic()
+    kill(pid)
+    assert job.wait(timeout=20) == 1
+    assert time.monotonic() - killed < 10
+    assert pids_of(run) == []
+    error = (cwd / "stderr.txt").read_text()
+    assert "GMI 2 failed" in error
+    assert "SIGKILL" in error
+    assert shared_memory() <= shm
+
+
+@pytest.mark.timeout(120)
+def test_an_interrupt_saves_the_whole_job(tmp_path: Path) -> None:
+    cwd = _folder(tmp_path)
+    run = cwd / "run"
+    job = start(*SMALL, FOREVER, "plan.gpus=2", "run.dir=run", cwd=cwd)
+    wait_until(lambda: iteration_of(run, 0) and iteration_of(run, 1), 90, "updates")
+    job.send_signal(signal.SIGINT)
+    assert job.wait(timeout=40) == 130
+    assert pids_of(run) == []
+    assert _read(run / "summary.json")["status"] == "interrupted"
+    assert (find_checkpoint(str(run), "test") / "gmi_1").is_dir()
+
+
+@pytest.mark.parametrize(
+    ("overrides", "said"),
+    [
+        (("plan.training_gmis_per_gpu=0",), "plan.training_gmis_per_gpu=0"),
+        (("plan.serving_gpus=0", "plan.training_gpus=1"), "plan.serving_gpus=0"),
+        (("channel.capacity_mib=100000000",), "channel.capacity_mib=100000000"),
+        (("algo.batch_size=24",), "algo.batch_size=24"),
+        (("algo.num_minibatches=3",), "algo.num_minibatches=3"),
+        (("plan.template=tcg_ex",), "plan.template=tcg_ex"),
+        (("plan.training_gmis_per_gpu=2", "reduce.strategy=mrr"), "reduce.strategy=mrr"),
+    ],
+)
+def test_bad_input_starts_nothing(tmp_path: Path, overrides: tuple[str, ...], said: str) -> None:
+    done = train(*SMALL, *overrides, "run.dir=run", cwd=_folder(tmp_path))
+    assert done.returncode == 2, done.stderr
+    assert said in done.stderr
+    assert len(done.stderr.strip().splitlines()) == 1
+    assert not (tmp_path / "run").exists()

@@ -1,0 +1,106 @@
+"""Training with trainers in GMIs of their own (`plan.template=tdg_ex`), on a tiny task."""
+
+from __future__ import annotations
+
+import json
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from test_custom_task import SMALL, TASK
+from training_jobs import (
+    child_environment,
+    gmi_pid,
+    iteration_of,
+    kill,
+    learner_arrays,
+    pids_of,
+    train,
+    wait_until,
+)
+
+pytestmark = pytest.mark.timeout(600)
+
+JOB = ("env=point.py:make", *SMALL)
+APART = ("plan.gmis_per_gpu=3", "plan.template=tdg_ex")
+STEPS = 2 * 16 * 4
+"""Environment steps of an iteration: two GMIs, 16 environments, 4 steps."""
+
+
+@pytest.fixture
+def home(tmp_path: Path) -> Path:
+    (tmp_path / "point.py").write_text(TASK)
+    return tmp_path
+
+
+def start(*overrides: str, cwd: Path) -> subprocess.Popen[str]:
+    return subprocess.Popen(
+        [sys.executable, "-m", "gmijax.train", *JOB, *overrides],
+        cwd=cwd,
+        env=child_environment(),
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.PIPE,
+        text=True,
+        start_new_session=True,
+    )
+
+
+def test_a_trainer_with_two_servants_learns_what_one_gmi_does(home: Path):
+    steps = f"num_timesteps={5 * STEPS}"
+    for overrides in ((*APART, "run.name=apart"), ("num_envs=32", "run.name=together")):
+        done = train(*JOB, *overrides, steps, cwd=home)
+        assert done.returncode == 0, done.stderr
+    apart, together = (learner_arrays(home / "runs" / name) for name in ("apart", "together"))
+    assert len(apart) == len(together)
+    for ours, theirs in zip(apart, together, strict=True):
+        np.testing.assert_allclose(ours, theirs, rtol=1e-3, atol=1e-4)
+    summary = json.loads((home / "runs" / "apart" / "summary.json").read_text())
+    assert summary["env_steps"] == 5 * STEPS
+    assert summary["plan"]["roles"] == ["trainer", "simulator+agent", "simulator+agent"]
+    rollouts = json.loads((home / "runs" / "apart" / "gmi_2" / "result.json").read_text())
+    assert rollouts["rollouts"] == 5
+
+
+def test_trainers_of_two_gpus_stay_equal_and_a_run_goes_on(home: Path):
+    """A `ParameterMismatch` would end the job at the checkpoint."""
+    two = (*JOB, "plan.gpus=2", "plan.gmis_per_gpu=2", "plan.template=tdg_ex")
+    done = train(*two, f"num_timesteps={2 * STEPS}", "run.name=two", cwd=home)
+    assert done.returncode == 0, done.stderr
+    assert "reduction mpr" in done.stdout
+    more = ("run.resume=runs/two", f"num_timesteps={3 * STEPS}", "run.name=more")
+    done = train(*more, cwd=home)
+    assert done.returncode == 0, done.stderr
+    lines = (home / "runs" / "more" / "metrics.jsonl").read_text().splitlines()
+    assert [json.loads(line)["env_steps"] for line in lines] == [STEPS, 2 * STEPS, 3 * STEPS]
+    # The environments of the servants are not saved: what follows may be any other template.
+    alone = ("run.resume=runs/two", "plan.template=auto", f"num_timesteps={3 * STEPS}")
+    done = train(*alone, "run.name=alone", cwd=home)
+    assert done.returncode == 0, done.stderr
+
+
+@pytest.mark.parametrize("victim", [0, 2])
+def test_a_killed_gmi_is_named(victim: int, home: Path, request: pytest.FixtureRequest):
+    process = start(*APART, "num_timesteps=1e9", "run.name=kill", cwd=home)
+    request.addfinalizer(process.kill)
+    run = home / "runs" / "kill"
+    wait_until(lambda: iteration_of(run, 0) > 2, 240, "training")
+    kill(gmi_pid(run, victim) or 0)
+    _, said = process.communicate(timeout=60)
+    assert process.returncode == 1, said
+    assert f"GMI {victim} failed: ended by SIGKILL" in said
+    assert not pids_of(run)
+
+
+def test_a_stop_saves_and_ends_all(home: Path, request: pytest.FixtureRequest):
+    process = start(*APART, "num_timesteps=1e9", "run.name=stop", cwd=home)
+    request.addfinalizer(process.kill)
+    run = home / "runs" / "stop"
+    wait_until(lambda: iteration_of(run, 0) > 2, 240, "training")
+    process.send_signal(signal.SIGINT)
+    _, said = process.communicate(timeout=60)
+    assert process.returncode == 130, said
+    assert "continue with run.resume" in said
+    assert not pids_of(run)

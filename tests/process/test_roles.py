@@ -1,0 +1,184 @@
+"""`gmijax.launch` with real processes: messages, groups, results, and how jobs end."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import gmijax
+from gmijax.errors import GmiFailed, JobInterrupted
+from gmijax.processes import identify
+from gmijax.rundir import read_json
+from tests import role_cases
+from tests.supervision import CHECKOUT
+
+pytestmark = pytest.mark.timeout(60)
+
+SCRIPT = """
+import gmijax
+from dataclasses import dataclass
+
+@dataclass
+class Found:
+    rank: int
+
+class Give(gmijax.Role):
+    def run(self):
+        self.send(Found(self.rank), 1 - self.rank)
+        return self.recv(1 - self.rank)
+"""
+
+
+@pytest.fixture(autouse=True)
+def run_folders_apart(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+
+
+def launch(plan: object, role: object, *args: object, **options: object) -> list:
+    return gmijax.launch(plan, role, *args, **{"timeout_s": 10.0, "grace_s": 2.0, **options})
+
+
+def three() -> object:
+    return gmijax.plan(layout=[[0, 1], [2]], backend="cpu")
+
+
+def test_messages_of_all_kinds_groups_and_results(tmp_path: Path) -> None:
+    run = tmp_path / "run"
+    found = launch(three(), role_cases.Talk(100_000), 3, run_dir=str(run), pipe_mib=0.25)
+    assert [each["where"] for each in found] == [(0, 0), (1, 0), (2, 1)]
+    means = [each["mean"] for each in found]
+    assert [mean["loss"] for mean in means] == [1.0] * 3
+    assert isinstance(means[0]["grads"], role_cases.Pair)
+    assert np.allclose(means[0]["grads"].left, 0.25)
+    assert len({mean["grads"].left.tobytes() for mean in means}) == 1
+    assert found[1]["total"] is None
+    assert found[0]["total"].tolist() == found[2]["total"].tolist() == [0, 2, 4, 6, 8]
+    assert [(each["near"].dtype, each["near"].item()) for each in found] == [
+        (np.float16, 1.0), (np.float16, 1.0), (np.float16, 2.0)
+    ]  # fmt: skip
+    assert read_json(run / "plan.json")["layout"] == [[0, 1], [2]]
+
+
+def test_the_listing_of_the_paper() -> None:
+    manager = gmijax.GMIManager(num_gpus=2, backend="cpu")
+    kinds = ["agent", "trainer", "agent", "trainer"]
+    roles = [role_cases.Listing(gmi, kind, gmi // 2, manager) for gmi, kind in enumerate(kinds)]
+    assert launch(manager, roles, 10) == [
+        ("agent", 0, 1.0), ("trainer", 0, 10.0), ("agent", 1, 1.0), ("trainer", 1, 10.0)
+    ]  # fmt: skip
+
+
+def test_timeouts_lose_nothing_and_different_data_are_told() -> None:
+    plan = gmijax.plan(gmis_per_gpu=2, backend="cpu")
+    assert launch(plan, role_cases.Retry()) == ["sent", "late"]
+    first, second = launch(plan, role_cases.Disagree())
+    assert first == "rank 0 reduces 2 numbers of float32, rank 1 3 of float32"
+    assert second == "rank 1 reduces 3 numbers of float32, rank 0 2 of float32"
+
+
+@pytest.mark.parametrize(
+    ("ends", "message", "seen"),
+    [
+        ("kill", "GMI 1 failed: ended by SIGKILL", ""),
+        ("raise", "GMI 1 failed: exit code 1: ZeroDivisionError: the sum is off", ""),
+        ("return", "peer 1 is gone during recv", "PeerLost"),
+        ("sleep", r"for ranks \[1\]", "CollectiveTimeout"),
+    ],
+)
+def test_the_gmi_that_fails_is_named(ends: str, message: str, seen: str, tmp_path: Path) -> None:
+    run = tmp_path / "run"
+    with pytest.raises(GmiFailed, match=message) as caught:
+        launch(three(), role_cases.Wait(), str(tmp_path), ends, run_dir=str(run), timeout_s=1.5)
+    notes = "\n".join(caught.value.__notes__)
+    assert f"run folder: {run}" in notes
+    assert ends != "raise" or 'raise ZeroDivisionError("the sum is off")' in notes
+    beats = [read_json(run / f"gmi_{gmi}" / "heartbeat.json") for gmi in range(3)]
+    assert not [beat["pid"] for beat in beats if identify(beat["pid"])]
+    if seen:  # The others are ended by the controller, before they notice.
+        kind, waited_s, *_ = (tmp_path / "seen_0").read_text().split()
+        assert kind == seen
+        assert float(waited_s) < (1.2 if seen == "PeerLost" else 3.0)
+
+
+def test_a_role_without_progress_ends_the_job() -> None:
+    with pytest.raises(GmiFailed, match="GMI 0 failed: made no progress after iteration 0 within"):
+        launch(gmijax.plan(backend="cpu"), role_cases.Stuck(), stall_timeout_s=0.5)
+
+
+def test_an_interrupt_lets_roles_finish(tmp_path: Path) -> None:
+    beat = tmp_path / "run" / "gmi_1" / "heartbeat.json"
+
+    def interrupt() -> None:
+        while not (beat.exists() and json.loads(beat.read_text())["state"] == "running"):
+            time.sleep(0.02)
+        time.sleep(0.3)
+        os.kill(os.getpid(), signal.SIGINT)
+
+    threading.Thread(target=interrupt, daemon=True).start()
+    plan = gmijax.plan(gmis_per_gpu=2, backend="cpu")
+    with pytest.raises(JobInterrupted, match="every GMI has finished by itself"):
+        launch(plan, role_cases.UntilStopped(), run_dir=str(tmp_path / "run"))
+
+
+def run_script(folder: Path, end: str) -> subprocess.CompletedProcess[str]:
+    (folder / "give.py").write_text(SCRIPT + end)
+    environment = {**os.environ, "PYTHONPATH": str(CHECKOUT)}
+    command = [sys.executable, "give.py"]
+    return subprocess.run(
+        command, cwd=folder, env=environment, capture_output=True, text=True, timeout=40
+    )
+
+
+def test_a_script_sends_and_returns_objects_of_its_own_classes(tmp_path: Path) -> None:
+    done = run_script(
+        tmp_path,
+        'if __name__ == "__main__":\n'
+        '    found = gmijax.launch(gmijax.plan(gmis_per_gpu=2, backend="cpu"), Give())\n'
+        "    print(found == [Found(1), Found(0)])\n",
+    )
+    assert done.stdout == "True\n", done.stderr
+
+
+def test_a_script_that_starts_jobs_when_it_is_loaded_is_told_how_to_stop(tmp_path: Path) -> None:
+    done = run_script(tmp_path, 'gmijax.launch(gmijax.plan(backend="cpu"), Give())\n')
+    assert "ConfigError: gmijax.launch: called inside a GMI" in done.stderr
+    assert 'if __name__ == "__main__":' in done.stderr
+
+
+TASK = """
+from tests.toy_env import point_mass_env
+
+def make(*, impl, max_envs):
+    return point_mass_env(100)
+"""
+
+
+def run_example(name: str, folder: Path, *options: str) -> str:
+    command = [sys.executable, str(CHECKOUT / "examples" / name), *options]
+    environment = {**os.environ, "PYTHONPATH": str(CHECKOUT)}
+    done = subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    return done.stdout
+
+
+def test_the_stencil_is_the_same_over_three_gmis(tmp_path: Path) -> None:
+    options = ("gmis=3", "size=48", "steps=40", "backend=cpu")
+    found = json.loads(run_example("stencil.py", tmp_path, *options))
+    assert found["difference"] == 0.0
+
+
+def test_the_custom_role_learns(tmp_path: Path) -> None:
+    (tmp_path / "point.py").write_text(TASK)
+    words = run_example("custom_role.py", tmp_path, "point.py:make", "2", "15").split()
+    first, last = float(words[1]), float(words[3].rstrip(","))
+    assert last > first + 20.0
+    assert words[-1] == "True"

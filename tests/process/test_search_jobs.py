@@ -1,0 +1,89 @@
+"""`python -m gmijax.search` as a user runs it, with profiles that are real jobs on the CPU."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+from training_jobs import pids_of, train
+
+pytestmark = pytest.mark.timeout(600)
+
+# A point on a line: it compiles in seconds. With 24 environments it brings its process down.
+TASK = """
+import os
+import jax
+import jax.numpy as jnp
+from gmijax.sim import episode
+from gmijax.sim.interface import Env, EnvSpec
+
+SPEC = EnvSpec("point", 1, 1, 0.1, 5, ("near",))
+
+def make(*, impl, max_envs):
+    if max_envs == 24:
+        os.abort()
+
+    def reset(model, key):
+        key, draw = jax.random.split(key)
+        start = jax.random.uniform(draw, (1,))
+        return episode.begin(SPEC, start, (), start, key)
+
+    def step(model, state, action):
+        moved = state.physics + 0.1 * action
+        near = -jnp.abs(moved[0])
+        return episode.advance(state, moved, (), moved, (near, {"near": near}), moved[0] > 3.0)
+
+    return Env(SPEC, (), reset, step, None, lambda state: state.physics)
+"""
+JOB = (
+    *("env=point.py:make", "search.store=store", "algo.unroll_length=4"),
+    *("algo.num_updates_per_batch=1", "run.measure_throughput=false", "run.grace_s=3"),
+    *("algo.policy_hidden_layer_sizes=[8]", "algo.value_hidden_layer_sizes=[8]"),
+)
+GRID = (
+    *("search.gmis_per_gpu=[2,1]", "search.num_envs=[16,24]", "search.iterations=3"),
+    "search.order=as_printed",
+)
+
+
+def test_a_search_answers_survives_a_crash_and_serves_a_training(tmp_path: Path):
+    (tmp_path / "point.py").write_text(TASK)
+    done = train(*JOB, *GRID, "run.dir=s", cwd=tmp_path, command="search")
+    assert done.returncode == 0, done.stderr
+    report = json.loads((tmp_path / "s" / "search.json").read_text())
+    assert report["complete"]
+    points = {(one["gmis_per_gpu"], one["num_envs"]): one for one in report["points"]}
+    assert set(points) == {(2, 16), (2, 24), (1, 16), (1, 24)}
+    for gmis in (1, 2):
+        assert "SIGABRT" in points[gmis, 24]["reason"]
+        one = points[gmis, 16]
+        assert one["projected"] == pytest.approx(gmis * one["env_steps_per_s"])
+        assert one["env_steps_per_s"] * one["iteration_s"] == pytest.approx(16 * 4)
+        assert 100 < one["memory_mib"] < 10_000  # The whole process's, on a CPU.
+        assert (one["reduce_s"] > 0) == (gmis == 2)
+    assert report["best"]["num_envs"] == 16
+    assert report["reason"] in done.stdout
+    for run in (tmp_path / "s" / "profiles").iterdir():
+        assert pids_of(run) == []
+        assert not (run / "checkpoints").exists()
+
+    # The store has all of it: nothing is profiled, and the job has what was found.
+    auto = ("num_envs=auto", "plan.gmis_per_gpu=auto")
+    done = train(*JOB, *GRID, *auto, "num_timesteps=64", "run.dir=t", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert report["reason"] in done.stdout
+    assert not (tmp_path / "runs").exists()
+    config = json.loads((tmp_path / "t" / "config.json").read_text())
+    found = (config["num_envs"], config["plan"]["gmis_per_gpu"])
+    assert found == (16, report["best"]["gmis_per_gpu"])
+
+
+def test_what_takes_too_long_is_ended_and_not_runnable(tmp_path: Path):
+    (tmp_path / "point.py").write_text(TASK)
+    limits = ("search.gmis_per_gpu=[2]", "search.num_envs=[16]", "search.profile_timeout_s=1")
+    done = train(*JOB, *limits, "run.dir=s", cwd=tmp_path, command="search")
+    assert done.returncode == 1, done.stderr
+    assert "no point of the search can run" in done.stderr
+    assert "no end within 1 s (GMI 0 starting, GMI 1 waiting)" in done.stderr
+    assert pids_of(tmp_path / "s" / "profiles" / "corun-2x16-jax") == []

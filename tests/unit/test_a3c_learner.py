@@ -1,0 +1,188 @@
+"""Updates on batches of unrolls, without processes."""
+
+from __future__ import annotations
+
+import dataclasses
+import threading
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from toy_env import point_mass
+
+from gmijax.a3c.learner import acting_weights, num_weights, pack_weights, unpack_weights
+from gmijax.a3c.programs import FusedUpdate, SplitUpdate, exchange_size
+from gmijax.a3c.rollout import collect
+from gmijax.a3c.staleness import histogram_of, mean_and_p99
+from gmijax.cli import compose
+from gmijax.collectives.solo import SoloReducer
+from gmijax.learner import init_learner, make_learner
+from gmijax.sim.wrappers import env_keys
+
+N, T = 12, 8
+ENV = point_mass()
+
+
+@pytest.fixture(scope="module")
+def config():
+    return dataclasses.replace(
+        compose("algo=a3c").algo,
+        unroll_length=T,
+        num_minibatches=2,
+        num_updates_per_batch=2,
+        learning_rate=1e-3,
+        learning_rate_schedule="fixed",
+        init_noise_std=0.6,
+        policy_hidden_layer_sizes=(16,),
+        value_hidden_layer_sizes=(16,),
+    )
+
+
+def _start(config, num_envs: int = N):
+    learner = make_learner(ENV.spec, config)
+    state = jax.jit(lambda key: init_learner(learner, ENV.spec.obs_size, key))(jax.random.key(0))
+    keys = env_keys(jax.random.key(1), 0, num_envs)
+    return learner, state, jax.jit(ENV.init)(ENV.model, keys)
+
+
+def _copy(tree):
+    return jax.tree.map(jnp.copy, tree)
+
+
+def test_weights_travel_as_one_array(config) -> None:
+    learner, state, _ = _start(config)
+    weights = acting_weights(learner, state)
+    packed = pack_weights(weights)
+    assert packed.shape == (num_weights(ENV.spec, config),)
+    jax.tree.map(np.testing.assert_array_equal, unpack_weights(weights, packed), weights)
+
+
+def test_an_unroll_is_what_the_environments_did(config) -> None:
+    learner, state, envs = _start(config, num_envs=64)
+    before = envs.env.obs
+    weights = acting_weights(learner, state)
+    cuts = 0
+    for _ in range(4):
+        envs, got, stats = collect(ENV, learner.networks, T, ENV.model, weights, envs)
+        np.testing.assert_array_equal(got.state[0], before)
+        np.testing.assert_array_equal(got.bootstrap[0], envs.env.obs)
+        assert float(stats.episodes.count) == got.done.any(-1).sum()
+        # A value behind a step is told where time ran out, and nowhere else.
+        np.testing.assert_array_equal(got.cut_value != 0, got.done[..., 1])
+        cuts += int(got.done[..., 1].sum())
+        before = envs.env.obs
+    assert cuts > 0
+
+
+def test_unrolls_without_weight_teach_nothing(config) -> None:
+    learner, state, envs = _start(config)
+    _, batch, _ = collect(
+        ENV, learner.networks, T, ENV.model, acting_weights(learner, state), envs
+    )
+    update = FusedUpdate(learner)
+    weight = jnp.asarray([1.0] * (N - 2) + [0.0] * 2)
+    spoilt = batch._replace(reward=batch.reward.at[:, -2:].set(1e6))
+    first, _ = update(_copy(state), batch, weight)
+    second, _ = update(_copy(state), spoilt, weight)
+    jax.tree.map(np.testing.assert_array_equal, first.params, second.params)
+    assert int(first.iteration) == 1
+
+
+class _Threads:
+    """A reducer among threads of this process, each with a barrier and the sums of all."""
+
+    is_device_resident = False
+
+    def __init__(self, rank: int, world_size: int, slots: list, barrier: threading.Barrier):
+        self.rank, self.world_size = rank, world_size
+        self._slots, self._barrier = slots, barrier
+
+    def _all(self, values) -> np.ndarray:
+        self._barrier.wait()
+        self._slots[self.rank] = np.array(values)
+        self._barrier.wait()
+        return np.stack(self._slots)
+
+    def mean(self, buffer):
+        return self._all(buffer).mean(axis=0, dtype=np.float32)
+
+    def all_gather(self, values):
+        return self._all(values)
+
+    def close(self) -> None:
+        pass
+
+
+def test_one_trainer_learns_the_same_in_both_forms(config) -> None:
+    learner, state, envs = _start(config)
+    _, batch, _ = collect(
+        ENV, learner.networks, T, ENV.model, acting_weights(learner, state), envs
+    )
+    split = SplitUpdate(learner, ENV.spec.obs_size, SoloReducer(exchange_size(ENV.spec, config)))
+    split.compile(state, batch, jnp.ones(N))
+    _, said = FusedUpdate(learner)(_copy(state), batch, jnp.ones(N))
+    _, also = split(_copy(state), batch, jnp.ones(N))
+    np.testing.assert_allclose(said.weights, also.weights, rtol=1e-4, atol=1e-6)
+    np.testing.assert_allclose(said.losses, also.losses, rtol=1e-3, atol=1e-5)
+
+
+def test_two_trainers_stay_equal_and_take_in_both_batches(config) -> None:
+    learner, state, envs = _start(config, num_envs=2 * N)
+    _, both, _ = collect(ENV, learner.networks, T, ENV.model, acting_weights(learner, state), envs)
+    half = [jax.tree.map(lambda x, k=k: x[:, k * N : (k + 1) * N], both) for k in range(2)]
+    slots, barrier = [None, None], threading.Barrier(2)
+    results: dict = {}
+
+    def run(rank: int) -> None:
+        reducer = _Threads(rank, 2, slots, barrier)
+        update = SplitUpdate(learner, ENV.spec.obs_size, reducer)
+        results[rank] = update(_copy(state), half[rank], jnp.ones(N))
+
+    threads = [threading.Thread(target=run, args=(rank,)) for rank in range(2)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    a, b = results[0][0], results[1][0]
+    jax.tree.map(np.testing.assert_array_equal, a.params, b.params)
+    jax.tree.map(np.testing.assert_array_equal, a.obs_moments, b.obs_moments)
+    seen = both.state.reshape(-1, ENV.spec.obs_size)
+    np.testing.assert_allclose(a.obs_moments.mean, seen.mean(0), rtol=1e-4, atol=1e-5)
+    assert float(a.obs_moments.count) == len(seen)
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"clipping_epsilon": 0.2},
+        {"clipping_epsilon": 0.2, "vtrace": False},
+        {"num_updates_per_batch": 1},
+    ],
+    ids=["vtrace-clip", "clip", "vtrace"],
+)
+def test_it_learns_to_stand_still_from_a_policy_that_lags(config, changes) -> None:
+    learner, state, envs = _start(
+        dataclasses.replace(config, learning_rate=3e-3, **changes), num_envs=64
+    )
+    update = FusedUpdate(learner)
+    rollout = jax.jit(
+        lambda weights, envs: collect(ENV, learner.networks, T, ENV.model, weights, envs)
+    )
+    versions = [acting_weights(learner, _copy(state))] * 3
+    rewards = []
+    for _ in range(80):
+        envs, batch, stats = rollout(versions[-3], envs)
+        state, updated = update(state, batch, jnp.ones(64))
+        versions.append(unpack_weights(versions[0], updated.weights))
+        rewards.append(float(stats.reward_sum) / (64 * T))
+    assert np.mean(rewards[:5]) < 0.1
+    assert np.mean(rewards[-5:]) > 0.4
+
+
+def test_staleness_by_hand() -> None:
+    histogram = histogram_of(np.array([0] * 98 + [3, 500]))
+    assert histogram.sum() == 100
+    # 500 counts as 127: (3 + 127) / 100; 98 % are at most 0, 99 % at most 3.
+    assert mean_and_p99(histogram) == (pytest.approx(1.3), 3.0)
+    assert mean_and_p99(0 * histogram) is None

@@ -1,0 +1,269 @@
+"""The parts of the experience channels, each alone; processes are in the contract tests."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+import pytest
+
+from gmijax.collectives.channel.build import (
+    Places,
+    create_channels,
+    max_piece_bytes,
+    open_receiver,
+    open_sender,
+    require_channels,
+)
+from gmijax.collectives.channel.dispenser import Dispenser
+from gmijax.collectives.channel.ends import Receiver, Sender
+from gmijax.config.channel import ChannelConfig
+from gmijax.errors import CollectiveTimeout, ConfigError, PeerLost, PipeClosed
+
+PLACES = Places(agents=(0,), trainers=(1,), gpu_of=(0, 0))
+T, N, O = 4, 6, 3
+
+
+def rollout(first: int = 0, envs: int = N) -> dict[str, Any]:
+    number = np.arange(first, first + envs, dtype=np.float32)
+    state = np.broadcast_to(number[:, None], (T + 1, envs, O)).copy()
+    return {"state": state, "done": np.tile(number % 2 == 0, (T, 1)), "bootstrap": number[None]}
+
+
+class Pair:
+    """Both ends in one process."""
+
+    def __init__(self, **keys: Any) -> None:
+        config = ChannelConfig(**{"capacity_mib": 1, **keys})
+        self.fd = create_channels(config, PLACES)
+        self.sender: Sender = open_sender(config, PLACES, 0, self.fd)
+        self.receiver: Receiver = open_receiver(config, PLACES, 1, self.fd)
+
+    def numbers(self, batch_size: int) -> list[int]:
+        batch = self.receiver.receive(batch_size, 0.0)
+        number = batch.experience["bootstrap"][0]
+        assert (batch.experience["state"] == number[:, None]).all()
+        assert batch.experience["state"].shape == (T + 1, batch_size, O)
+        assert (batch.experience["done"] == (number % 2 == 0)).all()
+        assert not batch.experience["state"].flags.writeable
+        assert batch.experience["done"].dtype == bool
+        return number.astype(int).tolist()
+
+
+@pytest.fixture
+def make_pair() -> Iterator[Any]:
+    made: list[Pair] = []
+
+    def make(**keys: Any) -> Pair:
+        made.append(Pair(**keys))
+        return made[-1]
+
+    yield make
+    for pair in made:
+        pair.sender.close()
+        pair.receiver.close()
+        os.close(pair.fd)
+
+
+@pytest.mark.parametrize("design", ["multi", "uni"])
+@pytest.mark.parametrize("batch", [1, 2, 4, 6, 9, 12])
+def test_batches_slice_and_stack(make_pair: Any, design: str, batch: int) -> None:
+    pair = make_pair(design=design)
+    for send in range(6):
+        assert pair.sender.send(rollout(send * N), send, 1.0)
+    pair.sender.flush()
+    got = [number for _ in range(6 * N // batch) for number in pair.numbers(batch)]
+    assert got == list(range(6 * N))
+    with pytest.raises(CollectiveTimeout, match=r"rank 1: waited 0 s in receive.*ranks \[0\]"):
+        pair.receiver.receive(batch, 0.0)
+
+
+def test_every_unroll_knows_its_policy_and_its_agent(make_pair: Any) -> None:
+    pair = make_pair()
+    for version in (7, 8):
+        pair.sender.send(rollout(), version, 1.0)
+    pair.sender.flush()
+    batch = pair.receiver.receive(2 * N, 0.0)
+    assert batch.versions.tolist() == [7] * N + [8] * N
+    assert batch.agents.tolist() == [0] * (2 * N)
+
+
+def test_a_timeout_loses_nothing_and_the_batch_size_may_change(make_pair: Any) -> None:
+    pair = make_pair()
+    pair.sender.send(rollout(), 0, 1.0)
+    pair.sender.flush()
+    with pytest.raises(CollectiveTimeout):
+        pair.receiver.receive(2 * N, 0.0)
+    assert pair.numbers(2) == [0, 1]
+    assert pair.numbers(N - 2) == [2, 3, 4, 5]
+    pair.sender.close()
+    with pytest.raises(PipeClosed, match="peer 0 has closed"):
+        pair.receiver.receive(1, 0.0)
+
+
+def test_small_rollouts_travel_together_large_ones_are_cut(make_pair: Any) -> None:
+    one = sum(array[:, :1].nbytes for array in rollout().values())
+    pair = make_pair(transfer_kib=1)
+    for send in range(20):
+        pair.sender.send(rollout(send * N), 0, 1.0)
+    assert pair.sender.stats().transfers == 20 // (1024 // (N * one))
+    large = max_piece_bytes(2**20) // one + 1
+    pair.sender.flush()
+    before = pair.sender.stats()
+    pair.sender.send(rollout(20 * N, large), 0, 1.0)
+    assert pair.sender.stats().pieces - before.pieces == 2
+    pair.sender.flush()
+    assert pair.numbers(20 * N + large)[-1] == 20 * N + large - 1
+
+
+def test_without_room_a_blocked_send_goes_on_where_it_was(make_pair: Any) -> None:
+    pair = make_pair()
+    one = sum(array[:, :1].nbytes for array in rollout().values())
+    large = rollout(0, 3 * (2**20 // one))
+    assert not pair.sender.send(large, 0, 0.01)
+    assert pair.sender.stats().waited_s > 0
+    got = pair.numbers(1000)
+    while not pair.sender.send(large, 0, 0.0):
+        got += pair.numbers(1000)
+    pair.sender.close()
+    while len(got) + 1000 <= len(large["bootstrap"][0]):
+        got += pair.numbers(1000)
+    assert got == list(range(len(got)))
+    assert pair.sender.stats().dropped == 0
+
+
+def test_drop_oldest_never_waits_and_counts_what_it_drops(make_pair: Any) -> None:
+    pair = make_pair(when_full="drop_oldest", max_waiting=3)
+    envs = 1000
+    for send in range(60):
+        experience = rollout(send * envs, envs)
+        assert pair.sender.send(experience, 0, 0.0)
+        experience["state"][:] = -1.0  # What waits must be a copy.
+    dropped = pair.sender.stats().dropped
+    assert 0 < dropped < 57
+    got = []
+    for _ in range(60 - 3 - dropped):
+        got += pair.numbers(envs)[::envs]
+    pair.sender.close()
+    for _ in range(3):
+        got += pair.numbers(envs)[::envs]
+    kept = len(got) - 3
+    assert got == [envs * n for n in (*range(kept), 57, 58, 59)]
+
+
+def test_what_still_waits_at_the_end_is_counted_as_dropped(make_pair: Any) -> None:
+    pair = make_pair(when_full="drop_oldest", max_waiting=3)
+    for send in range(60):
+        pair.sender.send(rollout(send * 1000, 1000), 0, 0.0)
+    dropped = pair.sender.stats().dropped
+    pair.receiver.close()
+    pair.sender.close()
+    assert pair.sender.stats().dropped == dropped + 3
+
+
+def test_after_an_error_a_send_goes_on_where_it_was(make_pair: Any) -> None:
+    pair = make_pair()
+    one = sum(array[:, :1].nbytes for array in rollout().values())
+    large = rollout(0, 3 * (2**20 // one))
+    pair.sender._pressure._why_lost = lambda: PeerLost(0, 1, "send", 0)
+    with pytest.raises(PeerLost):
+        pair.sender.send(large, 0, 0.3)
+    pieces = pair.sender.stats().pieces
+    got = pair.numbers(1000)
+    pair.sender._pressure._why_lost = lambda: None
+    while not pair.sender.send(large, 0, 0.0):
+        got += pair.numbers(1000)
+    assert pair.sender.stats().pieces == pieces
+    pair.sender.close()
+    while len(got) + 1000 <= len(large["bootstrap"][0]):
+        got += pair.numbers(1000)
+    assert got == list(range(len(got)))
+
+
+def test_many_tiny_pieces_fit_with_their_table(make_pair: Any) -> None:
+    pair = make_pair(transfer_kib=240)
+    for number in range(100):
+        assert pair.sender.send({"reward": np.full((1, 1), number, np.float32)}, number, 1.0)
+    pair.sender.flush()
+    assert pair.receiver.receive(100, 1.0).versions.tolist() == list(range(100))
+
+
+@pytest.mark.parametrize("first_read", [0, 1, 5])
+def test_a_trainer_that_follows_skips_a_rollout_that_had_begun(
+    make_pair: Any, first_read: int
+) -> None:
+    pair = make_pair(design="uni")
+    for send in range(2):
+        assert pair.sender.send(rollout(send * N), send, 1.0)
+    inlet = pair.receiver._inlets[0]
+    for _ in range(first_read):
+        inlet.try_get()
+        inlet.release()
+    follower = Receiver(1, [inlet], is_uni=True, leave=lambda: None)
+    batch = follower.receive(N, 0.0)
+    assert batch.versions.tolist() == [int(first_read > 0)] * N
+    assert follower.stats().discarded == int(first_read > 0)
+
+
+def test_float16_halves_a_channel_and_saturates(make_pair: Any) -> None:
+    pair = make_pair(float16=("state",))
+    experience = rollout()
+    experience["state"][0, 0, 0] = 1e6
+    experience["state"][0, 1, 0] = 1 / 3
+    pair.sender.send(experience, 0, 1.0)
+    pair.sender.flush()
+    plain = sum(array.nbytes for array in experience.values())
+    assert pair.sender.stats().num_bytes == plain - experience["state"].nbytes // 2
+    state = pair.receiver.receive(N, 0.0).experience["state"]
+    assert state.dtype == np.float32
+    assert state[0, 0, 0] == 65504.0
+    assert 0 < abs(state[0, 1, 0] - 1 / 3) < 1e-3
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"state": np.zeros((T, N, O))}, r"experience.state: got float64 \[4, 6, 3\], expected"),
+        ({"done": np.zeros((T, N + 1), bool)}, r"experience.done: got bool \[4, 7\], expected"),
+        ({"bootstrap": np.zeros(N, np.float32)}, r"experience.bootstrap: got float32 \[6\]"),
+        ({"reward": np.zeros((T, N), np.float32)}, "the first was"),
+    ],
+)
+def test_other_experience_is_refused(change: dict[str, Any], message: str) -> None:
+    dispenser = Dispenser(10_000)
+    assert len(list(dispenser.split(rollout(), 0))) == 1
+    with pytest.raises(ConfigError, match=message):
+        list(dispenser.split({**rollout(), **change}, 0))
+
+
+def test_an_unroll_that_never_fits_and_unknown_channels_are_refused() -> None:
+    with pytest.raises(ConfigError, match=r"bytes for one environment, at most 10; channel\."):
+        list(Dispenser(10).split(rollout(), 0))
+    with pytest.raises(ConfigError, match=r"channel.float16=\['stat'\]: expected some of"):
+        list(Dispenser(10_000, ["stat"]).split(rollout(), 0))
+    with pytest.raises(
+        ConfigError, match=r"channel.float16=\['done'\]: .*\['state', 'bootstrap'\]"
+    ):
+        list(Dispenser(10_000, ["state", "done"]).split(rollout(), 0))
+
+
+def test_what_cannot_be_had_is_refused_before_a_process_starts() -> None:
+    config = ChannelConfig(capacity_mib=1)
+    require_channels(config, PLACES, 1000)
+    with pytest.raises(ConfigError, match="room for 245760 bytes at once"):
+        require_channels(config, PLACES, 2**20)
+    with pytest.raises(ConfigError, match=r"1 pairs .* take 100000000 MiB, available are \d+ MiB"):
+        require_channels(ChannelConfig(capacity_mib=10**8), PLACES, 1000)
+    with pytest.raises(ConfigError, match="at least one of each"):
+        Places(agents=(), trainers=(0,), gpu_of=(0,))
+    with pytest.raises(ConfigError, match=r"channel\.transfer_kib=300: must be at most a quarter"):
+        ChannelConfig(capacity_mib=1, transfer_kib=300)
+    with pytest.raises(ConfigError, match=r"channel\.design=uni allows only block"):
+        ChannelConfig(design="uni", when_full="drop_oldest")
+    with pytest.raises(ConfigError, match="needs the channels of the job's controller"):
+        open_sender(config, PLACES, 0, None)
+    pytest.importorskip("zmq")
+    with pytest.raises(ConfigError, match="needs an address for agent 0 and trainer 1"):
+        open_sender(ChannelConfig(transport="zmq"), PLACES, 0, None)

@@ -1,0 +1,95 @@
+"""Channels over TCP: both ends in one process, what goes wrong with connections."""
+
+from __future__ import annotations
+
+import socket
+import time
+from collections.abc import Iterator
+from typing import Any
+
+import pytest
+
+from gmijax.errors import CollectiveError, PeerLost, PipeClosed
+from gmijax.partition.rendezvous import reserved_address
+
+pytest.importorskip("zmq")
+
+from gmijax.collectives.channel.remote import RemoteInlet, RemoteOutlet
+
+CAPACITY = 2**20
+
+
+@pytest.fixture
+def address() -> Iterator[str]:
+    with reserved_address() as reserved:
+        yield reserved
+
+
+def send(outlet: RemoteOutlet, *values: int) -> None:
+    for value in values:
+        views = outlet.try_reserve([8])
+        assert views is not None
+        views[0][:] = value
+        outlet.commit()
+
+
+def receive(inlet: RemoteInlet, count: int) -> list[int]:
+    got: list[int] = []
+    deadline_s = time.monotonic() + 5.0
+    while len(got) < count:
+        assert time.monotonic() < deadline_s, got
+        if (message := inlet.try_get()) is not None:
+            got.append(message.parts[0].item(0))
+    inlet.release()
+    return got
+
+
+def why_lost(inlet: RemoteInlet, looks: int) -> Any:
+    """What the last of some looks says, with all read in between."""
+    error = None
+    for _ in range(looks):
+        time.sleep(0.05)
+        error = inlet.why_lost("receive", 0)
+        inlet.try_get()
+    return error
+
+
+@pytest.mark.parametrize("junk", [b"", b"GET / HTTP/1.0\r\n\r\n"])
+def test_a_stranger_at_the_port_is_not_the_end_of_the_agent(address: str, junk: bytes) -> None:
+    inlet, outlet = RemoteInlet(address, 1, 0), RemoteOutlet(address, 0, 1, CAPACITY)
+    send(outlet, 1)
+    assert receive(inlet, 1) == [1]
+    host, _, port = address.rpartition(":")
+    with socket.create_connection((host, int(port)), timeout=5.0) as stranger:
+        stranger.sendall(junk)
+    assert why_lost(inlet, 6) is None
+    outlet._connection.close()  # As if it were killed.
+    assert isinstance(why_lost(inlet, 6), PeerLost)
+    inlet.close()
+
+
+def test_what_a_killed_agent_had_sent_is_read_beside_its_successors(address: str) -> None:
+    inlet, killed = RemoteInlet(address, 1, 0), RemoteOutlet(address, 0, 1, CAPACITY)
+    send(killed, *range(5))
+    time.sleep(0.2)
+    killed._connection.close()
+    outlet = RemoteOutlet(address, 0, 1, CAPACITY)
+    send(outlet, *range(10, 15))
+    time.sleep(0.2)
+    got = receive(inlet, 10)
+    assert [value for value in got if value < 10] == list(range(5))
+    assert [value for value in got if value >= 10] == list(range(10, 15))
+    deadline_s = time.monotonic() + 5.0
+    while outlet.load_bytes():
+        assert time.monotonic() < deadline_s
+    outlet.close()
+    with pytest.raises(PipeClosed):
+        receive(inlet, 1)
+    inlet.close()
+
+
+def test_an_address_that_cannot_be_is_named() -> None:
+    with pytest.raises(CollectiveError, match=r"no connection with rank 0 at 127.0.0.1 "):
+        RemoteInlet("127.0.0.1", 1, 0)
+    with pytest.raises(CollectiveError, match=r"no connection with rank 1 at 127.0.0.1 "):
+        RemoteOutlet("127.0.0.1", 0, 1, CAPACITY)

@@ -1,0 +1,62 @@
+"""Which trainer gets a transfer of the experience channels, and how large transfers become."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import pytest
+
+from gmijax.collectives.channel.migrator import Migrator
+from gmijax.collectives.channel.transfer_size import SAMPLES, START_BYTES, TransferSize
+
+
+class FakeOutlet:
+    """A way whose load the test sets."""
+
+    max_message_bytes = 1000
+    sent_items = 0
+
+    def __init__(self, peer: int, load: int, *, is_full: bool = False) -> None:
+        self.peer, self.load, self.is_full = peer, load, is_full
+
+    def try_reserve(self, sizes: Sequence[int]) -> list[Any] | None:
+        return None if self.is_full else [np.zeros(size, np.uint8) for size in sizes]
+
+    def load_bytes(self) -> int:
+        return self.load
+
+
+@pytest.mark.parametrize(
+    ("outlets", "gpu", "chosen"),
+    [
+        ([FakeOutlet(1, 500), FakeOutlet(2, 100), FakeOutlet(3, 300)], 9, [2, 2]),
+        ([FakeOutlet(1, 500), FakeOutlet(2, 100), FakeOutlet(3, 300)], 1, [1, 1]),
+        ([FakeOutlet(1, 0), FakeOutlet(2, 100, is_full=True), FakeOutlet(3, 300)], 2, [None]),
+        ([FakeOutlet(1, 0, is_full=True), FakeOutlet(2, 100), FakeOutlet(3, 99)], 9, [3]),
+        ([FakeOutlet(1, 0), FakeOutlet(2, 0), FakeOutlet(3, 0)], 9, [1, 2, 3, 1]),
+    ],
+)
+def test_same_gpu_first_then_the_least_load_then_in_turn(
+    outlets: list[Any], gpu: int, chosen: list[int | None]
+) -> None:
+    migrator = Migrator(outlets, gpu, {1: 1, 2: 2, 3: 3})
+    opened = [migrator.try_open([10]) for _ in chosen]
+    assert [None if found is None else found[0].peer for found in opened] == chosen
+
+
+def test_the_size_of_transfers_grows_while_a_byte_gets_cheaper() -> None:
+    size = TransferSize(None, 2**24)
+    tried = set()
+    while not size.is_settled:
+        tried.add(size.num_bytes)
+        size.record(size.num_bytes, 20e-6 + size.num_bytes / 5e9)
+    # 20 us are 5 % of the time of 2 MB at 5 GB/s, so that doubling gains less than that there.
+    assert size.num_bytes == 2**20
+    assert tried == {2**power for power in range(16, 22)}
+    fixed = TransferSize(1000, 2**24)
+    for _ in range(2 * SAMPLES):
+        fixed.record(1000, 1.0)
+    assert fixed.num_bytes == 1000
+    assert TransferSize(None, 100).num_bytes == 100 < START_BYTES

@@ -1,0 +1,141 @@
+"""Collecting experience in one process, on a task without physics."""
+
+from __future__ import annotations
+
+import json
+import math
+from functools import partial
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from toy_env import point_mass
+
+from gmijax.collection.policy import ActingPolicy, _gaussian, random_policy
+from gmijax.collection.programs import (
+    Keep,
+    Step,
+    infer,
+    next_keys,
+    no_counts,
+    simulate,
+    unroll,
+)
+from gmijax.collection.shards import ShardWriter
+from gmijax.config import PpoConfig
+from gmijax.datadir import DataPaths
+from gmijax.learner import Learner, init_learner, make_learner
+from gmijax.normalize import no_samples
+from gmijax.sim.wrappers import env_keys
+
+N, T = 6, 30
+ALL = Keep(steps=True, next_obs=True)
+
+
+def learner_of(env, algo: PpoConfig) -> Learner:
+    return make_learner(env.spec, algo)
+
+
+def gaussian(env, algo: PpoConfig, *, deterministic: bool) -> ActingPolicy:
+    learner = learner_of(env, algo)
+    state = init_learner(learner, env.spec.obs_size, jax.random.key(3))
+    weights = state.params, no_samples((env.spec.obs_size,))
+    return ActingPolicy(_gaussian(learner, env.spec.action_size, deterministic), weights, "x")
+
+
+@pytest.fixture
+def algo() -> PpoConfig:
+    import gmijax
+
+    return gmijax.compose("algo.policy_hidden_layer_sizes=[4]").algo  # type: ignore[return-value]
+
+
+def start(env):
+    return jax.jit(env.init)(env.model, env_keys(jax.random.key(0), 0, N))
+
+
+def test_an_unroll_keeps_what_happened(algo: PpoConfig):
+    env = point_mass(episode_length=8)
+    policy = gaussian(env, algo, deterministic=False)
+    program = jax.jit(partial(unroll, env, policy, T, ALL))
+    _, steps, counts = program(env.model, policy.weights, start(env))
+    ended = np.asarray(steps.terminated | steps.truncated)
+    assert ended.any()
+    assert counts.episodes.count == ended.sum()
+    assert steps.obs.shape == steps.next_obs.shape == (T, N, 2)
+    # Within an episode one step's end is the next one's beginning; after its end it is not.
+    same = (np.asarray(steps.next_obs)[:-1] == np.asarray(steps.obs)[1:]).all(-1)
+    np.testing.assert_array_equal(same, ~ended[:-1])
+    params = policy.weights[0]
+    mean = learner_of(env, algo).networks.action_mean(params, steps.obs)
+    std = np.exp(np.asarray(params.log_std))
+    z = (np.asarray(steps.action) - np.asarray(mean)) / std
+    density = np.exp(-0.5 * z**2) / (std * math.sqrt(2 * math.pi))
+    np.testing.assert_allclose(steps.log_prob, np.log(density.prod(-1)), rtol=1e-4, atol=1e-5)
+
+
+def test_halves_of_steps_make_the_same_experience_as_an_unroll(algo: PpoConfig):
+    env = point_mass(episode_length=8)
+    policy = gaussian(env, algo, deterministic=False)
+    _, whole, counts = jax.jit(partial(unroll, env, policy, T, ALL))(
+        env.model, policy.weights, start(env)
+    )
+    state, bits = next_keys(start(env))
+    total, kept = no_counts(env), []
+    half_a, half_s = jax.jit(partial(infer, policy)), jax.jit(partial(simulate, env, ALL))
+    for _ in range(T):
+        action, density = half_a(policy.weights, state.env.obs, bits)
+        state, bits, total, step = half_s(env.model, state, total, action, density)
+        kept.append(step)
+    halves = jax.tree.map(lambda *leaves: jnp.stack(leaves), *kept)
+    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, atol=1e-5), whole, halves)
+    assert total.episodes.count == counts.episodes.count
+
+
+def test_random_actions_fill_their_range_with_even_density():
+    env = point_mass()
+    policy = random_policy(env.spec._replace(action_size=3))
+    keys = env_keys(jax.random.key(1), 0, 2000)
+    action, density = policy.choose((), jnp.zeros((2000, 2)), keys)
+    assert np.abs(action).max() <= 1.0
+    assert abs(float(action.mean())) < 0.05
+    assert float(action.min()) < -0.99
+    np.testing.assert_allclose(density, math.log(1 / 2**3), rtol=1e-6)
+
+
+def test_a_deterministic_policy_acts_with_its_mean(algo: PpoConfig):
+    env = point_mass()
+    policy = gaussian(env, algo, deterministic=True)
+    obs = jnp.ones((N, 2))
+    first, density = policy.choose(policy.weights, obs, env_keys(jax.random.key(1), 0, N))
+    second, _ = policy.choose(policy.weights, obs, env_keys(jax.random.key(2), 0, N))
+    np.testing.assert_array_equal(first, second)
+    assert not np.asarray(density).any()
+
+
+@pytest.mark.parametrize("compress", [False, True])
+def test_shards_are_whole_and_say_what_they_are(compress: bool, tmp_path: Path):
+    paths = DataPaths(tmp_path)
+    paths.folder(1).mkdir()
+    (paths.folder(1) / ".000002.npz.partial").write_bytes(b"left by a job that was killed")
+    writer = ShardWriter(paths, 1, 2, {"seed": 5}, compress=compress)
+    full = partial(np.full, (T, N), dtype=np.float32)
+    step = Step(full(0), full(1), full(2), full(3), full(4), full(5), None)
+    writer.write(step)
+    writer.write(step._replace(reward=full(7)))
+    writer.wait()
+    writer.close()
+    assert writer.num_written == 2
+    assert paths.shard(1, 2).is_finished()
+    assert sorted(path.name for path in paths.folder(1).iterdir()) == [
+        *("000002.json", "000002.npz", "000003.json", "000003.npz"),
+    ]
+    with np.load(paths.shard(1, 3).arrays) as arrays:
+        assert set(arrays) == set(Step._fields) - {"next_obs"}
+        assert (arrays["reward"] == 7).all()
+    about = [json.loads(paths.shard(1, index).about.read_text()) for index in (2, 3)]
+    assert [item["starts_with_reset"] for item in about] == [True, False]
+    assert about[0]["seed"] == 5
+    assert about[0]["env_steps"] == T * N

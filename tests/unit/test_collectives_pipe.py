@@ -1,0 +1,212 @@
+"""Pipes in shared memory: what goes in comes out, whatever the sizes; limits and damage."""
+
+from __future__ import annotations
+
+import copy
+import os
+from collections.abc import Iterator
+from typing import Any, NamedTuple
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from gmijax.collectives.pipe import PipeReader, PipeWriter
+from gmijax.collectives.pipe_block import END, HEAD, LINE, LINE_BYTES, PipeBlock, create_pipes
+from gmijax.collectives.pipe_format import message_bytes
+from gmijax.errors import CollectiveError, CollectiveTimeout, ConfigError, PipeClosed
+
+CAPACITY = 8192
+
+
+class Ends(NamedTuple):
+    """Both ends of the pipe from rank 0 to rank 1, in one process."""
+
+    fd: int
+    blocks: tuple[PipeBlock, PipeBlock]
+    writer: PipeWriter
+    reader: PipeReader
+
+
+@pytest.fixture
+def ends() -> Iterator[Ends]:
+    yield from open_ends()
+
+
+def open_ends() -> Iterator[Ends]:
+    fd = create_pipes(2, CAPACITY)
+    first, second = (PipeBlock.attach(fd, rank, 2, CAPACITY) for rank in (0, 1))
+    yield Ends(fd, (first, second), PipeWriter(first, 1), PipeReader(second, 0))
+    first.close()
+    second.close()
+    os.close(fd)
+
+
+def test_lines_are_cache_lines() -> None:
+    assert LINE.itemsize == END.itemsize == LINE_BYTES == 64
+    assert HEAD.itemsize <= LINE_BYTES
+
+
+@given(
+    st.lists(st.lists(st.integers(0, 900), max_size=4), max_size=40),
+    st.lists(st.booleans(), min_size=80, max_size=80),
+)
+def test_messages_come_out_whole_and_in_order(sizes: list[list[int]], is_put: list[bool]) -> None:
+    """Whatever the order of puts and gets; the ring goes round several times."""
+    for ends in open_ends():
+        waiting: list[list[bytes]] = []
+        todo = iter(sizes)
+        for number, puts in enumerate(is_put):
+            wanted = next(todo, None) if puts else None
+            if wanted is not None:
+                parts = [np.random.default_rng(number).bytes(size) for size in wanted]
+                if ends.writer.try_put(parts, tag=-number):
+                    waiting.append(parts)
+            message = None if puts else ends.reader.try_get()
+            assert puts or (message is None) == (not waiting)
+            if message is not None:
+                assert [part.tobytes() for part in message.parts] == waiting.pop(0)
+        written, read = ends.blocks[1].written(0, 1), ends.blocks[0].read(0, 1)
+        assert written.messages - len(waiting) in (read.messages, read.messages + 1)
+
+
+def test_the_largest_message_fits_wherever_the_ring_stands(ends: Ends) -> None:
+    largest = ends.writer.max_message_bytes
+    whole = largest - message_bytes([0])
+    for number in range(50):
+        ends.writer.put([bytes(64 * number)], timeout_s=0.0)
+        ends.reader.get(timeout_s=0.0)
+        ends.reader.release()
+        ends.writer.put([np.full(whole, number, np.uint8)], timeout_s=0.0)
+        assert (ends.reader.get(timeout_s=0.0).parts[0] == number).all()
+        ends.reader.release()
+    with pytest.raises(CollectiveError, match=f"at most {largest}"):
+        ends.writer.try_put([bytes(whole + 1)])
+
+
+def test_arrays_of_any_strides_are_written_without_a_copy_of_theirs(ends: Ends) -> None:
+    values = np.arange(60, dtype=np.float32).reshape(3, 4, 5)
+    ends.writer.put([values[:, 1:3], np.array([True, False])], timeout_s=1.0, tag=7, items=2)
+    message = ends.reader.get(timeout_s=1.0)
+    assert (message.tag, message.items, message.sequence) == (7, 2, 0)
+    received = message.parts[0].view(np.float32).reshape(3, 2, 5)
+    np.testing.assert_array_equal(received, values[:, 1:3])
+    assert not received.flags.writeable
+    assert received.ctypes.data % 64 == 0
+    assert ends.writer.progress.items == 2
+
+
+def test_a_full_pipe_and_an_empty_one_wait_no_longer_than_told(ends: Ends) -> None:
+    with pytest.raises(CollectiveTimeout, match=r"rank 1: waited 0.01 s in get.* ranks \[0\]"):
+        ends.reader.get(timeout_s=0.01)
+    while ends.writer.try_put([bytes(1000)]):
+        pass
+    with pytest.raises(CollectiveTimeout, match=r"rank 0: waited 0.01 s in put.* ranks \[1\]"):
+        ends.writer.put([bytes(1000)], timeout_s=0.01)
+    assert ends.blocks[0].outstanding_bytes(1) == ends.writer.outstanding_bytes > 6000
+    held = ends.reader.try_get()
+    assert held is not None
+    assert not ends.writer.try_put([bytes(1000)]), "views of the reader must not be overwritten"
+    ends.reader.release()
+    assert ends.writer.try_put([bytes(900)])
+
+
+def test_a_closed_pipe_gives_what_is_in_it_and_then_says_so(ends: Ends) -> None:
+    ends.writer.put([b"last"], timeout_s=1.0)
+    ends.writer.close()
+    assert ends.reader.get(timeout_s=1.0).parts[0].tobytes() == b"last"
+    with pytest.raises(PipeClosed, match="peer 0 has closed"):
+        ends.reader.get(timeout_s=1.0)
+    ends.reader.close()
+    with pytest.raises(PipeClosed, match="peer 1 has closed"):
+        ends.writer.put([b"more"], timeout_s=1.0)
+
+
+def test_a_process_that_leaves_is_not_waited_for(ends: Ends) -> None:
+    ends.blocks[0].close()
+    with pytest.raises(PipeClosed, match="peer 0 has closed"):
+        ends.reader.get(timeout_s=5.0)
+
+
+@pytest.mark.parametrize("offset", [0, 8, 24, 64, 128, 1151])
+def test_a_damaged_message_is_found(ends: Ends, offset: int) -> None:
+    ends.writer.put([np.arange(128.0)], timeout_s=1.0)
+    ends.blocks[0].memory(0, 1).ring[offset] ^= 0x10
+    with pytest.raises(CollectiveError, match="message 0 from rank 0 is damaged"):
+        ends.reader.get(timeout_s=1.0)
+
+
+def test_a_successor_goes_on_after_what_was_committed(ends: Ends) -> None:
+    """Also if its predecessor was killed after it had noted a commit and before it made it."""
+    for number in range(5):
+        ends.writer.put([bytes([number])], timeout_s=1.0, items=10)
+    ends.writer.reserve([100], timeout_s=1.0)[0][:] = 255
+    memory = ends.blocks[0].memory(0, 1)
+    memory.writer["record"][0, 0] = 2**40, 6, 60
+    successor = PipeWriter(ends.blocks[0], 1)
+    assert successor.progress[1:] == (5, 50)
+    successor.put([b"\x05"], timeout_s=1.0)
+    got = [ends.reader.get(timeout_s=1.0).parts[0].item(0) for _ in range(6)]
+    assert got == [0, 1, 2, 3, 4, 5]
+    assert ends.reader.try_get() is None
+
+
+def test_a_reader_that_follows_gets_again_what_was_not_released(ends: Ends) -> None:
+    for number in range(3):
+        ends.writer.put([bytes([number])], timeout_s=1.0)
+    ends.reader.get(timeout_s=1.0)
+    assert ends.reader.get(timeout_s=1.0).parts[0].item(0) == 1
+    assert PipeReader(ends.blocks[1], 0).get(timeout_s=1.0).parts[0].item(0) == 1
+
+
+def test_senseless_numbers_and_other_blocks_are_refused(ends: Ends) -> None:
+    with pytest.raises(ConfigError, match="capacity_bytes=100: must be between"):
+        create_pipes(2, 100)
+    with pytest.raises(ConfigError, match=r"rank=2: must be 0 to world_size - 1 = 1"):
+        PipeBlock.attach(ends.fd, 2, 2, CAPACITY)
+    with pytest.raises(CollectiveError, match="world_size"):
+        PipeBlock.attach(ends.fd, 1, 3, CAPACITY)
+    with pytest.raises(CollectiveError, match="rank 1 is taken already by process"):
+        PipeBlock.attach(ends.fd, 1, 2, CAPACITY)
+    descriptors = len(os.listdir("/proc/self/fd"))
+    for _ in range(3):
+        with pytest.raises(CollectiveError, match="is taken"):
+            PipeBlock.attach(ends.fd, 1, 2, CAPACITY)
+    assert len(os.listdir("/proc/self/fd")) == descriptors
+    empty = os.memfd_create("empty", os.MFD_CLOEXEC)
+    with pytest.raises(CollectiveError, match="rank 1: no pipes at descriptor"):
+        PipeBlock.attach(empty, 1, 2, CAPACITY)
+    os.close(empty)
+
+
+def test_a_rank_that_is_coming_never_seems_to_have_left() -> None:
+    """Whoever looks between any two stores to its line."""
+    fd = create_pipes(2, CAPACITY)
+    watcher = PipeBlock.attach(fd, 0, 2, CAPACITY)
+    seen: list[bool] = []
+
+    class Line:
+        def __getitem__(self, key: str) -> Any:
+            return watcher._lines[1][key]
+
+        def __setitem__(self, key: str, value: Any) -> None:
+            watcher._lines[1][key] = value
+            seen.append(watcher.has_left(1))
+
+    comer: Any = copy.copy(watcher)
+    comer.rank, comer._lines = 1, [None, Line()]
+    comer._take_rank()
+    assert seen == [False] * 3
+    assert not watcher.is_gone(1)
+    watcher.close()
+    os.close(fd)
+
+
+def test_unused_pipes_cost_no_memory() -> None:
+    fd = create_pipes(16, 2**26)
+    block = PipeBlock.attach(fd, 3, 16, 2**26)
+    block.outstanding_bytes(5)
+    assert os.fstat(fd).st_blocks * 512 < 2**20
+    block.close()
+    os.close(fd)

@@ -1,0 +1,224 @@
+"""MIG: what NVML lists, which GMI gets which instance, what the backend does with them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import fake_nvml
+import pytest
+from supervision import plan_config, reduce_config
+
+from gmijax.errors import BackendUnavailable, ConfigError
+from gmijax.partition.backends import open_backend
+from gmijax.partition.environment import gmi_environment
+from gmijax.partition.machine import Machine, visible_gpus
+from gmijax.partition.mig_split import place_instances, split_commands
+from gmijax.partition.nvidia import Gpu, list_gpus
+from gmijax.partition.plan import Plan
+from gmijax.partition.planner import make_plan
+from gmijax.partition.shares import assign_instances
+from gmijax.rundir import RunPaths
+
+MPS = Path("/usr/bin/nvidia-cuda-mps-control")
+
+
+def machine_of(
+    monkeypatch: pytest.MonkeyPatch, *boards: fake_nvml.Board, control: Path | None = None
+) -> Machine:
+    fake_nvml.install(monkeypatch, *boards)
+    return Machine(list_gpus(), (0, 1), mps_control=control, driver_version="580.159.03")
+
+
+def planned(here: Machine, **changes: Any) -> Plan:
+    return make_plan(plan_config(**changes), reduce_config(), 64, here)
+
+
+def test_seven_equal_instances_are_listed(monkeypatch: pytest.MonkeyPatch):
+    [gpu] = machine_of(monkeypatch, fake_nvml.A100_SEVEN).gpus
+    assert gpu.mig_enabled
+    assert [one.profile for one in gpu.instances] == ["1g.10gb"] * 7
+    assert {(one.num_sms, one.memory_mib) for one in gpu.instances} == {(14, 9728)}
+    assert len({one.uuid for one in gpu.instances}) == 7
+
+
+def test_holes_between_instances_are_passed_over(monkeypatch: pytest.MonkeyPatch):
+    [gpu] = machine_of(monkeypatch, fake_nvml.H200_MIXED).gpus
+    assert [one.profile for one in gpu.instances] == ["3g.71gb", "2g.35gb", "1g.18gb", "1g.18gb"]
+
+
+@pytest.mark.parametrize(
+    ("board", "supported", "enabled"),
+    [
+        (fake_nvml.H200_MIG_OFF, True, False),
+        (fake_nvml.H200_MIG_EMPTY, True, True),
+        (fake_nvml.V100, False, False),
+    ],
+)
+def test_gpus_without_instances(
+    monkeypatch: pytest.MonkeyPatch, board: fake_nvml.Board, supported: bool, enabled: bool
+):
+    [gpu] = machine_of(monkeypatch, board).gpus
+    assert (gpu.mig_supported, gpu.mig_enabled, gpu.instances) == (supported, enabled, ())
+
+
+def test_cuda_visible_devices_may_name_instances(monkeypatch: pytest.MonkeyPatch):
+    gpus = machine_of(monkeypatch, fake_nvml.A100_SEVEN, fake_nvml.H200_MIXED).gpus
+    first, mixed = (fake_nvml.instance_uuid(0, place) for place in (4, 2)), gpus[1].instances[0]
+    seen = visible_gpus(gpus, ",".join([*first, mixed.uuid, "MIG-none", "0"]))
+    assert [gpu.index for gpu in seen] == [0, 1]
+    assert [one.uuid for one in seen[0].instances] == [
+        fake_nvml.instance_uuid(0, 4),
+        fake_nvml.instance_uuid(0, 2),
+    ]
+    assert seen[1].instances == (mixed,)
+    assert visible_gpus(gpus, "GPU-0") == (gpus[0],)
+
+
+@pytest.mark.parametrize(
+    ("num_sms", "num_gmis", "places"),
+    [
+        ((14,) * 7, 3, (0, 1, 2)),
+        ((16, 60, 32, 16), 2, (1, 2)),
+        ((16, 60, 32, 16), 4, (1, 2, 0, 3)),
+        ((16, 60, 32, 16), 6, (1, 2, 0, 3, 1, 1)),
+        ((42,), 3, (0, 0, 0)),
+    ],
+)
+def test_every_gmi_gets_an_instance_of_its_own_while_there_are_any(
+    num_sms: tuple[int, ...], num_gmis: int, places: tuple[int, ...]
+):
+    assert assign_instances(num_sms, num_gmis) == places
+
+
+def test_plan_over_uneven_instances(monkeypatch: pytest.MonkeyPatch):
+    here = machine_of(monkeypatch, fake_nvml.H200_MIXED)
+    plan = planned(here, gmis_per_gpu=4, backend="mig")
+    sizes = {one.uuid: one.profile for one in here.gpus[0].instances}
+    assert [sizes[share.device] for share in plan.slices] == [
+        *("3g.71gb", "2g.35gb", "1g.18gb", "1g.18gb")
+    ]
+    assert {share.memory_fraction for share in plan.slices} == {0.8}
+    assert (plan.strategy, plan.intra) == ("mpr", "host")
+
+
+def test_gmis_that_share_memory_split_it(monkeypatch: pytest.MonkeyPatch):
+    here = machine_of(monkeypatch, fake_nvml.A100_HALVES)
+    plan = planned(here, gmis_per_gpu=3, backend="mig")
+    assert [share.memory_fraction for share in plan.slices] == [0.8, 0.4, 0.4]
+
+
+def test_more_gmis_than_instances_need_mps(monkeypatch: pytest.MonkeyPatch):
+    here = machine_of(monkeypatch, fake_nvml.A100_HALVES)
+    with pytest.raises(BackendUnavailable, match=r"3 MIG instances for 4 GMIs, and MPS"):
+        planned(here, gmis_per_gpu=4, backend="mig")
+    here = machine_of(monkeypatch, fake_nvml.A100_SEVEN, control=MPS)
+    assert planned(here, gmis_per_gpu=42, backend="mig").layout.num_gmis == 42
+    with pytest.raises(ConfigError, match=r"at most 6 processes on a MIG instance 1g\.10gb"):
+        planned(here, gmis_per_gpu=43, backend="mig")
+
+
+def test_memory_over_the_limit_of_an_instance_is_refused(monkeypatch: pytest.MonkeyPatch):
+    here = machine_of(monkeypatch, fake_nvml.A100_SEVEN, control=MPS)
+    assert planned(here, gmis_per_gpu=7, backend="mig", memory_fraction=0.9)
+    with pytest.raises(ConfigError, match="2 GMIs on MIG-"):
+        planned(here, gmis_per_gpu=8, backend="mig", memory_fraction=0.5)
+
+
+@pytest.mark.parametrize(
+    ("board", "why"),
+    [
+        (fake_nvml.H200_MIG_EMPTY, "MIG mode is on, but there are no instances"),
+        (fake_nvml.H200_MIG_OFF, r"no GPU is divided .*gmijax\.doctor mig="),
+        (fake_nvml.V100, "the GPUs here have no MIG"),
+    ],
+)
+def test_mig_without_instances_is_refused(
+    monkeypatch: pytest.MonkeyPatch, board: fake_nvml.Board, why: str
+):
+    with pytest.raises(BackendUnavailable, match=f"plan.backend=mig: {why}"):
+        planned(machine_of(monkeypatch, board), backend="mig")
+
+
+def test_rings_between_instances_are_refused_and_not_chosen(monkeypatch: pytest.MonkeyPatch):
+    here = machine_of(monkeypatch, fake_nvml.A100_SEVEN, fake_nvml.H200_MIXED)
+    config = plan_config(gpus=2, gmis_per_gpu=2, backend="mig")
+    assert make_plan(config, reduce_config(), 64, here).strategy == "mpr"
+    with pytest.raises(ConfigError, match="mrr: rings between MIG instances"):
+        make_plan(config, reduce_config(strategy="mrr"), 64, here)
+
+
+def test_a_gmi_sees_its_instance_and_no_daemon(monkeypatch: pytest.MonkeyPatch, tmp_path: Path):
+    here = machine_of(monkeypatch, fake_nvml.A100_SEVEN)
+    plan = planned(here, gmis_per_gpu=2, backend="mig")
+    with open_backend(plan, here, RunPaths(tmp_path)) as backend:
+        found = gmi_environment(plan, 1, {}, tmp_path, backend.environment(1))
+        backend.verify({0: 1, 1: 2})
+        backend.terminate(0, 1)
+    assert found["CUDA_VISIBLE_DEVICES"] == fake_nvml.instance_uuid(0, 1)
+    assert found["XLA_CLIENT_MEM_FRACTION"] == "0.8"
+    assert list(Path(found["CUDA_MPS_PIPE_DIRECTORY"]).iterdir()) == []
+
+
+def test_instance_that_is_gone_is_told(monkeypatch: pytest.MonkeyPatch, tmp_path: Path):
+    here = machine_of(monkeypatch, fake_nvml.A100_SEVEN)
+    plan = planned(here, backend="mig")
+    gone = machine_of(monkeypatch, fake_nvml.H200_MIXED)
+    with pytest.raises(BackendUnavailable, match="of GMI 0 does not exist"):
+        open_backend(plan, gone, RunPaths(tmp_path))
+
+
+def board(name: str, memory_mib: int) -> Gpu:
+    return Gpu(0, "GPU-0", name, memory_mib, (9, 0), mig_enabled=False, mig_supported=True)
+
+
+@pytest.mark.parametrize(
+    ("name", "memory_mib", "wanted", "profiles"),
+    [
+        ("NVIDIA H200", 143771, "1g,3g,2g,1g", "3g.71gb:4,2g.35gb:2,1g.18gb:1,1g.18gb:0"),
+        ("NVIDIA A100-SXM4-80GB", 81920, "3g.40gb,4g.40gb", "4g.40gb:0,3g.40gb:4"),
+        ("NVIDIA A100-SXM4-40GB", 40960, "7g", "7g.40gb:0"),
+        ("NVIDIA H100 80GB HBM3", 81559, "2g,2g,2g,1g", "2g.20gb:4,2g.20gb:2,2g.20gb:0,1g.10gb:6"),
+        ("NVIDIA A30", 24576, "2g,1g,1g", "2g.12gb:2,1g.6gb:1,1g.6gb:0"),
+    ],
+)
+def test_commands_of_a_split(name: str, memory_mib: int, wanted: str, profiles: str):
+    assert split_commands(board(name, memory_mib), wanted) == (
+        "sudo nvidia-smi -i 0 -mig 1",
+        f"sudo nvidia-smi mig -i 0 -cgi {profiles} -C",
+        "nvidia-smi -L",
+    )
+
+
+def test_old_instances_are_destroyed_first(monkeypatch: pytest.MonkeyPatch):
+    [gpu] = machine_of(monkeypatch, fake_nvml.A100_SEVEN).gpus
+    assert split_commands(gpu, "7g")[:2] == (
+        "sudo nvidia-smi mig -i 0 -dci",
+        "sudo nvidia-smi mig -i 0 -dgi",
+    )
+
+
+@pytest.mark.parametrize("wanted", ["3g,3g,1g", "7g,1g", "1g,1g,1g,1g,1g,1g,1g,1g", "4g,4g"])
+def test_what_does_not_fit_is_refused(wanted: str):
+    with pytest.raises(ConfigError, match="do not fit side by side"):
+        split_commands(board("NVIDIA H200", 143771), wanted)
+
+
+@pytest.mark.parametrize("wanted", ["5g", "big", "1g,,1g", "1g.5tb"])
+def test_what_is_no_size_is_refused(wanted: str):
+    with pytest.raises(ConfigError, match="expected a list of 1g, 2g, 3g, 4g, 7g"):
+        split_commands(board("NVIDIA H200", 143771), wanted)
+
+
+def test_instances_do_not_overlap():
+    sizes = {1: 1, 2: 2, 3: 4, 4: 4}
+    for parts in ((4, 3), (3, 2, 1, 1), (2, 2, 2, 1), (4, 2, 1), (3, 2, 2), (1,) * 7):
+        starts = place_instances(parts)
+        assert starts is not None
+        cells = [
+            cell
+            for part, start in zip(parts, starts, strict=True)
+            for cell in range(start, start + sizes[part])
+        ]
+        assert len(cells) == len(set(cells))
+        assert max(cells) < 8

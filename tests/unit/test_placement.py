@@ -1,0 +1,63 @@
+"""Where serving and training GMIs go."""
+
+from __future__ import annotations
+
+import pytest
+from supervision import machine, plan_config, reduce_config
+
+from gmijax.errors import ConfigError
+from gmijax.partition.placement import place
+from gmijax.partition.planner import make_plan
+
+
+def planned(**changes):
+    placed = place(plan_config(**changes))
+    return make_plan(
+        placed.plan, reduce_config(), 8, machine(0), template="decoupled", trainers=placed.trainers
+    )
+
+
+@pytest.mark.parametrize(
+    ("changes", "layout", "trainers"),
+    [
+        ({}, "[[0,1]]", 1),
+        ({"serving_gmis_per_gpu": 3, "training_gmis_per_gpu": 2}, "[[0,1,2,3,4]]", 2),
+        ({"gpus": 2}, "[[1],[0]]", 1),
+        ({"gpus": 8}, "[[2],[3],[4],[5],[6],[7],[0],[1]]", 2),
+        ({"serving_gpus": 1, "training_gpus": 1, "serving_gmis_per_gpu": 2}, "[[1,2],[0]]", 1),
+        ({"serving_gpus": (0, 1), "training_gpus": (1,)}, "[[1],[0,2]]", 1),
+        ({"serving_gpus": (5, 3), "training_gpus": (7,)}, "[[2],[1],[0]]", 1),
+    ],
+)
+def test_trainers_come_first_and_every_gpu_has_what_it_is_for(changes, layout, trainers) -> None:
+    plan = planned(**changes)
+    assert str(plan.layout) == layout
+    serving = plan.layout.num_gmis - trainers
+    assert plan.roles == ("trainer",) * trainers + ("simulator+agent",) * serving
+    assert plan.strategy == ("none" if trainers == 1 else "mpr")
+
+
+def test_indices_are_those_of_the_machine() -> None:
+    assert place(plan_config(serving_gpus=(5, 3), training_gpus=(7,))).plan.gpus == (3, 5, 7)
+    assert place(plan_config(gpus=(4, 6))).plan.gpus == (4, 6)
+    apart = place(plan_config(gpus=(7, 2, 5), serving_gpus=2, training_gpus=1))
+    assert (apart.plan.gpus, apart.plan.layout) == ((7, 2, 5), ((1,), (2,), (0,)))
+
+
+@pytest.mark.parametrize(
+    ("changes", "said"),
+    [
+        ({"serving_gmis_per_gpu": 0}, r"plan.serving_gmis_per_gpu=0: at least one GMI must act"),
+        ({"training_gmis_per_gpu": 0}, r"plan.training_gmis_per_gpu=0: .* must train"),
+        ({"serving_gpus": 0, "training_gpus": 1}, r"plan.serving_gpus=0: there must be serving"),
+        ({"serving_gpus": (0,), "training_gpus": ()}, r"plan.training_gpus=\(\): there must be"),
+        ({"serving_gpus": 2}, r"plan.training_gpus=null"),
+        ({"serving_gpus": 1, "training_gpus": (1,)}, r"expected two numbers or two lists"),
+        ({"serving_gpus": (0, 0), "training_gpus": (1,)}, r"distinct indices"),
+        ({"gpus": (3,), "serving_gpus": 1, "training_gpus": 1}, r"plan.gpus=\[3\]: .* take 2"),
+        ({"layout": ((0,), (1,))}, r"plan.layout=\[\[0\], \[1\]\]: with the decoupled template"),
+    ],
+)
+def test_what_cannot_be_is_refused(changes, said: str) -> None:
+    with pytest.raises(ConfigError, match=said):
+        place(plan_config(**changes))

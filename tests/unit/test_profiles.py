@@ -1,0 +1,88 @@
+"""The profile store: what it keeps, and what it does with a file that is broken."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+
+from gmijax.errors import ConfigError
+from gmijax.partition.search import Measured, NotRunnable, Point
+from gmijax.profiles import ProfileStore
+
+KEY = {"device": "NVIDIA H200, 143771 MiB", "task": "ant", "versions": {"jax": "0.11.2"}}
+POINT = Point(4, 2048, "jax")
+MEASURED = Measured(345_000.5, 812.25, 0.095, 0.0125)
+
+
+def store(folder: Path, **changes: object) -> tuple[ProfileStore, list[str]]:
+    notes: list[str] = []
+    return ProfileStore(folder, {**KEY, **changes}, notes.append), notes
+
+
+def test_what_was_put_is_there_for_the_next_search(tmp_path: Path):
+    first, _ = store(tmp_path / "new" / "folder")
+    assert first.get("corun", POINT) is None
+    first.put("corun", POINT, MEASURED, 21.0)
+    first.put("corun", POINT._replace(num_envs=16384), NotRunnable("out of memory"), 5.0)
+    second, notes = store(tmp_path / "new" / "folder")
+    assert second.get("corun", POINT) == MEASURED
+    assert second.get("corun", POINT._replace(num_envs=16384)) == NotRunnable("out of memory")
+    for other in (POINT._replace(gmis_per_gpu=2), POINT._replace(impl="warp")):
+        assert second.get("corun", other) is None
+    assert second.get("isolated", POINT) is None
+    assert notes == []
+
+
+def test_another_device_task_or_version_has_a_file_of_its_own(tmp_path: Path):
+    first, _ = store(tmp_path)
+    first.put("corun", POINT, MEASURED, 21.0)
+    assert first.path.name.startswith("nvidia-h200-143771-mib-ant-")
+    for changes in ({"device": "A100"}, {"task": "humanoid"}, {"versions": {"jax": "0.12"}}):
+        other, _ = store(tmp_path, **changes)
+        assert other.path != first.path
+        assert other.get("corun", POINT) is None
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        "{",
+        "[]",
+        '"text"',
+        "{}",
+        '{"profiles": []}',
+        '{"profiles": {"corun 4x2048 jax": {"wall_s": 3}}}',
+        '{"profiles": {"corun 4x2048 jax": {"env_steps_per_s": "fast", "wall_s": 3}}}',
+        '{"profiles": {"corun 4x2048 jax": 7}}',
+    ],
+)
+def test_a_broken_file_is_moved_aside_and_told(content: str, tmp_path: Path):
+    path = store(tmp_path)[0].path
+    path.write_text(content)
+    broken, notes = store(tmp_path)
+    assert broken.get("corun", POINT) is None
+    aside = path.with_name(f"{path.name}.broken")
+    assert aside.read_text() == content
+    assert len(notes) == 1
+    assert f"profile store {path} is broken" in notes[0]
+    assert str(aside) in notes[0]
+    broken.put("corun", POINT, MEASURED, 1.0)
+    path.write_text(content)
+    store(tmp_path)  # A second one does not replace the first.
+    assert aside.with_name(f"{aside.name}1").exists()
+
+
+def test_a_folder_that_cannot_be_used_is_bad_input(tmp_path: Path):
+    (tmp_path / "file").write_text("")
+    with pytest.raises(ConfigError, match=r"search\.store=.*file/x: cannot be used"):
+        store(tmp_path / "file" / "x")
+
+
+def test_the_file_can_be_read_by_others(tmp_path: Path):
+    first, _ = store(tmp_path)
+    first.put("corun", POINT, MEASURED, 21.0)
+    content = json.loads(first.path.read_text())
+    assert content["key"] == KEY
+    assert content["profiles"] == {"corun 4x2048 jax": {**MEASURED._asdict(), "wall_s": 21.0}}

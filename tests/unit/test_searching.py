@@ -1,0 +1,281 @@
+"""Searches with store, budget and console, over profiles that are a formula."""
+
+from __future__ import annotations
+
+import functools
+import io
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+from rich.console import Console
+from supervision import machine
+
+from gmijax import searching
+from gmijax.cli import compose
+from gmijax.config import TrainConfig
+from gmijax.errors import ConfigError, GmijaxError, JobInterrupted
+from gmijax.partition.machine import Machine
+from gmijax.partition.search import Measured, NotRunnable, Point
+from gmijax.profiling import ProfileLate, Workload, plan_at, training
+
+Answer = Callable[[Point, str], Measured | NotRunnable]
+GRID = ("search.gmis_per_gpu=[4,2,1]", "search.num_envs=[64,128]", "search.order=as_printed")
+MPS = Path("/usr/bin/nvidia-cuda-mps-control")
+
+
+class Profiles:
+    """In place of `gmijax.profiling.profile`: answers with a formula and counts."""
+
+    def __init__(self, answer: Answer) -> None:
+        self.answer = answer
+        self.asked: list[tuple[Point, str]] = []
+
+    def __call__(
+        self, workload: Workload, point: Point, mode: str, *_: Any, **__: Any
+    ) -> Measured | NotRunnable:
+        assert workload.module == "gmijax.worker"
+        self.asked.append((point, mode))
+        return self.answer(point, mode)
+
+
+def scaling(point: Point, mode: str) -> Measured:
+    """Twice the throughput with twice the environments; GMIs of a GPU cost each other 10 %."""
+    contention = 0.9 if mode == "corun" and point.gmis_per_gpu > 1 else 1.0
+    return Measured(contention * 1000.0 * point.num_envs, 100.0 + point.num_envs, 0.1)
+
+
+@pytest.fixture
+def profiles(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Callable[[Answer], Profiles]:
+    monkeypatch.chdir(tmp_path)
+
+    def use(answer: Answer) -> Profiles:
+        used = Profiles(answer)
+        monkeypatch.setattr(searching, "profile", used)
+        return used
+
+    return use
+
+
+@functools.cache
+def wanted(*overrides: str) -> TrainConfig:
+    return compose(*GRID, "search.store=store", *overrides, command="search")
+
+
+def found(*overrides: str, here: Machine | None = None) -> tuple[searching.SearchResult, str]:
+    config, said = wanted(*overrides), io.StringIO()
+    result = searching.resolve_auto(
+        training(config), config.search, here or machine(0), Console(file=said, width=400)
+    )
+    return result, said.getvalue()
+
+
+def test_a_second_search_profiles_nothing(profiles: Callable[[Answer], Profiles]):
+    first = profiles(scaling)
+    result, said = found()
+    assert (result.gmis_per_gpu, result.num_envs, result.impl) == (4, 128, "jax")
+    assert len(first.asked) == 6
+    assert result.run_dir
+    assert result.reason in said
+    assert "3.60 times the best with one GMI" in result.reason
+    report = json.loads((result.run_dir / "search.json").read_text())
+    assert report["best"] == {
+        "gmis_per_gpu": 4,
+        "num_envs": 128,
+        "impl": "jax",
+        "projected": pytest.approx(4 * 0.9 * 128_000),
+    }
+    assert (report["complete"], report["num_profiled"]) == (True, 6)
+    assert (result.run_dir / "search.png").stat().st_size > 1000
+    again = profiles(scaling)
+    second, _ = found()
+    assert again.asked == []
+    assert second[1:5] == result[1:5]
+    assert second.run_dir is None
+
+
+def test_an_interrupted_search_goes_on_where_it_was(profiles: Callable[[Answer], Profiles]):
+    def interrupted(point: Point, mode: str) -> Measured:
+        if point == Point(2, 128, "jax"):
+            raise JobInterrupted("stopped")
+        return scaling(point, mode)
+
+    first = profiles(interrupted)
+    with pytest.raises(JobInterrupted) as stopped:
+        found()
+    assert "goes on from" in stopped.value.__notes__[0]
+    rest = profiles(scaling)
+    result, _ = found()
+    assert rest.asked[0] == first.asked[-1]
+    assert len(first.asked) - 1 + len(rest.asked) == 6
+    assert result.num_envs == 128
+
+
+def test_what_cannot_run_is_remembered_too(profiles: Callable[[Answer], Profiles]):
+    def small(point: Point, mode: str) -> Measured | NotRunnable:
+        if point.gmis_per_gpu == 4:
+            return NotRunnable("GMI 0 failed: RESOURCE_EXHAUSTED")
+        return scaling(point, mode)
+
+    profiles(small)
+    result, said = found()
+    assert result.gmis_per_gpu == 2
+    assert "4 x 64, jax (corun): not runnable: GMI 0 failed: RESOURCE_EXHAUSTED" in said
+    assert profiles(scaling).asked == []
+    assert found()[0].gmis_per_gpu == 2
+
+
+def test_a_reason_may_look_like_markup(profiles: Callable[[Answer], Profiles]):
+    reason = "cannot run on layout [[0,1]]: see [/tmp/x]"
+
+    def odd(point: Point, mode: str) -> Measured | NotRunnable:
+        return NotRunnable(reason) if point.gmis_per_gpu == 4 else scaling(point, mode)
+
+    profiles(odd)
+    assert found()[1].count(reason) == 4  # Two points, each when it is profiled and in the table.
+
+
+def test_where_nothing_runs_the_first_reason_is_told(profiles: Callable[[Answer], Profiles]):
+    profiles(lambda *_: NotRunnable("no such thing"))
+    with pytest.raises(GmijaxError, match=r"no point of the search can run; .*no such thing"):
+        found()
+
+
+def test_a_profile_that_hangs_cannot_run(profiles: Callable[[Answer], Profiles]):
+    def late(point: Point, mode: str) -> Measured:
+        if point.num_envs == 128:
+            raise ProfileLate("no end within 5 s (GMI 0 compiling)")
+        return scaling(point, mode)
+
+    profiles(late)
+    result, _ = found("search.profile_timeout_s=5")
+    assert result.num_envs == 64
+    reasons = [point.get("reason") for point in result.report["points"]]
+    assert reasons.count("no end within 5 s (GMI 0 compiling)") == 3
+    again = profiles(scaling)
+    assert found("search.profile_timeout_s=5")[0].num_envs == 64
+    assert again.asked == []
+    assert found("search.profile_timeout_s=6")[0].num_envs == 128  # More time than they had.
+    assert {point.num_envs for point, _ in again.asked} == {128}
+
+
+def test_a_profile_cut_off_by_the_budget_is_no_answer(profiles: Callable[[Answer], Profiles]):
+    def slow(point: Point, mode: str) -> Measured:
+        if point != Point(4, 64, "jax"):
+            raise ProfileLate("cut off")
+        return scaling(point, mode)
+
+    profiles(slow)
+    result, _ = found("search.budget_s=20", "search.profile_timeout_s=30")
+    assert (result.gmis_per_gpu, result.num_envs) == (4, 64)
+    assert not result.report["complete"]
+    assert "the budget ended the search after 1 points" in result.reason
+    rest = profiles(scaling)
+    found()
+    assert rest.asked[0] == (Point(4, 128, "jax"), "corun")
+
+
+def test_a_budget_too_small_for_one_profile_is_bad_input(
+    profiles: Callable[[Answer], Profiles],
+):
+    def late(*_: object) -> Measured:
+        raise ProfileLate("cut off")
+
+    profiles(late)
+    with pytest.raises(ConfigError, match=r"^search\.budget_s=10: too small for one profile"):
+        found("search.budget_s=10")
+    with pytest.raises(ConfigError, match=r"^search\.budget_s=2: too small for one profile"):
+        wanted("search.budget_s=2")
+
+
+def test_what_is_given_is_not_searched(profiles: Callable[[Answer], Profiles]):
+    asked = profiles(scaling).asked
+    assert found("plan.gmis_per_gpu=3")[0].gmis_per_gpu == 3
+    assert {point.gmis_per_gpu for point, _ in asked} == {3}
+    asked = profiles(scaling).asked
+    assert found("num_envs=96", "plan.layout=[[0,1],[2]]")[0].gmis_per_gpu == 2
+    assert [point for point, _ in asked] == [Point(2, 96, "jax")]
+
+
+def test_both_modes_tell_how_far_they_differ(profiles: Callable[[Answer], Profiles]):
+    asked = profiles(scaling).asked
+    result, said = found("search.mode=both")
+    modes = [mode for _, mode in asked]
+    assert modes == ["corun"] * 6 + ["isolated"] * 4  # One GMI is the same in both.
+    assert "corun/isolated" in said
+    ratios = {
+        point["gmis_per_gpu"]: point["corun_over_isolated"] for point in result.report["points"]
+    }
+    assert ratios == {4: pytest.approx(0.9), 2: pytest.approx(0.9), 1: None}
+
+
+def test_one_gmi_is_said_plainly(profiles: Callable[[Answer], Profiles]):
+    profiles(lambda point, _: Measured(1e6 / point.gmis_per_gpu, 100.0 + point.num_envs, 0.1))
+    result, _ = found()
+    assert (result.gmis_per_gpu, result.num_envs) == (1, 64)
+    assert "one GMI is enough here: the best with several, 4 x 64, jax, makes 1.00" in (
+        result.reason
+    )
+
+
+def test_a_job_with_auto_gets_the_answer_and_the_reason(profiles: Callable[[Answer], Profiles]):
+    profiles(scaling)
+    config, reasons = searching.decided(wanted(), machine(0), Console(quiet=True))
+    assert (config.num_envs, config.plan.gmis_per_gpu) == (128, 4)
+    assert config.physics.impl == "jax"
+    assert reasons[0].startswith("4 GMIs per GPU with 128 environments each, jax: ")
+    given = compose("num_envs=64")
+    assert searching.decided(given, machine(0), Console(quiet=True)) == (given, ())
+
+
+@pytest.mark.parametrize(
+    ("overrides", "message"),
+    [
+        (("num_envs=64", "plan.gmis_per_gpu=2"), "nothing to search for; make one of them auto"),
+        (("search.gmis_per_gpu=[2,2]",), r"search\.gmis_per_gpu=\[2, 2\]: expected distinct"),
+        (("search.num_envs=[]",), r"search\.num_envs=\[\]: expected distinct numbers"),
+        (("search.num_envs=[0]",), r"search\.num_envs=0: must be at least 1"),
+        (("search.impls=[cuda]",), r"search\.impls=cuda: allowed are jax, warp"),
+        (("search.alpha=-1",), r"search\.alpha=-1\.0: must be at least 0"),
+        (("search.mode=alone",), r"search\.mode=alone: expected one of corun, isolated, both"),
+        (("plan.backend=mps",), r"plan\.backend=mps"),
+        (("plan.template=tdg_ex",), r"plan\.template=tcg_ex only"),
+    ],
+)
+def test_bad_input_starts_nothing(
+    overrides: tuple[str, ...], message: str, profiles: Callable[[Answer], Profiles]
+):
+    asked = profiles(scaling).asked
+    with pytest.raises(ConfigError, match=message):
+        searching.search(wanted(*overrides))
+    assert asked == []
+    assert not Path("runs").exists()
+
+
+def test_undecided_numbers_are_refused_where_numbers_are_needed():
+    with pytest.raises(ConfigError, match="num_envs=auto: not decided yet"):
+        _ = wanted().envs_per_gmi
+
+
+def test_isolated_is_one_gmi_of_those_that_corun():
+    workload = training(wanted())
+    here = machine(0, cpu_cores=(0, 1, 2, 3))
+    together = plan_at(workload, Point(2, 64, "jax"), "corun", here)
+    alone = plan_at(workload, Point(2, 64, "jax"), "isolated", here)
+    assert (together.layout.num_gmis, alone.layout.num_gmis) == (2, 1)
+    assert together.strategy != alone.strategy == "none"
+    assert alone.slices == together.slices[:1]
+    assert alone.slices[0].cpus == (0, 1)
+
+
+def test_isolated_on_a_gpu_has_an_even_share_of_sms_and_memory():
+    workload = training(wanted("plan.gpus=2"))
+    here = machine(2, mps_control=MPS)
+    together = plan_at(workload, Point(4, 64, "jax"), "corun", here)
+    alone = plan_at(workload, Point(4, 64, "jax"), "isolated", here)
+    assert together.layout.num_gpus == 1
+    assert [share.sm_percent for share in together.slices] == [None] * 4
+    (share,) = alone.slices
+    assert (share.sm_percent, share.memory_fraction) == (25.0, 0.2)

@@ -1,0 +1,86 @@
+"""The check of matrix products finds wrong ones, and lets right ones pass."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import pytest
+from supervision import machine, plan_config, reduce_config
+
+from gmijax import selfcheck
+from gmijax.errors import SelfCheckFailed
+from gmijax.partition.planner import make_plan
+from gmijax.selfcheck import PRECISIONS, Precision, check_share, compare_products
+
+SMALL = ((64, 128, 32), (32, 64, 96))
+
+
+def right(left: jax.Array, right: jax.Array, kind: Precision) -> jax.Array:
+    return jnp.matmul(left, right, precision=kind.algorithm)
+
+
+def one_tile_missing(left: jax.Array, other: jax.Array, kind: Precision) -> jax.Array:
+    """Half-precision products without the last 16 terms of one tile."""
+    product = right(left, other, kind)
+    if kind.dtype == "float32":
+        return product
+    return product.at[:16, :16].add(-right(left[:16, -16:], other[-16:, :16], kind))
+
+
+def not_finite(left: jax.Array, other: jax.Array, kind: Precision) -> jax.Array:
+    return right(left, other, kind).at[0, 0].set(jnp.nan)
+
+
+def in_less_than_float32(left: jax.Array, other: jax.Array, kind: Precision) -> jax.Array:
+    """As if float32 were computed in bfloat16."""
+    product = right(left, other, kind)
+    return product if kind.dtype != "float32" else jax.lax.reduce_precision(product, 8, 7)
+
+
+def test_right_products_pass():
+    found = list(compare_products(SMALL))
+    assert [product for product in found if product.is_wrong] == []
+    assert len(found) == len(SMALL) * len(PRECISIONS)
+    # Rounding shows: the comparison is not with itself.
+    assert max(product.error for product in found) > 2**-12
+
+
+@pytest.mark.parametrize(
+    ("multiply", "wrong"),
+    [
+        (one_tile_missing, {"bfloat16", "float16"}),
+        (not_finite, {"bfloat16", "float16", "tf32", "float32"}),
+        (in_less_than_float32, {"tf32", "float32"}),
+    ],
+)
+def test_wrong_products_are_found(multiply: selfcheck.Multiply, wrong: set[str]):
+    found = list(compare_products(SMALL, multiply=multiply))
+    assert {product.precision.name for product in found if product.is_wrong} == wrong
+
+
+def test_a_wrong_share_is_named(monkeypatch: pytest.MonkeyPatch):
+    plan = make_plan(plan_config(self_check="on"), reduce_config(), 8, machine(0))
+    capped = dataclasses.replace(plan.slices[0], device="GPU-0", sm_percent=33.0)
+    plan = dataclasses.replace(plan, slices=(capped,))
+    monkeypatch.setattr(selfcheck, "SIZES", SMALL)
+    monkeypatch.setattr(selfcheck, "_multiply", one_tile_missing)
+    with pytest.raises(
+        SelfCheckFailed,
+        match=r"wrong on GPU-0 with plan\.sm_percent=33: bfloat16, float16 \(cublaslt, cublas\); ",
+    ):
+        check_share(plan, 0)
+
+
+def test_options_that_xla_no_longer_has_are_left_out(monkeypatch: pytest.MonkeyPatch):
+    plan = make_plan(plan_config(self_check="on"), reduce_config(), 8, machine(0))
+    monkeypatch.setattr(selfcheck, "SIZES", SMALL)
+    monkeypatch.setattr(selfcheck, "LIBRARIES", {"gone": {"xla_gpu_option_that_is_gone": True}})
+    assert check_share(plan, 0) > 0.0
+
+
+def test_nothing_is_multiplied_where_the_plan_does_not_ask(monkeypatch: pytest.MonkeyPatch):
+    plan = make_plan(plan_config(), reduce_config(), 8, machine(0))
+    monkeypatch.setattr(selfcheck, "compare_products", lambda **_: pytest.fail("multiplied"))
+    assert check_share(plan, 0) == 0.0
