@@ -55,16 +55,18 @@ class IterationMetrics(NamedTuple):
     noise_std: Array
 
 
+def _nothing() -> None:
+    pass
+
+
 class Iteration(Protocol):
     """One PPO iteration: rollout, then updates.
 
     Attributes:
-      is_asynchronous: whether a call returns before the device has finished the iteration.
       times: seconds that parts of the last iteration took on this GMI, where they can be told
         apart; waiting for other GMIs is part of an exchange.
     """
 
-    is_asynchronous: bool
     times: dict[str, float]
 
     def compile(self, state: LearnerState, env_state: BatchState) -> None:
@@ -72,9 +74,16 @@ class Iteration(Protocol):
         ...
 
     def __call__(
-        self, state: LearnerState, env_state: BatchState
+        self,
+        state: LearnerState,
+        env_state: BatchState,
+        meanwhile: Callable[[], None] = _nothing,
     ) -> tuple[LearnerState, BatchState, IterationMetrics]:
-        """Runs one iteration; both arguments are donated and must not be used again."""
+        """Runs one iteration; both states are donated and must not be used again.
+
+        Calls `meanwhile` once, when the device has work to do: what the host has to do for the
+        iteration before costs nothing there.
+        """
         ...
 
 
@@ -103,8 +112,6 @@ Mean = Callable[[Array], Array | FloatBuffer]
 class FusedIteration:
     """The iteration of a job with one GMI, as one jit."""
 
-    is_asynchronous = True
-
     def __init__(self, env: BatchedEnv, learner: Learner) -> None:
         self.times: dict[str, float] = {}
         self._env = env
@@ -117,10 +124,15 @@ class FusedIteration:
         self._program = self._program.lower(self._env.model, state, env_state).compile()
 
     def __call__(
-        self, state: LearnerState, env_state: BatchState
+        self,
+        state: LearnerState,
+        env_state: BatchState,
+        meanwhile: Callable[[], None] = _nothing,
     ) -> tuple[LearnerState, BatchState, IterationMetrics]:
         """See `Iteration`."""
-        return self._program(self._env.model, state, env_state)
+        results = self._program(self._env.model, state, env_state)
+        meanwhile()
+        return results
 
 
 def _fused(
@@ -150,8 +162,6 @@ def _fused(
 
 class SplitIteration:
     """The iteration of one of several GMIs: jits around a reducer."""
-
-    is_asynchronous = False
 
     def __init__(self, env: BatchedEnv, learner: Learner, reducer: Reducer) -> None:
         self.times: dict[str, float] = {}
@@ -193,13 +203,17 @@ class SplitIteration:
         self._finish = self._finish.lower(state, stats, [loss] * order.shape[0]).compile()
 
     def __call__(
-        self, state: LearnerState, env_state: BatchState
+        self,
+        state: LearnerState,
+        env_state: BatchState,
+        meanwhile: Callable[[], None] = _nothing,
     ) -> tuple[LearnerState, BatchState, IterationMetrics]:
         """See `Iteration`."""
         started = time.monotonic()
         env_state, samples, order, packed = self._rollout(
             self._env.model, state, env_state, self._rank
         )
+        meanwhile()
         mine = np.asarray(packed)  # Waits for the rollout.
         rollout_s = time.monotonic() - started
         state, metrics = self.update(state, samples, order, mine)

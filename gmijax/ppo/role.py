@@ -9,8 +9,10 @@ from __future__ import annotations
 import resource
 import statistics
 import time
+from collections.abc import Mapping
+from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -58,6 +60,14 @@ def train(
       CollectiveError: another GMI is gone or stuck.
     """
     return _SyncTrainer(config, env, reducer, link, servants).run()
+
+
+class _Pending(NamedTuple):
+    """An iteration that is not reported yet; see `Reporter.report`."""
+
+    env_steps: int
+    metrics: IterationMetrics
+    times: Mapping[str, float]
 
 
 class _SyncTrainer:
@@ -190,18 +200,15 @@ class _SyncTrainer:
         self, state: LearnerState, env_state: Any, reporter: Reporter
     ) -> tuple[LearnerState, Any, bool]:
         every = self._config.run.checkpoint_every
-        pending: tuple[int, IterationMetrics] | None = None
+        pending: _Pending | None = None
         stop = False
         while self._env_steps < self._config.num_timesteps and not stop:
-            state, env_state, metrics = self._iteration(state, env_state)
+            # The metrics of the iteration before are fetched while this one runs.
+            tell = partial(self._report, reporter, pending)
+            state, env_state, metrics = self._iteration(state, env_state, tell)
             self._env_steps += self._steps_per_iteration
             self._iterations += 1
-            if self._iteration.is_asynchronous:
-                # The metrics of the iteration before are fetched while this one runs.
-                self._report(reporter, pending)
-                pending = (self._env_steps, metrics)
-            else:
-                self._report(reporter, (self._env_steps, metrics))
+            pending = _Pending(self._env_steps, metrics, self._iteration.times)
             stop = self._agree_to_stop()
             is_last = stop or self._env_steps >= self._config.num_timesteps
             if not is_last and every and self._iterations % every == 0:
@@ -210,9 +217,9 @@ class _SyncTrainer:
         self._save(state, env_state)
         return state, env_state, stop
 
-    def _report(self, reporter: Reporter, pending: tuple[int, IterationMetrics] | None) -> None:
+    def _report(self, reporter: Reporter, pending: _Pending | None) -> None:
         if pending is not None:
-            reporter.report(*pending, self._iteration.times)
+            reporter.report(*pending)
             self._link.beat("running", self._iterations)
 
     def _agree_to_stop(self) -> bool:

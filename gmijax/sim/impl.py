@@ -43,7 +43,9 @@ ON_GPU: Mapping[str, OnGpu] = MappingProxyType(
     {
         "ant": OnGpu("warp"),
         "anymal": OnGpu("warp"),
-        "ball_balance": OnGpu("jax"),
+        "ball_balance": OnGpu(
+            "jax", why_no_warp="its second physics step is wrong there, on a GPU (docs/warp.md)"
+        ),
         "franka_cabinet": OnGpu(
             "jax", why_no_warp="its arm moves wrongly there, on a GPU (docs/warp.md)"
         ),
