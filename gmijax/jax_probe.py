@@ -1,6 +1,6 @@
 """Main of the child that asks jax what it sees: `python -m gmijax.jax_probe`.
 
-Started by `gmijax.diagnosis`, which must not load jax itself. Writes one line of JSON.
+Started by `gmijax.sight`, which must not load jax itself. Writes one line of JSON.
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ import sys
 
 
 def main() -> int:
-    """Writes version, platform and devices; an exception of jax is left to end the process."""
+    """Writes platform and devices; an exception of jax is left to end the process."""
     import jax
     import jax.numpy as jnp
 
@@ -18,7 +18,6 @@ def main() -> int:
     # A device that is listed may still refuse to compute.
     jnp.ones(8).sum().block_until_ready()
     seen = {
-        "version": jax.__version__,
         "platform": devices[0].platform,
         "devices": [str(device.device_kind) for device in devices],
     }

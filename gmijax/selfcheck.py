@@ -44,8 +44,8 @@ PRECISIONS: Final = (
     Precision("float32", "float32", "highest", 2**-20),
 )
 
-SIZES: Final = ((256, 256, 256), (1024, 1024, 1024), (8192, 256, 128))
-"""(M, K, N): a policy's layer for few environments, a product that fills a GPU, one for many."""
+SIZES: Final = ((1024, 1024, 1024), (8192, 256, 128), (504, 1016, 760), (16384, 64, 256))
+"""(M, K, N): at every cap where any measured product was wrong, one of these was."""
 
 Options: TypeAlias = Mapping[str, bool | int]
 

@@ -6,7 +6,6 @@ Reads the run folder, does what the plan gives to this GMI, and writes `result.j
 from __future__ import annotations
 
 import os
-import resource
 import sys
 from contextlib import ExitStack
 from pathlib import Path
@@ -44,6 +43,7 @@ def _run(link: ChildLink) -> dict[str, Any]:
     rank = group.gmis.index(link.gmi)
     # jax starts here, in the environment that the plan prepared.
     from gmijax.collection.share import Share
+    from gmijax.devices import describe_device
     from gmijax.selfcheck import check_share
     from gmijax.sim.build import make_training_env
 
@@ -70,7 +70,7 @@ def _run(link: ChildLink) -> dict[str, Any]:
         result = _work(share, plan, roles, held)
     written = {} if writer is None else {"shards": writer.num_written, "bytes": writer.num_bytes}
     return {
-        **{"roles": roles, "policy_digest": policy.digest, "device": _device()},
+        **{"roles": roles, "policy_digest": policy.digest, "device": describe_device()},
         **{"first_unroll": first, "written": written},
         **result,
     }
@@ -155,19 +155,6 @@ def _meeting(reducer: Reducer) -> Any:
     import numpy as np
 
     return lambda: reducer.all_gather(np.zeros(1, np.float32))
-
-
-def _device() -> dict[str, Any]:
-    import jax
-
-    device = jax.local_devices()[0]
-    peak = (device.memory_stats() or {}).get("peak_bytes_in_use")
-    return {
-        "platform": device.platform,
-        "kind": device.device_kind,
-        "peak_memory_mib": peak / 2**20 if peak else None,
-        "peak_host_memory_mib": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**10,
-    }
 
 
 if __name__ == "__main__":

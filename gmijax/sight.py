@@ -121,7 +121,7 @@ def try_mps(machine: Machine) -> str | None:
 
     Not tried where MPS is not installed, somebody's daemon runs, or no GPU can take one.
     """
-    whole = [gpu for gpu in machine.gpus if not gpu.mig_enabled]
+    whole = [gpu for gpu in machine.gpus if device_of(gpu) and not gpu.mig_enabled]
     if machine.mps_control is None or machine.operator_daemon is not None or not whole:
         return None
     config = PlanConfig(

@@ -37,26 +37,16 @@ def _run(link: ChildLink) -> dict[str, Any]:
     check_share(plan, link.gmi)
     from gmijax.ppo.programs import exchange_size
     from gmijax.ppo.role import train
-    from gmijax.sim.randomize import randomized
-    from gmijax.sim.registry import make_env
-    from gmijax.sim.wrappers import training_env
+    from gmijax.sim.build import make_training_env
 
     assert isinstance(config.algo, PpoConfig)  # Others have a main of their own.
-    env = make_env(
-        str(config.env.name),
-        suite=config.env.suite,
-        impl=config.physics.impl,
-        episode_length=config.env.episode_length,
-        max_envs=config.envs_per_gmi,
+    env = make_training_env(
+        config.env,
+        config.physics.impl,
+        seed=config.seed,
+        first_env=link.gmi * config.envs_per_gmi,
+        num_envs=config.envs_per_gmi,
     )
-    if config.env.randomize == "on":
-        env = randomized(
-            env,
-            config.env.randomization,
-            seed=config.seed,
-            first_env=link.gmi * config.envs_per_gmi,
-            num_envs=config.envs_per_gmi,
-        )
     reducer = build_reducer(
         plan.strategy,
         Membership(
@@ -72,7 +62,7 @@ def _run(link: ChildLink) -> dict[str, Any]:
         ),
     )
     try:
-        done = train(config, training_env(env), reducer, link)
+        done = train(config, env, reducer, link)
         if plan.strategy == "har":  # It may have come to another exchange than the plan's.
             done["intra"] = "ipc" if reducer.is_device_resident else "host"
         return done

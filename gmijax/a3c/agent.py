@@ -170,27 +170,22 @@ class _Agent:
     def _loop(self, program: Any, weights: ActingWeights, env_state: BatchState) -> None:
         pending: _Sent | None = None
         unpack = jax.jit(lambda packed: unpack_weights(weights, packed))
-        while True:
-            if self._orders.checkpoint not in (None, self._report.checkpoint):
-                self._save(env_state)
-            if self._orders.is_ending:
-                break
+        while not self._obey(env_state):
             if (posted := self._board.weights.read(self._weights_seen)) is not None:
                 self._weights_seen, self._version = posted.count, posted.tag
                 weights = unpack(posted.values.view(np.float32))
             env_state, experience, stats = program(self._env.model, weights, env_state)
             # While the device computes this unroll, the one before is sent.
             if pending is not None:
-                self._send(pending)
+                self._send(pending, env_state)
             pending = _Sent(experience, stats, self._version)
-            self._look()
         self._publish()
 
-    def _send(self, unroll: _Sent) -> None:
+    def _send(self, unroll: _Sent, env_state: BatchState) -> None:
         arrays = {name: np.asarray(x) for name, x in unroll.experience._asdict().items()}
         stats = np.asarray(unroll.stats, np.float64)
         started = time.monotonic()
-        if not self._hand_over(arrays, unroll.version, started):
+        if not self._hand_over(arrays, unroll.version, env_state, started):
             return
         counts = self._sender.stats()
         if not counts.least_occupancy:  # A trainer has nothing to do: what waits must go.
@@ -208,19 +203,24 @@ class _Agent:
         self._link.beat("running", self._unrolls)
 
     def _hand_over(
-        self, arrays: dict[str, npt.NDArray[Any]], version: int, started: float
+        self,
+        arrays: dict[str, npt.NDArray[Any]],
+        version: int,
+        env_state: BatchState,
+        started: float,
     ) -> bool:
         """Sends an unroll; False if the job ends and nobody wants it any more."""
         limit_s = self._config.reduce.timeout_s
         try:
             while self._is_ahead(arrays) or not self._sender.send(arrays, version, _SLICE_S):
-                if self._is_ending():
+                # Trainers that wait for a checkpoint make no room until it is complete.
+                if self._obey(env_state):
                     return False
                 if time.monotonic() - started > limit_s:
                     raise self._late("send", limit_s)
                 self._link.beat("running", self._unrolls)
         except PipeClosed:
-            if not self._is_ending():
+            if not self._obey(env_state):
                 raise
             return False
         return True
@@ -242,6 +242,13 @@ class _Agent:
             time.sleep(_POLL_S)
         return False
 
+    def _obey(self, env_state: BatchState) -> bool:
+        """Adds to the checkpoint that is wanted, if any; returns whether the job ends."""
+        self._look()
+        if self._orders.checkpoint not in (None, self._report.checkpoint):
+            self._save(env_state)
+        return self._orders.is_ending
+
     def _save(self, env_state: BatchState) -> None:
         steps = self._orders.checkpoint
         assert steps is not None
@@ -254,10 +261,6 @@ class _Agent:
         if (posted := self._board.orders.read(self._orders_seen)) is not None:
             self._orders_seen, self._orders = posted.count, unpack_orders(posted)
         return self._orders_seen > 0
-
-    def _is_ending(self) -> bool:
-        self._look()
-        return self._orders.is_ending
 
     def _publish(self) -> None:
         self._board.reports[self._index].publish(pack_report(self._report))

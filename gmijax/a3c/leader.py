@@ -17,6 +17,7 @@ from gmijax.a3c.losses import LossMetrics
 from gmijax.a3c.report import Progress, Reporter
 from gmijax.checkpoint import finish_checkpoint, save_learner
 from gmijax.config import TrainConfig
+from gmijax.devices import describe_device
 from gmijax.errors import CollectiveTimeout, NonFiniteError
 from gmijax.learner import LearnerState
 from gmijax.metrics import JsonlSink, MetricsLog, TensorBoardSink
@@ -161,7 +162,7 @@ class Leader:
             "final_return": reporter.last_return,
             "overflow_steps": reporter.overflow_steps,
             "checkpoint": str(self._checkpoint) if self._checkpoint else None,
-            "device": _device(),
+            "device": describe_device(),
         }
 
     def _progress(self, state: LearnerState) -> Progress:
@@ -236,14 +237,3 @@ class Leader:
 def _median(rates: list[float]) -> float | None:
     # The first one holds the start of the pipeline.
     return statistics.median(rates[1:] or rates) if rates else None
-
-
-def _device() -> dict[str, Any]:
-    device = jax.local_devices()[0]
-    stats = device.memory_stats() or {}
-    peak = stats.get("peak_bytes_in_use")
-    return {
-        "platform": device.platform,
-        "kind": device.device_kind,
-        "peak_memory_mib": peak / 2**20 if peak else None,
-    }

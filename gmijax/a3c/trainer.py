@@ -20,7 +20,7 @@ from gmijax.a3c.leader import Leader
 from gmijax.a3c.learner import acting_weights, pack_weights
 from gmijax.a3c.losses import LossMetrics, Unrolls
 from gmijax.a3c.programs import FusedUpdate, SplitUpdate, Update
-from gmijax.a3c.staleness import histogram_of
+from gmijax.a3c.staleness import MAX_COUNTED, histogram_of
 from gmijax.checkpoint import digest, restore_learner
 from gmijax.collectives.channel.interface import Batch, ExperienceReceiver
 from gmijax.collectives.interface import Reducer
@@ -57,7 +57,7 @@ class Tally(NamedTuple):
     Attributes:
       stop: how many have been asked to stop.
       fresh: unrolls that are learnt from.
-      stale: unrolls that were too old.
+      stale: unrolls that were too old, those of batches that were passed over too.
       receive_s: seconds that the last of them waited for experience.
       staleness: [MAX_COUNTED + 1] unrolls by versions behind.
     """
@@ -117,6 +117,7 @@ class _Trainer:
         self._env_steps = 0
         self._updates = 0
         self._version = 0
+        self._passed_over = np.zeros(MAX_COUNTED + 1, np.float32)
         self._lead = None
         if reducer.rank == 0:
             self._lead = Leader(training.config, self._env, board, link, training.agents)
@@ -204,6 +205,7 @@ class _Trainer:
             else:
                 if self._weights_of(batch).any():
                     return batch, time.monotonic() - started
+                self._passed_over += histogram_of(self._version - batch.versions)
                 since = time.monotonic()
             if self._updates:
                 self._link.beat("running", self._updates)
@@ -218,8 +220,10 @@ class _Trainer:
     def _meet(self, batch: Batch, waited_s: float) -> Tally:
         """Tells the other trainers of this batch, and hears of theirs."""
         fresh = float(self._weights_of(batch).sum())
-        head = [self._link.stop_requested, fresh, self._batch_size - fresh, waited_s]
-        mine = np.concatenate([head, histogram_of(self._version - batch.versions)])
+        behind = histogram_of(self._version - batch.versions) + self._passed_over
+        self._passed_over[:] = 0.0
+        head = [self._link.stop_requested, fresh, float(behind.sum()) - fresh, waited_s]
+        mine = np.concatenate([head, behind])
         gathered = self._reducer.all_gather(mine.astype(np.float32))
         stop, fresh, stale, _ = (float(x) for x in gathered[:, :4].sum(axis=0))
         return Tally(stop, fresh, stale, float(gathered[:, 3].max()), gathered[:, 4:].sum(axis=0))

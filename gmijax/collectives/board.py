@@ -81,7 +81,7 @@ class Note:
         self._places[place, : data.size] = data
         self._line["tag"][0, place] = tag
         self._line["length"][0, place] = data.size
-        self._line["checksum"][0, place] = zlib.crc32(data.data)
+        self._line["checksum"][0, place] = _checksum(data, tag)
         self._fence()
         self._line["count"][0] = count
 
@@ -101,7 +101,7 @@ class Note:
             tag, checksum = (int(self._line[name][0, place]) for name in ("tag", "checksum"))
             values = self._places[place, :length].copy()
             self._fence()
-            if zlib.crc32(values.data) == checksum and int(self._line["count"][0]) - count < 2:
+            if _checksum(values, tag) == checksum and int(self._line["count"][0]) - count < 2:
                 return Posted(count, tag, values)
         return None
 
@@ -151,6 +151,11 @@ def attach_board(fd: int, sizes_bytes: Sequence[int]) -> list[Note]:
         notes.append(Note(line, places[:, : sizes_bytes[index]]))
         offset += 2 * room
     return notes
+
+
+def _checksum(values: npt.NDArray[np.uint8], tag: int) -> int:
+    """Of the bytes and the tag, which a reader could otherwise take from two publications."""
+    return zlib.crc32(values.data, tag & 0xFFFFFFFF)
 
 
 def _round_up(value: int, multiple: int) -> int:

@@ -5,13 +5,13 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal
 
-from gmijax.config.ppo import ADAPTIVE_LEARNING_RATE_RANGE
+from gmijax.config.actor_critic import ActorCriticConfig
 from gmijax.errors import ConfigError
-from gmijax.schema import doc, require_at_least, require_between, require_positive
+from gmijax.schema import doc, require_at_least, require_positive
 
 
 @dataclass(frozen=True, kw_only=True)
-class A3cConfig:
+class A3cConfig(ActorCriticConfig):
     """Hyper-parameters of asynchronous actor-critic training, with Brax's names."""
 
     name: Literal["a3c"] = doc("training algorithm")
@@ -21,7 +21,6 @@ class A3cConfig:
     )
     num_minibatches: int = doc("minibatches per pass over a batch")
     num_updates_per_batch: int = doc("passes over a batch (epochs)")
-    discounting: float = doc("discount factor per step, 0 to 1")
     vtrace: bool = doc(
         "correct for the age of the policy that acted with V-trace; false: plain n-step returns"
     )
@@ -39,38 +38,21 @@ class A3cConfig:
         "unrolls of an agent that may wait for every trainer before the agent waits too "
         "(channel.when_full=block)"
     )
-    value_cost: float = doc("weight of the value loss")
-    entropy_cost: float = doc("weight of the entropy bonus")
-    bound_cost: float = doc("weight of the penalty on action means outside [-1.1, 1.1]")
-    learning_rate: float = doc("step size of Adam (the first one, if the schedule is adaptive)")
     learning_rate_schedule: Literal["fixed", "adaptive_kl"] = doc(
         "fixed, or steered to keep the policy's KL divergence per batch near desired_kl"
     )
-    desired_kl: float = doc("target of the adaptive schedule")
-    max_grad_norm: float = doc("gradients are scaled down to this global norm")
-    reward_scaling: float = doc("factor on rewards before learning (logged returns are unscaled)")
-    normalize_observations: bool = doc("normalise observations with running statistics")
     normalize_advantage: bool = doc("normalise advantages over every batch")
-    policy_hidden_layer_sizes: tuple[int, ...] = doc("widths of the policy network")
-    value_hidden_layer_sizes: tuple[int, ...] = doc("widths of the value network")
-    init_noise_std: float = doc("standard deviation of the first policy")
 
     def __post_init__(self) -> None:
-        for key in ("unroll_length", "num_minibatches", "num_updates_per_batch", "max_ahead"):
-            require_at_least(f"algo.{key}", getattr(self, key), 1)
-        for key in ("discounting", "gae_lambda"):
-            require_between(f"algo.{key}", getattr(self, key), 0.0, 1.0)
-        for key in ("value_cost", "entropy_cost", "bound_cost"):
-            require_at_least(f"algo.{key}", getattr(self, key), 0.0)
-        for key in (
-            *("rho_clip", "trace_clip", "learning_rate", "desired_kl", "max_grad_norm"),
-            *("reward_scaling", "init_noise_std"),
-        ):
+        super().__post_init__()
+        for key in ("rho_clip", "trace_clip"):
             require_positive(f"algo.{key}", getattr(self, key))
-        for key in ("policy_hidden_layer_sizes", "value_hidden_layer_sizes"):
-            for width in getattr(self, key):
-                require_at_least(f"algo.{key}", width, 1)
-        self._check_optional()
+        for key in ("batch_size", "max_staleness"):
+            if getattr(self, key) is not None:
+                require_at_least(f"algo.{key}", getattr(self, key), 1)
+        if self.clipping_epsilon is not None:
+            require_positive("algo.clipping_epsilon", self.clipping_epsilon)
+        require_at_least("algo.max_ahead", self.max_ahead, 1)
 
     def batch_of(self, num_envs: int) -> int:
         """B with `num_envs` environments on every agent.
@@ -90,17 +72,3 @@ class A3cConfig:
                 "of a batch (algo.batch_size, or num_envs if that is null)"
             )
         return batch
-
-    def _check_optional(self) -> None:
-        if self.batch_size is not None:
-            require_at_least("algo.batch_size", self.batch_size, 1)
-        if self.max_staleness is not None:
-            require_at_least("algo.max_staleness", self.max_staleness, 1)
-        if self.clipping_epsilon is not None:
-            require_positive("algo.clipping_epsilon", self.clipping_epsilon)
-        low, high = ADAPTIVE_LEARNING_RATE_RANGE
-        if self.learning_rate_schedule == "adaptive_kl" and not low <= self.learning_rate <= high:
-            raise ConfigError(
-                f"algo.learning_rate={self.learning_rate!r}: must be between {low} and {high} "
-                "with algo.learning_rate_schedule=adaptive_kl"
-            )

@@ -5,59 +5,26 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal
 
-from gmijax.errors import ConfigError
-from gmijax.schema import doc, require_at_least, require_between, require_positive
-
-ADAPTIVE_LEARNING_RATE_RANGE = (1e-5, 1e-2)
-"""Where the adaptive schedule keeps the learning rate, and so where it must begin."""
+from gmijax.config.actor_critic import ActorCriticConfig
+from gmijax.schema import doc, require_positive
 
 
 @dataclass(frozen=True, kw_only=True)
-class PpoConfig:
+class PpoConfig(ActorCriticConfig):
     """Hyper-parameters of PPO, with Brax's names."""
 
     name: Literal["ppo"] = doc("training algorithm")
     unroll_length: int = doc("T, environment steps per environment and iteration")
     num_minibatches: int = doc("minibatches per pass over the rollout")
     num_updates_per_batch: int = doc("passes over the rollout (epochs)")
-    discounting: float = doc("discount factor per step, 0 to 1")
     gae_lambda: float = doc("lambda of generalised advantage estimation, 0 to 1")
     clipping_epsilon: float = doc("clip range of the probability ratio")
     clip_value_loss: bool = doc("clip the value loss with clipping_epsilon too")
-    value_cost: float = doc("weight of the value loss")
-    entropy_cost: float = doc("weight of the entropy bonus")
-    bound_cost: float = doc("weight of the penalty on action means outside [-1.1, 1.1]")
-    learning_rate: float = doc("step size of Adam (the first one, if the schedule is adaptive)")
     learning_rate_schedule: Literal["fixed", "adaptive_kl"] = doc(
         "fixed, or steered to keep the policy's KL divergence per update near desired_kl"
     )
-    desired_kl: float = doc("target of the adaptive schedule")
-    max_grad_norm: float = doc("gradients are scaled down to this global norm")
-    reward_scaling: float = doc("factor on rewards before learning (logged returns are unscaled)")
-    normalize_observations: bool = doc("normalise observations with running statistics")
     normalize_advantage: bool = doc("normalise advantages over all samples of all GMIs")
-    policy_hidden_layer_sizes: tuple[int, ...] = doc("widths of the policy network")
-    value_hidden_layer_sizes: tuple[int, ...] = doc("widths of the value network")
-    init_noise_std: float = doc("standard deviation of the first policy")
 
     def __post_init__(self) -> None:
-        for key in ("unroll_length", "num_minibatches", "num_updates_per_batch"):
-            require_at_least(f"algo.{key}", getattr(self, key), 1)
-        for key in ("discounting", "gae_lambda"):
-            require_between(f"algo.{key}", getattr(self, key), 0.0, 1.0)
-        for key in ("value_cost", "entropy_cost", "bound_cost"):
-            require_at_least(f"algo.{key}", getattr(self, key), 0.0)
-        for key in (
-            *("clipping_epsilon", "learning_rate", "desired_kl", "max_grad_norm"),
-            *("reward_scaling", "init_noise_std"),
-        ):
-            require_positive(f"algo.{key}", getattr(self, key))
-        for key in ("policy_hidden_layer_sizes", "value_hidden_layer_sizes"):
-            for width in getattr(self, key):
-                require_at_least(f"algo.{key}", width, 1)
-        low, high = ADAPTIVE_LEARNING_RATE_RANGE
-        if self.learning_rate_schedule == "adaptive_kl" and not low <= self.learning_rate <= high:
-            raise ConfigError(
-                f"algo.learning_rate={self.learning_rate!r}: must be between {low} and {high} "
-                "with algo.learning_rate_schedule=adaptive_kl"
-            )
+        super().__post_init__()
+        require_positive("algo.clipping_epsilon", self.clipping_epsilon)

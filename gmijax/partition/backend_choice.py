@@ -50,6 +50,8 @@ def choose_backend(
     why = f"up to {most} GMIs on a GPU run at the same time with {daemon}"
     if oldest[0] < _AMPERE:
         return "mps", f"{why}; compute capability {_version(oldest)} has no MIG"
+    if purpose == "serve" and plan.sm_percent is not None:
+        return "mps", f"{why}; only MPS can cap SMs"
     if purpose == "serve":
         return "mps", f"{why}; there are no MIG instances to keep them apart"
     return "mps", f"{why}, and can exchange gradients"

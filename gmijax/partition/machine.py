@@ -79,7 +79,7 @@ def visible_gpus(gpus: tuple[Gpu, ...], selection: str | None) -> tuple[Gpu, ...
 
 def _named_part(gpu: Gpu, entry: str) -> Gpu | None:
     """The GPU, or it with one instance, if `entry` names that."""
-    if entry.isdigit():
+    if entry.isdecimal():
         return gpu if gpu.index == int(entry) else None
     if entry and gpu.uuid.startswith(entry):
         return gpu

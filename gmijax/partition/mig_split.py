@@ -47,7 +47,7 @@ def split_commands(gpu: Gpu, wanted: str) -> tuple[str, ...]:
     if not gpu.mig_supported:
         raise ConfigError(f"mig={wanted}: GPU {gpu.index} ({gpu.name}) has no MIG")
     sizes = _QUARTERS if _FOUR_SLICES.search(gpu.name) else _EIGHTHS
-    parts = _parse(wanted, sizes)
+    parts = _parse(wanted, gpu, sizes)
     places = place_instances(parts, sizes)
     if places is None:
         raise ConfigError(
@@ -90,14 +90,21 @@ def _place(
     return None
 
 
-def _parse(wanted: str, sizes: Mapping[int, _Size]) -> tuple[int, ...]:
+def _parse(wanted: str, gpu: Gpu, sizes: Mapping[int, _Size]) -> tuple[int, ...]:
     parts: list[int] = []
     for text in wanted.split(","):
         match = re.fullmatch(r"(\d)g(\.\d+gb)?", text.strip())
         if match is None or int(match[1]) not in sizes:
             allowed = ", ".join(f"{size}g" for size in sizes)
             raise ConfigError(f"mig={wanted}: expected a list of {allowed}, e.g. mig=3g,2g,1g,1g")
-        parts.append(int(match[1]))
+        part = int(match[1])
+        # There are other profiles with as many SMs, e.g. 1g.35gb; where they fit is not known here.
+        if match[2] and match[0] != (profile := _profile(part, gpu, sizes)):
+            raise ConfigError(
+                f"mig={wanted}: {match[0]} is not supported; {part}g of GPU {gpu.index} "
+                f"({gpu.name}) is {profile}"
+            )
+        parts.append(part)
     return tuple(sorted(parts, reverse=True))
 
 

@@ -23,8 +23,9 @@ from gmijax.learner import Learner, LearnerState, acting_moments, init_learner
 from gmijax.partition.heartbeat import GmiState
 from gmijax.ppo.learner import minibatch_order
 from gmijax.ppo.losses import Samples
-from gmijax.ppo.programs import IterationMetrics, SplitIteration
+from gmijax.ppo.programs import IterationMetrics
 from gmijax.ppo.rollout import collect, merge_stats, stats_example
+from gmijax.ppo.split import SplitIteration
 from gmijax.sim.wrappers import BatchedEnv, BatchState
 from gmijax.types import Array, PyTree
 

@@ -6,7 +6,6 @@ equal. The leader (rank 0) alone writes metrics and the shared part of checkpoin
 
 from __future__ import annotations
 
-import resource
 import statistics
 import time
 from collections.abc import Mapping
@@ -21,13 +20,15 @@ import numpy as np
 from gmijax.checkpoint import digest, has_envs, restore_envs, restore_learner, save_checkpoint
 from gmijax.collectives.interface import Reducer
 from gmijax.config import TrainConfig
+from gmijax.devices import describe_device
 from gmijax.errors import NonFiniteError, ParameterMismatch
 from gmijax.learner import Learner, LearnerState, init_learner, make_learner
 from gmijax.metrics import JsonlSink, MetricsLog, TensorBoardSink
 from gmijax.partition.child import ChildLink
-from gmijax.ppo.programs import FusedIteration, Iteration, IterationMetrics, SplitIteration
+from gmijax.ppo.programs import FusedIteration, Iteration, IterationMetrics
 from gmijax.ppo.remote import RemoteIteration, Servants
 from gmijax.ppo.report import Reporter
+from gmijax.ppo.split import SplitIteration
 from gmijax.ppo.throughput import ThroughputMeter
 from gmijax.results import read_metrics
 from gmijax.resume import CheckpointMeta
@@ -140,7 +141,7 @@ class _SyncTrainer:
             "final_return": reporter.last_return,
             "overflow_steps": reporter.overflow_steps,
             "checkpoint": str(self._checkpoint) if self._checkpoint else None,
-            "device": _device(),
+            "device": describe_device(),
         }
         if self._measures and not stopped:
             # Written before: whatever happens to the measurement, the training is done.
@@ -278,16 +279,3 @@ class _SyncTrainer:
         for line in history:  # A resumed run starts with the lines of the one before.
             board.write(line)
         return MetricsLog((JsonlSink(run.metrics), board))
-
-
-def _device() -> dict[str, Any]:
-    device = jax.local_devices()[0]
-    stats = device.memory_stats() or {}
-    peak = stats.get("peak_bytes_in_use")
-    return {
-        "platform": device.platform,
-        "kind": device.device_kind,
-        "peak_memory_mib": peak / 2**20 if peak else None,
-        # All that there is where the device does not count, as on the CPU.
-        "peak_host_memory_mib": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**10,
-    }

@@ -37,6 +37,10 @@ def test_a_value_that_is_torn_is_not_given_out(fd) -> None:
     writer.publish(np.arange(4, dtype=np.int32))
     writer._places[1, 0] ^= 1  # As if a second publication had begun to overwrite it.
     assert reader.read() is None
+    writer._places[1, 0] ^= 1
+    assert reader.read() is not None
+    writer._line["tag"][0, 1] = 7  # Likewise, with the same values.
+    assert reader.read() is None
     writer.publish(np.arange(4, dtype=np.int32))
     assert reader.read() is not None
 

@@ -16,7 +16,7 @@ from gmijax import doctor, sight
 from gmijax.diagnosis import Diagnosis, diagnose
 from gmijax.partition.machine import Machine
 from gmijax.partition.nvidia import list_gpus, nvml_problem
-from gmijax.sight import REQUIRED, JaxView, Sight, ask_jax
+from gmijax.sight import REQUIRED, JaxView, Sight, ask_jax, try_mps
 
 MPS = Path("/usr/bin/nvidia-cuda-mps-control")
 INSTALLED = dict.fromkeys(REQUIRED, "1.0") | dict.fromkeys(
@@ -156,6 +156,12 @@ def test_a_jax_that_fails_or_hangs_is_told(monkeypatch: pytest.MonkeyPatch, tmp_
     assert ask_jax(machine_of(monkeypatch)) == JaxView(None, error="RuntimeError: no cuda")
     program.write_text("#!/bin/sh\nexec sleep 60\n")
     assert ask_jax(machine_of(monkeypatch), 0.2).error == "no answer within 0.2 s"
+
+
+def test_mps_is_tried_on_a_gpu_that_may_be_used(monkeypatch: pytest.MonkeyPatch):
+    prohibited = H200_MIG_OFF._replace(compute_mode=pynvml.NVML_COMPUTEMODE_PROHIBITED)
+    here = machine_of(monkeypatch, prohibited, H200_MIG_OFF, control=Path("/bin/false"))
+    assert "failed with exit code 1" in (try_mps(here) or "")
 
 
 def test_the_report_names_everything(

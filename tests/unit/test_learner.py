@@ -15,8 +15,9 @@ from gmijax.learner import (
     make_learner,
 )
 from gmijax.ppo.learner import gradients, minibatch_order, update_context
-from gmijax.ppo.programs import FusedIteration, SplitIteration, exchange_size
+from gmijax.ppo.programs import FusedIteration, exchange_size
 from gmijax.ppo.rollout import collect, merge_stats
+from gmijax.ppo.split import SplitIteration
 from gmijax.sim.wrappers import env_keys
 
 N, T = 12, 8

@@ -11,8 +11,9 @@ from toy_env import point_mass_env
 
 from gmijax.metrics import Line, MetricsLog
 from gmijax.ppo.losses import LossMetrics
-from gmijax.ppo.programs import IterationMetrics, stats_example
+from gmijax.ppo.programs import IterationMetrics
 from gmijax.ppo.report import Reporter
+from gmijax.ppo.rollout import stats_example
 from gmijax.sim.interface import OVERFLOWS
 from gmijax.sim.wrappers import env_keys, training_env
 

@@ -33,6 +33,7 @@ THREE = (gpu(0), gpu(1), gpu(2))
         ("0,7,1", [0]),
         ("1,1", [1]),
         ("MIG-123", []),
+        ("²", []),
     ],
 )
 def test_cuda_visible_devices_is_read_as_cuda_reads_it(selection: str | None, indices: list[int]):

@@ -210,6 +210,11 @@ def test_what_is_no_size_is_refused(wanted: str):
         split_commands(board("NVIDIA H200", 143771), wanted)
 
 
+def test_another_profile_of_the_same_size_is_not_mistaken():
+    with pytest.raises(ConfigError, match=r"1g\.35gb is not supported; 1g of .* is 1g\.18gb"):
+        split_commands(board("NVIDIA H200", 143771), "3g.71gb,1g.35gb")
+
+
 def test_instances_do_not_overlap():
     sizes = {1: 1, 2: 2, 3: 4, 4: 4}
     for parts in ((4, 3), (3, 2, 1, 1), (2, 2, 2, 1), (4, 2, 1), (3, 2, 2), (1,) * 7):

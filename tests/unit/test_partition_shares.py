@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +15,7 @@ from gmijax.partition.planner import make_plan
 from gmijax.partition.shares import is_clean
 
 MPS = Path("/usr/bin/nvidia-cuda-mps-control")
+MEASURED = Path(__file__).parents[2] / "benchmarks/results/sm-shares-nvidia-h200.json"
 AMPERE = (gpu(0)._replace(compute_capability=(8, 0)),)
 
 
@@ -70,6 +72,15 @@ def test_no_value_between_the_clean_ones_counts_as_clean():
     ]  # fmt: skip
     assert is_clean(12.5)
     assert not is_clean(13.5)
+
+
+def test_no_cap_that_was_measured_to_be_wrong_counts_as_clean():
+    rows = json.loads(MEASURED.read_text())["rows"]
+    wrong = [
+        row["sm_percent"] for row in rows if any(product["wrong"] for product in row["products"])
+    ]
+    assert wrong
+    assert [percent for percent in wrong if is_clean(percent)] == []
 
 
 @pytest.mark.parametrize(

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import dataclasses
+import json
+from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -12,8 +14,9 @@ from supervision import machine, plan_config, reduce_config
 from gmijax import selfcheck
 from gmijax.errors import SelfCheckFailed
 from gmijax.partition.planner import make_plan
-from gmijax.selfcheck import PRECISIONS, Precision, check_share, compare_products
+from gmijax.selfcheck import PRECISIONS, SIZES, Precision, check_share, compare_products
 
+MEASURED = Path(__file__).parents[2] / "benchmarks/results/sm-shares-nvidia-h200.json"
 SMALL = ((64, 128, 32), (32, 64, 96))
 
 
@@ -71,6 +74,16 @@ def test_a_wrong_share_is_named(monkeypatch: pytest.MonkeyPatch):
         match=r"wrong on GPU-0 with plan\.sm_percent=33: bfloat16, float16 \(cublaslt, cublas\); ",
     ):
         check_share(plan, 0)
+
+
+def test_every_cap_that_was_measured_to_be_wrong_would_be_found():
+    rows = json.loads(MEASURED.read_text())["rows"]
+    wrong = {
+        row["sm_percent"]: {tuple(one["size"]) for one in row["products"] if one["wrong"]}
+        for row in rows
+    }
+    assert any(wrong.values())
+    assert [cap for cap, sizes in wrong.items() if sizes and not sizes & set(SIZES)] == []
 
 
 def test_options_that_xla_no_longer_has_are_left_out(monkeypatch: pytest.MonkeyPatch):

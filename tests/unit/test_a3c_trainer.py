@@ -1,0 +1,43 @@
+"""What a trainer makes of experience that is too old."""
+
+from __future__ import annotations
+
+import numpy as np
+from toy_env import point_mass
+
+from gmijax.a3c.board import Board
+from gmijax.a3c.trainer import Training, _Trainer
+from gmijax.cli import compose
+from gmijax.collectives.channel.interface import Batch
+from gmijax.collectives.solo import SoloReducer
+from gmijax.partition.child import ChildLink
+from gmijax.rundir import RunPaths
+
+
+class _Arrivals:
+    """A receiver that gives out batches of these versions."""
+
+    def __init__(self, *versions: list[int]) -> None:
+        self._batches = [
+            Batch({}, np.array(one, np.int64), np.ones(len(one), np.int64)) for one in versions
+        ]
+
+    def receive(self, batch_size: int, timeout_s: float) -> Batch:
+        return self._batches.pop(0)
+
+
+def test_unrolls_of_batches_that_are_passed_over_count_as_stale(tmp_path) -> None:
+    config = compose("env=ball_balance", "algo=a3c", "num_envs=4", "algo.max_staleness=3")
+    receiver = _Arrivals([1, 2, 3, 4], [10, 10, 9, 2], [10, 10, 10, 10])
+    trainer = _Trainer(
+        Training(config, config.algo, point_mass(), agents=(1,)),
+        Board(None, None, ()),
+        receiver,
+        SoloReducer(1),
+        ChildLink(0, RunPaths(tmp_path), None, None),
+    )
+    trainer._version = 10
+    first, second = (trainer._meet(*trainer._receive()) for _ in range(2))
+    assert (first.fresh, first.stale, first.staleness.sum()) == (3, 5, 8)
+    assert first.staleness[[0, 1, 6, 7, 8, 9]].tolist() == [2, 1, 1, 1, 2, 1]
+    assert (second.fresh, second.stale, second.staleness.sum()) == (4, 0, 4)
