@@ -1,6 +1,6 @@
 """What serving writes into `output.dir`: names, and what is there already. No jax here.
 
-`<output.dir>/dataset.json`
+`<output.dir>/dataset.json dataset.lock`
 `<output.dir>/gmi_000/000000.{npz,json} 000001.{npz,json} ...`
 
 A folder for every GMI that simulates, by its rank among them; a shard is one unroll: arrays
@@ -50,6 +50,11 @@ class DataPaths:
         """What all shards have in common."""
         return self.root / "dataset.json"
 
+    @property
+    def lock(self) -> Path:
+        """Empty; a job that writes into the folder holds it."""
+        return self.root / "dataset.lock"
+
     def folder(self, rank: int) -> Path:
         """The shards of the GMI that simulates as number `rank`."""
         return self.root / f"gmi_{rank:03d}"
@@ -69,9 +74,11 @@ class DataPaths:
     def finished(self) -> Iterator[ShardPaths]:
         """All finished shards, GMI by GMI."""
         for folder in sorted(self.root.glob("gmi_[0-9]*")):
-            rank = int(folder.name.removeprefix("gmi_"))
-            for index in range(self.num_finished(rank)):
-                yield self.shard(rank, index)
+            rank = folder.name.removeprefix("gmi_")
+            if not rank.isdecimal():  # A copy that somebody made, e.g. gmi_000.bak
+                continue
+            for index in range(self.num_finished(int(rank))):
+                yield self.shard(int(rank), index)
 
 
 def open_dataset(paths: DataPaths, about: Mapping[str, Any]) -> None:
@@ -106,14 +113,20 @@ def locked(paths: DataPaths) -> Iterator[None]:
     Raises:
       ConfigError: another job holds it.
     """
-    fd = os.open(paths.root, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
+    # A file: network file systems lock no folders, and files only if they are open for writing.
+    try:
+        fd = os.open(paths.lock, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o644)
+    except OSError as error:
+        raise ConfigError(f"output.dir={paths.root}: {error.strerror}") from None
     try:
         try:
             fcntl.flock(fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except OSError:
+        except BlockingIOError:
             raise ConfigError(
                 f"output.dir={paths.root}: another job writes into this folder now"
             ) from None
+        except OSError as error:
+            raise ConfigError(f"{paths.lock}: cannot be locked ({error.strerror})") from None
         yield
     finally:
         os.close(fd)
@@ -124,6 +137,8 @@ def _check_same(paths: DataPaths, about: Mapping[str, Any]) -> None:
         found = read_json(paths.dataset)
     except ValueError as error:
         raise ConfigError(f"{paths.dataset}: broken ({error})") from None
+    if not isinstance(found, dict):
+        raise ConfigError(f"{paths.dataset}: broken (not a JSON object)")
     for key, wanted in about.items():
         if found.get(key) != wanted:
             raise ConfigError(

@@ -64,7 +64,10 @@ def summarise(
         "serve_wall_s": _largest(collecting, "serve_wall_s"),
         "compile_s": _largest(list(found.values()), "compile_s"),
         "env_steps_per_s": _throughput(collecting),
-        "step_per_s_inference": _total(collecting, "step_per_s_inference"),
+        # In a job that goes on, a GMI may have nothing left to collect.
+        "step_per_s_inference": _total(
+            [result for result in collecting if result["env_steps"]], "step_per_s_inference"
+        ),
         "latency_ms": milliseconds([result.get("latency_s", []) for result in collecting]),
         "stages_ms": _stages(found.values()),
         "episodes": int(count),

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import signal
+import sys
 import time
 from dataclasses import dataclass
 from pathlib import Path
@@ -149,6 +150,9 @@ class Disagree(gmijax.Role):
                 self.collective(1.0, group=group)
         with pytest.raises(CollectiveError) as caught:
             self.collective(np.ones(2 + self.rank, np.float32))
+        # What GMI 1 sends for the first part is as long as all that GMI 0 has.
+        with pytest.raises(CollectiveError, match=r"reduces .* numbers of float32, rank"):
+            self.collective(np.ones(4096 * (1 + self.rank), np.float32), "sum")
         return str(caught.value)
 
 
@@ -160,6 +164,13 @@ class UntilStopped(gmijax.Role):
             self.progress(step)
             if self.collective(float(self.stop_requested), "sum") > 0:
                 return
+
+
+class Exit(gmijax.Role):
+    """Ends its process as if all were well."""
+
+    def run(self) -> None:
+        sys.exit()
 
 
 class Stuck(gmijax.Role):

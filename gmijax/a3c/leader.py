@@ -110,7 +110,7 @@ class Leader:
     def checkpoint_now_and_then(self, state: LearnerState, env_steps: int, updates: int) -> None:
         """Begins a checkpoint when one is due, finishes one when all agents have done theirs.
 
-        Nobody waits: the agents add their environments between two unrolls. Until then no other
+        Nobody waits: the agents add their environments when they look. Until then no other
         checkpoint is begun.
         """
         every = self._config.run.checkpoint_every

@@ -36,7 +36,7 @@ class ShardWriter:
         self._pool = ThreadPoolExecutor(1, "shards")
         self._pending: Future[int] | None = None
         paths.folder(rank).mkdir(parents=True, exist_ok=True)
-        for left in paths.folder(rank).glob(".*.partial"):
+        for left in paths.folder(rank).glob(".[0-9]*"):  # Of arrays, and of their JSON files.
             left.unlink()
 
     def write(self, steps: Step) -> None:

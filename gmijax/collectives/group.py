@@ -122,39 +122,37 @@ def _reduce(
         raise CollectiveError(f"rank {messenger.rank}: {op} of {flat.dtype}; it takes {what}")
     own = flat.astype(wide, copy=False)
     if own.nbytes <= AT_ONCE_BYTES:
-        result = _sum(_exchange(messenger, members, dict.fromkeys(members, own)))
+        result = _sum(_exchange(messenger, own.size, dict.fromkeys(members, own)))
     else:
         bounds = [place * own.size // len(members) for place in range(len(members) + 1)]
         parts = {m: own[bounds[p] : bounds[p + 1]] for p, m in enumerate(members)}
-        part = _sum(_exchange(messenger, members, parts))
-        result = np.concatenate(_exchange(messenger, members, dict.fromkeys(members, part), False))
+        part = _sum(_exchange(messenger, own.size, parts))
+        result = np.concatenate(_exchange(messenger, own.size, dict.fromkeys(members, part)))
     if op == "mean":
         result /= len(members)
     return result.astype(flat.dtype, copy=False)
 
 
 def _exchange(
-    messenger: Messenger,
-    members: Sequence[int],
-    parts: dict[int, npt.NDArray[Any]],
-    same_size: bool = True,
+    messenger: Messenger, size: int, parts: dict[int, npt.NDArray[Any]]
 ) -> list[npt.NDArray[Any]]:
-    """Sends every member its part; returns what they sent, in order of rank."""
+    """Sends every member its part of `size` numbers; returns what they sent, in order of rank."""
     own = parts[messenger.rank]
-    for member in members:
+    for member, part in parts.items():
         if member != messenger.rank:
-            messenger.send(parts[member], member, tag=COLLECTIVE)
+            messenger.send((size, part), member, tag=COLLECTIVE)
     got = [
-        own if member == messenger.rank else messenger.recv(member, tag=COLLECTIVE)
-        for member in members
+        (size, own) if member == messenger.rank else messenger.recv(member, tag=COLLECTIVE)
+        for member in parts
     ]
-    for member, part in zip(members, got, strict=True):
-        if part.dtype != own.dtype or (same_size and part.size != own.size):
+    for member, (their_size, part) in zip(parts, got, strict=True):
+        # The size of all: parts of data of different lengths may well be equally long.
+        if (their_size, part.dtype) != (size, own.dtype):
             raise CollectiveError(
-                f"rank {messenger.rank} reduces {own.size} numbers of {own.dtype}, "
-                f"rank {member} {part.size} of {part.dtype}"
+                f"rank {messenger.rank} reduces {size} numbers of {own.dtype}, "
+                f"rank {member} {their_size} of {part.dtype}"
             )
-    return got
+    return [part for _, part in got]
 
 
 def _sum(parts: Sequence[npt.NDArray[Any]]) -> npt.NDArray[Any]:

@@ -98,7 +98,7 @@ def _parse(wanted: str, gpu: Gpu, sizes: Mapping[int, _Size]) -> tuple[int, ...]
             allowed = ", ".join(f"{size}g" for size in sizes)
             raise ConfigError(f"mig={wanted}: expected a list of {allowed}, e.g. mig=3g,2g,1g,1g")
         part = int(match[1])
-        # There are other profiles with as many SMs, e.g. 1g.35gb; where they fit is not known here.
+        # Other profiles have as many SMs, e.g. 1g.35gb; where they fit is not known here.
         if match[2] and match[0] != (profile := _profile(part, gpu, sizes)):
             raise ConfigError(
                 f"mig={wanted}: {match[0]} is not supported; {part}g of GPU {gpu.index} "

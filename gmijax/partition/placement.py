@@ -69,6 +69,11 @@ def place(plan: PlanConfig) -> Placement:
 
 
 def _counts(plan: PlanConfig) -> tuple[int, int]:
+    if plan.gmis_per_gpu != 1:
+        raise ConfigError(
+            f"plan.gmis_per_gpu={plan.gmis_per_gpu}: with the decoupled template give "
+            "plan.serving_gmis_per_gpu and plan.training_gmis_per_gpu"
+        )
     for key, what in (("serving_gmis_per_gpu", "act"), ("training_gmis_per_gpu", "train")):
         if getattr(plan, key) < 1:
             raise ConfigError(
@@ -83,7 +88,7 @@ def _gpus(plan: PlanConfig) -> tuple[list[int], list[int], tuple[int, ...] | Non
     if serving is None and training is None:
         return _by_default(plan)
     for key, value in (("serving_gpus", serving), ("training_gpus", training)):
-        if value is None or not value:
+        if value is None or not value or (isinstance(value, int) and value < 1):
             raise ConfigError(
                 f"plan.{key}={'null' if value is None else value}: there must be serving and "
                 "training GPUs; give both keys, numbers of at least 1 or lists of indices"
@@ -101,6 +106,11 @@ def _gpus(plan: PlanConfig) -> tuple[list[int], list[int], tuple[int, ...] | Non
         if len(set(value)) != len(value) or min(value) < 0:
             raise ConfigError(f"plan.{key}={list(value)}: expected distinct indices of GPUs")
     indices = tuple(sorted({*serving, *training}))
+    if not isinstance(plan.gpus, int) and set(plan.gpus) != set(indices):
+        raise ConfigError(
+            f"plan.gpus={list(plan.gpus)}: plan.serving_gpus and plan.training_gpus name "
+            f"{list(indices)}"
+        )
     return [indices.index(i) for i in serving], [indices.index(i) for i in training], indices
 
 

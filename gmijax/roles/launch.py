@@ -8,7 +8,7 @@ import os
 import warnings
 from collections.abc import Sequence
 from functools import partial
-from typing import Any
+from typing import Any, Final
 
 from gmijax.collectives.messenger import MIN_CAPACITY_BYTES
 from gmijax.collectives.pipe_block import create_pipes
@@ -22,7 +22,10 @@ from gmijax.roles import shipping
 from gmijax.roles.manager import GMIManager
 from gmijax.roles.role import Role
 from gmijax.rundir import RunPaths, create_run, read_json, write_json
-from gmijax.schema import require_at_least, require_positive
+from gmijax.schema import require_between, require_positive
+
+MAX_PIPE_MIB: Final = 2**14
+"""Most shared memory for one pipe; larger messages travel in pieces anyway."""
 
 
 def launch(
@@ -96,10 +99,11 @@ def launch(
     )
     try:
         run_gmis(job)
+        outputs = [_output(run, gmi) for gmi in plan.layout.gmis]
     except GmijaxError as error:
         _explain(error, run)
         raise
-    return [shipping.load(run.gmi(gmi).output.read_bytes()) for gmi in plan.layout.gmis]
+    return [shipping.load(output) for output in outputs]
 
 
 def _require_no_gmi() -> None:
@@ -131,12 +135,14 @@ def _check_numbers(
     stall_timeout_s: float | None,
     grace_s: float,
 ) -> None:
-    require_positive("timeout_s", timeout_s)
-    require_at_least("pipe_mib", pipe_mib, MIN_CAPACITY_BYTES / 2**20)
-    require_positive("start_timeout_s", start_timeout_s)
-    require_positive("grace_s", grace_s)
+    require_between("pipe_mib", pipe_mib, MIN_CAPACITY_BYTES / 2**20, MAX_PIPE_MIB)
+    limits = {"timeout_s": timeout_s, "start_timeout_s": start_timeout_s, "grace_s": grace_s}
     if stall_timeout_s is not None:
-        require_positive("stall_timeout_s", stall_timeout_s)
+        limits["stall_timeout_s"] = stall_timeout_s
+    for key, value in limits.items():
+        require_positive(key, value)
+        if math.isinf(value):
+            raise ConfigError(f"{key}={value!r}: must be finite")
 
 
 def _parcel(role: Role, args: tuple[Any, ...]) -> bytes:
@@ -157,6 +163,14 @@ def _write(run: RunPaths, plan: Plan, config: dict[str, Any], parcels: Sequence[
     for gmi, parcel in enumerate(parcels):
         run.gmi(gmi).root.mkdir()
         run.gmi(gmi).role.write_bytes(parcel)
+
+
+def _output(run: RunPaths, gmi: int) -> bytes:
+    """What `run` returned in a GMI that ended well, pickled."""
+    try:
+        return run.gmi(gmi).output.read_bytes()
+    except FileNotFoundError:  # A role that calls sys.exit() ends with exit code 0, too.
+        raise GmiFailed(gmi, "its process ended with exit code 0 inside of run") from None
 
 
 def _explain(error: GmijaxError, run: RunPaths) -> None:

@@ -54,7 +54,8 @@ def own_script() -> dict[str, Any]:
     file = getattr(main, "__file__", None)
     return {
         # Started by `python -m`: then it is importable, and its relative imports need it to be.
-        "module": spec.name if spec is not None else None,
+        # A folder or an archive that is run has a spec too, but no name to import it by.
+        "module": spec.name if spec is not None and spec.name != MAIN else None,
         "file": os.path.abspath(file) if file and Path(file).is_file() else None,
         "sys_path": [os.path.abspath(entry) for entry in sys.path],
     }

@@ -114,6 +114,12 @@ def test_a_role_without_progress_ends_the_job() -> None:
         launch(gmijax.plan(backend="cpu"), role_cases.Stuck(), stall_timeout_s=0.5)
 
 
+def test_a_role_that_ends_its_process_has_returned_nothing() -> None:
+    with pytest.raises(GmiFailed, match=r"GMI 0 failed: .* exit code 0 inside of run") as caught:
+        launch(gmijax.plan(backend="cpu"), role_cases.Exit())
+    assert "sys.exit()" in "\n".join(caught.value.__notes__)
+
+
 def test_an_interrupt_lets_roles_finish(tmp_path: Path) -> None:
     beat = tmp_path / "run" / "gmi_1" / "heartbeat.json"
 

@@ -119,7 +119,8 @@ def test_a_deterministic_policy_acts_with_its_mean(algo: PpoConfig):
 def test_shards_are_whole_and_say_what_they_are(compress: bool, tmp_path: Path):
     paths = DataPaths(tmp_path)
     paths.folder(1).mkdir()
-    (paths.folder(1) / ".000002.npz.partial").write_bytes(b"left by a job that was killed")
+    for name in (".000002.npz.partial", ".000002.json.h2x_9k"):
+        (paths.folder(1) / name).write_bytes(b"left by a job that was killed")
     writer = ShardWriter(paths, 1, 2, {"seed": 5}, compress=compress)
     full = partial(np.full, (T, N), dtype=np.float32)
     step = Step(full(0), full(1), full(2), full(3), full(4), full(5), None)

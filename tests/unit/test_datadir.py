@@ -41,12 +41,25 @@ def test_an_unfinished_shard_does_not_count(harm: str, tmp_path: Path):
     assert paths.num_finished(0) == 0
 
 
+def test_a_copy_of_a_folder_of_shards_does_not_count(tmp_path: Path):
+    (tmp_path / "gmi_000.bak").mkdir()
+    assert not list(DataPaths(tmp_path).finished())
+
+
 def test_only_the_same_experience_is_continued(tmp_path: Path):
     paths = DataPaths(tmp_path / "new")
     open_dataset(paths, {"seed": 1, "num_envs": 4})
     open_dataset(paths, {"seed": 1, "num_envs": 4})
     with pytest.raises(ConfigError, match="holds experience with seed=1, this job would add 2"):
         open_dataset(paths, {"seed": 2, "num_envs": 4})
+
+
+@pytest.mark.parametrize("content", ["{", "[]"])
+def test_a_broken_dataset_is_told(content: str, tmp_path: Path):
+    paths = DataPaths(tmp_path)
+    paths.dataset.write_text(content)
+    with pytest.raises(ConfigError, match=r"dataset.json: broken \("):
+        open_dataset(paths, {"seed": 1})
 
 
 def test_a_folder_with_something_else_is_left_alone(tmp_path: Path):

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import sys
 import threading
+from importlib.machinery import ModuleSpec
 from pathlib import Path
+from types import ModuleType
 from typing import Any
 
 import numpy as np
@@ -11,6 +14,7 @@ import pytest
 
 import gmijax
 from gmijax.errors import ConfigError
+from gmijax.roles.shipping import own_script
 from tests.role_cases import Stuck, Talk
 
 
@@ -44,7 +48,9 @@ def local_role() -> gmijax.Role:
         (role_with(of=threading.Lock()), {}, r"^role=Stuck: cannot be sent .*lock.* in run$"),
         (Stuck(), {"timeout_s": 0}, "^timeout_s=0: must be greater than 0$"),
         (Stuck(), {"stall_timeout_s": -1.0}, "^stall_timeout_s=-1.0: must be greater than 0$"),
-        (Stuck(), {"pipe_mib": 0.1}, "^pipe_mib=0.1: must be at least 0.25$"),
+        (Stuck(), {"grace_s": float("inf")}, "^grace_s=inf: must be finite$"),
+        (Stuck(), {"pipe_mib": 0.1}, "^pipe_mib=0.1: must be between 0.25 and 16384$"),
+        (Stuck(), {"pipe_mib": float("inf")}, "^pipe_mib=inf: must be between"),
         (Stuck(), {"run_dir": "."}, r"^run.dir=\.: the run folder exists already$"),
     ],
 )
@@ -103,6 +109,15 @@ def test_the_manager_says_what_is_missing() -> None:
 def test_a_plan_is_needed() -> None:
     with pytest.raises(ConfigError, match=r"^plan=None: expected a plan of gmijax.plan"):
         gmijax.launch(None, Stuck())
+
+
+def test_a_folder_that_is_run_is_found_by_its_file(tmp_path: Path, monkeypatch: Any) -> None:
+    main = ModuleType("__main__")
+    main.__file__, main.__spec__ = str(tmp_path / "__main__.py"), ModuleSpec("__main__", None)
+    Path(main.__file__).touch()
+    monkeypatch.setitem(sys.modules, "__main__", main)
+    script = own_script()
+    assert (script["module"], script["file"]) == (None, main.__file__)
 
 
 def test_roles_talk_only_in_a_gmi() -> None:
