@@ -70,23 +70,29 @@ def _time_steps(share: Share, step: Any, state: Any) -> list[float]:
 
 def _run(share: Share, program: Any, state: Any) -> tuple[Tally, bool]:
     tally = Tally(share.link, share.env.spec.name, share.steps_per_unroll)
-    pending: Counts | None = None
+    pending: tuple[Any, Counts] | None = None
     stopped = False
     try:
         for _ in range(share.num_unrolls):
             if stopped := share.link.stop_requested:
                 break
-            state, steps, counts = program(state)
-            if share.writer is not None:
-                share.writer.write(steps)
+            state, *made = program(state)
             # The counts of the unroll before are fetched while this one runs.
-            if pending is not None:
-                tally.add(pending)
-            pending = counts
-        if pending is not None:
-            tally.add(pending)
+            _keep(share, tally, pending)
+            pending = made[0], made[1]
+        _keep(share, tally, pending)
         if share.writer is not None:
             share.writer.wait()
     finally:
         tally.close()
     return tally, stopped
+
+
+def _keep(share: Share, tally: Tally, unrolled: tuple[Any, Counts] | None) -> None:
+    """Counts an unroll and writes it; in this order, so that none with bad numbers is kept."""
+    if unrolled is None:
+        return
+    steps, counts = unrolled
+    tally.add(counts)
+    if share.writer is not None:
+        share.writer.write(steps)
