@@ -40,7 +40,8 @@ class PlanConfig:
         default=False,
     )
     self_check: Literal["auto", "on", "off"] = doc(
-        "compare matrix products with float64 when a GMI starts; auto: where SMs are capped",
+        "compare matrix products with float64 when a GMI starts; auto: where SMs are capped, or "
+        "an MPS daemon of somebody else may cap them",
         default="auto",
     )
     serving_gpus: int | tuple[int, ...] | None = doc(

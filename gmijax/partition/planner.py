@@ -84,7 +84,7 @@ def make_plan(
         intra=_intra(reduce, layout, backend, reasons) if training else "host",
         reasons=tuple(reasons),
         roles=roles,
-        self_check=_self_check(plan, slices),
+        self_check=_self_check(plan, slices, backend, machine),
         may_share=_may_share(plan, backend, gpus),
     )
 
@@ -166,10 +166,14 @@ def _slices(
     )
 
 
-def _self_check(plan: PlanConfig, slices: Sequence[Slice]) -> bool:
-    if plan.self_check == "auto":
-        return any((share.sm_percent or 100.0) < 100.0 for share in slices)
-    return plan.self_check == "on"
+def _self_check(
+    plan: PlanConfig, slices: Sequence[Slice], backend: BackendName, machine: Machine
+) -> bool:
+    if plan.self_check != "auto":
+        return plan.self_check == "on"
+    # A daemon of somebody else may cap all its clients by default, and does not tell.
+    is_theirs = backend == "mps" and machine.operator_daemon is not None
+    return is_theirs or any((share.sm_percent or 100.0) < 100.0 for share in slices)
 
 
 def _may_share(plan: PlanConfig, backend: BackendName, gpus: Sequence[Gpu]) -> bool:

@@ -92,7 +92,13 @@ def test_no_cap_that_was_measured_to_be_wrong_counts_as_clean():
         ({"sm_percent": 50.0, "self_check": "off"}, False),
         ({"self_check": "on"}, True),
         ({"backend": "cpu", "self_check": "on"}, True),
+        # Somebody else's daemon may cap its clients and not tell.
+        ({"here": {"operator_daemon": Path("/run/mps")}}, True),
+        ({"here": {"operator_daemon": Path("/run/mps")}, "self_check": "off"}, False),
+        ({"here": {"operator_daemon": Path("/run/mps")}, "backend": "share"}, False),
     ],
 )
-def test_products_are_checked_where_sms_are_capped(changes: dict[str, Any], checked: bool):
+def test_products_are_checked_where_sms_are_or_may_be_capped(
+    changes: dict[str, Any], checked: bool
+):
     assert planned(**changes).self_check == checked
