@@ -7,27 +7,24 @@ enters the backend, runs the GMIs, and writes the summary however the job ends.
 from __future__ import annotations
 
 import dataclasses
-import sys
 import time
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import suppress
-from importlib.metadata import PackageNotFoundError, version
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
 from rich.console import Console
 
-from gmijax import dedicated
+from gmijax import dedicated, trained
 from gmijax.config import TrainConfig
 from gmijax.decoupled import MODULE, is_decoupled, plan_decoupled, shared_blocks
-from gmijax.errors import ConfigError, GmijaxError, JobInterrupted
-from gmijax.launcher import Launch, run_gmis
+from gmijax.errors import ConfigError
+from gmijax.launcher import Launch, patience_of, recorded, run_gmis
 from gmijax.partition.machine import Machine, detect_machine
 from gmijax.partition.plan import Plan
 from gmijax.partition.planner import make_plan
-from gmijax.partition.supervisor import Patience
 from gmijax.progress import ConsoleProgress, SilentProgress
-from gmijax.results import MetricsReader, copy_history, draw_returns, read_metrics
+from gmijax.results import MetricsReader, copy_history, draw_returns
 from gmijax.resume import CheckpointMeta, check_fits, find_checkpoint, saved_config
 from gmijax.rundir import RunPaths, create_run, read_json, write_json
 from gmijax.schema import to_dict
@@ -36,12 +33,6 @@ from gmijax.selection import estimated_floats, with_measured
 from gmijax.sim import source
 from gmijax.sim.impl import choose_impl
 from gmijax.sim.registry import require_task
-from gmijax.version import __version__
-
-_ASYNCHRONOUS = ("pps", "ttop", "staleness", "bytes_per_s", "dropped")
-"""Figures that only asynchronous training has."""
-
-_VERSIONS = ("jax", "jaxlib", "mujoco-mjx", "flax", "optax", "orbax-checkpoint")
 
 
 class Result(NamedTuple):
@@ -89,29 +80,18 @@ def train(config: TrainConfig, *, show: bool = False) -> Result:
         if show
         else SilentProgress()
     )
-    status = "failed"
-    try:
+
+    def record(status: str, plan: Plan) -> None:
+        summary = trained.summarise(config, plan, run, status, time.monotonic() - started)
+        write_json(run.summary, summary)
+        draw_returns(run.metrics, run.returns_png, f"{config.env.label}, {config.algo.name}")
+
+    with recorded(run, partial(_what_is_left, run), record):
         _copy_history(config, run)
         with progress:
-            launch = _launch(config, plan, machine, run, console)
-            run_gmis(launch, progress.update)
-        status = "completed"
-    except JobInterrupted as error:
-        status = "interrupted"
-        error.add_note(_what_is_left(run))
-        raise
-    except GmijaxError as error:
-        error.add_note(f"run folder: {run.root}")
-        raise
-    finally:
-        # A full disk must not hide why the job failed.
-        with suppress(OSError):
-            plan = Plan.from_dict(read_json(run.plan))  # Its backend may have been replaced.
-            summary = _summarise(config, plan, run, status, time.monotonic() - started)
-            write_json(run.summary, summary)
-            draw_returns(run.metrics, run.returns_png, f"{config.env.label}, {config.algo.name}")
+            run_gmis(_launch(config, plan, machine, run, console), progress.update)
     summary = read_json(run.summary)
-    console.print(_outcome(summary, run))
+    console.print(trained.outcome(summary, run))
     return Result(run.root, summary)
 
 
@@ -188,7 +168,6 @@ def _with_checkpoint(config: TrainConfig) -> TrainConfig:
 def _launch(
     config: TrainConfig, plan: Plan, machine: Machine, run: RunPaths, console: Console
 ) -> Launch:
-    times = config.run
     return Launch(
         plan=plan,
         machine=machine,
@@ -197,12 +176,7 @@ def _launch(
         # Agents and trainers compile different programs.
         compile_once=not is_decoupled(config) and not dedicated.is_dedicated(plan),
         shared=_shared(config, plan),
-        patience=Patience(
-            start_timeout_s=times.start_timeout_s,
-            stall_timeout_s=times.stall_timeout_s,
-            stop_timeout_s=times.stall_timeout_s,
-            grace_s=times.grace_s,
-        ),
+        patience=patience_of(config.run),
         on_warning=lambda text: console.print(text, markup=False),
     )
 
@@ -231,79 +205,3 @@ def _announce(console: Console, plan: Plan, more: Sequence[str], run: RunPaths) 
     )
     for text in (*plan.reasons, *more):
         console.print(f"  {text}", markup=False)
-
-
-def _summarise(
-    config: TrainConfig, plan: Plan, run: RunPaths, status: str, wall_s: float
-) -> dict[str, Any]:
-    result = read_json(run.gmi(0).result) if run.gmi(0).result.exists() else _last_known(run)
-    checkpoints = sorted(run.checkpoints.glob("[0-9]*"))
-    return {
-        "status": status,
-        "env": config.env.label,
-        "algo": config.algo.name,
-        "plan": {
-            "backend": plan.backend,
-            "layout": [list(gmis) for gmis in plan.layout.gmis_of_gpu],
-            "num_envs_per_gmi": plan.num_envs_per_gmi,
-            "strategy": plan.strategy,
-            "intra": result.get("intra", plan.intra),
-            "selection": dict(plan.selection),
-            "template": plan.template,
-            "roles": list(plan.roles),
-        },
-        "env_steps": result.get("env_steps"),
-        "wall_s": wall_s,
-        "train_wall_s": result.get("train_wall_s"),
-        "compile_s": result.get("compile_s"),
-        "env_steps_per_s": result.get("env_steps_per_s"),
-        "step_per_s_sim": result.get("step_per_s_sim"),
-        "step_per_s_inference": result.get("step_per_s_inference"),
-        "step_per_s_train": result.get("step_per_s_train"),
-        **{key: result[key] for key in _ASYNCHRONOUS if key in result},
-        "final_return": result.get("final_return"),
-        "overflow_steps": result.get("overflow_steps") or {},
-        "checkpoint": str(checkpoints[-1]) if checkpoints else None,
-        "versions": {"gmijax": __version__, "python": sys.version.split()[0]}
-        | _installed_versions(),
-        "device": result.get("device"),
-        "impl": config.physics.impl,
-    }
-
-
-def _last_known(run: RunPaths) -> dict[str, Any]:
-    """What the metrics say of a job that did not end by itself."""
-    lines = read_metrics(run.metrics)
-    if not lines:
-        return {}
-    return {"env_steps": lines[-1]["env_steps"], "final_return": lines[-1]["return"]}
-
-
-def _installed_versions() -> dict[str, str | None]:
-    found: dict[str, str | None] = {}
-    for name in _VERSIONS:
-        try:
-            found[name] = version(name)
-        except PackageNotFoundError:
-            found[name] = None
-    return found
-
-
-def _outcome(summary: dict[str, Any], run: RunPaths) -> str:
-    def rate(key: str) -> str:
-        value = summary[key]
-        return "-" if value is None else f"{value:,.0f}"
-
-    final = summary["final_return"]
-    return (
-        f"{summary['status']}: {summary['env_steps']:,} env steps in {summary['wall_s']:.0f} s, "
-        f"final return {'-' if final is None else format(final, '.2f')}\n"
-        f"env steps/s: {rate('step_per_s_sim')} simulation, "
-        f"{rate('step_per_s_inference')} with inference, "
-        f"{rate('step_per_s_train')} with training\n"
-        f"checkpoint: {summary['checkpoint']}\nsummary: {run.summary}"
-    ) + "".join(
-        f"\nwarning: MJX-Warp's {name} buffer was too small in {count:,.0f} environment steps"
-        for name, count in summary["overflow_steps"].items()
-        if count
-    )

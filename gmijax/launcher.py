@@ -12,12 +12,13 @@ import signal
 import sys
 import threading
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 
 from gmijax.collectives.memory import create_exchange
-from gmijax.errors import BackendUnavailable
+from gmijax.config import RunConfig, ServeRunConfig
+from gmijax.errors import BackendUnavailable, GmijaxError, JobInterrupted
 from gmijax.partition.backend_choice import WHAT_SHARE_LOSES
 from gmijax.partition.backends import Backend, open_backend
 from gmijax.partition.child import ENV_EXCHANGE_FD
@@ -28,7 +29,7 @@ from gmijax.partition.plan import Plan
 from gmijax.partition.reduction import meets_at_start, needs_ring
 from gmijax.partition.rendezvous import reserved_address
 from gmijax.partition.supervisor import Job, Patience, Supervisor
-from gmijax.rundir import RunPaths, write_json
+from gmijax.rundir import RunPaths, read_json, write_json
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -99,6 +100,44 @@ def run_gmis(
         if launch.stops_gracefully:
             held.enter_context(_stopping_on_signals(supervisor.request_stop))
         supervisor.run(on_tick)
+
+
+@contextmanager
+def recorded(
+    run: RunPaths, what_is_left: Callable[[], str], record: Callable[[str, Plan], None]
+) -> Iterator[None]:
+    """A job of whose end a record is made, however it ends; errors get notes.
+
+    Args:
+      run: the run folder.
+      what_is_left: in words, for a job that was interrupted.
+      record: gets `completed`, `interrupted` or `failed`, and the plan as it was run.
+    """
+    status = "failed"
+    try:
+        yield
+        status = "completed"
+    except JobInterrupted as error:
+        status = "interrupted"
+        error.add_note(what_is_left())
+        raise
+    except GmijaxError as error:
+        error.add_note(f"run folder: {run.root}")
+        raise
+    finally:
+        # A full disk must not hide why the job failed.
+        with suppress(OSError):
+            record(status, Plan.from_dict(read_json(run.plan)))  # Its backend may be another.
+
+
+def patience_of(limits: RunConfig | ServeRunConfig) -> Patience:
+    """The time limits of a job, as its configuration has them."""
+    return Patience(
+        start_timeout_s=limits.start_timeout_s,
+        stall_timeout_s=limits.stall_timeout_s,
+        stop_timeout_s=limits.stall_timeout_s,
+        grace_s=limits.grace_s,
+    )
 
 
 def environment_of(

@@ -13,7 +13,6 @@ import statistics
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from importlib.metadata import PackageNotFoundError, version
 from typing import Any, Literal
 
 from gmijax.config import EnvConfig, PlanConfig, PpoConfig, ReduceConfig, TemplateName, TrainConfig
@@ -29,7 +28,7 @@ from gmijax.partition.supervisor import Patience
 from gmijax.results import read_metrics
 from gmijax.rundir import RunPaths, read_json, write_json
 from gmijax.schema import to_dict
-from gmijax.version import __version__
+from gmijax.version import __version__, versions_of
 
 Mode = Literal["corun", "isolated"]
 
@@ -249,13 +248,7 @@ def store_key(workload: Workload, machine: Machine) -> dict[str, Any]:
 
 def installed_versions() -> dict[str, str | None]:
     """Versions of what computes, None for what is not installed."""
-    found: dict[str, str | None] = {"gmijax": __version__}
-    for name in _VERSIONS:
-        try:
-            found[name] = version(name)
-        except PackageNotFoundError:
-            found[name] = None
-    return found
+    return {"gmijax": __version__, **versions_of(_VERSIONS)}
 
 
 def _read(workload: Workload, plan: Plan, run: RunPaths) -> Measured | NotRunnable:

@@ -11,7 +11,7 @@ import hashlib
 import json
 import time
 from collections.abc import Sequence
-from contextlib import ExitStack, suppress
+from contextlib import ExitStack
 from functools import partial
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
@@ -22,13 +22,12 @@ from gmijax import served
 from gmijax.collectives.pipe_block import create_pipes
 from gmijax.config import PhysicsConfig, ServeConfig
 from gmijax.datadir import DataPaths, locked, open_dataset
-from gmijax.errors import ConfigError, GmijaxError, JobInterrupted
-from gmijax.launcher import Launch, run_gmis
+from gmijax.errors import ConfigError
+from gmijax.launcher import Launch, patience_of, recorded, run_gmis
 from gmijax.partition.child import ENV_PIPES_FD
 from gmijax.partition.machine import Machine, detect_machine
 from gmijax.partition.plan import Plan
 from gmijax.partition.planner import make_plan
-from gmijax.partition.supervisor import Patience
 from gmijax.partition.templates import SIMULATOR, group_of
 from gmijax.progress import ConsoleProgress, SilentProgress
 from gmijax.resume import CheckpointMeta, find_checkpoint, trained_config
@@ -193,42 +192,25 @@ def _run(job: _Job, kept: int, run: RunPaths, console: Console) -> dict[str, Any
     lines = served.CollectedLines(run, job.simulators, kept * job.steps_per_unroll)
     total = job.wanted_unrolls * job.steps_per_unroll
     progress = SilentProgress() if console.quiet else ConsoleProgress(console, lines, total)
-    status = "failed"
-    try:
-        with progress:
-            run_gmis(_launch(job, run, console), progress.update)
-        status = "completed"
-    except JobInterrupted as error:
-        status = "interrupted"
-        error.add_note(_what_is_left(job))
-        raise
-    except GmijaxError as error:
-        error.add_note(f"run folder: {run.root}")
-        raise
-    finally:
-        # A full disk must not hide why the job failed.
-        with suppress(OSError):
-            wall_s = time.monotonic() - started_s
-            plan = Plan.from_dict(read_json(run.plan))  # Its backend may have been replaced.
-            summary = served.summarise(job.config, plan, run, status, wall_s)
-            write_json(run.summary, summary | {"output": _output(job, kept)})
+
+    def record(status: str, plan: Plan) -> None:
+        wall_s = time.monotonic() - started_s
+        summary = served.summarise(job.config, plan, run, status, wall_s)
+        write_json(run.summary, summary | {"output": _output(job, kept)})
+
+    with recorded(run, partial(_what_is_left, job), record), progress:
+        run_gmis(_launch(job, run, console), progress.update)
     return read_json(run.summary)
 
 
 def _launch(job: _Job, run: RunPaths, console: Console) -> Launch:
-    times = job.config.run
     pipes = partial(create_pipes, job.plan.layout.num_gmis, job.config.pipe_bytes)
     return Launch(
         plan=job.plan,
         machine=job.machine,
         run=run,
         module="gmijax.serving_worker",
-        patience=Patience(
-            start_timeout_s=times.start_timeout_s,
-            stall_timeout_s=times.stall_timeout_s,
-            stop_timeout_s=times.stall_timeout_s,
-            grace_s=times.grace_s,
-        ),
+        patience=patience_of(job.config.run),
         shared={ENV_PIPES_FD: pipes} if job.plan.template == "tdg" else {},
         on_warning=lambda text: console.print(text, markup=False),
     )

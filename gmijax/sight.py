@@ -8,7 +8,6 @@ import subprocess
 import sys
 import tempfile
 from collections.abc import Mapping
-from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from types import MappingProxyType
 from typing import Final, NamedTuple
@@ -20,6 +19,7 @@ from gmijax.partition.machine import Machine, detect_machine
 from gmijax.partition.nvidia import Gpu, nvml_problem
 from gmijax.partition.planner import make_plan
 from gmijax.rundir import RunPaths
+from gmijax.version import versions_of
 
 PROBE_TIMEOUT_S: Final = 120.0
 
@@ -71,7 +71,7 @@ def look() -> Sight:
     return Sight(
         machine=machine,
         jax=ask_jax(machine),
-        versions={name: _version(name) for name in (*REQUIRED, *_OPTIONAL)},
+        versions=versions_of((*REQUIRED, *_OPTIONAL)),
         variables=dict(os.environ),
         nvml_error=nvml_problem(),
         mps_error=try_mps(machine),
@@ -141,10 +141,3 @@ def try_mps(machine: Machine) -> str | None:
                 return None
         except GmijaxError as error:
             return str(error)
-
-
-def _version(package: str) -> str | None:
-    try:
-        return version(package)
-    except PackageNotFoundError:
-        return None

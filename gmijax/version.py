@@ -1,3 +1,20 @@
-"""The version of gmijax; the distribution takes it from here."""
+"""The version of gmijax, from which the distribution takes it, and of other packages."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from importlib.metadata import PackageNotFoundError, version
 
 __version__ = "0.1.0"
+
+
+def versions_of(packages: Iterable[str]) -> dict[str, str | None]:
+    """Versions of installed packages by name, None for what is not installed."""
+    return {name: _version_of(name) for name in packages}
+
+
+def _version_of(package: str) -> str | None:
+    try:
+        return version(package)
+    except PackageNotFoundError:
+        return None

@@ -7,16 +7,13 @@ reducer, runs it, and writes `result.json` or `error.json`.
 from __future__ import annotations
 
 import sys
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from gmijax.config import PpoConfig, TrainConfig
 from gmijax.partition.child import ChildLink, run_gmi
 from gmijax.partition.plan import Plan
 from gmijax.rundir import read_json
 from gmijax.schema import from_dict
-
-if TYPE_CHECKING:
-    pass
 
 
 def main() -> int:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import TypeVar
+from typing import Generic, TypeVar
 
 import jax
 import numpy as np
@@ -12,7 +12,7 @@ from gmijax.collectives.buffers import require_device_buffer, require_mean_input
 from gmijax.collectives.courier import Courier
 from gmijax.collectives.host import HostExchange
 from gmijax.collectives.interface import DeviceMean, FloatBuffer
-from gmijax.collectives.intra import IntraExchange
+from gmijax.collectives.intra import B, IntraExchange
 from gmijax.collectives.mrr import open_rings, run_watched
 from gmijax.collectives.ring import Ring, World
 from gmijax.collectives.turns import Turns
@@ -21,33 +21,46 @@ from gmijax.partition.reduction import leaders
 T = TypeVar("T")
 
 
-class HarReducer:
-    """A `Reducer` that sends one GMI of every GPU, the leader, to a ring.
-
-    `mean`: the GMIs of a GPU give their sum to the leader; the leaders sum over the ring; each
-    gives the mean to its GPU.
+class _Hierarchy(Generic[B]):
+    """What both forms of HAR have in common; B is how they hold a buffer.
 
     Args:
       host: this rank's use of the shared block.
-      intra: the exchange inside a GPU, through host memory.
+      intra: the exchange inside a GPU.
       world: this process among those of all GMIs; None with one GPU, which needs no ring.
       num_floats: P, length of the buffers for `mean`.
     """
 
-    is_device_resident = False
-
     def __init__(
-        self,
-        host: HostExchange,
-        intra: IntraExchange[FloatBuffer],
-        world: World | None,
-        num_floats: int,
+        self, host: HostExchange, intra: IntraExchange[B], world: World | None, num_floats: int
     ) -> None:
         self.rank = host.rank
         self.world_size = host.world_size
         self._host = host
         self._intra = intra
+        self._num_floats = num_floats
         self._ring = None if world is None else LeaderRing(host, world, num_floats)
+
+    def all_gather(self, values: FloatBuffer) -> FloatBuffer:
+        """See `HostExchange.all_gather`."""
+        return self._host.all_gather(values)
+
+    def close(self) -> None:
+        """Gives thread and memory back, once no result is in use; calling it twice is fine."""
+        if self._ring is not None:
+            self._ring.close()
+        self._intra.close()
+        self._host.close()
+
+
+class HarReducer(_Hierarchy[FloatBuffer]):
+    """A `Reducer` that sends one GMI of every GPU, the leader, to a ring.
+
+    `mean`: the GMIs of a GPU give their sum to the leader; the leaders sum over the ring; each
+    gives the mean to its GPU.
+    """
+
+    is_device_resident = False
 
     def mean(self, buffer: FloatBuffer) -> FloatBuffer:
         """Returns the mean over ranks of `buffer` [P] float32, see `Reducer.mean`.
@@ -66,42 +79,11 @@ class HarReducer:
         turns.end()
         return result
 
-    def all_gather(self, values: FloatBuffer) -> FloatBuffer:
-        """See `HostExchange.all_gather`."""
-        return self._host.all_gather(values)
 
-    def close(self) -> None:
-        """Gives thread and memory back, once no result is in use; calling it twice is fine."""
-        if self._ring is not None:
-            self._ring.close()
-        self._host.close()
-
-
-class DeviceHarReducer:
-    """The same without leaving the GPUs: a `DeviceReducer`.
-
-    Args:
-      host: this rank's use of the shared block, for turns and `all_gather`.
-      intra: the exchange inside a GPU, on the device.
-      world: this process among those of all GMIs; None with one GPU, which needs no ring.
-      num_floats: P, length of the buffers for `mean`.
-    """
+class DeviceHarReducer(_Hierarchy[jax.Array]):
+    """The same without leaving the GPUs: a `DeviceReducer`."""
 
     is_device_resident = True
-
-    def __init__(
-        self,
-        host: HostExchange,
-        intra: IntraExchange[jax.Array],
-        world: World | None,
-        num_floats: int,
-    ) -> None:
-        self.rank = host.rank
-        self.world_size = host.world_size
-        self._host = host
-        self._intra = intra
-        self._num_floats = num_floats
-        self._ring = None if world is None else LeaderRing(host, world, num_floats)
 
     def mean_on_device(self, buffer: jax.Array) -> jax.Array:
         """Returns the mean over ranks of `buffer` [P] float32, see `DeviceReducer`.
@@ -133,17 +115,6 @@ class DeviceHarReducer:
         """The same for a buffer in host memory, with a copy each way; the result is read-only."""
         require_mean_input(buffer, self._num_floats)
         return np.asarray(self.mean_on_device(jax.device_put(buffer)))
-
-    def all_gather(self, values: FloatBuffer) -> FloatBuffer:
-        """See `HostExchange.all_gather`."""
-        return self._host.all_gather(values)
-
-    def close(self) -> None:
-        """Gives thread and memory back; calling it twice is fine."""
-        if self._ring is not None:
-            self._ring.close()
-        self._intra.close()
-        self._host.close()
 
 
 class LeaderRing:

@@ -81,29 +81,33 @@ def launch(
         "script": shipping.own_script(),
     }
     _write(run, plan, config, parcels)
-    job = Launch(
-        plan=plan,
-        machine=detect_machine(),
-        run=run,
-        module="gmijax.roles.worker",
-        patience=Patience(
-            start_timeout_s=start_timeout_s,
-            stall_timeout_s=math.inf if stall_timeout_s is None else stall_timeout_s,
-            stop_timeout_s=grace_s,
-            grace_s=grace_s,
-        ),
-        # Roles wait for each other, so they start together.
-        compile_once=False,
-        on_warning=lambda text: warnings.warn(text, RuntimeWarning, stacklevel=2),
-        shared={ENV_PIPES_FD: partial(create_pipes, len(roles), config["capacity_bytes"])},
+    patience = Patience(
+        start_timeout_s=start_timeout_s,
+        stall_timeout_s=math.inf if stall_timeout_s is None else stall_timeout_s,
+        stop_timeout_s=grace_s,
+        grace_s=grace_s,
     )
     try:
-        run_gmis(job)
+        run_gmis(_job(plan, run, patience, config["capacity_bytes"]))
         outputs = [_output(run, gmi) for gmi in plan.layout.gmis]
     except GmijaxError as error:
         _explain(error, run)
         raise
     return [shipping.load(output) for output in outputs]
+
+
+def _job(plan: Plan, run: RunPaths, patience: Patience, capacity_bytes: int) -> Launch:
+    return Launch(
+        plan=plan,
+        machine=detect_machine(),
+        run=run,
+        module="gmijax.roles.worker",
+        patience=patience,
+        # Roles wait for each other, so they start together.
+        compile_once=False,
+        on_warning=lambda text: warnings.warn(text, RuntimeWarning, stacklevel=2),
+        shared={ENV_PIPES_FD: partial(create_pipes, plan.layout.num_gmis, capacity_bytes)},
+    )
 
 
 def _require_no_gmi() -> None:
