@@ -160,6 +160,9 @@ def _describe(kind: Any) -> str:
         elif typing.get_origin(option) is tuple:
             inner = typing.get_args(option)[0]
             nested = typing.get_origin(inner) is tuple
+            if typing.get_origin(inner) is Literal:
+                parts.append(f"a list of {', '.join(map(str, typing.get_args(inner)))}")
+                continue
             items = {float: "numbers", str: "names"}.get(inner, "integers")
             parts.append("a list of lists of integers" if nested else f"a list of {items}")
         elif typing.get_origin(option) is Mapping:

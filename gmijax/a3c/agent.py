@@ -1,16 +1,19 @@
 """The role of a serving GMI: simulator and agent in one.
 
 It acts with the newest weights on the board, sends what came of it, and goes on. Trainers never
-make it wait, except for room where experience is not to be dropped.
+make it wait, except for room where experience is not to be dropped. Newer weights are taken up
+within unrolls too: the less old what a policy learns from is, the fewer steps it takes.
 """
 
 from __future__ import annotations
 
 import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import numpy.typing as npt
 from jax.flatten_util import ravel_pytree
@@ -18,16 +21,16 @@ from jax.flatten_util import ravel_pytree
 from gmijax.a3c.board import Board, Orders, Report, pack_report, unpack_orders
 from gmijax.a3c.learner import ActingWeights, acting_weights, unpack_weights
 from gmijax.a3c.losses import Unrolls
-from gmijax.a3c.rollout import UnrollStats, collect, stats_example
+from gmijax.a3c.rollout import UnrollPrograms, UnrollStats, stats_example
 from gmijax.checkpoint import has_envs, restore_envs, save_envs
 from gmijax.collectives.channel.interface import ExperienceSender
 from gmijax.config import A3cConfig, TrainConfig
 from gmijax.errors import CollectiveTimeout, PipeClosed
-from gmijax.learner import LearnerState, host_sharding, init_learner, make_learner
+from gmijax.learner import LearnerState, init_learner, make_learner
 from gmijax.partition.child import ChildLink
 from gmijax.resume import CheckpointMeta
 from gmijax.sim.wrappers import BatchedEnv, BatchState, env_keys
-from gmijax.types import PyTree
+from gmijax.types import Array
 
 _PAUSE_S = 0.02
 _POLL_S = 0.0002
@@ -54,10 +57,10 @@ class Serving(NamedTuple):
 
 
 class _Sent(NamedTuple):
-    """An unroll that is being computed: what it will be, and the policy that makes it."""
+    """An unroll that is being computed: what it will be, and the first policy that makes it."""
 
     experience: Unrolls
-    stats: UnrollStats
+    stats: Array
     version: int
 
 
@@ -142,21 +145,12 @@ class _Agent:
             return env_state
         return restore_envs(Path(str(resume)), self._link.gmi, env_state)
 
-    def _compile(self, weights: ActingWeights, env_state: BatchState) -> Any:
-        def unroll(
-            model: PyTree, weights: ActingWeights, env_state: BatchState
-        ) -> tuple[BatchState, Unrolls, Any]:
-            env_state, experience, stats = collect(
-                self._env, self._learner.networks, self._algo.unroll_length, model, weights,
-                env_state,
-            )  # fmt: skip
-            return env_state, experience, ravel_pytree(stats)[0]
-
-        where = host_sharding()
-        jitted = jax.jit(
-            unroll, donate_argnums=(2,), out_shardings=(None, where, where) if where else None
+    def _compile(self, weights: ActingWeights, env_state: BatchState) -> UnrollPrograms:
+        num_pieces = self._algo.pieces_per_unroll
+        num_steps = self._algo.unroll_length // num_pieces
+        return UnrollPrograms(
+            self._env, self._learner.networks, num_steps, num_pieces, weights, env_state
         )
-        return jitted.lower(self._env.model, weights, env_state).compile()
 
     def _wait_for_start(self) -> None:
         """Returns when the leading trainer has written its first orders and weights."""
@@ -167,19 +161,35 @@ class _Agent:
                 raise self._late("the start", limit_s)
             time.sleep(_PAUSE_S)
 
-    def _loop(self, program: Any, weights: ActingWeights, env_state: BatchState) -> None:
+    def _loop(
+        self, programs: UnrollPrograms, weights: ActingWeights, env_state: BatchState
+    ) -> None:
         pending: _Sent | None = None
         unpack = jax.jit(lambda packed: unpack_weights(weights, packed))
         while not self._obey(env_state):
-            if (posted := self._board.weights.read(self._weights_seen)) is not None:
-                self._weights_seen, self._version = posted.count, posted.tag
-                weights = unpack(posted.values.view(np.float32))
-            env_state, experience, stats = program(self._env.model, weights, env_state)
-            # While the device computes this unroll, the one before is sent.
-            if pending is not None:
-                self._send(pending, env_state)
-            pending = _Sent(experience, stats, self._version)
+            pieces: list[tuple[Unrolls, UnrollStats]] = []
+            versions: list[int] = []
+            for index in range(self._algo.pieces_per_unroll):
+                if index > 1:  # One piece runs and one waits: more would act with older weights.
+                    jax.block_until_ready(pieces[index - 2])
+                weights = self._newest(weights, unpack)
+                env_state, made = programs.piece(weights, env_state)
+                pieces.append(made)
+                versions.append(self._version)
+                # While the device computes this unroll, the one before is sent.
+                if index == 0 and pending is not None:
+                    self._send(pending, env_state)
+            pending = _Sent(*programs.join(pieces), versions[0])
         self._publish()
+
+    def _newest(
+        self, weights: ActingWeights, unpack: Callable[[Array], ActingWeights]
+    ) -> ActingWeights:
+        """The newest weights on the board; `weights` if there are no newer ones."""
+        if (posted := self._board.weights.read(self._weights_seen)) is None:
+            return weights
+        self._weights_seen, self._version = posted.count, posted.tag
+        return unpack(jnp.asarray(posted.values.view(np.float32)))
 
     def _send(self, unroll: _Sent, env_state: BatchState) -> None:
         arrays = {name: np.asarray(x) for name, x in unroll.experience._asdict().items()}

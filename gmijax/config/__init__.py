@@ -10,7 +10,7 @@ from gmijax.config.a3c import A3cConfig
 from gmijax.config.actor_critic import ADAPTIVE_LEARNING_RATE_RANGE, ActorCriticConfig
 from gmijax.config.channel import ChannelConfig
 from gmijax.config.env import EnvConfig, PhysicsConfig
-from gmijax.config.plan import PlanConfig, ReduceConfig, TemplateName
+from gmijax.config.plan import PlanConfig, Priority, ReduceConfig, TemplateName
 from gmijax.config.play import PlayConfig, PlayRunConfig
 from gmijax.config.ppo import PpoConfig
 from gmijax.config.run import RunConfig
@@ -33,6 +33,7 @@ __all__ = [
     "PlayConfig",
     "PlayRunConfig",
     "PpoConfig",
+    "Priority",
     "ReduceConfig",
     "RunConfig",
     "SearchConfig",

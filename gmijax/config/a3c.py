@@ -16,6 +16,10 @@ class A3cConfig(ActorCriticConfig):
 
     name: Literal["a3c"] = doc("training algorithm")
     unroll_length: int = doc("T, environment steps per environment and unroll")
+    weights_every: int | None = doc(
+        "environment steps after which, at the latest, an agent takes up newer weights, within an "
+        "unroll too; null: with every unroll"
+    )
     batch_size: int | None = doc(
         "B, unrolls in one batch of one trainer; null: num_envs, the unrolls of one agent"
     )
@@ -47,12 +51,22 @@ class A3cConfig(ActorCriticConfig):
         super().__post_init__()
         for key in ("rho_clip", "trace_clip"):
             require_positive(f"algo.{key}", getattr(self, key))
-        for key in ("batch_size", "max_staleness"):
+        for key in ("weights_every", "batch_size", "max_staleness"):
             if getattr(self, key) is not None:
                 require_at_least(f"algo.{key}", getattr(self, key), 1)
         if self.clipping_epsilon is not None:
             require_positive("algo.clipping_epsilon", self.clipping_epsilon)
         require_at_least("algo.max_ahead", self.max_ahead, 1)
+
+    @property
+    def pieces_per_unroll(self) -> int:
+        """In how many equal pieces an agent makes an unroll, each with the newest weights."""
+        longest = min(self.weights_every or self.unroll_length, self.unroll_length)
+        return next(
+            pieces
+            for pieces in range(-(-self.unroll_length // longest), self.unroll_length + 1)
+            if self.unroll_length % pieces == 0
+        )
 
     def batch_of(self, num_envs: int) -> int:
         """B with `num_envs` environments on every agent.

@@ -10,6 +10,7 @@ from gmijax.errors import ConfigError
 from gmijax.schema import doc, require_at_least, require_between, require_positive
 
 TemplateName = Literal["tcg", "tdg", "tcg_ex", "tdg_ex", "decoupled"]
+Priority = Literal["normal", "below_normal"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -35,6 +36,11 @@ class PlanConfig:
         "per GMI; null: 0.8 split evenly"
     )
     template: Literal["auto", TemplateName] = doc("how roles map to GMIs")
+    mps_priority: Literal["trainers_first"] | tuple[Priority, ...] | None = doc(
+        "whose kernels go first where several wait for a GPU (MPS): trainers_first, or one of "
+        "normal, below_normal for each GMI; null: all alike",
+        default=None,
+    )
     force_sm_percent: bool = doc(
         "take an sm_percent at which wrong matrix products were reported (docs/shares.md)",
         default=False,
@@ -73,6 +79,11 @@ class PlanConfig:
                 require_between("plan.sm_percent", percent, 1.0, 100.0)
         for fraction in _numbers(self.memory_fraction):
             require_between("plan.memory_fraction", fraction, 0.01, 1.0)
+
+    @property
+    def needs_mps(self) -> bool:
+        """Whether something is wanted that only MPS has."""
+        return self.sm_percent is not None or self.mps_priority is not None
 
     def require_template(self, allowed: Iterable[TemplateName], why: str) -> None:
         """Raises ConfigError unless `template` is `auto` or one of those `allowed`."""

@@ -34,7 +34,7 @@ def choose_backend(
     most = max(len(gmis) for gmis in layout.gmis_of_gpu)
     if _takes_mig(plan, layout, machine, purpose):
         return "mig", _why_mig(plan, layout, machine, purpose)
-    if most == 1 and plan.sm_percent is None:
+    if most == 1 and not plan.needs_mps:
         return "share", "one GMI on every GPU has nothing to share, and MPS would only add risk"
     oldest = min(gpu.compute_capability for gpu in candidates(plan, machine))
     if oldest[0] < _VOLTA:
@@ -50,8 +50,8 @@ def choose_backend(
     why = f"up to {most} GMIs on a GPU run at the same time with {daemon}"
     if oldest[0] < _AMPERE:
         return "mps", f"{why}; compute capability {_version(oldest)} has no MIG"
-    if purpose == "serve" and plan.sm_percent is not None:
-        return "mps", f"{why}; only MPS can cap SMs"
+    if purpose == "serve" and plan.needs_mps:
+        return "mps", f"{why}; only MPS can cap SMs, and has priorities"
     if purpose == "serve":
         return "mps", f"{why}; there are no MIG instances to keep them apart"
     return "mps", f"{why}, and can exchange gradients"
@@ -127,7 +127,7 @@ def _takes_mig(plan: PlanConfig, layout: Layout, machine: Machine, purpose: Purp
     """Whether there are enough GPUs with instances, and reason to prefer them."""
     divided = [gpu for gpu in candidates(plan, machine) if gpu.instances]
     whole = [gpu for gpu in candidates(plan, machine) if not gpu.mig_enabled]
-    if len(divided) < layout.num_gpus or plan.sm_percent is not None:
+    if len(divided) < layout.num_gpus or plan.needs_mps:
         return False
     if len(whole) < layout.num_gpus:
         return True

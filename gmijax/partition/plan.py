@@ -10,7 +10,7 @@ from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
 from typing import Any, Literal
 
-from gmijax.config import TemplateName
+from gmijax.config import Priority, TemplateName
 from gmijax.errors import ConfigError
 from gmijax.partition.layout import Layout
 from gmijax.partition.templates import HOLISTIC
@@ -32,6 +32,7 @@ class Slice:
       sm_percent: cap on SMs in percent, None for no cap.
       memory_fraction: fraction of the device's memory, None where memory is not partitioned.
       cpus: CPU cores that the process is pinned to; empty for no pinning.
+      priority: of its kernels among those of the GPU's other GMIs (MPS), None where all are alike.
     """
 
     gmi: int
@@ -40,6 +41,7 @@ class Slice:
     sm_percent: float | None
     memory_fraction: float | None
     cpus: tuple[int, ...]
+    priority: Priority | None = None
 
 
 @dataclass(frozen=True)

@@ -26,7 +26,7 @@ from gmijax.partition.reduction import (
     select_strategy,
     why_not_intra,
 )
-from gmijax.partition.shares import gpu_slices, sm_percents
+from gmijax.partition.shares import gpu_slices, mps_priorities, sm_percents
 from gmijax.partition.templates import DESCRIPTIONS, TRAINER, Group, group_of, roles_of
 
 _CLIENTS_OF_OLD_DRIVERS, _CLIENTS_OF_NEW_DRIVERS, _NEW_DRIVER = 48, 60, 590
@@ -72,6 +72,11 @@ def make_plan(
     chosen = _template(plan, template, reasons)
     roles = roles_of(chosen, layout, trainers)
     training = group_of(layout, roles, TRAINER)
+    first = mps_priorities(plan, layout, backend, training.gmis if training else ())
+    slices = tuple(
+        dataclasses.replace(share, priority=priority)
+        for share, priority in zip(slices, first, strict=True)
+    )
     return Plan(
         layout=layout,
         slices=slices,
@@ -177,7 +182,7 @@ def _self_check(
 
 
 def _may_share(plan: PlanConfig, backend: BackendName, gpus: Sequence[Gpu]) -> bool:
-    if plan.backend != "auto" or backend != "mps" or plan.sm_percent is not None:
+    if plan.backend != "auto" or backend != "mps" or plan.needs_mps:
         return False
     return all(gpu.compute_mode == "default" for gpu in gpus)
 

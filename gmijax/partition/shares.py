@@ -6,10 +6,10 @@ Which SM caps are safe, and how that was found out: docs/shares.md.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from typing import Final
 
-from gmijax.config import PlanConfig
+from gmijax.config import PlanConfig, Priority
 from gmijax.errors import ConfigError
 from gmijax.partition.layout import Layout
 from gmijax.partition.nvidia import Gpu, MigInstance
@@ -59,6 +59,38 @@ def sm_percents(
     for gmi, cap in enumerate(caps):
         _check_cap(cap, gpus[layout.gpu_of(gmi)], plan.force_sm_percent, reasons)
     return caps
+
+
+def mps_priorities(
+    plan: PlanConfig, layout: Layout, backend: BackendName, trainers: Collection[int]
+) -> tuple[Priority | None, ...]:
+    """The priority of every GMI's kernels, in order of id; None where all are alike.
+
+    Args:
+      plan: what the user wants; `trainers_first` puts all others below those that train.
+      layout: which GMI is where.
+      backend: only `mps` has priorities.
+      trainers: the GMIs that train.
+
+    Raises:
+      ConfigError: a backend that cannot, not one value per GMI, or nobody to put first.
+    """
+    wanted = plan.mps_priority
+    if wanted is None:
+        return (None,) * layout.num_gmis
+    what = f"plan.mps_priority={_shown(wanted)}"
+    if backend != "mps":
+        raise ConfigError(f"{what}: only the mps backend has it, the backend is {backend}")
+    if wanted != "trainers_first":
+        if len(wanted) != layout.num_gmis:
+            raise ConfigError(f"{what}: {len(wanted)} values for {layout.num_gmis} GMIs")
+        return wanted
+    if len(trainers) in (0, layout.num_gmis):
+        raise ConfigError(
+            f"{what}: needs GMIs that train and GMIs that do not (algo=a3c, "
+            "plan.template=tdg_ex), here all are alike"
+        )
+    return tuple("normal" if gmi in trainers else "below_normal" for gmi in layout.gmis)
 
 
 def is_clean(sm_percent: float) -> bool:
@@ -171,5 +203,5 @@ def _one_each(key: str, wanted: float | tuple[float, ...], layout: Layout) -> tu
 
 def _shown(value: object) -> str:
     if isinstance(value, tuple):
-        return f"[{','.join(f'{number:g}' for number in value)}]"
+        return f"[{','.join(_shown(one) for one in value)}]"
     return f"{value:g}" if isinstance(value, float) else str(value)

@@ -21,10 +21,16 @@ from gmijax.cli import compose
 from gmijax.collectives.board import attach_board, create_board
 from gmijax.collectives.channel.interface import SenderStats
 from gmijax.learner import init_learner, make_learner
+from gmijax.normalize import normalize
 from gmijax.partition.child import ChildLink
+from gmijax.policy import log_prob
 from gmijax.rundir import RunPaths
 
 ENV = point_mass()
+OVERRIDES = (
+    *("env=ball_balance", "algo=a3c", "num_envs=4", "algo.unroll_length=4"),
+    *("algo.policy_hidden_layer_sizes=[8]", "algo.value_hidden_layer_sizes=[8]"),
+)
 
 
 class _NoRoom:
@@ -50,10 +56,7 @@ class _NoRoom:
 
 @pytest.fixture
 def config():
-    return compose(
-        "env=ball_balance", "algo=a3c", "num_envs=4", "algo.unroll_length=4",
-        "algo.policy_hidden_layer_sizes=[8]", "algo.value_hidden_layer_sizes=[8]",
-    )  # fmt: skip
+    return compose(*OVERRIDES)
 
 
 def _board(config) -> Board:
@@ -65,14 +68,62 @@ def _board(config) -> Board:
         os.close(fd)
 
 
-def test_an_agent_without_room_still_adds_to_a_checkpoint(tmp_path, config) -> None:
-    """At the end trainers wait for a pending checkpoint, and take nothing meanwhile."""
-    board, sender, link = _board(config), _NoRoom(), ChildLink(1, RunPaths(tmp_path), None, None)
+class _Publisher(_NoRoom):
+    """Takes everything, and publishes `packed` as version 4 when it is sent the first unroll."""
+
+    def __init__(self, board: Board, packed) -> None:
+        super().__init__()
+        self.taken: list = []
+        self._board, self._packed = board, packed
+
+    def send(self, experience, version, timeout_s) -> bool:
+        self.taken.append(({name: x.copy() for name, x in experience.items()}, version))
+        if len(self.taken) == 1:
+            self._board.weights.publish(self._packed, tag=4)
+        if len(self.taken) == 3:
+            self._board.orders.publish(pack_orders(Orders(None, is_ending=True)))
+        return True
+
+
+def _agent(tmp_path, config):
+    """Board with version 3 of the weights and the order to begin, link, weights, learner."""
+    board, link = _board(config), ChildLink(1, RunPaths(tmp_path), None, None)
     link.paths.root.mkdir(parents=True)
     learner = make_learner(ENV.spec, config.algo)
-    state = init_learner(learner, ENV.spec.obs_size, jax.random.key(0))
-    board.weights.publish(np.asarray(pack_weights(acting_weights(learner, state))), tag=3)
+    weights = acting_weights(learner, init_learner(learner, ENV.spec.obs_size, jax.random.key(0)))
+    board.weights.publish(np.asarray(pack_weights(weights)), tag=3)
     board.orders.publish(pack_orders(Orders(None, is_ending=False)))
+    return board, link, weights, learner
+
+
+def test_newer_weights_are_taken_up_within_an_unroll(tmp_path, config) -> None:
+    config = compose(*OVERRIDES, "algo.weights_every=2")
+    board, link, weights, learner = _agent(tmp_path, config)
+    bolder = weights._replace(params=weights.params._replace(log_std=weights.params.log_std + 1.0))
+    sender = _Publisher(board, np.asarray(pack_weights(bolder)))
+    act_until_told(Serving(config, config.algo, ENV, 0, (0,)), board, sender, link)
+    assert [version for _, version in sender.taken] == [3, 3, 4]
+
+    def told(experience, theirs):
+        obs = normalize(theirs.moments, experience["state"])
+        mean = learner.networks.action_mean(theirs.params, obs)
+        return log_prob(mean, theirs.params.log_std, experience["action"])
+
+    first, second, third = (experience for experience, _ in sender.taken)
+    for experience, steps, theirs in (
+        (first, slice(None), weights),
+        (second, slice(0, 2), weights),
+        (second, slice(2, 4), bolder),
+        (third, slice(None), bolder),
+    ):
+        want = told(experience, theirs)[steps]
+        np.testing.assert_allclose(experience["log_prob"][steps], want, rtol=1e-4, atol=1e-4)
+
+
+def test_an_agent_without_room_still_adds_to_a_checkpoint(tmp_path, config) -> None:
+    """At the end trainers wait for a pending checkpoint, and take nothing meanwhile."""
+    board, link, _, _ = _agent(tmp_path, config)
+    sender = _NoRoom()
 
     def added(steps: int) -> bool:
         posted = board.reports[0].read()

@@ -13,7 +13,7 @@ from toy_env import point_mass
 
 from gmijax.a3c.learner import acting_weights, num_weights, pack_weights, unpack_weights
 from gmijax.a3c.programs import FusedUpdate, SplitUpdate, exchange_size
-from gmijax.a3c.rollout import collect
+from gmijax.a3c.rollout import UnrollPrograms, collect
 from gmijax.a3c.staleness import histogram_of, mean_and_p99
 from gmijax.cli import compose
 from gmijax.collectives.solo import SoloReducer
@@ -73,6 +73,29 @@ def test_an_unroll_is_what_the_environments_did(config) -> None:
         cuts += int(got.done[..., 1].sum())
         before = envs.env.obs
     assert cuts > 0
+
+
+def test_pieces_make_the_unroll_that_they_are_parts_of(config) -> None:
+    learner, state, envs = _start(config)
+    weights = acting_weights(learner, state)
+    _, whole, counts = collect(ENV, learner.networks, T, ENV.model, weights, envs)
+    programs = UnrollPrograms(ENV, learner.networks, T // 4, 4, weights, envs)
+    envs, pieces = _copy(envs), []
+    for _ in range(4):
+        envs, piece = programs.piece(weights, envs)
+        pieces.append(piece)
+    joined, packed = programs.join(pieces)
+    for name, mine in joined._asdict().items():
+        np.testing.assert_allclose(mine, getattr(whole, name), rtol=1e-5, atol=1e-6)
+    np.testing.assert_allclose(packed, np.asarray(jax.tree.leaves(counts)), rtol=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("length", "every", "pieces"), [(16, 4, 4), (16, None, 1), (16, 5, 4), (10, 4, 5), (8, 99, 1)]
+)
+def test_pieces_are_equal_and_not_longer_than_asked_for(config, length, every, pieces) -> None:
+    changed = dataclasses.replace(config, unroll_length=length, weights_every=every)
+    assert changed.pieces_per_unroll == pieces
 
 
 def test_unrolls_without_weight_teach_nothing(config) -> None:

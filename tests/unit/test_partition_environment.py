@@ -157,3 +157,9 @@ def test_inputs_are_not_changed():
     gmi_environment(planned("cpu"), 0, inherited, Path("/cache"), backend)
     assert inherited == INHERITED
     assert backend == {"XLA_FLAGS": "--b=2"}
+
+
+def test_a_priority_becomes_the_number_of_the_driver():
+    found = environment(planned("mps", mps_priority=("normal", *["below_normal"] * 3)), 1)
+    assert found["CUDA_MPS_CLIENT_PRIORITY"] == "1"
+    assert "CUDA_MPS_CLIENT_PRIORITY" not in environment(planned("mps"))

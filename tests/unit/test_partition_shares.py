@@ -102,3 +102,38 @@ def test_products_are_checked_where_sms_are_or_may_be_capped(
     changes: dict[str, Any], checked: bool
 ):
     assert planned(**changes).self_check == checked
+
+
+def priorities(plan: Plan) -> list[str | None]:
+    return [share.priority for share in plan.slices]
+
+
+def test_trainers_go_first_where_that_is_wanted():
+    assert priorities(planned(3)) == [None] * 3
+    apart = {"template": "decoupled", "mps_priority": "trainers_first"}
+    first = make_plan(
+        plan_config(gmis_per_gpu=3, **apart), reduce_config(), 64, machine(1, mps_control=MPS),
+        trainers=(0,),
+    )  # fmt: skip
+    assert priorities(first) == ["normal", "below_normal", "below_normal"]
+    assert priorities(planned(mps_priority=("below_normal", "normal"))) == [
+        "below_normal",
+        "normal",
+    ]
+
+
+def test_a_priority_asks_for_mps():
+    assert planned(1, mps_priority=("normal",)).backend == "mps"
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"backend": "share"}, "only the mps backend has it, the backend is share"),
+        ({}, "needs GMIs that train and GMIs that do not"),
+        ({"mps_priority": ("normal",)}, r"plan\.mps_priority=\[normal\]: 1 values for 2 GMIs"),
+    ],
+)
+def test_priorities_that_cannot_be_are_refused(changes: dict[str, Any], message: str):
+    with pytest.raises(ConfigError, match=message):
+        planned(**{"mps_priority": "trainers_first", **changes})
