@@ -5,8 +5,6 @@ from __future__ import annotations
 from types import MappingProxyType
 from typing import NamedTuple
 
-from gmijax.sim.impl import ON_GPU
-
 
 class Case(NamedTuple):
     """One command line of `python -m gmijax.train`.
@@ -197,11 +195,15 @@ SUITES = MappingProxyType(
         ),
         # How fast and how far both learn.
         "async-learns": (
-            Case("sync", (*_ANT, "num_envs=4096", "num_timesteps=100e6", "seed={run}")),
-            _async(
-                *("async, 2 agents x 2048 + 1 trainer", 1, 2048),
-                *("plan.serving_gmis_per_gpu=2", "algo.batch_size=4096", "seed={run}"),
-                steps=100e6,
+            Case("sync", (*_ANT, "num_envs=4096", "num_timesteps=60e6", "seed={run}")),
+            *(
+                _async(
+                    *(f"async, 2 agents x 2048 + 1 trainer, {transport}", 1, 2048),
+                    *("plan.serving_gmis_per_gpu=2", "plan.mps_priority=trainers_first"),
+                    *(f"channel.transport={transport}", "seed={run}"),
+                    steps=60e6,
+                )
+                for transport in ("memory", "device")
             ),
         ),
         # The same 8192 environments on one GPU: together, and in four GMIs.
@@ -241,7 +243,6 @@ SUITES = MappingProxyType(
                 _throughput(task, impl, num_envs)
                 for num_envs in (2048, 8192, 32768)
                 for task in TASKS
-                if impl == "jax" or not ON_GPU[task].why_no_warp
             )
             for impl in ("jax", "warp")
         },

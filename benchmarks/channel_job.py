@@ -30,6 +30,7 @@ DEFAULTS: Options = {
     "pause_chance": 0.0,
     "busy_s": 0.0,  # what a trainer does with a batch
     "goes_on": False,  # without an agent that is gone
+    "fake_device": None,  # folder of the device memory that is none, for transport=device
     "fast": False,  # no numbers, nothing is checked
 }
 

@@ -6,6 +6,7 @@ what it got is whole, and its list of numbers tells what was lost or came twice.
 
 from __future__ import annotations
 
+import importlib
 import json
 import os
 import sys
@@ -16,9 +17,9 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from gmijax.collectives.channel import build
 from gmijax.collectives.channel.build import Places, open_receiver, open_sender
-from gmijax.collectives.channel.ends import Receiver, Sender
-from gmijax.collectives.channel.interface import Array, Batch
+from gmijax.collectives.channel.interface import Array, Batch, ExperienceReceiver
 from gmijax.config.channel import ChannelConfig
 from gmijax.errors import CollectiveTimeout, GmijaxError, PeerLost, PipeClosed
 from gmijax.partition.child import inherited_fd
@@ -49,7 +50,7 @@ def numbered(agent: int, first: int, task: Options) -> dict[str, Array]:
 
 def numbers_of(batch: Batch) -> npt.NDArray[np.int64]:
     """The numbers of the unrolls in a batch; AssertionError if one is torn or mixed up."""
-    got = batch.experience
+    got = {name: np.asarray(values) for name, values in batch.experience.items()}
     number, steps = got["bootstrap"][0], len(got["reward"])
     value = number + np.arange(steps + 1, dtype=np.float32)[:, None]
     whole = {
@@ -65,14 +66,16 @@ def numbers_of(batch: Batch) -> npt.NDArray[np.int64]:
     return number.astype(np.int64)
 
 
-def act(sender: Sender, task: Options) -> Options:
+def act(sender: Any, task: Options) -> Options:
     """Sends the unrolls that no predecessor has sent, with random pauses."""
     rank, pauses = task["rank"], np.random.default_rng([task["rank"], os.getpid()])
     envs, started_s = task["envs"], time.perf_counter()
     first = sender.sent_pieces * envs
     ready = numbered(rank, 0, task)
     for number in range(first, task["count"], envs):
-        experience = ready if task["fast"] else numbered(rank, number, task)
+        experience: Any = ready if task["fast"] else numbered(rank, number, task)
+        if sender.on_device and not task["fake_device"]:
+            experience = importlib.import_module("jax").device_put(experience)
         if not sender.send(experience, number // 1000, task["timeout_s"]):
             trainers = tuple(task["places"]["trainers"])
             raise CollectiveTimeout(rank, trainers, "send", number, task["timeout_s"])
@@ -84,7 +87,7 @@ def act(sender: Sender, task: Options) -> Options:
     return {"first": first, "wall_s": time.perf_counter() - started_s, **sender.stats()._asdict()}
 
 
-def learn(receiver: Receiver, task: Options) -> Options:
+def learn(receiver: ExperienceReceiver, task: Options) -> Options:
     """Receives until all agents have closed; writes the numbers it got, by agent, to a file."""
     got: list[npt.NDArray[np.int64]] = []
     lost: set[int] = set()
@@ -125,6 +128,8 @@ def run(task: Options) -> Options:
         places["addresses"] = {(a, t): where for a, t, where in places["addresses"]}
     for key in ("agents", "trainers", "gpu_of"):
         places[key] = tuple(places[key])
+    if task["fake_device"]:
+        use_fake_device(task["fake_device"])
     where, config = Places(**places), from_dict(ChannelConfig, task["channel"])
     fd = inherited_fd(os.environ, ENV_FD)
     if task["rank"] in where.agents:
@@ -137,6 +142,12 @@ def run(task: Options) -> Options:
         return learn(receiver, task)
     finally:
         receiver.close()
+
+
+def use_fake_device(folder: str) -> None:
+    """Lets experience stay on a device that is none; `folder` has `fake_device_memory`."""
+    sys.path.insert(0, folder)
+    build.DEVICE_MEMORY = importlib.import_module("fake_device_memory").FakeDeviceMemory
 
 
 def main(task: Options) -> None:

@@ -10,6 +10,7 @@ from __future__ import annotations
 import argparse
 import json
 import math
+import re
 import statistics
 import subprocess
 import sys
@@ -128,7 +129,9 @@ def run_all(books: Mapping[str, ResultsFile], repeats: int, runs: Path, gpus: in
     free = FreeGpus(gpus or 1)
 
     def run(book: ResultsFile, repeat: int, case: Case) -> None:
-        folder = runs / f"{book.results['suite']}-{case.name.replace(' ', '-')}-{repeat}"
+        # Letters and digits only: the folder is a value on a command line.
+        name = re.sub(r"[^a-zA-Z0-9]+", "-", case.name)
+        folder = runs / f"{book.results['suite']}-{name}-{repeat}"
         with free.taken(case.gpus if gpus else 1) as taken:
             alone = (f"plan.gpus=[{','.join(map(str, taken))}]",) if gpus else ()
             book.add(case, run_case(case, repeat, (*alone, f"run.dir={folder}"), folder))

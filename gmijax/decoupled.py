@@ -19,6 +19,7 @@ from gmijax.partition.machine import Machine
 from gmijax.partition.placement import place
 from gmijax.partition.plan import Plan
 from gmijax.partition.planner import make_plan
+from gmijax.partition.reduction import why_not_intra
 from gmijax.partition.templates import AGENT, TRAINER, Group, group_of
 
 MODULE: Final = "gmijax.async_worker"
@@ -33,18 +34,17 @@ def is_decoupled(config: TrainConfig) -> bool:
     return isinstance(config.algo, A3cConfig)
 
 
-def plan_decoupled(config: TrainConfig, machine: Machine) -> Plan:
-    """The plan of an asynchronous job; see `make_plan`.
+def plan_decoupled(config: TrainConfig, num_envs: int, machine: Machine) -> Plan:
+    """The plan of an asynchronous job with `num_envs` environments per agent; see `make_plan`.
 
     Raises:
       ConfigError: no serving or no training GMI, too little memory for the channels, or what
         `make_plan` refuses.
       BackendUnavailable: the wanted backend cannot be had on this machine.
     """
-    if config.channel.transport != "memory":
+    if config.channel.transport == "zmq":
         raise ConfigError(
-            f"channel.transport={config.channel.transport}: the GMIs of a job are on one host; "
-            "allowed is memory"
+            "channel.transport=zmq: the GMIs of a job are on one host; allowed are memory, device"
         )
     if config.reduce.selection != "paper":
         raise ConfigError(
@@ -55,13 +55,15 @@ def plan_decoupled(config: TrainConfig, machine: Machine) -> Plan:
     plan = make_plan(
         placed.plan,
         config.reduce,
-        config.envs_per_gmi,
+        num_envs,
         machine,
         template="decoupled",
         trainers=placed.trainers,
     )
     plan = dataclasses.replace(plan, reasons=(placed.reason, *plan.reasons))
     _require_experience_for_all(places_of(plan))
+    if config.channel.transport == "device":
+        _require_device(plan)
     # How large an unroll is shows only when the task is loaded: the GMIs check that.
     require_channels(config.channel, places_of(plan), unroll_bytes=0)
     return plan
@@ -79,6 +81,25 @@ def _require_experience_for_all(places: Places) -> None:
             f"plan.training_gpus: trainers on GPU {idle[0]} of the job would get no experience, "
             "because every agent has a trainer on its own GPU; let GPUs both act and train, or "
             "keep the two apart"
+        )
+
+
+def _require_device(plan: Plan) -> None:
+    """Refuses experience that stays on the GPU where it cannot.
+
+    Raises:
+      ConfigError: says why.
+    """
+    what = "channel.transport=device"
+    if reason := why_not_intra("ipc", plan.backend):
+        raise ConfigError(f"{what}: {reason}; use memory")
+    places = places_of(plan)
+    training = {places.gpu_of[gmi] for gmi in places.trainers}
+    far = [gmi for gmi in places.agents if places.gpu_of[gmi] not in training]
+    if far:
+        raise ConfigError(
+            f"{what}: agent {far[0]} is on GPU {places.gpu_of[far[0]]} of the job, where nobody "
+            "trains; use memory"
         )
 
 

@@ -97,7 +97,7 @@ def train(config: TrainConfig, *, show: bool = False) -> Result:
 
 def _make_plan(config: TrainConfig, machine: Machine) -> Plan:
     if is_decoupled(config):
-        return plan_decoupled(config, machine)
+        return plan_decoupled(config, config.envs_per_gmi, machine)
     return make_plan(config.plan, config.reduce, config.envs_per_gmi, machine)
 
 

@@ -49,6 +49,8 @@ class Launch:
         descriptor, and what makes one; beside the block that reducers use.
       variables: more environment variables of every GMI.
       on_warning: told in a sentence when the job runs otherwise than planned.
+      is_enough: whether the GMIs are to finish now, as after a first signal, and the job has done
+        what it was for; None: it ends by itself.
     """
 
     plan: Plan
@@ -61,6 +63,7 @@ class Launch:
     shared: Mapping[str, Callable[[], int]] = field(default_factory=dict)
     variables: Mapping[str, str] = field(default_factory=dict)
     on_warning: Callable[[str], None] = lambda _: None
+    is_enough: Callable[[tuple[GmiStatus, ...]], bool] | None = None
 
 
 def run_gmis(
@@ -99,7 +102,26 @@ def run_gmis(
         )
         if launch.stops_gracefully:
             held.enter_context(_stopping_on_signals(supervisor.request_stop))
-        supervisor.run(on_tick)
+        supervisor.run(_ticks(launch, supervisor, on_tick))
+
+
+def _ticks(
+    launch: Launch,
+    supervisor: Supervisor,
+    on_tick: Callable[[tuple[GmiStatus, ...]], None] | None,
+) -> Callable[[tuple[GmiStatus, ...]], None]:
+    """`on_tick`, and the order to finish when it is enough."""
+    is_enough = launch.is_enough
+
+    def tick(gmis: tuple[GmiStatus, ...]) -> None:
+        nonlocal is_enough
+        if on_tick is not None:
+            on_tick(gmis)
+        if is_enough is not None and is_enough(gmis):
+            supervisor.ask_to_finish()
+            is_enough = None
+
+    return tick
 
 
 @contextmanager

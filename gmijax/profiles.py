@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any
 
 from gmijax.errors import ConfigError
-from gmijax.partition.search import Measured, NotRunnable, Point
+from gmijax.partition.points import Measured, NotRunnable, Point
 from gmijax.rundir import read_json, write_json
 from gmijax.schema import from_dict, require_positive
 
@@ -26,12 +26,14 @@ _DIGEST_LENGTH = 10
 
 @dataclass(frozen=True, kw_only=True)
 class _Record:
-    """A profile in the file; `not_runnable` and `limit_s` are None, or the four above are."""
+    """A profile in the file; `not_runnable` and `limit_s` are None, or the figures above are."""
 
     env_steps_per_s: float | None = None
     memory_mib: float | None = None
     iteration_s: float | None = None
     reduce_s: float | None = None
+    acting_per_s: float | None = None
+    learning_per_s: float | None = None
     not_runnable: str | None = None
     limit_s: float | None = None
     wall_s: float
@@ -55,6 +57,8 @@ class _Record:
             self.memory_mib or 0.0,
             self.iteration_s or 0.0,
             self.reduce_s or 0.0,
+            self.acting_per_s or 0.0,
+            self.learning_per_s or 0.0,
         )
 
 
@@ -142,7 +146,8 @@ def _moved_aside(path: Path) -> Path:
 
 
 def _name(mode: str, point: Point) -> str:
-    return f"{mode} {point.gmis_per_gpu}x{point.num_envs} {point.impl}"
+    gmis = point.gmis.replace(" ", "")
+    return f"{mode} {gmis}x{point.num_envs} {point.impl}"
 
 
 def _slug(text: object) -> str:

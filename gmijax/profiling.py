@@ -18,12 +18,14 @@ from typing import Any, Literal
 from gmijax.config import EnvConfig, PlanConfig, PpoConfig, ReduceConfig, TemplateName, TrainConfig
 from gmijax.errors import ConfigError, GmijaxError, JobInterrupted
 from gmijax.launcher import Launch, run_gmis
+from gmijax.partition.balance import Split
 from gmijax.partition.gmi_process import GmiStatus
 from gmijax.partition.layout import Layout
 from gmijax.partition.machine import Machine
 from gmijax.partition.plan import Plan
 from gmijax.partition.planner import make_plan
-from gmijax.partition.search import Measured, NotRunnable, Point
+from gmijax.partition.points import Measured, NotRunnable, Point
+from gmijax.partition.search import estimate, top_of_one
 from gmijax.partition.supervisor import Patience
 from gmijax.results import read_metrics
 from gmijax.rundir import RunPaths, read_json, write_json
@@ -31,6 +33,7 @@ from gmijax.schema import to_dict
 from gmijax.version import __version__, versions_of
 
 Mode = Literal["corun", "isolated"]
+IsEnough = Callable[[Sequence[GmiStatus]], bool]
 
 _GRACE_S = 3.0
 _VERSIONS = ("jax", "jaxlib", "mujoco-mjx", "warp-lang")
@@ -56,6 +59,14 @@ class Workload:
         is what the GMIs read from the run folder. Raises ConfigError if there can be none.
       read: what one GMI did, from the run folder of that job.
       key: what else decides how fast it is, plain data.
+      trainers: numbers of training GMIs per GPU to choose from; (0,): every GMI does everything.
+      plan_of: the plan of a profile where the template's own GMIs are not all that there is.
+      compile_once: see `gmijax.launcher.Launch`.
+      shared: memory of the GMIs of a profile, see `Launch`.
+      is_enough: what says when a profile can be read; None: it ends by itself.
+      estimate: environment steps a second of the whole job; None: of the same on every GPU.
+      top: what Sat goes by.
+      split: GPUs that act and that train where none does both.
     """
 
     env: EnvConfig
@@ -68,6 +79,20 @@ class Workload:
     config_at: Callable[[Point, int], Any]
     read: Callable[[Plan, RunPaths], Measured]
     key: Mapping[str, Any]
+    trainers: tuple[int, ...] = (0,)
+    plan_of: Callable[[Point, Machine], Plan] | None = None
+    compile_once: bool = True
+    shared: Callable[[Plan], Mapping[str, Callable[[], int]]] = lambda _: {}
+    is_enough: Callable[[Plan, RunPaths], IsEnough] | None = None
+    estimate: Callable[[Point, Measured], float] | None = None
+    top: Callable[[Measured], float] = top_of_one
+    split: Callable[[Measured], Split | None] = lambda _: None
+
+    def projected(self, point: Point, measured: Measured) -> float:
+        """Environment steps a second of the whole job."""
+        if self.estimate is not None:
+            return self.estimate(point, measured)
+        return estimate(point.gmis_per_gpu, self.num_gpus, measured)
 
     @property
     def num_gpus(self) -> int:
@@ -85,7 +110,7 @@ def training(config: TrainConfig) -> Workload:
     """
     if not isinstance(config.algo, PpoConfig) or config.plan.template not in ("auto", "tcg_ex"):
         raise ConfigError(
-            "num_envs=auto, plan.gmis_per_gpu=auto: can be found for algo=ppo with "
+            "num_envs=auto, plan.gmis_per_gpu=auto: with algo=ppo can be found for "
             "plan.template=tcg_ex only; give numbers"
         )
 
@@ -159,8 +184,11 @@ def profile(
         machine=machine,
         run=run,
         module=workload.module,
+        compile_once=workload.compile_once,
+        shared=workload.shared(plan),
         patience=patience,
         on_warning=on_warning,
+        is_enough=workload.is_enough and workload.is_enough(plan, run),
     )
     try:
         run_gmis(launch, watch)
@@ -174,7 +202,7 @@ def profile(
 
 
 def plan_at(workload: Workload, point: Point, mode: Mode, machine: Machine) -> Plan:
-    """The plan of a profile, on the first GPU of the job.
+    """The plan of a profile, on the first GPU of the job, or as the workload has it.
 
     `isolated` is the first GMI of the plan that `corun` has, with its memory and cores; where the
     backend can cap SMs, with an even part of them.
@@ -182,6 +210,8 @@ def plan_at(workload: Workload, point: Point, mode: Mode, machine: Machine) -> P
     Raises:
       ConfigError: a point that the machine or the backend does not allow.
     """
+    if workload.plan_of is not None:
+        return workload.plan_of(point, machine)
     gpus = workload.plan.gpus
     one_gpu = dataclasses.replace(
         workload.plan,
@@ -267,12 +297,12 @@ def _read_training(plan: Plan, run: RunPaths) -> Measured:
     lines = read_metrics(run.metrics)[1:]
     return Measured(
         env_steps_per_s=all_steps_per_s / plan.layout.num_gmis,
-        memory_mib=max(_peak_memory_mib(result["device"]) for result in results),
+        memory_mib=max(peak_memory_mib(result["device"]) for result in results),
         iteration_s=steps / all_steps_per_s,
         reduce_s=statistics.median(line.get("time/reduce_s", 0.0) for line in lines),
     )
 
 
-def _peak_memory_mib(device: Mapping[str, Any]) -> float:
-    """Of the device, as its allocator counts; where it does not (the CPU), of the process."""
+def peak_memory_mib(device: Mapping[str, Any]) -> float:
+    """Of a GMI's device, as its allocator counts; where it does not (the CPU), of the process."""
     return float(device["peak_memory_mib"] or device["peak_host_memory_mib"])

@@ -14,19 +14,14 @@ from typing import Any, NamedTuple
 
 from rich.console import Console
 
+from gmijax.async_search import decoupled_training, settled
 from gmijax.config import AUTO, SearchConfig, TrainConfig
+from gmijax.decoupled import is_decoupled
 from gmijax.errors import ConfigError, GmijaxError, JobInterrupted
+from gmijax.partition.balance import Split
 from gmijax.partition.machine import Machine, detect_machine
-from gmijax.partition.search import (
-    Grid,
-    Measured,
-    NotRunnable,
-    Outcome,
-    OutOfBudget,
-    Point,
-    Rules,
-    Visited,
-)
+from gmijax.partition.points import Measured, NotRunnable, Point
+from gmijax.partition.search import Grid, Outcome, OutOfBudget, Rules, Visited
 from gmijax.partition.search import search as search_grid
 from gmijax.profiles import ProfileStore, default_folder
 from gmijax.profiling import (
@@ -59,6 +54,9 @@ class SearchResult(NamedTuple):
       impl: physics implementation.
       reason: why, in words.
       report: the content of `search.json`.
+      trainers: training GMIs on every GPU that trains, and then `gmis_per_gpu` are those that act;
+        0 where every GMI does everything.
+      split: how many GPUs act and train, where none does both.
     """
 
     run_dir: Path | None
@@ -67,6 +65,8 @@ class SearchResult(NamedTuple):
     impl: str
     reason: str
     report: dict[str, Any]
+    trainers: int = 0
+    split: Split | None = None
 
 
 def search(config: TrainConfig, *, show: bool = False) -> SearchResult:
@@ -94,12 +94,21 @@ def search(config: TrainConfig, *, show: bool = False) -> SearchResult:
     require_task(str(config.env.name), config.env.suite)
     config = dataclasses.replace(config, env=source.pinned(config.env))
     console = Console(stderr=False, quiet=not show, soft_wrap=True, highlight=False)
-    started = _Search(training(config), config.search, detect_machine(), console)
+    started = _Search(workload_of(config), config.search, detect_machine(), console)
     # After everything else was checked: nothing is left of a search that was refused.
     started.run = create_run(config.run.dir, config.run.name, f"{config.env.slug}-search")
     write_json(started.run.config, to_dict(config))
     console.print(f"run folder: {started.run.root}", markup=False)
     return started.result()
+
+
+def workload_of(config: TrainConfig) -> Workload:
+    """A training job as a workload.
+
+    Raises:
+      ConfigError: one that cannot be profiled.
+    """
+    return decoupled_training(config) if is_decoupled(config) else training(config)
 
 
 def is_auto(config: TrainConfig) -> bool:
@@ -117,11 +126,13 @@ def decided(
     """
     if not is_auto(config):
         return config, ()
-    result = resolve_auto(training(config), config.search, machine, console)
+    result = resolve_auto(workload_of(config), config.search, machine, console)
     plan = dataclasses.replace(config.plan, gmis_per_gpu=result.gmis_per_gpu)
+    if is_decoupled(config):
+        plan = settled(config.plan, result.gmis_per_gpu, result.trainers, result.split)
     physics = dataclasses.replace(config.physics, impl=result.impl)
-    settled = dataclasses.replace(config, num_envs=result.num_envs, plan=plan, physics=physics)
-    return settled, (result.reason,)
+    config = dataclasses.replace(config, num_envs=result.num_envs, plan=plan, physics=physics)
+    return config, (result.reason,)
 
 
 def resolve_auto(
@@ -160,7 +171,12 @@ class _Search:
         self._console = console
         self._grid = _grid(workload, settings, machine)
         # Refuses what no point can change: a backend that is not there, too few GPUs.
-        fewest = Point(min(self._grid.gmis_per_gpu), min(self._grid.num_envs), self._grid.impls[0])
+        fewest = Point(
+            min(self._grid.gmis_per_gpu),
+            min(self._grid.num_envs),
+            self._grid.impls[0],
+            min(self._grid.trainers),
+        )
         plan_at(workload, fewest, "corun", machine)
         self._device = device_of(workload, machine)
         folder = Path(settings.store) if settings.store else default_folder()
@@ -177,8 +193,10 @@ class _Search:
         with self._display:
             outcome = self._outcome()
         best = self._require_best(outcome)
-        reason = verdict(outcome, self._grid, self._workload.num_gpus)
-        report = plain_data(outcome, self._isolated, reason) | {
+        assert isinstance(best.result, Measured)
+        split = self._workload.split(best.result)
+        reason = verdict(outcome, self._grid, self._workload.num_gpus, split)
+        report = plain_data(outcome, self._isolated, reason, split) | {
             "env": self._workload.env.label,
             "device": self._device,
             "num_gpus": self._workload.num_gpus,
@@ -197,22 +215,20 @@ class _Search:
             self._note(f"report: {paths.report}")
         self._note(reason)
         run_dir = None if self.run is None else self.run.root
-        return SearchResult(run_dir, *best.point, reason, report)
+        gmis_per_gpu, num_envs, impl, trainers = best.point
+        return SearchResult(run_dir, gmis_per_gpu, num_envs, impl, reason, report, trainers, split)
 
     def _outcome(self) -> Outcome:
         settings = self._settings
         mode: Mode = "isolated" if settings.mode == "isolated" else "corun"
         rules = Rules(
-            num_gpus=self._workload.num_gpus,
+            estimate=self._workload.projected,
             alpha=settings.alpha,
             tolerance=settings.tolerance,
             coarse_first=settings.order == "coarse_first",
+            top=self._workload.top,
         )
-
-        def profiled(gmis_per_gpu: int, num_envs: int, impl: str) -> Measured | NotRunnable:
-            return self._profile(Point(gmis_per_gpu, num_envs, impl), mode)
-
-        outcome = search_grid(self._grid, profiled, rules)
+        outcome = search_grid(self._grid, lambda point: self._profile(point, mode), rules)
         if settings.mode == "both":
             with suppress(OutOfBudget):
                 for one in sorted(outcome.visited, key=lambda one: -one.projected):
@@ -231,7 +247,8 @@ class _Search:
         limit_s = min(left_s, self._settings.profile_timeout_s)
         if self.run is None:
             self.run = create_run(None, None, f"{self._workload.env.slug}-search")
-        folder = f"{mode}-{point.gmis_per_gpu}x{point.num_envs}-{point.impl}"
+        gmis = point.gmis.replace(" ", "")
+        folder = f"{mode}-{gmis}x{point.num_envs}-{point.impl}"
         started_s = time.monotonic()
         try:
             result = profile(
@@ -288,6 +305,6 @@ def _grid(workload: Workload, settings: SearchConfig, machine: Machine) -> Grid:
         gmis = (plan.gmis_per_gpu,)
     num_envs = settings.num_envs if workload.num_envs == "auto" else (workload.num_envs,)
     if workload.impl == "auto" and settings.impls:
-        return Grid(gmis, num_envs, settings.impls)
+        return Grid(gmis, num_envs, settings.impls, workload.trainers)
     impl, _ = choose_impl(workload.impl, platform_of(workload, machine), workload.env.label)
-    return Grid(gmis, num_envs, (impl,))
+    return Grid(gmis, num_envs, (impl,), workload.trainers)

@@ -11,7 +11,7 @@ from gmijax.config import AUTO, ReduceConfig, ServeConfig
 from gmijax.errors import ConfigError
 from gmijax.partition.machine import Machine
 from gmijax.partition.plan import Plan
-from gmijax.partition.search import Measured, Point
+from gmijax.partition.points import Measured, Point
 from gmijax.profiling import Workload
 from gmijax.rundir import RunPaths, read_json
 from gmijax.searching import resolve_auto

@@ -34,21 +34,20 @@ class FakeDeviceMemory:
         os.close(opened)
 
     def write(self, offset: int, values: jax.Array) -> None:
-        place = self._floats(offset, values.size)
-        place[:] = np.asarray(values)
+        self._region(offset, values.shape, values.dtype)[...] = np.asarray(values)
 
-    def view(self, offset: int, shape: tuple[int, ...]) -> jax.Array:
-        floats = self._floats(offset, int(np.prod(shape))).reshape(shape)
-        view = jax.dlpack.from_dlpack(floats, copy=False)
-        assert view.unsafe_buffer_pointer() == floats.ctypes.data
+    def view(self, offset: int, shape: tuple[int, ...], dtype=np.float32) -> jax.Array:
+        region = self._region(offset, shape, np.dtype(dtype))
+        view = jax.dlpack.from_dlpack(region, copy=False)
+        assert view.unsafe_buffer_pointer() == region.ctypes.data
         return view
 
     def close(self) -> None:
         self._mapping = None
 
-    def _floats(self, offset: int, count: int) -> np.ndarray:
+    def _region(self, offset: int, shape: tuple[int, ...], dtype: np.dtype) -> np.ndarray:
         assert self._mapping is not None
-        return np.frombuffer(self._mapping, np.float32, count, offset)
+        return np.frombuffer(self._mapping, dtype, int(np.prod(shape)), offset).reshape(shape)
 
 
 class BrokenDeviceMemory(FakeDeviceMemory):

@@ -25,6 +25,7 @@ from gmijax.a3c.rollout import UnrollPrograms, UnrollStats, stats_example
 from gmijax.checkpoint import has_envs, restore_envs, save_envs
 from gmijax.collectives.channel.interface import ExperienceSender
 from gmijax.config import A3cConfig, TrainConfig
+from gmijax.devices import describe_device
 from gmijax.errors import CollectiveTimeout, PipeClosed
 from gmijax.learner import LearnerState, init_learner, make_learner
 from gmijax.partition.child import ChildLink
@@ -94,12 +95,15 @@ class _Agent:
         self._link = link
         self._learner = make_learner(self._env.spec, serving.algo)
         example = ravel_pytree(stats_example(self._env.spec, self._env.overflows))[0]
-        self._report = Report(None, 0.0, 0.0, 0.0, 0.0, 0.0, np.zeros(example.size, np.float64))
+        self._report = Report(
+            None, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, np.zeros(example.size, np.float64)
+        )
         self._orders_seen = 0
         self._orders = Orders(None, is_ending=False)
         self._weights_seen = 0
         self._version = 0
         self._unrolls = 0
+        self._waited_s = 0.0
 
     def run(self) -> dict[str, Any]:
         """See `act_until_told`."""
@@ -119,8 +123,10 @@ class _Agent:
             "unrolls": self._unrolls,
             "wall_s": time.monotonic() - started,
             "send_s": self._report.send_s,
+            "wait_s": self._waited_s,
             "dropped": int(self._report.dropped),
             "compile_s": compile_s,
+            "device": describe_device(),
         }
 
     def _first_weights(self) -> ActingWeights:
@@ -149,7 +155,8 @@ class _Agent:
         num_pieces = self._algo.pieces_per_unroll
         num_steps = self._algo.unroll_length // num_pieces
         return UnrollPrograms(
-            self._env, self._learner.networks, num_steps, num_pieces, weights, env_state
+            *(self._env, self._learner.networks, num_steps, num_pieces, weights, env_state),
+            stays=self._sender.on_device,
         )
 
     def _wait_for_start(self) -> None:
@@ -192,7 +199,9 @@ class _Agent:
         return unpack(jnp.asarray(posted.values.view(np.float32)))
 
     def _send(self, unroll: _Sent, env_state: BatchState) -> None:
-        arrays = {name: np.asarray(x) for name, x in unroll.experience._asdict().items()}
+        arrays: dict[str, Any] = unroll.experience._asdict()
+        if not self._sender.on_device:
+            arrays = {name: np.asarray(values) for name, values in arrays.items()}
         stats = np.asarray(unroll.stats, np.float64)
         started = time.monotonic()
         if not self._hand_over(arrays, unroll.version, env_state, started):
@@ -206,6 +215,7 @@ class _Agent:
             bytes_sent=float(counts.num_bytes),
             dropped=float(counts.dropped),
             send_s=self._report.send_s + time.monotonic() - started,
+            wait_s=self._waited_s,
             occupancy=counts.occupancy,
             stats=self._report.stats + stats,
         )
@@ -222,7 +232,7 @@ class _Agent:
         """Sends an unroll; False if the job ends and nobody wants it any more."""
         limit_s = self._config.reduce.timeout_s
         try:
-            while self._is_ahead(arrays) or not self._sender.send(arrays, version, _SLICE_S):
+            while self._is_ahead(arrays, env_state) or not self._offer(arrays, version, env_state):
                 # Trainers that wait for a checkpoint make no room until it is complete.
                 if self._obey(env_state):
                     return False
@@ -235,7 +245,17 @@ class _Agent:
             return False
         return True
 
-    def _is_ahead(self, arrays: dict[str, npt.NDArray[Any]]) -> bool:
+    def _offer(
+        self, arrays: dict[str, npt.NDArray[Any]], version: int, env_state: BatchState
+    ) -> bool:
+        """Whether the channels took an unroll within a moment."""
+        is_idle, before_s = _is_idle(env_state), self._sender.stats().waited_s
+        is_sent = self._sender.send(arrays, version, _SLICE_S)
+        if is_idle:
+            self._waited_s += self._sender.stats().waited_s - before_s
+        return is_sent
+
+    def _is_ahead(self, arrays: dict[str, npt.NDArray[Any]], env_state: BatchState) -> bool:
         """Waits a moment while `max_ahead` unrolls wait for every trainer; whether they still do.
 
         More of them in the channel would only make experience older.
@@ -247,9 +267,12 @@ class _Agent:
         most = (self._algo.max_ahead - 0.5) * size / channel.capacity_bytes
         deadline_s = time.monotonic() + _SLICE_S
         while self._sender.stats().least_occupancy > most:
-            if time.monotonic() > deadline_s:
+            is_idle, now_s = _is_idle(env_state), time.monotonic()
+            if now_s > deadline_s:
                 return True
             time.sleep(_POLL_S)
+            if is_idle:
+                self._waited_s += time.monotonic() - now_s
         return False
 
     def _obey(self, env_state: BatchState) -> bool:
@@ -277,3 +300,8 @@ class _Agent:
 
     def _late(self, what: str, limit_s: float) -> CollectiveTimeout:
         return CollectiveTimeout(self._link.gmi, self._trainers, what, self._unrolls, limit_s)
+
+
+def _is_idle(env_state: BatchState) -> bool:
+    """Whether the device has computed all that it was given: then a wait costs time."""
+    return env_state.return_sum.is_ready()  # pyright: ignore[reportAttributeAccessIssue]

@@ -62,6 +62,7 @@ class Report(NamedTuple):
       bytes_sent: of experience.
       dropped: pieces of experience that were dropped because there was no room.
       send_s: seconds spent on sending, with waits for room.
+      wait_s: those of them in which it waited for room and had nothing to compute.
       occupancy: fraction of the room for experience that was full, after the last send.
       stats: [M] sums over all its unrolls, see `gmijax.a3c.rollout.UnrollStats`.
     """
@@ -71,6 +72,7 @@ class Report(NamedTuple):
     bytes_sent: float
     dropped: float
     send_s: float
+    wait_s: float
     occupancy: float
     stats: npt.NDArray[np.float64]
 

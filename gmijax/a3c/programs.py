@@ -173,6 +173,7 @@ class SplitUpdate:
         self, state: LearnerState, batch: Unrolls, weight: Array
     ) -> tuple[LearnerState, Updated]:
         """See `Update`."""
+        batch = jax.device_put(batch)  # Once, and not with every program.
         order, context, packed = self._begin(state, batch, weight, self._rank)
         gathered = np.array(self._reducer.all_gather(np.asarray(packed)))
         losses: list[npt.NDArray[np.float32]] = []

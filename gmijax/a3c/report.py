@@ -57,6 +57,7 @@ class _Sums(NamedTuple):
     bytes_sent: float
     dropped: float
     send_s: float
+    wait_s: float
     stats: Any
 
 
@@ -79,7 +80,7 @@ class Reporter:
         self._env_name = env_name
         self._log = log
         zeros, self._unpack = ravel_pytree(stats_example(env.spec, env.overflows))
-        self._before = _Sums(0.0, 0.0, 0.0, 0.0, np.zeros(zeros.size))
+        self._before = _Sums(0.0, 0.0, 0.0, 0.0, 0.0, np.zeros(zeros.size))
         self._window = EpisodeWindow()
         self._env_steps = env_steps
         self._last = time.monotonic()
@@ -186,6 +187,7 @@ class Reporter:
             "channel/bytes_per_s": self.bytes_per_s[-1],
             "channel/dropped": sums.dropped - self._before.dropped,
             "time/send_s": sums.send_s - self._before.send_s,
+            "time/wait_s": sums.wait_s - self._before.wait_s,
         }
 
     def _check_finite(self, stats: Any, steps: float, env_steps: int) -> None:
@@ -208,5 +210,6 @@ def _total(reports: tuple[Report, ...], before: _Sums) -> _Sums:
         bytes_sent=sum(r.bytes_sent for r in reports),
         dropped=sum(r.dropped for r in reports),
         send_s=sum(r.send_s for r in reports),
+        wait_s=sum(r.wait_s for r in reports),
         stats=np.sum([r.stats for r in reports], axis=0),
     )

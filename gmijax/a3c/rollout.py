@@ -94,6 +94,7 @@ class UnrollPrograms:
       num_pieces: of an unroll.
       weights: an example.
       env_state: likewise.
+      stays: whether unrolls stay on the device; else they go where the host can read them.
     """
 
     def __init__(
@@ -104,13 +105,16 @@ class UnrollPrograms:
         num_pieces: int,
         weights: ActingWeights,
         env_state: BatchState,
+        *,
+        stays: bool = False,
     ) -> None:
         self._model = env.model
         piece = jax.jit(partial(collect, env, networks, num_steps), donate_argnums=(2,))
         args = (env.model, weights, env_state)
         made = jax.eval_shape(piece, *args)[1:]
         where = host_sharding()
-        joining = jax.jit(join, out_shardings=(where, where) if where else None)
+        unroll: Any = None if stays else where
+        joining = jax.jit(join, out_shardings=(unroll, where) if where else None)
         self._piece: Any = piece.lower(*args).compile()
         self._join: Any = joining.lower([made] * num_pieces).compile()
 
@@ -122,7 +126,7 @@ class UnrollPrograms:
         return env_state, (kept, counts)
 
     def join(self, pieces: Sequence[tuple[Unrolls, UnrollStats]]) -> tuple[Unrolls, Array]:
-        """See the function `join`; what comes of it is where the host can read it."""
+        """See the function `join`."""
         return self._join(list(pieces))
 
 

@@ -127,7 +127,13 @@ class _Trainer:
         self._link.beat("compiling", 0)
         started = time.monotonic()
         state = self._first_state()
+        if self._lead is None:
+            # The leader compiles first, the others take its programs from the cache: those that
+            # each of them would tune could differ in the last bit.
+            self._reducer.all_gather(np.zeros(1, np.float32))
         self._update.compile(state, *self._example())
+        if self._lead is not None:
+            self._reducer.all_gather(np.zeros(1, np.float32))
         pack = jax.jit(lambda state: pack_weights(acting_weights(self._learner, state)))
         first = np.asarray(pack(state))
         compile_s = time.monotonic() - started

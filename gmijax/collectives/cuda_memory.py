@@ -9,6 +9,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+import numpy.typing as npt
 
 # By name, because it has no type information, and is not installed everywhere.
 runtime: Any = importlib.import_module("cuda.bindings.runtime")
@@ -77,10 +78,12 @@ class CudaMemory:
         )
         _checked(runtime.cudaStreamSynchronize(self._stream), "copy into shared GPU memory")
 
-    def view(self, offset: int, shape: tuple[int, ...]) -> jax.Array:
+    def view(
+        self, offset: int, shape: tuple[int, ...], dtype: npt.DTypeLike = np.float32
+    ) -> jax.Array:
         """See `DeviceMemory`."""
         pointer = self._pointer + offset
-        view = jnp.asarray(_Floats(pointer, shape))
+        view = jnp.asarray(_Region(pointer, shape, np.dtype(dtype)))
         if view.unsafe_buffer_pointer() != pointer:
             raise CudaError("jax copies shared GPU memory where it should read it in place")
         return view
@@ -97,15 +100,15 @@ class CudaMemory:
         self._pointer = 0
 
 
-class _Floats:
+class _Region:
     """Memory as the protocol describes it that jax, CuPy and Numba read arrays by."""
 
-    def __init__(self, pointer: int, shape: tuple[int, ...]) -> None:
+    def __init__(self, pointer: int, shape: tuple[int, ...], dtype: np.dtype) -> None:
         self.__cuda_array_interface__ = {
             "version": 3,
             "data": (pointer, False),
             "shape": shape,
-            "typestr": np.dtype(np.float32).str,
+            "typestr": dtype.str,
             "strides": None,
             # No stream to wait for: the ranks order what they do by turns.
             "stream": None,

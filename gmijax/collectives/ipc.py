@@ -48,8 +48,10 @@ class DeviceMemory(Protocol):
         """Copies `values` to `offset` bytes; on return they are there for all processes."""
         ...
 
-    def view(self, offset: int, shape: tuple[int, ...]) -> jax.Array:
-        """The float32 at `offset` bytes in place: a program reads what is there when it runs."""
+    def view(
+        self, offset: int, shape: tuple[int, ...], dtype: npt.DTypeLike = np.float32
+    ) -> jax.Array:
+        """The array at `offset` bytes in place: a program reads what is there when it runs."""
         ...
 
     def close(self) -> None:

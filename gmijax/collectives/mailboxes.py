@@ -11,7 +11,7 @@ from __future__ import annotations
 import struct
 import threading
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, Final, TypeAlias
 
 import numpy as np
@@ -35,9 +35,18 @@ _WORD = struct.Struct("=Q")
 _HEAD = struct.Struct("=QQ")
 
 
-def frames_of(tree: Any, tag: int, frame_bytes: int) -> list[Frame]:
-    """The message that carries `tree`, as frames of at most `frame_bytes`; views of its arrays."""
-    skeleton, arrays = flatten(tree)
+def frames_of(
+    tree: Any, tag: int, frame_bytes: int, stow: Callable[[Any], Any] = lambda _: None
+) -> list[Frame]:
+    """The message that carries `tree`, as frames of at most `frame_bytes`; views of its arrays.
+
+    Args:
+      tree: nested data.
+      tag: `DATA` or `COLLECTIVE`.
+      frame_bytes: see above.
+      stow: what stays where it is, see `gmijax.collectives.trees.flatten`.
+    """
+    skeleton, arrays = flatten(tree, stow=stow)
     parts = [np.frombuffer(skeleton, np.uint8), *map(as_bytes, arrays)]
     lengths = [part.size for part in parts]
     head = struct.pack(f"=QQ{len(parts)}Q", tag, len(parts), *lengths)
@@ -45,9 +54,14 @@ def frames_of(tree: Any, tag: int, frame_bytes: int) -> list[Frame]:
 
 
 class Outbox:
-    """What is on its way to one rank."""
+    """What is on its way to one rank.
+
+    Attributes:
+      frames: posted so far.
+    """
 
     def __init__(self, writer: PipeWriter, rank: int) -> None:
+        self.frames = 0
         self._writer = writer
         self._rank = rank
         self._frames: deque[Frame] = deque()
@@ -61,6 +75,7 @@ class Outbox:
         """Puts the frames into the pipe, or copies of them behind those that wait."""
         left = deque(frames)
         self._posts += 1
+        self.frames += len(frames)
         with self._changed:
             self._raise_error()
             # A frame that the thread is busy with is still among those that wait.
@@ -127,9 +142,13 @@ class Inbox:
     Attributes:
       ready: complete messages by tag, in order of arrival.
       received: how many there were.
+
+    Args:
+      fetch: for what stayed where it was, see `gmijax.collectives.trees.unflatten`.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, fetch: Callable[[Any], Any] | None = None) -> None:
+        self._fetch = fetch
         self.ready: dict[int, deque[Any]] = {DATA: deque(), COLLECTIVE: deque()}
         self.received = 0
         self._start()
@@ -171,7 +190,7 @@ class Inbox:
             skeleton, *buffers = self._full[2:]
             self._start()
             self.received += 1
-            self.ready[tag].append(unflatten(skeleton.data, buffers))
+            self.ready[tag].append(unflatten(skeleton.data, buffers, self._fetch))
 
 
 def _cut(parts: Sequence[Bytes], frame_bytes: int) -> list[Frame]:

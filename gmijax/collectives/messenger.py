@@ -8,7 +8,8 @@ other, however large the messages. Receiving waits, with a timeout.
 from __future__ import annotations
 
 import time
-from typing import Any, Final
+from collections.abc import Callable
+from typing import Any, Final, Protocol
 
 import numpy as np
 
@@ -21,6 +22,22 @@ MIN_CAPACITY_BYTES: Final = 1 << 18
 """Least capacity of the pipes, so that a frame fits."""
 
 
+class Post(Protocol):
+    """What keeps arrays where sender and receiver both reach them; see `DevicePost`."""
+
+    def stow(self, array: Any, dst: int, released_frames: int) -> Any:
+        """What travels to rank `dst` in an array's place, or None."""
+        ...
+
+    def sent(self, dst: int, frames: int) -> None:
+        """What was stowed for `dst` is in use until it has released so many frames."""
+        ...
+
+    def fetch(self, stowed: Any) -> Any:
+        """The array again."""
+        ...
+
+
 class Messenger:
     """One rank's messages to all others, and theirs to it.
 
@@ -30,13 +47,14 @@ class Messenger:
     Args:
       block: this process's view of the pipes, of at least `MIN_CAPACITY_BYTES` each.
       timeout_s: longest wait for a message, unless `recv` says else.
+      device: what keeps arrays on the GPU that ranks share; None: they go through the host.
 
     Attributes:
       rank: this rank.
       world_size: K, number of ranks.
     """
 
-    def __init__(self, block: PipeBlock, timeout_s: float) -> None:
+    def __init__(self, block: PipeBlock, timeout_s: float, device: Post | None = None) -> None:
         if block.capacity_bytes < MIN_CAPACITY_BYTES:
             raise ConfigError(
                 f"capacity_bytes={block.capacity_bytes}: messages need {MIN_CAPACITY_BYTES}"
@@ -45,6 +63,7 @@ class Messenger:
         self.world_size = block.world_size
         self._timeout_s = timeout_s
         self._block = block
+        self._device = device
         # Half of the longest message of the pipe, so that a frame can wait behind another.
         self._frame_bytes = block.capacity_bytes // 4
         self._outboxes: dict[int, Outbox] = {}
@@ -65,14 +84,17 @@ class Messenger:
           CollectiveTimeout: `MAX_WAITING_BYTES` wait already, for the whole of `timeout_s`.
         """
         self._check(dst, "dst")
-        frames = frames_of(tree, tag, self._frame_bytes)
         if dst == self.rank:
-            for frame in frames:
+            for frame in frames_of(tree, tag, self._frame_bytes):
                 self._inbox(dst).feed(frame)
             return
         if dst not in self._outboxes:
             self._outboxes[dst] = Outbox(PipeWriter(self._block, dst), self.rank)
-        self._outboxes[dst].post(frames, self._timeout_s)
+        outbox = self._outboxes[dst]
+        frames = frames_of(tree, tag, self._frame_bytes, self._stow(dst))
+        if self._device is not None:
+            self._device.sent(dst, outbox.frames + len(frames))
+        outbox.post(frames, self._timeout_s)
 
     def recv(self, src: int, *, tag: int = DATA, timeout_s: float | None = None) -> Any:
         """Returns the next message with this tag from rank `src`; its arrays are the caller's.
@@ -100,6 +122,7 @@ class Messenger:
             except PeerLost:
                 raise PeerLost(self.rank, src, "recv", inbox.received) from None
             inbox.feed(message.parts)
+            # What stayed on the GPU is copied by now: its place is free with the frame.
             reader.release()
         return inbox.ready[tag].popleft()
 
@@ -120,6 +143,13 @@ class Messenger:
         if late:
             raise CollectiveTimeout(self.rank, tuple(late), "flush", 0, allowed_s)
 
+    def _stow(self, dst: int) -> Callable[[Any], Any]:
+        device = self._device
+        if device is None:
+            return lambda _: None
+        released = self._block.read(self.rank, dst).messages
+        return lambda value: device.stow(value, dst, released)
+
     def _check(self, rank: int, what: str) -> None:
         if not (isinstance(rank, int | np.integer) and 0 <= rank < self.world_size):
             raise ConfigError(f"{what}={rank!r}: allowed are GMIs 0 to {self.world_size - 1}")
@@ -130,4 +160,5 @@ class Messenger:
         return self._readers[src]
 
     def _inbox(self, src: int) -> Inbox:
-        return self._inboxes.setdefault(src, Inbox())
+        fetch = None if self._device is None else self._device.fetch
+        return self._inboxes.setdefault(src, Inbox(fetch))

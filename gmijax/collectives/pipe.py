@@ -99,6 +99,11 @@ class PipeWriter:
         """Bytes committed and not yet released by the reader."""
         return self.progress.position - self._read_position.item(0)
 
+    @property
+    def outstanding_messages(self) -> int:
+        """Messages committed and not yet released by the reader."""
+        return self.progress.messages - progress_of(self._memory.reader).messages
+
     def put(
         self, parts: Sequence[Part], timeout_s: float, *, tag: int = 0, items: int = 1
     ) -> None:

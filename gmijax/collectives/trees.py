@@ -10,13 +10,15 @@ from __future__ import annotations
 import io
 import pickle
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
 from gmijax.collectives.pipe import Bytes
+
+_STOWED = "stowed"
 
 
 class FlatTree(NamedTuple):
@@ -32,31 +34,40 @@ class FlatTree(NamedTuple):
     arrays: list[npt.NDArray[Any]]
 
 
-def flatten(tree: Any, *, scalars: bool = False) -> FlatTree:
+def flatten(
+    tree: Any, *, scalars: bool = False, stow: Callable[[Any], Any] = lambda _: None
+) -> FlatTree:
     """Takes the arrays out of `tree`.
 
     Args:
       tree: nested data with arrays of numpy or jax; those of jax are fetched to host memory.
       scalars: count Python floats and scalars of numpy among the arrays.
+      stow: asked first for every object; what it gives, if not None, travels in its place, and
+        `unflatten` hands it to its `fetch`.
 
     Raises:
       TypeError, AttributeError, pickle.PicklingError: something cannot be pickled, e.g. a lambda.
     """
     file = io.BytesIO()
-    pickler = _Pickler(file, scalars)
+    pickler = _Pickler(file, scalars, stow)
     pickler.dump(tree)
     return FlatTree(file.getvalue(), pickler.arrays)
 
 
-def unflatten(skeleton: bytes | memoryview, buffers: Sequence[Bytes]) -> Any:
+def unflatten(
+    skeleton: bytes | memoryview,
+    buffers: Sequence[Bytes],
+    fetch: Callable[[Any], Any] | None = None,
+) -> Any:
     """The tree with a skeleton, and these bytes in place of its arrays.
 
     Args:
       skeleton: of `flatten`, in a process of the same job: unpickling runs code.
       buffers: one per array, [number of its bytes] uint8; the arrays of the tree are views of
         them. Arrays of jax come back as arrays of numpy.
+      fetch: gives back what `stow` had been asked for.
     """
-    return _Unpickler(skeleton, buffers).load()
+    return _Unpickler(skeleton, buffers, fetch).load()
 
 
 def as_bytes(array: npt.NDArray[Any]) -> Bytes:
@@ -68,7 +79,7 @@ def as_bytes(array: npt.NDArray[Any]) -> Bytes:
 def on_host(value: Any) -> npt.NDArray[Any] | None:
     """The numbers of an array of numpy or jax in host memory; None for anything else.
 
-    The one place where arrays leave a device on their way to another GMI.
+    The one place where arrays leave a device on their way to another GMI, if they do.
     """
     if type(value) is np.ndarray:  # Masked arrays and the like are more than their numbers.
         return value
@@ -79,12 +90,15 @@ def on_host(value: Any) -> npt.NDArray[Any] | None:
 
 
 class _Pickler(pickle.Pickler):
-    def __init__(self, file: io.BytesIO, scalars: bool) -> None:
+    def __init__(self, file: io.BytesIO, scalars: bool, stow: Callable[[Any], Any]) -> None:
         super().__init__(file, protocol=5)
         self.arrays: list[npt.NDArray[Any]] = []
+        self._stow = stow
         self._scalars = (float, np.generic) if scalars else ()
 
     def persistent_id(self, obj: Any) -> Any:
+        if (stowed := self._stow(obj)) is not None:
+            return _STOWED, stowed
         array, is_scalar = on_host(obj), False
         if array is None and isinstance(obj, self._scalars):
             array, is_scalar = np.asarray(obj), True
@@ -96,11 +110,21 @@ class _Pickler(pickle.Pickler):
 
 
 class _Unpickler(pickle.Unpickler):
-    def __init__(self, skeleton: bytes | memoryview, buffers: Sequence[Bytes]) -> None:
+    def __init__(
+        self,
+        skeleton: bytes | memoryview,
+        buffers: Sequence[Bytes],
+        fetch: Callable[[Any], Any] | None,
+    ) -> None:
         super().__init__(io.BytesIO(skeleton))
         self._buffers = buffers
+        self._fetch = fetch
 
     def persistent_load(self, pid: Any) -> Any:
+        if pid[0] == _STOWED:
+            if self._fetch is None:
+                raise pickle.UnpicklingError("an array that stayed on the sender's GPU")
+            return self._fetch(pid[1])
         index, dtype, shape, is_scalar = pid
         array = self._buffers[index].view(dtype).reshape(shape)
         return array[()] if is_scalar else array

@@ -17,8 +17,9 @@ class ChannelConfig:
         "multi: transfers by channel; uni: every step's tensors alone, the paper's baseline",
         default="multi",
     )
-    transport: Literal["memory", "zmq"] = doc(
-        "memory: shared memory of this host; zmq: TCP by pyzmq (package extra zmq)",
+    transport: Literal["memory", "device", "zmq"] = doc(
+        "memory: shared memory of this host; device: memory of the GPU, where every agent has a "
+        "trainer on its own (CUDA IPC); zmq: TCP by pyzmq (package extra zmq)",
         default="memory",
     )
     capacity_mib: int = doc(
@@ -47,10 +48,21 @@ class ChannelConfig:
                     f"channel.transfer_kib={self.transfer_kib}: must be at most a quarter of "
                     f"channel.capacity_mib={self.capacity_mib}"
                 )
+        if self.transport == "device" and (why := self._why_not_device()):
+            raise ConfigError(f"channel.transport=device: {why}")
         if self.design == "uni" and self.when_full != "block":
             raise ConfigError(
                 "channel.when_full=drop_oldest: channel.design=uni allows only block"
             )
+
+    def _why_not_device(self) -> str | None:
+        if self.design != "multi":
+            return f"not with channel.design={self.design}; allowed is multi"
+        if self.when_full != "block":
+            return f"not with channel.when_full={self.when_full}; allowed is block"
+        if self.float16:
+            return "not with channel.float16: nothing is converted on the way"
+        return None
 
     @property
     def capacity_bytes(self) -> int:

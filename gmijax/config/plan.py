@@ -19,7 +19,8 @@ class PlanConfig:
 
     gpus: int | tuple[int, ...] = doc("number of GPUs, or their indices as nvidia-smi lists them")
     gmis_per_gpu: int | Literal["auto"] = doc(
-        "GMIs on every GPU; auto: what a search finds (docs/search.md)"
+        "GMIs on every GPU (with algo=a3c 1, see serving_gmis_per_gpu and training_gmis_per_gpu); "
+        "auto: what a search finds (docs/search.md)"
     )
     layout: tuple[tuple[int, ...], ...] | None = doc(
         "GMI ids of every GPU, e.g. [[0,1],[2]]; overrides gpus and gmis_per_gpu"

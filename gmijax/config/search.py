@@ -20,6 +20,11 @@ class SearchConfig:
     """The search of `gmijax.search`, and of `num_envs=auto plan.gmis_per_gpu=auto`."""
 
     gmis_per_gpu: tuple[int, ...] = doc("numbers of GMIs per GPU to choose from")
+    training_gmis_per_gpu: tuple[int, ...] = doc(
+        "with algo=a3c: numbers of training GMIs to choose from, on every GPU that trains; "
+        "gmis_per_gpu are those that act",
+        default=(1,),
+    )
     num_envs: tuple[int, ...] = doc("environments per GMI to choose from")
     impls: tuple[str, ...] = doc(
         "MJX implementations to choose from, e.g. [jax,warp]; []: the one of physics.impl"
@@ -36,7 +41,10 @@ class SearchConfig:
         "a row of sizes ends when the gain of throughput by the growth of memory is below this"
     )
     tolerance: float = doc("relative difference of throughput that counts as none")
-    iterations: int = doc("training iterations of one profile; the first is not counted")
+    iterations: int = doc(
+        "training iterations of one profile, the first is not counted; with algo=a3c batches that "
+        "are counted, at least"
+    )
     budget_s: float = doc("seconds for the whole search; the best point so far is the answer")
     profile_timeout_s: float = doc("a profile that takes longer is not runnable, seconds")
     store: str | None = doc(
@@ -44,7 +52,7 @@ class SearchConfig:
     )
 
     def __post_init__(self) -> None:
-        for key in ("gmis_per_gpu", "num_envs"):
+        for key in ("gmis_per_gpu", "training_gmis_per_gpu", "num_envs"):
             values = getattr(self, key)
             if not values or len(set(values)) != len(values):
                 raise ConfigError(f"search.{key}={list(values)}: expected distinct numbers")

@@ -45,7 +45,7 @@ def place(plan: PlanConfig) -> Placement:
             "plan.serving_gpus and plan.training_gpus, and the GMIs on each"
         )
     serving_gmis, training_gmis = _counts(plan)
-    serving, training, indices = _gpus(plan)
+    serving, training, indices = serving_and_training(plan)
     num_gpus = 1 + max(*serving, *training)
     layout: list[list[int]] = [[] for _ in range(num_gpus)]
     for number in range(len(training) * training_gmis):
@@ -82,8 +82,14 @@ def _counts(plan: PlanConfig) -> tuple[int, int]:
     return plan.serving_gmis_per_gpu, plan.training_gmis_per_gpu
 
 
-def _gpus(plan: PlanConfig) -> tuple[list[int], list[int], tuple[int, ...] | None]:
-    """Positions of the GPUs that serve and that train, and the machine's indices if given."""
+def serving_and_training(
+    plan: PlanConfig,
+) -> tuple[list[int], list[int], tuple[int, ...] | None]:
+    """Positions of the GPUs that serve and that train, and the machine's indices if given.
+
+    Raises:
+      ConfigError: as `place`.
+    """
     serving, training = plan.serving_gpus, plan.training_gpus
     if serving is None and training is None:
         return _by_default(plan)

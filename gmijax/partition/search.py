@@ -14,16 +14,22 @@ runs training jobs, tests give it a formula. What the lines of the paper became:
   did not grow, Sat is infinite with a gain and 0 without.
 - 18-19: Sat < alpha ends the row, and that point is no candidate. The row ends here too, but the
   point is a candidate: a gain below alpha is still one.
-- 20: `estimate`, which the paper does not print, is `estimate` below.
+- 20: `estimate`, which the paper does not print, is `estimate` below; `Rules.estimate` is another
+  where GPUs act and train apart (`gmijax.partition.balance`).
 - 21-24: the highest projection wins. Here the simplest does of those within `Rules.tolerance` of
   it: with the fewest GMIs, then with the fewest environments.
+
+Where some GMIs act and others train, the numbers of both are dimensions of the grid.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from itertools import product
 from typing import Final, NamedTuple
+
+from gmijax.partition.points import Measured, NotRunnable, Point
 
 _STRIDE: Final = 3
 
@@ -32,54 +38,8 @@ class OutOfBudget(Exception):
     """Raised by a profile function when there is no time left to measure a point."""
 
 
-class Point(NamedTuple):
-    """What is to be measured.
-
-    Attributes:
-      gmis_per_gpu: GMIs on every GPU.
-      num_envs: environments per GMI.
-      impl: physics implementation.
-    """
-
-    gmis_per_gpu: int
-    num_envs: int
-    impl: str
-
-    def __str__(self) -> str:
-        """`4 x 2048, jax`."""
-        return f"{self.gmis_per_gpu} x {self.num_envs}, {self.impl}"
-
-
-class Measured(NamedTuple):
-    """What one GMI did.
-
-    Attributes:
-      env_steps_per_s: environment steps a second of one GMI, the paper's `top`.
-      memory_mib: its peak memory, MiB, the paper's `mem`.
-      iteration_s: seconds of one iteration.
-      reduce_s: those of them in the exchange of gradients; 0 where that was not measured.
-    """
-
-    env_steps_per_s: float
-    memory_mib: float
-    iteration_s: float
-    reduce_s: float = 0.0
-
-
-class NotRunnable(NamedTuple):
-    """A point that cannot run.
-
-    Attributes:
-      reason: why, in one line.
-      limit_s: the time within which it did not end; None where something else was the matter.
-    """
-
-    reason: str
-    limit_s: float | None = None
-
-
-Profile = Callable[[int, int, str], Measured | NotRunnable]
-"""(gmis_per_gpu, num_envs, impl) -> what one GMI did, or why it cannot; may raise OutOfBudget."""
+Profile = Callable[[Point], Measured | NotRunnable]
+"""What one GMI did at a point, or why it cannot; may raise OutOfBudget."""
 
 
 class Grid(NamedTuple):
@@ -88,23 +48,31 @@ class Grid(NamedTuple):
     gmis_per_gpu: tuple[int, ...]
     num_envs: tuple[int, ...]
     impls: tuple[str, ...]
+    trainers: tuple[int, ...] = (0,)
+
+
+def top_of_one(measured: Measured) -> float:
+    """The paper's `top`."""
+    return measured.env_steps_per_s
 
 
 class Rules(NamedTuple):
     """How the grid is searched.
 
     Attributes:
-      num_gpus: GPUs of the whole job, to which measurements on one are projected.
+      estimate: environment steps a second of the whole job, line 20.
       alpha: a row ends when Sat falls below it; the paper has below 0.1.
       tolerance: relative difference of throughput that counts as none.
       coarse_first: first every third row and every third size, then the neighbours of the best
         point, until none of them is better; else the whole grid in the paper's order.
+      top: what Sat goes by.
     """
 
-    num_gpus: int
+    estimate: Callable[[Point, Measured], float]
     alpha: float
     tolerance: float
     coarse_first: bool
+    top: Callable[[Measured], float] = top_of_one
 
 
 class Visited(NamedTuple):
@@ -137,9 +105,11 @@ class Outcome(NamedTuple):
     complete: bool
 
 
-def saturation(before: Measured, now: Measured) -> float:
+def saturation(
+    before: Measured, now: Measured, top: Callable[[Measured], float] = top_of_one
+) -> float:
     """Sat, lines 13 to 15: relative gain of throughput per relative growth of memory."""
-    gain = (now.env_steps_per_s - before.env_steps_per_s) / before.env_steps_per_s
+    gain = (top(now) - top(before)) / top(before)
     growth = (now.memory_mib - before.memory_mib) / before.memory_mib
     if growth <= 0:  # Nothing is paid: any gain is welcome, and without one there is no point.
         return math.inf if gain > 0 else 0.0
@@ -181,7 +151,7 @@ def search(grid: Grid, profile: Profile, rules: Rules) -> Outcome:
 def as_printed(grid: Grid) -> Grid:
     """The grid in the paper's order: from the most GMIs down, from the smallest size up."""
     rows = tuple(sorted(grid.gmis_per_gpu, reverse=True))
-    return Grid(rows, tuple(sorted(grid.num_envs)), grid.impls)
+    return grid._replace(gmis_per_gpu=rows, num_envs=tuple(sorted(grid.num_envs)))
 
 
 def coarse(grid: Grid) -> Grid:
@@ -190,12 +160,12 @@ def coarse(grid: Grid) -> Grid:
     The row with the fewest GMIs is among them: it is the measure of all others. It comes first,
     because the fewer GMIs, the sooner they have started, and time may run out.
     """
-    rows = sorted(grid.gmis_per_gpu, reverse=True)
     sizes = sorted(grid.num_envs, reverse=True)
     return Grid(
-        tuple(sorted({*rows[::_STRIDE], rows[-1]})),
+        _some_rows(grid.gmis_per_gpu),
         tuple(sorted(sizes[::_STRIDE])),
         grid.impls,
+        _some_rows(grid.trainers),
     )
 
 
@@ -206,7 +176,7 @@ def best(visited: Mapping[Point, Visited], tolerance: float) -> Visited | None:
         return None
     highest = max(one.projected for one in runnable)
     good = [one for one in runnable if one.projected >= highest * (1.0 - tolerance)]
-    return min(good, key=lambda v: (v.point.gmis_per_gpu, v.point.num_envs, -v.projected))
+    return min(good, key=lambda v: (_num_gmis(v.point), v.point.num_envs, -v.projected))
 
 
 class _Book:
@@ -220,12 +190,12 @@ class _Book:
     def visit(self, point: Point) -> Visited:
         """Measures a point, if it was not, and compares it with its row."""
         if point not in self.visited:
-            result = self._profile(*point)
+            result = self._profile(point)
             projected, sat = 0.0, None
             if isinstance(result, Measured):
-                projected = estimate(point.gmis_per_gpu, self.rules.num_gpus, result)
+                projected = self.rules.estimate(point, result)
                 before = self._before(point)
-                sat = None if before is None else saturation(before, result)
+                sat = None if before is None else saturation(before, result, self.rules.top)
             self.visited[point] = Visited(point, result, sat, projected)
         return self.visited[point]
 
@@ -251,19 +221,18 @@ class _Book:
         return max(ran, key=lambda item: item[0])[1] if ran else None
 
     def _smaller(self, point: Point) -> Iterator[Visited]:
-        row = point.gmis_per_gpu, point.impl
         for other, one in self.visited.items():
-            if (other.gmis_per_gpu, other.impl) == row and other.num_envs < point.num_envs:
+            is_same_row = other._replace(num_envs=point.num_envs) == point
+            if is_same_row and other.num_envs < point.num_envs:
                 yield one
 
 
 def _rows(book: _Book, grid: Grid) -> None:
     """Lines 2 to 26 over a grid, in its order."""
-    for impl in grid.impls:
-        for gmis_per_gpu in grid.gmis_per_gpu:
-            for num_envs in grid.num_envs:
-                if book.is_saturated(book.visit(Point(gmis_per_gpu, num_envs, impl))):
-                    break
+    for impl, trainers, gmis_per_gpu in product(grid.impls, grid.trainers, grid.gmis_per_gpu):
+        for num_envs in grid.num_envs:
+            if book.is_saturated(book.visit(Point(gmis_per_gpu, num_envs, impl, trainers))):
+                break
 
 
 def _climb(book: _Book, grid: Grid) -> None:
@@ -280,12 +249,24 @@ def _climb(book: _Book, grid: Grid) -> None:
 
 
 def neighbours(point: Point, grid: Grid) -> list[Point]:
-    """The points one step away in the grid: in GMIs, then in environments."""
+    """The points one step away in the grid: in GMIs, in trainers, then in environments."""
     rows = _beside(point.gmis_per_gpu, sorted(grid.gmis_per_gpu))
+    trainers = _beside(point.trainers, sorted(grid.trainers))
     sizes = _beside(point.num_envs, sorted(grid.num_envs))
-    return [point._replace(gmis_per_gpu=row) for row in rows] + [
-        point._replace(num_envs=size) for size in sizes
+    return [
+        *(point._replace(gmis_per_gpu=row) for row in rows),
+        *(point._replace(trainers=number) for number in trainers),
+        *(point._replace(num_envs=size) for size in sizes),
     ]
+
+
+def _num_gmis(point: Point) -> int:
+    return point.gmis_per_gpu + point.trainers
+
+
+def _some_rows(values: Sequence[int]) -> tuple[int, ...]:
+    rows = sorted(values, reverse=True)
+    return tuple(sorted({*rows[::_STRIDE], rows[-1]}))
 
 
 def _beside(value: int, values: Sequence[int]) -> list[int]:

@@ -21,6 +21,7 @@ from gmijax.learner import (
     LearnerState,
     acting_moments,
     apply_gradients,
+    host_sharding,
     init_learner,
     make_learner,
 )
@@ -105,8 +106,13 @@ class FusedIteration:
     def __init__(self, env: BatchedEnv, learner: Learner) -> None:
         self.times: dict[str, float] = {}
         self._env = env
+        # Metrics lie where the host reads them at once: a copy from the device would only be
+        # made after the next iteration, which has been started by then.
+        where = host_sharding()
         self._program: Any = jax.jit(
-            functools.partial(_fused, env, learner), donate_argnums=(1, 2)
+            functools.partial(_fused, env, learner),
+            donate_argnums=(1, 2),
+            out_shardings=(None, None, where) if where else None,
         )
 
     def compile(self, state: LearnerState, env_state: BatchState) -> None:

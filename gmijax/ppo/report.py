@@ -45,11 +45,19 @@ class Reporter:
         self.overflow_steps: dict[str, float] = {}
 
     def report(
-        self, env_steps: int, metrics: IterationMetrics, times: Mapping[str, float]
+        self,
+        env_steps: int,
+        metrics: IterationMetrics,
+        times: Mapping[str, float],
+        ended_s: float | None = None,
     ) -> None:
         """Waits for the iteration that ended at `env_steps` and writes its line.
 
-        `times` are seconds by name, written as they are.
+        Args:
+          env_steps: see above.
+          metrics: of the iteration.
+          times: seconds by name, written as they are.
+          ended_s: when it ended, by `time.monotonic`; None: when its metrics are there.
 
         Raises:
           NonFiniteError: an observation, a reward or a loss is NaN or infinite.
@@ -57,7 +65,7 @@ class Reporter:
         # Scalars only: the moments have O numbers each and are of no use in a log.
         scalars = metrics._replace(stats=metrics.stats._replace(obs=0.0, advantage=0.0))
         host: Any = jax.tree.map(float, jax.device_get(scalars))
-        now = time.monotonic()
+        now = time.monotonic() if ended_s is None else ended_s
         self._check_finite(host, env_steps)
         self._count_overflows(host.stats.overflowed)
         episodes = host.stats.episodes

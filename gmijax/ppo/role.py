@@ -9,6 +9,7 @@ from __future__ import annotations
 import statistics
 import time
 from collections.abc import Mapping
+from concurrent.futures import Future, ThreadPoolExecutor
 from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -69,6 +70,13 @@ class _Pending(NamedTuple):
     env_steps: int
     metrics: IterationMetrics
     times: Mapping[str, float]
+    ended_s: Future[float]
+
+
+def _end_of(metrics: IterationMetrics) -> float:
+    """When an iteration has ended, by `time.monotonic`; waits for it."""
+    jax.block_until_ready(metrics)
+    return time.monotonic()
 
 
 class _SyncTrainer:
@@ -200,6 +208,18 @@ class _SyncTrainer:
     def _loop(
         self, state: LearnerState, env_state: Any, reporter: Reporter
     ) -> tuple[LearnerState, Any, bool]:
+        # To start an iteration takes about as long as the device takes for it, so that this thread
+        # would notice too late that the one before has ended.
+        with ThreadPoolExecutor(1) as clock:
+            return self._iterate(state, env_state, reporter, clock)
+
+    def _iterate(
+        self,
+        state: LearnerState,
+        env_state: Any,
+        reporter: Reporter,
+        clock: ThreadPoolExecutor,
+    ) -> tuple[LearnerState, Any, bool]:
         every = self._config.run.checkpoint_every
         pending: _Pending | None = None
         stop = False
@@ -209,7 +229,8 @@ class _SyncTrainer:
             state, env_state, metrics = self._iteration(state, env_state, tell)
             self._env_steps += self._steps_per_iteration
             self._iterations += 1
-            pending = _Pending(self._env_steps, metrics, self._iteration.times)
+            ended_s = clock.submit(_end_of, metrics)
+            pending = _Pending(self._env_steps, metrics, self._iteration.times, ended_s)
             stop = self._agree_to_stop()
             is_last = stop or self._env_steps >= self._config.num_timesteps
             if not is_last and every and self._iterations % every == 0:
@@ -220,7 +241,7 @@ class _SyncTrainer:
 
     def _report(self, reporter: Reporter, pending: _Pending | None) -> None:
         if pending is not None:
-            reporter.report(*pending)
+            reporter.report(*pending[:3], pending.ended_s.result())
             self._link.beat("running", self._iterations)
 
     def _agree_to_stop(self) -> bool:

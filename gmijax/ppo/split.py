@@ -22,6 +22,7 @@ from gmijax.learner import (
     acting_moments,
     apply_gradients,
     gradient_sharding,
+    host_sharding,
 )
 from gmijax.ppo.learner import finish_iteration, gradients, minibatch_order, update_context
 from gmijax.ppo.losses import LossMetrics, Samples, UpdateContext
@@ -51,7 +52,10 @@ class SplitIteration:
             self._update_fn, donate_argnums=(0,), out_shardings=(None, where, None)
         )
         self._apply: Any = jax.jit(self._apply_fn, donate_argnums=(0,))
-        self._finish: Any = jax.jit(self._finish_fn, donate_argnums=(0,))
+        host = host_sharding()
+        self._finish: Any = jax.jit(
+            self._finish_fn, donate_argnums=(0,), out_shardings=(None, host) if host else None
+        )
 
     def compile(self, state: LearnerState, env_state: BatchState) -> None:
         """See `Iteration`."""

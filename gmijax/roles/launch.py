@@ -38,6 +38,7 @@ def launch(
     start_timeout_s: float = 600.0,
     stall_timeout_s: float | None = None,
     grace_s: float = 10.0,
+    device_messages: bool = True,
 ) -> list[Any]:
     """Runs a role in every GMI of a plan, each a process of its own, until all have ended.
 
@@ -53,6 +54,8 @@ def launch(
       stall_timeout_s: a GMI without progress for this long has failed (see `Role.progress`);
         None: never.
       grace_s: time that GMIs get to end by themselves, after Ctrl-C or a failure.
+      device_messages: arrays of jax stay on the GPU on their way to a GMI that shares it, where
+        CUDA IPC can be had; False: all messages go through host memory.
 
     Returns:
       What every GMI's `run` returned, in order of id.
@@ -78,6 +81,7 @@ def launch(
         "timeout_s": timeout_s,
         "start_timeout_s": start_timeout_s,
         "capacity_bytes": int(pipe_mib * 2**20),
+        "device_messages": device_messages,
         "script": shipping.own_script(),
     }
     _write(run, plan, config, parcels)

@@ -94,7 +94,8 @@ class Role(ABC):
         """Sends `data` to GMI `dst` and goes on; `data` may be changed at once.
 
         Args:
-          data: anything that can be pickled; arrays (of any size) travel as raw bytes.
+          data: anything that can be pickled; arrays (of any size) travel as raw bytes, and those
+            of jax stay on the GPU on their way to a GMI that shares it.
           dst: id of a GMI. Messages from one GMI to another arrive in order.
 
         Raises:
@@ -110,7 +111,8 @@ class Role(ABC):
           timeout_s: longest wait; None: what `gmijax.launch` was told.
 
         Returns:
-          What was sent; its arrays are this GMI's own, and those of jax have become numpy's.
+          What was sent; its arrays are this GMI's own. Those of jax are jax's still where they
+          could stay on the GPU, and numpy's else.
 
         Raises:
           PeerLost: that GMI is gone, and has left no message.

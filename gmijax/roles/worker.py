@@ -14,11 +14,13 @@ from gmijax.collectives.pipe_block import PipeBlock
 from gmijax.errors import ConfigError
 from gmijax.partition.child import ENV_PIPES_FD, ChildLink, inherited_fd, run_gmi
 from gmijax.partition.plan import Plan
+from gmijax.partition.reduction import why_not_intra
 from gmijax.roles import shipping
 from gmijax.roles.gmi import Gmi, enter
 from gmijax.rundir import read_json
 
 if TYPE_CHECKING:
+    from gmijax.collectives.device_post import DevicePost
     from gmijax.collectives.ring import World
 
 
@@ -32,7 +34,9 @@ def _run(link: ChildLink) -> dict[str, Any]:
     plan = Plan.from_dict(read_json(link.run.plan))
     # Before the role's own modules, which may use jax.
     world = _take_up_share(plan, link, config["start_timeout_s"])
-    messenger = Messenger(_attach(plan, link, config["capacity_bytes"]), config["timeout_s"])
+    block = _attach(plan, link, config["capacity_bytes"])
+    post = _device_post(plan, link.gmi) if config["device_messages"] else None
+    messenger = Messenger(block, config["timeout_s"], post)
     shipping.prepare_imports(config["script"])
     role, args = shipping.load(link.paths.role.read_bytes(), config["script"])
 
@@ -74,6 +78,17 @@ def _take_up_share(plan: Plan, link: ChildLink, timeout_s: float) -> World | Non
         jax.devices()
         check_share(plan, link.gmi)
     return world
+
+
+def _device_post(plan: Plan, gmi: int) -> DevicePost | None:
+    """What keeps arrays of messages on the GPU; None where GMIs share none, or not its memory."""
+    neighbours = [peer for peer in plan.layout.neighbours_of(gmi) if peer != gmi]
+    if not neighbours or why_not_intra("ipc", plan.backend):
+        return None
+    from gmijax.collectives.cuda_memory import CudaMemory
+    from gmijax.collectives.device_post import DevicePost
+
+    return DevicePost(neighbours, CudaMemory)
 
 
 def _attach(plan: Plan, link: ChildLink, capacity_bytes: int) -> PipeBlock:

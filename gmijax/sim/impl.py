@@ -31,24 +31,18 @@ class OnGpu(NamedTuple):
       auto: what `physics.impl=auto` chooses.
       warp_sizes: None for the sizes of MJX-JAX, which hold all that can ever be unless the model
         limits them (`max_contact_points`, `max_geom_pairs`).
-      why_no_warp: why MJX-Warp is refused on a GPU; None where it works.
     """
 
     auto: Impl
     warp_sizes: WarpSizes | None = None
-    why_no_warp: str | None = None
 
 
 ON_GPU: Mapping[str, OnGpu] = MappingProxyType(
     {
         "ant": OnGpu("warp"),
         "anymal": OnGpu("warp"),
-        "ball_balance": OnGpu(
-            "jax", why_no_warp="its second physics step is wrong there, on a GPU (docs/warp.md)"
-        ),
-        "franka_cabinet": OnGpu(
-            "jax", why_no_warp="its arm moves wrongly there, on a GPU (docs/warp.md)"
-        ),
+        "ball_balance": OnGpu("jax"),
+        "franka_cabinet": OnGpu("jax"),
         "humanoid": OnGpu("warp"),
         # MJX-JAX keeps the 12 deepest contacts, Warp all: up to 10 under random actions, 20 fit.
         "shadow_hand": OnGpu("warp", WarpSizes(contacts_per_env=12, constraints_per_env=108)),
@@ -73,8 +67,7 @@ def choose_impl(
       warp_installed: whether warp-lang can be imported; None to find out.
 
     Raises:
-      ConfigError: an unknown implementation, `warp` without warp-lang, or `warp` on a GPU for a
-        task that is wrong with it.
+      ConfigError: an unknown implementation, or `warp` without warp-lang.
     """
     if impl not in ("auto", "jax", "warp"):
         raise ConfigError(f"physics.impl={impl}: allowed are auto, jax, warp")
@@ -85,10 +78,6 @@ def choose_impl(
     is_gpu = device_platform in ("gpu", "cuda")
     on_gpu = ON_GPU.get(task or "")
     if impl == "warp":
-        if is_gpu and on_gpu is not None and on_gpu.why_no_warp:
-            raise ConfigError(
-                f"physics.impl=warp: not for {task}, {on_gpu.why_no_warp}; allowed are auto, jax"
-            )
         if not warp_installed:
             raise ConfigError(
                 "physics.impl=warp: needs the package warp-lang (pip install 'gmijax[warp]'); "

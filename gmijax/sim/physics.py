@@ -11,7 +11,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 from importlib import resources
-from typing import NamedTuple, TypeVar
+from typing import NamedTuple, TypeAlias, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -48,6 +48,10 @@ class PhysicsState(NamedTuple):
     qvel: Array
     qacc_warmstart: Array
     overflow: Array | None = None
+
+
+_Carried: TypeAlias = tuple[PhysicsState, T, Array | None]
+"""State, reading and overflows of a physics step."""
 
 
 @dataclass(frozen=True)
@@ -111,7 +115,8 @@ class Physics:
           integration, `qpos` and `qvel` to the moment after it.
         """
 
-        def substep(state: PhysicsState, _: None) -> tuple[PhysicsState, tuple[T, Array | None]]:
+        def substep(carried: _Carried[T], _: None) -> tuple[_Carried[T], None]:
+            state, bits = carried[0], carried[2]
             data = self.blank().replace(
                 ctrl=ctrl,
                 qpos=state.qpos,
@@ -119,18 +124,23 @@ class Physics:
                 qacc_warmstart=state.qacc_warmstart,
             )
             data = mjx.step(model, data)
-            bits = None if self.impl == "jax" else data._impl.overflow
-            return PhysicsState(data.qpos, data.qvel, data.qacc_warmstart), (read(data), bits)
+            bits = None if bits is None else bits | data._impl.overflow
+            state = PhysicsState(data.qpos, data.qvel, data.qacc_warmstart)
+            return (state, read(data), bits), None
 
-        # One traced physics step, though only the last one's sensors are wanted: a second copy
-        # without sensors takes half as long again to compile, and did not run faster.
-        moved, (readings, bits) = jax.lax.scan(
-            substep, state._replace(overflow=None), length=self.substeps
+        # Readings are carried, not stacked: of what Warp writes a GPU stacks nothing but zeros
+        # (docs/decisions/sim-warp-readings.md). One traced physics step, though only the last
+        # one's are wanted: a second copy takes half as long again to compile, and was not faster.
+        nothing = self.blank()
+        bits = None if self.impl == "jax" else jnp.zeros_like(nothing._impl.overflow)
+        unread = jax.tree.map(jnp.zeros_like, read(nothing))
+        (moved, reading, bits), _ = jax.lax.scan(
+            substep, (state._replace(overflow=None), unread, bits), length=self.substeps
         )
         if bits is not None:
             masks = jnp.array([_CONTACT_BITS, _CONSTRAINT_BITS])
-            moved = moved._replace(overflow=jnp.any(bits[:, None] & masks, axis=0))
-        return moved, jax.tree.map(lambda reading: reading[-1], readings)
+            moved = moved._replace(overflow=(bits & masks) != 0)
+        return moved, reading
 
     def env(
         self,

@@ -19,7 +19,10 @@ pytestmark = pytest.mark.timeout(120)
 
 TIMEOUT_S = 3.0
 KINDS = get_type_hints(ChannelConfig)
-DESIGNS, TRANSPORTS = get_args(KINDS["design"]), get_args(KINDS["transport"])
+DESIGNS = get_args(KINDS["design"])
+# Where experience stays on the device it needs agents and trainers on one: tests of its own.
+TRANSPORTS = [name for name in get_args(KINDS["transport"]) if name != "device"]
+HERE = str(Path(__file__).parents[1])
 PLACES = Places(agents=(0, 1, 2), trainers=(3, 4), gpu_of=(0, 0, 1, 2, 3))
 
 
@@ -120,3 +123,35 @@ def test_a_successor_of_a_killed_agent_goes_on_where_it_was(tmp_path: Path) -> N
         assert count // 6 < job.result(victim)["first"] < count
         assert victim in {peer for trainer in (3, 4) for peer in job.result(trainer)["lost"]}
         require_all_once(job, count)
+
+
+@pytest.mark.parametrize(("trainers", "batch"), [((2,), 100), ((2,), 25), ((2, 3), 50)])
+def test_experience_on_the_device_arrives_whole_and_once(
+    trainers: tuple[int, ...], batch: int, tmp_path: Path
+) -> None:
+    places = Places(agents=(0, 1), trainers=trainers, gpu_of=(0,) * (2 + len(trainers)))
+    task = {"count": 5000, "envs": 50, "batch": batch, "steps": 2, "pause_chance": 0.1}
+    with ChannelJob(
+        tmp_path, config(transport="device"), places, fake_device=HERE, timeout_s=30.0, **task
+    ).start() as job:
+        for rank in job.ranks:
+            assert job.result(rank)["error"] is None
+        require_all_once(job, 5000)
+
+
+@pytest.mark.parametrize("victim", [0, 2])
+def test_the_dead_are_named_where_experience_stays_on_the_device(
+    victim: int, tmp_path: Path
+) -> None:
+    places = Places(agents=(0, 1), trainers=(2,), gpu_of=(0, 0, 0))
+    task = {"count": 10**7, "envs": 50, "batch": 50, "pause_chance": 0.5, "timeout_s": 30.0}
+    with ChannelJob(
+        tmp_path, config(transport="device"), places, fake_device=HERE, **task
+    ).start() as job:
+        job.wait_for("open")
+        time.sleep(1.0)
+        killed_s = job.signal(victim, signal.SIGKILL)
+        for rank in {0, 1, 2} - {victim} if victim == 2 else {2}:
+            result = job.result(rank)
+            assert (result["error"], result["peers"]) == ("PeerLost", [victim])
+            assert result["ended_s"] - killed_s < TIMEOUT_S

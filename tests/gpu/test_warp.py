@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import json
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
-from training_jobs import train
+from supervision import CHECKOUT
+from training_jobs import child_environment, train
 
 from gmijax.sim.impl import ON_GPU
 
@@ -23,7 +26,7 @@ ITERATION = 512 * 16
 
 
 @pytest.mark.parametrize("randomize", ["off", "on"])
-@pytest.mark.parametrize("task", sorted(t for t in ON_GPU if not ON_GPU[t].why_no_warp))
+@pytest.mark.parametrize("task", sorted(ON_GPU))
 def test_a_task_trains_and_no_buffer_is_too_small(
     task: str, randomize: str, tmp_path: Path
 ) -> None:
@@ -44,6 +47,20 @@ def test_a_task_trains_and_no_buffer_is_too_small(
     assert summary["overflow_steps"] == {"contact": 0.0, "constraint": 0.0}
     lines = (tmp_path / "run" / "metrics.jsonl").read_text().splitlines()
     assert sum(json.loads(line)["diverged_steps"] for line in lines) < 1e-3 * steps
+
+
+@pytest.mark.parametrize("task", sorted(ON_GPU))
+def test_a_task_steps_as_with_mjx_jax(task: str, tmp_path: Path) -> None:
+    """What the simulator tells of itself too: loops on a GPU have lost that before."""
+    done = subprocess.run(
+        [sys.executable, str(CHECKOUT / "tests" / "steps_of_both.py"), task],
+        cwd=tmp_path,
+        env=child_environment() | {"XLA_PYTHON_CLIENT_PREALLOCATE": "false"},
+        capture_output=True,
+        text=True,
+    )
+    assert done.returncode == 0, done.stderr[-2000:]
+    assert json.loads(done.stdout.splitlines()[-1]) == {"obs": [], "reward": []}
 
 
 def test_two_gmis_share_a_gpu(tmp_path: Path) -> None:

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 
 import pytest
 from training_jobs import train
+
+from gmijax.results import read_metrics
 
 
 @pytest.mark.slow
@@ -17,7 +18,7 @@ def test_ball_balance_learns_from_two_agents(tmp_path: Path) -> None:
         "algo.batch_size=256", "num_timesteps=500e3", "run.dir=run", cwd=tmp_path, timeout_s=880,
     )  # fmt: skip
     assert done.returncode == 0, done.stderr
-    lines = [json.loads(x) for x in (tmp_path / "run" / "metrics.jsonl").open()]
+    lines = read_metrics(tmp_path / "run" / "metrics.jsonl")
     returns = [line["return"] for line in lines if line["return"] is not None]
     # A ball that falls past the tray earns about 12; one that stays on it 485.
     assert returns[0] < 30

@@ -128,12 +128,13 @@ def test_a_job_goes_on_from_its_checkpoint(two_and_two: Path) -> None:
 
 
 @pytest.mark.timeout(120)
-def test_a_killed_agent_ends_the_job_and_is_named(tmp_path: Path) -> None:
+@pytest.mark.parametrize("victim", [0, 2], ids=["trainer", "agent"])
+def test_a_killed_gmi_ends_the_job_and_is_named(victim: int, tmp_path: Path) -> None:
     cwd, shm = _folder(tmp_path), shared_memory()
     run = cwd / "run"
     job = start(*SMALL, FOREVER, "plan.serving_gmis_per_gpu=2", "run.dir=run", cwd=cwd)
     wait_until(lambda: iteration_of(run, 0) and iteration_of(run, 2), 90, "updates")
-    pid = gmi_pid(run, 2)
+    pid = gmi_pid(run, victim)
     assert pid is not None
     killed = time.monotonic()
     kill(pid)
@@ -141,7 +142,7 @@ def test_a_killed_agent_ends_the_job_and_is_named(tmp_path: Path) -> None:
     assert time.monotonic() - killed < 10
     assert pids_of(run) == []
     error = (cwd / "stderr.txt").read_text()
-    assert "GMI 2 failed" in error
+    assert f"GMI {victim} failed" in error
     assert "SIGKILL" in error
     assert shared_memory() <= shm
 

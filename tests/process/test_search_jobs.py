@@ -87,3 +87,43 @@ def test_what_takes_too_long_is_ended_and_not_runnable(tmp_path: Path):
     assert "no point of the search can run" in done.stderr
     assert "no end within 1 s (GMI 0 starting, GMI 1 waiting)" in done.stderr
     assert pids_of(tmp_path / "s" / "profiles" / "corun-2x16-jax") == []
+
+
+def test_an_asynchronous_job_gets_gmis_and_gpus_that_act_and_train(tmp_path: Path):
+    (tmp_path / "point.py").write_text(TASK)
+    job = (
+        *JOB, "algo=a3c", "algo.num_minibatches=2", "plan.gpus=3", "reduce.timeout_s=60",
+        "search.gmis_per_gpu=[2,1]", "search.num_envs=[16]", "search.iterations=3",
+    )  # fmt: skip
+    done = train(*job, "run.dir=s", cwd=tmp_path, command="search")
+    assert done.returncode == 0, done.stderr
+    report = json.loads((tmp_path / "s" / "search.json").read_text())
+    points = {(one["gmis_per_gpu"], one["trainers"]): one for one in report["points"]}
+    assert set(points) == {(2, 1), (1, 1)}
+    for (gmis, _), one in points.items():
+        metrics = tmp_path / "s" / "profiles" / f"corun-{gmis}+1x16-jax" / "metrics.jsonl"
+        lines = [json.loads(text) for text in metrics.read_text().splitlines()]
+        rates = [line[f"async/{what}"] for line in lines[1:-1] for what in ("pps", "ttop")]
+        assert min(rates) <= gmis * one["env_steps_per_s"] <= max(rates)
+        assert 100 < one["memory_mib"] < 10_000
+    best = report["best"]
+    assert best["serving_gpus"] + best["training_gpus"] == 3
+    assert f"{best['serving_gpus']} GPU" in report["reason"]
+    for run in (tmp_path / "s" / "profiles").iterdir():
+        assert pids_of(run) == []
+        assert not (run / "checkpoints").exists()
+
+    auto = ("num_envs=auto", "plan.gmis_per_gpu=auto")
+    done = train(*job, *auto, "num_timesteps=640", "run.dir=t", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert report["reason"] in done.stdout
+    assert not (tmp_path / "runs").exists()
+    plan = json.loads((tmp_path / "t" / "plan.json").read_text())
+    assert plan["roles"].count("trainer") == best["training_gpus"]
+    assert len(plan["roles"]) == sum(
+        gpus * gmis
+        for gpus, gmis in (
+            (best["serving_gpus"], best["gmis_per_gpu"]),
+            (best["training_gpus"], best["trainers"]),
+        )
+    )

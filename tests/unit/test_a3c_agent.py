@@ -36,19 +36,23 @@ OVERRIDES = (
 class _NoRoom:
     """A sender whose trainers make no room."""
 
+    on_device = False
+
     def __init__(self) -> None:
         self.was_asked = threading.Event()
+        self.waited_s = 0.0
 
     def send(self, experience, version, timeout_s) -> bool:
         self.was_asked.set()
         time.sleep(0.01)
+        self.waited_s += 0.01
         return False
 
     def flush(self) -> None:
         pass
 
     def stats(self) -> SenderStats:
-        return SenderStats(0, 0, 0, 0, 0.0, 0, 0.0, 0.0)
+        return SenderStats(0, 0, 0, 0, self.waited_s, 0, 0.0, 0.0)
 
     def close(self) -> None:
         pass
@@ -138,7 +142,9 @@ def test_an_agent_without_room_still_adds_to_a_checkpoint(tmp_path, config) -> N
             wait_until(lambda: added(5), 10, "environments in the checkpoint")
         finally:
             board.orders.publish(pack_orders(Orders(9, is_ending=True)))
-        assert outcome.result(timeout=20)["unrolls"] == 0
+        told = outcome.result(timeout=20)
+    assert told["unrolls"] == 0
+    assert 0 < told["wait_s"] <= sender.waited_s
     assert added(9)
     saved = [path.name for path in link.run.checkpoints.glob(".*.partial/gmi_1")]
     assert len(saved) == 2

@@ -19,6 +19,7 @@ from gmijax.collectives.channel.build import (
 )
 from gmijax.collectives.channel.dispenser import Dispenser
 from gmijax.collectives.channel.ends import Receiver, Sender
+from gmijax.collectives.channel.unichannel import UniSource
 from gmijax.config.channel import ChannelConfig
 from gmijax.errors import CollectiveTimeout, ConfigError, PeerLost, PipeClosed
 
@@ -201,7 +202,7 @@ def test_a_trainer_that_follows_skips_a_rollout_that_had_begun(
     for _ in range(first_read):
         inlet.try_get()
         inlet.release()
-    follower = Receiver(1, [inlet], is_uni=True, leave=lambda: None)
+    follower = Receiver(1, [inlet], make=UniSource, leave=lambda: None)
     batch = follower.receive(N, 0.0)
     assert batch.versions.tolist() == [int(first_read > 0)] * N
     assert follower.stats().discarded == int(first_read > 0)

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from gmijax.errors import ConfigError
-from gmijax.partition.search import Measured, NotRunnable, Point
+from gmijax.partition.points import Measured, NotRunnable, Point
 from gmijax.profiles import ProfileStore
 
 KEY = {"device": "NVIDIA H200, 143771 MiB", "task": "ant", "versions": {"jax": "0.11.2"}}
@@ -86,3 +86,23 @@ def test_the_file_can_be_read_by_others(tmp_path: Path):
     content = json.loads(first.path.read_text())
     assert content["key"] == KEY
     assert content["profiles"] == {"corun 4x2048 jax": {**MEASURED._asdict(), "wall_s": 21.0}}
+
+
+def test_trainers_are_part_of_the_point(tmp_path: Path):
+    first, _ = store(tmp_path)
+    with_trainers, rates = POINT._replace(trainers=2), MEASURED._replace(acting_per_s=5.0)
+    first.put("corun", with_trainers, rates, 21.0)
+    assert first.get("corun", POINT) is None
+    second, _ = store(tmp_path)
+    assert second.get("corun", with_trainers) == rates
+    assert "corun 4+2x2048 jax" in json.loads(first.path.read_text())["profiles"]
+
+
+def test_files_of_versions_without_trainers_can_be_read(tmp_path: Path):
+    path = store(tmp_path)[0].path
+    figures = {"env_steps_per_s": 345_000.5, "memory_mib": 812.25, "iteration_s": 0.095}
+    old = {"corun 4x2048 jax": {**figures, "reduce_s": 0.0125, "wall_s": 21.0}}
+    path.write_text(json.dumps({"key": KEY, "profiles": old}))
+    found, notes = store(tmp_path)
+    assert found.get("corun", POINT) == MEASURED
+    assert notes == []

@@ -9,7 +9,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from fake_device_memory import FakeDeviceMemory
 
+from gmijax.collectives.device_post import DevicePost
 from gmijax.collectives.mailboxes import COLLECTIVE, DATA, MAX_PARTS, Inbox, frames_of
 from gmijax.collectives.messenger import MIN_CAPACITY_BYTES, Messenger
 from gmijax.collectives.pipe import message_bytes
@@ -109,3 +111,61 @@ def test_ranks_that_there_are_not(alone: Messenger, rank: int) -> None:
         alone.send("hello", rank)
     with pytest.raises(ConfigError, match=r"src=.*: allowed are GMIs 0 to 1"):
         alone.recv(rank)
+
+
+def posts(count: int, part_bytes: int = 1 << 20) -> list[Messenger]:
+    """Messengers of `count` ranks that share memory of a device, in this process."""
+    fd = create_pipes(count, MIN_CAPACITY_BYTES)
+    try:
+        blocks = [PipeBlock.attach(fd, rank, count, MIN_CAPACITY_BYTES) for rank in range(count)]
+    finally:
+        os.close(fd)
+    others = [[peer for peer in range(count) if peer != rank] for rank in range(count)]
+    return [
+        Messenger(block, 5.0, DevicePost(peers, FakeDeviceMemory, part_bytes))
+        for block, peers in zip(blocks, others, strict=True)
+    ]
+
+
+def test_arrays_of_jax_stay_on_the_device_that_ranks_share() -> None:
+    first, second, third = posts(3)
+    large = jnp.arange(5000.0).reshape(50, 100)
+    first.send({"large": large, "flags": large > 7, "small": jnp.ones(3), "n": 7}, 1)
+    first.send(large + 1, 2)
+    got = second.recv(0)
+    assert isinstance(got["large"], jax.Array)
+    assert isinstance(got["small"], np.ndarray)  # Through the host it is as quick.
+    assert got["n"] == 7
+    np.testing.assert_array_equal(got["large"], large)
+    np.testing.assert_array_equal(got["flags"], large > 7)
+    np.testing.assert_array_equal(third.recv(0), large + 1)
+
+
+def test_places_on_the_device_are_used_again_and_never_too_early() -> None:
+    first, second = posts(2, part_bytes=3 * 20_000)
+    sent = [jnp.full(5000, float(number)) for number in range(40)]
+    kinds: list[type] = []
+    for number in range(0, 40, 8):
+        for array in sent[number : number + 8]:
+            first.send(array, 1)
+        for array in sent[number : number + 8]:
+            got = second.recv(0)
+            kinds.append(type(got))
+            np.testing.assert_array_equal(got, array)
+    # There is room for two or three at once; the others go through the host.
+    assert 10 <= sum(issubclass(kind, jax.Array) for kind in kinds) < 40
+
+
+def test_without_shared_memory_of_a_device_all_go_through_the_host() -> None:
+    class Refused(FakeDeviceMemory):
+        def create(self, num_bytes: int) -> bytes:
+            raise RuntimeError("no IPC here")
+
+    fd = create_pipes(2, MIN_CAPACITY_BYTES)
+    blocks = [PipeBlock.attach(fd, rank, 2, MIN_CAPACITY_BYTES) for rank in range(2)]
+    os.close(fd)
+    first, second = (
+        Messenger(block, 5.0, DevicePost([1 - block.rank], Refused)) for block in blocks
+    )
+    first.send(jnp.arange(5000.0), 1)
+    assert isinstance(second.recv(0), np.ndarray)

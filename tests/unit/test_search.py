@@ -3,16 +3,15 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 
 import pytest
 
+from gmijax.partition.points import Measured, NotRunnable, Point
 from gmijax.partition.search import (
     Grid,
-    Measured,
-    NotRunnable,
     Outcome,
     OutOfBudget,
-    Point,
     Profile,
     Rules,
     coarse,
@@ -22,8 +21,14 @@ from gmijax.partition.search import (
     search,
 )
 
+
+def on(num_gpus: int) -> Callable[[Point, Measured], float]:
+    """Projects to so many GPUs."""
+    return lambda point, one: estimate(point.gmis_per_gpu, num_gpus, one)
+
+
 PAPER = Grid(tuple(range(10, 0, -1)), tuple(128 * 2**i for i in range(8)), ("jax",))
-AS_PRINTED = Rules(num_gpus=1, alpha=0.1, tolerance=0.0, coarse_first=False)
+AS_PRINTED = Rules(on(1), alpha=0.1, tolerance=0.0, coarse_first=False)
 COARSE = AS_PRINTED._replace(coarse_first=True, tolerance=0.02)
 
 
@@ -31,11 +36,10 @@ def measured(env_steps_per_s: float, memory_mib: float = 100.0, **more: float) -
     return Measured(env_steps_per_s, memory_mib, **{"iteration_s": 1.0, **more})
 
 
-def gpu(gmis_per_gpu: int, num_envs: int, impl: str) -> Measured:
+def gpu(point: Point) -> Measured:
     """A GPU with a fixed price of a step: 2.6 ms + 0.34 us x environments, MPS fills the gaps."""
-    del impl
-    alone = num_envs / (2.6e-3 + 0.34e-6 * num_envs)
-    return measured(min(alone, 2.7e6 / gmis_per_gpu), 80.0 + 0.05 * num_envs)
+    alone = point.num_envs / (2.6e-3 + 0.34e-6 * point.num_envs)
+    return measured(min(alone, 2.7e6 / point.gmis_per_gpu), 80.0 + 0.05 * point.num_envs)
 
 
 def points(outcome: Outcome) -> list[tuple[int, int]]:
@@ -45,9 +49,8 @@ def points(outcome: Outcome) -> list[tuple[int, int]]:
 def row(*values: float | None, memory: tuple[float, ...] = (100, 200, 400, 800)) -> Profile:
     """One GMI, sizes 1, 2, 4, 8: throughput by size, None where it cannot run."""
 
-    def profile(gmis_per_gpu: int, num_envs: int, impl: str) -> Measured | NotRunnable:
-        del gmis_per_gpu, impl
-        at = int(math.log2(num_envs))
+    def profile(point: Point) -> Measured | NotRunnable:
+        at = int(math.log2(point.num_envs))
         value = values[at]
         return NotRunnable("out of memory") if value is None else measured(value, memory[at])
 
@@ -129,23 +132,22 @@ def test_estimate_charges_the_larger_exchange():
 
 
 def test_the_best_for_many_gpus_may_be_another():
-    def profile(gmis_per_gpu: int, num_envs: int, impl: str) -> Measured:
-        del num_envs, impl
-        if gmis_per_gpu == 1:
+    def profile(point: Point) -> Measured:
+        if point.gmis_per_gpu == 1:
             return measured(390.0)
         return measured(200.0, reduce_s=0.8)
 
     grid = Grid((2, 1), (1,), ("jax",))
     for num_gpus, gmis in ((1, 2), (4, 1)):
-        found = search(grid, profile, AS_PRINTED._replace(num_gpus=num_gpus)).best
+        found = search(grid, profile, AS_PRINTED._replace(estimate=on(num_gpus))).best
         assert found
         assert found.point.gmis_per_gpu == gmis
 
 
 def test_one_gmi_wins_where_several_bring_nothing():
-    def profile(gmis_per_gpu: int, num_envs: int, impl: str) -> Measured:
-        del impl
-        return measured(1e6 * num_envs / 16384 / gmis_per_gpu * 1.01**gmis_per_gpu, num_envs)
+    def profile(point: Point) -> Measured:
+        gmis, num_envs = point.gmis_per_gpu, point.num_envs
+        return measured(1e6 * num_envs / 16384 / gmis * 1.01**gmis, num_envs)
 
     grid = PAPER._replace(gmis_per_gpu=(2, 1))
     assert search(grid, profile, AS_PRINTED).best != search(grid, profile, COARSE).best
@@ -168,7 +170,8 @@ def test_the_coarse_grid_keeps_one_gmi_and_the_largest_size():
 
 
 def test_the_climb_ends_at_a_top_whose_neighbours_are_lower():
-    def hill(gmis_per_gpu: int, num_envs: int, impl: str) -> Measured:
+    def hill(point: Point) -> Measured:
+        gmis_per_gpu, num_envs, impl, _ = point
         height = 100 - 3 * abs(gmis_per_gpu - 6) - 10 * abs(math.log2(num_envs / 1024))
         return measured(height / gmis_per_gpu, num_envs) if impl == "jax" else measured(1.0)
 
@@ -183,9 +186,8 @@ def test_the_climb_ends_at_a_top_whose_neighbours_are_lower():
 
 def test_no_point_is_climbed_to_behind_the_end_of_its_row():
     # Row 4 is saturated at 2048, and it has the best point of all.
-    def profile(gmis_per_gpu: int, num_envs: int, impl: str) -> Measured:
-        del impl
-        return measured((100.0 if gmis_per_gpu == 4 else 1.0), num_envs)
+    def profile(point: Point) -> Measured:
+        return measured((100.0 if point.gmis_per_gpu == 4 else 1.0), point.num_envs)
 
     seen = points(search(PAPER, profile, COARSE))
     assert max(n for k, n in seen if k == 4) == 2048
@@ -194,12 +196,12 @@ def test_no_point_is_climbed_to_behind_the_end_of_its_row():
 def test_out_of_budget_ends_with_what_there_is():
     calls = 0
 
-    def profile(gmis_per_gpu: int, num_envs: int, impl: str) -> Measured:
+    def profile(point: Point) -> Measured:
         nonlocal calls
         calls += 1
         if calls > 3:
             raise OutOfBudget
-        return gpu(gmis_per_gpu, num_envs, impl)
+        return gpu(point)
 
     outcome = search(PAPER, profile, COARSE)
     assert not outcome.complete
@@ -209,11 +211,62 @@ def test_out_of_budget_ends_with_what_there_is():
 
 
 def test_the_faster_implementation_is_part_of_the_answer():
-    def profile(gmis_per_gpu: int, num_envs: int, impl: str) -> Measured:
-        one = gpu(gmis_per_gpu, num_envs, impl)
-        factor = 2 if impl == "warp" else 1
+    def profile(point: Point) -> Measured:
+        one = gpu(point)
+        factor = 2 if point.impl == "warp" else 1
         return one._replace(env_steps_per_s=factor * one.env_steps_per_s)
 
     found = search(PAPER._replace(impls=("jax", "warp")), profile, COARSE).best
     assert found
     assert found.point.impl == "warp"
+
+
+def test_rows_differ_in_trainers_too():
+    """A row has a number of agents and of trainers: Sat compares sizes of the same row only."""
+
+    def profile(point: Point) -> Measured:
+        return measured(point.num_envs / point.trainers, 100.0 * point.num_envs)
+
+    grid = Grid((2, 1), (1, 2), ("jax",), trainers=(1, 3))
+    outcome = search(grid, profile, AS_PRINTED)
+    assert len(outcome.visited) == 8
+    assert [one.saturation for one in outcome.visited] == [None, 1.0] * 4
+    assert outcome.best
+    assert outcome.best.point == Point(2, 2, "jax", 1)
+    assert str(outcome.best.point) == "2 + 1 x 2, jax"
+    assert str(Point(2, 2, "jax")) == "2 x 2, jax"
+
+
+def test_the_climb_goes_along_trainers_too():
+    def hill(point: Point) -> Measured:
+        height = 100 - 3 * abs(point.gmis_per_gpu - 6) - 10 * abs(point.trainers - 2)
+        return measured(height / point.gmis_per_gpu, point.num_envs)
+
+    grid = Grid(tuple(range(1, 11)), (64,), ("jax",), trainers=(1, 2, 3, 4))
+    found = search(grid, hill, COARSE._replace(tolerance=0.0))
+    assert coarse(grid).trainers == (1, 4)
+    assert found.best
+    assert found.best.point == Point(6, 64, "jax", 2)
+    assert len(found.visited) < 40 / 2
+
+
+def test_of_equals_the_one_with_the_fewest_gmis_wins_trainers_included():
+    def profile(point: Point) -> Measured:
+        return measured(100.0 / point.gmis_per_gpu)
+
+    grid = Grid((1, 2), (1,), ("jax",), trainers=(1, 2))
+    found = search(grid, profile, AS_PRINTED).best
+    assert found
+    assert found.point == Point(1, 1, "jax", 1)
+
+
+def test_sat_goes_by_what_the_job_gains():
+    """Here trainers learn no faster from more, but agents make more, so fewer must act."""
+
+    def profile(point: Point) -> Measured:
+        return measured(100.0, point.num_envs, acting_per_s=100.0 * point.num_envs)
+
+    grid = Grid((1,), (1, 2, 4), ("jax",), trainers=(1,))
+    assert len(search(grid, profile, AS_PRINTED).visited) == 2
+    whole = search(grid, profile, AS_PRINTED._replace(top=lambda one: one.acting_per_s))
+    assert [one.saturation for one in whole.visited] == [None, 1.0, 1.0]

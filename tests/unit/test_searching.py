@@ -18,7 +18,7 @@ from gmijax.cli import compose
 from gmijax.config import TrainConfig
 from gmijax.errors import ConfigError, GmijaxError, JobInterrupted
 from gmijax.partition.machine import Machine
-from gmijax.partition.search import Measured, NotRunnable, Point
+from gmijax.partition.points import Measured, NotRunnable, Point
 from gmijax.profiling import ProfileLate, Workload, plan_at, training
 
 Answer = Callable[[Point, str], Measured | NotRunnable]

@@ -47,16 +47,23 @@ class Batcher:
     Args:
       rank: of this trainer.
       sources: one for every agent.
+      new_stack: makes, from a spec and a size, what batches of several arrivals are stacked in.
     """
 
-    def __init__(self, rank: int, sources: Sequence[Source]) -> None:
+    def __init__(
+        self,
+        rank: int,
+        sources: Sequence[Source],
+        new_stack: Callable[[Spec, int], Stack] | None = None,
+    ) -> None:
         self.batches = self.unrolls = 0
         self.waited_s = 0.0
         self._rank = rank
         self._sources = list(sources)
         self._turn = 0
+        self._new_stack = Stack if new_stack is None else new_stack
         self._current: _Arrival | None = None
-        self._stack: _Stack | None = None
+        self._stack: Stack | None = None
         self._next_look_s = time.monotonic() + LIVENESS_PERIOD_S
 
     def receive(self, batch_size: int, timeout_s: float) -> Batch:
@@ -71,7 +78,7 @@ class Batcher:
                 batch = arrival.take(batch_size).batch()
                 break
             if self._stack is None or not self._stack.fits(arrival.spec):
-                self._stack = _Stack(arrival.spec.unpacked(), batch_size)
+                self._stack = self._new_stack(arrival.spec.unpacked(), batch_size)
             self._stack.add(arrival.take(min(batch_size - filled, arrival.left)))
             if not arrival.left:
                 self._release()
@@ -157,7 +164,7 @@ class _Unrolls(NamedTuple):
 
     def batch(self) -> Batch:
         experience = {
-            channel.name: _read_only(self.arrays[channel.name].astype(channel.dtype, copy=False))
+            channel.name: _given(self.arrays[channel.name], channel.dtype)
             for channel in self.spec.channels
         }
         return Batch(experience, self.versions, self.agents)
@@ -180,51 +187,84 @@ class _Arrival:
     def take(self, count: int) -> _Unrolls:
         low, high = self._taken, self._taken + count
         self._taken = high
-        arrays = {name: array[:, low:high] for name, array in self._transfer.arrays.items()}
+        arrays = self._transfer.arrays
+        if count < self._transfer.num_envs:  # A part of an array on a device is a copy.
+            arrays = {name: array[:, low:high] for name, array in arrays.items()}
         return _Unrolls(
             self.spec, arrays, self._transfer.versions[low:high], self.agents[low:high]
         )
 
 
-class _Stack:
-    """Memory for one batch that is put together from several arrivals."""
+class Stack:
+    """A batch that is put together from several arrivals, here in host memory.
+
+    Args:
+      spec: the channels.
+      size: B, unrolls of the batch.
+
+    Attributes:
+      spec, size: the same.
+      filled: unrolls that are in it.
+    """
 
     def __init__(self, spec: Spec, size: int) -> None:
-        self.size = size
+        self.spec, self.size = spec, size
         self.filled = 0
-        self._spec = spec
-        self._arrays = {
-            channel.name: np.empty(channel.full_shape(size), channel.dtype)
-            for channel in spec.channels
-        }
         self._versions, self._agents = np.zeros(size, np.int64), np.zeros(size, np.int64)
+        self._arrays: dict[str, Array] = {}
+        self._begin()
 
     def fits(self, spec: Spec) -> bool:
         """Whether unrolls of `spec` can be added; agents that differ cannot share a batch."""
-        fits = spec.unpacked() == self._spec
+        fits = spec.unpacked() == self.spec
         if self.filled and not fits:
-            raise CollectiveError(f"agents send different experience: {spec} and {self._spec}")
+            raise CollectiveError(f"agents send different experience: {spec} and {self.spec}")
         return fits
 
     def add(self, unrolls: _Unrolls) -> None:
+        """Takes unrolls in; their arrays may change after that."""
         low, high = self.filled, self.filled + len(unrolls.versions)
         for name, array in unrolls.arrays.items():
-            self._arrays[name][:, low:high] = array
+            self._put(name, low, high, array)
         self._versions[low:high] = unrolls.versions
         self._agents[low:high] = unrolls.agents
         self.filled = high
 
     def give(self) -> Batch:
+        """The batch, which is full; the next one begins."""
+        experience = self._so_far()
         self.filled = 0
-        experience = {name: _read_only(array) for name, array in self._arrays.items()}
+        self._begin()
         return Batch(experience, self._versions.copy(), self._agents.copy())
 
     def as_arrival(self) -> _Arrival:
-        arrays = {name: array[:, : self.filled] for name, array in self._arrays.items()}
-        transfer = Transfer(self._spec, self.filled, self._versions[: self.filled], arrays)
+        """What is in it so far, as if it had just come."""
+        transfer = Transfer(self.spec, self.filled, self._versions[: self.filled], self._so_far())
         arrival = _Arrival(transfer, None, lambda: None)
         arrival.agents[:] = self._agents[: self.filled]
         return arrival
+
+    def _begin(self) -> None:
+        """Makes room for a batch; the last one's memory may be used again."""
+        self._arrays = self._arrays or {
+            channel.name: np.empty(channel.full_shape(self.size), channel.dtype)
+            for channel in self.spec.channels
+        }
+
+    def _put(self, name: str, low: int, high: int, array: Array) -> None:
+        """Takes in unrolls `low` to `high` of a channel."""
+        self._arrays[name][:, low:high] = array
+
+    def _so_far(self) -> dict[str, Array]:
+        """The unrolls that are in it, by channel."""
+        return {name: _read_only(array[:, : self.filled]) for name, array in self._arrays.items()}
+
+
+def _given(array: Array, dtype: str) -> Array:
+    """An array as the trainer gets it, who may not write into it; one on a device nobody can."""
+    if not isinstance(array, np.ndarray):
+        return array
+    return _read_only(array.astype(dtype, copy=False))
 
 
 def _read_only(array: Array) -> Array:

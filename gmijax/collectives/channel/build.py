@@ -2,22 +2,26 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from gmijax.collectives.channel.backlog import Block, DropOldest
 from gmijax.collectives.channel.compressor import Compressor
 from gmijax.collectives.channel.dispenser import Dispenser
-from gmijax.collectives.channel.ends import Receiver, Sender
-from gmijax.collectives.channel.interface import Inlet, Outlet
+from gmijax.collectives.channel.ends import Receiver, Sender, TransferSource
+from gmijax.collectives.channel.interface import ExperienceSender, Inlet, Outlet
 from gmijax.collectives.channel.memory import MemoryInlet, MemoryOutlet
 from gmijax.collectives.channel.migrator import Migrator
 from gmijax.collectives.channel.transfer_size import TransferSize
-from gmijax.collectives.channel.unichannel import UniSender
+from gmijax.collectives.channel.unichannel import UniSender, UniSource
 from gmijax.collectives.pipe_block import PipeBlock, create_pipes
 from gmijax.config.channel import ChannelConfig
 from gmijax.errors import ConfigError
+
+NOTES_BYTES = 2**20
+"""Of a pipe of `transport=device`, which holds only where experience lies."""
 
 OVERHEAD_BYTES = 16 * 1024
 """More than header, spec and alignment of a message take."""
@@ -104,10 +108,12 @@ def max_piece_bytes(capacity_bytes: int) -> int:
 
 def create_channels(config: ChannelConfig, places: Places) -> int:
     """Makes the shared block of all channels (`transport=memory`); returns its descriptor."""
-    return create_pipes(len(places.gpu_of), config.capacity_bytes)
+    return create_pipes(len(places.gpu_of), _pipe_bytes(config))
 
 
-def open_sender(config: ChannelConfig, places: Places, rank: int, fd: int | None) -> Sender:
+def open_sender(
+    config: ChannelConfig, places: Places, rank: int, fd: int | None
+) -> ExperienceSender:
     """The end of agent `rank`.
 
     Args:
@@ -120,6 +126,8 @@ def open_sender(config: ChannelConfig, places: Places, rank: int, fd: int | None
       ConfigError: something is missing.
       CollectiveError: the shared memory cannot be had, or the rank is taken.
     """
+    if config.transport == "device":
+        return _resident_sender(config, places, rank, fd)
     if config.transport == "zmq":
         from gmijax.collectives.channel.remote import RemoteOutlet
 
@@ -136,17 +144,46 @@ def open_sender(config: ChannelConfig, places: Places, rank: int, fd: int | None
 
 def open_receiver(config: ChannelConfig, places: Places, rank: int, fd: int | None) -> Receiver:
     """The end of trainer `rank`; arguments and errors as `open_sender`."""
-    is_uni = config.design == "uni"
+    make = UniSource if config.design == "uni" else TransferSource
     if config.transport == "zmq":
         from gmijax.collectives.channel.remote import RemoteInlet
 
         inlets: list[Inlet] = [
             RemoteInlet(_address(places, peer, rank), rank, peer) for peer in places.agents
         ]
-        return Receiver(rank, inlets, is_uni=is_uni, leave=lambda: None)
+        return Receiver(rank, inlets, make=make, leave=lambda: None)
     block = _attach(config, places, rank, fd)
     inlets = [MemoryInlet(block, peer) for peer in places.agents]
-    return Receiver(rank, inlets, is_uni=is_uni, leave=block.close)
+    if config.transport == "device":
+        # jax and CUDA, which channels through the host do without.
+        from gmijax.collectives.channel.resident import DeviceStack, ResidentSource
+
+        return Receiver(
+            rank,
+            inlets,
+            make=lambda inlet: ResidentSource(inlet, DEVICE_MEMORY),
+            new_stack=DeviceStack,
+            leave=block.close,
+        )
+    return Receiver(rank, inlets, make=make, leave=block.close)
+
+
+def _resident_sender(
+    config: ChannelConfig, places: Places, rank: int, fd: int | None
+) -> ExperienceSender:
+    """The end of an agent that leaves its experience on the GPU, for the trainers there."""
+    from gmijax.collectives.channel.resident import ResidentSender
+
+    block = _attach(config, places, rank, fd)
+    near = [peer for peer in places.trainers if places.gpu_of[peer] == places.gpu_of[rank]]
+    return ResidentSender(
+        rank,
+        [MemoryOutlet(block, peer) for peer in near],
+        dict(enumerate(places.gpu_of)),
+        config.capacity_bytes,
+        DEVICE_MEMORY,
+        block.close,
+    )
 
 
 def _sender(
@@ -177,7 +214,21 @@ def _sender(
 def _attach(config: ChannelConfig, places: Places, rank: int, fd: int | None) -> PipeBlock:
     if fd is None:
         raise ConfigError("channel.transport=memory: needs the channels of the job's controller")
-    return PipeBlock.attach(fd, rank, len(places.gpu_of), config.capacity_bytes)
+    return PipeBlock.attach(fd, rank, len(places.gpu_of), _pipe_bytes(config))
+
+
+def _pipe_bytes(config: ChannelConfig) -> int:
+    return NOTES_BYTES if config.transport == "device" else config.capacity_bytes
+
+
+def _cuda_memory() -> Any:
+    from gmijax.collectives.cuda_memory import CudaMemory
+
+    return CudaMemory()
+
+
+DEVICE_MEMORY: Callable[[], Any] = _cuda_memory
+"""Makes the `DeviceMemory` by which agents and trainers of `transport=device` share their GPU."""
 
 
 def _address(places: Places, agent: int, trainer: int) -> str:

@@ -7,7 +7,7 @@ from collections.abc import Callable, Sequence
 from typing import Protocol
 
 from gmijax.collectives.channel.backlog import Block, DropOldest
-from gmijax.collectives.channel.batcher import Batcher
+from gmijax.collectives.channel.batcher import Batcher, Stack
 from gmijax.collectives.channel.compressor import Compressor, Transfer, read_transfer
 from gmijax.collectives.channel.dispenser import Dispenser
 from gmijax.collectives.channel.interface import (
@@ -18,8 +18,9 @@ from gmijax.collectives.channel.interface import (
     SenderStats,
 )
 from gmijax.collectives.channel.migrator import Migrator
+from gmijax.collectives.channel.spec import Spec
 from gmijax.collectives.channel.transfer_size import TransferSize
-from gmijax.collectives.channel.unichannel import UniSender, UniSource
+from gmijax.collectives.channel.unichannel import UniSender
 from gmijax.errors import GmijaxError
 
 CLOSE_TIMEOUT_S = 5.0
@@ -37,6 +38,8 @@ class Sender:
       size: of transfers; None with the uni-channel.
       leave: called at the end.
     """
+
+    on_device = False
 
     def __init__(
         self,
@@ -125,6 +128,10 @@ class CountingSource(Protocol):
         """See `Source`."""
         ...
 
+    def close(self) -> None:
+        """Nothing is read any more."""
+        ...
+
 
 class TransferSource:
     """Reads the compressor's transfers; a `CountingSource`."""
@@ -152,6 +159,9 @@ class TransferSource:
         """See `Source`."""
         return self._inlet.why_lost(operation, step)
 
+    def close(self) -> None:
+        """See `CountingSource`: nothing is held."""
+
 
 class Receiver:
     """A trainer's end; see `ExperienceReceiver`.
@@ -159,17 +169,23 @@ class Receiver:
     Args:
       rank: of this trainer.
       inlets: the ways from all agents.
-      is_uni: whether agents use the uni-channel.
+      make: what reads an inlet, as the agents write.
+      new_stack: see `Batcher`.
       leave: called at the end.
     """
 
     def __init__(
-        self, rank: int, inlets: Sequence[Inlet], *, is_uni: bool, leave: Callable[[], None]
+        self,
+        rank: int,
+        inlets: Sequence[Inlet],
+        *,
+        make: Callable[[Inlet], CountingSource],
+        new_stack: Callable[[Spec, int], Stack] = Stack,
+        leave: Callable[[], None],
     ) -> None:
-        make: Callable[[Inlet], CountingSource] = UniSource if is_uni else TransferSource
         self._inlets = list(inlets)
         self._sources = [make(inlet) for inlet in inlets]
-        self._batcher = Batcher(rank, self._sources)
+        self._batcher = Batcher(rank, self._sources, new_stack)
         self._leave = leave
         self._is_open = True
 
@@ -193,6 +209,7 @@ class Receiver:
         """See `ExperienceReceiver`."""
         if self._is_open:
             self._is_open = False
-            for inlet in self._inlets:
+            for source, inlet in zip(self._sources, self._inlets, strict=True):
+                source.close()
                 inlet.close()
             self._leave()

@@ -30,7 +30,7 @@ class Batch(NamedTuple):
 
     Attributes:
       experience: arrays by channel, [S, B, ...]; read-only views that are valid until the next
-        `receive`.
+        `receive`, of host memory or of the device's.
       versions: [B] int64, the policy version that every unroll was made with.
       agents: [B] int64, ranks of the agents that made them.
     """
@@ -88,7 +88,13 @@ class ReceiverStats(NamedTuple):
 
 
 class ExperienceSender(Protocol):
-    """An agent's end of the channels."""
+    """An agent's end of the channels.
+
+    Attributes:
+      on_device: whether it takes arrays of the device; otherwise numpy's.
+    """
+
+    on_device: bool
 
     def send(self, experience: Experience, version: int, timeout_s: float) -> bool:
         """Sends one rollout; the caller may change its arrays once that is done.

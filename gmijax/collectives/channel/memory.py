@@ -23,6 +23,16 @@ class MemoryOutlet:
         """See `Outlet`."""
         return self._writer.progress.items
 
+    @property
+    def messages(self) -> int:
+        """Messages committed since the way exists."""
+        return self._writer.progress.messages
+
+    @property
+    def outstanding_messages(self) -> int:
+        """Messages that the trainer has not released."""
+        return self._writer.outstanding_messages
+
     def try_reserve(self, sizes: Sequence[int]) -> list[Bytes] | None:
         """See `Outlet`."""
         return self._writer.try_reserve(sizes)

@@ -136,6 +136,9 @@ class UniSource:
         """See `Source`."""
         return self._inlet.why_lost(operation, step)
 
+    def close(self) -> None:
+        """Nothing is held."""
+
     def _put(self, message: Message) -> Transfer | None:
         spec = Spec.decode(message.parts[0].tobytes())
         step, place, is_first, num_envs, version = message.parts[1].view(np.int64).tolist()

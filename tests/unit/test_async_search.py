@@ -1,0 +1,304 @@
+"""The search for asynchronous jobs: what is profiled, what a profile says, what is refused."""
+
+from __future__ import annotations
+
+import functools
+import io
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+from rich.console import Console
+from supervision import gpu, machine
+
+from gmijax import searching
+from gmijax.async_search import (
+    FEWEST_LINES,
+    Enough,
+    decoupled_training,
+    measured_of,
+    window_start,
+)
+from gmijax.cli import compose
+from gmijax.config import TrainConfig
+from gmijax.decoupled import plan_decoupled
+from gmijax.errors import ConfigError
+from gmijax.partition.balance import Split
+from gmijax.partition.gmi_process import GmiStatus
+from gmijax.partition.points import Measured, Point
+from gmijax.profiling import Workload, plan_at, store_key
+from gmijax.rundir import RunPaths
+
+GRID = (
+    *("search.gmis_per_gpu=[2,1]", "search.num_envs=[64,128]", "search.order=as_printed"),
+    *("algo=a3c", "search.store=store"),
+)
+
+
+@functools.cache
+def wanted(*overrides: str) -> TrainConfig:
+    return compose(*GRID, *overrides, command="search")
+
+
+def line(wall_s: float, env_steps: int, **more: float) -> dict[str, float]:
+    rates = {"async/pps": 100.0, "async/updates": 2.0}
+    times = {"time/update_s": 0.1, "time/receive_s": 0.0, "time/wait_s": 0.0}
+    return {
+        "wall_s": wall_s,
+        "env_steps": env_steps,
+        **rates,
+        **times,
+        **{name.replace("__", "/"): value for name, value in more.items()},
+    }
+
+
+def test_rates_are_those_of_the_lines_after_the_first():
+    lines = [line(10.0, 5000), line(10.5, 5050), line(11.0, 5100), line(12.0, 5200)]
+    measured = measured_of(lines, num_agents=2, memory_mib=7.0)
+    assert measured == Measured(50.0, 7.0, 2.0 / 6, 0.0, 100.0, 100.0)
+
+
+def test_agents_that_waited_for_room_could_make_more():
+    # Two agents waited for 1.2 s of 2 x 2 s: 100 / (1 - 0.3).
+    lines = [line(0.0, 0), line(1.0, 100, time__wait_s=0.4), line(2.0, 200, time__wait_s=0.8)]
+    measured = measured_of(lines, num_agents=2, memory_mib=1.0)
+    assert measured.acting_per_s == pytest.approx(100.0 / 0.7)
+    assert measured.learning_per_s == pytest.approx(100.0)
+
+
+def test_trainers_that_waited_for_a_batch_could_learn_from_more():
+    # By batches: 3 of 4 waited 0.2 s, so 0.15 s on average, beside 0.1 s of work.
+    waits = {"time__receive_s": 0.2, "async__updates": 3.0}
+    lines = [line(0.0, 0), line(1.0, 100, **waits), line(2.0, 200, async__updates=1.0)]
+    measured = measured_of(lines, num_agents=1, memory_mib=1.0)
+    assert measured.learning_per_s == pytest.approx(100.0 * 0.25 / 0.1)
+    assert measured.acting_per_s == pytest.approx(100.0)
+
+
+def test_what_was_taken_from_the_channels_is_not_made_twice():
+    """TTOP cannot exceed PPS for long: what is above it is what had waited."""
+    lines = [line(0.0, 0), line(1.0, 150), line(2.0, 300)]
+    assert measured_of(lines, num_agents=1, memory_mib=1.0).env_steps_per_s == 100.0
+
+
+def test_agents_that_only_wait_have_no_endless_rate():
+    lines = [line(0.0, 0), line(1.0, 100, time__wait_s=1.1)]
+    assert measured_of(lines, num_agents=1, memory_mib=1.0).acting_per_s == pytest.approx(2000.0)
+
+
+@pytest.mark.parametrize(
+    ("updates", "start"),
+    [([9.0] * 8, 8 - FEWEST_LINES), ([1.0] * 8, 2), ([1.0] * 6, None), ([0.0] * 50, None)],
+)
+def test_lines_hold_enough_batches_and_are_several(updates: list[float], start: int | None):
+    lines = [line(i, 0, async__updates=number) for i, number in enumerate(updates)]
+    assert window_start(lines, 6) == start
+
+
+def test_a_profile_is_read_when_channels_had_filled(tmp_path: Path):
+    config = wanted("search.iterations=2")
+    run = RunPaths(tmp_path)
+    plan = plan_decoupled(compose("algo=a3c", "plan.serving_gmis_per_gpu=2"), 64, machine(0))
+    is_enough = Enough(config, plan, run)
+    told: list[str] = []
+
+    def with_lines(number: int) -> None:
+        told.extend(json.dumps(line(len(told) + i, 0)) + "\n" for i in range(number))
+        run.metrics.write_text("".join(told))
+
+    def gmis(*unrolls: int) -> list[GmiStatus]:
+        return [GmiStatus(gmi, "running", n, 1, None) for gmi, n in enumerate(unrolls)]
+
+    with_lines(20)  # One agent still compiles.
+    assert not is_enough([*gmis(20, 20), GmiStatus(2, "compiling", 0, 1, None)])
+    assert not is_enough(gmis(20, 20, 3))  # Two may wait, one is sent, one is made.
+    assert not is_enough(gmis(20, 20, 4))
+    with_lines(1)  # It had begun before.
+    assert not is_enough(gmis(21, 21, 5))
+    with_lines(FEWEST_LINES)
+    assert not is_enough(gmis(24, 24, 8))
+    with_lines(1)  # The last line is left out when the profile is read.
+    assert is_enough(gmis(25, 25, 9))
+
+
+def layout_of(*overrides: str) -> str:
+    workload = decoupled_training(wanted(*overrides))
+    plan = plan_at(workload, Point(2, 64, "jax", 1), "corun", machine(0))
+    assert plan.num_envs_per_gmi == 64
+    return f"{plan.layout} {plan.roles.count('trainer')}"
+
+
+@pytest.mark.parametrize(
+    ("overrides", "layout"),
+    [
+        ((), "[[0,1,2]] 1"),
+        (("plan.gpus=4",), "[[1,2],[0]] 1"),
+        (("plan.serving_gpus=3", "plan.training_gpus=2"), "[[1,2],[0]] 1"),
+        (("plan.serving_gpus=[0,1]", "plan.training_gpus=[1,0]"), "[[0,1,2]] 1"),
+        (("plan.serving_gpus=[1,2]", "plan.training_gpus=[0]"), "[[0],[1,2]] 1"),
+    ],
+)
+def test_one_gpu_of_each_kind_is_profiled(overrides: tuple[str, ...], layout: str):
+    assert layout_of(*overrides) == layout
+
+
+def test_profiled_are_gpus_of_the_job():
+    workload = decoupled_training(wanted("plan.serving_gpus=[2,3]", "plan.training_gpus=[1]"))
+    plan = plan_at(workload, Point(1, 64, "jax", 2), "corun", machine(4))
+    used = {share.device: role for share, role in zip(plan.slices, plan.roles, strict=True)}
+    assert used == {gpu(1).uuid: "trainer", gpu(2).uuid: "simulator+agent"}
+    assert workload.num_gpus == 3
+
+
+ONE = Measured(50.0, 100.0, 0.1, 0.0, acting_per_s=100.0, learning_per_s=300.0)
+"""Two agents made 100 in all, as they could; the trainer could learn from three times that."""
+
+
+@pytest.mark.parametrize(
+    ("overrides", "projected", "split"),
+    [
+        ((), 100.0, None),
+        (("plan.serving_gpus=[0,1]", "plan.training_gpus=[0,1]"), 200.0, None),
+        (("plan.gpus=2",), 100.0, Split(1, 1)),
+        (("plan.gpus=4",), 300.0, Split(3, 1)),
+        (("plan.gpus=8",), 600.0, Split(6, 2)),
+        (("plan.serving_gpus=4", "plan.training_gpus=1"), 300.0, Split(4, 1)),
+        (("plan.serving_gpus=1", "plan.training_gpus=4"), 100.0, Split(1, 4)),
+    ],
+)
+def test_the_projection(overrides: tuple[str, ...], projected: float, split: Split | None):
+    workload = decoupled_training(wanted(*overrides))
+    assert workload.projected(Point(2, 64, "jax", 1), ONE) == pytest.approx(projected)
+    assert workload.split(ONE) == split
+
+
+def test_waits_on_both_sides_are_in_the_projection():
+    workload = decoupled_training(wanted("plan.gpus=4"))
+    half = ONE._replace(env_steps_per_s=25.0)
+    assert workload.projected(Point(2, 64, "jax", 1), half) == pytest.approx(150.0)
+
+
+def test_placements_are_kept_apart_in_the_store():
+    def key(*overrides: str) -> dict[str, Any]:
+        return store_key(decoupled_training(wanted(*overrides)), machine(0))
+
+    assert key() != key("plan.gpus=2")
+    assert key("plan.gpus=2") == key("plan.serving_gpus=3", "plan.training_gpus=1")
+    assert key() == key("plan.gmis_per_gpu=1", "plan.serving_gmis_per_gpu=3")
+    assert key() != key("channel.design=uni")
+
+
+def formula(point: Point) -> Measured:
+    """An agent makes 10 a second for an environment; a trainer learns from 4000."""
+    acting, learning = 10.0 * point.gmis_per_gpu * point.num_envs, 4000.0 * point.trainers
+    memory_mib = 100.0 + point.num_envs
+    return Measured(
+        min(acting, learning) / point.gmis_per_gpu, memory_mib, 0.1, 0.0, acting, learning
+    )
+
+
+@pytest.fixture
+def asked(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> list[Point]:
+    monkeypatch.chdir(tmp_path)
+    points: list[Point] = []
+
+    def profile(workload: Workload, point: Point, *_: Any, **__: Any) -> Measured:
+        assert workload.module == "gmijax.async_worker"
+        points.append(point)
+        return formula(point)
+
+    monkeypatch.setattr(searching, "profile", profile)
+    return points
+
+
+def decided(*overrides: str) -> tuple[TrainConfig, str, str]:
+    said = io.StringIO()
+    config, (reason,) = searching.decided(
+        wanted(*overrides), machine(0), Console(file=said, width=400)
+    )
+    return config, reason, said.getvalue()
+
+
+def test_a_job_on_one_gpu_gets_numbers_of_gmis(asked: list[Point]):
+    config, reason, said = decided("search.training_gmis_per_gpu=[1,2]")
+    assert len(asked) == 8
+    plan = config.plan
+    assert (plan.gmis_per_gpu, plan.serving_gmis_per_gpu, plan.training_gmis_per_gpu) == (1, 2, 1)
+    assert (config.num_envs, plan.serving_gpus, plan.training_gpus) == (128, None, None)
+    assert reason.startswith(
+        "2 serving GMIs with 128 environments each and 1 training GMI per GPU, jax: 2,560 env"
+    )
+    assert "2.00 times the best with one serving GMI, 1 + 1 x 128, jax" in reason
+    assert "2 + 1 x 64, jax (corun): 1,280 env steps/s, agents could make 1,280" in said
+    plan_decoupled(config, config.envs_per_gmi, machine(0))  # It can be run.
+
+
+def test_a_job_on_several_gpus_gets_their_division_too(asked: list[Point]):
+    config, reason, _ = decided("plan.gpus=4")
+    # 2 x 128 make 2,560 on a GPU, 4,000 are learnt from: two and two, 5,120.
+    assert (config.plan.serving_gpus, config.plan.training_gpus) == (2, 2)
+    assert reason.startswith(
+        "2 GPUs with 2 serving GMIs of 128 environments each, 2 GPUs with 1 training GMI, jax: "
+        "5,120 env steps/s (projected from one GPU of each kind: agents could make 2,560, "
+        "trainers learn from 4,000; with so many GPUs agents are the slower side)"
+    )
+    report = json.loads(next(Path("runs").glob("*/search.json")).read_text())
+    best = report["best"]
+    assert (best["trainers"], best["serving_gpus"], best["training_gpus"]) == (1, 2, 2)
+    assert str(plan_decoupled(config, 128, machine(0)).layout) == "[[2,3],[4,5],[0],[1]]"
+
+
+def test_what_is_given_is_kept(asked: list[Point]):
+    config, _, _ = decided(
+        *("plan.serving_gpus=[0,1,2]", "plan.training_gpus=[3]", "plan.gmis_per_gpu=1"),
+        *("plan.serving_gmis_per_gpu=3", "plan.training_gmis_per_gpu=2"),
+    )
+    assert set(asked) == {Point(3, 64, "jax", 2), Point(3, 128, "jax", 2)}
+    plan = config.plan
+    assert (plan.serving_gmis_per_gpu, plan.training_gmis_per_gpu) == (3, 2)
+    assert (plan.serving_gpus, plan.training_gpus) == ((0, 1, 2), (3,))
+    asked.clear()
+    config, _, _ = decided("num_envs=96")
+    assert {point.num_envs for point in asked} == {96}
+    assert config.num_envs == 96
+
+
+@pytest.mark.parametrize(
+    ("overrides", "message"),
+    [
+        (("search.mode=isolated",), r"^search\.mode=isolated: with algo=a3c allowed is corun"),
+        (("search.mode=both",), r"^search\.mode=both: with algo=a3c"),
+        (
+            ("plan.serving_gpus=[0,1]", "plan.training_gpus=[1]"),
+            r"^plan\.serving_gpus, plan\.training_gpus: GPUs \[1\] both act and train and others",
+        ),
+        (
+            ("plan.serving_gmis_per_gpu=3",),
+            r"^plan\.serving_gmis_per_gpu=3: .* give search\.gmis_per_gpu=\[3\], or",
+        ),
+        (("plan.training_gmis_per_gpu=2",), r"give search\.training_gmis_per_gpu=\[2\]"),
+        (("plan.gmis_per_gpu=4",), r"^plan\.gmis_per_gpu=4: with the decoupled template give"),
+        (("plan.serving_gpus=1",), r"^plan\.training_gpus=null: there must be serving"),
+        (("plan.layout=[[0],[1]]",), r"^plan\.layout=\[\[0\], \[1\]\]: with the decoupled"),
+        (("search.training_gmis_per_gpu=[]",), r"^search\.training_gmis_per_gpu=\[\]: expected"),
+        (("search.training_gmis_per_gpu=[0]",), r"^search\.training_gmis_per_gpu=0: must be at"),
+        (("reduce.selection=measured",), r"^reduce\.selection=measured"),
+    ],
+)
+def test_bad_input_starts_nothing(overrides: tuple[str, ...], message: str, asked: list[Point]):
+    with pytest.raises(ConfigError, match=message):
+        searching.search(wanted(*overrides))
+    assert asked == []
+    assert not Path("runs").exists()
+
+
+def test_the_profile_of_a_trained_job_is_the_job_without_its_end():
+    config = wanted("run.checkpoint_every=7", "plan.gpus=4")
+    short: Callable[[Point, int], TrainConfig] = decoupled_training(config).config_at
+    profiled = short(Point(2, 128, "jax", 1), 3)
+    assert (profiled.num_envs, profiled.run.checkpoint_every) == (128, 0)
+    assert profiled.num_timesteps > 10**12
+    with pytest.raises(ConfigError, match=r"algo\.num_minibatches=4"):
+        short(Point(2, 130, "jax", 1), 3)
