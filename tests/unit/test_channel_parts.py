@@ -18,7 +18,7 @@ from gmijax.collectives.channel.build import (
     require_channels,
 )
 from gmijax.collectives.channel.dispenser import Dispenser
-from gmijax.collectives.channel.ends import Receiver, Sender
+from gmijax.collectives.channel.ends import Receiver
 from gmijax.collectives.channel.unichannel import UniSource
 from gmijax.config.channel import ChannelConfig
 from gmijax.errors import CollectiveTimeout, ConfigError, PeerLost, PipeClosed
@@ -39,7 +39,7 @@ class Pair:
     def __init__(self, **keys: Any) -> None:
         config = ChannelConfig(**{"capacity_mib": 1, **keys})
         self.fd = create_channels(config, PLACES)
-        self.sender: Sender = open_sender(config, PLACES, 0, self.fd)
+        self.sender: Any = open_sender(config, PLACES, 0, self.fd)
         self.receiver: Receiver = open_receiver(config, PLACES, 1, self.fd)
 
     def numbers(self, batch_size: int) -> list[int]:
