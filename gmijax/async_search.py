@@ -240,16 +240,18 @@ class Enough:
 def window_start(lines: Sequence[Line], iterations: int) -> int | None:
     """Index of the first of the latest lines that hold what a profile goes by; None: too few.
 
-    The line before it is needed too, because lines tell when they end.
+    The line before it is needed too, because lines tell when they end. Something was made in
+    them: where an unroll is many batches, agents can be silent for many lines.
 
     Args:
       lines: of `metrics.jsonl`.
       iterations: batches that they are to have at least.
     """
-    batches = 0.0
+    batches = made = 0.0
     for start in range(len(lines) - 1, 0, -1):
         batches += lines[start]["async/updates"]
-        if batches >= iterations and len(lines) - start >= FEWEST_LINES:
+        made += lines[start]["async/pps"]
+        if made > 0 and batches >= iterations and len(lines) - start >= FEWEST_LINES:
             return start
     return None
 

@@ -22,6 +22,7 @@ from gmijax.schema import from_dict
 if TYPE_CHECKING:
     from gmijax.a3c.board import Board
     from gmijax.collectives.interface import Reducer
+    from gmijax.collectives.ring import World
     from gmijax.sim.wrappers import BatchedEnv
 
 
@@ -47,12 +48,13 @@ def _run(link: ChildLink) -> dict[str, Any]:
     algo = config.algo
     if not isinstance(algo, A3cConfig):
         raise ConfigError(f"algo={algo.name}: allowed here is a3c")
+    agents, trainers = groups_of(plan)
     # jax starts here, in the environment that the plan prepared.
+    world = _world(config, plan, link) if link.gmi in trainers.gmis else None
     from gmijax.selfcheck import check_share
     from gmijax.sim.build import make_training_env
 
     check_share(plan, link.gmi)
-    agents, trainers = groups_of(plan)
     env = make_training_env(
         config.env,
         config.physics.impl,
@@ -61,7 +63,16 @@ def _run(link: ChildLink) -> dict[str, Any]:
         num_envs=config.envs_per_gmi,
     )
     parts = _Parts(config, algo, plan, env, _board(algo, env, len(agents.gmis)), link)
-    return _train(parts) if link.gmi in trainers.gmis else _act(parts)
+    return _train(parts, world) if link.gmi in trainers.gmis else _act(parts)
+
+
+def _world(config: TrainConfig, plan: Plan, link: ChildLink) -> World | None:
+    """The trainers' processes as one, where their gradients go in rings."""
+    from gmijax.collectives.build import join_world
+
+    trainers = groups_of(plan)[1]
+    rank, timeout_s = trainers.gmis.index(link.gmi), config.run.start_timeout_s
+    return join_world(plan.strategy, trainers.layout, rank, link.rendezvous, timeout_s)
 
 
 def _act(parts: _Parts) -> dict[str, Any]:
@@ -79,14 +90,14 @@ def _act(parts: _Parts) -> dict[str, Any]:
         sender.close()
 
 
-def _train(parts: _Parts) -> dict[str, Any]:
+def _train(parts: _Parts, world: World | None) -> dict[str, Any]:
     from gmijax.a3c.trainer import Training, learn_until_done
     from gmijax.collectives.channel.build import open_receiver
 
     config, plan, link = parts.config, parts.plan, parts.link
     training = Training(config, parts.algo, parts.env, groups_of(plan)[0].gmis)
     receiver = open_receiver(config.channel, places_of(plan), link.gmi, _channels_fd())
-    reducer = _reducer(parts)
+    reducer = _reducer(parts, world)
     try:
         return learn_until_done(training, parts.board, receiver, reducer, link)
     finally:
@@ -94,7 +105,7 @@ def _train(parts: _Parts) -> dict[str, Any]:
         reducer.close()
 
 
-def _reducer(parts: _Parts) -> Reducer:
+def _reducer(parts: _Parts, world: World | None) -> Reducer:
     """The reducer among the trainers, whose ranks are their places among them."""
     from gmijax.a3c.programs import exchange_size
     from gmijax.collectives.build import Membership, build_reducer
@@ -108,7 +119,9 @@ def _reducer(parts: _Parts) -> Reducer:
         exchange_fd=parts.link.exchange_fd,
         timeout_s=config.reduce.timeout_s,
         rendezvous_timeout_s=config.run.start_timeout_s,
+        world=world,
         intra=plan.intra,
+        host_if_unavailable=config.reduce.intra == "auto",
     )
     return build_reducer(plan.strategy, membership)
 

@@ -25,6 +25,9 @@ from gmijax.partition.templates import AGENT, TRAINER, Group, group_of
 MODULE: Final = "gmijax.async_worker"
 """Main of every GMI, started by name."""
 
+FLOAT_CHANNELS: Final = ("state", "action", "reward", "log_prob", "cut_value", "bootstrap")
+"""Channels of an unroll that could travel with half the bits; see `gmijax.a3c.losses.Unrolls`."""
+
 ENV_BOARD_FD: Final = "GMIJAX_BOARD_FD"
 ENV_CHANNELS_FD: Final = "GMIJAX_CHANNELS_FD"
 
@@ -45,6 +48,10 @@ def plan_decoupled(config: TrainConfig, num_envs: int, machine: Machine) -> Plan
     if config.channel.transport == "zmq":
         raise ConfigError(
             "channel.transport=zmq: the GMIs of a job are on one host; allowed are memory, device"
+        )
+    if unknown := [name for name in config.channel.float16 if name not in FLOAT_CHANNELS]:
+        raise ConfigError(
+            f"channel.float16={unknown}: allowed are some of {', '.join(FLOAT_CHANNELS)}"
         )
     if config.reduce.selection != "paper":
         raise ConfigError(

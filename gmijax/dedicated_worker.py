@@ -22,6 +22,7 @@ from gmijax.schema import from_dict
 if TYPE_CHECKING:
     from gmijax.collectives.interface import Reducer
     from gmijax.collectives.pipe_block import PipeBlock
+    from gmijax.collectives.ring import World
     from gmijax.sim.wrappers import BatchedEnv, BatchState
 
 
@@ -38,13 +39,14 @@ def _run(link: ChildLink) -> dict[str, Any]:
     fd = inherited_fd(os.environ, ENV_PIPES_FD)
     if trainers is None or servants is None or fd is None:
         raise ConfigError(f"plan: roles {list(plan.roles)} need trainers, agents and pipes")
+    trains = link.gmi in trainers.gmis
     # jax starts here, in the environment that the plan prepared.
+    world = _world(config, plan, trainers, link) if trains else None
     from gmijax.collectives.pipe_block import PipeBlock
     from gmijax.selfcheck import check_share
     from gmijax.sim.build import make_training_env
 
     check_share(plan, link.gmi)
-    trains = link.gmi in trainers.gmis
     env = make_training_env(
         config.env,
         config.physics.impl,
@@ -55,7 +57,8 @@ def _run(link: ChildLink) -> dict[str, Any]:
     block = PipeBlock.attach(fd, link.gmi, plan.layout.num_gmis, PIPE_BYTES)
     try:
         if trains:
-            return _train(config, plan, trainers, env, block, link)
+            reducer = _reducer(config, plan, trainers, env, link, world)
+            return _train(config, plan, reducer, env, block, link)
         return _serve(config, plan, servants, env, block, link)
     finally:
         block.close()
@@ -64,7 +67,7 @@ def _run(link: ChildLink) -> dict[str, Any]:
 def _train(
     config: TrainConfig,
     plan: Plan,
-    trainers: Group,
+    reducer: Reducer,
     env: BatchedEnv,
     block: PipeBlock,
     link: ChildLink,
@@ -75,7 +78,6 @@ def _train(
 
     mail = Messenger(block, config.reduce.timeout_s)
     servants = _neighbours(plan, link.gmi, AGENT)
-    reducer = _reducer(config, plan, trainers, env, link)
     try:
         remote = Servants(mail, servants, config.run.start_timeout_s)
         return train(config, env, reducer, link, remote)
@@ -122,8 +124,21 @@ def _first_envs(config: TrainConfig, env: BatchedEnv, rank: int) -> BatchState:
     return jax.jit(env.init)(env.model, keys)
 
 
+def _world(config: TrainConfig, plan: Plan, trainers: Group, link: ChildLink) -> World | None:
+    """The trainers' processes as one, where their gradients go in rings."""
+    from gmijax.collectives.build import join_world
+
+    rank, timeout_s = trainers.gmis.index(link.gmi), config.run.start_timeout_s
+    return join_world(plan.strategy, trainers.layout, rank, link.rendezvous, timeout_s)
+
+
 def _reducer(
-    config: TrainConfig, plan: Plan, trainers: Group, env: BatchedEnv, link: ChildLink
+    config: TrainConfig,
+    plan: Plan,
+    trainers: Group,
+    env: BatchedEnv,
+    link: ChildLink,
+    world: World | None,
 ) -> Reducer:
     from gmijax.collectives.build import Membership, build_reducer
     from gmijax.ppo.programs import exchange_size
@@ -138,6 +153,9 @@ def _reducer(
             exchange_fd=link.exchange_fd,
             timeout_s=config.reduce.timeout_s,
             rendezvous_timeout_s=config.run.start_timeout_s,
+            world=world,
+            intra=plan.intra,
+            host_if_unavailable=config.reduce.intra == "auto",
         ),
     )
 

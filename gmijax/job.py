@@ -16,6 +16,7 @@ from typing import Any, NamedTuple
 from rich.console import Console
 
 from gmijax import dedicated, trained
+from gmijax.auto import decided
 from gmijax.config import TrainConfig
 from gmijax.decoupled import MODULE, is_decoupled, plan_decoupled, shared_blocks
 from gmijax.errors import ConfigError
@@ -28,7 +29,6 @@ from gmijax.results import MetricsReader, copy_history, draw_returns
 from gmijax.resume import CheckpointMeta, check_fits, find_checkpoint, saved_config
 from gmijax.rundir import RunPaths, create_run, read_json, write_json
 from gmijax.schema import to_dict
-from gmijax.searching import decided
 from gmijax.selection import estimated_floats, with_measured
 from gmijax.sim import source
 from gmijax.sim.impl import choose_impl

@@ -77,7 +77,7 @@ def run_gmis(
       JobInterrupted: a signal came, and every GMI has ended.
     """
     plan = launch.plan
-    has_rings = needs_ring(plan.strategy, plan.layout)
+    has_rings = needs_ring(plan.strategy, plan.training_layout)
     with ExitStack() as held:
         blocks = dict(launch.shared)
         if plan.layout.num_gmis > 1:
@@ -97,7 +97,7 @@ def run_gmis(
                 patience=launch.patience,
                 inherited_fds=inherited,
                 compile_once=launch.compile_once
-                and not meets_at_start(plan.strategy, plan.layout, plan.intra),
+                and not meets_at_start(plan.strategy, plan.training_layout, plan.intra),
             )
         )
         if launch.stops_gracefully:

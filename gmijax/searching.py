@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 
 from rich.console import Console
 
-from gmijax.async_search import decoupled_training, settled
+from gmijax.async_search import decoupled_training
 from gmijax.config import AUTO, SearchConfig, TrainConfig
 from gmijax.decoupled import is_decoupled
 from gmijax.errors import ConfigError, GmijaxError, JobInterrupted
@@ -114,25 +114,6 @@ def workload_of(config: TrainConfig) -> Workload:
 def is_auto(config: TrainConfig) -> bool:
     """Whether something in a training job is for a search to find."""
     return AUTO in (config.num_envs, config.plan.gmis_per_gpu)
-
-
-def decided(
-    config: TrainConfig, machine: Machine, console: Console
-) -> tuple[TrainConfig, tuple[str, ...]]:
-    """A training job with everything decided that was `auto`, and the reasons in words.
-
-    Raises:
-      ConfigError, GmijaxError, JobInterrupted: as `search`.
-    """
-    if not is_auto(config):
-        return config, ()
-    result = resolve_auto(workload_of(config), config.search, machine, console)
-    plan = dataclasses.replace(config.plan, gmis_per_gpu=result.gmis_per_gpu)
-    if is_decoupled(config):
-        plan = settled(config.plan, result.gmis_per_gpu, result.trainers, result.split)
-    physics = dataclasses.replace(config.physics, impl=result.impl)
-    config = dataclasses.replace(config, num_envs=result.num_envs, plan=plan, physics=physics)
-    return config, (result.reason,)
 
 
 def resolve_auto(

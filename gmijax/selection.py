@@ -31,6 +31,7 @@ from gmijax.partition.reduction import (
 from gmijax.partition.supervisor import Patience
 from gmijax.partition.templates import TRAINER, has_role
 from gmijax.rundir import RunPaths, read_json, write_json
+from gmijax.version import versions_of
 
 CHAIN = 8
 """Means that are taken one of the other: in training every gradient needs the mean before it."""
@@ -39,6 +40,7 @@ TIMEOUT_S = 120.0
 CALLS = 40
 PATIENCE = Patience(start_timeout_s=300, stall_timeout_s=120, stop_timeout_s=60, grace_s=5)
 
+_PACKAGES = ("jax", "jaxlib", "nvidia-nccl-cu12", "nvidia-nccl-cu13", "cuda-bindings")
 _TYPICAL_INPUTS, _TYPICAL_OUTPUTS = 64, 16
 
 
@@ -212,11 +214,12 @@ def _file_name(plan: Plan, machine: Machine, probes: Sequence[Probe]) -> str:
     facts = {
         "devices": devices or [f"cpu x {len(machine.cpu_cores)}"],
         "driver": machine.driver_version,
+        "versions": versions_of(_PACKAGES),
         "backend": plan.backend,
         "layout": str(plan.layout),
         "sm_percent": [share.sm_percent for share in plan.slices],
         "probes": probes,
-        "format": 1,
+        "format": 2,
     }
     digest = hashlib.sha256(json.dumps(facts).encode()).hexdigest()
     return f"{plan.backend}-{plan.layout.num_gpus}g-{plan.layout.num_gmis}k-{digest[:16]}.json"

@@ -126,11 +126,11 @@ class _Trainer:
         """See `learn_until_done`."""
         self._link.beat("compiling", 0)
         started = time.monotonic()
-        state = self._first_state()
         if self._lead is None:
             # The leader compiles first, the others take its programs from the cache: those that
             # each of them would tune could differ in the last bit.
             self._reducer.all_gather(np.zeros(1, np.float32))
+        state = self._first_state()
         self._update.compile(state, *self._example())
         if self._lead is not None:
             self._reducer.all_gather(np.zeros(1, np.float32))
@@ -138,7 +138,7 @@ class _Trainer:
         first = np.asarray(pack(state))
         compile_s = time.monotonic() - started
         self._link.beat("ready", 0)
-        self._reducer.all_gather(np.zeros(1, np.float32))  # All trainers have compiled.
+        self._check_equal(state)  # And so all trainers have compiled.
         if self._lead is None:
             return {"status": self._loop(state), "updates": self._updates}
         try:

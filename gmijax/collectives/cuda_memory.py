@@ -11,6 +11,8 @@ import jax.numpy as jnp
 import numpy as np
 import numpy.typing as npt
 
+from gmijax.errors import CollectiveError
+
 # By name, because it has no type information, and is not installed everywhere.
 runtime: Any = importlib.import_module("cuda.bindings.runtime")
 
@@ -19,7 +21,7 @@ GRANULE_BYTES = 2 << 20
 """CUDA shares whole granules: a smaller block would show others what else lies in it."""
 
 
-class CudaError(RuntimeError):
+class CudaError(CollectiveError):
     """CUDA refused something; the message has its words."""
 
 

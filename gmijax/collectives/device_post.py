@@ -58,6 +58,9 @@ class DevicePost:
       neighbours: other ranks on this rank's GPU.
       new_memory: how processes share memory of the GPU.
       part_bytes: for the arrays on their way to one neighbour.
+
+    Attributes:
+      peers: the neighbours.
     """
 
     def __init__(
@@ -66,7 +69,8 @@ class DevicePost:
         new_memory: Callable[[], DeviceMemory],
         part_bytes: int = PART_BYTES,
     ) -> None:
-        self._parts = {peer: place * part_bytes for place, peer in enumerate(sorted(neighbours))}
+        self.peers = tuple(sorted(neighbours))
+        self._parts = {peer: place * part_bytes for place, peer in enumerate(self.peers)}
         self._part_bytes = part_bytes
         self._new_memory = new_memory
         self._held: dict[int, list[_Held]] = {peer: [] for peer in self._parts}
@@ -107,6 +111,11 @@ class DevicePost:
                 one._replace(frames=frames) if one.frames is None else one
                 for one in self._held[dst]
             ]
+
+    def holds(self, dst: int, released_frames: int) -> bool:
+        """Whether `dst` has yet to fetch something that was sent; see `stow`."""
+        held = self._held.get(dst, ())
+        return any(one.frames is not None and one.frames > released_frames for one in held)
 
     def fetch(self, stowed: Stowed) -> jax.Array:
         """A copy of an array; on return its place may be used again.

@@ -7,8 +7,9 @@ other, however large the messages. Receiving waits, with a timeout.
 
 from __future__ import annotations
 
+import contextlib
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from typing import Any, Final, Protocol
 
 import numpy as np
@@ -16,7 +17,8 @@ import numpy as np
 from gmijax.collectives.mailboxes import DATA, Inbox, Outbox, frames_of
 from gmijax.collectives.pipe import PipeReader, PipeWriter
 from gmijax.collectives.pipe_block import PipeBlock
-from gmijax.errors import CollectiveTimeout, ConfigError, PeerLost
+from gmijax.collectives.waits import wait_until
+from gmijax.errors import CollectiveTimeout, ConfigError, PeerLost, PipeClosed
 
 MIN_CAPACITY_BYTES: Final = 1 << 18
 """Least capacity of the pipes, so that a frame fits."""
@@ -25,12 +27,21 @@ MIN_CAPACITY_BYTES: Final = 1 << 18
 class Post(Protocol):
     """What keeps arrays where sender and receiver both reach them; see `DevicePost`."""
 
+    @property
+    def peers(self) -> Collection[int]:
+        """Ranks that reach them."""
+        ...
+
     def stow(self, array: Any, dst: int, released_frames: int) -> Any:
         """What travels to rank `dst` in an array's place, or None."""
         ...
 
     def sent(self, dst: int, frames: int) -> None:
         """What was stowed for `dst` is in use until it has released so many frames."""
+        ...
+
+    def holds(self, dst: int, released_frames: int) -> bool:
+        """Whether something waits for `dst`, which has released so many frames."""
         ...
 
     def fetch(self, stowed: Any) -> Any:
@@ -129,6 +140,8 @@ class Messenger:
     def flush(self, timeout_s: float | None = None) -> None:
         """Waits until all that was sent lies in shared memory, where it outlives this process.
 
+        What stays on the GPU does not: see `settle`.
+
         Raises:
           PeerLost: a receiver is gone, and has not taken all.
           CollectiveTimeout: receivers have not made room in time; names them.
@@ -143,12 +156,42 @@ class Messenger:
         if late:
             raise CollectiveTimeout(self.rank, tuple(late), "flush", 0, allowed_s)
 
+    def settle(self, timeout_s: float) -> bool:
+        """Whether all that stays on the GPU has been received within `timeout_s`.
+
+        It goes with this process, which must not end before. What others have sent is taken
+        meanwhile, so that two that end do not wait for each other.
+        """
+        return wait_until(self._is_settled, lambda: None, timeout_s) is not None
+
     def _stow(self, dst: int) -> Callable[[Any], Any]:
         device = self._device
         if device is None:
             return lambda _: None
-        released = self._block.read(self.rank, dst).messages
+        released = self._released(dst)
         return lambda value: device.stow(value, dst, released)
+
+    def _is_settled(self) -> bool | None:
+        device = self._device
+        if device is None:
+            return True
+        for peer in device.peers:
+            with contextlib.suppress(PipeClosed):
+                self._take(peer)
+        waiting = (peer for peer in device.peers if device.holds(peer, self._released(peer)))
+        is_lost = (self._block.why_lost((peer,), "settle", 0) is not None for peer in waiting)
+        return all(is_lost) or None
+
+    def _take(self, src: int) -> None:
+        """Takes all frames that rank `src` has sent by now."""
+        reader = self._reader(src)
+        while (message := reader.try_get()) is not None:
+            self._inbox(src).feed(message.parts)
+            reader.release()
+
+    def _released(self, dst: int) -> int:
+        """How many frames rank `dst` has released so far."""
+        return self._block.read(self.rank, dst).messages
 
     def _check(self, rank: int, what: str) -> None:
         if not (isinstance(rank, int | np.integer) and 0 <= rank < self.world_size):

@@ -13,7 +13,7 @@ from typing import Any, Literal
 from gmijax.config import Priority, TemplateName
 from gmijax.errors import ConfigError
 from gmijax.partition.layout import Layout
-from gmijax.partition.templates import HOLISTIC
+from gmijax.partition.templates import HOLISTIC, TRAINER, group_of
 
 BackendName = Literal["mps", "mig", "share", "cpu"]
 
@@ -93,6 +93,12 @@ class Plan:
                     f"plan.memory_fraction: {len(here)} GMIs on {part} {device[0]} would reserve "
                     f"{total:.2f} of its memory; at most {MAX_MEMORY_FRACTION} in sum"
                 )
+
+    @property
+    def training_layout(self) -> Layout:
+        """Where those that average gradients live, by their ranks: all GMIs, or the trainers."""
+        training = group_of(self.layout, self.roles, TRAINER)
+        return self.layout if training is None else training.layout
 
     def to_dict(self) -> dict[str, Any]:
         """Plain data for `plan.json`."""

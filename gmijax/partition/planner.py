@@ -83,9 +83,7 @@ def make_plan(
         backend=backend,
         template=chosen,
         num_envs_per_gmi=num_envs,
-        strategy=_strategy(
-            _without_rings(reduce, layout, backend), training, layout, backend, reasons
-        ),
+        strategy="none" if training is None else _strategy(reduce, training, backend, reasons),
         intra=_intra(reduce, layout, backend, reasons) if training else "host",
         reasons=tuple(reasons),
         roles=roles,
@@ -211,23 +209,11 @@ def _without_rings(reduce: ReduceConfig, layout: Layout, backend: BackendName) -
 
 
 def _strategy(
-    reduce: ReduceConfig,
-    training: Group | None,
-    whole: Layout,
-    backend: BackendName,
-    reasons: list[str],
+    reduce: ReduceConfig, training: Group, backend: BackendName, reasons: list[str]
 ) -> str:
-    """How those that train average gradients; `none` where nobody does, or only one."""
-    if training is None:
-        return "none"
+    """How those that train average gradients; `none` if there is only one."""
     layout = training.layout
-    if layout != whole and reduce.strategy not in ("auto", "mpr"):
-        raise ConfigError(
-            f"reduce.strategy={reduce.strategy}: needs every GMI to train; with trainers "
-            f"{list(training.gmis)} of {whole.num_gmis} GMIs allowed are auto, mpr"
-        )
-    if layout != whole:
-        return "mpr" if layout.num_gmis > 1 else "none"
+    reduce = _without_rings(reduce, layout, backend)
     if reduce.strategy != "auto":
         require_strategy(reduce.strategy, layout)
     if layout.num_gmis == 1:

@@ -9,7 +9,6 @@ one entry of the compilation cache.
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable
 from typing import Any, NamedTuple, Protocol
 
 import jax
@@ -49,10 +48,6 @@ class IterationMetrics(NamedTuple):
     noise_std: Array
 
 
-def nothing_else() -> None:
-    """For a device that has nothing to wait for."""
-
-
 class Iteration(Protocol):
     """One PPO iteration: rollout, then updates.
 
@@ -71,13 +66,8 @@ class Iteration(Protocol):
         self,
         state: LearnerState,
         env_state: BatchState,
-        meanwhile: Callable[[], None] = nothing_else,
     ) -> tuple[LearnerState, BatchState, IterationMetrics]:
-        """Runs one iteration; both states are donated and must not be used again.
-
-        Calls `meanwhile` once, when the device has work to do: what the host has to do for the
-        iteration before costs nothing there.
-        """
+        """Runs one iteration; both states are donated and must not be used again."""
         ...
 
 
@@ -106,8 +96,8 @@ class FusedIteration:
     def __init__(self, env: BatchedEnv, learner: Learner) -> None:
         self.times: dict[str, float] = {}
         self._env = env
-        # Metrics lie where the host reads them at once: a copy from the device would only be
-        # made after the next iteration, which has been started by then.
+        # Metrics lie where the host reads them at once: a copy from the device could only be made
+        # after the next iteration, which has been started by then.
         where = host_sharding()
         self._program: Any = jax.jit(
             functools.partial(_fused, env, learner),
@@ -123,12 +113,9 @@ class FusedIteration:
         self,
         state: LearnerState,
         env_state: BatchState,
-        meanwhile: Callable[[], None] = nothing_else,
     ) -> tuple[LearnerState, BatchState, IterationMetrics]:
         """See `Iteration`."""
-        results = self._program(self._env.model, state, env_state)
-        meanwhile()
-        return results
+        return self._program(self._env.model, state, env_state)
 
 
 def _fused(

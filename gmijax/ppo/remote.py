@@ -76,7 +76,7 @@ class RemoteIteration:
     def compile(self, state: LearnerState, env_state: Any) -> None:
         """See `Iteration`; waits for first rollouts, which are used by the first call."""
         del env_state  # There are no environments here.
-        self._first = self._ask(state, lambda: None)
+        self._first = self._ask(state)
         self._timeout_s = None
         arguments = state, *self._first, self._rank
         shapes = jax.eval_shape(partial(_join, self._env, self._learner), *arguments)
@@ -84,11 +84,11 @@ class RemoteIteration:
         self._updates.compile_updates(state, *shapes)
 
     def __call__(
-        self, state: LearnerState, env_state: Any, meanwhile: Callable[[], None] = lambda: None
+        self, state: LearnerState, env_state: Any
     ) -> tuple[LearnerState, Any, IterationMetrics]:
         """See `Iteration`."""
         started_s = time.monotonic()
-        (samples, stats), self._first = self._first or self._ask(state, meanwhile), None
+        (samples, stats), self._first = self._first or self._ask(state), None
         samples, order, packed = self._join(state, samples, stats, self._rank)
         mine = np.asarray(packed)
         rollout_s = time.monotonic() - started_s
@@ -101,15 +101,12 @@ class RemoteIteration:
         for gmi in self._servants.gmis:
             self._servants.mail.send(None, gmi)
 
-    def _ask(
-        self, state: LearnerState, meanwhile: Callable[[], None]
-    ) -> tuple[list[Samples], list[np.ndarray]]:
+    def _ask(self, state: LearnerState) -> tuple[list[Samples], list[np.ndarray]]:
         """Rollouts with the weights of `state`: samples [T, N], packed statistics."""
         mail, gmis = self._servants.mail, self._servants.gmis
         weights = np.asarray(self._pack(state))
         for gmi in gmis:
             mail.send(weights, gmi)
-        meanwhile()
         answers = [mail.recv(gmi, timeout_s=self._timeout_s) for gmi in gmis]
         return [Samples(*samples) for samples, _ in answers], [stats for _, stats in answers]
 

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import sys
+import threading
 import time
 from collections.abc import Mapping
+from queue import SimpleQueue
 from typing import Any
 
 import jax
@@ -18,6 +20,9 @@ TOLERATED_FRACTION = 1e-3
 
 TOLERATED_STEPS = 10
 """The same in steps, for iterations so short that one step is a large fraction."""
+
+_LAST_LINE_S = 2.0
+"""Longest wait for a line when training ends, however it ends."""
 
 
 class Reporter:
@@ -49,7 +54,6 @@ class Reporter:
         env_steps: int,
         metrics: IterationMetrics,
         times: Mapping[str, float],
-        ended_s: float | None = None,
     ) -> None:
         """Waits for the iteration that ended at `env_steps` and writes its line.
 
@@ -57,7 +61,6 @@ class Reporter:
           env_steps: see above.
           metrics: of the iteration.
           times: seconds by name, written as they are.
-          ended_s: when it ended, by `time.monotonic`; None: when its metrics are there.
 
         Raises:
           NonFiniteError: an observation, a reward or a loss is NaN or infinite.
@@ -65,7 +68,7 @@ class Reporter:
         # Scalars only: the moments have O numbers each and are of no use in a log.
         scalars = metrics._replace(stats=metrics.stats._replace(obs=0.0, advantage=0.0))
         host: Any = jax.tree.map(float, jax.device_get(scalars))
-        now = time.monotonic() if ended_s is None else ended_s
+        now = time.monotonic()
         self._check_finite(host, env_steps)
         self._count_overflows(host.stats.overflowed)
         episodes = host.stats.episodes
@@ -123,3 +126,56 @@ class Reporter:
         losses = host.losses._asdict()
         if names := [name for name, value in losses.items() if not abs(value) < float("inf")]:
             raise NonFiniteError(f"{where}: {', '.join(names)} of the update is not finite")
+
+
+class ReportThread:
+    """Reports iterations in a thread of its own, one after the other.
+
+    To start an iteration takes the host about as long as the device takes for it. So whoever
+    starts the next one notices too late that this one has ended, and the device would wait while
+    its line is written.
+
+    Args:
+      reporter: is used by the thread only, until `stop`.
+    """
+
+    def __init__(self, reporter: Reporter) -> None:
+        self._reporter = reporter
+        self._queue: SimpleQueue[tuple[Any, ...] | None] = SimpleQueue()
+        self._is_idle = threading.Event()
+        self._is_idle.set()
+        self._error: Exception | None = None
+        # A daemon: a device that hangs must not keep a process alive that has failed.
+        threading.Thread(target=self._run, name="report", daemon=True).start()
+
+    def report(
+        self, env_steps: int, metrics: IterationMetrics, times: Mapping[str, float]
+    ) -> None:
+        """See `Reporter.report`; returns when the iteration before has been reported.
+
+        Raises:
+          NonFiniteError: of that one.
+        """
+        self.wait()
+        self._is_idle.clear()
+        self._queue.put((env_steps, metrics, times))
+
+    def wait(self) -> None:
+        """Returns when all is reported; raises what was met."""
+        self._is_idle.wait()
+        if self._error is not None:
+            raise self._error
+
+    def stop(self) -> None:
+        """Ends the thread, which may finish a line; calling it twice is fine."""
+        self._is_idle.wait(_LAST_LINE_S)
+        self._queue.put(None)
+
+    def _run(self) -> None:
+        while (waiting := self._queue.get()) is not None:
+            try:
+                self._reporter.report(*waiting)
+            # Whatever it is, it is the caller's, who is told with the next call.
+            except Exception as error:
+                self._error = error
+            self._is_idle.set()

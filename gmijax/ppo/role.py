@@ -8,11 +8,8 @@ from __future__ import annotations
 
 import statistics
 import time
-from collections.abc import Mapping
-from concurrent.futures import Future, ThreadPoolExecutor
-from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -26,9 +23,9 @@ from gmijax.errors import NonFiniteError, ParameterMismatch
 from gmijax.learner import Learner, LearnerState, init_learner, make_learner
 from gmijax.metrics import JsonlSink, MetricsLog, TensorBoardSink
 from gmijax.partition.child import ChildLink
-from gmijax.ppo.programs import FusedIteration, Iteration, IterationMetrics
+from gmijax.ppo.programs import FusedIteration, Iteration
 from gmijax.ppo.remote import RemoteIteration, Servants
-from gmijax.ppo.report import Reporter
+from gmijax.ppo.report import Reporter, ReportThread
 from gmijax.ppo.split import SplitIteration
 from gmijax.ppo.throughput import ThroughputMeter
 from gmijax.results import read_metrics
@@ -62,21 +59,6 @@ def train(
       CollectiveError: another GMI is gone or stuck.
     """
     return _SyncTrainer(config, env, reducer, link, servants).run()
-
-
-class _Pending(NamedTuple):
-    """An iteration that is not reported yet; see `Reporter.report`."""
-
-    env_steps: int
-    metrics: IterationMetrics
-    times: Mapping[str, float]
-    ended_s: Future[float]
-
-
-def _end_of(metrics: IterationMetrics) -> float:
-    """When an iteration has ended, by `time.monotonic`; waits for it."""
-    jax.block_until_ready(metrics)
-    return time.monotonic()
 
 
 class _SyncTrainer:
@@ -129,11 +111,13 @@ class _SyncTrainer:
             self._env_steps,
             history[-1]["wall_s"] if history else 0.0,
         )
+        lines = ReportThread(reporter)
         first_steps = self._env_steps
         started = time.monotonic()
         try:
-            state, env_state, stopped = self._loop(state, env_state, reporter)
+            state, env_state, stopped = self._loop(state, env_state, lines)
         finally:
+            lines.stop()
             reporter.close()
         if isinstance(self._iteration, RemoteIteration):
             self._iteration.close()
@@ -206,43 +190,24 @@ class _SyncTrainer:
         return jax.jit(self._env.init)(self._env.model, keys)
 
     def _loop(
-        self, state: LearnerState, env_state: Any, reporter: Reporter
-    ) -> tuple[LearnerState, Any, bool]:
-        # To start an iteration takes about as long as the device takes for it, so that this thread
-        # would notice too late that the one before has ended.
-        with ThreadPoolExecutor(1) as clock:
-            return self._iterate(state, env_state, reporter, clock)
-
-    def _iterate(
-        self,
-        state: LearnerState,
-        env_state: Any,
-        reporter: Reporter,
-        clock: ThreadPoolExecutor,
+        self, state: LearnerState, env_state: Any, lines: ReportThread
     ) -> tuple[LearnerState, Any, bool]:
         every = self._config.run.checkpoint_every
-        pending: _Pending | None = None
         stop = False
         while self._env_steps < self._config.num_timesteps and not stop:
-            # The metrics of the iteration before are fetched while this one runs.
-            tell = partial(self._report, reporter, pending)
-            state, env_state, metrics = self._iteration(state, env_state, tell)
+            state, env_state, metrics = self._iteration(state, env_state)
             self._env_steps += self._steps_per_iteration
             self._iterations += 1
-            ended_s = clock.submit(_end_of, metrics)
-            pending = _Pending(self._env_steps, metrics, self._iteration.times, ended_s)
+            lines.report(self._env_steps, metrics, self._iteration.times)
+            self._link.beat("running", self._iterations)
             stop = self._agree_to_stop()
             is_last = stop or self._env_steps >= self._config.num_timesteps
             if not is_last and every and self._iterations % every == 0:
+                lines.wait()  # A resumed run goes on from the lines up to its checkpoint.
                 self._save(state, env_state)
-        self._report(reporter, pending)
+        lines.wait()
         self._save(state, env_state)
         return state, env_state, stop
-
-    def _report(self, reporter: Reporter, pending: _Pending | None) -> None:
-        if pending is not None:
-            reporter.report(*pending[:3], pending.ended_s.result())
-            self._link.beat("running", self._iterations)
 
     def _agree_to_stop(self) -> bool:
         # Only one GMI may have heard of it yet; all must leave after the same iteration.

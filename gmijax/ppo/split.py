@@ -26,7 +26,7 @@ from gmijax.learner import (
 )
 from gmijax.ppo.learner import finish_iteration, gradients, minibatch_order, update_context
 from gmijax.ppo.losses import LossMetrics, Samples, UpdateContext
-from gmijax.ppo.programs import IterationMetrics, flatten, metrics_of, nothing_else
+from gmijax.ppo.programs import IterationMetrics, flatten, metrics_of
 from gmijax.ppo.rollout import RolloutStats, collect, merge_stats, stats_example
 from gmijax.sim.wrappers import BatchedEnv, BatchState
 from gmijax.types import Array, PyTree
@@ -84,14 +84,12 @@ class SplitIteration:
         self,
         state: LearnerState,
         env_state: BatchState,
-        meanwhile: Callable[[], None] = nothing_else,
     ) -> tuple[LearnerState, BatchState, IterationMetrics]:
         """See `Iteration`."""
         started = time.monotonic()
         env_state, samples, order, packed = self._rollout(
             self._env.model, state, env_state, self._rank
         )
-        meanwhile()
         mine = np.asarray(packed)  # Waits for the rollout.
         rollout_s = time.monotonic() - started
         state, metrics = self.update(state, samples, order, mine)

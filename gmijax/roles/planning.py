@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Sequence
-from typing import Literal, TypeAlias
+from typing import Any, Literal, TypeAlias
 
 from gmijax.config import PlanConfig, ReduceConfig
 from gmijax.partition.machine import detect_machine
 from gmijax.partition.plan import Plan
 from gmijax.partition.planner import make_plan
+from gmijax.schema import from_dict
 
 BackendChoice: TypeAlias = Literal["auto", "mps", "mig", "share", "cpu"]
 
@@ -41,15 +42,17 @@ def plan(
     Raises:
       ConfigError: bad input, or this machine cannot do it.
     """
-    wanted = PlanConfig(
-        gpus=gpus if isinstance(gpus, int) else tuple(gpus),
-        gmis_per_gpu=gmis_per_gpu,
-        layout=None if layout is None else tuple(tuple(gmis) for gmis in layout),
-        backend=backend,
-        sm_percent=_per_gmi(sm_percent),
-        memory_fraction=_per_gmi(memory_fraction),
-        template="auto",
-    )
+    given = {
+        "gpus": gpus,
+        "gmis_per_gpu": gmis_per_gpu,
+        "layout": layout,
+        "backend": backend,
+        "sm_percent": sm_percent,
+        "memory_fraction": memory_fraction,
+        "template": "auto",
+    }
+    # As from a command line: what is no number, or not among the allowed, is told in one line.
+    wanted = from_dict(PlanConfig, {key: _plain(value) for key, value in given.items()}, "plan.")
     reduce = ReduceConfig(strategy=strategy, intra="host", timeout_s=1.0)
     made = make_plan(wanted, reduce, 0, detect_machine())
     # What the templates call roles are parts of reinforcement learning.
@@ -57,5 +60,8 @@ def plan(
     return dataclasses.replace(made, roles=(), reasons=reasons)
 
 
-def _per_gmi(share: float | Sequence[float] | None) -> float | tuple[float, ...] | None:
-    return tuple(share) if isinstance(share, Sequence) else share
+def _plain(value: Any) -> Any:
+    """Sequences of any kind as lists."""
+    if isinstance(value, Sequence) and not isinstance(value, str):
+        return [_plain(item) for item in value]
+    return value

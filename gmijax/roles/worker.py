@@ -24,6 +24,10 @@ if TYPE_CHECKING:
     from gmijax.collectives.ring import World
 
 
+_SETTLE_S = 1.0
+"""After so long a GMI that only waits for others to receive says that it is alive."""
+
+
 def main() -> int:
     """Runs this process's GMI; returns the exit code."""
     return run_gmi(_run)
@@ -59,8 +63,10 @@ def _run(link: ChildLink) -> dict[str, Any]:
     enter(Gmi(plan.layout, messenger, reducer, link))
     link.beat("ready", 0)
     output = shipping.dump(role.run(*args))
-    # What was sent must be in shared memory before this process is gone.
+    # What was sent must be in shared memory before this process is gone, or have been received.
     messenger.flush()
+    while not messenger.settle(_SETTLE_S):
+        link.beat("running", 0)
     reducer.close()
     link.paths.output.write_bytes(output)
     return {"status": "completed"}

@@ -41,8 +41,8 @@ ON_GPU: Mapping[str, OnGpu] = MappingProxyType(
     {
         "ant": OnGpu("warp"),
         "anymal": OnGpu("warp"),
-        "ball_balance": OnGpu("jax"),
-        "franka_cabinet": OnGpu("jax"),
+        "ball_balance": OnGpu("warp"),
+        "franka_cabinet": OnGpu("warp"),
         "humanoid": OnGpu("warp"),
         # MJX-JAX keeps the 12 deepest contacts, Warp all: up to 10 under random actions, 20 fit.
         "shadow_hand": OnGpu("warp", WarpSizes(contacts_per_env=12, constraints_per_env=108)),

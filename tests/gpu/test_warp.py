@@ -58,6 +58,7 @@ def test_a_task_steps_as_with_mjx_jax(task: str, tmp_path: Path) -> None:
         env=child_environment() | {"XLA_PYTHON_CLIENT_PREALLOCATE": "false"},
         capture_output=True,
         text=True,
+        timeout=1100,
     )
     assert done.returncode == 0, done.stderr[-2000:]
     assert json.loads(done.stdout.splitlines()[-1]) == {"obs": [], "reward": []}

@@ -128,6 +128,19 @@ def test_a_job_goes_on_from_its_checkpoint(two_and_two: Path) -> None:
 
 
 @pytest.mark.timeout(120)
+@pytest.mark.parametrize("strategy", ["flat", "har"])
+def test_trainers_on_several_gpus_reduce_in_rings(strategy: str, tmp_path: Path) -> None:
+    cwd = _folder(tmp_path)
+    done = train(
+        *SMALL, "plan.serving_gpus=[0,1]", "plan.training_gpus=[0,1]", "run.dir=run",
+        f"reduce.strategy={strategy}", f"num_timesteps={20 * 2 * UPDATE}", cwd=cwd,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    plan = _read(cwd / "run" / "summary.json")["plan"]
+    assert (plan["layout"], plan["strategy"]) == ([[0, 2], [1, 3]], strategy)
+
+
+@pytest.mark.timeout(120)
 @pytest.mark.parametrize("victim", [0, 2], ids=["trainer", "agent"])
 def test_a_killed_gmi_ends_the_job_and_is_named(victim: int, tmp_path: Path) -> None:
     cwd, shm = _folder(tmp_path), shared_memory()
@@ -169,6 +182,9 @@ def test_an_interrupt_saves_the_whole_job(tmp_path: Path) -> None:
         (("algo.batch_size=24",), "algo.batch_size=24"),
         (("algo.num_minibatches=3",), "algo.num_minibatches=3"),
         (("plan.template=tcg_ex",), "plan.template=tcg_ex"),
+        (("channel.float16=[done]",), "channel.float16=['done']"),
+        (("channel.transport=device",), "channel.transport=device: CUDA IPC needs an NVIDIA GPU"),
+        (("plan.mps_priority=trainers_first",), "plan.mps_priority=trainers_first"),
         (("plan.training_gmis_per_gpu=2", "reduce.strategy=mrr"), "reduce.strategy=mrr"),
     ],
 )

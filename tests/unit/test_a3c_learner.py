@@ -12,11 +12,13 @@ import pytest
 from toy_env import point_mass
 
 from gmijax.a3c.learner import acting_weights, num_weights, pack_weights, unpack_weights
+from gmijax.a3c.losses import Unrolls
 from gmijax.a3c.programs import FusedUpdate, SplitUpdate, exchange_size
 from gmijax.a3c.rollout import UnrollPrograms, collect
 from gmijax.a3c.staleness import histogram_of, mean_and_p99
 from gmijax.cli import compose
 from gmijax.collectives.solo import SoloReducer
+from gmijax.decoupled import FLOAT_CHANNELS
 from gmijax.learner import init_learner, make_learner
 from gmijax.sim.wrappers import env_keys
 
@@ -96,6 +98,10 @@ def test_pieces_make_the_unroll_that_they_are_parts_of(config) -> None:
 def test_pieces_are_equal_and_not_longer_than_asked_for(config, length, every, pieces) -> None:
     changed = dataclasses.replace(config, unroll_length=length, weights_every=every)
     assert changed.pieces_per_unroll == pieces
+
+
+def test_the_channels_that_may_lose_precision_are_those_of_floats() -> None:
+    assert set(FLOAT_CHANNELS) == set(Unrolls._fields) - {"done"}
 
 
 def test_unrolls_without_weight_teach_nothing(config) -> None:

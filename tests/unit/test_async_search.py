@@ -13,7 +13,7 @@ import pytest
 from rich.console import Console
 from supervision import gpu, machine
 
-from gmijax import searching
+from gmijax import auto, searching
 from gmijax.async_search import (
     FEWEST_LINES,
     Enough,
@@ -95,6 +95,13 @@ def test_agents_that_only_wait_have_no_endless_rate():
 def test_lines_hold_enough_batches_and_are_several(updates: list[float], start: int | None):
     lines = [line(i, 0, async__updates=number) for i, number in enumerate(updates)]
     assert window_start(lines, 6) == start
+
+
+def test_lines_hold_something_that_agents_made():
+    """An unroll of many batches: until the next one is sent, agents have no rate."""
+    lines = [line(i, 0, async__pps=rate) for i, rate in enumerate([9.0, 0, 9.0, 0, 0, 0, 0])]
+    assert window_start(lines, 2) == 2
+    assert window_start([lines[0], *lines[3:]], 2) is None
 
 
 def test_a_profile_is_read_when_channels_had_filled(tmp_path: Path):
@@ -215,9 +222,7 @@ def asked(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> list[Point]:
 
 def decided(*overrides: str) -> tuple[TrainConfig, str, str]:
     said = io.StringIO()
-    config, (reason,) = searching.decided(
-        wanted(*overrides), machine(0), Console(file=said, width=400)
-    )
+    config, (reason,) = auto.decided(wanted(*overrides), machine(0), Console(file=said, width=400))
     return config, reason, said.getvalue()
 
 

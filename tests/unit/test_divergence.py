@@ -9,10 +9,10 @@ import pytest
 from toy_env import point_mass
 
 from gmijax.errors import NonFiniteError
-from gmijax.metrics import MetricsLog
+from gmijax.metrics import Line, MetricsLog
 from gmijax.ppo.losses import LossMetrics
 from gmijax.ppo.programs import IterationMetrics
-from gmijax.ppo.report import TOLERATED_STEPS, Reporter
+from gmijax.ppo.report import TOLERATED_STEPS, Reporter, ReportThread
 from gmijax.ppo.rollout import stats_example
 from gmijax.sim.wrappers import env_keys
 
@@ -70,3 +70,32 @@ def test_few_bad_steps_are_tolerated_and_many_are_named(count: int) -> None:
     else:
         with pytest.raises(NonFiniteError, match=r"point_mass, up to env step 64: .* reward/near"):
             reporter.report(64, metrics, {})
+
+
+def _metrics(bad_steps: int) -> IterationMetrics:
+    stats = stats_example(ENV.spec)
+    stats = stats._replace(diverged=stats.diverged | {"any": jnp.asarray(bad_steps)})
+    zero = jnp.zeros(())
+    return IterationMetrics(stats, LossMetrics(*[zero] * 5), zero, zero)
+
+
+def test_lines_come_in_order_from_a_thread_of_their_own_and_errors_with_the_next_call() -> None:
+    written: list[Line] = []
+
+    class Sink:
+        def write(self, line: Line) -> None:
+            written.append(line)
+
+        def close(self) -> None:
+            pass
+
+    lines = ReportThread(Reporter("point_mass", MetricsLog((Sink(),)), 0))
+    for iteration in (1, 2, 3):
+        lines.report(64 * iteration, _metrics(0), {})
+    lines.wait()
+    assert [line["env_steps"] for line in written] == [64, 128, 192]
+    lines.report(256, _metrics(TOLERATED_STEPS + 1), {})
+    with pytest.raises(NonFiniteError, match="up to env step 256"):
+        lines.report(320, _metrics(0), {})
+    lines.stop()
+    assert len(written) == 3

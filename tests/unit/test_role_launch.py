@@ -69,6 +69,9 @@ def test_bad_input_of_launch(
         ({"gpus": 0}, "plan.gpus=0"),
         ({"gmis_per_gpu": 0}, "plan.gmis_per_gpu=0"),
         ({"layout": [[0], [2]]}, "GMI ids must be 0 to 1"),
+        ({"gpus": "two"}, "plan.gpus=two: expected an integer or a list of integers"),
+        ({"gmis_per_gpu": 1.5}, "plan.gmis_per_gpu=1.5: expected an integer"),
+        ({"backend": "tpu"}, "plan.backend=tpu: expected one of auto, mps"),
         ({"backend": "cpu", "sm_percent": 50.0}, "plan.sm_percent=50"),
     ],
 )

@@ -156,6 +156,27 @@ def test_places_on_the_device_are_used_again_and_never_too_early() -> None:
     assert 10 <= sum(issubclass(kind, jax.Array) for kind in kinds) < 40
 
 
+def test_a_rank_may_end_when_what_it_left_on_the_device_is_received() -> None:
+    first, second = posts(2)
+    first.send(jnp.arange(5000.0), 1)
+    first.flush(0.01)
+    assert not first.settle(0.01)
+    second.recv(0)
+    assert first.settle(0.01)
+    first.send(np.arange(5000.0), 1)
+    assert first.settle(0.01)  # In shared memory it outlives its sender.
+
+
+def test_two_ranks_that_end_do_not_wait_for_each_other() -> None:
+    first, second = posts(2)
+    first.send(jnp.arange(5000.0), 1)
+    second.send(jnp.arange(5000.0), 0)
+    assert not first.settle(0.01)  # It has taken what came, so the other one may end.
+    assert second.settle(0.01)
+    assert first.settle(0.01)
+    np.testing.assert_array_equal(first.recv(1), np.arange(5000.0))  # It is not lost by that.
+
+
 def test_without_shared_memory_of_a_device_all_go_through_the_host() -> None:
     class Refused(FakeDeviceMemory):
         def create(self, num_bytes: int) -> bytes:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import functools
 import io
 import json
@@ -14,6 +15,7 @@ from rich.console import Console
 from supervision import machine
 
 from gmijax import searching
+from gmijax.auto import decided
 from gmijax.cli import compose
 from gmijax.config import TrainConfig
 from gmijax.errors import ConfigError, GmijaxError, JobInterrupted
@@ -222,12 +224,22 @@ def test_one_gmi_is_said_plainly(profiles: Callable[[Answer], Profiles]):
 
 def test_a_job_with_auto_gets_the_answer_and_the_reason(profiles: Callable[[Answer], Profiles]):
     profiles(scaling)
-    config, reasons = searching.decided(wanted(), machine(0), Console(quiet=True))
+    config, reasons = decided(wanted(), machine(0), Console(quiet=True))
     assert (config.num_envs, config.plan.gmis_per_gpu) == (128, 4)
     assert config.physics.impl == "jax"
     assert reasons[0].startswith("4 GMIs per GPU with 128 environments each, jax: ")
     given = compose("num_envs=64")
-    assert searching.decided(given, machine(0), Console(quiet=True)) == (given, ())
+    assert decided(given, machine(0), Console(quiet=True)) == (given, ())
+
+
+def test_a_job_with_too_few_gpus_is_refused_before_anything_is_profiled(
+    profiles: Callable[[Answer], Profiles],
+):
+    asked = profiles(scaling)
+    config = dataclasses.replace(wanted(), plan=dataclasses.replace(wanted().plan, gpus=3))
+    with pytest.raises(ConfigError, match=r"plan\.gpus=3: this machine has 2 usable GPUs"):
+        decided(config, machine(2, mps_control=MPS), Console(quiet=True))
+    assert asked.asked == []
 
 
 @pytest.mark.parametrize(

@@ -67,14 +67,20 @@ def test_the_plan_carries_roles_and_only_trainers_reduce():
     assert Plan.from_dict(json.loads(json.dumps(two.to_dict()))) == two
 
 
-def test_rings_among_some_gmis_only_are_refused():
-    with pytest.raises(ConfigError, match=r"needs every GMI to train; with trainers \[0, 2\]"):
-        make_plan(
-            plan_config(gpus=2, gmis_per_gpu=2, template="tdg_ex"),
-            reduce_config(strategy="mrr"),
-            8,
-            machine(0),
-        )
+def test_the_layout_of_the_trainers_decides_how_they_reduce():
+    def planned(strategy: str, gmis_per_gpu: int = 2) -> Plan:
+        config = plan_config(gpus=2, gmis_per_gpu=gmis_per_gpu, template="tdg_ex")
+        return make_plan(config, reduce_config(strategy=strategy), 8, machine(0))
+
+    plan = planned("flat")  # One trainer on every GPU, whatever else is there.
+    assert plan.strategy == "flat"
+    assert plan.training_layout.gmis_of_gpu == ((0,), (1,))
+    assert planned("mrr").strategy == "mrr"
+    alone = plan_config(gpus=1, gmis_per_gpu=2, template="tdg_ex")
+    with pytest.raises(
+        ConfigError, match=r"reduce\.strategy=flat: cannot run on layout \[\[0\]\]"
+    ):
+        make_plan(alone, reduce_config(strategy="flat"), 8, machine(0))
 
 
 def test_plans_of_older_versions_have_holistic_gmis():

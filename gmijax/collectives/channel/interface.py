@@ -30,7 +30,8 @@ class Batch(NamedTuple):
 
     Attributes:
       experience: arrays by channel, [S, B, ...]; read-only views that are valid until the next
-        `receive`, of host memory or of the device's.
+        `receive`, of host memory or of the device's. The latter are for programs: the same view
+        comes again with other values, and jax keeps what `np.asarray` once read of it.
       versions: [B] int64, the policy version that every unroll was made with.
       agents: [B] int64, ranks of the agents that made them.
     """

@@ -1,0 +1,54 @@
+"""What is `auto` in a training job is searched for before it starts. No jax here."""
+
+from __future__ import annotations
+
+import dataclasses
+
+from rich.console import Console
+
+from gmijax.async_search import settled
+from gmijax.config import TrainConfig
+from gmijax.decoupled import is_decoupled
+from gmijax.errors import ConfigError
+from gmijax.partition.backend_choice import candidates
+from gmijax.partition.machine import Machine
+from gmijax.partition.placement import serving_and_training
+from gmijax.profiling import Workload, platform_of
+from gmijax.searching import is_auto, resolve_auto, workload_of
+
+
+def decided(
+    config: TrainConfig, machine: Machine, console: Console
+) -> tuple[TrainConfig, tuple[str, ...]]:
+    """A training job with everything decided that was `auto`, and the reasons in words.
+
+    Raises:
+      ConfigError: too few GPUs for the job, before anything is profiled.
+      ConfigError, GmijaxError, JobInterrupted: as `gmijax.searching.search`.
+    """
+    if not is_auto(config):
+        return config, ()
+    workload = workload_of(config)
+    _require_gpus(config, workload, machine)
+    result = resolve_auto(workload, config.search, machine, console)
+    plan = dataclasses.replace(config.plan, gmis_per_gpu=result.gmis_per_gpu)
+    if is_decoupled(config):
+        plan = settled(config.plan, result.gmis_per_gpu, result.trainers, result.split)
+    physics = dataclasses.replace(config.physics, impl=result.impl)
+    config = dataclasses.replace(config, num_envs=result.num_envs, plan=plan, physics=physics)
+    return config, (result.reason,)
+
+
+def _require_gpus(config: TrainConfig, workload: Workload, machine: Machine) -> None:
+    """Refuses a job that cannot start: a search by itself only projects to many GPUs."""
+    if platform_of(workload, machine) == "cpu":
+        return
+    needed = workload.num_gpus
+    if is_decoupled(config):
+        serving, training, _ = serving_and_training(workload.plan)
+        needed = len({*serving, *training})
+    if needed > (here := len(candidates(workload.plan, machine))):
+        raise ConfigError(
+            f"plan.gpus={needed}: this machine has {here} usable GPUs (any number is allowed "
+            "with plan.backend=cpu)"
+        )
