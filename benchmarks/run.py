@@ -176,18 +176,24 @@ def command(case: Case) -> str:
 
 
 def outcome(folder: Path) -> dict[str, Any]:
-    """The summary of a run, its curve thinned out, and the median times of its parts."""
+    """The summary of a run, its curve thinned out, and medians of times, losses and rates."""
     lines = read_metrics(folder / "metrics.jsonl")
     kept = lines[:: max(1, len(lines) // CURVE_POINTS)]
     kept += [] if kept[-1] is lines[-1] else lines[-1:]
-    times = [key for key in lines[-1] if key.startswith("time/")]
+    names = [key for key in lines[-1] if key.startswith(("time/", "loss/", "async/"))]
     return {
         "summary": json.loads((folder / "summary.json").read_text()),
         "curve": [[line["env_steps"], line["wall_s"], line["return"]] for line in kept],
         "metrics": {k: v for k, v in lines[-1].items() if k.startswith("metric/")},
         "diverged_steps": sum(line["diverged_steps"] for line in lines),
-        "times": {key: statistics.median(line[key] for line in lines) for key in times},
+        "medians": {name: _median_of(lines, name) for name in names},
     }
+
+
+def _median_of(lines: list[dict[str, Any]], name: str) -> float | None:
+    """Over the lines that have a value."""
+    found = [line[name] for line in lines if line.get(name) is not None]
+    return statistics.median(found) if found else None
 
 
 def table(results: dict[str, Any]) -> str:
