@@ -40,9 +40,13 @@ def main() -> int:
     parser.add_argument("--runs", type=Path, help="keep the run folders here")
     parser.add_argument("--resume", action="store_true", help="add to the runs in the JSON file")
     arguments = parser.parse_args()
-    needed = max(case.gpus for suite in arguments.suites for case in SUITES[suite])
-    if arguments.gpus is not None and arguments.gpus < needed:
-        parser.error(f"--gpus {arguments.gpus}: a case of these suites needs {needed}")
+    cases = [case for suite in arguments.suites for case in SUITES[suite]]
+    if arguments.gpus is not None:
+        large = [case for case in cases if case.gpus > arguments.gpus]
+        if len(large) == len(cases):
+            parser.error(f"--gpus {arguments.gpus}: every case of these suites needs more")
+        for case in large:
+            sys.stderr.write(f"{case.name}: left out, it needs {case.gpus} GPUs\n")
     arguments.out.mkdir(parents=True, exist_ok=True)
     books = {
         suite: ResultsFile(arguments.out / f"{suite}.json", suite, resume=arguments.resume)
@@ -77,14 +81,14 @@ class ResultsFile:
         }
         self._lock = threading.Lock()
 
-    def missing(self, repeats: int) -> list[tuple[int, Case]]:
-        """Runs that are still to be made, every case once before any case again."""
+    def missing(self, repeats: int, gpus: int | None) -> list[tuple[int, Case]]:
+        """Runs to be made, every case once before any case again; none that needs more GPUs."""
         cases = self.results["cases"]
         return [
             (repeat, case)
             for repeat in range(repeats)
             for case in SUITES[self.results["suite"]]
-            if len(cases[case.name]["runs"]) <= repeat
+            if len(cases[case.name]["runs"]) <= repeat and case.gpus <= (gpus or case.gpus)
         ]
 
     def add(self, case: Case, run: Mapping[str, Any]) -> None:
@@ -140,7 +144,7 @@ def run_all(books: Mapping[str, ResultsFile], repeats: int, runs: Path, gpus: in
         started = [
             pool.submit(run, book, repeat, case)
             for book in books.values()
-            for repeat, case in book.missing(repeats)
+            for repeat, case in book.missing(repeats, gpus)
         ]
         try:
             for one in started:
