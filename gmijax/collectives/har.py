@@ -16,7 +16,7 @@ from gmijax.collectives.intra import B, IntraExchange
 from gmijax.collectives.mrr import open_rings, run_watched
 from gmijax.collectives.ring import Ring, World
 from gmijax.collectives.turns import Turns
-from gmijax.partition.reduction import leaders
+from gmijax.partition.reduction import is_even, leaders
 
 T = TypeVar("T")
 
@@ -24,12 +24,17 @@ T = TypeVar("T")
 class _Hierarchy(Generic[B]):
     """What both forms of HAR have in common; B is how they hold a buffer.
 
+    Attributes:
+      is_device_resident: see `Reducer`.
+
     Args:
       host: this rank's use of the shared block.
       intra: the exchange inside a GPU.
       world: this process among those of all GMIs; None with one GPU, which needs no ring.
       num_floats: P, length of the buffers for `mean`.
     """
+
+    is_device_resident: bool
 
     def __init__(
         self, host: HostExchange, intra: IntraExchange[B], world: World | None, num_floats: int
@@ -39,7 +44,10 @@ class _Hierarchy(Generic[B]):
         self._host = host
         self._intra = intra
         self._num_floats = num_floats
-        self._ring = None if world is None else LeaderRing(host, world, num_floats)
+        self._ring: LeaderRing | None = None
+        if world is not None:
+            of_all = self.is_device_resident and is_even(world.layout)
+            self._ring = LeaderRing(host, world, num_floats, of_all=of_all)
 
     def all_gather(self, values: FloatBuffer) -> FloatBuffer:
         """See `HostExchange.all_gather`."""
@@ -81,7 +89,11 @@ class HarReducer(_Hierarchy[FloatBuffer]):
 
 
 class DeviceHarReducer(_Hierarchy[jax.Array]):
-    """The same without leaving the GPUs: a `DeviceReducer`."""
+    """The same without leaving the GPUs: a `DeviceReducer`.
+
+    Where all GPUs have as many GMIs, every GMI is a leader: it sums over its GPU by itself, and
+    the k-th GMIs of all GPUs have a ring. Then nobody waits for a leader's answer.
+    """
 
     is_device_resident = True
 
@@ -100,6 +112,8 @@ class DeviceHarReducer(_Hierarchy[jax.Array]):
         if mean is not None and self._ring is not None:
             mean = self._ring.mean(mean, turns)
         result = self._intra.spread(mean, block, turns)
+        if self._ring is not None and self._ring.is_of_all:
+            turns.arrive()  # Where others look for this rank while their rings run.
         turns.end()
         return result
 
@@ -124,13 +138,21 @@ class LeaderRing:
       host: this rank's use of the shared block.
       world: this process among those of all GMIs.
       num_floats: P, length of the buffers.
+      of_all: all GMIs lead, and the k-th of all GPUs have a ring; the layout must be even.
+
+    Attributes:
+      is_of_all: the same.
     """
 
-    def __init__(self, host: HostExchange, world: World, num_floats: int) -> None:
+    def __init__(self, host: HostExchange, world: World, num_floats: int, *, of_all: bool) -> None:
         host.rendezvous()
+        self.is_of_all = of_all
         self._scale = 1.0 / host.world_size
         self._courier = Courier("ring")
         members = leaders(world.layout)
+        if of_all:
+            place = world.layout.neighbours_of(host.rank).index(host.rank)
+            members = tuple(gmis[place] for gmis in world.layout.gmis_of_gpu)
         self._ring: Ring | None = None
         if host.rank in members:
             self._ring = world.ring(members, num_floats)
@@ -147,4 +169,6 @@ class LeaderRing:
 
     def _mean(self, total: jax.Array) -> jax.Array:
         assert self._ring is not None
+        if self.is_of_all:
+            return self._ring.ordered_sum(total, self._scale)
         return self._ring.sum(total, self._scale)

@@ -39,7 +39,7 @@ class IntraExchange(Protocol[B]):
     def sum(self, buffer: B, block: ExchangeBlock, turns: Turns, scale: float) -> B | None:
         """The sum of `buffer` [P] over this GPU's GMIs, times `scale`, for its leader; else None.
 
-        With one GPU, whose sum is the whole, others may get it too.
+        With an even layout others may get it too.
         """
         ...
 

@@ -19,7 +19,7 @@ from gmijax.collectives.memory import ExchangeBlock
 from gmijax.collectives.mrr import explained
 from gmijax.collectives.turns import Turns
 from gmijax.partition.layout import Layout
-from gmijax.partition.reduction import leaders
+from gmijax.partition.reduction import is_even, leaders
 
 TICKET_BYTES = 64
 """Room for what another process needs to open a block."""
@@ -62,11 +62,12 @@ class DeviceMemory(Protocol):
 class IpcIntra:
     """Through a block of device memory that the leader makes: two slots a GMI, one result.
 
-    With one GPU every rank writes its slot, they meet, and every rank sums all slots, in the same
-    order. The two slots are used in turn, so that one meeting suffices: a rank that writes a slot
-    again has passed the meeting in between, before which all had finished reading.
+    With one GPU, or as many GMIs on all, every rank writes its slot, they meet, and every rank
+    sums all slots of its GPU, in the same order. The two slots are used in turn, so that one
+    meeting suffices: a rank that writes a slot again has passed the meeting in between, before
+    which all had finished reading.
 
-    With several GPUs the leaders alone sum. `spread`: they write the mean into the result; all
+    With other layouts the leaders alone sum. `spread`: they write the mean into the result; all
     meet; the others copy it. It is written again after the next call's first meeting, before
     which all had finished copying.
 
@@ -96,7 +97,7 @@ class IpcIntra:
         neighbours = layout.neighbours_of(rank)
         leader = leaders(layout)[layout.gpu_of(rank)]
         self._count = len(neighbours)
-        self._all_sum = layout.num_gpus == 1
+        self._all_sum = is_even(layout)
         self._sums = self._all_sum or rank == leader
         self._memory: DeviceMemory | None = None
         self._slots: list[jax.Array] = []
@@ -162,7 +163,7 @@ class IpcIntra:
     def sum(
         self, buffer: jax.Array, block: ExchangeBlock, turns: Turns, scale: float
     ) -> jax.Array | None:
-        """See `IntraExchange`; with one GPU every rank gets the sum."""
+        """See `IntraExchange`; with an even layout every rank gets the sum."""
         del block
         self._num_means += 1
         half = self._num_means % 2

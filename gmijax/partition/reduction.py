@@ -102,6 +102,11 @@ def leaders(layout: Layout) -> tuple[int, ...]:
     return tuple(min(gmis) for gmis in layout.gmis_of_gpu)
 
 
+def is_even(layout: Layout) -> bool:
+    """Whether every GPU has as many GMIs as the others."""
+    return len({len(gmis) for gmis in layout.gmis_of_gpu}) == 1
+
+
 def _is_installed(*modules: str) -> bool:
     """Whether all modules can be imported; the packages of each come before it."""
     return all(importlib.util.find_spec(module) is not None for module in modules)
