@@ -18,13 +18,13 @@ from typing import Any
 from benchmarks.run import RESULTS
 from gmijax.collectives.cost_model import BYTES_PER_FLOAT, predicted_s
 from gmijax.config import PlanConfig, ReduceConfig
+from gmijax.control.selection import Probe, candidates, measure
 from gmijax.errors import ConfigError
 from gmijax.partition.layout import Layout
 from gmijax.partition.machine import Machine, detect_machine
 from gmijax.partition.plan import Plan
 from gmijax.partition.planner import make_plan
 from gmijax.partition.reduction import select_strategy
-from gmijax.selection import Probe, candidates, measure
 
 SIZES = (110_000, 290_000, 1_500_000)
 PROBE_FLOATS = 6_000_000

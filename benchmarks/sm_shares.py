@@ -20,8 +20,8 @@ from typing import Any
 from benchmarks.run import RESULTS
 from benchmarks.sm_share_rank import LIBRARIES
 from gmijax.config import PlanConfig, ReduceConfig
+from gmijax.control.launcher import Launch, run_gmis
 from gmijax.errors import ConfigError, GmiFailed
-from gmijax.launcher import Launch, run_gmis
 from gmijax.partition.machine import Machine, detect_machine
 from gmijax.partition.planner import make_plan
 from gmijax.partition.supervisor import Patience

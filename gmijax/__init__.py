@@ -13,13 +13,13 @@ from gmijax.version import __version__
 
 if TYPE_CHECKING:
     from gmijax.cli import compose
-    from gmijax.job import Result, train
+    from gmijax.control.job import Result, train
+    from gmijax.control.searching import search
+    from gmijax.control.serving import Served, serve
     from gmijax.roles.launch import launch
     from gmijax.roles.manager import GMIManager
     from gmijax.roles.planning import plan
     from gmijax.roles.role import Role
-    from gmijax.searching import search
-    from gmijax.serving import Served, serve
     from gmijax.sim.registry import make_env, task_names
 
 __all__ = [
@@ -40,17 +40,17 @@ __all__ = [
 
 _HOMES = {
     "GMIManager": "gmijax.roles.manager",
-    "Result": "gmijax.job",
+    "Result": "gmijax.control.job",
     "Role": "gmijax.roles.role",
-    "Served": "gmijax.serving",
+    "Served": "gmijax.control.serving",
     "compose": "gmijax.cli",
     "launch": "gmijax.roles.launch",
     "make_env": "gmijax.sim.registry",
     "plan": "gmijax.roles.planning",
-    "search": "gmijax.searching",
-    "serve": "gmijax.serving",
+    "search": "gmijax.control.searching",
+    "serve": "gmijax.control.serving",
     "task_names": "gmijax.sim.registry",
-    "train": "gmijax.job",
+    "train": "gmijax.control.job",
 }
 
 

@@ -10,11 +10,11 @@ from typing import Final, NamedTuple
 from rich.console import Console
 from rich.table import Table
 
-from gmijax.diagnosis import Diagnosis, diagnose
+from gmijax.control.diagnosis import Diagnosis, diagnose
+from gmijax.control.sight import look
 from gmijax.errors import ConfigError
 from gmijax.partition.machine import Machine, detect_machine
 from gmijax.partition.mig_split import split_commands
-from gmijax.sight import look
 from gmijax.version import __version__
 
 USAGE: Final = """usage: python -m gmijax.doctor [--json] [--help]

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import sys
 
-from gmijax import evaluation
 from gmijax.cli import EXIT_OK, command
 from gmijax.config import PlayConfig
+from gmijax.control import evaluation
 
 
 def _run(config: PlayConfig) -> int:

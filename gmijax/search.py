@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import sys
 
-from gmijax import searching
 from gmijax.cli import EXIT_OK, command
 from gmijax.config import TrainConfig
+from gmijax.control import searching
 
 
 def _run(config: TrainConfig) -> int:

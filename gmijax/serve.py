@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import sys
 
-from gmijax import serving
 from gmijax.cli import EXIT_OK, command
 from gmijax.config import ServeConfig
+from gmijax.control import serving
 
 
 def _run(config: ServeConfig) -> int:

@@ -1,7 +1,7 @@
 """Algorithm 2 of the paper (section 5.2): which environments per GMI and GMIs per GPU. No jax.
 
-Pure rules over a `profile` function that measures one point; `gmijax.searching` gives it one that
-runs training jobs, tests give it a formula. What the lines of the paper became:
+Pure rules over a `profile` function that measures one point; `gmijax.control.searching` gives it
+one that runs training jobs, tests give it a formula. What the lines of the paper became:
 
 - 2, 4: every number of GMIs, 10 ... 1, with every num_env, 128 ... 16384. The same grid, and the
   same order inside a row; which rows and sizes come first is for `Rules.coarse_first` to say.

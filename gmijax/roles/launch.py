@@ -12,8 +12,8 @@ from typing import Any, Final
 
 from gmijax.collectives.messenger import MIN_CAPACITY_BYTES
 from gmijax.collectives.pipe_block import create_pipes
+from gmijax.control.launcher import Launch, run_gmis
 from gmijax.errors import ConfigError, GmiFailed, GmijaxError
-from gmijax.launcher import Launch, run_gmis
 from gmijax.partition.child import ENV_GMI, ENV_PIPES_FD
 from gmijax.partition.machine import detect_machine
 from gmijax.partition.plan import Plan

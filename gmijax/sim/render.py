@@ -147,7 +147,7 @@ def choose_camera(model: Any, wanted: str | None) -> int:
 
 
 def load_trajectory(path: Path) -> Trajectory:
-    """Reads what `gmijax.playback` wrote."""
+    """Reads what `gmijax.workers.playback` wrote."""
     with np.load(path) as data:
         return Trajectory(data["qpos"], data["lengths"], float(data["control_dt_s"]))
 

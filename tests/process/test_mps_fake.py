@@ -12,8 +12,8 @@ from pathlib import Path
 import pytest
 from supervision import CHECKOUT, TESTS, gpu, machine, make_job, plan_config, reduce_config
 
+from gmijax.control.launcher import Launch, run_gmis
 from gmijax.errors import BackendUnavailable, GmiFailed, JobInterrupted
-from gmijax.launcher import Launch, run_gmis
 from gmijax.partition.backends import open_backend
 from gmijax.partition.gmi_process import GmiStatus
 from gmijax.partition.machine import Machine, detect_machine

@@ -13,22 +13,22 @@ import pytest
 from rich.console import Console
 from supervision import gpu, machine
 
-from gmijax import auto, searching
-from gmijax.async_search import (
+from gmijax.cli import compose
+from gmijax.config import TrainConfig
+from gmijax.control import auto, searching
+from gmijax.control.async_search import (
     FEWEST_LINES,
     Enough,
     decoupled_training,
     measured_of,
     window_start,
 )
-from gmijax.cli import compose
-from gmijax.config import TrainConfig
-from gmijax.decoupled import plan_decoupled
+from gmijax.control.decoupled import plan_decoupled
+from gmijax.control.profiling import Workload, plan_at, store_key
 from gmijax.errors import ConfigError
 from gmijax.partition.balance import Split
 from gmijax.partition.gmi_process import GmiStatus
 from gmijax.partition.points import Measured, Point
-from gmijax.profiling import Workload, plan_at, store_key
 from gmijax.rundir import RunPaths
 
 GRID = (
@@ -212,7 +212,7 @@ def asked(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> list[Point]:
     points: list[Point] = []
 
     def profile(workload: Workload, point: Point, *_: Any, **__: Any) -> Measured:
-        assert workload.module == "gmijax.async_worker"
+        assert workload.module == "gmijax.workers.async_worker"
         points.append(point)
         return formula(point)
 

@@ -12,11 +12,12 @@ import pytest
 from fake_nvml import A100_SEVEN, H200_MIG_EMPTY, H200_MIG_OFF, Board
 from rich.console import Console
 
-from gmijax import doctor, sight
-from gmijax.diagnosis import Diagnosis, diagnose
+from gmijax import doctor
+from gmijax.control import sight
+from gmijax.control.diagnosis import Diagnosis, diagnose
+from gmijax.control.sight import REQUIRED, JaxView, Sight, ask_jax, try_mps
 from gmijax.partition.machine import Machine
 from gmijax.partition.nvidia import list_gpus, nvml_problem
-from gmijax.sight import REQUIRED, JaxView, Sight, ask_jax, try_mps
 
 MPS = Path("/usr/bin/nvidia-cuda-mps-control")
 INSTALLED = dict.fromkeys(REQUIRED, "1.0") | dict.fromkeys(

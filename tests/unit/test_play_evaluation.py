@@ -11,11 +11,11 @@ from types import SimpleNamespace
 import pytest
 from rich.console import Console
 
-from gmijax import evaluation, pictures
 from gmijax.cli import command
 from gmijax.config import PlayConfig
+from gmijax.control import evaluation, pictures
+from gmijax.control.launcher import environment_of
 from gmijax.errors import ConfigError, GmijaxError
-from gmijax.launcher import environment_of
 from gmijax.partition.machine import Machine
 from gmijax.partition.nvidia import Gpu
 from gmijax.playdir import EXIT_NO_GL, PlayPaths

@@ -22,7 +22,14 @@ def test_an_unknown_name_is_an_attribute_error() -> None:
 
 
 @pytest.mark.parametrize(
-    "module", ["gmijax", "gmijax.cli", "gmijax.job", "gmijax.evaluation", "gmijax.serving"]
+    "module",
+    [
+        "gmijax",
+        "gmijax.cli",
+        "gmijax.control.job",
+        "gmijax.control.evaluation",
+        "gmijax.control.serving",
+    ],
 )
 def test_the_controller_loads_neither_jax_nor_mujoco(module: str) -> None:
     code = f"import {module}, sys; print(sorted({{'jax', 'mujoco', 'flax'}} & sys.modules.keys()))"

@@ -14,14 +14,14 @@ import pytest
 from rich.console import Console
 from supervision import machine
 
-from gmijax import searching
-from gmijax.auto import decided
 from gmijax.cli import compose
 from gmijax.config import TrainConfig
+from gmijax.control import searching
+from gmijax.control.auto import decided
+from gmijax.control.profiling import ProfileLate, Workload, plan_at, training
 from gmijax.errors import ConfigError, GmijaxError, JobInterrupted
 from gmijax.partition.machine import Machine
 from gmijax.partition.points import Measured, NotRunnable, Point
-from gmijax.profiling import ProfileLate, Workload, plan_at, training
 
 Answer = Callable[[Point, str], Measured | NotRunnable]
 GRID = ("search.gmis_per_gpu=[4,2,1]", "search.num_envs=[64,128]", "search.order=as_printed")
@@ -29,7 +29,7 @@ MPS = Path("/usr/bin/nvidia-cuda-mps-control")
 
 
 class Profiles:
-    """In place of `gmijax.profiling.profile`: answers with a formula and counts."""
+    """In place of `gmijax.control.profiling.profile`: answers with a formula and counts."""
 
     def __init__(self, answer: Answer) -> None:
         self.answer = answer
@@ -38,7 +38,7 @@ class Profiles:
     def __call__(
         self, workload: Workload, point: Point, mode: str, *_: Any, **__: Any
     ) -> Measured | NotRunnable:
-        assert workload.module == "gmijax.worker"
+        assert workload.module == "gmijax.workers.worker"
         self.asked.append((point, mode))
         return self.answer(point, mode)
 

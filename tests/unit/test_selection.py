@@ -9,12 +9,12 @@ from typing import Any
 import pytest
 from supervision import machine, plan_config, reduce_config
 
-from gmijax import selection
+from gmijax.control import selection
+from gmijax.control.selection import Probe, candidates, estimated_floats, with_measured
 from gmijax.errors import ConfigError
 from gmijax.partition import reduction
 from gmijax.partition.plan import Plan
 from gmijax.partition.planner import make_plan
-from gmijax.selection import Probe, candidates, estimated_floats, with_measured
 
 MACHINE = machine(2, mps_control=Path("/bin/true"))
 

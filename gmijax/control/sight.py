@@ -99,7 +99,7 @@ def ask_jax(machine: Machine, timeout_s: float = PROBE_TIMEOUT_S) -> JaxView:
     }
     try:
         done = subprocess.run(
-            [sys.executable, "-m", "gmijax.jax_probe"],
+            [sys.executable, "-m", "gmijax.workers.jax_probe"],
             env=environment,
             stdin=subprocess.DEVNULL,
             capture_output=True,

@@ -8,13 +8,13 @@ from typing import Final
 from rich.console import Console
 
 from gmijax.config import AUTO, ReduceConfig, ServeConfig
+from gmijax.control.profiling import Workload
+from gmijax.control.searching import resolve_auto
 from gmijax.errors import ConfigError
 from gmijax.partition.machine import Machine
 from gmijax.partition.plan import Plan
 from gmijax.partition.points import Measured, Point
-from gmijax.profiling import Workload
 from gmijax.rundir import RunPaths, read_json
-from gmijax.searching import resolve_auto
 
 NO_REDUCTION: Final = ReduceConfig(strategy="auto", intra="auto", timeout_s=1.0)
 """Nobody trains, so nobody averages gradients."""
@@ -26,7 +26,7 @@ def decided(
     """The job with everything decided that was `auto`, and the reasons in words.
 
     Raises:
-      ConfigError, GmijaxError, JobInterrupted: as `gmijax.searching.search`.
+      ConfigError, GmijaxError, JobInterrupted: as `gmijax.control.searching.search`.
     """
     if AUTO not in (config.num_envs, config.plan.gmis_per_gpu):
         return config, ()
@@ -70,7 +70,7 @@ def serving(config: ServeConfig) -> Workload:
         num_envs=config.num_envs,
         impl=config.physics.impl,
         template="tcg",
-        module="gmijax.serving_worker",
+        module="gmijax.workers.serving_worker",
         config_at=config_at,
         read=_read,
         # Which weights act makes no difference; their shapes do, and they are the run's.

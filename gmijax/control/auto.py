@@ -6,15 +6,15 @@ import dataclasses
 
 from rich.console import Console
 
-from gmijax.async_search import settled
 from gmijax.config import TrainConfig
-from gmijax.decoupled import is_decoupled
+from gmijax.control.async_search import settled
+from gmijax.control.decoupled import is_decoupled
+from gmijax.control.profiling import Workload, platform_of
+from gmijax.control.searching import is_auto, resolve_auto, workload_of
 from gmijax.errors import ConfigError
 from gmijax.partition.backend_choice import candidates
 from gmijax.partition.machine import Machine
 from gmijax.partition.placement import serving_and_training
-from gmijax.profiling import Workload, platform_of
-from gmijax.searching import is_auto, resolve_auto, workload_of
 
 
 def decided(
@@ -24,7 +24,7 @@ def decided(
 
     Raises:
       ConfigError: too few GPUs for the job, before anything is profiled.
-      ConfigError, GmijaxError, JobInterrupted: as `gmijax.searching.search`.
+      ConfigError, GmijaxError, JobInterrupted: as `gmijax.control.searching.search`.
     """
     if not is_auto(config):
         return config, ()

@@ -10,7 +10,7 @@ from gmijax.collectives.pipe_block import create_pipes
 from gmijax.partition.child import ENV_PIPES_FD
 from gmijax.partition.plan import Plan
 
-MODULE: Final = "gmijax.dedicated_worker"
+MODULE: Final = "gmijax.workers.dedicated_worker"
 """Main of every GMI, started by name."""
 
 PIPE_BYTES: Final = 16 << 20

@@ -15,21 +15,21 @@ from typing import Any, NamedTuple
 
 from rich.console import Console
 
-from gmijax import dedicated, trained
-from gmijax.auto import decided
 from gmijax.config import TrainConfig
-from gmijax.decoupled import MODULE, is_decoupled, plan_decoupled, shared_blocks
+from gmijax.control import dedicated, trained
+from gmijax.control.auto import decided
+from gmijax.control.decoupled import MODULE, is_decoupled, plan_decoupled, shared_blocks
+from gmijax.control.launcher import Launch, patience_of, recorded, run_gmis
+from gmijax.control.progress import ConsoleProgress, SilentProgress
+from gmijax.control.selection import estimated_floats, with_measured
 from gmijax.errors import ConfigError
-from gmijax.launcher import Launch, patience_of, recorded, run_gmis
 from gmijax.partition.machine import Machine, detect_machine
 from gmijax.partition.plan import Plan
 from gmijax.partition.planner import make_plan
-from gmijax.progress import ConsoleProgress, SilentProgress
 from gmijax.results import MetricsReader, copy_history, draw_returns
 from gmijax.resume import CheckpointMeta, check_fits, find_checkpoint, saved_config
 from gmijax.rundir import RunPaths, create_run, read_json, write_json
 from gmijax.schema import to_dict
-from gmijax.selection import estimated_floats, with_measured
 from gmijax.sim import source
 from gmijax.sim.impl import choose_impl
 from gmijax.sim.registry import require_task
@@ -185,7 +185,7 @@ def _module(config: TrainConfig, plan: Plan) -> str:
     """Main of the GMIs."""
     if is_decoupled(config):
         return MODULE
-    return dedicated.MODULE if dedicated.is_dedicated(plan) else "gmijax.worker"
+    return dedicated.MODULE if dedicated.is_dedicated(plan) else "gmijax.workers.worker"
 
 
 def _shared(config: TrainConfig, plan: Plan) -> Mapping[str, Callable[[], int]]:

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from typing import Any, Final, NamedTuple
 
 from gmijax.config import ReduceConfig
+from gmijax.control.sight import REQUIRED, Sight, device_of
 from gmijax.errors import ConfigError
 from gmijax.partition.backend_choice import why_not_backend
 from gmijax.partition.layout import Layout
@@ -16,7 +17,6 @@ from gmijax.partition.machine import Machine
 from gmijax.partition.nvidia import PIPE_VARIABLE, Gpu
 from gmijax.partition.plan import BackendName
 from gmijax.partition.reduction import why_not_intra, why_not_strategy
-from gmijax.sight import REQUIRED, Sight, device_of
 from gmijax.sim.impl import choose_impl
 from gmijax.sim.registry import SUITES, require_task, task_names
 from gmijax.version import __version__

@@ -1,4 +1,4 @@
-"""Main of a GMI in asynchronous training: `python -m gmijax.async_worker`.
+"""Main of a GMI in asynchronous training: `python -m gmijax.workers.async_worker`.
 
 Started by the supervisor and by nobody else. Builds the role that the plan gives to this GMI,
 agent or trainer, plugs in the board, the channels and the reducer among the trainers, runs it,
@@ -12,7 +12,7 @@ import sys
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from gmijax.config import A3cConfig, TrainConfig
-from gmijax.decoupled import ENV_BOARD_FD, ENV_CHANNELS_FD, groups_of, places_of
+from gmijax.control.decoupled import ENV_BOARD_FD, ENV_CHANNELS_FD, groups_of, places_of
 from gmijax.errors import ConfigError
 from gmijax.partition.child import ChildLink, inherited_fd, run_gmi
 from gmijax.partition.plan import Plan

@@ -19,7 +19,7 @@ from typing import Any, NamedTuple
 
 from gmijax.collectives.cost_model import COSTS
 from gmijax.collectives.memory import create_exchange
-from gmijax.launcher import Launch, compilation_cache_dir, run_gmis
+from gmijax.control.launcher import Launch, compilation_cache_dir, run_gmis
 from gmijax.partition.machine import Machine
 from gmijax.partition.plan import Plan
 from gmijax.partition.reduction import (
@@ -162,7 +162,7 @@ def measure(
                 plan=plan,
                 machine=machine,
                 run=run,
-                module="gmijax.reduction_probe",
+                module="gmijax.workers.reduction_probe",
                 patience=PATIENCE,
                 compile_once=False,
                 shared={block_variable(k): create_exchange for k in range(len(probes))},

@@ -1,7 +1,7 @@
-"""Main of a GMI that does nothing but reduce: `python -m gmijax.reduction_probe`.
+"""Main of a GMI that does nothing but reduce: `python -m gmijax.workers.reduction_probe`.
 
 One process measures all strategies and sizes one after the other, because starting is most of
-what a measurement costs. `gmijax.selection` starts it.
+what a measurement costs. `gmijax.control.selection` starts it.
 """
 
 from __future__ import annotations
@@ -17,10 +17,10 @@ import numpy as np
 from gmijax.collectives.build import Membership, build_reducer, join_world
 from gmijax.collectives.interface import DeviceMean, Reducer, stays_on_device
 from gmijax.collectives.intra import IntraUnavailable
+from gmijax.control.selection import CHAIN, TIMEOUT_S, block_variable
 from gmijax.partition.child import ChildLink, inherited_fd, run_gmi
 from gmijax.partition.plan import Plan
 from gmijax.rundir import read_json
-from gmijax.selection import CHAIN, TIMEOUT_S, block_variable
 
 if TYPE_CHECKING:
     import jax

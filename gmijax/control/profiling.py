@@ -16,8 +16,8 @@ from dataclasses import dataclass
 from typing import Any, Literal
 
 from gmijax.config import EnvConfig, PlanConfig, PpoConfig, ReduceConfig, TemplateName, TrainConfig
+from gmijax.control.launcher import Launch, run_gmis
 from gmijax.errors import ConfigError, GmijaxError, JobInterrupted
-from gmijax.launcher import Launch, run_gmis
 from gmijax.partition.balance import Split
 from gmijax.partition.gmi_process import GmiStatus
 from gmijax.partition.layout import Layout
@@ -61,7 +61,7 @@ class Workload:
       key: what else decides how fast it is, plain data.
       trainers: numbers of training GMIs per GPU to choose from; (0,): every GMI does everything.
       plan_of: the plan of a profile where the template's own GMIs are not all that there is.
-      compile_once: see `gmijax.launcher.Launch`.
+      compile_once: see `gmijax.control.launcher.Launch`.
       shared: memory of the GMIs of a profile, see `Launch`.
       is_enough: what says when a profile can be read; None: it ends by itself.
       estimate: environment steps a second of the whole job; None: of the same on every GPU.
@@ -133,7 +133,7 @@ def training(config: TrainConfig) -> Workload:
         num_envs=config.num_envs,
         impl=config.physics.impl,
         template="tcg_ex",
-        module="gmijax.worker",
+        module="gmijax.workers.worker",
         config_at=config_at,
         read=_read_training,
         key={"job": "train", "algo": to_dict(config.algo), "iterations": config.search.iterations},

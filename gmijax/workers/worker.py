@@ -1,7 +1,8 @@
-"""Main of one GMI: `python -m gmijax.worker`, started by the supervisor and by nobody else.
+"""Main of one GMI: `python -m gmijax.workers.worker`.
 
-Reads the run folder, builds the role that the plan gives to this GMI, plugs in the concrete
-reducer, runs it, and writes `result.json` or `error.json`.
+Started by the supervisor and by nobody else. Reads the run folder, builds the role that
+the plan gives to this GMI, plugs in the concrete reducer, runs it, and writes
+`result.json` or `error.json`.
 """
 
 from __future__ import annotations

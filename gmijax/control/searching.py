@@ -1,7 +1,7 @@
 """The controller of searches: `num_envs` and `plan.gmis_per_gpu` by profiling. No jax here.
 
-The rules are in `gmijax.partition.search`, a single profile in `gmijax.profiling`. Here they meet
-the profile store, the time budget and the console.
+The rules are in `gmijax.partition.search`, a single profile in `gmijax.control.profiling`. Here
+they meet the profile store, the time budget and the console.
 """
 
 from __future__ import annotations
@@ -14,17 +14,11 @@ from typing import Any, NamedTuple
 
 from rich.console import Console
 
-from gmijax.async_search import decoupled_training
 from gmijax.config import AUTO, SearchConfig, TrainConfig
-from gmijax.decoupled import is_decoupled
-from gmijax.errors import ConfigError, GmijaxError, JobInterrupted
-from gmijax.partition.balance import Split
-from gmijax.partition.machine import Machine, detect_machine
-from gmijax.partition.points import Measured, NotRunnable, Point
-from gmijax.partition.search import Grid, Outcome, OutOfBudget, Rules, Visited
-from gmijax.partition.search import search as search_grid
-from gmijax.profiles import ProfileStore, default_folder
-from gmijax.profiling import (
+from gmijax.control.async_search import decoupled_training
+from gmijax.control.decoupled import is_decoupled
+from gmijax.control.profiles import ProfileStore, default_folder
+from gmijax.control.profiling import (
     Mode,
     ProfileLate,
     Workload,
@@ -36,9 +30,22 @@ from gmijax.profiling import (
     store_key,
     training,
 )
+from gmijax.control.search_report import (
+    SearchDisplay,
+    SearchPaths,
+    draw,
+    plain_data,
+    table,
+    verdict,
+)
+from gmijax.errors import ConfigError, GmijaxError, JobInterrupted
+from gmijax.partition.balance import Split
+from gmijax.partition.machine import Machine, detect_machine
+from gmijax.partition.points import Measured, NotRunnable, Point
+from gmijax.partition.search import Grid, Outcome, OutOfBudget, Rules, Visited
+from gmijax.partition.search import search as search_grid
 from gmijax.rundir import RunPaths, create_run, write_json
 from gmijax.schema import to_dict
-from gmijax.search_report import SearchDisplay, SearchPaths, draw, plain_data, table, verdict
 from gmijax.sim import source
 from gmijax.sim.impl import choose_impl
 from gmijax.sim.registry import require_task

@@ -1,6 +1,7 @@
-"""Main of one serving GMI: `python -m gmijax.serving_worker`, started by `gmijax.serving`.
+"""Main of one serving GMI: `python -m gmijax.workers.serving_worker`.
 
-Reads the run folder, does what the plan gives to this GMI, and writes `result.json`.
+Started by `gmijax.control.serving`. Reads the run folder, does what the plan gives
+to this GMI, and writes `result.json`.
 """
 
 from __future__ import annotations

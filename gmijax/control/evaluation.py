@@ -1,7 +1,7 @@
 """The controller of `gmijax.play`: from a checkpoint to returns and a film. No jax here.
 
-Two children do the work, each a fresh interpreter: `gmijax.playback` runs the episodes as the one
-GMI of a small plan, `gmijax.sim.render` films them.
+Two children do the work, each a fresh interpreter: `gmijax.workers.playback` runs the episodes
+as the one GMI of a small plan, `gmijax.sim.render` films them.
 """
 
 from __future__ import annotations
@@ -15,13 +15,13 @@ from rich.console import Console
 from rich.table import Table
 
 from gmijax.config import PlanConfig, PlayConfig, ReduceConfig
+from gmijax.control.launcher import Launch, run_gmis
+from gmijax.control.pictures import film, has_brax, write_page
 from gmijax.errors import ConfigError, GmijaxError
-from gmijax.launcher import Launch, run_gmis
 from gmijax.partition.machine import Machine, detect_machine
 from gmijax.partition.plan import Plan
 from gmijax.partition.planner import make_plan
 from gmijax.partition.supervisor import Patience
-from gmijax.pictures import film, has_brax, write_page
 from gmijax.playdir import PlayPaths
 from gmijax.resume import CheckpointMeta, find_checkpoint, trained_config
 from gmijax.rundir import META, STEP_DIGITS, RunPaths, read_json, write_json
@@ -154,7 +154,7 @@ def _launch(config: PlayConfig, paths: PlayPaths, machine: Machine) -> Launch:
         plan=_light_plan(config.num_envs, machine),
         machine=machine,
         run=RunPaths(paths.root),
-        module="gmijax.playback",
+        module="gmijax.workers.playback",
         patience=_PATIENCE,
         stops_gracefully=False,
         # The GPU may be training: take what is needed when it is needed, up to the fraction.

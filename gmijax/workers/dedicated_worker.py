@@ -1,7 +1,8 @@
-"""Main of a GMI where trainers have GMIs of their own: `python -m gmijax.dedicated_worker`.
+"""Main of a GMI where trainers have GMIs of their own.
 
-Started by the supervisor and by nobody else. On every GPU one GMI trains, the others make its
-rollouts; the trainers of all GPUs average their gradients.
+`python -m gmijax.workers.dedicated_worker`, started by the supervisor and by nobody else. On
+every GPU one GMI trains, the others make its rollouts; the trainers of all GPUs average
+their gradients.
 """
 
 from __future__ import annotations
@@ -11,7 +12,7 @@ import sys
 from typing import TYPE_CHECKING, Any
 
 from gmijax.config import PpoConfig, TrainConfig
-from gmijax.dedicated import PIPE_BYTES
+from gmijax.control.dedicated import PIPE_BYTES
 from gmijax.errors import ConfigError
 from gmijax.partition.child import ENV_PIPES_FD, ChildLink, inherited_fd, run_gmi
 from gmijax.partition.plan import Plan

@@ -22,7 +22,7 @@ from gmijax.partition.planner import make_plan
 from gmijax.partition.reduction import why_not_intra
 from gmijax.partition.templates import AGENT, TRAINER, Group, group_of
 
-MODULE: Final = "gmijax.async_worker"
+MODULE: Final = "gmijax.workers.async_worker"
 """Main of every GMI, started by name."""
 
 FLOAT_CHANNELS: Final = ("state", "action", "reward", "log_prob", "cut_value", "bootstrap")

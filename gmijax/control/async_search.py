@@ -14,7 +14,8 @@ from itertools import pairwise
 from typing import Any, Final
 
 from gmijax.config import AUTO, A3cConfig, PlanConfig, TrainConfig
-from gmijax.decoupled import MODULE, groups_of, plan_decoupled, shared_blocks
+from gmijax.control.decoupled import MODULE, groups_of, plan_decoupled, shared_blocks
+from gmijax.control.profiling import Workload, peak_memory_mib
 from gmijax.errors import ConfigError
 from gmijax.partition.balance import Split, balance, per_gpu, throughput
 from gmijax.partition.gmi_process import GmiStatus
@@ -23,7 +24,6 @@ from gmijax.partition.placement import place, serving_and_training
 from gmijax.partition.plan import Plan
 from gmijax.partition.points import Measured, Point
 from gmijax.partition.search import top_of_one
-from gmijax.profiling import Workload, peak_memory_mib
 from gmijax.results import read_metrics
 from gmijax.rundir import RunPaths, read_json
 from gmijax.schema import to_dict

@@ -1,6 +1,6 @@
 """The controller of `gmijax.serve`: from a policy to throughput, latency and experience.
 
-No jax here. Like `gmijax.job`, it checks everything that can be checked before anything is
+No jax here. Like `gmijax.control.job`, it checks everything that can be checked before anything is
 started, runs the GMIs of a plan, and writes the summary however the job ends.
 """
 
@@ -18,22 +18,22 @@ from typing import Any, Literal, NamedTuple
 
 from rich.console import Console
 
-from gmijax import served
 from gmijax.collectives.pipe_block import create_pipes
 from gmijax.config import PhysicsConfig, ServeConfig
+from gmijax.control import served
+from gmijax.control.launcher import Launch, patience_of, recorded, run_gmis
+from gmijax.control.progress import ConsoleProgress, SilentProgress
+from gmijax.control.serving_search import NO_REDUCTION, decided
 from gmijax.datadir import DataPaths, locked, open_dataset
 from gmijax.errors import ConfigError
-from gmijax.launcher import Launch, patience_of, recorded, run_gmis
 from gmijax.partition.child import ENV_PIPES_FD
 from gmijax.partition.machine import Machine, detect_machine
 from gmijax.partition.plan import Plan
 from gmijax.partition.planner import make_plan
 from gmijax.partition.templates import SIMULATOR, group_of
-from gmijax.progress import ConsoleProgress, SilentProgress
 from gmijax.resume import CheckpointMeta, find_checkpoint, trained_config
 from gmijax.rundir import RunPaths, create_run, read_json, write_json
 from gmijax.schema import to_dict
-from gmijax.serving_search import NO_REDUCTION, decided
 from gmijax.sim import source
 from gmijax.sim.impl import choose_impl
 from gmijax.sim.registry import require_task
@@ -209,7 +209,7 @@ def _launch(job: _Job, run: RunPaths, console: Console) -> Launch:
         plan=job.plan,
         machine=job.machine,
         run=run,
-        module="gmijax.serving_worker",
+        module="gmijax.workers.serving_worker",
         patience=patience_of(job.config.run),
         shared={ENV_PIPES_FD: pipes} if job.plan.template == "tdg" else {},
         on_warning=lambda text: console.print(text, markup=False),
