@@ -10,6 +10,7 @@ import pytest
 
 from gmijax.collectives.channel.migrator import Migrator
 from gmijax.collectives.channel.transfer_size import SAMPLES, START_BYTES, TransferSize
+from gmijax.errors import GmijaxError, PeerLost, PipeClosed
 
 
 class FakeOutlet:
@@ -44,6 +45,33 @@ def test_same_gpu_first_then_the_least_load_then_in_turn(
     migrator = Migrator(outlets, gpu, {1: 1, 2: 2, 3: 3})
     opened = [migrator.try_open([10]) for _ in chosen]
     assert [None if found is None else found[0].peer for found in opened] == chosen
+
+
+class LostOutlet(FakeOutlet):
+    """A way to a trainer that closed, or whose process is gone."""
+
+    def __init__(self, peer: int, error: GmijaxError) -> None:
+        super().__init__(peer, 0)
+        self.error = error
+
+    def try_reserve(self, sizes: Sequence[int]) -> list[Any] | None:
+        if isinstance(self.error, PipeClosed):
+            raise self.error
+        return None
+
+    def why_lost(self, operation: str, step: int) -> GmijaxError | None:
+        return self.error
+
+
+def test_a_dead_trainer_is_named_before_one_that_has_left_because_of_it() -> None:
+    left, dead = LostOutlet(1, PipeClosed(0, 1, "send")), LostOutlet(2, PeerLost(0, 2, "send", 5))
+    migrator = Migrator([left, dead], 9, {1: 1, 2: 2})
+    with pytest.raises(PeerLost, match="peer 2 is gone"):
+        migrator.try_open([10])
+    assert migrator.why_lost() is dead.error
+    alone = Migrator([left], 9, {1: 1})
+    with pytest.raises(PipeClosed):
+        alone.try_open([10])
 
 
 def test_the_size_of_transfers_grows_while_a_byte_gets_cheaper() -> None:

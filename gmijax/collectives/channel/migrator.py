@@ -12,7 +12,7 @@ from collections.abc import Mapping, Sequence
 from gmijax.collectives.channel.interface import Outlet
 from gmijax.collectives.pipe import Bytes
 from gmijax.collectives.waits import LIVENESS_PERIOD_S
-from gmijax.errors import GmijaxError
+from gmijax.errors import GmijaxError, PeerLost, PipeClosed
 
 
 class Migrator:
@@ -41,18 +41,25 @@ class Migrator:
 
         Raises:
           PipeClosed: a trainer has closed its end.
+          PeerLost: one has, and the process of another is gone, which may be why.
         """
         for outlet in self._by_load():
-            views = outlet.try_reserve(sizes)
+            try:
+                views = outlet.try_reserve(sizes)
+            except PipeClosed as closed:
+                error = self.why_lost()
+                raise error if isinstance(error, PeerLost) else closed from None
             if views is not None:
                 self._transfers += 1
                 return outlet, views
         return None
 
     def why_lost(self) -> GmijaxError | None:
-        """Why some trainer will never read again, None if all may."""
-        found = (outlet.why_lost("send", self._transfers) for outlet in self._outlets)
-        return next((error for error in found if error is not None), None)
+        """Why some trainer will never read again, the dead first; None if all may."""
+        asked = (outlet.why_lost("send", self._transfers) for outlet in self._outlets)
+        found = [error for error in asked if error is not None]
+        dead = (error for error in found if isinstance(error, PeerLost))
+        return next(dead, found[0] if found else None)
 
     def check(self) -> None:
         """Looks at all trainers, five times a second at most; raises what `why_lost` finds."""
