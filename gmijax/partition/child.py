@@ -178,3 +178,15 @@ def inherited_fd(environment: Mapping[str, str], name: str) -> int | None:
             f"{name}={environment[name]!r}: expected the number of an open descriptor"
         ) from None
     return fd
+
+
+def required_fd(name: str) -> int:
+    """The descriptor that this process has inherited as `name`.
+
+    Raises:
+      ConfigError: it has not, or as `inherited_fd`.
+    """
+    fd = inherited_fd(os.environ, name)
+    if fd is None:
+        raise ConfigError(f"{name} must be set: GMIs are started by a controller")
+    return fd

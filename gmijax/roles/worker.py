@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import sys
 from typing import TYPE_CHECKING, Any
 
@@ -11,8 +10,7 @@ from gmijax.collectives.group import GroupReducer
 from gmijax.collectives.interface import Reducer
 from gmijax.collectives.messenger import Messenger
 from gmijax.collectives.pipe_block import PipeBlock
-from gmijax.errors import ConfigError
-from gmijax.partition.child import ENV_PIPES_FD, ChildLink, inherited_fd, run_gmi
+from gmijax.partition.child import ENV_PIPES_FD, ChildLink, required_fd, run_gmi
 from gmijax.partition.plan import Plan
 from gmijax.partition.reduction import why_not_intra
 from gmijax.roles import shipping
@@ -98,9 +96,7 @@ def _device_post(plan: Plan, gmi: int) -> DevicePost | None:
 
 
 def _attach(plan: Plan, link: ChildLink, capacity_bytes: int) -> PipeBlock:
-    fd = inherited_fd(os.environ, ENV_PIPES_FD)
-    if fd is None:
-        raise ConfigError(f"{ENV_PIPES_FD} must be set: GMIs are started by gmijax.launch")
+    fd = required_fd(ENV_PIPES_FD)
     return PipeBlock.attach(fd, link.gmi, plan.layout.num_gmis, capacity_bytes)
 
 

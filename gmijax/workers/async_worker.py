@@ -7,14 +7,13 @@ and writes `result.json` or `error.json`.
 
 from __future__ import annotations
 
-import os
 import sys
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from gmijax.config import A3cConfig, TrainConfig
 from gmijax.control.decoupled import ENV_BOARD_FD, ENV_CHANNELS_FD, groups_of, places_of
 from gmijax.errors import ConfigError
-from gmijax.partition.child import ChildLink, inherited_fd, run_gmi
+from gmijax.partition.child import ChildLink, required_fd, run_gmi
 from gmijax.partition.plan import Plan
 from gmijax.rundir import read_json
 from gmijax.schema import from_dict
@@ -133,18 +132,11 @@ def _board(algo: A3cConfig, env: BatchedEnv, num_agents: int) -> Board:
     from gmijax.collectives.board import attach_board
 
     sizes = note_sizes(num_weights(env.spec, algo), num_stats(env), num_agents)
-    return board_of(attach_board(_required_fd(ENV_BOARD_FD), sizes))
+    return board_of(attach_board(required_fd(ENV_BOARD_FD), sizes))
 
 
 def _channels_fd() -> int:
-    return _required_fd(ENV_CHANNELS_FD)
-
-
-def _required_fd(name: str) -> int:
-    fd = inherited_fd(os.environ, name)
-    if fd is None:
-        raise ConfigError(f"{name} must be set: GMIs are started by gmijax.train")
-    return fd
+    return required_fd(ENV_CHANNELS_FD)
 
 
 def _index(gmis: tuple[int, ...], gmi: int) -> int:

@@ -7,14 +7,13 @@ their gradients.
 
 from __future__ import annotations
 
-import os
 import sys
 from typing import TYPE_CHECKING, Any
 
 from gmijax.config import PpoConfig, TrainConfig
 from gmijax.control.dedicated import PIPE_BYTES
 from gmijax.errors import ConfigError
-from gmijax.partition.child import ENV_PIPES_FD, ChildLink, inherited_fd, run_gmi
+from gmijax.partition.child import ENV_PIPES_FD, ChildLink, required_fd, run_gmi
 from gmijax.partition.plan import Plan
 from gmijax.partition.templates import AGENT, TRAINER, Group, group_of, has_role
 from gmijax.rundir import read_json
@@ -37,9 +36,8 @@ def _run(link: ChildLink) -> dict[str, Any]:
     plan = Plan.from_dict(read_json(link.run.plan))
     trainers = group_of(plan.layout, plan.roles, TRAINER)
     servants = group_of(plan.layout, plan.roles, AGENT)
-    fd = inherited_fd(os.environ, ENV_PIPES_FD)
-    if trainers is None or servants is None or fd is None:
-        raise ConfigError(f"plan: roles {list(plan.roles)} need trainers, agents and pipes")
+    if trainers is None or servants is None:
+        raise ConfigError(f"plan: roles {list(plan.roles)} need trainers and agents")
     trains = link.gmi in trainers.gmis
     # jax starts here, in the environment that the plan prepared.
     world = _world(config, plan, trainers, link) if trains else None
@@ -55,7 +53,7 @@ def _run(link: ChildLink) -> dict[str, Any]:
         first_env=0 if trains else servants.gmis.index(link.gmi) * config.envs_per_gmi,
         num_envs=config.envs_per_gmi,
     )
-    block = PipeBlock.attach(fd, link.gmi, plan.layout.num_gmis, PIPE_BYTES)
+    block = PipeBlock.attach(required_fd(ENV_PIPES_FD), link.gmi, plan.layout.num_gmis, PIPE_BYTES)
     try:
         if trains:
             reducer = _reducer(config, plan, trainers, env, link, world)

@@ -6,7 +6,6 @@ what a measurement costs. `gmijax.control.selection` starts it.
 
 from __future__ import annotations
 
-import os
 import sys
 import time
 from collections.abc import Callable, Mapping
@@ -18,7 +17,7 @@ from gmijax.collectives.build import Membership, build_reducer, join_world
 from gmijax.collectives.interface import DeviceMean, Reducer, stays_on_device
 from gmijax.collectives.intra import IntraUnavailable
 from gmijax.control.selection import CHAIN, TIMEOUT_S, block_variable
-from gmijax.partition.child import ChildLink, inherited_fd, run_gmi
+from gmijax.partition.child import ChildLink, required_fd, run_gmi
 from gmijax.partition.plan import Plan
 from gmijax.rundir import read_json
 
@@ -68,7 +67,7 @@ def _reducer(
             layout=plan.layout,
             rank=gmi,
             num_floats=probe["num_floats"],
-            exchange_fd=inherited_fd(os.environ, block_variable(number)),
+            exchange_fd=required_fd(block_variable(number)),
             timeout_s=TIMEOUT_S,
             rendezvous_timeout_s=TIMEOUT_S,
             world=world,

@@ -6,7 +6,6 @@ to this GMI, and writes `result.json`.
 
 from __future__ import annotations
 
-import os
 import sys
 from contextlib import ExitStack
 from pathlib import Path
@@ -14,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 from gmijax.config import ServeConfig
 from gmijax.datadir import DataPaths
-from gmijax.partition.child import ENV_PIPES_FD, ChildLink, inherited_fd, run_gmi
+from gmijax.partition.child import ENV_PIPES_FD, ChildLink, required_fd, run_gmi
 from gmijax.partition.layout import Layout
 from gmijax.partition.plan import Plan
 from gmijax.partition.templates import AGENT, SIMULATOR, group_of, has_role
@@ -85,9 +84,9 @@ def _work(share: Share, plan: Plan, roles: str, held: ExitStack) -> dict[str, An
     if has_role(roles, SIMULATOR) and has_role(roles, AGENT):
         return colocated.collect(share)
     gmi, layout = share.link.gmi, plan.layout
-    fd = inherited_fd(os.environ, ENV_PIPES_FD)
-    assert fd is not None  # The controller makes pipes for this template.
-    block = PipeBlock.attach(fd, gmi, layout.num_gmis, share.config.pipe_bytes)
+    block = PipeBlock.attach(
+        required_fd(ENV_PIPES_FD), gmi, layout.num_gmis, share.config.pipe_bytes
+    )
     held.callback(block.close)
     wanted = AGENT if has_role(roles, SIMULATOR) else SIMULATOR
     peers = [
