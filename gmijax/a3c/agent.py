@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -21,6 +22,7 @@ from jax.flatten_util import ravel_pytree
 from gmijax.a3c.board import Board, Orders, Report, pack_report, unpack_orders
 from gmijax.a3c.learner import ActingWeights, acting_weights, unpack_weights
 from gmijax.a3c.losses import Unrolls
+from gmijax.a3c.outgoing import Outgoing
 from gmijax.a3c.rollout import UnrollPrograms, UnrollStats, stats_example
 from gmijax.checkpoint import has_envs, restore_envs, save_envs
 from gmijax.collectives.channel.interface import ExperienceSender
@@ -34,9 +36,6 @@ from gmijax.sim.wrappers import BatchedEnv, BatchState, env_keys
 from gmijax.types import Array
 
 _PAUSE_S = 0.02
-_POLL_S = 0.0002
-_SLICE_S = 0.5
-"""Longest wait for room before the agent looks at the board again."""
 
 
 class Serving(NamedTuple):
@@ -91,7 +90,8 @@ class _Agent:
         self._index = serving.index
         self._trainers = serving.trainers
         self._board = board
-        self._sender = sender
+        self._is_on_device = sender.on_device
+        self._outgoing = Outgoing(serving.config, serving.algo, sender)
         self._link = link
         self._learner = make_learner(self._env.spec, serving.algo)
         example = ravel_pytree(stats_example(self._env.spec, self._env.overflows))[0]
@@ -103,7 +103,6 @@ class _Agent:
         self._weights_seen = 0
         self._version = 0
         self._unrolls = 0
-        self._waited_s = 0.0
 
     def run(self) -> dict[str, Any]:
         """See `act_until_told`."""
@@ -123,7 +122,7 @@ class _Agent:
             "unrolls": self._unrolls,
             "wall_s": time.monotonic() - started,
             "send_s": self._report.send_s,
-            "wait_s": self._waited_s,
+            "wait_s": self._outgoing.waited_s,
             "dropped": int(self._report.dropped),
             "compile_s": compile_s,
             "device": describe_device(),
@@ -156,7 +155,7 @@ class _Agent:
         num_steps = self._algo.unroll_length // num_pieces
         return UnrollPrograms(
             *(self._env, self._learner.networks, num_steps, num_pieces, weights, env_state),
-            stays=self._sender.on_device,
+            stays=self._is_on_device,
         )
 
     def _wait_for_start(self) -> None:
@@ -200,22 +199,20 @@ class _Agent:
 
     def _send(self, unroll: _Sent, env_state: BatchState) -> None:
         arrays: dict[str, Any] = unroll.experience._asdict()
-        if not self._sender.on_device:
+        if not self._is_on_device:
             arrays = {name: np.asarray(values) for name, values in arrays.items()}
         stats = np.asarray(unroll.stats, np.float64)
         started = time.monotonic()
         if not self._hand_over(arrays, unroll.version, env_state, started):
             return
-        counts = self._sender.stats()
-        if not counts.least_occupancy:  # A trainer has nothing to do: what waits must go.
-            self._sender.flush()
+        counts = self._outgoing.counts()
         self._unrolls += 1
         self._report = self._report._replace(
             env_steps=self._report.env_steps + arrays["reward"].size,
             bytes_sent=float(counts.num_bytes),
             dropped=float(counts.dropped),
             send_s=self._report.send_s + time.monotonic() - started,
-            wait_s=self._waited_s,
+            wait_s=self._outgoing.waited_s,
             occupancy=counts.occupancy,
             stats=self._report.stats + stats,
         )
@@ -232,7 +229,7 @@ class _Agent:
         """Sends an unroll; False if the job ends and nobody wants it any more."""
         limit_s = self._config.reduce.timeout_s
         try:
-            while self._is_ahead(arrays, env_state) or not self._offer(arrays, version, env_state):
+            while not self._outgoing.offer(arrays, version, partial(_is_idle, env_state)):
                 # Trainers that wait for a checkpoint make no room until it is complete.
                 if self._obey(env_state):
                     return False
@@ -244,36 +241,6 @@ class _Agent:
                 raise
             return False
         return True
-
-    def _offer(
-        self, arrays: dict[str, npt.NDArray[Any]], version: int, env_state: BatchState
-    ) -> bool:
-        """Whether the channels took an unroll within a moment."""
-        is_idle, before_s = _is_idle(env_state), self._sender.stats().waited_s
-        is_sent = self._sender.send(arrays, version, _SLICE_S)
-        if is_idle:
-            self._waited_s += self._sender.stats().waited_s - before_s
-        return is_sent
-
-    def _is_ahead(self, arrays: dict[str, npt.NDArray[Any]], env_state: BatchState) -> bool:
-        """Waits a moment while `max_ahead` unrolls wait for every trainer; whether they still do.
-
-        More of them in the channel would only make experience older.
-        """
-        channel = self._config.channel
-        if channel.when_full != "block":
-            return False
-        size = sum(array.nbytes for array in arrays.values())
-        most = (self._algo.max_ahead - 0.5) * size / channel.capacity_bytes
-        deadline_s = time.monotonic() + _SLICE_S
-        while self._sender.stats().least_occupancy > most:
-            is_idle, now_s = _is_idle(env_state), time.monotonic()
-            if now_s > deadline_s:
-                return True
-            time.sleep(_POLL_S)
-            if is_idle:
-                self._waited_s += time.monotonic() - now_s
-        return False
 
     def _obey(self, env_state: BatchState) -> bool:
         """Adds to the checkpoint that is wanted, if any; returns whether the job ends."""
