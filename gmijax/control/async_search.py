@@ -15,7 +15,7 @@ from typing import Any, Final
 
 from gmijax.config import AUTO, A3cConfig, PlanConfig, TrainConfig
 from gmijax.control.decoupled import MODULE, groups_of, plan_decoupled, shared_blocks
-from gmijax.control.profiling import Workload, peak_memory_mib
+from gmijax.control.workload import Workload, peak_memory_mib
 from gmijax.errors import ConfigError
 from gmijax.partition.balance import Split, balance, per_gpu, throughput
 from gmijax.partition.gmi_process import GmiStatus

@@ -9,8 +9,9 @@ from rich.console import Console
 from gmijax.config import TrainConfig
 from gmijax.control.async_search import settled
 from gmijax.control.decoupled import is_decoupled
-from gmijax.control.profiling import Workload, platform_of
+from gmijax.control.profiling import platform_of
 from gmijax.control.searching import is_auto, resolve_auto, workload_of
+from gmijax.control.workload import Workload
 from gmijax.errors import ConfigError
 from gmijax.partition.backend_choice import candidates
 from gmijax.partition.machine import Machine

@@ -21,14 +21,12 @@ from gmijax.control.profiles import ProfileStore, default_folder
 from gmijax.control.profiling import (
     Mode,
     ProfileLate,
-    Workload,
     device_of,
     installed_versions,
     plan_at,
     platform_of,
     profile,
     store_key,
-    training,
 )
 from gmijax.control.search_report import (
     SearchDisplay,
@@ -38,6 +36,7 @@ from gmijax.control.search_report import (
     table,
     verdict,
 )
+from gmijax.control.workload import Workload, training
 from gmijax.errors import ConfigError, GmijaxError, JobInterrupted
 from gmijax.partition.balance import Split
 from gmijax.partition.machine import Machine, detect_machine

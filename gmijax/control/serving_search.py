@@ -8,8 +8,8 @@ from typing import Final
 from rich.console import Console
 
 from gmijax.config import AUTO, ReduceConfig, ServeConfig
-from gmijax.control.profiling import Workload
 from gmijax.control.searching import resolve_auto
+from gmijax.control.workload import Workload, peak_memory_mib
 from gmijax.errors import ConfigError
 from gmijax.partition.machine import Machine
 from gmijax.partition.plan import Plan
@@ -87,16 +87,11 @@ def serving(config: ServeConfig) -> Workload:
 def _read(plan: Plan, run: RunPaths) -> Measured:
     results = [read_json(run.gmi(gmi).result) for gmi in plan.layout.gmis]
     rates = [float(result["step_per_s_inference"]) for result in results]
-    devices = [result["device"] for result in results]
     mean_rate = sum(rates) / len(rates)
     steps = results[0]["env_steps"] / results[0]["unrolls"]
     return Measured(
         env_steps_per_s=mean_rate,
-        # Of the device, as its allocator counts; on the CPU, of the process.
-        memory_mib=max(
-            float(device["peak_memory_mib"] or device["peak_host_memory_mib"])
-            for device in devices
-        ),
+        memory_mib=max(peak_memory_mib(result["device"]) for result in results),
         iteration_s=steps / mean_rate,
         reduce_s=0.0,
     )

@@ -24,7 +24,8 @@ from gmijax.control.async_search import (
     window_start,
 )
 from gmijax.control.decoupled import plan_decoupled
-from gmijax.control.profiling import Workload, plan_at, store_key
+from gmijax.control.profiling import plan_at, store_key
+from gmijax.control.workload import Workload
 from gmijax.errors import ConfigError
 from gmijax.partition.balance import Split
 from gmijax.partition.gmi_process import GmiStatus

@@ -18,7 +18,8 @@ from gmijax.cli import compose
 from gmijax.config import TrainConfig
 from gmijax.control import searching
 from gmijax.control.auto import decided
-from gmijax.control.profiling import ProfileLate, Workload, plan_at, training
+from gmijax.control.profiling import ProfileLate, plan_at
+from gmijax.control.workload import Workload, training
 from gmijax.errors import ConfigError, GmijaxError, JobInterrupted
 from gmijax.partition.machine import Machine
 from gmijax.partition.points import Measured, NotRunnable, Point
