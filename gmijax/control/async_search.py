@@ -8,35 +8,24 @@ acts and one that trains. How the GPUs of a job are divided then follows from wh
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from functools import partial
-from itertools import pairwise
 from typing import Any, Final
 
-from gmijax.config import AUTO, A3cConfig, PlanConfig, TrainConfig
-from gmijax.control.decoupled import MODULE, groups_of, plan_decoupled, shared_blocks
-from gmijax.control.workload import Workload, peak_memory_mib
+from gmijax.config import AUTO, PlanConfig, TrainConfig
+from gmijax.control.async_profile import Enough, read
+from gmijax.control.decoupled import MODULE, plan_decoupled, shared_blocks
+from gmijax.control.workload import Workload
 from gmijax.errors import ConfigError
 from gmijax.partition.balance import Split, balance, per_gpu, throughput
-from gmijax.partition.gmi_process import GmiStatus
 from gmijax.partition.machine import Machine
 from gmijax.partition.placement import place, serving_and_training
 from gmijax.partition.plan import Plan
 from gmijax.partition.points import Measured, Point
 from gmijax.partition.search import top_of_one
-from gmijax.results import read_metrics
-from gmijax.rundir import RunPaths, read_json
 from gmijax.schema import to_dict
 
-FEWEST_LINES: Final = 3
-"""Lines of metrics that a profile goes by, each of half a second or of one batch."""
-
-MOST_IDLE: Final = 0.95
-"""Agents that wait longer than this part of their time say little of what they could do."""
-
 _ENDLESS_STEPS: Final = 10**15
-
-Line = Mapping[str, Any]
 
 
 def decoupled_training(config: TrainConfig) -> Workload:
@@ -84,7 +73,7 @@ def decoupled_training(config: TrainConfig) -> Workload:
         template="decoupled",
         module=MODULE,
         config_at=partial(_config_at, config),
-        read=partial(_read, config.search.iterations),
+        read=partial(read, config.search.iterations),
         key={
             "job": "train",
             "algo": to_dict(config.algo),
@@ -198,104 +187,6 @@ def _config_at(config: TrainConfig, point: Point, num_gmis: int) -> TrainConfig:
 def _plan_of(config: TrainConfig, plan: PlanConfig, point: Point, machine: Machine) -> Plan:
     plan = settled(plan, point.gmis_per_gpu, point.trainers, None)
     return plan_decoupled(dataclasses.replace(config, plan=plan), point.num_envs, machine)
-
-
-class Enough:
-    """Whether a profile can be read: enough was done since its channels had filled.
-
-    Agents compile for different times, and until the channels are full they never wait: nothing
-    that is counted before tells of a long job.
-
-    Args:
-      config: of the job.
-      plan: of the profile.
-      run: its folder.
-    """
-
-    def __init__(self, config: TrainConfig, plan: Plan, run: RunPaths) -> None:
-        agents, trainers = groups_of(plan)
-        self._iterations = config.search.iterations
-        self._agents = agents.gmis
-        assert isinstance(config.algo, A3cConfig)
-        # Those that may wait for every trainer, one on its way, and one that is being made.
-        self._unrolls = config.algo.max_ahead * len(trainers.gmis) + 2
-        self._metrics = run.metrics
-        self._first: int | None = None
-
-    def __call__(self, gmis: Sequence[GmiStatus]) -> bool:
-        """Whether it can, with the GMIs as they are now."""
-        if not all(
-            one.state == "running"
-            and one.iteration >= (self._unrolls if one.gmi in self._agents else 1)
-            for one in gmis
-        ):
-            return False
-        lines = read_metrics(self._metrics)
-        if self._first is None:
-            self._first = len(lines) + 1  # The line that has begun does not count.
-        start = window_start(lines[:-1], self._iterations)
-        return start is not None and start >= self._first
-
-
-def window_start(lines: Sequence[Line], iterations: int) -> int | None:
-    """Index of the first of the latest lines that hold what a profile goes by; None: too few.
-
-    The line before it is needed too, because lines tell when they end. Something was made in
-    them: where an unroll is many batches, agents can be silent for many lines.
-
-    Args:
-      lines: of `metrics.jsonl`.
-      iterations: batches that they are to have at least.
-    """
-    batches = made = 0.0
-    for start in range(len(lines) - 1, 0, -1):
-        batches += lines[start]["async/updates"]
-        made += lines[start]["async/pps"]
-        if made > 0 and batches >= iterations and len(lines) - start >= FEWEST_LINES:
-            return start
-    return None
-
-
-def measured_of(lines: Sequence[Line], num_agents: int, memory_mib: float) -> Measured:
-    """What a profile says of one serving GMI, and of a serving and a training GPU.
-
-    Trainers could learn from TTOP x (update + wait for a batch) / update, agents could make PPS /
-    (1 - the part of their time for which they had to wait for room).
-
-    Args:
-      lines: those that `window_start` names, and the one before them.
-      num_agents: all of them, on one GPU.
-      memory_mib: largest peak of any GMI.
-    """
-    before, *seen = lines
-    duration_s = seen[-1]["wall_s"] - before["wall_s"]
-    ends_s = [line["wall_s"] for line in lines]
-    spans_s = [end - start for start, end in pairwise(ends_s)]
-    batches = sum(line["async/updates"] for line in seen)
-    pps = sum(s * line["async/pps"] for s, line in zip(spans_s, seen, strict=True)) / duration_s
-    ttop = (seen[-1]["env_steps"] - before["env_steps"]) / duration_s
-    update_s, receive_s = (
-        sum(line["async/updates"] * line[f"time/{what}_s"] for line in seen) / batches
-        for what in ("update", "receive")
-    )
-    idle = sum(line["time/wait_s"] for line in seen) / (num_agents * duration_s)
-    return Measured(
-        env_steps_per_s=min(pps, ttop) / num_agents,
-        memory_mib=memory_mib,
-        iteration_s=duration_s / batches,
-        acting_per_s=pps / (1.0 - min(idle, MOST_IDLE)),
-        learning_per_s=ttop * (update_s + receive_s) / update_s,
-    )
-
-
-def _read(iterations: int, plan: Plan, run: RunPaths) -> Measured:
-    lines = read_metrics(run.metrics)[:-1]  # The last may hold the end of the job.
-    start = window_start(lines, iterations)
-    if start is None:
-        raise ValueError(f"{len(lines)} lines of metrics are too few")
-    results = [read_json(run.gmi(gmi).result) for gmi in plan.layout.gmis]
-    memory_mib = max(peak_memory_mib(one["device"]) for one in results if "device" in one)
-    return measured_of(lines[start - 1 :], len(groups_of(plan)[0].gmis), memory_mib)
 
 
 def _top_apart(measured: Measured) -> float:

@@ -16,13 +16,8 @@ from supervision import gpu, machine
 from gmijax.cli import compose
 from gmijax.config import TrainConfig
 from gmijax.control import auto, searching
-from gmijax.control.async_search import (
-    FEWEST_LINES,
-    Enough,
-    decoupled_training,
-    measured_of,
-    window_start,
-)
+from gmijax.control.async_profile import FEWEST_LINES, Enough, measured_of, window_start
+from gmijax.control.async_search import decoupled_training
 from gmijax.control.decoupled import plan_decoupled
 from gmijax.control.profiling import plan_at, store_key
 from gmijax.control.workload import Workload
