@@ -156,7 +156,7 @@ def open_receiver(config: ChannelConfig, places: Places, rank: int, fd: int | No
     inlets = [MemoryInlet(block, peer) for peer in places.agents]
     if config.transport == "device":
         # jax and CUDA, which channels through the host do without.
-        from gmijax.collectives.channel.resident import DeviceStack, ResidentSource
+        from gmijax.collectives.channel.resident_source import DeviceStack, ResidentSource
 
         return Receiver(
             rank,

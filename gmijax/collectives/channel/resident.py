@@ -12,16 +12,13 @@ from __future__ import annotations
 import contextlib
 import time
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 
-from gmijax.collectives.channel.batcher import Stack
-from gmijax.collectives.channel.compressor import Transfer
+from gmijax.collectives.channel.device_slots import NOTE, Slot, slot_of
 from gmijax.collectives.channel.ends import CLOSE_TIMEOUT_S
-from gmijax.collectives.channel.interface import Inlet, SenderStats
+from gmijax.collectives.channel.interface import SenderStats
 from gmijax.collectives.channel.memory import MemoryOutlet
 from gmijax.collectives.channel.migrator import Migrator
 from gmijax.collectives.channel.spec import Spec, spec_of
@@ -30,22 +27,9 @@ from gmijax.collectives.pipe import Bytes
 from gmijax.collectives.waits import wait_until
 from gmijax.errors import ConfigError, GmijaxError
 
-_ALIGNMENT = 256
 _LEAST_SLOTS = 2
 
 NewMemory = Callable[[], DeviceMemory]
-
-
-class _Slot(NamedTuple):
-    """Where the arrays of a rollout lie.
-
-    Attributes:
-      offsets: bytes from the beginning of the slot, in the order of the spec.
-      num_bytes: of the slot.
-    """
-
-    offsets: tuple[int, ...]
-    num_bytes: int
 
 
 class _Way:
@@ -120,7 +104,7 @@ class ResidentSender:
         self._ticket = b""
         self._spec: Spec | None = None
         self._num_envs = 0
-        self._slot = _Slot((), 0)
+        self._slot = Slot((), 0)
         self._sent = 0
         self._waited_s = 0.0
         self._is_open = True
@@ -135,7 +119,7 @@ class ResidentSender:
         self._prepare(experience)
         assert self._spec is not None
         text = self._spec.encode()
-        sizes = [len(text), TICKET_BYTES, _NOTE.itemsize]
+        sizes = [len(text), TICKET_BYTES, NOTE.itemsize]
         started_s = time.monotonic()
         opened = wait_until(
             lambda: self._migrator.try_open(sizes), self._migrator.why_lost, timeout_s
@@ -151,7 +135,7 @@ class ResidentSender:
             self._memory.write(offset + begin, experience[channel.name])
         head[:] = np.frombuffer(text, np.uint8)
         ticket[:] = np.frombuffer(self._ticket, np.uint8)
-        note.view(_NOTE)[0] = (offset, self._num_envs, version)
+        note.view(NOTE)[0] = (offset, self._num_envs, version)
         way.commit()
         self._sent += 1
         return True
@@ -201,7 +185,7 @@ class ResidentSender:
             if (spec, num_envs) != (self._spec, self._num_envs):
                 raise ConfigError(f"experience: got {spec}, the first was {self._spec}")
             return
-        self._spec, self._num_envs, self._slot = spec, num_envs, _slot_of(spec, num_envs)
+        self._spec, self._num_envs, self._slot = spec, num_envs, slot_of(spec, num_envs)
         num_slots = self._capacity_bytes // self._slot.num_bytes
         if num_slots < _LEAST_SLOTS:
             raise ConfigError(
@@ -213,93 +197,3 @@ class ResidentSender:
         self._ticket = self._memory.create(total)
         for way in self._ways:
             way.num_slots, way.slot_bytes = num_slots, self._slot.num_bytes
-
-
-class ResidentSource:
-    """What one agent has left on the device; a `CountingSource`."""
-
-    def __init__(self, inlet: Inlet, new_memory: NewMemory) -> None:
-        self.peer = inlet.peer
-        self.transfers = self.num_bytes = self.discarded = 0
-        self._inlet = inlet
-        self._new_memory = new_memory
-        self._memory: DeviceMemory | None = None
-        self._ticket = b""
-        self._views: dict[int, dict[str, jax.Array]] = {}
-
-    def try_next(self) -> Transfer | None:
-        """See `Source`.
-
-        Raises:
-          CudaError: the agent's memory cannot be read here.
-        """
-        message = self._inlet.try_get()
-        if message is None:
-            return None
-        spec = Spec.decode(message.parts[0].tobytes())
-        offset, num_envs, version = message.parts[2].view(_NOTE)[0].tolist()
-        self._open(message.parts[1].tobytes())
-        if offset not in self._views:
-            self._views[offset] = self._view(spec, num_envs, offset)
-        self.transfers += 1
-        self.num_bytes += sum(spec.sizes(num_envs))
-        versions = np.full(num_envs, version, np.int64)
-        arrays: dict[str, Any] = dict(self._views[offset])
-        return Transfer(spec, num_envs, versions, arrays)
-
-    def release(self) -> None:
-        """See `Source`."""
-        self._inlet.release()
-
-    def why_lost(self, operation: str, step: int) -> GmijaxError | None:
-        """See `Source`."""
-        return self._inlet.why_lost(operation, step)
-
-    def close(self) -> None:
-        """Gives the mapping back."""
-        self._views.clear()
-        if self._memory is not None:
-            self._memory.close()
-            self._memory = None
-
-    def _open(self, ticket: bytes) -> None:
-        if ticket != self._ticket:  # The first of an agent, or of its successor.
-            self.close()
-            self._memory = self._new_memory()
-            self._memory.open(ticket)
-            self._ticket = ticket
-
-    def _view(self, spec: Spec, num_envs: int, offset: int) -> dict[str, jax.Array]:
-        assert self._memory is not None
-        begins = _slot_of(spec, num_envs).offsets
-        return {
-            channel.name: self._memory.view(
-                offset + begin, channel.full_shape(num_envs), np.dtype(channel.dtype)
-            )
-            for begin, channel in zip(begins, spec.channels, strict=True)
-        }
-
-
-class DeviceStack(Stack):
-    """A batch that is put together on the device; parts are copied, for their slots get reused."""
-
-    def _begin(self) -> None:
-        self._parts: dict[str, list[jax.Array]] = {c.name: [] for c in self.spec.channels}
-
-    def _put(self, name: str, low: int, high: int, array: Any) -> None:
-        del low, high  # Parts come in order.
-        self._parts[name].append(jnp.copy(array).block_until_ready())
-
-    def _so_far(self) -> dict[str, Any]:
-        return {name: jnp.concatenate(parts, axis=1) for name, parts in self._parts.items()}
-
-
-def _slot_of(spec: Spec, num_envs: int) -> _Slot:
-    offsets, end = [], 0
-    for size in spec.sizes(num_envs):
-        offsets.append(end)
-        end += -(-size // _ALIGNMENT) * _ALIGNMENT
-    return _Slot(tuple(offsets), end)
-
-
-_NOTE = np.dtype([("offset", np.int64), ("num_envs", np.int64), ("version", np.int64)])
