@@ -17,10 +17,10 @@ from gmijax.partition.child import ChildLink, required_fd, run_gmi
 from gmijax.partition.plan import Plan
 from gmijax.rundir import read_json
 from gmijax.schema import from_dict
+from gmijax.workers.trainers import join_trainers, trainers_reducer
 
 if TYPE_CHECKING:
     from gmijax.a3c.board import Board
-    from gmijax.collectives.interface import Reducer
     from gmijax.collectives.ring import World
     from gmijax.sim.wrappers import BatchedEnv
 
@@ -48,8 +48,9 @@ def _run(link: ChildLink) -> dict[str, Any]:
     if not isinstance(algo, A3cConfig):
         raise ConfigError(f"algo={algo.name}: allowed here is a3c")
     agents, trainers = groups_of(plan)
+    trains = link.gmi in trainers.gmis
     # jax starts here, in the environment that the plan prepared.
-    world = _world(config, plan, link) if link.gmi in trainers.gmis else None
+    world = join_trainers(config, plan, trainers, link) if trains else None
     from gmijax.selfcheck import check_share
     from gmijax.sim.build import make_training_env
 
@@ -62,16 +63,7 @@ def _run(link: ChildLink) -> dict[str, Any]:
         num_envs=config.envs_per_gmi,
     )
     parts = _Parts(config, algo, plan, env, _board(algo, env, len(agents.gmis)), link)
-    return _train(parts, world) if link.gmi in trainers.gmis else _act(parts)
-
-
-def _world(config: TrainConfig, plan: Plan, link: ChildLink) -> World | None:
-    """The trainers' processes as one, where their gradients go in rings."""
-    from gmijax.collectives.build import join_world
-
-    trainers = groups_of(plan)[1]
-    rank, timeout_s = trainers.gmis.index(link.gmi), config.run.start_timeout_s
-    return join_world(plan.strategy, trainers.layout, rank, link.rendezvous, timeout_s)
+    return _train(parts, world) if trains else _act(parts)
 
 
 def _act(parts: _Parts) -> dict[str, Any]:
@@ -90,39 +82,21 @@ def _act(parts: _Parts) -> dict[str, Any]:
 
 
 def _train(parts: _Parts, world: World | None) -> dict[str, Any]:
+    from gmijax.a3c.programs import exchange_size
     from gmijax.a3c.trainer import Training, learn_until_done
     from gmijax.collectives.channel.build import open_receiver
 
     config, plan, link = parts.config, parts.plan, parts.link
-    training = Training(config, parts.algo, parts.env, groups_of(plan)[0].gmis)
+    agents, trainers = groups_of(plan)
+    training = Training(config, parts.algo, parts.env, agents.gmis)
     receiver = open_receiver(config.channel, places_of(plan), link.gmi, _channels_fd())
-    reducer = _reducer(parts, world)
+    num_floats = exchange_size(parts.env.spec, parts.algo)
+    reducer = trainers_reducer(config, plan, trainers, link, num_floats, world)
     try:
         return learn_until_done(training, parts.board, receiver, reducer, link)
     finally:
         receiver.close()
         reducer.close()
-
-
-def _reducer(parts: _Parts, world: World | None) -> Reducer:
-    """The reducer among the trainers, whose ranks are their places among them."""
-    from gmijax.a3c.programs import exchange_size
-    from gmijax.collectives.build import Membership, build_reducer
-
-    config, plan = parts.config, parts.plan
-    trainers = groups_of(plan)[1]
-    membership = Membership(
-        layout=trainers.layout,
-        rank=trainers.gmis.index(parts.link.gmi),
-        num_floats=exchange_size(parts.env.spec, parts.algo),
-        exchange_fd=parts.link.exchange_fd,
-        timeout_s=config.reduce.timeout_s,
-        rendezvous_timeout_s=config.run.start_timeout_s,
-        world=world,
-        intra=plan.intra,
-        host_if_unavailable=config.reduce.intra == "auto",
-    )
-    return build_reducer(plan.strategy, membership)
 
 
 def _board(algo: A3cConfig, env: BatchedEnv, num_agents: int) -> Board:

@@ -18,11 +18,11 @@ from gmijax.partition.plan import Plan
 from gmijax.partition.templates import AGENT, TRAINER, Group, group_of, has_role
 from gmijax.rundir import read_json
 from gmijax.schema import from_dict
+from gmijax.workers.trainers import join_trainers, trainers_reducer
 
 if TYPE_CHECKING:
     from gmijax.collectives.interface import Reducer
     from gmijax.collectives.pipe_block import PipeBlock
-    from gmijax.collectives.ring import World
     from gmijax.sim.wrappers import BatchedEnv, BatchState
 
 
@@ -40,8 +40,9 @@ def _run(link: ChildLink) -> dict[str, Any]:
         raise ConfigError(f"plan: roles {list(plan.roles)} need trainers and agents")
     trains = link.gmi in trainers.gmis
     # jax starts here, in the environment that the plan prepared.
-    world = _world(config, plan, trainers, link) if trains else None
+    world = join_trainers(config, plan, trainers, link) if trains else None
     from gmijax.collectives.pipe_block import PipeBlock
+    from gmijax.ppo.programs import exchange_size
     from gmijax.selfcheck import check_share
     from gmijax.sim.build import make_training_env
 
@@ -56,7 +57,9 @@ def _run(link: ChildLink) -> dict[str, Any]:
     block = PipeBlock.attach(required_fd(ENV_PIPES_FD), link.gmi, plan.layout.num_gmis, PIPE_BYTES)
     try:
         if trains:
-            reducer = _reducer(config, plan, trainers, env, link, world)
+            assert isinstance(config.algo, PpoConfig)
+            num_floats = exchange_size(env.spec, config.algo)
+            reducer = trainers_reducer(config, plan, trainers, link, num_floats, world)
             return _train(config, plan, reducer, env, block, link)
         return _serve(config, plan, servants, env, block, link)
     finally:
@@ -121,42 +124,6 @@ def _first_envs(config: TrainConfig, env: BatchedEnv, rank: int) -> BatchState:
         key = jax.random.fold_in(key, steps % 2**31)
     keys = env_keys(key, rank * config.envs_per_gmi, config.envs_per_gmi)
     return jax.jit(env.init)(env.model, keys)
-
-
-def _world(config: TrainConfig, plan: Plan, trainers: Group, link: ChildLink) -> World | None:
-    """The trainers' processes as one, where their gradients go in rings."""
-    from gmijax.collectives.build import join_world
-
-    rank, timeout_s = trainers.gmis.index(link.gmi), config.run.start_timeout_s
-    return join_world(plan.strategy, trainers.layout, rank, link.rendezvous, timeout_s)
-
-
-def _reducer(
-    config: TrainConfig,
-    plan: Plan,
-    trainers: Group,
-    env: BatchedEnv,
-    link: ChildLink,
-    world: World | None,
-) -> Reducer:
-    from gmijax.collectives.build import Membership, build_reducer
-    from gmijax.ppo.programs import exchange_size
-
-    assert isinstance(config.algo, PpoConfig)
-    return build_reducer(
-        plan.strategy,
-        Membership(
-            layout=trainers.layout,
-            rank=trainers.gmis.index(link.gmi),
-            num_floats=exchange_size(env.spec, config.algo),
-            exchange_fd=link.exchange_fd,
-            timeout_s=config.reduce.timeout_s,
-            rendezvous_timeout_s=config.run.start_timeout_s,
-            world=world,
-            intra=plan.intra,
-            host_if_unavailable=config.reduce.intra == "auto",
-        ),
-    )
 
 
 def _neighbours(plan: Plan, gmi: int, role: str) -> tuple[int, ...]:

@@ -13,8 +13,10 @@ from typing import Any
 from gmijax.config import PpoConfig, TrainConfig
 from gmijax.partition.child import ChildLink, run_gmi
 from gmijax.partition.plan import Plan
+from gmijax.partition.templates import Group
 from gmijax.rundir import read_json
 from gmijax.schema import from_dict
+from gmijax.workers.trainers import join_trainers, trainers_reducer
 
 
 def main() -> int:
@@ -25,11 +27,9 @@ def main() -> int:
 def _run(link: ChildLink) -> dict[str, Any]:
     config = from_dict(TrainConfig, read_json(link.run.config))
     plan = Plan.from_dict(read_json(link.run.plan))
+    everyone = Group(tuple(plan.layout.gmis), plan.layout)
     # jax starts here, in the environment that the plan prepared.
-    from gmijax.collectives.build import Membership, build_reducer, join_world
-
-    start_timeout_s = config.run.start_timeout_s
-    world = join_world(plan.strategy, plan.layout, link.gmi, link.rendezvous, start_timeout_s)
+    world = join_trainers(config, plan, everyone, link)
     from gmijax.selfcheck import check_share
 
     check_share(plan, link.gmi)
@@ -45,20 +45,8 @@ def _run(link: ChildLink) -> dict[str, Any]:
         first_env=link.gmi * config.envs_per_gmi,
         num_envs=config.envs_per_gmi,
     )
-    reducer = build_reducer(
-        plan.strategy,
-        Membership(
-            layout=plan.layout,
-            rank=link.gmi,
-            num_floats=exchange_size(env.spec, config.algo),
-            exchange_fd=link.exchange_fd,
-            timeout_s=config.reduce.timeout_s,
-            rendezvous_timeout_s=start_timeout_s,
-            world=world,
-            intra=plan.intra,
-            host_if_unavailable=config.reduce.intra == "auto",
-        ),
-    )
+    num_floats = exchange_size(env.spec, config.algo)
+    reducer = trainers_reducer(config, plan, everyone, link, num_floats, world)
     try:
         done = train(config, env, reducer, link)
         if plan.strategy == "har":  # It may have come to another exchange than the plan's.

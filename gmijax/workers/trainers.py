@@ -1,0 +1,64 @@
+"""How a GMI that trains finds the others that do: their processes as one, and a reducer."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from gmijax.config import TrainConfig
+from gmijax.partition.child import ChildLink
+from gmijax.partition.plan import Plan
+from gmijax.partition.templates import Group
+
+if TYPE_CHECKING:
+    from gmijax.collectives.interface import Reducer
+    from gmijax.collectives.ring import World
+
+
+def join_trainers(
+    config: TrainConfig, plan: Plan, trainers: Group, link: ChildLink
+) -> World | None:
+    """The trainers' processes as one, where their gradients go in rings; else None.
+
+    Comes before all other use of jax. Raises as `join_world`.
+    """
+    from gmijax.collectives.build import join_world
+
+    rank, timeout_s = trainers.gmis.index(link.gmi), config.run.start_timeout_s
+    return join_world(plan.strategy, trainers.layout, rank, link.rendezvous, timeout_s)
+
+
+def trainers_reducer(
+    config: TrainConfig,
+    plan: Plan,
+    trainers: Group,
+    link: ChildLink,
+    num_floats: int,
+    world: World | None,
+) -> Reducer:
+    """The reducer among the trainers, whose ranks are their places in the group.
+
+    Args:
+      config: of the run.
+      plan: of the run.
+      trainers: who takes part.
+      link: this process, one of them.
+      num_floats: P, length of the buffers for `mean`.
+      world: from `join_trainers`.
+
+    Raises:
+      ConfigError, CollectiveError: as `build_reducer`.
+    """
+    from gmijax.collectives.build import Membership, build_reducer
+
+    membership = Membership(
+        layout=trainers.layout,
+        rank=trainers.gmis.index(link.gmi),
+        num_floats=num_floats,
+        exchange_fd=link.exchange_fd,
+        timeout_s=config.reduce.timeout_s,
+        rendezvous_timeout_s=config.run.start_timeout_s,
+        world=world,
+        intra=plan.intra,
+        host_if_unavailable=config.reduce.intra == "auto",
+    )
+    return build_reducer(plan.strategy, membership)
