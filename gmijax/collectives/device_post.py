@@ -8,14 +8,14 @@ place, and for arrays that are small or of other types, messages travel through 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection
+from collections.abc import Collection
 from typing import Any, Final, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from gmijax.collectives.ipc import DeviceMemory
+from gmijax.collectives.ipc import DeviceMemory, NewMemory
 
 LEAST_BYTES: Final = 4096
 """Smaller arrays are through the host as soon as through the device."""
@@ -66,7 +66,7 @@ class DevicePost:
     def __init__(
         self,
         neighbours: Collection[int],
-        new_memory: Callable[[], DeviceMemory],
+        new_memory: NewMemory,
         part_bytes: int = PART_BYTES,
     ) -> None:
         self.peers = tuple(sorted(neighbours))

@@ -16,7 +16,7 @@ from gmijax.collectives.intra import B, IntraExchange
 from gmijax.collectives.mrr import open_rings, run_watched
 from gmijax.collectives.ring import Ring, World
 from gmijax.collectives.turns import Turns
-from gmijax.partition.reduction import is_even, leaders
+from gmijax.partition.reduction import leaders
 
 T = TypeVar("T")
 
@@ -46,8 +46,7 @@ class _Hierarchy(Generic[B]):
         self._num_floats = num_floats
         self._ring: LeaderRing | None = None
         if world is not None:
-            of_all = self.is_device_resident and is_even(world.layout)
-            self._ring = LeaderRing(host, world, num_floats, of_all=of_all)
+            self._ring = LeaderRing(host, world, num_floats, of_all=intra.all_sum)
 
     def all_gather(self, values: FloatBuffer) -> FloatBuffer:
         """See `HostExchange.all_gather`."""

@@ -32,14 +32,16 @@ class IntraExchange(Protocol[B]):
 
     Attributes:
       is_device_resident: whether the buffers are those of jax, in the device's memory.
+      all_sum: whether every rank gets the sum of its GPU, not the leader alone.
     """
 
     is_device_resident: bool
+    all_sum: bool
 
     def sum(self, buffer: B, block: ExchangeBlock, turns: Turns, scale: float) -> B | None:
         """The sum of `buffer` [P] over this GPU's GMIs, times `scale`, for its leader; else None.
 
-        With an even layout others may get it too.
+        With `all_sum` the others get it too.
         """
         ...
 
@@ -70,6 +72,7 @@ class HostIntra:
     """
 
     is_device_resident = False
+    all_sum = False
 
     def __init__(self, layout: Layout, rank: int, num_floats: int) -> None:
         neighbours, all_leaders = layout.neighbours_of(rank), leaders(layout)

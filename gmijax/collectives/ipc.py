@@ -5,7 +5,7 @@ from __future__ import annotations
 import functools
 from collections.abc import Callable
 from contextlib import suppress
-from typing import Protocol
+from typing import Protocol, TypeAlias
 
 import jax
 import jax.numpy as jnp
@@ -59,6 +59,10 @@ class DeviceMemory(Protocol):
         ...
 
 
+NewMemory: TypeAlias = Callable[[], DeviceMemory]
+"""How the processes of a GPU share a block: `CudaMemory`, or what a test puts in its place."""
+
+
 class IpcIntra:
     """Through a block of device memory that the leader makes: two slots a GMI, one result.
 
@@ -92,13 +96,13 @@ class IpcIntra:
         rank: int,
         num_floats: int,
         host: HostExchange,
-        new_memory: Callable[[], DeviceMemory],
+        new_memory: NewMemory,
     ) -> None:
         neighbours = layout.neighbours_of(rank)
         leader = leaders(layout)[layout.gpu_of(rank)]
         self._count = len(neighbours)
-        self._all_sum = is_even(layout)
-        self._sums = self._all_sum or rank == leader
+        self.all_sum = is_even(layout)
+        self._sums = self.all_sum or rank == leader
         self._memory: DeviceMemory | None = None
         self._slots: list[jax.Array] = []
         self._mean: jax.Array | None = None
@@ -119,14 +123,12 @@ class IpcIntra:
             )
             ticket = tickets[leader][:TICKET_BYTES].tobytes()
             _agreed(host, lambda: self._map(None if rank == leader else ticket))
-            _agreed(host, lambda: self._try(1.0 / self._count if self._all_sum else 1.0))
+            _agreed(host, lambda: self._try(1.0 / self._count if self.all_sum else 1.0))
         except IntraUnavailable:
             self.close()
             raise
 
-    def _make(
-        self, new_memory: Callable[[], DeviceMemory], num_bytes: int, is_leader: bool
-    ) -> bytes:
+    def _make(self, new_memory: NewMemory, num_bytes: int, is_leader: bool) -> bytes:
         self._memory = new_memory()
         return self._memory.create(num_bytes) if is_leader else b""
 
@@ -181,7 +183,7 @@ class IpcIntra:
     def spread(self, mean: jax.Array | None, block: ExchangeBlock, turns: Turns) -> jax.Array:
         """See `IntraExchange`; the result may still be computed, and is the caller's own."""
         del block
-        if self._all_sum and mean is not None:
+        if self.all_sum and mean is not None:
             return mean
         if mean is not None:
             with explained(turns):

@@ -11,7 +11,7 @@ import atexit
 import functools
 import math
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import Any, TypeAlias
 
 import jax
 import jax.numpy as jnp
@@ -29,6 +29,9 @@ from gmijax.partition.layout import Layout
 AXIS = "ring"
 _LOCAL_HOST = "127.0.0.1"
 _LEAVE_TIMEOUT_S = 300
+
+_Program: TypeAlias = Callable[[float, jax.Array], jax.Array]
+"""What a member does with a number, the same on all, and its buffer."""
 
 
 class World:
@@ -119,41 +122,27 @@ class Ring:
         self._mesh = Mesh(np.array(devices), (AXIS,))
         self._sharding = NamedSharding(self._mesh, PartitionSpec(AXIS))
         self._global_shape = (len(devices) * num_floats,)
-        self._ordered: dict[float, Callable[[jax.Array], jax.Array]] = {}
-        self._programs: dict[tuple[int | None, float], Callable[[jax.Array], jax.Array]] = {}
+        self._programs: dict[tuple[_Program, float], Callable[[jax.Array], jax.Array]] = {}
 
     def sum(self, buffer: jax.Array, scale: float = 1.0) -> jax.Array:
         """The sum over the ring of `buffer` [P] float32, times `scale`; on this GMI's device."""
-        return self._run(buffer, None, scale)
+        return self._run(_sum, scale, buffer)
 
     def ordered_sum(self, buffer: jax.Array, scale: float) -> jax.Array:
         """As `sum`, but summed by places: other rings with the same buffers get the same bits."""
-        if scale not in self._ordered:
-            self._ordered[scale] = self._compiled(functools.partial(_ordered_sum, scale))
-        return self._ordered[scale](self._whole(buffer)).addressable_data(0)
+        return self._run(_ordered_sum, scale, buffer)
 
     def broadcast(self, buffer: jax.Array, source: int) -> jax.Array:
         """The `buffer` [P] of the member at place `source`, on the device of every member."""
-        return self._run(buffer, source, 1.0)
+        return self._run(_broadcast, source, buffer)
 
-    def _run(self, buffer: jax.Array, source: int | None, scale: float) -> jax.Array:
-        if (source, scale) not in self._programs:
-            self._programs[source, scale] = self._program(source, scale)
-        return self._programs[source, scale](self._whole(buffer)).addressable_data(0)
-
-    def _whole(self, buffer: jax.Array) -> jax.Array:
-        return jax.make_array_from_single_device_arrays(
+    def _run(self, program: _Program, number: float, buffer: jax.Array) -> jax.Array:
+        if (program, number) not in self._programs:
+            self._programs[program, number] = self._compiled(functools.partial(program, number))
+        whole = jax.make_array_from_single_device_arrays(
             self._global_shape, self._sharding, [buffer]
         )
-
-    def _program(self, source: int | None, scale: float) -> Callable[[jax.Array], jax.Array]:
-        def total(x: jax.Array) -> jax.Array:
-            if source is not None:
-                # The others add zeros, which changes no value.
-                x = jnp.where(jax.lax.axis_index(AXIS) == source, x, 0.0)
-            return jax.lax.psum(x, AXIS) * np.float32(scale)
-
-        return self._compiled(total)
+        return self._programs[program, number](whole).addressable_data(0)
 
     def _compiled(
         self, program: Callable[[jax.Array], jax.Array]
@@ -168,6 +157,16 @@ class Ring:
             check_vma=False,
         )
         return jax.jit(inside)
+
+
+def _sum(scale: float, buffer: jax.Array) -> jax.Array:
+    return jax.lax.psum(buffer, AXIS) * np.float32(scale)
+
+
+def _broadcast(source: float, buffer: jax.Array) -> jax.Array:
+    # The others add zeros, which changes no value.
+    mine = jnp.where(jax.lax.axis_index(AXIS) == int(source), buffer, 0.0)
+    return jax.lax.psum(mine, AXIS)
 
 
 def _ordered_sum(scale: float, buffer: jax.Array) -> jax.Array:

@@ -22,14 +22,12 @@ from gmijax.collectives.channel.interface import SenderStats
 from gmijax.collectives.channel.memory import MemoryOutlet
 from gmijax.collectives.channel.migrator import Migrator
 from gmijax.collectives.channel.spec import Spec, spec_of
-from gmijax.collectives.ipc import TICKET_BYTES, DeviceMemory
+from gmijax.collectives.ipc import TICKET_BYTES, DeviceMemory, NewMemory
 from gmijax.collectives.pipe import Bytes
 from gmijax.collectives.waits import wait_until
 from gmijax.errors import ConfigError, GmijaxError
 
 _LEAST_SLOTS = 2
-
-NewMemory = Callable[[], DeviceMemory]
 
 
 class _Way:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import Any
 
 import jax
@@ -14,10 +13,8 @@ from gmijax.collectives.channel.compressor import Transfer
 from gmijax.collectives.channel.device_slots import NOTE, slot_of
 from gmijax.collectives.channel.interface import Inlet
 from gmijax.collectives.channel.spec import Spec
-from gmijax.collectives.ipc import DeviceMemory
+from gmijax.collectives.ipc import DeviceMemory, NewMemory
 from gmijax.errors import GmijaxError
-
-NewMemory = Callable[[], DeviceMemory]
 
 
 class ResidentSource:
