@@ -14,7 +14,6 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import numpy.typing as npt
 from jax.flatten_util import ravel_pytree
@@ -173,29 +172,30 @@ class _Agent:
         pending: _Sent | None = None
         unpack = jax.jit(lambda packed: unpack_weights(weights, packed))
         while not self._obey(env_state):
+            weights = self._newest(weights, unpack)
+            version = self._version  # Of the oldest weights that make this unroll.
             pieces: list[tuple[Unrolls, UnrollStats]] = []
-            versions: list[int] = []
             for index in range(self._algo.pieces_per_unroll):
                 if index > 1:  # One piece runs and one waits: more would act with older weights.
                     jax.block_until_ready(pieces[index - 2])
-                weights = self._newest(weights, unpack)
+                if index > 0:
+                    weights = self._newest(weights, unpack)
                 env_state, made = programs.piece(weights, env_state)
                 pieces.append(made)
-                versions.append(self._version)
                 # While the device computes this unroll, the one before is sent.
                 if index == 0 and pending is not None:
                     self._send(pending, env_state)
-            pending = _Sent(*programs.join(pieces), versions[0])
+            pending = _Sent(*programs.join(pieces), version)
         self._publish()
 
     def _newest(
-        self, weights: ActingWeights, unpack: Callable[[Array], ActingWeights]
+        self, weights: ActingWeights, unpack: Callable[[npt.NDArray[np.float32]], ActingWeights]
     ) -> ActingWeights:
         """The newest weights on the board; `weights` if there are no newer ones."""
         if (posted := self._board.weights.read(self._weights_seen)) is None:
             return weights
         self._weights_seen, self._version = posted.count, posted.tag
-        return unpack(jnp.asarray(posted.values.view(np.float32)))
+        return unpack(posted.values.view(np.float32))
 
     def _send(self, unroll: _Sent, env_state: BatchState) -> None:
         arrays: dict[str, Any] = unroll.experience._asdict()

@@ -12,8 +12,7 @@ from gmijax.control.decoupled import is_decoupled
 from gmijax.control.profiling import platform_of
 from gmijax.control.searching import is_auto, resolve_auto, workload_of
 from gmijax.control.workload import Workload
-from gmijax.errors import ConfigError
-from gmijax.partition.backend_choice import candidates
+from gmijax.partition.backend_choice import candidates, require_num_gpus
 from gmijax.partition.machine import Machine
 from gmijax.partition.placement import serving_and_training
 
@@ -48,8 +47,4 @@ def _require_gpus(config: TrainConfig, workload: Workload, machine: Machine) -> 
     if is_decoupled(config):
         serving, training, _ = serving_and_training(workload.plan)
         needed = len({*serving, *training})
-    if needed > (here := len(candidates(workload.plan, machine))):
-        raise ConfigError(
-            f"plan.gpus={needed}: this machine has {here} usable GPUs (any number is allowed "
-            "with plan.backend=cpu)"
-        )
+    require_num_gpus(needed, candidates(workload.plan, machine))

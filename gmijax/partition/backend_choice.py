@@ -6,6 +6,7 @@ instances exist, because GMIs that only simulate and infer gain from being apart
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from typing import Final, Literal, TypeAlias
 
 from gmijax.config import PlanConfig
@@ -106,6 +107,15 @@ def choose_gpus(
     return chosen
 
 
+def require_num_gpus(needed: int, usable: Collection[Gpu], key: str = "plan.gpus") -> None:
+    """Raises ConfigError if a job, by its setting `key`, needs more GPUs than are `usable`."""
+    if needed > len(usable):
+        raise ConfigError(
+            f"{key}={needed}: this machine has {len(usable)} usable GPUs "
+            "(any number is allowed with plan.backend=cpu)"
+        )
+
+
 def candidates(plan: PlanConfig, machine: Machine) -> tuple[Gpu, ...]:
     """The GPUs that the job may use: those that it names, else all.
 
@@ -176,12 +186,8 @@ def _first_gpus(
     reasons: list[str],
 ) -> tuple[Gpu, ...]:
     """The first GPUs, those that the backend cannot use only if there are not enough others."""
-    if num_gpus > len(machine.gpus):
-        key = "plan.gpus" if plan.layout is None else "GPUs of plan.layout"
-        raise ConfigError(
-            f"{key}={num_gpus}: this machine has {len(machine.gpus)} usable GPUs "
-            "(any number is allowed with plan.backend=cpu)"
-        )
+    key = "plan.gpus" if plan.layout is None else "GPUs of plan.layout"
+    require_num_gpus(num_gpus, machine.gpus, key)
 
     def is_unfit(gpu: Gpu) -> bool:
         return not gpu.instances if backend == "mig" else gpu.mig_enabled
