@@ -25,6 +25,7 @@ TASKS = ("ant", "anymal", "ball_balance", "franka_cabinet", "humanoid", "shadow_
 # Where the settings of a task ask for much more than it takes to learn it, fewer steps. Those of
 # ball_balance are made for a CPU.
 _LEARNING = {
+    "ant": ("num_timesteps=60e6",),
     "anymal": ("num_timesteps=60e6",),
     "ball_balance": ("num_envs=4096", "num_timesteps=10e6"),
     "franka_cabinet": ("num_timesteps=50e6",),

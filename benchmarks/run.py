@@ -2,7 +2,9 @@
 
 `python -m benchmarks.run ant-1gpu --repeats 3` runs the cases in turn (A B C A B C ...), prints
 the medians, and writes `benchmarks/results/<suite>.json` with every run in it. With `--gpus 4`
-as many runs go on at a time as there are GPUs for, each alone on its own.
+as many runs go on at a time as there are GPUs for, each alone on its own. `--together 3` puts
+three at a time on each GPU, under an MPS daemon that runs already: what they learn is the same,
+their seconds are not, and each run says how many they were.
 """
 
 from __future__ import annotations
@@ -23,11 +25,14 @@ from pathlib import Path
 from typing import Any
 
 from benchmarks.cases import SUITES, Case
+from gmijax.partition.machine import detect_machine
 from gmijax.results import read_metrics
 
 RESULTS = Path(__file__).parent / "results"
 RATES = ("step_per_s_sim", "step_per_s_inference", "step_per_s_train")
 CURVE_POINTS = 60
+_MEMORY_FRACTION = 0.9
+"""Of a GPU, for all runs on it."""
 
 
 def main() -> int:
@@ -36,6 +41,7 @@ def main() -> int:
     parser.add_argument("suites", nargs="+", choices=sorted(SUITES), metavar="SUITE")
     parser.add_argument("--repeats", type=int, default=3)
     parser.add_argument("--gpus", type=int, help="run cases at the same time on so many GPUs")
+    parser.add_argument("--together", type=int, default=1, help="runs at a time on each GPU")
     parser.add_argument("--out", type=Path, default=RESULTS, help="folder of the JSON files")
     parser.add_argument("--runs", type=Path, help="keep the run folders here")
     parser.add_argument("--resume", action="store_true", help="add to the runs in the JSON file")
@@ -47,16 +53,30 @@ def main() -> int:
             parser.error(f"--gpus {arguments.gpus}: every case of these suites needs more")
         for case in large:
             sys.stderr.write(f"{case.name}: left out, it needs {case.gpus} GPUs\n")
+    if arguments.together > 1 and (reason := why_not_together(cases, arguments.gpus)):
+        parser.error(f"--together {arguments.together}: {reason}")
     arguments.out.mkdir(parents=True, exist_ok=True)
     books = {
         suite: ResultsFile(arguments.out / f"{suite}.json", suite, resume=arguments.resume)
         for suite in arguments.suites
     }
     with tempfile.TemporaryDirectory() as scratch:
-        run_all(books, arguments.repeats, arguments.runs or Path(scratch), arguments.gpus)
+        free = FreeGpus(arguments.gpus, arguments.together) if arguments.gpus else None
+        run_all(books, arguments.repeats, arguments.runs or Path(scratch), free)
     for book in books.values():
         sys.stdout.write(f"{table(book.results)}\nwritten: {book.path}\n")
     return int(any(book.failures() for book in books.values()))
+
+
+def why_not_together(cases: list[Case], gpus: int | None) -> str | None:
+    """What stands in the way of several runs on a GPU, None if nothing does."""
+    if gpus is None:
+        return "needs --gpus"
+    if large := [case.name for case in cases if case.gpus > 1]:
+        return f"{large[0]} needs several GPUs"
+    if detect_machine().operator_daemon is None:
+        return "no MPS daemon runs; start one with nvidia-cuda-mps-control -d"
+    return None
 
 
 class ResultsFile:
@@ -104,47 +124,68 @@ class ResultsFile:
 
 
 class FreeGpus:
-    """The GPUs that no case runs on, by index; usable from any thread.
+    """The GPUs that have room for a case, by index; usable from any thread.
 
-    Args:
+    Attributes:
       count: how many there are.
+      together: how many cases of one GPU may share it.
     """
 
-    def __init__(self, count: int) -> None:
-        self._free = list(range(count))
+    def __init__(self, count: int, together: int = 1) -> None:
+        self.count = count
+        self.together = together
+        self._room = [together] * count
         self._changed = threading.Condition()
+
+    def overrides(self, taken: list[int]) -> Iterator[str]:
+        """The part of a plan that keeps a run to its share."""
+        yield f"plan.gpus=[{','.join(map(str, taken))}]"
+        if self.together > 1:
+            yield "plan.backend=mps"
+            yield f"plan.memory_fraction={_MEMORY_FRACTION / self.together:.3f}"
 
     @contextmanager
     def taken(self, count: int) -> Iterator[list[int]]:
-        """`count` of them, once there are so many."""
+        """The `count` emptiest of them, once so many have room."""
         with self._changed:
-            self._changed.wait_for(lambda: len(self._free) >= count)
-            mine, self._free = self._free[:count], self._free[count:]
+            self._changed.wait_for(lambda: sum(map(bool, self._room)) >= count)
+            by_room = sorted(range(self.count), key=lambda gpu: -self._room[gpu])
+            mine = sorted(by_room[:count])
+            self._change(mine, -1)
         try:
             yield mine
         finally:
             with self._changed:
-                self._free = sorted([*self._free, *mine])
+                self._change(mine, 1)
                 self._changed.notify_all()
 
+    def _change(self, gpus: list[int], by: int) -> None:
+        for gpu in gpus:
+            self._room[gpu] += by
 
-def run_all(books: Mapping[str, ResultsFile], repeats: int, runs: Path, gpus: int | None) -> None:
-    """Runs the cases of all suites in turn until each has `repeats` runs."""
-    free = FreeGpus(gpus or 1)
+
+def run_all(
+    books: Mapping[str, ResultsFile], repeats: int, runs: Path, free: FreeGpus | None
+) -> None:
+    """Runs the cases of all suites until each has `repeats` runs; in turn without `free`."""
 
     def run(book: ResultsFile, repeat: int, case: Case) -> None:
         # Letters and digits only: the folder is a value on a command line.
         name = re.sub(r"[^a-zA-Z0-9]+", "-", case.name)
         folder = runs / f"{book.results['suite']}-{name}-{repeat}"
-        with free.taken(case.gpus if gpus else 1) as taken:
-            alone = (f"plan.gpus=[{','.join(map(str, taken))}]",) if gpus else ()
-            book.add(case, run_case(case, repeat, (*alone, f"run.dir={folder}"), folder))
+        folder_override = f"run.dir={folder}"
+        if free is None:
+            book.add(case, run_case(case, repeat, (folder_override,), folder))
+            return
+        with free.taken(case.gpus) as taken:
+            done = run_case(case, repeat, (*free.overrides(taken), folder_override), folder)
+        book.add(case, done if free.together == 1 else {**done, "together": free.together})
 
-    with ThreadPoolExecutor(gpus or 1) as pool:
+    with ThreadPoolExecutor(free.count * free.together if free else 1) as pool:
         started = [
             pool.submit(run, book, repeat, case)
             for book in books.values()
-            for repeat, case in book.missing(repeats, gpus)
+            for repeat, case in book.missing(repeats, free and free.count)
         ]
         try:
             for one in started:

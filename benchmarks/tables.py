@@ -6,6 +6,7 @@ They are made from the JSON files in `benchmarks/results`, and pasted into the d
 from __future__ import annotations
 
 import json
+import math
 import sys
 from collections.abc import Iterator
 from typing import Any
@@ -59,7 +60,7 @@ def throughput() -> Iterator[str]:
 
 
 def learning() -> Iterator[str]:
-    """What every task reached over its seeds, and how long that took."""
+    """What every task reached over its seeds, and how long that took alone on a GPU."""
     yield "| task | million steps | seconds | return of every seed | metrics, means over seeds |"
     yield "|---|---|---|---|---|"
     for task in TASKS:
@@ -68,7 +69,8 @@ def learning() -> Iterator[str]:
         if not runs:
             continue
         steps = runs[0]["summary"]["env_steps"] / 1e6
-        seconds = median([run["summary"] for run in runs], "train_wall_s")
+        alone = [run["summary"] for run in runs if "together" not in run]
+        seconds = median(alone, "train_wall_s") if alone else math.nan
         returns = ", ".join(f"{run['summary']['final_return']:,.1f}" for run in runs)
         means = {
             name.removeprefix("metric/"): sum(run["metrics"][name] for run in runs) / len(runs)
