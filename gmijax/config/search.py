@@ -34,8 +34,8 @@ class SearchConfig:
         "both: choose by corun, then profile what was run isolated too and tell the difference"
     )
     order: Literal["coarse_first", "as_printed"] = doc(
-        "every third row and size, then the neighbours of the best point; or the whole grid in "
-        "the order of the paper's Algorithm 2"
+        "every third row with the largest size and the third below it, then the neighbours of the "
+        "best point; or the whole grid in the order of the paper's Algorithm 2"
     )
     alpha: float = doc(
         "a row of sizes ends when the gain of throughput by the growth of memory is below this"

@@ -32,6 +32,7 @@ from typing import Final, NamedTuple
 from gmijax.partition.points import Measured, NotRunnable, Point
 
 _STRIDE: Final = 3
+_COARSE_SIZES: Final = 2
 
 
 class OutOfBudget(Exception):
@@ -63,8 +64,9 @@ class Rules(NamedTuple):
       estimate: environment steps a second of the whole job, line 20.
       alpha: a row ends when Sat falls below it; the paper has below 0.1.
       tolerance: relative difference of throughput that counts as none.
-      coarse_first: first every third row and every third size, then the neighbours of the best
-        point, until none of them is better; else the whole grid in the paper's order.
+      coarse_first: first every third row with the largest size and the third below it, then the
+        neighbours of the best point, until none of them is better; else the whole grid in the
+        paper's order.
       top: what Sat goes by.
     """
 
@@ -139,7 +141,7 @@ def search(grid: Grid, profile: Profile, rules: Rules) -> Outcome:
     complete = True
     try:
         if rules.coarse_first:
-            _rows(book, coarse(grid))
+            _first_look(book, grid)
             _climb(book, grid)
         else:
             _rows(book, as_printed(grid))
@@ -155,15 +157,16 @@ def as_printed(grid: Grid) -> Grid:
 
 
 def coarse(grid: Grid) -> Grid:
-    """Every third row, and every third size from the largest down.
+    """Every third row, with the largest size and the third below it.
 
     The row with the fewest GMIs is among them: it is the measure of all others. It comes first,
-    because the fewer GMIs, the sooner they have started, and time may run out.
+    because the fewer GMIs, the sooner they have started, and time may run out. Smaller sizes are
+    left to the climb: where there is room for more environments, few are hardly ever the answer.
     """
-    sizes = sorted(grid.num_envs, reverse=True)
+    sizes = sorted(grid.num_envs, reverse=True)[::_STRIDE]
     return Grid(
         _some_rows(grid.gmis_per_gpu),
-        tuple(sorted(sizes[::_STRIDE])),
+        tuple(sorted(sizes[:_COARSE_SIZES])),
         grid.impls,
         _some_rows(grid.trainers),
     )
@@ -233,6 +236,15 @@ def _rows(book: _Book, grid: Grid) -> None:
         for num_envs in grid.num_envs:
             if book.is_saturated(book.visit(Point(gmis_per_gpu, num_envs, impl, trainers))):
                 break
+
+
+def _first_look(book: _Book, grid: Grid) -> None:
+    """The coarse rows; smaller sizes only as long as nothing runs."""
+    sizes = grid.num_envs
+    while sizes and book.best() is None:
+        part = coarse(grid._replace(num_envs=sizes))
+        _rows(book, part)
+        sizes = tuple(size for size in sizes if size < part.num_envs[0])
 
 
 def _climb(book: _Book, grid: Grid) -> None:
