@@ -30,6 +30,10 @@ _LOCAL_HOST = "127.0.0.1"
 # compile different programs.
 _NO_SHARED_AUTOTUNING = "--xla_gpu_shard_autotuning=false"
 
+# XLA's client for GPUs goes on looking for the service that ring members leave before they train,
+# and warns of it twice a second, for as long as the job lasts.
+_ERRORS_ONLY = {"TF_CPP_MIN_LOG_LEVEL": "2"}
+
 
 def gmi_environment(
     plan: Plan,
@@ -71,6 +75,7 @@ def gmi_environment(
         environment.update({ENV_RENDEZVOUS: rendezvous, "no_grpc_proxy": _LOCAL_HOST})
         if plan.backend != "cpu":
             flags = extend_xla_flags(flags, _NO_SHARED_AUTOTUNING)
+            environment = {**_ERRORS_ONLY, **environment}
     if flags:
         environment[_XLA_FLAGS] = flags
     return {**environment, **added}

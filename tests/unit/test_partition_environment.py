@@ -135,6 +135,7 @@ def test_gmis_that_form_rings_are_told_where_to_meet(backend: str, has_flag: boo
     found = gmi_environment(plan, 0, inherited, cache, {}, address)
     assert (found["GMIJAX_RENDEZVOUS"], found["no_grpc_proxy"]) == (address, "127.0.0.1")
     assert ("--xla_gpu_shard_autotuning=false" in found.get("XLA_FLAGS", "")) == has_flag
+    assert ("TF_CPP_MIN_LOG_LEVEL" in found) == has_flag
     assert "GMIJAX_RENDEZVOUS" not in gmi_environment(plan, 0, inherited, cache, {})
 
 
