@@ -1,6 +1,7 @@
 """Draws the return curves of suites: `python -m benchmarks.plot OUT.png ant-1gpu ...`.
 
-Left over environment steps, right over wall-clock seconds of training.
+Left over environment steps, right over wall-clock seconds of training, where runs that shared
+their GPU are left out.
 """
 
 from __future__ import annotations
@@ -30,7 +31,8 @@ def main(picture: str, suites: list[str]) -> None:
                 steps, seconds, returns = zip(*points, strict=True)
                 style = {"color": f"C{number}", "alpha": 0.8, "label": None if k else name}
                 over_steps.plot([s / 1e6 for s in steps], returns, **style)
-                over_time.plot(seconds, returns, **style)
+                if "together" not in run:
+                    over_time.plot(seconds, returns, **style)
             number += 1
     over_steps.set(xlabel="million environment steps", ylabel="mean episode return")
     over_time.set(xlabel="seconds of training")

@@ -11,6 +11,8 @@
   many GPUs; without them only the prediction is printed;
 - optionally `simulator_r`, `agent_r`, `trainer_r`, `alpha`, `beta`: R_s, R_a, R_t in any unit, and
   the sharing factors; the paper's ratios (10 : 1 : 2, 0.2, 0.3) where they were not measured.
+
+A file of `python -m benchmarks.run templates-<task>` is one case, see `training_case`.
 """
 
 from __future__ import annotations
@@ -24,6 +26,7 @@ from typing import Any
 
 from gmijax.partition.resource_model import Task, serving_gain, training_gain
 
+_TRAINING = ("tcg_ex", "tdg_ex")
 PAPER = {"simulator_r": 10.0, "agent_r": 1.0, "trainer_r": 2.0, "alpha": 0.2, "beta": 0.3}
 
 
@@ -31,13 +34,37 @@ def main() -> int:
     """Prints the table of all cases of all files; returns the exit code."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("files", nargs="+", type=Path, metavar="MEASURED.json")
-    cases = [
-        case
-        for file in parser.parse_args().files
-        for case in json.loads(file.read_text())["cases"]
-    ]
+    cases = [case for file in parser.parse_args().files for case in cases_of(file)]
     sys.stdout.write("\n".join(table(cases)) + "\n")
     return 0
+
+
+def cases_of(file: Path) -> list[dict[str, Any]]:
+    """The cases in a file of either kind."""
+    results = json.loads(file.read_text())
+    cases = results["cases"]
+    return cases if isinstance(cases, list) else [training_case(results["suite"], cases)]
+
+
+def training_case(name: str, cases: Mapping[str, Any]) -> dict[str, Any]:
+    """A case from the medians of a `templates-<task>` suite.
+
+    A rollout is one program, so T_s has T_a in it. What a dedicated trainer waits longer for its
+    rollouts than a co-located one takes to make them is what moving them costs.
+    """
+    tcg, tdg = (next(c["runs"][0] for n, c in cases.items() if n.endswith(t)) for t in _TRAINING)
+    rollout_s, reduce_s = (tcg["medians"][f"time/{part}_s"] for part in ("rollout", "reduce"))
+    longer_s = max(0.0, tdg["medians"]["time/rollout_s"] - rollout_s)
+    return {
+        "name": name,
+        "simulator_s": rollout_s,
+        "agent_s": 0.0,
+        "trainer_s": tcg["medians"]["time/update_s"] - reduce_s,
+        "reduce_s": reduce_s,
+        "com_s": longer_s + (tdg["medians"].get("time/reduce_s") or 0.0),
+        "colocated": tcg["summary"]["step_per_s_train"],
+        "dedicated": tdg["summary"]["step_per_s_train"],
+    }
 
 
 def table(cases: list[dict[str, Any]]) -> Iterator[str]:

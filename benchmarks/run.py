@@ -172,7 +172,7 @@ def run_all(
     def run(book: ResultsFile, repeat: int, case: Case) -> None:
         # Letters and digits only: the folder is a value on a command line.
         name = re.sub(r"[^a-zA-Z0-9]+", "-", case.name)
-        folder = runs / f"{book.results['suite']}-{name}-{repeat}"
+        folder = unused(runs / f"{book.results['suite']}-{name}-{repeat}")
         folder_override = f"run.dir={folder}"
         if free is None:
             book.add(case, run_case(case, repeat, (folder_override,), folder))
@@ -193,6 +193,11 @@ def run_all(
         except BaseException:
             pool.shutdown(wait=False, cancel_futures=True)
             raise
+
+
+def unused(folder: Path) -> Path:
+    """`folder`, or with a letter more where an interrupted run has left it."""
+    return next(f for f in (folder, *(Path(f"{folder}{x}") for x in "bcdefgh")) if not f.exists())
 
 
 def run_case(case: Case, repeat: int, overrides: tuple[str, ...], folder: Path) -> dict[str, Any]:

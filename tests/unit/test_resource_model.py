@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import pytest
 
+from benchmarks.resource_model import measured_gain, predicted_gain, training_case
 from gmijax.errors import ConfigError
 from gmijax.partition.resource_model import (
     Sizes,
@@ -85,3 +86,25 @@ def test_what_takes_no_time_has_no_throughput():
         tdg_resource(Task(0.0, 1.0), Task(0.0, 1.0), ALPHA)
     with pytest.raises(ConfigError, match="resource=0"):
         throughput(1.0, 0.0, 1.0, 0.0)
+
+
+def test_a_suite_of_templates_is_a_case_of_training():
+    def run(rate: float, rollout_s: float, update_s: float, reduce_s: float | None) -> dict:
+        times = {"time/rollout_s": rollout_s, "time/update_s": update_s}
+        medians = times | {"time/reduce_s": reduce_s}
+        return {"runs": [{"summary": {"step_per_s_train": rate}, "medians": medians}]}
+
+    cases = {
+        "2 GMIs, tcg_ex": run(300.0, 6.0, 3.0, 1.0),
+        "3 GMIs, tdg_ex": run(200.0, 9.0, 2, None),
+    }
+    case = training_case("templates-ant", cases)
+    assert [case[f"{part}_s"] for part in ("simulator", "trainer", "reduce", "com")] == [
+        6,
+        2,
+        1,
+        3,
+    ]
+    assert measured_gain(case) == 1.5
+    # (6 * 10 + 2 * 0.3 * 2) / 8 = 7.65 of 10, and 8 + 3 over 8 + 1.
+    assert predicted_gain(case) == pytest.approx(0.765 * 11 / 9)
