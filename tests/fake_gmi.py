@@ -135,7 +135,7 @@ def main() -> None:
     mode = MODES[sys.argv[1]]
     if mode is not silent:
         link.beat("starting", 0)
-        link.beat("compiling", 0)
+        link.begin_compiling()
         if mode is not mps_client:
             link.beat("ready", 0)
     mode(link)

@@ -23,16 +23,20 @@ def collect(share: Share) -> dict[str, Any]:
       NonFiniteError: the simulation produced NaN or infinity.
       CollectiveError: another GMI is gone or stuck before all have begun.
     """
-    share.link.beat("compiling", 0)
     started_s = time.monotonic()
     state = share.reset()
     arguments = share.env.model, share.policy.weights
-    program = _compiled(share, share.config.unroll_length, share.keep, (*arguments, state))
+    program = _lowered(share, share.config.unroll_length, share.keep, (*arguments, state))
     latency_s: list[float] = []
     single = None
     if share.config.latency_steps:
-        single = _compiled(share, 1, Keep(steps=False, next_obs=False), (*arguments, state))
-    compile_s = time.monotonic() - started_s
+        single = _lowered(share, 1, Keep(steps=False, next_obs=False), (*arguments, state))
+    trace_s = time.monotonic() - started_s
+    share.link.begin_compiling()
+    started_s = time.monotonic()
+    program = program.compile()
+    single = single and single.compile()
+    compile_s = trace_s + time.monotonic() - started_s
     share.link.beat("ready", 0)
     if single is not None:
         share.meet()
@@ -50,9 +54,9 @@ def collect(share: Share) -> dict[str, Any]:
     }
 
 
-def _compiled(share: Share, length: int, keep: Keep, arguments: tuple[Any, ...]) -> Any:
+def _lowered(share: Share, length: int, keep: Keep, arguments: tuple[Any, ...]) -> Any:
     program = partial(unroll, share.env, share.policy, length, keep)
-    return jax.jit(program, donate_argnums=(2,)).lower(*arguments).compile()
+    return jax.jit(program, donate_argnums=(2,)).lower(*arguments)
 
 
 def _time_steps(share: Share, step: Any, state: Any) -> list[float]:

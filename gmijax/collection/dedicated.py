@@ -67,7 +67,7 @@ class Stages(NamedTuple):
 
 def run_simulator(share: Share, agent: Peer) -> dict[str, Any]:
     """Makes the unrolls of this GMI with the actions of `agent`; see `colocated.collect`."""
-    share.link.beat("compiling", 0)
+    share.link.begin_compiling()
     started_s = time.monotonic()
     state = share.reset()
     loop = _Loop(share, agent, state)
@@ -151,7 +151,7 @@ class _Loop:
 
 def run_agent(share: Share, simulators: Sequence[Peer]) -> dict[str, Any]:
     """Answers the simulators until all have closed; what came of it, for `result.json`."""
-    share.link.beat("compiling", 0)
+    share.link.begin_compiling()
     started_s = time.monotonic()
     num_envs, obs_size = share.config.envs_per_gmi, share.env.spec.obs_size
     bits = np.asarray(jax.random.key_data(jax.random.split(jax.random.key(0), num_envs)))

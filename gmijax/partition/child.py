@@ -1,7 +1,8 @@
 """The GMI's side of supervision; stdlib only, so that it runs before jax is imported.
 
-The controller holds the write end of a pipe per GMI, the *lifeline*. One byte asks the GMI to
-finish; end of file means that the controller is gone, however it ended, and so must the GMI be.
+The controller holds the write end of a pipe per GMI, the *lifeline*. One byte lets a GMI compile
+that was to wait for another, one asks it to finish; end of file means that the controller is gone,
+however it ended, and so must the GMI be.
 """
 
 from __future__ import annotations
@@ -26,8 +27,10 @@ ENV_LIFELINE_FD: Final = "GMIJAX_LIFELINE_FD"
 ENV_EXCHANGE_FD: Final = "GMIJAX_EXCHANGE_FD"
 ENV_PIPES_FD: Final = "GMIJAX_PIPES_FD"
 ENV_RENDEZVOUS: Final = "GMIJAX_RENDEZVOUS"
+ENV_WAITS: Final = "GMIJAX_WAITS"
 
 STOP_BYTE: Final = b"s"
+GO_BYTE: Final = b"g"
 
 _BEAT_INTERVAL_S: Final = 0.2
 
@@ -41,6 +44,9 @@ class ChildLink:
       paths: files of this GMI.
       exchange_fd: inherited file of the gradient exchange, None where there is none.
       rendezvous: address where GMIs that form rings meet, None where they need not.
+
+    Args:
+      waits: whether another GMI compiles before this one may.
     """
 
     def __init__(
@@ -50,6 +56,8 @@ class ChildLink:
         lifeline_fd: int | None,
         exchange_fd: int | None,
         rendezvous: str | None = None,
+        *,
+        waits: bool = False,
     ) -> None:
         self.gmi = gmi
         self.run = run
@@ -57,6 +65,9 @@ class ChildLink:
         self.rendezvous = rendezvous
         self.paths: GmiPaths = run.gmi(gmi)
         self._stop = threading.Event()
+        self._turn = threading.Event()
+        if not waits:
+            self._turn.set()
         self._last_beat: tuple[GmiState, float] | None = None
         if lifeline_fd is not None:
             threading.Thread(
@@ -86,12 +97,22 @@ class ChildLink:
             inherited_fd(environment, ENV_LIFELINE_FD),
             inherited_fd(environment, ENV_EXCHANGE_FD),
             environment.get(ENV_RENDEZVOUS),
+            waits=ENV_WAITS in environment and ENV_LIFELINE_FD in environment,
         )
 
     @property
     def stop_requested(self) -> bool:
         """Whether the controller asked for an end: finish the iteration, save, return."""
         return self._stop.is_set()
+
+    def begin_compiling(self) -> None:
+        """Says that this GMI compiles from now on, once it may.
+
+        Where all GMIs run the same programs one compiles them while the others load what they
+        need and wait here; then they find the programs in the compilation cache.
+        """
+        self._turn.wait()
+        self.beat("compiling", 0)
 
     def beat(self, state: GmiState, iteration: int) -> None:
         """Reports progress; cheap enough for every iteration.
@@ -125,6 +146,8 @@ class ChildLink:
                 received = b""
             if not received:
                 _end_now()
+            if GO_BYTE in received:
+                self._turn.set()
             if STOP_BYTE in received:
                 self._stop.set()
 

@@ -11,7 +11,7 @@ from contextlib import suppress
 from typing import NamedTuple
 
 from gmijax.errors import GmiFailed
-from gmijax.partition.child import ENV_LIFELINE_FD, ENV_RUN_DIR, STOP_BYTE
+from gmijax.partition.child import ENV_LIFELINE_FD, ENV_RUN_DIR, ENV_WAITS, GO_BYTE, STOP_BYTE
 from gmijax.partition.heartbeat import Heartbeat, read_heartbeat
 from gmijax.rundir import GmiPaths, RunPaths
 
@@ -21,7 +21,7 @@ class GmiStatus(NamedTuple):
 
     Attributes:
       gmi: its id.
-      state: `waiting` before its process is started, then what it says (see `heartbeat`).
+      state: `waiting` until it may compile, else what it says (see `heartbeat`).
       iteration: training iterations done.
       pid: its process, None before the start.
       exit_code: None while it runs; negative for the signal that ended it.
@@ -39,17 +39,25 @@ class GmiProcess:
 
     Attributes:
       gmi: its id.
+      waits: whether it may not compile yet.
       exit_code: None while it runs; negative for the signal that ended it.
-      started_s: when it was started, `time.monotonic`.
-      progress_s: when its heartbeat was last seen to be a new one.
+      progress_s: when it was started, let go, or its heartbeat last seen to be a new one;
+        `time.monotonic`.
     """
 
     def __init__(
-        self, gmi: int, process: subprocess.Popen[bytes], lifeline: int, paths: GmiPaths
+        self,
+        gmi: int,
+        process: subprocess.Popen[bytes],
+        lifeline: int,
+        paths: GmiPaths,
+        *,
+        waits: bool,
     ) -> None:
         self.gmi = gmi
+        self.waits = waits
         self.exit_code: int | None = None
-        self.started_s = self.progress_s = time.monotonic()
+        self.progress_s = time.monotonic()
         self._process = process
         self._lifeline = lifeline
         self._paths = paths
@@ -65,8 +73,12 @@ class GmiProcess:
         environment: Mapping[str, str],
         run: RunPaths,
         inherited_fds: Mapping[str, int],
+        *,
+        waits: bool = False,
     ) -> GmiProcess:
         """Starts a fresh interpreter that inherits its lifeline, `inherited_fds`, nothing else.
+
+        With `waits` it compiles nothing before `let_go`.
 
         Raises:
           GmiFailed: the program cannot be started.
@@ -78,6 +90,8 @@ class GmiProcess:
         read_end, write_end = os.pipe()
         inherited = {ENV_LIFELINE_FD: read_end, **inherited_fds}
         variables = {name: str(fd) for name, fd in inherited.items()}
+        if waits:
+            variables[ENV_WAITS] = "1"
         try:
             process = _spawn(
                 command,
@@ -93,7 +107,7 @@ class GmiProcess:
             raise
         finally:
             os.close(read_end)
-        return cls(gmi, process, write_end, paths)
+        return cls(gmi, process, write_end, paths, waits=waits)
 
     @property
     def pid(self) -> int:
@@ -118,7 +132,8 @@ class GmiProcess:
     def status(self) -> GmiStatus:
         """A snapshot for progress displays."""
         beat = self._beat
-        return GmiStatus(self.gmi, beat.state, beat.iteration, beat.pid, self.exit_code)
+        state = "waiting" if self.waits else beat.state
+        return GmiStatus(self.gmi, state, beat.iteration, beat.pid, self.exit_code)
 
     def poll(self) -> int | None:
         """Reads the heartbeat and the exit code; ends what is left of an ended GMI's group."""
@@ -130,10 +145,15 @@ class GmiProcess:
             self._refresh()
         return self.exit_code
 
+    def let_go(self) -> None:
+        """Lets a GMI compile that was started to wait."""
+        self.waits = False
+        self.progress_s = time.monotonic()
+        self._tell(GO_BYTE)
+
     def ask_to_stop(self) -> None:
         """Asks the GMI to finish its iteration, save and end."""
-        with suppress(OSError):
-            os.write(self._lifeline, STOP_BYTE)
+        self._tell(STOP_BYTE)
 
     def send(self, number: signal.Signals) -> None:
         """Sends a signal to the GMI and to everything it started; nothing once it is reaped."""
@@ -146,6 +166,10 @@ class GmiProcess:
         if self._lifeline >= 0:
             os.close(self._lifeline)
             self._lifeline = -1
+
+    def _tell(self, byte: bytes) -> None:
+        with suppress(OSError):  # It may have ended.
+            os.write(self._lifeline, byte)
 
     def _has_ended(self) -> bool:
         flags = os.WEXITED | os.WNOHANG | os.WNOWAIT

@@ -54,8 +54,8 @@ class Job:
       patience: time limits.
       inherited_fds: open files that every GMI inherits, by the environment variable that will
         hold the number of the descriptor.
-      compile_once: start the first GMI alone and the others when it has compiled, so that
-        they find its program in the compilation cache.
+      compile_once: the first GMI compiles while the others load what they need and wait, so
+        that they find its programs in the compilation cache.
     """
 
     run: RunPaths
@@ -73,7 +73,6 @@ class Supervisor:
 
     def __init__(self, job: Job) -> None:
         self._job = job
-        self._waiting = list(job.gmis)
         self._started: dict[int, GmiProcess] = {}
         self._all_ready_s: float | None = None
         self._stop_requests = 0
@@ -110,9 +109,11 @@ class Supervisor:
           JobInterrupted: a stop was requested, and every GMI has ended.
         """
         try:
-            while self._waiting or self._alive():
-                self._start_due()
+            for gmi in self._job.gmis:
+                self._start(gmi)
+            while self._alive():
                 self._raise_failure()
+                self._let_go()
                 self._handle_stop()
                 self._check_ready()
                 self._check_progress()
@@ -128,26 +129,25 @@ class Supervisor:
     def _alive(self) -> list[GmiProcess]:
         return [process for process in self._started.values() if process.exit_code is None]
 
-    def _start_due(self) -> None:
-        """Starts what may start now: the first GMI, or all the rest."""
-        if self._stop_requests or not self._waiting:
-            return
-        if not self._job.compile_once or all(p.is_ready for p in self._started.values()):
-            due = self._waiting[:1] if self._starts_alone() else self._waiting[:]
-            for gmi in due:
-                self._start(gmi)
-
-    def _starts_alone(self) -> bool:
-        return self._job.compile_once and not self._started
-
     def _start(self, gmi: int) -> None:
         job = self._job
         process = GmiProcess.start(
-            gmi, job.command(gmi), job.environment(gmi), job.run, job.inherited_fds
+            gmi,
+            job.command(gmi),
+            job.environment(gmi),
+            job.run,
+            job.inherited_fds,
+            waits=job.compile_once and bool(self._started),
         )
         self._started[gmi] = process
-        self._waiting.remove(gmi)
         job.backend.started(gmi, process.pid)
+
+    def _let_go(self) -> None:
+        """Lets those compile that wait for the first one, once it has."""
+        waiting = [process for process in self._started.values() if process.waits]
+        if waiting and all(p.is_ready for p in self._started.values() if not p.waits):
+            for process in waiting:
+                process.let_go()
 
     def _raise_failure(self) -> None:
         """Reads heartbeats and exit codes; raises for the GMI that failed first."""
@@ -173,7 +173,7 @@ class Supervisor:
             return
         if self._stop_requests > 1:
             raise JobInterrupted("stopped at once on a second request; the last work is not saved")
-        if self._waiting or not all(p.is_ready for p in self._started.values()):
+        if not all(p.is_ready for p in self._started.values()):
             raise JobInterrupted("stopped before training began")
         now_s = time.monotonic()
         if self._stop_deadline_s is None:
@@ -189,11 +189,9 @@ class Supervisor:
 
     def _check_ready(self) -> None:
         """Checks the backend once, when every GMI holds its share."""
-        if self._all_ready_s is None and not self._waiting:
-            processes = self._started.values()
-            if all(process.is_ready for process in processes):
-                self._all_ready_s = time.monotonic()
-                self._verify_shares()
+        if self._all_ready_s is None and all(p.is_ready for p in self._started.values()):
+            self._all_ready_s = time.monotonic()
+            self._verify_shares()
 
     def _verify_shares(self) -> None:
         # One that has ended already cannot be asked for any more.
@@ -212,6 +210,8 @@ class Supervisor:
         now_s = time.monotonic()
         for process in self._alive():
             state = process.beat.state
+            if process.waits:
+                continue  # The one that it waits for has a time limit.
             if state in ("starting", "compiling"):
                 limit_s, since_s = self._job.patience.start_timeout_s, process.progress_s
                 what = "did not start and compile"

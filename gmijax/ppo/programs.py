@@ -58,8 +58,12 @@ class Iteration(Protocol):
 
     times: dict[str, float]
 
-    def compile(self, state: LearnerState, env_state: BatchState) -> None:
-        """Compiles all programs for these shapes (or takes them from the cache)."""
+    def trace(self, state: LearnerState, env_state: BatchState) -> None:
+        """Traces all programs for these shapes; every GMI does that itself, at the same time."""
+        ...
+
+    def compile(self) -> None:
+        """Compiles what was traced, or takes it from the cache."""
         ...
 
     def __call__(
@@ -105,9 +109,13 @@ class FusedIteration:
             out_shardings=(None, None, where) if where else None,
         )
 
-    def compile(self, state: LearnerState, env_state: BatchState) -> None:
+    def trace(self, state: LearnerState, env_state: BatchState) -> None:
         """See `Iteration`."""
-        self._program = self._program.lower(self._env.model, state, env_state).compile()
+        self._program = self._program.lower(self._env.model, state, env_state)
+
+    def compile(self) -> None:
+        """See `Iteration`."""
+        self._program = self._program.compile()
 
     def __call__(
         self,

@@ -73,15 +73,19 @@ class RemoteIteration:
         self._first: tuple[list[Samples], list[np.ndarray]] | None = None
         self._timeout_s: float | None = servants.start_timeout_s
 
-    def compile(self, state: LearnerState, env_state: Any) -> None:
+    def trace(self, state: LearnerState, env_state: Any) -> None:
         """See `Iteration`; waits for first rollouts, which are used by the first call."""
         del env_state  # There are no environments here.
         self._first = self._ask(state)
         self._timeout_s = None
         arguments = state, *self._first, self._rank
-        shapes = jax.eval_shape(partial(_join, self._env, self._learner), *arguments)
-        self._join = self._join.lower(*arguments).compile()
-        self._updates.compile_updates(state, *shapes)
+        self._join = self._join.lower(*arguments)
+        self._updates.trace_updates(state, *self._join.out_info)
+
+    def compile(self) -> None:
+        """See `Iteration`."""
+        self._join = self._join.compile()
+        self._updates.compile_updates()
 
     def __call__(
         self, state: LearnerState, env_state: Any

@@ -94,14 +94,19 @@ class _SyncTrainer:
 
     def run(self) -> dict[str, Any]:
         """See `train`."""
-        self._link.beat("compiling", 0)
         started = time.monotonic()
         state, env_state = self._first_state()
-        self._iteration.compile(state, env_state)
+        self._iteration.trace(state, env_state)
         meter = ThroughputMeter(self._env, self._learner, self._config, self._reducer)
         if self._measures:
-            meter.compile(state, env_state)
-        compile_s = time.monotonic() - started
+            meter.trace(state, env_state)
+        trace_s = time.monotonic() - started
+        self._link.begin_compiling()
+        started = time.monotonic()
+        self._iteration.compile()
+        if self._measures:
+            meter.compile()
+        compile_s = trace_s + time.monotonic() - started
         self._link.beat("ready", 0)
         self._meet()  # Everybody has compiled: the clock may start.
         history = read_metrics(self._link.run.metrics) if self._leader else []

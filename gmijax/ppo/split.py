@@ -57,28 +57,39 @@ class SplitIteration:
             self._finish_fn, donate_argnums=(0,), out_shardings=(None, host) if host else None
         )
 
-    def compile(self, state: LearnerState, env_state: BatchState) -> None:
+    def trace(self, state: LearnerState, env_state: BatchState) -> None:
         """See `Iteration`."""
-        model = self._env.model
-        shapes = jax.eval_shape(self._rollout_fn, model, state, env_state, self._rank)
-        self._rollout = self._rollout.lower(model, state, env_state, self._rank).compile()
-        self.compile_updates(state, *shapes[1:])
+        self._rollout = self._rollout.lower(self._env.model, state, env_state, self._rank)
+        self.trace_updates(state, *self._rollout.out_info[1:])
 
-    def compile_updates(
+    def compile(self) -> None:
+        """See `Iteration`."""
+        self._rollout = self._rollout.compile()
+        self.compile_updates()
+
+    def trace_updates(
         self, state: LearnerState, samples: Samples, order: Any, packed: Any
     ) -> None:
-        """Compiles all programs but the rollout; the last three arguments may be shapes only."""
+        """Traces all programs but the rollout; the last three arguments may be shapes only."""
         gathered = jax.ShapeDtypeStruct((self._reducer.world_size, *packed.shape), jnp.float32)
-        context, stats = jax.eval_shape(self._begin_fn, state, gathered)
+        self._begin = self._begin.lower(state, gathered)
+        context, stats = self._begin.out_info
         index = jax.ShapeDtypeStruct((), jnp.int32)
         gradient_args = (state.params, samples, order, index, context)
-        buffer = jax.eval_shape(self._gradient_fn, *gradient_args)
+        self._gradient = self._gradient.lower(*gradient_args)
+        buffer = self._gradient.out_info
         loss = jax.ShapeDtypeStruct((len(LossMetrics._fields),), jnp.float32)
-        self._begin = self._begin.lower(state, gathered).compile()
-        self._gradient = self._gradient.lower(*gradient_args).compile()
-        self._update = self._update.lower(state, buffer, *gradient_args[1:]).compile()
-        self._apply = self._apply.lower(state, buffer).compile()
-        self._finish = self._finish.lower(state, stats, [loss] * order.shape[0]).compile()
+        self._update = self._update.lower(state, buffer, *gradient_args[1:])
+        self._apply = self._apply.lower(state, buffer)
+        self._finish = self._finish.lower(state, stats, [loss] * order.shape[0])
+
+    def compile_updates(self) -> None:
+        """Compiles what `trace_updates` has traced."""
+        self._begin = self._begin.compile()
+        self._gradient = self._gradient.compile()
+        self._update = self._update.compile()
+        self._apply = self._apply.compile()
+        self._finish = self._finish.compile()
 
     def __call__(
         self,

@@ -50,11 +50,14 @@ class ThroughputMeter:
             for choose in (partial(_random, env), partial(_policy, env, learner))
         ]
 
-    def compile(self, state: LearnerState, env_state: BatchState) -> None:
-        """Compiles both programs; part of the start, whose time limit it needs."""
-        self._programs = [
-            program.lower(self._model, state, env_state).compile() for program in self._programs
-        ]
+    def trace(self, state: LearnerState, env_state: BatchState) -> None:
+        """Traces both programs; part of the start, whose time limit it needs."""
+        lowered = (program.lower(self._model, state, env_state) for program in self._programs)
+        self._programs = list(lowered)
+
+    def compile(self) -> None:
+        """Compiles what was traced."""
+        self._programs = [program.compile() for program in self._programs]
 
     def measure(
         self, state: LearnerState, env_state: BatchState, beat: Callable[[], None]

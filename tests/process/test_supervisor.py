@@ -51,7 +51,7 @@ def all_iterate(ticks: Ticks) -> bool:
     return all(status.state == "running" for status in ticks[-1])
 
 
-def test_clean_end_reports_progress_and_starts_the_first_alone(run: RunPaths):
+def test_clean_end_reports_progress_and_lets_the_first_compile_alone(run: RunPaths):
     ticks = run_job(cpu_job(run, ["clean", "clean"]))
     assert [status.state for status in ticks[0]] == ["starting", "waiting"]
     first_of_second = next(tick for tick in ticks if tick[1].state != "waiting")

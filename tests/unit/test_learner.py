@@ -90,7 +90,8 @@ def test_both_paths_compute_the_same(learner, config) -> None:
     results = []
     for iteration in (fused, split):
         state, envs = _start(learner)
-        iteration.compile(state, envs)
+        iteration.trace(state, envs)
+        iteration.compile()
         for _ in range(3):
             state, envs, metrics = iteration(state, envs)
         results.append((state.params, state.obs_moments, envs.env.obs, metrics))
@@ -120,7 +121,8 @@ def test_gradients_can_stay_on_the_device(learner, config) -> None:
     for reducer in (SoloReducer(size), OnDevice(size)):
         iteration = SplitIteration(ENV, learner, reducer)
         state, envs = _start(learner)
-        iteration.compile(state, envs)
+        iteration.trace(state, envs)
+        iteration.compile()
         for _ in range(2):
             state, envs, metrics = iteration(state, envs)
         results.append((state.params, envs.env.obs, metrics))
@@ -169,7 +171,8 @@ def test_shards_of_minibatches_give_the_update_of_the_whole(learner) -> None:
 def test_it_compiles_once_and_learns_to_stand_still(learner) -> None:
     iteration = FusedIteration(ENV, learner)
     state, envs = _start(learner, num_envs=64)
-    iteration.compile(state, envs)  # A compiled program cannot be traced again.
+    iteration.trace(state, envs)
+    iteration.compile()  # A compiled program cannot be traced again.
     returns = []
     for _ in range(80):
         state, envs, metrics = iteration(state, envs)
