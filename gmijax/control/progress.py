@@ -146,8 +146,10 @@ def _rates(line: dict[str, Any]) -> str:
     """Steps per second; of acting and of learning where other GMIs do the one and the other."""
     if "async/pps" not in line:
         return f"{line['env_steps_per_s']:,.0f} steps/s"
-    behind = line["async/staleness_mean"]
+    behind, filled = line["async/staleness_mean"], line["channel/occupancy"]
     return (
         f"PPS {line['async/pps']:,.0f}  TTOP {line['async/ttop']:,.0f}  "
-        f"staleness {'-' if behind is None else format(behind, '.1f')}"
+        f"staleness {'-' if behind is None else format(behind, '.1f')}  "
+        f"channels {'-' if filled is None else format(filled, '.0%')} full, "
+        f"{line['channel/bytes_per_s'] / 1e6:,.0f} MB/s, {line['channel/dropped']:,.0f} dropped"
     )

@@ -21,7 +21,7 @@ from gmijax.errors import ConfigError
         (("env=ball_balance", "env.name=ant"), "choose the task with env=ant$"),
         (("algo.learning_rate=.inf",), "expected a finite number"),
         (("algo.desired_kl=nan",), "^algo.desired_kl=nan: expected a finite number$"),
-        (("run=null",), "."),
+        (("run=null",), "^run=None: expected a group of keys$"),
     ],
 )
 def test_refused_overrides_are_told_in_one_line(overrides: tuple[str, ...], message: str):

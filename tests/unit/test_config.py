@@ -13,6 +13,7 @@ from gmijax.config import ADAPTIVE_LEARNING_RATE_RANGE, TrainConfig
 from gmijax.errors import ConfigError
 from gmijax.learner import adapted_learning_rate
 from gmijax.schema import from_dict, to_dict
+from gmijax.sim.registry import task_names
 
 
 @pytest.mark.parametrize("value", [float("inf"), float("-inf"), float("nan"), 10**400])
@@ -44,3 +45,17 @@ def test_limits_are_those_of_the_learner(end: int):
     limit, kl = ADAPTIVE_LEARNING_RATE_RANGE[end], (1.0, 1e-9)[end]
     kept = adapted_learning_rate(jnp.float32(limit), jnp.float32(kl), 0.01)
     assert float(kept) == pytest.approx(limit)
+
+
+# Hidden layers in Table 5 of the paper; 256:128:64 for all others.
+WIDTHS = {"humanoid": (200, 400, 100), "shadow_hand": (512, 512, 512, 256)}
+
+
+@pytest.mark.parametrize("algo", ["ppo", "a3c"])
+@pytest.mark.parametrize("task", task_names())
+def test_every_task_has_the_papers_networks_and_one_scale_of_rewards(task: str, algo: str):
+    settings = compose(f"env={task}", f"algo={algo}").algo
+    wanted = WIDTHS.get(task, (256, 128, 64))
+    assert settings.policy_hidden_layer_sizes == wanted
+    assert settings.value_hidden_layer_sizes == wanted
+    assert settings.reward_scaling == compose(f"env={task}").algo.reward_scaling

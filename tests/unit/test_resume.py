@@ -106,7 +106,7 @@ def test_what_an_older_version_did_not_save_is_filled_in_for_the_runs_own_task(r
         ("num_envs=8,16", "num_envs=8,16: expected one value"),
         ("env.name=ball_balance", "choose the task with env=ball_balance"),
         ("+run={a: 1}", r"unknown key run\.a"),
-        ("run=5", "."),
+        ("run=5", "run=5: expected a group of keys"),
     ],
 )
 def test_overrides_that_a_resumed_run_cannot_take(run: RunPaths, override: str, message: str):
