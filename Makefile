@@ -1,5 +1,5 @@
 # `make train` and `make test` need nothing but Python 3.11 or newer and a package index.
-# Variables: PYTHON (interpreter that makes the environment), VENV, EXTRAS, TRAIN_ARGS, TEST_ARGS.
+# Variables: PYTHON (interpreter that makes the environment), VENV, EXTRAS, TRAIN_ARGS, TEST_ARGS, TEST_WORKERS.
 
 PYTHON ?= python3
 VENV ?= .venv
@@ -17,6 +17,8 @@ PLAN := $(if $(filter 1,$(GPUS)),plan.gpus=1 plan.gmis_per_gpu=2,plan.gpus=2 pla
 # A million steps: under six minutes on two cores, with the making of the environment.
 TRAIN_ARGS ?= env=ball_balance $(PLAN) num_timesteps=1000000
 TEST_ARGS ?=
+# Most tests wait for one process at a time.
+TEST_WORKERS ?= -n 2 --dist loadgroup
 
 .DEFAULT_GOAL := help
 .PHONY: help venv train test test-all wheel-test lint types imports format check clean
@@ -37,10 +39,10 @@ train: $(READY)  ## a short training run with two GMIs on whatever this machine 
 	$(BIN)/python -m gmijax.train $(TRAIN_ARGS)
 
 test: $(READY)  ## the tests that are not slow
-	$(BIN)/python -m pytest $(TEST_ARGS)
+	$(BIN)/python -m pytest $(TEST_WORKERS) $(TEST_ARGS)
 
 test-all: $(READY)  ## all tests, slow ones too
-	$(BIN)/python -m pytest -m '' $(TEST_ARGS)
+	$(BIN)/python -m pytest $(TEST_WORKERS) -m '' $(TEST_ARGS)
 
 wheel-test: $(READY)  ## builds the wheel and tries it outside the checkout
 	$(BIN)/python -m pytest tests/process/test_wheel.py $(TEST_ARGS)

@@ -160,7 +160,7 @@ class Leader:
             "bytes_per_s": _median(reporter.bytes_per_s),
             "dropped": reporter.dropped,
             "final_return": reporter.last_return,
-            "overflow_steps": reporter.overflow_steps,
+            "overflow_steps": reporter.overflows.steps,
             "checkpoint": str(self._checkpoint) if self._checkpoint else None,
             "device": describe_device(),
         }

@@ -17,8 +17,8 @@ from gmijax.a3c.board import Report
 from gmijax.a3c.losses import LossMetrics
 from gmijax.a3c.rollout import stats_example
 from gmijax.a3c.staleness import MAX_COUNTED, mean_and_p99
-from gmijax.errors import NonFiniteError
 from gmijax.metrics import Episodes, EpisodeWindow, MetricsLog
+from gmijax.physics_health import OverflowCount, check_diverged, overflow_line
 from gmijax.sim.wrappers import BatchedEnv
 
 if TYPE_CHECKING:
@@ -26,12 +26,6 @@ if TYPE_CHECKING:
 
 LINE_EVERY_S = 0.5
 """Updates may be much faster than anybody can read: a line tells of all since the one before."""
-
-TOLERATED_FRACTION = 1e-3
-"""Fraction of the steps of a line that may diverge: rare, and nothing that is learnt."""
-
-TOLERATED_STEPS = 10
-"""The same in steps, for lines of so few steps that one is a large fraction."""
 
 
 class Progress(NamedTuple):
@@ -70,7 +64,7 @@ class Reporter:
       bytes_per_s: of experience, of every line.
       dropped: pieces of experience that were dropped for lack of room.
       last_return: mean return of the latest episodes, None while none has ended.
-      overflow_steps: environment steps for which a buffer of the simulator was too small.
+      overflows: environment steps for which a buffer of the simulator was too small.
     """
 
     def __init__(
@@ -94,7 +88,7 @@ class Reporter:
         self.bytes_per_s: list[float] = []
         self.dropped = 0
         self.last_return: float | None = None
-        self.overflow_steps: dict[str, float] = {}
+        self.overflows = OverflowCount(env_name)
 
     @property
     def is_due(self) -> bool:
@@ -126,9 +120,9 @@ class Reporter:
         packed = (sums.stats - self._before.stats).astype(np.float32)
         stats: Any = jax.tree.map(float, self._unpack(packed))
         predictions = sums.env_steps - self._before.env_steps
-        self._check_finite(stats, predictions, progress.env_steps)
-        for name, count in stats.overflowed.items():
-            self.overflow_steps[name] = self.overflow_steps.get(name, 0.0) + float(count)
+        where = f"{self._env_name}, up to env step {progress.env_steps}"
+        check_diverged(where, stats.diverged, predictions)
+        self.overflows.add(stats.overflowed)
         episodes: Any = stats.episodes
         self._window.add(Episodes(**episodes._asdict()))
         means = self._window.means()
@@ -145,7 +139,7 @@ class Reporter:
                 "env_steps_per_s": self.ttop[-1],
                 **means,
                 "diverged_steps": stats.diverged["any"],
-                **{f"physics/{n}_overflow_steps": c for n, c in stats.overflowed.items()},
+                **overflow_line(stats.overflowed),
                 "reward_per_step": stats.reward_sum / predictions if predictions else None,
                 **self._of_updates(),
                 "policy/learning_rate": progress.learning_rate,
@@ -189,16 +183,6 @@ class Reporter:
             "time/send_s": sums.send_s - self._before.send_s,
             "time/wait_s": sums.wait_s - self._before.wait_s,
         }
-
-    def _check_finite(self, stats: Any, steps: float, env_steps: int) -> None:
-        diverged = stats.diverged
-        if diverged["any"] > max(TOLERATED_STEPS, TOLERATED_FRACTION * steps):
-            places = [name for name, count in diverged.items() if count and name != "any"]
-            raise NonFiniteError(
-                f"{self._env_name}, up to env step {env_steps}: {diverged['any']:.0f} of "
-                f"{steps:.0f} steps gave numbers that are not finite or beyond all bounds, in "
-                f"{', '.join(places)}"
-            )
 
 
 def _total(reports: tuple[Report, ...], before: _Sums) -> _Sums:

@@ -14,6 +14,7 @@ import jax
 import jax.numpy as jnp
 
 from gmijax.collection.policy import ActingPolicy
+from gmijax.sim.divergence import sources
 from gmijax.sim.wrappers import BatchedEnv, BatchState, EpisodeSums, split_keys
 from gmijax.types import Array, PyTree
 
@@ -45,11 +46,13 @@ class Counts(NamedTuple):
 
     Attributes:
       episodes: sums over the episodes that ended.
-      diverged: [] worlds that were ended because of a bad number.
+      diverged: [] worlds that were ended because of a bad number: `any`, and by its source.
+      overflowed: [] steps for which a buffer of the simulator was too small, by which.
     """
 
     episodes: EpisodeSums
-    diverged: Array
+    diverged: dict[str, Array]
+    overflowed: dict[str, Array]
 
 
 class Keep(NamedTuple):
@@ -114,7 +117,11 @@ def no_counts(env: BatchedEnv) -> Counts:
     zero = jnp.zeros(())
     terms = dict.fromkeys(env.spec.reward_terms, zero)
     metrics = dict.fromkeys(env.spec.metrics, zero)
-    return Counts(EpisodeSums(zero, zero, zero, terms, metrics), zero)
+    return Counts(
+        episodes=EpisodeSums(zero, zero, zero, terms, metrics),
+        diverged=dict.fromkeys(("any", *sources(env.spec.reward_terms)), zero),
+        overflowed=dict.fromkeys(env.overflows, zero),
+    )
 
 
 def next_keys(state: BatchState) -> tuple[BatchState, Array]:
@@ -150,4 +157,4 @@ def _advance(
         if keep.steps
         else None
     )
-    return after, Counts(out.finished, out.diverged["any"]), kept
+    return after, Counts(out.finished, out.diverged, out.overflowed), kept

@@ -9,15 +9,9 @@ from typing import Any
 import jax
 
 from gmijax.collection.programs import Counts
-from gmijax.errors import NonFiniteError
 from gmijax.metrics import Episodes, EpisodeWindow, JsonlSink
 from gmijax.partition.child import ChildLink
-
-TOLERATED_FRACTION = 1e-3
-"""Fraction of an unroll's steps that may diverge."""
-
-TOLERATED_STEPS = 10
-"""The same in steps, for unrolls so short that one step is a large fraction."""
+from gmijax.physics_health import OverflowCount, check_diverged, overflow_line
 
 
 class Tally:
@@ -36,6 +30,7 @@ class Tally:
         self._window = EpisodeWindow()
         self._totals = {"count": 0.0, "return_sum": 0.0, "length_sum": 0.0}
         self._diverged = 0.0
+        self._overflows = OverflowCount(env_name)
         self._unroll_s: list[float] = []
         self._started_s = self._last_s = time.monotonic()
         self._lines = JsonlSink(link.paths.metrics)
@@ -52,7 +47,10 @@ class Tally:
         self._last_s = now_s
         self.env_steps += self._steps
         self.num_unrolls += 1
-        self._check(host.diverged)
+        where = f"{self._env_name}, up to env step {self.env_steps} of this GMI"
+        check_diverged(where, host.diverged, self._steps)
+        self._diverged += host.diverged["any"]
+        self._overflows.add(host.overflowed)
         episodes = Episodes(**host.episodes._asdict())
         self._window.add(episodes)
         for name in self._totals:
@@ -67,6 +65,7 @@ class Tally:
                 "episode_length": means["episode_length"],
                 "episodes": self._totals["count"],
                 "diverged_steps": self._diverged,
+                **overflow_line(host.overflowed),
             }
         )
         self._link.beat("running", self.num_unrolls)
@@ -88,13 +87,5 @@ class Tally:
             "step_per_s_inference": self._steps / statistics.median(steady) if steady else None,
             "episodes": self._totals,
             "diverged_steps": self._diverged,
+            "overflow_steps": self._overflows.steps,
         }
-
-    def _check(self, diverged: float) -> None:
-        self._diverged += diverged
-        limit = max(TOLERATED_STEPS, TOLERATED_FRACTION * self._steps)
-        if diverged > limit:
-            raise NonFiniteError(
-                f"{self._env_name}, up to env step {self.env_steps} of this GMI: {diverged:.0f} "
-                "steps of one unroll gave numbers that are not finite or beyond all bounds"
-            )

@@ -11,6 +11,7 @@ import numpy as np
 
 from gmijax.config import ServeConfig
 from gmijax.partition.plan import Plan
+from gmijax.physics_health import overflow_warnings
 from gmijax.results import MetricsReader, read_metrics
 from gmijax.resume import CheckpointMeta
 from gmijax.rundir import RunPaths, read_json
@@ -74,6 +75,7 @@ def summarise(
         "mean_return": sum(s["return_sum"] for s in episodes) / count if count else None,
         "mean_length": sum(s["length_sum"] for s in episodes) / count if count else None,
         "diverged_steps": sum(result.get("diverged_steps") or 0 for result in collecting),
+        "overflow_steps": _sums([result.get("overflow_steps") or {} for result in collecting]),
         "gmis": [_of_gmi(gmi, plan, result) for gmi, result in found.items()],
         "versions": {"gmijax": __version__, "python": sys.version.split()[0]},
         "device": next((r["device"] for r in found.values() if "device" in r), None),
@@ -107,7 +109,13 @@ def outcome(summary: Mapping[str, Any], run: RunPaths) -> str:
             f"experience: {output['shards']} shards, {output['env_steps']:,} env steps, "
             f"{output['bytes'] / 1e6:,.1f} MB in {output['dir']}"
         )
-    return "\n".join((*lines, f"summary: {run.summary}"))
+    warnings = overflow_warnings(summary["overflow_steps"])
+    return "\n".join((*lines, f"summary: {run.summary}")) + warnings
+
+
+def _sums(counts: Sequence[Mapping[str, float]]) -> dict[str, float]:
+    names = dict.fromkeys(name for one in counts for name in one)
+    return {name: sum(one.get(name, 0.0) for one in counts) for name in names}
 
 
 def milliseconds(seconds: Sequence[Sequence[float]]) -> dict[str, float | int] | None:

@@ -7,6 +7,7 @@ from typing import Any
 
 from gmijax.config import TrainConfig
 from gmijax.partition.plan import Plan
+from gmijax.physics_health import overflow_warnings
 from gmijax.results import read_metrics
 from gmijax.rundir import RunPaths, read_json
 from gmijax.version import __version__, versions_of
@@ -79,8 +80,4 @@ def outcome(summary: dict[str, Any], run: RunPaths) -> str:
         f"{rate('step_per_s_inference')} with inference, "
         f"{rate('step_per_s_train')} with training\n"
         f"checkpoint: {summary['checkpoint']}\nsummary: {run.summary}"
-    ) + "".join(
-        f"\nwarning: MJX-Warp's {name} buffer was too small in {count:,.0f} environment steps"
-        for name, count in summary["overflow_steps"].items()
-        if count
-    )
+    ) + overflow_warnings(summary["overflow_steps"])

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 import threading
 import time
 from collections.abc import Mapping
@@ -13,13 +12,8 @@ import jax
 
 from gmijax.errors import NonFiniteError
 from gmijax.metrics import Episodes, EpisodeWindow, MetricsLog
+from gmijax.physics_health import OverflowCount, check_diverged, overflow_line
 from gmijax.ppo.programs import IterationMetrics
-
-TOLERATED_FRACTION = 1e-3
-"""Fraction of an iteration's steps that may diverge: rare, and nothing that is learnt."""
-
-TOLERATED_STEPS = 10
-"""The same in steps, for iterations so short that one step is a large fraction."""
 
 _LAST_LINE_S = 2.0
 """Longest wait for a line when training ends, however it ends."""
@@ -31,8 +25,7 @@ class Reporter:
     Attributes:
       iteration_s: seconds between the ends of consecutive iterations.
       last_return: mean return of the latest episodes, None while none has ended.
-      overflow_steps: environment steps, so far, for which a buffer of the simulator was too
-        small, by which; empty if nothing can overflow.
+      overflows: environment steps for which a buffer of the simulator was too small.
     """
 
     def __init__(
@@ -47,7 +40,7 @@ class Reporter:
         self._started = self._last - wall_s
         self.iteration_s: list[float] = []
         self.last_return: float | None = None
-        self.overflow_steps: dict[str, float] = {}
+        self.overflows = OverflowCount(env_name)
 
     def report(
         self,
@@ -70,7 +63,7 @@ class Reporter:
         host: Any = jax.tree.map(float, jax.device_get(scalars))
         now = time.monotonic()
         self._check_finite(host, env_steps)
-        self._count_overflows(host.stats.overflowed)
+        self.overflows.add(host.stats.overflowed)
         episodes = host.stats.episodes
         self._window.add(Episodes(**episodes._asdict()))
         means = self._window.means()
@@ -85,10 +78,7 @@ class Reporter:
                 "env_steps_per_s": steps / duration,
                 **means,
                 "diverged_steps": host.stats.diverged["any"],
-                **{
-                    f"physics/{name}_overflow_steps": count
-                    for name, count in host.stats.overflowed.items()
-                },
+                **overflow_line(host.stats.overflowed),
                 "reward_per_step": host.stats.reward_sum / steps,
                 **{f"loss/{name}": value for name, value in host.losses._asdict().items()},
                 "policy/learning_rate": host.learning_rate,
@@ -102,27 +92,9 @@ class Reporter:
         """Flushes the log."""
         self._log.close()
 
-    def _count_overflows(self, overflowed: Mapping[str, float]) -> None:
-        for name, count in overflowed.items():
-            before = self.overflow_steps.get(name, 0.0)
-            if count and not before:
-                sys.stderr.write(
-                    f"{self._env_name}: MJX-Warp's {name} buffer was too small in {count:.0f} "
-                    "environment steps of one iteration; what did not fit was left out "
-                    f"(counted in physics/{name}_overflow_steps)\n"
-                )
-            self.overflow_steps[name] = before + count
-
     def _check_finite(self, host: Any, env_steps: int) -> None:
         where = f"{self._env_name}, up to env step {env_steps}"
-        diverged = host.stats.diverged
-        limit = max(TOLERATED_STEPS, TOLERATED_FRACTION * (env_steps - self._env_steps))
-        if diverged["any"] > limit:
-            places = [name for name, count in diverged.items() if count and name != "any"]
-            raise NonFiniteError(
-                f"{where}: {diverged['any']:.0f} steps of one iteration gave numbers that are "
-                f"not finite or beyond all bounds, in {', '.join(places)}"
-            )
+        check_diverged(where, host.stats.diverged, env_steps - self._env_steps)
         losses = host.losses._asdict()
         if names := [name for name, value in losses.items() if not abs(value) < float("inf")]:
             raise NonFiniteError(f"{where}: {', '.join(names)} of the update is not finite")

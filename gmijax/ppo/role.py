@@ -136,7 +136,7 @@ class _SyncTrainer:
             "env_steps_per_s": (self._env_steps - first_steps) / wall_s,
             "step_per_s_train": self._median_rate(reporter.iteration_s),
             "final_return": reporter.last_return,
-            "overflow_steps": reporter.overflow_steps,
+            "overflow_steps": reporter.overflows.steps,
             "checkpoint": str(self._checkpoint) if self._checkpoint else None,
             "device": describe_device(),
         }

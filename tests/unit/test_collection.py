@@ -24,10 +24,15 @@ from gmijax.collection.programs import (
     unroll,
 )
 from gmijax.collection.shards import ShardWriter
+from gmijax.collection.tally import Tally
 from gmijax.config import PpoConfig
 from gmijax.datadir import DataPaths
+from gmijax.errors import NonFiniteError
 from gmijax.learner import Learner, init_learner, make_learner
 from gmijax.normalize import no_samples
+from gmijax.partition.child import ChildLink
+from gmijax.physics_health import TOLERATED_STEPS
+from gmijax.rundir import RunPaths
 from gmijax.sim.wrappers import env_keys
 
 N, T = 6, 30
@@ -140,3 +145,35 @@ def test_shards_are_whole_and_say_what_they_are(compress: bool, tmp_path: Path):
     assert [item["starts_with_reset"] for item in about] == [True, False]
     assert about[0]["seed"] == 5
     assert about[0]["env_steps"] == T * N
+
+
+def tally_of(folder: Path) -> Tally:
+    link = ChildLink(0, RunPaths(folder), None, None)
+    link.paths.root.mkdir(parents=True)
+    return Tally(link, "point_mass", N * T)
+
+
+def test_too_many_bad_worlds_end_serving_and_the_term_is_named(tmp_path: Path):
+    tally, counts = tally_of(tmp_path), no_counts(point_mass())
+    few = {"any": jnp.asarray(TOLERATED_STEPS), "reward/near": jnp.asarray(TOLERATED_STEPS)}
+    tally.add(counts._replace(diverged=counts.diverged | few))
+    assert tally.outcome()["diverged_steps"] == TOLERATED_STEPS
+    many = {name: count + 1 for name, count in few.items()}
+    message = r"up to env step 360 of this GMI: 11 of 180 steps .*, in reward/near$"
+    with pytest.raises(NonFiniteError, match=message):
+        tally.add(counts._replace(diverged=counts.diverged | many))
+    tally.close()
+
+
+def test_full_buffers_are_counted_and_the_first_is_told(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    tally, counts = tally_of(tmp_path), no_counts(point_mass())
+    for count in (0, 5, 7):
+        tally.add(counts._replace(overflowed={"contact": jnp.asarray(count)}))
+    tally.close()
+    assert tally.outcome()["overflow_steps"] == {"contact": 12.0}
+    assert len(capsys.readouterr().err.splitlines()) == 1
+    lines = RunPaths(tmp_path).gmi(0).metrics.read_text().splitlines()
+    key = "physics/contact_overflow_steps"
+    assert [json.loads(line)[key] for line in lines] == [0.0, 5.0, 7.0]

@@ -10,9 +10,10 @@ from toy_env import point_mass
 
 from gmijax.errors import NonFiniteError
 from gmijax.metrics import Line, MetricsLog
+from gmijax.physics_health import TOLERATED_STEPS
 from gmijax.ppo.losses import LossMetrics
 from gmijax.ppo.programs import IterationMetrics
-from gmijax.ppo.report import TOLERATED_STEPS, Reporter, ReportThread
+from gmijax.ppo.report import Reporter, ReportThread
 from gmijax.ppo.rollout import stats_example
 from gmijax.sim.wrappers import env_keys
 

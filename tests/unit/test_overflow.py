@@ -78,7 +78,7 @@ def test_the_first_overflow_is_told_and_all_are_logged(
         reporter.report(64 * iteration, found, {})
     assert [line["physics/contact_overflow_steps"] for line in sink.lines] == [0.0, 5.0, 7.0]
     assert [line["physics/constraint_overflow_steps"] for line in sink.lines] == [0.0] * 3
-    assert reporter.overflow_steps == {"contact": 12.0, "constraint": 0.0}
+    assert reporter.overflows.steps == {"contact": 12.0, "constraint": 0.0}
     told = capsys.readouterr().err.splitlines()
     assert len(told) == 1
     assert told[0].startswith("point_mass: MJX-Warp's contact buffer was too small in 5 ")
