@@ -17,8 +17,8 @@ PLAN := $(if $(filter 1,$(GPUS)),plan.gpus=1 plan.gmis_per_gpu=2,plan.gpus=2 pla
 # A million steps: under six minutes on two cores, with the making of the environment.
 TRAIN_ARGS ?= env=ball_balance $(PLAN) num_timesteps=1000000
 TEST_ARGS ?=
-# Most tests wait for one process at a time.
-TEST_WORKERS ?= -n 2 --dist loadgroup
+# The tests of a file share what they compile.
+TEST_WORKERS ?= -n 2 --dist loadfile
 
 .DEFAULT_GOAL := help
 .PHONY: help venv train test test-all wheel-test lint types imports format check clean

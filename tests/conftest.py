@@ -30,17 +30,8 @@ def _has_gpu() -> bool:
         pynvml.nvmlShutdown()
 
 
-def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
-    """Skips tests marked `gpu` where there is no NVIDIA GPU; keeps together what shares programs.
-
-    With `-n 2 --dist loadgroup` the tests of a file run in one process, and so do those of the
-    contract of tasks, which share the programs of `compiled_tasks`.
-    """
-    if config.pluginmanager.hasplugin("xdist"):
-        for item in items:
-            shares = "task" in getattr(item, "fixturenames", ())
-            group = "tasks" if shares else str(item.path)
-            item.add_marker(pytest.mark.xdist_group(group))
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Skips tests marked `gpu` where there is no NVIDIA GPU."""
     marked = [item for item in items if item.get_closest_marker("gpu")]
     if marked and not _has_gpu():
         for item in marked:

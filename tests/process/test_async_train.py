@@ -114,6 +114,21 @@ def test_every_agent_adds_its_environments_to_the_checkpoint(two_and_two: Path) 
 
 
 @pytest.mark.timeout(300)
+def test_its_checkpoint_plays(two_and_two: Path) -> None:
+    quiet = ("video=none", "html=off")
+    done = train(f"run.dir={two_and_two}", *quiet, cwd=two_and_two.parent, command="play")
+    assert done.returncode == 0, done.stderr
+    assert list(two_and_two.glob("play/*/returns.json"))
+
+
+@pytest.mark.parametrize("way", ["channel.design=uni", "channel.when_full=drop_oldest"])
+def test_a_job_learns_whichever_way_experience_goes(way: str, tmp_path: Path) -> None:
+    steps = 30 * UPDATE
+    done = train(*SMALL, way, f"num_timesteps={steps}", "run.dir=run", cwd=_folder(tmp_path))
+    assert done.returncode == 0, done.stderr
+    assert _read(tmp_path / "run" / "summary.json")["env_steps"] >= steps
+
+
 def test_a_job_goes_on_from_its_checkpoint(two_and_two: Path) -> None:
     cwd, before = two_and_two.parent, _read(two_and_two / "summary.json")["env_steps"]
     more = before + 20 * 2 * UPDATE

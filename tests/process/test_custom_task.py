@@ -58,7 +58,7 @@ def test_a_task_of_ones_own_trains_in_two_gmis_resumes_and_plays(tmp_path: Path)
     assert f"custom task: {file}:make has changed since the run was started" in done.stdout
     # The change makes one term not a number: the error names task, step and term.
     assert done.returncode == 1, done.stderr
-    assert "NonFiniteError: point.py:make, up to env step 384: 128 steps" in done.stderr
+    assert "NonFiniteError: point.py:make, up to env step 384: 128 of 128 steps" in done.stderr
     assert "in reward/near" in done.stderr
 
     file.write_text(TASK)

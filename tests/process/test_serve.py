@@ -71,6 +71,20 @@ def finished(folder: Path) -> int:
     return len(list(DataPaths(folder).finished()))
 
 
+def test_what_is_auto_is_found_first(home: Path):
+    wanted = ("num_envs=auto", "plan.gmis_per_gpu=auto", "num_timesteps=128", "run.name=auto")
+    grid = ("search.gmis_per_gpu=[1]", "search.num_envs=[8,16]", "search.order=as_printed")
+    few = ("search.iterations=2", "search.alpha=0", "search.store=profiles")
+    task = ("env=point.py:make", "policy=random", *TINY[1:])
+    done = serve(*task, *wanted, *grid, *few, cwd=home)
+    assert done.returncode == 0, done.stderr
+    plan = summary_of(home, "auto")["plan"]
+    assert plan["layout"] == [[0]]
+    assert plan["num_envs_per_gmi"] in (8, 16)
+    assert "env steps/s" in done.stdout
+    assert len(list((home / "profiles").glob("*.json"))) == 1
+
+
 def test_both_templates_collect_the_same_experience(home: Path):
     """With the policy of a run, whose task need not be named."""
     shared = ("run.dir=runs/tiny", *TINY, "num_timesteps=500", "output.next_obs=true")

@@ -3,7 +3,11 @@
 from __future__ import annotations
 
 import importlib.util
+import subprocess
+import sys
+from importlib.machinery import ModuleSpec
 from pathlib import Path
+from types import ModuleType, SimpleNamespace
 from typing import Any, NamedTuple
 
 import jax
@@ -166,6 +170,25 @@ def test_a_package_that_is_missing_is_told_with_its_command():
     message = r"needs the package mujoco_playground \(pip install 'gmijax\[playground\]'\)$"
     with pytest.raises(ConfigError, match=message):
         make_env("CartpoleBalance", suite="playground")
+
+
+def test_models_that_cannot_be_downloaded_are_one_line(monkeypatch: pytest.MonkeyPatch):
+    def load(name: str, config: Any) -> None:
+        raise subprocess.CalledProcessError(128, ["git", "clone"])
+
+    registry = SimpleNamespace(
+        ALL_ENVS=("Go1Joystick",), get_default_config=lambda name: {"name": name}, load=load
+    )
+    package = ModuleType("mujoco_playground")
+    package.__dict__.update(__spec__=ModuleSpec(package.__name__, None), registry=registry)
+    monkeypatch.setitem(sys.modules, "mujoco_playground", package)
+    there = SimpleNamespace(MENAGERIE_PATH="/models")
+    monkeypatch.setitem(sys.modules, "mujoco_playground._src.mjx_env", there)
+    message = r"^env\.name=Go1Joystick: Playground could not download .* to /models: [^\n]+$"
+    with pytest.raises(ConfigError, match=message):
+        make_env("Go1Joystick", suite="playground")
+    with pytest.raises(ConfigError, match="did you mean Go1Joystick"):
+        make_env("Go1Joystic", suite="playground")
 
 
 def test_playground_as_ours():
