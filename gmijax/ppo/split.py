@@ -77,7 +77,8 @@ class SplitIteration:
         index = jax.ShapeDtypeStruct((), jnp.int32)
         gradient_args = (state.params, samples, order, index, context)
         self._gradient = self._gradient.lower(*gradient_args)
-        buffer = self._gradient.out_info
+        # Its shape only: it is made in pinned host memory, and comes back from elsewhere.
+        buffer = jax.ShapeDtypeStruct(self._gradient.out_info.shape, jnp.float32)
         loss = jax.ShapeDtypeStruct((len(LossMetrics._fields),), jnp.float32)
         self._update = self._update.lower(state, buffer, *gradient_args[1:])
         self._apply = self._apply.lower(state, buffer)
