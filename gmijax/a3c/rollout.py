@@ -16,9 +16,8 @@ from gmijax.acting import act
 from gmijax.learner import host_sharding
 from gmijax.normalize import normalize
 from gmijax.policy import ActorCritic, log_prob
-from gmijax.sim.divergence import sources
 from gmijax.sim.interface import EnvSpec
-from gmijax.sim.wrappers import BatchedEnv, BatchState, EpisodeSums
+from gmijax.sim.wrappers import BatchedEnv, BatchState, EpisodeSums, zero_counts
 from gmijax.types import Array, PyTree
 
 
@@ -132,13 +131,12 @@ class UnrollPrograms:
 
 def stats_example(spec: EnvSpec, overflows: tuple[str, ...] = ()) -> UnrollStats:
     """Zeros in the structure of `UnrollStats`."""
-    zero = jnp.zeros(())
-    terms, metrics = dict.fromkeys(spec.reward_terms, zero), dict.fromkeys(spec.metrics, zero)
+    episodes, diverged, overflowed = zero_counts(spec, overflows)
     return UnrollStats(
-        episodes=EpisodeSums(zero, zero, zero, terms, metrics),
-        reward_sum=zero,
-        diverged=dict.fromkeys(("any", *sources(spec.reward_terms)), zero),
-        overflowed=dict.fromkeys(overflows, zero),
+        episodes=episodes,
+        reward_sum=jnp.zeros(()),
+        diverged=diverged,
+        overflowed=overflowed,
     )
 
 

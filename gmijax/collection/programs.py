@@ -14,8 +14,7 @@ import jax
 import jax.numpy as jnp
 
 from gmijax.collection.policy import ActingPolicy
-from gmijax.sim.divergence import sources
-from gmijax.sim.wrappers import BatchedEnv, BatchState, EpisodeSums, split_keys
+from gmijax.sim.wrappers import BatchedEnv, BatchState, EpisodeSums, split_keys, zero_counts
 from gmijax.types import Array, PyTree
 
 
@@ -114,14 +113,7 @@ def simulate(
 
 def no_counts(env: BatchedEnv) -> Counts:
     """Counts before the first step."""
-    zero = jnp.zeros(())
-    terms = dict.fromkeys(env.spec.reward_terms, zero)
-    metrics = dict.fromkeys(env.spec.metrics, zero)
-    return Counts(
-        episodes=EpisodeSums(zero, zero, zero, terms, metrics),
-        diverged=dict.fromkeys(("any", *sources(env.spec.reward_terms)), zero),
-        overflowed=dict.fromkeys(env.overflows, zero),
-    )
+    return Counts(*zero_counts(env.spec, env.overflows))
 
 
 def next_keys(state: BatchState) -> tuple[BatchState, Array]:

@@ -20,9 +20,8 @@ from gmijax.normalize import (
 from gmijax.policy import ActorCritic, ActorCriticParams, log_prob
 from gmijax.ppo.advantages import gae
 from gmijax.ppo.losses import Samples
-from gmijax.sim.divergence import sources
 from gmijax.sim.interface import EnvSpec
-from gmijax.sim.wrappers import BatchedEnv, BatchState, EpisodeSums
+from gmijax.sim.wrappers import BatchedEnv, BatchState, EpisodeSums, zero_counts
 from gmijax.types import Array, PyTree
 
 
@@ -143,13 +142,12 @@ def _with_advantages(
 
 def stats_example(spec: EnvSpec, overflows: tuple[str, ...] = ()) -> RolloutStats:
     """Zeros in the structure of `RolloutStats`."""
-    zero = jnp.zeros(())
-    terms, metrics = dict.fromkeys(spec.reward_terms, zero), dict.fromkeys(spec.metrics, zero)
+    episodes, diverged, overflowed = zero_counts(spec, overflows)
     return RolloutStats(
         obs=no_samples((spec.obs_size,)),
         advantage=no_samples(()),
-        episodes=EpisodeSums(zero, zero, zero, terms, metrics),
-        reward_sum=zero,
-        diverged=dict.fromkeys(("any", *sources(spec.reward_terms)), zero),
-        overflowed=dict.fromkeys(overflows, zero),
+        episodes=episodes,
+        reward_sum=jnp.zeros(()),
+        diverged=diverged,
+        overflowed=overflowed,
     )
