@@ -10,6 +10,7 @@ their seconds are not, and each run says how many they were.
 from __future__ import annotations
 
 import argparse
+import itertools
 import json
 import math
 import re
@@ -196,8 +197,9 @@ def run_all(
 
 
 def unused(folder: Path) -> Path:
-    """`folder`, or with a letter more where an interrupted run has left it."""
-    return next(f for f in (folder, *(Path(f"{folder}{x}") for x in "bcdefgh")) if not f.exists())
+    """`folder`, or with a number more where an interrupted run has left it."""
+    more = (Path(f"{folder}-{number}") for number in itertools.count(2))
+    return next(path for path in itertools.chain((folder,), more) if not path.exists())
 
 
 def run_case(case: Case, repeat: int, overrides: tuple[str, ...], folder: Path) -> dict[str, Any]:
