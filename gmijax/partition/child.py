@@ -105,14 +105,17 @@ class ChildLink:
         """Whether the controller asked for an end: finish the iteration, save, return."""
         return self._stop.is_set()
 
-    def begin_compiling(self) -> None:
-        """Says that this GMI compiles from now on, once it may.
+    def begin_compiling(self) -> float:
+        """Says that this GMI compiles from now on, once it may; returns how long it waited, s.
 
         Where all GMIs run the same programs one compiles them while the others load what they
         need and wait here; then they find the programs in the compilation cache.
         """
+        started_s = time.monotonic()
         self._turn.wait()
+        waited_s = time.monotonic() - started_s
         self.beat("compiling", 0)
+        return waited_s
 
     def beat(self, state: GmiState, iteration: int) -> None:
         """Reports progress; cheap enough for every iteration.

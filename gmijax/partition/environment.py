@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from pathlib import Path
 
-from gmijax.partition.child import ENV_CPUS, ENV_GMI, ENV_RENDEZVOUS
+from gmijax.partition.child import ENV_CPUS, ENV_GMI, ENV_RENDEZVOUS, ENV_WAITS
 from gmijax.partition.plan import Plan, Slice
 
 # The old and the new name of one JAX setting; JAX refuses to start when both are set.
@@ -32,7 +32,7 @@ _NO_SHARED_AUTOTUNING = "--xla_gpu_shard_autotuning=false"
 
 # XLA's client for GPUs goes on looking for the service that ring members leave before they train,
 # and warns of it twice a second, for as long as the job lasts.
-_ERRORS_ONLY = {"TF_CPP_MIN_LOG_LEVEL": "2"}
+_LOG_LEVEL, _ERRORS_ONLY = "TF_CPP_MIN_LOG_LEVEL", "2"
 
 
 def gmi_environment(
@@ -69,13 +69,15 @@ def gmi_environment(
         environment.setdefault(name, str(len(share.cpus) or 1))
     added = dict(backend_environment)
     flags = extend_xla_flags(environment.get(_XLA_FLAGS, ""), added.pop(_XLA_FLAGS, ""))
-    environment.pop(ENV_RENDEZVOUS, None)
+    # Of the job that this one may be started from.
+    for name in (ENV_RENDEZVOUS, ENV_WAITS):
+        environment.pop(name, None)
     if rendezvous is not None:
         # A proxy that the user needs for other things must not get between the GMIs.
         environment.update({ENV_RENDEZVOUS: rendezvous, "no_grpc_proxy": _LOCAL_HOST})
         if plan.backend != "cpu":
             flags = extend_xla_flags(flags, _NO_SHARED_AUTOTUNING)
-            environment = {**_ERRORS_ONLY, **environment}
+            environment.setdefault(_LOG_LEVEL, _ERRORS_ONLY)
     if flags:
         environment[_XLA_FLAGS] = flags
     return {**environment, **added}

@@ -100,13 +100,11 @@ class _SyncTrainer:
         meter = ThroughputMeter(self._env, self._learner, self._config, self._reducer)
         if self._measures:
             meter.trace(state, env_state)
-        trace_s = time.monotonic() - started
-        self._link.begin_compiling()
-        started = time.monotonic()
+        waited_s = self._link.begin_compiling()
         self._iteration.compile()
         if self._measures:
             meter.compile()
-        compile_s = trace_s + time.monotonic() - started
+        compile_s = time.monotonic() - started - waited_s
         self._link.beat("ready", 0)
         self._meet()  # Everybody has compiled: the clock may start.
         history = read_metrics(self._link.run.metrics) if self._leader else []
