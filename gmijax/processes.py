@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterable
+from contextlib import suppress
 from pathlib import Path
 from typing import NamedTuple
 
 _POLL_S = 0.02
+_ENDED = (b"Z", b"X")
 
 
 class ProcessId(NamedTuple):
@@ -29,16 +31,27 @@ class ProcessId(NamedTuple):
 def identify(pid: int) -> ProcessId | None:
     """The running process with number `pid`, or None (also for a zombie)."""
     try:
-        process, state = _parse(Path(f"/proc/{pid}/stat").read_bytes())
+        process, state, _ = _parse(Path(f"/proc/{pid}/stat").read_bytes())
     except OSError:
         return None
-    return None if state in (b"Z", b"X") else process
+    return None if state in _ENDED else process
 
 
 def own_process() -> ProcessId:
     """The calling process."""
     # Not os.getpid(): processes look at each other through /proc, which may number differently.
     return _parse(Path("/proc/self/stat").read_bytes())[0]
+
+
+def members_of(group: int) -> tuple[ProcessId, ...]:
+    """The running processes of a process group; no zombies."""
+    found = []
+    for entry in Path("/proc").glob("[0-9]*"):
+        with suppress(OSError, ValueError):  # It may end meanwhile.
+            process, state, its_group = _parse((entry / "stat").read_bytes())
+            if its_group == group and state not in _ENDED:
+                found.append(process)
+    return tuple(found)
 
 
 def wait_until_gone(processes: Iterable[ProcessId], timeout_s: float) -> tuple[ProcessId, ...]:
@@ -51,9 +64,9 @@ def wait_until_gone(processes: Iterable[ProcessId], timeout_s: float) -> tuple[P
     return left
 
 
-def _parse(stat: bytes) -> tuple[ProcessId, bytes]:
-    """The process that a line of /proc/<pid>/stat is about, and its state."""
+def _parse(stat: bytes) -> tuple[ProcessId, bytes, int]:
+    """The process that a line of /proc/<pid>/stat is about, its state and its group."""
     # The second field is the program's name in brackets, which may itself hold blanks and
     # brackets: count from the last one.
     fields = stat.rpartition(b")")[2].split()
-    return ProcessId(int(stat.partition(b" ")[0]), int(fields[19])), fields[0]
+    return ProcessId(int(stat.partition(b" ")[0]), int(fields[19])), fields[0], int(fields[2])

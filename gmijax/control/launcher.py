@@ -26,7 +26,7 @@ from gmijax.partition.environment import gmi_environment
 from gmijax.partition.gmi_process import GmiStatus
 from gmijax.partition.machine import Machine
 from gmijax.partition.plan import Plan
-from gmijax.partition.reduction import meets_at_start, needs_ring
+from gmijax.partition.reduction import needs_ring
 from gmijax.partition.rendezvous import reserved_address
 from gmijax.partition.supervisor import Job, Patience, Supervisor
 from gmijax.rundir import RunPaths, read_json, write_json
@@ -44,7 +44,7 @@ class Launch:
       patience: time limits.
       stops_gracefully: a first SIGINT, SIGTERM or SIGHUP asks the GMIs to finish by themselves;
         otherwise signals do what Python does with them.
-      compile_once: see `Job`; never where GMIs meet before they compile.
+      compile_once: see `Job`; never where each has programs of its own.
       shared: blocks of memory for all GMIs, by the environment variable that names the
         descriptor, and what makes one; beside the block that reducers use.
       variables: more environment variables of every GMI.
@@ -96,8 +96,8 @@ def run_gmis(
                 backend=backend,
                 patience=launch.patience,
                 inherited_fds=inherited,
-                compile_once=launch.compile_once
-                and not meets_at_start(plan.strategy, plan.training_layout, plan.intra),
+                # On the CPU a program of a world belongs to one of its devices.
+                compile_once=launch.compile_once and not (has_rings and plan.backend == "cpu"),
             )
         )
         if launch.stops_gracefully:

@@ -13,7 +13,11 @@ from typing import NamedTuple
 from gmijax.errors import GmiFailed
 from gmijax.partition.child import ENV_LIFELINE_FD, ENV_RUN_DIR, ENV_WAITS, GO_BYTE, STOP_BYTE
 from gmijax.partition.heartbeat import Heartbeat, read_heartbeat
+from gmijax.processes import members_of, wait_until_gone
 from gmijax.rundir import GmiPaths, RunPaths
+
+_GROUP_ENDS_S = 2.0
+"""A killed process is gone in milliseconds, unless a driver holds it."""
 
 
 class GmiStatus(NamedTuple):
@@ -140,7 +144,9 @@ class GmiProcess:
         self._refresh()
         if self.exit_code is None and self._has_ended():
             # Before the zombie is reaped its group's number cannot go to somebody else.
+            others = members_of(self.pid)
             self.send(signal.SIGKILL)
+            wait_until_gone(others, _GROUP_ENDS_S)
             self.exit_code = self._process.wait()
             self._refresh()
         return self.exit_code

@@ -83,11 +83,6 @@ def needs_ring(strategy: str, layout: Layout) -> bool:
     return strategy in ("mrr", "flat") or (strategy == "har" and layout.num_gpus > 1)
 
 
-def meets_at_start(strategy: str, layout: Layout, intra: str) -> bool:
-    """Whether no GMI can compile before all are started: for rings, or to share device memory."""
-    return needs_ring(strategy, layout) or (strategy == "har" and intra == "ipc")
-
-
 def leaders(layout: Layout) -> tuple[int, ...]:
     """The GMI of every GPU that speaks for it in HAR.
 

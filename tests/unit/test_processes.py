@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import os
 import shutil
+import signal
 import subprocess
 from pathlib import Path
 
-from gmijax.processes import ProcessId, identify, own_process, wait_until_gone
+from gmijax.processes import ProcessId, identify, members_of, own_process, wait_until_gone
 
 
 def test_zombie_is_not_running():
@@ -43,3 +44,20 @@ def test_waiting_ends_in_time_and_returns_what_still_runs():
     own = own_process()
     assert wait_until_gone([own], timeout_s=0.05) == (own,)
     assert wait_until_gone([ProcessId(0, 0)], timeout_s=10) == ()
+
+
+def test_members_of_a_group_are_those_that_run():
+    shell = subprocess.Popen(
+        ["sh", "-c", "sleep 60 & echo; exec sleep 60"],
+        start_new_session=True,
+        stdout=subprocess.PIPE,
+    )
+    try:
+        assert shell.stdout is not None
+        shell.stdout.readline()
+        assert len(members_of(shell.pid)) == 2
+        assert identify(shell.pid) in members_of(shell.pid)
+    finally:
+        os.killpg(shell.pid, signal.SIGKILL)
+        shell.communicate()
+    assert wait_until_gone(members_of(shell.pid), timeout_s=10) == ()
