@@ -1,6 +1,7 @@
 """Every reduction strategy on real GPUs. Run with `pytest -m gpu tests/gpu/test_reducers_gpu.py`.
 
-With pytest-xdist (`-n 4`) the cases run at the same time, from another GPU on in each worker.
+With pytest-xdist (`-n 4`) the cases of the contract run at the same time, from another GPU on in
+each worker. Learning (`-k learning`) wants the GPUs for itself: a job takes most of their memory.
 """
 
 from __future__ import annotations
@@ -12,7 +13,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from training_jobs import STEPS, TINY, learner_arrays, train
+from training_jobs import POINT_TASK, STEPS, TINY, learner_arrays, train
 
 from gmijax.partition.layout import Layout
 from gmijax.partition.nvidia import list_gpus
@@ -69,8 +70,13 @@ def test_the_contract(strategy: str, intra: str, case: Case, tmp_path: Path) -> 
 def test_learning_does_not_depend_on_the_strategy(
     gmis_per_gpu: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Parameters after 52 updates agree to the order of sums, on two GPUs."""
+    """Parameters after 52 updates agree to the order of sums, on two GPUs.
+
+    The task has no contacts: where one begins a step earlier because a sum was rounded otherwise,
+    all that follows is different.
+    """
     _require("ipc")
+    (tmp_path / "point.py").write_text(POINT_TASK)
     # Otherwise a job differs from itself: sums with atomic operations, products in TF32.
     monkeypatch.setenv("XLA_FLAGS", "--xla_gpu_deterministic_ops=true")
     monkeypatch.setenv("JAX_DEFAULT_MATMUL_PRECISION", "highest")
@@ -83,7 +89,7 @@ def test_learning_does_not_depend_on_the_strategy(
         # Letters only: the folder is a value on a command line.
         run = tmp_path / re.sub(r"[^a-z]+", "-", way)
         overrides = f"reduce.strategy={way} num_timesteps={steps} run.dir={run}".split()
-        done = train(*TINY, *plan, *overrides, cwd=tmp_path)
+        done = train("env=point.py:make", *TINY[1:], *plan, *overrides, cwd=tmp_path)
         assert done.returncode == 0, done.stderr
         return learner_arrays(run)
 
@@ -92,4 +98,4 @@ def test_learning_does_not_depend_on_the_strategy(
     for way in WAYS[gmis_per_gpu]:
         for found, array in zip(trained(way), expected, strict=True):
             # Each update moves a parameter by 3e-4 at most.
-            np.testing.assert_allclose(found, array, rtol=1e-4, atol=1e-5, err_msg=way)
+            np.testing.assert_allclose(found, array, rtol=1e-4, atol=3e-6, err_msg=way)

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 from training_jobs import (
     FOREVER,
+    POINT_TASK,
     gmi_pid,
     iteration_of,
     kill,
@@ -26,15 +27,6 @@ from training_jobs import (
 from gmijax.a3c.staleness import MAX_COUNTED
 from gmijax.resume import find_checkpoint
 
-TESTS = Path(__file__).parents[1]
-TASK = f"""
-import sys
-sys.path.insert(0, {str(TESTS)!r})
-from toy_env import point_mass_env
-
-def make(*, impl, max_envs):
-    return point_mass_env()
-"""
 N, T = 16, 4
 UPDATE = N * T
 """Environment steps of one batch of one trainer."""
@@ -49,7 +41,7 @@ SMALL = (
 
 def _folder(path: Path) -> Path:
     path.mkdir(exist_ok=True)
-    (path / "point.py").write_text(TASK)
+    (path / "point.py").write_text(POINT_TASK)
     return path
 
 
