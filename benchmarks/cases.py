@@ -39,6 +39,12 @@ def _learning(task: str) -> Case:
     return Case(task, (f"env={task}", "seed={run}", *own, "run.measure_throughput=false"))
 
 
+def _entropy(cost: str) -> Case:
+    """Whether noise that is paid for finds the pull that some seeds of the task never find."""
+    own = ("num_timesteps=20e6", f"algo.entropy_cost={cost}", "run.measure_throughput=false")
+    return Case(f"entropy_cost {cost}", ("env=franka_cabinet", "seed={run}", *own))
+
+
 def _throughput(task: str, impl: str, num_envs: int) -> Case:
     # A dozen iterations of the longest rollout: their median is the training rate.
     steps = 12 * 32 * num_envs
@@ -251,6 +257,14 @@ SUITES = MappingProxyType(
         "sm-shares": tuple(_capped(percent) for percent in ("null", "25", "50", "100", "33")),
         # Every task with its own settings, another seed in every repeat.
         **{f"learn-{task}": (_learning(task),) for task in TASKS},
+        # What ant learns from as many steps of the other MJX.
+        "learn-ant-jax": (
+            Case(
+                "ant jax",
+                (*_ANT, "seed={run}", "num_timesteps=60e6", "run.measure_throughput=false"),
+            ),
+        ),
+        "entropy-franka_cabinet": tuple(map(_entropy, ("0", "0.002", "0.005"))),
         # Gradients through host memory against the best layout-aware reduction.
         **{
             f"lgr-{task}": tuple(
