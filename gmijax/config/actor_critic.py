@@ -34,6 +34,11 @@ class ActorCriticConfig:
     policy_hidden_layer_sizes: tuple[int, ...] = doc("widths of the policy network")
     value_hidden_layer_sizes: tuple[int, ...] = doc("widths of the value network")
     init_noise_std: float = doc("standard deviation of the first policy")
+    init_at_random_ep_len: bool = doc(
+        "cut the first episode of every world at a random time, so that worlds do not go through "
+        "their episodes in step; those episodes are not counted in returns",
+        default=False,
+    )
 
     def __post_init__(self) -> None:
         for key in ("unroll_length", "num_minibatches", "num_updates_per_batch"):

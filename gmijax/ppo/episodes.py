@@ -129,7 +129,8 @@ def run_episodes(
 def _start(env: Env, model: PyTree, keys: PRNGKey) -> BatchState:
     zero = jnp.zeros(keys.shape)
     terms = dict.fromkeys(env.spec.reward_terms, zero)
-    return BatchState(vectorise(env).reset(model, keys), zero, terms)
+    no_head_start = jnp.zeros(keys.shape, jnp.int32)
+    return BatchState(vectorise(env).reset(model, keys), zero, terms, no_head_start)
 
 
 def _run_chunk(
@@ -159,6 +160,7 @@ def _run_chunk(
             moved,
             before.return_sum + moved.reward,
             {name: sums + moved.reward_terms[name] for name, sums in before.term_sums.items()},
+            before.head_start,
         )
         running = _is_running(before.env, limit)
         kept = _where(running, after, before)

@@ -9,7 +9,13 @@ from gmijax.sim.wrappers import BatchedEnv, training_env
 
 
 def make_training_env(
-    config: EnvConfig, impl: str, *, seed: int, first_env: int, num_envs: int
+    config: EnvConfig,
+    impl: str,
+    *,
+    seed: int,
+    first_env: int,
+    num_envs: int,
+    random_ep_len: bool = False,
 ) -> BatchedEnv:
     """`num_envs` auto-resetting environments, randomised where the configuration says so.
 
@@ -19,6 +25,7 @@ def make_training_env(
       seed: of the run.
       first_env: number of the first of them in the whole job.
       num_envs: N.
+      random_ep_len: see `training_env`.
     """
     env = make_env(
         str(config.name),
@@ -31,4 +38,4 @@ def make_training_env(
         env = randomized(
             env, config.randomization, seed=seed, first_env=first_env, num_envs=num_envs
         )
-    return training_env(env)
+    return training_env(env, random_ep_len=random_ep_len)

@@ -19,6 +19,9 @@ from gmijax.sim.divergence import diverged_by_source, end_diverged, sources
 from gmijax.sim.interface import OVERFLOWS, Env, EnvSpec, EnvState
 from gmijax.types import Array, PRNGKey, PyTree
 
+_HEAD_START = 0x68656164
+"""Folded into a world's key for the length of its first episode."""
+
 
 class EpisodeSums(NamedTuple):
     """Sums over the episodes that ended in one step; add those of several steps or GMIs.
@@ -45,11 +48,14 @@ class BatchState(NamedTuple):
       env: all worlds; its `obs` [N, O] is the one after auto-reset, to act on next.
       return_sum: [N] float32, return of the running episode so far.
       term_sums: [N] float32 each, what every term has added to it.
+      head_start: [N] int32, steps by which the first episode of a world is shorter than its
+        time limit; 0 after it.
     """
 
     env: EnvState
     return_sum: Array
     term_sums: dict[str, Array]
+    head_start: Array
 
 
 class StepOutput(NamedTuple):
@@ -60,7 +66,7 @@ class StepOutput(NamedTuple):
       reward: [N] float32.
       terminated: [N] bool, the task has ended.
       truncated: [N] bool, time ran out.
-      finished: the episodes that ended in this step.
+      finished: the whole episodes that ended in this step; none that had a head start.
       diverged: [] int32, worlds that were ended because of a bad number (they count as
         terminated), and by where it was: `any` and `gmijax.sim.divergence.sources`.
       overflowed: [] int32, worlds for which a buffer was too small, by `OVERFLOWS`; empty if
@@ -129,6 +135,13 @@ def auto_reset(env: Env, model: PyTree, state: EnvState) -> EnvState:
     return jax.tree.map(pick, fresh, state)
 
 
+def without_head_start(spec: EnvSpec, before: BatchState, state: EnvState) -> EnvState:
+    """`state` [N], truncated where a first episode that had a head start is out of time."""
+    time_left = spec.episode_length - before.head_start - state.steps
+    out_of_time = (before.head_start > 0) & (time_left <= 0)
+    return state._replace(truncated=(state.truncated | out_of_time) & ~state.terminated)
+
+
 def episode_statistics(
     before: BatchState, state: EnvState
 ) -> tuple[Array, dict[str, Array], EpisodeSums]:
@@ -136,9 +149,10 @@ def episode_statistics(
 
     Returns:
       Returns [N] and term sums [N] of the episodes that go on (zero where one ended), and the
-      sums over those that ended.
+      sums over the whole ones that ended.
     """
-    done = state.terminated | state.truncated
+    over = state.terminated | state.truncated
+    done = over & (before.head_start == 0)
     returns = before.return_sum + state.reward
     terms = {name: before.term_sums[name] + state.reward_terms[name] for name in before.term_sums}
     finished = EpisodeSums(
@@ -150,8 +164,8 @@ def episode_statistics(
             name: jnp.where(done, value, 0.0).sum() for name, value in state.metrics.items()
         },
     )
-    going_on = {name: jnp.where(done, 0.0, value) for name, value in terms.items()}
-    return jnp.where(done, 0.0, returns), going_on, finished
+    going_on = {name: jnp.where(over, 0.0, value) for name, value in terms.items()}
+    return jnp.where(over, 0.0, returns), going_on, finished
 
 
 def zero_counts(
@@ -175,12 +189,24 @@ def overflowed(env: Env, state: EnvState) -> dict[str, Array]:
     return dict(zip(OVERFLOWS, counts, strict=True))
 
 
-def training_env(env: Env) -> BatchedEnv:
+def training_env(env: Env, *, random_ep_len: bool = False) -> BatchedEnv:
     """N auto-resetting copies of `env`, with statistics of the episodes that end.
+
+    Args:
+      env: one of them, with a time limit.
+      random_ep_len: the first episode of a world is as long as if it had begun before, by a
+        random part of the time limit. Otherwise worlds that do not end by themselves all end in
+        the same step, and all samples of an update are of the same moment of an episode.
 
     `init` raises ConfigError for more environments than `env.max_envs`.
     """
     batched = vectorise(env)
+
+    def head_starts(keys: PRNGKey) -> Array:
+        if not random_ep_len:
+            return jnp.zeros(keys.shape, jnp.int32)
+        own = jax.vmap(lambda key: jax.random.fold_in(key, _HEAD_START))(keys)
+        return jax.vmap(lambda key: jax.random.randint(key, (), 0, env.spec.episode_length))(own)
 
     def init(model: PyTree, keys: PRNGKey) -> BatchState:
         if env.max_envs is not None and len(keys) > env.max_envs:
@@ -188,12 +214,12 @@ def training_env(env: Env) -> BatchedEnv:
                 f"num_envs={len(keys)}: {env.spec.name} was made for at most {env.max_envs}"
             )
         zero = jnp.zeros(keys.shape)
-        return BatchState(
-            batched.reset(model, keys), zero, dict.fromkeys(env.spec.reward_terms, zero)
-        )
+        terms = dict.fromkeys(env.spec.reward_terms, zero)
+        return BatchState(batched.reset(model, keys), zero, terms, head_starts(keys))
 
     def step(model: PyTree, state: BatchState, actions: Array) -> tuple[BatchState, StepOutput]:
         stepped = batched.step(model, state.env, actions)
+        stepped = without_head_start(env.spec, state, stepped)
         bad = diverged_by_source(env, stepped)
         bad["any"] = reduce(jnp.logical_or, bad.values())
         stepped = end_diverged(state.env, stepped, bad["any"])
@@ -207,7 +233,9 @@ def training_env(env: Env) -> BatchedEnv:
             diverged={name: jnp.sum(where, dtype=jnp.int32) for name, where in bad.items()},
             overflowed=overflowed(env, stepped),
         )
-        return BatchState(auto_reset(batched, model, stepped), returns, terms), output
+        head_start = jnp.where(stepped.terminated | stepped.truncated, 0, state.head_start)
+        after = BatchState(auto_reset(batched, model, stepped), returns, terms, head_start)
+        return after, output
 
     overflows = () if env.overflow is None else OVERFLOWS
     return BatchedEnv(env.spec, env.model, init, step, overflows)

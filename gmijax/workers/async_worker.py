@@ -61,6 +61,7 @@ def _run(link: ChildLink) -> dict[str, Any]:
         seed=config.seed,
         first_env=_index(agents.gmis, link.gmi) * config.envs_per_gmi,
         num_envs=config.envs_per_gmi,
+        random_ep_len=config.algo.init_at_random_ep_len,
     )
     parts = _Parts(config, algo, plan, env, _board(algo, env, len(agents.gmis)), link)
     return _train(parts, world) if trains else _act(parts)

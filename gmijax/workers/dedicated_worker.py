@@ -53,6 +53,7 @@ def _run(link: ChildLink) -> dict[str, Any]:
         seed=config.seed,
         first_env=0 if trains else servants.gmis.index(link.gmi) * config.envs_per_gmi,
         num_envs=config.envs_per_gmi,
+        random_ep_len=config.algo.init_at_random_ep_len,
     )
     block = PipeBlock.attach(required_fd(ENV_PIPES_FD), link.gmi, plan.layout.num_gmis, PIPE_BYTES)
     try:

@@ -44,6 +44,7 @@ def _run(link: ChildLink) -> dict[str, Any]:
         seed=config.seed,
         first_env=link.gmi * config.envs_per_gmi,
         num_envs=config.envs_per_gmi,
+        random_ep_len=config.algo.init_at_random_ep_len,
     )
     num_floats = exchange_size(env.spec, config.algo)
     reducer = trainers_reducer(config, plan, everyone, link, num_floats, world)

@@ -105,3 +105,38 @@ def test_more_environments_than_the_model_was_made_for():
     env = training_env(toy(2, max_envs=2))
     with pytest.raises(ConfigError, match="num_envs=3: toy was made for at most 2"):
         env.init(None, env_keys(jax.random.key(0), 0, 3))
+
+
+def test_first_episodes_end_at_random_times_and_do_not_count():
+    # The toy ends by itself after three steps: what is shorter was cut.
+    env = training_env(toy(3), random_ep_len=True)
+    state = env.init(None, env_keys(jax.random.key(0), 0, 64))
+    head_start = state.head_start
+    assert set(head_start.tolist()) == {0, 1, 2}
+    for step in (1, 2, 3):
+        state, out = env.step(None, state, jnp.zeros((64, 1)))
+        np.testing.assert_array_equal(out.truncated, (head_start == 3 - step) & (step < 3))
+        np.testing.assert_array_equal(out.terminated, (step == 3) & (head_start == 0))
+        assert int(out.finished.count) == int(out.terminated.sum())
+    assert not state.head_start.any()
+    assert state.env.steps.tolist() == head_start.tolist()
+
+
+def test_an_episode_that_ends_by_itself_with_a_head_start_does_not_count():
+    env = training_env(toy(1000), random_ep_len=True)
+    state = env.init(None, env_keys(jax.random.key(0), 0, 8))
+    assert (state.head_start > 0).all()
+    for count in (0, 8):
+        for _ in range(3):
+            state, out = env.step(None, state, jnp.zeros((8, 1)))
+        assert out.terminated.all()
+        assert int(out.finished.count) == count
+
+
+def test_head_starts_are_those_of_the_world_whoever_has_it():
+    env = training_env(toy(1000), random_ep_len=True)
+    whole, left, right = (
+        env.init(None, env_keys(jax.random.key(3), first, count)).head_start
+        for first, count in ((0, 4), (0, 2), (2, 2))
+    )
+    np.testing.assert_array_equal(whole, np.concatenate([left, right]))
