@@ -14,7 +14,7 @@ EXTRAS ?= test,dev$(if $(CUDA),$(comma)warp$(comma)$(CUDA))
 
 # Two GMIs: on two GPUs (virtual ones where there is none), or sharing the only one.
 PLAN := $(if $(filter 1,$(GPUS)),plan.gpus=1 plan.gmis_per_gpu=2,plan.gpus=2 plan.gmis_per_gpu=1)
-# A million steps: under six minutes on two cores, with the making of the environment.
+# A million steps: six minutes on two cores, with the making of the environment.
 TRAIN_ARGS ?= env=ball_balance $(PLAN) num_timesteps=1000000
 TEST_ARGS ?=
 # The tests of a file share what they compile.
