@@ -135,7 +135,7 @@ def auto_reset(env: Env, model: PyTree, state: EnvState) -> EnvState:
     return jax.tree.map(pick, fresh, state)
 
 
-def without_head_start(spec: EnvSpec, before: BatchState, state: EnvState) -> EnvState:
+def cut_first_episodes(spec: EnvSpec, before: BatchState, state: EnvState) -> EnvState:
     """`state` [N], truncated where a first episode that had a head start is out of time."""
     time_left = spec.episode_length - before.head_start - state.steps
     out_of_time = (before.head_start > 0) & (time_left <= 0)
@@ -219,7 +219,7 @@ def training_env(env: Env, *, random_ep_len: bool = False) -> BatchedEnv:
 
     def step(model: PyTree, state: BatchState, actions: Array) -> tuple[BatchState, StepOutput]:
         stepped = batched.step(model, state.env, actions)
-        stepped = without_head_start(env.spec, state, stepped)
+        stepped = cut_first_episodes(env.spec, state, stepped)
         bad = diverged_by_source(env, stepped)
         bad["any"] = reduce(jnp.logical_or, bad.values())
         stepped = end_diverged(state.env, stepped, bad["any"])
