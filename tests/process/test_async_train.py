@@ -121,6 +121,7 @@ def test_a_job_learns_whichever_way_experience_goes(way: str, tmp_path: Path) ->
     assert _read(tmp_path / "run" / "summary.json")["env_steps"] >= steps
 
 
+@pytest.mark.timeout(300)
 def test_a_job_goes_on_from_its_checkpoint(two_and_two: Path) -> None:
     cwd, before = two_and_two.parent, _read(two_and_two / "summary.json")["env_steps"]
     more = before + 20 * 2 * UPDATE

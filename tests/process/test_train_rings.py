@@ -22,18 +22,12 @@ ITERATIONS = 13
 """Of four updates each: 52 updates."""
 
 
-def _trained(strategy: str, gmis_per_gpu: int, cwd: Path, *task: str) -> list[np.ndarray]:
+def _trained(strategy: str, gmis_per_gpu: int, cwd: Path, task: str = TINY[0]) -> list[np.ndarray]:
     """The learner after `ITERATIONS` on two GPUs."""
     plan = ("plan.gpus=2", f"plan.gmis_per_gpu={gmis_per_gpu}", f"reduce.strategy={strategy}")
     steps = ITERATIONS * 2 * gmis_per_gpu * STEPS
-    done = train(
-        *(task or TINY[:1]),
-        *TINY[1:],
-        *plan,
-        f"num_timesteps={steps}",
-        f"run.dir={strategy}",
-        cwd=cwd,
-    )
+    run = (f"num_timesteps={steps}", f"run.dir={strategy}")
+    done = train(task, *TINY[1:], *plan, *run, cwd=cwd)
     assert done.returncode == 0, done.stderr
     return learner_arrays(cwd / strategy)
 
