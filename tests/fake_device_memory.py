@@ -1,4 +1,4 @@
-"""Device memory for `gmijax.collectives.ipc` without a device: a file without a name.
+"""Device memory for the exchanges without a device: a file without a name.
 
 jax reads it in place, as it reads memory of a GPU: a program sees what is there when it runs.
 """
@@ -12,7 +12,7 @@ import struct
 import jax
 import numpy as np
 
-from gmijax.collectives.ipc import TICKET_BYTES
+from gmijax.collectives.device_memory import TICKET_BYTES
 
 
 class FakeDeviceMemory:
@@ -34,7 +34,14 @@ class FakeDeviceMemory:
         os.close(opened)
 
     def write(self, offset: int, values: jax.Array) -> None:
+        self.start_write(offset, values)
+        self.finish_writes()
+
+    def start_write(self, offset: int, values: jax.Array) -> None:
         self._region(offset, values.shape, values.dtype)[...] = np.asarray(values)
+
+    def finish_writes(self) -> None:
+        pass
 
     def view(self, offset: int, shape: tuple[int, ...], dtype=np.float32) -> jax.Array:
         region = self._region(offset, shape, np.dtype(dtype))
@@ -53,5 +60,5 @@ class FakeDeviceMemory:
 class BrokenDeviceMemory(FakeDeviceMemory):
     """Takes what is written and forgets it: the others see nothing of it."""
 
-    def write(self, offset: int, values: jax.Array) -> None:
+    def start_write(self, offset: int, values: jax.Array) -> None:
         del offset, values

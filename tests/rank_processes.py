@@ -265,11 +265,13 @@ def use_fake_device_memory(*, is_broken: bool) -> None:
 
     from gmijax.collectives import build, ipc
 
+    memory = BrokenDeviceMemory if is_broken else FakeDeviceMemory
+
     def fake(layout: Layout, rank: int, num_floats: int, host: HostExchange) -> ipc.IpcIntra:
-        memory = BrokenDeviceMemory if is_broken else FakeDeviceMemory
         return ipc.IpcIntra(layout, rank, num_floats, host, memory)
 
     build.INTRA = {**build.INTRA, "ipc": fake}
+    build.DEVICE_MEMORY = memory
 
 
 def make_reducer(options: Options) -> Reducer:

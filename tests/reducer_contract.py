@@ -32,10 +32,13 @@ CASES = [
     Case(Layout(((0, 1, 2), (3, 4, 5))), 100_003, signal.SIGKILL, 4),
     Case(Layout(((0, 1), (2,))), 1, signal.SIGKILL, 2),
 ]
+WAYS = {"har": tuple(INTRA), "one_shot": ("ipc",)}
+"""How the GMIs of a GPU exchange, where that is not host memory alone."""
+
 PAIRS = [
     (strategy, intra, case)
     for strategy in STRATEGIES
-    for intra in (INTRA if strategy == "har" else ["host"])
+    for intra in WAYS.get(strategy, ("host",))
     for case in CASES
     if why_not_strategy(strategy, case.layout) is None
 ]

@@ -7,6 +7,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
+from gmijax.collectives.device_memory import NewMemory, cuda_memory
 from gmijax.collectives.host import HostExchange
 from gmijax.collectives.interface import Reducer
 from gmijax.collectives.intra import INTRA, IntraExchange, IntraUnavailable
@@ -117,6 +118,13 @@ def _har(membership: Membership) -> Reducer:
     return reducer(host, intra, world, num_floats)
 
 
+def _one_shot(membership: Membership) -> Reducer:
+    from gmijax.collectives.one_shot import OneShotReducer  # Imports jax.
+
+    host = _host("one_shot", membership)
+    return OneShotReducer(host, membership.layout, membership.num_floats, DEVICE_MEMORY)
+
+
 def _intra(membership: Membership, host: HostExchange) -> IntraExchange:
     layout, rank, num_floats = membership.layout, membership.rank, membership.num_floats
     try:
@@ -149,12 +157,16 @@ def _world(name: str, membership: Membership) -> World:
     return membership.world
 
 
+DEVICE_MEMORY: NewMemory = cuda_memory
+"""Makes the memory of GPUs that ranks share in `one_shot`."""
+
 STRATEGIES: Mapping[str, Callable[[Membership], Reducer]] = {
     "none": _none,
     "mpr": _mpr,
     "mrr": _mrr,
     "har": _har,
     "flat": _flat,
+    "one_shot": _one_shot,
 }
 """How the reducer of one rank is made; `none` is what a plan with a single GMI uses.
 

@@ -42,11 +42,21 @@ def flat_s(g: int, t: int, m_p: float, b1: float, b2: float) -> float:
     return 2 * (g * t - 1) * m_p / (g * t * b2)
 
 
+def one_shot_s(g: int, t: int, m_p: float, b1: float, b2: float) -> float:
+    """Seconds of writing to every GPU: (g - 1) t M_p / B2, what leaves a GPU.
+
+    Not in the paper. Memory of the own GPU is taken to cost nothing.
+    """
+    del b1
+    return (g - 1) * t * m_p / b2
+
+
 COSTS: Mapping[str, Callable[[int, int, float, float, float], float]] = {
     "mpr": mpr_s,
     "mrr": mrr_s,
     "har": har_s,
     "flat": flat_s,
+    "one_shot": one_shot_s,
 }
 """Time of every strategy, as a function of (g, t, M_p, B1, B2)."""
 

@@ -28,8 +28,8 @@ class CudaError(CollectiveError):
 class CudaMemory:
     """A `DeviceMemory` on the one GPU that this process sees.
 
-    One process makes the block, others open it, on the same GPU. They must run at the same time
-    under one MPS daemon, or without any.
+    One process makes the block, others open it, on the same GPU or another of the host. On one
+    GPU they must run at the same time under one MPS daemon, or without any.
 
     Raises:
       CudaError: from every method.
@@ -71,6 +71,11 @@ class CudaMemory:
 
     def write(self, offset: int, values: jax.Array) -> None:
         """See `DeviceMemory`."""
+        self.start_write(offset, values)
+        self.finish_writes()
+
+    def start_write(self, offset: int, values: jax.Array) -> None:
+        """See `DeviceMemory`."""
         values.block_until_ready()
         to_device = runtime.cudaMemcpyKind.cudaMemcpyDeviceToDevice
         source, target = values.unsafe_buffer_pointer(), self._pointer + offset
@@ -78,6 +83,9 @@ class CudaMemory:
             runtime.cudaMemcpyAsync(target, source, values.nbytes, to_device, self._stream),
             "copy into shared GPU memory",
         )
+
+    def finish_writes(self) -> None:
+        """See `DeviceMemory`."""
         _checked(runtime.cudaStreamSynchronize(self._stream), "copy into shared GPU memory")
 
     def view(

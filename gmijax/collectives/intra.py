@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Protocol, TypeVar
 import numpy as np
 
 from gmijax.collectives.buffers import chunk_bounds
+from gmijax.collectives.device_memory import cuda_memory
 from gmijax.collectives.host import HostExchange
 from gmijax.collectives.interface import FloatBuffer
 from gmijax.collectives.memory import ExchangeBlock
@@ -119,12 +120,7 @@ def _host(layout: Layout, rank: int, num_floats: int, host: HostExchange) -> Int
 
 
 def _ipc(layout: Layout, rank: int, num_floats: int, host: HostExchange) -> IntraExchange:
-    from gmijax.collectives.ipc import DeviceMemory, IpcIntra  # Imports jax.
-
-    def cuda_memory() -> DeviceMemory:
-        from gmijax.collectives.cuda_memory import CudaMemory  # Needs cuda-bindings.
-
-        return CudaMemory()
+    from gmijax.collectives.ipc import IpcIntra  # Imports jax.
 
     return IpcIntra(layout, rank, num_floats, host, cuda_memory)
 

@@ -105,7 +105,7 @@ def _numbers(value: float | tuple[float, ...] | None) -> tuple[float, ...]:
 class ReduceConfig:
     """How gradients are averaged over GMIs."""
 
-    strategy: Literal["auto", "mpr", "mrr", "har", "flat"] = doc(
+    strategy: Literal["auto", "mpr", "mrr", "har", "flat", "one_shot"] = doc(
         "reduction strategy; auto: by the layout (Algorithm 1 of the paper)"
     )
     intra: Literal["auto", "host", "ipc"] = doc(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 import typing
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any, Final, NamedTuple
 
@@ -16,7 +16,7 @@ from gmijax.partition.layout import Layout
 from gmijax.partition.machine import Machine
 from gmijax.partition.nvidia import PIPE_VARIABLE, Gpu
 from gmijax.partition.plan import BackendName
-from gmijax.partition.reduction import why_not_intra, why_not_strategy
+from gmijax.partition.reduction import why_not_intra, why_not_strategy, why_not_under
 from gmijax.sim.impl import choose_impl
 from gmijax.sim.registry import SUITES, require_task, task_names
 from gmijax.version import __version__
@@ -100,7 +100,7 @@ def _abilities(sight: Sight) -> Iterator[Ability]:
             usable.append(name)
         yield Ability("backend", name, reason is None, reason or _about_backend(name, machine))
     for name in _allowed("strategy"):
-        yield _reducer(name, len(machine.gpus) or 2)
+        yield _reducer(name, len(machine.gpus) or 2, usable)
     for name in _allowed("intra"):
         reasons = {backend: why_not_intra(name, backend) for backend in usable}
         fine = [backend for backend, reason in reasons.items() if reason is None]
@@ -125,13 +125,16 @@ def _about_backend(name: str, machine: Machine) -> str:
     return "GMIs of a GPU take turns"
 
 
-def _reducer(name: str, num_gpus: int) -> Ability:
+def _reducer(name: str, num_gpus: int, backends: Sequence[BackendName]) -> Ability:
     layouts = [Layout.even(num_gpus, per_gpu) for per_gpu in (2, 1)]
     fitting = [layout for layout in layouts if why_not_strategy(name, layout) is None]
-    if fitting:
+    if not fitting:
+        reason = why_not_strategy(name, layouts[-1])
+        return Ability("reducer", name, False, f"with layout {layouts[-1]}: {reason}")
+    reasons = [why_not_under(name, fitting[0], backend) for backend in backends]
+    if None in reasons:
         return Ability("reducer", name, True, f"e.g. with layout {fitting[0]}")
-    reason = why_not_strategy(name, layouts[-1])
-    return Ability("reducer", name, False, f"with layout {layouts[-1]}: {reason}")
+    return Ability("reducer", name, False, next(filter(None, reasons), "no backend works"))
 
 
 def _physics(name: str, platform: str, has_warp: bool) -> Ability:

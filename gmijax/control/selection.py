@@ -20,6 +20,7 @@ from typing import Any, NamedTuple
 from gmijax.collectives.cost_model import COSTS
 from gmijax.collectives.memory import create_exchange
 from gmijax.control.launcher import Launch, compilation_cache_dir, run_gmis
+from gmijax.partition.layout import Layout
 from gmijax.partition.machine import Machine
 from gmijax.partition.plan import Plan
 from gmijax.partition.reduction import (
@@ -27,6 +28,7 @@ from gmijax.partition.reduction import (
     select_strategy,
     why_not_intra,
     why_not_strategy,
+    why_not_under,
 )
 from gmijax.partition.supervisor import Patience
 from gmijax.partition.templates import TRAINER, has_role
@@ -39,6 +41,9 @@ CHAIN = 8
 TIMEOUT_S = 120.0
 CALLS = 40
 PATIENCE = Patience(start_timeout_s=300, stall_timeout_s=120, stop_timeout_s=60, grace_s=5)
+
+_WAYS = {"har": ("host", "ipc"), "one_shot": ("ipc",)}
+"""How the GMIs of a GPU exchange, for strategies that care."""
 
 _PACKAGES = ("jax", "jaxlib", "nvidia-nccl-cu12", "nvidia-nccl-cu13", "cuda-bindings")
 _TYPICAL_INPUTS, _TYPICAL_OUTPUTS = 64, 16
@@ -124,16 +129,21 @@ def candidates(plan: Plan, num_floats: int, intra: str = "auto") -> list[Probe]:
     """Every way that the layout and the backend allow, once."""
     found: list[Probe] = []
     for strategy in COSTS:
-        # With one GMI on each GPU flat is the ring that mrr is.
-        if why_not_strategy(strategy, plan.layout) or strategy == "flat":
+        if why_not_strategy(strategy, plan.layout) or _is_another(strategy, plan.layout):
             continue
-        if plan.backend == "mig" and needs_ring(strategy, plan.layout):
+        if why_not_under(strategy, plan.layout, plan.backend):
             continue
-        for way in ("host", "ipc") if strategy == "har" else ("host",):
-            wanted = strategy != "har" or intra in ("auto", way)
+        for way in _WAYS.get(strategy, ("host",)):
+            wanted = strategy not in _WAYS or intra in ("auto", way)
             if wanted and why_not_intra(way, plan.backend) is None:
                 found.append(Probe(strategy, way, num_floats))
     return found
+
+
+def _is_another(strategy: str, layout: Layout) -> bool:
+    """Whether this is what another strategy does on such a layout."""
+    # With one GMI on each GPU flat is the ring that mrr is; on one GPU har sums all slots too.
+    return strategy == "flat" or (strategy == "one_shot" and layout.num_gpus == 1)
 
 
 def measure(

@@ -32,6 +32,15 @@ from gmijax.partition.templates import DESCRIPTIONS, TRAINER, Group, group_of, r
 _CLIENTS_OF_OLD_DRIVERS, _CLIENTS_OF_NEW_DRIVERS, _NEW_DRIVER = 48, 60, 590
 _SLICES_OF_A_GPU = 7
 
+_NO_RINGS = {
+    "cpu": (
+        "between virtual GPUs host memory is faster than any ring, ask for it with "
+        "reduce.strategy={}"
+    ),
+    "mig": "rings between MIG instances are not supported",
+}
+"""Backends that take host memory where Algorithm 1 says rings, and why."""
+
 
 def make_plan(
     plan: PlanConfig,
@@ -192,41 +201,23 @@ def _template(plan: PlanConfig, default: TemplateName, reasons: list[str]) -> Te
     return default
 
 
-def _without_rings(reduce: ReduceConfig, layout: Layout, backend: BackendName) -> ReduceConfig:
-    """What is left of the choice where a GPU shows itself in instances: NCCL takes one of each."""
-    if backend != "mig":
-        return reduce
-    if reduce.strategy != "auto":
-        if needs_ring(reduce.strategy, layout):
-            raise ConfigError(
-                f"reduce.strategy={reduce.strategy}: rings between MIG instances are not "
-                "supported; with plan.backend=mig allowed are auto, mpr"
-            )
-        return reduce
-    if not needs_ring(select_strategy(layout).strategy, layout):
-        return reduce
-    return dataclasses.replace(reduce, strategy="mpr")
-
-
 def _strategy(
     reduce: ReduceConfig, training: Group, backend: BackendName, reasons: list[str]
 ) -> str:
     """How those that train average gradients; `none` if there is only one."""
     layout = training.layout
-    reduce = _without_rings(reduce, layout, backend)
     if reduce.strategy != "auto":
-        require_strategy(reduce.strategy, layout)
+        require_strategy(reduce.strategy, layout, backend)
     if layout.num_gmis == 1:
         reasons.append("strategy none: one GMI has nobody to average gradients with")
         return "none"
     if reduce.strategy != "auto":
         return reduce.strategy
     choice = select_strategy(layout)
-    if backend == "cpu" and needs_ring(choice.strategy, layout):
+    if backend in _NO_RINGS and needs_ring(choice.strategy, layout):
         reasons.append(
-            f"strategy mpr: Algorithm 1 says {choice.strategy} ({choice.why}); between virtual "
-            "GPUs host memory is faster than any ring, ask for it with "
-            f"reduce.strategy={choice.strategy}"
+            f"strategy mpr: Algorithm 1 says {choice.strategy} ({choice.why}); "
+            f"{_NO_RINGS[backend].format(choice.strategy)}"
         )
         return "mpr"
     reasons.append(f"strategy {choice.strategy}: {choice.why} (Algorithm 1)")

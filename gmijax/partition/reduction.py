@@ -67,12 +67,33 @@ def why_not_intra(intra: str, backend: str) -> str | None:
     return None
 
 
-def require_strategy(strategy: str, layout: Layout) -> None:
-    """Raises ConfigError with strategy, layout and reason if they do not go together."""
+def require_strategy(strategy: str, layout: Layout, backend: str | None = None) -> None:
+    """Raises ConfigError with strategy, layout and reason if they do not go together.
+
+    Args:
+      strategy: a reduction strategy.
+      layout: where the GMIs live.
+      backend: how they share a GPU, None where that has been looked at already.
+    """
     if strategy not in _RULES:
         raise ConfigError(f"reduce.strategy={strategy}: expected one of {', '.join(_RULES)}")
-    if reason := why_not_strategy(strategy, layout):
+    reason = why_not_strategy(strategy, layout)
+    if reason is None and backend is not None:
+        reason = why_not_under(strategy, layout, backend)
+    if reason is not None:
         raise ConfigError(f"reduce.strategy={strategy}: cannot run on layout {layout}: {reason}")
+
+
+def why_not_under(strategy: str, layout: Layout, backend: str) -> str | None:
+    """None if `backend` gives `strategy` what it needs on `layout`, else the reason in words."""
+    if strategy == "one_shot":
+        return why_not_intra("ipc", backend)
+    if backend == "mig" and needs_ring(strategy, layout):
+        return (
+            "rings between MIG instances are not supported, because NCCL takes one of each GPU; "
+            "with plan.backend=mig allowed are auto, mpr"
+        )
+    return None
 
 
 def needs_ring(strategy: str, layout: Layout) -> bool:
@@ -114,7 +135,7 @@ def _none(layout: Layout) -> str | None:
 
 
 def _anywhere(layout: Layout) -> str | None:
-    del layout  # Host memory is there whatever the GPUs are.
+    del layout  # Memory is there whatever the GPUs are.
     return None
 
 
@@ -150,4 +171,5 @@ _RULES: Mapping[str, Callable[[Layout], str | None]] = {
     "mrr": _mrr,
     "har": _anywhere,
     "flat": _flat,
+    "one_shot": _anywhere,
 }

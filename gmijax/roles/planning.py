@@ -23,7 +23,7 @@ def plan(
     backend: BackendChoice = "auto",
     sm_percent: float | Sequence[float] | None = None,
     memory_fraction: float | Sequence[float] | None = None,
-    strategy: Literal["auto", "mpr", "mrr", "har", "flat"] = "mpr",
+    strategy: Literal["auto", "mpr", "mrr", "har", "flat", "one_shot"] = "mpr",
 ) -> Plan:
     """A plan for roles of one's own on this machine; see `gmijax.launch`.
 

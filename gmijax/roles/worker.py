@@ -89,10 +89,10 @@ def _device_post(plan: Plan, gmi: int) -> DevicePost | None:
     neighbours = [peer for peer in plan.layout.neighbours_of(gmi) if peer != gmi]
     if not neighbours or why_not_intra("ipc", plan.backend):
         return None
-    from gmijax.collectives.cuda_memory import CudaMemory
+    from gmijax.collectives.device_memory import cuda_memory
     from gmijax.collectives.device_post import DevicePost
 
-    return DevicePost(neighbours, CudaMemory)
+    return DevicePost(neighbours, cuda_memory)
 
 
 def _attach(plan: Plan, link: ChildLink, capacity_bytes: int) -> PipeBlock:

@@ -22,7 +22,7 @@ from tests.reducer_contract import PAIRS, Case, check_contract
 
 pytestmark = [pytest.mark.gpu, pytest.mark.timeout(200)]
 
-STRATEGIES = ("mrr", "har", "flat")
+STRATEGIES = ("mrr", "har", "flat", "one_shot")
 FOUR = Case(Layout.even(4, 1), 100_003, signal.SIGKILL, 2)
 FOUR_BY_FOUR = Case(Layout.even(4, 4), 290_000, signal.SIGSTOP, 5)
 ALL = [
@@ -30,13 +30,14 @@ ALL = [
     *((strategy, intra, case) for strategy, intra, case in PAIRS if strategy in STRATEGIES),
     *((strategy, "host", FOUR) for strategy in ("mrr", "flat")),
     *(("mrr", "host", FOUR_BY_FOUR), ("har", "ipc", FOUR_BY_FOUR)),
+    ("one_shot", "ipc", FOUR_BY_FOUR),
 ]
 ITERATIONS = 13
 """Of four updates each: 52 updates."""
 
 WAYS = {
-    1: ("mrr", "flat", "har reduce.intra=ipc"),
-    2: ("mrr", "har reduce.intra=host", "har reduce.intra=ipc"),
+    1: ("mrr", "flat", "har reduce.intra=ipc", "one_shot"),
+    2: ("mrr", "har reduce.intra=host", "har reduce.intra=ipc", "one_shot"),
 }
 """What is compared with mpr, by GMIs on each of two GPUs."""
 

@@ -32,12 +32,12 @@ def membership(num_gmis: int, num_floats: int = 4) -> Membership:
 @pytest.mark.parametrize(
     ("layout", "usable"),
     [
-        (Layout.even(1, 1), {"none", "mpr", "har"}),
-        (Layout.even(1, 2), {"mpr", "har"}),
-        (Layout.even(2, 1), {"mpr", "mrr", "har", "flat"}),
-        (Layout.even(2, 2), {"mpr", "mrr", "har"}),
-        (Layout.even(2, 3), {"mpr", "har"}),
-        (Layout(((0, 1), (2,))), {"mpr", "har"}),
+        (Layout.even(1, 1), {"none", "mpr", "har", "one_shot"}),
+        (Layout.even(1, 2), {"mpr", "har", "one_shot"}),
+        (Layout.even(2, 1), {"mpr", "mrr", "har", "flat", "one_shot"}),
+        (Layout.even(2, 2), {"mpr", "mrr", "har", "one_shot"}),
+        (Layout.even(2, 3), {"mpr", "har", "one_shot"}),
+        (Layout(((0, 1), (2,))), {"mpr", "har", "one_shot"}),
     ],
 )
 def test_which_strategies_a_layout_allows(layout: Layout, usable: set[str]) -> None:

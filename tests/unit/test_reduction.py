@@ -6,7 +6,15 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gmijax.collectives.cost_model import COSTS, flat_s, har_s, mpr_s, mrr_s, predicted_s
+from gmijax.collectives.cost_model import (
+    COSTS,
+    flat_s,
+    har_s,
+    mpr_s,
+    mrr_s,
+    one_shot_s,
+    predicted_s,
+)
 from gmijax.errors import ConfigError
 from gmijax.partition import reduction
 from gmijax.partition.layout import Layout
@@ -90,6 +98,24 @@ def test_what_cannot_run_names_strategy_layout_and_reason(
 
 
 @pytest.mark.parametrize(
+    ("strategy", "backend", "reason"),
+    [
+        ("one_shot", "cpu", "CUDA IPC needs an NVIDIA GPU"),
+        ("one_shot", "mig", "there is no CUDA IPC between the instances"),
+        ("mrr", "mig", "rings between MIG instances are not supported"),
+    ],
+)
+def test_what_a_backend_lacks_names_strategy_layout_and_reason(
+    strategy: str, backend: str, reason: str
+) -> None:
+    layout = Layout.even(2, 2)
+    require_strategy(strategy, layout)
+    expected = rf"{strategy}: cannot run on layout \[\[0,1\],\[2,3\]\]: {reason}"
+    with pytest.raises(ConfigError, match=expected):
+        require_strategy(strategy, layout, backend)
+
+
+@pytest.mark.parametrize(
     ("backend", "reason"),
     [("cpu", "NVIDIA GPU"), ("mig", "MIG"), ("mps", "cuda-bindings"), ("share", "cuda-bindings")],
 )
@@ -127,8 +153,8 @@ def test_leaders_live_on_their_gpus(layout: Layout) -> None:
 
 def test_only_what_leaves_the_host_needs_a_ring() -> None:
     one, two = Layout.even(1, 2), Layout.even(2, 2)
-    assert [needs_ring(name, two) for name in ("mpr", "mrr", "har", "flat")] == [
-        *(False, True, True, True)
+    assert [needs_ring(name, two) for name in ("mpr", "mrr", "har", "flat", "one_shot")] == [
+        *(False, True, True, True, False)
     ]
     assert not needs_ring("har", one)
 
@@ -140,6 +166,7 @@ def test_costs_are_those_of_table_2() -> None:
     assert mrr_s(*numbers) == pytest.approx(2 * 3 * 4 * 12 / (4 * 9))
     assert har_s(*numbers) == pytest.approx(2 * 3 * 12 / (4 * 9) + 2 * 2 * 12 / (3 * 2))
     assert flat_s(*numbers) == pytest.approx(2 * 11 * 12 / (12 * 9))
+    assert one_shot_s(*numbers) == pytest.approx(3 * 3 * 12 / 9)
 
 
 @given(st.integers(2, 8), st.floats(1e3, 1e9), st.floats(1e6, 1e12))

@@ -48,7 +48,11 @@ def measured(monkeypatch: pytest.MonkeyPatch) -> list[Sequence[Probe]]:
         ({"gmis_per_gpu": 2}, "auto", ["mpr", "har+host", "har+ipc"]),
         ({"gmis_per_gpu": 2}, "ipc", ["mpr", "har+ipc"]),
         ({"gmis_per_gpu": 2, "backend": "cpu"}, "auto", ["mpr", "har+host"]),
-        ({"gpus": 2, "gmis_per_gpu": 2}, "auto", ["mpr", "mrr", "har+host", "har+ipc"]),
+        (
+            {"gpus": 2, "gmis_per_gpu": 2},
+            "auto",
+            ["mpr", "mrr", "har+host", "har+ipc", "one_shot"],
+        ),
         ({"gpus": 2, "gmis_per_gpu": 3}, "host", ["mpr", "har+host"]),
     ],
 )

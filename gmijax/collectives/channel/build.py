@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 from gmijax.collectives.channel.backlog import Block, DropOldest
 from gmijax.collectives.channel.compressor import Compressor
@@ -16,6 +15,7 @@ from gmijax.collectives.channel.memory import MemoryInlet, MemoryOutlet
 from gmijax.collectives.channel.migrator import Migrator
 from gmijax.collectives.channel.transfer_size import TransferSize
 from gmijax.collectives.channel.unichannel import UniSender, UniSource
+from gmijax.collectives.device_memory import NewMemory, cuda_memory
 from gmijax.collectives.pipe_block import PipeBlock, create_pipes
 from gmijax.config.channel import ChannelConfig
 from gmijax.errors import ConfigError
@@ -221,13 +221,7 @@ def _pipe_bytes(config: ChannelConfig) -> int:
     return NOTES_BYTES if config.transport == "device" else config.capacity_bytes
 
 
-def _cuda_memory() -> Any:
-    from gmijax.collectives.cuda_memory import CudaMemory
-
-    return CudaMemory()
-
-
-DEVICE_MEMORY: Callable[[], Any] = _cuda_memory
+DEVICE_MEMORY: NewMemory = cuda_memory
 """Makes the `DeviceMemory` by which agents and trainers of `transport=device` share their GPU."""
 
 

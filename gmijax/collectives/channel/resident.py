@@ -22,7 +22,7 @@ from gmijax.collectives.channel.interface import SenderStats
 from gmijax.collectives.channel.memory import MemoryOutlet
 from gmijax.collectives.channel.migrator import Migrator
 from gmijax.collectives.channel.spec import Spec, spec_of
-from gmijax.collectives.ipc import TICKET_BYTES, DeviceMemory, NewMemory
+from gmijax.collectives.device_memory import TICKET_BYTES, DeviceMemory, NewMemory
 from gmijax.collectives.pipe import Bytes
 from gmijax.collectives.waits import wait_until
 from gmijax.errors import ConfigError, GmijaxError

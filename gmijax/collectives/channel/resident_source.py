@@ -13,7 +13,7 @@ from gmijax.collectives.channel.compressor import Transfer
 from gmijax.collectives.channel.device_slots import NOTE, slot_of
 from gmijax.collectives.channel.interface import Inlet
 from gmijax.collectives.channel.spec import Spec
-from gmijax.collectives.ipc import DeviceMemory, NewMemory
+from gmijax.collectives.device_memory import DeviceMemory, NewMemory
 from gmijax.errors import GmijaxError
 
 

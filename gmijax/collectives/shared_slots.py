@@ -1,0 +1,209 @@
+"""Slots in device memory that several ranks map: all write theirs, meet, and sum what is there."""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable, Sequence
+from contextlib import suppress
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import numpy.typing as npt
+
+from gmijax.collectives.device_memory import TICKET_BYTES, DeviceMemory, NewMemory
+from gmijax.collectives.host import HostExchange
+from gmijax.collectives.interface import FloatBuffer
+from gmijax.collectives.intra import IntraUnavailable
+from gmijax.collectives.mrr import explained
+from gmijax.collectives.turns import Turns
+
+NOTE_BYTES = 240
+"""What a rank tells the others at each step of the start: a ticket, or why it failed."""
+
+FLOATS_PER_ROW_UNIT = 64
+"""Slots begin at multiples of 256 bytes, as allocations of jax do."""
+
+_TRIAL_RESULT = 7.0
+
+
+class SharedSlots:
+    """One rank's use of blocks of device memory: two slots for each member, and one result.
+
+    The two slots are used in turn, so that one meeting of all ranks suffices for a sum: a rank
+    that writes a slot again has passed the meeting in between, before which all had finished
+    reading. The result is written after the meeting of a sum, and read after one more.
+
+    All ranks of the job make theirs together. In three steps blocks are made, mapped and filled
+    with known numbers, and read back through the programs that training will use.
+
+    Args:
+      host: this rank's use of the shared block, to hand the blocks around.
+      num_floats: P, length of a slot.
+      members: ranks that have slots in each block, in the order of sums; this one among them.
+      owners: ranks that make the blocks which this one writes; the first one's is on its own GPU.
+      scale: what sums will be multiplied with.
+      new_memory: how the processes share a block.
+      wish: what cannot be had if this fails, for the message.
+
+    Raises:
+      IntraUnavailable: there is no such memory here, or it does not hold what was written; on
+        all ranks alike.
+      PeerLost, CollectiveTimeout: as in the first call of a reducer.
+    """
+
+    def __init__(
+        self,
+        host: HostExchange,
+        num_floats: int,
+        members: Sequence[int],
+        owners: Sequence[int],
+        scale: float,
+        new_memory: NewMemory,
+        wish: str,
+    ) -> None:
+        self._num_floats = num_floats
+        self._row_floats = -(-num_floats // FLOATS_PER_ROW_UNIT) * FLOATS_PER_ROW_UNIT
+        self._count, self._place = len(members), members.index(host.rank)
+        row_bytes = self._row_floats * 4
+        self._half_bytes = self._count * row_bytes
+        self._own = [half * self._half_bytes + self._place * row_bytes for half in (0, 1)]
+        self._result_offset = 2 * self._half_bytes
+        self._owners, self._is_owner = tuple(owners), host.rank == owners[0]
+        self._memories: list[DeviceMemory] = []
+        self._slots: list[jax.Array] = []
+        self._result: jax.Array | None = None
+        self._num_writes = 0
+        # An output of the program that read the block last; the caller owns the others.
+        self._read: jax.Array | None = None
+        self._sum = jax.jit(functools.partial(_sum, num_floats), static_argnums=1)
+        self._copy = jax.jit(_copy)
+        size = self._result_offset + row_bytes
+        try:
+            tickets = _agreed(host, wish, lambda: self._make(new_memory, size))
+            _agreed(host, wish, lambda: self._map(tickets))
+            _agreed(host, wish, lambda: self._try(scale))
+        except IntraUnavailable:
+            self.close()
+            raise
+
+    def write(self, buffer: jax.Array, turns: Turns) -> None:
+        """Puts `buffer` [P] into this rank's slots, and meets all ranks.
+
+        Raises:
+          CollectiveError: other ranks make another call, or the copy failed.
+          PeerLost, CollectiveTimeout: as `Turns.meet`.
+        """
+        self._num_writes += 1
+        offset = self._own[self._num_writes % 2]
+        with explained(turns):
+            self._finish_reading()
+            for memory in self._memories:
+                memory.start_write(offset, buffer)
+            for memory in self._memories:
+                memory.finish_writes()
+        turns.meet()
+        turns.check_same_call()
+
+    def sum(self, turns: Turns, scale: float) -> jax.Array:
+        """The sum [P] of what all members wrote, times `scale`; it may still be computed."""
+        with explained(turns):
+            total, self._read = self._sum(self._slots[self._num_writes % 2], scale)
+        return total
+
+    def write_result(self, result: jax.Array, turns: Turns) -> None:
+        """Puts `result` [P] into the block of this GPU; only its owner may."""
+        with explained(turns):
+            self._memories[0].write(self._result_offset, result)
+
+    def read_result(self, turns: Turns) -> jax.Array:
+        """A copy of the result of this GPU's block; it may still be computed."""
+        with explained(turns):
+            copied, self._read = self._copy(self._result)
+        return copied
+
+    def close(self) -> None:
+        """Gives the mappings back; calling it twice is fine."""
+        with suppress(jax.errors.JaxRuntimeError):  # Why the job fails is known already.
+            self._finish_reading()
+        self._slots, self._result = [], None
+        for memory in self._memories:
+            memory.close()
+        self._memories = []
+
+    def _make(self, new_memory: NewMemory, num_bytes: int) -> bytes:
+        self._memories = [new_memory() for _ in self._owners]
+        return self._memories[0].create(num_bytes) if self._is_owner else b""
+
+    def _map(self, tickets: npt.NDArray[np.uint8]) -> bytes:
+        """Opens the blocks, and writes what `_try` expects in them."""
+        for owner, memory in zip(self._owners, self._memories, strict=True):
+            if not (self._is_owner and owner == self._owners[0]):
+                memory.open(tickets[owner][:TICKET_BYTES].tobytes())
+            for half in (0, 1):
+                memory.write(self._own[half], self._filled((half + 1) * (self._place + 1)))
+        near, shape = self._memories[0], (self._count, self._row_floats)
+        self._slots = [near.view(half * self._half_bytes, shape) for half in (0, 1)]
+        self._result = near.view(self._result_offset, (self._num_floats,))
+        if self._is_owner:
+            near.write(self._result_offset, self._filled(_TRIAL_RESULT))
+        return b""
+
+    def _try(self, scale: float) -> bytes:
+        """Reads what all have written, and compiles."""
+        whole = scale * self._count * (self._count + 1) / 2
+        for half in (0, 1):
+            total, _ = self._sum(self._slots[half], scale)
+            _require_equal(total, (half + 1) * whole)
+        _require_equal(self._copy(self._result)[0], _TRIAL_RESULT)
+        return b""
+
+    def _filled(self, value: float) -> jax.Array:
+        return jax.device_put(np.full(self._num_floats, value, np.float32))
+
+    def _finish_reading(self) -> None:
+        if self._read is not None:
+            self._read.block_until_ready()
+            self._read = None
+
+
+def _agreed(host: HostExchange, wish: str, step: Callable[[], bytes]) -> npt.NDArray[np.uint8]:
+    """Does a step of the start; returns what it returned on every rank [K, NOTE_BYTES].
+
+    All ranks of the job call this, and they go on together or not at all.
+
+    Raises:
+      IntraUnavailable: it failed on one of them, and why it did there.
+    """
+    try:
+        note, has_failed = step(), False
+    # Whatever it is, of CUDA, of jax or of an import: there is another way, through the host.
+    except Exception as error:
+        said = " ".join(str(error).split())
+        note, has_failed = f"{said or type(error).__name__}".encode()[:NOTE_BYTES], True
+    sent = np.zeros(1 + NOTE_BYTES, np.float32)  # One number a byte: no float has odd bits.
+    sent[0] = has_failed
+    sent[1 : 1 + len(note)] = np.frombuffer(note, np.uint8)
+    everyone: FloatBuffer = host.introduce(sent)
+    notes = everyone[:, 1:].astype(np.uint8)
+    if failed := np.flatnonzero(everyone[:, 0]).tolist():
+        why = notes[failed[0]].tobytes().rstrip(b"\0").decode(errors="replace")
+        raise IntraUnavailable(f"{wish}: rank {failed[0]}: {why}")
+    return notes
+
+
+def _require_equal(found: jax.Array, expected: float) -> None:
+    if not np.allclose(np.asarray(found), expected, rtol=1e-5, atol=0.0):
+        raise RuntimeError("shared GPU memory does not hold what was written into it")
+
+
+def _sum(num_floats: int, slots: jax.Array, scale: float) -> tuple[jax.Array, jax.Array]:
+    # Written out, so that it is one pass in a fixed order, not a reduction in some order.
+    total = functools.reduce(jnp.add, list(slots[:, :num_floats]))
+    total = total * np.float32(scale)
+    return total, total[:1]
+
+
+def _copy(result: jax.Array) -> tuple[jax.Array, jax.Array]:
+    copied = jnp.copy(result)
+    return copied, copied[:1]
