@@ -279,6 +279,15 @@ SUITES = MappingProxyType(
             f"lgr-{task}-mrr": (_lgr(task, 2, 2, "mrr"), _lgr(task, 4, 4, "mrr"))
             for task in ("ant", "humanoid", "shadow_hand")
         },
+        # The same without rings, beside mpr in one run.
+        **{
+            f"lgr-{task}-one_shot": tuple(
+                _lgr(task, gpus, gmis, strategy)
+                for gpus, gmis in _TRAINERS
+                for strategy in ("mpr", "one_shot")
+            )
+            for task in ("ant", "humanoid", "shadow_hand")
+        },
         "scaling": tuple(_scaling(gpus, gmis) for gmis in (1, 2) for gpus in (1, 2, 4, 8)),
         "ball-cpu": (Case("2 GMIs x 512", ("env=ball_balance", "plan.gpus=2")),),
     }

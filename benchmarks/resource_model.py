@@ -34,7 +34,14 @@ def main() -> int:
     """Prints the table of all cases of all files; returns the exit code."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("files", nargs="+", type=Path, metavar="MEASURED.json")
-    cases = [case for file in parser.parse_args().files for case in cases_of(file)]
+    parser.add_argument(
+        "--resources", type=Path, help="R_s, R_a and R_t, from python -m benchmarks.resource_use"
+    )
+    arguments = parser.parse_args()
+    cases = [case for file in arguments.files for case in cases_of(file)]
+    if arguments.resources is not None:
+        uses = json.loads(arguments.resources.read_text())["tasks"]
+        cases = [{**resources_of(case["name"], uses), **case} for case in cases]
     sys.stdout.write("\n".join(table(cases)) + "\n")
     return 0
 
@@ -48,6 +55,15 @@ def cases_of(file: Path) -> list[dict[str, Any]]:
     if missing := [case["name"] for case in cases if "simulator_s" not in case]:
         sys.stderr.write(f"{file}: left out, no times of its stages: {'; '.join(missing)}\n")
     return [case for case in cases if "simulator_s" in case]
+
+
+def resources_of(name: str, uses: Mapping[str, Any]) -> dict[str, float]:
+    """R of the tasks of a case, by the environment that its name has; none if there is no such.
+
+    Parts of a GPU: of SMs, or of memory where that is more (equation 1).
+    """
+    parts = next((use for env, use in uses.items() if env in name), {})
+    return {f"{task}_r": max(part["sm"], part["memory"]) for task, part in parts.items()}
 
 
 def training_case(name: str, cases: Mapping[str, Any]) -> dict[str, Any]:

@@ -144,7 +144,7 @@ def test_rings_between_instances_are_refused_and_not_chosen(monkeypatch: pytest.
     here = machine_of(monkeypatch, fake_nvml.A100_SEVEN, fake_nvml.H200_MIXED)
     config = plan_config(gpus=2, gmis_per_gpu=2, backend="mig")
     assert make_plan(config, reduce_config(), 64, here).strategy == "mpr"
-    with pytest.raises(ConfigError, match="mrr: .*: rings between MIG instances"):
+    with pytest.raises(ConfigError, match=r"mrr: .*: rings between MIG instances"):
         make_plan(config, reduce_config(strategy="mrr"), 64, here)
 
 

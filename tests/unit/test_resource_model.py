@@ -4,7 +4,12 @@ from __future__ import annotations
 
 import pytest
 
-from benchmarks.resource_model import measured_gain, predicted_gain, training_case
+from benchmarks.resource_model import (
+    measured_gain,
+    predicted_gain,
+    resources_of,
+    training_case,
+)
 from gmijax.errors import ConfigError
 from gmijax.partition.resource_model import (
     Sizes,
@@ -108,3 +113,14 @@ def test_a_suite_of_templates_is_a_case_of_training():
     assert measured_gain(case) == 1.5
     # (6 * 10 + 2 * 0.3 * 2) / 8 = 7.65 of 10, and 8 + 3 over 8 + 1.
     assert predicted_gain(case) == pytest.approx(0.765 * 11 / 9)
+
+
+def test_resources_are_the_larger_part_and_go_by_the_environment() -> None:
+    uses = {
+        "ant": {
+            "simulator": {"seconds": 1.0, "sm": 0.4, "memory": 0.1},
+            "agent": {"seconds": 1.0, "sm": 0.02, "memory": 0.05},
+        }
+    }
+    assert resources_of("ant 1 x 8192, mps", uses) == {"simulator_r": 0.4, "agent_r": 0.05}
+    assert resources_of("templates-humanoid", uses) == {}

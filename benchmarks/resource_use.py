@@ -1,0 +1,213 @@
+"""Measures T and R of the paper's resource model (section 5.1): what each task takes of a GPU.
+
+`python -m benchmarks.resource_use --tasks ant humanoid` runs simulator, agent and trainer of an
+iteration one after the other in one process, each alone on the GPU and over and over. While it
+does, NVML's performance monitor (GPM, from Hopper on) reads which part of the SMs is busy, and
+the compiler has said what memory its program takes. R is the larger part of the two (equation 1).
+Writes `benchmarks/results/resource-use-<device>.json`, which `python -m benchmarks.resource_model
+--resources` reads.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from functools import partial
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import pynvml
+
+from benchmarks.run import RESULTS
+from gmijax import compose
+from gmijax.acting import act
+from gmijax.config import PpoConfig
+from gmijax.learner import acting_moments, apply_gradients, init_learner, make_learner
+from gmijax.partition.resource_model import dominant_resource
+from gmijax.ppo.learner import (
+    finish_iteration,
+    gradients,
+    minibatch_order,
+    update_context,
+)
+from gmijax.ppo.programs import flatten
+from gmijax.ppo.rollout import collect
+from gmijax.sim.build import make_training_env
+from gmijax.sim.wrappers import env_keys
+
+SECONDS = 2.0
+"""How long each task runs: the monitor wants a tenth of a second at least."""
+
+
+class Use(NamedTuple):
+    """What one task takes of a GPU.
+
+    Attributes:
+      seconds: T, of one iteration.
+      sm: mean part of the SMs that were busy, 0 to 1.
+      memory: part of the GPU's memory that its program needs, 0 to 1.
+    """
+
+    seconds: float
+    sm: float
+    memory: float
+
+    @property
+    def dominant(self) -> str:
+        """`sm` or `memory`, equation 1."""
+        return dominant_resource(self.sm, 1.0, self.memory, 1.0)
+
+
+class Monitor:
+    """NVML's performance monitor of the GPU that jax uses; raises NVMLError where there is none.
+
+    Args:
+      index: of the GPU, as NVML counts.
+    """
+
+    def __init__(self, index: int) -> None:
+        self._device = pynvml.nvmlDeviceGetHandleByIndex(index)
+        self._samples = [pynvml.nvmlGpmSampleAlloc() for _ in range(2)]
+        self.memory_bytes = int(pynvml.nvmlDeviceGetMemoryInfo(self._device).total)
+
+    def start(self) -> None:
+        """Begins an interval."""
+        pynvml.nvmlGpmSampleGet(self._device, self._samples[0])
+
+    def busy_sms(self) -> float:
+        """Mean part of the SMs that were busy since `start`, 0 to 1."""
+        pynvml.nvmlGpmSampleGet(self._device, self._samples[1])
+        wanted: Any = pynvml.c_nvmlGpmMetricsGet_t()
+        wanted.version = pynvml.NVML_GPM_METRICS_GET_VERSION
+        wanted.numMetrics = 1
+        wanted.sample1, wanted.sample2 = self._samples
+        wanted.metrics[0].metricId = pynvml.NVML_GPM_METRIC_SM_UTIL
+        pynvml.nvmlGpmMetricsGet(wanted)
+        return wanted.metrics[0].value / 100.0
+
+
+def main() -> int:
+    """Measures and prints; returns the exit code."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--tasks", nargs="+", default=["ant", "humanoid"])
+    parser.add_argument("--num-envs", type=int, default=2048)
+    parser.add_argument("--impl", choices=("jax", "warp"), default="jax")
+    parser.add_argument("--gpu", type=int, default=0, help="index; make it the only visible one")
+    parser.add_argument("--out", type=Path, default=RESULTS)
+    arguments = parser.parse_args()
+    try:
+        with _nvml():
+            rows = {task: _task(task, arguments) for task in arguments.tasks}
+    except pynvml.NVMLError as error:
+        sys.stderr.write(f"--gpu {arguments.gpu}: NVML cannot watch it: {error}\n")
+        return 2
+    device = jax.local_devices()[0].device_kind
+    path = arguments.out / f"resource-use-{device.replace(' ', '-').lower()}.json"
+    found = {"device": device, "num_envs": arguments.num_envs, "impl": arguments.impl}
+    path.write_text(json.dumps({**found, "tasks": rows}, indent=1) + "\n")
+    for task, uses in rows.items():
+        for name, use in uses.items():
+            sys.stdout.write(
+                f"{task:16}{name:10} {use['seconds'] * 1e3:9.3f} ms, SMs {use['sm']:.1%}, memory "
+                f"{use['memory']:.2%}\n"
+            )
+    sys.stdout.write(f"written: {path}\n")
+    return 0
+
+
+def _task(name: str, arguments: argparse.Namespace) -> dict[str, Any]:
+    """What simulator, agent and trainer of a task take."""
+    monitor, found = Monitor(arguments.gpu), {}
+    for stage, program, state in _stages(name, arguments.impl, arguments.num_envs):
+        use = _measured(program, state, monitor)
+        found[stage] = {**use._asdict(), "dominant": use.dominant}
+    return found
+
+
+def _measured(program: Callable[[Any], Any], state: Any, monitor: Monitor) -> Use:
+    compiled = jax.jit(program, donate_argnums=0).lower(state).compile()
+    needs: Any = compiled.memory_analysis()
+    memory = needs.argument_size_in_bytes + needs.temp_size_in_bytes
+    state = jax.block_until_ready(compiled(compiled(state)))
+    count, started = 0, time.monotonic()
+    monitor.start()
+    while time.monotonic() - started < SECONDS:
+        for _ in range(4):
+            state = compiled(state)
+        jax.block_until_ready(state)
+        count += 4
+    busy, seconds = monitor.busy_sms(), time.monotonic() - started
+    return Use(seconds / count, busy, memory / monitor.memory_bytes)
+
+
+def _stages(
+    name: str, impl: str, num_envs: int
+) -> Iterator[tuple[str, Callable[[Any], Any], Any]]:
+    """Simulator, agent, trainer: a program from its state to the next, and the first state.
+
+    One run of a program is what a GMI does in an iteration: T steps of all environments, T
+    actions, all updates.
+    """
+    config = compose(f"env={name}", f"physics.impl={impl}", f"num_envs={num_envs}")
+    env = make_training_env(config.env, impl, seed=0, first_env=0, num_envs=num_envs)
+    assert isinstance(config.algo, PpoConfig)
+    learner = make_learner(env.spec, config.algo)
+    key = jax.random.key(0)
+    state = init_learner(learner, env.spec.obs_size, key)
+    envs = jax.jit(env.init)(env.model, env_keys(key, 0, num_envs))
+    steps, size = config.algo.unroll_length, env.spec.action_size
+    moments = acting_moments(learner, state)
+    actions = jax.random.uniform(key, (num_envs, size), minval=-1.0)
+
+    def simulate(envs: Any) -> Any:
+        def step(_: Any, envs: Any) -> Any:
+            return env.step(env.model, envs, actions)[0]
+
+        return jax.lax.fori_loop(0, steps, step, envs)
+
+    def infer(carry: Any) -> Any:
+        def step(_: Any, carry: Any) -> Any:
+            envs, total = carry
+            # Other observations in every step, or the network would be evaluated only once.
+            obs = envs.env.obs + 1e-9 * total[:, :1]
+            envs = envs._replace(env=envs.env._replace(obs=obs))
+            envs, _, action = act(learner.networks, state.params, moments, envs, size)
+            return envs, total + action
+
+        return jax.lax.fori_loop(0, steps, step, carry)
+
+    rollout = partial(collect, env, learner.networks, learner.config, env.model)
+    _, samples, stats = jax.jit(rollout)(state.params, moments, envs)
+    flat, context = flatten(samples), update_context(learner, state, stats)
+
+    def train(state: Any) -> Any:
+        order = minibatch_order(learner, state, jnp.zeros((), jnp.int32), num_envs * steps)
+
+        def update(state: Any, indices: Any) -> Any:
+            grads, losses = gradients(learner, state.params, flat, indices, context)
+            return apply_gradients(learner, state, grads, losses.kl), None
+
+        return finish_iteration(jax.lax.scan(update, state, order)[0], stats)
+
+    yield "agent", infer, jax.tree.map(jnp.copy, (envs, jnp.zeros((num_envs, size))))
+    yield "trainer", train, jax.tree.map(jnp.copy, state)
+    yield "simulator", simulate, envs
+
+
+@contextmanager
+def _nvml() -> Iterator[None]:
+    pynvml.nvmlInit()
+    try:
+        yield
+    finally:
+        pynvml.nvmlShutdown()
+
+
+if __name__ == "__main__":
+    sys.exit(main())
