@@ -60,7 +60,7 @@ def _throughput(task: str, impl: str, num_envs: int) -> Case:
     )
 
 
-def _lgr(task: str, gpus: int, gmis: int, strategy: str) -> Case:
+def _lgr(task: str, gpus: int, gmis: int, strategy: str, *more: str) -> Case:
     """A cell of the paper's table of LGR: so many GPUs with so many trainers each."""
     return Case(
         f"{gpus}G{gmis}T {strategy}",
@@ -75,6 +75,7 @@ def _lgr(task: str, gpus: int, gmis: int, strategy: str) -> Case:
             f"reduce.strategy={strategy}",
             "run.measure_throughput=false",
             "run.checkpoint_every=0",
+            *more,
         ),
         gpus,
     )
@@ -114,6 +115,8 @@ def _templates(task: str, num_envs: int) -> tuple[Case, ...]:
         ),
     )
 
+
+_WIDE = tuple(f"algo.{net}_hidden_layer_sizes=[512,512,512,256]" for net in ("policy", "value"))
 
 _TRAINERS = ((2, 2), (2, 3), (4, 4))
 
@@ -287,6 +290,15 @@ SUITES = MappingProxyType(
                 for strategy in ("mpr", "one_shot")
             )
             for task in ("ant", "humanoid", "shadow_hand")
+        },
+        # Both on MJX-JAX, which needs no kernels: ant, and ant with the networks of shadow_hand.
+        **{
+            f"lgr-{name}-jax": tuple(
+                _lgr("ant", gpus, gmis, strategy, "physics.impl=jax", *networks)
+                for gpus, gmis in _TRAINERS
+                for strategy in ("mpr", "one_shot")
+            )
+            for name, networks in (("ant", ()), ("ant-1.5M", _WIDE))
         },
         "scaling": tuple(_scaling(gpus, gmis) for gmis in (1, 2) for gpus in (1, 2, 4, 8)),
         "ball-cpu": (Case("2 GMIs x 512", ("env=ball_balance", "plan.gpus=2")),),

@@ -16,7 +16,6 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -36,8 +35,8 @@ from gmijax.ppo.learner import (
     minibatch_order,
     update_context,
 )
-from gmijax.ppo.programs import flatten
-from gmijax.ppo.rollout import collect
+from gmijax.ppo.losses import Samples
+from gmijax.ppo.rollout import stats_example
 from gmijax.sim.build import make_training_env
 from gmijax.sim.wrappers import env_keys
 
@@ -182,9 +181,9 @@ def _stages(
 
         return jax.lax.fori_loop(0, steps, step, carry)
 
-    rollout = partial(collect, env, learner.networks, learner.config, env.model)
-    _, samples, stats = jax.jit(rollout)(state.params, moments, envs)
-    flat, context = flatten(samples), update_context(learner, state, stats)
+    flat = _samples(num_envs * steps, env.spec.obs_size, size, key)
+    stats = stats_example(env.spec, env.overflows)
+    context = update_context(learner, state, stats)
 
     def train(state: Any) -> Any:
         order = minibatch_order(learner, state, jnp.zeros((), jnp.int32), num_envs * steps)
@@ -198,6 +197,15 @@ def _stages(
     yield "agent", infer, jax.tree.map(jnp.copy, (envs, jnp.zeros((num_envs, size))))
     yield "trainer", train, jax.tree.map(jnp.copy, state)
     yield "simulator", simulate, envs
+
+
+def _samples(count: int, obs_size: int, action_size: int, key: jax.Array) -> Samples:
+    """Random samples: how long an update takes does not depend on what is in them."""
+    obs, action, advantage = (
+        jax.random.normal(key, (count, *shape)) for shape in ((obs_size,), (action_size,), ())
+    )
+    zeros = jnp.zeros(count)
+    return Samples(obs, action, zeros, jnp.zeros_like(action), zeros, advantage)
 
 
 @contextmanager

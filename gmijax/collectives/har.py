@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable
 from typing import Generic, TypeVar
 
@@ -95,6 +96,7 @@ class DeviceHarReducer(_Hierarchy[jax.Array]):
     """
 
     is_device_resident = True
+    exchange_s = 0.0
 
     def mean_on_device(self, buffer: jax.Array) -> jax.Array:
         """Returns the mean over ranks of `buffer` [P] float32, see `DeviceReducer`.
@@ -105,6 +107,8 @@ class DeviceHarReducer(_Hierarchy[jax.Array]):
           CollectiveError: ranks make different calls, or this one is not allowed.
         """
         require_device_buffer(buffer, self._num_floats)
+        buffer.block_until_ready()
+        started_s = time.monotonic()
         block, turns = self._host.begin("mean", self._num_floats)
         scale = 1.0 if self._ring else 1.0 / self.world_size
         mean = self._intra.sum(buffer, block, turns, scale)
@@ -114,6 +118,7 @@ class DeviceHarReducer(_Hierarchy[jax.Array]):
         if self._ring is not None and self._ring.is_of_all:
             turns.arrive()  # Where others look for this rank while their rings run.
         turns.end()
+        self.exchange_s += time.monotonic() - started_s
         return result
 
     def run_on_device(self, program: Callable[[DeviceMean], T]) -> T:
@@ -122,6 +127,7 @@ class DeviceHarReducer(_Hierarchy[jax.Array]):
         The host takes part in every mean: the GMIs of a GPU know only from each other that a
         slot is written.
         """
+        self.exchange_s = 0.0
         return jax.block_until_ready(program(self.mean_on_device))
 
     def mean(self, buffer: FloatBuffer) -> FloatBuffer:

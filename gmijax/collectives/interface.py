@@ -60,7 +60,14 @@ class Reducer(Protocol):
 
 
 class DeviceReducer(Reducer, Protocol):
-    """A `Reducer` whose mean need not pass through host memory."""
+    """A `Reducer` whose mean need not pass through host memory.
+
+    Attributes:
+      exchange_s: seconds that the exchanges of the last `run_on_device` took, each from the time
+        its buffer was there; None where they are queued with all else and cannot be told apart.
+    """
+
+    exchange_s: float | None
 
     def run_on_device(self, program: Callable[[DeviceMean], T]) -> T:
         """Returns what `program(mean)` returns, when all its arrays are computed.

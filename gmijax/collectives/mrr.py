@@ -40,6 +40,7 @@ class RingReducer:
     """
 
     is_device_resident = True
+    exchange_s = None
 
     def __init__(self, host: HostExchange, world: World, num_floats: int) -> None:
         self.rank = host.rank

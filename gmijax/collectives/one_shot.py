@@ -9,6 +9,7 @@ their bytes. It is known as a one-shot all-reduce.
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable
 from typing import TypeVar
 
@@ -49,6 +50,7 @@ class OneShotReducer:
         self._host = host
         self._num_floats = num_floats
         self._scale = 1.0 / host.world_size
+        self.exchange_s = 0.0
         # The own GPU's first, then the following ones: not all write to the same GPU at once.
         owners, near = leaders(layout), layout.gpu_of(host.rank)
         self._slots = SharedSlots(
@@ -70,10 +72,13 @@ class OneShotReducer:
           CollectiveError: ranks make different calls, or this one is not allowed.
         """
         require_device_buffer(buffer, self._num_floats)
+        buffer.block_until_ready()
+        started_s = time.monotonic()
         _, turns = self._host.begin("mean", self._num_floats)
         self._slots.write(buffer, turns)
         mean = self._slots.sum(turns, self._scale)
         turns.end()
+        self.exchange_s += time.monotonic() - started_s
         return mean
 
     def run_on_device(self, program: Callable[[DeviceMean], T]) -> T:
@@ -81,6 +86,7 @@ class OneShotReducer:
 
         The host takes part in every mean: ranks know only from each other that a slot is written.
         """
+        self.exchange_s = 0.0
         return jax.block_until_ready(program(self.mean_on_device))
 
     def mean(self, buffer: FloatBuffer) -> FloatBuffer:

@@ -128,6 +128,8 @@ class SplitIteration:
 
         if stays_on_device(self._reducer):
             state, losses = self._reducer.run_on_device(updates)
+            if self._reducer.exchange_s is not None:
+                reduce_s.append(self._reducer.exchange_s)
         else:
             state, losses = updates(functools.partial(self._host_mean, reduce_s))
         state, metrics = self._finish(state, stats, losses)
