@@ -34,6 +34,9 @@ from gmijax.partition.points import Measured, NotRunnable, Point
 _STRIDE: Final = 3
 _COARSE_SIZES: Final = 2
 
+_CLEARLY_SLOWER: Final = 0.9
+"""An implementation that makes less than this of another with one GMI is not looked at further."""
+
 
 class OutOfBudget(Exception):
     """Raised by a profile function when there is no time left to measure a point."""
@@ -239,12 +242,30 @@ def _rows(book: _Book, grid: Grid) -> None:
 
 
 def _first_look(book: _Book, grid: Grid) -> None:
-    """The coarse rows; smaller sizes only as long as nothing runs."""
+    """The coarse rows; smaller sizes only as long as nothing runs.
+
+    The first row comes first with all implementations: one that is clearly slower in a single
+    GMI has never caught up in several, and a profile takes half a minute.
+    """
     sizes = grid.num_envs
     while sizes and book.best() is None:
         part = coarse(grid._replace(num_envs=sizes))
-        _rows(book, part)
+        _rows(book, _first_row(part))
+        _rows(book, part._replace(impls=_worth_more(book, grid.impls)))
         sizes = tuple(size for size in sizes if size < part.num_envs[0])
+
+
+def _first_row(grid: Grid) -> Grid:
+    return grid._replace(gmis_per_gpu=grid.gmis_per_gpu[:1], trainers=grid.trainers[:1])
+
+
+def _worth_more(book: _Book, impls: Sequence[str]) -> tuple[str, ...]:
+    """The implementations that are not clearly slower than another, as far as is known."""
+    highest = dict.fromkeys(impls, 0.0)
+    for point, one in book.visited.items():
+        highest[point.impl] = max(highest[point.impl], one.projected)
+    least = _CLEARLY_SLOWER * max(highest.values())
+    return tuple(impl for impl in impls if highest[impl] >= least)
 
 
 def _climb(book: _Book, grid: Grid) -> None:
