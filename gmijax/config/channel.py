@@ -49,14 +49,15 @@ class ChannelConfig:
                     f"channel.transfer_kib={self.transfer_kib}: must be at most a quarter of "
                     f"channel.capacity_mib={self.capacity_mib}"
                 )
-        if self.transport == "device" and (why := self._why_not_device()):
+        if self.transport == "device" and (why := self.why_not_device()):
             raise ConfigError(f"channel.transport=device: {why}")
         if self.design == "uni" and self.when_full != "block":
             raise ConfigError(
                 "channel.when_full=drop_oldest: channel.design=uni allows only block"
             )
 
-    def _why_not_device(self) -> str | None:
+    def why_not_device(self) -> str | None:
+        """None if these settings go with `transport=device`, else the reason."""
         if self.design != "multi":
             return f"not with channel.design={self.design}; allowed is multi"
         if self.when_full != "block":

@@ -28,6 +28,11 @@ MODULE: Final = "gmijax.workers.async_worker"
 FLOAT_CHANNELS: Final = ("state", "action", "reward", "log_prob", "cut_value", "bootstrap")
 """Channels of an unroll that could travel with half the bits; see `gmijax.a3c.losses.Unrolls`."""
 
+_ADVICE: Final = (
+    "channels through host memory; channel.transport=device keeps experience on its GPU, which "
+    "was faster on one H200 (docs/async.md)"
+)
+
 ENV_BOARD_FD: Final = "GMIJAX_BOARD_FD"
 ENV_CHANNELS_FD: Final = "GMIJAX_CHANNELS_FD"
 
@@ -69,8 +74,12 @@ def plan_decoupled(config: TrainConfig, num_envs: int, machine: Machine) -> Plan
     )
     plan = dataclasses.replace(plan, reasons=(placed.reason, *plan.reasons))
     _require_experience_for_all(places_of(plan))
-    if config.channel.transport == "device":
-        _require_device(plan)
+    reason = why_not_device(plan)
+    if config.channel.transport == "device" and reason is not None:
+        raise ConfigError(f"channel.transport=device: {reason}; use memory")
+    is_memory = config.channel.transport == "memory"
+    if is_memory and reason is None and config.channel.why_not_device() is None:
+        plan = dataclasses.replace(plan, reasons=(*plan.reasons, _ADVICE))
     # How large an unroll is shows only when the task is loaded: the GMIs check that.
     require_channels(config.channel, places_of(plan), unroll_bytes=0)
     return plan
@@ -91,23 +100,16 @@ def _require_experience_for_all(places: Places) -> None:
         )
 
 
-def _require_device(plan: Plan) -> None:
-    """Refuses experience that stays on the GPU where it cannot.
-
-    Raises:
-      ConfigError: says why.
-    """
-    what = "channel.transport=device"
+def why_not_device(plan: Plan) -> str | None:
+    """None if experience can stay in memory of the GPUs, else the reason."""
     if reason := why_not_intra("ipc", plan.backend):
-        raise ConfigError(f"{what}: {reason}; use memory")
+        return reason
     places = places_of(plan)
     training = {places.gpu_of[gmi] for gmi in places.trainers}
     far = [gmi for gmi in places.agents if places.gpu_of[gmi] not in training]
-    if far:
-        raise ConfigError(
-            f"{what}: agent {far[0]} is on GPU {places.gpu_of[far[0]]} of the job, where nobody "
-            "trains; use memory"
-        )
+    if not far:
+        return None
+    return f"agent {far[0]} is on GPU {places.gpu_of[far[0]]} of the job, where nobody trains"
 
 
 def groups_of(plan: Plan) -> tuple[Group, Group]:

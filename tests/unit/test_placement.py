@@ -5,7 +5,10 @@ from __future__ import annotations
 import pytest
 from supervision import machine, plan_config, reduce_config
 
+from gmijax import compose
+from gmijax.control.decoupled import plan_decoupled
 from gmijax.errors import ConfigError
+from gmijax.partition import reduction
 from gmijax.partition.placement import place
 from gmijax.partition.planner import make_plan
 
@@ -64,3 +67,31 @@ def test_indices_are_those_of_the_machine() -> None:
 def test_what_cannot_be_is_refused(changes, said: str) -> None:
     with pytest.raises(ConfigError, match=said):
         place(plan_config(**changes))
+
+
+@pytest.mark.parametrize(
+    ("overrides", "is_told"),
+    [
+        ((), True),
+        (("channel.transport=device",), False),
+        (("channel.design=uni",), False),
+        (("plan.serving_gpus=1", "plan.training_gpus=1"), False),
+    ],
+)
+def test_jobs_are_told_that_experience_could_stay_on_the_gpu(
+    overrides: tuple[str, ...], is_told: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(reduction, "_is_installed", lambda *_: True)
+    config = compose("env=ant", "algo=a3c", "plan.backend=share", *overrides)
+    plan = plan_decoupled(config, 8, machine(2))
+    assert any("channel.transport=device keeps" in why for why in plan.reasons) == is_told
+
+
+def test_experience_cannot_stay_on_a_gpu_where_nobody_trains(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(reduction, "_is_installed", lambda *_: True)
+    apart = ("plan.serving_gpus=1", "plan.training_gpus=1", "channel.transport=device")
+    config = compose("env=ant", "algo=a3c", "plan.backend=share", *apart)
+    with pytest.raises(ConfigError, match="agent 1 is on GPU 0 of the job, where nobody trains"):
+        plan_decoupled(config, 8, machine(2))
