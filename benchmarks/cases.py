@@ -81,9 +81,9 @@ def _lgr(task: str, gpus: int, gmis: int, strategy: str, *more: str) -> Case:
     )
 
 
-def _scaling(gpus: int, gmis: int) -> Case:
+def _scaling(gpus: int, gmis: int, strategy: str) -> Case:
     """8192 environments on every GPU: weak scaling."""
-    strategy = "auto" if gpus * gmis == 1 else "flat" if gmis == 1 else "har"
+    strategy = "auto" if gpus * gmis == 1 else strategy
     return Case(
         f"{gpus} GPUs x {gmis} GMIs x {8192 // gmis}",
         (
@@ -115,6 +115,8 @@ def _templates(task: str, num_envs: int) -> tuple[Case, ...]:
         ),
     )
 
+
+_SCALES = (1, 2, 4, 8)
 
 _WIDE = tuple(f"algo.{net}_hidden_layer_sizes=[512,512,512,256]" for net in ("policy", "value"))
 
@@ -300,7 +302,14 @@ SUITES = MappingProxyType(
             )
             for name, networks in (("ant", ()), ("ant-1.5M", _WIDE))
         },
-        "scaling": tuple(_scaling(gpus, gmis) for gmis in (1, 2) for gpus in (1, 2, 4, 8)),
+        "scaling": tuple(
+            _scaling(gpus, gmis, strategy)
+            for gmis, strategy in ((1, "flat"), (2, "har"))
+            for gpus in _SCALES
+        ),
+        "scaling-one_shot": tuple(
+            _scaling(gpus, gmis, "one_shot") for gmis in (1, 2) for gpus in _SCALES
+        ),
         "ball-cpu": (Case("2 GMIs x 512", ("env=ball_balance", "plan.gpus=2")),),
     }
 )

@@ -17,7 +17,7 @@ from gmijax.partition.child import ChildLink, required_fd, run_gmi
 from gmijax.partition.plan import Plan
 from gmijax.rundir import read_json
 from gmijax.schema import from_dict
-from gmijax.workers.trainers import join_trainers, trainers_reducer
+from gmijax.workers.trainers import environments_of, join_trainers, trainers_reducer
 
 if TYPE_CHECKING:
     from gmijax.a3c.board import Board
@@ -52,17 +52,9 @@ def _run(link: ChildLink) -> dict[str, Any]:
     # jax starts here, in the environment that the plan prepared.
     world = join_trainers(config, plan, trainers, link) if trains else None
     from gmijax.selfcheck import check_share
-    from gmijax.sim.build import make_training_env
 
     check_share(plan, link.gmi)
-    env = make_training_env(
-        config.env,
-        config.physics.impl,
-        seed=config.seed,
-        first_env=_index(agents.gmis, link.gmi) * config.envs_per_gmi,
-        num_envs=config.envs_per_gmi,
-        random_ep_len=config.algo.init_at_random_ep_len,
-    )
+    env = environments_of(config, _index(agents.gmis, link.gmi))
     parts = _Parts(config, algo, plan, env, _board(algo, env, len(agents.gmis)), link)
     return _train(parts, world) if trains else _act(parts)
 

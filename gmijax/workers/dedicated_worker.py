@@ -18,7 +18,7 @@ from gmijax.partition.plan import Plan
 from gmijax.partition.templates import AGENT, TRAINER, Group, group_of, has_role
 from gmijax.rundir import read_json
 from gmijax.schema import from_dict
-from gmijax.workers.trainers import join_trainers, trainers_reducer
+from gmijax.workers.trainers import environments_of, join_trainers, trainers_reducer
 
 if TYPE_CHECKING:
     from gmijax.collectives.interface import Reducer
@@ -44,17 +44,10 @@ def _run(link: ChildLink) -> dict[str, Any]:
     from gmijax.collectives.pipe_block import PipeBlock
     from gmijax.ppo.programs import exchange_size
     from gmijax.selfcheck import check_share
-    from gmijax.sim.build import make_training_env
 
     check_share(plan, link.gmi)
-    env = make_training_env(
-        config.env,
-        config.physics.impl,
-        seed=config.seed,
-        first_env=0 if trains else servants.gmis.index(link.gmi) * config.envs_per_gmi,
-        num_envs=config.envs_per_gmi,
-        random_ep_len=config.algo.init_at_random_ep_len,
-    )
+    place = 0 if trains else servants.gmis.index(link.gmi)
+    env = environments_of(config, place)
     block = PipeBlock.attach(required_fd(ENV_PIPES_FD), link.gmi, plan.layout.num_gmis, PIPE_BYTES)
     try:
         if trains:

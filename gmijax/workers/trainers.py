@@ -1,4 +1,4 @@
-"""How a GMI that trains finds the others that do: their processes as one, and a reducer."""
+"""What mains of training jobs share: environments, and how those that train find each other."""
 
 from __future__ import annotations
 
@@ -12,6 +12,21 @@ from gmijax.partition.templates import Group
 if TYPE_CHECKING:
     from gmijax.collectives.interface import Reducer
     from gmijax.collectives.ring import World
+    from gmijax.sim.wrappers import BatchedEnv
+
+
+def environments_of(config: TrainConfig, place: int) -> BatchedEnv:
+    """The environments of the GMI that is number `place` of those that simulate."""
+    from gmijax.sim.build import make_training_env
+
+    return make_training_env(
+        config.env,
+        config.physics.impl,
+        seed=config.seed,
+        first_env=place * config.envs_per_gmi,
+        num_envs=config.envs_per_gmi,
+        random_ep_len=config.algo.init_at_random_ep_len,
+    )
 
 
 def join_trainers(

@@ -16,7 +16,7 @@ from gmijax.partition.plan import Plan
 from gmijax.partition.templates import Group
 from gmijax.rundir import read_json
 from gmijax.schema import from_dict
-from gmijax.workers.trainers import join_trainers, trainers_reducer
+from gmijax.workers.trainers import environments_of, join_trainers, trainers_reducer
 
 
 def main() -> int:
@@ -35,17 +35,9 @@ def _run(link: ChildLink) -> dict[str, Any]:
     check_share(plan, link.gmi)
     from gmijax.ppo.programs import exchange_size
     from gmijax.ppo.role import train
-    from gmijax.sim.build import make_training_env
 
     assert isinstance(config.algo, PpoConfig)  # Others have a main of their own.
-    env = make_training_env(
-        config.env,
-        config.physics.impl,
-        seed=config.seed,
-        first_env=link.gmi * config.envs_per_gmi,
-        num_envs=config.envs_per_gmi,
-        random_ep_len=config.algo.init_at_random_ep_len,
-    )
+    env = environments_of(config, link.gmi)
     num_floats = exchange_size(env.spec, config.algo)
     reducer = trainers_reducer(config, plan, everyone, link, num_floats, world)
     try:
