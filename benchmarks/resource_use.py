@@ -12,10 +12,12 @@ from __future__ import annotations
 
 import argparse
 import json
+import os
 import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -26,8 +28,8 @@ import pynvml
 from benchmarks.run import RESULTS
 from gmijax import compose
 from gmijax.acting import act
-from gmijax.config import PpoConfig
-from gmijax.learner import acting_moments, apply_gradients, init_learner, make_learner
+from gmijax.config import PpoConfig, TrainConfig
+from gmijax.learner import Learner, acting_moments, apply_gradients, init_learner, make_learner
 from gmijax.partition.resource_model import dominant_resource
 from gmijax.ppo.learner import (
     finish_iteration,
@@ -38,7 +40,8 @@ from gmijax.ppo.learner import (
 from gmijax.ppo.losses import Samples
 from gmijax.ppo.rollout import stats_example
 from gmijax.sim.build import make_training_env
-from gmijax.sim.wrappers import env_keys
+from gmijax.sim.interface import EnvSpec
+from gmijax.sim.wrappers import BatchedEnv, env_keys
 
 SECONDS = 2.0
 """How long each task runs: the monitor wants a tenth of a second at least."""
@@ -63,8 +66,24 @@ class Use(NamedTuple):
         return dominant_resource(self.sm, 1.0, self.memory, 1.0)
 
 
+class Stage(NamedTuple):
+    """One task of an iteration.
+
+    Attributes:
+      name: simulator, agent or trainer.
+      program: from (given, state) to the next state, what a GMI does in an iteration.
+      given: what it reads.
+      state: the first one.
+    """
+
+    name: str
+    program: Callable[[Any, Any], Any]
+    given: Any
+    state: Any
+
+
 class Monitor:
-    """NVML's performance monitor of the GPU that jax uses; raises NVMLError where there is none.
+    """NVML's performance monitor of a GPU; raises NVMLError where there is none.
 
     Args:
       index: of the GPU, as NVML counts.
@@ -73,6 +92,7 @@ class Monitor:
     def __init__(self, index: int) -> None:
         self._device = pynvml.nvmlDeviceGetHandleByIndex(index)
         self._samples = [pynvml.nvmlGpmSampleAlloc() for _ in range(2)]
+        self.uuid = str(pynvml.nvmlDeviceGetUUID(self._device))
         self.memory_bytes = int(pynvml.nvmlDeviceGetMemoryInfo(self._device).total)
 
     def start(self) -> None:
@@ -90,6 +110,11 @@ class Monitor:
         pynvml.nvmlGpmMetricsGet(wanted)
         return wanted.metrics[0].value / 100.0
 
+    def close(self) -> None:
+        """Frees the samples."""
+        for sample in self._samples:
+            pynvml.nvmlGpmSampleFree(sample)
+
 
 def main() -> int:
     """Measures and prints; returns the exit code."""
@@ -97,12 +122,15 @@ def main() -> int:
     parser.add_argument("--tasks", nargs="+", default=["ant", "humanoid"])
     parser.add_argument("--num-envs", type=int, default=2048)
     parser.add_argument("--impl", choices=("jax", "warp"), default="jax")
-    parser.add_argument("--gpu", type=int, default=0, help="index; make it the only visible one")
+    parser.add_argument("--gpu", type=int, default=0, help="index, as NVML counts")
     parser.add_argument("--out", type=Path, default=RESULTS)
     arguments = parser.parse_args()
     try:
         with _nvml():
-            rows = {task: _task(task, arguments) for task in arguments.tasks}
+            monitor = Monitor(arguments.gpu)
+            os.environ["CUDA_VISIBLE_DEVICES"] = monitor.uuid  # jax looks when it is first used.
+            rows = {task: _task(task, arguments, monitor) for task in arguments.tasks}
+            monitor.close()
     except pynvml.NVMLError as error:
         sys.stderr.write(f"--gpu {arguments.gpu}: NVML cannot watch it: {error}\n")
         return 2
@@ -120,90 +148,95 @@ def main() -> int:
     return 0
 
 
-def _task(name: str, arguments: argparse.Namespace) -> dict[str, Any]:
+def _task(name: str, arguments: argparse.Namespace, monitor: Monitor) -> dict[str, Any]:
     """What simulator, agent and trainer of a task take."""
-    monitor, found = Monitor(arguments.gpu), {}
-    for stage, program, state in _stages(name, arguments.impl, arguments.num_envs):
-        use = _measured(program, state, monitor)
-        found[stage] = {**use._asdict(), "dominant": use.dominant}
+    config = compose(
+        f"env={name}", f"physics.impl={arguments.impl}", f"num_envs={arguments.num_envs}"
+    )
+    found = {}
+    for stage in _stages(config, arguments.impl):
+        use = _measured(stage, monitor)
+        found[stage.name] = {**use._asdict(), "dominant": use.dominant}
     return found
 
 
-def _measured(program: Callable[[Any], Any], state: Any, monitor: Monitor) -> Use:
-    compiled = jax.jit(program, donate_argnums=0).lower(state).compile()
+def _measured(stage: Stage, monitor: Monitor) -> Use:
+    given, state = stage.given, jax.tree.map(jnp.copy, stage.state)
+    compiled = jax.jit(stage.program, donate_argnums=1).lower(given, state).compile()
     needs: Any = compiled.memory_analysis()
     memory = needs.argument_size_in_bytes + needs.temp_size_in_bytes
-    state = jax.block_until_ready(compiled(compiled(state)))
+    state = jax.block_until_ready(compiled(given, compiled(given, state)))
     count, started = 0, time.monotonic()
     monitor.start()
     while time.monotonic() - started < SECONDS:
         for _ in range(4):
-            state = compiled(state)
+            state = compiled(given, state)
         jax.block_until_ready(state)
         count += 4
     busy, seconds = monitor.busy_sms(), time.monotonic() - started
     return Use(seconds / count, busy, memory / monitor.memory_bytes)
 
 
-def _stages(
-    name: str, impl: str, num_envs: int
-) -> Iterator[tuple[str, Callable[[Any], Any], Any]]:
-    """Simulator, agent, trainer: a program from its state to the next, and the first state.
-
-    One run of a program is what a GMI does in an iteration: T steps of all environments, T
-    actions, all updates.
-    """
-    config = compose(f"env={name}", f"physics.impl={impl}", f"num_envs={num_envs}")
+def _stages(config: TrainConfig, impl: str) -> Iterator[Stage]:
+    """Agent, trainer and simulator, with random experience where they need some."""
+    algo, num_envs = config.algo, config.envs_per_gmi
+    assert isinstance(algo, PpoConfig)
     env = make_training_env(config.env, impl, seed=0, first_env=0, num_envs=num_envs)
-    assert isinstance(config.algo, PpoConfig)
-    learner = make_learner(env.spec, config.algo)
-    key = jax.random.key(0)
+    learner, key = make_learner(env.spec, algo), jax.random.key(0)
     state = init_learner(learner, env.spec.obs_size, key)
     envs = jax.jit(env.init)(env.model, env_keys(key, 0, num_envs))
-    steps, size = config.algo.unroll_length, env.spec.action_size
-    moments = acting_moments(learner, state)
-    actions = jax.random.uniform(key, (num_envs, size), minval=-1.0)
-
-    def simulate(envs: Any) -> Any:
-        def step(_: Any, envs: Any) -> Any:
-            return env.step(env.model, envs, actions)[0]
-
-        return jax.lax.fori_loop(0, steps, step, envs)
-
-    def infer(carry: Any) -> Any:
-        def step(_: Any, carry: Any) -> Any:
-            envs, total = carry
-            # Other observations in every step, or the network would be evaluated only once.
-            obs = envs.env.obs + 1e-9 * total[:, :1]
-            envs = envs._replace(env=envs.env._replace(obs=obs))
-            envs, _, action = act(learner.networks, state.params, moments, envs, size)
-            return envs, total + action
-
-        return jax.lax.fori_loop(0, steps, step, carry)
-
-    flat = _samples(num_envs * steps, env.spec.obs_size, size, key)
+    zeros = jnp.zeros((num_envs, env.spec.action_size))
+    actions = jax.random.uniform(key, zeros.shape, minval=-1.0)
+    samples = _samples(num_envs * algo.unroll_length, env.spec, key)
     stats = stats_example(env.spec, env.overflows)
     context = update_context(learner, state, stats)
-
-    def train(state: Any) -> Any:
-        order = minibatch_order(learner, state, jnp.zeros((), jnp.int32), num_envs * steps)
-
-        def update(state: Any, indices: Any) -> Any:
-            grads, losses = gradients(learner, state.params, flat, indices, context)
-            return apply_gradients(learner, state, grads, losses.kl), None
-
-        return finish_iteration(jax.lax.scan(update, state, order)[0], stats)
-
-    yield "agent", infer, jax.tree.map(jnp.copy, (envs, jnp.zeros((num_envs, size))))
-    yield "trainer", train, jax.tree.map(jnp.copy, state)
-    yield "simulator", simulate, envs
+    yield Stage("agent", partial(_act, learner, zeros.shape[1]), state, (envs, zeros))
+    yield Stage("trainer", partial(_train, learner), (samples, stats, context), state)
+    yield Stage("simulator", partial(_simulate, env, algo), (env.model, actions), envs)
 
 
-def _samples(count: int, obs_size: int, action_size: int, key: jax.Array) -> Samples:
+def _simulate(env: BatchedEnv, algo: PpoConfig, given: Any, envs: Any) -> Any:
+    """T steps of all environments."""
+    model, actions = given
+
+    def step(_: Any, envs: Any) -> Any:
+        return env.step(model, envs, actions)[0]
+
+    return jax.lax.fori_loop(0, algo.unroll_length, step, envs)
+
+
+def _act(learner: Learner, size: int, state: Any, carry: Any) -> Any:
+    """T actions for all environments."""
+    moments = acting_moments(learner, state)
+
+    def step(_: Any, carry: Any) -> Any:
+        envs, total = carry
+        # Other observations in every step, or the network would be evaluated only once.
+        obs = envs.env.obs + 1e-9 * total[:, :1]
+        envs = envs._replace(env=envs.env._replace(obs=obs))
+        envs, _, action = act(learner.networks, state.params, moments, envs, size)
+        return envs, total + action
+
+    return jax.lax.fori_loop(0, learner.config.unroll_length, step, carry)
+
+
+def _train(learner: Learner, given: Any, state: Any) -> Any:
+    """All updates of an iteration."""
+    samples, stats, context = given
+    count = samples.advantage.shape[0]
+    order = minibatch_order(learner, state, jnp.zeros((), jnp.int32), count)
+
+    def update(state: Any, indices: Any) -> Any:
+        grads, losses = gradients(learner, state.params, samples, indices, context)
+        return apply_gradients(learner, state, grads, losses.kl), None
+
+    return finish_iteration(jax.lax.scan(update, state, order)[0], stats)
+
+
+def _samples(count: int, spec: EnvSpec, key: jax.Array) -> Samples:
     """Random samples: how long an update takes does not depend on what is in them."""
-    obs, action, advantage = (
-        jax.random.normal(key, (count, *shape)) for shape in ((obs_size,), (action_size,), ())
-    )
+    shapes = (spec.obs_size,), (spec.action_size,), ()
+    obs, action, advantage = (jax.random.normal(key, (count, *shape)) for shape in shapes)
     zeros = jnp.zeros(count)
     return Samples(obs, action, zeros, jnp.zeros_like(action), zeros, advantage)
 

@@ -175,12 +175,16 @@ def run_all(
         name = re.sub(r"[^a-zA-Z0-9]+", "-", case.name)
         folder = unused(runs / f"{book.results['suite']}-{name}-{repeat}")
         folder_override = f"run.dir={folder}"
+        # Runs that go on at the same time are noted as they end: who is which must be told.
+        note: dict[str, Any] = {"repeat": repeat}
         if free is None:
-            book.add(case, run_case(case, repeat, (folder_override,), folder))
+            book.add(case, {**run_case(case, repeat, (folder_override,), folder), **note})
             return
         with free.taken(case.gpus) as taken:
             done = run_case(case, repeat, (*free.overrides(taken), folder_override), folder)
-        book.add(case, done if free.together == 1 else {**done, "together": free.together})
+        if free.together > 1:
+            note["together"] = free.together
+        book.add(case, {**done, **note})
 
     with ThreadPoolExecutor(free.count * free.together if free else 1) as pool:
         started = [

@@ -72,7 +72,7 @@ def join_world(
 def build_reducer(name: str, membership: Membership) -> Reducer:
     """Makes the reducer of one rank with the strategy `name`.
 
-    Those that need rings wait here until all ranks have come.
+    Those that leave host memory wait here until all ranks have come.
 
     Raises:
       ConfigError: no such strategy, or it does not work for this layout, or lacks something.
@@ -122,7 +122,11 @@ def _one_shot(membership: Membership) -> Reducer:
     from gmijax.collectives.one_shot import OneShotReducer  # Imports jax.
 
     host = _host("one_shot", membership)
-    return OneShotReducer(host, membership.layout, membership.num_floats, DEVICE_MEMORY)
+    try:
+        return OneShotReducer(host, membership.layout, membership.num_floats, DEVICE_MEMORY)
+    except BaseException:
+        host.close()
+        raise
 
 
 def _intra(membership: Membership, host: HostExchange) -> IntraExchange:

@@ -54,9 +54,11 @@ class CudaMemory:
             runtime.cudaMalloc(size), f"get {size >> 20} MiB of GPU memory for the exchange"
         )
         self._pointer, self._is_owner = int(pointer), True
-        (handle,) = _checked(
-            runtime.cudaIpcGetMemHandle(self._pointer), "share GPU memory with other processes"
-        )
+        result = runtime.cudaIpcGetMemHandle(self._pointer)
+        if result[0] != runtime.cudaError_t.cudaSuccess:  # Nobody has mapped it.
+            runtime.cudaFree(self._pointer)
+            self._pointer = 0
+        (handle,) = _checked(result, "share GPU memory with other processes")
         return ctypes.string_at(int(handle.getPtr()), HANDLE_BYTES)
 
     def open(self, ticket: bytes) -> None:

@@ -107,9 +107,10 @@ class DeviceHarReducer(_Hierarchy[jax.Array]):
           CollectiveError: ranks make different calls, or this one is not allowed.
         """
         require_device_buffer(buffer, self._num_floats)
-        buffer.block_until_ready()
-        started_s = time.monotonic()
         block, turns = self._host.begin("mean", self._num_floats)
+        with turns.explained():
+            buffer.block_until_ready()
+        started_s = time.monotonic()
         scale = 1.0 if self._ring else 1.0 / self.world_size
         mean = self._intra.sum(buffer, block, turns, scale)
         if mean is not None and self._ring is not None:

@@ -25,7 +25,7 @@ B = TypeVar("B", "FloatBuffer", "jax.Array")
 
 
 class IntraUnavailable(CollectiveError):
-    """An exchange that cannot be had here; raised on all ranks of the job alike."""
+    """Shared memory of a GPU that cannot be had here; raised on all ranks of the job alike."""
 
 
 class IntraExchange(Protocol[B]):

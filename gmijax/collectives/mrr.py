@@ -8,8 +8,7 @@ ring, and nothing more to do: that is `flat`, plain data parallelism.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from typing import TypeVar
 
 import jax
@@ -21,7 +20,6 @@ from gmijax.collectives.host import HostExchange
 from gmijax.collectives.interface import DeviceMean, FloatBuffer
 from gmijax.collectives.ring import World
 from gmijax.collectives.turns import Turns
-from gmijax.errors import CollectiveError
 
 T = TypeVar("T")
 
@@ -149,23 +147,5 @@ def run_watched(courier: Courier, turns: Turns, program: Callable[[], T]) -> T:
       PeerLost, CollectiveTimeout: see `Turns.watch`.
       CollectiveError: the transfer failed although all peers are there.
     """
-    with explained(turns):
+    with turns.explained():
         return courier.run(lambda: jax.block_until_ready(program()), turns.watch)
-
-
-@contextmanager
-def explained(turns: Turns) -> Iterator[None]:
-    """Says of a transfer that fails whose end made it fail.
-
-    Raises:
-      PeerLost, CollectiveTimeout: see `Turns.explain_failure`.
-      CollectiveError: the transfer failed although all peers are there.
-    """
-    try:
-        yield
-    # A transfer that fails while jax still dispatches it comes as a plain ValueError. The errors
-    # of jax and of shared device memory are RuntimeErrors.
-    except (RuntimeError, ValueError) as error:
-        turns.explain_failure()
-        said = (str(error).splitlines() or [type(error).__name__])[0]
-        raise CollectiveError(f"{turns.where()}: {said}") from error

@@ -72,9 +72,10 @@ class OneShotReducer:
           CollectiveError: ranks make different calls, or this one is not allowed.
         """
         require_device_buffer(buffer, self._num_floats)
-        buffer.block_until_ready()
-        started_s = time.monotonic()
         _, turns = self._host.begin("mean", self._num_floats)
+        with turns.explained():
+            buffer.block_until_ready()
+        started_s = time.monotonic()
         self._slots.write(buffer, turns)
         mean = self._slots.sum(turns, self._scale)
         turns.end()

@@ -15,7 +15,6 @@ from gmijax.collectives.device_memory import TICKET_BYTES, DeviceMemory, NewMemo
 from gmijax.collectives.host import HostExchange
 from gmijax.collectives.interface import FloatBuffer
 from gmijax.collectives.intra import IntraUnavailable
-from gmijax.collectives.mrr import explained
 from gmijax.collectives.turns import Turns
 
 NOTE_BYTES = 240
@@ -83,7 +82,7 @@ class SharedSlots:
             tickets = _agreed(host, wish, lambda: self._make(new_memory, size))
             _agreed(host, wish, lambda: self._map(tickets))
             _agreed(host, wish, lambda: self._try(scale))
-        except IntraUnavailable:
+        except BaseException:
             self.close()
             raise
 
@@ -96,7 +95,7 @@ class SharedSlots:
         """
         self._num_writes += 1
         offset = self._own[self._num_writes % 2]
-        with explained(turns):
+        with turns.explained():
             self._finish_reading()
             for memory in self._memories:
                 memory.start_write(offset, buffer)
@@ -107,18 +106,18 @@ class SharedSlots:
 
     def sum(self, turns: Turns, scale: float) -> jax.Array:
         """The sum [P] of what all members wrote, times `scale`; it may still be computed."""
-        with explained(turns):
+        with turns.explained():
             total, self._read = self._sum(self._slots[self._num_writes % 2], scale)
         return total
 
     def write_result(self, result: jax.Array, turns: Turns) -> None:
         """Puts `result` [P] into the block of this GPU; only its owner may."""
-        with explained(turns):
+        with turns.explained():
             self._memories[0].write(self._result_offset, result)
 
     def read_result(self, turns: Turns) -> jax.Array:
         """A copy of the result of this GPU's block; it may still be computed."""
-        with explained(turns):
+        with turns.explained():
             copied, self._read = self._copy(self._result)
         return copied
 
@@ -132,7 +131,8 @@ class SharedSlots:
         self._memories = []
 
     def _make(self, new_memory: NewMemory, num_bytes: int) -> bytes:
-        self._memories = [new_memory() for _ in self._owners]
+        for _ in self._owners:  # One by one, so that those before one that fails are closed.
+            self._memories.append(new_memory())
         return self._memories[0].create(num_bytes) if self._is_owner else b""
 
     def _map(self, tickets: npt.NDArray[np.uint8]) -> bytes:

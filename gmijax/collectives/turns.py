@@ -10,6 +10,8 @@ from __future__ import annotations
 import os
 import threading
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 
 from gmijax.collectives.memory import ExchangeBlock, check_peer
 from gmijax.collectives.suspects import Suspects
@@ -126,6 +128,23 @@ class Turns:
             time.sleep(0.02)
         if silent := suspects.silent(self._behind()):
             suspects.give_up(silent)
+
+    @contextmanager
+    def explained(self) -> Iterator[None]:
+        """Says of a transfer that fails whose end made it fail.
+
+        Raises:
+          PeerLost, CollectiveTimeout: see `explain_failure`.
+          CollectiveError: the transfer failed although all peers are there.
+        """
+        try:
+            yield
+        # A transfer that fails while jax still dispatches it comes as a plain ValueError. The
+        # errors of jax and of shared device memory are RuntimeErrors.
+        except (RuntimeError, ValueError) as error:
+            self.explain_failure()
+            said = (str(error).splitlines() or [type(error).__name__])[0]
+            raise CollectiveError(f"{self.where()}: {said}") from error
 
     def where(self) -> str:
         """Rank, operation and step, for messages."""

@@ -110,7 +110,7 @@ class ReduceConfig:
     )
     intra: Literal["auto", "host", "ipc"] = doc(
         "exchange inside one GPU, for har: through host memory, or through GPU memory that GMIs "
-        "map (ipc); auto: ipc where it can be had"
+        "map (ipc); auto: ipc where it can be had; host leaves out one_shot"
     )
     timeout_s: float = doc("longest wait for another GMI in one exchange, seconds")
     selection: Literal["paper", "measured"] = doc(
@@ -121,6 +121,11 @@ class ReduceConfig:
 
     def __post_init__(self) -> None:
         require_positive("reduce.timeout_s", self.timeout_s)
+        if self.strategy == "one_shot" and self.intra == "host":
+            raise ConfigError(
+                "reduce.intra=host: reduce.strategy=one_shot goes through memory of the GPUs; "
+                "allowed are auto, ipc"
+            )
         if self.selection == "measured" and self.strategy != "auto":
             raise ConfigError(
                 f"reduce.selection=measured: needs reduce.strategy=auto, not {self.strategy}"

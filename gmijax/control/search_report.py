@@ -17,8 +17,9 @@ from rich.table import Table
 
 from gmijax.partition.balance import Split
 from gmijax.partition.gmi_process import GmiStatus
+from gmijax.partition.grid import Grid
 from gmijax.partition.points import Measured, NotRunnable, Point
-from gmijax.partition.search import Grid, Outcome, Visited
+from gmijax.partition.search import Outcome, Visited
 
 Results = Mapping[Point, Measured | NotRunnable]
 

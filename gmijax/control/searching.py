@@ -39,9 +39,10 @@ from gmijax.control.search_report import (
 from gmijax.control.workload import Workload, training
 from gmijax.errors import ConfigError, GmijaxError, JobInterrupted
 from gmijax.partition.balance import Split
+from gmijax.partition.grid import Grid
 from gmijax.partition.machine import Machine, detect_machine
 from gmijax.partition.points import Measured, NotRunnable, Point
-from gmijax.partition.search import Grid, Outcome, OutOfBudget, Rules, Visited
+from gmijax.partition.search import Outcome, OutOfBudget, Rules, Visited
 from gmijax.partition.search import search as search_grid
 from gmijax.rundir import RunPaths, create_run, write_json
 from gmijax.schema import to_dict

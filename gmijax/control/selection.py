@@ -54,7 +54,7 @@ class Probe(NamedTuple):
 
     Attributes:
       strategy: a reduction strategy.
-      intra: exchange inside a GPU, for `har`.
+      intra: exchange inside a GPU; `one_shot` has `ipc` only.
       num_floats: P, length of the buffers.
     """
 

@@ -234,5 +234,6 @@ def _intra(reduce: ReduceConfig, layout: Layout, backend: BackendName, reasons: 
     if reason := why_not_intra("ipc", backend):
         reasons.append(f"intra host: GMIs of a GPU exchange through shared host memory; {reason}")
         return "host"
-    reasons.append("intra ipc: with har GMIs of a GPU exchange through memory of the GPU")
+    if reduce.strategy != "one_shot":
+        reasons.append("intra ipc: with har GMIs of a GPU exchange through memory of the GPU")
     return "ipc"

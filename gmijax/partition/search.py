@@ -29,13 +29,11 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from itertools import product
 from typing import Final, NamedTuple
 
+from gmijax.partition.grid import Grid, as_printed, coarse, first_row, neighbours
 from gmijax.partition.points import Measured, NotRunnable, Point
 
-_STRIDE: Final = 3
-_COARSE_SIZES: Final = 2
-
 _CLEARLY_SLOWER: Final = 0.9
-"""An implementation that makes less than this of another with one GMI is not looked at further."""
+"""An implementation that makes less than this of another in the first row is left alone."""
 
 
 class OutOfBudget(Exception):
@@ -44,15 +42,6 @@ class OutOfBudget(Exception):
 
 Profile = Callable[[Point], Measured | NotRunnable]
 """What one GMI did at a point, or why it cannot; may raise OutOfBudget."""
-
-
-class Grid(NamedTuple):
-    """All points that may be looked at."""
-
-    gmis_per_gpu: tuple[int, ...]
-    num_envs: tuple[int, ...]
-    impls: tuple[str, ...]
-    trainers: tuple[int, ...] = (0,)
 
 
 def top_of_one(measured: Measured) -> float:
@@ -153,28 +142,6 @@ def search(grid: Grid, profile: Profile, rules: Rules) -> Outcome:
     return Outcome(tuple(book.visited.values()), best(book.visited, rules.tolerance), complete)
 
 
-def as_printed(grid: Grid) -> Grid:
-    """The grid in the paper's order: from the most GMIs down, from the smallest size up."""
-    rows = tuple(sorted(grid.gmis_per_gpu, reverse=True))
-    return grid._replace(gmis_per_gpu=rows, num_envs=tuple(sorted(grid.num_envs)))
-
-
-def coarse(grid: Grid) -> Grid:
-    """Every third row, with the largest size and the third below it.
-
-    The row with the fewest GMIs is among them: it is the measure of all others. It comes first,
-    because the fewer GMIs, the sooner they have started, and time may run out. Smaller sizes are
-    left to the climb: where there is room for more environments, few are hardly ever the answer.
-    """
-    sizes = sorted(grid.num_envs, reverse=True)[::_STRIDE]
-    return Grid(
-        _some_rows(grid.gmis_per_gpu),
-        tuple(sorted(sizes[:_COARSE_SIZES])),
-        grid.impls,
-        _some_rows(grid.trainers),
-    )
-
-
 def best(visited: Mapping[Point, Visited], tolerance: float) -> Visited | None:
     """Lines 21 to 24: the simplest of the points that are within `tolerance` of the highest."""
     runnable = [one for one in visited.values() if isinstance(one.result, Measured)]
@@ -244,19 +211,16 @@ def _rows(book: _Book, grid: Grid) -> None:
 def _first_look(book: _Book, grid: Grid) -> None:
     """The coarse rows; smaller sizes only as long as nothing runs.
 
-    The first row comes first with all implementations: one that is clearly slower in a single
-    GMI has never caught up in several, and a profile takes half a minute.
+    The first row, with the fewest GMIs, comes first with all implementations: one that was
+    clearly slower there did not catch up with more where both were measured, and a profile takes
+    half a minute.
     """
     sizes = grid.num_envs
     while sizes and book.best() is None:
         part = coarse(grid._replace(num_envs=sizes))
-        _rows(book, _first_row(part))
+        _rows(book, first_row(part))
         _rows(book, part._replace(impls=_worth_more(book, grid.impls)))
         sizes = tuple(size for size in sizes if size < part.num_envs[0])
-
-
-def _first_row(grid: Grid) -> Grid:
-    return grid._replace(gmis_per_gpu=grid.gmis_per_gpu[:1], trainers=grid.trainers[:1])
 
 
 def _worth_more(book: _Book, impls: Sequence[str]) -> tuple[str, ...]:
@@ -281,27 +245,5 @@ def _climb(book: _Book, grid: Grid) -> None:
         book.visit(fresh[0])
 
 
-def neighbours(point: Point, grid: Grid) -> list[Point]:
-    """The points one step away in the grid: in GMIs, in trainers, then in environments."""
-    rows = _beside(point.gmis_per_gpu, sorted(grid.gmis_per_gpu))
-    trainers = _beside(point.trainers, sorted(grid.trainers))
-    sizes = _beside(point.num_envs, sorted(grid.num_envs))
-    return [
-        *(point._replace(gmis_per_gpu=row) for row in rows),
-        *(point._replace(trainers=number) for number in trainers),
-        *(point._replace(num_envs=size) for size in sizes),
-    ]
-
-
 def _num_gmis(point: Point) -> int:
     return point.gmis_per_gpu + point.trainers
-
-
-def _some_rows(values: Sequence[int]) -> tuple[int, ...]:
-    rows = sorted(values, reverse=True)
-    return tuple(sorted({*rows[::_STRIDE], rows[-1]}))
-
-
-def _beside(value: int, values: Sequence[int]) -> list[int]:
-    at = values.index(value)
-    return [values[i] for i in (at + 1, at - 1) if 0 <= i < len(values)]

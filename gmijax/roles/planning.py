@@ -53,7 +53,8 @@ def plan(
     }
     # As from a command line: what is no number, or not among the allowed, is told in one line.
     wanted = from_dict(PlanConfig, {key: _plain(value) for key, value in given.items()}, "plan.")
-    reduce = ReduceConfig(strategy=strategy, intra="host", timeout_s=1.0)
+    intra = "auto" if strategy == "one_shot" else "host"
+    reduce = ReduceConfig(strategy=strategy, intra=intra, timeout_s=1.0)
     made = make_plan(wanted, reduce, 0, detect_machine())
     # What the templates call roles are parts of reinforcement learning.
     reasons = tuple(reason for reason in made.reasons if not reason.startswith("template "))

@@ -71,3 +71,13 @@ def test_device_memory_that_does_not_work_is_found_by_all(
             assert said in (tmp_path / f"stderr_{rank}").read_text()
         else:
             assert (result["error"], result["message"]) == ("IntraUnavailable", said)
+
+
+def test_one_shot_says_on_all_ranks_where_memory_does_not_work(tmp_path: Path) -> None:
+    options = {"strategy": "one_shot", "intra": "ipc", "num_calls": 2, "broken_rank": 1}
+    with Ranks(tmp_path, 2, "check_means", layout=[[0], [1]], **options).start() as job:
+        results = job.results()
+    said = "shared GPU memory does not hold what was written into it"
+    for result in results:
+        assert result["error"] == "IntraUnavailable"
+        assert result["message"] == f"reduce.strategy=one_shot: rank 0: {said}"

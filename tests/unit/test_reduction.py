@@ -15,6 +15,7 @@ from gmijax.collectives.cost_model import (
     one_shot_s,
     predicted_s,
 )
+from gmijax.config import ReduceConfig
 from gmijax.errors import ConfigError
 from gmijax.partition import reduction
 from gmijax.partition.layout import Layout
@@ -182,3 +183,8 @@ def test_predictions_take_floats_and_the_fullest_gpu() -> None:
         predicted_s("mpr", layout, 100, 0.0, 1.0)
     with pytest.raises(ConfigError, match="expected one of mpr, mrr, har, flat"):
         predicted_s("none", layout, 100, 1.0, 1.0)
+
+
+def test_one_shot_cannot_go_through_host_memory() -> None:
+    with pytest.raises(ConfigError, match="one_shot goes through memory of the GPUs; allowed are"):
+        ReduceConfig(strategy="one_shot", intra="host", timeout_s=1.0)
