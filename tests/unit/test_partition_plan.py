@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 from supervision import gpu, machine, plan_config, reduce_config
 
 from gmijax.errors import BackendUnavailable, ConfigError
+from gmijax.partition import reduction
 from gmijax.partition.layout import Layout
 from gmijax.partition.machine import Machine
 from gmijax.partition.plan import Plan, Slice
@@ -104,6 +105,16 @@ def test_auto_tells_what_algorithm_1_says_and_keeps_to_host_memory(
     (reason,) = [text for text in plan.reasons if text.startswith("strategy")]
     assert reason.startswith(f"strategy {strategy}: ")
     assert why in reason
+
+
+@pytest.mark.parametrize("is_installed", [True, False])
+def test_auto_tells_of_one_shot_where_it_can_be_had(
+    is_installed: bool, monkeypatch: pytest.MonkeyPatch
+):
+    monkeypatch.setattr(reduction, "_is_installed", lambda *_: is_installed)
+    plan = planned(machine(2), gpus=2, gmis_per_gpu=2, backend="share")
+    assert plan.strategy == "mrr"
+    assert any("reduce.strategy=one_shot" in why for why in plan.reasons) == is_installed
 
 
 @pytest.mark.parametrize(
