@@ -11,7 +11,7 @@ import dataclasses
 import hashlib
 import json
 import tempfile
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from itertools import pairwise
 from pathlib import Path
@@ -90,13 +90,20 @@ def with_measured(
     kept = (folder or compilation_cache_dir().parent / "reduction") / _file_name(
         plan, machine, probes
     )
-    found = _kept(kept, probes)
-    is_new = not found
-    if is_new:
+    found, source = _kept(kept, probes), f"from {kept}"
+    if not found:
         rows = measure(plan, machine, probes, CALLS)
         found = {probe.name: row for probe, row in zip(probes, rows, strict=True)}
+        source = "measured now"
         with suppress(OSError):  # Without a place to keep them, the next job measures again.
             write_json(kept, found)
+    return _with_fastest(plan, probes, found, source)
+
+
+def _with_fastest(
+    plan: Plan, probes: Sequence[Probe], found: Mapping[str, dict[str, Any]], source: str
+) -> Plan:
+    """The plan with the fastest of the probes that can be used."""
     usable = [probe for probe in probes if "why_not" not in found[probe.name]]
     times_s = {probe: float(found[probe.name]["chained_s"]) for probe in usable}
     best = min(usable, key=times_s.__getitem__)
@@ -108,8 +115,8 @@ def with_measured(
         for p in probes
     )
     why = (
-        f"strategy {best.name}: fastest mean of {num_floats:,} floats here ({shown}; "
-        f"{'measured now' if is_new else f'from {kept}'}); Algorithm 1 says {by_paper}"
+        f"strategy {best.name}: fastest mean of {best.num_floats:,} floats here ({shown}; "
+        f"{source}); Algorithm 1 says {by_paper}"
     )
     return dataclasses.replace(
         plan,
@@ -119,7 +126,7 @@ def with_measured(
         selection={
             "paper": by_paper,
             "measured": best.name,
-            "num_floats": num_floats,
+            "num_floats": best.num_floats,
             "seconds": {probe.name: s for probe, s in times_s.items()},
         },
     )
