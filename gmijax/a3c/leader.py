@@ -5,7 +5,7 @@ from __future__ import annotations
 import statistics
 import time
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -15,6 +15,7 @@ import numpy.typing as npt
 from gmijax.a3c.board import Board, Orders, Report, pack_orders, unpack_report
 from gmijax.a3c.losses import LossMetrics
 from gmijax.a3c.report import Progress, Reporter
+from gmijax.a3c.tally import Tally
 from gmijax.checkpoint import finish_checkpoint, save_learner
 from gmijax.config import TrainConfig
 from gmijax.devices import describe_device
@@ -25,9 +26,6 @@ from gmijax.partition.child import ChildLink
 from gmijax.results import read_metrics
 from gmijax.resume import CheckpointMeta
 from gmijax.sim.wrappers import BatchedEnv
-
-if TYPE_CHECKING:
-    from gmijax.a3c.trainer import Tally
 
 _PAUSE_S = 0.02
 

@@ -7,7 +7,7 @@ samples per second: environment steps that trainers have learnt from (paper, sec
 from __future__ import annotations
 
 import time
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import numpy as np
@@ -17,12 +17,10 @@ from gmijax.a3c.board import Report
 from gmijax.a3c.losses import LossMetrics
 from gmijax.a3c.rollout import stats_example
 from gmijax.a3c.staleness import MAX_COUNTED, mean_and_p99
+from gmijax.a3c.tally import Tally
 from gmijax.metrics import Episodes, EpisodeWindow, MetricsLog
 from gmijax.physics_health import OverflowCount, check_diverged, overflow_line
 from gmijax.sim.wrappers import BatchedEnv
-
-if TYPE_CHECKING:
-    from gmijax.a3c.trainer import Tally
 
 LINE_EVERY_S = 0.5
 """Updates may be much faster than anybody can read: a line tells of all since the one before."""

@@ -21,6 +21,7 @@ from gmijax.a3c.learner import acting_weights, pack_weights
 from gmijax.a3c.losses import LossMetrics, Unrolls
 from gmijax.a3c.programs import FusedUpdate, SplitUpdate, Update
 from gmijax.a3c.staleness import MAX_COUNTED, histogram_of
+from gmijax.a3c.tally import Tally
 from gmijax.checkpoint import digest, restore_learner
 from gmijax.collectives.channel.interface import Batch, ExperienceReceiver
 from gmijax.collectives.interface import Reducer
@@ -49,24 +50,6 @@ class Training(NamedTuple):
     algo: A3cConfig
     env: BatchedEnv
     agents: tuple[int, ...]
-
-
-class Tally(NamedTuple):
-    """What trainers tell each other with every batch.
-
-    Attributes:
-      stop: how many have been asked to stop.
-      fresh: unrolls that are learnt from.
-      stale: unrolls that were too old, those of batches that were passed over too.
-      receive_s: seconds that the last of them waited for experience.
-      staleness: [MAX_COUNTED + 1] unrolls by versions behind.
-    """
-
-    stop: float
-    fresh: float
-    stale: float
-    receive_s: float
-    staleness: npt.NDArray[np.float32]
 
 
 def learn_until_done(

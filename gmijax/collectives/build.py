@@ -7,10 +7,14 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from gmijax.collectives.device_memory import NewMemory, cuda_memory
+from gmijax.collectives.device_memory import (
+    DeviceMemoryUnavailable,
+    NewMemory,
+    cuda_memory,
+)
 from gmijax.collectives.host import HostExchange
 from gmijax.collectives.interface import Reducer
-from gmijax.collectives.intra import INTRA, IntraExchange, IntraUnavailable
+from gmijax.collectives.intra import INTRA, IntraExchange
 from gmijax.collectives.mpr import MprReducer
 from gmijax.collectives.solo import SoloReducer
 from gmijax.errors import ConfigError
@@ -133,7 +137,7 @@ def _intra(membership: Membership, host: HostExchange) -> IntraExchange:
     layout, rank, num_floats = membership.layout, membership.rank, membership.num_floats
     try:
         return INTRA[membership.intra](layout, rank, num_floats, host)
-    except IntraUnavailable as error:
+    except DeviceMemoryUnavailable as error:
         if not membership.host_if_unavailable:
             raise
         warnings.warn(f"{error}; so through host memory", RuntimeWarning, stacklevel=2)

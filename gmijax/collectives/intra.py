@@ -14,7 +14,6 @@ from gmijax.collectives.interface import FloatBuffer
 from gmijax.collectives.memory import ExchangeBlock
 from gmijax.collectives.slots import add_slots, read_only
 from gmijax.collectives.turns import Turns
-from gmijax.errors import CollectiveError
 from gmijax.partition.layout import Layout
 from gmijax.partition.reduction import leaders
 
@@ -22,10 +21,6 @@ if TYPE_CHECKING:
     import jax
 
 B = TypeVar("B", "FloatBuffer", "jax.Array")
-
-
-class IntraUnavailable(CollectiveError):
-    """Shared memory of a GPU that cannot be had here; raised on all ranks of the job alike."""
 
 
 class IntraExchange(Protocol[B]):

@@ -31,7 +31,7 @@ class IpcIntra:
       new_memory: how the processes share the block.
 
     Raises:
-      IntraUnavailable, PeerLost, CollectiveTimeout: as `SharedSlots`.
+      DeviceMemoryUnavailable, PeerLost, CollectiveTimeout: as `SharedSlots`.
     """
 
     is_device_resident = True

@@ -37,7 +37,7 @@ class OneShotReducer:
       new_memory: how the processes share a block.
 
     Raises:
-      IntraUnavailable, PeerLost, CollectiveTimeout: as `SharedSlots`.
+      DeviceMemoryUnavailable, PeerLost, CollectiveTimeout: as `SharedSlots`.
     """
 
     is_device_resident = True

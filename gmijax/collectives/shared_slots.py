@@ -11,10 +11,14 @@ import jax.numpy as jnp
 import numpy as np
 import numpy.typing as npt
 
-from gmijax.collectives.device_memory import TICKET_BYTES, DeviceMemory, NewMemory
+from gmijax.collectives.device_memory import (
+    TICKET_BYTES,
+    DeviceMemory,
+    DeviceMemoryUnavailable,
+    NewMemory,
+)
 from gmijax.collectives.host import HostExchange
 from gmijax.collectives.interface import FloatBuffer
-from gmijax.collectives.intra import IntraUnavailable
 from gmijax.collectives.turns import Turns
 
 NOTE_BYTES = 240
@@ -46,8 +50,8 @@ class SharedSlots:
       wish: what cannot be had if this fails, for the message.
 
     Raises:
-      IntraUnavailable: there is no such memory here, or it does not hold what was written; on
-        all ranks alike.
+      DeviceMemoryUnavailable: there is no such memory here, or it does not hold what was
+        written; on all ranks alike.
       PeerLost, CollectiveTimeout: as in the first call of a reducer.
     """
 
@@ -173,7 +177,7 @@ def _agreed(host: HostExchange, wish: str, step: Callable[[], bytes]) -> npt.NDA
     All ranks of the job call this, and they go on together or not at all.
 
     Raises:
-      IntraUnavailable: it failed on one of them, and why it did there.
+      DeviceMemoryUnavailable: it failed on one of them, and why it did there.
     """
     try:
         note, has_failed = step(), False
@@ -188,7 +192,7 @@ def _agreed(host: HostExchange, wish: str, step: Callable[[], bytes]) -> npt.NDA
     notes = everyone[:, 1:].astype(np.uint8)
     if failed := np.flatnonzero(everyone[:, 0]).tolist():
         why = notes[failed[0]].tobytes().rstrip(b"\0").decode(errors="replace")
-        raise IntraUnavailable(f"{wish}: rank {failed[0]}: {why}")
+        raise DeviceMemoryUnavailable(f"{wish}: rank {failed[0]}: {why}")
     return notes
 
 

@@ -14,8 +14,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from gmijax.collectives.build import Membership, build_reducer, join_world
+from gmijax.collectives.device_memory import DeviceMemoryUnavailable
 from gmijax.collectives.interface import DeviceMean, Reducer, stays_on_device
-from gmijax.collectives.intra import IntraUnavailable
 from gmijax.control.selection import CHAIN, TIMEOUT_S, block_variable
 from gmijax.partition.child import ChildLink, required_fd, run_gmi
 from gmijax.partition.plan import Plan
@@ -44,7 +44,7 @@ def _measure(link: ChildLink) -> dict[str, Any]:
     for number, probe in enumerate(task["probes"]):
         try:
             reducer = _reducer(plan, link.gmi, world, number, probe)
-        except IntraUnavailable as error:  # On all ranks alike, so all go on.
+        except DeviceMemoryUnavailable as error:  # On all ranks alike, so all go on.
             rows.append({"why_not": str(error)})
         else:
             rows.append(_times(reducer, probe["num_floats"], task["calls"]))

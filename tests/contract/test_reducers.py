@@ -70,7 +70,7 @@ def test_device_memory_that_does_not_work_is_found_by_all(
             assert result["error"] is None
             assert said in (tmp_path / f"stderr_{rank}").read_text()
         else:
-            assert (result["error"], result["message"]) == ("IntraUnavailable", said)
+            assert (result["error"], result["message"]) == ("DeviceMemoryUnavailable", said)
 
 
 def test_one_shot_says_on_all_ranks_where_memory_does_not_work(tmp_path: Path) -> None:
@@ -79,5 +79,5 @@ def test_one_shot_says_on_all_ranks_where_memory_does_not_work(tmp_path: Path) -
         results = job.results()
     said = "shared GPU memory does not hold what was written into it"
     for result in results:
-        assert result["error"] == "IntraUnavailable"
+        assert result["error"] == "DeviceMemoryUnavailable"
         assert result["message"] == f"reduce.strategy=one_shot: rank 0: {said}"

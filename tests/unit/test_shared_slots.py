@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 from fake_device_memory import FakeDeviceMemory
 
+from gmijax.collectives.device_memory import DeviceMemoryUnavailable
 from gmijax.collectives.host import HostExchange
-from gmijax.collectives.intra import IntraUnavailable
 from gmijax.collectives.memory import create_exchange
 from gmijax.collectives.one_shot import OneShotReducer
 from gmijax.collectives.shared_slots import SharedSlots
@@ -48,7 +48,7 @@ class Counted(FakeDeviceMemory):
 
 def test_what_was_made_before_a_failure_is_closed(host: HostExchange) -> None:
     said = "wish: rank 0: no more memory"
-    with pytest.raises(IntraUnavailable, match=said):
+    with pytest.raises(DeviceMemoryUnavailable, match=said):
         SharedSlots(host, SIZE, [0], [0, 0], 1.0, Counted, "wish")
     assert Counted.num_open == 0
 
