@@ -2,24 +2,21 @@
 
 from __future__ import annotations
 
-import time
-from collections.abc import Callable
-from typing import Generic, TypeVar
+from typing import Generic
 
 import jax
 import numpy as np
 
-from gmijax.collectives.buffers import require_device_buffer, require_mean_input
 from gmijax.collectives.courier import Courier
 from gmijax.collectives.host import HostExchange
-from gmijax.collectives.interface import DeviceMean, FloatBuffer
+from gmijax.collectives.interface import FloatBuffer
 from gmijax.collectives.intra import B, IntraExchange
+from gmijax.collectives.memory import ExchangeBlock
 from gmijax.collectives.mrr import open_rings, run_watched
+from gmijax.collectives.on_device import HostPaced
 from gmijax.collectives.ring import Ring, World
 from gmijax.collectives.turns import Turns
 from gmijax.partition.reduction import leaders
-
-T = TypeVar("T")
 
 
 class _Hierarchy(Generic[B]):
@@ -88,7 +85,7 @@ class HarReducer(_Hierarchy[FloatBuffer]):
         return result
 
 
-class DeviceHarReducer(_Hierarchy[jax.Array]):
+class DeviceHarReducer(_Hierarchy[jax.Array], HostPaced):
     """The same without leaving the GPUs: a `DeviceReducer`.
 
     Where all GPUs have as many GMIs, every GMI is a leader: it sums over its GPU by itself, and
@@ -96,21 +93,8 @@ class DeviceHarReducer(_Hierarchy[jax.Array]):
     """
 
     is_device_resident = True
-    exchange_s = 0.0
 
-    def mean_on_device(self, buffer: jax.Array) -> jax.Array:
-        """Returns the mean over ranks of `buffer` [P] float32, see `DeviceReducer`.
-
-        Raises:
-          PeerLost: the process of another rank is gone.
-          CollectiveTimeout: another rank did not arrive in time.
-          CollectiveError: ranks make different calls, or this one is not allowed.
-        """
-        require_device_buffer(buffer, self._num_floats)
-        block, turns = self._host.begin("mean", self._num_floats)
-        with turns.explained():
-            buffer.block_until_ready()
-        started_s = time.monotonic()
+    def _exchange(self, buffer: jax.Array, block: ExchangeBlock, turns: Turns) -> jax.Array:
         scale = 1.0 if self._ring else 1.0 / self.world_size
         mean = self._intra.sum(buffer, block, turns, scale)
         if mean is not None and self._ring is not None:
@@ -118,23 +102,7 @@ class DeviceHarReducer(_Hierarchy[jax.Array]):
         result = self._intra.spread(mean, block, turns)
         if self._ring is not None and self._ring.is_of_all:
             turns.arrive()  # Where others look for this rank while their rings run.
-        turns.end()
-        self.exchange_s += time.monotonic() - started_s
         return result
-
-    def run_on_device(self, program: Callable[[DeviceMean], T]) -> T:
-        """See `DeviceReducer`; raises what `mean_on_device` raises.
-
-        The host takes part in every mean: the GMIs of a GPU know only from each other that a
-        slot is written.
-        """
-        self.exchange_s = 0.0
-        return jax.block_until_ready(program(self.mean_on_device))
-
-    def mean(self, buffer: FloatBuffer) -> FloatBuffer:
-        """The same for a buffer in host memory, with a copy each way; the result is read-only."""
-        require_mean_input(buffer, self._num_floats)
-        return np.asarray(self.mean_on_device(jax.device_put(buffer)))
 
 
 class LeaderRing:

@@ -14,17 +14,18 @@ from typing import TypeVar
 import jax
 import numpy as np
 
-from gmijax.collectives.buffers import require_device_buffer, require_mean_input
+from gmijax.collectives.buffers import require_device_buffer
 from gmijax.collectives.courier import Courier
 from gmijax.collectives.host import HostExchange
-from gmijax.collectives.interface import DeviceMean, FloatBuffer
+from gmijax.collectives.interface import DeviceMean
+from gmijax.collectives.on_device import OnDevice
 from gmijax.collectives.ring import World
 from gmijax.collectives.turns import Turns
 
 T = TypeVar("T")
 
 
-class RingReducer:
+class RingReducer(OnDevice):
     """A `DeviceReducer` over rings of GPUs; the layout must be even.
 
     `mean` first meets all ranks on the host: that finds peers that are missing, and calls that
@@ -37,7 +38,6 @@ class RingReducer:
       num_floats: P, length of the buffers for `mean`.
     """
 
-    is_device_resident = True
     exchange_s = None
 
     def __init__(self, host: HostExchange, world: World, num_floats: int) -> None:
@@ -51,13 +51,7 @@ class RingReducer:
         open_rings(world, self._courier, self._rings, num_floats)
 
     def mean_on_device(self, buffer: jax.Array) -> jax.Array:
-        """Returns the mean over ranks of `buffer` [P] float32, see `DeviceReducer`.
-
-        Raises:
-          PeerLost: the process of another rank is gone.
-          CollectiveTimeout: another rank did not arrive in time.
-          CollectiveError: ranks make different calls, or this one is not allowed.
-        """
+        """See `OnDevice.mean_on_device`."""
         require_device_buffer(buffer, self._num_floats)
         return self.run_on_device(lambda mean: mean(buffer))
 
@@ -70,15 +64,6 @@ class RingReducer:
         turns.arrive()
         turns.end()
         return result
-
-    def mean(self, buffer: FloatBuffer) -> FloatBuffer:
-        """The same for a buffer in host memory, with a copy each way; the result is read-only."""
-        require_mean_input(buffer, self._num_floats)
-        return np.asarray(self.mean_on_device(jax.device_put(buffer)))
-
-    def all_gather(self, values: FloatBuffer) -> FloatBuffer:
-        """See `HostExchange.all_gather`."""
-        return self._host.all_gather(values)
 
     def close(self) -> None:
         """Gives thread and memory back; calling it twice is fine."""
