@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Protocol, TypeGuard, TypeVar
+from typing import TYPE_CHECKING, Any, Protocol, TypeAlias, TypeGuard, TypeVar
 
 import numpy as np
 import numpy.typing as npt
@@ -59,6 +59,50 @@ class Reducer(Protocol):
         ...
 
 
+class Peers(Protocol):
+    """The trainers of a job from within a program that runs on the devices of all of them."""
+
+    def rank(self) -> jax.Array:
+        """[] int32: the trainer on whose device this is computed."""
+        ...
+
+    def gather(self, values: jax.Array) -> jax.Array:
+        """[K, ...]: `values` of every trainer, in the same order on all."""
+        ...
+
+    def mean(self, buffer: jax.Array) -> jax.Array:
+        """The mean over trainers of `buffer` float32, bit-identical on all."""
+        ...
+
+
+Step: TypeAlias = Callable[[Peers, Any, Any, Any], tuple[Any, Any, Any]]
+"""`(peers, constants, shared, own) -> (shared, own, told)`, trees of arrays.
+
+`shared` and `told` are equal on all trainers if they were before; `constants` and `own` are a
+trainer's own.
+"""
+
+
+class TracedStep(Protocol):
+    """A `Step` of all trainers as one program; every one of them makes the same calls."""
+
+    def trace(self, constants: Any, shared: Any, own: Any) -> None:
+        """Traces it for these arguments, whose constants are kept."""
+        ...
+
+    def compile(self) -> None:
+        """Compiles what was traced, or takes it from the cache."""
+        ...
+
+    def __call__(self, shared: Any, own: Any) -> tuple[Any, Any, Any]:
+        """`(shared, own, told)` on this trainer's device, perhaps not computed yet.
+
+        The arguments are donated. Wait for the results under a reducer's eyes
+        (`DeviceReducer.run_on_device`): they never come if a peer is gone.
+        """
+        ...
+
+
 class DeviceReducer(Reducer, Protocol):
     """A `Reducer` whose mean need not pass through host memory.
 
@@ -93,6 +137,10 @@ class DeviceReducer(Reducer, Protocol):
           PeerLost: the process of another rank is gone.
           CollectiveTimeout: another rank did not arrive in time.
         """
+        ...
+
+    def joint(self, step: Step) -> TracedStep | None:
+        """`step` as one program on the devices of all ranks, None where there can be none."""
         ...
 
 

@@ -17,7 +17,8 @@ import numpy as np
 from gmijax.collectives.buffers import require_device_buffer
 from gmijax.collectives.courier import Courier
 from gmijax.collectives.host import HostExchange
-from gmijax.collectives.interface import DeviceMean
+from gmijax.collectives.interface import DeviceMean, Step, TracedStep
+from gmijax.collectives.joint import JointStep
 from gmijax.collectives.on_device import OnDevice
 from gmijax.collectives.ring import World
 from gmijax.collectives.turns import Turns
@@ -45,6 +46,7 @@ class RingReducer(OnDevice):
         self.world_size = host.world_size
         self._host = host
         self._num_floats = num_floats
+        self._world = world
         self._rings = RingMean(world, num_floats)
         self._courier = Courier("ring")
         host.rendezvous()
@@ -64,6 +66,14 @@ class RingReducer(OnDevice):
         turns.arrive()
         turns.end()
         return result
+
+    def joint(self, step: Step) -> TracedStep | None:
+        """See `DeviceReducer`; with one ring, since a program has each GPU once."""
+        gmis_of_gpu = self._world.layout.gmis_of_gpu
+        if len(gmis_of_gpu[0]) > 1:
+            return None
+        ranks = [gmi for gmis in gmis_of_gpu for gmi in gmis]
+        return JointStep(self._world.mesh(ranks), ranks, step)
 
     def close(self) -> None:
         """Gives thread and memory back; calling it twice is fine."""

@@ -12,7 +12,7 @@ import numpy as np
 
 from gmijax.collectives.buffers import require_device_buffer, require_mean_input
 from gmijax.collectives.host import HostExchange
-from gmijax.collectives.interface import DeviceMean, FloatBuffer
+from gmijax.collectives.interface import DeviceMean, FloatBuffer, Step, TracedStep
 from gmijax.collectives.memory import ExchangeBlock
 from gmijax.collectives.turns import Turns
 
@@ -39,6 +39,11 @@ class OnDevice(ABC):
           CollectiveError: ranks make different calls, or this one is not allowed.
         """
         ...
+
+    def joint(self, step: Step) -> TracedStep | None:
+        """See `DeviceReducer`; None, but for those who make one world of all processes."""
+        del step
+        return None
 
     def mean(self, buffer: FloatBuffer) -> FloatBuffer:
         """The same for a buffer in host memory, with a copy each way; the result is read-only."""

@@ -11,7 +11,7 @@ import atexit
 import functools
 import math
 from collections.abc import Callable, Sequence
-from typing import Any, TypeAlias
+from typing import TypeAlias
 
 import jax
 import jax.numpy as jnp
@@ -23,10 +23,10 @@ from jax._src import distributed, xla_bridge
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
 from gmijax.collectives.courier import end_at_once
+from gmijax.collectives.joint import AXIS
 from gmijax.errors import CollectiveError
 from gmijax.partition.layout import Layout
 
-AXIS = "ring"
 _LOCAL_HOST = "127.0.0.1"
 _LEAVE_TIMEOUT_S = 300
 
@@ -91,10 +91,14 @@ class World:
         jax.devices()
         return world
 
+    def mesh(self, ranks: Sequence[int]) -> Mesh:
+        """A device of each of the GMIs `ranks`, along `AXIS`."""
+        by_process = {device.process_index: device for device in jax.devices()}
+        return Mesh(np.array([by_process[self._process_ids[rank]] for rank in ranks]), (AXIS,))
+
     def ring(self, ranks: Sequence[int], num_floats: int) -> Ring:
         """A ring of the GMIs `ranks`, of which this one must be one; no communication yet."""
-        by_process = {device.process_index: device for device in jax.devices()}
-        return Ring([by_process[self._process_ids[rank]] for rank in ranks], num_floats)
+        return Ring(self.mesh(ranks), num_floats)
 
     def leave(self) -> None:
         """Leaves the coordination service, when all rings have been used once.
@@ -114,14 +118,14 @@ class Ring:
     """A sum over the devices of some GMIs, as one compiled program.
 
     Args:
-      devices: one of each GMI, each on another GPU.
+      mesh: a device of each GMI, each on another GPU.
       num_floats: P, length of the buffers.
     """
 
-    def __init__(self, devices: Sequence[Any], num_floats: int) -> None:
-        self._mesh = Mesh(np.array(devices), (AXIS,))
-        self._sharding = NamedSharding(self._mesh, PartitionSpec(AXIS))
-        self._global_shape = (len(devices) * num_floats,)
+    def __init__(self, mesh: Mesh, num_floats: int) -> None:
+        self._mesh = mesh
+        self._sharding = NamedSharding(mesh, PartitionSpec(AXIS))
+        self._global_shape = (mesh.size * num_floats,)
         self._programs: dict[tuple[_Program, float], Callable[[jax.Array], jax.Array]] = {}
 
     def sum(self, buffer: jax.Array, scale: float = 1.0) -> jax.Array:

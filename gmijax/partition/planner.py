@@ -226,7 +226,10 @@ def _strategy(
             f"{_NO_RINGS[backend].format(choice.strategy)}"
         )
         return "mpr"
-    advice = "" if why_not_under("one_shot", layout, backend) else _ADVICE
+    # With one GMI on each GPU the rings are part of the program that trains.
+    has_better = needs_ring(choice.strategy, layout) and max(map(len, layout.gmis_of_gpu)) == 1
+    is_advised = not has_better and why_not_under("one_shot", layout, backend) is None
+    advice = _ADVICE if is_advised else ""
     reasons.append(f"strategy {choice.strategy}: {choice.why} (Algorithm 1){advice}")
     return choice.strategy
 

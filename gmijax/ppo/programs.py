@@ -1,6 +1,6 @@
-"""What a PPO iteration is, and its form with one GMI: one jit with donated state.
+"""What a PPO iteration is, and its form as one program with donated state.
 
-With several GMIs it is split into several programs (`gmijax.ppo.split`).
+That of one GMI, or of several that have a GPU each. All others split it (`gmijax.ppo.split`).
 
 Programs hold nothing that depends on a GMI's rank (it is an argument), so that all GMIs share
 one entry of the compilation cache.
@@ -13,7 +13,15 @@ from typing import Any, NamedTuple, Protocol
 
 import jax
 import jax.numpy as jnp
+from jax.flatten_util import ravel_pytree
 
+from gmijax.collectives.interface import (
+    DeviceReducer,
+    Peers,
+    Reducer,
+    TracedStep,
+    stays_on_device,
+)
 from gmijax.config import PpoConfig
 from gmijax.learner import (
     Learner,
@@ -26,7 +34,7 @@ from gmijax.learner import (
 )
 from gmijax.ppo.learner import finish_iteration, gradients, minibatch_order, update_context
 from gmijax.ppo.losses import LossMetrics, Samples
-from gmijax.ppo.rollout import RolloutStats, collect
+from gmijax.ppo.rollout import RolloutStats, collect, merge_stats
 from gmijax.sim.interface import EnvSpec
 from gmijax.sim.wrappers import BatchedEnv, BatchState
 from gmijax.types import Array, PyTree
@@ -104,7 +112,7 @@ class FusedIteration:
         # after the next iteration, which has been started by then.
         where = host_sharding()
         self._program: Any = jax.jit(
-            functools.partial(_fused, env, learner),
+            functools.partial(iterate, env, learner, None),
             donate_argnums=(1, 2),
             out_shardings=(None, None, where) if where else None,
         )
@@ -126,9 +134,57 @@ class FusedIteration:
         return self._program(self._env.model, state, env_state)
 
 
-def _fused(
-    env: BatchedEnv, learner: Learner, model: PyTree, state: LearnerState, env_state: BatchState
+class JointIteration:
+    """The iteration of GMIs that have a GPU each, as one program on all of them.
+
+    Args:
+      env: this GMI's environments.
+      reducer: waits for the program, and says who is missing.
+      step: `iterate`, as that reducer's joint step.
+    """
+
+    def __init__(self, env: BatchedEnv, reducer: DeviceReducer, step: TracedStep) -> None:
+        self.times: dict[str, float] = {}
+        self._env = env
+        self._reducer = reducer
+        self._step = step
+
+    @classmethod
+    def if_possible(
+        cls, env: BatchedEnv, learner: Learner, reducer: Reducer
+    ) -> JointIteration | None:
+        """The iteration, None where the GMIs cannot run one program together."""
+        if not stays_on_device(reducer):
+            return None
+        step = reducer.joint(functools.partial(iterate, env, learner))
+        return None if step is None else cls(env, reducer, step)
+
+    def trace(self, state: LearnerState, env_state: BatchState) -> None:
+        """See `Iteration`."""
+        self._step.trace(self._env.model, state, env_state)
+
+    def compile(self) -> None:
+        """See `Iteration`."""
+        self._step.compile()
+
+    def __call__(
+        self,
+        state: LearnerState,
+        env_state: BatchState,
+    ) -> tuple[LearnerState, BatchState, IterationMetrics]:
+        """See `Iteration`; raises what `DeviceReducer.run_on_device` raises."""
+        return self._reducer.run_on_device(lambda _: self._step(state, env_state))
+
+
+def iterate(
+    env: BatchedEnv,
+    learner: Learner,
+    peers: Peers | None,
+    model: PyTree,
+    state: LearnerState,
+    env_state: BatchState,
 ) -> tuple[LearnerState, BatchState, IterationMetrics]:
+    """One PPO iteration as a pure function, with the GMIs `peers` if there are others."""
     env_state, samples, stats = collect(
         env,
         learner.networks,
@@ -138,12 +194,19 @@ def _fused(
         acting_moments(learner, state),
         env_state,
     )
+    rank = jnp.zeros((), jnp.int32)
+    if peers is not None:
+        packed, unpack = ravel_pytree(stats)  # One message, not one for each number.
+        rank, stats = peers.rank(), merge_stats(jax.vmap(unpack)(peers.gather(packed)))
     context = update_context(learner, state, stats)
     flat = flatten(samples)
-    order = minibatch_order(learner, state, jnp.zeros((), jnp.int32), flat.advantage.shape[0])
+    order = minibatch_order(learner, state, rank, flat.advantage.shape[0])
 
     def update(state: LearnerState, indices: Array) -> tuple[LearnerState, LossMetrics]:
         grads, losses = gradients(learner, state.params, flat, indices, context)
+        if peers is not None:
+            packed, unpack = ravel_pytree((grads, losses))
+            grads, losses = unpack(peers.mean(packed))
         return apply_gradients(learner, state, grads, losses.kl), losses
 
     state, losses = jax.lax.scan(update, state, order)

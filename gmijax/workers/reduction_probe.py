@@ -15,7 +15,13 @@ import numpy as np
 
 from gmijax.collectives.build import Membership, build_reducer, join_world
 from gmijax.collectives.device_memory import DeviceMemoryUnavailable
-from gmijax.collectives.interface import DeviceMean, Reducer, stays_on_device
+from gmijax.collectives.interface import (
+    DeviceMean,
+    DeviceReducer,
+    Peers,
+    Reducer,
+    stays_on_device,
+)
 from gmijax.control.selection import CHAIN, TIMEOUT_S, block_variable
 from gmijax.partition.child import ChildLink, required_fd, run_gmi
 from gmijax.partition.plan import Plan
@@ -96,6 +102,10 @@ def _exchange(reducer: Reducer, num_floats: int) -> Callable[[int], Any]:
 
     gradient = jax.device_put(np.ones(num_floats, np.float32))
     if stays_on_device(reducer):
+        alone, chained = (_chained(reducer, gradient, times) for times in (1, CHAIN))
+        if alone is not None and chained is not None:
+            programs = {1: alone, CHAIN: chained}
+            return lambda times: reducer.run_on_device(lambda _: programs[times]())
 
         def on_device(times: int) -> jax.Array:
             def chain(mean: DeviceMean) -> jax.Array:
@@ -117,6 +127,22 @@ def _exchange(reducer: Reducer, num_floats: int) -> Callable[[int], Any]:
         return buffer.block_until_ready()
 
     return through_host
+
+
+def _chained(reducer: DeviceReducer, gradient: jax.Array, times: int) -> Callable[[], Any] | None:
+    """The same as one program of all GMIs, where training is one; None where it is not."""
+    import jax
+
+    def step(peers: Peers, _: Any, buffer: jax.Array, own: Any) -> tuple[jax.Array, Any, Any]:
+        return jax.lax.fori_loop(0, times, lambda _, b: peers.mean(b), buffer), own, ()
+
+    joint = reducer.joint(step)
+    if joint is None:
+        return None
+    joint.trace((), gradient, ())
+    joint.compile()
+    # A copy, because the program takes the memory of what it is given.
+    return lambda: joint(gradient.copy(), ())[0]
 
 
 def _timed(call: Callable[[int], Any], times: int) -> float:

@@ -22,7 +22,7 @@ ITERATIONS = 13
 """Of four updates each: 52 updates."""
 
 
-def _trained(strategy: str, gmis_per_gpu: int, cwd: Path, task: str = TINY[0]) -> list[np.ndarray]:
+def _trained(strategy: str, gmis_per_gpu: int, cwd: Path, task: str) -> list[np.ndarray]:
     """The learner after `ITERATIONS` on two GPUs."""
     plan = ("plan.gpus=2", f"plan.gmis_per_gpu={gmis_per_gpu}", f"reduce.strategy={strategy}")
     steps = ITERATIONS * 2 * gmis_per_gpu * STEPS
@@ -32,28 +32,55 @@ def _trained(strategy: str, gmis_per_gpu: int, cwd: Path, task: str = TINY[0]) -
     return learner_arrays(cwd / strategy)
 
 
+def _point_task(cwd: Path) -> str:
+    # Without contacts: where one begins a step earlier because a sum was rounded otherwise, so
+    # may all that follows.
+    (cwd / "point.py").write_text(POINT_TASK)
+    return "env=point.py:make"
+
+
+def _assert_same(found: list[np.ndarray], expected: list[np.ndarray], what: str) -> None:
+    assert len(found) > 10
+    for array, other in zip(found, expected, strict=True):
+        # Each of 52 updates moves a parameter by 3e-4 at most.
+        np.testing.assert_allclose(array, other, rtol=1e-4, atol=3e-6, err_msg=what)
+
+
 @pytest.mark.timeout(400)
-def test_two_gmis_learn_the_same_bits_under_every_strategy(tmp_path: Path) -> None:
+def test_two_gmis_learn_the_same_bits_through_host_memory_and_rings(tmp_path: Path) -> None:
     # The sum of two numbers has one order only.
-    mpr = _trained("mpr", 1, tmp_path)
-    for strategy in ("mrr", "har", "flat"):
-        for other, expected in zip(_trained(strategy, 1, tmp_path), mpr, strict=True):
-            np.testing.assert_array_equal(other, expected)
+    mpr, har = (_trained(strategy, 1, tmp_path, TINY[0]) for strategy in ("mpr", "har"))
+    assert len(mpr) > 10
+    for other, expected in zip(har, mpr, strict=True):
+        np.testing.assert_array_equal(other, expected)
+
+
+@pytest.mark.timeout(400)
+def test_one_program_of_two_gmis_learns_what_several_programs_do(tmp_path: Path) -> None:
+    task = _point_task(tmp_path)
+    mpr, mrr, flat = (_trained(name, 1, tmp_path, task) for name in ("mpr", "mrr", "flat"))
+    _assert_same(mrr, mpr, "mrr")
+    for other, expected in zip(flat, mrr, strict=True):
+        np.testing.assert_array_equal(other, expected)
+    # Parts of an iteration have times of their own only where they are programs of their own.
+    is_split = {name: "time/update_s" in _last_line(tmp_path / name) for name in ("mpr", "mrr")}
+    assert is_split == {"mpr": True, "mrr": False}
+    mine, other = (_last_line(tmp_path / name) for name in ("mrr", "mpr"))
+    for name in ("reward_per_step", "loss/value_loss", "policy/noise_std"):
+        assert mine[name] == pytest.approx(other[name], rel=1e-3)
+
+
+def _last_line(run: Path) -> dict[str, float]:
+    return json.loads((run / "metrics.jsonl").read_text().splitlines()[-1])
 
 
 @pytest.mark.slow
 @pytest.mark.timeout(400)
 def test_four_gmis_learn_the_same_under_every_strategy(tmp_path: Path) -> None:
-    # Sums in another order: where a contact may begin a step earlier for it, so may all that
-    # follows. There are none in this task.
-    (tmp_path / "point.py").write_text(POINT_TASK)
-    mpr = _trained("mpr", 2, tmp_path, "env=point.py:make")
-    assert len(mpr) > 10
+    task = _point_task(tmp_path)
+    mpr = _trained("mpr", 2, tmp_path, task)
     for strategy in ("mrr", "har"):
-        found = _trained(strategy, 2, tmp_path, "env=point.py:make")
-        for other, expected in zip(found, mpr, strict=True):
-            # Each of 52 updates moves a parameter by 3e-4 at most.
-            np.testing.assert_allclose(other, expected, rtol=1e-4, atol=3e-6)
+        _assert_same(_trained(strategy, 2, tmp_path, task), mpr, strategy)
 
 
 @pytest.mark.timeout(300)

@@ -4,9 +4,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from jax.sharding import Mesh
 from toy_env import point_mass
 
 from gmijax.cli import compose
+from gmijax.collectives.joint import AXIS, JointStep
 from gmijax.collectives.solo import SoloReducer
 from gmijax.learner import (
     adapted_learning_rate,
@@ -15,7 +17,7 @@ from gmijax.learner import (
     make_learner,
 )
 from gmijax.ppo.learner import gradients, minibatch_order, update_context
-from gmijax.ppo.programs import FusedIteration, exchange_size
+from gmijax.ppo.programs import FusedIteration, JointIteration, exchange_size
 from gmijax.ppo.rollout import collect, merge_stats
 from gmijax.ppo.split import SplitIteration
 from gmijax.sim.wrappers import env_keys
@@ -84,19 +86,57 @@ def test_the_learning_rate_follows_the_divergence() -> None:
     assert float(slowest) == pytest.approx(1e-5)
 
 
-def test_both_paths_compute_the_same(learner, config) -> None:
+class Joint(SoloReducer):
+    """One process that makes a program of all devices, of which there is one."""
+
+    is_device_resident = True
+    exchange_s = None
+
+    def joint(self, step):
+        return JointStep(Mesh(np.array(jax.devices()[:1]), (AXIS,)), [0], step)
+
+    def run_on_device(self, program):
+        return program(None)
+
+
+def _joint(learner, config) -> JointIteration:
+    iteration = JointIteration.if_possible(ENV, learner, Joint(exchange_size(ENV.spec, config)))
+    assert iteration is not None
+    return iteration
+
+
+def test_all_paths_compute_the_same(learner, config) -> None:
+    size = exchange_size(ENV.spec, config)
     fused = FusedIteration(ENV, learner)
-    split = SplitIteration(ENV, learner, SoloReducer(exchange_size(ENV.spec, config)))
+    split = SplitIteration(ENV, learner, SoloReducer(size))
     results = []
-    for iteration in (fused, split):
+    for iteration in (fused, split, _joint(learner, config)):
         state, envs = _start(learner)
         iteration.trace(state, envs)
         iteration.compile()
         for _ in range(3):
             state, envs, metrics = iteration(state, envs)
         results.append((state.params, state.obs_moments, envs.env.obs, metrics))
-    # The second result carries counts as floats.
-    _close(results[0], jax.tree.map(lambda x: x, results[1]), atol=1e-4)
+    # Others than the first carry counts as floats.
+    for result in results[1:]:
+        _close(results[0], jax.tree.map(lambda x: x, result), atol=1e-4)
+
+
+def test_one_program_of_all_takes_other_states_than_its_own(learner, config) -> None:
+    iteration = _joint(learner, config)
+    iteration.trace(*_start(learner))
+    iteration.compile()
+    first = iteration(*_start(learner))
+    again = iteration(*_start(learner))
+    jax.tree.map(np.testing.assert_array_equal, first[0].params, again[0].params)
+    then = iteration(*again[:2])
+    assert int(then[0].iteration) == 2
+    assert then[1].env.obs.shape == (N, ENV.spec.obs_size)
+
+
+def test_a_reducer_that_spans_no_program_splits_the_iteration(learner, config) -> None:
+    size = exchange_size(ENV.spec, config)
+    assert JointIteration.if_possible(ENV, learner, SoloReducer(size)) is None
 
 
 class OnDevice(SoloReducer):

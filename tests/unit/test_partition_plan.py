@@ -117,6 +117,15 @@ def test_auto_tells_of_one_shot_where_it_can_be_had(
     assert any("reduce.strategy=one_shot" in why for why in plan.reasons) == is_installed
 
 
+def test_auto_does_not_tell_of_one_shot_where_one_program_trains_on_all_gpus(
+    monkeypatch: pytest.MonkeyPatch,
+):
+    monkeypatch.setattr(reduction, "_is_installed", lambda *_: True)
+    plan = planned(machine(2), gpus=2, backend="share")
+    assert plan.strategy == "mrr"
+    assert not any("one_shot" in why for why in plan.reasons)
+
+
 @pytest.mark.parametrize(
     ("reduce", "changes", "message"),
     [
