@@ -58,26 +58,36 @@ class JointStep:
 
     def __init__(self, mesh: Mesh, ranks: Sequence[int], step: Step) -> None:
         self._mesh = mesh
-        self._step = functools.partial(step, MeshPeers(ranks))
+        # A jit within: otherwise constants of the step become arguments of the program's parts.
+        self._step = jax.jit(functools.partial(step, MeshPeers(ranks)))
         self._program: Any = None
         self._constants: Any = None
+        self._own_shape: Any = None
         self._returned: Any = (None, None)
         self._next: Any = None
 
     def trace(self, constants: Any, shared: Any, own: Any) -> None:
         """See `TracedStep`."""
-        constants_specs, own_specs = _parts(constants), _parts(own)
+        shapes = self._own_shape = jax.eval_shape(lambda tree: tree, own)
+        given = constants
+
+        def inside(constants: Any, shared: Any, own: Any) -> tuple[Any, Any, Any]:
+            whole = _with_empty(given, constants), shared, _with_empty(shapes, own)
+            shared, own, told = self._step(*whole)
+            return shared, _without_empty(own), told
+
         # That members get the same `shared` is for the step to see to: of an `all_gather` jax
         # does not know it.
-        inside = jax.shard_map(
-            self._step,
+        constants, own_specs = _without_empty(constants), _parts(_without_empty(own))
+        mapped = jax.shard_map(
+            inside,
             mesh=self._mesh,
-            in_specs=(constants_specs, _EQUAL, own_specs),
+            in_specs=(_parts(constants), _EQUAL, own_specs),
             out_specs=(_EQUAL, own_specs, _EQUAL),
             check_vma=False,
         )
-        self._constants = self._whole(constants, constants_specs)
-        self._program = jax.jit(inside, donate_argnums=(1, 2)).lower(
+        self._constants = self._whole(constants, _parts(constants))
+        self._program = jax.jit(mapped, donate_argnums=(1, 2)).lower(
             self._constants, *self._wholes(shared, own)
         )
 
@@ -94,16 +104,17 @@ class JointStep:
         is_next = shared is self._returned[0] and own is self._returned[1]
         wholes = self._next if is_next else self._wholes(shared, own)
         self._next = None  # Donated.
-        shared, own, told = self._program(self._constants, *wholes)
+        results = self._program(self._constants, *wholes)
         # While the devices are busy: two hundred views take the host milliseconds.
-        self._next = (shared, own)
-        mine = jax.tree.map(lambda whole: whole.addressable_data(0), (shared, own, told))
-        self._returned = mine[:2]
-        for leaf in jax.tree.leaves(mine[2]):
+        self._next = results[:2]
+        shared, own, told = jax.tree.map(lambda whole: whole.addressable_data(0), results)
+        for leaf in jax.tree.leaves(told):
             leaf.copy_to_host_async()
-        return mine
+        self._returned = shared, _with_empty(self._own_shape, own)
+        return *self._returned, told
 
     def _wholes(self, shared: Any, own: Any) -> tuple[Any, Any]:
+        own = _without_empty(own)
         equal = jax.tree.map(lambda _: _EQUAL, shared)
         return self._whole(shared, equal), self._whole(own, _parts(own))
 
@@ -124,3 +135,20 @@ class JointStep:
 def _parts(tree: Any) -> Any:
     """How each array of a member's own lies among all: a number has no axis to be a part along."""
     return jax.tree.map(lambda leaf: _PART if jnp.ndim(leaf) else _EQUAL, tree)
+
+
+def _without_empty(tree: Any) -> Any:
+    """None for arrays with no elements, of which models of MuJoCo have many.
+
+    XLA's compiler for GPUs crashes where they are arguments of a part of a program (jax 0.11.2).
+    """
+    return jax.tree.map(lambda leaf: leaf if jnp.size(leaf) else None, tree)
+
+
+def _with_empty(shapes: Any, tree: Any) -> Any:
+    """The inverse, given a tree of the same shapes."""
+
+    def leaf_or_empty(shape: Any, leaf: Any) -> Any:
+        return jnp.zeros(jnp.shape(shape), shape.dtype) if leaf is None else leaf
+
+    return jax.tree.map(leaf_or_empty, shapes, tree)
