@@ -19,7 +19,7 @@ import subprocess
 import sys
 import tempfile
 import threading
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from pathlib import Path
@@ -40,6 +40,9 @@ def main() -> int:
     """Runs what the command line asks for; returns 1 if a run failed, else 0."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("suites", nargs="+", choices=sorted(SUITES), metavar="SUITE")
+    parser.add_argument(
+        "--only", default="", metavar="TEXT", help="cases with TEXT in their names"
+    )
     parser.add_argument("--repeats", type=int, default=3)
     parser.add_argument("--gpus", type=int, help="run cases at the same time on so many GPUs")
     parser.add_argument("--together", type=int, default=1, help="runs at a time on each GPU")
@@ -47,7 +50,9 @@ def main() -> int:
     parser.add_argument("--runs", type=Path, help="keep the run folders here")
     parser.add_argument("--resume", action="store_true", help="add to the runs in the JSON file")
     arguments = parser.parse_args()
-    cases = [case for suite in arguments.suites for case in SUITES[suite]]
+    cases = [c for suite in arguments.suites for c in SUITES[suite] if arguments.only in c.name]
+    if not cases:
+        parser.error(f"--only {arguments.only!r}: no case of these suites has that in its name")
     if arguments.gpus is not None:
         large = [case for case in cases if case.gpus > arguments.gpus]
         if len(large) == len(cases):
@@ -63,7 +68,8 @@ def main() -> int:
     }
     with tempfile.TemporaryDirectory() as scratch:
         free = FreeGpus(arguments.gpus, arguments.together) if arguments.gpus else None
-        run_all(books, arguments.repeats, arguments.runs or Path(scratch), free)
+        wanted = frozenset(case.name for case in cases)
+        run_all(books, wanted, arguments.repeats, arguments.runs or Path(scratch), free)
     for book in books.values():
         sys.stdout.write(f"{table(book.results)}\nwritten: {book.path}\n")
     return int(any(book.failures() for book in books.values()))
@@ -102,14 +108,21 @@ class ResultsFile:
         }
         self._lock = threading.Lock()
 
-    def missing(self, repeats: int, gpus: int | None) -> list[tuple[int, Case]]:
-        """Runs to be made, every case once before any case again; none that needs more GPUs."""
+    def missing(
+        self, wanted: Collection[str], repeats: int, gpus: int | None
+    ) -> list[tuple[int, Case]]:
+        """Runs to be made of the cases with the names `wanted`; none that needs more GPUs.
+
+        Every case once before any case again.
+        """
         cases = self.results["cases"]
         return [
             (repeat, case)
             for repeat in range(repeats)
             for case in SUITES[self.results["suite"]]
-            if len(cases[case.name]["runs"]) <= repeat and case.gpus <= (gpus or case.gpus)
+            if case.name in wanted
+            and len(cases[case.name]["runs"]) <= repeat
+            and case.gpus <= (gpus or case.gpus)
         ]
 
     def add(self, case: Case, run: Mapping[str, Any]) -> None:
@@ -166,9 +179,13 @@ class FreeGpus:
 
 
 def run_all(
-    books: Mapping[str, ResultsFile], repeats: int, runs: Path, free: FreeGpus | None
+    books: Mapping[str, ResultsFile],
+    wanted: Collection[str],
+    repeats: int,
+    runs: Path,
+    free: FreeGpus | None,
 ) -> None:
-    """Runs the cases of all suites until each has `repeats` runs; in turn without `free`."""
+    """Runs the cases `wanted` until each has `repeats` runs; in turn without `free`."""
 
     def run(book: ResultsFile, repeat: int, case: Case) -> None:
         # Letters and digits only: the folder is a value on a command line.
@@ -190,7 +207,7 @@ def run_all(
         started = [
             pool.submit(run, book, repeat, case)
             for book in books.values()
-            for repeat, case in book.missing(repeats, free and free.count)
+            for repeat, case in book.missing(wanted, repeats, free and free.count)
         ]
         try:
             for one in started:
