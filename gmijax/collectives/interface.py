@@ -95,10 +95,10 @@ class TracedStep(Protocol):
         ...
 
     def __call__(self, shared: Any, own: Any) -> tuple[Any, Any, Any]:
-        """`(shared, own, told)` on this trainer's device, perhaps not computed yet.
+        """`(shared, own, told)`, the first two on this trainer's device, the last on the host.
 
-        The arguments are donated. Wait for the results under a reducer's eyes
-        (`DeviceReducer.run_on_device`): they never come if a peer is gone.
+        The arguments are donated; `told` passes as float32. Call it under a reducer's eyes
+        (`DeviceReducer.run_on_device`): it never returns if a peer is gone.
         """
         ...
 

@@ -62,19 +62,19 @@ class JointStep:
         self._step = jax.jit(functools.partial(step, MeshPeers(ranks)))
         self._program: Any = None
         self._constants: Any = None
-        self._own_shape: Any = None
+        self._shapes: Any = (None, None)
         self._returned: Any = (None, None)
         self._next: Any = None
 
     def trace(self, constants: Any, shared: Any, own: Any) -> None:
         """See `TracedStep`."""
-        shapes = self._own_shape = jax.eval_shape(lambda tree: tree, own)
-        given = constants
+        constant_shapes, own_shapes = jax.eval_shape(lambda *trees: trees, constants, own)
 
         def inside(constants: Any, shared: Any, own: Any) -> tuple[Any, Any, Any]:
-            whole = _with_empty(given, constants), shared, _with_empty(shapes, own)
-            shared, own, told = self._step(*whole)
-            return shared, _without_empty(own), told
+            constants = _with_empty(constant_shapes, constants)
+            shared, own, told = self._step(constants, shared, _with_empty(own_shapes, own))
+            self._shapes = own_shapes, jax.eval_shape(lambda tree: tree, told)
+            return shared, _without_empty(own), _packed(told)
 
         # That members get the same `shared` is for the step to see to: of an `all_gather` jax
         # does not know it.
@@ -107,11 +107,12 @@ class JointStep:
         results = self._program(self._constants, *wholes)
         # While the devices are busy: two hundred views take the host milliseconds.
         self._next = results[:2]
-        shared, own, told = jax.tree.map(lambda whole: whole.addressable_data(0), results)
-        for leaf in jax.tree.leaves(told):
-            leaf.copy_to_host_async()
-        self._returned = shared, _with_empty(self._own_shape, own)
-        return *self._returned, told
+        shared, own, packed = jax.tree.map(lambda whole: whole.addressable_data(0), results)
+        own_shapes, told_shapes = self._shapes
+        self._returned = shared, _with_empty(own_shapes, own)
+        # Not left on the device until somebody reads it: where steps find memory would then
+        # depend on when that is, and MJX-Warp records its work anew for other addresses.
+        return *self._returned, _unpacked(told_shapes, packed)
 
     def _wholes(self, shared: Any, own: Any) -> tuple[Any, Any]:
         own = _without_empty(own)
@@ -152,3 +153,20 @@ def _with_empty(shapes: Any, tree: Any) -> Any:
         return jnp.zeros(jnp.shape(shape), shape.dtype) if leaf is None else leaf
 
     return jax.tree.map(leaf_or_empty, shapes, tree)
+
+
+def _packed(tree: Any) -> jax.Array | None:
+    """[M] float32, all numbers of `tree` in one message; None where there are none."""
+    leaves = jax.tree.leaves(tree)
+    return jnp.concatenate([jnp.ravel(x).astype(jnp.float32) for x in leaves]) if leaves else None
+
+
+def _unpacked(shapes: Any, packed: jax.Array | None) -> Any:
+    """The inverse, in host memory; waits for `packed`."""
+    if packed is None:
+        return shapes
+    leaves, structure = jax.tree.flatten(shapes)
+    ends = np.cumsum([leaf.size for leaf in leaves])
+    parts = np.split(np.asarray(packed), ends[:-1])
+    arrays = (p.reshape(x.shape).astype(x.dtype) for p, x in zip(parts, leaves, strict=True))
+    return jax.tree.unflatten(structure, arrays)
