@@ -137,9 +137,8 @@ SUITES = MappingProxyType(
             _async("3 + 1 GPUs, one process each", 4, 8192, *_on("3", "1", 1, 1)),
             _async("3 + 1 GPUs, 4 agents + 2 trainers", 4, 2048, *_on("3", "1", 4, 2)),
             _async(
-                *("3 + 1 GPUs, 4 agents + 2 trainers, batches of 4 agents", 4, 2048),
-                *_on("3", "1", 4, 2),
-                "algo.batch_size=8192",
+                *("3 + 1 GPUs, 4 agents + 2 trainers, har, batches of 4 agents", 4, 2048),
+                *(*_on("3", "1", 4, 2), "algo.batch_size=8192", "reduce.strategy=har"),
             ),
             _async(
                 *("4 GPUs, each 3 agents + 1 trainer", 4, 2048),

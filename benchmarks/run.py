@@ -19,7 +19,7 @@ import subprocess
 import sys
 import tempfile
 import threading
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from pathlib import Path
@@ -63,8 +63,13 @@ def main() -> int:
         parser.error(f"--together {arguments.together}: {reason}")
     arguments.out.mkdir(parents=True, exist_ok=True)
     books = {
-        suite: ResultsFile(arguments.out / f"{suite}.json", suite, resume=arguments.resume)
+        suite: ResultsFile(
+            arguments.out / f"{suite}.json",
+            suite,
+            keep=lambda name: arguments.resume or arguments.only not in name,
+        )
         for suite in arguments.suites
+        if any(arguments.only in case.name for case in SUITES[suite])
     }
     with tempfile.TemporaryDirectory() as scratch:
         free = FreeGpus(arguments.gpus, arguments.together) if arguments.gpus else None
@@ -94,8 +99,10 @@ class ResultsFile:
       results: its content.
     """
 
-    def __init__(self, path: Path, suite: str, *, resume: bool) -> None:
-        kept = json.loads(path.read_text())["cases"] if resume and path.exists() else {}
+    def __init__(self, path: Path, suite: str, *, keep: Callable[[str], bool]) -> None:
+        """Starts from what is on disk of the cases that `keep` says."""
+        found = json.loads(path.read_text())["cases"] if path.exists() else {}
+        kept = {name: case for name, case in found.items() if keep(name)}
         for case in kept.values():  # What failed is tried again.
             case["runs"] = [run for run in case["runs"] if "summary" in run]
         self.path = path

@@ -67,7 +67,7 @@ class Peers(Protocol):
         ...
 
     def gather(self, values: jax.Array) -> jax.Array:
-        """[K, ...]: `values` of every trainer, in the same order on all."""
+        """[K, ...]: `values` of every trainer, in order of rank."""
         ...
 
     def mean(self, buffer: jax.Array) -> jax.Array:
@@ -76,9 +76,9 @@ class Peers(Protocol):
 
 
 Step: TypeAlias = Callable[[Peers, Any, Any, Any], tuple[Any, Any, Any]]
-"""`(peers, constants, shared, own) -> (shared, own, told)`, trees of arrays.
+"""`(peers, constants, shared, own) -> (shared, own, metrics)`, trees of arrays.
 
-`shared` and `told` are equal on all trainers if they were before; `constants` and `own` are a
+`shared` and `metrics` are equal on all trainers if they were before; `constants` and `own` are a
 trainer's own.
 """
 
@@ -95,10 +95,14 @@ class TracedStep(Protocol):
         ...
 
     def __call__(self, shared: Any, own: Any) -> tuple[Any, Any, Any]:
-        """`(shared, own, told)`, the first two on this trainer's device, the last on the host.
+        """`(shared, own, metrics)`, the first two on this trainer's device, the last on the host.
 
-        The arguments are donated; `told` passes as float32. Call it under a reducer's eyes
-        (`DeviceReducer.run_on_device`): it never returns if a peer is gone.
+        The arguments are donated; metrics pass as float32. Returns when all is computed, however
+        long that takes while the other trainers are at it too.
+
+        Raises:
+          PeerLost: the process of another trainer is gone.
+          CollectiveTimeout: another trainer did not begin in time, or has not been heard of.
         """
         ...
 
@@ -139,7 +143,7 @@ class DeviceReducer(Reducer, Protocol):
         """
         ...
 
-    def joint(self, step: Step) -> TracedStep | None:
+    def spmd(self, step: Step) -> TracedStep | None:
         """`step` as one program on the devices of all ranks, None where there can be none."""
         ...
 

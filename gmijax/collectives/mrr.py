@@ -8,8 +8,9 @@ ring, and nothing more to do: that is `flat`, plain data parallelism.
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import jax
 import numpy as np
@@ -18,10 +19,11 @@ from gmijax.collectives.buffers import require_device_buffer
 from gmijax.collectives.courier import Courier
 from gmijax.collectives.host import HostExchange
 from gmijax.collectives.interface import DeviceMean, Step, TracedStep
-from gmijax.collectives.joint import JointStep
 from gmijax.collectives.on_device import OnDevice
 from gmijax.collectives.ring import World
+from gmijax.collectives.spmd import SpmdStep
 from gmijax.collectives.turns import Turns
+from gmijax.partition.reduction import is_one_per_gpu
 
 T = TypeVar("T")
 
@@ -59,30 +61,54 @@ class RingReducer(OnDevice):
 
     def run_on_device(self, program: Callable[[DeviceMean], T]) -> T:
         """See `DeviceReducer`; raises what `mean_on_device` raises."""
-        _, turns = self._host.begin("mean", self._num_floats)
-        turns.meet()
-        turns.check_same_call()
-        result = run_watched(self._courier, turns, lambda: program(self._mean))
-        turns.arrive()
-        turns.end()
-        return result
+        return self._together("mean", lambda: program(self._mean))
 
-    def joint(self, step: Step) -> TracedStep | None:
-        """See `DeviceReducer`; with one ring, since a program has each GPU once."""
-        gmis_of_gpu = self._world.layout.gmis_of_gpu
-        if len(gmis_of_gpu[0]) > 1:
+    def spmd(self, step: Step) -> TracedStep | None:
+        """See `DeviceReducer`; with one GMI on each GPU, since a program has each GPU once."""
+        layout = self._world.layout
+        if not is_one_per_gpu(layout):
             return None
-        ranks = [gmi for gmis in gmis_of_gpu for gmi in gmis]
-        return JointStep(self._world.mesh(ranks), ranks, step)
+        ranks = [gmi for gmis in layout.gmis_of_gpu for gmi in gmis]
+        return _WatchedStep(SpmdStep(self._world.mesh(ranks), ranks, step), self._together)
 
     def close(self) -> None:
         """Gives thread and memory back; calling it twice is fine."""
         self._courier.close()
         self._host.close()
 
+    def _together(self, operation: str, program: Callable[[], T]) -> T:
+        """Runs, with all other ranks, a program in which they exchange numbers."""
+        _, turns = self._host.begin(operation, self._num_floats)
+        turns.meet()
+        turns.check_same_call()
+        result = run_watched(self._courier, turns, program, is_step=operation == "step")
+        turns.arrive()
+        turns.end()
+        return result
+
     def _mean(self, buffer: jax.Array) -> jax.Array:
         require_device_buffer(buffer, self._num_floats)
         return self._rings(buffer)
+
+
+class _WatchedStep:
+    """A step that is only called when all ranks have come, while peers are looked at."""
+
+    def __init__(self, step: SpmdStep, together: Callable[[str, Callable[[], Any]], Any]) -> None:
+        self._step = step
+        self._together = together
+
+    def trace(self, constants: Any, shared: Any, own: Any) -> None:
+        """See `TracedStep`."""
+        self._step.trace(constants, shared, own)
+
+    def compile(self) -> None:
+        """See `TracedStep`."""
+        self._step.compile()
+
+    def __call__(self, shared: Any, own: Any) -> tuple[Any, Any, Any]:
+        """See `TracedStep`."""
+        return self._together("step", lambda: self._step(shared, own))
 
 
 class RingMean:
@@ -135,12 +161,22 @@ def open_rings(
     courier.run(first_use, lambda done: done.wait())
 
 
-def run_watched(courier: Courier, turns: Turns, program: Callable[[], T]) -> T:
+def run_watched(
+    courier: Courier, turns: Turns, program: Callable[[], T], *, is_step: bool = False
+) -> T:
     """Runs a program over several GMIs in the courier's thread, to its end.
+
+    Args:
+      courier: of this rank.
+      turns: in a call that has begun.
+      program: that of all ranks.
+      is_step: there is more in it than exchanges. It may take any time while all ranks are at
+        it, and its own errors stay what they are.
 
     Raises:
       PeerLost, CollectiveTimeout: see `Turns.watch`.
       CollectiveError: the transfer failed although all peers are there.
     """
-    with turns.explained():
-        return courier.run(lambda: jax.block_until_ready(program()), turns.watch)
+    watch = functools.partial(turns.watch, is_patient=is_step)
+    with turns.explained(keep_own=is_step):
+        return courier.run(lambda: jax.block_until_ready(program()), watch)

@@ -40,7 +40,7 @@ class OnDevice(ABC):
         """
         ...
 
-    def joint(self, step: Step) -> TracedStep | None:
+    def spmd(self, step: Step) -> TracedStep | None:
         """See `DeviceReducer`; None, but for those who make one world of all processes."""
         del step
         return None

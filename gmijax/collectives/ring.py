@@ -1,8 +1,8 @@
 """Rings between GPUs: the only owner of `jax.distributed`, and of what jax keeps private about it.
 
 All GMIs of a job become processes of one jax world, which gives programs over the devices of
-several GMIs: NCCL between GPUs, gloo between processes on the CPU. Each GMI still computes on its
-own device alone. `docs/reduction.md` says why the world is left again as soon as it stands.
+several GMIs: NCCL between GPUs, gloo between processes on the CPU. `docs/reduction.md` says why
+the world is left again as soon as it stands.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from jax._src import distributed, xla_bridge
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
 from gmijax.collectives.courier import end_at_once
-from gmijax.collectives.joint import AXIS
+from gmijax.collectives.spmd import AXIS
 from gmijax.errors import CollectiveError
 from gmijax.partition.layout import Layout
 
@@ -108,10 +108,10 @@ class World:
         """
         jax.distributed.shutdown()
         atexit.unregister(end_at_once)
-        if jax.devices()[0].platform == "cpu":
-            # Only process 0 writes to the compilation cache. On the CPU a program belongs to one
-            # device of the world, so the others would compile theirs anew in every job.
-            distributed.global_state.process_id = 0
+        # Only process 0 writes to the compilation cache. On the CPU a program belongs to one
+        # device of the world, so the others would compile theirs anew in every job; on GPUs the
+        # GMI that compiles for all need not be process 0.
+        distributed.global_state.process_id = 0
 
 
 class Ring:

@@ -34,20 +34,23 @@ class Suspects:
         self._operation = operation
         self._step = step
         self._timeout_s = timeout_s
-        self._start_s = self._next_look_s = time.monotonic()
+        self._start_s = self._clock_s = self._next_look_s = time.monotonic()
         self._heard: dict[int, tuple[int, float]] = {}
 
     @property
     def is_late(self) -> bool:
         """Whether the time is up."""
-        return time.monotonic() - self._start_s >= self._timeout_s
+        return self._waited_s() >= self._timeout_s
 
-    def look(self, missing: Callable[[], list[int]], *, now: bool = False) -> None:
+    def look(
+        self, missing: Callable[[], list[int]], *, now: bool = False, is_patient: bool = False
+    ) -> None:
         """Looks at those who are missing, five times a second at most unless `now`.
 
         Args:
           missing: ranks that have not arrived, read anew at every call.
           now: look even if the last time was a moment ago.
+          is_patient: the time starts anew while all who are missing are heard of.
 
         Raises:
           PeerLost: the process of one of them is gone.
@@ -60,12 +63,14 @@ class Suspects:
         self._block.lines["beats"][self._block.rank] += 1
         self._check_alive(missing)
         self._listen(now_s)
+        if is_patient and (left := missing()) and not self.silent(left):
+            self._clock_s, late = now_s, False
         if late and (left := missing()):
             self.give_up(left)
 
     def give_up(self, missing: list[int]) -> NoReturn:
         """Raises CollectiveTimeout for those of `missing` who do not wait themselves."""
-        self._raise_timeout(self.silent(missing) or missing, time.monotonic() - self._start_s)
+        self._raise_timeout(self.silent(missing) or missing, self._waited_s())
 
     def silent(self, missing: list[int]) -> list[int]:
         """Those of `missing` who do not wait themselves, as far as this rank has heard."""
@@ -85,7 +90,10 @@ class Suspects:
         cause = blamed(gone[0]) - 1
         if cause in (self._block.rank, *gone) or self._is_gone(cause):
             self._raise_lost(gone[0] if cause == self._block.rank else cause)
-        self._raise_timeout([cause], time.monotonic() - self._start_s)
+        self._raise_timeout([cause], self._waited_s())
+
+    def _waited_s(self) -> float:
+        return time.monotonic() - self._clock_s
 
     def _is_gone(self, peer: int) -> bool:
         # A rank that has not attached cannot be told from one that is still starting.

@@ -18,7 +18,7 @@ from gmijax.collectives.suspects import Suspects
 from gmijax.collectives.waits import LIVENESS_PERIOD_S, MAX_SLEEP_S, MIN_SLEEP_S, SPIN_S, Fence
 from gmijax.errors import CollectiveError
 
-OPERATIONS = ("mean", "all_gather")
+OPERATIONS = ("mean", "all_gather", "step")
 """What a rank can be calling; the wire format holds the position in this tuple."""
 
 COUNT_SHIFT = 8  # bits of a call word below the number of floats
@@ -99,11 +99,16 @@ class Turns:
         self.arrive()
         self._wait()
 
-    def watch(self, done: threading.Event) -> None:
+    def watch(self, done: threading.Event, *, is_patient: bool = False) -> None:
         """Waits for a thread of this rank that exchanges numbers with peers in its own way.
 
         Returns when `done` is set. Until then peers are looked at that have not arrived where
         this rank arrives next.
+
+        Args:
+          done: when this is set.
+          is_patient: time only counts while one of them is silent, or none is left. If all of
+            them are caught in it with this rank, the controller will see that nothing goes on.
 
         Raises:
           PeerLost: the process of such a peer is gone.
@@ -111,7 +116,7 @@ class Turns:
         """
         suspects = self._suspects()
         while not done.wait(LIVENESS_PERIOD_S):
-            suspects.look(self._behind, now=True)
+            suspects.look(self._behind, now=True, is_patient=is_patient)
             if suspects.is_late:  # All have come out of it but this rank.
                 suspects.give_up(self._peers)
 
@@ -130,8 +135,11 @@ class Turns:
             suspects.give_up(silent)
 
     @contextmanager
-    def explained(self) -> Iterator[None]:
+    def explained(self, *, keep_own: bool = False) -> Iterator[None]:
         """Says of a transfer that fails whose end made it fail.
+
+        Args:
+          keep_own: an error that no peer explains stays what it is.
 
         Raises:
           PeerLost, CollectiveTimeout: see `explain_failure`.
@@ -143,6 +151,8 @@ class Turns:
         # errors of jax and of shared device memory are RuntimeErrors.
         except (RuntimeError, ValueError) as error:
             self.explain_failure()
+            if keep_own:
+                raise
             said = (str(error).splitlines() or [type(error).__name__])[0]
             raise CollectiveError(f"{self.where()}: {said}") from error
 

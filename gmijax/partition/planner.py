@@ -21,6 +21,7 @@ from gmijax.partition.machine import Machine
 from gmijax.partition.nvidia import Gpu
 from gmijax.partition.plan import BackendName, Plan, Slice
 from gmijax.partition.reduction import (
+    is_one_per_gpu,
     needs_ring,
     require_strategy,
     select_strategy,
@@ -226,9 +227,8 @@ def _strategy(
             f"{_NO_RINGS[backend].format(choice.strategy)}"
         )
         return "mpr"
-    # With one GMI on each GPU the rings are part of the program that trains.
-    has_better = needs_ring(choice.strategy, layout) and max(map(len, layout.gmis_of_gpu)) == 1
-    is_advised = not has_better and why_not_under("one_shot", layout, backend) is None
+    # With one GMI on each GPU the ring is part of the program that trains.
+    is_advised = not is_one_per_gpu(layout) and not why_not_under("one_shot", layout, backend)
     advice = _ADVICE if is_advised else ""
     reasons.append(f"strategy {choice.strategy}: {choice.why} (Algorithm 1){advice}")
     return choice.strategy

@@ -104,6 +104,11 @@ def needs_ring(strategy: str, layout: Layout) -> bool:
     return strategy in ("mrr", "flat") or (strategy == "har" and layout.num_gpus > 1)
 
 
+def is_one_per_gpu(layout: Layout) -> bool:
+    """Whether rings can be part of one program on all GPUs: it has each of them once."""
+    return layout.num_gpus > 1 and layout.num_gmis == layout.num_gpus
+
+
 def leaders(layout: Layout) -> tuple[int, ...]:
     """The GMI of every GPU that speaks for it in HAR.
 

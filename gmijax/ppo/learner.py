@@ -1,7 +1,8 @@
 """The pure update functions of PPO.
 
-Two paths are built from them in `gmijax.ppo.programs`, and no third: one GMI runs the whole
-iteration as one jit; several GMIs split at the gradient, with a reducer between the halves.
+Two paths are built from them, and no third: one program of the whole iteration, of one GMI or of
+several with a GPU each (`gmijax.ppo.programs`); and several, split at the gradient with a reducer
+between the halves (`gmijax.ppo.split`).
 """
 
 from __future__ import annotations

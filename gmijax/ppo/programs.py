@@ -2,8 +2,8 @@
 
 That of one GMI, or of several that have a GPU each. All others split it (`gmijax.ppo.split`).
 
-Programs hold nothing that depends on a GMI's rank (it is an argument), so that all GMIs share
-one entry of the compilation cache.
+Programs hold nothing that depends on a GMI's rank (it is an argument, or looked up by the place
+of the device), so that all GMIs share one entry of the compilation cache.
 """
 
 from __future__ import annotations
@@ -16,7 +16,6 @@ import jax.numpy as jnp
 from jax.flatten_util import ravel_pytree
 
 from gmijax.collectives.interface import (
-    DeviceReducer,
     Peers,
     Reducer,
     TracedStep,
@@ -134,30 +133,30 @@ class FusedIteration:
         return self._program(self._env.model, state, env_state)
 
 
-class JointIteration:
+class SpmdIteration:
     """The iteration of GMIs that have a GPU each, as one program on all of them.
+
+    Its metrics are in host memory, and it returns when all is computed.
 
     Args:
       env: this GMI's environments.
-      reducer: waits for the program, and says who is missing.
-      step: `iterate`, as that reducer's joint step.
+      step: `iterate`, as one program.
     """
 
-    def __init__(self, env: BatchedEnv, reducer: DeviceReducer, step: TracedStep) -> None:
+    def __init__(self, env: BatchedEnv, step: TracedStep) -> None:
         self.times: dict[str, float] = {}
         self._env = env
-        self._reducer = reducer
         self._step = step
 
     @classmethod
     def if_possible(
         cls, env: BatchedEnv, learner: Learner, reducer: Reducer
-    ) -> JointIteration | None:
+    ) -> SpmdIteration | None:
         """The iteration, None where the GMIs cannot run one program together."""
         if not stays_on_device(reducer):
             return None
-        step = reducer.joint(functools.partial(iterate, env, learner))
-        return None if step is None else cls(env, reducer, step)
+        step = reducer.spmd(functools.partial(iterate, env, learner))
+        return None if step is None else cls(env, step)
 
     def trace(self, state: LearnerState, env_state: BatchState) -> None:
         """See `Iteration`."""
@@ -172,8 +171,8 @@ class JointIteration:
         state: LearnerState,
         env_state: BatchState,
     ) -> tuple[LearnerState, BatchState, IterationMetrics]:
-        """See `Iteration`; raises what `DeviceReducer.run_on_device` raises."""
-        return self._reducer.run_on_device(lambda _: self._step(state, env_state))
+        """See `Iteration`; raises what `TracedStep` raises."""
+        return self._step(state, env_state)
 
 
 def iterate(

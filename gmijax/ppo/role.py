@@ -23,7 +23,7 @@ from gmijax.errors import NonFiniteError, ParameterMismatch
 from gmijax.learner import Learner, LearnerState, init_learner, make_learner
 from gmijax.metrics import JsonlSink, MetricsLog, TensorBoardSink
 from gmijax.partition.child import ChildLink
-from gmijax.ppo.programs import FusedIteration, Iteration, JointIteration
+from gmijax.ppo.programs import FusedIteration, Iteration, SpmdIteration
 from gmijax.ppo.remote import RemoteIteration, Servants
 from gmijax.ppo.report import Reporter, ReportThread
 from gmijax.ppo.split import SplitIteration
@@ -153,7 +153,7 @@ class _SyncTrainer:
             return RemoteIteration(env, learner, reducer, self._servants)
         if reducer.world_size == 1:
             return FusedIteration(env, learner)
-        joint = JointIteration.if_possible(env, learner, reducer)
+        joint = SpmdIteration.if_possible(env, learner, reducer)
         return joint or SplitIteration(env, learner, reducer)
 
     def _first_state(self) -> tuple[LearnerState, Any]:

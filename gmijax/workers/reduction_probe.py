@@ -102,10 +102,10 @@ def _exchange(reducer: Reducer, num_floats: int) -> Callable[[int], Any]:
 
     gradient = jax.device_put(np.ones(num_floats, np.float32))
     if stays_on_device(reducer):
-        alone, chained = (_chained(reducer, gradient, times) for times in (1, CHAIN))
-        if alone is not None and chained is not None:
-            programs = {1: alone, CHAIN: chained}
-            return lambda times: reducer.run_on_device(lambda _: programs[times]())
+        alone, chain = _means(reducer, gradient, 1), _means(reducer, gradient, CHAIN)
+        if alone is not None and chain is not None:
+            programs = {1: alone, CHAIN: chain}
+            return lambda times: programs[times]()
 
         def on_device(times: int) -> jax.Array:
             def chain(mean: DeviceMean) -> jax.Array:
@@ -129,20 +129,28 @@ def _exchange(reducer: Reducer, num_floats: int) -> Callable[[int], Any]:
     return through_host
 
 
-def _chained(reducer: DeviceReducer, gradient: jax.Array, times: int) -> Callable[[], Any] | None:
-    """The same as one program of all GMIs, where training is one; None where it is not."""
+def _means(reducer: DeviceReducer, gradient: jax.Array, times: int) -> Callable[[], None] | None:
+    """So many means, one of the other, in one program of all GMIs, as where training is one.
+
+    None where it is not.
+    """
     import jax
 
     def step(peers: Peers, _: Any, buffer: jax.Array, own: Any) -> tuple[jax.Array, Any, Any]:
         return jax.lax.fori_loop(0, times, lambda _, b: peers.mean(b), buffer), own, ()
 
-    joint = reducer.joint(step)
-    if joint is None:
+    program = reducer.spmd(step)
+    if program is None:
         return None
-    joint.trace((), gradient, ())
-    joint.compile()
-    # A copy, because the program takes the memory of what it is given.
-    return lambda: joint(gradient.copy(), ())[0]
+    program.trace((), gradient, ())
+    program.compile()
+    # A copy, because the program takes the memory of what it is given; from then on its own.
+    carried = [(gradient.copy(), ())]
+
+    def call() -> None:
+        carried[0] = program(*carried[0])[:2]
+
+    return call
 
 
 def _timed(call: Callable[[int], Any], times: int) -> float:

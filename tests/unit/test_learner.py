@@ -8,8 +8,8 @@ from jax.sharding import Mesh
 from toy_env import point_mass
 
 from gmijax.cli import compose
-from gmijax.collectives.joint import AXIS, JointStep
 from gmijax.collectives.solo import SoloReducer
+from gmijax.collectives.spmd import AXIS, SpmdStep
 from gmijax.learner import (
     adapted_learning_rate,
     apply_gradients,
@@ -17,7 +17,7 @@ from gmijax.learner import (
     make_learner,
 )
 from gmijax.ppo.learner import gradients, minibatch_order, update_context
-from gmijax.ppo.programs import FusedIteration, JointIteration, exchange_size
+from gmijax.ppo.programs import FusedIteration, SpmdIteration, exchange_size
 from gmijax.ppo.rollout import collect, merge_stats
 from gmijax.ppo.split import SplitIteration
 from gmijax.sim.wrappers import env_keys
@@ -86,21 +86,17 @@ def test_the_learning_rate_follows_the_divergence() -> None:
     assert float(slowest) == pytest.approx(1e-5)
 
 
-class Joint(SoloReducer):
+class Spmd(SoloReducer):
     """One process that makes a program of all devices, of which there is one."""
 
     is_device_resident = True
-    exchange_s = None
 
-    def joint(self, step):
-        return JointStep(Mesh(np.array(jax.devices()[:1]), (AXIS,)), [0], step)
-
-    def run_on_device(self, program):
-        return program(None)
+    def spmd(self, step):
+        return SpmdStep(Mesh(np.array(jax.devices()[:1]), (AXIS,)), [0], step)
 
 
-def _joint(learner, config) -> JointIteration:
-    iteration = JointIteration.if_possible(ENV, learner, Joint(exchange_size(ENV.spec, config)))
+def _spmd(learner, config) -> SpmdIteration:
+    iteration = SpmdIteration.if_possible(ENV, learner, Spmd(exchange_size(ENV.spec, config)))
     assert iteration is not None
     return iteration
 
@@ -110,33 +106,36 @@ def test_all_paths_compute_the_same(learner, config) -> None:
     fused = FusedIteration(ENV, learner)
     split = SplitIteration(ENV, learner, SoloReducer(size))
     results = []
-    for iteration in (fused, split, _joint(learner, config)):
+    for iteration in (fused, split, _spmd(learner, config)):
         state, envs = _start(learner)
         iteration.trace(state, envs)
         iteration.compile()
         for _ in range(3):
             state, envs, metrics = iteration(state, envs)
         results.append((state.params, state.obs_moments, envs.env.obs, metrics))
-    # Others than the first carry counts as floats.
     for result in results[1:]:
-        _close(results[0], jax.tree.map(lambda x: x, result), atol=1e-4)
+        _close(results[0], result, atol=1e-4)
 
 
 def test_one_program_of_all_takes_other_states_than_its_own(learner, config) -> None:
-    iteration = _joint(learner, config)
+    iteration = _spmd(learner, config)
     iteration.trace(*_start(learner))
     iteration.compile()
-    first = iteration(*_start(learner))
+    state, envs, _ = iteration(*_start(learner))
+    once = jax.device_get(state.params)
+    copies = jax.tree.map(jnp.copy, (state, envs))
+    continued = iteration(state, envs)
     again = iteration(*_start(learner))
-    jax.tree.map(np.testing.assert_array_equal, first[0].params, again[0].params)
-    then = iteration(*again[:2])
-    assert int(then[0].iteration) == 2
-    assert then[1].env.obs.shape == (N, ENV.spec.obs_size)
+    jax.tree.map(np.testing.assert_array_equal, once, again[0].params)
+    # As a resumed run does.
+    resumed = iteration(*copies)
+    jax.tree.map(np.testing.assert_array_equal, continued[0].params, resumed[0].params)
+    np.testing.assert_array_equal(continued[1].env.obs, resumed[1].env.obs)
 
 
 def test_a_reducer_that_spans_no_program_splits_the_iteration(learner, config) -> None:
     size = exchange_size(ENV.spec, config)
-    assert JointIteration.if_possible(ENV, learner, SoloReducer(size)) is None
+    assert SpmdIteration.if_possible(ENV, learner, SoloReducer(size)) is None
 
 
 class OnDevice(SoloReducer):

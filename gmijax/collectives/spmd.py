@@ -1,7 +1,8 @@
-"""One program on the devices of several GMIs, each with arrays of its own: plain data parallelism.
+"""One program on the devices of several GMIs (SPMD), each with arrays of its own.
 
-What a GMI carries from step to step stays on its device. For jax each array is a part of one that
-lies on all devices, or the same on all of them; neither view costs a copy.
+That is plain data parallelism. What a GMI carries from step to step stays on its device. For jax
+each array is a part of one that lies on all devices, or the same on all of them; neither view
+costs a copy.
 """
 
 from __future__ import annotations
@@ -18,8 +19,8 @@ from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from gmijax.collectives.interface import Step
 
 AXIS = "ring"
-_EQUAL = PartitionSpec()
-_PART = PartitionSpec(AXIS)
+_REPLICATED = PartitionSpec()
+_SHARDED = PartitionSpec(AXIS)
 
 
 class MeshPeers:
@@ -38,14 +39,15 @@ class MeshPeers:
 
     def gather(self, values: jax.Array) -> jax.Array:
         """See `Peers`."""
-        return jax.lax.all_gather(values, AXIS)
+        in_mesh = jax.lax.all_gather(values, AXIS)
+        return jnp.stack([in_mesh[place] for place in np.argsort(self._ranks)])
 
     def mean(self, buffer: jax.Array) -> jax.Array:
         """See `Peers`."""
         return jax.lax.psum(buffer, AXIS) * np.float32(1.0 / len(self._ranks))
 
 
-class JointStep:
+class SpmdStep:
     """A step of several GMIs as one program: `TracedStep`.
 
     Every member calls it, and is then caught in it until all others have: meet them before.
@@ -62,33 +64,37 @@ class JointStep:
         self._step = jax.jit(functools.partial(step, MeshPeers(ranks)))
         self._program: Any = None
         self._constants: Any = None
-        self._shapes: Any = (None, None)
+        self._own_shapes: Any = None
+        self._metric_shapes: Any = None
+        self._empty: dict[Any, jax.Array] = {}
         self._returned: Any = (None, None)
         self._next: Any = None
 
     def trace(self, constants: Any, shared: Any, own: Any) -> None:
         """See `TracedStep`."""
-        constant_shapes, own_shapes = jax.eval_shape(lambda *trees: trees, constants, own)
+        constant_shapes, self._own_shapes = jax.eval_shape(lambda *trees: trees, constants, own)
 
         def inside(constants: Any, shared: Any, own: Any) -> tuple[Any, Any, Any]:
             constants = _with_empty(constant_shapes, constants)
-            shared, own, told = self._step(constants, shared, _with_empty(own_shapes, own))
-            self._shapes = own_shapes, jax.eval_shape(lambda tree: tree, told)
-            return shared, _without_empty(own), _packed(told)
+            shared, own, metrics = self._step(
+                constants, shared, _with_empty(self._own_shapes, own)
+            )
+            self._metric_shapes = jax.eval_shape(lambda tree: tree, metrics)
+            return shared, _without_empty(own), _packed(metrics)
 
         # That members get the same `shared` is for the step to see to: of an `all_gather` jax
         # does not know it.
-        constants, own_specs = _without_empty(constants), _parts(_without_empty(own))
+        constants, own_specs = _without_empty(constants), _specs(_without_empty(own))
         mapped = jax.shard_map(
             inside,
             mesh=self._mesh,
-            in_specs=(_parts(constants), _EQUAL, own_specs),
-            out_specs=(_EQUAL, own_specs, _EQUAL),
+            in_specs=(_specs(constants), _REPLICATED, own_specs),
+            out_specs=(_REPLICATED, own_specs, _REPLICATED),
             check_vma=False,
         )
-        self._constants = self._whole(constants, _parts(constants))
+        self._constants = self._global(constants, _specs(constants))
         self._program = jax.jit(mapped, donate_argnums=(1, 2)).lower(
-            self._constants, *self._wholes(shared, own)
+            self._constants, *self._arguments(shared, own)
         )
 
     def compile(self) -> None:
@@ -102,40 +108,43 @@ class JointStep:
     def __call__(self, shared: Any, own: Any) -> tuple[Any, Any, Any]:
         """See `TracedStep`."""
         is_next = shared is self._returned[0] and own is self._returned[1]
-        wholes = self._next if is_next else self._wholes(shared, own)
-        self._next = None  # Donated.
-        results = self._program(self._constants, *wholes)
+        arguments = self._next if is_next else self._arguments(shared, own)
+        self._returned, self._next = (None, None), None  # Donated.
+        results = self._program(self._constants, *arguments)
         # While the devices are busy: two hundred views take the host milliseconds.
         self._next = results[:2]
-        shared, own, packed = jax.tree.map(lambda whole: whole.addressable_data(0), results)
-        own_shapes, told_shapes = self._shapes
-        self._returned = shared, _with_empty(own_shapes, own)
+        shared, own, packed = jax.tree.map(lambda array: array.addressable_data(0), results)
+        self._returned = shared, _with_empty(self._own_shapes, own, self._empty)
         # Not left on the device until somebody reads it: where steps find memory would then
         # depend on when that is, and MJX-Warp records its work anew for other addresses.
-        return *self._returned, _unpacked(told_shapes, packed)
+        return *self._returned, _unpacked(self._metric_shapes, packed)
 
-    def _wholes(self, shared: Any, own: Any) -> tuple[Any, Any]:
+    def _arguments(self, shared: Any, own: Any) -> tuple[Any, Any]:
         own = _without_empty(own)
-        equal = jax.tree.map(lambda _: _EQUAL, shared)
-        return self._whole(shared, equal), self._whole(own, _parts(own))
+        replicated = jax.tree.map(lambda _: _REPLICATED, shared)
+        return self._global(shared, replicated), self._global(own, _specs(own))
 
-    def _whole(self, tree: Any, specs: Any) -> Any:
+    def _global(self, tree: Any, specs: Any) -> Any:
         """This member's arrays as jax sees those of all together."""
 
-        def whole(array: Any, spec: PartitionSpec) -> jax.Array:
+        def one(array: Any, spec: PartitionSpec) -> jax.Array:
             array = jnp.asarray(array)
             shape = array.shape
-            if spec == _PART:
+            if spec == _SHARDED:
                 shape = (shape[0] * self._mesh.size, *shape[1:])
             sharding = NamedSharding(self._mesh, spec)
             return jax.make_array_from_single_device_arrays(shape, sharding, [array])
 
-        return jax.tree.map(whole, tree, specs)
+        return jax.tree.map(one, tree, specs)
 
 
-def _parts(tree: Any) -> Any:
-    """How each array of a member's own lies among all: a number has no axis to be a part along."""
-    return jax.tree.map(lambda leaf: _PART if jnp.ndim(leaf) else _EQUAL, tree)
+def _specs(tree: Any) -> Any:
+    """How the arrays of a member lie among those of all.
+
+    A number has no axis to be sharded along. Each member computes with its own all the same: in
+    a `shard_map` nothing is made equal.
+    """
+    return jax.tree.map(lambda leaf: _SHARDED if jnp.ndim(leaf) else _REPLICATED, tree)
 
 
 def _without_empty(tree: Any) -> Any:
@@ -146,11 +155,17 @@ def _without_empty(tree: Any) -> Any:
     return jax.tree.map(lambda leaf: leaf if jnp.size(leaf) else None, tree)
 
 
-def _with_empty(shapes: Any, tree: Any) -> Any:
-    """The inverse, given a tree of the same shapes."""
+def _with_empty(shapes: Any, tree: Any, made: dict[Any, jax.Array] | None = None) -> Any:
+    """The inverse, given the shapes of the whole; takes from `made` and adds what is missing."""
+    made = {} if made is None else made
 
     def leaf_or_empty(shape: Any, leaf: Any) -> Any:
-        return jnp.zeros(jnp.shape(shape), shape.dtype) if leaf is None else leaf
+        if leaf is not None:
+            return leaf
+        kind = shape.shape, shape.dtype
+        if kind not in made:
+            made[kind] = jnp.zeros(*kind)
+        return made[kind]
 
     return jax.tree.map(leaf_or_empty, shapes, tree)
 
