@@ -153,8 +153,8 @@ class _SyncTrainer:
             return RemoteIteration(env, learner, reducer, self._servants)
         if reducer.world_size == 1:
             return FusedIteration(env, learner)
-        joint = SpmdIteration.if_possible(env, learner, reducer)
-        return joint or SplitIteration(env, learner, reducer)
+        spmd = SpmdIteration.if_possible(env, learner, reducer)
+        return spmd or SplitIteration(env, learner, reducer)
 
     def _first_state(self) -> tuple[LearnerState, Any]:
         base = jax.random.key(self._config.seed)
