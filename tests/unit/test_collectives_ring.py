@@ -5,8 +5,10 @@ from __future__ import annotations
 import jax
 import numpy as np
 import pytest
+from jax.sharding import Mesh
 
 from gmijax.collectives.ring import Ring, process_ids
+from gmijax.collectives.spmd import AXIS
 from gmijax.partition.layout import Layout
 
 
@@ -27,7 +29,7 @@ def test_members_of_a_ring_have_consecutive_numbers(
 
 
 def test_a_ring_of_one_scales_and_broadcasts() -> None:
-    ring = Ring(jax.local_devices()[:1], 5)
+    ring = Ring(Mesh(np.array(jax.local_devices()[:1]), (AXIS,)), 5)
     values = np.array([1.0, -2.5, 0.0, np.inf, 3e38], np.float32)
     buffer = jax.device_put(values)
     np.testing.assert_array_equal(ring.sum(buffer), values)
