@@ -29,15 +29,10 @@ from benchmarks.run import RESULTS
 from gmijax import compose
 from gmijax.acting import act
 from gmijax.config import PpoConfig, TrainConfig
-from gmijax.learner import Learner, acting_moments, apply_gradients, init_learner, make_learner
+from gmijax.learner import Learner, acting_moments, init_learner, make_learner
 from gmijax.partition.resource_model import dominant_resource
-from gmijax.ppo.learner import (
-    finish_iteration,
-    gradients,
-    minibatch_order,
-    update_context,
-)
 from gmijax.ppo.losses import Samples
+from gmijax.ppo.programs import learn
 from gmijax.ppo.rollout import stats_example
 from gmijax.sim.build import make_training_env
 from gmijax.sim.interface import EnvSpec
@@ -189,9 +184,8 @@ def _stages(config: TrainConfig, impl: str) -> Iterator[Stage]:
     actions = jax.random.uniform(key, zeros.shape, minval=-1.0)
     samples = _samples(num_envs * algo.unroll_length, env.spec, key)
     stats = stats_example(env.spec, env.overflows)
-    context = update_context(learner, state, stats)
     yield Stage("agent", partial(_act, learner, zeros.shape[1]), state, (envs, zeros))
-    yield Stage("trainer", partial(_train, learner), (samples, stats, context), state)
+    yield Stage("trainer", partial(_train, learner), (samples, stats), state)
     yield Stage("simulator", partial(_simulate, env, algo), (env.model, actions), envs)
 
 
@@ -222,15 +216,8 @@ def _act(learner: Learner, size: int, state: Any, carry: Any) -> Any:
 
 def _train(learner: Learner, given: Any, state: Any) -> Any:
     """All updates of an iteration."""
-    samples, stats, context = given
-    count = samples.advantage.shape[0]
-    order = minibatch_order(learner, state, jnp.zeros((), jnp.int32), count)
-
-    def update(state: Any, indices: Any) -> Any:
-        grads, losses = gradients(learner, state.params, samples, indices, context)
-        return apply_gradients(learner, state, grads, losses.kl), None
-
-    return finish_iteration(jax.lax.scan(update, state, order)[0], stats)
+    samples, stats = given
+    return learn(learner, None, state, samples, stats, jnp.zeros((), jnp.int32))[0]
 
 
 def _samples(count: int, spec: EnvSpec, key: jax.Array) -> Samples:

@@ -19,7 +19,7 @@ import subprocess
 import sys
 import tempfile
 import threading
-from collections.abc import Callable, Collection, Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from pathlib import Path
@@ -62,18 +62,18 @@ def main() -> int:
     if arguments.together > 1 and (reason := why_not_together(cases, arguments.gpus)):
         parser.error(f"--together {arguments.together}: {reason}")
     arguments.out.mkdir(parents=True, exist_ok=True)
+    wanted = {case.name for case in cases}
     books = {
         suite: ResultsFile(
             arguments.out / f"{suite}.json",
             suite,
-            keep=lambda name: arguments.resume or arguments.only not in name,
+            keep=names if arguments.resume else names - wanted,
         )
         for suite in arguments.suites
-        if any(arguments.only in case.name for case in SUITES[suite])
+        if wanted & (names := {case.name for case in SUITES[suite]})
     }
     with tempfile.TemporaryDirectory() as scratch:
         free = FreeGpus(arguments.gpus, arguments.together) if arguments.gpus else None
-        wanted = frozenset(case.name for case in cases)
         run_all(books, wanted, arguments.repeats, arguments.runs or Path(scratch), free)
     for book in books.values():
         sys.stdout.write(f"{table(book.results)}\nwritten: {book.path}\n")
@@ -99,10 +99,10 @@ class ResultsFile:
       results: its content.
     """
 
-    def __init__(self, path: Path, suite: str, *, keep: Callable[[str], bool]) -> None:
-        """Starts from what is on disk of the cases that `keep` says."""
-        found = json.loads(path.read_text())["cases"] if path.exists() else {}
-        kept = {name: case for name, case in found.items() if keep(name)}
+    def __init__(self, path: Path, suite: str, *, keep: Collection[str]) -> None:
+        """Starts from what is on disk of the cases `keep`."""
+        found = json.loads(path.read_text())["cases"] if keep and path.exists() else {}
+        kept = {name: case for name, case in found.items() if name in keep}
         for case in kept.values():  # What failed is tried again.
             case["runs"] = [run for run in case["runs"] if "summary" in run]
         self.path = path

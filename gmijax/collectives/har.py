@@ -92,8 +92,6 @@ class DeviceHarReducer(_Hierarchy[jax.Array], HostPaced):
     the k-th GMIs of all GPUs have a ring. Then nobody waits for a leader's answer.
     """
 
-    is_device_resident = True
-
     def _exchange(self, buffer: jax.Array, block: ExchangeBlock, turns: Turns) -> jax.Array:
         scale = 1.0 if self._ring else 1.0 / self.world_size
         mean = self._intra.sum(buffer, block, turns, scale)

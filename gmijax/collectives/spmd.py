@@ -14,6 +14,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.flatten_util import ravel_pytree
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
 from gmijax.collectives.interface import Step
@@ -64,26 +65,25 @@ class SpmdStep:
         self._step = jax.jit(functools.partial(step, MeshPeers(ranks)))
         self._program: Any = None
         self._constants: Any = None
-        self._own_shapes: Any = None
+        self._own_empty: Any = None
         self._metric_shapes: Any = None
-        self._empty: dict[Any, jax.Array] = {}
         self._returned: Any = (None, None)
         self._next: Any = None
 
     def trace(self, constants: Any, shared: Any, own: Any) -> None:
         """See `TracedStep`."""
-        constant_shapes, self._own_shapes = jax.eval_shape(lambda *trees: trees, constants, own)
+        whole_constants, whole_own = constants, own
 
         def inside(constants: Any, shared: Any, own: Any) -> tuple[Any, Any, Any]:
-            constants = _with_empty(constant_shapes, constants)
-            shared, own, metrics = self._step(
-                constants, shared, _with_empty(self._own_shapes, own)
-            )
+            constants = _merged(constants, _empty(whole_constants))
+            own = _merged(own, _empty(whole_own))
+            shared, own, metrics = self._step(constants, shared, own)
             self._metric_shapes = jax.eval_shape(lambda tree: tree, metrics)
             return shared, _without_empty(own), _packed(metrics)
 
         # That members get the same `shared` is for the step to see to: of an `all_gather` jax
         # does not know it.
+        self._own_empty = _empty(own)
         constants, own_specs = _without_empty(constants), _specs(_without_empty(own))
         mapped = jax.shard_map(
             inside,
@@ -114,7 +114,7 @@ class SpmdStep:
         # While the devices are busy: two hundred views take the host milliseconds.
         self._next = results[:2]
         shared, own, packed = jax.tree.map(lambda array: array.addressable_data(0), results)
-        self._returned = shared, _with_empty(self._own_shapes, own, self._empty)
+        self._returned = shared, _merged(own, self._own_empty)
         # Not left on the device until somebody reads it: where steps find memory would then
         # depend on when that is, and MJX-Warp records its work anew for other addresses.
         return *self._returned, _unpacked(self._metric_shapes, packed)
@@ -155,25 +155,23 @@ def _without_empty(tree: Any) -> Any:
     return jax.tree.map(lambda leaf: leaf if jnp.size(leaf) else None, tree)
 
 
-def _with_empty(shapes: Any, tree: Any, made: dict[Any, jax.Array] | None = None) -> Any:
-    """The inverse, given the shapes of the whole; takes from `made` and adds what is missing."""
-    made = {} if made is None else made
+def _empty(tree: Any) -> Any:
+    """The arrays with no elements, made anew, and None for all others."""
+    return jax.tree.map(lambda x: None if jnp.size(x) else jnp.zeros(x.shape, x.dtype), tree)
 
-    def leaf_or_empty(shape: Any, leaf: Any) -> Any:
-        if leaf is not None:
-            return leaf
-        kind = shape.shape, shape.dtype
-        if kind not in made:
-            made[kind] = jnp.zeros(*kind)
-        return made[kind]
 
-    return jax.tree.map(leaf_or_empty, shapes, tree)
+def _merged(tree: Any, empty: Any) -> Any:
+    """The whole, from what `_without_empty` and `_empty` give."""
+    return jax.tree.map(
+        lambda leaf, other: other if leaf is None else leaf,
+        *(tree, empty),
+        is_leaf=lambda leaf: leaf is None,
+    )
 
 
 def _packed(tree: Any) -> jax.Array | None:
     """[M] float32, all numbers of `tree` in one message; None where there are none."""
-    leaves = jax.tree.leaves(tree)
-    return jnp.concatenate([jnp.ravel(x).astype(jnp.float32) for x in leaves]) if leaves else None
+    return ravel_pytree(tree)[0].astype(jnp.float32) if jax.tree.leaves(tree) else None
 
 
 def _unpacked(shapes: Any, packed: jax.Array | None) -> Any:

@@ -197,17 +197,28 @@ def iterate(
     if peers is not None:
         packed, unpack = ravel_pytree(stats)  # One message, not one for each number.
         rank, stats = peers.rank(), merge_stats(jax.vmap(unpack)(peers.gather(packed)))
+    state, losses = learn(learner, peers, state, flatten(samples), stats, rank)
+    return state, env_state, metrics_of(state, stats, jax.tree.map(jnp.mean, losses))
+
+
+def learn(
+    learner: Learner,
+    peers: Peers | None,
+    state: LearnerState,
+    samples: Samples,
+    stats: RolloutStats,
+    rank: Array,
+) -> tuple[LearnerState, LossMetrics]:
+    """All updates of an iteration, on flat samples; losses of every minibatch."""
     context = update_context(learner, state, stats)
-    flat = flatten(samples)
-    order = minibatch_order(learner, state, rank, flat.advantage.shape[0])
+    order = minibatch_order(learner, state, rank, samples.advantage.shape[0])
 
     def update(state: LearnerState, indices: Array) -> tuple[LearnerState, LossMetrics]:
-        grads, losses = gradients(learner, state.params, flat, indices, context)
+        grads, losses = gradients(learner, state.params, samples, indices, context)
         if peers is not None:
             packed, unpack = ravel_pytree((grads, losses))
             grads, losses = unpack(peers.mean(packed))
         return apply_gradients(learner, state, grads, losses.kl), losses
 
     state, losses = jax.lax.scan(update, state, order)
-    state = finish_iteration(state, stats)
-    return state, env_state, metrics_of(state, stats, jax.tree.map(jnp.mean, losses))
+    return finish_iteration(state, stats), losses
