@@ -6,6 +6,7 @@ named in its options and writes what the body returns, or how it failed, to a JS
 
 from __future__ import annotations
 
+import faulthandler
 import hashlib
 import json
 import os
@@ -19,6 +20,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pytest
 
 from gmijax.collectives.build import Membership, build_reducer, join_world
 from gmijax.collectives.host import HostExchange
@@ -112,11 +114,22 @@ class Ranks:
         """What `ranks` (default: all) came to, once their processes have ended."""
         found = []
         for rank in ranks or range(self.world_size):
-            self.processes[rank].wait(WAIT_S)
+            self._wait_for_end(rank)
             path = self.folder / f"result_{rank}"
             assert path.exists(), (self.folder / f"stderr_{rank}").read_text()
             found.append(json.loads(path.read_text()))
         return found
+
+    def _wait_for_end(self, rank: int) -> None:
+        process = self.processes[rank]
+        try:
+            process.wait(WAIT_S)
+        except subprocess.TimeoutExpired:
+            process.send_signal(signal.SIGUSR1)  # It says where it is, see `main`.
+            time.sleep(1.0)
+            has_result = (self.folder / f"result_{rank}").exists()
+            said = (self.folder / f"stderr_{rank}").read_text()
+            pytest.fail(f"rank {rank} does not end, has a result: {has_result}\n{said}")
 
 
 def check_means(reducer: Reducer, options: Options) -> Options:
@@ -297,6 +310,7 @@ def make_reducer(options: Options) -> Reducer:
 
 def main(options: Options) -> None:
     """One rank: builds its reducer, runs the body, writes the result."""
+    faulthandler.register(signal.SIGUSR1, all_threads=True)
     result: Options = {"error": None}
     try:
         reducer = make_reducer(options)

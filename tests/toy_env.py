@@ -5,6 +5,9 @@ from __future__ import annotations
 import jax
 import jax.numpy as jnp
 
+from gmijax.ppo.losses import LossMetrics
+from gmijax.ppo.programs import IterationMetrics
+from gmijax.ppo.rollout import RolloutStats
 from gmijax.sim.interface import Env, EnvSpec, EnvState
 from gmijax.sim.wrappers import BatchedEnv, time_limit, training_env
 
@@ -52,3 +55,10 @@ def point_mass_env(episode_length: int = 20) -> Env:
 
     env = Env(spec, jnp.ones(()), reset, step, None, lambda state: state.physics[0][None])
     return time_limit(env, episode_length)
+
+
+def metrics_from(stats: RolloutStats) -> IterationMetrics:
+    """Of an iteration with such rollouts whose updates told zeros."""
+    zero = jnp.zeros(())
+    told = stats.episodes, stats.reward_sum, stats.diverged, stats.overflowed
+    return IterationMetrics(*told, LossMetrics(*[zero] * 5), zero, zero)

@@ -133,7 +133,7 @@ class LeaderRing:
 
     def mean(self, total: jax.Array, turns: Turns) -> jax.Array:
         """The mean over all GMIs, from the `total` [P] of every GPU; raises as `run_watched`."""
-        return run_watched(self._courier, turns, lambda: self._mean(total))
+        return run_watched(self._courier, turns, lambda: jax.block_until_ready(self._mean(total)))
 
     def close(self) -> None:
         """Ends the thread; calling it twice is fine."""

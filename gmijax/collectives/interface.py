@@ -97,12 +97,20 @@ class TracedStep(Protocol):
     def __call__(self, shared: Any, own: Any) -> tuple[Any, Any, Any]:
         """`(shared, own, metrics)`, the first two on this trainer's device, the last on the host.
 
-        The arguments are donated; metrics pass as float32. Returns when all is computed, however
-        long that takes while the other trainers are at it too.
+        The arguments are donated. All of it may still be computed, but for the metrics of the
+        call before; these are there, however long that took while the other trainers were at it
+        too.
 
         Raises:
           PeerLost: the process of another trainer is gone.
           CollectiveTimeout: another trainer did not begin in time, or has not been heard of.
+        """
+        ...
+
+    def wait(self) -> None:
+        """Returns when the last call is computed; raises what `__call__` raises.
+
+        Before its results are read: who reads them would wait for ever for a trainer that died.
         """
         ...
 

@@ -61,7 +61,7 @@ class RingReducer(OnDevice):
 
     def run_on_device(self, program: Callable[[DeviceMean], T]) -> T:
         """See `DeviceReducer`; raises what `mean_on_device` raises."""
-        return self._together("mean", lambda: program(self._mean))
+        return self._together("mean", lambda: jax.block_until_ready(program(self._mean)))
 
     def spmd(self, step: Step) -> TracedStep | None:
         """See `DeviceReducer`; with one GMI on each GPU, since a program has each GPU once."""
@@ -81,8 +81,12 @@ class RingReducer(OnDevice):
         _, turns = self._host.begin(operation, self._num_floats)
         turns.meet()
         turns.check_same_call()
-        result = run_watched(self._courier, turns, program, is_step=operation == "step")
-        turns.arrive()
+        is_step = operation == "step"
+        result = run_watched(self._courier, turns, program, is_step=is_step)
+        if is_step:  # Some have given it to their devices an iteration before others.
+            turns.meet(is_patient=True)
+        else:
+            turns.arrive()
         turns.end()
         return result
 
@@ -109,6 +113,10 @@ class _WatchedStep:
     def __call__(self, shared: Any, own: Any) -> tuple[Any, Any, Any]:
         """See `TracedStep`."""
         return self._together("step", lambda: self._step(shared, own))
+
+    def wait(self) -> None:
+        """See `TracedStep`."""
+        self._together("step", self._step.wait)
 
 
 class RingMean:
@@ -164,7 +172,7 @@ def open_rings(
 def run_watched(
     courier: Courier, turns: Turns, program: Callable[[], T], *, is_step: bool = False
 ) -> T:
-    """Runs a program over several GMIs in the courier's thread, to its end.
+    """Runs a program over several GMIs in the courier's thread.
 
     Args:
       courier: of this rank.
@@ -179,4 +187,4 @@ def run_watched(
     """
     watch = functools.partial(turns.watch, is_patient=is_step)
     with turns.explained(keep_own=is_step):
-        return courier.run(lambda: jax.block_until_ready(program()), watch)
+        return courier.run(program, watch)

@@ -14,7 +14,6 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.flatten_util import ravel_pytree
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
 from gmijax.collectives.interface import Step
@@ -51,7 +50,9 @@ class MeshPeers:
 class SpmdStep:
     """A step of several GMIs as one program: `TracedStep`.
 
-    Every member calls it, and is then caught in it until all others have: meet them before.
+    Every member calls it, and is then caught in it until all others have: meet them before. A
+    call returns when the devices have been given all of it, and the call before is computed: so
+    they have the next one waiting when they are through with this one.
 
     Args:
       mesh: one device of each member, along `AXIS`.
@@ -66,9 +67,9 @@ class SpmdStep:
         self._program: Any = None
         self._constants: Any = None
         self._own_empty: Any = None
-        self._metric_shapes: Any = None
         self._returned: Any = (None, None)
         self._next: Any = None
+        self._told: Any = None
 
     def trace(self, constants: Any, shared: Any, own: Any) -> None:
         """See `TracedStep`."""
@@ -78,8 +79,7 @@ class SpmdStep:
             constants = _merged(constants, _empty(whole_constants))
             own = _merged(own, _empty(whole_own))
             shared, own, metrics = self._step(constants, shared, own)
-            self._metric_shapes = jax.eval_shape(lambda tree: tree, metrics)
-            return shared, _without_empty(own), _packed(metrics)
+            return shared, _without_empty(own), metrics
 
         # That members get the same `shared` is for the step to see to: of an `all_gather` jax
         # does not know it.
@@ -93,16 +93,17 @@ class SpmdStep:
             check_vma=False,
         )
         self._constants = self._global(constants, _specs(constants))
-        self._program = jax.jit(mapped, donate_argnums=(1, 2)).lower(
-            self._constants, *self._arguments(shared, own)
-        )
+        # Metrics are in memory of the host, as those of one GMI (`FusedIteration`).
+        told = NamedSharding(self._mesh, _REPLICATED, memory_kind="pinned_host")
+        out_shardings = (None, None, told) if self._is_on_gpus else None
+        program = jax.jit(mapped, donate_argnums=(1, 2), out_shardings=out_shardings)
+        self._program = program.lower(self._constants, *self._arguments(shared, own))
 
     def compile(self) -> None:
         """See `TracedStep`."""
-        on_gpu = self._mesh.local_devices[0].platform == "gpu"
         # Members have left jax's coordination service, by which they would share the tuning.
         self._program = self._program.compile(
-            {"xla_gpu_shard_autotuning": False} if on_gpu else {}
+            {"xla_gpu_shard_autotuning": False} if self._is_on_gpus else {}
         )
 
     def __call__(self, shared: Any, own: Any) -> tuple[Any, Any, Any]:
@@ -113,11 +114,19 @@ class SpmdStep:
         results = self._program(self._constants, *arguments)
         # While the devices are busy: two hundred views take the host milliseconds.
         self._next = results[:2]
-        shared, own, packed = jax.tree.map(lambda array: array.addressable_data(0), results)
+        shared, own, metrics = jax.tree.map(lambda array: array.addressable_data(0), results)
         self._returned = shared, _merged(own, self._own_empty)
-        # Not left on the device until somebody reads it: where steps find memory would then
-        # depend on when that is, and MJX-Warp records its work anew for other addresses.
-        return *self._returned, _unpacked(self._metric_shapes, packed)
+        jax.block_until_ready(self._told)
+        self._told = metrics
+        return *self._returned, metrics
+
+    def wait(self) -> None:
+        """See `TracedStep`."""
+        jax.block_until_ready((self._next, self._told))
+
+    @property
+    def _is_on_gpus(self) -> bool:
+        return self._mesh.local_devices[0].platform == "gpu"
 
     def _arguments(self, shared: Any, own: Any) -> tuple[Any, Any]:
         own = _without_empty(own)
@@ -167,19 +176,3 @@ def _merged(tree: Any, empty: Any) -> Any:
         *(tree, empty),
         is_leaf=lambda leaf: leaf is None,
     )
-
-
-def _packed(tree: Any) -> jax.Array | None:
-    """[M] float32, all numbers of `tree` in one message; None where there are none."""
-    return ravel_pytree(tree)[0].astype(jnp.float32) if jax.tree.leaves(tree) else None
-
-
-def _unpacked(shapes: Any, packed: jax.Array | None) -> Any:
-    """The inverse, in host memory; waits for `packed`."""
-    if packed is None:
-        return shapes
-    leaves, structure = jax.tree.flatten(shapes)
-    ends = np.cumsum([leaf.size for leaf in leaves])
-    parts = np.split(np.asarray(packed), ends[:-1])
-    arrays = (p.reshape(x.shape).astype(x.dtype) for p, x in zip(parts, leaves, strict=True))
-    return jax.tree.unflatten(structure, arrays)

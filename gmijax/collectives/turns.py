@@ -87,17 +87,20 @@ class Turns:
         word = OPERATIONS.index(operation) | count << COUNT_SHIFT
         self._block.lines["call"][rank, self.step % 2] = word
 
-    def meet(self) -> None:
+    def meet(self, *, is_patient: bool = False) -> None:
         """Arrives, and waits until all ranks have arrived here.
 
         What a rank wrote before is visible to all after it, and what it read before is read.
+
+        Args:
+          is_patient: time only counts while one of those who have not arrived is silent.
 
         Raises:
           PeerLost: the process of a rank that has not arrived is gone.
           CollectiveTimeout: ranks did not arrive in time.
         """
         self.arrive()
-        self._wait()
+        self._wait(is_patient=is_patient)
 
     def watch(self, done: threading.Event, *, is_patient: bool = False) -> None:
         """Waits for a thread of this rank that exchanges numbers with peers in its own way.
@@ -191,7 +194,7 @@ class Turns:
         for peer in self._peers:
             check_peer(self._block, peer)
 
-    def _wait(self) -> None:
+    def _wait(self, *, is_patient: bool = False) -> None:
         target = int(self._sequence[self._block.rank])
         start = time.monotonic()
         suspects, pause_s = self._suspects(), MIN_SLEEP_S
@@ -202,7 +205,7 @@ class Turns:
             else:
                 time.sleep(pause_s)
                 pause_s = min(2 * pause_s, MAX_SLEEP_S)
-                suspects.look(lambda: self._missing(self._peers, target))
+                suspects.look(lambda: self._missing(self._peers, target), is_patient=is_patient)
             missing = self._missing(missing, target)
         self._fence()
 

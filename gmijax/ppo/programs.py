@@ -35,21 +35,28 @@ from gmijax.ppo.learner import finish_iteration, gradients, minibatch_order, upd
 from gmijax.ppo.losses import LossMetrics, Samples
 from gmijax.ppo.rollout import RolloutStats, collect, merge_stats
 from gmijax.sim.interface import EnvSpec
-from gmijax.sim.wrappers import BatchedEnv, BatchState
+from gmijax.sim.wrappers import BatchedEnv, BatchState, EpisodeSums
 from gmijax.types import Array, PyTree
 
 
 class IterationMetrics(NamedTuple):
     """What one iteration tells, over all GMIs; leaves are scalars.
 
+    No two of them may be the same number by definition: a GPU's program writes one of these to
+    the host and copies it there to the other, for which the host waits until all else is done.
+
     Attributes:
-      stats: merged statistics of the rollouts.
+      episodes: sums over the episodes that ended.
+      reward_sum, diverged, overflowed: see `RolloutStats`.
       losses: means over all minibatches of the iteration.
       learning_rate: after the last update.
       noise_std: mean standard deviation of the policy.
     """
 
-    stats: RolloutStats
+    episodes: EpisodeSums
+    reward_sum: Array
+    diverged: dict[str, Array]
+    overflowed: dict[str, Array]
     losses: LossMetrics
     learning_rate: Array
     noise_std: Array
@@ -78,7 +85,17 @@ class Iteration(Protocol):
         state: LearnerState,
         env_state: BatchState,
     ) -> tuple[LearnerState, BatchState, IterationMetrics]:
-        """Runs one iteration; both states are donated and must not be used again."""
+        """Runs one iteration; both states are donated and must not be used again.
+
+        What it returns may still be computed; what the call before told is there.
+        """
+        ...
+
+    def wait(self) -> None:
+        """Returns when nothing of the last call needs another GMI any more.
+
+        Before its results are read: who reads them would wait for ever for a GMI that died.
+        """
         ...
 
 
@@ -98,7 +115,16 @@ def flatten(samples: Samples) -> Samples:
 def metrics_of(state: LearnerState, stats: RolloutStats, losses: LossMetrics) -> IterationMetrics:
     """What an iteration tells, from its results."""
     std = jnp.mean(jnp.exp(state.params.log_std))
-    return IterationMetrics(stats, losses, state.learning_rate, std)
+    # Without the moments: they have O numbers each and are of no use in a log.
+    return IterationMetrics(
+        stats.episodes,
+        stats.reward_sum,
+        stats.diverged,
+        stats.overflowed,
+        losses,
+        state.learning_rate,
+        std,
+    )
 
 
 class FusedIteration:
@@ -132,11 +158,12 @@ class FusedIteration:
         """See `Iteration`."""
         return self._program(self._env.model, state, env_state)
 
+    def wait(self) -> None:
+        """See `Iteration`; there is no other GMI."""
+
 
 class SpmdIteration:
     """The iteration of GMIs that have a GPU each, as one program on all of them.
-
-    Its metrics are in host memory, and it returns when all is computed.
 
     Args:
       env: this GMI's environments.
@@ -173,6 +200,10 @@ class SpmdIteration:
     ) -> tuple[LearnerState, BatchState, IterationMetrics]:
         """See `Iteration`; raises what `TracedStep` raises."""
         return self._step(state, env_state)
+
+    def wait(self) -> None:
+        """See `Iteration`; raises what `TracedStep` raises."""
+        self._step.wait()
 
 
 def iterate(

@@ -100,6 +100,9 @@ class RemoteIteration:
         self.times = {"time/rollout_s": rollout_s, **self._updates.times}
         return state, env_state, metrics
 
+    def wait(self) -> None:
+        """See `Iteration`; a call returns after the last exchange."""
+
     def close(self) -> None:
         """Tells those that serve to end."""
         for gmi in self._servants.gmis:

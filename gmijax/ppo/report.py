@@ -58,13 +58,11 @@ class Reporter:
         Raises:
           NonFiniteError: an observation, a reward or a loss is NaN or infinite.
         """
-        # Scalars only: the moments have O numbers each and are of no use in a log.
-        scalars = metrics._replace(stats=metrics.stats._replace(obs=0.0, advantage=0.0))
-        host: Any = jax.tree.map(float, jax.device_get(scalars))
+        host: Any = jax.tree.map(float, jax.device_get(metrics))
         now = time.monotonic()
         self._check_finite(host, env_steps)
-        self.overflows.add(host.stats.overflowed)
-        episodes = host.stats.episodes
+        self.overflows.add(host.overflowed)
+        episodes = host.episodes
         self._window.add(Episodes(**episodes._asdict()))
         means = self._window.means()
         self.last_return = means["return"]
@@ -77,9 +75,9 @@ class Reporter:
                 "wall_s": now - self._started,
                 "env_steps_per_s": steps / duration,
                 **means,
-                "diverged_steps": host.stats.diverged["any"],
-                **overflow_line(host.stats.overflowed),
-                "reward_per_step": host.stats.reward_sum / steps,
+                "diverged_steps": host.diverged["any"],
+                **overflow_line(host.overflowed),
+                "reward_per_step": host.reward_sum / steps,
                 **{f"loss/{name}": value for name, value in host.losses._asdict().items()},
                 "policy/learning_rate": host.learning_rate,
                 "policy/noise_std": host.noise_std,
@@ -94,7 +92,7 @@ class Reporter:
 
     def _check_finite(self, host: Any, env_steps: int) -> None:
         where = f"{self._env_name}, up to env step {env_steps}"
-        check_diverged(where, host.stats.diverged, env_steps - self._env_steps)
+        check_diverged(where, host.diverged, env_steps - self._env_steps)
         losses = host.losses._asdict()
         if names := [name for name, value in losses.items() if not abs(value) < float("inf")]:
             raise NonFiniteError(f"{where}: {', '.join(names)} of the update is not finite")

@@ -207,11 +207,15 @@ class _SyncTrainer:
             stop = self._agree_to_stop()
             is_last = stop or self._env_steps >= self._config.num_timesteps
             if not is_last and every and self._iterations % every == 0:
-                lines.wait()  # A resumed run goes on from the lines up to its checkpoint.
+                self._settle(lines)  # A resumed run goes on from the lines up to its checkpoint.
                 self._save(state, env_state)
-        lines.wait()
+        self._settle(lines)
         self._save(state, env_state)
         return state, env_state, stop
+
+    def _settle(self, lines: ReportThread) -> None:
+        self._iteration.wait()
+        lines.wait()
 
     def _agree_to_stop(self) -> bool:
         # Only one GMI may have heard of it yet; all must leave after the same iteration.

@@ -108,6 +108,9 @@ class SplitIteration:
         self.times = {"time/rollout_s": rollout_s, **self.times}
         return state, env_state, metrics
 
+    def wait(self) -> None:
+        """See `Iteration`; a call returns after the last exchange."""
+
     def update(
         self, state: LearnerState, samples: Samples, order: Array, mine: FloatBuffer
     ) -> tuple[LearnerState, IterationMetrics]:

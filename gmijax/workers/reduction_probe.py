@@ -149,6 +149,7 @@ def _means(reducer: DeviceReducer, gradient: jax.Array, times: int) -> Callable[
 
     def call() -> None:
         carried[0] = program(*carried[0])[:2]
+        program.wait()
 
     return call
 

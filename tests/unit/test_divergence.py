@@ -6,12 +6,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from toy_env import point_mass
+from toy_env import metrics_from, point_mass
 
 from gmijax.errors import NonFiniteError
 from gmijax.metrics import Line, MetricsLog
 from gmijax.physics_health import TOLERATED_STEPS
-from gmijax.ppo.losses import LossMetrics
 from gmijax.ppo.programs import IterationMetrics
 from gmijax.ppo.report import Reporter, ReportThread
 from gmijax.ppo.rollout import stats_example
@@ -63,8 +62,7 @@ def test_few_bad_steps_are_tolerated_and_many_are_named(count: int) -> None:
     stats = stats._replace(
         diverged=stats.diverged | {"any": jnp.asarray(count), "reward/near": jnp.asarray(count)}
     )
-    zero = jnp.zeros(())
-    metrics = IterationMetrics(stats, LossMetrics(*[zero] * 5), zero, zero)
+    metrics = metrics_from(stats)
     reporter = Reporter("point_mass", MetricsLog(()), 0)
     if count <= TOLERATED_STEPS:
         reporter.report(64, metrics, {})
@@ -76,8 +74,7 @@ def test_few_bad_steps_are_tolerated_and_many_are_named(count: int) -> None:
 def _metrics(bad_steps: int) -> IterationMetrics:
     stats = stats_example(ENV.spec)
     stats = stats._replace(diverged=stats.diverged | {"any": jnp.asarray(bad_steps)})
-    zero = jnp.zeros(())
-    return IterationMetrics(stats, LossMetrics(*[zero] * 5), zero, zero)
+    return metrics_from(stats)
 
 
 def test_lines_come_in_order_from_a_thread_of_their_own_and_errors_with_the_next_call() -> None:

@@ -7,10 +7,9 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import pytest
-from toy_env import point_mass_env
+from toy_env import metrics_from, point_mass_env
 
 from gmijax.metrics import Line, MetricsLog
-from gmijax.ppo.losses import LossMetrics
 from gmijax.ppo.programs import IterationMetrics
 from gmijax.ppo.report import Reporter
 from gmijax.ppo.rollout import stats_example
@@ -38,8 +37,7 @@ def metrics(env: Any, overflowed: dict[str, int]) -> IterationMetrics:
     stats = stats._replace(
         overflowed={name: jnp.asarray(count) for name, count in overflowed.items()}
     )
-    zero = jnp.zeros(())
-    return IterationMetrics(stats, LossMetrics(*[zero] * 5), zero, zero)
+    return metrics_from(stats)
 
 
 def test_worlds_that_met_a_full_buffer_are_counted_by_buffer() -> None:
