@@ -312,6 +312,7 @@ def main(options: Options) -> None:
     """One rank: builds its reducer, runs the body, writes the result."""
     faulthandler.register(signal.SIGUSR1, all_threads=True)
     result: Options = {"error": None}
+    failure: GmijaxError | None = None
     try:
         reducer = make_reducer(options)
         try:
@@ -320,6 +321,7 @@ def main(options: Options) -> None:
             reducer.close()
             reducer.close()
     except GmijaxError as error:
+        failure = error
         result |= {"error": type(error).__name__, "message": str(error)}
         result["failed_at_s"] = time.monotonic()
         if isinstance(error, PeerLost):
@@ -329,6 +331,8 @@ def main(options: Options) -> None:
     path = Path(options["folder"]) / f"result_{options['rank']}"
     path.with_suffix(".part").write_text(json.dumps(result))
     path.with_suffix(".part").rename(path)
+    if failure is not None:
+        raise failure  # As a GMI ends: nothing is freed that a stuck call may use, see `Courier`.
 
 
 if __name__ == "__main__":

@@ -38,13 +38,17 @@ class Courier:
     """One daemon thread that runs one call at a time.
 
     A call that its owner gives up is left alone, and with it the thread. The process can still
-    raise, report and clean up, but it ends without the shutdown of the libraries that the thread
-    is stuck in, which could wait for ever (exit code 1).
+    raise and report, but it ends without the shutdown of the libraries that the thread is stuck
+    in, which could wait for ever (exit code 1). So does CUDA where memory or a program of a GPU
+    is freed on which a kernel waits: all of it must stay until the process ends.
+
+    Attributes:
+      is_stuck: whether a call has been given up.
     """
 
     def __init__(self, name: str) -> None:
         self._calls: SimpleQueue[_Call | None] = SimpleQueue()
-        self._is_stuck = False
+        self.is_stuck = False
         threading.Thread(target=self._serve, name=name, daemon=True).start()
 
     def run(self, function: Callable[[], T], wait: Callable[[threading.Event], object]) -> T:
@@ -75,8 +79,8 @@ class Courier:
             del call  # Nothing of it may outlive the caller's interest.
 
     def _give_up(self) -> None:
-        if not self._is_stuck:
-            self._is_stuck = True
+        if not self.is_stuck:
+            self.is_stuck = True
             # Runs first of all such functions, because they run in reverse order.
             atexit.register(end_at_once)
 

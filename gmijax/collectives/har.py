@@ -54,7 +54,8 @@ class _Hierarchy(Generic[B]):
         """Gives thread and memory back, once no result is in use; calling it twice is fine."""
         if self._ring is not None:
             self._ring.close()
-        self._intra.close()
+        if self._ring is None or not self._ring.is_stuck:
+            self._intra.close()
         self._host.close()
 
 
@@ -134,6 +135,11 @@ class LeaderRing:
     def mean(self, total: jax.Array, turns: Turns) -> jax.Array:
         """The mean over all GMIs, from the `total` [P] of every GPU; raises as `run_watched`."""
         return run_watched(self._courier, turns, lambda: jax.block_until_ready(self._mean(total)))
+
+    @property
+    def is_stuck(self) -> bool:
+        """See `Courier`."""
+        return self._courier.is_stuck
 
     def close(self) -> None:
         """Ends the thread; calling it twice is fine."""
