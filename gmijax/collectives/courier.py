@@ -39,8 +39,8 @@ class Courier:
 
     A call that its owner gives up is left alone, and with it the thread. The process can still
     raise and report, but it ends without the shutdown of the libraries that the thread is stuck
-    in, which could wait for ever (exit code 1). So does CUDA where memory or a program of a GPU
-    is freed on which a kernel waits: all of it must stay until the process ends.
+    in, which could wait for ever (exit code 1). Until then memory and programs of its GPU must
+    stay: CUDA frees none while a kernel there waits.
 
     Attributes:
       is_stuck: whether a call has been given up.

@@ -8,6 +8,7 @@ ring, and nothing more to do: that is `flat`, plain data parallelism.
 
 from __future__ import annotations
 
+import atexit
 import functools
 from collections.abc import Callable
 from typing import Any, TypeVar
@@ -16,7 +17,7 @@ import jax
 import numpy as np
 
 from gmijax.collectives.buffers import require_device_buffer
-from gmijax.collectives.courier import Courier
+from gmijax.collectives.courier import Courier, end_at_once
 from gmijax.collectives.host import HostExchange
 from gmijax.collectives.interface import DeviceMean, Step, TracedStep
 from gmijax.collectives.on_device import OnDevice
@@ -96,11 +97,16 @@ class RingReducer(OnDevice):
 
 
 class _WatchedStep:
-    """A step that is only called when all ranks have come, while peers are looked at."""
+    """A step that is only called when all ranks have come, while peers are looked at.
+
+    From the first call until `wait` the device may be at it, and wait for one that is gone: what
+    ends this process meanwhile, wherever it is found, ends it at once (see `Courier`).
+    """
 
     def __init__(self, step: SpmdStep, together: Callable[[str, Callable[[], Any]], Any]) -> None:
         self._step = step
         self._together = together
+        self._is_running = False
 
     def trace(self, constants: Any, shared: Any, own: Any) -> None:
         """See `TracedStep`."""
@@ -112,11 +118,16 @@ class _WatchedStep:
 
     def __call__(self, shared: Any, own: Any) -> tuple[Any, Any, Any]:
         """See `TracedStep`."""
+        if not self._is_running:
+            self._is_running = True
+            atexit.register(end_at_once)
         return self._together("step", lambda: self._step(shared, own))
 
     def wait(self) -> None:
         """See `TracedStep`."""
         self._together("step", self._step.wait)
+        self._is_running = False
+        atexit.unregister(end_at_once)
 
 
 class RingMean:
@@ -185,6 +196,6 @@ def run_watched(
       PeerLost, CollectiveTimeout: see `Turns.watch`.
       CollectiveError: the transfer failed although all peers are there.
     """
-    watch = functools.partial(turns.watch, is_patient=is_step)
-    with turns.explained(keep_own=is_step):
+    watch = functools.partial(turns.watch, is_step=is_step)
+    with turns.explained(is_step=is_step):
         return courier.run(program, watch)

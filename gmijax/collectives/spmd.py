@@ -50,9 +50,9 @@ class MeshPeers:
 class SpmdStep:
     """A step of several GMIs as one program: `TracedStep`.
 
-    Every member calls it, and is then caught in it until all others have: meet them before. A
-    call returns when the devices have been given all of it, and the call before is computed: so
-    they have the next one waiting when they are through with this one.
+    Every member calls it, and its device is then caught in it until all others have: meet them
+    before. A call returns when the device has been given all of it, and the call before is
+    computed: so it has the next one waiting when it is through with this one.
 
     Args:
       mesh: one device of each member, along `AXIS`.

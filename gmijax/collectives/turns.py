@@ -10,7 +10,7 @@ from __future__ import annotations
 import os
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
 from gmijax.collectives.memory import ExchangeBlock, check_peer
@@ -102,7 +102,7 @@ class Turns:
         self.arrive()
         self._wait(is_patient=is_patient)
 
-    def watch(self, done: threading.Event, *, is_patient: bool = False) -> None:
+    def watch(self, done: threading.Event, *, is_step: bool = False) -> None:
         """Waits for a thread of this rank that exchanges numbers with peers in its own way.
 
         Returns when `done` is set. Until then peers are looked at that have not arrived where
@@ -110,39 +110,43 @@ class Turns:
 
         Args:
           done: when this is set.
-          is_patient: time only counts while one of them is silent, or none is left. If all of
-            them are caught in it with this rank, the controller will see that nothing goes on.
+          is_step: all meet after it, and the devices of those who have arrived there may still
+            be at it: so all peers are looked at, and time only counts while one of them is
+            silent. If they are all caught in it, the controller will see that nothing goes on.
 
         Raises:
           PeerLost: the process of such a peer is gone.
           CollectiveTimeout: the thread did not finish in time.
         """
-        suspects = self._suspects()
+        suspects, concerned = self._suspects(), self._concerned(is_step=is_step)
         while not done.wait(LIVENESS_PERIOD_S):
-            suspects.look(self._behind, now=True, is_patient=is_patient)
+            suspects.look(concerned, now=True, is_patient=is_step)
             if suspects.is_late:  # All have come out of it but this rank.
                 suspects.give_up(self._peers)
 
-    def explain_failure(self) -> None:
+    def explain_failure(self, *, is_step: bool = False) -> None:
         """Raises for the peer whose end made a transfer of this rank fail, if there is one.
+
+        Args:
+          is_step: see `watch`.
 
         Raises:
           PeerLost, CollectiveTimeout: as in `watch`.
         """
-        suspects = self._suspects()
+        suspects, concerned = self._suspects(), self._concerned(is_step=is_step)
         deadline_s = time.monotonic() + SETTLE_S
         while time.monotonic() < deadline_s:
-            suspects.look(self._behind, now=True)
+            suspects.look(concerned, now=True)
             time.sleep(0.02)
-        if silent := suspects.silent(self._behind()):
+        if silent := suspects.silent(concerned()):
             suspects.give_up(silent)
 
     @contextmanager
-    def explained(self, *, keep_own: bool = False) -> Iterator[None]:
+    def explained(self, *, is_step: bool = False) -> Iterator[None]:
         """Says of a transfer that fails whose end made it fail.
 
         Args:
-          keep_own: an error that no peer explains stays what it is.
+          is_step: see `watch`; and an error that no peer explains stays what it is.
 
         Raises:
           PeerLost, CollectiveTimeout: see `explain_failure`.
@@ -153,8 +157,8 @@ class Turns:
         # A transfer that fails while jax still dispatches it comes as a plain ValueError. The
         # errors of jax and of shared device memory are RuntimeErrors.
         except (RuntimeError, ValueError) as error:
-            self.explain_failure()
-            if keep_own:
+            self.explain_failure(is_step=is_step)
+            if is_step:
                 raise
             said = (str(error).splitlines() or [type(error).__name__])[0]
             raise CollectiveError(f"{self.where()}: {said}") from error
@@ -213,6 +217,9 @@ class Turns:
         is_first = self.step <= self._first_step
         timeout_s = self._rendezvous_timeout_s if is_first else self._timeout_s
         return Suspects(self._block, self._operation, self.step, timeout_s)
+
+    def _concerned(self, *, is_step: bool) -> Callable[[], list[int]]:
+        return (lambda: self._peers) if is_step else self._behind
 
     def _behind(self) -> list[int]:
         """Peers that have not arrived where this rank arrives next."""

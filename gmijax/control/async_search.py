@@ -10,7 +10,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Sequence
 from functools import partial
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 from gmijax.config import AUTO, PlanConfig, TrainConfig
 from gmijax.control.async_profile import Enough, read
@@ -42,27 +42,13 @@ def decoupled_training(config: TrainConfig) -> Workload:
     given = _without_auto(config.plan)
     place(given)
     serving, training, indices = serving_and_training(given)
-    is_apart = _is_apart(serving, training, indices)
+    sides = _Sides(
+        num_serving=len(serving),
+        num_training=len(training),
+        is_apart=_is_apart(serving, training, indices),
+        is_open=given.serving_gpus is None and given.training_gpus is None,
+    )
     is_auto = config.plan.gmis_per_gpu == AUTO
-    is_open = given.serving_gpus is None and given.training_gpus is None
-
-    def split_of(measured: Measured) -> Split | None:
-        if not is_apart:
-            return None
-        if not is_open:
-            return Split(len(serving), len(training))
-        num_gpus = len(serving) + len(training)
-        return balance(num_gpus, measured.acting_per_s, measured.learning_per_s)
-
-    def estimate(point: Point, measured: Measured) -> float:
-        split = split_of(measured)
-        if split is None:
-            return len(serving) * point.gmis_per_gpu * measured.env_steps_per_s
-        profiled = point.gmis_per_gpu * measured.env_steps_per_s
-        rates = measured.acting_per_s, measured.learning_per_s
-        # Each side waits now and then although the other is the slower one: so in the profile.
-        return profiled * throughput(split, *rates) / min(rates)
-
     gmis_per_gpu = AUTO if is_auto else given.serving_gmis_per_gpu
     return Workload(
         env=config.env,
@@ -78,20 +64,54 @@ def decoupled_training(config: TrainConfig) -> Workload:
             "job": "train",
             "algo": to_dict(config.algo),
             "channel": to_dict(config.channel),
-            "placement": "apart" if is_apart else "together",
+            "placement": "apart" if sides.is_apart else "together",
             "iterations": config.search.iterations,
         },
         trainers=(
             config.search.training_gmis_per_gpu if is_auto else (given.training_gmis_per_gpu,)
         ),
-        plan_of=partial(_plan_of, config, _profiled_on(given, is_apart=is_apart)),
+        plan_of=partial(_plan_of, config, _profiled_on(given, is_apart=sides.is_apart)),
         compile_once=False,
         shared=partial(shared_blocks, config),
         is_enough=partial(Enough, config),
-        estimate=estimate,
-        top=_top_apart if is_apart else top_of_one,
-        split=split_of,
+        estimate=sides.estimate,
+        top=_top_apart if sides.is_apart else top_of_one,
+        split=sides.split,
     )
+
+
+class _Sides(NamedTuple):
+    """GPUs that act and GPUs that train.
+
+    Attributes:
+      num_serving, num_training: how many.
+      is_apart: every one does one of both.
+      is_open: their division is for the search to find.
+    """
+
+    num_serving: int
+    num_training: int
+    is_apart: bool
+    is_open: bool
+
+    def split(self, measured: Measured) -> Split | None:
+        """How the GPUs are divided after a profile; None where all do both."""
+        if not self.is_apart:
+            return None
+        if not self.is_open:
+            return Split(self.num_serving, self.num_training)
+        num_gpus = self.num_serving + self.num_training
+        return balance(num_gpus, measured.acting_per_s, measured.learning_per_s)
+
+    def estimate(self, point: Point, measured: Measured) -> float:
+        """What the whole job would make, environment steps per second."""
+        profiled = point.gmis_per_gpu * measured.env_steps_per_s
+        split = self.split(measured)
+        if split is None:
+            return self.num_serving * profiled
+        rates = measured.acting_per_s, measured.learning_per_s
+        # Each side waits now and then although the other is the slower one: so in the profile.
+        return profiled * throughput(split, *rates) / min(rates)
 
 
 def settled(plan: PlanConfig, serving: int, training: int, split: Split | None) -> PlanConfig:

@@ -70,13 +70,6 @@ def profile(
             states = ", ".join(f"GMI {gmi.gmi} {gmi.state}" for gmi in gmis)
             raise ProfileLate(f"no end within {limit_s:.0f} s ({states})")
 
-    # The supervisor's own limits are for jobs of unknown length.
-    patience = Patience(
-        start_timeout_s=2 * limit_s,
-        stall_timeout_s=2 * limit_s,
-        stop_timeout_s=_GRACE_S,
-        grace_s=_GRACE_S,
-    )
     launch = Launch(
         plan=plan,
         machine=machine,
@@ -84,7 +77,7 @@ def profile(
         module=workload.module,
         compile_once=workload.compile_once,
         shared=workload.shared(plan),
-        patience=patience,
+        patience=_patience(limit_s),
         on_warning=on_warning,
         is_enough=workload.is_enough and workload.is_enough(plan, run),
     )
@@ -97,6 +90,16 @@ def profile(
         return NotRunnable(" ".join(str(error).split()))
     finally:
         shutil.rmtree(run.checkpoints, ignore_errors=True)
+
+
+def _patience(limit_s: float) -> Patience:
+    # The supervisor's own limits are for jobs of unknown length.
+    return Patience(
+        start_timeout_s=2 * limit_s,
+        stall_timeout_s=2 * limit_s,
+        stop_timeout_s=_GRACE_S,
+        grace_s=_GRACE_S,
+    )
 
 
 def plan_at(workload: Workload, point: Point, mode: Mode, machine: Machine) -> Plan:

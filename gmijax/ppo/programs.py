@@ -87,7 +87,7 @@ class Iteration(Protocol):
     ) -> tuple[LearnerState, BatchState, IterationMetrics]:
         """Runs one iteration; both states are donated and must not be used again.
 
-        What it returns may still be computed; what the call before told is there.
+        What it returns may still be computed.
         """
         ...
 

@@ -136,6 +136,10 @@ class ReportThread:
         if self._error is not None:
             raise self._error
 
+    def give_up(self) -> None:
+        """Says that what the thread waits for will not come: `stop` does not wait for it."""
+        self._is_idle.set()
+
     def stop(self) -> None:
         """Ends the thread, which may finish a line; calling it twice is fine."""
         self._is_idle.wait(_LAST_LINE_S)

@@ -19,7 +19,7 @@ from gmijax.checkpoint import digest, has_envs, restore_envs, restore_learner, s
 from gmijax.collectives.interface import Reducer
 from gmijax.config import TrainConfig
 from gmijax.devices import describe_device
-from gmijax.errors import NonFiniteError, ParameterMismatch
+from gmijax.errors import CollectiveError, NonFiniteError, ParameterMismatch
 from gmijax.learner import Learner, LearnerState, init_learner, make_learner
 from gmijax.metrics import JsonlSink, MetricsLog, TensorBoardSink
 from gmijax.partition.child import ChildLink
@@ -96,34 +96,14 @@ class _SyncTrainer:
         """See `train`."""
         started = time.monotonic()
         state, env_state = self._first_state()
-        self._iteration.trace(state, env_state)
         meter = ThroughputMeter(self._env, self._learner, self._config, self._reducer)
-        if self._measures:
-            meter.trace(state, env_state)
-        waited_s = self._link.begin_compiling()
-        self._iteration.compile()
-        if self._measures:
-            meter.compile()
+        waited_s = self._compile(state, env_state, meter)
         compile_s = time.monotonic() - started - waited_s
         self._link.beat("ready", 0)
         self._meet()  # Everybody has compiled: the clock may start.
-        history = read_metrics(self._link.run.metrics) if self._leader else []
-        reporter = Reporter(
-            self._config.env.label,
-            self._open_log(history),
-            self._env_steps,
-            history[-1]["wall_s"] if history else 0.0,
-        )
-        lines = ReportThread(reporter)
-        first_steps = self._env_steps
-        started = time.monotonic()
-        try:
-            state, env_state, stopped = self._loop(state, env_state, lines)
-        finally:
-            lines.stop()
-            reporter.close()
-        if isinstance(self._iteration, RemoteIteration):
-            self._iteration.close()
+        reporter = self._make_reporter()
+        first_steps, started = self._env_steps, time.monotonic()
+        state, env_state, stopped = self._train(state, env_state, reporter)
         wall_s = time.monotonic() - started
         done = {
             "status": "stopped" if stopped else "completed",
@@ -146,6 +126,40 @@ class _SyncTrainer:
             )
             done |= rates._asdict()
         return done
+
+    def _compile(self, state: LearnerState, env_state: Any, meter: ThroughputMeter) -> float:
+        """Makes all programs; returns the seconds for which it was not this GMI's turn."""
+        self._iteration.trace(state, env_state)
+        if self._measures:
+            meter.trace(state, env_state)
+        waited_s = self._link.begin_compiling()
+        self._iteration.compile()
+        if self._measures:
+            meter.compile()
+        return waited_s
+
+    def _make_reporter(self) -> Reporter:
+        history = read_metrics(self._link.run.metrics) if self._leader else []
+        wall_s = history[-1]["wall_s"] if history else 0.0
+        log = self._open_log(history)
+        return Reporter(self._config.env.label, log, self._env_steps, wall_s)
+
+    def _train(
+        self, state: LearnerState, env_state: Any, reporter: Reporter
+    ) -> tuple[LearnerState, Any, bool]:
+        """Trains to the end; returns also whether it was asked to stop."""
+        lines = ReportThread(reporter)
+        try:
+            trained = self._loop(state, env_state, lines)
+        except CollectiveError:
+            lines.give_up()  # It may wait for a device that waits for a GMI that is gone.
+            raise
+        finally:
+            lines.stop()
+            reporter.close()
+        if isinstance(self._iteration, RemoteIteration):
+            self._iteration.close()
+        return trained
 
     def _make_iteration(self) -> Iteration:
         env, learner, reducer = self._env, self._learner, self._reducer

@@ -9,7 +9,7 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from gmijax.config import PlayConfig
+from gmijax.config import EnvConfig, PlayConfig
 from gmijax.errors import ConfigError
 from gmijax.partition.child import ChildLink, run_gmi
 from gmijax.playdir import PlayPaths
@@ -40,32 +40,9 @@ def _run(link: ChildLink) -> None:
     from gmijax.checkpoint import restore_learner
     from gmijax.learner import init_learner, make_learner
     from gmijax.ppo.episodes import Options, run_episodes
-    from gmijax.sim.impl import choose_impl
-    from gmijax.sim.randomize import randomized
-    from gmijax.sim.registry import make_env
 
-    wanted = config.physics.impl
-    if wanted == "auto" and CheckpointMeta.read(checkpoint).impl == "jax":
-        # A policy may depend on what it was trained with.
-        wanted = "jax"
-    impl, why = choose_impl(wanted, jax.default_backend(), env_config.label)
-    sys.stdout.write(f"physics.impl={impl}: {why}\n")
-    env = make_env(
-        str(env_config.name),
-        suite=env_config.suite,
-        impl=impl,
-        episode_length=env_config.episode_length,
-        max_envs=config.num_envs,
-    )
-    _check_camera(config.camera, env)
-    if config.randomize == "on":
-        env = randomized(
-            env,
-            env_config.randomization,
-            seed=config.seed,
-            first_env=0,
-            num_envs=config.num_envs,
-        )
+    impl = _impl(config, checkpoint, env_config)
+    env = _environment(config, env_config, impl)
     learner = make_learner(env.spec, algo)
     state = jax.jit(lambda key: init_learner(learner, env.spec.obs_size, key))(jax.random.key(0))
     state = restore_learner(checkpoint, state)
@@ -89,6 +66,40 @@ def _run(link: ChildLink) -> None:
     about = {"impl": impl, "device": f"{device.platform}: {device.device_kind}"}
     # Written last: whoever sees it finds the trajectory complete.
     write_json(paths.returns, {**summarise(config, env.spec.name, episodes), **about})
+
+
+def _impl(config: PlayConfig, checkpoint: Path, env_config: EnvConfig) -> str:
+    """The MJX to play with; says why."""
+    import jax
+
+    from gmijax.sim.impl import choose_impl
+
+    wanted = config.physics.impl
+    if wanted == "auto" and CheckpointMeta.read(checkpoint).impl == "jax":
+        # A policy may depend on what it was trained with.
+        wanted = "jax"
+    impl, why = choose_impl(wanted, jax.default_backend(), env_config.label)
+    sys.stdout.write(f"physics.impl={impl}: {why}\n")
+    return impl
+
+
+def _environment(config: PlayConfig, env_config: EnvConfig, impl: str) -> Env:
+    from gmijax.sim.randomize import randomized
+    from gmijax.sim.registry import make_env
+
+    num_envs = config.num_envs
+    env = make_env(
+        str(env_config.name),
+        suite=env_config.suite,
+        impl=impl,
+        episode_length=env_config.episode_length,
+        max_envs=num_envs,
+    )
+    _check_camera(config.camera, env)
+    if config.randomize != "on":
+        return env
+    ranges = env_config.randomization
+    return randomized(env, ranges, seed=config.seed, first_env=0, num_envs=num_envs)
 
 
 def summarise(config: PlayConfig, env_name: str, episodes: Episodes) -> dict[str, Any]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import signal
 import time
 from pathlib import Path
 
@@ -33,3 +34,27 @@ def test_ranks_with_different_lengths_name_both(tmp_path: Path) -> None:
         job.start(0, num_floats=100).start(1, num_floats=200)
         messages = [result["message"] for result in job.results()]
     assert all("do not fit together: num_floats is" in message for message in messages)
+
+
+@pytest.mark.timeout(240)
+@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGSTOP])
+def test_who_ends_while_one_program_runs_on_all_is_named(
+    number: signal.Signals, tmp_path: Path
+) -> None:
+    """And the others end, although their devices wait for the one that is gone or stopped."""
+    for attempt in range(4):  # At another moment each.
+        folder = tmp_path / str(attempt)
+        folder.mkdir()
+        with Ranks(
+            folder, 2, "step_forever", strategy="flat", layout=[[0], [1]], timeout_s=2.0
+        ) as job:
+            job.start().wait_for("running")
+            time.sleep(attempt * 7e-3)
+            sent_s = job.signal(1, number)
+            (result,) = job.results(0)
+            if number == signal.SIGKILL:
+                assert (result["error"], result.get("peer")) == ("PeerLost", 1), result
+                assert result["failed_at_s"] - sent_s < 3.0  # Two of them if the library fails.
+            else:
+                assert (result["error"], result.get("missing")) == ("CollectiveTimeout", [1])
+                assert 1.8 < result["failed_at_s"] - sent_s < 4.0

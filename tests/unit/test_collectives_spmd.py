@@ -71,11 +71,24 @@ def test_arrays_without_elements_come_back_as_they_went_in() -> None:
     assert own["nothing"].dtype == jnp.int32
 
 
-def test_metrics_keep_their_types_and_outlive_the_next_call() -> None:
-    program = _made()
-    shared, own, metrics = program(*_arguments()[1:])
-    program(shared, own)
+def test_a_call_returns_when_the_one_before_is_computed() -> None:
+    def slow(peers, constants, shared, own):
+        power = jax.lax.fori_loop(0, 300, lambda _, x: jnp.cos(x @ x), jnp.eye(400) + own["x"][0])
+        return shared + jnp.sum(power), own, jnp.sum(power) + 1
+
+    program = _made(slow)
+    shared, own, first = program(*_arguments()[1:])
+    assert not first.is_ready()
+    shared, own, second = program(shared, own)
+    assert first.is_ready()
+    assert not second.is_ready()
     program.wait()
+    assert shared.is_ready()
+    assert second.is_ready()
+
+
+def test_metrics_keep_their_types() -> None:
+    _, _, metrics = _made()(*_arguments()[1:])
     assert metrics["count"] == N
     assert metrics["count"].dtype == np.int32
     assert metrics["rank"] == 3

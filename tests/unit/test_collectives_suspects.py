@@ -91,39 +91,49 @@ def test_a_failed_transfer_is_blamed_on_the_dead(blocks: list[ExchangeBlock]) ->
     assert lost.value.peer == 1
 
 
-def test_a_patient_watch_has_no_end_while_all_are_at_it(blocks: list[ExchangeBlock]) -> None:
+def test_the_watch_of_a_step_has_no_end_while_all_are_at_it(blocks: list[ExchangeBlock]) -> None:
     everyone = turns_of(blocks, 0.3, 0.3, 0.3)
     done = threading.Event()
     threading.Timer(1.5, done.set).start()
     with ThreadPoolExecutor(3) as pool:
-        for waiting in [pool.submit(one.watch, done, is_patient=True) for one in everyone]:
+        for waiting in [pool.submit(one.watch, done, is_step=True) for one in everyone]:
             waiting.result()
 
 
-def test_a_patient_watch_names_the_silent(blocks: list[ExchangeBlock]) -> None:
+def test_the_watch_of_a_step_names_the_silent(blocks: list[ExchangeBlock]) -> None:
     first, second, _ = turns_of(blocks, 0.5, 30.0, 30.0)
     done = threading.Event()
     with ThreadPoolExecutor(1) as pool:
-        other = pool.submit(second.watch, done, is_patient=True)
+        other = pool.submit(second.watch, done, is_step=True)
         with pytest.raises(CollectiveTimeout, match=r"for ranks \[2\]"):
-            first.watch(NEVER, is_patient=True)
+            first.watch(NEVER, is_step=True)
         done.set()
         other.result()
 
 
-def test_a_patient_watch_ends_where_only_this_rank_is_left(blocks: list[ExchangeBlock]) -> None:
-    first, *others = turns_of(blocks, 0.3, 3.0, 3.0)
-    for other in others:
-        other.arrive()
-    with pytest.raises(CollectiveTimeout):
-        first.watch(NEVER, is_patient=True)
+def test_the_watch_of_a_step_looks_at_those_who_have_arrived_after_it(
+    blocks: list[ExchangeBlock],
+) -> None:
+    first, *others = turns_of(blocks, 0.3, 30.0, 30.0)
+    done = threading.Event()
+    with ThreadPoolExecutor(3) as pool:
+        meeting = [pool.submit(other.meet, is_patient=True) for other in others]
+        threading.Timer(1.5, done.set).start()
+        first.watch(done, is_step=True)  # They wait for this one, and are not late.
+        first.meet()
+        for other in meeting:
+            other.result()
+    others[0].arrive()
+    end(blocks, 1)
+    with pytest.raises(PeerLost, match="peer 1 is gone"):
+        first.watch(NEVER, is_step=True)
 
 
-def test_a_patient_watch_notices_the_dead(blocks: list[ExchangeBlock]) -> None:
+def test_the_watch_of_a_step_notices_the_dead(blocks: list[ExchangeBlock]) -> None:
     first, *_ = turns_of(blocks, 5.0, 5.0, 5.0)
     end(blocks, 1)
     with pytest.raises(PeerLost, match="peer 1 is gone"):
-        first.watch(NEVER, is_patient=True)
+        first.watch(NEVER, is_step=True)
 
 
 def test_an_error_of_ones_own_can_stay_what_it_is(
@@ -131,10 +141,10 @@ def test_an_error_of_ones_own_can_stay_what_it_is(
 ) -> None:
     monkeypatch.setattr("gmijax.collectives.turns.SETTLE_S", 0.1)
     first, *_ = turns_of(blocks, 5.0, 5.0, 5.0)
-    with pytest.raises(RuntimeError, match="out of memory"), first.explained(keep_own=True):
+    with pytest.raises(RuntimeError, match="out of memory"), first.explained(is_step=True):
         raise RuntimeError("out of memory")
     with pytest.raises(CollectiveError, match="out of memory"), first.explained():
         raise RuntimeError("out of memory")
     end(blocks, 1)
-    with pytest.raises(PeerLost, match="peer 1 is gone"), first.explained(keep_own=True):
+    with pytest.raises(PeerLost, match="peer 1 is gone"), first.explained(is_step=True):
         raise RuntimeError("connection reset")
