@@ -8,7 +8,7 @@ from pathlib import Path
 from supervision import machine, make_job, plan_config, reduce_config
 
 from gmijax.partition.backends import open_backend
-from gmijax.partition.nvidia import find_mps_control
+from gmijax.partition.mps_control import find_mps_control
 from gmijax.partition.planner import make_plan
 from gmijax.partition.supervisor import Supervisor
 from gmijax.rundir import RunPaths

@@ -11,7 +11,7 @@ from pathlib import Path
 
 from gmijax.errors import ConfigError, PeerLost
 from gmijax.partition.child import ChildLink
-from gmijax.partition.nvidia import PIPE_VARIABLE
+from gmijax.partition.mps_control import PIPE_VARIABLE
 from gmijax.processes import identify
 from gmijax.rundir import read_json, write_json
 

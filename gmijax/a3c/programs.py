@@ -8,12 +8,12 @@ gradients and statistics between them, on the host or on the device.
 from __future__ import annotations
 
 import functools
+from collections.abc import Callable
 from typing import Any, NamedTuple, Protocol
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-import numpy.typing as npt
 from jax.flatten_util import ravel_pytree
 from jax.sharding import Sharding
 
@@ -146,7 +146,7 @@ class SplitUpdate:
         self._begin: Any = jax.jit(self._begin_fn)
         self._gradient: Any = jax.jit(self._gradient_fn, out_shardings=where)
         self._step: Any = jax.jit(
-            self._step_fn, donate_argnums=(0,), out_shardings=(None, where) if where else None
+            self._step_fn, donate_argnums=(0,), out_shardings=(None, where, None)
         )
         self._apply: Any = jax.jit(self._apply_fn, donate_argnums=(0,))
         self._finish: Any = jax.jit(
@@ -162,7 +162,7 @@ class SplitUpdate:
         index = jax.ShapeDtypeStruct((), jnp.int32)
         rest = (batch, context, order, index)
         buffer = jax.eval_shape(self._gradient_fn, state.params, *rest)
-        losses = jax.ShapeDtypeStruct((order.shape[0], _NUM_LOSSES), jnp.float32)
+        losses = [jax.ShapeDtypeStruct((_NUM_LOSSES,), jnp.float32)] * order.shape[0]
         self._begin = self._begin.lower(state, batch, weight, self._rank).compile()
         self._gradient = self._gradient.lower(state.params, *rest).compile()
         self._step = self._step.lower(state, buffer, *rest).compile()
@@ -176,21 +176,25 @@ class SplitUpdate:
         batch = jax.device_put(batch)  # Once, and not with every program.
         order, context, packed = self._begin(state, batch, weight, self._rank)
         gathered = np.array(self._reducer.all_gather(np.asarray(packed)))
-        losses: list[npt.NDArray[np.float32]] = []
-        buffer = self._gradient(state.params, batch, context, order, np.int32(0))
-        for index in range(1, order.shape[0] + 1):
-            mean = self._mean(buffer)
-            if index < order.shape[0]:
-                # One program between two exchanges: every start of one costs time on the host.
-                state, buffer = self._step(state, mean, batch, context, order, np.int32(index))
-            else:
-                state = self._apply(state, mean)
-            losses.append(np.asarray(mean[-_NUM_LOSSES:]))
-        return self._finish(state, gathered, np.stack(losses))
 
-    def _mean(self, buffer: Array) -> Array | FloatBuffer:
+        def steps(mean: Callable[[Array], Array | FloatBuffer]) -> tuple[LearnerState, Any]:
+            losses: list[Array] = []
+            moved, buffer = state, self._gradient(state.params, batch, context, order, np.int32(0))
+            for index in range(1, order.shape[0]):
+                rest = batch, context, order, np.int32(index)
+                # One program between two exchanges: every start of one costs time on the host.
+                moved, buffer, loss = self._step(moved, mean(buffer), *rest)
+                losses.append(loss)
+            moved, loss = self._apply(moved, mean(buffer))
+            return moved, [*losses, loss]
+
         if stays_on_device(self._reducer):
-            return self._reducer.mean_on_device(buffer)
+            moved, losses = self._reducer.run_on_device(steps)
+        else:
+            moved, losses = steps(self._host_mean)
+        return self._finish(moved, gathered, losses)
+
+    def _host_mean(self, buffer: Array) -> FloatBuffer:
         # A copy: the reducer's view is overwritten by the next exchange, which may start
         # before the asynchronous step has read it.
         return np.array(self._reducer.mean(np.asarray(buffer)))
@@ -221,19 +225,20 @@ class SplitUpdate:
         context: UpdateContext,
         order: Array,
         index: Array,
-    ) -> tuple[LearnerState, Array]:
-        state = self._apply_fn(state, buffer)
-        return state, self._gradient_fn(state.params, batch, context, order, index)
+    ) -> tuple[LearnerState, Array, Array]:
+        state, losses = self._apply_fn(state, buffer)
+        return state, self._gradient_fn(state.params, batch, context, order, index), losses
 
-    def _apply_fn(self, state: LearnerState, buffer: Array) -> LearnerState:
+    def _apply_fn(self, state: LearnerState, buffer: Array) -> tuple[LearnerState, Array]:
+        gradient, losses = buffer[:-_NUM_LOSSES], buffer[-_NUM_LOSSES:]
         unravel = ravel_pytree(state.params)[1]
-        losses = LossMetrics(*buffer[-_NUM_LOSSES:])
-        return apply_gradients(self._learner, state, unravel(buffer[:-_NUM_LOSSES]), losses.kl)
+        kl = LossMetrics(*losses).kl
+        return apply_gradients(self._learner, state, unravel(gradient), kl), losses
 
     def _finish_fn(
-        self, state: LearnerState, gathered: Array, losses: Array
+        self, state: LearnerState, gathered: Array, losses: list[Array]
     ) -> tuple[LearnerState, Updated]:
         unpack = ravel_pytree(no_samples((self._obs_size,)))[1]
         state = finish_batch(state, merge_all(jax.vmap(unpack)(gathered)))
         weights = pack_weights(acting_weights(self._learner, state))
-        return state, Updated(weights, LossMetrics(*jnp.mean(losses, axis=0)))
+        return state, Updated(weights, LossMetrics(*jnp.mean(jnp.stack(losses), axis=0)))

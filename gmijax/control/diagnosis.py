@@ -14,7 +14,8 @@ from gmijax.errors import ConfigError
 from gmijax.partition.backend_choice import why_not_backend
 from gmijax.partition.layout import Layout
 from gmijax.partition.machine import Machine
-from gmijax.partition.nvidia import PIPE_VARIABLE, Gpu
+from gmijax.partition.mps_control import PIPE_VARIABLE
+from gmijax.partition.nvidia import Gpu
 from gmijax.partition.plan import BackendName
 from gmijax.partition.reduction import why_not_intra, why_not_strategy, why_not_under
 from gmijax.sim.impl import choose_impl

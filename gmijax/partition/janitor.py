@@ -22,7 +22,7 @@ from pathlib import Path
 from typing import Any
 
 from gmijax.errors import BackendUnavailable
-from gmijax.partition.nvidia import MpsControl
+from gmijax.partition.mps_control import MpsControl
 from gmijax.processes import ProcessId, identify, wait_until_gone
 
 _GMIS_END_THEMSELVES_S = 8.0

@@ -6,15 +6,13 @@ import os
 from dataclasses import dataclass
 from pathlib import Path
 
-from gmijax.partition.nvidia import (
+from gmijax.partition.mps_control import (
     DEFAULT_PIPE_DIRECTORY,
     PIPE_VARIABLE,
-    Gpu,
     MpsControl,
-    driver_version,
     find_mps_control,
-    list_gpus,
 )
+from gmijax.partition.nvidia import Gpu, driver_version, list_gpus
 
 
 @dataclass(frozen=True)

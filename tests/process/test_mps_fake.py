@@ -17,7 +17,8 @@ from gmijax.errors import BackendUnavailable, GmiFailed, JobInterrupted
 from gmijax.partition.backends import open_backend
 from gmijax.partition.gmi_process import GmiStatus
 from gmijax.partition.machine import Machine, detect_machine
-from gmijax.partition.nvidia import PIPE_VARIABLE, MigInstance, MpsControl, find_mps_control
+from gmijax.partition.mps_control import PIPE_VARIABLE, MpsControl, find_mps_control
+from gmijax.partition.nvidia import MigInstance
 from gmijax.partition.plan import Plan
 from gmijax.partition.planner import make_plan
 from gmijax.partition.supervisor import Patience, Supervisor

@@ -14,7 +14,8 @@ from supervision import gpu
 from gmijax.errors import BackendUnavailable
 from gmijax.partition import machine as machine_module
 from gmijax.partition.machine import Machine, detect_machine, visible_gpus
-from gmijax.partition.nvidia import Gpu, MpsControl, driver_version, find_mps_control, list_gpus
+from gmijax.partition.mps_control import MpsControl, find_mps_control
+from gmijax.partition.nvidia import Gpu, driver_version, list_gpus
 
 THREE = (gpu(0), gpu(1), gpu(2))
 

@@ -19,7 +19,7 @@ from typing import Self
 from gmijax.errors import BackendUnavailable, GmiFailed
 from gmijax.partition.janitor import JanitorLink, quit_daemon
 from gmijax.partition.machine import Machine
-from gmijax.partition.nvidia import PIPE_VARIABLE, MpsControl
+from gmijax.partition.mps_control import PIPE_VARIABLE, MpsControl
 from gmijax.partition.plan import Plan
 from gmijax.rundir import RunPaths
 
