@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import threading
+import time
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -97,3 +100,20 @@ def test_lines_come_in_order_from_a_thread_of_their_own_and_errors_with_the_next
         lines.report(320, _metrics(0), {})
     lines.stop()
     assert len(written) == 3
+
+
+def test_a_line_that_cannot_come_is_not_waited_for() -> None:
+    is_there = threading.Event()
+
+    class Pending:
+        def __array__(self, dtype=None, copy=None):
+            is_there.wait(30)
+            return np.zeros(())
+
+    lines = ReportThread(Reporter("point_mass", MetricsLog(()), 0))
+    lines.report(64, _metrics(0)._replace(noise_std=Pending()), {})
+    lines.give_up()
+    started = time.monotonic()
+    lines.stop()
+    assert time.monotonic() - started < 1.5  # It waits 2 s for one that may come.
+    is_there.set()
