@@ -154,8 +154,10 @@ class MpsBackend:
         clients: dict[MpsControl, Mapping[int, int]] = {}
         for gmi in pids:
             control = self._control_of(gmi)
+            if control in clients:  # Also if it has none yet.
+                continue
             try:
-                clients[control] = clients.get(control) or control.all_client_pids()
+                clients[control] = control.all_client_pids()
             except BackendUnavailable as error:
                 raise GmiFailed(gmi, f"cannot ask whether it is an MPS client: {error}") from error
         return {gmi: pid for gmi, pid in pids.items() if pid not in clients[self._control_of(gmi)]}
