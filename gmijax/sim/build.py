@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from gmijax.config import EnvConfig
+from gmijax.sim.interface import Env
 from gmijax.sim.randomize import randomized
 from gmijax.sim.registry import make_env
 from gmijax.sim.wrappers import BatchedEnv, training_env
@@ -27,6 +28,12 @@ def make_training_env(
       num_envs: N.
       random_ep_len: see `training_env`.
     """
+    env = make_worlds(config, impl, seed=seed, first_env=first_env, num_envs=num_envs)
+    return training_env(env, random_ep_len=random_ep_len)
+
+
+def make_worlds(config: EnvConfig, impl: str, *, seed: int, first_env: int, num_envs: int) -> Env:
+    """The same for one world at a time, with a model that holds all; arguments as above."""
     env = make_env(
         str(config.name),
         suite=config.suite,
@@ -34,8 +41,7 @@ def make_training_env(
         episode_length=config.episode_length,
         max_envs=num_envs,
     )
-    if config.randomize == "on":
-        env = randomized(
-            env, config.randomization, seed=seed, first_env=first_env, num_envs=num_envs
-        )
-    return training_env(env, random_ep_len=random_ep_len)
+    if config.randomize != "on":
+        return env
+    ranges = config.randomization
+    return randomized(env, ranges, seed=seed, first_env=first_env, num_envs=num_envs)

@@ -5,6 +5,7 @@ Restores a policy, runs episodes with it, and writes their returns and a traject
 
 from __future__ import annotations
 
+import dataclasses
 import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -40,9 +41,12 @@ def _run(link: ChildLink) -> None:
     from gmijax.checkpoint import restore_learner
     from gmijax.learner import init_learner, make_learner
     from gmijax.ppo.episodes import Options, run_episodes
+    from gmijax.sim.build import make_worlds
 
     impl = _impl(config, checkpoint, env_config)
-    env = _environment(config, env_config, impl)
+    played = dataclasses.replace(env_config, randomize=config.randomize)
+    env = make_worlds(played, impl, seed=config.seed, first_env=0, num_envs=config.num_envs)
+    _check_camera(config.camera, env)
     learner = make_learner(env.spec, algo)
     state = jax.jit(lambda key: init_learner(learner, env.spec.obs_size, key))(jax.random.key(0))
     state = restore_learner(checkpoint, state)
@@ -81,25 +85,6 @@ def _impl(config: PlayConfig, checkpoint: Path, env_config: EnvConfig) -> str:
     impl, why = choose_impl(wanted, jax.default_backend(), env_config.label)
     sys.stdout.write(f"physics.impl={impl}: {why}\n")
     return impl
-
-
-def _environment(config: PlayConfig, env_config: EnvConfig, impl: str) -> Env:
-    from gmijax.sim.randomize import randomized
-    from gmijax.sim.registry import make_env
-
-    num_envs = config.num_envs
-    env = make_env(
-        str(env_config.name),
-        suite=env_config.suite,
-        impl=impl,
-        episode_length=env_config.episode_length,
-        max_envs=num_envs,
-    )
-    _check_camera(config.camera, env)
-    if config.randomize != "on":
-        return env
-    ranges = env_config.randomization
-    return randomized(env, ranges, seed=config.seed, first_env=0, num_envs=num_envs)
 
 
 def summarise(config: PlayConfig, env_name: str, episodes: Episodes) -> dict[str, Any]:
