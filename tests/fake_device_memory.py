@@ -5,14 +5,22 @@ jax reads it in place, as it reads memory of a GPU: a program sees what is there
 
 from __future__ import annotations
 
+import ctypes
 import mmap
 import os
 import struct
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 
 import jax
 import numpy as np
 
-from gmijax.collectives.device_memory import TICKET_BYTES
+from gmijax.collectives.device_memory import TICKET_BYTES, NewMemory
+from gmijax.collectives.host import HostExchange
+from gmijax.collectives.memory import create_exchange
+from gmijax.collectives.one_shot import OneShotReducer
+from gmijax.partition.layout import Layout
 
 
 class FakeDeviceMemory:
@@ -49,6 +57,13 @@ class FakeDeviceMemory:
         assert view.unsafe_buffer_pointer() == region.ctypes.data
         return view
 
+    @property
+    def address(self) -> int:
+        return self._region(0, (1,), np.dtype(np.uint8)).ctypes.data
+
+    def queue(self, flags: np.ndarray) -> FakeQueue:
+        return FakeQueue(flags)
+
     def close(self) -> None:
         self._mapping = None
 
@@ -57,8 +72,67 @@ class FakeDeviceMemory:
         return np.frombuffer(self._mapping, dtype, int(np.prod(shape)), offset).reshape(shape)
 
 
+class FakeQueue:
+    """A `DeviceQueue` that does at once what it is given, as a stream of its own would."""
+
+    def __init__(self, flags: np.ndarray) -> None:
+        self._flags = flags
+        self._started_s, self._clocked_s = 0.0, 0.0
+
+    def copy(self, stream: int, target: int, source: int, num_bytes: int) -> None:
+        ctypes.memmove(target, source, num_bytes)
+
+    def copy_rows(
+        self, stream: int, target: int, source: int, pitch: int, num_bytes: int, rows: int
+    ) -> None:
+        for row in range(rows):
+            ctypes.memmove(target + row * num_bytes, source + row * pitch, num_bytes)
+
+    def raise_flag(self, stream: int, place: int, count: int) -> None:
+        self._flags[place, 0] = count
+
+    def wait_for_flag(self, stream: int, place: int, count: int) -> None:
+        while int(np.int32(self._flags[place, 0] - np.uint32(count))) < 0:
+            time.sleep(5e-5)
+
+    def start_clock(self, stream: int) -> None:
+        self._started_s = time.monotonic()
+
+    def stop_clock(self, stream: int) -> None:
+        self._clocked_s += time.monotonic() - self._started_s
+
+    def clocked_s(self) -> float:
+        told, self._clocked_s = self._clocked_s, 0.0
+        return told
+
+    def close(self) -> None:
+        pass
+
+
 class BrokenDeviceMemory(FakeDeviceMemory):
     """Takes what is written and forgets it: the others see nothing of it."""
 
     def start_write(self, offset: int, values: jax.Array) -> None:
         del offset, values
+
+
+class WithoutQueue(FakeDeviceMemory):
+    """Of a device that takes no such work."""
+
+    def queue(self, flags: np.ndarray) -> FakeQueue:
+        raise RuntimeError("CUDA_ERROR_NOT_SUPPORTED")
+
+
+@contextmanager
+def one_shot_of_one(
+    num_floats: int, new_memory: NewMemory = FakeDeviceMemory
+) -> Iterator[OneShotReducer]:
+    """The reducer of a job with one rank, which is this process."""
+    fd = create_exchange()
+    host = HostExchange(fd, 0, 1, num_floats, timeout_s=1.0, rendezvous_timeout_s=1.0)
+    os.close(fd)
+    reducer = OneShotReducer(host, Layout.even(1, 1), num_floats, new_memory)
+    try:
+        yield reducer
+    finally:
+        reducer.close()

@@ -62,6 +62,40 @@ def check_device(reducer: DeviceReducer, buffer: FloatBuffer, mean: FloatBuffer)
     assert np.asarray(on_device).tobytes() == mean.tobytes()
 
 
+def check_steps(reducer: Reducer, options: Options) -> Options:
+    """Means and values of all ranks from within a program, between calls from outside it."""
+    import jax
+    import jax.numpy as jnp
+
+    assert stays_on_device(reducer)
+    size = options["num_floats"]
+
+    def step(peers: Peers, _: Any, shared: Array, own: Array) -> tuple[Array, Array, Array]:
+        def add_mean_rank(_: int, total: Array) -> Array:
+            return peers.mean(total + peers.rank())
+
+        ranks = peers.gather(peers.rank()[None].astype(jnp.float32))[:, 0]
+        return jax.lax.fori_loop(0, 5, add_mean_rank, shared), own + 1.0, ranks
+
+    program = reducer.spmd(step)
+    if program is None:
+        return {"steps_digest": None}
+    shared, own = jnp.zeros(size), jnp.zeros(3)
+    program.trace((), shared, own)
+    program.compile()
+    middle = (reducer.world_size - 1) / 2
+    for call in range(1, 21):
+        shared, own, ranks = program(shared, own)
+        if call % 4 == 0:
+            program.wait()
+            np.testing.assert_allclose(shared, np.full(size, 5 * call * middle), rtol=1e-4)
+            np.testing.assert_array_equal(ranks, np.arange(reducer.world_size))
+            mean = reducer.mean(np.full(size, reducer.rank + call, np.float32))
+            np.testing.assert_allclose(mean, middle + call, rtol=1e-5)
+    program.wait()
+    return {"steps_digest": hashlib.sha256(np.asarray(shared).tobytes()).hexdigest()}
+
+
 def check_order(reducer: Reducer, options: Options) -> Options:
     """Makes many calls of both kinds with random pauses; every value tells its step."""
     kinds = np.random.default_rng(0).random(options["num_ordered_calls"])
@@ -125,6 +159,8 @@ def step_forever(reducer: Reducer, options: Options) -> Options:
 def check_all(reducer: Reducer, options: Options) -> Options:
     """Everything that can be checked while all ranks live; then calls until something happens."""
     found = check_means(reducer, options) | check_order(reducer, options)
+    if stays_on_device(reducer):
+        found |= check_steps(reducer, options)
     if options["goes_on"]:
         path = Path(options["folder"]) / f"checked_{options['rank']}"
         path.with_suffix(".part").write_text(json.dumps(found))
@@ -160,7 +196,7 @@ def close_at_once(reducer: Reducer, options: Options) -> Options:
 BODIES: dict[str, Callable[[Reducer, Options], Options]] = {
     body.__name__: body
     for body in (
-        *(check_all, check_means, check_order),
+        *(check_all, check_means, check_order, check_steps),
         *(call_forever, step_forever, call_once, gather_once, close_at_once),
     )
 }

@@ -11,7 +11,7 @@ from typing import NamedTuple
 from gmijax.collectives.build import STRATEGIES
 from gmijax.collectives.intra import INTRA
 from gmijax.partition.layout import Layout
-from gmijax.partition.reduction import why_not_strategy
+from gmijax.partition.reduction import is_one_per_gpu, why_not_strategy
 from tests.rank_processes import Ranks
 
 
@@ -84,6 +84,16 @@ def check_contract(
             results = job.results(*(rank for rank in range(ranks) if rank != case.victim))
             assert not [path for path in named_memory if path.exists()]
     assert len({result["digest"] for result in checked}) == 1
+    assert len({result.get("steps_digest") for result in checked}) == 1
+    # Whose gradients need not come to the host: whole steps do not either.
+    is_whole = (
+        is_one_per_gpu(case.layout)
+        if strategy in ("mrr", "flat")
+        else (
+            strategy == "one_shot" or (strategy, intra, case.layout.num_gpus) == ("har", "ipc", 1)
+        )
+    )
+    assert (checked[0].get("steps_digest") is not None) == is_whole
     for result in results:
         if case.signal is None:
             assert result["error"] is None, result

@@ -39,7 +39,7 @@ class Membership:
       world: this process among those of all GMIs, None where no strategy needs rings.
       intra: how the GMIs of one GPU exchange numbers in HAR.
       host_if_unavailable: whether HAR goes through host memory, with a warning, where `intra`
-        turns out not to work.
+        turns out not to work, and MPR takes the place of one_shot where that does not.
     """
 
     layout: Layout
@@ -111,6 +111,7 @@ def _rings(name: str, membership: Membership) -> Reducer:
 
 def _har(membership: Membership) -> Reducer:
     from gmijax.collectives.har import DeviceHarReducer, HarReducer  # Imports jax.
+    from gmijax.collectives.ipc import IpcIntra
 
     layout, num_floats = membership.layout, membership.num_floats
     world = _world("har", membership) if needs_ring("har", layout) else None
@@ -118,16 +119,23 @@ def _har(membership: Membership) -> Reducer:
         raise ConfigError(f"reduce.intra={membership.intra}: expected one of {', '.join(INTRA)}")
     host = _host("har", membership)
     intra = _intra(membership, host)
-    reducer = DeviceHarReducer if intra.is_device_resident else HarReducer
-    return reducer(host, intra, world, num_floats)
+    if isinstance(intra, IpcIntra):
+        return DeviceHarReducer(host, intra, world, num_floats)
+    return HarReducer(host, intra, world, num_floats)
 
 
 def _one_shot(membership: Membership) -> Reducer:
     from gmijax.collectives.one_shot import OneShotReducer  # Imports jax.
 
-    host = _host("one_shot", membership)
+    num_floats, host = membership.num_floats, _host("one_shot", membership)
     try:
-        return OneShotReducer(host, membership.layout, membership.num_floats, DEVICE_MEMORY)
+        return OneShotReducer(host, membership.layout, num_floats, DEVICE_MEMORY)
+    except DeviceMemoryUnavailable as error:
+        if not membership.host_if_unavailable:
+            host.close()
+            raise
+        warnings.warn(f"{error}; so reduce.strategy=mpr", RuntimeWarning, stacklevel=2)
+        return MprReducer(host, num_floats)
     except BaseException:
         host.close()
         raise

@@ -21,8 +21,52 @@ class DeviceMemoryUnavailable(CollectiveError):
     """It cannot be had here; raised on all ranks of the job alike."""
 
 
+class DeviceQueue(Protocol):
+    """Work for a stream of the device, which does it in order; all addresses are the device's."""
+
+    def copy(self, stream: int, target: int, source: int, num_bytes: int) -> None:
+        """Copies bytes."""
+        ...
+
+    def copy_rows(
+        self, stream: int, target: int, source: int, pitch: int, num_bytes: int, rows: int
+    ) -> None:
+        """Copies `num_bytes` of each row to the next ones in `target`; rows are `pitch` apart."""
+        ...
+
+    def raise_flag(self, stream: int, place: int, count: int) -> None:
+        """Sets a flag when all before it is done, and seen by who sees the flag."""
+        ...
+
+    def wait_for_flag(self, stream: int, place: int, count: int) -> None:
+        """Holds the stream until a flag has come to `count`."""
+        ...
+
+    def start_clock(self, stream: int) -> None:
+        """From here on the stream's time counts, until `stop_clock`."""
+        ...
+
+    def stop_clock(self, stream: int) -> None:
+        """See `start_clock`."""
+        ...
+
+    def clocked_s(self) -> float:
+        """Seconds that counted and have not been told before; of clocks that have stopped."""
+        ...
+
+    def close(self) -> None:
+        """Gives the flags back; calling it twice is fine."""
+        ...
+
+
 class DeviceMemory(Protocol):
-    """A block of device memory that processes share; `CudaMemory` is the real one."""
+    """A block of device memory that processes share; `CudaMemory` is the real one.
+
+    Attributes:
+      address: of its first byte on this process's device.
+    """
+
+    address: int
 
     def create(self, num_bytes: int) -> bytes:
         """Makes the block; returns what another process needs to open it."""
@@ -48,6 +92,10 @@ class DeviceMemory(Protocol):
         self, offset: int, shape: tuple[int, ...], dtype: npt.DTypeLike = np.float32
     ) -> jax.Array:
         """The array at `offset` bytes in place: a program reads what is there when it runs."""
+        ...
+
+    def queue(self, flags: npt.NDArray[np.uint32]) -> DeviceQueue:
+        """Work of the device on such memory, in the order of `flags` [whole pages, line]."""
         ...
 
     def close(self) -> None:

@@ -11,10 +11,12 @@ from gmijax.collectives.courier import Courier
 from gmijax.collectives.host import HostExchange
 from gmijax.collectives.interface import FloatBuffer
 from gmijax.collectives.intra import B, IntraExchange
+from gmijax.collectives.ipc import IpcIntra
 from gmijax.collectives.memory import ExchangeBlock
-from gmijax.collectives.mrr import open_rings, run_watched
+from gmijax.collectives.mrr import open_rings
 from gmijax.collectives.on_device import HostPaced
 from gmijax.collectives.ring import Ring, World
+from gmijax.collectives.together import run_watched
 from gmijax.collectives.turns import Turns
 from gmijax.partition.reduction import leaders
 
@@ -54,9 +56,13 @@ class _Hierarchy(Generic[B]):
         """Gives thread and memory back, once no result is in use; calling it twice is fine."""
         if self._ring is not None:
             self._ring.close()
-        if self._ring is None or not self._ring.is_stuck:
+        if self._is_through():
             self._intra.close()
         self._host.close()
+
+    def _is_through(self) -> bool:
+        """Whether the device is through with what `intra` holds."""
+        return self._ring is None or not self._ring.is_stuck
 
 
 class HarReducer(_Hierarchy[FloatBuffer]):
@@ -92,6 +98,16 @@ class DeviceHarReducer(_Hierarchy[jax.Array], HostPaced):
     Where all GPUs have as many GMIs, every GMI is a leader: it sums over its GPU by itself, and
     the k-th GMIs of all GPUs have a ring. Then nobody waits for a leader's answer.
     """
+
+    def __init__(
+        self, host: HostExchange, intra: IpcIntra, world: World | None, num_floats: int
+    ) -> None:
+        super().__init__(host, intra, world, num_floats)
+        if world is None:
+            self._all_slots = intra.slots
+
+    def _is_through(self) -> bool:
+        return super()._is_through() and self._leave_stream()
 
     def _exchange(self, buffer: jax.Array, block: ExchangeBlock, turns: Turns) -> jax.Array:
         scale = 1.0 if self._ring else 1.0 / self.world_size

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import numpy as np
+import numpy.typing as npt
+
 from gmijax.collectives.buffers import require_gather_input, require_mean_input
 from gmijax.collectives.interface import FloatBuffer
 from gmijax.collectives.memory import ExchangeBlock, attach
@@ -63,6 +66,11 @@ class HostExchange:
         """Opens a call of `mean` with a buffer [P] float32; raises as `begin` does."""
         require_mean_input(buffer, self._open_block("mean").result.size)
         return self.begin("mean", buffer.size)
+
+    @property
+    def flags(self) -> npt.NDArray[np.uint32]:
+        """See `ExchangeBlock`."""
+        return self._open_block("flags").flags
 
     def all_gather(self, values: FloatBuffer) -> FloatBuffer:
         """Returns [K, M]: `values` [M] float32 of every rank, see `Reducer.all_gather`.

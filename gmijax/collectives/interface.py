@@ -60,7 +60,7 @@ class Reducer(Protocol):
 
 
 class Peers(Protocol):
-    """The trainers of a job from within a program that runs on the devices of all of them."""
+    """The trainers of a job from within a program that the devices of all of them run."""
 
     def rank(self) -> jax.Array:
         """[] int32: the trainer on whose device this is computed."""
@@ -85,6 +85,14 @@ trainer's own.
 
 class TracedStep(Protocol):
     """A `Step` of all trainers as one program; every one of them makes the same calls."""
+
+    @property
+    def exchange_s(self) -> float | None:
+        """Seconds that this trainer's device spent on exchanges, and in waiting for others there.
+
+        Those in the call before the last one; None where they cannot be told apart, and at first.
+        """
+        ...
 
     def trace(self, constants: Any, shared: Any, own: Any) -> None:
         """Traces it for these arguments, whose constants are kept."""
@@ -152,7 +160,7 @@ class DeviceReducer(Reducer, Protocol):
         ...
 
     def spmd(self, step: Step) -> TracedStep | None:
-        """`step` as one program on the devices of all ranks, None where there can be none."""
+        """`step` as one program that all ranks run together, None where there can be none."""
         ...
 
 

@@ -23,6 +23,9 @@ class IpcIntra:
     meet; the others copy it. It is written again after the next call's first meeting, before
     which all had finished copying.
 
+    Attributes:
+      slots: of all GMIs of the GPU.
+
     Args:
       layout: where all GMIs live.
       rank: this one.
@@ -49,7 +52,7 @@ class IpcIntra:
         self.all_sum = is_even(layout)
         self._sums = self.all_sum or rank == leader
         scale = 1.0 if layout.num_gpus > 1 else 1.0 / len(neighbours)
-        self._slots = SharedSlots(
+        self.slots = SharedSlots(
             host, num_floats, neighbours, [leader], scale, new_memory, "reduce.intra=ipc"
         )
 
@@ -58,8 +61,8 @@ class IpcIntra:
     ) -> jax.Array | None:
         """See `IntraExchange`; with an even layout every rank gets the sum."""
         del block
-        self._slots.write(buffer, turns)
-        return self._slots.sum(turns, scale) if self._sums else None
+        self.slots.write(buffer, turns)
+        return self.slots.sum(turns, scale) if self._sums else None
 
     def spread(self, mean: jax.Array | None, block: ExchangeBlock, turns: Turns) -> jax.Array:
         """See `IntraExchange`; the result may still be computed, and is the caller's own."""
@@ -67,10 +70,10 @@ class IpcIntra:
         if self.all_sum and mean is not None:
             return mean
         if mean is not None:
-            self._slots.write_result(mean, turns)
+            self.slots.write_result(mean, turns)
         turns.meet()
-        return mean if mean is not None else self._slots.read_result(turns)
+        return mean if mean is not None else self.slots.read_result(turns)
 
     def close(self) -> None:
         """Gives the mapping back; calling it twice is fine."""
-        self._slots.close()
+        self.slots.close()

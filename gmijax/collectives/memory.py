@@ -13,6 +13,7 @@ This file is the only one that knows the wire format (K ranks, P floats, native 
 | 64 K | [2, K, MAX_GATHER_FLOATS] float32, values to gather, by parity of the step |
 | next page | [K, P] float32, one slot a rank, rows padded to whole cache lines |
 | after the slots | [P] float32, the result |
+| next page | K lines of 64 bytes: how often a rank's device has written its slots, [0] of each |
 """
 
 from __future__ import annotations
@@ -28,7 +29,7 @@ from gmijax.errors import CollectiveError, ConfigError
 from gmijax.processes import ProcessId, own_process
 
 MAGIC = 0x58494D47  # "GMIX" in memory on a little-endian machine
-VERSION = 2
+VERSION = 3
 MAX_GATHER_FLOATS = 16384  # 64 KiB a rank
 FLOATS_PER_LINE = 16
 PAGE_BYTES = 4096
@@ -60,6 +61,7 @@ class Geometry(NamedTuple):
     slots: int
     row_floats: int
     result: int
+    flags: int
     size: int
 
     @classmethod
@@ -69,7 +71,10 @@ class Geometry(NamedTuple):
         gathered = world_size * LINE.itemsize
         slots = _round_up(gathered + 2 * world_size * MAX_GATHER_FLOATS * 4, PAGE_BYTES)
         result = slots + world_size * row_floats * 4
-        return cls(gathered, slots, row_floats, result, result + row_floats * 4)
+        # Whole pages, because a GPU maps pages.
+        flags = _round_up(result + row_floats * 4, PAGE_BYTES)
+        size = flags + _round_up(world_size * LINE.itemsize, PAGE_BYTES)
+        return cls(gathered, slots, row_floats, result, flags, size)
 
 
 class ExchangeBlock(NamedTuple):
@@ -81,6 +86,8 @@ class ExchangeBlock(NamedTuple):
       gathered: [2, K, MAX_GATHER_FLOATS] float32.
       slots: [K, P] float32.
       result: [P] float32.
+      flags: [whole pages, FLOATS_PER_LINE] uint32, of which [rank, 0] counts what
+        the device of a rank has written.
     """
 
     rank: int
@@ -88,6 +95,7 @@ class ExchangeBlock(NamedTuple):
     gathered: npt.NDArray[np.float32]
     slots: npt.NDArray[np.float32]
     result: npt.NDArray[np.float32]
+    flags: npt.NDArray[np.uint32]
 
 
 def create_exchange() -> int:
@@ -177,6 +185,7 @@ def _map(fd: int, rank: int, world_size: int, num_floats: int) -> ExchangeBlock:
         gathered=gathered.reshape(2, world_size, MAX_GATHER_FLOATS),
         slots=slots.reshape(world_size, geometry.row_floats)[:, :num_floats],
         result=floats(geometry.result, num_floats),
+        flags=np.frombuffer(mapping, np.uint32, -1, geometry.flags).reshape(-1, FLOATS_PER_LINE),
     )
 
 

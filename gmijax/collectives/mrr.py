@@ -8,22 +8,20 @@ ring, and nothing more to do: that is `flat`, plain data parallelism.
 
 from __future__ import annotations
 
-import atexit
-import functools
 from collections.abc import Callable
-from typing import Any, TypeVar
+from typing import TypeVar
 
 import jax
 import numpy as np
 
 from gmijax.collectives.buffers import require_device_buffer
-from gmijax.collectives.courier import Courier, end_at_once
+from gmijax.collectives.courier import Courier
 from gmijax.collectives.host import HostExchange
 from gmijax.collectives.interface import DeviceMean, Step, TracedStep
 from gmijax.collectives.on_device import OnDevice
 from gmijax.collectives.ring import World
 from gmijax.collectives.spmd import SpmdStep
-from gmijax.collectives.turns import Turns
+from gmijax.collectives.together import Together, WatchedStep
 from gmijax.partition.reduction import is_one_per_gpu
 
 T = TypeVar("T")
@@ -52,6 +50,7 @@ class RingReducer(OnDevice):
         self._world = world
         self._rings = RingMean(world, num_floats)
         self._courier = Courier("ring")
+        self._together = Together(host, self._courier, num_floats)
         host.rendezvous()
         open_rings(world, self._courier, self._rings, num_floats)
 
@@ -62,7 +61,7 @@ class RingReducer(OnDevice):
 
     def run_on_device(self, program: Callable[[DeviceMean], T]) -> T:
         """See `DeviceReducer`; raises what `mean_on_device` raises."""
-        return self._together("mean", lambda: jax.block_until_ready(program(self._mean)))
+        return self._together.mean(lambda: jax.block_until_ready(program(self._mean)))
 
     def spmd(self, step: Step) -> TracedStep | None:
         """See `DeviceReducer`; with one GMI on each GPU, since a program has each GPU once."""
@@ -70,64 +69,16 @@ class RingReducer(OnDevice):
         if not is_one_per_gpu(layout):
             return None
         ranks = [gmi for gmis in layout.gmis_of_gpu for gmi in gmis]
-        return _WatchedStep(SpmdStep(self._world.mesh(ranks), ranks, step), self._together)
+        return WatchedStep(SpmdStep(self._world.mesh(ranks), ranks, step), self._together)
 
     def close(self) -> None:
         """Gives thread and memory back; calling it twice is fine."""
         self._courier.close()
         self._host.close()
 
-    def _together(self, operation: str, program: Callable[[], T]) -> T:
-        """Runs, with all other ranks, a program in which they exchange numbers."""
-        _, turns = self._host.begin(operation, self._num_floats)
-        turns.meet()
-        turns.check_same_call()
-        is_step = operation == "step"
-        result = run_watched(self._courier, turns, program, is_step=is_step)
-        if is_step:  # Some have given it to their devices an iteration before others.
-            turns.meet(is_patient=True)
-        else:
-            turns.arrive()
-        turns.end()
-        return result
-
     def _mean(self, buffer: jax.Array) -> jax.Array:
         require_device_buffer(buffer, self._num_floats)
         return self._rings(buffer)
-
-
-class _WatchedStep:
-    """A step that is only called when all ranks have come, while peers are looked at.
-
-    From the first call until `wait` the device may be at it, and wait for one that is gone: what
-    ends this process meanwhile, wherever it is found, ends it at once (see `Courier`).
-    """
-
-    def __init__(self, step: SpmdStep, together: Callable[[str, Callable[[], Any]], Any]) -> None:
-        self._step = step
-        self._together = together
-        self._is_running = False
-
-    def trace(self, constants: Any, shared: Any, own: Any) -> None:
-        """See `TracedStep`."""
-        self._step.trace(constants, shared, own)
-
-    def compile(self) -> None:
-        """See `TracedStep`."""
-        self._step.compile()
-
-    def __call__(self, shared: Any, own: Any) -> tuple[Any, Any, Any]:
-        """See `TracedStep`."""
-        if not self._is_running:
-            self._is_running = True
-            atexit.register(end_at_once)
-        return self._together("step", lambda: self._step(shared, own))
-
-    def wait(self) -> None:
-        """See `TracedStep`."""
-        self._together("step", self._step.wait)
-        self._is_running = False
-        atexit.unregister(end_at_once)
 
 
 class RingMean:
@@ -178,24 +129,3 @@ def open_rings(
 
     # Without a limit: the controller ends a GMI that does not get through its start.
     courier.run(first_use, lambda done: done.wait())
-
-
-def run_watched(
-    courier: Courier, turns: Turns, program: Callable[[], T], *, is_step: bool = False
-) -> T:
-    """Runs a program over several GMIs in the courier's thread.
-
-    Args:
-      courier: of this rank.
-      turns: in a call that has begun.
-      program: that of all ranks.
-      is_step: there is more in it than exchanges. It may take any time while all ranks are at
-        it, and its own errors stay what they are.
-
-    Raises:
-      PeerLost, CollectiveTimeout: see `Turns.watch`.
-      CollectiveError: the transfer failed although all peers are there.
-    """
-    watch = functools.partial(turns.watch, is_step=is_step)
-    with turns.explained(is_step=is_step):
-        return courier.run(program, watch)

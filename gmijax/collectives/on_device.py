@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+import warnings
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from typing import TypeVar
@@ -11,9 +12,15 @@ import jax
 import numpy as np
 
 from gmijax.collectives.buffers import require_device_buffer, require_mean_input
+from gmijax.collectives.courier import Courier
+from gmijax.collectives.device_memory import DeviceMemoryUnavailable
 from gmijax.collectives.host import HostExchange
 from gmijax.collectives.interface import DeviceMean, FloatBuffer, Step, TracedStep
 from gmijax.collectives.memory import ExchangeBlock
+from gmijax.collectives.shared_slots import SharedSlots
+from gmijax.collectives.stream_exchange import StreamExchange
+from gmijax.collectives.stream_step import StreamStep
+from gmijax.collectives.together import Together, WatchedStep
 from gmijax.collectives.turns import Turns
 
 T = TypeVar("T")
@@ -41,7 +48,7 @@ class OnDevice(ABC):
         ...
 
     def spmd(self, step: Step) -> TracedStep | None:
-        """See `DeviceReducer`; None, but for those who make one world of all processes."""
+        """See `DeviceReducer`; None unless somebody knows how."""
         del step
         return None
 
@@ -58,11 +65,29 @@ class OnDevice(ABC):
 class HostPaced(OnDevice):
     """The host takes part in every mean: ranks know only from each other that a slot is written.
 
+    But for steps: where all goes through slots, `_all_slots`, the devices tell each other.
+
     Attributes:
       exchange_s: see `DeviceReducer`.
     """
 
     exchange_s = 0.0
+    _all_slots: SharedSlots | None = None
+    _stream: StreamExchange | None = None
+    _together: Together | None = None
+
+    def spmd(self, step: Step) -> TracedStep | None:
+        """See `DeviceReducer`; each rank has a program of its own."""
+        if self._all_slots is None:
+            return None
+        if self._stream is None or self._together is None:
+            try:
+                self._stream = StreamExchange(self._host, self._all_slots)
+            except DeviceMemoryUnavailable as error:
+                warnings.warn(f"{error}; so the host comes between", RuntimeWarning, stacklevel=2)
+                return None
+            self._together = Together(self._host, Courier("step"), self._num_floats)
+        return WatchedStep(StreamStep(self._stream, step), self._together)
 
     def mean_on_device(self, buffer: jax.Array) -> jax.Array:
         """See `OnDevice.mean_on_device`."""
@@ -80,6 +105,15 @@ class HostPaced(OnDevice):
         """See `DeviceReducer`; raises what `mean_on_device` raises."""
         self.exchange_s = 0.0
         return jax.block_until_ready(program(self.mean_on_device))
+
+    def _leave_stream(self) -> bool:
+        """Gives back what steps need; whether the device is through with them."""
+        if self._together is not None and self._together.is_caught:
+            return False
+        if self._together is not None and self._stream is not None:
+            self._together.close()
+            self._stream.close()
+        return True
 
     @abstractmethod
     def _exchange(self, buffer: jax.Array, block: ExchangeBlock, turns: Turns) -> jax.Array:

@@ -44,7 +44,7 @@ class OneShotReducer(HostPaced):
         self._scale = 1.0 / host.world_size
         # The own GPU's first, then the following ones: not all write to the same GPU at once.
         owners, near = leaders(layout), layout.gpu_of(host.rank)
-        self._slots = SharedSlots(
+        self._all_slots = self._slots = SharedSlots(
             host,
             num_floats,
             layout.gmis,
@@ -56,7 +56,8 @@ class OneShotReducer(HostPaced):
 
     def close(self) -> None:
         """Gives memory back, once no result is in use; calling it twice is fine."""
-        self._slots.close()
+        if self._leave_stream():
+            self._slots.close()
         self._host.close()
 
     def _exchange(self, buffer: jax.Array, block: ExchangeBlock, turns: Turns) -> jax.Array:

@@ -15,6 +15,7 @@ from gmijax.collectives.device_memory import (
     TICKET_BYTES,
     DeviceMemory,
     DeviceMemoryUnavailable,
+    DeviceQueue,
     NewMemory,
 )
 from gmijax.collectives.host import HostExchange
@@ -49,6 +50,9 @@ class SharedSlots:
       new_memory: how the processes share a block.
       wish: what cannot be had if this fails, for the message.
 
+    Attributes:
+      num_floats: the same.
+
     Raises:
       DeviceMemoryUnavailable: there is no such memory here, or it does not hold what was
         written; on all ranks alike.
@@ -65,8 +69,9 @@ class SharedSlots:
         new_memory: NewMemory,
         wish: str,
     ) -> None:
-        self._num_floats = num_floats
+        self.num_floats = num_floats
         self._row_floats = -(-num_floats // FLOATS_PER_ROW_UNIT) * FLOATS_PER_ROW_UNIT
+        self._members, self._rank = tuple(members), host.rank
         self._count, self._place = len(members), members.index(host.rank)
         row_bytes = self._row_floats * 4
         self._half_bytes = self._count * row_bytes
@@ -83,9 +88,9 @@ class SharedSlots:
         self._copy = jax.jit(_copy)
         size = self._result_offset + row_bytes
         try:
-            tickets = _agreed(host, wish, lambda: self._make(new_memory, size))
-            _agreed(host, wish, lambda: self._map(tickets))
-            _agreed(host, wish, lambda: self._try(scale))
+            tickets = agreed(host, wish, lambda: self._make(new_memory, size))
+            agreed(host, wish, lambda: self._map(tickets))
+            agreed(host, wish, lambda: self._try(scale))
         except BaseException:
             self.close()
             raise
@@ -125,6 +130,36 @@ class SharedSlots:
             copied, self._read = self._copy(self._result)
         return copied
 
+    def queue(self, flags: npt.NDArray[np.uint32]) -> DeviceQueue:
+        """For `gather`; see `DeviceMemory.queue`."""
+        return self._memories[0].queue(flags)
+
+    def gather(
+        self, queue: DeviceQueue, stream: int, source: int, target: int, num_floats: int
+    ) -> None:
+        """Queues a write, and a copy of what all members wrote.
+
+        Args:
+          queue: of these slots.
+          stream: of the device, where it is queued.
+          source: address of [n] float32, n <= P.
+          target: address of [members, n] float32.
+          num_floats: n.
+        """
+        self._num_writes += 1
+        half, count = self._num_writes % 2, self._num_writes & 0xFFFFFFFF
+        queue.start_clock(stream)
+        for memory in self._memories:
+            queue.copy(stream, memory.address + self._own[half], source, 4 * num_floats)
+        queue.raise_flag(stream, self._rank, count)
+        for member in self._members:
+            if member != self._rank:
+                queue.wait_for_flag(stream, member, count)
+        slots = self._memories[0].address + half * self._half_bytes
+        pitch = 4 * self._row_floats
+        queue.copy_rows(stream, target, slots, pitch, 4 * num_floats, self._count)
+        queue.stop_clock(stream)
+
     def close(self) -> None:
         """Gives the mappings back; calling it twice is fine."""
         with suppress(jax.errors.JaxRuntimeError):  # Why the job fails is known already.
@@ -148,7 +183,7 @@ class SharedSlots:
                 memory.write(self._own[half], self._filled((half + 1) * (self._place + 1)))
         near, shape = self._memories[0], (self._count, self._row_floats)
         self._slots = [near.view(half * self._half_bytes, shape) for half in (0, 1)]
-        self._result = near.view(self._result_offset, (self._num_floats,))
+        self._result = near.view(self._result_offset, (self.num_floats,))
         if self._is_owner:
             near.write(self._result_offset, self._filled(_TRIAL_RESULT))
         return b""
@@ -163,7 +198,7 @@ class SharedSlots:
         return b""
 
     def _filled(self, value: float) -> jax.Array:
-        return jax.device_put(np.full(self._num_floats, value, np.float32))
+        return jax.device_put(np.full(self.num_floats, value, np.float32))
 
     def _finish_reading(self) -> None:
         if self._read is not None:
@@ -171,7 +206,7 @@ class SharedSlots:
             self._read = None
 
 
-def _agreed(host: HostExchange, wish: str, step: Callable[[], bytes]) -> npt.NDArray[np.uint8]:
+def agreed(host: HostExchange, wish: str, step: Callable[[], bytes]) -> npt.NDArray[np.uint8]:
     """Does a step of the start; returns what it returned on every rank [K, NOTE_BYTES].
 
     All ranks of the job call this, and they go on together or not at all.

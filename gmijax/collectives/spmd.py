@@ -58,7 +58,12 @@ class SpmdStep:
       mesh: one device of each member, along `AXIS`.
       ranks: of the members, in the same order.
       step: see `Step`.
+
+    Attributes:
+      exchange_s: see `TracedStep`.
     """
+
+    exchange_s = None
 
     def __init__(self, mesh: Mesh, ranks: Sequence[int], step: Step) -> None:
         self._mesh = mesh

@@ -106,16 +106,17 @@ class ReduceConfig:
     """How gradients are averaged over GMIs."""
 
     strategy: Literal["auto", "mpr", "mrr", "har", "flat", "one_shot"] = doc(
-        "reduction strategy; auto: by the layout (Algorithm 1 of the paper)"
+        "reduction strategy; auto: by the layout, see selection"
     )
     intra: Literal["auto", "host", "ipc"] = doc(
         "exchange inside one GPU, for har: through host memory, or through GPU memory that GMIs "
         "map (ipc); auto: ipc where it can be had; host leaves out one_shot"
     )
     timeout_s: float = doc("longest wait for another GMI in one exchange, seconds")
-    selection: Literal["paper", "measured"] = doc(
-        "what strategy=auto goes by: the paper's Algorithm 1, or the time that every strategy "
-        "takes here, measured before the job starts and kept for the next one",
+    selection: Literal["paper", "device", "measured"] = doc(
+        "what strategy=auto goes by: the paper's Algorithm 1 (paper), the same but one_shot where "
+        "several GMIs share a GPU and can map its memory (device), or the time that every "
+        "strategy takes here, measured before the job starts and kept for the next one (measured)",
         default="paper",
     )
 

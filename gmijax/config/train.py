@@ -46,10 +46,10 @@ class TrainConfig:
             ("decoupled",) if isinstance(self.algo, A3cConfig) else ("tcg_ex", "tdg_ex"),
             f"gmijax.train with algo={self.algo.name}",
         )
-        if self.plan.template == "tdg_ex" and self.reduce.selection != "paper":
+        if self.plan.template == "tdg_ex" and self.reduce.selection == "measured":
             raise ConfigError(
-                f"reduce.selection={self.reduce.selection}: measured for jobs in which every GMI "
-                "trains; with plan.template=tdg_ex allowed is paper"
+                "reduce.selection=measured: for jobs in which every GMI trains; with "
+                "plan.template=tdg_ex allowed are paper, device"
             )
         if self.num_envs != "auto":
             self._check_num_envs(self.num_envs)

@@ -58,10 +58,10 @@ def plan_decoupled(config: TrainConfig, num_envs: int, machine: Machine) -> Plan
         raise ConfigError(
             f"channel.float16={unknown}: allowed are some of {', '.join(FLOAT_CHANNELS)}"
         )
-    if config.reduce.selection != "paper":
+    if config.reduce.selection == "measured":
         raise ConfigError(
-            f"reduce.selection={config.reduce.selection}: measured for jobs in which every GMI "
-            "trains; with algo=a3c allowed is paper"
+            "reduce.selection=measured: for jobs in which every GMI trains; with algo=a3c allowed "
+            "are paper, device"
         )
     placed = place(config.plan)
     plan = make_plan(

@@ -32,7 +32,7 @@ def summarise(
             "backend": plan.backend,
             "layout": [list(gmis) for gmis in plan.layout.gmis_of_gpu],
             "num_envs_per_gmi": plan.num_envs_per_gmi,
-            "strategy": plan.strategy,
+            "strategy": result.get("strategy", plan.strategy),
             "intra": result.get("intra", plan.intra),
             "selection": dict(plan.selection),
             "template": plan.template,

@@ -34,11 +34,6 @@ from gmijax.partition.templates import DESCRIPTIONS, TRAINER, Group, group_of, r
 _CLIENTS_OF_OLD_DRIVERS, _CLIENTS_OF_NEW_DRIVERS, _NEW_DRIVER = 48, 60, 590
 _SLICES_OF_A_GPU = 7
 
-_ADVICE = (
-    "; reduce.strategy=one_shot keeps gradients on the GPUs, which trained as fast or faster on "
-    "two H200s (docs/reduction.md)"
-)
-
 _NO_RINGS = {
     "cpu": (
         "between virtual GPUs host memory is faster than any ring, ask for it with "
@@ -93,14 +88,18 @@ def make_plan(
         dataclasses.replace(share, priority=priority)
         for share, priority in zip(slices, first, strict=True)
     )
+    strategy, intra = "none", "host"
+    if training is not None:
+        strategy = _strategy(reduce, training, backend, reasons)
+        intra = _intra(reduce, strategy, layout, backend, reasons)
     return Plan(
         layout=layout,
         slices=slices,
         backend=backend,
         template=chosen,
         num_envs_per_gmi=num_envs,
-        strategy="none" if training is None else _strategy(reduce, training, backend, reasons),
-        intra=_intra(reduce, layout, backend, reasons) if training else "host",
+        strategy=strategy,
+        intra=intra,
         reasons=tuple(reasons),
         roles=roles,
         self_check=_self_check(plan, slices, backend, machine),
@@ -227,14 +226,25 @@ def _strategy(
             f"{_NO_RINGS[backend].format(choice.strategy)}"
         )
         return "mpr"
-    # With one GMI on each GPU the ring is part of the program that trains.
-    is_advised = not is_one_per_gpu(layout) and not why_not_under("one_shot", layout, backend)
-    advice = _ADVICE if is_advised else ""
-    reasons.append(f"strategy {choice.strategy}: {choice.why} (Algorithm 1){advice}")
+    if reduce.selection == "device" and _exchange_on_devices(reduce, layout, backend):
+        reasons.append(
+            "strategy one_shot: GMIs that share GPUs train faster with exchanges on them; "
+            f"Algorithm 1 says {choice.strategy} ({choice.why}), as reduce.selection=paper does"
+        )
+        return "one_shot"
+    reasons.append(f"strategy {choice.strategy}: {choice.why} (Algorithm 1)")
     return choice.strategy
 
 
-def _intra(reduce: ReduceConfig, layout: Layout, backend: BackendName, reasons: list[str]) -> str:
+def _exchange_on_devices(reduce: ReduceConfig, layout: Layout, backend: BackendName) -> bool:
+    # With one GMI on each GPU the ring is part of the program that trains.
+    can = reduce.intra != "host" and why_not_under("one_shot", layout, backend) is None
+    return can and not is_one_per_gpu(layout)
+
+
+def _intra(
+    reduce: ReduceConfig, strategy: str, layout: Layout, backend: BackendName, reasons: list[str]
+) -> str:
     if reduce.intra != "auto":
         if reason := why_not_intra(reduce.intra, backend):
             raise ConfigError(
@@ -244,6 +254,6 @@ def _intra(reduce: ReduceConfig, layout: Layout, backend: BackendName, reasons: 
     if reason := why_not_intra("ipc", backend):
         reasons.append(f"intra host: GMIs of a GPU exchange through shared host memory; {reason}")
         return "host"
-    if reduce.strategy != "one_shot":
+    if strategy != "one_shot":
         reasons.append("intra ipc: with har GMIs of a GPU exchange through memory of the GPU")
     return "ipc"

@@ -199,7 +199,10 @@ class SpmdIteration:
         env_state: BatchState,
     ) -> tuple[LearnerState, BatchState, IterationMetrics]:
         """See `Iteration`; raises what `TracedStep` raises."""
-        return self._step(state, env_state)
+        stepped = self._step(state, env_state)
+        if (reduce_s := self._step.exchange_s) is not None:
+            self.times = {"time/reduce_s": reduce_s}
+        return stepped
 
     def wait(self) -> None:
         """See `Iteration`; raises what `TracedStep` raises."""

@@ -9,7 +9,7 @@ from __future__ import annotations
 import sys
 import time
 from collections.abc import Callable, Mapping
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
@@ -33,6 +33,8 @@ if TYPE_CHECKING:
     from gmijax.collectives.ring import World
 
 WARM_UP_CALLS = 10
+STEPS = 4
+"""Whole steps between two waits for the device; training waits after dozens."""
 
 
 def main() -> int:
@@ -83,61 +85,82 @@ def _reducer(
 
 
 def _times(reducer: Reducer, num_floats: int, calls: int) -> dict[str, float]:
-    """Seconds of a mean alone, and of one of `CHAIN` that need each other, as in training."""
-    call = _exchange(reducer, num_floats)
+    """Seconds of a mean alone, and of one of many that need each other, as in training."""
+    if stays_on_device(reducer):
+        alone, chain, length = _on_device(reducer, num_floats)
+    else:
+        alone, chain, length = _through_host(reducer, num_floats)
     for _ in range(WARM_UP_CALLS):
-        call(CHAIN)
-    alone_s = [_timed(call, 1) for _ in range(calls)]
-    chained_s = [_timed(call, CHAIN) / CHAIN for _ in range(-(-calls // CHAIN))]
+        alone()
+        chain()
+    alone_s = [_timed(alone) for _ in range(calls)]
+    chained_s = [_timed(chain) / length for _ in range(-(-calls // CHAIN))]
     low, middle, high = np.quantile(alone_s, (0.1, 0.5, 0.9)).tolist()
     chained = float(np.median(chained_s))
     return {"median_s": middle, "p10_s": low, "p90_s": high, "chained_s": chained}
 
 
-def _exchange(reducer: Reducer, num_floats: int) -> Callable[[int], Any]:
-    """Takes means one of the other, from a gradient on the device to the mean on the device."""
+class _Ways(NamedTuple):
+    """How to take means, from a gradient on the device to the mean on the device.
+
+    Attributes:
+      alone: takes one.
+      chain: takes several, each of the one before.
+      length: of the chain.
+    """
+
+    alone: Callable[[], Any]
+    chain: Callable[[], Any]
+    length: int = CHAIN
+
+
+def _on_device(reducer: DeviceReducer, num_floats: int) -> _Ways:
+    import jax
+
+    gradient = jax.device_put(np.ones(num_floats, np.float32))
+
+    def means(times: int) -> jax.Array:
+        def chain(mean: DeviceMean) -> jax.Array:
+            buffer = gradient
+            for _ in range(times):
+                buffer = mean(buffer)
+            return buffer
+
+        return reducer.run_on_device(chain)
+
+    whole = _whole_steps(reducer, gradient)
+    if whole is not None:
+        return _Ways(lambda: means(1), whole, CHAIN * STEPS)
+    return _Ways(lambda: means(1), lambda: means(CHAIN))
+
+
+def _through_host(reducer: Reducer, num_floats: int) -> _Ways:
     import jax
 
     from gmijax.learner import gradient_sharding
 
     gradient = jax.device_put(np.ones(num_floats, np.float32))
-    if stays_on_device(reducer):
-        alone, chain = _means(reducer, gradient, 1), _means(reducer, gradient, CHAIN)
-        if alone is not None and chain is not None:
-            programs = {1: alone, CHAIN: chain}
-            return lambda times: programs[times]()
-
-        def on_device(times: int) -> jax.Array:
-            def chain(mean: DeviceMean) -> jax.Array:
-                buffer = gradient
-                for _ in range(times):
-                    buffer = mean(buffer)
-                return buffer
-
-            return reducer.run_on_device(chain)
-
-        return on_device
     fetch = jax.jit(lambda x: x + 0.0, out_shardings=gradient_sharding(reducer))
 
-    def through_host(times: int) -> jax.Array:
+    def means(times: int) -> jax.Array:
         buffer = gradient
         for _ in range(times):
             mean = reducer.mean(np.asarray(fetch(buffer)))
             buffer = jax.device_put(np.array(mean))
         return buffer.block_until_ready()
 
-    return through_host
+    return _Ways(lambda: means(1), lambda: means(CHAIN))
 
 
-def _means(reducer: DeviceReducer, gradient: jax.Array, times: int) -> Callable[[], None] | None:
-    """So many means, one of the other, in one program of all GMIs, as where training is one.
+def _whole_steps(reducer: DeviceReducer, gradient: jax.Array) -> Callable[[], None] | None:
+    """`STEPS` steps of `CHAIN` means each, queued as where whole steps of training are.
 
-    None where it is not.
+    None where they are not.
     """
     import jax
 
     def step(peers: Peers, _: Any, buffer: jax.Array, own: Any) -> tuple[jax.Array, Any, Any]:
-        return jax.lax.fori_loop(0, times, lambda _, b: peers.mean(b), buffer), own, ()
+        return jax.lax.fori_loop(0, CHAIN, lambda _, b: peers.mean(b), buffer), own, ()
 
     program = reducer.spmd(step)
     if program is None:
@@ -148,15 +171,16 @@ def _means(reducer: DeviceReducer, gradient: jax.Array, times: int) -> Callable[
     carried = [(gradient.copy(), ())]
 
     def call() -> None:
-        carried[0] = program(*carried[0])[:2]
+        for _ in range(STEPS):
+            carried[0] = program(*carried[0])[:2]
         program.wait()
 
     return call
 
 
-def _timed(call: Callable[[int], Any], times: int) -> float:
+def _timed(call: Callable[[], Any]) -> float:
     started = time.perf_counter()
-    call(times)
+    call()
     return time.perf_counter() - started
 
 

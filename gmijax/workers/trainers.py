@@ -74,6 +74,17 @@ def trainers_reducer(
         rendezvous_timeout_s=config.run.start_timeout_s,
         world=world,
         intra=plan.intra,
-        host_if_unavailable=config.reduce.intra == "auto",
+        # Whoever asks for it by name is told that it does not work.
+        host_if_unavailable=config.reduce.intra == "auto" and config.reduce.strategy != "one_shot",
     )
     return build_reducer(plan.strategy, membership)
+
+
+def exchange_used(plan: Plan, reducer: Reducer) -> dict[str, str]:
+    """What the summary says of the plan's strategy where it may have come to another way."""
+    on_device = reducer.is_device_resident
+    if plan.strategy == "har":
+        return {"intra": "ipc" if on_device else "host"}
+    if plan.strategy == "one_shot" and not on_device:
+        return {"strategy": "mpr", "intra": "host"}
+    return {}

@@ -16,7 +16,12 @@ from gmijax.partition.plan import Plan
 from gmijax.partition.templates import Group
 from gmijax.rundir import read_json
 from gmijax.schema import from_dict
-from gmijax.workers.trainers import environments_of, join_trainers, trainers_reducer
+from gmijax.workers.trainers import (
+    environments_of,
+    exchange_used,
+    join_trainers,
+    trainers_reducer,
+)
 
 
 def main() -> int:
@@ -41,10 +46,7 @@ def _run(link: ChildLink) -> dict[str, Any]:
     num_floats = exchange_size(env.spec, config.algo)
     reducer = trainers_reducer(config, plan, everyone, link, num_floats, world)
     try:
-        done = train(config, env, reducer, link)
-        if plan.strategy == "har":  # It may have come to another exchange than the plan's.
-            done["intra"] = "ipc" if reducer.is_device_resident else "host"
-        return done
+        return train(config, env, reducer, link) | exchange_used(plan, reducer)
     finally:
         reducer.close()
 

@@ -73,11 +73,24 @@ def test_device_memory_that_does_not_work_is_found_by_all(
             assert (result["error"], result["message"]) == ("DeviceMemoryUnavailable", said)
 
 
-def test_one_shot_says_on_all_ranks_where_memory_does_not_work(tmp_path: Path) -> None:
-    options = {"strategy": "one_shot", "intra": "ipc", "num_calls": 2, "broken_rank": 1}
+@pytest.mark.parametrize("host_if_unavailable", [True, False])
+def test_one_shot_says_on_all_ranks_where_memory_does_not_work(
+    host_if_unavailable: bool, tmp_path: Path
+) -> None:
+    options = {
+        "strategy": "one_shot",
+        "intra": "ipc",
+        "num_calls": 2,
+        "broken_rank": 1,
+        "host_if_unavailable": host_if_unavailable,
+    }
     with Ranks(tmp_path, 2, "check_means", layout=[[0], [1]], **options).start() as job:
         results = job.results()
-    said = "shared GPU memory does not hold what was written into it"
-    for result in results:
-        assert result["error"] == "DeviceMemoryUnavailable"
-        assert result["message"] == f"reduce.strategy=one_shot: rank 0: {said}"
+    why = "shared GPU memory does not hold what was written into it"
+    said = f"reduce.strategy=one_shot: rank 0: {why}"
+    for rank, result in enumerate(results):
+        if host_if_unavailable:
+            assert result["error"] is None
+            assert f"{said}; so reduce.strategy=mpr" in (tmp_path / f"stderr_{rank}").read_text()
+        else:
+            assert (result["error"], result["message"]) == ("DeviceMemoryUnavailable", said)

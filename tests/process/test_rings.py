@@ -38,16 +38,16 @@ def test_ranks_with_different_lengths_name_both(tmp_path: Path) -> None:
 
 @pytest.mark.timeout(240)
 @pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGSTOP])
-def test_who_ends_while_one_program_runs_on_all_is_named(
-    number: signal.Signals, tmp_path: Path
+@pytest.mark.parametrize(("strategy", "intra"), [("flat", "host"), ("one_shot", "ipc")])
+def test_who_ends_while_all_run_a_step_is_named(
+    strategy: str, intra: str, number: signal.Signals, tmp_path: Path
 ) -> None:
     """And the others end, although their devices wait for the one that is gone or stopped."""
     for attempt in range(4):  # At another moment each.
         folder = tmp_path / str(attempt)
         folder.mkdir()
-        with Ranks(
-            folder, 2, "step_forever", strategy="flat", layout=[[0], [1]], timeout_s=2.0
-        ) as job:
+        way = {"strategy": strategy, "intra": intra, "layout": [[0], [1]]}
+        with Ranks(folder, 2, "step_forever", **way, timeout_s=2.0) as job:
             job.start().wait_for("running")
             time.sleep(attempt * 7e-3)
             sent_s = job.signal(1, number)

@@ -5,6 +5,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from fake_device_memory import one_shot_of_one
 from jax.sharding import Mesh
 from toy_env import point_mass
 
@@ -107,13 +108,18 @@ def test_all_paths_compute_the_same(learner, config) -> None:
     fused = FusedIteration(ENV, learner)
     split = SplitIteration(ENV, learner, SoloReducer(size))
     results = []
-    for iteration in (fused, split, _spmd(learner, config)):
-        state, envs = _start(learner)
-        iteration.trace(state, envs)
-        iteration.compile()
-        for _ in range(3):
-            state, envs, metrics = iteration(state, envs)
-        results.append((state.params, state.obs_moments, envs.env.obs, metrics))
+    with one_shot_of_one(size) as reducer:
+        queued = SpmdIteration.if_possible(ENV, learner, reducer)
+        assert queued is not None
+        for iteration in (fused, split, _spmd(learner, config), queued):
+            state, envs = _start(learner)
+            iteration.trace(state, envs)
+            iteration.compile()
+            for _ in range(3):
+                state, envs, metrics = iteration(state, envs)
+            iteration.wait()
+            results.append((state.params, state.obs_moments, envs.env.obs, metrics))
+        assert queued.times["time/reduce_s"] > 0
     for result in results[1:]:
         _close(results[0], result, atol=1e-4)
 

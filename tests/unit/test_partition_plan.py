@@ -21,8 +21,8 @@ from gmijax.partition.planner import make_plan, split_cores
 MPS = Path("/usr/bin/nvidia-cuda-mps-control")
 
 
-def planned(here: Machine, **changes: Any) -> Plan:
-    return make_plan(plan_config(**changes), reduce_config(), 64, here)
+def planned(here: Machine, reduce: dict[str, Any] | None = None, **changes: Any) -> Plan:
+    return make_plan(plan_config(**changes), reduce_config(**(reduce or {})), 64, here)
 
 
 def test_even_layout_numbers_gmis_gpu_by_gpu():
@@ -107,23 +107,40 @@ def test_auto_tells_what_algorithm_1_says_and_keeps_to_host_memory(
     assert why in reason
 
 
+@pytest.mark.parametrize(
+    ("changes", "selection", "strategy"),
+    [
+        ({"gpus": 2, "gmis_per_gpu": 2}, "device", "one_shot"),
+        ({"gmis_per_gpu": 3}, "device", "one_shot"),
+        ({"layout": ((0, 1), (2,))}, "device", "one_shot"),
+        # One program trains on all GPUs.
+        ({"gpus": 2}, "device", "mrr"),
+        ({"gpus": 2, "gmis_per_gpu": 2}, "paper", "mrr"),
+        ({"gmis_per_gpu": 3}, "paper", "mpr"),
+    ],
+)
 @pytest.mark.parametrize("is_installed", [True, False])
-def test_auto_tells_of_one_shot_where_it_can_be_had(
-    is_installed: bool, monkeypatch: pytest.MonkeyPatch
-):
-    monkeypatch.setattr(reduction, "_is_installed", lambda *_: is_installed)
-    plan = planned(machine(2), gpus=2, gmis_per_gpu=2, backend="share")
-    assert plan.strategy == "mrr"
-    assert any("reduce.strategy=one_shot" in why for why in plan.reasons) == is_installed
-
-
-def test_auto_does_not_tell_of_one_shot_where_one_program_trains_on_all_gpus(
+def test_gmis_that_share_a_gpu_exchange_on_it_where_they_can(
+    changes: dict[str, Any],
+    selection: str,
+    strategy: str,
+    is_installed: bool,
     monkeypatch: pytest.MonkeyPatch,
 ):
+    monkeypatch.setattr(reduction, "_is_installed", lambda *_: is_installed)
+    by_paper = planned(machine(2), backend="share", **changes).strategy
+    plan = planned(machine(2), {"selection": selection}, backend="share", **changes)
+    assert plan.strategy == (strategy if is_installed else by_paper)
+    (reason,) = [text for text in plan.reasons if text.startswith("strategy")]
+    assert f"Algorithm 1 says {by_paper} (" in reason or "(Algorithm 1)" in reason
+    assert plan.intra == ("ipc" if is_installed else "host")
+
+
+def test_who_wants_host_memory_gets_what_algorithm_1_says(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(reduction, "_is_installed", lambda *_: True)
-    plan = planned(machine(2), gpus=2, backend="share")
-    assert plan.strategy == "mrr"
-    assert not any("one_shot" in why for why in plan.reasons)
+    reduce = {"selection": "device", "intra": "host"}
+    plan = planned(machine(1), reduce, backend="share", gmis_per_gpu=2)
+    assert (plan.strategy, plan.intra) == ("mpr", "host")
 
 
 @pytest.mark.parametrize(

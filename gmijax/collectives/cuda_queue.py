@@ -1,0 +1,124 @@
+"""Work for a stream of a GPU: copies, and flags in memory of the host, by cuda-bindings."""
+
+from __future__ import annotations
+
+import importlib
+from collections import deque
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from gmijax.errors import CollectiveError
+
+# By name, because it has no type information, and is not installed everywhere.
+runtime: Any = importlib.import_module("cuda.bindings.runtime")
+driver: Any = importlib.import_module("cuda.bindings.driver")
+
+
+class CudaError(CollectiveError):
+    """CUDA refused something; the message has its words."""
+
+
+class CudaQueue:
+    """A `DeviceQueue`: copies, and stream memory operations on flags in memory of the host.
+
+    Args:
+      flags: [whole pages, line] uint32, shared by processes; not of a file with a name, which
+        CUDA does not register.
+
+    Raises:
+      CudaError: from every method.
+    """
+
+    def __init__(self, flags: npt.NDArray[np.uint32]) -> None:
+        self._host, self._line_bytes = flags.ctypes.data, flags.strides[0]
+        mapped = runtime.cudaHostRegisterMapped | runtime.cudaHostRegisterPortable
+        checked(
+            runtime.cudaHostRegister(self._host, flags.nbytes, mapped),
+            "let the GPU see flags in host memory",
+        )
+        (address,) = checked(
+            runtime.cudaHostGetDevicePointer(self._host, 0), "see flags from the GPU"
+        )
+        self._flags = int(address)
+        self._kind = runtime.cudaMemcpyKind.cudaMemcpyDeviceToDevice
+        self._clocks: deque[tuple[Any, Any]] = deque()  # Started and stopped, not yet read.
+        self._idle_clocks: list[tuple[Any, Any]] = []
+        self._clock: tuple[Any, Any] | None = None
+
+    def copy(self, stream: int, target: int, source: int, num_bytes: int) -> None:
+        """See `DeviceQueue`."""
+        checked(
+            runtime.cudaMemcpyAsync(target, source, num_bytes, self._kind, stream), "queue a copy"
+        )
+
+    def copy_rows(
+        self, stream: int, target: int, source: int, pitch: int, num_bytes: int, rows: int
+    ) -> None:
+        """See `DeviceQueue`."""
+        copied = runtime.cudaMemcpy2DAsync(
+            target, num_bytes, source, pitch, num_bytes, rows, self._kind, stream
+        )
+        checked(copied, "queue a copy")
+
+    def raise_flag(self, stream: int, place: int, count: int) -> None:
+        """See `DeviceQueue`."""
+        # No flags: with the barrier that makes what was written before visible to all.
+        flag = self._flags + place * self._line_bytes
+        _queued(driver.cuStreamWriteValue32(stream, flag, count, 0), "write")
+
+    def wait_for_flag(self, stream: int, place: int, count: int) -> None:
+        """See `DeviceQueue`."""
+        flag = self._flags + place * self._line_bytes
+        at_least = driver.CUstreamWaitValue_flags.CU_STREAM_WAIT_VALUE_GEQ.value
+        _queued(driver.cuStreamWaitValue32(stream, flag, count, at_least), "wait for")
+
+    def start_clock(self, stream: int) -> None:
+        """See `DeviceQueue`."""
+        self._clock = self._idle_clocks.pop() if self._idle_clocks else (_event(), _event())
+        checked(runtime.cudaEventRecord(self._clock[0], stream), "record an event")
+
+    def stop_clock(self, stream: int) -> None:
+        """See `DeviceQueue`."""
+        assert self._clock is not None
+        checked(runtime.cudaEventRecord(self._clock[1], stream), "record an event")
+        self._clocks.append(self._clock)
+
+    def clocked_s(self) -> float:
+        """See `DeviceQueue`."""
+        total_ms = 0.0
+        success = runtime.cudaError_t.cudaSuccess
+        while self._clocks and runtime.cudaEventQuery(self._clocks[0][1])[0] == success:
+            clock = self._clocks.popleft()
+            total_ms += checked(runtime.cudaEventElapsedTime(*clock), "read an event")[0]
+            self._idle_clocks.append(clock)
+        return total_ms / 1e3
+
+    def close(self) -> None:
+        """See `DeviceQueue`."""
+        if self._host:
+            runtime.cudaHostUnregister(self._host)
+            self._host = 0
+
+
+def checked(result: tuple[Any, ...], wish: str) -> tuple[Any, ...]:
+    """What a call of the runtime returned, but for its error code.
+
+    Raises:
+      CudaError: there was one; the message says that one cannot `wish`.
+    """
+    code, *values = result
+    if code != runtime.cudaError_t.cudaSuccess:
+        said = runtime.cudaGetErrorString(code)[1].decode()
+        raise CudaError(f"cannot {wish}: {code.name}: {said}")
+    return tuple(values)
+
+
+def _queued(result: tuple[Any, ...], wish: str) -> None:
+    if result[0] != driver.CUresult.CUDA_SUCCESS:
+        raise CudaError(f"cannot {wish} a flag on the stream: {result[0].name}")
+
+
+def _event() -> Any:
+    return checked(runtime.cudaEventCreate(), "make an event")[0]

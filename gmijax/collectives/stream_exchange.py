@@ -1,0 +1,101 @@
+"""An exchange through shared slots as work of the device, which a compiled program queues.
+
+No rank stops on the host for it: copies, a flag for the others, waits for their flags and a copy
+of what they wrote lie on the program's stream, between what it computes before and after.
+"""
+
+from __future__ import annotations
+
+import itertools
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from gmijax.collectives.device_memory import DeviceQueue
+from gmijax.collectives.host import HostExchange
+from gmijax.collectives.shared_slots import SharedSlots, agreed
+from gmijax.collectives.xla_call import Buffer, register
+from gmijax.errors import CollectiveError
+
+_FREE = 2**30
+_serial = itertools.count()
+
+
+class StreamExchange:
+    """One rank's part; all ranks of the job make theirs together, and try it.
+
+    The slots are used in turn, as by the host: a device that writes one again has seen the flags
+    of the exchange in between, which come after all that had been read of the one before.
+
+    Args:
+      host: this rank's use of the shared block, with the flags.
+      slots: of which all ranks are members.
+
+    Raises:
+      DeviceMemoryUnavailable: it does not work here; on all ranks alike.
+      PeerLost, CollectiveTimeout: as in the first call of a reducer.
+    """
+
+    def __init__(self, host: HostExchange, slots: SharedSlots) -> None:
+        self.rank, self.world_size = host.rank, host.world_size
+        self._slots: SharedSlots | None = slots
+        self._flags = host.flags
+        self._queue: DeviceQueue | None = None
+        # The same on all ranks, which make as many: it is part of their programs.
+        self._name = f"gmijax_exchange_{next(_serial)}"
+        agreed(host, "exchange on the device's stream", self._open)
+        try:
+            agreed(host, "exchange on the device's stream", self._try)
+        except BaseException:
+            self.close()
+            raise
+
+    def gather(self, values: jax.Array) -> jax.Array:
+        """[K, n] from `values` [n] float32 of every rank, n <= P; within a program of all."""
+        if self._slots is None or values.size > self._slots.num_floats:
+            room = 0 if self._slots is None else self._slots.num_floats
+            raise CollectiveError(f"rank {self.rank}: {values.size} floats, room is for {room}")
+        result = jax.ShapeDtypeStruct((self.world_size, values.size), jnp.float32)
+        call: Any = jax.ffi.ffi_call(self._name, result, has_side_effect=True)
+        return call(values)
+
+    def clocked_s(self) -> float:
+        """Seconds of exchanges that the device is through with, and that were not told before.
+
+        Each from the time that this rank's values were there to the time that all ranks' were.
+        """
+        return 0.0 if self._queue is None else self._queue.clocked_s()
+
+    def close(self) -> None:
+        """Gives the flags back, once no program is under way; calling it twice is fine."""
+        if self._queue is not None:
+            self._queue.close()
+        self._queue, self._slots = None, None
+
+    def _open(self) -> bytes:
+        assert self._slots is not None
+        self._queue = self._slots.queue(self._flags)
+        register(self._name, self._call)
+        return b""
+
+    def _try(self) -> bytes:
+        """A first exchange of known numbers."""
+        assert self._slots is not None
+        size = self._slots.num_floats
+        try:
+            found = jax.jit(self.gather)(jnp.full(size, self.rank + 1, jnp.float32))
+            wanted = np.repeat(np.arange(1, self.world_size + 1)[:, None], size, axis=1)
+            if not np.array_equal(found, wanted):
+                raise RuntimeError("what comes is not what was sent")
+        except BaseException:
+            self._flags[self.rank, 0] = _FREE  # The others' devices wait for it.
+            raise
+        return b""
+
+    def _call(self, stream: int, arguments: list[Buffer], results: list[Buffer]) -> None:
+        if self._slots is None or self._queue is None:
+            raise RuntimeError("the exchange is closed")
+        (values,), (gathered,) = arguments, results
+        self._slots.gather(self._queue, stream, values.address, gathered.address, values.shape[0])
