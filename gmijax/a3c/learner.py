@@ -114,8 +114,3 @@ def batch_moments(learner: Learner[A3cConfig], state: LearnerState, batch: Unrol
 def finish_batch(state: LearnerState, obs: Moments) -> LearnerState:
     """Counts the batch, which makes a new version of the policy, and takes in its statistics."""
     return state._replace(obs_moments=merge(state.obs_moments, obs), iteration=state.iteration + 1)
-
-
-def pack_losses(losses: LossMetrics) -> Array:
-    """[5] float32, to travel with a gradient."""
-    return jnp.stack(losses)

@@ -8,7 +8,6 @@ gradients and statistics between them, on the host or on the device.
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable
 from typing import Any, NamedTuple, Protocol
 
 import jax
@@ -24,24 +23,22 @@ from gmijax.a3c.learner import (
     finish_batch,
     gradients,
     minibatch_order,
-    pack_losses,
     pack_weights,
 )
 from gmijax.a3c.losses import LossMetrics, Unrolls, UpdateContext
-from gmijax.collectives.interface import FloatBuffer, Reducer, stays_on_device
+from gmijax.collectives.interface import Reducer
 from gmijax.config import A3cConfig
 from gmijax.learner import (
     Learner,
     LearnerState,
     apply_gradients,
-    gradient_sharding,
     host_sharding,
     init_learner,
     make_learner,
 )
 from gmijax.normalize import merge_all, no_samples
-from gmijax.policy import ActorCriticParams
 from gmijax.sim.interface import EnvSpec
+from gmijax.split_updates import SplitUpdates
 from gmijax.types import Array
 
 _NUM_LOSSES = len(LossMetrics._fields)
@@ -142,13 +139,8 @@ class SplitUpdate:
         self._obs_size = obs_size
         self._reducer = reducer
         self._rank = np.int32(reducer.rank)
-        where = gradient_sharding(reducer)
         self._begin: Any = jax.jit(self._begin_fn)
-        self._gradient: Any = jax.jit(self._gradient_fn, out_shardings=where)
-        self._step: Any = jax.jit(
-            self._step_fn, donate_argnums=(0,), out_shardings=(None, where, None)
-        )
-        self._apply: Any = jax.jit(self._apply_fn, donate_argnums=(0,))
+        self._updates = SplitUpdates(learner, reducer, gradients, LossMetrics)
         self._finish: Any = jax.jit(
             self._finish_fn,
             donate_argnums=(0,),
@@ -159,14 +151,9 @@ class SplitUpdate:
         """See `Update`."""
         order, context, packed = jax.eval_shape(self._begin_fn, state, batch, weight, self._rank)
         gathered = jax.ShapeDtypeStruct((self._reducer.world_size, *packed.shape), jnp.float32)
-        index = jax.ShapeDtypeStruct((), jnp.int32)
-        rest = (batch, context, order, index)
-        buffer = jax.eval_shape(self._gradient_fn, state.params, *rest)
-        losses = [jax.ShapeDtypeStruct((_NUM_LOSSES,), jnp.float32)] * order.shape[0]
+        losses = self._updates.trace(state, batch, context, order)
         self._begin = self._begin.lower(state, batch, weight, self._rank).compile()
-        self._gradient = self._gradient.lower(state.params, *rest).compile()
-        self._step = self._step.lower(state, buffer, *rest).compile()
-        self._apply = self._apply.lower(state, buffer).compile()
+        self._updates.compile()
         self._finish = self._finish.lower(state, gathered, losses).compile()
 
     def __call__(
@@ -177,27 +164,8 @@ class SplitUpdate:
         order, context, packed = self._begin(state, batch, weight, self._rank)
         gathered = np.array(self._reducer.all_gather(np.asarray(packed)))
 
-        def steps(mean: Callable[[Array], Array | FloatBuffer]) -> tuple[LearnerState, Any]:
-            losses: list[Array] = []
-            moved, buffer = state, self._gradient(state.params, batch, context, order, np.int32(0))
-            for index in range(1, order.shape[0]):
-                rest = batch, context, order, np.int32(index)
-                # One program between two exchanges: every start of one costs time on the host.
-                moved, buffer, loss = self._step(moved, mean(buffer), *rest)
-                losses.append(loss)
-            moved, loss = self._apply(moved, mean(buffer))
-            return moved, [*losses, loss]
-
-        if stays_on_device(self._reducer):
-            moved, losses = self._reducer.run_on_device(steps)
-        else:
-            moved, losses = steps(self._host_mean)
+        moved, losses = self._updates(state, batch, context, order)
         return self._finish(moved, gathered, losses)
-
-    def _host_mean(self, buffer: Array) -> FloatBuffer:
-        # A copy: the reducer's view is overwritten by the next exchange, which may start
-        # before the asynchronous step has read it.
-        return np.array(self._reducer.mean(np.asarray(buffer)))
 
     def _begin_fn(
         self, state: LearnerState, batch: Unrolls, weight: Array, rank: Array
@@ -205,35 +173,6 @@ class SplitUpdate:
         order = minibatch_order(self._learner, state, rank, batch.reward.shape[1])
         seen = ravel_pytree(batch_moments(self._learner, state, batch))[0]
         return order, begin_batch(self._learner, state, batch, weight), seen
-
-    def _gradient_fn(
-        self,
-        params: ActorCriticParams,
-        batch: Unrolls,
-        context: UpdateContext,
-        order: Array,
-        index: Array,
-    ) -> Array:
-        grads, losses = gradients(self._learner, params, batch, context, order[index])
-        return jnp.concatenate([ravel_pytree(grads)[0], pack_losses(losses)])
-
-    def _step_fn(
-        self,
-        state: LearnerState,
-        buffer: Array,
-        batch: Unrolls,
-        context: UpdateContext,
-        order: Array,
-        index: Array,
-    ) -> tuple[LearnerState, Array, Array]:
-        state, losses = self._apply_fn(state, buffer)
-        return state, self._gradient_fn(state.params, batch, context, order, index), losses
-
-    def _apply_fn(self, state: LearnerState, buffer: Array) -> tuple[LearnerState, Array]:
-        gradient, losses = buffer[:-_NUM_LOSSES], buffer[-_NUM_LOSSES:]
-        unravel = ravel_pytree(state.params)[1]
-        kl = LossMetrics(*losses).kl
-        return apply_gradients(self._learner, state, unravel(gradient), kl), losses
 
     def _finish_fn(
         self, state: LearnerState, gathered: Array, losses: list[Array]

@@ -40,8 +40,8 @@ def gradients(
     learner: Learner,
     params: ActorCriticParams,
     samples: Samples,
-    indices: Array,
     context: UpdateContext,
+    indices: Array,
 ) -> tuple[ActorCriticParams, LossMetrics]:
     """Gradient and loss parts on the minibatch `indices` [B] of flat samples [T * N]."""
     minibatch = jax.tree.map(lambda x: x[indices], samples)

@@ -248,7 +248,7 @@ def learn(
     order = minibatch_order(learner, state, rank, samples.advantage.shape[0])
 
     def update(state: LearnerState, indices: Array) -> tuple[LearnerState, LossMetrics]:
-        grads, losses = gradients(learner, state.params, samples, indices, context)
+        grads, losses = gradients(learner, state.params, samples, context, indices)
         if peers is not None:
             packed, unpack = ravel_pytree((grads, losses))
             grads, losses = unpack(peers.mean(packed))

@@ -204,13 +204,13 @@ def test_shards_of_minibatches_give_the_update_of_the_whole(learner) -> None:
     sharded = single = state
     for k in range(order[0].shape[0]):
         parts = [
-            gradients(learner, sharded.params, shards[r], order[r][k], context) for r in range(2)
+            gradients(learner, sharded.params, shards[r], context, order[r][k]) for r in range(2)
         ]
         grads, losses = jax.tree.map(lambda *x: sum(x) / 2, *parts)
         sharded = apply_gradients(learner, sharded, grads, losses.kl)
         # Sample (t, env) of shard r is row t * 2N + r * N + env of the whole.
         rows = [(o[k] // N) * 2 * N + r * N + o[k] % N for r, o in enumerate(order)]
-        grads, losses = gradients(learner, single.params, whole, jnp.concatenate(rows), context)
+        grads, losses = gradients(learner, single.params, whole, context, jnp.concatenate(rows))
         single = apply_gradients(learner, single, grads, losses.kl)
     _close(sharded.params, single.params, atol=2e-5)
     np.testing.assert_allclose(sharded.learning_rate, single.learning_rate)
