@@ -53,6 +53,8 @@ def _templates(task: str, num_envs: int) -> tuple[Case, ...]:
     shared = (
         *(f"env={task}", f"num_envs={num_envs}", f"num_timesteps={12 * 32 * 2 * num_envs}"),
         *("plan.backend=mps", "run.measure_throughput=false", "run.checkpoint_every=0"),
+        # The resource model has rollout, updates and exchanges apart.
+        "reduce.selection=paper",
     )
     return (
         Case(f"2 GMIs x {num_envs}, tcg_ex", (*shared, "plan.gmis_per_gpu=2")),

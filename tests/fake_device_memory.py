@@ -92,7 +92,8 @@ class FakeQueue:
         self._flags[place, 0] = count
 
     def wait_for_flag(self, stream: int, place: int, count: int) -> None:
-        while int(np.int32(self._flags[place, 0] - np.uint32(count))) < 0:
+        # As a GPU compares, which takes counts for a circle.
+        while (int(self._flags[place, 0]) - count) % 2**32 >= 2**31:
             time.sleep(5e-5)
 
     def start_clock(self, stream: int) -> None:
@@ -114,6 +115,20 @@ class BrokenDeviceMemory(FakeDeviceMemory):
 
     def start_write(self, offset: int, values: jax.Array) -> None:
         del offset, values
+
+
+class FailingQueue(FakeQueue):
+    """Takes no copy."""
+
+    def copy(self, stream: int, target: int, source: int, num_bytes: int) -> None:
+        raise RuntimeError("CUDA_ERROR_INVALID_VALUE")
+
+
+class WithFailingQueue(FakeDeviceMemory):
+    """Of a device that says only when it is used that it does not work."""
+
+    def queue(self, flags: np.ndarray) -> FakeQueue:
+        return FailingQueue(flags)
 
 
 class WithoutQueue(FakeDeviceMemory):

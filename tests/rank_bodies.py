@@ -21,6 +21,7 @@ from gmijax.collectives.interface import (
 from gmijax.types import Array
 
 Options = dict[str, Any]
+TINY = {"policy_hidden_layer_sizes": (16,), "value_hidden_layer_sizes": (16,)}
 
 
 def check_means(reducer: Reducer, options: Options) -> Options:
@@ -77,13 +78,16 @@ def check_steps(reducer: Reducer, options: Options) -> Options:
         ranks = peers.gather(peers.rank()[None].astype(jnp.float32))[:, 0]
         return jax.lax.fori_loop(0, 5, add_mean_rank, shared), own + 1.0, ranks
 
+    middle = (reducer.world_size - 1) / 2
     program = reducer.spmd(step)
     if program is None:
+        for call in range(3):
+            mean = reducer.mean(np.full(size, reducer.rank + call, np.float32))
+            np.testing.assert_allclose(mean, middle + call, rtol=1e-5)
         return {"steps_digest": None}
     shared, own = jnp.zeros(size), jnp.zeros(3)
     program.trace((), shared, own)
     program.compile()
-    middle = (reducer.world_size - 1) / 2
     for call in range(1, 21):
         shared, own, ranks = program(shared, own)
         if call % 4 == 0:
@@ -94,6 +98,42 @@ def check_steps(reducer: Reducer, options: Options) -> Options:
             np.testing.assert_allclose(mean, middle + call, rtol=1e-5)
     program.wait()
     return {"steps_digest": hashlib.sha256(np.asarray(shared).tobytes()).hexdigest()}
+
+
+def check_training(reducer: Reducer, options: Options) -> Options:
+    """PPO learns the same with the exchanges in its program and with the host between them."""
+    import dataclasses
+
+    import jax
+    from toy_env import point_mass
+
+    from gmijax.cli import compose
+    from gmijax.learner import init_learner, make_learner
+    from gmijax.ppo.programs import SpmdIteration
+    from gmijax.ppo.split import SplitIteration
+    from gmijax.sim.wrappers import env_keys
+
+    env = point_mass()
+    config = dataclasses.replace(
+        compose().algo, unroll_length=4, num_minibatches=2, num_updates_per_batch=2, **TINY
+    )
+    learner = make_learner(env.spec, dataclasses.replace(config, **options["algo"]))
+    keys = env_keys(jax.random.key(1), reducer.rank * 8, 8)
+    whole = SpmdIteration.if_possible(env, learner, reducer)
+    assert whole is not None
+    found = []
+    for iteration in (whole, SplitIteration(env, learner, reducer)):
+        state = init_learner(learner, env.spec.obs_size, jax.random.key(0))
+        envs = jax.jit(env.init)(env.model, keys)
+        iteration.trace(state, envs)
+        iteration.compile()
+        for _ in range(3):
+            state, envs, _ = iteration(state, envs)
+        iteration.wait()
+        found.append(jax.device_get((state.params, state.obs_moments, envs.env.obs)))
+    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-4, atol=1e-5), *found)
+    shared = jax.tree.leaves(found[0][:2])
+    return {"digest": hashlib.sha256(b"".join(x.tobytes() for x in shared)).hexdigest()}
 
 
 def check_order(reducer: Reducer, options: Options) -> Options:
@@ -196,7 +236,7 @@ def close_at_once(reducer: Reducer, options: Options) -> Options:
 BODIES: dict[str, Callable[[Reducer, Options], Options]] = {
     body.__name__: body
     for body in (
-        *(check_all, check_means, check_order, check_steps),
+        *(check_all, check_means, check_order, check_steps, check_training),
         *(call_forever, step_forever, call_once, gather_once, close_at_once),
     )
 }

@@ -149,13 +149,13 @@ def layout_of(options: Options) -> Layout:
     return Layout(tuple(tuple(gmis) for gmis in options["layout"]))
 
 
-def use_fake_device_memory(*, is_broken: bool) -> None:
+def use_fake_device_memory(kind: str) -> None:
     """Lets `intra=ipc` run on the CPU: the real exchange over memory that is not a GPU's."""
-    from fake_device_memory import BrokenDeviceMemory, FakeDeviceMemory
+    import fake_device_memory
 
     from gmijax.collectives import build, ipc
 
-    memory = BrokenDeviceMemory if is_broken else FakeDeviceMemory
+    memory = getattr(fake_device_memory, kind)
 
     def fake(layout: Layout, rank: int, num_floats: int, host: HostExchange) -> ipc.IpcIntra:
         return ipc.IpcIntra(layout, rank, num_floats, host, memory)
@@ -168,7 +168,8 @@ def make_reducer(options: Options) -> Reducer:
     """The reducer of one rank."""
     strategy, rank, layout = options["strategy"], options["rank"], layout_of(options)
     if options["intra"] == "ipc" and not options["gpus"]:
-        use_fake_device_memory(is_broken=rank == options.get("broken_rank"))
+        is_special = rank == options.get("special_rank")
+        use_fake_device_memory(options["special"] if is_special else "FakeDeviceMemory")
     return build_reducer(
         strategy,
         Membership(

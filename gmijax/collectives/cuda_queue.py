@@ -38,9 +38,10 @@ class CudaQueue:
             runtime.cudaHostRegister(self._host, flags.nbytes, mapped),
             "let the GPU see flags in host memory",
         )
-        (address,) = checked(
-            runtime.cudaHostGetDevicePointer(self._host, 0), "see flags from the GPU"
-        )
+        mapping = runtime.cudaHostGetDevicePointer(self._host, 0)
+        if mapping[0] != runtime.cudaError_t.cudaSuccess:
+            runtime.cudaHostUnregister(self._host)
+        (address,) = checked(mapping, "see flags from the GPU")
         self._flags = int(address)
         self._kind = runtime.cudaMemcpyKind.cudaMemcpyDeviceToDevice
         self._clocks: deque[tuple[Any, Any]] = deque()  # Started and stopped, not yet read.

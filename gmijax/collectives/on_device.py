@@ -22,6 +22,7 @@ from gmijax.collectives.stream_exchange import StreamExchange
 from gmijax.collectives.stream_step import StreamStep
 from gmijax.collectives.together import Together, WatchedStep
 from gmijax.collectives.turns import Turns
+from gmijax.errors import CollectiveError
 
 T = TypeVar("T")
 
@@ -81,17 +82,23 @@ class HostPaced(OnDevice):
         if self._all_slots is None:
             return None
         if self._stream is None or self._together is None:
+            self._together = Together(self._host, Courier("step"), self._num_floats)
             try:
-                self._stream = StreamExchange(self._host, self._all_slots)
+                self._stream = StreamExchange(self._host, self._all_slots, self._together)
             except DeviceMemoryUnavailable as error:
+                self._together.close()
+                self._all_slots = self._together = None
                 warnings.warn(f"{error}; so the host comes between", RuntimeWarning, stacklevel=2)
                 return None
-            self._together = Together(self._host, Courier("step"), self._num_floats)
         return WatchedStep(StreamStep(self._stream, step), self._together)
 
     def mean_on_device(self, buffer: jax.Array) -> jax.Array:
         """See `OnDevice.mean_on_device`."""
         require_device_buffer(buffer, self._num_floats)
+        if self._together is not None and self._together.is_caught:
+            raise CollectiveError(
+                f"rank {self._host.rank}: mean before the last step was waited for"
+            )
         block, turns = self._host.begin("mean", self._num_floats)
         with turns.explained():
             buffer.block_until_ready()
@@ -110,8 +117,9 @@ class HostPaced(OnDevice):
         """Gives back what steps need; whether the device is through with them."""
         if self._together is not None and self._together.is_caught:
             return False
-        if self._together is not None and self._stream is not None:
+        if self._together is not None:
             self._together.close()
+        if self._stream is not None:
             self._stream.close()
         return True
 

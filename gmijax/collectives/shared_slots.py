@@ -132,6 +132,7 @@ class SharedSlots:
 
     def queue(self, flags: npt.NDArray[np.uint32]) -> DeviceQueue:
         """For `gather`; see `DeviceMemory.queue`."""
+        self._finish_reading()
         return self._memories[0].queue(flags)
 
     def gather(
@@ -159,6 +160,10 @@ class SharedSlots:
         pitch = 4 * self._row_floats
         queue.copy_rows(stream, target, slots, pitch, 4 * num_floats, self._count)
         queue.stop_clock(stream)
+
+    def restart(self) -> None:
+        """Begins again with the same one of the two slots on all ranks, when none is at work."""
+        self._num_writes = 0
 
     def close(self) -> None:
         """Gives the mappings back; calling it twice is fine."""

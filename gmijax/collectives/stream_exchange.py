@@ -12,14 +12,17 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+import numpy.typing as npt
 
 from gmijax.collectives.device_memory import DeviceQueue
 from gmijax.collectives.host import HostExchange
 from gmijax.collectives.shared_slots import SharedSlots, agreed
+from gmijax.collectives.together import Together
 from gmijax.collectives.xla_call import Buffer, register
 from gmijax.errors import CollectiveError
 
 _FREE = 2**30
+_WISH = "exchange on the device's stream"
 _serial = itertools.count()
 
 
@@ -32,28 +35,34 @@ class StreamExchange:
     Args:
       host: this rank's use of the shared block, with the flags.
       slots: of which all ranks are members.
+      together: looks at the peers while the first exchange is tried.
 
     Raises:
       DeviceMemoryUnavailable: it does not work here; on all ranks alike.
       PeerLost, CollectiveTimeout: as in the first call of a reducer.
     """
 
-    def __init__(self, host: HostExchange, slots: SharedSlots) -> None:
+    def __init__(self, host: HostExchange, slots: SharedSlots, together: Together) -> None:
         self.rank, self.world_size = host.rank, host.world_size
         self._slots: SharedSlots | None = slots
-        self._flags = host.flags
+        self._flags: npt.NDArray[np.uint32] | None = host.flags
         self._queue: DeviceQueue | None = None
         # The same on all ranks, which make as many: it is part of their programs.
         self._name = f"gmijax_exchange_{next(_serial)}"
-        agreed(host, "exchange on the device's stream", self._open)
         try:
-            agreed(host, "exchange on the device's stream", self._try)
+            agreed(host, _WISH, self._open)
+            failure = together.settle(self._try)
+            agreed(host, _WISH, lambda: _raise(failure))
         except BaseException:
-            self.close()
+            slots.restart()  # Not all ranks need have come as far.
+            if not together.is_caught:
+                self.close()
             raise
 
     def gather(self, values: jax.Array) -> jax.Array:
         """[K, n] from `values` [n] float32 of every rank, n <= P; within a program of all."""
+        if values.dtype != jnp.float32:
+            raise CollectiveError(f"rank {self.rank}: exchanges float32, not {values.dtype}")
         if self._slots is None or values.size > self._slots.num_floats:
             room = 0 if self._slots is None else self._slots.num_floats
             raise CollectiveError(f"rank {self.rank}: {values.size} floats, room is for {room}")
@@ -72,30 +81,41 @@ class StreamExchange:
         """Gives the flags back, once no program is under way; calling it twice is fine."""
         if self._queue is not None:
             self._queue.close()
-        self._queue, self._slots = None, None
+        # XLA keeps the call for ever, and with it this object.
+        self._queue, self._slots, self._flags = None, None, None
 
     def _open(self) -> bytes:
         assert self._slots is not None
+        assert self._flags is not None
         self._queue = self._slots.queue(self._flags)
         register(self._name, self._call)
         return b""
 
-    def _try(self) -> bytes:
-        """A first exchange of known numbers."""
+    def _try(self) -> Exception | None:
+        """A first exchange of known numbers; what went wrong with it."""
         assert self._slots is not None
+        assert self._flags is not None
         size = self._slots.num_floats
         try:
             found = jax.jit(self.gather)(jnp.full(size, self.rank + 1, jnp.float32))
             wanted = np.repeat(np.arange(1, self.world_size + 1)[:, None], size, axis=1)
-            if not np.array_equal(found, wanted):
+            is_right = np.array_equal(found, wanted)
+            if not is_right and not (self._flags[:, 0] == _FREE).any():  # Another one says why.
                 raise RuntimeError("what comes is not what was sent")
-        except BaseException:
+        except Exception as error:  # Whatever it is, the host can take part instead.
             self._flags[self.rank, 0] = _FREE  # The others' devices wait for it.
-            raise
-        return b""
+            return error
+        self.clocked_s()  # Not a part of the first step.
+        return None
 
     def _call(self, stream: int, arguments: list[Buffer], results: list[Buffer]) -> None:
         if self._slots is None or self._queue is None:
             raise RuntimeError("the exchange is closed")
         (values,), (gathered,) = arguments, results
         self._slots.gather(self._queue, stream, values.address, gathered.address, values.shape[0])
+
+
+def _raise(failure: Exception | None) -> bytes:
+    if failure is not None:
+        raise failure
+    return b""

@@ -58,11 +58,12 @@ class Together:
         turns.end()
         return result
 
-    def settle(self, program: Callable[[], object]) -> None:
+    def settle(self, program: Callable[[], T]) -> T:
         """Runs a program that returns when all steps are computed; raises as `run_watched`."""
-        self.step(program)
+        result = self.step(program)
         self._is_running = False
         atexit.unregister(end_at_once)
+        return result
 
     def close(self) -> None:
         """Ends the courier's thread; calling it twice is fine."""

@@ -236,7 +236,7 @@ def _file_name(plan: Plan, machine: Machine, probes: Sequence[Probe]) -> str:
         "layout": str(plan.layout),
         "sm_percent": [share.sm_percent for share in plan.slices],
         "probes": probes,
-        "format": 3,
+        "format": 4,
     }
     digest = hashlib.sha256(json.dumps(facts).encode()).hexdigest()
     return f"{plan.backend}-{plan.layout.num_gpus}g-{plan.layout.num_gmis}k-{digest[:16]}.json"

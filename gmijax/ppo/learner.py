@@ -1,8 +1,8 @@
 """The pure update functions of PPO.
 
 Two paths are built from them, and no third: one program of the whole iteration, of one GMI or of
-several with a GPU each (`gmijax.ppo.programs`); and several, split at the gradient with a reducer
-between the halves (`gmijax.ppo.split`).
+several whose exchanges are part of it (`gmijax.ppo.programs`); and several, split at the gradient
+with a reducer between the halves (`gmijax.ppo.split`).
 """
 
 from __future__ import annotations

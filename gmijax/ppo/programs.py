@@ -1,6 +1,7 @@
 """What a PPO iteration is, and its form as one program with donated state.
 
-That of one GMI, or of several that have a GPU each. All others split it (`gmijax.ppo.split`).
+That of one GMI, or of several whose exchanges can be part of it. All others split it
+(`gmijax.ppo.split`).
 
 Programs hold nothing that depends on a GMI's rank (it is an argument, or looked up by the place
 of the device), so that all GMIs share one entry of the compilation cache.
@@ -163,7 +164,7 @@ class FusedIteration:
 
 
 class SpmdIteration:
-    """The iteration of GMIs that have a GPU each, as one program on all of them.
+    """The iteration of several GMIs, as one program on all their GPUs or one of each GMI.
 
     Args:
       env: this GMI's environments.

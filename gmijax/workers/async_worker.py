@@ -17,7 +17,12 @@ from gmijax.partition.child import ChildLink, required_fd, run_gmi
 from gmijax.partition.plan import Plan
 from gmijax.rundir import read_json
 from gmijax.schema import from_dict
-from gmijax.workers.trainers import environments_of, join_trainers, trainers_reducer
+from gmijax.workers.trainers import (
+    environments_of,
+    exchange_used,
+    join_trainers,
+    trainers_reducer,
+)
 
 if TYPE_CHECKING:
     from gmijax.a3c.board import Board
@@ -86,7 +91,8 @@ def _train(parts: _Parts, world: World | None) -> dict[str, Any]:
     num_floats = exchange_size(parts.env.spec, parts.algo)
     reducer = trainers_reducer(config, plan, trainers, link, num_floats, world)
     try:
-        return learn_until_done(training, parts.board, receiver, reducer, link)
+        done = learn_until_done(training, parts.board, receiver, reducer, link)
+        return done | exchange_used(plan, reducer)
     finally:
         receiver.close()
         reducer.close()

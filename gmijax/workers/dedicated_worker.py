@@ -18,7 +18,12 @@ from gmijax.partition.plan import Plan
 from gmijax.partition.templates import AGENT, TRAINER, Group, group_of, has_role
 from gmijax.rundir import read_json
 from gmijax.schema import from_dict
-from gmijax.workers.trainers import environments_of, join_trainers, trainers_reducer
+from gmijax.workers.trainers import (
+    environments_of,
+    exchange_used,
+    join_trainers,
+    trainers_reducer,
+)
 
 if TYPE_CHECKING:
     from gmijax.collectives.interface import Reducer
@@ -76,7 +81,7 @@ def _train(
     servants = _neighbours(plan, link.gmi, AGENT)
     try:
         remote = Servants(mail, servants, config.run.start_timeout_s)
-        return train(config, env, reducer, link, remote)
+        return train(config, env, reducer, link, remote) | exchange_used(plan, reducer)
     finally:
         reducer.close()
 

@@ -55,7 +55,7 @@ def test_nothing_is_lost_doubled_torn_or_out_of_order(
     settings = config(design=design, transport=transport)
     with ChannelJob(tmp_path, settings, PLACES, **task).start() as job:
         for rank in job.ranks:
-            assert job.result(rank)["error"] is None
+            assert job.result(rank)["error"] is None, job.result(rank)
         require_all_once(job, count)
         assert sum(job.result(trainer)["unrolls"] for trainer in (3, 4)) >= 3 * count
 

@@ -59,7 +59,8 @@ def test_device_memory_that_does_not_work_is_found_by_all(
         "strategy": "har",
         "intra": "ipc",
         "num_calls": 2,
-        "broken_rank": 1,
+        "special_rank": 1,
+        "special": "BrokenDeviceMemory",
         "host_if_unavailable": host_if_unavailable,
     }
     with Ranks(tmp_path, 2, "check_means", **options).start() as job:
@@ -81,7 +82,8 @@ def test_one_shot_says_on_all_ranks_where_memory_does_not_work(
         "strategy": "one_shot",
         "intra": "ipc",
         "num_calls": 2,
-        "broken_rank": 1,
+        "special_rank": 1,
+        "special": "BrokenDeviceMemory",
         "host_if_unavailable": host_if_unavailable,
     }
     with Ranks(tmp_path, 2, "check_means", layout=[[0], [1]], **options).start() as job:
@@ -94,3 +96,18 @@ def test_one_shot_says_on_all_ranks_where_memory_does_not_work(
             assert f"{said}; so reduce.strategy=mpr" in (tmp_path / f"stderr_{rank}").read_text()
         else:
             assert (result["error"], result["message"]) == ("DeviceMemoryUnavailable", said)
+
+
+def test_exchanges_in_a_program_that_fail_on_one_rank_are_left_to_the_host(tmp_path: Path) -> None:
+    special = {"special_rank": 1, "special": "WithFailingQueue"}
+    options = {"strategy": "one_shot", "intra": "ipc", "num_calls": 2, "goes_on": False, **special}
+    layout = [[0, 1], [2]]
+    with Ranks(
+        tmp_path, 3, "check_all", layout=layout, num_ordered_calls=50, **options
+    ).start() as job:
+        results = job.results()
+    for rank, result in enumerate(results):
+        # Means from outside a program are right before and after it was tried.
+        assert (result["error"], result["steps_digest"]) == (None, None), result
+        said = (tmp_path / f"stderr_{rank}").read_text()
+        assert "rank 1: INTERNAL: gmijax_exchange_0: CUDA_ERROR_INVALID_VALUE; so the host" in said

@@ -95,7 +95,7 @@ def test_a_buffer_written_by_another_process_is_read_by_the_documented_format(
         slot = np.frombuffer(raw, np.float32, 20, at.slots + at.row_floats * 4).copy()
         result = np.frombuffer(raw, np.float32, 20, at.result).copy()
     magic, version, world_size, rank, blamed, _, num_floats, pid = head
-    assert (magic, version, world_size, rank, blamed) == (b"GMIX", 2, 2, 1, 0)
+    assert (magic, version, world_size, rank, blamed) == (b"GMIX", 3, 2, 1, 0)
     assert (num_floats, pid) == (20, job.processes[1].pid)
     assert sequence == 3  # attached, then the two meetings of one mean
     assert slot.tolist() == [2.0] * 20

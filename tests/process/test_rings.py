@@ -58,3 +58,23 @@ def test_who_ends_while_all_run_a_step_is_named(
             else:
                 assert (result["error"], result.get("missing")) == ("CollectiveTimeout", [1])
                 assert 1.8 < result["failed_at_s"] - sent_s < 4.0
+
+
+@pytest.mark.timeout(180)
+@pytest.mark.parametrize("normalize_advantage", [True, False])
+@pytest.mark.parametrize(("strategy", "layout"), [("har", [[0, 1]]), ("one_shot", [[0], [1, 2]])])
+def test_exchanges_in_the_program_learn_what_the_host_does_between(
+    strategy: str, layout: list[list[int]], normalize_advantage: bool, tmp_path: Path
+) -> None:
+    """PPO, with fake memory of a device; without it statistics and gradients are independent."""
+    options = {
+        "strategy": strategy,
+        "intra": "ipc",
+        "layout": layout,
+        "num_floats": 2 * 65 + 1 + 5,  # Two networks 2-16-1, one deviation, five losses.
+        "algo": {"normalize_advantage": normalize_advantage},
+    }
+    with Ranks(tmp_path, sum(map(len, layout)), "check_training", **options).start() as job:
+        results = job.results()
+    assert [result["error"] for result in results] == [None] * len(results)
+    assert len({result["digest"] for result in results}) == 1

@@ -82,10 +82,15 @@ def test_a_step_exchanges_no_more_than_there_is_room_for() -> None:
         assert program.exchange_s is None
         with pytest.raises(CollectiveError, match="rank 0: 6 floats, room is for 5"):
             program.trace((), jnp.ones(SIZE + 1), jnp.ones(2))
+        with pytest.raises(CollectiveError, match="exchanges float32, not bfloat16"):
+            program.trace((), jnp.ones(SIZE, jnp.bfloat16), jnp.ones(2))
         program.trace((), jnp.ones(SIZE), jnp.ones(2))
         program.compile()
         shared, own, told = program(jnp.arange(5.0), jnp.full(2, 3.0))
+        with pytest.raises(CollectiveError, match="mean before the last step was waited for"):
+            reducer.mean(np.ones(SIZE, np.float32))
         program.wait()
+        np.testing.assert_array_equal(reducer.mean(np.ones(SIZE, np.float32)), np.ones(SIZE))
         np.testing.assert_array_equal(shared, np.arange(5.0))
         np.testing.assert_array_equal(told, own)
 
