@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import socket
+import threading
 import time
 from collections.abc import Iterator
 from typing import Any
@@ -86,6 +87,38 @@ def test_what_a_killed_agent_had_sent_is_read_beside_its_successors(address: str
     with pytest.raises(PipeClosed):
         receive(inlet, 1)
     inlet.close()
+
+
+def test_an_agent_stays_until_its_trainer_has_taken_all(address: str) -> None:
+    inlet, outlet = RemoteInlet(address, 1, 0), RemoteOutlet(address, 0, 1, CAPACITY)
+    send(outlet, 1, 2)
+    assert receive(inlet, 1) == [1]
+    closing = threading.Thread(target=outlet.close)
+    closing.start()
+    closing.join(0.3)
+    assert closing.is_alive()
+    assert receive(inlet, 1) == [2]
+    closing.join(2.0)
+    assert not closing.is_alive()
+    with pytest.raises(PipeClosed):
+        receive(inlet, 1)
+    inlet.close()
+
+
+@pytest.mark.parametrize("is_there", [True, False])
+def test_an_agent_does_not_wait_for_a_trainer_that_is_not_there(
+    is_there: bool, address: str
+) -> None:
+    inlet = RemoteInlet(address, 1, 0) if is_there else None
+    outlet = RemoteOutlet(address, 0, 1, CAPACITY)
+    send(outlet, 1)
+    if inlet is not None:
+        assert receive(inlet, 1) == [1]
+        send(outlet, 2)
+        inlet.close()
+    started_s = time.monotonic()
+    outlet.close()
+    assert time.monotonic() - started_s < 4.0  # Less than for one that is.
 
 
 def test_an_address_that_cannot_be_is_named() -> None:

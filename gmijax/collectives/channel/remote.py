@@ -11,8 +11,6 @@ Nothing is encrypted and nobody proves who he is: for loopback and networks of o
 
 from __future__ import annotations
 
-import contextlib
-import socket
 import struct
 import time
 import zlib
@@ -22,17 +20,10 @@ from typing import Any, Final
 
 import numpy as np
 
+from gmijax.collectives.channel.connection import Connection
 from gmijax.collectives.pipe import Bytes, Message
 from gmijax.collectives.pipe_format import message_bytes
-from gmijax.errors import CollectiveError, ConfigError, GmijaxError, PeerLost, PipeClosed
-
-try:
-    import zmq
-    from zmq.utils.monitor import recv_monitor_message
-except ImportError:
-    raise ConfigError(
-        "channel.transport=zmq: pyzmq is not installed; the package extra zmq brings it"
-    ) from None
+from gmijax.errors import CollectiveError, GmijaxError, PeerLost, PipeClosed
 
 MAGIC: Final = 0x5A494D47  # "GMIZ" in memory on a little-endian machine
 DATA, GOODBYE, RELEASED = 1, 2, 3
@@ -40,91 +31,8 @@ DATA, GOODBYE, RELEASED = 1, 2, 3
 _HEADER: Final = struct.Struct("<IIQQqQI")
 """magic, kind, epoch, sequence, tag, items, checksum of the parts."""
 
-_LINGER_MS: Final = 2000
-"""How long an end waits for what it has not yet put on the wire, at its close or exit."""
-
-_OPTIONS: Final = {
-    zmq.SNDHWM: 0,  # Acknowledgements bound what waits, not a number of messages.
-    zmq.RCVHWM: 0,
-    zmq.LINGER: _LINGER_MS,
-    zmq.HEARTBEAT_IVL: 2000,
-    zmq.HEARTBEAT_TIMEOUT: 10000,
-}
-
-_HANDSHAKE_FAILED: Final = (
-    zmq.EVENT_HANDSHAKE_FAILED_NO_DETAIL
-    | zmq.EVENT_HANDSHAKE_FAILED_PROTOCOL
-    | zmq.EVENT_HANDSHAKE_FAILED_AUTH
-)
-
-
-class _Connection:
-    """One end of a connection: frames in and out, and whether the other end is there."""
-
-    def __init__(self, address: str, rank: int, peer: int, *, listens: bool) -> None:
-        self.rank, self.peer = rank, peer
-        self.is_closed = False
-        self._connections = self._failures = 0
-        self._was_up = False
-        self._context = zmq.Context()
-        self._socket = self._context.socket(zmq.DEALER)
-        for option, value in _OPTIONS.items():
-            self._socket.setsockopt(option, value)
-        self._monitor = self._socket.get_monitor_socket(
-            zmq.EVENT_HANDSHAKE_SUCCEEDED | zmq.EVENT_DISCONNECTED | _HANDSHAKE_FAILED
-        )
-        try:
-            if listens:
-                self._socket.setsockopt(zmq.USE_FD, _listening(address))
-                self._socket.bind(f"tcp://{address}")
-            else:
-                self._socket.connect(f"tcp://{address}")
-        except (OSError, ValueError, OverflowError, zmq.ZMQError) as error:
-            self.close()
-            raise CollectiveError(
-                f"rank {rank}: no connection with rank {peer} at {address} ({error})"
-            ) from None
-
-    def send(self, frames: Sequence[Any]) -> None:
-        self._socket.send_multipart(frames, flags=zmq.NOBLOCK, copy=False)
-
-    def tell(self, kind: int, epoch: int, sequence: int) -> None:
-        """Sends a message without parts, if there is somebody who could want it."""
-        with contextlib.suppress(zmq.Again):
-            self.send([_HEADER.pack(MAGIC, kind, epoch, sequence, 0, 0, 0)])
-
-    def try_receive(self) -> list[Any] | None:
-        """The next message as buffers, without a copy; None if there is none."""
-        if self.is_closed:
-            return None
-        try:
-            return [f.buffer for f in self._socket.recv_multipart(zmq.NOBLOCK, copy=False)]
-        except zmq.Again:
-            return None
-
-    def is_cut(self) -> bool:
-        """Whether there was a connection and is none now."""
-        while not self.is_closed and self._monitor.poll(0):
-            event = recv_monitor_message(self._monitor)["event"]
-            if event == zmq.EVENT_HANDSHAKE_SUCCEEDED:
-                self._connections += 1
-                self._was_up = True
-            elif event & _HANDSHAKE_FAILED:
-                self._failures += 1
-            elif self._failures:  # The end of a connection that was none, of whomever.
-                self._failures -= 1
-            else:
-                self._connections = max(0, self._connections - 1)
-        return self._was_up and not self._connections
-
-    def close(self) -> None:
-        if not self.is_closed:
-            linger_ms = 0 if self.is_cut() else _LINGER_MS
-            self.is_closed = True
-            self._socket.disable_monitor()
-            self._monitor.close()
-            self._socket.close(linger_ms)
-            self._context.term()
+_FAREWELL_S: Final = 5.0
+"""How long an agent that closes waits for its trainer to take what is on the way."""
 
 
 class RemoteOutlet:
@@ -138,7 +46,7 @@ class RemoteOutlet:
         self.max_message_bytes = capacity_bytes // 2
         self.sent_items = 0
         self._capacity_bytes = capacity_bytes
-        self._connection = _Connection(address, rank, peer, listens=False)
+        self._connection = Connection(address, rank, peer, listens=False)
         self._epoch = time.time_ns()
         self._sequence = self._released = 0
         self._lengths: deque[int] = deque()
@@ -194,8 +102,18 @@ class RemoteOutlet:
     def close(self) -> None:
         """See `Outlet`."""
         if not self._connection.is_closed:
-            self._connection.tell(GOODBYE, self._epoch, self._sequence)
+            _tell(self._connection, GOODBYE, self._epoch, self._sequence)
+            self._wait_until_taken()
             self._connection.close()
+
+    def _wait_until_taken(self) -> None:
+        # An answer to a socket that is closed resets the connection, and what the network has
+        # not delivered by then is lost.
+        deadline_s = time.monotonic() + _FAREWELL_S
+        while self.load_bytes() and not self._has_left and self._connection.is_up():
+            if time.monotonic() > deadline_s:
+                break
+            time.sleep(1e-3)
 
     def _read_answers(self) -> None:
         while (frames := self._connection.try_receive()) is not None:
@@ -214,7 +132,7 @@ class RemoteInlet:
 
     def __init__(self, address: str, rank: int, peer: int) -> None:
         self.peer = peer
-        self._connection = _Connection(address, rank, peer, listens=True)
+        self._connection = Connection(address, rank, peer, listens=True)
         self._next: dict[int, int] = {}  # By epoch: what a killed agent sent may be read later.
         self._held_epoch: int | None = None
         self._has_left = False
@@ -249,7 +167,7 @@ class RemoteInlet:
         """See `Inlet`."""
         if self._held_epoch is not None:
             epoch, self._held_epoch = self._held_epoch, None
-            self._connection.tell(RELEASED, epoch, self._next[epoch])
+            _tell(self._connection, RELEASED, epoch, self._next[epoch])
 
     def occupancy(self) -> float:
         """Not known on this side: 0."""
@@ -271,22 +189,16 @@ class RemoteInlet:
     def close(self) -> None:
         """See `Inlet`."""
         if not self._connection.is_closed:
-            self._connection.tell(GOODBYE, 0, 0)
+            _tell(self._connection, GOODBYE, 0, 0)
             self._connection.close()
 
 
-def _listening(address: str) -> int:
-    """A listening socket, which may share its port with who reserved it."""
-    host, _, port = address.rpartition(":")
-    with socket.socket(socket.AF_INET, socket.SOCK_STREAM) as listener:
-        listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEPORT, 1)
-        listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-        listener.bind((host, int(port)))
-        listener.listen()
-        return listener.detach()
+def _tell(connection: Connection, kind: int, epoch: int, sequence: int) -> None:
+    """Sends a message without parts."""
+    connection.try_send([_HEADER.pack(MAGIC, kind, epoch, sequence, 0, 0, 0)])
 
 
-def _unpack(connection: _Connection, frames: Sequence[Any]) -> tuple[int, ...]:
+def _unpack(connection: Connection, frames: Sequence[Any]) -> tuple[int, ...]:
     if len(frames[0]) == _HEADER.size:
         header = _HEADER.unpack(frames[0])
         if header[0] == MAGIC:
