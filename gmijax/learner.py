@@ -10,10 +10,11 @@ from typing import Generic, NamedTuple, TypeVar
 import jax
 import jax.numpy as jnp
 import optax
-from jax.sharding import Sharding, SingleDeviceSharding
+from jax.sharding import Sharding
 
 from gmijax.collectives.interface import Reducer, stays_on_device
 from gmijax.config import ADAPTIVE_LEARNING_RATE_RANGE, AlgoConfig
+from gmijax.host_memory import host_sharding
 from gmijax.normalize import Moments, no_samples
 from gmijax.policy import ActorCritic, ActorCriticParams, make_actor_critic
 from gmijax.sim.interface import EnvSpec
@@ -109,18 +110,6 @@ def apply_gradients(
 def gradient_sharding(reducer: Reducer) -> Sharding | None:
     """Where a program should put gradients: where the reducer reads them; None for anywhere."""
     return None if stays_on_device(reducer) else host_sharding()
-
-
-def host_sharding() -> Sharding | None:
-    """Where a GPU should put what the host reads next: pinned host memory; None on a CPU.
-
-    The program then ends with one transfer at full speed. Reading a device array instead goes
-    through pageable memory: 0.9 ms against 0.07 ms for 0.11M float32 on an H200.
-    """
-    device = jax.local_devices()[0]
-    if device.platform != "gpu":
-        return None
-    return SingleDeviceSharding(device, memory_kind="pinned_host")
 
 
 def adapted_learning_rate(rate: Array, kl: Array, desired_kl: float) -> Array:

@@ -28,11 +28,11 @@ from gmijax.a3c.learner import (
 from gmijax.a3c.losses import LossMetrics, Unrolls, UpdateContext
 from gmijax.collectives.interface import Reducer
 from gmijax.config import A3cConfig
+from gmijax.host_memory import host_sharding
 from gmijax.learner import (
     Learner,
     LearnerState,
     apply_gradients,
-    host_sharding,
     init_learner,
     make_learner,
 )
@@ -163,9 +163,8 @@ class SplitUpdate:
         batch = jax.device_put(batch)  # Once, and not with every program.
         order, context, packed = self._begin(state, batch, weight, self._rank)
         gathered = np.array(self._reducer.all_gather(np.asarray(packed)))
-
-        moved, losses = self._updates(state, batch, context, order)
-        return self._finish(moved, gathered, losses)
+        state, losses = self._updates(state, batch, context, order)
+        return self._finish(state, gathered, losses)
 
     def _begin_fn(
         self, state: LearnerState, batch: Unrolls, weight: Array, rank: Array

@@ -13,7 +13,7 @@ from jax.flatten_util import ravel_pytree
 from gmijax.a3c.learner import ActingWeights
 from gmijax.a3c.losses import Unrolls
 from gmijax.acting import act
-from gmijax.learner import host_sharding
+from gmijax.host_memory import host_sharding
 from gmijax.normalize import normalize
 from gmijax.policy import ActorCritic, log_prob
 from gmijax.sim.interface import EnvSpec

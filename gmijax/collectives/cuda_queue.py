@@ -44,6 +44,7 @@ class CudaQueue:
         (address,) = checked(mapping, "see flags from the GPU")
         self._flags = int(address)
         self._kind = runtime.cudaMemcpyKind.cudaMemcpyDeviceToDevice
+        self._at_least = driver.CUstreamWaitValue_flags.CU_STREAM_WAIT_VALUE_GEQ.value
         self._clocks: deque[tuple[Any, Any]] = deque()  # Started and stopped, not yet read.
         self._idle_clocks: list[tuple[Any, Any]] = []
         self._clock: tuple[Any, Any] | None = None
@@ -72,8 +73,7 @@ class CudaQueue:
     def wait_for_flag(self, stream: int, place: int, count: int) -> None:
         """See `DeviceQueue`."""
         flag = self._flags + place * self._line_bytes
-        at_least = driver.CUstreamWaitValue_flags.CU_STREAM_WAIT_VALUE_GEQ.value
-        _queued(driver.cuStreamWaitValue32(stream, flag, count, at_least), "wait for")
+        _queued(driver.cuStreamWaitValue32(stream, flag, count, self._at_least), "wait for")
 
     def start_clock(self, stream: int) -> None:
         """See `DeviceQueue`."""

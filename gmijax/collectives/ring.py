@@ -24,6 +24,7 @@ from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
 from gmijax.collectives.courier import end_at_once
 from gmijax.collectives.spmd import AXIS
+from gmijax.collectives.sums import ordered_sum
 from gmijax.errors import CollectiveError
 from gmijax.partition.layout import Layout
 
@@ -174,8 +175,7 @@ def _broadcast(source: float, buffer: jax.Array) -> jax.Array:
 
 
 def _ordered_sum(scale: float, buffer: jax.Array) -> jax.Array:
-    parts = list(jax.lax.all_gather(buffer, AXIS))
-    return functools.reduce(jnp.add, parts) * np.float32(scale)
+    return ordered_sum(jax.lax.all_gather(buffer, AXIS), scale)
 
 
 def process_ids(layout: Layout) -> tuple[int, ...]:

@@ -20,6 +20,7 @@ from gmijax.collectives.device_memory import (
 )
 from gmijax.collectives.host import HostExchange
 from gmijax.collectives.interface import FloatBuffer
+from gmijax.collectives.sums import ordered_sum
 from gmijax.collectives.turns import Turns
 
 NOTE_BYTES = 240
@@ -242,9 +243,7 @@ def _require_equal(found: jax.Array, expected: float) -> None:
 
 
 def _sum(num_floats: int, slots: jax.Array, scale: float) -> tuple[jax.Array, jax.Array]:
-    # Written out, so that it is one pass in a fixed order, not a reduction in some order.
-    total = functools.reduce(jnp.add, list(slots[:, :num_floats]))
-    total = total * np.float32(scale)
+    total = ordered_sum(slots[:, :num_floats], scale)
     return total, total[:1]
 
 

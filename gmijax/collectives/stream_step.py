@@ -6,16 +6,15 @@ a whole, and the host does not come between gradient and mean.
 
 from __future__ import annotations
 
-import functools
 from typing import Any
 
 import jax
 import jax.numpy as jnp
-import numpy as np
-from jax.sharding import SingleDeviceSharding
 
 from gmijax.collectives.interface import Step
 from gmijax.collectives.stream_exchange import StreamExchange
+from gmijax.collectives.sums import ordered_sum
+from gmijax.host_memory import host_sharding
 
 
 class StreamPeers:
@@ -41,9 +40,7 @@ class StreamPeers:
 
     def mean(self, buffer: jax.Array) -> jax.Array:
         """See `Peers`."""
-        # Written out, so that it is one pass in a fixed order, not a reduction in some order.
-        total = functools.reduce(jnp.add, list(self.gather(buffer)))
-        return total * np.float32(1.0 / self._exchange.world_size)
+        return ordered_sum(self.gather(buffer), 1.0 / self._exchange.world_size)
 
 
 class StreamStep:
@@ -76,10 +73,7 @@ class StreamStep:
         def whole(rank: jax.Array, constants: Any, shared: Any, own: Any) -> tuple[Any, Any, Any]:
             return self._step(StreamPeers(self._exchange, rank), constants, shared, own)
 
-        device = jax.local_devices()[0]
-        told = None
-        if device.platform == "gpu":  # As `SpmdStep` does.
-            told = SingleDeviceSharding(device, memory_kind="pinned_host")
+        told = host_sharding()  # As metrics of one GMI (`FusedIteration`).
         out_shardings = None if told is None else (None, None, told)
         program = jax.jit(whole, donate_argnums=(2, 3), out_shardings=out_shardings)
         self._constants = constants

@@ -88,10 +88,7 @@ def make_plan(
         dataclasses.replace(share, priority=priority)
         for share, priority in zip(slices, first, strict=True)
     )
-    strategy, intra = "none", "host"
-    if training is not None:
-        strategy = _strategy(reduce, training, backend, reasons)
-        intra = _intra(reduce, strategy, layout, backend, reasons)
+    strategy, intra = _reduction(reduce, training, layout, backend, reasons)
     return Plan(
         layout=layout,
         slices=slices,
@@ -205,6 +202,20 @@ def _template(plan: PlanConfig, default: TemplateName, reasons: list[str]) -> Te
         return plan.template
     reasons.append(f"template {default}: {DESCRIPTIONS[default]}")
     return default
+
+
+def _reduction(
+    reduce: ReduceConfig,
+    training: Group | None,
+    layout: Layout,
+    backend: BackendName,
+    reasons: list[str],
+) -> tuple[str, str]:
+    """How gradients are averaged, and exchanged inside a GPU."""
+    if training is None:
+        return "none", "host"
+    strategy = _strategy(reduce, training, backend, reasons)
+    return strategy, _intra(reduce, strategy, layout, backend, reasons)
 
 
 def _strategy(

@@ -23,12 +23,12 @@ from gmijax.collectives.interface import (
     stays_on_device,
 )
 from gmijax.config import PpoConfig
+from gmijax.host_memory import host_sharding
 from gmijax.learner import (
     Learner,
     LearnerState,
     acting_moments,
     apply_gradients,
-    host_sharding,
     init_learner,
     make_learner,
 )

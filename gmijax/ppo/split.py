@@ -15,11 +15,11 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 
 from gmijax.collectives.interface import FloatBuffer, Reducer
+from gmijax.host_memory import host_sharding
 from gmijax.learner import (
     Learner,
     LearnerState,
     acting_moments,
-    host_sharding,
 )
 from gmijax.ppo.learner import finish_iteration, gradients, minibatch_order, update_context
 from gmijax.ppo.losses import LossMetrics, Samples, UpdateContext

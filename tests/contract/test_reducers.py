@@ -52,12 +52,25 @@ def test_a_killed_peer_is_named_by_all_others_within_two_seconds(
 
 
 @pytest.mark.parametrize("host_if_unavailable", [True, False])
+@pytest.mark.parametrize(
+    ("strategy", "layout", "wish", "instead"),
+    [
+        ("har", [[0, 1]], "reduce.intra=ipc", "through host memory"),
+        ("one_shot", [[0], [1]], "reduce.strategy=one_shot", "reduce.strategy=mpr"),
+    ],
+)
 def test_device_memory_that_does_not_work_is_found_by_all(
-    host_if_unavailable: bool, tmp_path: Path
+    strategy: str,
+    layout: list[list[int]],
+    wish: str,
+    instead: str,
+    host_if_unavailable: bool,
+    tmp_path: Path,
 ) -> None:
     options = {
-        "strategy": "har",
+        "strategy": strategy,
         "intra": "ipc",
+        "layout": layout,
         "num_calls": 2,
         "special_rank": 1,
         "special": "BrokenDeviceMemory",
@@ -65,35 +78,11 @@ def test_device_memory_that_does_not_work_is_found_by_all(
     }
     with Ranks(tmp_path, 2, "check_means", **options).start() as job:
         results = job.results()
-    said = "reduce.intra=ipc: rank 0: shared GPU memory does not hold what was written into it"
+    said = f"{wish}: rank 0: shared GPU memory does not hold what was written into it"
     for rank, result in enumerate(results):
         if host_if_unavailable:
             assert result["error"] is None
-            assert said in (tmp_path / f"stderr_{rank}").read_text()
-        else:
-            assert (result["error"], result["message"]) == ("DeviceMemoryUnavailable", said)
-
-
-@pytest.mark.parametrize("host_if_unavailable", [True, False])
-def test_one_shot_says_on_all_ranks_where_memory_does_not_work(
-    host_if_unavailable: bool, tmp_path: Path
-) -> None:
-    options = {
-        "strategy": "one_shot",
-        "intra": "ipc",
-        "num_calls": 2,
-        "special_rank": 1,
-        "special": "BrokenDeviceMemory",
-        "host_if_unavailable": host_if_unavailable,
-    }
-    with Ranks(tmp_path, 2, "check_means", layout=[[0], [1]], **options).start() as job:
-        results = job.results()
-    why = "shared GPU memory does not hold what was written into it"
-    said = f"reduce.strategy=one_shot: rank 0: {why}"
-    for rank, result in enumerate(results):
-        if host_if_unavailable:
-            assert result["error"] is None
-            assert f"{said}; so reduce.strategy=mpr" in (tmp_path / f"stderr_{rank}").read_text()
+            assert f"{said}; so {instead}" in (tmp_path / f"stderr_{rank}").read_text()
         else:
             assert (result["error"], result["message"]) == ("DeviceMemoryUnavailable", said)
 
