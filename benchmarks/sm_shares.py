@@ -20,6 +20,7 @@ from typing import Any
 from benchmarks.run import RESULTS
 from benchmarks.sm_share_rank import LIBRARIES
 from gmijax.config import PlanConfig, ReduceConfig
+from gmijax.control.kinds import Plain
 from gmijax.control.launcher import Launch, run_gmis
 from gmijax.errors import ConfigError, GmiFailed
 from gmijax.partition.machine import Machine, detect_machine
@@ -123,9 +124,8 @@ def measure(
                 plan=plan,
                 machine=machine,
                 run=run,
-                module="benchmarks.sm_share_rank",
+                kind=Plain("benchmarks.sm_share_rank", compile_once=False),
                 patience=PATIENCE,
-                compile_once=False,
             )
         )
         found = [read_json(run.gmi(gmi).result) for gmi in plan.layout.gmis]

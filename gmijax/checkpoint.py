@@ -2,13 +2,17 @@
 
 `<run>/checkpoints/<12-digit env steps>/{learner,gmi_0,gmi_1,...,meta.json}`: what all GMIs share
 is written by the leader, each GMI's environments by itself. Everything goes to a hidden folder
-that is renamed when all GMIs have finished, so a checkpoint is there as a whole or not at all.
+that is renamed when all GMIs have finished and all of it is on the disk, so a checkpoint is there
+as a whole or not at all.
 """
 
 from __future__ import annotations
 
+import dataclasses
 import hashlib
+import math
 import os
+import shutil
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -20,7 +24,7 @@ import numpy as np
 import orbax.checkpoint as ocp
 
 from gmijax.errors import ConfigError
-from gmijax.resume import CheckpointMeta
+from gmijax.resume import CheckpointMeta, file_check
 from gmijax.rundir import META, RunPaths, write_json
 from gmijax.types import PyTree
 
@@ -38,6 +42,7 @@ def save_checkpoint(
     gmi: int,
     leader: bool,
     barrier: Callable[[], None],
+    keep: int | None = None,
 ) -> Path:
     """Writes this GMI's part of a checkpoint; every GMI of the job must call it.
 
@@ -49,6 +54,7 @@ def save_checkpoint(
       gmi: id of this GMI.
       leader: whether this GMI writes the shared part.
       barrier: returns when all GMIs have called it.
+      keep: see `finish_checkpoint`.
 
     Returns:
       The checkpoint's folder.
@@ -59,7 +65,7 @@ def save_checkpoint(
         save_learner(paths, meta.env_steps, learner_state)
     barrier()
     if leader:
-        finish_checkpoint(paths, meta)
+        finish_checkpoint(paths, meta, keep)
     # Nobody may look for the folder before it has its name.
     barrier()
     return paths.checkpoint(meta.env_steps)
@@ -75,12 +81,63 @@ def save_envs(paths: RunPaths, env_steps: int, gmi: int, env_state: PyTree) -> N
     _save(_partial(paths, env_steps) / f"gmi_{gmi}", env_state)
 
 
-def finish_checkpoint(paths: RunPaths, meta: CheckpointMeta) -> Path:
-    """Gives a checkpoint its name, once all have written their parts; returns its folder."""
+def finish_checkpoint(paths: RunPaths, meta: CheckpointMeta, keep: int | None = None) -> Path:
+    """Gives a checkpoint its name, once all have written their parts; returns its folder.
+
+    Args:
+      paths: the run folder.
+      meta: what the checkpoint holds; the list of its files is added.
+      keep: how many checkpoints stay, among them always the one with the best return and the
+        last one; None: all.
+    """
     final, partial = paths.checkpoint(meta.env_steps), _partial(paths, meta.env_steps)
-    write_json(partial / META, meta.to_dict())
+    files = [path for path in sorted(partial.rglob("*")) if path.is_file()]
+    checks = {path.relative_to(partial).as_posix(): file_check(path) for path in files}
+    for path in (*files, *(path for path in partial.rglob("*") if path.is_dir())):
+        _sync(path)
+    write_json(partial / META, dataclasses.replace(meta, files=checks).to_dict())
+    _sync(partial)
+    if final.exists():  # A broken one, which a restart has passed over.
+        _remove(final)
     os.replace(partial, final)
+    _sync(final.parent)
+    if keep is not None:
+        _remove_old(paths, keep)
     return final
+
+
+def _remove_old(paths: RunPaths, keep: int) -> None:
+    found = sorted(path.parent for path in paths.checkpoints.glob(f"[0-9]*/{META}"))
+    returns = {path: _return_of(path) for path in found}
+    best = max(reversed(found), key=lambda path: returns[path])
+    others = [path for path in found if path != best]
+    num_others = max(keep - 1, int(best != found[-1]))
+    for path in others[: max(0, len(others) - num_others)]:
+        _remove(path)
+
+
+def _return_of(checkpoint: Path) -> float:
+    try:
+        mean = CheckpointMeta.read(checkpoint).mean_return
+    except ConfigError:
+        return -math.inf
+    return -math.inf if mean is None else mean
+
+
+def _remove(checkpoint: Path) -> None:
+    # Under another name first: what has lost some of its files is no checkpoint.
+    hidden = checkpoint.with_name(f".{checkpoint.name}.removed")
+    shutil.rmtree(hidden, ignore_errors=True)
+    os.replace(checkpoint, hidden)
+    shutil.rmtree(hidden, ignore_errors=True)
+
+
+def _sync(path: Path) -> None:
+    fd = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(fd)
+    finally:
+        os.close(fd)
 
 
 def has_envs(checkpoint: Path, gmi: int) -> bool:

@@ -122,8 +122,10 @@ def _build(name: str, cls: type[C], overrides: Sequence[str]) -> C:
         data = _with_task_of_run(data, overrides)
     if cls is TrainConfig:
         _check_task_key(_parse(overrides))
-        if isinstance(data["run"], dict) and data["run"].get("resume"):
-            data = _on_top_of_saved(data, overrides, str(data["run"]["resume"]))
+        # With `auto` the command that started the run is given again, whole.
+        resume = data["run"].get("resume") if isinstance(data["run"], dict) else None
+        if resume not in (None, "auto"):
+            data = _on_top_of_saved(data, overrides, str(resume))
     return from_dict(cls, data)
 
 
@@ -133,7 +135,7 @@ def _algorithm_of_resumed(name: str, overrides: Sequence[str]) -> list[str]:
         return []
     given = {item.key_or_group: str(item.value()) for item in _parse(overrides)}
     resume = given.get("run.resume", "null")
-    if "algo" in given or resume in ("null", "None", ""):
+    if "algo" in given or resume in ("null", "None", "", "auto"):
         return []
     algo = saved_config(find_checkpoint(resume, "run.resume"))["algo"].get("name", "ppo")
     return [f"algo={algo}"]
@@ -229,7 +231,7 @@ def _on_top_of_saved(
                 "change single keys with key=value"
             )
         raise _unknown_key(key, _flatten(data))
-    merged["run"]["resume"] = str(checkpoint)
+    merged["run"]["resume"] = resume
     return merged
 
 

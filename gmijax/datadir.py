@@ -10,10 +10,7 @@ file, or of another size than it says, is unfinished and is made again.
 
 from __future__ import annotations
 
-import fcntl
-import os
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -104,32 +101,6 @@ def open_dataset(paths: DataPaths, about: Mapping[str, Any]) -> None:
             write_json(paths.dataset, about)
     except OSError as error:
         raise ConfigError(f"output.dir={paths.root}: {error.strerror}") from None
-
-
-@contextmanager
-def locked(paths: DataPaths) -> Iterator[None]:
-    """Holds the folder, so that two jobs cannot write into it; free again when this one ends.
-
-    Raises:
-      ConfigError: another job holds it.
-    """
-    # A file: network file systems lock no folders, and files only if they are open for writing.
-    try:
-        fd = os.open(paths.lock, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o644)
-    except OSError as error:
-        raise ConfigError(f"output.dir={paths.root}: {error.strerror}") from None
-    try:
-        try:
-            fcntl.flock(fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            raise ConfigError(
-                f"output.dir={paths.root}: another job writes into this folder now"
-            ) from None
-        except OSError as error:
-            raise ConfigError(f"{paths.lock}: cannot be locked ({error.strerror})") from None
-        yield
-    finally:
-        os.close(fd)
 
 
 def _check_same(paths: DataPaths, about: Mapping[str, Any]) -> None:

@@ -16,6 +16,9 @@ GmijaxError
 
 from __future__ import annotations
 
+import time
+from typing import NamedTuple
+
 
 class GmijaxError(Exception):
     """Base of all errors that gmijax raises on purpose."""
@@ -29,18 +32,42 @@ class BackendUnavailable(ConfigError):
     """The wanted backend cannot be had on this machine; the message says what is missing."""
 
 
+class ReportedError(NamedTuple):
+    """The exception that ended a GMI, in words.
+
+    Attributes:
+      type: its class.
+      message: of the exception.
+      traceback: with the message, as Python prints it.
+    """
+
+    type: str
+    message: str
+    traceback: str
+
+
 class GmiFailed(GmijaxError):
     """A GMI ended with an error or a signal, or stopped making progress.
 
     Attributes:
       gmi: id of the first GMI that failed.
       reason: one line: the GMI's own error, its exit code, or the signal that ended it.
+      iteration: training iterations that it had done.
+      error: its own exception, None where it left none.
+      is_final: whether to try again cannot help, whatever the cause.
+      seen_s: when the failure was seen, `time.monotonic`.
     """
 
-    def __init__(self, gmi: int, reason: str) -> None:
+    def __init__(
+        self, gmi: int, reason: str, *, iteration: int = 0, error: ReportedError | None = None
+    ) -> None:
         super().__init__(f"GMI {gmi} failed: {reason}")
         self.gmi = gmi
         self.reason = reason
+        self.iteration = iteration
+        self.error = error
+        self.is_final = False
+        self.seen_s = time.monotonic()
 
 
 class CollectiveError(GmijaxError):

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import json
 import math
+import time
 from collections import deque
 from collections.abc import Iterable, Mapping
 from pathlib import Path
-from typing import NamedTuple, Protocol
+from typing import Any, NamedTuple, Protocol
 
-from tensorboardX import SummaryWriter
+from tensorboardX.event_file_writer import EventsWriter
+from tensorboardX.proto import event_pb2, summary_pb2
 
 WINDOW_EPISODES = 100
 """Means over episodes are taken over at least this many of the latest ones."""
@@ -99,18 +101,32 @@ class JsonlSink:
 
 
 class TensorBoardSink:
-    """Writes every number as a scalar over environment steps."""
+    """Writes every number as a scalar over environment steps.
+
+    In the calling thread: the queue of tensorboardX's own writer needs /dev/shm, and blocks for
+    ever once its thread has met a full disk.
+    """
 
     def __init__(self, folder: Path) -> None:
-        self._writer = SummaryWriter(str(folder))
+        folder.mkdir(parents=True, exist_ok=True)
+        self._writer = EventsWriter(str(folder / "events"))
+        # Made by protobuf at run time: type checkers cannot see them.
+        self._event: Any = vars(event_pb2)["Event"]
+        self._summary: Any = vars(summary_pb2)["Summary"]
 
     def write(self, line: Line) -> None:
         """See `Sink`."""
         steps = int(line["env_steps"] or 0)
-        for name, value in line.items():
-            if value is not None and name != "env_steps":
-                tag = name if "/" in name else f"train/{name}"
-                self._writer.add_scalar(tag, value, steps)
+        values = [
+            self._summary.Value(
+                tag=name if "/" in name else f"train/{name}", simple_value=float(value)
+            )
+            for name, value in line.items()
+            if value is not None and name != "env_steps"
+        ]
+        summary = self._summary(value=values)
+        self._writer.write_event(self._event(wall_time=time.time(), step=steps, summary=summary))
+        self._writer.flush()
 
     def close(self) -> None:
         """See `Sink`."""

@@ -1,15 +1,56 @@
-"""Questions about processes that are not our children, answered by /proc; stdlib only."""
+"""Processes that are not our children, asked about in /proc, and pipes to our own; stdlib only."""
 
 from __future__ import annotations
 
+import os
 import time
 from collections.abc import Iterable
 from contextlib import suppress
 from pathlib import Path
-from typing import NamedTuple
+from typing import ClassVar, NamedTuple
 
 _POLL_S = 0.02
 _ENDED = (b"Z", b"X")
+
+
+class GuardPipe:
+    """The write end of a pipe whose end of file tells a child that this process is gone.
+
+    A process that the caller forks while the pipe is open would hold it open for longer than this
+    one lives, so it is closed in every fork.
+
+    Attributes:
+      read_end: for the child; the caller closes it once that is started.
+    """
+
+    # What `os.register_at_fork` calls cannot be taken back: one function, over those open now.
+    _open: ClassVar[set[int]] = set()
+
+    def __init__(self) -> None:
+        self.read_end, self._write_end = os.pipe()
+        self._open.add(self._write_end)
+
+    def write(self, data: bytes) -> None:
+        """Sends bytes; the child may have ended."""
+        with suppress(OSError):
+            os.write(self._write_end, data)
+
+    def close(self) -> None:
+        """Ends the pipe; calling it twice is fine."""
+        if self._write_end in self._open:
+            self._open.discard(self._write_end)
+            os.close(self._write_end)
+        self._write_end = -1
+
+    @classmethod
+    def _close_all(cls) -> None:
+        for fd in cls._open:
+            with suppress(OSError):
+                os.close(fd)
+        cls._open.clear()
+
+
+os.register_at_fork(after_in_child=GuardPipe._close_all)
 
 
 class ProcessId(NamedTuple):

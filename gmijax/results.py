@@ -3,9 +3,13 @@
 from __future__ import annotations
 
 import json
+import os
 from collections.abc import Iterator
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
+
+from gmijax.rundir import write_text
 
 
 def read_metrics(path: Path) -> list[dict[str, Any]]:
@@ -14,9 +18,12 @@ def read_metrics(path: Path) -> list[dict[str, Any]]:
 
 
 def copy_history(source: Path, target: Path, env_steps: int) -> None:
-    """Copies the lines up to `env_steps`, so that a resumed run has the whole curve."""
+    """Copies the lines up to `env_steps`, so that a resumed run has the whole curve.
+
+    `source` may be `target`, which is replaced as a whole.
+    """
     lines = [line for line in read_metrics(source) if line["env_steps"] <= env_steps]
-    target.write_text("".join(json.dumps(line) + "\n" for line in lines))
+    write_text(target, "".join(json.dumps(line) + "\n" for line in lines))
 
 
 class MetricsReader:
@@ -30,9 +37,11 @@ class MetricsReader:
         """The last complete line that came since the last call, None if there is none."""
         try:
             with self._path.open("rb") as file:
+                if os.fstat(file.fileno()).st_size < self._offset:
+                    self._offset = 0  # A restart has cut it.
                 file.seek(self._offset)
                 new = file.read()
-        except FileNotFoundError:
+        except OSError:
             return None
         complete = new[: new.rfind(b"\n") + 1]
         self._offset += len(complete)
@@ -62,5 +71,7 @@ def draw_returns(metrics: Path, picture: Path, title: str) -> bool:
 def _lines(path: Path) -> Iterator[dict[str, Any]]:
     with path.open() as file:
         for line in file:
-            if line.endswith("\n"):
-                yield json.loads(line)
+            # A full disk may have cut off a line, with later ones right behind it.
+            with suppress(ValueError):
+                if line.endswith("\n"):
+                    yield json.loads(line)

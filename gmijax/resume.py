@@ -1,15 +1,19 @@
-"""Finding a checkpoint and checking that it fits, without loading it. No jax here."""
+"""Finding a checkpoint and checking that it is whole and fits, without loading it. No jax here."""
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
+import zlib
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, Final, NamedTuple
 
 from gmijax.config import ALGORITHMS, AlgoConfig, EnvConfig
 from gmijax.errors import ConfigError
 from gmijax.rundir import META, RunPaths, last_run, read_json
 from gmijax.schema import from_dict, from_named
+
+_CHUNK_BYTES: Final = 1 << 20
 
 
 @dataclass(frozen=True)
@@ -24,6 +28,9 @@ class CheckpointMeta:
       num_envs: N of that job, environments per GMI.
       hidden: widths of the policy and of the value network.
       impl: physics implementation; environment states of one cannot be used by the other.
+      mean_return: of the latest episodes before it, None while none had ended.
+      files: size in bytes and CRC-32 of every other file, by its path in the checkpoint; empty
+        in those of older versions.
     """
 
     env: str
@@ -33,6 +40,8 @@ class CheckpointMeta:
     num_envs: int
     hidden: tuple[tuple[int, ...], tuple[int, ...]]
     impl: str
+    mean_return: float | None = None
+    files: Mapping[str, tuple[int, ...]] = field(default_factory=dict)
 
     def to_dict(self) -> dict[str, object]:
         """Plain data for `meta.json`."""
@@ -51,10 +60,59 @@ class CheckpointMeta:
             raise ConfigError(f"checkpoint {checkpoint}: broken {META} ({error})") from None
 
 
+class Found(NamedTuple):
+    """What was found in a run folder.
+
+    Attributes:
+      checkpoint: the newest one that is whole, None if there is none.
+      passed_over: newer ones, each with what is wrong with it.
+    """
+
+    checkpoint: Path | None
+    passed_over: tuple[str, ...]
+
+
+def newest_checkpoint(folder: Path) -> Found:
+    """The newest checkpoint of a run folder whose files are as they were written."""
+    passed_over: list[str] = []
+    for path in sorted(folder.glob(f"checkpoints/[0-9]*/{META}"), reverse=True):
+        wrong = what_is_broken(path.parent)
+        if wrong is None:
+            return Found(path.parent.resolve(), tuple(passed_over))
+        passed_over.append(f"checkpoint {path.parent}: passed over, {wrong}")
+    return Found(None, tuple(passed_over))
+
+
+def what_is_broken(checkpoint: Path) -> str | None:
+    """Why a checkpoint cannot be used, None if its files are as they were written."""
+    try:
+        meta = CheckpointMeta.read(checkpoint)
+    except ConfigError as error:
+        return str(error).partition(": ")[2]
+    for name, wanted in meta.files.items():
+        try:
+            is_same = file_check(checkpoint / name) == tuple(wanted)
+        except OSError as error:
+            return f"{name}: {error.strerror}"
+        if not is_same:
+            return f"{name} is not as it was written"
+    return None
+
+
+def file_check(path: Path) -> tuple[int, int]:
+    """Size in bytes and CRC-32 of a file."""
+    size = crc = 0
+    with path.open("rb") as file:
+        while chunk := file.read(_CHUNK_BYTES):
+            size, crc = size + len(chunk), zlib.crc32(chunk, crc)
+    return size, crc
+
+
 def find_checkpoint(wanted: str, key: str) -> Path:
     """The checkpoint that `wanted` names: `last`, a run folder, or a checkpoint folder.
 
-    `last` is the run below `runs/` with the newest checkpoint; a run folder means its latest one.
+    `last` is the run below `runs/` with the newest checkpoint; a run folder means its newest one
+    that is whole.
 
     Args:
       wanted: value of the key.
@@ -65,13 +123,17 @@ def find_checkpoint(wanted: str, key: str) -> Path:
     """
     folder = last_run(key) if wanted == "last" else Path(wanted)
     if (folder / META).is_file():
+        if wrong := what_is_broken(folder):
+            raise ConfigError(f"{key}={wanted}: {wrong}")
         return folder.resolve()
     if not folder.is_dir():
         raise ConfigError(f"{key}={wanted}: no such folder")
-    found = sorted(path.parent for path in folder.glob(f"checkpoints/[0-9]*/{META}"))
-    if not found:
-        raise ConfigError(f"{key}={wanted}: no checkpoint in this folder")
-    return found[-1].resolve()
+    found = newest_checkpoint(folder)
+    if found.checkpoint is None:
+        raise ConfigError(
+            "; ".join((f"{key}={wanted}: no checkpoint in this folder", *found.passed_over))
+        )
+    return found.checkpoint
 
 
 def saved_config(checkpoint: Path) -> dict[str, Any]:
@@ -95,6 +157,13 @@ def saved_config(checkpoint: Path) -> dict[str, Any]:
     if not all(isinstance(saved.get(group), dict) for group in ("env", "algo", "run")):
         raise ConfigError(f"{path}: not the configuration of a training run")
     return saved
+
+
+def saved_job(run: RunPaths) -> tuple[str, str]:
+    """Task and algorithm of a run folder, by name; raises as `saved_config`."""
+    # The folder of a checkpoint that may not be there yet.
+    env, algo = trained_config(run.checkpoint(0))
+    return env.label, algo.name
 
 
 def trained_config(checkpoint: Path) -> tuple[EnvConfig, AlgoConfig]:

@@ -1,16 +1,19 @@
 """Every file name of a run folder, and how files in it are written. No jax here.
 
-`<run>/config.json plan.json summary.json metrics.jsonl returns.png tensorboard/`
+`<run>/config.json plan.json summary.json metrics.jsonl events.jsonl returns.png tensorboard/`
 `<run>/checkpoints/<12-digit env steps>/meta.json`
-`<run>/gmi_<id>/{stdout.log,stderr.log,heartbeat.json,error.json,result.json,metrics.jsonl}`
+`<run>/gmi_<id>/{stdout.log,stderr.log,error.json,result.json,metrics.jsonl}`
+`<run>/gmi_<id>/attempt_<n>/`: the same files of attempts that failed
 """
 
 from __future__ import annotations
 
+import fcntl
 import json
 import os
-import tempfile
-from collections.abc import Mapping
+import threading
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
@@ -42,11 +45,6 @@ class GmiPaths:
     def stderr(self) -> Path:
         """What the process and its libraries complain about."""
         return self.root / "stderr.log"
-
-    @property
-    def heartbeat(self) -> Path:
-        """State and iteration, rewritten as the GMI makes progress."""
-        return self.root / "heartbeat.json"
 
     @property
     def error(self) -> Path:
@@ -120,6 +118,21 @@ class RunPaths:
         """Folder of the logs of MPS daemons that the job starts."""
         return self.root / "mps"
 
+    @property
+    def janitor_log(self) -> Path:
+        """Errors of the process that cleans up after a killed controller; gone without any."""
+        return self.root / "janitor.log"
+
+    @property
+    def lock(self) -> Path:
+        """Held by the job that writes into the folder."""
+        return self.root / ".lock"
+
+    @property
+    def events(self) -> Path:
+        """Starts, faults and restarts of the job, one JSON object a line."""
+        return self.root / "events.jsonl"
+
     def checkpoint(self, env_steps: int) -> Path:
         """The checkpoint after `env_steps` environment steps."""
         return self.checkpoints / f"{env_steps:0{STEP_DIGITS}d}"
@@ -138,42 +151,99 @@ def create_run(
       ConfigError: the folder exists already, or cannot be made.
     """
     stamp = (now or datetime.now()).strftime("%Y%m%d-%H%M%S")
-    root = Path(run_dir) if run_dir else RUNS / (name or f"{prefix}-{stamp}")
+    given = given_run(run_dir, name)
+    root = given or RUNS / f"{prefix}-{stamp}"
     key = "run.dir" if run_dir else "run.name"
     for attempt in range(100):
         # Two jobs started in the same second: only a name that we made up may be changed.
-        made_up = not (run_dir or name)
-        candidate = root.with_name(f"{root.name}-{attempt}") if attempt and made_up else root
+        candidate = root.with_name(f"{root.name}-{attempt}") if attempt and not given else root
         try:
             candidate.mkdir(parents=True)
         except FileExistsError:
-            if made_up:
-                continue
-            raise ConfigError(f"{key}={root}: the run folder exists already") from None
+            require_new_run(run_dir, name)
+            continue
         except OSError as error:
             raise ConfigError(f"{key}={root}: cannot make the folder ({error.strerror})") from None
         return RunPaths(candidate.resolve())
     raise ConfigError(f"{key}={root}: no free name")
 
 
-def write_json(path: Path, data: Mapping[str, Any]) -> None:
-    """Writes `data` so that a reader sees the old file or the new one, never half a file."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
+def given_run(run_dir: str | None, name: str | None) -> Path | None:
+    """The run folder that the user names, None if none."""
+    if run_dir:
+        return Path(run_dir)
+    return RUNS / name if name else None
+
+
+def require_new_run(run_dir: str | None, name: str | None) -> None:
+    """Raises ConfigError if the run folder that the user names exists already."""
+    root = given_run(run_dir, name)
+    if root is not None and os.path.lexists(root):
+        key = "run.dir" if run_dir else "run.name"
+        raise ConfigError(f"{key}={root}: the run folder exists already")
+
+
+@contextmanager
+def locked(lock: Path, what: str) -> Iterator[None]:
+    """Holds a folder by a file in it, so that two jobs cannot write into it at once.
+
+    Args:
+      lock: the file; it stays.
+      what: the key and its value, for messages.
+
+    Raises:
+      ConfigError: another job holds it, or it cannot be locked.
+    """
+    # A file: network file systems lock no folders, and files only if they are open for writing.
     try:
-        with os.fdopen(handle, "w") as file:
-            json.dump(data, file, indent=2)
-            file.write("\n")
-        os.chmod(temporary, 0o644)
+        fd = os.open(lock, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o644)
+    except OSError as error:
+        raise ConfigError(f"{what}: {error.strerror}") from None
+    try:
+        try:
+            fcntl.flock(fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            raise ConfigError(f"{what}: another job writes into this folder now") from None
+        except OSError as error:
+            raise ConfigError(f"{lock}: cannot be locked ({error.strerror})") from None
+        yield
+    finally:
+        os.close(fd)
+
+
+def write_json(path: Path, data: Mapping[str, Any]) -> None:
+    """Writes `data` as `write_text` does."""
+    write_text(path, json.dumps(data, indent=2) + "\n")
+
+
+def write_text(path: Path, text: str) -> None:
+    """Writes a file so that a reader sees the old one or the new one, never half a file.
+
+    Also after a loss of power: its content is on the disk before its name is.
+    """
+    path.parent.mkdir(parents=True, exist_ok=True)
+    temporary = path.with_name(f".{path.name}.{os.getpid()}-{threading.get_ident()}")
+    try:
+        with temporary.open("w") as file:
+            file.write(text)
+            file.flush()
+            os.fsync(file.fileno())
         os.replace(temporary, path)
     except BaseException:
-        Path(temporary).unlink(missing_ok=True)
+        temporary.unlink(missing_ok=True)
         raise
 
 
 def read_json(path: Path) -> dict[str, Any]:
     """Reads what `write_json` wrote."""
     return json.loads(path.read_text())
+
+
+def add_event(path: Path, event: str, **details: Any) -> None:
+    """Appends to the events of a run; a full disk must not end what it only records."""
+    line = {"time": datetime.now().astimezone().isoformat(timespec="milliseconds")}
+    with suppress(OSError), path.open("a") as file:
+        file.write(json.dumps({**line, "event": event, **details}) + "\n")
 
 
 def last_run(key: str, runs: Path = RUNS) -> Path:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import signal
 import sys
+import threading
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -45,10 +46,16 @@ def deaf(link: ChildLink) -> None:
 
 
 def stubborn(link: ChildLink) -> None:
-    """Ignores SIGTERM."""
-    signal.signal(signal.SIGTERM, signal.SIG_IGN)
-    (link.paths.root / "ignoring").touch()
-    deaf(link)
+    """Is stopped, so that it can hear no order."""
+    link.beat("running", 1)
+    (link.paths.root / "stopping").touch()
+    os.kill(os.getpid(), signal.SIGSTOP)
+
+
+def linger(link: ChildLink) -> None:
+    """Is done, but a thread of it is not."""
+    threading.Thread(target=time.sleep, args=(600,)).start()
+    link.beat("done", 3)
 
 
 def busy(link: ChildLink) -> None:
@@ -125,7 +132,7 @@ MODES: dict[str, Callable[[ChildLink], None]] = {
     mode.__name__: mode
     for mode in (
         *(clean, train, deaf, stubborn, busy, exit_3, raise_value_error, raise_config_error),
-        *(lose_peer, die_late, stall, silent, mps_client),
+        *(lose_peer, die_late, stall, silent, mps_client, linger),
     )
 }
 

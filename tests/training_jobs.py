@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 import random
 import signal
@@ -15,11 +14,13 @@ from typing import Any
 
 import numpy as np
 
+from gmijax.partition.heartbeat import Heartbeat, HeartbeatBlock
 from gmijax.resume import find_checkpoint
 
 TINY = (
     *("env=ball_balance", "num_envs=16", "algo.unroll_length=4", "algo.num_minibatches=2"),
     *("algo.num_updates_per_batch=2", "run.measure_throughput=false", "run.grace_s=3"),
+    "run.max_restarts=0",
 )
 STEPS = 16 * 4
 """Environment steps of one iteration of one GMI in a TINY run."""
@@ -84,12 +85,29 @@ def wait_until(condition: Callable[[], Any], timeout_s: float, what: str) -> Any
     raise AssertionError(f"not within {timeout_s} s: {what}")
 
 
+def heartbeat_of(run: Path, gmi: int) -> Heartbeat | None:
+    """What a GMI last said of itself, from its memory; None if it does not run."""
+    for pid in pids_of(run):
+        try:
+            variables = dict(
+                item.split(b"=", 1)
+                for item in Path(f"/proc/{pid}/environ").read_bytes().split(b"\0")
+                if b"=" in item
+            )
+            if variables[b"GMIJAX_GMI"] != str(gmi).encode():
+                continue
+            fd = int(variables[b"GMIJAX_HEARTBEAT_FD"])
+            with open(f"/proc/{pid}/fd/{fd}", "r+b") as memory:
+                return HeartbeatBlock(memory.fileno()).read()
+        except (OSError, KeyError, ValueError):
+            continue
+    return None
+
+
 def iteration_of(run: Path, gmi: int) -> int:
     """Iterations that a GMI says it has done."""
-    try:
-        return int(json.loads((run / f"gmi_{gmi}" / "heartbeat.json").read_text())["iteration"])
-    except (OSError, ValueError):
-        return 0
+    beat = heartbeat_of(run, gmi)
+    return 0 if beat is None else beat.iteration
 
 
 def pids_of(run: Path) -> list[int]:
@@ -109,10 +127,8 @@ def pids_of(run: Path) -> list[int]:
 
 def gmi_pid(run: Path, gmi: int) -> int | None:
     """The process of a GMI, None if it has not said so yet."""
-    try:
-        return int(json.loads((run / f"gmi_{gmi}" / "heartbeat.json").read_text())["pid"])
-    except (OSError, ValueError):
-        return None
+    beat = heartbeat_of(run, gmi)
+    return None if beat is None else beat.pid
 
 
 def learner_arrays(run: Path) -> list[np.ndarray]:

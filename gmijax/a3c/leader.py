@@ -201,6 +201,7 @@ class Leader:
             num_envs=self._config.envs_per_gmi,
             hidden=(algo.policy_hidden_layer_sizes, algo.value_hidden_layer_sizes),
             impl=self._config.physics.impl,
+            mean_return=self._require_reporter().last_return,
         )
 
     def _wait_for_agents(self) -> None:
@@ -224,7 +225,9 @@ class Leader:
 
     def _finish_checkpoint(self) -> None:
         assert self._pending is not None
-        self._checkpoint = finish_checkpoint(self._link.run, self._pending)
+        self._checkpoint = finish_checkpoint(
+            self._link.run, self._pending, self._config.run.keep_checkpoints
+        )
         self._pending = None
 
     def _require_reporter(self) -> Reporter:

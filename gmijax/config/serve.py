@@ -28,10 +28,16 @@ class ServeRunConfig:
     start_timeout_s: float = doc("longest wait for a GMI to start and compile, seconds")
     stall_timeout_s: float = doc("a GMI with no progress for this long has failed, seconds")
     exchange_timeout_s: float = doc("longest wait for another GMI in one exchange, seconds")
+    stop_timeout_s: float = doc(
+        "time that GMIs get to finish their unroll when the job is told to end, seconds"
+    )
     grace_s: float = doc("time a GMI gets to end by itself before it is killed, seconds")
 
     def __post_init__(self) -> None:
-        for key in ("start_timeout_s", "stall_timeout_s", "exchange_timeout_s", "grace_s"):
+        for key in (
+            *("start_timeout_s", "stall_timeout_s", "stop_timeout_s"),
+            *("exchange_timeout_s", "grace_s"),
+        ):
             require_positive(f"run.{key}", getattr(self, key))
 
 

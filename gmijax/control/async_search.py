@@ -14,7 +14,8 @@ from typing import Any, Final, NamedTuple
 
 from gmijax.config import AUTO, PlanConfig, TrainConfig
 from gmijax.control.async_profile import Enough, read
-from gmijax.control.decoupled import MODULE, plan_decoupled, shared_blocks
+from gmijax.control.decoupled import plan_decoupled
+from gmijax.control.kinds import Decoupled
 from gmijax.control.workload import Workload
 from gmijax.errors import ConfigError
 from gmijax.partition.balance import Split, balance, per_gpu, throughput
@@ -57,7 +58,7 @@ def decoupled_training(config: TrainConfig) -> Workload:
         num_envs=config.num_envs,
         impl=config.physics.impl,
         template="decoupled",
-        module=MODULE,
+        kind=Decoupled(config),
         config_at=partial(_config_at, config),
         read=partial(read, config.search.iterations),
         key={
@@ -71,8 +72,6 @@ def decoupled_training(config: TrainConfig) -> Workload:
             config.search.training_gmis_per_gpu if is_auto else (given.training_gmis_per_gpu,)
         ),
         plan_of=partial(_plan_of, config, _profiled_on(given, is_apart=sides.is_apart)),
-        compile_once=False,
-        shared=partial(shared_blocks, config),
         is_enough=partial(Enough, config),
         estimate=sides.estimate,
         top=_top_apart if sides.is_apart else top_of_one,

@@ -15,6 +15,7 @@ from rich.console import Console
 from rich.table import Table
 
 from gmijax.config import PlanConfig, PlayConfig, ReduceConfig
+from gmijax.control.kinds import Plain
 from gmijax.control.launcher import Launch, run_gmis
 from gmijax.control.pictures import film, has_brax, write_page
 from gmijax.errors import ConfigError, GmijaxError
@@ -154,7 +155,7 @@ def _launch(config: PlayConfig, paths: PlayPaths, machine: Machine) -> Launch:
         plan=_light_plan(config.num_envs, machine),
         machine=machine,
         run=RunPaths(paths.root),
-        module="gmijax.workers.playback",
+        kind=Plain("gmijax.workers.playback"),
         patience=_PATIENCE,
         stops_gracefully=False,
         # The GPU may be training: take what is needed when it is needed, up to the fraction.

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -16,19 +16,21 @@ from typing import Any, NamedTuple
 from rich.console import Console
 
 from gmijax.config import TrainConfig
-from gmijax.control import dedicated, trained
+from gmijax.control import trained
 from gmijax.control.auto import decided
-from gmijax.control.decoupled import MODULE, is_decoupled, plan_decoupled, shared_blocks
-from gmijax.control.launcher import Launch, patience_of, recorded, run_gmis
+from gmijax.control.beginnings import Beginning, find_beginning
+from gmijax.control.elastic import with_gpus_left
+from gmijax.control.kinds import training_kind, training_plan
+from gmijax.control.launcher import Launch, patience_of, recorded
+from gmijax.control.output import open_console
 from gmijax.control.progress import ConsoleProgress, SilentProgress
+from gmijax.control.restarts import Attempts, clear_unfinished
 from gmijax.control.selection import estimated_floats, with_measured
-from gmijax.errors import ConfigError
 from gmijax.partition.machine import Machine, detect_machine
 from gmijax.partition.plan import Plan
-from gmijax.partition.planner import make_plan
 from gmijax.results import MetricsReader, copy_history, draw_returns
-from gmijax.resume import CheckpointMeta, check_fits, find_checkpoint, saved_config
-from gmijax.rundir import RunPaths, create_run, read_json, write_json
+from gmijax.resume import CheckpointMeta, saved_config
+from gmijax.rundir import RunPaths, add_event, locked, read_json, write_json
 from gmijax.schema import to_dict
 from gmijax.sim import source
 from gmijax.sim.impl import choose_impl
@@ -56,49 +58,127 @@ def train(config: TrainConfig, *, show: bool = False) -> Result:
 
     Raises:
       ConfigError: bad input, before anything was started.
-      GmiFailed: a GMI failed; the run folder holds the logs and the last checkpoint.
-      JobInterrupted: SIGINT, SIGTERM or SIGHUP came; its note says what is left to resume.
+      GmiFailed: a GMI failed, and starting again did not help or would not have; the run folder
+        holds the logs and the last checkpoint.
+      JobInterrupted: SIGINT, SIGTERM, SIGHUP or SIGUSR1 came; its note says what is left to
+        resume.
     """
     started = time.monotonic()
     require_task(str(config.env.name), config.env.suite)
     config = dataclasses.replace(config, env=source.pinned(config.env))
-    config = _with_checkpoint(config)
+    beginning = find_beginning(config)
+    console = open_console(show=show)
+    if beginning.is_complete and beginning.folder is not None:
+        return _finished(config, beginning.folder, console)
+    config = _from(config, beginning.checkpoint)
     machine = detect_machine()
-    console = Console(stderr=False, quiet=not show, soft_wrap=True, highlight=False)
     config, found = decided(config, machine, console)
-    plan = _make_plan(config, machine)
+    plan = training_plan(config, machine)
     if config.reduce.selection == "measured":
         plan = _with_measured(config, plan, machine)
     config, reason = _with_impl(config, plan)
-    run = create_run(config.run.dir, config.run.name, f"{config.env.slug}-{config.algo.name}")
-    write_json(run.config, to_dict(config))
-    write_json(run.plan, plan.to_dict())
     changed = _what_changed(config)
-    _announce(console, plan, (*found, reason, *((changed,) if changed else ())), run)
-    progress = (
-        ConsoleProgress(console, MetricsReader(run.metrics), config.num_timesteps)
-        if show
-        else SilentProgress()
-    )
-
-    def record(status: str, plan: Plan) -> None:
-        summary = trained.summarise(config, plan, run, status, time.monotonic() - started)
-        write_json(run.summary, summary)
-        draw_returns(run.metrics, run.returns_png, f"{config.env.label}, {config.algo.name}")
-
-    with recorded(run, partial(_what_is_left, run), record):
-        _copy_history(config, run)
-        with progress:
-            run_gmis(_launch(config, plan, machine, run, console), progress.update)
+    run = beginning.open(config)
+    with locked(run.lock, f"run.dir={run.root}"):
+        _announce(console, plan, (*found, reason, *changed, *beginning.notes), run)
+        job = _Job(config, plan, machine, run, console)
+        job.run_to_the_end(beginning, started, show=show)
     summary = read_json(run.summary)
-    console.print(trained.outcome(summary, run))
+    console.print(trained.outcome(summary, run), markup=False)
     return Result(run.root, summary)
 
 
-def _make_plan(config: TrainConfig, machine: Machine) -> Plan:
-    if is_decoupled(config):
-        return plan_decoupled(config, config.envs_per_gmi, machine)
-    return make_plan(config.plan, config.reduce, config.envs_per_gmi, machine)
+class _Job:
+    """A training job that is ready to start."""
+
+    def __init__(
+        self,
+        config: TrainConfig,
+        plan: Plan,
+        machine: Machine,
+        run: RunPaths,
+        console: Console,
+    ) -> None:
+        self._config = config
+        self._plan = plan
+        self._machine = machine
+        self._run = run
+        self._console = console
+        self._attempts = Attempts(run, config.run.max_restarts, self._launch_at, self._say)
+
+    def run_to_the_end(self, beginning: Beginning, started_s: float, *, show: bool) -> None:
+        """Runs it, with restarts; writes the summary however it ends."""
+        config, run = self._config, self._run
+        progress = (
+            ConsoleProgress(self._console, MetricsReader(run.metrics), config.num_timesteps)
+            if show
+            else SilentProgress()
+        )
+
+        def record(status: str, plan: Plan) -> None:
+            add_event(run.events, status)
+            wall_s = time.monotonic() - started_s
+            restarts = self._attempts.restarts
+            summary = trained.summarise(config, plan, run, status, wall_s, restarts)
+            write_json(run.summary, summary)
+            draw_returns(run.metrics, run.returns_png, f"{config.env.label}, {config.algo.name}")
+
+        write_json(run.plan, self._plan.to_dict())
+        with recorded(run, partial(_what_is_left, run), record):
+            self._prepare(beginning)
+            with progress:
+                self._attempts.run_to_the_end(beginning.checkpoint, progress.update)
+
+    def _prepare(self, beginning: Beginning) -> None:
+        checkpoint = beginning.checkpoint
+        if beginning.folder is not None:
+            clear_unfinished(self._run, checkpoint)
+        elif checkpoint is not None:
+            steps = CheckpointMeta.read(checkpoint).env_steps
+            copy_history(RunPaths(checkpoint.parents[1]).metrics, self._run.metrics, steps)
+
+    def _launch_at(self, checkpoint: Path | None, attempt: int) -> Launch:
+        if attempt:
+            self._look_again()
+        config = _from(self._config, checkpoint)
+        write_json(self._run.config, to_dict(config))
+        write_json(self._run.plan, self._plan.to_dict())
+        return Launch(
+            plan=self._plan,
+            machine=self._machine,
+            run=self._run,
+            kind=training_kind(config),
+            patience=patience_of(config.run),
+            on_warning=self._say,
+        )
+
+    def _look_again(self) -> None:
+        """Takes the machine as it is after a fault: GPUs and daemons may be gone."""
+        self._machine = detect_machine()
+        self._config, self._plan, notes = with_gpus_left(self._config, self._plan, self._machine)
+        for note in notes:
+            add_event(self._run.events, "plan", what=note)
+            self._say(note)
+
+    def _say(self, text: str) -> None:
+        self._console.print(text, markup=False)
+
+
+def _from(config: TrainConfig, checkpoint: Path | None) -> TrainConfig:
+    """The configuration with `run.resume` as the path of a checkpoint, or null."""
+    resume = None if checkpoint is None else str(checkpoint)
+    return dataclasses.replace(config, run=dataclasses.replace(config.run, resume=resume))
+
+
+def _finished(config: TrainConfig, run: RunPaths, console: Console) -> Result:
+    """What a run left that needs nothing more; with the summary that it may lack."""
+    summary = read_json(run.summary) if run.summary.exists() else {}
+    if summary.get("status") != "completed":
+        plan = Plan.from_dict(read_json(run.plan))
+        summary = trained.summarise(config, plan, run, "completed", 0.0, ())
+        write_json(run.summary, summary)
+    console.print(f"nothing is left to do: {run.root}", markup=False)
+    return Result(run.root, summary)
 
 
 def _with_measured(config: TrainConfig, plan: Plan, machine: Machine) -> Plan:
@@ -116,11 +196,12 @@ def _with_impl(config: TrainConfig, plan: Plan) -> tuple[TrainConfig, str]:
     return decided, f"physics.impl {impl}: {why}"
 
 
-def _what_changed(config: TrainConfig) -> str | None:
-    """Says that a resumed run's custom task is no longer the same, None where nothing changed."""
+def _what_changed(config: TrainConfig) -> tuple[str, ...]:
+    """Says that a resumed run's custom task is no longer the same."""
     if config.run.resume is None:
-        return None
-    return source.changes(config.env, saved_config(Path(config.run.resume))["env"])
+        return ()
+    changed = source.changes(config.env, saved_config(Path(config.run.resume))["env"])
+    return () if changed is None else (changed,)
 
 
 def _what_is_left(run: RunPaths) -> str:
@@ -132,72 +213,9 @@ def _what_is_left(run: RunPaths) -> str:
     return "there is no checkpoint yet"
 
 
-def _copy_history(config: TrainConfig, run: RunPaths) -> None:
-    if config.run.resume:
-        checkpoint = Path(config.run.resume)
-        steps = CheckpointMeta.read(checkpoint).env_steps
-        copy_history(RunPaths(checkpoint.parent.parent).metrics, run.metrics, steps)
-
-
-def _with_checkpoint(config: TrainConfig) -> TrainConfig:
-    """The configuration with `run.resume` as the path of a checkpoint that fits."""
-    wanted = config.run.resume
-    if wanted is None:
-        return config
-    checkpoint = find_checkpoint(wanted, "run.resume")
-    meta = CheckpointMeta.read(checkpoint)
-    algo = config.algo
-    expected = dataclasses.replace(
-        meta,
-        env=config.env.label,
-        algo=algo.name,
-        hidden=(algo.policy_hidden_layer_sizes, algo.value_hidden_layer_sizes),
-    )
-    check_fits(meta, expected, "run.resume", wanted)
-    seed = read_json(RunPaths(checkpoint.parent.parent).config)["seed"]
-    if config.seed != seed:
-        raise ConfigError(f"seed={config.seed}: a resumed run keeps its seed {seed}")
-    if meta.env_steps >= config.num_timesteps:
-        raise ConfigError(
-            f"num_timesteps={config.num_timesteps}: the checkpoint has {meta.env_steps} "
-            "steps already; give more in all"
-        )
-    return dataclasses.replace(config, run=dataclasses.replace(config.run, resume=str(checkpoint)))
-
-
-def _launch(
-    config: TrainConfig, plan: Plan, machine: Machine, run: RunPaths, console: Console
-) -> Launch:
-    return Launch(
-        plan=plan,
-        machine=machine,
-        run=run,
-        module=_module(config, plan),
-        # Agents and trainers compile different programs.
-        compile_once=not is_decoupled(config) and not dedicated.is_dedicated(plan),
-        shared=_shared(config, plan),
-        patience=patience_of(config.run),
-        on_warning=lambda text: console.print(text, markup=False),
-    )
-
-
-def _module(config: TrainConfig, plan: Plan) -> str:
-    """Main of the GMIs."""
-    if is_decoupled(config):
-        return MODULE
-    return dedicated.MODULE if dedicated.is_dedicated(plan) else "gmijax.workers.worker"
-
-
-def _shared(config: TrainConfig, plan: Plan) -> Mapping[str, Callable[[], int]]:
-    """The memory that the GMIs share, beside that of the reducer."""
-    if is_decoupled(config):
-        return shared_blocks(config, plan)
-    return dedicated.shared_blocks(plan) if dedicated.is_dedicated(plan) else {}
-
-
 def _announce(console: Console, plan: Plan, more: Sequence[str], run: RunPaths) -> None:
     layout = [list(gmis) for gmis in plan.layout.gmis_of_gpu]
-    console.print(f"run folder: {run.root}")
+    console.print(f"run folder: {run.root}", markup=False)
     console.print(
         f"plan: layout {layout}, backend {plan.backend}, {plan.num_envs_per_gmi} environments "
         f"per GMI, template {plan.template}, reduction {plan.strategy}",

@@ -11,18 +11,23 @@ import os
 import signal
 import sys
 import threading
+import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
+from types import FrameType
+from typing import Final
 
 from gmijax.collectives.memory import create_exchange
 from gmijax.config import RunConfig, ServeRunConfig
+from gmijax.control.kinds import JobKind
+from gmijax.control.program_cache import drop_broken_programs
 from gmijax.errors import BackendUnavailable, GmijaxError, JobInterrupted
 from gmijax.partition.backend_choice import WHAT_SHARE_LOSES
 from gmijax.partition.backends import Backend, open_backend
 from gmijax.partition.child import ENV_EXCHANGE_FD
-from gmijax.partition.environment import gmi_environment
+from gmijax.partition.environment import COMPILATION_CACHE, gmi_environment
 from gmijax.partition.gmi_process import GmiStatus
 from gmijax.partition.machine import Machine
 from gmijax.partition.plan import Plan
@@ -30,6 +35,11 @@ from gmijax.partition.reduction import needs_ring
 from gmijax.partition.rendezvous import reserved_address
 from gmijax.partition.supervisor import Job, Patience, Supervisor
 from gmijax.rundir import RunPaths, read_json, write_json
+
+STOP_SIGNALS: Final = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGUSR1)
+"""What asks a job to save and end: Ctrl-C, batch systems, a terminal that is closed."""
+
+_AGAIN_S = 1.0
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -40,13 +50,10 @@ class Launch:
       plan: where GMIs live and what they share.
       machine: where this is; see `detect_machine`.
       run: the run folder; what the GMIs read from it is there already.
-      module: main of every GMI, started by name: `python -m module`.
+      kind: what the GMIs run, and what they share beside the block that reducers use.
       patience: time limits.
-      stops_gracefully: a first SIGINT, SIGTERM or SIGHUP asks the GMIs to finish by themselves;
+      stops_gracefully: a first one of `STOP_SIGNALS` asks the GMIs to finish by themselves;
         otherwise signals do what Python does with them.
-      compile_once: see `Job`; never where each has programs of its own.
-      shared: blocks of memory for all GMIs, by the environment variable that names the
-        descriptor, and what makes one; beside the block that reducers use.
       variables: more environment variables of every GMI.
       on_warning: told in a sentence when the job runs otherwise than planned.
       is_enough: whether the GMIs are to finish now, as after a first signal, and the job has done
@@ -56,20 +63,25 @@ class Launch:
     plan: Plan
     machine: Machine
     run: RunPaths
-    module: str
+    kind: JobKind
     patience: Patience
     stops_gracefully: bool = True
-    compile_once: bool = True
-    shared: Mapping[str, Callable[[], int]] = field(default_factory=dict)
     variables: Mapping[str, str] = field(default_factory=dict)
     on_warning: Callable[[str], None] = lambda _: None
     is_enough: Callable[[tuple[GmiStatus, ...]], bool] | None = None
 
 
 def run_gmis(
-    launch: Launch, on_tick: Callable[[tuple[GmiStatus, ...]], None] | None = None
+    launch: Launch,
+    on_tick: Callable[[tuple[GmiStatus, ...]], None] | None = None,
+    signals: StopSignals | None = None,
 ) -> None:
     """Runs all GMIs to their end; calls `on_tick` about 20 times a second.
+
+    Args:
+      launch: what to run.
+      on_tick: see above.
+      signals: those that the caller hears already; None: heard while this runs.
 
     Raises:
       GmiFailed: a GMI failed; names the first one.
@@ -78,8 +90,13 @@ def run_gmis(
     """
     plan = launch.plan
     has_rings = needs_ring(plan.strategy, plan.training_layout)
+    # There a program of a world belongs to one of its devices.
+    is_world_on_cpu = has_rings and plan.backend == "cpu"
     with ExitStack() as held:
-        blocks = dict(launch.shared)
+        # First, so that it ends last: a signal must not cut off the end of the backend.
+        if launch.stops_gracefully and signals is None:
+            signals = held.enter_context(stop_signals())
+        blocks = dict(launch.kind.shared(plan))
         if plan.layout.num_gmis > 1:
             blocks[ENV_EXCHANGE_FD] = create_exchange
         inherited = {name: _open_block(held, create) for name, create in blocks.items()}
@@ -89,20 +106,23 @@ def run_gmis(
             Job(
                 run=launch.run,
                 gmis=plan.layout.gmis,
-                command=lambda _: [sys.executable, "-m", launch.module],
+                command=lambda _: [sys.executable, "-m", launch.kind.module],
                 environment=lambda gmi: environment_of(
                     launch, gmi, backend.environment(gmi), rendezvous
                 ),
                 backend=backend,
                 patience=launch.patience,
                 inherited_fds=inherited,
-                # On the CPU a program of a world belongs to one of its devices.
-                compile_once=launch.compile_once and not (has_rings and plan.backend == "cpu"),
+                compile_once=launch.kind.compile_once and not is_world_on_cpu,
             )
         )
-        if launch.stops_gracefully:
-            held.enter_context(_stopping_on_signals(supervisor.request_stop))
-        supervisor.run(_ticks(launch, supervisor, on_tick))
+        if signals is not None:
+            signals.forward_to(supervisor.request_stop)
+        try:
+            supervisor.run(_ticks(launch, supervisor, on_tick))
+        finally:
+            logs = [launch.run.gmi(gmi).stderr for gmi in plan.layout.gmis]
+            drop_broken_programs(program_cache_of(launch), logs)
 
 
 def _ticks(
@@ -157,7 +177,7 @@ def patience_of(limits: RunConfig | ServeRunConfig) -> Patience:
     return Patience(
         start_timeout_s=limits.start_timeout_s,
         stall_timeout_s=limits.stall_timeout_s,
-        stop_timeout_s=limits.stall_timeout_s,
+        stop_timeout_s=limits.stop_timeout_s,
         grace_s=limits.grace_s,
     )
 
@@ -169,6 +189,11 @@ def environment_of(
     own, cache = dict(os.environ), compilation_cache_dir()
     variables = gmi_environment(launch.plan, gmi, own, cache, added, rendezvous)
     return {**variables, **launch.variables}
+
+
+def program_cache_of(launch: Launch) -> Path:
+    """The compilation cache that the GMIs use."""
+    return Path(os.environ.get(COMPILATION_CACHE) or compilation_cache_dir())
 
 
 def compilation_cache_dir() -> Path:
@@ -205,17 +230,54 @@ def _open_block(held: ExitStack, create: Callable[[], int]) -> int:
     return fd
 
 
+class StopSignals:
+    """Signals that ask for an end: the first one, and the same one again a second later or more.
+
+    A program such as `timeout` sends its signal twice at once, and a batch system sends others
+    before the last: that is no impatience.
+    """
+
+    def __init__(self) -> None:
+        self._requests = 0
+        self._last_s: dict[int, float] = {}
+        self._forward: Callable[[], None] | None = None
+
+    @property
+    def have_come(self) -> bool:
+        """Whether an end was asked for."""
+        return self._requests > 0
+
+    def handle(self, number: int, _: FrameType | None = None) -> None:
+        """The signal handler."""
+        now_s = time.monotonic()
+        is_again = now_s - self._last_s.get(number, now_s) >= _AGAIN_S
+        if is_again or not self._last_s:
+            self._requests += 1
+            if self._forward is not None:
+                self._forward()
+        self._last_s[number] = now_s
+
+    def forward_to(self, request_stop: Callable[[], None]) -> None:
+        """Who is told, also of what has come before."""
+        self._forward = request_stop
+        for _ in range(self._requests):
+            request_stop()
+
+
 @contextmanager
-def _stopping_on_signals(request_stop: Callable[[], None]) -> Iterator[None]:
+def stop_signals() -> Iterator[StopSignals]:
+    """Hears `STOP_SIGNALS` in place of whatever they did."""
+    signals = StopSignals()
     # Python delivers signals to the main thread only; elsewhere they are the caller's business.
     is_main = threading.current_thread() is threading.main_thread()
+    # What was ignored when the job was started, by nohup for one, stays ignored.
     previous = {
-        number: signal.signal(number, lambda *_: request_stop())
-        for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
-        if is_main
+        number: signal.signal(number, signals.handle)
+        for number in STOP_SIGNALS
+        if is_main and signal.getsignal(number) is not signal.SIG_IGN
     }
     try:
-        yield
+        yield signals
     finally:
         for number, handler in previous.items():
             signal.signal(number, handler)

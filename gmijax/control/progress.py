@@ -71,6 +71,7 @@ class ConsoleProgress:
         self._first: tuple[float, int] | None = None
         self._shown: tuple[str, int | None] = ("", None)
         self._shown_s = 0.0
+        self._is_broken = False
         self._live = Live(console=console, refresh_per_second=4, transient=True)
 
     def __enter__(self) -> ConsoleProgress:
@@ -90,7 +91,16 @@ class ConsoleProgress:
             self._console.print(self._text(), highlight=False)
 
     def update(self, gmis: Sequence[GmiStatus]) -> None:
-        """See `Progress`."""
+        """See `Progress`; what goes wrong with the display must not end the job."""
+        if self._is_broken:
+            return
+        try:
+            self._show(gmis)
+        except Exception as error:
+            self._is_broken = True
+            self._console.print(f"no progress from here on: {error!r}", markup=False)
+
+    def _show(self, gmis: Sequence[GmiStatus]) -> None:
         if (line := self._metrics.latest()) is not None:
             self._line = line
             if self._first is None:

@@ -19,6 +19,7 @@ from typing import Any, NamedTuple
 
 from gmijax.collectives.cost_model import COSTS
 from gmijax.collectives.memory import create_exchange
+from gmijax.control.kinds import Plain
 from gmijax.control.launcher import Launch, compilation_cache_dir, run_gmis
 from gmijax.partition.layout import Layout
 from gmijax.partition.machine import Machine
@@ -179,10 +180,12 @@ def measure(
                 plan=plan,
                 machine=machine,
                 run=run,
-                module="gmijax.workers.reduction_probe",
+                kind=Plain(
+                    "gmijax.workers.reduction_probe",
+                    compile_once=False,
+                    blocks={block_variable(k): create_exchange for k in range(len(probes))},
+                ),
                 patience=PATIENCE,
-                compile_once=False,
-                shared={block_variable(k): create_exchange for k in range(len(probes))},
             )
         )
         found = [read_json(run.gmi(gmi).result) for gmi in plan.layout.gmis]

@@ -18,21 +18,20 @@ from typing import Any, Literal, NamedTuple
 
 from rich.console import Console
 
-from gmijax.collectives.pipe_block import create_pipes
 from gmijax.config import PhysicsConfig, ServeConfig
 from gmijax.control import served
+from gmijax.control.kinds import Serving
 from gmijax.control.launcher import Launch, patience_of, recorded, run_gmis
 from gmijax.control.progress import ConsoleProgress, SilentProgress
 from gmijax.control.serving_search import NO_REDUCTION, decided
-from gmijax.datadir import DataPaths, locked, open_dataset
+from gmijax.datadir import DataPaths, open_dataset
 from gmijax.errors import ConfigError
-from gmijax.partition.child import ENV_PIPES_FD
 from gmijax.partition.machine import Machine, detect_machine
 from gmijax.partition.plan import Plan
 from gmijax.partition.planner import make_plan
 from gmijax.partition.templates import SIMULATOR, group_of
 from gmijax.resume import CheckpointMeta, find_checkpoint, trained_config
-from gmijax.rundir import RunPaths, create_run, read_json, write_json
+from gmijax.rundir import RunPaths, create_run, locked, read_json, write_json
 from gmijax.schema import to_dict
 from gmijax.sim import source
 from gmijax.sim.impl import choose_impl
@@ -96,7 +95,7 @@ def serve(config: ServeConfig, *, show: bool = False) -> Served:
     with ExitStack() as held:
         if job.data is not None:
             open_dataset(job.data, _about(job))
-            held.enter_context(locked(job.data))
+            held.enter_context(locked(job.data.lock, f"output.dir={job.data.root}"))
         kept = job.finished_unrolls()
         if kept and kept == job.wanted_unrolls:
             raise ConfigError(
@@ -204,14 +203,12 @@ def _run(job: _Job, kept: int, run: RunPaths, console: Console) -> dict[str, Any
 
 
 def _launch(job: _Job, run: RunPaths, console: Console) -> Launch:
-    pipes = partial(create_pipes, job.plan.layout.num_gmis, job.config.pipe_bytes)
     return Launch(
         plan=job.plan,
         machine=job.machine,
         run=run,
-        module="gmijax.workers.serving_worker",
+        kind=Serving(job.config),
         patience=patience_of(job.config.run),
-        shared={ENV_PIPES_FD: pipes} if job.plan.template == "tdg" else {},
         on_warning=lambda text: console.print(text, markup=False),
     )
 

@@ -8,6 +8,7 @@ from typing import Final
 from rich.console import Console
 
 from gmijax.config import AUTO, ReduceConfig, ServeConfig
+from gmijax.control.kinds import Serving
 from gmijax.control.searching import resolve_auto
 from gmijax.control.workload import Workload, peak_memory_mib
 from gmijax.errors import ConfigError
@@ -70,7 +71,7 @@ def serving(config: ServeConfig) -> Workload:
         num_envs=config.num_envs,
         impl=config.physics.impl,
         template="tcg",
-        module="gmijax.workers.serving_worker",
+        kind=Serving(config),
         config_at=config_at,
         read=_read,
         # Which weights act makes no difference; their shapes do, and they are the run's.

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import sys
+from collections.abc import Sequence
 from typing import Any
 
 from gmijax.config import TrainConfig
+from gmijax.control.restarts import Restart
 from gmijax.partition.plan import Plan
 from gmijax.physics_health import overflow_warnings
 from gmijax.results import read_metrics
@@ -19,7 +21,12 @@ _VERSIONS = ("jax", "jaxlib", "mujoco-mjx", "flax", "optax", "orbax-checkpoint")
 
 
 def summarise(
-    config: TrainConfig, plan: Plan, run: RunPaths, status: str, wall_s: float
+    config: TrainConfig,
+    plan: Plan,
+    run: RunPaths,
+    status: str,
+    wall_s: float,
+    restarts: Sequence[Restart],
 ) -> dict[str, Any]:
     """The content of `summary.json`, from what the leader left or, failing that, the metrics."""
     result = read_json(run.gmi(0).result) if run.gmi(0).result.exists() else _last_known(run)
@@ -50,6 +57,7 @@ def summarise(
         "final_return": result.get("final_return"),
         "overflow_steps": result.get("overflow_steps") or {},
         "checkpoint": str(checkpoints[-1]) if checkpoints else None,
+        "restarts": [restart._asdict() for restart in restarts],
         "versions": {"gmijax": __version__, "python": sys.version.split()[0]}
         | versions_of(_VERSIONS),
         "device": result.get("device"),
@@ -72,10 +80,11 @@ def outcome(summary: dict[str, Any], run: RunPaths) -> str:
         value = summary[key]
         return "-" if value is None else f"{value:,.0f}"
 
-    final = summary["final_return"]
+    final, times = summary["final_return"], len(summary["restarts"])
     return (
         f"{summary['status']}: {summary['env_steps']:,} env steps in {summary['wall_s']:.0f} s, "
-        f"final return {'-' if final is None else format(final, '.2f')}\n"
+        f"final return {'-' if final is None else format(final, '.2f')}"
+        f"{f', started again {times} times' if times else ''}\n"
         f"env steps/s: {rate('step_per_s_sim')} simulation, "
         f"{rate('step_per_s_inference')} with inference, "
         f"{rate('step_per_s_train')} with training\n"

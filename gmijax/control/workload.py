@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from typing import Any, Literal
 
 from gmijax.config import EnvConfig, PlanConfig, PpoConfig, ReduceConfig, TemplateName, TrainConfig
+from gmijax.control.kinds import SYNCHRONOUS, JobKind
 from gmijax.errors import ConfigError
 from gmijax.partition.balance import Split
 from gmijax.partition.gmi_process import GmiStatus
@@ -34,15 +35,13 @@ class Workload:
       num_envs: environments per GMI, or `auto`.
       impl: physics implementation, or `auto`.
       template: what `plan.template=auto` means.
-      module: main of its GMIs.
+      kind: what its GMIs run and share.
       config_at: the configuration of the short job that profiles a point with so many GMIs; it
         is what the GMIs read from the run folder. Raises ConfigError if there can be none.
       read: what one GMI did, from the run folder of that job.
       key: what else decides how fast it is, plain data.
       trainers: numbers of training GMIs per GPU to choose from; (0,): every GMI does everything.
       plan_of: the plan of a profile where the template's own GMIs are not all that there is.
-      compile_once: see `gmijax.control.launcher.Launch`.
-      shared: memory of the GMIs of a profile, see `Launch`.
       is_enough: what says when a profile can be read; None: it ends by itself.
       estimate: environment steps a second of the whole job; None: of the same on every GPU.
       top: what Sat goes by.
@@ -55,14 +54,12 @@ class Workload:
     num_envs: int | Literal["auto"]
     impl: str
     template: TemplateName
-    module: str
+    kind: JobKind
     config_at: Callable[[Point, int], Any]
     read: Callable[[Plan, RunPaths], Measured]
     key: Mapping[str, Any]
     trainers: tuple[int, ...] = (0,)
     plan_of: Callable[[Point, Machine], Plan] | None = None
-    compile_once: bool = True
-    shared: Callable[[Plan], Mapping[str, Callable[[], int]]] = lambda _: {}
     is_enough: Callable[[Plan, RunPaths], IsEnough] | None = None
     estimate: Callable[[Point, Measured], float] | None = None
     top: Callable[[Measured], float] = top_of_one
@@ -113,7 +110,7 @@ def training(config: TrainConfig) -> Workload:
         num_envs=config.num_envs,
         impl=config.physics.impl,
         template="tcg_ex",
-        module="gmijax.workers.worker",
+        kind=SYNCHRONOUS,
         config_at=config_at,
         read=_read_training,
         key={"job": "train", "algo": to_dict(config.algo), "iterations": config.search.iterations},

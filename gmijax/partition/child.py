@@ -1,23 +1,28 @@
 """The GMI's side of supervision; stdlib only, so that it runs before jax is imported.
 
 The controller holds the write end of a pipe per GMI, the *lifeline*. One byte lets a GMI compile
-that was to wait for another, one asks it to finish; end of file means that the controller is gone,
-however it ended, and so must the GMI be.
+that was to wait for another, one asks it to finish, one ends it at once; end of file means that
+the controller is gone, however it ended, and so must the GMI be. While the lifeline holds a GMI
+ignores the signals that ask for an end: a batch system sends them to every process of a job, and
+the controller decides what becomes of it.
 """
 
 from __future__ import annotations
 
+import faulthandler
 import os
 import signal
+import sys
 import threading
 import time
 import traceback
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from pathlib import Path
 from typing import Any, Final
 
-from gmijax.errors import ConfigError
-from gmijax.partition.heartbeat import GmiState, Heartbeat, write_heartbeat
+from gmijax.errors import ConfigError, ReportedError
+from gmijax.partition.heartbeat import GmiState, Heartbeat, HeartbeatBlock
 from gmijax.rundir import GmiPaths, RunPaths, write_json
 
 ENV_GMI: Final = "GMIJAX_GMI"
@@ -28,11 +33,17 @@ ENV_EXCHANGE_FD: Final = "GMIJAX_EXCHANGE_FD"
 ENV_PIPES_FD: Final = "GMIJAX_PIPES_FD"
 ENV_RENDEZVOUS: Final = "GMIJAX_RENDEZVOUS"
 ENV_WAITS: Final = "GMIJAX_WAITS"
+ENV_HEARTBEAT_FD: Final = "GMIJAX_HEARTBEAT_FD"
 
 STOP_BYTE: Final = b"s"
 GO_BYTE: Final = b"g"
+END_BYTE: Final = b"e"
 
-_BEAT_INTERVAL_S: Final = 0.2
+LEFT_TO_CONTROLLER: Final = (signal.SIGTERM, signal.SIGINT, signal.SIGHUP, signal.SIGUSR1)
+"""Signals that a GMI with a lifeline ignores."""
+
+STACKS_SIGNAL: Final = signal.SIGUSR2
+"""Makes a GMI write the stacks of all its threads to its log."""
 
 
 class ChildLink:
@@ -47,6 +58,7 @@ class ChildLink:
 
     Args:
       waits: whether another GMI compiles before this one may.
+      heartbeat_fd: inherited memory for beats and errors, None where nobody reads them.
     """
 
     def __init__(
@@ -58,6 +70,7 @@ class ChildLink:
         rendezvous: str | None = None,
         *,
         waits: bool = False,
+        heartbeat_fd: int | None = None,
     ) -> None:
         self.gmi = gmi
         self.run = run
@@ -68,7 +81,7 @@ class ChildLink:
         self._turn = threading.Event()
         if not waits:
             self._turn.set()
-        self._last_beat: tuple[GmiState, float] | None = None
+        self._block = HeartbeatBlock(heartbeat_fd)
         if lifeline_fd is not None:
             threading.Thread(
                 target=self._hold_lifeline, args=(lifeline_fd,), name="lifeline", daemon=True
@@ -91,13 +104,17 @@ class ChildLink:
                 f"{ENV_GMI} and {ENV_RUN_DIR} must be set: GMIs are started by gmijax.train"
             ) from None
         pin_to_cpus(environment.get(ENV_CPUS, ""))
+        lifeline_fd = inherited_fd(environment, ENV_LIFELINE_FD)
+        if lifeline_fd is not None:
+            _leave_signals_to_controller()
         return cls(
             gmi,
             RunPaths(Path(run_dir)),
-            inherited_fd(environment, ENV_LIFELINE_FD),
+            lifeline_fd,
             inherited_fd(environment, ENV_EXCHANGE_FD),
             environment.get(ENV_RENDEZVOUS),
-            waits=ENV_WAITS in environment and ENV_LIFELINE_FD in environment,
+            waits=ENV_WAITS in environment and lifeline_fd is not None,
+            heartbeat_fd=inherited_fd(environment, ENV_HEARTBEAT_FD),
         )
 
     @property
@@ -118,28 +135,17 @@ class ChildLink:
         return waited_s
 
     def beat(self, state: GmiState, iteration: int) -> None:
-        """Reports progress; cheap enough for every iteration.
-
-        Beats in an unchanged state are written at most five times a second.
-        """
-        now_s = time.monotonic()
-        if self._last_beat is not None:
-            last_state, last_s = self._last_beat
-            if state == last_state and now_s - last_s < _BEAT_INTERVAL_S:
-                return
-        write_heartbeat(self.paths.heartbeat, Heartbeat(state, iteration, os.getpid()))
-        self._last_beat = state, now_s
+        """Reports progress; costs microseconds."""
+        self._block.write(Heartbeat(state, iteration, os.getpid()))
 
     def report_error(self, error: BaseException) -> None:
-        """Writes why this GMI fails; end with a non-zero exit code after it."""
-        write_json(
-            self.paths.error,
-            {
-                "type": type(error).__name__,
-                "message": str(error),
-                "traceback": "".join(traceback.format_exception(error)),
-            },
+        """Says why this GMI fails, also in `error.json`; end with a non-zero code after it."""
+        said = ReportedError(
+            type(error).__name__, str(error), "".join(traceback.format_exception(error))
         )
+        self._block.write_error(said)
+        with suppress(OSError):  # The disk may be what is wrong.
+            write_json(self.paths.error, said._asdict())
 
     def _hold_lifeline(self, lifeline_fd: int) -> None:
         while True:
@@ -147,7 +153,7 @@ class ChildLink:
                 received = os.read(lifeline_fd, 16)
             except OSError:
                 received = b""
-            if not received:
+            if not received or END_BYTE in received:
                 _end_now()
             if GO_BYTE in received:
                 self._turn.set()
@@ -171,6 +177,18 @@ def run_gmi(routine: Callable[[ChildLink], Mapping[str, Any] | None]) -> int:
         raise
     link.beat("done", 0)
     return 0
+
+
+def _leave_signals_to_controller() -> None:
+    # A handler and not SIG_IGN, which programs that a role starts would inherit.
+    for number in LEFT_TO_CONTROLLER:
+        signal.signal(number, lambda *_: None)
+        signal.siginterrupt(number, False)
+    # The controller had them blocked, so that none could end this process until now.
+    signal.pthread_sigmask(signal.SIG_UNBLOCK, LEFT_TO_CONTROLLER)
+    if sys.__stderr__ is not None:
+        faulthandler.enable(sys.__stderr__)
+        faulthandler.register(STACKS_SIGNAL, sys.__stderr__, all_threads=True)
 
 
 def pin_to_cpus(cpus: str) -> None:

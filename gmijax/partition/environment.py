@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
+from typing import Final
 
 from gmijax.partition.child import ENV_CPUS, ENV_GMI, ENV_RENDEZVOUS, ENV_WAITS
 from gmijax.partition.plan import Plan, Slice
@@ -20,7 +21,7 @@ _XLA_FLAGS = "XLA_FLAGS"
 _SM_PERCENT = "CUDA_MPS_ACTIVE_THREAD_PERCENTAGE"
 _PRIORITY = "CUDA_MPS_CLIENT_PRIORITY"
 _PRIORITIES = {"normal": "0", "below_normal": "1"}
-_COMPILATION_CACHE = "JAX_COMPILATION_CACHE_DIR"
+COMPILATION_CACHE: Final = "JAX_COMPILATION_CACHE_DIR"
 _THREAD_LIMITS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 
 _SMALLEST_POOL = 4
@@ -62,7 +63,7 @@ def gmi_environment(
         environment.pop(name, None)
     environment.update(_cpu(share) if plan.backend == "cpu" else _gpu(share))
     environment.update(_common(share))
-    environment.setdefault(_COMPILATION_CACHE, str(cache_dir))
+    environment.setdefault(COMPILATION_CACHE, str(cache_dir))
     for name in _THREAD_LIMITS:
         # One thread beside a GPU: there the host only moves small arrays, and the GMIs of all
         # GPUs share the cores.

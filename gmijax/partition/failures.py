@@ -2,16 +2,21 @@
 
 from __future__ import annotations
 
-import json
 import os
 import signal
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 from gmijax import errors
-from gmijax.errors import CollectiveError, ConfigError, GmiFailed, GmijaxError
-from gmijax.rundir import GmiPaths, read_json
+from gmijax.errors import (
+    CollectiveError,
+    CollectiveTimeout,
+    ConfigError,
+    GmiFailed,
+    GmijaxError,
+    ReportedError,
+)
 
 _TAIL_BYTES = 8192
 _MAX_LINE = 300
@@ -24,36 +29,48 @@ class Failure(NamedTuple):
       gmi: its id.
       exit_code: as in `subprocess`: negative for the signal that ended the process.
       reason: one line.
-      error_type: class name of the GMI's own exception, None where it left none.
-      message: first line of that exception's message.
+      iteration: training iterations done.
+      error: the GMI's own exception, None where it left none.
     """
 
     gmi: int
     exit_code: int
     reason: str
-    error_type: str | None
-    message: str
+    iteration: int
+    error: ReportedError | None
 
     @property
     def is_consequence(self) -> bool:
         """Whether the GMI says that another one is to blame."""
-        return self.exit_code > 0 and _is_a(self.error_type, CollectiveError)
+        return self._is(CollectiveError)
+
+    @property
+    def is_timeout(self) -> bool:
+        """Whether the GMI has waited in vain for another one."""
+        return self._is(CollectiveTimeout)
 
     def to_error(self) -> GmijaxError:
         """The exception for the user; bad input found inside a GMI stays bad input."""
-        if self.exit_code > 0 and _is_a(self.error_type, ConfigError):
-            return ConfigError(self.message)
-        return GmiFailed(self.gmi, self.reason)
+        if self.error is not None and self._is(ConfigError):
+            return ConfigError(_first_line(self.error.message))
+        return GmiFailed(self.gmi, self.reason, iteration=self.iteration, error=self.error)
+
+    def _is(self, parent: type[GmijaxError]) -> bool:
+        if self.exit_code <= 0 or self.error is None:
+            return False
+        found = getattr(errors, self.error.type, None)
+        return isinstance(found, type) and issubclass(found, parent)
 
 
-def describe_exit(gmi: int, exit_code: int, paths: GmiPaths) -> Failure:
-    """Puts together what the GMI left behind: its error.json, else its last line on stderr."""
-    error_type, message = _own_error(paths.error)
-    own = f"{error_type}: {message}" if error_type else last_line(paths.stderr)
+def describe_exit(
+    gmi: int, exit_code: int, error: ReportedError | None, stderr: Path, iteration: int = 0
+) -> Failure:
+    """Puts together what the GMI left behind: its own error, else its last line on stderr."""
+    own = f"{error.type}: {_first_line(error.message)}" if error else last_line(stderr)
     how = f"exit code {exit_code}" if exit_code >= 0 else f"ended by {signal_name(-exit_code)}"
     if exit_code == -signal.SIGKILL and not own:
         own = "not killed by gmijax; perhaps the machine ran out of memory"
-    return Failure(gmi, exit_code, f"{how}: {own}" if own else how, error_type, message)
+    return Failure(gmi, exit_code, f"{how}: {own}" if own else how, iteration, error)
 
 
 def first_cause(failures: Sequence[Failure]) -> Failure:
@@ -92,15 +109,6 @@ def last_line(path: Path) -> str:
     return next((line.strip() for line in reversed(lines) if line.strip()), "")[:_MAX_LINE]
 
 
-def _own_error(path: Path) -> tuple[str | None, str]:
-    try:
-        data: dict[str, Any] = read_json(path)
-        lines = str(data["message"]).strip().splitlines()
-        return str(data["type"]), lines[0][:_MAX_LINE] if lines else ""
-    except (OSError, json.JSONDecodeError, KeyError, TypeError):
-        return None, ""
-
-
-def _is_a(error_type: str | None, parent: type[GmijaxError]) -> bool:
-    found = getattr(errors, error_type, None) if error_type else None
-    return isinstance(found, type) and issubclass(found, parent)
+def _first_line(text: str) -> str:
+    lines = text.strip().splitlines()
+    return lines[0][:_MAX_LINE] if lines else ""

@@ -10,10 +10,20 @@ from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from typing import NamedTuple
 
-from gmijax.errors import GmiFailed
-from gmijax.partition.child import ENV_LIFELINE_FD, ENV_RUN_DIR, ENV_WAITS, GO_BYTE, STOP_BYTE
-from gmijax.partition.heartbeat import Heartbeat, read_heartbeat
-from gmijax.processes import members_of, wait_until_gone
+from gmijax.errors import GmiFailed, ReportedError
+from gmijax.partition.child import (
+    END_BYTE,
+    ENV_HEARTBEAT_FD,
+    ENV_LIFELINE_FD,
+    ENV_RUN_DIR,
+    ENV_WAITS,
+    GO_BYTE,
+    LEFT_TO_CONTROLLER,
+    STACKS_SIGNAL,
+    STOP_BYTE,
+)
+from gmijax.partition.heartbeat import Heartbeat, HeartbeatBlock
+from gmijax.processes import GuardPipe, members_of, wait_until_gone
 from gmijax.rundir import GmiPaths, RunPaths
 
 _GROUP_ENDS_S = 2.0
@@ -53,7 +63,8 @@ class GmiProcess:
         self,
         gmi: int,
         process: subprocess.Popen[bytes],
-        lifeline: int,
+        lifeline: GuardPipe,
+        block: HeartbeatBlock,
         paths: GmiPaths,
         *,
         waits: bool,
@@ -64,9 +75,10 @@ class GmiProcess:
         self.progress_s = time.monotonic()
         self._process = process
         self._lifeline = lifeline
+        self._block = block
         self._paths = paths
         self._beat = Heartbeat("starting", 0, process.pid)
-        self._beat_stamp: tuple[int, int] | None = None
+        self._beats = 0
         self._was_ready = False
 
     @classmethod
@@ -89,10 +101,14 @@ class GmiProcess:
         """
         paths = run.gmi(gmi)
         paths.root.mkdir(parents=True, exist_ok=True)
-        for stale in (paths.heartbeat, paths.error, paths.result):
+        for stale in (paths.error, paths.result):
             stale.unlink(missing_ok=True)
-        read_end, write_end = os.pipe()
-        inherited = {ENV_LIFELINE_FD: read_end, **inherited_fds}
+        lifeline, heartbeat_fd = GuardPipe(), HeartbeatBlock.create()
+        inherited = {
+            ENV_LIFELINE_FD: lifeline.read_end,
+            ENV_HEARTBEAT_FD: heartbeat_fd,
+            **inherited_fds,
+        }
         variables = {name: str(fd) for name, fd in inherited.items()}
         if waits:
             variables[ENV_WAITS] = "1"
@@ -103,15 +119,16 @@ class GmiProcess:
                 paths,
                 tuple(inherited.values()),
             )
-        except BaseException as error:
-            os.close(write_end)
-            if isinstance(error, OSError):
-                what = f"cannot start {command[0]}: {error.strerror}"
-                raise GmiFailed(gmi, what) from error
+            return cls(gmi, process, lifeline, HeartbeatBlock(heartbeat_fd), paths, waits=waits)
+        except OSError as error:
+            lifeline.close()
+            raise GmiFailed(gmi, f"cannot start {command[0]}: {error.strerror}") from error
+        except BaseException:
+            lifeline.close()
             raise
         finally:
-            os.close(read_end)
-        return cls(gmi, process, write_end, paths, waits=waits)
+            os.close(lifeline.read_end)
+            os.close(heartbeat_fd)
 
     @property
     def pid(self) -> int:
@@ -127,6 +144,11 @@ class GmiProcess:
     def is_ready(self) -> bool:
         """Whether the GMI has once been ready, or has ended well without saying so."""
         return self._was_ready or self.exit_code == 0
+
+    @property
+    def error(self) -> ReportedError | None:
+        """The exception that it said it ends with, None without one."""
+        return self._block.read_error()
 
     @property
     def paths(self) -> GmiPaths:
@@ -155,11 +177,41 @@ class GmiProcess:
         """Lets a GMI compile that was started to wait."""
         self.waits = False
         self.progress_s = time.monotonic()
-        self._tell(GO_BYTE)
+        self._lifeline.write(GO_BYTE)
 
     def ask_to_stop(self) -> None:
         """Asks the GMI to finish its iteration, save and end."""
-        self._tell(STOP_BYTE)
+        self._lifeline.write(STOP_BYTE)
+
+    def order_end(self) -> None:
+        """Makes the GMI and all that it started end at once, without saving."""
+        self._lifeline.write(END_BYTE)
+
+    def request_stacks(self) -> int | None:
+        """Has the GMI write the stacks of its threads to its log; the log's size before.
+
+        None where it has not started far enough for that: the signal would end it.
+        """
+        if self.exit_code is not None or not self._beats:
+            return None
+        size = self.log_bytes
+        with suppress(ProcessLookupError, PermissionError):
+            os.kill(self._beat.pid, STACKS_SIGNAL)
+        return size
+
+    @property
+    def log_bytes(self) -> int:
+        """Size of what it has written to stderr."""
+        try:
+            return self._paths.stderr.stat().st_size
+        except OSError:
+            return 0
+
+    def end_as_done(self) -> None:
+        """Ends a GMI that has said that it is done, but whose process stays."""
+        self.send(signal.SIGKILL)
+        self._process.wait()
+        self.exit_code = 0
 
     def send(self, number: signal.Signals) -> None:
         """Sends a signal to the GMI and to everything it started; nothing once it is reaped."""
@@ -169,13 +221,7 @@ class GmiProcess:
 
     def close(self) -> None:
         """Drops the lifeline: a process that is still there ends itself."""
-        if self._lifeline >= 0:
-            os.close(self._lifeline)
-            self._lifeline = -1
-
-    def _tell(self, byte: bytes) -> None:
-        with suppress(OSError):  # It may have ended.
-            os.write(self._lifeline, byte)
+        self._lifeline.close()
 
     def _has_ended(self) -> bool:
         flags = os.WEXITED | os.WNOHANG | os.WNOWAIT
@@ -185,14 +231,10 @@ class GmiProcess:
             return True
 
     def _refresh(self) -> None:
-        try:
-            stat = self._paths.heartbeat.stat()
-        except OSError:
-            return
-        # Every beat is a new file, so a beat with equal content counts as progress too.
-        stamp = (stat.st_mtime_ns, stat.st_ino)
-        if stamp != self._beat_stamp and (beat := read_heartbeat(self._paths.heartbeat)):
-            self._beat, self._beat_stamp = beat, stamp
+        beats = self._block.beats
+        # A beat with equal content counts as progress too.
+        if beats != self._beats and (beat := self._block.read()):
+            self._beat, self._beats = beat, beats
             self._was_ready |= beat.is_ready
             self.progress_s = time.monotonic()
 
@@ -200,14 +242,19 @@ class GmiProcess:
 def _spawn(
     command: Sequence[str], environment: Mapping[str, str], paths: GmiPaths, fds: tuple[int, ...]
 ) -> subprocess.Popen[bytes]:
-    # Files, not pipes: a child that floods a pipe which nobody reads would block.
-    with paths.stdout.open("wb") as stdout, paths.stderr.open("wb") as stderr:
-        return subprocess.Popen(
-            command,
-            env=environment,
-            stdin=subprocess.DEVNULL,
-            stdout=stdout,
-            stderr=stderr,
-            start_new_session=True,
-            pass_fds=fds,
-        )
+    # The child inherits that they are blocked, until it can leave them to this process.
+    blocked = signal.pthread_sigmask(signal.SIG_BLOCK, LEFT_TO_CONTROLLER)
+    try:
+        # Files, not pipes: a child that floods a pipe which nobody reads would block.
+        with paths.stdout.open("wb") as stdout, paths.stderr.open("wb") as stderr:
+            return subprocess.Popen(
+                command,
+                env=environment,
+                stdin=subprocess.DEVNULL,
+                stdout=stdout,
+                stderr=stderr,
+                start_new_session=True,
+                pass_fds=fds,
+            )
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, blocked)

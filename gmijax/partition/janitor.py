@@ -1,9 +1,9 @@
-"""Cleans up MPS daemons after a controller that was killed: `python -m gmijax.partition.janitor`.
+"""Cleans up after a controller that was killed: `python -m gmijax.partition.janitor`.
 
-A daemon outlives whoever started it, and a killed controller runs no clean-up. So a janitor is
-started before the first daemon, in a session of its own, and reads from a pipe what there is to
-clean, one JSON object a line (see `JanitorLink`). The pipe's end without the word `clean` means
-that the controller is gone.
+A killed controller runs no clean-up. GMIs end by themselves then, but one that is stopped
+(SIGSTOP) cannot, and an MPS daemon outlives whoever started it. So a janitor is started before
+them, in a session of its own, and reads from a pipe what there is to clean, one JSON object a line
+(see `JanitorLink`). The pipe's end without the word `clean` means that the controller is gone.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from typing import Any
 
 from gmijax.errors import BackendUnavailable
 from gmijax.partition.mps_control import MpsControl
-from gmijax.processes import ProcessId, identify, wait_until_gone
+from gmijax.processes import GuardPipe, ProcessId, identify, wait_until_gone
 
 _GMIS_END_THEMSELVES_S = 8.0
 _DAEMON_ENDS_S = 10.0
@@ -51,20 +51,27 @@ class JanitorLink:
     """The controller's end of the pipe to a janitor.
 
     Args:
-      log_directory: where the janitor's own errors go.
+      log: where the janitor's own errors go; removed at the end if there are none.
     """
 
-    def __init__(self, log_directory: Path) -> None:
-        log_directory.mkdir(parents=True, exist_ok=True)
-        with (log_directory / "janitor.log").open("wb") as log:
-            self._process = subprocess.Popen(
-                [sys.executable, "-m", "gmijax.partition.janitor"],
-                stdin=subprocess.PIPE,
-                stdout=log,
-                stderr=log,
-                text=True,
-                start_new_session=True,
-            )
+    def __init__(self, log: Path) -> None:
+        log.parent.mkdir(parents=True, exist_ok=True)
+        self._log = log
+        self._pipe = GuardPipe()
+        try:
+            with log.open("wb") as errors:
+                self._process = subprocess.Popen(
+                    [sys.executable, "-m", "gmijax.partition.janitor"],
+                    stdin=self._pipe.read_end,
+                    stdout=errors,
+                    stderr=errors,
+                    start_new_session=True,
+                )
+        except BaseException:
+            self._pipe.close()
+            raise
+        finally:
+            os.close(self._pipe.read_end)
 
     def watch_daemon(self, control: MpsControl) -> None:
         """Makes the janitor quit this daemon and remove its pipe directory; tell it before."""
@@ -78,23 +85,23 @@ class JanitorLink:
     def dismiss(self, timeout_s: float = _DAEMON_ENDS_S) -> None:
         """Says that everything is clean and waits for the janitor to end."""
         self._tell({"clean": True})
-        with suppress(OSError):
-            self._stream.close()
+        self._pipe.close()
         try:
             self._process.wait(timeout_s)
         except subprocess.TimeoutExpired:
             self._process.kill()
             self._process.wait()
+        with suppress(OSError):
+            if not self._log.stat().st_size:
+                self._log.unlink()
 
-    @property
-    def _stream(self) -> Any:
-        return self._process.stdin
+    def take_over(self) -> None:
+        """Lets the janitor clean up now, as if this process were gone."""
+        self._pipe.close()
 
     def _tell(self, message: dict[str, Any]) -> None:
         # A janitor that somebody killed must not end the job that it only guards.
-        with suppress(OSError):
-            self._stream.write(json.dumps(message) + "\n")
-            self._stream.flush()
+        self._pipe.write(json.dumps(message).encode() + b"\n")
 
 
 def quit_daemon(control: MpsControl, timeout_s: float = _DAEMON_ENDS_S) -> None:

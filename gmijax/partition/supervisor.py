@@ -1,7 +1,7 @@
 """Starts the GMIs of a job, watches them, and ends them all, whatever happens.
 
-All or nothing: the first failure ends the job, and no process is left when `run` returns or
-raises. There is no restart; a job continues from a checkpoint instead.
+All or nothing: the first failure ends all GMIs, and no process is left when `run` returns or
+raises. Whether the job is tried again is decided by `gmijax.control.restarts`.
 """
 
 from __future__ import annotations
@@ -21,6 +21,8 @@ from gmijax.rundir import RunPaths
 _POLL_S = 0.05
 _SETTLE_S = 1.0
 _SWEEP_S = 10.0
+_STACKS_S = 3.0
+"""Longest wait for stacks to be written; a process that is stopped never does."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -31,7 +33,7 @@ class Patience:
       start_timeout_s: for a GMI to compile, counted from its start or from its last beat.
       stall_timeout_s: between two beats of a GMI that is past compiling.
       stop_timeout_s: for all GMIs to finish by themselves after a request to stop.
-      grace_s: between SIGTERM and SIGKILL.
+      grace_s: for a GMI to end at once, on the order to; for one that is done to be gone.
     """
 
     start_timeout_s: float
@@ -121,8 +123,13 @@ class Supervisor:
                     on_tick(self.status())
                 time.sleep(_POLL_S)
             self._raise_failure()
-        finally:
-            self._end_all()
+        except BaseException as error:
+            if left := self._end_all():
+                error.add_note(f"processes {left} do not end: a driver may hold them")
+                if isinstance(error, GmiFailed):
+                    error.is_final = True  # Nothing may be started beside them.
+            raise
+        self._end_all()
         if self._stop_requests:
             raise JobInterrupted("stopped on request; every GMI has finished by itself")
 
@@ -159,11 +166,20 @@ class Supervisor:
         while first_cause(failures).is_consequence and time.monotonic() < deadline_s:
             time.sleep(_POLL_S)
             failures = self._poll_failures()
-        raise first_cause(failures).to_error()
+        cause = first_cause(failures)
+        if cause.is_timeout:
+            self._collect_stacks()
+        raise cause.to_error()
 
     def _poll_failures(self) -> list[Failure]:
         return [
-            describe_exit(process.gmi, process.exit_code, process.paths)
+            describe_exit(
+                process.gmi,
+                process.exit_code,
+                process.error,
+                process.paths.stderr,
+                process.beat.iteration,
+            )
             for process in self._started.values()
             if process.poll() and process.exit_code is not None
         ]
@@ -212,6 +228,9 @@ class Supervisor:
             state = process.beat.state
             if process.waits:
                 continue  # The one that it waits for has a time limit.
+            if state == "done" and now_s - process.progress_s > self._job.patience.grace_s:
+                process.end_as_done()
+                continue
             if state in ("starting", "compiling"):
                 limit_s, since_s = self._job.patience.start_timeout_s, process.progress_s
                 what = "did not start and compile"
@@ -224,24 +243,48 @@ class Supervisor:
             else:
                 continue
             if now_s - since_s > limit_s:
-                raise GmiFailed(process.gmi, f"{what} within {limit_s:g} s (state: {state})")
+                self._collect_stacks()
+                raise GmiFailed(
+                    process.gmi,
+                    f"{what} within {limit_s:g} s (state: {state})",
+                    iteration=process.beat.iteration,
+                )
 
-    def _end_all(self) -> None:
-        """Ends every process that is left: backend, SIGTERM, grace, SIGKILL, lifeline."""
+    def _collect_stacks(self) -> None:
+        """Has all that still run write where their threads are to their logs."""
+        sizes = {process: process.request_stacks() for process in self._alive()}
+        waiting = {process: size for process, size in sizes.items() if size is not None}
+        deadline_s = time.monotonic() + _STACKS_S
+        while waiting and time.monotonic() < deadline_s:
+            time.sleep(_POLL_S)
+            now = {process: process.log_bytes for process in waiting}
+            # Written once a log has grown and grows no more.
+            waiting = {
+                process: now[process]
+                for process, before in waiting.items()
+                if now[process] == sizes[process] or now[process] != before
+            }
+
+    def _end_all(self) -> list[int]:
+        """Ends every process that is left: backend, order to end, grace, SIGKILL, lifeline.
+
+        Returns:
+          Those that are still there.
+        """
         alive = [process for process in self._started.values() if process.poll() is None]
         for process in alive:
             # Whatever is wrong with the backend, the processes must end.
             with suppress(Exception):
                 self._job.backend.terminate(process.gmi, process.beat.pid)
-        for number, wait_s in (
-            (signal.SIGTERM, self._job.patience.grace_s),
-            (signal.SIGKILL, _SWEEP_S),
-        ):
-            for process in alive:
-                process.send(number)
-            alive = _wait_for_end(alive, wait_s)
+        for process in alive:
+            process.order_end()
+        alive = _wait_for_end(alive, self._job.patience.grace_s)
+        for process in alive:
+            process.send(signal.SIGKILL)
+        alive = _wait_for_end(alive, _SWEEP_S)
         for process in self._started.values():
             process.close()
+        return [process.pid for process in alive]
 
 
 def _wait_for_end(processes: Sequence[GmiProcess], timeout_s: float) -> list[GmiProcess]:

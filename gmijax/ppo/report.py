@@ -136,6 +136,11 @@ class ReportThread:
         if self._error is not None:
             raise self._error
 
+    @property
+    def last_return(self) -> float | None:
+        """Of the reporter; call `wait` before."""
+        return self._reporter.last_return
+
     def give_up(self) -> None:
         """Says that what the thread waits for will not come: `stop` does not wait for it."""
         self._is_idle.set()

@@ -217,14 +217,15 @@ class _SyncTrainer:
             self._env_steps += self._steps_per_iteration
             self._iterations += 1
             lines.report(self._env_steps, metrics, self._iteration.times)
-            self._link.beat("running", self._iterations)
+            # Counted from the run's start, so that it says the same after a restart.
+            self._link.beat("running", self._env_steps // self._steps_per_iteration)
             stop = self._agree_to_stop()
             is_last = stop or self._env_steps >= self._config.num_timesteps
             if not is_last and every and self._iterations % every == 0:
                 self._settle(lines)  # A resumed run goes on from the lines up to its checkpoint.
-                self._save(state, env_state)
+                self._save(state, env_state, lines.last_return)
         self._settle(lines)
-        self._save(state, env_state)
+        self._save(state, env_state, lines.last_return)
         return state, env_state, stop
 
     def _settle(self, lines: ReportThread) -> None:
@@ -236,7 +237,7 @@ class _SyncTrainer:
         mine = np.array([self._link.stop_requested], np.float32)
         return bool(self._reducer.all_gather(mine).any())
 
-    def _save(self, state: LearnerState, env_state: Any) -> None:
+    def _save(self, state: LearnerState, env_state: Any, mean_return: float | None) -> None:
         digests = self._reducer.all_gather(digest(state.params))
         if different := [r for r in range(len(digests)) if (digests[r] != digests[0]).any()]:
             raise ParameterMismatch(
@@ -250,19 +251,20 @@ class _SyncTrainer:
             )
         self._checkpoint = save_checkpoint(
             self._link.run,
-            self._meta(),
+            self._meta(mean_return),
             state,
             env_state,
             gmi=self._link.gmi,
             leader=self._leader,
             barrier=self._meet,
+            keep=self._config.run.keep_checkpoints,
         )
 
     def _meet(self) -> None:
         """Returns when all GMIs have called it."""
         self._reducer.all_gather(np.zeros(1, np.float32))
 
-    def _meta(self) -> CheckpointMeta:
+    def _meta(self, mean_return: float | None) -> CheckpointMeta:
         algo = self._config.algo
         return CheckpointMeta(
             env=self._config.env.label,
@@ -272,6 +274,7 @@ class _SyncTrainer:
             num_envs=self._config.envs_per_gmi,
             hidden=(algo.policy_hidden_layer_sizes, algo.value_hidden_layer_sizes),
             impl=self._config.physics.impl,
+            mean_return=mean_return,
         )
 
     def _median_rate(self, iteration_s: list[float]) -> float | None:

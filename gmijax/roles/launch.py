@@ -12,6 +12,7 @@ from typing import Any, Final
 
 from gmijax.collectives.messenger import MIN_CAPACITY_BYTES
 from gmijax.collectives.pipe_block import create_pipes
+from gmijax.control.kinds import Plain
 from gmijax.control.launcher import Launch, run_gmis
 from gmijax.errors import ConfigError, GmiFailed, GmijaxError
 from gmijax.partition.child import ENV_GMI, ENV_PIPES_FD
@@ -105,12 +106,14 @@ def _job(plan: Plan, run: RunPaths, patience: Patience, capacity_bytes: int) -> 
         plan=plan,
         machine=detect_machine(),
         run=run,
-        module="gmijax.roles.worker",
-        patience=patience,
         # Roles wait for each other, so they start together.
-        compile_once=False,
+        kind=Plain(
+            "gmijax.roles.worker",
+            compile_once=False,
+            blocks={ENV_PIPES_FD: partial(create_pipes, plan.layout.num_gmis, capacity_bytes)},
+        ),
+        patience=patience,
         on_warning=lambda text: warnings.warn(text, RuntimeWarning, stacklevel=2),
-        shared={ENV_PIPES_FD: partial(create_pipes, plan.layout.num_gmis, capacity_bytes)},
     )
 
 

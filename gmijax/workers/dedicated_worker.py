@@ -11,7 +11,7 @@ import sys
 from typing import TYPE_CHECKING, Any
 
 from gmijax.config import PpoConfig, TrainConfig
-from gmijax.control.dedicated import PIPE_BYTES
+from gmijax.control.kinds import ROLLOUT_PIPE_BYTES
 from gmijax.errors import ConfigError
 from gmijax.partition.child import ENV_PIPES_FD, ChildLink, required_fd, run_gmi
 from gmijax.partition.plan import Plan
@@ -53,7 +53,8 @@ def _run(link: ChildLink) -> dict[str, Any]:
     check_share(plan, link.gmi)
     place = 0 if trains else servants.gmis.index(link.gmi)
     env = environments_of(config, place)
-    block = PipeBlock.attach(required_fd(ENV_PIPES_FD), link.gmi, plan.layout.num_gmis, PIPE_BYTES)
+    fd, num_gmis = required_fd(ENV_PIPES_FD), plan.layout.num_gmis
+    block = PipeBlock.attach(fd, link.gmi, num_gmis, ROLLOUT_PIPE_BYTES)
     try:
         if trains:
             assert isinstance(config.algo, PpoConfig)

@@ -12,6 +12,7 @@ from pathlib import Path
 import pytest
 from supervision import CHECKOUT, TESTS, gpu, machine, make_job, plan_config, reduce_config
 
+from gmijax.control.kinds import Plain
 from gmijax.control.launcher import Launch, run_gmis
 from gmijax.errors import BackendUnavailable, GmiFailed, JobInterrupted
 from gmijax.partition.backends import open_backend
@@ -110,7 +111,7 @@ def test_job_of_clients_is_verified_and_stops(mps: FakeMps, run: RunPaths):
     assert (run.gmi(0).root / "saved").exists()
     assert not mps.told("terminate_client")
     assert not directories[0].exists()
-    assert (run.mps / "janitor.log").read_text() == ""
+    assert not run.janitor_log.exists()
 
 
 def test_gmi_that_is_no_client_is_refused(mps: FakeMps, run: RunPaths):
@@ -206,7 +207,12 @@ def small_job(run: RunPaths, here: Machine, plan: Plan, told: list[str]) -> Laun
     write_json(run.plan, plan.to_dict())
     patience = Patience(start_timeout_s=20, stall_timeout_s=20, stop_timeout_s=20, grace_s=2)
     return Launch(
-        plan=plan, machine=here, run=run, module="this", patience=patience, on_warning=told.append
+        plan=plan,
+        machine=here,
+        run=run,
+        kind=Plain("this"),
+        patience=patience,
+        on_warning=told.append,
     )
 
 

@@ -16,10 +16,10 @@ import pytest
 
 import gmijax
 from gmijax.errors import GmiFailed, JobInterrupted
-from gmijax.processes import identify
 from gmijax.rundir import read_json
 from tests import role_cases
 from tests.supervision import CHECKOUT
+from tests.training_jobs import heartbeat_of, pids_of
 
 pytestmark = pytest.mark.timeout(60)
 
@@ -101,8 +101,7 @@ def test_the_gmi_that_fails_is_named(ends: str, message: str, seen: str, tmp_pat
     notes = "\n".join(caught.value.__notes__)
     assert f"run folder: {run}" in notes
     assert ends != "raise" or 'raise ZeroDivisionError("the sum is off")' in notes
-    beats = [read_json(run / f"gmi_{gmi}" / "heartbeat.json") for gmi in range(3)]
-    assert not [beat["pid"] for beat in beats if identify(beat["pid"])]
+    assert not pids_of(run)
     if seen:  # The others are ended by the controller, before they notice.
         kind, waited_s, *_ = (tmp_path / "seen_0").read_text().split()
         assert kind == seen
@@ -121,10 +120,8 @@ def test_a_role_that_ends_its_process_has_returned_nothing() -> None:
 
 
 def test_an_interrupt_lets_roles_finish(tmp_path: Path) -> None:
-    beat = tmp_path / "run" / "gmi_1" / "heartbeat.json"
-
     def interrupt() -> None:
-        while not (beat.exists() and json.loads(beat.read_text())["state"] == "running"):
+        while (beat := heartbeat_of(tmp_path / "run", 1)) is None or beat.state != "running":
             time.sleep(0.02)
         time.sleep(0.3)
         os.kill(os.getpid(), signal.SIGINT)

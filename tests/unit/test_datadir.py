@@ -6,9 +6,9 @@ from pathlib import Path
 
 import pytest
 
-from gmijax.datadir import DataPaths, locked, open_dataset
+from gmijax.datadir import DataPaths, open_dataset
 from gmijax.errors import ConfigError
-from gmijax.rundir import write_json
+from gmijax.rundir import locked, write_json
 
 
 def make_shard(paths: DataPaths, rank: int, index: int) -> None:
@@ -71,7 +71,11 @@ def test_a_folder_with_something_else_is_left_alone(tmp_path: Path):
 
 def test_one_job_at_a_time_writes_into_a_folder(tmp_path: Path):
     paths = DataPaths(tmp_path)
-    with locked(paths), pytest.raises(ConfigError, match="another job writes"), locked(paths):
+    with (
+        locked(paths.lock, "output.dir=x"),
+        pytest.raises(ConfigError, match="output.dir=x: another job writes"),
+        locked(paths.lock, "output.dir=x"),
+    ):
         pass
-    with locked(paths):
+    with locked(paths.lock, "output.dir=x"):
         pass

@@ -7,22 +7,18 @@ import signal
 import subprocess
 import sys
 import time
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
-from gmijax.errors import CollectiveTimeout, ConfigError, GmiFailed
+from gmijax.errors import CollectiveTimeout, ConfigError, GmiFailed, ReportedError
 from gmijax.partition.child import ChildLink
 from gmijax.partition.failures import describe_exit, first_cause, last_line
-from gmijax.partition.heartbeat import Heartbeat, read_heartbeat
-from gmijax.rundir import GmiPaths, RunPaths, read_json, write_json
+from gmijax.partition.heartbeat import Heartbeat, HeartbeatBlock
+from gmijax.rundir import GmiPaths, RunPaths, read_json
 
 pytestmark = pytest.mark.timeout(20)
-
-
-@pytest.fixture
-def link(tmp_path: Path) -> ChildLink:
-    return ChildLink(3, RunPaths(tmp_path), lifeline_fd=None, exchange_fd=None)
 
 
 def test_link_is_read_from_the_environment(tmp_path: Path):
@@ -49,20 +45,44 @@ def test_process_that_is_no_gmi_is_told():
         ChildLink.from_environment({})
 
 
-def test_beats_of_an_unchanged_state_are_limited(link: ChildLink):
+@pytest.fixture
+def block() -> Iterator[tuple[int, HeartbeatBlock]]:
+    fd = HeartbeatBlock.create()
+    yield fd, HeartbeatBlock(fd)
+    os.close(fd)
+
+
+def test_beats_and_errors_reach_whoever_has_the_memory(
+    tmp_path: Path, block: tuple[int, HeartbeatBlock]
+):
+    fd, seen = block
+    link = ChildLink(3, RunPaths(tmp_path), None, None, heartbeat_fd=fd)
+    assert (seen.read(), seen.read_error(), seen.beats) == (None, None, 0)
     for iteration in range(50):
         link.beat("running", iteration)
-    assert read_heartbeat(link.paths.heartbeat) == Heartbeat("running", 0, os.getpid())
-    link.beat("done", 50)
-    assert read_heartbeat(link.paths.heartbeat) == Heartbeat("done", 50, os.getpid())
+    assert (seen.read(), seen.beats) == (Heartbeat("running", 49, os.getpid()), 50)
+    link.report_error(ValueError("the sum is off"))
+    error = seen.read_error()
+    assert error is not None
+    assert (error.type, error.message) == ("ValueError", "the sum is off")
 
 
-@pytest.mark.parametrize("text", ["", "{", '{"state": "running"}', "[]"])
-def test_broken_heartbeat_is_no_heartbeat(tmp_path: Path, text: str):
-    path = tmp_path / "heartbeat.json"
-    assert read_heartbeat(path) is None
-    path.write_text(text)
-    assert read_heartbeat(path) is None
+def test_an_error_of_any_length_fits(block: tuple[int, HeartbeatBlock]):
+    text = "\x00\N{GRINNING FACE}\udcff" * 10_000
+    block[1].write_error(ReportedError("E", text, text))
+    error = block[1].read_error()
+    assert error is not None
+    assert len(error.message) == 2000
+
+
+def test_an_error_is_told_where_nothing_can_be_written(
+    tmp_path: Path, block: tuple[int, HeartbeatBlock]
+):
+    (tmp_path / "gmi_3").write_text("a file where the folder should be")
+    link = ChildLink(3, RunPaths(tmp_path), None, None, heartbeat_fd=block[0])
+    link.report_error(OSError(28, "No space left on device"))
+    failure = describe_exit(3, 1, block[1].read_error(), tmp_path / "stderr.log")
+    assert failure.reason == "exit code 1: OSError: [Errno 28] No space left on device"
 
 
 def test_lifeline_asks_for_a_stop(tmp_path: Path):
@@ -88,15 +108,18 @@ def test_lifeline_ends_the_process_with_the_controller(tmp_path: Path):
     assert child.wait(10) == 1
 
 
-def test_error_is_reported_and_described(link: ChildLink):
+def test_error_is_reported_and_described(tmp_path: Path, block: tuple[int, HeartbeatBlock]):
+    link = ChildLink(3, RunPaths(tmp_path), None, None, heartbeat_fd=block[0])
     try:
         raise ValueError("first\nsecond")
     except ValueError as error:
         link.report_error(error)
     assert "raise ValueError" in read_json(link.paths.error)["traceback"]
-    failure = describe_exit(3, 1, link.paths)
+    failure = describe_exit(3, 1, block[1].read_error(), link.paths.stderr, iteration=7)
     assert failure.reason == "exit code 1: ValueError: first"
-    assert isinstance(failure.to_error(), GmiFailed)
+    error = failure.to_error()
+    assert isinstance(error, GmiFailed)
+    assert (error.iteration, error.error) == (7, block[1].read_error())
 
 
 @pytest.mark.parametrize(
@@ -114,26 +137,27 @@ def test_end_without_an_error_file_is_described(
 ):
     paths = GmiPaths(tmp_path)
     paths.stderr.write_text(stderr)
-    assert describe_exit(0, exit_code, paths).reason == reason
+    assert describe_exit(0, exit_code, None, paths.stderr).reason == reason
 
 
 def test_an_abort_comes_after_other_causes(tmp_path: Path):
-    bad_input, aborted = (GmiPaths(tmp_path / name) for name in "ab")
-    write_json(bad_input.error, {"type": "ConfigError", "message": "num_envs=7: too odd"})
-    failures = [describe_exit(1, -signal.SIGABRT, aborted), describe_exit(2, 1, bad_input)]
-    assert first_cause(failures).gmi == 2
-    assert first_cause(failures[:1]).gmi == 1
-    assert first_cause([failures[0], describe_exit(0, -signal.SIGKILL, aborted)]).gmi == 0
+    bad_input = ReportedError("ConfigError", "num_envs=7: too odd", "")
+    log = tmp_path / "stderr.log"
+    aborted = describe_exit(1, -signal.SIGABRT, None, log)
+    assert first_cause([aborted, describe_exit(2, 1, bad_input, log)]).gmi == 2
+    assert first_cause([aborted]).gmi == 1
+    assert first_cause([aborted, describe_exit(0, -signal.SIGKILL, None, log)]).gmi == 0
 
 
 def test_cause_goes_before_consequence(tmp_path: Path):
-    victim, culprit, killed = (GmiPaths(tmp_path / name) for name in "abc")
     error = CollectiveTimeout(rank=0, missing=(1,), operation="mean", step=3, timeout_s=5)
-    write_json(victim.error, {"type": type(error).__name__, "message": str(error)})
-    failures = [describe_exit(0, 1, victim), describe_exit(1, 3, culprit)]
+    log = tmp_path / "stderr.log"
+    victim = describe_exit(0, 1, ReportedError(type(error).__name__, str(error), ""), log)
+    failures = [victim, describe_exit(1, 3, None, log)]
     assert first_cause(failures).gmi == 1
-    assert first_cause([*failures, describe_exit(2, -9, killed)]).gmi == 2
+    assert first_cause([*failures, describe_exit(2, -9, None, log)]).gmi == 2
     assert first_cause(failures[:1]).is_consequence
+    assert first_cause(failures[:1]).is_timeout
 
 
 def test_only_the_end_of_a_long_log_is_read(tmp_path: Path):

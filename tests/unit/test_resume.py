@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import os
+import re
 import shutil
 from pathlib import Path
 
@@ -11,7 +13,7 @@ import pytest
 
 from gmijax.cli import compose
 from gmijax.errors import ConfigError
-from gmijax.resume import CheckpointMeta, find_checkpoint
+from gmijax.resume import CheckpointMeta, file_check, find_checkpoint, newest_checkpoint
 from gmijax.rundir import META, RunPaths, last_run, read_json, write_json
 from gmijax.schema import to_dict
 
@@ -66,19 +68,44 @@ def test_meta_data_survive_the_file(run: RunPaths):
         '"impl": "jax"}',
     ],
 )
-def test_broken_meta_data_are_bad_input(run: RunPaths, text: str):
+def test_a_checkpoint_with_broken_meta_data_is_passed_over(run: RunPaths, text: str):
     (run.checkpoint(2000) / META).write_text(text, errors="surrogateescape")
-    checkpoint = find_checkpoint(str(run.root), "run.resume")
+    assert find_checkpoint(str(run.root), "run.resume") == run.checkpoint(100)
+    [said] = newest_checkpoint(run.root).passed_over
+    assert re.search(r"/000000002000: passed over, broken meta\.json \(.+\)$", said)
+    with pytest.raises(ConfigError, match=r"^run\.resume=.*: broken meta\.json \(.+\)$"):
+        find_checkpoint(str(run.checkpoint(2000)), "run.resume")
+    with pytest.raises(ConfigError, match=r"000000002000: broken meta\.json \(.+\)$"):
+        CheckpointMeta.read(run.checkpoint(2000))
+
+
+@pytest.mark.parametrize("damage", ["truncated", "changed", "missing"])
+def test_a_checkpoint_whose_files_are_not_as_written_is_passed_over(run: RunPaths, damage: str):
+    weights = run.checkpoint(2000) / "learner" / "weights"
+    weights.parent.mkdir()
+    weights.write_bytes(b"0123456789")
+    meta = CheckpointMeta.read(run.checkpoint(2000))
+    meta = dataclasses.replace(meta, files={"learner/weights": file_check(weights)})
+    write_json(run.checkpoint(2000) / META, meta.to_dict())
+    assert newest_checkpoint(run.root) == (run.checkpoint(2000), ())
+    if damage == "missing":
+        weights.unlink()
+    else:
+        weights.write_bytes(b"01234" if damage == "truncated" else b"0123456780")
+    found = newest_checkpoint(run.root)
+    assert found.checkpoint == run.checkpoint(100)
+    assert "learner/weights" in found.passed_over[0]
+    shutil.rmtree(run.checkpoint(100))
     with pytest.raises(
-        ConfigError, match=r"checkpoint .*/000000002000: broken meta\.json \(.+\)$"
+        ConfigError, match=r"no checkpoint in this folder; .* passed over, learner"
     ):
-        CheckpointMeta.read(checkpoint)
+        find_checkpoint(str(run.root), "run.resume")
 
 
 def test_a_resumed_run_keeps_its_settings_but_those_given_again(run: RunPaths):
     config = compose(f"run.resume={run.root}", "num_envs=16", "plan=default", "run.grace_s=3")
     assert (config.env.name, config.seed, config.num_envs, config.run.grace_s) == ("ant", 5, 16, 3)
-    assert config.run.resume == str(run.checkpoint(2000))
+    assert config.run.resume == str(run.root)
     assert config.run.name is None
 
 

@@ -5,9 +5,8 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping
 from importlib import metadata
-from types import TracebackType
-from typing import Self
 
+from gmijax.partition.backends.guarded import GuardedBackend
 from gmijax.partition.machine import Machine
 from gmijax.partition.plan import Plan
 from gmijax.rundir import RunPaths
@@ -19,31 +18,17 @@ _FIRST_JAXLIB_WITHOUT_FLAG = (0, 11, 1)
 """From here on XLA ends the process when it meets the flag, as with any unknown one."""
 
 
-class CpuBackend:
+class CpuBackend(GuardedBackend):
     """Nothing to set up: the cores are part of the plan, GMIs pin themselves to them."""
 
     def __init__(self, plan: Plan, machine: Machine, run: RunPaths) -> None:
-        del plan, machine, run
-
-    def __enter__(self) -> Self:
-        """Does nothing."""
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
-        """Does nothing."""
+        del plan, machine
+        super().__init__(run)
 
     def environment(self, gmi: int) -> Mapping[str, str]:
         """XLA flags that the installed jaxlib understands."""
         del gmi
         return cpu_environment(_jaxlib_version())
-
-    def started(self, gmi: int, pid: int) -> None:
-        """Nothing to do."""
 
     def verify(self, pids: Mapping[int, int]) -> None:
         """Nothing can be missing."""

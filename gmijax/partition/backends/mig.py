@@ -54,8 +54,12 @@ class MigBackend:
     def __enter__(self) -> Self:
         """Starts a daemon for every instance that several GMIs share."""
         self._alone.__enter__()
-        if self._mps is not None:
-            self._mps.__enter__()
+        try:
+            if self._mps is not None:
+                self._mps.__enter__()
+        except BaseException:
+            self._alone.__exit__(None, None, None)
+            raise
         return self
 
     def __exit__(
@@ -67,6 +71,7 @@ class MigBackend:
         """Quits these daemons; the instances stay as they were."""
         if self._mps is not None:
             self._mps.__exit__(kind, error, trace)
+        self._alone.__exit__(kind, error, trace)
 
     def environment(self, gmi: int) -> Mapping[str, str]:
         """Where the GMI's daemon listens, or a place where none does."""
@@ -74,7 +79,8 @@ class MigBackend:
         return self._alone.environment(gmi) if daemons is None else daemons.environment(gmi)
 
     def started(self, gmi: int, pid: int) -> None:
-        """Tells the janitor, if there is one."""
+        """Tells the janitors: that of the daemons waits for its clients before it ends them."""
+        self._alone.started(gmi, pid)
         if self._mps is not None:
             self._mps.started(gmi, pid)
 

@@ -17,7 +17,8 @@ from types import TracebackType
 from typing import Self
 
 from gmijax.errors import BackendUnavailable, GmiFailed
-from gmijax.partition.janitor import JanitorLink, quit_daemon
+from gmijax.partition.backends.guarded import GuardedBackend
+from gmijax.partition.janitor import quit_daemon
 from gmijax.partition.machine import Machine
 from gmijax.partition.mps_control import PIPE_VARIABLE, MpsControl
 from gmijax.partition.plan import Plan
@@ -32,7 +33,7 @@ _POLL_S = 0.1
 _LONGEST_PARENT = 60
 
 
-class MpsBackend:
+class MpsBackend(GuardedBackend):
     """Runs the daemons of a job while it is entered.
 
     Args:
@@ -48,6 +49,7 @@ class MpsBackend:
     def __init__(
         self, plan: Plan, machine: Machine, run: RunPaths, gmis: Collection[int] | None = None
     ) -> None:
+        super().__init__(run)
         if machine.mps_control is None:
             raise BackendUnavailable(
                 f"plan.backend={plan.backend}: nvidia-cuda-mps-control was not found"
@@ -59,21 +61,21 @@ class MpsBackend:
         clients = plan.layout.gmis if gmis is None else gmis
         self._devices = {gmi: plan.slices[gmi].device for gmi in clients}
         self._controls: dict[str, MpsControl] = {}
-        self._janitor: JanitorLink | None = None
         self._unresponsive: set[str] = set()
 
     def __enter__(self) -> Self:
         """Starts a daemon per GPU, or attaches to the one that runs."""
+        super().__enter__()
         if self._operator is not None:
             control = MpsControl(self._program, self._operator)
             self._controls = dict.fromkeys(self._devices.values(), control)
             return self
         try:
-            self._janitor = JanitorLink(self._logs)
             for place, device in enumerate(dict.fromkeys(self._devices.values())):
                 self._start_daemon(device, self._logs / f"gpu_{place}")
         except BaseException:
             self._quit_all()
+            super().__exit__(None, None, None)
             raise
         return self
 
@@ -89,16 +91,11 @@ class MpsBackend:
             for control in self._controls.values():
                 _wait_for_no_clients(control, deadline_s)
             self._quit_all()
+        super().__exit__(kind, error, trace)
 
     def environment(self, gmi: int) -> Mapping[str, str]:
         """Where the GMI's daemon listens."""
         return {PIPE_VARIABLE: str(self._control_of(gmi).pipe_directory)}
-
-    def started(self, gmi: int, pid: int) -> None:
-        """Tells the janitor."""
-        del gmi
-        if self._janitor is not None:
-            self._janitor.watch_gmi(pid)
 
     def verify(self, pids: Mapping[int, int]) -> None:
         """Checks with the daemons that every GMI is a client.
@@ -172,12 +169,14 @@ class MpsBackend:
         )
 
     def _quit_all(self) -> None:
-        for control in self._controls.values():
-            quit_daemon(control)
+        try:
+            for control in self._controls.values():
+                quit_daemon(control)
+        except BaseException:  # Ctrl-C in a process that lives on.
+            if self._janitor is not None:
+                self._janitor.take_over()
+            raise
         self._controls = {}
-        if self._janitor is not None:
-            self._janitor.dismiss()
-            self._janitor = None
 
 
 def _wait_for_no_clients(control: MpsControl, deadline_s: float) -> None:

@@ -1,0 +1,207 @@
+"""Runs a job again from its last good checkpoint when GMIs were lost. No jax here.
+
+An attempt ends with all its processes, shared memory and daemons; the next one starts anew in the
+same run folder. What cannot get better by trying again ends the job at once.
+"""
+
+from __future__ import annotations
+
+import re
+import shutil
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from datetime import datetime
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from gmijax.control.launcher import Launch, StopSignals, run_gmis, stop_signals
+from gmijax.errors import ConfigError, GmiFailed, JobInterrupted
+from gmijax.partition.gmi_process import GmiStatus
+from gmijax.results import copy_history
+from gmijax.resume import CheckpointMeta, newest_checkpoint
+from gmijax.rundir import RunPaths, add_event
+
+_LASTING = ("NonFiniteError", "ParameterMismatch", "SelfCheckFailed")
+"""Errors of a GMI that the next attempt would meet too."""
+
+_FRAME = re.compile(r'^ +File "(.+)", line (\d+), in (.+)$', re.MULTILINE)
+
+OnTick = Callable[[tuple[GmiStatus, ...]], None]
+
+
+class Restart(NamedTuple):
+    """One time that a job was started again, for `summary.json`.
+
+    Attributes:
+      time: of the fault, ISO 8601.
+      gmi: which one failed first.
+      cause: in one line.
+      iteration: that it had done.
+      checkpoint: that the job went on from, None from its beginning.
+    """
+
+    time: str
+    gmi: int
+    cause: str
+    iteration: int
+    checkpoint: str | None
+
+
+@dataclass
+class Attempts:
+    """The attempts at one job.
+
+    Attributes:
+      run: the run folder.
+      max_restarts: without a newer checkpoint in between.
+      launch_at: what to start from a checkpoint (None: from the beginning), by number of the
+        attempt; raises ConfigError if nothing can be started any more.
+      say: takes a line for the user.
+      restarts: those so far.
+    """
+
+    run: RunPaths
+    max_restarts: int
+    launch_at: Callable[[Path | None, int], Launch]
+    say: Callable[[str], None]
+    restarts: list[Restart] = field(default_factory=list)
+    _seen_s: float = 0.0
+
+    def run_to_the_end(self, checkpoint: Path | None, on_tick: OnTick) -> None:
+        """Runs the job; raises as `run_gmis` of the last attempt does."""
+        budget, last = self.max_restarts, None
+        with stop_signals() as signals:
+            while True:
+                try:
+                    self._attempt(checkpoint, on_tick, signals)
+                    return
+                except GmiFailed as error:
+                    reason = why_not_again(error, last)
+                    newest = self._newest(checkpoint)
+                    if newest != checkpoint:
+                        budget = self.max_restarts
+                    if reason is None and budget == 0:
+                        reason = f"restarts are used up (run.max_restarts={self.max_restarts})"
+                    if reason is not None or signals.have_come:
+                        self._give_up(error, reason)
+                        raise
+                    budget, last = budget - 1, error
+                    self._prepare_again(error, newest)
+                    checkpoint = newest
+
+    def _attempt(self, checkpoint: Path | None, on_tick: OnTick, signals: StopSignals) -> None:
+        number = len(self.restarts)
+        try:
+            launch = self.launch_at(checkpoint, number)
+        except ConfigError as error:
+            if not number:
+                raise
+            fault = self.restarts[-1]
+            failed = GmiFailed(fault.gmi, fault.cause, iteration=fault.iteration)
+            failed.add_note(f"cannot start again: {error}")
+            failed.is_final = True
+            raise failed from error
+        if signals.have_come:
+            raise JobInterrupted("stopped between two attempts")
+        add_event(self.run.events, "start", attempt=number, checkpoint=_text(checkpoint))
+        run_gmis(launch, _Recovery(self.run, on_tick, number, self._seen_s).tick, signals)
+        add_event(self.run.events, "end", attempt=number)
+
+    def _newest(self, checkpoint: Path | None) -> Path | None:
+        found = newest_checkpoint(self.run.root)
+        for text in found.passed_over:
+            self.say(text)
+            add_event(self.run.events, "passed_over", what=text)
+        # Before its own first one, a resumed run goes on from where it came from.
+        return found.checkpoint or checkpoint
+
+    def _prepare_again(self, error: GmiFailed, newest: Path | None) -> None:
+        number = len(self.restarts)
+        now = datetime.now().astimezone().isoformat(timespec="milliseconds")
+        self.restarts.append(Restart(now, error.gmi, error.reason, error.iteration, _text(newest)))
+        self._seen_s = error.seen_s
+        add_event(self.run.events, "fault", attempt=number, **_about(error))
+        self.say(f"{error}; starting again from {newest or 'the beginning'}")
+        try:
+            keep_logs(self.run, number)
+            clear_unfinished(self.run, newest)
+        except OSError as full:
+            error.add_note(f"not started again: {full}")
+            raise error from full
+
+    def _give_up(self, error: GmiFailed, reason: str | None) -> None:
+        add_event(self.run.events, "fault", attempt=len(self.restarts), **_about(error))
+        if reason is not None:
+            error.add_note(f"not started again: {reason}")
+            add_event(self.run.events, "gave_up", reason=reason)
+
+
+class _Recovery:
+    """Notes when a job that was started again trains again, and how long after the fault."""
+
+    def __init__(self, run: RunPaths, on_tick: OnTick, attempt: int, fault_s: float) -> None:
+        self._run = run
+        self._on_tick = on_tick
+        self._attempt = attempt
+        self._fault_s = fault_s
+        self._is_over = attempt == 0
+
+    def tick(self, gmis: tuple[GmiStatus, ...]) -> None:
+        """See `run_gmis`."""
+        self._on_tick(gmis)
+        if not self._is_over and any(gmi.state == "running" for gmi in gmis):
+            self._is_over = True
+            seconds = round(time.monotonic() - self._fault_s, 3)
+            add_event(self._run.events, "recovered", attempt=self._attempt, seconds=seconds)
+
+
+def why_not_again(error: GmiFailed, last: GmiFailed | None) -> str | None:
+    """Why a job that failed should not be tried again, None if it should.
+
+    Args:
+      error: of this attempt.
+      last: of the attempt before, if there was one.
+    """
+    if error.is_final:
+        return "the last attempt left something behind, or nothing can be started"
+    if error.error is not None and error.error.type in _LASTING:
+        return f"{error.error.type} would come again"
+    if last is not None and error.error is not None and last.error is not None:
+        same = (error.iteration, error.error.type, _frames(error.error.traceback))
+        if same == (last.iteration, last.error.type, _frames(last.error.traceback)):
+            return f"the same error at the same iteration ({error.iteration}) twice"
+    return None
+
+
+def keep_logs(run: RunPaths, attempt: int) -> None:
+    """Moves what the GMIs of a failed attempt have left out of the way of the next one's."""
+    for folder in run.root.glob("gmi_[0-9]*"):
+        kept = folder / f"attempt_{attempt}"
+        files = [path for path in folder.iterdir() if path.is_file()]
+        kept.mkdir(exist_ok=True)
+        for path in files:
+            path.rename(kept / path.name)
+
+
+def clear_unfinished(run: RunPaths, checkpoint: Path | None) -> None:
+    """Leaves of a run what belongs to a checkpoint: no half-written ones, no later metrics."""
+    for hidden in run.checkpoints.glob(".*"):
+        shutil.rmtree(hidden, ignore_errors=True)
+    # Written anew from the metrics: event files cannot be cut.
+    shutil.rmtree(run.tensorboard, ignore_errors=True)
+    steps = CheckpointMeta.read(checkpoint).env_steps if checkpoint else 0
+    copy_history(run.metrics, run.metrics, steps)
+
+
+def _about(error: GmiFailed) -> dict[str, Any]:
+    return {"gmi": error.gmi, "cause": error.reason, "iteration": error.iteration}
+
+
+def _frames(traceback: str) -> Sequence[tuple[str, ...]]:
+    # Not the message: it may hold addresses and sizes.
+    return _FRAME.findall(traceback)
+
+
+def _text(checkpoint: Path | None) -> str | None:
+    return None if checkpoint is None else str(checkpoint)

@@ -1,0 +1,205 @@
+"""When a job is tried again, from where, and when it is not; attempts are faked."""
+
+from __future__ import annotations
+
+import json
+import signal
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from gmijax.control import restarts
+from gmijax.control.launcher import StopSignals
+from gmijax.control.restarts import Attempts, clear_unfinished, keep_logs, why_not_again
+from gmijax.errors import ConfigError, GmiFailed, ReportedError
+from gmijax.resume import CheckpointMeta
+from gmijax.rundir import META, RunPaths, read_json, write_json
+
+TRACE = 'Traceback:\n  File "task.py", line {line}, in step\n    x\nValueError: at 0x{address}\n'
+
+
+def error(kind: str = "ValueError", *, iteration: int = 3, line: int = 5) -> GmiFailed:
+    said = ReportedError(kind, "off", TRACE.format(line=line, address=iteration * 7919))
+    return GmiFailed(1, f"exit code 1: {kind}: off", iteration=iteration, error=said)
+
+
+def killed() -> GmiFailed:
+    return GmiFailed(0, "ended by SIGKILL", iteration=3)
+
+
+def save(run: RunPaths, env_steps: int) -> Path:
+    meta = CheckpointMeta("ant", "ppo", env_steps, 1, 8, ((8,), (8,)), "jax")
+    write_json(run.checkpoint(env_steps) / META, meta.to_dict())
+    return run.checkpoint(env_steps)
+
+
+class Job:
+    """Attempts of which each does what the next of `acts` does."""
+
+    def __init__(self, run: RunPaths, monkeypatch: pytest.MonkeyPatch, max_restarts: int) -> None:
+        self.run = run
+        self.started_from: list[Path | None] = []
+        self.said: list[str] = []
+        self.acts: Iterator[Callable[[StopSignals], None]] = iter(())
+        self.attempts = Attempts(run, max_restarts, self._launch_at, self.said.append)
+        monkeypatch.setattr(restarts, "run_gmis", self._run_gmis)
+
+    def go(self, *acts: Callable[[StopSignals], None]) -> None:
+        self.acts = iter(acts)
+        self.attempts.run_to_the_end(None, lambda _: None)
+
+    def events(self) -> list[str]:
+        return [json.loads(line)["event"] for line in self.run.events.read_text().splitlines()]
+
+    def _launch_at(self, checkpoint: Path | None, attempt: int) -> Any:
+        self.started_from.append(checkpoint)
+        return attempt
+
+    def _run_gmis(self, launch: Any, on_tick: Any, signals: StopSignals) -> None:
+        next(self.acts)(signals)
+
+
+def fail(error: Exception) -> Callable[[StopSignals], None]:
+    def act(_: StopSignals) -> None:
+        raise error
+
+    return act
+
+
+def fine(_: StopSignals) -> None:
+    return None
+
+
+@pytest.fixture
+def run(tmp_path: Path) -> RunPaths:
+    return RunPaths(tmp_path)
+
+
+@pytest.fixture
+def job(run: RunPaths, monkeypatch: pytest.MonkeyPatch) -> Job:
+    return Job(run, monkeypatch, max_restarts=2)
+
+
+def test_a_killed_gmi_starts_the_job_again_from_its_newest_checkpoint(job: Job, run: RunPaths):
+    def save_and_fail(_: StopSignals) -> None:
+        save(run, 100), save(run, 200)
+        raise killed()
+
+    job.go(fail(killed()), save_and_fail, fine)
+    assert job.started_from == [None, None, run.checkpoint(200)]
+    assert [(r.gmi, r.checkpoint) for r in job.attempts.restarts] == [
+        (0, None),
+        (0, str(run.checkpoint(200))),
+    ]
+    assert job.events() == ["start", "fault", "start", "fault", "start", "end"]
+
+
+def test_a_newer_checkpoint_sets_the_count_back(job: Job, run: RunPaths):
+    def save_and_fail(env_steps: int) -> Callable[[StopSignals], None]:
+        def act(_: StopSignals) -> None:
+            save(run, env_steps)
+            raise killed()
+
+        return act
+
+    ends = [killed() for _ in range(3)]
+    job.go(
+        fail(ends[0]), fail(ends[1]), save_and_fail(100), fail(ends[2]), save_and_fail(200), fine
+    )
+    assert len(job.attempts.restarts) == 5
+
+
+def test_without_a_newer_checkpoint_the_count_ends(job: Job):
+    with pytest.raises(GmiFailed) as caught:
+        job.go(*(fail(killed()) for _ in range(4)))
+    assert len(job.attempts.restarts) == 2
+    assert "run.max_restarts=2" in caught.value.__notes__[0]
+    assert job.events()[-2:] == ["fault", "gave_up"]
+
+
+@pytest.mark.parametrize("kind", ["NonFiniteError", "ParameterMismatch", "SelfCheckFailed"])
+def test_what_would_come_again_ends_the_job(job: Job, kind: str):
+    with pytest.raises(GmiFailed):
+        job.go(fail(error(kind)), fine)
+    assert not job.attempts.restarts
+
+
+def test_bad_input_ends_the_job(job: Job):
+    with pytest.raises(ConfigError):
+        job.go(fail(ConfigError("env.name=antt")), fine)
+
+
+def test_the_same_error_at_the_same_iteration_ends_the_job(job: Job):
+    with pytest.raises(GmiFailed) as caught:
+        job.go(fail(error()), fail(error()), fine)
+    assert len(job.attempts.restarts) == 1
+    assert "same iteration (3) twice" in caught.value.__notes__[0]
+
+
+@pytest.mark.parametrize("other", [error(iteration=4), error(line=6), error("KeyError"), killed()])
+def test_another_error_is_tried_again(other: GmiFailed):
+    assert why_not_again(other, error()) is None
+
+
+def test_a_failure_while_the_job_stops_is_not_tried_again(job: Job):
+    def stop_and_fail(signals: StopSignals) -> None:
+        signals.handle(signal.SIGTERM)
+        raise killed()
+
+    with pytest.raises(GmiFailed):
+        job.go(stop_and_fail, fine)
+    assert job.started_from == [None]
+
+
+def test_a_machine_that_cannot_go_on_is_told_with_the_fault(job: Job):
+    def launch_at(checkpoint: Path | None, attempt: int) -> Any:
+        if attempt:
+            raise ConfigError("GPUs [1] of the job are gone")
+        return attempt
+
+    job.attempts.launch_at = launch_at
+    with pytest.raises(GmiFailed, match="GMI 0 failed: ended by SIGKILL") as caught:
+        job.go(fail(killed()))
+    assert "cannot start again: GPUs [1] of the job are gone" in caught.value.__notes__
+
+
+def test_logs_of_a_failed_attempt_are_kept(run: RunPaths):
+    write_json(run.gmi(0).error, {"type": "E"})
+    keep_logs(run, 0)
+    write_json(run.gmi(0).error, {"type": "F"})
+    keep_logs(run, 1)
+    kept = [read_json(run.gmi(0).root / f"attempt_{n}" / "error.json")["type"] for n in (0, 1)]
+    assert kept == ["E", "F"]
+    assert not run.gmi(0).error.exists()
+
+
+def test_what_came_after_the_checkpoint_is_dropped(run: RunPaths):
+    lines = [{"env_steps": steps} for steps in (50, 100, 150)]
+    run.metrics.write_text("".join(json.dumps(line) + "\n" for line in lines) + '{"env_st')
+    checkpoint = save(run, 100)
+    (run.checkpoints / ".000000000150.partial" / "learner").mkdir(parents=True)
+    clear_unfinished(run, checkpoint)
+    assert [path.name for path in run.checkpoints.iterdir()] == [checkpoint.name]
+    assert [json.loads(line)["env_steps"] for line in run.metrics.read_text().splitlines()] == [
+        50,
+        100,
+    ]
+
+
+def test_only_the_same_signal_a_second_later_is_impatience(monkeypatch: pytest.MonkeyPatch):
+    now_s = [100.0]
+    monkeypatch.setattr("gmijax.control.launcher.time.monotonic", lambda: now_s[0])
+    asked: list[float] = []
+    signals = StopSignals()
+    signals.handle(signal.SIGUSR1)
+    signals.forward_to(lambda: asked.append(now_s[0]))
+    assert asked == [100.0]
+    for later_s, number in ((0, signal.SIGUSR1), (30, signal.SIGTERM), (0.1, signal.SIGTERM)):
+        now_s[0] += later_s
+        signals.handle(number)
+    assert asked == [100.0]
+    now_s[0] += 1.5
+    signals.handle(signal.SIGTERM)
+    assert asked == [100.0, now_s[0]]
