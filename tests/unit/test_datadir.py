@@ -73,7 +73,7 @@ def test_one_job_at_a_time_writes_into_a_folder(tmp_path: Path):
     paths = DataPaths(tmp_path)
     with (
         locked(paths.lock, "output.dir=x"),
-        pytest.raises(ConfigError, match="output.dir=x: another job writes"),
+        pytest.raises(ConfigError, match=r"output\.dir=x: another job writes"),
         locked(paths.lock, "output.dir=x"),
     ):
         pass

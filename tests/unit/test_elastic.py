@@ -30,10 +30,18 @@ def test_a_lost_gpu_shrinks_the_plan():
     assert [share.device for share in shrunk.slices] == [
         gpu(index).uuid for index in (0, 0, 2, 2, 3, 3)
     ]
-    assert (shrunk.num_envs_per_gmi, plan.strategy) == (64, "har")
-    # Algorithm 1: three GPUs with two GMIs each have rings of their own.
-    assert shrunk.strategy == training_plan(config, LEFT).strategy
+    assert (shrunk.num_envs_per_gmi, shrunk.strategy) == (64, "mrr")
     assert notes[0].startswith("GPUs [1] of the job are gone: going on with 3")
+
+
+def test_algorithm_1_decides_again_for_what_is_left():
+    config = compose(
+        *("env=ant", "plan.gpus=2", "plan.gmis_per_gpu=2", "plan.backend=share"),
+        *("run.elastic=true", "reduce.intra=host"),
+    )
+    plan = training_plan(config, FOUR)
+    _, shrunk, _ = with_gpus_left(config, plan, LEFT)
+    assert (plan.strategy, shrunk.strategy) == ("mrr", "mpr")
 
 
 def test_an_uneven_layout_loses_its_row():
