@@ -9,15 +9,11 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from gmijax.errors import CollectiveError
+from gmijax.errors import CudaError
 
 # By name, because it has no type information, and is not installed everywhere.
 runtime: Any = importlib.import_module("cuda.bindings.runtime")
 driver: Any = importlib.import_module("cuda.bindings.driver")
-
-
-class CudaError(CollectiveError):
-    """CUDA refused something; the message has its words."""
 
 
 class CudaQueue:

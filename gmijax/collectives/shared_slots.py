@@ -14,7 +14,6 @@ import numpy.typing as npt
 from gmijax.collectives.device_memory import (
     TICKET_BYTES,
     DeviceMemory,
-    DeviceMemoryUnavailable,
     DeviceQueue,
     NewMemory,
 )
@@ -22,6 +21,7 @@ from gmijax.collectives.host import HostExchange
 from gmijax.collectives.interface import FloatBuffer
 from gmijax.collectives.sums import ordered_sum
 from gmijax.collectives.turns import Turns
+from gmijax.errors import DeviceMemoryUnavailable
 
 NOTE_BYTES = 240
 """What a rank tells the others at each step of the start: a ticket, or why it failed."""

@@ -11,13 +11,12 @@ import numpy as np
 import pytest
 from fake_device_memory import FakeDeviceMemory, WithoutQueue, one_shot_of_one
 
-from gmijax.collectives.device_memory import DeviceMemoryUnavailable
 from gmijax.collectives.host import HostExchange
 from gmijax.collectives.interface import Peers
 from gmijax.collectives.memory import create_exchange
 from gmijax.collectives.one_shot import OneShotReducer
 from gmijax.collectives.shared_slots import SharedSlots
-from gmijax.errors import CollectiveError
+from gmijax.errors import CollectiveError, DeviceMemoryUnavailable
 from gmijax.partition.layout import Layout
 from gmijax.types import Array
 
