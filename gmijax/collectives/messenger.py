@@ -103,9 +103,9 @@ class Messenger:
             self._outboxes[dst] = Outbox(PipeWriter(self._block, dst), self.rank)
         outbox = self._outboxes[dst]
         frames = frames_of(tree, tag, self._frame_bytes, self._stow(dst))
-        if self._device is not None:
-            self._device.sent(dst, outbox.frames + len(frames))
         outbox.post(frames, self._timeout_s)
+        if self._device is not None:
+            self._device.sent(dst, outbox.frames)
 
     def recv(self, src: int, *, tag: int = DATA, timeout_s: float | None = None) -> Any:
         """Returns the next message with this tag from rank `src`; its arrays are the caller's.
