@@ -137,6 +137,12 @@ class Messenger:
             reader.release()
         return inbox.ready[tag].popleft()
 
+    def has_message(self, src: int, *, tag: int = DATA) -> bool:
+        """Whether `recv` would return at once."""
+        with contextlib.suppress(PipeClosed):
+            self._take(src)
+        return bool(self._inbox(src).ready[tag])
+
     def flush(self, timeout_s: float | None = None) -> None:
         """Waits until all that was sent lies in shared memory, where it outlives this process.
 
