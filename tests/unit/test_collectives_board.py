@@ -177,3 +177,14 @@ def test_what_does_not_fit_is_refused(fd) -> None:
         note.publish(np.zeros(2, np.float32))
     with pytest.raises(CollectiveError, match="note 0 has 4 bytes for another process, 8 here"):
         attach_board(fd, [8])
+
+
+@pytest.mark.parametrize("page_bytes", [4096, 65536])
+def test_notes_begin_at_pages_of_this_machine(
+    fd, page_bytes: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("mmap.PAGESIZE", page_bytes)
+    first, second = attach_board(fd, [8, 64])
+    begin = first._line.ctypes.data
+    assert first._places.ctypes.data - begin == page_bytes
+    assert second._places.ctypes.data - begin == 3 * page_bytes

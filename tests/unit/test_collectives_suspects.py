@@ -11,6 +11,7 @@ from concurrent.futures import ThreadPoolExecutor
 import pytest
 
 from gmijax.collectives.memory import ExchangeBlock, attach, create_exchange
+from gmijax.collectives.suspects import Suspects
 from gmijax.collectives.turns import Turns
 from gmijax.errors import CollectiveError, CollectiveTimeout, CudaError, PeerLost
 
@@ -172,3 +173,18 @@ def test_a_copy_that_cuda_refuses_keeps_its_words(
     first, *_ = turns_of(blocks, 5.0, 5.0, 5.0)
     with pytest.raises(CollectiveError, match="rank 0: , step 0: cannot copy"), first.explained():
         raise CudaError("cannot copy")
+
+
+def test_a_process_is_looked_at_after_its_counter(
+    blocks: list[ExchangeBlock], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """That there is a fence: what it does cannot be seen on x86, which keeps the order anyway."""
+    Turns(blocks[1], 1.0, 1.0)
+    pid = int(blocks[1].lines["pid"][1])
+    blocks[1].lines["pid"][1] = 0  # As seen before the counter, by an early read.
+
+    def all_before_is_seen() -> None:
+        blocks[1].lines["pid"][1] = pid
+
+    monkeypatch.setattr("gmijax.collectives.suspects.fence", all_before_is_seen)
+    Suspects(blocks[0], "mean", 1, 1.0).look(lambda: [1], now=True)  # Nobody is gone.
