@@ -165,11 +165,11 @@ class StreamExchange:
         stream: int,
         arguments: list[Buffer],
         results: list[Buffer],
-        attributes: dict[str, int],
+        attributes: list[int],
     ) -> None:
         if self._slots is None or self._queue is None or self._order is None:
             raise RuntimeError("the exchange is closed")
-        identity = attributes["identity"]
+        (identity,) = attributes
         if (peer := self._order.come_to(identity)) is not None:
             raise RuntimeError(
                 f"rank {self.rank} and rank {peer} have come to their exchanges in different "

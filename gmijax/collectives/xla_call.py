@@ -34,10 +34,10 @@ class Buffer(NamedTuple):
     shape: tuple[int, ...]
 
 
-Call = Callable[[int, list[Buffer], list[Buffer], dict[str, int]], None]
+Call = Callable[[int, list[Buffer], list[Buffer], list[int]], None]
 """`(stream, arguments, results, attributes)`: adds work to a stream of the device; 0 on a CPU,
-where the arguments are computed already. Attributes are `np.int64` that the program was traced
-with."""
+where the arguments are computed already. Attributes are the `np.int64` that the program was
+traced with, in the order of their names."""
 
 
 class _Version(ctypes.Structure):
@@ -69,10 +69,6 @@ class _Buffers(ctypes.Structure):
     ]
 
 
-class _Name(ctypes.Structure):
-    _fields_ = [("text", c_void_p), ("length", c_size_t)]
-
-
 class _Scalar(ctypes.Structure):
     _fields_ = [("dtype", c_int), ("value", POINTER(c_int64))]
 
@@ -80,7 +76,7 @@ class _Scalar(ctypes.Structure):
 class _Attributes(ctypes.Structure):
     _fields_ = [
         *(*_HEADER, ("size", c_int64), ("types", POINTER(c_int))),
-        *(("names", POINTER(POINTER(_Name))), ("values", POINTER(POINTER(_Scalar)))),
+        *(("names", c_void_p), ("values", POINTER(POINTER(_Scalar)))),
     ]
 
 
@@ -152,13 +148,13 @@ def _buffers(values: Any) -> list[Buffer]:
     return found
 
 
-def _integers(attributes: Any) -> dict[str, int]:
-    found = {}
+def _integers(attributes: Any) -> list[int]:
+    found = []
     for place in range(attributes.size):
-        name, value = attributes.names[place].contents, attributes.values[place].contents
+        value = attributes.values[place].contents
         if attributes.types[place] != _SCALAR or value.dtype != _INT64:
             raise TypeError(f"attribute {place} is no int64")
-        found[ctypes.string_at(name.text, name.length).decode()] = value.value.contents.value
+        found.append(value.value[0])
     return found
 
 

@@ -13,11 +13,11 @@ from gmijax.collectives.xla_call import Buffer, register
 
 
 def _add_two(
-    stream: int, arguments: list[Buffer], results: list[Buffer], attributes: dict[str, int]
+    stream: int, arguments: list[Buffer], results: list[Buffer], attributes: list[int]
 ) -> None:
     (given,), (added, counted) = arguments, results
     assert stream == 0  # There is none on a CPU.
-    assert attributes == {"least": -(2**40), "is_there": 1}
+    assert attributes == [1, -(2**40)]  # By name.
     if len(given.shape) != 2:
         raise ValueError(f"{len(given.shape)} axes")
     size = int(np.prod(given.shape))
