@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 
 from gmijax.collectives.board import Posted, attach_board, create_board
+from gmijax.collectives.waits import Fence
 from gmijax.errors import CollectiveError, ConfigError
 
 
@@ -36,10 +37,11 @@ def test_a_reader_gets_the_newest_value_once(fd) -> None:
     assert attach_board(fd, [8, 64])[0].read() is None  # Notes are apart.
 
 
-class Interrupted:
+class Interrupted(Fence):
     """A fence of a reader or a writer at which something else happens first, each time."""
 
     def __init__(self, *events: Callable[[], object]) -> None:
+        super().__init__()
         self._events = list(events)
 
     def __call__(self) -> None:
