@@ -28,6 +28,7 @@ import numpy.typing as npt
 from gmijax.collectives.waits import fence
 from gmijax.errors import CollectiveError, ConfigError, GmijaxError, PeerLost, PipeClosed
 from gmijax.processes import ProcessId, own_process
+from gmijax.schema import require_at_least, require_between
 
 MAGIC = 0x50494D47  # "GMIP" in memory on a little-endian machine
 VERSION = 1
@@ -107,12 +108,8 @@ def create_pipes(world_size: int, capacity_bytes: int) -> int:
 
 def require_pipes(world_size: int, capacity_bytes: int) -> None:
     """Raises ConfigError unless a block of such numbers makes sense."""
-    if world_size < 1:
-        raise ConfigError(f"world_size={world_size}: must be at least 1")
-    if not mmap.PAGESIZE <= capacity_bytes <= 2**40:
-        raise ConfigError(
-            f"capacity_bytes={capacity_bytes}: must be between {mmap.PAGESIZE} and {2**40}"
-        )
+    require_at_least("world_size", world_size, 1)
+    require_between("capacity_bytes", capacity_bytes, mmap.PAGESIZE, 2**40)
 
 
 class PipeBlock:
@@ -185,9 +182,9 @@ class PipeBlock:
     def has_left(self, peer: int) -> bool:
         """Whether `peer` was there and closed its block."""
         line = self._lines[peer]
-        has_attached = bool(line["attached"])
+        attached = line["attached"]
         fence()  # See `_take_rank`.
-        return has_attached and not line["pid"]
+        return bool(attached) and not line["pid"]
 
     def process_of(self, peer: int) -> ProcessId | None:
         """The process behind `peer`, running or not; None before it comes and after it leaves."""
@@ -230,9 +227,8 @@ class PipeBlock:
         if (src, dst) not in self._memory:
             offset = self._offset(src, dst)
             ends = np.frombuffer(self._mapping, END, 2, offset)
-            ring = np.frombuffer(
-                self._mapping, np.uint8, self.capacity_bytes, offset + mmap.PAGESIZE
-            )
+            begin = offset + mmap.PAGESIZE
+            ring = np.frombuffer(self._mapping, np.uint8, self.capacity_bytes, begin)
             self._memory[src, dst] = PipeMemory(ends[:1], ends[1:], ring)
         return self._memory[src, dst]
 
