@@ -172,10 +172,7 @@ class PipeBlock:
         return block
 
     def is_gone(self, peer: int) -> bool:
-        """Whether the process of `peer` has ended without leaving, or was killed.
-
-        One that has not attached yet is not gone: it may still start.
-        """
+        """Whether the process of `peer` has ended without leaving; not if it may still come."""
         process = self.process_of(peer)
         return process is not None and not process.is_running()
 
