@@ -7,7 +7,9 @@ GmijaxError
 ├── CollectiveError          an exchange between GMIs failed
 │   ├── PeerLost             the process of another GMI is gone
 │   ├── CollectiveTimeout    another GMI did not arrive in time
-│   └── PipeClosed           the other end of a pipe was closed on purpose
+│   ├── PipeClosed           the other end of a pipe was closed on purpose
+│   ├── CudaError            CUDA refused something that an exchange needs
+│   └── DeviceMemoryUnavailable  GPU memory that GMIs share cannot be had; on all of them alike
 ├── ParameterMismatch        GMIs that must hold equal parameters do not
 ├── SelfCheckFailed          matrix products are wrong on the share of a GMI
 ├── NonFiniteError           a loss, gradient or simulation became NaN or infinite
@@ -117,6 +119,14 @@ class PipeClosed(CollectiveError):
     def __init__(self, rank: int, peer: int, operation: str) -> None:
         super().__init__(f"rank {rank}: peer {peer} has closed its pipe, in {operation}")
         self.rank, self.peer, self.operation = rank, peer, operation
+
+
+class CudaError(CollectiveError):
+    """CUDA refused something that an exchange needs; the message has its words."""
+
+
+class DeviceMemoryUnavailable(CollectiveError):
+    """GPU memory that GMIs share cannot be had here; raised on all ranks of the job alike."""
 
 
 class ParameterMismatch(GmijaxError):

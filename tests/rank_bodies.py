@@ -18,6 +18,7 @@ from gmijax.collectives.interface import (
     Reducer,
     stays_on_device,
 )
+from gmijax.errors import CollectiveError
 from gmijax.types import Array
 
 Options = dict[str, Any]
@@ -98,6 +99,36 @@ def check_steps(reducer: Reducer, options: Options) -> Options:
             np.testing.assert_allclose(mean, middle + call, rtol=1e-5)
     program.wait()
     return {"steps_digest": hashlib.sha256(np.asarray(shared).tobytes()).hexdigest()}
+
+
+def step_in_different_orders(reducer: Reducer, options: Options) -> Options:
+    """The last rank comes to the two exchanges of a step in the opposite order."""
+    import jax
+    import jax.numpy as jnp
+
+    assert stays_on_device(reducer)
+
+    def step(peers: Peers, _: Any, shared: Array, own: Array) -> tuple[Array, Array, Array]:
+        if reducer.rank < reducer.world_size - 1:
+            mean = peers.mean(own)
+            gathered = peers.gather(own + 0 * mean[0])
+        else:
+            gathered = peers.gather(own)
+            mean = peers.mean(own + 0 * gathered[0, 0])
+        return shared + mean, own + gathered[0], mean[0]
+
+    program = reducer.spmd(step)
+    assert program is not None
+    shared, own = (jnp.full(options["num_floats"], 1.0 + reducer.rank) for _ in range(2))
+    program.trace((), shared, own)
+    program.compile()
+    try:
+        for _ in range(3):
+            shared, own, _ = program(shared, own)
+        program.wait()
+    except jax.errors.JaxRuntimeError as error:  # As a GMI ends, with the error's words.
+        raise CollectiveError(str(error).splitlines()[0]) from None
+    return {"mean": float(shared[0])}
 
 
 def check_training(reducer: Reducer, options: Options) -> Options:
@@ -237,6 +268,7 @@ BODIES: dict[str, Callable[[Reducer, Options], Options]] = {
     body.__name__: body
     for body in (
         *(check_all, check_means, check_order, check_steps, check_training),
+        step_in_different_orders,
         *(call_forever, step_forever, call_once, gather_once, close_at_once),
     )
 }

@@ -151,7 +151,7 @@ class Disagree(gmijax.Role):
         with pytest.raises(CollectiveError) as caught:
             self.collective(np.ones(2 + self.rank, np.float32))
         # What GMI 1 sends for the first part is as long as all that GMI 0 has.
-        with pytest.raises(CollectiveError, match=r"reduces .* numbers of float32, rank"):
+        with pytest.raises(CollectiveError, match=r"the sum of .* numbers of float32, rank"):
             self.collective(np.ones(4096 * (1 + self.rank), np.float32), "sum")
         return str(caught.value)
 

@@ -1,9 +1,10 @@
 """A board of notes in shared memory: one writer each, any number of readers, nobody ever waits.
 
 A note holds the newest value only. Its writer has two places and writes them in turn, so that a
-reader that copies one is disturbed only if the writer publishes twice meanwhile; a checksum tells
-it so, and it looks again, or leaves it for later. Made for weights: trainers publish them when
-they have new ones, agents look between two unrolls.
+reader that copies one is disturbed only if the writer begins to publish for the second time
+meanwhile; a counter of what was begun tells it so, and it looks again, or leaves it for later (a
+seqlock with two places). Made for weights: trainers publish them when they have new ones, agents
+look between two unrolls. On the order of memory accesses: `gmijax.collectives.waits.Fence`.
 
     fd = create_board()                              # the controller
     notes = attach_board(fd, sizes_bytes=[64, 4096])   # every process, with the same sizes
@@ -18,7 +19,6 @@ from __future__ import annotations
 
 import mmap
 import os
-import zlib
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
@@ -32,13 +32,12 @@ LINE = np.dtype(
     [
         ("size", np.uint64),  # 0 until somebody attaches
         ("count", np.uint64),  # how often the note was published
+        ("begun", np.uint64),  # how often that was begun: `count`, or one more
         ("tag", np.uint64, (2,)),
         ("length", np.uint64, (2,)),
-        ("checksum", np.uint32, (2,)),
         ("pad", np.uint64, (1,)),
     ]
 )
-PAGE_BYTES = 4096
 
 _LOOKS = 3
 
@@ -66,7 +65,7 @@ class Note:
         self._fence = Fence()
 
     def publish(self, values: npt.NDArray[Any], tag: int = 0) -> None:
-        """Replaces the value; one process only may do so. The checksum costs about 1 ms per MB.
+        """Replaces the value; one process only may do so. Costs a copy.
 
         Raises:
           CollectiveError: more bytes than the note has room for.
@@ -78,10 +77,11 @@ class Note:
             )
         count = int(self._line["count"][0]) + 1
         place = count % 2
+        self._line["begun"][0] = count
+        self._fence()  # Who sees anything of what follows sees that it was begun.
         self._places[place, : data.size] = data
         self._line["tag"][0, place] = tag
         self._line["length"][0, place] = data.size
-        self._line["checksum"][0, place] = _checksum(data, tag)
         self._fence()
         self._line["count"][0] = count
 
@@ -98,10 +98,11 @@ class Note:
             self._fence()
             place = count % 2
             length = min(int(self._line["length"][0, place]), self._places.shape[1])
-            tag, checksum = (int(self._line[name][0, place]) for name in ("tag", "checksum"))
+            tag = int(self._line["tag"][0, place])
             values = self._places[place, :length].copy()
             self._fence()
-            if _checksum(values, tag) == checksum and int(self._line["count"][0]) - count < 2:
+            # The next publication goes into the other place.
+            if int(self._line["begun"][0]) - count < 2:
                 return Posted(count, tag, values)
         return None
 
@@ -127,8 +128,8 @@ def attach_board(fd: int, sizes_bytes: Sequence[int]) -> list[Note]:
     """
     if not sizes_bytes or min(sizes_bytes) < 1:
         raise ConfigError(f"sizes_bytes={list(sizes_bytes)}: every note needs at least 1 byte")
-    rooms = [_round_up(size, PAGE_BYTES) for size in sizes_bytes]
-    first = _round_up(len(rooms) * LINE.itemsize, PAGE_BYTES)
+    rooms = [_round_up(size, mmap.PAGESIZE) for size in sizes_bytes]
+    first = _round_up(len(rooms) * LINE.itemsize, mmap.PAGESIZE)
     total = first + 2 * sum(rooms)
     try:
         # Unlike ftruncate this never shrinks the file under a process that has mapped more.
@@ -151,11 +152,6 @@ def attach_board(fd: int, sizes_bytes: Sequence[int]) -> list[Note]:
         notes.append(Note(line, places[:, : sizes_bytes[index]]))
         offset += 2 * room
     return notes
-
-
-def _checksum(values: npt.NDArray[np.uint8], tag: int) -> int:
-    """Of the bytes and the tag, which a reader could otherwise take from two publications."""
-    return zlib.crc32(values.data, tag & 0xFFFFFFFF)
 
 
 def _round_up(value: int, multiple: int) -> int:

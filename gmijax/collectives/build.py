@@ -7,17 +7,13 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from gmijax.collectives.device_memory import (
-    DeviceMemoryUnavailable,
-    NewMemory,
-    cuda_memory,
-)
+from gmijax.collectives.device_memory import NewMemory, cuda_memory
 from gmijax.collectives.host import HostExchange
 from gmijax.collectives.interface import Reducer
 from gmijax.collectives.intra import INTRA, IntraExchange
 from gmijax.collectives.mpr import MprReducer
 from gmijax.collectives.solo import SoloReducer
-from gmijax.errors import ConfigError
+from gmijax.errors import ConfigError, DeviceMemoryUnavailable
 from gmijax.partition.layout import Layout
 from gmijax.partition.reduction import needs_ring, require_strategy
 

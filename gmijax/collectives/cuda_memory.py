@@ -10,7 +10,8 @@ import jax.numpy as jnp
 import numpy as np
 import numpy.typing as npt
 
-from gmijax.collectives.cuda_queue import CudaError, CudaQueue, checked, runtime
+from gmijax.collectives.cuda_queue import CudaQueue, checked, runtime
+from gmijax.errors import CudaError
 
 HANDLE_BYTES = 64
 GRANULE_BYTES = 2 << 20

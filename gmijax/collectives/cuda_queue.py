@@ -9,15 +9,11 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from gmijax.errors import CollectiveError
+from gmijax.errors import CudaError
 
 # By name, because it has no type information, and is not installed everywhere.
 runtime: Any = importlib.import_module("cuda.bindings.runtime")
 driver: Any = importlib.import_module("cuda.bindings.driver")
-
-
-class CudaError(CollectiveError):
-    """CUDA refused something; the message has its words."""
 
 
 class CudaQueue:
@@ -33,6 +29,7 @@ class CudaQueue:
 
     def __init__(self, flags: npt.NDArray[np.uint32]) -> None:
         self._host, self._line_bytes = flags.ctypes.data, flags.strides[0]
+        self._wait = _wait_flags()
         mapped = runtime.cudaHostRegisterMapped | runtime.cudaHostRegisterPortable
         checked(
             runtime.cudaHostRegister(self._host, flags.nbytes, mapped),
@@ -44,7 +41,6 @@ class CudaQueue:
         (address,) = checked(mapping, "see flags from the GPU")
         self._flags = int(address)
         self._kind = runtime.cudaMemcpyKind.cudaMemcpyDeviceToDevice
-        self._at_least = driver.CUstreamWaitValue_flags.CU_STREAM_WAIT_VALUE_GEQ.value
         self._clocks: deque[tuple[Any, Any]] = deque()  # Started and stopped, not yet read.
         self._idle_clocks: list[tuple[Any, Any]] = []
         self._clock: tuple[Any, Any] | None = None
@@ -73,7 +69,7 @@ class CudaQueue:
     def wait_for_flag(self, stream: int, place: int, count: int) -> None:
         """See `DeviceQueue`."""
         flag = self._flags + place * self._line_bytes
-        _queued(driver.cuStreamWaitValue32(stream, flag, count, self._at_least), "wait for")
+        _queued(driver.cuStreamWaitValue32(stream, flag, count, self._wait), "wait for")
 
     def start_clock(self, stream: int) -> None:
         """See `DeviceQueue`."""
@@ -101,6 +97,16 @@ class CudaQueue:
         if self._host:
             runtime.cudaHostUnregister(self._host)
             self._host = 0
+
+
+def _wait_flags() -> int:
+    """How to wait for a flag that says that other GPUs have written into memory of this one."""
+    can_flush = runtime.cudaDeviceAttr.cudaDevAttrCanFlushRemoteWrites
+    (is_able,) = checked(runtime.cudaDeviceGetAttribute(can_flush, 0), "ask what the GPU can do")
+    flags = driver.CUstreamWaitValue_flags
+    wait = int(flags.CU_STREAM_WAIT_VALUE_GEQ.value)
+    # What came over PCIe before the flag did may yet be on its way to who reads it here.
+    return wait | int(flags.CU_STREAM_WAIT_VALUE_FLUSH.value) if is_able else wait
 
 
 def checked(result: tuple[Any, ...], wish: str) -> tuple[Any, ...]:

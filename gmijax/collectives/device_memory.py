@@ -8,17 +8,11 @@ from typing import TYPE_CHECKING, Protocol, TypeAlias
 import numpy as np
 import numpy.typing as npt
 
-from gmijax.errors import CollectiveError
-
 if TYPE_CHECKING:
     import jax
 
 TICKET_BYTES = 64
 """Room for what another process needs to open a block."""
-
-
-class DeviceMemoryUnavailable(CollectiveError):
-    """It cannot be had here; raised on all ranks of the job alike."""
 
 
 class DeviceQueue(Protocol):

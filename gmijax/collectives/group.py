@@ -11,7 +11,7 @@ This takes any data and any group. For the mean of many float32 over all ranks t
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
-from typing import Any, Final, Literal
+from typing import Any, Final, Literal, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -20,7 +20,7 @@ from gmijax.collectives.interface import FloatBuffer, Reducer
 from gmijax.collectives.mailboxes import COLLECTIVE
 from gmijax.collectives.messenger import Messenger
 from gmijax.collectives.trees import as_bytes, flatten, unflatten
-from gmijax.errors import CollectiveError, ConfigError
+from gmijax.errors import CollectiveError, CollectiveTimeout, ConfigError
 
 Operation = Literal["mean", "sum"]
 
@@ -28,6 +28,17 @@ AT_ONCE_BYTES: Final = 16384
 """Up to this size numbers go to everybody at once."""
 
 _OPERATIONS: Final = ("mean", "sum")
+
+
+class _Call(NamedTuple):
+    """What a member asks for; it goes with all that it sends."""
+
+    op: str
+    size: int
+    dtype: str
+
+    def __str__(self) -> str:
+        return f"the {self.op} of {self.size} numbers of {self.dtype}"
 
 
 class GroupReducer:
@@ -62,7 +73,8 @@ class GroupReducer:
 
         Raises:
           ConfigError: an unknown operation, or a group without this rank.
-          CollectiveError: members come with different data, or the mean of integers is wanted.
+          CollectiveError: members come with different data or operations (names both), or the
+            mean of integers is wanted.
           PeerLost, CollectiveTimeout: a member is gone, or did not come in time; names it.
         """
         group = sorted({int(member) for member in members})
@@ -93,9 +105,15 @@ class GroupReducer:
         return _reduce(self._messenger, group, flat, op)
 
     def _mean_of_all(self, flat: FloatBuffer) -> FloatBuffer:
-        if self._reducer is None:
-            self._reducer = self._build(flat.size)
-        return self._reducer.mean(flat).copy()  # A view of memory that is used again.
+        call = _Call("mean", flat.size, flat.dtype.name)
+        _require_no_other(self._messenger, call)
+        try:
+            if self._reducer is None:
+                self._reducer = self._build(flat.size)
+            return self._reducer.mean(flat).copy()  # A view of memory that is used again.
+        except CollectiveTimeout:
+            _require_no_other(self._messenger, call)
+            raise
 
 
 def _check(messenger: Messenger, members: Sequence[int], op: str) -> None:
@@ -115,44 +133,61 @@ def _reduce(
     messenger: Messenger, members: Sequence[int], flat: npt.NDArray[Any], op: Operation
 ) -> npt.NDArray[Any]:
     """The mean or sum of a flat array [n] over `members`."""
-    wide = _summing_dtype(flat.dtype)
+    call, wide = _Call(op, flat.size, flat.dtype.name), _summing_dtype(flat.dtype)
     allowed = np.inexact if op == "mean" else np.number
     if not np.issubdtype(wide, allowed):
         what = "real or complex numbers" if op == "mean" else "numbers"
         raise CollectiveError(f"rank {messenger.rank}: {op} of {flat.dtype}; it takes {what}")
     own = flat.astype(wide, copy=False)
     if own.nbytes <= AT_ONCE_BYTES:
-        result = _sum(_exchange(messenger, own.size, dict.fromkeys(members, own)))
+        result = _sum(_exchange(messenger, call, dict.fromkeys(members, own)))
     else:
         bounds = [place * own.size // len(members) for place in range(len(members) + 1)]
         parts = {m: own[bounds[p] : bounds[p + 1]] for p, m in enumerate(members)}
-        part = _sum(_exchange(messenger, own.size, parts))
-        result = np.concatenate(_exchange(messenger, own.size, dict.fromkeys(members, part)))
+        part = _sum(_exchange(messenger, call, parts))
+        result = np.concatenate(_exchange(messenger, call, dict.fromkeys(members, part)))
     if op == "mean":
-        result /= len(members)
+        result *= np.finfo(wide).dtype.type(1.0 / len(members))  # As `Reducer.mean` has it.
     return result.astype(flat.dtype, copy=False)
 
 
 def _exchange(
-    messenger: Messenger, size: int, parts: dict[int, npt.NDArray[Any]]
+    messenger: Messenger, call: _Call, parts: dict[int, npt.NDArray[Any]]
 ) -> list[npt.NDArray[Any]]:
-    """Sends every member its part of `size` numbers; returns what they sent, in order of rank."""
+    """Sends every member its part of what is reduced; returns theirs, in order of rank."""
     own = parts[messenger.rank]
     for member, part in parts.items():
         if member != messenger.rank:
-            messenger.send((size, part), member, tag=COLLECTIVE)
-    got = [
-        (size, own) if member == messenger.rank else messenger.recv(member, tag=COLLECTIVE)
-        for member in parts
-    ]
-    for member, (their_size, part) in zip(parts, got, strict=True):
-        # The size of all: parts of data of different lengths may well be equally long.
-        if (their_size, part.dtype) != (size, own.dtype):
-            raise CollectiveError(
-                f"rank {messenger.rank} reduces {size} numbers of {own.dtype}, "
-                f"rank {member} {their_size} of {part.dtype}"
-            )
-    return [part for _, part in got]
+            messenger.send((*call, part), member, tag=COLLECTIVE)
+    got = []
+    for member in parts:
+        if member == messenger.rank:
+            got.append(own)
+            continue
+        *theirs, part = messenger.recv(member, tag=COLLECTIVE)
+        _require_same(messenger.rank, call, member, _Call(*theirs))
+        got.append(part)
+    return got
+
+
+def _require_no_other(messenger: Messenger, call: _Call) -> None:
+    """Raises CollectiveError if a rank has come with a call that goes by messages.
+
+    A mean by the reducer of all sends none, so each would wait where the other does not look. It
+    is told what this rank asks for, and all such ranks raise the same.
+    """
+    others = [rank for rank in range(messenger.world_size) if rank != messenger.rank]
+    if came := [other for other in others if messenger.has_message(other, tag=COLLECTIVE)]:
+        for other in came:
+            messenger.send((*call, None), other, tag=COLLECTIVE)
+        *theirs, _ = messenger.recv(came[0], tag=COLLECTIVE)
+        _require_same(messenger.rank, call, came[0], _Call(*theirs))
+
+
+def _require_same(rank: int, call: _Call, other: int, theirs: _Call) -> None:
+    # The size of all: parts of data of different lengths may well be equally long.
+    if theirs != call:
+        raise CollectiveError(f"rank {rank} asks for {call}, rank {other} for {theirs}")
 
 
 def _sum(parts: Sequence[npt.NDArray[Any]]) -> npt.NDArray[Any]:

@@ -7,7 +7,7 @@ import numpy.typing as npt
 
 from gmijax.collectives.buffers import require_gather_input, require_mean_input
 from gmijax.collectives.interface import FloatBuffer
-from gmijax.collectives.memory import ExchangeBlock, attach
+from gmijax.collectives.memory import ExchangeBlock, attach, process_of
 from gmijax.collectives.turns import Turns
 from gmijax.errors import CollectiveError
 
@@ -100,6 +100,10 @@ class HostExchange:
         gathered = self.all_gather(values)
         self._turns.restart()
         return gathered
+
+    def is_gone(self, peer: int) -> bool:
+        """Whether an attached peer has closed its exchange, or its process has ended."""
+        return not process_of(self._open_block("is_gone"), peer).is_running()
 
     def close(self) -> None:
         """Gives the memory back, once no result is in use; calling it twice is fine."""

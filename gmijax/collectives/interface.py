@@ -37,7 +37,9 @@ class Reducer(Protocol):
     def mean(self, buffer: FloatBuffer) -> FloatBuffer:
         """Returns the mean over ranks of `buffer` [P] float32.
 
-        The result may be a read-only view that is valid until the next call on this rank.
+        It is the sum, in an order of the strategy's, times 1 / K, all in float32. (Not divided
+        by K: XLA makes such a product of a division by a constant.) The result may be a
+        read-only view that is valid until the next call on this rank.
 
         Raises:
           PeerLost: the process of another rank is gone.

@@ -57,7 +57,7 @@ class Outbox:
     """What is on its way to one rank.
 
     Attributes:
-      frames: posted so far.
+      frames: that are in the pipe, or wait for it.
     """
 
     def __init__(self, writer: PipeWriter, rank: int) -> None:
@@ -72,22 +72,26 @@ class Outbox:
         self._thread: threading.Thread | None = None
 
     def post(self, frames: Sequence[Frame], timeout_s: float) -> None:
-        """Puts the frames into the pipe, or copies of them behind those that wait."""
+        """Puts the frames into the pipe, or copies of them behind those that wait.
+
+        All of them or none: it only waits where others do, and then has put nothing yet.
+        """
         left = deque(frames)
         self._posts += 1
-        self.frames += len(frames)
         with self._changed:
             self._raise_error()
             # A frame that the thread is busy with is still among those that wait.
             while left and not self._frames and self._writer.try_put(left[0]):
                 left.popleft()
             if not left:
+                self.frames += len(frames)
                 return
             if not self._changed.wait_for(self._has_room, timeout_s):
                 raise CollectiveTimeout(
                     self._rank, (self._writer.dst,), "send", self._posts, timeout_s
                 )
             self._raise_error()
+            self.frames += len(frames)
             for frame in left:
                 copied = np.concatenate(frame)
                 self._frames.append([copied])

@@ -13,7 +13,7 @@ This file is the only one that knows the wire format (K ranks, P floats, native 
 | 64 K | [2, K, MAX_GATHER_FLOATS] float32, values to gather, by parity of the step |
 | next page | [K, P] float32, one slot a rank, rows padded to whole cache lines |
 | after the slots | [P] float32, the result |
-| next page | K lines of 64 bytes: how often a rank's device has written its slots, [0] of each |
+| next page | K lines of 64 bytes, uint32: `ExchangeBlock.flags` |
 """
 
 from __future__ import annotations
@@ -32,7 +32,6 @@ MAGIC = 0x58494D47  # "GMIX" in memory on a little-endian machine
 VERSION = 3
 MAX_GATHER_FLOATS = 16384  # 64 KiB a rank
 FLOATS_PER_LINE = 16
-PAGE_BYTES = 4096
 
 LINE = np.dtype(
     [
@@ -69,11 +68,11 @@ class Geometry(NamedTuple):
         """The geometry for K ranks and P floats."""
         row_floats = _round_up(max(num_floats, 1), FLOATS_PER_LINE)
         gathered = world_size * LINE.itemsize
-        slots = _round_up(gathered + 2 * world_size * MAX_GATHER_FLOATS * 4, PAGE_BYTES)
+        slots = _round_up(gathered + 2 * world_size * MAX_GATHER_FLOATS * 4, mmap.PAGESIZE)
         result = slots + world_size * row_floats * 4
         # Whole pages, because a GPU maps pages.
-        flags = _round_up(result + row_floats * 4, PAGE_BYTES)
-        size = flags + _round_up(world_size * LINE.itemsize, PAGE_BYTES)
+        flags = _round_up(result + row_floats * 4, mmap.PAGESIZE)
+        size = flags + _round_up(world_size * LINE.itemsize, mmap.PAGESIZE)
         return cls(gathered, slots, row_floats, result, flags, size)
 
 
@@ -86,8 +85,9 @@ class ExchangeBlock(NamedTuple):
       gathered: [2, K, MAX_GATHER_FLOATS] float32.
       slots: [K, P] float32.
       result: [P] float32.
-      flags: [whole pages, FLOATS_PER_LINE] uint32, of which [rank, 0] counts what
-        the device of a rank has written.
+      flags: [whole pages, FLOATS_PER_LINE] uint32, of which [rank, 0] counts how often the device
+        of a rank has written its slots; 1 says that the rank is through with slots in device
+        memory, and 2 to 3 which exchanges it has come to (`stream_exchange.Order`).
     """
 
     rank: int
@@ -101,7 +101,7 @@ class ExchangeBlock(NamedTuple):
 def create_exchange() -> int:
     """Makes an empty block and returns its descriptor, for the controller.
 
-    Pass the descriptor to every GMI (`Job.exchange_fd` of the supervisor), then close it.
+    Pass the descriptor to every GMI (`ENV_EXCHANGE_FD` names it there), then close it.
     """
     fd = os.memfd_create("gmijax-exchange", os.MFD_CLOEXEC)
     # Another user who may look into /proc/<pid>/fd must not read or change gradients.

@@ -103,9 +103,9 @@ class Messenger:
             self._outboxes[dst] = Outbox(PipeWriter(self._block, dst), self.rank)
         outbox = self._outboxes[dst]
         frames = frames_of(tree, tag, self._frame_bytes, self._stow(dst))
-        if self._device is not None:
-            self._device.sent(dst, outbox.frames + len(frames))
         outbox.post(frames, self._timeout_s)
+        if self._device is not None:
+            self._device.sent(dst, outbox.frames)
 
     def recv(self, src: int, *, tag: int = DATA, timeout_s: float | None = None) -> Any:
         """Returns the next message with this tag from rank `src`; its arrays are the caller's.
@@ -136,6 +136,12 @@ class Messenger:
             # What stayed on the GPU is copied by now: its place is free with the frame.
             reader.release()
         return inbox.ready[tag].popleft()
+
+    def has_message(self, src: int, *, tag: int = DATA) -> bool:
+        """Whether `recv` would return at once."""
+        with contextlib.suppress(PipeClosed):
+            self._take(src)
+        return bool(self._inbox(src).ready[tag])
 
     def flush(self, timeout_s: float | None = None) -> None:
         """Waits until all that was sent lies in shared memory, where it outlives this process.

@@ -13,7 +13,6 @@ import numpy as np
 
 from gmijax.collectives.buffers import require_device_buffer, require_mean_input
 from gmijax.collectives.courier import Courier
-from gmijax.collectives.device_memory import DeviceMemoryUnavailable
 from gmijax.collectives.host import HostExchange
 from gmijax.collectives.interface import DeviceMean, FloatBuffer, Step, TracedStep
 from gmijax.collectives.memory import ExchangeBlock
@@ -22,7 +21,7 @@ from gmijax.collectives.stream_exchange import StreamExchange
 from gmijax.collectives.stream_step import StreamStep
 from gmijax.collectives.together import Together, WatchedStep
 from gmijax.collectives.turns import Turns
-from gmijax.errors import CollectiveError
+from gmijax.errors import CollectiveError, DeviceMemoryUnavailable
 
 T = TypeVar("T")
 

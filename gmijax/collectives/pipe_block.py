@@ -25,12 +25,13 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
+from gmijax.collectives.waits import fence
 from gmijax.errors import CollectiveError, ConfigError, GmijaxError, PeerLost, PipeClosed
 from gmijax.processes import ProcessId, own_process
+from gmijax.schema import require_at_least, require_between
 
 MAGIC = 0x50494D47  # "GMIP" in memory on a little-endian machine
 VERSION = 1
-PAGE_BYTES = 4096
 LINE_BYTES = 64
 
 HEAD = np.dtype(
@@ -107,12 +108,8 @@ def create_pipes(world_size: int, capacity_bytes: int) -> int:
 
 def require_pipes(world_size: int, capacity_bytes: int) -> None:
     """Raises ConfigError unless a block of such numbers makes sense."""
-    if world_size < 1:
-        raise ConfigError(f"world_size={world_size}: must be at least 1")
-    if not PAGE_BYTES <= capacity_bytes <= 2**40:
-        raise ConfigError(
-            f"capacity_bytes={capacity_bytes}: must be between {PAGE_BYTES} and {2**40}"
-        )
+    require_at_least("world_size", world_size, 1)
+    require_between("capacity_bytes", capacity_bytes, mmap.PAGESIZE, 2**40)
 
 
 class PipeBlock:
@@ -175,22 +172,22 @@ class PipeBlock:
         return block
 
     def is_gone(self, peer: int) -> bool:
-        """Whether the process of `peer` has ended without leaving, or was killed.
-
-        One that has not attached yet is not gone: it may still start.
-        """
+        """Whether the process of `peer` has ended without leaving; not if it may still come."""
         process = self.process_of(peer)
         return process is not None and not process.is_running()
 
     def has_left(self, peer: int) -> bool:
         """Whether `peer` was there and closed its block."""
         line = self._lines[peer]
-        return bool(line["attached"]) and not line["pid"]
+        attached = line["attached"]
+        fence()  # See `_take_rank`.
+        return bool(attached) and not line["pid"]
 
     def process_of(self, peer: int) -> ProcessId | None:
         """The process behind `peer`, running or not; None before it comes and after it leaves."""
         line = self._lines[peer]
         pid = int(line["pid"])
+        fence()  # See `_take_rank`.
         return ProcessId(pid, int(line["start_ticks"])) if pid else None
 
     def why_lost(self, peers: tuple[int, ...], operation: str, step: int) -> GmijaxError | None:
@@ -227,7 +224,8 @@ class PipeBlock:
         if (src, dst) not in self._memory:
             offset = self._offset(src, dst)
             ends = np.frombuffer(self._mapping, END, 2, offset)
-            ring = np.frombuffer(self._mapping, np.uint8, self.capacity_bytes, offset + PAGE_BYTES)
+            begin = offset + mmap.PAGESIZE
+            ring = np.frombuffer(self._mapping, np.uint8, self.capacity_bytes, begin)
             self._memory[src, dst] = PipeMemory(ends[:1], ends[1:], ring)
         return self._memory[src, dst]
 
@@ -237,7 +235,7 @@ class PipeBlock:
         Raises:
           CollectiveError: there is not enough.
         """
-        size = PAGE_BYTES + self.capacity_bytes
+        size = mmap.PAGESIZE + self.capacity_bytes
         try:
             # A lack of memory shows here and not at the first touch, which would kill us.
             os.posix_fallocate(self._fd, self._offset(src, dst), size)
@@ -260,7 +258,7 @@ class PipeBlock:
             if not 0 <= rank < self.world_size:
                 raise ConfigError(f"rank={rank}: must be 0 to {self.world_size - 1}")
         place = src * self.world_size + dst
-        return _lines_end(self.world_size) + place * (self.capacity_bytes + PAGE_BYTES)
+        return _lines_end(self.world_size) + place * (self.capacity_bytes + mmap.PAGESIZE)
 
     def _take_rank(self) -> None:
         line = self._lines[self.rank]
@@ -268,9 +266,12 @@ class PipeBlock:
         if holder is not None and holder.is_running():
             raise CollectiveError(f"rank {self.rank} is taken already by process {holder.pid}")
         process = own_process()
-        # The count last: with a count and no pid, this rank would seem to have left.
+        # A pid with another start would seem to be a process that is gone, and a count with no
+        # pid one that has left. Who looks reads them in the opposite order.
         line["start_ticks"] = process.start_ticks
+        fence()
         line["pid"] = process.pid
+        fence()
         line["attached"] += 1
 
 
@@ -278,8 +279,10 @@ def progress_of(end: npt.NDArray[np.void]) -> Progress:
     """What one end of a pipe says of itself, read by whomever while it may change."""
     while True:
         position = end["position"].item(0)
-        for record in end["record"][0].tolist():
-            # Its record is not written again before the position has moved.
+        fence()  # Its record was written before it.
+        records = end["record"][0].tolist()
+        fence()  # And is not written again before it has moved.
+        for record in records:
             if record[0] == position == end["position"].item(0):
                 return Progress(*record)
 
@@ -289,9 +292,9 @@ def _lines_end(world_size: int) -> int:
 
 
 def _size(world_size: int, capacity_bytes: int) -> int:
-    pipe = _round_up(capacity_bytes) + PAGE_BYTES
+    pipe = _round_up(capacity_bytes) + mmap.PAGESIZE
     return _lines_end(world_size) + world_size**2 * pipe
 
 
 def _round_up(num_bytes: int) -> int:
-    return -(-num_bytes // PAGE_BYTES) * PAGE_BYTES
+    return -(-num_bytes // mmap.PAGESIZE) * mmap.PAGESIZE

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import sys
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 
@@ -14,7 +15,6 @@ import numpy.typing as npt
 from gmijax.collectives.device_memory import (
     TICKET_BYTES,
     DeviceMemory,
-    DeviceMemoryUnavailable,
     DeviceQueue,
     NewMemory,
 )
@@ -22,9 +22,14 @@ from gmijax.collectives.host import HostExchange
 from gmijax.collectives.interface import FloatBuffer
 from gmijax.collectives.sums import ordered_sum
 from gmijax.collectives.turns import Turns
+from gmijax.collectives.waits import fence, wait_until
+from gmijax.errors import DeviceMemoryUnavailable, PeerLost
 
 NOTE_BYTES = 240
 """What a rank tells the others at each step of the start: a ticket, or why it failed."""
+
+CLOSE_S = 10.0
+"""How long an owner waits for others that still use its memory; longer than a last step takes."""
 
 FLOATS_PER_ROW_UNIT = 64
 """Slots begin at multiples of 256 bytes, as allocations of jax do."""
@@ -83,6 +88,8 @@ class SharedSlots:
         self._slots: list[jax.Array] = []
         self._result: jax.Array | None = None
         self._num_writes = 0
+        self._host: HostExchange | None = host
+        host.flags[host.rank, 1] = 0
         # An output of the program that read the block last; the caller owns the others.
         self._read: jax.Array | None = None
         self._sum = jax.jit(functools.partial(_sum, num_floats), static_argnums=1)
@@ -167,13 +174,34 @@ class SharedSlots:
         self._num_writes = 0
 
     def close(self) -> None:
-        """Gives the mappings back; calling it twice is fine."""
+        """Gives the mappings back; calling it twice is fine.
+
+        A block goes with its owner's process, so an owner first waits for all members to be
+        through with it; not if an error is what ends it, or `CLOSE_S` are over.
+        """
         with suppress(jax.errors.JaxRuntimeError):  # Why the job fails is known already.
             self._finish_reading()
         self._slots, self._result = [], None
+        if self._host is not None:
+            fence()
+            self._host.flags[self._rank, 1] = 1
+            if self._is_owner and sys.exception() is None:
+                self._wait_for_members(self._host)
+            self._host = None
         for memory in self._memories:
             memory.close()
         self._memories = []
+
+    def _wait_for_members(self, host: HostExchange) -> None:
+        def late() -> list[int]:
+            return [member for member in self._members if not host.flags[member, 1]]
+
+        def lost() -> PeerLost | None:
+            gone = [member for member in late() if host.is_gone(member)]
+            return PeerLost(self._rank, gone[0], "close", 0) if gone else None
+
+        with suppress(PeerLost):
+            wait_until(lambda: None if late() else True, lost, CLOSE_S)
 
     def _make(self, new_memory: NewMemory, num_bytes: int) -> bytes:
         for _ in self._owners:  # One by one, so that those before one that fails are closed.

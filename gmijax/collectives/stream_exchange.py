@@ -7,6 +7,7 @@ of what they wrote lie on the program's stream, between what it computes before 
 from __future__ import annotations
 
 import itertools
+import zlib
 from typing import Any
 
 import jax
@@ -18,12 +19,48 @@ from gmijax.collectives.device_memory import DeviceQueue
 from gmijax.collectives.host import HostExchange
 from gmijax.collectives.shared_slots import SharedSlots, agreed
 from gmijax.collectives.together import Together
+from gmijax.collectives.waits import Fence
 from gmijax.collectives.xla_call import Buffer, register
 from gmijax.errors import CollectiveError
 
 _FREE = 2**30
 _WISH = "exchange on the device's stream"
 _serial = itertools.count()
+
+
+class Order:
+    """Whether ranks come to the same exchanges in the same order; without waiting.
+
+    Flags only count. Each rank keeps a word beside its own: how many exchanges it has come to,
+    and a checksum of which ones these were, in their order. It looks at the words of those that
+    have come as far. Checksums that differ once go on to do so, and who comes last to the end of
+    a step finds all others there: so one of two ranks sees it before the next step, whoever is
+    ahead.
+
+    Args:
+      flags: [pages, line] uint32, see `ExchangeBlock`; the second 64 bits of each line are used.
+      rank: this one.
+      world_size: K.
+    """
+
+    def __init__(self, flags: npt.NDArray[np.uint32], rank: int, world_size: int) -> None:
+        self._words = flags.view(np.uint64)[:world_size, 1]
+        self._rank = rank
+        self._fence = Fence()
+        self._count = self._checksum = 0
+        self._words[rank] = 0
+
+    def come_to(self, identity: int) -> int | None:
+        """Comes to the next exchange; a rank that has come to another one instead, if any."""
+        self._count += 1
+        self._checksum = zlib.crc32(identity.to_bytes(8, "little"), self._checksum)
+        own = (self._count & 0xFFFFFFFF) << 32 | self._checksum
+        self._words[self._rank] = own
+        self._fence()  # Of two that come at the same time one sees the other.
+        for peer, word in enumerate(self._words.tolist()):
+            if word != own and word >> 32 == own >> 32:
+                return peer
+        return None
 
 
 class StreamExchange:
@@ -47,6 +84,8 @@ class StreamExchange:
         self._slots: SharedSlots | None = slots
         self._flags: npt.NDArray[np.uint32] | None = host.flags
         self._queue: DeviceQueue | None = None
+        self._order: Order | None = None
+        self._kinds: dict[int, str] = {}  # What was traced, by its checksum.
         # The same on all ranks, which make as many: it is part of their programs.
         self._name = f"gmijax_exchange_{next(_serial)}"
         try:
@@ -59,8 +98,16 @@ class StreamExchange:
                 self.close()
             raise
 
-    def gather(self, values: jax.Array) -> jax.Array:
-        """[K, n] from `values` [n] float32 of every rank, n <= P; within a program of all."""
+    def gather(self, values: jax.Array, kind: str) -> jax.Array:
+        """[K, n] from `values` [n] float32 of every rank, n <= P; within a program of all.
+
+        XLA may give exchanges that do not need each other to the device in any order. A program
+        that another rank gives them in another order fails.
+
+        Args:
+          values: of this rank.
+          kind: which exchange of its program it is, the same on all ranks, other than the rest.
+        """
         if values.dtype != jnp.float32:
             raise CollectiveError(f"rank {self.rank}: exchanges float32, not {values.dtype}")
         if self._slots is None or values.size > self._slots.num_floats:
@@ -68,7 +115,9 @@ class StreamExchange:
             raise CollectiveError(f"rank {self.rank}: {values.size} floats, room is for {room}")
         result = jax.ShapeDtypeStruct((self.world_size, values.size), jnp.float32)
         call: Any = jax.ffi.ffi_call(self._name, result, has_side_effect=True)
-        return call(values)
+        identity = zlib.crc32(kind.encode())
+        self._kinds[identity] = kind
+        return call(values, identity=np.int64(identity))
 
     def clocked_s(self) -> float:
         """Seconds of exchanges that the device is through with, and that were not told before.
@@ -82,12 +131,13 @@ class StreamExchange:
         if self._queue is not None:
             self._queue.close()
         # XLA keeps the call for ever, and with it this object.
-        self._queue, self._slots, self._flags = None, None, None
+        self._queue, self._slots, self._flags, self._order = None, None, None, None
 
     def _open(self) -> bytes:
         assert self._slots is not None
         assert self._flags is not None
         self._queue = self._slots.queue(self._flags)
+        self._order = Order(self._flags, self.rank, self.world_size)
         register(self._name, self._call)
         return b""
 
@@ -97,7 +147,9 @@ class StreamExchange:
         assert self._flags is not None
         size = self._slots.num_floats
         try:
-            found = jax.jit(self.gather)(jnp.full(size, self.rank + 1, jnp.float32))
+            found = jax.jit(lambda x: self.gather(x, "trial"))(
+                jnp.full(size, self.rank + 1, jnp.float32)
+            )
             wanted = np.repeat(np.arange(1, self.world_size + 1)[:, None], size, axis=1)
             is_right = np.array_equal(found, wanted)
             if not is_right and not (self._flags[:, 0] == _FREE).any():  # Another one says why.
@@ -108,9 +160,21 @@ class StreamExchange:
         self.clocked_s()  # Not a part of the first step.
         return None
 
-    def _call(self, stream: int, arguments: list[Buffer], results: list[Buffer]) -> None:
-        if self._slots is None or self._queue is None:
+    def _call(
+        self,
+        stream: int,
+        arguments: list[Buffer],
+        results: list[Buffer],
+        attributes: list[int],
+    ) -> None:
+        if self._slots is None or self._queue is None or self._order is None:
             raise RuntimeError("the exchange is closed")
+        (identity,) = attributes
+        if (peer := self._order.come_to(identity)) is not None:
+            raise RuntimeError(
+                f"rank {self.rank} and rank {peer} have come to their exchanges in different "
+                f"orders; here it is {self._kinds[identity]}"
+            )
         (values,), (gathered,) = arguments, results
         self._slots.gather(self._queue, stream, values.address, gathered.address, values.shape[0])
 

@@ -6,6 +6,7 @@ a whole, and the host does not come between gradient and mean.
 
 from __future__ import annotations
 
+import itertools
 from typing import Any
 
 import jax
@@ -28,6 +29,7 @@ class StreamPeers:
     def __init__(self, exchange: StreamExchange, rank: jax.Array) -> None:
         self._exchange = exchange
         self._rank = rank
+        self._places = itertools.count()
 
     def rank(self) -> jax.Array:
         """See `Peers`."""
@@ -35,12 +37,16 @@ class StreamPeers:
 
     def gather(self, values: jax.Array) -> jax.Array:
         """See `Peers`; float32."""
-        gathered = self._exchange.gather(values.ravel())
-        return gathered.reshape(-1, *values.shape)
+        return self._gather(values, "gather")
 
     def mean(self, buffer: jax.Array) -> jax.Array:
         """See `Peers`."""
-        return ordered_sum(self.gather(buffer), 1.0 / self._exchange.world_size)
+        return ordered_sum(self._gather(buffer, "mean"), 1.0 / self._exchange.world_size)
+
+    def _gather(self, values: jax.Array, kind: str) -> jax.Array:
+        kind = f"number {next(self._places)} of the trace, {kind} of {list(values.shape)} floats"
+        gathered = self._exchange.gather(values.ravel(), kind)
+        return gathered.reshape(-1, *values.shape)
 
 
 class StreamStep:

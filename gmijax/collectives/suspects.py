@@ -12,7 +12,7 @@ from collections.abc import Callable
 from typing import NoReturn
 
 from gmijax.collectives.memory import ExchangeBlock, process_of
-from gmijax.collectives.waits import LIVENESS_PERIOD_S
+from gmijax.collectives.waits import LIVENESS_PERIOD_S, fence
 from gmijax.errors import CollectiveTimeout, PeerLost
 
 SILENCE_S = 0.7
@@ -98,6 +98,7 @@ class Suspects:
     def _is_gone(self, peer: int) -> bool:
         # A rank that has not attached cannot be told from one that is still starting.
         attached = self._block.lines["sequence"][peer]
+        fence()  # Its process was noted before.
         return bool(attached) and not process_of(self._block, peer).is_running()
 
     def _listen(self, now_s: float) -> None:

@@ -16,7 +16,7 @@ from contextlib import contextmanager
 from gmijax.collectives.memory import ExchangeBlock, check_peer
 from gmijax.collectives.suspects import Suspects
 from gmijax.collectives.waits import LIVENESS_PERIOD_S, MAX_SLEEP_S, MIN_SLEEP_S, SPIN_S, Fence
-from gmijax.errors import CollectiveError
+from gmijax.errors import CollectiveError, CudaError
 
 OPERATIONS = ("mean", "all_gather", "step")
 """What a rank can be calling; the wire format holds the position in this tuple."""
@@ -154,9 +154,9 @@ class Turns:
         """
         try:
             yield
-        # A transfer that fails while jax still dispatches it comes as a plain ValueError. The
-        # errors of jax and of shared device memory are RuntimeErrors.
-        except (RuntimeError, ValueError) as error:
+        # A transfer that fails while jax still dispatches it comes as a plain ValueError. Other
+        # errors of jax are RuntimeErrors, and those of shared device memory CudaErrors.
+        except (RuntimeError, ValueError, CudaError) as error:
             self.explain_failure(is_step=is_step)
             if is_step:
                 raise

@@ -39,6 +39,11 @@ class Fence:
         self._lock.acquire()
 
 
+def fence() -> None:
+    """The same in one call, for threads that may come at once, where 0.4 us do not count."""
+    Fence()()
+
+
 def wait_until(
     ready: Callable[[], T | None], blame: Callable[[], GmijaxError | None], timeout_s: float
 ) -> T | None:

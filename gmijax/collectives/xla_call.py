@@ -18,6 +18,7 @@ import jax
 MAJOR_VERSION = 0
 _METADATA_EXTENSION = 1
 _INTERNAL_ERROR = 13
+_SCALAR, _INT64 = 3, 5  # A kind of attribute, and a kind of number.
 _HEADER: list[Any] = [("struct_size", c_size_t), ("extension", c_void_p)]
 
 
@@ -33,9 +34,10 @@ class Buffer(NamedTuple):
     shape: tuple[int, ...]
 
 
-Call = Callable[[int, list[Buffer], list[Buffer]], None]
-"""`(stream, arguments, results)`: adds work to a stream of the device; 0 on a CPU, where the
-arguments are computed already."""
+Call = Callable[[int, list[Buffer], list[Buffer], list[int]], None]
+"""`(stream, arguments, results, attributes)`: adds work to a stream of the device; 0 on a CPU,
+where the arguments are computed already. Attributes are the `np.int64` that the program was
+traced with, in the order of their names."""
 
 
 class _Version(ctypes.Structure):
@@ -67,6 +69,17 @@ class _Buffers(ctypes.Structure):
     ]
 
 
+class _Scalar(ctypes.Structure):
+    _fields_ = [("dtype", c_int), ("value", POINTER(c_int64))]
+
+
+class _Attributes(ctypes.Structure):
+    _fields_ = [
+        *(*_HEADER, ("size", c_int64), ("types", POINTER(c_int))),
+        *(("names", c_void_p), ("values", POINTER(POINTER(_Scalar)))),
+    ]
+
+
 class _ErrorArguments(ctypes.Structure):
     _fields_ = [*_HEADER, ("message", c_char_p), ("code", c_int)]
 
@@ -88,6 +101,7 @@ class _Frame(ctypes.Structure):
     _fields_ = [
         *(("struct_size", c_size_t), ("extension", POINTER(_Extension)), ("api", POINTER(_Api))),
         *(("context", c_void_p), ("stage", c_int), ("arguments", _Buffers), ("results", _Buffers)),
+        ("attributes", _Attributes),
     ]
 
 
@@ -109,7 +123,8 @@ def register(name: str, call: Call) -> None:
             return _describe(frame)
         try:
             stream = _stream(frame) if platform == "CUDA" else 0
-            call(stream, _buffers(frame.arguments), _buffers(frame.results))
+            arguments, results = _buffers(frame.arguments), _buffers(frame.results)
+            call(stream, arguments, results, _integers(frame.attributes))
         except BaseException as error:  # Nothing may be raised into XLA.
             return _error(frame, f"{name}: {error}")
         return None
@@ -130,6 +145,16 @@ def _buffers(values: Any) -> list[Buffer]:
     for place in range(values.size):
         buffer = values.values[place].contents
         found.append(Buffer(buffer.data or 0, tuple(buffer.dims[: buffer.rank])))
+    return found
+
+
+def _integers(attributes: Any) -> list[int]:
+    found = []
+    for place in range(attributes.size):
+        value = attributes.values[place].contents
+        if attributes.types[place] != _SCALAR or value.dtype != _INT64:
+            raise TypeError(f"attribute {place} is no int64")
+        found.append(value.value[0])
     return found
 
 

@@ -117,7 +117,7 @@ class ReduceConfig:
         "what strategy=auto goes by: the paper's Algorithm 1 (paper), the same but one_shot where "
         "several GMIs share a GPU and can map its memory (device), or the time that every "
         "strategy takes here, measured before the job starts and kept for the next one (measured)",
-        default="paper",
+        default="device",
     )
 
     def __post_init__(self) -> None:

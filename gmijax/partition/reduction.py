@@ -7,11 +7,15 @@ refuses by the same rules in a GMI.
 from __future__ import annotations
 
 import importlib.util
+import re
 from collections.abc import Callable, Mapping
 from typing import NamedTuple
 
 from gmijax.errors import ConfigError
 from gmijax.partition.layout import Layout
+from gmijax.version import versions_of
+
+_BINDINGS, _LEAST_BINDINGS = "cuda-bindings", (12, 9, 1)
 
 
 class Choice(NamedTuple):
@@ -64,7 +68,7 @@ def why_not_intra(intra: str, backend: str) -> str | None:
         return "there is no CUDA IPC between the instances of a GPU in MIG mode"
     if not _is_installed("cuda", "cuda.bindings"):
         return "CUDA IPC needs the package cuda-bindings (pip install 'gmijax[ipc]')"
-    return None
+    return _why_too_old(versions_of([_BINDINGS])[_BINDINGS])
 
 
 def require_strategy(strategy: str, layout: Layout, backend: str | None = None) -> None:
@@ -131,6 +135,19 @@ def is_even(layout: Layout) -> bool:
 def _is_installed(*modules: str) -> bool:
     """Whether all modules can be imported; the packages of each come before it."""
     return all(importlib.util.find_spec(module) is not None for module in modules)
+
+
+def _why_too_old(installed: str | None) -> str | None:
+    # Before, a call that waits in CUDA for other GMIs kept all threads of Python from running,
+    # also the one that looks whether these live.
+    numbers = tuple(int(number) for number in re.findall(r"\d+", installed or "")[:3])
+    if not numbers or numbers >= _LEAST_BINDINGS:
+        return None
+    least = ".".join(map(str, _LEAST_BINDINGS))
+    return (
+        f"CUDA IPC needs cuda-bindings {least} or newer, and {installed} is installed "
+        f"(pip install 'cuda-bindings>={least},<13' with CUDA 12, 'cuda-bindings>=13' with 13)"
+    )
 
 
 def _none(layout: Layout) -> str | None:

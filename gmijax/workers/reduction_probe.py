@@ -14,7 +14,6 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from gmijax.collectives.build import Membership, build_reducer, join_world
-from gmijax.collectives.device_memory import DeviceMemoryUnavailable
 from gmijax.collectives.interface import (
     DeviceMean,
     DeviceReducer,
@@ -23,6 +22,7 @@ from gmijax.collectives.interface import (
     stays_on_device,
 )
 from gmijax.control.selection import CHAIN, TIMEOUT_S, block_variable
+from gmijax.errors import DeviceMemoryUnavailable
 from gmijax.partition.child import ChildLink, required_fd, run_gmi
 from gmijax.partition.plan import Plan
 from gmijax.rundir import read_json

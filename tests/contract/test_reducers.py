@@ -100,3 +100,14 @@ def test_exchanges_in_a_program_that_fail_on_one_rank_are_left_to_the_host(tmp_p
         assert (result["error"], result["steps_digest"]) == (None, None), result
         said = (tmp_path / f"stderr_{rank}").read_text()
         assert "rank 1: INTERNAL: gmijax_exchange_0: CUDA_ERROR_INVALID_VALUE; so the host" in said
+
+
+def test_exchanges_in_different_orders_fail_and_do_not_mix(tmp_path: Path) -> None:
+    options = {"strategy": "one_shot", "intra": "ipc", "num_floats": 64, "timeout_s": 5.0}
+    with Ranks(tmp_path, 2, "step_in_different_orders", **options).start() as job:
+        results = job.results()
+    assert {result["error"] for result in results} <= {"CollectiveError", "PeerLost"}
+    said = [result["message"] for result in results if result["error"] == "CollectiveError"]
+    assert said
+    for message in said:
+        assert "have come to their exchanges in different orders; here it is number" in message

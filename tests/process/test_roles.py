@@ -81,8 +81,9 @@ def test_timeouts_lose_nothing_and_different_data_are_told() -> None:
     plan = gmijax.plan(gmis_per_gpu=2, backend="cpu")
     assert launch(plan, role_cases.Retry()) == ["sent", "late"]
     first, second = launch(plan, role_cases.Disagree())
-    assert first == "rank 0 reduces 2 numbers of float32, rank 1 3 of float32"
-    assert second == "rank 1 reduces 3 numbers of float32, rank 0 2 of float32"
+    two, three = (f"the mean of {count} numbers of float32" for count in (2, 3))
+    assert first == f"rank 0 asks for {two}, rank 1 for {three}"
+    assert second == f"rank 1 asks for {three}, rank 0 for {two}"
 
 
 @pytest.mark.parametrize(

@@ -36,6 +36,16 @@ def test_parts_of_the_block_do_not_overlap_and_begin_at_cache_lines(
     assert at.row_floats % 16 == 0
 
 
+@pytest.mark.parametrize("page_bytes", [4096, 65536])
+def test_what_a_gpu_maps_is_whole_pages_of_this_machine(
+    page_bytes: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("mmap.PAGESIZE", page_bytes)
+    at = Geometry.of(3, 100)
+    assert at.flags % page_bytes == 0
+    assert at.size - at.flags == page_bytes
+
+
 def test_a_line_is_one_cache_line_and_its_counters_are_aligned() -> None:
     assert LINE.itemsize == 64
     line = np.zeros(1, LINE)

@@ -13,7 +13,15 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from gmijax.collectives.pipe import PipeReader, PipeWriter
-from gmijax.collectives.pipe_block import END, HEAD, LINE, LINE_BYTES, PipeBlock, create_pipes
+from gmijax.collectives.pipe_block import (
+    END,
+    HEAD,
+    LINE,
+    LINE_BYTES,
+    PipeBlock,
+    create_pipes,
+    progress_of,
+)
 from gmijax.collectives.pipe_format import message_bytes
 from gmijax.errors import CollectiveError, CollectiveTimeout, ConfigError, PipeClosed
 
@@ -200,6 +208,60 @@ def test_a_rank_that_is_coming_never_seems_to_have_left() -> None:
     assert seen == [False] * 3
     assert not watcher.is_gone(1)
     watcher.close()
+    os.close(fd)
+
+
+class Noted:
+    """A line or an end of a pipe that notes what is read and written."""
+
+    def __init__(self, real: Any, seen: list[str]) -> None:
+        self._real, self._seen = real, seen
+
+    def __getitem__(self, key: str) -> Any:
+        self._seen.append(f"read {key}")
+        return self._real[key]
+
+    def __setitem__(self, key: str, value: Any) -> None:
+        self._seen.append(f"write {key}")
+        self._real[key] = value
+
+
+def test_there_is_a_fence_wherever_the_order_of_accesses_counts(
+    ends: Ends, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """That they stand there: what they do cannot be seen on x86, which keeps the order anyway."""
+    seen: list[str] = []
+    monkeypatch.setattr("gmijax.collectives.pipe_block.fence", lambda: seen.append("fence"))
+    block: Any = copy.copy(ends.blocks[0])
+    block._lines = [Noted(np.zeros((), LINE), seen) for _ in range(2)]
+    block._take_rank()
+    # After those of the look at who holds the rank.
+    assert seen[-6:] == [
+        *("write start_ticks", "fence", "write pid", "fence", "read attached", "write attached")
+    ]
+    seen.clear()
+    assert not block.has_left(0)
+    assert seen == ["read attached", "fence", "read pid"]
+    seen.clear()
+    assert block.process_of(0) is not None
+    assert seen == ["read pid", "fence", "read start_ticks"]
+    seen.clear()
+    end: Any = Noted(ends.blocks[0].memory(0, 1).writer, seen)
+    assert progress_of(end).messages == 0
+    assert seen == ["read position", "fence", "read record", "fence", "read position"]
+
+
+@pytest.mark.parametrize("page_bytes", [4096, 65536])
+def test_rings_begin_at_pages_of_this_machine(
+    page_bytes: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("mmap.PAGESIZE", page_bytes)
+    fd = create_pipes(2, 2 * page_bytes)
+    block = PipeBlock.attach(fd, 0, 2, 2 * page_bytes)
+    begin = block._lines.ctypes.data - LINE_BYTES
+    offsets = [block.memory(0, dst).ring.ctypes.data - begin for dst in (0, 1)]
+    assert offsets == [2 * page_bytes, 5 * page_bytes]
+    block.close()
     os.close(fd)
 
 

@@ -11,8 +11,9 @@ from concurrent.futures import ThreadPoolExecutor
 import pytest
 
 from gmijax.collectives.memory import ExchangeBlock, attach, create_exchange
+from gmijax.collectives.suspects import Suspects
 from gmijax.collectives.turns import Turns
-from gmijax.errors import CollectiveError, CollectiveTimeout, PeerLost
+from gmijax.errors import CollectiveError, CollectiveTimeout, CudaError, PeerLost
 
 NEVER = threading.Event()
 
@@ -148,3 +149,42 @@ def test_an_error_of_ones_own_can_stay_what_it_is(
     end(blocks, 1)
     with pytest.raises(PeerLost, match="peer 1 is gone"), first.explained(is_step=True):
         raise RuntimeError("connection reset")
+
+
+@pytest.mark.parametrize("is_step", [False, True])
+def test_a_copy_that_cuda_refuses_is_blamed_on_the_dead(
+    blocks: list[ExchangeBlock], is_step: bool
+) -> None:
+    first, second, _ = turns_of(blocks, 5.0, 5.0, 5.0)
+    end(blocks, 2)
+    with pytest.raises(PeerLost) as lost, first.explained(is_step=is_step):
+        raise CudaError("cannot copy into shared GPU memory: cudaErrorMpsClientTerminated")
+    assert lost.value.peer == 2
+    end(blocks, 0, blamed=blocks[0].lines["blamed"][0] - 1)  # It ends for that reason.
+    with pytest.raises(PeerLost) as lost:
+        second.watch(NEVER)
+    assert lost.value.peer == 2
+
+
+def test_a_copy_that_cuda_refuses_keeps_its_words(
+    blocks: list[ExchangeBlock], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("gmijax.collectives.turns.SETTLE_S", 0.1)
+    first, *_ = turns_of(blocks, 5.0, 5.0, 5.0)
+    with pytest.raises(CollectiveError, match="rank 0: , step 0: cannot copy"), first.explained():
+        raise CudaError("cannot copy")
+
+
+def test_a_process_is_looked_at_after_its_counter(
+    blocks: list[ExchangeBlock], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """That there is a fence: what it does cannot be seen on x86, which keeps the order anyway."""
+    Turns(blocks[1], 1.0, 1.0)
+    pid = int(blocks[1].lines["pid"][1])
+    blocks[1].lines["pid"][1] = 0  # As seen before the counter, by an early read.
+
+    def all_before_is_seen() -> None:
+        blocks[1].lines["pid"][1] = pid
+
+    monkeypatch.setattr("gmijax.collectives.suspects.fence", all_before_is_seen)
+    Suspects(blocks[0], "mean", 1, 1.0).look(lambda: [1], now=True)  # Nobody is gone.

@@ -47,6 +47,15 @@ def test_limits_are_those_of_the_learner(end: int):
     assert float(kept) == pytest.approx(limit)
 
 
+@pytest.mark.parametrize("group", ["plan", "reduce", "run", "search", "channel"])
+def test_a_default_is_the_same_in_code_and_on_the_command_line(group: str):
+    """But for groups whose defaults differ from task to task."""
+    composed = getattr(compose(), group)
+    for field in dataclasses.fields(composed):
+        if field.default is not dataclasses.MISSING:
+            assert (field.name, field.default) == (field.name, getattr(composed, field.name))
+
+
 # Hidden layers in Table 5 of the paper; 256:128:64 for all others.
 WIDTHS = {"humanoid": (200, 400, 100), "shadow_hand": (512, 512, 512, 256)}
 

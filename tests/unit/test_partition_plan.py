@@ -128,7 +128,7 @@ def test_gmis_that_share_a_gpu_exchange_on_it_where_they_can(
     monkeypatch: pytest.MonkeyPatch,
 ):
     monkeypatch.setattr(reduction, "_is_installed", lambda *_: is_installed)
-    by_paper = planned(machine(2), backend="share", **changes).strategy
+    by_paper = planned(machine(2), {"selection": "paper"}, backend="share", **changes).strategy
     plan = planned(machine(2), {"selection": selection}, backend="share", **changes)
     assert plan.strategy == (strategy if is_installed else by_paper)
     (reason,) = [text for text in plan.reasons if text.startswith("strategy")]

@@ -131,6 +131,24 @@ def test_device_exchange_says_why_it_is_not_to_be_had(
 
 
 @pytest.mark.parametrize(
+    ("version", "is_enough"),
+    [("12.8.0", False), ("12.9.0.post1", False), ("12.9.1", True), ("13.0.0", True), (None, True)],
+)
+def test_bindings_that_hold_up_python_are_too_old(
+    version: str | None, is_enough: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(reduction, "_is_installed", lambda *_: True)
+    monkeypatch.setattr(reduction, "versions_of", lambda names: dict.fromkeys(names, version))
+    reason = why_not_intra("ipc", "mps")
+    assert (reason is None) == is_enough
+    if reason is not None:
+        assert f"12.9.1 or newer, and {version} is installed (pip install " in reason
+        require_strategy("one_shot", Layout.even(1, 2))
+        with pytest.raises(ConfigError, match="is installed"):
+            require_strategy("one_shot", Layout.even(1, 2), "mps")
+
+
+@pytest.mark.parametrize(
     ("gmis_of_gpu", "expected"),
     [
         (((0, 1, 2), (3, 4, 5)), (0, 3)),

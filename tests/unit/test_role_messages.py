@@ -113,7 +113,7 @@ def test_ranks_that_there_are_not(alone: Messenger, rank: int) -> None:
         alone.recv(rank)
 
 
-def posts(count: int, part_bytes: int = 1 << 20) -> list[Messenger]:
+def posts(count: int, part_bytes: int = 1 << 20, timeout_s: float = 5.0) -> list[Messenger]:
     """Messengers of `count` ranks that share memory of a device, in this process."""
     fd = create_pipes(count, MIN_CAPACITY_BYTES)
     try:
@@ -122,7 +122,7 @@ def posts(count: int, part_bytes: int = 1 << 20) -> list[Messenger]:
         os.close(fd)
     others = [[peer for peer in range(count) if peer != rank] for rank in range(count)]
     return [
-        Messenger(block, 5.0, DevicePost(peers, FakeDeviceMemory, part_bytes))
+        Messenger(block, timeout_s, DevicePost(peers, FakeDeviceMemory, part_bytes))
         for block, peers in zip(blocks, others, strict=True)
     ]
 
@@ -165,6 +165,23 @@ def test_a_rank_may_end_when_what_it_left_on_the_device_is_received() -> None:
     assert first.settle(0.01)
     first.send(np.arange(5000.0), 1)
     assert first.settle(0.01)  # In shared memory it outlives its sender.
+
+
+def test_what_was_not_sent_for_want_of_room_is_not_waited_for(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr("gmijax.collectives.mailboxes.MAX_WAITING_BYTES", 1)
+    first, second = posts(2, timeout_s=0.1)
+    second._timeout_s = 5.0
+    first.send(np.ones(10**6), 1)
+    with pytest.raises(CollectiveTimeout, match=r"in send, step 2, for ranks \[1\]"):
+        first.send(jnp.arange(5000.0), 1)
+    assert second.recv(0).size == 10**6
+    assert first.settle(1.0)
+    first.send(jnp.arange(5000.0), 1)
+    assert not first.settle(0.01)
+    np.testing.assert_array_equal(second.recv(0), np.arange(5000.0))
+    assert first.settle(1.0)
 
 
 def test_two_ranks_that_end_do_not_wait_for_each_other() -> None:

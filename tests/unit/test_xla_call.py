@@ -12,9 +12,12 @@ import pytest
 from gmijax.collectives.xla_call import Buffer, register
 
 
-def _add_two(stream: int, arguments: list[Buffer], results: list[Buffer]) -> None:
+def _add_two(
+    stream: int, arguments: list[Buffer], results: list[Buffer], attributes: list[int]
+) -> None:
     (given,), (added, counted) = arguments, results
     assert stream == 0  # There is none on a CPU.
+    assert attributes == [1, -(2**40)]  # By name.
     if len(given.shape) != 2:
         raise ValueError(f"{len(given.shape)} axes")
     size = int(np.prod(given.shape))
@@ -31,7 +34,8 @@ def name() -> str:
 
 def _call(name: str, x: jax.Array) -> tuple[jax.Array, jax.Array]:
     results = jax.ShapeDtypeStruct(x.shape, x.dtype), jax.ShapeDtypeStruct((), jnp.int32)
-    changed, counted = jax.ffi.ffi_call(name, results, has_side_effect=True)(x)
+    call = jax.ffi.ffi_call(name, results, has_side_effect=True)
+    changed, counted = call(x, least=np.int64(-(2**40)), is_there=np.int64(1))
     return changed, counted
 
 
@@ -54,3 +58,9 @@ def test_what_it_raises_fails_the_program(name: str) -> None:
     with pytest.raises(jax.errors.JaxRuntimeError, match="test_add_two: 3 axes"):
         jax.block_until_ready(jax.jit(lambda x: _call(name, x))(jnp.ones((1, 2, 3))))
     jax.block_until_ready(jax.jit(lambda x: _call(name, x))(jnp.ones((1, 2))))  # Not for ever.
+
+
+def test_attributes_are_integers(name: str) -> None:
+    call = jax.ffi.ffi_call(name, jax.ShapeDtypeStruct((), jnp.float32), has_side_effect=True)
+    with pytest.raises(jax.errors.JaxRuntimeError, match="attribute 0 is no int64"):
+        jax.block_until_ready(jax.jit(lambda x: call(x, least="text"))(jnp.ones(1)))
