@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -64,9 +65,9 @@ def find_checkpoint(wanted: str, key: str) -> Path:
       ConfigError: there is none.
     """
     folder = last_run(key) if wanted == "last" else Path(wanted)
-    if (folder / META).is_file():
+    if os.path.isfile(folder / META):  # Unlike `Path.is_file` it takes any text.
         return folder.resolve()
-    if not folder.is_dir():
+    if not os.path.isdir(folder):
         raise ConfigError(f"{key}={wanted}: no such folder")
     found = sorted(path.parent for path in folder.glob(f"checkpoints/[0-9]*/{META}"))
     if not found:

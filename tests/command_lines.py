@@ -7,6 +7,7 @@ import importlib
 import io
 import os
 import subprocess
+import tempfile
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, redirect_stderr, redirect_stdout
 from pathlib import Path
@@ -67,6 +68,7 @@ def _nothing_starts(machine: Machine, cwd: Path) -> Iterator[None]:
         for module in (job, serving, searching, evaluation):
             patch.setattr(module, "detect_machine", lambda: machine)
         patch.setattr(Path, "mkdir", _mkdir)
+        patch.setattr(tempfile, "mkstemp", _would_start)
         patch.setattr(searching._Search, "result", _would_start)
         patch.setattr(selection, "measure", _would_start)
         for owner, name in ((subprocess, "Popen"), (os, "fork"), (os, "posix_spawn")):
@@ -91,7 +93,7 @@ def _mkdir(path: Path, mode: int = 0o777, parents: bool = False, exist_ok: bool 
     except FileNotFoundError:
         raise WouldStart from None
     if exist_ok and path.is_dir():
-        raise WouldStart
+        return
     raise FileExistsError(errno.EEXIST, os.strerror(errno.EEXIST), str(path))
 
 

@@ -49,7 +49,8 @@ def _leaves(cls: Any, prefix: str = "") -> Iterator[tuple[str, Any]]:
         for tree in trees:
             yield from _leaves(tree, f"{prefix}{name}.")
         if not trees:
-            yield prefix + name, kind
+            # Names and paths meet more code than numbers do.
+            yield from [(prefix + name, kind)] * (4 if str in options else 1)
 
 
 def _right(kind: Any) -> st.SearchStrategy[str]:
@@ -73,7 +74,21 @@ def _right(kind: Any) -> st.SearchStrategy[str]:
 _DIGITS = "9" * 5000
 _WRONG = st.sampled_from(
     [
-        *("", " ", "null", "None", "nan", "-inf", ".inf", "-1", "0", "0x10", "1_0", "1e400", "-0.0"),
+        *(
+            "",
+            " ",
+            "null",
+            "None",
+            "nan",
+            "-inf",
+            ".inf",
+            "-1",
+            "0",
+            "0x10",
+            "1_0",
+            "1e400",
+            "-0.0",
+        ),
         *("1e300", "1e18", str(2**31), str(2**64), "1" + "0" * 400, _DIGITS, f"-{_DIGITS}", "١٢"),
         *("'", '"', "'a", '"a\\"', "''", "a b", "a=b", "=", "==", "a:b", ":", "#", "\\", "\\\\"),
         *("[", "]", "[]", "[[]]", "[[0],[1,[2]]]", "[1,", "[null]", "[a,1,true]", "[-1]", "[0,0]"),
@@ -83,11 +98,39 @@ _WRONG = st.sampled_from(
         *("${oc.env:HOME}", "${oc.env:NO_SUCH}", "${oc.env}", "${oc.decode:'[1'}", "${oc.x:1}"),
         *("${oc.create:{a:1}}", "${oc.select:x,1}", "${now:%Y}", "${hydra:runtime.cwd}", "???"),
         *("1,2", "a,b", "choice(1,2)", "range(1,3)", "interval(0,1)", "sort(3,2)", "glob(*)"),
-        *("int(x)", "int(inf)", "int(nan)", "float(x)", "json_str({})", "str(1)", "bool(2)", "f()"),
-        *("tag(a,choice(1))", "shuffle(1)", "extend_list(1)", "int([1,a])", "int({a:b})", "glob(["),
+        *(
+            "int(x)",
+            "int(inf)",
+            "int(nan)",
+            "float(x)",
+            "json_str({})",
+            "str(1)",
+            "bool(2)",
+            "f()",
+        ),
+        *(
+            "tag(a,choice(1))",
+            "shuffle(1)",
+            "extend_list(1)",
+            "int([1,a])",
+            "int({a:b})",
+            "glob([",
+        ),
         *("\0", "a\0b", "\n", "a\nb", "'a\nb'", "\r", "\t", "\x1b[31m", "\x7f", "\x85", "\u2028"),
         *("\ud800", "\udcff", "é", "漢字", "🤖", "\u202e", "\ufeff", "\xa0", "%s", "%d%n", "{0}"),
-        *("..", "/", "../..", "/dev/null", "/proc/self/mem", "/root/x", "~", "*", "a/b/c", "-", "--"),
+        *(
+            "..",
+            "/",
+            "../..",
+            "/dev/null",
+            "/proc/self/mem",
+            "/root/x",
+            "~",
+            "*",
+            "a/b/c",
+            "-",
+            "--",
+        ),
         *("a" * 300, "a" * 20000, "a/" * 3000, "é" * 200, "yes", "True", "!!python/object:os"),
         *("x.py", "x.py:", "x.py:f", ".py:f", "task.py:make", "task.py:1", "a'b.py:f", "\0.py:f"),
     ]
@@ -97,7 +140,22 @@ _ANY_TEXT = st.text(max_size=12) | st.text(
 )
 
 
+_PATHS = st.sampled_from(
+    [
+        *("last", "done", "runs/done", "runs/done/checkpoints/000000001000", "1000", "01000", "7"),
+        *("runs", ".", "..", "", "/", "task.py", "task.py/x", "task.py:make", "./task.py:make"),
+        *("/dev/null", "/dev/null/x", "/proc/self/mem", "/proc/1/root", "/root/x", "~", "$HOME"),
+        *("a" * 250, "a" * 300, "a/" * 3000, "漢" * 200, "'" + "9" * 300 + "'", f"'{_DIGITS}'"),
+        *("a" * 300 + ".py:f", "'a b'", "'[x]'", "'{x}'", "'${x}'", "'\\'", "a=b", "x:y", "..."),
+        *("\0", "a\nb", "\udcff", "é", "🤖", "'[bold]'", "'[/]'", "%s", "1", "1.5", "true", "[a]"),
+        *("${oc.env:HOME}", "${env.name}", "${oc.env:NOT_TEXT}", "${oc.env:TWO_LINES}"),
+    ]
+)
+
+
 def _values(kind: Any) -> st.SearchStrategy[str]:
+    if str in (kind, *typing.get_args(kind)):
+        return _PATHS | _WRONG | _ANY_TEXT
     return st.one_of(_right(kind), _right(kind), _WRONG, _ANY_TEXT)
 
 
@@ -121,6 +179,13 @@ def _overrides(draw: st.DrawFn, keys: tuple[tuple[str, Any], ...]) -> str:
 
 
 @st.composite
+def _good(draw: st.DrawFn, keys: tuple[tuple[str, Any], ...]) -> str:
+    """What may well be taken."""
+    key, kind = draw(st.sampled_from(keys))
+    return f"{key}={draw(_right(kind))}"
+
+
+@st.composite
 def _group_choices(draw: st.DrawFn) -> str:
     group = draw(st.sampled_from([*_GROUPS, "", "..", "/", "nothing", "hydra", "é", "a" * 300]))
     package = draw(st.sampled_from(["", "", "", "", "@x", "@_global_", "@", "@a@b", ":a"]))
@@ -134,8 +199,23 @@ _OPTIONS = st.sampled_from(
     [
         *("--cfg", "--cfg=job", "job", "--cfg=", "--cfg=hydra", "--cfg=all", "-m", "--multirun"),
         *("--config-dir", "--config-dir=.", "--config-name=x", "-cn", "-cd", "--run", "--info"),
-        *("--resolve", "--version", "--hydra-help", "--shell-completion", "-", "--", "-h", "--help"),
-        *("hydra.run.dir=x", "hydra/launcher=joblib", "+hydra.x=1", "hydra.mode=MULTIRUN", "~hydra"),
+        *(
+            "--resolve",
+            "--version",
+            "--hydra-help",
+            "--shell-completion",
+            "-",
+            "--",
+            "-h",
+            "--help",
+        ),
+        *(
+            "hydra.run.dir=x",
+            "hydra/launcher=joblib",
+            "+hydra.x=1",
+            "hydra.mode=MULTIRUN",
+            "~hydra",
+        ),
         *("hydra=null", "hydra.sweeper.params=1", "+_target_=os.system", "defaults=[]"),
         *("+defaults=[env]", "_self_", "+x=1", "++x.y.z=1", "~x", "run.resume=last", "", " ", "="),
         *("run.resume=done", "run.dir=last", "env=task.py:make", "env=custom", "policy=random"),
@@ -168,19 +248,25 @@ def _mutated(draw: st.DrawFn, lines: st.SearchStrategy[str]) -> str:
 
 @st.composite
 def _command_lines(draw: st.DrawFn, command: str) -> list[str]:
+    """At most two strange arguments among good ones, so that all checks are reached."""
     keys = tuple(_leaves(COMMANDS[command]))
-    good = _overrides(keys)
-    one = st.one_of(good, good, good, _group_choices(), _OPTIONS, _mutated(good), _ANY_TEXT)
-    argv = draw(st.lists(one, min_size=1, max_size=4))
-    if draw(st.integers(0, 5)) == 0:
+    strange = _overrides(keys)
+    strange |= st.one_of(
+        _group_choices(), _OPTIONS, _mutated(_overrides(keys)), _ANY_TEXT, strange
+    )
+    argv = draw(st.lists(_good(keys), max_size=3)) + draw(st.lists(strange, max_size=2))
+    if command == "serve":
+        argv.insert(0, draw(st.sampled_from(["policy=random", "policy=random", "run.dir=last"])))
+    if argv and draw(st.integers(0, 5)) == 0:
         argv.append(draw(st.sampled_from(argv)))
-    return argv
+    return draw(st.permutations(argv)) if draw(st.booleans()) else argv
 
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
     """A working directory with a run, a file of a task, and limited memory."""
     root = tmp_path_factory.mktemp("fuzz")
+    (root / "cache" / "gmijax" / "profiles").mkdir(parents=True)
     (root / "task.py").write_text("def make(*, impl, max_envs): ...\n")
     done = RunPaths(root / "runs" / "done")
     config = compose("env=ant", "num_envs=64")
@@ -194,7 +280,10 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
     resource.setrlimit(
         resource.RLIMIT_AS, (pages * resource.getpagesize() + _ADDRESS_SPACE_BYTES, hard)
     )
-    yield root
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("NOT_TEXT", os.fsdecode(b"a\xffb"))
+        patch.setenv("TWO_LINES", "a\nb")
+        yield root
     resource.setrlimit(resource.RLIMIT_AS, (soft, hard))
 
 
