@@ -130,6 +130,9 @@ def _build(name: str, cls: type[C], overrides: Sequence[str]) -> C:
         _check_task_key(_parse(overrides))
         if isinstance(data["run"], dict) and data["run"].get("resume"):
             data = _on_top_of_saved(data, overrides, str(data["run"]["resume"]))
+    for key, value in _flatten(data).items():  # What the environment has may be anything.
+        if isinstance(value, str):
+            _require_text(f"{key}={value}")
     return from_dict(cls, data)
 
 
@@ -201,10 +204,14 @@ def _parse(overrides: Sequence[str]) -> list[Override]:
     return [_parsed(parser, text) for text in overrides]
 
 
-def _parsed(parser: OverridesParser, text: str) -> Override:
+def _require_text(text: str) -> None:
     # A surrogate stands for a byte that is no text, which nothing can print.
     if any(unicodedata.category(letter) in _NOT_TEXT for letter in text):
         raise ConfigError(f"{text!r}: expected text without control characters")
+
+
+def _parsed(parser: OverridesParser, text: str) -> Override:
+    _require_text(text)
     try:
         return parser.parse_overrides([text])[0]
     except RecursionError:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 
 import pytest
@@ -51,7 +52,7 @@ def test_play_has_no_task_to_choose(capsys: pytest.CaptureFixture[str]):
         ("train", "run.dir=a\0b", "expected text without control characters"),
         ("train", "run.dir=\udcff", r"'run.dir=\udcff': expected text without control"),
         ("train", f"seed={'9' * 5000}", "a number has too many digits"),
-        ("train", f"seed={'[' * 3000}", "nested too deeply"),
+        ("train", f"seed={'[' * 3000}{']' * 3000}", "nested too deeply"),
         ("train", f"{'a' * 300}=1", "aaa=1: File name too long"),
         ("train", f"{'a' * 300}/x=1", "aaa/x=1: File name too long"),
         ("train", f"run.resume={'a' * 300}", "aaa: no such folder"),
@@ -77,6 +78,13 @@ def test_more_gmis_than_a_host_can_run_are_refused_before_they_are_counted_out()
         ("algo=a3c", "plan.gpus=100", "plan.serving_gmis_per_gpu=11"),
         ("algo=a3c", "plan.training_gpus=1e9"),
     ):
-        with pytest.raises(ConfigError, match="at most 1024 are allowed$"):
+        with pytest.raises(ConfigError, match=r"at most 1024 are allowed$"):
             compose(*overrides)
     assert compose("plan.gpus=1024").plan.gpus == 1024
+
+
+@pytest.mark.parametrize("value", ["a\nb", os.fsdecode(b"a\xffb")])
+def test_what_the_environment_has_is_text_too(value: str, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setenv("A_NAME", value)
+    with pytest.raises(ConfigError, match=r"^'run\.name=a.*b': expected text without"):
+        compose("run.name=${oc.env:A_NAME}")
