@@ -158,7 +158,7 @@ def _compose_dict(name: str, overrides: Sequence[str]) -> dict[str, Any]:
     except (HydraException, OmegaConfBaseException) as error:
         raise ConfigError(_one_line(name, error)) from None
     except OSError as error:  # Hydra looks for a file with the name of the key.
-        raise ConfigError(f"{max(overrides, key=len)}: {error.strerror}") from None
+        raise ConfigError(f"{max(overrides, key=len, default=name)}: {error.strerror}") from None
     return typing.cast("dict[str, Any]", data)
 
 
@@ -317,7 +317,7 @@ def _flatten(data: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
         if isinstance(value, Mapping):
             flat |= _flatten(value, f"{prefix}{key}.")
         else:
-            flat[prefix + key] = value
+            flat[f"{prefix}{key}"] = value
     return flat
 
 

@@ -57,6 +57,7 @@ def test_play_has_no_task_to_choose(capsys: pytest.CaptureFixture[str]):
         ("train", f"{'a' * 300}/x=1", "aaa/x=1: File name too long"),
         ("train", f"run.resume={'a' * 300}", "aaa: no such folder"),
         ("train", "plan.gpus=1e6", "plan.gmis_per_gpu=1: makes 1000000 GMIs on 1000000 GPUs"),
+        ("train", "run.dir={1:2}", "run.dir={1: 2}: expected text or null"),
         ("search", "plan.layout=[]", "plan.layout=[]: every GPU needs at least one GMI"),
         ("serve", f"run.dir={'a' * 300}", "aaa: no such folder"),
         ("play", f"checkpoint={'a' * 300}", "aaa: expected the folder of a checkpoint"),
