@@ -9,6 +9,7 @@ from __future__ import annotations
 import re
 import sys
 import typing
+import unicodedata
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
@@ -37,6 +38,9 @@ _COMPOSED: Mapping[str, type[Any]] = {
     "search": TrainConfig,
     "serve": ServeConfig,
 }
+
+_NOT_TEXT = ("Cc", "Cs", "Zl", "Zp")
+"""Unicode's categories of control characters, surrogates, and ends of lines and paragraphs."""
 
 EXIT_OK, EXIT_FAILED, EXIT_BAD_INPUT, EXIT_INTERRUPTED = 0, 1, 2, 130
 
@@ -110,7 +114,9 @@ def config_dir() -> Path:
 
 def choices(group: str) -> list[str]:
     """Names of the YAML files of a group, e.g. the tasks for `env`."""
-    return sorted(path.stem for path in (config_dir() / group).glob("*.yaml"))
+    # No path of the user's making: it could lead anywhere, or be too long for a file system.
+    folders = [path for path in config_dir().iterdir() if path.name == group]
+    return sorted(path.stem for folder in folders for path in folder.glob("*.yaml"))
 
 
 def _build(name: str, cls: type[C], overrides: Sequence[str]) -> C:
@@ -126,6 +132,9 @@ def _build(name: str, cls: type[C], overrides: Sequence[str]) -> C:
         resume = data["run"].get("resume") if isinstance(data["run"], dict) else None
         if resume not in (None, "auto"):
             data = _on_top_of_saved(data, overrides, str(resume))
+    for key, value in _flatten(data).items():  # What the environment has may be anything.
+        if isinstance(value, str):
+            _require_text(f"{key}={value}")
     return from_dict(cls, data)
 
 
@@ -150,6 +159,8 @@ def _compose_dict(name: str, overrides: Sequence[str]) -> dict[str, Any]:
         data = OmegaConf.to_container(config, resolve=True, throw_on_missing=True)
     except (HydraException, OmegaConfBaseException) as error:
         raise ConfigError(_one_line(name, error)) from None
+    except OSError as error:  # Hydra looks for a file with the name of the key.
+        raise ConfigError(f"{max(overrides, key=len, default=name)}: {error.strerror}") from None
     return typing.cast("dict[str, Any]", data)
 
 
@@ -191,12 +202,27 @@ def _unknown_key(key: str, known: Iterable[str]) -> ConfigError:
 
 
 def _parse(overrides: Sequence[str]) -> list[Override]:
+    parser = OverridesParser.create()
+    return [_parsed(parser, text) for text in overrides]
+
+
+def _require_text(text: str) -> None:
+    # A surrogate stands for a byte that is no text, which nothing can print.
+    if any(unicodedata.category(letter) in _NOT_TEXT for letter in text):
+        raise ConfigError(f"{text!r}: expected text without control characters")
+
+
+def _parsed(parser: OverridesParser, text: str) -> Override:
+    _require_text(text)
     try:
-        return OverridesParser.create().parse_overrides(list(overrides))
+        return parser.parse_overrides([text])[0]
+    except RecursionError:
+        raise ConfigError(f"{text}: nested too deeply") from None
+    except ValueError:  # Python's own limit.
+        raise ConfigError(f"{text}: a number has too many digits") from None
     except HydraException as error:
-        bad = next((text for text in overrides if "=" not in text), None)
-        if bad is not None:
-            raise ConfigError(f"{bad}: expected key=value") from None
+        if "=" not in text:
+            raise ConfigError(f"{text}: expected key=value") from None
         raise ConfigError(" ".join(str(error).split())) from None
 
 
@@ -293,7 +319,7 @@ def _flatten(data: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
         if isinstance(value, Mapping):
             flat |= _flatten(value, f"{prefix}{key}.")
         else:
-            flat[prefix + key] = value
+            flat[f"{prefix}{key}"] = value
     return flat
 
 
@@ -314,4 +340,7 @@ def _split_options(argv: Sequence[str]) -> tuple[list[str], bool]:
 
 def _complain(name: str, what: object) -> None:
     notes = getattr(what, "__notes__", [])
-    sys.stderr.write(f"gmijax.{name}: {'; '.join([str(what), *notes])}\n")
+    text = "; ".join([str(what), *notes])
+    # One line, whatever is in the values that it shows.
+    shown = "".join(c if c.isprintable() else ascii(c)[1:-1] for c in text)
+    sys.stderr.write(f"gmijax.{name}: {shown}\n")

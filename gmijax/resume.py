@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import zlib
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
@@ -122,11 +123,11 @@ def find_checkpoint(wanted: str, key: str) -> Path:
       ConfigError: there is none.
     """
     folder = last_run(key) if wanted == "last" else Path(wanted)
-    if (folder / META).is_file():
+    if os.path.isfile(folder / META):  # Unlike `Path.is_file` it takes any text.
         if wrong := what_is_broken(folder):
             raise ConfigError(f"{key}={wanted}: {wrong}")
         return folder.resolve()
-    if not folder.is_dir():
+    if not os.path.isdir(folder):
         raise ConfigError(f"{key}={wanted}: no such folder")
     found = newest_checkpoint(folder)
     if found.checkpoint is None:

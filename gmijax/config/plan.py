@@ -12,6 +12,9 @@ from gmijax.schema import doc, require_at_least, require_between, require_positi
 TemplateName = Literal["tcg", "tdg", "tcg_ex", "tdg_ex", "decoupled"]
 Priority = Literal["normal", "below_normal"]
 
+MAX_GMIS = 1024
+"""More processes than one host can run; making a plan of far more would take all its memory."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class PlanConfig:
@@ -75,11 +78,25 @@ class PlanConfig:
             )
         if self.gmis_per_gpu != "auto":
             require_at_least("plan.gmis_per_gpu", self.gmis_per_gpu, 1)
+        self._require_few_gmis()
         if self.sm_percent != "even":
             for percent in _numbers(self.sm_percent):
                 require_between("plan.sm_percent", percent, 1.0, 100.0)
         for fraction in _numbers(self.memory_fraction):
             require_between("plan.memory_fraction", fraction, 0.01, 1.0)
+
+    def _require_few_gmis(self) -> None:
+        for side in ("", "serving_", "training_"):
+            gpus = getattr(self, f"{side}gpus")
+            gpus = self.gpus if gpus is None else gpus
+            num_gpus = gpus if isinstance(gpus, int) else len(gpus)
+            key = f"{side}gmis_per_gpu"
+            gmis = getattr(self, key)
+            if (num_gmis := num_gpus * (1 if gmis == "auto" else gmis)) > MAX_GMIS:
+                raise ConfigError(
+                    f"plan.{key}={gmis}: makes {num_gmis} GMIs on {num_gpus} GPUs; at most "
+                    f"{MAX_GMIS} are allowed"
+                )
 
     @property
     def needs_mps(self) -> bool:

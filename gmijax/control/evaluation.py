@@ -7,6 +7,7 @@ as the one GMI of a small plan, `gmijax.sim.render` films them.
 from __future__ import annotations
 
 import dataclasses
+import os
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Final, NamedTuple
@@ -36,6 +37,9 @@ MEMORY_FRACTION: Final = 0.1
 _PATIENCE: Final = Patience(
     start_timeout_s=1200.0, stall_timeout_s=600.0, stop_timeout_s=60.0, grace_s=10.0
 )
+
+_MOST_DIGITS: Final = 18
+"""Of env steps; a longer number is no file name."""
 
 
 class Evaluation(NamedTuple):
@@ -104,10 +108,10 @@ def play(config: PlayConfig, *, show: bool = False) -> Evaluation:
 def _find(config: PlayConfig) -> Path:
     """The checkpoint that the configuration names."""
     wanted, run_dir = config.checkpoint, config.run.dir
-    if wanted is None or wanted.isdecimal():
+    if wanted is None or (wanted.isdecimal() and len(wanted) <= _MOST_DIGITS):
         latest = find_checkpoint(run_dir or "last", "run.dir")
         return latest if wanted is None else _at_step(_run_of(latest), int(wanted))
-    if not (Path(wanted) / META).is_file():
+    if not os.path.isfile(Path(wanted) / META):  # Unlike `Path.is_file` it takes any text.
         raise ConfigError(
             f"checkpoint={wanted}: expected the folder of a checkpoint, or its env steps"
         )

@@ -40,6 +40,7 @@ from gmijax.control.workload import Workload, training
 from gmijax.errors import ConfigError, GmijaxError, JobInterrupted
 from gmijax.partition.balance import Split
 from gmijax.partition.grid import Grid
+from gmijax.partition.layout import Layout
 from gmijax.partition.machine import Machine, detect_machine
 from gmijax.partition.points import Measured, NotRunnable, Point
 from gmijax.partition.search import Outcome, OutOfBudget, Rules, Visited
@@ -288,7 +289,7 @@ def _grid(workload: Workload, settings: SearchConfig, machine: Machine) -> Grid:
     plan = workload.plan
     gmis: tuple[int, ...] = settings.gmis_per_gpu
     if plan.layout is not None:
-        gmis = (max(len(here) for here in plan.layout),)
+        gmis = (max(len(here) for here in Layout(plan.layout).gmis_of_gpu),)
     elif plan.gmis_per_gpu != "auto":
         gmis = (plan.gmis_per_gpu,)
     num_envs = settings.num_envs if workload.num_envs == "auto" else (workload.num_envs,)

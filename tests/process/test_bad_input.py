@@ -1,10 +1,14 @@
-"""Bad input: one line on standard error, exit code 2, nothing started."""
+"""Bad input: one line on standard error, exit code 2, nothing started.
+
+Most lines run in this process, some in one of their own, as a user's do.
+"""
 
 from __future__ import annotations
 
 from pathlib import Path
 
 import pytest
+from command_lines import run
 from training_jobs import train
 
 
@@ -54,7 +58,30 @@ from training_jobs import train
     ],
 )
 def test_one_line_and_exit_code_two(overrides: list[str], said: str, tmp_path: Path) -> None:
-    done = train(*overrides, cwd=tmp_path)
+    done = run("train", *overrides, cwd=tmp_path)
+    assert done.code == 2, done.stderr
+    assert said in done.stderr
+    assert len(done.stderr.strip().splitlines()) == 1
+    assert done.stdout == ""
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    ("command", "overrides", "said"),
+    [
+        ("train", ["env=antt"], "env=antt: unknown: did you mean ant?"),
+        # All checks but the last one are behind.
+        ("train", ["run.dir=."], "the run folder exists already"),
+        ("search", ["num_env=3"], "unknown key num_env: did you mean num_envs?"),
+        ("serve", ["policy=random", "num_envs=0"], "num_envs=0: must be at least 1"),
+        ("play", [], "run.dir=last: no run with a checkpoint"),
+        ("doctor", ["gpu=x"], "gpu=x: allowed are --json"),
+    ],
+)
+def test_so_does_the_process_of_every_command(
+    command: str, overrides: list[str], said: str, tmp_path: Path
+) -> None:
+    done = train(*overrides, cwd=tmp_path, command=command)
     assert done.returncode == 2, done.stderr
     assert said in done.stderr
     assert len(done.stderr.strip().splitlines()) == 1

@@ -1,0 +1,105 @@
+"""Command lines in this process, up to the first thing that would be left on disk or started."""
+
+from __future__ import annotations
+
+import errno
+import importlib
+import io
+import os
+import subprocess
+import tempfile
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager, redirect_stderr, redirect_stdout
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import pytest
+
+from gmijax import cli
+from gmijax.config import PlayConfig, ServeConfig, TrainConfig
+from gmijax.control import evaluation, job, searching, selection, serving
+from gmijax.partition.machine import Machine
+
+COMMANDS: Mapping[str, type[Any]] = {
+    "train": TrainConfig,
+    "serve": ServeConfig,
+    "search": TrainConfig,
+    "play": PlayConfig,
+}
+"""The commands with their configurations."""
+
+CPU = Machine(gpus=(), cpu_cores=(0, 1, 2, 3))
+"""A machine without a GPU."""
+
+
+class Done(NamedTuple):
+    """What a command line came to; `code` is None where it would have started something."""
+
+    code: int | None
+    stdout: str
+    stderr: str
+
+
+class WouldStart(BaseException):
+    """All checks are behind; the next act would be one on the world."""
+
+
+def run(command: str, *argv: str, cwd: Path, machine: Machine = CPU) -> Done:
+    """Runs a command line in `cwd` of a faked machine, with streams like a user's.
+
+    It ends where it would make or start something. Every command makes a folder before it starts
+    a process, so that is where. A process that is started all the same is an error.
+    """
+    out, err = _stream("strict"), _stream("backslashreplace")
+    body = importlib.import_module(f"gmijax.{command}")._run
+    with _nothing_starts(machine, cwd), redirect_stdout(out), redirect_stderr(err):
+        try:
+            code = cli.command(command, COMMANDS[command], body, argv)
+        except WouldStart:
+            code = None
+    return Done(code, _text(out), _text(err))
+
+
+@contextmanager
+def _nothing_starts(machine: Machine, cwd: Path) -> Iterator[None]:
+    with pytest.MonkeyPatch.context() as patch:
+        patch.chdir(cwd)
+        patch.setenv("XDG_CACHE_HOME", str(cwd / "cache"))
+        for module in (job, serving, searching, evaluation):
+            patch.setattr(module, "detect_machine", lambda: machine)
+        patch.setattr(Path, "mkdir", _mkdir)
+        patch.setattr(tempfile, "mkstemp", _would_start)
+        patch.setattr(searching._Search, "result", _would_start)
+        patch.setattr(selection, "measure", _would_start)
+        for owner, name in ((subprocess, "Popen"), (os, "fork"), (os, "posix_spawn")):
+            patch.setattr(owner, name, _must_not_start)
+        yield
+
+
+def _stream(errors: str) -> io.TextIOWrapper:
+    return io.TextIOWrapper(io.BytesIO(), encoding="utf-8", errors=errors, newline="")
+
+
+def _text(stream: io.TextIOWrapper) -> str:
+    stream.seek(0)
+    return stream.read()
+
+
+def _mkdir(path: Path, mode: int = 0o777, parents: bool = False, exist_ok: bool = False) -> None:
+    """Refuses what a file system would; makes nothing."""
+    del mode, parents
+    try:
+        os.stat(path)
+    except FileNotFoundError:
+        raise WouldStart from None
+    if exist_ok and path.is_dir():
+        return
+    raise FileExistsError(errno.EEXIST, os.strerror(errno.EEXIST), str(path))
+
+
+def _would_start(*_: Any, **__: Any) -> Any:
+    raise WouldStart
+
+
+def _must_not_start(*args: Any, **__: Any) -> Any:
+    raise AssertionError(f"a process would be started: {args}")
