@@ -13,7 +13,7 @@ import zlib
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from pathlib import Path
-from typing import NamedTuple, TypeVar
+from typing import Final, NamedTuple, TypeVar
 
 from gmijax.errors import ConfigError
 
@@ -51,6 +51,10 @@ class Host(NamedTuple):
     memory_mib: float | None = None
     threads: int | None = None
     open_files: int | None = None
+
+
+UNKNOWN_HOST: Final = Host()
+"""Takes any number of GMIs."""
 
 
 class _Need(NamedTuple):

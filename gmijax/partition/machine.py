@@ -8,7 +8,13 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
-from gmijax.partition.host_limits import CgroupLimits, Host, detect_host, usable_cores
+from gmijax.partition.host_limits import (
+    UNKNOWN_HOST,
+    CgroupLimits,
+    Host,
+    detect_host,
+    usable_cores,
+)
 from gmijax.partition.mps_control import (
     DEFAULT_PIPE_DIRECTORY,
     PIPE_VARIABLE,
@@ -46,7 +52,7 @@ class Machine:
     mps_control: Path | None = None
     driver_version: str | None = None
     operator_daemon: Path | None = None
-    host: Host = Host()
+    host: Host = UNKNOWN_HOST
     gpu_problem: str | None = None
     warnings: tuple[str, ...] = ()
 

@@ -16,8 +16,8 @@ from gmijax import doctor
 from gmijax.control import sight
 from gmijax.control.diagnosis import Diagnosis, diagnose
 from gmijax.control.sight import REQUIRED, JaxView, Sight, ask_jax, try_mps
-from gmijax.partition.machine import Machine
 from gmijax.partition import nvidia
+from gmijax.partition.machine import Machine
 from gmijax.partition.nvidia import list_gpus, nvml_problem
 
 MPS = Path("/usr/bin/nvidia-cuda-mps-control")

@@ -80,9 +80,7 @@ def test_what_there_is_room_for_is_planned():
 def test_each_limit_is_told(host: Host, said: str):
     with pytest.raises(ConfigError) as error:
         planned(two_cores(host), gmis_per_gpu=8)
-    assert str(error.value) == (
-        f"plan.gmis_per_gpu=8: 8 GMIs on this machine need about {said}"
-    )
+    assert str(error.value) == (f"plan.gmis_per_gpu=8: 8 GMIs on this machine need about {said}")
 
 
 def test_one_gmi_may_always_try():
@@ -173,9 +171,7 @@ def test_without_control_groups_there_are_no_limits(tmp_path: Path):
     assert (found.memory_mib(), found.threads(), found.cpu_quota()) == (None, None, None)
 
 
-@pytest.mark.parametrize(
-    ("quota", "count"), [(None, 8), (0.2, 1), (1.5, 2), (8.0, 8), (64.0, 8)]
-)
+@pytest.mark.parametrize(("quota", "count"), [(None, 8), (0.2, 1), (1.5, 2), (8.0, 8), (64.0, 8)])
 def test_a_quota_of_time_is_as_many_cores(quota: float | None, count: int):
     cores = tuple(range(3, 11))
     taken = usable_cores(cores, quota, "host")
@@ -191,5 +187,5 @@ def test_containers_of_one_machine_take_different_cores():
 
 def test_a_machine_with_gpus_has_its_limits_too():
     assert machine(1).gpus == (gpu(0),)
-    with pytest.raises(ConfigError, match="at most 1$"):
+    with pytest.raises(ConfigError, match=r"at most 1$"):
         planned(machine(2, host=Host(memory_mib=1500)), gpus=2)
