@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import json
 import os
-import tempfile
+import secrets
 from collections.abc import Mapping
 from dataclasses import dataclass
 from datetime import datetime
@@ -159,15 +159,15 @@ def create_run(
 def write_json(path: Path, data: Mapping[str, Any]) -> None:
     """Writes `data` so that a reader sees the old file or the new one, never half a file."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
+    temporary = path.with_name(f".{path.name}.{secrets.token_hex(4)}")
     try:
-        with os.fdopen(handle, "w") as file:
+        # As any new file, for whom the user's umask lets read it: mkstemp would not ask.
+        with temporary.open("x") as file:
             json.dump(data, file, indent=2)
             file.write("\n")
-        os.chmod(temporary, 0o644)
         os.replace(temporary, path)
     except BaseException:
-        Path(temporary).unlink(missing_ok=True)
+        temporary.unlink(missing_ok=True)
         raise
 
 

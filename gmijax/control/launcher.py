@@ -16,6 +16,7 @@ from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from gmijax.cachedir import cache_folder
 from gmijax.collectives.memory import create_exchange
 from gmijax.config import RunConfig, ServeRunConfig
 from gmijax.errors import BackendUnavailable, GmijaxError, JobInterrupted
@@ -173,8 +174,7 @@ def environment_of(
 
 def compilation_cache_dir() -> Path:
     """Where compiled programs stay between runs, unless JAX_COMPILATION_CACHE_DIR says else."""
-    base = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
-    return Path(base) / "gmijax" / "xla"
+    return cache_folder() / "xla"
 
 
 def _enter_backend(held: ExitStack, launch: Launch) -> tuple[Launch, Backend]:

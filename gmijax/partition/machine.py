@@ -8,6 +8,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
+from gmijax.cachedir import why_temporary
 from gmijax.partition.host_limits import (
     UNKNOWN_HOST,
     CgroupLimits,
@@ -44,7 +45,7 @@ class Machine:
       host: what is left of memory, threads and open files.
       gpu_problem: why there are no GPUs although NVIDIA's driver is there; None where it works,
         there is none, or the user hides all GPUs.
-      warnings: what is here and is not used, one sentence each.
+      warnings: what is here and is not used or cannot be, one sentence each.
     """
 
     gpus: tuple[Gpu, ...]
@@ -83,7 +84,10 @@ def detect_machine() -> Machine:
         operator_daemon=daemon,
         host=detect_host(),
         gpu_problem=None if listed or is_hidden else gpu_problem(),
-        warnings=(*(() if gpus else _other_accelerators()), *filter(None, (stranger,))),
+        warnings=(
+            *(() if gpus else _other_accelerators()),
+            *filter(None, (stranger, why_temporary())),
+        ),
     )
 
 
