@@ -1,4 +1,4 @@
-"""Where gmijax keeps what is found again: compiled programs, profiles, measurements. No jax here."""
+"""Where gmijax keeps compiled programs, profiles and measurements. No jax here."""
 
 from __future__ import annotations
 
@@ -54,7 +54,8 @@ def _temporary() -> Path:
         found = folder.lstat()
     except OSError as error:
         raise ConfigError(
-            f"no home folder that can be written, and {folder} cannot be used ({error.strerror}); {_ADVICE}"
+            f"no home folder that can be written, and {folder} cannot be used "
+            f"({error.strerror}); {_ADVICE}"
         ) from None
     # What others can write to would be run by us: compiled programs are code.
     if not stat.S_ISDIR(found.st_mode) or found.st_uid != os.geteuid() or found.st_mode & 0o077:

@@ -71,21 +71,21 @@ def play(config: PlayConfig, *, show: bool = False) -> Evaluation:
             "allowed without it are auto, off"
         )
     checkpoint = _find(config)
-    config = dataclasses.replace(
-        config,
-        checkpoint=str(checkpoint),
-        run=dataclasses.replace(config.run, dir=str(_run_of(checkpoint))),
-    )
     meta = CheckpointMeta.read(checkpoint)
     # Before a process is started, which would find it bad too.
-    env, _ = trained_config(checkpoint)
+    saved, _ = trained_config(checkpoint)
+    env = source.opened(saved, config.run.env)
     require_task(str(env.name), env.suite)
+    run = dataclasses.replace(config.run, dir=str(_run_of(checkpoint)))
+    if env.suite == "custom":
+        run = dataclasses.replace(run, env=env.name, env_sha256=env.source_sha256)
+    config = dataclasses.replace(config, checkpoint=str(checkpoint), run=run)
     if config.randomize == "on" and not env.randomization:
         raise ConfigError("randomize=on: env.randomization of the run names nothing to draw")
     paths = _prepare(config, meta.env_steps)
     console = Console(quiet=not show, soft_wrap=True, highlight=False)
     console.print(f"checkpoint: {checkpoint}", markup=False)
-    if changed := source.changes(source.pinned(env), dataclasses.asdict(env)):
+    if changed := source.changes(env, dataclasses.asdict(saved)):
         console.print(changed, markup=False)
     with console.status(f"playing {config.num_envs} episodes"):
         run_gmis(_launch(config, paths, detect_machine()))
