@@ -156,6 +156,21 @@ def create_run(
     raise ConfigError(f"{key}={root}: no free name")
 
 
+def require_new_run(run_dir: str | None, name: str | None) -> None:
+    """Refuses what `create_run` would, before something is started that takes long.
+
+    Raises:
+      ConfigError: the folder that is named exists already.
+    """
+    if (run_dir or name) and _named(run_dir, name).exists():
+        key = "run.dir" if run_dir else "run.name"
+        raise ConfigError(f"{key}={_named(run_dir, name)}: the run folder exists already")
+
+
+def _named(run_dir: str | None, name: str | None) -> Path:
+    return Path(run_dir) if run_dir else RUNS / str(name)
+
+
 def write_json(path: Path, data: Mapping[str, Any]) -> None:
     """Writes `data` so that a reader sees the old file or the new one, never half a file."""
     path.parent.mkdir(parents=True, exist_ok=True)

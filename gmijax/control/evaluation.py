@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any, Final, NamedTuple
 
 from rich.console import Console
+from rich.markup import escape
 from rich.table import Table
 
 from gmijax.config import PlanConfig, PlayConfig, ReduceConfig
@@ -189,7 +190,7 @@ def _table(returns: Mapping[str, Any]) -> Table:
     how = "mean actions" if returns["deterministic"] else "sampled actions"
     diverged = returns["num_diverged"]
     table = Table(
-        title=f"{returns['env']} after {returns['env_steps']:,} env steps, {how}",
+        title=escape(f"{returns['env']} after {returns['env_steps']:,} env steps, {how}"),
         caption=(
             f"{returns['num_envs']} episodes: {returns['num_terminated']} terminated"
             f"{f' ({diverged} of them diverged)' if diverged else ''}, "
@@ -204,5 +205,5 @@ def _table(returns: Mapping[str, Any]) -> Table:
     rows |= {f"  {name}": term for name, term in returns["terms"].items()}
     rows |= returns["metrics"]
     for name, row in rows.items():
-        table.add_row(name, *(f"{row[key]:.2f}" for key in ("mean", "std", "min", "max")))
+        table.add_row(escape(name), *(f"{row[key]:.2f}" for key in ("mean", "std", "min", "max")))
     return table

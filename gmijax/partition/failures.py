@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from gmijax import errors
-from gmijax.errors import CollectiveError, ConfigError, GmiFailed, GmijaxError
+from gmijax.errors import CollectiveError, ConfigError, GmiFailed, GmijaxError, printable
 from gmijax.rundir import GmiPaths, read_json
 
 _TAIL_BYTES = 8192
@@ -89,14 +89,15 @@ def last_line(path: Path) -> str:
             lines = file.read().decode(errors="replace").splitlines()
     except OSError:
         return ""
-    return next((line.strip() for line in reversed(lines) if line.strip()), "")[:_MAX_LINE]
+    shown = (printable(line).strip() for line in reversed(lines))
+    return next(filter(None, shown), "")[:_MAX_LINE]
 
 
 def _own_error(path: Path) -> tuple[str | None, str]:
     try:
         data: dict[str, Any] = read_json(path)
         lines = str(data["message"]).strip().splitlines()
-        return str(data["type"]), lines[0][:_MAX_LINE] if lines else ""
+        return str(data["type"]), printable(lines[0])[:_MAX_LINE] if lines else ""
     except (OSError, json.JSONDecodeError, KeyError, TypeError):
         return None, ""
 
