@@ -14,7 +14,9 @@ import pytest
 from gmijax.errors import CollectiveError, ConfigError, PeerLost, PipeClosed
 from gmijax.partition.rendezvous import reserved_address
 
-zmq = pytest.importorskip("zmq")
+pytest.importorskip("zmq")
+
+import zmq
 
 from gmijax.collectives.channel import remote
 from gmijax.collectives.channel.connection import ENV_KEY
