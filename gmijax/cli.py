@@ -120,8 +120,7 @@ def choices(group: str) -> list[str]:
 
 
 def _build(name: str, cls: type[C], overrides: Sequence[str]) -> C:
-    if name != "play":
-        overrides = [part for text in overrides for part in _with_custom_task(text)]
+    overrides = [part for text in overrides for part in _with_custom_task(name, text)]
     data = _compose_dict(name, [*_algorithm_of_resumed(name, overrides), *overrides])
     if cls is ServeConfig:
         _check_task_key(_parse(overrides))
@@ -177,12 +176,14 @@ def _check_override(name: str, item: Override) -> None:
         raise ConfigError(f"{key}={item.value()}: unknown{close}")
 
 
-def _with_custom_task(override: str) -> tuple[str, ...]:
+def _with_custom_task(name: str, override: str) -> tuple[str, ...]:
     """`env=path/to/file.py:make` in words that hydra knows; anything else as it is."""
     key, _, value = override.partition("=")
     if key != "env" or not re.search(r"\.py(:|$)", value):
         return (override,)
     quoted = value.replace("\\", "\\\\").replace("'", "\\'")
+    if name == "play":  # Which task it is the run says.
+        return (f"run.env='{quoted}'",)
     return "env=custom", f"env.name='{quoted}'"
 
 
@@ -247,6 +248,8 @@ def _on_top_of_saved(
         merged["env"]["randomization"] = saved["env"]["randomization"]
     for item in items:
         key = item.key_or_group
+        if key == "env.name":  # Whatever the file holds by now is meant.
+            merged["env"]["source_sha256"] = None
         if (key, item.value()) == ("env", "custom") and suite == "custom":
             continue  # The file may have moved; `env.name` says where to.
         if _copy_key(key, data, merged):

@@ -18,8 +18,23 @@ GmijaxError
 
 from __future__ import annotations
 
+import re
 import time
+import unicodedata
 from typing import NamedTuple
+
+_TERMINAL_COMMAND = re.compile(r"\x1b(?:\[[0-?]*[ -/]*[@-~]|\][^\x07\x1b]*(?:\x07|\x1b\\)?|[ -~])")
+"""What a terminal obeys and does not show: colours, the cursor, its title."""
+
+
+def printable(text: str) -> str:
+    """One line of somebody's output without what a terminal would obey.
+
+    Commands of terminals and control characters go, among them those that turn the direction of
+    writing; tabs become blanks.
+    """
+    shown = _TERMINAL_COMMAND.sub("", text).replace("\t", " ")
+    return "".join(c for c in shown if unicodedata.category(c) not in ("Cc", "Cf"))
 
 
 class GmijaxError(Exception):

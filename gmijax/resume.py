@@ -157,6 +157,9 @@ def saved_config(checkpoint: Path) -> dict[str, Any]:
         raise ConfigError(f"{path}: broken ({error})") from None
     if not all(isinstance(saved.get(group), dict) for group in ("env", "algo", "run")):
         raise ConfigError(f"{path}: not the configuration of a training run")
+    if saved["env"].get("suite") == "custom":
+        # A file of which nothing is noted is none that can be recognised.
+        saved["env"]["source_sha256"] = saved["env"].get("source_sha256") or ""
     return saved
 
 

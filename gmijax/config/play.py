@@ -14,6 +14,13 @@ class PlayRunConfig:
     """The run to play."""
 
     dir: str | None = doc("run folder, or `last`; null: the run of `checkpoint`, else `last`")
+    env: str | None = doc(
+        "the run's custom task, PATH.py:FUNCTION, where its file has changed or moved since; "
+        "env=PATH.py:FUNCTION is short for it; null: as the run noted it",
+        default=None,
+    )
+    # Digest of that file: the controller notes it for its child.
+    env_sha256: str | None = None
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -16,9 +16,9 @@ from gmijax.collectives.channel.build import Places, create_channels, require_ch
 from gmijax.config import A3cConfig, TrainConfig
 from gmijax.errors import ConfigError
 from gmijax.partition.machine import Machine
-from gmijax.partition.placement import place
+from gmijax.partition.placement import num_gmis_of, place
 from gmijax.partition.plan import Plan
-from gmijax.partition.planner import make_plan
+from gmijax.partition.planner import make_plan, require_host
 from gmijax.partition.reduction import why_not_intra
 from gmijax.partition.templates import AGENT, TRAINER, Group, group_of
 
@@ -63,6 +63,8 @@ def plan_decoupled(config: TrainConfig, num_envs: int, machine: Machine) -> Plan
             "reduce.selection=measured: for jobs in which every GMI trains; with algo=a3c allowed "
             "are paper, device"
         )
+    if config.plan.layout is None:
+        require_host(*num_gmis_of(config.plan), config.plan, machine)
     placed = place(config.plan)
     plan = make_plan(
         placed.plan,

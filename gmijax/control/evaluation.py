@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any, Final, NamedTuple
 
 from rich.console import Console
+from rich.markup import escape
 from rich.table import Table
 
 from gmijax.config import PlanConfig, PlayConfig, ReduceConfig
@@ -76,21 +77,21 @@ def play(config: PlayConfig, *, show: bool = False) -> Evaluation:
             "allowed without it are auto, off"
         )
     checkpoint = _find(config)
-    config = dataclasses.replace(
-        config,
-        checkpoint=str(checkpoint),
-        run=dataclasses.replace(config.run, dir=str(_run_of(checkpoint))),
-    )
     meta = CheckpointMeta.read(checkpoint)
     # Before a process is started, which would find it bad too.
-    env, _ = trained_config(checkpoint)
+    saved, _ = trained_config(checkpoint)
+    env = source.opened(saved, config.run.env)
     require_task(str(env.name), env.suite)
+    run = dataclasses.replace(config.run, dir=str(_run_of(checkpoint)))
+    if env.suite == "custom":
+        run = dataclasses.replace(run, env=env.name, env_sha256=env.source_sha256)
+    config = dataclasses.replace(config, checkpoint=str(checkpoint), run=run)
     if config.randomize == "on" and not env.randomization:
         raise ConfigError("randomize=on: env.randomization of the run names nothing to draw")
     paths = _prepare(config, meta.env_steps)
     console = Console(quiet=not show, soft_wrap=True, highlight=False)
     console.print(f"checkpoint: {checkpoint}", markup=False)
-    if changed := source.changes(source.pinned(env), dataclasses.asdict(env)):
+    if changed := source.changes(env, dataclasses.asdict(saved)):
         console.print(changed, markup=False)
     with console.status(f"playing {config.num_envs} episodes"):
         run_gmis(_launch(config, paths, detect_machine()))
@@ -194,7 +195,7 @@ def _table(returns: Mapping[str, Any]) -> Table:
     how = "mean actions" if returns["deterministic"] else "sampled actions"
     diverged = returns["num_diverged"]
     table = Table(
-        title=f"{returns['env']} after {returns['env_steps']:,} env steps, {how}",
+        title=escape(f"{returns['env']} after {returns['env_steps']:,} env steps, {how}"),
         caption=(
             f"{returns['num_envs']} episodes: {returns['num_terminated']} terminated"
             f"{f' ({diverged} of them diverged)' if diverged else ''}, "
@@ -209,5 +210,5 @@ def _table(returns: Mapping[str, Any]) -> Table:
     rows |= {f"  {name}": term for name, term in returns["terms"].items()}
     rows |= returns["metrics"]
     for name, row in rows.items():
-        table.add_row(name, *(f"{row[key]:.2f}" for key in ("mean", "std", "min", "max")))
+        table.add_row(escape(name), *(f"{row[key]:.2f}" for key in ("mean", "std", "min", "max")))
     return table

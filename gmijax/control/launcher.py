@@ -19,6 +19,7 @@ from pathlib import Path
 from types import FrameType
 from typing import Final
 
+from gmijax.cachedir import cache_folder
 from gmijax.collectives.memory import create_exchange
 from gmijax.config import RunConfig, ServeRunConfig
 from gmijax.control.kinds import JobKind
@@ -198,8 +199,7 @@ def program_cache_of(launch: Launch) -> Path:
 
 def compilation_cache_dir() -> Path:
     """Where compiled programs stay between runs, unless JAX_COMPILATION_CACHE_DIR says else."""
-    base = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
-    return Path(base) / "gmijax" / "xla"
+    return cache_folder() / "xla"
 
 
 def _enter_backend(held: ExitStack, launch: Launch) -> tuple[Launch, Backend]:

@@ -7,15 +7,18 @@ same job measures nothing.
 
 from __future__ import annotations
 
+import fcntl
 import hashlib
 import json
 import os
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
+from gmijax.cachedir import cache_folder
 from gmijax.errors import ConfigError
 from gmijax.partition.points import Measured, NotRunnable, Point
 from gmijax.rundir import read_json, write_json
@@ -81,6 +84,7 @@ class ProfileStore:
           ConfigError: the folder cannot be used.
         """
         self._key = dict(key)
+        self._note = note
         digest = hashlib.sha256(json.dumps(self._key, sort_keys=True).encode()).hexdigest()
         name = f"{_slug(key['device'])}-{_slug(key['task'])}-{digest[:_DIGEST_LENGTH]}.json"
         self.path = folder / name
@@ -90,7 +94,7 @@ class ProfileStore:
             raise ConfigError(
                 f"search.store={folder}: cannot be used ({error.strerror})"
             ) from None
-        self._records = self._load(note)
+        self._records = self._load()
 
     def get(self, mode: str, point: Point) -> Measured | NotRunnable | None:
         """What a point did, None where it was not profiled yet."""
@@ -103,16 +107,19 @@ class ProfileStore:
         Raises:
           ConfigError: it cannot be written.
         """
-        self._records[_name(mode, point)] = _Record.of(result, wall_s)
-        profiles = {name: _without_none(record) for name, record in self._records.items()}
+        name, record = _name(mode, point), _Record.of(result, wall_s)
         try:
-            write_json(self.path, {"key": self._key, "profiles": profiles})
+            with _locked(self.path.with_suffix(".lock")):
+                # What another search has found meanwhile stays.
+                self._records = {**self._records, **self._load(), name: record}
+                profiles = {key: _without_none(one) for key, one in self._records.items()}
+                write_json(self.path, {"key": self._key, "profiles": profiles})
         except OSError as error:
             raise ConfigError(
                 f"search.store={self.path.parent}: cannot be written ({error.strerror})"
             ) from None
 
-    def _load(self, note: Callable[[str], None]) -> dict[str, _Record]:
+    def _load(self) -> dict[str, _Record]:
         if not self.path.exists():
             return {}
         try:
@@ -121,14 +128,22 @@ class ProfileStore:
         except (OSError, ValueError, KeyError, TypeError, AttributeError, ConfigError) as error:
             aside = _moved_aside(self.path)
             what = " ".join(str(error).split()) or type(error).__name__
-            note(f"profile store {self.path} is broken ({what}): moved to {aside}")
+            self._note(f"profile store {self.path} is broken ({what}): moved to {aside}")
             return {}
 
 
 def default_folder() -> Path:
     """Where profiles are kept unless `search.store` names a folder."""
-    base = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
-    return Path(base) / "gmijax" / "profiles"
+    return cache_folder() / "profiles"
+
+
+@contextmanager
+def _locked(path: Path) -> Iterator[None]:
+    """Keeps other searches out of a store; file systems that know no locks go without."""
+    with path.open("w") as file:
+        with suppress(OSError):
+            fcntl.flock(file, fcntl.LOCK_EX)
+        yield
 
 
 def _moved_aside(path: Path) -> Path:

@@ -9,6 +9,7 @@ from typing import Any, Protocol
 
 from rich.console import Console
 from rich.live import Live
+from rich.markup import escape
 from rich.table import Table
 
 from gmijax.partition.gmi_process import GmiStatus
@@ -126,7 +127,8 @@ class ConsoleProgress:
         bar = f"[green]{'━' * filled}[/][dim]{'━' * (_BAR_WIDTH - filled)}[/]"
         grid.add_row(f"{bar} {self._text() if self._line else 'starting'}")
         for gmi in gmis:
-            grid.add_row(f"[dim]GMI {gmi.gmi}: {gmi.state}, iteration {gmi.iteration}[/]")
+            state = escape(gmi.state)
+            grid.add_row(f"[dim]GMI {gmi.gmi}: {state}, iteration {gmi.iteration}[/]")
         return grid
 
     def _text(self) -> str:

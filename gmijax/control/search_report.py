@@ -84,7 +84,7 @@ class SearchDisplay:
         self._bar.update(
             self._task,
             completed=time.monotonic() - self._started_s,
-            description=f"{what}: GMI {slowest.gmi} {slowest.state}",
+            description=escape(f"{what}: GMI {slowest.gmi} {slowest.state}"),
         )
 
     def done(self, what: str, point: Point, result: Measured | NotRunnable, wall_s: float) -> None:
@@ -226,7 +226,7 @@ def draw(outcome: Outcome, picture: Path, title: str) -> None:
         axes.set(xlabel="environments per GMI", ylabel=what, xscale="log", ylim=(0, None))
         axes.grid(alpha=0.3)
     left.legend(title="GMIs per GPU", fontsize="small")
-    figure.suptitle(title)
+    figure.suptitle(title, parse_math=False)
     figure.savefig(picture, dpi=120)
 
 

@@ -227,6 +227,13 @@ class _Search:
 
     def _profile(self, point: Point, mode: Mode) -> Measured | NotRunnable:
         """What a point did: from the store, else from a job of its own."""
+        try:
+            plan_at(self._workload, point, mode, self._machine)
+        except ConfigError as error:
+            # Not kept: there may be more room, or another driver, next time.
+            refused = NotRunnable(str(error))
+            self._display.done(f"{point} ({mode})", point, refused, 0.0)
+            return refused
         known = self._store.get(mode, point)
         if known is not None and not self._may_end_now(known):
             return known

@@ -31,7 +31,14 @@ from gmijax.partition.plan import Plan
 from gmijax.partition.planner import make_plan
 from gmijax.partition.templates import SIMULATOR, group_of
 from gmijax.resume import CheckpointMeta, find_checkpoint, trained_config
-from gmijax.rundir import RunPaths, create_run, locked, read_json, write_json
+from gmijax.rundir import (
+    RunPaths,
+    create_run,
+    locked,
+    read_json,
+    require_new_run,
+    write_json,
+)
 from gmijax.schema import to_dict
 from gmijax.sim import source
 from gmijax.sim.impl import choose_impl
@@ -116,6 +123,7 @@ def _prepared(config: ServeConfig, console: Console) -> _Job:
     """Everything that can be checked and decided without starting anything."""
     require_task(str(config.env.name), config.env.suite)
     config = dataclasses.replace(config, env=source.pinned(config.env))
+    require_new_run(None, config.run.name)  # Before a search, which takes minutes.
     config, wanted_impl = _with_checkpoint(config)
     machine = detect_machine()
     config, found = decided(

@@ -29,7 +29,17 @@ _AMPERE: Final = 8
 def choose_backend(
     plan: PlanConfig, layout: Layout, machine: Machine, purpose: Purpose
 ) -> tuple[BackendName, str]:
-    """The backend for `plan.backend=auto`, and why, in words."""
+    """The backend for `plan.backend=auto`, and why, in words.
+
+    Raises:
+      BackendUnavailable: the driver is broken. Who has GPUs does not want to go on without them
+        unless that is said.
+    """
+    if machine.gpu_problem is not None:
+        raise BackendUnavailable(
+            f"plan.backend=auto: the NVIDIA driver does not work: {machine.gpu_problem}; "
+            "plan.backend=cpu (or CUDA_VISIBLE_DEVICES=-1) goes on without GPUs"
+        )
     if not machine.gpus:
         return "cpu", "no usable NVIDIA GPU here, so GPUs are virtual"
     most = max(len(gmis) for gmis in layout.gmis_of_gpu)

@@ -31,6 +31,8 @@ _LOCAL_HOST = "127.0.0.1"
 # compile different programs.
 _NO_SHARED_AUTOTUNING = "--xla_gpu_shard_autotuning=false"
 
+_NCCL_INTERFACE = "NCCL_SOCKET_IFNAME"
+
 # XLA's client for GPUs goes on looking for the service that ring members leave before they train,
 # and warns of it twice a second, for as long as the job lasts.
 _LOG_LEVEL, _ERRORS_ONLY = "TF_CPP_MIN_LOG_LEVEL", "2"
@@ -78,6 +80,8 @@ def gmi_environment(
         environment.update({ENV_RENDEZVOUS: rendezvous, "no_grpc_proxy": _LOCAL_HOST})
         if plan.backend != "cpu":
             flags = extend_xla_flags(flags, _NO_SHARED_AUTOTUNING)
+            # All GMIs are on this host, and NCCL's sockets are open to whoever reaches them.
+            environment.setdefault(_NCCL_INTERFACE, "lo")
             environment.setdefault(_LOG_LEVEL, _ERRORS_ONLY)
     if flags:
         environment[_XLA_FLAGS] = flags

@@ -10,12 +10,14 @@ from typing import NamedTuple
 
 from gmijax import errors
 from gmijax.errors import (
-    CollectiveError,
     CollectiveTimeout,
     ConfigError,
     GmiFailed,
     GmijaxError,
+    PeerLost,
+    PipeClosed,
     ReportedError,
+    printable,
 )
 
 _TAIL_BYTES = 8192
@@ -42,7 +44,7 @@ class Failure(NamedTuple):
     @property
     def is_consequence(self) -> bool:
         """Whether the GMI says that another one is to blame."""
-        return self._is(CollectiveError)
+        return self._is(PeerLost, CollectiveTimeout, PipeClosed)
 
     @property
     def is_timeout(self) -> bool:
@@ -55,11 +57,11 @@ class Failure(NamedTuple):
             return ConfigError(_first_line(self.error.message))
         return GmiFailed(self.gmi, self.reason, iteration=self.iteration, error=self.error)
 
-    def _is(self, parent: type[GmijaxError]) -> bool:
+    def _is(self, *parents: type[GmijaxError]) -> bool:
         if self.exit_code <= 0 or self.error is None:
             return False
         found = getattr(errors, self.error.type, None)
-        return isinstance(found, type) and issubclass(found, parent)
+        return isinstance(found, type) and issubclass(found, parents)
 
 
 def describe_exit(
@@ -106,9 +108,10 @@ def last_line(path: Path) -> str:
             lines = file.read().decode(errors="replace").splitlines()
     except OSError:
         return ""
-    return next((line.strip() for line in reversed(lines) if line.strip()), "")[:_MAX_LINE]
+    shown = (printable(line).strip() for line in reversed(lines))
+    return next(filter(None, shown), "")[:_MAX_LINE]
 
 
 def _first_line(text: str) -> str:
     lines = text.strip().splitlines()
-    return lines[0][:_MAX_LINE] if lines else ""
+    return printable(lines[0])[:_MAX_LINE] if lines else ""

@@ -3,16 +3,32 @@
 from __future__ import annotations
 
 import os
+import platform
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
+from gmijax.cachedir import why_temporary
+from gmijax.partition.host_limits import (
+    UNKNOWN_HOST,
+    CgroupLimits,
+    Host,
+    detect_host,
+    usable_cores,
+)
 from gmijax.partition.mps_control import (
     DEFAULT_PIPE_DIRECTORY,
     PIPE_VARIABLE,
     MpsControl,
     find_mps_control,
 )
-from gmijax.partition.nvidia import Gpu, driver_version, list_gpus
+from gmijax.partition.nvidia import Gpu, driver_version, gpu_problem, list_gpus
+
+_HIDES_ALL = ("", "-1", "NoDevFiles")
+"""Values of `CUDA_VISIBLE_DEVICES` that say on purpose that there are no GPUs."""
+
+_DEVICES = Path("/dev")
+_OTHERS = {"kfd": "a GPU for ROCm", "accel[0-9]*": "a TPU"}
 
 
 @dataclass(frozen=True)
@@ -21,10 +37,15 @@ class Machine:
 
     Attributes:
       gpus: GPUs that the job may use, in order of preference.
-      cpu_cores: ids of the CPU cores that this process may run on.
+      cpu_cores: ids of the CPU cores that a job may use: those that this process may run on, no
+        more than its control group gets time for.
       mps_control: program of the MPS daemon, None where it is not installed.
       driver_version: of the NVIDIA driver, None without one.
       operator_daemon: pipe directory of a running MPS daemon that somebody else started.
+      host: what is left of memory, threads and open files.
+      gpu_problem: why there are no GPUs although NVIDIA's driver is there; None where it works,
+        there is none, or the user hides all GPUs.
+      warnings: what is here and is not used or cannot be, one sentence each.
     """
 
     gpus: tuple[Gpu, ...]
@@ -32,6 +53,9 @@ class Machine:
     mps_control: Path | None = None
     driver_version: str | None = None
     operator_daemon: Path | None = None
+    host: Host = UNKNOWN_HOST
+    gpu_problem: str | None = None
+    warnings: tuple[str, ...] = ()
 
     @property
     def driver_major(self) -> int:
@@ -46,14 +70,24 @@ def detect_machine() -> Machine:
     An inherited `CUDA_VISIBLE_DEVICES` restricts the GPUs, as a batch system that sets it
     expects; GPUs keep their indices of nvidia-smi.
     """
-    gpus = visible_gpus(list_gpus(), os.environ.get("CUDA_VISIBLE_DEVICES"))
+    selection = os.environ.get("CUDA_VISIBLE_DEVICES")
+    listed = list_gpus()
+    gpus = visible_gpus(listed, selection)
+    is_hidden = selection is not None and selection.strip() in _HIDES_ALL
     mps_control = find_mps_control() if gpus else None
+    daemon, stranger = _operator_daemon(mps_control) if mps_control else (None, None)
     return Machine(
         gpus=gpus,
-        cpu_cores=_cpu_cores(),
+        cpu_cores=usable_cores(_cpu_cores(), CgroupLimits().cpu_quota(), platform.node()),
         mps_control=mps_control,
         driver_version=driver_version(),
-        operator_daemon=_operator_daemon(mps_control) if mps_control else None,
+        operator_daemon=daemon,
+        host=detect_host(),
+        gpu_problem=None if listed or is_hidden else gpu_problem(),
+        warnings=(
+            *(() if gpus else _other_accelerators()),
+            *filter(None, (stranger, why_temporary())),
+        ),
     )
 
 
@@ -101,10 +135,29 @@ def _cpu_cores() -> tuple[int, ...]:
     return tuple(range(os.cpu_count() or 1))
 
 
-def _operator_daemon(program: Path) -> Path | None:
+def _operator_daemon(program: Path) -> tuple[Path | None, str | None]:
+    """The pipe directory of a daemon that runs, or why the one that is there is left alone."""
     named = os.environ.get(PIPE_VARIABLE)
     directory = Path(named) if named else DEFAULT_PIPE_DIRECTORY
     # Asking where there is no directory would cost a process start on every run.
-    if directory.is_dir() and MpsControl(program, directory).is_answering():
-        return directory
-    return None
+    if not directory.is_dir():
+        return None, None
+    if not named and (owner := _strange_owner(directory)) is not None:
+        return None, (
+            f"warning: {directory} belongs to user {owner}, so the MPS daemon there is not used; "
+            f"{PIPE_VARIABLE}={directory} says that it is to be"
+        )
+    return (directory if MpsControl(program, directory).is_answering() else None), None
+
+
+def _strange_owner(directory: Path) -> int | None:
+    """Who owns a directory that everybody could have made; None if root or this user does."""
+    owners = (directory.lstat().st_uid, directory.stat().st_uid)
+    return next((owner for owner in owners if owner not in (0, os.geteuid())), None)
+
+
+def _other_accelerators() -> Iterator[str]:
+    """What else could compute here, as far as device files tell."""
+    for pattern, what in _OTHERS.items():
+        if found := sorted(_DEVICES.glob(pattern)):
+            yield f"warning: {found[0]} looks like {what}, which gmijax does not use"

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from contextlib import suppress
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import pynvml
 
 _MIB = 1024 * 1024
+_DEVICES = Path("/dev")
 
 
 class MigInstance(NamedTuple):
@@ -81,8 +83,29 @@ def nvml_problem() -> str | None:
         pynvml.nvmlInit()
     except pynvml.NVMLError as error:
         absent = (pynvml.NVML_ERROR_LIBRARY_NOT_FOUND, pynvml.NVML_ERROR_DRIVER_NOT_LOADED)
-        return None if getattr(error, "value", None) in absent else str(error)
+        if getattr(error, "value", None) not in absent:
+            return str(error)
+        devices = sorted(_DEVICES.glob("nvidia[0-9]*"))
+        return f"{error}, although there is {devices[0]}" if devices else None
     pynvml.nvmlShutdown()
+    return None
+
+
+def gpu_problem() -> str | None:
+    """Why `list_gpus` is empty although a driver is there; None where there is nothing to list."""
+    if (problem := nvml_problem()) is not None:
+        return problem
+    try:
+        pynvml.nvmlInit()
+    except pynvml.NVMLError:
+        return None
+    try:
+        for index in range(pynvml.nvmlDeviceGetCount()):
+            _describe(index)
+    except pynvml.NVMLError as error:
+        return str(error)
+    finally:
+        pynvml.nvmlShutdown()
     return None
 
 

@@ -68,6 +68,18 @@ def place(plan: PlanConfig) -> Placement:
     return Placement(placed, trainers, reason)
 
 
+def num_gmis_of(plan: PlanConfig) -> tuple[int, str]:
+    """How many GMIs a job has, and the settings that say so; before they are numbered.
+
+    Raises:
+      ConfigError: as `place`.
+    """
+    serving_gmis, training_gmis = _counts(plan)
+    serving, training, _ = serving_and_training(plan)
+    what = f"plan.serving_gmis_per_gpu={serving_gmis}, plan.training_gmis_per_gpu={training_gmis}"
+    return len(serving) * serving_gmis + len(training) * training_gmis, what
+
+
 def _counts(plan: PlanConfig) -> tuple[int, int]:
     if plan.gmis_per_gpu != 1:
         raise ConfigError(

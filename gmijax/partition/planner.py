@@ -16,6 +16,7 @@ from gmijax.partition.backend_choice import (
     choose_gpus,
     require_backend,
 )
+from gmijax.partition.host_limits import require_room
 from gmijax.partition.layout import Layout
 from gmijax.partition.machine import Machine
 from gmijax.partition.nvidia import Gpu
@@ -72,8 +73,9 @@ def make_plan(
       BackendUnavailable: the wanted backend cannot be had on this machine.
       ConfigError: a value that does not fit the machine or the backend.
     """
+    require_host(*num_gmis_of(plan), plan, machine)
     layout = _layout(plan)
-    reasons: list[str] = []
+    reasons: list[str] = list(machine.warnings)
     if purpose is None:
         wanted = template if plan.template == "auto" else plan.template
         purpose = "serve" if wanted in ("tcg", "tdg") else "train"
@@ -104,6 +106,24 @@ def make_plan(
     )
 
 
+def require_host(num_gmis: int, what: str, plan: PlanConfig, machine: Machine) -> None:
+    """Raises ConfigError if a job, by its settings `what`, has more GMIs than the host takes."""
+    on_cpu = plan.backend == "cpu" or not machine.gpus
+    require_room(num_gmis, what, machine.host, len(machine.cpu_cores), on_cpu=on_cpu)
+
+
+def num_gmis_of(plan: PlanConfig) -> tuple[int, str]:
+    """How many GMIs a job has, and the settings that say so; before there is a layout."""
+    if plan.layout is not None:
+        return sum(map(len, plan.layout)), "plan.layout"
+    num_gpus = plan.gpus if isinstance(plan.gpus, int) else len(plan.gpus)
+    each = plan.gmis_per_gpu
+    if each == "auto":
+        raise ConfigError("plan.gmis_per_gpu=auto: not decided yet; expected an integer")
+    gpus = f", plan.gpus={num_gpus}" if num_gpus > 1 else ""
+    return num_gpus * each, f"plan.gmis_per_gpu={each}{gpus}"
+
+
 def split_cores(cores: Sequence[int], num_gmis: int) -> tuple[tuple[int, ...], ...]:
     """Cores of every GMI: contiguous and disjoint, or one each in turn if there are too few."""
     if len(cores) < num_gmis:
@@ -115,8 +135,7 @@ def split_cores(cores: Sequence[int], num_gmis: int) -> tuple[tuple[int, ...], .
 def _layout(plan: PlanConfig) -> Layout:
     num_gpus = plan.gpus if isinstance(plan.gpus, int) else len(plan.gpus)
     if plan.layout is None:
-        if plan.gmis_per_gpu == "auto":
-            raise ConfigError("plan.gmis_per_gpu=auto: not decided yet; expected an integer")
+        assert plan.gmis_per_gpu != "auto"
         return Layout.even(num_gpus, plan.gmis_per_gpu)
     layout = Layout(plan.layout)
     if not isinstance(plan.gpus, int) and num_gpus != layout.num_gpus:

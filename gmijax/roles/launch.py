@@ -16,7 +16,8 @@ from gmijax.control.kinds import Plain
 from gmijax.control.launcher import Launch, run_gmis
 from gmijax.errors import ConfigError, GmiFailed, GmijaxError
 from gmijax.partition.child import ENV_GMI, ENV_PIPES_FD
-from gmijax.partition.machine import detect_machine
+from gmijax.partition.host_limits import require_room
+from gmijax.partition.machine import Machine, detect_machine
 from gmijax.partition.plan import Plan
 from gmijax.partition.supervisor import Patience
 from gmijax.roles import shipping
@@ -75,6 +76,15 @@ def launch(
         raise ConfigError(f"plan={plan!r}: expected a plan of gmijax.plan, or a GMIManager")
     roles = _roles(role, plan)
     _check_numbers(timeout_s, pipe_mib, start_timeout_s, stall_timeout_s, grace_s)
+    machine = detect_machine()
+    # The plan may come from another machine, or from a time when there was more room here.
+    require_room(
+        plan.layout.num_gmis,
+        "plan",
+        machine.host,
+        len(machine.cpu_cores),
+        on_cpu=plan.backend == "cpu",
+    )
     parcels = [_parcel(each, args) for each in roles]
     run = create_run(run_dir, None, type(roles[0]).__name__.lower())
     config = {
@@ -93,7 +103,7 @@ def launch(
         grace_s=grace_s,
     )
     try:
-        run_gmis(_job(plan, run, patience, config["capacity_bytes"]))
+        run_gmis(_job(plan, machine, run, patience, config["capacity_bytes"]))
         outputs = [_output(run, gmi) for gmi in plan.layout.gmis]
     except GmijaxError as error:
         _explain(error, run)
@@ -101,10 +111,12 @@ def launch(
     return [shipping.load(output) for output in outputs]
 
 
-def _job(plan: Plan, run: RunPaths, patience: Patience, capacity_bytes: int) -> Launch:
+def _job(
+    plan: Plan, machine: Machine, run: RunPaths, patience: Patience, capacity_bytes: int
+) -> Launch:
     return Launch(
         plan=plan,
-        machine=detect_machine(),
+        machine=machine,
         run=run,
         # Roles wait for each other, so they start together.
         kind=Plain(

@@ -40,6 +40,7 @@ def make_worlds(config: EnvConfig, impl: str, *, seed: int, first_env: int, num_
         impl=impl,
         episode_length=config.episode_length,
         max_envs=num_envs,
+        source_sha256=config.source_sha256,
     )
     if config.randomize != "on":
         return env

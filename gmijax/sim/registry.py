@@ -69,6 +69,7 @@ def make_env(
     impl: str = ...,
     episode_length: int | None = ...,
     max_envs: int | None = ...,
+    source_sha256: str | None = ...,
     api: Literal["gmijax"] = ...,
 ) -> Env: ...
 
@@ -81,6 +82,7 @@ def make_env(
     impl: str = ...,
     episode_length: int | None = ...,
     max_envs: int | None = ...,
+    source_sha256: str | None = ...,
     api: Literal["brax"],
 ) -> Any: ...
 
@@ -92,6 +94,7 @@ def make_env(
     impl: str = "auto",
     episode_length: int | None = None,
     max_envs: int | None = None,
+    source_sha256: str | None = None,
     api: Literal["gmijax", "brax"] = "gmijax",
 ) -> Any:
     """Makes a task, with its time limit.
@@ -103,6 +106,7 @@ def make_env(
       episode_length: steps after which an episode is truncated; None: the task's own.
       max_envs: upper bound of environments stepped at once; only `warp` needs it, to size the
         contact buffer that they share. None: `gmijax.sim.physics.WARP_MAX_ENVS`.
+      source_sha256: digest of a custom task's file, which is not executed with another one.
       api: `gmijax` for an `Env`, `brax` for a `brax.envs.Env` without a time limit, as Brax's
         wrappers want it.
 
@@ -118,7 +122,7 @@ def make_env(
         raise ConfigError(f"env.episode_length={episode_length}: must be at least 1")
     if suite == "gmijax" and ".py:" in name:
         suite = "custom"
-    env = _make(name, suite, impl, max_envs)
+    env = _make(name, suite, impl, max_envs, source_sha256)
     if api == "brax":
         require_task("", "brax")
         return importlib.import_module("gmijax.sim.adapters.to_brax").BraxEnv(env)
@@ -127,10 +131,14 @@ def make_env(
     return time_limit(env, episode_length or env.spec.episode_length)
 
 
-def _make(name: str, suite: str, impl: str, max_envs: int | None) -> Env:
+def _make(
+    name: str, suite: str, impl: str, max_envs: int | None, source_sha256: str | None
+) -> Env:
     if suite not in ("gmijax", *SUITES):
         raise ConfigError(f"suite={suite}: allowed are gmijax, {', '.join(SUITES)}")
     require_task(name, suite)
     if suite == "gmijax":
         return importlib.import_module(TASKS[name]).make(impl=impl, max_envs=max_envs)
-    return importlib.import_module(SUITES[suite]).make(name, impl=impl, max_envs=max_envs)
+    noted = {"source_sha256": source_sha256} if suite == "custom" else {}
+    module = importlib.import_module(SUITES[suite])
+    return module.make(name, impl=impl, max_envs=max_envs, **noted)

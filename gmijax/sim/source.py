@@ -55,7 +55,11 @@ def reference(make: Callable[..., Any]) -> str:
 
 
 def pinned(env: EnvConfig) -> EnvConfig:
-    """The same task; a custom one by its absolute path, with the digest of its file."""
+    """The same task; a custom one by its absolute path, with the digest of its file.
+
+    Raises:
+      ConfigError: the file is not there, or its digest is not the one that `env` notes already.
+    """
     if env.suite != "custom":
         return env
     path, function = split(str(env.name))
@@ -63,7 +67,31 @@ def pinned(env: EnvConfig) -> EnvConfig:
         digest = hashlib.sha256(path.read_bytes()).hexdigest()
     except OSError as error:
         raise ConfigError(f"env={path}: cannot be read ({error.strerror})") from None
+    if env.source_sha256 not in (None, digest):
+        # To open a run is not to say that whatever its file holds by now may be executed.
+        raise ConfigError(
+            f"env={path}:{function}: not the file that the run noted (its SHA-256 differs), so it "
+            f"is not executed; env={path}:{function} says that it is meant as it is now"
+        )
     return dataclasses.replace(env, name=f"{path}:{function}", source_sha256=digest)
+
+
+def opened(env: EnvConfig, name: str | None) -> EnvConfig:
+    """The task of a saved run, pinned.
+
+    Args:
+      env: as the run noted it.
+      name: the custom task's file and function as they are now; None: those of the run.
+
+    Raises:
+      ConfigError: see `pinned`, or `name` is that of another task.
+    """
+    if name is None:
+        return pinned(env)
+    named = dataclasses.replace(env, suite="custom", name=name, source_sha256=None)
+    if named.label != env.label:
+        raise ConfigError(f"env={name}: the run was trained on {env.label}")
+    return pinned(named)
 
 
 def changes(env: EnvConfig, saved: Mapping[str, Any]) -> str | None:

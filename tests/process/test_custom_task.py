@@ -54,7 +54,11 @@ def test_a_task_of_ones_own_trains_in_two_gmis_resumes_and_plays(tmp_path: Path)
     assert line["return"] == pytest.approx(line["reward/near"] + line["reward/effort"], rel=1e-4)
 
     file.write_text(TASK.replace('{"near": -', '{"near": jnp.log(-1.0 - 0 * moved[0]) - '))
-    done = train("run.resume=last", "num_timesteps=512", "run.name=second", cwd=tmp_path)
+    again = ("run.resume=last", "num_timesteps=512", "run.name=second")
+    done = train(*again, cwd=tmp_path)
+    assert done.returncode == 2
+    assert f"env={file}:make says that it is meant as it is now" in done.stderr
+    done = train(*again, "env=point.py:make", cwd=tmp_path)
     assert f"custom task: {file}:make has changed since the run was started" in done.stdout
     # The change makes one term not a number: the error names task, step and term.
     assert done.returncode == 1, done.stderr

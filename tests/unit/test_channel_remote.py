@@ -6,18 +6,32 @@ import socket
 import threading
 import time
 from collections.abc import Iterator
+from pathlib import Path
 from typing import Any
 
 import pytest
 
-from gmijax.errors import CollectiveError, PeerLost, PipeClosed
+from gmijax.errors import CollectiveError, ConfigError, PeerLost, PipeClosed
 from gmijax.partition.rendezvous import reserved_address
 
 pytest.importorskip("zmq")
 
+import zmq
+
+from gmijax.collectives.channel import remote
+from gmijax.collectives.channel.connection import ENV_KEY
 from gmijax.collectives.channel.remote import RemoteInlet, RemoteOutlet
 
 CAPACITY = 2**20
+FORGED = remote._HEADER.pack(remote.MAGIC, remote.DATA, 5, 0, 0, 1, 0), b""
+
+
+@pytest.fixture(autouse=True)
+def cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """The secret of this user, elsewhere; none is given."""
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    monkeypatch.delenv(ENV_KEY, raising=False)
+    return tmp_path / "gmijax"
 
 
 @pytest.fixture
@@ -126,3 +140,86 @@ def test_an_address_that_cannot_be_is_named() -> None:
         RemoteInlet("127.0.0.1", 1, 0)
     with pytest.raises(CollectiveError, match=r"no connection with rank 1 at 127.0.0.1 "):
         RemoteOutlet("127.0.0.1", 0, 1, CAPACITY)
+
+
+def test_a_stranger_who_speaks_zeromq_delivers_nothing(address: str) -> None:
+    inlet, outlet = RemoteInlet(address, 1, 0), RemoteOutlet(address, 0, 1, CAPACITY)
+    send(outlet, 1)
+    assert receive(inlet, 1) == [1]
+    context = zmq.Context()
+    stranger = context.socket(zmq.DEALER)
+    stranger.connect(f"tcp://{address}")
+    stranger.send_multipart(FORGED)
+    stranger.send(b"junk")
+    assert why_lost(inlet, 6) is None
+    assert (inlet.num_dropped, len(inlet._next)) == (0, 1)
+    stranger.close(0)
+    context.term()
+    send(outlet, 2)
+    assert receive(inlet, 1) == [2]
+    outlet._connection.close()
+    assert isinstance(why_lost(inlet, 6), PeerLost)
+    inlet.close()
+
+
+def test_who_has_another_secret_delivers_nothing(
+    address: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    inlet = RemoteInlet(address, 1, 0)
+    monkeypatch.setenv(ENV_KEY, "that of another job")
+    stranger = RemoteOutlet(address, 0, 1, CAPACITY)
+    send(stranger, 66)
+    assert why_lost(inlet, 6) is None
+    assert not inlet._next
+    assert not stranger._connection.is_up()
+    stranger._connection.close()
+    inlet.close()
+
+
+def test_junk_of_a_peer_is_dropped_and_counted(address: str) -> None:
+    inlet, outlet = RemoteInlet(address, 1, 0), RemoteOutlet(address, 0, 1, CAPACITY)
+    for junk in (b"", b"junk", b"x" * remote._HEADER.size):
+        outlet._connection.send([junk])
+    send(outlet, 7)
+    assert receive(inlet, 1) == [7]
+    assert inlet.num_dropped == 3
+    inlet._connection.try_send([b"junk"])
+    deadline_s = time.monotonic() + 5.0
+    while not outlet.num_dropped:
+        assert time.monotonic() < deadline_s
+        outlet.load_bytes()
+    outlet.close()
+    inlet.close()
+
+
+def test_a_message_that_is_too_long_is_not_taken(
+    address: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(remote, "MAX_PART_BYTES", 2**16)
+    outlet = RemoteOutlet(address, 0, 1, CAPACITY)
+    assert outlet.max_message_bytes == 2**16
+    inlet = RemoteInlet(address, 1, 0)
+    send(outlet, 1)
+    assert receive(inlet, 1) == [1]
+    outlet._connection.send([b"x" * 2**18])
+    assert why_lost(inlet, 6) is None or inlet.num_dropped == 0
+    outlet._connection.close()
+    inlet.close()
+
+
+def test_a_network_needs_a_secret_that_is_given(
+    cache: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with pytest.raises(ConfigError, match=rf"^channel\.transport=zmq: 0\.0\.0\.0:1 .* {ENV_KEY}"):
+        RemoteInlet("0.0.0.0:1", 1, 0)
+    monkeypatch.setenv(ENV_KEY, "short")
+    with pytest.raises(ConfigError, match="at least 16 characters"):
+        RemoteInlet("127.0.0.1:1", 1, 0)
+    assert not cache.exists()
+
+
+def test_the_secret_of_a_user_is_for_nobody_else(address: str, cache: Path) -> None:
+    RemoteInlet(address, 1, 0).close()
+    [key] = cache.iterdir()
+    assert key.stat().st_mode & 0o777 == 0o600
+    assert len(key.read_text()) == 64

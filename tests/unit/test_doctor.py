@@ -16,6 +16,7 @@ from gmijax import doctor
 from gmijax.control import sight
 from gmijax.control.diagnosis import Diagnosis, diagnose
 from gmijax.control.sight import REQUIRED, JaxView, Sight, ask_jax, try_mps
+from gmijax.partition import nvidia
 from gmijax.partition.machine import Machine
 from gmijax.partition.nvidia import list_gpus, nvml_problem
 
@@ -121,11 +122,12 @@ def test_what_is_missing_or_broken_is_a_problem(monkeypatch: pytest.MonkeyPatch)
     ],
 )
 def test_an_nvml_that_is_only_absent_is_no_problem(
-    monkeypatch: pytest.MonkeyPatch, code: int, is_problem: bool
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, code: int, is_problem: bool
 ):
     def fail() -> None:
         raise pynvml.NVMLError(code)
 
+    monkeypatch.setattr(nvidia, "_DEVICES", tmp_path)
     monkeypatch.setattr(pynvml, "nvmlInit", fail)
     assert (nvml_problem() is not None) == is_problem
 

@@ -136,6 +136,9 @@ def test_gmis_that_form_rings_are_told_where_to_meet(backend: str, has_flag: boo
     assert (found["GMIJAX_RENDEZVOUS"], found["no_grpc_proxy"]) == (address, "127.0.0.1")
     assert ("--xla_gpu_shard_autotuning=false" in found.get("XLA_FLAGS", "")) == has_flag
     assert ("TF_CPP_MIN_LOG_LEVEL" in found) == has_flag
+    assert found.get("NCCL_SOCKET_IFNAME") == ("lo" if has_flag else None)
+    users = {"NCCL_SOCKET_IFNAME": "eth0"}
+    assert users.items() <= gmi_environment(plan, 0, users, cache, {}, address).items()
     assert not inherited.keys() & gmi_environment(plan, 0, inherited, cache, {}).keys()
 
 

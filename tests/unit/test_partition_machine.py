@@ -3,19 +3,23 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
 from typing import NoReturn
 
+import fake_nvml
 import pynvml
 import pytest
-from supervision import gpu
+from supervision import gpu, plan_config, reduce_config
 
 from gmijax.errors import BackendUnavailable
 from gmijax.partition import machine as machine_module
+from gmijax.partition import nvidia
 from gmijax.partition.machine import Machine, detect_machine, visible_gpus
 from gmijax.partition.mps_control import MpsControl, find_mps_control
 from gmijax.partition.nvidia import Gpu, driver_version, list_gpus
+from gmijax.partition.planner import make_plan
 
 THREE = (gpu(0), gpu(1), gpu(2))
 
@@ -160,3 +164,118 @@ def test_operator_daemon_counts_only_if_it_answers(
     assert detect_machine().operator_daemon is None
     script(tmp_path, "exit 0")
     assert detect_machine().operator_daemon == tmp_path
+
+
+def failing(code: int) -> Callable[[], NoReturn]:
+    def fail() -> NoReturn:
+        raise pynvml.NVMLError(code)
+
+    return fail
+
+
+@pytest.fixture
+def no_devices(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """An empty /dev, and nothing hidden by the environment."""
+    folder = tmp_path / "dev"
+    folder.mkdir()
+    for module in (machine_module, nvidia):
+        monkeypatch.setattr(module, "_DEVICES", folder)
+    monkeypatch.delenv("CUDA_VISIBLE_DEVICES", raising=False)
+    return folder
+
+
+@pytest.mark.parametrize("others", [{}, {"gmis_per_gpu": 2}, {"gpus": 2}])
+def test_auto_does_not_go_on_without_gpus_where_the_driver_is_broken(
+    others: dict[str, int], no_devices: Path, monkeypatch: pytest.MonkeyPatch
+):
+    monkeypatch.setattr(pynvml, "nvmlInit", failing(pynvml.NVML_ERROR_LIB_RM_VERSION_MISMATCH))
+    here = detect_machine()
+    with pytest.raises(BackendUnavailable, match=r"^plan\.backend=auto: .* does not work: RM has"):
+        make_plan(plan_config(**others), reduce_config(), 8, here)
+    plan = make_plan(plan_config(backend="cpu", **others), reduce_config(), 8, here)
+    assert plan.backend == "cpu"
+
+
+@pytest.mark.parametrize("code", ["LIBRARY_NOT_FOUND", "DRIVER_NOT_LOADED"])
+def test_a_driver_that_is_absent_although_its_devices_are_there_is_broken(
+    code: str, no_devices: Path, monkeypatch: pytest.MonkeyPatch
+):
+    monkeypatch.setattr(pynvml, "nvmlInit", failing(getattr(pynvml, f"NVML_ERROR_{code}")))
+    assert detect_machine().gpu_problem is None
+    (no_devices / "nvidiactl").touch()
+    assert detect_machine().gpu_problem is None
+    (no_devices / "nvidia0").touch()
+    problem = detect_machine().gpu_problem
+    assert problem is not None
+    assert problem.endswith(f"although there is {no_devices / 'nvidia0'}")
+
+
+def test_gpus_of_which_none_can_be_described_are_a_broken_driver(
+    no_devices: Path, monkeypatch: pytest.MonkeyPatch
+):
+    fake_nvml.install(monkeypatch, fake_nvml.V100)
+    assert detect_machine().gpu_problem is None
+    lost = pynvml.NVML_ERROR_GPU_IS_LOST
+    monkeypatch.setattr(pynvml, "nvmlDeviceGetHandleByIndex", lambda _: failing(lost)())
+    here = detect_machine()
+    assert (here.gpus, here.gpu_problem) == ((), str(pynvml.NVMLError(lost)))
+    fake_nvml.install(monkeypatch)
+    assert detect_machine().gpu_problem is None
+
+
+@pytest.mark.parametrize("selection", ["", "-1"])
+def test_who_hides_all_gpus_need_not_have_a_driver_that_works(
+    selection: str, no_devices: Path, monkeypatch: pytest.MonkeyPatch
+):
+    monkeypatch.setattr(pynvml, "nvmlInit", failing(pynvml.NVML_ERROR_LIB_RM_VERSION_MISMATCH))
+    monkeypatch.setenv("CUDA_VISIBLE_DEVICES", selection)
+    assert make_plan(plan_config(), reduce_config(), 8, detect_machine()).backend == "cpu"
+
+
+@pytest.mark.parametrize(("device", "what"), [("kfd", "a GPU for ROCm"), ("accel0", "a TPU")])
+def test_a_plan_says_what_else_could_compute_here(
+    device: str, what: str, no_devices: Path, monkeypatch: pytest.MonkeyPatch
+):
+    monkeypatch.setattr(pynvml, "nvmlInit", failing(pynvml.NVML_ERROR_LIBRARY_NOT_FOUND))
+    assert detect_machine().warnings == ()
+    (no_devices / device).touch()
+    plan = make_plan(plan_config(), reduce_config(), 8, detect_machine())
+    said = f"warning: {no_devices / device} looks like {what}, which gmijax does not use"
+    assert plan.reasons[0] == said
+
+
+@pytest.mark.parametrize(
+    ("owner", "is_used"), [(os.geteuid(), True), (0, True), (os.geteuid() + 1234, False)]
+)
+def test_a_strangers_daemon_is_not_used(
+    owner: int, is_used: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    if os.geteuid() != 0:
+        monkeypatch.setattr(machine_module, "_strange_owner", lambda _: None if is_used else owner)
+    pipe = tmp_path / "nvidia-mps"
+    pipe.mkdir()
+    if os.geteuid() == 0:
+        os.chown(pipe, owner, -1)
+    monkeypatch.setattr(machine_module, "list_gpus", lambda: THREE)
+    monkeypatch.setattr(machine_module, "DEFAULT_PIPE_DIRECTORY", pipe)
+    monkeypatch.delenv("CUDA_MPS_PIPE_DIRECTORY", raising=False)
+    monkeypatch.delenv("CUDA_VISIBLE_DEVICES", raising=False)
+    monkeypatch.setenv("PATH", f"{tmp_path}{os.pathsep}{os.environ['PATH']}")
+    script(tmp_path, "exit 0")
+    here = detect_machine()
+    assert here.operator_daemon == (pipe if is_used else None)
+    said = f"warning: {pipe} belongs to user {owner}, so the MPS daemon there is not used; "
+    assert [text.startswith(said) for text in here.warnings] == [True] * (not is_used)
+    # Who names it has decided.
+    monkeypatch.setenv("CUDA_MPS_PIPE_DIRECTORY", str(pipe))
+    assert detect_machine().operator_daemon == pipe
+
+
+def test_a_link_of_a_strangers_to_a_directory_of_roots_is_not_used(tmp_path: Path):
+    real, link = tmp_path / "real", tmp_path / "link"
+    real.mkdir()
+    link.symlink_to(real)
+    assert machine_module._strange_owner(link) is None
+    if os.geteuid() == 0:
+        os.chown(link, 4321, -1, follow_symlinks=False)
+        assert machine_module._strange_owner(link) == 4321

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -105,4 +107,34 @@ def test_files_of_versions_without_trainers_can_be_read(tmp_path: Path):
     path.write_text(json.dumps({"key": KEY, "profiles": old}))
     found, notes = store(tmp_path)
     assert found.get("corun", POINT) == MEASURED
+    assert notes == []
+
+
+def test_two_searches_at_once_keep_what_both_found(tmp_path: Path):
+    first, _ = store(tmp_path)
+    second, _ = store(tmp_path)
+    points = [POINT._replace(num_envs=2**power) for power in range(4)]
+    for number, point in enumerate(points):
+        (first, second)[number % 2].put("corun", point, MEASURED, 1.0)
+    third, _ = store(tmp_path)
+    assert [third.get("corun", point) for point in points] == [MEASURED] * 4
+
+
+def test_searches_write_one_after_the_other(tmp_path: Path):
+    script = f"""
+import sys
+from pathlib import Path
+from test_profiles import MEASURED, POINT, store
+mine, _ = store(Path({str(tmp_path)!r}))
+for size in range(20):
+    mine.put("corun", POINT._replace(num_envs=20 * int(sys.argv[1]) + size), MEASURED, 1.0)
+"""
+    started = [
+        subprocess.Popen([sys.executable, "-c", script, str(number)], cwd=Path(__file__).parent)
+        for number in range(3)
+    ]
+    assert [one.wait(timeout=60) for one in started] == [0, 0, 0]
+    found, notes = store(tmp_path)
+    kept = [found.get("corun", POINT._replace(num_envs=size)) for size in range(60)]
+    assert kept == [MEASURED] * 60
     assert notes == []

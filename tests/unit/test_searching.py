@@ -21,6 +21,7 @@ from gmijax.control.auto import decided
 from gmijax.control.profiling import ProfileLate, plan_at
 from gmijax.control.workload import Workload, training
 from gmijax.errors import ConfigError, GmijaxError, JobInterrupted
+from gmijax.partition.host_limits import Host
 from gmijax.partition.machine import Machine
 from gmijax.partition.points import Measured, NotRunnable, Point
 
@@ -128,6 +129,23 @@ def test_what_cannot_run_is_remembered_too(profiles: Callable[[Answer], Profiles
     assert "4 x 64, jax (corun): not runnable: GMI 0 failed: RESOURCE_EXHAUSTED" in said
     assert profiles(scaling).asked == []
     assert found()[0].gmis_per_gpu == 2
+
+
+def test_points_for_which_the_host_is_too_small_are_told_and_not_started(
+    profiles: Callable[[Answer], Profiles],
+):
+    few = machine(0, host=Host(memory_mib=1500))
+    asked = profiles(scaling)
+    result, said = found(here=few)
+    assert result.gmis_per_gpu == 2
+    assert all(point.gmis_per_gpu < 4 for point, _ in asked.asked)
+    assert "4 x 64, jax (corun): not runnable: plan.gmis_per_gpu=4: 4 GMIs on this" in said
+    # With more room they are measured: they were not remembered as what cannot run.
+    again = profiles(scaling)
+    assert found()[0].gmis_per_gpu == 4
+    assert {point.gmis_per_gpu for point, _ in again.asked} == {4}
+    with pytest.raises(ConfigError, match=r"^plan\.gmis_per_gpu=64: 64 GMIs .* are at most 2$"):
+        found("plan.gmis_per_gpu=64", here=few)
 
 
 def test_a_reason_may_look_like_markup(profiles: Callable[[Answer], Profiles]):

@@ -150,6 +150,8 @@ def test_a_run_notes_the_absolute_path_and_the_digest(
     saved = {"source_sha256": first.source_sha256}
     assert changes(pinned(config), saved) is None
     written(tmp_path, TASK + "# changed\n")
+    with pytest.raises(ConfigError, match="not the file that the run noted"):
+        pinned(first)
     assert (
         changes(pinned(config), saved) == f"custom task: {first.name} has changed since the "
         "run was started"

@@ -1,16 +1,28 @@
-"""One end of a TCP connection between two processes, by pyzmq."""
+"""One end of a TCP connection between two processes, by pyzmq, for those who share a secret.
+
+ZeroMQ's CURVE encrypts and authenticates. Whoever listens has a pair of keys that follows from the
+secret, and its public half is told to nobody: without it no handshake succeeds. The secret is in
+`GMIJAX_CHANNEL_KEY`, the same for all processes of a job; between processes of one user on one
+host a file that only this user can read takes its place.
+"""
 
 from __future__ import annotations
 
 import contextlib
+import hashlib
+import ipaddress
+import os
+import secrets
 import socket
 from collections.abc import Sequence
 from typing import Any, Final
 
+from gmijax.cachedir import cache_folder
 from gmijax.errors import CollectiveError, ConfigError
 
 try:
     import zmq
+    from zmq.utils import z85
     from zmq.utils.monitor import recv_monitor_message
 except ImportError:
     raise ConfigError(
@@ -19,6 +31,9 @@ except ImportError:
 
 _LINGER_MS: Final = 2000
 """How long an end waits for what it has not yet put on the wire, at its close or exit."""
+
+ENV_KEY: Final = "GMIJAX_CHANNEL_KEY"
+_SHORTEST_KEY: Final = 16
 
 _OPTIONS: Final = {
     zmq.SNDHWM: 0,  # Acknowledgements bound what waits, not a number of messages.
@@ -36,21 +51,38 @@ _HANDSHAKE_FAILED: Final = (
 
 
 class Connection:
-    """One end of a connection: frames in and out, and whether the other end is there."""
+    """One end of a connection: frames in and out, and whether the other end is there.
 
-    def __init__(self, address: str, rank: int, peer: int, *, listens: bool) -> None:
+    Args:
+      address: `host:port`.
+      rank: of this process.
+      peer: rank of the other one.
+      max_frame_bytes: who sends a longer part of a message is cut off.
+      listens: here, or the other end does.
+
+    Raises:
+      CollectiveError: an address that cannot be.
+      ConfigError: an address of a network, and no secret; or one that is too short.
+    """
+
+    def __init__(
+        self, address: str, rank: int, peer: int, max_frame_bytes: int, *, listens: bool
+    ) -> None:
         self.rank, self.peer = rank, peer
         self.is_closed = False
         self._connections = self._failures = 0
         self._was_up = False
+        server_key = _server_key(address)
         self._context = zmq.Context()
         self._socket = self._context.socket(zmq.DEALER)
         for option, value in _OPTIONS.items():
             self._socket.setsockopt(option, value)
+        self._socket.setsockopt(zmq.MAXMSGSIZE, max_frame_bytes)
         self._monitor = self._socket.get_monitor_socket(
             zmq.EVENT_HANDSHAKE_SUCCEEDED | zmq.EVENT_DISCONNECTED | _HANDSHAKE_FAILED
         )
         try:
+            _authenticate(self._socket, server_key, listens=listens)
             if listens:
                 self._socket.setsockopt(zmq.USE_FD, _listening(address))
                 self._socket.bind(f"tcp://{address}")
@@ -108,6 +140,60 @@ class Connection:
             self._monitor.close()
             self._socket.close(linger_ms)
             self._context.term()
+
+
+def _authenticate(end: zmq.Socket[Any], server_key: bytes, *, listens: bool) -> None:
+    """Makes one end take part in nothing but a handshake of those who know the secret."""
+    if listens:
+        end.setsockopt(zmq.CURVE_SERVER, 1)
+        end.setsockopt(zmq.CURVE_SECRETKEY, server_key)
+        return
+    own_public, own_secret = zmq.curve_keypair()
+    end.setsockopt(zmq.CURVE_SERVERKEY, zmq.curve_public(server_key))
+    end.setsockopt(zmq.CURVE_PUBLICKEY, own_public)
+    end.setsockopt(zmq.CURVE_SECRETKEY, own_secret)
+
+
+def _server_key(address: str) -> bytes:
+    """The secret key of whoever listens, as ZeroMQ writes keys."""
+    given = os.environ.get(ENV_KEY, "").encode()
+    if given and len(given) < _SHORTEST_KEY:
+        raise ConfigError(f"{ENV_KEY}: a secret of at least {_SHORTEST_KEY} characters, please")
+    if not given and not _is_loopback(address.rpartition(":")[0]):
+        raise ConfigError(
+            f"channel.transport=zmq: {address} can be reached by others, so set {ENV_KEY} to the "
+            "same secret in all processes of the job"
+        )
+    return z85.encode(hashlib.sha256(b"gmijax channel " + (given or _key_of_user())).digest())
+
+
+def _is_loopback(host: str) -> bool:
+    try:
+        return ipaddress.ip_address(host).is_loopback
+    except ValueError:  # A name, or nothing.
+        return host in ("", "localhost")
+
+
+def _key_of_user() -> bytes:
+    """A secret that processes of this user share, made by the first of them."""
+    path = cache_folder() / "channel.key"
+    mine = path.with_name(f".{path.name}.{secrets.token_hex(4)}")
+    try:
+        if not path.exists():
+            path.parent.mkdir(parents=True, exist_ok=True)
+            made = os.open(mine, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600)
+            with os.fdopen(made, "w") as file:
+                file.write(secrets.token_hex(32))
+            # A link, because it is there as a whole or not at all, and the first one stays.
+            with contextlib.suppress(FileExistsError):
+                os.link(mine, path)
+            mine.unlink()
+        return path.read_bytes()
+    except OSError as error:
+        raise ConfigError(
+            f"channel.transport=zmq: {path} cannot be used ({error.strerror}); set {ENV_KEY} to "
+            "the same secret in all processes of the job"
+        ) from None
 
 
 def _listening(address: str) -> int:

@@ -6,7 +6,8 @@ has released, which bounds what is on the way. The end of a connection without a
 the peer is gone; so do ten seconds without ZeroMQ's own heartbeats. What a killed agent had not
 yet put on the wire is lost, and nothing else.
 
-Nothing is encrypted and nobody proves who he is: for loopback and networks of one's own.
+Both ends prove that they know one secret, and all is encrypted (`connection.py`). What is no
+message of a channel all the same is dropped and counted.
 """
 
 from __future__ import annotations
@@ -31,6 +32,12 @@ DATA, GOODBYE, RELEASED = 1, 2, 3
 _HEADER: Final = struct.Struct("<IIQQqQI")
 """magic, kind, epoch, sequence, tag, items, checksum of the parts."""
 
+MAX_PART_BYTES: Final = 2**30
+"""Longest part of a message: who sends a longer one is cut off."""
+
+_MAX_ANSWER_BYTES: Final = 4096
+"""Longest part that an agent gets: a header, and what ZeroMQ's handshake takes."""
+
 _FAREWELL_S: Final = 5.0
 """How long an agent that closes waits for its trainer to take what is on the way."""
 
@@ -43,10 +50,10 @@ class RemoteOutlet:
 
     def __init__(self, address: str, rank: int, peer: int, capacity_bytes: int) -> None:
         self.peer = peer
-        self.max_message_bytes = capacity_bytes // 2
-        self.sent_items = 0
+        self.max_message_bytes = min(capacity_bytes // 2, MAX_PART_BYTES)
+        self.sent_items = self.num_dropped = 0
         self._capacity_bytes = capacity_bytes
-        self._connection = Connection(address, rank, peer, listens=False)
+        self._connection = Connection(address, rank, peer, _MAX_ANSWER_BYTES, listens=False)
         self._epoch = time.time_ns()
         self._sequence = self._released = 0
         self._lengths: deque[int] = deque()
@@ -117,7 +124,10 @@ class RemoteOutlet:
 
     def _read_answers(self) -> None:
         while (frames := self._connection.try_receive()) is not None:
-            _, kind, epoch, sequence, *_ = _unpack(self._connection, frames)
+            if (header := _unpack(frames)) is None:
+                self.num_dropped += 1
+                continue
+            _, kind, epoch, sequence, *_ = header
             if kind == GOODBYE:
                 self._has_left = True
             if kind != RELEASED or epoch != self._epoch:
@@ -128,11 +138,17 @@ class RemoteOutlet:
 
 
 class RemoteInlet:
-    """The way from agent `peer`, for which the trainer listens at `address`; see `Inlet`."""
+    """The way from agent `peer`, for which the trainer listens at `address`; see `Inlet`.
+
+    Attributes:
+      num_dropped: what came and was no message of a channel.
+    """
 
     def __init__(self, address: str, rank: int, peer: int) -> None:
         self.peer = peer
-        self._connection = Connection(address, rank, peer, listens=True)
+        self.num_dropped = 0
+        longest = MAX_PART_BYTES + _MAX_ANSWER_BYTES
+        self._connection = Connection(address, rank, peer, longest, listens=True)
         self._next: dict[int, int] = {}  # By epoch: what a killed agent sent may be read later.
         self._held_epoch: int | None = None
         self._has_left = False
@@ -141,13 +157,13 @@ class RemoteInlet:
     def try_get(self) -> Message | None:
         """See `Inlet`."""
         self.release()
-        frames = self._connection.try_receive()
-        if frames is None:
+        frames, header = self._next_of_channel()
+        if header is None:
             self._is_empty = True
             if self._has_left:
                 raise PipeClosed(self._connection.rank, self.peer, "receive")
             return None
-        _, kind, epoch, sequence, tag, items, checksum = _unpack(self._connection, frames)
+        _, kind, epoch, sequence, tag, items, checksum = header
         if epoch not in self._next:  # Another process took the agent's rank.
             self._next[epoch], self._has_left = 0, False
         parts = tuple(np.frombuffer(frame, np.uint8) for frame in frames[1:])
@@ -162,6 +178,14 @@ class RemoteInlet:
         self._next[epoch] += 1
         self._held_epoch = epoch
         return Message(sequence, tag, items, parts)
+
+    def _next_of_channel(self) -> tuple[Sequence[Any], tuple[int, ...] | None]:
+        """The next message and its header; None for that if there is none."""
+        while (frames := self._connection.try_receive()) is not None:
+            if (header := _unpack(frames)) is not None:
+                return frames, header
+            self.num_dropped += 1
+        return (), None
 
     def release(self) -> None:
         """See `Inlet`."""
@@ -198,14 +222,12 @@ def _tell(connection: Connection, kind: int, epoch: int, sequence: int) -> None:
     connection.try_send([_HEADER.pack(MAGIC, kind, epoch, sequence, 0, 0, 0)])
 
 
-def _unpack(connection: Connection, frames: Sequence[Any]) -> tuple[int, ...]:
-    if len(frames[0]) == _HEADER.size:
-        header = _HEADER.unpack(frames[0])
-        if header[0] == MAGIC:
-            return header
-    raise CollectiveError(
-        f"rank {connection.rank}: what came from rank {connection.peer} is not from a channel"
-    )
+def _unpack(frames: Sequence[Any]) -> tuple[int, ...] | None:
+    """The header of a message, None if it is none of a channel."""
+    if len(frames[0]) != _HEADER.size:
+        return None
+    header = _HEADER.unpack(frames[0])
+    return header if header[0] == MAGIC and header[1] in (DATA, GOODBYE, RELEASED) else None
 
 
 def _crc(parts: Sequence[Bytes]) -> int:

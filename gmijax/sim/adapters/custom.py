@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import importlib.util
 import inspect
 import sys
@@ -15,15 +16,23 @@ from gmijax.sim.interface import Env
 from gmijax.sim.source import split
 
 
-def make(name: str, *, impl: str = "auto", max_envs: int | None = None) -> Env:
+def make(
+    name: str,
+    *,
+    impl: str = "auto",
+    max_envs: int | None = None,
+    source_sha256: str | None = None,
+) -> Env:
     """Calls `FUNCTION(impl=..., max_envs=...)` of `PATH.py:FUNCTION`, and checks what it returns.
+
+    With `source_sha256` a file of another digest is not executed.
 
     Raises:
       ConfigError: the file or the function cannot be had, it fails, or what it returns is no
         environment; one line, with the place.
     """
     path, function = split(name)
-    module = attempt(f"env={path}", _load, path)
+    module = attempt(f"env={path}", _load, path, source_sha256)
     found = getattr(module, function, None)
     if not callable(found):
         names = [key for key, value in vars(module).items() if inspect.isfunction(value)]
@@ -35,8 +44,11 @@ def make(name: str, *, impl: str = "auto", max_envs: int | None = None) -> Env:
     return env
 
 
-def _load(path: Path) -> ModuleType:
+def _load(path: Path, source_sha256: str | None) -> ModuleType:
     """Runs the file as a module; it may import what lies beside it, as a script may."""
+    text = path.read_bytes()
+    if source_sha256 not in (None, hashlib.sha256(text).hexdigest()):
+        raise ConfigError(f"env={path}: has changed since the job was started")
     if str(path.parent) not in sys.path:
         sys.path.append(str(path.parent))
     # A name of its own: a file called brax.py must not take the place of a package.
@@ -46,5 +58,6 @@ def _load(path: Path) -> ModuleType:
         raise ConfigError(f"env={path}: not a Python file")
     module = importlib.util.module_from_spec(spec)
     sys.modules[name] = module
-    spec.loader.exec_module(module)
+    # What the digest was taken of, and not what lies in __pycache__ or was written meanwhile.
+    exec(compile(text, path, "exec"), vars(module))
     return module

@@ -1,0 +1,74 @@
+"""Where the cache is, with and without a home."""
+
+from __future__ import annotations
+
+import os
+import tempfile
+from pathlib import Path
+
+import pytest
+from supervision import plan_config, reduce_config
+
+from gmijax.cachedir import cache_folder, why_temporary
+from gmijax.control.launcher import compilation_cache_dir
+from gmijax.control.profiles import default_folder
+from gmijax.errors import ConfigError
+from gmijax.partition.machine import detect_machine
+from gmijax.partition.planner import make_plan
+
+
+@pytest.fixture
+def homeless(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """No HOME, and no user of that number, as in a container; the folder that is left."""
+
+    def nobody() -> Path:
+        raise RuntimeError("Could not determine home directory.")
+
+    monkeypatch.setattr(Path, "home", nobody)
+    monkeypatch.delenv("XDG_CACHE_HOME", raising=False)
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    return tmp_path / f"gmijax-{os.geteuid()}"
+
+
+def test_without_a_home_the_cache_is_a_folder_of_this_users_alone(homeless: Path):
+    assert compilation_cache_dir() == homeless / "xla"
+    assert default_folder() == homeless / "profiles"
+    assert homeless.stat().st_mode & 0o777 == 0o700
+    assert cache_folder() == homeless
+    plan = make_plan(plan_config(backend="cpu"), reduce_config(), 8, detect_machine())
+    assert any(f"are kept in {homeless};" in reason for reason in plan.reasons)
+
+
+@pytest.mark.parametrize("trap", ["file", "open", "link"])
+def test_a_temporary_folder_that_others_may_write_is_refused(
+    trap: str, homeless: Path, tmp_path: Path
+):
+    if trap == "file":
+        homeless.touch()
+    elif trap == "open":
+        homeless.mkdir()
+        homeless.chmod(0o777)
+    else:
+        (tmp_path / "theirs").mkdir(mode=0o700)
+        homeless.symlink_to(tmp_path / "theirs")
+    with pytest.raises(ConfigError, match=r"no home folder .*; set XDG_CACHE_HOME to a folder"):
+        cache_folder()
+
+
+def test_a_folder_that_is_named_needs_no_home(homeless: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setenv("XDG_CACHE_HOME", "/mine")
+    assert cache_folder() == Path("/mine/gmijax")
+    assert why_temporary() is None
+    assert not homeless.exists()
+
+
+def test_a_home_that_cannot_be_written_is_none(homeless: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(Path, "home", lambda: Path("/proc/nowhere"))
+    assert cache_folder() == homeless
+
+
+def test_the_cache_is_in_the_home(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.delenv("XDG_CACHE_HOME", raising=False)
+    monkeypatch.setattr(Path, "home", lambda: tmp_path)
+    assert cache_folder() == tmp_path / ".cache" / "gmijax"
+    assert why_temporary() is None

@@ -1,0 +1,191 @@
+"""How many GMIs a host takes. Nothing is started here: that is the point."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import Any
+
+import pytest
+from supervision import gpu, machine, plan_config, reduce_config
+
+import gmijax
+from gmijax.control.decoupled import plan_decoupled
+from gmijax.errors import ConfigError
+from gmijax.partition import host_limits
+from gmijax.partition.host_limits import CgroupLimits, Host, detect_host, usable_cores
+from gmijax.partition.machine import Machine, detect_machine
+from gmijax.partition.plan import Plan
+from gmijax.partition.planner import make_plan
+
+SMALL = Host(memory_mib=24 * 1024, threads=30_000, open_files=20_000)
+
+
+def two_cores(host: Host = SMALL) -> Machine:
+    return Machine((), (0, 1), host=host)
+
+
+def planned(here: Machine, **changes: Any) -> Plan:
+    return make_plan(plan_config(**changes), reduce_config(), 64, here)
+
+
+def test_a_thousand_gmis_on_two_cores_are_refused():
+    with pytest.raises(ConfigError) as error:
+        planned(two_cores(), gmis_per_gpu=1000)
+    assert str(error.value) == (
+        "plan.gmis_per_gpu=1000: 1000 GMIs on this machine need about 586 GiB of memory (there "
+        "are 24 GiB), 63 CPU cores, one for every 16 (there are 2); allowed are at most 32"
+    )
+
+
+@pytest.mark.parametrize(
+    ("changes", "what"),
+    [
+        ({"gmis_per_gpu": 64}, r"plan\.gmis_per_gpu=64: 64 GMIs"),
+        ({"gpus": 8, "gmis_per_gpu": 8}, r"plan\.gmis_per_gpu=8, plan\.gpus=8: 64 GMIs"),
+        ({"gpus": 64}, r"plan\.gmis_per_gpu=1, plan\.gpus=64: 64 GMIs"),
+        ({"layout": (tuple(range(64)),)}, r"plan\.layout: 64 GMIs"),
+        ({"gmis_per_gpu": 10**12}, r"plan\.gmis_per_gpu=1000000000000: "),
+        ({"gmis_per_gpu": 64, "backend": "cpu"}, r"plan\.gmis_per_gpu=64: 64 GMIs"),
+        ({"gmis_per_gpu": 64, "template": "tdg"}, r"plan\.gmis_per_gpu=64: 64 GMIs"),
+    ],
+)
+def test_every_way_to_ask_for_too_many_is_refused(changes: dict[str, Any], what: str):
+    with pytest.raises(ConfigError, match=f"^{what}.*; allowed are at most 32$"):
+        planned(two_cores(), **changes)
+
+
+@pytest.mark.parametrize("side", ["serving", "training"])
+def test_too_many_agents_or_trainers_are_refused(side: str):
+    config = gmijax.compose("env=ant", "algo=a3c", f"plan.{side}_gmis_per_gpu=1000000000")
+    with pytest.raises(ConfigError, match=r"plan\.serving_gmis_per_gpu=.*allowed are at most 32$"):
+        plan_decoupled(config, 8, two_cores())
+
+
+def test_what_there_is_room_for_is_planned():
+    assert planned(two_cores(), gmis_per_gpu=32).layout.num_gmis == 32
+
+
+@pytest.mark.parametrize(
+    ("host", "said"),
+    [
+        (Host(memory_mib=2048), "4.69 GiB of memory (there are 2 GiB); allowed are at most 3"),
+        (Host(threads=100), "192 threads (100 may still be started); allowed are at most 4"),
+        (
+            Host(open_files=84),
+            "96 open files (84 may still be opened, see ulimit -n); allowed are at most 5",
+        ),
+    ],
+)
+def test_each_limit_is_told(host: Host, said: str):
+    with pytest.raises(ConfigError) as error:
+        planned(two_cores(host), gmis_per_gpu=8)
+    assert str(error.value) == (f"plan.gmis_per_gpu=8: 8 GMIs on this machine need about {said}")
+
+
+def test_one_gmi_may_always_try():
+    tiny = two_cores(Host(memory_mib=128, threads=2, open_files=10))
+    assert planned(tiny).layout.num_gmis == 1
+
+
+def test_beside_gpus_memory_counts_and_cores_do_not():
+    here = machine(1, cpu_cores=(0,), mps_control=Path("/usr/bin/mps"), host=SMALL)
+    assert planned(here, gmis_per_gpu=20).layout.num_gmis == 20
+    with pytest.raises(ConfigError, match=r"39\.1 GiB of memory .*; allowed are at most 24$"):
+        planned(here, gmis_per_gpu=40)
+    with pytest.raises(ConfigError, match=r"2 CPU cores.*; allowed are at most 16$"):
+        planned(here, gmis_per_gpu=20, backend="cpu")
+
+
+def test_roles_are_refused_too(monkeypatch: pytest.MonkeyPatch, tmp_path: Path):
+    fits = gmijax.plan(gmis_per_gpu=2, backend="cpu")
+    monkeypatch.setattr("gmijax.roles.planning.detect_machine", two_cores)
+    with pytest.raises(ConfigError, match=r"^plan\.gmis_per_gpu=1000: 1000 GMIs"):
+        gmijax.plan(gmis_per_gpu=1000)
+    monkeypatch.chdir(tmp_path)
+    tiny = two_cores(Host(memory_mib=700))
+    monkeypatch.setattr("gmijax.roles.launch.detect_machine", lambda: tiny)
+    with pytest.raises(ConfigError, match=r"^plan: 2 GMIs on this machine .* at most 1$"):
+        gmijax.launch(fits, Idle())
+    assert not list(tmp_path.iterdir())
+
+
+class Idle(gmijax.Role):
+    def run(self) -> None: ...
+
+
+def test_this_machine_is_seen():
+    host = detect_host()
+    assert host.memory_mib is not None
+    assert host.memory_mib > 100
+    assert host.threads is None or host.threads > 0
+    here = detect_machine()
+    assert here.host.memory_mib == host.memory_mib
+    assert set(here.cpu_cores) <= os.sched_getaffinity(0)
+
+
+def test_threads_of_a_user_with_a_limit_are_counted(monkeypatch: pytest.MonkeyPatch):
+    limit = host_limits.resource.getrlimit(host_limits.resource.RLIMIT_NPROC)
+    monkeypatch.setattr(host_limits.resource, "getrlimit", lambda _: (50_000, limit[1]))
+    monkeypatch.setattr(host_limits.os, "geteuid", lambda: 0)
+    assert host_limits._threads_of_user() is None
+    own = Path("/proc/self").stat().st_uid
+    monkeypatch.setattr(host_limits.os, "geteuid", lambda: own or -1)
+    left = host_limits._threads_of_user()
+    assert left is not None
+    assert left <= 50_000
+
+
+def group(folder: Path, **files: str) -> None:
+    folder.mkdir(parents=True, exist_ok=True)
+    for name, text in files.items():
+        (folder / name.replace("__", ".")).write_text(text + "\n")
+
+
+def test_limits_of_control_groups_of_version_2(tmp_path: Path):
+    (tmp_path / "own").write_text("0::/slice/job\n")
+    root = tmp_path / "root"
+    group(root / "slice", memory__max=str(8 * 2**30), pids__max="100", pids__current="40")
+    group(root / "slice/job", memory__max="max", cpu__max="150000 100000", pids__max="max")
+    found = CgroupLimits(tmp_path / "own", root)
+    assert (found.memory_mib(), found.threads(), found.cpu_quota()) == (8192.0, 60, 1.5)
+    group(root / "slice", cpu__max="max 100000")
+    group(root / "slice/job", cpu__max="max 100000")
+    assert found.cpu_quota() is None
+
+
+def test_limits_of_control_groups_of_version_1(tmp_path: Path):
+    # In a container without a cgroup namespace the path is that of the host and not seen.
+    (tmp_path / "own").write_text("4:memory:/a/b\n3:cpu,cpuacct:/a\n8:pids:/docker/1\n0::/x\n")
+    root = tmp_path / "root"
+    group(root / "memory/a", memory__limit_in_bytes=str(2**30))
+    group(root / "cpu/a", cpu__cfs_quota_us="50000", cpu__cfs_period_us="100000")
+    group(root / "cpu", cpu__cfs_quota_us="-1", cpu__cfs_period_us="100000")
+    group(root / "pids", pids__max="30", pids__current="10")
+    found = CgroupLimits(tmp_path / "own", root)
+    assert (found.memory_mib(), found.threads(), found.cpu_quota()) == (1024.0, 20, 0.5)
+
+
+def test_without_control_groups_there_are_no_limits(tmp_path: Path):
+    found = CgroupLimits(tmp_path / "own", tmp_path / "root")
+    assert (found.memory_mib(), found.threads(), found.cpu_quota()) == (None, None, None)
+
+
+@pytest.mark.parametrize(("quota", "count"), [(None, 8), (0.2, 1), (1.5, 2), (8.0, 8), (64.0, 8)])
+def test_a_quota_of_time_is_as_many_cores(quota: float | None, count: int):
+    cores = tuple(range(3, 11))
+    taken = usable_cores(cores, quota, "host")
+    assert len(taken) == count
+    assert cores[taken[0] - 3 : taken[0] - 3 + count] == taken
+    assert taken == usable_cores(cores, quota, "host")
+
+
+def test_containers_of_one_machine_take_different_cores():
+    taken = {usable_cores(range(64), 2.0, f"container-{number}") for number in range(10)}
+    assert len(taken) > 5
+
+
+def test_a_machine_with_gpus_has_its_limits_too():
+    assert machine(1).gpus == (gpu(0),)
+    with pytest.raises(ConfigError, match=r"at most 1$"):
+        planned(machine(2, host=Host(memory_mib=1500)), gpus=2)

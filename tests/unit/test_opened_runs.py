@@ -1,0 +1,143 @@
+"""Opening a run executes the file of its custom task only if it is the noted one, or named."""
+
+from __future__ import annotations
+
+import hashlib
+import importlib.util
+import json
+import py_compile
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+import gmijax
+from gmijax.cli import _build, command
+from gmijax.config import PlayConfig
+from gmijax.control import evaluation, job, serving
+from gmijax.errors import ConfigError
+from gmijax.resume import CheckpointMeta
+from gmijax.rundir import META, RunPaths, read_json, write_json
+from gmijax.schema import to_dict
+from gmijax.sim import source
+from gmijax.sim.adapters import custom
+from gmijax.sim.registry import make_env
+
+TRAP = "from pathlib import Path\nPath(__file__).with_name('executed').touch()\nmake = None\n"
+
+
+@pytest.fixture
+def run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> RunPaths:
+    """A run of a custom task with a checkpoint, whose file has changed since."""
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "point.py").write_text("def make(): ...\n")
+    config = gmijax.compose("env=point.py:make", "num_envs=8")
+    saved = {**to_dict(config), "env": to_dict(source.pinned(config.env))}
+    paths = RunPaths(tmp_path / "theirs")
+    write_json(paths.config, saved)
+    algo = config.algo
+    hidden = (algo.policy_hidden_layer_sizes, algo.value_hidden_layer_sizes)
+    meta = CheckpointMeta("point.py:make", "ppo", 100, 1, 8, hidden, "jax")
+    write_json(paths.checkpoint(100) / META, meta.to_dict())
+    (tmp_path / "point.py").write_text(TRAP)
+    return paths
+
+
+class StartedError(Exception):
+    """Checked all, and would start GMIs now."""
+
+
+@pytest.fixture
+def starts(monkeypatch: pytest.MonkeyPatch) -> None:
+    def run_gmis(*_: Any) -> None:
+        raise StartedError
+
+    for module in (evaluation, job, serving):
+        monkeypatch.setattr(module, "run_gmis", run_gmis)
+
+
+def opened(kind: str, *overrides: str) -> Any:
+    if kind == "play":
+        return evaluation.play(_build("play", PlayConfig, ("run.dir=theirs", *overrides)))
+    if kind == "serve":
+        return serving.serve(gmijax.compose("run.dir=theirs", *overrides, command="serve"))
+    return gmijax.train(gmijax.compose("run.resume=theirs", *overrides))
+
+
+KINDS = pytest.mark.parametrize("kind", ["play", "serve", "resume"])
+
+
+@KINDS
+def test_a_file_that_has_changed_is_not_executed(kind: str, run: RunPaths, starts: None):
+    with pytest.raises(ConfigError) as error:
+        opened(kind)
+    file = Path("point.py").resolve()
+    assert str(error.value) == (
+        f"env={file}:make: not the file that the run noted (its SHA-256 differs), so it is not "
+        f"executed; env={file}:make says that it is meant as it is now"
+    )
+
+
+@KINDS
+def test_a_file_of_which_nothing_is_noted_is_not_executed(kind: str, run: RunPaths, starts: None):
+    saved = read_json(run.config)
+    del saved["env"]["source_sha256"]
+    write_json(run.config, saved)
+    with pytest.raises(ConfigError, match="is not executed"):
+        opened(kind)
+
+
+@KINDS
+def test_who_names_the_file_means_it(kind: str, run: RunPaths, starts: None):
+    with pytest.raises(StartedError):
+        opened(kind, "env=point.py:make")
+
+
+@KINDS
+def test_an_equal_file_is_the_runs(kind: str, run: RunPaths, starts: None):
+    Path("point.py").write_text("def make(): ...\n")
+    with pytest.raises(StartedError):
+        opened(kind)
+
+
+def test_play_says_it_in_one_line(run: RunPaths, capsys: pytest.CaptureFixture[str]):
+    def play(config: PlayConfig) -> int:
+        evaluation.play(config)
+        return 0
+
+    assert command("play", PlayConfig, play, ["run.dir=theirs"]) == 2
+    assert len(capsys.readouterr().err.splitlines()) == 1
+
+
+def test_play_hands_its_child_the_file_that_it_looked_at(run: RunPaths, starts: None):
+    with pytest.raises(StartedError):
+        opened("play", "env=point.py:make")
+    told = json.loads((run.root / "play" / f"{100:012d}" / "config.json").read_text())["run"]
+    digest = hashlib.sha256(TRAP.encode()).hexdigest()
+    assert (told["env"], told["env_sha256"]) == (f"{Path('point.py').resolve()}:make", digest)
+
+
+def test_play_takes_no_other_task(run: RunPaths):
+    Path("other.py").write_text(TRAP)
+    with pytest.raises(ConfigError, match=r"^env=other\.py:make: the run was trained on point"):
+        opened("play", "env=other.py:make")
+
+
+def test_a_gmi_executes_nothing_else_either(run: RunPaths):
+    with pytest.raises(ConfigError, match=r"point\.py: has changed since the job was started$"):
+        make_env("point.py:make", suite="custom", source_sha256="0" * 64)
+    assert not Path("executed").exists()
+
+
+def test_what_is_executed_is_what_was_looked_at(tmp_path: Path):
+    """And not a compiled file beside it, which may hold anything."""
+    file = tmp_path / "task.py"
+    file.write_text("VALUE = 1\n")
+    digest = hashlib.sha256(file.read_bytes()).hexdigest()
+    other = tmp_path / "other.py"
+    other.write_text("VALUE = 2\n")
+    cached = Path(importlib.util.cache_from_source(str(file)))
+    py_compile.compile(
+        str(other), str(cached), invalidation_mode=py_compile.PycInvalidationMode.UNCHECKED_HASH
+    )
+    assert custom._load(file, digest).VALUE == 1
