@@ -19,6 +19,7 @@ from rich.table import Table
 from gmijax.config import PlanConfig, PlayConfig, ReduceConfig
 from gmijax.control.kinds import Plain
 from gmijax.control.launcher import Launch, run_gmis
+from gmijax.control.output import open_console
 from gmijax.control.pictures import film, has_brax, write_page
 from gmijax.errors import ConfigError, GmijaxError
 from gmijax.partition.machine import Machine, detect_machine
@@ -89,7 +90,7 @@ def play(config: PlayConfig, *, show: bool = False) -> Evaluation:
     if config.randomize == "on" and not env.randomization:
         raise ConfigError("randomize=on: env.randomization of the run names nothing to draw")
     paths = _prepare(config, meta.env_steps)
-    console = Console(quiet=not show, soft_wrap=True, highlight=False)
+    console = open_console(show=show)
     console.print(f"checkpoint: {checkpoint}", markup=False)
     if changed := source.changes(env, dataclasses.asdict(saved)):
         console.print(changed, markup=False)

@@ -17,6 +17,7 @@ from rich.console import Console
 from gmijax.config import AUTO, SearchConfig, TrainConfig
 from gmijax.control.async_search import decoupled_training
 from gmijax.control.decoupled import is_decoupled
+from gmijax.control.output import open_console
 from gmijax.control.profiles import ProfileStore, default_folder
 from gmijax.control.profiling import (
     Mode,
@@ -101,7 +102,7 @@ def search(config: TrainConfig, *, show: bool = False) -> SearchResult:
         )
     require_task(str(config.env.name), config.env.suite)
     config = dataclasses.replace(config, env=source.pinned(config.env))
-    console = Console(stderr=False, quiet=not show, soft_wrap=True, highlight=False)
+    console = open_console(show=show)
     started = _Search(workload_of(config), config.search, detect_machine(), console)
     # After everything else was checked: nothing is left of a search that was refused.
     started.run = create_run(config.run.dir, config.run.name, f"{config.env.slug}-search")

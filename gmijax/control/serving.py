@@ -22,6 +22,7 @@ from gmijax.config import PhysicsConfig, ServeConfig
 from gmijax.control import served
 from gmijax.control.kinds import Serving
 from gmijax.control.launcher import Launch, patience_of, recorded, run_gmis
+from gmijax.control.output import open_console
 from gmijax.control.progress import ConsoleProgress, SilentProgress
 from gmijax.control.serving_search import NO_REDUCTION, decided
 from gmijax.datadir import DataPaths, open_dataset
@@ -97,7 +98,7 @@ def serve(config: ServeConfig, *, show: bool = False) -> Served:
       GmiFailed: a GMI failed; finished shards of experience stay.
       JobInterrupted: SIGINT, SIGTERM or SIGHUP came; the same command goes on with what is there.
     """
-    console = Console(stderr=False, quiet=not show, soft_wrap=True, highlight=False)
+    console = open_console(show=show)
     job = _prepared(config, console)
     with ExitStack() as held:
         if job.data is not None:
