@@ -31,10 +31,11 @@ OVERRIDES = (
 
 CONTROLLER = """
 import sys
+from gmijax.cli import command
+from gmijax.config import TrainConfig
 from gmijax.control import job, kinds
 kinds.SYNCHRONOUS = kinds.Plain("tests.faults.gpu_worker")
-from gmijax.train import main
-sys.exit(main(sys.argv[1:]))
+sys.exit(command("train", TrainConfig, lambda c: bool(job.train(c, show=True)) - 1, sys.argv[1:]))
 """
 
 
@@ -124,13 +125,16 @@ def harm(job: Job, name: str, act: Callable[[Job, int], None], gmi: int) -> dict
     return row
 
 
+def _stacks(run: Path) -> str:
+    logs = [path.read_text() for path in run.glob("gmi_*/attempt_*/stderr.log")]
+    return "".join(text[-1500:] for text in logs if "most recent call first" in text)
+
+
 def main() -> int:
     """See the module."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--kills", type=int, default=20)
-    parser.add_argument(
-        "--seconds", type=float, default=1e9, help="no fault is begun after so long"
-    )
+    parser.add_argument("--seconds", type=float, default=1e9, help="none begins later")
     parser.add_argument("--out", type=Path, required=True)
     parser.add_argument("overrides", nargs="*")
     given = parser.parse_args()
@@ -148,27 +152,17 @@ def main() -> int:
         finally:
             job.process.send_signal(signal.SIGTERM)
             code = job.process.wait()
-            log = (Path(folder) / "job.log").read_text()[-3000:]
             events = (job.run / "events.jsonl").read_text().splitlines()
-            left = pids_of(job.run)
-            stacks = "".join(
-                path.read_text()[-1500:] for path in job.run.glob("gmi_*/attempt_*/stderr.log")
-                if "most recent call first" in path.read_text()
-            )[:4000]  # fmt: skip
-            given.out.write_text(
-                json.dumps(
-                    {
-                        "rows": rows,
-                        "exit_code": code,
-                        "left": left,
-                        "events": events[-400:],
-                        "log": log,
-                        "stacks": stacks,
-                    },
-                    indent=1,
-                )  # fmt: skip
-            )
-    return 0 if code == 130 and not left else 1
+            found = {
+                "rows": rows,
+                "exit_code": code,
+                "left": pids_of(job.run),
+                "events": events[-400:],
+                "log": (Path(folder) / "job.log").read_text()[-3000:],
+                "stacks": _stacks(job.run)[:4000],
+            }
+            given.out.write_text(json.dumps(found, indent=1))
+    return 0 if code == 130 and not found["left"] else 1
 
 
 if __name__ == "__main__":
