@@ -43,10 +43,11 @@ _OPTIONS: Final = {
     zmq.HEARTBEAT_TIMEOUT: 10000,
 }
 
-_HANDSHAKE_FAILED: Final = (
-    zmq.EVENT_HANDSHAKE_FAILED_NO_DETAIL
-    | zmq.EVENT_HANDSHAKE_FAILED_PROTOCOL
-    | zmq.EVENT_HANDSHAKE_FAILED_AUTH
+_WATCHED: Final = (
+    zmq.EVENT_ACCEPTED
+    | zmq.EVENT_CONNECTED
+    | zmq.EVENT_HANDSHAKE_SUCCEEDED
+    | zmq.EVENT_DISCONNECTED
 )
 
 
@@ -70,7 +71,9 @@ class Connection:
     ) -> None:
         self.rank, self.peer = rank, peer
         self.is_closed = False
-        self._connections = self._failures = 0
+        self._proved: set[int] = set()
+        self._strangers: set[int] = set()
+        self._handshakes = 0
         self._was_up = False
         server_key = _server_key(address)
         self._context = zmq.Context()
@@ -78,9 +81,7 @@ class Connection:
         for option, value in _OPTIONS.items():
             self._socket.setsockopt(option, value)
         self._socket.setsockopt(zmq.MAXMSGSIZE, max_frame_bytes)
-        self._monitor = self._socket.get_monitor_socket(
-            zmq.EVENT_HANDSHAKE_SUCCEEDED | zmq.EVENT_DISCONNECTED | _HANDSHAKE_FAILED
-        )
+        self._monitor = self._socket.get_monitor_socket(_WATCHED)
         try:
             _authenticate(self._socket, server_key, listens=listens)
             if listens:
@@ -119,17 +120,27 @@ class Connection:
     def is_cut(self) -> bool:
         """Whether there was a connection and is none now."""
         while not self.is_closed and self._monitor.poll(0):
-            event = recv_monitor_message(self._monitor)["event"]
-            if event == zmq.EVENT_HANDSHAKE_SUCCEEDED:
-                self._connections += 1
-                self._was_up = True
-            elif event & _HANDSHAKE_FAILED:
-                self._failures += 1
-            elif self._failures:  # The end of a connection that was none, of whomever.
-                self._failures -= 1
-            else:
-                self._connections = max(0, self._connections - 1)
-        return self._was_up and not self._connections
+            message = recv_monitor_message(self._monitor)
+            self._note(message["event"], message["value"])
+        return self._was_up and not (self._proved or self._handshakes)
+
+    def _note(self, event: int, descriptor: int) -> None:
+        """Tells connections of the peer from those of strangers, who end without a handshake.
+
+        ZeroMQ does not say whose handshake succeeded. Where several are under way it is seen when
+        the others have ended, which ZeroMQ sees to within half a minute.
+        """
+        if event == zmq.EVENT_HANDSHAKE_SUCCEEDED:
+            self._handshakes += 1
+            self._was_up = True
+        elif event == zmq.EVENT_DISCONNECTED:
+            self._proved.discard(descriptor)
+            self._strangers.discard(descriptor)
+        else:
+            self._strangers.add(descriptor)
+        if self._handshakes and len(self._strangers) <= self._handshakes:
+            self._proved |= self._strangers
+            self._strangers, self._handshakes = set(), 0
 
     def close(self) -> None:
         """Leaves at once, but for what is not on the wire; calling it twice is fine."""
