@@ -51,8 +51,8 @@ def modules_of(node: ast.AST) -> Iterator[str]:
             if name in ("import_module", "find_spec") or any(
                 arg.attr == "import_module" for arg in handed
             ):
-                texts = [arg.value for arg in args if isinstance(arg, ast.Constant)]
-                yield from (text for text in texts if str(text).replace(".", "").isidentifier())
+                texts = [str(arg.value) for arg in args if isinstance(arg, ast.Constant)]
+                yield from (text for text in texts if text.replace(".", "").isidentifier())
 
 
 def imported() -> set[str]:
