@@ -107,6 +107,13 @@ def apply_gradients(
     return state._replace(params=params, opt_state=opt_state, learning_rate=rate)
 
 
+def rate_figures(config: AlgoConfig, rates: Array) -> dict[str, Array]:
+    """Mean, least and largest of the learning rates of updates; none if they cannot differ."""
+    if config.learning_rate_schedule == "fixed" or rates.size == 1:
+        return {}
+    return {"mean": jnp.mean(rates), "min": jnp.min(rates), "max": jnp.max(rates)}
+
+
 def gradient_sharding(reducer: Reducer) -> Sharding | None:
     """Where a program should put gradients: where the reducer reads them; None for anywhere."""
     return None if stays_on_device(reducer) else host_sharding()

@@ -89,5 +89,9 @@ def std_of(moments: Moments) -> Array:
 
 
 def normalize(moments: Moments, samples: Array) -> Array:
-    """`samples` [..., S] in standard deviations from the mean, clipped to +-OBS_CLIP."""
-    return jnp.clip((samples - moments.mean) / std_of(moments), -OBS_CLIP, OBS_CLIP)
+    """`samples` [..., S] in standard deviations from the mean, clipped to +-OBS_CLIP.
+
+    As they are while there are no statistics: their unit is not known, and so no limit.
+    """
+    limit = jnp.where(moments.count > 0, OBS_CLIP, jnp.inf)
+    return jnp.clip((samples - moments.mean) / std_of(moments), -limit, limit)

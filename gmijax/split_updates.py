@@ -22,7 +22,7 @@ from gmijax.types import Array
 
 Gradients: TypeAlias = Callable[[Learner, ActorCriticParams, Any, Any, Array], tuple[Any, Any]]
 """`(learner, params, data, context, indices) -> (gradient, losses)` of a minibatch of `data`;
-the losses are a named tuple of [] float32, with `kl` among them."""
+the losses are a named tuple of [] float32, with a property `steering_kl`."""
 
 Mean: TypeAlias = Callable[[Array], Array | FloatBuffer]
 """From a rank's gradient to the mean of all."""
@@ -58,15 +58,15 @@ class SplitUpdates:
         self._apply: Any = jax.jit(self._apply_fn, donate_argnums=(0,))
 
     def trace(self, state: LearnerState, data: Any, context: Any, order: Any) -> list[Any]:
-        """Traces all programs, for arguments that may be shapes only; shapes of the losses."""
+        """Traces all programs, for arguments that may be shapes only; shapes for `summary`."""
         rest = data, context, order, jax.ShapeDtypeStruct((), jnp.int32)
         self._gradient = self._gradient.lower(state.params, *rest)
         # Its shape only: it is made in pinned host memory, and comes back from elsewhere.
         buffer = jax.ShapeDtypeStruct(self._gradient.out_info.shape, jnp.float32)
         self._update = self._update.lower(state, buffer, *rest)
         self._apply = self._apply.lower(state, buffer)
-        loss = jax.ShapeDtypeStruct((len(self._losses._fields),), jnp.float32)
-        return [loss] * order.shape[0]
+        told = jax.ShapeDtypeStruct((len(self._losses._fields) + 1,), jnp.float32)
+        return [told] * order.shape[0]
 
     def compile(self) -> None:
         """Compiles what `trace` has traced."""
@@ -77,7 +77,7 @@ class SplitUpdates:
     def __call__(
         self, state: LearnerState, data: Any, context: Any, order: Array
     ) -> tuple[LearnerState, list[Array]]:
-        """The new state, and the losses of every minibatch, packed.
+        """The new state, and what every minibatch told, packed; see `summary`.
 
         Args:
           state: donated.
@@ -97,6 +97,11 @@ class SplitUpdates:
         result = updates(functools.partial(self._host_mean, exchanges_s))
         self.reduce_s = sum(exchanges_s)
         return result
+
+    def summary(self, told: list[Array]) -> tuple[Any, Array]:
+        """Means of the losses over all minibatches, and the learning rate after each of them."""
+        stacked = jnp.stack(told)
+        return self._losses(*jnp.mean(stacked[:, :-1], axis=0)), stacked[:, -1]
 
     def _updates(
         self, mean: Mean, state: LearnerState, data: Any, context: Any, order: Array
@@ -129,8 +134,9 @@ class SplitUpdates:
     def _apply_fn(self, state: LearnerState, buffer: Array) -> tuple[LearnerState, Array]:
         unravel, count = ravel_pytree(state.params)[1], len(self._losses._fields)
         gradient, losses = unravel(buffer[:-count]), buffer[-count:]
-        kl = self._losses(*losses).kl
-        return apply_gradients(self._learner, state, gradient, kl), losses
+        kl = self._losses(*losses).steering_kl
+        state = apply_gradients(self._learner, state, gradient, kl)
+        return state, jnp.append(losses, state.learning_rate)
 
     def _update_fn(
         self,

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from importlib.metadata import PackageNotFoundError, version
+from importlib.metadata import PackageNotFoundError, requires, version
 
 __version__ = "0.1.0"
 
@@ -11,6 +11,16 @@ __version__ = "0.1.0"
 def versions_of(packages: Iterable[str]) -> dict[str, str | None]:
     """Versions of installed packages by name, None for what is not installed."""
     return {name: _version_of(name) for name in packages}
+
+
+def pinned_version(package: str, dependency: str) -> str | None:
+    """The one version of `dependency` that an installed package asks for, else None."""
+    try:
+        wanted = requires(package) or []
+    except PackageNotFoundError:
+        return None
+    named = (line.partition(";")[0].replace(" ", "") for line in wanted)
+    return next((x.partition("==")[2] for x in named if x.startswith(f"{dependency}==")), None)
 
 
 def _version_of(package: str) -> str | None:

@@ -61,4 +61,4 @@ def metrics_from(stats: RolloutStats) -> IterationMetrics:
     """Of an iteration with such rollouts whose updates told zeros."""
     zero = jnp.zeros(())
     told = stats.episodes, stats.reward_sum, stats.diverged, stats.overflowed
-    return IterationMetrics(*told, LossMetrics(*[zero] * 5), zero, zero)
+    return IterationMetrics(*told, LossMetrics(*[zero] * 5), zero, {}, zero)

@@ -13,8 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from gmijax.a3c.board import Board, Orders, Report, pack_orders, unpack_report
-from gmijax.a3c.losses import LossMetrics
-from gmijax.a3c.report import Progress, Reporter
+from gmijax.a3c.report import Progress, Reporter, Told
 from gmijax.a3c.tally import Tally
 from gmijax.checkpoint import finish_checkpoint, save_learner
 from gmijax.config import TrainConfig
@@ -93,14 +92,13 @@ class Leader:
         env_steps: int,
         updates: int,
         tally: Tally,
-        losses: LossMetrics,
+        told: Told,
         state: LearnerState,
-        update_s: float,
     ) -> None:
         """Takes one update into the metrics."""
         self._env_steps, self._updates = env_steps, updates
         reporter = self._require_reporter()
-        reporter.add(tally, losses, update_s)
+        reporter.add(tally, told)
         if reporter.is_due:
             self._hear()
             reporter.write(self._progress(state))

@@ -46,7 +46,8 @@ class UpdateContext(NamedTuple):
     """What stays the same during all passes over one batch: the policy before the first one.
 
     Attributes:
-      weight: [B], 0 for unrolls that are too old to learn from, else 1.
+      weight: [B], 0 for unrolls that are too old to learn from; the others weigh alike, so that
+        the mean over the batches of all trainers is 1.
       moments: statistics that observations are normalised with.
       mean: [T, B, A] of that policy.
       log_std: [A] likewise.
@@ -69,7 +70,9 @@ class UpdateContext(NamedTuple):
 
 
 class LossMetrics(NamedTuple):
-    """Means over a minibatch, [] float32 each.
+    """Means over a minibatch, [] float32 each, under the weights of its unrolls.
+
+    Weights are 1 in the mean over all minibatches of a batch, and not in each of them.
 
     Attributes:
       policy_loss: see `a3c_loss`.
@@ -77,6 +80,7 @@ class LossMetrics(NamedTuple):
       entropy: of the policy, in nats.
       kl: divergence of the policy from itself before the first pass, in nats.
       behaviour_kl: of the policy before the first pass from those that acted, estimated.
+      weight: mean weight of the unrolls.
     """
 
     policy_loss: Array
@@ -84,6 +88,12 @@ class LossMetrics(NamedTuple):
     entropy: Array
     kl: Array
     behaviour_kl: Array
+    weight: Array
+
+    @property
+    def steering_kl(self) -> Array:
+        """`kl` as a mean over what is learnt from; 0, which steers nothing, where that is none."""
+        return self.kl / jnp.maximum(self.weight, _MIN_WEIGHT)
 
 
 def update_context(
@@ -130,7 +140,9 @@ def a3c_loss(
     """Loss [] of a minibatch of unrolls and its parts.
 
     Policy gradient with the advantages of `context`, half the squared error of the values, minus
-    the entropy bonus (arXiv:1602.01783, section 4), means over all steps of unrolls with weight.
+    the entropy bonus (arXiv:1602.01783, section 4), means over all steps under the weights of
+    their unrolls. The divisor is the same on all trainers, so that their mean weighs alike what
+    each of them learns from, however much that is.
     With `clipping_epsilon` the policy's part is that of PPO (arXiv:1707.06347) relative to the
     policy before the first pass, under the weights of the steps: how old experience is, and how
     far one batch may move the policy, are two questions (arXiv:2110.00641, section 3).
@@ -146,12 +158,17 @@ def a3c_loss(
     loss = (
         policy_loss
         + config.value_cost * value_loss
-        - config.entropy_cost * bonus
+        - config.entropy_cost * bonus * jnp.mean(weight)
         + config.bound_cost * _mean(beyond, weight)
     )
     moved = kl_divergence(context.mean, context.log_std, mean, params.log_std)
     return loss, LossMetrics(
-        policy_loss, value_loss, bonus, _mean(moved, weight), context.behaviour_kl
+        policy_loss,
+        value_loss,
+        bonus,
+        _mean(moved, weight),
+        context.behaviour_kl,
+        jnp.mean(weight),
     )
 
 
@@ -208,5 +225,5 @@ def _normalised(targets: Returns, weight: Array, config: A3cConfig) -> Array:
 
 
 def _mean(values: Array, weight: Array) -> Array:
-    """Mean [] of `values` [T, B] over the unrolls with `weight` [B]."""
-    return jnp.sum(values * weight) / (values.shape[0] * jnp.maximum(jnp.sum(weight), 1.0))
+    """Mean [] of `values` [T, B] under `weight` [B], which is 1 in the mean over all batches."""
+    return jnp.mean(values * weight)

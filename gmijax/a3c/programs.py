@@ -35,6 +35,7 @@ from gmijax.learner import (
     apply_gradients,
     init_learner,
     make_learner,
+    rate_figures,
 )
 from gmijax.normalize import merge_all, no_samples
 from gmijax.sim.interface import EnvSpec
@@ -50,10 +51,12 @@ class Updated(NamedTuple):
     Attributes:
       weights: [W] float32, to publish; see `pack_weights`.
       losses: means over all minibatches of all trainers, [] each.
+      rates: learning rates of all minibatches, see `rate_figures`.
     """
 
     weights: Array
     losses: LossMetrics
+    rates: dict[str, Array]
 
 
 class Update(Protocol):
@@ -71,7 +74,8 @@ class Update(Protocol):
         Args:
           state: of the learner; donated.
           batch: [T, B].
-          weight: [B], 0 for unrolls that are too old to learn from, else 1.
+          weight: [B], 0 for unrolls that are too old to learn from; the others weigh alike on
+            all trainers, and the mean over all of them is 1.
         """
         ...
 
@@ -109,9 +113,9 @@ def _with_weights_at(where: Sharding | None) -> Any:
     """`out_shardings` of a program that returns a state and `Updated`."""
     if where is None:
         return None
-    losses: Any = None
+    rest: Any = None
     weights: Any = where
-    return None, Updated(weights, losses)
+    return None, Updated(weights, rest, rest)
 
 
 def _fused(
@@ -121,14 +125,18 @@ def _fused(
     seen = batch_moments(learner, state, batch)
     order = minibatch_order(learner, state, jnp.zeros((), jnp.int32), batch.reward.shape[1])
 
-    def step(state: LearnerState, indices: Array) -> tuple[LearnerState, LossMetrics]:
+    def step(
+        state: LearnerState, indices: Array
+    ) -> tuple[LearnerState, tuple[LossMetrics, Array]]:
         grads, losses = gradients(learner, state.params, batch, context, indices)
-        return apply_gradients(learner, state, grads, losses.kl), losses
+        state = apply_gradients(learner, state, grads, losses.steering_kl)
+        return state, (losses, state.learning_rate)
 
-    state, losses = jax.lax.scan(step, state, order)
+    state, (losses, rates) = jax.lax.scan(step, state, order)
     state = finish_batch(state, seen)
     weights = pack_weights(acting_weights(learner, state))
-    return state, Updated(weights, jax.tree.map(jnp.mean, losses))
+    means = jax.tree.map(jnp.mean, losses)
+    return state, Updated(weights, means, rate_figures(learner.config, rates))
 
 
 class SplitUpdate:
@@ -151,10 +159,10 @@ class SplitUpdate:
         """See `Update`."""
         order, context, packed = jax.eval_shape(self._begin_fn, state, batch, weight, self._rank)
         gathered = jax.ShapeDtypeStruct((self._reducer.world_size, *packed.shape), jnp.float32)
-        losses = self._updates.trace(state, batch, context, order)
+        told = self._updates.trace(state, batch, context, order)
         self._begin = self._begin.lower(state, batch, weight, self._rank).compile()
         self._updates.compile()
-        self._finish = self._finish.lower(state, gathered, losses).compile()
+        self._finish = self._finish.lower(state, gathered, told).compile()
 
     def __call__(
         self, state: LearnerState, batch: Unrolls, weight: Array
@@ -163,8 +171,8 @@ class SplitUpdate:
         batch = jax.device_put(batch)  # Once, and not with every program.
         order, context, packed = self._begin(state, batch, weight, self._rank)
         gathered = np.array(self._reducer.all_gather(np.asarray(packed)))
-        state, losses = self._updates(state, batch, context, order)
-        return self._finish(state, gathered, losses)
+        state, told = self._updates(state, batch, context, order)
+        return self._finish(state, gathered, told)
 
     def _begin_fn(
         self, state: LearnerState, batch: Unrolls, weight: Array, rank: Array
@@ -174,9 +182,10 @@ class SplitUpdate:
         return order, begin_batch(self._learner, state, batch, weight), seen
 
     def _finish_fn(
-        self, state: LearnerState, gathered: Array, losses: list[Array]
+        self, state: LearnerState, gathered: Array, told: list[Array]
     ) -> tuple[LearnerState, Updated]:
         unpack = ravel_pytree(no_samples((self._obs_size,)))[1]
         state = finish_batch(state, merge_all(jax.vmap(unpack)(gathered)))
         weights = pack_weights(acting_weights(self._learner, state))
-        return state, Updated(weights, LossMetrics(*jnp.mean(jnp.stack(losses), axis=0)))
+        losses, rates = self._updates.summary(told)
+        return state, Updated(weights, losses, rate_figures(self._learner.config, rates))

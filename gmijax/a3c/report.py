@@ -7,6 +7,8 @@ samples per second: environment steps that trainers have learnt from (paper, sec
 from __future__ import annotations
 
 import time
+from collections.abc import Callable, Mapping
+from types import MappingProxyType
 from typing import Any, NamedTuple
 
 import jax
@@ -21,6 +23,11 @@ from gmijax.a3c.tally import Tally
 from gmijax.metrics import Episodes, EpisodeWindow, MetricsLog
 from gmijax.physics_health import OverflowCount, check_diverged, overflow_line
 from gmijax.sim.wrappers import BatchedEnv
+
+_OF_RATES: Mapping[str, Callable[[Any], Any]] = MappingProxyType(
+    {"mean": np.mean, "min": np.min, "max": np.max}
+)
+"""How figures of several updates are joined to those of a line."""
 
 LINE_EVERY_S = 0.5
 """Updates may be much faster than anybody can read: a line tells of all since the one before."""
@@ -40,6 +47,20 @@ class Progress(NamedTuple):
     reports: tuple[Report, ...]
     learning_rate: float
     noise_std: float
+
+
+class Told(NamedTuple):
+    """What an update tells.
+
+    Attributes:
+      losses: on the host.
+      rates: likewise, see `rate_figures`.
+      update_s: seconds that it took.
+    """
+
+    losses: LossMetrics
+    rates: dict[str, Any]
+    update_s: float
 
 
 class _Sums(NamedTuple):
@@ -77,7 +98,7 @@ class Reporter:
         self._env_steps = env_steps
         self._last = time.monotonic()
         self._started = self._last - wall_s
-        self._updates: list[tuple[Any, float, float]] = []
+        self._updates: list[tuple[Told, float]] = []
         self._stale = 0.0
         self._recent = np.zeros(MAX_COUNTED + 1, np.float32)
         self._whole = np.zeros(MAX_COUNTED + 1, np.float64)
@@ -93,9 +114,9 @@ class Reporter:
         """Whether the last line is old enough."""
         return time.monotonic() - self._last >= LINE_EVERY_S
 
-    def add(self, tally: Tally, losses: LossMetrics, update_s: float) -> None:
+    def add(self, tally: Tally, told: Told) -> None:
         """Takes in one update."""
-        self._updates.append((losses, update_s, tally.receive_s))
+        self._updates.append((told, tally.receive_s))
         self._stale += tally.stale
         self._recent += tally.staleness
 
@@ -156,11 +177,18 @@ class Reporter:
         self._log.close()
 
     def _of_updates(self) -> dict[str, float]:
-        losses, update_s, receive_s = zip(*self._updates, strict=True)
+        told, receive_s = zip(*self._updates, strict=True)
+        losses, rates, update_s = zip(*told, strict=True)
         return {
             **{
                 f"loss/{name}": float(np.mean([getattr(one, name) for one in losses]))
                 for name in LossMetrics._fields
+                if name != "weight"  # 1, over a batch.
+            },
+            **{
+                f"policy/learning_rate_{name}": float(joined([one[name] for one in rates]))
+                for name, joined in _OF_RATES.items()
+                if name in rates[0]
             },
             "async/updates": len(self._updates),
             "time/update_s": float(np.mean(update_s)),

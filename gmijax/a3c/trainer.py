@@ -20,6 +20,7 @@ from gmijax.a3c.leader import Leader
 from gmijax.a3c.learner import acting_weights, pack_weights
 from gmijax.a3c.losses import LossMetrics, Unrolls
 from gmijax.a3c.programs import FusedUpdate, SplitUpdate, Update
+from gmijax.a3c.report import Told
 from gmijax.a3c.staleness import MAX_COUNTED, histogram_of
 from gmijax.a3c.tally import Tally
 from gmijax.checkpoint import digest, restore_learner
@@ -150,8 +151,10 @@ class _Trainer:
             tally = self._meet(batch, waited_s)
             started = time.monotonic()
             unrolls = Unrolls(**batch.experience)  # pyright: ignore[reportArgumentType]
-            state, updated = self._update(state, unrolls, jnp.asarray(self._weights_of(batch)))
-            weights, losses = np.asarray(updated.weights), jax.device_get(updated.losses)
+            weight = jnp.asarray(self._weights_of(batch) * self._scale(tally))
+            state, updated = self._update(state, unrolls, weight)
+            weights = np.asarray(updated.weights)
+            losses, rates = jax.device_get((updated.losses, updated.rates))
             self._version += 1
             self._updates += 1
             self._env_steps += round(tally.fresh) * self._algo.unroll_length
@@ -161,7 +164,8 @@ class _Trainer:
             if self._lead is not None:
                 self._lead.publish(weights, self._version)
                 update_s = time.monotonic() - started
-                self._lead.record(self._env_steps, self._updates, tally, losses, state, update_s)
+                told = Told(losses, rates, update_s)
+                self._lead.record(self._env_steps, self._updates, tally, told, state)
                 if not is_last:
                     self._lead.checkpoint_now_and_then(state, self._env_steps, self._updates)
             self._link.beat("running", self._updates)
@@ -205,6 +209,10 @@ class _Trainer:
             return np.ones(self._batch_size, np.float32)
         fresh = self._version - batch.versions <= self._algo.max_staleness
         return fresh.astype(np.float32)
+
+    def _scale(self, tally: Tally) -> np.float32:
+        """What a fresh unroll weighs, so that it weighs as much as any other of the job."""
+        return np.float32(self._reducer.world_size * self._batch_size / tally.fresh)
 
     def _meet(self, batch: Batch, waited_s: float) -> Tally:
         """Tells the other trainers of this batch, and hears of theirs."""

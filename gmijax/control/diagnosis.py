@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from typing import Any, Final, NamedTuple
 
 from gmijax.config import ReduceConfig
+from gmijax.control.fast_path import cuda_major, missing_pieces
 from gmijax.control.sight import REQUIRED, Sight, device_of
 from gmijax.errors import ConfigError
 from gmijax.partition.backend_choice import why_not_backend
@@ -192,9 +193,7 @@ def _jax_problems(sight: Sight) -> Iterator[str]:
 def _cuda_advice(sight: Sight) -> str:
     if any(sight.versions[f"jax-cuda{cuda}-plugin"] for cuda in (12, 13)):
         return ""
-    # CUDA 13 needs a driver of the 580 branch.
-    cuda = 13 if sight.machine.driver_major >= 580 else 12
-    return f" (pip install 'gmijax[cuda{cuda}]')"
+    return f" (pip install 'gmijax[cuda{cuda_major(sight)}]')"
 
 
 def _notes(sight: Sight) -> Iterator[str]:
@@ -208,6 +207,13 @@ def _notes(sight: Sight) -> Iterator[str]:
         yield (
             f"{PIPE_VARIABLE}={variables[PIPE_VARIABLE]}: no daemon answers there; jobs start "
             "their own"
+        )
+    yield from missing_pieces(sight)
+    mujoco, mjx = sight.versions["mujoco"], sight.versions["mujoco-mjx"]
+    if mujoco and mjx and mujoco.partition(".")[0] != mjx.partition(".")[0]:
+        yield (
+            f"mujoco {mujoco} with mujoco-mjx {mjx} was never tried "
+            "(pip install 'mujoco~=3.17' 'mujoco-mjx~=3.17')"
         )
     if sight.mps_error:
         yield "with plan.backend=auto jobs fall back to share, because MPS does not start"

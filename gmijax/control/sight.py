@@ -19,7 +19,7 @@ from gmijax.partition.machine import Machine, detect_machine
 from gmijax.partition.nvidia import Gpu, nvml_problem
 from gmijax.partition.planner import make_plan
 from gmijax.rundir import RunPaths
-from gmijax.version import versions_of
+from gmijax.version import pinned_version, versions_of
 
 PROBE_TIMEOUT_S: Final = 120.0
 
@@ -55,6 +55,7 @@ class Sight(NamedTuple):
       variables: the environment.
       nvml_error: why NVML fails although it is installed, None where it does not.
       mps_error: why an MPS daemon cannot be started, None where it can or was not tried.
+      wanted_warp: the one warp-lang that mujoco-mjx was made for, None where it names none.
     """
 
     machine: Machine
@@ -63,6 +64,7 @@ class Sight(NamedTuple):
     variables: Mapping[str, str] = MappingProxyType({})
     nvml_error: str | None = None
     mps_error: str | None = None
+    wanted_warp: str | None = None
 
 
 def look() -> Sight:
@@ -75,6 +77,7 @@ def look() -> Sight:
         variables=dict(os.environ),
         nvml_error=nvml_problem(),
         mps_error=try_mps(machine),
+        wanted_warp=pinned_version("mujoco-mjx", "warp-lang"),
     )
 
 

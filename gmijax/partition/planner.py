@@ -256,20 +256,35 @@ def _strategy(
             f"{_NO_RINGS[backend].format(choice.strategy)}"
         )
         return "mpr"
-    if reduce.selection == "device" and _exchange_on_devices(reduce, layout, backend):
+    if _exchange_on_devices(reduce, layout, backend):
         reasons.append(
             "strategy one_shot: GMIs that share GPUs train faster with exchanges on them; "
             f"Algorithm 1 says {choice.strategy} ({choice.why}), as reduce.selection=paper does"
         )
         return "one_shot"
-    reasons.append(f"strategy {choice.strategy}: {choice.why} (Algorithm 1)")
+    slow = _why_not_one_shot(reduce, layout, backend)
+    reasons.append(f"strategy {choice.strategy}: {choice.why} (Algorithm 1){slow}")
     return choice.strategy
 
 
 def _exchange_on_devices(reduce: ReduceConfig, layout: Layout, backend: BackendName) -> bool:
+    can = why_not_under("one_shot", layout, backend) is None
+    return can and _wants_one_shot(reduce, layout)
+
+
+def _wants_one_shot(reduce: ReduceConfig, layout: Layout) -> bool:
     # With one GMI on each GPU the ring is part of the program that trains.
-    can = reduce.intra != "host" and why_not_under("one_shot", layout, backend) is None
-    return can and not is_one_per_gpu(layout)
+    is_allowed = reduce.selection == "device" and reduce.intra != "host"
+    return is_allowed and not is_one_per_gpu(layout)
+
+
+def _why_not_one_shot(reduce: ReduceConfig, layout: Layout, backend: BackendName) -> str:
+    """What this machine lacks for the faster way, as the end of a sentence; else nothing."""
+    # Under other backends there is no memory of a GPU to share, whatever is installed.
+    if backend not in ("mps", "share") or not _wants_one_shot(reduce, layout):
+        return ""
+    lacking = why_not_under("one_shot", layout, backend)
+    return f"; one_shot would train faster: {lacking}" if lacking else ""
 
 
 def _intra(

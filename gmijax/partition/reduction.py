@@ -67,7 +67,10 @@ def why_not_intra(intra: str, backend: str) -> str | None:
     if backend == "mig":
         return "there is no CUDA IPC between the instances of a GPU in MIG mode"
     if not _is_installed("cuda", "cuda.bindings"):
-        return "CUDA IPC needs the package cuda-bindings (pip install 'gmijax[ipc]')"
+        return (
+            "CUDA IPC needs the package cuda-bindings "
+            "(pip install 'gmijax[cuda13]', with a driver before 580 'gmijax[cuda12]')"
+        )
     return _why_too_old(versions_of([_BINDINGS])[_BINDINGS])
 
 

@@ -43,6 +43,11 @@ class LossMetrics(NamedTuple):
     kl: Array
     clip_fraction: Array
 
+    @property
+    def steering_kl(self) -> Array:
+        """What the adaptive learning rate follows."""
+        return self.kl
+
 
 class UpdateContext(NamedTuple):
     """What stays the same during all updates on one rollout.

@@ -31,6 +31,7 @@ from gmijax.learner import (
     apply_gradients,
     init_learner,
     make_learner,
+    rate_figures,
 )
 from gmijax.ppo.learner import finish_iteration, gradients, minibatch_order, update_context
 from gmijax.ppo.losses import LossMetrics, Samples
@@ -51,6 +52,7 @@ class IterationMetrics(NamedTuple):
       reward_sum, diverged, overflowed: see `RolloutStats`.
       losses: means over all minibatches of the iteration.
       learning_rate: after the last update.
+      rates: of all updates, see `rate_figures`.
       noise_std: mean standard deviation of the policy.
     """
 
@@ -60,6 +62,7 @@ class IterationMetrics(NamedTuple):
     overflowed: dict[str, Array]
     losses: LossMetrics
     learning_rate: Array
+    rates: dict[str, Array]
     noise_std: Array
 
 
@@ -113,8 +116,10 @@ def flatten(samples: Samples) -> Samples:
     return jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), samples)
 
 
-def metrics_of(state: LearnerState, stats: RolloutStats, losses: LossMetrics) -> IterationMetrics:
-    """What an iteration tells, from its results."""
+def metrics_of(
+    learner: Learner, state: LearnerState, stats: RolloutStats, losses: LossMetrics, rates: Array
+) -> IterationMetrics:
+    """What an iteration tells, from its results; `rates` are the learning rates of all updates."""
     std = jnp.mean(jnp.exp(state.params.log_std))
     # Without the moments: they have O numbers each and are of no use in a log.
     return IterationMetrics(
@@ -124,6 +129,7 @@ def metrics_of(state: LearnerState, stats: RolloutStats, losses: LossMetrics) ->
         stats.overflowed,
         losses,
         state.learning_rate,
+        rate_figures(learner.config, rates),
         std,
     )
 
@@ -232,8 +238,9 @@ def iterate(
     if peers is not None:
         packed, unpack = ravel_pytree(stats)  # One message, not one for each number.
         rank, stats = peers.rank(), merge_stats(jax.vmap(unpack)(peers.gather(packed)))
-    state, losses = learn(learner, peers, state, flatten(samples), stats, rank)
-    return state, env_state, metrics_of(state, stats, jax.tree.map(jnp.mean, losses))
+    state, losses, rates = learn(learner, peers, state, flatten(samples), stats, rank)
+    means = jax.tree.map(jnp.mean, losses)
+    return state, env_state, metrics_of(learner, state, stats, means, rates)
 
 
 def learn(
@@ -243,17 +250,20 @@ def learn(
     samples: Samples,
     stats: RolloutStats,
     rank: Array,
-) -> tuple[LearnerState, LossMetrics]:
-    """All updates of an iteration, on flat samples; losses of every minibatch."""
+) -> tuple[LearnerState, LossMetrics, Array]:
+    """All updates of an iteration, on flat samples; losses and learning rates of all of them."""
     context = update_context(learner, state, stats)
     order = minibatch_order(learner, state, rank, samples.advantage.shape[0])
 
-    def update(state: LearnerState, indices: Array) -> tuple[LearnerState, LossMetrics]:
+    def update(
+        state: LearnerState, indices: Array
+    ) -> tuple[LearnerState, tuple[LossMetrics, Array]]:
         grads, losses = gradients(learner, state.params, samples, context, indices)
         if peers is not None:
             packed, unpack = ravel_pytree((grads, losses))
             grads, losses = unpack(peers.mean(packed))
-        return apply_gradients(learner, state, grads, losses.kl), losses
+        state = apply_gradients(learner, state, grads, losses.steering_kl)
+        return state, (losses, state.learning_rate)
 
-    state, losses = jax.lax.scan(update, state, order)
-    return finish_iteration(state, stats), losses
+    state, (losses, rates) = jax.lax.scan(update, state, order)
+    return finish_iteration(state, stats), losses, rates

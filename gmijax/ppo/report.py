@@ -80,6 +80,7 @@ class Reporter:
                 "reward_per_step": host.reward_sum / steps,
                 **{f"loss/{name}": value for name, value in host.losses._asdict().items()},
                 "policy/learning_rate": host.learning_rate,
+                **{f"policy/learning_rate_{name}": rate for name, rate in host.rates.items()},
                 "policy/noise_std": host.noise_std,
                 **times,
             }

@@ -64,8 +64,8 @@ class SplitIteration:
         gathered = jax.ShapeDtypeStruct((self._reducer.world_size, *packed.shape), jnp.float32)
         self._begin = self._begin.lower(state, gathered)
         context, stats = self._begin.out_info
-        losses = self._updates.trace(state, samples, context, order)
-        self._finish = self._finish.lower(state, stats, losses)
+        told = self._updates.trace(state, samples, context, order)
+        self._finish = self._finish.lower(state, stats, told)
 
     def compile_updates(self) -> None:
         """Compiles what `trace_updates` has traced."""
@@ -105,8 +105,8 @@ class SplitIteration:
         """
         context, stats = self._begin(state, np.array(self._reducer.all_gather(mine)))
         started = time.monotonic()
-        state, losses = self._updates(state, samples, context, order)
-        state, metrics = self._finish(state, stats, losses)
+        state, told = self._updates(state, samples, context, order)
+        state, metrics = self._finish(state, stats, told)
         self.times = {"time/update_s": time.monotonic() - started}
         if self._updates.reduce_s is not None:
             self.times["time/reduce_s"] = self._updates.reduce_s
@@ -131,11 +131,10 @@ class SplitIteration:
         return update_context(self._learner, state, stats), stats
 
     def _finish_fn(
-        self, state: LearnerState, stats: RolloutStats, losses: list[Array]
+        self, state: LearnerState, stats: RolloutStats, told: list[Array]
     ) -> tuple[LearnerState, IterationMetrics]:
         state = finish_iteration(state, stats)
-        means = jnp.mean(jnp.stack(losses), axis=0)
-        return state, metrics_of(state, stats, LossMetrics(*means))
+        return state, metrics_of(self._learner, state, stats, *self._updates.summary(told))
 
     @functools.cached_property
     def _unpack_stats(self) -> Any:

@@ -9,10 +9,18 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from jax.flatten_util import ravel_pytree
 from toy_env import point_mass
 
-from gmijax.a3c.learner import acting_weights, num_weights, pack_weights, unpack_weights
-from gmijax.a3c.losses import Unrolls
+from gmijax.a3c.learner import (
+    acting_weights,
+    begin_batch,
+    gradients,
+    num_weights,
+    pack_weights,
+    unpack_weights,
+)
+from gmijax.a3c.losses import LossMetrics, Unrolls
 from gmijax.a3c.programs import FusedUpdate, SplitUpdate, exchange_size
 from gmijax.a3c.rollout import UnrollPrograms, collect
 from gmijax.a3c.staleness import histogram_of, mean_and_p99
@@ -143,6 +151,21 @@ class _Threads:
         pass
 
 
+def _in_threads(update_of) -> dict:
+    """What two trainers return, each in a thread, by rank."""
+    slots, barrier, results = [None, None], threading.Barrier(2), {}
+
+    def run(rank: int) -> None:
+        results[rank] = update_of(rank, _Threads(rank, 2, slots, barrier))
+
+    threads = [threading.Thread(target=run, args=(rank,)) for rank in range(2)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    return results
+
+
 def test_one_trainer_learns_the_same_in_both_forms(config) -> None:
     learner, state, envs = _start(config)
     _, batch, _ = collect(
@@ -160,25 +183,78 @@ def test_two_trainers_stay_equal_and_take_in_both_batches(config) -> None:
     learner, state, envs = _start(config, num_envs=2 * N)
     _, both, _ = collect(ENV, learner.networks, T, ENV.model, acting_weights(learner, state), envs)
     half = [jax.tree.map(lambda x, k=k: x[:, k * N : (k + 1) * N], both) for k in range(2)]
-    slots, barrier = [None, None], threading.Barrier(2)
-    results: dict = {}
 
-    def run(rank: int) -> None:
-        reducer = _Threads(rank, 2, slots, barrier)
+    def update_of(rank: int, reducer):
         update = SplitUpdate(learner, ENV.spec.obs_size, reducer)
-        results[rank] = update(_copy(state), half[rank], jnp.ones(N))
+        return update(_copy(state), half[rank], jnp.ones(N))
 
-    threads = [threading.Thread(target=run, args=(rank,)) for rank in range(2)]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join()
+    results = _in_threads(update_of)
     a, b = results[0][0], results[1][0]
     jax.tree.map(np.testing.assert_array_equal, a.params, b.params)
     jax.tree.map(np.testing.assert_array_equal, a.obs_moments, b.obs_moments)
     seen = both.state.reshape(-1, ENV.spec.obs_size)
     np.testing.assert_allclose(a.obs_moments.mean, seen.mean(0), rtol=1e-4, atol=1e-5)
     assert float(a.obs_moments.count) == len(seen)
+
+
+def test_fresh_unrolls_weigh_alike_however_many_a_trainer_has(config) -> None:
+    plain = dataclasses.replace(
+        config, num_minibatches=1, num_updates_per_batch=1, normalize_advantage=False
+    )
+    learner, state, envs = _start(plain, num_envs=2 * N)
+    _, both, _ = collect(ENV, learner.networks, T, ENV.model, acting_weights(learner, state), envs)
+    # One trainer has a fresh unroll and stale ones, the other fresh ones only.
+    fresh = np.array([1.0] + [0.0] * (N - 1) + [1.0] * N, np.float32)
+    weight = jnp.asarray(fresh * len(fresh) / fresh.sum())
+    alone, said = FusedUpdate(learner)(_copy(state), both, weight)
+
+    def update_of(rank: int, reducer):
+        mine = slice(rank * N, (rank + 1) * N)
+        update = SplitUpdate(learner, ENV.spec.obs_size, reducer)
+        return update(_copy(state), jax.tree.map(lambda x: x[:, mine], both), weight[mine])
+
+    together, also = _in_threads(update_of)[0]
+    np.testing.assert_allclose(said.losses, also.losses, rtol=1e-4, atol=1e-6)
+    # Adam divides by the gradient's size: its moments tell how large it was.
+    np.testing.assert_allclose(
+        *(ravel_pytree(one.opt_state)[0] for one in (alone, together)), rtol=1e-3, atol=1e-6
+    )
+    only_fresh = jax.tree.map(lambda x: x[:, fresh > 0], both)
+    _, theirs = FusedUpdate(learner)(_copy(state), only_fresh, jnp.ones(N + 1))
+    np.testing.assert_allclose(also.losses, theirs.losses, rtol=1e-4, atol=1e-6)
+
+
+def test_a_minibatch_of_stale_unrolls_does_not_dilute_the_divergence(config) -> None:
+    learner, state, envs = _start(config)
+    weights = acting_weights(learner, state)
+    _, batch, _ = collect(ENV, learner.networks, T, ENV.model, weights, envs)
+    moved = state.params._replace(log_std=state.params.log_std + 0.1)
+    told = []
+    for fresh in (np.ones(N), np.r_[1.0, np.zeros(N - 1)], np.zeros(N)):
+        context = begin_batch(learner, state, batch, jnp.asarray(fresh, jnp.float32))
+        told.append(gradients(learner, moved, batch, context, jnp.arange(N))[1])
+    # Of a trainer with fresh unrolls only, one with a twelfth, and one with none.
+    means = LossMetrics(*(sum(parts) / len(parts) for parts in zip(*told, strict=True)))
+    np.testing.assert_allclose(means.steering_kl, told[0].kl, rtol=1e-4)
+    assert float(told[2].steering_kl) == 0.0
+
+
+def test_learning_rates_of_all_minibatches_are_told(config) -> None:
+    adaptive = dataclasses.replace(
+        config, learning_rate_schedule="adaptive_kl", learning_rate=1e-3, desired_kl=1e-7
+    )
+    learner, state, envs = _start(adaptive)
+    weights = acting_weights(learner, state)
+    _, batch, _ = collect(ENV, learner.networks, T, ENV.model, weights, envs)
+    split = SplitUpdate(learner, ENV.spec.obs_size, SoloReducer(exchange_size(ENV.spec, adaptive)))
+    for update in (FusedUpdate(learner), split):
+        new, told = update(_copy(state), batch, jnp.ones(N))
+        # The first pass has not moved yet, the others each lower the rate.
+        rates = [1e-3, 1e-3 / 1.5, 1e-3 / 1.5**2, 1e-3 / 1.5**3]
+        assert float(told.rates["max"]) == pytest.approx(rates[0])
+        assert float(told.rates["min"]) == pytest.approx(rates[3])
+        assert float(told.rates["mean"]) == pytest.approx(np.mean(rates))
+        assert float(new.learning_rate) == pytest.approx(rates[3])
 
 
 @pytest.mark.parametrize(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 from toy_env import point_mass
 
 from gmijax.a3c.board import Board
@@ -41,3 +42,21 @@ def test_unrolls_of_batches_that_are_passed_over_count_as_stale(tmp_path) -> Non
     assert (first.fresh, first.stale, first.staleness.sum()) == (3, 5, 8)
     assert first.staleness[[0, 1, 6, 7, 8, 9]].tolist() == [2, 1, 1, 1, 2, 1]
     assert (second.fresh, second.stale, second.staleness.sum()) == (4, 0, 4)
+
+
+def test_fresh_unrolls_weigh_as_much_as_those_of_all_trainers(tmp_path) -> None:
+    config = compose("env=ball_balance", "algo=a3c", "num_envs=4", "algo.max_staleness=3")
+    trainer = _Trainer(
+        Training(config, config.algo, point_mass(), agents=(1,)),
+        Board(None, None, ()),
+        _Arrivals([10, 2, 2, 2]),
+        SoloReducer(1),
+        ChildLink(0, RunPaths(tmp_path), None, None),
+    )
+    trainer._version = 10
+    batch, waited_s = trainer._receive()
+    mine = trainer._meet(batch, waited_s)
+    assert (trainer._weights_of(batch) * trainer._scale(mine)).tolist() == [4, 0, 0, 0]
+    # With another trainer that has four of four.
+    trainer._reducer.world_size = 2
+    assert float(trainer._scale(mine._replace(fresh=5.0))) == pytest.approx(8 / 5)

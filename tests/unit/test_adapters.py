@@ -247,6 +247,15 @@ def test_brax_truncates_ours_at_its_own_limit_and_starts_over(swing_up: Theirs):
     assert swing_up.states[6].pipeline_state.steps.tolist() == [1] * NUM_ENVS
 
 
+def test_ours_keeps_the_metrics_of_brax_evaluation(swing_up: Theirs):
+    wrapped = training.EvalWrapper(training.wrap(swing_up.env, episode_length=5))
+    keys = jax.random.split(jax.random.PRNGKey(0), NUM_ENVS)
+    first: Any = jax.eval_shape(wrapped.reset, keys)
+    then: Any = jax.eval_shape(wrapped.step, first, jnp.zeros((NUM_ENVS, 1)))
+    assert set(then.metrics) == {"reward", "reward/upright", "reward/centre", "reward/effort"}
+    assert jax.tree.structure(then) == jax.tree.structure(first)
+
+
 def test_an_end_by_the_task_is_no_truncation():
     env = make_env(SWING_UP, api="brax")
     wrapped = training.wrap(env, episode_length=5)

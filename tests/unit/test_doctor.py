@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import subprocess
 from pathlib import Path
@@ -222,3 +223,66 @@ def test_commands_for_a_split_are_printed(
     assert doctor.main(["mig=3g,2g,1g,1g"]) == 0
     said = capsys.readouterr().out
     assert "sudo nvidia-smi mig -i 1 -cgi 3g.71gb:4,2g.35gb:2,1g.18gb:1,1g.18gb:0 -C\n" in said
+
+
+BINDINGS_MISSING = (
+    "gradients of GMIs that share a GPU go through host memory: reduce.strategy=one_shot needs "
+    "cuda-bindings>=13, and {} (pip install 'gmijax[cuda13]')"
+)
+
+
+@pytest.mark.parametrize(
+    ("driver", "changes", "note"),
+    [
+        ("580.159.03", {}, BINDINGS_MISSING.format("it is not installed")),
+        (
+            "580.159.03",
+            {"cuda-bindings": "12.9.4", "jax-cuda12-plugin": None},
+            BINDINGS_MISSING.format("12.9.4 is installed"),
+        ),
+        ("580.159.03", {"cuda-bindings": "13.5.0"}, None),
+        ("570.86.10", {}, "cuda-bindings>=12.9.1,<13, and it is not installed (pip install '"),
+        ("570.86.10", {"cuda-bindings": "12.9.0"}, "12.9.0 is installed (pip install 'gmijax[cu"),
+        ("570.86.10", {"cuda-bindings": "13.5.0"}, "13.5.0 is installed (pip install 'gmijax[cu"),
+        ("570.86.10", {"cuda-bindings": "12.9.1"}, None),
+        # What jax has counts, where the driver takes both.
+        (
+            "580.159.03",
+            {"jax-cuda13-plugin": None},
+            "cuda-bindings>=12.9.1,<13, and it is not installed (pip install 'gmijax[cuda12]')",
+        ),
+    ],
+)
+def test_missing_or_old_bindings_are_told_with_the_command_that_brings_them(
+    monkeypatch: pytest.MonkeyPatch, driver: str, changes: dict[str, str | None], note: str | None
+):
+    here = machine_of(monkeypatch, H200_MIG_OFF)
+    here = dataclasses.replace(here, driver_version=driver)
+    notes = diagnose(seen(here, versions=INSTALLED | changes)).notes
+    assert [note in found for found in notes] == [True] if note else notes == ()
+
+
+FAST = INSTALLED | {"cuda-bindings": "13.5.0"}
+
+
+def test_without_mps_or_warp_the_fast_path_is_not_whole(monkeypatch: pytest.MonkeyPatch):
+    no_mps = machine_of(monkeypatch, H200_MIG_OFF, control=None)
+    [note] = diagnose(seen(no_mps, versions=FAST)).notes
+    assert "nvidia-cuda-mps-control is not installed" in note
+    here = machine_of(monkeypatch, H200_MIG_OFF)
+    [note] = diagnose(seen(here, versions=FAST | {"warp-lang": None})).notes
+    assert "faster physics for ant, " in note
+    assert note.endswith("needs warp-lang (pip install 'gmijax[warp]')")
+    [note] = diagnose(seen(here, versions=FAST, wanted_warp="1.18.0")).notes
+    assert note.startswith("MJX-Warp was made for warp-lang 1.18.0, and 1.0 is installed")
+    assert diagnose(seen(here, versions=FAST, wanted_warp="1.0")).notes == ()
+
+
+def test_between_instances_there_is_no_fast_path_to_complete(monkeypatch: pytest.MonkeyPatch):
+    assert diagnose(seen(machine_of(monkeypatch, A100_SEVEN))).notes == ()
+
+
+def test_a_mujoco_that_mjx_does_not_know_is_told(monkeypatch: pytest.MonkeyPatch):
+    mixed = INSTALLED | {"mujoco": "4.0.0", "mujoco-mjx": "3.17.0"}
+    [note] = diagnose(seen(machine_of(monkeypatch), versions=mixed)).notes
+    assert note.startswith("mujoco 4.0.0 with mujoco-mjx 3.17.0 was never tried (pip install")

@@ -228,8 +228,10 @@ def test_it_compiles_once_and_learns_to_stand_still(learner) -> None:
     assert np.mean(returns[-10:]) > np.mean(returns[:10]) + 0.4
 
 
-def test_no_number_is_told_twice(learner) -> None:
+@pytest.mark.parametrize("schedule", ["fixed", "adaptive_kl"])
+def test_no_number_is_told_twice(config, schedule) -> None:
     """GPUs would copy it within host memory, for which the host waits (`IterationMetrics`)."""
+    learner = make_learner(ENV.spec, dataclasses.replace(config, learning_rate_schedule=schedule))
     iteration = FusedIteration(ENV, learner)
     iteration.trace(*_start(learner))
     told = len(jax.tree.leaves(iteration._program.out_info[2]))
@@ -241,6 +243,22 @@ def test_no_number_is_told_twice(learner) -> None:
         source = {name: re.findall(r"%[\w.\-]+", made_by[name])[1] for name in copied}
         results = [source.get(name, name) for name in results]
     assert len(set(results)) == told
+
+
+def test_learning_rates_of_all_updates_are_told(config) -> None:
+    adaptive = dataclasses.replace(
+        config, num_updates_per_batch=1, learning_rate_schedule="adaptive_kl", desired_kl=1e-7
+    )
+    mine = make_learner(ENV.spec, adaptive)
+    reducer = SoloReducer(exchange_size(ENV.spec, adaptive))
+    # The first update has not moved yet, the others each lower the rate.
+    rates = [1e-3 / 1.5**k for k in range(4)]
+    for iteration in (FusedIteration(ENV, mine), SplitIteration(ENV, mine, reducer)):
+        _, _, told = iteration(*_start(mine))
+        assert float(told.learning_rate) == pytest.approx(rates[-1])
+        assert {k: float(v) for k, v in told.rates.items()} == pytest.approx(
+            {"mean": np.mean(rates), "min": rates[-1], "max": rates[0]}
+        )
 
 
 def _returned(lines: list[str]) -> str:

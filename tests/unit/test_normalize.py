@@ -72,3 +72,9 @@ def test_constant_inputs_and_outliers_stay_finite() -> None:
     moments = moments_of(jnp.ones((10, 4)), 1)
     assert np.all(std_of(moments) > 0)
     np.testing.assert_array_equal(normalize(moments, jnp.full(4, 100.0)), OBS_CLIP)
+
+
+def test_raw_observations_are_not_clipped() -> None:
+    # Without normalisation, and until there are statistics: their unit is not known.
+    obs = jnp.array([1.0, -200.0, 3e4, 0.0])
+    np.testing.assert_array_equal(normalize(no_samples((4,)), obs), obs)

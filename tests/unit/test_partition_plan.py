@@ -137,6 +137,31 @@ def test_gmis_that_share_a_gpu_exchange_on_it_where_they_can(
     assert plan.intra == ("ipc" if is_installed else "host")
 
 
+@pytest.mark.parametrize(
+    ("reduce", "changes", "backend", "is_told"),
+    [
+        ({}, {"gmis_per_gpu": 2}, "share", True),
+        ({}, {"gmis_per_gpu": 2, "gpus": 2}, "share", True),
+        ({"selection": "paper"}, {"gmis_per_gpu": 2}, "share", False),
+        ({"intra": "host"}, {"gmis_per_gpu": 2}, "share", False),
+        ({}, {"gpus": 2}, "share", False),  # One program trains on all GPUs.
+        ({}, {"gmis_per_gpu": 2}, "cpu", False),
+    ],
+)
+def test_a_plan_that_leaves_the_fast_path_says_what_would_bring_it(
+    reduce: dict[str, Any],
+    changes: dict[str, Any],
+    backend: str,
+    is_told: bool,
+    monkeypatch: pytest.MonkeyPatch,
+):
+    monkeypatch.setattr(reduction, "_is_installed", lambda *_: False)
+    plan = planned(machine(2), {"selection": "device"} | reduce, backend=backend, **changes)
+    (reason,) = [text for text in plan.reasons if text.startswith("strategy")]
+    lacking = "one_shot would train faster: CUDA IPC needs the package cuda-bindings (pip install"
+    assert (lacking in reason) == is_told
+
+
 def test_who_wants_host_memory_gets_what_algorithm_1_says(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(reduction, "_is_installed", lambda *_: True)
     reduce = {"selection": "device", "intra": "host"}

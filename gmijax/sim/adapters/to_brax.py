@@ -32,7 +32,7 @@ class BraxEnv(Env):
         """Starts an episode from a key, new-style or plain integers [2]."""
         if not jnp.issubdtype(rng.dtype, jax.dtypes.prng_key):
             rng = jax.random.wrap_key_data(rng)
-        return _to_state(self._env.reset(self._env.model, rng), {})
+        return _to_state(self._env.reset(self._env.model, rng), {}, {})
 
     def step(self, state: State, action: Array) -> State:
         """One control step of one world under `action` [A]."""
@@ -40,7 +40,7 @@ class BraxEnv(Env):
         before: Any = state.pipeline_state
         key = jax.random.wrap_key_data(state.info[_KEY])
         moved = self._env.step(self._env.model, before._replace(key=key), action)
-        return _to_state(moved, state.info)
+        return _to_state(moved, state.info, state.metrics)
 
     @property
     def observation_size(self) -> int:
@@ -73,7 +73,9 @@ class BraxEnv(Env):
         return self._env.mj_model
 
 
-def _to_state(state: interface.EnvState, info: dict[str, Any]) -> State:
+def _to_state(state: interface.EnvState, info: dict[str, Any], metrics: dict[str, Array]) -> State:
+    # What Brax's wrappers have put into `info` and `metrics` stays.
+    terms = {f"reward/{name}": value for name, value in state.reward_terms.items()}
     mine: dict[str, PyTree] = {
         _KEY: jax.random.key_data(state.key),
         "task_metrics": state.metrics,
@@ -83,7 +85,6 @@ def _to_state(state: interface.EnvState, info: dict[str, Any]) -> State:
         obs=state.obs,
         reward=state.reward,
         done=(state.terminated | state.truncated).astype(jnp.float32),
-        metrics={f"reward/{name}": value for name, value in state.reward_terms.items()},
-        # What Brax's wrappers have put there stays.
+        metrics={**metrics, **terms},
         info={**info, **mine},
     )

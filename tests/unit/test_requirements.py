@@ -1,0 +1,106 @@
+"""What pyproject.toml asks for is what the package uses."""
+
+from __future__ import annotations
+
+import ast
+import sys
+import tomllib
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from packaging.requirements import Requirement
+
+from gmijax.control.fast_path import BINDINGS
+
+ROOT = Path(__file__).parents[2]
+PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+EXTRAS = PROJECT["optional-dependencies"]
+
+# Where a distribution is not named like what is imported of it.
+DISTRIBUTIONS = {
+    "cuda": "cuda-bindings",
+    "hydra": "hydra-core",
+    "imageio_ffmpeg": "imageio-ffmpeg",
+    "mujoco.mjx": "mujoco-mjx",
+    "mujoco_playground": "playground",
+    "orbax": "orbax-checkpoint",
+    "pynvml": "nvidia-ml-py",
+    "zmq": "pyzmq",
+}
+# jax and its jaxlib, mujoco-mjx and the warp-lang of its kernels are one thing each.
+BROUGHT = {"jaxlib": "jax", "warp": "mujoco-mjx"}
+
+
+def requirements(*extras: str) -> dict[str, Requirement]:
+    lines = PROJECT["dependencies"] + [line for extra in extras for line in EXTRAS[extra]]
+    return {(found := Requirement(line)).name: found for line in lines}
+
+
+def modules_of(node: ast.AST) -> Iterator[str]:
+    """Modules that a statement or a call by name imports."""
+    match node:
+        case ast.Import(names=names):
+            yield from (alias.name for alias in names)
+        case ast.ImportFrom(module=str(module), names=names, level=0):
+            yield module
+            yield from (f"{module}.{alias.name}" for alias in names)
+        case ast.Call(func=function, args=args):
+            name = function.attr if isinstance(function, ast.Attribute) else ""
+            handed = [arg for arg in args if isinstance(arg, ast.Attribute)]
+            if name in ("import_module", "find_spec") or any(
+                arg.attr == "import_module" for arg in handed
+            ):
+                texts = [str(arg.value) for arg in args if isinstance(arg, ast.Constant)]
+                yield from (text for text in texts if text.replace(".", "").isidentifier())
+
+
+def imported() -> set[str]:
+    """Distributions that the package imports from."""
+    found: set[str] = set()
+    for path in (ROOT / "gmijax").rglob("*.py"):
+        for node in ast.walk(ast.parse(path.read_text())):
+            for module in modules_of(node):
+                top = module.partition(".")[0]
+                if top == "gmijax" or top in sys.stdlib_module_names:
+                    continue
+                name = BROUGHT.get(top, top)
+                found.add(DISTRIBUTIONS.get(module, DISTRIBUTIONS.get(name, name)))
+    return found
+
+
+@pytest.mark.parametrize(
+    ("cuda", "fits", "does_not"),
+    [
+        (12, ("12.9.1", "12.9.10"), ("12.8.0", "12.9.0", "13.0.0")),
+        (13, ("13.0.0", "13.5.0"), ("12.9.10",)),
+    ],
+)
+def test_cuda_extras_bring_the_fast_path(cuda: int, fits: tuple[str], does_not: tuple[str]):
+    wanted = requirements(f"cuda{cuda}")
+    assert wanted["jax"].extras == {f"cuda{cuda}"}
+    bindings = wanted["cuda-bindings"].specifier
+    for version in fits:
+        assert bindings.contains(version)
+        assert BINDINGS[cuda].has(version)
+    for version in does_not:
+        assert not bindings.contains(version)
+        assert not BINDINGS[cuda].has(version)
+
+
+def test_mujoco_and_mjx_are_a_pair():
+    wanted = requirements()
+    assert wanted["mujoco"].specifier == wanted["mujoco-mjx"].specifier
+    assert requirements("warp")["mujoco-mjx"].specifier == wanted["mujoco"].specifier
+    # Its Newton solver has a wrong Hessian.
+    assert not wanted["mujoco"].specifier.contains("4.0.0")
+
+
+def test_every_declared_dependency_is_imported():
+    users_own = [extra for extra in EXTRAS if extra not in ("test", "dev")]
+    assert requirements(*users_own).keys() - imported() == set()
+
+
+def test_every_import_is_declared():
+    users_own = [extra for extra in EXTRAS if extra not in ("test", "dev")]
+    assert imported() - requirements(*users_own).keys() == set()
