@@ -10,7 +10,7 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
-from gmijax.errors import ConfigError, PeerLost
+from gmijax.errors import CollectiveTimeout, ConfigError, PeerLost
 from gmijax.partition.child import ChildLink
 from gmijax.partition.mps_control import PIPE_VARIABLE
 from gmijax.processes import identify
@@ -97,6 +97,16 @@ def lose_peer(link: ChildLink) -> None:
     sys.exit(1)
 
 
+def wait_in_vain(link: ChildLink) -> None:
+    """Fails like a reducer does when GMI 1 does not come."""
+    while not (link.run.gmi(1).root / "stalling").exists():
+        link.beat("running", 1)
+        time.sleep(TICK_S)
+    time.sleep(0.2)
+    link.report_error(CollectiveTimeout(0, (1,), "mean", 7, 5.0))
+    sys.exit(1)
+
+
 def die_late(link: ChildLink) -> None:
     """Names a helper as its process; that is gone half a second before this one."""
     helper = os.fork()
@@ -112,6 +122,7 @@ def die_late(link: ChildLink) -> None:
 def stall(link: ChildLink) -> None:
     """Stops to make progress."""
     link.beat("running", 5)
+    (link.paths.root / "stalling").touch()
     time.sleep(600)
 
 
@@ -132,7 +143,7 @@ MODES: dict[str, Callable[[ChildLink], None]] = {
     mode.__name__: mode
     for mode in (
         *(clean, train, deaf, stubborn, busy, exit_3, raise_value_error, raise_config_error),
-        *(lose_peer, die_late, stall, silent, mps_client, linger),
+        *(lose_peer, wait_in_vain, die_late, stall, silent, mps_client, linger),
     )
 }
 

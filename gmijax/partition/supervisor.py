@@ -167,8 +167,13 @@ class Supervisor:
             time.sleep(_POLL_S)
             failures = self._poll_failures()
         cause = first_cause(failures)
-        if cause.is_timeout:
+        if cause.is_timeout and (alive := self._alive()):
+            # Whoever is waited for runs, and has not said anything for longest.
+            stuck = min(alive, key=lambda process: process.progress_s)
             self._collect_stacks()
+            iteration = stuck.beat.iteration
+            what = f"made no progress after iteration {iteration}; GMI {cause.gmi} {cause.reason}"
+            raise GmiFailed(stuck.gmi, what, iteration=iteration)
         raise cause.to_error()
 
     def _poll_failures(self) -> list[Failure]:

@@ -100,6 +100,13 @@ def test_gmi_that_lost_its_peer_does_not_hide_the_peer(run: RunPaths):
         run_job(cpu_job(run, ["lose_peer", "die_late"], compile_once=False))
 
 
+def test_gmi_that_others_wait_for_in_vain_is_named_and_leaves_its_stacks(run: RunPaths):
+    message = r"GMI 1 failed: made no progress after iteration 5; GMI 0 exit code 1: Collective"
+    with pytest.raises(GmiFailed, match=message):
+        run_job(cpu_job(run, ["wait_in_vain", "stall"], compile_once=False))
+    assert "in stall" in run.gmi(1).stderr.read_text()
+
+
 def test_gmi_that_hears_no_order_is_killed_after_the_grace_time(run: RunPaths):
     with pytest.raises(GmiFailed, match="GMI 1"):
         run_job(cpu_job(run, ["stubborn", "exit_3"], grace=0.5, stall=30))
