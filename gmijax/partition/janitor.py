@@ -96,8 +96,9 @@ class JanitorLink:
                 self._log.unlink()
 
     def take_over(self) -> None:
-        """Lets the janitor clean up now, as if this process were gone."""
+        """Lets the janitor clean up now, as if this process were gone, and waits for it."""
         self._pipe.close()
+        self._process.wait()
 
     def _tell(self, message: dict[str, Any]) -> None:
         # A janitor that somebody killed must not end the job that it only guards.

@@ -7,6 +7,7 @@ import signal
 import subprocess
 import sys
 import time
+from contextlib import ExitStack
 from pathlib import Path
 
 import pytest
@@ -102,6 +103,28 @@ def test_one_private_daemon_per_gpu_that_is_gone_afterwards(mps: FakeMps, run: R
     assert len(mps.told("quit")) == 2
     assert not [pid for pid in daemons if pid and identify(pid)]
     assert not [path for path in directories if path.exists()]
+
+
+def test_an_interrupted_end_leaves_the_daemons_to_the_janitor(
+    mps: FakeMps, run: RunPaths, monkeypatch: pytest.MonkeyPatch
+):
+    def interrupted(_: MpsControl) -> None:
+        raise KeyboardInterrupt
+
+    here = machine(1, mps_control=find_mps_control())
+    plan = mps_plan(here, num_gpus=1, gmis_per_gpu=2)
+    monkeypatch.setattr("gmijax.partition.backends.mps.quit_daemon", interrupted)
+    backend = open_backend(plan, here, run)
+    with ExitStack() as held:
+        held.enter_context(backend)
+        directory = Path(backend.environment(0)[PIPE_VARIABLE])
+        daemon = MpsControl(mps.program, directory).daemon_pid()
+        process = identify(daemon or 0)
+        assert process is not None
+        with pytest.raises(KeyboardInterrupt):
+            held.close()
+    assert not wait_until_gone([process], 30)
+    assert not directory.exists()
 
 
 def test_job_of_clients_is_verified_and_stops(mps: FakeMps, run: RunPaths):

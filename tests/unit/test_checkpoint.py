@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+import os
+import zlib
 from pathlib import Path
 
 import jax.numpy as jnp
 import orbax.checkpoint as ocp
 import pytest
 
-from gmijax.checkpoint import restore_learner
+from gmijax.checkpoint import finish_checkpoint, restore_learner
 from gmijax.errors import ConfigError
+from gmijax.resume import CheckpointMeta, newest_checkpoint
+from gmijax.rundir import RunPaths
 
 
 def restore_with(error: Exception, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -43,3 +47,70 @@ def test_checkpoint_that_does_not_fit_is_bad_input(
 def test_failure_of_the_device_is_not_the_checkpoints(monkeypatch: pytest.MonkeyPatch):
     with pytest.raises(RuntimeError, match="RESOURCE_EXHAUSTED"):
         restore_with(RuntimeError("RESOURCE_EXHAUSTED"), monkeypatch)
+
+
+def save(run: RunPaths, env_steps: int, mean_return: float | None, keep: int | None) -> Path:
+    folder = run.checkpoints / f".{env_steps:012d}.partial" / "learner"
+    folder.mkdir(parents=True)
+    (folder / "weights").write_bytes(b"0123456789")
+    meta = CheckpointMeta("ant", "ppo", env_steps, 1, 8, ((8,), (8,)), "jax", mean_return)
+    return finish_checkpoint(run, meta, keep)
+
+
+def test_a_checkpoint_lists_its_files_and_is_on_the_disk_before_it_has_its_name(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    run = RunPaths(tmp_path)
+    synced: list[str] = []
+    real_sync, real_replace = os.fsync, os.replace
+
+    def fsync(fd: int) -> None:
+        synced.append(os.readlink(f"/proc/self/fd/{fd}"))
+        real_sync(fd)
+
+    def replace(source: object, target: object) -> None:
+        if Path(str(target)) == run.checkpoint(100):
+            partial = Path(str(source))
+            wanted = {partial, partial / "learner", partial / "learner" / "weights"}
+            assert {str(path) for path in wanted} <= set(synced)
+        real_replace(str(source), str(target))
+
+    monkeypatch.setattr(os, "fsync", fsync)
+    monkeypatch.setattr(os, "replace", replace)
+    checkpoint = save(run, 100, None, None)
+    assert synced[-1] == str(run.checkpoints)  # The name itself.
+    meta = CheckpointMeta.read(checkpoint)
+    assert meta.files == {"learner/weights": (10, zlib.crc32(b"0123456789"))}
+    assert newest_checkpoint(run.root) == (checkpoint.resolve(), ())
+
+
+@pytest.mark.parametrize(
+    ("keep", "left"),
+    [
+        (None, [1, 2, 3, 4, 5, 6]),
+        (5, [2, 3, 4, 5, 6]),
+        (3, [2, 5, 6]),
+        (2, [2, 6]),
+        (1, [2, 6]),
+    ],
+)
+def test_the_last_and_the_best_checkpoint_stay(tmp_path: Path, keep: int | None, left: list[int]):
+    run = RunPaths(tmp_path)
+    for env_steps, mean in enumerate([None, 9.0, 1.0, -3.0, None, 2.0], start=1):
+        save(run, env_steps, mean, keep)
+    assert sorted(int(path.name) for path in run.checkpoints.iterdir()) == left
+
+
+def test_one_checkpoint_is_enough_where_the_last_is_the_best(tmp_path: Path):
+    run = RunPaths(tmp_path)
+    for env_steps in (1, 2, 3):
+        save(run, env_steps, float(env_steps), keep=1)
+    assert [int(path.name) for path in run.checkpoints.iterdir()] == [3]
+
+
+def test_a_broken_checkpoint_of_the_same_step_is_replaced(tmp_path: Path):
+    run = RunPaths(tmp_path)
+    (save(run, 100, None, None) / "learner" / "weights").write_bytes(b"")
+    assert newest_checkpoint(run.root).checkpoint is None
+    save(run, 100, None, None)
+    assert newest_checkpoint(run.root).checkpoint == run.checkpoint(100)
