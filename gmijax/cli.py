@@ -165,6 +165,8 @@ def _compose_dict(name: str, overrides: Sequence[str]) -> dict[str, Any]:
 
 def _check_override(name: str, item: Override) -> None:
     key = item.key_or_group
+    if not key:
+        raise ConfigError(f"{item.input_line}: expected key=value")
     # Hydra's own settings are for jobs that hydra runs; here they would do nothing.
     if re.split(r"[./]", key)[0] == "hydra":
         raise _unknown_key(key, _known_keys(name))

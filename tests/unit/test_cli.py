@@ -58,6 +58,7 @@ def test_play_has_no_task_to_choose(capsys: pytest.CaptureFixture[str]):
         ("train", f"run.resume={'a' * 300}", "aaa: no such folder"),
         ("train", "plan.gpus=1e6", "plan.gmis_per_gpu=1: makes 1000000 GMIs on 1000000 GPUs"),
         ("train", "run.dir={1:2}", "run.dir={1: 2}: expected text or null"),
+        ("train", "+=-0.0", "+=-0.0: expected key=value"),
         ("search", "plan.layout=[]", "plan.layout=[]: every GPU needs at least one GMI"),
         ("serve", f"run.dir={'a' * 300}", "aaa: no such folder"),
         ("play", f"checkpoint={'a' * 300}", "aaa: expected the folder of a checkpoint"),
