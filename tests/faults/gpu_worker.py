@@ -33,5 +33,5 @@ def _beat_and_fail(link: ChildLink, state: Any, iteration: int) -> None:
 
 
 if __name__ == "__main__":
-    ChildLink.beat = _beat_and_fail
+    setattr(ChildLink, "beat", _beat_and_fail)  # noqa: B010
     sys.exit(worker.main())

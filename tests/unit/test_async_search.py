@@ -208,7 +208,7 @@ def asked(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> list[Point]:
     points: list[Point] = []
 
     def profile(workload: Workload, point: Point, *_: Any, **__: Any) -> Measured:
-        assert workload.module == "gmijax.workers.async_worker"
+        assert workload.kind.module == "gmijax.workers.async_worker"
         points.append(point)
         return formula(point)
 

@@ -84,7 +84,8 @@ def job(run: RunPaths, monkeypatch: pytest.MonkeyPatch) -> Job:
 
 def test_a_killed_gmi_starts_the_job_again_from_its_newest_checkpoint(job: Job, run: RunPaths):
     def save_and_fail(_: StopSignals) -> None:
-        save(run, 100), save(run, 200)
+        save(run, 100)
+        save(run, 200)
         raise killed()
 
     job.go(fail(killed()), save_and_fail, fine)

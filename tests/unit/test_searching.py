@@ -40,7 +40,7 @@ class Profiles:
     def __call__(
         self, workload: Workload, point: Point, mode: str, *_: Any, **__: Any
     ) -> Measured | NotRunnable:
-        assert workload.module == "gmijax.workers.worker"
+        assert workload.kind.module == "gmijax.workers.worker"
         self.asked.append((point, mode))
         return self.answer(point, mode)
 
