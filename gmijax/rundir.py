@@ -11,6 +11,7 @@ from __future__ import annotations
 import fcntl
 import json
 import os
+import re
 import threading
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
@@ -28,6 +29,9 @@ STEP_DIGITS = 12
 
 META = "meta.json"
 """Written last into a checkpoint: a folder without it is not one."""
+
+_TEMPORARY = re.compile(r"\..+\.\d+-\d+")
+"""Names that files have while they are written."""
 
 
 @dataclass(frozen=True)
@@ -232,6 +236,13 @@ def write_text(path: Path, text: str) -> None:
     except BaseException:
         temporary.unlink(missing_ok=True)
         raise
+
+
+def remove_temporary(folder: Path) -> None:
+    """Removes what processes left in a folder that were killed within `write_text`."""
+    for path in folder.glob(".*"):
+        if _TEMPORARY.fullmatch(path.name):
+            path.unlink(missing_ok=True)
 
 
 def read_json(path: Path) -> dict[str, Any]:

@@ -53,8 +53,11 @@ KINDS: Final[dict[str, Kind]] = {
     "raise_beat": Kind("raise", "beat", "restarted"),
     "file_limit": Kind("file_limit", "beat", "restarted", place="leader"),
     "slow": Kind("slow", "mean", "nothing happened"),
+    "kill_janitor": Kind("kill_janitor", "beat", "nothing happened"),
     "kill_controller": Kind("kill_controller", "beat", "resumed", -9),
     "kill_controller_rename": Kind("kill_controller", "rename", "resumed", -9, "leader"),
+    "kill_controller_compiling": Kind("kill_controller", "compiling", "resumed", -9),
+    "kill_controller_and_stop": Kind("kill_controller_and_stop", "beat", "resumed", -9),
     "term_all": Kind("term_all", "beat", "resumed", 130),
     "usr1_controller": Kind("usr1", "beat", "resumed", 130),
     "hup_controller": Kind("hup", "beat", "resumed", 130),
@@ -92,8 +95,7 @@ def draw_jobs(seed: int, num_faults: int, kinds: Sequence[str]) -> Iterator[list
         chosen: list[str] = []
         for _ in range(min(5, num_faults)):
             deck = deck or draw.sample(list(kinds), len(kinds))
-            # One command cannot be started in two ways.
-            fits = [k for k in deck if not (_is_at_start(k) and any(map(_is_at_start, chosen)))]
+            fits = [kind for kind in deck if all(_may_meet(kind, other) for other in chosen)]
             if not fits:
                 break
             chosen.append(fits[0])
@@ -114,6 +116,12 @@ def place_faults(kinds: Sequence[str], draw: random.Random) -> list[Fault]:
         Fault(kind, 0 if KINDS[kind].place == "leader" else draw.randrange(2), iteration)
         for kind, iteration in placed
     ]
+
+
+def _may_meet(kind: str, other: str) -> bool:
+    """Whether one job may have both: a command is started in one way, and has one janitor."""
+    needs_janitor = {kind, other} == {"kill_janitor", "kill_controller_and_stop"}
+    return not needs_janitor and not (_is_at_start(kind) and _is_at_start(other))
 
 
 def _is_at_start(kind: str) -> bool:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import signal
 import sys
 
 from gmijax.cli import command
@@ -12,5 +13,7 @@ from gmijax.control.kinds import SYNCHRONOUS
 if __name__ == "__main__":
     from gmijax.train import _run
 
+    # Whoever started this may ignore it (nohup), and then so would the job.
+    signal.signal(signal.SIGHUP, signal.SIG_DFL)
     job.training_kind = lambda _: SYNCHRONOUS._replace(module="faulty_worker")
     sys.exit(command("train", TrainConfig, _run, sys.argv[1:]))

@@ -61,7 +61,9 @@ class Faults:
         """Whether this attempt has had a fault that ends it, which may take a moment."""
         now = {path.name for path in SCRATCH.glob("fired_*")}
         harmless = {
-            f"fired_{number}" for number, fault in enumerate(self._plan) if fault.kind == "slow"
+            f"fired_{number}"
+            for number, fault in enumerate(self._plan)
+            if KINDS[fault.kind].outcome == "nothing happened"
         }
         return bool(now - self._before - harmless)
 
@@ -72,6 +74,11 @@ class Faults:
             "stop": lambda: os.kill(own, signal.SIGSTOP),
             "slow": lambda: time.sleep(SLOW_S),
             "kill_controller": lambda: os.kill(controller, signal.SIGKILL),
+            "kill_controller_and_stop": lambda: (
+                os.kill(controller, signal.SIGKILL),
+                os.kill(own, signal.SIGSTOP),
+            ),
+            "kill_janitor": lambda: os.kill(_janitor_of(controller), signal.SIGKILL),
             "usr1": lambda: os.kill(controller, signal.SIGUSR1),
             "hup": lambda: os.kill(controller, signal.SIGHUP),
             "term_all": lambda: [
@@ -83,6 +90,13 @@ class Faults:
             "raise": _raise,
         }
         actions[what]()
+
+
+def _janitor_of(controller: int) -> int:
+    for entry in Path(f"/proc/{controller}/task/{controller}/children").read_text().split():
+        if b"gmijax.partition.janitor" in Path(f"/proc/{entry}/cmdline").read_bytes():
+            return int(entry)
+    raise LookupError("no janitor")
 
 
 def _raise() -> None:

@@ -35,6 +35,7 @@ COLUMNS = ("injected", "as wanted", "unexpected", "leaks", "lost checkpoints", "
 def main(argv: Sequence[str]) -> int:
     """Runs jobs and prints a table; 1 if anything was wrong."""
     options = _options(argv)
+    options.commit = _said("git", "rev-parse", "HEAD")
     folder = Path(tempfile.mkdtemp(prefix="faults-"))
     started_s = time.monotonic()
     expected = undisturbed(folder / "undisturbed")
@@ -99,7 +100,7 @@ def _results(
     done = [report for _, report in reports]
     return {
         "date": datetime.now(UTC).isoformat(timespec="seconds"),
-        "commit": _said("git", "rev-parse", "HEAD"),
+        "commit": options.commit,
         "machine": f"{os.cpu_count()} cores, {_memory_gib()} GiB",
         "seeds": sorted({seed for seed, _ in reports}),
         "minutes": round((time.monotonic() - started_s) / 60, 1),
