@@ -252,9 +252,12 @@ def read_json(path: Path) -> dict[str, Any]:
 
 def add_event(path: Path, event: str, **details: Any) -> None:
     """Appends to the events of a run; a full disk must not end what it only records."""
-    line = {"time": datetime.now().astimezone().isoformat(timespec="milliseconds")}
-    with suppress(OSError), path.open("a") as file:
-        file.write(json.dumps({**line, "event": event, **details}) + "\n")
+    when = datetime.now().astimezone().isoformat(timespec="milliseconds")
+    line = (json.dumps({"time": when, "event": event, **details}) + "\n").encode()
+    with suppress(OSError), path.open("ab", buffering=0) as file:
+        end = file.tell()
+        if file.write(line) < len(line):
+            file.truncate(end)  # The next event would stand behind half of this one.
 
 
 def last_run(key: str, runs: Path = RUNS) -> Path:

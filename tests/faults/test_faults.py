@@ -1,17 +1,28 @@
-"""Every kind of fault once; `python -m tests.faults.many` has as many as are wanted."""
+"""Some kinds of faults, and all of them once where slow tests run.
+
+`python -m tests.faults.many` has as many as are wanted. Every start of a job costs five seconds.
+"""
 
 from __future__ import annotations
 
+import random
 import shutil
 from pathlib import Path
 
 import numpy as np
 import pytest
 from fault_jobs import kinds_here, run_job, undisturbed
-from fault_plan import KINDS, Fault, draw_jobs
+from fault_plan import KINDS, Fault, draw_jobs, place_faults
 
 SEED = 0
-JOBS = tuple(draw_jobs(SEED, len(KINDS), tuple(KINDS)))
+QUICK = (
+    ("stdout_gone", "slow", "kill_named", "raise_part", "term_all", "checkpoint_byte"),
+    ("stdout_closed", "stop", "nan", "disk_full"),
+)
+JOBS = (
+    *(place_faults(kinds, random.Random(SEED)) for kinds in QUICK),
+    *draw_jobs(SEED, len(KINDS), tuple(KINDS)),
+)
 
 
 @pytest.fixture(scope="module")
@@ -21,11 +32,21 @@ def expected(tmp_path_factory: pytest.TempPathFactory) -> list[np.ndarray]:
 
 
 def test_a_deck_has_every_kind_once():
-    assert sorted(fault.kind for job in JOBS for fault in job) == sorted(KINDS)
+    assert sorted(fault.kind for job in JOBS[len(QUICK) :] for fault in job) == sorted(KINDS)
 
 
 @pytest.mark.timeout(600)
-@pytest.mark.parametrize("job", JOBS, ids=lambda job: "-".join(fault.kind for fault in job))
+@pytest.mark.parametrize(
+    "job",
+    [
+        pytest.param(
+            job,
+            id="-".join(fault.kind for fault in job),
+            marks=() if number < len(QUICK) else pytest.mark.slow,
+        )
+        for number, job in enumerate(JOBS)
+    ],
+)
 def test_a_job_gets_over_its_faults(
     job: list[Fault], tmp_path: Path, expected: list[np.ndarray]
 ) -> None:
