@@ -1,5 +1,6 @@
 # `make train` and `make test` need nothing but Python 3.11 or newer and a package index.
-# Variables: PYTHON (interpreter that makes the environment), VENV, EXTRAS, TRAIN_ARGS, TEST_ARGS, TEST_WORKERS.
+# Variables: PYTHON (interpreter that makes the environment), VENV, EXTRAS, TRAIN_ARGS, TEST_ARGS, TEST_WORKERS,
+# SOAK_MINUTES.
 
 PYTHON ?= python3
 VENV ?= .venv
@@ -19,9 +20,10 @@ TRAIN_ARGS ?= env=ball_balance $(PLAN) num_timesteps=1000000
 TEST_ARGS ?=
 # The tests of a file share what they compile.
 TEST_WORKERS ?= -n 2 --dist loadfile
+SOAK_MINUTES ?= 60
 
 .DEFAULT_GOAL := help
-.PHONY: help venv train test test-all wheel-test lint types imports format check clean
+.PHONY: help venv train test test-all soak wheel-test lint types imports format check clean
 
 help:  ## this list
 	@sed -nE 's/^([a-z-]+):.*## (.*)/\1|\2/p' Makefile | awk -F'|' '{printf "make %-11s %s\n", $$1, $$2}'
@@ -43,6 +45,11 @@ test: $(READY)  ## the tests that are not slow
 
 test-all: $(READY)  ## all tests, slow ones too
 	$(BIN)/python -m pytest $(TEST_WORKERS) -m '' $(TEST_ARGS)
+
+soak: $(READY)  ## faults from fresh seeds, then a long run's memory; SOAK_MINUTES in all
+	mkdir -p runs
+	$(BIN)/python -m tests.faults.many --minutes $$(($(SOAK_MINUTES) / 2)) --out runs/soak-faults.json
+	$(BIN)/python -m tests.faults.soak --minutes $$(($(SOAK_MINUTES) / 2))
 
 wheel-test: $(READY)  ## builds the wheel and tries it outside the checkout
 	$(BIN)/python -m pytest tests/process/test_wheel.py $(TEST_ARGS)

@@ -11,6 +11,7 @@ from __future__ import annotations
 import fcntl
 import json
 import os
+import re
 import threading
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
@@ -28,6 +29,9 @@ STEP_DIGITS = 12
 
 META = "meta.json"
 """Written last into a checkpoint: a folder without it is not one."""
+
+_TEMPORARY = re.compile(r"\..+\.\d+-\d+")
+"""Names that files have while they are written."""
 
 
 @dataclass(frozen=True)
@@ -234,6 +238,13 @@ def write_text(path: Path, text: str) -> None:
         raise
 
 
+def remove_temporary(folder: Path) -> None:
+    """Removes what processes left in a folder that were killed within `write_text`."""
+    for path in folder.glob(".*"):
+        if _TEMPORARY.fullmatch(path.name):
+            path.unlink(missing_ok=True)
+
+
 def read_json(path: Path) -> dict[str, Any]:
     """Reads what `write_json` wrote."""
     return json.loads(path.read_text())
@@ -241,9 +252,12 @@ def read_json(path: Path) -> dict[str, Any]:
 
 def add_event(path: Path, event: str, **details: Any) -> None:
     """Appends to the events of a run; a full disk must not end what it only records."""
-    line = {"time": datetime.now().astimezone().isoformat(timespec="milliseconds")}
-    with suppress(OSError), path.open("a") as file:
-        file.write(json.dumps({**line, "event": event, **details}) + "\n")
+    when = datetime.now().astimezone().isoformat(timespec="milliseconds")
+    line = (json.dumps({"time": when, "event": event, **details}) + "\n").encode()
+    with suppress(OSError), path.open("ab", buffering=0) as file:
+        end = file.tell()
+        if file.write(line) < len(line):
+            file.truncate(end)  # The next event would stand behind half of this one.
 
 
 def last_run(key: str, runs: Path = RUNS) -> Path:

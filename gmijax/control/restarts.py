@@ -20,7 +20,7 @@ from gmijax.errors import ConfigError, GmiFailed, JobInterrupted
 from gmijax.partition.gmi_process import GmiStatus
 from gmijax.results import copy_history
 from gmijax.resume import CheckpointMeta, newest_checkpoint
-from gmijax.rundir import RunPaths, add_event
+from gmijax.rundir import RunPaths, add_event, remove_temporary
 
 _LASTING = ("NonFiniteError", "ParameterMismatch", "SelfCheckFailed")
 """Errors of a GMI that the next attempt would meet too."""
@@ -185,7 +185,9 @@ def keep_logs(run: RunPaths, attempt: int) -> None:
 
 
 def clear_unfinished(run: RunPaths, checkpoint: Path | None) -> None:
-    """Leaves of a run what belongs to a checkpoint: no half-written ones, no later metrics."""
+    """Leaves of a run what belongs to a checkpoint: no half-written files, no later metrics."""
+    for folder in (run.root, *run.root.glob("gmi_[0-9]*"), *run.root.glob("gmi_[0-9]*/attempt_*")):
+        remove_temporary(folder)
     for hidden in run.checkpoints.glob(".*"):
         shutil.rmtree(hidden, ignore_errors=True)
     # Written anew from the metrics: event files cannot be cut.

@@ -204,3 +204,18 @@ def test_only_the_same_signal_a_second_later_is_impatience(monkeypatch: pytest.M
     now_s[0] += 1.5
     signals.handle(signal.SIGTERM)
     assert asked == [100.0, now_s[0]]
+
+
+def test_half_written_files_of_killed_processes_go_and_all_others_stay(run: RunPaths):
+    half = (
+        run.root / ".summary.json.12-345",
+        run.gmi(1).root / ".error.json.12-345",
+        run.gmi(1).root / "attempt_0" / ".error.json.67-8",
+    )
+    whole = (run.lock, run.summary, run.gmi(1).root / "attempt_0" / "error.json")
+    for path in (*half, *whole):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.touch()
+    clear_unfinished(run, None)
+    assert not any(path.exists() for path in half)
+    assert all(path.exists() for path in whole)

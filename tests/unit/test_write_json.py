@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import json
 import os
+import resource
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
-from gmijax.rundir import read_json, write_json
+from gmijax.rundir import add_event, read_json, write_json
 
 
 @pytest.fixture
@@ -35,3 +37,18 @@ def test_what_cannot_be_written_leaves_the_old_file_and_nothing_else(tmp_path: P
         write_json(path, {"a": object()})
     assert read_json(path) == {"a": 1}
     assert list(tmp_path.iterdir()) == [path]
+
+
+def test_half_an_event_is_taken_back_where_the_disk_is_full(tmp_path: Path):
+    path = tmp_path / "events.jsonl"
+    add_event(path, "start")
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    # Python ignores the signal that would come with it.
+    resource.setrlimit(resource.RLIMIT_FSIZE, (path.stat().st_size + 10, limits[1]))
+    try:
+        add_event(path, "fault")
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    add_event(path, "end")
+    events = [json.loads(line)["event"] for line in path.read_text().splitlines()]
+    assert events == ["start", "end"]

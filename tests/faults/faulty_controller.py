@@ -1,0 +1,19 @@
+"""`python -m gmijax.train` whose GMIs run `faulty_worker`."""
+
+from __future__ import annotations
+
+import signal
+import sys
+
+from gmijax.cli import command
+from gmijax.config import TrainConfig
+from gmijax.control import job
+from gmijax.control.kinds import SYNCHRONOUS
+
+if __name__ == "__main__":
+    from gmijax.train import _run
+
+    # Whoever started this may ignore it (nohup), and then so would the job.
+    signal.signal(signal.SIGHUP, signal.SIG_DFL)
+    job.training_kind = lambda _: SYNCHRONOUS._replace(module="faulty_worker")
+    sys.exit(command("train", TrainConfig, _run, sys.argv[1:]))
