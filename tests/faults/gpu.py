@@ -90,22 +90,32 @@ def ask(kind: str) -> Callable[[Job, int], None]:
 
 def kill_daemon(job: Job, gmi: int) -> None:
     """Kills the MPS control daemon and server of the job."""
-    del job, gmi
+    directory = _pipe_directory(job.pid(gmi))
+    assert directory is not None
     for entry in Path("/proc").glob("[0-9]*"):
         try:
             words = (entry / "cmdline").read_bytes()
-            variables = (entry / "environ").read_bytes()
         except OSError:
             continue
-        if b"nvidia-cuda-mps" in words and b"/gmijax-" in variables:
+        if b"nvidia-cuda-mps" in words and _pipe_directory(int(entry.name)) == directory:
             os.kill(int(entry.name), signal.SIGKILL)
+
+
+def _pipe_directory(pid: int) -> bytes | None:
+    """Where a process meets its MPS daemon, None if nowhere in particular."""
+    try:
+        variables = Path(f"/proc/{pid}/environ").read_bytes().split(b"\0")
+    except OSError:
+        return None
+    found = [v for v in variables if v.startswith(b"CUDA_MPS_PIPE_DIRECTORY=")]
+    return found[0] if found else None
 
 
 def harm(job: Job, name: str, act: Callable[[Job, int], None], gmi: int) -> dict[str, Any]:
     """One fault, and how long until all GMIs iterate again."""
     restarts, saved = len(job.events("fault")), job.checkpoints()
     job.wait(lambda: job.trains() and job.checkpoints() > saved, "a newer checkpoint")
-    saved, started_s = job.checkpoints(), time.monotonic()
+    started_s = time.monotonic()
     act(job, gmi)
     job.wait(lambda: len(job.events("fault")) > restarts, "the fault to be seen")
     seen_s = time.monotonic() - started_s
@@ -118,7 +128,6 @@ def harm(job: Job, name: str, act: Callable[[Job, int], None], gmi: int) -> dict
         "cause": str(fault.get("cause"))[:160],
         "seconds": round(time.monotonic() - started_s, 2),
         "of_which_until_seen": round(seen_s, 2),
-        "steps_lost_at_most": saved,
         "recovered": job.process.poll() is None,
     }
     print(json.dumps(row), flush=True)  # noqa: T201
@@ -156,6 +165,7 @@ def main() -> int:
             found = {
                 "rows": rows,
                 "exit_code": code,
+                "plan": json.loads((job.run / "plan.json").read_text())["reasons"],
                 "left": pids_of(job.run),
                 "events": events[-400:],
                 "log": (Path(folder) / "job.log").read_text()[-3000:],
