@@ -219,7 +219,8 @@ def training_env(env: Env, *, random_ep_len: bool = False) -> BatchedEnv:
 
     def step(model: PyTree, state: BatchState, actions: Array) -> tuple[BatchState, StepOutput]:
         stepped = batched.step(model, state.env, actions)
-        stepped = cut_first_episodes(env.spec, state, stepped)
+        if random_ep_len:  # Else it changes nothing, and costs MJX-JAX 4 % of ant's iteration.
+            stepped = cut_first_episodes(env.spec, state, stepped)
         bad = diverged_by_source(env, stepped)
         bad["any"] = reduce(jnp.logical_or, bad.values())
         stepped = end_diverged(state.env, stepped, bad["any"])
