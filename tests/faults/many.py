@@ -89,7 +89,7 @@ def _jobs(options: argparse.Namespace) -> Iterator[tuple[int, list[Fault]]]:
         return
     # As many as no machine does in that time.
     first = int(time.time())
-    for seed in range(first, first + int(options.minutes)):
+    for seed in range(first, first + 1 + int(options.minutes)):
         for faults in draw_jobs(seed, len(kinds), kinds):
             yield seed, faults
 
