@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from gmijax.control.launcher import Launch, StopSignals, run_gmis, stop_signals
-from gmijax.errors import ConfigError, GmiFailed, JobInterrupted
+from gmijax.errors import BackendUnavailable, ConfigError, GmiFailed, JobInterrupted
 from gmijax.partition.gmi_process import GmiStatus
 from gmijax.results import copy_history
 from gmijax.resume import CheckpointMeta, newest_checkpoint
@@ -79,7 +79,7 @@ class Attempts:
                 except GmiFailed as error:
                     reason = why_not_again(error, last)
                     newest = self._newest(checkpoint)
-                    if newest != checkpoint:
+                    if _steps(newest) > _steps(checkpoint):
                         budget = self.max_restarts
                     if reason is None and budget == 0:
                         reason = f"restarts are used up (run.max_restarts={self.max_restarts})"
@@ -97,16 +97,25 @@ class Attempts:
         except ConfigError as error:
             if not number:
                 raise
-            fault = self.restarts[-1]
-            failed = GmiFailed(fault.gmi, fault.cause, iteration=fault.iteration)
-            failed.add_note(f"cannot start again: {error}")
-            failed.is_final = True
-            raise failed from error
+            raise self._last_fault(error) from error
         if signals.have_come:
             raise JobInterrupted("stopped between two attempts")
         add_event(self.run.events, "start", attempt=number, checkpoint=_text(checkpoint))
-        run_gmis(launch, _Recovery(self.run, on_tick, number, self._seen_s).tick, signals)
+        try:
+            run_gmis(launch, _Recovery(self.run, on_tick, number, self._seen_s).tick, signals)
+        except BackendUnavailable as error:
+            if not number:
+                raise
+            raise self._last_fault(error) from error
         add_event(self.run.events, "end", attempt=number)
+
+    def _last_fault(self, why: ConfigError) -> GmiFailed:
+        """What ended the attempt before, after which the machine cannot go on."""
+        fault = self.restarts[-1]
+        failed = GmiFailed(fault.gmi, fault.cause, iteration=fault.iteration)
+        failed.add_note(f"cannot start again: {why}")
+        failed.is_final = True
+        return failed
 
     def _newest(self, checkpoint: Path | None) -> Path | None:
         found = newest_checkpoint(self.run.root)
@@ -192,8 +201,7 @@ def clear_unfinished(run: RunPaths, checkpoint: Path | None) -> None:
         shutil.rmtree(hidden, ignore_errors=True)
     # Written anew from the metrics: event files cannot be cut.
     shutil.rmtree(run.tensorboard, ignore_errors=True)
-    steps = CheckpointMeta.read(checkpoint).env_steps if checkpoint else 0
-    copy_history(run.metrics, run.metrics, steps)
+    copy_history(run.metrics, run.metrics, max(0, _steps(checkpoint)))
 
 
 def _about(error: GmiFailed) -> dict[str, Any]:
@@ -203,6 +211,10 @@ def _about(error: GmiFailed) -> dict[str, Any]:
 def _frames(traceback: str) -> Sequence[tuple[str, ...]]:
     # Not the message: it may hold addresses and sizes.
     return _FRAME.findall(traceback)
+
+
+def _steps(checkpoint: Path | None) -> int:
+    return -1 if checkpoint is None else CheckpointMeta.read(checkpoint).env_steps
 
 
 def _text(checkpoint: Path | None) -> str | None:

@@ -13,7 +13,7 @@ import pytest
 from gmijax.control import restarts
 from gmijax.control.launcher import StopSignals
 from gmijax.control.restarts import Attempts, clear_unfinished, keep_logs, why_not_again
-from gmijax.errors import ConfigError, GmiFailed, ReportedError
+from gmijax.errors import BackendUnavailable, ConfigError, GmiFailed, ReportedError
 from gmijax.resume import CheckpointMeta
 from gmijax.rundir import META, RunPaths, read_json, write_json
 
@@ -118,6 +118,34 @@ def test_without_a_newer_checkpoint_the_count_ends(job: Job):
     assert len(job.attempts.restarts) == 2
     assert "run.max_restarts=2" in caught.value.__notes__[0]
     assert job.events()[-2:] == ["fault", "gave_up"]
+
+
+def test_an_older_checkpoint_does_not_set_the_count_back(job: Job, run: RunPaths):
+    def break_and_fail(_: StopSignals) -> None:
+        (run.checkpoint(200) / META).write_text("{")
+        raise killed()
+
+    save(run, 100)
+    dies = fail(killed())
+
+    def save_and_fail(_: StopSignals) -> None:
+        save(run, 200)
+        raise killed()
+
+    with pytest.raises(GmiFailed):
+        job.go(save_and_fail, dies, break_and_fail, fine)
+    assert len(job.attempts.restarts) == 2
+
+
+def test_a_backend_that_cannot_be_had_again_is_told_with_the_fault(job: Job):
+    with pytest.raises(GmiFailed, match="GMI 0 failed: ended by SIGKILL") as caught:
+        job.go(fail(killed()), fail(BackendUnavailable("the daemon does not answer")))
+    assert "cannot start again: the daemon does not answer" in caught.value.__notes__
+
+
+def test_a_backend_that_cannot_be_had_at_all_is_bad_input(job: Job):
+    with pytest.raises(BackendUnavailable):
+        job.go(fail(BackendUnavailable("the daemon does not answer")))
 
 
 @pytest.mark.parametrize("kind", ["NonFiniteError", "ParameterMismatch", "SelfCheckFailed"])
