@@ -70,7 +70,10 @@ class Attempts:
 
     def run_to_the_end(self, checkpoint: Path | None, on_tick: OnTick) -> None:
         """Runs the job; raises as `run_gmis` of the last attempt does."""
-        budget, last = self.max_restarts, None
+        budget, last, reached = self.max_restarts, None, _steps(checkpoint)
+        is_own = checkpoint is not None and checkpoint.parent == self.run.checkpoints
+        # Before its own first one, a resumed run goes on from where it came from.
+        origin = None if is_own else checkpoint
         with stop_signals() as signals:
             while True:
                 try:
@@ -78,9 +81,9 @@ class Attempts:
                     return
                 except GmiFailed as error:
                     reason = why_not_again(error, last)
-                    newest = self._newest(checkpoint)
-                    if _steps(newest) > _steps(checkpoint):
-                        budget = self.max_restarts
+                    newest = self._newest() or origin
+                    if _steps(newest) > reached:
+                        budget, reached = self.max_restarts, _steps(newest)
                     if reason is None and budget == 0:
                         reason = f"restarts are used up (run.max_restarts={self.max_restarts})"
                     if reason is not None or signals.have_come:
@@ -117,13 +120,12 @@ class Attempts:
         failed.is_final = True
         return failed
 
-    def _newest(self, checkpoint: Path | None) -> Path | None:
+    def _newest(self) -> Path | None:
         found = newest_checkpoint(self.run.root)
         for text in found.passed_over:
             self.say(text)
             add_event(self.run.events, "passed_over", what=text)
-        # Before its own first one, a resumed run goes on from where it came from.
-        return found.checkpoint or checkpoint
+        return found.checkpoint
 
     def _prepare_again(self, error: GmiFailed, newest: Path | None) -> None:
         number = len(self.restarts)

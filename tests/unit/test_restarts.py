@@ -135,6 +135,23 @@ def test_an_older_checkpoint_does_not_set_the_count_back(job: Job, run: RunPaths
     with pytest.raises(GmiFailed):
         job.go(save_and_fail, dies, break_and_fail, fine)
     assert len(job.attempts.restarts) == 2
+    assert job.started_from == [None, run.checkpoint(200), run.checkpoint(200)]
+
+
+def test_a_job_whose_checkpoints_are_all_broken_starts_at_its_origin(job: Job, run: RunPaths):
+    other = save(RunPaths(run.root / "other"), 50)
+
+    def save_and_fail(_: StopSignals) -> None:
+        save(run, 100)
+        raise killed()
+
+    def break_and_fail(_: StopSignals) -> None:
+        (run.checkpoint(100) / META).write_text("{")
+        raise killed()
+
+    job.acts = iter((save_and_fail, break_and_fail, fine))
+    job.attempts.run_to_the_end(other, lambda _: None)
+    assert job.started_from == [other, run.checkpoint(100), other]
 
 
 def test_a_backend_that_cannot_be_had_again_is_told_with_the_fault(job: Job):
