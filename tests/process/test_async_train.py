@@ -35,7 +35,7 @@ SMALL = (
     *("env=point.py:make", "algo=a3c", f"num_envs={N}", f"algo.unroll_length={T}"),
     *("algo.num_minibatches=2", "algo.num_updates_per_batch=2", "run.grace_s=3"),
     *("algo.policy_hidden_layer_sizes=[16]", "algo.value_hidden_layer_sizes=[16]"),
-    "reduce.timeout_s=30",
+    *("reduce.timeout_s=30", "run.max_restarts=0"),
 )
 
 
