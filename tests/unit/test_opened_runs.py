@@ -14,7 +14,7 @@ import pytest
 import gmijax
 from gmijax.cli import _build, command
 from gmijax.config import PlayConfig
-from gmijax.control import evaluation, job, serving
+from gmijax.control import evaluation, restarts, serving
 from gmijax.errors import ConfigError
 from gmijax.resume import CheckpointMeta
 from gmijax.rundir import META, RunPaths, read_json, write_json
@@ -52,7 +52,7 @@ def starts(monkeypatch: pytest.MonkeyPatch) -> None:
     def run_gmis(*_: Any) -> None:
         raise StartedError
 
-    for module in (evaluation, job, serving):
+    for module in (evaluation, restarts, serving):
         monkeypatch.setattr(module, "run_gmis", run_gmis)
 
 
