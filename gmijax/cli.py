@@ -26,7 +26,7 @@ from omegaconf.errors import OmegaConfBaseException
 from gmijax.cli_help import print_help
 from gmijax.config import ServeConfig, TrainConfig
 from gmijax.errors import ConfigError, GmijaxError, JobInterrupted
-from gmijax.resume import find_checkpoint, saved_config
+from gmijax.resume import saved_config_of
 from gmijax.schema import from_dict, suggestion, to_dict
 from gmijax.sim.registry import SUITES
 from gmijax.sim.source import reference
@@ -145,7 +145,7 @@ def _algorithm_of_resumed(name: str, overrides: Sequence[str]) -> list[str]:
     resume = given.get("run.resume", "null")
     if "algo" in given or resume in ("null", "None", "", "auto"):
         return []
-    algo = saved_config(find_checkpoint(resume, "run.resume"))["algo"].get("name", "ppo")
+    algo = saved_config_of(resume, "run.resume")["algo"].get("name", "ppo")
     return [f"algo={algo}"]
 
 
@@ -236,8 +236,7 @@ def _on_top_of_saved(
 
     What an older version did not save comes from the defaults for the run's own task.
     """
-    checkpoint = find_checkpoint(resume, "run.resume")
-    saved = saved_config(checkpoint)
+    saved = saved_config_of(resume, "run.resume")
     saved["run"].update(dir=None, name=None)
     items = _parse(overrides)
     suite = saved["env"].get("suite", "gmijax")
@@ -272,7 +271,7 @@ def _with_task_of_run(data: dict[str, Any], overrides: Sequence[str]) -> dict[st
     run_dir = data["run"].get("dir") if isinstance(data["run"], dict) else None
     if run_dir is None or any(item.key_or_group == "env" for item in items):
         return data
-    saved = saved_config(find_checkpoint(str(run_dir), "run.dir"))["env"]
+    saved = saved_config_of(str(run_dir), "run.dir")["env"]
     merged = {**data, "env": {**data["env"], **saved}}
     for item in items:
         if item.key_or_group.startswith("env."):

@@ -122,19 +122,38 @@ def find_checkpoint(wanted: str, key: str) -> Path:
     Raises:
       ConfigError: there is none.
     """
-    folder = last_run(key) if wanted == "last" else Path(wanted)
-    if os.path.isfile(folder / META):  # Unlike `Path.is_file` it takes any text.
+    folder = _named(wanted, key)
+    if (folder / META).is_file():
         if wrong := what_is_broken(folder):
             raise ConfigError(f"{key}={wanted}: {wrong}")
         return folder.resolve()
-    if not os.path.isdir(folder):
-        raise ConfigError(f"{key}={wanted}: no such folder")
     found = newest_checkpoint(folder)
     if found.checkpoint is None:
         raise ConfigError(
             "; ".join((f"{key}={wanted}: no checkpoint in this folder", *found.passed_over))
         )
     return found.checkpoint
+
+
+def saved_config_of(wanted: str, key: str) -> dict[str, Any]:
+    """The configuration of the run that `wanted` names, whole or not; see `find_checkpoint`.
+
+    Raises:
+      ConfigError: there is no checkpoint, or it does not lie in the folder of a training run.
+    """
+    folder = _named(wanted, key)
+    metas = (folder / META, *folder.glob(f"checkpoints/[0-9]*/{META}"))
+    for meta in metas:
+        if meta.is_file():
+            return saved_config(meta.parent.resolve())
+    raise ConfigError(f"{key}={wanted}: no checkpoint in this folder")
+
+
+def _named(wanted: str, key: str) -> Path:
+    folder = last_run(key) if wanted == "last" else Path(wanted)
+    if not os.path.isdir(folder):  # Unlike `Path.is_dir` it takes any text.
+        raise ConfigError(f"{key}={wanted}: no such folder")
+    return folder
 
 
 def saved_config(checkpoint: Path) -> dict[str, Any]:

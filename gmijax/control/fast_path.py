@@ -8,6 +8,7 @@ from types import MappingProxyType
 from typing import Final, NamedTuple
 
 from gmijax.control.sight import Sight, device_of
+from gmijax.partition.reduction import LEAST_BINDINGS
 from gmijax.sim.impl import ON_GPU
 
 _CUDA_13_DRIVER: Final = 580
@@ -31,7 +32,7 @@ class Range(NamedTuple):
 
 
 BINDINGS: Final[Mapping[int, Range]] = MappingProxyType(
-    {12: Range((12, 9, 1), (13,)), 13: Range((13,))}
+    {12: Range(LEAST_BINDINGS, (13,)), 13: Range((13,))}
 )
 """Which cuda-bindings the extras `cuda12` and `cuda13` bring: earlier ones hold the GIL."""
 

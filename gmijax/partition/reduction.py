@@ -15,7 +15,9 @@ from gmijax.errors import ConfigError
 from gmijax.partition.layout import Layout
 from gmijax.version import versions_of
 
-_BINDINGS, _LEAST_BINDINGS = "cuda-bindings", (12, 9, 1)
+_BINDINGS = "cuda-bindings"
+LEAST_BINDINGS = (12, 9, 1)
+"""Of CUDA 12; earlier ones hold the GIL in calls that wait in CUDA."""
 
 
 class Choice(NamedTuple):
@@ -144,9 +146,9 @@ def _why_too_old(installed: str | None) -> str | None:
     # Before, a call that waits in CUDA for other GMIs kept all threads of Python from running,
     # also the one that looks whether these live.
     numbers = tuple(int(number) for number in re.findall(r"\d+", installed or "")[:3])
-    if not numbers or numbers >= _LEAST_BINDINGS:
+    if not numbers or numbers >= LEAST_BINDINGS:
         return None
-    least = ".".join(map(str, _LEAST_BINDINGS))
+    least = ".".join(map(str, LEAST_BINDINGS))
     return (
         f"CUDA IPC needs cuda-bindings {least} or newer, and {installed} is installed "
         f"(pip install 'cuda-bindings>={least},<13' with CUDA 12, 'cuda-bindings>=13' with 13)"

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from types import TracebackType
-from typing import Self
+from typing import Any, Self
 
 from gmijax.partition.janitor import JanitorLink
 from gmijax.rundir import RunPaths
@@ -25,12 +24,7 @@ class GuardedBackend:
         self._janitor = JanitorLink(self._janitor_log)
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *exc: Any) -> None:
         """Dismisses it."""
         if self._janitor is not None:
             self._janitor.dismiss()

@@ -11,8 +11,7 @@ from __future__ import annotations
 import dataclasses
 from collections import Counter
 from collections.abc import Mapping
-from types import TracebackType
-from typing import Self
+from typing import Any, Self
 
 from gmijax.errors import BackendUnavailable
 from gmijax.partition.backends.mps import MpsBackend
@@ -62,16 +61,11 @@ class MigBackend:
             raise
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *exc: Any) -> None:
         """Quits these daemons; the instances stay as they were."""
         if self._mps is not None:
-            self._mps.__exit__(kind, error, trace)
-        self._alone.__exit__(kind, error, trace)
+            self._mps.__exit__(*exc)
+        self._alone.__exit__(*exc)
 
     def environment(self, gmi: int) -> Mapping[str, str]:
         """Where the GMI's daemon listens, or a place where none does."""

@@ -13,8 +13,7 @@ import time
 from collections.abc import Collection, Mapping
 from contextlib import suppress
 from pathlib import Path
-from types import TracebackType
-from typing import Self
+from typing import Any, Self
 
 from gmijax.errors import BackendUnavailable, GmiFailed
 from gmijax.partition.backends.guarded import GuardedBackend
@@ -79,19 +78,14 @@ class MpsBackend(GuardedBackend):
             raise
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *exc: Any) -> None:
         """Quits the own daemons once their clients have left."""
         if self._operator is None:
             deadline_s = time.monotonic() + _CLIENTS_LEAVE_S
             for control in self._controls.values():
                 _wait_for_no_clients(control, deadline_s)
             self._quit_all()
-        super().__exit__(kind, error, trace)
+        super().__exit__(*exc)
 
     def environment(self, gmi: int) -> Mapping[str, str]:
         """Where the GMI's daemon listens."""
