@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from benchmarks.run import RESULTS
-from gmijax.collectives.cost_model import BYTES_PER_FLOAT, predicted_s
+from gmijax.collectives.strategies import BYTES_PER_FLOAT, predicted_s
 from gmijax.config import PlanConfig, ReduceConfig
 from gmijax.control.selection import Probe, candidates, measure
 from gmijax.errors import ConfigError

@@ -10,17 +10,12 @@ import mmap
 import os
 import struct
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager
 
 import jax
 import numpy as np
 
-from gmijax.collectives.device_memory import TICKET_BYTES, NewMemory
-from gmijax.collectives.host import HostExchange
-from gmijax.collectives.memory import create_exchange
-from gmijax.collectives.one_shot import OneShotReducer
-from gmijax.partition.layout import Layout
+from gmijax.collectives.device_links import Device
+from gmijax.collectives.device_memory import TICKET_BYTES
 
 
 class FakeDeviceMemory:
@@ -61,9 +56,6 @@ class FakeDeviceMemory:
     def address(self) -> int:
         return self._region(0, (1,), np.dtype(np.uint8)).ctypes.data
 
-    def queue(self, flags: np.ndarray) -> FakeQueue:
-        return FakeQueue(flags)
-
     def close(self) -> None:
         self._mapping = None
 
@@ -88,12 +80,15 @@ class FakeQueue:
         for row in range(rows):
             ctypes.memmove(target + row * num_bytes, source + row * pitch, num_bytes)
 
-    def raise_flag(self, stream: int, place: int, count: int) -> None:
-        self._flags[place, 0] = count
+    def clear(self, stream: int, target: int, num_bytes: int) -> None:
+        ctypes.memset(target, 0, num_bytes)
 
-    def wait_for_flag(self, stream: int, place: int, count: int) -> None:
+    def raise_flag(self, stream: int, rank: int, count: int) -> None:
+        self._flags[rank, 0] = count
+
+    def wait_for_flag(self, stream: int, rank: int, count: int) -> None:
         # As a GPU compares, which takes counts for a circle.
-        while (int(self._flags[place, 0]) - count) % 2**32 >= 2**31:
+        while (int(self._flags[rank, 0]) - count) % 2**32 >= 2**31:
             time.sleep(5e-5)
 
     def start_clock(self, stream: int) -> None:
@@ -110,11 +105,11 @@ class FakeQueue:
         pass
 
 
-class BrokenDeviceMemory(FakeDeviceMemory):
+class ForgetfulQueue(FakeQueue):
     """Takes what is written and forgets it: the others see nothing of it."""
 
-    def start_write(self, offset: int, values: jax.Array) -> None:
-        del offset, values
+    def copy(self, stream: int, target: int, source: int, num_bytes: int) -> None:
+        del stream, target, source, num_bytes
 
 
 class FailingQueue(FakeQueue):
@@ -124,30 +119,14 @@ class FailingQueue(FakeQueue):
         raise RuntimeError("CUDA_ERROR_INVALID_VALUE")
 
 
-class WithFailingQueue(FakeDeviceMemory):
-    """Of a device that says only when it is used that it does not work."""
-
-    def queue(self, flags: np.ndarray) -> FakeQueue:
-        return FailingQueue(flags)
-
-
-class WithoutQueue(FakeDeviceMemory):
+def without_queue(flags: np.ndarray) -> FakeQueue:
     """Of a device that takes no such work."""
-
-    def queue(self, flags: np.ndarray) -> FakeQueue:
-        raise RuntimeError("CUDA_ERROR_NOT_SUPPORTED")
+    raise RuntimeError("CUDA_ERROR_NOT_SUPPORTED")
 
 
-@contextmanager
-def one_shot_of_one(
-    num_floats: int, new_memory: NewMemory = FakeDeviceMemory
-) -> Iterator[OneShotReducer]:
-    """The reducer of a job with one rank, which is this process."""
-    fd = create_exchange()
-    host = HostExchange(fd, 0, 1, num_floats, timeout_s=1.0, rendezvous_timeout_s=1.0)
-    os.close(fd)
-    reducer = OneShotReducer(host, Layout.even(1, 1), num_floats, new_memory)
-    try:
-        yield reducer
-    finally:
-        reducer.close()
+FAKES = {
+    "fake": Device(FakeDeviceMemory, FakeQueue, None),
+    "forgetful": Device(FakeDeviceMemory, ForgetfulQueue, None),
+    "failing_queue": Device(FakeDeviceMemory, FailingQueue, None),
+    "without_queue": Device(FakeDeviceMemory, without_queue, None),
+}

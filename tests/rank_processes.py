@@ -13,21 +13,17 @@ import signal
 import subprocess
 import sys
 import time
-from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
 import pytest
 
-from gmijax.collectives.build import Membership, build_reducer, join_world
-from gmijax.collectives.host import HostExchange
+from gmijax.collectives.build import Membership, build_reducer
 from gmijax.collectives.interface import Reducer
-from gmijax.collectives.memory import create_exchange
+from gmijax.collectives.shared_block import create_exchange
 from gmijax.errors import CollectiveTimeout, GmijaxError, PeerLost
 from gmijax.partition.child import ENV_EXCHANGE_FD
 from gmijax.partition.layout import Layout
-from gmijax.partition.reduction import needs_ring
-from gmijax.partition.rendezvous import reserved_address
 from tests.rank_bodies import BODIES, Options
 
 WAIT_S = 90.0
@@ -51,9 +47,6 @@ class Ranks:
         # Devices by position of a GPU in the layout; none: the CPU.
         defaults |= {"intra": "host", "layout": layout, "gpus": []}
         self._options = {**defaults, "body": body, **options}
-        self._held = ExitStack()
-        if needs_ring(self._options["strategy"], layout_of(self._options)):
-            self._options["address"] = self._held.enter_context(reserved_address())
 
     def __enter__(self) -> Ranks:
         return self
@@ -63,7 +56,6 @@ class Ranks:
             process.kill()
             process.wait()
         os.close(self.fd)
-        self._held.close()
 
     def start(self, *ranks: int, **options: Any) -> Ranks:
         """Starts `ranks` (default: all), with `options` on top of the common ones."""
@@ -153,15 +145,9 @@ def use_fake_device_memory(kind: str) -> None:
     """Lets `intra=ipc` run on the CPU: the real exchange over memory that is not a GPU's."""
     import fake_device_memory
 
-    from gmijax.collectives import build, ipc
+    from gmijax.collectives import build
 
-    memory = getattr(fake_device_memory, kind)
-
-    def fake(layout: Layout, rank: int, num_floats: int, host: HostExchange) -> ipc.IpcIntra:
-        return ipc.IpcIntra(layout, rank, num_floats, host, memory)
-
-    build.INTRA = {**build.INTRA, "ipc": fake}
-    build.DEVICE_MEMORY = memory
+    build.DEVICE = lambda: fake_device_memory.FAKES[kind]
 
 
 def make_reducer(options: Options) -> Reducer:
@@ -169,7 +155,7 @@ def make_reducer(options: Options) -> Reducer:
     strategy, rank, layout = options["strategy"], options["rank"], layout_of(options)
     if options["intra"] == "ipc" and not options["gpus"]:
         is_special = rank == options.get("special_rank")
-        use_fake_device_memory(options["special"] if is_special else "FakeDeviceMemory")
+        use_fake_device_memory(options["special"] if is_special else "fake")
     return build_reducer(
         strategy,
         Membership(
@@ -179,7 +165,6 @@ def make_reducer(options: Options) -> Reducer:
             exchange_fd=int(os.environ[ENV_EXCHANGE_FD]),
             timeout_s=options["timeout_s"],
             rendezvous_timeout_s=options["start_s"],
-            world=join_world(strategy, layout, rank, options.get("address"), options["start_s"]),
             intra=options["intra"],
             host_if_unavailable=options.get("host_if_unavailable", False),
         ),
@@ -210,7 +195,7 @@ def main(options: Options) -> None:
     path.with_suffix(".part").write_text(json.dumps(result))
     path.with_suffix(".part").rename(path)
     if failure is not None:
-        raise failure  # As a GMI ends: nothing is freed that a stuck call may use, see `Courier`.
+        raise failure  # As a GMI ends, see `WatchedThread`.
 
 
 if __name__ == "__main__":

@@ -1,41 +1,39 @@
-"""The reduction strategies by name; a new one is one file and one entry here."""
+"""Makes the reducer of one rank: links by what its strategy's stages need."""
 
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
-from gmijax.collectives.device_memory import NewMemory, cuda_memory
 from gmijax.collectives.host import HostExchange
-from gmijax.collectives.interface import Reducer
-from gmijax.collectives.intra import INTRA, IntraExchange
-from gmijax.collectives.mpr import MprReducer
-from gmijax.collectives.solo import SoloReducer
+from gmijax.collectives.interface import FloatBuffer, Reducer, Step, TracedStep
+from gmijax.collectives.shared_block import LANES
+from gmijax.collectives.strategies import stages
 from gmijax.errors import ConfigError, DeviceMemoryUnavailable
 from gmijax.partition.layout import Layout
-from gmijax.partition.reduction import needs_ring, require_strategy
+from gmijax.partition.reduction import require_strategy
 
 if TYPE_CHECKING:
-    from gmijax.collectives.ring import World
+    from gmijax.collectives.device_links import Device
+    from gmijax.collectives.program import Exchange
 
 
 @dataclass(frozen=True, kw_only=True)
 class Membership:
-    """What a strategy must know to build the reducer of one rank.
+    """What is needed to build the reducer of one rank.
 
     Attributes:
       layout: where all ranks live; the rank of a GMI is its id.
       rank: this GMI's.
-      num_floats: P, length of the buffers for `mean`.
-      exchange_fd: descriptor of the shared block, None where no strategy needs it.
+      num_floats: P, length of the largest buffer whose mean is taken.
+      exchange_fd: descriptor of the shared block, None where there is one rank.
       timeout_s: longest wait for other ranks.
       rendezvous_timeout_s: the same in the first call, when others may still start or compile.
-      world: this process among those of all GMIs, None where no strategy needs rings.
-      intra: how the GMIs of one GPU exchange numbers in HAR.
-      host_if_unavailable: whether HAR goes through host memory, with a warning, where `intra`
-        turns out not to work, and MPR takes the place of one_shot where that does not.
+      intra: how the GMIs of one GPU exchange numbers in HAR, `host` or `ipc`.
+      host_if_unavailable: whether ranks go through host memory, with a warning, where the memory
+        of GPUs cannot be shared.
     """
 
     layout: Layout
@@ -44,114 +42,112 @@ class Membership:
     exchange_fd: int | None
     timeout_s: float
     rendezvous_timeout_s: float
-    world: World | None = None
     intra: str = "host"
     host_if_unavailable: bool = False
 
 
-def join_world(
-    strategy: str, layout: Layout, rank: int, address: str | None, timeout_s: float
-) -> World | None:
-    """This process among those of all GMIs; None if the strategy needs no rings.
+def build_reducer(strategy: str, membership: Membership) -> Reducer:
+    """Makes the reducer of one rank.
 
-    Comes before all other use of jax.
-
-    Raises:
-      ConfigError: no address where the GMIs meet.
-      CollectiveError: the others did not come.
-    """
-    if not needs_ring(strategy, layout):
-        return None
-    if address is None:
-        raise ConfigError(f"reduce.strategy={strategy}: needs an address where GMIs meet")
-    from gmijax.collectives.ring import World  # Imports jax.
-
-    return World.join(layout, rank, address, timeout_s)
-
-
-def build_reducer(name: str, membership: Membership) -> Reducer:
-    """Makes the reducer of one rank with the strategy `name`.
-
-    Those that leave host memory wait here until all ranks have come.
+    Strategies that leave the host wait here until all ranks have come.
 
     Raises:
       ConfigError: no such strategy, or it does not work for this layout, or lacks something.
       CollectiveError: the shared memory cannot be had, or another rank is gone or does not come.
     """
-    require_strategy(name, membership.layout)
-    return STRATEGIES[name](membership)
+    require_strategy(strategy, membership.layout)
+    if membership.layout.num_gmis == 1:
+        return SoloReducer(strategy)
+    control, host = (_lane(strategy, membership, lane) for lane in range(LANES))
+    try:
+        return _built(strategy, membership, control, host)
+    except DeviceMemoryUnavailable as error:
+        if not membership.host_if_unavailable:
+            raise
+        instead = "mpr" if strategy == "one_shot" else strategy
+        what = f"reduce.strategy={instead} through host memory"
+        warnings.warn(f"{error}; so {what}", RuntimeWarning, stacklevel=2)
+        return _built(instead, replace(membership, intra="host"), control, host)
 
 
-def _none(membership: Membership) -> Reducer:
-    return SoloReducer(membership.num_floats)
-
-
-def _mpr(membership: Membership) -> Reducer:
-    return MprReducer(_host("mpr", membership), membership.num_floats)
-
-
-def _mrr(membership: Membership) -> Reducer:
-    return _rings("mrr", membership)
-
-
-def _flat(membership: Membership) -> Reducer:
-    return _rings("flat", membership)
-
-
-def _rings(name: str, membership: Membership) -> Reducer:
-    from gmijax.collectives.mrr import RingReducer  # Imports jax.
-
-    world = _world(name, membership)
-    return RingReducer(_host(name, membership), world, membership.num_floats)
-
-
-def _har(membership: Membership) -> Reducer:
-    from gmijax.collectives.har import DeviceHarReducer, HarReducer  # Imports jax.
-    from gmijax.collectives.ipc import IpcIntra
+def _built(
+    strategy: str, membership: Membership, control: HostExchange, host: HostExchange
+) -> Reducer:
+    from gmijax.collectives.host_links import HostLinks  # Imports jax.
+    from gmijax.collectives.program import Exchange
 
     layout, num_floats = membership.layout, membership.num_floats
-    world = _world("har", membership) if needs_ring("har", layout) else None
-    if membership.intra not in INTRA:
-        raise ConfigError(f"reduce.intra={membership.intra}: expected one of {', '.join(INTRA)}")
-    host = _host("har", membership)
-    intra = _intra(membership, host)
-    if isinstance(intra, IpcIntra):
-        return DeviceHarReducer(host, intra, world, num_floats)
-    return HarReducer(host, intra, world, num_floats)
-
-
-def _one_shot(membership: Membership) -> Reducer:
-    from gmijax.collectives.one_shot import OneShotReducer  # Imports jax.
-
-    num_floats, host = membership.num_floats, _host("one_shot", membership)
+    parts = stages(strategy, layout, membership.intra)
+    device, links = DEVICE(), None
     try:
-        return OneShotReducer(host, membership.layout, num_floats, DEVICE_MEMORY)
-    except DeviceMemoryUnavailable as error:
-        if not membership.host_if_unavailable:
+        if device is None or all(stage.link == "host" for stage in parts):
+            links = HostLinks(host, num_floats)
+        else:
+            from gmijax.collectives.device_links import DeviceLinks
+
+            links = DeviceLinks(control, host, layout, num_floats, parts, device)
+        exchange = Exchange(links, parts, host.rank, host.world_size)
+        links.start(exchange)
+    except BaseException as error:
+        if links is not None:
+            links.close()
+        if not isinstance(error, DeviceMemoryUnavailable):
             host.close()
-            raise
-        warnings.warn(f"{error}; so reduce.strategy=mpr", RuntimeWarning, stacklevel=2)
-        return MprReducer(host, num_floats)
-    except BaseException:
-        host.close()
+            control.close()
         raise
+    return SharedReducer(strategy, control, host, exchange)
 
 
-def _intra(membership: Membership, host: HostExchange) -> IntraExchange:
-    layout, rank, num_floats = membership.layout, membership.rank, membership.num_floats
-    try:
-        return INTRA[membership.intra](layout, rank, num_floats, host)
-    except DeviceMemoryUnavailable as error:
-        if not membership.host_if_unavailable:
-            raise
-        warnings.warn(f"{error}; so through host memory", RuntimeWarning, stacklevel=2)
-    return INTRA["host"](layout, rank, num_floats, host)
+class SharedReducer:
+    """The `Reducer` of one of several ranks."""
+
+    def __init__(
+        self, strategy: str, control: HostExchange, host: HostExchange, exchange: Exchange
+    ) -> None:
+        self.rank, self.world_size, self.strategy = host.rank, host.world_size, strategy
+        self._control, self._host, self._exchange = control, host, exchange
+
+    def all_gather(self, values: FloatBuffer) -> FloatBuffer:
+        """See `Reducer`."""
+        return self._control.all_gather(values)
+
+    def program(self, step: Step) -> TracedStep:
+        """See `Reducer`."""
+        return self._exchange.program(step)
+
+    def close(self) -> None:
+        """See `Reducer`."""
+        self._exchange.close()
+        self._host.close()
+        self._control.close()
 
 
-def _host(name: str, membership: Membership) -> HostExchange:
+class SoloReducer:
+    """The `Reducer` of a job with one trainer."""
+
+    rank, world_size = 0, 1
+
+    def __init__(self, strategy: str = "none") -> None:
+        self.strategy = strategy
+
+    def all_gather(self, values: FloatBuffer) -> FloatBuffer:
+        """See `Reducer`."""
+        return values[None].copy()
+
+    def program(self, step: Step) -> TracedStep:
+        """See `Reducer`."""
+        from gmijax.collectives.program import ProgramStep  # Imports jax.
+
+        return ProgramStep(None, None, step)
+
+    def close(self) -> None:
+        """Does nothing: there is nothing to release."""
+
+
+def _lane(strategy: str, membership: Membership, lane: int) -> HostExchange:
     if membership.exchange_fd is None:
         raise ConfigError(
-            f"reduce.strategy={name}: needs the shared block of the job's controller"
+            f"reduce.strategy={strategy}: needs the shared block of the job's controller"
         )
     return HostExchange(
         membership.exchange_fd,
@@ -160,27 +156,19 @@ def _host(name: str, membership: Membership) -> HostExchange:
         membership.num_floats,
         timeout_s=membership.timeout_s,
         rendezvous_timeout_s=membership.rendezvous_timeout_s,
+        lane=lane,
     )
 
 
-def _world(name: str, membership: Membership) -> World:
-    if membership.world is None:
-        raise ConfigError(f"reduce.strategy={name}: needs a jax world of all GMIs; see World.join")
-    return membership.world
+def _device() -> Device | None:
+    """What links of this process's GPU are made of; None on a CPU."""
+    import jax
+
+    if jax.local_devices()[0].platform != "gpu":
+        return None
+    from gmijax.collectives.cuda import CUDA
+
+    return CUDA
 
 
-DEVICE_MEMORY: NewMemory = cuda_memory
-"""Makes the memory of GPUs that ranks share in `one_shot`."""
-
-STRATEGIES: Mapping[str, Callable[[Membership], Reducer]] = {
-    "none": _none,
-    "mpr": _mpr,
-    "mrr": _mrr,
-    "har": _har,
-    "flat": _flat,
-    "one_shot": _one_shot,
-}
-"""How the reducer of one rank is made; `none` is what a plan with a single GMI uses.
-
-Which layouts each of them takes: `gmijax.partition.reduction`.
-"""
+DEVICE: Callable[[], Device | None] = _device

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 import numpy.typing as npt
 
-from gmijax.collectives.cuda_queue import CudaQueue, checked, runtime
+from gmijax.collectives.cuda_queue import checked, runtime
 from gmijax.errors import CudaError
 
 HANDLE_BYTES = 64
@@ -92,10 +92,6 @@ class CudaMemory:
         if view.unsafe_buffer_pointer() != pointer:
             raise CudaError("jax copies shared GPU memory where it should read it in place")
         return view
-
-    def queue(self, flags: npt.NDArray[np.uint32]) -> CudaQueue:
-        """See `DeviceMemory`."""
-        return CudaQueue(flags)
 
     def close(self) -> None:
         """See `DeviceMemory`."""

@@ -60,15 +60,19 @@ class CudaQueue:
         )
         checked(copied, "queue a copy")
 
-    def raise_flag(self, stream: int, place: int, count: int) -> None:
+    def clear(self, stream: int, target: int, num_bytes: int) -> None:
+        """See `DeviceQueue`."""
+        checked(runtime.cudaMemsetAsync(target, 0, num_bytes, stream), "clear memory")
+
+    def raise_flag(self, stream: int, rank: int, count: int) -> None:
         """See `DeviceQueue`."""
         # No flags: with the barrier that makes what was written before visible to all.
-        flag = self._flags + place * self._line_bytes
+        flag = self._flags + rank * self._line_bytes
         _queued(driver.cuStreamWriteValue32(stream, flag, count, 0), "write")
 
-    def wait_for_flag(self, stream: int, place: int, count: int) -> None:
+    def wait_for_flag(self, stream: int, rank: int, count: int) -> None:
         """See `DeviceQueue`."""
-        flag = self._flags + place * self._line_bytes
+        flag = self._flags + rank * self._line_bytes
         _queued(driver.cuStreamWaitValue32(stream, flag, count, self._wait), "wait for")
 
     def start_clock(self, stream: int) -> None:
@@ -129,3 +133,21 @@ def _queued(result: tuple[Any, ...], wish: str) -> None:
 
 def _event() -> Any:
     return checked(runtime.cudaEventCreate(), "make an event")[0]
+
+
+def fetch(stream: int, source: int, num_floats: int) -> npt.NDArray[np.float32]:
+    """A copy in host memory of [n] float32 of the device, once the stream has come to it."""
+    values = np.empty(num_floats, np.float32)
+    kind = runtime.cudaMemcpyKind.cudaMemcpyDeviceToHost
+    copied = runtime.cudaMemcpyAsync(values.ctypes.data, source, values.nbytes, kind, stream)
+    checked(copied, "copy from the GPU")
+    checked(runtime.cudaStreamSynchronize(stream), "copy from the GPU")
+    return values
+
+
+def store(stream: int, target: int, values: npt.NDArray[np.float32]) -> None:
+    """Copies `values` to the device; they may be used again on return."""
+    kind = runtime.cudaMemcpyKind.cudaMemcpyHostToDevice
+    copied = runtime.cudaMemcpyAsync(target, values.ctypes.data, values.nbytes, kind, stream)
+    checked(copied, "copy to the GPU")
+    checked(runtime.cudaStreamSynchronize(stream), "copy to the GPU")

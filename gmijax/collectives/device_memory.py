@@ -28,11 +28,15 @@ class DeviceQueue(Protocol):
         """Copies `num_bytes` of each row to the next ones in `target`; rows are `pitch` apart."""
         ...
 
-    def raise_flag(self, stream: int, place: int, count: int) -> None:
+    def clear(self, stream: int, target: int, num_bytes: int) -> None:
+        """Sets bytes to zero."""
+        ...
+
+    def raise_flag(self, stream: int, rank: int, count: int) -> None:
         """Sets a flag when all before it is done, and seen by who sees the flag."""
         ...
 
-    def wait_for_flag(self, stream: int, place: int, count: int) -> None:
+    def wait_for_flag(self, stream: int, rank: int, count: int) -> None:
         """Holds the stream until a flag has come to `count`."""
         ...
 
@@ -86,10 +90,6 @@ class DeviceMemory(Protocol):
         self, offset: int, shape: tuple[int, ...], dtype: npt.DTypeLike = np.float32
     ) -> jax.Array:
         """The array at `offset` bytes in place: a program reads what is there when it runs."""
-        ...
-
-    def queue(self, flags: npt.NDArray[np.uint32]) -> DeviceQueue:
-        """Work of the device on such memory, in the order of `flags` [whole pages, line]."""
         ...
 
     def close(self) -> None:

@@ -1,35 +1,54 @@
-"""What every strategy does through the shared block: gather, meet, leave."""
+"""What ranks do through the shared block of their host: gather, sum, broadcast."""
 
 from __future__ import annotations
+
+from collections.abc import Sequence
 
 import numpy as np
 import numpy.typing as npt
 
-from gmijax.collectives.buffers import require_gather_input, require_mean_input
+from gmijax.collectives.barrier import Barrier
 from gmijax.collectives.interface import FloatBuffer
-from gmijax.collectives.memory import ExchangeBlock, attach, process_of
-from gmijax.collectives.turns import Turns
+from gmijax.collectives.shared_block import (
+    FLOATS_PER_LINE,
+    MAX_GATHER_FLOATS,
+    SharedBlock,
+    attach,
+    process_of,
+)
+from gmijax.collectives.strategies import Groups
 from gmijax.errors import CollectiveError
+
+PIECE_FLOATS = 32768
+"""Floats summed at a time: 128 KiB of sums stay in the second-level cache over all ranks."""
 
 
 class HostExchange:
     """One rank's use of the shared block, from `attach` to `close`.
 
+    All calls are collective: every rank of the job makes the same ones in the same order, also
+    those that are in none of the groups. Results are bit-identical on the members of a group.
+
+    A rank uses its two slots in turn. It writes one again in the call after the next one; by then
+    it has met all others in between, who came there after reading what this call left.
+
     Args:
       fd: descriptor of the shared block; the caller may close it afterwards.
       rank: 0 to `world_size - 1`.
       world_size: K, number of ranks.
-      num_floats: P, length of the buffers for `mean`.
+      num_floats: P, length of the largest buffer.
       timeout_s: longest wait for other ranks.
       rendezvous_timeout_s: the same in the first call, when others may still start or compile.
+      lane: of the block; those who use one thread of calls each take a lane each.
 
     Attributes:
-      rank: this rank.
-      world_size: K.
+      rank, world_size: the same.
 
     Raises:
       ConfigError: numbers that make no sense.
-      CollectiveError: no memory, not such a descriptor, or the rank is taken.
+      CollectiveError: no memory, not such a descriptor, or the rank is taken; and, from every
+        call: ranks make different calls, an earlier one failed, or after `close`.
+      PeerLost, CollectiveTimeout: (from every call) a rank is gone, or did not arrive in time.
     """
 
     def __init__(
@@ -41,78 +60,148 @@ class HostExchange:
         *,
         timeout_s: float,
         rendezvous_timeout_s: float,
+        lane: int = 0,
     ) -> None:
         self.rank = rank
         self.world_size = world_size
-        self._block: ExchangeBlock | None = attach(fd, rank, world_size, num_floats)
-        self._turns = Turns(self._block, timeout_s, rendezvous_timeout_s)
+        self._block: SharedBlock | None = attach(fd, rank, world_size, num_floats, lane)
+        self.barrier = Barrier(self._block, timeout_s, rendezvous_timeout_s)
 
-    def rendezvous(self) -> None:
-        """Waits until all ranks have attached; raises as `Turns.rendezvous` does."""
-        self._turns.rendezvous()
+    def sum(
+        self, source: FloatBuffer, target: FloatBuffer, groups: Groups, place: int = 0
+    ) -> None:
+        """Writes the sum over the rank's group of `source` [n] into `target` [n], n <= P.
 
-    def begin(self, operation: str, buffer_floats: int) -> tuple[ExchangeBlock, Turns]:
-        """Opens a call; the caller ends it with `Turns.end`.
+        Every member sums a part of it in the order of the group, so each number is computed once.
+        For a rank in no group the target gets the source.
 
-        Raises:
-          CollectiveError: after `close`, or see `Turns.begin`.
-          PeerLost, CollectiveTimeout: see `Turns.begin`.
+        Args:
+          source: of this rank; may be the target.
+          target: for the sum.
+          groups: who reduces with whom.
+          place: which exchange of its program this is, see `Barrier.begin`.
         """
-        block = self._open_block(operation)
-        self._turns.begin(operation, buffer_floats)
-        return block, self._turns
+        block, group = self._begin("sum", source, place), _group_of(self.rank, groups)
+        slots = block.slots[self.barrier.step % 2, :, : source.size]
+        slots[self.rank] = source
+        self._meet()
+        if group:
+            part = chunk(source.size, group.index(self.rank), len(group))
+            # In place: nobody else reads this part of the first member's slot.
+            _add(slots, group, part)
+        self.barrier.wait()
+        target[:] = slots[group[0] if group else self.rank]
+        self.barrier.end()
 
-    def begin_mean(self, buffer: FloatBuffer) -> tuple[ExchangeBlock, Turns]:
-        """Opens a call of `mean` with a buffer [P] float32; raises as `begin` does."""
-        require_mean_input(buffer, self._open_block("mean").result.size)
-        return self.begin("mean", buffer.size)
+    def broadcast(
+        self, source: FloatBuffer, target: FloatBuffer, groups: Groups, place: int = 0
+    ) -> None:
+        """Writes what the first of the rank's group has as `source` [n] into `target` [n]."""
+        block, group = self._begin("broadcast", source, place), _group_of(self.rank, groups)
+        slots = block.slots[self.barrier.step % 2, :, : source.size]
+        slots[self.rank] = source
+        self._meet()
+        target[:] = slots[group[0] if group else self.rank]
+        self.barrier.end()
 
-    @property
-    def flags(self) -> npt.NDArray[np.uint32]:
-        """See `ExchangeBlock`."""
-        return self._open_block("flags").flags
+    def gather(
+        self, source: FloatBuffer, target: FloatBuffer, groups: Groups, place: int = 0
+    ) -> None:
+        """Writes what all of the rank's group have as `source` [n] into `target` [m, n]."""
+        block, group = self._begin("gather", source, place), _group_of(self.rank, groups)
+        slots = block.slots[self.barrier.step % 2, :, : source.size]
+        slots[self.rank] = source
+        self._meet()
+        for row, member in zip(target, group or (self.rank,), strict=False):
+            row[:] = slots[member]
+        self.barrier.end()
 
-    def all_gather(self, values: FloatBuffer) -> FloatBuffer:
-        """Returns [K, M]: `values` [M] float32 of every rank, see `Reducer.all_gather`.
-
-        One meeting and hence two regions in turn: a rank that writes one of them again has
-        passed the call in between, which all entered after reading. The result is the caller's.
-
-        Raises:
-          PeerLost: the process of another rank is gone.
-          CollectiveTimeout: another rank did not arrive in time.
-          CollectiveError: ranks make different calls, or this one is not allowed; M is limited
-            to `MAX_GATHER_FLOATS`.
-        """
-        self._open_block("all_gather")
-        require_gather_input(values)
-        block, turns = self.begin("all_gather", values.size)
-        region = block.gathered[turns.step % 2]
+    def all_gather(self, values: FloatBuffer, place: int = 0) -> FloatBuffer:
+        """Returns [K, M]: `values` [M] float32 of every rank, M <= `MAX_GATHER_FLOATS`."""
+        if values.dtype != np.float32 or values.ndim != 1 or values.size > MAX_GATHER_FLOATS:
+            raise CollectiveError(
+                f"all_gather of {values.dtype} {list(values.shape)}: expected a vector of at "
+                f"most {MAX_GATHER_FLOATS} float32"
+            )
+        block = self._open_block("all_gather")
+        self.barrier.begin("all_gather", values.size, place)
+        region = block.gathered[self.barrier.step % 2]
         region[self.rank, : values.size] = values
-        turns.meet()
-        turns.check_same_call()
+        self._meet()
         gathered = region[:, : values.size].copy()
-        turns.end()
+        self.barrier.end()
         return gathered
+
+    def mean(self, buffer: FloatBuffer) -> FloatBuffer:
+        """Returns the mean over all ranks of `buffer` [P] float32: the sum times 1 / K."""
+        total = np.empty_like(buffer)
+        self.sum(buffer, total, (tuple(range(self.world_size)),))
+        total *= np.float32(1.0 / self.world_size)
+        return total
 
     def introduce(self, values: FloatBuffer) -> FloatBuffer:
         """`all_gather` as part of the start: others may still compile in the call after it."""
         gathered = self.all_gather(values)
-        self._turns.restart()
+        self.barrier.restart()
         return gathered
+
+    @property
+    def flags(self) -> npt.NDArray[np.uint32]:
+        """See `SharedBlock`."""
+        return self._open_block("flags").flags
 
     def is_gone(self, peer: int) -> bool:
         """Whether an attached peer has closed its exchange, or its process has ended."""
         return not process_of(self._open_block("is_gone"), peer).is_running()
 
     def close(self) -> None:
-        """Gives the memory back, once no result is in use; calling it twice is fine."""
+        """Gives the memory back. Idempotent."""
         if self._block is not None:
-            self._turns.leave()
-            del self._turns
+            self.barrier.leave()
             self._block = None
 
-    def _open_block(self, operation: str) -> ExchangeBlock:
+    def _begin(self, operation: str, source: FloatBuffer, place: int) -> SharedBlock:
+        block = self._open_block(operation)
+        room = block.slots.shape[2]
+        if source.dtype != np.float32 or source.ndim != 1 or source.size > room:
+            raise CollectiveError(
+                f"{operation} of {source.dtype} {list(source.shape)}: expected a vector of at "
+                f"most {room} float32"
+            )
+        self.barrier.begin(operation, source.size, place)
+        return block
+
+    def _meet(self) -> None:
+        self.barrier.wait()
+        self.barrier.check_same_call()
+
+    def _open_block(self, operation: str) -> SharedBlock:
         if self._block is None:
             raise CollectiveError(f"rank {self.rank}: {operation} after close")
         return self._block
+
+
+def chunk(num_floats: int, place: int, num_places: int) -> slice:
+    """The part of a buffer [P] that the member at `place` reduces.
+
+    The chunks of all members are disjoint, in order, and cover the buffer. They begin at whole
+    cache lines, so that no two ranks write to one line; trailing chunks may be empty.
+    """
+    num_lines = -(-num_floats // FLOATS_PER_LINE)
+    low, high = (num_lines * p // num_places * FLOATS_PER_LINE for p in (place, place + 1))
+    return slice(min(low, num_floats), min(high, num_floats))
+
+
+def _add(slots: FloatBuffer, members: Sequence[int], part: slice) -> None:
+    """Adds what the other members have within `part` to the first one's."""
+    # Overflow and NaN are for the caller to judge, not worth a warning here.
+    with np.errstate(over="ignore", invalid="ignore"):
+        for start in range(part.start, part.stop, PIECE_FLOATS):
+            end = min(start + PIECE_FLOATS, part.stop)
+            total = slots[members[0], start:end]
+            for member in members[1:]:
+                total += slots[member, start:end]
+
+
+def _group_of(rank: int, groups: Groups) -> Sequence[int]:
+    return next((group for group in groups if rank in group), ())

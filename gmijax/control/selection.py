@@ -17,7 +17,7 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from gmijax.collectives.cost_model import COSTS
+from gmijax.collectives.strategies import COSTS
 from gmijax.collectives.memory import create_exchange
 from gmijax.control.kinds import Plain
 from gmijax.control.launcher import Launch, compilation_cache_dir, run_gmis

@@ -1,4 +1,4 @@
-"""GMIs that meet to form rings, and one of them fails on the way."""
+"""Steps in which GMIs wait for each other, and one of them ends or stops."""
 
 from __future__ import annotations
 
@@ -9,31 +9,6 @@ from pathlib import Path
 import pytest
 
 from tests.rank_processes import Ranks
-
-
-@pytest.mark.timeout(120)
-@pytest.mark.parametrize("rank", [0, 1])
-def test_one_that_fails_while_the_others_wait_ends_at_once(rank: int, tmp_path: Path) -> None:
-    # Its library would wait five minutes for the others to say goodbye.
-    layout = [[0], [1]]
-    with Ranks(tmp_path, 2, "call_once", strategy="mrr", layout=layout) as job:
-        started_s = time.monotonic()
-        job.start(1 - rank)
-        job.start(rank, num_floats=0)
-        (result,) = job.results(rank)
-        assert time.monotonic() - started_s < 60
-    assert (result["error"], result["message"]) == (
-        "ConfigError",
-        "num_floats=0: must be at least 1",
-    )
-
-
-@pytest.mark.timeout(120)
-def test_ranks_with_different_lengths_name_both(tmp_path: Path) -> None:
-    with Ranks(tmp_path, 2, "call_once", strategy="mrr", layout=[[0], [1]]) as job:
-        job.start(0, num_floats=100).start(1, num_floats=200)
-        messages = [result["message"] for result in job.results()]
-    assert all("do not fit together: num_floats is" in message for message in messages)
 
 
 @pytest.mark.timeout(240)
@@ -58,23 +33,3 @@ def test_who_ends_while_all_run_a_step_is_named(
             else:
                 assert (result["error"], result.get("missing")) == ("CollectiveTimeout", [1])
                 assert 1.8 < result["failed_at_s"] - sent_s < 4.0
-
-
-@pytest.mark.timeout(180)
-@pytest.mark.parametrize("normalize_advantage", [True, False])
-@pytest.mark.parametrize(("strategy", "layout"), [("har", [[0, 1]]), ("one_shot", [[0], [1, 2]])])
-def test_exchanges_in_the_program_learn_what_the_host_does_between(
-    strategy: str, layout: list[list[int]], normalize_advantage: bool, tmp_path: Path
-) -> None:
-    """PPO, with fake memory of a device; without it statistics and gradients are independent."""
-    options = {
-        "strategy": strategy,
-        "intra": "ipc",
-        "layout": layout,
-        "num_floats": 2 * 65 + 1 + 5,  # Two networks 2-16-1, one deviation, five losses.
-        "algo": {"normalize_advantage": normalize_advantage},
-    }
-    with Ranks(tmp_path, sum(map(len, layout)), "check_training", **options).start() as job:
-        results = job.results()
-    assert [result["error"] for result in results] == [None] * len(results)
-    assert len({result["digest"] for result in results}) == 1

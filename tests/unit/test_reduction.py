@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gmijax.collectives.cost_model import (
+from gmijax.collectives.strategies import (
     COSTS,
     flat_s,
     har_s,

@@ -11,7 +11,7 @@ import time
 from collections.abc import Callable
 from typing import NoReturn
 
-from gmijax.collectives.memory import ExchangeBlock, process_of
+from gmijax.collectives.shared_block import SharedBlock, process_of
 from gmijax.collectives.waits import LIVENESS_PERIOD_S, fence
 from gmijax.errors import CollectiveTimeout, PeerLost
 
@@ -19,7 +19,7 @@ SILENCE_S = 0.7
 """A rank that has not beaten for so long does not wait: three beats are missing."""
 
 
-class Suspects:
+class FailureDetector:
     """One wait of one rank, from its start.
 
     Args:
@@ -29,7 +29,7 @@ class Suspects:
       timeout_s: longest wait.
     """
 
-    def __init__(self, block: ExchangeBlock, operation: str, step: int, timeout_s: float) -> None:
+    def __init__(self, block: SharedBlock, operation: str, step: int, timeout_s: float) -> None:
         self._block = block
         self._operation = operation
         self._step = step

@@ -34,7 +34,7 @@ class _Call(Generic[T]):
         self.done.set()
 
 
-class Courier:
+class WatchedThread:
     """One daemon thread that runs one call at a time.
 
     A call that its owner gives up is left alone, and with it the thread. The process can still
@@ -55,7 +55,7 @@ class Courier:
         """Returns what `function` returns, or raises what it raises.
 
         Args:
-          function: runs in the courier's thread.
+          function: runs in the watched thread's thread.
           wait: returns when the event is set, or raises, which gives the call up.
         """
         call = _Call(function)

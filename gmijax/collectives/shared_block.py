@@ -9,11 +9,10 @@ This file is the only one that knows the wire format (K ranks, P floats, native 
 
 | offset | content |
 |---|---|
-| 0 | K lines of 64 bytes, `LINE`, each written by its own rank only |
-| 64 K | [2, K, MAX_GATHER_FLOATS] float32, values to gather, by parity of the step |
-| next page | [K, P] float32, one slot a rank, rows padded to whole cache lines |
-| after the slots | [P] float32, the result |
-| next page | K lines of 64 bytes, uint32: `ExchangeBlock.flags` |
+| 0 | [2, K] lines of 64 bytes, `LINE`, by lane, each written by its own rank only |
+| 128 K | [2, 2, K, MAX_GATHER_FLOATS] float32, values to gather, by lane and parity of the step |
+| next page | [2, K, P] float32, two slots a rank, rows padded to whole cache lines |
+| next page | K lines of 64 bytes, uint32: `SharedBlock.flags` |
 """
 
 from __future__ import annotations
@@ -29,9 +28,11 @@ from gmijax.errors import CollectiveError, ConfigError
 from gmijax.processes import ProcessId, own_process
 
 MAGIC = 0x58494D47  # "GMIX" in memory on a little-endian machine
-VERSION = 3
+VERSION = 4
 MAX_GATHER_FLOATS = 16384  # 64 KiB a rank
 FLOATS_PER_LINE = 16
+LANES = 2
+"""Ranks meet in each of them by itself: from outside of programs, and from within."""
 
 LINE = np.dtype(
     [
@@ -59,7 +60,6 @@ class Geometry(NamedTuple):
     gathered: int
     slots: int
     row_floats: int
-    result: int
     flags: int
     size: int
 
@@ -67,34 +67,32 @@ class Geometry(NamedTuple):
     def of(cls, world_size: int, num_floats: int) -> Geometry:
         """The geometry for K ranks and P floats."""
         row_floats = _round_up(max(num_floats, 1), FLOATS_PER_LINE)
-        gathered = world_size * LINE.itemsize
-        slots = _round_up(gathered + 2 * world_size * MAX_GATHER_FLOATS * 4, mmap.PAGESIZE)
-        result = slots + world_size * row_floats * 4
+        gathered = LANES * world_size * LINE.itemsize
+        floats = LANES * 2 * world_size * MAX_GATHER_FLOATS
+        slots = _round_up(gathered + floats * 4, mmap.PAGESIZE)
         # Whole pages, because a GPU maps pages.
-        flags = _round_up(result + row_floats * 4, mmap.PAGESIZE)
+        flags = _round_up(slots + 2 * world_size * row_floats * 4, mmap.PAGESIZE)
         size = flags + _round_up(world_size * LINE.itemsize, mmap.PAGESIZE)
-        return cls(gathered, slots, row_floats, result, flags, size)
+        return cls(gathered, slots, row_floats, flags, size)
 
 
-class ExchangeBlock(NamedTuple):
+class SharedBlock(NamedTuple):
     """The mapped block as arrays; the mapping lives as long as one of them does.
 
     Attributes:
       rank: whose view this is.
-      lines: [K] of `LINE`.
-      gathered: [2, K, MAX_GATHER_FLOATS] float32.
-      slots: [K, P] float32.
-      result: [P] float32.
+      lines: [K] of `LINE`, of one lane.
+      gathered: [2, K, MAX_GATHER_FLOATS] float32, of the same.
+      slots: [2, K, P] float32, used in turn.
       flags: [whole pages, FLOATS_PER_LINE] uint32, of which [rank, 0] counts how often the device
         of a rank has written its slots; 1 says that the rank is through with slots in device
-        memory, and 2 to 3 which exchanges it has come to (`stream_exchange.Order`).
+        memory, and 2 to 3 which exchanges it has come to (`device_links.Order`).
     """
 
     rank: int
     lines: npt.NDArray[np.void]
     gathered: npt.NDArray[np.float32]
     slots: npt.NDArray[np.float32]
-    result: npt.NDArray[np.float32]
     flags: npt.NDArray[np.uint32]
 
 
@@ -109,7 +107,7 @@ def create_exchange() -> int:
     return fd
 
 
-def attach(fd: int, rank: int, world_size: int, num_floats: int) -> ExchangeBlock:
+def attach(fd: int, rank: int, world_size: int, num_floats: int, lane: int = 0) -> SharedBlock:
     """Maps the block and makes this process known as `rank`.
 
     The block gets its size here, from whoever comes first; the caller keeps `fd` and may close
@@ -120,6 +118,7 @@ def attach(fd: int, rank: int, world_size: int, num_floats: int) -> ExchangeBloc
       rank: 0 to `world_size - 1`.
       world_size: K, number of ranks.
       num_floats: P, length of the buffers whose mean is taken.
+      lane: below `LANES`.
 
     Raises:
       ConfigError: numbers that make no sense.
@@ -129,7 +128,7 @@ def attach(fd: int, rank: int, world_size: int, num_floats: int) -> ExchangeBloc
         raise ConfigError(f"rank={rank}: must be between 0 and world_size - 1 = {world_size - 1}")
     if num_floats < 1:
         raise ConfigError(f"num_floats={num_floats}: must be at least 1")
-    block = _map(fd, rank, world_size, num_floats)
+    block = _map(fd, rank, world_size, num_floats, lane)
     line = block.lines[rank]
     if line["sequence"]:
         raise CollectiveError(f"rank {rank} is taken already by process {line['pid']}")
@@ -139,7 +138,7 @@ def attach(fd: int, rank: int, world_size: int, num_floats: int) -> ExchangeBloc
     return block
 
 
-def check_peer(block: ExchangeBlock, peer: int) -> None:
+def check_peer(block: SharedBlock, peer: int) -> None:
     """Checks that an attached `peer` sees the block as this rank does.
 
     Raises:
@@ -155,13 +154,13 @@ def check_peer(block: ExchangeBlock, peer: int) -> None:
             )
 
 
-def process_of(block: ExchangeBlock, peer: int) -> ProcessId:
+def process_of(block: SharedBlock, peer: int) -> ProcessId:
     """The process behind an attached `peer`."""
     line = block.lines[peer]
     return ProcessId(int(line["pid"]), int(line["start_ticks"]))
 
 
-def _map(fd: int, rank: int, world_size: int, num_floats: int) -> ExchangeBlock:
+def _map(fd: int, rank: int, world_size: int, num_floats: int, lane: int) -> SharedBlock:
     geometry = Geometry.of(world_size, num_floats)
     try:
         # Unlike ftruncate this never shrinks the file, which would crash (SIGBUS) ranks that
@@ -177,14 +176,13 @@ def _map(fd: int, rank: int, world_size: int, num_floats: int) -> ExchangeBlock:
     def floats(offset: int, count: int) -> npt.NDArray[np.float32]:
         return np.frombuffer(mapping, np.float32, count, offset)
 
-    gathered = floats(geometry.gathered, 2 * world_size * MAX_GATHER_FLOATS)
-    slots = floats(geometry.slots, world_size * geometry.row_floats)
-    return ExchangeBlock(
+    gathered = floats(geometry.gathered, LANES * 2 * world_size * MAX_GATHER_FLOATS)
+    slots = floats(geometry.slots, 2 * world_size * geometry.row_floats)
+    return SharedBlock(
         rank=rank,
-        lines=np.frombuffer(mapping, LINE, world_size),
-        gathered=gathered.reshape(2, world_size, MAX_GATHER_FLOATS),
-        slots=slots.reshape(world_size, geometry.row_floats)[:, :num_floats],
-        result=floats(geometry.result, num_floats),
+        lines=np.frombuffer(mapping, LINE, LANES * world_size).reshape(LANES, -1)[lane],
+        gathered=gathered.reshape(LANES, 2, world_size, MAX_GATHER_FLOATS)[lane],
+        slots=slots.reshape(2, world_size, geometry.row_floats)[:, :, :num_floats],
         flags=np.frombuffer(mapping, np.uint32, -1, geometry.flags).reshape(-1, FLOATS_PER_LINE),
     )
 

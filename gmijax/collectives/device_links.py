@@ -1,0 +1,255 @@
+"""Exchanges of a program as work of the device: through memory of the GPUs, and rings.
+
+No rank stops on the host for them: copies, a flag for the others, waits for their flags and a
+copy of what they wrote lie on the program's stream, between what it computes before and after.
+"""
+
+from __future__ import annotations
+
+import zlib
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from typing import TYPE_CHECKING, NamedTuple, Protocol, TypeVar
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import numpy.typing as npt
+
+from gmijax.collectives.device_memory import DeviceQueue, NewMemory
+from gmijax.collectives.host import HostExchange
+from gmijax.collectives.host_links import HostLinks
+from gmijax.collectives.lockstep import LockstepRunner
+from gmijax.collectives.shared_slots import SharedSlots, agreed
+from gmijax.collectives.strategies import Groups, Stage
+from gmijax.collectives.waits import Fence
+from gmijax.partition.layout import Layout
+from gmijax.partition.reduction import leaders
+
+if TYPE_CHECKING:
+    from gmijax.collectives.program import Exchange
+
+T = TypeVar("T")
+
+_FREE = 2**30
+_WISH = "exchange on the device's stream"
+
+
+class Order:
+    """Whether ranks come to the same exchanges in the same order; without waiting.
+
+    Flags only count. Each rank keeps a word beside its own: how many exchanges it has come to,
+    and a checksum of which ones these were, in their order. It looks at the words of those that
+    have come as far. Checksums that differ once go on to do so, and who comes last to the end of
+    a step finds all others there: so one of two ranks sees it before the next step, whoever is
+    ahead.
+
+    Args:
+      flags: [pages, line] uint32, see `SharedBlock`; the second 64 bits of each line are used.
+      rank: this one.
+      world_size: K.
+    """
+
+    def __init__(self, flags: npt.NDArray[np.uint32], rank: int, world_size: int) -> None:
+        self._words = flags.view(np.uint64)[:world_size, 1]
+        self._rank = rank
+        self._fence = Fence()
+        self._count = self._checksum = 0
+        self._words[rank] = 0
+
+    def come_to(self, place: int) -> int | None:
+        """Comes to the next exchange; a rank that has come to another one instead, if any."""
+        self._count += 1
+        self._checksum = zlib.crc32(place.to_bytes(8, "little"), self._checksum)
+        own = (self._count & 0xFFFFFFFF) << 32 | self._checksum
+        self._words[self._rank] = own
+        self._fence()  # Of two that come at the same time one sees the other.
+        for peer, word in enumerate(self._words.tolist()):
+            if word != own and word >> 32 == own >> 32:
+                return peer
+        return None
+
+
+class Ring(Protocol):
+    """Collectives between some ranks, each on another GPU; adds work to a stream."""
+
+    def gather(self, stream: int, source: int, target: int, num_floats: int) -> None:
+        """`target` [m, n] becomes what all members have."""
+        ...
+
+    def sum(self, stream: int, source: int, target: int, num_floats: int) -> None:
+        """`target` [n] becomes the sum over the members."""
+        ...
+
+    def broadcast(self, stream: int, source: int, target: int, num_floats: int) -> None:
+        """`target` [n] becomes what the first member has."""
+        ...
+
+    def close(self) -> None:
+        """Gives the communicator back. Idempotent."""
+        ...
+
+
+class Device(NamedTuple):
+    """What links of a device are made of.
+
+    Attributes:
+      new_memory: makes or opens memory that processes share.
+      new_queue: adds work to streams, with flags [whole pages, line].
+      new_ring: makes this rank's ring; all ranks of the job call it, and get None if they are in
+        none of the groups. None itself where rings go through the host.
+    """
+
+    new_memory: NewMemory
+    new_queue: Callable[[npt.NDArray[np.uint32]], DeviceQueue]
+    new_ring: Callable[[HostExchange, Groups], Ring | None] | None
+
+
+class DeviceLinks(HostLinks):
+    """`Links` of strategies that leave the host; all ranks of the job make theirs together.
+
+    Stages through the host go the way of `HostLinks`, and so do rings on a CPU.
+
+    Args:
+      control: this rank's use of the shared block from outside of programs.
+      host: the same from within them, with the flags.
+      layout: where all ranks live.
+      num_floats: P, length of the largest buffer.
+      stages: of the strategy.
+      device: what they are made of.
+
+    Raises:
+      DeviceMemoryUnavailable: it does not work here; on all ranks alike.
+      PeerLost, CollectiveTimeout: as in the first call of a reducer.
+    """
+
+    def __init__(
+        self,
+        control: HostExchange,
+        host: HostExchange,
+        layout: Layout,
+        num_floats: int,
+        stages: Sequence[Stage],
+        device: Device,
+    ) -> None:
+        super().__init__(host, num_floats)
+        self._control = control
+        self._device = device
+        self._runner = LockstepRunner(control, num_floats)
+        self._queue: DeviceQueue | None = None
+        self._order: Order | None = None
+        self._slots: SharedSlots | None = None
+        self._rings: dict[Groups, Ring | None] = {}
+        try:
+            if any(stage.link == "slots" for stage in stages):
+                self._slots = self._new_slots(layout, stages, device.new_memory)
+            if (new_ring := device.new_ring) is not None:
+                rings = {stage.groups for stage in stages if stage.link == "ring"}
+                self._rings = {groups: new_ring(control, groups) for groups in sorted(rings)}
+        except BaseException:
+            self.close()
+            raise
+
+    def _new_slots(
+        self, layout: Layout, stages: Sequence[Stage], new_memory: NewMemory
+    ) -> SharedSlots:
+        rank, groups = self._control.rank, stages[0].groups
+        group = next(group for group in groups if rank in group)
+        owners = group[:1]
+        if len(group) == layout.num_gmis:
+            # On every GPU: the own first, then the following ones, so that not all write to one.
+            first, near = leaders(layout), layout.gpu_of(rank)
+            owners = first[near:] + first[:near]
+        return SharedSlots(self._control, self.room, group, owners, new_memory, _WISH)
+
+    def start(self, exchange: Exchange) -> None:
+        """See `Links`."""
+        agreed(self._control, _WISH, self._open)
+        failure = self._runner.settle(lambda: self._try(exchange))
+        agreed(self._control, _WISH, lambda: _raise(failure))
+        self.exchange_s()  # Not a part of the first step.
+
+    def reduce(
+        self, stage: Stage, stream: int, place: int, source: int, target: int, num_floats: int
+    ) -> None:
+        """See `Links`."""
+        most = max(len(group) for group in stage.groups)
+        if stage.link == "slots" and self._slots is not None:
+            with self._exchanging(stream, place) as queue:
+                if stage.kind == "gather":
+                    self._slots.gather(queue, stream, source, target, num_floats, rows=most)
+                else:
+                    self._slots.broadcast(queue, stream, source, target, num_floats)
+        elif stage.link == "ring" and stage.groups in self._rings:
+            with self._exchanging(stream, place) as queue:
+                ring = self._rings[stage.groups]
+                if ring is None:
+                    queue.copy(stream, target, source, 4 * num_floats)
+                else:
+                    getattr(ring, stage.kind)(stream, source, target, num_floats)
+        else:
+            super().reduce(stage, stream, place, source, target, num_floats)
+
+    def run(self, program: Callable[[], T], *, is_last: bool) -> T:
+        """See `Links`."""
+        run = self._runner.settle if is_last else self._runner.step
+        return self._explained(lambda: run(program))
+
+    def exchange_s(self) -> float:
+        """See `Links`: each from the time that this rank's numbers were there."""
+        on_device_s = 0.0 if self._queue is None else self._queue.clocked_s()
+        return super().exchange_s() + on_device_s
+
+    def close(self) -> None:
+        """See `Links`; what a device may still be at stays until the process ends."""
+        if self._runner.is_caught:
+            return
+        self._runner.close()
+        for held in (self._queue, *self._rings.values(), self._slots):
+            if held is not None:
+                held.close()
+        self._queue, self._order, self._slots, self._rings = None, None, None, {}
+
+    @contextmanager
+    def _exchanging(self, stream: int, place: int) -> Iterator[DeviceQueue]:
+        """Counts the time, and makes sure that other ranks come to the same exchange."""
+        if self._queue is None or self._order is None:
+            raise RuntimeError("the exchange is closed")
+        if (peer := self._order.come_to(place)) is not None:
+            raise RuntimeError(
+                f"rank {self._control.rank} and rank {peer} have come to their exchanges in "
+                f"different orders; here it is number {place} of its program"
+            )
+        self._queue.start_clock(stream)
+        yield self._queue
+        self._queue.stop_clock(stream)
+
+    def _open(self) -> bytes:
+        self._queue = self._device.new_queue(self._control.flags)
+        self._order = Order(self._control.flags, self._control.rank, self._control.world_size)
+        return b""
+
+    def _try(self, exchange: Exchange) -> Exception | None:
+        """First exchanges of known numbers; what went wrong with them."""
+        rank, world_size = self._control.rank, self._control.world_size
+
+        def trial(values: jax.Array) -> tuple[jax.Array, jax.Array]:
+            gathered = exchange.gather(values[:1], place=1)
+            return gathered[:, 0], exchange.mean(values, place=2, after=gathered)
+
+        try:
+            gathered, mean = jax.jit(trial)(jnp.full(self.room, rank + 1, jnp.float32))
+            is_right = np.array_equal(gathered, np.arange(1, world_size + 1))
+            is_right &= np.allclose(mean, (world_size + 1) / 2, rtol=1e-5)
+            if not is_right and not (self._control.flags[:, 0] == _FREE).any():
+                raise RuntimeError("shared GPU memory does not hold what was written into it")
+        except Exception as error:  # Whatever it is, the host can take part instead.
+            self._control.flags[rank, 0] = _FREE  # The others' devices wait for it.
+            return error
+        return None
+
+
+def _raise(failure: Exception | None) -> bytes:
+    if failure is not None:
+        raise failure
+    return b""

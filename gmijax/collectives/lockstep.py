@@ -1,0 +1,65 @@
+"""Steps that the devices of all ranks run together: ranks meet before, and look at each other."""
+
+from __future__ import annotations
+
+import atexit
+from collections.abc import Callable
+from typing import TypeVar
+
+from gmijax.collectives.host import HostExchange
+from gmijax.collectives.watched_thread import WatchedThread, end_at_once
+
+T = TypeVar("T")
+
+
+class LockstepRunner:
+    """One rank's part in steps of all ranks.
+
+    Args:
+      host: this rank's use of the shared block.
+      num_floats: P, which all ranks must agree on.
+    """
+
+    def __init__(self, host: HostExchange, num_floats: int) -> None:
+        self._barrier = host.barrier
+        self._num_floats = num_floats
+        self._thread = WatchedThread("step")
+        self._is_running = False
+
+    @property
+    def is_caught(self) -> bool:
+        """Whether the device may be at something that a peer has not come to."""
+        return self._thread.is_stuck or self._is_running
+
+    def step(self, program: Callable[[], T]) -> T:
+        """Runs a program that queues a step of all.
+
+        From the first one until `settle` the device may be at it, and wait for a peer that is
+        gone: what ends this process meanwhile, wherever it is found, ends it at once.
+
+        Raises:
+          PeerLost, CollectiveTimeout: see `Barrier.watch`; errors that no peer explains stay.
+        """
+        if not self._is_running:
+            self._is_running = True
+            atexit.register(end_at_once)
+        barrier = self._barrier
+        barrier.begin("step", self._num_floats)
+        barrier.wait()
+        barrier.check_same_call()
+        with barrier.explained():
+            result = self._thread.run(program, barrier.watch)
+        barrier.wait(is_patient=True)  # Some have given it to their devices a step before others.
+        barrier.end()
+        return result
+
+    def settle(self, program: Callable[[], T]) -> T:
+        """Runs a program that returns when all steps are computed; raises as `step`."""
+        result = self.step(program)
+        self._is_running = False
+        atexit.unregister(end_at_once)
+        return result
+
+    def close(self) -> None:
+        """Ends the thread. Idempotent."""
+        self._thread.close()

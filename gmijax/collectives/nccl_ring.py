@@ -1,0 +1,80 @@
+"""Collectives between ranks on different GPUs: NCCL through nccl4py, as work of a stream."""
+
+from __future__ import annotations
+
+import importlib
+from typing import Any
+
+from gmijax.collectives.host import HostExchange
+from gmijax.collectives.shared_slots import agreed
+from gmijax.collectives.strategies import Groups
+
+_WISH = "rings between GPUs"
+
+
+class NcclRing:
+    """This rank's communicator, as `Ring`.
+
+    Args:
+      nccl: the module `nccl.bindings.nccl`.
+      comm: from it.
+    """
+
+    def __init__(self, nccl: Any, comm: Any) -> None:
+        self._nccl, self._comm = nccl, comm
+        self._float, self._sum = int(nccl.DataType.FLOAT32), int(nccl.RedOp.SUM)
+
+    def gather(self, stream: int, source: int, target: int, num_floats: int) -> None:
+        """See `Ring`."""
+        self._nccl.all_gather(source, target, num_floats, self._float, self._comm, stream)
+
+    def sum(self, stream: int, source: int, target: int, num_floats: int) -> None:
+        """See `Ring`."""
+        kind = self._float, self._sum
+        self._nccl.all_reduce(source, target, num_floats, *kind, self._comm, stream)
+
+    def broadcast(self, stream: int, source: int, target: int, num_floats: int) -> None:
+        """See `Ring`."""
+        kind = self._float, 0
+        self._nccl.broadcast(source, target, num_floats, *kind, self._comm, stream)
+
+    def close(self) -> None:
+        """See `Ring`."""
+        if self._comm is not None:
+            self._nccl.comm_destroy(self._comm)
+        self._comm = None
+
+
+def nccl_ring(host: HostExchange, groups: Groups) -> NcclRing | None:
+    """Meets the other members of this rank's group; all ranks of the job call it.
+
+    Raises:
+      DeviceMemoryUnavailable: NCCL is not to be had, or refuses; on all ranks alike.
+    """
+    found: list[NcclRing] = []
+    group = next((group for group in groups if host.rank in group), ())
+
+    def make_id() -> bytes:
+        if not group or group[0] != host.rank:
+            return b""
+        return bytes(_nccl().get_unique_id())
+
+    def join() -> bytes:
+        if group:
+            nccl = _nccl()
+            unique = nccl.UniqueId.from_buffer(ids[group[0]][:_ID_BYTES].tobytes())
+            place = group.index(host.rank)
+            found.append(NcclRing(nccl, nccl.comm_init_rank(len(group), unique, place)))
+        return b""
+
+    ids = agreed(host, _WISH, make_id)
+    agreed(host, _WISH, join)
+    return found[0] if found else None
+
+
+_ID_BYTES = 128
+
+
+def _nccl() -> Any:
+    # By name, because it has no type information, and is not installed everywhere.
+    return importlib.import_module("nccl.bindings.nccl")

@@ -1,0 +1,260 @@
+"""Exchanges between ranks from within a compiled program.
+
+A program calls by name a Python function of this process (see `xla_call`), which moves the
+numbers: at once on a CPU, on a GPU by adding work to the program's stream. So no rank stops
+between a gradient and its mean, and a program is the same on all ranks: they share one entry of
+the compilation cache.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Callable, Sequence
+from typing import Any, Protocol, TypeVar
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from gmijax.collectives.interface import Step
+from gmijax.collectives.strategies import Stage
+from gmijax.collectives.sums import ordered_sum
+from gmijax.collectives.xla_call import Buffer, register
+from gmijax.errors import CollectiveError
+from gmijax.host_memory import host_sharding
+
+T = TypeVar("T")
+
+_serial = itertools.count()
+
+
+class Links(Protocol):
+    """How the exchanges of one rank move numbers; addresses are those of its device.
+
+    All calls take `(stream, place, source, target, num_floats)`: the stream of the device (0 on
+    a CPU), which exchange of its program it is, and the addresses of [n] float32 and the result.
+
+    Attributes:
+      room: P, length of the largest buffer whose mean is taken.
+      gather_room: the same for what is gathered.
+    """
+
+    room: int
+    gather_room: int
+
+    def start(self, exchange: Exchange) -> None:
+        """Tries them, together with all other ranks; raises DeviceMemoryUnavailable on all."""
+        ...
+
+    def gather(self, stream: int, place: int, source: int, target: int, num_floats: int) -> None:
+        """`target` [K, n] becomes what all ranks have, in order of rank."""
+        ...
+
+    def reduce(
+        self, stage: Stage, stream: int, place: int, source: int, target: int, num_floats: int
+    ) -> None:
+        """`target` becomes what the stage makes of `source`: [n], or [m, n] if it gathers."""
+        ...
+
+    def run(self, program: Callable[[], T], *, is_last: bool) -> T:
+        """Runs a program that has exchanges in it, or (`is_last`) waits for the last one.
+
+        Raises:
+          PeerLost, CollectiveTimeout, CollectiveError: see `TracedStep`.
+        """
+        ...
+
+    def exchange_s(self) -> float | None:
+        """Seconds that exchanges took which are through, and were not told before."""
+        ...
+
+    def close(self) -> None:
+        """Releases what they hold. Idempotent."""
+        ...
+
+
+class Exchange:
+    """One rank's exchanges in programs, by a strategy's stages.
+
+    Args:
+      links: of this rank.
+      stages: of the strategy.
+      rank: of this process.
+      world_size: K.
+    """
+
+    def __init__(self, links: Links, stages: Sequence[Stage], rank: int, world_size: int) -> None:
+        self.rank, self.world_size = rank, world_size
+        self._links: Links | None = links
+        self._stages = stages
+        # The same on all ranks, which make as many: it is part of their programs.
+        self._name = f"gmijax_exchange_{next(_serial)}"
+        register(self._name, self._call)
+
+    def gather(self, values: jax.Array, place: int, after: jax.Array | None = None) -> jax.Array:
+        """[K, n]: `values` [n] float32 of every rank; in a program, where it is number `place`."""
+        return self._traced(values, (self.world_size, values.size), 0, place, after)
+
+    def mean(self, buffer: jax.Array, place: int, after: jax.Array | None = None) -> jax.Array:
+        """The mean over ranks of `buffer` [n] float32, n <= P; in a program."""
+        total = buffer
+        for number, stage in enumerate(self._stages, 1):
+            if stage.kind == "gather":
+                # The largest group's size: the program must be the same on all ranks.
+                most = max(len(group) for group in stage.groups)
+                rows = self._traced(total, (most, buffer.size), number, place, after)
+                total = ordered_sum(rows, 1.0)
+            else:
+                total = self._traced(total, buffer.shape, number, place, after)
+        return total * np.float32(1.0 / self.world_size)
+
+    def program(self, step: Step) -> ProgramStep:
+        """See `Reducer`."""
+        assert self._links is not None
+        return ProgramStep(self, self._links, step)
+
+    def close(self) -> None:
+        """Releases the links. Idempotent."""
+        if self._links is not None:
+            self._links.close()
+        self._links = None  # XLA keeps the call forever, and with it this object.
+
+    def _traced(
+        self,
+        values: jax.Array,
+        shape: tuple[int, ...],
+        number: int,
+        place: int,
+        after: jax.Array | None,
+    ) -> jax.Array:
+        if self._links is None:
+            raise CollectiveError(f"rank {self.rank}: exchange after close")
+        room = self._links.room if number else self._links.gather_room
+        if values.dtype != jnp.float32:
+            raise CollectiveError(f"rank {self.rank}: exchanges float32, not {values.dtype}")
+        if values.size > room:
+            raise CollectiveError(f"rank {self.rank}: {values.size} floats, room is for {room}")
+        result = jax.ShapeDtypeStruct(shape, jnp.float32)
+        call: Any = jax.ffi.ffi_call(self._name, result, has_side_effect=True)
+        # What has to come before is an argument that is not looked at.
+        arguments = (values,) if after is None else (values, after)
+        return call(*arguments, number=np.int64(number), place=np.int64(place))
+
+    def _call(
+        self, stream: int, arguments: list[Buffer], results: list[Buffer], attributes: list[int]
+    ) -> None:
+        if self._links is None:
+            raise RuntimeError("the exchange is closed")
+        (values, *_), (result,), (number, place) = arguments, results, attributes
+        where = (stream, place, values.address, result.address, values.shape[0])
+        if number == 0:
+            self._links.gather(*where)
+        else:
+            self._links.reduce(self._stages[number - 1], *where)
+
+
+class ProgramPeers:
+    """The ranks of an exchange as a program sees them: `Peers`.
+
+    Args:
+      exchange: this rank's.
+      rank: [] int32, an argument of the program, so that all ranks have the same one.
+    """
+
+    def __init__(self, exchange: Exchange, rank: jax.Array) -> None:
+        self._exchange = exchange
+        self._rank = rank
+        self._places = itertools.count(1)
+
+    def rank(self) -> jax.Array:
+        """See `Peers`."""
+        return self._rank
+
+    def gather(self, values: jax.Array, after: jax.Array | None = None) -> jax.Array:
+        """See `Peers`."""
+        gathered = self._exchange.gather(values.ravel(), next(self._places), after)
+        return gathered.reshape(-1, *values.shape)
+
+    def mean(self, buffer: jax.Array, after: jax.Array | None = None) -> jax.Array:
+        """See `Peers`."""
+        return self._exchange.mean(buffer, next(self._places), after)
+
+
+class PeersOfOne:
+    """`Peers` of a job with one trainer."""
+
+    def rank(self) -> jax.Array:
+        """See `Peers`."""
+        return jnp.zeros((), jnp.int32)
+
+    def gather(self, values: jax.Array, after: jax.Array | None = None) -> jax.Array:
+        """See `Peers`."""
+        del after
+        return values[None]
+
+    def mean(self, buffer: jax.Array, after: jax.Array | None = None) -> jax.Array:
+        """See `Peers`."""
+        del after
+        return buffer
+
+
+class ProgramStep:
+    """A step as one program of each rank: `TracedStep`.
+
+    A call returns when the device has been given all of it, and the call before is computed.
+
+    Args:
+      exchange: this rank's; None in a job with one rank.
+      links: of the exchange.
+      step: see `Step`.
+    """
+
+    def __init__(self, exchange: Exchange | None, links: Links | None, step: Step) -> None:
+        self._exchange, self._links = exchange, links
+        self._step = step
+        self._rank = jnp.asarray(0 if exchange is None else exchange.rank, jnp.int32)
+        self._program: Any = None
+        self._constants: Any = None
+        self._last: Any = None
+        self._metrics: Any = None
+        self.exchange_s: float | None = None
+
+    def trace(self, constants: Any, shared: Any, own: Any) -> None:
+        """See `TracedStep`."""
+
+        def whole(rank: jax.Array, constants: Any, shared: Any, own: Any) -> tuple[Any, Any, Any]:
+            peers = PeersOfOne() if self._exchange is None else ProgramPeers(self._exchange, rank)
+            return self._step(peers, constants, shared, own)
+
+        # Metrics lie where the host reads them at once: a copy from the device could only be made
+        # after the next step, which has been started by then.
+        host = host_sharding()
+        out_shardings = None if host is None else (None, None, host)
+        program = jax.jit(whole, donate_argnums=(2, 3), out_shardings=out_shardings)
+        self._constants = constants
+        self._program = program.lower(self._rank, constants, shared, own)
+
+    def compile(self) -> None:
+        """See `TracedStep`."""
+        self._program = self._program.compile()
+
+    def __call__(self, shared: Any, own: Any) -> tuple[Any, Any, Any]:
+        """See `TracedStep`."""
+        return self._run(lambda: self._start(shared, own), is_last=False)
+
+    def wait(self) -> None:
+        """See `TracedStep`."""
+        self._run(lambda: jax.block_until_ready(self._last), is_last=True)
+
+    def _start(self, shared: Any, own: Any) -> tuple[Any, Any, Any]:
+        self._last = None  # Donated.
+        self._last = self._program(self._rank, self._constants, shared, own)
+        if self._metrics is not None:
+            jax.block_until_ready(self._metrics)
+            if self._links is not None:
+                self.exchange_s = self._links.exchange_s()
+        self._metrics = self._last[2]
+        return self._last
+
+    def _run(self, program: Callable[[], T], *, is_last: bool) -> T:
+        return program() if self._links is None else self._links.run(program, is_last=is_last)

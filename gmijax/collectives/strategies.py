@@ -1,0 +1,161 @@
+"""The reduction strategies as stages, and what they should cost by the paper (section 4.1).
+
+Which of them a layout gets (Algorithm 1) and which it allows: `gmijax.partition.reduction`.
+No jax.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import Literal, NamedTuple, TypeAlias
+
+from gmijax.errors import ConfigError
+from gmijax.partition.layout import Layout
+from gmijax.partition.reduction import is_even, leaders
+
+Kind: TypeAlias = Literal["sum", "gather", "broadcast"]
+Link: TypeAlias = Literal["host", "slots", "ring"]
+"""Through shared memory of the host, memory of the GPUs that all map, or NCCL between GPUs."""
+
+
+Groups: TypeAlias = tuple[tuple[int, ...], ...]
+"""Ranks that exchange with each other; no rank is in two of them, some may be in none."""
+
+
+class Stage(NamedTuple):
+    """One part of a reduction.
+
+    Attributes:
+      kind: all members of a group get their sum, or what each of them has, which the program
+        sums in the order of the group, or what its first member has.
+      link: how the numbers move.
+      groups: ranks; those that are in none keep what they have.
+    """
+
+    kind: Kind
+    link: Link
+    groups: Groups
+
+
+def stages(strategy: str, layout: Layout, intra: str = "host") -> Sequence[Stage]:
+    """What ranks do one after the other to have the sum over all of them, by strategy.
+
+    - `mpr`, multi-process reduction: all through the host.
+    - `flat`: one ring over all, plain data parallelism.
+    - `mrr`, multi-ring reduction: one ring for every place on a GPU; then one member of each
+      ring, each on another GPU, in a last ring; then back to the members of its first ring.
+    - `har`, hierarchical reduction: inside every GPU, a ring between the GPUs, and back. Where
+      each GPU has as many GMIs and all of them have their GPU's sum, there is a ring for every
+      place, and no way back.
+    - `one_shot`: every rank writes to every GPU, and sums what is there. Not in the paper. What
+      travels is K - t buffers to each GPU, for a ring of K it would be two: it is made for
+      networks whose messages cost more than their bytes.
+
+    Args:
+      strategy: a key of `COSTS`.
+      layout: where the ranks live; the strategy must be allowed there.
+      intra: `host` or `ipc`, the link inside a GPU for `har`.
+    """
+    gpus, everyone = layout.gmis_of_gpu, (tuple(layout.gmis),)
+    if strategy == "mpr":
+        return [Stage("sum", "host", everyone)]
+    if strategy == "flat":
+        return [Stage("sum", "ring", everyone)]
+    if strategy == "one_shot":
+        return [Stage("gather", "slots", everyone)]
+    rings = tuple(zip(*gpus, strict=True)) if is_even(layout) else ()
+    if strategy == "mrr":
+        if len(rings) == 1:
+            return [Stage("sum", "ring", rings)]
+        # The ring of place k ends on GPU k: the ends are on different GPUs, as NCCL asks.
+        ends = tuple(ring[place] for place, ring in enumerate(rings))
+        back = tuple(_first(end, ring) for end, ring in zip(ends, rings, strict=True))
+        return [
+            Stage("sum", "ring", rings),
+            Stage("sum", "ring", (ends,)),
+            Stage("broadcast", "ring", back),
+        ]
+    link: Link = "slots" if intra == "ipc" else "host"
+    led = tuple(_first(leader, gpu) for leader, gpu in zip(leaders(layout), gpus, strict=True))
+    inside = Stage("gather" if link == "slots" else "sum", link, led)
+    if len(gpus) == 1:
+        return [inside]
+    if link == "slots" and rings:
+        # Not a sum of NCCL's: its order may differ from ring to ring.
+        return [inside, Stage("gather", "ring", rings)]
+    return [inside, Stage("sum", "ring", (leaders(layout),)), Stage("broadcast", link, led)]
+
+
+def _first(leader: int, group: Sequence[int]) -> tuple[int, ...]:
+    return (leader, *(rank for rank in group if rank != leader))
+
+
+BYTES_PER_FLOAT = 4
+
+
+def mpr_s(g: int, t: int, m_p: float, b1: float, b2: float) -> float:
+    """Seconds of multi-process reduction: 2 (g t - 1) M_p / (g t B1)."""
+    del b2
+    return 2 * (g * t - 1) * m_p / (g * t * b1)
+
+
+def mrr_s(g: int, t: int, m_p: float, b1: float, b2: float) -> float:
+    """Seconds of multi-ring reduction: 2 (g - 1) (t + 1) M_p / (g B2)."""
+    del b1
+    return 2 * (g - 1) * (t + 1) * m_p / (g * b2)
+
+
+def har_s(g: int, t: int, m_p: float, b1: float, b2: float) -> float:
+    """Seconds of hierarchical reduction: 2 (g - 1) M_p / (g B2) + 2 (t - 1) M_p / (t B1)."""
+    return 2 * (g - 1) * m_p / (g * b2) + 2 * (t - 1) * m_p / (t * b1)
+
+
+def flat_s(g: int, t: int, m_p: float, b1: float, b2: float) -> float:
+    """Seconds of one ring over all GMIs: 2 (g t - 1) M_p / (g t B2).
+
+    Not in the paper: its ring formula for g t members.
+    """
+    del b1
+    return 2 * (g * t - 1) * m_p / (g * t * b2)
+
+
+def one_shot_s(g: int, t: int, m_p: float, b1: float, b2: float) -> float:
+    """Seconds of writing to every GPU: (g - 1) t M_p / B2, what leaves a GPU.
+
+    Not in the paper. Memory of the own GPU is taken to cost nothing.
+    """
+    del b1
+    return (g - 1) * t * m_p / b2
+
+
+COSTS: Mapping[str, Callable[[int, int, float, float, float], float]] = {
+    "mpr": mpr_s,
+    "mrr": mrr_s,
+    "har": har_s,
+    "flat": flat_s,
+    "one_shot": one_shot_s,
+}
+"""Time of every strategy, as a function of (g, t, M_p, B1, B2)."""
+
+
+def predicted_s(strategy: str, layout: Layout, num_floats: int, b1: float, b2: float) -> float:
+    """Seconds that one mean of `num_floats` float32 should take.
+
+    In an uneven layout t is the number of GMIs on the fullest GPU: the others wait for it.
+
+    Args:
+      strategy: a key of `COSTS`.
+      layout: where the GMIs live.
+      num_floats: P.
+      b1: bytes a second between GMIs through host memory.
+      b2: bytes a second of a ring between GPUs.
+
+    Raises:
+      ConfigError: a bandwidth that is not positive, or another strategy.
+    """
+    if strategy not in COSTS:
+        raise ConfigError(f"strategy={strategy}: expected one of {', '.join(COSTS)}")
+    if b1 <= 0 or b2 <= 0:
+        raise ConfigError(f"b1={b1:g}, b2={b2:g}: bandwidths must be positive")
+    most = max(len(gmis) for gmis in layout.gmis_of_gpu)
+    return COSTS[strategy](layout.num_gpus, most, num_floats * BYTES_PER_FLOAT, b1, b2)

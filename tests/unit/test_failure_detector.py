@@ -1,0 +1,168 @@
+"""Who is named when a wait goes wrong: ranks as threads or as mere lines of the block."""
+
+from __future__ import annotations
+
+import os
+import threading
+import time
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+
+import pytest
+
+from gmijax.collectives.barrier import Barrier
+from gmijax.collectives.failure_detector import FailureDetector
+from gmijax.collectives.shared_block import SharedBlock, attach, create_exchange
+from gmijax.errors import CollectiveTimeout, CudaError, PeerLost
+
+NEVER = threading.Event()
+
+
+@pytest.fixture
+def blocks() -> Iterator[list[SharedBlock]]:
+    """The block as three ranks see it."""
+    fd = create_exchange()
+    yield [attach(fd, rank, 3, 10) for rank in range(3)]
+    os.close(fd)
+
+
+def barriers_of(blocks: list[SharedBlock], *timeouts_s: float) -> list[Barrier]:
+    """All three ranks, attached."""
+    return [Barrier(block, t, t) for block, t in zip(blocks, timeouts_s, strict=True)]
+
+
+def end(blocks: list[SharedBlock], rank: int, blamed: int | None = None) -> None:
+    """Makes `rank` look as if its process had ended, having given up for `blamed`."""
+    line = blocks[rank].lines[rank]
+    line["pid"], line["blamed"] = 0, 0 if blamed is None else blamed + 1
+
+
+def test_a_watch_ends_with_the_call(blocks: list[SharedBlock]) -> None:
+    barrier = barriers_of(blocks, 5, 5, 5)[0]
+    done = threading.Event()
+    threading.Timer(0.3, done.set).start()
+    started = time.monotonic()
+    barrier.watch(done)
+    assert 0.2 < time.monotonic() - started < 2.0
+
+
+def test_who_waits_too_is_not_named(blocks: list[SharedBlock]) -> None:
+    first, second, _ = barriers_of(blocks, 1.2, 3.0, 3.0)
+    with ThreadPoolExecutor(1) as pool:
+        other = pool.submit(second.watch, NEVER)
+        with pytest.raises(CollectiveTimeout, match=r"waited 1\.2 s .* for ranks \[2\]"):
+            first.watch(NEVER)
+        end(blocks, 0, blamed=2)
+        with pytest.raises(CollectiveTimeout, match=r"rank 1: .* for ranks \[2\]"):
+            other.result()
+
+
+def test_a_call_that_only_this_rank_does_not_finish_times_out(blocks: list[SharedBlock]) -> None:
+    first, *others = barriers_of(blocks, 0.3, 3.0, 3.0)
+    for other in others:
+        other._arrive()
+    with pytest.raises(CollectiveTimeout, match=r"for ranks \[1, 2\]"):
+        first.watch(NEVER)
+
+
+def test_the_dead_are_named_and_not_those_who_gave_up_for_them(
+    blocks: list[SharedBlock],
+) -> None:
+    first = barriers_of(blocks, 3.0, 3.0, 3.0)[0]
+    end(blocks, 1, blamed=2)
+    end(blocks, 2)
+    with pytest.raises(PeerLost) as lost:
+        first.watch(NEVER)
+    assert lost.value.peer == 2
+    assert blocks[0].lines["blamed"][0] == 3
+
+
+def test_one_that_gave_up_for_a_stuck_rank_points_at_it(blocks: list[SharedBlock]) -> None:
+    first = barriers_of(blocks, 3.0, 3.0, 3.0)[0]
+    end(blocks, 1, blamed=2)
+    with pytest.raises(CollectiveTimeout, match=r"for ranks \[2\]"):
+        first.watch(NEVER)
+
+
+def test_a_failed_transfer_is_blamed_on_the_dead(blocks: list[SharedBlock]) -> None:
+    first = barriers_of(blocks, 30, 30, 30)[0]
+    threading.Timer(0.4, end, (blocks, 1)).start()
+    with pytest.raises(PeerLost) as lost, first.explained():
+        raise RuntimeError("connection reset")
+    assert lost.value.peer == 1
+
+
+def test_the_watch_of_a_step_has_no_end_while_all_are_at_it(blocks: list[SharedBlock]) -> None:
+    everyone = barriers_of(blocks, 0.3, 0.3, 0.3)
+    done = threading.Event()
+    threading.Timer(1.5, done.set).start()
+    with ThreadPoolExecutor(3) as pool:
+        for waiting in [pool.submit(one.watch, done) for one in everyone]:
+            waiting.result()
+
+
+def test_the_watch_of_a_step_names_the_silent(blocks: list[SharedBlock]) -> None:
+    first, second, _ = barriers_of(blocks, 0.5, 30.0, 30.0)
+    done = threading.Event()
+    with ThreadPoolExecutor(1) as pool:
+        other = pool.submit(second.watch, done)
+        with pytest.raises(CollectiveTimeout, match=r"for ranks \[2\]"):
+            first.watch(NEVER)
+        done.set()
+        other.result()
+
+
+def test_the_watch_of_a_step_looks_at_those_who_have_arrived_after_it(
+    blocks: list[SharedBlock],
+) -> None:
+    first, *others = barriers_of(blocks, 0.3, 30.0, 30.0)
+    done = threading.Event()
+    with ThreadPoolExecutor(3) as pool:
+        meeting = [pool.submit(other.wait, is_patient=True) for other in others]
+        threading.Timer(1.5, done.set).start()
+        first.watch(done)  # They wait for this one, and are not late.
+        first.wait()
+        for other in meeting:
+            other.result()
+    others[0]._arrive()
+    end(blocks, 1)
+    with pytest.raises(PeerLost, match="peer 1 is gone"):
+        first.watch(NEVER)
+
+
+def test_an_error_of_ones_own_stays_what_it_is(
+    blocks: list[SharedBlock], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("gmijax.collectives.barrier.SETTLE_S", 0.1)
+    first, *_ = barriers_of(blocks, 5.0, 5.0, 5.0)
+    with pytest.raises(RuntimeError, match="out of memory"), first.explained():
+        raise RuntimeError("out of memory")
+    with pytest.raises(CudaError, match="cannot copy"), first.explained():
+        raise CudaError("cannot copy")
+
+
+def test_a_copy_that_cuda_refuses_is_blamed_on_the_dead(blocks: list[SharedBlock]) -> None:
+    first, second, _ = barriers_of(blocks, 5.0, 5.0, 5.0)
+    end(blocks, 2)
+    with pytest.raises(PeerLost) as lost, first.explained():
+        raise CudaError("cannot copy into shared GPU memory: cudaErrorMpsClientTerminated")
+    assert lost.value.peer == 2
+    end(blocks, 0, blamed=blocks[0].lines["blamed"][0] - 1)  # It ends for that reason.
+    with pytest.raises(PeerLost) as lost:
+        second.watch(NEVER)
+    assert lost.value.peer == 2
+
+
+def test_a_process_is_looked_at_after_its_counter(
+    blocks: list[SharedBlock], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """That there is a fence: what it does cannot be seen on x86, which keeps the order anyway."""
+    Barrier(blocks[1], 1.0, 1.0)
+    pid = int(blocks[1].lines["pid"][1])
+    blocks[1].lines["pid"][1] = 0  # As seen before the counter, by an early read.
+
+    def all_before_is_seen() -> None:
+        blocks[1].lines["pid"][1] = pid
+
+    monkeypatch.setattr("gmijax.collectives.failure_detector.fence", all_before_is_seen)
+    FailureDetector(blocks[0], "sum", 1, 1.0).look(lambda: [1], now=True)  # Nobody is gone.
