@@ -4,6 +4,7 @@
 `<run>/checkpoints/<12-digit env steps>/meta.json`
 `<run>/gmi_<id>/{stdout.log,stderr.log,error.json,result.json,metrics.jsonl}`
 `<run>/gmi_<id>/attempt_<n>/`: the same files of attempts that failed
+`<run>/play/<12-digit env steps>/`: a played checkpoint, see `PlayPaths`
 """
 
 from __future__ import annotations
@@ -15,7 +16,6 @@ import re
 import threading
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
 from typing import Any
@@ -30,120 +30,132 @@ STEP_DIGITS = 12
 META = "meta.json"
 """Written last into a checkpoint: a folder without it is not one."""
 
+EXIT_NO_GL = 3
+"""Exit code of the renderer where the OpenGL that it was told to use cannot be had."""
+
 _TEMPORARY = re.compile(r"\..+\.\d+-\d+")
 """Names that files have while they are written."""
 
 
-@dataclass(frozen=True)
-class GmiPaths:
-    """Files of one GMI."""
+class _Folder:
+    """A folder whose files have names here; equal to another one of the same path."""
 
-    root: Path
+    def __init__(self, root: Path) -> None:
+        self.root = root
 
-    @property
-    def stdout(self) -> Path:
-        """What the process prints."""
-        return self.root / "stdout.log"
+    def __eq__(self, other: object) -> bool:
+        return type(other) is type(self) and vars(other) == vars(self)
 
-    @property
-    def stderr(self) -> Path:
-        """What the process and its libraries complain about."""
-        return self.root / "stderr.log"
+    def __hash__(self) -> int:
+        return hash(self.root)
 
-    @property
-    def error(self) -> Path:
-        """Why the GMI failed: type, message, traceback."""
-        return self.root / "error.json"
-
-    @property
-    def result(self) -> Path:
-        """What the GMI's role returned."""
-        return self.root / "result.json"
-
-    @property
-    def role(self) -> Path:
-        """A role of the user's own and its arguments, pickled."""
-        return self.root / "role.pickle"
-
-    @property
-    def output(self) -> Path:
-        """What a role of the user's own returned, pickled."""
-        return self.root / "output.pickle"
-
-    @property
-    def metrics(self) -> Path:
-        """Lines of a GMI that reports for itself alone."""
-        return self.root / "metrics.jsonl"
+    def __repr__(self) -> str:
+        return f"{type(self).__name__}({str(self.root)!r})"
 
 
-@dataclass(frozen=True)
-class RunPaths:
-    """Files of one run."""
+class GmiPaths(_Folder):
+    """Files of one GMI.
 
-    root: Path
+    Attributes:
+      root: the folder.
+      stdout: what the process prints.
+      stderr: what the process and its libraries complain about.
+      error: why the GMI failed: type, message, traceback.
+      result: what the GMI's role returned.
+      role: a role of the user's own and its arguments, pickled.
+      output: what a role of the user's own returned, pickled.
+      metrics: lines of a GMI that reports for itself alone.
+    """
 
-    @property
-    def config(self) -> Path:
-        """The composed configuration."""
-        return self.root / "config.json"
+    def __init__(self, root: Path) -> None:
+        super().__init__(root)
+        self.stdout = root / "stdout.log"
+        self.stderr = root / "stderr.log"
+        self.error = root / "error.json"
+        self.result = root / "result.json"
+        self.role = root / "role.pickle"
+        self.output = root / "output.pickle"
+        self.metrics = root / "metrics.jsonl"
 
-    @property
-    def plan(self) -> Path:
-        """The partition."""
-        return self.root / "plan.json"
 
-    @property
-    def summary(self) -> Path:
-        """The outcome."""
-        return self.root / "summary.json"
+class RunPaths(_Folder):
+    """Files of one run.
 
-    @property
-    def metrics(self) -> Path:
-        """One JSON object a line and iteration."""
-        return self.root / "metrics.jsonl"
+    Attributes:
+      root: the folder.
+      config: the composed configuration.
+      plan: the partition.
+      summary: the outcome.
+      metrics: one JSON object a line and iteration.
+      tensorboard: folder of TensorBoard event files.
+      returns_png: picture of the return curve.
+      checkpoints: folder of checkpoints.
+      mps: folder of the logs of MPS daemons that the job starts.
+      janitor_log: errors of the process that cleans up after a killed controller; gone without
+        any.
+      lock: held by the job that writes into the folder.
+      events: starts, faults and restarts of the job, one JSON object a line.
+      search_report: all points of a search and the answer.
+      search_png: throughput and memory over environments.
+    """
 
-    @property
-    def tensorboard(self) -> Path:
-        """Folder of TensorBoard event files."""
-        return self.root / "tensorboard"
-
-    @property
-    def returns_png(self) -> Path:
-        """Picture of the return curve."""
-        return self.root / "returns.png"
-
-    @property
-    def checkpoints(self) -> Path:
-        """Folder of checkpoints."""
-        return self.root / "checkpoints"
-
-    @property
-    def mps(self) -> Path:
-        """Folder of the logs of MPS daemons that the job starts."""
-        return self.root / "mps"
-
-    @property
-    def janitor_log(self) -> Path:
-        """Errors of the process that cleans up after a killed controller; gone without any."""
-        return self.root / "janitor.log"
-
-    @property
-    def lock(self) -> Path:
-        """Held by the job that writes into the folder."""
-        return self.root / ".lock"
-
-    @property
-    def events(self) -> Path:
-        """Starts, faults and restarts of the job, one JSON object a line."""
-        return self.root / "events.jsonl"
+    def __init__(self, root: Path) -> None:
+        super().__init__(root)
+        self.config = root / "config.json"
+        self.plan = root / "plan.json"
+        self.summary = root / "summary.json"
+        self.metrics = root / "metrics.jsonl"
+        self.tensorboard = root / "tensorboard"
+        self.returns_png = root / "returns.png"
+        self.checkpoints = root / "checkpoints"
+        self.mps = root / "mps"
+        self.janitor_log = root / "janitor.log"
+        self.lock = root / ".lock"
+        self.events = root / "events.jsonl"
+        self.search_report = root / "search.json"
+        self.search_png = root / "search.png"
 
     def checkpoint(self, env_steps: int) -> Path:
         """The checkpoint after `env_steps` environment steps."""
         return self.checkpoints / f"{env_steps:0{STEP_DIGITS}d}"
 
+    def profile(self, name: str) -> RunPaths:
+        """The run folder of a profile of a search; it keeps no checkpoints."""
+        return RunPaths(self.root / "profiles" / name)
+
     def gmi(self, gmi: int) -> GmiPaths:
         """Files of one GMI."""
         return GmiPaths(self.root / f"gmi_{gmi}")
+
+
+class PlayPaths(_Folder):
+    """Files of one played checkpoint; its folder also has the files of a run with one GMI.
+
+    Attributes:
+      root: the folder.
+      returns: the return of every episode, and statistics over them.
+      trajectory: `qpos` [L + 1, E, nq] of the shown environments, `lengths` [E], `control_dt_s`.
+      model: the MuJoCo model of the trajectory, in MuJoCo's binary format.
+      mp4, gif: the film.
+      html: the first shown environment as a page that moves in 3D.
+      page_log, render_log: stderr of the processes that write page and film.
+    """
+
+    def __init__(self, root: Path) -> None:
+        super().__init__(root)
+        self.returns = root / "returns.json"
+        self.trajectory = root / "trajectory.npz"
+        self.model = root / "model.mjb"
+        self.mp4 = root / "video.mp4"
+        self.gif = root / "video.gif"
+        self.html = root / "view.html"
+        self.page_log = root / "page.log"
+        self.render_log = root / "render.log"
+
+    def results(self) -> tuple[Path, ...]:
+        """All files that a new evaluation replaces."""
+        watched = self.mp4, self.gif, self.html
+        return self.returns, self.trajectory, self.model, *watched, self.render_log, self.page_log
 
 
 def create_run(

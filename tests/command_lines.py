@@ -16,8 +16,9 @@ from typing import Any, NamedTuple
 import pytest
 
 from gmijax import cli
+from gmijax.autotune import tuner
 from gmijax.config import PlayConfig, ServeConfig, TrainConfig
-from gmijax.control import evaluation, job, searching, selection, serving
+from gmijax.control import decide, evaluation, searching, selection
 from gmijax.partition.machine import Machine
 
 COMMANDS: Mapping[str, type[Any]] = {
@@ -65,11 +66,11 @@ def _nothing_starts(machine: Machine, cwd: Path) -> Iterator[None]:
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(cwd)
         patch.setenv("XDG_CACHE_HOME", str(cwd / "cache"))
-        for module in (job, serving, searching, evaluation):
+        for module in (decide, searching, evaluation):
             patch.setattr(module, "detect_machine", lambda: machine)
         patch.setattr(Path, "mkdir", _mkdir)
         patch.setattr(tempfile, "mkstemp", _would_start)
-        patch.setattr(searching._Search, "result", _would_start)
+        patch.setattr(tuner.Search, "result", _would_start)
         patch.setattr(selection, "measure", _would_start)
         for owner, name in ((subprocess, "Popen"), (os, "fork"), (os, "posix_spawn")):
             patch.setattr(owner, name, _must_not_start)

@@ -10,7 +10,14 @@ from gmijax.config.a3c import A3cConfig
 from gmijax.config.actor_critic import ADAPTIVE_LEARNING_RATE_RANGE, ActorCriticConfig
 from gmijax.config.channel import ChannelConfig
 from gmijax.config.env import EnvConfig, PhysicsConfig
-from gmijax.config.plan import PlanConfig, Priority, ReduceConfig, TemplateName
+from gmijax.config.plan import (
+    BackendName,
+    PlanConfig,
+    Priority,
+    ReduceConfig,
+    StrategyName,
+    TemplateName,
+)
 from gmijax.config.play import PlayConfig, PlayRunConfig
 from gmijax.config.ppo import PpoConfig
 from gmijax.config.run import RunConfig
@@ -25,6 +32,7 @@ __all__ = [
     "A3cConfig",
     "ActorCriticConfig",
     "AlgoConfig",
+    "BackendName",
     "ChannelConfig",
     "EnvConfig",
     "OutputConfig",
@@ -39,6 +47,7 @@ __all__ = [
     "SearchConfig",
     "ServeConfig",
     "ServeRunConfig",
+    "StrategyName",
     "TemplateName",
     "TrainConfig",
 ]

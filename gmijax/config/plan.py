@@ -9,6 +9,8 @@ from typing import Literal
 from gmijax.errors import ConfigError
 from gmijax.schema import doc, require_at_least, require_between, require_positive
 
+BackendName = Literal["mps", "mig", "share", "cpu"]
+StrategyName = Literal["mpr", "mrr", "har", "flat", "one_shot"]
 TemplateName = Literal["tcg", "tdg", "tcg_ex", "tdg_ex", "decoupled"]
 Priority = Literal["normal", "below_normal"]
 
@@ -20,26 +22,31 @@ MAX_GMIS = 1024
 class PlanConfig:
     """How the job is spread over GPUs."""
 
-    gpus: int | tuple[int, ...] = doc("number of GPUs, or their indices as nvidia-smi lists them")
+    gpus: int | tuple[int, ...] = doc(
+        "number of GPUs, or their indices as nvidia-smi lists them", default=1
+    )
     gmis_per_gpu: int | Literal["auto"] = doc(
         "GMIs on every GPU (with algo=a3c 1, see serving_gmis_per_gpu and training_gmis_per_gpu); "
-        "auto: what a search finds (docs/search.md)"
+        "auto: what a search finds (docs/search.md)",
+        default=1,
     )
     layout: tuple[tuple[int, ...], ...] | None = doc(
-        "GMI ids of every GPU, e.g. [[0,1],[2]]; overrides gpus and gmis_per_gpu"
+        "GMI ids of every GPU, e.g. [[0,1],[2]]; overrides gpus and gmis_per_gpu", default=None
     )
-    backend: Literal["auto", "mps", "mig", "share", "cpu"] = doc(
-        "how a GMI gets its share of a GPU"
+    backend: Literal["auto", BackendName] = doc(
+        "how a GMI gets its share of a GPU", default="auto"
     )
     sm_percent: float | tuple[float, ...] | Literal["even"] | None = doc(
         "cap on a GMI's share of SMs in percent (MPS): one number, one per GMI, even (100 / GMIs "
-        "of the GPU, kept clear of docs/shares.md's bad values), or null: no cap"
+        "of the GPU, kept clear of docs/shares.md's bad values), or null: no cap",
+        default=None,
     )
     memory_fraction: float | tuple[float, ...] | None = doc(
         "fraction of a GPU's (or MIG instance's) memory that each GMI reserves: one number or one "
-        "per GMI; null: 0.8 split evenly"
+        "per GMI; null: 0.8 split evenly",
+        default=None,
     )
-    template: Literal["auto", TemplateName] = doc("how roles map to GMIs")
+    template: Literal["auto", TemplateName] = doc("how roles map to GMIs", default="auto")
     mps_priority: Literal["trainers_first"] | tuple[Priority, ...] | None = doc(
         "whose kernels go first where several wait for a GPU (MPS): trainers_first, or one of "
         "normal, below_normal for each GMI; null: all alike",
@@ -122,14 +129,15 @@ def _numbers(value: float | tuple[float, ...] | None) -> tuple[float, ...]:
 class ReduceConfig:
     """How gradients are averaged over GMIs."""
 
-    strategy: Literal["auto", "mpr", "mrr", "har", "flat", "one_shot"] = doc(
-        "reduction strategy; auto: by the layout, see selection"
+    strategy: Literal["auto", StrategyName] = doc(
+        "reduction strategy; auto: by the layout, see selection", default="auto"
     )
     intra: Literal["auto", "host", "ipc"] = doc(
         "exchange inside one GPU, for har: through host memory, or through GPU memory that GMIs "
-        "map (ipc); auto: ipc where it can be had; host leaves out one_shot"
+        "map (ipc); auto: ipc where it can be had; host leaves out one_shot",
+        default="auto",
     )
-    timeout_s: float = doc("longest wait for another GMI in one exchange, seconds")
+    timeout_s: float = doc("longest wait for another GMI in one exchange, seconds", default=120.0)
     selection: Literal["paper", "device", "measured"] = doc(
         "what strategy=auto goes by: the paper's Algorithm 1 (paper), the same but one_shot where "
         "several GMIs share a GPU and can map its memory (device), or the time that every "

@@ -55,6 +55,11 @@ class TrainConfig:
             self._check_num_envs(self.num_envs)
 
     @property
+    def is_asynchronous(self) -> bool:
+        """Whether some GMIs act and others train."""
+        return isinstance(self.algo, A3cConfig)
+
+    @property
     def envs_per_gmi(self) -> int:
         """`num_envs` as a number; the controller decides an `auto` before it starts a GMI."""
         if self.num_envs == "auto":

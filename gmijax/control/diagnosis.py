@@ -6,9 +6,9 @@ import sys
 import typing
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import Any, Final, NamedTuple
+from typing import Any, NamedTuple
 
-from gmijax.config import ReduceConfig
+from gmijax.config import BackendName, StrategyName
 from gmijax.control.fast_path import cuda_major, missing_pieces
 from gmijax.control.sight import REQUIRED, Sight, device_of
 from gmijax.errors import ConfigError
@@ -17,13 +17,10 @@ from gmijax.partition.layout import Layout
 from gmijax.partition.machine import Machine
 from gmijax.partition.mps_control import PIPE_VARIABLE
 from gmijax.partition.nvidia import Gpu
-from gmijax.partition.plan import BackendName
 from gmijax.partition.reduction import why_not_intra, why_not_strategy, why_not_under
 from gmijax.sim.impl import choose_impl
 from gmijax.sim.registry import SUITES, require_task, task_names
 from gmijax.version import __version__
-
-_BACKENDS: Final[tuple[BackendName, ...]] = ("mps", "mig", "share", "cpu")
 
 
 class Ability(NamedTuple):
@@ -94,16 +91,16 @@ def diagnose(sight: Sight) -> Diagnosis:
 def _abilities(sight: Sight) -> Iterator[Ability]:
     machine = sight.machine
     usable: list[BackendName] = []
-    for name in _BACKENDS:
+    for name in typing.get_args(BackendName):
         reason = why_not_backend(name, machine)
         if name == "mps" and reason is None:
             reason = sight.mps_error
         if reason is None:
             usable.append(name)
         yield Ability("backend", name, reason is None, reason or _about_backend(name, machine))
-    for name in _allowed("strategy"):
+    for name in typing.get_args(StrategyName):
         yield _reducer(name, len(machine.gpus) or 2, usable)
-    for name in _allowed("intra"):
+    for name in ("host", "ipc"):
         reasons = {backend: why_not_intra(name, backend) for backend in usable}
         fine = [backend for backend, reason in reasons.items() if reason is None]
         why = f"with {', '.join(fine)}" if fine else next(iter(reasons.values())) or ""
@@ -224,8 +221,3 @@ def _notes(sight: Sight) -> Iterator[str]:
 
 def _profiles(gpu: Gpu) -> str:
     return ", ".join(one.profile for one in gpu.instances)
-
-
-def _allowed(key: str) -> tuple[str, ...]:
-    names = typing.get_args(typing.get_type_hints(ReduceConfig)[key])
-    return tuple(name for name in names if name != "auto")

@@ -17,21 +17,19 @@ from rich.markup import escape
 from rich.table import Table
 
 from gmijax.config import PlanConfig, PlayConfig, ReduceConfig
-from gmijax.control.kinds import Plain
-from gmijax.control.launcher import Launch, run_gmis
-from gmijax.control.output import open_console
+from gmijax.control.console import open_console
 from gmijax.control.pictures import film, has_brax, write_page
 from gmijax.errors import ConfigError, GmijaxError
 from gmijax.partition.machine import Machine, detect_machine
-from gmijax.partition.plan import Plan
 from gmijax.partition.planner import make_plan
 from gmijax.partition.supervisor import Patience
-from gmijax.playdir import PlayPaths
 from gmijax.resume import CheckpointMeta, find_checkpoint, trained_config
-from gmijax.rundir import META, STEP_DIGITS, RunPaths, read_json, write_json
+from gmijax.rundir import META, STEP_DIGITS, PlayPaths, RunPaths, read_json, write_json
 from gmijax.schema import to_dict
 from gmijax.sim import source
 from gmijax.sim.registry import require_task
+from gmijax.supervise.kinds import JobKind
+from gmijax.supervise.launcher import Launch, run_gmis
 
 MEMORY_FRACTION: Final = 0.1
 """Most of a GPU's memory that playing takes: beside a training job that reserves 0.8."""
@@ -157,30 +155,17 @@ def _prepare(config: PlayConfig, env_steps: int) -> PlayPaths:
 
 
 def _launch(config: PlayConfig, paths: PlayPaths, machine: Machine) -> Launch:
+    one_gmi = PlanConfig(memory_fraction=MEMORY_FRACTION if machine.gpus else None)
     return Launch(
-        plan=_light_plan(config.num_envs, machine),
+        plan=make_plan(one_gmi, ReduceConfig(), config.num_envs, machine),
         machine=machine,
         run=RunPaths(paths.root),
-        kind=Plain("gmijax.workers.playback"),
+        kind=JobKind("gmijax.workers.playback"),
         patience=_PATIENCE,
         stops_gracefully=False,
         # The GPU may be training: take what is needed when it is needed, up to the fraction.
         variables={"XLA_PYTHON_CLIENT_PREALLOCATE": "false"},
     )
-
-
-def _light_plan(num_envs: int, machine: Machine) -> Plan:
-    one = PlanConfig(
-        gpus=1,
-        gmis_per_gpu=1,
-        layout=None,
-        backend="auto",
-        sm_percent=None,
-        memory_fraction=MEMORY_FRACTION if machine.gpus else None,
-        template="auto",
-    )
-    nobody = ReduceConfig(strategy="auto", intra="auto", timeout_s=1.0)
-    return make_plan(one, nobody, num_envs, machine)
 
 
 def _accept_nothing_to_see(config: PlayConfig, env: str, console: Console) -> None:

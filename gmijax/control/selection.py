@@ -17,10 +17,9 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from gmijax.cachedir import cache_folder
 from gmijax.collectives.cost_model import COSTS
 from gmijax.collectives.memory import create_exchange
-from gmijax.control.kinds import Plain
-from gmijax.control.launcher import Launch, compilation_cache_dir, run_gmis
 from gmijax.partition.layout import Layout
 from gmijax.partition.machine import Machine
 from gmijax.partition.plan import Plan
@@ -34,6 +33,8 @@ from gmijax.partition.reduction import (
 from gmijax.partition.supervisor import Patience
 from gmijax.partition.templates import TRAINER, has_role
 from gmijax.rundir import RunPaths, read_json, write_json
+from gmijax.supervise.kinds import JobKind
+from gmijax.supervise.launcher import Launch, run_gmis
 from gmijax.version import versions_of
 
 CHAIN = 8
@@ -88,9 +89,7 @@ def with_measured(
     if plan.strategy == "none" or not all(has_role(roles, TRAINER) for roles in plan.roles):
         return plan
     probes = candidates(plan, num_floats, intra)
-    kept = (folder or compilation_cache_dir().parent / "reduction") / _file_name(
-        plan, machine, probes
-    )
+    kept = (folder or cache_folder() / "reduction") / _file_name(plan, machine, probes)
     found, source = _kept(kept, probes), f"from {kept}"
     if not found:
         rows = measure(plan, machine, probes, CALLS)
@@ -171,6 +170,7 @@ def measure(
     # The GMIs meet for rings if one of the probes has some.
     rings = any(needs_ring(probe.strategy, plan.layout) for probe in probes)
     plan = dataclasses.replace(plan, strategy="har" if rings else "mpr", intra="host")
+    numbers = range(len(probes))
     with tempfile.TemporaryDirectory(prefix="gmijax-") as scratch:
         run = RunPaths(Path(scratch))
         write_json(run.plan, plan.to_dict())
@@ -180,10 +180,10 @@ def measure(
                 plan=plan,
                 machine=machine,
                 run=run,
-                kind=Plain(
+                kind=JobKind(
                     "gmijax.workers.reduction_probe",
                     compile_once=False,
-                    blocks={block_variable(k): create_exchange for k in range(len(probes))},
+                    shared=lambda _: {block_variable(k): create_exchange for k in numbers},
                 ),
                 patience=PATIENCE,
             )

@@ -127,19 +127,10 @@ def try_mps(machine: Machine) -> str | None:
     whole = [gpu for gpu in machine.gpus if device_of(gpu) and not gpu.mig_enabled]
     if machine.mps_control is None or machine.operator_daemon is not None or not whole:
         return None
-    config = PlanConfig(
-        gpus=(whole[0].index,),
-        gmis_per_gpu=1,
-        layout=None,
-        backend="mps",
-        sm_percent=None,
-        memory_fraction=None,
-        template="auto",
-    )
-    reduce = ReduceConfig(strategy="auto", intra="auto", timeout_s=1.0)
+    config = PlanConfig(gpus=(whole[0].index,), backend="mps")
     with tempfile.TemporaryDirectory() as scratch:
         try:
-            plan = make_plan(config, reduce, 1, machine)
+            plan = make_plan(config, ReduceConfig(), 1, machine)
             with MpsBackend(plan, machine, RunPaths(Path(scratch))):
                 return None
         except GmijaxError as error:

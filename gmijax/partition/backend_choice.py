@@ -9,12 +9,11 @@ from __future__ import annotations
 from collections.abc import Collection
 from typing import Final, Literal, TypeAlias
 
-from gmijax.config import PlanConfig
+from gmijax.config import BackendName, PlanConfig
 from gmijax.errors import BackendUnavailable, ConfigError
 from gmijax.partition.layout import Layout
 from gmijax.partition.machine import Machine
 from gmijax.partition.nvidia import Gpu
-from gmijax.partition.plan import BackendName
 
 Purpose: TypeAlias = Literal["train", "serve"]
 

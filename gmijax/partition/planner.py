@@ -8,7 +8,7 @@ from collections import Counter
 from collections.abc import Sequence
 from itertools import pairwise
 
-from gmijax.config import PlanConfig, ReduceConfig, TemplateName
+from gmijax.config import BackendName, PlanConfig, ReduceConfig, TemplateName
 from gmijax.errors import ConfigError
 from gmijax.partition.backend_choice import (
     Purpose,
@@ -20,7 +20,7 @@ from gmijax.partition.host_limits import require_room
 from gmijax.partition.layout import Layout
 from gmijax.partition.machine import Machine
 from gmijax.partition.nvidia import Gpu
-from gmijax.partition.plan import BackendName, Plan, Slice
+from gmijax.partition.plan import Plan, Slice
 from gmijax.partition.reduction import (
     is_one_per_gpu,
     needs_ring,

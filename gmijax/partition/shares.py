@@ -9,11 +9,11 @@ from collections import Counter
 from collections.abc import Collection, Sequence
 from typing import Final
 
-from gmijax.config import PlanConfig, Priority
+from gmijax.config import BackendName, PlanConfig, Priority
 from gmijax.errors import ConfigError
 from gmijax.partition.layout import Layout
 from gmijax.partition.nvidia import Gpu, MigInstance
-from gmijax.partition.plan import BackendName, Slice
+from gmijax.partition.plan import Slice
 
 DEFAULT_MEMORY_FRACTION: Final = 0.8
 """Part of a GPU's (or MIG instance's) memory that its GMIs reserve together."""

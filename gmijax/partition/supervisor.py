@@ -13,7 +13,7 @@ from contextlib import suppress
 from dataclasses import dataclass, field
 
 from gmijax.errors import GmiFailed, JobInterrupted
-from gmijax.partition.backends.interface import Backend
+from gmijax.partition.backends.backend import Backend
 from gmijax.partition.failures import Failure, describe_exit, first_cause
 from gmijax.partition.gmi_process import GmiProcess, GmiStatus
 from gmijax.rundir import RunPaths

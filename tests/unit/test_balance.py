@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import pytest
 
-from gmijax.partition.balance import Split, balance, per_gpu, throughput
+from gmijax.autotune.async_workload import balance, per_gpu, throughput
+from gmijax.autotune.workloads import Split
 
 
 @pytest.mark.parametrize(

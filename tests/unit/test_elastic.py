@@ -6,9 +6,9 @@ import pytest
 from supervision import gpu, machine
 
 from gmijax.cli import compose
-from gmijax.control.elastic import with_gpus_left
-from gmijax.control.kinds import training_plan
+from gmijax.control.restarts import with_gpus_left
 from gmijax.errors import ConfigError
+from gmijax.supervise.kinds import training_plan
 
 FOUR = machine(4)
 LEFT = machine(0, gpus=(gpu(0), gpu(2), gpu(3)), driver_version="580.159.03")

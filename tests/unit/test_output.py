@@ -10,13 +10,11 @@ from pathlib import Path
 import pytest
 from supervision import CHECKOUT
 
-from gmijax.control.output import open_console
-from gmijax.control.program_cache import drop_broken_programs
-from gmijax.control.progress import ConsoleProgress
+from gmijax.cachedir import drop_broken_programs
+from gmijax.control.console import ConsoleProgress, open_console
 from gmijax.partition.gmi_process import GmiStatus
 
 PRINTS = """
-from gmijax.control.output import open_console
 console = open_console(show=True)
 for number in range(200_000):
     console.print(f"line {number}")
@@ -46,11 +44,10 @@ def test_names_in_brackets_are_printed_as_they_are(capsys: pytest.CaptureFixture
 
 
 def test_a_display_that_fails_is_given_up(capsys: pytest.CaptureFixture[str]):
-    class Broken:
-        def latest(self) -> None:
-            raise RuntimeError("off")
+    def broken() -> None:
+        raise RuntimeError("off")
 
-    progress = ConsoleProgress(open_console(show=True), Broken(), 100)
+    progress = ConsoleProgress(open_console(show=True), broken, 100)
     for _ in range(2):
         progress.update((GmiStatus(0, "running", 1, 1, None),))
     assert capsys.readouterr().out == "no progress from here on: RuntimeError('off')\n"

@@ -6,11 +6,11 @@ import pytest
 from supervision import machine, plan_config, reduce_config
 
 from gmijax import compose
-from gmijax.control.decoupled import plan_decoupled
 from gmijax.errors import ConfigError
 from gmijax.partition import reduction
 from gmijax.partition.placement import place
 from gmijax.partition.planner import make_plan
+from gmijax.supervise.kinds import training_plan
 
 
 def planned(**changes):
@@ -83,7 +83,7 @@ def test_jobs_are_told_that_experience_could_stay_on_the_gpu(
 ) -> None:
     monkeypatch.setattr(reduction, "_is_installed", lambda *_: True)
     config = compose("env=ant", "algo=a3c", "plan.backend=share", *overrides)
-    plan = plan_decoupled(config, 8, machine(2))
+    plan = training_plan(config, machine(2))
     assert any("channel.transport=device keeps" in why for why in plan.reasons) == is_told
 
 
@@ -94,4 +94,4 @@ def test_experience_cannot_stay_on_a_gpu_where_nobody_trains(
     apart = ("plan.serving_gpus=1", "plan.training_gpus=1", "channel.transport=device")
     config = compose("env=ant", "algo=a3c", "plan.backend=share", *apart)
     with pytest.raises(ConfigError, match="agent 1 is on GPU 0 of the job, where nobody trains"):
-        plan_decoupled(config, 8, machine(2))
+        training_plan(config, machine(2))

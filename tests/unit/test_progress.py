@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 from rich.console import Console
 
-from gmijax.control.progress import ConsoleProgress
+from gmijax.control.console import ConsoleProgress
 
 SYNC = {"env_steps": 500, "env_steps_per_s": 1234.5, "return": 7.25}
 EXPERIENCE = {
@@ -30,7 +30,7 @@ class Lines:
 
 def said_at_the_end(line: dict[str, Any]) -> str:
     console = Console(file=io.StringIO(), width=300)
-    with ConsoleProgress(console, Lines(line), 1000) as progress:
+    with ConsoleProgress(console, Lines(line).latest, 1000) as progress:
         progress.update(())
     assert isinstance(console.file, io.StringIO)
     return console.file.getvalue().splitlines()[-1]

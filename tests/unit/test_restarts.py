@@ -11,11 +11,11 @@ from typing import Any
 import pytest
 
 from gmijax.control import restarts
-from gmijax.control.launcher import StopSignals
 from gmijax.control.restarts import Attempts, clear_unfinished, keep_logs, why_not_again
 from gmijax.errors import BackendUnavailable, ConfigError, GmiFailed, ReportedError
 from gmijax.resume import CheckpointMeta
 from gmijax.rundir import META, RunPaths, read_json, write_json
+from gmijax.supervise.launcher import StopSignals
 
 TRACE = 'Traceback:\n  File "task.py", line {line}, in step\n    x\nValueError: at 0x{address}\n'
 
@@ -236,7 +236,7 @@ def test_what_came_after_the_checkpoint_is_dropped(run: RunPaths):
 
 def test_only_the_same_signal_a_second_later_is_impatience(monkeypatch: pytest.MonkeyPatch):
     now_s = [100.0]
-    monkeypatch.setattr("gmijax.control.launcher.time.monotonic", lambda: now_s[0])
+    monkeypatch.setattr("gmijax.supervise.launcher.time.monotonic", lambda: now_s[0])
     asked: list[float] = []
     signals = StopSignals()
     signals.handle(signal.SIGUSR1)

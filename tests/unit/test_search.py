@@ -7,9 +7,8 @@ from collections.abc import Callable
 
 import pytest
 
-from gmijax.partition.grid import Grid, coarse, neighbours
-from gmijax.partition.points import Measured, NotRunnable, Point
-from gmijax.partition.search import (
+from gmijax.autotune.grid import Grid, Measured, NotRunnable, Point, coarse, neighbours
+from gmijax.autotune.search import (
     Outcome,
     OutOfBudget,
     Profile,

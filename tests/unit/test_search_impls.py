@@ -7,8 +7,8 @@ import json
 from test_search import COARSE, PAPER, gpu, measured
 
 from benchmarks.run import RESULTS
-from gmijax.partition.points import Measured, Point
-from gmijax.partition.search import search
+from gmijax.autotune.grid import Measured, Point
+from gmijax.autotune.search import search
 
 
 def test_the_faster_implementation_is_part_of_the_answer():

@@ -6,14 +6,13 @@ from collections.abc import Mapping, Sequence
 from itertools import pairwise
 from typing import Any, Final
 
+from gmijax.autotune.grid import Measured
 from gmijax.config import A3cConfig, TrainConfig
-from gmijax.control.decoupled import groups_of
-from gmijax.control.workload import peak_memory_mib
 from gmijax.partition.gmi_process import GmiStatus
 from gmijax.partition.plan import Plan
-from gmijax.partition.points import Measured
 from gmijax.results import read_metrics
-from gmijax.rundir import RunPaths, read_json
+from gmijax.rundir import RunPaths
+from gmijax.supervise.kinds import groups_of
 
 FEWEST_LINES: Final = 3
 """Lines of metrics that a profile goes by, each of half a second or of one batch."""
@@ -112,12 +111,14 @@ def measured_of(lines: Sequence[Line], num_agents: int, memory_mib: float) -> Me
     )
 
 
-def read(iterations: int, plan: Plan, run: RunPaths) -> Measured:
-    """What one GMI did, from the run folder of a profile."""
+def read(run: RunPaths, iterations: int, num_agents: int, memory_mib: float) -> Measured:
+    """What was measured of one GMI, from the run folder of a profile.
+
+    Raises:
+      ValueError: too few lines of metrics.
+    """
     lines = read_metrics(run.metrics)[:-1]  # The last may hold the end of the job.
     start = window_start(lines, iterations)
     if start is None:
         raise ValueError(f"{len(lines)} lines of metrics are too few")
-    results = [read_json(run.gmi(gmi).result) for gmi in plan.layout.gmis]
-    memory_mib = max(peak_memory_mib(one["device"]) for one in results if "device" in one)
-    return measured_of(lines[start - 1 :], len(groups_of(plan)[0].gmis), memory_mib)
+    return measured_of(lines[start - 1 :], num_agents, memory_mib)

@@ -18,9 +18,9 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
+from gmijax.autotune.grid import Measured, NotRunnable, Point
 from gmijax.cachedir import cache_folder
 from gmijax.errors import ConfigError
-from gmijax.partition.points import Measured, NotRunnable, Point
 from gmijax.rundir import read_json, write_json
 from gmijax.schema import from_dict, require_positive
 
@@ -55,14 +55,7 @@ class _Record:
     def result(self) -> Measured | NotRunnable:
         if self.not_runnable is not None:
             return NotRunnable(self.not_runnable, self.limit_s)
-        return Measured(
-            self.env_steps_per_s or 0.0,
-            self.memory_mib or 0.0,
-            self.iteration_s or 0.0,
-            self.reduce_s or 0.0,
-            self.acting_per_s or 0.0,
-            self.learning_per_s or 0.0,
-        )
+        return Measured(*(getattr(self, name) or 0.0 for name in Measured._fields))
 
 
 class ProfileStore:
@@ -161,8 +154,7 @@ def _moved_aside(path: Path) -> Path:
 
 
 def _name(mode: str, point: Point) -> str:
-    gmis = point.gmis.replace(" ", "")
-    return f"{mode} {gmis}x{point.num_envs} {point.impl}"
+    return f"{mode} {point.gmis_key}x{point.num_envs} {point.impl}"
 
 
 def _slug(text: object) -> str:

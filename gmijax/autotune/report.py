@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -14,37 +13,14 @@ from rich.markup import escape
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
-from gmijax.partition.balance import Split
+from gmijax.autotune.grid import Grid, Measured, NotRunnable, Point
+from gmijax.autotune.search import Outcome, Visited
+from gmijax.autotune.workloads import Split
 from gmijax.partition.gmi_process import GmiStatus
-from gmijax.partition.grid import Grid
-from gmijax.partition.points import Measured, NotRunnable, Point
-from gmijax.partition.search import Outcome, Visited
 
 Results = Mapping[Point, Measured | NotRunnable]
 
 _LONGEST_REASON = 90
-
-
-@dataclass(frozen=True)
-class SearchPaths:
-    """Files of a search, beside its `config.json`."""
-
-    root: Path
-
-    @property
-    def report(self) -> Path:
-        """All points and the answer."""
-        return self.root / "search.json"
-
-    @property
-    def picture(self) -> Path:
-        """Throughput and memory over environments."""
-        return self.root / "search.png"
-
-    @property
-    def profiles(self) -> Path:
-        """Run folders of the profiles, without their checkpoints."""
-        return self.root / "profiles"
 
 
 class SearchDisplay:
