@@ -82,7 +82,7 @@ def compose(*overrides: str, command: str = "train", env: Callable[..., Any] | N
     return _build(command, _COMPOSED[command], (*chosen, *overrides))
 
 
-def command(name: str, cls: type[C], run: Callable[[C], int], argv: Sequence[str]) -> int:
+def command(name: str, cls: type[C], run: Callable[..., object], argv: Sequence[str]) -> int:
     """Runs one of the commands and turns every error into its exit code."""
     try:
         if "--help" in argv or "-h" in argv:
@@ -93,7 +93,8 @@ def command(name: str, cls: type[C], run: Callable[[C], int], argv: Sequence[str
         if show:
             sys.stdout.write(OmegaConf.to_yaml(OmegaConf.create(to_dict(config))))
             return EXIT_OK
-        return run(config)
+        run(config, show=True)
+        return EXIT_OK
     except ConfigError as error:
         _complain(name, error)
         return EXIT_BAD_INPUT

@@ -54,64 +54,35 @@ class _Folder:
 
 
 class GmiPaths(_Folder):
-    """Files of one GMI.
-
-    Attributes:
-      root: the folder.
-      stdout: what the process prints.
-      stderr: what the process and its libraries complain about.
-      error: why the GMI failed: type, message, traceback.
-      result: what the GMI's role returned.
-      role: a role of the user's own and its arguments, pickled.
-      output: what a role of the user's own returned, pickled.
-      metrics: lines of a GMI that reports for itself alone.
-    """
+    """Files of one GMI."""
 
     def __init__(self, root: Path) -> None:
         super().__init__(root)
         self.stdout = root / "stdout.log"
         self.stderr = root / "stderr.log"
-        self.error = root / "error.json"
-        self.result = root / "result.json"
-        self.role = root / "role.pickle"
-        self.output = root / "output.pickle"
-        self.metrics = root / "metrics.jsonl"
+        self.error = root / "error.json"  # Why it failed: type, message, traceback.
+        self.result = root / "result.json"  # What its main returned.
+        self.role = root / "role.pickle"  # A role of the user's own and its arguments.
+        self.output = root / "output.pickle"  # What that returned.
+        self.metrics = root / "metrics.jsonl"  # Of a GMI that reports for itself alone.
 
 
 class RunPaths(_Folder):
-    """Files of one run.
-
-    Attributes:
-      root: the folder.
-      config: the composed configuration.
-      plan: the partition.
-      summary: the outcome.
-      metrics: one JSON object a line and iteration.
-      tensorboard: folder of TensorBoard event files.
-      returns_png: picture of the return curve.
-      checkpoints: folder of checkpoints.
-      mps: folder of the logs of MPS daemons that the job starts.
-      janitor_log: errors of the process that cleans up after a killed controller; gone without
-        any.
-      lock: held by the job that writes into the folder.
-      events: starts, faults and restarts of the job, one JSON object a line.
-      search_report: all points of a search and the answer.
-      search_png: throughput and memory over environments.
-    """
+    """Files of one run."""
 
     def __init__(self, root: Path) -> None:
         super().__init__(root)
         self.config = root / "config.json"
         self.plan = root / "plan.json"
         self.summary = root / "summary.json"
-        self.metrics = root / "metrics.jsonl"
+        self.metrics = root / "metrics.jsonl"  # One JSON object a line and iteration.
         self.tensorboard = root / "tensorboard"
         self.returns_png = root / "returns.png"
         self.checkpoints = root / "checkpoints"
-        self.mps = root / "mps"
-        self.janitor_log = root / "janitor.log"
-        self.lock = root / ".lock"
-        self.events = root / "events.jsonl"
+        self.mps = root / "mps"  # Logs of MPS daemons that the job starts.
+        self.janitor_log = root / "janitor.log"  # Errors of the janitor; gone without any.
+        self.lock = root / ".lock"  # Held by the job that writes into the folder.
+        self.events = root / "events.jsonl"  # Starts, faults and restarts of the job.
         self.search_report = root / "search.json"
         self.search_png = root / "search.png"
 
@@ -129,23 +100,14 @@ class RunPaths(_Folder):
 
 
 class PlayPaths(_Folder):
-    """Files of one played checkpoint; its folder also has the files of a run with one GMI.
-
-    Attributes:
-      root: the folder.
-      returns: the return of every episode, and statistics over them.
-      trajectory: `qpos` [L + 1, E, nq] of the shown environments, `lengths` [E], `control_dt_s`.
-      model: the MuJoCo model of the trajectory, in MuJoCo's binary format.
-      mp4, gif: the film.
-      html: the first shown environment as a page that moves in 3D.
-      page_log, render_log: stderr of the processes that write page and film.
-    """
+    """Files of one played checkpoint; its folder also has the files of a run with one GMI."""
 
     def __init__(self, root: Path) -> None:
         super().__init__(root)
-        self.returns = root / "returns.json"
+        self.returns = root / "returns.json"  # Of every episode, and statistics over them.
+        # `qpos` [L + 1, E, nq] of the shown environments, `lengths` [E], `control_dt_s`.
         self.trajectory = root / "trajectory.npz"
-        self.model = root / "model.mjb"
+        self.model = root / "model.mjb"  # Of the trajectory, in MuJoCo's binary format.
         self.mp4 = root / "video.mp4"
         self.gif = root / "video.gif"
         self.html = root / "view.html"
@@ -202,10 +164,6 @@ def require_new_run(run_dir: str | None, name: str | None) -> None:
 @contextmanager
 def locked(lock: Path, what: str) -> Iterator[None]:
     """Holds a folder by a file in it, so that two jobs cannot write into it at once.
-
-    Args:
-      lock: the file; it stays.
-      what: the key and its value, for messages.
 
     Raises:
       ConfigError: another job holds it, or it cannot be locked.
@@ -274,10 +232,6 @@ def add_event(path: Path, event: str, **details: Any) -> None:
 
 def last_run(key: str, runs: Path = RUNS) -> Path:
     """The run folder below `runs` with the newest checkpoint.
-
-    Args:
-      key: the configuration key that asks for it, for the message.
-      runs: where to look.
 
     Raises:
       ConfigError: there is none.

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import errno
-import importlib
 import io
 import os
 import subprocess
@@ -18,7 +17,7 @@ import pytest
 from gmijax import cli
 from gmijax.autotune import tuner
 from gmijax.config import PlayConfig, ServeConfig, TrainConfig
-from gmijax.control import decide, evaluation, searching, selection
+from gmijax.control import decide, evaluation, job, searching, selection, serving
 from gmijax.partition.machine import Machine
 
 COMMANDS: Mapping[str, type[Any]] = {
@@ -28,6 +27,14 @@ COMMANDS: Mapping[str, type[Any]] = {
     "play": PlayConfig,
 }
 """The commands with their configurations."""
+
+BODIES: Mapping[str, Any] = {
+    "train": job.train,
+    "serve": serving.serve,
+    "search": searching.search,
+    "play": evaluation.play,
+}
+"""What they run."""
 
 CPU = Machine(gpus=(), cpu_cores=(0, 1, 2, 3))
 """A machine without a GPU."""
@@ -52,10 +59,9 @@ def run(command: str, *argv: str, cwd: Path, machine: Machine = CPU) -> Done:
     a process, so that is where. A process that is started all the same is an error.
     """
     out, err = _stream("strict"), _stream("backslashreplace")
-    body = importlib.import_module(f"gmijax.{command}")._run
     with _nothing_starts(machine, cwd), redirect_stdout(out), redirect_stderr(err):
         try:
-            code = cli.command(command, COMMANDS[command], body, argv)
+            code = cli.command(command, COMMANDS[command], BODIES[command], argv)
         except WouldStart:
             code = None
     return Done(code, _text(out), _text(err))

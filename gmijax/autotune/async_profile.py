@@ -28,11 +28,6 @@ class Enough:
 
     Agents compile for different times, and until the channels are full they never wait: nothing
     that is counted before tells of a long job.
-
-    Args:
-      config: of the job.
-      plan: of the profile.
-      run: its folder.
     """
 
     def __init__(self, config: TrainConfig, plan: Plan, run: RunPaths) -> None:
@@ -65,10 +60,6 @@ def window_start(lines: Sequence[Line], iterations: int) -> int | None:
 
     The line before it is needed too, because lines tell when they end. Something was made in
     them: where an unroll is many batches, agents can be silent for many lines.
-
-    Args:
-      lines: of `metrics.jsonl`.
-      iterations: batches that they are to have at least.
     """
     batches = made = 0.0
     for start in range(len(lines) - 1, 0, -1):

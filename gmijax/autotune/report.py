@@ -63,14 +63,7 @@ class SearchDisplay:
 
 
 def verdict(outcome: Outcome, grid: Grid, num_gpus: int, split: Split | None = None) -> str:
-    """The answer and what it is worth, in words; only for an outcome with a best point.
-
-    Args:
-      outcome: of the search.
-      grid: in which it searched.
-      num_gpus: of the whole job.
-      split: how many of them act and train, where none does both.
-    """
+    """The answer and what it is worth, in words; only for an outcome with a best point."""
     if outcome.best is None:
         raise ValueError("an outcome without a best point")
     top = outcome.best

@@ -5,11 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal, TypeAlias
 
-from gmijax.config.a3c import A3cConfig
+from gmijax.config.algo import A3cConfig, PpoConfig
 from gmijax.config.channel import ChannelConfig
 from gmijax.config.env import EnvConfig, PhysicsConfig
 from gmijax.config.plan import PlanConfig, ReduceConfig
-from gmijax.config.ppo import PpoConfig
 from gmijax.config.run import RunConfig
 from gmijax.config.search import SearchConfig
 from gmijax.errors import ConfigError

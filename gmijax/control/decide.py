@@ -50,10 +50,6 @@ def with_task(config: C) -> C:
 def decide(config: C, console: Console) -> Decided[C]:
     """Numbers of GMIs and environments, plan, reduction and physics of a job, in this order.
 
-    Args:
-      config: of the job, `with_task`.
-      console: takes the progress of a search.
-
     Raises:
       ConfigError, GmijaxError, JobInterrupted: as `with_auto_decided` and `make_plan`.
     """

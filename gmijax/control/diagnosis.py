@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
+import re
 import sys
 import typing
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from types import MappingProxyType
+from typing import Any, Final, NamedTuple
 
 from gmijax.config import BackendName, StrategyName
-from gmijax.control.fast_path import cuda_major, missing_pieces
 from gmijax.control.sight import REQUIRED, Sight, device_of
 from gmijax.errors import ConfigError
 from gmijax.partition.backend_choice import why_not_backend
@@ -17,10 +18,40 @@ from gmijax.partition.layout import Layout
 from gmijax.partition.machine import Machine
 from gmijax.partition.mps_control import PIPE_VARIABLE
 from gmijax.partition.nvidia import Gpu
-from gmijax.partition.reduction import why_not_intra, why_not_strategy, why_not_under
-from gmijax.sim.impl import choose_impl
+from gmijax.partition.reduction import (
+    LEAST_BINDINGS,
+    why_not_intra,
+    why_not_strategy,
+    why_not_under,
+)
+from gmijax.sim.impl import ON_GPU, choose_impl
 from gmijax.sim.registry import SUITES, require_task, task_names
 from gmijax.version import __version__
+
+_CUDA_13_DRIVER: Final = 580
+"""CUDA 13 needs a driver of this branch."""
+
+
+class Range(NamedTuple):
+    """Versions from `least` on, and before `below` if that is given."""
+
+    least: tuple[int, ...]
+    below: tuple[int, ...] | None = None
+
+    def __str__(self) -> str:
+        upper = f",<{_text(self.below)}" if self.below else ""
+        return f">={_text(self.least)}{upper}"
+
+    def has(self, version: str) -> bool:
+        """Whether `version` is in it."""
+        numbers = _numbers(version)
+        return numbers >= self.least and (self.below is None or numbers < self.below)
+
+
+BINDINGS: Final[Mapping[int, Range]] = MappingProxyType(
+    {12: Range(LEAST_BINDINGS, (13,)), 13: Range((13,))}
+)
+"""Which cuda-bindings the extras `cuda12` and `cuda13` bring: earlier ones hold the GIL."""
 
 
 class Ability(NamedTuple):
@@ -190,7 +221,7 @@ def _jax_problems(sight: Sight) -> Iterator[str]:
 def _cuda_advice(sight: Sight) -> str:
     if any(sight.versions[f"jax-cuda{cuda}-plugin"] for cuda in (12, 13)):
         return ""
-    return f" (pip install 'gmijax[cuda{cuda_major(sight)}]')"
+    return f" (pip install 'gmijax[cuda{_cuda_major(sight)}]')"
 
 
 def _notes(sight: Sight) -> Iterator[str]:
@@ -205,7 +236,7 @@ def _notes(sight: Sight) -> Iterator[str]:
             f"{PIPE_VARIABLE}={variables[PIPE_VARIABLE]}: no daemon answers there; jobs start "
             "their own"
         )
-    yield from missing_pieces(sight)
+    yield from _missing_pieces(sight)
     mujoco, mjx = sight.versions["mujoco"], sight.versions["mujoco-mjx"]
     if mujoco and mjx and mujoco.partition(".")[0] != mjx.partition(".")[0]:
         yield (
@@ -221,3 +252,56 @@ def _notes(sight: Sight) -> Iterator[str]:
 
 def _profiles(gpu: Gpu) -> str:
     return ", ".join(one.profile for one in gpu.instances)
+
+
+def _cuda_major(sight: Sight) -> int:
+    """The CUDA that packages are to be for: what jax has, if the driver takes it."""
+    if sight.machine.driver_major < _CUDA_13_DRIVER:
+        return 12
+    has_12, has_13 = (sight.versions.get(f"jax-cuda{cuda}-plugin") for cuda in (12, 13))
+    return 12 if has_12 and not has_13 else 13
+
+
+def _missing_pieces(sight: Sight) -> Iterator[str]:
+    """What GMIs lack to train as fast as they can, and the command that brings it."""
+    usable = [gpu for gpu in sight.machine.gpus if device_of(gpu)]
+    if not usable:
+        return
+    if any(not gpu.mig_enabled for gpu in usable):
+        yield from _bindings(sight)
+        if sight.machine.mps_control is None:
+            yield (
+                "GMIs of a GPU take turns, because nvidia-cuda-mps-control is not installed: it "
+                "comes with the NVIDIA driver, into containers with its capability compute"
+            )
+    yield from _warp(sight)
+
+
+def _bindings(sight: Sight) -> Iterator[str]:
+    cuda = _cuda_major(sight)
+    wanted, found = BINDINGS[cuda], sight.versions.get("cuda-bindings")
+    if found is not None and wanted.has(found):
+        return
+    state = f"{found} is installed" if found else "it is not installed"
+    yield (
+        "gradients of GMIs that share a GPU go through host memory: reduce.strategy=one_shot "
+        f"needs cuda-bindings{wanted}, and {state} (pip install 'gmijax[cuda{cuda}]')"
+    )
+
+
+def _warp(sight: Sight) -> Iterator[str]:
+    found, wanted = sight.versions.get("warp-lang"), sight.wanted_warp
+    command = "(pip install 'gmijax[warp]')"
+    if found is None:
+        faster = ", ".join(sorted(task for task, how in ON_GPU.items() if how.auto == "warp"))
+        yield f"MJX-Warp is the faster physics for {faster}: needs warp-lang {command}"
+    elif wanted is not None and found != wanted:
+        yield f"MJX-Warp was made for warp-lang {wanted}, and {found} is installed {command}"
+
+
+def _numbers(version: str) -> tuple[int, ...]:
+    return tuple(int(number) for number in re.findall(r"\d+", version)[:3])
+
+
+def _text(numbers: tuple[int, ...]) -> str:
+    return ".".join(map(str, numbers))

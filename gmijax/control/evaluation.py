@@ -81,7 +81,7 @@ def play(config: PlayConfig, *, show: bool = False) -> Evaluation:
     saved, _ = trained_config(checkpoint)
     env = source.opened(saved, config.run.env)
     require_task(str(env.name), env.suite)
-    run = dataclasses.replace(config.run, dir=str(_run_of(checkpoint)))
+    run = dataclasses.replace(config.run, dir=str(checkpoint.parents[1]))
     if env.suite == "custom":
         run = dataclasses.replace(run, env=env.name, env_sha256=env.source_sha256)
     config = dataclasses.replace(config, checkpoint=str(checkpoint), run=run)
@@ -110,7 +110,7 @@ def _find(config: PlayConfig) -> Path:
     wanted, run_dir = config.checkpoint, config.run.dir
     if wanted is None or (wanted.isdecimal() and len(wanted) <= _MOST_DIGITS):
         latest = find_checkpoint(run_dir or "last", "run.dir")
-        return latest if wanted is None else _at_step(_run_of(latest), int(wanted))
+        return latest if wanted is None else _at_step(latest.parents[1], int(wanted))
     if not os.path.isfile(Path(wanted) / META):  # Unlike `Path.is_file` it takes any text.
         raise ConfigError(
             f"checkpoint={wanted}: expected the folder of a checkpoint, or its env steps"
@@ -118,7 +118,7 @@ def _find(config: PlayConfig) -> Path:
     checkpoint = Path(wanted).resolve()
     if run_dir is not None:
         latest = find_checkpoint(run_dir, "run.dir")
-        if _run_of(latest) != _run_of(checkpoint):
+        if latest.parents[1] != checkpoint.parents[1]:
             raise ConfigError(
                 f"checkpoint={wanted}: not of run.dir={run_dir}; leave out one of them"
             )
@@ -134,10 +134,6 @@ def _at_step(run: Path, env_steps: int) -> Path:
             f"checkpoint={env_steps}: no such checkpoint in {run}; there are {steps}"
         )
     return checkpoint
-
-
-def _run_of(checkpoint: Path) -> Path:
-    return checkpoint.parent.parent
 
 
 def _prepare(config: PlayConfig, env_steps: int) -> PlayPaths:

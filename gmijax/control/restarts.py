@@ -109,12 +109,26 @@ class Attempts:
             raise JobInterrupted("stopped between two attempts")
         add_event(self.run.events, "start", attempt=number, checkpoint=_text(checkpoint))
         try:
-            run_gmis(launch, _Recovery(self.run, on_tick, number, self._seen_s).tick, signals)
+            run_gmis(launch, self._ticks(on_tick, number), signals)
         except BackendUnavailable as error:
             if not number:
                 raise
             raise self._last_fault(error) from error
         add_event(self.run.events, "end", attempt=number)
+
+    def _ticks(self, on_tick: OnTick, attempt: int) -> OnTick:
+        """`on_tick`, and a note when a job that was started again trains again."""
+        is_over = attempt == 0
+
+        def tick(gmis: tuple[GmiStatus, ...]) -> None:
+            nonlocal is_over
+            on_tick(gmis)
+            if not is_over and any(gmi.state == "running" for gmi in gmis):
+                is_over = True
+                seconds = round(time.monotonic() - self._seen_s, 3)
+                add_event(self.run.events, "recovered", attempt=attempt, seconds=seconds)
+
+        return tick
 
     def _last_fault(self, why: ConfigError) -> GmiFailed:
         """What ended the attempt before, after which the machine cannot go on."""
@@ -152,32 +166,8 @@ class Attempts:
             add_event(self.run.events, "gave_up", reason=reason)
 
 
-class _Recovery:
-    """Notes when a job that was started again trains again, and how long after the fault."""
-
-    def __init__(self, run: RunPaths, on_tick: OnTick, attempt: int, fault_s: float) -> None:
-        self._run = run
-        self._on_tick = on_tick
-        self._attempt = attempt
-        self._fault_s = fault_s
-        self._is_over = attempt == 0
-
-    def tick(self, gmis: tuple[GmiStatus, ...]) -> None:
-        """See `run_gmis`."""
-        self._on_tick(gmis)
-        if not self._is_over and any(gmi.state == "running" for gmi in gmis):
-            self._is_over = True
-            seconds = round(time.monotonic() - self._fault_s, 3)
-            add_event(self._run.events, "recovered", attempt=self._attempt, seconds=seconds)
-
-
 def why_not_again(error: GmiFailed, last: GmiFailed | None) -> str | None:
-    """Why a job that failed should not be tried again, None if it should.
-
-    Args:
-      error: of this attempt.
-      last: of the attempt before, if there was one.
-    """
+    """Why a job that failed should not be tried again, None if it should."""
     if error.is_final:
         return "the last attempt left something behind, or nothing can be started"
     if error.error is not None and error.error.type in _LASTING:
@@ -216,11 +206,6 @@ def with_gpus_left(
     """The job as it can go on, with Algorithm 1 decided again where GPUs are gone.
 
     Every GMI keeps its number of environments, so there are fewer of them in all.
-
-    Args:
-      config: of the job.
-      plan: that it had.
-      machine: as it is now.
 
     Returns:
       Configuration and plan, both as they were where no GPU is gone, and sentences for the user.

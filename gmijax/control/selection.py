@@ -18,12 +18,12 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from gmijax.cachedir import cache_folder
-from gmijax.collectives.cost_model import COSTS
 from gmijax.collectives.memory import create_exchange
 from gmijax.partition.layout import Layout
 from gmijax.partition.machine import Machine
 from gmijax.partition.plan import Plan
 from gmijax.partition.reduction import (
+    STRATEGIES,
     needs_ring,
     select_strategy,
     why_not_intra,
@@ -43,9 +43,6 @@ CHAIN = 8
 TIMEOUT_S = 120.0
 CALLS = 40
 PATIENCE = Patience(start_timeout_s=300, stall_timeout_s=120, stop_timeout_s=60, grace_s=5)
-
-_WAYS = {"har": ("host", "ipc"), "one_shot": ("ipc",)}
-"""How the GMIs of a GPU exchange, for strategies that care."""
 
 _PACKAGES = ("jax", "jaxlib", "nvidia-nccl-cu12", "nvidia-nccl-cu13", "cuda-bindings")
 _TYPICAL_INPUTS, _TYPICAL_OUTPUTS = 64, 16
@@ -135,15 +132,15 @@ def _with_fastest(
 def candidates(plan: Plan, num_floats: int, intra: str = "auto") -> list[Probe]:
     """Every way that the layout and the backend allow, once."""
     found: list[Probe] = []
-    for strategy in COSTS:
-        if why_not_strategy(strategy, plan.layout) or _is_another(strategy, plan.layout):
+    for name, strategy in STRATEGIES.items():
+        if why_not_strategy(name, plan.layout) or _is_another(name, plan.layout):
             continue
-        if why_not_under(strategy, plan.layout, plan.backend):
+        if why_not_under(name, plan.layout, plan.backend):
             continue
-        for way in _WAYS.get(strategy, ("host",)):
-            wanted = strategy not in _WAYS or intra in ("auto", way)
+        for way in strategy.ways:
+            wanted = strategy.ways == ("host",) or intra in ("auto", way)
             if wanted and why_not_intra(way, plan.backend) is None:
-                found.append(Probe(strategy, way, num_floats))
+                found.append(Probe(name, way, num_floats))
     return found
 
 

@@ -10,12 +10,7 @@ from itertools import pairwise
 
 from gmijax.config import BackendName, PlanConfig, ReduceConfig, TemplateName
 from gmijax.errors import ConfigError
-from gmijax.partition.backend_choice import (
-    Purpose,
-    choose_backend,
-    choose_gpus,
-    require_backend,
-)
+from gmijax.partition.backend_choice import choose_backend, choose_gpus, require_backend
 from gmijax.partition.host_limits import require_room
 from gmijax.partition.layout import Layout
 from gmijax.partition.machine import Machine
@@ -53,7 +48,6 @@ def make_plan(
     *,
     template: TemplateName = "tcg_ex",
     trainers: Sequence[int] = (),
-    purpose: Purpose | None = None,
 ) -> Plan:
     """Decides everything that is `auto` and checks the rest against the machine.
 
@@ -64,7 +58,6 @@ def make_plan(
       machine: what there is.
       template: what `plan.template=auto` means.
       trainers: ids of the GMIs that train, for the template `decoupled`.
-      purpose: what `plan.backend=auto` is chosen for; None: as the template says.
 
     Returns:
       The plan; its `reasons` say what was decided and why, one sentence each.
@@ -76,13 +69,12 @@ def make_plan(
     require_host(*num_gmis_of(plan), plan, machine)
     layout = _layout(plan)
     reasons: list[str] = list(machine.warnings)
-    if purpose is None:
-        wanted = template if plan.template == "auto" else plan.template
-        purpose = "serve" if wanted in ("tcg", "tdg") else "train"
-    backend = _backend(plan, layout, machine, purpose, reasons)
+    chosen = template if plan.template == "auto" else plan.template
+    backend = _backend(plan, layout, machine, chosen in ("tcg", "tdg"), reasons)
     gpus = choose_gpus(plan, layout, machine, backend, reasons) if backend != "cpu" else ()
     slices = _slices(plan, layout, gpus, backend, machine, reasons)
-    chosen = _template(plan, template, reasons)
+    if plan.template == "auto":
+        reasons.append(f"template {chosen}: {DESCRIPTIONS[chosen]}")
     roles = roles_of(chosen, layout, trainers)
     training = group_of(layout, roles, TRAINER)
     first = mps_priorities(plan, layout, backend, training.gmis if training else ())
@@ -147,10 +139,10 @@ def _layout(plan: PlanConfig) -> Layout:
 
 
 def _backend(
-    plan: PlanConfig, layout: Layout, machine: Machine, purpose: Purpose, reasons: list[str]
+    plan: PlanConfig, layout: Layout, machine: Machine, serves: bool, reasons: list[str]
 ) -> BackendName:
     if plan.backend == "auto":
-        backend, reason = choose_backend(plan, layout, machine, purpose)
+        backend, reason = choose_backend(plan, layout, machine, serves=serves)
         reasons.append(f"backend {backend}: {reason}")
         return backend
     require_backend(plan.backend, machine)
@@ -214,13 +206,6 @@ def _may_share(plan: PlanConfig, backend: BackendName, gpus: Sequence[Gpu]) -> b
     if plan.backend != "auto" or backend != "mps" or plan.needs_mps:
         return False
     return all(gpu.compute_mode == "default" for gpu in gpus)
-
-
-def _template(plan: PlanConfig, default: TemplateName, reasons: list[str]) -> TemplateName:
-    if plan.template != "auto":
-        return plan.template
-    reasons.append(f"template {default}: {DESCRIPTIONS[default]}")
-    return default
 
 
 def _reduction(

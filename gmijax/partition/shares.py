@@ -66,12 +66,6 @@ def mps_priorities(
 ) -> tuple[Priority | None, ...]:
     """The priority of every GMI's kernels, in order of id; None where all are alike.
 
-    Args:
-      plan: what the user wants; `trainers_first` puts all others below those that train.
-      layout: which GMI is where.
-      backend: only `mps` has priorities.
-      trainers: the GMIs that train.
-
     Raises:
       ConfigError: a backend that cannot, not one value per GMI, or nobody to put first.
     """

@@ -58,11 +58,6 @@ def roles_of(
 ) -> tuple[str, ...]:
     """The roles of every GMI, in order of id.
 
-    Args:
-      template: its name.
-      layout: which GMI is where.
-      trainers: ids of the GMIs that train; for `decoupled` only.
-
     Raises:
       ConfigError: a template that this layout is too small for, or no trainer or nobody else
         in `decoupled`.

@@ -31,8 +31,8 @@ from gmijax.partition.gmi_process import GmiStatus
 from gmijax.partition.machine import Machine
 from gmijax.partition.plan import Plan
 from gmijax.partition.reduction import needs_ring
-from gmijax.partition.rendezvous import reserved_address
 from gmijax.partition.supervisor import Job, Patience, Supervisor
+from gmijax.processes import reserved_address
 from gmijax.rundir import RunPaths, read_json, write_json
 from gmijax.supervise.kinds import JobKind
 

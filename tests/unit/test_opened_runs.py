@@ -101,11 +101,7 @@ def test_an_equal_file_is_the_runs(kind: str, run: RunPaths, starts: None):
 
 
 def test_play_says_it_in_one_line(run: RunPaths, capsys: pytest.CaptureFixture[str]):
-    def play(config: PlayConfig) -> int:
-        evaluation.play(config)
-        return 0
-
-    assert command("play", PlayConfig, play, ["run.dir=theirs"]) == 2
+    assert command("play", PlayConfig, evaluation.play, ["run.dir=theirs"]) == 2
     assert len(capsys.readouterr().err.splitlines()) == 1
 
 

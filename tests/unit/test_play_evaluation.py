@@ -25,7 +25,7 @@ from gmijax.supervise.launcher import environment_of
 
 def config_of(*overrides: str) -> PlayConfig:
     found: list[PlayConfig] = []
-    assert command("play", PlayConfig, lambda c: found.append(c) or 0, overrides) == 0
+    assert command("play", PlayConfig, lambda c, **_: found.append(c), overrides) == 0
     return found[0]
 
 

@@ -17,11 +17,6 @@ class Backend:
     This one enforces nothing: it starts the janitor, which ends the GMIs if the controller is
     killed. Leave it only after every GMI has ended.
 
-    Args:
-      plan: its slices name the devices.
-      machine: what there is.
-      run: logs go into it.
-
     Raises:
       BackendUnavailable: it cannot be had on this machine.
     """
