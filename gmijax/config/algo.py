@@ -6,15 +6,17 @@ from dataclasses import dataclass
 from typing import Literal
 
 from gmijax.errors import ConfigError
-from gmijax.schema import doc, require_at_least, require_between, require_positive
+from gmijax.schema import KeyGroup, doc
 
 ADAPTIVE_LEARNING_RATE_RANGE = (1e-5, 1e-2)
 """Where the adaptive schedule keeps the learning rate, and so where it must begin."""
 
 
 @dataclass(frozen=True, kw_only=True)
-class ActorCriticConfig:
+class ActorCriticConfig(KeyGroup):
     """What PPO and A3C share; some keys mean a little else to each, and are told there."""
+
+    prefix = "algo."
 
     unroll_length: int
     num_minibatches: int
@@ -22,18 +24,22 @@ class ActorCriticConfig:
     gae_lambda: float
     normalize_advantage: bool
     learning_rate_schedule: Literal["fixed", "adaptive_kl"]
-    discounting: float = doc("discount factor per step, 0 to 1")
-    value_cost: float = doc("weight of the value loss")
-    entropy_cost: float = doc("weight of the entropy bonus")
-    bound_cost: float = doc("weight of the penalty on action means outside [-1.1, 1.1]")
-    learning_rate: float = doc("step size of Adam (the first one, if the schedule is adaptive)")
-    desired_kl: float = doc("target of the adaptive schedule")
-    max_grad_norm: float = doc("gradients are scaled down to this global norm")
-    reward_scaling: float = doc("factor on rewards before learning (logged returns are unscaled)")
+    discounting: float = doc("discount factor per step, 0 to 1", low=0.0, high=1.0)
+    value_cost: float = doc("weight of the value loss", low=0.0)
+    entropy_cost: float = doc("weight of the entropy bonus", low=0.0)
+    bound_cost: float = doc("weight of the penalty on action means outside [-1.1, 1.1]", low=0.0)
+    learning_rate: float = doc(
+        "step size of Adam (the first one, if the schedule is adaptive)", positive=True
+    )
+    desired_kl: float = doc("target of the adaptive schedule", positive=True)
+    max_grad_norm: float = doc("gradients are scaled down to this global norm", positive=True)
+    reward_scaling: float = doc(
+        "factor on rewards before learning (logged returns are unscaled)", positive=True
+    )
     normalize_observations: bool = doc("normalise observations with running statistics")
-    policy_hidden_layer_sizes: tuple[int, ...] = doc("widths of the policy network")
-    value_hidden_layer_sizes: tuple[int, ...] = doc("widths of the value network")
-    init_noise_std: float = doc("standard deviation of the first policy")
+    policy_hidden_layer_sizes: tuple[int, ...] = doc("widths of the policy network", low=1)
+    value_hidden_layer_sizes: tuple[int, ...] = doc("widths of the value network", low=1)
+    init_noise_std: float = doc("standard deviation of the first policy", positive=True)
     init_at_random_ep_len: bool = doc(
         "cut the first episode of every world at a random time, so that worlds do not go through "
         "their episodes in step; those episodes are not counted in returns",
@@ -41,20 +47,7 @@ class ActorCriticConfig:
     )
 
     def __post_init__(self) -> None:
-        for key in ("unroll_length", "num_minibatches", "num_updates_per_batch"):
-            require_at_least(f"algo.{key}", getattr(self, key), 1)
-        for key in ("discounting", "gae_lambda"):
-            require_between(f"algo.{key}", getattr(self, key), 0.0, 1.0)
-        for key in ("value_cost", "entropy_cost", "bound_cost"):
-            require_at_least(f"algo.{key}", getattr(self, key), 0.0)
-        for key in (
-            *("learning_rate", "desired_kl", "max_grad_norm"),
-            *("reward_scaling", "init_noise_std"),
-        ):
-            require_positive(f"algo.{key}", getattr(self, key))
-        for key in ("policy_hidden_layer_sizes", "value_hidden_layer_sizes"):
-            for width in getattr(self, key):
-                require_at_least(f"algo.{key}", width, 1)
+        super().__post_init__()
         low, high = ADAPTIVE_LEARNING_RATE_RANGE
         if self.learning_rate_schedule == "adaptive_kl" and not low <= self.learning_rate <= high:
             raise ConfigError(
@@ -68,20 +61,18 @@ class PpoConfig(ActorCriticConfig):
     """Hyper-parameters of PPO, with Brax's names."""
 
     name: Literal["ppo"] = doc("training algorithm")
-    unroll_length: int = doc("T, environment steps per environment and iteration")
-    num_minibatches: int = doc("minibatches per pass over the rollout")
-    num_updates_per_batch: int = doc("passes over the rollout (epochs)")
-    gae_lambda: float = doc("lambda of generalised advantage estimation, 0 to 1")
-    clipping_epsilon: float = doc("clip range of the probability ratio")
+    unroll_length: int = doc("T, environment steps per environment and iteration", low=1)
+    num_minibatches: int = doc("minibatches per pass over the rollout", low=1)
+    num_updates_per_batch: int = doc("passes over the rollout (epochs)", low=1)
+    gae_lambda: float = doc(
+        "lambda of generalised advantage estimation, 0 to 1", low=0.0, high=1.0
+    )
+    clipping_epsilon: float = doc("clip range of the probability ratio", positive=True)
     clip_value_loss: bool = doc("clip the value loss with clipping_epsilon too")
     learning_rate_schedule: Literal["fixed", "adaptive_kl"] = doc(
         "fixed, or steered to keep the policy's KL divergence per update near desired_kl"
     )
     normalize_advantage: bool = doc("normalise advantages over all samples of all GMIs")
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        require_positive("algo.clipping_epsilon", self.clipping_epsilon)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -89,48 +80,42 @@ class A3cConfig(ActorCriticConfig):
     """Hyper-parameters of asynchronous actor-critic training, with Brax's names."""
 
     name: Literal["a3c"] = doc("training algorithm")
-    unroll_length: int = doc("T, environment steps per environment and unroll")
+    unroll_length: int = doc("T, environment steps per environment and unroll", low=1)
     weights_every: int | None = doc(
         "environment steps after which, at the latest, an agent takes up newer weights, within an "
-        "unroll too; null: with every unroll"
+        "unroll too; null: with every unroll",
+        low=1,
     )
     batch_size: int | None = doc(
-        "B, unrolls in one batch of one trainer; null: num_envs, the unrolls of one agent"
+        "B, unrolls in one batch of one trainer; null: num_envs, the unrolls of one agent", low=1
     )
-    num_minibatches: int = doc("minibatches per pass over a batch")
-    num_updates_per_batch: int = doc("passes over a batch (epochs)")
+    num_minibatches: int = doc("minibatches per pass over a batch", low=1)
+    num_updates_per_batch: int = doc("passes over a batch (epochs)", low=1)
     vtrace: bool = doc(
         "correct for the age of the policy that acted with V-trace; false: plain n-step returns"
     )
-    gae_lambda: float = doc("lambda of V-trace's returns, 0 to 1")
-    rho_clip: float = doc("V-trace's upper limit of a step's probability ratio")
-    trace_clip: float = doc("V-trace's upper limit of the ratio that lets later steps through")
+    gae_lambda: float = doc("lambda of V-trace's returns, 0 to 1", low=0.0, high=1.0)
+    rho_clip: float = doc("V-trace's upper limit of a step's probability ratio", positive=True)
+    trace_clip: float = doc(
+        "V-trace's upper limit of the ratio that lets later steps through", positive=True
+    )
     clipping_epsilon: float | None = doc(
         "clip range of the probability ratio during the passes over a batch, as in PPO; null: the "
-        "plain policy gradient of A3C"
+        "plain policy gradient of A3C",
+        positive=True,
     )
     max_staleness: int | None = doc(
-        "unrolls of a policy that is more versions behind are dropped; null: none are"
+        "unrolls of a policy that is more versions behind are dropped; null: none are", low=1
     )
     max_ahead: int = doc(
         "unrolls of an agent that may wait for every trainer before the agent waits too "
-        "(channel.when_full=block)"
+        "(channel.when_full=block)",
+        low=1,
     )
     learning_rate_schedule: Literal["fixed", "adaptive_kl"] = doc(
         "fixed, or steered to keep the policy's KL divergence per batch near desired_kl"
     )
     normalize_advantage: bool = doc("normalise advantages over every batch")
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        for key in ("rho_clip", "trace_clip"):
-            require_positive(f"algo.{key}", getattr(self, key))
-        for key in ("weights_every", "batch_size", "max_staleness"):
-            if getattr(self, key) is not None:
-                require_at_least(f"algo.{key}", getattr(self, key), 1)
-        if self.clipping_epsilon is not None:
-            require_positive("algo.clipping_epsilon", self.clipping_epsilon)
-        require_at_least("algo.max_ahead", self.max_ahead, 1)
 
     @property
     def pieces_per_unroll(self) -> int:

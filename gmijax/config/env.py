@@ -11,7 +11,7 @@ from typing import Literal
 
 from gmijax.errors import ConfigError
 from gmijax.randomization import LeafRange
-from gmijax.schema import doc, require_at_least
+from gmijax.schema import KeyGroup, doc
 
 _EXAMPLES: Mapping[str, str] = MappingProxyType(
     {"brax": "ant", "playground": "CartpoleBalance", "custom": "path/to/cart.py:make"}
@@ -19,8 +19,10 @@ _EXAMPLES: Mapping[str, str] = MappingProxyType(
 
 
 @dataclass(frozen=True, kw_only=True)
-class EnvConfig:
+class EnvConfig(KeyGroup):
     """The task."""
+
+    prefix = "env."
 
     # Whose task it is: env= sets it.
     suite: Literal["gmijax", "brax", "playground", "custom"] = "gmijax"
@@ -36,6 +38,7 @@ class EnvConfig:
     randomize: Literal["off", "on"] = doc(
         "whether every world has a physics model of its own, drawn from env.randomization",
         default="off",
+        low=1,
     )
     randomization: Mapping[str, LeafRange] = dataclasses.field(
         default_factory=dict,
@@ -43,13 +46,12 @@ class EnvConfig:
     )
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         if self.name is None:
             example = _EXAMPLES.get(self.suite, "ant")
             raise ConfigError(
                 f"env.name: must be given with env={self.suite}, e.g. env.name={example}"
             )
-        if self.episode_length is not None:
-            require_at_least("env.episode_length", self.episode_length, 1)
         for leaf, drawn in self.randomization.items():
             drawn.check(leaf)
         if self.randomize == "on" and not self.randomization:
