@@ -31,14 +31,13 @@ class EnvConfig(KeyGroup):
         "robot models at first use), with env=custom PATH.py:FUNCTION"
     )
     episode_length: int | None = doc(
-        "steps after which an episode is truncated (time limit); null: the task's own"
+        "steps after which an episode is truncated (time limit); null: the task's own", low=1
     )
     # Digest of a custom task's file: the run itself notes it.
     source_sha256: str | None = None
     randomize: Literal["off", "on"] = doc(
         "whether every world has a physics model of its own, drawn from env.randomization",
         default="off",
-        low=1,
     )
     randomization: Mapping[str, LeafRange] = dataclasses.field(
         default_factory=dict,

@@ -15,6 +15,7 @@ from gmijax.control.console import ConsoleProgress, open_console
 from gmijax.partition.gmi_process import GmiStatus
 
 PRINTS = """
+from gmijax.control.console import open_console
 console = open_console(show=True)
 for number in range(200_000):
     console.print(f"line {number}")
