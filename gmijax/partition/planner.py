@@ -82,7 +82,10 @@ def make_plan(
         dataclasses.replace(share, priority=priority)
         for share, priority in zip(slices, first, strict=True)
     )
-    strategy, intra = _reduction(reduce, training, layout, backend, reasons)
+    strategy, intra = "none", "host"
+    if training is not None:
+        strategy = _strategy(reduce, training, backend, reasons)
+        intra = _intra(reduce, strategy, layout, backend, reasons)
     return Plan(
         layout=layout,
         slices=slices,
@@ -94,7 +97,10 @@ def make_plan(
         reasons=tuple(reasons),
         roles=roles,
         self_check=_self_check(plan, slices, backend, machine),
-        may_share=_may_share(plan, backend, gpus),
+        may_share=plan.backend == "auto"
+        and backend == "mps"
+        and not plan.needs_mps
+        and all(gpu.compute_mode == "default" for gpu in gpus),
     )
 
 
@@ -202,26 +208,6 @@ def _self_check(
     return is_theirs or any((share.sm_percent or 100.0) < 100.0 for share in slices)
 
 
-def _may_share(plan: PlanConfig, backend: BackendName, gpus: Sequence[Gpu]) -> bool:
-    if plan.backend != "auto" or backend != "mps" or plan.needs_mps:
-        return False
-    return all(gpu.compute_mode == "default" for gpu in gpus)
-
-
-def _reduction(
-    reduce: ReduceConfig,
-    training: Group | None,
-    layout: Layout,
-    backend: BackendName,
-    reasons: list[str],
-) -> tuple[str, str]:
-    """How gradients are averaged, and exchanged inside a GPU."""
-    if training is None:
-        return "none", "host"
-    strategy = _strategy(reduce, training, backend, reasons)
-    return strategy, _intra(reduce, strategy, layout, backend, reasons)
-
-
 def _strategy(
     reduce: ReduceConfig, training: Group, backend: BackendName, reasons: list[str]
 ) -> str:
@@ -241,35 +227,23 @@ def _strategy(
             f"{_NO_RINGS[backend].format(choice.strategy)}"
         )
         return "mpr"
-    if _exchange_on_devices(reduce, layout, backend):
+    # With one GMI on each GPU the ring is part of the program that trains.
+    wants_one_shot = (
+        reduce.selection == "device" and reduce.intra != "host" and not is_one_per_gpu(layout)
+    )
+    lacking = why_not_under("one_shot", layout, backend)
+    if wants_one_shot and lacking is None:
         reasons.append(
             "strategy one_shot: GMIs that share GPUs train faster with exchanges on them; "
             f"Algorithm 1 says {choice.strategy} ({choice.why}), as reduce.selection=paper does"
         )
         return "one_shot"
-    slow = _why_not_one_shot(reduce, layout, backend)
+    slow = ""
+    # Under other backends there is no memory of a GPU to share, whatever is installed.
+    if wants_one_shot and backend in ("mps", "share"):
+        slow = f"; one_shot would train faster: {lacking}"
     reasons.append(f"strategy {choice.strategy}: {choice.why} (Algorithm 1){slow}")
     return choice.strategy
-
-
-def _exchange_on_devices(reduce: ReduceConfig, layout: Layout, backend: BackendName) -> bool:
-    can = why_not_under("one_shot", layout, backend) is None
-    return can and _wants_one_shot(reduce, layout)
-
-
-def _wants_one_shot(reduce: ReduceConfig, layout: Layout) -> bool:
-    # With one GMI on each GPU the ring is part of the program that trains.
-    is_allowed = reduce.selection == "device" and reduce.intra != "host"
-    return is_allowed and not is_one_per_gpu(layout)
-
-
-def _why_not_one_shot(reduce: ReduceConfig, layout: Layout, backend: BackendName) -> str:
-    """What this machine lacks for the faster way, as the end of a sentence; else nothing."""
-    # Under other backends there is no memory of a GPU to share, whatever is installed.
-    if backend not in ("mps", "share") or not _wants_one_shot(reduce, layout):
-        return ""
-    lacking = why_not_under("one_shot", layout, backend)
-    return f"; one_shot would train faster: {lacking}" if lacking else ""
 
 
 def _intra(
