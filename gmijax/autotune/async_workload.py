@@ -83,14 +83,9 @@ class A3cWorkload(Workload[TrainConfig]):
     def config_at(self, point: Point, num_gmis: int) -> TrainConfig:
         """See `Workload`."""
         del num_gmis
-        config = self.config
-        return dataclasses.replace(
-            config,
-            num_envs=point.num_envs,
-            num_timesteps=_ENDLESS_STEPS,  # It ends when there is enough to read.
-            physics=dataclasses.replace(config.physics, impl=point.impl),
-            run=dataclasses.replace(config.run, resume=None, checkpoint_every=0),
-        )
+        run = dataclasses.replace(self.config.run, resume=None, checkpoint_every=0)
+        # It ends when there is enough to read.
+        return self.with_point(point, num_timesteps=_ENDLESS_STEPS, run=run)
 
     def plan_at(self, point: Point, mode: Mode, machine: Machine) -> Plan:
         """See `Workload`; on one GPU that does both, or on one that acts and one that trains."""

@@ -137,11 +137,13 @@ class Workload(Generic[C]):
 
     def settled(self, point: Point, split: Split | None) -> C:
         """The job with what a search has found."""
+        return self.with_point(point, plan=self.settled_plan(point, split))
+
+    def with_point(self, point: Point, **changes: Any) -> C:
+        """The job's configuration with environments and physics of a point, and other changes."""
+        physics = dataclasses.replace(self.config.physics, impl=point.impl)
         return dataclasses.replace(
-            self.config,
-            num_envs=point.num_envs,
-            plan=self.settled_plan(point, split),
-            physics=dataclasses.replace(self.config.physics, impl=point.impl),
+            self.config, num_envs=point.num_envs, physics=physics, **changes
         )
 
     def settled_plan(self, point: Point, split: Split | None) -> PlanConfig:
@@ -215,15 +217,10 @@ class PpoWorkload(Workload[TrainConfig]):
         """See `Workload`."""
         config = self.config
         steps = point.num_envs * config.algo.unroll_length * num_gmis
-        return dataclasses.replace(
-            config,
-            num_envs=point.num_envs,
-            num_timesteps=config.search.iterations * steps,
-            physics=dataclasses.replace(config.physics, impl=point.impl),
-            run=dataclasses.replace(
-                config.run, resume=None, checkpoint_every=0, measure_throughput=False
-            ),
+        run = dataclasses.replace(
+            config.run, resume=None, checkpoint_every=0, measure_throughput=False
         )
+        return self.with_point(point, num_timesteps=config.search.iterations * steps, run=run)
 
     def read(self, plan: Plan, run: RunPaths) -> Measured:
         """See `Workload`."""
@@ -274,11 +271,9 @@ class ServeWorkload(Workload[ServeConfig]):
         """See `Workload`."""
         config = self.config
         steps = point.num_envs * config.unroll_length * num_gmis
-        return dataclasses.replace(
-            config,
-            num_envs=point.num_envs,
+        return self.with_point(
+            point,
             num_timesteps=config.search.iterations * steps,
-            physics=dataclasses.replace(config.physics, impl=point.impl),
             output=dataclasses.replace(config.output, dir=None),
             latency_steps=0,
         )

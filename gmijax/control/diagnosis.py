@@ -1,4 +1,4 @@
-"""What this machine can do for gmijax, what it cannot, and why: a pure function of its sight."""
+"""What this machine can do for gmijax, what it cannot, and why: a pure function of its system."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from types import MappingProxyType
 from typing import Any, Final, NamedTuple
 
 from gmijax.config import BackendName, StrategyName
-from gmijax.control.sight import REQUIRED, Sight, device_of
+from gmijax.control.system_info import REQUIRED, SystemInfo, device_of
 from gmijax.errors import ConfigError
 from gmijax.partition.backend_choice import why_not_backend
 from gmijax.partition.layout import Layout
@@ -75,20 +75,20 @@ class Diagnosis:
     """The answer.
 
     Attributes:
-      sight: what it is made from.
+      system: what it is made from.
       abilities: what can be used and what not.
       problems: what is broken and should work, one sentence each; none on a healthy machine.
       notes: what is worth knowing.
     """
 
-    sight: Sight
+    system: SystemInfo
     abilities: tuple[Ability, ...]
     problems: tuple[str, ...]
     notes: tuple[str, ...]
 
     def to_dict(self) -> dict[str, Any]:
         """Plain data for `--json`."""
-        machine = self.sight.machine
+        machine = self.system.machine
         return {
             "ok": not self.problems,
             "gmijax": __version__,
@@ -102,30 +102,30 @@ class Diagnosis:
             "mps": {
                 "control": str(machine.mps_control) if machine.mps_control else None,
                 "daemon": str(machine.operator_daemon) if machine.operator_daemon else None,
-                "error": self.sight.mps_error,
+                "error": self.system.mps_error,
             },
-            "jax": self.sight.jax._asdict(),
-            "versions": dict(self.sight.versions),
+            "jax": self.system.jax._asdict(),
+            "versions": dict(self.system.versions),
             "abilities": [ability._asdict() for ability in self.abilities],
             "problems": list(self.problems),
             "notes": list(self.notes),
         }
 
 
-def diagnose(sight: Sight) -> Diagnosis:
+def diagnose(system: SystemInfo) -> Diagnosis:
     """What can be used, what is broken, what is worth knowing."""
     return Diagnosis(
-        sight, tuple(_abilities(sight)), tuple(_problems(sight)), tuple(_notes(sight))
+        system, tuple(_abilities(system)), tuple(_problems(system)), tuple(_notes(system))
     )
 
 
-def _abilities(sight: Sight) -> Iterator[Ability]:
-    machine = sight.machine
+def _abilities(system: SystemInfo) -> Iterator[Ability]:
+    machine = system.machine
     usable: list[BackendName] = []
     for name in typing.get_args(BackendName):
         reason = why_not_backend(name, machine)
         if name == "mps" and reason is None:
-            reason = sight.mps_error
+            reason = system.mps_error
         if reason is None:
             usable.append(name)
         yield Ability("backend", name, reason is None, reason or _about_backend(name, machine))
@@ -138,7 +138,7 @@ def _abilities(sight: Sight) -> Iterator[Ability]:
         yield Ability("intra", name, bool(fine), why)
     platform = "gpu" if machine.gpus else "cpu"
     for name in ("jax", "warp"):
-        yield _physics(name, platform, sight.versions["warp-lang"] is not None)
+        yield _physics(name, platform, system.versions["warp-lang"] is not None)
     yield Ability("env", "gmijax", True, ", ".join(task_names()))
     for suite in SUITES:
         yield _suite(suite)
@@ -190,14 +190,14 @@ def _suite(suite: str) -> Ability:
     return Ability("env", suite, True, f"env={suite} env.name=...")
 
 
-def _problems(sight: Sight) -> Iterator[str]:
-    if sight.nvml_error:
-        yield f"NVML is installed and does not work: {sight.nvml_error}"
+def _problems(system: SystemInfo) -> Iterator[str]:
+    if system.nvml_error:
+        yield f"NVML is installed and does not work: {system.nvml_error}"
     for name in REQUIRED:
-        if sight.versions[name] is None:
+        if system.versions[name] is None:
             yield f"the package {name} is not installed (pip install gmijax)"
-    yield from _jax_problems(sight)
-    for gpu in sight.machine.gpus:
+    yield from _jax_problems(system)
+    for gpu in system.machine.gpus:
         if gpu.mig_enabled and not gpu.instances:
             yield (
                 f"GPU {gpu.index} is in MIG mode and has no instance, so nothing can use it "
@@ -207,25 +207,25 @@ def _problems(sight: Sight) -> Iterator[str]:
             yield f"GPU {gpu.index} is in compute mode PROHIBITED (nvidia-smi -c 0)"
 
 
-def _jax_problems(sight: Sight) -> Iterator[str]:
-    usable = [gpu for gpu in sight.machine.gpus if device_of(gpu)]
-    num_seen = len(sight.jax.devices)
-    if sight.jax.error and usable:
-        yield f"jax cannot use the GPUs that NVML lists: {sight.jax.error}{_cuda_advice(sight)}"
-    elif sight.jax.error:
-        yield f"jax does not work: {sight.jax.error}"
+def _jax_problems(system: SystemInfo) -> Iterator[str]:
+    usable = [gpu for gpu in system.machine.gpus if device_of(gpu)]
+    num_seen = len(system.jax.devices)
+    if system.jax.error and usable:
+        yield f"jax cannot use the GPUs that NVML lists: {system.jax.error}{_cuda_advice(system)}"
+    elif system.jax.error:
+        yield f"jax does not work: {system.jax.error}"
     elif usable and not any(gpu.instances for gpu in usable) and num_seen != len(usable):
         yield f"jax sees {num_seen} GPUs, and NVML lists {len(usable)}"
 
 
-def _cuda_advice(sight: Sight) -> str:
-    if any(sight.versions[f"jax-cuda{cuda}-plugin"] for cuda in (12, 13)):
+def _cuda_advice(system: SystemInfo) -> str:
+    if any(system.versions[f"jax-cuda{cuda}-plugin"] for cuda in (12, 13)):
         return ""
-    return f" (pip install 'gmijax[cuda{_cuda_major(sight)}]')"
+    return f" (pip install 'gmijax[cuda{_cuda_major(system)}]')"
 
 
-def _notes(sight: Sight) -> Iterator[str]:
-    machine, variables = sight.machine, sight.variables
+def _notes(system: SystemInfo) -> Iterator[str]:
+    machine, variables = system.machine, system.variables
     if "CUDA_VISIBLE_DEVICES" in variables:
         indices = [gpu.index for gpu in machine.gpus]
         yield (
@@ -236,14 +236,14 @@ def _notes(sight: Sight) -> Iterator[str]:
             f"{PIPE_VARIABLE}={variables[PIPE_VARIABLE]}: no daemon answers there; jobs start "
             "their own"
         )
-    yield from _missing_pieces(sight)
-    mujoco, mjx = sight.versions["mujoco"], sight.versions["mujoco-mjx"]
+    yield from _missing_pieces(system)
+    mujoco, mjx = system.versions["mujoco"], system.versions["mujoco-mjx"]
     if mujoco and mjx and mujoco.partition(".")[0] != mjx.partition(".")[0]:
         yield (
             f"mujoco {mujoco} with mujoco-mjx {mjx} was never tried "
             "(pip install 'mujoco~=3.17' 'mujoco-mjx~=3.17')"
         )
-    if sight.mps_error:
+    if system.mps_error:
         yield "with plan.backend=auto jobs fall back to share, because MPS does not start"
     for gpu in machine.gpus:
         if gpu.compute_mode == "exclusive":
@@ -254,32 +254,32 @@ def _profiles(gpu: Gpu) -> str:
     return ", ".join(one.profile for one in gpu.instances)
 
 
-def _cuda_major(sight: Sight) -> int:
+def _cuda_major(system: SystemInfo) -> int:
     """The CUDA that packages are to be for: what jax has, if the driver takes it."""
-    if sight.machine.driver_major < _CUDA_13_DRIVER:
+    if system.machine.driver_major < _CUDA_13_DRIVER:
         return 12
-    has_12, has_13 = (sight.versions.get(f"jax-cuda{cuda}-plugin") for cuda in (12, 13))
+    has_12, has_13 = (system.versions.get(f"jax-cuda{cuda}-plugin") for cuda in (12, 13))
     return 12 if has_12 and not has_13 else 13
 
 
-def _missing_pieces(sight: Sight) -> Iterator[str]:
+def _missing_pieces(system: SystemInfo) -> Iterator[str]:
     """What GMIs lack to train as fast as they can, and the command that brings it."""
-    usable = [gpu for gpu in sight.machine.gpus if device_of(gpu)]
+    usable = [gpu for gpu in system.machine.gpus if device_of(gpu)]
     if not usable:
         return
     if any(not gpu.mig_enabled for gpu in usable):
-        yield from _bindings(sight)
-        if sight.machine.mps_control is None:
+        yield from _bindings(system)
+        if system.machine.mps_control is None:
             yield (
                 "GMIs of a GPU take turns, because nvidia-cuda-mps-control is not installed: it "
                 "comes with the NVIDIA driver, into containers with its capability compute"
             )
-    yield from _warp(sight)
+    yield from _warp(system)
 
 
-def _bindings(sight: Sight) -> Iterator[str]:
-    cuda = _cuda_major(sight)
-    wanted, found = BINDINGS[cuda], sight.versions.get("cuda-bindings")
+def _bindings(system: SystemInfo) -> Iterator[str]:
+    cuda = _cuda_major(system)
+    wanted, found = BINDINGS[cuda], system.versions.get("cuda-bindings")
     if found is not None and wanted.has(found):
         return
     state = f"{found} is installed" if found else "it is not installed"
@@ -289,8 +289,8 @@ def _bindings(sight: Sight) -> Iterator[str]:
     )
 
 
-def _warp(sight: Sight) -> Iterator[str]:
-    found, wanted = sight.versions.get("warp-lang"), sight.wanted_warp
+def _warp(system: SystemInfo) -> Iterator[str]:
+    found, wanted = system.versions.get("warp-lang"), system.wanted_warp
     command = "(pip install 'gmijax[warp]')"
     if found is None:
         faster = ", ".join(sorted(task for task, how in ON_GPU.items() if how.auto == "warp"))

@@ -45,7 +45,7 @@ class JaxView(NamedTuple):
     error: str | None = None
 
 
-class Sight(NamedTuple):
+class SystemInfo(NamedTuple):
     """What was found on this machine.
 
     Attributes:
@@ -67,10 +67,10 @@ class Sight(NamedTuple):
     wanted_warp: str | None = None
 
 
-def look() -> Sight:
+def look() -> SystemInfo:
     """Looks at this machine: asks NVML, jax (in a child), and tries to start an MPS daemon."""
     machine = detect_machine()
-    return Sight(
+    return SystemInfo(
         machine=machine,
         jax=ask_jax(machine),
         versions=versions_of((*REQUIRED, *_OPTIONAL)),
