@@ -82,6 +82,7 @@ def test_mig_serves_on_the_gpus_that_have_instances(monkeypatch: pytest.MonkeyPa
 def test_one_serving_gmi_takes_a_whole_gpu(monkeypatch: pytest.MonkeyPatch):
     plan = planned(monkeypatch, (A100_SEVEN, H200_MIG_OFF), make=SERVE, gmis_per_gpu=1)
     assert (plan.backend, plan.slices[0].device) == ("share", "GPU-1-uuid")
+    assert "nothing to share" in plan.reasons[0]
 
 
 @pytest.mark.parametrize(
