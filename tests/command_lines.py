@@ -14,8 +14,8 @@ from typing import Any, NamedTuple
 
 import pytest
 
-from gmijax import cli
 from gmijax.autotune import tuner
+from gmijax.cli_command import command as run_command
 from gmijax.config import PlayConfig, ServeConfig, TrainConfig
 from gmijax.control import decide, evaluation, job, searching, selection, serving
 from gmijax.partition.machine import Machine
@@ -61,7 +61,7 @@ def run(command: str, *argv: str, cwd: Path, machine: Machine = CPU) -> Done:
     out, err = _stream("strict"), _stream("backslashreplace")
     with _nothing_starts(machine, cwd), redirect_stdout(out), redirect_stderr(err):
         try:
-            code = cli.command(command, COMMANDS[command], BODIES[command], argv)
+            code = run_command(command, COMMANDS[command], BODIES[command], argv)
         except WouldStart:
             code = None
     return Done(code, _text(out), _text(err))

@@ -8,7 +8,8 @@ from pathlib import Path
 import pytest
 from command_lines import run
 
-from gmijax.cli import command, compose
+from gmijax.cli import compose
+from gmijax.cli_command import command
 from gmijax.config import PlayConfig
 from gmijax.errors import ConfigError
 

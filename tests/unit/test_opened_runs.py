@@ -12,7 +12,8 @@ from typing import Any
 import pytest
 
 import gmijax
-from gmijax.cli import _build, command
+from gmijax.cli import build
+from gmijax.cli_command import command
 from gmijax.config import PlayConfig
 from gmijax.control import evaluation, restarts, serving
 from gmijax.errors import ConfigError
@@ -58,7 +59,7 @@ def starts(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def opened(kind: str, *overrides: str) -> Any:
     if kind == "play":
-        return evaluation.play(_build("play", PlayConfig, ("run.dir=theirs", *overrides)))
+        return evaluation.play(build("play", PlayConfig, ("run.dir=theirs", *overrides)))
     if kind == "serve":
         return serving.serve(gmijax.compose("run.dir=theirs", *overrides, command="serve"))
     return gmijax.train(gmijax.compose("run.resume=theirs", *overrides))

@@ -11,7 +11,7 @@ from types import SimpleNamespace
 import pytest
 from rich.console import Console
 
-from gmijax.cli import command
+from gmijax.cli_command import command
 from gmijax.config import PlayConfig
 from gmijax.control import evaluation, pictures
 from gmijax.errors import ConfigError, GmijaxError
