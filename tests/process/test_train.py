@@ -164,19 +164,6 @@ def test_a_killed_gmi_ends_the_job_and_is_named(tmp_path: Path) -> None:
     assert _read(run / "summary.json")["status"] == "failed"
 
 
-@pytest.mark.timeout(120)
-def test_a_killed_controller_leaves_nothing(tmp_path: Path) -> None:
-    run = tmp_path / "run"
-    before = shared_memory()
-    job = start(*POINT, FOREVER, "plan.gpus=2", "run.dir=run", cwd=tmp_path)
-    wait_until(lambda: iteration_of(run, 1) >= 1, 90, "an iteration")
-    assert len(pids_of(run)) == 2
-    job.kill()
-    job.wait()
-    wait_until(lambda: not pids_of(run), 10, "both GMIs gone")
-    assert shared_memory() <= before
-
-
 @pytest.mark.timeout(400)
 @pytest.mark.parametrize(
     "plan",
