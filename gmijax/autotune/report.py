@@ -64,8 +64,7 @@ class SearchDisplay:
 
 def verdict(outcome: Outcome, grid: Grid, num_gpus: int, split: Split | None = None) -> str:
     """The answer and what it is worth, in words; only for an outcome with a best point."""
-    if outcome.best is None:
-        raise ValueError("an outcome without a best point")
+    assert outcome.best is not None
     top = outcome.best
     several = _highest(outcome, lambda gmis: gmis > 1)
     one = _highest(outcome, lambda gmis: gmis == 1)
@@ -230,8 +229,7 @@ def _answer(top: Visited, split: Split | None) -> str:
 
 
 def _reason_of(split: Split, top: Visited) -> str:
-    if not isinstance(top.result, Measured):
-        raise ValueError("a point that did not run has no split")
+    assert isinstance(top.result, Measured)
     acting, learning = top.result.acting_per_s, top.result.learning_per_s
     slower = "agents" if split.serving * acting < split.training * learning else "trainers"
     return (

@@ -103,15 +103,16 @@ class ConsoleProgress:
         self._shown: tuple[str, int | None] = ("", None)
         self._shown_s = 0.0
         self._is_off = console.quiet
+        self._has_panel = console.is_terminal and not console.quiet
         self._live = Live(console=console, refresh_per_second=4, transient=True)
 
     def __enter__(self) -> ConsoleProgress:
-        if self._console.is_terminal:
+        if self._has_panel:
             self._live.start()
         return self
 
     def __exit__(self, *exc: Any) -> None:
-        if self._console.is_terminal:
+        if self._has_panel:
             self._live.stop()
         if self._line:
             self._console.print(self._text(), highlight=False)
@@ -131,7 +132,7 @@ class ConsoleProgress:
             self._line = line
             if self._first is None:
                 self._first = (time.monotonic(), line["env_steps"])
-        if self._console.is_terminal:
+        if self._has_panel:
             self._live.update(self._panel(gmis))
         else:
             self._print_now_and_then(gmis)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import re
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from itertools import pairwise
 
 from gmijax.config import BackendName, PlanConfig, ReduceConfig, TemplateName
@@ -47,7 +47,7 @@ def make_plan(
     machine: Machine,
     *,
     template: TemplateName = "tcg_ex",
-    trainers: Sequence[int] = (),
+    trainers: Collection[int] = (),
 ) -> Plan:
     """Decides everything that is `auto` and checks the rest against the machine.
 

@@ -173,15 +173,11 @@ def why_not_device(plan: Plan) -> str | None:
 
 
 def groups_of(plan: Plan) -> tuple[Group, Group]:
-    """The agents and the trainers of an asynchronous job.
-
-    Raises:
-      ConfigError: there are none of a kind.
-    """
+    """The agents and the trainers of an asynchronous job."""
     agents = group_of(plan.layout, plan.roles, AGENT)
     trainers = group_of(plan.layout, plan.roles, TRAINER)
-    if agents is None or trainers is None:
-        raise ConfigError(f"plan: roles {list(plan.roles)} lack agents or trainers")
+    assert agents is not None
+    assert trainers is not None
     return agents, trainers
 
 

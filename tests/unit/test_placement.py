@@ -126,15 +126,6 @@ def test_decoupled_trains_where_it_is_told():
     assert roles == (*("simulator+agent",) * 2, "trainer", "simulator+agent", "trainer")
 
 
-@pytest.mark.parametrize(
-    ("trainers", "said"),
-    [((), "no GMI trains"), (range(5), "all 5 GMIs train"), ((5,), "no GMI 5 in layout")],
-)
-def test_decoupled_needs_both_sides(trainers, said: str):
-    with pytest.raises(ConfigError, match=said):
-        roles_of("decoupled", UNEVEN, trainers)
-
-
 def test_a_group_has_ranks_of_its_own_and_no_empty_gpu():
     layout = Layout(((0,), (1, 2), (4, 3)))
     roles = ("agent", "simulator", "trainer", "agent+trainer", "simulator")
