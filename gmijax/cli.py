@@ -17,6 +17,7 @@ from hydra.errors import HydraException
 from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
+import gmijax
 from gmijax.config import ServeConfig, TrainConfig
 from gmijax.errors import ConfigError
 from gmijax.resume import saved_config_of
@@ -75,7 +76,7 @@ def compose(*overrides: str, command: str = "train", env: Callable[..., Any] | N
 
 def config_dir() -> Path:
     """The folder of YAML files: inside an installed package, or beside it in a checkout."""
-    package = Path(__file__).resolve().parent
+    package = Path(gmijax.__file__).resolve().parent
     installed = package / "configs"
     return installed if installed.is_dir() else package.parent / "configs"
 
