@@ -157,7 +157,12 @@ def best(visited: Mapping[Point, Visited], tolerance: float) -> Visited | None:
         return None
     highest = max(one.projected for one in runnable)
     good = [one for one in runnable if one.projected >= highest * (1.0 - tolerance)]
-    return min(good, key=lambda v: (_num_gmis(v.point), v.point.num_envs, -v.projected))
+
+    def simplest_first(one: Visited) -> tuple[float, ...]:
+        point = one.point
+        return (point.gmis_per_gpu + point.trainers, point.num_envs, -one.projected)
+
+    return min(good, key=simplest_first)
 
 
 class _Book:
@@ -251,7 +256,3 @@ def _climb(book: _Book, grid: Grid) -> None:
         if not fresh:
             return
         book.visit(fresh[0])
-
-
-def _num_gmis(point: Point) -> int:
-    return point.gmis_per_gpu + point.trainers

@@ -210,7 +210,9 @@ class Search:
             self._display.done(what, point, refused, 0.0)
             return refused
         known = self._store.get(mode, point)
-        if known is not None and not self._may_end_now(known):
+        limit_s = known.limit_s if isinstance(known, NotRunnable) else None
+        # What was late before may have more time now.
+        if known is not None and not (limit_s and limit_s < self._settings.profile_timeout_s):
             return known
         started_s = time.monotonic()
         result = self._measured(point, mode, what)
@@ -246,11 +248,6 @@ class Search:
         except JobInterrupted as error:
             error.add_note(f"the same search goes on from {self._store.path}")
             raise
-
-    def _may_end_now(self, known: Measured | NotRunnable) -> bool:
-        """Whether a point was late, and is given more time now."""
-        limit_s = known.limit_s if isinstance(known, NotRunnable) else None
-        return limit_s is not None and limit_s < self._settings.profile_timeout_s
 
     def _require_best(self, outcome: Outcome) -> Visited:
         if outcome.best is not None:

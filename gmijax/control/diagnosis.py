@@ -17,7 +17,6 @@ from gmijax.partition.backend_choice import why_not_backend
 from gmijax.partition.layout import Layout
 from gmijax.partition.machine import Machine
 from gmijax.partition.mps_control import PIPE_VARIABLE
-from gmijax.partition.nvidia import Gpu
 from gmijax.partition.reduction import (
     LEAST_BINDINGS,
     why_not_intra,
@@ -148,8 +147,11 @@ def _about_backend(name: str, machine: Machine) -> str:
     if name == "mps":
         return f"daemon: {machine.operator_daemon or 'an own one for each GPU'}"
     if name == "mig":
-        parts = [f"GPU {gpu.index}: {_profiles(gpu)}" for gpu in machine.gpus if gpu.instances]
-        return "; ".join(parts)
+        return "; ".join(
+            f"GPU {gpu.index}: {', '.join(one.profile for one in gpu.instances)}"
+            for gpu in machine.gpus
+            if gpu.instances
+        )
     if name == "cpu":
         return f"virtual GPUs on {len(machine.cpu_cores)} cores"
     return "GMIs of a GPU take turns"
@@ -248,10 +250,6 @@ def _notes(system: SystemInfo) -> Iterator[str]:
     for gpu in machine.gpus:
         if gpu.compute_mode == "exclusive":
             yield f"GPU {gpu.index} is in compute mode EXCLUSIVE_PROCESS: several GMIs need MPS"
-
-
-def _profiles(gpu: Gpu) -> str:
-    return ", ".join(one.profile for one in gpu.instances)
 
 
 def _cuda_major(system: SystemInfo) -> int:

@@ -65,14 +65,17 @@ def train(config: TrainConfig, *, show: bool = False) -> Result:
         return _finished(config, beginning.folder, console)
     decided = decide(_from(config, beginning.checkpoint), console)
     config, plan = decided.config, decided.plan
-    changed = _what_changed(config)
+    changed = None
+    if beginning.checkpoint is not None:
+        changed = source.changes(config.env, saved_config(beginning.checkpoint)["env"])
     run = beginning.open(config)
     with locked(run.lock, f"run.dir={run.root}"):
         what = (
             f"{plan.num_envs_per_gmi} environments per GMI, template {plan.template}, reduction "
             f"{plan.strategy}"
         )
-        announce(console, run, plan, what, (*decided.reasons, *changed, *beginning.notes))
+        changes = () if changed is None else (changed,)
+        announce(console, run, plan, what, (*decided.reasons, *changes, *beginning.notes))
         _Job(decided, run, console).run_to_the_end(beginning, started_s)
     summary = read_json(run.summary)
     console.print(train_outcome(summary, run), markup=False)
@@ -158,14 +161,6 @@ def _finished(config: TrainConfig, run: RunPaths, console: Console) -> Result:
         write_json(run.summary, summary)
     console.print(f"nothing is left to do: {run.root}", markup=False)
     return Result(run.root, summary)
-
-
-def _what_changed(config: TrainConfig) -> tuple[str, ...]:
-    """Says that a resumed run's custom task is no longer the same."""
-    if config.run.resume is None:
-        return ()
-    changed = source.changes(config.env, saved_config(Path(config.run.resume))["env"])
-    return () if changed is None else (changed,)
 
 
 def _what_is_left(run: RunPaths) -> str:

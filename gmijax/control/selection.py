@@ -19,7 +19,6 @@ from typing import Any, NamedTuple
 
 from gmijax.cachedir import cache_folder
 from gmijax.collectives.memory import create_exchange
-from gmijax.partition.layout import Layout
 from gmijax.partition.machine import Machine
 from gmijax.partition.plan import Plan
 from gmijax.partition.reduction import (
@@ -133,7 +132,9 @@ def candidates(plan: Plan, num_floats: int, intra: str = "auto") -> list[Probe]:
     """Every way that the layout and the backend allow, once."""
     found: list[Probe] = []
     for name, strategy in STRATEGIES.items():
-        if why_not_strategy(name, plan.layout) or _is_another(name, plan.layout):
+        # With one GMI on each GPU flat is the ring that mrr is; on one GPU har sums all slots.
+        is_another = name == "flat" or (name == "one_shot" and plan.layout.num_gpus == 1)
+        if is_another or why_not_strategy(name, plan.layout):
             continue
         if why_not_under(name, plan.layout, plan.backend):
             continue
@@ -142,12 +143,6 @@ def candidates(plan: Plan, num_floats: int, intra: str = "auto") -> list[Probe]:
             if wanted and why_not_intra(way, plan.backend) is None:
                 found.append(Probe(name, way, num_floats))
     return found
-
-
-def _is_another(strategy: str, layout: Layout) -> bool:
-    """Whether this is what another strategy does on such a layout."""
-    # With one GMI on each GPU flat is the ring that mrr is; on one GPU har sums all slots too.
-    return strategy == "flat" or (strategy == "one_shot" and layout.num_gpus == 1)
 
 
 def measure(
@@ -186,7 +181,8 @@ def measure(
             )
         )
         found = [read_json(run.gmi(gmi).result) for gmi in plan.layout.gmis]
-    slowest = [max(rows, key=lambda row: row.get("chained_s", 0)) for rows in _by_probe(found)]
+    by_probe = zip(*(result["rows"] for result in found), strict=True)
+    slowest = [max(rows, key=lambda row: row.get("chained_s", 0)) for rows in by_probe]
     return [{**row, "device": found[0]["device"]} for row in slowest]
 
 
@@ -219,10 +215,6 @@ def _kept(path: Path, probes: Sequence[Probe]) -> dict[str, dict[str, Any]]:
     except (OSError, ValueError, KeyError, TypeError):
         return {}
     return found
-
-
-def _by_probe(found: Sequence[dict[str, Any]]) -> list[list[dict[str, Any]]]:
-    return [list(rows) for rows in zip(*(result["rows"] for result in found), strict=True)]
 
 
 def _file_name(plan: Plan, machine: Machine, probes: Sequence[Probe]) -> str:

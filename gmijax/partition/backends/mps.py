@@ -82,7 +82,9 @@ class MpsBackend(Backend):
         if self._operator is None:
             deadline_s = time.monotonic() + _CLIENTS_LEAVE_S
             for control in self._controls.values():
-                _wait_for_no_clients(control, deadline_s)
+                with suppress(BackendUnavailable):
+                    while control.all_client_pids() and time.monotonic() < deadline_s:
+                        time.sleep(_POLL_S)
             self._quit_all()
         super().__exit__(*exc)
 
@@ -175,12 +177,6 @@ class MpsBackend(Backend):
                 self._janitor.take_over()
             raise
         self._controls = {}
-
-
-def _wait_for_no_clients(control: MpsControl, deadline_s: float) -> None:
-    with suppress(BackendUnavailable):
-        while control.all_client_pids() and time.monotonic() < deadline_s:
-            time.sleep(_POLL_S)
 
 
 def _short_parent() -> str:
