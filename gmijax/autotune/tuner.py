@@ -109,7 +109,7 @@ def with_auto_decided(config: Any, machine: Machine, console: Console) -> Any:
         return config, ()
     workload = workload_of(config)
     if workload.platform_on(machine) == "gpu":
-        require_num_gpus(workload.num_gpus, candidates(workload.plan, machine))
+        require_num_gpus(workload.plan.num_gpus, candidates(workload.plan, machine))
     found = Search(workload, machine, console).result()
     return workload.settled(found.point, found.split), (found.reason,)
 
@@ -158,12 +158,12 @@ class Search:
         assert isinstance(best.result, Measured)
         workload = self._workload
         split = workload.split(best.result)
-        reason = verdict(outcome, self._grid, workload.num_gpus, split)
+        reason = verdict(outcome, self._grid, workload.plan.num_gpus, split)
         device, label = workload.device(self._machine), workload.config.env.label
         report = plain_data(outcome, self._isolated, reason, split) | {
             "env": label,
             "device": device,
-            "num_gpus": workload.num_gpus,
+            "num_gpus": workload.plan.num_gpus,
             "grid": self._grid._asdict(),
             "search": to_dict(self._settings),
             "wall_s": time.monotonic() - started_s,

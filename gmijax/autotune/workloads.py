@@ -124,7 +124,7 @@ class Workload(Generic[C]):
 
     def projected(self, point: Point, measured: Measured) -> float:
         """Environment steps a second of the whole job."""
-        return estimate(point.gmis_per_gpu, self.num_gpus, measured)
+        return estimate(point.gmis_per_gpu, self.plan.num_gpus, measured)
 
     def top(self, measured: Measured) -> float:
         """What Sat goes by; the paper's `top`."""
@@ -150,13 +150,6 @@ class Workload(Generic[C]):
         """See `settled`."""
         del split
         return dataclasses.replace(self.config.plan, gmis_per_gpu=point.gmis_per_gpu)
-
-    @property
-    def num_gpus(self) -> int:
-        """GPUs of the whole job."""
-        if self.plan.layout is not None:
-            return len(self.plan.layout)
-        return self.plan.gpus if isinstance(self.plan.gpus, int) else len(self.plan.gpus)
 
     def platform_on(self, machine: Machine) -> Literal["cpu", "gpu"]:
         """What the GMIs will run on."""

@@ -107,6 +107,13 @@ class PlanConfig(KeyGroup):
                 )
 
     @property
+    def num_gpus(self) -> int:
+        """GPUs of the whole job."""
+        if self.layout is not None:
+            return len(self.layout)
+        return self.gpus if isinstance(self.gpus, int) else len(self.gpus)
+
+    @property
     def needs_mps(self) -> bool:
         """Whether something is wanted that only MPS has."""
         return self.sm_percent is not None or self.mps_priority is not None

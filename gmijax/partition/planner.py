@@ -114,8 +114,7 @@ def num_gmis_of(plan: PlanConfig) -> tuple[int, str]:
     """How many GMIs a job has, and the settings that say so; before there is a layout."""
     if plan.layout is not None:
         return sum(map(len, plan.layout)), "plan.layout"
-    num_gpus = plan.gpus if isinstance(plan.gpus, int) else len(plan.gpus)
-    each = plan.gmis_per_gpu
+    num_gpus, each = plan.num_gpus, plan.gmis_per_gpu
     if each == "auto":
         raise ConfigError("plan.gmis_per_gpu=auto: not decided yet; expected an integer")
     gpus = f", plan.gpus={num_gpus}" if num_gpus > 1 else ""
@@ -131,12 +130,11 @@ def split_cores(cores: Sequence[int], num_gmis: int) -> tuple[tuple[int, ...], .
 
 
 def _layout(plan: PlanConfig) -> Layout:
-    num_gpus = plan.gpus if isinstance(plan.gpus, int) else len(plan.gpus)
     if plan.layout is None:
         assert plan.gmis_per_gpu != "auto"
-        return Layout.even(num_gpus, plan.gmis_per_gpu)
+        return Layout.even(plan.num_gpus, plan.gmis_per_gpu)
     layout = Layout(plan.layout)
-    if not isinstance(plan.gpus, int) and num_gpus != layout.num_gpus:
+    if not isinstance(plan.gpus, int) and len(plan.gpus) != layout.num_gpus:
         raise ConfigError(
             f"plan.gpus={list(plan.gpus)}: plan.layout has {layout.num_gpus} GPUs, "
             f"so give {layout.num_gpus} indices or none"

@@ -152,7 +152,7 @@ def test_profiled_are_gpus_of_the_job():
     plan = workload.plan_at(Point(1, 64, "jax", 2), "corun", machine(4))
     used = {share.device: role for share, role in zip(plan.slices, plan.roles, strict=True)}
     assert used == {gpu(1).uuid: "trainer", gpu(2).uuid: "simulator+agent"}
-    assert workload.num_gpus == 3
+    assert workload.plan.num_gpus == 3
 
 
 ONE = Measured(50.0, 100.0, 0.1, 0.0, acting_per_s=100.0, learning_per_s=300.0)
