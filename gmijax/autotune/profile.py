@@ -5,6 +5,7 @@ Whatever goes wrong in the job is an answer, not an error.
 
 from __future__ import annotations
 
+import dataclasses
 import shutil
 import time
 from collections.abc import Callable, Sequence
@@ -20,7 +21,9 @@ from gmijax.rundir import RunPaths, write_json
 from gmijax.schema import to_dict
 from gmijax.supervise.launcher import Launch, run_gmis
 
-_GRACE_S: Final = 3.0
+_PATIENCE: Final = Patience(
+    start_timeout_s=60.0, stall_timeout_s=60.0, stop_timeout_s=3.0, grace_s=3.0
+)
 
 
 class ProfileLate(Exception):
@@ -64,12 +67,8 @@ def profile(
         machine=machine,
         run=run,
         kind=workload.kind,
-        # The supervisor's own limits are for jobs of unknown length.
-        patience=Patience(
-            start_timeout_s=2 * limit_s,
-            stall_timeout_s=2 * limit_s,
-            stop_timeout_s=_GRACE_S,
-            grace_s=_GRACE_S,
+        patience=dataclasses.replace(
+            _PATIENCE, start_timeout_s=2 * limit_s, stall_timeout_s=2 * limit_s
         ),
         on_warning=on_warning,
         is_enough=workload.enough(plan, run),

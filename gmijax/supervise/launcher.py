@@ -96,13 +96,7 @@ def run_gmis(
         # First, so that it ends last: a signal must not cut off the end of the backend.
         if launch.stops_gracefully and signals is None:
             signals = held.enter_context(stop_signals())
-        inherited: dict[str, int] = {}
-        blocks = dict(kind.shared(plan))
-        if plan.layout.num_gmis > 1:
-            blocks[ENV_EXCHANGE_FD] = create_exchange
-        for name, create in blocks.items():
-            inherited[name] = create()
-            held.callback(os.close, inherited[name])
+        inherited = _shared_blocks(held, kind, plan)
         rendezvous = held.enter_context(reserved_address()) if has_rings else None
         launch, backend = _enter_backend(held, launch)
 
@@ -130,6 +124,18 @@ def run_gmis(
             drop_broken_programs(
                 programs, [launch.run.gmi(gmi).stderr for gmi in plan.layout.gmis]
             )
+
+
+def _shared_blocks(held: ExitStack, kind: JobKind, plan: Plan) -> dict[str, int]:
+    """Descriptors of the memory that the GMIs share, by the variable that names each."""
+    opened: dict[str, int] = {}
+    blocks = dict(kind.shared(plan))
+    if plan.layout.num_gmis > 1:
+        blocks[ENV_EXCHANGE_FD] = create_exchange
+    for name, create in blocks.items():
+        opened[name] = create()
+        held.callback(os.close, opened[name])
+    return opened
 
 
 def _ticks(launch: Launch, supervisor: Supervisor, on_tick: OnTick | None) -> OnTick:
