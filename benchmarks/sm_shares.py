@@ -100,16 +100,12 @@ def measure(
     has_gpu = bool(machine.gpus)
     plan = make_plan(
         PlanConfig(
-            gpus=1,
             gmis_per_gpu=len(shares),
-            layout=None,
             backend="mps" if has_gpu else "cpu",
             sm_percent=tuple(shares) if has_gpu else None,
-            memory_fraction=None,
-            template="auto",
             force_sm_percent=True,
         ),
-        ReduceConfig(strategy="auto", intra="auto", timeout_s=60),
+        ReduceConfig(),
         1,
         machine,
     )

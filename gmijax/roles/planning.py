@@ -49,7 +49,6 @@ def plan(
         "backend": backend,
         "sm_percent": sm_percent,
         "memory_fraction": memory_fraction,
-        "template": "auto",
     }
     # As from a command line: what is no number, or not among the allowed, is told in one line.
     wanted = from_dict(PlanConfig, {key: _plain(value) for key, value in given.items()}, "plan.")
