@@ -32,7 +32,7 @@ EXIT_OK, EXIT_BROKEN, EXIT_BAD_INPUT, EXIT_INTERRUPTED = 0, 1, 2, 130
 
 
 class Options(NamedTuple):
-    """What the command line asks for."""
+    """Options of the command line."""
 
     as_json: bool = False
     mig: str | None = None

@@ -38,7 +38,7 @@ class GuardPipe:
             os.write(self._write_end, data)
 
     def close(self) -> None:
-        """Ends the pipe; calling it twice is fine."""
+        """Ends the pipe; idempotent."""
         if self._write_end in self._open:
             self._open.discard(self._write_end)
             os.close(self._write_end)

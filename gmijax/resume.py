@@ -19,7 +19,7 @@ _CHUNK_BYTES: Final = 1 << 20
 
 @dataclass(frozen=True)
 class CheckpointMeta:
-    """What a checkpoint holds.
+    """Meta data of a checkpoint.
 
     Attributes:
       env: task name.
@@ -62,7 +62,7 @@ class CheckpointMeta:
 
 
 class Found(NamedTuple):
-    """What was found in a run folder.
+    """Checkpoints of a run folder.
 
     Attributes:
       checkpoint: the newest one that is whole, None if there is none.

@@ -71,7 +71,7 @@ def window_start(lines: Sequence[Line], iterations: int) -> int | None:
 
 
 def measured_of(lines: Sequence[Line], num_agents: int, memory_mib: float) -> Measured:
-    """What a profile says of one serving GMI, and of a serving and a training GPU.
+    """Rates of one serving GMI, and of a serving and a training GPU, from a profile.
 
     Trainers could learn from TTOP x (update + wait for a batch) / update, agents could make PPS /
     (1 - the part of their time for which they had to wait for room).
@@ -103,7 +103,7 @@ def measured_of(lines: Sequence[Line], num_agents: int, memory_mib: float) -> Me
 
 
 def read(run: RunPaths, iterations: int, num_agents: int, memory_mib: float) -> Measured:
-    """What was measured of one GMI, from the run folder of a profile.
+    """Figures of one GMI from the run folder of a profile.
 
     Raises:
       ValueError: too few lines of metrics.

@@ -10,7 +10,7 @@ _COARSE_SIZES: Final = 2
 
 
 class Point(NamedTuple):
-    """What is to be measured.
+    """A point of the grid.
 
     Attributes:
       gmis_per_gpu: GMIs on every GPU; where others train, those that act on every GPU that acts.
@@ -40,7 +40,7 @@ class Point(NamedTuple):
 
 
 class Measured(NamedTuple):
-    """What was measured at a point, of one GMI.
+    """Figures of one GMI at a point.
 
     Attributes:
       env_steps_per_s: environment steps a second of one GMI, the paper's `top`; where others

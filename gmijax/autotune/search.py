@@ -94,7 +94,7 @@ class Visited(NamedTuple):
 
 
 class Outcome(NamedTuple):
-    """What a search found.
+    """Result of a search.
 
     Attributes:
       visited: all points that were looked at, in order.
@@ -166,7 +166,7 @@ def best(visited: Mapping[Point, Visited], tolerance: float) -> Visited | None:
 
 
 class _Book:
-    """What was measured so far; measures no point twice."""
+    """Points measured so far; measures no point twice."""
 
     def __init__(self, profile: Profile, rules: Rules) -> None:
         self.visited: dict[Point, Visited] = {}

@@ -39,7 +39,7 @@ class ProfileStore:
         Args:
           folder: where the files of all devices and tasks are.
           key: everything that decides what a point does; `device` and `task` name the file.
-          note: is told, in a sentence, that a broken file was moved aside.
+          note: gets a sentence where a broken file was moved aside.
 
         Raises:
           ConfigError: the folder cannot be used.
@@ -58,7 +58,7 @@ class ProfileStore:
         self._records = self._load()
 
     def get(self, mode: str, point: Point) -> Measured | NotRunnable | None:
-        """What a point did, None where it was not profiled yet."""
+        """Result of a point, None where it was not profiled yet."""
         record = self._records.get(_name(mode, point))
         return _result(record) if record else None
 
@@ -135,7 +135,7 @@ def _slug(text: object) -> str:
 
 
 def _result(record: Mapping[str, Any]) -> Measured | NotRunnable:
-    """What a profile in the file says; versions without trainers left some figures out.
+    """Result of a profile in the file; versions without trainers left some figures out.
 
     Raises:
       ConfigError, ValueError, TypeError: it is broken.

@@ -39,7 +39,7 @@ from gmijax.sim.impl import choose_impl
 
 
 class SearchResult(NamedTuple):
-    """What a search found.
+    """Result of a search.
 
     Attributes:
       run_dir: its folder, None where the profile store had everything.
@@ -200,7 +200,7 @@ class Search:
         return outcome
 
     def _profile(self, point: Point, mode: Mode) -> Measured | NotRunnable:
-        """What a point did: from the store, else from a job of its own."""
+        """Result of a point: from the store, else from a job of its own."""
         what = f"{point} ({mode})"
         try:
             self._workload.plan_at(point, mode, self._machine)

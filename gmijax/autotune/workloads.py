@@ -76,7 +76,7 @@ class Workload(Generic[C]):
         raise NotImplementedError
 
     def read(self, plan: Plan, run: RunPaths) -> Measured:
-        """What was measured of one GMI, from the run folder of a profile."""
+        """Figures of one GMI from the run folder of a profile."""
         raise NotImplementedError
 
     @property
@@ -152,7 +152,7 @@ class Workload(Generic[C]):
         return dataclasses.replace(self.config.plan, gmis_per_gpu=point.gmis_per_gpu)
 
     def platform_on(self, machine: Machine) -> Literal["cpu", "gpu"]:
-        """What the GMIs will run on."""
+        """Platform of the GMIs."""
         return "gpu" if machine.gpus and self.plan.backend != "cpu" else "cpu"
 
     def device(self, machine: Machine) -> str:

@@ -14,7 +14,7 @@ ADAPTIVE_LEARNING_RATE_RANGE = (1e-5, 1e-2)
 
 @dataclass(frozen=True, kw_only=True)
 class ActorCriticConfig(KeyGroup):
-    """What PPO and A3C share; some keys mean a little else to each, and are told there."""
+    """Keys that PPO and A3C share; those that differ in meaning are documented in each."""
 
     prefix = "algo."
 

@@ -58,7 +58,7 @@ class EnvConfig(KeyGroup):
 
     @property
     def label(self) -> str:
-        """What a task is called in files and messages: `ant`, `brax/ant`, `cart.py:make`."""
+        """Name of the task in files and messages: `ant`, `brax/ant`, `cart.py:make`."""
         if self.suite == "custom":
             return PurePath(str(self.name)).name
         return str(self.name) if self.suite == "gmijax" else f"{self.suite}/{self.name}"

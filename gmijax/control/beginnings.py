@@ -34,7 +34,7 @@ class Beginning(NamedTuple):
 
 
 def find_beginning(config: TrainConfig) -> Beginning:
-    """What `run.resume`, `run.dir` and `run.name` come to; nothing is changed on the disk.
+    """Reads `run.resume`, `run.dir` and `run.name`; changes nothing on the disk.
 
     Raises:
       ConfigError: a folder that exists and must not, no checkpoint, or one that does not fit.

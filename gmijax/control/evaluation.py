@@ -43,7 +43,7 @@ _MOST_DIGITS: Final = 18
 
 
 class Evaluation(NamedTuple):
-    """What playing a checkpoint leaves.
+    """Result of playing a checkpoint.
 
     Attributes:
       returns: the content of `returns.json`.

@@ -32,7 +32,7 @@ from gmijax.supervise.launcher import Launch, patience_of, recorded
 
 
 class Result(NamedTuple):
-    """What a training job leaves.
+    """Result of a training job.
 
     Attributes:
       run_dir: the run folder.
@@ -153,7 +153,7 @@ def _from(config: TrainConfig, checkpoint: Path | None) -> TrainConfig:
 
 
 def _finished(config: TrainConfig, run: RunPaths, console: Console) -> Result:
-    """What a run left that needs nothing more; with the summary that it may lack."""
+    """Result of a run that is complete; writes the summary if it is missing."""
     summary = read_json(run.summary) if run.summary.exists() else {}
     if summary.get("status") != "completed":
         plan = Plan.from_dict(read_json(run.plan))
@@ -164,7 +164,7 @@ def _finished(config: TrainConfig, run: RunPaths, console: Console) -> Result:
 
 
 def _what_is_left(run: RunPaths) -> str:
-    """What an interrupted job leaves, in words."""
+    """Says how an interrupted job can be continued."""
     if run.gmi(0).result.exists() and read_json(run.gmi(0).result)["status"] == "completed":
         return f"training was complete: {run.root}"
     if any(run.checkpoints.glob("[0-9]*")):

@@ -205,7 +205,7 @@ def estimated_floats(*hidden: Sequence[int]) -> int:
 
 
 def _kept(path: Path, probes: Sequence[Probe]) -> dict[str, dict[str, Any]]:
-    """What was measured earlier; nothing if that cannot be read, or lacks one of the probes."""
+    """Earlier measurements; empty if that cannot be read, or lacks one of the probes."""
     try:
         found = read_json(path)
         for probe in probes:

@@ -43,7 +43,7 @@ from gmijax.supervise.launcher import Launch, patience_of, recorded, run_gmis
 
 
 class Served(NamedTuple):
-    """What a serving job leaves.
+    """Result of a serving job.
 
     Attributes:
       run_dir: the folder of the job.
@@ -228,7 +228,7 @@ def _run(job: _Job, kept: int, run: RunPaths, console: Console) -> dict[str, Any
 
 
 def _output(job: _Job, kept: int) -> dict[str, Any] | None:
-    """What is in the output folder now, None without one."""
+    """Content of the output folder, None without one."""
     if job.data is None:
         return None
     finished = list(job.data.finished())

@@ -66,7 +66,7 @@ def train_summary(
 
 
 def _last_known(run: RunPaths) -> dict[str, Any]:
-    """What the metrics say of a job that did not end by itself."""
+    """Last metrics of a job that did not end by itself."""
     lines = read_metrics(run.metrics)
     if not lines:
         return {}
@@ -169,7 +169,7 @@ def _milliseconds(seconds: Sequence[Sequence[float]]) -> dict[str, float | int] 
 
 
 def _result(run: RunPaths, gmi: int) -> dict[str, Any]:
-    """What a GMI left, or what its lines say if it did not end by itself."""
+    """Result of a GMI, or its last metrics if it did not end by itself."""
     paths = run.gmi(gmi)
     if paths.result.exists():
         return read_json(paths.result)

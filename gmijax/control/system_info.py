@@ -1,4 +1,4 @@
-"""What is found on this machine for `gmijax.doctor`. No jax here: a child asks it."""
+"""State of this machine for `gmijax.doctor`. No jax here: a child asks it."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ _CUDA_VARIABLES: Final = ("XLA_CLIENT_MEM_FRACTION", "XLA_PYTHON_CLIENT_MEM_FRAC
 
 
 class JaxView(NamedTuple):
-    """What jax says in a process that is started as a GMI would be.
+    """Devices that jax sees in a process that is started as a GMI would be.
 
     Attributes:
       platform: `cpu` or `gpu`; None where jax failed.
@@ -46,7 +46,7 @@ class JaxView(NamedTuple):
 
 
 class SystemInfo(NamedTuple):
-    """What was found on this machine.
+    """State of this machine.
 
     Attributes:
       machine: GPUs, driver, MPS.
@@ -82,7 +82,7 @@ def look() -> SystemInfo:
 
 
 def device_of(gpu: Gpu) -> str | None:
-    """What a process would be shown of a GPU, None if nothing can be used."""
+    """UUID that a process gets for a GPU, None if it cannot be used."""
     if gpu.compute_mode == "prohibited":
         return None
     if not gpu.mig_enabled:

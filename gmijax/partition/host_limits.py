@@ -40,7 +40,7 @@ for its core longer than it computes, and twice as many would compile at a time.
 
 
 class Host(NamedTuple):
-    """What is left for the GMIs of a job, None where it is not known or not limited.
+    """Free resources for the GMIs of a job, None where unknown or unlimited.
 
     Attributes:
       memory_mib: of the machine, or of the control group that this process is in.

@@ -46,7 +46,7 @@ SharedBlocks = Mapping[str, Callable[[], int]]
 
 @dataclass(frozen=True)
 class JobKind:
-    """What the GMIs of a job run and share.
+    """Main of the GMIs of a job, and the memory that they share.
 
     Attributes:
       module: main of every GMI, started by name.

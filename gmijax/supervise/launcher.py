@@ -250,7 +250,7 @@ class StopSignals:
         self._last_s[number] = now_s
 
     def forward_to(self, request_stop: Callable[[], None]) -> None:
-        """Who is told, also of what has come before."""
+        """Forwards requests, also those that have come before."""
         self._forward = request_stop
         for _ in range(self._requests):
             request_stop()
