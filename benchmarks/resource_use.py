@@ -25,12 +25,12 @@ import jax
 import jax.numpy as jnp
 import pynvml
 
+from benchmarks.paper_model import dominant_resource
 from benchmarks.run import RESULTS
 from gmijax import compose
 from gmijax.acting import act
 from gmijax.config import PpoConfig, TrainConfig
 from gmijax.learner import Learner, acting_moments, init_learner, make_learner
-from gmijax.partition.resource_model import dominant_resource
 from gmijax.ppo.losses import Samples
 from gmijax.ppo.programs import learn
 from gmijax.ppo.rollout import stats_example

@@ -1,13 +1,19 @@
-"""Where gmijax keeps compiled programs, profiles and measurements. No jax here."""
+"""The cache folder: compiled programs, profiles and measurements. No jax here."""
 
 from __future__ import annotations
 
 import os
+import re
 import stat
 import tempfile
+from collections.abc import Iterable
+from contextlib import suppress
 from pathlib import Path
 
 from gmijax.errors import ConfigError
+
+_BROKEN = re.compile(r"Error reading persistent compilation cache entry for '([\w.<>-]+)'")
+"""The warning of JAX; it names the program, not the file."""
 
 _ADVICE = "set XDG_CACHE_HOME to a folder of your own"
 
@@ -22,6 +28,38 @@ def cache_folder() -> Path:
       ConfigError: there is none, and a temporary one cannot be had.
     """
     return _of_user() or _temporary()
+
+
+def compilation_cache_dir() -> Path:
+    """Where compiled programs stay between runs, unless JAX_COMPILATION_CACHE_DIR says else."""
+    return cache_folder() / "xla"
+
+
+def drop_broken_programs(cache: Path, logs: Iterable[Path]) -> int:
+    """Removes entries of programs that GMIs could not read, so that the next job writes them.
+
+    JAX writes an entry in place and never writes over one that is there. A process that is killed
+    meanwhile, or a full disk, leaves half an entry: every GMI of every later job would then
+    compile that program by itself.
+
+    Args:
+      cache: the folder, `JAX_COMPILATION_CACHE_DIR` of the GMIs.
+      logs: stderr of the GMIs.
+
+    Returns:
+      The number of files removed: all entries of these programs, good ones too.
+    """
+    names: set[str] = set()
+    for log in logs:
+        with suppress(OSError):
+            names.update(_BROKEN.findall(log.read_text(errors="replace")))
+    removed = 0
+    for name in names:
+        for entry in cache.glob(f"{name}-*"):
+            with suppress(OSError):
+                entry.unlink()
+                removed += 1
+    return removed
 
 
 def why_temporary() -> str | None:

@@ -1,17 +1,11 @@
-"""Command lines: hydra overrides in, a checked configuration out, exit codes. Only hydra user.
-
-`key=value` overrides, `--help` (every key with its meaning), `--cfg job` (the composed
-configuration). Exit codes: 0 success, 2 bad input (one line), 130 interrupted, 1 anything else.
-"""
+"""From `key=value` overrides to a checked configuration; the only user of hydra."""
 
 from __future__ import annotations
 
 import re
-import sys
 import typing
 import unicodedata
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from functools import partial
 from pathlib import Path
 from typing import Any, Literal, TypeVar, overload
 
@@ -23,11 +17,11 @@ from hydra.errors import HydraException
 from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from gmijax.cli_help import print_help
+import gmijax
 from gmijax.config import ServeConfig, TrainConfig
-from gmijax.errors import ConfigError, GmijaxError, JobInterrupted
+from gmijax.errors import ConfigError
 from gmijax.resume import saved_config_of
-from gmijax.schema import from_dict, suggestion, to_dict
+from gmijax.schema import from_dict, suggestion
 from gmijax.sim.registry import SUITES
 from gmijax.sim.source import reference
 
@@ -41,8 +35,6 @@ _COMPOSED: Mapping[str, type[Any]] = {
 
 _NOT_TEXT = ("Cc", "Cs", "Zl", "Zp")
 """Unicode's categories of control characters, surrogates, and ends of lines and paragraphs."""
-
-EXIT_OK, EXIT_FAILED, EXIT_BAD_INPUT, EXIT_INTERRUPTED = 0, 1, 2, 130
 
 
 @overload
@@ -79,35 +71,12 @@ def compose(*overrides: str, command: str = "train", env: Callable[..., Any] | N
     chosen = () if env is None else (f"env={reference(env)}",)
     if command not in _COMPOSED:
         raise ConfigError(f"command={command}: allowed are {', '.join(_COMPOSED)}")
-    return _build(command, _COMPOSED[command], (*chosen, *overrides))
-
-
-def command(name: str, cls: type[C], run: Callable[[C], int], argv: Sequence[str]) -> int:
-    """Runs one of the commands and turns every error into its exit code."""
-    try:
-        if "--help" in argv or "-h" in argv:
-            print_help(name, cls, partial(_defaults, name), choices)
-            return EXIT_OK
-        overrides, show = _split_options(argv)
-        config = _build(name, cls, overrides)
-        if show:
-            sys.stdout.write(OmegaConf.to_yaml(OmegaConf.create(to_dict(config))))
-            return EXIT_OK
-        return run(config)
-    except ConfigError as error:
-        _complain(name, error)
-        return EXIT_BAD_INPUT
-    except (JobInterrupted, KeyboardInterrupt) as error:
-        _complain(name, error if str(error) else "interrupted")
-        return EXIT_INTERRUPTED
-    except GmijaxError as error:
-        _complain(name, error)
-        return EXIT_FAILED
+    return build(command, _COMPOSED[command], (*chosen, *overrides))
 
 
 def config_dir() -> Path:
     """The folder of YAML files: inside an installed package, or beside it in a checkout."""
-    package = Path(__file__).resolve().parent
+    package = Path(gmijax.__file__).resolve().parent
     installed = package / "configs"
     return installed if installed.is_dir() else package.parent / "configs"
 
@@ -119,7 +88,8 @@ def choices(group: str) -> list[str]:
     return sorted(path.stem for folder in folders for path in folder.glob("*.yaml"))
 
 
-def _build(name: str, cls: type[C], overrides: Sequence[str]) -> C:
+def build(name: str, cls: type[C], overrides: Sequence[str]) -> C:
+    """The configuration of a command; raises as `compose`."""
     overrides = [part for text in overrides for part in _with_custom_task(name, text)]
     data = _compose_dict(name, [*_algorithm_of_resumed(name, overrides), *overrides])
     if cls is ServeConfig:
@@ -310,10 +280,11 @@ def _one_line(name: str, error: Exception) -> str:
 
 
 def _known_keys(name: str) -> list[str]:
-    return list(_defaults(name, ()))
+    return list(defaults(name, ()))
 
 
-def _defaults(name: str, overrides: Sequence[str]) -> dict[str, Any]:
+def defaults(name: str, overrides: Sequence[str]) -> dict[str, Any]:
+    """The values of all keys of a command, by dotted name, with some overrides."""
     return _flatten(_compose_dict(name, overrides))
 
 
@@ -325,26 +296,3 @@ def _flatten(data: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
         else:
             flat[f"{prefix}{key}"] = value
     return flat
-
-
-def _split_options(argv: Sequence[str]) -> tuple[list[str], bool]:
-    arguments = [part for text in argv for part in re.split(r"^(--cfg)=", text) if part]
-    show = False
-    if "--cfg" in arguments:
-        at = arguments.index("--cfg")
-        if arguments[at + 1 : at + 2] != ["job"]:
-            raise ConfigError(f"--cfg {' '.join(arguments[at + 1 : at + 2])}: allowed is job")
-        del arguments[at : at + 2]
-        show = True
-    for text in arguments:
-        if text.startswith("-"):
-            raise ConfigError(f"unknown option {text}: allowed are --help, --cfg job, key=value")
-    return arguments, show
-
-
-def _complain(name: str, what: object) -> None:
-    notes = getattr(what, "__notes__", [])
-    text = "; ".join([str(what), *notes])
-    # One line, whatever is in the values that it shows.
-    shown = "".join(c if c.isprintable() else ascii(c)[1:-1] for c in text)
-    sys.stderr.write(f"gmijax.{name}: {shown}\n")

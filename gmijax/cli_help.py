@@ -19,14 +19,7 @@ def print_help(
     defaults_of: Callable[[Sequence[str]], Mapping[str, Any]],
     choices: Callable[[str], Sequence[str]],
 ) -> None:
-    """Prints how a command is used, and every key with its default and meaning.
-
-    Args:
-      name: of the command.
-      cls: its configuration.
-      defaults_of: the values of all keys, by dotted name, with some overrides.
-      choices: what a group of keys can be chosen from.
-    """
+    """Prints how a command is used, and every key with its default and meaning."""
     values = defaults_of(())
     table = Table(box=None, pad_edge=False)
     for heading in ("key", "default", "meaning"):

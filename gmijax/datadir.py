@@ -81,10 +81,6 @@ class DataPaths:
 def open_dataset(paths: DataPaths, about: Mapping[str, Any]) -> None:
     """Makes the folder, or checks that what is in it can be continued.
 
-    Args:
-      paths: the folder.
-      about: what all shards have in common; those of a folder that is continued must be equal.
-
     Raises:
       ConfigError: the folder cannot be written, holds something else, or experience that was
         collected in another way.

@@ -11,7 +11,7 @@ from rich.console import Console
 from rich.table import Table
 
 from gmijax.control.diagnosis import Diagnosis, diagnose
-from gmijax.control.sight import look
+from gmijax.control.system_info import look
 from gmijax.errors import ConfigError
 from gmijax.partition.machine import Machine, detect_machine
 from gmijax.partition.mig_split import split_commands
@@ -32,7 +32,7 @@ EXIT_OK, EXIT_BROKEN, EXIT_BAD_INPUT, EXIT_INTERRUPTED = 0, 1, 2, 130
 
 
 class Options(NamedTuple):
-    """What the command line asks for."""
+    """Options of the command line."""
 
     as_json: bool = False
     mig: str | None = None
@@ -111,8 +111,8 @@ def split_text(wanted: str, index: int | None, machine: Machine) -> str:
 
 def show(found: Diagnosis, console: Console) -> None:
     """Prints the diagnosis for people."""
-    sight = found.sight
-    machine = sight.machine
+    system = found.system
+    machine = system.machine
     console.print(
         f"gmijax {__version__}, Python {sys.version.split()[0]}, {len(machine.cpu_cores)} CPU "
         f"cores, NVIDIA driver {machine.driver_version or 'none'}",
@@ -130,9 +130,9 @@ def show(found: Diagnosis, console: Console) -> None:
                 f"  {one.profile}: {one.num_sms} SMs, {one.memory_mib} MiB, {one.uuid}",
                 markup=False,
             )
-    devices = ", ".join(sight.jax.devices)
-    console.print(f"jax sees: {devices or sight.jax.error}", markup=False)
-    installed = [f"{name} {number}" for name, number in sight.versions.items() if number]
+    devices = ", ".join(system.jax.devices)
+    console.print(f"jax sees: {devices or system.jax.error}", markup=False)
+    installed = [f"{name} {number}" for name, number in system.versions.items() if number]
     console.print(f"packages: {', '.join(installed)}\n", markup=False)
     console.print(_table(found))
     for note in found.notes:

@@ -19,7 +19,7 @@ _CHUNK_BYTES: Final = 1 << 20
 
 @dataclass(frozen=True)
 class CheckpointMeta:
-    """What a checkpoint holds.
+    """Meta data of a checkpoint.
 
     Attributes:
       env: task name.
@@ -62,7 +62,7 @@ class CheckpointMeta:
 
 
 class Found(NamedTuple):
-    """What was found in a run folder.
+    """Checkpoints of a run folder.
 
     Attributes:
       checkpoint: the newest one that is whole, None if there is none.
@@ -114,10 +114,6 @@ def find_checkpoint(wanted: str, key: str) -> Path:
 
     `last` is the run below `runs/` with the newest checkpoint; a run folder means its newest one
     that is whole.
-
-    Args:
-      wanted: value of the key.
-      key: the configuration key, for messages.
 
     Raises:
       ConfigError: there is none.
@@ -182,13 +178,6 @@ def saved_config(checkpoint: Path) -> dict[str, Any]:
     return saved
 
 
-def saved_job(run: RunPaths) -> tuple[str, str]:
-    """Task and algorithm of a run folder, by name; raises as `saved_config`."""
-    # The folder of a checkpoint that may not be there yet.
-    env, algo = trained_config(run.checkpoint(0))
-    return env.label, algo.name
-
-
 def trained_config(checkpoint: Path) -> tuple[EnvConfig, AlgoConfig]:
     """Task and algorithm of the run that a checkpoint lies in.
 
@@ -198,21 +187,6 @@ def trained_config(checkpoint: Path) -> tuple[EnvConfig, AlgoConfig]:
     saved = saved_config(checkpoint)
     algo = from_named(ALGORITHMS, saved["algo"], "algo.")
     return from_dict(EnvConfig, saved["env"], "env."), algo
-
-
-def check_fits(meta: CheckpointMeta, wanted: CheckpointMeta, key: str, value: str) -> None:
-    """Raises ConfigError if a job like `wanted` cannot continue from a checkpoint `meta`."""
-    for name, have, want in (
-        ("task", meta.env, wanted.env),
-        ("algorithm", meta.algo, wanted.algo),
-        ("network widths", _shown(meta.hidden), _shown(wanted.hidden)),
-    ):
-        if have != want:
-            raise ConfigError(f"{key}={value}: checkpoint of {name} {have}, not {want}")
-
-
-def _shown(hidden: tuple[tuple[int, ...], ...]) -> str:
-    return " and ".join(":".join(map(str, widths)) for widths in hidden)
 
 
 def _read_object(path: Path) -> dict[str, Any]:

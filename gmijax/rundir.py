@@ -4,6 +4,7 @@
 `<run>/checkpoints/<12-digit env steps>/meta.json`
 `<run>/gmi_<id>/{stdout.log,stderr.log,error.json,result.json,metrics.jsonl}`
 `<run>/gmi_<id>/attempt_<n>/`: the same files of attempts that failed
+`<run>/play/<12-digit env steps>/`: a played checkpoint, see `PlayPaths`
 """
 
 from __future__ import annotations
@@ -15,7 +16,6 @@ import re
 import threading
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
 from typing import Any
@@ -30,120 +30,94 @@ STEP_DIGITS = 12
 META = "meta.json"
 """Written last into a checkpoint: a folder without it is not one."""
 
+EXIT_NO_GL = 3
+"""Exit code of the renderer where the OpenGL that it was told to use cannot be had."""
+
 _TEMPORARY = re.compile(r"\..+\.\d+-\d+")
 """Names that files have while they are written."""
 
 
-@dataclass(frozen=True)
-class GmiPaths:
+class _Folder:
+    """A folder whose files have names here; equal to another one of the same path."""
+
+    def __init__(self, root: Path) -> None:
+        self.root = root
+
+    def __eq__(self, other: object) -> bool:
+        return type(other) is type(self) and vars(other) == vars(self)
+
+    def __hash__(self) -> int:
+        return hash(self.root)
+
+    def __repr__(self) -> str:
+        return f"{type(self).__name__}({str(self.root)!r})"
+
+
+class GmiPaths(_Folder):
     """Files of one GMI."""
 
-    root: Path
-
-    @property
-    def stdout(self) -> Path:
-        """What the process prints."""
-        return self.root / "stdout.log"
-
-    @property
-    def stderr(self) -> Path:
-        """What the process and its libraries complain about."""
-        return self.root / "stderr.log"
-
-    @property
-    def error(self) -> Path:
-        """Why the GMI failed: type, message, traceback."""
-        return self.root / "error.json"
-
-    @property
-    def result(self) -> Path:
-        """What the GMI's role returned."""
-        return self.root / "result.json"
-
-    @property
-    def role(self) -> Path:
-        """A role of the user's own and its arguments, pickled."""
-        return self.root / "role.pickle"
-
-    @property
-    def output(self) -> Path:
-        """What a role of the user's own returned, pickled."""
-        return self.root / "output.pickle"
-
-    @property
-    def metrics(self) -> Path:
-        """Lines of a GMI that reports for itself alone."""
-        return self.root / "metrics.jsonl"
+    def __init__(self, root: Path) -> None:
+        super().__init__(root)
+        self.stdout = root / "stdout.log"
+        self.stderr = root / "stderr.log"
+        self.error = root / "error.json"  # Why it failed: type, message, traceback.
+        self.result = root / "result.json"  # What its main returned.
+        self.role = root / "role.pickle"  # A role of the user's own and its arguments.
+        self.output = root / "output.pickle"  # What that returned.
+        self.metrics = root / "metrics.jsonl"  # Of a GMI that reports for itself alone.
 
 
-@dataclass(frozen=True)
-class RunPaths:
+class RunPaths(_Folder):
     """Files of one run."""
 
-    root: Path
-
-    @property
-    def config(self) -> Path:
-        """The composed configuration."""
-        return self.root / "config.json"
-
-    @property
-    def plan(self) -> Path:
-        """The partition."""
-        return self.root / "plan.json"
-
-    @property
-    def summary(self) -> Path:
-        """The outcome."""
-        return self.root / "summary.json"
-
-    @property
-    def metrics(self) -> Path:
-        """One JSON object a line and iteration."""
-        return self.root / "metrics.jsonl"
-
-    @property
-    def tensorboard(self) -> Path:
-        """Folder of TensorBoard event files."""
-        return self.root / "tensorboard"
-
-    @property
-    def returns_png(self) -> Path:
-        """Picture of the return curve."""
-        return self.root / "returns.png"
-
-    @property
-    def checkpoints(self) -> Path:
-        """Folder of checkpoints."""
-        return self.root / "checkpoints"
-
-    @property
-    def mps(self) -> Path:
-        """Folder of the logs of MPS daemons that the job starts."""
-        return self.root / "mps"
-
-    @property
-    def janitor_log(self) -> Path:
-        """Errors of the process that cleans up after a killed controller; gone without any."""
-        return self.root / "janitor.log"
-
-    @property
-    def lock(self) -> Path:
-        """Held by the job that writes into the folder."""
-        return self.root / ".lock"
-
-    @property
-    def events(self) -> Path:
-        """Starts, faults and restarts of the job, one JSON object a line."""
-        return self.root / "events.jsonl"
+    def __init__(self, root: Path) -> None:
+        super().__init__(root)
+        self.config = root / "config.json"
+        self.plan = root / "plan.json"
+        self.summary = root / "summary.json"
+        self.metrics = root / "metrics.jsonl"  # One JSON object a line and iteration.
+        self.tensorboard = root / "tensorboard"
+        self.returns_png = root / "returns.png"
+        self.checkpoints = root / "checkpoints"
+        self.mps = root / "mps"  # Logs of MPS daemons that the job starts.
+        self.janitor_log = root / "janitor.log"  # Errors of the janitor; gone without any.
+        self.lock = root / ".lock"  # Held by the job that writes into the folder.
+        self.events = root / "events.jsonl"  # Starts, faults and restarts of the job.
+        self.search_report = root / "search.json"
+        self.search_png = root / "search.png"
 
     def checkpoint(self, env_steps: int) -> Path:
         """The checkpoint after `env_steps` environment steps."""
         return self.checkpoints / f"{env_steps:0{STEP_DIGITS}d}"
 
+    def profile(self, name: str) -> RunPaths:
+        """The run folder of a profile of a search; it keeps no checkpoints."""
+        return RunPaths(self.root / "profiles" / name)
+
     def gmi(self, gmi: int) -> GmiPaths:
         """Files of one GMI."""
         return GmiPaths(self.root / f"gmi_{gmi}")
+
+
+class PlayPaths(_Folder):
+    """Files of one played checkpoint; its folder also has the files of a run with one GMI."""
+
+    def __init__(self, root: Path) -> None:
+        super().__init__(root)
+        self.returns = root / "returns.json"  # Of every episode, and statistics over them.
+        # `qpos` [L + 1, E, nq] of the shown environments, `lengths` [E], `control_dt_s`.
+        self.trajectory = root / "trajectory.npz"
+        self.model = root / "model.mjb"  # Of the trajectory, in MuJoCo's binary format.
+        self.mp4 = root / "video.mp4"
+        self.gif = root / "video.gif"
+        self.html = root / "view.html"
+        self.page_log = root / "page.log"
+        self.render_log = root / "render.log"
+
+    def results(self) -> tuple[Path, ...]:
+        """All files that a new evaluation replaces."""
+        watched = self.mp4, self.gif, self.html
+        return self.returns, self.trajectory, self.model, *watched, self.render_log, self.page_log
 
 
 def create_run(
@@ -190,10 +164,6 @@ def require_new_run(run_dir: str | None, name: str | None) -> None:
 @contextmanager
 def locked(lock: Path, what: str) -> Iterator[None]:
     """Holds a folder by a file in it, so that two jobs cannot write into it at once.
-
-    Args:
-      lock: the file; it stays.
-      what: the key and its value, for messages.
 
     Raises:
       ConfigError: another job holds it, or it cannot be locked.
@@ -262,10 +232,6 @@ def add_event(path: Path, event: str, **details: Any) -> None:
 
 def last_run(key: str, runs: Path = RUNS) -> Path:
     """The run folder below `runs` with the newest checkpoint.
-
-    Args:
-      key: the configuration key that asks for it, for the message.
-      runs: where to look.
 
     Raises:
       ConfigError: there is none.

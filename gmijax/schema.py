@@ -19,9 +19,44 @@ from gmijax.errors import ConfigError
 T = TypeVar("T")
 
 
-def doc(text: str, default: Any = dataclasses.MISSING) -> Any:
-    """A dataclass field whose meaning `--help` prints; one with a default may be left out."""
-    return dataclasses.field(metadata={"doc": text}, default=default)
+def doc(
+    text: str,
+    default: Any = dataclasses.MISSING,
+    *,
+    low: float | None = None,
+    high: float | None = None,
+    positive: bool = False,
+) -> Any:
+    """A dataclass field whose meaning `--help` prints; one with a default may be left out.
+
+    `KeyGroup` checks its limits: at least `low`, at most `high`, or greater than 0.
+    """
+    limits = (low, high, positive)
+    return dataclasses.field(metadata={"doc": text, "limits": limits}, default=default)
+
+
+class KeyGroup:
+    """Base of dataclasses whose fields have limits, see `doc`; `prefix` is their keys' group."""
+
+    prefix = ""
+
+    def __post_init__(self) -> None:
+        for field in dataclasses.fields(typing.cast("Any", self)):
+            limits, found = field.metadata.get("limits"), getattr(self, field.name)
+            for value in found if isinstance(found, tuple) else (found,):
+                if limits and isinstance(value, int | float):
+                    _require_limits(f"{self.prefix}{field.name}", value, *limits)
+
+
+def _require_limits(
+    key: str, value: float, low: float | None, high: float | None, positive: bool
+) -> None:
+    if positive:
+        require_positive(key, value)
+    if low is not None and high is not None:
+        require_between(key, value, low, high)
+    elif low is not None:
+        require_at_least(key, value, low)
 
 
 def require_at_least(key: str, value: float, low: float) -> None:

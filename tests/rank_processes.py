@@ -27,7 +27,7 @@ from gmijax.errors import CollectiveTimeout, GmijaxError, PeerLost
 from gmijax.partition.child import ENV_EXCHANGE_FD
 from gmijax.partition.layout import Layout
 from gmijax.partition.reduction import needs_ring
-from gmijax.partition.rendezvous import reserved_address
+from gmijax.processes import reserved_address
 from tests.rank_bodies import BODIES, Options
 
 WAIT_S = 90.0

@@ -23,24 +23,8 @@ CHECKOUT = Path(errors.__file__).parents[1]
 TESTS = Path(__file__).parent
 
 
-def plan_config(**changes: Any) -> PlanConfig:
-    """One GPU with one GMI, everything else left open."""
-    values: dict[str, Any] = {
-        "gpus": 1,
-        "gmis_per_gpu": 1,
-        "layout": None,
-        "backend": "auto",
-        "sm_percent": None,
-        "memory_fraction": None,
-        "template": "auto",
-    }
-    return PlanConfig(**{**values, **changes})
-
-
-def reduce_config(**changes: Any) -> ReduceConfig:
-    """Everything left open."""
-    values: dict[str, Any] = {"strategy": "auto", "intra": "auto", "timeout_s": 10.0}
-    return ReduceConfig(**{**values, **changes})
+plan_config = PlanConfig
+reduce_config = ReduceConfig
 
 
 def gpu(index: int, *, mig_enabled: bool = False) -> Gpu:

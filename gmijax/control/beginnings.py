@@ -2,21 +2,13 @@
 
 from __future__ import annotations
 
-import dataclasses
 from pathlib import Path
 from typing import NamedTuple
 
 from gmijax.config import TrainConfig
 from gmijax.errors import ConfigError
-from gmijax.resume import (
-    META,
-    CheckpointMeta,
-    check_fits,
-    find_checkpoint,
-    newest_checkpoint,
-    saved_job,
-)
-from gmijax.rundir import RunPaths, create_run, given_run, read_json, require_new_run
+from gmijax.resume import CheckpointMeta, find_checkpoint, newest_checkpoint, trained_config
+from gmijax.rundir import META, RunPaths, create_run, given_run, read_json, require_new_run
 
 
 class Beginning(NamedTuple):
@@ -42,7 +34,7 @@ class Beginning(NamedTuple):
 
 
 def find_beginning(config: TrainConfig) -> Beginning:
-    """What `run.resume`, `run.dir` and `run.name` come to; nothing is changed on the disk.
+    """Reads `run.resume`, `run.dir` and `run.name`; changes nothing on the disk.
 
     Raises:
       ConfigError: a folder that exists and must not, no checkpoint, or one that does not fit.
@@ -77,8 +69,9 @@ def _go_on_or_start(config: TrainConfig) -> Beginning:
         if any(path != run.lock for path in folder.iterdir()):
             raise ConfigError(f"{shown} is no run folder, and not empty")
         return Beginning(run, None, is_complete=False, notes=())
-    saved = saved_job(run)
-    wanted = (config.env.label, config.algo.name)
+    # The folder of a checkpoint that may not be there yet.
+    env, algo = trained_config(run.checkpoint(0))
+    saved, wanted = (env.label, algo.name), (config.env.label, config.algo.name)
     if saved != wanted:
         raise ConfigError(
             f"{shown} holds a run of {' with '.join(saved)}, not {' with '.join(wanted)}"
@@ -95,14 +88,19 @@ def _require_fit(config: TrainConfig, checkpoint: Path, wanted: str) -> Checkpoi
     """The checkpoint's meta data, if the job can go on from it."""
     meta = CheckpointMeta.read(checkpoint)
     algo = config.algo
-    expected = dataclasses.replace(
-        meta,
-        env=config.env.label,
-        algo=algo.name,
-        hidden=(algo.policy_hidden_layer_sizes, algo.value_hidden_layer_sizes),
-    )
-    check_fits(meta, expected, "run.resume", wanted)
+    hidden = (algo.policy_hidden_layer_sizes, algo.value_hidden_layer_sizes)
+    for name, have, want in (
+        ("task", meta.env, config.env.label),
+        ("algorithm", meta.algo, algo.name),
+        ("network widths", _shown(meta.hidden), _shown(hidden)),
+    ):
+        if have != want:
+            raise ConfigError(f"run.resume={wanted}: checkpoint of {name} {have}, not {want}")
     seed = read_json(RunPaths(checkpoint.parent.parent).config)["seed"]
     if config.seed != seed:
         raise ConfigError(f"seed={config.seed}: a resumed run keeps its seed {seed}")
     return meta
+
+
+def _shown(hidden: tuple[tuple[int, ...], ...]) -> str:
+    return " and ".join(":".join(map(str, widths)) for widths in hidden)

@@ -89,7 +89,7 @@ class ChildLink:
 
     @classmethod
     def from_environment(cls, environment: Mapping[str, str] = os.environ) -> ChildLink:
-        """Pins this process to its CPU cores and takes up the link; call it before jax starts.
+        """Pins this process to its CPU cores and opens the link; call it before jax starts.
 
         Without a lifeline in the environment (a worker started by hand, to debug it) nothing
         can ask the process to stop, and everything else works.
@@ -198,7 +198,7 @@ def pin_to_cpus(cpus: str) -> None:
 
 
 def _end_now() -> None:
-    # No clean-up: it could wait for a peer or a GPU for ever, and nobody is left who would
+    # No clean-up: it could wait for a peer or a GPU forever, and nobody is left who would
     # read the outcome. Helper processes must not stay behind either.
     if os.getpgrp() == os.getpid():
         os.killpg(0, signal.SIGKILL)

@@ -55,6 +55,8 @@ class GmiProcess:
       gmi: its id.
       waits: whether it may not compile yet.
       exit_code: None while it runs; negative for the signal that ended it.
+      beat: the newest heartbeat that `poll` saw.
+      paths: files of this GMI.
       progress_s: when it was started, let go, or its heartbeat last seen to be a new one;
         `time.monotonic`.
     """
@@ -76,9 +78,9 @@ class GmiProcess:
         self._process = process
         self._lifeline = lifeline
         self._block = block
-        self._paths = paths
-        self._beat = Heartbeat("starting", 0, process.pid)
-        self._beats = 0
+        self.paths = paths
+        self.beat = Heartbeat("starting", 0, process.pid)
+        self._num_beats = 0
         self._was_ready = False
 
     @classmethod
@@ -136,11 +138,6 @@ class GmiProcess:
         return self._process.pid
 
     @property
-    def beat(self) -> Heartbeat:
-        """The newest heartbeat that `poll` saw."""
-        return self._beat
-
-    @property
     def is_ready(self) -> bool:
         """Whether the GMI has once been ready, or has ended well without saying so."""
         return self._was_ready or self.exit_code == 0
@@ -150,14 +147,9 @@ class GmiProcess:
         """The exception that it said it ends with, None without one."""
         return self._block.read_error()
 
-    @property
-    def paths(self) -> GmiPaths:
-        """Files of this GMI."""
-        return self._paths
-
     def status(self) -> GmiStatus:
         """A snapshot for progress displays."""
-        beat = self._beat
+        beat = self.beat
         state = "waiting" if self.waits else beat.state
         return GmiStatus(self.gmi, state, beat.iteration, beat.pid, self.exit_code)
 
@@ -192,18 +184,18 @@ class GmiProcess:
 
         None where it has not started far enough for that: the signal would end it.
         """
-        if self.exit_code is not None or not self._beats:
+        if self.exit_code is not None or not self._num_beats:
             return None
         size = self.log_bytes
         with suppress(ProcessLookupError, PermissionError):
-            os.kill(self._beat.pid, STACKS_SIGNAL)
+            os.kill(self.beat.pid, STACKS_SIGNAL)
         return size
 
     @property
     def log_bytes(self) -> int:
         """Size of what it has written to stderr."""
         try:
-            return self._paths.stderr.stat().st_size
+            return self.paths.stderr.stat().st_size
         except OSError:
             return 0
 
@@ -233,8 +225,8 @@ class GmiProcess:
     def _refresh(self) -> None:
         beats = self._block.beats
         # A beat with equal content counts as progress too.
-        if beats != self._beats and (beat := self._block.read()):
-            self._beat, self._beats = beat, beats
+        if beats != self._num_beats and (beat := self._block.read()):
+            self.beat, self._num_beats = beat, beats
             self._was_ready |= beat.is_ready
             self.progress_s = time.monotonic()
 

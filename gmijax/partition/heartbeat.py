@@ -28,7 +28,7 @@ _MAX_MESSAGE, _MAX_TRACEBACK = 2000, 8000
 
 
 class Heartbeat(NamedTuple):
-    """What a GMI last said about itself.
+    """Last report of a GMI.
 
     Attributes:
       state: how far it is.

@@ -40,7 +40,7 @@ for its core longer than it computes, and twice as many would compile at a time.
 
 
 class Host(NamedTuple):
-    """What is left for the GMIs of a job, None where it is not known or not limited.
+    """Free resources for the GMIs of a job, None where unknown or unlimited.
 
     Attributes:
       memory_mib: of the machine, or of the control group that this process is in.
@@ -55,13 +55,6 @@ class Host(NamedTuple):
 
 UNKNOWN_HOST: Final = Host()
 """Takes any number of GMIs."""
-
-
-class _Need(NamedTuple):
-    """One thing that GMIs need: how many it is enough for, and what to say if that is too few."""
-
-    most: int
-    text: str
 
 
 def detect_host() -> Host:
@@ -89,8 +82,8 @@ def require_room(num_gmis: int, what: str, host: Host, num_cores: int, *, on_cpu
       on_cpu: the GMIs compute on cores, and not on GPUs.
     """
     needs = list(_needs(num_gmis, host, num_cores, on_cpu=on_cpu))
-    if lacking := [need.text for need in needs if need.most < num_gmis]:
-        most = min(need.most for need in needs)
+    if lacking := [text for most, text in needs if most < num_gmis]:
+        most = min(most for most, _ in needs)
         raise ConfigError(
             f"{what}: {num_gmis} GMIs on this machine need about {', '.join(lacking)}; "
             f"allowed are at most {most}"
@@ -102,11 +95,6 @@ def usable_cores(cores: Sequence[int], quota: float | None, name: str) -> tuple[
 
     Which ones depends on the host's name: containers of one machine, each with a quota and all
     its cores to choose from, must not all pin their GMIs to the first ones.
-
-    Args:
-      cores: that this process may run on.
-      quota: cores' worth of time, None for no limit.
-      name: of the host, or of the container.
     """
     count = len(cores) if quota is None else min(len(cores), max(1, math.ceil(quota)))
     first = zlib.crc32(name.encode()) % (len(cores) - count + 1)
@@ -174,25 +162,29 @@ class CgroupLimits:
                 yield base.joinpath(*parts[:length])
 
 
-def _needs(num_gmis: int, host: Host, num_cores: int, *, on_cpu: bool) -> Iterator[_Need]:
+def _needs(
+    num_gmis: int, host: Host, num_cores: int, *, on_cpu: bool
+) -> Iterator[tuple[int, str]]:
+    """For how many GMIs each thing is enough, and what to say if that is too few."""
+
     def room(available: float, each: float) -> int:
         return max(1, int(available // each))
 
     if host.memory_mib is not None:
         each = CPU_GMI_MIB if on_cpu else GPU_GMI_MIB
         text = f"{_gib(num_gmis * each)} of memory (there are {_gib(host.memory_mib)})"
-        yield _Need(room(host.memory_mib, each), text)
+        yield room(host.memory_mib, each), text
     if on_cpu:
         wanted = math.ceil(num_gmis / GMIS_PER_CORE)
         text = f"{wanted} CPU cores, one for every {GMIS_PER_CORE} (there are {num_cores})"
-        yield _Need(num_cores * GMIS_PER_CORE, text)
+        yield num_cores * GMIS_PER_CORE, text
     if host.threads is not None:
         text = f"{num_gmis * THREADS_OF_A_GMI} threads ({host.threads} may still be started)"
-        yield _Need(room(host.threads, THREADS_OF_A_GMI), text)
+        yield room(host.threads, THREADS_OF_A_GMI), text
     if host.open_files is not None:
         wanted = FILES_OF_A_JOB + num_gmis * FILES_OF_A_GMI
         text = f"{wanted} open files ({host.open_files} may still be opened, see ulimit -n)"
-        yield _Need(room(host.open_files - FILES_OF_A_JOB, FILES_OF_A_GMI), text)
+        yield room(host.open_files - FILES_OF_A_JOB, FILES_OF_A_GMI), text
 
 
 def _gib(mib: float) -> str:

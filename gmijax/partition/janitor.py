@@ -32,7 +32,7 @@ _LATE_DAEMON_S = 2.0
 
 @dataclass
 class _Duties:
-    """What the controller has started so far."""
+    """Processes and daemons that the controller has started so far."""
 
     gmis: list[ProcessId] = field(default_factory=list)
     daemons: list[MpsControl] = field(default_factory=list)

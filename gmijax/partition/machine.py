@@ -33,7 +33,7 @@ _OTHERS = {"kfd": "a GPU for ROCm", "accel[0-9]*": "a TPU"}
 
 @dataclass(frozen=True)
 class Machine:
-    """What a job may use here.
+    """Resources that a job may use here.
 
     Attributes:
       gpus: GPUs that the job may use, in order of preference.

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from contextlib import suppress
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -56,71 +57,56 @@ class Gpu(NamedTuple):
     compute_mode: str = "default"
 
 
+@contextmanager
+def _nvml() -> Iterator[None]:
+    pynvml.nvmlInit()
+    try:
+        yield
+    finally:
+        pynvml.nvmlShutdown()
+
+
 def list_gpus() -> tuple[Gpu, ...]:
     """All GPUs of the machine, whatever `CUDA_VISIBLE_DEVICES` says; none without a driver.
 
     A GPU that NVML cannot describe (fallen off the bus, not permitted) is left out.
     """
-    try:
-        pynvml.nvmlInit()
-    except pynvml.NVMLError:
-        return ()
     gpus: list[Gpu] = []
-    try:
+    with suppress(pynvml.NVMLError), _nvml():
         for index in range(pynvml.nvmlDeviceGetCount()):
             with suppress(pynvml.NVMLError):
                 gpus.append(_describe(index))
-    except pynvml.NVMLError:
-        return ()
-    finally:
-        pynvml.nvmlShutdown()
     return tuple(gpus)
 
 
 def nvml_problem() -> str | None:
     """Why NVML fails although a driver is there; None where it works or there is no driver."""
+    return _problem(lambda: None)
+
+
+def gpu_problem() -> str | None:
+    """Why `list_gpus` is empty although a driver is there; None where there is nothing to list."""
+    return _problem(lambda: [_describe(i) for i in range(pynvml.nvmlDeviceGetCount())])
+
+
+def _problem(ask: Callable[[], object]) -> str | None:
     try:
-        pynvml.nvmlInit()
+        with _nvml():
+            ask()
     except pynvml.NVMLError as error:
         absent = (pynvml.NVML_ERROR_LIBRARY_NOT_FOUND, pynvml.NVML_ERROR_DRIVER_NOT_LOADED)
         if getattr(error, "value", None) not in absent:
             return str(error)
         devices = sorted(_DEVICES.glob("nvidia[0-9]*"))
         return f"{error}, although there is {devices[0]}" if devices else None
-    pynvml.nvmlShutdown()
-    return None
-
-
-def gpu_problem() -> str | None:
-    """Why `list_gpus` is empty although a driver is there; None where there is nothing to list."""
-    if (problem := nvml_problem()) is not None:
-        return problem
-    try:
-        pynvml.nvmlInit()
-    except pynvml.NVMLError:
-        return None
-    try:
-        for index in range(pynvml.nvmlDeviceGetCount()):
-            _describe(index)
-    except pynvml.NVMLError as error:
-        return str(error)
-    finally:
-        pynvml.nvmlShutdown()
     return None
 
 
 def driver_version() -> str | None:
     """The NVIDIA driver's version, e.g. `580.159.03`; None without a driver."""
-    try:
-        pynvml.nvmlInit()
-    except pynvml.NVMLError:
-        return None
-    try:
+    with suppress(pynvml.NVMLError), _nvml():
         return str(pynvml.nvmlSystemGetDriverVersion())
-    except pynvml.NVMLError:
-        return None
-    finally:
-        pynvml.nvmlShutdown()
+    return None
 
 
 def _describe(index: int) -> Gpu:

@@ -13,7 +13,7 @@ from contextlib import suppress
 from dataclasses import dataclass, field
 
 from gmijax.errors import GmiFailed, JobInterrupted
-from gmijax.partition.backends.interface import Backend
+from gmijax.partition.backends.backend import Backend
 from gmijax.partition.failures import Failure, describe_exit, first_cause
 from gmijax.partition.gmi_process import GmiProcess, GmiStatus
 from gmijax.rundir import RunPaths
@@ -117,7 +117,10 @@ class Supervisor:
                 self._raise_failure()
                 self._let_go()
                 self._handle_stop()
-                self._check_ready()
+                if self._all_ready_s is None and all(p.is_ready for p in self._started.values()):
+                    # Once, when every GMI holds its share.
+                    self._all_ready_s = time.monotonic()
+                    self._verify_shares()
                 self._check_progress()
                 if on_tick is not None:
                     on_tick(self.status())
@@ -207,12 +210,6 @@ class Supervisor:
                 f"stopped on request; GMIs {late} did not finish within "
                 f"{self._job.patience.stop_timeout_s:g} s and were ended"
             )
-
-    def _check_ready(self) -> None:
-        """Checks the backend once, when every GMI holds its share."""
-        if self._all_ready_s is None and all(p.is_ready for p in self._started.values()):
-            self._all_ready_s = time.monotonic()
-            self._verify_shares()
 
     def _verify_shares(self) -> None:
         # One that has ended already cannot be asked for any more.

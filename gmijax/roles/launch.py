@@ -11,11 +11,8 @@ from functools import partial
 from typing import Any, Final
 
 from gmijax.collectives.messenger import MIN_CAPACITY_BYTES
-from gmijax.collectives.pipe_block import create_pipes
-from gmijax.control.kinds import Plain
-from gmijax.control.launcher import Launch, run_gmis
 from gmijax.errors import ConfigError, GmiFailed, GmijaxError
-from gmijax.partition.child import ENV_GMI, ENV_PIPES_FD
+from gmijax.partition.child import ENV_GMI
 from gmijax.partition.host_limits import require_room
 from gmijax.partition.machine import Machine, detect_machine
 from gmijax.partition.plan import Plan
@@ -25,6 +22,8 @@ from gmijax.roles.manager import GMIManager
 from gmijax.roles.role import Role
 from gmijax.rundir import RunPaths, create_run, read_json, write_json
 from gmijax.schema import require_between, require_positive
+from gmijax.supervise.kinds import JobKind, pipes
+from gmijax.supervise.launcher import Launch, run_gmis
 
 MAX_PIPE_MIB: Final = 2**14
 """Most shared memory for one pipe; larger messages travel in pieces anyway."""
@@ -119,10 +118,8 @@ def _job(
         machine=machine,
         run=run,
         # Roles wait for each other, so they start together.
-        kind=Plain(
-            "gmijax.roles.worker",
-            compile_once=False,
-            blocks={ENV_PIPES_FD: partial(create_pipes, plan.layout.num_gmis, capacity_bytes)},
+        kind=JobKind(
+            "gmijax.roles.worker", compile_once=False, shared=partial(pipes, capacity_bytes)
         ),
         patience=patience,
         on_warning=lambda text: warnings.warn(text, RuntimeWarning, stacklevel=2),

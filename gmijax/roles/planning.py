@@ -6,13 +6,13 @@ import dataclasses
 from collections.abc import Sequence
 from typing import Any, Literal, TypeAlias
 
-from gmijax.config import PlanConfig, ReduceConfig
+from gmijax.config import BackendName, PlanConfig, ReduceConfig
 from gmijax.partition.machine import detect_machine
 from gmijax.partition.plan import Plan
 from gmijax.partition.planner import make_plan
 from gmijax.schema import from_dict
 
-BackendChoice: TypeAlias = Literal["auto", "mps", "mig", "share", "cpu"]
+BackendChoice: TypeAlias = Literal["auto", BackendName]
 
 
 def plan(
@@ -49,7 +49,6 @@ def plan(
         "backend": backend,
         "sm_percent": sm_percent,
         "memory_fraction": memory_fraction,
-        "template": "auto",
     }
     # As from a command line: what is no number, or not among the allowed, is told in one line.
     wanted = from_dict(PlanConfig, {key: _plain(value) for key, value in given.items()}, "plan.")

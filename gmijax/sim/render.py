@@ -21,8 +21,7 @@ import numpy as np
 import numpy.typing as npt
 
 from gmijax.config import PlayConfig
-from gmijax.playdir import EXIT_NO_GL, PlayPaths
-from gmijax.rundir import RunPaths, read_json
+from gmijax.rundir import EXIT_NO_GL, PlayPaths, RunPaths, read_json
 from gmijax.schema import from_dict
 
 MP4_MAX_FPS, GIF_MAX_FPS = 30.0, 15.0
@@ -68,7 +67,7 @@ class Timing(NamedTuple):
 
 
 class Trajectory(NamedTuple):
-    """What is filmed; see `gmijax.playdir.PlayPaths.trajectory`.
+    """What is filmed; see `gmijax.rundir.PlayPaths`.
 
     Attributes:
       qpos: [L + 1, E, nq].

@@ -11,12 +11,12 @@ import sys
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from gmijax.config import A3cConfig, TrainConfig
-from gmijax.control.decoupled import ENV_BOARD_FD, ENV_CHANNELS_FD, groups_of, places_of
 from gmijax.errors import ConfigError
 from gmijax.partition.child import ChildLink, required_fd, run_gmi
 from gmijax.partition.plan import Plan
 from gmijax.rundir import read_json
 from gmijax.schema import from_dict
+from gmijax.supervise.kinds import ENV_BOARD_FD, ENV_CHANNELS_FD, groups_of, places_of
 from gmijax.workers.trainers import (
     environments_of,
     exchange_used,

@@ -11,13 +11,13 @@ import sys
 from typing import TYPE_CHECKING, Any
 
 from gmijax.config import PpoConfig, TrainConfig
-from gmijax.control.kinds import ROLLOUT_PIPE_BYTES
 from gmijax.errors import ConfigError
 from gmijax.partition.child import ENV_PIPES_FD, ChildLink, required_fd, run_gmi
 from gmijax.partition.plan import Plan
 from gmijax.partition.templates import AGENT, TRAINER, Group, group_of, has_role
 from gmijax.rundir import read_json
 from gmijax.schema import from_dict
+from gmijax.supervise.kinds import ROLLOUT_PIPE_BYTES
 from gmijax.workers.trainers import (
     environments_of,
     exchange_used,

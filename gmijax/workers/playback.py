@@ -13,9 +13,8 @@ from typing import TYPE_CHECKING, Any
 from gmijax.config import EnvConfig, PlayConfig
 from gmijax.errors import ConfigError
 from gmijax.partition.child import ChildLink, run_gmi
-from gmijax.playdir import PlayPaths
 from gmijax.resume import CheckpointMeta, trained_config
-from gmijax.rundir import read_json, write_json
+from gmijax.rundir import PlayPaths, read_json, write_json
 from gmijax.schema import from_dict
 
 if TYPE_CHECKING:

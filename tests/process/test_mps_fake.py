@@ -13,8 +13,6 @@ from pathlib import Path
 import pytest
 from supervision import CHECKOUT, TESTS, gpu, machine, make_job, plan_config, reduce_config
 
-from gmijax.control.kinds import Plain
-from gmijax.control.launcher import Launch, run_gmis
 from gmijax.errors import BackendUnavailable, GmiFailed, JobInterrupted
 from gmijax.partition.backends import open_backend
 from gmijax.partition.gmi_process import GmiStatus
@@ -26,6 +24,8 @@ from gmijax.partition.planner import make_plan
 from gmijax.partition.supervisor import Patience, Supervisor
 from gmijax.processes import ProcessId, identify, wait_until_gone
 from gmijax.rundir import RunPaths, read_json, write_json
+from gmijax.supervise.kinds import JobKind
+from gmijax.supervise.launcher import Launch, run_gmis
 
 pytestmark = pytest.mark.timeout(60)
 
@@ -233,7 +233,7 @@ def small_job(run: RunPaths, here: Machine, plan: Plan, told: list[str]) -> Laun
         plan=plan,
         machine=here,
         run=run,
-        kind=Plain("this"),
+        kind=JobKind("this"),
         patience=patience,
         on_warning=told.append,
     )

@@ -26,9 +26,9 @@ from gmijax.a3c.rollout import UnrollPrograms, collect
 from gmijax.a3c.staleness import histogram_of, mean_and_p99
 from gmijax.cli import compose
 from gmijax.collectives.solo import SoloReducer
-from gmijax.control.decoupled import FLOAT_CHANNELS
 from gmijax.learner import init_learner, make_learner
 from gmijax.sim.wrappers import env_keys
+from gmijax.supervise.kinds import FLOAT_CHANNELS
 
 N, T = 12, 8
 ENV = point_mass()

@@ -12,7 +12,8 @@ from typing import Any
 import pytest
 
 import gmijax
-from gmijax.cli import _build, command
+from gmijax.cli import build
+from gmijax.cli_command import command
 from gmijax.config import PlayConfig
 from gmijax.control import evaluation, job, restarts, serving
 from gmijax.errors import ConfigError
@@ -58,7 +59,7 @@ def starts(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def opened(kind: str, *overrides: str) -> Any:
     if kind == "play":
-        return evaluation.play(_build("play", PlayConfig, ("run.dir=theirs", *overrides)))
+        return evaluation.play(build("play", PlayConfig, ("run.dir=theirs", *overrides)))
     if kind == "serve":
         return serving.serve(gmijax.compose("run.dir=theirs", *overrides, command="serve"))
     return job.train(gmijax.compose("run.resume=theirs", *overrides))
@@ -101,11 +102,7 @@ def test_an_equal_file_is_the_runs(kind: str, run: RunPaths, starts: None):
 
 
 def test_play_says_it_in_one_line(run: RunPaths, capsys: pytest.CaptureFixture[str]):
-    def play(config: PlayConfig) -> int:
-        evaluation.play(config)
-        return 0
-
-    assert command("play", PlayConfig, play, ["run.dir=theirs"]) == 2
+    assert command("play", PlayConfig, evaluation.play, ["run.dir=theirs"]) == 2
     assert len(capsys.readouterr().err.splitlines()) == 1
 
 

@@ -16,7 +16,7 @@ from gmijax.partition.environment import extend_xla_flags, gmi_environment
 from gmijax.partition.nvidia import Gpu, MigInstance
 from gmijax.partition.plan import Plan
 from gmijax.partition.planner import make_plan
-from gmijax.partition.rendezvous import reserved_address
+from gmijax.processes import reserved_address
 
 GOLDEN = Path(__file__).parents[1] / "golden"
 INHERITED = {

@@ -51,23 +51,6 @@ def test_plan_refuses_slices_that_do_not_fit_the_layout():
         Plan(Layout(((0,),)), slices, "cpu", "tcg_ex", 8, "none", "host")
 
 
-@pytest.mark.parametrize(
-    ("num_gpus", "control", "gmis_per_gpu", "backend", "reason"),
-    [
-        (0, None, 2, "cpu", "GPUs are virtual"),
-        (1, MPS, 1, "share", "nothing to share"),
-        (1, MPS, 2, "mps", "with an own daemon"),
-        (1, None, 2, "share", "2.0 to 2.9 times as fast"),
-    ],
-)
-def test_auto_backend(
-    num_gpus: int, control: Path | None, gmis_per_gpu: int, backend: str, reason: str
-):
-    plan = planned(machine(num_gpus, mps_control=control), gmis_per_gpu=gmis_per_gpu)
-    assert plan.backend == backend
-    assert reason in plan.reasons[0]
-
-
 def test_running_daemon_is_named_in_the_reason():
     here = machine(1, mps_control=MPS, operator_daemon=Path("/tmp/nvidia-mps"))
     assert "the daemon that runs here" in planned(here, gmis_per_gpu=2).reasons[0]
@@ -222,13 +205,6 @@ def test_values_that_do_not_fit_are_refused(here: Machine, changes: dict[str, An
 def test_backend_that_cannot_be_had_is_refused(here: Machine, backend: str, message: str):
     with pytest.raises(BackendUnavailable, match=message):
         planned(here, backend=backend)
-
-
-def test_gpu_in_mig_mode_is_refused():
-    here = machine(0, gpus=(gpu(0), gpu(1, mig_enabled=True)))
-    assert planned(here, gpus=1).slices[0].device == gpu(0).uuid
-    with pytest.raises(BackendUnavailable, match="GPU 1 is in MIG mode"):
-        planned(here, gpus=(1,))
 
 
 def test_gpus_in_mig_mode_are_passed_over():

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from types import MappingProxyType
-from typing import TypeAlias
 
+from gmijax.config import BackendName
+from gmijax.partition.backends.backend import Backend
 from gmijax.partition.backends.cpu import CpuBackend
-from gmijax.partition.backends.interface import Backend
 from gmijax.partition.backends.mig import MigBackend
 from gmijax.partition.backends.mps import MpsBackend
 from gmijax.partition.backends.share import ShareBackend
@@ -15,15 +15,8 @@ from gmijax.partition.machine import Machine
 from gmijax.partition.plan import Plan
 from gmijax.rundir import RunPaths
 
-BackendFactory: TypeAlias = Callable[[Plan, Machine, RunPaths], Backend]
-
-BACKENDS: Mapping[str, BackendFactory] = MappingProxyType(
-    {
-        "cpu": CpuBackend,
-        "mig": MigBackend,
-        "mps": MpsBackend,
-        "share": ShareBackend,
-    }
+BACKENDS: Mapping[BackendName, type[Backend]] = MappingProxyType(
+    {"mps": MpsBackend, "mig": MigBackend, "share": ShareBackend, "cpu": CpuBackend}
 )
 
 

@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any, Self
 
 from gmijax.errors import BackendUnavailable, GmiFailed
-from gmijax.partition.backends.guarded import GuardedBackend
+from gmijax.partition.backends.backend import Backend
 from gmijax.partition.janitor import quit_daemon
 from gmijax.partition.machine import Machine
 from gmijax.partition.mps_control import PIPE_VARIABLE, MpsControl
@@ -32,7 +32,7 @@ _POLL_S = 0.1
 _LONGEST_PARENT = 60
 
 
-class MpsBackend(GuardedBackend):
+class MpsBackend(Backend):
     """Runs the daemons of a job while it is entered.
 
     Args:
@@ -48,17 +48,16 @@ class MpsBackend(GuardedBackend):
     def __init__(
         self, plan: Plan, machine: Machine, run: RunPaths, gmis: Collection[int] | None = None
     ) -> None:
-        super().__init__(run)
-        if machine.mps_control is None:
+        super().__init__(plan, machine, run)
+        clients = plan.layout.gmis if gmis is None else gmis
+        self._devices = {gmi: plan.slices[gmi].device for gmi in clients}
+        if machine.mps_control is None and self._devices:
             raise BackendUnavailable(
                 f"plan.backend={plan.backend}: nvidia-cuda-mps-control was not found"
             )
         self._backend = plan.backend
-        self._program = machine.mps_control
+        self._program = machine.mps_control or Path()
         self._operator = machine.operator_daemon
-        self._logs = run.mps
-        clients = plan.layout.gmis if gmis is None else gmis
-        self._devices = {gmi: plan.slices[gmi].device for gmi in clients}
         self._controls: dict[str, MpsControl] = {}
         self._unresponsive: set[str] = set()
 
@@ -71,7 +70,7 @@ class MpsBackend(GuardedBackend):
             return self
         try:
             for place, device in enumerate(dict.fromkeys(self._devices.values())):
-                self._start_daemon(device, self._logs / f"gpu_{place}")
+                self._start_daemon(device, self.run.mps / f"gpu_{place}")
         except BaseException:
             self._quit_all()
             super().__exit__(None, None, None)
@@ -83,16 +82,22 @@ class MpsBackend(GuardedBackend):
         if self._operator is None:
             deadline_s = time.monotonic() + _CLIENTS_LEAVE_S
             for control in self._controls.values():
-                _wait_for_no_clients(control, deadline_s)
+                with suppress(BackendUnavailable):
+                    while control.all_client_pids() and time.monotonic() < deadline_s:
+                        time.sleep(_POLL_S)
             self._quit_all()
         super().__exit__(*exc)
+
+    def is_client(self, gmi: int) -> bool:
+        """Whether a GMI is to be a client of a daemon."""
+        return gmi in self._devices
 
     def environment(self, gmi: int) -> Mapping[str, str]:
         """Where the GMI's daemon listens."""
         return {PIPE_VARIABLE: str(self._control_of(gmi).pipe_directory)}
 
     def verify(self, pids: Mapping[int, int]) -> None:
-        """Checks with the daemons that every GMI is a client.
+        """Checks with the daemons that every GMI that is to be a client is one.
 
         CUDA falls back to taking turns, silently, when it does not reach the daemon.
         """
@@ -109,10 +114,10 @@ class MpsBackend(GuardedBackend):
 
     def terminate(self, gmi: int, pid: int) -> None:
         """Takes the GMI off the GPU: killing a busy client can fault its neighbours."""
-        device = self._devices[gmi]
-        control = self._controls[device]
-        if device in self._unresponsive:
+        device = self._devices.get(gmi)
+        if device is None or device in self._unresponsive:
             return
+        control = self._controls[device]
         try:
             server = control.all_client_pids().get(pid)
             if server is not None:
@@ -142,6 +147,7 @@ class MpsBackend(GuardedBackend):
             time.sleep(_POLL_S)
 
     def _strangers(self, pids: Mapping[int, int]) -> dict[int, int]:
+        pids = {gmi: pid for gmi, pid in pids.items() if self.is_client(gmi)}
         clients: dict[MpsControl, Mapping[int, int]] = {}
         for gmi in pids:
             control = self._control_of(gmi)
@@ -155,7 +161,7 @@ class MpsBackend(GuardedBackend):
 
     def _advice(self) -> str:
         if self._operator is None:
-            return f"see its logs in {self._logs}, or use plan.backend=share"
+            return f"see its logs in {self.run.mps}, or use plan.backend=share"
         return (
             "gmijax did not start this daemon: if it runs in another PID namespace (outside of "
             "this container), it knows its clients by other numbers and they cannot be checked; "
@@ -171,12 +177,6 @@ class MpsBackend(GuardedBackend):
                 self._janitor.take_over()
             raise
         self._controls = {}
-
-
-def _wait_for_no_clients(control: MpsControl, deadline_s: float) -> None:
-    with suppress(BackendUnavailable):
-        while control.all_client_pids() and time.monotonic() < deadline_s:
-            time.sleep(_POLL_S)
 
 
 def _short_parent() -> str:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -14,37 +13,14 @@ from rich.markup import escape
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
-from gmijax.partition.balance import Split
+from gmijax.autotune.grid import Grid, Measured, NotRunnable, Point
+from gmijax.autotune.search import Outcome, Visited
+from gmijax.autotune.workloads import Split
 from gmijax.partition.gmi_process import GmiStatus
-from gmijax.partition.grid import Grid
-from gmijax.partition.points import Measured, NotRunnable, Point
-from gmijax.partition.search import Outcome, Visited
 
 Results = Mapping[Point, Measured | NotRunnable]
 
 _LONGEST_REASON = 90
-
-
-@dataclass(frozen=True)
-class SearchPaths:
-    """Files of a search, beside its `config.json`."""
-
-    root: Path
-
-    @property
-    def report(self) -> Path:
-        """All points and the answer."""
-        return self.root / "search.json"
-
-    @property
-    def picture(self) -> Path:
-        """Throughput and memory over environments."""
-        return self.root / "search.png"
-
-    @property
-    def profiles(self) -> Path:
-        """Run folders of the profiles, without their checkpoints."""
-        return self.root / "profiles"
 
 
 class SearchDisplay:
@@ -87,16 +63,8 @@ class SearchDisplay:
 
 
 def verdict(outcome: Outcome, grid: Grid, num_gpus: int, split: Split | None = None) -> str:
-    """The answer and what it is worth, in words; only for an outcome with a best point.
-
-    Args:
-      outcome: of the search.
-      grid: in which it searched.
-      num_gpus: of the whole job.
-      split: how many of them act and train, where none does both.
-    """
-    if outcome.best is None:
-        raise ValueError("an outcome without a best point")
+    """The answer and what it is worth, in words; only for an outcome with a best point."""
+    assert outcome.best is not None
     top = outcome.best
     several = _highest(outcome, lambda gmis: gmis > 1)
     one = _highest(outcome, lambda gmis: gmis == 1)
@@ -261,8 +229,7 @@ def _answer(top: Visited, split: Split | None) -> str:
 
 
 def _reason_of(split: Split, top: Visited) -> str:
-    if not isinstance(top.result, Measured):
-        raise ValueError("a point that did not run has no split")
+    assert isinstance(top.result, Measured)
     acting, learning = top.result.acting_per_s, top.result.learning_per_s
     slower = "agents" if split.serving * acting < split.training * learning else "trainers"
     return (

@@ -14,55 +14,16 @@ import os
 import re
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
-from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
+from gmijax.autotune.grid import Measured, NotRunnable, Point
 from gmijax.cachedir import cache_folder
 from gmijax.errors import ConfigError
-from gmijax.partition.points import Measured, NotRunnable, Point
 from gmijax.rundir import read_json, write_json
-from gmijax.schema import from_dict, require_positive
+from gmijax.schema import require_positive
 
 _DIGEST_LENGTH = 10
-
-
-@dataclass(frozen=True, kw_only=True)
-class _Record:
-    """A profile in the file; `not_runnable` and `limit_s` are None, or the figures above are."""
-
-    env_steps_per_s: float | None = None
-    memory_mib: float | None = None
-    iteration_s: float | None = None
-    reduce_s: float | None = None
-    acting_per_s: float | None = None
-    learning_per_s: float | None = None
-    not_runnable: str | None = None
-    limit_s: float | None = None
-    wall_s: float
-
-    def __post_init__(self) -> None:
-        if self.not_runnable is None:
-            for key in ("env_steps_per_s", "memory_mib", "iteration_s"):
-                require_positive(key, getattr(self, key) or 0.0)
-
-    @classmethod
-    def of(cls, result: Measured | NotRunnable, wall_s: float) -> _Record:
-        if isinstance(result, NotRunnable):
-            return cls(not_runnable=result.reason, limit_s=result.limit_s, wall_s=wall_s)
-        return cls(**result._asdict(), wall_s=wall_s)
-
-    def result(self) -> Measured | NotRunnable:
-        if self.not_runnable is not None:
-            return NotRunnable(self.not_runnable, self.limit_s)
-        return Measured(
-            self.env_steps_per_s or 0.0,
-            self.memory_mib or 0.0,
-            self.iteration_s or 0.0,
-            self.reduce_s or 0.0,
-            self.acting_per_s or 0.0,
-            self.learning_per_s or 0.0,
-        )
 
 
 class ProfileStore:
@@ -78,7 +39,7 @@ class ProfileStore:
         Args:
           folder: where the files of all devices and tasks are.
           key: everything that decides what a point does; `device` and `task` name the file.
-          note: is told, in a sentence, that a broken file was moved aside.
+          note: gets a sentence where a broken file was moved aside.
 
         Raises:
           ConfigError: the folder cannot be used.
@@ -97,9 +58,9 @@ class ProfileStore:
         self._records = self._load()
 
     def get(self, mode: str, point: Point) -> Measured | NotRunnable | None:
-        """What a point did, None where it was not profiled yet."""
+        """Result of a point, None where it was not profiled yet."""
         record = self._records.get(_name(mode, point))
-        return record.result() if record else None
+        return _result(record) if record else None
 
     def put(self, mode: str, point: Point, result: Measured | NotRunnable, wall_s: float) -> None:
         """Keeps what a point did; the file is written at once, as a whole.
@@ -107,24 +68,29 @@ class ProfileStore:
         Raises:
           ConfigError: it cannot be written.
         """
-        name, record = _name(mode, point), _Record.of(result, wall_s)
+        if isinstance(result, NotRunnable):
+            said = {"not_runnable": result.reason, "limit_s": result.limit_s, "wall_s": wall_s}
+        else:
+            said = {**result._asdict(), "wall_s": wall_s}
+        record = {key: value for key, value in said.items() if value is not None}
         try:
             with _locked(self.path.with_suffix(".lock")):
                 # What another search has found meanwhile stays.
-                self._records = {**self._records, **self._load(), name: record}
-                profiles = {key: _without_none(one) for key, one in self._records.items()}
-                write_json(self.path, {"key": self._key, "profiles": profiles})
+                self._records = {**self._records, **self._load(), _name(mode, point): record}
+                write_json(self.path, {"key": self._key, "profiles": self._records})
         except OSError as error:
             raise ConfigError(
                 f"search.store={self.path.parent}: cannot be written ({error.strerror})"
             ) from None
 
-    def _load(self) -> dict[str, _Record]:
+    def _load(self) -> dict[str, dict[str, Any]]:
         if not self.path.exists():
             return {}
         try:
             profiles = read_json(self.path)["profiles"]
-            return {name: from_dict(_Record, item) for name, item in profiles.items()}
+            for item in profiles.values():
+                _result(item)
+            return dict(profiles)
         except (OSError, ValueError, KeyError, TypeError, AttributeError, ConfigError) as error:
             aside = _moved_aside(self.path)
             what = " ".join(str(error).split()) or type(error).__name__
@@ -161,13 +127,22 @@ def _moved_aside(path: Path) -> Path:
 
 
 def _name(mode: str, point: Point) -> str:
-    gmis = point.gmis.replace(" ", "")
-    return f"{mode} {gmis}x{point.num_envs} {point.impl}"
+    return f"{mode} {point.gmis_key}x{point.num_envs} {point.impl}"
 
 
 def _slug(text: object) -> str:
     return re.sub(r"[^a-z0-9]+", "-", str(text).lower()).strip("-")
 
 
-def _without_none(record: _Record) -> dict[str, Any]:
-    return {key: value for key, value in asdict(record).items() if value is not None}
+def _result(record: Mapping[str, Any]) -> Measured | NotRunnable:
+    """Result of a profile in the file; versions without trainers left some figures out.
+
+    Raises:
+      ConfigError, ValueError, TypeError: it is broken.
+    """
+    if record.get("not_runnable") is not None:
+        return NotRunnable(str(record["not_runnable"]), record.get("limit_s"))
+    found = Measured(*(float(record.get(name) or 0.0) for name in Measured._fields))
+    for key in ("env_steps_per_s", "memory_mib", "iteration_s"):
+        require_positive(key, getattr(found, key))
+    return found

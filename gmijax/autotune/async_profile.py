@@ -6,14 +6,13 @@ from collections.abc import Mapping, Sequence
 from itertools import pairwise
 from typing import Any, Final
 
+from gmijax.autotune.grid import Measured
 from gmijax.config import A3cConfig, TrainConfig
-from gmijax.control.decoupled import groups_of
-from gmijax.control.workload import peak_memory_mib
 from gmijax.partition.gmi_process import GmiStatus
 from gmijax.partition.plan import Plan
-from gmijax.partition.points import Measured
 from gmijax.results import read_metrics
-from gmijax.rundir import RunPaths, read_json
+from gmijax.rundir import RunPaths
+from gmijax.supervise.kinds import groups_of
 
 FEWEST_LINES: Final = 3
 """Lines of metrics that a profile goes by, each of half a second or of one batch."""
@@ -29,11 +28,6 @@ class Enough:
 
     Agents compile for different times, and until the channels are full they never wait: nothing
     that is counted before tells of a long job.
-
-    Args:
-      config: of the job.
-      plan: of the profile.
-      run: its folder.
     """
 
     def __init__(self, config: TrainConfig, plan: Plan, run: RunPaths) -> None:
@@ -66,10 +60,6 @@ def window_start(lines: Sequence[Line], iterations: int) -> int | None:
 
     The line before it is needed too, because lines tell when they end. Something was made in
     them: where an unroll is many batches, agents can be silent for many lines.
-
-    Args:
-      lines: of `metrics.jsonl`.
-      iterations: batches that they are to have at least.
     """
     batches = made = 0.0
     for start in range(len(lines) - 1, 0, -1):
@@ -81,7 +71,7 @@ def window_start(lines: Sequence[Line], iterations: int) -> int | None:
 
 
 def measured_of(lines: Sequence[Line], num_agents: int, memory_mib: float) -> Measured:
-    """What a profile says of one serving GMI, and of a serving and a training GPU.
+    """Rates of one serving GMI, and of a serving and a training GPU, from a profile.
 
     Trainers could learn from TTOP x (update + wait for a batch) / update, agents could make PPS /
     (1 - the part of their time for which they had to wait for room).
@@ -112,12 +102,14 @@ def measured_of(lines: Sequence[Line], num_agents: int, memory_mib: float) -> Me
     )
 
 
-def read(iterations: int, plan: Plan, run: RunPaths) -> Measured:
-    """What one GMI did, from the run folder of a profile."""
+def read(run: RunPaths, iterations: int, num_agents: int, memory_mib: float) -> Measured:
+    """Figures of one GMI from the run folder of a profile.
+
+    Raises:
+      ValueError: too few lines of metrics.
+    """
     lines = read_metrics(run.metrics)[:-1]  # The last may hold the end of the job.
     start = window_start(lines, iterations)
     if start is None:
         raise ValueError(f"{len(lines)} lines of metrics are too few")
-    results = [read_json(run.gmi(gmi).result) for gmi in plan.layout.gmis]
-    memory_mib = max(peak_memory_mib(one["device"]) for one in results if "device" in one)
-    return measured_of(lines[start - 1 :], len(groups_of(plan)[0].gmis), memory_mib)
+    return measured_of(lines[start - 1 :], num_agents, memory_mib)

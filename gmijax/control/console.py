@@ -1,10 +1,16 @@
-"""What the user sees of a running job: a live panel on a terminal, plain lines elsewhere."""
+"""What the user sees of a running job: a live panel on a terminal, plain lines elsewhere.
+
+Nothing that goes wrong with the output may end the job. No jax here.
+"""
 
 from __future__ import annotations
 
+import os
+import sys
 import time
-from collections.abc import Sequence
-from typing import Any, Protocol
+from collections.abc import Callable, Sequence
+from contextlib import suppress
+from typing import Any, TextIO
 
 from rich.console import Console
 from rich.live import Live
@@ -12,85 +18,121 @@ from rich.markup import escape
 from rich.table import Table
 
 from gmijax.partition.gmi_process import GmiStatus
+from gmijax.partition.plan import Plan
+from gmijax.rundir import RunPaths
 
 _LINE_EVERY_S = 5.0
 _BAR_WIDTH = 30
 
 
-class Progress(Protocol):
-    """A view of a running job, used as a context manager."""
+class _Careful:
+    """A text stream that is dropped at its first error: `train | head`, a closed terminal."""
 
-    def __enter__(self) -> Progress: ...
+    def __init__(self, stream: TextIO | None) -> None:
+        self._stream = stream
+        self.encoding = getattr(stream, "encoding", None) or "utf-8"
 
-    def __exit__(self, *exc: Any) -> None: ...
+    def write(self, text: str) -> int:
+        """Writes, or does nothing once that has failed."""
+        if self._stream is not None:
+            try:
+                self._stream.write(text)
+            except (OSError, ValueError):
+                self._drop(self._stream)
+        return len(text)
 
-    def update(self, gmis: Sequence[GmiStatus]) -> None:
-        """Called about 20 times a second."""
-        ...
+    def flush(self) -> None:
+        """See `write`."""
+        if self._stream is not None:
+            try:
+                self._stream.flush()
+            except (OSError, ValueError):
+                self._drop(self._stream)
+
+    def isatty(self) -> bool:
+        """Whether it is a terminal."""
+        with suppress(OSError, ValueError):
+            return self._stream is not None and self._stream.isatty()
+        return False
+
+    def _drop(self, stream: TextIO) -> None:
+        self._stream = None
+        # What is left in its buffer would fail once more when Python ends.
+        with suppress(OSError, ValueError):
+            nowhere = os.open(os.devnull, os.O_WRONLY)
+            os.dup2(nowhere, stream.fileno())
+            os.close(nowhere)
 
 
-class LineSource(Protocol):
-    """Where the latest line of metrics comes from: `MetricsReader`, or several as one."""
+def open_console(*, show: bool) -> Console:
+    """Where a job prints what the user may read: standard output, or nowhere."""
+    # Without a standard output (`>&-`) it is None.
+    stream: Any = _Careful(sys.stdout if show else None)
+    return Console(file=stream, quiet=not show, soft_wrap=True, highlight=False)
 
-    def latest(self) -> dict[str, Any] | None:
-        """The line that came since the last call, None if there is none."""
-        ...
 
-
-class SilentProgress:
-    """Shows nothing; for use as a library."""
-
-    def __enter__(self) -> SilentProgress:
-        return self
-
-    def __exit__(self, *exc: Any) -> None:
-        return None
-
-    def update(self, gmis: Sequence[GmiStatus]) -> None:
-        """See `Progress`."""
+def announce(console: Console, run: RunPaths, plan: Plan, what: str, lines: Sequence[str]) -> None:
+    """Prints where a job is, its plan (`what`: the end of that line), and why it is so."""
+    layout = [list(gmis) for gmis in plan.layout.gmis_of_gpu]
+    console.print(f"run folder: {run.root}", markup=False)
+    console.print(f"plan: layout {layout}, backend {plan.backend}, {what}", markup=False)
+    for line in (*plan.reasons, *lines):
+        console.print(f"  {line}", markup=False)
 
 
 class ConsoleProgress:
-    """Iteration, environment steps per second, return, ETA, and the state of every GMI."""
+    """Iteration, environment steps per second, return, ETA, and the state of every GMI.
 
-    def __init__(self, console: Console, metrics: LineSource, num_timesteps: int) -> None:
+    Args:
+      console: nothing is shown on a quiet one.
+      latest: the line of metrics that came since the last call, None if there is none.
+      num_timesteps: environment steps of the whole job.
+    """
+
+    def __init__(
+        self,
+        console: Console,
+        latest: Callable[[], dict[str, Any] | None],
+        num_timesteps: int,
+    ) -> None:
         self._console = console
-        self._metrics = metrics
+        self._latest = latest
         self._num_timesteps = num_timesteps
         self._line: dict[str, Any] = {}
         self._first: tuple[float, int] | None = None
         self._shown: tuple[str, int | None] = ("", None)
         self._shown_s = 0.0
-        self._is_broken = False
+        self._is_off = console.quiet
+        self._has_panel = console.is_terminal and not console.quiet
         self._live = Live(console=console, refresh_per_second=4, transient=True)
 
     def __enter__(self) -> ConsoleProgress:
-        if self._console.is_terminal:
+        if self._has_panel:
             self._live.start()
         return self
 
     def __exit__(self, *exc: Any) -> None:
-        if self._console.is_terminal:
+        if self._has_panel:
             self._live.stop()
         if self._line:
             self._console.print(self._text(), highlight=False)
 
     def update(self, gmis: Sequence[GmiStatus]) -> None:
-        """See `Progress`; what goes wrong with the display must not end the job."""
-        if self._is_broken:
+        """Called about 20 times a second."""
+        if self._is_off:
             return
         try:
             self._show(gmis)
         except Exception as error:
-            self._is_broken = True
+            self._is_off = True
             self._console.print(f"no progress from here on: {error!r}", markup=False)
 
     def _show(self, gmis: Sequence[GmiStatus]) -> None:
-        if (line := self._metrics.latest()) is not None:
+        if (line := self._latest()) is not None:
             self._line = line
             if self._first is None:
                 self._first = (time.monotonic(), line["env_steps"])
-        if self._console.is_terminal:
+        if self._has_panel:
             self._live.update(self._panel(gmis))
         else:
             self._print_now_and_then(gmis)

@@ -19,11 +19,9 @@ from pathlib import Path
 from types import FrameType
 from typing import Final
 
-from gmijax.cachedir import cache_folder
+from gmijax.cachedir import compilation_cache_dir, drop_broken_programs
 from gmijax.collectives.memory import create_exchange
 from gmijax.config import RunConfig, ServeRunConfig
-from gmijax.control.kinds import JobKind
-from gmijax.control.program_cache import drop_broken_programs
 from gmijax.errors import BackendUnavailable, GmijaxError, JobInterrupted
 from gmijax.partition.backend_choice import WHAT_SHARE_LOSES
 from gmijax.partition.backends import Backend, open_backend
@@ -33,14 +31,17 @@ from gmijax.partition.gmi_process import GmiStatus
 from gmijax.partition.machine import Machine
 from gmijax.partition.plan import Plan
 from gmijax.partition.reduction import needs_ring
-from gmijax.partition.rendezvous import reserved_address
 from gmijax.partition.supervisor import Job, Patience, Supervisor
+from gmijax.processes import reserved_address
 from gmijax.rundir import RunPaths, read_json, write_json
+from gmijax.supervise.kinds import JobKind
 
 STOP_SIGNALS: Final = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGUSR1)
 """What asks a job to save and end: Ctrl-C, batch systems, a terminal that is closed."""
 
 _AGAIN_S = 1.0
+
+OnTick = Callable[[tuple[GmiStatus, ...]], None]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -73,9 +74,7 @@ class Launch:
 
 
 def run_gmis(
-    launch: Launch,
-    on_tick: Callable[[tuple[GmiStatus, ...]], None] | None = None,
-    signals: StopSignals | None = None,
+    launch: Launch, on_tick: OnTick | None = None, signals: StopSignals | None = None
 ) -> None:
     """Runs all GMIs to their end; calls `on_tick` about 20 times a second.
 
@@ -89,7 +88,7 @@ def run_gmis(
       ConfigError: a GMI rejected its input.
       JobInterrupted: a signal came, and every GMI has ended.
     """
-    plan = launch.plan
+    plan, kind = launch.plan, launch.kind
     has_rings = needs_ring(plan.strategy, plan.training_layout)
     # There a program of a world belongs to one of its devices.
     is_world_on_cpu = has_rings and plan.backend == "cpu"
@@ -97,24 +96,23 @@ def run_gmis(
         # First, so that it ends last: a signal must not cut off the end of the backend.
         if launch.stops_gracefully and signals is None:
             signals = held.enter_context(stop_signals())
-        blocks = dict(launch.kind.shared(plan))
-        if plan.layout.num_gmis > 1:
-            blocks[ENV_EXCHANGE_FD] = create_exchange
-        inherited = {name: _open_block(held, create) for name, create in blocks.items()}
+        inherited = _shared_blocks(held, kind, plan)
         rendezvous = held.enter_context(reserved_address()) if has_rings else None
         launch, backend = _enter_backend(held, launch)
+
+        def environment(gmi: int) -> dict[str, str]:
+            return environment_of(launch, gmi, backend.environment(gmi), rendezvous)
+
         supervisor = Supervisor(
             Job(
                 run=launch.run,
                 gmis=plan.layout.gmis,
-                command=lambda _: [sys.executable, "-m", launch.kind.module],
-                environment=lambda gmi: environment_of(
-                    launch, gmi, backend.environment(gmi), rendezvous
-                ),
+                command=lambda _: [sys.executable, "-m", kind.module],
+                environment=environment,
                 backend=backend,
                 patience=launch.patience,
                 inherited_fds=inherited,
-                compile_once=launch.kind.compile_once and not is_world_on_cpu,
+                compile_once=kind.compile_once and not is_world_on_cpu,
             )
         )
         if signals is not None:
@@ -122,15 +120,25 @@ def run_gmis(
         try:
             supervisor.run(_ticks(launch, supervisor, on_tick))
         finally:
-            logs = [launch.run.gmi(gmi).stderr for gmi in plan.layout.gmis]
-            drop_broken_programs(program_cache_of(launch), logs)
+            programs = Path(os.environ.get(COMPILATION_CACHE) or compilation_cache_dir())
+            drop_broken_programs(
+                programs, [launch.run.gmi(gmi).stderr for gmi in plan.layout.gmis]
+            )
 
 
-def _ticks(
-    launch: Launch,
-    supervisor: Supervisor,
-    on_tick: Callable[[tuple[GmiStatus, ...]], None] | None,
-) -> Callable[[tuple[GmiStatus, ...]], None]:
+def _shared_blocks(held: ExitStack, kind: JobKind, plan: Plan) -> dict[str, int]:
+    """Descriptors of the memory that the GMIs share, by the variable that names each."""
+    opened: dict[str, int] = {}
+    blocks = dict(kind.shared(plan))
+    if plan.layout.num_gmis > 1:
+        blocks[ENV_EXCHANGE_FD] = create_exchange
+    for name, create in blocks.items():
+        opened[name] = create()
+        held.callback(os.close, opened[name])
+    return opened
+
+
+def _ticks(launch: Launch, supervisor: Supervisor, on_tick: OnTick | None) -> OnTick:
     """`on_tick`, and the order to finish when it is enough."""
     is_enough = launch.is_enough
 
@@ -192,16 +200,6 @@ def environment_of(
     return {**variables, **launch.variables}
 
 
-def program_cache_of(launch: Launch) -> Path:
-    """The compilation cache that the GMIs use."""
-    return Path(os.environ.get(COMPILATION_CACHE) or compilation_cache_dir())
-
-
-def compilation_cache_dir() -> Path:
-    """Where compiled programs stay between runs, unless JAX_COMPILATION_CACHE_DIR says else."""
-    return cache_folder() / "xla"
-
-
 def _enter_backend(held: ExitStack, launch: Launch) -> tuple[Launch, Backend]:
     """Enters the plan's backend, or `share` where the plan allows it and says so afterwards.
 
@@ -222,12 +220,6 @@ def _enter_backend(held: ExitStack, launch: Launch) -> tuple[Launch, Backend]:
     write_json(run.plan, plan.to_dict())
     launch = dataclasses.replace(launch, plan=plan)
     return launch, held.enter_context(open_backend(plan, machine, run))
-
-
-def _open_block(held: ExitStack, create: Callable[[], int]) -> int:
-    fd = create()
-    held.callback(os.close, fd)
-    return fd
 
 
 class StopSignals:
@@ -258,7 +250,7 @@ class StopSignals:
         self._last_s[number] = now_s
 
     def forward_to(self, request_stop: Callable[[], None]) -> None:
-        """Who is told, also of what has come before."""
+        """Forwards requests, also those that have come before."""
         self._forward = request_stop
         for _ in range(self._requests):
             request_stop()

@@ -1,4 +1,4 @@
-"""What a serving job has come to: progress while it runs, the summary after it. No jax here."""
+"""Summaries of training and serving jobs: `summary.json`, and its lines for people. No jax."""
 
 from __future__ import annotations
 
@@ -9,39 +9,86 @@ from typing import Any
 
 import numpy as np
 
-from gmijax.config import ServeConfig
+from gmijax.config import ServeConfig, TrainConfig
 from gmijax.partition.plan import Plan
 from gmijax.physics_health import overflow_warnings
-from gmijax.results import MetricsReader, read_metrics
+from gmijax.results import read_metrics
 from gmijax.resume import CheckpointMeta
 from gmijax.rundir import RunPaths, read_json
-from gmijax.version import __version__
+from gmijax.version import __version__, versions_of
+
+_ASYNCHRONOUS = ("pps", "ttop", "staleness", "bytes_per_s", "dropped")
+"""Figures that only asynchronous training has."""
+
+_RATES = (
+    *("train_wall_s", "compile_s", "env_steps_per_s"),
+    *("step_per_s_sim", "step_per_s_inference", "step_per_s_train"),
+)
+
+_VERSIONS = ("jax", "jaxlib", "mujoco-mjx", "flax", "optax", "orbax-checkpoint")
+
+Data = Mapping[str, Any]
 
 
-class CollectedLines:
-    """The lines of all GMIs that simulate as one; for `ConsoleProgress`."""
+def train_summary(
+    config: TrainConfig,
+    plan: Plan,
+    run: RunPaths,
+    status: str,
+    wall_s: float,
+    restarts: Sequence[Data],
+) -> dict[str, Any]:
+    """The content of `summary.json`, from what the leader left or, failing that, the metrics."""
+    result = read_json(run.gmi(0).result) if run.gmi(0).result.exists() else _last_known(run)
+    checkpoints = sorted(run.checkpoints.glob("[0-9]*"))
+    return {
+        "status": status,
+        "env": config.env.label,
+        "algo": config.algo.name,
+        "plan": {
+            **_of_plan(plan),
+            "strategy": result.get("strategy", plan.strategy),
+            "intra": result.get("intra", plan.intra),
+            "selection": dict(plan.selection),
+        },
+        "env_steps": result.get("env_steps"),
+        "wall_s": wall_s,
+        **{key: result.get(key) for key in _RATES},
+        **{key: result[key] for key in _ASYNCHRONOUS if key in result},
+        "final_return": result.get("final_return"),
+        "overflow_steps": result.get("overflow_steps") or {},
+        "checkpoint": str(checkpoints[-1]) if checkpoints else None,
+        "restarts": list(restarts),
+        "versions": _own_versions() | versions_of(_VERSIONS),
+        "device": result.get("device"),
+        "impl": config.physics.impl,
+    }
 
-    def __init__(self, run: RunPaths, simulators: Sequence[int], steps_before: int) -> None:
-        self._readers = {gmi: MetricsReader(run.gmi(gmi).metrics) for gmi in simulators}
-        self._lines: dict[int, dict[str, Any]] = {}
-        self._steps_before = steps_before
 
-    def latest(self) -> dict[str, Any] | None:
-        """Sums of steps and rates and the mean return, None if nothing is new."""
-        new = {gmi: line for gmi, reader in self._readers.items() if (line := reader.latest())}
-        self._lines |= new
-        if not new:
-            return None
-        lines = self._lines.values()
-        returns = [line["return"] for line in lines if line["return"] is not None]
-        return {
-            "env_steps": self._steps_before + sum(line["env_steps"] for line in lines),
-            "env_steps_per_s": sum(line["env_steps_per_s"] for line in lines),
-            "return": sum(returns) / len(returns) if returns else None,
-        }
+def _last_known(run: RunPaths) -> dict[str, Any]:
+    """Last metrics of a job that did not end by itself."""
+    lines = read_metrics(run.metrics)
+    if not lines:
+        return {}
+    return {"env_steps": lines[-1]["env_steps"], "final_return": lines[-1]["return"]}
 
 
-def summarise(
+def train_outcome(summary: Data, run: RunPaths) -> str:
+    """The summary in a few lines for people."""
+    times = len(summary["restarts"])
+    sim, inference, train = (
+        _shown(summary[f"step_per_s_{what}"], ",.0f") for what in ("sim", "inference", "train")
+    )
+    return (
+        f"{summary['status']}: {summary['env_steps']:,} env steps in {summary['wall_s']:.0f} s, "
+        f"final return {_shown(summary['final_return'], '.2f')}"
+        f"{f', started again {times} times' if times else ''}\n"
+        f"env steps/s: {sim} simulation, {inference} with inference, {train} with training\n"
+        f"checkpoint: {summary['checkpoint']}\nsummary: {run.summary}"
+    ) + overflow_warnings(summary["overflow_steps"])
+
+
+def serve_summary(
     config: ServeConfig, plan: Plan, run: RunPaths, status: str, wall_s: float
 ) -> dict[str, Any]:
     """The content of `summary.json`, without what is in the output folder."""
@@ -53,13 +100,7 @@ def summarise(
         "status": status,
         "env": config.env.label,
         "policy": _policy(config, found.values()),
-        "plan": {
-            "backend": plan.backend,
-            "layout": [list(gmis) for gmis in plan.layout.gmis_of_gpu],
-            "template": plan.template,
-            "roles": list(plan.roles),
-            "num_envs_per_gmi": plan.num_envs_per_gmi,
-        },
+        "plan": _of_plan(plan),
         "env_steps": sum(result["env_steps"] for result in collecting),
         "wall_s": wall_s,
         "serve_wall_s": _largest(collecting, "serve_wall_s"),
@@ -69,7 +110,7 @@ def summarise(
         "step_per_s_inference": _total(
             [result for result in collecting if result["env_steps"]], "step_per_s_inference"
         ),
-        "latency_ms": milliseconds([result.get("latency_s", []) for result in collecting]),
+        "latency_ms": _milliseconds([result.get("latency_s", []) for result in collecting]),
         "stages_ms": _stages(found.values()),
         "episodes": int(count),
         "mean_return": sum(s["return_sum"] for s in episodes) / count if count else None,
@@ -77,13 +118,13 @@ def summarise(
         "diverged_steps": sum(result.get("diverged_steps") or 0 for result in collecting),
         "overflow_steps": _sums([result.get("overflow_steps") or {} for result in collecting]),
         "gmis": [_of_gmi(gmi, plan, result) for gmi, result in found.items()],
-        "versions": {"gmijax": __version__, "python": sys.version.split()[0]},
+        "versions": _own_versions(),
         "device": next((r["device"] for r in found.values() if "device" in r), None),
         "impl": config.physics.impl,
     }
 
 
-def outcome(summary: Mapping[str, Any], run: RunPaths) -> str:
+def serve_outcome(summary: Data, run: RunPaths) -> str:
     """The summary in a few lines for people."""
     lines = [
         f"{summary['status']}: {summary['env_steps']:,} env steps in {summary['wall_s']:.0f} s, "
@@ -118,7 +159,7 @@ def _sums(counts: Sequence[Mapping[str, float]]) -> dict[str, float]:
     return {name: sum(one.get(name, 0.0) for one in counts) for name in names}
 
 
-def milliseconds(seconds: Sequence[Sequence[float]]) -> dict[str, float | int] | None:
+def _milliseconds(seconds: Sequence[Sequence[float]]) -> dict[str, float | int] | None:
     """Median and 99th percentile in ms over all samples, None where nothing was timed."""
     samples = [value for part in seconds for value in part]
     if not samples:
@@ -128,7 +169,7 @@ def milliseconds(seconds: Sequence[Sequence[float]]) -> dict[str, float | int] |
 
 
 def _result(run: RunPaths, gmi: int) -> dict[str, Any]:
-    """What a GMI left, or what its lines say if it did not end by itself."""
+    """Result of a GMI, or its last metrics if it did not end by itself."""
     paths = run.gmi(gmi)
     if paths.result.exists():
         return read_json(paths.result)
@@ -138,13 +179,13 @@ def _result(run: RunPaths, gmi: int) -> dict[str, Any]:
     return {"env_steps": lines[-1]["env_steps"], "serve_wall_s": lines[-1]["wall_s"]}
 
 
-def _of_gmi(gmi: int, plan: Plan, result: Mapping[str, Any]) -> dict[str, Any]:
+def _of_gmi(gmi: int, plan: Plan, result: Data) -> dict[str, Any]:
     return {
         "gmi": gmi,
         "roles": plan.roles[gmi],
         "env_steps": result.get("env_steps"),
         "env_steps_per_s": result.get("env_steps_per_s"),
-        "latency_ms": milliseconds([result.get("latency_s", [])]),
+        "latency_ms": _milliseconds([result.get("latency_s", [])]),
         "written": result.get("written") or None,
     }
 
@@ -168,24 +209,38 @@ def _stages(results: Any) -> dict[str, Any]:
     for result in results:
         for name, seconds in result.get("stages_s", {}).items():
             samples.setdefault(name, []).append(seconds)
-    timed = {name: milliseconds(parts) for name, parts in samples.items()}
+    timed = {name: _milliseconds(parts) for name, parts in samples.items()}
     return {name: times for name, times in timed.items() if times}
 
 
-def _throughput(results: Sequence[Mapping[str, Any]]) -> float | None:
+def _throughput(results: Sequence[Data]) -> float | None:
     """Steps of all GMIs over the time of the slowest: they begin together."""
     wall_s = _largest(results, "serve_wall_s")
     return sum(result["env_steps"] for result in results) / wall_s if wall_s else None
 
 
-def _total(results: Sequence[Mapping[str, Any]], key: str) -> float | None:
+def _total(results: Sequence[Data], key: str) -> float | None:
     values = [result.get(key) for result in results]
     return sum(v for v in values if v is not None) if values and None not in values else None
 
 
-def _largest(results: Sequence[Mapping[str, Any]], key: str) -> float | None:
+def _largest(results: Sequence[Data], key: str) -> float | None:
     return max((result[key] for result in results if result.get(key) is not None), default=None)
 
 
 def _shown(value: float | None, form: str) -> str:
     return "-" if value is None else format(value, form)
+
+
+def _of_plan(plan: Plan) -> dict[str, Any]:
+    return {
+        "backend": plan.backend,
+        "layout": [list(gmis) for gmis in plan.layout.gmis_of_gpu],
+        "num_envs_per_gmi": plan.num_envs_per_gmi,
+        "template": plan.template,
+        "roles": list(plan.roles),
+    }
+
+
+def _own_versions() -> dict[str, str | None]:
+    return {"gmijax": __version__, "python": sys.version.split()[0]}

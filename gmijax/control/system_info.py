@@ -1,4 +1,4 @@
-"""What is found on this machine for `gmijax.doctor`. No jax here: a child asks it."""
+"""State of this machine for `gmijax.doctor`. No jax here: a child asks it."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ _CUDA_VARIABLES: Final = ("XLA_CLIENT_MEM_FRACTION", "XLA_PYTHON_CLIENT_MEM_FRAC
 
 
 class JaxView(NamedTuple):
-    """What jax says in a process that is started as a GMI would be.
+    """Devices that jax sees in a process that is started as a GMI would be.
 
     Attributes:
       platform: `cpu` or `gpu`; None where jax failed.
@@ -45,8 +45,8 @@ class JaxView(NamedTuple):
     error: str | None = None
 
 
-class Sight(NamedTuple):
-    """What was found on this machine.
+class SystemInfo(NamedTuple):
+    """State of this machine.
 
     Attributes:
       machine: GPUs, driver, MPS.
@@ -67,10 +67,10 @@ class Sight(NamedTuple):
     wanted_warp: str | None = None
 
 
-def look() -> Sight:
+def look() -> SystemInfo:
     """Looks at this machine: asks NVML, jax (in a child), and tries to start an MPS daemon."""
     machine = detect_machine()
-    return Sight(
+    return SystemInfo(
         machine=machine,
         jax=ask_jax(machine),
         versions=versions_of((*REQUIRED, *_OPTIONAL)),
@@ -82,7 +82,7 @@ def look() -> Sight:
 
 
 def device_of(gpu: Gpu) -> str | None:
-    """What a process would be shown of a GPU, None if nothing can be used."""
+    """UUID that a process gets for a GPU, None if it cannot be used."""
     if gpu.compute_mode == "prohibited":
         return None
     if not gpu.mig_enabled:
@@ -127,19 +127,10 @@ def try_mps(machine: Machine) -> str | None:
     whole = [gpu for gpu in machine.gpus if device_of(gpu) and not gpu.mig_enabled]
     if machine.mps_control is None or machine.operator_daemon is not None or not whole:
         return None
-    config = PlanConfig(
-        gpus=(whole[0].index,),
-        gmis_per_gpu=1,
-        layout=None,
-        backend="mps",
-        sm_percent=None,
-        memory_fraction=None,
-        template="auto",
-    )
-    reduce = ReduceConfig(strategy="auto", intra="auto", timeout_s=1.0)
+    config = PlanConfig(gpus=(whole[0].index,), backend="mps")
     with tempfile.TemporaryDirectory() as scratch:
         try:
-            plan = make_plan(config, reduce, 1, machine)
+            plan = make_plan(config, ReduceConfig(), 1, machine)
             with MpsBackend(plan, machine, RunPaths(Path(scratch))):
                 return None
         except GmijaxError as error:

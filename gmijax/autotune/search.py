@@ -1,6 +1,6 @@
 """Algorithm 2 of the paper (section 5.2): which environments per GMI and GMIs per GPU. No jax.
 
-Pure rules over a `profile` function that measures one point; `gmijax.control.searching` gives it
+Pure rules over a `profile` function that measures one point; `gmijax.autotune.tuner` gives it
 one that runs training jobs, tests give it a formula. What the lines of the paper became:
 
 - 2, 4: every number of GMIs, 10 ... 1, with every num_env, 128 ... 16384. The same grid, and the
@@ -15,7 +15,7 @@ one that runs training jobs, tests give it a formula. What the lines of the pape
 - 18-19: Sat < alpha ends the row, and that point is no candidate. The row ends here too, but the
   point is a candidate: a gain below alpha is still one.
 - 20: `estimate`, which the paper does not print, is `estimate` below; `Rules.estimate` is another
-  where GPUs act and train apart (`gmijax.partition.balance`).
+  where GPUs act and train apart (`gmijax.autotune.async_workload`).
 - 21-24: the highest projection wins. Here the simplest does of those within `Rules.tolerance` of
   it: with the fewest GMIs, then with the fewest environments.
 
@@ -29,8 +29,16 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from itertools import product
 from typing import Final, NamedTuple
 
-from gmijax.partition.grid import Grid, as_printed, coarse, first_row, neighbours
-from gmijax.partition.points import Measured, NotRunnable, Point
+from gmijax.autotune.grid import (
+    Grid,
+    Measured,
+    NotRunnable,
+    Point,
+    as_printed,
+    coarse,
+    first_row,
+    neighbours,
+)
 
 _CLEARLY_SLOWER: Final = 0.9
 """An implementation that makes less than this of another in the first row is left alone."""
@@ -86,7 +94,7 @@ class Visited(NamedTuple):
 
 
 class Outcome(NamedTuple):
-    """What a search found.
+    """Result of a search.
 
     Attributes:
       visited: all points that were looked at, in order.
@@ -149,11 +157,16 @@ def best(visited: Mapping[Point, Visited], tolerance: float) -> Visited | None:
         return None
     highest = max(one.projected for one in runnable)
     good = [one for one in runnable if one.projected >= highest * (1.0 - tolerance)]
-    return min(good, key=lambda v: (_num_gmis(v.point), v.point.num_envs, -v.projected))
+
+    def simplest_first(one: Visited) -> tuple[float, ...]:
+        point = one.point
+        return (point.gmis_per_gpu + point.trainers, point.num_envs, -one.projected)
+
+    return min(good, key=simplest_first)
 
 
 class _Book:
-    """What was measured so far; measures no point twice."""
+    """Points measured so far; measures no point twice."""
 
     def __init__(self, profile: Profile, rules: Rules) -> None:
         self.visited: dict[Point, Visited] = {}
@@ -243,7 +256,3 @@ def _climb(book: _Book, grid: Grid) -> None:
         if not fresh:
             return
         book.visit(fresh[0])
-
-
-def _num_gmis(point: Point) -> int:
-    return point.gmis_per_gpu + point.trainers
