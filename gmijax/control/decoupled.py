@@ -26,7 +26,7 @@ MODULE: Final = "gmijax.workers.async_worker"
 """Main of every GMI, started by name."""
 
 FLOAT_CHANNELS: Final = ("state", "action", "reward", "log_prob", "cut_value", "bootstrap")
-"""Channels of an unroll that could travel with half the bits; see `gmijax.a3c.losses.Unrolls`."""
+"""Channels of an unroll that could travel with half the bits; see `gmijax.a3c.a3c.Unrolls`."""
 
 _ADVICE: Final = (
     "channels through host memory; channel.transport=device keeps experience on its GPU, which "

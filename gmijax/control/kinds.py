@@ -63,7 +63,7 @@ SYNCHRONOUS: Final = Plain("gmijax.workers.worker")
 class Dedicated(NamedTuple):
     """Synchronous training with trainers in GMIs of their own (TDG_EX)."""
 
-    module: str = "gmijax.workers.dedicated_worker"
+    module: str = "gmijax.workers.worker"
     compile_once: bool = False
 
     def shared(self, plan: Plan) -> SharedBlocks:

@@ -1,4 +1,4 @@
-"""What mains of training jobs share: environments, and how those that train find each other."""
+"""What the mains of training jobs share: their input, environments, the exchange of trainers."""
 
 from __future__ import annotations
 
@@ -8,11 +8,19 @@ from gmijax.config import TrainConfig
 from gmijax.partition.child import ChildLink
 from gmijax.partition.plan import Plan
 from gmijax.partition.templates import Group
+from gmijax.rundir import read_json
+from gmijax.schema import from_dict
 
 if TYPE_CHECKING:
     from gmijax.collectives.interface import Reducer
     from gmijax.collectives.ring import World
     from gmijax.sim.wrappers import BatchedEnv
+
+
+def read_job(link: ChildLink) -> tuple[TrainConfig, Plan]:
+    """What the controller has written for this run."""
+    config = from_dict(TrainConfig, read_json(link.run.config))
+    return config, Plan.from_dict(read_json(link.run.plan))
 
 
 def environments_of(config: TrainConfig, place: int) -> BatchedEnv:

@@ -2,7 +2,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from gmijax.ppo.advantages import gae
+from gmijax.ppo.ppo import gae
 
 T, N = 7, 3
 

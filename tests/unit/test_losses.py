@@ -7,7 +7,7 @@ import pytest
 
 from gmijax.cli import compose
 from gmijax.policy import entropy, kl_divergence, log_prob, make_actor_critic
-from gmijax.ppo.losses import Samples, UpdateContext, ppo_loss
+from gmijax.ppo.ppo import Samples, UpdateContext, ppo_loss
 
 B, O, A = 6, 3, 2
 NEUTRAL = UpdateContext(jnp.zeros(()), jnp.ones(()), jnp.zeros(A))

@@ -9,7 +9,7 @@ import pytest
 
 from gmijax.config import PpoConfig
 from gmijax.learner import init_learner, make_learner
-from gmijax.ppo.episodes import CHUNK_STEPS, Options, run_episodes
+from gmijax.learning.episodes import CHUNK_STEPS, Options, run_episodes
 from gmijax.sim import episode
 from gmijax.sim.interface import Env, EnvSpec, EnvState
 from gmijax.sim.wrappers import time_limit

@@ -12,22 +12,22 @@ import pytest
 from jax.flatten_util import ravel_pytree
 from toy_env import point_mass
 
-from gmijax.a3c.learner import (
+from gmijax.a3c.a3c import A3cLosses, Unrolls, batch_targets, gradients
+from gmijax.a3c.report import histogram_of, mean_and_p99
+from gmijax.a3c.rollout import UnrollPrograms, collect
+from gmijax.a3c.update import FusedUpdate, SplitUpdate
+from gmijax.cli import compose
+from gmijax.collectives.solo import SoloReducer
+from gmijax.control.decoupled import FLOAT_CHANNELS
+from gmijax.learner import (
     acting_weights,
-    begin_batch,
-    gradients,
+    init_learner,
+    make_learner,
     num_weights,
     pack_weights,
     unpack_weights,
 )
-from gmijax.a3c.losses import LossMetrics, Unrolls
-from gmijax.a3c.programs import FusedUpdate, SplitUpdate, exchange_size
-from gmijax.a3c.rollout import UnrollPrograms, collect
-from gmijax.a3c.staleness import histogram_of, mean_and_p99
-from gmijax.cli import compose
-from gmijax.collectives.solo import SoloReducer
-from gmijax.control.decoupled import FLOAT_CHANNELS
-from gmijax.learner import init_learner, make_learner
+from gmijax.learning.updates import exchange_size
 from gmijax.sim.wrappers import env_keys
 
 N, T = 12, 8
@@ -56,8 +56,18 @@ def _start(config, num_envs: int = N):
     return learner, state, jax.jit(ENV.init)(ENV.model, keys)
 
 
+def _size(config) -> int:
+    return exchange_size(ENV.spec, config, A3cLosses)
+
+
 def _copy(tree):
     return jax.tree.map(jnp.copy, tree)
+
+
+def _unrolled(learner, state, envs):
+    """The environments after an unroll, the unroll, and its counts."""
+    weights = acting_weights(learner, state)
+    return collect(ENV, learner.networks, T, ENV.model, weights, envs)
 
 
 def test_weights_travel_as_one_array(config) -> None:
@@ -114,9 +124,7 @@ def test_the_channels_that_may_lose_precision_are_those_of_floats() -> None:
 
 def test_unrolls_without_weight_teach_nothing(config) -> None:
     learner, state, envs = _start(config)
-    _, batch, _ = collect(
-        ENV, learner.networks, T, ENV.model, acting_weights(learner, state), envs
-    )
+    _, batch, _ = _unrolled(learner, state, envs)
     update = FusedUpdate(learner)
     weight = jnp.asarray([1.0] * (N - 2) + [0.0] * 2)
     spoilt = batch._replace(reward=batch.reward.at[:, -2:].set(1e6))
@@ -168,10 +176,8 @@ def _in_threads(update_of) -> dict:
 
 def test_one_trainer_learns_the_same_in_both_forms(config) -> None:
     learner, state, envs = _start(config)
-    _, batch, _ = collect(
-        ENV, learner.networks, T, ENV.model, acting_weights(learner, state), envs
-    )
-    split = SplitUpdate(learner, ENV.spec.obs_size, SoloReducer(exchange_size(ENV.spec, config)))
+    _, batch, _ = _unrolled(learner, state, envs)
+    split = SplitUpdate(learner, ENV.spec.obs_size, SoloReducer(_size(config)))
     split.compile(state, batch, jnp.ones(N))
     _, said = FusedUpdate(learner)(_copy(state), batch, jnp.ones(N))
     _, also = split(_copy(state), batch, jnp.ones(N))
@@ -181,7 +187,7 @@ def test_one_trainer_learns_the_same_in_both_forms(config) -> None:
 
 def test_two_trainers_stay_equal_and_take_in_both_batches(config) -> None:
     learner, state, envs = _start(config, num_envs=2 * N)
-    _, both, _ = collect(ENV, learner.networks, T, ENV.model, acting_weights(learner, state), envs)
+    _, both, _ = _unrolled(learner, state, envs)
     half = [jax.tree.map(lambda x, k=k: x[:, k * N : (k + 1) * N], both) for k in range(2)]
 
     def update_of(rank: int, reducer):
@@ -202,7 +208,7 @@ def test_fresh_unrolls_weigh_alike_however_many_a_trainer_has(config) -> None:
         config, num_minibatches=1, num_updates_per_batch=1, normalize_advantage=False
     )
     learner, state, envs = _start(plain, num_envs=2 * N)
-    _, both, _ = collect(ENV, learner.networks, T, ENV.model, acting_weights(learner, state), envs)
+    _, both, _ = _unrolled(learner, state, envs)
     # One trainer has a fresh unroll and stale ones, the other fresh ones only.
     fresh = np.array([1.0] + [0.0] * (N - 1) + [1.0] * N, np.float32)
     weight = jnp.asarray(fresh * len(fresh) / fresh.sum())
@@ -226,15 +232,14 @@ def test_fresh_unrolls_weigh_alike_however_many_a_trainer_has(config) -> None:
 
 def test_a_minibatch_of_stale_unrolls_does_not_dilute_the_divergence(config) -> None:
     learner, state, envs = _start(config)
-    weights = acting_weights(learner, state)
-    _, batch, _ = collect(ENV, learner.networks, T, ENV.model, weights, envs)
+    _, batch, _ = _unrolled(learner, state, envs)
     moved = state.params._replace(log_std=state.params.log_std + 0.1)
     told = []
     for fresh in (np.ones(N), np.r_[1.0, np.zeros(N - 1)], np.zeros(N)):
-        context = begin_batch(learner, state, batch, jnp.asarray(fresh, jnp.float32))
+        context = batch_targets(learner, state, batch, jnp.asarray(fresh, jnp.float32))
         told.append(gradients(learner, moved, batch, context, jnp.arange(N))[1])
     # Of a trainer with fresh unrolls only, one with a twelfth, and one with none.
-    means = LossMetrics(*(sum(parts) / len(parts) for parts in zip(*told, strict=True)))
+    means = A3cLosses(*(sum(parts) / len(parts) for parts in zip(*told, strict=True)))
     np.testing.assert_allclose(means.steering_kl, told[0].kl, rtol=1e-4)
     assert float(told[2].steering_kl) == 0.0
 
@@ -244,9 +249,8 @@ def test_learning_rates_of_all_minibatches_are_told(config) -> None:
         config, learning_rate_schedule="adaptive_kl", learning_rate=1e-3, desired_kl=1e-7
     )
     learner, state, envs = _start(adaptive)
-    weights = acting_weights(learner, state)
-    _, batch, _ = collect(ENV, learner.networks, T, ENV.model, weights, envs)
-    split = SplitUpdate(learner, ENV.spec.obs_size, SoloReducer(exchange_size(ENV.spec, adaptive)))
+    _, batch, _ = _unrolled(learner, state, envs)
+    split = SplitUpdate(learner, ENV.spec.obs_size, SoloReducer(_size(adaptive)))
     for update in (FusedUpdate(learner), split):
         new, told = update(_copy(state), batch, jnp.ones(N))
         # The first pass has not moved yet, the others each lower the rate.
