@@ -13,7 +13,6 @@ from typing import Any, Protocol
 from tensorboardX.event_file_writer import EventsWriter
 from tensorboardX.proto import event_pb2, summary_pb2
 
-from gmijax.sim.wrappers import EpisodeSums
 
 WINDOW_EPISODES = 100
 """Means over episodes are taken over at least this many of the latest ones."""
@@ -25,11 +24,11 @@ class EpisodeWindow:
     """Means over the latest episodes: the fewest iterations that hold WINDOW_EPISODES."""
 
     def __init__(self) -> None:
-        self._latest: deque[EpisodeSums] = deque()
+        self._latest: deque[Any] = deque()
         self._count = 0.0
 
-    def add(self, episodes: EpisodeSums) -> None:
-        """Takes in the episodes that ended in one iteration; leaves are numbers of the host."""
+    def add(self, episodes: Any) -> None:
+        """Takes in the `EpisodeSums` of one iteration, as numbers of the host."""
         self._latest.append(episodes)
         self._count += episodes.count
         while self._count - self._latest[0].count >= WINDOW_EPISODES:

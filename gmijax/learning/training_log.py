@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterable, Mapping
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
-from gmijax.learning.unroll import Counts
 from gmijax.metrics import EpisodeWindow, JsonlSink, Line, Sink, TensorBoardSink
 from gmijax.physics_health import OverflowCount, check_diverged, check_losses, overflow_line
 from gmijax.results import read_metrics
@@ -66,7 +65,7 @@ class TrainingLog:
     def write(
         self,
         env_steps: int,
-        counts: Counts,
+        counts: Any,
         learnt: Learnt,
         others: Line,
         *,
@@ -77,7 +76,7 @@ class TrainingLog:
 
         Args:
           env_steps: environment steps learnt from so far.
-          counts: of the steps simulated since the last line, as numbers of the host.
+          counts: `Counts` of the steps simulated since the last line, as numbers of the host.
           learnt: of the updates since the last line.
           others: what else is to stand there.
           simulated: how many steps `counts` are of, None for those learnt from.
