@@ -13,7 +13,6 @@ from typing import Any, Protocol
 from tensorboardX.event_file_writer import EventsWriter
 from tensorboardX.proto import event_pb2, summary_pb2
 
-
 WINDOW_EPISODES = 100
 """Means over episodes are taken over at least this many of the latest ones."""
 

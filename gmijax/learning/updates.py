@@ -69,7 +69,7 @@ def run_updates(
       order: indices into `data` [minibatches, B].
 
     Returns:
-      The new state, and losses and learning rates of all updates, with a leading axis.
+      The new state; losses and learning rates of all updates, with a leading axis.
     """
 
     def update(state: LearnerState, indices: Array) -> tuple[LearnerState, tuple[Any, Array]]:

@@ -45,7 +45,7 @@ class TrainingLoop:
 
     Args:
       config: of the run.
-      env: the environments; where others make the rollouts, one of theirs.
+      env: the environments; where others make the rollouts, like theirs.
       reducer: among the GMIs that train.
       link: to the controller.
       workers: the GMIs that make this one's rollouts, None where it does so itself.
@@ -235,14 +235,7 @@ def report(
 ) -> None:
     """Waits for the iteration that ended at `env_steps` and writes its line.
 
-    Args:
-      log: takes the line.
-      env_steps: see above.
-      metrics: of the iteration.
-      times: seconds by name, written as they are.
-
-    Raises:
-      NonFiniteError: an observation, a reward or a loss is NaN or infinite.
+    `times` are seconds by name, written as they are. Raises as `TrainingLog.write`.
     """
     host: Any = jax.tree.map(float, jax.device_get(metrics))
     learnt = Learnt(host.losses._asdict(), host.learning_rate, host.rates, host.noise_std)

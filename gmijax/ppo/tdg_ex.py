@@ -116,13 +116,8 @@ def serve_rollouts(
 ) -> int:
     """Makes rollouts for `trainer` until it says that it needs no more; returns how many.
 
-    Args:
-      env: the environments.
-      learner: networks and hyper-parameters.
-      env_state: their state at the start; donated.
-      mail: to the trainer.
-      trainer: its GMI.
-      on_state: told `compiling`, `ready` or `running`, with the number of rollouts made.
+    `env_state` is the environments' state at the start and donated; `on_state` is called with
+    `compiling`, `ready` or `running`, and the number of rollouts made.
     """
     on_state("compiling", 0)
     state = init_learner(learner, env.spec.obs_size, jax.random.key(0))

@@ -60,16 +60,8 @@ def trainers_reducer(
 ) -> Reducer:
     """The reducer among the trainers, whose ranks are their places in the group.
 
-    Args:
-      config: of the run.
-      plan: of the run.
-      trainers: who takes part.
-      link: this process, one of them.
-      num_floats: P, length of the buffers for `mean`.
-      world: from `join_trainers`.
-
-    Raises:
-      ConfigError, CollectiveError: as `build_reducer`.
+    Its buffers for `mean` have `num_floats` numbers; `world` is from `join_trainers`. Raises as
+    `build_reducer`.
     """
     from gmijax.collectives.build import Membership, build_reducer
 
