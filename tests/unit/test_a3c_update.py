@@ -70,8 +70,24 @@ def _unrolled(learner, state, envs):
     return collect(ENV, learner.networks, T, ENV.model, weights, envs)
 
 
-def test_weights_travel_as_one_array(config) -> None:
-    learner, state, _ = _start(config)
+@pytest.fixture(scope="module")
+def start(config):
+    """Learner, its state and environments; nobody may donate them."""
+    return _start(config)
+
+
+@pytest.fixture(scope="module")
+def batch(start) -> Unrolls:
+    return _unrolled(*start)[1]
+
+
+@pytest.fixture(scope="module")
+def fused(start) -> FusedUpdate:
+    return FusedUpdate(start[0])
+
+
+def test_weights_travel_as_one_array(config, start) -> None:
+    learner, state, _ = start
     weights = acting_weights(learner, state)
     packed = pack_weights(weights)
     assert packed.shape == (num_weights(ENV.spec, config),)
@@ -95,10 +111,10 @@ def test_an_unroll_is_what_the_environments_did(config) -> None:
     assert cuts > 0
 
 
-def test_pieces_make_the_unroll_that_they_are_parts_of(config) -> None:
-    learner, state, envs = _start(config)
+def test_pieces_make_the_unroll_that_they_are_parts_of(start) -> None:
+    learner, state, envs = start
     weights = acting_weights(learner, state)
-    _, whole, counts = collect(ENV, learner.networks, T, ENV.model, weights, envs)
+    _, whole, counts = _unrolled(*start)
     programs = UnrollPrograms(ENV, learner.networks, T // 4, 4, weights, envs)
     envs, pieces = _copy(envs), []
     for _ in range(4):
@@ -122,14 +138,12 @@ def test_the_channels_that_may_lose_precision_are_those_of_floats() -> None:
     assert set(FLOAT_CHANNELS) == set(Unrolls._fields) - {"done"}
 
 
-def test_unrolls_without_weight_teach_nothing(config) -> None:
-    learner, state, envs = _start(config)
-    _, batch, _ = _unrolled(learner, state, envs)
-    update = FusedUpdate(learner)
+def test_unrolls_without_weight_teach_nothing(start, batch, fused) -> None:
+    state = start[1]
     weight = jnp.asarray([1.0] * (N - 2) + [0.0] * 2)
     spoilt = batch._replace(reward=batch.reward.at[:, -2:].set(1e6))
-    first, _ = update(_copy(state), batch, weight)
-    second, _ = update(_copy(state), spoilt, weight)
+    first, _ = fused(_copy(state), batch, weight)
+    second, _ = fused(_copy(state), spoilt, weight)
     jax.tree.map(np.testing.assert_array_equal, first.params, second.params)
     assert int(first.iteration) == 1
 
@@ -174,12 +188,11 @@ def _in_threads(update_of) -> dict:
     return results
 
 
-def test_one_trainer_learns_the_same_in_both_forms(config) -> None:
-    learner, state, envs = _start(config)
-    _, batch, _ = _unrolled(learner, state, envs)
+def test_one_trainer_learns_the_same_in_both_forms(config, start, batch, fused) -> None:
+    learner, state, _ = start
     split = SplitUpdate(learner, ENV.spec.obs_size, SoloReducer(_size(config)))
     split.compile(state, batch, jnp.ones(N))
-    _, said = FusedUpdate(learner)(_copy(state), batch, jnp.ones(N))
+    _, said = fused(_copy(state), batch, jnp.ones(N))
     _, also = split(_copy(state), batch, jnp.ones(N))
     np.testing.assert_allclose(said.weights, also.weights, rtol=1e-4, atol=1e-6)
     np.testing.assert_allclose(said.losses, also.losses, rtol=1e-3, atol=1e-5)
@@ -230,9 +243,8 @@ def test_fresh_unrolls_weigh_alike_however_many_a_trainer_has(config) -> None:
     np.testing.assert_allclose(also.losses, theirs.losses, rtol=1e-4, atol=1e-6)
 
 
-def test_a_minibatch_of_stale_unrolls_does_not_dilute_the_divergence(config) -> None:
-    learner, state, envs = _start(config)
-    _, batch, _ = _unrolled(learner, state, envs)
+def test_a_minibatch_of_stale_unrolls_does_not_dilute_the_divergence(start, batch) -> None:
+    learner, state, _ = start
     moved = state.params._replace(log_std=state.params.log_std + 0.1)
     told = []
     for fresh in (np.ones(N), np.r_[1.0, np.zeros(N - 1)], np.zeros(N)):

@@ -20,16 +20,17 @@ from gmijax.ppo.loop import report
 from gmijax.sim.wrappers import env_keys
 
 ENV = point_mass()
+INIT, STEP = jax.jit(ENV.init), jax.jit(ENV.step)
 N = 4
 
 
 def _step_from(x: list[float]):
-    state = jax.jit(ENV.init)(ENV.model, env_keys(jax.random.key(0), 0, N))
+    state = INIT(ENV.model, env_keys(jax.random.key(0), 0, N))
     position, velocity = jnp.asarray(x), state.env.physics[1]
     state = state._replace(
         env=state.env._replace(physics=(position, velocity), obs=jnp.ones((N, 2)))
     )
-    return jax.jit(ENV.step)(ENV.model, state, jnp.zeros((N, 1)))
+    return STEP(ENV.model, state, jnp.zeros((N, 1)))
 
 
 def test_a_bad_world_ends_with_its_last_good_observation_and_no_reward() -> None:
