@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import threading
+from functools import partial
 
 import jax
 import jax.numpy as jnp
@@ -32,6 +33,7 @@ from gmijax.sim.wrappers import env_keys
 
 N, T = 12, 8
 ENV = point_mass()
+COLLECT = jax.jit(partial(collect, ENV), static_argnums=(0, 1))
 
 
 @pytest.fixture(scope="module")
@@ -66,8 +68,7 @@ def _copy(tree):
 
 def _unrolled(learner, state, envs):
     """The environments after an unroll, the unroll, and its counts."""
-    weights = acting_weights(learner, state)
-    return collect(ENV, learner.networks, T, ENV.model, weights, envs)
+    return COLLECT(learner.networks, T, ENV.model, acting_weights(learner, state), envs)
 
 
 @pytest.fixture(scope="module")
@@ -100,7 +101,7 @@ def test_an_unroll_is_what_the_environments_did(config) -> None:
     weights = acting_weights(learner, state)
     cuts = 0
     for _ in range(4):
-        envs, got, stats = collect(ENV, learner.networks, T, ENV.model, weights, envs)
+        envs, got, stats = COLLECT(learner.networks, T, ENV.model, weights, envs)
         np.testing.assert_array_equal(got.state[0], before)
         np.testing.assert_array_equal(got.bootstrap[0], envs.env.obs)
         assert float(stats.episodes.count) == got.done.any(-1).sum()
@@ -287,13 +288,10 @@ def test_it_learns_to_stand_still_from_a_policy_that_lags(config, changes) -> No
         dataclasses.replace(config, learning_rate=3e-3, **changes), num_envs=64
     )
     update = FusedUpdate(learner)
-    rollout = jax.jit(
-        lambda weights, envs: collect(ENV, learner.networks, T, ENV.model, weights, envs)
-    )
     versions = [acting_weights(learner, _copy(state))] * 3
     rewards = []
     for _ in range(80):
-        envs, batch, stats = rollout(versions[-3], envs)
+        envs, batch, stats = COLLECT(learner.networks, T, ENV.model, versions[-3], envs)
         state, updated = update(state, batch, jnp.ones(64))
         versions.append(unpack_weights(versions[0], updated.weights))
         rewards.append(float(stats.reward_sum) / (64 * T))

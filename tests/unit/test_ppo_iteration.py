@@ -1,4 +1,5 @@
 import dataclasses
+import functools
 import re
 
 import jax
@@ -191,10 +192,13 @@ def test_a_reducer_that_spans_no_program_splits_the_iteration(learner, size) -> 
 def test_shards_of_minibatches_give_the_update_of_the_whole(learner) -> None:
     """Two GMIs with N environments against one process with 2 N, on the same samples."""
     state, _ = _start(learner)
+    roll_out = jax.jit(functools.partial(rollout, ENV, learner))
+    gradients_of = jax.jit(functools.partial(gradients, learner))
+    apply = jax.jit(functools.partial(apply_gradients, learner))
 
     def collected(num_envs: int, first: int):
         envs = _start(learner, num_envs, first)[1]
-        _, samples, stats = rollout(ENV, learner, ENV.model, acting_weights(learner, state), envs)
+        _, samples, stats = roll_out(ENV.model, acting_weights(learner, state), envs)
         return flatten(samples), stats
 
     shards, shard_stats = zip(collected(N, 0), collected(N, N), strict=True)
@@ -208,15 +212,13 @@ def test_shards_of_minibatches_give_the_update_of_the_whole(learner) -> None:
     order = [minibatch_order(learner.config, state, jnp.int32(rank), T * N) for rank in range(2)]
     sharded = single = state
     for k in range(order[0].shape[0]):
-        parts = [
-            gradients(learner, sharded.params, shards[r], context, order[r][k]) for r in range(2)
-        ]
+        parts = [gradients_of(sharded.params, shards[r], context, order[r][k]) for r in range(2)]
         grads, losses = jax.tree.map(lambda *x: sum(x) / 2, *parts)
-        sharded = apply_gradients(learner, sharded, grads, losses.kl)
+        sharded = apply(sharded, grads, losses.kl)
         # Sample (t, env) of shard r is row t * 2N + r * N + env of the whole.
         rows = [(o[k] // N) * 2 * N + r * N + o[k] % N for r, o in enumerate(order)]
-        grads, losses = gradients(learner, single.params, whole, context, jnp.concatenate(rows))
-        single = apply_gradients(learner, single, grads, losses.kl)
+        grads, losses = gradients_of(single.params, whole, context, jnp.concatenate(rows))
+        single = apply(single, grads, losses.kl)
     _close(sharded.params, single.params, atol=2e-5)
     np.testing.assert_allclose(sharded.learning_rate, single.learning_rate)
 
