@@ -104,12 +104,8 @@ class Agent:
         self._link.beat("compiling", 0)
         started = time.monotonic()
         # Of the right shapes; those to act with come from the board.
-        weights = acting_weights(
-            self._learner,
-            jax.jit(partial(init_learner, self._learner, self._env.spec.obs_size))(
-                jax.random.key(0)
-            ),
-        )
+        start = jax.jit(partial(init_learner, self._learner, self._env.spec.obs_size))
+        weights = acting_weights(self._learner, start(jax.random.key(0)))
         env_state = first_envs(self._env, self._config, self._index, gmi=self._link.gmi)
         num_pieces = self._algo.pieces_per_unroll
         num_steps = self._algo.unroll_length // num_pieces

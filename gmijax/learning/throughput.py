@@ -69,7 +69,7 @@ class ThroughputMeter:
 
     def _rate(
         self,
-        unroll: Callable[[BatchState], BatchState],
+        move: Callable[[BatchState], BatchState],
         env_state: BatchState,
         beat: Callable[[], None],
     ) -> tuple[float, BatchState]:
@@ -77,7 +77,7 @@ class ThroughputMeter:
             self._reducer.all_gather(np.zeros(1, np.float32))
             started = time.monotonic()
             for _ in range(repeats):
-                envs = unroll(envs)
+                envs = move(envs)
             jax.block_until_ready(envs)
             seconds = time.monotonic() - started
             beat()
