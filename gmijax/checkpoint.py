@@ -13,7 +13,7 @@ import hashlib
 import math
 import os
 import shutil
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TypeVar
@@ -23,7 +23,9 @@ import jax.numpy as jnp
 import numpy as np
 import orbax.checkpoint as ocp
 
-from gmijax.errors import ConfigError
+from gmijax.collectives.interface import Reducer
+from gmijax.config import TrainConfig
+from gmijax.errors import ConfigError, NonFiniteError, ParameterMismatch
 from gmijax.resume import CheckpointMeta, file_check
 from gmijax.rundir import META, RunPaths, write_json
 from gmijax.types import PyTree
@@ -33,42 +35,39 @@ T = TypeVar("T")
 LEARNER = "learner"
 
 
-def save_checkpoint(
-    paths: RunPaths,
-    meta: CheckpointMeta,
-    learner_state: PyTree,
-    env_state: PyTree,
-    *,
-    gmi: int,
-    leader: bool,
-    barrier: Callable[[], None],
-    keep: int | None = None,
-) -> Path:
-    """Writes this GMI's part of a checkpoint; every GMI of the job must call it.
+def checkpoint_meta(
+    config: TrainConfig, env_steps: int, num_gmis: int, mean_return: float | None
+) -> CheckpointMeta:
+    """What `meta.json` says of a checkpoint of this run; `num_gmis` are those that simulate."""
+    algo = config.algo
+    return CheckpointMeta(
+        env=config.env.label,
+        algo=algo.name,
+        env_steps=env_steps,
+        num_gmis=num_gmis,
+        num_envs=config.envs_per_gmi,
+        hidden=(algo.policy_hidden_layer_sizes, algo.value_hidden_layer_sizes),
+        impl=config.physics.impl,
+        mean_return=mean_return,
+    )
 
-    Args:
-      paths: the run folder.
-      meta: what the checkpoint holds.
-      learner_state: equal on all GMIs, written by the leader only.
-      env_state: this GMI's environments, None if it has none.
-      gmi: id of this GMI.
-      leader: whether this GMI writes the shared part.
-      barrier: returns when all GMIs have called it.
-      keep: see `finish_checkpoint`.
 
-    Returns:
-      The checkpoint's folder.
-    """
-    if env_state is not None:
-        save_envs(paths, meta.env_steps, gmi, env_state)
-    if leader:
-        save_learner(paths, meta.env_steps, learner_state)
-    barrier()
-    if leader:
-        finish_checkpoint(paths, meta, keep)
-    # Nobody may look for the folder before it has its name.
-    barrier()
-    return paths.checkpoint(meta.env_steps)
+def require_equal(reducer: Reducer, params: PyTree, env_steps: int) -> None:
+    """Raises `ParameterMismatch` if the trainers' parameters differ; collective."""
+    digests = reducer.all_gather(digest(params))
+    if different := [r for r in range(len(digests)) if (digests[r] != digests[0]).any()]:
+        raise ParameterMismatch(
+            f"after {env_steps} env steps the parameters of trainers {different} differ from "
+            "those of trainer 0"
+        )
+
+
+def require_finite(params: PyTree, env_name: str, env_steps: int) -> None:
+    """Raises `NonFiniteError` if parameters to be saved are NaN or infinite."""
+    if not all(bool(jnp.all(jnp.isfinite(leaf))) for leaf in jax.tree.leaves(params)):
+        raise NonFiniteError(
+            f"{env_name}: parameters are not finite after {env_steps} env steps; nothing was saved"
+        )
 
 
 def save_learner(paths: RunPaths, env_steps: int, learner_state: PyTree) -> None:
@@ -202,7 +201,7 @@ def _as_one_process() -> Iterator[None]:
 
     GMIs that form rings are processes of one jax world, in which orbax would have them write one
     checkpoint together, through a service of jax that is gone by then. Here each writes folders
-    of its own, and `save_checkpoint` has a barrier.
+    of its own, and the training loop has a barrier.
     """
     count, index = jax.process_count, jax.process_index
     jax.process_count, jax.process_index = lambda *_: 1, lambda *_: 0

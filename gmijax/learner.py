@@ -10,11 +10,9 @@ from typing import Generic, NamedTuple, TypeVar
 import jax
 import jax.numpy as jnp
 import optax
-from jax.sharding import Sharding
+from jax.flatten_util import ravel_pytree
 
-from gmijax.collectives.interface import Reducer, stays_on_device
 from gmijax.config import ADAPTIVE_LEARNING_RATE_RANGE, AlgoConfig
-from gmijax.host_memory import host_sharding
 from gmijax.normalize import Moments, no_samples
 from gmijax.policy import ActorCritic, ActorCriticParams, make_actor_critic
 from gmijax.sim.interface import EnvSpec
@@ -92,6 +90,45 @@ def acting_moments(learner: Learner, state: LearnerState) -> Moments:
     return no_samples(state.obs_moments.mean.shape)
 
 
+class ActingWeights(NamedTuple):
+    """What it takes to act.
+
+    Attributes:
+      params: weights of policy and value function.
+      moments: statistics that observations are normalised with.
+    """
+
+    params: ActorCriticParams
+    moments: Moments
+
+
+def acting_weights(learner: Learner, state: LearnerState) -> ActingWeights:
+    """The weights to act with when the learner has `state`."""
+    return ActingWeights(state.params, acting_moments(learner, state))
+
+
+def pack_weights(weights: ActingWeights) -> Array:
+    """All numbers as one array [W] float32, to be sent."""
+    return ravel_pytree(weights)[0]
+
+
+def unpack_weights(example: ActingWeights, packed: Array) -> ActingWeights:
+    """Inverts `pack_weights`; `example` gives the structure."""
+    return ravel_pytree(example)[1](packed)
+
+
+def learner_shapes(spec: EnvSpec, config: AlgoConfig) -> LearnerState:
+    """Shapes of a state; nothing is computed."""
+    learner = make_learner(spec, config)
+    return jax.eval_shape(lambda: init_learner(learner, spec.obs_size, jax.random.key(0)))
+
+
+def num_weights(spec: EnvSpec, config: AlgoConfig) -> int:
+    """W, length of the packed weights."""
+    state = learner_shapes(spec, config)
+    return sum(leaf.size for leaf in jax.tree.leaves((state.params, state.obs_moments)))
+
+
 def apply_gradients(
     learner: Learner, state: LearnerState, grads: ActorCriticParams, kl: Array
 ) -> LearnerState:
@@ -112,11 +149,6 @@ def rate_figures(config: AlgoConfig, rates: Array) -> dict[str, Array]:
     if config.learning_rate_schedule == "fixed" or rates.size == 1:
         return {}
     return {"mean": jnp.mean(rates), "min": jnp.min(rates), "max": jnp.max(rates)}
-
-
-def gradient_sharding(reducer: Reducer) -> Sharding | None:
-    """Where a program should put gradients: where the reducer reads them; None for anywhere."""
-    return None if stays_on_device(reducer) else host_sharding()
 
 
 def adapted_learning_rate(rate: Array, kl: Array, desired_kl: float) -> Array:

@@ -1,4 +1,4 @@
-"""What a run says of itself: one flat dict of numbers per iteration, and where it goes."""
+"""Lines of metrics: one flat dict of numbers per iteration, and the files that they go to."""
 
 from __future__ import annotations
 
@@ -6,9 +6,9 @@ import json
 import math
 import time
 from collections import deque
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, NamedTuple, Protocol
+from typing import Any, Protocol
 
 from tensorboardX.event_file_writer import EventsWriter
 from tensorboardX.proto import event_pb2, summary_pb2
@@ -19,33 +19,15 @@ WINDOW_EPISODES = 100
 Line = Mapping[str, float | int | None]
 
 
-class Episodes(NamedTuple):
-    """Sums over episodes that ended.
-
-    Attributes:
-      count: number of episodes.
-      return_sum: sum of their returns, unscaled.
-      length_sum: sum of their lengths in steps.
-      term_sums: sums of every reward term.
-      metric_sums: sums of every metric of the task at the episodes' ends.
-    """
-
-    count: float
-    return_sum: float
-    length_sum: float
-    term_sums: Mapping[str, float]
-    metric_sums: Mapping[str, float]
-
-
 class EpisodeWindow:
     """Means over the latest episodes: the fewest iterations that hold WINDOW_EPISODES."""
 
     def __init__(self) -> None:
-        self._latest: deque[Episodes] = deque()
+        self._latest: deque[Any] = deque()
         self._count = 0.0
 
-    def add(self, episodes: Episodes) -> None:
-        """Takes in the episodes that ended in one iteration."""
+    def add(self, episodes: Any) -> None:
+        """Takes in the `EpisodeSums` of one iteration, as numbers of the host."""
         self._latest.append(episodes)
         self._count += episodes.count
         while self._count - self._latest[0].count >= WINDOW_EPISODES:
@@ -131,23 +113,6 @@ class TensorBoardSink:
     def close(self) -> None:
         """See `Sink`."""
         self._writer.close()
-
-
-class MetricsLog:
-    """Several sinks as one."""
-
-    def __init__(self, sinks: Iterable[Sink]) -> None:
-        self._sinks = tuple(sinks)
-
-    def write(self, line: Line) -> None:
-        """See `Sink`."""
-        for sink in self._sinks:
-            sink.write(line)
-
-    def close(self) -> None:
-        """See `Sink`."""
-        for sink in self._sinks:
-            sink.close()
 
 
 def _finite(value: float | int | None) -> float | int | None:

@@ -1,7 +1,8 @@
-"""What went wrong in the physics of some steps, told alike by training and serving. No jax."""
+"""Bad numbers and full buffers, reported alike by training and serving. No jax."""
 
 from __future__ import annotations
 
+import math
 import sys
 from collections.abc import Mapping
 
@@ -32,6 +33,16 @@ def check_diverged(where: str, diverged: Mapping[str, float], steps: float) -> N
             f"{where}: {diverged['any']:.0f} of {steps:.0f} steps gave numbers that are not "
             f"finite or beyond all bounds, in {', '.join(places)}"
         )
+
+
+def check_losses(where: str, losses: Mapping[str, float]) -> None:
+    """Ends a job whose losses are not finite.
+
+    Raises:
+      NonFiniteError: names those of `losses` that are NaN or infinite, and `where`.
+    """
+    if names := [name for name, value in losses.items() if not math.isfinite(value)]:
+        raise NonFiniteError(f"{where}: {', '.join(names)} of the update is not finite")
 
 
 class OverflowCount:

@@ -140,8 +140,7 @@ def check_training(reducer: Reducer, options: Options) -> Options:
 
     from gmijax.cli import compose
     from gmijax.learner import init_learner, make_learner
-    from gmijax.ppo.programs import SpmdIteration
-    from gmijax.ppo.split import SplitIteration
+    from gmijax.ppo.iteration import SplitIteration, make_iteration
     from gmijax.sim.wrappers import env_keys
 
     env = point_mass()
@@ -150,13 +149,13 @@ def check_training(reducer: Reducer, options: Options) -> Options:
     )
     learner = make_learner(env.spec, dataclasses.replace(config, **options["algo"]))
     keys = env_keys(jax.random.key(1), reducer.rank * 8, 8)
-    whole = SpmdIteration.if_possible(env, learner, reducer)
-    assert whole is not None
+    whole = make_iteration(env, learner, reducer)
+    assert not isinstance(whole, SplitIteration)
     found = []
     for iteration in (whole, SplitIteration(env, learner, reducer)):
         state = init_learner(learner, env.spec.obs_size, jax.random.key(0))
         envs = jax.jit(env.init)(env.model, keys)
-        iteration.trace(state, envs)
+        iteration.trace(env.model, state, envs)
         iteration.compile()
         for _ in range(3):
             state, envs, _ = iteration(state, envs)

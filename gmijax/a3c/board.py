@@ -64,7 +64,7 @@ class Report(NamedTuple):
       send_s: seconds spent on sending, with waits for room.
       wait_s: those of them in which it waited for room and had nothing to compute.
       occupancy: fraction of the room for experience that was full, after the last send.
-      stats: [M] sums over all its unrolls, see `gmijax.a3c.rollout.UnrollStats`.
+      stats: [M] sums over all its unrolls, see `gmijax.learning.unroll.Counts`.
     """
 
     checkpoint: int | None

@@ -10,9 +10,9 @@ from typing import Final, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from gmijax.acting import policy_noise
 from gmijax.checkpoint import digest, restore_learner
 from gmijax.learner import Learner, acting_moments, init_learner, make_learner
+from gmijax.learning.unroll import policy_noise
 from gmijax.normalize import normalize
 from gmijax.policy import log_prob
 from gmijax.resume import trained_config

@@ -9,7 +9,7 @@ from typing import Any
 import jax
 
 from gmijax.collection.programs import Counts
-from gmijax.metrics import Episodes, EpisodeWindow, JsonlSink
+from gmijax.metrics import EpisodeWindow, JsonlSink
 from gmijax.partition.child import ChildLink
 from gmijax.physics_health import OverflowCount, check_diverged, overflow_line
 
@@ -51,7 +51,7 @@ class Tally:
         check_diverged(where, host.diverged, self._steps)
         self._diverged += host.diverged["any"]
         self._overflows.add(host.overflowed)
-        episodes = Episodes(**host.episodes._asdict())
+        episodes = host.episodes
         self._window.add(episodes)
         for name in self._totals:
             self._totals[name] += getattr(episodes, name)

@@ -98,7 +98,7 @@ class SpmdStep:
             check_vma=False,
         )
         self._constants = self._global(constants, _specs(constants))
-        # Metrics are in memory of the host, as those of one GMI (`FusedIteration`).
+        # Metrics are in memory of the host, as those of one GMI (`StepOfOne`).
         told = NamedSharding(self._mesh, _REPLICATED, memory_kind="pinned_host")
         out_shardings = (None, None, told) if self._is_on_gpus else None
         program = jax.jit(mapped, donate_argnums=(1, 2), out_shardings=out_shardings)

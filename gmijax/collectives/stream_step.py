@@ -15,7 +15,7 @@ import jax.numpy as jnp
 from gmijax.collectives.interface import Step
 from gmijax.collectives.stream_exchange import StreamExchange
 from gmijax.collectives.sums import ordered_sum
-from gmijax.host_memory import host_sharding
+from gmijax.devices import host_sharding
 
 
 class StreamPeers:
@@ -79,7 +79,7 @@ class StreamStep:
         def whole(rank: jax.Array, constants: Any, shared: Any, own: Any) -> tuple[Any, Any, Any]:
             return self._step(StreamPeers(self._exchange, rank), constants, shared, own)
 
-        told = host_sharding()  # As metrics of one GMI (`FusedIteration`).
+        told = host_sharding()  # As metrics of one GMI (`StepOfOne`).
         out_shardings = None if told is None else (None, None, told)
         program = jax.jit(whole, donate_argnums=(2, 3), out_shardings=out_shardings)
         self._constants = constants

@@ -33,7 +33,7 @@ ENV_BOARD_FD: Final = "GMIJAX_BOARD_FD"
 ENV_CHANNELS_FD: Final = "GMIJAX_CHANNELS_FD"
 
 FLOAT_CHANNELS: Final = ("state", "action", "reward", "log_prob", "cut_value", "bootstrap")
-"""Channels of an unroll that could travel with half the bits; see `gmijax.a3c.losses.Unrolls`."""
+"""Channels of an unroll that could travel with half the bits; see `gmijax.a3c.a3c.Unrolls`."""
 
 _ADVICE: Final = (
     "channels through host memory; channel.transport=device keeps experience on its GPU, which "
@@ -69,7 +69,7 @@ def training_kind(config: TrainConfig) -> JobKind:
         module = "gmijax.workers.async_worker"
         return JobKind(module, compile_once=False, shared=partial(_board_and_channels, config))
     if config.plan.template == "tdg_ex":
-        module = "gmijax.workers.dedicated_worker"
+        module = "gmijax.workers.worker"
         return JobKind(module, compile_once=False, shared=partial(pipes, ROLLOUT_PIPE_BYTES))
     return SYNCHRONOUS
 

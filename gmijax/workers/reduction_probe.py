@@ -137,7 +137,7 @@ def _on_device(reducer: DeviceReducer, num_floats: int) -> _Ways:
 def _through_host(reducer: Reducer, num_floats: int) -> _Ways:
     import jax
 
-    from gmijax.learner import gradient_sharding
+    from gmijax.learning.updates import gradient_sharding
 
     gradient = jax.device_put(np.ones(num_floats, np.float32))
     fetch = jax.jit(lambda x: x + 0.0, out_shardings=gradient_sharding(reducer))

@@ -1,4 +1,4 @@
-"""What mains of training jobs share: environments, and how those that train find each other."""
+"""What the mains of training jobs share: their input, environments, the exchange of trainers."""
 
 from __future__ import annotations
 
@@ -8,11 +8,19 @@ from gmijax.config import TrainConfig
 from gmijax.partition.child import ChildLink
 from gmijax.partition.plan import Plan
 from gmijax.partition.templates import Group
+from gmijax.rundir import read_json
+from gmijax.schema import from_dict
 
 if TYPE_CHECKING:
     from gmijax.collectives.interface import Reducer
     from gmijax.collectives.ring import World
     from gmijax.sim.wrappers import BatchedEnv
+
+
+def read_job(link: ChildLink) -> tuple[TrainConfig, Plan]:
+    """What the controller has written for this run."""
+    config = from_dict(TrainConfig, read_json(link.run.config))
+    return config, Plan.from_dict(read_json(link.run.plan))
 
 
 def environments_of(config: TrainConfig, place: int) -> BatchedEnv:
@@ -52,16 +60,8 @@ def trainers_reducer(
 ) -> Reducer:
     """The reducer among the trainers, whose ranks are their places in the group.
 
-    Args:
-      config: of the run.
-      plan: of the run.
-      trainers: who takes part.
-      link: this process, one of them.
-      num_floats: P, length of the buffers for `mean`.
-      world: from `join_trainers`.
-
-    Raises:
-      ConfigError, CollectiveError: as `build_reducer`.
+    Its buffers for `mean` have `num_floats` numbers; `world` is from `join_trainers`. Raises as
+    `build_reducer`.
     """
     from gmijax.collectives.build import Membership, build_reducer
 

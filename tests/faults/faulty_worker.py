@@ -147,8 +147,8 @@ def _inject_in_training(faults: Faults) -> None:
 
     from gmijax import checkpoint
     from gmijax.collectives.mpr import MprReducer
-    from gmijax.ppo.report import Reporter
-    from gmijax.ppo.split import SplitIteration
+    from gmijax.learning.training_log import TrainingLog
+    from gmijax.ppo.iteration import SplitIteration
 
     def synced(path: Path) -> None:
         if path.name.endswith(".partial"):
@@ -179,7 +179,7 @@ def _inject_in_training(faults: Faults) -> None:
         return iterate(self, state, env_state)
 
     _before(MprReducer, "mean", lambda *_: faults.at("mean"))
-    _before(Reporter, "report", lambda *_: faults.at("report"))
+    _before(TrainingLog, "write", lambda *_: faults.at("report"))
     _before(checkpoint, "_sync", synced)
     checkpoint._save = save_half
     checkpoint.shutil = _Recorded(checkpoint.shutil, removed)

@@ -26,7 +26,7 @@ from training_jobs import (
     wait_until,
 )
 
-from gmijax.a3c.staleness import MAX_COUNTED
+from gmijax.a3c.report import MAX_COUNTED
 from gmijax.resume import find_checkpoint
 
 N, T = 16, 4

@@ -13,14 +13,19 @@ import pytest
 from toy_env import point_mass
 from training_jobs import wait_until
 
-from gmijax.a3c.agent import Serving, act_until_told
+from gmijax.a3c.agent import Agent
 from gmijax.a3c.board import Board, Orders, board_of, note_sizes, pack_orders, unpack_report
-from gmijax.a3c.learner import acting_weights, num_weights, pack_weights
-from gmijax.a3c.rollout import num_stats
+from gmijax.a3c.rollout import num_counts
 from gmijax.cli import compose
 from gmijax.collectives.board import attach_board, create_board
 from gmijax.collectives.channel.interface import SenderStats
-from gmijax.learner import init_learner, make_learner
+from gmijax.learner import (
+    acting_weights,
+    init_learner,
+    make_learner,
+    num_weights,
+    pack_weights,
+)
 from gmijax.normalize import normalize
 from gmijax.partition.child import ChildLink
 from gmijax.policy import log_prob
@@ -64,7 +69,7 @@ def config():
 
 
 def _board(config) -> Board:
-    sizes = note_sizes(num_weights(ENV.spec, config.algo), num_stats(ENV), num_agents=1)
+    sizes = note_sizes(num_weights(ENV.spec, config.algo), num_counts(ENV), num_agents=1)
     fd = create_board()
     try:
         return board_of(attach_board(fd, sizes))
@@ -105,7 +110,7 @@ def test_newer_weights_are_taken_up_within_an_unroll(tmp_path, config) -> None:
     board, link, weights, learner = _agent(tmp_path, config)
     bolder = weights._replace(params=weights.params._replace(log_std=weights.params.log_std + 1.0))
     sender = _Publisher(board, np.asarray(pack_weights(bolder)))
-    act_until_told(Serving(config, config.algo, ENV, 0, (0,)), board, sender, link)
+    Agent(config, ENV, 0, (0,), board, sender, link).run()
     assert [version for _, version in sender.taken] == [3, 3, 4]
 
     def told(experience, theirs):
@@ -133,9 +138,9 @@ def test_an_agent_without_room_still_adds_to_a_checkpoint(tmp_path, config) -> N
         posted = board.reports[0].read()
         return posted is not None and unpack_report(posted).checkpoint == steps
 
-    serving = Serving(config, config.algo, ENV, index=0, trainers=(0,))
+    agent = Agent(config, ENV, 0, (0,), board, sender, link)
     with ThreadPoolExecutor(1) as pool:
-        outcome = pool.submit(act_until_told, serving, board, sender, link)
+        outcome = pool.submit(agent.run)
         try:
             assert sender.was_asked.wait(timeout=60)
             board.orders.publish(pack_orders(Orders(5, is_ending=False)))

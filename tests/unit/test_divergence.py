@@ -12,24 +12,25 @@ import pytest
 from toy_env import metrics_from, point_mass
 
 from gmijax.errors import NonFiniteError
-from gmijax.metrics import Line, MetricsLog
+from gmijax.learning.report_thread import ReportThread
+from gmijax.learning.training_log import TrainingLog
+from gmijax.learning.unroll import Counts, no_counts
 from gmijax.physics_health import TOLERATED_STEPS
-from gmijax.ppo.programs import IterationMetrics
-from gmijax.ppo.report import Reporter, ReportThread
-from gmijax.ppo.rollout import stats_example
+from gmijax.ppo.loop import report
 from gmijax.sim.wrappers import env_keys
 
 ENV = point_mass()
+INIT, STEP = jax.jit(ENV.init), jax.jit(ENV.step)
 N = 4
 
 
 def _step_from(x: list[float]):
-    state = jax.jit(ENV.init)(ENV.model, env_keys(jax.random.key(0), 0, N))
+    state = INIT(ENV.model, env_keys(jax.random.key(0), 0, N))
     position, velocity = jnp.asarray(x), state.env.physics[1]
     state = state._replace(
         env=state.env._replace(physics=(position, velocity), obs=jnp.ones((N, 2)))
     )
-    return jax.jit(ENV.step)(ENV.model, state, jnp.zeros((N, 1)))
+    return STEP(ENV.model, state, jnp.zeros((N, 1)))
 
 
 def test_a_bad_world_ends_with_its_last_good_observation_and_no_reward() -> None:
@@ -59,61 +60,58 @@ def test_a_bad_world_starts_over_and_the_others_go_on() -> None:
     assert np.isfinite(state.env.obs).all()
 
 
-@pytest.mark.parametrize("count", [TOLERATED_STEPS, TOLERATED_STEPS + 1])
-def test_few_bad_steps_are_tolerated_and_many_are_named(count: int) -> None:
-    stats = stats_example(ENV.spec)
-    stats = stats._replace(
-        diverged=stats.diverged | {"any": jnp.asarray(count), "reward/near": jnp.asarray(count)}
-    )
-    metrics = metrics_from(stats)
-    reporter = Reporter("point_mass", MetricsLog(()), 0)
-    if count <= TOLERATED_STEPS:
-        reporter.report(64, metrics, {})
-    else:
-        with pytest.raises(NonFiniteError, match=r"point_mass, up to env step 64: .* reward/near"):
-            reporter.report(64, metrics, {})
+def _counts(**diverged: int) -> Counts:
+    counts = no_counts(ENV.spec)
+    bad = {name: jnp.asarray(float(steps)) for name, steps in diverged.items()}
+    return counts._replace(diverged=counts.diverged | bad)
 
 
-def _metrics(bad_steps: int) -> IterationMetrics:
-    stats = stats_example(ENV.spec)
-    stats = stats._replace(diverged=stats.diverged | {"any": jnp.asarray(bad_steps)})
-    return metrics_from(stats)
+def test_few_bad_steps_are_tolerated_and_many_are_named() -> None:
+    log = TrainingLog("point_mass", (), 0)
+    for count in (TOLERATED_STEPS, TOLERATED_STEPS + 1):
+        metrics = metrics_from(_counts(any=count, **{"reward/near": count}))
+        if count <= TOLERATED_STEPS:
+            report(log, 64, metrics, {})
+        else:
+            with pytest.raises(
+                NonFiniteError, match=r"point_mass, up to env step 128: .* reward/near"
+            ):
+                report(log, 128, metrics, {})
 
 
-def test_lines_come_in_order_from_a_thread_of_their_own_and_errors_with_the_next_call() -> None:
-    written: list[Line] = []
-
-    class Sink:
-        def write(self, line: Line) -> None:
-            written.append(line)
-
-        def close(self) -> None:
-            pass
-
-    lines = ReportThread(Reporter("point_mass", MetricsLog((Sink(),)), 0))
-    for iteration in (1, 2, 3):
-        lines.report(64 * iteration, _metrics(0), {})
-    lines.wait()
-    assert [line["env_steps"] for line in written] == [64, 128, 192]
-    lines.report(256, _metrics(TOLERATED_STEPS + 1), {})
-    with pytest.raises(NonFiniteError, match="up to env step 256"):
-        lines.report(320, _metrics(0), {})
-    lines.stop()
-    assert len(written) == 3
+def test_a_loss_that_is_not_finite_is_named() -> None:
+    metrics = metrics_from(_counts())
+    spoilt = metrics._replace(losses=metrics.losses._replace(value_loss=jnp.asarray(jnp.nan)))
+    with pytest.raises(NonFiniteError, match="value_loss of the update is not finite"):
+        report(TrainingLog("point_mass", (), 0), 64, spoilt, {})
 
 
-def test_a_line_that_cannot_come_is_not_waited_for() -> None:
+def test_reports_come_in_order_from_a_thread_of_their_own_and_errors_with_the_next_call() -> None:
+    written: list[int] = []
+
+    def write(number: int) -> None:
+        if number < 0:
+            raise NonFiniteError("bad number")
+        written.append(number)
+
+    thread = ReportThread(write)
+    for number in (1, 2, 3):
+        thread.report(number)
+    thread.wait()
+    assert written == [1, 2, 3]
+    thread.report(-1)
+    with pytest.raises(NonFiniteError, match="bad number"):
+        thread.report(4)
+    thread.stop()
+    assert written == [1, 2, 3]
+
+
+def test_a_report_that_cannot_come_is_not_waited_for() -> None:
     is_there = threading.Event()
-
-    class Pending:
-        def __array__(self, dtype=None, copy=None):
-            is_there.wait(30)
-            return np.zeros(())
-
-    lines = ReportThread(Reporter("point_mass", MetricsLog(()), 0))
-    lines.report(64, _metrics(0)._replace(noise_std=Pending()), {})
-    lines.give_up()
+    thread = ReportThread(lambda: is_there.wait(30))
+    thread.report()
+    thread.give_up()
     started = time.monotonic()
-    lines.stop()
+    thread.stop()
     assert time.monotonic() - started < 1.5  # It waits 2 s for one that may come.
     is_there.set()

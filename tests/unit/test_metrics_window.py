@@ -6,13 +6,14 @@ from pathlib import Path
 
 import pytest
 
-from gmijax.metrics import Episodes, EpisodeWindow, TensorBoardSink
+from gmijax.metrics import EpisodeWindow, TensorBoardSink
+from gmijax.sim.wrappers import EpisodeSums
 
 
 def test_terms_and_metrics_are_means_over_episodes():
     window = EpisodeWindow()
-    window.add(Episodes(1, 4.0, 10, {"alive": 2.0}, {"successes": 3.0}))
-    window.add(Episodes(3, 8.0, 30, {"alive": 6.0}, {"successes": 5.0}))
+    window.add(EpisodeSums(1, 4.0, 10, {"alive": 2.0}, {"successes": 3.0}))
+    window.add(EpisodeSums(3, 8.0, 30, {"alive": 6.0}, {"successes": 5.0}))
     assert window.means() == {
         "return": 3.0,
         "episode_length": 10.0,
@@ -23,7 +24,7 @@ def test_terms_and_metrics_are_means_over_episodes():
 
 def test_there_are_no_means_before_an_episode_has_ended():
     window = EpisodeWindow()
-    window.add(Episodes(0, 0.0, 0, {"alive": 0.0}, {}))
+    window.add(EpisodeSums(0, 0.0, 0, {"alive": 0.0}, {}))
     assert window.means() == {"return": None, "episode_length": None}
 
 

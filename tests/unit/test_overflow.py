@@ -9,10 +9,11 @@ import jax.numpy as jnp
 import pytest
 from toy_env import metrics_from, point_mass_env
 
-from gmijax.metrics import Line, MetricsLog
-from gmijax.ppo.programs import IterationMetrics
-from gmijax.ppo.report import Reporter
-from gmijax.ppo.rollout import stats_example
+from gmijax.learning.training_log import TrainingLog
+from gmijax.learning.unroll import no_counts
+from gmijax.metrics import Line
+from gmijax.ppo.loop import report
+from gmijax.ppo.ppo import IterationMetrics
 from gmijax.sim.interface import OVERFLOWS
 from gmijax.sim.wrappers import env_keys, training_env
 
@@ -33,11 +34,8 @@ class Lines:
 
 
 def metrics(env: Any, overflowed: dict[str, int]) -> IterationMetrics:
-    stats = stats_example(env.spec, env.overflows)
-    stats = stats._replace(
-        overflowed={name: jnp.asarray(count) for name, count in overflowed.items()}
-    )
-    return metrics_from(stats)
+    steps = {name: jnp.asarray(count) for name, count in overflowed.items()}
+    return metrics_from(no_counts(env.spec, env.overflows)._replace(overflowed=steps))
 
 
 def test_worlds_that_met_a_full_buffer_are_counted_by_buffer() -> None:
@@ -59,7 +57,7 @@ def test_without_such_buffers_there_is_nothing_to_count() -> None:
     state = env.init(env.model, env_keys(jax.random.key(0), 0, N))
     assert env.step(env.model, state, jnp.zeros((N, 1)))[1].overflowed == {}
     sink = Lines()
-    Reporter("point_mass", MetricsLog((sink,)), 0).report(64, metrics(env, {}), {})
+    report(TrainingLog("point_mass", (sink,), 0), 64, metrics(env, {}), {})
     assert not [name for name in sink.lines[0] if name.startswith("physics/")]
 
 
@@ -70,13 +68,13 @@ def test_the_first_overflow_is_told_and_all_are_logged(
         point_mass_env()._replace(overflow=lambda _: jnp.zeros(len(OVERFLOWS), bool))
     )
     sink = Lines()
-    reporter = Reporter("point_mass", MetricsLog((sink,)), 0)
+    log = TrainingLog("point_mass", (sink,), 0)
     for iteration, count in enumerate((0, 5, 7), start=1):
         found = metrics(env, {"contact": count, "constraint": 0})
-        reporter.report(64 * iteration, found, {})
+        report(log, 64 * iteration, found, {})
     assert [line["physics/contact_overflow_steps"] for line in sink.lines] == [0.0, 5.0, 7.0]
     assert [line["physics/constraint_overflow_steps"] for line in sink.lines] == [0.0] * 3
-    assert reporter.overflows.steps == {"contact": 12.0, "constraint": 0.0}
+    assert log.overflows.steps == {"contact": 12.0, "constraint": 0.0}
     told = capsys.readouterr().err.splitlines()
     assert len(told) == 1
     assert told[0].startswith("point_mass: MJX-Warp's contact buffer was too small in 5 ")

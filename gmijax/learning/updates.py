@@ -1,7 +1,4 @@
-"""Updates of one of several trainers: gradient and step are programs around a reducer.
-
-What the algorithms share where their updates cannot be one program of all trainers.
-"""
+"""Updates on minibatches, whatever the loss: in one program, or as programs around a reducer."""
 
 from __future__ import annotations
 
@@ -14,11 +11,15 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
+from jax.sharding import Sharding
 
-from gmijax.collectives.interface import FloatBuffer, Reducer, stays_on_device
-from gmijax.learner import Learner, LearnerState, apply_gradients, gradient_sharding
+from gmijax.collectives.interface import FloatBuffer, Peers, Reducer, stays_on_device
+from gmijax.config import AlgoConfig
+from gmijax.devices import host_sharding
+from gmijax.learner import Learner, LearnerState, apply_gradients, learner_shapes
 from gmijax.policy import ActorCriticParams
-from gmijax.types import Array
+from gmijax.sim.interface import EnvSpec
+from gmijax.types import Array, PyTree
 
 Gradients: TypeAlias = Callable[[Learner, ActorCriticParams, Any, Any, Array], tuple[Any, Any]]
 """`(learner, params, data, context, indices) -> (gradient, losses)` of a minibatch of `data`;
@@ -28,8 +29,63 @@ Mean: TypeAlias = Callable[[Array], Array | FloatBuffer]
 """From a rank's gradient to the mean of all."""
 
 
+def minibatch_order(config: AlgoConfig, state: LearnerState, rank: Array, size: int) -> Array:
+    """Indices [epochs * minibatches, B] into data of length `size`: each once per epoch."""
+    key = jax.random.fold_in(jax.random.fold_in(state.key, state.iteration), rank)
+    keys = jax.random.split(key, config.num_updates_per_batch)
+    order = jax.vmap(lambda k: jax.random.permutation(k, size))(keys)
+    return order.reshape(config.num_updates_per_batch * config.num_minibatches, -1)
+
+
+def exchange_size(spec: EnvSpec, config: AlgoConfig, losses: Any) -> int:
+    """P, how many float32 trainers average per minibatch: gradient and parts of the loss."""
+    params = learner_shapes(spec, config).params
+    return sum(leaf.size for leaf in jax.tree.leaves(params)) + len(losses._fields)
+
+
+def gradient_sharding(reducer: Reducer) -> Sharding | None:
+    """Where a program should put gradients: where the reducer reads them; None for anywhere."""
+    return None if stays_on_device(reducer) else host_sharding()
+
+
+def run_updates(
+    learner: Learner,
+    peers: Peers | None,
+    gradients: Gradients,
+    state: LearnerState,
+    data: PyTree,
+    context: Any,
+    order: Array,
+) -> tuple[LearnerState, Any, Array]:
+    """All updates on one set of data, within a program of all trainers.
+
+    Args:
+      learner: of this trainer.
+      peers: the trainers, None if there is only this one.
+      gradients: see `Gradients`.
+      state: of the learner.
+      data: of this trainer.
+      context: what stays the same in all updates.
+      order: indices into `data` [minibatches, B].
+
+    Returns:
+      The new state; losses and learning rates of all updates, with a leading axis.
+    """
+
+    def update(state: LearnerState, indices: Array) -> tuple[LearnerState, tuple[Any, Array]]:
+        grads, losses = gradients(learner, state.params, data, context, indices)
+        if peers is not None:
+            packed, unpack = ravel_pytree((grads, losses))
+            grads, losses = unpack(peers.mean(packed))
+        state = apply_gradients(learner, state, grads, losses.steering_kl)
+        return state, (losses, state.learning_rate)
+
+    state, (losses, rates) = jax.lax.scan(update, state, order)
+    return state, losses, rates
+
+
 class SplitUpdates:
-    """All updates on one set of data; collective.
+    """All updates on one set of data, where the host comes between; collective.
 
     Args:
       learner: of this trainer.
@@ -77,14 +133,7 @@ class SplitUpdates:
     def __call__(
         self, state: LearnerState, data: Any, context: Any, order: Array
     ) -> tuple[LearnerState, list[Array]]:
-        """The new state, and what every minibatch told, packed; see `summary`.
-
-        Args:
-          state: donated.
-          data: of this trainer, on its device.
-          context: what stays the same in all updates.
-          order: indices into `data` [minibatches, b].
-        """
+        """As `run_updates`; the second result is for `summary`, and `state` is donated."""
 
         def updates(mean: Mean) -> tuple[LearnerState, list[Array]]:
             return self._updates(mean, state, data, context, order)

@@ -9,18 +9,18 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from functools import partial, reduce
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import numpy.typing as npt
 
-from gmijax.acting import act
-from gmijax.learner import Learner, LearnerState, acting_moments
+from gmijax.learner import Learner, LearnerState, acting_weights
+from gmijax.learning.unroll import act, unroll
 from gmijax.sim.divergence import diverged_by_source, end_diverged
 from gmijax.sim.interface import Env, EnvState
-from gmijax.sim.wrappers import BatchState, env_keys, vectorise
+from gmijax.sim.wrappers import BatchedEnv, BatchState, env_keys, vectorise
 from gmijax.types import Array, PRNGKey, PyTree
 
 CHUNK_STEPS = 50
@@ -147,14 +147,15 @@ def _run_chunk(
     Returns:
       The state, qpos [CHUNK_STEPS, E, nq], and which worlds diverged meanwhile, [N] bool.
     """
+    weights = acting_weights(learner, state)
     step_all = vectorise(env).step
-    moments = acting_moments(learner, state)
 
-    def step(before: BatchState, _: None) -> tuple[BatchState, tuple[Array, Array]]:
-        drawn, mean, noisy = act(
-            learner.networks, state.params, moments, before, env.spec.action_size
-        )
-        moved = step_all(model, drawn.env, mean if options.deterministic else noisy)
+    def choose(before: BatchState) -> tuple[BatchState, Array, Array]:
+        drawn, mean, noisy = act(learner.networks, weights, before)
+        return drawn, mean, mean if options.deterministic else noisy
+
+    def step(model: PyTree, before: BatchState, action: Array) -> tuple[BatchState, Any]:
+        moved = step_all(model, before.env, action)
         moved, bad = _without_bad_numbers(env, before.env, moved)
         after = BatchState(
             moved,
@@ -166,7 +167,10 @@ def _run_chunk(
         kept = _where(running, after, before)
         return kept, (_shown_qpos(env, kept.env, options.num_shown), running & bad)
 
-    batch, (qpos, diverged) = jax.lax.scan(step, batch, None, length=CHUNK_STEPS)
+    stopping: Any = BatchedEnv(env.spec, model, partial(_start, env), step)
+    batch, (qpos, diverged) = unroll(
+        stopping, choose, CHUNK_STEPS, lambda *step: step[-1], model, batch
+    )
     return batch, qpos, jnp.any(diverged, axis=0)
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import threading
+from functools import partial
 
 import jax
 import jax.numpy as jnp
@@ -12,26 +13,27 @@ import pytest
 from jax.flatten_util import ravel_pytree
 from toy_env import point_mass
 
-from gmijax.a3c.learner import (
+from gmijax.a3c.a3c import A3cLosses, Unrolls, batch_targets, gradients
+from gmijax.a3c.report import histogram_of, mean_and_p99
+from gmijax.a3c.rollout import UnrollPrograms, collect
+from gmijax.a3c.update import FusedUpdate, SplitUpdate
+from gmijax.cli import compose
+from gmijax.collectives.solo import SoloReducer
+from gmijax.learner import (
     acting_weights,
-    begin_batch,
-    gradients,
+    init_learner,
+    make_learner,
     num_weights,
     pack_weights,
     unpack_weights,
 )
-from gmijax.a3c.losses import LossMetrics, Unrolls
-from gmijax.a3c.programs import FusedUpdate, SplitUpdate, exchange_size
-from gmijax.a3c.rollout import UnrollPrograms, collect
-from gmijax.a3c.staleness import histogram_of, mean_and_p99
-from gmijax.cli import compose
-from gmijax.collectives.solo import SoloReducer
-from gmijax.learner import init_learner, make_learner
+from gmijax.learning.updates import exchange_size
 from gmijax.sim.wrappers import env_keys
 from gmijax.supervise.kinds import FLOAT_CHANNELS
 
 N, T = 12, 8
 ENV = point_mass()
+COLLECT = jax.jit(partial(collect, ENV), static_argnums=(0, 1))
 
 
 @pytest.fixture(scope="module")
@@ -56,12 +58,37 @@ def _start(config, num_envs: int = N):
     return learner, state, jax.jit(ENV.init)(ENV.model, keys)
 
 
+def _size(config) -> int:
+    return exchange_size(ENV.spec, config, A3cLosses)
+
+
 def _copy(tree):
     return jax.tree.map(jnp.copy, tree)
 
 
-def test_weights_travel_as_one_array(config) -> None:
-    learner, state, _ = _start(config)
+def _unrolled(learner, state, envs):
+    """The environments after an unroll, the unroll, and its counts."""
+    return COLLECT(learner.networks, T, ENV.model, acting_weights(learner, state), envs)
+
+
+@pytest.fixture(scope="module")
+def start(config):
+    """Learner, its state and environments; nobody may donate them."""
+    return _start(config)
+
+
+@pytest.fixture(scope="module")
+def batch(start) -> Unrolls:
+    return _unrolled(*start)[1]
+
+
+@pytest.fixture(scope="module")
+def fused(start) -> FusedUpdate:
+    return FusedUpdate(start[0])
+
+
+def test_weights_travel_as_one_array(config, start) -> None:
+    learner, state, _ = start
     weights = acting_weights(learner, state)
     packed = pack_weights(weights)
     assert packed.shape == (num_weights(ENV.spec, config),)
@@ -74,7 +101,7 @@ def test_an_unroll_is_what_the_environments_did(config) -> None:
     weights = acting_weights(learner, state)
     cuts = 0
     for _ in range(4):
-        envs, got, stats = collect(ENV, learner.networks, T, ENV.model, weights, envs)
+        envs, got, stats = COLLECT(learner.networks, T, ENV.model, weights, envs)
         np.testing.assert_array_equal(got.state[0], before)
         np.testing.assert_array_equal(got.bootstrap[0], envs.env.obs)
         assert float(stats.episodes.count) == got.done.any(-1).sum()
@@ -85,10 +112,10 @@ def test_an_unroll_is_what_the_environments_did(config) -> None:
     assert cuts > 0
 
 
-def test_pieces_make_the_unroll_that_they_are_parts_of(config) -> None:
-    learner, state, envs = _start(config)
+def test_pieces_make_the_unroll_that_they_are_parts_of(start) -> None:
+    learner, state, envs = start
     weights = acting_weights(learner, state)
-    _, whole, counts = collect(ENV, learner.networks, T, ENV.model, weights, envs)
+    _, whole, counts = _unrolled(*start)
     programs = UnrollPrograms(ENV, learner.networks, T // 4, 4, weights, envs)
     envs, pieces = _copy(envs), []
     for _ in range(4):
@@ -112,16 +139,12 @@ def test_the_channels_that_may_lose_precision_are_those_of_floats() -> None:
     assert set(FLOAT_CHANNELS) == set(Unrolls._fields) - {"done"}
 
 
-def test_unrolls_without_weight_teach_nothing(config) -> None:
-    learner, state, envs = _start(config)
-    _, batch, _ = collect(
-        ENV, learner.networks, T, ENV.model, acting_weights(learner, state), envs
-    )
-    update = FusedUpdate(learner)
+def test_unrolls_without_weight_teach_nothing(start, batch, fused) -> None:
+    state = start[1]
     weight = jnp.asarray([1.0] * (N - 2) + [0.0] * 2)
     spoilt = batch._replace(reward=batch.reward.at[:, -2:].set(1e6))
-    first, _ = update(_copy(state), batch, weight)
-    second, _ = update(_copy(state), spoilt, weight)
+    first, _ = fused(_copy(state), batch, weight)
+    second, _ = fused(_copy(state), spoilt, weight)
     jax.tree.map(np.testing.assert_array_equal, first.params, second.params)
     assert int(first.iteration) == 1
 
@@ -166,14 +189,11 @@ def _in_threads(update_of) -> dict:
     return results
 
 
-def test_one_trainer_learns_the_same_in_both_forms(config) -> None:
-    learner, state, envs = _start(config)
-    _, batch, _ = collect(
-        ENV, learner.networks, T, ENV.model, acting_weights(learner, state), envs
-    )
-    split = SplitUpdate(learner, ENV.spec.obs_size, SoloReducer(exchange_size(ENV.spec, config)))
+def test_one_trainer_learns_the_same_in_both_forms(config, start, batch, fused) -> None:
+    learner, state, _ = start
+    split = SplitUpdate(learner, ENV.spec.obs_size, SoloReducer(_size(config)))
     split.compile(state, batch, jnp.ones(N))
-    _, said = FusedUpdate(learner)(_copy(state), batch, jnp.ones(N))
+    _, said = fused(_copy(state), batch, jnp.ones(N))
     _, also = split(_copy(state), batch, jnp.ones(N))
     np.testing.assert_allclose(said.weights, also.weights, rtol=1e-4, atol=1e-6)
     np.testing.assert_allclose(said.losses, also.losses, rtol=1e-3, atol=1e-5)
@@ -181,7 +201,7 @@ def test_one_trainer_learns_the_same_in_both_forms(config) -> None:
 
 def test_two_trainers_stay_equal_and_take_in_both_batches(config) -> None:
     learner, state, envs = _start(config, num_envs=2 * N)
-    _, both, _ = collect(ENV, learner.networks, T, ENV.model, acting_weights(learner, state), envs)
+    _, both, _ = _unrolled(learner, state, envs)
     half = [jax.tree.map(lambda x, k=k: x[:, k * N : (k + 1) * N], both) for k in range(2)]
 
     def update_of(rank: int, reducer):
@@ -202,7 +222,7 @@ def test_fresh_unrolls_weigh_alike_however_many_a_trainer_has(config) -> None:
         config, num_minibatches=1, num_updates_per_batch=1, normalize_advantage=False
     )
     learner, state, envs = _start(plain, num_envs=2 * N)
-    _, both, _ = collect(ENV, learner.networks, T, ENV.model, acting_weights(learner, state), envs)
+    _, both, _ = _unrolled(learner, state, envs)
     # One trainer has a fresh unroll and stale ones, the other fresh ones only.
     fresh = np.array([1.0] + [0.0] * (N - 1) + [1.0] * N, np.float32)
     weight = jnp.asarray(fresh * len(fresh) / fresh.sum())
@@ -224,17 +244,15 @@ def test_fresh_unrolls_weigh_alike_however_many_a_trainer_has(config) -> None:
     np.testing.assert_allclose(also.losses, theirs.losses, rtol=1e-4, atol=1e-6)
 
 
-def test_a_minibatch_of_stale_unrolls_does_not_dilute_the_divergence(config) -> None:
-    learner, state, envs = _start(config)
-    weights = acting_weights(learner, state)
-    _, batch, _ = collect(ENV, learner.networks, T, ENV.model, weights, envs)
+def test_a_minibatch_of_stale_unrolls_does_not_dilute_the_divergence(start, batch) -> None:
+    learner, state, _ = start
     moved = state.params._replace(log_std=state.params.log_std + 0.1)
     told = []
     for fresh in (np.ones(N), np.r_[1.0, np.zeros(N - 1)], np.zeros(N)):
-        context = begin_batch(learner, state, batch, jnp.asarray(fresh, jnp.float32))
+        context = batch_targets(learner, state, batch, jnp.asarray(fresh, jnp.float32))
         told.append(gradients(learner, moved, batch, context, jnp.arange(N))[1])
     # Of a trainer with fresh unrolls only, one with a twelfth, and one with none.
-    means = LossMetrics(*(sum(parts) / len(parts) for parts in zip(*told, strict=True)))
+    means = A3cLosses(*(sum(parts) / len(parts) for parts in zip(*told, strict=True)))
     np.testing.assert_allclose(means.steering_kl, told[0].kl, rtol=1e-4)
     assert float(told[2].steering_kl) == 0.0
 
@@ -244,9 +262,8 @@ def test_learning_rates_of_all_minibatches_are_told(config) -> None:
         config, learning_rate_schedule="adaptive_kl", learning_rate=1e-3, desired_kl=1e-7
     )
     learner, state, envs = _start(adaptive)
-    weights = acting_weights(learner, state)
-    _, batch, _ = collect(ENV, learner.networks, T, ENV.model, weights, envs)
-    split = SplitUpdate(learner, ENV.spec.obs_size, SoloReducer(exchange_size(ENV.spec, adaptive)))
+    _, batch, _ = _unrolled(learner, state, envs)
+    split = SplitUpdate(learner, ENV.spec.obs_size, SoloReducer(_size(adaptive)))
     for update in (FusedUpdate(learner), split):
         new, told = update(_copy(state), batch, jnp.ones(N))
         # The first pass has not moved yet, the others each lower the rate.
@@ -271,13 +288,10 @@ def test_it_learns_to_stand_still_from_a_policy_that_lags(config, changes) -> No
         dataclasses.replace(config, learning_rate=3e-3, **changes), num_envs=64
     )
     update = FusedUpdate(learner)
-    rollout = jax.jit(
-        lambda weights, envs: collect(ENV, learner.networks, T, ENV.model, weights, envs)
-    )
     versions = [acting_weights(learner, _copy(state))] * 3
     rewards = []
     for _ in range(80):
-        envs, batch, stats = rollout(versions[-3], envs)
+        envs, batch, stats = COLLECT(learner.networks, T, ENV.model, versions[-3], envs)
         state, updated = update(state, batch, jnp.ones(64))
         versions.append(unpack_weights(versions[0], updated.weights))
         rewards.append(float(stats.reward_sum) / (64 * T))

@@ -1,19 +1,25 @@
-"""The loss of advantage actor-critic on whole unrolls."""
+"""Advantage actor-critic on batches of whole unrolls: targets, loss, gradients (arXiv:1602.01783).
+
+These are pure functions; `gmijax.a3c.update` compiles them. With the defaults this is what
+the field calls APPO: V-trace, a clipped surrogate, and several passes over a batch.
+"""
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import NamedTuple, TypeAlias
 
+import jax
 import jax.numpy as jnp
 
 from gmijax.a3c.returns import Returns, n_step_returns, vtrace
 from gmijax.config import A3cConfig
-from gmijax.normalize import Moments, normalize
+from gmijax.learner import Learner, LearnerState, acting_moments
+from gmijax.learning.losses import bound_loss, clipped_surrogate
+from gmijax.normalize import Moments, moments_of, normalize, without_outliers
 from gmijax.policy import ActorCritic, ActorCriticParams, entropy, kl_divergence, log_prob
 from gmijax.types import Array
 
-_ACTION_BOUND = 1.1
-"""Means beyond this are penalised; actions are clipped to 1, and a little room is harmless."""
+A3cLearner: TypeAlias = Learner[A3cConfig]
 
 _MIN_STD = 1e-8
 _MIN_WEIGHT = 1e-8
@@ -42,7 +48,7 @@ class Unrolls(NamedTuple):
     bootstrap: Array
 
 
-class UpdateContext(NamedTuple):
+class Targets(NamedTuple):
     """What stays the same during all passes over one batch: the policy before the first one.
 
     Attributes:
@@ -69,7 +75,7 @@ class UpdateContext(NamedTuple):
     behaviour_kl: Array
 
 
-class LossMetrics(NamedTuple):
+class A3cLosses(NamedTuple):
     """Means over a minibatch, [] float32 each, under the weights of its unrolls.
 
     Weights are 1 in the mean over all minibatches of a batch, and not in each of them.
@@ -96,79 +102,36 @@ class LossMetrics(NamedTuple):
         return self.kl / jnp.maximum(self.weight, _MIN_WEIGHT)
 
 
-def update_context(
-    params: ActorCriticParams,
-    batch: Unrolls,
-    weight: Array,
-    moments: Moments,
-    networks: ActorCritic,
-    config: A3cConfig,
-) -> UpdateContext:
+def batch_targets(
+    learner: A3cLearner, state: LearnerState, batch: Unrolls, weight: Array
+) -> Targets:
     """Targets of a batch by the policy and the values before the first pass over it.
 
     They are not renewed between passes: values that have been fitted to the same batch know its
     rewards, and leave nothing for the advantages.
     """
+    networks, config, params = learner.networks, learner.config, state.params
+    moments = acting_moments(learner, state)
     obs = normalize(moments, jnp.concatenate([batch.state, batch.bootstrap]))
     mean = networks.action_mean(params, obs[:-1])
     logs = log_prob(mean, params.log_std, batch.action)
     log_ratios = logs - batch.log_prob
     ratios = jnp.exp(log_ratios)
-    targets = returns_of(batch, networks.state_value(params, obs), ratios, config)
-    advantage = _normalised(targets, weight, config)
-    return UpdateContext(
+    returns = returns_of(batch, networks.state_value(params, obs), ratios, config)
+    advantage = _normalised(returns, weight, config)
+    # Copies, because the updates donate the state that they would alias.
+    copied_moments, log_std = jax.tree.map(jnp.copy, (moments, params.log_std))
+    return Targets(
         weight=weight,
-        moments=moments,
+        moments=copied_moments,
         mean=mean,
-        log_std=params.log_std,
+        log_std=log_std,
         log_prob=logs,
-        value=targets.value,
+        value=returns.value,
         advantage=advantage,
-        step_weight=jnp.where(_is_learnt(ratios, advantage, config), 0.0, targets.rho),
+        step_weight=jnp.where(_is_learnt(ratios, advantage, config), 0.0, returns.rho),
         # An estimate that is never negative and needs the actions only.
         behaviour_kl=_mean(ratios - 1.0 - log_ratios, weight),
-    )
-
-
-def a3c_loss(
-    params: ActorCriticParams,
-    batch: Unrolls,
-    context: UpdateContext,
-    networks: ActorCritic,
-    config: A3cConfig,
-) -> tuple[Array, LossMetrics]:
-    """Loss [] of a minibatch of unrolls and its parts.
-
-    Policy gradient with the advantages of `context`, half the squared error of the values, minus
-    the entropy bonus (arXiv:1602.01783, section 4), means over all steps under the weights of
-    their unrolls. The divisor is the same on all trainers, so that their mean weighs alike what
-    each of them learns from, however much that is.
-    With `clipping_epsilon` the policy's part is that of PPO (arXiv:1707.06347) relative to the
-    policy before the first pass, under the weights of the steps: how old experience is, and how
-    far one batch may move the policy, are two questions (arXiv:2110.00641, section 3).
-    """
-    weight, obs = context.weight, normalize(context.moments, batch.state)
-    mean = networks.action_mean(params, obs)
-    logs = log_prob(mean, params.log_std, batch.action)
-    values = networks.state_value(params, obs)
-    policy_loss = _mean(_policy_terms(logs, context, config), weight)
-    value_loss = 0.5 * _mean((values - context.value) ** 2, weight)
-    bonus = entropy(params.log_std)
-    beyond = jnp.sum(jnp.maximum(jnp.abs(mean) - _ACTION_BOUND, 0.0) ** 2, -1)
-    loss = (
-        policy_loss
-        + config.value_cost * value_loss
-        - config.entropy_cost * bonus * jnp.mean(weight)
-        + config.bound_cost * _mean(beyond, weight)
-    )
-    moved = kl_divergence(context.mean, context.log_std, mean, params.log_std)
-    return loss, LossMetrics(
-        policy_loss,
-        value_loss,
-        bonus,
-        _mean(moved, weight),
-        context.behaviour_kl,
-        jnp.mean(weight),
     )
 
 
@@ -192,13 +155,15 @@ def returns_of(batch: Unrolls, values: Array, ratios: Array, config: A3cConfig) 
     )
 
 
-def _policy_terms(logs: Array, context: UpdateContext, config: A3cConfig) -> Array:
-    if config.clipping_epsilon is None:
-        return -logs * context.step_weight * context.advantage
-    ratios = jnp.exp(logs - context.log_prob)
-    clipped = jnp.clip(ratios, 1.0 - config.clipping_epsilon, 1.0 + config.clipping_epsilon)
-    gain = jnp.minimum(ratios * context.advantage, clipped * context.advantage)
-    return -context.step_weight * gain
+def _normalised(returns: Returns, weight: Array, config: A3cConfig) -> Array:
+    """Advantages [T, B] with mean 0 and deviation 1 under the weights of the steps."""
+    if not config.normalize_advantage:
+        return returns.advantage
+    total = jnp.maximum(jnp.sum(returns.rho * weight), _MIN_WEIGHT)
+    mean = jnp.sum(returns.rho * weight * returns.advantage) / total
+    centred = returns.advantage - mean
+    std = jnp.sqrt(jnp.sum(returns.rho * weight * centred**2) / total)
+    return centred / (std + _MIN_STD)
 
 
 def _is_learnt(ratios: Array, advantage: Array, config: A3cConfig) -> Array:
@@ -213,17 +178,82 @@ def _is_learnt(ratios: Array, advantage: Array, config: A3cConfig) -> Array:
     return ((ratios > high) & (advantage > 0)) | ((ratios < low) & (advantage < 0))
 
 
-def _normalised(targets: Returns, weight: Array, config: A3cConfig) -> Array:
-    """Advantages [T, B] with mean 0 and deviation 1 under the weights of the steps."""
-    if not config.normalize_advantage:
-        return targets.advantage
-    total = jnp.maximum(jnp.sum(targets.rho * weight), _MIN_WEIGHT)
-    mean = jnp.sum(targets.rho * weight * targets.advantage) / total
-    centred = targets.advantage - mean
-    std = jnp.sqrt(jnp.sum(targets.rho * weight * centred**2) / total)
-    return centred / (std + _MIN_STD)
+def a3c_loss(
+    params: ActorCriticParams,
+    batch: Unrolls,
+    targets: Targets,
+    networks: ActorCritic,
+    config: A3cConfig,
+) -> tuple[Array, A3cLosses]:
+    """Loss [] of a minibatch of unrolls and its parts.
+
+    Policy gradient with the advantages of `targets`, half the squared error of the values, minus
+    the entropy bonus (arXiv:1602.01783, section 4), means over all steps under the weights of
+    their unrolls. The divisor is the same on all trainers, so that their mean weighs alike what
+    each of them learns from, however much that is.
+    With `clipping_epsilon` the policy's part is that of PPO (arXiv:1707.06347) relative to the
+    policy before the first pass, under the weights of the steps: how old experience is, and how
+    far one batch may move the policy, are two questions (arXiv:2110.00641, section 3).
+    """
+    weight, obs = targets.weight, normalize(targets.moments, batch.state)
+    mean = networks.action_mean(params, obs)
+    logs = log_prob(mean, params.log_std, batch.action)
+    values = networks.state_value(params, obs)
+    policy_loss = _mean(_policy_terms(logs, targets, config), weight)
+    value_loss = 0.5 * _mean((values - targets.value) ** 2, weight)
+    bonus = entropy(params.log_std)
+    loss = (
+        policy_loss
+        + config.value_cost * value_loss
+        - config.entropy_cost * bonus * jnp.mean(weight)
+        + config.bound_cost * _mean(bound_loss(mean), weight)
+    )
+    moved = kl_divergence(targets.mean, targets.log_std, mean, params.log_std)
+    return loss, A3cLosses(
+        policy_loss,
+        value_loss,
+        bonus,
+        _mean(moved, weight),
+        targets.behaviour_kl,
+        jnp.mean(weight),
+    )
+
+
+def _policy_terms(logs: Array, targets: Targets, config: A3cConfig) -> Array:
+    if config.clipping_epsilon is None:
+        return -logs * targets.step_weight * targets.advantage
+    ratios = jnp.exp(logs - targets.log_prob)
+    gain = clipped_surrogate(ratios, targets.advantage, config.clipping_epsilon)
+    return -targets.step_weight * gain
 
 
 def _mean(values: Array, weight: Array) -> Array:
     """Mean [] of `values` [T, B] under `weight` [B], which is 1 in the mean over all batches."""
     return jnp.mean(values * weight)
+
+
+def gradients(
+    learner: A3cLearner,
+    params: ActorCriticParams,
+    batch: Unrolls,
+    targets: Targets,
+    indices: Array,
+) -> tuple[ActorCriticParams, A3cLosses]:
+    """Gradient and loss parts on the unrolls `indices` [b] of a batch."""
+    minibatch: Unrolls = jax.tree.map(lambda x: x[:, indices], batch)
+    theirs = targets._replace(
+        weight=targets.weight[indices],
+        mean=targets.mean[:, indices],
+        log_prob=targets.log_prob[:, indices],
+        value=targets.value[:, indices],
+        advantage=targets.advantage[:, indices],
+        step_weight=targets.step_weight[:, indices],
+    )
+    return jax.grad(a3c_loss, has_aux=True)(
+        params, minibatch, theirs, learner.networks, learner.config
+    )
+
+
+def batch_moments(learner: A3cLearner, state: LearnerState, batch: Unrolls) -> Moments:
+    """Statistics [O] of a batch's observations."""
+    return moments_of(without_outliers(acting_moments(learner, state), batch.state), 2)

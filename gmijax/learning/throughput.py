@@ -15,17 +15,15 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
-from gmijax.acting import act
 from gmijax.collectives.interface import Reducer
 from gmijax.config import TrainConfig
-from gmijax.learner import Learner, LearnerState, acting_moments
+from gmijax.learner import Learner, LearnerState, acting_weights
+from gmijax.learning.unroll import act, unroll
 from gmijax.sim.wrappers import BatchedEnv, BatchState, split_keys
 from gmijax.types import Array, PyTree
 
 _BLOCKS = 3
 _BLOCK_S = 1.0
-
-Choose = Callable[[LearnerState, BatchState], tuple[BatchState, Array]]
 
 
 class Throughput(NamedTuple):
@@ -46,8 +44,8 @@ class ThroughputMeter:
         self._steps = config.algo.unroll_length
         self._reducer = reducer
         self._programs: list[Any] = [
-            jax.jit(partial(_unroll, env, choose, self._steps), donate_argnums=(2,))
-            for choose in (partial(_random, env), partial(_policy, env, learner))
+            jax.jit(partial(_moved, env, choose, self._steps), donate_argnums=(2,))
+            for choose in (partial(_random, env), partial(_policy, learner))
         ]
 
     def trace(self, state: LearnerState, env_state: BatchState) -> None:
@@ -71,7 +69,7 @@ class ThroughputMeter:
 
     def _rate(
         self,
-        unroll: Callable[[BatchState], BatchState],
+        move: Callable[[BatchState], BatchState],
         env_state: BatchState,
         beat: Callable[[], None],
     ) -> tuple[float, BatchState]:
@@ -79,7 +77,7 @@ class ThroughputMeter:
             self._reducer.all_gather(np.zeros(1, np.float32))
             started = time.monotonic()
             for _ in range(repeats):
-                envs = unroll(envs)
+                envs = move(envs)
             jax.block_until_ready(envs)
             seconds = time.monotonic() - started
             beat()
@@ -98,30 +96,25 @@ class ThroughputMeter:
         return float(self._reducer.all_gather(mine).sum()), env_state
 
 
-def _unroll(
+def _moved(
     env: BatchedEnv,
-    choose: Choose,
+    choose: Callable[[LearnerState, BatchState], tuple[BatchState, Array, Array]],
     length: int,
     model: PyTree,
     state: LearnerState,
     env_state: BatchState,
 ) -> BatchState:
-    def step(_: int, envs: BatchState) -> BatchState:
-        envs, action = choose(state, envs)
-        return env.step(model, envs, action)[0]
-
-    return jax.lax.fori_loop(0, length, step, env_state)
+    return unroll(env, partial(choose, state), length, lambda *_: None, model, env_state)[0]
 
 
-def _random(env: BatchedEnv, _: LearnerState, envs: BatchState) -> tuple[BatchState, Array]:
+def _random(env: BatchedEnv, _: LearnerState, envs: BatchState) -> tuple[BatchState, Array, Array]:
     envs, keys = split_keys(envs)
     size = (env.spec.action_size,)
-    return envs, jax.vmap(lambda k: jax.random.uniform(k, size, minval=-1.0))(keys)
+    actions = jax.vmap(lambda k: jax.random.uniform(k, size, minval=-1.0))(keys)
+    return envs, actions, actions
 
 
 def _policy(
-    env: BatchedEnv, learner: Learner, state: LearnerState, envs: BatchState
-) -> tuple[BatchState, Array]:
-    moments = acting_moments(learner, state)
-    envs, _, action = act(learner.networks, state.params, moments, envs, env.spec.action_size)
-    return envs, action
+    learner: Learner, state: LearnerState, envs: BatchState
+) -> tuple[BatchState, Array, Array]:
+    return act(learner.networks, acting_weights(learner, state), envs)

@@ -1,0 +1,1 @@
+"""What every training algorithm has: policy, learner, updates, unroll, checkpoints, metrics."""
