@@ -38,7 +38,7 @@ LEARNER = "learner"
 def checkpoint_meta(
     config: TrainConfig, env_steps: int, num_gmis: int, mean_return: float | None
 ) -> CheckpointMeta:
-    """What `meta.json` says of a checkpoint of this run; `num_gmis` are those that simulate."""
+    """Content of `meta.json` for a checkpoint of this run by `num_gmis` GMIs."""
     algo = config.algo
     return CheckpointMeta(
         env=config.env.label,

@@ -91,7 +91,7 @@ def acting_moments(learner: Learner, state: LearnerState) -> Moments:
 
 
 class ActingWeights(NamedTuple):
-    """What it takes to act.
+    """Weights of a policy that acts.
 
     Attributes:
       params: weights of policy and value function.

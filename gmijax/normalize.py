@@ -19,7 +19,7 @@ OBS_CLIP = 10.0
 """Normalised observations are clipped to [-OBS_CLIP, OBS_CLIP] standard deviations."""
 
 OUTLIER_STD = 20.0
-"""What is farther from the mean than this counts as this far in the statistics."""
+"""Samples farther from the mean than this count as this far in the statistics."""
 
 _MIN_STD = 1e-4
 

@@ -46,7 +46,7 @@ def check_losses(where: str, losses: Mapping[str, float]) -> None:
 
 
 class OverflowCount:
-    """Counts steps for which a buffer of MJX-Warp was too small; tells of the first ones.
+    """Counts steps for which a buffer of MJX-Warp was too small; reports the first ones.
 
     Attributes:
       steps: environment steps so far, by buffer; empty if nothing can overflow.

@@ -49,7 +49,7 @@ class Unrolls(NamedTuple):
 
 
 class Targets(NamedTuple):
-    """What stays the same during all passes over one batch: the policy before the first one.
+    """Constants of all passes over one batch, by the policy before the first one.
 
     Attributes:
       weight: [B], 0 for unrolls that are too old to learn from; the others weigh alike, so that

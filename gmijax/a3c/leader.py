@@ -1,4 +1,4 @@
-"""What the first trainer does for all: weights, orders, metrics, checkpoints, the outcome."""
+"""Duties of the first trainer: weights, orders, metrics, checkpoints, the outcome."""
 
 from __future__ import annotations
 

@@ -89,8 +89,9 @@ class Reporter:
         self.ttop: list[float] = []
         self.bytes_per_s: list[float] = []
         self.dropped = 0
-        zeros, self._unpack = ravel_pytree(no_counts(env.spec, env.overflows))
-        self._before = Report(None, *[0.0] * 6, np.zeros(zeros.size))
+        zeros, unpack = ravel_pytree(no_counts(env.spec, env.overflows))
+        self._unpack: Any = unpack
+        self._before = Report._make([None, *[0.0] * 6, np.zeros(zeros.size)])
         self._env_steps = env_steps
         self._updates: list[tuple[UpdateFigures, float]] = []
         self._stale = 0.0
@@ -163,7 +164,8 @@ class Reporter:
         """Means of the losses, figures of the learning rates, and the rest."""
         figures, receive_s = zip(*self._updates, strict=True)
         losses, rates, update_s = zip(*figures, strict=True)
-        means = A3cLosses(*np.mean(losses, axis=0, dtype=np.float64).tolist())._asdict()
+        averaged: Any = np.mean(losses, axis=0, dtype=np.float64)
+        means = dict(zip(A3cLosses._fields, map(float, averaged), strict=True))
         del means["weight"]  # 1, over a batch.
         joined = {name: float(_OF_RATES[name]([one[name] for one in rates])) for name in rates[0]}
         return (
@@ -211,4 +213,5 @@ def mean_and_p99(histogram: npt.NDArray[np.floating]) -> tuple[float, float] | N
 def _total(reports: Sequence[Report]) -> Report:
     """Sums over agents, since they started."""
     numbers = zip(*(report[1:-1] for report in reports), strict=True)
-    return Report(None, *map(sum, numbers), np.sum([r.stats for r in reports], axis=0))
+    stats = np.sum([report.stats for report in reports], axis=0)
+    return Report._make([None, *map(sum, numbers), stats])

@@ -1,7 +1,7 @@
 """The role of a training GMI: takes experience, learns, publishes weights.
 
-All trainers make the same updates; the first leads them: it publishes the weights, tells the
-agents what to do, writes metrics and the shared part of checkpoints.
+All trainers make the same updates; the first leads them: it publishes the weights, gives the
+agents their orders, writes metrics and the shared part of checkpoints.
 """
 
 from __future__ import annotations
@@ -184,7 +184,7 @@ class Trainer:
         return fresh.astype(np.float32)
 
     def _scale(self, counts: BatchCounts) -> np.float32:
-        """What a fresh unroll weighs, so that it weighs as much as any other of the job."""
+        """Weight of a fresh unroll, equal to that of any other of the job."""
         return np.float32(self._reducer.world_size * self._batch_size / counts.fresh)
 
     def _meet(self, batch: Batch, waited_s: float) -> BatchCounts:

@@ -33,7 +33,7 @@ from gmijax.types import Array
 
 
 class Updated(NamedTuple):
-    """What an update leaves, beside the state.
+    """Results of an update, beside the state.
 
     Attributes:
       weights: [W] float32, to publish; see `pack_weights`.
@@ -87,10 +87,10 @@ class SplitUpdate:
         self._begin = self._begin.lower(state, batch, weight, self._rank)
         order, targets, packed = self._begin.out_info
         gathered = jax.ShapeDtypeStruct((self._reducer.world_size, *packed.shape), jnp.float32)
-        told = self._updates.trace(state, batch, targets, order)
+        figures = self._updates.trace(state, batch, targets, order)
         self._begin = self._begin.compile()
         self._updates.compile()
-        self._finish = self._finish.lower(state, gathered, told).compile()
+        self._finish = self._finish.lower(state, gathered, figures).compile()
 
     def __call__(
         self, state: LearnerState, batch: Unrolls, weight: Array
@@ -99,8 +99,8 @@ class SplitUpdate:
         batch = jax.device_put(batch)  # Once, and not with every program.
         order, targets, packed = self._begin(state, batch, weight, self._rank)
         gathered = np.array(self._reducer.all_gather(np.asarray(packed)))
-        state, told = self._updates(state, batch, targets, order)
-        return self._finish(state, gathered, told)
+        state, figures = self._updates(state, batch, targets, order)
+        return self._finish(state, gathered, figures)
 
     def _begin_fn(
         self, state: LearnerState, batch: Unrolls, weight: Array, rank: Array
@@ -110,10 +110,10 @@ class SplitUpdate:
         return order, batch_targets(self._learner, state, batch, weight), seen
 
     def _finish_fn(
-        self, state: LearnerState, gathered: Array, told: list[Array]
+        self, state: LearnerState, gathered: Array, figures: list[Array]
     ) -> tuple[LearnerState, Updated]:
         seen = merge_all(jax.vmap(self._unpack_moments)(gathered))
-        return _finished(self._learner, state, seen, *self._updates.summary(told))
+        return _finished(self._learner, state, seen, *self._updates.summary(figures))
 
 
 def make_update(learner: A3cLearner, obs_size: int, reducer: Reducer) -> FusedUpdate | SplitUpdate:

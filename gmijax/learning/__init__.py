@@ -1,1 +1,1 @@
-"""What every training algorithm has: policy, learner, updates, unroll, checkpoints, metrics."""
+"""Shared by all algorithms: policy, learner, updates, unroll, checkpoints, metrics."""

@@ -28,7 +28,7 @@ CHUNK_STEPS = 50
 
 
 class Options(NamedTuple):
-    """How to run episodes.
+    """Options of `run_episodes`.
 
     Attributes:
       num_envs: N.
@@ -46,7 +46,7 @@ class Options(NamedTuple):
 
 
 class Episodes(NamedTuple):
-    """What N episodes came to.
+    """Outcome of N episodes.
 
     Attributes:
       returns: [N] undiscounted returns.

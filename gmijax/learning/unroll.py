@@ -98,7 +98,7 @@ def unroll(
 
 
 def outcome_of(out: StepOutput) -> Outcome:
-    """What is to be counted of a step, for `count`."""
+    """The parts of a step that `count` sums."""
     return out.finished, out.diverged, out.overflowed
 
 

@@ -95,7 +95,7 @@ class SplitUpdates:
 
     Attributes:
       reduce_s: seconds that the exchanges of the last call took, with waits for other trainers;
-        None where they cannot be told apart.
+        None where they are not known.
     """
 
     def __init__(
@@ -121,8 +121,8 @@ class SplitUpdates:
         buffer = jax.ShapeDtypeStruct(self._gradient.out_info.shape, jnp.float32)
         self._update = self._update.lower(state, buffer, *rest)
         self._apply = self._apply.lower(state, buffer)
-        told = jax.ShapeDtypeStruct((len(self._losses._fields) + 1,), jnp.float32)
-        return [told] * order.shape[0]
+        figures = jax.ShapeDtypeStruct((len(self._losses._fields) + 1,), jnp.float32)
+        return [figures] * order.shape[0]
 
     def compile(self) -> None:
         """Compiles what `trace` has traced."""
@@ -147,9 +147,9 @@ class SplitUpdates:
         self.reduce_s = sum(exchanges_s)
         return result
 
-    def summary(self, told: list[Array]) -> tuple[Any, Array]:
+    def summary(self, figures: list[Array]) -> tuple[Any, Array]:
         """Means of the losses over all minibatches, and the learning rate after each of them."""
-        stacked = jnp.stack(told)
+        stacked = jnp.stack(figures)
         return self._losses(*jnp.mean(stacked[:, :-1], axis=0)), stacked[:, -1]
 
     def _updates(

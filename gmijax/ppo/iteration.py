@@ -160,8 +160,8 @@ class SplitIteration:
         gathered = jax.ShapeDtypeStruct((self._reducer.world_size, *packed.shape), jnp.float32)
         self._begin = self._begin.lower(state, gathered)
         context, stats = self._begin.out_info
-        told = self._updates.trace(state, samples, context, order)
-        self._finish = self._finish.lower(state, stats, told)
+        figures = self._updates.trace(state, samples, context, order)
+        self._finish = self._finish.lower(state, stats, figures)
 
     def compile(self) -> None:
         """See `TracedStep`."""
@@ -180,8 +180,8 @@ class SplitIteration:
         gathered = np.array(self._reducer.all_gather(packed))
         context, stats = self._begin(state, gathered)
         updating = time.monotonic()
-        state, told = self._updates(state, samples, context, order)
-        state, metrics = self._finish(state, stats, told)
+        state, figures = self._updates(state, samples, context, order)
+        state, metrics = self._finish(state, stats, figures)
         self.times = {
             "time/rollout_s": rolled_out - started,
             "time/update_s": time.monotonic() - updating,
@@ -200,9 +200,9 @@ class SplitIteration:
         return update_context(self._learner, state, stats), stats
 
     def _finish_fn(
-        self, state: LearnerState, stats: RolloutStats, told: list[Array]
+        self, state: LearnerState, stats: RolloutStats, figures: list[Array]
     ) -> tuple[LearnerState, IterationMetrics]:
-        return finish(self._learner, state, stats, *self._updates.summary(told))
+        return finish(self._learner, state, stats, *self._updates.summary(figures))
 
 
 def make_iteration(
@@ -216,7 +216,7 @@ def make_iteration(
 
 
 def times_of(iteration: TracedStep | SplitIteration) -> dict[str, float]:
-    """Seconds of parts of the last iteration, by name, where they can be told apart."""
+    """Seconds of parts of the last iteration, by name, where they are known."""
     if isinstance(iteration, SplitIteration):
         return iteration.times
     return {} if iteration.exchange_s is None else {"time/reduce_s": iteration.exchange_s}

@@ -60,7 +60,7 @@ class Transition(NamedTuple):
 
 
 class Samples(NamedTuple):
-    """What the loss needs of every step; leading axes are [T, N], [T * N] or [B].
+    """Inputs of the loss, for every step; leading axes are [T, N], [T * N] or [B].
 
     Attributes:
       obs: [..., O], normalised as the policy saw it.
@@ -80,7 +80,7 @@ class Samples(NamedTuple):
 
 
 class RolloutStats(NamedTuple):
-    """What GMIs must know of each other's rollouts; see `merge_stats`.
+    """Statistics of a rollout that GMIs exchange; see `merge_stats`.
 
     Attributes:
       obs: moments of the raw observations, [O].
@@ -94,7 +94,7 @@ class RolloutStats(NamedTuple):
 
 
 class UpdateContext(NamedTuple):
-    """What stays the same during all updates on one rollout.
+    """Constants of all updates on one rollout.
 
     Attributes:
       advantage_mean: [] over all samples of all GMIs (0 where not normalised).
@@ -118,7 +118,7 @@ class PpoLosses(NamedTuple):
 
     @property
     def steering_kl(self) -> Array:
-        """What the adaptive learning rate follows."""
+        """The divergence that the adaptive learning rate follows."""
         return self.kl
 
 
@@ -286,7 +286,7 @@ def gradients(
 
 
 def update_context(learner: PpoLearner, state: LearnerState, stats: RolloutStats) -> UpdateContext:
-    """What all updates of an iteration share; `stats` are those of all GMIs together."""
+    """The constants of an iteration's updates; `stats` are those of all GMIs together."""
     mean, std = stats.advantage.mean, std_of(stats.advantage)
     if not learner.config.normalize_advantage:
         mean, std = jnp.zeros(()), jnp.ones(())

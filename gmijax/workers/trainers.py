@@ -1,4 +1,4 @@
-"""What the mains of training jobs share: their input, environments, the exchange of trainers."""
+"""Parts of the mains of training jobs: input, environments, the reducer among trainers."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 
 def read_job(link: ChildLink) -> tuple[TrainConfig, Plan]:
-    """What the controller has written for this run."""
+    """Configuration and plan of this run."""
     config = from_dict(TrainConfig, read_json(link.run.config))
     return config, Plan.from_dict(read_json(link.run.plan))
 
@@ -81,7 +81,7 @@ def trainers_reducer(
 
 
 def exchange_used(plan: Plan, reducer: Reducer) -> dict[str, str]:
-    """What the summary says of the plan's strategy where it may have come to another way."""
+    """For the summary: the exchange in use, where it may differ from the plan's strategy."""
     on_device = reducer.is_device_resident
     if plan.strategy == "har":
         return {"intra": "ipc" if on_device else "host"}

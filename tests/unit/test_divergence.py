@@ -1,27 +1,19 @@
-"""Worlds with bad numbers are ended, counted, and do no harm."""
+"""Worlds with bad numbers or full buffers are counted, and those with bad numbers are ended."""
 
 from __future__ import annotations
 
-import threading
-import time
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-import pytest
-from toy_env import metrics_from, point_mass
+from toy_env import point_mass, point_mass_env
 
-from gmijax.errors import NonFiniteError
-from gmijax.learning.report_thread import ReportThread
-from gmijax.learning.training_log import TrainingLog
-from gmijax.learning.unroll import Counts, no_counts
-from gmijax.physics_health import TOLERATED_STEPS
-from gmijax.ppo.loop import report
-from gmijax.sim.wrappers import env_keys
+from gmijax.sim.wrappers import env_keys, training_env
 
 ENV = point_mass()
-INIT, STEP = jax.jit(ENV.init), jax.jit(ENV.step)
 N = 4
+INIT, STEP = jax.jit(ENV.init), jax.jit(ENV.step)
 
 
 def _step_from(x: list[float]):
@@ -60,58 +52,15 @@ def test_a_bad_world_starts_over_and_the_others_go_on() -> None:
     assert np.isfinite(state.env.obs).all()
 
 
-def _counts(**diverged: int) -> Counts:
-    counts = no_counts(ENV.spec)
-    bad = {name: jnp.asarray(float(steps)) for name, steps in diverged.items()}
-    return counts._replace(diverged=counts.diverged | bad)
+def test_worlds_that_met_a_full_buffer_are_counted_by_buffer() -> None:
+    def overflow(state: Any) -> jax.Array:
+        return jnp.stack([jnp.ones((), bool), state.obs[0] > 0.0])
 
-
-def test_few_bad_steps_are_tolerated_and_many_are_named() -> None:
-    log = TrainingLog("point_mass", (), 0)
-    for count in (TOLERATED_STEPS, TOLERATED_STEPS + 1):
-        metrics = metrics_from(_counts(any=count, **{"reward/near": count}))
-        if count <= TOLERATED_STEPS:
-            report(log, 64, metrics, {})
-        else:
-            with pytest.raises(
-                NonFiniteError, match=r"point_mass, up to env step 128: .* reward/near"
-            ):
-                report(log, 128, metrics, {})
-
-
-def test_a_loss_that_is_not_finite_is_named() -> None:
-    metrics = metrics_from(_counts())
-    spoilt = metrics._replace(losses=metrics.losses._replace(value_loss=jnp.asarray(jnp.nan)))
-    with pytest.raises(NonFiniteError, match="value_loss of the update is not finite"):
-        report(TrainingLog("point_mass", (), 0), 64, spoilt, {})
-
-
-def test_reports_come_in_order_from_a_thread_of_their_own_and_errors_with_the_next_call() -> None:
-    written: list[int] = []
-
-    def write(number: int) -> None:
-        if number < 0:
-            raise NonFiniteError("bad number")
-        written.append(number)
-
-    thread = ReportThread(write)
-    for number in (1, 2, 3):
-        thread.report(number)
-    thread.wait()
-    assert written == [1, 2, 3]
-    thread.report(-1)
-    with pytest.raises(NonFiniteError, match="bad number"):
-        thread.report(4)
-    thread.stop()
-    assert written == [1, 2, 3]
-
-
-def test_a_report_that_cannot_come_is_not_waited_for() -> None:
-    is_there = threading.Event()
-    thread = ReportThread(lambda: is_there.wait(30))
-    thread.report()
-    thread.give_up()
-    started = time.monotonic()
-    thread.stop()
-    assert time.monotonic() - started < 1.5  # It waits 2 s for one that may come.
-    is_there.set()
+    env = training_env(point_mass_env()._replace(overflow=overflow))
+    state = env.init(env.model, env_keys(jax.random.key(0), 0, N))
+    _, out = env.step(env.model, state, jnp.zeros((N, 1)))
+    counts = {name: int(count) for name, count in out.overflowed.items()}
+    assert counts == {"contact": N, "constraint": int((out.next_obs[:, 0] > 0.0).sum())}
+    assert 0 < counts["constraint"] < N
+    # Without such buffers there is nothing to count.
+    assert _step_from([0.0] * N)[1].overflowed == {}

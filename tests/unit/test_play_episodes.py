@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from gmijax.cli import compose
-from gmijax.config import PpoConfig
+from gmijax.config import AlgoConfig
 from gmijax.learner import init_learner, make_learner
 from gmijax.learning.episodes import CHUNK_STEPS, Episodes, Options, run_episodes
 from gmijax.sim import episode
@@ -42,13 +42,13 @@ def counting_env(reward: float = 1.0) -> Env:
 
 
 @pytest.fixture(scope="module")
-def algo() -> PpoConfig:
+def algo() -> AlgoConfig:
     return dataclasses.replace(
         compose().algo, policy_hidden_layer_sizes=(4,), value_hidden_layer_sizes=(4,)
     )
 
 
-def episodes_of(algo: PpoConfig, env: Env, **changes: object):
+def episodes_of(algo: AlgoConfig, env: Env, **changes: object):
     learner = make_learner(SPEC, algo)
     state = init_learner(learner, SPEC.obs_size, jax.random.key(1))
     options = Options(num_envs=8, num_shown=3, seed=0, deterministic=True, max_steps=None)
@@ -59,7 +59,7 @@ def episodes_of(algo: PpoConfig, env: Env, **changes: object):
 
 
 @pytest.fixture(scope="module")
-def played(algo: PpoConfig) -> Episodes:
+def played(algo: AlgoConfig) -> Episodes:
     return episodes_of(algo, counting_env())
 
 
@@ -81,20 +81,20 @@ def test_positions_go_from_start_to_the_longest_shown_end(played: Episodes):
     np.testing.assert_array_equal(played.qpos[..., 0], np.minimum(steps, played.lengths[:3]))
 
 
-def test_max_steps_cuts_episodes_off(algo: PpoConfig):
+def test_max_steps_cuts_episodes_off(algo: AlgoConfig):
     played = episodes_of(algo, counting_env(), max_steps=3)
     assert played.lengths.tolist() == [3] * 8
     assert not played.terminated.any()
     assert not played.truncated.any()
 
 
-def test_environments_do_not_depend_on_how_many_there_are(algo: PpoConfig):
+def test_environments_do_not_depend_on_how_many_there_are(algo: AlgoConfig):
     few = episodes_of(algo, counting_env(), num_envs=3, deterministic=False)
     many = episodes_of(algo, counting_env(), deterministic=False)
     np.testing.assert_array_equal(few.lengths, many.lengths[:3])
 
 
-def test_a_world_with_a_bad_number_ends_without_reward(algo: PpoConfig):
+def test_a_world_with_a_bad_number_ends_without_reward(algo: AlgoConfig):
     played = episodes_of(algo, counting_env(reward=float("nan")))
     assert played.diverged.all()
     assert played.terminated.all()
