@@ -1,8 +1,8 @@
 """The role of a serving GMI: simulator and agent in one.
 
-It acts with the newest weights on the board, sends what came of it, and goes on. Trainers never
-make it wait, except for room where experience is not to be dropped. Newer weights are taken up
-within unrolls too: the less old what a policy learns from is, the fewer steps it takes.
+It acts with the newest weights that were published, sends what came of it, and goes on. Trainers
+never make it wait, except for room where experience is not to be dropped. Newer weights are taken
+up within unrolls too: the less old what a policy learns from is, the fewer steps it takes.
 """
 
 from __future__ import annotations
@@ -18,13 +18,13 @@ import numpy as np
 import numpy.typing as npt
 from jax.flatten_util import ravel_pytree
 
-from gmijax.a3c.board import Board, Orders, Report, pack_report, unpack_orders
+from gmijax.a3c.board import JobRegisters, Orders, Report
 from gmijax.a3c.learner import ActingWeights, acting_weights, unpack_weights
 from gmijax.a3c.losses import Unrolls
 from gmijax.a3c.outgoing import Outgoing
 from gmijax.a3c.rollout import UnrollPrograms, UnrollStats, stats_example
 from gmijax.checkpoint import has_envs, restore_envs, save_envs
-from gmijax.collectives.channel.interface import ExperienceSender
+from gmijax.collectives.channel.sender import Sender
 from gmijax.config import A3cConfig, TrainConfig
 from gmijax.devices import describe_device
 from gmijax.errors import CollectiveTimeout, PipeClosed
@@ -64,7 +64,7 @@ class _Sent(NamedTuple):
 
 
 def act_until_told(
-    serving: Serving, board: Board, sender: ExperienceSender, link: ChildLink
+    serving: Serving, registers: JobRegisters, sender: Sender, link: ChildLink
 ) -> dict[str, Any]:
     """Acts until the leading trainer ends the job.
 
@@ -74,21 +74,21 @@ def act_until_told(
     Raises:
       CollectiveTimeout: trainers do not start, or take nothing any more.
     """
-    return _Agent(serving, board, sender, link).run()
+    return _Agent(serving, registers, sender, link).run()
 
 
 class _Agent:
     """One serving GMI; see `act_until_told`."""
 
     def __init__(
-        self, serving: Serving, board: Board, sender: ExperienceSender, link: ChildLink
+        self, serving: Serving, registers: JobRegisters, sender: Sender, link: ChildLink
     ) -> None:
         self._config = serving.config
         self._algo = serving.algo
         self._env = serving.env
         self._index = serving.index
         self._trainers = serving.trainers
-        self._board = board
+        self._registers = registers
         self._is_on_device = sender.on_device
         self._outgoing = Outgoing(serving.config, serving.algo, sender)
         self._link = link
@@ -128,7 +128,7 @@ class _Agent:
         }
 
     def _first_weights(self) -> ActingWeights:
-        """Weights of the right shapes; those to act with come from the board."""
+        """Weights of the right shapes; those to act with are read later."""
         state: LearnerState = jax.jit(
             lambda key: init_learner(self._learner, self._env.spec.obs_size, key)
         )(jax.random.key(0))
@@ -191,11 +191,11 @@ class _Agent:
     def _newest(
         self, weights: ActingWeights, unpack: Callable[[npt.NDArray[np.float32]], ActingWeights]
     ) -> ActingWeights:
-        """The newest weights on the board; `weights` if there are no newer ones."""
-        if (posted := self._board.weights.read(self._weights_seen)) is None:
+        """The newest weights published; `weights` if there are no newer ones."""
+        if (snapshot := self._registers.weights.read(self._weights_seen)) is None:
             return weights
-        self._weights_seen, self._version = posted.count, posted.tag
-        return unpack(posted.values.view(np.float32))
+        self._weights_seen, self._version = snapshot.count, snapshot.tag
+        return unpack(snapshot.values.view(np.float32))
 
     def _send(self, unroll: _Sent, env_state: BatchState) -> None:
         arrays: dict[str, Any] = unroll.experience._asdict()
@@ -258,12 +258,12 @@ class _Agent:
 
     def _look(self) -> bool:
         """Takes up new orders; returns whether there ever were any."""
-        if (posted := self._board.orders.read(self._orders_seen)) is not None:
-            self._orders_seen, self._orders = posted.count, unpack_orders(posted)
+        if (snapshot := self._registers.orders.read(self._orders_seen)) is not None:
+            self._orders_seen, self._orders = snapshot.count, Orders.unpack(snapshot.values)
         return self._orders_seen > 0
 
     def _publish(self) -> None:
-        self._board.reports[self._index].publish(pack_report(self._report))
+        self._registers.reports[self._index].publish(self._report.pack())
 
     def _late(self, what: str, limit_s: float) -> CollectiveTimeout:
         return CollectiveTimeout(self._link.gmi, self._trainers, what, self._unrolls, limit_s)

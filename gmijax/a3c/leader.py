@@ -12,9 +12,9 @@ import jax.numpy as jnp
 import numpy as np
 import numpy.typing as npt
 
-from gmijax.a3c.board import Board, Orders, Report, pack_orders, unpack_report
+from gmijax.a3c.board import JobRegisters, Orders, Report
 from gmijax.a3c.report import Progress, Reporter, Told
-from gmijax.a3c.tally import Tally
+from gmijax.a3c.staleness import BatchCounts
 from gmijax.checkpoint import finish_checkpoint, save_learner
 from gmijax.config import TrainConfig
 from gmijax.devices import describe_device
@@ -35,7 +35,7 @@ class Leader:
     Args:
       config: of the run.
       env: one of the environments, for its names.
-      board: of the job.
+      registers: of the job.
       link: to the controller.
       agents: ids of the GMIs that act, in the order of their reports.
     """
@@ -44,13 +44,13 @@ class Leader:
         self,
         config: TrainConfig,
         env: BatchedEnv,
-        board: Board,
+        registers: JobRegisters,
         link: ChildLink,
         agents: tuple[int, ...],
     ) -> None:
         self._config = config
         self._env = env
-        self._board = board
+        self._registers = registers
         self._link = link
         self._agents = agents
         self._seen = [0] * len(agents)
@@ -85,20 +85,20 @@ class Leader:
 
     def publish(self, weights: npt.NDArray[np.float32], version: int) -> None:
         """Gives agents new weights [W]; never waits for them."""
-        self._board.weights.publish(weights, tag=version)
+        self._registers.weights.publish(weights, tag=version)
 
     def record(
         self,
         env_steps: int,
         updates: int,
-        tally: Tally,
+        counts: BatchCounts,
         told: Told,
         state: LearnerState,
     ) -> None:
         """Takes one update into the metrics."""
         self._env_steps, self._updates = env_steps, updates
         reporter = self._require_reporter()
-        reporter.add(tally, told)
+        reporter.add(counts, told)
         if reporter.is_due:
             self._hear()
             reporter.write(self._progress(state))
@@ -170,12 +170,13 @@ class Leader:
         )
 
     def _order(self, checkpoint: int | None, *, is_ending: bool) -> None:
-        self._board.orders.publish(pack_orders(Orders(checkpoint, is_ending)))
+        self._registers.orders.publish(Orders(checkpoint, is_ending).pack())
 
     def _hear(self) -> None:
-        for index, note in enumerate(self._board.reports):
-            if (posted := note.read(self._seen[index])) is not None:
-                self._seen[index], self._reports[index] = posted.count, unpack_report(posted)
+        for index, register in enumerate(self._registers.reports):
+            if (snapshot := register.read(self._seen[index])) is not None:
+                self._seen[index] = snapshot.count
+                self._reports[index] = Report.unpack(snapshot.values)
 
     def _missing(self) -> list[int]:
         """Agents that have not added to the pending checkpoint."""

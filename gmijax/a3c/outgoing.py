@@ -6,12 +6,12 @@ import time
 from collections.abc import Callable, Mapping
 from typing import Any
 
-from gmijax.collectives.channel.interface import ExperienceSender, SenderStats
+from gmijax.collectives.channel.sender import Sender, SenderStats
 from gmijax.config import A3cConfig, TrainConfig
 
 _POLL_S = 0.0002
 _SLICE_S = 0.5
-"""Longest wait for room before the agent looks at the board again."""
+"""Longest wait for room before the agent looks for orders again."""
 
 
 class Outgoing:
@@ -26,7 +26,7 @@ class Outgoing:
       waited_s: seconds of waits for room in which the device had nothing to do.
     """
 
-    def __init__(self, config: TrainConfig, algo: A3cConfig, sender: ExperienceSender) -> None:
+    def __init__(self, config: TrainConfig, algo: A3cConfig, sender: Sender) -> None:
         self.waited_s = 0.0
         self._channel = config.channel
         self._max_ahead = algo.max_ahead
@@ -41,7 +41,7 @@ class Outgoing:
           is_idle: whether the device has computed all that it was given.
 
         Raises:
-          PeerLost, PipeClosed: as `ExperienceSender.send`.
+          PeerLost, PipeClosed: as `Sender.send`.
         """
         if self._is_ahead(arrays, is_idle):
             return False

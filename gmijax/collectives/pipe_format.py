@@ -21,13 +21,15 @@ from typing import NamedTuple, TypeAlias
 import numpy as np
 import numpy.typing as npt
 
+from gmijax.collectives.shared_memory import round_up
+
 Bytes: TypeAlias = npt.NDArray[np.uint8]
 
 ALIGNMENT = 64
 MAGIC = 0x4D494D47  # "GMIM" in memory on a little-endian machine
 MESSAGE, GAP = 1, 2
 
-_HEADER = struct.Struct("=IHHQQQqQ")
+_HEADER = struct.Struct("=IHHQQqQ")
 _CRC = struct.Struct("=I")
 
 
@@ -39,7 +41,6 @@ class Header(NamedTuple):
     num_parts: int
     sequence: int
     length: int
-    items: int
     tag: int
     checksum: int
 
@@ -50,31 +51,31 @@ class Damaged(Exception):
 
 def message_bytes(sizes: Sequence[int]) -> int:
     """What a message with parts of such sizes (bytes) takes in the ring."""
-    return parts_offset(len(sizes)) + sum(map(round_up, sizes))
+    return _parts_offset(len(sizes)) + sum(round_up(size, ALIGNMENT) for size in sizes)
 
 
 def split_parts(ring: Bytes, begin: int, sizes: Sequence[int]) -> list[Bytes]:
     """The parts of the message at `begin` as views."""
-    views, at = [], begin + parts_offset(len(sizes))
+    views, at = [], begin + _parts_offset(len(sizes))
     for size in sizes:
         views.append(ring[at : at + size])
-        at += round_up(size)
+        at += round_up(size, ALIGNMENT)
     return views
 
 
 def seal_gap(ring: Bytes, begin: int, length: int, sequence: int) -> None:
     """Writes the header of a gap of `length` bytes before message `sequence`."""
-    _seal(ring, begin, Header(MAGIC, GAP, 0, sequence, length, 0, 0, 0))
+    _seal(ring, begin, Header(MAGIC, GAP, 0, sequence, length, 0, 0))
 
 
 def seal_message(
-    ring: Bytes, begin: int, sizes: Sequence[int], *, sequence: int, items: int, tag: int
+    ring: Bytes, begin: int, sizes: Sequence[int], *, sequence: int, tag: int
 ) -> None:
     """Writes header and sizes of a message whose parts are in place."""
     length = message_bytes(sizes)
-    total = _checksum(ring[begin + parts_offset(len(sizes)) : begin + length])
+    total = _checksum(ring[begin + _parts_offset(len(sizes)) : begin + length])
     ring[begin + ALIGNMENT : begin + ALIGNMENT + 8 * len(sizes)].view(np.uint64)[:] = sizes
-    _seal(ring, begin, Header(MAGIC, MESSAGE, len(sizes), sequence, length, items, tag, total))
+    _seal(ring, begin, Header(MAGIC, MESSAGE, len(sizes), sequence, length, tag, total))
 
 
 def read_header(ring: Bytes, begin: int, sequence: int) -> Header:
@@ -84,7 +85,7 @@ def read_header(ring: Bytes, begin: int, sequence: int) -> Header:
       Damaged: it is not.
     """
     header = Header(*_HEADER.unpack_from(ring.data, begin))
-    if header.magic != MAGIC or begin + parts_offset(header.num_parts) > len(ring):
+    if header.magic != MAGIC or begin + _parts_offset(header.num_parts) > len(ring):
         raise Damaged("the header is wrong")
     if _crc(ring, begin, header.num_parts) != _CRC.unpack_from(ring.data, begin + _HEADER.size)[0]:
         raise Damaged("the checksum of the header is wrong")
@@ -99,7 +100,7 @@ def read_parts(ring: Bytes, begin: int, header: Header) -> tuple[Bytes, ...]:
     Raises:
       Damaged: they are not what was written.
     """
-    first = begin + parts_offset(header.num_parts)
+    first = begin + _parts_offset(header.num_parts)
     if _checksum(ring[first : begin + header.length]) != header.checksum:
         raise Damaged("the checksum of the parts is wrong")
     sizes_at = begin + ALIGNMENT
@@ -110,14 +111,8 @@ def read_parts(ring: Bytes, begin: int, header: Header) -> tuple[Bytes, ...]:
     return tuple(parts)
 
 
-def parts_offset(num_parts: int) -> int:
-    """Where the parts begin in a message."""
-    return round_up(ALIGNMENT + 8 * num_parts)
-
-
-def round_up(num_bytes: int) -> int:
-    """The next multiple of 64."""
-    return -(-num_bytes // ALIGNMENT) * ALIGNMENT
+def _parts_offset(num_parts: int) -> int:
+    return round_up(ALIGNMENT + 8 * num_parts, ALIGNMENT)
 
 
 def _seal(ring: Bytes, begin: int, header: Header) -> None:

@@ -11,8 +11,8 @@ from functools import partial
 from types import MappingProxyType
 from typing import Final
 
-from gmijax.collectives.board import create_board
-from gmijax.collectives.channel.build import Places, create_channels, require_channels
+from gmijax.collectives.board import create_registers
+from gmijax.collectives.channel.build import ChannelTopology, create_channels, require_memory
 from gmijax.config import A3cConfig, TrainConfig
 from gmijax.errors import ConfigError
 from gmijax.partition.machine import Machine
@@ -33,7 +33,7 @@ _ADVICE: Final = (
     "was faster on one H200 (docs/async.md)"
 )
 
-ENV_BOARD_FD: Final = "GMIJAX_BOARD_FD"
+ENV_REGISTERS_FD: Final = "GMIJAX_REGISTERS_FD"
 ENV_CHANNELS_FD: Final = "GMIJAX_CHANNELS_FD"
 
 
@@ -75,7 +75,7 @@ def plan_decoupled(config: TrainConfig, num_envs: int, machine: Machine) -> Plan
         trainers=placed.trainers,
     )
     plan = dataclasses.replace(plan, reasons=(placed.reason, *plan.reasons))
-    _require_experience_for_all(places_of(plan))
+    _require_experience_for_all(topology_of(plan))
     reason = why_not_device(plan)
     if config.channel.transport == "device" and reason is not None:
         raise ConfigError(f"channel.transport=device: {reason}; use memory")
@@ -83,17 +83,17 @@ def plan_decoupled(config: TrainConfig, num_envs: int, machine: Machine) -> Plan
     if is_memory and reason is None and config.channel.why_not_device() is None:
         plan = dataclasses.replace(plan, reasons=(*plan.reasons, _ADVICE))
     # How large an unroll is shows only when the task is loaded: the GMIs check that.
-    require_channels(config.channel, places_of(plan), unroll_bytes=0)
+    require_memory(config.channel, topology_of(plan))
     return plan
 
 
-def _require_experience_for_all(places: Places) -> None:
+def _require_experience_for_all(topology: ChannelTopology) -> None:
     """Refuses a placement in which a trainer gets nothing: all trainers learn in step.
 
     An agent with trainers on its own GPU sends to these only.
     """
-    serving = {places.gpu_of[gmi] for gmi in places.agents}
-    training = {places.gpu_of[gmi] for gmi in places.trainers}
+    serving = {topology.gpu_of[gmi] for gmi in topology.agents}
+    training = {topology.gpu_of[gmi] for gmi in topology.trainers}
     if serving <= training and (idle := sorted(training - serving)):
         raise ConfigError(
             f"plan.training_gpus: trainers on GPU {idle[0]} of the job would get no experience, "
@@ -106,12 +106,12 @@ def why_not_device(plan: Plan) -> str | None:
     """None if experience can stay in memory of the GPUs, else the reason."""
     if reason := why_not_intra("ipc", plan.backend):
         return reason
-    places = places_of(plan)
-    training = {places.gpu_of[gmi] for gmi in places.trainers}
-    far = [gmi for gmi in places.agents if places.gpu_of[gmi] not in training]
+    topology = topology_of(plan)
+    training = {topology.gpu_of[gmi] for gmi in topology.trainers}
+    far = [gmi for gmi in topology.agents if topology.gpu_of[gmi] not in training]
     if not far:
         return None
-    return f"agent {far[0]} is on GPU {places.gpu_of[far[0]]} of the job, where nobody trains"
+    return f"agent {far[0]} is on GPU {topology.gpu_of[far[0]]} of the job, where nobody trains"
 
 
 def groups_of(plan: Plan) -> tuple[Group, Group]:
@@ -127,11 +127,11 @@ def groups_of(plan: Plan) -> tuple[Group, Group]:
     return agents, trainers
 
 
-def places_of(plan: Plan) -> Places:
+def topology_of(plan: Plan) -> ChannelTopology:
     """Who sends experience, who receives it, and on which GPU of the job each is."""
     agents, trainers = groups_of(plan)
     layout = plan.layout
-    return Places(
+    return ChannelTopology(
         agents=agents.gmis,
         trainers=trainers.gmis,
         gpu_of=tuple(layout.gpu_of(gmi) for gmi in layout.gmis),
@@ -140,5 +140,5 @@ def places_of(plan: Plan) -> Places:
 
 def shared_blocks(config: TrainConfig, plan: Plan) -> Mapping[str, Callable[[], int]]:
     """What makes the memory that the GMIs share, by the variable that names its descriptor."""
-    channels = partial(create_channels, config.channel, places_of(plan))
-    return MappingProxyType({ENV_BOARD_FD: create_board, ENV_CHANNELS_FD: channels})
+    channels = partial(create_channels, config.channel, topology_of(plan))
+    return MappingProxyType({ENV_REGISTERS_FD: create_registers, ENV_CHANNELS_FD: channels})

@@ -12,7 +12,7 @@ from typing import Any, Final
 
 from gmijax.collectives.messenger import MIN_CAPACITY_BYTES
 from gmijax.collectives.pipe_block import create_pipes
-from gmijax.control.kinds import Plain
+from gmijax.control.kinds import Plain, SharedBlocks
 from gmijax.control.launcher import Launch, run_gmis
 from gmijax.errors import ConfigError, GmiFailed, GmijaxError
 from gmijax.partition.child import ENV_GMI, ENV_PIPES_FD
@@ -69,23 +69,23 @@ def launch(
         traceback and the run folder.
       JobInterrupted: SIGINT, SIGTERM or SIGHUP came, and all GMIs have ended.
     """
-    # Before anything else: the module of a GMI's role starts jobs without end otherwise.
-    _require_no_gmi()
+    if ENV_GMI in os.environ:  # Before anything else: it would start jobs without end.
+        raise ConfigError(
+            "gmijax.launch: called inside a GMI; in the file of a role, call it below "
+            'if __name__ == "__main__":'
+        )
     plan = plan.plan() if isinstance(plan, GMIManager) else plan
     if not isinstance(plan, Plan):
         raise ConfigError(f"plan={plan!r}: expected a plan of gmijax.plan, or a GMIManager")
     roles = _roles(role, plan)
-    _check_numbers(timeout_s, pipe_mib, start_timeout_s, stall_timeout_s, grace_s)
+    require_between("pipe_mib", pipe_mib, MIN_CAPACITY_BYTES / 2**20, MAX_PIPE_MIB)
+    _require_finite("timeout_s", timeout_s)
+    patience = _patience(start_timeout_s, stall_timeout_s, grace_s)
     machine = detect_machine()
     # The plan may come from another machine, or from a time when there was more room here.
-    require_room(
-        plan.layout.num_gmis,
-        "plan",
-        machine.host,
-        len(machine.cpu_cores),
-        on_cpu=plan.backend == "cpu",
-    )
-    parcels = [_parcel(each, args) for each in roles]
+    num_cores, on_cpu = len(machine.cpu_cores), plan.backend == "cpu"
+    require_room(plan.layout.num_gmis, "plan", machine.host, num_cores, on_cpu=on_cpu)
+    pickles = [_pickled(each, args) for each in roles]
     run = create_run(run_dir, None, type(roles[0]).__name__.lower())
     config = {
         "roles": [type(each).__qualname__ for each in roles],
@@ -95,46 +95,35 @@ def launch(
         "device_messages": device_messages,
         "script": shipping.own_script(),
     }
-    _write(run, plan, config, parcels)
-    patience = Patience(
-        start_timeout_s=start_timeout_s,
-        stall_timeout_s=math.inf if stall_timeout_s is None else stall_timeout_s,
-        stop_timeout_s=grace_s,
-        grace_s=grace_s,
+    write_json(run.plan, plan.to_dict())
+    write_json(run.config, config)
+    for gmi, pickled in enumerate(pickles):
+        run.gmi(gmi).root.mkdir()
+        run.gmi(gmi).role.write_bytes(pickled)
+    create = partial(create_pipes, plan.layout.num_gmis, config["capacity_bytes"])
+    return _run(plan, machine, run, patience, {ENV_PIPES_FD: create})
+
+
+def _run(
+    plan: Plan, machine: Machine, run: RunPaths, patience: Patience, blocks: SharedBlocks
+) -> list[Any]:
+    """Starts the GMIs and waits for their end; returns what their roles returned."""
+    job = Launch(
+        plan=plan,
+        machine=machine,
+        run=run,
+        # Roles wait for each other, so they start together.
+        kind=Plain("gmijax.roles.worker", compile_once=False, blocks=blocks),
+        patience=patience,
+        on_warning=lambda text: warnings.warn(text, RuntimeWarning, stacklevel=2),
     )
     try:
-        run_gmis(_job(plan, machine, run, patience, config["capacity_bytes"]))
+        run_gmis(job)
         outputs = [_output(run, gmi) for gmi in plan.layout.gmis]
     except GmijaxError as error:
         _explain(error, run)
         raise
     return [shipping.load(output) for output in outputs]
-
-
-def _job(
-    plan: Plan, machine: Machine, run: RunPaths, patience: Patience, capacity_bytes: int
-) -> Launch:
-    return Launch(
-        plan=plan,
-        machine=machine,
-        run=run,
-        # Roles wait for each other, so they start together.
-        kind=Plain(
-            "gmijax.roles.worker",
-            compile_once=False,
-            blocks={ENV_PIPES_FD: partial(create_pipes, plan.layout.num_gmis, capacity_bytes)},
-        ),
-        patience=patience,
-        on_warning=lambda text: warnings.warn(text, RuntimeWarning, stacklevel=2),
-    )
-
-
-def _require_no_gmi() -> None:
-    if ENV_GMI in os.environ:
-        raise ConfigError(
-            "gmijax.launch: called inside a GMI; in the file of a role, call it below "
-            'if __name__ == "__main__":'
-        )
 
 
 def _roles(role: Role | Sequence[Role], plan: Plan) -> list[Role]:
@@ -151,24 +140,28 @@ def _roles(role: Role | Sequence[Role], plan: Plan) -> list[Role]:
     return roles
 
 
-def _check_numbers(
-    timeout_s: float,
-    pipe_mib: float,
-    start_timeout_s: float,
-    stall_timeout_s: float | None,
-    grace_s: float,
-) -> None:
-    require_between("pipe_mib", pipe_mib, MIN_CAPACITY_BYTES / 2**20, MAX_PIPE_MIB)
-    limits = {"timeout_s": timeout_s, "start_timeout_s": start_timeout_s, "grace_s": grace_s}
-    if stall_timeout_s is not None:
-        limits["stall_timeout_s"] = stall_timeout_s
-    for key, value in limits.items():
-        require_positive(key, value)
-        if math.isinf(value):
-            raise ConfigError(f"{key}={value!r}: must be finite")
+def _patience(start_timeout_s: float, stall_timeout_s: float | None, grace_s: float) -> Patience:
+    _require_finite("start_timeout_s", start_timeout_s)
+    _require_finite("grace_s", grace_s)
+    if stall_timeout_s is None:
+        stall_timeout_s = math.inf
+    else:
+        _require_finite("stall_timeout_s", stall_timeout_s)
+    return Patience(
+        start_timeout_s=start_timeout_s,
+        stall_timeout_s=stall_timeout_s,
+        stop_timeout_s=grace_s,
+        grace_s=grace_s,
+    )
 
 
-def _parcel(role: Role, args: tuple[Any, ...]) -> bytes:
+def _require_finite(key: str, value: float) -> None:
+    require_positive(key, value)
+    if math.isinf(value):
+        raise ConfigError(f"{key}={value!r}: must be finite")
+
+
+def _pickled(role: Role, args: tuple[Any, ...]) -> bytes:
     try:
         return shipping.dump((role, args))
     except Exception as error:
@@ -178,14 +171,6 @@ def _parcel(role: Role, args: tuple[Any, ...]) -> bytes:
             f"{str(error).splitlines()[0] if str(error) else type(error).__name__}; it is pickled "
             "when the job starts, so make what is no plain data in run"
         ) from error
-
-
-def _write(run: RunPaths, plan: Plan, config: dict[str, Any], parcels: Sequence[bytes]) -> None:
-    write_json(run.plan, plan.to_dict())
-    write_json(run.config, config)
-    for gmi, parcel in enumerate(parcels):
-        run.gmi(gmi).root.mkdir()
-        run.gmi(gmi).role.write_bytes(parcel)
 
 
 def _output(run: RunPaths, gmi: int) -> bytes:

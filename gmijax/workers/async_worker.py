@@ -1,7 +1,7 @@
 """Main of a GMI in asynchronous training: `python -m gmijax.workers.async_worker`.
 
 Started by the supervisor and by nobody else. Builds the role that the plan gives to this GMI,
-agent or trainer, plugs in the board, the channels and the reducer among the trainers, runs it,
+agent or trainer, plugs in the registers, the channels and the reducer among the trainers, runs it,
 and writes `result.json` or `error.json`.
 """
 
@@ -11,7 +11,7 @@ import sys
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from gmijax.config import A3cConfig, TrainConfig
-from gmijax.control.decoupled import ENV_BOARD_FD, ENV_CHANNELS_FD, groups_of, places_of
+from gmijax.control.decoupled import ENV_CHANNELS_FD, ENV_REGISTERS_FD, groups_of, topology_of
 from gmijax.errors import ConfigError
 from gmijax.partition.child import ChildLink, required_fd, run_gmi
 from gmijax.partition.plan import Plan
@@ -25,7 +25,7 @@ from gmijax.workers.trainers import (
 )
 
 if TYPE_CHECKING:
-    from gmijax.a3c.board import Board
+    from gmijax.a3c.board import JobRegisters
     from gmijax.collectives.ring import World
     from gmijax.sim.wrappers import BatchedEnv
 
@@ -37,7 +37,7 @@ class _Parts(NamedTuple):
     algo: A3cConfig
     plan: Plan
     env: BatchedEnv
-    board: Board
+    registers: JobRegisters
     link: ChildLink
 
 
@@ -60,7 +60,7 @@ def _run(link: ChildLink) -> dict[str, Any]:
 
     check_share(plan, link.gmi)
     env = environments_of(config, _index(agents.gmis, link.gmi))
-    parts = _Parts(config, algo, plan, env, _board(algo, env, len(agents.gmis)), link)
+    parts = _Parts(config, algo, plan, env, _registers(algo, env, len(agents.gmis)), link)
     return _train(parts, world) if trains else _act(parts)
 
 
@@ -72,9 +72,9 @@ def _act(parts: _Parts) -> dict[str, Any]:
     agents, trainers = groups_of(plan)
     index = _index(agents.gmis, link.gmi)
     serving = Serving(config, parts.algo, parts.env, index, trainers.gmis)
-    sender = open_sender(config.channel, places_of(plan), link.gmi, _channels_fd())
+    sender = open_sender(config.channel, topology_of(plan), link.gmi, _channels_fd())
     try:
-        return act_until_told(serving, parts.board, sender, link)
+        return act_until_told(serving, parts.registers, sender, link)
     finally:
         sender.close()
 
@@ -87,25 +87,24 @@ def _train(parts: _Parts, world: World | None) -> dict[str, Any]:
     config, plan, link = parts.config, parts.plan, parts.link
     agents, trainers = groups_of(plan)
     training = Training(config, parts.algo, parts.env, agents.gmis)
-    receiver = open_receiver(config.channel, places_of(plan), link.gmi, _channels_fd())
+    receiver = open_receiver(config.channel, topology_of(plan), link.gmi, _channels_fd())
     num_floats = exchange_size(parts.env.spec, parts.algo)
     reducer = trainers_reducer(config, plan, trainers, link, num_floats, world)
     try:
-        done = learn_until_done(training, parts.board, receiver, reducer, link)
+        done = learn_until_done(training, parts.registers, receiver, reducer, link)
         return done | exchange_used(plan, reducer)
     finally:
         receiver.close()
         reducer.close()
 
 
-def _board(algo: A3cConfig, env: BatchedEnv, num_agents: int) -> Board:
-    from gmijax.a3c.board import board_of, note_sizes
+def _registers(algo: A3cConfig, env: BatchedEnv, num_agents: int) -> JobRegisters:
+    from gmijax.a3c.board import open_job_registers
     from gmijax.a3c.learner import num_weights
     from gmijax.a3c.rollout import num_stats
-    from gmijax.collectives.board import attach_board
 
-    sizes = note_sizes(num_weights(env.spec, algo), num_stats(env), num_agents)
-    return board_of(attach_board(required_fd(ENV_BOARD_FD), sizes))
+    fd = required_fd(ENV_REGISTERS_FD)
+    return open_job_registers(fd, num_weights(env.spec, algo), num_stats(env), num_agents)
 
 
 def _channels_fd() -> int:

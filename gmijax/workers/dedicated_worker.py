@@ -11,7 +11,6 @@ import sys
 from typing import TYPE_CHECKING, Any
 
 from gmijax.config import PpoConfig, TrainConfig
-from gmijax.control.kinds import ROLLOUT_PIPE_BYTES
 from gmijax.errors import ConfigError
 from gmijax.partition.child import ENV_PIPES_FD, ChildLink, required_fd, run_gmi
 from gmijax.partition.plan import Plan
@@ -53,8 +52,7 @@ def _run(link: ChildLink) -> dict[str, Any]:
     check_share(plan, link.gmi)
     place = 0 if trains else servants.gmis.index(link.gmi)
     env = environments_of(config, place)
-    fd, num_gmis = required_fd(ENV_PIPES_FD), plan.layout.num_gmis
-    block = PipeBlock.attach(fd, link.gmi, num_gmis, ROLLOUT_PIPE_BYTES)
+    block = PipeBlock(required_fd(ENV_PIPES_FD), link.gmi)
     try:
         if trains:
             assert isinstance(config.algo, PpoConfig)

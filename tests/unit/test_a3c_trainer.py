@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from toy_env import point_mass
 
-from gmijax.a3c.board import Board
+from gmijax.a3c.board import JobRegisters
 from gmijax.a3c.trainer import Training, _Trainer
 from gmijax.cli import compose
-from gmijax.collectives.channel.interface import Batch
+from gmijax.collectives.channel.batcher import Batch
 from gmijax.collectives.solo import SoloReducer
 from gmijax.partition.child import ChildLink
 from gmijax.rundir import RunPaths
@@ -32,13 +32,13 @@ def test_unrolls_of_batches_that_are_passed_over_count_as_stale(tmp_path) -> Non
     receiver = _Arrivals([1, 2, 3, 4], [10, 10, 9, 2], [10, 10, 10, 10])
     trainer = _Trainer(
         Training(config, config.algo, point_mass(), agents=(1,)),
-        Board(None, None, ()),
+        JobRegisters(None, None, ()),
         receiver,
         SoloReducer(1),
         ChildLink(0, RunPaths(tmp_path), None, None),
     )
     trainer._version = 10
-    first, second = (trainer._meet(*trainer._receive()) for _ in range(2))
+    first, second = (trainer._gather_counts(*trainer._receive()) for _ in range(2))
     assert (first.fresh, first.stale, first.staleness.sum()) == (3, 5, 8)
     assert first.staleness[[0, 1, 6, 7, 8, 9]].tolist() == [2, 1, 1, 1, 2, 1]
     assert (second.fresh, second.stale, second.staleness.sum()) == (4, 0, 4)
@@ -48,14 +48,14 @@ def test_fresh_unrolls_weigh_as_much_as_those_of_all_trainers(tmp_path) -> None:
     config = compose("env=ball_balance", "algo=a3c", "num_envs=4", "algo.max_staleness=3")
     trainer = _Trainer(
         Training(config, config.algo, point_mass(), agents=(1,)),
-        Board(None, None, ()),
+        JobRegisters(None, None, ()),
         _Arrivals([10, 2, 2, 2]),
         SoloReducer(1),
         ChildLink(0, RunPaths(tmp_path), None, None),
     )
     trainer._version = 10
     batch, waited_s = trainer._receive()
-    mine = trainer._meet(batch, waited_s)
+    mine = trainer._gather_counts(batch, waited_s)
     assert (trainer._weights_of(batch) * trainer._scale(mine)).tolist() == [4, 0, 0, 0]
     # With another trainer that has four of four.
     trainer._reducer.world_size = 2

@@ -13,18 +13,19 @@ import numpy as np
 import pytest
 from toy_env import point_mass
 
-from gmijax.collection.policy import ActingPolicy, _gaussian, random_policy
 from gmijax.collection.programs import (
+    ActingPolicy,
     Keep,
     Step,
+    _gaussian,
     infer,
     next_keys,
     no_counts,
+    random_policy,
     simulate,
     unroll,
 )
-from gmijax.collection.shards import ShardWriter
-from gmijax.collection.tally import Tally
+from gmijax.collection.recording import CollectionStats, ShardWriter
 from gmijax.config import PpoConfig
 from gmijax.datadir import DataPaths
 from gmijax.errors import NonFiniteError
@@ -147,32 +148,32 @@ def test_shards_are_whole_and_say_what_they_are(compress: bool, tmp_path: Path):
     assert about[0]["env_steps"] == T * N
 
 
-def tally_of(folder: Path) -> Tally:
+def stats_of(folder: Path) -> CollectionStats:
     link = ChildLink(0, RunPaths(folder), None, None)
     link.paths.root.mkdir(parents=True)
-    return Tally(link, "point_mass", N * T)
+    return CollectionStats(link, "point_mass", N * T)
 
 
 def test_too_many_bad_worlds_end_serving_and_the_term_is_named(tmp_path: Path):
-    tally, counts = tally_of(tmp_path), no_counts(point_mass())
+    stats, counts = stats_of(tmp_path), no_counts(point_mass())
     few = {"any": jnp.asarray(TOLERATED_STEPS), "reward/near": jnp.asarray(TOLERATED_STEPS)}
-    tally.add(counts._replace(diverged=counts.diverged | few))
-    assert tally.outcome()["diverged_steps"] == TOLERATED_STEPS
+    stats.add(counts._replace(diverged=counts.diverged | few))
+    assert stats.outcome()["diverged_steps"] == TOLERATED_STEPS
     many = {name: count + 1 for name, count in few.items()}
     message = r"up to env step 360 of this GMI: 11 of 180 steps .*, in reward/near$"
     with pytest.raises(NonFiniteError, match=message):
-        tally.add(counts._replace(diverged=counts.diverged | many))
-    tally.close()
+        stats.add(counts._replace(diverged=counts.diverged | many))
+    stats.close()
 
 
 def test_full_buffers_are_counted_and_the_first_is_told(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ):
-    tally, counts = tally_of(tmp_path), no_counts(point_mass())
+    stats, counts = stats_of(tmp_path), no_counts(point_mass())
     for count in (0, 5, 7):
-        tally.add(counts._replace(overflowed={"contact": jnp.asarray(count)}))
-    tally.close()
-    assert tally.outcome()["overflow_steps"] == {"contact": 12.0}
+        stats.add(counts._replace(overflowed={"contact": jnp.asarray(count)}))
+    stats.close()
+    assert stats.outcome()["overflow_steps"] == {"contact": 12.0}
     assert len(capsys.readouterr().err.splitlines()) == 1
     lines = RunPaths(tmp_path).gmi(0).metrics.read_text().splitlines()
     key = "physics/contact_overflow_steps"

@@ -2,44 +2,69 @@
 
 from __future__ import annotations
 
+import contextlib
 import time
 from collections.abc import Callable, Sequence
-from typing import NamedTuple, Protocol
+from typing import NamedTuple, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
 
 from gmijax.collectives.channel.compressor import Transfer
-from gmijax.collectives.channel.interface import Array, Batch
-from gmijax.collectives.channel.spec import Spec
+from gmijax.collectives.channel.spec import Array, Spec
+from gmijax.collectives.channel.transport import ChannelReader
+from gmijax.collectives.pipe import Message
 from gmijax.collectives.waits import LIVENESS_PERIOD_S, wait_until
 from gmijax.errors import CollectiveError, CollectiveTimeout, GmijaxError, PipeClosed
 
+Decode: TypeAlias = Callable[[Message], Transfer | None]
+"""Reads a message of one agent; None if it only began or continued a transfer."""
 
-class Source(Protocol):
-    """Unrolls from one agent.
+
+class Batch(NamedTuple):
+    """What a trainer gets: whole unrolls of B environments.
 
     Attributes:
-      peer: rank of the agent.
+      experience: arrays by channel, [S, B, ...]; read-only views that are valid until the next
+        `receive`, of host memory or of the device's. The latter are for programs: the same view
+        comes again with other values, and jax keeps what `np.asarray` once read of it.
+      versions: [B] int64, the policy version that every unroll was made with.
+      agents: [B] int64, ranks of the agents that made them.
     """
 
-    peer: int
+    experience: dict[str, Array]
+    versions: npt.NDArray[np.int64]
+    agents: npt.NDArray[np.int64]
+
+
+class Source:
+    """Transfers from one agent.
+
+    Args:
+      reader: the way from it.
+      decode: reads its messages.
+
+    Attributes:
+      reader: the same.
+      messages: that arrived.
+    """
+
+    def __init__(self, reader: ChannelReader, decode: Decode) -> None:
+        self.reader = reader
+        self.messages = 0
+        self._decode = decode
 
     def try_next(self) -> Transfer | None:
-        """The next unrolls, valid until `release`; PipeClosed if no more can come."""
-        ...
-
-    def release(self) -> None:
-        """Gives their memory back."""
-        ...
-
-    def why_lost(self, operation: str, step: int) -> GmijaxError | None:
-        """Why the agent will never send again, None if it may."""
-        ...
+        """The next transfer, valid until the reader's `release`; PipeClosed if none can come."""
+        while (message := self.reader.try_get()) is not None:
+            self.messages += 1
+            if (transfer := self._decode(message)) is not None:
+                return transfer
+        return None
 
 
 class Batcher:
-    """Makes batches of unrolls from several agents, in turn.
+    """A trainer's end of the channels: makes batches of unrolls from several agents, in turn.
 
     A batch that lies in one transfer is a slice of it, without a copy, and holds its memory until
     the next batch is asked for. Otherwise unrolls are stacked in memory of the batcher's own.
@@ -48,26 +73,50 @@ class Batcher:
       rank: of this trainer.
       sources: one for every agent.
       new_stack: makes, from a spec and a size, what batches of several arrivals are stacked in.
+      held: closed at the end.
+
+    Attributes:
+      batches: given out.
+      unrolls: environments' unrolls that arrived.
+      num_bytes: in all channels, as they travelled.
     """
 
     def __init__(
         self,
         rank: int,
         sources: Sequence[Source],
-        new_stack: Callable[[Spec, int], Stack] | None = None,
+        new_stack: Callable[[Spec, int], Stack],
+        held: contextlib.ExitStack,
     ) -> None:
-        self.batches = self.unrolls = 0
-        self.waited_s = 0.0
+        self.batches = self.unrolls = self.num_bytes = 0
         self._rank = rank
+        self._all_sources = tuple(sources)
         self._sources = list(sources)
         self._turn = 0
-        self._new_stack = Stack if new_stack is None else new_stack
+        self._new_stack = new_stack
+        self._held = held
         self._current: _Arrival | None = None
         self._stack: Stack | None = None
         self._next_look_s = time.monotonic() + LIVENESS_PERIOD_S
 
+    @property
+    def transfers(self) -> int:
+        """Messages that arrived."""
+        return sum(source.messages for source in self._all_sources)
+
     def receive(self, batch_size: int, timeout_s: float) -> Batch:
-        """Waits for `batch_size` unrolls; see `ExperienceReceiver.receive`."""
+        """Waits for the unrolls of `batch_size` environments.
+
+        After any error nothing is lost: what had arrived is in the next batch. An agent that is
+        gone is named at most five times a second, also while others still send; who can do
+        without it goes on.
+
+        Raises:
+          CollectiveTimeout: too few came in time.
+          PeerLost: the process of an agent is gone.
+          PipeClosed: all agents have closed, and too few are left.
+          CollectiveError: a message is damaged.
+        """
         self._check_agents()
         self._resize(batch_size)
         deadline_s = time.monotonic() + timeout_s
@@ -88,27 +137,20 @@ class Batcher:
         self.batches += 1
         return batch
 
+    def close(self) -> None:
+        """Tells the agents that nothing more is wanted. Idempotent."""
+        self._held.close()
+
     def _arrival(self, deadline_s: float, timeout_s: float) -> _Arrival:
         """What has unrolls left: the arrival in use, or the next one."""
         if self._current is not None and self._current.left:
             return self._current
         self._release()
-        arrival = self._next()
+        arrival = wait_until(self._next, self._why_lost, deadline_s - time.monotonic())
         if arrival is None:
-            arrival = self._wait(deadline_s, timeout_s)
-        self.unrolls += arrival.left
-        self._current = arrival
-        return arrival
-
-    def _wait(self, deadline_s: float, timeout_s: float) -> _Arrival:
-        started_s = time.monotonic()
-        try:
-            arrival = wait_until(self._next, self._why_lost, deadline_s - started_s)
-        finally:
-            self.waited_s += time.monotonic() - started_s
-        if arrival is None:
-            peers = tuple(source.peer for source in self._sources)
+            peers = tuple(source.reader.peer for source in self._sources)
             raise CollectiveTimeout(self._rank, peers, "receive", self.batches, timeout_s)
+        self._current = arrival
         return arrival
 
     def _next(self) -> _Arrival | None:
@@ -123,12 +165,15 @@ class Batcher:
                 return self._next()
             if transfer is not None:
                 self._turn += place + 1
-                return _Arrival(transfer, source.peer, source.release)
+                self.unrolls += transfer.num_envs
+                self.num_bytes += sum(transfer.spec.sizes(transfer.num_envs))
+                agents = np.full(transfer.num_envs, source.reader.peer, np.int64)
+                return _Arrival(transfer, agents, source.reader.release)
         return None
 
     def _why_lost(self) -> GmijaxError | None:
         self._next_look_s = time.monotonic() + LIVENESS_PERIOD_S
-        found = (source.why_lost("receive", self.batches) for source in self._sources)
+        found = (source.reader.why_lost("receive", self.batches) for source in self._sources)
         # One that has closed is no loss: `_next` finds out when its last message is read.
         lost = (error for error in found if not isinstance(error, PipeClosed))
         return next((error for error in lost if error is not None), None)
@@ -173,12 +218,14 @@ class _Unrolls(NamedTuple):
 class _Arrival:
     """A transfer of which a part may be in batches already."""
 
-    def __init__(self, transfer: Transfer, agent: int | None, release: Callable[[], None]) -> None:
+    def __init__(
+        self, transfer: Transfer, agents: npt.NDArray[np.int64], release: Callable[[], None]
+    ) -> None:
         self.spec = transfer.spec
         self.release = release
         self._transfer = transfer
+        self._agents = agents
         self._taken = 0
-        self.agents = np.full(transfer.num_envs, -1 if agent is None else agent, np.int64)
 
     @property
     def left(self) -> int:
@@ -191,7 +238,7 @@ class _Arrival:
         if count < self._transfer.num_envs:  # A part of an array on a device is a copy.
             arrays = {name: array[:, low:high] for name, array in arrays.items()}
         return _Unrolls(
-            self.spec, arrays, self._transfer.versions[low:high], self.agents[low:high]
+            self.spec, arrays, self._transfer.versions[low:high], self._agents[low:high]
         )
 
 
@@ -240,9 +287,7 @@ class Stack:
     def as_arrival(self) -> _Arrival:
         """What is in it so far, as if it had just come."""
         transfer = Transfer(self.spec, self.filled, self._versions[: self.filled], self._so_far())
-        arrival = _Arrival(transfer, None, lambda: None)
-        arrival.agents[:] = self._agents[: self.filled]
-        return arrival
+        return _Arrival(transfer, self._agents[: self.filled], lambda: None)
 
     def _begin(self) -> None:
         """Makes room for a batch; the last one's memory may be used again."""
