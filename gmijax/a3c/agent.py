@@ -89,7 +89,7 @@ class _Agent:
         self._index = serving.index
         self._trainers = serving.trainers
         self._registers = registers
-        self._is_on_device = sender.on_device
+        self._sender = sender
         self._outgoing = Outgoing(serving.config, serving.algo, sender)
         self._link = link
         self._learner = make_learner(self._env.spec, serving.algo)
@@ -154,7 +154,7 @@ class _Agent:
         num_steps = self._algo.unroll_length // num_pieces
         return UnrollPrograms(
             *(self._env, self._learner.networks, num_steps, num_pieces, weights, env_state),
-            stays=self._is_on_device,
+            stays=self._sender.on_device,
         )
 
     def _wait_for_start(self) -> None:
@@ -199,21 +199,22 @@ class _Agent:
 
     def _send(self, unroll: _Sent, env_state: BatchState) -> None:
         arrays: dict[str, Any] = unroll.experience._asdict()
-        if not self._is_on_device:
+        if not self._sender.on_device:
             arrays = {name: np.asarray(values) for name, values in arrays.items()}
         stats = np.asarray(unroll.stats, np.float64)
         started = time.monotonic()
         if not self._hand_over(arrays, unroll.version, env_state, started):
             return
-        counts = self._outgoing.counts()
+        sender, occupancy = self._sender, self._sender.occupancy()
+        self._outgoing.flush_if_starving()
         self._unrolls += 1
         self._report = self._report._replace(
             env_steps=self._report.env_steps + arrays["reward"].size,
-            bytes_sent=float(counts.num_bytes),
-            dropped=float(counts.dropped),
+            bytes_sent=float(sender.num_bytes),
+            dropped=float(sender.dropped),
             send_s=self._report.send_s + time.monotonic() - started,
             wait_s=self._outgoing.waited_s,
-            occupancy=counts.occupancy,
+            occupancy=occupancy,
             stats=self._report.stats + stats,
         )
         self._publish()

@@ -19,7 +19,6 @@ from gmijax.a3c.learner import acting_weights, num_weights, pack_weights
 from gmijax.a3c.rollout import num_stats
 from gmijax.cli import compose
 from gmijax.collectives.board import create_registers
-from gmijax.collectives.channel.sender import SenderStats
 from gmijax.learner import init_learner, make_learner
 from gmijax.normalize import normalize
 from gmijax.partition.child import ChildLink
@@ -41,6 +40,7 @@ class _NoRoom:
     def __init__(self) -> None:
         self.was_asked = threading.Event()
         self.waited_s = 0.0
+        self.num_bytes = self.dropped = 0
 
     def send(self, experience, version, timeout_s) -> bool:
         self.was_asked.set()
@@ -51,8 +51,10 @@ class _NoRoom:
     def flush(self) -> None:
         pass
 
-    def stats(self) -> SenderStats:
-        return SenderStats(0, 0, 0, 0, self.waited_s, 0.0, 0.0)
+    def occupancy(self) -> float:
+        return 0.0
+
+    least_occupancy = occupancy
 
     def close(self) -> None:
         pass

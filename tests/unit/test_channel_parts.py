@@ -109,12 +109,12 @@ def test_small_rollouts_travel_together_large_ones_are_cut(make_pair: Any) -> No
     pair = make_pair(transfer_kib=1)
     for send in range(20):
         pair.sender.send(rollout(send * N), 0, 1.0)
-    assert pair.sender.stats().transfers == 20 // (1024 // (N * one))
+    assert pair.sender.transfers == 20 // (1024 // (N * one))
     large = max_piece_bytes(2**20) // one + 1
     pair.sender.flush()
-    before = pair.sender.stats()
+    before = pair.sender.transfers
     pair.sender.send(rollout(20 * N, large), 0, 1.0)
-    assert pair.sender.stats().pieces - before.pieces == 2
+    assert pair.sender.transfers - before == 2
     pair.sender.flush()
     assert pair.numbers(20 * N + large)[-1] == 20 * N + large - 1
 
@@ -124,7 +124,7 @@ def test_without_room_a_blocked_send_goes_on_where_it_was(make_pair: Any) -> Non
     one = sum(array[:, :1].nbytes for array in rollout().values())
     large = rollout(0, 3 * (2**20 // one))
     assert not pair.sender.send(large, 0, 0.01)
-    assert pair.sender.stats().waited_s > 0
+    assert pair.sender.waited_s > 0
     got = pair.numbers(1000)
     while not pair.sender.send(large, 0, 0.0):
         got += pair.numbers(1000)
@@ -132,7 +132,7 @@ def test_without_room_a_blocked_send_goes_on_where_it_was(make_pair: Any) -> Non
     while len(got) + 1000 <= len(large["bootstrap"][0]):
         got += pair.numbers(1000)
     assert got == list(range(len(got)))
-    assert pair.sender.stats().dropped == 0
+    assert pair.sender.dropped == 0
 
 
 def test_drop_oldest_never_waits_and_counts_what_it_drops(make_pair: Any) -> None:
@@ -142,7 +142,7 @@ def test_drop_oldest_never_waits_and_counts_what_it_drops(make_pair: Any) -> Non
         experience = rollout(send * envs, envs)
         assert pair.sender.send(experience, 0, 0.0)
         experience["state"][:] = -1.0  # What waits must be a copy.
-    dropped = pair.sender.stats().dropped
+    dropped = pair.sender.dropped
     assert 0 < dropped < 57
     got = []
     for _ in range(60 - 3 - dropped):
@@ -158,10 +158,10 @@ def test_what_still_waits_at_the_end_is_counted_as_dropped(make_pair: Any) -> No
     pair = make_pair(when_full="drop_oldest", max_waiting=3)
     for send in range(60):
         pair.sender.send(rollout(send * 1000, 1000), 0, 0.0)
-    dropped = pair.sender.stats().dropped
+    dropped = pair.sender.dropped
     pair.receiver.close()
     pair.sender.close()
-    assert pair.sender.stats().dropped == dropped + 3
+    assert pair.sender.dropped == dropped + 3
 
 
 def test_after_an_error_a_send_goes_on_where_it_was(make_pair: Any) -> None:
@@ -172,12 +172,10 @@ def test_after_an_error_a_send_goes_on_where_it_was(make_pair: Any) -> None:
     pair.sender._migrator.why_lost = lambda: PeerLost(0, 1, "send", 0)
     with pytest.raises(PeerLost):
         pair.sender.send(large, 0, 0.3)
-    pieces = pair.sender.stats().pieces
     got = pair.numbers(1000)
     pair.sender._migrator.why_lost = lambda: None
     while not pair.sender.send(large, 0, 0.0):
         got += pair.numbers(1000)
-    assert pair.sender.stats().pieces == pieces
     pair.sender.close()
     while len(got) + 1000 <= len(large["bootstrap"][0]):
         got += pair.numbers(1000)
@@ -200,7 +198,7 @@ def test_float16_halves_a_channel_and_saturates(make_pair: Any) -> None:
     pair.sender.send(experience, 0, 1.0)
     pair.sender.flush()
     plain = sum(array.nbytes for array in experience.values())
-    assert pair.sender.stats().num_bytes == plain - experience["state"].nbytes // 2
+    assert pair.sender.num_bytes == plain - experience["state"].nbytes // 2
     state = pair.receiver.receive(N, 0.0).experience["state"]
     assert state.dtype == np.float32
     assert state[0, 0, 0] == 65504.0

@@ -190,7 +190,8 @@ def test_there_is_a_fence_wherever_the_order_of_accesses_counts(
     seen.clear()
     assert block.why_lost(0, "get", 0) is None
     assert seen == ["read pid", "fence", "read start_ticks", "read has_left"]
-    for end in (ends.writer, ends.reader):
+    both: list[Any] = [ends.writer, ends.reader]
+    for end in both:
         end._own = Noted(end._own, seen)
         end._fence = lambda: seen.append("fence")
     seen.clear()

@@ -124,7 +124,7 @@ class Batcher:
             arrival = self._arrival(deadline_s, timeout_s)
             filled = self._stack.filled if self._stack is not None else 0
             if not filled and arrival.left >= batch_size:
-                batch = arrival.take(batch_size).batch()
+                batch = _unpacked(arrival.take(batch_size), arrival.spec)
                 break
             if self._stack is None or not self._stack.fits(arrival.spec):
                 self._stack = self._new_stack(arrival.spec.unpacked(), batch_size)
@@ -199,22 +199,6 @@ class Batcher:
             self._current = None
 
 
-class _Unrolls(NamedTuple):
-    """Some unrolls of one agent."""
-
-    spec: Spec
-    arrays: dict[str, Array]
-    versions: npt.NDArray[np.int64]
-    agents: npt.NDArray[np.int64]
-
-    def batch(self) -> Batch:
-        experience = {
-            channel.name: _given(self.arrays[channel.name], channel.dtype)
-            for channel in self.spec.channels
-        }
-        return Batch(experience, self.versions, self.agents)
-
-
 class _Arrival:
     """A transfer of which a part may be in batches already."""
 
@@ -231,15 +215,14 @@ class _Arrival:
     def left(self) -> int:
         return self._transfer.num_envs - self._taken
 
-    def take(self, count: int) -> _Unrolls:
+    def take(self, count: int) -> Batch:
+        """The next unrolls, as they travelled."""
         low, high = self._taken, self._taken + count
         self._taken = high
         arrays = self._transfer.arrays
         if count < self._transfer.num_envs:  # A part of an array on a device is a copy.
             arrays = {name: array[:, low:high] for name, array in arrays.items()}
-        return _Unrolls(
-            self.spec, arrays, self._transfer.versions[low:high], self._agents[low:high]
-        )
+        return Batch(arrays, self._transfer.versions[low:high], self._agents[low:high])
 
 
 class Stack:
@@ -268,10 +251,10 @@ class Stack:
             raise CollectiveError(f"agents send different experience: {spec} and {self.spec}")
         return fits
 
-    def add(self, unrolls: _Unrolls) -> None:
+    def add(self, unrolls: Batch) -> None:
         """Takes unrolls in; their arrays may change after that."""
         low, high = self.filled, self.filled + len(unrolls.versions)
-        for name, array in unrolls.arrays.items():
+        for name, array in unrolls.experience.items():
             self._put(name, low, high, array)
         self._versions[low:high] = unrolls.versions
         self._agents[low:high] = unrolls.agents
@@ -305,11 +288,14 @@ class Stack:
         return {name: _read_only(array[:, : self.filled]) for name, array in self._arrays.items()}
 
 
-def _given(array: Array, dtype: str) -> Array:
-    """An array as the trainer gets it, who may not write into it; one on a device nobody can."""
-    if not isinstance(array, np.ndarray):
-        return array
-    return _read_only(array.astype(dtype, copy=False))
+def _unpacked(unrolls: Batch, spec: Spec) -> Batch:
+    """Unrolls as the trainer gets them, who may not write into them; nobody can on a device."""
+    experience = dict(unrolls.experience)
+    for channel in spec.channels:
+        array = experience[channel.name]
+        if isinstance(array, np.ndarray):
+            experience[channel.name] = _read_only(array.astype(channel.dtype, copy=False))
+    return unrolls._replace(experience=experience)
 
 
 def _read_only(array: Array) -> Array:

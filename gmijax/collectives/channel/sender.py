@@ -6,7 +6,7 @@ import contextlib
 import time
 from collections import deque
 from collections.abc import Sequence
-from typing import NamedTuple, Protocol
+from typing import Protocol
 
 from gmijax.collectives.channel.dispenser import Dispenser, Piece
 from gmijax.collectives.channel.migrator import Migrator
@@ -38,29 +38,6 @@ class Packer(Protocol):
         ...
 
 
-class SenderStats(NamedTuple):
-    """Counts of one agent since it started.
-
-    Attributes:
-      pieces: handed over, dropped ones too.
-      dropped: pieces that nobody gets, with `when_full=drop_oldest`; after `close` also those
-        that still waited.
-      transfers: messages committed.
-      num_bytes: in all channels, as they travel.
-      waited_s: time spent waiting for room.
-      occupancy: fullest of the ways to the trainers, 0 to 1.
-      least_occupancy: emptiest of the ways that the next transfer may take, 0 to 1.
-    """
-
-    pieces: int
-    dropped: int
-    transfers: int
-    num_bytes: int
-    waited_s: float
-    occupancy: float
-    least_occupancy: float
-
-
 class Sender:
     """An agent's end of the channels.
 
@@ -76,6 +53,9 @@ class Sender:
 
     Attributes:
       on_device: whether it takes arrays of the device; otherwise numpy's.
+      dropped: pieces that nobody gets, with `max_waiting`; after `close` also those that still
+        waited.
+      waited_s: time spent waiting for room.
     """
 
     def __init__(
@@ -95,8 +75,8 @@ class Sender:
         self._max_waiting = max_waiting
         self._held = held
         self._waiting: deque[Piece] = deque()
-        self._pieces = self._dropped = 0
-        self._waited_s = 0.0
+        self.dropped = 0
+        self.waited_s = 0.0
         self._is_pending = False
         self._is_open = True
 
@@ -121,7 +101,6 @@ class Sender:
         self._migrator.check()
         # If pending it is the same rollout as before, which is split already.
         pieces = [] if self._is_pending else self._dispenser.split(experience, version)
-        self._pieces += len(pieces)
         self._is_pending = True  # Also after an error: some of it may have been sent.
         if self._max_waiting is None:
             self._waiting.extend(pieces)
@@ -135,17 +114,23 @@ class Sender:
         """Hands over what waits for more to come; trainers cannot see it before."""
         self._packer.flush()
 
-    def stats(self) -> SenderStats:
-        """Counts so far."""
-        return SenderStats(
-            pieces=self._pieces,
-            dropped=self._dropped,
-            transfers=self._packer.transfers,
-            num_bytes=self._packer.num_bytes,
-            waited_s=self._waited_s,
-            occupancy=self._migrator.occupancy() if self._is_open else 0.0,
-            least_occupancy=self._migrator.least_occupancy() if self._is_open else 0.0,
-        )
+    @property
+    def transfers(self) -> int:
+        """Messages committed."""
+        return self._packer.transfers
+
+    @property
+    def num_bytes(self) -> int:
+        """Bytes committed, in all channels, as they travel."""
+        return self._packer.num_bytes
+
+    def occupancy(self) -> float:
+        """Of the fullest way to a trainer, 0 to 1."""
+        return self._migrator.occupancy()
+
+    def least_occupancy(self) -> float:
+        """Of the emptiest way that the next transfer may take, 0 to 1."""
+        return self._migrator.least_occupancy()
 
     def close(self) -> None:
         """Flushes, and tells the trainers that nothing more comes. Idempotent.
@@ -158,7 +143,7 @@ class Sender:
         self._is_open = False
         with contextlib.suppress(GmijaxError):  # A trainer that is gone wants nothing.
             self._drain(CLOSE_TIMEOUT_S)
-        self._dropped += len(self._waiting)
+        self.dropped += len(self._waiting)
         self._waiting.clear()
         self._packer.flush()  # Another one may.
         self._held.close()
@@ -182,7 +167,7 @@ class Sender:
                 deadline_s - started_s,
             )
         finally:
-            self._waited_s += time.monotonic() - started_s
+            self.waited_s += time.monotonic() - started_s
         return took is not None
 
     def _queue(self, pieces: Sequence[Piece], max_waiting: int) -> None:
@@ -195,4 +180,4 @@ class Sender:
             self._waiting.append(piece.copy())
             if len(self._waiting) > max_waiting:
                 self._waiting.popleft()
-                self._dropped += 1
+                self.dropped += 1

@@ -51,15 +51,14 @@ class UniPacker:
         channel = piece.spec.channels[place]
         head = piece.spec.encode()
         sizes = [head.size, 32, channel.wire_bytes(piece.num_envs) // channel.steps]
-        if self._writer is None:
+        if self._writer is None:  # All of a rollout go to one trainer.
             opened = self._migrator.try_open(sizes)
-            if opened is None:
-                return False
-            self._writer, views = opened
         else:
             views = self._writer.try_reserve(sizes)
-            if views is None:
-                return False
+            opened = None if views is None else (self._writer, views)
+        if opened is None:
+            return False
+        self._writer, views = opened
         views[0][:] = head
         views[1].view(np.int64)[:] = step, place, piece.num_envs, piece.version
         into = views[2].view(channel.wire_dtype).reshape(piece.num_envs, *channel.shape)
