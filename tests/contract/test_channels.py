@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import signal
 import time
-from itertools import product
 from pathlib import Path
 from typing import Any, get_args, get_type_hints
 
@@ -19,9 +18,10 @@ pytestmark = pytest.mark.timeout(120)
 
 TIMEOUT_S = 3.0
 KINDS = get_type_hints(ChannelConfig)
-DESIGNS = get_args(KINDS["design"])
 # Where experience stays on the device it needs agents and trainers on one: tests of its own.
 TRANSPORTS = [name for name in get_args(KINDS["transport"]) if name != "device"]
+# A design goes through any transport alike, so each of both is here at least once.
+WAYS = [*(("multi", transport) for transport in TRANSPORTS), ("uni", "memory")]
 HERE = str(Path(__file__).parents[1])
 TOPOLOGY = ChannelTopology(agents=(0, 1, 2), trainers=(3, 4), gpu_of=(0, 0, 1, 2, 3))
 
@@ -44,7 +44,7 @@ def require_all_once(job: ChannelJob, count: int) -> None:
         np.testing.assert_array_equal(np.sort(np.concatenate(parts)), np.arange(count))
 
 
-@pytest.mark.parametrize(("design", "transport"), list(product(DESIGNS, TRANSPORTS)))
+@pytest.mark.parametrize(("design", "transport"), WAYS)
 def test_nothing_is_lost_doubled_torn_or_out_of_order(
     design: Any, transport: Any, tmp_path: Path
 ) -> None:
@@ -90,13 +90,11 @@ def test_an_agent_that_finds_no_room_waits_as_told(transport: Any, tmp_path: Pat
         assert result["ended_s"] - started_s < 10.0
 
 
-@pytest.mark.parametrize("transport", TRANSPORTS)
-def test_an_agent_that_need_not_wait_counts_what_it_drops(transport: Any, tmp_path: Path) -> None:
-    require_zmq(transport)
+def test_an_agent_that_need_not_wait_counts_what_it_drops(tmp_path: Path) -> None:
     topology = ChannelTopology(agents=(0, 1), trainers=(2,), gpu_of=(0, 0, 0))
     count, envs = 40_000, 100
     task = {"count": count, "envs": envs, "batch": envs, "sizes": (50, 2)}
-    settings = config(transport=transport, when_full="drop_oldest", max_waiting=2)
+    settings = config(when_full="drop_oldest", max_waiting=2)
     with ChannelJob(tmp_path, settings, topology, **task) as job:
         job.start(2, busy_s=0.02).wait_for("open")
         job.start(0, 1)
@@ -130,7 +128,7 @@ def test_a_killed_process_is_named_and_leaves_nothing(
     assert set(Path("/dev/shm").iterdir()) <= before
 
 
-@pytest.mark.parametrize(("trainers", "batch"), [((2,), 100), ((2,), 25), ((2, 3), 50)])
+@pytest.mark.parametrize(("trainers", "batch"), [((2,), 25), ((2, 3), 100)])
 def test_experience_on_the_device_arrives_whole_and_once(
     trainers: tuple[int, ...], batch: int, tmp_path: Path
 ) -> None:
@@ -144,10 +142,7 @@ def test_experience_on_the_device_arrives_whole_and_once(
         require_all_once(job, 5000)
 
 
-@pytest.mark.parametrize("victim", [0, 2])
-def test_the_dead_are_named_where_experience_stays_on_the_device(
-    victim: int, tmp_path: Path
-) -> None:
+def test_the_dead_are_named_where_experience_stays_on_the_device(tmp_path: Path) -> None:
     topology = ChannelTopology(agents=(0, 1), trainers=(2,), gpu_of=(0, 0, 0))
     task = {"count": 10**7, "envs": 50, "batch": 50, "pause_chance": 0.5, "timeout_s": 30.0}
     with ChannelJob(
@@ -155,8 +150,7 @@ def test_the_dead_are_named_where_experience_stays_on_the_device(
     ).start() as job:
         job.wait_for("open")
         time.sleep(1.0)
-        killed_s = job.signal(victim, signal.SIGKILL)
-        for rank in {0, 1, 2} - {victim} if victim == 2 else {2}:
-            result = job.result(rank)
-            assert (result["error"], result["peers"]) == ("PeerLost", [victim])
-            assert result["ended_s"] - killed_s < TIMEOUT_S
+        killed_s = job.signal(0, signal.SIGKILL)
+        result = job.result(2)
+        assert (result["error"], result["peers"]) == ("PeerLost", [0])
+        assert result["ended_s"] - killed_s < TIMEOUT_S
