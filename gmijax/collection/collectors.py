@@ -275,34 +275,19 @@ def run_agent(share: Share, simulators: Sequence[Peer]) -> dict[str, Any]:
     """Answers the simulators until all have closed; the outcome for `result.json`."""
     share.link.begin_compiling()
     started_s = time.monotonic()
-    num_envs, obs_size = share.config.envs_per_gmi, share.env.spec.obs_size
-    bits = np.asarray(jax.random.key_data(jax.random.split(jax.random.key(0), num_envs)))
-    program: Any = (
-        jax.jit(partial(infer, share.policy))
-        .lower(share.policy.weights, np.zeros((num_envs, obs_size), np.float32), bits)
-        .compile()
-    )
+    agent = _Agent(share)
     compile_s = time.monotonic() - started_s
-    infer_s: deque[float] = deque(maxlen=share.config.latency_steps)
     share.link.beat("ready", 0)
     share.barrier()
     answered, left = 0, list(simulators)
     while left:
         for peer in tuple(left):
             try:
-                obs, keys = peer.recv().parts
+                obs, bits = peer.recv().parts
             except PipeClosed:
                 left.remove(peer)
                 continue
-            began_s = time.perf_counter()
-            action, log_prob = program(
-                share.policy.weights,
-                obs.view(np.float32).reshape(num_envs, obs_size),
-                keys.view(np.uint32).reshape(bits.shape),
-            )
-            answer = np.asarray(action), np.asarray(log_prob)
-            infer_s.append(time.perf_counter() - began_s)
-            peer.send(*answer)
+            peer.send(*agent.act(obs, bits))
             answered += 1
         share.link.beat("running", answered)
     for peer in simulators:
@@ -311,8 +296,34 @@ def run_agent(share: Share, simulators: Sequence[Peer]) -> dict[str, Any]:
         "status": "stopped" if share.link.stop_requested else "completed",
         "compile_s": compile_s,
         "answered": answered,
-        "stages_s": {"infer": list(infer_s)},
+        "stages_s": {"infer": list(agent.infer_s)},
     }
+
+
+class _Agent:
+    """The compiled agent of several simulators; `infer_s`: seconds of its latest answers."""
+
+    def __init__(self, share: Share) -> None:
+        num_envs, obs_size = share.config.envs_per_gmi, share.env.spec.obs_size
+        keys = jax.random.split(jax.random.key(0), num_envs)
+        obs, bits = np.zeros((num_envs, obs_size), np.float32), jax.random.key_data(keys)
+        program = jax.jit(partial(infer, share.policy))
+        self.infer_s: deque[float] = deque(maxlen=share.config.latency_steps)
+        self._weights = share.policy.weights
+        self._shapes = obs.shape, bits.shape
+        self._program: Any = program.lower(self._weights, obs, np.asarray(bits)).compile()
+
+    def act(self, obs: np.ndarray, bits: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Actions [N, A] and log densities [N], from the bytes of observations and keys."""
+        began_s = time.perf_counter()
+        action, log_prob = self._program(
+            self._weights,
+            obs.view(np.float32).reshape(self._shapes[0]),
+            bits.view(np.uint32).reshape(self._shapes[1]),
+        )
+        answer = np.asarray(action), np.asarray(log_prob)
+        self.infer_s.append(time.perf_counter() - began_s)
+        return answer
 
 
 def _stacked(steps: Sequence[Step]) -> Step:

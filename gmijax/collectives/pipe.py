@@ -228,10 +228,6 @@ class PipeReader:
         """Bytes committed by the writer and not yet released."""
         return self._written_position.item(0) - self._position
 
-    def occupancy(self) -> float:
-        """How full the pipe is, 0 to 1."""
-        return self.outstanding_bytes / self._block.capacity_bytes
-
     def why_lost(self, operation: str, step: int) -> GmijaxError | None:
         """Why the writer will never write again, None if it may."""
         return self._block.why_lost(self.peer, operation, step)

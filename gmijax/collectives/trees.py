@@ -11,7 +11,7 @@ import io
 import pickle
 import sys
 from collections.abc import Callable, Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -21,22 +21,9 @@ from gmijax.collectives.pipe import Bytes
 _ON_DEVICE = "on device"
 
 
-class FlatTree(NamedTuple):
-    """Nested data without its arrays, and the arrays.
-
-    Attributes:
-      skeleton: everything else, pickled.
-      arrays: in the order in which they were met; C-contiguous, of any shape. They may be views
-        of what was flattened.
-    """
-
-    skeleton: bytes
-    arrays: list[npt.NDArray[Any]]
-
-
 def flatten(
     tree: Any, *, scalars: bool = False, put: Callable[[Any], Any] = lambda _: None
-) -> FlatTree:
+) -> tuple[bytes, list[npt.NDArray[Any]]]:
     """Takes the arrays out of `tree`.
 
     Args:
@@ -45,13 +32,17 @@ def flatten(
       put: asked first for every object; what it returns, if not None, travels in its place, and
         `unflatten` hands it to its `get`.
 
+    Returns:
+      The skeleton, and the arrays in the order in which they were met; C-contiguous, perhaps
+      views of what was flattened.
+
     Raises:
       TypeError, AttributeError, pickle.PicklingError: something cannot be pickled, e.g. a lambda.
     """
     file = io.BytesIO()
     pickler = _Pickler(file, scalars, put)
     pickler.dump(tree)
-    return FlatTree(file.getvalue(), pickler.arrays)
+    return file.getvalue(), pickler.arrays
 
 
 def unflatten(

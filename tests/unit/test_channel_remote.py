@@ -23,7 +23,7 @@ from gmijax.collectives.channel.connection import ENV_KEY
 from gmijax.collectives.channel.remote import RemoteReader, RemoteWriter
 
 CAPACITY = 2**20
-FORGED = remote._HEADER.pack(remote.MAGIC, remote.DATA, 0, 0, 0), b""
+FORGED = remote._HEADER.pack(remote.MAGIC, remote.DATA, 0, 0), b""
 
 
 @pytest.fixture(autouse=True)
