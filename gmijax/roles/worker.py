@@ -39,7 +39,7 @@ def _run(link: ChildLink) -> dict[str, Any]:
     block = PipeBlock(required_fd(ENV_PIPES_FD), link.gmi)
     device = _device_buffers(plan, link.gmi) if config["device_messages"] else None
     messenger = Messenger(block, config["timeout_s"], device)
-    shipping.prepare_imports(config["script"])
+    sys.path[:] = config["script"]["sys_path"]  # As where the job was started.
     role, args = shipping.load(link.paths.role.read_bytes(), config["script"])
 
     def build(num_floats: int) -> Reducer:
