@@ -136,7 +136,10 @@ def test_experience_on_the_device_arrives_whole_and_once(
     task = {"count": 5000, "envs": 50, "batch": batch, "steps": 2, "pause_chance": 0.1}
     with ChannelJob(
         tmp_path, config(transport="device"), topology, fake_device=HERE, timeout_s=30.0, **task
-    ).start() as job:
+    ) as job:
+        job.start(*trainers)
+        job.wait_for("open")  # Agents that end before wait a few seconds only.
+        job.start(*topology.agents)
         for rank in job.ranks:
             assert job.result(rank)["error"] is None
         require_all_once(job, 5000)

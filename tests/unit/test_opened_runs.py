@@ -14,7 +14,7 @@ import pytest
 import gmijax
 from gmijax.cli import _build, command
 from gmijax.config import PlayConfig
-from gmijax.control import evaluation, restarts, serving
+from gmijax.control import evaluation, job, restarts, serving
 from gmijax.errors import ConfigError
 from gmijax.resume import CheckpointMeta
 from gmijax.rundir import META, RunPaths, read_json, write_json
@@ -61,7 +61,7 @@ def opened(kind: str, *overrides: str) -> Any:
         return evaluation.play(_build("play", PlayConfig, ("run.dir=theirs", *overrides)))
     if kind == "serve":
         return serving.serve(gmijax.compose("run.dir=theirs", *overrides, command="serve"))
-    return gmijax.train(gmijax.compose("run.resume=theirs", *overrides))
+    return job.train(gmijax.compose("run.resume=theirs", *overrides))
 
 
 KINDS = pytest.mark.parametrize("kind", ["play", "serve", "resume"])
