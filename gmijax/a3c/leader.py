@@ -14,7 +14,7 @@ import numpy.typing as npt
 
 from gmijax.a3c.board import JobRegisters, Orders, Report
 from gmijax.a3c.report import Progress, Reporter, Told
-from gmijax.a3c.staleness import BatchCounts
+from gmijax.a3c.tally import Tally
 from gmijax.checkpoint import finish_checkpoint, save_learner
 from gmijax.config import TrainConfig
 from gmijax.devices import describe_device
@@ -91,14 +91,14 @@ class Leader:
         self,
         env_steps: int,
         updates: int,
-        counts: BatchCounts,
+        tally: Tally,
         told: Told,
         state: LearnerState,
     ) -> None:
         """Takes one update into the metrics."""
         self._env_steps, self._updates = env_steps, updates
         reporter = self._require_reporter()
-        reporter.add(counts, told)
+        reporter.add(tally, told)
         if reporter.is_due:
             self._hear()
             reporter.write(self._progress(state))

@@ -18,7 +18,8 @@ from jax.flatten_util import ravel_pytree
 from gmijax.a3c.board import Report
 from gmijax.a3c.losses import LossMetrics
 from gmijax.a3c.rollout import stats_example
-from gmijax.a3c.staleness import MAX_COUNTED, BatchCounts, mean_and_p99
+from gmijax.a3c.staleness import MAX_COUNTED, mean_and_p99
+from gmijax.a3c.tally import Tally
 from gmijax.metrics import Episodes, EpisodeWindow, MetricsLog
 from gmijax.physics_health import OverflowCount, check_diverged, overflow_line
 from gmijax.sim.wrappers import BatchedEnv
@@ -113,11 +114,11 @@ class Reporter:
         """Whether the last line is old enough."""
         return time.monotonic() - self._last >= LINE_EVERY_S
 
-    def add(self, counts: BatchCounts, told: Told) -> None:
+    def add(self, tally: Tally, told: Told) -> None:
         """Takes in one update."""
-        self._updates.append((told, counts.receive_s))
-        self._stale += counts.stale
-        self._recent += counts.staleness
+        self._updates.append((told, tally.receive_s))
+        self._stale += tally.stale
+        self._recent += tally.staleness
 
     def staleness(self) -> dict[str, float] | None:
         """Mean and 99th percentile of versions behind over the whole run."""

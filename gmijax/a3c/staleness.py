@@ -2,31 +2,11 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
-
 import numpy as np
 import numpy.typing as npt
 
 MAX_COUNTED = 127
 """Anything older counts as this old in the figures."""
-
-
-class BatchCounts(NamedTuple):
-    """The batches of all trainers for one update.
-
-    Attributes:
-      stop: how many trainers have been asked to stop.
-      fresh: unrolls that are learnt from.
-      stale: unrolls that were too old, those of batches that were passed over too.
-      receive_s: seconds that the last of them waited for experience.
-      staleness: [MAX_COUNTED + 1] unrolls by versions behind.
-    """
-
-    stop: float
-    fresh: float
-    stale: float
-    receive_s: float
-    staleness: npt.NDArray[np.float32]
 
 
 def histogram_of(versions_behind: npt.NDArray[np.int64]) -> npt.NDArray[np.float32]:

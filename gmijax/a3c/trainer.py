@@ -21,7 +21,8 @@ from gmijax.a3c.learner import acting_weights, pack_weights
 from gmijax.a3c.losses import LossMetrics, Unrolls
 from gmijax.a3c.programs import FusedUpdate, SplitUpdate, Update
 from gmijax.a3c.report import Told
-from gmijax.a3c.staleness import MAX_COUNTED, BatchCounts, histogram_of
+from gmijax.a3c.staleness import MAX_COUNTED, histogram_of
+from gmijax.a3c.tally import Tally
 from gmijax.checkpoint import digest, restore_learner
 from gmijax.collectives.channel.batcher import Batch, Batcher
 from gmijax.collectives.interface import Reducer
@@ -147,24 +148,24 @@ class _Trainer:
         """Returns the status for the outcome."""
         while True:
             batch, waited_s = self._receive()
-            counts = self._gather_counts(batch, waited_s)
+            tally = self._meet(batch, waited_s)
             started = time.monotonic()
             unrolls = Unrolls(**batch.experience)  # pyright: ignore[reportArgumentType]
-            weight = jnp.asarray(self._weights_of(batch) * self._scale(counts))
+            weight = jnp.asarray(self._weights_of(batch) * self._scale(tally))
             state, updated = self._update(state, unrolls, weight)
             weights = np.asarray(updated.weights)
             losses, rates = jax.device_get((updated.losses, updated.rates))
             self._version += 1
             self._updates += 1
-            self._env_steps += round(counts.fresh) * self._algo.unroll_length
+            self._env_steps += round(tally.fresh) * self._algo.unroll_length
             self._check_finite(losses)
-            is_stopped = counts.stop > 0
+            is_stopped = tally.stop > 0
             is_last = is_stopped or self._env_steps >= self._config.num_timesteps
             if self._lead is not None:
                 self._lead.publish(weights, self._version)
                 update_s = time.monotonic() - started
                 told = Told(losses, rates, update_s)
-                self._lead.record(self._env_steps, self._updates, counts, told, state)
+                self._lead.record(self._env_steps, self._updates, tally, told, state)
                 if not is_last:
                     self._lead.checkpoint_now_and_then(state, self._env_steps, self._updates)
             self._link.beat("running", self._updates)
@@ -209,12 +210,12 @@ class _Trainer:
         fresh = self._version - batch.versions <= self._algo.max_staleness
         return fresh.astype(np.float32)
 
-    def _scale(self, counts: BatchCounts) -> np.float32:
+    def _scale(self, tally: Tally) -> np.float32:
         """What a fresh unroll weighs, so that it weighs as much as any other of the job."""
-        return np.float32(self._reducer.world_size * self._batch_size / counts.fresh)
+        return np.float32(self._reducer.world_size * self._batch_size / tally.fresh)
 
-    def _gather_counts(self, batch: Batch, waited_s: float) -> BatchCounts:
-        """Counts of this batch and those of the other trainers."""
+    def _meet(self, batch: Batch, waited_s: float) -> Tally:
+        """Tells the other trainers of this batch, and hears of theirs."""
         fresh = float(self._weights_of(batch).sum())
         behind = histogram_of(self._version - batch.versions) + self._passed_over
         self._passed_over[:] = 0.0
@@ -222,9 +223,7 @@ class _Trainer:
         mine = np.concatenate([head, behind])
         gathered = self._reducer.all_gather(mine.astype(np.float32))
         stop, fresh, stale, _ = (float(x) for x in gathered[:, :4].sum(axis=0))
-        return BatchCounts(
-            stop, fresh, stale, float(gathered[:, 3].max()), gathered[:, 4:].sum(axis=0)
-        )
+        return Tally(stop, fresh, stale, float(gathered[:, 3].max()), gathered[:, 4:].sum(axis=0))
 
     def _example(self) -> tuple[Unrolls, Any]:
         """Shapes of a batch and its weights."""

@@ -38,7 +38,7 @@ def test_unrolls_of_batches_that_are_passed_over_count_as_stale(tmp_path) -> Non
         ChildLink(0, RunPaths(tmp_path), None, None),
     )
     trainer._version = 10
-    first, second = (trainer._gather_counts(*trainer._receive()) for _ in range(2))
+    first, second = (trainer._meet(*trainer._receive()) for _ in range(2))
     assert (first.fresh, first.stale, first.staleness.sum()) == (3, 5, 8)
     assert first.staleness[[0, 1, 6, 7, 8, 9]].tolist() == [2, 1, 1, 1, 2, 1]
     assert (second.fresh, second.stale, second.staleness.sum()) == (4, 0, 4)
@@ -55,7 +55,7 @@ def test_fresh_unrolls_weigh_as_much_as_those_of_all_trainers(tmp_path) -> None:
     )
     trainer._version = 10
     batch, waited_s = trainer._receive()
-    mine = trainer._gather_counts(batch, waited_s)
+    mine = trainer._meet(batch, waited_s)
     assert (trainer._weights_of(batch) * trainer._scale(mine)).tolist() == [4, 0, 0, 0]
     # With another trainer that has four of four.
     trainer._reducer.world_size = 2
