@@ -84,7 +84,7 @@ class JobRegisters(NamedTuple):
 
 
 def open_job_registers(fd: int, num_weights: int, num_stats: int, num_agents: int) -> JobRegisters:
-    """Maps the registers of a job; `fd` is from `gmijax.collectives.board.create_registers`."""
+    """Maps the registers of a job; `fd` is from `create_registers`."""
     report_bytes = 8 * (len(Report._fields) - 1 + num_stats)
     sizes = [8 * len(Orders._fields), 4 * num_weights, *[report_bytes] * num_agents]
     orders, weights, *reports = open_registers(fd, sizes)

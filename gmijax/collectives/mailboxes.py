@@ -1,8 +1,8 @@
 """The two ends of the messages between two ranks: what is on its way out, what came in.
 
 Format of a message, native byte order: uint64 tag, uint64 number of parts, uint64 length of every
-part; then the parts, of which the first is a skeleton (`gmijax.collectives.trees`) and the others
-the bytes of its arrays. It travels as one or more messages of the pipe, *frames*, which are cut
+part; then the parts, of which the first is a skeleton (`trees.py`) and the others the bytes of its
+arrays. It travels as one or more messages of the pipe, *frames*, which are cut
 without regard to the parts.
 """
 
@@ -43,7 +43,7 @@ def frames_of(
       tree: nested data.
       tag: `DATA` or `COLLECTIVE`.
       frame_bytes: see above.
-      put: see `gmijax.collectives.trees.flatten`.
+      put: see `flatten`.
     """
     skeleton, arrays = flatten(tree, put=put)
     parts = [np.frombuffer(skeleton, np.uint8), *map(as_bytes, arrays)]
@@ -160,7 +160,7 @@ class Inbox:
       received: how many there were.
 
     Args:
-      get: see `gmijax.collectives.trees.unflatten`.
+      get: see `unflatten`.
     """
 
     def __init__(self, get: Callable[[Any], Any] | None = None) -> None:

@@ -65,7 +65,7 @@ class Messenger:
         """Sends `tree` to rank `dst` and does not wait for it; the caller may change it then.
 
         Args:
-          tree: nested data with arrays, see `gmijax.collectives.trees`.
+          tree: nested data with arrays, see `trees.py`.
           dst: a rank; sending to oneself is fine.
           tag: `DATA` or `COLLECTIVE`.
 

@@ -14,7 +14,7 @@ buffers needs no buffer of its own.
     name, values = reader.get(timeout_s=5.0).parts             # read-only views [bytes] uint8
     reader.release()
 
-What is in the ring: `gmijax.collectives.pipe_format`. What the checksums cost and what they find:
+What is in the ring: `pipe_format.py`. What the checksums cost and what they find:
 `docs/channels.md`. Which order of memory accesses this relies on:
 `docs/decisions/shared-memory-exchange.md`.
 """

@@ -12,7 +12,7 @@ Wire format (K ranks, capacity C rounded up to whole pages, native byte order):
 | next page + (src K + dst) (C + page) | the pipe from src to dst |
 
 A pipe is a page with two lines of 64 bytes, `END`, the writer's and the reader's, followed by a
-ring of C bytes. What is in the ring: `gmijax.collectives.pipe_format`.
+ring of C bytes. What is in the ring: `pipe_format.py`.
 """
 
 from __future__ import annotations
@@ -144,7 +144,7 @@ class PipeBlock:
         return total
 
     def pipe(self, src: int, dst: int) -> PipeMemory:
-        """The pipe from `src` to `dst`; for `gmijax.collectives.pipe`."""
+        """The pipe from `src` to `dst`; for `pipe.py`."""
         if self._mapping is None:
             raise CollectiveError(f"rank {self.rank}: pipe after close")
         if (src, dst) not in self._pipes:
