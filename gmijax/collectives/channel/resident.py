@@ -100,6 +100,7 @@ class ResidentPacker:
         self._new_memory = new_memory
         self._memory: DeviceMemory | None = None
         self._ticket = b""
+        self._head = np.zeros(0, np.uint8)
         self._num_envs = 0
         self._offsets: list[int] = []
         self._slot_bytes = 0
@@ -112,8 +113,7 @@ class ResidentPacker:
           CudaError: memory of the GPU cannot be shared.
         """
         memory = self._prepare(piece)
-        head = piece.spec.encode()
-        opened = self._migrator.try_open([head.size, TICKET_BYTES, NOTE.itemsize])
+        opened = self._migrator.try_open([self._head.size, TICKET_BYTES, NOTE.itemsize])
         if opened is None:
             return False
         writer, views = opened
@@ -122,7 +122,7 @@ class ResidentPacker:
         offset = place * self._slot_bytes
         for begin, channel in zip(self._offsets, piece.spec.channels, strict=True):
             memory.write(offset + begin, piece.channels[channel.name])  # pyright: ignore[reportArgumentType]
-        views[0][:] = head
+        views[0][:] = self._head
         views[1][:] = np.frombuffer(self._ticket, np.uint8)
         views[2].view(NOTE)[0] = (offset, piece.num_envs, piece.version)
         writer.commit()
@@ -152,7 +152,7 @@ class ResidentPacker:
                     f"{self._num_envs}"
                 )
             return self._memory
-        self._num_envs = piece.num_envs
+        self._head, self._num_envs = piece.spec.encode(), piece.num_envs
         self._offsets, self._slot_bytes = slot_offsets(piece.spec, piece.num_envs)
         num_slots = self._capacity_bytes // self._slot_bytes
         if num_slots < _LEAST_SLOTS:
