@@ -37,32 +37,6 @@ class Batch(NamedTuple):
     agents: npt.NDArray[np.int64]
 
 
-class Source:
-    """Transfers from one agent.
-
-    Args:
-      reader: the way from it.
-      decode: reads its messages.
-
-    Attributes:
-      reader: the same.
-      messages: that arrived.
-    """
-
-    def __init__(self, reader: ChannelReader, decode: Decode) -> None:
-        self.reader = reader
-        self.messages = 0
-        self._decode = decode
-
-    def try_next(self) -> Transfer | None:
-        """The next transfer, valid until the reader's `release`; PipeClosed if none can come."""
-        while (message := self.reader.try_get()) is not None:
-            self.messages += 1
-            if (transfer := self._decode(message)) is not None:
-                return transfer
-        return None
-
-
 class Batcher:
     """A trainer's end of the channels: makes batches of unrolls from several agents, in turn.
 
@@ -71,26 +45,26 @@ class Batcher:
 
     Args:
       rank: of this trainer.
-      sources: one for every agent.
+      sources: the ways from all agents, each with what reads its messages.
       new_stack: makes, from a spec and a size, what batches of several arrivals are stacked in.
       held: closed at the end.
 
     Attributes:
       batches: given out.
       unrolls: environments' unrolls that arrived.
+      transfers: messages that arrived.
       num_bytes: in all channels, as they travelled.
     """
 
     def __init__(
         self,
         rank: int,
-        sources: Sequence[Source],
+        sources: Sequence[tuple[ChannelReader, Decode]],
         new_stack: Callable[[Spec, int], Stack],
         held: contextlib.ExitStack,
     ) -> None:
-        self.batches = self.unrolls = self.num_bytes = 0
+        self.batches = self.unrolls = self.transfers = self.num_bytes = 0
         self._rank = rank
-        self._all_sources = tuple(sources)
         self._sources = list(sources)
         self._turn = 0
         self._new_stack = new_stack
@@ -98,11 +72,6 @@ class Batcher:
         self._current: _Arrival | None = None
         self._stack: Stack | None = None
         self._next_look_s = time.monotonic() + LIVENESS_PERIOD_S
-
-    @property
-    def transfers(self) -> int:
-        """Messages that arrived."""
-        return sum(source.messages for source in self._all_sources)
 
     def receive(self, batch_size: int, timeout_s: float) -> Batch:
         """Waits for the unrolls of `batch_size` environments.
@@ -148,7 +117,7 @@ class Batcher:
         self._release()
         arrival = wait_until(self._next, self._why_lost, deadline_s - time.monotonic())
         if arrival is None:
-            peers = tuple(source.reader.peer for source in self._sources)
+            peers = tuple(reader.peer for reader, _ in self._sources)
             raise CollectiveTimeout(self._rank, peers, "receive", self.batches, timeout_s)
         self._current = arrival
         return arrival
@@ -157,7 +126,7 @@ class Batcher:
         for place in range(len(self._sources)):
             source = self._sources[(self._turn + place) % len(self._sources)]
             try:
-                transfer = source.try_next()
+                transfer = self._read(*source)
             except PipeClosed:
                 if len(self._sources) == 1:
                     raise
@@ -167,13 +136,21 @@ class Batcher:
                 self._turn += place + 1
                 self.unrolls += transfer.num_envs
                 self.num_bytes += sum(transfer.spec.sizes(transfer.num_envs))
-                agents = np.full(transfer.num_envs, source.reader.peer, np.int64)
-                return _Arrival(transfer, agents, source.reader.release)
+                agents = np.full(transfer.num_envs, source[0].peer, np.int64)
+                return _Arrival(transfer, agents, source[0].release)
+        return None
+
+    def _read(self, reader: ChannelReader, decode: Decode) -> Transfer | None:
+        """The next transfer, valid until the reader's `release`; PipeClosed if none can come."""
+        while (message := reader.try_get()) is not None:
+            self.transfers += 1
+            if (transfer := decode(message)) is not None:
+                return transfer
         return None
 
     def _why_lost(self) -> GmijaxError | None:
         self._next_look_s = time.monotonic() + LIVENESS_PERIOD_S
-        found = (source.reader.why_lost("receive", self.batches) for source in self._sources)
+        found = (reader.why_lost("receive", self.batches) for reader, _ in self._sources)
         # One that has closed is no loss: `_next` finds out when its last message is read.
         lost = (error for error in found if not isinstance(error, PipeClosed))
         return next((error for error in lost if error is not None), None)

@@ -7,7 +7,7 @@ from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
 
-from gmijax.collectives.channel.batcher import Batcher, Source, Stack
+from gmijax.collectives.channel.batcher import Batcher, Stack
 from gmijax.collectives.channel.compressor import Compressor, TransferSize, read_transfer
 from gmijax.collectives.channel.dispenser import Dispenser
 from gmijax.collectives.channel.migrator import Migrator
@@ -159,10 +159,9 @@ def open_receiver(
         decoders = [ResidentDecoder(DEVICE_MEMORY) for _ in readers]
         for decoder in decoders:
             held.callback(decoder.close)  # Before its reader: then its agent may end.
-        sources = [Source(*both) for both in zip(readers, decoders, strict=True)]
-        return Batcher(rank, sources, DeviceStack, held)
+        return Batcher(rank, list(zip(readers, decoders, strict=True)), DeviceStack, held)
     is_uni = config.design == "uni"
-    sources = [Source(reader, UniDecoder() if is_uni else read_transfer) for reader in readers]
+    sources = [(reader, UniDecoder() if is_uni else read_transfer) for reader in readers]
     return Batcher(rank, sources, Stack, held)
 
 
