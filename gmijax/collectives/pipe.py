@@ -14,7 +14,7 @@ buffers needs no buffer of its own.
     name, values = reader.get(timeout_s=5.0).parts             # read-only views [bytes] uint8
     reader.release()
 
-What is in the ring: `pipe_format.py`. What the checksums cost and what they find:
+What is in the ring: `pipe_format.py`. What the checksum costs and what it finds:
 `docs/channels.md`. Which order of memory accesses this relies on:
 `docs/decisions/shared-memory-exchange.md`.
 """
@@ -174,7 +174,7 @@ class PipeWriter:
         return split_parts(self._ring, begin, sizes)
 
     def commit(self, *, tag: int = 0) -> None:
-        """Hands the reserved message to the reader, with `tag`, an int64 of the caller's."""
+        """Hands the reserved message to the reader, with `tag`, a uint64 of the caller's."""
         if self._reserved is None:
             raise CollectiveError(f"rank {self._block.rank}: commit without reserve")
         (begin, gap, length, sizes), self._reserved = self._reserved, None
