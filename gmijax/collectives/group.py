@@ -57,17 +57,8 @@ class GroupReducer:
     def reduce(self, members: Iterable[int], tree: Any, op: Operation) -> Any:
         """The mean or the sum of `tree` over `members`, bit-identical on all of them.
 
-        Collective: every member calls it with data of the same nesting, shapes and dtypes, and
-        all make their collective calls in the same order.
-
-        Args:
-          members: ranks, this one among them.
-          tree: nested data; its arrays and floats are reduced, all else is this rank's own.
-            Numbers of 16 bits and less are added up in float32.
-          op: `mean` or `sum`.
-
-        Returns:
-          The same nesting with arrays of numpy, which are the caller's own.
+        Collective, see `gmijax.Role.collective`. Arrays and floats are reduced, those of 16 bits
+        and less in float32; all else is this rank's own.
 
         Raises:
           ConfigError: an unknown operation, or a group without this rank.

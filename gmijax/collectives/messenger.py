@@ -62,12 +62,7 @@ class Messenger:
         self._inboxes: dict[int, Inbox] = {}
 
     def send(self, tree: Any, dst: int, *, tag: int = DATA) -> None:
-        """Sends `tree` to rank `dst` and does not wait for it; the caller may change it then.
-
-        Args:
-          tree: nested data with arrays, see `trees.py`.
-          dst: a rank; sending to oneself is fine.
-          tag: `DATA` or `COLLECTIVE`.
+        """Sends nested data to a rank and does not wait for it; the caller may change it then.
 
         Raises:
           ConfigError: no such rank.

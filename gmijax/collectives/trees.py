@@ -33,8 +33,7 @@ def flatten(
         `unflatten` hands it to its `get`.
 
     Returns:
-      The skeleton, and the arrays in the order in which they were met; C-contiguous, perhaps
-      views of what was flattened.
+      The skeleton and the arrays, C-contiguous, perhaps views of what was flattened.
 
     Raises:
       TypeError, AttributeError, pickle.PicklingError: something cannot be pickled, e.g. a lambda.
