@@ -17,8 +17,7 @@ if TYPE_CHECKING:
     from gmijax.control.searching import search
     from gmijax.control.serving import Served, serve
     from gmijax.roles.launch import launch
-    from gmijax.roles.manager import GMIManager
-    from gmijax.roles.planning import plan
+    from gmijax.roles.manager import GMIManager, plan
     from gmijax.roles.role import Role
     from gmijax.sim.registry import make_env, task_names
 
@@ -46,7 +45,7 @@ _HOMES = {
     "compose": "gmijax.cli",
     "launch": "gmijax.roles.launch",
     "make_env": "gmijax.sim.registry",
-    "plan": "gmijax.roles.planning",
+    "plan": "gmijax.roles.manager",
     "search": "gmijax.control.searching",
     "serve": "gmijax.control.serving",
     "task_names": "gmijax.sim.registry",

@@ -1,8 +1,8 @@
 """The role of a serving GMI: simulator and agent in one.
 
-It acts with the newest weights on the board, sends what came of it, and goes on. Trainers never
-make it wait, except for room where experience is not to be dropped. Newer weights are taken up
-within unrolls too: the less old what a policy learns from is, the fewer steps it takes.
+It acts with the newest weights that were published, sends what came of it, and goes on. Trainers
+never make it wait, except for room where experience is not to be dropped. Newer weights are taken
+up within unrolls too: the less old what a policy learns from is, the fewer steps it takes.
 """
 
 from __future__ import annotations
@@ -17,11 +17,11 @@ import numpy as np
 import numpy.typing as npt
 
 from gmijax.a3c.a3c import Unrolls
-from gmijax.a3c.board import Board, Orders, Report, pack_report, unpack_orders
+from gmijax.a3c.board import JobRegisters, Orders, Report
 from gmijax.a3c.outgoing import Outgoing
 from gmijax.a3c.rollout import UnrollPrograms, num_counts
 from gmijax.checkpoint import save_envs
-from gmijax.collectives.channel.interface import ExperienceSender
+from gmijax.collectives.channel.sender import Sender
 from gmijax.config import A3cConfig, TrainConfig
 from gmijax.devices import describe_device
 from gmijax.errors import CollectiveTimeout, PipeClosed
@@ -57,7 +57,7 @@ class Agent:
       env: its environments.
       index: place among the agents, 0 for the first.
       trainers: ids of the GMIs that train, for messages.
-      board: of the job.
+      registers: of the job.
       sender: of experience.
       link: to the controller.
     """
@@ -68,8 +68,8 @@ class Agent:
         env: BatchedEnv,
         index: int,
         trainers: tuple[int, ...],
-        board: Board,
-        sender: ExperienceSender,
+        registers: JobRegisters,
+        sender: Sender,
         link: ChildLink,
     ) -> None:
         assert isinstance(config.algo, A3cConfig)
@@ -78,8 +78,8 @@ class Agent:
         self._env = env
         self._index = index
         self._trainers = trainers
-        self._board = board
-        self._is_on_device = sender.on_device
+        self._registers = registers
+        self._sender = sender
         self._outgoing = Outgoing(config, config.algo, sender)
         self._link = link
         self._learner = make_learner(env.spec, config.algo)
@@ -103,7 +103,7 @@ class Agent:
         """
         self._link.beat("compiling", 0)
         started = time.monotonic()
-        # Of the right shapes; those to act with come from the board.
+        # Of the right shapes; those to act with are read later.
         start = jax.jit(partial(init_learner, self._learner, self._env.spec.obs_size))
         weights = acting_weights(self._learner, start(jax.random.key(0)))
         env_state = first_envs(self._env, self._config, self._index, gmi=self._link.gmi)
@@ -111,7 +111,7 @@ class Agent:
         num_steps = self._algo.unroll_length // num_pieces
         program = UnrollPrograms(
             *(self._env, self._learner.networks, num_steps, num_pieces, weights, env_state),
-            stays=self._is_on_device,
+            stays=self._sender.on_device,
         )
         compile_s = time.monotonic() - started
         self._link.beat("ready", 0)
@@ -164,29 +164,30 @@ class Agent:
     def _newest(
         self, weights: ActingWeights, unpack: Callable[[npt.NDArray[np.float32]], ActingWeights]
     ) -> ActingWeights:
-        """The newest weights on the board; `weights` if there are no newer ones."""
-        if (posted := self._board.weights.read(self._weights_seen)) is None:
+        """The newest weights published; `weights` if there are no newer ones."""
+        if (snapshot := self._registers.weights.read(self._weights_seen)) is None:
             return weights
-        self._weights_seen, self._version = posted.count, posted.tag
-        return unpack(posted.values.view(np.float32))
+        self._weights_seen, self._version = snapshot.count, snapshot.tag
+        return unpack(snapshot.values.view(np.float32))
 
     def _send(self, unroll: _Sent, env_state: BatchState) -> None:
         arrays: dict[str, Any] = unroll.experience._asdict()
-        if not self._is_on_device:
+        if not self._sender.on_device:
             arrays = {name: np.asarray(values) for name, values in arrays.items()}
         stats = np.asarray(unroll.stats, np.float64)
         started = time.monotonic()
         if not self._hand_over(arrays, unroll.version, env_state, started):
             return
-        counts = self._outgoing.counts()
+        sender, occupancy = self._sender, self._sender.occupancy()
+        self._outgoing.flush_if_starving()
         self._unrolls += 1
         self._report = self._report._replace(
             env_steps=self._report.env_steps + arrays["reward"].size,
-            bytes_sent=float(counts.num_bytes),
-            dropped=float(counts.dropped),
+            bytes_sent=float(sender.num_bytes),
+            dropped=float(sender.dropped),
             send_s=self._report.send_s + time.monotonic() - started,
             wait_s=self._outgoing.waited_s,
-            occupancy=counts.occupancy,
+            occupancy=occupancy,
             stats=self._report.stats + stats,
         )
         self._publish()
@@ -231,12 +232,12 @@ class Agent:
 
     def _look(self) -> bool:
         """Takes up new orders; returns whether there ever were any."""
-        if (posted := self._board.orders.read(self._orders_seen)) is not None:
-            self._orders_seen, self._orders = posted.count, unpack_orders(posted)
+        if (snapshot := self._registers.orders.read(self._orders_seen)) is not None:
+            self._orders_seen, self._orders = snapshot.count, Orders.unpack(snapshot.values)
         return self._orders_seen > 0
 
     def _publish(self) -> None:
-        self._board.reports[self._index].publish(pack_report(self._report))
+        self._registers.reports[self._index].publish(self._report.pack())
 
     def _late(self, what: str, limit_s: float) -> CollectiveTimeout:
         return CollectiveTimeout(self._link.gmi, self._trainers, what, self._unrolls, limit_s)

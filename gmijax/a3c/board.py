@@ -1,43 +1,19 @@
-"""What trainers and agents tell each other, as notes that nobody ever waits for.
+"""What trainers and agents tell each other, in registers that nobody ever waits for.
 
-Note 0: orders of the leading trainer. Note 1: the newest weights, with the policy's version as
-tag. Then one note per agent: what it has done so far. Experience travels elsewhere.
+Register 0: orders of the leading trainer. Register 1: the newest weights, with the policy's
+version as tag. Then one per agent: what it has done so far. Experience travels elsewhere.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import NamedTuple, Protocol
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
+from gmijax.collectives.board import Register, open_registers
+
 _NO_CHECKPOINT = -1
-
-
-class Posted(Protocol):
-    """The newest value of a note: how often it was published, a number, and its bytes."""
-
-    @property
-    def count(self) -> int: ...  # noqa: D102
-
-    @property
-    def tag(self) -> int: ...  # noqa: D102
-
-    @property
-    def values(self) -> npt.NDArray[np.uint8]: ...  # noqa: D102
-
-
-class Note(Protocol):
-    """One place on the board: one writer, any number of readers."""
-
-    def publish(self, values: npt.NDArray, tag: int = 0) -> None:
-        """Replaces the value; never waits."""
-        ...
-
-    def read(self, after: int = 0) -> Posted | None:
-        """The newest value if it was published after the `after`-th, else None; never waits."""
-        ...
 
 
 class Orders(NamedTuple):
@@ -51,6 +27,16 @@ class Orders(NamedTuple):
 
     checkpoint: int | None
     is_ending: bool
+
+    def pack(self) -> npt.NDArray[np.int64]:
+        """As numbers for the register."""
+        return np.array([_number(self.checkpoint), self.is_ending], np.int64)
+
+    @classmethod
+    def unpack(cls, values: npt.NDArray[np.uint8]) -> Orders:
+        """Inverts `pack`."""
+        checkpoint, is_ending = values.view(np.int64)
+        return cls(_optional(checkpoint), bool(is_ending))
 
 
 class Report(NamedTuple):
@@ -76,49 +62,33 @@ class Report(NamedTuple):
     occupancy: float
     stats: npt.NDArray[np.float64]
 
+    def pack(self) -> npt.NDArray[np.float64]:
+        """As numbers for the register; environment steps are exact up to 2^53."""
+        head = [_number(self.checkpoint), *self[1:-1]]
+        return np.concatenate([np.array(head, np.float64), self.stats])
 
-class Board(NamedTuple):
-    """All notes of a job, see the module."""
-
-    orders: Note
-    weights: Note
-    reports: Sequence[Note]
-
-
-def note_sizes(num_weights: int, num_stats: int, num_agents: int) -> list[int]:
-    """Bytes of every note, in the order of `board_of`."""
-    report = 8 * (len(Report._fields) - 1 + num_stats)
-    return [8 * len(Orders._fields), 4 * num_weights, *[report] * num_agents]
+    @classmethod
+    def unpack(cls, values: npt.NDArray[np.uint8]) -> Report:
+        """Inverts `pack`."""
+        numbers, head = values.view(np.float64), len(cls._fields) - 1
+        first, *rest = (float(x) for x in numbers[:head])
+        return cls(_optional(first), *rest, stats=numbers[head:])
 
 
-def board_of(notes: Sequence[Note]) -> Board:
-    """The board from its notes."""
-    return Board(notes[0], notes[1], tuple(notes[2:]))
+class JobRegisters(NamedTuple):
+    """All registers of a job, see the module."""
+
+    orders: Register
+    weights: Register
+    reports: tuple[Register, ...]
 
 
-def pack_orders(orders: Orders) -> npt.NDArray[np.int64]:
-    """As numbers for the note."""
-    return np.array([_number(orders.checkpoint), orders.is_ending], np.int64)
-
-
-def unpack_orders(posted: Posted) -> Orders:
-    """Inverts `pack_orders`."""
-    checkpoint, is_ending = posted.values.view(np.int64)
-    return Orders(_optional(checkpoint), bool(is_ending))
-
-
-def pack_report(report: Report) -> npt.NDArray[np.float64]:
-    """As numbers for the note; environment steps are exact up to 2^53."""
-    head = [_number(report.checkpoint), *report[1:-1]]
-    return np.concatenate([np.array(head, np.float64), report.stats])
-
-
-def unpack_report(posted: Posted) -> Report:
-    """Inverts `pack_report`."""
-    numbers = posted.values.view(np.float64)
-    head = len(Report._fields) - 1
-    first, *rest = (float(x) for x in numbers[:head])
-    return Report(_optional(first), *rest, stats=numbers[head:])
+def open_job_registers(fd: int, num_weights: int, num_stats: int, num_agents: int) -> JobRegisters:
+    """Maps the registers of a job; `fd` is from `create_registers`."""
+    report_bytes = 8 * (len(Report._fields) - 1 + num_stats)
+    sizes = [8 * len(Orders._fields), 4 * num_weights, *[report_bytes] * num_agents]
+    orders, weights, *reports = open_registers(fd, sizes)
+    return JobRegisters(orders, weights, tuple(reports))
 
 
 def _number(checkpoint: int | None) -> int:

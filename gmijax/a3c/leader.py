@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 import numpy.typing as npt
 
-from gmijax.a3c.board import Board, Orders, Report, pack_orders, unpack_report
+from gmijax.a3c.board import JobRegisters, Orders, Report
 from gmijax.a3c.report import BatchCounts, Reporter, UpdateFigures
 from gmijax.checkpoint import checkpoint_meta, finish_checkpoint, require_finite, save_learner
 from gmijax.config import TrainConfig
@@ -32,7 +32,7 @@ class Leader:
     Args:
       config: of the run.
       env: one of the environments, for its names.
-      board: of the job.
+      registers: of the job.
       link: to the controller.
       agents: ids of the GMIs that act, in the order of their reports.
       env_steps: learnt from so far.
@@ -42,13 +42,13 @@ class Leader:
         self,
         config: TrainConfig,
         env: BatchedEnv,
-        board: Board,
+        registers: JobRegisters,
         link: ChildLink,
         agents: tuple[int, ...],
         env_steps: int,
     ) -> None:
         self._config = config
-        self._board = board
+        self._registers = registers
         self._link = link
         self._agents = agents
         self._seen = [0] * len(agents)
@@ -69,7 +69,7 @@ class Leader:
 
     def publish(self, weights: npt.NDArray[np.float32], version: int) -> None:
         """Gives agents new weights [W]; never waits for them."""
-        self._board.weights.publish(weights, tag=version)
+        self._registers.weights.publish(weights, tag=version)
 
     def record(
         self,
@@ -151,12 +151,13 @@ class Leader:
         )
 
     def _order(self, checkpoint: int | None, *, is_ending: bool) -> None:
-        self._board.orders.publish(pack_orders(Orders(checkpoint, is_ending)))
+        self._registers.orders.publish(Orders(checkpoint, is_ending).pack())
 
     def _hear(self) -> None:
-        for index, note in enumerate(self._board.reports):
-            if (posted := note.read(self._seen[index])) is not None:
-                self._seen[index], self._reports[index] = posted.count, unpack_report(posted)
+        for index, register in enumerate(self._registers.reports):
+            if (snapshot := register.read(self._seen[index])) is not None:
+                self._seen[index] = snapshot.count
+                self._reports[index] = Report.unpack(snapshot.values)
 
     def _missing(self) -> list[int]:
         """Agents that have not added to the pending checkpoint."""

@@ -15,12 +15,12 @@ import numpy as np
 import numpy.typing as npt
 
 from gmijax.a3c.a3c import Unrolls
-from gmijax.a3c.board import Board
+from gmijax.a3c.board import JobRegisters
 from gmijax.a3c.leader import Leader
 from gmijax.a3c.report import MAX_COUNTED, BatchCounts, UpdateFigures, histogram_of
 from gmijax.a3c.update import make_update
 from gmijax.checkpoint import require_equal
-from gmijax.collectives.channel.interface import Batch, ExperienceReceiver
+from gmijax.collectives.channel.batcher import Batch, Batcher
 from gmijax.collectives.interface import Reducer
 from gmijax.config import A3cConfig, TrainConfig
 from gmijax.errors import CollectiveTimeout
@@ -41,7 +41,7 @@ class Trainer:
       config: of the run.
       env: one of the environments, for its sizes; it is not stepped.
       agents: ids of the GMIs that act.
-      board: of the job.
+      registers: of the job.
       receiver: of experience.
       reducer: among the trainers.
       link: to the controller.
@@ -52,8 +52,8 @@ class Trainer:
         config: TrainConfig,
         env: BatchedEnv,
         agents: tuple[int, ...],
-        board: Board,
-        receiver: ExperienceReceiver,
+        registers: JobRegisters,
+        receiver: Batcher,
         reducer: Reducer,
         link: ChildLink,
     ) -> None:
@@ -62,7 +62,7 @@ class Trainer:
         self._algo = config.algo
         self._env = env
         self._agents = agents
-        self._board = board
+        self._registers = registers
         self._receiver = receiver
         self._reducer = reducer
         self._link = link
@@ -105,8 +105,8 @@ class Trainer:
         self._require_equal(state)  # And so all trainers have compiled.
         if not leads:
             return {"status": self._loop(state, None), "updates": self._updates}
-        config, env, board, agents = self._config, self._env, self._board, self._agents
-        leader = Leader(config, env, board, self._link, agents, self._env_steps)
+        config, env, agents = self._config, self._env, self._agents
+        leader = Leader(config, env, self._registers, self._link, agents, self._env_steps)
         try:
             leader.start(first, self._version)
             status = self._loop(state, leader)
@@ -147,7 +147,7 @@ class Trainer:
         if leader is not None:
             leader.end()
         self._require_equal(state)
-        # Agents that wait for room may go: the order to end is on the board by now.
+        # Agents that wait for room may go: the order to end is published by now.
         self._receiver.close()
         if leader is not None:
             leader.finish(state)

@@ -1,37 +1,36 @@
-"""A board of notes in shared memory: one writer each, any number of readers, nobody ever waits.
+"""Registers in shared memory: one writer each, any number of readers, nobody ever waits.
 
-A note holds the newest value only. Its writer has two places and writes them in turn, so that a
-reader that copies one is disturbed only if the writer begins to publish for the second time
+A register holds the newest value only. Its writer has two places and writes them in turn, so that
+a reader that copies one is disturbed only if the writer begins to publish for the second time
 meanwhile; a counter of what was begun tells it so, and it looks again, or leaves it for later (a
 seqlock with two places). Made for weights: trainers publish them when they have new ones, agents
 look between two unrolls. On the order of memory accesses: `gmijax.collectives.waits.Fence`.
 
-    fd = create_board()                              # the controller
-    notes = attach_board(fd, sizes_bytes=[64, 4096])   # every process, with the same sizes
-    notes[1].publish(array, tag=7)                   # the one writer of note 1
-    notes[1].read(after=0)                           # anybody: Posted, or None if nothing newer
+    fd = create_registers()                             # the controller
+    registers = open_registers(fd, [64, 4096])          # every process, with the same sizes
+    registers[1].publish(array, tag=7)                  # the one writer of register 1
+    registers[1].read(after=0)                          # anybody: None if nothing is newer
 
-Wire format (native byte order): a line of 64 bytes (`LINE`) for every note, then for every note
-two places of its size, each on pages of its own.
+Wire format (native byte order): a line of 64 bytes (`LINE`) for every register, then for every
+register two places of its size, each on pages of its own.
 """
 
 from __future__ import annotations
 
-import mmap
-import os
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
+from gmijax.collectives.shared_memory import create_file, map_file, whole_pages
 from gmijax.collectives.waits import Fence
 from gmijax.errors import CollectiveError, ConfigError
 
 LINE = np.dtype(
     [
-        ("size", np.uint64),  # 0 until somebody attaches
-        ("count", np.uint64),  # how often the note was published
+        ("size", np.uint64),  # 0 until somebody has come
+        ("count", np.uint64),  # how often the register was published
         ("begun", np.uint64),  # how often that was begun: `count`, or one more
         ("tag", np.uint64, (2,)),
         ("length", np.uint64, (2,)),
@@ -42,11 +41,11 @@ LINE = np.dtype(
 _LOOKS = 3
 
 
-class Posted(NamedTuple):
-    """The newest value of a note.
+class Snapshot(NamedTuple):
+    """The newest value of a register.
 
     Attributes:
-      count: how often the note had been published; give it to the next `read`.
+      count: how often the register had been published; give it to the next `read`.
       tag: the writer's number for the value.
       values: a copy of its bytes, [length] uint8.
     """
@@ -56,8 +55,8 @@ class Posted(NamedTuple):
     values: npt.NDArray[np.uint8]
 
 
-class Note:
-    """One note; see the module."""
+class Register:
+    """One register; see the module."""
 
     def __init__(self, line: npt.NDArray[np.void], places: npt.NDArray[np.uint8]) -> None:
         self._line = line
@@ -68,12 +67,12 @@ class Note:
         """Replaces the value; one process only may do so. Costs a copy.
 
         Raises:
-          CollectiveError: more bytes than the note has room for.
+          CollectiveError: more bytes than the register has room for.
         """
         data = np.ascontiguousarray(values).reshape(-1).view(np.uint8)
         if data.size > self._places.shape[1]:
             raise CollectiveError(
-                f"board: {data.size} bytes for a note of {self._places.shape[1]}"
+                f"{data.size} bytes for a register of {self._places.shape[1]} bytes"
             )
         count = int(self._line["count"][0]) + 1
         place = count % 2
@@ -85,7 +84,7 @@ class Note:
         self._fence()
         self._line["count"][0] = count
 
-    def read(self, after: int = 0) -> Posted | None:
+    def read(self, after: int = 0) -> Snapshot | None:
         """The newest value if it was published after the `after`-th, else None; never waits.
 
         None, too, if the writer was faster than this reader three times over: the next call
@@ -103,56 +102,41 @@ class Note:
             self._fence()
             # The next publication goes into the other place.
             if int(self._line["begun"][0]) - count < 2:
-                return Posted(count, tag, values)
+                return Snapshot(count, tag, values)
         return None
 
 
-def create_board() -> int:
-    """Makes an empty board and returns its descriptor, for the controller."""
-    fd = os.memfd_create("gmijax-board", os.MFD_CLOEXEC)
-    # Another user who may look into /proc/<pid>/fd must not read or change anything.
-    os.fchmod(fd, 0o600)
-    return fd
+def create_registers() -> int:
+    """Makes the memory of the registers and returns its descriptor, for the controller."""
+    return create_file("registers")
 
 
-def attach_board(fd: int, sizes_bytes: Sequence[int]) -> list[Note]:
-    """Maps the board; the caller keeps `fd` and may close it at once.
+def open_registers(fd: int, sizes_bytes: Sequence[int]) -> list[Register]:
+    """Maps the registers; the caller keeps `fd` and may close it at once.
 
     Args:
-      fd: descriptor from `create_board`.
-      sizes_bytes: room of every note, the same for all processes.
+      fd: descriptor from `create_registers`.
+      sizes_bytes: room of every register, the same for all processes.
 
     Raises:
-      ConfigError: no notes, or a size that makes no sense.
-      CollectiveError: no memory, or processes that attach with different sizes.
+      ConfigError: no registers, or a size that makes no sense.
+      CollectiveError: no memory, or processes that come with different sizes.
     """
     if not sizes_bytes or min(sizes_bytes) < 1:
-        raise ConfigError(f"sizes_bytes={list(sizes_bytes)}: every note needs at least 1 byte")
-    rooms = [_round_up(size, mmap.PAGESIZE) for size in sizes_bytes]
-    first = _round_up(len(rooms) * LINE.itemsize, mmap.PAGESIZE)
-    total = first + 2 * sum(rooms)
-    try:
-        # Unlike ftruncate this never shrinks the file under a process that has mapped more.
-        os.posix_fallocate(fd, 0, total)
-        mapping = mmap.mmap(fd, total, flags=mmap.MAP_SHARED)
-    except OSError as error:
-        raise CollectiveError(
-            f"board: cannot map {total / 2**20:.1f} MiB of shared memory ({error.strerror})"
-        ) from None
-    notes, offset = [], first
-    for index, room in enumerate(rooms):
-        line = np.frombuffer(mapping, LINE, 1, index * LINE.itemsize)
-        if int(line["size"][0]) not in (0, sizes_bytes[index]):
+        raise ConfigError(f"sizes_bytes={list(sizes_bytes)}: every register needs at least 1 byte")
+    rooms = [whole_pages(size) for size in sizes_bytes]
+    offset = whole_pages(len(rooms) * LINE.itemsize)
+    mapping = map_file(fd, offset + 2 * sum(rooms), "registers")
+    lines = np.frombuffer(mapping, LINE, len(rooms))
+    registers = []
+    for index, (size, room) in enumerate(zip(sizes_bytes, rooms, strict=True)):
+        line = lines[index : index + 1]
+        if int(line["size"][0]) not in (0, size):
             raise CollectiveError(
-                f"board: note {index} has {line['size'][0]} bytes for another process, "
-                f"{sizes_bytes[index]} here"
+                f"register {index} has {line['size'][0]} bytes for another process, {size} here"
             )
-        line["size"][0] = sizes_bytes[index]
+        line["size"][0] = size
         places = np.frombuffer(mapping, np.uint8, 2 * room, offset).reshape(2, room)
-        notes.append(Note(line, places[:, : sizes_bytes[index]]))
+        registers.append(Register(line, places[:, :size]))
         offset += 2 * room
-    return notes
-
-
-def _round_up(value: int, multiple: int) -> int:
-    return -(-value // multiple) * multiple
+    return registers

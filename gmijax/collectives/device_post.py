@@ -27,7 +27,7 @@ _ALIGNMENT = 256
 _MAX_VIEWS = 256
 
 
-class Stowed(NamedTuple):
+class BufferedArray(NamedTuple):
     """Where an array lies; it travels in its place.
 
     Attributes:
@@ -51,7 +51,7 @@ class _Held(NamedTuple):
     frames: int | None
 
 
-class DevicePost:
+class DeviceBuffers:
     """One rank's arrays to its neighbours on the GPU, and theirs to it.
 
     Args:
@@ -78,9 +78,9 @@ class DevicePost:
         self._ticket = b""
         self._is_usable = True
         self._theirs: dict[bytes, DeviceMemory] = {}
-        self._views: dict[Stowed, jax.Array] = {}
+        self._views: dict[BufferedArray, jax.Array] = {}
 
-    def stow(self, array: Any, dst: int, released_frames: int) -> Stowed | None:
+    def put(self, array: Any, dst: int, released_frames: int) -> BufferedArray | None:
         """Puts an array where rank `dst` finds it; None: it must travel through the host.
 
         Args:
@@ -102,10 +102,10 @@ class DevicePost:
         offset = self._parts[dst] + begin
         assert self._own is not None
         self._own.write(offset, array)
-        return Stowed(self._ticket, offset, array.shape, array.dtype.name)
+        return BufferedArray(self._ticket, offset, array.shape, array.dtype.name)
 
-    def sent(self, dst: int, frames: int) -> None:
-        """What was stowed for `dst` is in use until it has released `frames` frames in all."""
+    def mark_sent(self, dst: int, frames: int) -> None:
+        """What was put for `dst` is in use until it has released `frames` frames in all."""
         if dst in self._held:
             self._held[dst] = [
                 one._replace(frames=frames) if one.frames is None else one
@@ -113,26 +113,26 @@ class DevicePost:
             ]
 
     def holds(self, dst: int, released_frames: int) -> bool:
-        """Whether `dst` has yet to fetch something that was sent; see `stow`."""
+        """Whether `dst` has yet to get something that was sent; see `put`."""
         held = self._held.get(dst, ())
         return any(one.frames is not None and one.frames > released_frames for one in held)
 
-    def fetch(self, stowed: Stowed) -> jax.Array:
+    def get(self, buffered: BufferedArray) -> jax.Array:
         """A copy of an array; on return its place may be used again.
 
         Raises:
           CudaError: the sender's memory cannot be read here.
         """
-        if stowed not in self._views:
+        if buffered not in self._views:
             if len(self._views) >= _MAX_VIEWS:
                 self._views.clear()
-            memory = self._theirs.get(stowed.ticket)
+            memory = self._theirs.get(buffered.ticket)
             if memory is None:
-                memory = self._theirs[stowed.ticket] = self._new_memory()
-                memory.open(stowed.ticket)
-            dtype = np.dtype(stowed.dtype)
-            self._views[stowed] = memory.view(stowed.offset, stowed.shape, dtype)
-        return jnp.copy(self._views[stowed]).block_until_ready()
+                memory = self._theirs[buffered.ticket] = self._new_memory()
+                memory.open(buffered.ticket)
+            dtype = np.dtype(buffered.dtype)
+            self._views[buffered] = memory.view(buffered.offset, buffered.shape, dtype)
+        return jnp.copy(self._views[buffered]).block_until_ready()
 
     def _is_made(self) -> bool:
         """Whether there is a block; it is made when it is first wanted."""

@@ -1,8 +1,8 @@
 """The two ends of the messages between two ranks: what is on its way out, what came in.
 
 Format of a message, native byte order: uint64 tag, uint64 number of parts, uint64 length of every
-part; then the parts, of which the first is a skeleton (`gmijax.collectives.trees`) and the others
-the bytes of its arrays. It travels as one or more messages of the pipe, *frames*, which are cut
+part; then the parts, of which the first is a skeleton (`trees.py`) and the others the bytes of its
+arrays. It travels as one or more messages of the pipe, *frames*, which are cut
 without regard to the parts.
 """
 
@@ -11,7 +11,7 @@ from __future__ import annotations
 import struct
 import threading
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any, Final, TypeAlias
 
 import numpy as np
@@ -31,12 +31,11 @@ MAX_PARTS: Final = 256
 
 Frame: TypeAlias = list[Bytes]
 
-_WORD = struct.Struct("=Q")
 _HEAD = struct.Struct("=QQ")
 
 
 def frames_of(
-    tree: Any, tag: int, frame_bytes: int, stow: Callable[[Any], Any] = lambda _: None
+    tree: Any, tag: int, frame_bytes: int, put: Callable[[Any], Any] = lambda _: None
 ) -> list[Frame]:
     """The message that carries `tree`, as frames of at most `frame_bytes`; views of its arrays.
 
@@ -44,13 +43,24 @@ def frames_of(
       tree: nested data.
       tag: `DATA` or `COLLECTIVE`.
       frame_bytes: see above.
-      stow: what stays where it is, see `gmijax.collectives.trees.flatten`.
+      put: see `flatten`.
     """
-    skeleton, arrays = flatten(tree, stow=stow)
+    skeleton, arrays = flatten(tree, put=put)
     parts = [np.frombuffer(skeleton, np.uint8), *map(as_bytes, arrays)]
-    lengths = [part.size for part in parts]
-    head = struct.pack(f"=QQ{len(parts)}Q", tag, len(parts), *lengths)
-    return _cut([np.frombuffer(head, np.uint8), *parts], frame_bytes)
+    head = np.array([tag, len(parts), *(part.size for part in parts)], np.uint64)
+    frames: list[Frame] = [[]]
+    room = frame_bytes
+    for part in (head.view(np.uint8), *parts):
+        start = 0
+        while start < part.size:
+            if not room or len(frames[-1]) == MAX_PARTS:
+                frames.append([])
+                room = frame_bytes
+            piece = part[start : start + room]
+            frames[-1].append(piece)
+            start += piece.size
+            room -= piece.size
+    return frames
 
 
 class Outbox:
@@ -71,6 +81,11 @@ class Outbox:
         self._error: CollectiveError | None = None
         self._thread: threading.Thread | None = None
 
+    @property
+    def released_frames(self) -> int:
+        """How many frames the receiver has released."""
+        return self._writer.released_messages
+
     def post(self, frames: Sequence[Frame], timeout_s: float) -> None:
         """Puts the frames into the pipe, or copies of them behind those that wait.
 
@@ -83,21 +98,18 @@ class Outbox:
             # A frame that the thread is busy with is still among those that wait.
             while left and not self._frames and self._writer.try_put(left[0]):
                 left.popleft()
-            if not left:
-                self.frames += len(frames)
-                return
-            if not self._changed.wait_for(self._has_room, timeout_s):
-                raise CollectiveTimeout(
-                    self._rank, (self._writer.dst,), "send", self._posts, timeout_s
-                )
+            if left and not self._changed.wait_for(self._has_room, timeout_s):
+                peers = (self._writer.peer,)
+                raise CollectiveTimeout(self._rank, peers, "send", self._posts, timeout_s)
             self._raise_error()
             self.frames += len(frames)
             for frame in left:
                 copied = np.concatenate(frame)
                 self._frames.append([copied])
                 self._waiting_bytes += copied.size
-            self._start_thread()
-            self._changed.notify_all()
+            if left:
+                self._start_thread()
+                self._changed.notify_all()
 
     def wait_until_empty(self, timeout_s: float) -> bool:
         """Whether all frames got into the pipe; raises what the thread met."""
@@ -117,7 +129,7 @@ class Outbox:
         if self._thread is None:
             # A daemon: it must not keep a GMI alive that has failed.
             self._thread = threading.Thread(
-                target=self._pass_on, name=f"send-{self._writer.dst}", daemon=True
+                target=self._pass_on, name=f"send-{self._writer.peer}", daemon=True
             )
             self._thread.start()
 
@@ -148,67 +160,45 @@ class Inbox:
       received: how many there were.
 
     Args:
-      fetch: for what stayed where it was, see `gmijax.collectives.trees.unflatten`.
+      get: see `unflatten`.
     """
 
-    def __init__(self, fetch: Callable[[Any], Any] | None = None) -> None:
-        self._fetch = fetch
+    def __init__(self, get: Callable[[Any], Any] | None = None) -> None:
+        self._get = get
         self.ready: dict[int, deque[Any]] = {DATA: deque(), COLLECTIVE: deque()}
         self.received = 0
-        self._start()
+        self._begin()
 
     def feed(self, frame: Sequence[Bytes]) -> None:
         """Takes the parts of the next frame; copies them."""
         for part in frame:
-            self._take(part)
-
-    def _take(self, data: Bytes) -> None:
-        while data.size:
-            target = self._targets[0][self._filled :]
-            count = min(target.size, data.size)
-            target[:count] = data[:count]
-            data = data[count:]
-            self._filled += count
-            while self._targets and self._filled == self._targets[0].size:
-                self._full.append(self._targets.popleft())
-                self._filled = 0
+            data = part
+            while data.size:
+                count = min(self._room.size, data.size)
+                self._room[:count] = data[:count]
+                self._room, data = self._room[count:], data[count:]
                 self._advance()
 
-    def _start(self) -> None:
-        self._targets = deque([np.empty(_HEAD.size, np.uint8)])
-        self._full: list[Bytes] = []
-        self._filled = 0
+    def _begin(self) -> None:
+        self._rooms = self._fill_messages()
+        self._room = next(self._rooms)
 
     def _advance(self) -> None:
-        """Makes room for what the last full part announces, or completes the message."""
-        if self._targets:
-            return
-        if len(self._full) == 1:
-            _, num_parts = _HEAD.unpack(self._full[0].data)
-            self._targets.append(np.empty(num_parts * _WORD.size, np.uint8))
-        elif len(self._full) == 2:
-            lengths = self._full[1].view(np.uint64).tolist()
-            self._targets.extend(np.empty(length, np.uint8) for length in lengths)
-        else:
-            tag, _ = _HEAD.unpack(self._full[0].data)
-            skeleton, *buffers = self._full[2:]
-            self._start()
+        """Goes on to the next room that is not full."""
+        try:
+            while not self._room.size:
+                self._room = next(self._rooms)
+        except BaseException:  # Of a message that cannot be unpickled: the next one may be.
+            self._begin()
+            raise
+
+    def _fill_messages(self) -> Iterator[Bytes]:
+        """Gives out memory for what comes next, and takes it for filled when asked again."""
+        while True:
+            yield (head := np.empty(_HEAD.size, np.uint8))
+            tag, num_parts = _HEAD.unpack(head.data)
+            yield (sizes := np.empty(8 * num_parts, np.uint8))
+            parts = [np.empty(size, np.uint8) for size in sizes.view(np.uint64).tolist()]
+            yield from parts
             self.received += 1
-            self.ready[tag].append(unflatten(skeleton.data, buffers, self._fetch))
-
-
-def _cut(parts: Sequence[Bytes], frame_bytes: int) -> list[Frame]:
-    """The bytes of `parts` as frames of at most `frame_bytes`, each a list of views."""
-    frames: list[Frame] = [[]]
-    room = frame_bytes
-    for part in parts:
-        start = 0
-        while start < part.size:
-            if not room or len(frames[-1]) == MAX_PARTS:
-                frames.append([])
-                room = frame_bytes
-            piece = part[start : start + room]
-            frames[-1].append(piece)
-            start += piece.size
-            room -= piece.size
-    return frames
+            self.ready[tag].append(unflatten(parts[0].data, parts[1:], self._get))

@@ -9,8 +9,8 @@ from __future__ import annotations
 
 import contextlib
 import time
-from collections.abc import Callable, Collection
-from typing import Any, Final, Protocol
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
@@ -18,35 +18,13 @@ from gmijax.collectives.mailboxes import DATA, Inbox, Outbox, frames_of
 from gmijax.collectives.pipe import PipeReader, PipeWriter
 from gmijax.collectives.pipe_block import PipeBlock
 from gmijax.collectives.waits import wait_until
-from gmijax.errors import CollectiveTimeout, ConfigError, PeerLost, PipeClosed
+from gmijax.errors import CollectiveTimeout, ConfigError, PipeClosed
+
+if TYPE_CHECKING:
+    from gmijax.collectives.device_post import DeviceBuffers
 
 MIN_CAPACITY_BYTES: Final = 1 << 18
 """Least capacity of the pipes, so that a frame fits."""
-
-
-class Post(Protocol):
-    """What keeps arrays where sender and receiver both reach them; see `DevicePost`."""
-
-    @property
-    def peers(self) -> Collection[int]:
-        """Ranks that reach them."""
-        ...
-
-    def stow(self, array: Any, dst: int, released_frames: int) -> Any:
-        """What travels to rank `dst` in an array's place, or None."""
-        ...
-
-    def sent(self, dst: int, frames: int) -> None:
-        """What was stowed for `dst` is in use until it has released so many frames."""
-        ...
-
-    def holds(self, dst: int, released_frames: int) -> bool:
-        """Whether something waits for `dst`, which has released so many frames."""
-        ...
-
-    def fetch(self, stowed: Any) -> Any:
-        """The array again."""
-        ...
 
 
 class Messenger:
@@ -58,14 +36,16 @@ class Messenger:
     Args:
       block: this process's view of the pipes, of at least `MIN_CAPACITY_BYTES` each.
       timeout_s: longest wait for a message, unless `recv` says else.
-      device: what keeps arrays on the GPU that ranks share; None: they go through the host.
+      device: keeps arrays on the GPU that ranks share; None: they go through the host.
 
     Attributes:
       rank: this rank.
       world_size: K, number of ranks.
     """
 
-    def __init__(self, block: PipeBlock, timeout_s: float, device: Post | None = None) -> None:
+    def __init__(
+        self, block: PipeBlock, timeout_s: float, device: DeviceBuffers | None = None
+    ) -> None:
         if block.capacity_bytes < MIN_CAPACITY_BYTES:
             raise ConfigError(
                 f"capacity_bytes={block.capacity_bytes}: messages need {MIN_CAPACITY_BYTES}"
@@ -82,12 +62,7 @@ class Messenger:
         self._inboxes: dict[int, Inbox] = {}
 
     def send(self, tree: Any, dst: int, *, tag: int = DATA) -> None:
-        """Sends `tree` to rank `dst` and does not wait for it; the caller may change it then.
-
-        Args:
-          tree: nested data with arrays, see `gmijax.collectives.trees`.
-          dst: a rank; sending to oneself is fine.
-          tag: `DATA` or `COLLECTIVE`.
+        """Sends nested data to a rank and does not wait for it; the caller may change it then.
 
         Raises:
           ConfigError: no such rank.
@@ -102,10 +77,10 @@ class Messenger:
         if dst not in self._outboxes:
             self._outboxes[dst] = Outbox(PipeWriter(self._block, dst), self.rank)
         outbox = self._outboxes[dst]
-        frames = frames_of(tree, tag, self._frame_bytes, self._stow(dst))
+        frames = frames_of(tree, tag, self._frame_bytes, self._put(dst, outbox))
         outbox.post(frames, self._timeout_s)
         if self._device is not None:
-            self._device.sent(dst, outbox.frames)
+            self._device.mark_sent(dst, outbox.frames)
 
     def recv(self, src: int, *, tag: int = DATA, timeout_s: float | None = None) -> Any:
         """Returns the next message with this tag from rank `src`; its arrays are the caller's.
@@ -119,28 +94,22 @@ class Messenger:
         """
         self._check(src, "src")
         inbox = self._inbox(src)
+        # Nobody else sends to oneself.
         allowed_s = self._timeout_s if timeout_s is None else timeout_s
-        deadline_s = time.monotonic() + allowed_s
-        while not inbox.ready[tag]:
-            if src == self.rank:  # Nobody else would send it.
-                raise CollectiveTimeout(self.rank, (src,), "recv", inbox.received, 0.0)
-            reader = self._reader(src)
-            try:
-                message = reader.get(max(0.0, deadline_s - time.monotonic()))
-            except CollectiveTimeout:
-                step = inbox.received
-                raise CollectiveTimeout(self.rank, (src,), "recv", step, allowed_s) from None
-            except PeerLost:
-                raise PeerLost(self.rank, src, "recv", inbox.received) from None
-            inbox.feed(message.parts)
-            # What stayed on the GPU is copied by now: its place is free with the frame.
-            reader.release()
+        allowed_s = 0.0 if src == self.rank else allowed_s
+        arrived = wait_until(
+            lambda: self._read(src, tag) or None,
+            lambda: self._block.why_lost(src, "recv", inbox.received),
+            allowed_s,
+        )
+        if arrived is None:
+            raise CollectiveTimeout(self.rank, (src,), "recv", inbox.received, allowed_s)
         return inbox.ready[tag].popleft()
 
     def has_message(self, src: int, *, tag: int = DATA) -> bool:
         """Whether `recv` would return at once."""
         with contextlib.suppress(PipeClosed):
-            self._take(src)
+            self._read(src)
         return bool(self._inbox(src).ready[tag])
 
     def flush(self, timeout_s: float | None = None) -> None:
@@ -168,46 +137,48 @@ class Messenger:
         It goes with this process, which must not end before. What others have sent is taken
         meanwhile, so that two that end do not wait for each other.
         """
-        return wait_until(self._is_settled, lambda: None, timeout_s) is not None
+        return wait_until(lambda: self._is_settled() or None, lambda: None, timeout_s) is not None
 
-    def _stow(self, dst: int) -> Callable[[Any], Any]:
+    def _put(self, dst: int, outbox: Outbox) -> Callable[[Any], Any]:
         device = self._device
         if device is None:
             return lambda _: None
-        released = self._released(dst)
-        return lambda value: device.stow(value, dst, released)
+        released = outbox.released_frames
+        return lambda value: device.put(value, dst, released)
 
-    def _is_settled(self) -> bool | None:
-        device = self._device
-        if device is None:
+    def _is_settled(self) -> bool:
+        if self._device is None:
             return True
-        for peer in device.peers:
+        for peer in self._device.peers:
             with contextlib.suppress(PipeClosed):
-                self._take(peer)
-        waiting = (peer for peer in device.peers if device.holds(peer, self._released(peer)))
-        is_lost = (self._block.why_lost((peer,), "settle", 0) is not None for peer in waiting)
-        return all(is_lost) or None
+                self._read(peer)
+        waiting = (
+            peer
+            for peer, outbox in self._outboxes.items()
+            if self._device.holds(peer, outbox.released_frames)
+        )
+        return all(self._block.why_lost(peer, "settle", 0) is not None for peer in waiting)
 
-    def _take(self, src: int) -> None:
-        """Takes all frames that rank `src` has sent by now."""
-        reader = self._reader(src)
-        while (message := reader.try_get()) is not None:
-            self._inbox(src).feed(message.parts)
+    def _read(self, src: int, tag: int | None = None) -> bool:
+        """Takes what rank `src` has sent, up to a message with `tag`; whether there is one."""
+        ready = self._inbox(src).ready
+        if src == self.rank:
+            return tag is not None and bool(ready[tag])
+        if src not in self._readers:
+            self._readers[src] = PipeReader(self._block, src)
+        reader = self._readers[src]
+        while tag is None or not ready[tag]:
+            if (frame := reader.try_get()) is None:
+                return False
+            self._inbox(src).feed(frame.parts)
+            # What stayed on the GPU is copied by now: its place is free with the frame.
             reader.release()
-
-    def _released(self, dst: int) -> int:
-        """How many frames rank `dst` has released so far."""
-        return self._block.read(self.rank, dst).messages
+        return True
 
     def _check(self, rank: int, what: str) -> None:
         if not (isinstance(rank, int | np.integer) and 0 <= rank < self.world_size):
             raise ConfigError(f"{what}={rank!r}: allowed are GMIs 0 to {self.world_size - 1}")
 
-    def _reader(self, src: int) -> PipeReader:
-        if src not in self._readers:
-            self._readers[src] = PipeReader(self._block, src)
-        return self._readers[src]
-
     def _inbox(self, src: int) -> Inbox:
-        fetch = None if self._device is None else self._device.fetch
-        return self._inboxes.setdefault(src, Inbox(fetch))
+        get = None if self._device is None else self._device.get
+        return self._inboxes.setdefault(src, Inbox(get))

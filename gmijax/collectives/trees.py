@@ -11,53 +11,43 @@ import io
 import pickle
 import sys
 from collections.abc import Callable, Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from gmijax.collectives.pipe import Bytes
 
-_STOWED = "stowed"
-
-
-class FlatTree(NamedTuple):
-    """Nested data without its arrays, and the arrays.
-
-    Attributes:
-      skeleton: everything else, pickled.
-      arrays: in the order in which they were met; C-contiguous, of any shape. They may be views
-        of what was flattened.
-    """
-
-    skeleton: bytes
-    arrays: list[npt.NDArray[Any]]
+_ON_DEVICE = "on device"
 
 
 def flatten(
-    tree: Any, *, scalars: bool = False, stow: Callable[[Any], Any] = lambda _: None
-) -> FlatTree:
+    tree: Any, *, scalars: bool = False, put: Callable[[Any], Any] = lambda _: None
+) -> tuple[bytes, list[npt.NDArray[Any]]]:
     """Takes the arrays out of `tree`.
 
     Args:
-      tree: nested data with arrays of numpy or jax; those of jax are fetched to host memory.
+      tree: nested data with arrays of numpy or jax; those of jax are copied to host memory.
       scalars: count Python floats and scalars of numpy among the arrays.
-      stow: asked first for every object; what it gives, if not None, travels in its place, and
-        `unflatten` hands it to its `fetch`.
+      put: asked first for every object; what it returns, if not None, travels in its place, and
+        `unflatten` hands it to its `get`.
+
+    Returns:
+      The skeleton and the arrays, C-contiguous, perhaps views of what was flattened.
 
     Raises:
       TypeError, AttributeError, pickle.PicklingError: something cannot be pickled, e.g. a lambda.
     """
     file = io.BytesIO()
-    pickler = _Pickler(file, scalars, stow)
+    pickler = _Pickler(file, scalars, put)
     pickler.dump(tree)
-    return FlatTree(file.getvalue(), pickler.arrays)
+    return file.getvalue(), pickler.arrays
 
 
 def unflatten(
     skeleton: bytes | memoryview,
     buffers: Sequence[Bytes],
-    fetch: Callable[[Any], Any] | None = None,
+    get: Callable[[Any], Any] | None = None,
 ) -> Any:
     """The tree with a skeleton, and these bytes in place of its arrays.
 
@@ -65,9 +55,9 @@ def unflatten(
       skeleton: of `flatten`, in a process of the same job: unpickling runs code.
       buffers: one per array, [number of its bytes] uint8; the arrays of the tree are views of
         them. Arrays of jax come back as arrays of numpy.
-      fetch: gives back what `stow` had been asked for.
+      get: inverts `put`.
     """
-    return _Unpickler(skeleton, buffers, fetch).load()
+    return _Unpickler(skeleton, buffers, get).load()
 
 
 def as_bytes(array: npt.NDArray[Any]) -> Bytes:
@@ -90,15 +80,15 @@ def on_host(value: Any) -> npt.NDArray[Any] | None:
 
 
 class _Pickler(pickle.Pickler):
-    def __init__(self, file: io.BytesIO, scalars: bool, stow: Callable[[Any], Any]) -> None:
+    def __init__(self, file: io.BytesIO, scalars: bool, put: Callable[[Any], Any]) -> None:
         super().__init__(file, protocol=5)
         self.arrays: list[npt.NDArray[Any]] = []
-        self._stow = stow
+        self._put = put
         self._scalars = (float, np.generic) if scalars else ()
 
     def persistent_id(self, obj: Any) -> Any:
-        if (stowed := self._stow(obj)) is not None:
-            return _STOWED, stowed
+        if (on_device := self._put(obj)) is not None:
+            return _ON_DEVICE, on_device
         array, is_scalar = on_host(obj), False
         if array is None and isinstance(obj, self._scalars):
             array, is_scalar = np.asarray(obj), True
@@ -114,17 +104,17 @@ class _Unpickler(pickle.Unpickler):
         self,
         skeleton: bytes | memoryview,
         buffers: Sequence[Bytes],
-        fetch: Callable[[Any], Any] | None,
+        get: Callable[[Any], Any] | None,
     ) -> None:
         super().__init__(io.BytesIO(skeleton))
         self._buffers = buffers
-        self._fetch = fetch
+        self._get = get
 
     def persistent_load(self, pid: Any) -> Any:
-        if pid[0] == _STOWED:
-            if self._fetch is None:
+        if pid[0] == _ON_DEVICE:
+            if self._get is None:
                 raise pickle.UnpicklingError("an array that stayed on the sender's GPU")
-            return self._fetch(pid[1])
+            return self._get(pid[1])
         index, dtype, shape, is_scalar = pid
         array = self._buffers[index].view(dtype).reshape(shape)
         return array[()] if is_scalar else array

@@ -13,8 +13,8 @@ from functools import partial
 from types import MappingProxyType
 from typing import Final
 
-from gmijax.collectives.board import create_board
-from gmijax.collectives.channel.build import Places, create_channels, require_channels
+from gmijax.collectives.board import create_registers
+from gmijax.collectives.channel.build import ChannelTopology, create_channels, require_memory
 from gmijax.collectives.pipe_block import create_pipes
 from gmijax.config import ServeConfig, TrainConfig
 from gmijax.errors import ConfigError
@@ -29,7 +29,7 @@ from gmijax.partition.templates import AGENT, TRAINER, Group, group_of
 ROLLOUT_PIPE_BYTES: Final = 16 << 20
 """Of a pipe between a trainer and who makes its rollouts; larger messages go in pieces."""
 
-ENV_BOARD_FD: Final = "GMIJAX_BOARD_FD"
+ENV_REGISTERS_FD: Final = "GMIJAX_REGISTERS_FD"
 ENV_CHANNELS_FD: Final = "GMIJAX_CHANNELS_FD"
 
 FLOAT_CHANNELS: Final = ("state", "action", "reward", "log_prob", "cut_value", "bootstrap")
@@ -67,7 +67,7 @@ def training_kind(config: TrainConfig) -> JobKind:
     """The kind of a training job."""
     if config.is_asynchronous:
         module = "gmijax.workers.async_worker"
-        return JobKind(module, compile_once=False, shared=partial(_board_and_channels, config))
+        return JobKind(module, compile_once=False, shared=partial(_registers_and_channels, config))
     if config.plan.template == "tdg_ex":
         module = "gmijax.workers.worker"
         return JobKind(module, compile_once=False, shared=partial(pipes, ROLLOUT_PIPE_BYTES))
@@ -88,9 +88,9 @@ def pipes(num_bytes: int, plan: Plan) -> SharedBlocks:
     return {ENV_PIPES_FD: partial(create_pipes, plan.layout.num_gmis, num_bytes)}
 
 
-def _board_and_channels(config: TrainConfig, plan: Plan) -> SharedBlocks:
-    channels = partial(create_channels, config.channel, places_of(plan))
-    return {ENV_BOARD_FD: create_board, ENV_CHANNELS_FD: channels}
+def _registers_and_channels(config: TrainConfig, plan: Plan) -> SharedBlocks:
+    channels = partial(create_channels, config.channel, topology_of(plan))
+    return {ENV_REGISTERS_FD: create_registers, ENV_CHANNELS_FD: channels}
 
 
 def training_plan(config: TrainConfig, machine: Machine, num_envs: int | None = None) -> Plan:
@@ -116,13 +116,13 @@ def training_plan(config: TrainConfig, machine: Machine, num_envs: int | None = 
         template="decoupled",
         trainers=placed.trainers,
     )
-    places, channel = places_of(plan), config.channel
-    _require_experience_for_all(places)
+    topology, channel = topology_of(plan), config.channel
+    _require_experience_for_all(topology)
     why_not = why_not_device(plan)
     if channel.transport == "device" and why_not is not None:
         raise ConfigError(f"channel.transport=device: {why_not}; use memory")
     # How large an unroll is shows only when the task is loaded: the GMIs check that.
-    require_channels(channel, places, unroll_bytes=0)
+    require_memory(channel, topology)
     could_stay = why_not is None and channel.why_not_device() is None
     advice = (_ADVICE,) if could_stay and channel.transport == "memory" else ()
     return dataclasses.replace(plan, reasons=(placed.reason, *plan.reasons, *advice))
@@ -145,13 +145,13 @@ def _require_asynchronous(config: TrainConfig) -> None:
         )
 
 
-def _require_experience_for_all(places: Places) -> None:
+def _require_experience_for_all(topology: ChannelTopology) -> None:
     """Refuses a placement in which a trainer gets nothing: all trainers learn in step.
 
     An agent with trainers on its own GPU sends to these only.
     """
-    serving = {places.gpu_of[gmi] for gmi in places.agents}
-    training = {places.gpu_of[gmi] for gmi in places.trainers}
+    serving = {topology.gpu_of[gmi] for gmi in topology.agents}
+    training = {topology.gpu_of[gmi] for gmi in topology.trainers}
     if serving <= training and (idle := sorted(training - serving)):
         raise ConfigError(
             f"plan.training_gpus: trainers on GPU {idle[0]} of the job would get no experience, "
@@ -164,12 +164,12 @@ def why_not_device(plan: Plan) -> str | None:
     """None if experience can stay in memory of the GPUs, else the reason."""
     if reason := why_not_intra("ipc", plan.backend):
         return reason
-    places = places_of(plan)
-    training = {places.gpu_of[gmi] for gmi in places.trainers}
-    far = [gmi for gmi in places.agents if places.gpu_of[gmi] not in training]
+    topology = topology_of(plan)
+    training = {topology.gpu_of[gmi] for gmi in topology.trainers}
+    far = [gmi for gmi in topology.agents if topology.gpu_of[gmi] not in training]
     if not far:
         return None
-    return f"agent {far[0]} is on GPU {places.gpu_of[far[0]]} of the job, where nobody trains"
+    return f"agent {far[0]} is on GPU {topology.gpu_of[far[0]]} of the job, where nobody trains"
 
 
 def groups_of(plan: Plan) -> tuple[Group, Group]:
@@ -181,9 +181,9 @@ def groups_of(plan: Plan) -> tuple[Group, Group]:
     return agents, trainers
 
 
-def places_of(plan: Plan) -> Places:
+def topology_of(plan: Plan) -> ChannelTopology:
     """Who sends experience, who receives it, and on which GPU of the job each is."""
     agents, trainers = groups_of(plan)
     layout = plan.layout
     gpu_of = tuple(layout.gpu_of(gmi) for gmi in layout.gmis)
-    return Places(agents=agents.gmis, trainers=trainers.gmis, gpu_of=gpu_of)
+    return ChannelTopology(agents=agents.gmis, trainers=trainers.gmis, gpu_of=gpu_of)

@@ -1,7 +1,7 @@
 """Main of a GMI in asynchronous training: `python -m gmijax.workers.async_worker`.
 
 Started by the supervisor and by nobody else. Builds the role that the plan gives to this GMI,
-agent or trainer, plugs in the board, the channels and the reducer among the trainers, runs it,
+agent or trainer, plugs in the registers, the channels and the reducer among the trainers, runs it,
 and writes `result.json` or `error.json`.
 """
 
@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 from gmijax.config import A3cConfig, TrainConfig
 from gmijax.errors import ConfigError
 from gmijax.partition.child import ChildLink, required_fd, run_gmi
-from gmijax.supervise.kinds import ENV_BOARD_FD, ENV_CHANNELS_FD, groups_of, places_of
+from gmijax.supervise.kinds import ENV_CHANNELS_FD, ENV_REGISTERS_FD, groups_of, topology_of
 from gmijax.workers.trainers import (
     environments_of,
     exchange_used,
@@ -24,7 +24,7 @@ from gmijax.workers.trainers import (
 )
 
 if TYPE_CHECKING:
-    from gmijax.a3c.board import Board
+    from gmijax.a3c.board import JobRegisters
     from gmijax.sim.wrappers import BatchedEnv
 
 
@@ -51,30 +51,29 @@ def _run(link: ChildLink) -> dict[str, Any]:
     check_share(plan, link.gmi)
     place = 0 if trains else agents.gmis.index(link.gmi)  # A trainer steps no environment.
     env = environments_of(config, place)
-    board = _board(config, env, len(agents.gmis))
-    channels = config.channel, places_of(plan), link.gmi, required_fd(ENV_CHANNELS_FD)
+    registers = _registers(config, env, len(agents.gmis))
+    channels = config.channel, topology_of(plan), link.gmi, required_fd(ENV_CHANNELS_FD)
     with ExitStack() as held:
         if not trains:
             sender = open_sender(*channels)
             held.callback(sender.close)
-            return Agent(config, env, place, trainers.gmis, board, sender, link).run()
+            return Agent(config, env, place, trainers.gmis, registers, sender, link).run()
         receiver = open_receiver(*channels)
         held.callback(receiver.close)
         num_floats = exchange_size(env.spec, config.algo, A3cLosses)
         reducer = trainers_reducer(config, plan, trainers, link, num_floats, world)
         held.callback(reducer.close)
-        trainer = Trainer(config, env, agents.gmis, board, receiver, reducer, link)
+        trainer = Trainer(config, env, agents.gmis, registers, receiver, reducer, link)
         return trainer.run() | exchange_used(plan, reducer)
 
 
-def _board(config: TrainConfig, env: BatchedEnv, num_agents: int) -> Board:
-    from gmijax.a3c.board import board_of, note_sizes
+def _registers(config: TrainConfig, env: BatchedEnv, num_agents: int) -> JobRegisters:
+    from gmijax.a3c.board import open_job_registers
     from gmijax.a3c.rollout import num_counts
-    from gmijax.collectives.board import attach_board
     from gmijax.learner import num_weights
 
-    sizes = note_sizes(num_weights(env.spec, config.algo), num_counts(env), num_agents)
-    return board_of(attach_board(required_fd(ENV_BOARD_FD), sizes))
+    fd = required_fd(ENV_REGISTERS_FD)
+    return open_job_registers(fd, num_weights(env.spec, config.algo), num_counts(env), num_agents)
 
 
 if __name__ == "__main__":

@@ -15,7 +15,7 @@ from gmijax.config import PpoConfig, TrainConfig
 from gmijax.partition.child import ENV_PIPES_FD, ChildLink, required_fd, run_gmi
 from gmijax.partition.plan import Plan
 from gmijax.partition.templates import AGENT, TRAINER, has_role
-from gmijax.supervise.kinds import ROLLOUT_PIPE_BYTES, groups_of
+from gmijax.supervise.kinds import groups_of
 from gmijax.workers.trainers import (
     environments_of,
     exchange_used,
@@ -55,8 +55,7 @@ def _run(link: ChildLink) -> dict[str, Any]:
     workers = None
     with ExitStack() as held:
         if plan.template == "tdg_ex":
-            fd, num_gmis = required_fd(ENV_PIPES_FD), plan.layout.num_gmis
-            block = PipeBlock.attach(fd, link.gmi, num_gmis, ROLLOUT_PIPE_BYTES)
+            block = PipeBlock(required_fd(ENV_PIPES_FD), link.gmi)
             held.callback(block.close)
             if not trains:
                 return _serve(config, plan, place, env, block, link)

@@ -132,16 +132,15 @@ def test_a_job_goes_on_from_its_checkpoint(two_and_two: Path) -> None:
 
 
 @pytest.mark.timeout(120)
-@pytest.mark.parametrize("strategy", ["flat", "har"])
-def test_trainers_on_several_gpus_reduce_in_rings(strategy: str, tmp_path: Path) -> None:
+def test_trainers_on_several_gpus_reduce_in_rings(tmp_path: Path) -> None:
     cwd = tmp_path
     done = train(
         *SMALL, "plan.serving_gpus=[0,1]", "plan.training_gpus=[0,1]", "run.dir=run",
-        f"reduce.strategy={strategy}", f"num_timesteps={20 * 2 * UPDATE}", cwd=cwd,
+        "reduce.strategy=har", f"num_timesteps={20 * 2 * UPDATE}", cwd=cwd,
     )  # fmt: skip
     assert done.returncode == 0, done.stderr
     plan = _read(cwd / "run" / "summary.json")["plan"]
-    assert (plan["layout"], plan["strategy"]) == ([[0, 2], [1, 3]], strategy)
+    assert (plan["layout"], plan["strategy"]) == ([[0, 2], [1, 3]], "har")
 
 
 @pytest.mark.timeout(120)

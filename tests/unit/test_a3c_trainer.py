@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from toy_env import point_mass
 
-from gmijax.a3c.board import Board
+from gmijax.a3c.board import JobRegisters
 from gmijax.a3c.trainer import Trainer
 from gmijax.cli import compose
-from gmijax.collectives.channel.interface import Batch
+from gmijax.collectives.channel.batcher import Batch
 from gmijax.collectives.solo import SoloReducer
 from gmijax.partition.child import ChildLink
 from gmijax.rundir import RunPaths
@@ -33,7 +33,7 @@ def _trainer(tmp_path, *versions: list[int]) -> Trainer:
         compose("env=ball_balance", "algo=a3c", "num_envs=4", "algo.max_staleness=3"),
         point_mass(),
         (1,),
-        Board(None, None, ()),
+        JobRegisters(None, None, ()),
         _Arrivals(*versions),
         SoloReducer(1),
         ChildLink(0, RunPaths(tmp_path), None, None),

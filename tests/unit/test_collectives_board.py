@@ -1,40 +1,39 @@
-"""Notes in shared memory that nobody waits for."""
+"""Registers in shared memory that nobody waits for."""
 
 from __future__ import annotations
 
 import os
 import subprocess
 import sys
-import threading
 from collections.abc import Callable
 from functools import partial
 
 import numpy as np
 import pytest
 
-from gmijax.collectives.board import Posted, attach_board, create_board
+from gmijax.collectives.board import Snapshot, create_registers, open_registers
 from gmijax.collectives.waits import Fence
 from gmijax.errors import CollectiveError, ConfigError
 
 
 @pytest.fixture
 def fd():
-    made = create_board()
+    made = create_registers()
     yield made
     os.close(made)
 
 
 def test_a_reader_gets_the_newest_value_once(fd) -> None:
-    writer, reader = attach_board(fd, [8, 64])[1], attach_board(fd, [8, 64])[1]
+    writer, reader = open_registers(fd, [8, 64])[1], open_registers(fd, [8, 64])[1]
     assert reader.read() is None
     for version in range(1, 4):
         writer.publish(np.full(3, version, np.float32), tag=10 * version)
-    posted = reader.read()
-    assert posted is not None
-    assert (posted.count, posted.tag) == (3, 30)
-    np.testing.assert_array_equal(posted.values.view(np.float32), [3, 3, 3])
-    assert reader.read(posted.count) is None
-    assert attach_board(fd, [8, 64])[0].read() is None  # Notes are apart.
+    snapshot = reader.read()
+    assert snapshot is not None
+    assert (snapshot.count, snapshot.tag) == (3, 30)
+    np.testing.assert_array_equal(snapshot.values.view(np.float32), [3, 3, 3])
+    assert reader.read(snapshot.count) is None
+    assert open_registers(fd, [8, 64])[0].read() is None  # Registers are apart.
 
 
 class Interrupted(Fence):
@@ -62,7 +61,7 @@ def die() -> None:
 
 
 def test_a_value_that_is_torn_is_not_given_out(fd) -> None:
-    writer, reader = attach_board(fd, [16])[0], attach_board(fd, [16])[0]
+    writer, reader = open_registers(fd, [16])[0], open_registers(fd, [16])[0]
     publish = [partial(writer.publish, np.full(4, k, np.int32), tag=k) for k in range(4)]
     for once in publish[:2]:
         once()
@@ -75,15 +74,15 @@ def test_a_value_that_is_torn_is_not_given_out(fd) -> None:
             publish[3]()
 
     reader._fence = Interrupted(nothing, die_in_the_fourth)
-    posted = reader.read()
-    assert posted is not None
-    assert (posted.count, posted.tag, posted.values.view(np.int32)[0]) == (3, 2, 2)
+    snapshot = reader.read()
+    assert snapshot is not None
+    assert (snapshot.count, snapshot.tag, snapshot.values.view(np.int32)[0]) == (3, 2, 2)
 
 
 def test_a_value_is_whole_while_the_next_one_is_written(fd) -> None:
-    writer, reader = attach_board(fd, [16])[0], attach_board(fd, [16])[0]
+    writer, reader = open_registers(fd, [16])[0], open_registers(fd, [16])[0]
     writer.publish(np.full(4, 1, np.int32), tag=1)
-    looks: list[Posted | None] = []
+    looks: list[Snapshot | None] = []
     for number in (2, 3):
         # Both before and after the values of the next one are there.
         writer._fence = Interrupted(*[lambda: looks.append(reader.read())] * 2)
@@ -93,7 +92,7 @@ def test_a_value_is_whole_while_the_next_one_is_written(fd) -> None:
 
 
 def test_a_reader_gives_up_on_a_writer_that_is_always_faster(fd) -> None:
-    writer, reader = attach_board(fd, [16])[0], attach_board(fd, [16])[0]
+    writer, reader = open_registers(fd, [16])[0], open_registers(fd, [16])[0]
     writer.publish(np.zeros(4, np.int32))
 
     def publish_twice() -> None:
@@ -102,27 +101,27 @@ def test_a_reader_gives_up_on_a_writer_that_is_always_faster(fd) -> None:
 
     reader._fence = Interrupted(*[nothing, publish_twice] * 3)
     assert reader.read() is None
-    posted = reader.read()
-    assert posted is not None
-    assert posted.count == 7
+    snapshot = reader.read()
+    assert snapshot is not None
+    assert snapshot.count == 7
 
 
 WRITER = """
 import sys
 import numpy as np
-from gmijax.collectives.board import attach_board
+from gmijax.collectives.board import open_registers
 
-note, number = attach_board(int(sys.argv[1]), [int(sys.argv[2])])[0], 0
+register, number = open_registers(int(sys.argv[1]), [int(sys.argv[2])])[0], 0
 print("ready", flush=True)
 while True:
     number += 1
-    note.publish(np.full(int(sys.argv[2]) // 4 - number % 100, number, np.int32), tag=number)
+    register.publish(np.full(int(sys.argv[2]) // 4 - number % 100, number, np.int32), tag=number)
 """
 
 
 def test_readers_of_another_process_see_whole_values_only(fd) -> None:
     size = 400_000
-    reader = attach_board(fd, [size])[0]
+    reader = open_registers(fd, [size])[0]
     seen: list[int] = []
     command = [sys.executable, "-c", WRITER, str(fd), str(size)]
     with subprocess.Popen(command, pass_fds=[fd], stdout=subprocess.PIPE) as writer:
@@ -131,62 +130,37 @@ def test_readers_of_another_process_see_whole_values_only(fd) -> None:
             assert writer.stdout.readline() == b"ready\n"
             while len(seen) < 200:
                 assert writer.poll() is None
-                if (posted := reader.read(seen[-1] if seen else 0)) is not None:
-                    values = posted.values.view(np.int32)
-                    assert (values == posted.tag).all()
-                    assert (posted.tag, values.size) == (
-                        posted.count,
-                        size // 4 - posted.tag % 100,
+                if (snapshot := reader.read(seen[-1] if seen else 0)) is not None:
+                    values = snapshot.values.view(np.int32)
+                    assert (values == snapshot.tag).all()
+                    assert (snapshot.tag, values.size) == (
+                        snapshot.count,
+                        size // 4 - snapshot.tag % 100,
                     )
-                    seen.append(posted.count)
+                    seen.append(snapshot.count)
         finally:
             writer.kill()
     assert seen == sorted(set(seen))
 
 
-def test_readers_of_a_fast_writer_see_whole_values_only(fd) -> None:
-    size = 20_000
-    writer, reader = attach_board(fd, [4 * size])[0], attach_board(fd, [4 * size])[0]
-    stop = threading.Event()
-
-    def publish() -> None:
-        number = 0
-        while not stop.is_set():
-            number += 1
-            writer.publish(np.full(size, number, np.int32), tag=number)
-
-    thread = threading.Thread(target=publish)
-    thread.start()
-    seen: list[int] = []
-    count = 0
-    try:
-        while len(seen) < 10:
-            if (posted := reader.read(count)) is not None:
-                assert (posted.values.view(np.int32) == posted.tag).all()
-                count = posted.count
-                seen.append(posted.tag)
-    finally:
-        stop.set()
-        thread.join()
-    assert seen == sorted(set(seen))
-
-
 def test_what_does_not_fit_is_refused(fd) -> None:
     with pytest.raises(ConfigError, match=r"sizes_bytes=\[4, 0\]"):
-        attach_board(fd, [4, 0])
-    note = attach_board(fd, [4])[0]
-    with pytest.raises(CollectiveError, match="8 bytes for a note of 4"):
-        note.publish(np.zeros(2, np.float32))
-    with pytest.raises(CollectiveError, match="note 0 has 4 bytes for another process, 8 here"):
-        attach_board(fd, [8])
+        open_registers(fd, [4, 0])
+    register = open_registers(fd, [4])[0]
+    with pytest.raises(CollectiveError, match="8 bytes for a register of 4"):
+        register.publish(np.zeros(2, np.float32))
+    with pytest.raises(
+        CollectiveError, match="register 0 has 4 bytes for another process, 8 here"
+    ):
+        open_registers(fd, [8])
 
 
 @pytest.mark.parametrize("page_bytes", [4096, 65536])
-def test_notes_begin_at_pages_of_this_machine(
+def test_registers_begin_at_pages_of_this_machine(
     fd, page_bytes: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("mmap.PAGESIZE", page_bytes)
-    first, second = attach_board(fd, [8, 64])
+    first, second = open_registers(fd, [8, 64])
     begin = first._line.ctypes.data
     assert first._places.ctypes.data - begin == page_bytes
     assert second._places.ctypes.data - begin == 3 * page_bytes

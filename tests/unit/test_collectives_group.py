@@ -60,7 +60,7 @@ def groups(build: Any = None, timeout_s: float = 20.0) -> list[GroupReducer]:
     """Of all ranks; `build(rank, num_floats)` makes the reducers for large means."""
     fd = create_pipes(RANKS, MIN_CAPACITY_BYTES)
     try:
-        blocks = [PipeBlock.attach(fd, rank, RANKS, MIN_CAPACITY_BYTES) for rank in range(RANKS)]
+        blocks = [PipeBlock(fd, rank) for rank in range(RANKS)]
     finally:
         os.close(fd)
     return [

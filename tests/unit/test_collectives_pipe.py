@@ -20,7 +20,6 @@ from gmijax.collectives.pipe_block import (
     LINE_BYTES,
     PipeBlock,
     create_pipes,
-    progress_of,
 )
 from gmijax.collectives.pipe_format import message_bytes
 from gmijax.errors import CollectiveError, CollectiveTimeout, ConfigError, PipeClosed
@@ -44,7 +43,7 @@ def ends() -> Iterator[Ends]:
 
 def open_ends() -> Iterator[Ends]:
     fd = create_pipes(2, CAPACITY)
-    first, second = (PipeBlock.attach(fd, rank, 2, CAPACITY) for rank in (0, 1))
+    first, second = (PipeBlock(fd, rank) for rank in (0, 1))
     yield Ends(fd, (first, second), PipeWriter(first, 1), PipeReader(second, 0))
     first.close()
     second.close()
@@ -69,14 +68,14 @@ def test_messages_come_out_whole_and_in_order(sizes: list[list[int]], is_put: li
             wanted = next(todo, None) if puts else None
             if wanted is not None:
                 parts = [np.random.default_rng(number).bytes(size) for size in wanted]
-                if ends.writer.try_put(parts, tag=-number):
+                if ends.writer.try_put(parts, tag=number):
                     waiting.append(parts)
             message = None if puts else ends.reader.try_get()
             assert puts or (message is None) == (not waiting)
             if message is not None:
                 assert [part.tobytes() for part in message.parts] == waiting.pop(0)
-        written, read = ends.blocks[1].written(0, 1), ends.blocks[0].read(0, 1)
-        assert written.messages - len(waiting) in (read.messages, read.messages + 1)
+        assert ends.writer.messages - len(waiting) == ends.reader.messages + (message is not None)
+        assert ends.writer.released_messages == ends.reader.messages
 
 
 def test_the_largest_message_fits_wherever_the_ring_stands(ends: Ends) -> None:
@@ -95,14 +94,13 @@ def test_the_largest_message_fits_wherever_the_ring_stands(ends: Ends) -> None:
 
 def test_arrays_of_any_strides_are_written_without_a_copy_of_theirs(ends: Ends) -> None:
     values = np.arange(60, dtype=np.float32).reshape(3, 4, 5)
-    ends.writer.put([values[:, 1:3], np.array([True, False])], timeout_s=1.0, tag=7, items=2)
+    ends.writer.put([values[:, 1:3], np.array([True, False])], timeout_s=1.0, tag=7)
     message = ends.reader.get(timeout_s=1.0)
-    assert (message.tag, message.items, message.sequence) == (7, 2, 0)
+    assert message.tag == 7
     received = message.parts[0].view(np.float32).reshape(3, 2, 5)
     np.testing.assert_array_equal(received, values[:, 1:3])
     assert not received.flags.writeable
     assert received.ctypes.data % 64 == 0
-    assert ends.writer.progress.items == 2
 
 
 def test_a_full_pipe_and_an_empty_one_wait_no_longer_than_told(ends: Ends) -> None:
@@ -137,82 +135,35 @@ def test_a_process_that_leaves_is_not_waited_for(ends: Ends) -> None:
         ends.reader.get(timeout_s=5.0)
 
 
-@pytest.mark.parametrize("offset", [0, 8, 24, 64, 128, 1151])
+@pytest.mark.parametrize("offset", [0, 8, 16, 24, 32, 40, 64, 128, 1151])
 def test_a_damaged_message_is_found(ends: Ends, offset: int) -> None:
     ends.writer.put([np.arange(128.0)], timeout_s=1.0)
-    ends.blocks[0].memory(0, 1).ring[offset] ^= 0x10
+    ends.blocks[0].pipe(0, 1).ring[offset] ^= 0x10
     with pytest.raises(CollectiveError, match="message 0 from rank 0 is damaged"):
         ends.reader.get(timeout_s=1.0)
-
-
-def test_a_successor_goes_on_after_what_was_committed(ends: Ends) -> None:
-    """Also if its predecessor was killed after it had noted a commit and before it made it."""
-    for number in range(5):
-        ends.writer.put([bytes([number])], timeout_s=1.0, items=10)
-    ends.writer.reserve([100], timeout_s=1.0)[0][:] = 255
-    memory = ends.blocks[0].memory(0, 1)
-    memory.writer["record"][0, 0] = 2**40, 6, 60
-    successor = PipeWriter(ends.blocks[0], 1)
-    assert successor.progress[1:] == (5, 50)
-    successor.put([b"\x05"], timeout_s=1.0)
-    got = [ends.reader.get(timeout_s=1.0).parts[0].item(0) for _ in range(6)]
-    assert got == [0, 1, 2, 3, 4, 5]
-    assert ends.reader.try_get() is None
-
-
-def test_a_reader_that_follows_gets_again_what_was_not_released(ends: Ends) -> None:
-    for number in range(3):
-        ends.writer.put([bytes([number])], timeout_s=1.0)
-    ends.reader.get(timeout_s=1.0)
-    assert ends.reader.get(timeout_s=1.0).parts[0].item(0) == 1
-    assert PipeReader(ends.blocks[1], 0).get(timeout_s=1.0).parts[0].item(0) == 1
 
 
 def test_senseless_numbers_and_other_blocks_are_refused(ends: Ends) -> None:
     with pytest.raises(ConfigError, match="capacity_bytes=100: must be between"):
         create_pipes(2, 100)
     with pytest.raises(ConfigError, match=r"rank=2: must be 0 to world_size - 1 = 1"):
-        PipeBlock.attach(ends.fd, 2, 2, CAPACITY)
-    with pytest.raises(CollectiveError, match="world_size"):
-        PipeBlock.attach(ends.fd, 1, 3, CAPACITY)
-    with pytest.raises(CollectiveError, match="rank 1 is taken already by process"):
-        PipeBlock.attach(ends.fd, 1, 2, CAPACITY)
+        PipeBlock(ends.fd, 2)
     descriptors = len(os.listdir("/proc/self/fd"))
     for _ in range(3):
-        with pytest.raises(CollectiveError, match="is taken"):
-            PipeBlock.attach(ends.fd, 1, 2, CAPACITY)
+        with pytest.raises(CollectiveError, match="rank 1 is taken already by process"):
+            PipeBlock(ends.fd, 1)
     assert len(os.listdir("/proc/self/fd")) == descriptors
     empty = os.memfd_create("empty", os.MFD_CLOEXEC)
     with pytest.raises(CollectiveError, match="rank 1: no pipes at descriptor"):
-        PipeBlock.attach(empty, 1, 2, CAPACITY)
+        PipeBlock(empty, 1)
+    os.pwrite(empty, bytes(64), 0)
+    with pytest.raises(CollectiveError, match=r"it begins with \(0, 0\), not"):
+        PipeBlock(empty, 1)
     os.close(empty)
 
 
-def test_a_rank_that_is_coming_never_seems_to_have_left() -> None:
-    """Whoever looks between any two stores to its line."""
-    fd = create_pipes(2, CAPACITY)
-    watcher = PipeBlock.attach(fd, 0, 2, CAPACITY)
-    seen: list[bool] = []
-
-    class Line:
-        def __getitem__(self, key: str) -> Any:
-            return watcher._lines[1][key]
-
-        def __setitem__(self, key: str, value: Any) -> None:
-            watcher._lines[1][key] = value
-            seen.append(watcher.has_left(1))
-
-    comer: Any = copy.copy(watcher)
-    comer.rank, comer._lines = 1, [None, Line()]
-    comer._take_rank()
-    assert seen == [False] * 3
-    assert not watcher.is_gone(1)
-    watcher.close()
-    os.close(fd)
-
-
 class Noted:
-    """A line or an end of a pipe that notes what is read and written."""
+    """A line that notes what is read and written."""
 
     def __init__(self, real: Any, seen: list[str]) -> None:
         self._real, self._seen = real, seen
@@ -235,20 +186,23 @@ def test_there_is_a_fence_wherever_the_order_of_accesses_counts(
     block: Any = copy.copy(ends.blocks[0])
     block._lines = [Noted(np.zeros((), LINE), seen) for _ in range(2)]
     block._take_rank()
-    # After those of the look at who holds the rank.
-    assert seen[-6:] == [
-        *("write start_ticks", "fence", "write pid", "fence", "read attached", "write attached")
-    ]
+    assert seen == ["read pid", "write start_ticks", "fence", "write pid"]
     seen.clear()
-    assert not block.has_left(0)
-    assert seen == ["read attached", "fence", "read pid"]
+    assert block.why_lost(0, "get", 0) is None
+    assert seen == ["read pid", "fence", "read start_ticks", "read has_left"]
+    both: list[Any] = [ends.writer, ends.reader]
+    for end in both:
+        end._own = Noted(end._own, seen)
+        end._fence = lambda: seen.append("fence")
     seen.clear()
-    assert block.process_of(0) is not None
-    assert seen == ["read pid", "fence", "read start_ticks"]
+    ends.writer.put([b"one"], timeout_s=0.0)
+    assert seen == ["fence", "fence", "read position"]
+    ends.reader.get(timeout_s=0.0)
     seen.clear()
-    end: Any = Noted(ends.blocks[0].memory(0, 1).writer, seen)
-    assert progress_of(end).messages == 0
-    assert seen == ["read position", "fence", "read record", "fence", "read position"]
+    ends.reader.release()
+    assert seen == ["fence", "read messages", "read position"]
+    assert ends.writer.released_messages == 1
+    assert seen[-1] == "fence"
 
 
 @pytest.mark.parametrize("page_bytes", [4096, 65536])
@@ -257,9 +211,9 @@ def test_rings_begin_at_pages_of_this_machine(
 ) -> None:
     monkeypatch.setattr("mmap.PAGESIZE", page_bytes)
     fd = create_pipes(2, 2 * page_bytes)
-    block = PipeBlock.attach(fd, 0, 2, 2 * page_bytes)
+    block = PipeBlock(fd, 0)
     begin = block._lines.ctypes.data - LINE_BYTES
-    offsets = [block.memory(0, dst).ring.ctypes.data - begin for dst in (0, 1)]
+    offsets = [block.pipe(0, dst).ring.ctypes.data - begin for dst in (0, 1)]
     assert offsets == [2 * page_bytes, 5 * page_bytes]
     block.close()
     os.close(fd)
@@ -267,7 +221,7 @@ def test_rings_begin_at_pages_of_this_machine(
 
 def test_unused_pipes_cost_no_memory() -> None:
     fd = create_pipes(16, 2**26)
-    block = PipeBlock.attach(fd, 3, 16, 2**26)
+    block = PipeBlock(fd, 3)
     block.outstanding_bytes(5)
     assert os.fstat(fd).st_blocks * 512 < 2**20
     block.close()

@@ -99,7 +99,7 @@ def test_beside_gpus_memory_counts_and_cores_do_not():
 
 def test_roles_are_refused_too(monkeypatch: pytest.MonkeyPatch, tmp_path: Path):
     fits = gmijax.plan(gmis_per_gpu=2, backend="cpu")
-    monkeypatch.setattr("gmijax.roles.planning.detect_machine", two_cores)
+    monkeypatch.setattr("gmijax.roles.manager.detect_machine", two_cores)
     with pytest.raises(ConfigError, match=r"^plan\.gmis_per_gpu=1000: 1000 GMIs"):
         gmijax.plan(gmis_per_gpu=1000)
     monkeypatch.chdir(tmp_path)

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from fake_device_memory import FakeDeviceMemory
 
-from gmijax.collectives.device_post import DevicePost
+from gmijax.collectives.device_post import DeviceBuffers
 from gmijax.collectives.mailboxes import COLLECTIVE, DATA, MAX_PARTS, Inbox, frames_of
 from gmijax.collectives.messenger import MIN_CAPACITY_BYTES, Messenger
 from gmijax.collectives.pipe import message_bytes
@@ -51,13 +51,9 @@ def test_more_than_numbers_is_pickled_as_it_is() -> None:
 
 
 def test_floats_are_arrays_only_where_asked_for() -> None:
-    assert flatten([1.5, np.float32(2)]).arrays == []
-    assert [
-        array.item() for array in flatten([1.5, np.float32(2), 3, True], scalars=True).arrays
-    ] == [
-        1.5,
-        2.0,
-    ]
+    assert flatten([1.5, np.float32(2)])[1] == []
+    _, arrays = flatten([1.5, np.float32(2), 3, True], scalars=True)
+    assert [array.item() for array in arrays] == [1.5, 2.0]
     assert round_trip({"loss": 0.5}, scalars=True) == {"loss": 0.5}
 
 
@@ -85,7 +81,7 @@ def test_every_frame_fits_into_the_smallest_pipe() -> None:
 def alone() -> Messenger:
     fd = create_pipes(2, MIN_CAPACITY_BYTES)
     try:
-        return Messenger(PipeBlock.attach(fd, 0, 2, MIN_CAPACITY_BYTES), timeout_s=0.05)
+        return Messenger(PipeBlock(fd, 0), timeout_s=0.05)
     finally:
         os.close(fd)
 
@@ -117,12 +113,12 @@ def posts(count: int, part_bytes: int = 1 << 20, timeout_s: float = 5.0) -> list
     """Messengers of `count` ranks that share memory of a device, in this process."""
     fd = create_pipes(count, MIN_CAPACITY_BYTES)
     try:
-        blocks = [PipeBlock.attach(fd, rank, count, MIN_CAPACITY_BYTES) for rank in range(count)]
+        blocks = [PipeBlock(fd, rank) for rank in range(count)]
     finally:
         os.close(fd)
     others = [[peer for peer in range(count) if peer != rank] for rank in range(count)]
     return [
-        Messenger(block, timeout_s, DevicePost(peers, FakeDeviceMemory, part_bytes))
+        Messenger(block, timeout_s, DeviceBuffers(peers, FakeDeviceMemory, part_bytes))
         for block, peers in zip(blocks, others, strict=True)
     ]
 
@@ -200,10 +196,10 @@ def test_without_shared_memory_of_a_device_all_go_through_the_host() -> None:
             raise RuntimeError("no IPC here")
 
     fd = create_pipes(2, MIN_CAPACITY_BYTES)
-    blocks = [PipeBlock.attach(fd, rank, 2, MIN_CAPACITY_BYTES) for rank in range(2)]
+    blocks = [PipeBlock(fd, rank) for rank in range(2)]
     os.close(fd)
     first, second = (
-        Messenger(block, 5.0, DevicePost([1 - block.rank], Refused)) for block in blocks
+        Messenger(block, 5.0, DeviceBuffers([1 - block.rank], Refused)) for block in blocks
     )
     first.send(jnp.arange(5000.0), 1)
     assert isinstance(second.recv(0), np.ndarray)
