@@ -18,7 +18,7 @@ import numpy as np
 from benchmarks.channel_ranks import ENV_FD, Options
 from gmijax.collectives.channel.build import ChannelTopology, create_channels
 from gmijax.config.channel import ChannelConfig
-from gmijax.processes import reserved_address
+from gmijax.machine.processes import reserved_address
 
 DEFAULTS: Options = {
     "count": 1000,  # unrolls of every agent

@@ -23,9 +23,9 @@ from gmijax.collectives.channel.build import ChannelTopology, open_receiver, ope
 from gmijax.collectives.channel.sender import Sender
 from gmijax.collectives.channel.spec import Array
 from gmijax.config.channel import ChannelConfig
+from gmijax.config.schema import from_dict
 from gmijax.errors import CollectiveTimeout, GmijaxError, PeerLost, PipeClosed
-from gmijax.partition.child import inherited_fd
-from gmijax.schema import from_dict
+from gmijax.supervise.child import inherited_fd
 
 ENV_FD = "GMIJAX_CHANNELS_FD"
 Options = dict[str, Any]

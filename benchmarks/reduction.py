@@ -20,8 +20,8 @@ from gmijax.collectives.cost_model import BYTES_PER_FLOAT, predicted_s
 from gmijax.config import PlanConfig, ReduceConfig
 from gmijax.control.selection import Probe, candidates, measure
 from gmijax.errors import ConfigError
+from gmijax.machine.snapshot import Machine, detect_machine
 from gmijax.partition.layout import Layout
-from gmijax.partition.machine import Machine, detect_machine
 from gmijax.partition.plan import Plan
 from gmijax.partition.planner import make_plan
 from gmijax.partition.reduction import select_strategy

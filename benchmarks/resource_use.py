@@ -29,7 +29,7 @@ from benchmarks.paper_model import dominant_resource
 from benchmarks.run import RESULTS
 from gmijax import compose
 from gmijax.config import PpoConfig, TrainConfig
-from gmijax.learner import Learner, acting_weights, init_learner, make_learner
+from gmijax.learning.learner import Learner, acting_weights, init_learner, make_learner
 from gmijax.learning.unroll import act
 from gmijax.ppo.ppo import Samples, learn, no_stats
 from gmijax.sim.build import make_training_env

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 from gmijax.version import __version__
 
 if TYPE_CHECKING:
-    from gmijax.cli import compose
+    from gmijax.cli.compose import compose
     from gmijax.control.job import Result, train
     from gmijax.control.searching import search
     from gmijax.control.serving import Served, serve
@@ -42,7 +42,7 @@ _HOMES = {
     "Result": "gmijax.control.job",
     "Role": "gmijax.roles.role",
     "Served": "gmijax.control.serving",
-    "compose": "gmijax.cli",
+    "compose": "gmijax.cli.compose",
     "launch": "gmijax.roles.launch",
     "make_env": "gmijax.sim.registry",
     "plan": "gmijax.roles.manager",

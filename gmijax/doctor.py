@@ -13,8 +13,8 @@ from rich.table import Table
 from gmijax.control.diagnosis import Diagnosis, diagnose
 from gmijax.control.system_info import look
 from gmijax.errors import ConfigError
-from gmijax.partition.machine import Machine, detect_machine
-from gmijax.partition.mig_split import split_commands
+from gmijax.machine.mig_split import split_commands
+from gmijax.machine.snapshot import Machine, detect_machine
 from gmijax.version import __version__
 
 USAGE: Final = """usage: python -m gmijax.doctor [--json] [--help]
@@ -27,7 +27,7 @@ With mig=3g,2g,1g,1g, prints the commands with which an administrator would divi
 Exit codes: 0 healthy, 1 something is broken that should work, 2 bad input.
 """
 
-# Not those of gmijax.cli, whose import needs packages that may be what is broken.
+# Not those of gmijax.cli.compose, whose import needs packages that may be what is broken.
 EXIT_OK, EXIT_BROKEN, EXIT_BAD_INPUT, EXIT_INTERRUPTED = 0, 1, 2, 130
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 
-from gmijax.cli_command import command
+from gmijax.cli.command import command
 from gmijax.config import PlayConfig
 from gmijax.control import evaluation
 

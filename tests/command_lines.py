@@ -15,10 +15,10 @@ from typing import Any, NamedTuple
 import pytest
 
 from gmijax.autotune import tuner
-from gmijax.cli_command import command as run_command
+from gmijax.cli.command import command as run_command
 from gmijax.config import PlayConfig, ServeConfig, TrainConfig
 from gmijax.control import decide, evaluation, job, searching, selection, serving
-from gmijax.partition.machine import Machine
+from gmijax.machine.snapshot import Machine
 
 COMMANDS: Mapping[str, type[Any]] = {
     "train": TrainConfig,

@@ -138,8 +138,8 @@ def check_training(reducer: Reducer, options: Options) -> Options:
     import jax
     from toy_env import point_mass
 
-    from gmijax.cli import compose
-    from gmijax.learner import init_learner, make_learner
+    from gmijax.cli.compose import compose
+    from gmijax.learning.learner import init_learner, make_learner
     from gmijax.ppo.iteration import SplitIteration, make_iteration
     from gmijax.sim.wrappers import env_keys
 

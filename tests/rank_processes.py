@@ -24,10 +24,10 @@ from gmijax.collectives.host import HostExchange
 from gmijax.collectives.interface import Reducer
 from gmijax.collectives.memory import create_exchange
 from gmijax.errors import CollectiveTimeout, GmijaxError, PeerLost
-from gmijax.partition.child import ENV_EXCHANGE_FD
+from gmijax.machine.processes import reserved_address
 from gmijax.partition.layout import Layout
 from gmijax.partition.reduction import needs_ring
-from gmijax.processes import reserved_address
+from gmijax.supervise.child import ENV_EXCHANGE_FD
 from tests.rank_bodies import BODIES, Options
 
 WAIT_S = 90.0

@@ -14,8 +14,8 @@ from typing import Any
 
 import numpy as np
 
-from gmijax.partition.heartbeat import Heartbeat, HeartbeatBlock
-from gmijax.resume import find_checkpoint
+from gmijax.runs.resume import find_checkpoint
+from gmijax.supervise.heartbeat import Heartbeat, HeartbeatBlock
 
 TINY = (
     *("env=ball_balance", "num_envs=16", "algo.unroll_length=4", "algo.num_minibatches=2"),

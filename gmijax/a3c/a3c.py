@@ -13,10 +13,10 @@ import jax.numpy as jnp
 
 from gmijax.a3c.returns import Returns, n_step_returns, vtrace
 from gmijax.config import A3cConfig
-from gmijax.learner import Learner, LearnerState, acting_moments
+from gmijax.learning.learner import Learner, TrainState, acting_moments
 from gmijax.learning.losses import bound_loss, clipped_surrogate
-from gmijax.normalize import Moments, moments_of, normalize, without_outliers
-from gmijax.policy import ActorCritic, ActorCriticParams, entropy, kl_divergence, log_prob
+from gmijax.learning.normalize import Moments, moments_of, normalize, without_outliers
+from gmijax.learning.policy import ActorCritic, ActorCriticParams, entropy, kl_divergence, log_prob
 from gmijax.types import Array
 
 A3cLearner: TypeAlias = Learner[A3cConfig]
@@ -103,7 +103,7 @@ class A3cLosses(NamedTuple):
 
 
 def batch_targets(
-    learner: A3cLearner, state: LearnerState, batch: Unrolls, weight: Array
+    learner: A3cLearner, state: TrainState, batch: Unrolls, weight: Array
 ) -> Targets:
     """Targets of a batch by the policy and the values before the first pass over it.
 
@@ -254,6 +254,6 @@ def gradients(
     )
 
 
-def batch_moments(learner: A3cLearner, state: LearnerState, batch: Unrolls) -> Moments:
+def batch_moments(learner: A3cLearner, state: TrainState, batch: Unrolls) -> Moments:
     """Statistics [O] of a batch's observations."""
     return moments_of(without_outliers(acting_moments(learner, state), batch.state), 2)

@@ -17,15 +17,15 @@ import numpy as np
 import numpy.typing as npt
 
 from gmijax.a3c.a3c import Unrolls
-from gmijax.a3c.board import JobRegisters, Orders, Report
+from gmijax.a3c.job_registers import JobRegisters, Orders, Report
 from gmijax.a3c.outgoing import Outgoing
 from gmijax.a3c.rollout import UnrollPrograms, num_counts
-from gmijax.checkpoint import save_envs
 from gmijax.collectives.channel.sender import Sender
 from gmijax.config import A3cConfig, TrainConfig
 from gmijax.devices import describe_device
 from gmijax.errors import CollectiveTimeout, PipeClosed
-from gmijax.learner import (
+from gmijax.learning.checkpoint import save_envs
+from gmijax.learning.learner import (
     ActingWeights,
     acting_weights,
     init_learner,
@@ -34,8 +34,8 @@ from gmijax.learner import (
 )
 from gmijax.learning.start import first_envs
 from gmijax.learning.unroll import Counts
-from gmijax.partition.child import ChildLink
 from gmijax.sim.wrappers import BatchedEnv, BatchState
+from gmijax.supervise.child import ChildLink
 from gmijax.types import Array
 
 _PAUSE_S = 0.02

@@ -11,17 +11,22 @@ import jax.numpy as jnp
 import numpy as np
 import numpy.typing as npt
 
-from gmijax.a3c.board import JobRegisters, Orders, Report
+from gmijax.a3c.job_registers import JobRegisters, Orders, Report
 from gmijax.a3c.report import BatchCounts, Reporter, UpdateFigures
-from gmijax.checkpoint import checkpoint_meta, finish_checkpoint, require_finite, save_learner
 from gmijax.config import TrainConfig
 from gmijax.devices import describe_device
 from gmijax.errors import CollectiveTimeout
-from gmijax.learner import LearnerState
+from gmijax.learning.checkpoint import (
+    checkpoint_meta,
+    finish_checkpoint,
+    require_finite,
+    save_learner,
+)
+from gmijax.learning.learner import TrainState
 from gmijax.learning.training_log import TrainingLog
-from gmijax.partition.child import ChildLink
-from gmijax.resume import CheckpointMeta
+from gmijax.runs.resume import CheckpointMeta
 from gmijax.sim.wrappers import BatchedEnv
+from gmijax.supervise.child import ChildLink
 
 _PAUSE_S = 0.02
 
@@ -77,7 +82,7 @@ class Leader:
         updates: int,
         counts: BatchCounts,
         figures: UpdateFigures,
-        state: LearnerState,
+        state: TrainState,
     ) -> None:
         """Takes one update into the metrics."""
         self._env_steps, self._updates = env_steps, updates
@@ -86,7 +91,7 @@ class Leader:
             self._hear()
             self._write_line(state)
 
-    def checkpoint_now_and_then(self, state: LearnerState) -> None:
+    def checkpoint_now_and_then(self, state: TrainState) -> None:
         """Begins a checkpoint when one is due, finishes one when all agents have done theirs.
 
         Nobody waits: the agents add their environments when they look. Until then no other
@@ -107,7 +112,7 @@ class Leader:
             self._wait_for_agents()
         self._order(self._env_steps, is_ending=True)
 
-    def finish(self, state: LearnerState) -> None:
+    def finish(self, state: TrainState) -> None:
         """Writes the last checkpoint and the last line of metrics."""
         self._wall_s = time.monotonic() - self._started
         self._begin_checkpoint(state)
@@ -142,7 +147,7 @@ class Leader:
             "device": describe_device(),
         }
 
-    def _write_line(self, state: LearnerState) -> None:
+    def _write_line(self, state: TrainState) -> None:
         self._reporter.write(
             self._env_steps,
             [report for report in self._reports if report is not None],
@@ -165,7 +170,7 @@ class Leader:
         theirs = [None if report is None else report.checkpoint for report in self._reports]
         return [gmi for gmi, has in zip(self._agents, theirs, strict=True) if has != wanted]
 
-    def _begin_checkpoint(self, state: LearnerState) -> None:
+    def _begin_checkpoint(self, state: TrainState) -> None:
         require_finite(state.params, self._config.env.label, self._env_steps)
         save_learner(self._link.run, self._env_steps, state)
         self._pending = checkpoint_meta(

@@ -18,7 +18,7 @@ import numpy.typing as npt
 from jax.flatten_util import ravel_pytree
 
 from gmijax.a3c.a3c import A3cLosses
-from gmijax.a3c.board import Report
+from gmijax.a3c.job_registers import Report
 from gmijax.learning.training_log import Learnt, TrainingLog
 from gmijax.learning.unroll import no_counts
 from gmijax.sim.wrappers import BatchedEnv

@@ -12,10 +12,10 @@ from jax.flatten_util import ravel_pytree
 
 from gmijax.a3c.a3c import Unrolls
 from gmijax.devices import host_sharding
-from gmijax.learner import ActingWeights
+from gmijax.learning.learner import ActingWeights
+from gmijax.learning.normalize import normalize
+from gmijax.learning.policy import ActorCritic, log_prob
 from gmijax.learning.unroll import Counts, Outcome, act, count, no_counts, outcome_of, unroll
-from gmijax.normalize import normalize
-from gmijax.policy import ActorCritic, log_prob
 from gmijax.sim.wrappers import BatchedEnv, BatchState, StepOutput
 from gmijax.types import Array, PyTree
 

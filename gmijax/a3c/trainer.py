@@ -15,20 +15,20 @@ import numpy as np
 import numpy.typing as npt
 
 from gmijax.a3c.a3c import Unrolls
-from gmijax.a3c.board import JobRegisters
+from gmijax.a3c.job_registers import JobRegisters
 from gmijax.a3c.leader import Leader
 from gmijax.a3c.report import MAX_COUNTED, BatchCounts, UpdateFigures, histogram_of
 from gmijax.a3c.update import make_update
-from gmijax.checkpoint import require_equal
 from gmijax.collectives.channel.batcher import Batch, Batcher
 from gmijax.collectives.interface import Reducer
 from gmijax.config import A3cConfig, TrainConfig
 from gmijax.errors import CollectiveTimeout
-from gmijax.learner import LearnerState, acting_weights, make_learner, pack_weights
+from gmijax.learning.checkpoint import require_equal
+from gmijax.learning.learner import TrainState, acting_weights, make_learner, pack_weights
+from gmijax.learning.physics_health import check_losses
 from gmijax.learning.start import first_state
-from gmijax.partition.child import ChildLink
-from gmijax.physics_health import check_losses
 from gmijax.sim.wrappers import BatchedEnv
+from gmijax.supervise.child import ChildLink
 
 _SLICE_S = 0.5
 """Longest wait for experience before the trainer says that it is alive."""
@@ -114,10 +114,10 @@ class Trainer:
             leader.close()
         return leader.outcome(status, compile_s)
 
-    def _require_equal(self, state: LearnerState) -> None:
+    def _require_equal(self, state: TrainState) -> None:
         require_equal(self._reducer, state.params, self._env_steps)
 
-    def _loop(self, state: LearnerState, leader: Leader | None) -> str:
+    def _loop(self, state: TrainState, leader: Leader | None) -> str:
         """Returns the status for the outcome."""
         while True:
             batch, waited_s = self._receive()

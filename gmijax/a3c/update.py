@@ -26,9 +26,9 @@ from gmijax.a3c.a3c import (
 )
 from gmijax.collectives.interface import Reducer
 from gmijax.devices import host_sharding
-from gmijax.learner import LearnerState, acting_weights, pack_weights, rate_figures
+from gmijax.learning.learner import TrainState, acting_weights, pack_weights, rate_figures
+from gmijax.learning.normalize import Moments, merge, merge_all, no_samples
 from gmijax.learning.updates import SplitUpdates, minibatch_order, run_updates
-from gmijax.normalize import Moments, merge, merge_all, no_samples
 from gmijax.types import Array
 
 
@@ -52,13 +52,13 @@ class FusedUpdate:
     def __init__(self, learner: A3cLearner) -> None:
         self._program: Any = _jitted(functools.partial(_fused, learner))
 
-    def compile(self, state: LearnerState, batch: Unrolls, weight: Array) -> None:
+    def compile(self, state: TrainState, batch: Unrolls, weight: Array) -> None:
         """Compiles all programs for these shapes, or takes them from the cache."""
         self._program = self._program.lower(state, batch, weight).compile()
 
     def __call__(
-        self, state: LearnerState, batch: Unrolls, weight: Array
-    ) -> tuple[LearnerState, Updated]:
+        self, state: TrainState, batch: Unrolls, weight: Array
+    ) -> tuple[TrainState, Updated]:
         """Learns from one batch.
 
         Args:
@@ -82,7 +82,7 @@ class SplitUpdate:
         self._updates = SplitUpdates(learner, reducer, gradients, A3cLosses)
         self._finish: Any = _jitted(self._finish_fn)
 
-    def compile(self, state: LearnerState, batch: Unrolls, weight: Array) -> None:
+    def compile(self, state: TrainState, batch: Unrolls, weight: Array) -> None:
         """See `FusedUpdate`."""
         self._begin = self._begin.lower(state, batch, weight, self._rank)
         order, targets, packed = self._begin.out_info
@@ -93,8 +93,8 @@ class SplitUpdate:
         self._finish = self._finish.lower(state, gathered, figures).compile()
 
     def __call__(
-        self, state: LearnerState, batch: Unrolls, weight: Array
-    ) -> tuple[LearnerState, Updated]:
+        self, state: TrainState, batch: Unrolls, weight: Array
+    ) -> tuple[TrainState, Updated]:
         """See `FusedUpdate`; collective."""
         batch = jax.device_put(batch)  # Once, and not with every program.
         order, targets, packed = self._begin(state, batch, weight, self._rank)
@@ -103,15 +103,15 @@ class SplitUpdate:
         return self._finish(state, gathered, figures)
 
     def _begin_fn(
-        self, state: LearnerState, batch: Unrolls, weight: Array, rank: Array
+        self, state: TrainState, batch: Unrolls, weight: Array, rank: Array
     ) -> tuple[Array, Targets, Array]:
         order = minibatch_order(self._learner.config, state, rank, batch.reward.shape[1])
         seen = ravel_pytree(batch_moments(self._learner, state, batch))[0]
         return order, batch_targets(self._learner, state, batch, weight), seen
 
     def _finish_fn(
-        self, state: LearnerState, gathered: Array, figures: list[Array]
-    ) -> tuple[LearnerState, Updated]:
+        self, state: TrainState, gathered: Array, figures: list[Array]
+    ) -> tuple[TrainState, Updated]:
         seen = merge_all(jax.vmap(self._unpack_moments)(gathered))
         return _finished(self._learner, state, seen, *self._updates.summary(figures))
 
@@ -132,8 +132,8 @@ def _jitted(program: Any) -> Any:
 
 
 def _fused(
-    learner: A3cLearner, state: LearnerState, batch: Unrolls, weight: Array
-) -> tuple[LearnerState, Updated]:
+    learner: A3cLearner, state: TrainState, batch: Unrolls, weight: Array
+) -> tuple[TrainState, Updated]:
     targets = batch_targets(learner, state, batch, weight)
     seen = batch_moments(learner, state, batch)
     rank = jnp.zeros((), jnp.int32)
@@ -143,8 +143,8 @@ def _fused(
 
 
 def _finished(
-    learner: A3cLearner, state: LearnerState, seen: Moments, losses: A3cLosses, rates: Array
-) -> tuple[LearnerState, Updated]:
+    learner: A3cLearner, state: TrainState, seen: Moments, losses: A3cLosses, rates: Array
+) -> tuple[TrainState, Updated]:
     """Counts the batch, which makes a new version of the policy, and takes in its statistics."""
     state = state._replace(
         obs_moments=merge(state.obs_moments, seen), iteration=state.iteration + 1

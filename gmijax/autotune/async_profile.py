@@ -8,10 +8,10 @@ from typing import Any, Final
 
 from gmijax.autotune.grid import Measured
 from gmijax.config import A3cConfig, TrainConfig
-from gmijax.partition.gmi_process import GmiStatus
 from gmijax.partition.plan import Plan
-from gmijax.results import read_metrics
-from gmijax.rundir import RunPaths
+from gmijax.runs.folder import RunPaths
+from gmijax.runs.history import read_metrics
+from gmijax.supervise.gmi_process import GmiStatus
 from gmijax.supervise.kinds import groups_of
 
 FEWEST_LINES: Final = 3

@@ -19,13 +19,13 @@ from gmijax.autotune import async_profile
 from gmijax.autotune.grid import Measured, Point
 from gmijax.autotune.workloads import Mode, Split, Workload, peak_memory_mib, results_of
 from gmijax.config import AUTO, PlanConfig, TrainConfig
+from gmijax.config.schema import to_dict
 from gmijax.errors import ConfigError
-from gmijax.partition.gmi_process import GmiStatus
-from gmijax.partition.machine import Machine
+from gmijax.machine.snapshot import Machine
 from gmijax.partition.placement import place, serving_and_training
 from gmijax.partition.plan import Plan
-from gmijax.rundir import RunPaths
-from gmijax.schema import to_dict
+from gmijax.runs.folder import RunPaths
+from gmijax.supervise.gmi_process import GmiStatus
 from gmijax.supervise.kinds import groups_of, training_kind, training_plan
 
 _ENDLESS_STEPS: Final = 10**15

@@ -13,15 +13,15 @@ from typing import Any, Final
 
 from gmijax.autotune.grid import Measured, NotRunnable, Point
 from gmijax.autotune.workloads import Mode, Workload
+from gmijax.config.schema import to_dict
 from gmijax.errors import ConfigError, GmijaxError, JobInterrupted
-from gmijax.partition.gmi_process import GmiStatus
-from gmijax.partition.machine import Machine
-from gmijax.partition.supervisor import Patience
-from gmijax.rundir import RunPaths, write_json
-from gmijax.schema import to_dict
+from gmijax.machine.snapshot import Machine
+from gmijax.runs.folder import RunPaths, write_json
+from gmijax.supervise.gmi_process import GmiStatus
 from gmijax.supervise.launcher import Launch, run_gmis
+from gmijax.supervise.supervisor import Timeouts
 
-_PATIENCE: Final = Patience(
+_TIMEOUTS: Final = Timeouts(
     start_timeout_s=60.0, stall_timeout_s=60.0, stop_timeout_s=3.0, grace_s=3.0
 )
 
@@ -67,8 +67,8 @@ def profile(
         machine=machine,
         run=run,
         kind=workload.kind,
-        patience=dataclasses.replace(
-            _PATIENCE, start_timeout_s=2 * limit_s, stall_timeout_s=2 * limit_s
+        timeouts=dataclasses.replace(
+            _TIMEOUTS, start_timeout_s=2 * limit_s, stall_timeout_s=2 * limit_s
         ),
         on_warning=on_warning,
         is_enough=workload.enough(plan, run),

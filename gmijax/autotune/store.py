@@ -18,10 +18,10 @@ from pathlib import Path
 from typing import Any
 
 from gmijax.autotune.grid import Measured, NotRunnable, Point
-from gmijax.cachedir import cache_folder
+from gmijax.config.schema import require_positive
 from gmijax.errors import ConfigError
-from gmijax.rundir import read_json, write_json
-from gmijax.schema import require_positive
+from gmijax.runs.cache import cache_folder
+from gmijax.runs.folder import read_json, write_json
 
 _DIGEST_LENGTH = 10
 

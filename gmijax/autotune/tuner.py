@@ -29,12 +29,12 @@ from gmijax.autotune.workloads import (
     installed_versions,
 )
 from gmijax.config import AUTO, ServeConfig, TrainConfig
+from gmijax.config.schema import to_dict
 from gmijax.errors import ConfigError, GmijaxError, JobInterrupted
+from gmijax.machine.snapshot import Machine
 from gmijax.partition.backend_choice import candidates, require_num_gpus
 from gmijax.partition.layout import Layout
-from gmijax.partition.machine import Machine
-from gmijax.rundir import RunPaths, create_run, write_json
-from gmijax.schema import to_dict
+from gmijax.runs.folder import RunPaths, create_run, write_json
 from gmijax.sim.impl import choose_impl
 
 

@@ -19,15 +19,15 @@ from gmijax.config import (
     TemplateName,
     TrainConfig,
 )
+from gmijax.config.schema import to_dict
 from gmijax.errors import ConfigError
-from gmijax.partition.gmi_process import GmiStatus
+from gmijax.machine.snapshot import Machine
 from gmijax.partition.layout import Layout
-from gmijax.partition.machine import Machine
 from gmijax.partition.plan import Plan
 from gmijax.partition.planner import make_plan
-from gmijax.results import read_metrics
-from gmijax.rundir import RunPaths, read_json
-from gmijax.schema import to_dict
+from gmijax.runs.folder import RunPaths, read_json
+from gmijax.runs.history import read_metrics
+from gmijax.supervise.gmi_process import GmiStatus
 from gmijax.supervise.kinds import JobKind, serving_kind, training_kind
 from gmijax.version import __version__, versions_of
 

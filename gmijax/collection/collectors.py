@@ -30,12 +30,12 @@ from gmijax.collection.programs import (
     unroll,
 )
 from gmijax.collection.recording import CollectionStats, ShardWriter
-from gmijax.collectives.pipe import Message, PipeReader, PipeWriter
-from gmijax.collectives.pipe_block import PipeBlock
+from gmijax.collectives.messages.pipe import Message, PipeReader, PipeWriter
+from gmijax.collectives.messages.pipe_block import PipeBlock
 from gmijax.config import ServeConfig
 from gmijax.errors import PipeClosed
-from gmijax.partition.child import ChildLink
 from gmijax.sim.wrappers import BatchedEnv, BatchState, env_keys
+from gmijax.supervise.child import ChildLink
 from gmijax.types import Array
 
 WARM_UP_STEPS = 10

@@ -16,12 +16,12 @@ from typing import Final, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from gmijax.checkpoint import digest, restore_learner
-from gmijax.learner import Learner, acting_moments, init_learner, make_learner
+from gmijax.learning.checkpoint import digest, restore_learner
+from gmijax.learning.learner import Learner, acting_moments, init_learner, make_learner
+from gmijax.learning.normalize import normalize
+from gmijax.learning.policy import log_prob as log_density
 from gmijax.learning.unroll import policy_noise
-from gmijax.normalize import normalize
-from gmijax.policy import log_prob as log_density
-from gmijax.resume import trained_config
+from gmijax.runs.resume import trained_config
 from gmijax.sim.interface import EnvSpec
 from gmijax.sim.wrappers import BatchedEnv, BatchState, EpisodeSums, split_keys, zero_counts
 from gmijax.types import Array, PRNGKey, PyTree

@@ -14,11 +14,11 @@ import jax
 import numpy as np
 
 from gmijax.collection.programs import Counts, Step
-from gmijax.datadir import DataPaths
-from gmijax.metrics import EpisodeWindow, JsonlSink
-from gmijax.partition.child import ChildLink
-from gmijax.physics_health import OverflowCount, check_diverged, overflow_line
-from gmijax.rundir import write_json
+from gmijax.learning.metrics import EpisodeWindow, JsonlSink
+from gmijax.learning.physics_health import OverflowCount, check_diverged, overflow_line
+from gmijax.runs.dataset import DataPaths
+from gmijax.runs.folder import write_json
+from gmijax.supervise.child import ChildLink
 
 
 class ShardWriter:

@@ -25,7 +25,7 @@ import numpy.typing as npt
 
 from gmijax.collectives.shared_memory import create_file, map_file, round_up, whole_pages
 from gmijax.errors import CollectiveError, ConfigError
-from gmijax.processes import ProcessId, own_process
+from gmijax.machine.processes import ProcessId, own_process
 
 MAGIC = 0x58494D47  # "GMIX" in memory on a little-endian machine
 VERSION = 3

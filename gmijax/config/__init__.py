@@ -1,7 +1,7 @@
 """The configuration of a run: frozen dataclasses and their checks.
 
 No hydra and no jax here. Default values live in `configs/`, meanings live here: `--help` prints
-the `doc` of every field. `gmijax.schema.from_dict` makes them from outside data.
+the `doc` of every field. `gmijax.config.schema.from_dict` makes them from outside data.
 """
 
 from __future__ import annotations

@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal
 
+from gmijax.config.schema import KeyGroup, doc
 from gmijax.errors import ConfigError
-from gmijax.schema import KeyGroup, doc
 
 ADAPTIVE_LEARNING_RATE_RANGE = (1e-5, 1e-2)
 """Where the adaptive schedule keeps the learning rate, and so where it must begin."""

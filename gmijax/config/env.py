@@ -9,9 +9,9 @@ from pathlib import PurePath
 from types import MappingProxyType
 from typing import Literal
 
+from gmijax.config.randomization import LeafRange
+from gmijax.config.schema import KeyGroup, doc
 from gmijax.errors import ConfigError
-from gmijax.randomization import LeafRange
-from gmijax.schema import KeyGroup, doc
 
 _EXAMPLES: Mapping[str, str] = MappingProxyType(
     {"brax": "ant", "playground": "CartpoleBalance", "custom": "path/to/cart.py:make"}

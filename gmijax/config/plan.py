@@ -6,8 +6,8 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Literal
 
+from gmijax.config.schema import KeyGroup, doc, require_at_least
 from gmijax.errors import ConfigError
-from gmijax.schema import KeyGroup, doc, require_at_least
 
 BackendName = Literal["mps", "mig", "share", "cpu"]
 StrategyName = Literal["mpr", "mrr", "har", "flat", "one_shot"]

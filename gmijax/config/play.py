@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 from gmijax.config.env import PhysicsConfig
-from gmijax.schema import KeyGroup, doc, require_between
+from gmijax.config.schema import KeyGroup, doc, require_between
 
 
 @dataclass(frozen=True, kw_only=True)

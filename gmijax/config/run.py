@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from gmijax.config.schema import KeyGroup, doc
 from gmijax.errors import ConfigError
-from gmijax.schema import KeyGroup, doc
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal
 
+from gmijax.config.schema import KeyGroup, doc
 from gmijax.errors import ConfigError
-from gmijax.schema import KeyGroup, doc
 
 AUTO = "auto"
 """The value of `num_envs` and `plan.gmis_per_gpu` that the search is to find."""

@@ -7,9 +7,9 @@ from typing import Literal
 
 from gmijax.config.env import EnvConfig, PhysicsConfig
 from gmijax.config.plan import PlanConfig
+from gmijax.config.schema import KeyGroup, doc
 from gmijax.config.search import AUTO, SearchConfig
 from gmijax.errors import ConfigError
-from gmijax.schema import KeyGroup, doc
 
 _MIN_PIPE_BYTES = 1 << 20
 _PIPE_BYTES_PER_ENV = 8192

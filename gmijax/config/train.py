@@ -10,9 +10,9 @@ from gmijax.config.channel import ChannelConfig
 from gmijax.config.env import EnvConfig, PhysicsConfig
 from gmijax.config.plan import PlanConfig, ReduceConfig
 from gmijax.config.run import RunConfig
+from gmijax.config.schema import KeyGroup, doc
 from gmijax.config.search import SearchConfig
 from gmijax.errors import ConfigError
-from gmijax.schema import KeyGroup, doc
 
 AlgoConfig: TypeAlias = PpoConfig | A3cConfig
 """The training algorithms; `algo.name` says which."""

@@ -17,9 +17,9 @@ from rich.live import Live
 from rich.markup import escape
 from rich.table import Table
 
-from gmijax.partition.gmi_process import GmiStatus
 from gmijax.partition.plan import Plan
-from gmijax.rundir import RunPaths
+from gmijax.runs.folder import RunPaths
+from gmijax.supervise.gmi_process import GmiStatus
 
 _LINE_EVERY_S = 5.0
 _BAR_WIDTH = 30

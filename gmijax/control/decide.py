@@ -10,7 +10,7 @@ from rich.console import Console
 from gmijax.autotune.tuner import with_auto_decided
 from gmijax.config import ReduceConfig, ServeConfig, TrainConfig
 from gmijax.control.selection import estimated_floats, with_measured
-from gmijax.partition.machine import Machine, detect_machine
+from gmijax.machine.snapshot import Machine, detect_machine
 from gmijax.partition.plan import Plan
 from gmijax.partition.planner import make_plan
 from gmijax.sim import source

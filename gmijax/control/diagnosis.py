@@ -13,10 +13,10 @@ from typing import Any, Final, NamedTuple
 from gmijax.config import BackendName, StrategyName
 from gmijax.control.system_info import REQUIRED, SystemInfo, device_of
 from gmijax.errors import ConfigError
+from gmijax.machine.mps_control import PIPE_VARIABLE
+from gmijax.machine.snapshot import Machine
 from gmijax.partition.backend_choice import why_not_backend
 from gmijax.partition.layout import Layout
-from gmijax.partition.machine import Machine
-from gmijax.partition.mps_control import PIPE_VARIABLE
 from gmijax.partition.reduction import (
     LEAST_BINDINGS,
     why_not_intra,

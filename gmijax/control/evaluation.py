@@ -17,24 +17,24 @@ from rich.markup import escape
 from rich.table import Table
 
 from gmijax.config import PlanConfig, PlayConfig, ReduceConfig
+from gmijax.config.schema import to_dict
 from gmijax.control.console import open_console
 from gmijax.control.pictures import film, has_brax, write_page
 from gmijax.errors import ConfigError, GmijaxError
-from gmijax.partition.machine import Machine, detect_machine
+from gmijax.machine.snapshot import Machine, detect_machine
 from gmijax.partition.planner import make_plan
-from gmijax.partition.supervisor import Patience
-from gmijax.resume import CheckpointMeta, find_checkpoint, trained_config
-from gmijax.rundir import META, STEP_DIGITS, PlayPaths, RunPaths, read_json, write_json
-from gmijax.schema import to_dict
+from gmijax.runs.folder import META, STEP_DIGITS, PlayPaths, RunPaths, read_json, write_json
+from gmijax.runs.resume import CheckpointMeta, find_checkpoint, trained_config
 from gmijax.sim import source
 from gmijax.sim.registry import require_task
 from gmijax.supervise.kinds import JobKind
 from gmijax.supervise.launcher import Launch, run_gmis
+from gmijax.supervise.supervisor import Timeouts
 
 MEMORY_FRACTION: Final = 0.1
 """Most of a GPU's memory that playing takes: beside a training job that reserves 0.8."""
 
-_PATIENCE: Final = Patience(
+_TIMEOUTS: Final = Timeouts(
     start_timeout_s=1200.0, stall_timeout_s=600.0, stop_timeout_s=60.0, grace_s=10.0
 )
 
@@ -157,7 +157,7 @@ def _launch(config: PlayConfig, paths: PlayPaths, machine: Machine) -> Launch:
         machine=machine,
         run=RunPaths(paths.root),
         kind=JobKind("gmijax.workers.playback"),
-        patience=_PATIENCE,
+        timeouts=_TIMEOUTS,
         stops_gracefully=False,
         # The GPU may be training: take what is needed when it is needed, up to the fraction.
         variables={"XLA_PYTHON_CLIENT_PREALLOCATE": "false"},

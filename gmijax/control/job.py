@@ -15,20 +15,20 @@ from typing import Any, NamedTuple
 from rich.console import Console
 
 from gmijax.config import TrainConfig
-from gmijax.control.beginnings import Beginning, find_beginning
+from gmijax.config.schema import to_dict
 from gmijax.control.console import ConsoleProgress, announce, open_console
 from gmijax.control.decide import Decided, decide, with_task
 from gmijax.control.restarts import Attempts, clear_unfinished, with_gpus_left
+from gmijax.control.start_point import StartPoint, find_start_point
 from gmijax.control.summary import train_outcome, train_summary
-from gmijax.partition.machine import detect_machine
+from gmijax.machine.snapshot import detect_machine
 from gmijax.partition.plan import Plan
-from gmijax.results import MetricsReader, copy_history, draw_returns
-from gmijax.resume import CheckpointMeta, saved_config
-from gmijax.rundir import RunPaths, add_event, locked, read_json, write_json
-from gmijax.schema import to_dict
+from gmijax.runs.folder import RunPaths, add_event, locked, read_json, write_json
+from gmijax.runs.history import MetricsReader, copy_history, draw_returns
+from gmijax.runs.resume import CheckpointMeta, saved_config
 from gmijax.sim import source
 from gmijax.supervise.kinds import training_kind
-from gmijax.supervise.launcher import Launch, patience_of, recorded
+from gmijax.supervise.launcher import Launch, recorded, timeouts_of
 
 
 class Result(NamedTuple):
@@ -59,7 +59,7 @@ def train(config: TrainConfig, *, show: bool = False) -> Result:
     """
     started_s = time.monotonic()
     config = with_task(config)
-    beginning = find_beginning(config)
+    beginning = find_start_point(config)
     console = open_console(show=show)
     if beginning.is_complete and beginning.folder is not None:
         return _finished(config, beginning.folder, console)
@@ -91,7 +91,7 @@ class _Job:
         self._console = console
         self._attempts = Attempts(run, self._config.run.max_restarts, self._launch_at, self._say)
 
-    def run_to_the_end(self, beginning: Beginning, started_s: float) -> None:
+    def run_to_the_end(self, beginning: StartPoint, started_s: float) -> None:
         """Runs it, with restarts; writes the summary however it ends."""
         config, run = self._config, self._run
         latest = MetricsReader(run.metrics).latest
@@ -111,7 +111,7 @@ class _Job:
             with progress:
                 self._attempts.run_to_the_end(beginning.checkpoint, progress.update)
 
-    def _prepare(self, beginning: Beginning) -> None:
+    def _prepare(self, beginning: StartPoint) -> None:
         checkpoint = beginning.checkpoint
         if beginning.folder is not None:
             clear_unfinished(self._run, checkpoint)
@@ -130,7 +130,7 @@ class _Job:
             machine=self._machine,
             run=self._run,
             kind=training_kind(config),
-            patience=patience_of(config.run),
+            timeouts=timeouts_of(config.run),
             on_warning=self._say,
         )
 

@@ -19,12 +19,12 @@ from typing import Any, NamedTuple
 
 from gmijax.config import PlanConfig, TrainConfig
 from gmijax.errors import BackendUnavailable, ConfigError, GmiFailed, JobInterrupted
-from gmijax.partition.gmi_process import GmiStatus
-from gmijax.partition.machine import Machine
+from gmijax.machine.snapshot import Machine
 from gmijax.partition.plan import Plan
-from gmijax.results import copy_history
-from gmijax.resume import CheckpointMeta, newest_checkpoint
-from gmijax.rundir import RunPaths, add_event, remove_temporary
+from gmijax.runs.folder import RunPaths, add_event, remove_temporary
+from gmijax.runs.history import copy_history
+from gmijax.runs.resume import CheckpointMeta, newest_checkpoint
+from gmijax.supervise.gmi_process import GmiStatus
 from gmijax.supervise.kinds import training_plan
 from gmijax.supervise.launcher import Launch, OnTick, StopSignals, run_gmis, stop_signals
 

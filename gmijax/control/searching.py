@@ -6,11 +6,11 @@ import dataclasses
 
 from gmijax.autotune.tuner import Search, SearchResult, is_auto, workload_of
 from gmijax.config import TrainConfig
+from gmijax.config.schema import to_dict
 from gmijax.control.console import open_console
 from gmijax.errors import ConfigError
-from gmijax.partition.machine import detect_machine
-from gmijax.rundir import create_run, write_json
-from gmijax.schema import to_dict
+from gmijax.machine.snapshot import detect_machine
+from gmijax.runs.folder import create_run, write_json
 from gmijax.sim import source
 from gmijax.sim.registry import require_task
 

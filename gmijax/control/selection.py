@@ -17,9 +17,8 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from gmijax.cachedir import cache_folder
 from gmijax.collectives.memory import create_exchange
-from gmijax.partition.machine import Machine
+from gmijax.machine.snapshot import Machine
 from gmijax.partition.plan import Plan
 from gmijax.partition.reduction import (
     STRATEGIES,
@@ -29,11 +28,12 @@ from gmijax.partition.reduction import (
     why_not_strategy,
     why_not_under,
 )
-from gmijax.partition.supervisor import Patience
 from gmijax.partition.templates import TRAINER, has_role
-from gmijax.rundir import RunPaths, read_json, write_json
+from gmijax.runs.cache import cache_folder
+from gmijax.runs.folder import RunPaths, read_json, write_json
 from gmijax.supervise.kinds import JobKind
 from gmijax.supervise.launcher import Launch, run_gmis
+from gmijax.supervise.supervisor import Timeouts
 from gmijax.version import versions_of
 
 CHAIN = 8
@@ -41,7 +41,7 @@ CHAIN = 8
 
 TIMEOUT_S = 120.0
 CALLS = 40
-PATIENCE = Patience(start_timeout_s=300, stall_timeout_s=120, stop_timeout_s=60, grace_s=5)
+TIMEOUTS = Timeouts(start_timeout_s=300, stall_timeout_s=120, stop_timeout_s=60, grace_s=5)
 
 _PACKAGES = ("jax", "jaxlib", "nvidia-nccl-cu12", "nvidia-nccl-cu13", "cuda-bindings")
 _TYPICAL_INPUTS, _TYPICAL_OUTPUTS = 64, 16
@@ -177,7 +177,7 @@ def measure(
                     compile_once=False,
                     shared=lambda _: {block_variable(k): create_exchange for k in numbers},
                 ),
-                patience=PATIENCE,
+                timeouts=TIMEOUTS,
             )
         )
         found = [read_json(run.gmi(gmi).result) for gmi in plan.layout.gmis]

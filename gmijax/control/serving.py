@@ -19,17 +19,16 @@ from typing import Any, NamedTuple
 from rich.console import Console
 
 from gmijax.config import ServeConfig
+from gmijax.config.schema import to_dict
 from gmijax.control.console import ConsoleProgress, announce, open_console
 from gmijax.control.decide import decide, with_task
 from gmijax.control.summary import serve_outcome, serve_summary
-from gmijax.datadir import DataPaths, open_dataset
 from gmijax.errors import ConfigError
-from gmijax.partition.machine import Machine
+from gmijax.machine.snapshot import Machine
 from gmijax.partition.plan import Plan
 from gmijax.partition.templates import SIMULATOR, group_of
-from gmijax.results import MetricsReader
-from gmijax.resume import CheckpointMeta, find_checkpoint, trained_config
-from gmijax.rundir import (
+from gmijax.runs.dataset import DataPaths, open_dataset
+from gmijax.runs.folder import (
     RunPaths,
     create_run,
     locked,
@@ -37,9 +36,10 @@ from gmijax.rundir import (
     require_new_run,
     write_json,
 )
-from gmijax.schema import to_dict
+from gmijax.runs.history import MetricsReader
+from gmijax.runs.resume import CheckpointMeta, find_checkpoint, trained_config
 from gmijax.supervise.kinds import serving_kind
-from gmijax.supervise.launcher import Launch, patience_of, recorded, run_gmis
+from gmijax.supervise.launcher import Launch, recorded, run_gmis, timeouts_of
 
 
 class Served(NamedTuple):
@@ -219,7 +219,7 @@ def _run(job: _Job, kept: int, run: RunPaths, console: Console) -> dict[str, Any
         machine=job.machine,
         run=run,
         kind=serving_kind(job.config),
-        patience=patience_of(job.config.run),
+        timeouts=timeouts_of(job.config.run),
         on_warning=lambda text: console.print(text, markup=False),
     )
     with recorded(run, partial(_what_is_left, job), record), progress:

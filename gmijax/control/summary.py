@@ -10,11 +10,11 @@ from typing import Any
 import numpy as np
 
 from gmijax.config import ServeConfig, TrainConfig
+from gmijax.learning.physics_health import overflow_warnings
 from gmijax.partition.plan import Plan
-from gmijax.physics_health import overflow_warnings
-from gmijax.results import read_metrics
-from gmijax.resume import CheckpointMeta
-from gmijax.rundir import RunPaths, read_json
+from gmijax.runs.folder import RunPaths, read_json
+from gmijax.runs.history import read_metrics
+from gmijax.runs.resume import CheckpointMeta
 from gmijax.version import __version__, versions_of
 
 _ASYNCHRONOUS = ("pps", "ttop", "staleness", "bytes_per_s", "dropped")

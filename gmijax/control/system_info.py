@@ -14,11 +14,11 @@ from typing import Final, NamedTuple
 
 from gmijax.config import PlanConfig, ReduceConfig
 from gmijax.errors import GmijaxError
-from gmijax.partition.backends.mps import MpsBackend
-from gmijax.partition.machine import Machine, detect_machine
-from gmijax.partition.nvidia import Gpu, nvml_problem
+from gmijax.machine.nvidia import Gpu, nvml_problem
+from gmijax.machine.snapshot import Machine, detect_machine
 from gmijax.partition.planner import make_plan
-from gmijax.rundir import RunPaths
+from gmijax.runs.folder import RunPaths
+from gmijax.supervise.backends.mps import MpsBackend
 from gmijax.version import pinned_version, versions_of
 
 PROBE_TIMEOUT_S: Final = 120.0

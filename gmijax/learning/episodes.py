@@ -16,7 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 import numpy.typing as npt
 
-from gmijax.learner import Learner, LearnerState, acting_weights
+from gmijax.learning.learner import Learner, TrainState, acting_weights
 from gmijax.learning.unroll import act, unroll
 from gmijax.sim.divergence import diverged_by_source, end_diverged
 from gmijax.sim.interface import Env, EnvState
@@ -77,7 +77,7 @@ class Episodes(NamedTuple):
 def run_episodes(
     env: Env,
     learner: Learner,
-    state: LearnerState,
+    state: TrainState,
     options: Options,
     on_progress: Callable[[int], None],
 ) -> Episodes:
@@ -138,7 +138,7 @@ def _run_chunk(
     learner: Learner,
     options: Options,
     model: PyTree,
-    state: LearnerState,
+    state: TrainState,
     limit: Array,
     batch: BatchState,
 ) -> tuple[BatchState, Array, Array]:

@@ -8,15 +8,15 @@ from pathlib import Path
 import jax
 import jax.numpy as jnp
 
-from gmijax.checkpoint import has_envs, restore_envs, restore_learner
 from gmijax.config import TrainConfig
-from gmijax.learner import Learner, LearnerState, init_learner
-from gmijax.resume import CheckpointMeta
-from gmijax.rundir import RunPaths, read_json
+from gmijax.learning.checkpoint import has_envs, restore_envs, restore_learner
+from gmijax.learning.learner import Learner, TrainState, init_learner
+from gmijax.runs.folder import RunPaths, read_json
+from gmijax.runs.resume import CheckpointMeta
 from gmijax.sim.wrappers import BatchedEnv, BatchState, env_keys
 
 
-def first_state(learner: Learner, obs_size: int, config: TrainConfig) -> tuple[LearnerState, int]:
+def first_state(learner: Learner, obs_size: int, config: TrainConfig) -> tuple[TrainState, int]:
     """The learner's state, and the environment steps that it has learnt from.
 
     Raises:

@@ -17,7 +17,7 @@ import numpy as np
 
 from gmijax.collectives.interface import Reducer
 from gmijax.config import TrainConfig
-from gmijax.learner import Learner, LearnerState, acting_weights
+from gmijax.learning.learner import Learner, TrainState, acting_weights
 from gmijax.learning.unroll import act, unroll
 from gmijax.sim.wrappers import BatchedEnv, BatchState, split_keys
 from gmijax.types import Array, PyTree
@@ -48,7 +48,7 @@ class ThroughputMeter:
             for choose in (partial(_random, env), partial(_policy, learner))
         ]
 
-    def trace(self, state: LearnerState, env_state: BatchState) -> None:
+    def trace(self, state: TrainState, env_state: BatchState) -> None:
         """Traces both programs; part of the start, whose time limit it needs."""
         lowered = (program.lower(self._model, state, env_state) for program in self._programs)
         self._programs = list(lowered)
@@ -58,7 +58,7 @@ class ThroughputMeter:
         self._programs = [program.compile() for program in self._programs]
 
     def measure(
-        self, state: LearnerState, env_state: BatchState, beat: Callable[[], None]
+        self, state: TrainState, env_state: BatchState, beat: Callable[[], None]
     ) -> Throughput:
         """Measures; `env_state` is donated, `beat` is called after every unroll."""
         rates = []
@@ -98,16 +98,16 @@ class ThroughputMeter:
 
 def _moved(
     env: BatchedEnv,
-    choose: Callable[[LearnerState, BatchState], tuple[BatchState, Array, Array]],
+    choose: Callable[[TrainState, BatchState], tuple[BatchState, Array, Array]],
     length: int,
     model: PyTree,
-    state: LearnerState,
+    state: TrainState,
     env_state: BatchState,
 ) -> BatchState:
     return unroll(env, partial(choose, state), length, lambda *_: None, model, env_state)[0]
 
 
-def _random(env: BatchedEnv, _: LearnerState, envs: BatchState) -> tuple[BatchState, Array, Array]:
+def _random(env: BatchedEnv, _: TrainState, envs: BatchState) -> tuple[BatchState, Array, Array]:
     envs, keys = split_keys(envs)
     size = (env.spec.action_size,)
     actions = jax.vmap(lambda k: jax.random.uniform(k, size, minval=-1.0))(keys)
@@ -115,6 +115,6 @@ def _random(env: BatchedEnv, _: LearnerState, envs: BatchState) -> tuple[BatchSt
 
 
 def _policy(
-    learner: Learner, state: LearnerState, envs: BatchState
+    learner: Learner, state: TrainState, envs: BatchState
 ) -> tuple[BatchState, Array, Array]:
     return act(learner.networks, acting_weights(learner, state), envs)

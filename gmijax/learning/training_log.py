@@ -6,10 +6,15 @@ import time
 from collections.abc import Iterable, Mapping
 from typing import Any, NamedTuple
 
-from gmijax.metrics import EpisodeWindow, JsonlSink, Line, Sink, TensorBoardSink
-from gmijax.physics_health import OverflowCount, check_diverged, check_losses, overflow_line
-from gmijax.results import read_metrics
-from gmijax.rundir import RunPaths
+from gmijax.learning.metrics import EpisodeWindow, JsonlSink, Line, Sink, TensorBoardSink
+from gmijax.learning.physics_health import (
+    OverflowCount,
+    check_diverged,
+    check_losses,
+    overflow_line,
+)
+from gmijax.runs.folder import RunPaths
+from gmijax.runs.history import read_metrics
 
 
 class Learnt(NamedTuple):

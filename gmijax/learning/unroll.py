@@ -8,9 +8,9 @@ from typing import Any, NamedTuple, TypeAlias, TypeVar
 import jax
 import jax.numpy as jnp
 
-from gmijax.learner import ActingWeights
-from gmijax.normalize import normalize
-from gmijax.policy import ActorCritic
+from gmijax.learning.learner import ActingWeights
+from gmijax.learning.normalize import normalize
+from gmijax.learning.policy import ActorCritic
 from gmijax.sim.interface import EnvSpec
 from gmijax.sim.wrappers import (
     BatchedEnv,

@@ -16,8 +16,8 @@ from jax.sharding import Sharding
 from gmijax.collectives.interface import FloatBuffer, Peers, Reducer, stays_on_device
 from gmijax.config import AlgoConfig
 from gmijax.devices import host_sharding
-from gmijax.learner import Learner, LearnerState, apply_gradients, learner_shapes
-from gmijax.policy import ActorCriticParams
+from gmijax.learning.learner import Learner, TrainState, apply_gradients, learner_shapes
+from gmijax.learning.policy import ActorCriticParams
 from gmijax.sim.interface import EnvSpec
 from gmijax.types import Array, PyTree
 
@@ -29,7 +29,7 @@ Mean: TypeAlias = Callable[[Array], Array | FloatBuffer]
 """From a rank's gradient to the mean of all."""
 
 
-def minibatch_order(config: AlgoConfig, state: LearnerState, rank: Array, size: int) -> Array:
+def minibatch_order(config: AlgoConfig, state: TrainState, rank: Array, size: int) -> Array:
     """Indices [epochs * minibatches, B] into data of length `size`: each once per epoch."""
     key = jax.random.fold_in(jax.random.fold_in(state.key, state.iteration), rank)
     keys = jax.random.split(key, config.num_updates_per_batch)
@@ -52,11 +52,11 @@ def run_updates(
     learner: Learner,
     peers: Peers | None,
     gradients: Gradients,
-    state: LearnerState,
+    state: TrainState,
     data: PyTree,
     context: Any,
     order: Array,
-) -> tuple[LearnerState, Any, Array]:
+) -> tuple[TrainState, Any, Array]:
     """All updates on one set of data, within a program of all trainers.
 
     Args:
@@ -72,7 +72,7 @@ def run_updates(
       The new state; losses and learning rates of all updates, with a leading axis.
     """
 
-    def update(state: LearnerState, indices: Array) -> tuple[LearnerState, tuple[Any, Array]]:
+    def update(state: TrainState, indices: Array) -> tuple[TrainState, tuple[Any, Array]]:
         grads, losses = gradients(learner, state.params, data, context, indices)
         if peers is not None:
             packed, unpack = ravel_pytree((grads, losses))
@@ -113,7 +113,7 @@ class SplitUpdates:
         )
         self._apply: Any = jax.jit(self._apply_fn, donate_argnums=(0,))
 
-    def trace(self, state: LearnerState, data: Any, context: Any, order: Any) -> list[Any]:
+    def trace(self, state: TrainState, data: Any, context: Any, order: Any) -> list[Any]:
         """Traces all programs, for arguments that may be shapes only; shapes for `summary`."""
         rest = data, context, order, jax.ShapeDtypeStruct((), jnp.int32)
         self._gradient = self._gradient.lower(state.params, *rest)
@@ -131,11 +131,11 @@ class SplitUpdates:
         self._apply = self._apply.compile()
 
     def __call__(
-        self, state: LearnerState, data: Any, context: Any, order: Array
-    ) -> tuple[LearnerState, list[Array]]:
+        self, state: TrainState, data: Any, context: Any, order: Array
+    ) -> tuple[TrainState, list[Array]]:
         """As `run_updates`; the second result is for `summary`, and `state` is donated."""
 
-        def updates(mean: Mean) -> tuple[LearnerState, list[Array]]:
+        def updates(mean: Mean) -> tuple[TrainState, list[Array]]:
             return self._updates(mean, state, data, context, order)
 
         if stays_on_device(self._reducer):
@@ -153,8 +153,8 @@ class SplitUpdates:
         return self._losses(*jnp.mean(stacked[:, :-1], axis=0)), stacked[:, -1]
 
     def _updates(
-        self, mean: Mean, state: LearnerState, data: Any, context: Any, order: Array
-    ) -> tuple[LearnerState, list[Array]]:
+        self, mean: Mean, state: TrainState, data: Any, context: Any, order: Array
+    ) -> tuple[TrainState, list[Array]]:
         losses: list[Array] = []
         buffer = self._gradient(state.params, data, context, order, np.int32(0))
         for index in range(1, order.shape[0]):
@@ -180,7 +180,7 @@ class SplitUpdates:
         grads, losses = self._gradients(self._learner, params, data, context, order[index])
         return jnp.concatenate([ravel_pytree(grads)[0], jnp.stack(losses)])
 
-    def _apply_fn(self, state: LearnerState, buffer: Array) -> tuple[LearnerState, Array]:
+    def _apply_fn(self, state: TrainState, buffer: Array) -> tuple[TrainState, Array]:
         unravel, count = ravel_pytree(state.params)[1], len(self._losses._fields)
         gradient, losses = unravel(buffer[:-count]), buffer[-count:]
         kl = self._losses(*losses).steering_kl
@@ -189,13 +189,13 @@ class SplitUpdates:
 
     def _update_fn(
         self,
-        state: LearnerState,
+        state: TrainState,
         buffer: Array,
         data: Any,
         context: Any,
         order: Array,
         index: Array,
-    ) -> tuple[LearnerState, Array, Array]:
+    ) -> tuple[TrainState, Array, Array]:
         # Between two exchanges there is one program, not two: each start of one costs time on
         # the host, and that is most of what a small network's update takes.
         state, losses = self._apply_fn(state, buffer)

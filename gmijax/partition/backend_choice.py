@@ -11,9 +11,9 @@ from typing import Final
 
 from gmijax.config import BackendName, PlanConfig
 from gmijax.errors import BackendUnavailable, ConfigError
+from gmijax.machine.nvidia import Gpu
+from gmijax.machine.snapshot import Machine
 from gmijax.partition.layout import Layout
-from gmijax.partition.machine import Machine
-from gmijax.partition.nvidia import Gpu
 
 WHAT_SHARE_LOSES: Final = (
     "the GMIs of a GPU take turns; with MPS they were 2.0 to 2.9 times as fast"

@@ -10,11 +10,11 @@ from itertools import pairwise
 
 from gmijax.config import BackendName, PlanConfig, ReduceConfig, TemplateName
 from gmijax.errors import ConfigError
+from gmijax.machine.host_limits import require_room
+from gmijax.machine.nvidia import Gpu
+from gmijax.machine.snapshot import Machine
 from gmijax.partition.backend_choice import choose_backend, choose_gpus, require_backend
-from gmijax.partition.host_limits import require_room
 from gmijax.partition.layout import Layout
-from gmijax.partition.machine import Machine
-from gmijax.partition.nvidia import Gpu
 from gmijax.partition.plan import Plan, Slice
 from gmijax.partition.reduction import (
     is_one_per_gpu,

@@ -11,8 +11,8 @@ from typing import Final
 
 from gmijax.config import BackendName, PlanConfig, Priority
 from gmijax.errors import ConfigError
+from gmijax.machine.nvidia import Gpu, MigInstance
 from gmijax.partition.layout import Layout
-from gmijax.partition.nvidia import Gpu, MigInstance
 from gmijax.partition.plan import Slice
 
 DEFAULT_MEMORY_FRACTION: Final = 0.8

@@ -13,7 +13,7 @@ from jax.flatten_util import ravel_pytree
 
 from gmijax.collectives.interface import FloatBuffer, Reducer, TracedStep, stays_on_device
 from gmijax.devices import host_sharding
-from gmijax.learner import LearnerState, acting_weights
+from gmijax.learning.learner import TrainState, acting_weights
 from gmijax.learning.updates import SplitUpdates, minibatch_order
 from gmijax.ppo.ppo import (
     IterationMetrics,
@@ -79,7 +79,7 @@ class LocalRollouts:
             functools.partial(_packed_rollout, env, learner), donate_argnums=(2,)
         )
 
-    def trace(self, model: PyTree, state: LearnerState, env_state: Any) -> tuple[Any, Any, Any]:
+    def trace(self, model: PyTree, state: TrainState, env_state: Any) -> tuple[Any, Any, Any]:
         """Traces the program; shapes of the last three results of a call."""
         self._model = model
         self._program = self._program.lower(model, state, env_state, self._rank)
@@ -90,7 +90,7 @@ class LocalRollouts:
         self._program = self._program.compile()
 
     def __call__(
-        self, state: LearnerState, env_state: BatchState
+        self, state: TrainState, env_state: BatchState
     ) -> tuple[BatchState, Samples, Array, FloatBuffer]:
         """Makes a rollout; `env_state` is donated.
 
@@ -108,7 +108,7 @@ def _packed_rollout(
     env: BatchedEnv,
     learner: PpoLearner,
     model: PyTree,
-    state: LearnerState,
+    state: TrainState,
     env_state: BatchState,
     rank: Array,
 ) -> tuple[BatchState, Samples, Array, Array]:
@@ -154,7 +154,7 @@ class SplitIteration:
             self._finish_fn, donate_argnums=(0,), out_shardings=(None, host) if host else None
         )
 
-    def trace(self, model: PyTree, state: LearnerState, env_state: Any) -> None:
+    def trace(self, model: PyTree, state: TrainState, env_state: Any) -> None:
         """See `TracedStep`."""
         samples, order, packed = self._rollouts.trace(model, state, env_state)
         gathered = jax.ShapeDtypeStruct((self._reducer.world_size, *packed.shape), jnp.float32)
@@ -171,8 +171,8 @@ class SplitIteration:
         self._finish = self._finish.compile()
 
     def __call__(
-        self, state: LearnerState, env_state: Any
-    ) -> tuple[LearnerState, Any, IterationMetrics]:
+        self, state: TrainState, env_state: Any
+    ) -> tuple[TrainState, Any, IterationMetrics]:
         """See `TracedStep`."""
         started = time.monotonic()
         env_state, samples, order, packed = self._rollouts(state, env_state)
@@ -193,15 +193,13 @@ class SplitIteration:
     def wait(self) -> None:
         """See `TracedStep`; a call returns after the last exchange."""
 
-    def _begin_fn(
-        self, state: LearnerState, gathered: Array
-    ) -> tuple[UpdateContext, RolloutStats]:
+    def _begin_fn(self, state: TrainState, gathered: Array) -> tuple[UpdateContext, RolloutStats]:
         stats = merge_stats(jax.vmap(self._unpack_stats)(gathered))
         return update_context(self._learner, state, stats), stats
 
     def _finish_fn(
-        self, state: LearnerState, stats: RolloutStats, figures: list[Array]
-    ) -> tuple[LearnerState, IterationMetrics]:
+        self, state: TrainState, stats: RolloutStats, figures: list[Array]
+    ) -> tuple[TrainState, IterationMetrics]:
         return finish(self._learner, state, stats, *self._updates.summary(figures))
 
 

@@ -15,7 +15,11 @@ from typing import Any
 import jax
 import numpy as np
 
-from gmijax.checkpoint import (
+from gmijax.collectives.interface import Reducer
+from gmijax.config import PpoConfig, TrainConfig
+from gmijax.devices import describe_device
+from gmijax.errors import CollectiveError
+from gmijax.learning.checkpoint import (
     checkpoint_meta,
     finish_checkpoint,
     require_equal,
@@ -23,21 +27,17 @@ from gmijax.checkpoint import (
     save_envs,
     save_learner,
 )
-from gmijax.collectives.interface import Reducer
-from gmijax.config import PpoConfig, TrainConfig
-from gmijax.devices import describe_device
-from gmijax.errors import CollectiveError
-from gmijax.learner import LearnerState, make_learner
+from gmijax.learning.learner import TrainState, make_learner
 from gmijax.learning.report_thread import ReportThread
 from gmijax.learning.start import first_envs, first_state
 from gmijax.learning.throughput import ThroughputMeter
 from gmijax.learning.training_log import Learnt, TrainingLog
-from gmijax.partition.child import ChildLink
 from gmijax.ppo.iteration import SplitIteration, make_iteration, times_of
 from gmijax.ppo.ppo import IterationMetrics
 from gmijax.ppo.tdg_ex import RemoteRollouts, RolloutWorkers
-from gmijax.rundir import write_json
+from gmijax.runs.folder import write_json
 from gmijax.sim.wrappers import BatchedEnv
+from gmijax.supervise.child import ChildLink
 
 
 class TrainingLoop:
@@ -142,7 +142,7 @@ class TrainingLoop:
             num_gmis=self._reducer.world_size,
         )
 
-    def _compile(self, state: LearnerState, env_state: Any) -> float:
+    def _compile(self, state: TrainState, env_state: Any) -> float:
         """Makes all programs; returns the seconds for which it was not this GMI's turn."""
         # Every GMI does that itself, at the same time.
         self._iteration.trace(self._env.model, state, env_state)
@@ -161,8 +161,8 @@ class TrainingLoop:
         return TrainingLog.open(name, self._link.run, self._env_steps)
 
     def _train(
-        self, state: LearnerState, env_state: Any, log: TrainingLog
-    ) -> tuple[LearnerState, Any, bool]:
+        self, state: TrainState, env_state: Any, log: TrainingLog
+    ) -> tuple[TrainState, Any, bool]:
         """Trains to the end; returns also whether it was asked to stop."""
         thread = ReportThread(lambda *line: report(log, *line))
         try:
@@ -178,8 +178,8 @@ class TrainingLoop:
         return trained
 
     def _loop(
-        self, state: LearnerState, env_state: Any, thread: ReportThread, log: TrainingLog
-    ) -> tuple[LearnerState, Any, bool]:
+        self, state: TrainState, env_state: Any, thread: ReportThread, log: TrainingLog
+    ) -> tuple[TrainState, Any, bool]:
         every = self._config.run.checkpoint_every
         stop = False
         while self._env_steps < self._config.num_timesteps and not stop:
@@ -202,7 +202,7 @@ class TrainingLoop:
         return bool(self._reducer.all_gather(mine).any())
 
     def _save(
-        self, state: LearnerState, env_state: Any, thread: ReportThread, log: TrainingLog
+        self, state: TrainState, env_state: Any, thread: ReportThread, log: TrainingLog
     ) -> None:
         self._iteration.wait()
         thread.wait()  # A resumed run goes on from the lines up to its checkpoint.

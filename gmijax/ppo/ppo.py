@@ -19,17 +19,15 @@ from jax.flatten_util import ravel_pytree
 
 from gmijax.collectives.interface import Peers
 from gmijax.config import PpoConfig
-from gmijax.learner import (
+from gmijax.learning.learner import (
     ActingWeights,
     Learner,
-    LearnerState,
+    TrainState,
     acting_weights,
     rate_figures,
 )
 from gmijax.learning.losses import bound_loss, clipped_surrogate
-from gmijax.learning.unroll import Counts, Outcome, act, count, no_counts, outcome_of, unroll
-from gmijax.learning.updates import minibatch_order, run_updates
-from gmijax.normalize import (
+from gmijax.learning.normalize import (
     Moments,
     merge,
     merge_all,
@@ -39,7 +37,9 @@ from gmijax.normalize import (
     std_of,
     without_outliers,
 )
-from gmijax.policy import ActorCritic, ActorCriticParams, entropy, kl_divergence, log_prob
+from gmijax.learning.policy import ActorCritic, ActorCriticParams, entropy, kl_divergence, log_prob
+from gmijax.learning.unroll import Counts, Outcome, act, count, no_counts, outcome_of, unroll
+from gmijax.learning.updates import minibatch_order, run_updates
 from gmijax.sim.interface import EnvSpec
 from gmijax.sim.wrappers import BatchedEnv, BatchState, StepOutput
 from gmijax.types import Array, PyTree
@@ -285,7 +285,7 @@ def gradients(
     )
 
 
-def update_context(learner: PpoLearner, state: LearnerState, stats: RolloutStats) -> UpdateContext:
+def update_context(learner: PpoLearner, state: TrainState, stats: RolloutStats) -> UpdateContext:
     """The constants of an iteration's updates; `stats` are those of all GMIs together."""
     mean, std = stats.advantage.mean, std_of(stats.advantage)
     if not learner.config.normalize_advantage:
@@ -297,11 +297,11 @@ def update_context(learner: PpoLearner, state: LearnerState, stats: RolloutStats
 def learn(
     learner: PpoLearner,
     peers: Peers | None,
-    state: LearnerState,
+    state: TrainState,
     samples: Samples,
     stats: RolloutStats,
     rank: Array,
-) -> tuple[LearnerState, IterationMetrics]:
+) -> tuple[TrainState, IterationMetrics]:
     """All updates of an iteration, on flat samples."""
     context = update_context(learner, state, stats)
     order = minibatch_order(learner.config, state, rank, samples.advantage.shape[0])
@@ -310,8 +310,8 @@ def learn(
 
 
 def finish(
-    learner: PpoLearner, state: LearnerState, stats: RolloutStats, losses: PpoLosses, rates: Array
-) -> tuple[LearnerState, IterationMetrics]:
+    learner: PpoLearner, state: TrainState, stats: RolloutStats, losses: PpoLosses, rates: Array
+) -> tuple[TrainState, IterationMetrics]:
     """Counts the iteration and takes its observations into the statistics.
 
     The statistics change only between iterations: the policy that is updated then sees the
@@ -332,9 +332,9 @@ def iterate(
     learner: PpoLearner,
     peers: Peers | None,
     model: PyTree,
-    state: LearnerState,
+    state: TrainState,
     env_state: BatchState,
-) -> tuple[LearnerState, BatchState, IterationMetrics]:
+) -> tuple[TrainState, BatchState, IterationMetrics]:
     """One iteration, together with the GMIs `peers` if there are others."""
     weights = acting_weights(learner, state)
     env_state, samples, stats = rollout(env, learner, model, weights, env_state)

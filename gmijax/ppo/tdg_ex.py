@@ -18,22 +18,22 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 
 from gmijax.collectives.interface import FloatBuffer
-from gmijax.learner import (
+from gmijax.learning.learner import (
     ActingWeights,
-    LearnerState,
+    TrainState,
     acting_weights,
     init_learner,
     pack_weights,
 )
 from gmijax.learning.updates import minibatch_order
-from gmijax.partition.heartbeat import GmiState
 from gmijax.ppo.ppo import PpoLearner, Samples, flatten, merge_stats, no_stats, rollout
 from gmijax.sim.wrappers import BatchedEnv, BatchState
+from gmijax.supervise.heartbeat import GmiState
 from gmijax.types import Array, PyTree
 
 
 class Mail(Protocol):
-    """Messages between GMIs, see `gmijax.collectives.messenger`."""
+    """Messages between GMIs, see `gmijax.collectives.messages.messenger`."""
 
     def send(self, tree: Any, dst: int) -> None:
         """Sends nested data to GMI `dst`, without waiting for it."""
@@ -71,7 +71,7 @@ class RemoteRollouts:
         self._first: tuple[list[Samples], list[np.ndarray]] | None = None
         self._timeout_s: float | None = workers.start_timeout_s
 
-    def trace(self, model: PyTree, state: LearnerState, env_state: None) -> tuple[Any, Any, Any]:
+    def trace(self, model: PyTree, state: TrainState, env_state: None) -> tuple[Any, Any, Any]:
         """See `LocalRollouts`; waits for first rollouts, which are used by the first call."""
         del model, env_state
         self._first = self._ask(state)
@@ -84,7 +84,7 @@ class RemoteRollouts:
         self._join = self._join.compile()
 
     def __call__(
-        self, state: LearnerState, env_state: None
+        self, state: TrainState, env_state: None
     ) -> tuple[None, Samples, Array, FloatBuffer]:
         """See `LocalRollouts`."""
         (samples, stats), self._first = self._first or self._ask(state), None
@@ -96,7 +96,7 @@ class RemoteRollouts:
         for gmi in self._workers.gmis:
             self._workers.mail.send(None, gmi)
 
-    def _ask(self, state: LearnerState) -> tuple[list[Samples], list[np.ndarray]]:
+    def _ask(self, state: TrainState) -> tuple[list[Samples], list[np.ndarray]]:
         """Rollouts with the weights of `state`: samples [T, N], packed statistics."""
         mail, gmis, _ = self._workers
         weights = np.asarray(self._pack(state))
@@ -149,7 +149,7 @@ def _rollout(
 def _join(
     env: BatchedEnv,
     learner: PpoLearner,
-    state: LearnerState,
+    state: TrainState,
     samples: Sequence[Samples],
     stats: Sequence[Array],
     rank: Array,

@@ -6,15 +6,15 @@ import dataclasses
 from collections.abc import Hashable, Iterable, Sequence
 from typing import Any, Literal, TypeAlias
 
-from gmijax.collectives.group import Operation
+from gmijax.collectives.messages.group import Operation
 from gmijax.config import BackendName, PlanConfig, ReduceConfig
+from gmijax.config.schema import from_dict
 from gmijax.errors import ConfigError
+from gmijax.machine.snapshot import detect_machine
 from gmijax.partition.layout import Layout
-from gmijax.partition.machine import detect_machine
 from gmijax.partition.plan import Plan
 from gmijax.partition.planner import make_plan
 from gmijax.roles.role import here
-from gmijax.schema import from_dict
 
 BackendChoice: TypeAlias = Literal["auto", BackendName]
 

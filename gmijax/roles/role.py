@@ -6,11 +6,11 @@ from abc import ABC, abstractmethod
 from collections.abc import Iterable
 from typing import Any
 
-from gmijax.collectives.group import GroupReducer, Operation
-from gmijax.collectives.messenger import Messenger
+from gmijax.collectives.messages.group import GroupReducer, Operation
+from gmijax.collectives.messages.messenger import Messenger
 from gmijax.errors import ConfigError
-from gmijax.partition.child import ChildLink
 from gmijax.partition.layout import Layout
+from gmijax.supervise.child import ChildLink
 
 
 class Gmi:

@@ -6,19 +6,19 @@ import sys
 from typing import TYPE_CHECKING, Any
 
 from gmijax.collectives.build import Membership, build_reducer, join_world
-from gmijax.collectives.group import GroupReducer
 from gmijax.collectives.interface import Reducer
-from gmijax.collectives.messenger import Messenger
-from gmijax.collectives.pipe_block import PipeBlock
-from gmijax.partition.child import ENV_PIPES_FD, ChildLink, required_fd, run_gmi
+from gmijax.collectives.messages.group import GroupReducer
+from gmijax.collectives.messages.messenger import Messenger
+from gmijax.collectives.messages.pipe_block import PipeBlock
 from gmijax.partition.plan import Plan
 from gmijax.partition.reduction import why_not_intra
 from gmijax.roles import shipping
 from gmijax.roles.role import Gmi, enter
-from gmijax.rundir import read_json
+from gmijax.runs.folder import read_json
+from gmijax.supervise.child import ENV_PIPES_FD, ChildLink, required_fd, run_gmi
 
 if TYPE_CHECKING:
-    from gmijax.collectives.device_post import DeviceBuffers
+    from gmijax.collectives.messages.device_buffers import DeviceBuffers
     from gmijax.collectives.ring import World
 
 
@@ -90,7 +90,7 @@ def _device_buffers(plan: Plan, gmi: int) -> DeviceBuffers | None:
     if not neighbours or why_not_intra("ipc", plan.backend):
         return None
     from gmijax.collectives.device_memory import cuda_memory
-    from gmijax.collectives.device_post import DeviceBuffers
+    from gmijax.collectives.messages.device_buffers import DeviceBuffers
 
     return DeviceBuffers(neighbours, cuda_memory)
 

@@ -13,18 +13,18 @@ from functools import partial
 from types import MappingProxyType
 from typing import Final
 
-from gmijax.collectives.board import create_registers
 from gmijax.collectives.channel.build import ChannelTopology, create_channels, require_memory
-from gmijax.collectives.pipe_block import create_pipes
+from gmijax.collectives.messages.pipe_block import create_pipes
+from gmijax.collectives.messages.registers import create_registers
 from gmijax.config import ServeConfig, TrainConfig
 from gmijax.errors import ConfigError
-from gmijax.partition.child import ENV_PIPES_FD
-from gmijax.partition.machine import Machine
+from gmijax.machine.snapshot import Machine
 from gmijax.partition.placement import num_gmis_of, place
 from gmijax.partition.plan import Plan
 from gmijax.partition.planner import make_plan, require_host
 from gmijax.partition.reduction import why_not_intra
 from gmijax.partition.templates import AGENT, TRAINER, Group, group_of
+from gmijax.supervise.child import ENV_PIPES_FD
 
 ROLLOUT_PIPE_BYTES: Final = 16 << 20
 """Of a pipe between a trainer and who makes its rollouts; larger messages go in pieces."""

@@ -19,22 +19,22 @@ from pathlib import Path
 from types import FrameType
 from typing import Final
 
-from gmijax.cachedir import compilation_cache_dir, drop_broken_programs
 from gmijax.collectives.memory import create_exchange
 from gmijax.config import RunConfig, ServeRunConfig
 from gmijax.errors import BackendUnavailable, GmijaxError, JobInterrupted
+from gmijax.machine.processes import reserved_address
+from gmijax.machine.snapshot import Machine
 from gmijax.partition.backend_choice import WHAT_SHARE_LOSES
-from gmijax.partition.backends import Backend, open_backend
-from gmijax.partition.child import ENV_EXCHANGE_FD
-from gmijax.partition.environment import COMPILATION_CACHE, gmi_environment
-from gmijax.partition.gmi_process import GmiStatus
-from gmijax.partition.machine import Machine
 from gmijax.partition.plan import Plan
 from gmijax.partition.reduction import needs_ring
-from gmijax.partition.supervisor import Job, Patience, Supervisor
-from gmijax.processes import reserved_address
-from gmijax.rundir import RunPaths, read_json, write_json
+from gmijax.runs.cache import compilation_cache_dir, drop_broken_programs
+from gmijax.runs.folder import RunPaths, read_json, write_json
+from gmijax.supervise.backends import Backend, open_backend
+from gmijax.supervise.child import ENV_EXCHANGE_FD
+from gmijax.supervise.environment import COMPILATION_CACHE, gmi_environment
+from gmijax.supervise.gmi_process import GmiStatus
 from gmijax.supervise.kinds import JobKind
+from gmijax.supervise.supervisor import Job, Supervisor, Timeouts
 
 STOP_SIGNALS: Final = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGUSR1)
 """What asks a job to save and end: Ctrl-C, batch systems, a terminal that is closed."""
@@ -53,7 +53,7 @@ class Launch:
       machine: where this is; see `detect_machine`.
       run: the run folder; what the GMIs read from it is there already.
       kind: what the GMIs run, and what they share beside the block that reducers use.
-      patience: time limits.
+      timeouts: time limits.
       stops_gracefully: a first one of `STOP_SIGNALS` asks the GMIs to finish by themselves;
         otherwise signals do what Python does with them.
       variables: more environment variables of every GMI.
@@ -66,7 +66,7 @@ class Launch:
     machine: Machine
     run: RunPaths
     kind: JobKind
-    patience: Patience
+    timeouts: Timeouts
     stops_gracefully: bool = True
     variables: Mapping[str, str] = field(default_factory=dict)
     on_warning: Callable[[str], None] = lambda _: None
@@ -110,7 +110,7 @@ def run_gmis(
                 command=lambda _: [sys.executable, "-m", kind.module],
                 environment=environment,
                 backend=backend,
-                patience=launch.patience,
+                timeouts=launch.timeouts,
                 inherited_fds=inherited,
                 compile_once=kind.compile_once and not is_world_on_cpu,
             )
@@ -181,9 +181,9 @@ def recorded(
             record(status, Plan.from_dict(read_json(run.plan)))  # Its backend may be another.
 
 
-def patience_of(limits: RunConfig | ServeRunConfig) -> Patience:
+def timeouts_of(limits: RunConfig | ServeRunConfig) -> Timeouts:
     """The time limits of a job, as its configuration has them."""
-    return Patience(
+    return Timeouts(
         start_timeout_s=limits.start_timeout_s,
         stall_timeout_s=limits.stall_timeout_s,
         stop_timeout_s=limits.stop_timeout_s,

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 from gmijax.config import A3cConfig, TrainConfig
 from gmijax.errors import ConfigError
-from gmijax.partition.child import ChildLink, required_fd, run_gmi
+from gmijax.supervise.child import ChildLink, required_fd, run_gmi
 from gmijax.supervise.kinds import ENV_CHANNELS_FD, ENV_REGISTERS_FD, groups_of, topology_of
 from gmijax.workers.trainers import (
     environments_of,
@@ -24,7 +24,7 @@ from gmijax.workers.trainers import (
 )
 
 if TYPE_CHECKING:
-    from gmijax.a3c.board import JobRegisters
+    from gmijax.a3c.job_registers import JobRegisters
     from gmijax.sim.wrappers import BatchedEnv
 
 
@@ -68,9 +68,9 @@ def _run(link: ChildLink) -> dict[str, Any]:
 
 
 def _registers(config: TrainConfig, env: BatchedEnv, num_agents: int) -> JobRegisters:
-    from gmijax.a3c.board import open_job_registers
+    from gmijax.a3c.job_registers import open_job_registers
     from gmijax.a3c.rollout import num_counts
-    from gmijax.learner import num_weights
+    from gmijax.learning.learner import num_weights
 
     fd = required_fd(ENV_REGISTERS_FD)
     return open_job_registers(fd, num_weights(env.spec, config.algo), num_counts(env), num_agents)

@@ -11,11 +11,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from gmijax.config import EnvConfig, PlayConfig
+from gmijax.config.schema import from_dict
 from gmijax.errors import ConfigError
-from gmijax.partition.child import ChildLink, run_gmi
-from gmijax.resume import CheckpointMeta, trained_config
-from gmijax.rundir import PlayPaths, read_json, write_json
-from gmijax.schema import from_dict
+from gmijax.runs.folder import PlayPaths, read_json, write_json
+from gmijax.runs.resume import CheckpointMeta, trained_config
+from gmijax.supervise.child import ChildLink, run_gmi
 
 if TYPE_CHECKING:
     import numpy as np
@@ -40,9 +40,9 @@ def _run(link: ChildLink) -> None:
     # jax starts here, in the environment that the plan prepared.
     import jax
 
-    from gmijax.checkpoint import restore_learner
-    from gmijax.learner import init_learner, make_learner
+    from gmijax.learning.checkpoint import restore_learner
     from gmijax.learning.episodes import Options, run_episodes
+    from gmijax.learning.learner import init_learner, make_learner
     from gmijax.sim.build import make_worlds
 
     impl = _impl(config, checkpoint, env_config)

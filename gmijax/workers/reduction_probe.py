@@ -23,9 +23,9 @@ from gmijax.collectives.interface import (
 )
 from gmijax.control.selection import CHAIN, TIMEOUT_S, block_variable
 from gmijax.errors import DeviceMemoryUnavailable
-from gmijax.partition.child import ChildLink, required_fd, run_gmi
 from gmijax.partition.plan import Plan
-from gmijax.rundir import read_json
+from gmijax.runs.folder import read_json
+from gmijax.supervise.child import ChildLink, required_fd, run_gmi
 
 if TYPE_CHECKING:
     import jax

@@ -12,12 +12,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from gmijax.config import ServeConfig
-from gmijax.datadir import DataPaths
-from gmijax.partition.child import ENV_PIPES_FD, ChildLink, required_fd, run_gmi
+from gmijax.config.schema import from_dict
 from gmijax.partition.plan import Plan
 from gmijax.partition.templates import AGENT, SIMULATOR, group_of, has_role
-from gmijax.rundir import read_json
-from gmijax.schema import from_dict
+from gmijax.runs.dataset import DataPaths
+from gmijax.runs.folder import read_json
+from gmijax.supervise.child import ENV_PIPES_FD, ChildLink, required_fd, run_gmi
 
 if TYPE_CHECKING:
     from gmijax.collection.collectors import Share
@@ -81,7 +81,7 @@ def _run(link: ChildLink) -> dict[str, Any]:
 def _work(share: Share, plan: Plan, held: ExitStack) -> dict[str, Any]:
     """Does the part that the template gives to this GMI."""
     from gmijax.collection import collectors
-    from gmijax.collectives.pipe_block import PipeBlock
+    from gmijax.collectives.messages.pipe_block import PipeBlock
 
     gmi, layout = share.link.gmi, plan.layout
     simulates, acts = (has_role(plan.roles[gmi], role) for role in (SIMULATOR, AGENT))

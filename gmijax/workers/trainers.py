@@ -5,11 +5,11 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from gmijax.config import TrainConfig
-from gmijax.partition.child import ChildLink
+from gmijax.config.schema import from_dict
 from gmijax.partition.plan import Plan
 from gmijax.partition.templates import Group
-from gmijax.rundir import read_json
-from gmijax.schema import from_dict
+from gmijax.runs.folder import read_json
+from gmijax.supervise.child import ChildLink
 
 if TYPE_CHECKING:
     from gmijax.collectives.interface import Reducer

@@ -12,9 +12,9 @@ from contextlib import ExitStack
 from typing import TYPE_CHECKING, Any
 
 from gmijax.config import PpoConfig, TrainConfig
-from gmijax.partition.child import ENV_PIPES_FD, ChildLink, required_fd, run_gmi
 from gmijax.partition.plan import Plan
 from gmijax.partition.templates import AGENT, TRAINER, has_role
+from gmijax.supervise.child import ENV_PIPES_FD, ChildLink, required_fd, run_gmi
 from gmijax.supervise.kinds import groups_of
 from gmijax.workers.trainers import (
     environments_of,
@@ -25,7 +25,7 @@ from gmijax.workers.trainers import (
 )
 
 if TYPE_CHECKING:
-    from gmijax.collectives.pipe_block import PipeBlock
+    from gmijax.collectives.messages.pipe_block import PipeBlock
     from gmijax.sim.wrappers import BatchedEnv
 
 
@@ -41,8 +41,8 @@ def _run(link: ChildLink) -> dict[str, Any]:
     trains = link.gmi in trainers.gmis
     # jax starts here, in the environment that the plan prepared.
     world = join_trainers(config, plan, trainers, link) if trains else None
-    from gmijax.collectives.messenger import Messenger
-    from gmijax.collectives.pipe_block import PipeBlock
+    from gmijax.collectives.messages.messenger import Messenger
+    from gmijax.collectives.messages.pipe_block import PipeBlock
     from gmijax.learning.updates import exchange_size
     from gmijax.ppo.loop import TrainingLoop
     from gmijax.ppo.ppo import PpoLosses
@@ -78,8 +78,8 @@ def _serve(
     link: ChildLink,
 ) -> dict[str, Any]:
     """Makes rollouts for the trainer on the same GPU."""
-    from gmijax.collectives.messenger import Messenger
-    from gmijax.learner import make_learner
+    from gmijax.collectives.messages.messenger import Messenger
+    from gmijax.learning.learner import make_learner
     from gmijax.learning.start import first_envs
     from gmijax.ppo.tdg_ex import serve_rollouts
 

@@ -6,7 +6,7 @@ import dataclasses
 import signal
 import sys
 
-from gmijax.cli_command import command
+from gmijax.cli.command import command
 from gmijax.config import TrainConfig
 from gmijax.control import job
 from gmijax.supervise.kinds import SYNCHRONOUS

@@ -27,7 +27,7 @@ from training_jobs import (
 )
 
 from gmijax.a3c.report import MAX_COUNTED
-from gmijax.resume import find_checkpoint
+from gmijax.runs.resume import find_checkpoint
 
 N, T = 16, 4
 UPDATE = N * T

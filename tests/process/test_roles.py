@@ -16,7 +16,7 @@ import pytest
 
 import gmijax
 from gmijax.errors import GmiFailed, JobInterrupted
-from gmijax.rundir import read_json
+from gmijax.runs.folder import read_json
 from tests import role_cases
 from tests.supervision import CHECKOUT
 from tests.training_jobs import heartbeat_of, pids_of

@@ -14,7 +14,7 @@ from command_lines import run as run_here
 from test_custom_task import SMALL, TASK
 from training_jobs import gmi_pid, kill, pids_of, start, train, wait_until
 
-from gmijax.datadir import DataPaths
+from gmijax.runs.dataset import DataPaths
 
 pytestmark = pytest.mark.timeout(600)
 

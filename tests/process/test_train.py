@@ -28,7 +28,7 @@ from training_jobs import (
     wait_until,
 )
 
-from gmijax.resume import find_checkpoint
+from gmijax.runs.resume import find_checkpoint
 
 
 def _read(path: Path) -> dict[str, Any]:

@@ -14,21 +14,21 @@ from toy_env import point_mass
 from training_jobs import wait_until
 
 from gmijax.a3c.agent import Agent
-from gmijax.a3c.board import JobRegisters, Orders, Report, open_job_registers
+from gmijax.a3c.job_registers import JobRegisters, Orders, Report, open_job_registers
 from gmijax.a3c.rollout import num_counts
-from gmijax.cli import compose
-from gmijax.collectives.board import create_registers
-from gmijax.learner import (
+from gmijax.cli.compose import compose
+from gmijax.collectives.messages.registers import create_registers
+from gmijax.learning.learner import (
     acting_weights,
     init_learner,
     make_learner,
     num_weights,
     pack_weights,
 )
-from gmijax.normalize import normalize
-from gmijax.partition.child import ChildLink
-from gmijax.policy import log_prob
-from gmijax.rundir import RunPaths
+from gmijax.learning.normalize import normalize
+from gmijax.learning.policy import log_prob
+from gmijax.runs.folder import RunPaths
+from gmijax.supervise.child import ChildLink
 
 ENV = point_mass()
 OVERRIDES = (

@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 from toy_env import point_mass
 
-from gmijax.a3c.board import JobRegisters
+from gmijax.a3c.job_registers import JobRegisters
 from gmijax.a3c.trainer import Trainer
-from gmijax.cli import compose
+from gmijax.cli.compose import compose
 from gmijax.collectives.channel.batcher import Batch
 from gmijax.collectives.solo import SoloReducer
-from gmijax.partition.child import ChildLink
-from gmijax.rundir import RunPaths
+from gmijax.runs.folder import RunPaths
+from gmijax.supervise.child import ChildLink
 
 
 class _Arrivals:

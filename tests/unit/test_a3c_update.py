@@ -17,9 +17,9 @@ from gmijax.a3c.a3c import A3cLosses, Unrolls, batch_targets, gradients
 from gmijax.a3c.report import histogram_of, mean_and_p99
 from gmijax.a3c.rollout import UnrollPrograms, collect
 from gmijax.a3c.update import FusedUpdate, SplitUpdate
-from gmijax.cli import compose
+from gmijax.cli.compose import compose
 from gmijax.collectives.solo import SoloReducer
-from gmijax.learner import (
+from gmijax.learning.learner import (
     acting_weights,
     init_learner,
     make_learner,

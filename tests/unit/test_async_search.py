@@ -19,12 +19,12 @@ from gmijax.autotune.async_workload import A3cWorkload, balance, per_gpu, throug
 from gmijax.autotune.grid import Measured, Point
 from gmijax.autotune.tuner import with_auto_decided
 from gmijax.autotune.workloads import Split, Workload
-from gmijax.cli import compose
+from gmijax.cli.compose import compose
 from gmijax.config import TrainConfig
 from gmijax.control import searching
 from gmijax.errors import ConfigError
-from gmijax.partition.gmi_process import GmiStatus
-from gmijax.rundir import RunPaths
+from gmijax.runs.folder import RunPaths
+from gmijax.supervise.gmi_process import GmiStatus
 from gmijax.supervise.kinds import training_plan
 
 GRID = (

@@ -11,8 +11,8 @@ from fake_nvml import A100_SEVEN, H200_MIG_EMPTY, H200_MIG_OFF, V100, Board
 from supervision import plan_config, reduce_config
 
 from gmijax.errors import BackendUnavailable
-from gmijax.partition.machine import Machine
-from gmijax.partition.nvidia import list_gpus
+from gmijax.machine.nvidia import list_gpus
+from gmijax.machine.snapshot import Machine
 from gmijax.partition.plan import Plan
 from gmijax.partition.planner import make_plan
 

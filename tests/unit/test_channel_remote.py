@@ -12,7 +12,7 @@ from typing import Any
 import pytest
 
 from gmijax.errors import CollectiveError, ConfigError, PeerLost, PipeClosed
-from gmijax.processes import reserved_address
+from gmijax.machine.processes import reserved_address
 
 pytest.importorskip("zmq")
 

@@ -8,8 +8,8 @@ from pathlib import Path
 import pytest
 from command_lines import run
 
-from gmijax.cli import compose
-from gmijax.cli_command import command
+from gmijax.cli.command import command
+from gmijax.cli.compose import compose
 from gmijax.config import PlayConfig
 from gmijax.errors import ConfigError
 

@@ -29,14 +29,14 @@ from gmijax.collection.programs import (
     unroll,
 )
 from gmijax.collection.recording import CollectionStats, ShardWriter
-from gmijax.datadir import DataPaths
 from gmijax.errors import NonFiniteError
-from gmijax.learner import Learner, init_learner, make_learner
-from gmijax.normalize import no_samples
-from gmijax.partition.child import ChildLink
-from gmijax.physics_health import TOLERATED_STEPS
-from gmijax.rundir import RunPaths
+from gmijax.learning.learner import Learner, init_learner, make_learner
+from gmijax.learning.normalize import no_samples
+from gmijax.learning.physics_health import TOLERATED_STEPS
+from gmijax.runs.dataset import DataPaths
+from gmijax.runs.folder import RunPaths
 from gmijax.sim.wrappers import BatchedEnv, env_keys
+from gmijax.supervise.child import ChildLink
 
 N, T = 6, 30
 ALL = Keep(steps=True, next_obs=True)
@@ -72,6 +72,7 @@ def start(env):
 
 def test_an_unroll_keeps_what_happened(unrolled: Unrolled):
     _, learner, policy, steps, counts = unrolled
+    assert steps.next_obs is not None
     ended = np.asarray(steps.terminated | steps.truncated)
     assert ended.any()
     assert counts.episodes.count == ended.sum()

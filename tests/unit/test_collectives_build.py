@@ -13,8 +13,8 @@ import pytest
 from gmijax.collectives.build import STRATEGIES, Membership, build_reducer
 from gmijax.collectives.memory import create_exchange
 from gmijax.errors import CollectiveError, ConfigError
+from gmijax.machine.nvidia import list_gpus
 from gmijax.partition.layout import Layout
-from gmijax.partition.nvidia import list_gpus
 from gmijax.partition.reduction import why_not_strategy
 
 

@@ -17,9 +17,9 @@ from gmijax import doctor
 from gmijax.control import system_info
 from gmijax.control.diagnosis import Diagnosis, diagnose
 from gmijax.control.system_info import REQUIRED, JaxView, SystemInfo, ask_jax, try_mps
-from gmijax.partition import nvidia
-from gmijax.partition.machine import Machine
-from gmijax.partition.nvidia import list_gpus, nvml_problem
+from gmijax.machine import nvidia
+from gmijax.machine.nvidia import list_gpus, nvml_problem
+from gmijax.machine.snapshot import Machine
 
 MPS = Path("/usr/bin/nvidia-cuda-mps-control")
 INSTALLED = dict.fromkeys(REQUIRED, "1.0") | dict.fromkeys(

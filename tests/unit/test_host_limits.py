@@ -11,9 +11,9 @@ from supervision import gpu, machine, plan_config, reduce_config
 
 import gmijax
 from gmijax.errors import ConfigError
-from gmijax.partition import host_limits
-from gmijax.partition.host_limits import CgroupLimits, Host, detect_host, usable_cores
-from gmijax.partition.machine import Machine, detect_machine
+from gmijax.machine import host_limits
+from gmijax.machine.host_limits import CgroupLimits, Host, detect_host, usable_cores
+from gmijax.machine.snapshot import Machine, detect_machine
 from gmijax.partition.plan import Plan
 from gmijax.partition.planner import make_plan
 from gmijax.supervise.kinds import training_plan

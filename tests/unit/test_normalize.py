@@ -4,7 +4,7 @@ import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from gmijax.normalize import (
+from gmijax.learning.normalize import (
     OBS_CLIP,
     merge,
     merge_all,

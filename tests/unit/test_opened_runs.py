@@ -12,14 +12,14 @@ from typing import Any
 import pytest
 
 import gmijax
-from gmijax.cli import build
-from gmijax.cli_command import command
+from gmijax.cli.command import command
+from gmijax.cli.compose import build
 from gmijax.config import PlayConfig
+from gmijax.config.schema import to_dict
 from gmijax.control import evaluation, job, restarts, serving
 from gmijax.errors import ConfigError
-from gmijax.resume import CheckpointMeta
-from gmijax.rundir import META, RunPaths, read_json, write_json
-from gmijax.schema import to_dict
+from gmijax.runs.folder import META, RunPaths, read_json, write_json
+from gmijax.runs.resume import CheckpointMeta
 from gmijax.sim import source
 from gmijax.sim.adapters import custom
 from gmijax.sim.registry import make_env

@@ -13,9 +13,9 @@ import pytest
 from rich.console import Console
 from supervision import CHECKOUT
 
-from gmijax.cachedir import drop_broken_programs
 from gmijax.control.console import ConsoleProgress, open_console
-from gmijax.partition.gmi_process import GmiStatus
+from gmijax.runs.cache import drop_broken_programs
+from gmijax.supervise.gmi_process import GmiStatus
 
 PRINTS = """
 from gmijax.control.console import open_console

@@ -12,9 +12,9 @@ from hypothesis import strategies as st
 from supervision import gpu, machine, plan_config, reduce_config
 
 from gmijax.errors import BackendUnavailable, ConfigError
+from gmijax.machine.snapshot import Machine
 from gmijax.partition import reduction
 from gmijax.partition.layout import Layout
-from gmijax.partition.machine import Machine
 from gmijax.partition.plan import Plan, Slice
 from gmijax.partition.planner import make_plan, split_cores
 

@@ -9,10 +9,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from gmijax.cli import compose
+from gmijax.cli.compose import compose
 from gmijax.config import AlgoConfig
-from gmijax.learner import init_learner, make_learner
 from gmijax.learning.episodes import CHUNK_STEPS, Episodes, Options, run_episodes
+from gmijax.learning.learner import init_learner, make_learner
 from gmijax.sim import episode
 from gmijax.sim.interface import Env, EnvSpec, EnvState
 from gmijax.sim.wrappers import time_limit

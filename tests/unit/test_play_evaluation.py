@@ -11,15 +11,15 @@ from types import SimpleNamespace
 import pytest
 from rich.console import Console
 
-from gmijax.cli_command import command
+from gmijax.cli.command import command
 from gmijax.config import PlayConfig
+from gmijax.config.schema import to_dict
 from gmijax.control import evaluation, pictures
 from gmijax.errors import ConfigError, GmijaxError
-from gmijax.partition.machine import Machine
-from gmijax.partition.nvidia import Gpu
-from gmijax.resume import CheckpointMeta
-from gmijax.rundir import EXIT_NO_GL, META, PlayPaths, RunPaths, write_json
-from gmijax.schema import to_dict
+from gmijax.machine.nvidia import Gpu
+from gmijax.machine.snapshot import Machine
+from gmijax.runs.folder import EXIT_NO_GL, META, PlayPaths, RunPaths, write_json
+from gmijax.runs.resume import CheckpointMeta
 from gmijax.supervise.launcher import environment_of
 
 

@@ -7,8 +7,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from gmijax.cli import compose
-from gmijax.policy import entropy, kl_divergence, log_prob, make_actor_critic
+from gmijax.cli.compose import compose
+from gmijax.learning.policy import entropy, kl_divergence, log_prob, make_actor_critic
 from gmijax.ppo.ppo import Samples, UpdateContext, gae, ppo_loss
 
 B, O, A = 6, 3, 2

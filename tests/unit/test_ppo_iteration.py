@@ -10,10 +10,10 @@ from fake_device_memory import one_shot_of_one
 from jax.sharding import Mesh
 from toy_env import point_mass
 
-from gmijax.cli import compose
+from gmijax.cli.compose import compose
 from gmijax.collectives.solo import SoloReducer
 from gmijax.collectives.spmd import AXIS, SpmdStep
-from gmijax.learner import (
+from gmijax.learning.learner import (
     acting_weights,
     adapted_learning_rate,
     apply_gradients,

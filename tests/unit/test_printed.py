@@ -12,8 +12,8 @@ from rich.console import Console
 import gmijax
 from gmijax.control import console, decide, evaluation, serving
 from gmijax.errors import ConfigError, printable
-from gmijax.partition.failures import last_line
-from gmijax.partition.gmi_process import GmiStatus
+from gmijax.supervise.failures import last_line
+from gmijax.supervise.gmi_process import GmiStatus
 
 
 @pytest.mark.parametrize(

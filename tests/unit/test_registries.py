@@ -16,9 +16,9 @@ from gmijax.config import (
     TrainConfig,
 )
 from gmijax.partition import reduction
-from gmijax.partition.backends import BACKENDS
 from gmijax.partition.templates import DESCRIPTIONS
 from gmijax.sim.registry import SUITES
+from gmijax.supervise.backends import BACKENDS
 
 
 def names(kind: Any) -> set[str]:

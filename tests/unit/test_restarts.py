@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 from supervision import gpu, machine
 
-from gmijax.cli import compose
+from gmijax.cli.compose import compose
 from gmijax.control import restarts
 from gmijax.control.restarts import (
     Attempts,
@@ -21,8 +21,8 @@ from gmijax.control.restarts import (
     with_gpus_left,
 )
 from gmijax.errors import BackendUnavailable, ConfigError, GmiFailed, ReportedError
-from gmijax.resume import CheckpointMeta
-from gmijax.rundir import META, RunPaths, read_json, write_json
+from gmijax.runs.folder import META, RunPaths, read_json, write_json
+from gmijax.runs.resume import CheckpointMeta
 from gmijax.supervise.kinds import training_plan
 from gmijax.supervise.launcher import StopSignals
 

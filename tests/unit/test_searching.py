@@ -19,12 +19,12 @@ from gmijax.autotune.grid import Measured, NotRunnable, Point
 from gmijax.autotune.profile import ProfileLate
 from gmijax.autotune.tuner import Search, SearchResult, with_auto_decided
 from gmijax.autotune.workloads import PpoWorkload, Workload
-from gmijax.cli import compose
+from gmijax.cli.compose import compose
 from gmijax.config import TrainConfig
 from gmijax.control import searching
 from gmijax.errors import ConfigError, GmijaxError, JobInterrupted
-from gmijax.partition.host_limits import Host
-from gmijax.partition.machine import Machine
+from gmijax.machine.host_limits import Host
+from gmijax.machine.snapshot import Machine
 
 Answer = Callable[[Point, str], Measured | NotRunnable]
 GRID = ("search.gmis_per_gpu=[4,2,1]", "search.num_envs=[64,128]", "search.order=as_printed")

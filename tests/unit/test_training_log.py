@@ -13,11 +13,11 @@ import pytest
 from toy_env import metrics_from, point_mass
 
 from gmijax.errors import NonFiniteError
+from gmijax.learning.metrics import EpisodeWindow, Line, TensorBoardSink
+from gmijax.learning.physics_health import TOLERATED_STEPS
 from gmijax.learning.report_thread import ReportThread
 from gmijax.learning.training_log import TrainingLog
 from gmijax.learning.unroll import Counts, no_counts
-from gmijax.metrics import EpisodeWindow, Line, TensorBoardSink
-from gmijax.physics_health import TOLERATED_STEPS
 from gmijax.ppo.loop import report
 from gmijax.sim.interface import OVERFLOWS
 from gmijax.sim.wrappers import EpisodeSums

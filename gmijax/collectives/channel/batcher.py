@@ -13,7 +13,7 @@ import numpy.typing as npt
 from gmijax.collectives.channel.compressor import Transfer
 from gmijax.collectives.channel.spec import Array, Spec
 from gmijax.collectives.channel.transport import ChannelReader
-from gmijax.collectives.pipe import Message
+from gmijax.collectives.messages.pipe import Message
 from gmijax.collectives.waits import LIVENESS_PERIOD_S, wait_until
 from gmijax.errors import CollectiveError, CollectiveTimeout, GmijaxError, PipeClosed
 

@@ -15,8 +15,8 @@ from gmijax.collectives.channel.sender import Packer, Sender
 from gmijax.collectives.channel.transport import ChannelReader, ChannelWriter
 from gmijax.collectives.channel.unichannel import UniDecoder, UniPacker
 from gmijax.collectives.device_memory import NewMemory, cuda_memory
-from gmijax.collectives.pipe import PipeReader, PipeWriter
-from gmijax.collectives.pipe_block import PipeBlock, create_pipes
+from gmijax.collectives.messages.pipe import PipeReader, PipeWriter
+from gmijax.collectives.messages.pipe_block import PipeBlock, create_pipes
 from gmijax.config.channel import ChannelConfig
 from gmijax.errors import ConfigError
 

@@ -24,7 +24,7 @@ from gmijax.collectives.channel.dispenser import Piece
 from gmijax.collectives.channel.migrator import Migrator
 from gmijax.collectives.channel.spec import Array, Spec, write_channel
 from gmijax.collectives.channel.transport import ChannelWriter
-from gmijax.collectives.pipe import Message
+from gmijax.collectives.messages.pipe import Message
 
 ROW_BYTES = 16
 

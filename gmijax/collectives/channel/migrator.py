@@ -11,7 +11,7 @@ from collections.abc import Sequence
 from typing import Generic, TypeVar
 
 from gmijax.collectives.channel.transport import ChannelWriter
-from gmijax.collectives.pipe import Bytes
+from gmijax.collectives.messages.pipe import Bytes
 from gmijax.collectives.waits import LIVENESS_PERIOD_S
 from gmijax.errors import GmijaxError, PeerLost, PipeClosed
 

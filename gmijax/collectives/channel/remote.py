@@ -19,8 +19,8 @@ from typing import Any, Final
 import numpy as np
 
 from gmijax.collectives.channel.connection import Connection
-from gmijax.collectives.pipe import Bytes, Message
-from gmijax.collectives.pipe_format import message_bytes
+from gmijax.collectives.messages.pipe import Bytes, Message
+from gmijax.collectives.messages.pipe_format import message_bytes
 from gmijax.errors import CollectiveError, GmijaxError, PeerLost, PipeClosed
 
 MAGIC: Final = 0x5A494D47  # "GMIZ" in memory on a little-endian machine

@@ -24,8 +24,8 @@ from gmijax.collectives.channel.migrator import Migrator
 from gmijax.collectives.channel.sender import CLOSE_TIMEOUT_S
 from gmijax.collectives.channel.spec import Spec
 from gmijax.collectives.device_memory import TICKET_BYTES, DeviceMemory, NewMemory
-from gmijax.collectives.pipe import Bytes, Message, PipeWriter
-from gmijax.collectives.pipe_block import PipeBlock
+from gmijax.collectives.messages.pipe import Bytes, Message, PipeWriter
+from gmijax.collectives.messages.pipe_block import PipeBlock
 from gmijax.collectives.shared_memory import round_up
 from gmijax.collectives.waits import wait_until
 from gmijax.errors import ConfigError, GmijaxError

@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Protocol
 
-from gmijax.collectives.pipe import Bytes, Message
+from gmijax.collectives.messages.pipe import Bytes, Message
 from gmijax.errors import GmijaxError
 
 
