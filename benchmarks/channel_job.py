@@ -16,9 +16,9 @@ from typing import Any
 import numpy as np
 
 from benchmarks.channel_ranks import ENV_FD, Options
-from gmijax.collectives.channel.build import Places, create_channels
+from gmijax.collectives.channel.build import ChannelTopology, create_channels
 from gmijax.config.channel import ChannelConfig
-from gmijax.partition.rendezvous import reserved_address
+from gmijax.machine.processes import reserved_address
 
 DEFAULTS: Options = {
     "count": 1000,  # unrolls of every agent
@@ -29,7 +29,6 @@ DEFAULTS: Options = {
     "timeout_s": 20.0,
     "pause_chance": 0.0,
     "busy_s": 0.0,  # what a trainer does with a batch
-    "goes_on": False,  # without an agent that is gone
     "fake_device": None,  # folder of the device memory that is none, for transport=device
     "fast": False,  # no numbers, nothing is checked
 }
@@ -41,18 +40,22 @@ class ChannelJob:
     Args:
       folder: for results.
       config: of the channels.
-      places: who takes part.
+      topology: who takes part.
       task: what differs from `DEFAULTS`.
     """
 
-    def __init__(self, folder: Path, config: ChannelConfig, places: Places, **task: Any) -> None:
+    def __init__(
+        self, folder: Path, config: ChannelConfig, topology: ChannelTopology, **task: Any
+    ) -> None:
         self._held = ExitStack()
         self._folder = folder
         self._processes: dict[int, subprocess.Popen[bytes]] = {}
-        self.places = self._with_addresses(places) if config.transport == "zmq" else places
-        self._fd = create_channels(config, places)
+        if config.transport == "zmq":
+            topology = self._with_addresses(topology)
+        self.topology = topology
+        self._fd = create_channels(config, topology)
         self._held.callback(os.close, self._fd)
-        self._task = {**DEFAULTS, **task, "channel": asdict(config), "places": self._places()}
+        self._task = {**DEFAULTS, **task, "channel": asdict(config), "topology": self._plain()}
 
     def __enter__(self) -> ChannelJob:
         return self
@@ -66,7 +69,7 @@ class ChannelJob:
     @property
     def ranks(self) -> tuple[int, ...]:
         """All that take part."""
-        return (*self.places.agents, *self.places.trainers)
+        return (*self.topology.agents, *self.topology.trainers)
 
     def start(self, *ranks: int, **task: Any) -> ChannelJob:
         """Starts `ranks` (default: all), with `task` on top of the common one."""
@@ -87,7 +90,7 @@ class ChannelJob:
     def wait_for(self, mark: str, *ranks: int, timeout_s: float = 60.0) -> None:
         """Waits until `ranks` (default: all that were started) have left a mark.
 
-        Marks are `open` (has opened its end) and `third` (an agent has sent a third).
+        The mark `open` says that a rank has opened its end.
         """
         deadline_s = time.monotonic() + timeout_s
         for rank in ranks or self._processes:
@@ -100,15 +103,6 @@ class ChannelJob:
         """Sends a signal to `rank`; returns when, monotonic clock."""
         self._processes[rank].send_signal(number)
         return time.monotonic()
-
-    def end(self, rank: int) -> None:
-        """Kills `rank` and waits for its end; it may be started again."""
-        self._processes[rank].kill()
-        self._processes[rank].wait()
-
-    def is_running(self, rank: int) -> bool:
-        """Whether `rank` still runs."""
-        return self._processes[rank].poll() is None
 
     def result(self, rank: int, timeout_s: float = 90.0) -> dict[str, Any]:
         """What `rank` came to, once it has ended."""
@@ -126,22 +120,16 @@ class ChannelJob:
     def _path(self, rank: int) -> Path:
         return self._folder / f"rank_{rank}"
 
-    def _places(self) -> dict[str, Any]:
-        places = self.places
-        addresses = [[*pair, where] for pair, where in (places.addresses or {}).items()]
-        return {
-            "agents": places.agents,
-            "trainers": places.trainers,
-            "gpu_of": places.gpu_of,
-            "addresses": addresses or None,
-        }
+    def _plain(self) -> dict[str, Any]:
+        addresses = [[*pair, where] for pair, where in (self.topology.addresses or {}).items()]
+        return {**vars(self.topology), "addresses": addresses}
 
-    def _with_addresses(self, places: Places) -> Places:
+    def _with_addresses(self, topology: ChannelTopology) -> ChannelTopology:
         return replace(
-            places,
+            topology,
             addresses={
                 (agent, trainer): self._held.enter_context(reserved_address())
-                for agent in places.agents
-                for trainer in places.trainers
+                for agent in topology.agents
+                for trainer in topology.trainers
             },
         )

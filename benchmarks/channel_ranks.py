@@ -18,12 +18,14 @@ import numpy as np
 import numpy.typing as npt
 
 from gmijax.collectives.channel import build
-from gmijax.collectives.channel.build import Places, open_receiver, open_sender
-from gmijax.collectives.channel.interface import Array, Batch, ExperienceReceiver
+from gmijax.collectives.channel.batcher import Batch, Batcher
+from gmijax.collectives.channel.build import ChannelTopology, open_receiver, open_sender
+from gmijax.collectives.channel.sender import Sender
+from gmijax.collectives.channel.spec import Array
 from gmijax.config.channel import ChannelConfig
+from gmijax.config.schema import from_dict
 from gmijax.errors import CollectiveTimeout, GmijaxError, PeerLost, PipeClosed
-from gmijax.partition.child import inherited_fd
-from gmijax.schema import from_dict
+from gmijax.supervise.child import inherited_fd
 
 ENV_FD = "GMIJAX_CHANNELS_FD"
 Options = dict[str, Any]
@@ -66,41 +68,31 @@ def numbers_of(batch: Batch) -> npt.NDArray[np.int64]:
     return number.astype(np.int64)
 
 
-def act(sender: Any, task: Options) -> Options:
-    """Sends the unrolls that no predecessor has sent, with random pauses."""
+def act(sender: Sender, task: Options) -> Options:
+    """Sends the unrolls, with random pauses."""
     rank, pauses = task["rank"], np.random.default_rng([task["rank"], os.getpid()])
     envs, started_s = task["envs"], time.perf_counter()
-    first = sender.sent_pieces * envs
     ready = numbered(rank, 0, task)
-    for number in range(first, task["count"], envs):
+    for number in range(0, task["count"], envs):
         experience: Any = ready if task["fast"] else numbered(rank, number, task)
         if sender.on_device and not task["fake_device"]:
             experience = importlib.import_module("jax").device_put(experience)
         if not sender.send(experience, number // 1000, task["timeout_s"]):
-            trainers = tuple(task["places"]["trainers"])
+            trainers = tuple(task["topology"]["trainers"])
             raise CollectiveTimeout(rank, trainers, "send", number, task["timeout_s"])
-        if number <= task["count"] // 3 < number + envs:
-            mark("third", task)
         if pauses.random() < task["pause_chance"]:
             time.sleep(pauses.random() * 2e-3)
     sender.close()
-    return {"first": first, "wall_s": time.perf_counter() - started_s, **sender.stats()._asdict()}
+    return {"wall_s": time.perf_counter() - started_s, "dropped": sender.dropped}
 
 
-def learn(receiver: ExperienceReceiver, task: Options) -> Options:
+def learn(receiver: Batcher, task: Options) -> Options:
     """Receives until all agents have closed; writes the numbers it got, by agent, to a file."""
     got: list[npt.NDArray[np.int64]] = []
-    lost: set[int] = set()
     batch_size, started_s, wall_s = task["batch"], None, 0.0
     while True:
         try:
             batch = receiver.receive(batch_size, task["timeout_s"])
-        except PeerLost as error:
-            if not task["goes_on"]:
-                raise
-            lost.add(error.peer)
-            time.sleep(0.01)
-            continue
         except PipeClosed:
             if batch_size == 1:
                 break
@@ -113,7 +105,8 @@ def learn(receiver: ExperienceReceiver, task: Options) -> Options:
         time.sleep(task["busy_s"])
     if got:
         np.save(f"{task['result']}.npy", np.concatenate(got, axis=1))
-    return {"lost": sorted(lost), "wall_s": wall_s, **receiver.stats()._asdict()}
+    counted = ("unrolls", "transfers", "num_bytes")
+    return {"wall_s": wall_s, **{name: getattr(receiver, name) for name in counted}}
 
 
 def mark(name: str, task: Options) -> None:
@@ -123,20 +116,19 @@ def mark(name: str, task: Options) -> None:
 
 def run(task: Options) -> Options:
     """Opens this rank's end and uses it."""
-    places = dict(task["places"])
-    if places.get("addresses"):
-        places["addresses"] = {(a, t): where for a, t, where in places["addresses"]}
+    given = dict(task["topology"])
+    given["addresses"] = {(a, t): where for a, t, where in given["addresses"]}
     for key in ("agents", "trainers", "gpu_of"):
-        places[key] = tuple(places[key])
+        given[key] = tuple(given[key])
     if task["fake_device"]:
         use_fake_device(task["fake_device"])
-    where, config = Places(**places), from_dict(ChannelConfig, task["channel"])
+    topology, config = ChannelTopology(**given), from_dict(ChannelConfig, task["channel"])
     fd = inherited_fd(os.environ, ENV_FD)
-    if task["rank"] in where.agents:
-        sender = open_sender(config, where, task["rank"], fd)
+    if task["rank"] in topology.agents:
+        sender = open_sender(config, topology, task["rank"], fd)
         mark("open", task)
         return act(sender, task)
-    receiver = open_receiver(config, where, task["rank"], fd)
+    receiver = open_receiver(config, topology, task["rank"], fd)
     mark("open", task)
     try:
         return learn(receiver, task)

@@ -20,8 +20,8 @@ from gmijax.collectives.strategies import BYTES_PER_FLOAT, predicted_s
 from gmijax.config import PlanConfig, ReduceConfig
 from gmijax.control.selection import Probe, candidates, measure
 from gmijax.errors import ConfigError
+from gmijax.machine.snapshot import Machine, detect_machine
 from gmijax.partition.layout import Layout
-from gmijax.partition.machine import Machine, detect_machine
 from gmijax.partition.plan import Plan
 from gmijax.partition.planner import make_plan
 from gmijax.partition.reduction import select_strategy
@@ -120,20 +120,8 @@ def layout_of(text: str) -> Layout:
 
 def plan_of(layout: Layout, backend: Any, machine: Machine) -> Plan:
     """A plan of GMIs that train, for `candidates` and `measure`; raises ConfigError."""
-    return make_plan(
-        PlanConfig(
-            gpus=layout.num_gpus,
-            gmis_per_gpu=1,
-            layout=layout.gmis_of_gpu,
-            backend=backend,
-            sm_percent=None,
-            memory_fraction=None,
-            template="auto",
-        ),
-        ReduceConfig(strategy="auto", intra="auto", timeout_s=60),
-        1,
-        machine,
-    )
+    config = PlanConfig(gpus=layout.num_gpus, layout=layout.gmis_of_gpu, backend=backend)
+    return make_plan(config, ReduceConfig(), 1, machine)
 
 
 def line(row: dict[str, Any]) -> str:

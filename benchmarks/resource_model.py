@@ -24,7 +24,7 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
-from gmijax.partition.resource_model import Task, serving_gain, training_gain
+from benchmarks.paper_model import Task, serving_gain, training_gain
 
 _TRAINING = ("tcg_ex", "tdg_ex")
 PAPER = {"simulator_r": 10.0, "agent_r": 1.0, "trainer_r": 2.0, "alpha": 0.2, "beta": 0.3}

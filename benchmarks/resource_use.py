@@ -25,15 +25,13 @@ import jax
 import jax.numpy as jnp
 import pynvml
 
+from benchmarks.paper_model import dominant_resource
 from benchmarks.run import RESULTS
 from gmijax import compose
-from gmijax.acting import act
 from gmijax.config import PpoConfig, TrainConfig
-from gmijax.learner import Learner, acting_moments, init_learner, make_learner
-from gmijax.partition.resource_model import dominant_resource
-from gmijax.ppo.losses import Samples
-from gmijax.ppo.programs import learn
-from gmijax.ppo.rollout import stats_example
+from gmijax.learning.learner import Learner, acting_weights, init_learner, make_learner
+from gmijax.learning.unroll import act
+from gmijax.ppo.ppo import Samples, learn, no_stats
 from gmijax.sim.build import make_training_env
 from gmijax.sim.interface import EnvSpec
 from gmijax.sim.wrappers import BatchedEnv, env_keys
@@ -183,8 +181,8 @@ def _stages(config: TrainConfig, impl: str) -> Iterator[Stage]:
     zeros = jnp.zeros((num_envs, env.spec.action_size))
     actions = jax.random.uniform(key, zeros.shape, minval=-1.0)
     samples = _samples(num_envs * algo.unroll_length, env.spec, key)
-    stats = stats_example(env.spec, env.overflows)
-    yield Stage("agent", partial(_act, learner, zeros.shape[1]), state, (envs, zeros))
+    stats = no_stats(env.spec, env.overflows)
+    yield Stage("agent", partial(_act, learner), state, (envs, zeros))
     yield Stage("trainer", partial(_train, learner), (samples, stats), state)
     yield Stage("simulator", partial(_simulate, env, algo), (env.model, actions), envs)
 
@@ -199,16 +197,16 @@ def _simulate(env: BatchedEnv, algo: PpoConfig, given: Any, envs: Any) -> Any:
     return jax.lax.fori_loop(0, algo.unroll_length, step, envs)
 
 
-def _act(learner: Learner, size: int, state: Any, carry: Any) -> Any:
+def _act(learner: Learner, state: Any, carry: Any) -> Any:
     """T actions for all environments."""
-    moments = acting_moments(learner, state)
+    weights = acting_weights(learner, state)
 
     def step(_: Any, carry: Any) -> Any:
         envs, total = carry
         # Other observations in every step, or the network would be evaluated only once.
         obs = envs.env.obs + 1e-9 * total[:, :1]
         envs = envs._replace(env=envs.env._replace(obs=obs))
-        envs, _, action = act(learner.networks, state.params, moments, envs, size)
+        envs, _, action = act(learner.networks, weights, envs)
         return envs, total + action
 
     return jax.lax.fori_loop(0, learner.config.unroll_length, step, carry)

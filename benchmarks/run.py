@@ -26,8 +26,8 @@ from typing import Any
 
 from benchmarks.cases import SUITES, Case
 from benchmarks.free_gpus import FreeGpus
-from gmijax.partition.machine import detect_machine
-from gmijax.results import read_metrics
+from gmijax.machine.snapshot import detect_machine
+from gmijax.runs.history import read_metrics
 
 RESULTS = Path(__file__).parent / "results"
 RATES = ("step_per_s_sim", "step_per_s_inference", "step_per_s_train")

@@ -12,8 +12,8 @@ from pathlib import Path
 from typing import Any
 
 from gmijax.errors import GmijaxError
-from gmijax.partition.child import ChildLink, run_gmi
-from gmijax.rundir import read_json
+from gmijax.runs.folder import read_json
+from gmijax.supervise.child import ChildLink, run_gmi
 
 LIBRARIES = ("cublaslt", "cublas", "xla")
 """Both libraries by their first choice, and XLA's own choice, which it finds by trying."""

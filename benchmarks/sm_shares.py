@@ -20,13 +20,13 @@ from typing import Any
 from benchmarks.run import RESULTS
 from benchmarks.sm_share_rank import LIBRARIES
 from gmijax.config import PlanConfig, ReduceConfig
-from gmijax.control.kinds import Plain
-from gmijax.control.launcher import Launch, run_gmis
 from gmijax.errors import ConfigError, GmiFailed
-from gmijax.partition.machine import Machine, detect_machine
+from gmijax.machine.snapshot import Machine, detect_machine
 from gmijax.partition.planner import make_plan
-from gmijax.partition.supervisor import Patience
-from gmijax.rundir import RunPaths, read_json, write_json
+from gmijax.runs.folder import RunPaths, read_json, write_json
+from gmijax.supervise.kinds import JobKind
+from gmijax.supervise.launcher import Launch, run_gmis
+from gmijax.supervise.supervisor import Timeouts
 
 SHARES = (
     *(10, 12, 13, 14, 16, 18, 20, 22, 23, 25, 27, 28, 30, 33, 36, 40),
@@ -46,7 +46,7 @@ SIZES = {
 
 SPEED_SIZE = 4096
 SMALL_SIZES = {library: ((128, 128, 128),) for library in SIZES}
-PATIENCE = Patience(start_timeout_s=240, stall_timeout_s=120, stop_timeout_s=30, grace_s=5)
+TIMEOUTS = Timeouts(start_timeout_s=240, stall_timeout_s=120, stop_timeout_s=30, grace_s=5)
 
 
 def main() -> int:
@@ -100,16 +100,12 @@ def measure(
     has_gpu = bool(machine.gpus)
     plan = make_plan(
         PlanConfig(
-            gpus=1,
             gmis_per_gpu=len(shares),
-            layout=None,
             backend="mps" if has_gpu else "cpu",
             sm_percent=tuple(shares) if has_gpu else None,
-            memory_fraction=None,
-            template="auto",
             force_sm_percent=True,
         ),
-        ReduceConfig(strategy="auto", intra="auto", timeout_s=60),
+        ReduceConfig(),
         1,
         machine,
     )
@@ -124,8 +120,8 @@ def measure(
                 plan=plan,
                 machine=machine,
                 run=run,
-                kind=Plain("benchmarks.sm_share_rank", compile_once=False),
-                patience=PATIENCE,
+                kind=JobKind("benchmarks.sm_share_rank", compile_once=False),
+                timeouts=TIMEOUTS,
             )
         )
         found = [read_json(run.gmi(gmi).result) for gmi in plan.layout.gmis]

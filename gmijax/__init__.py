@@ -12,13 +12,12 @@ from typing import TYPE_CHECKING, Any
 from gmijax.version import __version__
 
 if TYPE_CHECKING:
-    from gmijax.cli import compose
+    from gmijax.cli.compose import compose
     from gmijax.control.job import Result, train
     from gmijax.control.searching import search
     from gmijax.control.serving import Served, serve
     from gmijax.roles.launch import launch
-    from gmijax.roles.manager import GMIManager
-    from gmijax.roles.planning import plan
+    from gmijax.roles.manager import GMIManager, plan
     from gmijax.roles.role import Role
     from gmijax.sim.registry import make_env, task_names
 
@@ -43,10 +42,10 @@ _HOMES = {
     "Result": "gmijax.control.job",
     "Role": "gmijax.roles.role",
     "Served": "gmijax.control.serving",
-    "compose": "gmijax.cli",
+    "compose": "gmijax.cli.compose",
     "launch": "gmijax.roles.launch",
     "make_env": "gmijax.sim.registry",
-    "plan": "gmijax.roles.planning",
+    "plan": "gmijax.roles.manager",
     "search": "gmijax.control.searching",
     "serve": "gmijax.control.serving",
     "task_names": "gmijax.sim.registry",

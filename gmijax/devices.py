@@ -1,4 +1,4 @@
-"""What a summary says of the device that a GMI ran on."""
+"""The device of a GMI: where programs put what the host reads, and its entry in a summary."""
 
 from __future__ import annotations
 
@@ -6,6 +6,19 @@ import resource
 from typing import Any
 
 import jax
+from jax.sharding import Sharding, SingleDeviceSharding
+
+
+def host_sharding() -> Sharding | None:
+    """Where a GPU should put what the host reads next: pinned host memory; None on a CPU.
+
+    The program then ends with one transfer at full speed. Reading a device array instead goes
+    through pageable memory: 0.9 ms against 0.07 ms for 0.11M float32 on an H200.
+    """
+    device = jax.local_devices()[0]
+    if device.platform != "gpu":
+        return None
+    return SingleDeviceSharding(device, memory_kind="pinned_host")
 
 
 def describe_device() -> dict[str, Any]:

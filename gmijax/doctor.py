@@ -11,10 +11,10 @@ from rich.console import Console
 from rich.table import Table
 
 from gmijax.control.diagnosis import Diagnosis, diagnose
-from gmijax.control.sight import look
+from gmijax.control.system_info import look
 from gmijax.errors import ConfigError
-from gmijax.partition.machine import Machine, detect_machine
-from gmijax.partition.mig_split import split_commands
+from gmijax.machine.mig_split import split_commands
+from gmijax.machine.snapshot import Machine, detect_machine
 from gmijax.version import __version__
 
 USAGE: Final = """usage: python -m gmijax.doctor [--json] [--help]
@@ -27,12 +27,12 @@ With mig=3g,2g,1g,1g, prints the commands with which an administrator would divi
 Exit codes: 0 healthy, 1 something is broken that should work, 2 bad input.
 """
 
-# Not those of gmijax.cli, whose import needs packages that may be what is broken.
+# Not those of gmijax.cli.compose, whose import needs packages that may be what is broken.
 EXIT_OK, EXIT_BROKEN, EXIT_BAD_INPUT, EXIT_INTERRUPTED = 0, 1, 2, 130
 
 
 class Options(NamedTuple):
-    """What the command line asks for."""
+    """Options of the command line."""
 
     as_json: bool = False
     mig: str | None = None
@@ -111,8 +111,8 @@ def split_text(wanted: str, index: int | None, machine: Machine) -> str:
 
 def show(found: Diagnosis, console: Console) -> None:
     """Prints the diagnosis for people."""
-    sight = found.sight
-    machine = sight.machine
+    system = found.system
+    machine = system.machine
     console.print(
         f"gmijax {__version__}, Python {sys.version.split()[0]}, {len(machine.cpu_cores)} CPU "
         f"cores, NVIDIA driver {machine.driver_version or 'none'}",
@@ -130,9 +130,9 @@ def show(found: Diagnosis, console: Console) -> None:
                 f"  {one.profile}: {one.num_sms} SMs, {one.memory_mib} MiB, {one.uuid}",
                 markup=False,
             )
-    devices = ", ".join(sight.jax.devices)
-    console.print(f"jax sees: {devices or sight.jax.error}", markup=False)
-    installed = [f"{name} {number}" for name, number in sight.versions.items() if number]
+    devices = ", ".join(system.jax.devices)
+    console.print(f"jax sees: {devices or system.jax.error}", markup=False)
+    installed = [f"{name} {number}" for name, number in system.versions.items() if number]
     console.print(f"packages: {', '.join(installed)}\n", markup=False)
     console.print(_table(found))
     for note in found.notes:

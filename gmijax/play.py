@@ -4,15 +4,9 @@ from __future__ import annotations
 
 import sys
 
-from gmijax.cli import EXIT_OK, command
+from gmijax.cli.command import command
 from gmijax.config import PlayConfig
 from gmijax.control import evaluation
 
-
-def _run(config: PlayConfig) -> int:
-    evaluation.play(config, show=True)
-    return EXIT_OK
-
-
 if __name__ == "__main__":
-    sys.exit(command("play", PlayConfig, _run, sys.argv[1:]))
+    sys.exit(command("play", PlayConfig, evaluation.play, sys.argv[1:]))

@@ -124,14 +124,7 @@ def compare_products(
     multiply: Multiply | None = None,
     compiler_options: Options | None = None,
 ) -> Iterator[Product]:
-    """Multiplies on the default device, and compares with float64.
-
-    Args:
-      sizes: (M, K, N) of every product; None for `SIZES`.
-      precisions: the kinds of product.
-      multiply: the product under test; None for the one of jax.
-      compiler_options: of XLA, e.g. which library it takes.
-    """
+    """Multiplies on the default device, and compares with float64."""
     product = multiply or _multiply
 
     def all_kinds(factors: list[tuple[jax.Array, jax.Array]]) -> list[jax.Array]:

@@ -4,15 +4,9 @@ from __future__ import annotations
 
 import sys
 
-from gmijax.cli import EXIT_OK, command
+from gmijax.cli.command import command
 from gmijax.config import ServeConfig
 from gmijax.control import serving
 
-
-def _run(config: ServeConfig) -> int:
-    serving.serve(config, show=True)
-    return EXIT_OK
-
-
 if __name__ == "__main__":
-    sys.exit(command("serve", ServeConfig, _run, sys.argv[1:]))
+    sys.exit(command("serve", ServeConfig, serving.serve, sys.argv[1:]))

@@ -10,7 +10,13 @@ __version__ = "0.1.0"
 
 def versions_of(packages: Iterable[str]) -> dict[str, str | None]:
     """Versions of installed packages by name, None for what is not installed."""
-    return {name: _version_of(name) for name in packages}
+    found: dict[str, str | None] = {}
+    for name in packages:
+        try:
+            found[name] = version(name)
+        except PackageNotFoundError:
+            found[name] = None
+    return found
 
 
 def pinned_version(package: str, dependency: str) -> str | None:
@@ -21,10 +27,3 @@ def pinned_version(package: str, dependency: str) -> str | None:
         return None
     named = (line.partition(";")[0].replace(" ", "") for line in wanted)
     return next((x.partition("==")[2] for x in named if x.startswith(f"{dependency}==")), None)
-
-
-def _version_of(package: str) -> str | None:
-    try:
-        return version(package)
-    except PackageNotFoundError:
-        return None

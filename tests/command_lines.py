@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import errno
-import importlib
 import io
 import os
 import subprocess
@@ -15,10 +14,11 @@ from typing import Any, NamedTuple
 
 import pytest
 
-from gmijax import cli
+from gmijax.autotune import tuner
+from gmijax.cli.command import command as run_command
 from gmijax.config import PlayConfig, ServeConfig, TrainConfig
-from gmijax.control import evaluation, job, searching, selection, serving
-from gmijax.partition.machine import Machine
+from gmijax.control import decide, evaluation, job, searching, selection, serving
+from gmijax.machine.snapshot import Machine
 
 COMMANDS: Mapping[str, type[Any]] = {
     "train": TrainConfig,
@@ -27,6 +27,14 @@ COMMANDS: Mapping[str, type[Any]] = {
     "play": PlayConfig,
 }
 """The commands with their configurations."""
+
+BODIES: Mapping[str, Any] = {
+    "train": job.train,
+    "serve": serving.serve,
+    "search": searching.search,
+    "play": evaluation.play,
+}
+"""What they run."""
 
 CPU = Machine(gpus=(), cpu_cores=(0, 1, 2, 3))
 """A machine without a GPU."""
@@ -51,10 +59,9 @@ def run(command: str, *argv: str, cwd: Path, machine: Machine = CPU) -> Done:
     a process, so that is where. A process that is started all the same is an error.
     """
     out, err = _stream("strict"), _stream("backslashreplace")
-    body = importlib.import_module(f"gmijax.{command}")._run
     with _nothing_starts(machine, cwd), redirect_stdout(out), redirect_stderr(err):
         try:
-            code = cli.command(command, COMMANDS[command], body, argv)
+            code = run_command(command, COMMANDS[command], BODIES[command], argv)
         except WouldStart:
             code = None
     return Done(code, _text(out), _text(err))
@@ -65,11 +72,11 @@ def _nothing_starts(machine: Machine, cwd: Path) -> Iterator[None]:
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(cwd)
         patch.setenv("XDG_CACHE_HOME", str(cwd / "cache"))
-        for module in (job, serving, searching, evaluation):
+        for module in (decide, searching, evaluation):
             patch.setattr(module, "detect_machine", lambda: machine)
         patch.setattr(Path, "mkdir", _mkdir)
         patch.setattr(tempfile, "mkstemp", _would_start)
-        patch.setattr(searching._Search, "result", _would_start)
+        patch.setattr(tuner.Search, "result", _would_start)
         patch.setattr(selection, "measure", _would_start)
         for owner, name in ((subprocess, "Popen"), (os, "fork"), (os, "posix_spawn")):
             patch.setattr(owner, name, _must_not_start)

@@ -7,11 +7,11 @@ from pathlib import Path
 
 from supervision import machine, make_job, plan_config, reduce_config
 
-from gmijax.partition.backends import open_backend
-from gmijax.partition.mps_control import find_mps_control
+from gmijax.machine.mps_control import find_mps_control
 from gmijax.partition.planner import make_plan
-from gmijax.partition.supervisor import Supervisor
-from gmijax.rundir import RunPaths
+from gmijax.runs.folder import RunPaths
+from gmijax.supervise.backends import open_backend
+from gmijax.supervise.supervisor import Supervisor
 
 
 def main() -> None:

@@ -11,10 +11,10 @@ from collections.abc import Callable
 from pathlib import Path
 
 from gmijax.errors import CollectiveTimeout, ConfigError, PeerLost
-from gmijax.partition.child import ChildLink
-from gmijax.partition.mps_control import PIPE_VARIABLE
-from gmijax.processes import identify
-from gmijax.rundir import read_json, write_json
+from gmijax.machine.mps_control import PIPE_VARIABLE
+from gmijax.machine.processes import identify
+from gmijax.runs.folder import read_json, write_json
+from gmijax.supervise.child import ChildLink
 
 TICK_S = 0.02
 

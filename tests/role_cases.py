@@ -124,24 +124,11 @@ class Wait(gmijax.Role):
         return "not reached"
 
 
-class Retry(gmijax.Role):
-    """A timeout loses nothing: the same message can be waited for again."""
-
-    def run(self) -> str:
-        if self.rank == 0:
-            self.recv(1)
-            self.send("late", 1)
-            return "sent"
-        with pytest.raises(CollectiveTimeout, match=r"waited 0.05 s in recv, .* ranks \[0\]"):
-            self.recv(0, timeout_s=0.05)
-        self.send("go", 0)
-        return self.recv(0)
-
-
 class Disagree(gmijax.Role):
-    """GMIs come with different data."""
+    """GMIs time out, then come with different data."""
 
     def run(self) -> str:
+        self._time_out()
         for data, op in ((np.ones(3, int), "mean"), (np.ones(3, bool), "sum")):
             with pytest.raises(CollectiveError, match=f"{op} of {data.dtype}; it takes"):
                 self.collective(data, op)
@@ -154,6 +141,17 @@ class Disagree(gmijax.Role):
         with pytest.raises(CollectiveError, match=r"the sum of .* numbers of float32, rank"):
             self.collective(np.ones(4096 * (1 + self.rank), np.float32), "sum")
         return str(caught.value)
+
+    def _time_out(self) -> None:
+        """A timeout loses nothing: the same message can be waited for again."""
+        if self.rank == 0:
+            self.recv(1)
+            self.send("late", 1)
+            return
+        with pytest.raises(CollectiveTimeout, match=r"waited 0.05 s in recv, .* ranks \[0\]"):
+            self.recv(0, timeout_s=0.05)
+        self.send("go", 0)
+        assert self.recv(0) == "late"
 
 
 class UntilStopped(gmijax.Role):

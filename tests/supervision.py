@@ -10,37 +10,21 @@ from typing import Any
 
 from gmijax import errors
 from gmijax.config import PlanConfig, ReduceConfig
-from gmijax.partition.backends import Backend, open_backend
-from gmijax.partition.environment import gmi_environment
-from gmijax.partition.machine import Machine
-from gmijax.partition.nvidia import Gpu
+from gmijax.machine.nvidia import Gpu
+from gmijax.machine.snapshot import Machine
 from gmijax.partition.plan import Plan
 from gmijax.partition.planner import make_plan
-from gmijax.partition.supervisor import Job, Patience
-from gmijax.rundir import RunPaths
+from gmijax.runs.folder import RunPaths
+from gmijax.supervise.backends import Backend, open_backend
+from gmijax.supervise.environment import gmi_environment
+from gmijax.supervise.supervisor import Job, Timeouts
 
 CHECKOUT = Path(errors.__file__).parents[1]
 TESTS = Path(__file__).parent
 
 
-def plan_config(**changes: Any) -> PlanConfig:
-    """One GPU with one GMI, everything else left open."""
-    values: dict[str, Any] = {
-        "gpus": 1,
-        "gmis_per_gpu": 1,
-        "layout": None,
-        "backend": "auto",
-        "sm_percent": None,
-        "memory_fraction": None,
-        "template": "auto",
-    }
-    return PlanConfig(**{**values, **changes})
-
-
-def reduce_config(**changes: Any) -> ReduceConfig:
-    """Everything left open."""
-    values: dict[str, Any] = {"strategy": "auto", "intra": "auto", "timeout_s": 10.0}
-    return ReduceConfig(**{**values, **changes})
+plan_config = PlanConfig
+reduce_config = ReduceConfig
 
 
 def gpu(index: int, *, mig_enabled: bool = False) -> Gpu:
@@ -67,7 +51,7 @@ def make_job(
     command: Callable[[int], list[str]] | None = None,
     compile_once: bool = True,
     inherited_fds: Mapping[str, int] | None = None,
-    **patience_s: float,
+    **timeouts_s: float,
 ) -> Job:
     """A job whose GMI i runs `fake_gmi.py modes[i]`."""
 
@@ -75,14 +59,14 @@ def make_job(
         inherited = {**os.environ, "PYTHONPATH": str(CHECKOUT)}
         return gmi_environment(plan, gmi, inherited, run.root, backend.environment(gmi))
 
-    limits = {"start": 20.0, "stall": 20.0, "stop": 20.0, "grace": 2.0} | patience_s
+    limits = {"start": 20.0, "stall": 20.0, "stop": 20.0, "grace": 2.0} | timeouts_s
     return Job(
         run=run,
         gmis=range(len(modes)),
         command=command or (lambda gmi: [sys.executable, str(TESTS / "fake_gmi.py"), modes[gmi]]),
         environment=environment,
         backend=backend,
-        patience=Patience(
+        timeouts=Timeouts(
             start_timeout_s=limits["start"],
             stall_timeout_s=limits["stall"],
             stop_timeout_s=limits["stop"],

@@ -5,9 +5,8 @@ from __future__ import annotations
 import jax
 import jax.numpy as jnp
 
-from gmijax.ppo.losses import LossMetrics
-from gmijax.ppo.programs import IterationMetrics
-from gmijax.ppo.rollout import RolloutStats
+from gmijax.learning.unroll import Counts
+from gmijax.ppo.ppo import IterationMetrics, PpoLosses
 from gmijax.sim.interface import Env, EnvSpec, EnvState
 from gmijax.sim.wrappers import BatchedEnv, time_limit, training_env
 
@@ -57,8 +56,7 @@ def point_mass_env(episode_length: int = 20) -> Env:
     return time_limit(env, episode_length)
 
 
-def metrics_from(stats: RolloutStats) -> IterationMetrics:
-    """Of an iteration with such rollouts whose updates told zeros."""
+def metrics_from(counts: Counts) -> IterationMetrics:
+    """Of an iteration with such rollouts, and zeros of its updates."""
     zero = jnp.zeros(())
-    told = stats.episodes, stats.reward_sum, stats.diverged, stats.overflowed
-    return IterationMetrics(*told, LossMetrics(*[zero] * 5), zero, {}, zero)
+    return IterationMetrics(counts, PpoLosses(*[zero] * 5), zero, {}, zero)

@@ -8,14 +8,14 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from gmijax.partition.heartbeat import Heartbeat, HeartbeatBlock
-from gmijax.resume import find_checkpoint
+from gmijax.runs.resume import find_checkpoint
+from gmijax.supervise.heartbeat import Heartbeat, HeartbeatBlock
 
 TINY = (
     *("env=ball_balance", "num_envs=16", "algo.unroll_length=4", "algo.num_minibatches=2"),
@@ -37,11 +37,15 @@ def make(*, impl, max_envs):
 """
 """`toy_env` as the file of a task of one's own: no contacts, and it compiles in a second."""
 
+POINT = ("env=point.py:make", *TINY[1:])
+"""As TINY, with that task; `train` and `start` write its file where there is none."""
+
 
 def train(
     *overrides: str, cwd: Path, timeout_s: float = 240.0, command: str = "train"
 ) -> subprocess.CompletedProcess[str]:
     """Runs a command to its end."""
+    _write_task(overrides, cwd)
     return subprocess.run(
         [sys.executable, "-m", f"gmijax.{command}", *overrides],
         cwd=cwd,
@@ -53,17 +57,23 @@ def train(
     )
 
 
-def start(*overrides: str, cwd: Path) -> subprocess.Popen[bytes]:
+def start(*overrides: str, cwd: Path, command: str = "train") -> subprocess.Popen[bytes]:
     """Starts a command; its output goes to files in `cwd`."""
+    _write_task(overrides, cwd)
     with (cwd / "stdout.txt").open("wb") as out, (cwd / "stderr.txt").open("wb") as err:
         return subprocess.Popen(
-            [sys.executable, "-m", "gmijax.train", *overrides],
+            [sys.executable, "-m", f"gmijax.{command}", *overrides],
             cwd=cwd,
             env=child_environment(),
             stdout=out,
             stderr=err,
             start_new_session=True,
         )
+
+
+def _write_task(overrides: Sequence[str], cwd: Path) -> None:
+    if POINT[0] in overrides and not (cwd / "point.py").exists():
+        (cwd / "point.py").write_text(POINT_TASK)
 
 
 def child_environment() -> dict[str, str]:
@@ -157,7 +167,7 @@ def kill_somebody(
     """Kills the controller or one of two GMIs of a job at any moment; nothing may be left."""
     cwd.mkdir()
     run = cwd / "run"
-    job = start(*TINY, FOREVER, *overrides, "run.dir=run", cwd=cwd)
+    job = start(*POINT, FOREVER, *overrides, "run.dir=run", cwd=cwd)
     time.sleep(draw.uniform(*within_s))
     kill(draw.choice([job.pid, *filter(None, (gmi_pid(run, gmi) for gmi in range(2)))]))
     code = job.wait(timeout=30)

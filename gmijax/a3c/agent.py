@@ -1,8 +1,8 @@
 """The role of a serving GMI: simulator and agent in one.
 
-It acts with the newest weights on the board, sends what came of it, and goes on. Trainers never
-make it wait, except for room where experience is not to be dropped. Newer weights are taken up
-within unrolls too: the less old what a policy learns from is, the fewer steps it takes.
+It acts with the newest weights that were published, sends what came of it, and goes on. Trainers
+never make it wait, except for room where experience is not to be dropped. Newer weights are taken
+up within unrolls too: the less old what a policy learns from is, the fewer steps it takes.
 """
 
 from __future__ import annotations
@@ -10,49 +10,35 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from functools import partial
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import jax
 import numpy as np
 import numpy.typing as npt
-from jax.flatten_util import ravel_pytree
 
-from gmijax.a3c.board import Board, Orders, Report, pack_report, unpack_orders
-from gmijax.a3c.learner import ActingWeights, acting_weights, unpack_weights
-from gmijax.a3c.losses import Unrolls
+from gmijax.a3c.a3c import Unrolls
+from gmijax.a3c.job_registers import JobRegisters, Orders, Report
 from gmijax.a3c.outgoing import Outgoing
-from gmijax.a3c.rollout import UnrollPrograms, UnrollStats, stats_example
-from gmijax.checkpoint import has_envs, restore_envs, save_envs
-from gmijax.collectives.channel.interface import ExperienceSender
+from gmijax.a3c.rollout import UnrollPrograms, num_counts
+from gmijax.collectives.channel.sender import Sender
 from gmijax.config import A3cConfig, TrainConfig
 from gmijax.devices import describe_device
 from gmijax.errors import CollectiveTimeout, PipeClosed
-from gmijax.learner import LearnerState, init_learner, make_learner
-from gmijax.partition.child import ChildLink
-from gmijax.resume import CheckpointMeta
-from gmijax.sim.wrappers import BatchedEnv, BatchState, env_keys
+from gmijax.learning.checkpoint import save_envs
+from gmijax.learning.learner import (
+    ActingWeights,
+    acting_weights,
+    init_learner,
+    make_learner,
+    unpack_weights,
+)
+from gmijax.learning.start import first_envs
+from gmijax.learning.unroll import Counts
+from gmijax.sim.wrappers import BatchedEnv, BatchState
+from gmijax.supervise.child import ChildLink
 from gmijax.types import Array
 
 _PAUSE_S = 0.02
-
-
-class Serving(NamedTuple):
-    """What an agent is made of.
-
-    Attributes:
-      config: of the run.
-      env: its environments.
-      algo: of the run, too.
-      index: place among the agents, 0 for the first.
-      trainers: ids of the GMIs that train, for messages.
-    """
-
-    config: TrainConfig
-    algo: A3cConfig
-    env: BatchedEnv
-    index: int
-    trainers: tuple[int, ...]
 
 
 class _Sent(NamedTuple):
@@ -63,39 +49,42 @@ class _Sent(NamedTuple):
     version: int
 
 
-def act_until_told(
-    serving: Serving, board: Board, sender: ExperienceSender, link: ChildLink
-) -> dict[str, Any]:
-    """Acts until the leading trainer ends the job.
+class Agent:
+    """One serving GMI.
 
-    Returns:
-      The outcome for `result.json`.
-
-    Raises:
-      CollectiveTimeout: trainers do not start, or take nothing any more.
+    Args:
+      config: of the run.
+      env: its environments.
+      index: place among the agents, 0 for the first.
+      trainers: ids of the GMIs that train, for messages.
+      registers: of the job.
+      sender: of experience.
+      link: to the controller.
     """
-    return _Agent(serving, board, sender, link).run()
-
-
-class _Agent:
-    """One serving GMI; see `act_until_told`."""
 
     def __init__(
-        self, serving: Serving, board: Board, sender: ExperienceSender, link: ChildLink
+        self,
+        config: TrainConfig,
+        env: BatchedEnv,
+        index: int,
+        trainers: tuple[int, ...],
+        registers: JobRegisters,
+        sender: Sender,
+        link: ChildLink,
     ) -> None:
-        self._config = serving.config
-        self._algo = serving.algo
-        self._env = serving.env
-        self._index = serving.index
-        self._trainers = serving.trainers
-        self._board = board
-        self._is_on_device = sender.on_device
-        self._outgoing = Outgoing(serving.config, serving.algo, sender)
+        assert isinstance(config.algo, A3cConfig)
+        self._config = config
+        self._algo = config.algo
+        self._env = env
+        self._index = index
+        self._trainers = trainers
+        self._registers = registers
+        self._sender = sender
+        self._outgoing = Outgoing(config, config.algo, sender)
         self._link = link
-        self._learner = make_learner(self._env.spec, serving.algo)
-        example = ravel_pytree(stats_example(self._env.spec, self._env.overflows))[0]
+        self._learner = make_learner(env.spec, config.algo)
         self._report = Report(
-            None, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, np.zeros(example.size, np.float64)
+            None, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, np.zeros(num_counts(env), np.float64)
         )
         self._orders_seen = 0
         self._orders = Orders(None, is_ending=False)
@@ -104,12 +93,26 @@ class _Agent:
         self._unrolls = 0
 
     def run(self) -> dict[str, Any]:
-        """See `act_until_told`."""
+        """Acts until the leading trainer ends the job.
+
+        Returns:
+          The outcome for `result.json`.
+
+        Raises:
+          CollectiveTimeout: trainers do not start, or take nothing any more.
+        """
         self._link.beat("compiling", 0)
         started = time.monotonic()
-        weights = self._first_weights()
-        env_state = self._first_envs()
-        program = self._compile(weights, env_state)
+        # Of the right shapes; those to act with are read later.
+        start = jax.jit(partial(init_learner, self._learner, self._env.spec.obs_size))
+        weights = acting_weights(self._learner, start(jax.random.key(0)))
+        env_state = first_envs(self._env, self._config, self._index, gmi=self._link.gmi)
+        num_pieces = self._algo.pieces_per_unroll
+        num_steps = self._algo.unroll_length // num_pieces
+        program = UnrollPrograms(
+            *(self._env, self._learner.networks, num_steps, num_pieces, weights, env_state),
+            stays=self._sender.on_device,
+        )
         compile_s = time.monotonic() - started
         self._link.beat("ready", 0)
         self._wait_for_start()
@@ -126,36 +129,6 @@ class _Agent:
             "compile_s": compile_s,
             "device": describe_device(),
         }
-
-    def _first_weights(self) -> ActingWeights:
-        """Weights of the right shapes; those to act with come from the board."""
-        state: LearnerState = jax.jit(
-            lambda key: init_learner(self._learner, self._env.spec.obs_size, key)
-        )(jax.random.key(0))
-        return acting_weights(self._learner, state)
-
-    def _first_envs(self) -> BatchState:
-        config = self._config
-        key = jax.random.split(jax.random.key(config.seed))[1]
-        resume = config.run.resume
-        meta = None if resume is None else CheckpointMeta.read(Path(resume))
-        if meta is not None:  # Other ones than the first run's start.
-            key = jax.random.fold_in(key, meta.env_steps % 2**31)
-        keys = env_keys(key, self._index * config.envs_per_gmi, config.envs_per_gmi)
-        env_state = jax.jit(self._env.init)(self._env.model, keys)
-        if meta is None or not has_envs(Path(str(resume)), self._link.gmi):
-            return env_state
-        if (meta.num_envs, meta.impl) != (config.envs_per_gmi, config.physics.impl):
-            return env_state
-        return restore_envs(Path(str(resume)), self._link.gmi, env_state)
-
-    def _compile(self, weights: ActingWeights, env_state: BatchState) -> UnrollPrograms:
-        num_pieces = self._algo.pieces_per_unroll
-        num_steps = self._algo.unroll_length // num_pieces
-        return UnrollPrograms(
-            *(self._env, self._learner.networks, num_steps, num_pieces, weights, env_state),
-            stays=self._is_on_device,
-        )
 
     def _wait_for_start(self) -> None:
         """Returns when the leading trainer has written its first orders and weights."""
@@ -174,7 +147,7 @@ class _Agent:
         while not self._obey(env_state):
             weights = self._newest(weights, unpack)
             version = self._version  # Of the oldest weights that make this unroll.
-            pieces: list[tuple[Unrolls, UnrollStats]] = []
+            pieces: list[tuple[Unrolls, Counts]] = []
             for index in range(self._algo.pieces_per_unroll):
                 if index > 1:  # One piece runs and one waits: more would act with older weights.
                     jax.block_until_ready(pieces[index - 2])
@@ -191,29 +164,30 @@ class _Agent:
     def _newest(
         self, weights: ActingWeights, unpack: Callable[[npt.NDArray[np.float32]], ActingWeights]
     ) -> ActingWeights:
-        """The newest weights on the board; `weights` if there are no newer ones."""
-        if (posted := self._board.weights.read(self._weights_seen)) is None:
+        """The newest weights published; `weights` if there are no newer ones."""
+        if (snapshot := self._registers.weights.read(self._weights_seen)) is None:
             return weights
-        self._weights_seen, self._version = posted.count, posted.tag
-        return unpack(posted.values.view(np.float32))
+        self._weights_seen, self._version = snapshot.count, snapshot.tag
+        return unpack(snapshot.values.view(np.float32))
 
     def _send(self, unroll: _Sent, env_state: BatchState) -> None:
         arrays: dict[str, Any] = unroll.experience._asdict()
-        if not self._is_on_device:
+        if not self._sender.on_device:
             arrays = {name: np.asarray(values) for name, values in arrays.items()}
         stats = np.asarray(unroll.stats, np.float64)
         started = time.monotonic()
         if not self._hand_over(arrays, unroll.version, env_state, started):
             return
-        counts = self._outgoing.counts()
+        sender, occupancy = self._sender, self._sender.occupancy()
+        self._outgoing.flush_if_starving()
         self._unrolls += 1
         self._report = self._report._replace(
             env_steps=self._report.env_steps + arrays["reward"].size,
-            bytes_sent=float(counts.num_bytes),
-            dropped=float(counts.dropped),
+            bytes_sent=float(sender.num_bytes),
+            dropped=float(sender.dropped),
             send_s=self._report.send_s + time.monotonic() - started,
             wait_s=self._outgoing.waited_s,
-            occupancy=counts.occupancy,
+            occupancy=occupancy,
             stats=self._report.stats + stats,
         )
         self._publish()
@@ -258,12 +232,12 @@ class _Agent:
 
     def _look(self) -> bool:
         """Takes up new orders; returns whether there ever were any."""
-        if (posted := self._board.orders.read(self._orders_seen)) is not None:
-            self._orders_seen, self._orders = posted.count, unpack_orders(posted)
+        if (snapshot := self._registers.orders.read(self._orders_seen)) is not None:
+            self._orders_seen, self._orders = snapshot.count, Orders.unpack(snapshot.values)
         return self._orders_seen > 0
 
     def _publish(self) -> None:
-        self._board.reports[self._index].publish(pack_report(self._report))
+        self._registers.reports[self._index].publish(self._report.pack())
 
     def _late(self, what: str, limit_s: float) -> CollectiveTimeout:
         return CollectiveTimeout(self._link.gmi, self._trainers, what, self._unrolls, limit_s)

@@ -6,12 +6,12 @@ import time
 from collections.abc import Callable, Mapping
 from typing import Any
 
-from gmijax.collectives.channel.interface import ExperienceSender, SenderStats
+from gmijax.collectives.channel.sender import Sender
 from gmijax.config import A3cConfig, TrainConfig
 
 _POLL_S = 0.0002
 _SLICE_S = 0.5
-"""Longest wait for room before the agent looks at the board again."""
+"""Longest wait for room before the agent looks for orders again."""
 
 
 class Outgoing:
@@ -26,7 +26,7 @@ class Outgoing:
       waited_s: seconds of waits for room in which the device had nothing to do.
     """
 
-    def __init__(self, config: TrainConfig, algo: A3cConfig, sender: ExperienceSender) -> None:
+    def __init__(self, config: TrainConfig, algo: A3cConfig, sender: Sender) -> None:
         self.waited_s = 0.0
         self._channel = config.channel
         self._max_ahead = algo.max_ahead
@@ -41,22 +41,20 @@ class Outgoing:
           is_idle: whether the device has computed all that it was given.
 
         Raises:
-          PeerLost, PipeClosed: as `ExperienceSender.send`.
+          PeerLost, PipeClosed: as `Sender.send`.
         """
         if self._is_ahead(arrays, is_idle):
             return False
-        costs, before_s = is_idle(), self._sender.stats().waited_s
+        costs, before_s = is_idle(), self._sender.waited_s
         is_sent = self._sender.send(arrays, version, _SLICE_S)
         if costs:
-            self.waited_s += self._sender.stats().waited_s - before_s
+            self.waited_s += self._sender.waited_s - before_s
         return is_sent
 
-    def counts(self) -> SenderStats:
-        """Of the channels; what waits goes if a trainer has nothing to do."""
-        counts = self._sender.stats()
-        if not counts.least_occupancy:
+    def flush_if_starving(self) -> None:
+        """Hands over what waits for more to come if a trainer has nothing to do."""
+        if not self._sender.least_occupancy():
             self._sender.flush()
-        return counts
 
     def _is_ahead(self, arrays: Mapping[str, Any], is_idle: Callable[[], bool]) -> bool:
         """Waits a moment while `max_ahead` unrolls wait for every trainer; whether they still do.
@@ -68,7 +66,7 @@ class Outgoing:
         size = sum(array.nbytes for array in arrays.values())
         most = (self._max_ahead - 0.5) * size / self._channel.capacity_bytes
         deadline_s = time.monotonic() + _SLICE_S
-        while self._sender.stats().least_occupancy > most:
+        while self._sender.least_occupancy() > most:
             costs, now_s = is_idle(), time.monotonic()
             if now_s > deadline_s:
                 return True

@@ -1,4 +1,4 @@
-"""What a step turned out to be worth: n-step returns, and V-trace for steps of older policies."""
+"""Targets of values and advantages: n-step returns, and V-trace for steps of older policies."""
 
 from __future__ import annotations
 

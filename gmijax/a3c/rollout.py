@@ -4,37 +4,20 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from functools import partial
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 from jax.flatten_util import ravel_pytree
 
-from gmijax.a3c.learner import ActingWeights
-from gmijax.a3c.losses import Unrolls
-from gmijax.acting import act
-from gmijax.host_memory import host_sharding
-from gmijax.normalize import normalize
-from gmijax.policy import ActorCritic, log_prob
-from gmijax.sim.interface import EnvSpec
-from gmijax.sim.wrappers import BatchedEnv, BatchState, EpisodeSums, zero_counts
+from gmijax.a3c.a3c import Unrolls
+from gmijax.devices import host_sharding
+from gmijax.learning.learner import ActingWeights
+from gmijax.learning.normalize import normalize
+from gmijax.learning.policy import ActorCritic, log_prob
+from gmijax.learning.unroll import Counts, Outcome, act, count, no_counts, outcome_of, unroll
+from gmijax.sim.wrappers import BatchedEnv, BatchState, StepOutput
 from gmijax.types import Array, PyTree
-
-
-class UnrollStats(NamedTuple):
-    """What an agent tells of its unrolls, sums over all of them; [] each.
-
-    Attributes:
-      episodes: the episodes that ended.
-      reward_sum: of all rewards, unscaled.
-      diverged: steps that ended a world because of a bad number, by where it was.
-      overflowed: steps for which a buffer of the simulator was too small, by which.
-    """
-
-    episodes: EpisodeSums
-    reward_sum: Array
-    diverged: dict[str, Array]
-    overflowed: dict[str, Array]
 
 
 def collect(
@@ -44,43 +27,40 @@ def collect(
     model: PyTree,
     weights: ActingWeights,
     env_state: BatchState,
-) -> tuple[BatchState, Unrolls, UnrollStats]:
+) -> tuple[BatchState, Unrolls, Counts]:
     """Runs steps with one version of the policy: an unroll, or a piece of one."""
 
-    def step(state: BatchState, _: None) -> tuple[BatchState, tuple[Unrolls, Array, UnrollStats]]:
-        params, moments = weights
-        obs = state.env.obs
-        state, mean, action = act(networks, params, moments, state, env.spec.action_size)
-        state, out = env.step(model, state, action)
+    def keep(
+        before: BatchState, mean: Array, action: Array, out: StepOutput
+    ) -> tuple[Unrolls, Array, Outcome]:
         kept = Unrolls(
-            state=obs,
+            state=before.env.obs,
             action=action,
             reward=out.reward,
             done=jnp.stack([out.terminated, out.truncated], axis=-1),
-            log_prob=log_prob(mean, params.log_std, action),
+            log_prob=log_prob(mean, weights.params.log_std, action),
             cut_value=jnp.zeros_like(out.reward),
             bootstrap=jnp.zeros(()),
         )
-        counts = UnrollStats(out.finished, jnp.sum(out.reward), out.diverged, out.overflowed)
-        return state, (kept, out.next_obs, counts)
+        return kept, out.next_obs, outcome_of(out)
 
-    env_state, (kept, next_obs, counts) = jax.lax.scan(step, env_state, None, length=num_steps)
+    choose = partial(act, networks, weights)
+    env_state, (kept, next_obs, outcomes) = unroll(env, choose, num_steps, keep, model, env_state)
     # A second pass over all rows is simple, and cheap beside the physics.
     values = networks.state_value(weights.params, normalize(weights.moments, next_obs))
     kept = kept._replace(
         cut_value=jnp.where(kept.done[..., 1], values, 0.0), bootstrap=env_state.env.obs[None]
     )
-    totals = jax.tree.map(lambda x: jnp.sum(x, axis=0, dtype=jnp.float32), counts)
-    return env_state, kept, totals
+    return env_state, kept, count(kept.reward, outcomes)
 
 
-def join(pieces: Sequence[tuple[Unrolls, UnrollStats]]) -> tuple[Unrolls, Array]:
-    """The unroll that pieces are in a row, and its packed statistics [M]."""
+def join(pieces: Sequence[tuple[Unrolls, Counts]]) -> tuple[Unrolls, Array]:
+    """The unroll that pieces are in a row, and its packed counts [M]."""
     kept, counts = zip(*pieces, strict=True)
     steps: Any = [piece._replace(bootstrap=None) for piece in kept]
-    unroll: Unrolls = jax.tree.map(lambda *parts: jnp.concatenate(parts), *steps)
+    joined: Unrolls = jax.tree.map(lambda *parts: jnp.concatenate(parts), *steps)
     totals = jax.tree.map(lambda *parts: sum(parts), *counts)
-    return unroll._replace(bootstrap=kept[-1].bootstrap), ravel_pytree(totals)[0]
+    return joined._replace(bootstrap=kept[-1].bootstrap), ravel_pytree(totals)[0]
 
 
 class UnrollPrograms:
@@ -109,37 +89,25 @@ class UnrollPrograms:
     ) -> None:
         self._model = env.model
         piece = jax.jit(partial(collect, env, networks, num_steps), donate_argnums=(2,))
-        args = (env.model, weights, env_state)
-        made = jax.eval_shape(piece, *args)[1:]
+        lowered: Any = piece.lower(env.model, weights, env_state)
         where = host_sharding()
-        unroll: Any = None if stays else where
-        joining = jax.jit(join, out_shardings=(unroll, where) if where else None)
-        self._piece: Any = piece.lower(*args).compile()
-        self._join: Any = joining.lower([made] * num_pieces).compile()
+        unrolls: Any = None if stays else where
+        joining = jax.jit(join, out_shardings=(unrolls, where) if where else None)
+        self._join: Any = joining.lower([lowered.out_info[1:]] * num_pieces).compile()
+        self._piece: Any = lowered.compile()
 
     def piece(
         self, weights: ActingWeights, env_state: BatchState
-    ) -> tuple[BatchState, tuple[Unrolls, UnrollStats]]:
+    ) -> tuple[BatchState, tuple[Unrolls, Counts]]:
         """Starts the next steps; `env_state` is donated."""
         env_state, kept, counts = self._piece(self._model, weights, env_state)
         return env_state, (kept, counts)
 
-    def join(self, pieces: Sequence[tuple[Unrolls, UnrollStats]]) -> tuple[Unrolls, Array]:
+    def join(self, pieces: Sequence[tuple[Unrolls, Counts]]) -> tuple[Unrolls, Array]:
         """See the function `join`."""
         return self._join(list(pieces))
 
 
-def stats_example(spec: EnvSpec, overflows: tuple[str, ...] = ()) -> UnrollStats:
-    """Zeros in the structure of `UnrollStats`."""
-    episodes, diverged, overflowed = zero_counts(spec, overflows)
-    return UnrollStats(
-        episodes=episodes,
-        reward_sum=jnp.zeros(()),
-        diverged=diverged,
-        overflowed=overflowed,
-    )
-
-
-def num_stats(env: BatchedEnv) -> int:
-    """M, how many numbers `UnrollStats` are."""
-    return len(jax.tree.leaves(stats_example(env.spec, env.overflows)))
+def num_counts(env: BatchedEnv) -> int:
+    """M, how many numbers `Counts` are."""
+    return len(jax.tree.leaves(no_counts(env.spec, env.overflows)))

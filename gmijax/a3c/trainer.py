@@ -1,183 +1,156 @@
 """The role of a training GMI: takes experience, learns, publishes weights.
 
-All trainers make the same updates; the first leads them: it publishes the weights, tells the
-agents what to do, writes metrics and the shared part of checkpoints.
+All trainers make the same updates; the first leads them: it publishes the weights, gives the
+agents their orders, writes metrics and the shared part of checkpoints.
 """
 
 from __future__ import annotations
 
 import time
-from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import numpy.typing as npt
 
-from gmijax.a3c.board import Board
+from gmijax.a3c.a3c import Unrolls
+from gmijax.a3c.job_registers import JobRegisters
 from gmijax.a3c.leader import Leader
-from gmijax.a3c.learner import acting_weights, pack_weights
-from gmijax.a3c.losses import LossMetrics, Unrolls
-from gmijax.a3c.programs import FusedUpdate, SplitUpdate, Update
-from gmijax.a3c.report import Told
-from gmijax.a3c.staleness import MAX_COUNTED, histogram_of
-from gmijax.a3c.tally import Tally
-from gmijax.checkpoint import digest, restore_learner
-from gmijax.collectives.channel.interface import Batch, ExperienceReceiver
+from gmijax.a3c.report import MAX_COUNTED, BatchCounts, UpdateFigures, histogram_of
+from gmijax.a3c.update import make_update
+from gmijax.collectives.channel.batcher import Batch, Batcher
 from gmijax.collectives.interface import Reducer
 from gmijax.config import A3cConfig, TrainConfig
-from gmijax.errors import CollectiveTimeout, NonFiniteError, ParameterMismatch
-from gmijax.learner import LearnerState, init_learner, make_learner
-from gmijax.partition.child import ChildLink
-from gmijax.resume import CheckpointMeta
+from gmijax.errors import CollectiveTimeout
+from gmijax.learning.checkpoint import require_equal
+from gmijax.learning.learner import TrainState, acting_weights, make_learner, pack_weights
+from gmijax.learning.physics_health import check_losses
+from gmijax.learning.start import first_state
 from gmijax.sim.wrappers import BatchedEnv
+from gmijax.supervise.child import ChildLink
 
 _SLICE_S = 0.5
 """Longest wait for experience before the trainer says that it is alive."""
 
 
-class Training(NamedTuple):
-    """What a trainer is made of.
+class Trainer:
+    """One training GMI.
 
-    Attributes:
+    Args:
       config: of the run.
-      algo: of the run, too.
       env: one of the environments, for its sizes; it is not stepped.
       agents: ids of the GMIs that act.
+      registers: of the job.
+      receiver: of experience.
+      reducer: among the trainers.
+      link: to the controller.
     """
-
-    config: TrainConfig
-    algo: A3cConfig
-    env: BatchedEnv
-    agents: tuple[int, ...]
-
-
-def learn_until_done(
-    training: Training,
-    board: Board,
-    receiver: ExperienceReceiver,
-    reducer: Reducer,
-    link: ChildLink,
-) -> dict[str, Any]:
-    """Learns until `num_timesteps` are consumed or the controller asks for an end.
-
-    Returns:
-      The outcome for `result.json`; of the leader, that of the job.
-
-    Raises:
-      NonFiniteError: simulation or learning produced NaN or infinity.
-      ParameterMismatch: the trainers' parameters differ.
-      CollectiveError: another GMI is gone or stuck.
-    """
-    return _Trainer(training, board, receiver, reducer, link).run()
-
-
-class _Trainer:
-    """One training GMI; see `learn_until_done`."""
 
     def __init__(
         self,
-        training: Training,
-        board: Board,
-        receiver: ExperienceReceiver,
+        config: TrainConfig,
+        env: BatchedEnv,
+        agents: tuple[int, ...],
+        registers: JobRegisters,
+        receiver: Batcher,
         reducer: Reducer,
         link: ChildLink,
     ) -> None:
-        self._config = training.config
-        self._algo = training.algo
-        self._env = training.env
-        self._agents = training.agents
+        assert isinstance(config.algo, A3cConfig)
+        self._config = config
+        self._algo = config.algo
+        self._env = env
+        self._agents = agents
+        self._registers = registers
         self._receiver = receiver
         self._reducer = reducer
         self._link = link
-        self._batch_size = training.algo.batch_of(training.config.envs_per_gmi)
-        self._learner = make_learner(self._env.spec, training.algo)
-        self._update: Update = (
-            FusedUpdate(self._learner)
-            if reducer.world_size == 1
-            else SplitUpdate(self._learner, self._env.spec.obs_size, reducer)
-        )
+        self._batch_size = self._algo.batch_of(config.envs_per_gmi)
+        self._learner = make_learner(env.spec, self._algo)
+        self._update = make_update(self._learner, env.spec.obs_size, reducer)
         self._env_steps = 0
         self._updates = 0
         self._version = 0
         self._passed_over = np.zeros(MAX_COUNTED + 1, np.float32)
-        self._lead = None
-        if reducer.rank == 0:
-            self._lead = Leader(training.config, self._env, board, link, training.agents)
 
     def run(self) -> dict[str, Any]:
-        """See `learn_until_done`."""
+        """Learns until `num_timesteps` are consumed or the controller asks for an end.
+
+        Returns:
+          The outcome for `result.json`; of the leader, that of the job.
+
+        Raises:
+          NonFiniteError: simulation or learning produced NaN or infinity.
+          ParameterMismatch: the trainers' parameters differ.
+          CollectiveError: another GMI is gone or stuck.
+        """
         self._link.beat("compiling", 0)
         started = time.monotonic()
-        if self._lead is None:
+        leads = self._reducer.rank == 0
+        if not leads:
             # The leader compiles first, the others take its programs from the cache: those that
             # each of them would tune could differ in the last bit.
             self._reducer.all_gather(np.zeros(1, np.float32))
-        state = self._first_state()
+        # The same key as synchronous training uses: the same first policy.
+        state, self._env_steps = first_state(self._learner, self._env.spec.obs_size, self._config)
+        self._version = int(state.iteration)
         self._update.compile(state, *self._example())
-        if self._lead is not None:
+        if leads:
             self._reducer.all_gather(np.zeros(1, np.float32))
         pack = jax.jit(lambda state: pack_weights(acting_weights(self._learner, state)))
         first = np.asarray(pack(state))
         compile_s = time.monotonic() - started
         self._link.beat("ready", 0)
-        self._check_equal(state)  # And so all trainers have compiled.
-        if self._lead is None:
-            return {"status": self._loop(state), "updates": self._updates}
+        self._require_equal(state)  # And so all trainers have compiled.
+        if not leads:
+            return {"status": self._loop(state, None), "updates": self._updates}
+        config, env, agents = self._config, self._env, self._agents
+        leader = Leader(config, env, self._registers, self._link, agents, self._env_steps)
         try:
-            self._lead.start(first, self._version, self._env_steps)
-            status = self._loop(state)
+            leader.start(first, self._version)
+            status = self._loop(state, leader)
         finally:
-            self._lead.close()
-        return self._lead.outcome(status, compile_s)
+            leader.close()
+        return leader.outcome(status, compile_s)
 
-    def _first_state(self) -> LearnerState:
-        # The same key as synchronous training uses: the same first policy.
-        key = jax.random.split(jax.random.key(self._config.seed))[0]
-        obs_size = self._env.spec.obs_size
-        state = jax.jit(lambda k: init_learner(self._learner, obs_size, k))(key)
-        resume = self._config.run.resume
-        if resume is not None:
-            self._env_steps = CheckpointMeta.read(Path(resume)).env_steps
-            state = restore_learner(Path(resume), state)
-        self._version = int(state.iteration)
-        return state
+    def _require_equal(self, state: TrainState) -> None:
+        require_equal(self._reducer, state.params, self._env_steps)
 
-    def _loop(self, state: LearnerState) -> str:
+    def _loop(self, state: TrainState, leader: Leader | None) -> str:
         """Returns the status for the outcome."""
         while True:
             batch, waited_s = self._receive()
-            tally = self._meet(batch, waited_s)
+            counts = self._meet(batch, waited_s)
             started = time.monotonic()
             unrolls = Unrolls(**batch.experience)  # pyright: ignore[reportArgumentType]
-            weight = jnp.asarray(self._weights_of(batch) * self._scale(tally))
+            weight = jnp.asarray(self._weights_of(batch) * self._scale(counts))
             state, updated = self._update(state, unrolls, weight)
             weights = np.asarray(updated.weights)
             losses, rates = jax.device_get((updated.losses, updated.rates))
             self._version += 1
             self._updates += 1
-            self._env_steps += round(tally.fresh) * self._algo.unroll_length
-            self._check_finite(losses)
-            is_stopped = tally.stop > 0
+            self._env_steps += round(counts.fresh) * self._algo.unroll_length
+            where = f"{self._config.env.label}, up to env step {self._env_steps}"
+            check_losses(where, losses._asdict())
+            is_stopped = counts.stop > 0
             is_last = is_stopped or self._env_steps >= self._config.num_timesteps
-            if self._lead is not None:
-                self._lead.publish(weights, self._version)
-                update_s = time.monotonic() - started
-                told = Told(losses, rates, update_s)
-                self._lead.record(self._env_steps, self._updates, tally, told, state)
+            if leader is not None:
+                leader.publish(weights, self._version)
+                figures = UpdateFigures(losses, rates, time.monotonic() - started)
+                leader.record(self._env_steps, self._updates, counts, figures, state)
                 if not is_last:
-                    self._lead.checkpoint_now_and_then(state, self._env_steps, self._updates)
+                    leader.checkpoint_now_and_then(state)
             self._link.beat("running", self._updates)
             if is_last:
                 break
-        if self._lead is not None:
-            self._lead.end(self._env_steps)
-        self._check_equal(state)
-        # Agents that wait for room may go: the order to end is on the board by now.
+        if leader is not None:
+            leader.end()
+        self._require_equal(state)
+        # Agents that wait for room may go: the order to end is published by now.
         self._receiver.close()
-        if self._lead is not None:
-            self._lead.finish(state, self._env_steps, self._updates)
+        if leader is not None:
+            leader.finish(state)
         return "stopped" if is_stopped else "completed"
 
     def _receive(self) -> tuple[Batch, float]:
@@ -210,11 +183,11 @@ class _Trainer:
         fresh = self._version - batch.versions <= self._algo.max_staleness
         return fresh.astype(np.float32)
 
-    def _scale(self, tally: Tally) -> np.float32:
-        """What a fresh unroll weighs, so that it weighs as much as any other of the job."""
-        return np.float32(self._reducer.world_size * self._batch_size / tally.fresh)
+    def _scale(self, counts: BatchCounts) -> np.float32:
+        """Weight of a fresh unroll, equal to that of any other of the job."""
+        return np.float32(self._reducer.world_size * self._batch_size / counts.fresh)
 
-    def _meet(self, batch: Batch, waited_s: float) -> Tally:
+    def _meet(self, batch: Batch, waited_s: float) -> BatchCounts:
         """Tells the other trainers of this batch, and hears of theirs."""
         fresh = float(self._weights_of(batch).sum())
         behind = histogram_of(self._version - batch.versions) + self._passed_over
@@ -223,7 +196,9 @@ class _Trainer:
         mine = np.concatenate([head, behind])
         gathered = self._reducer.all_gather(mine.astype(np.float32))
         stop, fresh, stale, _ = (float(x) for x in gathered[:, :4].sum(axis=0))
-        return Tally(stop, fresh, stale, float(gathered[:, 3].max()), gathered[:, 4:].sum(axis=0))
+        return BatchCounts(
+            stop, fresh, stale, float(gathered[:, 3].max()), gathered[:, 4:].sum(axis=0)
+        )
 
     def _example(self) -> tuple[Unrolls, Any]:
         """Shapes of a batch and its weights."""
@@ -242,18 +217,3 @@ class _Trainer:
             bootstrap=floats(1, size, spec.obs_size),
         )
         return unrolls, floats(size)
-
-    def _check_finite(self, losses: LossMetrics) -> None:
-        if bad := [name for name, x in losses._asdict().items() if not np.isfinite(x)]:
-            raise NonFiniteError(
-                f"{self._config.env.label}, up to env step {self._env_steps}: "
-                f"{', '.join(bad)} of the update is not finite"
-            )
-
-    def _check_equal(self, state: LearnerState) -> None:
-        digests = self._reducer.all_gather(digest(state.params))
-        if different := [r for r in range(len(digests)) if (digests[r] != digests[0]).any()]:
-            raise ParameterMismatch(
-                f"after {self._env_steps} env steps the parameters of trainers {different} "
-                "differ from those of trainer 0"
-            )

@@ -1,4 +1,4 @@
-"""The compiled parts of collecting: a whole unroll, one step, and the halves of a step.
+"""Who acts while experience is collected, and the compiled parts: an unroll, halves of a step.
 
 Where simulator and agent share a GMI, T steps are one program. Where they do not, a step is cut
 where data leaves the GMI: `simulate` ends with what the agent must know, `infer` is the agent's.
@@ -8,14 +8,85 @@ experience.
 
 from __future__ import annotations
 
-from typing import NamedTuple
+import math
+from collections.abc import Callable
+from pathlib import Path
+from typing import Final, NamedTuple
 
 import jax
 import jax.numpy as jnp
 
-from gmijax.collection.policy import ActingPolicy
+from gmijax.learning.checkpoint import digest, restore_learner
+from gmijax.learning.learner import Learner, acting_moments, init_learner, make_learner
+from gmijax.learning.normalize import normalize
+from gmijax.learning.policy import log_prob as log_density
+from gmijax.learning.unroll import policy_noise
+from gmijax.runs.resume import trained_config
+from gmijax.sim.interface import EnvSpec
 from gmijax.sim.wrappers import BatchedEnv, BatchState, EpisodeSums, split_keys, zero_counts
-from gmijax.types import Array, PyTree
+from gmijax.types import Array, PRNGKey, PyTree
+
+RANDOM: Final = "random"
+
+
+class ActingPolicy(NamedTuple):
+    """What chooses actions.
+
+    Attributes:
+      choose: `(weights, obs [N, O], keys [N]) -> (actions [N, A], log densities [N])`; consumes
+        the keys. The log density of a policy that does not sample is 0.
+      weights: what `choose` needs, on the device.
+      digest: hexadecimal SHA-256 of the weights, or `random`.
+    """
+
+    choose: Callable[[PyTree, Array, PRNGKey], tuple[Array, Array]]
+    weights: PyTree
+    digest: str
+
+
+def random_policy(spec: EnvSpec) -> ActingPolicy:
+    """Actions uniform in [-1, 1], independent of what is observed."""
+    size = spec.action_size
+
+    def choose(weights: PyTree, obs: Array, keys: PRNGKey) -> tuple[Array, Array]:
+        del weights
+        draw = jax.vmap(lambda key: jax.random.uniform(key, (size,), minval=-1.0))
+        return draw(keys), jnp.full(obs.shape[:1], -size * math.log(2.0))
+
+    return ActingPolicy(choose, (), RANDOM)
+
+
+def trained_policy(checkpoint: Path, spec: EnvSpec, *, deterministic: bool) -> ActingPolicy:
+    """The policy of a checkpoint.
+
+    Args:
+      checkpoint: its folder, in the folder of its run.
+      spec: sizes of the environment.
+      deterministic: act with the mean; else sample.
+
+    Raises:
+      ConfigError: the checkpoint is broken, or of an environment with other sizes.
+    """
+    learner = make_learner(spec, trained_config(checkpoint)[1])
+    start = jax.jit(lambda key: init_learner(learner, spec.obs_size, key))(jax.random.key(0))
+    state = restore_learner(checkpoint, start)
+    weights = state.params, acting_moments(learner, state)
+    sha = digest(weights).astype("uint16").tobytes().hex()
+    return ActingPolicy(_gaussian(learner, spec.action_size, deterministic), weights, sha)
+
+
+def _gaussian(
+    learner: Learner, size: int, deterministic: bool
+) -> Callable[[PyTree, Array, PRNGKey], tuple[Array, Array]]:
+    def choose(weights: PyTree, obs: Array, keys: PRNGKey) -> tuple[Array, Array]:
+        params, moments = weights
+        mean = learner.networks.action_mean(params, normalize(moments, obs))
+        if deterministic:
+            return mean, jnp.zeros(obs.shape[:1])
+        action = mean + jnp.exp(params.log_std) * policy_noise(keys, size)
+        return action, log_density(mean, params.log_std, action)
+
+    return choose
 
 
 class Step(NamedTuple):

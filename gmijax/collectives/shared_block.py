@@ -17,15 +17,14 @@ This file is the only one that knows the wire format (K ranks, P floats, native 
 
 from __future__ import annotations
 
-import mmap
-import os
 from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
+from gmijax.collectives.shared_memory import create_file, map_file, round_up, whole_pages
 from gmijax.errors import CollectiveError, ConfigError
-from gmijax.processes import ProcessId, own_process
+from gmijax.machine.processes import ProcessId, own_process
 
 MAGIC = 0x58494D47  # "GMIX" in memory on a little-endian machine
 VERSION = 4
@@ -66,13 +65,13 @@ class Geometry(NamedTuple):
     @classmethod
     def of(cls, world_size: int, num_floats: int) -> Geometry:
         """The geometry for K ranks and P floats."""
-        row_floats = _round_up(max(num_floats, 1), FLOATS_PER_LINE)
+        row_floats = round_up(max(num_floats, 1), FLOATS_PER_LINE)
         gathered = LANES * world_size * LINE.itemsize
         floats = LANES * 2 * world_size * MAX_GATHER_FLOATS
-        slots = _round_up(gathered + floats * 4, mmap.PAGESIZE)
+        slots = whole_pages(gathered + floats * 4)
         # Whole pages, because a GPU maps pages.
-        flags = _round_up(slots + 2 * world_size * row_floats * 4, mmap.PAGESIZE)
-        size = flags + _round_up(world_size * LINE.itemsize, mmap.PAGESIZE)
+        flags = whole_pages(slots + 2 * world_size * row_floats * 4)
+        size = flags + whole_pages(world_size * LINE.itemsize)
         return cls(gathered, slots, row_floats, flags, size)
 
 
@@ -101,10 +100,7 @@ def create_exchange() -> int:
 
     Pass the descriptor to every GMI (`ENV_EXCHANGE_FD` names it there), then close it.
     """
-    fd = os.memfd_create("gmijax-exchange", os.MFD_CLOEXEC)
-    # Another user who may look into /proc/<pid>/fd must not read or change gradients.
-    os.fchmod(fd, 0o600)
-    return fd
+    return create_file("exchange")
 
 
 def attach(fd: int, rank: int, world_size: int, num_floats: int, lane: int = 0) -> SharedBlock:
@@ -162,16 +158,7 @@ def process_of(block: SharedBlock, peer: int) -> ProcessId:
 
 def _map(fd: int, rank: int, world_size: int, num_floats: int, lane: int) -> SharedBlock:
     geometry = Geometry.of(world_size, num_floats)
-    try:
-        # Unlike ftruncate this never shrinks the file, which would crash (SIGBUS) ranks that
-        # have mapped more of it, and it fails here, not at first touch, if memory is short.
-        os.posix_fallocate(fd, 0, geometry.size)
-        mapping = mmap.mmap(fd, geometry.size, flags=mmap.MAP_SHARED | mmap.MAP_POPULATE)
-    except OSError as error:
-        raise CollectiveError(
-            f"rank {rank}: cannot map {geometry.size / 2**20:.1f} MiB of shared memory "
-            f"at descriptor {fd} ({error.strerror})"
-        ) from None
+    mapping = map_file(fd, geometry.size, f"rank {rank}")
 
     def floats(offset: int, count: int) -> npt.NDArray[np.float32]:
         return np.frombuffer(mapping, np.float32, count, offset)
@@ -185,7 +172,3 @@ def _map(fd: int, rank: int, world_size: int, num_floats: int, lane: int) -> Sha
         slots=slots.reshape(2, world_size, geometry.row_floats)[:, :, :num_floats],
         flags=np.frombuffer(mapping, np.uint32, -1, geometry.flags).reshape(-1, FLOATS_PER_LINE),
     )
-
-
-def _round_up(value: int, multiple: int) -> int:
-    return -(-value // multiple) * multiple

@@ -1,18 +1,28 @@
 """The configuration of a run: frozen dataclasses and their checks.
 
 No hydra and no jax here. Default values live in `configs/`, meanings live here: `--help` prints
-the `doc` of every field. `gmijax.schema.from_dict` makes them from outside data.
+the `doc` of every field. `gmijax.config.schema.from_dict` makes them from outside data.
 """
 
 from __future__ import annotations
 
-from gmijax.config.a3c import A3cConfig
-from gmijax.config.actor_critic import ADAPTIVE_LEARNING_RATE_RANGE, ActorCriticConfig
+from gmijax.config.algo import (
+    ADAPTIVE_LEARNING_RATE_RANGE,
+    A3cConfig,
+    ActorCriticConfig,
+    PpoConfig,
+)
 from gmijax.config.channel import ChannelConfig
 from gmijax.config.env import EnvConfig, PhysicsConfig
-from gmijax.config.plan import PlanConfig, Priority, ReduceConfig, TemplateName
+from gmijax.config.plan import (
+    BackendName,
+    PlanConfig,
+    Priority,
+    ReduceConfig,
+    StrategyName,
+    TemplateName,
+)
 from gmijax.config.play import PlayConfig, PlayRunConfig
-from gmijax.config.ppo import PpoConfig
 from gmijax.config.run import RunConfig
 from gmijax.config.search import AUTO, SearchConfig
 from gmijax.config.serve import OutputConfig, ServeConfig, ServeRunConfig
@@ -25,6 +35,7 @@ __all__ = [
     "A3cConfig",
     "ActorCriticConfig",
     "AlgoConfig",
+    "BackendName",
     "ChannelConfig",
     "EnvConfig",
     "OutputConfig",
@@ -39,6 +50,7 @@ __all__ = [
     "SearchConfig",
     "ServeConfig",
     "ServeRunConfig",
+    "StrategyName",
     "TemplateName",
     "TrainConfig",
 ]

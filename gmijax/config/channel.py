@@ -5,13 +5,15 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal
 
+from gmijax.config.schema import KeyGroup, doc
 from gmijax.errors import ConfigError
-from gmijax.schema import doc, require_at_least
 
 
 @dataclass(frozen=True, kw_only=True)
-class ChannelConfig:
+class ChannelConfig(KeyGroup):
     """How experience gets from agents to trainers (docs/channels.md)."""
+
+    prefix = "channel."
 
     design: Literal["multi", "uni"] = doc(
         "multi: transfers by channel; uni: every step's tensors alone, the paper's baseline",
@@ -26,29 +28,28 @@ class ChannelConfig:
     capacity_mib: int = doc(
         "room between every agent and every trainer, MiB; a transfer may take a quarter of it",
         default=64,
+        low=1,
     )
     transfer_kib: int | None = doc(
         "experience that travels at once, KiB, one rollout at least; null: found by trying",
         default=None,
+        low=1,
     )
     when_full: Literal["block", "drop_oldest"] = doc(
         "what an agent does without room: wait, or queue and drop the oldest", default="block"
     )
-    max_waiting: int = doc("most pieces in that queue (when_full=drop_oldest)", default=4)
+    max_waiting: int = doc("most pieces in that queue (when_full=drop_oldest)", default=4, low=1)
     float16: tuple[str, ...] = doc(
         "channels that travel with half the bits, e.g. [state]; they lose precision", default=()
     )
 
     def __post_init__(self) -> None:
-        require_at_least("channel.capacity_mib", self.capacity_mib, 1)
-        require_at_least("channel.max_waiting", self.max_waiting, 1)
-        if self.transfer_kib is not None:
-            require_at_least("channel.transfer_kib", self.transfer_kib, 1)
-            if self.transfer_kib * 4 > self.capacity_mib * 1024:
-                raise ConfigError(
-                    f"channel.transfer_kib={self.transfer_kib}: must be at most a quarter of "
-                    f"channel.capacity_mib={self.capacity_mib}"
-                )
+        super().__post_init__()
+        if self.transfer_kib is not None and self.transfer_kib * 4 > self.capacity_mib * 1024:
+            raise ConfigError(
+                f"channel.transfer_kib={self.transfer_kib}: must be at most a quarter of "
+                f"channel.capacity_mib={self.capacity_mib}"
+            )
         if self.transport == "device" and (why := self.why_not_device()):
             raise ConfigError(f"channel.transport=device: {why}")
         if self.design == "uni" and self.when_full != "block":

@@ -9,9 +9,9 @@ from pathlib import PurePath
 from types import MappingProxyType
 from typing import Literal
 
+from gmijax.config.randomization import LeafRange
+from gmijax.config.schema import KeyGroup, doc
 from gmijax.errors import ConfigError
-from gmijax.randomization import LeafRange
-from gmijax.schema import doc, require_at_least
 
 _EXAMPLES: Mapping[str, str] = MappingProxyType(
     {"brax": "ant", "playground": "CartpoleBalance", "custom": "path/to/cart.py:make"}
@@ -19,8 +19,10 @@ _EXAMPLES: Mapping[str, str] = MappingProxyType(
 
 
 @dataclass(frozen=True, kw_only=True)
-class EnvConfig:
+class EnvConfig(KeyGroup):
     """The task."""
+
+    prefix = "env."
 
     # Whose task it is: env= sets it.
     suite: Literal["gmijax", "brax", "playground", "custom"] = "gmijax"
@@ -29,7 +31,7 @@ class EnvConfig:
         "robot models at first use), with env=custom PATH.py:FUNCTION"
     )
     episode_length: int | None = doc(
-        "steps after which an episode is truncated (time limit); null: the task's own"
+        "steps after which an episode is truncated (time limit); null: the task's own", low=1
     )
     # Digest of a custom task's file: the run itself notes it.
     source_sha256: str | None = None
@@ -43,13 +45,12 @@ class EnvConfig:
     )
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         if self.name is None:
             example = _EXAMPLES.get(self.suite, "ant")
             raise ConfigError(
                 f"env.name: must be given with env={self.suite}, e.g. env.name={example}"
             )
-        if self.episode_length is not None:
-            require_at_least("env.episode_length", self.episode_length, 1)
         for leaf, drawn in self.randomization.items():
             drawn.check(leaf)
         if self.randomize == "on" and not self.randomization:
@@ -57,7 +58,7 @@ class EnvConfig:
 
     @property
     def label(self) -> str:
-        """What a task is called in files and messages: `ant`, `brax/ant`, `cart.py:make`."""
+        """Name of the task in files and messages: `ant`, `brax/ant`, `cart.py:make`."""
         if self.suite == "custom":
             return PurePath(str(self.name)).name
         return str(self.name) if self.suite == "gmijax" else f"{self.suite}/{self.name}"

@@ -6,9 +6,11 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Literal
 
+from gmijax.config.schema import KeyGroup, doc, require_at_least
 from gmijax.errors import ConfigError
-from gmijax.schema import doc, require_at_least, require_between, require_positive
 
+BackendName = Literal["mps", "mig", "share", "cpu"]
+StrategyName = Literal["mpr", "mrr", "har", "flat", "one_shot"]
 TemplateName = Literal["tcg", "tdg", "tcg_ex", "tdg_ex", "decoupled"]
 Priority = Literal["normal", "below_normal"]
 
@@ -17,29 +19,41 @@ MAX_GMIS = 1024
 
 
 @dataclass(frozen=True, kw_only=True)
-class PlanConfig:
+class PlanConfig(KeyGroup):
     """How the job is spread over GPUs."""
 
-    gpus: int | tuple[int, ...] = doc("number of GPUs, or their indices as nvidia-smi lists them")
+    prefix = "plan."
+
+    gpus: int | tuple[int, ...] = doc(
+        "number of GPUs, or their indices as nvidia-smi lists them", default=1
+    )
     gmis_per_gpu: int | Literal["auto"] = doc(
         "GMIs on every GPU (with algo=a3c 1, see serving_gmis_per_gpu and training_gmis_per_gpu); "
-        "auto: what a search finds (docs/search.md)"
+        "auto: what a search finds (docs/search.md)",
+        default=1,
+        low=1,
     )
     layout: tuple[tuple[int, ...], ...] | None = doc(
-        "GMI ids of every GPU, e.g. [[0,1],[2]]; overrides gpus and gmis_per_gpu"
+        "GMI ids of every GPU, e.g. [[0,1],[2]]; overrides gpus and gmis_per_gpu", default=None
     )
-    backend: Literal["auto", "mps", "mig", "share", "cpu"] = doc(
-        "how a GMI gets its share of a GPU"
+    backend: Literal["auto", BackendName] = doc(
+        "how a GMI gets its share of a GPU", default="auto"
     )
     sm_percent: float | tuple[float, ...] | Literal["even"] | None = doc(
         "cap on a GMI's share of SMs in percent (MPS): one number, one per GMI, even (100 / GMIs "
-        "of the GPU, kept clear of docs/shares.md's bad values), or null: no cap"
+        "of the GPU, kept clear of docs/shares.md's bad values), or null: no cap",
+        default=None,
+        low=1.0,
+        high=100.0,
     )
     memory_fraction: float | tuple[float, ...] | None = doc(
         "fraction of a GPU's (or MIG instance's) memory that each GMI reserves: one number or one "
-        "per GMI; null: 0.8 split evenly"
+        "per GMI; null: 0.8 split evenly",
+        default=None,
+        low=0.01,
+        high=1.0,
     )
-    template: Literal["auto", TemplateName] = doc("how roles map to GMIs")
+    template: Literal["auto", TemplateName] = doc("how roles map to GMIs", default="auto")
     mps_priority: Literal["trainers_first"] | tuple[Priority, ...] | None = doc(
         "whose kernels go first where several wait for a GPU (MPS): trainers_first, or one of "
         "normal, below_normal for each GMI; null: all alike",
@@ -70,20 +84,14 @@ class PlanConfig:
     )
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         if isinstance(self.gpus, int):
             require_at_least("plan.gpus", self.gpus, 1)
         elif not self.gpus or len(set(self.gpus)) != len(self.gpus) or min(self.gpus) < 0:
             raise ConfigError(
                 f"plan.gpus={list(self.gpus)}: expected a number of GPUs or distinct indices"
             )
-        if self.gmis_per_gpu != "auto":
-            require_at_least("plan.gmis_per_gpu", self.gmis_per_gpu, 1)
         self._require_few_gmis()
-        if self.sm_percent != "even":
-            for percent in _numbers(self.sm_percent):
-                require_between("plan.sm_percent", percent, 1.0, 100.0)
-        for fraction in _numbers(self.memory_fraction):
-            require_between("plan.memory_fraction", fraction, 0.01, 1.0)
 
     def _require_few_gmis(self) -> None:
         for side in ("", "serving_", "training_"):
@@ -99,6 +107,13 @@ class PlanConfig:
                 )
 
     @property
+    def num_gpus(self) -> int:
+        """GPUs of the whole job."""
+        if self.layout is not None:
+            return len(self.layout)
+        return self.gpus if isinstance(self.gpus, int) else len(self.gpus)
+
+    @property
     def needs_mps(self) -> bool:
         """Whether something is wanted that only MPS has."""
         return self.sm_percent is not None or self.mps_priority is not None
@@ -112,24 +127,23 @@ class PlanConfig:
             )
 
 
-def _numbers(value: float | tuple[float, ...] | None) -> tuple[float, ...]:
-    if value is None:
-        return ()
-    return value if isinstance(value, tuple) else (value,)
-
-
 @dataclass(frozen=True, kw_only=True)
-class ReduceConfig:
+class ReduceConfig(KeyGroup):
     """How gradients are averaged over GMIs."""
 
-    strategy: Literal["auto", "mpr", "mrr", "har", "flat", "one_shot"] = doc(
-        "reduction strategy; auto: by the layout, see selection"
+    prefix = "reduce."
+
+    strategy: Literal["auto", StrategyName] = doc(
+        "reduction strategy; auto: by the layout, see selection", default="auto"
     )
     intra: Literal["auto", "host", "ipc"] = doc(
         "exchange inside one GPU, for har: through host memory, or through GPU memory that GMIs "
-        "map (ipc); auto: ipc where it can be had; host leaves out one_shot"
+        "map (ipc); auto: ipc where it can be had; host leaves out one_shot",
+        default="auto",
     )
-    timeout_s: float = doc("longest wait for another GMI in one exchange, seconds")
+    timeout_s: float = doc(
+        "longest wait for another GMI in one exchange, seconds", default=120.0, positive=True
+    )
     selection: Literal["paper", "device", "measured"] = doc(
         "what strategy=auto goes by: the paper's Algorithm 1 (paper), the same but one_shot where "
         "several GMIs share a GPU and can map its memory (device), or the time that every "
@@ -138,7 +152,7 @@ class ReduceConfig:
     )
 
     def __post_init__(self) -> None:
-        require_positive("reduce.timeout_s", self.timeout_s)
+        super().__post_init__()
         if self.strategy == "one_shot" and self.intra == "host":
             raise ConfigError(
                 "reduce.intra=host: reduce.strategy=one_shot goes through memory of the GPUs; "

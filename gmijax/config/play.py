@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 from gmijax.config.env import PhysicsConfig
-from gmijax.schema import doc, require_at_least, require_between
+from gmijax.config.schema import KeyGroup, doc, require_between
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -24,20 +24,22 @@ class PlayRunConfig:
 
 
 @dataclass(frozen=True, kw_only=True)
-class PlayConfig:
+class PlayConfig(KeyGroup):
     """Everything that `python -m gmijax.play` can be told."""
 
     run: PlayRunConfig
     physics: PhysicsConfig
     checkpoint: str | None = doc("folder of a checkpoint, or its env steps; null: the latest")
-    num_envs: int = doc("N, environments, one episode each")
-    seed: int = doc("seed of the episodes' starts and of sampled actions")
+    num_envs: int = doc("N, environments, one episode each", low=1)
+    seed: int = doc("seed of the episodes' starts and of sampled actions", low=0, high=2**31 - 1)
     deterministic: bool = doc("act with the policy's mean; false: sample actions")
     randomize: Literal["off", "on"] = doc(
         "play in worlds drawn from the run's env.randomization; off: in the model as it is",
         default="off",
     )
-    max_steps: int | None = doc("cut episodes off after this many steps; null: only the task does")
+    max_steps: int | None = doc(
+        "cut episodes off after this many steps; null: only the task does", low=1
+    )
     video: Literal["auto", "mp4", "gif", "both", "none"] = doc(
         "what to film; auto: mp4, or nothing where there is no headless OpenGL"
     )
@@ -46,15 +48,10 @@ class PlayConfig:
         "write a page with the first environment in 3D, with Brax's viewer, which a browser loads "
         "from the internet; auto: where brax is installed and knows the model's shapes"
     )
-    width: int = doc("width of the picture in pixels")
-    height: int = doc("height of the picture in pixels")
+    width: int = doc("width of the picture in pixels", low=64, high=4096)
+    height: int = doc("height of the picture in pixels", low=64, high=4096)
     camera: str | None = doc("name of a camera of the model; null: one that tracks the robot")
 
     def __post_init__(self) -> None:
-        require_at_least("num_envs", self.num_envs, 1)
-        require_between("seed", self.seed, 0, 2**31 - 1)
+        super().__post_init__()
         require_between("video_envs", self.video_envs, 1, self.num_envs)
-        if self.max_steps is not None:
-            require_at_least("max_steps", self.max_steps, 1)
-        for key in ("width", "height"):
-            require_between(key, getattr(self, key), 64, 4096)

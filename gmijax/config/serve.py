@@ -7,17 +7,19 @@ from typing import Literal
 
 from gmijax.config.env import EnvConfig, PhysicsConfig
 from gmijax.config.plan import PlanConfig
+from gmijax.config.schema import KeyGroup, doc
 from gmijax.config.search import AUTO, SearchConfig
 from gmijax.errors import ConfigError
-from gmijax.schema import doc, require_at_least, require_between, require_positive
 
 _MIN_PIPE_BYTES = 1 << 20
 _PIPE_BYTES_PER_ENV = 8192
 
 
 @dataclass(frozen=True, kw_only=True)
-class ServeRunConfig:
+class ServeRunConfig(KeyGroup):
     """Where the policy comes from, and the life of the job."""
+
+    prefix = "run."
 
     dir: str | None = doc(
         "trained run whose policy acts: its folder, one of its checkpoints, or `last`"
@@ -25,20 +27,22 @@ class ServeRunConfig:
     name: str | None = doc(
         "name of the job's own folder below runs/; null: <env>-serve-<date>-<time>"
     )
-    start_timeout_s: float = doc("longest wait for a GMI to start and compile, seconds")
-    stall_timeout_s: float = doc("a GMI with no progress for this long has failed, seconds")
-    exchange_timeout_s: float = doc("longest wait for another GMI in one exchange, seconds")
-    stop_timeout_s: float = doc(
-        "time that GMIs get to finish their unroll when the job is told to end, seconds"
+    start_timeout_s: float = doc(
+        "longest wait for a GMI to start and compile, seconds", positive=True
     )
-    grace_s: float = doc("time a GMI gets to end by itself before it is killed, seconds")
-
-    def __post_init__(self) -> None:
-        for key in (
-            *("start_timeout_s", "stall_timeout_s", "stop_timeout_s"),
-            *("exchange_timeout_s", "grace_s"),
-        ):
-            require_positive(f"run.{key}", getattr(self, key))
+    stall_timeout_s: float = doc(
+        "a GMI with no progress for this long has failed, seconds", positive=True
+    )
+    exchange_timeout_s: float = doc(
+        "longest wait for another GMI in one exchange, seconds", positive=True
+    )
+    stop_timeout_s: float = doc(
+        "time that GMIs get to finish their unroll when the job is told to end, seconds",
+        positive=True,
+    )
+    grace_s: float = doc(
+        "time a GMI gets to end by itself before it is killed, seconds", positive=True
+    )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -51,7 +55,7 @@ class OutputConfig:
 
 
 @dataclass(frozen=True, kw_only=True)
-class ServeConfig:
+class ServeConfig(KeyGroup):
     """Everything that `python -m gmijax.serve` can be told."""
 
     env: EnvConfig
@@ -65,20 +69,18 @@ class ServeConfig:
     )
     deterministic: bool = doc("act with the policy's mean; false: sample actions")
     num_envs: int | Literal["auto"] = doc(
-        "N, environments of every GMI that simulates; auto: what a search finds (docs/search.md)"
+        "N, environments of every GMI that simulates; auto: what a search finds (docs/search.md)",
+        low=1,
     )
-    num_timesteps: int = doc("environment steps of the whole job, all GMIs together")
-    unroll_length: int = doc("T, steps of one unroll, and of one shard of experience")
-    latency_steps: int = doc("steps timed one by one for the latency; 0: not measured")
-    seed: int = doc("seed of every random number in the job")
+    num_timesteps: int = doc("environment steps of the whole job, all GMIs together", low=1)
+    unroll_length: int = doc("T, steps of one unroll, and of one shard of experience", low=1)
+    latency_steps: int = doc(
+        "steps timed one by one for the latency; 0: not measured", low=0, high=100_000
+    )
+    seed: int = doc("seed of every random number in the job", low=0, high=2**31 - 1)
 
     def __post_init__(self) -> None:
-        for key in ("num_timesteps", "unroll_length"):
-            require_at_least(key, getattr(self, key), 1)
-        if self.num_envs != AUTO:
-            require_at_least("num_envs", self.num_envs, 1)
-        require_between("latency_steps", self.latency_steps, 0, 100_000)
-        require_between("seed", self.seed, 0, 2**31 - 1)
+        super().__post_init__()
         self.plan.require_template(("tcg", "tdg"), "gmijax.serve")
         if self.policy == "trained" and self.run.dir is None:
             raise ConfigError(

@@ -5,15 +5,14 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal, TypeAlias
 
-from gmijax.config.a3c import A3cConfig
+from gmijax.config.algo import A3cConfig, PpoConfig
 from gmijax.config.channel import ChannelConfig
 from gmijax.config.env import EnvConfig, PhysicsConfig
 from gmijax.config.plan import PlanConfig, ReduceConfig
-from gmijax.config.ppo import PpoConfig
 from gmijax.config.run import RunConfig
+from gmijax.config.schema import KeyGroup, doc
 from gmijax.config.search import SearchConfig
 from gmijax.errors import ConfigError
-from gmijax.schema import doc, require_at_least, require_between
 
 AlgoConfig: TypeAlias = PpoConfig | A3cConfig
 """The training algorithms; `algo.name` says which."""
@@ -22,7 +21,7 @@ ALGORITHMS: tuple[type[AlgoConfig], ...] = (PpoConfig, A3cConfig)
 
 
 @dataclass(frozen=True, kw_only=True)
-class TrainConfig:
+class TrainConfig(KeyGroup):
     """Everything that `python -m gmijax.train` can be told."""
 
     env: EnvConfig
@@ -34,14 +33,13 @@ class TrainConfig:
     run: RunConfig
     search: SearchConfig
     num_envs: int | Literal["auto"] = doc(
-        "N, environments per GMI; auto: what a search finds (docs/search.md)"
+        "N, environments per GMI; auto: what a search finds (docs/search.md)", low=1
     )
-    num_timesteps: int = doc("environment steps of the whole job, all GMIs together")
-    seed: int = doc("seed of every random number in the job")
+    num_timesteps: int = doc("environment steps of the whole job, all GMIs together", low=1)
+    seed: int = doc("seed of every random number in the job", low=0, high=2**31 - 1)
 
     def __post_init__(self) -> None:
-        require_at_least("num_timesteps", self.num_timesteps, 1)
-        require_between("seed", self.seed, 0, 2**31 - 1)
+        super().__post_init__()
         self.plan.require_template(
             ("decoupled",) if isinstance(self.algo, A3cConfig) else ("tcg_ex", "tdg_ex"),
             f"gmijax.train with algo={self.algo.name}",
@@ -55,6 +53,11 @@ class TrainConfig:
             self._check_num_envs(self.num_envs)
 
     @property
+    def is_asynchronous(self) -> bool:
+        """Whether some GMIs act and others train."""
+        return isinstance(self.algo, A3cConfig)
+
+    @property
     def envs_per_gmi(self) -> int:
         """`num_envs` as a number; the controller decides an `auto` before it starts a GMI."""
         if self.num_envs == "auto":
@@ -62,7 +65,6 @@ class TrainConfig:
         return self.num_envs
 
     def _check_num_envs(self, num_envs: int) -> None:
-        require_at_least("num_envs", num_envs, 1)
         if isinstance(self.algo, A3cConfig):
             self.algo.batch_of(num_envs)
             return

@@ -1,29 +1,56 @@
-"""What this machine can do for gmijax, what it cannot, and why: a pure function of its sight."""
+"""What this machine can do for gmijax, what it cannot, and why: a pure function of its system."""
 
 from __future__ import annotations
 
+import re
 import sys
 import typing
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from types import MappingProxyType
 from typing import Any, Final, NamedTuple
 
-from gmijax.config import ReduceConfig
-from gmijax.control.fast_path import cuda_major, missing_pieces
-from gmijax.control.sight import REQUIRED, Sight, device_of
+from gmijax.config import BackendName, StrategyName
+from gmijax.control.system_info import REQUIRED, SystemInfo, device_of
 from gmijax.errors import ConfigError
+from gmijax.machine.mps_control import PIPE_VARIABLE
+from gmijax.machine.snapshot import Machine
 from gmijax.partition.backend_choice import why_not_backend
 from gmijax.partition.layout import Layout
-from gmijax.partition.machine import Machine
-from gmijax.partition.mps_control import PIPE_VARIABLE
-from gmijax.partition.nvidia import Gpu
-from gmijax.partition.plan import BackendName
-from gmijax.partition.reduction import why_not_intra, why_not_strategy, why_not_under
-from gmijax.sim.impl import choose_impl
+from gmijax.partition.reduction import (
+    LEAST_BINDINGS,
+    why_not_intra,
+    why_not_strategy,
+    why_not_under,
+)
+from gmijax.sim.impl import ON_GPU, choose_impl
 from gmijax.sim.registry import SUITES, require_task, task_names
 from gmijax.version import __version__
 
-_BACKENDS: Final[tuple[BackendName, ...]] = ("mps", "mig", "share", "cpu")
+_CUDA_13_DRIVER: Final = 580
+"""CUDA 13 needs a driver of this branch."""
+
+
+class Range(NamedTuple):
+    """Versions from `least` on, and before `below` if that is given."""
+
+    least: tuple[int, ...]
+    below: tuple[int, ...] | None = None
+
+    def __str__(self) -> str:
+        upper = f",<{_text(self.below)}" if self.below else ""
+        return f">={_text(self.least)}{upper}"
+
+    def has(self, version: str) -> bool:
+        """Whether `version` is in it."""
+        numbers = _numbers(version)
+        return numbers >= self.least and (self.below is None or numbers < self.below)
+
+
+BINDINGS: Final[Mapping[int, Range]] = MappingProxyType(
+    {12: Range(LEAST_BINDINGS, (13,)), 13: Range((13,))}
+)
+"""Which cuda-bindings the extras `cuda12` and `cuda13` bring: earlier ones hold the GIL."""
 
 
 class Ability(NamedTuple):
@@ -47,20 +74,20 @@ class Diagnosis:
     """The answer.
 
     Attributes:
-      sight: what it is made from.
+      system: what it is made from.
       abilities: what can be used and what not.
       problems: what is broken and should work, one sentence each; none on a healthy machine.
       notes: what is worth knowing.
     """
 
-    sight: Sight
+    system: SystemInfo
     abilities: tuple[Ability, ...]
     problems: tuple[str, ...]
     notes: tuple[str, ...]
 
     def to_dict(self) -> dict[str, Any]:
         """Plain data for `--json`."""
-        machine = self.sight.machine
+        machine = self.system.machine
         return {
             "ok": not self.problems,
             "gmijax": __version__,
@@ -74,43 +101,43 @@ class Diagnosis:
             "mps": {
                 "control": str(machine.mps_control) if machine.mps_control else None,
                 "daemon": str(machine.operator_daemon) if machine.operator_daemon else None,
-                "error": self.sight.mps_error,
+                "error": self.system.mps_error,
             },
-            "jax": self.sight.jax._asdict(),
-            "versions": dict(self.sight.versions),
+            "jax": self.system.jax._asdict(),
+            "versions": dict(self.system.versions),
             "abilities": [ability._asdict() for ability in self.abilities],
             "problems": list(self.problems),
             "notes": list(self.notes),
         }
 
 
-def diagnose(sight: Sight) -> Diagnosis:
+def diagnose(system: SystemInfo) -> Diagnosis:
     """What can be used, what is broken, what is worth knowing."""
     return Diagnosis(
-        sight, tuple(_abilities(sight)), tuple(_problems(sight)), tuple(_notes(sight))
+        system, tuple(_abilities(system)), tuple(_problems(system)), tuple(_notes(system))
     )
 
 
-def _abilities(sight: Sight) -> Iterator[Ability]:
-    machine = sight.machine
+def _abilities(system: SystemInfo) -> Iterator[Ability]:
+    machine = system.machine
     usable: list[BackendName] = []
-    for name in _BACKENDS:
+    for name in typing.get_args(BackendName):
         reason = why_not_backend(name, machine)
         if name == "mps" and reason is None:
-            reason = sight.mps_error
+            reason = system.mps_error
         if reason is None:
             usable.append(name)
         yield Ability("backend", name, reason is None, reason or _about_backend(name, machine))
-    for name in _allowed("strategy"):
+    for name in typing.get_args(StrategyName):
         yield _reducer(name, len(machine.gpus) or 2, usable)
-    for name in _allowed("intra"):
+    for name in ("host", "ipc"):
         reasons = {backend: why_not_intra(name, backend) for backend in usable}
         fine = [backend for backend, reason in reasons.items() if reason is None]
         why = f"with {', '.join(fine)}" if fine else next(iter(reasons.values())) or ""
         yield Ability("intra", name, bool(fine), why)
     platform = "gpu" if machine.gpus else "cpu"
     for name in ("jax", "warp"):
-        yield _physics(name, platform, sight.versions["warp-lang"] is not None)
+        yield _physics(name, platform, system.versions["warp-lang"] is not None)
     yield Ability("env", "gmijax", True, ", ".join(task_names()))
     for suite in SUITES:
         yield _suite(suite)
@@ -120,8 +147,11 @@ def _about_backend(name: str, machine: Machine) -> str:
     if name == "mps":
         return f"daemon: {machine.operator_daemon or 'an own one for each GPU'}"
     if name == "mig":
-        parts = [f"GPU {gpu.index}: {_profiles(gpu)}" for gpu in machine.gpus if gpu.instances]
-        return "; ".join(parts)
+        return "; ".join(
+            f"GPU {gpu.index}: {', '.join(one.profile for one in gpu.instances)}"
+            for gpu in machine.gpus
+            if gpu.instances
+        )
     if name == "cpu":
         return f"virtual GPUs on {len(machine.cpu_cores)} cores"
     return "GMIs of a GPU take turns"
@@ -162,14 +192,14 @@ def _suite(suite: str) -> Ability:
     return Ability("env", suite, True, f"env={suite} env.name=...")
 
 
-def _problems(sight: Sight) -> Iterator[str]:
-    if sight.nvml_error:
-        yield f"NVML is installed and does not work: {sight.nvml_error}"
+def _problems(system: SystemInfo) -> Iterator[str]:
+    if system.nvml_error:
+        yield f"NVML is installed and does not work: {system.nvml_error}"
     for name in REQUIRED:
-        if sight.versions[name] is None:
+        if system.versions[name] is None:
             yield f"the package {name} is not installed (pip install gmijax)"
-    yield from _jax_problems(sight)
-    for gpu in sight.machine.gpus:
+    yield from _jax_problems(system)
+    for gpu in system.machine.gpus:
         if gpu.mig_enabled and not gpu.instances:
             yield (
                 f"GPU {gpu.index} is in MIG mode and has no instance, so nothing can use it "
@@ -179,25 +209,25 @@ def _problems(sight: Sight) -> Iterator[str]:
             yield f"GPU {gpu.index} is in compute mode PROHIBITED (nvidia-smi -c 0)"
 
 
-def _jax_problems(sight: Sight) -> Iterator[str]:
-    usable = [gpu for gpu in sight.machine.gpus if device_of(gpu)]
-    num_seen = len(sight.jax.devices)
-    if sight.jax.error and usable:
-        yield f"jax cannot use the GPUs that NVML lists: {sight.jax.error}{_cuda_advice(sight)}"
-    elif sight.jax.error:
-        yield f"jax does not work: {sight.jax.error}"
+def _jax_problems(system: SystemInfo) -> Iterator[str]:
+    usable = [gpu for gpu in system.machine.gpus if device_of(gpu)]
+    num_seen = len(system.jax.devices)
+    if system.jax.error and usable:
+        yield f"jax cannot use the GPUs that NVML lists: {system.jax.error}{_cuda_advice(system)}"
+    elif system.jax.error:
+        yield f"jax does not work: {system.jax.error}"
     elif usable and not any(gpu.instances for gpu in usable) and num_seen != len(usable):
         yield f"jax sees {num_seen} GPUs, and NVML lists {len(usable)}"
 
 
-def _cuda_advice(sight: Sight) -> str:
-    if any(sight.versions[f"jax-cuda{cuda}-plugin"] for cuda in (12, 13)):
+def _cuda_advice(system: SystemInfo) -> str:
+    if any(system.versions[f"jax-cuda{cuda}-plugin"] for cuda in (12, 13)):
         return ""
-    return f" (pip install 'gmijax[cuda{cuda_major(sight)}]')"
+    return f" (pip install 'gmijax[cuda{_cuda_major(system)}]')"
 
 
-def _notes(sight: Sight) -> Iterator[str]:
-    machine, variables = sight.machine, sight.variables
+def _notes(system: SystemInfo) -> Iterator[str]:
+    machine, variables = system.machine, system.variables
     if "CUDA_VISIBLE_DEVICES" in variables:
         indices = [gpu.index for gpu in machine.gpus]
         yield (
@@ -208,24 +238,68 @@ def _notes(sight: Sight) -> Iterator[str]:
             f"{PIPE_VARIABLE}={variables[PIPE_VARIABLE]}: no daemon answers there; jobs start "
             "their own"
         )
-    yield from missing_pieces(sight)
-    mujoco, mjx = sight.versions["mujoco"], sight.versions["mujoco-mjx"]
+    yield from _missing_pieces(system)
+    mujoco, mjx = system.versions["mujoco"], system.versions["mujoco-mjx"]
     if mujoco and mjx and mujoco.partition(".")[0] != mjx.partition(".")[0]:
         yield (
             f"mujoco {mujoco} with mujoco-mjx {mjx} was never tried "
             "(pip install 'mujoco~=3.17' 'mujoco-mjx~=3.17')"
         )
-    if sight.mps_error:
+    if system.mps_error:
         yield "with plan.backend=auto jobs fall back to share, because MPS does not start"
     for gpu in machine.gpus:
         if gpu.compute_mode == "exclusive":
             yield f"GPU {gpu.index} is in compute mode EXCLUSIVE_PROCESS: several GMIs need MPS"
 
 
-def _profiles(gpu: Gpu) -> str:
-    return ", ".join(one.profile for one in gpu.instances)
+def _cuda_major(system: SystemInfo) -> int:
+    """The CUDA that packages are to be for: what jax has, if the driver takes it."""
+    if system.machine.driver_major < _CUDA_13_DRIVER:
+        return 12
+    has_12, has_13 = (system.versions.get(f"jax-cuda{cuda}-plugin") for cuda in (12, 13))
+    return 12 if has_12 and not has_13 else 13
 
 
-def _allowed(key: str) -> tuple[str, ...]:
-    names = typing.get_args(typing.get_type_hints(ReduceConfig)[key])
-    return tuple(name for name in names if name != "auto")
+def _missing_pieces(system: SystemInfo) -> Iterator[str]:
+    """What GMIs lack to train as fast as they can, and the command that brings it."""
+    usable = [gpu for gpu in system.machine.gpus if device_of(gpu)]
+    if not usable:
+        return
+    if any(not gpu.mig_enabled for gpu in usable):
+        yield from _bindings(system)
+        if system.machine.mps_control is None:
+            yield (
+                "GMIs of a GPU take turns, because nvidia-cuda-mps-control is not installed: it "
+                "comes with the NVIDIA driver, into containers with its capability compute"
+            )
+    yield from _warp(system)
+
+
+def _bindings(system: SystemInfo) -> Iterator[str]:
+    cuda = _cuda_major(system)
+    wanted, found = BINDINGS[cuda], system.versions.get("cuda-bindings")
+    if found is not None and wanted.has(found):
+        return
+    state = f"{found} is installed" if found else "it is not installed"
+    yield (
+        "gradients of GMIs that share a GPU go through host memory: reduce.strategy=one_shot "
+        f"needs cuda-bindings{wanted}, and {state} (pip install 'gmijax[cuda{cuda}]')"
+    )
+
+
+def _warp(system: SystemInfo) -> Iterator[str]:
+    found, wanted = system.versions.get("warp-lang"), system.wanted_warp
+    command = "(pip install 'gmijax[warp]')"
+    if found is None:
+        faster = ", ".join(sorted(task for task, how in ON_GPU.items() if how.auto == "warp"))
+        yield f"MJX-Warp is the faster physics for {faster}: needs warp-lang {command}"
+    elif wanted is not None and found != wanted:
+        yield f"MJX-Warp was made for warp-lang {wanted}, and {found} is installed {command}"
+
+
+def _numbers(version: str) -> tuple[int, ...]:
+    return tuple(int(number) for number in re.findall(r"\d+", version)[:3])
+
+
+def _text(numbers: tuple[int, ...]) -> str:
+    return ".".join(map(str, numbers))

@@ -17,26 +17,24 @@ from rich.markup import escape
 from rich.table import Table
 
 from gmijax.config import PlanConfig, PlayConfig, ReduceConfig
-from gmijax.control.kinds import Plain
-from gmijax.control.launcher import Launch, run_gmis
-from gmijax.control.output import open_console
+from gmijax.config.schema import to_dict
+from gmijax.control.console import open_console
 from gmijax.control.pictures import film, has_brax, write_page
 from gmijax.errors import ConfigError, GmijaxError
-from gmijax.partition.machine import Machine, detect_machine
-from gmijax.partition.plan import Plan
+from gmijax.machine.snapshot import Machine, detect_machine
 from gmijax.partition.planner import make_plan
-from gmijax.partition.supervisor import Patience
-from gmijax.playdir import PlayPaths
-from gmijax.resume import CheckpointMeta, find_checkpoint, trained_config
-from gmijax.rundir import META, STEP_DIGITS, RunPaths, read_json, write_json
-from gmijax.schema import to_dict
+from gmijax.runs.folder import META, STEP_DIGITS, PlayPaths, RunPaths, read_json, write_json
+from gmijax.runs.resume import CheckpointMeta, find_checkpoint, trained_config
 from gmijax.sim import source
 from gmijax.sim.registry import require_task
+from gmijax.supervise.kinds import JobKind
+from gmijax.supervise.launcher import Launch, run_gmis
+from gmijax.supervise.supervisor import Timeouts
 
 MEMORY_FRACTION: Final = 0.1
 """Most of a GPU's memory that playing takes: beside a training job that reserves 0.8."""
 
-_PATIENCE: Final = Patience(
+_TIMEOUTS: Final = Timeouts(
     start_timeout_s=1200.0, stall_timeout_s=600.0, stop_timeout_s=60.0, grace_s=10.0
 )
 
@@ -45,7 +43,7 @@ _MOST_DIGITS: Final = 18
 
 
 class Evaluation(NamedTuple):
-    """What playing a checkpoint leaves.
+    """Result of playing a checkpoint.
 
     Attributes:
       returns: the content of `returns.json`.
@@ -83,7 +81,7 @@ def play(config: PlayConfig, *, show: bool = False) -> Evaluation:
     saved, _ = trained_config(checkpoint)
     env = source.opened(saved, config.run.env)
     require_task(str(env.name), env.suite)
-    run = dataclasses.replace(config.run, dir=str(_run_of(checkpoint)))
+    run = dataclasses.replace(config.run, dir=str(checkpoint.parents[1]))
     if env.suite == "custom":
         run = dataclasses.replace(run, env=env.name, env_sha256=env.source_sha256)
     config = dataclasses.replace(config, checkpoint=str(checkpoint), run=run)
@@ -112,7 +110,7 @@ def _find(config: PlayConfig) -> Path:
     wanted, run_dir = config.checkpoint, config.run.dir
     if wanted is None or (wanted.isdecimal() and len(wanted) <= _MOST_DIGITS):
         latest = find_checkpoint(run_dir or "last", "run.dir")
-        return latest if wanted is None else _at_step(_run_of(latest), int(wanted))
+        return latest if wanted is None else _at_step(latest.parents[1], int(wanted))
     if not os.path.isfile(Path(wanted) / META):  # Unlike `Path.is_file` it takes any text.
         raise ConfigError(
             f"checkpoint={wanted}: expected the folder of a checkpoint, or its env steps"
@@ -120,7 +118,7 @@ def _find(config: PlayConfig) -> Path:
     checkpoint = Path(wanted).resolve()
     if run_dir is not None:
         latest = find_checkpoint(run_dir, "run.dir")
-        if _run_of(latest) != _run_of(checkpoint):
+        if latest.parents[1] != checkpoint.parents[1]:
             raise ConfigError(
                 f"checkpoint={wanted}: not of run.dir={run_dir}; leave out one of them"
             )
@@ -138,10 +136,6 @@ def _at_step(run: Path, env_steps: int) -> Path:
     return checkpoint
 
 
-def _run_of(checkpoint: Path) -> Path:
-    return checkpoint.parent.parent
-
-
 def _prepare(config: PlayConfig, env_steps: int) -> PlayPaths:
     run = Path(str(config.run.dir))
     root = run / "play" / f"{env_steps:0{STEP_DIGITS}d}"
@@ -157,30 +151,17 @@ def _prepare(config: PlayConfig, env_steps: int) -> PlayPaths:
 
 
 def _launch(config: PlayConfig, paths: PlayPaths, machine: Machine) -> Launch:
+    one_gmi = PlanConfig(memory_fraction=MEMORY_FRACTION if machine.gpus else None)
     return Launch(
-        plan=_light_plan(config.num_envs, machine),
+        plan=make_plan(one_gmi, ReduceConfig(), config.num_envs, machine),
         machine=machine,
         run=RunPaths(paths.root),
-        kind=Plain("gmijax.workers.playback"),
-        patience=_PATIENCE,
+        kind=JobKind("gmijax.workers.playback"),
+        timeouts=_TIMEOUTS,
         stops_gracefully=False,
         # The GPU may be training: take what is needed when it is needed, up to the fraction.
         variables={"XLA_PYTHON_CLIENT_PREALLOCATE": "false"},
     )
-
-
-def _light_plan(num_envs: int, machine: Machine) -> Plan:
-    one = PlanConfig(
-        gpus=1,
-        gmis_per_gpu=1,
-        layout=None,
-        backend="auto",
-        sm_percent=None,
-        memory_fraction=MEMORY_FRACTION if machine.gpus else None,
-        template="auto",
-    )
-    nobody = ReduceConfig(strategy="auto", intra="auto", timeout_s=1.0)
-    return make_plan(one, nobody, num_envs, machine)
 
 
 def _accept_nothing_to_see(config: PlayConfig, env: str, console: Console) -> None:

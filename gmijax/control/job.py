@@ -1,4 +1,4 @@
-"""The controller: from a configuration to a finished run. No jax here.
+"""The controller of training: from a configuration to a finished run. No jax here.
 
 Checks everything that can be checked before anything is started, then makes the run folder,
 enters the backend, runs the GMIs, and writes the summary however the job ends.
@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import dataclasses
 import time
-from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -16,29 +15,24 @@ from typing import Any, NamedTuple
 from rich.console import Console
 
 from gmijax.config import TrainConfig
-from gmijax.control import trained
-from gmijax.control.auto import decided
-from gmijax.control.beginnings import Beginning, find_beginning
-from gmijax.control.elastic import with_gpus_left
-from gmijax.control.kinds import training_kind, training_plan
-from gmijax.control.launcher import Launch, patience_of, recorded
-from gmijax.control.output import open_console
-from gmijax.control.progress import ConsoleProgress, SilentProgress
-from gmijax.control.restarts import Attempts, clear_unfinished
-from gmijax.control.selection import estimated_floats, with_measured
-from gmijax.partition.machine import Machine, detect_machine
+from gmijax.config.schema import to_dict
+from gmijax.control.console import ConsoleProgress, announce, open_console
+from gmijax.control.decide import Decided, decide, with_task
+from gmijax.control.restarts import Attempts, clear_unfinished, with_gpus_left
+from gmijax.control.start_point import StartPoint, find_start_point
+from gmijax.control.summary import train_outcome, train_summary
+from gmijax.machine.snapshot import detect_machine
 from gmijax.partition.plan import Plan
-from gmijax.results import MetricsReader, copy_history, draw_returns
-from gmijax.resume import CheckpointMeta, saved_config
-from gmijax.rundir import RunPaths, add_event, locked, read_json, write_json
-from gmijax.schema import to_dict
+from gmijax.runs.folder import RunPaths, add_event, locked, read_json, write_json
+from gmijax.runs.history import MetricsReader, copy_history, draw_returns
+from gmijax.runs.resume import CheckpointMeta, saved_config
 from gmijax.sim import source
-from gmijax.sim.impl import choose_impl
-from gmijax.sim.registry import require_task
+from gmijax.supervise.kinds import training_kind
+from gmijax.supervise.launcher import Launch, recorded, timeouts_of
 
 
 class Result(NamedTuple):
-    """What a training job leaves.
+    """Result of a training job.
 
     Attributes:
       run_dir: the run folder.
@@ -63,63 +57,51 @@ def train(config: TrainConfig, *, show: bool = False) -> Result:
       JobInterrupted: SIGINT, SIGTERM, SIGHUP or SIGUSR1 came; its note says what is left to
         resume.
     """
-    started = time.monotonic()
-    require_task(str(config.env.name), config.env.suite)
-    config = dataclasses.replace(config, env=source.pinned(config.env))
-    beginning = find_beginning(config)
+    started_s = time.monotonic()
+    config = with_task(config)
+    beginning = find_start_point(config)
     console = open_console(show=show)
     if beginning.is_complete and beginning.folder is not None:
         return _finished(config, beginning.folder, console)
-    config = _from(config, beginning.checkpoint)
-    machine = detect_machine()
-    config, found = decided(config, machine, console)
-    plan = training_plan(config, machine)
-    if config.reduce.selection == "measured":
-        plan = _with_measured(config, plan, machine)
-    config, reason = _with_impl(config, plan)
-    changed = _what_changed(config)
+    decided = decide(_from(config, beginning.checkpoint), console)
+    config, plan = decided.config, decided.plan
+    changed = None
+    if beginning.checkpoint is not None:
+        changed = source.changes(config.env, saved_config(beginning.checkpoint)["env"])
     run = beginning.open(config)
     with locked(run.lock, f"run.dir={run.root}"):
-        _announce(console, plan, (*found, reason, *changed, *beginning.notes), run)
-        job = _Job(config, plan, machine, run, console)
-        job.run_to_the_end(beginning, started, show=show)
+        what = (
+            f"{plan.num_envs_per_gmi} environments per GMI, template {plan.template}, reduction "
+            f"{plan.strategy}"
+        )
+        changes = () if changed is None else (changed,)
+        announce(console, run, plan, what, (*decided.reasons, *changes, *beginning.notes))
+        _Job(decided, run, console).run_to_the_end(beginning, started_s)
     summary = read_json(run.summary)
-    console.print(trained.outcome(summary, run), markup=False)
+    console.print(train_outcome(summary, run), markup=False)
     return Result(run.root, summary)
 
 
 class _Job:
     """A training job that is ready to start."""
 
-    def __init__(
-        self,
-        config: TrainConfig,
-        plan: Plan,
-        machine: Machine,
-        run: RunPaths,
-        console: Console,
-    ) -> None:
-        self._config = config
-        self._plan = plan
-        self._machine = machine
+    def __init__(self, decided: Decided[TrainConfig], run: RunPaths, console: Console) -> None:
+        self._config, self._plan, self._machine, _ = decided
         self._run = run
         self._console = console
-        self._attempts = Attempts(run, config.run.max_restarts, self._launch_at, self._say)
+        self._attempts = Attempts(run, self._config.run.max_restarts, self._launch_at, self._say)
 
-    def run_to_the_end(self, beginning: Beginning, started_s: float, *, show: bool) -> None:
+    def run_to_the_end(self, beginning: StartPoint, started_s: float) -> None:
         """Runs it, with restarts; writes the summary however it ends."""
         config, run = self._config, self._run
-        progress = (
-            ConsoleProgress(self._console, MetricsReader(run.metrics), config.num_timesteps)
-            if show
-            else SilentProgress()
-        )
+        latest = MetricsReader(run.metrics).latest
+        progress = ConsoleProgress(self._console, latest, config.num_timesteps)
 
         def record(status: str, plan: Plan) -> None:
             add_event(run.events, status)
             wall_s = time.monotonic() - started_s
-            restarts = self._attempts.restarts
-            summary = trained.summarise(config, plan, run, status, wall_s, restarts)
+            restarts = [restart._asdict() for restart in self._attempts.restarts]
+            summary = train_summary(config, plan, run, status, wall_s, restarts)
             write_json(run.summary, summary)
             draw_returns(run.metrics, run.returns_png, f"{config.env.label}, {config.algo.name}")
 
@@ -129,7 +111,7 @@ class _Job:
             with progress:
                 self._attempts.run_to_the_end(beginning.checkpoint, progress.update)
 
-    def _prepare(self, beginning: Beginning) -> None:
+    def _prepare(self, beginning: StartPoint) -> None:
         checkpoint = beginning.checkpoint
         if beginning.folder is not None:
             clear_unfinished(self._run, checkpoint)
@@ -148,7 +130,7 @@ class _Job:
             machine=self._machine,
             run=self._run,
             kind=training_kind(config),
-            patience=patience_of(config.run),
+            timeouts=timeouts_of(config.run),
             on_warning=self._say,
         )
 
@@ -171,55 +153,20 @@ def _from(config: TrainConfig, checkpoint: Path | None) -> TrainConfig:
 
 
 def _finished(config: TrainConfig, run: RunPaths, console: Console) -> Result:
-    """What a run left that needs nothing more; with the summary that it may lack."""
+    """Result of a run that is complete; writes the summary if it is missing."""
     summary = read_json(run.summary) if run.summary.exists() else {}
     if summary.get("status") != "completed":
         plan = Plan.from_dict(read_json(run.plan))
-        summary = trained.summarise(config, plan, run, "completed", 0.0, ())
+        summary = train_summary(config, plan, run, "completed", 0.0, [])
         write_json(run.summary, summary)
     console.print(f"nothing is left to do: {run.root}", markup=False)
     return Result(run.root, summary)
 
 
-def _with_measured(config: TrainConfig, plan: Plan, machine: Machine) -> Plan:
-    """The plan with the reduction that is fastest here, which may first have to be measured."""
-    algo = config.algo
-    hidden = (algo.policy_hidden_layer_sizes, algo.value_hidden_layer_sizes)
-    return with_measured(plan, machine, estimated_floats(*hidden), config.reduce.intra)
-
-
-def _with_impl(config: TrainConfig, plan: Plan) -> tuple[TrainConfig, str]:
-    """The configuration with `physics.impl` decided, and the reason in words."""
-    platform = "cpu" if plan.backend == "cpu" else "gpu"
-    impl, why = choose_impl(config.physics.impl, platform, config.env.label)
-    decided = dataclasses.replace(config, physics=dataclasses.replace(config.physics, impl=impl))
-    return decided, f"physics.impl {impl}: {why}"
-
-
-def _what_changed(config: TrainConfig) -> tuple[str, ...]:
-    """Says that a resumed run's custom task is no longer the same."""
-    if config.run.resume is None:
-        return ()
-    changed = source.changes(config.env, saved_config(Path(config.run.resume))["env"])
-    return () if changed is None else (changed,)
-
-
 def _what_is_left(run: RunPaths) -> str:
-    """What an interrupted job leaves, in words."""
+    """Says how an interrupted job can be continued."""
     if run.gmi(0).result.exists() and read_json(run.gmi(0).result)["status"] == "completed":
         return f"training was complete: {run.root}"
     if any(run.checkpoints.glob("[0-9]*")):
         return f"continue with run.resume={run.root}"
     return "there is no checkpoint yet"
-
-
-def _announce(console: Console, plan: Plan, more: Sequence[str], run: RunPaths) -> None:
-    layout = [list(gmis) for gmis in plan.layout.gmis_of_gpu]
-    console.print(f"run folder: {run.root}", markup=False)
-    console.print(
-        f"plan: layout {layout}, backend {plan.backend}, {plan.num_envs_per_gmi} environments "
-        f"per GMI, template {plan.template}, reduction {plan.strategy}",
-        markup=False,
-    )
-    for text in (*plan.reasons, *more):
-        console.print(f"  {text}", markup=False)

@@ -15,8 +15,8 @@ from rich.console import Console
 
 from gmijax.config import PlayConfig
 from gmijax.errors import GmijaxError
-from gmijax.partition.failures import last_line, signal_name
-from gmijax.playdir import EXIT_NO_GL, PlayPaths
+from gmijax.runs.folder import EXIT_NO_GL, PlayPaths
+from gmijax.supervise.failures import last_line, signal_name
 
 _GL: Final = "MUJOCO_GL"
 _FALLBACK_GLS: Final = ("egl", "osmesa")

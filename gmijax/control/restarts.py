@@ -1,11 +1,13 @@
 """Runs a job again from its last good checkpoint when GMIs were lost. No jax here.
 
 An attempt ends with all its processes, shared memory and daemons; the next one starts anew in the
-same run folder. What cannot get better by trying again ends the job at once.
+same run folder, on the GPUs that are left. What cannot get better by trying again ends the job at
+once.
 """
 
 from __future__ import annotations
 
+import dataclasses
 import re
 import shutil
 import time
@@ -15,19 +17,21 @@ from datetime import datetime
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from gmijax.control.launcher import Launch, StopSignals, run_gmis, stop_signals
+from gmijax.config import PlanConfig, TrainConfig
 from gmijax.errors import BackendUnavailable, ConfigError, GmiFailed, JobInterrupted
-from gmijax.partition.gmi_process import GmiStatus
-from gmijax.results import copy_history
-from gmijax.resume import CheckpointMeta, newest_checkpoint
-from gmijax.rundir import RunPaths, add_event, remove_temporary
+from gmijax.machine.snapshot import Machine
+from gmijax.partition.plan import Plan
+from gmijax.runs.folder import RunPaths, add_event, remove_temporary
+from gmijax.runs.history import copy_history
+from gmijax.runs.resume import CheckpointMeta, newest_checkpoint
+from gmijax.supervise.gmi_process import GmiStatus
+from gmijax.supervise.kinds import training_plan
+from gmijax.supervise.launcher import Launch, OnTick, StopSignals, run_gmis, stop_signals
 
 _LASTING = ("NonFiniteError", "ParameterMismatch", "SelfCheckFailed")
 """Errors of a GMI that the next attempt would meet too."""
 
 _FRAME = re.compile(r'^ +File "(.+)", line (\d+), in (.+)$', re.MULTILINE)
-
-OnTick = Callable[[tuple[GmiStatus, ...]], None]
 
 
 class Restart(NamedTuple):
@@ -105,12 +109,26 @@ class Attempts:
             raise JobInterrupted("stopped between two attempts")
         add_event(self.run.events, "start", attempt=number, checkpoint=_text(checkpoint))
         try:
-            run_gmis(launch, _Recovery(self.run, on_tick, number, self._seen_s).tick, signals)
+            run_gmis(launch, self._ticks(on_tick, number), signals)
         except BackendUnavailable as error:
             if not number:
                 raise
             raise self._last_fault(error) from error
         add_event(self.run.events, "end", attempt=number)
+
+    def _ticks(self, on_tick: OnTick, attempt: int) -> OnTick:
+        """`on_tick`, and a note when a job that was started again trains again."""
+        is_over = attempt == 0
+
+        def tick(gmis: tuple[GmiStatus, ...]) -> None:
+            nonlocal is_over
+            on_tick(gmis)
+            if not is_over and any(gmi.state == "running" for gmi in gmis):
+                is_over = True
+                seconds = round(time.monotonic() - self._seen_s, 3)
+                add_event(self.run.events, "recovered", attempt=attempt, seconds=seconds)
+
+        return tick
 
     def _last_fault(self, why: ConfigError) -> GmiFailed:
         """What ended the attempt before, after which the machine cannot go on."""
@@ -148,32 +166,8 @@ class Attempts:
             add_event(self.run.events, "gave_up", reason=reason)
 
 
-class _Recovery:
-    """Notes when a job that was started again trains again, and how long after the fault."""
-
-    def __init__(self, run: RunPaths, on_tick: OnTick, attempt: int, fault_s: float) -> None:
-        self._run = run
-        self._on_tick = on_tick
-        self._attempt = attempt
-        self._fault_s = fault_s
-        self._is_over = attempt == 0
-
-    def tick(self, gmis: tuple[GmiStatus, ...]) -> None:
-        """See `run_gmis`."""
-        self._on_tick(gmis)
-        if not self._is_over and any(gmi.state == "running" for gmi in gmis):
-            self._is_over = True
-            seconds = round(time.monotonic() - self._fault_s, 3)
-            add_event(self._run.events, "recovered", attempt=self._attempt, seconds=seconds)
-
-
 def why_not_again(error: GmiFailed, last: GmiFailed | None) -> str | None:
-    """Why a job that failed should not be tried again, None if it should.
-
-    Args:
-      error: of this attempt.
-      last: of the attempt before, if there was one.
-    """
+    """Why a job that failed should not be tried again, None if it should."""
     if error.is_final:
         return "the last attempt left something behind, or nothing can be started"
     if error.error is not None and error.error.type in _LASTING:
@@ -204,6 +198,62 @@ def clear_unfinished(run: RunPaths, checkpoint: Path | None) -> None:
     # Written anew from the metrics: event files cannot be cut.
     shutil.rmtree(run.tensorboard, ignore_errors=True)
     copy_history(run.metrics, run.metrics, max(0, _steps(checkpoint)))
+
+
+def with_gpus_left(
+    config: TrainConfig, plan: Plan, machine: Machine
+) -> tuple[TrainConfig, Plan, tuple[str, ...]]:
+    """The job as it can go on, with Algorithm 1 decided again where GPUs are gone.
+
+    Every GMI keeps its number of environments, so there are fewer of them in all.
+
+    Returns:
+      Configuration and plan, both as they were where no GPU is gone, and sentences for the user.
+
+    Raises:
+      ConfigError: GPUs are gone, and the job may not or cannot go on with those that are left.
+    """
+    lost = _lost(plan, machine)
+    if not lost:
+        return config, plan, ()
+    num_left = plan.layout.num_gpus - len(lost)
+    gone = f"GPUs {sorted(lost)} of the job are gone"
+    if not config.run.elastic:
+        raise ConfigError(f"{gone}; run.elastic=true would go on with the {num_left} left")
+    if num_left == 0:
+        raise ConfigError(f"{gone}, and no other one is left")
+    if config.is_asynchronous and config.plan.serving_gpus is not None:
+        raise ConfigError(f"{gone}; plan.serving_gpus and plan.training_gpus name them")
+    config = dataclasses.replace(config, plan=_without(config, plan, machine, lost))
+    shrunk = training_plan(config, machine)
+    note = (
+        f"{gone}: going on with {num_left}, layout {shrunk.layout}, reduction {shrunk.strategy}; "
+        f"{shrunk.num_envs_per_gmi} environments per GMI as before"
+    )
+    return config, dataclasses.replace(shrunk, reasons=(*shrunk.reasons, note)), (note,)
+
+
+def _lost(plan: Plan, machine: Machine) -> set[int]:
+    """Positions in the job of the GPUs that the machine no longer has."""
+    if plan.backend == "cpu":
+        return set()
+    present = {gpu.uuid for gpu in machine.gpus}
+    present |= {one.uuid for gpu in machine.gpus for one in gpu.instances}
+    return {share.gpu for share in plan.slices if share.device not in present}
+
+
+def _without(config: TrainConfig, plan: Plan, machine: Machine, lost: set[int]) -> PlanConfig:
+    """The user's wishes for the GPUs that are left, which keep their indices."""
+    kept = [position for position in range(plan.layout.num_gpus) if position not in lost]
+    index_of = {gpu.uuid: gpu.index for gpu in machine.gpus}
+    index_of |= {one.uuid: gpu.index for gpu in machine.gpus for one in gpu.instances}
+    device_of = {share.gpu: share.device for share in plan.slices}
+    gpus = tuple(index_of[device_of[position]] for position in kept)
+    rows = config.plan.layout
+    if rows is not None:
+        new_ids = {old: new for new, old in enumerate(sorted(i for p in kept for i in rows[p]))}
+        rows = tuple(tuple(new_ids[i] for i in rows[position]) for position in kept)
+    return dataclasses.replace(config.plan, gpus=gpus, layout=rows)
 
 
 def _about(error: GmiFailed) -> dict[str, Any]:

@@ -17,23 +17,23 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from gmijax.collectives.strategies import COSTS
-from gmijax.collectives.memory import create_exchange
-from gmijax.control.kinds import Plain
-from gmijax.control.launcher import Launch, compilation_cache_dir, run_gmis
-from gmijax.partition.layout import Layout
-from gmijax.partition.machine import Machine
+from gmijax.collectives.shared_block import create_exchange
+from gmijax.machine.snapshot import Machine
 from gmijax.partition.plan import Plan
 from gmijax.partition.reduction import (
+    STRATEGIES,
     needs_ring,
     select_strategy,
     why_not_intra,
     why_not_strategy,
     why_not_under,
 )
-from gmijax.partition.supervisor import Patience
 from gmijax.partition.templates import TRAINER, has_role
-from gmijax.rundir import RunPaths, read_json, write_json
+from gmijax.runs.cache import cache_folder
+from gmijax.runs.folder import RunPaths, read_json, write_json
+from gmijax.supervise.kinds import JobKind
+from gmijax.supervise.launcher import Launch, run_gmis
+from gmijax.supervise.supervisor import Timeouts
 from gmijax.version import versions_of
 
 CHAIN = 8
@@ -41,10 +41,7 @@ CHAIN = 8
 
 TIMEOUT_S = 120.0
 CALLS = 40
-PATIENCE = Patience(start_timeout_s=300, stall_timeout_s=120, stop_timeout_s=60, grace_s=5)
-
-_WAYS = {"har": ("host", "ipc"), "one_shot": ("ipc",)}
-"""How the GMIs of a GPU exchange, for strategies that care."""
+TIMEOUTS = Timeouts(start_timeout_s=300, stall_timeout_s=120, stop_timeout_s=60, grace_s=5)
 
 _PACKAGES = ("jax", "jaxlib", "nvidia-nccl-cu12", "nvidia-nccl-cu13", "cuda-bindings")
 _TYPICAL_INPUTS, _TYPICAL_OUTPUTS = 64, 16
@@ -88,9 +85,7 @@ def with_measured(
     if plan.strategy == "none" or not all(has_role(roles, TRAINER) for roles in plan.roles):
         return plan
     probes = candidates(plan, num_floats, intra)
-    kept = (folder or compilation_cache_dir().parent / "reduction") / _file_name(
-        plan, machine, probes
-    )
+    kept = (folder or cache_folder() / "reduction") / _file_name(plan, machine, probes)
     found, source = _kept(kept, probes), f"from {kept}"
     if not found:
         rows = measure(plan, machine, probes, CALLS)
@@ -136,22 +131,18 @@ def _with_fastest(
 def candidates(plan: Plan, num_floats: int, intra: str = "auto") -> list[Probe]:
     """Every way that the layout and the backend allow, once."""
     found: list[Probe] = []
-    for strategy in COSTS:
-        if why_not_strategy(strategy, plan.layout) or _is_another(strategy, plan.layout):
+    for name, strategy in STRATEGIES.items():
+        # With one GMI on each GPU flat is the ring that mrr is; on one GPU har sums all slots.
+        is_another = name == "flat" or (name == "one_shot" and plan.layout.num_gpus == 1)
+        if is_another or why_not_strategy(name, plan.layout):
             continue
-        if why_not_under(strategy, plan.layout, plan.backend):
+        if why_not_under(name, plan.layout, plan.backend):
             continue
-        for way in _WAYS.get(strategy, ("host",)):
-            wanted = strategy not in _WAYS or intra in ("auto", way)
+        for way in strategy.ways:
+            wanted = strategy.ways == ("host",) or intra in ("auto", way)
             if wanted and why_not_intra(way, plan.backend) is None:
-                found.append(Probe(strategy, way, num_floats))
+                found.append(Probe(name, way, num_floats))
     return found
-
-
-def _is_another(strategy: str, layout: Layout) -> bool:
-    """Whether this is what another strategy does on such a layout."""
-    # With one GMI on each GPU flat is the ring that mrr is; on one GPU har sums all slots too.
-    return strategy == "flat" or (strategy == "one_shot" and layout.num_gpus == 1)
 
 
 def measure(
@@ -171,6 +162,7 @@ def measure(
     # The GMIs meet for rings if one of the probes has some.
     rings = any(needs_ring(probe.strategy, plan.layout) for probe in probes)
     plan = dataclasses.replace(plan, strategy="har" if rings else "mpr", intra="host")
+    numbers = range(len(probes))
     with tempfile.TemporaryDirectory(prefix="gmijax-") as scratch:
         run = RunPaths(Path(scratch))
         write_json(run.plan, plan.to_dict())
@@ -180,16 +172,17 @@ def measure(
                 plan=plan,
                 machine=machine,
                 run=run,
-                kind=Plain(
+                kind=JobKind(
                     "gmijax.workers.reduction_probe",
                     compile_once=False,
-                    blocks={block_variable(k): create_exchange for k in range(len(probes))},
+                    shared=lambda _: {block_variable(k): create_exchange for k in numbers},
                 ),
-                patience=PATIENCE,
+                timeouts=TIMEOUTS,
             )
         )
         found = [read_json(run.gmi(gmi).result) for gmi in plan.layout.gmis]
-    slowest = [max(rows, key=lambda row: row.get("chained_s", 0)) for rows in _by_probe(found)]
+    by_probe = zip(*(result["rows"] for result in found), strict=True)
+    slowest = [max(rows, key=lambda row: row.get("chained_s", 0)) for rows in by_probe]
     return [{**row, "device": found[0]["device"]} for row in slowest]
 
 
@@ -212,7 +205,7 @@ def estimated_floats(*hidden: Sequence[int]) -> int:
 
 
 def _kept(path: Path, probes: Sequence[Probe]) -> dict[str, dict[str, Any]]:
-    """What was measured earlier; nothing if that cannot be read, or lacks one of the probes."""
+    """Earlier measurements; empty if that cannot be read, or lacks one of the probes."""
     try:
         found = read_json(path)
         for probe in probes:
@@ -222,10 +215,6 @@ def _kept(path: Path, probes: Sequence[Probe]) -> dict[str, dict[str, Any]]:
     except (OSError, ValueError, KeyError, TypeError):
         return {}
     return found
-
-
-def _by_probe(found: Sequence[dict[str, Any]]) -> list[list[dict[str, Any]]]:
-    return [list(rows) for rows in zip(*(result["rows"] for result in found), strict=True)]
 
 
 def _file_name(plan: Plan, machine: Machine, probes: Sequence[Probe]) -> str:

@@ -14,25 +14,21 @@ from collections.abc import Sequence
 from contextlib import ExitStack
 from functools import partial
 from pathlib import Path
-from typing import Any, Literal, NamedTuple
+from typing import Any, NamedTuple
 
 from rich.console import Console
 
-from gmijax.config import PhysicsConfig, ServeConfig
-from gmijax.control import served
-from gmijax.control.kinds import Serving
-from gmijax.control.launcher import Launch, patience_of, recorded, run_gmis
-from gmijax.control.output import open_console
-from gmijax.control.progress import ConsoleProgress, SilentProgress
-from gmijax.control.serving_search import NO_REDUCTION, decided
-from gmijax.datadir import DataPaths, open_dataset
+from gmijax.config import ServeConfig
+from gmijax.config.schema import to_dict
+from gmijax.control.console import ConsoleProgress, announce, open_console
+from gmijax.control.decide import decide, with_task
+from gmijax.control.summary import serve_outcome, serve_summary
 from gmijax.errors import ConfigError
-from gmijax.partition.machine import Machine, detect_machine
+from gmijax.machine.snapshot import Machine
 from gmijax.partition.plan import Plan
-from gmijax.partition.planner import make_plan
 from gmijax.partition.templates import SIMULATOR, group_of
-from gmijax.resume import CheckpointMeta, find_checkpoint, trained_config
-from gmijax.rundir import (
+from gmijax.runs.dataset import DataPaths, open_dataset
+from gmijax.runs.folder import (
     RunPaths,
     create_run,
     locked,
@@ -40,14 +36,14 @@ from gmijax.rundir import (
     require_new_run,
     write_json,
 )
-from gmijax.schema import to_dict
-from gmijax.sim import source
-from gmijax.sim.impl import choose_impl
-from gmijax.sim.registry import require_task
+from gmijax.runs.history import MetricsReader
+from gmijax.runs.resume import CheckpointMeta, find_checkpoint, trained_config
+from gmijax.supervise.kinds import serving_kind
+from gmijax.supervise.launcher import Launch, recorded, run_gmis, timeouts_of
 
 
 class Served(NamedTuple):
-    """What a serving job leaves.
+    """Result of a serving job.
 
     Attributes:
       run_dir: the folder of the job.
@@ -116,42 +112,29 @@ def serve(config: ServeConfig, *, show: bool = False) -> Served:
         write_json(run.plan, job.plan.to_dict())
         _announce(console, job, kept, run)
         summary = _run(job, kept, run, console)
-    console.print(served.outcome(summary, run), markup=False)
+    console.print(serve_outcome(summary, run), markup=False)
     return Served(run.root, summary, None if job.data is None else job.data.root)
 
 
 def _prepared(config: ServeConfig, console: Console) -> _Job:
     """Everything that can be checked and decided without starting anything."""
-    require_task(str(config.env.name), config.env.suite)
-    config = dataclasses.replace(config, env=source.pinned(config.env))
+    config = with_task(config)
     require_new_run(None, config.run.name)  # Before a search, which takes minutes.
-    config, wanted_impl = _with_checkpoint(config)
-    machine = detect_machine()
-    config, found = decided(
-        dataclasses.replace(config, physics=PhysicsConfig(impl=wanted_impl)), machine, console
-    )
-    plan = make_plan(config.plan, NO_REDUCTION, config.envs_per_gmi, machine, template="tcg")
-    platform = "cpu" if plan.backend == "cpu" else "gpu"
-    impl, why = choose_impl(config.physics.impl, platform, config.env.label)
+    config, plan, machine, reasons = decide(_with_checkpoint(config), console)
     data = None
-    output = config.output
-    if output.dir is not None:
-        data = DataPaths(Path(output.dir).resolve())
-        output = dataclasses.replace(output, dir=str(data.root))
-    config = dataclasses.replace(
-        config, physics=dataclasses.replace(config.physics, impl=impl), output=output
-    )
+    if config.output.dir is not None:
+        data = DataPaths(Path(config.output.dir).resolve())
+        output = dataclasses.replace(config.output, dir=str(data.root))
+        config = dataclasses.replace(config, output=output)
     group = group_of(plan.layout, plan.roles, SIMULATOR)
     assert group is not None
-    reasons = (*plan.reasons, *found, f"physics.impl {impl}: {why}")
     return _Job(config, plan, machine, group.gmis, data, reasons)
 
 
-def _with_checkpoint(config: ServeConfig) -> tuple[ServeConfig, Literal["auto", "jax", "warp"]]:
-    """The configuration with `run.dir` as the path of a checkpoint, and which MJX is wanted."""
-    wanted = config.physics.impl
+def _with_checkpoint(config: ServeConfig) -> ServeConfig:
+    """The configuration with `run.dir` as the path of a checkpoint, and the MJX that it wants."""
     if config.run.dir is None:
-        return config, wanted
+        return config
     checkpoint = find_checkpoint(config.run.dir, "run.dir")
     meta = CheckpointMeta.read(checkpoint)
     trained_config(checkpoint)  # What is broken shows here, and not in every GMI.
@@ -159,10 +142,12 @@ def _with_checkpoint(config: ServeConfig) -> tuple[ServeConfig, Literal["auto", 
         raise ConfigError(
             f"env={config.env.label}: run.dir={config.run.dir} was trained on {meta.env}"
         )
-    if wanted == "auto" and meta.impl == "jax":
-        wanted = "jax"  # A policy may depend on what it was trained with.
+    physics = config.physics
+    if physics.impl == "auto" and meta.impl == "jax":
+        # A policy may depend on what it was trained with.
+        physics = dataclasses.replace(physics, impl="jax")
     run = dataclasses.replace(config.run, dir=str(checkpoint))
-    return dataclasses.replace(config, run=run), wanted
+    return dataclasses.replace(config, run=run, physics=physics)
 
 
 def _about(job: _Job) -> dict[str, Any]:
@@ -194,36 +179,56 @@ def _sha256(checkpoint: Path) -> str:
     return sha.hexdigest()
 
 
+class _CollectedLines:
+    """The lines of all GMIs that simulate as one; for `ConsoleProgress`."""
+
+    def __init__(self, run: RunPaths, simulators: Sequence[int], steps_before: int) -> None:
+        self._readers = {gmi: MetricsReader(run.gmi(gmi).metrics) for gmi in simulators}
+        self._lines: dict[int, dict[str, Any]] = {}
+        self._steps_before = steps_before
+
+    def latest(self) -> dict[str, Any] | None:
+        """Sums of steps and rates and the mean return, None if nothing is new."""
+        new = {gmi: line for gmi, reader in self._readers.items() if (line := reader.latest())}
+        self._lines |= new
+        if not new:
+            return None
+        lines = self._lines.values()
+        returns = [line["return"] for line in lines if line["return"] is not None]
+        return {
+            "env_steps": self._steps_before + sum(line["env_steps"] for line in lines),
+            "env_steps_per_s": sum(line["env_steps_per_s"] for line in lines),
+            "return": sum(returns) / len(returns) if returns else None,
+        }
+
+
 def _run(job: _Job, kept: int, run: RunPaths, console: Console) -> dict[str, Any]:
     """Runs the GMIs; returns the summary, which is written however they end."""
     started_s = time.monotonic()
-    lines = served.CollectedLines(run, job.simulators, kept * job.steps_per_unroll)
+    lines = _CollectedLines(run, job.simulators, kept * job.steps_per_unroll)
     total = job.wanted_unrolls * job.steps_per_unroll
-    progress = SilentProgress() if console.quiet else ConsoleProgress(console, lines, total)
+    progress = ConsoleProgress(console, lines.latest, total)
 
     def record(status: str, plan: Plan) -> None:
         wall_s = time.monotonic() - started_s
-        summary = served.summarise(job.config, plan, run, status, wall_s)
+        summary = serve_summary(job.config, plan, run, status, wall_s)
         write_json(run.summary, summary | {"output": _output(job, kept)})
 
-    with recorded(run, partial(_what_is_left, job), record), progress:
-        run_gmis(_launch(job, run, console), progress.update)
-    return read_json(run.summary)
-
-
-def _launch(job: _Job, run: RunPaths, console: Console) -> Launch:
-    return Launch(
+    launch = Launch(
         plan=job.plan,
         machine=job.machine,
         run=run,
-        kind=Serving(job.config),
-        patience=patience_of(job.config.run),
+        kind=serving_kind(job.config),
+        timeouts=timeouts_of(job.config.run),
         on_warning=lambda text: console.print(text, markup=False),
     )
+    with recorded(run, partial(_what_is_left, job), record), progress:
+        run_gmis(launch, progress.update)
+    return read_json(run.summary)
 
 
 def _output(job: _Job, kept: int) -> dict[str, Any] | None:
-    """What is in the output folder now, None without one."""
+    """Content of the output folder, None without one."""
     if job.data is None:
         return None
     finished = list(job.data.finished())
@@ -248,24 +253,15 @@ def _what_is_left(job: _Job) -> str:
 
 def _announce(console: Console, job: _Job, kept: int, run: RunPaths) -> None:
     plan = job.plan
-    layout = [list(gmis) for gmis in plan.layout.gmis_of_gpu]
-    console.print(f"run folder: {run.root}", markup=False)
-    console.print(
-        f"plan: layout {layout}, backend {plan.backend}, template {plan.template}, "
-        f"{plan.num_envs_per_gmi} environments in each of {len(job.simulators)} GMIs",
-        markup=False,
+    what = (
+        f"template {plan.template}, {plan.num_envs_per_gmi} environments in each of "
+        f"{len(job.simulators)} GMIs"
     )
-    _print_all(console, job.reasons)
+    announce(console, run, plan, what, job.reasons)
     if job.config.run.dir is not None:
         console.print(f"policy: {job.config.run.dir}", markup=False)
-    if kept:
+    if kept and job.data is not None:
         console.print(
-            f"continuing {job.data and job.data.root}: {kept} of {job.wanted_unrolls} shards are "
-            "there",
+            f"continuing {job.data.root}: {kept} of {job.wanted_unrolls} shards are there",
             markup=False,
         )
-
-
-def _print_all(console: Console, lines: Sequence[str]) -> None:
-    for line in lines:
-        console.print(f"  {line}", markup=False)

@@ -7,16 +7,13 @@ instances exist, because GMIs that only simulate and infer gain from being apart
 from __future__ import annotations
 
 from collections.abc import Collection
-from typing import Final, Literal, TypeAlias
+from typing import Final
 
-from gmijax.config import PlanConfig
+from gmijax.config import BackendName, PlanConfig
 from gmijax.errors import BackendUnavailable, ConfigError
+from gmijax.machine.nvidia import Gpu
+from gmijax.machine.snapshot import Machine
 from gmijax.partition.layout import Layout
-from gmijax.partition.machine import Machine
-from gmijax.partition.nvidia import Gpu
-from gmijax.partition.plan import BackendName
-
-Purpose: TypeAlias = Literal["train", "serve"]
 
 WHAT_SHARE_LOSES: Final = (
     "the GMIs of a GPU take turns; with MPS they were 2.0 to 2.9 times as fast"
@@ -27,9 +24,9 @@ _AMPERE: Final = 8
 
 
 def choose_backend(
-    plan: PlanConfig, layout: Layout, machine: Machine, purpose: Purpose
+    plan: PlanConfig, layout: Layout, machine: Machine, *, serves: bool
 ) -> tuple[BackendName, str]:
-    """The backend for `plan.backend=auto`, and why, in words.
+    """The backend for `plan.backend=auto`, and why, in words; `serves`: nobody trains.
 
     Raises:
       BackendUnavailable: the driver is broken. Who has GPUs does not want to go on without them
@@ -43,8 +40,8 @@ def choose_backend(
     if not machine.gpus:
         return "cpu", "no usable NVIDIA GPU here, so GPUs are virtual"
     most = max(len(gmis) for gmis in layout.gmis_of_gpu)
-    if _takes_mig(plan, layout, machine, purpose):
-        return "mig", _why_mig(plan, layout, machine, purpose)
+    if _takes_mig(plan, layout, machine, serves):
+        return "mig", _why_mig(plan, layout, machine, serves)
     if most == 1 and not plan.needs_mps:
         return "share", "one GMI on every GPU has nothing to share, and MPS would only add risk"
     oldest = min(gpu.compute_capability for gpu in candidates(plan, machine))
@@ -61,9 +58,9 @@ def choose_backend(
     why = f"up to {most} GMIs on a GPU run at the same time with {daemon}"
     if oldest[0] < _AMPERE:
         return "mps", f"{why}; compute capability {_version(oldest)} has no MIG"
-    if purpose == "serve" and plan.needs_mps:
+    if serves and plan.needs_mps:
         return "mps", f"{why}; only MPS can cap SMs, and has priorities"
-    if purpose == "serve":
+    if serves:
         return "mps", f"{why}; there are no MIG instances to keep them apart"
     return "mps", f"{why}, and can exchange gradients"
 
@@ -143,7 +140,7 @@ def candidates(plan: PlanConfig, machine: Machine) -> tuple[Gpu, ...]:
     return tuple(by_index[index] for index in plan.gpus)
 
 
-def _takes_mig(plan: PlanConfig, layout: Layout, machine: Machine, purpose: Purpose) -> bool:
+def _takes_mig(plan: PlanConfig, layout: Layout, machine: Machine, serves: bool) -> bool:
     """Whether there are enough GPUs with instances, and reason to prefer them."""
     divided = [gpu for gpu in candidates(plan, machine) if gpu.instances]
     whole = [gpu for gpu in candidates(plan, machine) if not gpu.mig_enabled]
@@ -153,7 +150,7 @@ def _takes_mig(plan: PlanConfig, layout: Layout, machine: Machine, purpose: Purp
         return True
     # One GMI alone does better with a whole GPU than with a part of one.
     shares = max(len(gmis) for gmis in layout.gmis_of_gpu) > 1
-    return purpose == "serve" and shares and not _needs_missing_mps(divided, layout, machine)
+    return serves and shares and not _needs_missing_mps(divided, layout, machine)
 
 
 def _needs_missing_mps(divided: list[Gpu], layout: Layout, machine: Machine) -> bool:
@@ -164,7 +161,7 @@ def _needs_missing_mps(divided: list[Gpu], layout: Layout, machine: Machine) -> 
     return crowded and machine.mps_control is None
 
 
-def _why_mig(plan: PlanConfig, layout: Layout, machine: Machine, purpose: Purpose) -> str:
+def _why_mig(plan: PlanConfig, layout: Layout, machine: Machine, serves: bool) -> str:
     whole = [gpu for gpu in candidates(plan, machine) if not gpu.mig_enabled]
     forced = len(whole) < layout.num_gpus
     why = (
@@ -172,7 +169,7 @@ def _why_mig(plan: PlanConfig, layout: Layout, machine: Machine, purpose: Purpos
         if forced
         else "serving needs no exchange, and instances do not disturb each other"
     )
-    if purpose == "train":
+    if not serves:
         return f"{why}; MPS on a whole GPU would let the GMIs exchange gradients faster"
     return why
 

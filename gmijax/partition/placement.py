@@ -148,7 +148,7 @@ def _in_turn(
 
 def _by_default(plan: PlanConfig) -> tuple[list[int], list[int], tuple[int, ...] | None]:
     indices = None if isinstance(plan.gpus, int) else plan.gpus
-    count = plan.gpus if isinstance(plan.gpus, int) else len(plan.gpus)
+    count = plan.num_gpus
     if count == 1:
         return [0], [0], indices
     training = max(1, count // _TRAINING_SHARE)

@@ -8,14 +8,12 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
-from typing import Any, Literal
+from typing import Any
 
-from gmijax.config import Priority, TemplateName
+from gmijax.config import BackendName, Priority, TemplateName
 from gmijax.errors import ConfigError
 from gmijax.partition.layout import Layout
 from gmijax.partition.templates import HOLISTIC, TRAINER, group_of
-
-BackendName = Literal["mps", "mig", "share", "cpu"]
 
 MAX_MEMORY_FRACTION = 0.9
 """Limit of the sum of memory fractions on one GPU: CUDA contexts, NCCL and Warp need the rest."""

@@ -5,22 +5,17 @@ from __future__ import annotations
 import dataclasses
 import re
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from itertools import pairwise
 
-from gmijax.config import PlanConfig, ReduceConfig, TemplateName
+from gmijax.config import BackendName, PlanConfig, ReduceConfig, TemplateName
 from gmijax.errors import ConfigError
-from gmijax.partition.backend_choice import (
-    Purpose,
-    choose_backend,
-    choose_gpus,
-    require_backend,
-)
-from gmijax.partition.host_limits import require_room
+from gmijax.machine.host_limits import require_room
+from gmijax.machine.nvidia import Gpu
+from gmijax.machine.snapshot import Machine
+from gmijax.partition.backend_choice import choose_backend, choose_gpus, require_backend
 from gmijax.partition.layout import Layout
-from gmijax.partition.machine import Machine
-from gmijax.partition.nvidia import Gpu
-from gmijax.partition.plan import BackendName, Plan, Slice
+from gmijax.partition.plan import Plan, Slice
 from gmijax.partition.reduction import (
     is_one_per_gpu,
     needs_ring,
@@ -52,8 +47,7 @@ def make_plan(
     machine: Machine,
     *,
     template: TemplateName = "tcg_ex",
-    trainers: Sequence[int] = (),
-    purpose: Purpose | None = None,
+    trainers: Collection[int] = (),
 ) -> Plan:
     """Decides everything that is `auto` and checks the rest against the machine.
 
@@ -64,7 +58,6 @@ def make_plan(
       machine: what there is.
       template: what `plan.template=auto` means.
       trainers: ids of the GMIs that train, for the template `decoupled`.
-      purpose: what `plan.backend=auto` is chosen for; None: as the template says.
 
     Returns:
       The plan; its `reasons` say what was decided and why, one sentence each.
@@ -76,13 +69,12 @@ def make_plan(
     require_host(*num_gmis_of(plan), plan, machine)
     layout = _layout(plan)
     reasons: list[str] = list(machine.warnings)
-    if purpose is None:
-        wanted = template if plan.template == "auto" else plan.template
-        purpose = "serve" if wanted in ("tcg", "tdg") else "train"
-    backend = _backend(plan, layout, machine, purpose, reasons)
+    chosen = template if plan.template == "auto" else plan.template
+    backend = _backend(plan, layout, machine, chosen in ("tcg", "tdg"), reasons)
     gpus = choose_gpus(plan, layout, machine, backend, reasons) if backend != "cpu" else ()
     slices = _slices(plan, layout, gpus, backend, machine, reasons)
-    chosen = _template(plan, template, reasons)
+    if plan.template == "auto":
+        reasons.append(f"template {chosen}: {DESCRIPTIONS[chosen]}")
     roles = roles_of(chosen, layout, trainers)
     training = group_of(layout, roles, TRAINER)
     first = mps_priorities(plan, layout, backend, training.gmis if training else ())
@@ -90,7 +82,10 @@ def make_plan(
         dataclasses.replace(share, priority=priority)
         for share, priority in zip(slices, first, strict=True)
     )
-    strategy, intra = _reduction(reduce, training, layout, backend, reasons)
+    strategy, intra = "none", "host"
+    if training is not None:
+        strategy = _strategy(reduce, training, backend, reasons)
+        intra = _intra(reduce, strategy, layout, backend, reasons)
     return Plan(
         layout=layout,
         slices=slices,
@@ -102,7 +97,10 @@ def make_plan(
         reasons=tuple(reasons),
         roles=roles,
         self_check=_self_check(plan, slices, backend, machine),
-        may_share=_may_share(plan, backend, gpus),
+        may_share=plan.backend == "auto"
+        and backend == "mps"
+        and not plan.needs_mps
+        and all(gpu.compute_mode == "default" for gpu in gpus),
     )
 
 
@@ -116,8 +114,7 @@ def num_gmis_of(plan: PlanConfig) -> tuple[int, str]:
     """How many GMIs a job has, and the settings that say so; before there is a layout."""
     if plan.layout is not None:
         return sum(map(len, plan.layout)), "plan.layout"
-    num_gpus = plan.gpus if isinstance(plan.gpus, int) else len(plan.gpus)
-    each = plan.gmis_per_gpu
+    num_gpus, each = plan.num_gpus, plan.gmis_per_gpu
     if each == "auto":
         raise ConfigError("plan.gmis_per_gpu=auto: not decided yet; expected an integer")
     gpus = f", plan.gpus={num_gpus}" if num_gpus > 1 else ""
@@ -133,12 +130,11 @@ def split_cores(cores: Sequence[int], num_gmis: int) -> tuple[tuple[int, ...], .
 
 
 def _layout(plan: PlanConfig) -> Layout:
-    num_gpus = plan.gpus if isinstance(plan.gpus, int) else len(plan.gpus)
     if plan.layout is None:
         assert plan.gmis_per_gpu != "auto"
-        return Layout.even(num_gpus, plan.gmis_per_gpu)
+        return Layout.even(plan.num_gpus, plan.gmis_per_gpu)
     layout = Layout(plan.layout)
-    if not isinstance(plan.gpus, int) and num_gpus != layout.num_gpus:
+    if not isinstance(plan.gpus, int) and len(plan.gpus) != layout.num_gpus:
         raise ConfigError(
             f"plan.gpus={list(plan.gpus)}: plan.layout has {layout.num_gpus} GPUs, "
             f"so give {layout.num_gpus} indices or none"
@@ -147,10 +143,10 @@ def _layout(plan: PlanConfig) -> Layout:
 
 
 def _backend(
-    plan: PlanConfig, layout: Layout, machine: Machine, purpose: Purpose, reasons: list[str]
+    plan: PlanConfig, layout: Layout, machine: Machine, serves: bool, reasons: list[str]
 ) -> BackendName:
     if plan.backend == "auto":
-        backend, reason = choose_backend(plan, layout, machine, purpose)
+        backend, reason = choose_backend(plan, layout, machine, serves=serves)
         reasons.append(f"backend {backend}: {reason}")
         return backend
     require_backend(plan.backend, machine)
@@ -210,33 +206,6 @@ def _self_check(
     return is_theirs or any((share.sm_percent or 100.0) < 100.0 for share in slices)
 
 
-def _may_share(plan: PlanConfig, backend: BackendName, gpus: Sequence[Gpu]) -> bool:
-    if plan.backend != "auto" or backend != "mps" or plan.needs_mps:
-        return False
-    return all(gpu.compute_mode == "default" for gpu in gpus)
-
-
-def _template(plan: PlanConfig, default: TemplateName, reasons: list[str]) -> TemplateName:
-    if plan.template != "auto":
-        return plan.template
-    reasons.append(f"template {default}: {DESCRIPTIONS[default]}")
-    return default
-
-
-def _reduction(
-    reduce: ReduceConfig,
-    training: Group | None,
-    layout: Layout,
-    backend: BackendName,
-    reasons: list[str],
-) -> tuple[str, str]:
-    """How gradients are averaged, and exchanged inside a GPU."""
-    if training is None:
-        return "none", "host"
-    strategy = _strategy(reduce, training, backend, reasons)
-    return strategy, _intra(reduce, strategy, layout, backend, reasons)
-
-
 def _strategy(
     reduce: ReduceConfig, training: Group, backend: BackendName, reasons: list[str]
 ) -> str:
@@ -256,35 +225,23 @@ def _strategy(
             f"{_NO_RINGS[backend].format(choice.strategy)}"
         )
         return "mpr"
-    if _exchange_on_devices(reduce, layout, backend):
+    # With one GMI on each GPU the ring is part of the program that trains.
+    wants_one_shot = (
+        reduce.selection == "device" and reduce.intra != "host" and not is_one_per_gpu(layout)
+    )
+    lacking = why_not_under("one_shot", layout, backend)
+    if wants_one_shot and lacking is None:
         reasons.append(
             "strategy one_shot: GMIs that share GPUs train faster with exchanges on them; "
             f"Algorithm 1 says {choice.strategy} ({choice.why}), as reduce.selection=paper does"
         )
         return "one_shot"
-    slow = _why_not_one_shot(reduce, layout, backend)
+    slow = ""
+    # Under other backends there is no memory of a GPU to share, whatever is installed.
+    if wants_one_shot and backend in ("mps", "share"):
+        slow = f"; one_shot would train faster: {lacking}"
     reasons.append(f"strategy {choice.strategy}: {choice.why} (Algorithm 1){slow}")
     return choice.strategy
-
-
-def _exchange_on_devices(reduce: ReduceConfig, layout: Layout, backend: BackendName) -> bool:
-    can = why_not_under("one_shot", layout, backend) is None
-    return can and _wants_one_shot(reduce, layout)
-
-
-def _wants_one_shot(reduce: ReduceConfig, layout: Layout) -> bool:
-    # With one GMI on each GPU the ring is part of the program that trains.
-    is_allowed = reduce.selection == "device" and reduce.intra != "host"
-    return is_allowed and not is_one_per_gpu(layout)
-
-
-def _why_not_one_shot(reduce: ReduceConfig, layout: Layout, backend: BackendName) -> str:
-    """What this machine lacks for the faster way, as the end of a sentence; else nothing."""
-    # Under other backends there is no memory of a GPU to share, whatever is installed.
-    if backend not in ("mps", "share") or not _wants_one_shot(reduce, layout):
-        return ""
-    lacking = why_not_under("one_shot", layout, backend)
-    return f"; one_shot would train faster: {lacking}" if lacking else ""
 
 
 def _intra(

@@ -9,6 +9,7 @@ from __future__ import annotations
 import importlib.util
 import re
 from collections.abc import Callable, Mapping
+from types import MappingProxyType
 from typing import NamedTuple
 
 from gmijax.errors import ConfigError
@@ -55,7 +56,7 @@ def select_strategy(layout: Layout) -> Choice:
 
 def why_not_strategy(strategy: str, layout: Layout) -> str | None:
     """None if `strategy` can run on `layout`, else the reason in words."""
-    return _RULES[strategy](layout)
+    return STRATEGIES[strategy].why_not(layout)
 
 
 def why_not_intra(intra: str, backend: str) -> str | None:
@@ -77,15 +78,9 @@ def why_not_intra(intra: str, backend: str) -> str | None:
 
 
 def require_strategy(strategy: str, layout: Layout, backend: str | None = None) -> None:
-    """Raises ConfigError with strategy, layout and reason if they do not go together.
-
-    Args:
-      strategy: a reduction strategy.
-      layout: where the GMIs live.
-      backend: how they share a GPU, None where that has been looked at already.
-    """
-    if strategy not in _RULES:
-        raise ConfigError(f"reduce.strategy={strategy}: expected one of {', '.join(_RULES)}")
+    """Raises ConfigError with strategy, layout and reason if they do not go together."""
+    if strategy not in STRATEGIES:
+        raise ConfigError(f"reduce.strategy={strategy}: expected one of {', '.join(STRATEGIES)}")
     reason = why_not_strategy(strategy, layout)
     if reason is None and backend is not None:
         reason = why_not_under(strategy, layout, backend)
@@ -106,11 +101,8 @@ def why_not_under(strategy: str, layout: Layout, backend: str) -> str | None:
 
 
 def needs_ring(strategy: str, layout: Layout) -> bool:
-    """Whether GMIs of several GPUs talk to each other past the host's memory.
-
-    They must all be started before any of them can use jax.
-    """
-    return strategy in ("mrr", "flat") or (strategy == "har" and layout.num_gpus > 1)
+    """Whether GMIs form rings: they must all be started before any of them can use jax."""
+    return STRATEGIES[strategy].has_ring(layout)
 
 
 def is_one_per_gpu(layout: Layout) -> bool:
@@ -192,11 +184,28 @@ def _flat(layout: Layout) -> str | None:
     return None
 
 
-_RULES: Mapping[str, Callable[[Layout], str | None]] = {
-    "none": _none,
-    "mpr": _anywhere,
-    "mrr": _mrr,
-    "har": _anywhere,
-    "flat": _flat,
-    "one_shot": _anywhere,
-}
+class Strategy(NamedTuple):
+    """Rules of a reduction strategy.
+
+    Attributes:
+      why_not: None if it can run on a layout, else the reason in words.
+      has_ring: whether GMIs of several GPUs talk to each other past the host's memory.
+      ways: how GMIs of one GPU may exchange (`reduce.intra`); `host` for those that do not care.
+    """
+
+    why_not: Callable[[Layout], str | None]
+    has_ring: Callable[[Layout], bool] = lambda _: False
+    ways: tuple[str, ...] = ("host",)
+
+
+STRATEGIES: Mapping[str, Strategy] = MappingProxyType(
+    {
+        "none": Strategy(_none),
+        "mpr": Strategy(_anywhere),
+        "mrr": Strategy(_mrr, lambda _: True),
+        "har": Strategy(_anywhere, lambda layout: layout.num_gpus > 1, ("host", "ipc")),
+        "flat": Strategy(_flat, lambda _: True),
+        "one_shot": Strategy(_anywhere, ways=("ipc",)),
+    }
+)
+"""How they are built: `gmijax.collectives.build`."""

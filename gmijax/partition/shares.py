@@ -9,11 +9,11 @@ from collections import Counter
 from collections.abc import Collection, Sequence
 from typing import Final
 
-from gmijax.config import PlanConfig, Priority
+from gmijax.config import BackendName, PlanConfig, Priority
 from gmijax.errors import ConfigError
+from gmijax.machine.nvidia import Gpu, MigInstance
 from gmijax.partition.layout import Layout
-from gmijax.partition.nvidia import Gpu, MigInstance
-from gmijax.partition.plan import BackendName, Slice
+from gmijax.partition.plan import Slice
 
 DEFAULT_MEMORY_FRACTION: Final = 0.8
 """Part of a GPU's (or MIG instance's) memory that its GMIs reserve together."""
@@ -65,12 +65,6 @@ def mps_priorities(
     plan: PlanConfig, layout: Layout, backend: BackendName, trainers: Collection[int]
 ) -> tuple[Priority | None, ...]:
     """The priority of every GMI's kernels, in order of id; None where all are alike.
-
-    Args:
-      plan: what the user wants; `trainers_first` puts all others below those that train.
-      layout: which GMI is where.
-      backend: only `mps` has priorities.
-      trainers: the GMIs that train.
 
     Raises:
       ConfigError: a backend that cannot, not one value per GMI, or nobody to put first.

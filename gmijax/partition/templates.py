@@ -14,7 +14,7 @@ A GMI has one role or several in one process, written with `+` between them: `si
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping
 from types import MappingProxyType
 from typing import Final, NamedTuple
 
@@ -54,25 +54,19 @@ class Group(NamedTuple):
 
 
 def roles_of(
-    template: TemplateName, layout: Layout, trainers: Iterable[int] = ()
+    template: TemplateName, layout: Layout, trainers: Collection[int] = ()
 ) -> tuple[str, ...]:
-    """The roles of every GMI, in order of id.
-
-    Args:
-      template: its name.
-      layout: which GMI is where.
-      trainers: ids of the GMIs that train; for `decoupled` only.
+    """The roles of every GMI, in order of id; in `decoupled` the `trainers` train.
 
     Raises:
-      ConfigError: a template that this layout is too small for, or no trainer or nobody else
-        in `decoupled`.
+      ConfigError: a template that this layout is too small for.
     """
     if template == "tcg":
         return (SERVING,) * layout.num_gmis
     if template == "tcg_ex":
         return (HOLISTIC,) * layout.num_gmis
     if template == "decoupled":
-        return _with_some(layout, trainers)
+        return tuple(TRAINER if gmi in trainers else SERVING for gmi in layout.gmis)
     if small := [gpu for gpu, gmis in enumerate(layout.gmis_of_gpu) if len(gmis) < 2]:
         raise ConfigError(
             f"plan.template={template}: GPU {small[0]} of layout {layout} has one GMI; "
@@ -97,19 +91,3 @@ def group_of(layout: Layout, roles: Iterable[str], role: str) -> Group | None:
         tuple(rank for rank, gmi in enumerate(gmis) if gmi in here) for here in layout.gmis_of_gpu
     )
     return Group(gmis, Layout(tuple(here for here in ranks if here)))
-
-
-def _with_some(layout: Layout, trainers: Iterable[int]) -> tuple[str, ...]:
-    training = set(trainers)
-    if unknown := training - set(layout.gmis):
-        raise ConfigError(
-            f"plan.template=decoupled: no GMI {min(unknown)} in layout {layout} to train"
-        )
-    if not training:
-        raise ConfigError("plan.template=decoupled: no GMI trains; give at least one trainer")
-    if len(training) == layout.num_gmis:
-        raise ConfigError(
-            f"plan.template=decoupled: all {layout.num_gmis} GMIs train; at least one must "
-            "simulate and infer"
-        )
-    return tuple(TRAINER if gmi in training else SERVING for gmi in layout.gmis)

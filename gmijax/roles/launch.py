@@ -10,21 +10,20 @@ from collections.abc import Sequence
 from functools import partial
 from typing import Any, Final
 
-from gmijax.collectives.messenger import MIN_CAPACITY_BYTES
-from gmijax.collectives.pipe_block import create_pipes
-from gmijax.control.kinds import Plain
-from gmijax.control.launcher import Launch, run_gmis
+from gmijax.collectives.messages.messenger import MIN_CAPACITY_BYTES
+from gmijax.config.schema import require_between, require_positive
 from gmijax.errors import ConfigError, GmiFailed, GmijaxError
-from gmijax.partition.child import ENV_GMI, ENV_PIPES_FD
-from gmijax.partition.host_limits import require_room
-from gmijax.partition.machine import Machine, detect_machine
+from gmijax.machine.host_limits import require_room
+from gmijax.machine.snapshot import Machine, detect_machine
 from gmijax.partition.plan import Plan
-from gmijax.partition.supervisor import Patience
 from gmijax.roles import shipping
 from gmijax.roles.manager import GMIManager
 from gmijax.roles.role import Role
-from gmijax.rundir import RunPaths, create_run, read_json, write_json
-from gmijax.schema import require_between, require_positive
+from gmijax.runs.folder import RunPaths, create_run, read_json, write_json
+from gmijax.supervise.child import ENV_GMI
+from gmijax.supervise.kinds import JobKind, pipes
+from gmijax.supervise.launcher import Launch, run_gmis
+from gmijax.supervise.supervisor import Timeouts
 
 MAX_PIPE_MIB: Final = 2**14
 """Most shared memory for one pipe; larger messages travel in pieces anyway."""
@@ -96,14 +95,14 @@ def launch(
         "script": shipping.own_script(),
     }
     _write(run, plan, config, parcels)
-    patience = Patience(
+    timeouts = Timeouts(
         start_timeout_s=start_timeout_s,
         stall_timeout_s=math.inf if stall_timeout_s is None else stall_timeout_s,
         stop_timeout_s=grace_s,
         grace_s=grace_s,
     )
     try:
-        run_gmis(_job(plan, machine, run, patience, config["capacity_bytes"]))
+        run_gmis(_job(plan, machine, run, timeouts, config["capacity_bytes"]))
         outputs = [_output(run, gmi) for gmi in plan.layout.gmis]
     except GmijaxError as error:
         _explain(error, run)
@@ -112,19 +111,17 @@ def launch(
 
 
 def _job(
-    plan: Plan, machine: Machine, run: RunPaths, patience: Patience, capacity_bytes: int
+    plan: Plan, machine: Machine, run: RunPaths, timeouts: Timeouts, capacity_bytes: int
 ) -> Launch:
     return Launch(
         plan=plan,
         machine=machine,
         run=run,
         # Roles wait for each other, so they start together.
-        kind=Plain(
-            "gmijax.roles.worker",
-            compile_once=False,
-            blocks={ENV_PIPES_FD: partial(create_pipes, plan.layout.num_gmis, capacity_bytes)},
+        kind=JobKind(
+            "gmijax.roles.worker", compile_once=False, shared=partial(pipes, capacity_bytes)
         ),
-        patience=patience,
+        timeouts=timeouts,
         on_warning=lambda text: warnings.warn(text, RuntimeWarning, stacklevel=2),
     )
 

@@ -1,36 +1,74 @@
-"""The GMI manager (paper, section 3, Listing 1): which GMIs there are, and where they live."""
+"""Which GMIs there are and where they live: plans, and the GMI manager (section 3, Listing 1)."""
 
 from __future__ import annotations
 
-from collections.abc import Hashable, Iterable, Iterator, Sequence
-from typing import Any
+import dataclasses
+from collections.abc import Hashable, Iterable, Sequence
+from typing import Any, Literal, TypeAlias
 
-from gmijax.collectives.group import Operation
+from gmijax.collectives.messages.group import Operation
+from gmijax.config import BackendName, PlanConfig, ReduceConfig
+from gmijax.config.schema import from_dict
 from gmijax.errors import ConfigError
+from gmijax.machine.snapshot import detect_machine
 from gmijax.partition.layout import Layout
 from gmijax.partition.plan import Plan
-from gmijax.roles.gmi import here
-from gmijax.roles.planning import BackendChoice, plan
+from gmijax.partition.planner import make_plan
+from gmijax.roles.role import here
+
+BackendChoice: TypeAlias = Literal["auto", BackendName]
 
 
-class Group:
-    """GMIs that reduce data together; iterates over their ids in order.
+def plan(
+    gpus: int | Sequence[int] = 1,
+    gmis_per_gpu: int = 1,
+    *,
+    layout: Sequence[Sequence[int]] | None = None,
+    backend: BackendChoice = "auto",
+    sm_percent: float | Sequence[float] | None = None,
+    memory_fraction: float | Sequence[float] | None = None,
+    strategy: Literal["auto", "mpr", "mrr", "har", "flat", "one_shot"] = "mpr",
+) -> Plan:
+    """A plan for roles of one's own on this machine; see `gmijax.launch`.
 
-    Attributes:
-      name: as the user calls it.
+    Args:
+      gpus: number of GPUs, or their indices as nvidia-smi lists them. Without a GPU here they
+        are virtual: groups of processes.
+      gmis_per_gpu: GMIs on each of them.
+      layout: ids of the GMIs of every GPU, e.g. `[[0, 1], [2]]`, in place of the two.
+      backend: how a GMI gets its share; `auto` decides, `Plan.reasons` says why.
+      sm_percent: cap on the SMs of every GMI in percent (mps), or one for each; None for no cap.
+      memory_fraction: part of a GPU's memory for every GMI, or one for each; None: 0.8 split
+        evenly.
+      strategy: how the mean of many float32 over all GMIs is taken (docs/reduction.md); `auto`
+        by the layout. A role's data pass through host memory, so `mpr` has the least to do.
+
+    Raises:
+      ConfigError: bad input, or this machine cannot do it.
     """
+    given = {
+        "gpus": gpus,
+        "gmis_per_gpu": gmis_per_gpu,
+        "layout": layout,
+        "backend": backend,
+        "sm_percent": sm_percent,
+        "memory_fraction": memory_fraction,
+    }
+    # As from a command line: what is no number, or not among the allowed, is told in one line.
+    wanted = from_dict(PlanConfig, {key: _plain(value) for key, value in given.items()}, "plan.")
+    intra = "auto" if strategy == "one_shot" else "host"
+    reduce = ReduceConfig(strategy=strategy, intra=intra, timeout_s=1.0)
+    made = make_plan(wanted, reduce, 0, detect_machine())
+    # What the templates call roles are parts of reinforcement learning.
+    reasons = tuple(reason for reason in made.reasons if not reason.startswith("template "))
+    return dataclasses.replace(made, roles=(), reasons=reasons)
 
-    def __init__(self, name: Hashable) -> None:
-        self.name = name
-        self._members: set[int] = set()
 
-    def __iter__(self) -> Iterator[int]:
-        """The ids in order."""
-        return iter(sorted(self._members))
-
-    def add(self, gmi: int) -> None:
-        """Takes `gmi` in; nothing if it is in already."""
-        self._members.add(gmi)
+def _plain(value: Any) -> Any:
+    """Sequences of any kind as lists."""
+    if isinstance(value, Sequence) and not isinstance(value, str):
+        return [_plain(item) for item in value]
+    return value
 
 
 class GMIManager:
@@ -61,7 +99,7 @@ class GMIManager:
         self.sm_percent = sm_percent
         self.memory_fraction = memory_fraction
         self._gpu_of: dict[int, int | None] = {}
-        self._groups: dict[Hashable, Group] = {}
+        self._groups: dict[Hashable, set[int]] = {}
 
     def add_gmi(self, gmi: int) -> GMIManager:
         """Registers a GMI; returns the manager itself, as in the paper's listing.
@@ -86,14 +124,14 @@ class GMIManager:
             raise ConfigError(f"gpu={gpu}: allowed are GPUs 0 to {self.num_gpus - 1}")
         self._gpu_of[gmi] = gpu
 
-    def get_group(self, gmi: int, name: Hashable) -> Group:
-        """Takes a registered GMI into the group `name`, and returns the group.
+    def get_group(self, gmi: int, name: Hashable) -> set[int]:
+        """Takes a registered GMI into the group `name`; returns the ids of the whole group.
 
         Raises:
           ConfigError: no such GMI.
         """
         self._check(gmi)
-        group = self._groups.setdefault(name, Group(name))
+        group = self._groups.setdefault(name, set())
         group.add(gmi)
         return group
 

@@ -6,8 +6,80 @@ from abc import ABC, abstractmethod
 from collections.abc import Iterable
 from typing import Any
 
-from gmijax.collectives.group import Operation
-from gmijax.roles.gmi import here
+from gmijax.collectives.messages.group import GroupReducer, Operation
+from gmijax.collectives.messages.messenger import Messenger
+from gmijax.errors import ConfigError
+from gmijax.partition.layout import Layout
+from gmijax.supervise.child import ChildLink
+
+
+class Gmi:
+    """This process as one of the GMIs of a job: talks to the others and to the controller.
+
+    What the methods do, see `Role`. Messages and collective calls count as progress.
+
+    Attributes:
+      layout: GPU -> GMIs.
+      rank: id of this GMI.
+    """
+
+    def __init__(
+        self, layout: Layout, messenger: Messenger, reducer: GroupReducer, link: ChildLink
+    ) -> None:
+        self.layout = layout
+        self.rank = messenger.rank
+        self._messenger = messenger
+        self._reducer = reducer
+        self._link = link
+        self._steps = 0
+
+    @property
+    def stop_requested(self) -> bool:
+        """Whether the controller asked for an end."""
+        return self._link.stop_requested
+
+    def reduce(self, data: Any, op: Operation, group: Iterable[int] | None) -> Any:
+        """See `Role.collective`."""
+        result = self._reducer.reduce(self.layout.gmis if group is None else group, data, op)
+        self.progress(self._steps)
+        return result
+
+    def send(self, data: Any, dst: int) -> None:
+        """See `Role.send`."""
+        self._messenger.send(data, dst)
+        self.progress(self._steps)
+
+    def recv(self, src: int, timeout_s: float | None) -> Any:
+        """See `Role.recv`."""
+        data = self._messenger.recv(src, timeout_s=timeout_s)
+        self.progress(self._steps)
+        return data
+
+    def progress(self, step: int) -> None:
+        """See `Role.progress`."""
+        self._steps = step
+        self._link.beat("running", step)
+
+
+# One process is one GMI, so this is as global as the process: managers that a role's module makes
+# when it is loaded must find it too.
+_here: list[Gmi] = []
+
+
+def enter(gmi: Gmi) -> None:
+    """Makes `gmi` the one that this process is."""
+    _here[:] = [gmi]
+
+
+def here(what: str) -> Gmi:
+    """The GMI that this process is.
+
+    Raises:
+      ConfigError: it is none, so that `what` makes no sense.
+    """
+    if not _here:
+        raise ConfigError(f"{what}: only inside a GMI, in the role's run; see gmijax.launch")
+    return _here[0]
 
 
 class Role(ABC):

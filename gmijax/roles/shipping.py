@@ -18,7 +18,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any, Final
 
-from gmijax.collectives.trees import on_host
+from gmijax.collectives.messages.trees import on_host
 from gmijax.errors import ConfigError
 
 MAIN: Final = "__main__"
@@ -48,7 +48,7 @@ def load(data: bytes, script: Mapping[str, Any] | None = None) -> Any:
 
 
 def own_script() -> dict[str, Any]:
-    """How a GMI finds what this process has: plain data for `load` and `prepare_imports`."""
+    """How a GMI finds what this process has: plain data for `load`, with `sys.path`."""
     main = sys.modules[MAIN]
     spec = getattr(main, "__spec__", None)
     file = getattr(main, "__file__", None)
@@ -76,11 +76,6 @@ def require_findable(role: type) -> None:
         )
 
 
-def prepare_imports(script: Mapping[str, Any]) -> None:
-    """In a GMI: makes importable what is importable where the job was started."""
-    sys.path[:] = script["sys_path"]
-
-
 class _Pickler(pickle.Pickler):
     def reducer_override(self, obj: Any) -> Any:
         if type(obj).__module__.partition(".")[0] not in ("jax", "jaxlib"):
@@ -97,14 +92,10 @@ class _Unpickler(pickle.Unpickler):
     def find_class(self, module_name: str, global_name: str, /) -> Any:
         if module_name == MAIN and self._script is not None:
             module_name = _load_main(self._script).__name__
-        elif module_name == _name_in_gmis(own_script()) and self._script is None:
+        elif module_name == (own_script()["module"] or LOADED_MAIN) and self._script is None:
             # What a GMI returns: there, this very script has another name.
             module_name = MAIN
         return super().find_class(module_name, global_name)
-
-
-def _name_in_gmis(script: Mapping[str, Any]) -> str:
-    return script["module"] or LOADED_MAIN
 
 
 def _load_main(script: Mapping[str, Any]) -> ModuleType:

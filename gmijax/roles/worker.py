@@ -6,19 +6,19 @@ import sys
 from typing import TYPE_CHECKING, Any
 
 from gmijax.collectives.build import Membership, build_reducer, join_world
-from gmijax.collectives.group import GroupReducer
 from gmijax.collectives.interface import Reducer
-from gmijax.collectives.messenger import Messenger
-from gmijax.collectives.pipe_block import PipeBlock
-from gmijax.partition.child import ENV_PIPES_FD, ChildLink, required_fd, run_gmi
+from gmijax.collectives.messages.group import GroupReducer
+from gmijax.collectives.messages.messenger import Messenger
+from gmijax.collectives.messages.pipe_block import PipeBlock
 from gmijax.partition.plan import Plan
 from gmijax.partition.reduction import why_not_intra
 from gmijax.roles import shipping
-from gmijax.roles.gmi import Gmi, enter
-from gmijax.rundir import read_json
+from gmijax.roles.role import Gmi, enter
+from gmijax.runs.folder import read_json
+from gmijax.supervise.child import ENV_PIPES_FD, ChildLink, required_fd, run_gmi
 
 if TYPE_CHECKING:
-    from gmijax.collectives.device_post import DevicePost
+    from gmijax.collectives.messages.device_buffers import DeviceBuffers
     from gmijax.collectives.ring import World
 
 
@@ -36,10 +36,10 @@ def _run(link: ChildLink) -> dict[str, Any]:
     plan = Plan.from_dict(read_json(link.run.plan))
     # Before the role's own modules, which may use jax.
     world = _take_up_share(plan, link, config["start_timeout_s"])
-    block = _attach(plan, link, config["capacity_bytes"])
-    post = _device_post(plan, link.gmi) if config["device_messages"] else None
-    messenger = Messenger(block, config["timeout_s"], post)
-    shipping.prepare_imports(config["script"])
+    block = PipeBlock(required_fd(ENV_PIPES_FD), link.gmi)
+    device = _device_buffers(plan, link.gmi) if config["device_messages"] else None
+    messenger = Messenger(block, config["timeout_s"], device)
+    sys.path[:] = config["script"]["sys_path"]  # As where the job was started.
     role, args = shipping.load(link.paths.role.read_bytes(), config["script"])
 
     def build(num_floats: int) -> Reducer:
@@ -84,20 +84,15 @@ def _take_up_share(plan: Plan, link: ChildLink, timeout_s: float) -> World | Non
     return world
 
 
-def _device_post(plan: Plan, gmi: int) -> DevicePost | None:
+def _device_buffers(plan: Plan, gmi: int) -> DeviceBuffers | None:
     """What keeps arrays of messages on the GPU; None where GMIs share none, or not its memory."""
     neighbours = [peer for peer in plan.layout.neighbours_of(gmi) if peer != gmi]
     if not neighbours or why_not_intra("ipc", plan.backend):
         return None
     from gmijax.collectives.device_memory import cuda_memory
-    from gmijax.collectives.device_post import DevicePost
+    from gmijax.collectives.messages.device_buffers import DeviceBuffers
 
-    return DevicePost(neighbours, cuda_memory)
-
-
-def _attach(plan: Plan, link: ChildLink, capacity_bytes: int) -> PipeBlock:
-    fd = required_fd(ENV_PIPES_FD)
-    return PipeBlock.attach(fd, link.gmi, plan.layout.num_gmis, capacity_bytes)
+    return DeviceBuffers(neighbours, cuda_memory)
 
 
 if __name__ == "__main__":

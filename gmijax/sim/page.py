@@ -17,7 +17,7 @@ import mujoco
 import numpy as np
 import numpy.typing as npt
 
-from gmijax.playdir import PlayPaths
+from gmijax.runs.folder import PlayPaths
 from gmijax.sim.render import Trajectory, load_trajectory, real_time
 
 MAX_FPS = 60.0

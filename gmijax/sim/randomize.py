@@ -19,8 +19,8 @@ import numpy as np
 import numpy.typing as npt
 from mujoco import mjx
 
+from gmijax.config.randomization import NEVER_ZERO, RANDOMIZED_LEAVES, LeafRange
 from gmijax.errors import ConfigError
-from gmijax.randomization import NEVER_ZERO, RANDOMIZED_LEAVES, LeafRange
 from gmijax.sim.interface import Env
 from gmijax.sim.wrappers import env_keys
 from gmijax.types import PRNGKey

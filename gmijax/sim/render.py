@@ -21,9 +21,8 @@ import numpy as np
 import numpy.typing as npt
 
 from gmijax.config import PlayConfig
-from gmijax.playdir import EXIT_NO_GL, PlayPaths
-from gmijax.rundir import RunPaths, read_json
-from gmijax.schema import from_dict
+from gmijax.config.schema import from_dict
+from gmijax.runs.folder import EXIT_NO_GL, PlayPaths, RunPaths, read_json
 
 MP4_MAX_FPS, GIF_MAX_FPS = 30.0, 15.0
 
@@ -68,7 +67,7 @@ class Timing(NamedTuple):
 
 
 class Trajectory(NamedTuple):
-    """What is filmed; see `gmijax.playdir.PlayPaths.trajectory`.
+    """What is filmed; see `gmijax.runs.folder.PlayPaths`.
 
     Attributes:
       qpos: [L + 1, E, nq].

@@ -1,44 +1,31 @@
 """Main of a GMI in asynchronous training: `python -m gmijax.workers.async_worker`.
 
 Started by the supervisor and by nobody else. Builds the role that the plan gives to this GMI,
-agent or trainer, plugs in the board, the channels and the reducer among the trainers, runs it,
+agent or trainer, plugs in the registers, the channels and the reducer among the trainers, runs it,
 and writes `result.json` or `error.json`.
 """
 
 from __future__ import annotations
 
 import sys
-from typing import TYPE_CHECKING, Any, NamedTuple
+from contextlib import ExitStack
+from typing import TYPE_CHECKING, Any
 
 from gmijax.config import A3cConfig, TrainConfig
-from gmijax.control.decoupled import ENV_BOARD_FD, ENV_CHANNELS_FD, groups_of, places_of
 from gmijax.errors import ConfigError
-from gmijax.partition.child import ChildLink, required_fd, run_gmi
-from gmijax.partition.plan import Plan
-from gmijax.rundir import read_json
-from gmijax.schema import from_dict
+from gmijax.supervise.child import ChildLink, required_fd, run_gmi
+from gmijax.supervise.kinds import ENV_CHANNELS_FD, ENV_REGISTERS_FD, groups_of, topology_of
 from gmijax.workers.trainers import (
     environments_of,
     exchange_used,
     join_trainers,
+    read_job,
     trainers_reducer,
 )
 
 if TYPE_CHECKING:
-    from gmijax.a3c.board import Board
-    from gmijax.collectives.ring import World
+    from gmijax.a3c.job_registers import JobRegisters
     from gmijax.sim.wrappers import BatchedEnv
-
-
-class _Parts(NamedTuple):
-    """What both roles are made of."""
-
-    config: TrainConfig
-    algo: A3cConfig
-    plan: Plan
-    env: BatchedEnv
-    board: Board
-    link: ChildLink
 
 
 def main() -> int:
@@ -47,74 +34,46 @@ def main() -> int:
 
 
 def _run(link: ChildLink) -> dict[str, Any]:
-    config = from_dict(TrainConfig, read_json(link.run.config))
-    plan = Plan.from_dict(read_json(link.run.plan))
-    algo = config.algo
-    if not isinstance(algo, A3cConfig):
-        raise ConfigError(f"algo={algo.name}: allowed here is a3c")
+    config, plan = read_job(link)
+    if not isinstance(config.algo, A3cConfig):
+        raise ConfigError(f"algo={config.algo.name}: allowed here is a3c")
     agents, trainers = groups_of(plan)
     trains = link.gmi in trainers.gmis
     # jax starts here, in the environment that the plan prepared.
     world = join_trainers(config, plan, trainers, link) if trains else None
+    from gmijax.a3c.a3c import A3cLosses
+    from gmijax.a3c.agent import Agent
+    from gmijax.a3c.trainer import Trainer
+    from gmijax.collectives.channel.build import open_receiver, open_sender
+    from gmijax.learning.updates import exchange_size
     from gmijax.selfcheck import check_share
 
     check_share(plan, link.gmi)
-    env = environments_of(config, _index(agents.gmis, link.gmi))
-    parts = _Parts(config, algo, plan, env, _board(algo, env, len(agents.gmis)), link)
-    return _train(parts, world) if trains else _act(parts)
+    place = 0 if trains else agents.gmis.index(link.gmi)  # A trainer steps no environment.
+    env = environments_of(config, place)
+    registers = _registers(config, env, len(agents.gmis))
+    channels = config.channel, topology_of(plan), link.gmi, required_fd(ENV_CHANNELS_FD)
+    with ExitStack() as held:
+        if not trains:
+            sender = open_sender(*channels)
+            held.callback(sender.close)
+            return Agent(config, env, place, trainers.gmis, registers, sender, link).run()
+        receiver = open_receiver(*channels)
+        held.callback(receiver.close)
+        num_floats = exchange_size(env.spec, config.algo, A3cLosses)
+        reducer = trainers_reducer(config, plan, trainers, link, num_floats, world)
+        held.callback(reducer.close)
+        trainer = Trainer(config, env, agents.gmis, registers, receiver, reducer, link)
+        return trainer.run() | exchange_used(plan, reducer)
 
 
-def _act(parts: _Parts) -> dict[str, Any]:
-    from gmijax.a3c.agent import Serving, act_until_told
-    from gmijax.collectives.channel.build import open_sender
+def _registers(config: TrainConfig, env: BatchedEnv, num_agents: int) -> JobRegisters:
+    from gmijax.a3c.job_registers import open_job_registers
+    from gmijax.a3c.rollout import num_counts
+    from gmijax.learning.learner import num_weights
 
-    config, plan, link = parts.config, parts.plan, parts.link
-    agents, trainers = groups_of(plan)
-    index = _index(agents.gmis, link.gmi)
-    serving = Serving(config, parts.algo, parts.env, index, trainers.gmis)
-    sender = open_sender(config.channel, places_of(plan), link.gmi, _channels_fd())
-    try:
-        return act_until_told(serving, parts.board, sender, link)
-    finally:
-        sender.close()
-
-
-def _train(parts: _Parts, world: World | None) -> dict[str, Any]:
-    from gmijax.a3c.programs import exchange_size
-    from gmijax.a3c.trainer import Training, learn_until_done
-    from gmijax.collectives.channel.build import open_receiver
-
-    config, plan, link = parts.config, parts.plan, parts.link
-    agents, trainers = groups_of(plan)
-    training = Training(config, parts.algo, parts.env, agents.gmis)
-    receiver = open_receiver(config.channel, places_of(plan), link.gmi, _channels_fd())
-    num_floats = exchange_size(parts.env.spec, parts.algo)
-    reducer = trainers_reducer(config, plan, trainers, link, num_floats, world)
-    try:
-        done = learn_until_done(training, parts.board, receiver, reducer, link)
-        return done | exchange_used(plan, reducer)
-    finally:
-        receiver.close()
-        reducer.close()
-
-
-def _board(algo: A3cConfig, env: BatchedEnv, num_agents: int) -> Board:
-    from gmijax.a3c.board import board_of, note_sizes
-    from gmijax.a3c.learner import num_weights
-    from gmijax.a3c.rollout import num_stats
-    from gmijax.collectives.board import attach_board
-
-    sizes = note_sizes(num_weights(env.spec, algo), num_stats(env), num_agents)
-    return board_of(attach_board(required_fd(ENV_BOARD_FD), sizes))
-
-
-def _channels_fd() -> int:
-    return required_fd(ENV_CHANNELS_FD)
-
-
-def _index(gmis: tuple[int, ...], gmi: int) -> int:
-    """Place of an agent among the agents; 0 for a trainer, which steps no environment."""
-    return gmis.index(gmi) if gmi in gmis else 0
+    fd = required_fd(ENV_REGISTERS_FD)
+    return open_job_registers(fd, num_weights(env.spec, config.algo), num_counts(env), num_agents)
 
 
 if __name__ == "__main__":

@@ -1,6 +1,6 @@
 """Main of the child that asks jax what it sees: `python -m gmijax.workers.jax_probe`.
 
-Started by `gmijax.control.sight`, which must not load jax itself. Writes one line of JSON.
+Started by `gmijax.control.system_info`, which must not load jax itself. Writes one line of JSON.
 """
 
 from __future__ import annotations

@@ -11,18 +11,17 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from gmijax.config import EnvConfig, PlayConfig
+from gmijax.config.schema import from_dict
 from gmijax.errors import ConfigError
-from gmijax.partition.child import ChildLink, run_gmi
-from gmijax.playdir import PlayPaths
-from gmijax.resume import CheckpointMeta, trained_config
-from gmijax.rundir import read_json, write_json
-from gmijax.schema import from_dict
+from gmijax.runs.folder import PlayPaths, read_json, write_json
+from gmijax.runs.resume import CheckpointMeta, trained_config
+from gmijax.supervise.child import ChildLink, run_gmi
 
 if TYPE_CHECKING:
     import numpy as np
     import numpy.typing as npt
 
-    from gmijax.ppo.episodes import Episodes
+    from gmijax.learning.episodes import Episodes
     from gmijax.sim.interface import Env
 
 
@@ -41,9 +40,9 @@ def _run(link: ChildLink) -> None:
     # jax starts here, in the environment that the plan prepared.
     import jax
 
-    from gmijax.checkpoint import restore_learner
-    from gmijax.learner import init_learner, make_learner
-    from gmijax.ppo.episodes import Options, run_episodes
+    from gmijax.learning.checkpoint import restore_learner
+    from gmijax.learning.episodes import Options, run_episodes
+    from gmijax.learning.learner import init_learner, make_learner
     from gmijax.sim.build import make_worlds
 
     impl = _impl(config, checkpoint, env_config)
@@ -133,14 +132,13 @@ def statistics(values: npt.NDArray[np.generic]) -> dict[str, float]:
 
 
 def _check_camera(camera: str | None, env: Env) -> None:
-    if camera is not None and env.mj_model is None:
+    if camera is None:
+        return
+    model = env.mj_model
+    if model is None:
         raise ConfigError(f"camera={camera}: {env.spec.name} has no model that could be filmed")
-    names = (
-        []
-        if env.mj_model is None
-        else [env.mj_model.camera(i).name for i in range(env.mj_model.ncam)]
-    )
-    if camera is not None and camera not in names:
+    names = [model.camera(i).name for i in range(model.ncam)]
+    if camera not in names:
         allowed = ", ".join(["null", *filter(None, names)])
         raise ConfigError(
             f"camera={camera}: unknown camera of {env.spec.name}; allowed: {allowed}"

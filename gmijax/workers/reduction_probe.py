@@ -23,9 +23,9 @@ from gmijax.collectives.interface import (
 )
 from gmijax.control.selection import CHAIN, TIMEOUT_S, block_variable
 from gmijax.errors import DeviceMemoryUnavailable
-from gmijax.partition.child import ChildLink, required_fd, run_gmi
 from gmijax.partition.plan import Plan
-from gmijax.rundir import read_json
+from gmijax.runs.folder import read_json
+from gmijax.supervise.child import ChildLink, required_fd, run_gmi
 
 if TYPE_CHECKING:
     import jax
@@ -137,7 +137,7 @@ def _on_device(reducer: DeviceReducer, num_floats: int) -> _Ways:
 def _through_host(reducer: Reducer, num_floats: int) -> _Ways:
     import jax
 
-    from gmijax.learner import gradient_sharding
+    from gmijax.learning.updates import gradient_sharding
 
     gradient = jax.device_put(np.ones(num_floats, np.float32))
     fetch = jax.jit(lambda x: x + 0.0, out_shardings=gradient_sharding(reducer))

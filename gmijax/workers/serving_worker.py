@@ -12,18 +12,17 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from gmijax.config import ServeConfig
-from gmijax.datadir import DataPaths
-from gmijax.partition.child import ENV_PIPES_FD, ChildLink, required_fd, run_gmi
-from gmijax.partition.layout import Layout
+from gmijax.config.schema import from_dict
 from gmijax.partition.plan import Plan
 from gmijax.partition.templates import AGENT, SIMULATOR, group_of, has_role
-from gmijax.rundir import read_json
-from gmijax.schema import from_dict
+from gmijax.runs.dataset import DataPaths
+from gmijax.runs.folder import read_json
+from gmijax.supervise.child import ENV_PIPES_FD, ChildLink, required_fd, run_gmi
 
 if TYPE_CHECKING:
-    from gmijax.collection.policy import ActingPolicy
-    from gmijax.collection.shards import ShardWriter
-    from gmijax.collection.share import Share
+    from gmijax.collection.collectors import Share
+    from gmijax.collection.programs import ActingPolicy
+    from gmijax.collection.recording import ShardWriter
     from gmijax.collectives.interface import Reducer
     from gmijax.sim.interface import EnvSpec
 
@@ -42,7 +41,9 @@ def _run(link: ChildLink) -> dict[str, Any]:
     assert group is not None
     rank = group.gmis.index(link.gmi)
     # jax starts here, in the environment that the plan prepared.
-    from gmijax.collection.share import Share
+    import numpy as np
+
+    from gmijax.collection.collectors import Share
     from gmijax.devices import describe_device
     from gmijax.selfcheck import check_share
     from gmijax.sim.build import make_training_env
@@ -58,16 +59,17 @@ def _run(link: ChildLink) -> dict[str, Any]:
     policy = _policy(config, env.spec)
     first, num_unrolls = _unrolls(config, rank, len(group.gmis)) if own == SIMULATOR else (0, 0)
     with ExitStack() as held:
-        reducer = _barrier(config, plan.layout, link)
+        reducer = _reducer(config, plan, link)
         held.callback(reducer.close)
         writer = None
         if own == SIMULATOR and config.output.dir is not None:
             writer = _writer(config, rank, first, policy)
             held.callback(writer.close)
         share = Share(
-            config, link, env, policy, rank, first, num_unrolls, writer, _meeting(reducer)
+            *(config, link, env, policy, rank, first, num_unrolls, writer),
+            barrier=lambda: reducer.all_gather(np.zeros(1, np.float32)),
         )
-        result = _work(share, plan, roles, held)
+        result = _work(share, plan, held)
     written = {} if writer is None else {"shards": writer.num_written, "bytes": writer.num_bytes}
     return {
         **{"roles": roles, "policy_digest": policy.digest, "device": describe_device()},
@@ -76,31 +78,30 @@ def _run(link: ChildLink) -> dict[str, Any]:
     }
 
 
-def _work(share: Share, plan: Plan, roles: str, held: ExitStack) -> dict[str, Any]:
-    """Runs the part that the template gives to this GMI."""
-    from gmijax.collection import colocated, dedicated
-    from gmijax.collectives.pipe_block import PipeBlock
+def _work(share: Share, plan: Plan, held: ExitStack) -> dict[str, Any]:
+    """Does the part that the template gives to this GMI."""
+    from gmijax.collection import collectors
+    from gmijax.collectives.messages.pipe_block import PipeBlock
 
-    if has_role(roles, SIMULATOR) and has_role(roles, AGENT):
-        return colocated.collect(share)
     gmi, layout = share.link.gmi, plan.layout
-    block = PipeBlock.attach(
-        required_fd(ENV_PIPES_FD), gmi, layout.num_gmis, share.config.pipe_bytes
-    )
+    simulates, acts = (has_role(plan.roles[gmi], role) for role in (SIMULATOR, AGENT))
+    if simulates and acts:
+        return collectors.collect(share)
+    block = PipeBlock(required_fd(ENV_PIPES_FD), gmi)
     held.callback(block.close)
-    wanted = AGENT if has_role(roles, SIMULATOR) else SIMULATOR
+    wanted = AGENT if simulates else SIMULATOR
     peers = [
-        dedicated.Peer(block, other, share.config.run.exchange_timeout_s)
+        collectors.Peer(block, other, share.config.run.exchange_timeout_s)
         for other in sorted(layout.neighbours_of(gmi))
         if has_role(plan.roles[other], wanted)
     ]
-    if wanted == AGENT:
-        return dedicated.run_simulator(share, peers[0])
-    return dedicated.run_agent(share, peers)
+    if simulates:
+        return collectors.run_simulator(share, peers[0])
+    return collectors.run_agent(share, peers)
 
 
 def _policy(config: ServeConfig, spec: EnvSpec) -> ActingPolicy:
-    from gmijax.collection.policy import random_policy, trained_policy
+    from gmijax.collection.programs import random_policy, trained_policy
 
     if config.policy == "random":
         return random_policy(spec)
@@ -117,7 +118,7 @@ def _unrolls(config: ServeConfig, rank: int, num_simulators: int) -> tuple[int, 
 
 
 def _writer(config: ServeConfig, rank: int, first: int, policy: ActingPolicy) -> ShardWriter:
-    from gmijax.collection.shards import ShardWriter
+    from gmijax.collection.recording import ShardWriter
 
     about = {
         "env": config.env.label,
@@ -132,14 +133,14 @@ def _writer(config: ServeConfig, rank: int, first: int, policy: ActingPolicy) ->
     return ShardWriter(paths, rank, first, about, compress=config.output.compress)
 
 
-def _barrier(config: ServeConfig, layout: Layout, link: ChildLink) -> Reducer:
-    """What the GMIs meet with; it needs no gradients."""
+def _reducer(config: ServeConfig, plan: Plan, link: ChildLink) -> Reducer:
+    """Serves as a barrier of all GMIs; it needs no gradients."""
     from gmijax.collectives.build import Membership, build_reducer
 
     return build_reducer(
-        "mpr" if layout.num_gmis > 1 else "none",
+        "mpr" if plan.layout.num_gmis > 1 else "none",
         Membership(
-            layout=layout,
+            layout=plan.layout,
             rank=link.gmi,
             num_floats=1,
             exchange_fd=link.exchange_fd,
@@ -149,12 +150,6 @@ def _barrier(config: ServeConfig, layout: Layout, link: ChildLink) -> Reducer:
             intra="host",
         ),
     )
-
-
-def _meeting(reducer: Reducer) -> Any:
-    import numpy as np
-
-    return lambda: reducer.all_gather(np.zeros(1, np.float32))
 
 
 if __name__ == "__main__":

@@ -1,18 +1,26 @@
-"""What mains of training jobs share: environments, and how those that train find each other."""
+"""Parts of the mains of training jobs: input, environments, the reducer among trainers."""
 
 from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
 from gmijax.config import TrainConfig
-from gmijax.partition.child import ChildLink
+from gmijax.config.schema import from_dict
 from gmijax.partition.plan import Plan
 from gmijax.partition.templates import Group
+from gmijax.runs.folder import read_json
+from gmijax.supervise.child import ChildLink
 
 if TYPE_CHECKING:
     from gmijax.collectives.interface import Reducer
     from gmijax.collectives.ring import World
     from gmijax.sim.wrappers import BatchedEnv
+
+
+def read_job(link: ChildLink) -> tuple[TrainConfig, Plan]:
+    """Configuration and plan of this run."""
+    config = from_dict(TrainConfig, read_json(link.run.config))
+    return config, Plan.from_dict(read_json(link.run.plan))
 
 
 def environments_of(config: TrainConfig, place: int) -> BatchedEnv:
@@ -52,16 +60,8 @@ def trainers_reducer(
 ) -> Reducer:
     """The reducer among the trainers, whose ranks are their places in the group.
 
-    Args:
-      config: of the run.
-      plan: of the run.
-      trainers: who takes part.
-      link: this process, one of them.
-      num_floats: P, length of the buffers for `mean`.
-      world: from `join_trainers`.
-
-    Raises:
-      ConfigError, CollectiveError: as `build_reducer`.
+    Its buffers for `mean` have `num_floats` numbers; `world` is from `join_trainers`. Raises as
+    `build_reducer`.
     """
     from gmijax.collectives.build import Membership, build_reducer
 
@@ -81,7 +81,7 @@ def trainers_reducer(
 
 
 def exchange_used(plan: Plan, reducer: Reducer) -> dict[str, str]:
-    """What the summary says of the plan's strategy where it may have come to another way."""
+    """For the summary: the exchange in use, where it may differ from the plan's strategy."""
     on_device = reducer.is_device_resident
     if plan.strategy == "har":
         return {"intra": "ipc" if on_device else "host"}

@@ -1,27 +1,32 @@
-"""Main of one GMI: `python -m gmijax.workers.worker`.
+"""Main of a GMI in synchronous training: `python -m gmijax.workers.worker`.
 
-Started by the supervisor and by nobody else. Reads the run folder, builds the role that
-the plan gives to this GMI, plugs in the concrete reducer, runs it, and writes
-`result.json` or `error.json`.
+Started by the supervisor and by nobody else. Reads the run folder, plugs in the concrete reducer,
+trains, and writes `result.json` or `error.json`. With the template `tdg_ex` one GMI of every GPU
+trains and the others make its rollouts; the trainers of all GPUs average their gradients.
 """
 
 from __future__ import annotations
 
 import sys
-from typing import Any
+from contextlib import ExitStack
+from typing import TYPE_CHECKING, Any
 
 from gmijax.config import PpoConfig, TrainConfig
-from gmijax.partition.child import ChildLink, run_gmi
 from gmijax.partition.plan import Plan
-from gmijax.partition.templates import Group
-from gmijax.rundir import read_json
-from gmijax.schema import from_dict
+from gmijax.partition.templates import AGENT, TRAINER, has_role
+from gmijax.supervise.child import ENV_PIPES_FD, ChildLink, required_fd, run_gmi
+from gmijax.supervise.kinds import groups_of
 from gmijax.workers.trainers import (
     environments_of,
     exchange_used,
     join_trainers,
+    read_job,
     trainers_reducer,
 )
+
+if TYPE_CHECKING:
+    from gmijax.collectives.messages.pipe_block import PipeBlock
+    from gmijax.sim.wrappers import BatchedEnv
 
 
 def main() -> int:
@@ -30,25 +35,69 @@ def main() -> int:
 
 
 def _run(link: ChildLink) -> dict[str, Any]:
-    config = from_dict(TrainConfig, read_json(link.run.config))
-    plan = Plan.from_dict(read_json(link.run.plan))
-    everyone = Group(tuple(plan.layout.gmis), plan.layout)
+    config, plan = read_job(link)
+    assert isinstance(config.algo, PpoConfig)  # Others have a main of their own.
+    simulating, trainers = groups_of(plan)
+    trains = link.gmi in trainers.gmis
     # jax starts here, in the environment that the plan prepared.
-    world = join_trainers(config, plan, everyone, link)
+    world = join_trainers(config, plan, trainers, link) if trains else None
+    from gmijax.collectives.messages.messenger import Messenger
+    from gmijax.collectives.messages.pipe_block import PipeBlock
+    from gmijax.learning.updates import exchange_size
+    from gmijax.ppo.loop import TrainingLoop
+    from gmijax.ppo.ppo import PpoLosses
+    from gmijax.ppo.tdg_ex import RolloutWorkers
     from gmijax.selfcheck import check_share
 
     check_share(plan, link.gmi)
-    from gmijax.ppo.programs import exchange_size
-    from gmijax.ppo.role import train
+    place = simulating.gmis.index(link.gmi) if link.gmi in simulating.gmis else 0
+    env = environments_of(config, place)
+    workers = None
+    with ExitStack() as held:
+        if plan.template == "tdg_ex":
+            block = PipeBlock(required_fd(ENV_PIPES_FD), link.gmi)
+            held.callback(block.close)
+            if not trains:
+                return _serve(config, plan, place, env, block, link)
+            mail = Messenger(block, config.reduce.timeout_s)
+            here = _neighbours(plan, link.gmi, AGENT)
+            workers = RolloutWorkers(mail, here, config.run.start_timeout_s)
+        num_floats = exchange_size(env.spec, config.algo, PpoLosses)
+        reducer = trainers_reducer(config, plan, trainers, link, num_floats, world)
+        held.callback(reducer.close)
+        loop = TrainingLoop(config, env, reducer, link, workers)
+        return loop.run() | exchange_used(plan, reducer)
 
-    assert isinstance(config.algo, PpoConfig)  # Others have a main of their own.
-    env = environments_of(config, link.gmi)
-    num_floats = exchange_size(env.spec, config.algo)
-    reducer = trainers_reducer(config, plan, everyone, link, num_floats, world)
-    try:
-        return train(config, env, reducer, link) | exchange_used(plan, reducer)
-    finally:
-        reducer.close()
+
+def _serve(
+    config: TrainConfig,
+    plan: Plan,
+    place: int,
+    env: BatchedEnv,
+    block: PipeBlock,
+    link: ChildLink,
+) -> dict[str, Any]:
+    """Makes rollouts for the trainer on the same GPU."""
+    from gmijax.collectives.messages.messenger import Messenger
+    from gmijax.learning.learner import make_learner
+    from gmijax.learning.start import first_envs
+    from gmijax.ppo.tdg_ex import serve_rollouts
+
+    assert isinstance(config.algo, PpoConfig)
+    [trainer] = _neighbours(plan, link.gmi, TRAINER)
+    # The first weights come when the trainer is there, which may still start.
+    mail = Messenger(block, max(config.reduce.timeout_s, config.run.start_timeout_s))
+    learner = make_learner(env.spec, config.algo)
+    state = first_envs(env, config, place)
+    rollouts = serve_rollouts(env, learner, state, mail, trainer, link.beat)
+    mail.flush()
+    return {"status": "completed", "rollouts": rollouts}
+
+
+def _neighbours(plan: Plan, gmi: int, role: str) -> tuple[int, ...]:
+    """The GMIs on the same GPU that have a role, in order."""
+    here = sorted(plan.layout.neighbours_of(gmi))
+    return tuple(other for other in here if has_role(plan.roles[other], role))
 
 
 if __name__ == "__main__":

@@ -11,7 +11,7 @@ from pathlib import Path
 from fault_plan import ITERATIONS
 from training_jobs import STEPS, mps_directories, shared_memory, wait_until
 
-from gmijax.resume import newest_checkpoint, what_is_broken
+from gmijax.runs.resume import newest_checkpoint, what_is_broken
 
 _OTHERS_S = 10.0
 """Names in shared places that appeared may be those of other programs, which end."""

@@ -22,7 +22,7 @@ import numpy as np
 from fault_plan import CHECKPOINT_EVERY, ITERATIONS, KINDS, Fault
 from training_jobs import POINT_TASK, STEPS, TINY, child_environment, learner_arrays, wait_until
 
-from gmijax.resume import newest_checkpoint
+from gmijax.runs.resume import newest_checkpoint
 
 LIMIT_S = 120.0
 """Of what is waited for after a command; on an idle machine it takes seconds."""

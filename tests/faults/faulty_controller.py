@@ -2,18 +2,17 @@
 
 from __future__ import annotations
 
+import dataclasses
 import signal
 import sys
 
-from gmijax.cli import command
+from gmijax.cli.command import command
 from gmijax.config import TrainConfig
 from gmijax.control import job
-from gmijax.control.kinds import SYNCHRONOUS
+from gmijax.supervise.kinds import SYNCHRONOUS
 
 if __name__ == "__main__":
-    from gmijax.train import _run
-
     # Whoever started this may ignore it (nohup), and then so would the job.
     signal.signal(signal.SIGHUP, signal.SIG_DFL)
-    job.training_kind = lambda _: SYNCHRONOUS._replace(module="faulty_worker")
-    sys.exit(command("train", TrainConfig, _run, sys.argv[1:]))
+    job.training_kind = lambda _: dataclasses.replace(SYNCHRONOUS, module="faulty_worker")
+    sys.exit(command("train", TrainConfig, job.train, sys.argv[1:]))

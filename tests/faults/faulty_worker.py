@@ -19,7 +19,7 @@ from typing import Any
 from fault_plan import KINDS, Fault
 from training_jobs import pids_of
 
-from gmijax.partition.child import ChildLink
+from gmijax.supervise.child import ChildLink
 from gmijax.workers import worker
 
 SCRATCH = Path(os.environ["GMIJAX_FAULTS"])
@@ -94,7 +94,7 @@ class Faults:
 
 def _janitor_of(controller: int) -> int:
     for entry in Path(f"/proc/{controller}/task/{controller}/children").read_text().split():
-        if b"gmijax.partition.janitor" in Path(f"/proc/{entry}/cmdline").read_bytes():
+        if b"gmijax.supervise.janitor" in Path(f"/proc/{entry}/cmdline").read_bytes():
             return int(entry)
     raise LookupError("no janitor")
 
@@ -145,10 +145,10 @@ def _inject_in_training(faults: Faults) -> None:
     import jax
     import jax.numpy as jnp
 
-    from gmijax import checkpoint
     from gmijax.collectives.mpr import MprReducer
-    from gmijax.ppo.report import Reporter
-    from gmijax.ppo.split import SplitIteration
+    from gmijax.learning import checkpoint
+    from gmijax.learning.training_log import TrainingLog
+    from gmijax.ppo.iteration import SplitIteration
 
     def synced(path: Path) -> None:
         if path.name.endswith(".partial"):
@@ -179,7 +179,7 @@ def _inject_in_training(faults: Faults) -> None:
         return iterate(self, state, env_state)
 
     _before(MprReducer, "mean", lambda *_: faults.at("mean"))
-    _before(Reporter, "report", lambda *_: faults.at("report"))
+    _before(TrainingLog, "write", lambda *_: faults.at("report"))
     _before(checkpoint, "_sync", synced)
     checkpoint._save = save_half
     checkpoint.shutil = _Recorded(checkpoint.shutil, removed)

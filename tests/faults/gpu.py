@@ -31,7 +31,7 @@ OVERRIDES = (
 
 CONTROLLER = """
 import sys
-from gmijax.cli import command
+from gmijax.cli.command import command
 from gmijax.config import TrainConfig
 from gmijax.control import job, kinds
 kinds.SYNCHRONOUS = kinds.Plain("tests.faults.gpu_worker")

@@ -12,7 +12,7 @@ import time
 from pathlib import Path
 from typing import Any
 
-from gmijax.partition.child import ChildLink
+from gmijax.supervise.child import ChildLink
 from gmijax.workers import worker
 
 _beat = ChildLink.beat

@@ -23,11 +23,11 @@ from hypothesis import HealthCheck, given, seed, settings
 from hypothesis import strategies as st
 from supervision import machine
 
-from gmijax.cli import choices, compose
+from gmijax.cli.compose import choices, compose
 from gmijax.config import ALGORITHMS
-from gmijax.resume import CheckpointMeta
-from gmijax.rundir import META, RunPaths, write_json
-from gmijax.schema import to_dict
+from gmijax.config.schema import to_dict
+from gmijax.runs.folder import META, RunPaths, write_json
+from gmijax.runs.resume import CheckpointMeta
 
 _MORE = os.environ.get("GMIJAX_FUZZ_EXAMPLES")
 _SEED = random.randrange(2**32) if _MORE else 0

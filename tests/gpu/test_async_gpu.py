@@ -10,7 +10,7 @@ import pytest
 from training_jobs import train
 
 from benchmarks.channel_job import ChannelJob
-from gmijax.collectives.channel.build import Places
+from gmijax.collectives.channel.build import ChannelTopology
 from gmijax.config.channel import ChannelConfig
 
 pytestmark = [pytest.mark.gpu, pytest.mark.timeout(600)]
@@ -23,14 +23,14 @@ def test_experience_on_the_gpu_arrives_whole_and_once(
 ) -> None:
     """Without MPS: the processes take turns."""
     monkeypatch.setenv("XLA_PYTHON_CLIENT_PREALLOCATE", "false")
-    places = Places(agents=(0, 1), trainers=(2,), gpu_of=(0, 0, 0))
+    topology = ChannelTopology(agents=(0, 1), trainers=(2,), gpu_of=(0, 0, 0))
     task = {"count": 5000, "envs": 50, "batch": 100, "pause_chance": 0.1, "timeout_s": 60.0}
     settings = ChannelConfig(capacity_mib=1, transport="device")
-    with ChannelJob(tmp_path, settings, places, **task).start() as job:
+    with ChannelJob(tmp_path, settings, topology, **task).start() as job:
         for rank in job.ranks:
             result = job.result(rank)
             assert result["error"] is None, result
-        for agent in places.agents:
+        for agent in topology.agents:
             np.testing.assert_array_equal(np.sort(job.numbers(2, agent)), np.arange(5000))
 
 

@@ -24,7 +24,7 @@ from training_jobs import (
     wait_until,
 )
 
-from gmijax.partition.machine import detect_machine
+from gmijax.machine.snapshot import detect_machine
 
 pytestmark = [pytest.mark.gpu, pytest.mark.timeout(300)]
 

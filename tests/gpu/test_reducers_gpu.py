@@ -15,8 +15,8 @@ import numpy as np
 import pytest
 from training_jobs import POINT_TASK, STEPS, TINY, learner_arrays, train
 
+from gmijax.machine.nvidia import list_gpus
 from gmijax.partition.layout import Layout
-from gmijax.partition.nvidia import list_gpus
 from gmijax.partition.reduction import why_not_intra
 from tests.reducer_contract import PAIRS, Case, check_contract
 

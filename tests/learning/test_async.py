@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 from training_jobs import train
 
-from gmijax.results import read_metrics
+from gmijax.runs.history import read_metrics
 
 
 @pytest.mark.slow

@@ -10,8 +10,10 @@ from typing import Any
 
 import numpy as np
 import pytest
+from command_lines import run as run_here
 from training_jobs import (
     FOREVER,
+    POINT,
     POINT_TASK,
     gmi_pid,
     iteration_of,
@@ -24,25 +26,19 @@ from training_jobs import (
     wait_until,
 )
 
-from gmijax.a3c.staleness import MAX_COUNTED
-from gmijax.resume import find_checkpoint
+from gmijax.a3c.report import MAX_COUNTED
+from gmijax.runs.resume import find_checkpoint
 
 N, T = 16, 4
 UPDATE = N * T
 """Environment steps of one batch of one trainer."""
 
 SMALL = (
-    *("env=point.py:make", "algo=a3c", f"num_envs={N}", f"algo.unroll_length={T}"),
+    *(POINT[0], "algo=a3c", f"num_envs={N}", f"algo.unroll_length={T}"),
     *("algo.num_minibatches=2", "algo.num_updates_per_batch=2", "run.grace_s=3"),
     *("algo.policy_hidden_layer_sizes=[16]", "algo.value_hidden_layer_sizes=[16]"),
     *("reduce.timeout_s=30", "run.max_restarts=0"),
 )
-
-
-def _folder(path: Path) -> Path:
-    path.mkdir(exist_ok=True)
-    (path / "point.py").write_text(POINT_TASK)
-    return path
 
 
 def _read(path: Path) -> dict[str, Any]:
@@ -52,7 +48,7 @@ def _read(path: Path) -> dict[str, Any]:
 @pytest.fixture(scope="module")
 def two_and_two(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Two agents and two trainers, 150 updates."""
-    cwd = _folder(tmp_path_factory.mktemp("async"))
+    cwd = tmp_path_factory.mktemp("async")
     done = train(
         *SMALL, "plan.serving_gmis_per_gpu=2", "plan.training_gmis_per_gpu=2",
         f"num_timesteps={150 * 2 * UPDATE}", "run.checkpoint_every=50", "run.dir=run", cwd=cwd,
@@ -116,7 +112,7 @@ def test_its_checkpoint_plays(two_and_two: Path) -> None:
 @pytest.mark.parametrize("way", ["channel.design=uni", "channel.when_full=drop_oldest"])
 def test_a_job_learns_whichever_way_experience_goes(way: str, tmp_path: Path) -> None:
     steps = 30 * UPDATE
-    done = train(*SMALL, way, f"num_timesteps={steps}", "run.dir=run", cwd=_folder(tmp_path))
+    done = train(*SMALL, way, f"num_timesteps={steps}", "run.dir=run", cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     assert _read(tmp_path / "run" / "summary.json")["env_steps"] >= steps
 
@@ -136,22 +132,21 @@ def test_a_job_goes_on_from_its_checkpoint(two_and_two: Path) -> None:
 
 
 @pytest.mark.timeout(120)
-@pytest.mark.parametrize("strategy", ["flat", "har"])
-def test_trainers_on_several_gpus_reduce_in_rings(strategy: str, tmp_path: Path) -> None:
-    cwd = _folder(tmp_path)
+def test_trainers_on_several_gpus_reduce_in_rings(tmp_path: Path) -> None:
+    cwd = tmp_path
     done = train(
         *SMALL, "plan.serving_gpus=[0,1]", "plan.training_gpus=[0,1]", "run.dir=run",
-        f"reduce.strategy={strategy}", f"num_timesteps={20 * 2 * UPDATE}", cwd=cwd,
+        "reduce.strategy=har", f"num_timesteps={20 * 2 * UPDATE}", cwd=cwd,
     )  # fmt: skip
     assert done.returncode == 0, done.stderr
     plan = _read(cwd / "run" / "summary.json")["plan"]
-    assert (plan["layout"], plan["strategy"]) == ([[0, 2], [1, 3]], strategy)
+    assert (plan["layout"], plan["strategy"]) == ([[0, 2], [1, 3]], "har")
 
 
 @pytest.mark.timeout(120)
 @pytest.mark.parametrize("victim", [0, 2], ids=["trainer", "agent"])
 def test_a_killed_gmi_ends_the_job_and_is_named(victim: int, tmp_path: Path) -> None:
-    cwd, shm = _folder(tmp_path), shared_memory()
+    cwd, shm = tmp_path, shared_memory()
     run = cwd / "run"
     job = start(*SMALL, FOREVER, "plan.serving_gmis_per_gpu=2", "run.dir=run", cwd=cwd)
     wait_until(lambda: iteration_of(run, 0) and iteration_of(run, 2), 90, "updates")
@@ -170,7 +165,7 @@ def test_a_killed_gmi_ends_the_job_and_is_named(victim: int, tmp_path: Path) -> 
 
 @pytest.mark.timeout(120)
 def test_an_interrupt_saves_the_whole_job(tmp_path: Path) -> None:
-    cwd = _folder(tmp_path)
+    cwd = tmp_path
     run = cwd / "run"
     job = start(*SMALL, FOREVER, "plan.gpus=2", "run.dir=run", cwd=cwd)
     wait_until(lambda: iteration_of(run, 0) and iteration_of(run, 1), 90, "updates")
@@ -197,8 +192,8 @@ def test_an_interrupt_saves_the_whole_job(tmp_path: Path) -> None:
     ],
 )
 def test_bad_input_starts_nothing(tmp_path: Path, overrides: tuple[str, ...], said: str) -> None:
-    done = train(*SMALL, *overrides, "run.dir=run", cwd=_folder(tmp_path))
-    assert done.returncode == 2, done.stderr
+    (tmp_path / "point.py").write_text(POINT_TASK)
+    done = run_here("train", *SMALL, *overrides, "run.dir=run", cwd=tmp_path)
+    assert done.code == 2, done.stderr
     assert said in done.stderr
     assert len(done.stderr.strip().splitlines()) == 1
-    assert not (tmp_path / "run").exists()

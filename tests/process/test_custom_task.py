@@ -83,18 +83,8 @@ def test_an_environment_of_brax_trains(tmp_path: Path):
     assert json.loads((run / "summary.json").read_text())["env"] == "brax/fast"
 
 
-@pytest.mark.parametrize(
-    ("overrides", "said"),
-    [
-        (("env=brax", "env.name=antt"), "env.name=antt: Brax has no such env"),
-        (("env=point.py:mak",), "no function mak there: did you mean make?"),
-    ],
-)
-def test_what_only_a_gmi_can_know_is_still_bad_input(
-    overrides: tuple[str, ...], said: str, tmp_path: Path
-):
-    (tmp_path / "point.py").write_text(TASK)
-    done = train(*overrides, cwd=tmp_path)
+def test_what_only_a_gmi_can_know_is_still_bad_input(tmp_path: Path):
+    done = train("env=brax", "env.name=antt", cwd=tmp_path)
     assert done.returncode == 2
-    assert said in done.stderr
+    assert "env.name=antt: Brax has no such env" in done.stderr
     assert len(done.stderr.strip().splitlines()) == 1

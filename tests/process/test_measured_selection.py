@@ -6,13 +6,13 @@ import json
 from pathlib import Path
 
 import pytest
-from training_jobs import STEPS, TINY, train
+from training_jobs import POINT, STEPS, train
 
 
 @pytest.mark.timeout(300)
 def test_measured_once_and_used(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
-    job = (*TINY, "plan.gmis_per_gpu=2", f"num_timesteps={2 * STEPS}")
+    job = (*POINT, "plan.gmis_per_gpu=2", f"num_timesteps={2 * STEPS}")
     done = train(*job, "reduce.selection=measured", "run.dir=run", cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     summary = json.loads((tmp_path / "run" / "summary.json").read_text())["plan"]

@@ -13,19 +13,19 @@ from pathlib import Path
 import pytest
 from supervision import CHECKOUT, TESTS, gpu, machine, make_job, plan_config, reduce_config
 
-from gmijax.control.kinds import Plain
-from gmijax.control.launcher import Launch, run_gmis
 from gmijax.errors import BackendUnavailable, GmiFailed, JobInterrupted
-from gmijax.partition.backends import open_backend
-from gmijax.partition.gmi_process import GmiStatus
-from gmijax.partition.machine import Machine, detect_machine
-from gmijax.partition.mps_control import PIPE_VARIABLE, MpsControl, find_mps_control
-from gmijax.partition.nvidia import MigInstance
+from gmijax.machine.mps_control import PIPE_VARIABLE, MpsControl, find_mps_control
+from gmijax.machine.nvidia import MigInstance
+from gmijax.machine.processes import ProcessId, identify, wait_until_gone
+from gmijax.machine.snapshot import Machine, detect_machine
 from gmijax.partition.plan import Plan
 from gmijax.partition.planner import make_plan
-from gmijax.partition.supervisor import Patience, Supervisor
-from gmijax.processes import ProcessId, identify, wait_until_gone
-from gmijax.rundir import RunPaths, read_json, write_json
+from gmijax.runs.folder import RunPaths, read_json, write_json
+from gmijax.supervise.backends import open_backend
+from gmijax.supervise.gmi_process import GmiStatus
+from gmijax.supervise.kinds import JobKind
+from gmijax.supervise.launcher import Launch, run_gmis
+from gmijax.supervise.supervisor import Supervisor, Timeouts
 
 pytestmark = pytest.mark.timeout(60)
 
@@ -113,7 +113,7 @@ def test_an_interrupted_end_leaves_the_daemons_to_the_janitor(
 
     here = machine(1, mps_control=find_mps_control())
     plan = mps_plan(here, num_gpus=1, gmis_per_gpu=2)
-    monkeypatch.setattr("gmijax.partition.backends.mps.quit_daemon", interrupted)
+    monkeypatch.setattr("gmijax.supervise.backends.mps.quit_daemon", interrupted)
     backend = open_backend(plan, here, run)
     with ExitStack() as held:
         held.enter_context(backend)
@@ -228,13 +228,13 @@ def test_daemon_that_does_not_start_leaves_nothing(
 def small_job(run: RunPaths, here: Machine, plan: Plan, told: list[str]) -> Launch:
     """Its GMIs end at once: `this` is the module of the standard library."""
     write_json(run.plan, plan.to_dict())
-    patience = Patience(start_timeout_s=20, stall_timeout_s=20, stop_timeout_s=20, grace_s=2)
+    timeouts = Timeouts(start_timeout_s=20, stall_timeout_s=20, stop_timeout_s=20, grace_s=2)
     return Launch(
         plan=plan,
         machine=here,
         run=run,
-        kind=Plain("this"),
-        patience=patience,
+        kind=JobKind("this"),
+        timeouts=timeouts,
         on_warning=told.append,
     )
 
@@ -306,7 +306,7 @@ def test_daemon_of_somebody_else_is_used_and_left_alone(
     daemon = control.daemon_pid()
     assert daemon is not None
     monkeypatch.setenv(PIPE_VARIABLE, str(pipe_directory))
-    monkeypatch.setattr("gmijax.partition.machine.list_gpus", lambda: (gpu(0),))
+    monkeypatch.setattr("gmijax.machine.snapshot.list_gpus", lambda: (gpu(0),))
     monkeypatch.delenv("CUDA_VISIBLE_DEVICES", raising=False)
     try:
         here = detect_machine()

@@ -3,16 +3,15 @@
 from __future__ import annotations
 
 import json
-import os
 import subprocess
-import sys
 from collections.abc import Sequence
 from pathlib import Path
 
 import imageio_ffmpeg
 import pytest
+from command_lines import run as run_here
+from training_jobs import train
 
-COMMAND_TIMEOUT_S = 240
 TINY = (
     *("env=ball_balance", "num_envs=32", "num_timesteps=256", "plan.gpus=1"),
     *("algo.unroll_length=4", "algo.num_updates_per_batch=1", "run.measure_throughput=false"),
@@ -22,32 +21,21 @@ TINY = (
 pytestmark = pytest.mark.timeout(600)
 
 
-def gmijax(command: str, *overrides: str, cwd: Path) -> subprocess.CompletedProcess[str]:
-    return subprocess.run(
-        [sys.executable, "-m", f"gmijax.{command}", *overrides],
-        cwd=cwd,
-        env={**os.environ, "PYTHONPATH": str(CHECKOUT)},
-        capture_output=True,
-        text=True,
-        timeout=COMMAND_TIMEOUT_S,
-        check=False,
-    )
+def play(*overrides: str, cwd: Path) -> subprocess.CompletedProcess[str]:
+    return train(*overrides, cwd=cwd, command="play")
 
 
-CHECKOUT = Path(__file__).resolve().parents[2]
-
-
-@pytest.fixture(scope="session")
+@pytest.fixture(scope="module")
 def home(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A working directory with one run, `runs/tiny`: two iterations, a checkpoint after each."""
     folder = tmp_path_factory.mktemp("home")
-    done = gmijax("train", *TINY, "run.name=tiny", "run.checkpoint_every=1", cwd=folder)
+    done = train(*TINY, "run.name=tiny", "run.checkpoint_every=1", cwd=folder)
     assert done.returncode == 0, done.stderr
     return folder
 
 
 def test_returns_are_shown_and_written(home: Path):
-    done = gmijax("play", "run.dir=last", "num_envs=4", "video=none", "html=off", cwd=home)
+    done = play("run.dir=last", "num_envs=4", "video=none", "html=off", cwd=home)
     assert done.returncode == 0, done.stderr
     folder = home / "runs" / "tiny" / "play" / "000000000256"
     assert str(folder / "returns.json") in done.stdout
@@ -72,7 +60,7 @@ def test_the_same_seed_gives_the_same_returns(home: Path):
     folder = home / "runs" / "tiny" / "play" / "000000000128"
     played: list[list[float]] = []
     for _ in range(2):
-        done = gmijax("play", "run.dir=runs/tiny", "seed=1", *shared, *nothing, cwd=home)
+        done = play("run.dir=runs/tiny", "seed=1", *shared, *nothing, cwd=home)
         assert done.returncode == 0, done.stderr
         episodes = json.loads((folder / "returns.json").read_text())["episodes"]
         played.append([item["return"] for item in episodes])
@@ -81,7 +69,7 @@ def test_the_same_seed_gives_the_same_returns(home: Path):
 
 def test_films_have_the_wanted_size_and_play_in_real_time(home: Path):
     wanted = ("num_envs=3", "video_envs=3", "video=both", "width=200", "height=160")
-    done = gmijax("play", "run.dir=runs/tiny", *wanted, "max_steps=60", cwd=home)
+    done = play("run.dir=runs/tiny", *wanted, "max_steps=60", cwd=home)
     if "no headless OpenGL" in done.stderr:
         assert done.returncode == 1
         pytest.skip("neither EGL nor OSMesa on this machine: nothing can be drawn")
@@ -112,12 +100,17 @@ def test_films_have_the_wanted_size_and_play_in_real_time(home: Path):
         (("run.dir=runs/tiny", "vidoe=gif"), "unknown key vidoe: did you mean video?"),
         (("run.dir=runs/tiny", "video=avi"), "video=avi: expected one of auto, mp4"),
         (("num_envs=2", "video_envs=3"), "video_envs=3: must be between 1 and 2"),
-        # Only the child knows the model's cameras.
-        (("run.dir=runs/tiny", "camera=nose"), "camera=nose: unknown camera of ball_balance"),
     ],
 )
 def test_bad_input_is_one_line_and_exit_code_2(home: Path, overrides: Sequence[str], message: str):
-    done = gmijax("play", *overrides, cwd=home)
-    assert done.returncode == 2, done.stderr
+    done = run_here("play", *overrides, cwd=home)
+    assert done.code == 2, done.stderr
     assert message in done.stderr
+    assert done.stderr.count("\n") == 1
+
+
+def test_what_only_the_child_knows_is_bad_input_too(home: Path):
+    done = play("run.dir=runs/tiny", "camera=nose", cwd=home)
+    assert done.returncode == 2, done.stderr
+    assert "camera=nose: unknown camera of ball_balance" in done.stderr
     assert done.stderr.count("\n") == 1

@@ -15,7 +15,7 @@ ON = "env.randomize=on"
 
 def test_one_gmi_and_two_train_in_randomised_worlds(tmp_path: Path) -> None:
     returns = {}
-    for name, randomize in (("on", "on"), ("again", "true"), ("off", "off")):
+    for name, randomize in (("on", "true"), ("off", "off")):
         done = train(
             *TINY,
             f"env.randomize={randomize}",
@@ -27,7 +27,7 @@ def test_one_gmi_and_two_train_in_randomised_worlds(tmp_path: Path) -> None:
         assert saved["env"]["randomize"] == ("off" if name == "off" else "on")
         lines = (tmp_path / name / "metrics.jsonl").read_text().splitlines()
         returns[name] = [json.loads(line)["return"] for line in lines]
-    assert returns["on"] == returns["again"] != returns["off"]
+    assert returns["on"] != returns["off"]
     two = train(
         *TINY,
         ON,

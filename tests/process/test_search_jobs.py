@@ -6,36 +6,14 @@ import json
 from pathlib import Path
 
 import pytest
-from training_jobs import pids_of, train
+from training_jobs import POINT_TASK, pids_of, train
 
 pytestmark = pytest.mark.timeout(600)
 
-# A point on a line: it compiles in seconds. With 24 environments it brings its process down.
-TASK = """
-import os
-import jax
-import jax.numpy as jnp
-from gmijax.sim import episode
-from gmijax.sim.interface import Env, EnvSpec
-
-SPEC = EnvSpec("point", 1, 1, 0.1, 5, ("near",))
-
-def make(*, impl, max_envs):
-    if max_envs == 24:
-        os.abort()
-
-    def reset(model, key):
-        key, draw = jax.random.split(key)
-        start = jax.random.uniform(draw, (1,))
-        return episode.begin(SPEC, start, (), start, key)
-
-    def step(model, state, action):
-        moved = state.physics + 0.1 * action
-        near = -jnp.abs(moved[0])
-        return episode.advance(state, moved, (), moved, (near, {"near": near}), moved[0] > 3.0)
-
-    return Env(SPEC, (), reset, step, None, lambda state: state.physics)
-"""
+# It compiles in seconds. With 24 environments it brings its process down.
+TASK = POINT_TASK.replace(
+    "    return point", "    if max_envs == 24:\n        import os; os.abort()\n    return point"
+)
 JOB = (
     *("env=point.py:make", "search.store=store", "algo.unroll_length=4"),
     *("algo.num_updates_per_batch=1", "run.measure_throughput=false", "run.grace_s=3"),

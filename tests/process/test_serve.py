@@ -5,16 +5,16 @@ from __future__ import annotations
 import json
 import signal
 import subprocess
-import sys
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from command_lines import run as run_here
 from test_custom_task import SMALL, TASK
-from training_jobs import child_environment, gmi_pid, kill, pids_of, train, wait_until
+from training_jobs import gmi_pid, kill, pids_of, start, train, wait_until
 
-from gmijax.datadir import DataPaths
+from gmijax.runs.dataset import DataPaths
 
 pytestmark = pytest.mark.timeout(600)
 
@@ -30,18 +30,6 @@ RANDOM = ("env=point.py:make", "policy=random", *TINY)
 
 def serve(*overrides: str, cwd: Path) -> subprocess.CompletedProcess[str]:
     return train(*overrides, cwd=cwd, command="serve")
-
-
-def start(*overrides: str, cwd: Path) -> subprocess.Popen[str]:
-    return subprocess.Popen(
-        [sys.executable, "-m", "gmijax.serve", *overrides],
-        cwd=cwd,
-        env=child_environment(),
-        stdout=subprocess.DEVNULL,
-        stderr=subprocess.PIPE,
-        text=True,
-        start_new_session=True,
-    )
 
 
 @pytest.fixture(scope="module")
@@ -135,12 +123,12 @@ def test_after_a_kill_the_same_command_goes_on(
     name = f"kill{victim}"
     folder, run = home / name, home / "runs" / name
     job = (*RANDOM, "plan.gmis_per_gpu=2", *template, f"output.dir={name}")
-    process = start(*job, "num_timesteps=1e9", f"run.name={name}", cwd=home)
+    process = start(*job, "num_timesteps=1e9", f"run.name={name}", cwd=home, command="serve")
     request.addfinalizer(process.kill)
     wait_until(lambda: finished(folder) >= 3, 240, "three shards")
     kill(gmi_pid(run, victim) or 0)
-    _, said = process.communicate(timeout=60)
-    assert process.returncode == 1, said
+    assert process.wait(timeout=60) == 1
+    said = (home / "stderr.txt").read_text()
     assert f"GMI {victim} failed: ended by SIGKILL" in said
     assert not pids_of(run)
     assert summary_of(home, name)["status"] == "failed"
@@ -173,13 +161,12 @@ def test_after_a_kill_the_same_command_goes_on(
 
 def test_an_interrupted_job_leaves_whole_shards(home: Path, request: pytest.FixtureRequest):
     job = (*RANDOM, "plan.gmis_per_gpu=3", "plan.template=tdg", "num_timesteps=1e9")
-    process = start(*job, "run.name=int", "output.dir=int", cwd=home)
+    process = start(*job, "run.name=int", "output.dir=int", cwd=home, command="serve")
     request.addfinalizer(process.kill)
     wait_until(lambda: finished(home / "int") >= 2, 240, "two shards")
     process.send_signal(signal.SIGINT)
-    _, said = process.communicate(timeout=60)
-    assert process.returncode == 130, said
-    assert "the same command makes the rest" in said
+    assert process.wait(timeout=60) == 130
+    assert "the same command makes the rest" in (home / "stderr.txt").read_text()
     folder = home / "int"
     assert len(list(folder.rglob("*.npz"))) == finished(folder) >= 2
     assert not list(folder.rglob(".*"))
@@ -201,8 +188,8 @@ def test_an_interrupted_job_leaves_whole_shards(home: Path, request: pytest.Fixt
 )
 def test_bad_input_starts_nothing(overrides: list[str], said: str, home: Path):
     before = sorted(home.glob("*"))
-    done = serve(*overrides, cwd=home)
-    assert done.returncode == 2, done.stderr
+    done = run_here("serve", *overrides, cwd=home)
+    assert done.code == 2, done.stderr
     assert said in done.stderr
     assert len(done.stderr.strip().splitlines()) == 1
     assert sorted(home.glob("*")) == before

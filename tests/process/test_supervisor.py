@@ -15,11 +15,11 @@ from supervision import CHECKOUT, TESTS, cpu_job
 from training_jobs import heartbeat_of
 
 from gmijax.errors import ConfigError, GmiFailed, JobInterrupted
-from gmijax.partition.child import ENV_EXCHANGE_FD
-from gmijax.partition.gmi_process import GmiStatus
-from gmijax.partition.supervisor import Job, Supervisor
-from gmijax.processes import ProcessId, identify, wait_until_gone
-from gmijax.rundir import RunPaths, read_json
+from gmijax.machine.processes import ProcessId, identify, wait_until_gone
+from gmijax.runs.folder import RunPaths, read_json
+from gmijax.supervise.child import ENV_EXCHANGE_FD
+from gmijax.supervise.gmi_process import GmiStatus
+from gmijax.supervise.supervisor import Job, Supervisor
 
 pytestmark = pytest.mark.timeout(30)
 
@@ -217,7 +217,7 @@ def test_exception_of_the_callback_ends_all(run: RunPaths):
 def test_exchange_file_reaches_every_gmi(run: RunPaths):
     exchange = os.memfd_create("")
     code = (
-        "import os; from gmijax.partition.child import ChildLink;"
+        "import os; from gmijax.supervise.child import ChildLink;"
         "link = ChildLink.from_environment();"
         "os.pwrite(link.exchange_fd, b'x', link.gmi)"
     )
@@ -237,7 +237,7 @@ def test_exchange_file_reaches_every_gmi(run: RunPaths):
 
 def test_gmi_is_pinned_to_its_cores(run: RunPaths):
     code = (
-        "import os; from gmijax.partition.child import ChildLink;"
+        "import os; from gmijax.supervise.child import ChildLink;"
         "ChildLink.from_environment(); print(sorted(os.sched_getaffinity(0)))"
     )
     job = cpu_job(run, ["clean"] * 2, command=lambda gmi: [sys.executable, "-c", code])
@@ -268,7 +268,7 @@ def test_killed_controller_leaves_no_process_and_no_helper_of_a_gmi(run: RunPath
 
 def test_a_fork_of_the_controller_does_not_keep_gmis(run: RunPaths):
     code = (
-        "import os, time; from gmijax.processes import GuardPipe\n"
+        "import os, time; from gmijax.machine.processes import GuardPipe\n"
         "pipe = GuardPipe()\n"
         "if os.fork() == 0: time.sleep(600)\n"
         "print(pipe.read_end, flush=True); os.read(0, 1)"

@@ -14,7 +14,17 @@ NUM_ENVS = 8
 STEPS = NUM_ENVS * 2
 
 
-@pytest.mark.parametrize("task", sorted(TASKS))
+# Each of the others compiles for a minute or more; `tests/contract` has all of them.
+QUICK = ("ant", "ball_balance")
+
+
+@pytest.mark.parametrize(
+    "task",
+    [
+        pytest.param(task, marks=() if task in QUICK else pytest.mark.slow)
+        for task in sorted(TASKS)
+    ],
+)
 def test_a_task_trains_for_two_iterations(task: str, tmp_path: Path) -> None:
     done = train(
         *(f"env={task}", f"num_envs={NUM_ENVS}", f"num_timesteps={2 * STEPS}", "run.dir=run"),

@@ -13,8 +13,8 @@ import numpy as np
 import pytest
 from training_jobs import (
     FOREVER,
+    POINT,
     STEPS,
-    TINY,
     gmi_pid,
     iteration_of,
     kill,
@@ -28,7 +28,7 @@ from training_jobs import (
     wait_until,
 )
 
-from gmijax.resume import find_checkpoint
+from gmijax.runs.resume import find_checkpoint
 
 
 def _read(path: Path) -> dict[str, Any]:
@@ -40,7 +40,7 @@ def two_gmis(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Six iterations on two virtual GPUs, in one go."""
     cwd = tmp_path_factory.mktemp("two")
     done = train(
-        *TINY, "plan.gpus=2", f"num_timesteps={6 * 2 * STEPS}", "run.dir=run",
+        *POINT, "plan.gpus=2", f"num_timesteps={6 * 2 * STEPS}", "run.dir=run",
         "run.measure_throughput=true", "run.checkpoint_every=3", cwd=cwd,
     )  # fmt: skip
     assert done.returncode == 0, done.stderr
@@ -65,7 +65,7 @@ def test_two_gmis_leave_every_file_of_the_contract(two_gmis: Path) -> None:
 def test_the_summary_says_what_was_done(two_gmis: Path) -> None:
     summary = _read(two_gmis / "summary.json")
     assert summary["status"] == "completed"
-    assert summary["env"] == "ball_balance"
+    assert summary["env"] == "point.py:make"
     assert summary["env_steps"] == 6 * 2 * STEPS
     assert (
         summary["plan"].items()
@@ -94,7 +94,9 @@ def test_there_is_a_line_of_metrics_per_iteration(two_gmis: Path) -> None:
 @pytest.mark.timeout(300)
 def test_resuming_gives_bit_equal_parameters(two_gmis: Path) -> None:
     cwd = two_gmis.parent
-    first = train(*TINY, "plan.gpus=2", f"num_timesteps={3 * 2 * STEPS}", "run.name=half", cwd=cwd)
+    first = train(
+        *POINT, "plan.gpus=2", f"num_timesteps={3 * 2 * STEPS}", "run.name=half", cwd=cwd
+    )
     assert first.returncode == 0, first.stderr
     # `last` is runs/half; only what changes is given again.
     second = train("run.resume=last", f"num_timesteps={6 * 2 * STEPS}", "run.dir=resumed", cwd=cwd)
@@ -115,7 +117,7 @@ def test_two_gmis_compute_what_one_process_with_all_environments_does(tmp_path: 
         ("two", ("plan.gmis_per_gpu=2", "num_envs=16")),
         ("one", ("plan.gmis_per_gpu=1", "num_envs=32")),
     ):
-        done = train(*TINY, *same, *plan, f"run.dir={name}", cwd=tmp_path)
+        done = train(*POINT, *same, *plan, f"run.dir={name}", cwd=tmp_path)
         assert done.returncode == 0, done.stderr
     for two, one in zip(
         learner_arrays(tmp_path / "two"), learner_arrays(tmp_path / "one"), strict=True
@@ -127,7 +129,7 @@ def test_two_gmis_compute_what_one_process_with_all_environments_does(tmp_path: 
 @pytest.mark.timeout(120)
 def test_an_interrupt_saves_and_stops_everything(tmp_path: Path) -> None:
     run = tmp_path / "run"
-    job = start(*TINY, FOREVER, "plan.gpus=2", "run.dir=run", cwd=tmp_path)
+    job = start(*POINT, FOREVER, "plan.gpus=2", "run.dir=run", cwd=tmp_path)
     wait_until(lambda: iteration_of(run, 1) >= 2, 90, "two iterations")
     job.send_signal(signal.SIGINT)
     assert job.wait(timeout=30) == 130
@@ -143,7 +145,7 @@ def test_an_interrupt_saves_and_stops_everything(tmp_path: Path) -> None:
 def test_a_killed_gmi_ends_the_job_and_is_named(tmp_path: Path) -> None:
     run = tmp_path / "run"
     job = start(
-        *TINY, FOREVER, "plan.gpus=2", "run.dir=run", "run.checkpoint_every=2", cwd=tmp_path
+        *POINT, FOREVER, "plan.gpus=2", "run.dir=run", "run.checkpoint_every=2", cwd=tmp_path
     )
     wait_until(lambda: iteration_of(run, 1) >= 4, 90, "four iterations")
     pid = gmi_pid(run, 1)
@@ -162,26 +164,21 @@ def test_a_killed_gmi_ends_the_job_and_is_named(tmp_path: Path) -> None:
     assert _read(run / "summary.json")["status"] == "failed"
 
 
-@pytest.mark.timeout(120)
-def test_a_killed_controller_leaves_nothing(tmp_path: Path) -> None:
-    run = tmp_path / "run"
-    before = shared_memory()
-    job = start(*TINY, FOREVER, "plan.gpus=2", "run.dir=run", cwd=tmp_path)
-    wait_until(lambda: iteration_of(run, 1) >= 1, 90, "an iteration")
-    assert len(pids_of(run)) == 2
-    job.kill()
-    job.wait()
-    wait_until(lambda: not pids_of(run), 10, "both GMIs gone")
-    assert shared_memory() <= before
-
-
 @pytest.mark.timeout(400)
-def test_twenty_random_kills_leave_nothing(tmp_path: Path) -> None:
-    """At any moment, also while starting and compiling, GMIs and controller alike."""
+@pytest.mark.parametrize(
+    "plan",
+    [
+        ("plan.gmis_per_gpu=2",),
+        # Also while GMIs meet, when a library would rather end them by itself.
+        ("plan.gpus=2", "reduce.strategy=mrr"),
+    ],
+    ids=["memory", "rings"],
+)
+def test_kills_at_any_moment_leave_nothing(plan: tuple[str, ...], tmp_path: Path) -> None:
+    """Also while starting and compiling, GMIs and controller alike."""
     draw = random.Random(0)
     shm, pipes = shared_memory(), mps_directories()
-    for number in range(20):
-        cwd = tmp_path / str(number)
-        kill_somebody("plan.gmis_per_gpu=2", cwd=cwd, draw=draw, within_s=(0.3, 7.0))
+    for number in range(6):
+        kill_somebody(*plan, cwd=tmp_path / str(number), draw=draw, within_s=(0.3, 7.0))
     assert shared_memory() <= shm
     assert mps_directories() <= pipes

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import os
-import random
 import signal
 from pathlib import Path
 
@@ -12,15 +11,13 @@ import numpy as np
 import pytest
 from training_jobs import (
     FOREVER,
-    POINT_TASK,
+    POINT,
     STEPS,
     TINY,
     gmi_pid,
     iteration_of,
-    kill_somebody,
     learner_arrays,
     pids_of,
-    shared_memory,
     start,
     train,
     wait_until,
@@ -31,22 +28,19 @@ ITERATIONS = 13
 
 
 def _trained(
-    strategy: str, gmis_per_gpu: int, cwd: Path, task: str, layout: str = "plan.gpus=2"
+    strategy: str, gmis_per_gpu: int, cwd: Path, layout: str = "plan.gpus=2"
 ) -> list[np.ndarray]:
-    """The learner after `ITERATIONS` on two GPUs."""
+    """The learner after `ITERATIONS` on two GPUs.
+
+    Without contacts: where one begins a step earlier because a sum was rounded otherwise, so may
+    all that follows.
+    """
     plan = (layout, f"plan.gmis_per_gpu={gmis_per_gpu}", f"reduce.strategy={strategy}")
     steps = ITERATIONS * 2 * gmis_per_gpu * STEPS
     run = (f"num_timesteps={steps}", f"run.dir={strategy}")
-    done = train(task, *TINY[1:], *plan, *run, cwd=cwd)
+    done = train(*POINT, *plan, *run, cwd=cwd)
     assert done.returncode == 0, done.stderr
     return learner_arrays(cwd / strategy)
-
-
-def _point_task(cwd: Path) -> str:
-    # Without contacts: where one begins a step earlier because a sum was rounded otherwise, so
-    # may all that follows.
-    (cwd / "point.py").write_text(POINT_TASK)
-    return "env=point.py:make"
 
 
 def _assert_same(found: list[np.ndarray], expected: list[np.ndarray], what: str) -> None:
@@ -59,7 +53,7 @@ def _assert_same(found: list[np.ndarray], expected: list[np.ndarray], what: str)
 @pytest.mark.timeout(400)
 def test_two_gmis_learn_the_same_bits_through_host_memory_and_rings(tmp_path: Path) -> None:
     # The sum of two numbers has one order only.
-    mpr, har = (_trained(strategy, 1, tmp_path, TINY[0]) for strategy in ("mpr", "har"))
+    mpr, har = (_trained(strategy, 1, tmp_path) for strategy in ("mpr", "har"))
     assert len(mpr) > 10
     for other, expected in zip(har, mpr, strict=True):
         np.testing.assert_array_equal(other, expected)
@@ -67,10 +61,9 @@ def test_two_gmis_learn_the_same_bits_through_host_memory_and_rings(tmp_path: Pa
 
 @pytest.mark.timeout(400)
 def test_one_program_of_two_gmis_learns_what_several_programs_do(tmp_path: Path) -> None:
-    task = _point_task(tmp_path)
-    mpr, mrr = (_trained(name, 1, tmp_path, task) for name in ("mpr", "mrr"))
+    mpr, mrr = (_trained(name, 1, tmp_path) for name in ("mpr", "mrr"))
     # With the GMIs the other way round: GMI 0 is not the first of the ring.
-    flat = _trained("flat", 1, tmp_path, task, "plan.layout=[[1],[0]]")
+    flat = _trained("flat", 1, tmp_path, "plan.layout=[[1],[0]]")
     _assert_same(mrr, mpr, "mrr")
     for other, expected in zip(flat, mrr, strict=True):
         np.testing.assert_array_equal(other, expected)
@@ -104,7 +97,7 @@ def test_one_program_of_two_gmis_goes_on_from_a_checkpoint(tmp_path: Path) -> No
 @pytest.mark.timeout(120)
 def test_a_gmi_that_hangs_in_the_program_of_all_is_named(tmp_path: Path) -> None:
     plan = ("plan.gpus=2", "reduce.strategy=flat", "reduce.timeout_s=2", "run.dir=run")
-    job = start(_point_task(tmp_path), *TINY[1:], FOREVER, *plan, cwd=tmp_path)
+    job = start(*POINT, FOREVER, *plan, cwd=tmp_path)
     run = tmp_path / "run"
     wait_until(lambda: iteration_of(run, 1) > 5, 60, "GMI 1 has trained")
     pid = gmi_pid(run, 1)
@@ -119,20 +112,6 @@ def test_a_gmi_that_hangs_in_the_program_of_all_is_named(tmp_path: Path) -> None
 @pytest.mark.slow
 @pytest.mark.timeout(400)
 def test_four_gmis_learn_the_same_under_every_strategy(tmp_path: Path) -> None:
-    task = _point_task(tmp_path)
-    mpr = _trained("mpr", 2, tmp_path, task)
+    mpr = _trained("mpr", 2, tmp_path)
     for strategy in ("mrr", "har"):
-        _assert_same(_trained(strategy, 2, tmp_path, task), mpr, strategy)
-
-
-@pytest.mark.timeout(300)
-def test_kills_at_any_moment_leave_nothing_of_a_job_with_rings(tmp_path: Path) -> None:
-    """Also while GMIs meet, when a library would rather end them by itself."""
-    draw = random.Random(0)
-    shm = shared_memory()
-    rings = ("plan.gpus=2", "reduce.strategy=mrr")
-    for number in range(8):
-        kill_somebody(*rings, cwd=tmp_path / str(number), draw=draw, within_s=(1.0, 10.0))
-    assert shared_memory() <= shm
-    plan = json.loads((tmp_path / "7" / "run" / "plan.json").read_text())
-    assert plan["strategy"] == "mrr"
+        _assert_same(_trained(strategy, 2, tmp_path), mpr, strategy)

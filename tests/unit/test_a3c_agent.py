@@ -13,18 +13,22 @@ import pytest
 from toy_env import point_mass
 from training_jobs import wait_until
 
-from gmijax.a3c.agent import Serving, act_until_told
-from gmijax.a3c.board import Board, Orders, board_of, note_sizes, pack_orders, unpack_report
-from gmijax.a3c.learner import acting_weights, num_weights, pack_weights
-from gmijax.a3c.rollout import num_stats
-from gmijax.cli import compose
-from gmijax.collectives.board import attach_board, create_board
-from gmijax.collectives.channel.interface import SenderStats
-from gmijax.learner import init_learner, make_learner
-from gmijax.normalize import normalize
-from gmijax.partition.child import ChildLink
-from gmijax.policy import log_prob
-from gmijax.rundir import RunPaths
+from gmijax.a3c.agent import Agent
+from gmijax.a3c.job_registers import JobRegisters, Orders, Report, open_job_registers
+from gmijax.a3c.rollout import num_counts
+from gmijax.cli.compose import compose
+from gmijax.collectives.messages.registers import create_registers
+from gmijax.learning.learner import (
+    acting_weights,
+    init_learner,
+    make_learner,
+    num_weights,
+    pack_weights,
+)
+from gmijax.learning.normalize import normalize
+from gmijax.learning.policy import log_prob
+from gmijax.runs.folder import RunPaths
+from gmijax.supervise.child import ChildLink
 
 ENV = point_mass()
 OVERRIDES = (
@@ -41,6 +45,7 @@ class _NoRoom:
     def __init__(self) -> None:
         self.was_asked = threading.Event()
         self.waited_s = 0.0
+        self.num_bytes = self.dropped = 0
 
     def send(self, experience, version, timeout_s) -> bool:
         self.was_asked.set()
@@ -51,8 +56,10 @@ class _NoRoom:
     def flush(self) -> None:
         pass
 
-    def stats(self) -> SenderStats:
-        return SenderStats(0, 0, 0, 0, self.waited_s, 0, 0.0, 0.0)
+    def occupancy(self) -> float:
+        return 0.0
+
+    least_occupancy = occupancy
 
     def close(self) -> None:
         pass
@@ -63,11 +70,11 @@ def config():
     return compose(*OVERRIDES)
 
 
-def _board(config) -> Board:
-    sizes = note_sizes(num_weights(ENV.spec, config.algo), num_stats(ENV), num_agents=1)
-    fd = create_board()
+def _registers(config) -> JobRegisters:
+    fd = create_registers()
     try:
-        return board_of(attach_board(fd, sizes))
+        weights = num_weights(ENV.spec, config.algo)
+        return open_job_registers(fd, weights, num_counts(ENV), num_agents=1)
     finally:
         os.close(fd)
 
@@ -75,37 +82,37 @@ def _board(config) -> Board:
 class _Publisher(_NoRoom):
     """Takes everything, and publishes `packed` as version 4 when it is sent the first unroll."""
 
-    def __init__(self, board: Board, packed) -> None:
+    def __init__(self, registers: JobRegisters, packed) -> None:
         super().__init__()
         self.taken: list = []
-        self._board, self._packed = board, packed
+        self._registers, self._packed = registers, packed
 
     def send(self, experience, version, timeout_s) -> bool:
         self.taken.append(({name: x.copy() for name, x in experience.items()}, version))
         if len(self.taken) == 1:
-            self._board.weights.publish(self._packed, tag=4)
+            self._registers.weights.publish(self._packed, tag=4)
         if len(self.taken) == 3:
-            self._board.orders.publish(pack_orders(Orders(None, is_ending=True)))
+            self._registers.orders.publish(Orders(None, is_ending=True).pack())
         return True
 
 
 def _agent(tmp_path, config):
-    """Board with version 3 of the weights and the order to begin, link, weights, learner."""
-    board, link = _board(config), ChildLink(1, RunPaths(tmp_path), None, None)
+    """Registers with version 3 of the weights and the order to begin, link, weights, learner."""
+    registers, link = _registers(config), ChildLink(1, RunPaths(tmp_path), None, None)
     link.paths.root.mkdir(parents=True)
     learner = make_learner(ENV.spec, config.algo)
     weights = acting_weights(learner, init_learner(learner, ENV.spec.obs_size, jax.random.key(0)))
-    board.weights.publish(np.asarray(pack_weights(weights)), tag=3)
-    board.orders.publish(pack_orders(Orders(None, is_ending=False)))
-    return board, link, weights, learner
+    registers.weights.publish(np.asarray(pack_weights(weights)), tag=3)
+    registers.orders.publish(Orders(None, is_ending=False).pack())
+    return registers, link, weights, learner
 
 
 def test_newer_weights_are_taken_up_within_an_unroll(tmp_path, config) -> None:
     config = compose(*OVERRIDES, "algo.weights_every=2")
-    board, link, weights, learner = _agent(tmp_path, config)
+    registers, link, weights, learner = _agent(tmp_path, config)
     bolder = weights._replace(params=weights.params._replace(log_std=weights.params.log_std + 1.0))
-    sender = _Publisher(board, np.asarray(pack_weights(bolder)))
-    act_until_told(Serving(config, config.algo, ENV, 0, (0,)), board, sender, link)
+    sender = _Publisher(registers, np.asarray(pack_weights(bolder)))
+    Agent(config, ENV, 0, (0,), registers, sender, link).run()
     assert [version for _, version in sender.taken] == [3, 3, 4]
 
     def told(experience, theirs):
@@ -126,22 +133,22 @@ def test_newer_weights_are_taken_up_within_an_unroll(tmp_path, config) -> None:
 
 def test_an_agent_without_room_still_adds_to_a_checkpoint(tmp_path, config) -> None:
     """At the end trainers wait for a pending checkpoint, and take nothing meanwhile."""
-    board, link, _, _ = _agent(tmp_path, config)
+    registers, link, _, _ = _agent(tmp_path, config)
     sender = _NoRoom()
 
     def added(steps: int) -> bool:
-        posted = board.reports[0].read()
-        return posted is not None and unpack_report(posted).checkpoint == steps
+        snapshot = registers.reports[0].read()
+        return snapshot is not None and Report.unpack(snapshot.values).checkpoint == steps
 
-    serving = Serving(config, config.algo, ENV, index=0, trainers=(0,))
+    agent = Agent(config, ENV, 0, (0,), registers, sender, link)
     with ThreadPoolExecutor(1) as pool:
-        outcome = pool.submit(act_until_told, serving, board, sender, link)
+        outcome = pool.submit(agent.run)
         try:
             assert sender.was_asked.wait(timeout=60)
-            board.orders.publish(pack_orders(Orders(5, is_ending=False)))
+            registers.orders.publish(Orders(5, is_ending=False).pack())
             wait_until(lambda: added(5), 10, "environments in the checkpoint")
         finally:
-            board.orders.publish(pack_orders(Orders(9, is_ending=True)))
+            registers.orders.publish(Orders(9, is_ending=True).pack())
         told = outcome.result(timeout=20)
     assert told["unrolls"] == 0
     assert 0 < told["wait_s"] <= sender.waited_s

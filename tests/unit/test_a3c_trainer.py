@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 from toy_env import point_mass
 
-from gmijax.a3c.board import Board
-from gmijax.a3c.trainer import Training, _Trainer
-from gmijax.cli import compose
-from gmijax.collectives.channel.interface import Batch
+from gmijax.a3c.job_registers import JobRegisters
+from gmijax.a3c.trainer import Trainer
+from gmijax.cli.compose import compose
+from gmijax.collectives.channel.batcher import Batch
 from gmijax.collectives.solo import SoloReducer
-from gmijax.partition.child import ChildLink
-from gmijax.rundir import RunPaths
+from gmijax.runs.folder import RunPaths
+from gmijax.supervise.child import ChildLink
 
 
 class _Arrivals:
@@ -27,17 +27,23 @@ class _Arrivals:
         return self._batches.pop(0)
 
 
-def test_unrolls_of_batches_that_are_passed_over_count_as_stale(tmp_path) -> None:
-    config = compose("env=ball_balance", "algo=a3c", "num_envs=4", "algo.max_staleness=3")
-    receiver = _Arrivals([1, 2, 3, 4], [10, 10, 9, 2], [10, 10, 10, 10])
-    trainer = _Trainer(
-        Training(config, config.algo, point_mass(), agents=(1,)),
-        Board(None, None, ()),
-        receiver,
+def _trainer(tmp_path, *versions: list[int]) -> Trainer:
+    """A trainer of version 10 that unrolls may be 3 versions behind."""
+    trainer = Trainer(
+        compose("env=ball_balance", "algo=a3c", "num_envs=4", "algo.max_staleness=3"),
+        point_mass(),
+        (1,),
+        JobRegisters(None, None, ()),
+        _Arrivals(*versions),
         SoloReducer(1),
         ChildLink(0, RunPaths(tmp_path), None, None),
     )
     trainer._version = 10
+    return trainer
+
+
+def test_unrolls_of_batches_that_are_passed_over_count_as_stale(tmp_path) -> None:
+    trainer = _trainer(tmp_path, [1, 2, 3, 4], [10, 10, 9, 2], [10, 10, 10, 10])
     first, second = (trainer._meet(*trainer._receive()) for _ in range(2))
     assert (first.fresh, first.stale, first.staleness.sum()) == (3, 5, 8)
     assert first.staleness[[0, 1, 6, 7, 8, 9]].tolist() == [2, 1, 1, 1, 2, 1]
@@ -45,15 +51,7 @@ def test_unrolls_of_batches_that_are_passed_over_count_as_stale(tmp_path) -> Non
 
 
 def test_fresh_unrolls_weigh_as_much_as_those_of_all_trainers(tmp_path) -> None:
-    config = compose("env=ball_balance", "algo=a3c", "num_envs=4", "algo.max_staleness=3")
-    trainer = _Trainer(
-        Training(config, config.algo, point_mass(), agents=(1,)),
-        Board(None, None, ()),
-        _Arrivals([10, 2, 2, 2]),
-        SoloReducer(1),
-        ChildLink(0, RunPaths(tmp_path), None, None),
-    )
-    trainer._version = 10
+    trainer = _trainer(tmp_path, [10, 2, 2, 2])
     batch, waited_s = trainer._receive()
     mine = trainer._meet(batch, waited_s)
     assert (trainer._weights_of(batch) * trainer._scale(mine)).tolist() == [4, 0, 0, 0]

@@ -13,19 +13,19 @@ import pytest
 from rich.console import Console
 from supervision import gpu, machine
 
-from gmijax.cli import compose
+from gmijax.autotune import tuner
+from gmijax.autotune.async_profile import FEWEST_LINES, Enough, measured_of, window_start
+from gmijax.autotune.async_workload import A3cWorkload, balance, per_gpu, throughput
+from gmijax.autotune.grid import Measured, Point
+from gmijax.autotune.tuner import with_auto_decided
+from gmijax.autotune.workloads import Split, Workload
+from gmijax.cli.compose import compose
 from gmijax.config import TrainConfig
-from gmijax.control import auto, searching
-from gmijax.control.async_profile import FEWEST_LINES, Enough, measured_of, window_start
-from gmijax.control.async_search import decoupled_training
-from gmijax.control.decoupled import plan_decoupled
-from gmijax.control.profiling import plan_at, store_key
-from gmijax.control.workload import Workload
+from gmijax.control import searching
 from gmijax.errors import ConfigError
-from gmijax.partition.balance import Split
-from gmijax.partition.gmi_process import GmiStatus
-from gmijax.partition.points import Measured, Point
-from gmijax.rundir import RunPaths
+from gmijax.runs.folder import RunPaths
+from gmijax.supervise.gmi_process import GmiStatus
+from gmijax.supervise.kinds import training_plan
 
 GRID = (
     *("search.gmis_per_gpu=[2,1]", "search.num_envs=[64,128]", "search.order=as_printed"),
@@ -103,7 +103,7 @@ def test_lines_hold_something_that_agents_made():
 def test_a_profile_is_read_when_channels_had_filled(tmp_path: Path):
     config = wanted("search.iterations=2")
     run = RunPaths(tmp_path)
-    plan = plan_decoupled(compose("algo=a3c", "plan.serving_gmis_per_gpu=2"), 64, machine(0))
+    plan = training_plan(compose("algo=a3c", "plan.serving_gmis_per_gpu=2"), machine(0))
     is_enough = Enough(config, plan, run)
     told: list[str] = []
 
@@ -127,8 +127,8 @@ def test_a_profile_is_read_when_channels_had_filled(tmp_path: Path):
 
 
 def layout_of(*overrides: str) -> str:
-    workload = decoupled_training(wanted(*overrides))
-    plan = plan_at(workload, Point(2, 64, "jax", 1), "corun", machine(0))
+    workload = A3cWorkload(wanted(*overrides))
+    plan = workload.plan_at(Point(2, 64, "jax", 1), "corun", machine(0))
     assert plan.num_envs_per_gmi == 64
     return f"{plan.layout} {plan.roles.count('trainer')}"
 
@@ -148,11 +148,11 @@ def test_one_gpu_of_each_kind_is_profiled(overrides: tuple[str, ...], layout: st
 
 
 def test_profiled_are_gpus_of_the_job():
-    workload = decoupled_training(wanted("plan.serving_gpus=[2,3]", "plan.training_gpus=[1]"))
-    plan = plan_at(workload, Point(1, 64, "jax", 2), "corun", machine(4))
+    workload = A3cWorkload(wanted("plan.serving_gpus=[2,3]", "plan.training_gpus=[1]"))
+    plan = workload.plan_at(Point(1, 64, "jax", 2), "corun", machine(4))
     used = {share.device: role for share, role in zip(plan.slices, plan.roles, strict=True)}
     assert used == {gpu(1).uuid: "trainer", gpu(2).uuid: "simulator+agent"}
-    assert workload.num_gpus == 3
+    assert workload.plan.num_gpus == 3
 
 
 ONE = Measured(50.0, 100.0, 0.1, 0.0, acting_per_s=100.0, learning_per_s=300.0)
@@ -172,20 +172,20 @@ ONE = Measured(50.0, 100.0, 0.1, 0.0, acting_per_s=100.0, learning_per_s=300.0)
     ],
 )
 def test_the_projection(overrides: tuple[str, ...], projected: float, split: Split | None):
-    workload = decoupled_training(wanted(*overrides))
+    workload = A3cWorkload(wanted(*overrides))
     assert workload.projected(Point(2, 64, "jax", 1), ONE) == pytest.approx(projected)
     assert workload.split(ONE) == split
 
 
 def test_waits_on_both_sides_are_in_the_projection():
-    workload = decoupled_training(wanted("plan.gpus=4"))
+    workload = A3cWorkload(wanted("plan.gpus=4"))
     half = ONE._replace(env_steps_per_s=25.0)
     assert workload.projected(Point(2, 64, "jax", 1), half) == pytest.approx(150.0)
 
 
 def test_placements_are_kept_apart_in_the_store():
     def key(*overrides: str) -> dict[str, Any]:
-        return store_key(decoupled_training(wanted(*overrides)), machine(0))
+        return A3cWorkload(wanted(*overrides)).store_key(machine(0))
 
     assert key() != key("plan.gpus=2")
     assert key("plan.gpus=2") == key("plan.serving_gpus=3", "plan.training_gpus=1")
@@ -207,18 +207,20 @@ def asked(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> list[Point]:
     monkeypatch.chdir(tmp_path)
     points: list[Point] = []
 
-    def profile(workload: Workload, point: Point, *_: Any, **__: Any) -> Measured:
+    def profile(workload: Workload[Any], point: Point, *_: Any, **__: Any) -> Measured:
         assert workload.kind.module == "gmijax.workers.async_worker"
         points.append(point)
         return formula(point)
 
-    monkeypatch.setattr(searching, "profile", profile)
+    monkeypatch.setattr(tuner, "profile", profile)
     return points
 
 
 def decided(*overrides: str) -> tuple[TrainConfig, str, str]:
     said = io.StringIO()
-    config, (reason,) = auto.decided(wanted(*overrides), machine(0), Console(file=said, width=400))
+    config, (reason,) = with_auto_decided(
+        wanted(*overrides), machine(0), Console(file=said, width=400)
+    )
     return config, reason, said.getvalue()
 
 
@@ -233,7 +235,7 @@ def test_a_job_on_one_gpu_gets_numbers_of_gmis(asked: list[Point]):
     )
     assert "2.00 times the best with one serving GMI, 1 + 1 x 128, jax" in reason
     assert "2 + 1 x 64, jax (corun): 1,280 env steps/s, agents could make 1,280" in said
-    plan_decoupled(config, config.envs_per_gmi, machine(0))  # It can be run.
+    training_plan(config, machine(0))  # It can be run.
 
 
 def test_a_job_on_several_gpus_gets_their_division_too(asked: list[Point]):
@@ -248,7 +250,7 @@ def test_a_job_on_several_gpus_gets_their_division_too(asked: list[Point]):
     report = json.loads(next(Path("runs").glob("*/search.json")).read_text())
     best = report["best"]
     assert (best["trainers"], best["serving_gpus"], best["training_gpus"]) == (1, 2, 2)
-    assert str(plan_decoupled(config, 128, machine(0)).layout) == "[[2,3],[4,5],[0],[1]]"
+    assert str(training_plan(config, machine(0)).layout) == "[[2,3],[4,5],[0],[1]]"
 
 
 def test_what_is_given_is_kept(asked: list[Point]):
@@ -297,9 +299,56 @@ def test_bad_input_starts_nothing(overrides: tuple[str, ...], message: str, aske
 
 def test_the_profile_of_a_trained_job_is_the_job_without_its_end():
     config = wanted("run.checkpoint_every=7", "plan.gpus=4")
-    short: Callable[[Point, int], TrainConfig] = decoupled_training(config).config_at
+    short: Callable[[Point, int], TrainConfig] = A3cWorkload(config).config_at
     profiled = short(Point(2, 128, "jax", 1), 3)
     assert (profiled.num_envs, profiled.run.checkpoint_every) == (128, 0)
     assert profiled.num_timesteps > 10**12
     with pytest.raises(ConfigError, match=r"algo\.num_minibatches=4"):
         short(Point(2, 130, "jax", 1), 3)
+
+
+@pytest.mark.parametrize(
+    ("num_gpus", "acting_per_s", "learning_per_s", "split"),
+    [
+        (2, 1.0, 100.0, (1, 1)),  # There must be one of each, whatever they can do.
+        (2, 100.0, 1.0, (1, 1)),
+        (4, 1.0, 3.0, (3, 1)),
+        (4, 3.0, 1.0, (1, 3)),
+        (4, 1.0, 1.0, (2, 2)),
+        (8, 1.0, 3.0, (6, 2)),
+        (8, 1.0, 7.0, (7, 1)),
+        (8, 1.0, 100.0, (7, 1)),
+        (3, 2.0, 2.0, (2, 1)),  # As good as (1, 2), with fewer training GPUs.
+    ],
+)
+def test_the_split_with_the_highest_throughput(num_gpus, acting_per_s, learning_per_s, split):
+    assert balance(num_gpus, acting_per_s, learning_per_s) == split
+
+
+def test_nobody_learns_from_what_was_not_made():
+    assert throughput(Split(2, 1), 10.0, 30.0) == 20.0
+    assert throughput(Split(2, 1), 10.0, 15.0) == 15.0
+
+
+def test_no_other_split_is_better():
+    for num_gpus in range(2, 10):
+        for acting_per_s in (1.0, 2.5, 40.0):
+            for learning_per_s in (1.5, 4.0):
+                found = balance(num_gpus, acting_per_s, learning_per_s)
+                assert found.serving + found.training == num_gpus
+                rate = throughput(found, acting_per_s, learning_per_s)
+                # No better than what GPUs in any proportion could do.
+                assert rate <= num_gpus * per_gpu(acting_per_s, learning_per_s) * (1 + 1e-9)
+                for training in range(1, num_gpus):
+                    other = Split(num_gpus - training, training)
+                    assert throughput(other, acting_per_s, learning_per_s) <= rate
+
+
+def test_per_gpu_is_what_a_balanced_job_makes():
+    # 3 of 4 GPUs act: 3 x 1 = 1 x 3.
+    assert 4 * per_gpu(1.0, 3.0) == pytest.approx(throughput(Split(3, 1), 1.0, 3.0))
+
+
+def test_one_gpu_cannot_be_split():
+    with pytest.raises(ValueError, match="num_gpus=1"):
+        balance(1, 1.0, 1.0)

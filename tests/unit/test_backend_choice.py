@@ -11,8 +11,8 @@ from fake_nvml import A100_SEVEN, H200_MIG_EMPTY, H200_MIG_OFF, V100, Board
 from supervision import plan_config, reduce_config
 
 from gmijax.errors import BackendUnavailable
-from gmijax.partition.machine import Machine
-from gmijax.partition.nvidia import list_gpus
+from gmijax.machine.nvidia import list_gpus
+from gmijax.machine.snapshot import Machine
 from gmijax.partition.plan import Plan
 from gmijax.partition.planner import make_plan
 
@@ -34,7 +34,7 @@ def planned(
     return make_plan(config, reduce_config(), 64, here, **(make or {}))
 
 
-SERVE = {"purpose": "serve"}
+SERVE = {"template": "tcg"}
 
 
 @pytest.mark.parametrize(
@@ -44,7 +44,6 @@ SERVE = {"purpose": "serve"}
         ((H200_MIG_OFF,), MPS, SERVE, "mps", "no MIG instances to keep them apart"),
         ((H200_MIG_OFF, A100_SEVEN), MPS, {}, "mps", "and can exchange gradients"),
         ((H200_MIG_OFF, A100_SEVEN), MPS, SERVE, "mig", "serving needs no exchange"),
-        ((H200_MIG_OFF, A100_SEVEN), MPS, {"template": "tcg"}, "mig", "serving needs no exchange"),
         ((A100_SEVEN,), MPS, {}, "mig", "in MIG mode; MPS on a whole GPU would"),
         ((V100,), MPS, SERVE, "mps", "compute capability 7.0 has no MIG"),
         ((P100,), MPS, {}, "share", "warning: MPS of a GPU of compute capability 6.0"),
@@ -83,6 +82,7 @@ def test_mig_serves_on_the_gpus_that_have_instances(monkeypatch: pytest.MonkeyPa
 def test_one_serving_gmi_takes_a_whole_gpu(monkeypatch: pytest.MonkeyPatch):
     plan = planned(monkeypatch, (A100_SEVEN, H200_MIG_OFF), make=SERVE, gmis_per_gpu=1)
     assert (plan.backend, plan.slices[0].device) == ("share", "GPU-1-uuid")
+    assert "nothing to share" in plan.reasons[0]
 
 
 @pytest.mark.parametrize(

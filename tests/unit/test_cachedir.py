@@ -9,12 +9,11 @@ from pathlib import Path
 import pytest
 from supervision import plan_config, reduce_config
 
-from gmijax.cachedir import cache_folder, why_temporary
-from gmijax.control.launcher import compilation_cache_dir
-from gmijax.control.profiles import default_folder
+from gmijax.autotune.store import default_folder
 from gmijax.errors import ConfigError
-from gmijax.partition.machine import detect_machine
+from gmijax.machine.snapshot import detect_machine
 from gmijax.partition.planner import make_plan
+from gmijax.runs.cache import cache_folder, compilation_cache_dir, why_temporary
 
 
 @pytest.fixture

@@ -8,18 +8,15 @@ from typing import Any
 import numpy as np
 import pytest
 
+from gmijax.collectives.channel.compressor import SAMPLES, START_BYTES, TransferSize
 from gmijax.collectives.channel.migrator import Migrator
-from gmijax.collectives.channel.transfer_size import SAMPLES, START_BYTES, TransferSize
 from gmijax.errors import GmijaxError, PeerLost, PipeClosed
 
 
-class FakeOutlet:
+class FakeWriter:
     """A way whose load the test sets."""
 
-    max_message_bytes = 1000
-    sent_items = 0
-
-    def __init__(self, peer: int, load: int, *, is_full: bool = False) -> None:
+    def __init__(self, peer: int, load: int = 0, *, is_full: bool = False) -> None:
         self.peer, self.load, self.is_full = peer, load, is_full
 
     def try_reserve(self, sizes: Sequence[int]) -> list[Any] | None:
@@ -30,28 +27,31 @@ class FakeOutlet:
 
 
 @pytest.mark.parametrize(
-    ("outlets", "gpu", "chosen"),
+    ("loads", "full", "near", "chosen"),
     [
-        ([FakeOutlet(1, 500), FakeOutlet(2, 100), FakeOutlet(3, 300)], 9, [2, 2]),
-        ([FakeOutlet(1, 500), FakeOutlet(2, 100), FakeOutlet(3, 300)], 1, [1, 1]),
-        ([FakeOutlet(1, 0), FakeOutlet(2, 100, is_full=True), FakeOutlet(3, 300)], 2, [None]),
-        ([FakeOutlet(1, 0, is_full=True), FakeOutlet(2, 100), FakeOutlet(3, 99)], 9, [3]),
-        ([FakeOutlet(1, 0), FakeOutlet(2, 0), FakeOutlet(3, 0)], 9, [1, 2, 3, 1]),
+        ((500, 100, 300), None, (), [2, 2]),
+        ((500, 100, 300), None, (1,), [1, 1]),
+        ((0, 100, 300), 2, (2,), [None]),
+        ((0, 100, 99), 1, (), [3]),
+        ((0, 0, 0), None, (), [1, 2, 3, 1]),
     ],
 )
 def test_same_gpu_first_then_the_least_load_then_in_turn(
-    outlets: list[Any], gpu: int, chosen: list[int | None]
+    loads: tuple[int, ...], full: int | None, near: tuple[int, ...], chosen: list[int | None]
 ) -> None:
-    migrator = Migrator(outlets, gpu, {1: 1, 2: 2, 3: 3})
+    writers: list[Any] = [
+        FakeWriter(peer, load, is_full=peer == full) for peer, load in enumerate(loads, start=1)
+    ]
+    migrator = Migrator(writers, near)
     opened = [migrator.try_open([10]) for _ in chosen]
     assert [None if found is None else found[0].peer for found in opened] == chosen
 
 
-class LostOutlet(FakeOutlet):
+class LostWriter(FakeWriter):
     """A way to a trainer that closed, or whose process is gone."""
 
     def __init__(self, peer: int, error: GmijaxError) -> None:
-        super().__init__(peer, 0)
+        super().__init__(peer)
         self.error = error
 
     def try_reserve(self, sizes: Sequence[int]) -> list[Any] | None:
@@ -64,14 +64,14 @@ class LostOutlet(FakeOutlet):
 
 
 def test_a_dead_trainer_is_named_before_one_that_has_left_because_of_it() -> None:
-    left, dead = LostOutlet(1, PipeClosed(0, 1, "send")), LostOutlet(2, PeerLost(0, 2, "send", 5))
-    migrator = Migrator([left, dead], 9, {1: 1, 2: 2})
+    left: Any = LostWriter(1, PipeClosed(0, 1, "send"))
+    dead: Any = LostWriter(2, PeerLost(0, 2, "send", 5))
+    migrator = Migrator([left, dead], ())
     with pytest.raises(PeerLost, match="peer 2 is gone"):
         migrator.try_open([10])
     assert migrator.why_lost() is dead.error
-    alone = Migrator([left], 9, {1: 1})
     with pytest.raises(PipeClosed):
-        alone.try_open([10])
+        Migrator([left], ()).try_open([10])
 
 
 def test_the_size_of_transfers_grows_while_a_byte_gets_cheaper() -> None:

@@ -10,10 +10,10 @@ import jax.numpy as jnp
 import orbax.checkpoint as ocp
 import pytest
 
-from gmijax.checkpoint import finish_checkpoint, restore_learner
 from gmijax.errors import ConfigError
-from gmijax.resume import CheckpointMeta, newest_checkpoint
-from gmijax.rundir import RunPaths
+from gmijax.learning.checkpoint import finish_checkpoint, restore_learner
+from gmijax.runs.folder import RunPaths
+from gmijax.runs.resume import CheckpointMeta, newest_checkpoint
 
 
 def restore_with(error: Exception, monkeypatch: pytest.MonkeyPatch) -> None:

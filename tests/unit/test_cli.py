@@ -8,7 +8,8 @@ from pathlib import Path
 import pytest
 from command_lines import run
 
-from gmijax.cli import command, compose
+from gmijax.cli.command import command
+from gmijax.cli.compose import compose
 from gmijax.config import PlayConfig
 from gmijax.errors import ConfigError
 
@@ -39,7 +40,7 @@ def test_a_task_may_be_named_twice():
 
 
 def test_play_has_no_task_to_choose(capsys: pytest.CaptureFixture[str]):
-    assert command("play", PlayConfig, lambda _: 0, ["env.name=ant"]) == 2
+    assert command("play", PlayConfig, lambda _, **__: None, ["env.name=ant"]) == 2
     assert "unknown key env" in capsys.readouterr().err
 
 

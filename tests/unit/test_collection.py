@@ -6,6 +6,7 @@ import json
 import math
 from functools import partial
 from pathlib import Path
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -13,59 +14,65 @@ import numpy as np
 import pytest
 from toy_env import point_mass
 
-from gmijax.collection.policy import ActingPolicy, _gaussian, random_policy
+import gmijax
 from gmijax.collection.programs import (
+    ActingPolicy,
+    Counts,
     Keep,
     Step,
+    _gaussian,
     infer,
     next_keys,
     no_counts,
+    random_policy,
     simulate,
     unroll,
 )
-from gmijax.collection.shards import ShardWriter
-from gmijax.collection.tally import Tally
-from gmijax.config import PpoConfig
-from gmijax.datadir import DataPaths
+from gmijax.collection.recording import CollectionStats, ShardWriter
 from gmijax.errors import NonFiniteError
-from gmijax.learner import Learner, init_learner, make_learner
-from gmijax.normalize import no_samples
-from gmijax.partition.child import ChildLink
-from gmijax.physics_health import TOLERATED_STEPS
-from gmijax.rundir import RunPaths
-from gmijax.sim.wrappers import env_keys
+from gmijax.learning.learner import Learner, init_learner, make_learner
+from gmijax.learning.normalize import no_samples
+from gmijax.learning.physics_health import TOLERATED_STEPS
+from gmijax.runs.dataset import DataPaths
+from gmijax.runs.folder import RunPaths
+from gmijax.sim.wrappers import BatchedEnv, env_keys
+from gmijax.supervise.child import ChildLink
 
 N, T = 6, 30
 ALL = Keep(steps=True, next_obs=True)
 
 
-def learner_of(env, algo: PpoConfig) -> Learner:
-    return make_learner(env.spec, algo)
+class Unrolled(NamedTuple):
+    """An unroll of a sampling policy, computed once for all tests."""
+
+    env: BatchedEnv
+    learner: Learner
+    policy: ActingPolicy
+    steps: Step
+    counts: Counts
 
 
-def gaussian(env, algo: PpoConfig, *, deterministic: bool) -> ActingPolicy:
-    learner = learner_of(env, algo)
-    state = init_learner(learner, env.spec.obs_size, jax.random.key(3))
-    weights = state.params, no_samples((env.spec.obs_size,))
-    return ActingPolicy(_gaussian(learner, env.spec.action_size, deterministic), weights, "x")
-
-
-@pytest.fixture
-def algo() -> PpoConfig:
-    import gmijax
-
-    return gmijax.compose("algo.policy_hidden_layer_sizes=[4]").algo  # type: ignore[return-value]
+@pytest.fixture(scope="module")
+def unrolled() -> Unrolled:
+    algo = gmijax.compose("algo.policy_hidden_layer_sizes=[4]").algo
+    env = point_mass(episode_length=8)
+    learner, size = make_learner(env.spec, algo), env.spec.obs_size
+    state = jax.jit(lambda key: init_learner(learner, size, key))(jax.random.key(3))
+    choose = _gaussian(learner, env.spec.action_size, deterministic=False)
+    policy = ActingPolicy(choose, (state.params, no_samples((size,))), "x")
+    program = jax.jit(partial(unroll, env, policy, T, ALL))
+    _, steps, counts = program(env.model, policy.weights, start(env))
+    assert steps is not None
+    return Unrolled(env, learner, policy, steps, counts)
 
 
 def start(env):
     return jax.jit(env.init)(env.model, env_keys(jax.random.key(0), 0, N))
 
 
-def test_an_unroll_keeps_what_happened(algo: PpoConfig):
-    env = point_mass(episode_length=8)
-    policy = gaussian(env, algo, deterministic=False)
-    program = jax.jit(partial(unroll, env, policy, T, ALL))
-    _, steps, counts = program(env.model, policy.weights, start(env))
+def test_an_unroll_keeps_what_happened(unrolled: Unrolled):
+    _, learner, policy, steps, counts = unrolled
+    assert steps.next_obs is not None
     ended = np.asarray(steps.terminated | steps.truncated)
     assert ended.any()
     assert counts.episodes.count == ended.sum()
@@ -74,19 +81,15 @@ def test_an_unroll_keeps_what_happened(algo: PpoConfig):
     same = (np.asarray(steps.next_obs)[:-1] == np.asarray(steps.obs)[1:]).all(-1)
     np.testing.assert_array_equal(same, ~ended[:-1])
     params = policy.weights[0]
-    mean = learner_of(env, algo).networks.action_mean(params, steps.obs)
+    mean = learner.networks.action_mean(params, steps.obs)
     std = np.exp(np.asarray(params.log_std))
     z = (np.asarray(steps.action) - np.asarray(mean)) / std
     density = np.exp(-0.5 * z**2) / (std * math.sqrt(2 * math.pi))
     np.testing.assert_allclose(steps.log_prob, np.log(density.prod(-1)), rtol=1e-4, atol=1e-5)
 
 
-def test_halves_of_steps_make_the_same_experience_as_an_unroll(algo: PpoConfig):
-    env = point_mass(episode_length=8)
-    policy = gaussian(env, algo, deterministic=False)
-    _, whole, counts = jax.jit(partial(unroll, env, policy, T, ALL))(
-        env.model, policy.weights, start(env)
-    )
+def test_halves_of_steps_make_the_same_experience_as_an_unroll(unrolled: Unrolled):
+    env, _, policy, whole, counts = unrolled
     state, bits = next_keys(start(env))
     total, kept = no_counts(env), []
     half_a, half_s = jax.jit(partial(infer, policy)), jax.jit(partial(simulate, env, ALL))
@@ -110,12 +113,11 @@ def test_random_actions_fill_their_range_with_even_density():
     np.testing.assert_allclose(density, math.log(1 / 2**3), rtol=1e-6)
 
 
-def test_a_deterministic_policy_acts_with_its_mean(algo: PpoConfig):
-    env = point_mass()
-    policy = gaussian(env, algo, deterministic=True)
-    obs = jnp.ones((N, 2))
-    first, density = policy.choose(policy.weights, obs, env_keys(jax.random.key(1), 0, N))
-    second, _ = policy.choose(policy.weights, obs, env_keys(jax.random.key(2), 0, N))
+def test_a_deterministic_policy_acts_with_its_mean(unrolled: Unrolled):
+    choose = _gaussian(unrolled.learner, unrolled.env.spec.action_size, deterministic=True)
+    obs, weights = jnp.ones((N, 2)), unrolled.policy.weights
+    first, density = choose(weights, obs, env_keys(jax.random.key(1), 0, N))
+    second, _ = choose(weights, obs, env_keys(jax.random.key(2), 0, N))
     np.testing.assert_array_equal(first, second)
     assert not np.asarray(density).any()
 
@@ -147,32 +149,32 @@ def test_shards_are_whole_and_say_what_they_are(compress: bool, tmp_path: Path):
     assert about[0]["env_steps"] == T * N
 
 
-def tally_of(folder: Path) -> Tally:
+def stats_of(folder: Path) -> CollectionStats:
     link = ChildLink(0, RunPaths(folder), None, None)
     link.paths.root.mkdir(parents=True)
-    return Tally(link, "point_mass", N * T)
+    return CollectionStats(link, "point_mass", N * T)
 
 
 def test_too_many_bad_worlds_end_serving_and_the_term_is_named(tmp_path: Path):
-    tally, counts = tally_of(tmp_path), no_counts(point_mass())
+    stats, counts = stats_of(tmp_path), no_counts(point_mass())
     few = {"any": jnp.asarray(TOLERATED_STEPS), "reward/near": jnp.asarray(TOLERATED_STEPS)}
-    tally.add(counts._replace(diverged=counts.diverged | few))
-    assert tally.outcome()["diverged_steps"] == TOLERATED_STEPS
+    stats.add(counts._replace(diverged=counts.diverged | few))
+    assert stats.outcome()["diverged_steps"] == TOLERATED_STEPS
     many = {name: count + 1 for name, count in few.items()}
     message = r"up to env step 360 of this GMI: 11 of 180 steps .*, in reward/near$"
     with pytest.raises(NonFiniteError, match=message):
-        tally.add(counts._replace(diverged=counts.diverged | many))
-    tally.close()
+        stats.add(counts._replace(diverged=counts.diverged | many))
+    stats.close()
 
 
 def test_full_buffers_are_counted_and_the_first_is_told(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ):
-    tally, counts = tally_of(tmp_path), no_counts(point_mass())
+    stats, counts = stats_of(tmp_path), no_counts(point_mass())
     for count in (0, 5, 7):
-        tally.add(counts._replace(overflowed={"contact": jnp.asarray(count)}))
-    tally.close()
-    assert tally.outcome()["overflow_steps"] == {"contact": 12.0}
+        stats.add(counts._replace(overflowed={"contact": jnp.asarray(count)}))
+    stats.close()
+    assert stats.outcome()["overflow_steps"] == {"contact": 12.0}
     assert len(capsys.readouterr().err.splitlines()) == 1
     lines = RunPaths(tmp_path).gmi(0).metrics.read_text().splitlines()
     key = "physics/contact_overflow_steps"

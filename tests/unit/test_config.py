@@ -8,11 +8,11 @@ from typing import Any
 import jax.numpy as jnp
 import pytest
 
-from gmijax.cli import compose
+from gmijax.cli.compose import compose
 from gmijax.config import ADAPTIVE_LEARNING_RATE_RANGE, TrainConfig
+from gmijax.config.schema import from_dict, to_dict
 from gmijax.errors import ConfigError
-from gmijax.learner import adapted_learning_rate
-from gmijax.schema import from_dict, to_dict
+from gmijax.learning.learner import adapted_learning_rate
 from gmijax.sim.registry import task_names
 
 

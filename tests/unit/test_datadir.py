@@ -6,9 +6,9 @@ from pathlib import Path
 
 import pytest
 
-from gmijax.datadir import DataPaths, open_dataset
 from gmijax.errors import ConfigError
-from gmijax.rundir import locked, write_json
+from gmijax.runs.dataset import DataPaths, open_dataset
+from gmijax.runs.folder import locked, write_json
 
 
 def make_shard(paths: DataPaths, rank: int, index: int) -> None:

@@ -1,35 +1,28 @@
-"""Worlds with bad numbers are ended, counted, and do no harm."""
+"""Worlds with bad numbers or full buffers are counted, and those with bad numbers are ended."""
 
 from __future__ import annotations
 
-import threading
-import time
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-import pytest
-from toy_env import metrics_from, point_mass
+from toy_env import point_mass, point_mass_env
 
-from gmijax.errors import NonFiniteError
-from gmijax.metrics import Line, MetricsLog
-from gmijax.physics_health import TOLERATED_STEPS
-from gmijax.ppo.programs import IterationMetrics
-from gmijax.ppo.report import Reporter, ReportThread
-from gmijax.ppo.rollout import stats_example
-from gmijax.sim.wrappers import env_keys
+from gmijax.sim.wrappers import env_keys, training_env
 
 ENV = point_mass()
 N = 4
+INIT, STEP = jax.jit(ENV.init), jax.jit(ENV.step)
 
 
 def _step_from(x: list[float]):
-    state = jax.jit(ENV.init)(ENV.model, env_keys(jax.random.key(0), 0, N))
+    state = INIT(ENV.model, env_keys(jax.random.key(0), 0, N))
     position, velocity = jnp.asarray(x), state.env.physics[1]
     state = state._replace(
         env=state.env._replace(physics=(position, velocity), obs=jnp.ones((N, 2)))
     )
-    return jax.jit(ENV.step)(ENV.model, state, jnp.zeros((N, 1)))
+    return STEP(ENV.model, state, jnp.zeros((N, 1)))
 
 
 def test_a_bad_world_ends_with_its_last_good_observation_and_no_reward() -> None:
@@ -59,61 +52,15 @@ def test_a_bad_world_starts_over_and_the_others_go_on() -> None:
     assert np.isfinite(state.env.obs).all()
 
 
-@pytest.mark.parametrize("count", [TOLERATED_STEPS, TOLERATED_STEPS + 1])
-def test_few_bad_steps_are_tolerated_and_many_are_named(count: int) -> None:
-    stats = stats_example(ENV.spec)
-    stats = stats._replace(
-        diverged=stats.diverged | {"any": jnp.asarray(count), "reward/near": jnp.asarray(count)}
-    )
-    metrics = metrics_from(stats)
-    reporter = Reporter("point_mass", MetricsLog(()), 0)
-    if count <= TOLERATED_STEPS:
-        reporter.report(64, metrics, {})
-    else:
-        with pytest.raises(NonFiniteError, match=r"point_mass, up to env step 64: .* reward/near"):
-            reporter.report(64, metrics, {})
+def test_worlds_that_met_a_full_buffer_are_counted_by_buffer() -> None:
+    def overflow(state: Any) -> jax.Array:
+        return jnp.stack([jnp.ones((), bool), state.obs[0] > 0.0])
 
-
-def _metrics(bad_steps: int) -> IterationMetrics:
-    stats = stats_example(ENV.spec)
-    stats = stats._replace(diverged=stats.diverged | {"any": jnp.asarray(bad_steps)})
-    return metrics_from(stats)
-
-
-def test_lines_come_in_order_from_a_thread_of_their_own_and_errors_with_the_next_call() -> None:
-    written: list[Line] = []
-
-    class Sink:
-        def write(self, line: Line) -> None:
-            written.append(line)
-
-        def close(self) -> None:
-            pass
-
-    lines = ReportThread(Reporter("point_mass", MetricsLog((Sink(),)), 0))
-    for iteration in (1, 2, 3):
-        lines.report(64 * iteration, _metrics(0), {})
-    lines.wait()
-    assert [line["env_steps"] for line in written] == [64, 128, 192]
-    lines.report(256, _metrics(TOLERATED_STEPS + 1), {})
-    with pytest.raises(NonFiniteError, match="up to env step 256"):
-        lines.report(320, _metrics(0), {})
-    lines.stop()
-    assert len(written) == 3
-
-
-def test_a_line_that_cannot_come_is_not_waited_for() -> None:
-    is_there = threading.Event()
-
-    class Pending:
-        def __array__(self, dtype=None, copy=None):
-            is_there.wait(30)
-            return np.zeros(())
-
-    lines = ReportThread(Reporter("point_mass", MetricsLog(()), 0))
-    lines.report(64, _metrics(0)._replace(noise_std=Pending()), {})
-    lines.give_up()
-    started = time.monotonic()
-    lines.stop()
-    assert time.monotonic() - started < 1.5  # It waits 2 s for one that may come.
-    is_there.set()
+    env = training_env(point_mass_env()._replace(overflow=overflow))
+    state = env.init(env.model, env_keys(jax.random.key(0), 0, N))
+    _, out = env.step(env.model, state, jnp.zeros((N, 1)))
+    counts = {name: int(count) for name, count in out.overflowed.items()}
+    assert counts == {"contact": N, "constraint": int((out.next_obs[:, 0] > 0.0).sum())}
+    assert 0 < counts["constraint"] < N
+    # Without such buffers there is nothing to count.
+    assert _step_from([0.0] * N)[1].overflowed == {}

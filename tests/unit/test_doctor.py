@@ -14,12 +14,12 @@ from fake_nvml import A100_SEVEN, H200_MIG_EMPTY, H200_MIG_OFF, Board
 from rich.console import Console
 
 from gmijax import doctor
-from gmijax.control import sight
+from gmijax.control import system_info
 from gmijax.control.diagnosis import Diagnosis, diagnose
-from gmijax.control.sight import REQUIRED, JaxView, Sight, ask_jax, try_mps
-from gmijax.partition import nvidia
-from gmijax.partition.machine import Machine
-from gmijax.partition.nvidia import list_gpus, nvml_problem
+from gmijax.control.system_info import REQUIRED, JaxView, SystemInfo, ask_jax, try_mps
+from gmijax.machine import nvidia
+from gmijax.machine.nvidia import list_gpus, nvml_problem
+from gmijax.machine.snapshot import Machine
 
 MPS = Path("/usr/bin/nvidia-cuda-mps-control")
 INSTALLED = dict.fromkeys(REQUIRED, "1.0") | dict.fromkeys(
@@ -35,8 +35,8 @@ def machine_of(
     return Machine(list_gpus(), (0, 1), control, "580.159.03" if boards else None)
 
 
-def seen(machine: Machine, jax: JaxView = ONE_H200, **changes: object) -> Sight:
-    return Sight(machine, jax, INSTALLED)._replace(**changes)
+def seen(machine: Machine, jax: JaxView = ONE_H200, **changes: object) -> SystemInfo:
+    return SystemInfo(machine, jax, INSTALLED)._replace(**changes)
 
 
 def ability(found: Diagnosis, kind: str, name: str) -> tuple[bool, str]:
@@ -140,7 +140,7 @@ def test_jax_is_asked_as_a_gmi_would_be_started(monkeypatch: pytest.MonkeyPatch)
         asked.append(env)
         return subprocess.CompletedProcess(command, 0, '{"platform": "gpu", "devices": ["x"]}', "")
 
-    monkeypatch.setattr(sight.subprocess, "run", run)
+    monkeypatch.setattr(system_info.subprocess, "run", run)
     assert ask_jax(machine_of(monkeypatch, H200_MIG_OFF, H200_MIG_OFF)).devices == ("x",)
     ask_jax(machine_of(monkeypatch, A100_SEVEN))
     ask_jax(machine_of(monkeypatch))
@@ -156,7 +156,7 @@ def test_a_jax_that_fails_or_hangs_is_told(monkeypatch: pytest.MonkeyPatch, tmp_
     program = tmp_path / "python"
     program.write_text("#!/bin/sh\necho 'RuntimeError: no cuda' >&2; exit 1\n")
     program.chmod(0o755)
-    monkeypatch.setattr(sight.sys, "executable", str(program))
+    monkeypatch.setattr(system_info.sys, "executable", str(program))
     assert ask_jax(machine_of(monkeypatch)) == JaxView(None, error="RuntimeError: no cuda")
     program.write_text("#!/bin/sh\nexec sleep 60\n")
     assert ask_jax(machine_of(monkeypatch), 0.2).error == "no answer within 0.2 s"

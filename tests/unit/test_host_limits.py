@@ -10,13 +10,13 @@ import pytest
 from supervision import gpu, machine, plan_config, reduce_config
 
 import gmijax
-from gmijax.control.decoupled import plan_decoupled
 from gmijax.errors import ConfigError
-from gmijax.partition import host_limits
-from gmijax.partition.host_limits import CgroupLimits, Host, detect_host, usable_cores
-from gmijax.partition.machine import Machine, detect_machine
+from gmijax.machine import host_limits
+from gmijax.machine.host_limits import CgroupLimits, Host, detect_host, usable_cores
+from gmijax.machine.snapshot import Machine, detect_machine
 from gmijax.partition.plan import Plan
 from gmijax.partition.planner import make_plan
+from gmijax.supervise.kinds import training_plan
 
 SMALL = Host(memory_mib=24 * 1024, threads=30_000, open_files=20_000)
 
@@ -59,7 +59,7 @@ def test_every_way_to_ask_for_too_many_is_refused(changes: dict[str, Any], what:
 def test_too_many_agents_or_trainers_are_refused(side: str):
     config = gmijax.compose("env=ant", "algo=a3c", f"plan.{side}_gmis_per_gpu=1000")
     with pytest.raises(ConfigError, match=r"plan\.serving_gmis_per_gpu=.*allowed are at most 32$"):
-        plan_decoupled(config, 8, two_cores())
+        training_plan(config, two_cores())
 
 
 def test_what_there_is_room_for_is_planned():
@@ -99,7 +99,7 @@ def test_beside_gpus_memory_counts_and_cores_do_not():
 
 def test_roles_are_refused_too(monkeypatch: pytest.MonkeyPatch, tmp_path: Path):
     fits = gmijax.plan(gmis_per_gpu=2, backend="cpu")
-    monkeypatch.setattr("gmijax.roles.planning.detect_machine", two_cores)
+    monkeypatch.setattr("gmijax.roles.manager.detect_machine", two_cores)
     with pytest.raises(ConfigError, match=r"^plan\.gmis_per_gpu=1000: 1000 GMIs"):
         gmijax.plan(gmis_per_gpu=1000)
     monkeypatch.chdir(tmp_path)

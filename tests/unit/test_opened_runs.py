@@ -12,13 +12,14 @@ from typing import Any
 import pytest
 
 import gmijax
-from gmijax.cli import _build, command
+from gmijax.cli.command import command
+from gmijax.cli.compose import build
 from gmijax.config import PlayConfig
-from gmijax.control import evaluation, restarts, serving
+from gmijax.config.schema import to_dict
+from gmijax.control import evaluation, job, restarts, serving
 from gmijax.errors import ConfigError
-from gmijax.resume import CheckpointMeta
-from gmijax.rundir import META, RunPaths, read_json, write_json
-from gmijax.schema import to_dict
+from gmijax.runs.folder import META, RunPaths, read_json, write_json
+from gmijax.runs.resume import CheckpointMeta
 from gmijax.sim import source
 from gmijax.sim.adapters import custom
 from gmijax.sim.registry import make_env
@@ -58,10 +59,10 @@ def starts(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def opened(kind: str, *overrides: str) -> Any:
     if kind == "play":
-        return evaluation.play(_build("play", PlayConfig, ("run.dir=theirs", *overrides)))
+        return evaluation.play(build("play", PlayConfig, ("run.dir=theirs", *overrides)))
     if kind == "serve":
         return serving.serve(gmijax.compose("run.dir=theirs", *overrides, command="serve"))
-    return gmijax.train(gmijax.compose("run.resume=theirs", *overrides))
+    return job.train(gmijax.compose("run.resume=theirs", *overrides))
 
 
 KINDS = pytest.mark.parametrize("kind", ["play", "serve", "resume"])
@@ -101,11 +102,7 @@ def test_an_equal_file_is_the_runs(kind: str, run: RunPaths, starts: None):
 
 
 def test_play_says_it_in_one_line(run: RunPaths, capsys: pytest.CaptureFixture[str]):
-    def play(config: PlayConfig) -> int:
-        evaluation.play(config)
-        return 0
-
-    assert command("play", PlayConfig, play, ["run.dir=theirs"]) == 2
+    assert command("play", PlayConfig, evaluation.play, ["run.dir=theirs"]) == 2
     assert len(capsys.readouterr().err.splitlines()) == 1
 
 

@@ -2,21 +2,23 @@
 
 from __future__ import annotations
 
+import io
 import os
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import pytest
+from rich.console import Console
 from supervision import CHECKOUT
 
-from gmijax.control.output import open_console
-from gmijax.control.program_cache import drop_broken_programs
-from gmijax.control.progress import ConsoleProgress
-from gmijax.partition.gmi_process import GmiStatus
+from gmijax.control.console import ConsoleProgress, open_console
+from gmijax.runs.cache import drop_broken_programs
+from gmijax.supervise.gmi_process import GmiStatus
 
 PRINTS = """
-from gmijax.control.output import open_console
+from gmijax.control.console import open_console
 console = open_console(show=True)
 for number in range(200_000):
     console.print(f"line {number}")
@@ -46,11 +48,10 @@ def test_names_in_brackets_are_printed_as_they_are(capsys: pytest.CaptureFixture
 
 
 def test_a_display_that_fails_is_given_up(capsys: pytest.CaptureFixture[str]):
-    class Broken:
-        def latest(self) -> None:
-            raise RuntimeError("off")
+    def broken() -> None:
+        raise RuntimeError("off")
 
-    progress = ConsoleProgress(open_console(show=True), Broken(), 100)
+    progress = ConsoleProgress(open_console(show=True), broken, 100)
     for _ in range(2):
         progress.update((GmiStatus(0, "running", 1, 1, None),))
     assert capsys.readouterr().out == "no progress from here on: RuntimeError('off')\n"
@@ -67,3 +68,48 @@ def test_programs_that_could_not_be_read_are_removed(tmp_path: Path):
     )
     assert drop_broken_programs(cache, [log, tmp_path / "none"]) == 2
     assert [path.name for path in cache.iterdir()] == ["jit_step_two-0c-cache"]
+
+
+SYNC = {"env_steps": 500, "env_steps_per_s": 1234.5, "return": 7.25}
+EXPERIENCE = {
+    **{"async/pps": 2000.0, "async/ttop": 1500.0, "async/staleness_mean": 2.5},
+    **{"channel/occupancy": 0.25, "channel/bytes_per_s": 3e6, "channel/dropped": 4},
+}
+
+
+class Lines:
+    """A file of metrics with one line."""
+
+    def __init__(self, line: dict[str, Any]) -> None:
+        self._line: dict[str, Any] | None = line
+
+    def latest(self) -> dict[str, Any] | None:
+        line, self._line = self._line, None
+        return line
+
+
+def said_at_the_end(line: dict[str, Any]) -> str:
+    console = Console(file=io.StringIO(), width=300)
+    with ConsoleProgress(console, Lines(line).latest, 1000) as progress:
+        progress.update(())
+    assert isinstance(console.file, io.StringIO)
+    return console.file.getvalue().splitlines()[-1]
+
+
+def test_a_synchronous_job_tells_its_rate_and_return():
+    said = said_at_the_end(SYNC)
+    assert said.startswith("50 %  500 steps  1,234 steps/s  return 7.25")
+
+
+@pytest.mark.parametrize(
+    ("line", "part"),
+    [
+        (EXPERIENCE, "PPS 2,000  TTOP 1,500  staleness 2.5  channels 25% full, 3 MB/s, 4 dropped"),
+        (
+            {**EXPERIENCE, "async/staleness_mean": None, "channel/occupancy": None},
+            "staleness -  channels - full",
+        ),
+    ],
+)
+def test_an_asynchronous_job_tells_of_its_channels(line: dict[str, Any], part: str):
+    assert part in said_at_the_end({**SYNC, **line})

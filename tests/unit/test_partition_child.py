@@ -13,10 +13,10 @@ from pathlib import Path
 import pytest
 
 from gmijax.errors import CollectiveTimeout, ConfigError, GmiFailed, ReportedError
-from gmijax.partition.child import ChildLink
-from gmijax.partition.failures import describe_exit, first_cause, last_line
-from gmijax.partition.heartbeat import Heartbeat, HeartbeatBlock
-from gmijax.rundir import GmiPaths, RunPaths, read_json
+from gmijax.runs.folder import GmiPaths, RunPaths, read_json
+from gmijax.supervise.child import ChildLink
+from gmijax.supervise.failures import describe_exit, first_cause, last_line
+from gmijax.supervise.heartbeat import Heartbeat, HeartbeatBlock
 
 pytestmark = pytest.mark.timeout(20)
 
@@ -97,8 +97,8 @@ def test_lifeline_asks_for_a_stop(tmp_path: Path):
 def test_lifeline_ends_the_process_with_the_controller(tmp_path: Path):
     read_end, write_end = os.pipe()
     code = (
-        "import sys; from pathlib import Path; from gmijax.rundir import RunPaths;"
-        "from gmijax.partition.child import ChildLink;"
+        "import sys; from pathlib import Path; from gmijax.runs.folder import RunPaths;"
+        "from gmijax.supervise.child import ChildLink;"
         "ChildLink(0, RunPaths(Path('.')), int(sys.argv[1]), None)\nwhile True: pass"
     )
     child = subprocess.Popen([sys.executable, "-c", code, str(read_end)], pass_fds=(read_end,))

@@ -10,13 +10,13 @@ from typing import Any
 import pytest
 from supervision import gpu, machine, plan_config, reduce_config
 
-from gmijax.partition.backends import BACKENDS
-from gmijax.partition.backends.cpu import NO_FUSION_EMITTERS, cpu_environment
-from gmijax.partition.environment import extend_xla_flags, gmi_environment
-from gmijax.partition.nvidia import Gpu, MigInstance
+from gmijax.machine.nvidia import Gpu, MigInstance
+from gmijax.machine.processes import reserved_address
 from gmijax.partition.plan import Plan
 from gmijax.partition.planner import make_plan
-from gmijax.partition.rendezvous import reserved_address
+from gmijax.supervise.backends import BACKENDS
+from gmijax.supervise.backends.cpu import NO_FUSION_EMITTERS, cpu_environment
+from gmijax.supervise.environment import extend_xla_flags, gmi_environment
 
 GOLDEN = Path(__file__).parents[1] / "golden"
 INHERITED = {

@@ -14,11 +14,11 @@ import pytest
 from supervision import gpu, plan_config, reduce_config
 
 from gmijax.errors import BackendUnavailable
-from gmijax.partition import machine as machine_module
-from gmijax.partition import nvidia
-from gmijax.partition.machine import Machine, detect_machine, visible_gpus
-from gmijax.partition.mps_control import MpsControl, find_mps_control
-from gmijax.partition.nvidia import Gpu, driver_version, list_gpus
+from gmijax.machine import nvidia
+from gmijax.machine import snapshot as machine_module
+from gmijax.machine.mps_control import MpsControl, find_mps_control
+from gmijax.machine.nvidia import Gpu, driver_version, list_gpus
+from gmijax.machine.snapshot import Machine, detect_machine, visible_gpus
 from gmijax.partition.planner import make_plan
 
 THREE = (gpu(0), gpu(1), gpu(2))
@@ -97,7 +97,7 @@ def test_gpu_that_nvml_cannot_describe_is_left_out(monkeypatch: pytest.MonkeyPat
     monkeypatch.setattr(pynvml, "nvmlShutdown", lambda: None)
     monkeypatch.setattr(pynvml, "nvmlDeviceGetCount", lambda: 2)
     monkeypatch.setattr(pynvml, "nvmlSystemGetDriverVersion", lost)
-    monkeypatch.setattr("gmijax.partition.nvidia._describe", describe)
+    monkeypatch.setattr("gmijax.machine.nvidia._describe", describe)
     assert list_gpus() == (gpu(1),)
     assert driver_version() is None
     monkeypatch.setattr(pynvml, "nvmlDeviceGetCount", lost)

@@ -10,15 +10,15 @@ import pytest
 from supervision import plan_config, reduce_config
 
 from gmijax.errors import BackendUnavailable, ConfigError
-from gmijax.partition.backends import open_backend
-from gmijax.partition.environment import gmi_environment
-from gmijax.partition.machine import Machine, visible_gpus
-from gmijax.partition.mig_split import place_instances, split_commands
-from gmijax.partition.nvidia import Gpu, list_gpus
+from gmijax.machine.mig_split import place_instances, split_commands
+from gmijax.machine.nvidia import Gpu, list_gpus
+from gmijax.machine.snapshot import Machine, visible_gpus
 from gmijax.partition.plan import Plan
 from gmijax.partition.planner import make_plan
 from gmijax.partition.shares import assign_instances
-from gmijax.rundir import RunPaths
+from gmijax.runs.folder import RunPaths
+from gmijax.supervise.backends import open_backend
+from gmijax.supervise.environment import gmi_environment
 
 MPS = Path("/usr/bin/nvidia-cuda-mps-control")
 

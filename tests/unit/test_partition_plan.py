@@ -12,9 +12,9 @@ from hypothesis import strategies as st
 from supervision import gpu, machine, plan_config, reduce_config
 
 from gmijax.errors import BackendUnavailable, ConfigError
+from gmijax.machine.snapshot import Machine
 from gmijax.partition import reduction
 from gmijax.partition.layout import Layout
-from gmijax.partition.machine import Machine
 from gmijax.partition.plan import Plan, Slice
 from gmijax.partition.planner import make_plan, split_cores
 
@@ -49,23 +49,6 @@ def test_plan_refuses_slices_that_do_not_fit_the_layout():
     slices = (Slice(1, 0, "cpu", None, None, ()),)
     with pytest.raises(ConfigError, match="do not match layout"):
         Plan(Layout(((0,),)), slices, "cpu", "tcg_ex", 8, "none", "host")
-
-
-@pytest.mark.parametrize(
-    ("num_gpus", "control", "gmis_per_gpu", "backend", "reason"),
-    [
-        (0, None, 2, "cpu", "GPUs are virtual"),
-        (1, MPS, 1, "share", "nothing to share"),
-        (1, MPS, 2, "mps", "with an own daemon"),
-        (1, None, 2, "share", "2.0 to 2.9 times as fast"),
-    ],
-)
-def test_auto_backend(
-    num_gpus: int, control: Path | None, gmis_per_gpu: int, backend: str, reason: str
-):
-    plan = planned(machine(num_gpus, mps_control=control), gmis_per_gpu=gmis_per_gpu)
-    assert plan.backend == backend
-    assert reason in plan.reasons[0]
 
 
 def test_running_daemon_is_named_in_the_reason():
@@ -222,13 +205,6 @@ def test_values_that_do_not_fit_are_refused(here: Machine, changes: dict[str, An
 def test_backend_that_cannot_be_had_is_refused(here: Machine, backend: str, message: str):
     with pytest.raises(BackendUnavailable, match=message):
         planned(here, backend=backend)
-
-
-def test_gpu_in_mig_mode_is_refused():
-    here = machine(0, gpus=(gpu(0), gpu(1, mig_enabled=True)))
-    assert planned(here, gpus=1).slices[0].device == gpu(0).uuid
-    with pytest.raises(BackendUnavailable, match="GPU 1 is in MIG mode"):
-        planned(here, gpus=(1,))
 
 
 def test_gpus_in_mig_mode_are_passed_over():

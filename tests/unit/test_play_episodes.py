@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from gmijax.config import PpoConfig
-from gmijax.learner import init_learner, make_learner
-from gmijax.ppo.episodes import CHUNK_STEPS, Options, run_episodes
+from gmijax.cli.compose import compose
+from gmijax.config import AlgoConfig
+from gmijax.learning.episodes import CHUNK_STEPS, Episodes, Options, run_episodes
+from gmijax.learning.learner import init_learner, make_learner
 from gmijax.sim import episode
 from gmijax.sim.interface import Env, EnvSpec, EnvState
 from gmijax.sim.wrappers import time_limit
@@ -39,33 +42,13 @@ def counting_env(reward: float = 1.0) -> Env:
 
 
 @pytest.fixture(scope="module")
-def algo() -> PpoConfig:
-    return PpoConfig(
-        name="ppo",
-        unroll_length=4,
-        num_minibatches=1,
-        num_updates_per_batch=1,
-        discounting=0.99,
-        gae_lambda=0.95,
-        clipping_epsilon=0.2,
-        clip_value_loss=True,
-        value_cost=1.0,
-        entropy_cost=0.0,
-        bound_cost=0.0,
-        learning_rate=1e-3,
-        learning_rate_schedule="fixed",
-        desired_kl=0.01,
-        max_grad_norm=1.0,
-        reward_scaling=1.0,
-        normalize_observations=True,
-        normalize_advantage=True,
-        policy_hidden_layer_sizes=(4,),
-        value_hidden_layer_sizes=(4,),
-        init_noise_std=1.0,
+def algo() -> AlgoConfig:
+    return dataclasses.replace(
+        compose().algo, policy_hidden_layer_sizes=(4,), value_hidden_layer_sizes=(4,)
     )
 
 
-def episodes_of(algo: PpoConfig, env: Env, **changes: object):
+def episodes_of(algo: AlgoConfig, env: Env, **changes: object):
     learner = make_learner(SPEC, algo)
     state = init_learner(learner, SPEC.obs_size, jax.random.key(1))
     options = Options(num_envs=8, num_shown=3, seed=0, deterministic=True, max_steps=None)
@@ -75,8 +58,12 @@ def episodes_of(algo: PpoConfig, env: Env, **changes: object):
     return played
 
 
-def test_every_environment_plays_one_episode_and_no_more(algo: PpoConfig):
-    played = episodes_of(algo, counting_env())
+@pytest.fixture(scope="module")
+def played(algo: AlgoConfig) -> Episodes:
+    return episodes_of(algo, counting_env())
+
+
+def test_every_environment_plays_one_episode_and_no_more(played: Episodes):
     assert played.terminated.any()
     assert played.truncated.any()
     assert not played.diverged.any()
@@ -88,27 +75,26 @@ def test_every_environment_plays_one_episode_and_no_more(algo: PpoConfig):
     np.testing.assert_allclose(played.terms["minus"], -0.25 * played.lengths)
 
 
-def test_positions_go_from_start_to_the_longest_shown_end(algo: PpoConfig):
-    played = episodes_of(algo, counting_env())
+def test_positions_go_from_start_to_the_longest_shown_end(played: Episodes):
     steps = np.arange(played.lengths[:3].max() + 1)[:, None]
     # The world's one position is its step count, and it stands still after its end.
     np.testing.assert_array_equal(played.qpos[..., 0], np.minimum(steps, played.lengths[:3]))
 
 
-def test_max_steps_cuts_episodes_off(algo: PpoConfig):
+def test_max_steps_cuts_episodes_off(algo: AlgoConfig):
     played = episodes_of(algo, counting_env(), max_steps=3)
     assert played.lengths.tolist() == [3] * 8
     assert not played.terminated.any()
     assert not played.truncated.any()
 
 
-def test_environments_do_not_depend_on_how_many_there_are(algo: PpoConfig):
+def test_environments_do_not_depend_on_how_many_there_are(algo: AlgoConfig):
     few = episodes_of(algo, counting_env(), num_envs=3, deterministic=False)
     many = episodes_of(algo, counting_env(), deterministic=False)
     np.testing.assert_array_equal(few.lengths, many.lengths[:3])
 
 
-def test_a_world_with_a_bad_number_ends_without_reward(algo: PpoConfig):
+def test_a_world_with_a_bad_number_ends_without_reward(algo: AlgoConfig):
     played = episodes_of(algo, counting_env(reward=float("nan")))
     assert played.diverged.all()
     assert played.terminated.all()

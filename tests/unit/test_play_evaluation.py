@@ -11,22 +11,21 @@ from types import SimpleNamespace
 import pytest
 from rich.console import Console
 
-from gmijax.cli import command
+from gmijax.cli.command import command
 from gmijax.config import PlayConfig
+from gmijax.config.schema import to_dict
 from gmijax.control import evaluation, pictures
-from gmijax.control.launcher import environment_of
 from gmijax.errors import ConfigError, GmijaxError
-from gmijax.partition.machine import Machine
-from gmijax.partition.nvidia import Gpu
-from gmijax.playdir import EXIT_NO_GL, PlayPaths
-from gmijax.resume import CheckpointMeta
-from gmijax.rundir import META, RunPaths, write_json
-from gmijax.schema import to_dict
+from gmijax.machine.nvidia import Gpu
+from gmijax.machine.snapshot import Machine
+from gmijax.runs.folder import EXIT_NO_GL, META, PlayPaths, RunPaths, write_json
+from gmijax.runs.resume import CheckpointMeta
+from gmijax.supervise.launcher import environment_of
 
 
 def config_of(*overrides: str) -> PlayConfig:
     found: list[PlayConfig] = []
-    assert command("play", PlayConfig, lambda c: found.append(c) or 0, overrides) == 0
+    assert command("play", PlayConfig, lambda c, **_: found.append(c), overrides) == 0
     return found[0]
 
 

@@ -15,7 +15,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from gmijax.playdir import PlayPaths
+from gmijax.runs.folder import PlayPaths
 from gmijax.sim.page import page
 from gmijax.sim.render import Trajectory
 

@@ -10,10 +10,10 @@ import pytest
 from rich.console import Console
 
 import gmijax
-from gmijax.control import evaluation, progress, serving
+from gmijax.control import console, decide, evaluation, serving
 from gmijax.errors import ConfigError, printable
-from gmijax.partition.failures import last_line
-from gmijax.partition.gmi_process import GmiStatus
+from gmijax.supervise.failures import last_line
+from gmijax.supervise.gmi_process import GmiStatus
 
 
 @pytest.mark.parametrize(
@@ -60,14 +60,9 @@ def test_names_in_the_table_of_play_may_look_like_markup():
 
 def test_the_panel_of_a_job_shows_what_a_gmi_says():
     said = io.StringIO()
-    shown = progress.ConsoleProgress(Console(file=said), Nothing(), 10)
+    shown = console.ConsoleProgress(Console(file=said), lambda: None, 10)
     Console(file=said).print(shown._panel([GmiStatus(0, "[/odd]", 3, None, None)]))
     assert "GMI 0: [/odd], iteration 3" in said.getvalue()
-
-
-class Nothing:
-    def latest(self) -> None:
-        return None
 
 
 def test_serve_refuses_a_name_that_is_taken_before_it_searches(
@@ -78,7 +73,7 @@ def test_serve_refuses_a_name_that_is_taken_before_it_searches(
 
     monkeypatch.chdir(tmp_path)
     (tmp_path / "runs" / "mine").mkdir(parents=True)
-    monkeypatch.setattr(serving, "decided", search)
+    monkeypatch.setattr(decide, "with_auto_decided", search)
     overrides = ("policy=random", "num_envs=auto", "run.name=mine")
     config = gmijax.compose(*overrides, command="serve")
     with pytest.raises(ConfigError, match=r"^run\.name=runs/mine: the run folder exists already$"):

@@ -8,7 +8,7 @@ import signal
 import subprocess
 from pathlib import Path
 
-from gmijax.processes import ProcessId, identify, members_of, own_process, wait_until_gone
+from gmijax.machine.processes import ProcessId, identify, members_of, own_process, wait_until_gone
 
 
 def test_zombie_is_not_running():

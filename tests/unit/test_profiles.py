@@ -9,9 +9,9 @@ from pathlib import Path
 
 import pytest
 
-from gmijax.control.profiles import ProfileStore
+from gmijax.autotune.grid import Measured, NotRunnable, Point
+from gmijax.autotune.store import ProfileStore
 from gmijax.errors import ConfigError
-from gmijax.partition.points import Measured, NotRunnable, Point
 
 KEY = {"device": "NVIDIA H200, 143771 MiB", "task": "ant", "versions": {"jax": "0.11.2"}}
 POINT = Point(4, 2048, "jax")

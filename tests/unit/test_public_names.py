@@ -25,7 +25,7 @@ def test_an_unknown_name_is_an_attribute_error() -> None:
     "module",
     [
         "gmijax",
-        "gmijax.cli",
+        "gmijax.cli.compose",
         "gmijax.control.job",
         "gmijax.control.evaluation",
         "gmijax.control.serving",

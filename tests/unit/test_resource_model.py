@@ -4,14 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from benchmarks.resource_model import (
-    measured_gain,
-    predicted_gain,
-    resources_of,
-    training_case,
-)
-from gmijax.errors import ConfigError
-from gmijax.partition.resource_model import (
+from benchmarks.paper_model import (
     Sizes,
     Task,
     dominant_resource,
@@ -27,6 +20,13 @@ from gmijax.partition.resource_model import (
     throughput,
     training_gain,
 )
+from benchmarks.resource_model import (
+    measured_gain,
+    predicted_gain,
+    resources_of,
+    training_case,
+)
+from gmijax.errors import ConfigError
 
 # Section 5.1: R_s = 10 R_a = 5 R_t, T_s = 6 T_a = 3 T_t, alpha 0.2, beta 0.3.
 SIMULATOR, AGENT, TRAINER = Task(6.0, 10.0), Task(1.0, 1.0), Task(2.0, 2.0)

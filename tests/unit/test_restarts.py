@@ -9,13 +9,22 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from supervision import gpu, machine
 
+from gmijax.cli.compose import compose
 from gmijax.control import restarts
-from gmijax.control.launcher import StopSignals
-from gmijax.control.restarts import Attempts, clear_unfinished, keep_logs, why_not_again
+from gmijax.control.restarts import (
+    Attempts,
+    clear_unfinished,
+    keep_logs,
+    why_not_again,
+    with_gpus_left,
+)
 from gmijax.errors import BackendUnavailable, ConfigError, GmiFailed, ReportedError
-from gmijax.resume import CheckpointMeta
-from gmijax.rundir import META, RunPaths, read_json, write_json
+from gmijax.runs.folder import META, RunPaths, read_json, write_json
+from gmijax.runs.resume import CheckpointMeta
+from gmijax.supervise.kinds import training_plan
+from gmijax.supervise.launcher import StopSignals
 
 TRACE = 'Traceback:\n  File "task.py", line {line}, in step\n    x\nValueError: at 0x{address}\n'
 
@@ -236,7 +245,7 @@ def test_what_came_after_the_checkpoint_is_dropped(run: RunPaths):
 
 def test_only_the_same_signal_a_second_later_is_impatience(monkeypatch: pytest.MonkeyPatch):
     now_s = [100.0]
-    monkeypatch.setattr("gmijax.control.launcher.time.monotonic", lambda: now_s[0])
+    monkeypatch.setattr("gmijax.supervise.launcher.time.monotonic", lambda: now_s[0])
     asked: list[float] = []
     signals = StopSignals()
     signals.handle(signal.SIGUSR1)
@@ -264,3 +273,62 @@ def test_half_written_files_of_killed_processes_go_and_all_others_stay(run: RunP
     clear_unfinished(run, None)
     assert not any(path.exists() for path in half)
     assert all(path.exists() for path in whole)
+
+
+FOUR = machine(4)
+LEFT = machine(0, gpus=(gpu(0), gpu(2), gpu(3)), driver_version="580.159.03")
+
+
+def test_a_job_that_has_its_gpus_stays_as_it_is():
+    config = compose("env=ant", "plan.gpus=2", "plan.backend=share")
+    plan = training_plan(config, FOUR)
+    assert with_gpus_left(config, plan, FOUR) == (config, plan, ())
+
+
+def test_a_lost_gpu_shrinks_the_plan():
+    config = compose(
+        *("env=ant", "plan.gpus=4", "plan.gmis_per_gpu=2", "plan.backend=share", "num_envs=64"),
+        *("run.elastic=true", "reduce.intra=host"),
+    )
+    plan = training_plan(config, FOUR)
+    config, shrunk, notes = with_gpus_left(config, plan, LEFT)
+    assert [share.device for share in shrunk.slices] == [
+        gpu(index).uuid for index in (0, 0, 2, 2, 3, 3)
+    ]
+    assert (shrunk.num_envs_per_gmi, shrunk.strategy) == (64, "mrr")
+    assert notes[0].startswith("GPUs [1] of the job are gone: going on with 3")
+
+
+def test_algorithm_1_decides_again_for_what_is_left():
+    config = compose(
+        *("env=ant", "plan.gpus=2", "plan.gmis_per_gpu=2", "plan.backend=share"),
+        *("run.elastic=true", "reduce.intra=host"),
+    )
+    plan = training_plan(config, FOUR)
+    _, shrunk, _ = with_gpus_left(config, plan, LEFT)
+    assert (plan.strategy, shrunk.strategy) == ("mrr", "mpr")
+
+
+def test_an_uneven_layout_loses_its_row():
+    config = compose(
+        *("env=ant", "plan.layout=[[0],[1,2],[3,4,5]]", "plan.backend=share", "run.elastic=true")
+    )
+    plan = training_plan(config, FOUR)
+    _, shrunk, _ = with_gpus_left(config, plan, LEFT)
+    assert str(shrunk.layout) == "[[0],[1,2,3]]"
+
+
+@pytest.mark.parametrize(
+    ("overrides", "message"),
+    [
+        (["run.elastic=false"], r"GPUs \[1\] of the job are gone; run\.elastic=true would go on"),
+        (["run.elastic=true", "plan.gpus=[1]"], "gone, and no other one is left"),
+    ],
+)
+def test_what_cannot_go_on_is_told(overrides: list[str], message: str):
+    config = compose("env=ant", "plan.gpus=2", "plan.backend=share", *overrides)
+    plan = training_plan(config, FOUR)
+    lost = [0] if "plan.gpus=[1]" in overrides else [1]
+    assert lost
+    with pytest.raises(ConfigError, match=message.replace(r"\[1\]", rf"\[{lost[0]}\]")):
+        with_gpus_left(config, plan, LEFT)

@@ -11,11 +11,11 @@ from pathlib import Path
 
 import pytest
 
-from gmijax.cli import compose
+from gmijax.cli.compose import compose
+from gmijax.config.schema import to_dict
 from gmijax.errors import ConfigError
-from gmijax.resume import CheckpointMeta, file_check, find_checkpoint, newest_checkpoint
-from gmijax.rundir import META, RunPaths, last_run, read_json, write_json
-from gmijax.schema import to_dict
+from gmijax.runs.folder import META, RunPaths, last_run, read_json, write_json
+from gmijax.runs.resume import CheckpointMeta, file_check, find_checkpoint, newest_checkpoint
 
 
 def make_run(root: Path, *env_steps: int) -> RunPaths:

@@ -90,7 +90,7 @@ def test_a_plan_of_roles_names_no_template() -> None:
 
 def test_a_plan_of_roles_goes_by_the_layout_whatever_training_does(monkeypatch: Any) -> None:
     monkeypatch.setattr("gmijax.partition.reduction._is_installed", lambda *_: True)
-    monkeypatch.setattr("gmijax.roles.planning.detect_machine", lambda: machine(2))
+    monkeypatch.setattr("gmijax.roles.manager.detect_machine", lambda: machine(2))
     plan = gmijax.plan(2, 2, backend="share", strategy="auto")
     assert (plan.strategy, plan.intra) == ("mrr", "host")
     assert gmijax.plan(2, 2, backend="share", strategy="one_shot").intra == "ipc"
@@ -112,8 +112,8 @@ def test_the_manager_says_what_is_missing() -> None:
         manager.plan()
     manager.add_gmi(1).set_gpu(1, 0)
     assert manager.plan().layout.gmis_of_gpu == ((1,), (0,))
-    assert list(manager.get_group(1, "all")) == [1]
-    assert list(manager.get_group(0, "all")) == [0, 1]
+    assert manager.get_group(1, "all") == {1}
+    assert manager.get_group(0, "all") == {0, 1}
     with pytest.raises(ConfigError, match=r"^allreduce: only inside a GMI"):
         manager.allreduce(np.ones(1))
 

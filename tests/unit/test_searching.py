@@ -14,16 +14,17 @@ import pytest
 from rich.console import Console
 from supervision import machine
 
-from gmijax.cli import compose
+from gmijax.autotune import tuner
+from gmijax.autotune.grid import Measured, NotRunnable, Point
+from gmijax.autotune.profile import ProfileLate
+from gmijax.autotune.tuner import Search, SearchResult, with_auto_decided
+from gmijax.autotune.workloads import PpoWorkload, Workload
+from gmijax.cli.compose import compose
 from gmijax.config import TrainConfig
 from gmijax.control import searching
-from gmijax.control.auto import decided
-from gmijax.control.profiling import ProfileLate, plan_at
-from gmijax.control.workload import Workload, training
 from gmijax.errors import ConfigError, GmijaxError, JobInterrupted
-from gmijax.partition.host_limits import Host
-from gmijax.partition.machine import Machine
-from gmijax.partition.points import Measured, NotRunnable, Point
+from gmijax.machine.host_limits import Host
+from gmijax.machine.snapshot import Machine
 
 Answer = Callable[[Point, str], Measured | NotRunnable]
 GRID = ("search.gmis_per_gpu=[4,2,1]", "search.num_envs=[64,128]", "search.order=as_printed")
@@ -31,14 +32,14 @@ MPS = Path("/usr/bin/nvidia-cuda-mps-control")
 
 
 class Profiles:
-    """In place of `gmijax.control.profiling.profile`: answers with a formula and counts."""
+    """In place of `gmijax.autotune.profile.profile`: answers with a formula and counts."""
 
     def __init__(self, answer: Answer) -> None:
         self.answer = answer
         self.asked: list[tuple[Point, str]] = []
 
     def __call__(
-        self, workload: Workload, point: Point, mode: str, *_: Any, **__: Any
+        self, workload: Workload[Any], point: Point, mode: str, *_: Any, **__: Any
     ) -> Measured | NotRunnable:
         assert workload.kind.module == "gmijax.workers.worker"
         self.asked.append((point, mode))
@@ -57,7 +58,7 @@ def profiles(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Callable[[Answe
 
     def use(answer: Answer) -> Profiles:
         used = Profiles(answer)
-        monkeypatch.setattr(searching, "profile", used)
+        monkeypatch.setattr(tuner, "profile", used)
         return used
 
     return use
@@ -68,11 +69,10 @@ def wanted(*overrides: str) -> TrainConfig:
     return compose(*GRID, "search.store=store", *overrides, command="search")
 
 
-def found(*overrides: str, here: Machine | None = None) -> tuple[searching.SearchResult, str]:
-    config, said = wanted(*overrides), io.StringIO()
-    result = searching.resolve_auto(
-        training(config), config.search, here or machine(0), Console(file=said, width=400)
-    )
+def found(*overrides: str, here: Machine | None = None) -> tuple[SearchResult, str]:
+    said = io.StringIO()
+    console = Console(file=said, width=400)
+    result = Search(PpoWorkload(wanted(*overrides)), here or machine(0), console).result()
     return result, said.getvalue()
 
 
@@ -243,12 +243,12 @@ def test_one_gmi_is_said_plainly(profiles: Callable[[Answer], Profiles]):
 
 def test_a_job_with_auto_gets_the_answer_and_the_reason(profiles: Callable[[Answer], Profiles]):
     profiles(scaling)
-    config, reasons = decided(wanted(), machine(0), Console(quiet=True))
+    config, reasons = with_auto_decided(wanted(), machine(0), Console(quiet=True))
     assert (config.num_envs, config.plan.gmis_per_gpu) == (128, 4)
     assert config.physics.impl == "jax"
     assert reasons[0].startswith("4 GMIs per GPU with 128 environments each, jax: ")
     given = compose("num_envs=64")
-    assert decided(given, machine(0), Console(quiet=True)) == (given, ())
+    assert with_auto_decided(given, machine(0), Console(quiet=True)) == (given, ())
 
 
 def test_a_job_with_too_few_gpus_is_refused_before_anything_is_profiled(
@@ -257,7 +257,7 @@ def test_a_job_with_too_few_gpus_is_refused_before_anything_is_profiled(
     asked = profiles(scaling)
     config = dataclasses.replace(wanted(), plan=dataclasses.replace(wanted().plan, gpus=3))
     with pytest.raises(ConfigError, match=r"plan\.gpus=3: this machine has 2 usable GPUs"):
-        decided(config, machine(2, mps_control=MPS), Console(quiet=True))
+        with_auto_decided(config, machine(2, mps_control=MPS), Console(quiet=True))
     assert asked.asked == []
 
 
@@ -291,10 +291,10 @@ def test_undecided_numbers_are_refused_where_numbers_are_needed():
 
 
 def test_isolated_is_one_gmi_of_those_that_corun():
-    workload = training(wanted())
+    workload = PpoWorkload(wanted())
     here = machine(0, cpu_cores=(0, 1, 2, 3))
-    together = plan_at(workload, Point(2, 64, "jax"), "corun", here)
-    alone = plan_at(workload, Point(2, 64, "jax"), "isolated", here)
+    together = workload.plan_at(Point(2, 64, "jax"), "corun", here)
+    alone = workload.plan_at(Point(2, 64, "jax"), "isolated", here)
     assert (together.layout.num_gmis, alone.layout.num_gmis) == (2, 1)
     assert together.strategy != alone.strategy == "none"
     assert alone.slices == together.slices[:1]
@@ -302,10 +302,10 @@ def test_isolated_is_one_gmi_of_those_that_corun():
 
 
 def test_isolated_on_a_gpu_has_an_even_share_of_sms_and_memory():
-    workload = training(wanted("plan.gpus=2"))
+    workload = PpoWorkload(wanted("plan.gpus=2"))
     here = machine(2, mps_control=MPS)
-    together = plan_at(workload, Point(4, 64, "jax"), "corun", here)
-    alone = plan_at(workload, Point(4, 64, "jax"), "isolated", here)
+    together = workload.plan_at(Point(4, 64, "jax"), "corun", here)
+    alone = workload.plan_at(Point(4, 64, "jax"), "isolated", here)
     assert together.layout.num_gpus == 1
     assert [share.sm_percent for share in together.slices] == [None] * 4
     (share,) = alone.slices

@@ -12,11 +12,11 @@ import numpy as np
 import pytest
 from compile_options import CPU_OPTIONS
 
-from gmijax.cli import compose
+from gmijax.cli.compose import compose
 from gmijax.config import EnvConfig
+from gmijax.config.randomization import RANDOMIZED_LEAVES, LeafRange
+from gmijax.config.schema import from_dict
 from gmijax.errors import ConfigError
-from gmijax.randomization import RANDOMIZED_LEAVES, LeafRange
-from gmijax.schema import from_dict
 from gmijax.sim import episode, physics, wrappers
 from gmijax.sim.interface import Env, EnvSpec, EnvState
 from gmijax.sim.randomize import randomized

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from gmijax.rundir import add_event, read_json, write_json
+from gmijax.runs.folder import add_event, read_json, write_json
 
 
 @pytest.fixture

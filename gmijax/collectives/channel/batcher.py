@@ -2,72 +2,90 @@
 
 from __future__ import annotations
 
+import contextlib
 import time
 from collections.abc import Callable, Sequence
-from typing import NamedTuple, Protocol
+from typing import NamedTuple, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
 
 from gmijax.collectives.channel.compressor import Transfer
-from gmijax.collectives.channel.interface import Array, Batch
-from gmijax.collectives.channel.spec import Spec
+from gmijax.collectives.channel.spec import Array, Spec
+from gmijax.collectives.channel.transport import ChannelReader
+from gmijax.collectives.messages.pipe import Message
 from gmijax.collectives.waits import LIVENESS_PERIOD_S, wait_until
 from gmijax.errors import CollectiveError, CollectiveTimeout, GmijaxError, PipeClosed
 
+Decode: TypeAlias = Callable[[Message], Transfer | None]
+"""Reads a message of one agent; None if it only began or continued a transfer."""
 
-class Source(Protocol):
-    """Unrolls from one agent.
+
+class Batch(NamedTuple):
+    """What a trainer gets: whole unrolls of B environments.
 
     Attributes:
-      peer: rank of the agent.
+      experience: arrays by channel, [S, B, ...]; read-only views that are valid until the next
+        `receive`, of host memory or of the device's. The latter are for programs: the same view
+        comes again with other values, and jax keeps what `np.asarray` once read of it.
+      versions: [B] int64, the policy version that every unroll was made with.
+      agents: [B] int64, ranks of the agents that made them.
     """
 
-    peer: int
-
-    def try_next(self) -> Transfer | None:
-        """The next unrolls, valid until `release`; PipeClosed if no more can come."""
-        ...
-
-    def release(self) -> None:
-        """Gives their memory back."""
-        ...
-
-    def why_lost(self, operation: str, step: int) -> GmijaxError | None:
-        """Why the agent will never send again, None if it may."""
-        ...
+    experience: dict[str, Array]
+    versions: npt.NDArray[np.int64]
+    agents: npt.NDArray[np.int64]
 
 
 class Batcher:
-    """Makes batches of unrolls from several agents, in turn.
+    """A trainer's end of the channels: makes batches of unrolls from several agents, in turn.
 
     A batch that lies in one transfer is a slice of it, without a copy, and holds its memory until
     the next batch is asked for. Otherwise unrolls are stacked in memory of the batcher's own.
 
     Args:
       rank: of this trainer.
-      sources: one for every agent.
+      sources: the ways from all agents, each with what reads its messages.
       new_stack: makes, from a spec and a size, what batches of several arrivals are stacked in.
+      held: closed at the end.
+
+    Attributes:
+      batches: given out.
+      unrolls: environments' unrolls that arrived.
+      transfers: messages that arrived.
+      num_bytes: in all channels, as they travelled.
     """
 
     def __init__(
         self,
         rank: int,
-        sources: Sequence[Source],
-        new_stack: Callable[[Spec, int], Stack] | None = None,
+        sources: Sequence[tuple[ChannelReader, Decode]],
+        new_stack: Callable[[Spec, int], Stack],
+        held: contextlib.ExitStack,
     ) -> None:
-        self.batches = self.unrolls = 0
-        self.waited_s = 0.0
+        self.batches = self.unrolls = self.transfers = self.num_bytes = 0
         self._rank = rank
         self._sources = list(sources)
         self._turn = 0
-        self._new_stack = Stack if new_stack is None else new_stack
+        self._new_stack = new_stack
+        self._held = held
         self._current: _Arrival | None = None
         self._stack: Stack | None = None
         self._next_look_s = time.monotonic() + LIVENESS_PERIOD_S
 
     def receive(self, batch_size: int, timeout_s: float) -> Batch:
-        """Waits for `batch_size` unrolls; see `ExperienceReceiver.receive`."""
+        """Waits for the unrolls of `batch_size` environments.
+
+        After any error nothing is lost: what had arrived is in the next batch. An agent that is
+        gone is named at most five times a second, also while others still send; who can do
+        without it goes on.
+
+        Raises:
+          CollectiveTimeout: too few came in time.
+          PeerLost: the process of an agent is gone.
+          PipeClosed: all agents have closed, and too few are left.
+          CollectiveError: a message is damaged.
+        """
         self._check_agents()
         self._resize(batch_size)
         deadline_s = time.monotonic() + timeout_s
@@ -75,7 +93,7 @@ class Batcher:
             arrival = self._arrival(deadline_s, timeout_s)
             filled = self._stack.filled if self._stack is not None else 0
             if not filled and arrival.left >= batch_size:
-                batch = arrival.take(batch_size).batch()
+                batch = _unpacked(arrival.take(batch_size), arrival.spec)
                 break
             if self._stack is None or not self._stack.fits(arrival.spec):
                 self._stack = self._new_stack(arrival.spec.unpacked(), batch_size)
@@ -88,34 +106,27 @@ class Batcher:
         self.batches += 1
         return batch
 
+    def close(self) -> None:
+        """Tells the agents that nothing more is wanted. Idempotent."""
+        self._held.close()
+
     def _arrival(self, deadline_s: float, timeout_s: float) -> _Arrival:
         """What has unrolls left: the arrival in use, or the next one."""
         if self._current is not None and self._current.left:
             return self._current
         self._release()
-        arrival = self._next()
+        arrival = wait_until(self._next, self._why_lost, deadline_s - time.monotonic())
         if arrival is None:
-            arrival = self._wait(deadline_s, timeout_s)
-        self.unrolls += arrival.left
-        self._current = arrival
-        return arrival
-
-    def _wait(self, deadline_s: float, timeout_s: float) -> _Arrival:
-        started_s = time.monotonic()
-        try:
-            arrival = wait_until(self._next, self._why_lost, deadline_s - started_s)
-        finally:
-            self.waited_s += time.monotonic() - started_s
-        if arrival is None:
-            peers = tuple(source.peer for source in self._sources)
+            peers = tuple(reader.peer for reader, _ in self._sources)
             raise CollectiveTimeout(self._rank, peers, "receive", self.batches, timeout_s)
+        self._current = arrival
         return arrival
 
     def _next(self) -> _Arrival | None:
         for place in range(len(self._sources)):
             source = self._sources[(self._turn + place) % len(self._sources)]
             try:
-                transfer = source.try_next()
+                transfer = self._read(*source)
             except PipeClosed:
                 if len(self._sources) == 1:
                     raise
@@ -123,12 +134,23 @@ class Batcher:
                 return self._next()
             if transfer is not None:
                 self._turn += place + 1
-                return _Arrival(transfer, source.peer, source.release)
+                self.unrolls += transfer.num_envs
+                self.num_bytes += sum(transfer.spec.sizes(transfer.num_envs))
+                agents = np.full(transfer.num_envs, source[0].peer, np.int64)
+                return _Arrival(transfer, agents, source[0].release)
+        return None
+
+    def _read(self, reader: ChannelReader, decode: Decode) -> Transfer | None:
+        """The next transfer, valid until the reader's `release`; PipeClosed if none can come."""
+        while (message := reader.try_get()) is not None:
+            self.transfers += 1
+            if (transfer := decode(message)) is not None:
+                return transfer
         return None
 
     def _why_lost(self) -> GmijaxError | None:
         self._next_look_s = time.monotonic() + LIVENESS_PERIOD_S
-        found = (source.why_lost("receive", self.batches) for source in self._sources)
+        found = (reader.why_lost("receive", self.batches) for reader, _ in self._sources)
         # One that has closed is no loss: `_next` finds out when its last message is read.
         lost = (error for error in found if not isinstance(error, PipeClosed))
         return next((error for error in lost if error is not None), None)
@@ -154,45 +176,30 @@ class Batcher:
             self._current = None
 
 
-class _Unrolls(NamedTuple):
-    """Some unrolls of one agent."""
-
-    spec: Spec
-    arrays: dict[str, Array]
-    versions: npt.NDArray[np.int64]
-    agents: npt.NDArray[np.int64]
-
-    def batch(self) -> Batch:
-        experience = {
-            channel.name: _given(self.arrays[channel.name], channel.dtype)
-            for channel in self.spec.channels
-        }
-        return Batch(experience, self.versions, self.agents)
-
-
 class _Arrival:
     """A transfer of which a part may be in batches already."""
 
-    def __init__(self, transfer: Transfer, agent: int | None, release: Callable[[], None]) -> None:
+    def __init__(
+        self, transfer: Transfer, agents: npt.NDArray[np.int64], release: Callable[[], None]
+    ) -> None:
         self.spec = transfer.spec
         self.release = release
         self._transfer = transfer
+        self._agents = agents
         self._taken = 0
-        self.agents = np.full(transfer.num_envs, -1 if agent is None else agent, np.int64)
 
     @property
     def left(self) -> int:
         return self._transfer.num_envs - self._taken
 
-    def take(self, count: int) -> _Unrolls:
+    def take(self, count: int) -> Batch:
+        """The next unrolls, as they travelled."""
         low, high = self._taken, self._taken + count
         self._taken = high
         arrays = self._transfer.arrays
         if count < self._transfer.num_envs:  # A part of an array on a device is a copy.
             arrays = {name: array[:, low:high] for name, array in arrays.items()}
-        return _Unrolls(
-            self.spec, arrays, self._transfer.versions[low:high], self.agents[low:high]
-        )
+        return Batch(arrays, self._transfer.versions[low:high], self._agents[low:high])
 
 
 class Stack:
@@ -221,10 +228,10 @@ class Stack:
             raise CollectiveError(f"agents send different experience: {spec} and {self.spec}")
         return fits
 
-    def add(self, unrolls: _Unrolls) -> None:
+    def add(self, unrolls: Batch) -> None:
         """Takes unrolls in; their arrays may change after that."""
         low, high = self.filled, self.filled + len(unrolls.versions)
-        for name, array in unrolls.arrays.items():
+        for name, array in unrolls.experience.items():
             self._put(name, low, high, array)
         self._versions[low:high] = unrolls.versions
         self._agents[low:high] = unrolls.agents
@@ -240,9 +247,7 @@ class Stack:
     def as_arrival(self) -> _Arrival:
         """What is in it so far, as if it had just come."""
         transfer = Transfer(self.spec, self.filled, self._versions[: self.filled], self._so_far())
-        arrival = _Arrival(transfer, None, lambda: None)
-        arrival.agents[:] = self._agents[: self.filled]
-        return arrival
+        return _Arrival(transfer, self._agents[: self.filled], lambda: None)
 
     def _begin(self) -> None:
         """Makes room for a batch; the last one's memory may be used again."""
@@ -260,11 +265,14 @@ class Stack:
         return {name: _read_only(array[:, : self.filled]) for name, array in self._arrays.items()}
 
 
-def _given(array: Array, dtype: str) -> Array:
-    """An array as the trainer gets it, who may not write into it; one on a device nobody can."""
-    if not isinstance(array, np.ndarray):
-        return array
-    return _read_only(array.astype(dtype, copy=False))
+def _unpacked(unrolls: Batch, spec: Spec) -> Batch:
+    """Unrolls as the trainer gets them, who may not write into them; nobody can on a device."""
+    experience = dict(unrolls.experience)
+    for channel in spec.channels:
+        array = experience[channel.name]
+        if isinstance(array, np.ndarray):
+            experience[channel.name] = _read_only(array.astype(channel.dtype, copy=False))
+    return unrolls._replace(experience=experience)
 
 
 def _read_only(array: Array) -> Array:

@@ -13,6 +13,7 @@ The table is [1 + k, 2] int64: (room in environments, number of pieces), then fo
 
 from __future__ import annotations
 
+import statistics
 import time
 from typing import NamedTuple
 
@@ -20,16 +21,61 @@ import numpy as np
 import numpy.typing as npt
 
 from gmijax.collectives.channel.dispenser import Piece
-from gmijax.collectives.channel.interface import Array, Outlet
 from gmijax.collectives.channel.migrator import Migrator
-from gmijax.collectives.channel.spec import Spec, arrays_of, write_channel
-from gmijax.collectives.channel.transfer_size import TransferSize
+from gmijax.collectives.channel.spec import Array, Spec, write_channel
+from gmijax.collectives.channel.transport import ChannelWriter
+from gmijax.collectives.messages.pipe import Message
 
 ROW_BYTES = 16
 
+START_BYTES = 64 * 1024
+SAMPLES = 9
+WORTH_IT = 0.95
+"""A size is better if it takes less than this part of the time per byte."""
+
+
+class TransferSize:
+    """Doubles the size as long as a byte gets cheaper, then keeps the best.
+
+    The price of a transfer is fixed plus so much a byte, so that there is no use in going on
+    once it has stopped falling; larger transfers only make experience older.
+
+    Args:
+      fixed_bytes: a size to keep to; None: found by trying.
+      max_bytes: largest size to try.
+
+    Attributes:
+      num_bytes: the size to use now.
+      is_settled: whether it will not change any more.
+    """
+
+    def __init__(self, fixed_bytes: int | None, max_bytes: int) -> None:
+        self.num_bytes = min(fixed_bytes or START_BYTES, max_bytes)
+        self.is_settled = fixed_bytes is not None
+        self._max_bytes = max_bytes
+        self._samples: list[float] = []
+        self._best: tuple[float, int] | None = None
+
+    def record(self, num_bytes: int, seconds: float) -> None:
+        """Takes note of what one transfer cost, without the time it waited for room."""
+        if self.is_settled or not num_bytes:
+            return
+        self._samples.append(seconds / num_bytes)
+        if len(self._samples) < SAMPLES:
+            return
+        price, self._samples = statistics.median(self._samples), []
+        if self._best is None or price < WORTH_IT * self._best[0]:
+            self._best = price, self.num_bytes
+            # A transfer that holds one piece already, however large, cannot show more.
+            larger = 2 * max(self.num_bytes, num_bytes)
+            if larger <= self._max_bytes:
+                self.num_bytes = larger
+                return
+        self.num_bytes, self.is_settled = self._best[1], True
+
 
 class Compressor:
-    """Fills transfers with pieces, one transfer at a time.
+    """Fills transfers with pieces, one transfer at a time; a `Packer`.
 
     Args:
       migrator: gives transfers their way and their memory.
@@ -46,7 +92,7 @@ class Compressor:
         self._migrator = migrator
         self._size = size
         self._max_transfer_bytes = max_transfer_bytes
-        self._open: _Transfer | None = None
+        self._open: _OpenTransfer | None = None
 
     def try_add(self, piece: Piece) -> bool:
         """Puts `piece` into a transfer, if there is room; hands the transfer over when full."""
@@ -74,36 +120,36 @@ class Compressor:
         self.transfers += 1
         self.num_bytes += num_bytes
 
-    def _begin(self, piece: Piece) -> _Transfer | None:
+    def _begin(self, piece: Piece) -> _OpenTransfer | None:
         # With its row of the table, which may be larger than a small piece.
         piece_bytes = sum(piece.spec.sizes(piece.num_envs)) + ROW_BYTES
         wanted = min(self._size.num_bytes, self._max_transfer_bytes)
         pieces = max(1, wanted // piece_bytes)
-        room, text = pieces * piece.num_envs, piece.spec.encode()
-        sizes = [len(text), ROW_BYTES * (1 + pieces), *piece.spec.sizes(room)]
+        room, head = pieces * piece.num_envs, piece.spec.encode()
+        sizes = [head.size, ROW_BYTES * (1 + pieces), *piece.spec.sizes(room)]
         opened = self._migrator.try_open(sizes)
         if opened is None:
             return None
-        outlet, (head, table, *parts) = opened
-        head[:] = np.frombuffer(text, np.uint8)
-        names = [channel.name for channel in piece.spec.channels]
-        arrays = arrays_of(piece.spec, dict(zip(names, parts, strict=True)), room)
-        return _Transfer(outlet, piece.spec, table.view(np.int64).reshape(-1, 2), arrays, room)
+        writer, views = opened
+        views[0][:] = head
+        table = views[1].view(np.int64).reshape(-1, 2)
+        arrays = piece.spec.arrays_in(views[2:], room)
+        return _OpenTransfer(writer, piece.spec, table, arrays, room)
 
 
-class _Transfer:
+class _OpenTransfer:
     """A transfer that is being filled."""
 
     def __init__(
         self,
-        outlet: Outlet,
+        writer: ChannelWriter,
         spec: Spec,
         table: npt.NDArray[np.int64],
         arrays: dict[str, Array],
         room: int,
     ) -> None:
         self.spent_s = 0.0
-        self._outlet = outlet
+        self._writer = writer
         self._spec = spec
         self._table = table
         self._arrays = arrays
@@ -127,7 +173,7 @@ class _Transfer:
 
     def commit(self) -> int:
         self._table[0] = self._room, self._pieces
-        self._outlet.commit(items=self._pieces)
+        self._writer.commit()
         return sum(self._spec.sizes(self._filled))
 
 
@@ -147,14 +193,13 @@ class Transfer(NamedTuple):
     arrays: dict[str, Array]
 
 
-def read_transfer(parts: tuple[Array, ...]) -> Transfer:
-    """What a `Compressor` made, from the parts of its message."""
-    spec = Spec.decode(parts[0].tobytes())
-    table = parts[1].view(np.int64).reshape(-1, 2)
+def read_transfer(message: Message) -> Transfer:
+    """What a `Compressor` made; a `Decode`."""
+    head, table, *parts = message.parts
+    spec, table = Spec.decode(head), table.view(np.int64).reshape(-1, 2)
     room, pieces = table[0].tolist()
     counts, versions = table[1 : 1 + pieces].T
     num_envs = int(counts.sum())
-    names = [channel.name for channel in spec.channels]
-    arrays = arrays_of(spec, dict(zip(names, parts[2:], strict=True)), room)
+    arrays = spec.arrays_in(parts, room)
     filled = {name: array[:, :num_envs] for name, array in arrays.items()}
     return Transfer(spec, num_envs, np.repeat(versions, counts), filled)

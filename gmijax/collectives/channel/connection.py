@@ -17,8 +17,8 @@ import socket
 from collections.abc import Sequence
 from typing import Any, Final
 
-from gmijax.cachedir import cache_folder
 from gmijax.errors import CollectiveError, ConfigError
+from gmijax.runs.cache import cache_folder
 
 try:
     import zmq

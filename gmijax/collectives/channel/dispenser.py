@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Collection, Mapping
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from gmijax.collectives.channel.interface import Array, Experience
-from gmijax.collectives.channel.spec import Spec, spec_of
+from gmijax.collectives.channel.spec import Array, Experience, Spec, spec_of
 from gmijax.errors import ConfigError
 
 
@@ -36,16 +35,17 @@ class Dispenser:
     """Splits what an agent sends into pieces with one array a channel.
 
     Args:
-      max_piece_bytes: largest piece; a rollout beyond it is cut between environments.
+      max_piece_bytes: largest piece; a rollout beyond it is cut between environments. None: it
+        stays whole, and its arrays where they are, on the host or the device.
       float16: channels that travel as float16; the others as they are.
     """
 
-    def __init__(self, max_piece_bytes: int, float16: Collection[str] = ()) -> None:
+    def __init__(self, max_piece_bytes: int | None, float16: Collection[str] = ()) -> None:
         self._max_piece_bytes = max_piece_bytes
         self._float16 = frozenset(float16)
         self._spec: Spec | None = None
 
-    def split(self, experience: Experience | Any, version: int) -> Iterator[Piece]:
+    def split(self, experience: Experience | Any, version: int) -> list[Piece]:
         """The pieces of one rollout, in order of environment.
 
         Args:
@@ -56,28 +56,34 @@ class Dispenser:
           ConfigError: not such arrays, others than the first time, or too large ones.
         """
         by_channel = experience if isinstance(experience, Mapping) else experience._asdict()
-        channels = {name: np.asarray(values) for name, values in by_channel.items()}
+        channels = dict(by_channel)
+        if self._max_piece_bytes is not None:
+            channels = {name: np.asarray(values) for name, values in by_channel.items()}
         spec, num_envs = spec_of(channels, self._float16)
         if self._spec is None:
             self._check_names(spec)
             self._spec = spec
         if spec != self._spec:
             raise ConfigError(f"experience: got {spec}, the first was {self._spec}")
-        pieces = -(-num_envs // self._envs_per_piece(spec))
+        if self._max_piece_bytes is None:
+            return [Piece(self._spec, num_envs, version, channels)]
+        pieces = -(-num_envs // self._envs_per_piece(self._max_piece_bytes, spec))
         step = -(-num_envs // pieces)  # As equal as can be.
+        found = []
         for low in range(0, num_envs, step):
             high = min(low + step, num_envs)
             part = {name: array[:, low:high] for name, array in channels.items()}
-            yield Piece(self._spec, high - low, version, part)
+            found.append(Piece(self._spec, high - low, version, part))
+        return found
 
-    def _envs_per_piece(self, spec: Spec) -> int:
+    def _envs_per_piece(self, max_bytes: int, spec: Spec) -> int:
         one = sum(spec.sizes(1))
-        if one > self._max_piece_bytes:
+        if one > max_bytes:
             raise ConfigError(
-                f"experience: {one} bytes for one environment, at most {self._max_piece_bytes}; "
+                f"experience: {one} bytes for one environment, at most {max_bytes}; "
                 "channel.capacity_mib must be larger, or the unroll shorter"
             )
-        return self._max_piece_bytes // one
+        return max_bytes // one
 
     def _check_names(self, spec: Spec) -> None:
         allowed = [channel.name for channel in spec.channels if channel.dtype == "float32"]

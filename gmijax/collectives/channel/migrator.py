@@ -7,56 +7,52 @@ channel (the compressor's transfers) and goes to the trainer with the least outs
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
+from typing import Generic, TypeVar
 
-from gmijax.collectives.channel.interface import Outlet
-from gmijax.collectives.pipe import Bytes
+from gmijax.collectives.channel.transport import ChannelWriter
+from gmijax.collectives.messages.pipe import Bytes
 from gmijax.collectives.waits import LIVENESS_PERIOD_S
 from gmijax.errors import GmijaxError, PeerLost, PipeClosed
 
+W = TypeVar("W", bound=ChannelWriter)
 
-class Migrator:
+
+class Migrator(Generic[W]):
     """Routes the transfers of one agent.
 
     Args:
-      outlets: the ways to all trainers.
-      gpu: index of the agent's GPU.
-      gpu_of: GPUs of the trainers by rank.
+      writers: the ways to all trainers.
+      near: ranks of the trainers on the agent's GPU.
     """
 
-    def __init__(self, outlets: Sequence[Outlet], gpu: int, gpu_of: Mapping[int, int]) -> None:
-        near = [outlet for outlet in outlets if gpu_of[outlet.peer] == gpu]
-        self._outlets = tuple(outlets)
-        self._candidates = near or list(outlets)
+    def __init__(self, writers: Sequence[W], near: Sequence[int]) -> None:
+        self._writers = tuple(writers)
+        self._candidates = [w for w in writers if w.peer in near] or list(writers)
         self._transfers = 0
         self._next_look_s = time.monotonic()
 
-    @property
-    def sent_items(self) -> int:
-        """Pieces committed to all trainers, by predecessors of this process too."""
-        return sum(outlet.sent_items for outlet in self._outlets)
-
-    def try_open(self, sizes: Sequence[int]) -> tuple[Outlet, list[Bytes]] | None:
+    def try_open(self, sizes: Sequence[int]) -> tuple[W, list[Bytes]] | None:
         """A way for a transfer with parts of `sizes` bytes and its memory; None: no room now.
 
         Raises:
           PipeClosed: a trainer has closed its end.
           PeerLost: one has, and the process of another is gone, which may be why.
         """
-        for outlet in self._by_load():
+        for writer in self._by_load():
             try:
-                views = outlet.try_reserve(sizes)
+                views = writer.try_reserve(sizes)
             except PipeClosed as closed:
                 error = self.why_lost()
                 raise error if isinstance(error, PeerLost) else closed from None
             if views is not None:
                 self._transfers += 1
-                return outlet, views
+                return writer, views
         return None
 
     def why_lost(self) -> GmijaxError | None:
         """Why some trainer will never read again, the dead first; None if all may."""
-        asked = (outlet.why_lost("send", self._transfers) for outlet in self._outlets)
+        asked = (writer.why_lost("send", self._transfers) for writer in self._writers)
         found = [error for error in asked if error is not None]
         dead = (error for error in found if isinstance(error, PeerLost))
         return next(dead, found[0] if found else None)
@@ -71,22 +67,22 @@ class Migrator:
 
     def occupancy(self) -> float:
         """How full the fullest way is, 0 to 1."""
-        return max(outlet.occupancy() for outlet in self._outlets)
+        return max(writer.occupancy() for writer in self._writers)
 
     def least_occupancy(self) -> float:
         """How full the emptiest way is that the next transfer may take, 0 to 1."""
-        return min(outlet.occupancy() for outlet in self._candidates)
+        return min(writer.occupancy() for writer in self._candidates)
 
     def close(self) -> None:
         """Tells all trainers that nothing more comes."""
-        for outlet in self._outlets:
-            outlet.close()
+        for writer in self._writers:
+            writer.close()
 
-    def _by_load(self) -> list[Outlet]:
+    def _by_load(self) -> list[W]:
         """The least loaded first; among equals in turn, so that idle trainers get the same."""
         count = len(self._candidates)
         if count == 1:
             return self._candidates
         turn = self._transfers % count
         in_turn = self._candidates[turn:] + self._candidates[:turn]
-        return sorted(in_turn, key=lambda outlet: outlet.load_bytes())
+        return sorted(in_turn, key=lambda writer: writer.load_bytes())

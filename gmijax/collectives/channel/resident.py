@@ -10,188 +10,212 @@ no experience passes through the host. What lies in the slots has no checksum.
 from __future__ import annotations
 
 import contextlib
-import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Sequence
 from typing import Any
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 
-from gmijax.collectives.channel.device_slots import NOTE, Slot, slot_of
-from gmijax.collectives.channel.ends import CLOSE_TIMEOUT_S
-from gmijax.collectives.channel.interface import SenderStats
-from gmijax.collectives.channel.memory import MemoryOutlet
+from gmijax.collectives.channel.batcher import Stack
+from gmijax.collectives.channel.compressor import Transfer
+from gmijax.collectives.channel.dispenser import Piece
 from gmijax.collectives.channel.migrator import Migrator
-from gmijax.collectives.channel.spec import Spec, spec_of
+from gmijax.collectives.channel.sender import CLOSE_TIMEOUT_S
+from gmijax.collectives.channel.spec import Spec
 from gmijax.collectives.device_memory import TICKET_BYTES, DeviceMemory, NewMemory
-from gmijax.collectives.pipe import Bytes
+from gmijax.collectives.messages.pipe import Bytes, Message, PipeWriter
+from gmijax.collectives.messages.pipe_block import PipeBlock
+from gmijax.collectives.shared_memory import round_up
 from gmijax.collectives.waits import wait_until
 from gmijax.errors import ConfigError, GmijaxError
 
+_ALIGNMENT = 256
 _LEAST_SLOTS = 2
 
+NOTE = np.dtype([("offset", np.int64), ("num_envs", np.int64), ("version", np.int64)])
+"""What travels: where a rollout lies, of how many environments it is, and of which policy."""
 
-class _Way:
-    """The way to one trainer: notes, and slots that are used in turn; an `Outlet`."""
 
-    def __init__(self, notes: MemoryOutlet, capacity_bytes: int) -> None:
-        self.peer = notes.peer
-        self.max_message_bytes = notes.max_message_bytes
+def slot_offsets(spec: Spec, num_envs: int) -> tuple[list[int], int]:
+    """Where the arrays of a rollout lie, bytes from the beginning of its slot, and its size."""
+    ends = np.cumsum([0, *(round_up(size, _ALIGNMENT) for size in spec.sizes(num_envs))]).tolist()
+    return ends[:-1], ends[-1]
+
+
+class SlotWriter(PipeWriter):
+    """The way to one trainer: notes, and slots that are used in turn.
+
+    Args:
+      block: of the pipes that the notes travel through.
+      peer: rank of the trainer.
+      capacity_bytes: GPU memory for it.
+
+    Attributes:
+      num_slots, slot_bytes: set when the first rollout shows how large it is.
+    """
+
+    def __init__(self, block: PipeBlock, peer: int, capacity_bytes: int) -> None:
+        super().__init__(block, peer)
         self.num_slots = self.slot_bytes = 0
-        self._notes = notes
         self._capacity_bytes = capacity_bytes
 
     @property
-    def sent_items(self) -> int:
-        return self._notes.sent_items
-
-    @property
-    def next_slot(self) -> int:
-        """Which slot the next note is about."""
-        return self._notes.messages % self.num_slots
+    def outstanding_messages(self) -> int:
+        """Slots in use: of notes that the trainer has not released."""
+        return self.messages - self.released_messages
 
     def try_reserve(self, sizes: Sequence[int]) -> list[Bytes] | None:
-        if self._notes.outstanding_messages >= self.num_slots:
+        """See `PipeWriter`; None, too, while no slot is free."""
+        if self.outstanding_messages >= self.num_slots:
             return None
-        return self._notes.try_reserve(sizes)
-
-    def commit(self, *, tag: int = 0, items: int = 1) -> None:
-        self._notes.commit(tag=tag, items=items)
-
-    def load_bytes(self) -> int:
-        return self._notes.load_bytes()
+        return super().try_reserve(sizes)
 
     def occupancy(self) -> float:
-        return self._notes.outstanding_messages * self.slot_bytes / self._capacity_bytes
-
-    def why_lost(self, operation: str, step: int) -> GmijaxError | None:
-        return self._notes.why_lost(operation, step)
-
-    def close(self) -> None:
-        self._notes.close()
+        """How much of the GPU memory is in use, 0 to 1."""
+        return self.outstanding_messages * self.slot_bytes / self._capacity_bytes
 
 
-class ResidentSender:
-    """An agent's end; an `ExperienceSender` of arrays that lie on the device.
+class ResidentPacker:
+    """Leaves rollouts on the device; a `Packer`.
 
     Args:
-      rank: of this agent.
-      notes: the ways to its trainers, all on its GPU.
-      gpu_of: GPUs by rank.
+      migrator: the ways to the agent's trainers, all on its GPU.
+      writers: the same ways.
       capacity_bytes: GPU memory for each trainer.
       new_memory: how the processes share memory of the GPU.
-      leave: called at the end.
     """
-
-    on_device = True
 
     def __init__(
         self,
-        rank: int,
-        notes: Sequence[MemoryOutlet],
-        gpu_of: Mapping[int, int],
+        migrator: Migrator[SlotWriter],
+        writers: Sequence[SlotWriter],
         capacity_bytes: int,
         new_memory: NewMemory,
-        leave: Callable[[], None],
     ) -> None:
-        self._ways = [_Way(outlet, capacity_bytes) for outlet in notes]
-        self._migrator = Migrator(self._ways, gpu_of[rank], gpu_of)
+        self.transfers = self.num_bytes = 0
+        self._migrator = migrator
+        self._writers = tuple(writers)
         self._capacity_bytes = capacity_bytes
         self._new_memory = new_memory
-        self._leave = leave
         self._memory: DeviceMemory | None = None
         self._ticket = b""
-        self._spec: Spec | None = None
+        self._head = np.zeros(0, np.uint8)
         self._num_envs = 0
-        self._slot = Slot((), 0)
-        self._sent = 0
-        self._waited_s = 0.0
-        self._is_open = True
+        self._offsets: list[int] = []
+        self._slot_bytes = 0
 
-    def send(self, experience: Mapping[str, Any], version: int, timeout_s: float) -> bool:
-        """See `ExperienceSender`; arrays are jax's, and are copied on the device.
+    def try_add(self, piece: Piece) -> bool:
+        """Copies a rollout into a slot, if one is free; its arrays are jax's.
 
         Raises:
+          ConfigError: too little memory for two rollouts, or one of another size.
           CudaError: memory of the GPU cannot be shared.
         """
-        self._migrator.check()
-        self._prepare(experience)
-        assert self._spec is not None
-        text = self._spec.encode()
-        sizes = [len(text), TICKET_BYTES, NOTE.itemsize]
-        started_s = time.monotonic()
-        opened = wait_until(
-            lambda: self._migrator.try_open(sizes), self._migrator.why_lost, timeout_s
-        )
-        self._waited_s += time.monotonic() - started_s
+        memory = self._prepare(piece)
+        opened = self._migrator.try_open([self._head.size, TICKET_BYTES, NOTE.itemsize])
         if opened is None:
             return False
-        way, (head, ticket, note) = opened
-        assert isinstance(way, _Way)
-        offset = (self._ways.index(way) * way.num_slots + way.next_slot) * self._slot.num_bytes
-        assert self._memory is not None
-        for begin, channel in zip(self._slot.offsets, self._spec.channels, strict=True):
-            self._memory.write(offset + begin, experience[channel.name])
-        head[:] = np.frombuffer(text, np.uint8)
-        ticket[:] = np.frombuffer(self._ticket, np.uint8)
-        note.view(NOTE)[0] = (offset, self._num_envs, version)
-        way.commit()
-        self._sent += 1
+        writer, views = opened
+        slot = writer.messages % writer.num_slots
+        place = self._writers.index(writer) * writer.num_slots + slot
+        offset = place * self._slot_bytes
+        for begin, channel in zip(self._offsets, piece.spec.channels, strict=True):
+            memory.write(offset + begin, piece.channels[channel.name])  # pyright: ignore[reportArgumentType]
+        views[0][:] = self._head
+        views[1][:] = np.frombuffer(self._ticket, np.uint8)
+        views[2].view(NOTE)[0] = (offset, piece.num_envs, piece.version)
+        writer.commit()
+        self.transfers += 1
+        self.num_bytes += self._slot_bytes
         return True
-
-    @property
-    def sent_pieces(self) -> int:
-        """Rollouts that trainers have got or will get, of predecessors with this rank too."""
-        return self._migrator.sent_items
 
     def flush(self) -> None:
         """Nothing ever waits for more to come."""
 
-    def stats(self) -> SenderStats:
-        """See `ExperienceSender`."""
-        return SenderStats(
-            pieces=self._sent,
-            dropped=0,
-            transfers=self._sent,
-            num_bytes=self._sent * self._slot.num_bytes,
-            waited_s=self._waited_s,
-            transfer_bytes=self._slot.num_bytes,
-            occupancy=self._migrator.occupancy() if self._is_open else 0.0,
-            least_occupancy=self._migrator.least_occupancy() if self._is_open else 0.0,
-        )
-
     def close(self) -> None:
-        """See `ExperienceSender`.
-
-        It waits a while for trainers: what they have not read goes with this process.
-        """
-        if self._is_open:
-            self._is_open = False
-            self._migrator.close()
-            with contextlib.suppress(GmijaxError):  # A trainer that is gone wants nothing.
-                wait_until(self._is_read, self._migrator.why_lost, CLOSE_TIMEOUT_S)
-            if self._memory is not None:
-                self._memory.close()
-            self._leave()
+        """Frees the memory when the trainers have read all, or some time has passed."""
+        with contextlib.suppress(GmijaxError):  # A trainer that is gone wants nothing.
+            wait_until(self._is_read, self._migrator.why_lost, CLOSE_TIMEOUT_S)
+        if self._memory is not None:
+            self._memory.close()
 
     def _is_read(self) -> bool | None:
-        return not any(way.occupancy() for way in self._ways) or None
+        return not any(writer.outstanding_messages for writer in self._writers) or None
 
-    def _prepare(self, experience: Mapping[str, Any]) -> None:
-        """Makes the slots when the first rollout shows how large they are."""
-        spec, num_envs = spec_of(experience, ())
-        if self._spec is not None:
-            if (spec, num_envs) != (self._spec, self._num_envs):
-                raise ConfigError(f"experience: got {spec}, the first was {self._spec}")
-            return
-        self._spec, self._num_envs, self._slot = spec, num_envs, slot_of(spec, num_envs)
-        num_slots = self._capacity_bytes // self._slot.num_bytes
+    def _prepare(self, piece: Piece) -> DeviceMemory:
+        """The memory; its slots are made when the first rollout shows how large they are."""
+        if self._memory is not None:
+            if piece.num_envs != self._num_envs:
+                raise ConfigError(
+                    f"experience: got {piece.num_envs} environments, the first had "
+                    f"{self._num_envs}"
+                )
+            return self._memory
+        self._head, self._num_envs = piece.spec.encode(), piece.num_envs
+        self._offsets, self._slot_bytes = slot_offsets(piece.spec, piece.num_envs)
+        num_slots = self._capacity_bytes // self._slot_bytes
         if num_slots < _LEAST_SLOTS:
             raise ConfigError(
                 f"channel.capacity_mib={self._capacity_bytes >> 20}: must hold {_LEAST_SLOTS} "
-                f"rollouts of {self._slot.num_bytes} bytes"
+                f"rollouts of {self._slot_bytes} bytes"
             )
-        self._memory = self._new_memory()
-        total = len(self._ways) * num_slots * self._slot.num_bytes
-        self._ticket = self._memory.create(total)
-        for way in self._ways:
-            way.num_slots, way.slot_bytes = num_slots, self._slot.num_bytes
+        memory = self._new_memory()
+        self._ticket = memory.create(len(self._writers) * num_slots * self._slot_bytes)
+        self._memory = memory
+        for writer in self._writers:
+            writer.num_slots, writer.slot_bytes = num_slots, self._slot_bytes
+        return memory
+
+
+class ResidentDecoder:
+    """Reads in place what one agent has left on the device; a `Decode`."""
+
+    def __init__(self, new_memory: NewMemory) -> None:
+        self._new_memory = new_memory
+        self._memory: DeviceMemory | None = None
+        self._views: dict[int, dict[str, jax.Array]] = {}
+
+    def __call__(self, message: Message) -> Transfer:
+        """The rollout that a note tells of.
+
+        Raises:
+          CudaError: the agent's memory cannot be read here.
+        """
+        spec = Spec.decode(message.parts[0])
+        offset, num_envs, version = message.parts[2].view(NOTE)[0].tolist()
+        if self._memory is None:
+            self._memory = self._new_memory()
+            self._memory.open(message.parts[1].tobytes())
+        if offset not in self._views:
+            self._views[offset] = {
+                channel.name: self._memory.view(
+                    offset + begin, channel.full_shape(num_envs), np.dtype(channel.dtype)
+                )
+                for begin, channel in zip(
+                    slot_offsets(spec, num_envs)[0], spec.channels, strict=True
+                )
+            }
+        arrays: dict[str, Any] = dict(self._views[offset])
+        return Transfer(spec, num_envs, np.full(num_envs, version, np.int64), arrays)
+
+    def close(self) -> None:
+        """Gives the mapping back."""
+        self._views.clear()
+        if self._memory is not None:
+            self._memory.close()
+            self._memory = None
+
+
+class DeviceStack(Stack):
+    """A batch that is put together on the device; parts are copied, for their slots get reused."""
+
+    def _begin(self) -> None:
+        self._parts: dict[str, list[jax.Array]] = {c.name: [] for c in self.spec.channels}
+
+    def _put(self, name: str, low: int, high: int, array: Any) -> None:
+        del low, high  # Parts come in order.
+        self._parts[name].append(jnp.copy(array).block_until_ready())
+
+    def _so_far(self) -> dict[str, Any]:
+        return {name: jnp.concatenate(parts, axis=1) for name, parts in self._parts.items()}

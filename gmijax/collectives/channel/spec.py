@@ -7,15 +7,23 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Mapping, Sequence
 from functools import lru_cache
-from typing import NamedTuple
+from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
+import numpy.typing as npt
 
-from gmijax.collectives.channel.interface import Array, Experience
-from gmijax.collectives.pipe import Bytes
+from gmijax.collectives.messages.pipe import Bytes
 from gmijax.errors import ConfigError
+
+Array: TypeAlias = npt.NDArray[Any]
+Experience: TypeAlias = Mapping[str, Array]
+"""Arrays by channel, [S, N, ...] float32 or bool, of N environments.
+
+S is the number of steps, or one more (the last state), or 1 (one value an unroll): channels may
+differ in it.
+"""
 
 DTYPES = ("float32", "bool")
 
@@ -59,20 +67,29 @@ class Spec(NamedTuple):
         """The same as it is before and after the way."""
         return Spec(tuple(c._replace(wire_dtype=c.dtype) for c in self.channels))
 
-    def encode(self) -> bytes:
-        """As text; `decode` is the way back."""
-        return json.dumps(self).encode()
+    def arrays_in(self, parts: Sequence[Bytes], num_envs: int) -> dict[str, Array]:
+        """Arrays by channel that lie in `parts`, bytes of every channel on the way."""
+        return {
+            channel.name: part.view(channel.wire_dtype).reshape(channel.full_shape(num_envs))
+            for channel, part in zip(self.channels, parts, strict=True)
+        }
+
+    def encode(self) -> Bytes:
+        """As bytes; `decode` is the way back."""
+        return np.frombuffer(json.dumps(self).encode(), np.uint8)
 
     @staticmethod
-    @lru_cache(maxsize=64)
-    def decode(text: bytes) -> Spec:
+    def decode(data: Bytes) -> Spec:
         """The spec that `encode` wrote."""
-        (channels,) = json.loads(text)
-        return Spec(
-            tuple(
-                Channel(name, steps, tuple(shape), *rest) for name, steps, shape, *rest in channels
-            )
-        )
+        return _decode(data.tobytes())
+
+
+@lru_cache(maxsize=64)
+def _decode(text: bytes) -> Spec:
+    (channels,) = json.loads(text)
+    return Spec(
+        tuple(Channel(name, steps, tuple(shape), *rest) for name, steps, shape, *rest in channels)
+    )
 
 
 def spec_of(experience: Experience, float16: Collection[str]) -> tuple[Spec, int]:
@@ -109,13 +126,3 @@ def write_channel(into: Array, values: Array) -> None:
         np.clip(values, -largest, largest, out=into, casting="same_kind")
     else:
         into[...] = values
-
-
-def arrays_of(spec: Spec, parts: Mapping[str, Bytes], num_envs: int) -> dict[str, Array]:
-    """Arrays by channel that lie in `parts`, bytes by channel."""
-    return {
-        channel.name: parts[channel.name]
-        .view(channel.wire_dtype)
-        .reshape(channel.full_shape(num_envs))
-        for channel in spec.channels
-    }

@@ -7,8 +7,8 @@ from typing import Any
 from brax import envs
 from brax.envs.base import Env as BraxEnv
 
+from gmijax.config.schema import suggestion
 from gmijax.errors import ConfigError
-from gmijax.schema import suggestion
 from gmijax.sim.adapters.theirs import adapt, require_jax
 from gmijax.sim.interface import Env
 

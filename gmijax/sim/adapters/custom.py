@@ -9,8 +9,8 @@ import sys
 from pathlib import Path
 from types import ModuleType
 
+from gmijax.config.schema import suggestion
 from gmijax.errors import ConfigError
-from gmijax.schema import suggestion
 from gmijax.sim.adapters.checks import attempt, check_env, check_start
 from gmijax.sim.interface import Env
 from gmijax.sim.source import split

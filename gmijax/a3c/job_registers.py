@@ -1,0 +1,99 @@
+"""What trainers and agents tell each other, in registers that nobody ever waits for.
+
+Register 0: orders of the leading trainer. Register 1: the newest weights, with the policy's
+version as tag. Then one per agent: what it has done so far. Experience travels elsewhere.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from gmijax.collectives.messages.registers import Register, open_registers
+
+_NO_CHECKPOINT = -1
+
+
+class Orders(NamedTuple):
+    """What the leading trainer wants of all agents.
+
+    Attributes:
+      checkpoint: environment steps of the checkpoint to which every agent is to add its
+        environments, None for none.
+      is_ending: whether agents are to end when they have done so.
+    """
+
+    checkpoint: int | None
+    is_ending: bool
+
+    def pack(self) -> npt.NDArray[np.int64]:
+        """As numbers for the register."""
+        return np.array([_number(self.checkpoint), self.is_ending], np.int64)
+
+    @classmethod
+    def unpack(cls, values: npt.NDArray[np.uint8]) -> Orders:
+        """Inverts `pack`."""
+        checkpoint, is_ending = values.view(np.int64)
+        return cls(_optional(checkpoint), bool(is_ending))
+
+
+class Report(NamedTuple):
+    """What an agent has done since its start.
+
+    Attributes:
+      checkpoint: environment steps of the latest checkpoint that it has added to, or None.
+      env_steps: environment steps acted upon: predictions.
+      bytes_sent: of experience.
+      dropped: pieces of experience that were dropped because there was no room.
+      send_s: seconds spent on sending, with waits for room.
+      wait_s: those of them in which it waited for room and had nothing to compute.
+      occupancy: fraction of the room for experience that was full, after the last send.
+      stats: [M] sums over all its unrolls, see `gmijax.learning.unroll.Counts`.
+    """
+
+    checkpoint: int | None
+    env_steps: float
+    bytes_sent: float
+    dropped: float
+    send_s: float
+    wait_s: float
+    occupancy: float
+    stats: npt.NDArray[np.float64]
+
+    def pack(self) -> npt.NDArray[np.float64]:
+        """As numbers for the register; environment steps are exact up to 2^53."""
+        head = [_number(self.checkpoint), *self[1:-1]]
+        return np.concatenate([np.array(head, np.float64), self.stats])
+
+    @classmethod
+    def unpack(cls, values: npt.NDArray[np.uint8]) -> Report:
+        """Inverts `pack`."""
+        numbers, head = values.view(np.float64), len(cls._fields) - 1
+        first, *rest = (float(x) for x in numbers[:head])
+        return cls(_optional(first), *rest, stats=numbers[head:])
+
+
+class JobRegisters(NamedTuple):
+    """All registers of a job, see the module."""
+
+    orders: Register
+    weights: Register
+    reports: tuple[Register, ...]
+
+
+def open_job_registers(fd: int, num_weights: int, num_stats: int, num_agents: int) -> JobRegisters:
+    """Maps the registers of a job; `fd` is from `create_registers`."""
+    report_bytes = 8 * (len(Report._fields) - 1 + num_stats)
+    sizes = [8 * len(Orders._fields), 4 * num_weights, *[report_bytes] * num_agents]
+    orders, weights, *reports = open_registers(fd, sizes)
+    return JobRegisters(orders, weights, tuple(reports))
+
+
+def _number(checkpoint: int | None) -> int:
+    return _NO_CHECKPOINT if checkpoint is None else checkpoint
+
+
+def _optional(number: float) -> int | None:
+    return None if number == _NO_CHECKPOINT else int(number)

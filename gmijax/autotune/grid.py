@@ -1,0 +1,132 @@
+"""Points of a search, what was measured there, and the ways through their grid. Pure data."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Final, NamedTuple
+
+_STRIDE: Final = 3
+_COARSE_SIZES: Final = 2
+
+
+class Point(NamedTuple):
+    """A point of the grid.
+
+    Attributes:
+      gmis_per_gpu: GMIs on every GPU; where others train, those that act on every GPU that acts.
+      num_envs: environments per GMI.
+      impl: physics implementation.
+      trainers: training GMIs on every GPU that trains; 0: every GMI does everything.
+    """
+
+    gmis_per_gpu: int
+    num_envs: int
+    impl: str
+    trainers: int = 0
+
+    @property
+    def gmis(self) -> str:
+        """`4`, or `4 + 1` with a trainer."""
+        return f"{self.gmis_per_gpu}{f' + {self.trainers}' if self.trainers else ''}"
+
+    @property
+    def gmis_key(self) -> str:
+        """The same in names of files: `4`, or `4+1`."""
+        return self.gmis.replace(" ", "")
+
+    def __str__(self) -> str:
+        """`4 x 2048, jax`, or `4 + 1 x 2048, jax` with a trainer."""
+        return f"{self.gmis} x {self.num_envs}, {self.impl}"
+
+
+class Measured(NamedTuple):
+    """Figures of one GMI at a point.
+
+    Attributes:
+      env_steps_per_s: environment steps a second of one GMI, the paper's `top`; where others
+        train, those that were learnt from for each GMI that acts.
+      memory_mib: its peak memory, MiB, the paper's `mem`.
+      iteration_s: seconds of one iteration.
+      reduce_s: those of them in the exchange of gradients; 0 where that was not measured.
+      acting_per_s: environment steps a second that the agents of one serving GPU could make if
+        trainers took everything; 0 where every GMI does everything.
+      learning_per_s: those that the trainers of one training GPU could learn from if there were
+        always a batch; 0 as above.
+    """
+
+    env_steps_per_s: float
+    memory_mib: float
+    iteration_s: float
+    reduce_s: float = 0.0
+    acting_per_s: float = 0.0
+    learning_per_s: float = 0.0
+
+
+class NotRunnable(NamedTuple):
+    """A point that cannot run.
+
+    Attributes:
+      reason: why, in one line.
+      limit_s: the time within which it did not end; None where something else was the matter.
+    """
+
+    reason: str
+    limit_s: float | None = None
+
+
+class Grid(NamedTuple):
+    """All points that may be looked at."""
+
+    gmis_per_gpu: tuple[int, ...]
+    num_envs: tuple[int, ...]
+    impls: tuple[str, ...]
+    trainers: tuple[int, ...] = (0,)
+
+
+def as_printed(grid: Grid) -> Grid:
+    """The grid in the paper's order: from the most GMIs down, from the smallest size up."""
+    rows = tuple(sorted(grid.gmis_per_gpu, reverse=True))
+    return grid._replace(gmis_per_gpu=rows, num_envs=tuple(sorted(grid.num_envs)))
+
+
+def coarse(grid: Grid) -> Grid:
+    """Every third row, with the largest size and the third below it.
+
+    The row with the fewest GMIs is among them: it is the measure of all others. It comes first,
+    because the fewer GMIs, the sooner they have started, and time may run out. Smaller sizes are
+    left to the climb: where there is room for more environments, few are hardly ever the answer.
+    """
+    sizes = sorted(grid.num_envs, reverse=True)[::_STRIDE]
+    return Grid(
+        _some_rows(grid.gmis_per_gpu),
+        tuple(sorted(sizes[:_COARSE_SIZES])),
+        grid.impls,
+        _some_rows(grid.trainers),
+    )
+
+
+def first_row(grid: Grid) -> Grid:
+    """The row with the fewest GMIs of a grid that begins with it."""
+    return grid._replace(gmis_per_gpu=grid.gmis_per_gpu[:1], trainers=grid.trainers[:1])
+
+
+def neighbours(point: Point, grid: Grid) -> list[Point]:
+    """The points one step away in the grid: in GMIs, in trainers, then in environments."""
+    rows = _beside(point.gmis_per_gpu, sorted(grid.gmis_per_gpu))
+    trainers = _beside(point.trainers, sorted(grid.trainers))
+    sizes = _beside(point.num_envs, sorted(grid.num_envs))
+    return [
+        *(point._replace(gmis_per_gpu=row) for row in rows),
+        *(point._replace(trainers=number) for number in trainers),
+        *(point._replace(num_envs=size) for size in sizes),
+    ]
+
+
+def _some_rows(values: Sequence[int]) -> tuple[int, ...]:
+    rows = sorted(values, reverse=True)
+    return tuple(sorted({*rows[::_STRIDE], rows[-1]}))
+
+
+def _beside(value: int, values: Sequence[int]) -> list[int]:
+    at = values.index(value)
+    return [values[i] for i in (at + 1, at - 1) if 0 <= i < len(values)]

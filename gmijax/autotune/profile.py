@@ -1,0 +1,87 @@
+"""One profile of a search: a real short job in child GMIs. No jax here.
+
+Whatever goes wrong in the job is an answer, not an error.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import shutil
+import time
+from collections.abc import Callable, Sequence
+from typing import Any, Final
+
+from gmijax.autotune.grid import Measured, NotRunnable, Point
+from gmijax.autotune.workloads import Mode, Workload
+from gmijax.config.schema import to_dict
+from gmijax.errors import ConfigError, GmijaxError, JobInterrupted
+from gmijax.machine.snapshot import Machine
+from gmijax.runs.folder import RunPaths, write_json
+from gmijax.supervise.gmi_process import GmiStatus
+from gmijax.supervise.launcher import Launch, run_gmis
+from gmijax.supervise.supervisor import Timeouts
+
+_TIMEOUTS: Final = Timeouts(
+    start_timeout_s=60.0, stall_timeout_s=60.0, stop_timeout_s=3.0, grace_s=3.0
+)
+
+
+class ProfileLate(Exception):
+    """A profile did not end within its time limit; says how far its GMIs were."""
+
+
+def profile(
+    workload: Workload[Any],
+    point: Point,
+    mode: Mode,
+    machine: Machine,
+    run: RunPaths,
+    *,
+    limit_s: float,
+    on_tick: Callable[[Sequence[GmiStatus]], None],
+    on_warning: Callable[[str], None],
+) -> Measured | NotRunnable:
+    """Runs a short job at a point; `run` is its folder, of which logs are kept.
+
+    Raises:
+      ProfileLate: it did not end within `limit_s`.
+      JobInterrupted: a signal came.
+    """
+    try:
+        plan = workload.plan_at(point, mode, machine)
+        config = workload.config_at(point, plan.layout.num_gmis)
+    except ConfigError as error:
+        return NotRunnable(str(error))
+    write_json(run.config, to_dict(config))
+    write_json(run.plan, plan.to_dict())
+    deadline_s = time.monotonic() + limit_s
+
+    def watch(gmis: tuple[GmiStatus, ...]) -> None:
+        on_tick(gmis)
+        if time.monotonic() > deadline_s:
+            states = ", ".join(f"GMI {gmi.gmi} {gmi.state}" for gmi in gmis)
+            raise ProfileLate(f"no end within {limit_s:.0f} s ({states})")
+
+    launch = Launch(
+        plan=plan,
+        machine=machine,
+        run=run,
+        kind=workload.kind,
+        timeouts=dataclasses.replace(
+            _TIMEOUTS, start_timeout_s=2 * limit_s, stall_timeout_s=2 * limit_s
+        ),
+        on_warning=on_warning,
+        is_enough=workload.enough(plan, run),
+    )
+    try:
+        run_gmis(launch, watch)
+        return workload.read(plan, run)
+    except JobInterrupted:
+        raise
+    except GmijaxError as error:
+        return NotRunnable(" ".join(str(error).split()))
+    # All GMIs ended well, and still their results do not say what they should.
+    except (OSError, ArithmeticError, LookupError, TypeError, ValueError) as error:
+        return NotRunnable(f"no result to read: {type(error).__name__}: {error}")
+    finally:
+        shutil.rmtree(run.checkpoints, ignore_errors=True)

@@ -1,0 +1,148 @@
+"""The profile store: what points of a search did, kept between searches. No jax here.
+
+One JSON file for a device, a task with its settings, and the versions of what computes. A search
+writes it after every profile: what was interrupted goes on from there, and a second search of the
+same job measures nothing.
+"""
+
+from __future__ import annotations
+
+import fcntl
+import hashlib
+import json
+import os
+import re
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from typing import Any
+
+from gmijax.autotune.grid import Measured, NotRunnable, Point
+from gmijax.config.schema import require_positive
+from gmijax.errors import ConfigError
+from gmijax.runs.cache import cache_folder
+from gmijax.runs.folder import read_json, write_json
+
+_DIGEST_LENGTH = 10
+
+
+class ProfileStore:
+    """The profiles of one device, task and version.
+
+    Attributes:
+      path: the file; it is made with the first profile.
+    """
+
+    def __init__(self, folder: Path, key: Mapping[str, Any], note: Callable[[str], None]) -> None:
+        """Reads what there is.
+
+        Args:
+          folder: where the files of all devices and tasks are.
+          key: everything that decides what a point does; `device` and `task` name the file.
+          note: gets a sentence where a broken file was moved aside.
+
+        Raises:
+          ConfigError: the folder cannot be used.
+        """
+        self._key = dict(key)
+        self._note = note
+        digest = hashlib.sha256(json.dumps(self._key, sort_keys=True).encode()).hexdigest()
+        name = f"{_slug(key['device'])}-{_slug(key['task'])}-{digest[:_DIGEST_LENGTH]}.json"
+        self.path = folder / name
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise ConfigError(
+                f"search.store={folder}: cannot be used ({error.strerror})"
+            ) from None
+        self._records = self._load()
+
+    def get(self, mode: str, point: Point) -> Measured | NotRunnable | None:
+        """Result of a point, None where it was not profiled yet."""
+        record = self._records.get(_name(mode, point))
+        return _result(record) if record else None
+
+    def put(self, mode: str, point: Point, result: Measured | NotRunnable, wall_s: float) -> None:
+        """Keeps what a point did; the file is written at once, as a whole.
+
+        Raises:
+          ConfigError: it cannot be written.
+        """
+        if isinstance(result, NotRunnable):
+            said = {"not_runnable": result.reason, "limit_s": result.limit_s, "wall_s": wall_s}
+        else:
+            said = {**result._asdict(), "wall_s": wall_s}
+        record = {key: value for key, value in said.items() if value is not None}
+        try:
+            with _locked(self.path.with_suffix(".lock")):
+                # What another search has found meanwhile stays.
+                self._records = {**self._records, **self._load(), _name(mode, point): record}
+                write_json(self.path, {"key": self._key, "profiles": self._records})
+        except OSError as error:
+            raise ConfigError(
+                f"search.store={self.path.parent}: cannot be written ({error.strerror})"
+            ) from None
+
+    def _load(self) -> dict[str, dict[str, Any]]:
+        if not self.path.exists():
+            return {}
+        try:
+            profiles = read_json(self.path)["profiles"]
+            for item in profiles.values():
+                _result(item)
+            return dict(profiles)
+        except (OSError, ValueError, KeyError, TypeError, AttributeError, ConfigError) as error:
+            aside = _moved_aside(self.path)
+            what = " ".join(str(error).split()) or type(error).__name__
+            self._note(f"profile store {self.path} is broken ({what}): moved to {aside}")
+            return {}
+
+
+def default_folder() -> Path:
+    """Where profiles are kept unless `search.store` names a folder."""
+    return cache_folder() / "profiles"
+
+
+@contextmanager
+def _locked(path: Path) -> Iterator[None]:
+    """Keeps other searches out of a store; file systems that know no locks go without."""
+    with path.open("w") as file:
+        with suppress(OSError):
+            fcntl.flock(file, fcntl.LOCK_EX)
+        yield
+
+
+def _moved_aside(path: Path) -> Path:
+    for number in range(1000):
+        aside = path.with_name(f"{path.name}.broken{number or ''}")
+        if not aside.exists():
+            try:
+                os.replace(path, aside)
+            except OSError as error:
+                raise ConfigError(
+                    f"search.store={path.parent}: cannot move {path.name} ({error.strerror})"
+                ) from None
+            return aside
+    raise ConfigError(f"search.store={path.parent}: too many broken files of {path.name}")
+
+
+def _name(mode: str, point: Point) -> str:
+    return f"{mode} {point.gmis_key}x{point.num_envs} {point.impl}"
+
+
+def _slug(text: object) -> str:
+    return re.sub(r"[^a-z0-9]+", "-", str(text).lower()).strip("-")
+
+
+def _result(record: Mapping[str, Any]) -> Measured | NotRunnable:
+    """Result of a profile in the file; versions without trainers left some figures out.
+
+    Raises:
+      ConfigError, ValueError, TypeError: it is broken.
+    """
+    if record.get("not_runnable") is not None:
+        return NotRunnable(str(record["not_runnable"]), record.get("limit_s"))
+    found = Measured(*(float(record.get(name) or 0.0) for name in Measured._fields))
+    for key in ("env_steps_per_s", "memory_mib", "iteration_s"):
+        require_positive(key, getattr(found, key))
+    return found

@@ -1,0 +1,1 @@
+"""Command lines: overrides to configuration, `--help`, exit codes."""

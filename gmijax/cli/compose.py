@@ -1,0 +1,298 @@
+"""From `key=value` overrides to a checked configuration; the only user of hydra."""
+
+from __future__ import annotations
+
+import re
+import typing
+import unicodedata
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import Any, Literal, TypeVar, overload
+
+from hydra import compose as hydra_compose
+from hydra import initialize_config_dir
+from hydra.core.override_parser.overrides_parser import OverridesParser
+from hydra.core.override_parser.types import Override
+from hydra.errors import HydraException
+from omegaconf import OmegaConf
+from omegaconf.errors import OmegaConfBaseException
+
+import gmijax
+from gmijax.config import ServeConfig, TrainConfig
+from gmijax.config.schema import from_dict, suggestion
+from gmijax.errors import ConfigError
+from gmijax.runs.resume import saved_config_of
+from gmijax.sim.registry import SUITES
+from gmijax.sim.source import reference
+
+C = TypeVar("C")
+
+_COMPOSED: Mapping[str, type[Any]] = {
+    "train": TrainConfig,
+    "search": TrainConfig,
+    "serve": ServeConfig,
+}
+
+_NOT_TEXT = ("Cc", "Cs", "Zl", "Zp")
+"""Unicode's categories of control characters, surrogates, and ends of lines and paragraphs."""
+
+
+@overload
+def compose(
+    *overrides: str,
+    command: Literal["train", "search"] = ...,
+    env: Callable[..., Any] | None = ...,
+) -> TrainConfig: ...
+
+
+@overload
+def compose(
+    *overrides: str, command: Literal["serve"], env: Callable[..., Any] | None = ...
+) -> ServeConfig: ...
+
+
+def compose(*overrides: str, command: str = "train", env: Callable[..., Any] | None = None) -> Any:
+    """The configuration that `python -m gmijax.train OVERRIDES` (or another command) would run.
+
+    Args:
+      overrides: `key=value`.
+      command: `train`, `search` (a training job whose `num_envs` and `plan.gmis_per_gpu` are
+        `auto`) or `serve`.
+      env: a function `make(*, impl, max_envs) -> gmijax.sim.interface.Env` at the top level of a
+        file, in place of `env=path/to/file.py:make`.
+
+    Example:
+      >>> compose("env=ant", "num_envs=512").num_envs
+      512
+
+    Raises:
+      ConfigError: an unknown key, a wrong type or value, or a function that is in no file.
+    """
+    chosen = () if env is None else (f"env={reference(env)}",)
+    if command not in _COMPOSED:
+        raise ConfigError(f"command={command}: allowed are {', '.join(_COMPOSED)}")
+    return build(command, _COMPOSED[command], (*chosen, *overrides))
+
+
+def config_dir() -> Path:
+    """The folder of YAML files: inside an installed package, or beside it in a checkout."""
+    package = Path(gmijax.__file__).resolve().parent
+    installed = package / "configs"
+    return installed if installed.is_dir() else package.parent / "configs"
+
+
+def choices(group: str) -> list[str]:
+    """Names of the YAML files of a group, e.g. the tasks for `env`."""
+    # No path of the user's making: it could lead anywhere, or be too long for a file system.
+    folders = [path for path in config_dir().iterdir() if path.name == group]
+    return sorted(path.stem for folder in folders for path in folder.glob("*.yaml"))
+
+
+def build(name: str, cls: type[C], overrides: Sequence[str]) -> C:
+    """The configuration of a command; raises as `compose`."""
+    overrides = [part for text in overrides for part in _with_custom_task(name, text)]
+    data = _compose_dict(name, [*_algorithm_of_resumed(name, overrides), *overrides])
+    if cls is ServeConfig:
+        _check_task_key(_parse(overrides))
+        data = _with_task_of_run(data, overrides)
+    if cls is TrainConfig:
+        _check_task_key(_parse(overrides))
+        # With `auto` the command that started the run is given again, whole.
+        resume = data["run"].get("resume") if isinstance(data["run"], dict) else None
+        if resume not in (None, "auto"):
+            data = _on_top_of_saved(data, overrides, str(resume))
+    for key, value in _flatten(data).items():  # What the environment has may be anything.
+        if isinstance(value, str):
+            _require_text(f"{key}={value}")
+    return from_dict(cls, data)
+
+
+def _algorithm_of_resumed(name: str, overrides: Sequence[str]) -> list[str]:
+    """`algo=` of the run that `overrides` resume: its algorithm decides which keys there are."""
+    if name != "train":
+        return []
+    given = {item.key_or_group: str(item.value()) for item in _parse(overrides)}
+    resume = given.get("run.resume", "null")
+    if "algo" in given or resume in ("null", "None", "", "auto"):
+        return []
+    algo = saved_config_of(resume, "run.resume")["algo"].get("name", "ppo")
+    return [f"algo={algo}"]
+
+
+def _compose_dict(name: str, overrides: Sequence[str]) -> dict[str, Any]:
+    for item in _parse(overrides):
+        _check_override(name, item)
+    try:
+        with initialize_config_dir(str(config_dir()), version_base=None):
+            config = hydra_compose(name, overrides=list(overrides))
+        data = OmegaConf.to_container(config, resolve=True, throw_on_missing=True)
+    except (HydraException, OmegaConfBaseException) as error:
+        raise ConfigError(_one_line(name, error)) from None
+    except OSError as error:  # Hydra looks for a file with the name of the key.
+        raise ConfigError(f"{max(overrides, key=len, default=name)}: {error.strerror}") from None
+    return typing.cast("dict[str, Any]", data)
+
+
+def _check_override(name: str, item: Override) -> None:
+    key = item.key_or_group
+    if not key:
+        raise ConfigError(f"{item.input_line}: expected key=value")
+    # Hydra's own settings are for jobs that hydra runs; here they would do nothing.
+    if re.split(r"[./]", key)[0] == "hydra":
+        raise _unknown_key(key, _known_keys(name))
+    if item.is_sweep_override():
+        raise ConfigError(f"{item.input_line}: expected one value (a list stands in brackets)")
+    options = choices(key)
+    if options and not item.is_delete() and item.value() not in options:
+        close = suggestion(str(item.value()), options)
+        raise ConfigError(f"{key}={item.value()}: unknown{close}")
+
+
+def _with_custom_task(name: str, override: str) -> tuple[str, ...]:
+    """`env=path/to/file.py:make` in words that hydra knows; anything else as it is."""
+    key, _, value = override.partition("=")
+    if key != "env" or not re.search(r"\.py(:|$)", value):
+        return (override,)
+    quoted = value.replace("\\", "\\\\").replace("'", "\\'")
+    if name == "play":  # Which task it is the run says.
+        return (f"run.env='{quoted}'",)
+    return "env=custom", f"env.name='{quoted}'"
+
+
+def _check_task_key(items: Sequence[Override]) -> None:
+    """Refuses `env.name` alone: it would run a task with the settings tuned for another one."""
+    groups = {str(item.value()) for item in items if item.key_or_group == "env"}
+    for item in items:
+        name = str(item.value())
+        if item.key_or_group == "env.suite" and name not in groups:
+            raise ConfigError(f"env.suite={name}: choose it with env=")
+        if item.key_or_group == "env.name" and not groups & {name, *SUITES}:
+            raise ConfigError(f"env.name={name}: choose the task with env={name}")
+
+
+def _unknown_key(key: str, known: Iterable[str]) -> ConfigError:
+    return ConfigError(f"unknown key {key}{suggestion(key, known)}")
+
+
+def _parse(overrides: Sequence[str]) -> list[Override]:
+    parser = OverridesParser.create()
+    return [_parsed(parser, text) for text in overrides]
+
+
+def _require_text(text: str) -> None:
+    # A surrogate stands for a byte that is no text, which nothing can print.
+    if any(unicodedata.category(letter) in _NOT_TEXT for letter in text):
+        raise ConfigError(f"{text!r}: expected text without control characters")
+
+
+def _parsed(parser: OverridesParser, text: str) -> Override:
+    _require_text(text)
+    try:
+        return parser.parse_overrides([text])[0]
+    except RecursionError:
+        raise ConfigError(f"{text}: nested too deeply") from None
+    except ValueError:  # Python's own limit.
+        raise ConfigError(f"{text}: a number has too many digits") from None
+    except HydraException as error:
+        if "=" not in text:
+            raise ConfigError(f"{text}: expected key=value") from None
+        raise ConfigError(" ".join(str(error).split())) from None
+
+
+def _on_top_of_saved(
+    data: dict[str, Any], overrides: Sequence[str], resume: str
+) -> dict[str, Any]:
+    """The saved configuration of the resumed run, changed where the command line says so.
+
+    What an older version did not save comes from the defaults for the run's own task.
+    """
+    saved = saved_config_of(resume, "run.resume")
+    saved["run"].update(dir=None, name=None)
+    items = _parse(overrides)
+    suite = saved["env"].get("suite", "gmijax")
+    task = saved["env"].get("name") if suite == "gmijax" else suite
+    if task in choices("env") and all(item.key_or_group != "env" for item in items):
+        algo = _algorithm_of_resumed("train", overrides)
+        data = _compose_dict("train", [f"env={task}", *algo, *overrides])
+    merged = _merged(data, saved)
+    if "randomization" in saved["env"]:  # A leaf that the run left out stays out.
+        merged["env"]["randomization"] = saved["env"]["randomization"]
+    for item in items:
+        key = item.key_or_group
+        if key == "env.name":  # Whatever the file holds by now is meant.
+            merged["env"]["source_sha256"] = None
+        if (key, item.value()) == ("env", "custom") and suite == "custom":
+            continue  # The file may have moved; `env.name` says where to.
+        if _copy_key(key, data, merged):
+            continue
+        if item.is_delete() or choices(key):
+            raise ConfigError(
+                f"{item.input_line}: a run that is resumed keeps its settings; "
+                "change single keys with key=value"
+            )
+        raise _unknown_key(key, _flatten(data))
+    merged["run"]["resume"] = resume
+    return merged
+
+
+def _with_task_of_run(data: dict[str, Any], overrides: Sequence[str]) -> dict[str, Any]:
+    """With `run.dir` and without `env=`: the task of that run, changed where `env.*` says so."""
+    items = _parse(overrides)
+    run_dir = data["run"].get("dir") if isinstance(data["run"], dict) else None
+    if run_dir is None or any(item.key_or_group == "env" for item in items):
+        return data
+    saved = saved_config_of(str(run_dir), "run.dir")["env"]
+    merged = {**data, "env": {**data["env"], **saved}}
+    for item in items:
+        if item.key_or_group.startswith("env."):
+            _copy_key(item.key_or_group, data, merged)
+    return merged
+
+
+def _merged(base: Mapping[str, Any], top: Mapping[str, Any]) -> dict[str, Any]:
+    """`base` with the values of `top`, group by group."""
+    merged = {**base, **top}
+    for key in base.keys() & top.keys():
+        if isinstance(base[key], Mapping) and isinstance(top[key], Mapping):
+            merged[key] = _merged(base[key], top[key])
+    return merged
+
+
+def _copy_key(key: str, source: dict[str, Any], target: dict[str, Any]) -> bool:
+    """Copies the value or group of a dotted key; returns whether `source` has it."""
+    *groups, last = key.split(".")
+    for group in groups:
+        source, target = source.get(group, {}), target.get(group, {})
+        if not (isinstance(source, dict) and isinstance(target, dict)):
+            return False
+    if last in source:
+        target[last] = source[last]
+    return last in source
+
+
+def _one_line(name: str, error: Exception) -> str:
+    text = " ".join(str(error).split())
+    if match := re.search(r"Key '([^']+)' is not in struct full_key: (\S+)", text):
+        return str(_unknown_key(match[2], _known_keys(name)))
+    if match := re.search(r"Could not override '([^']+)'", text):
+        return str(_unknown_key(match[1], _known_keys(name)))
+    return text
+
+
+def _known_keys(name: str) -> list[str]:
+    return list(defaults(name, ()))
+
+
+def defaults(name: str, overrides: Sequence[str]) -> dict[str, Any]:
+    """The values of all keys of a command, by dotted name, with some overrides."""
+    return _flatten(_compose_dict(name, overrides))
+
+
+def _flatten(data: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
+    flat: dict[str, Any] = {}
+    for key, value in data.items():
+        if isinstance(value, Mapping):
+            flat |= _flatten(value, f"{prefix}{key}.")
+        else:
+            flat[f"{prefix}{key}"] = value
+    return flat

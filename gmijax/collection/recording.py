@@ -1,0 +1,180 @@
+"""What a serving GMI keeps: experience as shards, statistics as lines for the progress display."""
+
+from __future__ import annotations
+
+import os
+import statistics
+import time
+from collections.abc import Callable, Mapping
+from concurrent.futures import Future, ThreadPoolExecutor
+from pathlib import Path
+from typing import Any, BinaryIO
+
+import jax
+import numpy as np
+
+from gmijax.collection.programs import Counts, Step
+from gmijax.learning.metrics import EpisodeWindow, JsonlSink
+from gmijax.learning.physics_health import OverflowCount, check_diverged, overflow_line
+from gmijax.runs.dataset import DataPaths
+from gmijax.runs.folder import write_json
+from gmijax.supervise.child import ChildLink
+
+
+class ShardWriter:
+    """Writes the shards of one GMI in order, in a thread, while the next unroll is made.
+
+    Attributes:
+      num_written: shards that are finished and safe, by this writer.
+      num_bytes: their size.
+    """
+
+    def __init__(
+        self, paths: DataPaths, rank: int, first: int, about: Mapping[str, Any], *, compress: bool
+    ) -> None:
+        """Begins at shard `first`; `about` goes into the JSON file of every shard."""
+        self.num_written = self.num_bytes = 0
+        self._paths = paths
+        self._rank = rank
+        self._first = self._next = first
+        self._about = dict(about)
+        self._save: Callable[..., None] = np.savez_compressed if compress else np.savez
+        self._pool = ThreadPoolExecutor(1, "shards")
+        self._pending: Future[int] | None = None
+        paths.folder(rank).mkdir(parents=True, exist_ok=True)
+        for left in paths.folder(rank).glob(".[0-9]*"):  # Of arrays, and of their JSON files.
+            left.unlink()
+
+    def write(self, steps: Step) -> None:
+        """Takes one unroll [T, N]; waits for the one before, and raises what it met."""
+        self.wait()
+        self._pending = self._pool.submit(self._write, self._next, steps)
+        self._next += 1
+
+    def wait(self) -> None:
+        """Returns when all that was taken is written.
+
+        Raises:
+          OSError: it cannot be written, e.g. because the disk is full.
+        """
+        if self._pending is not None:
+            pending, self._pending = self._pending, None
+            self.num_bytes += pending.result()
+            self.num_written += 1
+
+    def close(self) -> None:
+        """Ends the thread; what is being written is finished first."""
+        self._pool.shutdown()
+
+    def _write(self, index: int, steps: Step) -> int:
+        arrays = {
+            name: np.asarray(array) for name, array in steps._asdict().items() if array is not None
+        }
+        shard = self._paths.shard(self._rank, index)
+        size = _write_whole(shard.arrays, lambda file: self._save(file, **arrays))
+        write_json(
+            shard.about,
+            {
+                **self._about,
+                "shard": index,
+                "env_steps": int(arrays["reward"].size),
+                # The environments of a job that goes on start anew; no episode spans the gap.
+                "starts_with_reset": index == self._first,
+                "num_bytes": size,
+                "arrays": {
+                    name: {"shape": list(array.shape), "dtype": str(array.dtype)}
+                    for name, array in arrays.items()
+                },
+            },
+        )
+        return size
+
+
+def _write_whole(path: Path, save: Callable[[BinaryIO], None]) -> int:
+    """Writes a file under another name, then renames it; returns its size in bytes."""
+    temporary = path.with_name(f".{path.name}.partial")
+    with temporary.open("wb") as file:
+        save(file)
+        file.flush()
+        # A crash of the machine must not leave a JSON file beside arrays that are not there.
+        os.fsync(file.fileno())
+        size = file.tell()
+    os.replace(temporary, path)
+    return size
+
+
+class CollectionStats:
+    """Counts unrolls; the clock starts when it is made.
+
+    Attributes:
+      env_steps: environment steps so far.
+      num_unrolls: unrolls so far.
+    """
+
+    def __init__(self, link: ChildLink, env_name: str, steps_per_unroll: int) -> None:
+        self.env_steps = self.num_unrolls = 0
+        self._link = link
+        self._env_name = env_name
+        self._steps = steps_per_unroll
+        self._window = EpisodeWindow()
+        self._totals = {"count": 0.0, "return_sum": 0.0, "length_sum": 0.0}
+        self._diverged = 0.0
+        self._overflows = OverflowCount(env_name)
+        self._unroll_s: list[float] = []
+        self._started_s = self._last_s = time.monotonic()
+        self._lines = JsonlSink(link.paths.metrics)
+
+    def add(self, counts: Counts) -> None:
+        """Waits for an unroll and takes it in.
+
+        Raises:
+          NonFiniteError: too many worlds gave numbers that are not finite or beyond all bounds.
+        """
+        host: Any = jax.tree.map(float, jax.device_get(counts))
+        now_s = time.monotonic()
+        self._unroll_s.append(now_s - self._last_s)
+        self._last_s = now_s
+        self.env_steps += self._steps
+        self.num_unrolls += 1
+        where = f"{self._env_name}, up to env step {self.env_steps} of this GMI"
+        check_diverged(where, host.diverged, self._steps)
+        self._diverged += host.diverged["any"]
+        self._overflows.add(host.overflowed)
+        episodes = host.episodes
+        self._window.add(episodes)
+        for name in self._totals:
+            self._totals[name] += getattr(episodes, name)
+        means = self._window.means()
+        self._lines.write(
+            {
+                "env_steps": self.env_steps,
+                "wall_s": now_s - self._started_s,
+                "env_steps_per_s": self._steps / self._unroll_s[-1],
+                "return": means["return"],
+                "episode_length": means["episode_length"],
+                "episodes": self._totals["count"],
+                "diverged_steps": self._diverged,
+                **overflow_line(host.overflowed),
+            }
+        )
+        self._link.beat("running", self.num_unrolls)
+
+    def close(self) -> None:
+        """Flushes the lines."""
+        self._lines.close()
+
+    def outcome(self) -> dict[str, Any]:
+        """What this GMI has collected, for `result.json`."""
+        wall_s = self._last_s - self._started_s
+        steady = self._unroll_s[1:] or self._unroll_s
+        return {
+            "env_steps": self.env_steps,
+            "unrolls": self.num_unrolls,
+            "serve_wall_s": wall_s,
+            "env_steps_per_s": self.env_steps / wall_s if self.env_steps else None,
+            # The first unroll fills caches and pools.
+            "step_per_s_inference": self._steps / statistics.median(steady) if steady else None,
+            "episodes": self._totals,
+            "diverged_steps": self._diverged,
+            "overflow_steps": self._overflows.steps,
+        }

@@ -1,0 +1,1 @@
+"""Messages between processes of a host: pipes, registers, mailboxes, group reductions."""

@@ -1,0 +1,184 @@
+"""Messages between the GMIs of a host: nested data over pipes in shared memory.
+
+Sending is asynchronous: what does not fit into the pipe at once is copied, and a thread passes it
+on piece by piece, so that GMIs which send to each other before they receive never block each
+other, however large the messages. Receiving waits, with a timeout.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import time
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any, Final
+
+import numpy as np
+
+from gmijax.collectives.messages.mailboxes import DATA, Inbox, Outbox, frames_of
+from gmijax.collectives.messages.pipe import PipeReader, PipeWriter
+from gmijax.collectives.messages.pipe_block import PipeBlock
+from gmijax.collectives.waits import wait_until
+from gmijax.errors import CollectiveTimeout, ConfigError, PipeClosed
+
+if TYPE_CHECKING:
+    from gmijax.collectives.messages.device_buffers import DeviceBuffers
+
+MIN_CAPACITY_BYTES: Final = 1 << 18
+"""Least capacity of the pipes, so that a frame fits."""
+
+
+class Messenger:
+    """One rank's messages to all others, and theirs to it.
+
+    Messages from one rank to another arrive in order, each tag in an order of its own. One
+    thread only may use it.
+
+    Args:
+      block: this process's view of the pipes, of at least `MIN_CAPACITY_BYTES` each.
+      timeout_s: longest wait for a message, unless `recv` says else.
+      device: keeps arrays on the GPU that ranks share; None: they go through the host.
+
+    Attributes:
+      rank: this rank.
+      world_size: K, number of ranks.
+    """
+
+    def __init__(
+        self, block: PipeBlock, timeout_s: float, device: DeviceBuffers | None = None
+    ) -> None:
+        if block.capacity_bytes < MIN_CAPACITY_BYTES:
+            raise ConfigError(
+                f"capacity_bytes={block.capacity_bytes}: messages need {MIN_CAPACITY_BYTES}"
+            )
+        self.rank = block.rank
+        self.world_size = block.world_size
+        self._timeout_s = timeout_s
+        self._block = block
+        self._device = device
+        # Half of the longest message of the pipe, so that a frame can wait behind another.
+        self._frame_bytes = block.capacity_bytes // 4
+        self._outboxes: dict[int, Outbox] = {}
+        self._readers: dict[int, PipeReader] = {}
+        self._inboxes: dict[int, Inbox] = {}
+
+    def send(self, tree: Any, dst: int, *, tag: int = DATA) -> None:
+        """Sends nested data to a rank and does not wait for it; the caller may change it then.
+
+        Raises:
+          ConfigError: no such rank.
+          PeerLost: its process is gone, and what was sent before could not be passed on.
+          CollectiveTimeout: `MAX_WAITING_BYTES` wait already, for the whole of `timeout_s`.
+        """
+        self._check(dst, "dst")
+        if dst == self.rank:
+            for frame in frames_of(tree, tag, self._frame_bytes):
+                self._inbox(dst).feed(frame)
+            return
+        if dst not in self._outboxes:
+            self._outboxes[dst] = Outbox(PipeWriter(self._block, dst), self.rank)
+        outbox = self._outboxes[dst]
+        frames = frames_of(tree, tag, self._frame_bytes, self._put(dst, outbox))
+        outbox.post(frames, self._timeout_s)
+        if self._device is not None:
+            self._device.mark_sent(dst, outbox.frames)
+
+    def recv(self, src: int, *, tag: int = DATA, timeout_s: float | None = None) -> Any:
+        """Returns the next message with this tag from rank `src`; its arrays are the caller's.
+
+        After a timeout the same message can be waited for again.
+
+        Raises:
+          ConfigError: no such rank.
+          PeerLost: its process is gone, and has left no message.
+          CollectiveTimeout: none came in time.
+        """
+        self._check(src, "src")
+        inbox = self._inbox(src)
+        # Nobody else sends to oneself.
+        allowed_s = self._timeout_s if timeout_s is None else timeout_s
+        allowed_s = 0.0 if src == self.rank else allowed_s
+        arrived = wait_until(
+            lambda: self._read(src, tag) or None,
+            lambda: self._block.why_lost(src, "recv", inbox.received),
+            allowed_s,
+        )
+        if arrived is None:
+            raise CollectiveTimeout(self.rank, (src,), "recv", inbox.received, allowed_s)
+        return inbox.ready[tag].popleft()
+
+    def has_message(self, src: int, *, tag: int = DATA) -> bool:
+        """Whether `recv` would return at once."""
+        with contextlib.suppress(PipeClosed):
+            self._read(src)
+        return bool(self._inbox(src).ready[tag])
+
+    def flush(self, timeout_s: float | None = None) -> None:
+        """Waits until all that was sent lies in shared memory, where it outlives this process.
+
+        What stays on the GPU does not: see `settle`.
+
+        Raises:
+          PeerLost: a receiver is gone, and has not taken all.
+          CollectiveTimeout: receivers have not made room in time; names them.
+        """
+        allowed_s = self._timeout_s if timeout_s is None else timeout_s
+        deadline_s = time.monotonic() + allowed_s
+        late = [
+            dst
+            for dst, outbox in self._outboxes.items()
+            if not outbox.wait_until_empty(deadline_s - time.monotonic())
+        ]
+        if late:
+            raise CollectiveTimeout(self.rank, tuple(late), "flush", 0, allowed_s)
+
+    def settle(self, timeout_s: float) -> bool:
+        """Whether all that stays on the GPU has been received within `timeout_s`.
+
+        It goes with this process, which must not end before. What others have sent is taken
+        meanwhile, so that two that end do not wait for each other.
+        """
+        return wait_until(lambda: self._is_settled() or None, lambda: None, timeout_s) is not None
+
+    def _put(self, dst: int, outbox: Outbox) -> Callable[[Any], Any]:
+        device = self._device
+        if device is None:
+            return lambda _: None
+        released = outbox.released_frames
+        return lambda value: device.put(value, dst, released)
+
+    def _is_settled(self) -> bool:
+        if self._device is None:
+            return True
+        for peer in self._device.peers:
+            with contextlib.suppress(PipeClosed):
+                self._read(peer)
+        waiting = (
+            peer
+            for peer, outbox in self._outboxes.items()
+            if self._device.holds(peer, outbox.released_frames)
+        )
+        return all(self._block.why_lost(peer, "settle", 0) is not None for peer in waiting)
+
+    def _read(self, src: int, tag: int | None = None) -> bool:
+        """Takes what rank `src` has sent, up to a message with `tag`; whether there is one."""
+        ready = self._inbox(src).ready
+        if src == self.rank:
+            return tag is not None and bool(ready[tag])
+        if src not in self._readers:
+            self._readers[src] = PipeReader(self._block, src)
+        reader = self._readers[src]
+        while tag is None or not ready[tag]:
+            if (frame := reader.try_get()) is None:
+                return False
+            self._inbox(src).feed(frame.parts)
+            # What stayed on the GPU is copied by now: its place is free with the frame.
+            reader.release()
+        return True
+
+    def _check(self, rank: int, what: str) -> None:
+        if not (isinstance(rank, int | np.integer) and 0 <= rank < self.world_size):
+            raise ConfigError(f"{what}={rank!r}: allowed are GMIs 0 to {self.world_size - 1}")
+
+    def _inbox(self, src: int) -> Inbox:
+        get = None if self._device is None else self._device.get
+        return self._inboxes.setdefault(src, Inbox(get))

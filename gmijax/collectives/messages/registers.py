@@ -1,0 +1,142 @@
+"""Registers in shared memory: one writer each, any number of readers, nobody ever waits.
+
+A register holds the newest value only. Its writer has two places and writes them in turn, so that
+a reader that copies one is disturbed only if the writer begins to publish for the second time
+meanwhile; a counter of what was begun tells it so, and it looks again, or leaves it for later (a
+seqlock with two places). Made for weights: trainers publish them when they have new ones, agents
+look between two unrolls. On the order of memory accesses: `gmijax.collectives.waits.Fence`.
+
+    fd = create_registers()                             # the controller
+    registers = open_registers(fd, [64, 4096])          # every process, with the same sizes
+    registers[1].publish(array, tag=7)                  # the one writer of register 1
+    registers[1].read(after=0)                          # anybody: None if nothing is newer
+
+Wire format (native byte order): a line of 64 bytes (`LINE`) for every register, then for every
+register two places of its size, each on pages of its own.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from gmijax.collectives.shared_memory import create_file, map_file, whole_pages
+from gmijax.collectives.waits import Fence
+from gmijax.errors import CollectiveError, ConfigError
+
+LINE = np.dtype(
+    [
+        ("size", np.uint64),  # 0 until somebody has come
+        ("count", np.uint64),  # how often the register was published
+        ("begun", np.uint64),  # how often that was begun: `count`, or one more
+        ("tag", np.uint64, (2,)),
+        ("length", np.uint64, (2,)),
+        ("pad", np.uint64, (1,)),
+    ]
+)
+
+_LOOKS = 3
+
+
+class Snapshot(NamedTuple):
+    """The newest value of a register.
+
+    Attributes:
+      count: how often the register had been published; give it to the next `read`.
+      tag: the writer's number for the value.
+      values: a copy of its bytes, [length] uint8.
+    """
+
+    count: int
+    tag: int
+    values: npt.NDArray[np.uint8]
+
+
+class Register:
+    """One register; see the module."""
+
+    def __init__(self, line: npt.NDArray[np.void], places: npt.NDArray[np.uint8]) -> None:
+        self._line = line
+        self._places = places
+        self._fence = Fence()
+
+    def publish(self, values: npt.NDArray[Any], tag: int = 0) -> None:
+        """Replaces the value; one process only may do so. Costs a copy.
+
+        Raises:
+          CollectiveError: more bytes than the register has room for.
+        """
+        data = np.ascontiguousarray(values).reshape(-1).view(np.uint8)
+        if data.size > self._places.shape[1]:
+            raise CollectiveError(
+                f"{data.size} bytes for a register of {self._places.shape[1]} bytes"
+            )
+        count = int(self._line["count"][0]) + 1
+        place = count % 2
+        self._line["begun"][0] = count
+        self._fence()  # Who sees anything of what follows sees that it was begun.
+        self._places[place, : data.size] = data
+        self._line["tag"][0, place] = tag
+        self._line["length"][0, place] = data.size
+        self._fence()
+        self._line["count"][0] = count
+
+    def read(self, after: int = 0) -> Snapshot | None:
+        """The newest value if it was published after the `after`-th, else None; never waits.
+
+        None, too, if the writer was faster than this reader three times over: the next call
+        finds a newer one.
+        """
+        for _ in range(_LOOKS):
+            count = int(self._line["count"][0])
+            if count <= after:
+                return None
+            self._fence()
+            place = count % 2
+            length = min(int(self._line["length"][0, place]), self._places.shape[1])
+            tag = int(self._line["tag"][0, place])
+            values = self._places[place, :length].copy()
+            self._fence()
+            # The next publication goes into the other place.
+            if int(self._line["begun"][0]) - count < 2:
+                return Snapshot(count, tag, values)
+        return None
+
+
+def create_registers() -> int:
+    """Makes the memory of the registers and returns its descriptor, for the controller."""
+    return create_file("registers")
+
+
+def open_registers(fd: int, sizes_bytes: Sequence[int]) -> list[Register]:
+    """Maps the registers; the caller keeps `fd` and may close it at once.
+
+    Args:
+      fd: descriptor from `create_registers`.
+      sizes_bytes: room of every register, the same for all processes.
+
+    Raises:
+      ConfigError: no registers, or a size that makes no sense.
+      CollectiveError: no memory, or processes that come with different sizes.
+    """
+    if not sizes_bytes or min(sizes_bytes) < 1:
+        raise ConfigError(f"sizes_bytes={list(sizes_bytes)}: every register needs at least 1 byte")
+    rooms = [whole_pages(size) for size in sizes_bytes]
+    offset = whole_pages(len(rooms) * LINE.itemsize)
+    mapping = map_file(fd, offset + 2 * sum(rooms), "registers")
+    lines = np.frombuffer(mapping, LINE, len(rooms))
+    registers = []
+    for index, (size, room) in enumerate(zip(sizes_bytes, rooms, strict=True)):
+        line = lines[index : index + 1]
+        if int(line["size"][0]) not in (0, size):
+            raise CollectiveError(
+                f"register {index} has {line['size'][0]} bytes for another process, {size} here"
+            )
+        line["size"][0] = size
+        places = np.frombuffer(mapping, np.uint8, 2 * room, offset).reshape(2, room)
+        registers.append(Register(line, places[:, :size]))
+        offset += 2 * room
+    return registers

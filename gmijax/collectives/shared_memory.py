@@ -1,0 +1,49 @@
+"""Shared memory without a name: the controller makes it, its processes inherit and map it.
+
+An anonymous file vanishes with the last process that has it open, so nothing is left behind
+whoever gets killed, and it does not count against the size of /dev/shm.
+"""
+
+from __future__ import annotations
+
+import mmap
+import os
+
+from gmijax.errors import CollectiveError
+
+
+def create_file(name: str, num_bytes: int = 0) -> int:
+    """Makes an anonymous file of zeros, which takes memory where it is written; its descriptor."""
+    fd = os.memfd_create(f"gmijax-{name}", os.MFD_CLOEXEC)
+    # Another user who may look into /proc/<pid>/fd must not read or change anything.
+    os.fchmod(fd, 0o600)
+    os.ftruncate(fd, num_bytes)
+    return fd
+
+
+def map_file(fd: int, num_bytes: int, who: str) -> mmap.mmap:
+    """Maps a file that gets its size here, from whoever comes first; all its memory is taken.
+
+    Raises:
+      CollectiveError: no memory, or no such descriptor; names `who`.
+    """
+    try:
+        # Unlike ftruncate this never shrinks the file, which would crash (SIGBUS) processes that
+        # have mapped more of it, and it fails here, not at first touch, if memory is short.
+        os.posix_fallocate(fd, 0, num_bytes)
+        return mmap.mmap(fd, num_bytes, flags=mmap.MAP_SHARED | mmap.MAP_POPULATE)
+    except OSError as error:
+        raise CollectiveError(
+            f"{who}: cannot map {num_bytes / 2**20:.1f} MiB of shared memory at descriptor {fd} "
+            f"({error.strerror})"
+        ) from None
+
+
+def round_up(value: int, multiple: int) -> int:
+    """The next multiple of `multiple`."""
+    return -(-value // multiple) * multiple
+
+
+def whole_pages(num_bytes: int) -> int:
+    """Bytes of the pages that hold so many."""
+    return round_up(num_bytes, mmap.PAGESIZE)

@@ -1,0 +1,147 @@
+"""Hyper-parameters of PPO and A3C, with Brax's names."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+from gmijax.config.schema import KeyGroup, doc
+from gmijax.errors import ConfigError
+
+ADAPTIVE_LEARNING_RATE_RANGE = (1e-5, 1e-2)
+"""Where the adaptive schedule keeps the learning rate, and so where it must begin."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class ActorCriticConfig(KeyGroup):
+    """Keys that PPO and A3C share; those that differ in meaning are documented in each."""
+
+    prefix = "algo."
+
+    unroll_length: int
+    num_minibatches: int
+    num_updates_per_batch: int
+    gae_lambda: float
+    normalize_advantage: bool
+    learning_rate_schedule: Literal["fixed", "adaptive_kl"]
+    discounting: float = doc("discount factor per step, 0 to 1", low=0.0, high=1.0)
+    value_cost: float = doc("weight of the value loss", low=0.0)
+    entropy_cost: float = doc("weight of the entropy bonus", low=0.0)
+    bound_cost: float = doc("weight of the penalty on action means outside [-1.1, 1.1]", low=0.0)
+    learning_rate: float = doc(
+        "step size of Adam (the first one, if the schedule is adaptive)", positive=True
+    )
+    desired_kl: float = doc("target of the adaptive schedule", positive=True)
+    max_grad_norm: float = doc("gradients are scaled down to this global norm", positive=True)
+    reward_scaling: float = doc(
+        "factor on rewards before learning (logged returns are unscaled)", positive=True
+    )
+    normalize_observations: bool = doc("normalise observations with running statistics")
+    policy_hidden_layer_sizes: tuple[int, ...] = doc("widths of the policy network", low=1)
+    value_hidden_layer_sizes: tuple[int, ...] = doc("widths of the value network", low=1)
+    init_noise_std: float = doc("standard deviation of the first policy", positive=True)
+    init_at_random_ep_len: bool = doc(
+        "cut the first episode of every world at a random time, so that worlds do not go through "
+        "their episodes in step; those episodes are not counted in returns",
+        default=False,
+    )
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        low, high = ADAPTIVE_LEARNING_RATE_RANGE
+        if self.learning_rate_schedule == "adaptive_kl" and not low <= self.learning_rate <= high:
+            raise ConfigError(
+                f"algo.learning_rate={self.learning_rate!r}: must be between {low} and {high} "
+                "with algo.learning_rate_schedule=adaptive_kl"
+            )
+
+
+@dataclass(frozen=True, kw_only=True)
+class PpoConfig(ActorCriticConfig):
+    """Hyper-parameters of PPO, with Brax's names."""
+
+    name: Literal["ppo"] = doc("training algorithm")
+    unroll_length: int = doc("T, environment steps per environment and iteration", low=1)
+    num_minibatches: int = doc("minibatches per pass over the rollout", low=1)
+    num_updates_per_batch: int = doc("passes over the rollout (epochs)", low=1)
+    gae_lambda: float = doc(
+        "lambda of generalised advantage estimation, 0 to 1", low=0.0, high=1.0
+    )
+    clipping_epsilon: float = doc("clip range of the probability ratio", positive=True)
+    clip_value_loss: bool = doc("clip the value loss with clipping_epsilon too")
+    learning_rate_schedule: Literal["fixed", "adaptive_kl"] = doc(
+        "fixed, or steered to keep the policy's KL divergence per update near desired_kl"
+    )
+    normalize_advantage: bool = doc("normalise advantages over all samples of all GMIs")
+
+
+@dataclass(frozen=True, kw_only=True)
+class A3cConfig(ActorCriticConfig):
+    """Hyper-parameters of asynchronous actor-critic training, with Brax's names."""
+
+    name: Literal["a3c"] = doc("training algorithm")
+    unroll_length: int = doc("T, environment steps per environment and unroll", low=1)
+    weights_every: int | None = doc(
+        "environment steps after which, at the latest, an agent takes up newer weights, within an "
+        "unroll too; null: with every unroll",
+        low=1,
+    )
+    batch_size: int | None = doc(
+        "B, unrolls in one batch of one trainer; null: num_envs, the unrolls of one agent", low=1
+    )
+    num_minibatches: int = doc("minibatches per pass over a batch", low=1)
+    num_updates_per_batch: int = doc("passes over a batch (epochs)", low=1)
+    vtrace: bool = doc(
+        "correct for the age of the policy that acted with V-trace; false: plain n-step returns"
+    )
+    gae_lambda: float = doc("lambda of V-trace's returns, 0 to 1", low=0.0, high=1.0)
+    rho_clip: float = doc("V-trace's upper limit of a step's probability ratio", positive=True)
+    trace_clip: float = doc(
+        "V-trace's upper limit of the ratio that lets later steps through", positive=True
+    )
+    clipping_epsilon: float | None = doc(
+        "clip range of the probability ratio during the passes over a batch, as in PPO; null: the "
+        "plain policy gradient of A3C",
+        positive=True,
+    )
+    max_staleness: int | None = doc(
+        "unrolls of a policy that is more versions behind are dropped; null: none are", low=1
+    )
+    max_ahead: int = doc(
+        "unrolls of an agent that may wait for every trainer before the agent waits too "
+        "(channel.when_full=block)",
+        low=1,
+    )
+    learning_rate_schedule: Literal["fixed", "adaptive_kl"] = doc(
+        "fixed, or steered to keep the policy's KL divergence per batch near desired_kl"
+    )
+    normalize_advantage: bool = doc("normalise advantages over every batch")
+
+    @property
+    def pieces_per_unroll(self) -> int:
+        """In how many equal pieces an agent makes an unroll, each with the newest weights."""
+        longest = min(self.weights_every or self.unroll_length, self.unroll_length)
+        return next(
+            pieces
+            for pieces in range(-(-self.unroll_length // longest), self.unroll_length + 1)
+            if self.unroll_length % pieces == 0
+        )
+
+    def batch_of(self, num_envs: int) -> int:
+        """B with `num_envs` environments on every agent.
+
+        Raises:
+          ConfigError: unrolls of an agent and of a batch do not fit into each other, or a batch
+            not into minibatches.
+        """
+        batch = self.batch_size or num_envs
+        if batch % num_envs and num_envs % batch:
+            raise ConfigError(
+                f"algo.batch_size={batch}: must be a multiple or a divisor of num_envs={num_envs}"
+            )
+        if batch % self.num_minibatches:
+            raise ConfigError(
+                f"algo.num_minibatches={self.num_minibatches}: must divide the {batch} unrolls "
+                "of a batch (algo.batch_size, or num_envs if that is null)"
+            )
+        return batch

@@ -1,0 +1,213 @@
+"""Typed trees of plain data: what `gmijax.config` is built with.
+
+`from_dict` makes a tree of frozen dataclasses from plain data (JSON, YAML, a command line) and
+rejects unknown keys, wrong types and values out of range with one clear line. No hydra, no jax.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import difflib
+import sys
+import types
+import typing
+from collections.abc import Mapping, Sequence
+from typing import Any, Literal, TypeVar
+
+from gmijax.errors import ConfigError
+
+T = TypeVar("T")
+
+
+def doc(
+    text: str,
+    default: Any = dataclasses.MISSING,
+    *,
+    low: float | None = None,
+    high: float | None = None,
+    positive: bool = False,
+) -> Any:
+    """A dataclass field whose meaning `--help` prints; one with a default may be left out.
+
+    `KeyGroup` checks its limits: at least `low`, at most `high`, or greater than 0.
+    """
+    limits = (low, high, positive)
+    return dataclasses.field(metadata={"doc": text, "limits": limits}, default=default)
+
+
+class KeyGroup:
+    """Base of dataclasses whose fields have limits, see `doc`; `prefix` is their keys' group."""
+
+    prefix = ""
+
+    def __post_init__(self) -> None:
+        for field in dataclasses.fields(typing.cast("Any", self)):
+            limits, found = field.metadata.get("limits"), getattr(self, field.name)
+            for value in found if isinstance(found, tuple) else (found,):
+                if limits and isinstance(value, int | float):
+                    _require_limits(f"{self.prefix}{field.name}", value, *limits)
+
+
+def _require_limits(
+    key: str, value: float, low: float | None, high: float | None, positive: bool
+) -> None:
+    if positive:
+        require_positive(key, value)
+    if low is not None and high is not None:
+        require_between(key, value, low, high)
+    elif low is not None:
+        require_at_least(key, value, low)
+
+
+def require_at_least(key: str, value: float, low: float) -> None:
+    """Raises ConfigError unless `value >= low`."""
+    if not value >= low:
+        raise ConfigError(f"{key}={value!r}: must be at least {low}")
+
+
+def require_positive(key: str, value: float) -> None:
+    """Raises ConfigError unless `value > 0`."""
+    if not value > 0:
+        raise ConfigError(f"{key}={value!r}: must be greater than 0")
+
+
+def require_between(key: str, value: float, low: float, high: float) -> None:
+    """Raises ConfigError unless `low <= value <= high`."""
+    if not low <= value <= high:
+        raise ConfigError(f"{key}={value!r}: must be between {low} and {high}")
+
+
+def from_dict(cls: type[T], data: Mapping[str, Any], path: str = "") -> T:
+    """Builds a frozen config tree from plain data, checking names and types.
+
+    Lists become tuples, and a float with a whole value is accepted for an integer (`30e6`).
+
+    Raises:
+      ConfigError: an unknown or missing key, a wrong type, or a value out of range.
+    """
+    hints = typing.get_type_hints(cls)
+    for key in data:
+        if key not in hints:
+            raise ConfigError(f"unknown key {path}{key}{suggestion(key, hints)}")
+    if missing := [key for key in hints if key not in data and not _has_default(cls, key)]:
+        raise ConfigError(f"missing key {path}{missing[0]}")
+    given = {key: kind for key, kind in hints.items() if key in data}
+    return cls(**{key: _convert(kind, data[key], path + key) for key, kind in given.items()})
+
+
+def from_named(classes: Sequence[type[T]], data: Mapping[str, Any], path: str = "") -> T:
+    """`from_dict` with the one of `classes` whose field `name`, a literal, allows that of `data`.
+
+    Raises:
+      ConfigError: none does, or as `from_dict`.
+    """
+    by_name = {
+        name: cls
+        for cls in classes
+        for name in typing.get_args(typing.get_type_hints(cls)["name"])
+    }
+    if data.get("name") not in by_name:
+        raise ConfigError(
+            f"{path}name={_shown(data.get('name'))}: expected one of {', '.join(by_name)}"
+        )
+    return from_dict(by_name[data["name"]], data, path)
+
+
+def to_dict(config: Any) -> dict[str, Any]:
+    """The plain data of a config tree; `from_dict` inverts it."""
+    return dataclasses.asdict(config)
+
+
+def suggestion(key: str, allowed: typing.Iterable[str]) -> str:
+    """`: did you mean ...` where a name is close, else `: allowed are ...`."""
+    names = sorted(allowed)
+    close = difflib.get_close_matches(key, names, n=1)
+    return f": did you mean {close[0]}?" if close else f": allowed are {', '.join(names)}"
+
+
+def _has_default(cls: Any, key: str) -> bool:
+    field = cls.__dataclass_fields__[key]
+    return (field.default, field.default_factory) != (dataclasses.MISSING, dataclasses.MISSING)
+
+
+def _convert(kind: Any, value: Any, key: str) -> Any:
+    trees: list[Any] = [x for x in _options(kind) if dataclasses.is_dataclass(x)]
+    if trees:
+        if not isinstance(value, Mapping):
+            raise ConfigError(f"{key}={value!r}: expected a group of keys")
+        if len(trees) > 1:
+            return from_named(trees, value, f"{key}.")
+        return from_dict(trees[0], value, f"{key}.")
+    for option in _options(kind):
+        converted = _accept(option, value, key)
+        if converted is not _REJECTED:
+            return converted
+    raise ConfigError(f"{key}={_shown(value)}: expected {_describe(kind)}")
+
+
+_REJECTED = object()
+
+
+def _options(kind: Any) -> tuple[Any, ...]:
+    if typing.get_origin(kind) in (types.UnionType, typing.Union):
+        return typing.get_args(kind)
+    return (kind,)
+
+
+def _accept(kind: Any, value: Any, key: str) -> Any:
+    if typing.get_origin(kind) is not None:
+        return _accept_generic(kind, value, key)
+    if kind is type(None):
+        return None if value is None else _REJECTED
+    if isinstance(value, bool):
+        return value if kind is bool else _REJECTED
+    if kind is int and isinstance(value, float) and value.is_integer():
+        return int(value)
+    if kind is float and isinstance(value, int | float):
+        # Neither not-a-number nor infinite, nor an integer that is larger than any float.
+        return float(value) if abs(value) <= sys.float_info.max else _REJECTED
+    if kind is str and isinstance(value, int):
+        return str(value)
+    return value if isinstance(kind, type) and isinstance(value, kind) else _REJECTED
+
+
+def _accept_generic(kind: Any, value: Any, key: str) -> Any:
+    inner = typing.get_args(kind)
+    if typing.get_origin(kind) is Literal:
+        if isinstance(value, bool):  # YAML reads a bare `off` or `on` as a boolean.
+            value = "on" if value else "off"
+        return value if value in inner else _REJECTED
+    if typing.get_origin(kind) is Mapping and isinstance(value, Mapping):
+        return {
+            str(name): _convert(inner[1], item, f"{key}.{name}") for name, item in value.items()
+        }
+    if typing.get_origin(kind) is tuple and isinstance(value, list | tuple):
+        return tuple(_convert(inner[0], item, key) for item in value)
+    return _REJECTED
+
+
+def _describe(kind: Any) -> str:
+    names = {int: "an integer", float: "a finite number", bool: "true or false", str: "text"}
+    parts: list[str] = []
+    for option in _options(kind):
+        if typing.get_origin(option) is Literal:
+            parts.append("one of " + ", ".join(map(str, typing.get_args(option))))
+        elif typing.get_origin(option) is tuple:
+            inner = typing.get_args(option)[0]
+            nested = typing.get_origin(inner) is tuple
+            if typing.get_origin(inner) is Literal:
+                parts.append(f"a list of {', '.join(map(str, typing.get_args(inner)))}")
+                continue
+            items = {float: "numbers", str: "names"}.get(inner, "integers")
+            parts.append("a list of lists of integers" if nested else f"a list of {items}")
+        elif typing.get_origin(option) is Mapping:
+            parts.append("a group of keys")
+        elif option is type(None):
+            parts.append("null")
+        else:
+            parts.append(names[option])
+    return " or ".join(parts)
+
+
+def _shown(value: Any) -> str:
+    return str(value) if isinstance(value, str) else repr(value)

@@ -1,0 +1,193 @@
+"""What the user sees of a running job: a live panel on a terminal, plain lines elsewhere.
+
+Nothing that goes wrong with the output may end the job. No jax here.
+"""
+
+from __future__ import annotations
+
+import os
+import sys
+import time
+from collections.abc import Callable, Sequence
+from contextlib import suppress
+from typing import Any, TextIO
+
+from rich.console import Console
+from rich.live import Live
+from rich.markup import escape
+from rich.table import Table
+
+from gmijax.partition.plan import Plan
+from gmijax.runs.folder import RunPaths
+from gmijax.supervise.gmi_process import GmiStatus
+
+_LINE_EVERY_S = 5.0
+_BAR_WIDTH = 30
+
+
+class _Careful:
+    """A text stream that is dropped at its first error: `train | head`, a closed terminal."""
+
+    def __init__(self, stream: TextIO | None) -> None:
+        self._stream = stream
+        self.encoding = getattr(stream, "encoding", None) or "utf-8"
+
+    def write(self, text: str) -> int:
+        """Writes, or does nothing once that has failed."""
+        if self._stream is not None:
+            try:
+                self._stream.write(text)
+            except (OSError, ValueError):
+                self._drop(self._stream)
+        return len(text)
+
+    def flush(self) -> None:
+        """See `write`."""
+        if self._stream is not None:
+            try:
+                self._stream.flush()
+            except (OSError, ValueError):
+                self._drop(self._stream)
+
+    def isatty(self) -> bool:
+        """Whether it is a terminal."""
+        with suppress(OSError, ValueError):
+            return self._stream is not None and self._stream.isatty()
+        return False
+
+    def _drop(self, stream: TextIO) -> None:
+        self._stream = None
+        # What is left in its buffer would fail once more when Python ends.
+        with suppress(OSError, ValueError):
+            nowhere = os.open(os.devnull, os.O_WRONLY)
+            os.dup2(nowhere, stream.fileno())
+            os.close(nowhere)
+
+
+def open_console(*, show: bool) -> Console:
+    """Where a job prints what the user may read: standard output, or nowhere."""
+    # Without a standard output (`>&-`) it is None.
+    stream: Any = _Careful(sys.stdout if show else None)
+    return Console(file=stream, quiet=not show, soft_wrap=True, highlight=False)
+
+
+def announce(console: Console, run: RunPaths, plan: Plan, what: str, lines: Sequence[str]) -> None:
+    """Prints where a job is, its plan (`what`: the end of that line), and why it is so."""
+    layout = [list(gmis) for gmis in plan.layout.gmis_of_gpu]
+    console.print(f"run folder: {run.root}", markup=False)
+    console.print(f"plan: layout {layout}, backend {plan.backend}, {what}", markup=False)
+    for line in (*plan.reasons, *lines):
+        console.print(f"  {line}", markup=False)
+
+
+class ConsoleProgress:
+    """Iteration, environment steps per second, return, ETA, and the state of every GMI.
+
+    Args:
+      console: nothing is shown on a quiet one.
+      latest: the line of metrics that came since the last call, None if there is none.
+      num_timesteps: environment steps of the whole job.
+    """
+
+    def __init__(
+        self,
+        console: Console,
+        latest: Callable[[], dict[str, Any] | None],
+        num_timesteps: int,
+    ) -> None:
+        self._console = console
+        self._latest = latest
+        self._num_timesteps = num_timesteps
+        self._line: dict[str, Any] = {}
+        self._first: tuple[float, int] | None = None
+        self._shown: tuple[str, int | None] = ("", None)
+        self._shown_s = 0.0
+        self._is_off = console.quiet
+        self._has_panel = console.is_terminal and not console.quiet
+        self._live = Live(console=console, refresh_per_second=4, transient=True)
+
+    def __enter__(self) -> ConsoleProgress:
+        if self._has_panel:
+            self._live.start()
+        return self
+
+    def __exit__(self, *exc: Any) -> None:
+        if self._has_panel:
+            self._live.stop()
+        if self._line:
+            self._console.print(self._text(), highlight=False)
+
+    def update(self, gmis: Sequence[GmiStatus]) -> None:
+        """Called about 20 times a second."""
+        if self._is_off:
+            return
+        try:
+            self._show(gmis)
+        except Exception as error:
+            self._is_off = True
+            self._console.print(f"no progress from here on: {error!r}", markup=False)
+
+    def _show(self, gmis: Sequence[GmiStatus]) -> None:
+        if (line := self._latest()) is not None:
+            self._line = line
+            if self._first is None:
+                self._first = (time.monotonic(), line["env_steps"])
+        if self._has_panel:
+            self._live.update(self._panel(gmis))
+        else:
+            self._print_now_and_then(gmis)
+
+    def _print_now_and_then(self, gmis: Sequence[GmiStatus]) -> None:
+        states, steps = _states(gmis), self._line.get("env_steps")
+        now = time.monotonic()
+        waited = now - self._shown_s > _LINE_EVERY_S
+        if states != self._shown[0] or (steps != self._shown[1] and waited):
+            text = f"{self._text()}  " if self._line else ""
+            self._console.print(f"{text}[{states}]", markup=False, highlight=False, soft_wrap=True)
+            self._shown, self._shown_s = (states, steps), now
+
+    def _panel(self, gmis: Sequence[GmiStatus]) -> Table:
+        grid = Table.grid()
+        done = min(self._line.get("env_steps", 0) / self._num_timesteps, 1.0)
+        filled = round(done * _BAR_WIDTH)
+        bar = f"[green]{'━' * filled}[/][dim]{'━' * (_BAR_WIDTH - filled)}[/]"
+        grid.add_row(f"{bar} {self._text() if self._line else 'starting'}")
+        for gmi in gmis:
+            state = escape(gmi.state)
+            grid.add_row(f"[dim]GMI {gmi.gmi}: {state}, iteration {gmi.iteration}[/]")
+        return grid
+
+    def _text(self) -> str:
+        line = self._line
+        mean = line.get("return")
+        return (
+            f"{100 * min(line['env_steps'] / self._num_timesteps, 1):.0f} %  "
+            f"{line['env_steps']:,} steps  {_rates(line)}  "
+            f"return {'-' if mean is None else format(mean, '.2f')}  ETA {self._eta()}"
+        )
+
+    def _eta(self) -> str:
+        if self._first is None or self._line["env_steps"] <= self._first[1]:
+            return "-"
+        since_s, steps = self._first
+        rate = (self._line["env_steps"] - steps) / (time.monotonic() - since_s)
+        left_s = max(0.0, (self._num_timesteps - self._line["env_steps"]) / rate)
+        minutes, seconds = divmod(round(left_s), 60)
+        return f"{minutes // 60}:{minutes % 60:02d}:{seconds:02d}"
+
+
+def _states(gmis: Sequence[GmiStatus]) -> str:
+    return ", ".join(f"GMI {gmi.gmi} {gmi.state}" for gmi in gmis)
+
+
+def _rates(line: dict[str, Any]) -> str:
+    """Steps per second; of acting and of learning where other GMIs do the one and the other."""
+    if "async/pps" not in line:
+        return f"{line['env_steps_per_s']:,.0f} steps/s"
+    behind, filled = line["async/staleness_mean"], line["channel/occupancy"]
+    return (
+        f"PPS {line['async/pps']:,.0f}  TTOP {line['async/ttop']:,.0f}  "
+        f"staleness {'-' if behind is None else format(behind, '.1f')}  "
+        f"channels {'-' if filled is None else format(filled, '.0%')} full, "
+        f"{line['channel/bytes_per_s'] / 1e6:,.0f} MB/s, {line['channel/dropped']:,.0f} dropped"
+    )

@@ -1,0 +1,71 @@
+"""Decides everything that is `auto` in a job, before anything is made or started. No jax here."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Generic, NamedTuple, TypeVar
+
+from rich.console import Console
+
+from gmijax.autotune.tuner import with_auto_decided
+from gmijax.config import ReduceConfig, ServeConfig, TrainConfig
+from gmijax.control.selection import estimated_floats, with_measured
+from gmijax.machine.snapshot import Machine, detect_machine
+from gmijax.partition.plan import Plan
+from gmijax.partition.planner import make_plan
+from gmijax.sim import source
+from gmijax.sim.impl import choose_impl
+from gmijax.sim.registry import require_task
+from gmijax.supervise.kinds import training_plan
+
+C = TypeVar("C", TrainConfig, ServeConfig)
+
+
+class Decided(NamedTuple, Generic[C]):
+    """A job that is ready to start.
+
+    Attributes:
+      config: with nothing `auto` in it that GMIs would have to decide.
+      plan: of the job.
+      machine: where it runs.
+      reasons: what was decided beside the plan, in words.
+    """
+
+    config: C
+    plan: Plan
+    machine: Machine
+    reasons: tuple[str, ...]
+
+
+def with_task(config: C) -> C:
+    """The configuration with its task pinned.
+
+    Raises:
+      ConfigError: no such task, or a custom task's file is not the one that a run noted.
+    """
+    require_task(str(config.env.name), config.env.suite)
+    return dataclasses.replace(config, env=source.pinned(config.env))
+
+
+def decide(config: C, console: Console) -> Decided[C]:
+    """Numbers of GMIs and environments, plan, reduction and physics of a job, in this order.
+
+    Raises:
+      ConfigError, GmijaxError, JobInterrupted: as `with_auto_decided` and `make_plan`.
+    """
+    machine = detect_machine()
+    config, found = with_auto_decided(config, machine, console)
+    if isinstance(config, ServeConfig):
+        # Nobody trains, so nobody averages gradients.
+        nothing, num_envs = ReduceConfig(), config.envs_per_gmi
+        plan = make_plan(config.plan, nothing, num_envs, machine, template="tcg")
+    else:
+        plan = training_plan(config, machine)
+        if config.reduce.selection == "measured":
+            algo = config.algo
+            hidden = (algo.policy_hidden_layer_sizes, algo.value_hidden_layer_sizes)
+            plan = with_measured(plan, machine, estimated_floats(*hidden), config.reduce.intra)
+    platform = "cpu" if plan.backend == "cpu" else "gpu"
+    impl, why = choose_impl(config.physics.impl, platform, config.env.label)
+    config = dataclasses.replace(config, physics=dataclasses.replace(config.physics, impl=impl))
+    return Decided(config, plan, machine, (*found, f"physics.impl {impl}: {why}"))

@@ -1,0 +1,106 @@
+"""Where a training job begins: in which run folder, and from which checkpoint. No jax here."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import NamedTuple
+
+from gmijax.config import TrainConfig
+from gmijax.errors import ConfigError
+from gmijax.runs.folder import META, RunPaths, create_run, given_run, read_json, require_new_run
+from gmijax.runs.resume import CheckpointMeta, find_checkpoint, newest_checkpoint, trained_config
+
+
+class StartPoint(NamedTuple):
+    """Where a job begins.
+
+    Attributes:
+      folder: the run folder if it exists already, None if a new one is to be made.
+      checkpoint: what the job goes on from, None from its beginning.
+      is_complete: whether the checkpoint has all steps that are wanted.
+      notes: sentences for the user.
+    """
+
+    folder: RunPaths | None
+    checkpoint: Path | None
+    is_complete: bool
+    notes: tuple[str, ...]
+
+    def open(self, config: TrainConfig) -> RunPaths:
+        """The run folder; raises as `create_run`."""
+        if self.folder is not None:
+            return self.folder
+        return create_run(config.run.dir, config.run.name, f"{config.env.slug}-{config.algo.name}")
+
+
+def find_start_point(config: TrainConfig) -> StartPoint:
+    """Reads `run.resume`, `run.dir` and `run.name`; changes nothing on the disk.
+
+    Raises:
+      ConfigError: a folder that exists and must not, no checkpoint, or one that does not fit.
+    """
+    if config.run.resume == "auto":
+        return _go_on_or_start(config)
+    require_new_run(config.run.dir, config.run.name)
+    if config.run.resume is None:
+        return StartPoint(None, None, is_complete=False, notes=())
+    checkpoint = find_checkpoint(config.run.resume, "run.resume")
+    meta = _require_fit(config, checkpoint, config.run.resume)
+    if meta.env_steps >= config.num_timesteps:
+        raise ConfigError(
+            f"num_timesteps={config.num_timesteps}: the checkpoint has {meta.env_steps} "
+            "steps already; give more in all"
+        )
+    is_named = (Path(config.run.resume) / META).is_file()
+    notes = () if is_named else newest_checkpoint(checkpoint.parents[1]).passed_over
+    return StartPoint(None, checkpoint, is_complete=False, notes=notes)
+
+
+def _go_on_or_start(config: TrainConfig) -> StartPoint:
+    folder = given_run(config.run.dir, config.run.name)
+    assert folder is not None  # `RunConfig` has checked it.
+    shown = f"run.resume=auto: {folder}"
+    if not folder.is_dir():
+        if folder.exists():
+            raise ConfigError(f"{shown} is no folder")
+        return StartPoint(None, None, is_complete=False, notes=())
+    run = RunPaths(folder.resolve())
+    if not run.config.exists():
+        if any(path != run.lock for path in folder.iterdir()):
+            raise ConfigError(f"{shown} is no run folder, and not empty")
+        return StartPoint(run, None, is_complete=False, notes=())
+    # The folder of a checkpoint that may not be there yet.
+    env, algo = trained_config(run.checkpoint(0))
+    saved, wanted = (env.label, algo.name), (config.env.label, config.algo.name)
+    if saved != wanted:
+        raise ConfigError(
+            f"{shown} holds a run of {' with '.join(saved)}, not {' with '.join(wanted)}"
+        )
+    found = newest_checkpoint(folder)
+    if found.checkpoint is None:
+        return StartPoint(run, None, is_complete=False, notes=found.passed_over)
+    meta = _require_fit(config, found.checkpoint, "auto")
+    is_complete = meta.env_steps >= config.num_timesteps
+    return StartPoint(run, found.checkpoint, is_complete, found.passed_over)
+
+
+def _require_fit(config: TrainConfig, checkpoint: Path, wanted: str) -> CheckpointMeta:
+    """The checkpoint's meta data, if the job can go on from it."""
+    meta = CheckpointMeta.read(checkpoint)
+    algo = config.algo
+    hidden = (algo.policy_hidden_layer_sizes, algo.value_hidden_layer_sizes)
+    for name, have, want in (
+        ("task", meta.env, config.env.label),
+        ("algorithm", meta.algo, algo.name),
+        ("network widths", _shown(meta.hidden), _shown(hidden)),
+    ):
+        if have != want:
+            raise ConfigError(f"run.resume={wanted}: checkpoint of {name} {have}, not {want}")
+    seed = read_json(RunPaths(checkpoint.parent.parent).config)["seed"]
+    if config.seed != seed:
+        raise ConfigError(f"seed={config.seed}: a resumed run keeps its seed {seed}")
+    return meta
+
+
+def _shown(hidden: tuple[tuple[int, ...], ...]) -> str:
+    return " and ".join(":".join(map(str, widths)) for widths in hidden)

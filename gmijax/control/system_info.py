@@ -1,0 +1,137 @@
+"""State of this machine for `gmijax.doctor`. No jax here: a child asks it."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+import tempfile
+from collections.abc import Mapping
+from pathlib import Path
+from types import MappingProxyType
+from typing import Final, NamedTuple
+
+from gmijax.config import PlanConfig, ReduceConfig
+from gmijax.errors import GmijaxError
+from gmijax.machine.nvidia import Gpu, nvml_problem
+from gmijax.machine.snapshot import Machine, detect_machine
+from gmijax.partition.planner import make_plan
+from gmijax.runs.folder import RunPaths
+from gmijax.supervise.backends.mps import MpsBackend
+from gmijax.version import pinned_version, versions_of
+
+PROBE_TIMEOUT_S: Final = 120.0
+
+REQUIRED: Final = ("jax", "jaxlib", "mujoco", "mujoco-mjx", "flax", "optax", "orbax-checkpoint")
+_OPTIONAL: Final = (
+    *("jax-cuda12-plugin", "jax-cuda13-plugin", "nvidia-nccl-cu12", "nvidia-nccl-cu13"),
+    *("cuda-bindings", "cuda-core", "nvidia-ml-py", "warp-lang", "brax", "playground"),
+)
+_CUDA_VARIABLES: Final = ("XLA_CLIENT_MEM_FRACTION", "XLA_PYTHON_CLIENT_MEM_FRACTION")
+
+
+class JaxView(NamedTuple):
+    """Devices that jax sees in a process that is started as a GMI would be.
+
+    Attributes:
+      platform: `cpu` or `gpu`; None where jax failed.
+      devices: the kind of every device.
+      error: why it failed, in one line.
+    """
+
+    platform: str | None
+    devices: tuple[str, ...] = ()
+    error: str | None = None
+
+
+class SystemInfo(NamedTuple):
+    """State of this machine.
+
+    Attributes:
+      machine: GPUs, driver, MPS.
+      jax: what jax sees.
+      versions: of packages, None for one that is not installed.
+      variables: the environment.
+      nvml_error: why NVML fails although it is installed, None where it does not.
+      mps_error: why an MPS daemon cannot be started, None where it can or was not tried.
+      wanted_warp: the one warp-lang that mujoco-mjx was made for, None where it names none.
+    """
+
+    machine: Machine
+    jax: JaxView
+    versions: Mapping[str, str | None]
+    variables: Mapping[str, str] = MappingProxyType({})
+    nvml_error: str | None = None
+    mps_error: str | None = None
+    wanted_warp: str | None = None
+
+
+def look() -> SystemInfo:
+    """Looks at this machine: asks NVML, jax (in a child), and tries to start an MPS daemon."""
+    machine = detect_machine()
+    return SystemInfo(
+        machine=machine,
+        jax=ask_jax(machine),
+        versions=versions_of((*REQUIRED, *_OPTIONAL)),
+        variables=dict(os.environ),
+        nvml_error=nvml_problem(),
+        mps_error=try_mps(machine),
+        wanted_warp=pinned_version("mujoco-mjx", "warp-lang"),
+    )
+
+
+def device_of(gpu: Gpu) -> str | None:
+    """UUID that a process gets for a GPU, None if it cannot be used."""
+    if gpu.compute_mode == "prohibited":
+        return None
+    if not gpu.mig_enabled:
+        return gpu.uuid
+    return gpu.instances[0].uuid if gpu.instances else None
+
+
+def ask_jax(machine: Machine, timeout_s: float = PROBE_TIMEOUT_S) -> JaxView:
+    """Asks jax in a child with the devices that GMIs would get."""
+    devices = [device for gpu in machine.gpus if (device := device_of(gpu))]
+    # CUDA shows one MIG instance to a process, and no whole GPU beside it.
+    seen = devices[:1] if any(device.startswith("MIG-") for device in devices) else devices
+    environment = {k: v for k, v in os.environ.items() if k not in _CUDA_VARIABLES} | {
+        "CUDA_VISIBLE_DEVICES": ",".join(seen),
+        "JAX_PLATFORMS": "cuda" if seen else "cpu",
+        "XLA_PYTHON_CLIENT_PREALLOCATE": "false",
+    }
+    try:
+        done = subprocess.run(
+            [sys.executable, "-m", "gmijax.workers.jax_probe"],
+            env=environment,
+            stdin=subprocess.DEVNULL,
+            capture_output=True,
+            text=True,
+            timeout=timeout_s,
+            check=False,
+        )
+    except subprocess.TimeoutExpired:
+        return JaxView(None, error=f"no answer within {timeout_s:g} s")
+    if done.returncode:
+        lines = done.stderr.strip().splitlines()
+        return JaxView(None, error=lines[-1] if lines else f"exit code {done.returncode}")
+    said = json.loads(done.stdout.strip().splitlines()[-1])
+    return JaxView(said["platform"], tuple(said["devices"]))
+
+
+def try_mps(machine: Machine) -> str | None:
+    """Starts an MPS daemon as a job would and ends it again; the error, None if there is none.
+
+    Not tried where MPS is not installed, somebody's daemon runs, or no GPU can take one.
+    """
+    whole = [gpu for gpu in machine.gpus if device_of(gpu) and not gpu.mig_enabled]
+    if machine.mps_control is None or machine.operator_daemon is not None or not whole:
+        return None
+    config = PlanConfig(gpus=(whole[0].index,), backend="mps")
+    with tempfile.TemporaryDirectory() as scratch:
+        try:
+            plan = make_plan(config, ReduceConfig(), 1, machine)
+            with MpsBackend(plan, machine, RunPaths(Path(scratch))):
+                return None
+        except GmijaxError as error:
+            return str(error)

@@ -1,0 +1,1 @@
+"""Shared by all algorithms: policy, learner, updates, unroll, checkpoints, metrics."""

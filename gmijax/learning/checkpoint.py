@@ -1,0 +1,233 @@
+"""Checkpoints of the full state, written with orbax.
+
+`<run>/checkpoints/<12-digit env steps>/{learner,gmi_0,gmi_1,...,meta.json}`: what all GMIs share
+is written by the leader, each GMI's environments by itself. Everything goes to a hidden folder
+that is renamed when all GMIs have finished and all of it is on the disk, so a checkpoint is there
+as a whole or not at all.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import math
+import os
+import shutil
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TypeVar
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import orbax.checkpoint as ocp
+
+from gmijax.collectives.interface import Reducer
+from gmijax.config import TrainConfig
+from gmijax.errors import ConfigError, NonFiniteError, ParameterMismatch
+from gmijax.runs.folder import META, RunPaths, write_json
+from gmijax.runs.resume import CheckpointMeta, file_check
+from gmijax.types import PyTree
+
+T = TypeVar("T")
+
+LEARNER = "learner"
+
+
+def checkpoint_meta(
+    config: TrainConfig, env_steps: int, num_gmis: int, mean_return: float | None
+) -> CheckpointMeta:
+    """Content of `meta.json` for a checkpoint of this run by `num_gmis` GMIs."""
+    algo = config.algo
+    return CheckpointMeta(
+        env=config.env.label,
+        algo=algo.name,
+        env_steps=env_steps,
+        num_gmis=num_gmis,
+        num_envs=config.envs_per_gmi,
+        hidden=(algo.policy_hidden_layer_sizes, algo.value_hidden_layer_sizes),
+        impl=config.physics.impl,
+        mean_return=mean_return,
+    )
+
+
+def require_equal(reducer: Reducer, params: PyTree, env_steps: int) -> None:
+    """Raises `ParameterMismatch` if the trainers' parameters differ; collective."""
+    digests = reducer.all_gather(digest(params))
+    if different := [r for r in range(len(digests)) if (digests[r] != digests[0]).any()]:
+        raise ParameterMismatch(
+            f"after {env_steps} env steps the parameters of trainers {different} differ from "
+            "those of trainer 0"
+        )
+
+
+def require_finite(params: PyTree, env_name: str, env_steps: int) -> None:
+    """Raises `NonFiniteError` if parameters to be saved are NaN or infinite."""
+    if not all(bool(jnp.all(jnp.isfinite(leaf))) for leaf in jax.tree.leaves(params)):
+        raise NonFiniteError(
+            f"{env_name}: parameters are not finite after {env_steps} env steps; nothing was saved"
+        )
+
+
+def save_learner(paths: RunPaths, env_steps: int, learner_state: PyTree) -> None:
+    """Writes the shared part of the checkpoint at `env_steps`, not yet under its name."""
+    _save(_partial(paths, env_steps) / LEARNER, learner_state)
+
+
+def save_envs(paths: RunPaths, env_steps: int, gmi: int, env_state: PyTree) -> None:
+    """Writes the environments of one GMI, as `save_learner` does the shared part."""
+    _save(_partial(paths, env_steps) / f"gmi_{gmi}", env_state)
+
+
+def finish_checkpoint(paths: RunPaths, meta: CheckpointMeta, keep: int | None = None) -> Path:
+    """Gives a checkpoint its name, once all have written their parts; returns its folder.
+
+    Args:
+      paths: the run folder.
+      meta: what the checkpoint holds; the list of its files is added.
+      keep: how many checkpoints stay, among them always the one with the best return and the
+        last one; None: all.
+    """
+    final, partial = paths.checkpoint(meta.env_steps), _partial(paths, meta.env_steps)
+    files = [path for path in sorted(partial.rglob("*")) if path.is_file()]
+    checks = {path.relative_to(partial).as_posix(): file_check(path) for path in files}
+    for path in (*files, *(path for path in partial.rglob("*") if path.is_dir())):
+        _sync(path)
+    write_json(partial / META, dataclasses.replace(meta, files=checks).to_dict())
+    _sync(partial)
+    if final.exists():  # A broken one, which a restart has passed over.
+        _remove(final)
+    os.replace(partial, final)
+    _sync(final.parent)
+    if keep is not None:
+        _remove_old(paths, keep)
+    return final
+
+
+def _remove_old(paths: RunPaths, keep: int) -> None:
+    found = sorted(path.parent for path in paths.checkpoints.glob(f"[0-9]*/{META}"))
+    returns = {path: _return_of(path) for path in found}
+    best = max(reversed(found), key=lambda path: returns[path])
+    others = [path for path in found if path != best]
+    num_others = max(keep - 1, int(best != found[-1]))
+    for path in others[: max(0, len(others) - num_others)]:
+        _remove(path)
+
+
+def _return_of(checkpoint: Path) -> float:
+    try:
+        mean = CheckpointMeta.read(checkpoint).mean_return
+    except ConfigError:
+        return -math.inf
+    return -math.inf if mean is None else mean
+
+
+def _remove(checkpoint: Path) -> None:
+    # Under another name first: what has lost some of its files is no checkpoint.
+    hidden = checkpoint.with_name(f".{checkpoint.name}.removed")
+    shutil.rmtree(hidden, ignore_errors=True)
+    os.replace(checkpoint, hidden)
+    shutil.rmtree(hidden, ignore_errors=True)
+
+
+def _sync(path: Path) -> None:
+    fd = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(fd)
+    finally:
+        os.close(fd)
+
+
+def has_envs(checkpoint: Path, gmi: int) -> bool:
+    """Whether a checkpoint holds environments of that GMI."""
+    return (checkpoint / f"gmi_{gmi}").is_dir()
+
+
+def restore_learner(checkpoint: Path, template: T) -> T:
+    """The learner's state; `template` gives structure, shapes and dtypes.
+
+    Raises:
+      ConfigError: the checkpoint does not fit the template.
+    """
+    return _restore(checkpoint / LEARNER, template)
+
+
+def restore_envs(checkpoint: Path, gmi: int, template: T) -> T:
+    """The environments of one GMI; `template` gives structure, shapes and dtypes."""
+    return _restore(checkpoint / f"gmi_{gmi}", template)
+
+
+def digest(tree: PyTree) -> np.ndarray:
+    """SHA-256 of all bytes of a tree as [16] float32 of 16-bit numbers, exact in float32."""
+    sha = hashlib.sha256()
+    for leaf in jax.tree.leaves(tree):
+        sha.update(np.ascontiguousarray(leaf).tobytes())
+    return np.frombuffer(sha.digest(), np.uint16).astype(np.float32)
+
+
+def _partial(paths: RunPaths, env_steps: int) -> Path:
+    final = paths.checkpoint(env_steps)
+    partial = final.with_name(f".{final.name}.partial")
+    partial.mkdir(parents=True, exist_ok=True)
+    return partial
+
+
+def _save(folder: Path, tree: PyTree) -> None:
+    # Orbax takes device arrays for parts of arrays of the whole jax world.
+    arrays = jax.tree.map(np.asarray, _storable(tree))
+    with _as_one_process(), ocp.StandardCheckpointer() as checkpointer:
+        checkpointer.save(folder.resolve(), arrays)
+
+
+def _restore(folder: Path, template: T) -> T:
+    plain = jax.tree.map(np.asarray, _storable(template))
+    try:
+        with _as_one_process(), ocp.StandardCheckpointer() as checkpointer:
+            restored = checkpointer.restore(folder.resolve(), plain)
+    except Exception as error:
+        # Orbax raises a plain `Exception` for an array that it cannot read. Anything else, such
+        # as a device without enough memory, does not say that the checkpoint is bad.
+        if not isinstance(error, ValueError | KeyError | OSError) and type(error) is not Exception:
+            raise
+        lines = str(error).strip().splitlines() or [type(error).__name__]
+        raise ConfigError(f"checkpoint {folder} does not fit this job: {lines[0]}") from error
+    return jax.tree.map(_restored, template, restored)
+
+
+@contextmanager
+def _as_one_process() -> Iterator[None]:
+    """Lets orbax see this process alone.
+
+    GMIs that form rings are processes of one jax world, in which orbax would have them write one
+    checkpoint together, through a service of jax that is gone by then. Here each writes folders
+    of its own, and the training loop has a barrier.
+    """
+    count, index = jax.process_count, jax.process_index
+    jax.process_count, jax.process_index = lambda *_: 1, lambda *_: 0
+    try:
+        yield
+    finally:
+        jax.process_count, jax.process_index = count, index
+
+
+def _is_key(leaf: jax.Array) -> bool:
+    return jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key)
+
+
+def _storable(tree: PyTree) -> PyTree:
+    # Orbax takes neither typed random keys, whose bits are plain uint32 arrays, nor arrays
+    # without elements, such as the activations of a model that has none.
+    def plain(leaf: jax.Array) -> jax.Array:
+        if leaf.size == 0:
+            return jnp.zeros(1)
+        return jax.random.key_data(leaf) if _is_key(leaf) else leaf
+
+    return jax.tree.map(plain, tree)
+
+
+def _restored(like: jax.Array, leaf: jax.Array) -> jax.Array:
+    if like.size == 0:
+        return like
+    array = jnp.array(leaf)
+    return jax.random.wrap_key_data(array) if _is_key(like) else array

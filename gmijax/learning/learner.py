@@ -1,0 +1,165 @@
+"""Networks, optimiser and the learner's state: what all training algorithms share.
+
+Checkpoints hold a `TrainState` whatever the algorithm, so that all can be played.
+"""
+
+from __future__ import annotations
+
+from typing import Generic, NamedTuple, TypeVar
+
+import jax
+import jax.numpy as jnp
+import optax
+from jax.flatten_util import ravel_pytree
+
+from gmijax.config import ADAPTIVE_LEARNING_RATE_RANGE, AlgoConfig
+from gmijax.learning.normalize import Moments, no_samples
+from gmijax.learning.policy import ActorCritic, ActorCriticParams, make_actor_critic
+from gmijax.sim.interface import EnvSpec
+from gmijax.types import Array, PRNGKey, PyTree
+
+C = TypeVar("C", bound=AlgoConfig)
+
+_LEARNING_RATE_STEP = 1.5
+_UNMOVED_KL = 1e-6
+
+
+class TrainState(NamedTuple):
+    """All that learning must remember; equal, bit by bit, on every GMI.
+
+    Attributes:
+      params: weights of policy and value function.
+      opt_state: Adam's moments.
+      obs_moments: statistics of all observations before this iteration.
+      learning_rate: [] float32.
+      iteration: [] int32, finished iterations.
+      key: base of the shuffling keys; never consumed, only folded with iteration and rank.
+    """
+
+    params: ActorCriticParams
+    opt_state: PyTree
+    obs_moments: Moments
+    learning_rate: Array
+    iteration: Array
+    key: PRNGKey
+
+
+class Learner(NamedTuple, Generic[C]):
+    """Networks, optimiser and hyper-parameters: what the update functions need, no arrays."""
+
+    networks: ActorCritic
+    optimizer: optax.GradientTransformation
+    config: C
+
+
+def make_learner(spec: EnvSpec, config: C) -> Learner[C]:
+    """The learner for an environment's sizes."""
+    return Learner(
+        networks=make_actor_critic(
+            spec.action_size,
+            config.policy_hidden_layer_sizes,
+            config.value_hidden_layer_sizes,
+            config.init_noise_std,
+        ),
+        # The learning rate is in the state, because the adaptive schedule changes it.
+        optimizer=optax.chain(
+            optax.clip_by_global_norm(config.max_grad_norm), optax.scale_by_adam()
+        ),
+        config=config,
+    )
+
+
+def init_learner(learner: Learner, obs_size: int, key: PRNGKey) -> TrainState:
+    """The first state; consumes `key`."""
+    params_key, shuffle_key = jax.random.split(key)
+    params = learner.networks.init(params_key, obs_size)
+    return TrainState(
+        params=params,
+        opt_state=learner.optimizer.init(params),
+        obs_moments=no_samples((obs_size,)),
+        learning_rate=jnp.asarray(learner.config.learning_rate, jnp.float32),
+        iteration=jnp.zeros((), jnp.int32),
+        key=shuffle_key,
+    )
+
+
+def acting_moments(learner: Learner, state: TrainState) -> Moments:
+    """The statistics that observations are normalised with (none if switched off)."""
+    if learner.config.normalize_observations:
+        return state.obs_moments
+    return no_samples(state.obs_moments.mean.shape)
+
+
+class ActingWeights(NamedTuple):
+    """Weights of a policy that acts.
+
+    Attributes:
+      params: weights of policy and value function.
+      moments: statistics that observations are normalised with.
+    """
+
+    params: ActorCriticParams
+    moments: Moments
+
+
+def acting_weights(learner: Learner, state: TrainState) -> ActingWeights:
+    """The weights to act with when the learner has `state`."""
+    return ActingWeights(state.params, acting_moments(learner, state))
+
+
+def pack_weights(weights: ActingWeights) -> Array:
+    """All numbers as one array [W] float32, to be sent."""
+    return ravel_pytree(weights)[0]
+
+
+def unpack_weights(example: ActingWeights, packed: Array) -> ActingWeights:
+    """Inverts `pack_weights`; `example` gives the structure."""
+    return ravel_pytree(example)[1](packed)
+
+
+def learner_shapes(spec: EnvSpec, config: AlgoConfig) -> TrainState:
+    """Shapes of a state; nothing is computed."""
+    learner = make_learner(spec, config)
+    return jax.eval_shape(lambda: init_learner(learner, spec.obs_size, jax.random.key(0)))
+
+
+def num_weights(spec: EnvSpec, config: AlgoConfig) -> int:
+    """W, length of the packed weights."""
+    state = learner_shapes(spec, config)
+    return sum(leaf.size for leaf in jax.tree.leaves((state.params, state.obs_moments)))
+
+
+def apply_gradients(
+    learner: Learner, state: TrainState, grads: ActorCriticParams, kl: Array
+) -> TrainState:
+    """One Adam step with the mean gradient of all GMIs.
+
+    `kl` [] is the divergence that the adaptive schedule looks at; see `adapted_learning_rate`.
+    """
+    rate = state.learning_rate
+    if learner.config.learning_rate_schedule == "adaptive_kl":
+        rate = adapted_learning_rate(rate, kl, learner.config.desired_kl)
+    updates, opt_state = learner.optimizer.update(grads, state.opt_state, state.params)
+    params = jax.tree.map(lambda p, u: p - rate * u, state.params, updates)
+    return state._replace(params=params, opt_state=opt_state, learning_rate=rate)
+
+
+def rate_figures(config: AlgoConfig, rates: Array) -> dict[str, Array]:
+    """Mean, least and largest of the learning rates of updates; none if they cannot differ."""
+    if config.learning_rate_schedule == "fixed" or rates.size == 1:
+        return {}
+    return {"mean": jnp.mean(rates), "min": jnp.min(rates), "max": jnp.max(rates)}
+
+
+def adapted_learning_rate(rate: Array, kl: Array, desired_kl: float) -> Array:
+    """Steers the rate to keep the KL divergence per update near `desired_kl`.
+
+    Divided by 1.5 above twice the target, multiplied by 1.5 below half of it (the rule of
+    Isaac Gym's trainers), within [1e-5, 1e-2]. No change below 1e-6: that is the first update
+    on a rollout, where the policy has not moved yet and the rest is rounding.
+    """
+    low, high = ADAPTIVE_LEARNING_RATE_RANGE
+    slower = jnp.maximum(rate / _LEARNING_RATE_STEP, low)
+    faster = jnp.minimum(rate * _LEARNING_RATE_STEP, high)
+    too_slow = (kl < 0.5 * desired_kl) & (kl > _UNMOVED_KL)
+    return jnp.where(kl > 2.0 * desired_kl, slower, jnp.where(too_slow, faster, rate))

@@ -1,0 +1,72 @@
+"""Where a GMI begins: first states of learner and environments, or those of a checkpoint."""
+
+from __future__ import annotations
+
+from functools import partial
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+
+from gmijax.config import TrainConfig
+from gmijax.learning.checkpoint import has_envs, restore_envs, restore_learner
+from gmijax.learning.learner import Learner, TrainState, init_learner
+from gmijax.runs.folder import RunPaths, read_json
+from gmijax.runs.resume import CheckpointMeta
+from gmijax.sim.wrappers import BatchedEnv, BatchState, env_keys
+
+
+def first_state(learner: Learner, obs_size: int, config: TrainConfig) -> tuple[TrainState, int]:
+    """The learner's state, and the environment steps that it has learnt from.
+
+    Raises:
+      ConfigError: the checkpoint to go on from does not fit.
+    """
+    key = jax.random.split(jax.random.key(config.seed))[0]
+    state = jax.jit(partial(init_learner, learner, obs_size))(key)
+    if config.run.resume is None:
+        return state, 0
+    checkpoint = Path(config.run.resume)
+    state = restore_learner(checkpoint, state)
+    # The schedule's rate is part of the state, unless the user asks for another one now.
+    wanted = config.algo.learning_rate
+    if wanted != read_json(RunPaths(checkpoint.parent.parent).config)["algo"]["learning_rate"]:
+        state = state._replace(learning_rate=jnp.asarray(wanted, jnp.float32))
+    return state, CheckpointMeta.read(checkpoint).env_steps
+
+
+def first_envs(
+    env: BatchedEnv,
+    config: TrainConfig,
+    place: int,
+    *,
+    gmi: int | None = None,
+    num_gmis: int | None = None,
+) -> BatchState:
+    """Environments at their starts, or as a checkpoint has them.
+
+    The key of an environment comes from its number in the whole job, so that k GMIs of n
+    environments and one of k * n simulate the same ones.
+
+    Args:
+      env: the environments.
+      config: of the run.
+      place: number of this GMI among those that simulate.
+      gmi: whose environments of a checkpoint to take, None for nobody's.
+      num_gmis: only from a checkpoint of so many GMIs, None for any.
+    """
+    num_envs = config.envs_per_gmi
+    key = jax.random.split(jax.random.key(config.seed))[1]
+    resume = None if config.run.resume is None else Path(config.run.resume)
+    meta = None if resume is None else CheckpointMeta.read(resume)
+    if meta is not None:  # Other environments than the first run's: never its starts again.
+        key = jax.random.fold_in(key, meta.env_steps % 2**31)
+    keys = env_keys(key, place * num_envs, num_envs)
+    env_state = jax.jit(env.init)(env.model, keys)
+    if resume is None or meta is None or gmi is None or not has_envs(resume, gmi):
+        return env_state
+    if num_gmis not in (None, meta.num_gmis):
+        return env_state
+    if (meta.num_envs, meta.impl) != (num_envs, config.physics.impl):
+        return env_state
+    return restore_envs(resume, gmi, env_state)

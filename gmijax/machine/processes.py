@@ -1,0 +1,129 @@
+"""Processes of this host, asked about in /proc, pipes to our own, a port for them; stdlib only."""
+
+from __future__ import annotations
+
+import os
+import socket
+import time
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from typing import ClassVar, NamedTuple
+
+_POLL_S = 0.02
+_ENDED = (b"Z", b"X")
+_LOCAL_HOST = "127.0.0.1"
+
+
+class GuardPipe:
+    """The write end of a pipe whose end of file tells a child that this process is gone.
+
+    A process that the caller forks while the pipe is open would hold it open for longer than this
+    one lives, so it is closed in every fork.
+
+    Attributes:
+      read_end: for the child; the caller closes it once that is started.
+    """
+
+    # What `os.register_at_fork` calls cannot be taken back: one function, over those open now.
+    _open: ClassVar[set[int]] = set()
+
+    def __init__(self) -> None:
+        self.read_end, self._write_end = os.pipe()
+        self._open.add(self._write_end)
+
+    def write(self, data: bytes) -> None:
+        """Sends bytes; the child may have ended."""
+        with suppress(OSError):
+            os.write(self._write_end, data)
+
+    def close(self) -> None:
+        """Ends the pipe; idempotent."""
+        if self._write_end in self._open:
+            self._open.discard(self._write_end)
+            os.close(self._write_end)
+        self._write_end = -1
+
+    @classmethod
+    def _close_all(cls) -> None:
+        for fd in cls._open:
+            with suppress(OSError):
+                os.close(fd)
+        cls._open.clear()
+
+
+os.register_at_fork(after_in_child=GuardPipe._close_all)
+
+
+class ProcessId(NamedTuple):
+    """One process, told apart from a later one that got the same number.
+
+    Attributes:
+      pid: the process's number.
+      start_ticks: when it started, clock ticks since the machine booted.
+    """
+
+    pid: int
+    start_ticks: int
+
+    def is_running(self) -> bool:
+        """Whether exactly this process runs; a zombie does not."""
+        return identify(self.pid) == self
+
+
+def identify(pid: int) -> ProcessId | None:
+    """The running process with number `pid`, or None (also for a zombie)."""
+    try:
+        process, state, _ = _parse(Path(f"/proc/{pid}/stat").read_bytes())
+    except OSError:
+        return None
+    return None if state in _ENDED else process
+
+
+def own_process() -> ProcessId:
+    """The calling process."""
+    # Not os.getpid(): processes look at each other through /proc, which may number differently.
+    return _parse(Path("/proc/self/stat").read_bytes())[0]
+
+
+def members_of(group: int) -> tuple[ProcessId, ...]:
+    """The running processes of a process group; no zombies."""
+    found = []
+    for entry in Path("/proc").glob("[0-9]*"):
+        with suppress(OSError, ValueError):  # It may end meanwhile.
+            process, state, its_group = _parse((entry / "stat").read_bytes())
+            if its_group == group and state not in _ENDED:
+                found.append(process)
+    return tuple(found)
+
+
+def wait_until_gone(processes: Iterable[ProcessId], timeout_s: float) -> tuple[ProcessId, ...]:
+    """Waits until all have ended; returns those that still run after `timeout_s`."""
+    deadline_s = time.monotonic() + timeout_s
+    left = tuple(process for process in processes if process.is_running())
+    while left and time.monotonic() < deadline_s:
+        time.sleep(_POLL_S)
+        left = tuple(process for process in left if process.is_running())
+    return left
+
+
+@contextmanager
+def reserved_address() -> Iterator[str]:
+    """`127.0.0.1:port`, where one process of this user may listen, and nobody else.
+
+    The port is bound here without listening, and shared (SO_REUSEPORT) with the server of a GMI.
+    So it cannot go to somebody else between the choice and the server's start. Connections go
+    to who listens.
+    """
+    with socket.socket(socket.AF_INET, socket.SOCK_STREAM) as holder:
+        holder.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEPORT, 1)
+        holder.bind((_LOCAL_HOST, 0))
+        yield f"{_LOCAL_HOST}:{holder.getsockname()[1]}"
+
+
+def _parse(stat: bytes) -> tuple[ProcessId, bytes, int]:
+    """The process that a line of /proc/<pid>/stat is about, its state and its group."""
+    # The second field is the program's name in brackets, which may itself hold blanks and
+    # brackets: count from the last one.
+    fields = stat.rpartition(b")")[2].split()
+    return ProcessId(int(stat.partition(b" ")[0]), int(fields[19])), fields[0], int(fields[2])

@@ -1,0 +1,163 @@
+"""A snapshot of the machine, so that planning is a pure function of it."""
+
+from __future__ import annotations
+
+import os
+import platform
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+from gmijax.machine.host_limits import (
+    UNKNOWN_HOST,
+    CgroupLimits,
+    Host,
+    detect_host,
+    usable_cores,
+)
+from gmijax.machine.mps_control import (
+    DEFAULT_PIPE_DIRECTORY,
+    PIPE_VARIABLE,
+    MpsControl,
+    find_mps_control,
+)
+from gmijax.machine.nvidia import Gpu, driver_version, gpu_problem, list_gpus
+from gmijax.runs.cache import why_temporary
+
+_HIDES_ALL = ("", "-1", "NoDevFiles")
+"""Values of `CUDA_VISIBLE_DEVICES` that say on purpose that there are no GPUs."""
+
+_DEVICES = Path("/dev")
+_OTHERS = {"kfd": "a GPU for ROCm", "accel[0-9]*": "a TPU"}
+
+
+@dataclass(frozen=True)
+class Machine:
+    """Resources that a job may use here.
+
+    Attributes:
+      gpus: GPUs that the job may use, in order of preference.
+      cpu_cores: ids of the CPU cores that a job may use: those that this process may run on, no
+        more than its control group gets time for.
+      mps_control: program of the MPS daemon, None where it is not installed.
+      driver_version: of the NVIDIA driver, None without one.
+      operator_daemon: pipe directory of a running MPS daemon that somebody else started.
+      host: what is left of memory, threads and open files.
+      gpu_problem: why there are no GPUs although NVIDIA's driver is there; None where it works,
+        there is none, or the user hides all GPUs.
+      warnings: what is here and is not used or cannot be, one sentence each.
+    """
+
+    gpus: tuple[Gpu, ...]
+    cpu_cores: tuple[int, ...]
+    mps_control: Path | None = None
+    driver_version: str | None = None
+    operator_daemon: Path | None = None
+    host: Host = UNKNOWN_HOST
+    gpu_problem: str | None = None
+    warnings: tuple[str, ...] = ()
+
+    @property
+    def driver_major(self) -> int:
+        """The driver's branch, e.g. 580; 0 where it is not known."""
+        major = (self.driver_version or "").partition(".")[0]
+        return int(major) if major.isdigit() else 0
+
+
+def detect_machine() -> Machine:
+    """Looks at this machine; takes well under a second and makes no GPU context.
+
+    An inherited `CUDA_VISIBLE_DEVICES` restricts the GPUs, as a batch system that sets it
+    expects; GPUs keep their indices of nvidia-smi.
+    """
+    selection = os.environ.get("CUDA_VISIBLE_DEVICES")
+    listed = list_gpus()
+    gpus = visible_gpus(listed, selection)
+    is_hidden = selection is not None and selection.strip() in _HIDES_ALL
+    mps_control = find_mps_control() if gpus else None
+    daemon, stranger = _operator_daemon(mps_control) if mps_control else (None, None)
+    return Machine(
+        gpus=gpus,
+        cpu_cores=usable_cores(_cpu_cores(), CgroupLimits().cpu_quota(), platform.node()),
+        mps_control=mps_control,
+        driver_version=driver_version(),
+        operator_daemon=daemon,
+        host=detect_host(),
+        gpu_problem=None if listed or is_hidden else gpu_problem(),
+        warnings=(
+            *(() if gpus else _other_accelerators()),
+            *filter(None, (stranger, why_temporary())),
+        ),
+    )
+
+
+def visible_gpus(gpus: tuple[Gpu, ...], selection: str | None) -> tuple[Gpu, ...]:
+    """The GPUs that a value of `CUDA_VISIBLE_DEVICES` leaves, in its order.
+
+    Numbers are taken for indices of nvidia-smi (as with `CUDA_DEVICE_ORDER=PCI_BUS_ID`), other
+    entries for (beginnings of) UUIDs, of GPUs or of MIG instances; a GPU of which instances are
+    named has only those. As in CUDA the first entry that fits nothing ends the list; None means
+    no restriction, an empty value hides all GPUs.
+    """
+    if selection is None:
+        return gpus
+    chosen: dict[int, Gpu] = {}
+    for entry in selection.replace(" ", "").split(","):
+        fits = [part for gpu in gpus if (part := _named_part(gpu, entry))]
+        if len(fits) != 1 or not _add(chosen, fits[0]):
+            break
+    return tuple(chosen.values())
+
+
+def _named_part(gpu: Gpu, entry: str) -> Gpu | None:
+    """The GPU, or it with one instance, if `entry` names that."""
+    if entry.isdecimal():
+        return gpu if gpu.index == int(entry) else None
+    if entry and gpu.uuid.startswith(entry):
+        return gpu
+    named = tuple(one for one in gpu.instances if entry and one.uuid.startswith(entry))
+    return gpu._replace(instances=named) if len(named) == 1 else None
+
+
+def _add(chosen: dict[int, Gpu], part: Gpu) -> bool:
+    """Adds a GPU, or one more instance of it; False if that is there already."""
+    before = chosen.get(part.index)
+    if before is not None and set(part.instances) <= set(before.instances):
+        return False
+    more = before.instances if before is not None else ()
+    chosen[part.index] = part._replace(instances=(*more, *part.instances))
+    return True
+
+
+def _cpu_cores() -> tuple[int, ...]:
+    if hasattr(os, "sched_getaffinity"):
+        return tuple(sorted(os.sched_getaffinity(0)))
+    return tuple(range(os.cpu_count() or 1))
+
+
+def _operator_daemon(program: Path) -> tuple[Path | None, str | None]:
+    """The pipe directory of a daemon that runs, or why the one that is there is left alone."""
+    named = os.environ.get(PIPE_VARIABLE)
+    directory = Path(named) if named else DEFAULT_PIPE_DIRECTORY
+    # Asking where there is no directory would cost a process start on every run.
+    if not directory.is_dir():
+        return None, None
+    if not named and (owner := _strange_owner(directory)) is not None:
+        return None, (
+            f"warning: {directory} belongs to user {owner}, so the MPS daemon there is not used; "
+            f"{PIPE_VARIABLE}={directory} says that it is to be"
+        )
+    return (directory if MpsControl(program, directory).is_answering() else None), None
+
+
+def _strange_owner(directory: Path) -> int | None:
+    """Who owns a directory that everybody could have made; None if root or this user does."""
+    owners = (directory.lstat().st_uid, directory.stat().st_uid)
+    return next((owner for owner in owners if owner not in (0, os.geteuid())), None)
+
+
+def _other_accelerators() -> Iterator[str]:
+    """What else could compute here, as far as device files tell."""
+    for pattern, what in _OTHERS.items():
+        if found := sorted(_DEVICES.glob(pattern)):
+            yield f"warning: {found[0]} looks like {what}, which gmijax does not use"

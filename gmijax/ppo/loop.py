@@ -1,0 +1,242 @@
+"""The training loop of a GMI in synchronous training: checkpoints, metrics, agreement to stop.
+
+Every GMI that trains runs this same routine; the reducer keeps them in step and makes their
+learner states equal. The leader (rank 0) alone writes metrics and the shared part of checkpoints.
+"""
+
+from __future__ import annotations
+
+import statistics
+import time
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+
+from gmijax.collectives.interface import Reducer
+from gmijax.config import PpoConfig, TrainConfig
+from gmijax.devices import describe_device
+from gmijax.errors import CollectiveError
+from gmijax.learning.checkpoint import (
+    checkpoint_meta,
+    finish_checkpoint,
+    require_equal,
+    require_finite,
+    save_envs,
+    save_learner,
+)
+from gmijax.learning.learner import TrainState, make_learner
+from gmijax.learning.report_thread import ReportThread
+from gmijax.learning.start import first_envs, first_state
+from gmijax.learning.throughput import ThroughputMeter
+from gmijax.learning.training_log import Learnt, TrainingLog
+from gmijax.ppo.iteration import SplitIteration, make_iteration, times_of
+from gmijax.ppo.ppo import IterationMetrics
+from gmijax.ppo.tdg_ex import RemoteRollouts, RolloutWorkers
+from gmijax.runs.folder import write_json
+from gmijax.sim.wrappers import BatchedEnv
+from gmijax.supervise.child import ChildLink
+
+
+class TrainingLoop:
+    """One GMI's training run.
+
+    Args:
+      config: of the run.
+      env: the environments; where others make the rollouts, like theirs.
+      reducer: among the GMIs that train.
+      link: to the controller.
+      workers: the GMIs that make this one's rollouts, None where it does so itself.
+    """
+
+    def __init__(
+        self,
+        config: TrainConfig,
+        env: BatchedEnv,
+        reducer: Reducer,
+        link: ChildLink,
+        workers: RolloutWorkers | None = None,
+    ) -> None:
+        assert isinstance(config.algo, PpoConfig)
+        self._config = config
+        self._env = env
+        self._reducer = reducer
+        self._link = link
+        self._leader = reducer.rank == 0
+        self._learner = make_learner(env.spec, config.algo)
+        self._remote = None
+        num_simulating = reducer.world_size
+        if workers is not None:
+            self._remote = RemoteRollouts(env, self._learner, reducer.rank, workers)
+            num_simulating *= len(workers.gmis)
+        self._steps_per_iteration = (
+            config.envs_per_gmi * config.algo.unroll_length * num_simulating
+        )
+        self._iteration = (
+            make_iteration(env, self._learner, reducer)
+            if self._remote is None
+            else SplitIteration(env, self._learner, reducer, self._remote)
+        )
+        self._meter: ThroughputMeter | None = None
+        # Who has no environments cannot measure how fast they are.
+        if config.run.measure_throughput and self._remote is None:
+            self._meter = ThroughputMeter(env, self._learner, config, reducer)
+        self._env_steps = 0
+        self._iterations = 0
+        self._checkpoint: Path | None = None
+
+    def run(self) -> dict[str, Any]:
+        """Trains until `num_timesteps` or until the controller asks for an end.
+
+        Returns:
+          The outcome for `result.json`.
+
+        Raises:
+          NonFiniteError: simulation or learning produced NaN or infinity.
+          ParameterMismatch: the GMIs' parameters differ.
+          CollectiveError: another GMI is gone or stuck.
+        """
+        started = time.monotonic()
+        state, self._env_steps = first_state(self._learner, self._env.spec.obs_size, self._config)
+        env_state = self._first_envs()
+        waited_s = self._compile(state, env_state)
+        compile_s = time.monotonic() - started - waited_s
+        self._link.beat("ready", 0)
+        self._meet()  # Everybody has compiled: the clock may start.
+        log = self._open_log()
+        first_steps, started = self._env_steps, time.monotonic()
+        state, env_state, stopped = self._train(state, env_state, log)
+        wall_s = time.monotonic() - started
+        done = {
+            "status": "stopped" if stopped else "completed",
+            "env_steps": self._env_steps,
+            "iterations": self._iterations,
+            "train_wall_s": wall_s,
+            "compile_s": compile_s,
+            "env_steps_per_s": (self._env_steps - first_steps) / wall_s,
+            "step_per_s_train": self._median_rate(log.line_s),
+            "final_return": log.last_return,
+            "overflow_steps": log.overflows.steps,
+            "checkpoint": str(self._checkpoint) if self._checkpoint else None,
+            "device": describe_device(),
+        }
+        if self._meter is not None and not stopped:
+            # Written before: whatever happens to the measurement, the training is done.
+            write_json(self._link.paths.result, done)
+            rates = self._meter.measure(
+                state, env_state, lambda: self._link.beat("running", self._iterations)
+            )
+            done |= rates._asdict()
+        return done
+
+    def _first_envs(self) -> Any:
+        if self._remote is not None:
+            return None
+        return first_envs(
+            self._env,
+            self._config,
+            self._reducer.rank,
+            gmi=self._link.gmi,
+            num_gmis=self._reducer.world_size,
+        )
+
+    def _compile(self, state: TrainState, env_state: Any) -> float:
+        """Makes all programs; returns the seconds for which it was not this GMI's turn."""
+        # Every GMI does that itself, at the same time.
+        self._iteration.trace(self._env.model, state, env_state)
+        if self._meter is not None:
+            self._meter.trace(state, env_state)
+        waited_s = self._link.begin_compiling()
+        self._iteration.compile()
+        if self._meter is not None:
+            self._meter.compile()
+        return waited_s
+
+    def _open_log(self) -> TrainingLog:
+        name = self._config.env.label
+        if not self._leader:
+            return TrainingLog(name, (), self._env_steps)
+        return TrainingLog.open(name, self._link.run, self._env_steps)
+
+    def _train(
+        self, state: TrainState, env_state: Any, log: TrainingLog
+    ) -> tuple[TrainState, Any, bool]:
+        """Trains to the end; returns also whether it was asked to stop."""
+        thread = ReportThread(lambda *line: report(log, *line))
+        try:
+            trained = self._loop(state, env_state, thread, log)
+        except CollectiveError:
+            thread.give_up()  # It may wait for a device that waits for a GMI that is gone.
+            raise
+        finally:
+            thread.stop()
+            log.close()
+        if self._remote is not None:
+            self._remote.close()
+        return trained
+
+    def _loop(
+        self, state: TrainState, env_state: Any, thread: ReportThread, log: TrainingLog
+    ) -> tuple[TrainState, Any, bool]:
+        every = self._config.run.checkpoint_every
+        stop = False
+        while self._env_steps < self._config.num_timesteps and not stop:
+            state, env_state, metrics = self._iteration(state, env_state)
+            self._env_steps += self._steps_per_iteration
+            self._iterations += 1
+            thread.report(self._env_steps, metrics, times_of(self._iteration))
+            # Counted from the run's start, so that it says the same after a restart.
+            self._link.beat("running", self._env_steps // self._steps_per_iteration)
+            stop = self._agree_to_stop()
+            is_last = stop or self._env_steps >= self._config.num_timesteps
+            if not is_last and every and self._iterations % every == 0:
+                self._save(state, env_state, thread, log)
+        self._save(state, env_state, thread, log)
+        return state, env_state, stop
+
+    def _agree_to_stop(self) -> bool:
+        # Only one GMI may have heard of it yet; all must leave after the same iteration.
+        mine = np.array([self._link.stop_requested], np.float32)
+        return bool(self._reducer.all_gather(mine).any())
+
+    def _save(
+        self, state: TrainState, env_state: Any, thread: ReportThread, log: TrainingLog
+    ) -> None:
+        self._iteration.wait()
+        thread.wait()  # A resumed run goes on from the lines up to its checkpoint.
+        config, run, steps = self._config, self._link.run, self._env_steps
+        require_equal(self._reducer, state.params, steps)
+        require_finite(state.params, config.env.label, steps)
+        if env_state is not None:
+            save_envs(run, steps, self._link.gmi, env_state)
+        if self._leader:
+            save_learner(run, steps, state)
+        self._meet()
+        if self._leader:
+            meta = checkpoint_meta(config, steps, self._reducer.world_size, log.last_return)
+            finish_checkpoint(run, meta, config.run.keep_checkpoints)
+        self._meet()  # Nobody may look for the folder before it has its name.
+        self._checkpoint = run.checkpoint(steps)
+
+    def _meet(self) -> None:
+        """Returns when all GMIs have called it."""
+        self._reducer.all_gather(np.zeros(1, np.float32))
+
+    def _median_rate(self, iteration_s: list[float]) -> float | None:
+        # The first iteration fills caches and pools, and its metrics come late.
+        steady = iteration_s[1:] or iteration_s
+        return self._steps_per_iteration / statistics.median(steady) if steady else None
+
+
+def report(
+    log: TrainingLog, env_steps: int, metrics: IterationMetrics, times: Mapping[str, float]
+) -> None:
+    """Waits for the iteration that ended at `env_steps` and writes its line.
+
+    `times` are seconds by name, written as they are. Raises as `TrainingLog.write`.
+    """
+    host: Any = jax.tree.map(float, jax.device_get(metrics))
+    learnt = Learnt(host.losses._asdict(), host.learning_rate, host.rates, host.noise_std)
+    log.write(env_steps, host.counts, learnt, times)

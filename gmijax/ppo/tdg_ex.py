@@ -1,0 +1,162 @@
+"""PPO with rollouts made in other GMIs than the updates: the template `tdg_ex`.
+
+A trainer sends the weights to the GMIs that serve it, takes their rollouts of T steps, and updates
+as a co-located GMI would with all their environments. So m serving GMIs with N environments and
+one trainer learn what one GMI with m N does, up to rounding. Everything moves through host
+memory, as the paper has it (sec. 5.1, Table 4): experience to the trainer, parameters back.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from functools import partial
+from typing import Any, NamedTuple, Protocol
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.flatten_util import ravel_pytree
+
+from gmijax.collectives.interface import FloatBuffer
+from gmijax.learning.learner import (
+    ActingWeights,
+    TrainState,
+    acting_weights,
+    init_learner,
+    pack_weights,
+)
+from gmijax.learning.updates import minibatch_order
+from gmijax.ppo.ppo import PpoLearner, Samples, flatten, merge_stats, no_stats, rollout
+from gmijax.sim.wrappers import BatchedEnv, BatchState
+from gmijax.supervise.heartbeat import GmiState
+from gmijax.types import Array, PyTree
+
+
+class Mail(Protocol):
+    """Messages between GMIs, see `gmijax.collectives.messages.messenger`."""
+
+    def send(self, tree: Any, dst: int) -> None:
+        """Sends nested data to GMI `dst`, without waiting for it."""
+        ...
+
+    def recv(self, src: int, *, timeout_s: float | None = None) -> Any:
+        """Waits for the next message of GMI `src`."""
+        ...
+
+
+class RolloutWorkers(NamedTuple):
+    """The GMIs that make a trainer's rollouts.
+
+    Attributes:
+      mail: to them.
+      gmis: their ids; their environments stand in this order in the samples.
+      start_timeout_s: longest wait for the first rollout: they may still compile.
+    """
+
+    mail: Mail
+    gmis: tuple[int, ...]
+    start_timeout_s: float
+
+
+class RemoteRollouts:
+    """Rollouts that other GMIs make, as `LocalRollouts`; here are no environments."""
+
+    def __init__(
+        self, env: BatchedEnv, learner: PpoLearner, rank: int, workers: RolloutWorkers
+    ) -> None:
+        self._workers = workers
+        self._rank = jnp.asarray(rank, jnp.int32)
+        self._join: Any = jax.jit(partial(_join, env, learner))
+        self._pack: Any = jax.jit(lambda state: pack_weights(acting_weights(learner, state)))
+        self._first: tuple[list[Samples], list[np.ndarray]] | None = None
+        self._timeout_s: float | None = workers.start_timeout_s
+
+    def trace(self, model: PyTree, state: TrainState, env_state: None) -> tuple[Any, Any, Any]:
+        """See `LocalRollouts`; waits for first rollouts, which are used by the first call."""
+        del model, env_state
+        self._first = self._ask(state)
+        self._timeout_s = None
+        self._join = self._join.lower(state, *self._first, self._rank)
+        return self._join.out_info
+
+    def compile(self) -> None:
+        """See `LocalRollouts`."""
+        self._join = self._join.compile()
+
+    def __call__(
+        self, state: TrainState, env_state: None
+    ) -> tuple[None, Samples, Array, FloatBuffer]:
+        """See `LocalRollouts`."""
+        (samples, stats), self._first = self._first or self._ask(state), None
+        flat, order, packed = self._join(state, samples, stats, self._rank)
+        return env_state, flat, order, np.asarray(packed)
+
+    def close(self) -> None:
+        """Tells those that serve to end."""
+        for gmi in self._workers.gmis:
+            self._workers.mail.send(None, gmi)
+
+    def _ask(self, state: TrainState) -> tuple[list[Samples], list[np.ndarray]]:
+        """Rollouts with the weights of `state`: samples [T, N], packed statistics."""
+        mail, gmis, _ = self._workers
+        weights = np.asarray(self._pack(state))
+        for gmi in gmis:
+            mail.send(weights, gmi)
+        answers = [mail.recv(gmi, timeout_s=self._timeout_s) for gmi in gmis]
+        return [Samples(*samples) for samples, _ in answers], [stats for _, stats in answers]
+
+
+def serve_rollouts(
+    env: BatchedEnv,
+    learner: PpoLearner,
+    env_state: BatchState,
+    mail: Mail,
+    trainer: int,
+    on_state: Callable[[GmiState, int], None],
+) -> int:
+    """Makes rollouts for `trainer` until it says that it needs no more; returns how many.
+
+    `env_state` is the environments' state at the start and donated; `on_state` is called with
+    `compiling`, `ready` or `running`, and the number of rollouts made.
+    """
+    on_state("compiling", 0)
+    state = init_learner(learner, env.spec.obs_size, jax.random.key(0))
+    packed, unpack = ravel_pytree(acting_weights(learner, state))
+    program: Any = jax.jit(partial(_rollout, env, learner, unpack), donate_argnums=(2,))
+    program = program.lower(env.model, np.asarray(packed), env_state).compile()
+    on_state("ready", 0)
+    number = 0
+    while (weights := mail.recv(trainer)) is not None:
+        on_state("running", number)
+        env_state, samples, stats = program(env.model, weights, env_state)
+        mail.send((tuple(map(np.asarray, samples)), np.asarray(stats)), trainer)
+        number += 1
+    return number
+
+
+def _rollout(
+    env: BatchedEnv,
+    learner: PpoLearner,
+    unpack: Callable[[Array], ActingWeights],
+    model: PyTree,
+    packed: Array,
+    env_state: BatchState,
+) -> tuple[BatchState, Samples, Array]:
+    env_state, samples, stats = rollout(env, learner, model, unpack(packed), env_state)
+    return env_state, samples, ravel_pytree(stats)[0]
+
+
+def _join(
+    env: BatchedEnv,
+    learner: PpoLearner,
+    state: TrainState,
+    samples: Sequence[Samples],
+    stats: Sequence[Array],
+    rank: Array,
+) -> tuple[Samples, Array, Array]:
+    """Flat samples of all environments, the order of minibatches, and packed statistics."""
+    flat = flatten(jax.tree.map(lambda *parts: jnp.concatenate(parts, axis=1), *samples))
+    order = minibatch_order(learner.config, state, rank, flat.advantage.shape[0])
+    unpack = ravel_pytree(no_stats(env.spec, env.overflows))[1]
+    merged = merge_stats(jax.vmap(unpack)(jnp.stack(stats)))
+    return flat, order, ravel_pytree(merged)[0]

@@ -1,0 +1,114 @@
+"""What serving writes into `output.dir`: names, and what is there already. No jax here.
+
+`<output.dir>/dataset.json dataset.lock`
+`<output.dir>/gmi_000/000000.{npz,json} 000001.{npz,json} ...`
+
+A folder for every GMI that simulates, by its rank among them; a shard is one unroll: arrays
+[T, N, ...] and, written after them, a JSON file that says what they are. A shard without its JSON
+file, or of another size than it says, is unfinished and is made again.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from gmijax.errors import ConfigError
+from gmijax.runs.folder import read_json, write_json
+
+_DIGITS = 6
+
+
+@dataclass(frozen=True)
+class ShardPaths:
+    """Files of one shard."""
+
+    arrays: Path
+    about: Path
+
+    def is_finished(self) -> bool:
+        """Whether both files are there, and the arrays are as long as they were written."""
+        try:
+            return self.arrays.stat().st_size == read_json(self.about)["num_bytes"]
+        except (OSError, ValueError, KeyError):
+            return False
+
+
+@dataclass(frozen=True)
+class DataPaths:
+    """Files of one folder of experience."""
+
+    root: Path
+
+    @property
+    def dataset(self) -> Path:
+        """What all shards have in common."""
+        return self.root / "dataset.json"
+
+    @property
+    def lock(self) -> Path:
+        """Empty; a job that writes into the folder holds it."""
+        return self.root / "dataset.lock"
+
+    def folder(self, rank: int) -> Path:
+        """The shards of the GMI that simulates as number `rank`."""
+        return self.root / f"gmi_{rank:03d}"
+
+    def shard(self, rank: int, index: int) -> ShardPaths:
+        """Shard number `index` of GMI `rank`."""
+        stem = self.folder(rank) / f"{index:0{_DIGITS}d}"
+        return ShardPaths(stem.with_suffix(".npz"), stem.with_suffix(".json"))
+
+    def num_finished(self, rank: int) -> int:
+        """How many shards of GMI `rank` are finished, from the first on without a gap."""
+        count = 0
+        while self.shard(rank, count).is_finished():
+            count += 1
+        return count
+
+    def finished(self) -> Iterator[ShardPaths]:
+        """All finished shards, GMI by GMI."""
+        for folder in sorted(self.root.glob("gmi_[0-9]*")):
+            rank = folder.name.removeprefix("gmi_")
+            if not rank.isdecimal():  # A copy that somebody made, e.g. gmi_000.bak
+                continue
+            for index in range(self.num_finished(int(rank))):
+                yield self.shard(int(rank), index)
+
+
+def open_dataset(paths: DataPaths, about: Mapping[str, Any]) -> None:
+    """Makes the folder, or checks that what is in it can be continued.
+
+    Raises:
+      ConfigError: the folder cannot be written, holds something else, or experience that was
+        collected in another way.
+    """
+    try:
+        if paths.dataset.exists():
+            _check_same(paths, about)
+        elif paths.root.exists() and any(paths.root.iterdir()):
+            raise ConfigError(
+                f"output.dir={paths.root}: the folder is not empty and holds no experience "
+                f"({paths.dataset.name} is missing)"
+            )
+        else:
+            write_json(paths.dataset, about)
+    except OSError as error:
+        raise ConfigError(f"output.dir={paths.root}: {error.strerror}") from None
+
+
+def _check_same(paths: DataPaths, about: Mapping[str, Any]) -> None:
+    try:
+        found = read_json(paths.dataset)
+    except ValueError as error:
+        raise ConfigError(f"{paths.dataset}: broken ({error})") from None
+    if not isinstance(found, dict):
+        raise ConfigError(f"{paths.dataset}: broken (not a JSON object)")
+    for key, wanted in about.items():
+        if found.get(key) != wanted:
+            raise ConfigError(
+                f"output.dir={paths.root}: holds experience with {key}={found.get(key)!r}, this "
+                f"job would add {wanted!r}; use another folder or the same settings"
+            )

@@ -1,0 +1,243 @@
+"""Every file name of a run folder, and how files in it are written. No jax here.
+
+`<run>/config.json plan.json summary.json metrics.jsonl events.jsonl returns.png tensorboard/`
+`<run>/checkpoints/<12-digit env steps>/meta.json`
+`<run>/gmi_<id>/{stdout.log,stderr.log,error.json,result.json,metrics.jsonl}`
+`<run>/gmi_<id>/attempt_<n>/`: the same files of attempts that failed
+`<run>/play/<12-digit env steps>/`: a played checkpoint, see `PlayPaths`
+"""
+
+from __future__ import annotations
+
+import fcntl
+import json
+import os
+import re
+import threading
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager, suppress
+from datetime import datetime
+from pathlib import Path
+from typing import Any
+
+from gmijax.errors import ConfigError
+
+RUNS = Path("runs")
+"""Where run folders go unless `run.dir` names one; relative to the working directory."""
+
+STEP_DIGITS = 12
+
+META = "meta.json"
+"""Written last into a checkpoint: a folder without it is not one."""
+
+EXIT_NO_GL = 3
+"""Exit code of the renderer where the OpenGL that it was told to use cannot be had."""
+
+_TEMPORARY = re.compile(r"\..+\.\d+-\d+")
+"""Names that files have while they are written."""
+
+
+class _Folder:
+    """A folder whose files have names here; equal to another one of the same path."""
+
+    def __init__(self, root: Path) -> None:
+        self.root = root
+
+    def __eq__(self, other: object) -> bool:
+        return type(other) is type(self) and vars(other) == vars(self)
+
+    def __hash__(self) -> int:
+        return hash(self.root)
+
+    def __repr__(self) -> str:
+        return f"{type(self).__name__}({str(self.root)!r})"
+
+
+class GmiPaths(_Folder):
+    """Files of one GMI."""
+
+    def __init__(self, root: Path) -> None:
+        super().__init__(root)
+        self.stdout = root / "stdout.log"
+        self.stderr = root / "stderr.log"
+        self.error = root / "error.json"  # Why it failed: type, message, traceback.
+        self.result = root / "result.json"  # What its main returned.
+        self.role = root / "role.pickle"  # A role of the user's own and its arguments.
+        self.output = root / "output.pickle"  # What that returned.
+        self.metrics = root / "metrics.jsonl"  # Of a GMI that reports for itself alone.
+
+
+class RunPaths(_Folder):
+    """Files of one run."""
+
+    def __init__(self, root: Path) -> None:
+        super().__init__(root)
+        self.config = root / "config.json"
+        self.plan = root / "plan.json"
+        self.summary = root / "summary.json"
+        self.metrics = root / "metrics.jsonl"  # One JSON object a line and iteration.
+        self.tensorboard = root / "tensorboard"
+        self.returns_png = root / "returns.png"
+        self.checkpoints = root / "checkpoints"
+        self.mps = root / "mps"  # Logs of MPS daemons that the job starts.
+        self.janitor_log = root / "janitor.log"  # Errors of the janitor; gone without any.
+        self.lock = root / ".lock"  # Held by the job that writes into the folder.
+        self.events = root / "events.jsonl"  # Starts, faults and restarts of the job.
+        self.search_report = root / "search.json"
+        self.search_png = root / "search.png"
+
+    def checkpoint(self, env_steps: int) -> Path:
+        """The checkpoint after `env_steps` environment steps."""
+        return self.checkpoints / f"{env_steps:0{STEP_DIGITS}d}"
+
+    def profile(self, name: str) -> RunPaths:
+        """The run folder of a profile of a search; it keeps no checkpoints."""
+        return RunPaths(self.root / "profiles" / name)
+
+    def gmi(self, gmi: int) -> GmiPaths:
+        """Files of one GMI."""
+        return GmiPaths(self.root / f"gmi_{gmi}")
+
+
+class PlayPaths(_Folder):
+    """Files of one played checkpoint; its folder also has the files of a run with one GMI."""
+
+    def __init__(self, root: Path) -> None:
+        super().__init__(root)
+        self.returns = root / "returns.json"  # Of every episode, and statistics over them.
+        # `qpos` [L + 1, E, nq] of the shown environments, `lengths` [E], `control_dt_s`.
+        self.trajectory = root / "trajectory.npz"
+        self.model = root / "model.mjb"  # Of the trajectory, in MuJoCo's binary format.
+        self.mp4 = root / "video.mp4"
+        self.gif = root / "video.gif"
+        self.html = root / "view.html"
+        self.page_log = root / "page.log"
+        self.render_log = root / "render.log"
+
+    def results(self) -> tuple[Path, ...]:
+        """All files that a new evaluation replaces."""
+        watched = self.mp4, self.gif, self.html
+        return self.returns, self.trajectory, self.model, *watched, self.render_log, self.page_log
+
+
+def create_run(
+    run_dir: str | None, name: str | None, prefix: str, now: datetime | None = None
+) -> RunPaths:
+    """Creates the run folder `run_dir`, or `runs/<name>`, or `runs/<prefix>-<date>-<time>`.
+
+    Raises:
+      ConfigError: the folder exists already, or cannot be made.
+    """
+    stamp = (now or datetime.now()).strftime("%Y%m%d-%H%M%S")
+    given = given_run(run_dir, name)
+    root = given or RUNS / f"{prefix}-{stamp}"
+    key = "run.dir" if run_dir else "run.name"
+    for attempt in range(100):
+        # Two jobs started in the same second: only a name that we made up may be changed.
+        candidate = root.with_name(f"{root.name}-{attempt}") if attempt and not given else root
+        try:
+            candidate.mkdir(parents=True)
+        except FileExistsError:
+            require_new_run(run_dir, name)
+            continue
+        except OSError as error:
+            raise ConfigError(f"{key}={root}: cannot make the folder ({error.strerror})") from None
+        return RunPaths(candidate.resolve())
+    raise ConfigError(f"{key}={root}: no free name")
+
+
+def given_run(run_dir: str | None, name: str | None) -> Path | None:
+    """The run folder that the user names, None if none."""
+    if run_dir:
+        return Path(run_dir)
+    return RUNS / name if name else None
+
+
+def require_new_run(run_dir: str | None, name: str | None) -> None:
+    """Raises ConfigError if the run folder that the user names exists already."""
+    root = given_run(run_dir, name)
+    if root is not None and os.path.lexists(root):
+        key = "run.dir" if run_dir else "run.name"
+        raise ConfigError(f"{key}={root}: the run folder exists already")
+
+
+@contextmanager
+def locked(lock: Path, what: str) -> Iterator[None]:
+    """Holds a folder by a file in it, so that two jobs cannot write into it at once.
+
+    Raises:
+      ConfigError: another job holds it, or it cannot be locked.
+    """
+    # A file: network file systems lock no folders, and files only if they are open for writing.
+    try:
+        fd = os.open(lock, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o644)
+    except OSError as error:
+        raise ConfigError(f"{what}: {error.strerror}") from None
+    try:
+        try:
+            fcntl.flock(fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            raise ConfigError(f"{what}: another job writes into this folder now") from None
+        except OSError as error:
+            raise ConfigError(f"{lock}: cannot be locked ({error.strerror})") from None
+        yield
+    finally:
+        os.close(fd)
+
+
+def write_json(path: Path, data: Mapping[str, Any]) -> None:
+    """Writes `data` as `write_text` does."""
+    write_text(path, json.dumps(data, indent=2) + "\n")
+
+
+def write_text(path: Path, text: str) -> None:
+    """Writes a file so that a reader sees the old one or the new one, never half a file.
+
+    Also after a loss of power: its content is on the disk before its name is.
+    """
+    path.parent.mkdir(parents=True, exist_ok=True)
+    temporary = path.with_name(f".{path.name}.{os.getpid()}-{threading.get_ident()}")
+    try:
+        with temporary.open("w") as file:
+            file.write(text)
+            file.flush()
+            os.fsync(file.fileno())
+        os.replace(temporary, path)
+    except BaseException:
+        temporary.unlink(missing_ok=True)
+        raise
+
+
+def remove_temporary(folder: Path) -> None:
+    """Removes what processes left in a folder that were killed within `write_text`."""
+    for path in folder.glob(".*"):
+        if _TEMPORARY.fullmatch(path.name):
+            path.unlink(missing_ok=True)
+
+
+def read_json(path: Path) -> dict[str, Any]:
+    """Reads what `write_json` wrote."""
+    return json.loads(path.read_text())
+
+
+def add_event(path: Path, event: str, **details: Any) -> None:
+    """Appends to the events of a run; a full disk must not end what it only records."""
+    when = datetime.now().astimezone().isoformat(timespec="milliseconds")
+    line = (json.dumps({"time": when, "event": event, **details}) + "\n").encode()
+    with suppress(OSError), path.open("ab", buffering=0) as file:
+        end = file.tell()
+        if file.write(line) < len(line):
+            file.truncate(end)  # The next event would stand behind half of this one.
+
+
+def last_run(key: str, runs: Path = RUNS) -> Path:
+    """The run folder below `runs` with the newest checkpoint.
+
+    Raises:
+      ConfigError: there is none.
+    """
+    # Not the time of a folder: that changes with whatever is put into it later, e.g. films.
+    found = list(runs.glob(f"*/checkpoints/[0-9]*/{META}"))
+    if not found:
+        raise ConfigError(f"{key}=last: no run with a checkpoint in {runs}/")
+    return max(found, key=lambda meta: meta.stat().st_mtime).parents[2]

@@ -1,0 +1,77 @@
+"""Reading a run's metrics, and the picture of its return curve. No jax here."""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Iterator
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+from gmijax.runs.folder import write_text
+
+
+def read_metrics(path: Path) -> list[dict[str, Any]]:
+    """All lines of a `metrics.jsonl`; an unfinished last line is left out."""
+    return list(_lines(path)) if path.exists() else []
+
+
+def copy_history(source: Path, target: Path, env_steps: int) -> None:
+    """Copies the lines up to `env_steps`, so that a resumed run has the whole curve.
+
+    `source` may be `target`, which is replaced as a whole.
+    """
+    lines = [line for line in read_metrics(source) if line["env_steps"] <= env_steps]
+    write_text(target, "".join(json.dumps(line) + "\n" for line in lines))
+
+
+class MetricsReader:
+    """Follows a `metrics.jsonl` that grows."""
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        self._offset = 0
+
+    def latest(self) -> dict[str, Any] | None:
+        """The last complete line that came since the last call, None if there is none."""
+        try:
+            with self._path.open("rb") as file:
+                if os.fstat(file.fileno()).st_size < self._offset:
+                    self._offset = 0  # A restart has cut it.
+                file.seek(self._offset)
+                new = file.read()
+        except OSError:
+            return None
+        complete = new[: new.rfind(b"\n") + 1]
+        self._offset += len(complete)
+        lines = complete.splitlines()
+        return json.loads(lines[-1]) if lines else None
+
+
+def draw_returns(metrics: Path, picture: Path, title: str) -> bool:
+    """Draws mean episode return over environment steps; False where no episode has ended."""
+    lines = [line for line in read_metrics(metrics) if line.get("return") is not None]
+    if not lines:
+        return False
+    # Imported here: it costs half a second that no other use of this module should pay.
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(7, 4), layout="constrained")
+    FigureCanvasAgg(figure)
+    axes = figure.add_subplot()
+    axes.plot([x["env_steps"] for x in lines], [x["return"] for x in lines])
+    axes.set(title=title, xlabel="environment steps", ylabel="mean episode return")
+    axes.grid(alpha=0.3)
+    figure.savefig(picture, dpi=120)
+    return True
+
+
+def _lines(path: Path) -> Iterator[dict[str, Any]]:
+    with path.open() as file:
+        for line in file:
+            # A full disk may have cut off a line, with later ones right behind it.
+            with suppress(ValueError):
+                if line.endswith("\n"):
+                    yield json.loads(line)

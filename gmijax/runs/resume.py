@@ -1,0 +1,201 @@
+"""Finding a checkpoint and checking that it is whole and fits, without loading it. No jax here."""
+
+from __future__ import annotations
+
+import os
+import zlib
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any, Final, NamedTuple
+
+from gmijax.config import ALGORITHMS, AlgoConfig, EnvConfig
+from gmijax.config.schema import from_dict, from_named
+from gmijax.errors import ConfigError
+from gmijax.runs.folder import META, RunPaths, last_run, read_json
+
+_CHUNK_BYTES: Final = 1 << 20
+
+
+@dataclass(frozen=True)
+class CheckpointMeta:
+    """Meta data of a checkpoint.
+
+    Attributes:
+      env: task name.
+      algo: training algorithm.
+      env_steps: environment steps of the whole job so far.
+      num_gmis: K of the job that wrote it.
+      num_envs: N of that job, environments per GMI.
+      hidden: widths of the policy and of the value network.
+      impl: physics implementation; environment states of one cannot be used by the other.
+      mean_return: of the latest episodes before it, None while none had ended.
+      files: size in bytes and CRC-32 of every other file, by its path in the checkpoint; empty
+        in those of older versions.
+    """
+
+    env: str
+    algo: str
+    env_steps: int
+    num_gmis: int
+    num_envs: int
+    hidden: tuple[tuple[int, ...], tuple[int, ...]]
+    impl: str
+    mean_return: float | None = None
+    files: Mapping[str, tuple[int, ...]] = field(default_factory=dict)
+
+    def to_dict(self) -> dict[str, object]:
+        """Plain data for `meta.json`."""
+        return asdict(self)
+
+    @classmethod
+    def read(cls, checkpoint: Path) -> CheckpointMeta:
+        """Reads the meta data of a checkpoint folder.
+
+        Raises:
+          ConfigError: they are not those of a checkpoint.
+        """
+        try:
+            return from_dict(cls, _read_object(checkpoint / META))
+        except ConfigError as error:
+            raise ConfigError(f"checkpoint {checkpoint}: broken {META} ({error})") from None
+
+
+class Found(NamedTuple):
+    """Checkpoints of a run folder.
+
+    Attributes:
+      checkpoint: the newest one that is whole, None if there is none.
+      passed_over: newer ones, each with what is wrong with it.
+    """
+
+    checkpoint: Path | None
+    passed_over: tuple[str, ...]
+
+
+def newest_checkpoint(folder: Path) -> Found:
+    """The newest checkpoint of a run folder whose files are as they were written."""
+    passed_over: list[str] = []
+    for path in sorted(folder.glob(f"checkpoints/[0-9]*/{META}"), reverse=True):
+        wrong = what_is_broken(path.parent)
+        if wrong is None:
+            return Found(path.parent.resolve(), tuple(passed_over))
+        passed_over.append(f"checkpoint {path.parent}: passed over, {wrong}")
+    return Found(None, tuple(passed_over))
+
+
+def what_is_broken(checkpoint: Path) -> str | None:
+    """Why a checkpoint cannot be used, None if its files are as they were written."""
+    try:
+        meta = CheckpointMeta.read(checkpoint)
+    except ConfigError as error:
+        return str(error).partition(": ")[2]
+    for name, wanted in meta.files.items():
+        try:
+            is_same = file_check(checkpoint / name) == tuple(wanted)
+        except OSError as error:
+            return f"{name}: {error.strerror}"
+        if not is_same:
+            return f"{name} is not as it was written"
+    return None
+
+
+def file_check(path: Path) -> tuple[int, int]:
+    """Size in bytes and CRC-32 of a file."""
+    size = crc = 0
+    with path.open("rb") as file:
+        while chunk := file.read(_CHUNK_BYTES):
+            size, crc = size + len(chunk), zlib.crc32(chunk, crc)
+    return size, crc
+
+
+def find_checkpoint(wanted: str, key: str) -> Path:
+    """The checkpoint that `wanted` names: `last`, a run folder, or a checkpoint folder.
+
+    `last` is the run below `runs/` with the newest checkpoint; a run folder means its newest one
+    that is whole.
+
+    Raises:
+      ConfigError: there is none.
+    """
+    folder = _named(wanted, key)
+    if (folder / META).is_file():
+        if wrong := what_is_broken(folder):
+            raise ConfigError(f"{key}={wanted}: {wrong}")
+        return folder.resolve()
+    found = newest_checkpoint(folder)
+    if found.checkpoint is None:
+        raise ConfigError(
+            "; ".join((f"{key}={wanted}: no checkpoint in this folder", *found.passed_over))
+        )
+    return found.checkpoint
+
+
+def saved_config_of(wanted: str, key: str) -> dict[str, Any]:
+    """The configuration of the run that `wanted` names, whole or not; see `find_checkpoint`.
+
+    Raises:
+      ConfigError: there is no checkpoint, or it does not lie in the folder of a training run.
+    """
+    folder = _named(wanted, key)
+    metas = (folder / META, *folder.glob(f"checkpoints/[0-9]*/{META}"))
+    for meta in metas:
+        if meta.is_file():
+            return saved_config(meta.parent.resolve())
+    raise ConfigError(f"{key}={wanted}: no checkpoint in this folder")
+
+
+def _named(wanted: str, key: str) -> Path:
+    folder = last_run(key) if wanted == "last" else Path(wanted)
+    if not os.path.isdir(folder):  # Unlike `Path.is_dir` it takes any text.
+        raise ConfigError(f"{key}={wanted}: no such folder")
+    return folder
+
+
+def saved_config(checkpoint: Path) -> dict[str, Any]:
+    """The configuration of the run that a checkpoint lies in, as plain data.
+
+    Keys that its version of gmijax did not know are missing.
+
+    Raises:
+      ConfigError: the checkpoint does not lie in the folder of a training run.
+    """
+    path = RunPaths(checkpoint.parent.parent).config
+    if not path.is_file():
+        raise ConfigError(
+            f"checkpoint {checkpoint}: no config.json in {path.parent}; "
+            "a checkpoint can only be used in its run folder"
+        )
+    try:
+        saved = _read_object(path)
+    except ConfigError as error:
+        raise ConfigError(f"{path}: broken ({error})") from None
+    if not all(isinstance(saved.get(group), dict) for group in ("env", "algo", "run")):
+        raise ConfigError(f"{path}: not the configuration of a training run")
+    if saved["env"].get("suite") == "custom":
+        # A file of which nothing is noted is none that can be recognised.
+        saved["env"]["source_sha256"] = saved["env"].get("source_sha256") or ""
+    return saved
+
+
+def trained_config(checkpoint: Path) -> tuple[EnvConfig, AlgoConfig]:
+    """Task and algorithm of the run that a checkpoint lies in.
+
+    Raises:
+      ConfigError: the checkpoint does not lie in the folder of a training run.
+    """
+    saved = saved_config(checkpoint)
+    algo = from_named(ALGORITHMS, saved["algo"], "algo.")
+    return from_dict(EnvConfig, saved["env"], "env."), algo
+
+
+def _read_object(path: Path) -> dict[str, Any]:
+    try:
+        data: object = read_json(path)
+    except OSError as error:
+        raise ConfigError(f"cannot read it: {error.strerror}") from None
+    except ValueError as error:  # Not JSON, or not even text.
+        raise ConfigError(f"not JSON: {error}") from None
+    if not isinstance(data, dict):
+        raise ConfigError("not a JSON object")
+    return data

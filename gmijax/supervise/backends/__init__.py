@@ -1,0 +1,29 @@
+"""Ways to give a GMI its share of a GPU. A new one is one file and one line in `BACKENDS`."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from types import MappingProxyType
+
+from gmijax.config import BackendName
+from gmijax.machine.snapshot import Machine
+from gmijax.partition.plan import Plan
+from gmijax.runs.folder import RunPaths
+from gmijax.supervise.backends.backend import Backend
+from gmijax.supervise.backends.cpu import CpuBackend
+from gmijax.supervise.backends.mig import MigBackend
+from gmijax.supervise.backends.mps import MpsBackend
+from gmijax.supervise.backends.share import ShareBackend
+
+BACKENDS: Mapping[BackendName, type[Backend]] = MappingProxyType(
+    {"mps": MpsBackend, "mig": MigBackend, "share": ShareBackend, "cpu": CpuBackend}
+)
+
+
+def open_backend(plan: Plan, machine: Machine, run: RunPaths) -> Backend:
+    """The backend of a plan, to be entered with `with`.
+
+    Raises:
+      BackendUnavailable: it cannot be had on this machine.
+    """
+    return BACKENDS[plan.backend](plan, machine, run)

@@ -1,0 +1,66 @@
+"""The seam between the supervisor and the ways to give a GMI its share of a GPU."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, Self
+
+from gmijax.machine.snapshot import Machine
+from gmijax.partition.plan import Plan
+from gmijax.runs.folder import RunPaths
+from gmijax.supervise.janitor import JanitorLink
+
+
+class Backend:
+    """Enforces the shares of a plan while it is entered; leaving it undoes what it did.
+
+    This one enforces nothing: it starts the janitor, which ends the GMIs if the controller is
+    killed. Leave it only after every GMI has ended.
+
+    Raises:
+      BackendUnavailable: it cannot be had on this machine.
+    """
+
+    def __init__(self, plan: Plan, machine: Machine, run: RunPaths) -> None:
+        del plan, machine
+        self.run = run
+        self._janitor: JanitorLink | None = None
+
+    def __enter__(self) -> Self:
+        """Sets up what the GMIs need.
+
+        Raises:
+          BackendUnavailable: it cannot be had on this machine; nothing is left behind.
+        """
+        self._janitor = JanitorLink(self.run.janitor_log)
+        return self
+
+    def __exit__(self, *exc: Any) -> None:
+        """Takes down what `__enter__` set up, and nothing else."""
+        if self._janitor is not None:
+            self._janitor.dismiss()
+            self._janitor = None
+
+    def environment(self, gmi: int) -> Mapping[str, str]:
+        """The backend's own environment variables of a GMI.
+
+        `XLA_FLAGS` among them are added to the user's, see `gmi_environment`.
+        """
+        del gmi
+        return {}
+
+    def started(self, gmi: int, pid: int) -> None:
+        """Tells the backend that a GMI runs as the process group `pid`."""
+        del gmi
+        if self._janitor is not None:
+            self._janitor.watch_gmi(pid)
+
+    def verify(self, pids: Mapping[int, int]) -> None:
+        """Checks that every GMI really has its share; `pids` is GMI -> process.
+
+        Raises:
+          GmiFailed: a GMI runs without it, or that cannot be found out.
+        """
+
+    def terminate(self, gmi: int, pid: int) -> None:
+        """Detaches a GMI from its GPU before it is killed; best effort, returns in seconds."""

@@ -1,0 +1,184 @@
+"""Backend `mps`: the GMIs of a GPU run at the same time under NVIDIA's Multi-Process Service.
+
+One daemon per GPU (or MIG instance), with a pipe directory of its own: a fatal fault of one
+client ends every client of its server, so GPUs must not share a server. A daemon that somebody
+else has started is used and never stopped.
+"""
+
+from __future__ import annotations
+
+import os
+import tempfile
+import time
+from collections.abc import Collection, Mapping
+from contextlib import suppress
+from pathlib import Path
+from typing import Any, Self
+
+from gmijax.errors import BackendUnavailable, GmiFailed
+from gmijax.machine.mps_control import PIPE_VARIABLE, MpsControl
+from gmijax.machine.snapshot import Machine
+from gmijax.partition.plan import Plan
+from gmijax.runs.folder import RunPaths
+from gmijax.supervise.backends.backend import Backend
+from gmijax.supervise.janitor import quit_daemon
+
+_ANSWER_S = 10.0
+_CLIENTS_LEAVE_S = 5.0
+_CLIENTS_APPEAR_S = 3.0
+_POLL_S = 0.1
+
+# A pipe directory holds sockets, whose paths may have 107 characters.
+_LONGEST_PARENT = 60
+
+
+class MpsBackend(Backend):
+    """Runs the daemons of a job while it is entered.
+
+    Args:
+      plan: its slices name the devices.
+      machine: where the control program is, and whether somebody's daemon runs.
+      run: logs go below its `mps` folder.
+      gmis: those that are clients; None for all.
+
+    Raises:
+      BackendUnavailable: the control program is not installed.
+    """
+
+    def __init__(
+        self, plan: Plan, machine: Machine, run: RunPaths, gmis: Collection[int] | None = None
+    ) -> None:
+        super().__init__(plan, machine, run)
+        clients = plan.layout.gmis if gmis is None else gmis
+        self._devices = {gmi: plan.slices[gmi].device for gmi in clients}
+        if machine.mps_control is None and self._devices:
+            raise BackendUnavailable(
+                f"plan.backend={plan.backend}: nvidia-cuda-mps-control was not found"
+            )
+        self._backend = plan.backend
+        self._program = machine.mps_control or Path()
+        self._operator = machine.operator_daemon
+        self._controls: dict[str, MpsControl] = {}
+        self._unresponsive: set[str] = set()
+
+    def __enter__(self) -> Self:
+        """Starts a daemon per GPU, or attaches to the one that runs."""
+        super().__enter__()
+        if self._operator is not None:
+            control = MpsControl(self._program, self._operator)
+            self._controls = dict.fromkeys(self._devices.values(), control)
+            return self
+        try:
+            for place, device in enumerate(dict.fromkeys(self._devices.values())):
+                self._start_daemon(device, self.run.mps / f"gpu_{place}")
+        except BaseException:
+            self._quit_all()
+            super().__exit__(None, None, None)
+            raise
+        return self
+
+    def __exit__(self, *exc: Any) -> None:
+        """Quits the own daemons once their clients have left."""
+        if self._operator is None:
+            deadline_s = time.monotonic() + _CLIENTS_LEAVE_S
+            for control in self._controls.values():
+                with suppress(BackendUnavailable):
+                    while control.all_client_pids() and time.monotonic() < deadline_s:
+                        time.sleep(_POLL_S)
+            self._quit_all()
+        super().__exit__(*exc)
+
+    def is_client(self, gmi: int) -> bool:
+        """Whether a GMI is to be a client of a daemon."""
+        return gmi in self._devices
+
+    def environment(self, gmi: int) -> Mapping[str, str]:
+        """Where the GMI's daemon listens."""
+        return {PIPE_VARIABLE: str(self._control_of(gmi).pipe_directory)}
+
+    def verify(self, pids: Mapping[int, int]) -> None:
+        """Checks with the daemons that every GMI that is to be a client is one.
+
+        CUDA falls back to taking turns, silently, when it does not reach the daemon.
+        """
+        deadline_s = time.monotonic() + _CLIENTS_APPEAR_S
+        while strangers := self._strangers(pids):
+            if time.monotonic() > deadline_s:
+                gmi, pid = next(iter(strangers.items()))
+                raise GmiFailed(
+                    gmi,
+                    f"its process {pid} is no client of the MPS daemon in "
+                    f"{self._control_of(gmi).pipe_directory}; {self._advice()}",
+                )
+            time.sleep(_POLL_S)
+
+    def terminate(self, gmi: int, pid: int) -> None:
+        """Takes the GMI off the GPU: killing a busy client can fault its neighbours."""
+        device = self._devices.get(gmi)
+        if device is None or device in self._unresponsive:
+            return
+        control = self._controls[device]
+        try:
+            server = control.all_client_pids().get(pid)
+            if server is not None:
+                control.terminate_client(server, pid)
+        except BackendUnavailable:
+            # Each attempt could cost a time limit; the other GMIs are killed without it.
+            self._unresponsive.add(device)
+
+    def _control_of(self, gmi: int) -> MpsControl:
+        return self._controls[self._devices[gmi]]
+
+    def _start_daemon(self, device: str, log_directory: Path) -> None:
+        # mkdtemp makes it readable for nobody else.
+        directory = Path(tempfile.mkdtemp(prefix="gmijax-", dir=_short_parent()))
+        control = MpsControl(self._program, directory)
+        self._controls[device] = control
+        if self._janitor is not None:
+            self._janitor.watch_daemon(control)
+        control.start(device, log_directory)
+        deadline_s = time.monotonic() + _ANSWER_S
+        while not control.is_answering():
+            if time.monotonic() > deadline_s:
+                raise BackendUnavailable(
+                    f"plan.backend={self._backend}: the daemon of {device} does not answer "
+                    f"within {_ANSWER_S:g} s; see {log_directory}"
+                )
+            time.sleep(_POLL_S)
+
+    def _strangers(self, pids: Mapping[int, int]) -> dict[int, int]:
+        pids = {gmi: pid for gmi, pid in pids.items() if self.is_client(gmi)}
+        clients: dict[MpsControl, Mapping[int, int]] = {}
+        for gmi in pids:
+            control = self._control_of(gmi)
+            if control in clients:  # Also if it has none yet.
+                continue
+            try:
+                clients[control] = control.all_client_pids()
+            except BackendUnavailable as error:
+                raise GmiFailed(gmi, f"cannot ask whether it is an MPS client: {error}") from error
+        return {gmi: pid for gmi, pid in pids.items() if pid not in clients[self._control_of(gmi)]}
+
+    def _advice(self) -> str:
+        if self._operator is None:
+            return f"see its logs in {self.run.mps}, or use plan.backend=share"
+        return (
+            "gmijax did not start this daemon: if it runs in another PID namespace (outside of "
+            "this container), it knows its clients by other numbers and they cannot be checked; "
+            "share its PID namespace, or use plan.backend=share"
+        )
+
+    def _quit_all(self) -> None:
+        try:
+            for control in self._controls.values():
+                quit_daemon(control)
+        except BaseException:  # Ctrl-C in a process that lives on.
+            if self._janitor is not None:
+                self._janitor.take_over()
+            raise
+        self._controls = {}
+
+
+def _short_parent() -> str:
+    parent = tempfile.gettempdir()
+    return parent if len(parent) <= _LONGEST_PARENT or os.name != "posix" else "/tmp"

@@ -1,0 +1,236 @@
+"""The GMI's side of supervision; stdlib only, so that it runs before jax is imported.
+
+The controller holds the write end of a pipe per GMI, the *lifeline*. One byte lets a GMI compile
+that was to wait for another, one asks it to finish, one ends it at once; end of file means that
+the controller is gone, however it ended, and so must the GMI be. While the lifeline holds a GMI
+ignores the signals that ask for an end: a batch system sends them to every process of a job, and
+the controller decides what becomes of it.
+"""
+
+from __future__ import annotations
+
+import faulthandler
+import os
+import signal
+import sys
+import threading
+import time
+import traceback
+from collections.abc import Callable, Mapping
+from contextlib import suppress
+from pathlib import Path
+from typing import Any, Final
+
+from gmijax.errors import ConfigError, ReportedError
+from gmijax.runs.folder import GmiPaths, RunPaths, write_json
+from gmijax.supervise.heartbeat import GmiState, Heartbeat, HeartbeatBlock
+
+ENV_GMI: Final = "GMIJAX_GMI"
+ENV_CPUS: Final = "GMIJAX_CPUS"
+ENV_RUN_DIR: Final = "GMIJAX_RUN_DIR"
+ENV_LIFELINE_FD: Final = "GMIJAX_LIFELINE_FD"
+ENV_EXCHANGE_FD: Final = "GMIJAX_EXCHANGE_FD"
+ENV_PIPES_FD: Final = "GMIJAX_PIPES_FD"
+ENV_RENDEZVOUS: Final = "GMIJAX_RENDEZVOUS"
+ENV_WAITS: Final = "GMIJAX_WAITS"
+ENV_HEARTBEAT_FD: Final = "GMIJAX_HEARTBEAT_FD"
+
+STOP_BYTE: Final = b"s"
+GO_BYTE: Final = b"g"
+END_BYTE: Final = b"e"
+
+LEFT_TO_CONTROLLER: Final = (signal.SIGTERM, signal.SIGINT, signal.SIGHUP, signal.SIGUSR1)
+"""Signals that a GMI with a lifeline ignores."""
+
+STACKS_SIGNAL: Final = signal.SIGUSR2
+"""Makes a GMI write the stacks of all its threads to its log."""
+
+
+class ChildLink:
+    """The link of this process to the controller.
+
+    Attributes:
+      gmi: id of this GMI.
+      run: files of the run.
+      paths: files of this GMI.
+      exchange_fd: inherited file of the gradient exchange, None where there is none.
+      rendezvous: address where GMIs that form rings meet, None where they need not.
+
+    Args:
+      waits: whether another GMI compiles before this one may.
+      heartbeat_fd: inherited memory for beats and errors, None where nobody reads them.
+    """
+
+    def __init__(
+        self,
+        gmi: int,
+        run: RunPaths,
+        lifeline_fd: int | None,
+        exchange_fd: int | None,
+        rendezvous: str | None = None,
+        *,
+        waits: bool = False,
+        heartbeat_fd: int | None = None,
+    ) -> None:
+        self.gmi = gmi
+        self.run = run
+        self.exchange_fd = exchange_fd
+        self.rendezvous = rendezvous
+        self.paths: GmiPaths = run.gmi(gmi)
+        self._stop = threading.Event()
+        self._turn = threading.Event()
+        if not waits:
+            self._turn.set()
+        self._block = HeartbeatBlock(heartbeat_fd)
+        if lifeline_fd is not None:
+            threading.Thread(
+                target=self._hold_lifeline, args=(lifeline_fd,), name="lifeline", daemon=True
+            ).start()
+
+    @classmethod
+    def from_environment(cls, environment: Mapping[str, str] = os.environ) -> ChildLink:
+        """Pins this process to its CPU cores and opens the link; call it before jax starts.
+
+        Without a lifeline in the environment (a worker started by hand, to debug it) nothing
+        can ask the process to stop, and everything else works.
+
+        Raises:
+          ConfigError: the process was not started as a GMI, or inherited no such descriptor.
+        """
+        try:
+            gmi, run_dir = int(environment[ENV_GMI]), environment[ENV_RUN_DIR]
+        except (KeyError, ValueError):
+            raise ConfigError(
+                f"{ENV_GMI} and {ENV_RUN_DIR} must be set: GMIs are started by gmijax.train"
+            ) from None
+        pin_to_cpus(environment.get(ENV_CPUS, ""))
+        lifeline_fd = inherited_fd(environment, ENV_LIFELINE_FD)
+        if lifeline_fd is not None:
+            _leave_signals_to_controller()
+        return cls(
+            gmi,
+            RunPaths(Path(run_dir)),
+            lifeline_fd,
+            inherited_fd(environment, ENV_EXCHANGE_FD),
+            environment.get(ENV_RENDEZVOUS),
+            waits=ENV_WAITS in environment and lifeline_fd is not None,
+            heartbeat_fd=inherited_fd(environment, ENV_HEARTBEAT_FD),
+        )
+
+    @property
+    def stop_requested(self) -> bool:
+        """Whether the controller asked for an end: finish the iteration, save, return."""
+        return self._stop.is_set()
+
+    def begin_compiling(self) -> float:
+        """Says that this GMI compiles from now on, once it may; returns how long it waited, s.
+
+        Where all GMIs run the same programs one compiles them while the others load what they
+        need and wait here; then they find the programs in the compilation cache.
+        """
+        started_s = time.monotonic()
+        self._turn.wait()
+        waited_s = time.monotonic() - started_s
+        self.beat("compiling", 0)
+        return waited_s
+
+    def beat(self, state: GmiState, iteration: int) -> None:
+        """Reports progress; costs microseconds."""
+        self._block.write(Heartbeat(state, iteration, os.getpid()))
+
+    def report_error(self, error: BaseException) -> None:
+        """Says why this GMI fails, also in `error.json`; end with a non-zero code after it."""
+        said = ReportedError(
+            type(error).__name__, str(error), "".join(traceback.format_exception(error))
+        )
+        self._block.write_error(said)
+        with suppress(OSError):  # The disk may be what is wrong.
+            write_json(self.paths.error, said._asdict())
+
+    def _hold_lifeline(self, lifeline_fd: int) -> None:
+        while True:
+            try:
+                received = os.read(lifeline_fd, 16)
+            except OSError:
+                received = b""
+            if not received or END_BYTE in received:
+                _end_now()
+            if GO_BYTE in received:
+                self._turn.set()
+            if STOP_BYTE in received:
+                self._stop.set()
+
+
+def run_gmi(routine: Callable[[ChildLink], Mapping[str, Any] | None]) -> int:
+    """Main of a GMI: its routine between the first beat and the last; returns the exit code.
+
+    What the routine returns is the content of `result.json`; None writes none.
+    """
+    link = ChildLink.from_environment()  # Pins the cores, so it comes before jax.
+    link.beat("starting", 0)
+    try:
+        result = routine(link)
+        if result is not None:
+            write_json(link.paths.result, result)
+    except BaseException as error:  # The controller must learn of every way to fail.
+        link.report_error(error)
+        raise
+    link.beat("done", 0)
+    return 0
+
+
+def _leave_signals_to_controller() -> None:
+    # A handler and not SIG_IGN, which programs that a role starts would inherit.
+    for number in LEFT_TO_CONTROLLER:
+        signal.signal(number, lambda *_: None)
+        signal.siginterrupt(number, False)
+    # The controller had them blocked, so that none could end this process until now.
+    signal.pthread_sigmask(signal.SIG_UNBLOCK, LEFT_TO_CONTROLLER)
+    if sys.__stderr__ is not None:
+        faulthandler.enable(sys.__stderr__)
+        faulthandler.register(STACKS_SIGNAL, sys.__stderr__, all_threads=True)
+
+
+def pin_to_cpus(cpus: str) -> None:
+    """Restricts this process to the cores in `cpus`, e.g. `0,1,5`; empty for no restriction."""
+    if cpus and hasattr(os, "sched_setaffinity"):
+        os.sched_setaffinity(0, {int(cpu) for cpu in cpus.split(",")})
+
+
+def _end_now() -> None:
+    # No clean-up: it could wait for a peer or a GPU forever, and nobody is left who would
+    # read the outcome. Helper processes must not stay behind either.
+    if os.getpgrp() == os.getpid():
+        os.killpg(0, signal.SIGKILL)
+    os._exit(1)
+
+
+def inherited_fd(environment: Mapping[str, str], name: str) -> int | None:
+    """The open descriptor whose number stands in the variable `name`, None if it is not set.
+
+    Raises:
+      ConfigError: it is not a number, or not of an open file.
+    """
+    if name not in environment:
+        return None
+    try:
+        fd = int(environment[name])
+        # Processes that a GMI starts have no use for it.
+        os.set_inheritable(fd, False)
+    except (ValueError, OverflowError, OSError):
+        raise ConfigError(
+            f"{name}={environment[name]!r}: expected the number of an open descriptor"
+        ) from None
+    return fd
+
+
+def required_fd(name: str) -> int:
+    """The descriptor that this process has inherited as `name`.
+
+    Raises:
+      ConfigError: it has not, or as `inherited_fd`.
+    """
+    fd = inherited_fd(os.environ, name)
+    if fd is None:
+        raise ConfigError(f"{name} must be set: GMIs are started by a controller")
+    return fd

@@ -1,0 +1,169 @@
+"""Cleans up after a controller that was killed: `python -m gmijax.supervise.janitor`.
+
+A killed controller runs no clean-up. GMIs end by themselves then, but one that is stopped
+(SIGSTOP) cannot, and an MPS daemon outlives whoever started it. So a janitor is started before
+them, in a session of its own, and reads from a pipe what there is to clean, one JSON object a line
+(see `JanitorLink`). The pipe's end without the word `clean` means that the controller is gone.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterable
+from contextlib import suppress
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from gmijax.errors import BackendUnavailable
+from gmijax.machine.mps_control import MpsControl
+from gmijax.machine.processes import GuardPipe, ProcessId, identify, wait_until_gone
+
+_GMIS_END_THEMSELVES_S = 8.0
+_DAEMON_ENDS_S = 10.0
+_LATE_DAEMON_S = 2.0
+
+
+@dataclass
+class _Duties:
+    """Processes and daemons that the controller has started so far."""
+
+    gmis: list[ProcessId] = field(default_factory=list)
+    daemons: list[MpsControl] = field(default_factory=list)
+    is_clean: bool = False
+
+    def learn(self, line: str) -> None:
+        message: dict[str, Any] = json.loads(line)
+        if "daemon" in message:
+            self.daemons.append(MpsControl(Path(message["program"]), Path(message["daemon"])))
+        elif "gmi" in message:
+            self.gmis.append(ProcessId(*message["gmi"]))
+        self.is_clean |= "clean" in message
+
+
+class JanitorLink:
+    """The controller's end of the pipe to a janitor.
+
+    Args:
+      log: where the janitor's own errors go; removed at the end if there are none.
+    """
+
+    def __init__(self, log: Path) -> None:
+        log.parent.mkdir(parents=True, exist_ok=True)
+        self._log = log
+        self._pipe = GuardPipe()
+        try:
+            with log.open("wb") as errors:
+                self._process = subprocess.Popen(
+                    [sys.executable, "-m", "gmijax.supervise.janitor"],
+                    stdin=self._pipe.read_end,
+                    stdout=errors,
+                    stderr=errors,
+                    start_new_session=True,
+                )
+        except BaseException:
+            self._pipe.close()
+            raise
+        finally:
+            os.close(self._pipe.read_end)
+
+    def watch_daemon(self, control: MpsControl) -> None:
+        """Makes the janitor quit this daemon and remove its pipe directory; tell it before."""
+        self._tell({"daemon": str(control.pipe_directory), "program": str(control.program)})
+
+    def watch_gmi(self, pid: int) -> None:
+        """Makes the janitor wait for this process group, and kill it if it stays."""
+        if process := identify(pid):
+            self._tell({"gmi": list(process)})
+
+    def dismiss(self, timeout_s: float = _DAEMON_ENDS_S) -> None:
+        """Says that everything is clean and waits for the janitor to end."""
+        self._tell({"clean": True})
+        self._pipe.close()
+        try:
+            self._process.wait(timeout_s)
+        except subprocess.TimeoutExpired:
+            self._process.kill()
+            self._process.wait()
+        with suppress(OSError):
+            if not self._log.stat().st_size:
+                self._log.unlink()
+
+    def take_over(self) -> None:
+        """Lets the janitor clean up now, as if this process were gone, and waits for it."""
+        self._pipe.close()
+        self._process.wait()
+
+    def _tell(self, message: dict[str, Any]) -> None:
+        # A janitor that somebody killed must not end the job that it only guards.
+        self._pipe.write(json.dumps(message).encode() + b"\n")
+
+
+def quit_daemon(control: MpsControl, timeout_s: float = _DAEMON_ENDS_S) -> None:
+    """Ends a daemon that gmijax has started, and removes its pipe directory.
+
+    A daemon or server that does not end when asked is killed: nobody else knows of it.
+    """
+    daemon = control.daemon_pid()
+    pids = {daemon} if daemon is not None else set()
+    with suppress(BackendUnavailable):
+        pids |= set(control.server_pids())
+    processes = [process for pid in pids if (process := identify(pid))]
+    with suppress(BackendUnavailable):
+        control.quit(timeout_s)
+    for process in wait_until_gone(processes, timeout_s):
+        with suppress(ProcessLookupError):
+            os.kill(process.pid, signal.SIGKILL)
+    shutil.rmtree(control.pipe_directory, ignore_errors=True)
+
+
+def main(lines: Iterable[str] = sys.stdin) -> int:
+    """Learns until the pipe ends, then cleans up unless the controller has."""
+    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+        signal.signal(number, signal.SIG_IGN)
+    duties = _Duties()
+    for line in lines:
+        duties.learn(line)
+    if not duties.is_clean:
+        _clean(duties)
+    return 0
+
+
+def _clean(duties: _Duties) -> None:
+    # The GMIs notice by themselves that the controller is gone.
+    left = wait_until_gone(duties.gmis, _GMIS_END_THEMSELVES_S)
+    if left:
+        for control in duties.daemons:
+            _terminate_clients(control)
+        for process in left:
+            if process.is_running():
+                with suppress(ProcessLookupError):
+                    os.killpg(process.pid, signal.SIGKILL)
+        wait_until_gone(left, _DAEMON_ENDS_S)
+    for control in duties.daemons:
+        _wait_for_late_daemon(control)
+        quit_daemon(control)
+
+
+def _wait_for_late_daemon(control: MpsControl) -> None:
+    # The controller may have been killed while it was starting this one.
+    deadline_s = time.monotonic() + _LATE_DAEMON_S
+    while not control.is_answering() and time.monotonic() < deadline_s:
+        time.sleep(_LATE_DAEMON_S / 10)
+
+
+def _terminate_clients(control: MpsControl) -> None:
+    # All clients of an own daemon are GMIs of the job.
+    with suppress(BackendUnavailable):
+        for client, server in control.all_client_pids().items():
+            control.terminate_client(server, client)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,275 @@
+"""Starts the GMIs of a plan and watches them to their end, with all that they share. No jax here.
+
+What GMIs share is made here and gone when `run_gmis` returns: blocks of memory without a name,
+a reserved port for those that form rings, the backend with its daemons.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import os
+import signal
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import ExitStack, contextmanager, suppress
+from dataclasses import dataclass, field
+from pathlib import Path
+from types import FrameType
+from typing import Final
+
+from gmijax.collectives.shared_block import create_exchange
+from gmijax.config import RunConfig, ServeRunConfig
+from gmijax.errors import BackendUnavailable, GmijaxError, JobInterrupted
+from gmijax.machine.processes import reserved_address
+from gmijax.machine.snapshot import Machine
+from gmijax.partition.backend_choice import WHAT_SHARE_LOSES
+from gmijax.partition.plan import Plan
+from gmijax.partition.reduction import needs_ring
+from gmijax.runs.cache import compilation_cache_dir, drop_broken_programs
+from gmijax.runs.folder import RunPaths, read_json, write_json
+from gmijax.supervise.backends import Backend, open_backend
+from gmijax.supervise.child import ENV_EXCHANGE_FD
+from gmijax.supervise.environment import COMPILATION_CACHE, gmi_environment
+from gmijax.supervise.gmi_process import GmiStatus
+from gmijax.supervise.kinds import JobKind
+from gmijax.supervise.supervisor import Job, Supervisor, Timeouts
+
+STOP_SIGNALS: Final = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGUSR1)
+"""What asks a job to save and end: Ctrl-C, batch systems, a terminal that is closed."""
+
+_AGAIN_S = 1.0
+
+OnTick = Callable[[tuple[GmiStatus, ...]], None]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Launch:
+    """What to run in the GMIs of a plan.
+
+    Attributes:
+      plan: where GMIs live and what they share.
+      machine: where this is; see `detect_machine`.
+      run: the run folder; what the GMIs read from it is there already.
+      kind: what the GMIs run, and what they share beside the block that reducers use.
+      timeouts: time limits.
+      stops_gracefully: a first one of `STOP_SIGNALS` asks the GMIs to finish by themselves;
+        otherwise signals do what Python does with them.
+      variables: more environment variables of every GMI.
+      on_warning: told in a sentence when the job runs otherwise than planned.
+      is_enough: whether the GMIs are to finish now, as after a first signal, and the job has done
+        what it was for; None: it ends by itself.
+    """
+
+    plan: Plan
+    machine: Machine
+    run: RunPaths
+    kind: JobKind
+    timeouts: Timeouts
+    stops_gracefully: bool = True
+    variables: Mapping[str, str] = field(default_factory=dict)
+    on_warning: Callable[[str], None] = lambda _: None
+    is_enough: Callable[[tuple[GmiStatus, ...]], bool] | None = None
+
+
+def run_gmis(
+    launch: Launch, on_tick: OnTick | None = None, signals: StopSignals | None = None
+) -> None:
+    """Runs all GMIs to their end; calls `on_tick` about 20 times a second.
+
+    Args:
+      launch: what to run.
+      on_tick: see above.
+      signals: those that the caller hears already; None: heard while this runs.
+
+    Raises:
+      GmiFailed: a GMI failed; names the first one.
+      ConfigError: a GMI rejected its input.
+      JobInterrupted: a signal came, and every GMI has ended.
+    """
+    plan, kind = launch.plan, launch.kind
+    has_rings = needs_ring(plan.strategy, plan.training_layout)
+    # There a program of a world belongs to one of its devices.
+    is_world_on_cpu = has_rings and plan.backend == "cpu"
+    with ExitStack() as held:
+        # First, so that it ends last: a signal must not cut off the end of the backend.
+        if launch.stops_gracefully and signals is None:
+            signals = held.enter_context(stop_signals())
+        inherited = _shared_blocks(held, kind, plan)
+        rendezvous = held.enter_context(reserved_address()) if has_rings else None
+        launch, backend = _enter_backend(held, launch)
+
+        def environment(gmi: int) -> dict[str, str]:
+            return environment_of(launch, gmi, backend.environment(gmi), rendezvous)
+
+        supervisor = Supervisor(
+            Job(
+                run=launch.run,
+                gmis=plan.layout.gmis,
+                command=lambda _: [sys.executable, "-m", kind.module],
+                environment=environment,
+                backend=backend,
+                timeouts=launch.timeouts,
+                inherited_fds=inherited,
+                compile_once=kind.compile_once and not is_world_on_cpu,
+            )
+        )
+        if signals is not None:
+            signals.forward_to(supervisor.request_stop)
+        try:
+            supervisor.run(_ticks(launch, supervisor, on_tick))
+        finally:
+            programs = Path(os.environ.get(COMPILATION_CACHE) or compilation_cache_dir())
+            drop_broken_programs(
+                programs, [launch.run.gmi(gmi).stderr for gmi in plan.layout.gmis]
+            )
+
+
+def _shared_blocks(held: ExitStack, kind: JobKind, plan: Plan) -> dict[str, int]:
+    """Descriptors of the memory that the GMIs share, by the variable that names each."""
+    opened: dict[str, int] = {}
+    blocks = dict(kind.shared(plan))
+    if plan.layout.num_gmis > 1:
+        blocks[ENV_EXCHANGE_FD] = create_exchange
+    for name, create in blocks.items():
+        opened[name] = create()
+        held.callback(os.close, opened[name])
+    return opened
+
+
+def _ticks(launch: Launch, supervisor: Supervisor, on_tick: OnTick | None) -> OnTick:
+    """`on_tick`, and the order to finish when it is enough."""
+    is_enough = launch.is_enough
+
+    def tick(gmis: tuple[GmiStatus, ...]) -> None:
+        nonlocal is_enough
+        if on_tick is not None:
+            on_tick(gmis)
+        if is_enough is not None and is_enough(gmis):
+            supervisor.ask_to_finish()
+            is_enough = None
+
+    return tick
+
+
+@contextmanager
+def recorded(
+    run: RunPaths, what_is_left: Callable[[], str], record: Callable[[str, Plan], None]
+) -> Iterator[None]:
+    """A job of whose end a record is made, however it ends; errors get notes.
+
+    Args:
+      run: the run folder.
+      what_is_left: in words, for a job that was interrupted.
+      record: gets `completed`, `interrupted` or `failed`, and the plan as it was run.
+    """
+    status = "failed"
+    try:
+        yield
+        status = "completed"
+    except JobInterrupted as error:
+        status = "interrupted"
+        error.add_note(what_is_left())
+        raise
+    except GmijaxError as error:
+        error.add_note(f"run folder: {run.root}")
+        raise
+    finally:
+        # A full disk must not hide why the job failed.
+        with suppress(OSError):
+            record(status, Plan.from_dict(read_json(run.plan)))  # Its backend may be another.
+
+
+def timeouts_of(limits: RunConfig | ServeRunConfig) -> Timeouts:
+    """The time limits of a job, as its configuration has them."""
+    return Timeouts(
+        start_timeout_s=limits.start_timeout_s,
+        stall_timeout_s=limits.stall_timeout_s,
+        stop_timeout_s=limits.stop_timeout_s,
+        grace_s=limits.grace_s,
+    )
+
+
+def environment_of(
+    launch: Launch, gmi: int, added: Mapping[str, str], rendezvous: str | None = None
+) -> dict[str, str]:
+    """All environment variables of a GMI; `added` are those of its backend."""
+    own, cache = dict(os.environ), compilation_cache_dir()
+    variables = gmi_environment(launch.plan, gmi, own, cache, added, rendezvous)
+    return {**variables, **launch.variables}
+
+
+def _enter_backend(held: ExitStack, launch: Launch) -> tuple[Launch, Backend]:
+    """Enters the plan's backend, or `share` where the plan allows it and says so afterwards.
+
+    Whether daemons may be started here (rights, somebody else's daemon) shows only when it is
+    tried.
+    """
+    plan, machine, run = launch.plan, launch.machine, launch.run
+    try:
+        return launch, held.enter_context(open_backend(plan, machine, run))
+    except BackendUnavailable as error:
+        if not plan.may_share:
+            raise
+        warning = f"backend share: warning: {error}; so {WHAT_SHARE_LOSES}"
+    launch.on_warning(warning)
+    plan = dataclasses.replace(
+        plan, backend="share", may_share=False, reasons=(*plan.reasons, warning)
+    )
+    write_json(run.plan, plan.to_dict())
+    launch = dataclasses.replace(launch, plan=plan)
+    return launch, held.enter_context(open_backend(plan, machine, run))
+
+
+class StopSignals:
+    """Signals that ask for an end: the first one, and the same one again a second later or more.
+
+    A program such as `timeout` sends its signal twice at once, and a batch system sends others
+    before the last: that is no impatience.
+    """
+
+    def __init__(self) -> None:
+        self._requests = 0
+        self._last_s: dict[int, float] = {}
+        self._forward: Callable[[], None] | None = None
+
+    @property
+    def have_come(self) -> bool:
+        """Whether an end was asked for."""
+        return self._requests > 0
+
+    def handle(self, number: int, _: FrameType | None = None) -> None:
+        """The signal handler."""
+        now_s = time.monotonic()
+        is_again = now_s - self._last_s.get(number, now_s) >= _AGAIN_S
+        if is_again or not self._last_s:
+            self._requests += 1
+            if self._forward is not None:
+                self._forward()
+        self._last_s[number] = now_s
+
+    def forward_to(self, request_stop: Callable[[], None]) -> None:
+        """Forwards requests, also those that have come before."""
+        self._forward = request_stop
+        for _ in range(self._requests):
+            request_stop()
+
+
+@contextmanager
+def stop_signals() -> Iterator[StopSignals]:
+    """Hears `STOP_SIGNALS` in place of whatever they did."""
+    signals = StopSignals()
+    # Python delivers signals to the main thread only; elsewhere they are the caller's business.
+    is_main = threading.current_thread() is threading.main_thread()
+    # What was ignored when the job was started, by nohup for one, stays ignored.
+    previous = {
+        number: signal.signal(number, signals.handle)
+        for number in STOP_SIGNALS
+        if is_main and signal.getsignal(number) is not signal.SIG_IGN
+    }
+    try:
+        yield signals
+    finally:
+        for number, handler in previous.items():
+            signal.signal(number, handler)

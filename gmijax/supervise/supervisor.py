@@ -1,0 +1,299 @@
+"""Starts the GMIs of a job, watches them, and ends them all, whatever happens.
+
+All or nothing: the first failure ends all GMIs, and no process is left when `run` returns or
+raises. Whether the job is tried again is decided by `gmijax.control.restarts`.
+"""
+
+from __future__ import annotations
+
+import signal
+import time
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, field
+
+from gmijax.errors import GmiFailed, JobInterrupted
+from gmijax.runs.folder import RunPaths
+from gmijax.supervise.backends.backend import Backend
+from gmijax.supervise.failures import Failure, describe_exit, first_cause
+from gmijax.supervise.gmi_process import GmiProcess, GmiStatus
+
+_POLL_S = 0.05
+_SETTLE_S = 1.0
+_SWEEP_S = 10.0
+_STACKS_S = 3.0
+"""Longest wait for stacks to be written; a process that is stopped never does."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Timeouts:
+    """How long the supervisor waits.
+
+    Attributes:
+      start_timeout_s: for a GMI to compile, counted from its start or from its last beat.
+      stall_timeout_s: between two beats of a GMI that is past compiling.
+      stop_timeout_s: for all GMIs to finish by themselves after a request to stop.
+      grace_s: for a GMI to end at once, on the order to; for one that is done to be gone.
+    """
+
+    start_timeout_s: float
+    stall_timeout_s: float
+    stop_timeout_s: float
+    grace_s: float
+
+
+@dataclass(frozen=True, kw_only=True)
+class Job:
+    """What to start and how.
+
+    Attributes:
+      run: the run folder.
+      gmis: ids of the GMIs, in the order of their start.
+      command: program and arguments of a GMI.
+      environment: all environment variables of a GMI (see `gmi_environment`); the supervisor
+        adds the run folder, the lifeline and the exchange.
+      backend: an entered backend.
+      timeouts: time limits.
+      inherited_fds: open files that every GMI inherits, by the environment variable that will
+        hold the number of the descriptor.
+      compile_once: the first GMI compiles while the others load what they need and wait, so
+        that they find its programs in the compilation cache.
+    """
+
+    run: RunPaths
+    gmis: Sequence[int]
+    command: Callable[[int], Sequence[str]]
+    environment: Callable[[int], Mapping[str, str]]
+    backend: Backend
+    timeouts: Timeouts
+    inherited_fds: Mapping[str, int] = field(default_factory=dict)
+    compile_once: bool = True
+
+
+class Supervisor:
+    """Runs one job once."""
+
+    def __init__(self, job: Job) -> None:
+        self._job = job
+        self._started: dict[int, GmiProcess] = {}
+        self._all_ready_s: float | None = None
+        self._stop_requests = 0
+        self._stop_deadline_s: float | None = None
+
+    def request_stop(self) -> None:
+        """Asks for an end; may be called from a signal handler.
+
+        The first request lets the GMIs finish their iteration and save; the second ends them.
+        """
+        self._stop_requests += 1
+
+    def ask_to_finish(self) -> None:
+        """Lets the GMIs finish as a first request does; the job then ends well."""
+        for process in self._alive():
+            process.ask_to_stop()
+
+    def status(self) -> tuple[GmiStatus, ...]:
+        """Where every GMI stands, in the order of `Job.gmis`."""
+        return tuple(
+            self._started[gmi].status()
+            if gmi in self._started
+            else GmiStatus(gmi, "waiting", 0, None, None)
+            for gmi in self._job.gmis
+        )
+
+    def run(self, on_tick: Callable[[tuple[GmiStatus, ...]], None] | None = None) -> None:
+        """Runs the job to its end; calls `on_tick` about 20 times a second.
+
+        Raises:
+          GmiFailed: a GMI failed, did not start in time, stalled, or runs without the share
+            that the plan gives it; names the first one.
+          ConfigError: a GMI rejected its input.
+          JobInterrupted: a stop was requested, and every GMI has ended.
+        """
+        try:
+            for gmi in self._job.gmis:
+                self._start(gmi)
+            while self._alive():
+                self._raise_failure()
+                self._let_go()
+                self._handle_stop()
+                if self._all_ready_s is None and all(p.is_ready for p in self._started.values()):
+                    # Once, when every GMI holds its share.
+                    self._all_ready_s = time.monotonic()
+                    self._verify_shares()
+                self._check_progress()
+                if on_tick is not None:
+                    on_tick(self.status())
+                time.sleep(_POLL_S)
+            self._raise_failure()
+        except BaseException as error:
+            if left := self._end_all():
+                error.add_note(f"processes {left} do not end: a driver may hold them")
+                if isinstance(error, GmiFailed):
+                    error.is_final = True  # Nothing may be started beside them.
+            raise
+        self._end_all()
+        if self._stop_requests:
+            raise JobInterrupted("stopped on request; every GMI has finished by itself")
+
+    def _alive(self) -> list[GmiProcess]:
+        return [process for process in self._started.values() if process.exit_code is None]
+
+    def _start(self, gmi: int) -> None:
+        job = self._job
+        process = GmiProcess.start(
+            gmi,
+            job.command(gmi),
+            job.environment(gmi),
+            job.run,
+            job.inherited_fds,
+            waits=job.compile_once and bool(self._started),
+        )
+        self._started[gmi] = process
+        job.backend.started(gmi, process.pid)
+
+    def _let_go(self) -> None:
+        """Lets those compile that wait for the first one, once it has."""
+        waiting = [process for process in self._started.values() if process.waits]
+        if waiting and all(p.is_ready for p in self._started.values() if not p.waits):
+            for process in waiting:
+                process.let_go()
+
+    def _raise_failure(self) -> None:
+        """Reads heartbeats and exit codes; raises for the GMI that failed first."""
+        failures = self._poll_failures()
+        if not failures:
+            return
+        # A GMI that lost its peer can be quicker to end than that peer is to be seen dead.
+        deadline_s = time.monotonic() + _SETTLE_S
+        while first_cause(failures).is_consequence and time.monotonic() < deadline_s:
+            time.sleep(_POLL_S)
+            failures = self._poll_failures()
+        cause = first_cause(failures)
+        if cause.is_timeout and (alive := self._alive()):
+            # Whoever is waited for runs, and has not said anything for longest.
+            stuck = min(alive, key=lambda process: process.progress_s)
+            self._collect_stacks()
+            iteration = stuck.beat.iteration
+            what = f"made no progress after iteration {iteration}; GMI {cause.gmi} {cause.reason}"
+            raise GmiFailed(stuck.gmi, what, iteration=iteration)
+        raise cause.to_error()
+
+    def _poll_failures(self) -> list[Failure]:
+        return [
+            describe_exit(
+                process.gmi,
+                process.exit_code,
+                process.error,
+                process.paths.stderr,
+                process.beat.iteration,
+            )
+            for process in self._started.values()
+            if process.poll() and process.exit_code is not None
+        ]
+
+    def _handle_stop(self) -> None:
+        if not self._stop_requests:
+            return
+        if self._stop_requests > 1:
+            raise JobInterrupted("stopped at once on a second request; the last work is not saved")
+        if not all(p.is_ready for p in self._started.values()):
+            raise JobInterrupted("stopped before training began")
+        now_s = time.monotonic()
+        if self._stop_deadline_s is None:
+            self._stop_deadline_s = now_s + self._job.timeouts.stop_timeout_s
+            for process in self._alive():
+                process.ask_to_stop()
+        elif now_s > self._stop_deadline_s:
+            late = [process.gmi for process in self._alive()]
+            raise JobInterrupted(
+                f"stopped on request; GMIs {late} did not finish within "
+                f"{self._job.timeouts.stop_timeout_s:g} s and were ended"
+            )
+
+    def _verify_shares(self) -> None:
+        # One that has ended already cannot be asked for any more.
+        alive = {process.gmi: process.beat.pid for process in self._alive()}
+        try:
+            self._job.backend.verify(alive)
+        except GmiFailed as error:
+            # One that failed meanwhile has lost its share by that, and may have taken the
+            # others' with it.
+            self._raise_failure()
+            if self._started[error.gmi].exit_code is None:
+                raise
+            self._verify_shares()
+
+    def _check_progress(self) -> None:
+        now_s = time.monotonic()
+        for process in self._alive():
+            state = process.beat.state
+            if process.waits:
+                continue  # The one that it waits for has a time limit.
+            if state == "done" and now_s - process.progress_s > self._job.timeouts.grace_s:
+                process.end_as_done()
+                continue
+            if state in ("starting", "compiling"):
+                limit_s, since_s = self._job.timeouts.start_timeout_s, process.progress_s
+                what = "did not start and compile"
+            elif self._all_ready_s is not None:
+                # A GMI that is ready waits for the others without a beat: its clock starts
+                # when the last one is ready.
+                limit_s = self._job.timeouts.stall_timeout_s
+                since_s = max(process.progress_s, self._all_ready_s)
+                what = f"made no progress after iteration {process.beat.iteration}"
+            else:
+                continue
+            if now_s - since_s > limit_s:
+                self._collect_stacks()
+                raise GmiFailed(
+                    process.gmi,
+                    f"{what} within {limit_s:g} s (state: {state})",
+                    iteration=process.beat.iteration,
+                )
+
+    def _collect_stacks(self) -> None:
+        """Has all that still run write where their threads are to their logs."""
+        sizes = {process: process.request_stacks() for process in self._alive()}
+        waiting = {process: size for process, size in sizes.items() if size is not None}
+        deadline_s = time.monotonic() + _STACKS_S
+        while waiting and time.monotonic() < deadline_s:
+            time.sleep(_POLL_S)
+            now = {process: process.log_bytes for process in waiting}
+            # Written once a log has grown and grows no more.
+            waiting = {
+                process: now[process]
+                for process, before in waiting.items()
+                if now[process] == sizes[process] or now[process] != before
+            }
+
+    def _end_all(self) -> list[int]:
+        """Ends every process that is left: backend, order to end, grace, SIGKILL, lifeline.
+
+        Returns:
+          Those that are still there.
+        """
+        alive = [process for process in self._started.values() if process.poll() is None]
+        for process in alive:
+            # Whatever is wrong with the backend, the processes must end.
+            with suppress(Exception):
+                self._job.backend.terminate(process.gmi, process.beat.pid)
+        for process in alive:
+            process.order_end()
+        alive = _wait_for_end(alive, self._job.timeouts.grace_s)
+        for process in alive:
+            process.send(signal.SIGKILL)
+        alive = _wait_for_end(alive, _SWEEP_S)
+        for process in self._started.values():
+            process.close()
+        return [process.pid for process in alive]
+
+
+def _wait_for_end(processes: Sequence[GmiProcess], timeout_s: float) -> list[GmiProcess]:
+    """Waits until all have ended; returns those that have not."""
+    deadline_s = time.monotonic() + timeout_s
+    alive = [process for process in processes if process.poll() is None]
+    while alive and time.monotonic() < deadline_s:
+        time.sleep(_POLL_S)
+        alive = [process for process in alive if process.poll() is None]
+    return alive

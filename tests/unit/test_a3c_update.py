@@ -1,0 +1,307 @@
+"""Updates on batches of unrolls, without processes."""
+
+from __future__ import annotations
+
+import dataclasses
+import threading
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jax.flatten_util import ravel_pytree
+from toy_env import point_mass
+
+from gmijax.a3c.a3c import A3cLosses, Unrolls, batch_targets, gradients
+from gmijax.a3c.report import histogram_of, mean_and_p99
+from gmijax.a3c.rollout import UnrollPrograms, collect
+from gmijax.a3c.update import FusedUpdate, SplitUpdate
+from gmijax.cli.compose import compose
+from gmijax.collectives.solo import SoloReducer
+from gmijax.learning.learner import (
+    acting_weights,
+    init_learner,
+    make_learner,
+    num_weights,
+    pack_weights,
+    unpack_weights,
+)
+from gmijax.learning.updates import exchange_size
+from gmijax.sim.wrappers import env_keys
+from gmijax.supervise.kinds import FLOAT_CHANNELS
+
+N, T = 12, 8
+ENV = point_mass()
+COLLECT = jax.jit(partial(collect, ENV), static_argnums=(0, 1))
+
+
+@pytest.fixture(scope="module")
+def config():
+    return dataclasses.replace(
+        compose("algo=a3c").algo,
+        unroll_length=T,
+        num_minibatches=2,
+        num_updates_per_batch=2,
+        learning_rate=1e-3,
+        learning_rate_schedule="fixed",
+        init_noise_std=0.6,
+        policy_hidden_layer_sizes=(16,),
+        value_hidden_layer_sizes=(16,),
+    )
+
+
+def _start(config, num_envs: int = N):
+    learner = make_learner(ENV.spec, config)
+    state = jax.jit(lambda key: init_learner(learner, ENV.spec.obs_size, key))(jax.random.key(0))
+    keys = env_keys(jax.random.key(1), 0, num_envs)
+    return learner, state, jax.jit(ENV.init)(ENV.model, keys)
+
+
+def _size(config) -> int:
+    return exchange_size(ENV.spec, config, A3cLosses)
+
+
+def _copy(tree):
+    return jax.tree.map(jnp.copy, tree)
+
+
+def _unrolled(learner, state, envs):
+    """The environments after an unroll, the unroll, and its counts."""
+    return COLLECT(learner.networks, T, ENV.model, acting_weights(learner, state), envs)
+
+
+@pytest.fixture(scope="module")
+def start(config):
+    """Learner, its state and environments; nobody may donate them."""
+    return _start(config)
+
+
+@pytest.fixture(scope="module")
+def batch(start) -> Unrolls:
+    return _unrolled(*start)[1]
+
+
+@pytest.fixture(scope="module")
+def fused(start) -> FusedUpdate:
+    return FusedUpdate(start[0])
+
+
+def test_weights_travel_as_one_array(config, start) -> None:
+    learner, state, _ = start
+    weights = acting_weights(learner, state)
+    packed = pack_weights(weights)
+    assert packed.shape == (num_weights(ENV.spec, config),)
+    jax.tree.map(np.testing.assert_array_equal, unpack_weights(weights, packed), weights)
+
+
+def test_an_unroll_is_what_the_environments_did(config) -> None:
+    learner, state, envs = _start(config, num_envs=64)
+    before = envs.env.obs
+    weights = acting_weights(learner, state)
+    cuts = 0
+    for _ in range(4):
+        envs, got, stats = COLLECT(learner.networks, T, ENV.model, weights, envs)
+        np.testing.assert_array_equal(got.state[0], before)
+        np.testing.assert_array_equal(got.bootstrap[0], envs.env.obs)
+        assert float(stats.episodes.count) == got.done.any(-1).sum()
+        # A value behind a step is told where time ran out, and nowhere else.
+        np.testing.assert_array_equal(got.cut_value != 0, got.done[..., 1])
+        cuts += int(got.done[..., 1].sum())
+        before = envs.env.obs
+    assert cuts > 0
+
+
+def test_pieces_make_the_unroll_that_they_are_parts_of(start) -> None:
+    learner, state, envs = start
+    weights = acting_weights(learner, state)
+    _, whole, counts = _unrolled(*start)
+    programs = UnrollPrograms(ENV, learner.networks, T // 4, 4, weights, envs)
+    envs, pieces = _copy(envs), []
+    for _ in range(4):
+        envs, piece = programs.piece(weights, envs)
+        pieces.append(piece)
+    joined, packed = programs.join(pieces)
+    for name, mine in joined._asdict().items():
+        np.testing.assert_allclose(mine, getattr(whole, name), rtol=1e-5, atol=1e-6)
+    np.testing.assert_allclose(packed, np.asarray(jax.tree.leaves(counts)), rtol=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("length", "every", "pieces"), [(16, 4, 4), (16, None, 1), (16, 5, 4), (10, 4, 5), (8, 99, 1)]
+)
+def test_pieces_are_equal_and_not_longer_than_asked_for(config, length, every, pieces) -> None:
+    changed = dataclasses.replace(config, unroll_length=length, weights_every=every)
+    assert changed.pieces_per_unroll == pieces
+
+
+def test_the_channels_that_may_lose_precision_are_those_of_floats() -> None:
+    assert set(FLOAT_CHANNELS) == set(Unrolls._fields) - {"done"}
+
+
+def test_unrolls_without_weight_teach_nothing(start, batch, fused) -> None:
+    state = start[1]
+    weight = jnp.asarray([1.0] * (N - 2) + [0.0] * 2)
+    spoilt = batch._replace(reward=batch.reward.at[:, -2:].set(1e6))
+    first, _ = fused(_copy(state), batch, weight)
+    second, _ = fused(_copy(state), spoilt, weight)
+    jax.tree.map(np.testing.assert_array_equal, first.params, second.params)
+    assert int(first.iteration) == 1
+
+
+class _Threads:
+    """A reducer among threads of this process, each with a barrier and the sums of all."""
+
+    is_device_resident = False
+
+    def __init__(self, rank: int, world_size: int, slots: list, barrier: threading.Barrier):
+        self.rank, self.world_size = rank, world_size
+        self._slots, self._barrier = slots, barrier
+
+    def _all(self, values) -> np.ndarray:
+        self._barrier.wait()
+        self._slots[self.rank] = np.array(values)
+        self._barrier.wait()
+        return np.stack(self._slots)
+
+    def mean(self, buffer):
+        return self._all(buffer).mean(axis=0, dtype=np.float32)
+
+    def all_gather(self, values):
+        return self._all(values)
+
+    def close(self) -> None:
+        pass
+
+
+def _in_threads(update_of) -> dict:
+    """What two trainers return, each in a thread, by rank."""
+    slots, barrier, results = [None, None], threading.Barrier(2), {}
+
+    def run(rank: int) -> None:
+        results[rank] = update_of(rank, _Threads(rank, 2, slots, barrier))
+
+    threads = [threading.Thread(target=run, args=(rank,)) for rank in range(2)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    return results
+
+
+def test_one_trainer_learns_the_same_in_both_forms(config, start, batch, fused) -> None:
+    learner, state, _ = start
+    split = SplitUpdate(learner, ENV.spec.obs_size, SoloReducer(_size(config)))
+    split.compile(state, batch, jnp.ones(N))
+    _, said = fused(_copy(state), batch, jnp.ones(N))
+    _, also = split(_copy(state), batch, jnp.ones(N))
+    np.testing.assert_allclose(said.weights, also.weights, rtol=1e-4, atol=1e-6)
+    np.testing.assert_allclose(said.losses, also.losses, rtol=1e-3, atol=1e-5)
+
+
+def test_two_trainers_stay_equal_and_take_in_both_batches(config) -> None:
+    learner, state, envs = _start(config, num_envs=2 * N)
+    _, both, _ = _unrolled(learner, state, envs)
+    half = [jax.tree.map(lambda x, k=k: x[:, k * N : (k + 1) * N], both) for k in range(2)]
+
+    def update_of(rank: int, reducer):
+        update = SplitUpdate(learner, ENV.spec.obs_size, reducer)
+        return update(_copy(state), half[rank], jnp.ones(N))
+
+    results = _in_threads(update_of)
+    a, b = results[0][0], results[1][0]
+    jax.tree.map(np.testing.assert_array_equal, a.params, b.params)
+    jax.tree.map(np.testing.assert_array_equal, a.obs_moments, b.obs_moments)
+    seen = both.state.reshape(-1, ENV.spec.obs_size)
+    np.testing.assert_allclose(a.obs_moments.mean, seen.mean(0), rtol=1e-4, atol=1e-5)
+    assert float(a.obs_moments.count) == len(seen)
+
+
+def test_fresh_unrolls_weigh_alike_however_many_a_trainer_has(config) -> None:
+    plain = dataclasses.replace(
+        config, num_minibatches=1, num_updates_per_batch=1, normalize_advantage=False
+    )
+    learner, state, envs = _start(plain, num_envs=2 * N)
+    _, both, _ = _unrolled(learner, state, envs)
+    # One trainer has a fresh unroll and stale ones, the other fresh ones only.
+    fresh = np.array([1.0] + [0.0] * (N - 1) + [1.0] * N, np.float32)
+    weight = jnp.asarray(fresh * len(fresh) / fresh.sum())
+    alone, said = FusedUpdate(learner)(_copy(state), both, weight)
+
+    def update_of(rank: int, reducer):
+        mine = slice(rank * N, (rank + 1) * N)
+        update = SplitUpdate(learner, ENV.spec.obs_size, reducer)
+        return update(_copy(state), jax.tree.map(lambda x: x[:, mine], both), weight[mine])
+
+    together, also = _in_threads(update_of)[0]
+    np.testing.assert_allclose(said.losses, also.losses, rtol=1e-4, atol=1e-6)
+    # Adam divides by the gradient's size: its moments tell how large it was.
+    np.testing.assert_allclose(
+        *(ravel_pytree(one.opt_state)[0] for one in (alone, together)), rtol=1e-3, atol=1e-6
+    )
+    only_fresh = jax.tree.map(lambda x: x[:, fresh > 0], both)
+    _, theirs = FusedUpdate(learner)(_copy(state), only_fresh, jnp.ones(N + 1))
+    np.testing.assert_allclose(also.losses, theirs.losses, rtol=1e-4, atol=1e-6)
+
+
+def test_a_minibatch_of_stale_unrolls_does_not_dilute_the_divergence(start, batch) -> None:
+    learner, state, _ = start
+    moved = state.params._replace(log_std=state.params.log_std + 0.1)
+    told = []
+    for fresh in (np.ones(N), np.r_[1.0, np.zeros(N - 1)], np.zeros(N)):
+        context = batch_targets(learner, state, batch, jnp.asarray(fresh, jnp.float32))
+        told.append(gradients(learner, moved, batch, context, jnp.arange(N))[1])
+    # Of a trainer with fresh unrolls only, one with a twelfth, and one with none.
+    means = A3cLosses(*(sum(parts) / len(parts) for parts in zip(*told, strict=True)))
+    np.testing.assert_allclose(means.steering_kl, told[0].kl, rtol=1e-4)
+    assert float(told[2].steering_kl) == 0.0
+
+
+def test_learning_rates_of_all_minibatches_are_told(config) -> None:
+    adaptive = dataclasses.replace(
+        config, learning_rate_schedule="adaptive_kl", learning_rate=1e-3, desired_kl=1e-7
+    )
+    learner, state, envs = _start(adaptive)
+    _, batch, _ = _unrolled(learner, state, envs)
+    split = SplitUpdate(learner, ENV.spec.obs_size, SoloReducer(_size(adaptive)))
+    for update in (FusedUpdate(learner), split):
+        new, told = update(_copy(state), batch, jnp.ones(N))
+        # The first pass has not moved yet, the others each lower the rate.
+        rates = [1e-3, 1e-3 / 1.5, 1e-3 / 1.5**2, 1e-3 / 1.5**3]
+        assert float(told.rates["max"]) == pytest.approx(rates[0])
+        assert float(told.rates["min"]) == pytest.approx(rates[3])
+        assert float(told.rates["mean"]) == pytest.approx(np.mean(rates))
+        assert float(new.learning_rate) == pytest.approx(rates[3])
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"clipping_epsilon": 0.2},
+        {"clipping_epsilon": 0.2, "vtrace": False},
+        {"num_updates_per_batch": 1},
+    ],
+    ids=["vtrace-clip", "clip", "vtrace"],
+)
+def test_it_learns_to_stand_still_from_a_policy_that_lags(config, changes) -> None:
+    learner, state, envs = _start(
+        dataclasses.replace(config, learning_rate=3e-3, **changes), num_envs=64
+    )
+    update = FusedUpdate(learner)
+    versions = [acting_weights(learner, _copy(state))] * 3
+    rewards = []
+    for _ in range(80):
+        envs, batch, stats = COLLECT(learner.networks, T, ENV.model, versions[-3], envs)
+        state, updated = update(state, batch, jnp.ones(64))
+        versions.append(unpack_weights(versions[0], updated.weights))
+        rewards.append(float(stats.reward_sum) / (64 * T))
+    assert np.mean(rewards[:5]) < 0.1
+    assert np.mean(rewards[-5:]) > 0.4
+
+
+def test_staleness_by_hand() -> None:
+    histogram = histogram_of(np.array([0] * 98 + [3, 500]))
+    assert histogram.sum() == 100
+    # 500 counts as 127: (3 + 127) / 100; 98 % are at most 0, 99 % at most 3.
+    assert mean_and_p99(histogram) == (pytest.approx(1.3), 3.0)
+    assert mean_and_p99(0 * histogram) is None

@@ -1,0 +1,154 @@
+"""Means and sums of several ranks, each a thread of this process."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any, TypeVar
+
+import numpy as np
+import pytest
+from fake_device_memory import FakeDeviceMemory
+
+from gmijax.collectives.har import HarReducer
+from gmijax.collectives.host import HostExchange
+from gmijax.collectives.interface import FloatBuffer, Reducer
+from gmijax.collectives.intra import HostIntra
+from gmijax.collectives.shared_block import create_exchange
+from gmijax.collectives.messages.group import AT_ONCE_BYTES, GroupReducer
+from gmijax.collectives.messages.messenger import MIN_CAPACITY_BYTES, Messenger
+from gmijax.collectives.messages.pipe_block import PipeBlock, create_pipes
+from gmijax.collectives.mpr import MprReducer
+from gmijax.collectives.one_shot import OneShotReducer
+from gmijax.errors import CollectiveError
+from gmijax.partition.layout import Layout
+
+RANKS = 3
+SMALL = AT_ONCE_BYTES // 4
+LARGE = 2 * SMALL
+LAYOUT = Layout.even(1, RANKS)
+
+T = TypeVar("T")
+
+
+@pytest.fixture
+def pool() -> Iterator[ThreadPoolExecutor]:
+    with ThreadPoolExecutor(RANKS) as made:
+        yield made
+
+
+def on_all(pool: ThreadPoolExecutor, call: Callable[[int], T]) -> list[T]:
+    """What `call(rank)` returns on every rank, all at the same time."""
+    return [one.result() for one in [pool.submit(call, rank) for rank in range(RANKS)]]
+
+
+def hosts(num_floats: int, timeout_s: float = 20.0) -> list[HostExchange]:
+    fd = create_exchange()
+    try:
+        return [
+            HostExchange(
+                fd, rank, RANKS, num_floats, timeout_s=timeout_s, rendezvous_timeout_s=timeout_s
+            )
+            for rank in range(RANKS)
+        ]
+    finally:
+        os.close(fd)
+
+
+def groups(build: Any = None, timeout_s: float = 20.0) -> list[GroupReducer]:
+    """Of all ranks; `build(rank, num_floats)` makes the reducers for large means."""
+    fd = create_pipes(RANKS, MIN_CAPACITY_BYTES)
+    try:
+        blocks = [PipeBlock(fd, rank) for rank in range(RANKS)]
+    finally:
+        os.close(fd)
+    return [
+        GroupReducer(Messenger(block, timeout_s), lambda size, rank=block.rank: build(rank, size))
+        for block in blocks
+    ]
+
+
+def by_messages(buffers: list[FloatBuffer], count: int) -> list[Callable[[int], FloatBuffer]]:
+    """The mean of the first `count` numbers, as small or large data of any group."""
+    members = groups()
+
+    def mean(rank: int) -> FloatBuffer:
+        members[rank]._num_floats = 1  # Another length is by messages, however large.
+        return members[rank].reduce(range(RANKS), buffers[rank][:count], "mean")
+
+    return [mean]
+
+
+def by_reducer(
+    buffers: list[FloatBuffer], make: Callable[[HostExchange], Reducer]
+) -> Callable[[int], FloatBuffer]:
+    def mean(rank: int) -> FloatBuffer:
+        return make(exchanges[rank]).mean(buffers[rank]).copy()
+
+    exchanges = hosts(LARGE)
+    return mean
+
+
+def test_the_mean_of_three_has_the_same_bits_on_every_way(pool: ThreadPoolExecutor) -> None:
+    rng = np.random.default_rng(0)
+    buffers = [rng.normal(size=LARGE).astype(np.float32) for _ in range(RANKS)]
+    expected = (buffers[0] + buffers[1] + buffers[2]) * np.float32(1 / 3)
+    assert (expected != (buffers[0] + buffers[1] + buffers[2]) / np.float32(3)).any()
+    ways = {
+        "small": by_messages(buffers, SMALL)[0],
+        "large": by_messages(buffers, LARGE)[0],
+        "mpr": by_reducer(buffers, lambda host: MprReducer(host, LARGE)),
+        "har": by_reducer(
+            buffers,
+            lambda host: HarReducer(host, HostIntra(LAYOUT, host.rank, LARGE), None, LARGE),
+        ),
+        "one_shot": by_reducer(
+            buffers, lambda host: OneShotReducer(host, LAYOUT, LARGE, FakeDeviceMemory)
+        ),
+    }
+    for name, way in ways.items():
+        for found in on_all(pool, way):
+            assert found.tobytes() == expected[: found.size].tobytes(), name
+
+
+def test_ranks_that_ask_for_different_operations_are_told_both(pool: ThreadPoolExecutor) -> None:
+    members = groups()
+    operations = ("mean", "sum", "mean")
+
+    def reduce(rank: int) -> str:
+        with pytest.raises(CollectiveError) as caught:
+            members[rank].reduce(range(RANKS), np.ones(4, np.float32), operations[rank])
+        return str(caught.value)
+
+    told = on_all(pool, reduce)
+    assert told[0] == (
+        "rank 0 asks for the mean of 4 numbers of float32, "
+        "rank 1 for the sum of 4 numbers of float32"
+    )
+    assert "rank 1 asks for the sum" in told[1]
+    assert "rank 2 asks for the mean" in told[2]
+
+
+@pytest.mark.parametrize("first", [0, 1])
+def test_so_are_those_of_which_some_go_by_a_reducer(first: int, pool: ThreadPoolExecutor) -> None:
+    """Whoever comes first; the others find it in the reducer's wait or in their messages."""
+    exchanges = hosts(LARGE, timeout_s=1.0)
+    members = groups(lambda rank, size: MprReducer(exchanges[rank], size), timeout_s=10.0)
+    operations = ("mean", "sum", "mean")
+
+    def reduce(rank: int) -> str:
+        with pytest.raises(CollectiveError) as caught:
+            members[rank].reduce(range(RANKS), np.ones(LARGE, np.float32), operations[rank])
+        return str(caught.value)
+
+    early = pool.submit(reduce, first)
+    while first == 1 and not members[0]._messenger.has_message(1, tag=1):
+        pass
+    while first == 0 and not exchanges[0]._turns.step:
+        pass
+    others = [pool.submit(reduce, rank) for rank in range(RANKS) if rank != first]
+    told = [one.result() for one in (early, *others)]
+    for said in told:
+        assert "the mean of 8192 numbers of float32" in said
+        assert "the sum of 8192 numbers of float32" in said

@@ -1,0 +1,230 @@
+"""Pipes in shared memory: what goes in comes out, whatever the sizes; limits and damage."""
+
+from __future__ import annotations
+
+import copy
+import os
+from collections.abc import Iterator
+from typing import Any, NamedTuple
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from gmijax.collectives.messages.pipe import PipeReader, PipeWriter
+from gmijax.collectives.messages.pipe_block import (
+    END,
+    HEAD,
+    LINE,
+    LINE_BYTES,
+    PipeBlock,
+    create_pipes,
+)
+from gmijax.collectives.messages.pipe_format import message_bytes
+from gmijax.errors import CollectiveError, CollectiveTimeout, ConfigError, PipeClosed
+
+CAPACITY = 8192
+
+
+class Ends(NamedTuple):
+    """Both ends of the pipe from rank 0 to rank 1, in one process."""
+
+    fd: int
+    blocks: tuple[PipeBlock, PipeBlock]
+    writer: PipeWriter
+    reader: PipeReader
+
+
+@pytest.fixture
+def ends() -> Iterator[Ends]:
+    yield from open_ends()
+
+
+def open_ends() -> Iterator[Ends]:
+    fd = create_pipes(2, CAPACITY)
+    first, second = (PipeBlock(fd, rank) for rank in (0, 1))
+    yield Ends(fd, (first, second), PipeWriter(first, 1), PipeReader(second, 0))
+    first.close()
+    second.close()
+    os.close(fd)
+
+
+def test_lines_are_cache_lines() -> None:
+    assert LINE.itemsize == END.itemsize == LINE_BYTES == 64
+    assert HEAD.itemsize <= LINE_BYTES
+
+
+@given(
+    st.lists(st.lists(st.integers(0, 900), max_size=4), max_size=40),
+    st.lists(st.booleans(), min_size=80, max_size=80),
+)
+def test_messages_come_out_whole_and_in_order(sizes: list[list[int]], is_put: list[bool]) -> None:
+    """Whatever the order of puts and gets; the ring goes round several times."""
+    for ends in open_ends():
+        waiting: list[list[bytes]] = []
+        todo = iter(sizes)
+        for number, puts in enumerate(is_put):
+            wanted = next(todo, None) if puts else None
+            if wanted is not None:
+                parts = [np.random.default_rng(number).bytes(size) for size in wanted]
+                if ends.writer.try_put(parts, tag=number):
+                    waiting.append(parts)
+            message = None if puts else ends.reader.try_get()
+            assert puts or (message is None) == (not waiting)
+            if message is not None:
+                assert [part.tobytes() for part in message.parts] == waiting.pop(0)
+        assert ends.writer.messages - len(waiting) == ends.reader.messages + (message is not None)
+        assert ends.writer.released_messages == ends.reader.messages
+
+
+def test_the_largest_message_fits_wherever_the_ring_stands(ends: Ends) -> None:
+    largest = ends.writer.max_message_bytes
+    whole = largest - message_bytes([0])
+    for number in range(50):
+        ends.writer.put([bytes(64 * number)], timeout_s=0.0)
+        ends.reader.get(timeout_s=0.0)
+        ends.reader.release()
+        ends.writer.put([np.full(whole, number, np.uint8)], timeout_s=0.0)
+        assert (ends.reader.get(timeout_s=0.0).parts[0] == number).all()
+        ends.reader.release()
+    with pytest.raises(CollectiveError, match=f"at most {largest}"):
+        ends.writer.try_put([bytes(whole + 1)])
+
+
+def test_arrays_of_any_strides_are_written_without_a_copy_of_theirs(ends: Ends) -> None:
+    values = np.arange(60, dtype=np.float32).reshape(3, 4, 5)
+    ends.writer.put([values[:, 1:3], np.array([True, False])], timeout_s=1.0, tag=7)
+    message = ends.reader.get(timeout_s=1.0)
+    assert message.tag == 7
+    received = message.parts[0].view(np.float32).reshape(3, 2, 5)
+    np.testing.assert_array_equal(received, values[:, 1:3])
+    assert not received.flags.writeable
+    assert received.ctypes.data % 64 == 0
+
+
+def test_a_full_pipe_and_an_empty_one_wait_no_longer_than_told(ends: Ends) -> None:
+    with pytest.raises(CollectiveTimeout, match=r"rank 1: waited 0.01 s in get.* ranks \[0\]"):
+        ends.reader.get(timeout_s=0.01)
+    while ends.writer.try_put([bytes(1000)]):
+        pass
+    with pytest.raises(CollectiveTimeout, match=r"rank 0: waited 0.01 s in put.* ranks \[1\]"):
+        ends.writer.put([bytes(1000)], timeout_s=0.01)
+    assert ends.blocks[0].outstanding_bytes(1) == ends.writer.outstanding_bytes > 6000
+    held = ends.reader.try_get()
+    assert held is not None
+    assert not ends.writer.try_put([bytes(1000)]), "views of the reader must not be overwritten"
+    ends.reader.release()
+    assert ends.writer.try_put([bytes(900)])
+
+
+def test_a_closed_pipe_gives_what_is_in_it_and_then_says_so(ends: Ends) -> None:
+    ends.writer.put([b"last"], timeout_s=1.0)
+    ends.writer.close()
+    assert ends.reader.get(timeout_s=1.0).parts[0].tobytes() == b"last"
+    with pytest.raises(PipeClosed, match="peer 0 has closed"):
+        ends.reader.get(timeout_s=1.0)
+    ends.reader.close()
+    with pytest.raises(PipeClosed, match="peer 1 has closed"):
+        ends.writer.put([b"more"], timeout_s=1.0)
+
+
+def test_a_process_that_leaves_is_not_waited_for(ends: Ends) -> None:
+    ends.blocks[0].close()
+    with pytest.raises(PipeClosed, match="peer 0 has closed"):
+        ends.reader.get(timeout_s=5.0)
+
+
+@pytest.mark.parametrize("offset", [0, 8, 16, 24, 32, 40, 64, 128, 1151])
+def test_a_damaged_message_is_found(ends: Ends, offset: int) -> None:
+    ends.writer.put([np.arange(128.0)], timeout_s=1.0)
+    ends.blocks[0].pipe(0, 1).ring[offset] ^= 0x10
+    with pytest.raises(CollectiveError, match="message 0 from rank 0 is damaged"):
+        ends.reader.get(timeout_s=1.0)
+
+
+def test_senseless_numbers_and_other_blocks_are_refused(ends: Ends) -> None:
+    with pytest.raises(ConfigError, match="capacity_bytes=100: must be between"):
+        create_pipes(2, 100)
+    with pytest.raises(ConfigError, match=r"rank=2: must be 0 to world_size - 1 = 1"):
+        PipeBlock(ends.fd, 2)
+    descriptors = len(os.listdir("/proc/self/fd"))
+    for _ in range(3):
+        with pytest.raises(CollectiveError, match="rank 1 is taken already by process"):
+            PipeBlock(ends.fd, 1)
+    assert len(os.listdir("/proc/self/fd")) == descriptors
+    empty = os.memfd_create("empty", os.MFD_CLOEXEC)
+    with pytest.raises(CollectiveError, match="rank 1: no pipes at descriptor"):
+        PipeBlock(empty, 1)
+    os.pwrite(empty, bytes(64), 0)
+    with pytest.raises(CollectiveError, match=r"it begins with \(0, 0\), not"):
+        PipeBlock(empty, 1)
+    os.close(empty)
+
+
+class Noted:
+    """A line that notes what is read and written."""
+
+    def __init__(self, real: Any, seen: list[str]) -> None:
+        self._real, self._seen = real, seen
+
+    def __getitem__(self, key: str) -> Any:
+        self._seen.append(f"read {key}")
+        return self._real[key]
+
+    def __setitem__(self, key: str, value: Any) -> None:
+        self._seen.append(f"write {key}")
+        self._real[key] = value
+
+
+def test_there_is_a_fence_wherever_the_order_of_accesses_counts(
+    ends: Ends, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """That they stand there: what they do cannot be seen on x86, which keeps the order anyway."""
+    seen: list[str] = []
+    monkeypatch.setattr(
+        "gmijax.collectives.messages.pipe_block.fence", lambda: seen.append("fence")
+    )
+    block: Any = copy.copy(ends.blocks[0])
+    block._lines = [Noted(np.zeros((), LINE), seen) for _ in range(2)]
+    block._take_rank()
+    assert seen == ["read pid", "write start_ticks", "fence", "write pid"]
+    seen.clear()
+    assert block.why_lost(0, "get", 0) is None
+    assert seen == ["read pid", "fence", "read start_ticks", "read has_left"]
+    both: list[Any] = [ends.writer, ends.reader]
+    for end in both:
+        end._own = Noted(end._own, seen)
+        end._fence = lambda: seen.append("fence")
+    seen.clear()
+    ends.writer.put([b"one"], timeout_s=0.0)
+    assert seen == ["fence", "fence", "read position"]
+    ends.reader.get(timeout_s=0.0)
+    seen.clear()
+    ends.reader.release()
+    assert seen == ["fence", "read messages", "read position"]
+    assert ends.writer.released_messages == 1
+    assert seen[-1] == "fence"
+
+
+@pytest.mark.parametrize("page_bytes", [4096, 65536])
+def test_rings_begin_at_pages_of_this_machine(
+    page_bytes: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("mmap.PAGESIZE", page_bytes)
+    fd = create_pipes(2, 2 * page_bytes)
+    block = PipeBlock(fd, 0)
+    begin = block._lines.ctypes.data - LINE_BYTES
+    offsets = [block.pipe(0, dst).ring.ctypes.data - begin for dst in (0, 1)]
+    assert offsets == [2 * page_bytes, 5 * page_bytes]
+    block.close()
+    os.close(fd)
+
+
+def test_unused_pipes_cost_no_memory() -> None:
+    fd = create_pipes(16, 2**26)
+    block = PipeBlock(fd, 3)
+    block.outstanding_bytes(5)
+    assert os.fstat(fd).st_blocks * 512 < 2**20
+    block.close()
+    os.close(fd)

@@ -1,0 +1,166 @@
+"""Registers in shared memory that nobody waits for."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from collections.abc import Callable
+from functools import partial
+
+import numpy as np
+import pytest
+
+from gmijax.collectives.messages.registers import Snapshot, create_registers, open_registers
+from gmijax.collectives.waits import Fence
+from gmijax.errors import CollectiveError, ConfigError
+
+
+@pytest.fixture
+def fd():
+    made = create_registers()
+    yield made
+    os.close(made)
+
+
+def test_a_reader_gets_the_newest_value_once(fd) -> None:
+    writer, reader = open_registers(fd, [8, 64])[1], open_registers(fd, [8, 64])[1]
+    assert reader.read() is None
+    for version in range(1, 4):
+        writer.publish(np.full(3, version, np.float32), tag=10 * version)
+    snapshot = reader.read()
+    assert snapshot is not None
+    assert (snapshot.count, snapshot.tag) == (3, 30)
+    np.testing.assert_array_equal(snapshot.values.view(np.float32), [3, 3, 3])
+    assert reader.read(snapshot.count) is None
+    assert open_registers(fd, [8, 64])[0].read() is None  # Registers are apart.
+
+
+class Interrupted(Fence):
+    """A fence of a reader or a writer at which something else happens first, each time."""
+
+    def __init__(self, *events: Callable[[], object]) -> None:
+        super().__init__()
+        self._events = list(events)
+
+    def __call__(self) -> None:
+        if self._events:
+            self._events.pop(0)()
+
+
+def nothing() -> None:
+    pass
+
+
+class Killed(Exception):
+    """The writer's process has ended."""
+
+
+def die() -> None:
+    raise Killed
+
+
+def test_a_value_that_is_torn_is_not_given_out(fd) -> None:
+    writer, reader = open_registers(fd, [16])[0], open_registers(fd, [16])[0]
+    publish = [partial(writer.publish, np.full(4, k, np.int32), tag=k) for k in range(4)]
+    for once in publish[:2]:
+        once()
+
+    def die_in_the_fourth() -> None:
+        """After the third and half of the fourth, which goes where the second one is."""
+        publish[2]()
+        writer._fence = Interrupted(nothing, die)
+        with pytest.raises(Killed):
+            publish[3]()
+
+    reader._fence = Interrupted(nothing, die_in_the_fourth)
+    snapshot = reader.read()
+    assert snapshot is not None
+    assert (snapshot.count, snapshot.tag, snapshot.values.view(np.int32)[0]) == (3, 2, 2)
+
+
+def test_a_value_is_whole_while_the_next_one_is_written(fd) -> None:
+    writer, reader = open_registers(fd, [16])[0], open_registers(fd, [16])[0]
+    writer.publish(np.full(4, 1, np.int32), tag=1)
+    looks: list[Snapshot | None] = []
+    for number in (2, 3):
+        # Both before and after the values of the next one are there.
+        writer._fence = Interrupted(*[lambda: looks.append(reader.read())] * 2)
+        writer.publish(np.full(4, number, np.int32), tag=number)
+    found = [(look.tag, look.values[0]) for look in looks if look]
+    assert found == [(1, 1), (1, 1), (2, 2), (2, 2)]
+
+
+def test_a_reader_gives_up_on_a_writer_that_is_always_faster(fd) -> None:
+    writer, reader = open_registers(fd, [16])[0], open_registers(fd, [16])[0]
+    writer.publish(np.zeros(4, np.int32))
+
+    def publish_twice() -> None:
+        for _ in range(2):
+            writer.publish(np.zeros(4, np.int32))
+
+    reader._fence = Interrupted(*[nothing, publish_twice] * 3)
+    assert reader.read() is None
+    snapshot = reader.read()
+    assert snapshot is not None
+    assert snapshot.count == 7
+
+
+WRITER = """
+import sys
+import numpy as np
+from gmijax.collectives.messages.registers import open_registers
+
+register, number = open_registers(int(sys.argv[1]), [int(sys.argv[2])])[0], 0
+print("ready", flush=True)
+while True:
+    number += 1
+    register.publish(np.full(int(sys.argv[2]) // 4 - number % 100, number, np.int32), tag=number)
+"""
+
+
+def test_readers_of_another_process_see_whole_values_only(fd) -> None:
+    size = 400_000
+    reader = open_registers(fd, [size])[0]
+    seen: list[int] = []
+    command = [sys.executable, "-c", WRITER, str(fd), str(size)]
+    with subprocess.Popen(command, pass_fds=[fd], stdout=subprocess.PIPE) as writer:
+        try:
+            assert writer.stdout is not None
+            assert writer.stdout.readline() == b"ready\n"
+            while len(seen) < 200:
+                assert writer.poll() is None
+                if (snapshot := reader.read(seen[-1] if seen else 0)) is not None:
+                    values = snapshot.values.view(np.int32)
+                    assert (values == snapshot.tag).all()
+                    assert (snapshot.tag, values.size) == (
+                        snapshot.count,
+                        size // 4 - snapshot.tag % 100,
+                    )
+                    seen.append(snapshot.count)
+        finally:
+            writer.kill()
+    assert seen == sorted(set(seen))
+
+
+def test_what_does_not_fit_is_refused(fd) -> None:
+    with pytest.raises(ConfigError, match=r"sizes_bytes=\[4, 0\]"):
+        open_registers(fd, [4, 0])
+    register = open_registers(fd, [4])[0]
+    with pytest.raises(CollectiveError, match="8 bytes for a register of 4"):
+        register.publish(np.zeros(2, np.float32))
+    with pytest.raises(
+        CollectiveError, match="register 0 has 4 bytes for another process, 8 here"
+    ):
+        open_registers(fd, [8])
+
+
+@pytest.mark.parametrize("page_bytes", [4096, 65536])
+def test_registers_begin_at_pages_of_this_machine(
+    fd, page_bytes: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("mmap.PAGESIZE", page_bytes)
+    first, second = open_registers(fd, [8, 64])
+    begin = first._line.ctypes.data
+    assert first._places.ctypes.data - begin == page_bytes
+    assert second._places.ctypes.data - begin == 3 * page_bytes

@@ -1,0 +1,144 @@
+"""Lines of metrics: their numbers, what they refuse, where they go, and their thread."""
+
+from __future__ import annotations
+
+import multiprocessing
+import threading
+import time
+from pathlib import Path
+from typing import Any
+
+import jax.numpy as jnp
+import pytest
+from toy_env import metrics_from, point_mass
+
+from gmijax.errors import NonFiniteError
+from gmijax.learning.metrics import EpisodeWindow, Line, TensorBoardSink
+from gmijax.learning.physics_health import TOLERATED_STEPS
+from gmijax.learning.report_thread import ReportThread
+from gmijax.learning.training_log import TrainingLog
+from gmijax.learning.unroll import Counts, no_counts
+from gmijax.ppo.loop import report
+from gmijax.sim.interface import OVERFLOWS
+from gmijax.sim.wrappers import EpisodeSums
+
+SPEC = point_mass().spec
+
+
+class Lines:
+    """A sink that keeps what it is given."""
+
+    def __init__(self) -> None:
+        self.lines: list[dict[str, Any]] = []
+
+    def write(self, line: Line) -> None:
+        self.lines.append(dict(line))
+
+    def close(self) -> None:
+        return None
+
+
+def _counts(overflowed: dict[str, int] | None = None, **diverged: int) -> Counts:
+    counts = no_counts(SPEC, tuple(overflowed or ()))
+    bad = {name: jnp.asarray(float(steps)) for name, steps in diverged.items()}
+    full = {name: jnp.asarray(float(steps)) for name, steps in (overflowed or {}).items()}
+    return counts._replace(diverged=counts.diverged | bad, overflowed=full)
+
+
+def test_few_bad_steps_are_tolerated_and_many_are_named() -> None:
+    log = TrainingLog("point_mass", (), 0)
+    few, many = TOLERATED_STEPS, TOLERATED_STEPS + 1
+    report(log, 64, metrics_from(_counts(any=few, **{"reward/near": few})), {})
+    metrics = metrics_from(_counts(any=many, **{"reward/near": many}))
+    with pytest.raises(NonFiniteError, match=r"point_mass, up to env step 128: .* reward/near"):
+        report(log, 128, metrics, {})
+
+
+def test_a_loss_that_is_not_finite_is_named() -> None:
+    metrics = metrics_from(_counts())
+    spoilt = metrics._replace(losses=metrics.losses._replace(value_loss=jnp.asarray(jnp.nan)))
+    with pytest.raises(NonFiniteError, match="value_loss of the update is not finite"):
+        report(TrainingLog("point_mass", (), 0), 64, spoilt, {})
+
+
+def test_the_first_overflow_is_told_and_all_are_logged(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    sink = Lines()
+    log = TrainingLog("point_mass", (sink,), 0)
+    for iteration, count in enumerate((0, 5, 7), start=1):
+        full = dict.fromkeys(OVERFLOWS, 0) | {"contact": count}
+        report(log, 64 * iteration, metrics_from(_counts(full)), {})
+    assert [line["physics/contact_overflow_steps"] for line in sink.lines] == [0.0, 5.0, 7.0]
+    assert [line["physics/constraint_overflow_steps"] for line in sink.lines] == [0.0] * 3
+    assert log.overflows.steps == {"contact": 12.0, "constraint": 0.0}
+    told = capsys.readouterr().err.splitlines()
+    assert len(told) == 1
+    assert told[0].startswith("point_mass: MJX-Warp's contact buffer was too small in 5 ")
+    # Where nothing can overflow no line speaks of it.
+    report(TrainingLog("point_mass", (sink,), 0), 64, metrics_from(_counts()), {})
+    assert not [name for name in sink.lines[-1] if name.startswith("physics/")]
+
+
+def test_reports_come_in_order_from_a_thread_of_their_own_and_errors_with_the_next_call() -> None:
+    written: list[int] = []
+
+    def write(number: int) -> None:
+        if number < 0:
+            raise NonFiniteError("bad number")
+        written.append(number)
+
+    thread = ReportThread(write)
+    for number in (1, 2, 3):
+        thread.report(number)
+    thread.wait()
+    assert written == [1, 2, 3]
+    thread.report(-1)
+    with pytest.raises(NonFiniteError, match="bad number"):
+        thread.report(4)
+    thread.stop()
+    assert written == [1, 2, 3]
+
+
+def test_a_report_that_cannot_come_is_not_waited_for() -> None:
+    is_there = threading.Event()
+    thread = ReportThread(lambda: is_there.wait(30))
+    thread.report()
+    thread.give_up()
+    started = time.monotonic()
+    thread.stop()
+    assert time.monotonic() - started < 1.5  # It waits 2 s for one that may come.
+    is_there.set()
+
+
+def test_terms_and_metrics_are_means_over_episodes() -> None:
+    window = EpisodeWindow()
+    window.add(EpisodeSums(0, 0.0, 0, {"alive": 0.0}, {"successes": 0.0}))
+    assert window.means() == {"return": None, "episode_length": None}
+    window.add(EpisodeSums(1, 4.0, 10, {"alive": 2.0}, {"successes": 3.0}))
+    window.add(EpisodeSums(3, 8.0, 30, {"alive": 6.0}, {"successes": 5.0}))
+    assert window.means() == {
+        "return": 3.0,
+        "episode_length": 10.0,
+        "reward/alive": 2.0,
+        "metric/successes": 2.0,
+    }
+
+
+def test_tensorboard_needs_neither_a_queue_nor_a_thread(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refuse(*_: object, **__: object) -> None:
+        raise PermissionError("/dev/shm cannot be written")
+
+    monkeypatch.setattr(multiprocessing, "Queue", refuse)
+    monkeypatch.setattr(threading.Thread, "start", refuse)
+    sink = TensorBoardSink(tmp_path)
+    sink.write({"env_steps": 640, "return": 1.5, "loss/policy": 2, "episode_length": None})
+    # Before it is closed: a process that is killed must have left its lines.
+    [events] = tmp_path.iterdir()
+    written = events.read_bytes()
+    assert b"train/return" in written
+    assert b"loss/policy" in written
+    assert b"episode_length" not in written
+    sink.close()
