@@ -68,7 +68,7 @@ class Trainer:
         self._link = link
         self._batch_size = self._algo.batch_of(config.envs_per_gmi)
         self._learner = make_learner(env.spec, self._algo)
-        self._update = make_update(self._learner, env.spec.obs_size, reducer)
+        self._update = make_update(self._learner, reducer)
         self._env_steps = 0
         self._updates = 0
         self._version = 0
@@ -95,7 +95,8 @@ class Trainer:
         # The same key as synchronous training uses: the same first policy.
         state, self._env_steps = first_state(self._learner, self._env.spec.obs_size, self._config)
         self._version = int(state.iteration)
-        self._update.compile(state, *self._example())
+        self._update.trace((), state, self._example())
+        self._update.compile()
         if leads:
             self._reducer.all_gather(np.zeros(1, np.float32))
         pack = jax.jit(lambda state: pack_weights(acting_weights(self._learner, state)))
@@ -125,7 +126,8 @@ class Trainer:
             started = time.monotonic()
             unrolls = Unrolls(**batch.experience)  # pyright: ignore[reportArgumentType]
             weight = jnp.asarray(self._weights_of(batch) * self._scale(counts))
-            state, updated = self._update(state, unrolls, weight)
+            state, _, updated = self._update(state, (unrolls, weight))
+            self._update.wait()
             weights = np.asarray(updated.weights)
             losses, rates = jax.device_get((updated.losses, updated.rates))
             self._version += 1

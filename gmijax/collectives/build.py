@@ -95,25 +95,31 @@ def _built(
             host.close()
             control.close()
         raise
-    return SharedReducer(strategy, control, host, exchange)
+    return SharedReducer(strategy, membership.intra, control, host, exchange)
 
 
 class SharedReducer:
     """The `Reducer` of one of several ranks."""
 
     def __init__(
-        self, strategy: str, control: HostExchange, host: HostExchange, exchange: Exchange
+        self,
+        strategy: str,
+        intra: str,
+        control: HostExchange,
+        host: HostExchange,
+        exchange: Exchange,
     ) -> None:
-        self.rank, self.world_size, self.strategy = host.rank, host.world_size, strategy
+        self.rank, self.world_size = host.rank, host.world_size
+        self.strategy, self.intra = strategy, intra
         self._control, self._host, self._exchange = control, host, exchange
 
     def all_gather(self, values: FloatBuffer) -> FloatBuffer:
         """See `Reducer`."""
         return self._control.all_gather(values)
 
-    def program(self, step: Step) -> TracedStep:
+    def program(self, step: Step, *, donates_own: bool = True) -> TracedStep:
         """See `Reducer`."""
-        return self._exchange.program(step)
+        return self._exchange.program(step, donates_own=donates_own)
 
     def close(self) -> None:
         """See `Reducer`."""
@@ -125,7 +131,7 @@ class SharedReducer:
 class SoloReducer:
     """The `Reducer` of a job with one trainer."""
 
-    rank, world_size = 0, 1
+    rank, world_size, intra = 0, 1, "host"
 
     def __init__(self, strategy: str = "none") -> None:
         self.strategy = strategy
@@ -134,11 +140,11 @@ class SoloReducer:
         """See `Reducer`."""
         return values[None].copy()
 
-    def program(self, step: Step) -> TracedStep:
+    def program(self, step: Step, *, donates_own: bool = True) -> TracedStep:
         """See `Reducer`."""
         from gmijax.collectives.program import ProgramStep  # Imports jax.
 
-        return ProgramStep(None, None, step)
+        return ProgramStep(None, None, step, donates_own=donates_own)
 
     def close(self) -> None:
         """Does nothing: there is nothing to release."""

@@ -114,4 +114,4 @@ class HostLinks:
 
 
 def _at(address: int, num_floats: int) -> FloatBuffer:
-    return np.frombuffer((ctypes.c_float * num_floats).from_address(address), np.float32)
+    return np.ctypeslib.as_array((ctypes.c_float * num_floats).from_address(address))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any, Protocol, TypeAlias
+from typing import TYPE_CHECKING, Any, Protocol, TypeAlias, TypeVar
 
 import numpy as np
 import numpy.typing as npt
@@ -12,6 +12,8 @@ if TYPE_CHECKING:
     import jax
 
 FloatBuffer = npt.NDArray[np.float32]
+
+T = TypeVar("T")
 
 
 class Peers(Protocol):
@@ -25,15 +27,24 @@ class Peers(Protocol):
         """[] int32: the trainer on whose device this is computed."""
         ...
 
-    def gather(self, values: jax.Array, after: jax.Array | None = None) -> jax.Array:
-        """[K, ...] float32: `values` of every trainer, in order of rank."""
+    def gather(self, tree: T, after: Any = None) -> T:
+        """`tree` of every trainer, float32; leaves [...] become [K, ...], in order of rank.
+
+        Args:
+          tree: of this trainer.
+          after: what has to be computed before.
+        """
         ...
 
-    def mean(self, buffer: jax.Array, after: jax.Array | None = None) -> jax.Array:
-        """The mean over trainers of `buffer` [n] float32, n <= P; bit-identical on all.
+    def mean(self, tree: T, after: Any = None) -> T:
+        """The mean over trainers of `tree`, float32, with at most P numbers; the same bits on all.
 
         It is the sum, in an order of the strategy's, times 1 / K, all in float32. (Not divided
         by K: XLA makes such a product of a division by a constant.)
+
+        Args:
+          tree: of this trainer.
+          after: what has to be computed before.
         """
         ...
 
@@ -68,8 +79,8 @@ class TracedStep(Protocol):
     def __call__(self, shared: Any, own: Any) -> tuple[Any, Any, Any]:
         """`(shared, own, metrics)`, the first two on this trainer's device, the last on the host.
 
-        The arguments are donated. All of it may still be computed, but for the metrics of the
-        call before.
+        The arguments are donated, `own` only if it is returned alike (`Reducer.program`). All of
+        it may still be computed, but for the metrics of the call before.
 
         Raises:
           PeerLost: the process of another trainer is gone.
@@ -93,11 +104,13 @@ class Reducer(Protocol):
       rank: this trainer's place, 0 to `world_size - 1`.
       world_size: K, number of trainers.
       strategy: which one it is, also where the wanted one was not to be had.
+      intra: how the GMIs of one GPU exchange numbers in `har`, `host` or `ipc`.
     """
 
     rank: int
     world_size: int
     strategy: str
+    intra: str
 
     def all_gather(self, values: FloatBuffer) -> FloatBuffer:
         """Returns [K, M]: `values` [M] float32 of every rank, in order of rank.
@@ -110,8 +123,13 @@ class Reducer(Protocol):
         """
         ...
 
-    def program(self, step: Step) -> TracedStep:
-        """`step` as a program in which the trainers exchange numbers."""
+    def program(self, step: Step, *, donates_own: bool = True) -> TracedStep:
+        """`step` as a program in which the trainers exchange numbers.
+
+        Args:
+          step: see `Step`.
+          donates_own: whether what the step returns as `own` takes the memory of the argument.
+        """
         ...
 
     def close(self) -> None:

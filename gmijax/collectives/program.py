@@ -15,13 +15,14 @@ from typing import Any, Protocol, TypeVar
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.flatten_util import ravel_pytree
 
 from gmijax.collectives.interface import Step
 from gmijax.collectives.strategies import Stage
 from gmijax.collectives.sums import ordered_sum
 from gmijax.collectives.xla_call import Buffer, register
+from gmijax.devices import host_sharding
 from gmijax.errors import CollectiveError
-from gmijax.host_memory import host_sharding
 
 T = TypeVar("T")
 
@@ -108,10 +109,10 @@ class Exchange:
                 total = self._traced(total, buffer.shape, number, place, after)
         return total * np.float32(1.0 / self.world_size)
 
-    def program(self, step: Step) -> ProgramStep:
+    def program(self, step: Step, *, donates_own: bool = True) -> ProgramStep:
         """See `Reducer`."""
         assert self._links is not None
-        return ProgramStep(self, self._links, step)
+        return ProgramStep(self, self._links, step, donates_own=donates_own)
 
     def close(self) -> None:
         """Releases the links. Idempotent."""
@@ -170,14 +171,19 @@ class ProgramPeers:
         """See `Peers`."""
         return self._rank
 
-    def gather(self, values: jax.Array, after: jax.Array | None = None) -> jax.Array:
+    def gather(self, tree: T, after: Any = None) -> T:
         """See `Peers`."""
-        gathered = self._exchange.gather(values.ravel(), next(self._places), after)
-        return gathered.reshape(-1, *values.shape)
+        packed, unpack = ravel_pytree(tree)  # One message, not one for each leaf.
+        return jax.vmap(unpack)(self._exchange.gather(packed, next(self._places), _leaf(after)))
 
-    def mean(self, buffer: jax.Array, after: jax.Array | None = None) -> jax.Array:
+    def mean(self, tree: T, after: Any = None) -> T:
         """See `Peers`."""
-        return self._exchange.mean(buffer, next(self._places), after)
+        packed, unpack = ravel_pytree(tree)
+        return unpack(self._exchange.mean(packed, next(self._places), _leaf(after)))
+
+
+def _leaf(tree: Any) -> Any:
+    return next(iter(jax.tree.leaves(tree)), None)
 
 
 class PeersOfOne:
@@ -187,15 +193,15 @@ class PeersOfOne:
         """See `Peers`."""
         return jnp.zeros((), jnp.int32)
 
-    def gather(self, values: jax.Array, after: jax.Array | None = None) -> jax.Array:
+    def gather(self, tree: T, after: Any = None) -> T:
         """See `Peers`."""
         del after
-        return values[None]
+        return jax.tree.map(lambda leaf: leaf[None], tree)
 
-    def mean(self, buffer: jax.Array, after: jax.Array | None = None) -> jax.Array:
+    def mean(self, tree: T, after: Any = None) -> T:
         """See `Peers`."""
         del after
-        return buffer
+        return tree
 
 
 class ProgramStep:
@@ -207,10 +213,19 @@ class ProgramStep:
       exchange: this rank's; None in a job with one rank.
       links: of the exchange.
       step: see `Step`.
+      donates_own: see `Reducer.program`.
     """
 
-    def __init__(self, exchange: Exchange | None, links: Links | None, step: Step) -> None:
+    def __init__(
+        self,
+        exchange: Exchange | None,
+        links: Links | None,
+        step: Step,
+        *,
+        donates_own: bool = True,
+    ) -> None:
         self._exchange, self._links = exchange, links
+        self._donated = (2, 3) if donates_own else (2,)
         self._step = step
         self._rank = jnp.asarray(0 if exchange is None else exchange.rank, jnp.int32)
         self._program: Any = None
@@ -230,7 +245,7 @@ class ProgramStep:
         # after the next step, which has been started by then.
         host = host_sharding()
         out_shardings = None if host is None else (None, None, host)
-        program = jax.jit(whole, donate_argnums=(2, 3), out_shardings=out_shardings)
+        program = jax.jit(whole, donate_argnums=self._donated, out_shardings=out_shardings)
         self._constants = constants
         self._program = program.lower(self._rank, constants, shared, own)
 

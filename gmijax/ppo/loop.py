@@ -9,6 +9,7 @@ from __future__ import annotations
 import statistics
 import time
 from collections.abc import Mapping
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -32,9 +33,8 @@ from gmijax.learning.report_thread import ReportThread
 from gmijax.learning.start import first_envs, first_state
 from gmijax.learning.throughput import ThroughputMeter
 from gmijax.learning.training_log import Learnt, TrainingLog
-from gmijax.ppo.iteration import SplitIteration, make_iteration, times_of
-from gmijax.ppo.ppo import IterationMetrics
-from gmijax.ppo.tdg_ex import RemoteRollouts, RolloutWorkers
+from gmijax.ppo.ppo import IterationMetrics, iterate
+from gmijax.ppo.tdg_ex import RemoteIteration, RolloutWorkers
 from gmijax.runs.folder import write_json
 from gmijax.sim.wrappers import BatchedEnv
 from gmijax.supervise.child import ChildLink
@@ -66,18 +66,15 @@ class TrainingLoop:
         self._link = link
         self._leader = reducer.rank == 0
         self._learner = make_learner(env.spec, config.algo)
-        self._remote = None
+        self._remote: RemoteIteration | None = None
         num_simulating = reducer.world_size
-        if workers is not None:
-            self._remote = RemoteRollouts(env, self._learner, reducer.rank, workers)
+        if workers is None:
+            self._iteration = reducer.program(partial(iterate, env, self._learner))
+        else:
+            self._iteration = self._remote = RemoteIteration(env, self._learner, reducer, workers)
             num_simulating *= len(workers.gmis)
         self._steps_per_iteration = (
             config.envs_per_gmi * config.algo.unroll_length * num_simulating
-        )
-        self._iteration = (
-            make_iteration(env, self._learner, reducer)
-            if self._remote is None
-            else SplitIteration(env, self._learner, reducer, self._remote)
         )
         self._meter: ThroughputMeter | None = None
         # Who has no environments cannot measure how fast they are.
@@ -186,7 +183,7 @@ class TrainingLoop:
             state, env_state, metrics = self._iteration(state, env_state)
             self._env_steps += self._steps_per_iteration
             self._iterations += 1
-            thread.report(self._env_steps, metrics, times_of(self._iteration))
+            thread.report(self._env_steps, metrics, self._times())
             # Counted from the run's start, so that it says the same after a restart.
             self._link.beat("running", self._env_steps // self._steps_per_iteration)
             stop = self._agree_to_stop()
@@ -195,6 +192,14 @@ class TrainingLoop:
                 self._save(state, env_state, thread, log)
         self._save(state, env_state, thread, log)
         return state, env_state, stop
+
+    def _times(self) -> dict[str, float]:
+        """Seconds of parts of an iteration, where they are known."""
+        reduce_s = self._iteration.exchange_s
+        times = {} if reduce_s is None else {"time/reduce_s": reduce_s}
+        if self._remote is not None:
+            times["time/rollout_s"] = self._remote.rollout_s
+        return times
 
     def _agree_to_stop(self) -> bool:
         # Only one GMI may have heard of it yet; all must leave after the same iteration.

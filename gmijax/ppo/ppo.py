@@ -1,11 +1,8 @@
 """PPO from top to bottom: rollout, advantages, losses, updates, iteration (arXiv:1707.06347).
 
-These are pure functions. `iterate` is one program, of one GMI or of several whose exchanges are
-part of it. `gmijax.ppo.iteration` compiles it, and builds from the same functions the form where
-the host comes between.
-
-Programs hold nothing that depends on a GMI's rank (it is an argument, or looked up by the place
-of the device), so that all GMIs share one entry of the compilation cache.
+These are pure functions. `iterate` is one program of each GMI, in which it exchanges numbers with
+its peers. Programs hold nothing that depends on a GMI's rank, so that all GMIs share one entry of
+the compilation cache.
 """
 
 from __future__ import annotations
@@ -15,7 +12,6 @@ from typing import NamedTuple, TypeAlias
 
 import jax
 import jax.numpy as jnp
-from jax.flatten_util import ravel_pytree
 
 from gmijax.collectives.interface import Peers
 from gmijax.config import PpoConfig
@@ -296,16 +292,19 @@ def update_context(learner: PpoLearner, state: TrainState, stats: RolloutStats) 
 
 def learn(
     learner: PpoLearner,
-    peers: Peers | None,
+    peers: Peers,
     state: TrainState,
     samples: Samples,
     stats: RolloutStats,
-    rank: Array,
 ) -> tuple[TrainState, IterationMetrics]:
-    """All updates of an iteration, on flat samples."""
+    """All updates of an iteration, on flat samples and this GMI's statistics."""
+    everyone = peers.gather(stats)
+    stats = merge_stats(everyone)
     context = update_context(learner, state, stats)
-    order = minibatch_order(learner.config, state, rank, samples.advantage.shape[0])
-    state, losses, rates = run_updates(learner, peers, gradients, state, samples, context, order)
+    order = minibatch_order(learner.config, state, peers.rank(), samples.advantage.shape[0])
+    state, losses, rates = run_updates(
+        learner, peers, gradients, state, samples, context, order, after=everyone
+    )
     return finish(learner, state, stats, jax.tree.map(jnp.mean, losses), rates)
 
 
@@ -330,17 +329,13 @@ def finish(
 def iterate(
     env: BatchedEnv,
     learner: PpoLearner,
-    peers: Peers | None,
+    peers: Peers,
     model: PyTree,
     state: TrainState,
     env_state: BatchState,
 ) -> tuple[TrainState, BatchState, IterationMetrics]:
-    """One iteration, together with the GMIs `peers` if there are others."""
+    """One iteration, together with the GMIs `peers`."""
     weights = acting_weights(learner, state)
     env_state, samples, stats = rollout(env, learner, model, weights, env_state)
-    rank = jnp.zeros((), jnp.int32)
-    if peers is not None:
-        packed, unpack = ravel_pytree(stats)  # One message, not one for each number.
-        rank, stats = peers.rank(), merge_stats(jax.vmap(unpack)(peers.gather(packed)))
-    state, metrics = learn(learner, peers, state, flatten(samples), stats, rank)
+    state, metrics = learn(learner, peers, state, flatten(samples), stats)
     return state, env_state, metrics

@@ -8,16 +8,17 @@ memory, as the paper has it (sec. 5.1, Table 4): experience to the trainer, para
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+import time
+from collections.abc import Callable
 from functools import partial
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple, Protocol, TypeAlias
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
 
-from gmijax.collectives.interface import FloatBuffer
+from gmijax.collectives.interface import FloatBuffer, Peers, Reducer
 from gmijax.learning.learner import (
     ActingWeights,
     TrainState,
@@ -25,11 +26,22 @@ from gmijax.learning.learner import (
     init_learner,
     pack_weights,
 )
-from gmijax.learning.updates import minibatch_order
-from gmijax.ppo.ppo import PpoLearner, Samples, flatten, merge_stats, no_stats, rollout
+from gmijax.ppo.ppo import (
+    IterationMetrics,
+    PpoLearner,
+    Samples,
+    flatten,
+    learn,
+    merge_stats,
+    no_stats,
+    rollout,
+)
 from gmijax.sim.wrappers import BatchedEnv, BatchState
 from gmijax.supervise.heartbeat import GmiState
 from gmijax.types import Array, PyTree
+
+_Answers: TypeAlias = tuple[list[Samples], list[FloatBuffer]]
+"""Of every worker: samples [T, N] and packed statistics."""
 
 
 class Mail(Protocol):
@@ -58,45 +70,53 @@ class RolloutWorkers(NamedTuple):
     start_timeout_s: float
 
 
-class RemoteRollouts:
-    """Rollouts that other GMIs make, as `LocalRollouts`; here are no environments."""
+class RemoteIteration:
+    """An iteration on rollouts that other GMIs make: `TracedStep`; here are no environments."""
 
     def __init__(
-        self, env: BatchedEnv, learner: PpoLearner, rank: int, workers: RolloutWorkers
+        self, env: BatchedEnv, learner: PpoLearner, reducer: Reducer, workers: RolloutWorkers
     ) -> None:
         self._workers = workers
-        self._rank = jnp.asarray(rank, jnp.int32)
-        self._join: Any = jax.jit(partial(_join, env, learner))
+        self._step = reducer.program(partial(_learn_from, env, learner), donates_own=False)
         self._pack: Any = jax.jit(lambda state: pack_weights(acting_weights(learner, state)))
-        self._first: tuple[list[Samples], list[np.ndarray]] | None = None
+        self._first: _Answers | None = None
         self._timeout_s: float | None = workers.start_timeout_s
+        self.rollout_s = 0.0
 
-    def trace(self, model: PyTree, state: TrainState, env_state: None) -> tuple[Any, Any, Any]:
-        """See `LocalRollouts`; waits for first rollouts, which are used by the first call."""
-        del model, env_state
-        self._first = self._ask(state)
+    @property
+    def exchange_s(self) -> float | None:
+        """See `TracedStep`."""
+        return self._step.exchange_s
+
+    def trace(self, constants: Any, shared: TrainState, own: None) -> None:
+        """See `TracedStep`; waits for first rollouts, which are used by the first call."""
+        del constants, own
+        self._first = self._ask(shared)
         self._timeout_s = None
-        self._join = self._join.lower(state, *self._first, self._rank)
-        return self._join.out_info
+        self._step.trace((), shared, self._first)
 
     def compile(self) -> None:
-        """See `LocalRollouts`."""
-        self._join = self._join.compile()
+        """See `TracedStep`."""
+        self._step.compile()
 
-    def __call__(
-        self, state: TrainState, env_state: None
-    ) -> tuple[None, Samples, Array, FloatBuffer]:
-        """See `LocalRollouts`."""
-        (samples, stats), self._first = self._first or self._ask(state), None
-        flat, order, packed = self._join(state, samples, stats, self._rank)
-        return env_state, flat, order, np.asarray(packed)
+    def __call__(self, shared: TrainState, own: None) -> tuple[TrainState, None, IterationMetrics]:
+        """See `TracedStep`."""
+        started = time.monotonic()
+        answers, self._first = self._first or self._ask(shared), None
+        self.rollout_s = time.monotonic() - started
+        state, _, metrics = self._step(shared, answers)
+        return state, own, metrics
+
+    def wait(self) -> None:
+        """See `TracedStep`."""
+        self._step.wait()
 
     def close(self) -> None:
         """Tells those that serve to end."""
         for gmi in self._workers.gmis:
             self._workers.mail.send(None, gmi)
 
-    def _ask(self, state: TrainState) -> tuple[list[Samples], list[np.ndarray]]:
+    def _ask(self, state: TrainState) -> _Answers:
         """Rollouts with the weights of `state`: samples [T, N], packed statistics."""
         mail, gmis, _ = self._workers
         weights = np.asarray(self._pack(state))
@@ -146,17 +166,18 @@ def _rollout(
     return env_state, samples, ravel_pytree(stats)[0]
 
 
-def _join(
+def _learn_from(
     env: BatchedEnv,
     learner: PpoLearner,
+    peers: Peers,
+    _: Any,
     state: TrainState,
-    samples: Sequence[Samples],
-    stats: Sequence[Array],
-    rank: Array,
-) -> tuple[Samples, Array, Array]:
-    """Flat samples of all environments, the order of minibatches, and packed statistics."""
+    answers: _Answers,
+) -> tuple[TrainState, tuple[()], IterationMetrics]:
+    """Updates on the rollouts of several GMIs, whose environments stand one behind the other."""
+    samples, packed = answers
     flat = flatten(jax.tree.map(lambda *parts: jnp.concatenate(parts, axis=1), *samples))
-    order = minibatch_order(learner.config, state, rank, flat.advantage.shape[0])
     unpack = ravel_pytree(no_stats(env.spec, env.overflows))[1]
-    merged = merge_stats(jax.vmap(unpack)(jnp.stack(stats)))
-    return flat, order, ravel_pytree(merged)[0]
+    stats = merge_stats(jax.vmap(unpack)(jnp.stack(packed)))
+    state, metrics = learn(learner, peers, state, flat, stats)
+    return state, (), metrics

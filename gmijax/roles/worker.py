@@ -5,8 +5,7 @@ from __future__ import annotations
 import sys
 from typing import TYPE_CHECKING, Any
 
-from gmijax.collectives.build import Membership, build_reducer, join_world
-from gmijax.collectives.interface import Reducer
+from gmijax.collectives.host import HostExchange
 from gmijax.collectives.messages.group import GroupReducer
 from gmijax.collectives.messages.messenger import Messenger
 from gmijax.collectives.messages.pipe_block import PipeBlock
@@ -15,11 +14,10 @@ from gmijax.partition.reduction import why_not_intra
 from gmijax.roles import shipping
 from gmijax.roles.role import Gmi, enter
 from gmijax.runs.folder import read_json
-from gmijax.supervise.child import ENV_PIPES_FD, ChildLink, required_fd, run_gmi
+from gmijax.supervise.child import ENV_EXCHANGE_FD, ENV_PIPES_FD, ChildLink, required_fd, run_gmi
 
 if TYPE_CHECKING:
     from gmijax.collectives.messages.device_buffers import DeviceBuffers
-    from gmijax.collectives.ring import World
 
 
 _SETTLE_S = 1.0
@@ -35,26 +33,19 @@ def _run(link: ChildLink) -> dict[str, Any]:
     config = read_json(link.run.config)
     plan = Plan.from_dict(read_json(link.run.plan))
     # Before the role's own modules, which may use jax.
-    world = _take_up_share(plan, link, config["start_timeout_s"])
+    _take_up_share(plan, link)
     block = PipeBlock(required_fd(ENV_PIPES_FD), link.gmi)
     device = _device_buffers(plan, link.gmi) if config["device_messages"] else None
     messenger = Messenger(block, config["timeout_s"], device)
     sys.path[:] = config["script"]["sys_path"]  # As where the job was started.
     role, args = shipping.load(link.paths.role.read_bytes(), config["script"])
 
-    def build(num_floats: int) -> Reducer:
-        return build_reducer(
-            plan.strategy,
-            Membership(
-                layout=plan.layout,
-                rank=link.gmi,
-                num_floats=num_floats,
-                exchange_fd=link.exchange_fd,
-                timeout_s=config["timeout_s"],
-                rendezvous_timeout_s=config["timeout_s"],
-                world=world,
-                intra=plan.intra,
-            ),
+    def build(num_floats: int) -> HostExchange:
+        timeout_s = config["timeout_s"]
+        return HostExchange(
+            *(required_fd(ENV_EXCHANGE_FD), link.gmi, plan.layout.num_gmis, num_floats),
+            timeout_s=timeout_s,
+            rendezvous_timeout_s=timeout_s,
         )
 
     reducer = GroupReducer(messenger, build)
@@ -70,9 +61,8 @@ def _run(link: ChildLink) -> dict[str, Any]:
     return {"status": "completed"}
 
 
-def _take_up_share(plan: Plan, link: ChildLink, timeout_s: float) -> World | None:
+def _take_up_share(plan: Plan, link: ChildLink) -> None:
     """Opens the GPU, with jax's pool of memory; on a CPU jax is left to the role."""
-    world = join_world(plan.strategy, plan.layout, link.gmi, link.rendezvous, timeout_s)
     if plan.backend != "cpu":
         import jax
 
@@ -81,7 +71,6 @@ def _take_up_share(plan: Plan, link: ChildLink, timeout_s: float) -> World | Non
         # Backends look for it once all GMIs are ready.
         jax.devices()
         check_share(plan, link.gmi)
-    return world
 
 
 def _device_buffers(plan: Plan, gmi: int) -> DeviceBuffers | None:

@@ -31,7 +31,6 @@ ENV_RUN_DIR: Final = "GMIJAX_RUN_DIR"
 ENV_LIFELINE_FD: Final = "GMIJAX_LIFELINE_FD"
 ENV_EXCHANGE_FD: Final = "GMIJAX_EXCHANGE_FD"
 ENV_PIPES_FD: Final = "GMIJAX_PIPES_FD"
-ENV_RENDEZVOUS: Final = "GMIJAX_RENDEZVOUS"
 ENV_WAITS: Final = "GMIJAX_WAITS"
 ENV_HEARTBEAT_FD: Final = "GMIJAX_HEARTBEAT_FD"
 
@@ -54,7 +53,6 @@ class ChildLink:
       run: files of the run.
       paths: files of this GMI.
       exchange_fd: inherited file of the gradient exchange, None where there is none.
-      rendezvous: address where GMIs that form rings meet, None where they need not.
 
     Args:
       waits: whether another GMI compiles before this one may.
@@ -67,7 +65,6 @@ class ChildLink:
         run: RunPaths,
         lifeline_fd: int | None,
         exchange_fd: int | None,
-        rendezvous: str | None = None,
         *,
         waits: bool = False,
         heartbeat_fd: int | None = None,
@@ -75,7 +72,6 @@ class ChildLink:
         self.gmi = gmi
         self.run = run
         self.exchange_fd = exchange_fd
-        self.rendezvous = rendezvous
         self.paths: GmiPaths = run.gmi(gmi)
         self._stop = threading.Event()
         self._turn = threading.Event()
@@ -112,7 +108,6 @@ class ChildLink:
             RunPaths(Path(run_dir)),
             lifeline_fd,
             inherited_fd(environment, ENV_EXCHANGE_FD),
-            environment.get(ENV_RENDEZVOUS),
             waits=ENV_WAITS in environment and lifeline_fd is not None,
             heartbeat_fd=inherited_fd(environment, ENV_HEARTBEAT_FD),
         )

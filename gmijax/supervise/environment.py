@@ -10,7 +10,8 @@ from pathlib import Path
 from typing import Final
 
 from gmijax.partition.plan import Plan, Slice
-from gmijax.supervise.child import ENV_CPUS, ENV_GMI, ENV_RENDEZVOUS, ENV_WAITS
+from gmijax.partition.reduction import needs_ring
+from gmijax.supervise.child import ENV_CPUS, ENV_GMI, ENV_WAITS
 
 # The old and the new name of one JAX setting; JAX refuses to start when both are set.
 _MEMORY_FRACTION, _OLD_MEMORY_FRACTION = (
@@ -25,17 +26,8 @@ COMPILATION_CACHE: Final = "JAX_COMPILATION_CACHE_DIR"
 _THREAD_LIMITS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 
 _SMALLEST_POOL = 4
-_LOCAL_HOST = "127.0.0.1"
-
-# Processes of one jax world would tune kernels together and wait for each other, although they
-# compile different programs.
-_NO_SHARED_AUTOTUNING = "--xla_gpu_shard_autotuning=false"
 
 _NCCL_INTERFACE = "NCCL_SOCKET_IFNAME"
-
-# XLA's client for GPUs goes on looking for the service that ring members leave before they train,
-# and warns of it twice a second, for as long as the job lasts.
-_LOG_LEVEL, _ERRORS_ONLY = "TF_CPP_MIN_LOG_LEVEL", "2"
 
 
 def gmi_environment(
@@ -44,7 +36,6 @@ def gmi_environment(
     inherited: Mapping[str, str],
     cache_dir: Path,
     backend_environment: Mapping[str, str],
-    rendezvous: str | None = None,
 ) -> dict[str, str]:
     """All environment variables of one GMI.
 
@@ -57,7 +48,6 @@ def gmi_environment(
       inherited: the controller's own variables.
       cache_dir: compilation cache, unless the user has set one.
       backend_environment: what the backend adds; its `XLA_FLAGS` are appended to the user's.
-      rendezvous: address where GMIs that form rings meet, None if they need not.
     """
     share = plan.slices[gmi]
     environment = dict(inherited)
@@ -72,17 +62,10 @@ def gmi_environment(
         environment.setdefault(name, str(len(share.cpus) or 1))
     added = dict(backend_environment)
     flags = extend_xla_flags(environment.get(_XLA_FLAGS, ""), added.pop(_XLA_FLAGS, ""))
-    # Of the job that this one may be started from.
-    for name in (ENV_RENDEZVOUS, ENV_WAITS):
-        environment.pop(name, None)
-    if rendezvous is not None:
-        # A proxy that the user needs for other things must not get between the GMIs.
-        environment.update({ENV_RENDEZVOUS: rendezvous, "no_grpc_proxy": _LOCAL_HOST})
-        if plan.backend != "cpu":
-            flags = extend_xla_flags(flags, _NO_SHARED_AUTOTUNING)
-            # All GMIs are on this host, and NCCL's sockets are open to whoever reaches them.
-            environment.setdefault(_NCCL_INTERFACE, "lo")
-            environment.setdefault(_LOG_LEVEL, _ERRORS_ONLY)
+    environment.pop(ENV_WAITS, None)  # Of the job that this one may be started from.
+    if plan.backend != "cpu" and needs_ring(plan.strategy, plan.training_layout):
+        # All GMIs are on this host, and NCCL's sockets are open to whoever reaches them.
+        environment.setdefault(_NCCL_INTERFACE, "lo")
     if flags:
         environment[_XLA_FLAGS] = flags
     return {**environment, **added}

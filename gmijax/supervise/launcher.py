@@ -22,11 +22,9 @@ from typing import Final
 from gmijax.collectives.shared_block import create_exchange
 from gmijax.config import RunConfig, ServeRunConfig
 from gmijax.errors import BackendUnavailable, GmijaxError, JobInterrupted
-from gmijax.machine.processes import reserved_address
 from gmijax.machine.snapshot import Machine
 from gmijax.partition.backend_choice import WHAT_SHARE_LOSES
 from gmijax.partition.plan import Plan
-from gmijax.partition.reduction import needs_ring
 from gmijax.runs.cache import compilation_cache_dir, drop_broken_programs
 from gmijax.runs.folder import RunPaths, read_json, write_json
 from gmijax.supervise.backends import Backend, open_backend
@@ -89,19 +87,15 @@ def run_gmis(
       JobInterrupted: a signal came, and every GMI has ended.
     """
     plan, kind = launch.plan, launch.kind
-    has_rings = needs_ring(plan.strategy, plan.training_layout)
-    # There a program of a world belongs to one of its devices.
-    is_world_on_cpu = has_rings and plan.backend == "cpu"
     with ExitStack() as held:
         # First, so that it ends last: a signal must not cut off the end of the backend.
         if launch.stops_gracefully and signals is None:
             signals = held.enter_context(stop_signals())
         inherited = _shared_blocks(held, kind, plan)
-        rendezvous = held.enter_context(reserved_address()) if has_rings else None
         launch, backend = _enter_backend(held, launch)
 
         def environment(gmi: int) -> dict[str, str]:
-            return environment_of(launch, gmi, backend.environment(gmi), rendezvous)
+            return environment_of(launch, gmi, backend.environment(gmi))
 
         supervisor = Supervisor(
             Job(
@@ -112,7 +106,7 @@ def run_gmis(
                 backend=backend,
                 timeouts=launch.timeouts,
                 inherited_fds=inherited,
-                compile_once=kind.compile_once and not is_world_on_cpu,
+                compile_once=kind.compile_once,
             )
         )
         if signals is not None:
@@ -191,12 +185,10 @@ def timeouts_of(limits: RunConfig | ServeRunConfig) -> Timeouts:
     )
 
 
-def environment_of(
-    launch: Launch, gmi: int, added: Mapping[str, str], rendezvous: str | None = None
-) -> dict[str, str]:
+def environment_of(launch: Launch, gmi: int, added: Mapping[str, str]) -> dict[str, str]:
     """All environment variables of a GMI; `added` are those of its backend."""
     own, cache = dict(os.environ), compilation_cache_dir()
-    variables = gmi_environment(launch.plan, gmi, own, cache, added, rendezvous)
+    variables = gmi_environment(launch.plan, gmi, own, cache, added)
     return {**variables, **launch.variables}
 
 

@@ -18,7 +18,6 @@ from gmijax.supervise.kinds import ENV_CHANNELS_FD, ENV_REGISTERS_FD, groups_of,
 from gmijax.workers.trainers import (
     environments_of,
     exchange_used,
-    join_trainers,
     read_job,
     trainers_reducer,
 )
@@ -40,7 +39,6 @@ def _run(link: ChildLink) -> dict[str, Any]:
     agents, trainers = groups_of(plan)
     trains = link.gmi in trainers.gmis
     # jax starts here, in the environment that the plan prepared.
-    world = join_trainers(config, plan, trainers, link) if trains else None
     from gmijax.a3c.a3c import A3cLosses
     from gmijax.a3c.agent import Agent
     from gmijax.a3c.trainer import Trainer
@@ -61,7 +59,7 @@ def _run(link: ChildLink) -> dict[str, Any]:
         receiver = open_receiver(*channels)
         held.callback(receiver.close)
         num_floats = exchange_size(env.spec, config.algo, A3cLosses)
-        reducer = trainers_reducer(config, plan, trainers, link, num_floats, world)
+        reducer = trainers_reducer(config, plan, trainers, link, num_floats)
         held.callback(reducer.close)
         trainer = Trainer(config, env, agents.gmis, registers, receiver, reducer, link)
         return trainer.run() | exchange_used(plan, reducer)

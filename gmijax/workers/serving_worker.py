@@ -146,7 +146,6 @@ def _reducer(config: ServeConfig, plan: Plan, link: ChildLink) -> Reducer:
             exchange_fd=link.exchange_fd,
             timeout_s=config.run.exchange_timeout_s,
             rendezvous_timeout_s=config.run.start_timeout_s,
-            world=None,
             intra="host",
         ),
     )

@@ -13,7 +13,6 @@ from gmijax.supervise.child import ChildLink
 
 if TYPE_CHECKING:
     from gmijax.collectives.interface import Reducer
-    from gmijax.collectives.ring import World
     from gmijax.sim.wrappers import BatchedEnv
 
 
@@ -37,31 +36,16 @@ def environments_of(config: TrainConfig, place: int) -> BatchedEnv:
     )
 
 
-def join_trainers(
-    config: TrainConfig, plan: Plan, trainers: Group, link: ChildLink
-) -> World | None:
-    """The trainers' processes as one, where their gradients go in rings; else None.
-
-    Comes before all other use of jax. Raises as `join_world`.
-    """
-    from gmijax.collectives.build import join_world
-
-    rank, timeout_s = trainers.gmis.index(link.gmi), config.run.start_timeout_s
-    return join_world(plan.strategy, trainers.layout, rank, link.rendezvous, timeout_s)
-
-
 def trainers_reducer(
     config: TrainConfig,
     plan: Plan,
     trainers: Group,
     link: ChildLink,
     num_floats: int,
-    world: World | None,
 ) -> Reducer:
     """The reducer among the trainers, whose ranks are their places in the group.
 
-    Its buffers for `mean` have `num_floats` numbers; `world` is from `join_trainers`. Raises as
-    `build_reducer`.
+    Means are of at most `num_floats` numbers. Raises as `build_reducer`.
     """
     from gmijax.collectives.build import Membership, build_reducer
 
@@ -72,7 +56,6 @@ def trainers_reducer(
         exchange_fd=link.exchange_fd,
         timeout_s=config.reduce.timeout_s,
         rendezvous_timeout_s=config.run.start_timeout_s,
-        world=world,
         intra=plan.intra,
         # Whoever asks for it by name is told that it does not work.
         host_if_unavailable=config.reduce.intra == "auto" and config.reduce.strategy != "one_shot",
@@ -82,9 +65,6 @@ def trainers_reducer(
 
 def exchange_used(plan: Plan, reducer: Reducer) -> dict[str, str]:
     """For the summary: the exchange in use, where it may differ from the plan's strategy."""
-    on_device = reducer.is_device_resident
-    if plan.strategy == "har":
-        return {"intra": "ipc" if on_device else "host"}
-    if plan.strategy == "one_shot" and not on_device:
-        return {"strategy": "mpr", "intra": "host"}
-    return {}
+    if reducer.strategy != plan.strategy:
+        return {"strategy": reducer.strategy, "intra": "host"}
+    return {"intra": reducer.intra} if plan.strategy == "har" else {}

@@ -19,7 +19,6 @@ from gmijax.supervise.kinds import groups_of
 from gmijax.workers.trainers import (
     environments_of,
     exchange_used,
-    join_trainers,
     read_job,
     trainers_reducer,
 )
@@ -40,7 +39,6 @@ def _run(link: ChildLink) -> dict[str, Any]:
     simulating, trainers = groups_of(plan)
     trains = link.gmi in trainers.gmis
     # jax starts here, in the environment that the plan prepared.
-    world = join_trainers(config, plan, trainers, link) if trains else None
     from gmijax.collectives.messages.messenger import Messenger
     from gmijax.collectives.messages.pipe_block import PipeBlock
     from gmijax.learning.updates import exchange_size
@@ -63,7 +61,7 @@ def _run(link: ChildLink) -> dict[str, Any]:
             here = _neighbours(plan, link.gmi, AGENT)
             workers = RolloutWorkers(mail, here, config.run.start_timeout_s)
         num_floats = exchange_size(env.spec, config.algo, PpoLosses)
-        reducer = trainers_reducer(config, plan, trainers, link, num_floats, world)
+        reducer = trainers_reducer(config, plan, trainers, link, num_floats)
         held.callback(reducer.close)
         loop = TrainingLoop(config, env, reducer, link, workers)
         return loop.run() | exchange_used(plan, reducer)

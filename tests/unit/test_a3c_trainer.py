@@ -10,7 +10,7 @@ from gmijax.a3c.job_registers import JobRegisters
 from gmijax.a3c.trainer import Trainer
 from gmijax.cli.compose import compose
 from gmijax.collectives.channel.batcher import Batch
-from gmijax.collectives.solo import SoloReducer
+from gmijax.collectives.build import SoloReducer
 from gmijax.runs.folder import RunPaths
 from gmijax.supervise.child import ChildLink
 

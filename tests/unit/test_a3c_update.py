@@ -18,7 +18,7 @@ from gmijax.a3c.report import histogram_of, mean_and_p99
 from gmijax.a3c.rollout import UnrollPrograms, collect
 from gmijax.a3c.update import FusedUpdate, SplitUpdate
 from gmijax.cli.compose import compose
-from gmijax.collectives.solo import SoloReducer
+from gmijax.collectives.build import SoloReducer
 from gmijax.learning.learner import (
     acting_weights,
     init_learner,

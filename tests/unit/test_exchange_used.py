@@ -6,7 +6,7 @@ import pytest
 from fake_device_memory import one_shot_of_one
 from supervision import machine, plan_config, reduce_config
 
-from gmijax.collectives.solo import SoloReducer
+from gmijax.collectives.build import SoloReducer
 from gmijax.partition.planner import make_plan
 from gmijax.workers.trainers import exchange_used
 

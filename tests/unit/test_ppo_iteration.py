@@ -11,7 +11,7 @@ from jax.sharding import Mesh
 from toy_env import point_mass
 
 from gmijax.cli.compose import compose
-from gmijax.collectives.solo import SoloReducer
+from gmijax.collectives.build import SoloReducer
 from gmijax.collectives.spmd import AXIS, SpmdStep
 from gmijax.learning.learner import (
     acting_weights,

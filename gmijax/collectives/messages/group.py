@@ -16,7 +16,8 @@ from typing import Any, Final, Literal, NamedTuple, get_args
 import numpy as np
 import numpy.typing as npt
 
-from gmijax.collectives.interface import FloatBuffer, Reducer
+from gmijax.collectives.host import HostExchange
+from gmijax.collectives.interface import FloatBuffer
 from gmijax.collectives.messages.mailboxes import COLLECTIVE
 from gmijax.collectives.messages.messenger import Messenger
 from gmijax.collectives.messages.trees import as_bytes, flatten, unflatten
@@ -48,10 +49,10 @@ class GroupReducer:
         needed, by all ranks in the same call.
     """
 
-    def __init__(self, messenger: Messenger, build: Callable[[int], Reducer]) -> None:
+    def __init__(self, messenger: Messenger, build: Callable[[int], HostExchange]) -> None:
         self._messenger = messenger
         self._build = build
-        self._reducer: Reducer | None = None
+        self._reducer: HostExchange | None = None
         self._num_floats = 0
 
     def reduce(self, members: Iterable[int], tree: Any, op: Operation) -> Any:
@@ -109,7 +110,7 @@ class GroupReducer:
         try:
             if self._reducer is None:
                 self._reducer = self._build(flat.size)
-            return self._reducer.mean(flat).copy()  # A view of memory that is used again.
+            return self._reducer.mean(flat)
         except CollectiveTimeout:
             self._require_no_other(call)
             raise
