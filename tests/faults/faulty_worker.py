@@ -145,10 +145,10 @@ def _inject_in_training(faults: Faults) -> None:
     import jax
     import jax.numpy as jnp
 
-    from gmijax.collectives.mpr import MprReducer
+    from gmijax.collectives.host import HostExchange
+    from gmijax.collectives.program import ProgramStep
     from gmijax.learning import checkpoint
     from gmijax.learning.training_log import TrainingLog
-    from gmijax.ppo.iteration import SplitIteration
 
     def synced(path: Path) -> None:
         if path.name.endswith(".partial"):
@@ -160,7 +160,7 @@ def _inject_in_training(faults: Faults) -> None:
         if path.name.endswith(".removed") and path.exists():
             faults.at("removing")
 
-    save, iterate = checkpoint._save, SplitIteration.__call__
+    save, iterate = checkpoint._save, ProgramStep.__call__
 
     def save_half(folder: Path, tree: Any) -> None:
         save(folder, tree)
@@ -173,17 +173,17 @@ def _inject_in_training(faults: Faults) -> None:
     def nan(leaf: jax.Array) -> jax.Array:
         return leaf * jnp.nan if jnp.issubdtype(leaf.dtype, jnp.floating) else leaf
 
-    def iterate_poisoned(self: SplitIteration, state: Any, env_state: Any) -> Any:
+    def iterate_poisoned(self: ProgramStep, state: Any, env_state: Any) -> Any:
         if faults.is_poisoned():
             env_state = jax.tree.map(nan, env_state)
         return iterate(self, state, env_state)
 
-    _before(MprReducer, "mean", lambda *_: faults.at("mean"))
+    _before(HostExchange, "sum", lambda *_: faults.at("mean"))
     _before(TrainingLog, "write", lambda *_: faults.at("report"))
     _before(checkpoint, "_sync", synced)
     checkpoint._save = save_half
     checkpoint.shutil = _Recorded(checkpoint.shutil, removed)
-    SplitIteration.__call__ = iterate_poisoned
+    ProgramStep.__call__ = iterate_poisoned
 
 
 class _Recorded:

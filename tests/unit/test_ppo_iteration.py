@@ -1,18 +1,25 @@
 import dataclasses
 import functools
+import os
 import re
+from collections.abc import Iterator
+from contextlib import contextmanager
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from fake_device_memory import one_shot_of_one
-from jax.sharding import Mesh
+from fake_device_memory import FAKES
 from toy_env import point_mass
 
 from gmijax.cli.compose import compose
 from gmijax.collectives.build import SoloReducer
-from gmijax.collectives.spmd import AXIS, SpmdStep
+from gmijax.collectives.device_links import DeviceLinks
+from gmijax.collectives.host import HostExchange
+from gmijax.collectives.host_links import HostLinks
+from gmijax.collectives.program import Exchange
+from gmijax.collectives.shared_block import LANES, create_exchange
+from gmijax.collectives.strategies import stages
 from gmijax.learning.learner import (
     acting_weights,
     adapted_learning_rate,
@@ -21,11 +28,12 @@ from gmijax.learning.learner import (
     make_learner,
 )
 from gmijax.learning.updates import exchange_size, minibatch_order
-from gmijax.ppo.iteration import SplitIteration, StepOfOne, make_iteration, times_of
+from gmijax.partition.layout import Layout
 from gmijax.ppo.ppo import (
     PpoLosses,
     flatten,
     gradients,
+    iterate,
     merge_stats,
     rollout,
     update_context,
@@ -99,94 +107,54 @@ def test_the_learning_rate_follows_the_divergence() -> None:
     assert float(slowest) == pytest.approx(1e-5)
 
 
-class Spmd(SoloReducer):
-    """One process that makes a program of all devices, of which there is one."""
-
-    is_device_resident = True
-
-    def spmd(self, step):
-        return SpmdStep(Mesh(np.array(jax.devices()[:1]), (AXIS,)), [0], step)
-
-
 @pytest.fixture(scope="module")
 def size(config) -> int:
     return exchange_size(ENV.spec, config, PpoLosses)
 
 
 @pytest.fixture(scope="module")
-def fused(learner, size):
+def alone(learner):
     """The iteration of a job with one GMI, compiled."""
-    return _compiled(make_iteration(ENV, learner, SoloReducer(size)), learner)
+    return _compiled(SoloReducer().program(functools.partial(iterate, ENV, learner)), learner)
 
 
-@pytest.fixture(scope="module")
-def spmd(learner, size):
-    return _compiled(make_iteration(ENV, learner, Spmd(size)), learner)
+@contextmanager
+def _exchange(strategy: str, num_floats: int) -> Iterator[Exchange]:
+    """Exchanges of a job with one rank, which is this process, as one of several would have."""
+    fd, layout = create_exchange(), Layout.even(1, 1)
+    control, host = (
+        HostExchange(fd, 0, 1, num_floats, timeout_s=5.0, rendezvous_timeout_s=5.0, lane=lane)
+        for lane in range(LANES)
+    )
+    os.close(fd)
+    parts = stages(strategy, layout)
+    links = HostLinks(host, num_floats)
+    if strategy == "one_shot":
+        links = DeviceLinks(control, host, layout, num_floats, parts, FAKES["fake"])
+    exchange = Exchange(links, parts, 0, 1)
+    links.start(exchange)
+    yield exchange
+    exchange.close()
+    host.close()
+    control.close()
 
 
-def test_all_paths_compute_the_same(learner, size, fused, spmd) -> None:
-    split = _compiled(SplitIteration(ENV, learner, SoloReducer(size)), learner)
-    results = []
-    with one_shot_of_one(size) as reducer:
-        queued = _compiled(make_iteration(ENV, learner, reducer), learner)
-        for iteration in (fused, split, spmd, queued):
+@pytest.mark.parametrize("strategy", ["mpr", "one_shot"])
+def test_exchanges_in_the_program_change_nothing_but_its_place(
+    strategy: str, learner, size, alone
+) -> None:
+    with _exchange(strategy, size) as exchange:
+        step = exchange.program(functools.partial(iterate, ENV, learner))
+        results = []
+        for iteration in (alone, _compiled(step, learner)):
             state, envs = _start(learner)
             for _ in range(3):
                 state, envs, metrics = iteration(state, envs)
             iteration.wait()
             results.append((state.params, state.obs_moments, envs.env.obs, metrics))
-        assert times_of(queued)["time/reduce_s"] > 0
-    for result in results[1:]:
-        _close(results[0], result, atol=1e-4)
-
-
-def test_one_program_of_all_takes_other_states_than_its_own(learner, spmd) -> None:
-    state, envs, _ = spmd(*_start(learner))
-    once = jax.device_get(state.params)
-    copies = jax.tree.map(jnp.copy, (state, envs))
-    continued = spmd(state, envs)
-    again = spmd(*_start(learner))
-    jax.tree.map(np.testing.assert_array_equal, once, again[0].params)
-    # As a resumed run does.
-    resumed = spmd(*copies)
-    jax.tree.map(np.testing.assert_array_equal, continued[0].params, resumed[0].params)
-    np.testing.assert_array_equal(continued[1].env.obs, resumed[1].env.obs)
-
-
-class OnDevice(SoloReducer):
-    """Keeps the gradient where it is, as rings do."""
-
-    is_device_resident = True
-    exchange_s = 0.25
-
-    def run_on_device(self, program):
-        def mean(buffer):
-            assert isinstance(buffer, jax.Array)
-            return buffer
-
-        return program(mean)
-
-    def mean(self, buffer):
-        raise AssertionError("through the host")
-
-
-def test_gradients_can_stay_on_the_device(learner, size) -> None:
-    results = []
-    for reducer in (SoloReducer(size), OnDevice(size)):
-        iteration = _compiled(SplitIteration(ENV, learner, reducer), learner)
-        state, envs = _start(learner)
-        for _ in range(2):
-            state, envs, metrics = iteration(state, envs)
-        results.append((state.params, envs.env.obs, metrics))
-        assert iteration.times["time/update_s"] > 0
-        assert (iteration.times["time/reduce_s"] == 0.25) == isinstance(reducer, OnDevice)
-    jax.tree.map(np.testing.assert_array_equal, *results)
-
-
-def test_a_reducer_that_spans_no_program_splits_the_iteration(learner, size) -> None:
-    several = SoloReducer(size)
-    several.world_size = 2
-    assert isinstance(make_iteration(ENV, learner, several), SplitIteration)
+        assert step.exchange_s is not None
+        assert step.exchange_s > 0
+    _close(*results, atol=1e-4)
 
 
 def test_shards_of_minibatches_give_the_update_of_the_whole(learner) -> None:
@@ -223,9 +191,10 @@ def test_shards_of_minibatches_give_the_update_of_the_whole(learner) -> None:
     np.testing.assert_allclose(sharded.learning_rate, single.learning_rate)
 
 
-def test_it_compiles_once_and_learns_to_stand_still(learner, size) -> None:
+def test_it_compiles_once_and_learns_to_stand_still(learner) -> None:
     # A compiled program cannot be traced again.
-    iteration = _compiled(make_iteration(ENV, learner, SoloReducer(size)), learner, num_envs=64)
+    step = SoloReducer().program(functools.partial(iterate, ENV, learner))
+    iteration = _compiled(step, learner, num_envs=64)
     state, envs = _start(learner, num_envs=64)
     returns = []
     for _ in range(80):
@@ -234,34 +203,33 @@ def test_it_compiles_once_and_learns_to_stand_still(learner, size) -> None:
     assert np.mean(returns[-10:]) > np.mean(returns[:10]) + 0.4
 
 
-def test_the_normaliser_changes_only_between_iterations(learner, fused) -> None:
-    new, _, metrics = fused(*_start(learner))
+def test_the_normaliser_changes_only_between_iterations(learner, alone) -> None:
+    new, _, metrics = alone(*_start(learner))
     assert float(new.obs_moments.count) == T * N
     assert int(new.iteration) == 1
     # The first ratio of every iteration is 1, so the first losses see no clipping at all.
     assert float(metrics.losses.clip_fraction) < 1.0
 
 
-def test_no_learning_rate_is_lost_and_no_number_is_written_twice(config, size, fused) -> None:
+def test_no_learning_rate_is_lost_and_no_number_is_written_twice(config, alone) -> None:
     """GPUs would copy it within host memory, for which the host waits (`IterationMetrics`)."""
-    _check_no_number_is_written_twice(fused)
+    _check_no_number_is_written_twice(alone)
     adaptive = dataclasses.replace(
         config, num_updates_per_batch=1, learning_rate_schedule="adaptive_kl", desired_kl=1e-7
     )
-    mine, alone = make_learner(ENV.spec, adaptive), SoloReducer(size)
+    mine = make_learner(ENV.spec, adaptive)
+    step = SoloReducer().program(functools.partial(iterate, ENV, mine))
     # The first update has not moved yet, the others each lower the rate.
     rates = [1e-3 / 1.5**k for k in range(4)]
-    for iteration in (make_iteration(ENV, mine, alone), SplitIteration(ENV, mine, alone)):
-        _, _, told = _compiled(iteration, mine)(*_start(mine))
-        assert float(told.learning_rate) == pytest.approx(rates[-1])
-        assert {k: float(v) for k, v in told.rates.items()} == pytest.approx(
-            {"mean": np.mean(rates), "min": rates[-1], "max": rates[0]}
-        )
-        if isinstance(iteration, StepOfOne):
-            _check_no_number_is_written_twice(iteration)
+    _, _, told = _compiled(step, mine)(*_start(mine))
+    assert float(told.learning_rate) == pytest.approx(rates[-1])
+    assert {k: float(v) for k, v in told.rates.items()} == pytest.approx(
+        {"mean": np.mean(rates), "min": rates[-1], "max": rates[0]}
+    )
+    _check_no_number_is_written_twice(step)
 
 
-def _check_no_number_is_written_twice(iteration: StepOfOne) -> None:
+def _check_no_number_is_written_twice(iteration) -> None:
     program = iteration._program
     count = len(jax.tree.leaves(program.out_info[2]))
     lines = program.as_text().splitlines()
