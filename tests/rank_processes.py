@@ -22,7 +22,6 @@ from gmijax.collectives.build import Membership, build_reducer
 from gmijax.collectives.interface import Reducer
 from gmijax.collectives.shared_block import create_exchange
 from gmijax.errors import CollectiveTimeout, GmijaxError, PeerLost
-from gmijax.machine.processes import reserved_address
 from gmijax.partition.layout import Layout
 from gmijax.supervise.child import ENV_EXCHANGE_FD
 from tests.rank_bodies import BODIES, Options

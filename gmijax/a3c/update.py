@@ -43,16 +43,17 @@ def make_update(learner: A3cLearner, reducer: Reducer) -> TracedStep:
     The batch has unrolls [T, B]. The weight [B] is 0 for unrolls that are too old to learn from;
     the others weigh alike on all trainers, and the mean over all of them is 1.
     """
-    return reducer.program(partial(_update, learner), donates_own=False)
+    return reducer.program(partial(update, learner), donates_own=False)
 
 
-def _update(
+def update(
     learner: A3cLearner,
     peers: Peers,
     _: Any,
     state: TrainState,
     weighted: tuple[Unrolls, Array],
 ) -> tuple[TrainState, tuple[()], Updated]:
+    """See `make_update`."""
     batch, weight = weighted
     targets = batch_targets(learner, state, batch, weight)
     everyone = peers.gather(batch_moments(learner, state, batch))

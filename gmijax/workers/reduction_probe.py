@@ -52,9 +52,7 @@ def _measure(link: ChildLink) -> dict[str, Any]:
     return {"rows": rows, "device": jax.local_devices()[0].device_kind}
 
 
-def _reducer(
-    plan: Plan, gmi: int, number: int, probe: Mapping[str, Any]
-) -> Reducer:
+def _reducer(plan: Plan, gmi: int, number: int, probe: Mapping[str, Any]) -> Reducer:
     """The reducer of one probe, with a shared block of its own."""
     return build_reducer(
         probe["strategy"],

@@ -9,8 +9,8 @@ from toy_env import point_mass
 from gmijax.a3c.job_registers import JobRegisters
 from gmijax.a3c.trainer import Trainer
 from gmijax.cli.compose import compose
-from gmijax.collectives.channel.batcher import Batch
 from gmijax.collectives.build import SoloReducer
+from gmijax.collectives.channel.batcher import Batch
 from gmijax.runs.folder import RunPaths
 from gmijax.supervise.child import ChildLink
 
@@ -35,7 +35,7 @@ def _trainer(tmp_path, *versions: list[int]) -> Trainer:
         (1,),
         JobRegisters(None, None, ()),
         _Arrivals(*versions),
-        SoloReducer(1),
+        SoloReducer(),
         ChildLink(0, RunPaths(tmp_path), None, None),
     )
     trainer._version = 10

@@ -3,22 +3,22 @@
 from __future__ import annotations
 
 import dataclasses
-import threading
 from functools import partial
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from axis_peers import run_together
 from jax.flatten_util import ravel_pytree
 from toy_env import point_mass
 
 from gmijax.a3c.a3c import A3cLosses, Unrolls, batch_targets, gradients
 from gmijax.a3c.report import histogram_of, mean_and_p99
 from gmijax.a3c.rollout import UnrollPrograms, collect
-from gmijax.a3c.update import FusedUpdate, SplitUpdate
+from gmijax.a3c.update import update
 from gmijax.cli.compose import compose
-from gmijax.collectives.build import SoloReducer
+from gmijax.collectives.program import PeersOfOne
 from gmijax.learning.learner import (
     acting_weights,
     init_learner,
@@ -27,7 +27,6 @@ from gmijax.learning.learner import (
     pack_weights,
     unpack_weights,
 )
-from gmijax.learning.updates import exchange_size
 from gmijax.sim.wrappers import env_keys
 from gmijax.supervise.kinds import FLOAT_CHANNELS
 
@@ -58,8 +57,15 @@ def _start(config, num_envs: int = N):
     return learner, state, jax.jit(ENV.init)(ENV.model, keys)
 
 
-def _size(config) -> int:
-    return exchange_size(ENV.spec, config, A3cLosses)
+def _alone(learner):
+    """The update of a job with one trainer, compiled: `(state, batch, weight) -> state, told`."""
+    program = jax.jit(partial(update, learner, PeersOfOne(), ()))
+
+    def call(state, batch, weight):
+        state, _, told = program(state, (batch, weight))
+        return state, told
+
+    return call
 
 
 def _copy(tree):
@@ -83,8 +89,8 @@ def batch(start) -> Unrolls:
 
 
 @pytest.fixture(scope="module")
-def fused(start) -> FusedUpdate:
-    return FusedUpdate(start[0])
+def alone(start):
+    return _alone(start[0])
 
 
 def test_weights_travel_as_one_array(config, start) -> None:
@@ -139,77 +145,28 @@ def test_the_channels_that_may_lose_precision_are_those_of_floats() -> None:
     assert set(FLOAT_CHANNELS) == set(Unrolls._fields) - {"done"}
 
 
-def test_unrolls_without_weight_teach_nothing(start, batch, fused) -> None:
+def test_unrolls_without_weight_teach_nothing(start, batch, alone) -> None:
     state = start[1]
     weight = jnp.asarray([1.0] * (N - 2) + [0.0] * 2)
     spoilt = batch._replace(reward=batch.reward.at[:, -2:].set(1e6))
-    first, _ = fused(_copy(state), batch, weight)
-    second, _ = fused(_copy(state), spoilt, weight)
+    first, _ = alone(state, batch, weight)
+    second, _ = alone(state, spoilt, weight)
     jax.tree.map(np.testing.assert_array_equal, first.params, second.params)
     assert int(first.iteration) == 1
 
 
-class _Threads:
-    """A reducer among threads of this process, each with a barrier and the sums of all."""
-
-    is_device_resident = False
-
-    def __init__(self, rank: int, world_size: int, slots: list, barrier: threading.Barrier):
-        self.rank, self.world_size = rank, world_size
-        self._slots, self._barrier = slots, barrier
-
-    def _all(self, values) -> np.ndarray:
-        self._barrier.wait()
-        self._slots[self.rank] = np.array(values)
-        self._barrier.wait()
-        return np.stack(self._slots)
-
-    def mean(self, buffer):
-        return self._all(buffer).mean(axis=0, dtype=np.float32)
-
-    def all_gather(self, values):
-        return self._all(values)
-
-    def close(self) -> None:
-        pass
-
-
-def _in_threads(update_of) -> dict:
-    """What two trainers return, each in a thread, by rank."""
-    slots, barrier, results = [None, None], threading.Barrier(2), {}
-
-    def run(rank: int) -> None:
-        results[rank] = update_of(rank, _Threads(rank, 2, slots, barrier))
-
-    threads = [threading.Thread(target=run, args=(rank,)) for rank in range(2)]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join()
-    return results
-
-
-def test_one_trainer_learns_the_same_in_both_forms(config, start, batch, fused) -> None:
-    learner, state, _ = start
-    split = SplitUpdate(learner, ENV.spec.obs_size, SoloReducer(_size(config)))
-    split.compile(state, batch, jnp.ones(N))
-    _, said = fused(_copy(state), batch, jnp.ones(N))
-    _, also = split(_copy(state), batch, jnp.ones(N))
-    np.testing.assert_allclose(said.weights, also.weights, rtol=1e-4, atol=1e-6)
-    np.testing.assert_allclose(said.losses, also.losses, rtol=1e-3, atol=1e-5)
+def _together(learner, state, both, weight):
+    """The update of two trainers that have half of the batch each."""
+    halves = jax.tree.map(lambda x: jnp.stack(jnp.split(x, 2, axis=1)), both)
+    step = partial(update, learner)
+    return run_together(step, (), state, (halves, weight.reshape(2, N)))
 
 
 def test_two_trainers_stay_equal_and_take_in_both_batches(config) -> None:
     learner, state, envs = _start(config, num_envs=2 * N)
     _, both, _ = _unrolled(learner, state, envs)
-    half = [jax.tree.map(lambda x, k=k: x[:, k * N : (k + 1) * N], both) for k in range(2)]
-
-    def update_of(rank: int, reducer):
-        update = SplitUpdate(learner, ENV.spec.obs_size, reducer)
-        return update(_copy(state), half[rank], jnp.ones(N))
-
-    results = _in_threads(update_of)
-    a, b = results[0][0], results[1][0]
+    states, _, _ = _together(learner, state, both, jnp.ones(2 * N))
+    a, b = (jax.tree.map(lambda x, k=k: x[k], states) for k in range(2))
     jax.tree.map(np.testing.assert_array_equal, a.params, b.params)
     jax.tree.map(np.testing.assert_array_equal, a.obs_moments, b.obs_moments)
     seen = both.state.reshape(-1, ENV.spec.obs_size)
@@ -226,21 +183,15 @@ def test_fresh_unrolls_weigh_alike_however_many_a_trainer_has(config) -> None:
     # One trainer has a fresh unroll and stale ones, the other fresh ones only.
     fresh = np.array([1.0] + [0.0] * (N - 1) + [1.0] * N, np.float32)
     weight = jnp.asarray(fresh * len(fresh) / fresh.sum())
-    alone, said = FusedUpdate(learner)(_copy(state), both, weight)
-
-    def update_of(rank: int, reducer):
-        mine = slice(rank * N, (rank + 1) * N)
-        update = SplitUpdate(learner, ENV.spec.obs_size, reducer)
-        return update(_copy(state), jax.tree.map(lambda x: x[:, mine], both), weight[mine])
-
-    together, also = _in_threads(update_of)[0]
+    alone, said = _alone(learner)(state, both, weight)
+    together, _, also = jax.tree.map(lambda x: x[0], _together(learner, state, both, weight))
     np.testing.assert_allclose(said.losses, also.losses, rtol=1e-4, atol=1e-6)
     # Adam divides by the gradient's size: its moments tell how large it was.
     np.testing.assert_allclose(
         *(ravel_pytree(one.opt_state)[0] for one in (alone, together)), rtol=1e-3, atol=1e-6
     )
     only_fresh = jax.tree.map(lambda x: x[:, fresh > 0], both)
-    _, theirs = FusedUpdate(learner)(_copy(state), only_fresh, jnp.ones(N + 1))
+    _, theirs = _alone(learner)(state, only_fresh, jnp.ones(N + 1))
     np.testing.assert_allclose(also.losses, theirs.losses, rtol=1e-4, atol=1e-6)
 
 
@@ -263,15 +214,13 @@ def test_learning_rates_of_all_minibatches_are_told(config) -> None:
     )
     learner, state, envs = _start(adaptive)
     _, batch, _ = _unrolled(learner, state, envs)
-    split = SplitUpdate(learner, ENV.spec.obs_size, SoloReducer(_size(adaptive)))
-    for update in (FusedUpdate(learner), split):
-        new, told = update(_copy(state), batch, jnp.ones(N))
-        # The first pass has not moved yet, the others each lower the rate.
-        rates = [1e-3, 1e-3 / 1.5, 1e-3 / 1.5**2, 1e-3 / 1.5**3]
-        assert float(told.rates["max"]) == pytest.approx(rates[0])
-        assert float(told.rates["min"]) == pytest.approx(rates[3])
-        assert float(told.rates["mean"]) == pytest.approx(np.mean(rates))
-        assert float(new.learning_rate) == pytest.approx(rates[3])
+    new, told = _alone(learner)(state, batch, jnp.ones(N))
+    # The first pass has not moved yet, the others each lower the rate.
+    rates = [1e-3, 1e-3 / 1.5, 1e-3 / 1.5**2, 1e-3 / 1.5**3]
+    assert float(told.rates["max"]) == pytest.approx(rates[0])
+    assert float(told.rates["min"]) == pytest.approx(rates[3])
+    assert float(told.rates["mean"]) == pytest.approx(np.mean(rates))
+    assert float(new.learning_rate) == pytest.approx(rates[3])
 
 
 @pytest.mark.parametrize(
@@ -287,12 +236,12 @@ def test_it_learns_to_stand_still_from_a_policy_that_lags(config, changes) -> No
     learner, state, envs = _start(
         dataclasses.replace(config, learning_rate=3e-3, **changes), num_envs=64
     )
-    update = FusedUpdate(learner)
+    learn = _alone(learner)
     versions = [acting_weights(learner, _copy(state))] * 3
     rewards = []
     for _ in range(80):
         envs, batch, stats = COLLECT(learner.networks, T, ENV.model, versions[-3], envs)
-        state, updated = update(state, batch, jnp.ones(64))
+        state, updated = learn(state, batch, jnp.ones(64))
         versions.append(unpack_weights(versions[0], updated.weights))
         rewards.append(float(stats.reward_sum) / (64 * T))
     assert np.mean(rewards[:5]) < 0.1

@@ -9,25 +9,18 @@ from typing import Any, TypeVar
 
 import numpy as np
 import pytest
-from fake_device_memory import FakeDeviceMemory
 
-from gmijax.collectives.har import HarReducer
 from gmijax.collectives.host import HostExchange
-from gmijax.collectives.interface import FloatBuffer, Reducer
-from gmijax.collectives.intra import HostIntra
-from gmijax.collectives.shared_block import create_exchange
+from gmijax.collectives.interface import FloatBuffer
 from gmijax.collectives.messages.group import AT_ONCE_BYTES, GroupReducer
 from gmijax.collectives.messages.messenger import MIN_CAPACITY_BYTES, Messenger
 from gmijax.collectives.messages.pipe_block import PipeBlock, create_pipes
-from gmijax.collectives.mpr import MprReducer
-from gmijax.collectives.one_shot import OneShotReducer
+from gmijax.collectives.shared_block import create_exchange
 from gmijax.errors import CollectiveError
-from gmijax.partition.layout import Layout
 
 RANKS = 3
 SMALL = AT_ONCE_BYTES // 4
 LARGE = 2 * SMALL
-LAYOUT = Layout.even(1, RANKS)
 
 T = TypeVar("T")
 
@@ -80,32 +73,16 @@ def by_messages(buffers: list[FloatBuffer], count: int) -> list[Callable[[int], 
     return [mean]
 
 
-def by_reducer(
-    buffers: list[FloatBuffer], make: Callable[[HostExchange], Reducer]
-) -> Callable[[int], FloatBuffer]:
-    def mean(rank: int) -> FloatBuffer:
-        return make(exchanges[rank]).mean(buffers[rank]).copy()
-
-    exchanges = hosts(LARGE)
-    return mean
-
-
 def test_the_mean_of_three_has_the_same_bits_on_every_way(pool: ThreadPoolExecutor) -> None:
     rng = np.random.default_rng(0)
     buffers = [rng.normal(size=LARGE).astype(np.float32) for _ in range(RANKS)]
     expected = (buffers[0] + buffers[1] + buffers[2]) * np.float32(1 / 3)
     assert (expected != (buffers[0] + buffers[1] + buffers[2]) / np.float32(3)).any()
+    exchanges = hosts(LARGE)
     ways = {
         "small": by_messages(buffers, SMALL)[0],
         "large": by_messages(buffers, LARGE)[0],
-        "mpr": by_reducer(buffers, lambda host: MprReducer(host, LARGE)),
-        "har": by_reducer(
-            buffers,
-            lambda host: HarReducer(host, HostIntra(LAYOUT, host.rank, LARGE), None, LARGE),
-        ),
-        "one_shot": by_reducer(
-            buffers, lambda host: OneShotReducer(host, LAYOUT, LARGE, FakeDeviceMemory)
-        ),
+        "of all": lambda rank: exchanges[rank].mean(buffers[rank]),
     }
     for name, way in ways.items():
         for found in on_all(pool, way):
@@ -134,7 +111,7 @@ def test_ranks_that_ask_for_different_operations_are_told_both(pool: ThreadPoolE
 def test_so_are_those_of_which_some_go_by_a_reducer(first: int, pool: ThreadPoolExecutor) -> None:
     """Whoever comes first; the others find it in the reducer's wait or in their messages."""
     exchanges = hosts(LARGE, timeout_s=1.0)
-    members = groups(lambda rank, size: MprReducer(exchanges[rank], size), timeout_s=10.0)
+    members = groups(lambda rank, _: exchanges[rank], timeout_s=10.0)
     operations = ("mean", "sum", "mean")
 
     def reduce(rank: int) -> str:
@@ -145,7 +122,7 @@ def test_so_are_those_of_which_some_go_by_a_reducer(first: int, pool: ThreadPool
     early = pool.submit(reduce, first)
     while first == 1 and not members[0]._messenger.has_message(1, tag=1):
         pass
-    while first == 0 and not exchanges[0]._turns.step:
+    while first == 0 and not exchanges[0].barrier.step:
         pass
     others = [pool.submit(reduce, rank) for rank in range(RANKS) if rank != first]
     told = [one.result() for one in (early, *others)]
