@@ -16,7 +16,6 @@ import os
 import sys
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -31,6 +30,7 @@ from gmijax import compose
 from gmijax.config import PpoConfig, TrainConfig
 from gmijax.learning.learner import Learner, acting_weights, init_learner, make_learner
 from gmijax.learning.unroll import act
+from gmijax.machine.nvidia import nvml_session
 from gmijax.ppo.ppo import Samples, learn, no_stats
 from gmijax.sim.build import make_training_env
 from gmijax.sim.interface import EnvSpec
@@ -119,7 +119,7 @@ def main() -> int:
     parser.add_argument("--out", type=Path, default=RESULTS)
     arguments = parser.parse_args()
     try:
-        with _nvml():
+        with nvml_session():
             monitor = Monitor(arguments.gpu)
             os.environ["CUDA_VISIBLE_DEVICES"] = monitor.uuid  # jax looks when it is first used.
             rows = {task: _task(task, arguments, monitor) for task in arguments.tasks}
@@ -224,15 +224,6 @@ def _samples(count: int, spec: EnvSpec, key: jax.Array) -> Samples:
     obs, action, advantage = (jax.random.normal(key, (count, *shape)) for shape in shapes)
     zeros = jnp.zeros(count)
     return Samples(obs, action, zeros, jnp.zeros_like(action), zeros, advantage)
-
-
-@contextmanager
-def _nvml() -> Iterator[None]:
-    pynvml.nvmlInit()
-    try:
-        yield
-    finally:
-        pynvml.nvmlShutdown()
 
 
 if __name__ == "__main__":

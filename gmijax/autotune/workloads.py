@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import platform
 import statistics
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Final, Generic, Literal, NamedTuple, TypeVar
 
@@ -46,7 +47,7 @@ class Split(NamedTuple):
     training: int
 
 
-class Workload(Generic[C]):
+class Workload(ABC, Generic[C]):
     """A job that can be profiled, and what is `auto` in it.
 
     Attributes:
@@ -67,22 +68,22 @@ class Workload(Generic[C]):
         self.plan = config.plan
         self.reduce = reduce
 
+    @abstractmethod
     def config_at(self, point: Point, num_gmis: int) -> C:
         """The configuration of the short job that profiles a point with so many GMIs.
 
         Raises:
           ConfigError: there can be none.
         """
-        raise NotImplementedError
 
+    @abstractmethod
     def read(self, plan: Plan, run: RunPaths) -> Measured:
         """Figures of one GMI from the run folder of a profile."""
-        raise NotImplementedError
 
     @property
+    @abstractmethod
     def key(self) -> Mapping[str, Any]:
         """What else decides how fast the job is, plain data."""
-        raise NotImplementedError
 
     def plan_at(self, point: Point, mode: Mode, machine: Machine) -> Plan:
         """The plan of a profile, on the first GPU of the job.

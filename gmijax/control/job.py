@@ -124,7 +124,6 @@ class _Job:
             self._look_again()
         config = _from(self._config, checkpoint)
         write_json(self._run.config, to_dict(config))
-        write_json(self._run.plan, self._plan.to_dict())
         return Launch(
             plan=self._plan,
             machine=self._machine,
@@ -138,6 +137,8 @@ class _Job:
         """Takes the machine as it is after a fault: GPUs and daemons may be gone."""
         self._machine = detect_machine()
         self._config, self._plan, notes = with_gpus_left(self._config, self._plan, self._machine)
+        # Also where nothing has changed: the attempt before may have run with another backend.
+        write_json(self._run.plan, self._plan.to_dict())
         for note in notes:
             add_event(self._run.events, "plan", what=note)
             self._say(note)

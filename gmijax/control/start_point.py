@@ -7,8 +7,8 @@ from typing import NamedTuple
 
 from gmijax.config import TrainConfig
 from gmijax.errors import ConfigError
-from gmijax.runs.folder import META, RunPaths, create_run, given_run, read_json, require_new_run
-from gmijax.runs.resume import CheckpointMeta, find_checkpoint, newest_checkpoint, trained_config
+from gmijax.runs.folder import RunPaths, create_run, given_run, read_json, require_new_run
+from gmijax.runs.resume import CheckpointMeta, choose_checkpoint, newest_checkpoint, trained_config
 
 
 class StartPoint(NamedTuple):
@@ -44,15 +44,13 @@ def find_start_point(config: TrainConfig) -> StartPoint:
     require_new_run(config.run.dir, config.run.name)
     if config.run.resume is None:
         return StartPoint(None, None, is_complete=False, notes=())
-    checkpoint = find_checkpoint(config.run.resume, "run.resume")
+    checkpoint, notes = choose_checkpoint(config.run.resume, "run.resume")
     meta = _require_fit(config, checkpoint, config.run.resume)
     if meta.env_steps >= config.num_timesteps:
         raise ConfigError(
             f"num_timesteps={config.num_timesteps}: the checkpoint has {meta.env_steps} "
             "steps already; give more in all"
         )
-    is_named = (Path(config.run.resume) / META).is_file()
-    notes = () if is_named else newest_checkpoint(checkpoint.parents[1]).passed_over
     return StartPoint(None, checkpoint, is_complete=False, notes=notes)
 
 

@@ -58,7 +58,8 @@ class Gpu(NamedTuple):
 
 
 @contextmanager
-def _nvml() -> Iterator[None]:
+def nvml_session() -> Iterator[None]:
+    """NVML while it is entered; raises NVMLError without a driver."""
     pynvml.nvmlInit()
     try:
         yield
@@ -72,7 +73,7 @@ def list_gpus() -> tuple[Gpu, ...]:
     A GPU that NVML cannot describe (fallen off the bus, not permitted) is left out.
     """
     gpus: list[Gpu] = []
-    with suppress(pynvml.NVMLError), _nvml():
+    with suppress(pynvml.NVMLError), nvml_session():
         for index in range(pynvml.nvmlDeviceGetCount()):
             with suppress(pynvml.NVMLError):
                 gpus.append(_describe(index))
@@ -91,7 +92,7 @@ def gpu_problem() -> str | None:
 
 def _problem(ask: Callable[[], object]) -> str | None:
     try:
-        with _nvml():
+        with nvml_session():
             ask()
     except pynvml.NVMLError as error:
         absent = (pynvml.NVML_ERROR_LIBRARY_NOT_FOUND, pynvml.NVML_ERROR_DRIVER_NOT_LOADED)
@@ -104,7 +105,7 @@ def _problem(ask: Callable[[], object]) -> str | None:
 
 def driver_version() -> str | None:
     """The NVIDIA driver's version, e.g. `580.159.03`; None without a driver."""
-    with suppress(pynvml.NVMLError), _nvml():
+    with suppress(pynvml.NVMLError), nvml_session():
         return str(pynvml.nvmlSystemGetDriverVersion())
     return None
 

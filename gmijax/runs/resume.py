@@ -110,7 +110,14 @@ def file_check(path: Path) -> tuple[int, int]:
 
 
 def find_checkpoint(wanted: str, key: str) -> Path:
-    """The checkpoint that `wanted` names: `last`, a run folder, or a checkpoint folder.
+    """The checkpoint that `wanted` names, see `choose_checkpoint`."""
+    return choose_checkpoint(wanted, key)[0]
+
+
+def choose_checkpoint(wanted: str, key: str) -> tuple[Path, tuple[str, ...]]:
+    """The checkpoint that `wanted` names, and what was passed over for it (see `Found`).
+
+    It names `last`, a run folder, or a checkpoint folder.
 
     `last` is the run below `runs/` with the newest checkpoint; a run folder means its newest one
     that is whole.
@@ -122,13 +129,13 @@ def find_checkpoint(wanted: str, key: str) -> Path:
     if (folder / META).is_file():
         if wrong := what_is_broken(folder):
             raise ConfigError(f"{key}={wanted}: {wrong}")
-        return folder.resolve()
+        return folder.resolve(), ()
     found = newest_checkpoint(folder)
     if found.checkpoint is None:
         raise ConfigError(
             "; ".join((f"{key}={wanted}: no checkpoint in this folder", *found.passed_over))
         )
-    return found.checkpoint
+    return found.checkpoint, found.passed_over
 
 
 def saved_config_of(wanted: str, key: str) -> dict[str, Any]:
