@@ -5,10 +5,12 @@ from __future__ import annotations
 import json
 import os
 import signal
+import socket
 import subprocess
 import sys
 import time
-from contextlib import ExitStack
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
@@ -18,7 +20,6 @@ import numpy as np
 from benchmarks.channel_ranks import ENV_FD, Options
 from gmijax.collectives.channel.build import ChannelTopology, create_channels
 from gmijax.config.channel import ChannelConfig
-from gmijax.machine.processes import reserved_address
 
 DEFAULTS: Options = {
     "count": 1000,  # unrolls of every agent
@@ -133,3 +134,13 @@ class ChannelJob:
                 for trainer in topology.trainers
             },
         )
+
+
+@contextmanager
+def reserved_address() -> Iterator[str]:
+    """`127.0.0.1:port`, which cannot go to somebody else before its server starts."""
+    # Bound without listening, and shared: connections go to who listens.
+    with socket.socket() as holder:
+        holder.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEPORT, 1)
+        holder.bind(("127.0.0.1", 0))
+        yield f"127.0.0.1:{holder.getsockname()[1]}"

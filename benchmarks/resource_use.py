@@ -27,6 +27,7 @@ import pynvml
 from benchmarks.paper_model import dominant_resource
 from benchmarks.run import RESULTS
 from gmijax import compose
+from gmijax.collectives.program import PeersOfOne
 from gmijax.config import PpoConfig, TrainConfig
 from gmijax.learning.learner import Learner, acting_weights, init_learner, make_learner
 from gmijax.learning.unroll import act
@@ -215,7 +216,7 @@ def _act(learner: Learner, state: Any, carry: Any) -> Any:
 def _train(learner: Learner, given: Any, state: Any) -> Any:
     """All updates of an iteration."""
     samples, stats = given
-    return learn(learner, None, state, samples, stats, jnp.zeros((), jnp.int32))[0]
+    return learn(learner, PeersOfOne(), state, samples, stats)[0]
 
 
 def _samples(count: int, spec: EnvSpec, key: jax.Array) -> Samples:

@@ -22,7 +22,7 @@ def mean_of(reducer: Reducer, size: int) -> Callable[[FloatBuffer], FloatBuffer]
     """A function that takes the mean of buffers [size] in a program."""
     import jax
 
-    def step(peers: Peers, _: Any, shared: Array, own: Array) -> tuple[Array, Array, Array]:
+    def step(peers: Peers, _: Any, shared: Array, own: Array) -> tuple[Array, Array, Any]:
         return peers.mean(own), own, ()
 
     program = reducer.program(step)

@@ -22,7 +22,7 @@ class NcclRing:
 
     def __init__(self, nccl: Any, comm: Any) -> None:
         self._nccl, self._comm = nccl, comm
-        self._float, self._sum = int(nccl.DataType.FLOAT32), int(nccl.RedOp.SUM)
+        self._float, self._sum = int(nccl.DataType.Float32), int(nccl.RedOp.Sum)
 
     def gather(self, stream: int, source: int, target: int, num_floats: int) -> None:
         """See `Ring`."""

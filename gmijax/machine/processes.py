@@ -3,16 +3,14 @@
 from __future__ import annotations
 
 import os
-import socket
 import time
-from collections.abc import Iterable, Iterator
-from contextlib import contextmanager, suppress
+from collections.abc import Iterable
+from contextlib import suppress
 from pathlib import Path
 from typing import ClassVar, NamedTuple
 
 _POLL_S = 0.02
 _ENDED = (b"Z", b"X")
-_LOCAL_HOST = "127.0.0.1"
 
 
 class GuardPipe:
@@ -105,20 +103,6 @@ def wait_until_gone(processes: Iterable[ProcessId], timeout_s: float) -> tuple[P
         time.sleep(_POLL_S)
         left = tuple(process for process in left if process.is_running())
     return left
-
-
-@contextmanager
-def reserved_address() -> Iterator[str]:
-    """`127.0.0.1:port`, where one process of this user may listen, and nobody else.
-
-    The port is bound here without listening, and shared (SO_REUSEPORT) with the server of a GMI.
-    So it cannot go to somebody else between the choice and the server's start. Connections go
-    to who listens.
-    """
-    with socket.socket(socket.AF_INET, socket.SOCK_STREAM) as holder:
-        holder.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEPORT, 1)
-        holder.bind((_LOCAL_HOST, 0))
-        yield f"{_LOCAL_HOST}:{holder.getsockname()[1]}"
 
 
 def _parse(stat: bytes) -> tuple[ProcessId, bytes, int]:

@@ -173,10 +173,10 @@ def _inject_in_training(faults: Faults) -> None:
     def nan(leaf: jax.Array) -> jax.Array:
         return leaf * jnp.nan if jnp.issubdtype(leaf.dtype, jnp.floating) else leaf
 
-    def iterate_poisoned(self: ProgramStep, state: Any, env_state: Any) -> Any:
+    def iterate_poisoned(self: ProgramStep, shared: Any, own: Any) -> Any:
         if faults.is_poisoned():
-            env_state = jax.tree.map(nan, env_state)
-        return iterate(self, state, env_state)
+            own = jax.tree.map(nan, own)
+        return iterate(self, shared, own)
 
     _before(HostExchange, "sum", lambda *_: faults.at("mean"))
     _before(TrainingLog, "write", lambda *_: faults.at("report"))

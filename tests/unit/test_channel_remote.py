@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import socket
 import threading
 import time
 from collections.abc import Iterator
@@ -11,8 +10,8 @@ from typing import Any
 
 import pytest
 
+from benchmarks.channel_job import reserved_address
 from gmijax.errors import CollectiveError, ConfigError, PeerLost, PipeClosed
-from gmijax.machine.processes import reserved_address
 
 pytest.importorskip("zmq")
 
