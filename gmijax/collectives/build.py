@@ -13,11 +13,15 @@ from gmijax.collectives.shared_block import LANES
 from gmijax.collectives.strategies import stages
 from gmijax.errors import ConfigError, DeviceMemoryUnavailable
 from gmijax.partition.layout import Layout
-from gmijax.partition.reduction import require_strategy
+from gmijax.partition.reduction import require_strategy, why_no_bindings
 
 if TYPE_CHECKING:
     from gmijax.collectives.device_links import Device
     from gmijax.collectives.program import Exchange
+
+
+GATHERED_FLOATS = 1024
+"""Of each rank; more where P leaves room for them."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -76,7 +80,7 @@ def _built(
     from gmijax.collectives.host_links import HostLinks  # Imports jax.
     from gmijax.collectives.program import Exchange
 
-    layout, num_floats = membership.layout, membership.num_floats
+    layout, num_floats = membership.layout, _room(membership)
     parts = stages(strategy, layout, membership.intra)
     device, links = DEVICE(), None
     try:
@@ -159,11 +163,16 @@ def _lane(strategy: str, membership: Membership, lane: int) -> HostExchange:
         membership.exchange_fd,
         membership.rank,
         membership.layout.num_gmis,
-        membership.num_floats,
+        _room(membership),
         timeout_s=membership.timeout_s,
         rendezvous_timeout_s=membership.rendezvous_timeout_s,
         lane=lane,
     )
+
+
+def _room(membership: Membership) -> int:
+    """Length of the largest buffer whose sum is taken; what is gathered is one of all ranks."""
+    return max(membership.num_floats, GATHERED_FLOATS * membership.layout.num_gmis)
 
 
 def _device() -> Device | None:
@@ -172,6 +181,8 @@ def _device() -> Device | None:
 
     if jax.local_devices()[0].platform != "gpu":
         return None
+    if reason := why_no_bindings():
+        raise ConfigError(f"GMIs that train together on GPUs: {reason}")
     from gmijax.collectives.cuda import CUDA
 
     return CUDA

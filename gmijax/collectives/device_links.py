@@ -9,7 +9,7 @@ from __future__ import annotations
 import zlib
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from typing import TYPE_CHECKING, NamedTuple, Protocol, TypeVar
+from typing import NamedTuple, Protocol, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -20,14 +20,12 @@ from gmijax.collectives.device_memory import DeviceQueue, NewMemory
 from gmijax.collectives.host import HostExchange
 from gmijax.collectives.host_links import HostLinks
 from gmijax.collectives.lockstep import LockstepRunner
+from gmijax.collectives.program import Exchange, ProgramPeers
 from gmijax.collectives.shared_slots import SharedSlots, agreed
 from gmijax.collectives.strategies import Groups, Stage
 from gmijax.collectives.waits import Fence
 from gmijax.partition.layout import Layout
 from gmijax.partition.reduction import leaders
-
-if TYPE_CHECKING:
-    from gmijax.collectives.program import Exchange
 
 T = TypeVar("T")
 
@@ -193,7 +191,7 @@ class DeviceLinks(HostLinks):
     def run(self, program: Callable[[], T], *, is_last: bool) -> T:
         """See `Links`."""
         run = self._runner.settle if is_last else self._runner.step
-        return self._explained(lambda: run(program))
+        return run(lambda: self._explained(program))
 
     def exchange_s(self) -> float:
         """See `Links`: each from the time that this rank's numbers were there."""
@@ -234,8 +232,9 @@ class DeviceLinks(HostLinks):
         rank, world_size = self._control.rank, self._control.world_size
 
         def trial(values: jax.Array) -> tuple[jax.Array, jax.Array]:
-            gathered = exchange.gather(values[:1], place=1)
-            return gathered[:, 0], exchange.mean(values, place=2, after=gathered)
+            peers = ProgramPeers(exchange, jnp.asarray(rank))
+            gathered = peers.gather(values[:1])[:, 0]
+            return gathered, peers.mean(values, after=gathered)
 
         try:
             gathered, mean = jax.jit(trial)(jnp.full(self.room, rank + 1, jnp.float32))

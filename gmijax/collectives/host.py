@@ -116,7 +116,7 @@ class HostExchange:
             row[:] = slots[member]
         self.barrier.end()
 
-    def all_gather(self, values: FloatBuffer, place: int = 0) -> FloatBuffer:
+    def all_gather(self, values: FloatBuffer) -> FloatBuffer:
         """Returns [K, M]: `values` [M] float32 of every rank, M <= `MAX_GATHER_FLOATS`."""
         if values.dtype != np.float32 or values.ndim != 1 or values.size > MAX_GATHER_FLOATS:
             raise CollectiveError(
@@ -124,7 +124,7 @@ class HostExchange:
                 f"most {MAX_GATHER_FLOATS} float32"
             )
         block = self._open_block("all_gather")
-        self.barrier.begin("all_gather", values.size, place)
+        self.barrier.begin("all_gather", values.size)
         region = block.gathered[self.barrier.step % 2]
         region[self.rank, : values.size] = values
         self._meet()

@@ -12,7 +12,6 @@ import numpy as np
 
 from gmijax.collectives.host import HostExchange
 from gmijax.collectives.interface import FloatBuffer
-from gmijax.collectives.shared_block import MAX_GATHER_FLOATS
 from gmijax.collectives.strategies import Stage
 from gmijax.errors import GmijaxError
 
@@ -33,21 +32,13 @@ class HostLinks:
     """
 
     def __init__(self, host: HostExchange, num_floats: int) -> None:
-        self.room, self.gather_room = num_floats, MAX_GATHER_FLOATS
+        self.room = num_floats
         self._host = host
         self._failure: GmijaxError | None = None
         self._exchange_s = 0.0
 
     def start(self, exchange: Exchange) -> None:
         """Does nothing: there is nothing to agree on."""
-
-    def gather(self, stream: int, place: int, source: int, target: int, num_floats: int) -> None:
-        """See `Links`."""
-
-        def gather(values: FloatBuffer, result: FloatBuffer) -> None:
-            result[:] = self._host.all_gather(values, place).ravel()
-
-        self._exchange(gather, stream, source, num_floats, target, self._host.world_size)
 
     def reduce(
         self, stage: Stage, stream: int, place: int, source: int, target: int, num_floats: int

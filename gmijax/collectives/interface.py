@@ -30,6 +30,8 @@ class Peers(Protocol):
     def gather(self, tree: T, after: Any = None) -> T:
         """`tree` of every trainer, float32; leaves [...] become [K, ...], in order of rank.
 
+        For at most P / K numbers, or 1024.
+
         Args:
           tree: of this trainer.
           after: what has to be computed before.

@@ -36,19 +36,13 @@ class Links(Protocol):
     a CPU), which exchange of its program it is, and the addresses of [n] float32 and the result.
 
     Attributes:
-      room: P, length of the largest buffer whose mean is taken.
-      gather_room: the same for what is gathered.
+      room: length of the largest buffer whose sum is taken.
     """
 
     room: int
-    gather_room: int
 
     def start(self, exchange: Exchange) -> None:
         """Tries them, together with all other ranks; raises DeviceMemoryUnavailable on all."""
-        ...
-
-    def gather(self, stream: int, place: int, source: int, target: int, num_floats: int) -> None:
-        """`target` [K, n] becomes what all ranks have, in order of rank."""
         ...
 
     def reduce(
@@ -92,14 +86,10 @@ class Exchange:
         self._name = f"gmijax_exchange_{next(_serial)}"
         register(self._name, self._call)
 
-    def gather(self, values: jax.Array, place: int, after: jax.Array | None = None) -> jax.Array:
-        """[K, n]: `values` [n] float32 of every rank; in a program, where it is number `place`."""
-        return self._traced(values, (self.world_size, values.size), 0, place, after)
-
-    def mean(self, buffer: jax.Array, place: int, after: jax.Array | None = None) -> jax.Array:
-        """The mean over ranks of `buffer` [n] float32, n <= P; in a program."""
+    def sum(self, buffer: jax.Array, place: int, after: jax.Array | None = None) -> jax.Array:
+        """The sum over ranks of `buffer` [n] float32; in a program, where it is number `place`."""
         total = buffer
-        for number, stage in enumerate(self._stages, 1):
+        for number, stage in enumerate(self._stages):
             if stage.kind == "gather":
                 # The largest group's size: the program must be the same on all ranks.
                 most = max(len(group) for group in stage.groups)
@@ -107,7 +97,7 @@ class Exchange:
                 total = ordered_sum(rows, 1.0)
             else:
                 total = self._traced(total, buffer.shape, number, place, after)
-        return total * np.float32(1.0 / self.world_size)
+        return total
 
     def program(self, step: Step, *, donates_own: bool = True) -> ProgramStep:
         """See `Reducer`."""
@@ -130,14 +120,12 @@ class Exchange:
     ) -> jax.Array:
         if self._links is None:
             raise CollectiveError(f"rank {self.rank}: exchange after close")
-        room = self._links.room if number else self._links.gather_room
         if values.dtype != jnp.float32:
             raise CollectiveError(f"rank {self.rank}: exchanges float32, not {values.dtype}")
-        if values.size > room:
+        if values.size > (room := self._links.room):
             raise CollectiveError(f"rank {self.rank}: {values.size} floats, room is for {room}")
         result = jax.ShapeDtypeStruct(shape, jnp.float32)
         call: Any = jax.ffi.ffi_call(self._name, result, has_side_effect=True)
-        # What has to come before is an argument that is not looked at.
         arguments = (values,) if after is None else (values, after)
         return call(*arguments, number=np.int64(number), place=np.int64(place))
 
@@ -148,10 +136,7 @@ class Exchange:
             raise RuntimeError("the exchange is closed")
         (values, *_), (result,), (number, place) = arguments, results, attributes
         where = (stream, place, values.address, result.address, values.shape[0])
-        if number == 0:
-            self._links.gather(*where)
-        else:
-            self._links.reduce(self._stages[number - 1], *where)
+        self._links.reduce(self._stages[number], *where)
 
 
 class ProgramPeers:
@@ -174,16 +159,20 @@ class ProgramPeers:
     def gather(self, tree: T, after: Any = None) -> T:
         """See `Peers`."""
         packed, unpack = ravel_pytree(tree)  # One message, not one for each leaf.
-        return jax.vmap(unpack)(self._exchange.gather(packed, next(self._places), _leaf(after)))
+        # A sum of which each rank gives one row is exact in any order.
+        is_own = jnp.arange(self._exchange.world_size)[:, None] == self._rank
+        rows = self._sum(jnp.where(is_own, packed, 0.0).ravel(), after)
+        return jax.vmap(unpack)(rows.reshape(-1, packed.size))
 
     def mean(self, tree: T, after: Any = None) -> T:
         """See `Peers`."""
         packed, unpack = ravel_pytree(tree)
-        return unpack(self._exchange.mean(packed, next(self._places), _leaf(after)))
+        return unpack(self._sum(packed, after) * np.float32(1.0 / self._exchange.world_size))
 
-
-def _leaf(tree: Any) -> Any:
-    return next(iter(jax.tree.leaves(tree)), None)
+    def _sum(self, buffer: jax.Array, after: Any) -> jax.Array:
+        # What has to come before is an argument that is not looked at; one leaf of it does.
+        before = next(iter(jax.tree.leaves(after)), None)
+        return self._exchange.sum(buffer, next(self._places), before)
 
 
 class PeersOfOne:

@@ -30,13 +30,9 @@ from gmijax.partition.templates import DESCRIPTIONS, TRAINER, Group, group_of, r
 _CLIENTS_OF_OLD_DRIVERS, _CLIENTS_OF_NEW_DRIVERS, _NEW_DRIVER = 48, 60, 590
 _SLICES_OF_A_GPU = 7
 
-_NO_RINGS = {
-    "cpu": (
-        "between virtual GPUs host memory is faster than any ring, ask for it with "
-        "reduce.strategy={}"
-    ),
-    "mig": "rings between MIG instances are not supported",
-}
+_NO_RINGS_ON_CPU = (
+    "between virtual GPUs host memory is faster than any ring, ask for it with reduce.strategy={}"
+)
 """Backends that take host memory where Algorithm 1 says rings, and why."""
 
 
@@ -219,18 +215,14 @@ def _strategy(
     if reduce.strategy != "auto":
         return reduce.strategy
     choice = select_strategy(layout)
-    if backend in _NO_RINGS and needs_ring(choice.strategy, layout):
-        reasons.append(
-            f"strategy mpr: Algorithm 1 says {choice.strategy} ({choice.why}); "
-            f"{_NO_RINGS[backend].format(choice.strategy)}"
-        )
-        return "mpr"
-    # With one GMI on each GPU the ring is part of the program that trains.
-    wants_one_shot = (
-        reduce.selection == "device" and reduce.intra != "host" and not is_one_per_gpu(layout)
-    )
-    lacking = why_not_under("one_shot", layout, backend)
-    if wants_one_shot and lacking is None:
+    no_ring = why_not_under(choice.strategy, layout, backend)
+    if backend == "cpu" and needs_ring(choice.strategy, layout):
+        no_ring = _NO_RINGS_ON_CPU.format(choice.strategy)
+    no_one_shot = why_not_under("one_shot", layout, backend)
+    # With one GMI on each GPU one ring over all is as fast.
+    wants_one_shot = no_ring is not None or not is_one_per_gpu(layout)
+    wants_one_shot &= reduce.selection == "device" and reduce.intra != "host"
+    if wants_one_shot and no_one_shot is None:
         reasons.append(
             "strategy one_shot: GMIs that share GPUs train faster with exchanges on them; "
             f"Algorithm 1 says {choice.strategy} ({choice.why}), as reduce.selection=paper does"
@@ -239,7 +231,12 @@ def _strategy(
     slow = ""
     # Under other backends there is no memory of a GPU to share, whatever is installed.
     if wants_one_shot and backend in ("mps", "share"):
-        slow = f"; one_shot would train faster: {lacking}"
+        slow = f"; one_shot would train faster: {no_one_shot}"
+    if no_ring is not None:
+        reasons.append(
+            f"strategy mpr: Algorithm 1 says {choice.strategy} ({choice.why}); {no_ring}{slow}"
+        )
+        return "mpr"
     reasons.append(f"strategy {choice.strategy}: {choice.why} (Algorithm 1){slow}")
     return choice.strategy
 

@@ -20,6 +20,8 @@ _BINDINGS = "cuda-bindings"
 LEAST_BINDINGS = (12, 9, 1)
 """Of CUDA 12; earlier ones hold the GIL in calls that wait in CUDA."""
 
+_INSTALL = "(pip install 'gmijax[cuda13]', with a driver before 580 'gmijax[cuda12]')"
+
 
 class Choice(NamedTuple):
     """A strategy and why it was chosen, in words."""
@@ -69,12 +71,7 @@ def why_not_intra(intra: str, backend: str) -> str | None:
         )
     if backend == "mig":
         return "there is no CUDA IPC between the instances of a GPU in MIG mode"
-    if not _is_installed("cuda", "cuda.bindings"):
-        return (
-            "CUDA IPC needs the package cuda-bindings "
-            "(pip install 'gmijax[cuda13]', with a driver before 580 'gmijax[cuda12]')"
-        )
-    return _why_too_old(versions_of([_BINDINGS])[_BINDINGS])
+    return why_no_bindings()
 
 
 def require_strategy(strategy: str, layout: Layout, backend: str | None = None) -> None:
@@ -92,16 +89,27 @@ def why_not_under(strategy: str, layout: Layout, backend: str) -> str | None:
     """None if `backend` gives `strategy` what it needs on `layout`, else the reason in words."""
     if strategy == "one_shot":
         return why_not_intra("ipc", backend)
-    if backend == "mig" and needs_ring(strategy, layout):
+    if backend == "cpu" or not needs_ring(strategy, layout):
+        return None
+    if backend == "mig":
         return (
             "rings between MIG instances are not supported, because NCCL takes one of each GPU; "
             "with plan.backend=mig allowed are auto, mpr"
         )
+    if not _is_installed("nccl", "nccl.bindings"):
+        return f"rings between GPUs need the package nccl4py {_INSTALL}"
     return None
 
 
+def why_no_bindings() -> str | None:
+    """None if a program can hand numbers to other processes from a GPU, else the reason."""
+    if not _is_installed("cuda", "cuda.bindings"):
+        return f"exchanges between GMIs on GPUs need the package cuda-bindings {_INSTALL}"
+    return _why_too_old(versions_of([_BINDINGS])[_BINDINGS])
+
+
 def needs_ring(strategy: str, layout: Layout) -> bool:
-    """Whether GMIs form rings: they must all be started before any of them can use jax."""
+    """Whether GMIs form rings between GPUs."""
     return STRATEGIES[strategy].has_ring(layout)
 
 
@@ -142,8 +150,9 @@ def _why_too_old(installed: str | None) -> str | None:
         return None
     least = ".".join(map(str, LEAST_BINDINGS))
     return (
-        f"CUDA IPC needs cuda-bindings {least} or newer, and {installed} is installed "
-        f"(pip install 'cuda-bindings>={least},<13' with CUDA 12, 'cuda-bindings>=13' with 13)"
+        f"exchanges between GMIs on GPUs need cuda-bindings {least} or newer, and {installed} is "
+        f"installed (pip install 'cuda-bindings>={least},<13' with CUDA 12, "
+        "'cuda-bindings>=13' with 13)"
     )
 
 

@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Final
 
 from gmijax.partition.plan import Plan, Slice
-from gmijax.partition.reduction import needs_ring
 from gmijax.supervise.child import ENV_CPUS, ENV_GMI, ENV_WAITS
 
 # The old and the new name of one JAX setting; JAX refuses to start when both are set.
@@ -63,7 +62,7 @@ def gmi_environment(
     added = dict(backend_environment)
     flags = extend_xla_flags(environment.get(_XLA_FLAGS, ""), added.pop(_XLA_FLAGS, ""))
     environment.pop(ENV_WAITS, None)  # Of the job that this one may be started from.
-    if plan.backend != "cpu" and needs_ring(plan.strategy, plan.training_layout):
+    if plan.backend != "cpu":
         # All GMIs are on this host, and NCCL's sockets are open to whoever reaches them.
         environment.setdefault(_NCCL_INTERFACE, "lo")
     if flags:

@@ -112,11 +112,12 @@ def test_gmis_that_share_a_gpu_exchange_on_it_where_they_can(
 ):
     monkeypatch.setattr(reduction, "_is_installed", lambda *_: is_installed)
     by_paper = planned(machine(2), {"selection": "paper"}, backend="share", **changes).strategy
+    assert is_installed or by_paper == "mpr"
     plan = planned(machine(2), {"selection": selection}, backend="share", **changes)
     assert plan.strategy == (strategy if is_installed else by_paper)
     (reason,) = [text for text in plan.reasons if text.startswith("strategy")]
-    takes_it = is_installed and strategy == "one_shot"
-    assert (f"Algorithm 1 says {by_paper} (" if takes_it else "(Algorithm 1)") in reason
+    assert ("one_shot: GMIs that share" in reason) == (is_installed and strategy == "one_shot")
+    assert "Algorithm 1" in reason
     assert plan.intra == ("ipc" if is_installed else "host")
 
 
@@ -127,7 +128,7 @@ def test_gmis_that_share_a_gpu_exchange_on_it_where_they_can(
         ({}, {"gmis_per_gpu": 2, "gpus": 2}, "share", True),
         ({"selection": "paper"}, {"gmis_per_gpu": 2}, "share", False),
         ({"intra": "host"}, {"gmis_per_gpu": 2}, "share", False),
-        ({}, {"gpus": 2}, "share", False),  # One program trains on all GPUs.
+        ({}, {"gpus": 2}, "share", True),  # There are no rings either.
         ({}, {"gmis_per_gpu": 2}, "cpu", False),
     ],
 )
@@ -141,7 +142,7 @@ def test_a_plan_that_leaves_the_fast_path_says_what_would_bring_it(
     monkeypatch.setattr(reduction, "_is_installed", lambda *_: False)
     plan = planned(machine(2), {"selection": "device"} | reduce, backend=backend, **changes)
     (reason,) = [text for text in plan.reasons if text.startswith("strategy")]
-    lacking = "one_shot would train faster: CUDA IPC needs the package cuda-bindings (pip install"
+    lacking = "one_shot would train faster: exchanges between GMIs on GPUs need the package cuda-b"
     assert (lacking in reason) == is_told
 
 

@@ -24,6 +24,7 @@ DISTRIBUTIONS = {
     "imageio_ffmpeg": "imageio-ffmpeg",
     "mujoco.mjx": "mujoco-mjx",
     "mujoco_playground": "playground",
+    "nccl": "nccl4py",
     "orbax": "orbax-checkpoint",
     "pynvml": "nvidia-ml-py",
     "zmq": "pyzmq",
