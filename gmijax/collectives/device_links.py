@@ -55,10 +55,11 @@ class Order:
         self._count = self._checksum = 0
         self._words[rank] = 0
 
-    def come_to(self, place: int) -> int | None:
+    def come_to(self, place: int, num_floats: int) -> int | None:
         """Comes to the next exchange; a rank that has come to another one instead, if any."""
         self._count += 1
-        self._checksum = zlib.crc32(place.to_bytes(8, "little"), self._checksum)
+        which = place.to_bytes(8, "little") + num_floats.to_bytes(8, "little")
+        self._checksum = zlib.crc32(which, self._checksum)
         own = (self._count & 0xFFFFFFFF) << 32 | self._checksum
         self._words[self._rank] = own
         self._fence()  # Of two that come at the same time one sees the other.
@@ -173,13 +174,13 @@ class DeviceLinks(HostLinks):
         """See `Links`."""
         most = max(len(group) for group in stage.groups)
         if stage.link == "slots" and self._slots is not None:
-            with self._exchanging(stream, place) as queue:
+            with self._exchanging(stream, place, num_floats) as queue:
                 if stage.kind == "gather":
                     self._slots.gather(queue, stream, source, target, num_floats, rows=most)
                 else:
                     self._slots.broadcast(queue, stream, source, target, num_floats)
         elif stage.link == "ring" and stage.groups in self._rings:
-            with self._exchanging(stream, place) as queue:
+            with self._exchanging(stream, place, num_floats) as queue:
                 ring = self._rings[stage.groups]
                 if ring is None:
                     queue.copy(stream, target, source, 4 * num_floats)
@@ -209,14 +210,15 @@ class DeviceLinks(HostLinks):
         self._queue, self._order, self._slots, self._rings = None, None, None, {}
 
     @contextmanager
-    def _exchanging(self, stream: int, place: int) -> Iterator[DeviceQueue]:
+    def _exchanging(self, stream: int, place: int, num_floats: int) -> Iterator[DeviceQueue]:
         """Counts the time, and makes sure that other ranks come to the same exchange."""
         if self._queue is None or self._order is None:
             raise RuntimeError("the exchange is closed")
-        if (peer := self._order.come_to(place)) is not None:
+        if (peer := self._order.come_to(place, num_floats)) is not None:
             raise RuntimeError(
                 f"rank {self._control.rank} and rank {peer} have come to their exchanges in "
-                f"different orders; here it is number {place} of its program"
+                f"different orders; here it is number {place} of its program, with {num_floats} "
+                "floats"
             )
         self._queue.start_clock(stream)
         yield self._queue

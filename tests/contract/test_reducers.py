@@ -104,5 +104,7 @@ def test_exchanges_in_different_orders_fail_and_do_not_mix(tmp_path: Path) -> No
     options = {"strategy": "one_shot", "intra": "ipc", "num_floats": 64, "timeout_s": 5.0}
     with Ranks(tmp_path, 2, "step_in_different_orders", **options).start() as job:
         results = job.results()
-    # One waits in the memory of the host, and one in that of the device.
-    assert {result["error"] for result in results} <= {"CollectiveTimeout", "PeerLost"}
+    # Who comes second sees it, and is gone when the other one looks.
+    errors = {result["error"] for result in results}
+    assert errors <= {"CollectiveError", "CollectiveTimeout", "PeerLost"}
+    assert any("in different orders" in result["message"] for result in results)

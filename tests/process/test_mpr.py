@@ -46,21 +46,21 @@ def test_a_rank_that_has_closed_is_lost_to_those_who_still_call(tmp_path: Path) 
 
 
 def test_ranks_with_different_lengths_name_both(tmp_path: Path) -> None:
-    with Ranks(tmp_path, 2, "call_once").start(0, num_floats=100) as job:
+    with Ranks(tmp_path, 2, "call_once").start(0, num_floats=5000) as job:
         job.start(1, num_floats=200_000)
         messages = [result["message"] for result in job.results()]
     assert messages == [
-        "rank 0 and rank 1 do not fit together: num_floats is 100 for rank 0, "
+        "rank 0 and rank 1 do not fit together: num_floats is 5000 for rank 0, "
         "and 200000 for rank 1",
         "rank 1 and rank 0 do not fit together: num_floats is 200000 for rank 1, "
-        "and 100 for rank 0",
+        "and 5000 for rank 0",
     ]
 
 
 def test_ranks_that_come_to_different_exchanges_name_both(tmp_path: Path) -> None:
     with Ranks(tmp_path, 2, "step_in_different_orders", num_floats=64).start() as job:
         messages = [result["message"] for result in job.results()]
-    mean, gather = "sum of 64 floats", "all_gather of 64 floats"
+    mean, gather = "sum of 64 floats", "sum of 128 floats"
     assert messages[0].startswith(f"step 1: rank 0 calls {mean}")
     assert f"rank 1 calls {gather}" in messages[0]
     assert messages[1].startswith(f"step 1: rank 1 calls {gather}")
@@ -82,23 +82,23 @@ def test_one_rank_number_is_given_once(tmp_path: Path) -> None:
 def test_a_buffer_written_by_another_process_is_read_by_the_documented_format(
     tmp_path: Path,
 ) -> None:
-    with Ranks(tmp_path, 2, "call_once", num_floats=20, stay_s=20.0).start() as job:
+    with Ranks(tmp_path, 2, "call_once", num_floats=3000, stay_s=20.0).start() as job:
         job.wait_for("called")
         raw = mmap.mmap(job.fd, os.fstat(job.fd).st_size, prot=mmap.PROT_READ)
         line = 3 * 64  # The second rank's in the lane of programs.
         head = struct.unpack_from("=4sHHHHIQQ", raw, line)
         (sequence,) = struct.unpack_from("=Q", raw, line + 56)
-        at = Geometry.of(2, 20)
+        at = Geometry.of(2, 3000)
         own, first = (
-            np.frombuffer(raw, np.float32, 20, at.slots + row * at.row_floats * 4).tolist()
+            np.frombuffer(raw, np.float32, 3000, at.slots + row * at.row_floats * 4).tolist()
             for row in (3, 2)  # Of the second slots, since this is the first call.
         )
     magic, version, world_size, rank, blamed, _, num_floats, pid = head
     assert (magic, version, world_size, rank, blamed) == (b"GMIX", 4, 2, 1, 0)
-    assert (num_floats, pid) == (20, job.processes[1].pid)
+    assert (num_floats, pid) == (3000, job.processes[1].pid)
     assert sequence == 3  # attached, then the two meetings of one sum
-    assert own == [2.0] * 20
-    assert first == [3.0] * 20
+    assert own == [2.0] * 3000
+    assert first == [3.0] * 3000
 
 
 def test_a_rank_sees_whether_the_process_of_another_one_lives(tmp_path: Path) -> None:
