@@ -183,9 +183,12 @@ def _device() -> Device | None:
         return None
     if reason := why_no_bindings():
         raise ConfigError(f"GMIs that train together on GPUs: {reason}")
-    from gmijax.collectives.cuda import CUDA
+    from gmijax.collectives.cuda_memory import CudaMemory
+    from gmijax.collectives.cuda_queue import CudaQueue
+    from gmijax.collectives.device_links import Device
+    from gmijax.collectives.nccl_ring import nccl_ring
 
-    return CUDA
+    return Device(CudaMemory, CudaQueue, nccl_ring)
 
 
 DEVICE: Callable[[], Device | None] = _device

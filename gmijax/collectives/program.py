@@ -8,6 +8,7 @@ the compilation cache.
 
 from __future__ import annotations
 
+import functools
 import itertools
 from collections.abc import Callable, Sequence
 from typing import Any, Protocol, TypeVar
@@ -19,7 +20,6 @@ from jax.flatten_util import ravel_pytree
 
 from gmijax.collectives.interface import Step
 from gmijax.collectives.strategies import Stage
-from gmijax.collectives.sums import ordered_sum
 from gmijax.collectives.xla_call import Buffer, register
 from gmijax.devices import host_sharding
 from gmijax.errors import CollectiveError
@@ -94,7 +94,8 @@ class Exchange:
                 # The largest group's size: the program must be the same on all ranks.
                 most = max(len(group) for group in stage.groups)
                 rows = self._traced(total, (most, buffer.size), number, place, after)
-                total = ordered_sum(rows, 1.0)
+                # Written out, so that it is one pass in the order of ranks, the same on all.
+                total = functools.reduce(jnp.add, list(rows))
             else:
                 total = self._traced(total, buffer.shape, number, place, after)
         return total
