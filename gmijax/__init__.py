@@ -20,12 +20,14 @@ if TYPE_CHECKING:
     from gmijax.roles.manager import GMIManager, plan
     from gmijax.roles.role import Role
     from gmijax.sim.registry import make_env, task_names
+    from gmijax.sweeps.sweep import SweepResult, sweep
 
 __all__ = [
     "GMIManager",
     "Result",
     "Role",
     "Served",
+    "SweepResult",
     "__version__",
     "compose",
     "launch",
@@ -33,6 +35,7 @@ __all__ = [
     "plan",
     "search",
     "serve",
+    "sweep",
     "task_names",
     "train",
 ]
@@ -42,12 +45,14 @@ _HOMES = {
     "Result": "gmijax.control.job",
     "Role": "gmijax.roles.role",
     "Served": "gmijax.control.serving",
+    "SweepResult": "gmijax.sweeps.sweep",
     "compose": "gmijax.cli.compose",
     "launch": "gmijax.roles.launch",
     "make_env": "gmijax.sim.registry",
     "plan": "gmijax.roles.manager",
     "search": "gmijax.control.searching",
     "serve": "gmijax.control.serving",
+    "sweep": "gmijax.sweeps.sweep",
     "task_names": "gmijax.sim.registry",
     "train": "gmijax.control.job",
 }

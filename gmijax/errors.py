@@ -13,6 +13,7 @@ GmijaxError
 ├── ParameterMismatch        GMIs that must hold equal parameters do not
 ├── SelfCheckFailed          matrix products are wrong on the share of a GMI
 ├── NonFiniteError           a loss, gradient or simulation became NaN or infinite
+├── SweepFailed              jobs of a sweep failed; the others have run
 └── JobInterrupted           the user asked the job to stop; commands exit with code 130
 """
 
@@ -154,6 +155,10 @@ class SelfCheckFailed(GmijaxError):
 
 class NonFiniteError(GmijaxError):
     """A loss, gradient or simulation became NaN or infinite; the message says where."""
+
+
+class SweepFailed(GmijaxError):
+    """Jobs of a sweep failed, and all others have run; the message names the first one."""
 
 
 class JobInterrupted(GmijaxError):

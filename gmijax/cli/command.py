@@ -1,7 +1,4 @@
-"""Runs a command: its configuration, `--help`, `--cfg job`, exit codes.
-
-Exit codes: 0 success, 2 bad input (one line), 130 interrupted, 1 anything else.
-"""
+"""Runs a command: its configuration, `--help`, `--cfg job`."""
 
 from __future__ import annotations
 
@@ -9,45 +6,54 @@ import re
 import sys
 from collections.abc import Callable, Sequence
 from functools import partial
-from typing import Final, TypeVar
+from typing import TypeVar
 
 from omegaconf import OmegaConf
 
 from gmijax.cli.compose import build, choices, defaults
+from gmijax.cli.grid import SweepHelp, build_sweep
 from gmijax.cli.help import print_help
 from gmijax.config.schema import to_dict
-from gmijax.errors import ConfigError, GmijaxError, JobInterrupted
+from gmijax.control.exit_codes import exit_code_of
+from gmijax.errors import ConfigError
+from gmijax.sweeps.sweep import run_jobs
 
 C = TypeVar("C")
 
-EXIT_OK: Final = 0
-EXIT_FAILED: Final = 1
-EXIT_BAD_INPUT: Final = 2
-EXIT_INTERRUPTED: Final = 130
-
 
 def command(name: str, cls: type[C], run: Callable[..., object], argv: Sequence[str]) -> int:
-    """Runs one of the commands and turns every error into its exit code."""
-    try:
+    """Runs one of the commands; returns its exit code."""
+
+    def whole() -> None:
         if "--help" in argv or "-h" in argv:
             print_help(name, cls, partial(defaults, name), choices)
-            return EXIT_OK
+            return
         overrides, show = _split_options(argv)
         config = build(name, cls, overrides)
         if show:
             sys.stdout.write(OmegaConf.to_yaml(OmegaConf.create(to_dict(config))))
-            return EXIT_OK
-        run(config, show=True)
-        return EXIT_OK
-    except ConfigError as error:
-        _complain(name, error)
-        return EXIT_BAD_INPUT
-    except (JobInterrupted, KeyboardInterrupt) as error:
-        _complain(name, error if str(error) else "interrupted")
-        return EXIT_INTERRUPTED
-    except GmijaxError as error:
-        _complain(name, error)
-        return EXIT_FAILED
+        else:
+            run(config, show=True)
+
+    return exit_code_of(name, whole)
+
+
+def sweep_command(argv: Sequence[str]) -> int:
+    """Runs `gmijax.sweep`, or `gmijax.train -m`; returns its exit code."""
+
+    def whole() -> None:
+        if "--help" in argv or "-h" in argv:
+            print_help("sweep", SweepHelp, partial(defaults, "sweep"), choices)
+            return
+        overrides, show = _split_options(argv)
+        settings, jobs = build_sweep(overrides)
+        if show:
+            shown = {"sweep": to_dict(settings), "jobs": [dict(job.overrides) for job in jobs]}
+            sys.stdout.write(OmegaConf.to_yaml(OmegaConf.create(shown)))
+        else:
+            run_jobs(settings, jobs, show=True)
+
+    return exit_code_of("sweep", whole)
 
 
 def _split_options(argv: Sequence[str]) -> tuple[list[str], bool]:
@@ -63,11 +69,3 @@ def _split_options(argv: Sequence[str]) -> tuple[list[str], bool]:
         if text.startswith("-"):
             raise ConfigError(f"unknown option {text}: allowed are --help, --cfg job, key=value")
     return arguments, show
-
-
-def _complain(name: str, what: object) -> None:
-    notes = getattr(what, "__notes__", [])
-    text = "; ".join([str(what), *notes])
-    # One line, whatever is in the values that it shows.
-    shown = "".join(c if c.isprintable() else ascii(c)[1:-1] for c in text)
-    sys.stderr.write(f"gmijax.{name}: {shown}\n")

@@ -19,7 +19,7 @@ from omegaconf.errors import OmegaConfBaseException
 
 import gmijax
 from gmijax.config import ServeConfig, TrainConfig
-from gmijax.config.schema import from_dict, suggestion
+from gmijax.config.schema import flatten, from_dict, suggestion
 from gmijax.errors import ConfigError
 from gmijax.runs.resume import saved_config_of
 from gmijax.sim.registry import SUITES
@@ -90,18 +90,18 @@ def choices(group: str) -> list[str]:
 
 def build(name: str, cls: type[C], overrides: Sequence[str]) -> C:
     """The configuration of a command; raises as `compose`."""
-    overrides = [part for text in overrides for part in _with_custom_task(name, text)]
-    data = _compose_dict(name, [*_algorithm_of_resumed(name, overrides), *overrides])
+    overrides = [part for text in overrides for part in with_custom_task(name, text)]
+    data = compose_dict(name, [*_algorithm_of_resumed(name, overrides), *overrides])
     if cls is ServeConfig:
-        _check_task_key(_parse(overrides))
+        _check_task_key(parse(overrides))
         data = _with_task_of_run(data, overrides)
     if cls is TrainConfig:
-        _check_task_key(_parse(overrides))
+        _check_task_key(parse(overrides))
         # With `auto` the command that started the run is given again, whole.
         resume = data["run"].get("resume") if isinstance(data["run"], dict) else None
         if resume not in (None, "auto"):
             data = _on_top_of_saved(data, overrides, str(resume))
-    for key, value in _flatten(data).items():  # What the environment has may be anything.
+    for key, value in flatten(data).items():  # What the environment has may be anything.
         if isinstance(value, str):
             _require_text(f"{key}={value}")
     return from_dict(cls, data)
@@ -111,7 +111,7 @@ def _algorithm_of_resumed(name: str, overrides: Sequence[str]) -> list[str]:
     """`algo=` of the run that `overrides` resume: its algorithm decides which keys there are."""
     if name != "train":
         return []
-    given = {item.key_or_group: str(item.value()) for item in _parse(overrides)}
+    given = {item.key_or_group: str(item.value()) for item in parse(overrides)}
     resume = given.get("run.resume", "null")
     if "algo" in given or resume in ("null", "None", "", "auto"):
         return []
@@ -119,8 +119,9 @@ def _algorithm_of_resumed(name: str, overrides: Sequence[str]) -> list[str]:
     return [f"algo={algo}"]
 
 
-def _compose_dict(name: str, overrides: Sequence[str]) -> dict[str, Any]:
-    for item in _parse(overrides):
+def compose_dict(name: str, overrides: Sequence[str]) -> dict[str, Any]:
+    """The plain data of a command's configuration; raises ConfigError."""
+    for item in parse(overrides):
         _check_override(name, item)
     try:
         with initialize_config_dir(str(config_dir()), version_base=None):
@@ -148,7 +149,7 @@ def _check_override(name: str, item: Override) -> None:
         raise ConfigError(f"{key}={item.value()}: unknown{close}")
 
 
-def _with_custom_task(name: str, override: str) -> tuple[str, ...]:
+def with_custom_task(name: str, override: str) -> tuple[str, ...]:
     """`env=path/to/file.py:make` in words that hydra knows; anything else as it is."""
     key, _, value = override.partition("=")
     if key != "env" or not re.search(r"\.py(:|$)", value):
@@ -174,7 +175,8 @@ def _unknown_key(key: str, known: Iterable[str]) -> ConfigError:
     return ConfigError(f"unknown key {key}{suggestion(key, known)}")
 
 
-def _parse(overrides: Sequence[str]) -> list[Override]:
+def parse(overrides: Sequence[str]) -> list[Override]:
+    """Overrides by Hydra's grammar; raises ConfigError."""
     parser = OverridesParser.create()
     return [_parsed(parser, text) for text in overrides]
 
@@ -208,12 +210,12 @@ def _on_top_of_saved(
     """
     saved = saved_config_of(resume, "run.resume")
     saved["run"].update(dir=None, name=None)
-    items = _parse(overrides)
+    items = parse(overrides)
     suite = saved["env"].get("suite", "gmijax")
     task = saved["env"].get("name") if suite == "gmijax" else suite
     if task in choices("env") and all(item.key_or_group != "env" for item in items):
         algo = _algorithm_of_resumed("train", overrides)
-        data = _compose_dict("train", [f"env={task}", *algo, *overrides])
+        data = compose_dict("train", [f"env={task}", *algo, *overrides])
     merged = _merged(data, saved)
     if "randomization" in saved["env"]:  # A leaf that the run left out stays out.
         merged["env"]["randomization"] = saved["env"]["randomization"]
@@ -230,14 +232,14 @@ def _on_top_of_saved(
                 f"{item.input_line}: a run that is resumed keeps its settings; "
                 "change single keys with key=value"
             )
-        raise _unknown_key(key, _flatten(data))
+        raise _unknown_key(key, flatten(data))
     merged["run"]["resume"] = resume
     return merged
 
 
 def _with_task_of_run(data: dict[str, Any], overrides: Sequence[str]) -> dict[str, Any]:
     """With `run.dir` and without `env=`: the task of that run, changed where `env.*` says so."""
-    items = _parse(overrides)
+    items = parse(overrides)
     run_dir = data["run"].get("dir") if isinstance(data["run"], dict) else None
     if run_dir is None or any(item.key_or_group == "env" for item in items):
         return data
@@ -285,14 +287,4 @@ def _known_keys(name: str) -> list[str]:
 
 def defaults(name: str, overrides: Sequence[str]) -> dict[str, Any]:
     """The values of all keys of a command, by dotted name, with some overrides."""
-    return _flatten(_compose_dict(name, overrides))
-
-
-def _flatten(data: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
-    flat: dict[str, Any] = {}
-    for key, value in data.items():
-        if isinstance(value, Mapping):
-            flat |= _flatten(value, f"{prefix}{key}.")
-        else:
-            flat[f"{prefix}{key}"] = value
-    return flat
+    return flatten(compose_dict(name, overrides))

@@ -118,6 +118,17 @@ def to_dict(config: Any) -> dict[str, Any]:
     return dataclasses.asdict(config)
 
 
+def flatten(data: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
+    """A tree of mappings as one: values by their dotted names."""
+    flat: dict[str, Any] = {}
+    for key, value in data.items():
+        if isinstance(value, Mapping):
+            flat |= flatten(value, f"{prefix}{key}.")
+        else:
+            flat[f"{prefix}{key}"] = value
+    return flat
+
+
 def suggestion(key: str, allowed: typing.Iterable[str]) -> str:
     """`: did you mean ...` where a name is close, else `: allowed are ...`."""
     names = sorted(allowed)

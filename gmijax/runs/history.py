@@ -35,6 +35,10 @@ class MetricsReader:
 
     def latest(self) -> dict[str, Any] | None:
         """The last complete line that came since the last call, None if there is none."""
+        return next(reversed(self.new()), None)
+
+    def new(self) -> list[dict[str, Any]]:
+        """The complete lines that came since the last call."""
         try:
             with self._path.open("rb") as file:
                 if os.fstat(file.fileno()).st_size < self._offset:
@@ -42,11 +46,10 @@ class MetricsReader:
                 file.seek(self._offset)
                 new = file.read()
         except OSError:
-            return None
+            return []
         complete = new[: new.rfind(b"\n") + 1]
         self._offset += len(complete)
-        lines = complete.splitlines()
-        return json.loads(lines[-1]) if lines else None
+        return [json.loads(line) for line in complete.splitlines()]
 
 
 def draw_returns(metrics: Path, picture: Path, title: str) -> bool:

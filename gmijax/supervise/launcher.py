@@ -219,24 +219,27 @@ class StopSignals:
 
     A program such as `timeout` sends its signal twice at once, and a batch system sends others
     before the last: that is no impatience.
+
+    Attributes:
+      requests: how many have come that count.
     """
 
     def __init__(self) -> None:
-        self._requests = 0
+        self.requests = 0
         self._last_s: dict[int, float] = {}
         self._forward: Callable[[], None] | None = None
 
     @property
     def have_come(self) -> bool:
         """Whether an end was asked for."""
-        return self._requests > 0
+        return self.requests > 0
 
     def handle(self, number: int, _: FrameType | None = None) -> None:
         """The signal handler."""
         now_s = time.monotonic()
         is_again = now_s - self._last_s.get(number, now_s) >= _AGAIN_S
         if is_again or not self._last_s:
-            self._requests += 1
+            self.requests += 1
             if self._forward is not None:
                 self._forward()
         self._last_s[number] = now_s
@@ -244,7 +247,7 @@ class StopSignals:
     def forward_to(self, request_stop: Callable[[], None]) -> None:
         """Forwards requests, also those that have come before."""
         self._forward = request_stop
-        for _ in range(self._requests):
+        for _ in range(self.requests):
             request_stop()
 
 

@@ -1,0 +1,42 @@
+"""Everything that `python -m gmijax.sweep` can be told beside the training jobs."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+from gmijax.config.schema import KeyGroup, doc, require_at_least
+from gmijax.errors import ConfigError
+
+
+@dataclass(frozen=True, kw_only=True)
+class SweepConfig(KeyGroup):
+    """How the jobs of a sweep share the GPUs, and what they are compared by."""
+
+    prefix = "sweep."
+
+    gpus: int | tuple[int, ...] | None = doc(
+        "number of GPUs, or their indices as nvidia-smi lists them; null: all", default=None
+    )
+    jobs_per_gpu: int = doc(
+        "jobs that run at the same time on every GPU (without one: on the machine)",
+        default=1,
+        low=1,
+    )
+    objective: str = doc(
+        "what jobs are ranked by: a key of their metrics; its best value counts", default="return"
+    )
+    direction: Literal["maximize", "minimize"] = doc(
+        "whether a larger or a smaller objective is better", default="maximize"
+    )
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if isinstance(self.gpus, int):
+            require_at_least("sweep.gpus", self.gpus, 1)
+        elif self.gpus is not None and (
+            not self.gpus or len(set(self.gpus)) != len(self.gpus) or min(self.gpus) < 0
+        ):
+            raise ConfigError(
+                f"sweep.gpus={list(self.gpus)}: expected a number of GPUs or distinct indices"
+            )

@@ -1,0 +1,38 @@
+"""Exit codes of commands: 0 success, 2 bad input (one line), 130 interrupted, 1 anything else."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable
+from typing import Final
+
+from gmijax.errors import ConfigError, GmijaxError, JobInterrupted
+
+EXIT_OK: Final = 0
+EXIT_FAILED: Final = 1
+EXIT_BAD_INPUT: Final = 2
+EXIT_INTERRUPTED: Final = 130
+
+
+def exit_code_of(name: str, run: Callable[[], object]) -> int:
+    """Runs the command `name` and turns every error into its exit code."""
+    try:
+        run()
+        return EXIT_OK
+    except ConfigError as error:
+        _complain(name, error)
+        return EXIT_BAD_INPUT
+    except (JobInterrupted, KeyboardInterrupt) as error:
+        _complain(name, error if str(error) else "interrupted")
+        return EXIT_INTERRUPTED
+    except GmijaxError as error:
+        _complain(name, error)
+        return EXIT_FAILED
+
+
+def _complain(name: str, what: object) -> None:
+    notes = getattr(what, "__notes__", [])
+    text = "; ".join([str(what), *notes])
+    # One line, whatever is in the values that it shows.
+    shown = "".join(c if c.isprintable() else ascii(c)[1:-1] for c in text)
+    sys.stderr.write(f"gmijax.{name}: {shown}\n")

@@ -1,0 +1,128 @@
+"""Processes of the jobs of a sweep: each is a controller of its own."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Mapping
+from contextlib import suppress
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from gmijax.errors import GmijaxError
+from gmijax.machine.processes import GuardPipe, members_of
+from gmijax.runs.folder import write_json
+from gmijax.sweeps.jobs import Job
+from gmijax.sweeps.places import Place
+
+MODULE = "gmijax.workers.training_job"
+_INTERRUPTED = 130
+_LONGEST_ERROR = 300
+
+
+@dataclass
+class Child:
+    """The process of a job.
+
+    Attributes:
+      job: what it trains.
+      place: where.
+      started_s: when, by the monotonic clock.
+    """
+
+    job: Job
+    place: Place
+    log: Path
+    process: subprocess.Popen[bytes]
+    pipe: GuardPipe
+    started_s: float = field(default_factory=time.monotonic)
+    asked_s: float | None = None
+
+    @property
+    def wall_s(self) -> float:
+        """Seconds since its start."""
+        return time.monotonic() - self.started_s
+
+    def has_ended(self) -> bool:
+        """Whether the process is gone."""
+        return self.process.poll() is not None
+
+    def ask_to_stop(self) -> None:
+        """Asks it to save and end; a second time, later: to end at once."""
+        self.asked_s = time.monotonic()
+        with suppress(ProcessLookupError):
+            self.process.send_signal(signal.SIGTERM)
+
+    def kill(self) -> None:
+        """Ends it now; its GMIs end with it."""
+        with suppress(ProcessLookupError):
+            os.killpg(self.process.pid, signal.SIGKILL)
+
+    def close(self) -> tuple[bool, str | None]:
+        """After its end: whether it was interrupted, and why it failed (None: it did not)."""
+        self.pipe.close()
+        code = self.process.wait()
+        if code == 0:
+            return False, None
+        if code == _INTERRUPTED:
+            return True, None
+        return False, _last_words(self.log) or f"exit code {code}"
+
+
+def start(
+    job: Job,
+    place: Place,
+    config: Mapping[str, Any],
+    order: Path,
+    log: Path,
+    variables: Mapping[str, str],
+) -> Child:
+    """Starts a job.
+
+    Args:
+      job: what to train.
+      place: where it goes.
+      config: of the training, with everything that the place decides.
+      order: file for what the process is told.
+      log: file for what it prints; continued if it exists.
+      variables: environment variables beside those of this process.
+    """
+    write_json(order, {"config": config, "cpus": list(place.cpus)})
+    pipe = GuardPipe()
+    try:
+        with log.open("ab") as output:
+            process = subprocess.Popen(
+                [sys.executable, "-m", MODULE, str(order), str(pipe.read_end)],
+                env={**os.environ, **variables},
+                stdin=subprocess.DEVNULL,
+                stdout=output,
+                stderr=output,
+                pass_fds=(pipe.read_end,),
+                # Ctrl-C is for the sweep, which asks its jobs.
+                start_new_session=True,
+            )
+    except OSError as error:
+        pipe.close()
+        raise GmijaxError(f"job {job.number}: cannot be started ({error.strerror})") from None
+    finally:
+        os.close(pipe.read_end)
+    return Child(job, place, log, process, pipe)
+
+
+def wait_for_groups(children: list[Child], timeout_s: float) -> None:
+    """Waits until nothing of these process groups is left."""
+    deadline_s = time.monotonic() + timeout_s
+    while time.monotonic() < deadline_s:
+        if not any(members_of(child.process.pid) for child in children):
+            return
+        time.sleep(0.05)
+
+
+def _last_words(log: Path) -> str:
+    lines = [line for line in log.read_text(errors="replace").splitlines() if line.strip()]
+    said = lines[-1].removeprefix("gmijax.train: ") if lines else ""
+    return said[:_LONGEST_ERROR]

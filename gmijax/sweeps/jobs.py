@@ -1,0 +1,184 @@
+"""The jobs of a sweep: what they are, where their files are, how far they are."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Literal, TypeAlias
+
+from gmijax.config import BackendName, TrainConfig
+from gmijax.config.schema import flatten, to_dict
+from gmijax.config.sweep import SweepConfig
+from gmijax.errors import ConfigError
+from gmijax.runs.folder import RunPaths, read_json
+from gmijax.runs.history import read_metrics
+from gmijax.sweeps.places import Place
+
+State: TypeAlias = Literal["waiting", "running", "completed", "failed", "interrupted"]
+
+DIGITS = 3
+"""Of the number of a job in the names of its files; more jobs have more digits."""
+
+
+class SweepPaths(RunPaths):
+    """Files of a sweep; each job has a run folder of its own in it."""
+
+    def __init__(self, root: Path) -> None:
+        super().__init__(root)
+        self.sweep = root / "sweep.json"  # Jobs, their states and results.
+        self.table = root / "sweep.csv"  # One line a job.
+        self.curves = root / "sweep.png"
+
+    def job(self, number: int) -> RunPaths:
+        """The run folder of a job."""
+        return RunPaths(self.root / f"{number:0{DIGITS}d}")
+
+    def order(self, number: int) -> Path:
+        """What the process of a job is told."""
+        return self.root / "jobs" / f"{number:0{DIGITS}d}.json"
+
+    def log(self, number: int) -> Path:
+        """What the process of a job prints."""
+        return self.root / "jobs" / f"{number:0{DIGITS}d}.log"
+
+
+@dataclass(frozen=True)
+class Job:
+    """One training of a sweep.
+
+    Attributes:
+      number: from 0.
+      overrides: what makes it different from the other jobs, e.g. `{"seed": "1"}`.
+      config: of the training.
+    """
+
+    number: int
+    overrides: Mapping[str, str]
+    config: TrainConfig
+
+    @property
+    def label(self) -> str:
+        """The overrides in one line."""
+        return " ".join(f"{key}={value}" for key, value in self.overrides.items()) or "-"
+
+    @property
+    def num_gpus(self) -> int:
+        """How many GPUs it takes a place on."""
+        return self.config.plan.num_gpus
+
+    def program(self) -> str:
+        """The same for jobs that compile the same programs."""
+        data = to_dict(self.config)
+        for key in ("run", "seed", "num_timesteps", "search"):
+            del data[key]
+        data["plan"].pop("memory_fraction")
+        return repr(data)
+
+
+@dataclass
+class Progress:
+    """How far a job is.
+
+    Attributes:
+      state: see `State`.
+      env_steps: environment steps so far.
+      env_steps_per_s: of the last iteration; 0 while it does not run.
+      value: best value of the objective so far, None before there is one.
+      wall_s: seconds of its process in this sweep.
+      place: GPUs and slot where it runs, in words.
+      error: why it failed, in one line.
+    """
+
+    state: State = "waiting"
+    env_steps: int = 0
+    env_steps_per_s: float = 0.0
+    value: float | None = None
+    wall_s: float = 0.0
+    place: str = ""
+    error: str | None = None
+    curve: list[tuple[int, float]] = field(default_factory=list)
+
+    def take(self, line: Mapping[str, Any], sweep: SweepConfig) -> None:
+        """Takes in a line of metrics."""
+        self.env_steps = line["env_steps"]
+        self.env_steps_per_s = line.get("env_steps_per_s") or 0.0
+        found = line.get(sweep.objective)
+        if found is None or not math.isfinite(found):
+            return
+        self.curve.append((self.env_steps, found))
+        is_better = self.value is None or (
+            found > self.value if sweep.direction == "maximize" else found < self.value
+        )
+        if is_better:
+            self.value = found
+
+    def read(self, run: RunPaths, sweep: SweepConfig) -> None:
+        """Takes in all metrics that a run folder has."""
+        self.value, self.curve = None, []
+        for line in read_metrics(run.metrics):
+            self.take(line, sweep)
+        self.env_steps_per_s = 0.0
+
+
+def jobs_of(configs: Sequence[TrainConfig]) -> tuple[Job, ...]:
+    """Jobs with the keys in which the configurations differ as their overrides."""
+    flat = [flatten(to_dict(config)) for config in configs]
+    keys = dict.fromkeys(key for one in flat for key in one)
+    differing = [key for key in keys if len({repr(one.get(key)) for one in flat}) > 1]
+    return tuple(
+        Job(number, {key: str(one[key]) for key in differing if key in one}, config)
+        for number, (one, config) in enumerate(zip(flat, configs, strict=True))
+    )
+
+
+def require_placeable(jobs: Sequence[Job], num_gpus: int) -> None:
+    """Refuses jobs that say themselves where they run, or that no place is large enough for.
+
+    Raises:
+      ConfigError: names the key.
+    """
+    if not jobs:
+        raise ConfigError("sweep: there is no job in it")
+    for job in jobs:
+        plan = job.config.plan
+        if not isinstance(plan.gpus, int):
+            raise ConfigError(
+                f"plan.gpus={list(plan.gpus)}: a sweep chooses the GPUs of its jobs; expected a "
+                "number (sweep.gpus says which ones it may use)"
+            )
+        if plan.layout is not None or plan.memory_fraction is not None:
+            key = "layout" if plan.layout is not None else "memory_fraction"
+            raise ConfigError(f"plan.{key}: a sweep decides it for its jobs; leave it out")
+        if job.num_gpus > num_gpus:
+            raise ConfigError(f"plan.gpus={job.num_gpus}: the sweep has {num_gpus} GPUs")
+        if job.config.run.resume not in (None, "auto"):
+            raise ConfigError(
+                f"run.resume={job.config.run.resume}: the jobs of a sweep start from nothing, or "
+                "go on where the same sweep was interrupted"
+            )
+
+
+def placed(job: Job, run: RunPaths, place: Place, backend: BackendName) -> TrainConfig:
+    """The configuration of a job in its run folder and its place."""
+    wanted = job.config.plan
+    plan = dataclasses.replace(
+        wanted,
+        backend=backend if wanted.backend == "auto" else wanted.backend,
+        memory_fraction=place.memory_fraction(job.config),
+        # The daemon is the sweep's, and caps nobody.
+        self_check="off" if wanted.self_check == "auto" else wanted.self_check,
+    )
+    own = dataclasses.replace(job.config.run, dir=str(run.root), name=None, resume="auto")
+    return dataclasses.replace(job.config, plan=plan, run=own)
+
+
+def state_of(run: RunPaths, config: TrainConfig) -> State:
+    """Whether an earlier attempt at the sweep has completed a job."""
+    if not run.summary.exists():
+        return "waiting"
+    summary = read_json(run.summary)
+    done = summary["status"] == "completed" and summary["env_steps"] >= config.num_timesteps
+    return "completed" if done else "waiting"

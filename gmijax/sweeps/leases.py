@@ -1,0 +1,49 @@
+"""GPUs of one user go to one sweep at a time."""
+
+from __future__ import annotations
+
+import fcntl
+import os
+import time
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import ExitStack, contextmanager
+
+from gmijax.runs.cache import cache_folder
+
+_POLL_S = 0.2
+
+
+@contextmanager
+def leased(
+    devices: Iterable[str], say: Callable[[str], None], is_over: Callable[[], bool]
+) -> Iterator[bool]:
+    """Holds all devices; waits for those that another sweep has.
+
+    Args:
+      devices: UUIDs of GPUs or MIG instances.
+      say: told in a sentence whom it waits for.
+      is_over: whether to give up; what is yielded is then false.
+    """
+    folder = cache_folder() / "leases"
+    with ExitStack() as held:
+        # In one order, so that two sweeps do not wait for each other.
+        for device in sorted(set(devices)):
+            folder.mkdir(parents=True, exist_ok=True)
+            fd = os.open(folder / f"{device}.lock", os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
+            held.callback(os.close, fd)
+            if not _locked(fd):
+                say(f"another sweep has {device}: waiting until it ends")
+            while not _locked(fd):
+                if is_over():
+                    yield False
+                    return
+                time.sleep(_POLL_S)
+        yield True
+
+
+def _locked(fd: int) -> bool:
+    try:
+        fcntl.flock(fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return False
+    return True

@@ -1,0 +1,69 @@
+"""Places for jobs: the slices of a plan of GMIs that have nothing to do with each other."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from gmijax.config import TrainConfig
+from gmijax.partition.plan import Slice
+
+
+@dataclass(frozen=True)
+class Place:
+    """Where a job runs: a slice of each of its GPUs."""
+
+    slices: tuple[Slice, ...]
+
+    @property
+    def devices(self) -> tuple[str, ...]:
+        """UUIDs of its GPUs or MIG instances; none on a machine without GPUs."""
+        return tuple(share.device for share in self.slices if share.device != "cpu")
+
+    @property
+    def cpus(self) -> tuple[int, ...]:
+        """Cores of its processes."""
+        return tuple(sorted({cpu for share in self.slices for cpu in share.cpus}))
+
+    @property
+    def label(self) -> str:
+        """In words, e.g. `GPU 0.1`: the second place on the first GPU."""
+        return " ".join(f"{share.gpu}.{share.gmi}" for share in self.slices)
+
+    def memory_fraction(self, config: TrainConfig) -> float | None:
+        """For each GMI of a job that is put here; None where memory is not divided."""
+        fraction = self.slices[0].memory_fraction
+        if fraction is None:
+            return None
+        plan = config.plan
+        gmis = (
+            plan.serving_gmis_per_gpu + plan.training_gmis_per_gpu
+            if config.is_asynchronous
+            else 1
+            if plan.gmis_per_gpu == "auto"
+            else plan.gmis_per_gpu
+        )
+        return max(0.01, int(1e4 * fraction / gmis) / 1e4)
+
+
+class Places:
+    """All places of a sweep, free and taken."""
+
+    def __init__(self, slices: Sequence[Slice]) -> None:
+        self._free = list(slices)
+
+    def take(self, num_gpus: int) -> Place | None:
+        """A place on each of `num_gpus` GPUs, those with the most free ones; None: not now."""
+        by_gpu: dict[int, list[Slice]] = {}
+        for share in self._free:
+            by_gpu.setdefault(share.gpu, []).append(share)
+        emptiest = sorted(by_gpu.values(), key=len, reverse=True)[:num_gpus]
+        if len(emptiest) < num_gpus:
+            return None
+        taken = tuple(free[0] for free in emptiest)
+        self._free = [share for share in self._free if share not in taken]
+        return Place(taken)
+
+    def give_back(self, place: Place) -> None:
+        """The job that was there has ended."""
+        self._free = sorted([*self._free, *place.slices], key=lambda share: share.gmi)

@@ -1,0 +1,141 @@
+"""What a sweep leaves: `sweep.json`, `sweep.csv`, a ranking, and one picture of all curves."""
+
+from __future__ import annotations
+
+import csv
+import io
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from rich.table import Table
+
+from gmijax.config.schema import to_dict
+from gmijax.config.sweep import SweepConfig
+from gmijax.runs.folder import write_json, write_text
+from gmijax.sweeps.jobs import Job, Progress, SweepPaths
+from gmijax.version import __version__
+
+CURVE_POINTS = 200
+_QUARTILES = (25, 75)
+
+
+def write_report(
+    status: str,
+    jobs: Sequence[Job],
+    progress: Mapping[int, Progress],
+    sweep: SweepConfig,
+    paths: SweepPaths,
+    wall_s: float,
+) -> dict[str, Any]:
+    """Writes the files; returns the content of `sweep.json`."""
+    rows = [_row(job, progress[job.number], paths) for job in jobs]
+    done = [row for row in rows if row["state"] == "completed"]
+    data = {
+        "status": status,
+        "sweep": to_dict(sweep),
+        "wall_s": round(wall_s, 3),
+        "trainings_per_hour": 3600.0 * len(done) / wall_s if wall_s else None,
+        "ranking": [row["job"] for row in ranked(rows, sweep)],
+        "jobs": rows,
+        "versions": {"gmijax": __version__},
+    }
+    write_json(paths.sweep, data)
+    write_text(paths.table, _csv(rows))
+    draw_curves(jobs, progress, sweep, paths)
+    return data
+
+
+def ranked(rows: Sequence[Mapping[str, Any]], sweep: SweepConfig) -> list[Mapping[str, Any]]:
+    """Rows that have a value, the best first."""
+    sign = -1.0 if sweep.direction == "maximize" else 1.0
+    return sorted(
+        (row for row in rows if row["value"] is not None), key=lambda row: sign * row["value"]
+    )
+
+
+def ranking(rows: Sequence[Mapping[str, Any]], sweep: SweepConfig) -> Table:
+    """The ranking for people."""
+    table = Table(box=None, pad_edge=False)
+    for heading in ("rank", "job", "overrides", f"best {sweep.objective}", "steps", "state"):
+        table.add_column(heading)
+    for rank, row in enumerate(ranked(rows, sweep), 1):
+        label = " ".join(f"{key}={value}" for key, value in row["overrides"].items())
+        shown = f"{row['value']:.4g}", f"{row['env_steps']:,}"
+        table.add_row(str(rank), str(row["job"]), label, *shown, row["state"])
+    return table
+
+
+def draw_curves(
+    jobs: Sequence[Job], progress: Mapping[int, Progress], sweep: SweepConfig, paths: SweepPaths
+) -> bool:
+    """Draws the objective over environment steps: one line for all seeds of the same settings.
+
+    The line is the interquartile mean over the seeds, the band the range between the quartiles
+    (as rliable draws them, arXiv 2108.13264). False where there is nothing to draw.
+    """
+    groups: dict[str, list[list[tuple[int, float]]]] = {}
+    for job in jobs:
+        if curve := progress[job.number].curve:
+            own = {key: value for key, value in job.overrides.items() if key != "seed"}
+            label = " ".join(f"{key}={value}" for key, value in own.items()) or "all seeds"
+            groups.setdefault(label, []).append(curve)
+    if not groups:
+        return False
+    # Imported here: it costs half a second that no other use of this module should pay.
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(8, 5), layout="constrained")
+    FigureCanvasAgg(figure)
+    axes = figure.add_subplot()
+    for label, curves in groups.items():
+        steps, middle, low, high = spread(curves)
+        axes.plot(steps, middle, label=f"{label} (n={len(curves)})")
+        if len(curves) > 1:
+            axes.fill_between(steps, low, high, alpha=0.2)
+    axes.set(xlabel="environment steps", ylabel=sweep.objective)
+    axes.grid(alpha=0.3)
+    axes.legend(fontsize="small")
+    figure.savefig(paths.curves, dpi=120)
+    return True
+
+
+def spread(
+    curves: Sequence[Sequence[tuple[int, float]]],
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Steps [P], interquartile mean [P] and both quartiles [P] over curves, where all are."""
+    first = max(curve[0][0] for curve in curves)
+    last = min(curve[-1][0] for curve in curves)
+    steps = np.linspace(first, max(first, last), CURVE_POINTS)
+    values = np.stack([np.interp(steps, *np.array(curve).T) for curve in curves])
+    low, high = np.percentile(values, _QUARTILES, axis=0)
+    inside = (values >= low) & (values <= high)
+    # With two or three curves the quartiles lie between them, and nothing else does.
+    inside |= ~inside.any(axis=0)
+    return steps, (values * inside).sum(axis=0) / inside.sum(axis=0), low, high
+
+
+def _row(job: Job, progress: Progress, paths: SweepPaths) -> dict[str, Any]:
+    return {
+        "job": job.number,
+        "overrides": dict(job.overrides),
+        "run_dir": str(paths.job(job.number).root),
+        "state": progress.state,
+        "value": progress.value,
+        "env_steps": progress.env_steps,
+        "wall_s": round(progress.wall_s, 3),
+        "error": progress.error,
+    }
+
+
+def _csv(rows: Sequence[Mapping[str, Any]]) -> str:
+    keys = list(dict.fromkeys(key for row in rows for key in row["overrides"]))
+    output = io.StringIO()
+    own = ("state", "value", "env_steps", "wall_s", "run_dir", "error")
+    writer = csv.writer(output, lineterminator="\n")
+    writer.writerow(["job", *keys, *own])
+    for row in rows:
+        values = [row["overrides"].get(key, "") for key in keys]
+        writer.writerow([row["job"], *values, *(row[name] for name in own)])
+    return output.getvalue()

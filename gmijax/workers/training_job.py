@@ -1,0 +1,36 @@
+"""Main of a training job of a sweep: a controller of its own, `training_job.py ORDER FD`.
+
+It ends, with a checkpoint, when the pipe FD ends: the sweep is gone then.
+"""
+
+from __future__ import annotations
+
+import os
+import signal
+import sys
+import threading
+from pathlib import Path
+
+from gmijax.config import TrainConfig
+from gmijax.config.schema import from_dict
+from gmijax.control.exit_codes import exit_code_of
+from gmijax.control.job import train
+from gmijax.runs.folder import read_json
+
+
+def main(order: Path, lifeline_fd: int) -> int:
+    """Trains as the file `order` says; returns the exit code of `gmijax.train`."""
+    threading.Thread(target=_end_with_the_sweep, args=(lifeline_fd,), daemon=True).start()
+    data = read_json(order)
+    if data["cpus"]:
+        os.sched_setaffinity(0, data["cpus"])
+    return exit_code_of("train", lambda: train(from_dict(TrainConfig, data["config"]), show=True))
+
+
+def _end_with_the_sweep(fd: int) -> None:
+    os.read(fd, 1)
+    os.kill(os.getpid(), signal.SIGTERM)
+
+
+if __name__ == "__main__":
+    sys.exit(main(Path(sys.argv[1]), int(sys.argv[2])))
