@@ -123,8 +123,8 @@ def plan_of(settings: SweepConfig, machine: Machine) -> Plan:
     gpus = settings.gpus
     if gpus is None:
         gpus = max(1, len(machine.gpus))
-    config = PlanConfig(gpus=gpus, gmis_per_gpu=settings.jobs_per_gpu)
     try:
+        config = PlanConfig(gpus=gpus, gmis_per_gpu=settings.jobs_per_gpu)
         return make_plan(config, ReduceConfig(), 1, machine, template="tcg")
     except ConfigError as error:
         said = str(error).replace("plan.gmis_per_gpu", "sweep.jobs_per_gpu")

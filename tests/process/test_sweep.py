@@ -1,0 +1,58 @@
+"""A sweep with real processes on the CPU: a job that fails, a kill, and going on."""
+
+from __future__ import annotations
+
+import csv
+import json
+import signal
+from pathlib import Path
+from typing import Any
+
+import pytest
+from training_jobs import POINT, STEPS, start, train, wait_until
+
+SWEEP = (
+    *POINT,
+    f"num_timesteps={40 * STEPS}",
+    "run.checkpoint_every=10",
+    "seed=0,1,2",
+    # The larger one makes every number infinite at once.
+    "algo.learning_rate=3e-4,1e30",
+    "algo.max_grad_norm=1e30",
+    "sweep.jobs_per_gpu=2",
+    "run.dir=all",
+)
+
+
+def report(folder: Path) -> dict[str, Any]:
+    return json.loads((folder / "all" / "sweep.json").read_text())
+
+
+def states(folder: Path) -> list[str]:
+    return [job["state"] for job in report(folder)["jobs"]]
+
+
+@pytest.mark.timeout(600)
+def test_a_sweep_that_is_killed_goes_on_and_a_job_fails_alone(tmp_path: Path) -> None:
+    first = start(*SWEEP, cwd=tmp_path, command="sweep")
+    whole = tmp_path / "all" / "000" / "summary.json"
+    wait_until(whole.exists, 200.0, "the first job is through")
+    first.send_signal(signal.SIGKILL)
+    first.wait()
+    when = whole.stat().st_mtime_ns
+
+    done = train(*SWEEP, cwd=tmp_path, command="sweep", timeout_s=400.0)
+    assert done.returncode == 1
+    assert "3 of 6 jobs failed; job 1: " in done.stderr
+    assert len(done.stderr.splitlines()) == 1
+    assert states(tmp_path) == ["completed", "failed"] * 3
+    assert whole.stat().st_mtime_ns == when  # It was not run again.
+    found = report(tmp_path)
+    assert sorted(found["ranking"]) == [0, 2, 4]
+    assert found["jobs"][1]["overrides"] == {"seed": "0", "algo.learning_rate": "1e+30"}
+    with (tmp_path / "all" / "sweep.csv").open() as file:
+        assert [row["state"] for row in csv.DictReader(file)] == states(tmp_path)
+    assert (tmp_path / "all" / "sweep.png").stat().st_size > 10_000
+
+    other = train(*SWEEP, "sweep.objective=episode_length", cwd=tmp_path, command="sweep")
+    assert other.returncode == 1  # The failed ones are tried again.

@@ -1,0 +1,214 @@
+"""Sweeps without processes: lists to jobs, places, curves, rankings, what is refused."""
+
+from __future__ import annotations
+
+import dataclasses
+import threading
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from supervision import machine
+
+from gmijax.cli.compose import compose
+from gmijax.cli.grid import build_sweep, expand
+from gmijax.config.sweep import SweepConfig
+from gmijax.errors import ConfigError
+from gmijax.runs.folder import write_json
+from gmijax.sweeps.jobs import Progress, SweepPaths, jobs_of, placed, require_placeable, state_of
+from gmijax.sweeps.leases import leased
+from gmijax.sweeps.places import Places
+from gmijax.sweeps.report import ranked, spread
+from gmijax.sweeps.sweep import plan_of
+
+
+@pytest.mark.parametrize(
+    ("overrides", "expected"),
+    [
+        ((), [{}]),
+        (("seed=1",), [{}]),
+        (("seed=0,1",), [{"seed": "0"}, {"seed": "1"}]),
+        (("seed=range(2)",), [{"seed": "0"}, {"seed": "1"}]),
+        (
+            ("env=ant,humanoid", "algo.learning_rate=choice(1e-4,3e-4)"),
+            [
+                {"env": env, "algo.learning_rate": rate}
+                for env in ("ant", "humanoid")
+                for rate in ("0.0001", "0.0003")
+            ],
+        ),
+        (("env=glob(a*,exclude=any*)",), [{"env": "ant"}]),
+        (
+            ("algo.policy_hidden_layer_sizes=[8,8],[4]",),
+            [{"algo.policy_hidden_layer_sizes": text} for text in ("[8,8]", "[4]")],
+        ),
+    ],
+)
+def test_lists_become_every_combination(
+    overrides: tuple[str, ...], expected: list[dict[str, str]]
+) -> None:
+    assert expand(overrides) == expected
+
+
+@pytest.mark.parametrize(
+    ("overrides", "said"),
+    [
+        (("seed=range(3,3)",), "seed: an empty list"),
+        (("seed=1,1",), "a value that comes twice"),
+        (("algo.learning_rate=interval(0,1)",), "expected values, not an interval"),
+        (("seed=range(200)", "num_envs=range(1,200)"), "39,800 jobs; at most 10,000"),
+        (("sweep.jobs_per_gpu=1,2",), "expected one value"),
+        (("run.dir=a,b",), "expected one value"),
+        (("sweep.jobs_per_gpu=0",), "must be at least 1"),
+        (("sweep.gpus=[]",), "expected a number of GPUs or distinct indices"),
+        (("seed=0,1", "algo.learnin_rate=1"), "unknown key algo.learnin_rate"),
+        (("seed=0,x",), "seed"),
+        (("env=ant,nobody",), "env=nobody: unknown"),
+    ],
+)
+def test_bad_lists_are_refused(overrides: tuple[str, ...], said: str) -> None:
+    with pytest.raises(ConfigError) as raised:
+        build_sweep(overrides)
+    assert said in str(raised.value)
+    assert "\n" not in str(raised.value)
+
+
+def test_configurations_differ_by_what_they_are_named() -> None:
+    jobs = jobs_of([compose(f"seed={seed}", f"num_envs={16 * (seed + 1)}") for seed in range(2)])
+    assert [dict(job.overrides) for job in jobs] == [
+        {"num_envs": "16", "seed": "0"},
+        {"num_envs": "32", "seed": "1"},
+    ]
+    assert jobs[0].label == "num_envs=16 seed=0"
+    assert len({job.program() for job in jobs}) == 2
+    assert len({job.program() for job in jobs_of([compose(f"seed={s}") for s in "01"])}) == 1
+
+
+@pytest.mark.parametrize(
+    ("overrides", "said"),
+    [
+        (("plan.gpus=[0]",), "a sweep chooses the GPUs"),
+        (("plan.layout=[[0]]",), "plan.layout: a sweep decides it"),
+        (("plan.memory_fraction=0.5",), "plan.memory_fraction: a sweep decides it"),
+        (("plan.gpus=3",), "plan.gpus=3: the sweep has 2 GPUs"),
+    ],
+)
+def test_jobs_that_place_themselves_are_refused(overrides: tuple[str, ...], said: str) -> None:
+    with pytest.raises(ConfigError) as raised:
+        require_placeable(jobs_of([compose(*overrides)]), 2)
+    assert said in str(raised.value)
+
+
+def gpu_plan(gpus: int, jobs_per_gpu: int) -> Any:
+    here = machine(gpus, mps_control=Path("/usr/bin/nvidia-cuda-mps-control"))
+    return plan_of(SweepConfig(jobs_per_gpu=jobs_per_gpu), here)
+
+
+def test_jobs_go_to_the_gpu_with_most_room_and_large_ones_to_several() -> None:
+    plan = gpu_plan(2, 2)
+    assert plan.backend == "mps"
+    places = Places(plan.slices)
+    first, second = places.take(1), places.take(1)
+    assert first is not None
+    assert second is not None
+    assert {first.label, second.label} == {"0.0", "1.2"}
+    both = places.take(2)
+    assert both is not None
+    assert len(set(both.devices)) == 2
+    assert places.take(1) is None
+    places.give_back(first)
+    assert places.take(2) is None
+    assert places.take(1) == first
+
+
+@pytest.mark.parametrize(
+    ("overrides", "fraction"),
+    [
+        ((), 0.2),
+        (("plan.gmis_per_gpu=2",), 0.1),
+        (("algo=a3c", "plan.serving_gmis_per_gpu=3"), 0.05),
+    ],
+)
+def test_jobs_divide_the_memory_of_a_gpu(
+    overrides: tuple[str, ...], fraction: float, tmp_path: Path
+) -> None:
+    (job,) = jobs_of([compose(*overrides)])
+    place = Places(gpu_plan(1, 4).slices).take(1)
+    assert place is not None
+    config = placed(job, SweepPaths(tmp_path).job(7), place, "mps")
+    assert config.plan.memory_fraction == fraction
+    assert config.plan.backend == "mps"
+    assert (config.run.dir, config.run.resume) == (str(tmp_path / "007"), "auto")
+
+
+def test_too_many_jobs_for_the_machine_are_refused() -> None:
+    with pytest.raises(ConfigError, match=r"sweep\.jobs_per_gpu=2000"):
+        gpu_plan(1, 2000)
+
+
+def test_progress_keeps_the_best_value() -> None:
+    lines = [(10, None), (20, 3.0), (30, float("nan")), (40, 1.0)]
+    highest, lowest = Progress(), Progress()
+    for steps, value in lines:
+        line = {"env_steps": steps, "env_steps_per_s": 5.0, "return": value}
+        highest.take(line, SweepConfig())
+        lowest.take(line, SweepConfig(direction="minimize"))
+    assert (highest.value, lowest.value, highest.env_steps) == (3.0, 1.0, 40)
+    assert highest.curve == [(20, 3.0), (40, 1.0)]
+
+
+def test_only_a_run_with_all_its_steps_is_complete(tmp_path: Path) -> None:
+    run, config = SweepPaths(tmp_path).job(0), compose("num_timesteps=100")
+    assert state_of(run, config) == "waiting"
+    write_json(run.summary, {"status": "interrupted", "env_steps": 100})
+    assert state_of(run, config) == "waiting"
+    write_json(run.summary, {"status": "completed", "env_steps": 100})
+    assert state_of(run, config) == "completed"
+    assert state_of(run, dataclasses.replace(config, num_timesteps=200)) == "waiting"
+
+
+def test_the_ranking_has_the_best_first_and_nothing_without_a_value() -> None:
+    rows = [{"job": n, "value": value} for n, value in enumerate((1.0, None, 3.0))]
+    assert [row["job"] for row in ranked(rows, SweepConfig())] == [2, 0]
+    assert [row["job"] for row in ranked(rows, SweepConfig(direction="minimize"))] == [0, 2]
+
+
+def test_the_middle_of_curves_leaves_out_the_outer_quarters() -> None:
+    curves = [[(0, float(k)), (100, float(k))] for k in (0, 1, 2, 3, 100)]
+    steps, middle, low, high = spread(curves)
+    assert (steps[0], steps[-1]) == (0, 100)
+    np.testing.assert_allclose(middle, 2.0)
+    np.testing.assert_allclose((low[0], high[0]), (1.0, 3.0))
+    _, alone, _, _ = spread([[(0, 1.0), (10, 3.0)]])
+    np.testing.assert_allclose(alone, np.linspace(1.0, 3.0, len(alone)))
+    _, two, _, _ = spread([[(0, 1.0), (10, 1.0)], [(0, 3.0), (10, 3.0)]])
+    np.testing.assert_allclose(two, 2.0)
+
+
+def test_a_gpu_goes_to_one_sweep_at_a_time(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    said: list[str] = []
+    waiting, got = threading.Event(), threading.Event()
+
+    def second() -> None:
+        def say(text: str) -> None:
+            said.append(text)
+            waiting.set()
+
+        with leased(["GPU-1"], say, lambda: False):
+            got.set()
+
+    with leased(["GPU-1"], said.append, lambda: False) as is_held:
+        assert is_held
+        other = threading.Thread(target=second)
+        other.start()
+        assert waiting.wait(10.0)
+        assert not got.is_set()
+        with leased(["GPU-1"], lambda _: None, lambda: True) as is_held_twice:
+            assert not is_held_twice
+    assert got.wait(10.0)
+    other.join()
+    assert said == ["another sweep has GPU-1: waiting until it ends"]
