@@ -16,7 +16,7 @@ from gmijax.cli.help import print_help
 from gmijax.config.schema import to_dict
 from gmijax.control.exit_codes import exit_code_of
 from gmijax.errors import ConfigError
-from gmijax.sweeps.sweep import run_jobs
+from gmijax.sweeps.sweep import run_request
 
 C = TypeVar("C")
 
@@ -46,12 +46,13 @@ def sweep_command(argv: Sequence[str]) -> int:
             print_help("sweep", SweepHelp, partial(defaults, "sweep"), choices)
             return
         overrides, show = _split_options(argv)
-        settings, jobs = build_sweep(overrides)
+        request = build_sweep(overrides)
         if show:
-            shown = {"sweep": to_dict(settings), "jobs": [dict(job.overrides) for job in jobs]}
+            jobs = [dict(job.overrides) for job in request.jobs]
+            shown = {"sweep": to_dict(request.settings), "jobs": jobs}
             sys.stdout.write(OmegaConf.to_yaml(OmegaConf.create(shown)))
         else:
-            run_jobs(settings, jobs, show=True)
+            run_request(request, show=True)
 
     return exit_code_of("sweep", whole)
 

@@ -30,8 +30,21 @@ class SweepConfig(KeyGroup):
         "whether a larger or a smaller objective is better", default="maximize"
     )
 
+    sampler: Literal["grid", "random", "tpe"] = doc(
+        "where jobs come from: every combination of the lists (grid), or draws from lists and "
+        "intervals by Optuna (random, tpe)",
+        default="grid",
+    )
+    trials: int | None = doc("number of jobs with another sampler than grid", default=None, low=1)
+    pruner: Literal["none", "asha", "median"] = doc(
+        "ends jobs early that are worse than others were (Optuna); not with sampler=grid",
+        default="none",
+    )
+    seed: int = doc("of the sampler", default=0, low=0, high=2**31 - 1)
+
     def __post_init__(self) -> None:
         super().__post_init__()
+        self._require_sampler()
         if isinstance(self.gpus, int):
             require_at_least("sweep.gpus", self.gpus, 1)
         elif self.gpus is not None and (
@@ -39,4 +52,14 @@ class SweepConfig(KeyGroup):
         ):
             raise ConfigError(
                 f"sweep.gpus={list(self.gpus)}: expected a number of GPUs or distinct indices"
+            )
+
+    def _require_sampler(self) -> None:
+        if self.sampler != "grid" and self.trials is None:
+            raise ConfigError(f"sweep.sampler={self.sampler}: needs sweep.trials, how many jobs")
+        if self.sampler == "grid" and self.trials is not None:
+            raise ConfigError(f"sweep.trials={self.trials}: sweep.sampler=grid runs all of them")
+        if self.sampler == "grid" and self.pruner != "none":
+            raise ConfigError(
+                f"sweep.pruner={self.pruner}: not with sweep.sampler=grid; allowed are random, tpe"
             )

@@ -32,6 +32,8 @@ class Child:
       job: what it trains.
       place: where.
       started_s: when, by the monotonic clock.
+      is_pruned: whether it was asked to end because others are better.
+      is_killed: whether it was ended by force, as the whole sweep is.
     """
 
     job: Job
@@ -40,7 +42,8 @@ class Child:
     process: subprocess.Popen[bytes]
     pipe: GuardPipe
     started_s: float = field(default_factory=time.monotonic)
-    asked_s: float | None = None
+    is_pruned: bool = False
+    is_killed: bool = False
 
     @property
     def wall_s(self) -> float:
@@ -52,13 +55,13 @@ class Child:
         return self.process.poll() is not None
 
     def ask_to_stop(self) -> None:
-        """Asks it to save and end; a second time, later: to end at once."""
-        self.asked_s = time.monotonic()
+        """Asks it to save and end."""
         with suppress(ProcessLookupError):
             self.process.send_signal(signal.SIGTERM)
 
     def kill(self) -> None:
         """Ends it now; its GMIs end with it."""
+        self.is_killed = True
         with suppress(ProcessLookupError):
             os.killpg(self.process.pid, signal.SIGKILL)
 
@@ -68,7 +71,7 @@ class Child:
         code = self.process.wait()
         if code == 0:
             return False, None
-        if code == _INTERRUPTED:
+        if code == _INTERRUPTED or self.is_killed:
             return True, None
         return False, _last_words(self.log) or f"exit code {code}"
 

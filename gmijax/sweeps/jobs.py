@@ -17,7 +17,7 @@ from gmijax.runs.folder import RunPaths, read_json
 from gmijax.runs.history import read_metrics
 from gmijax.sweeps.places import Place
 
-State: TypeAlias = Literal["waiting", "running", "completed", "failed", "interrupted"]
+State: TypeAlias = Literal["waiting", "running", "completed", "failed", "pruned", "interrupted"]
 
 DIGITS = 3
 """Of the number of a job in the names of its files; more jobs have more digits."""
@@ -28,6 +28,8 @@ class SweepPaths(RunPaths):
 
     def __init__(self, root: Path) -> None:
         super().__init__(root)
+        self.request = root / "request.json"  # What was asked: a command that goes on asks it too.
+        self.study = root / "study.log"  # Of Optuna.
         self.sweep = root / "sweep.json"  # Jobs, their states and results.
         self.table = root / "sweep.csv"  # One line a job.
         self.curves = root / "sweep.png"
@@ -45,39 +47,6 @@ class SweepPaths(RunPaths):
         return self.root / "jobs" / f"{number:0{DIGITS}d}.log"
 
 
-@dataclass(frozen=True)
-class Job:
-    """One training of a sweep.
-
-    Attributes:
-      number: from 0.
-      overrides: what makes it different from the other jobs, e.g. `{"seed": "1"}`.
-      config: of the training.
-    """
-
-    number: int
-    overrides: Mapping[str, str]
-    config: TrainConfig
-
-    @property
-    def label(self) -> str:
-        """The overrides in one line."""
-        return " ".join(f"{key}={value}" for key, value in self.overrides.items()) or "-"
-
-    @property
-    def num_gpus(self) -> int:
-        """How many GPUs it takes a place on."""
-        return self.config.plan.num_gpus
-
-    def program(self) -> str:
-        """The same for jobs that compile the same programs."""
-        data = to_dict(self.config)
-        for key in ("run", "seed", "num_timesteps", "search"):
-            del data[key]
-        data["plan"].pop("memory_fraction")
-        return repr(data)
-
-
 @dataclass
 class Progress:
     """How far a job is.
@@ -90,6 +59,7 @@ class Progress:
       wall_s: seconds of its process in this sweep.
       place: GPUs and slot where it runs, in words.
       error: why it failed, in one line.
+      curve: environment steps and objective of every line of metrics that has one.
     """
 
     state: State = "waiting"
@@ -121,6 +91,41 @@ class Progress:
         for line in read_metrics(run.metrics):
             self.take(line, sweep)
         self.env_steps_per_s = 0.0
+
+
+@dataclass(frozen=True)
+class Job:
+    """One training of a sweep.
+
+    Attributes:
+      number: from 0.
+      overrides: what makes it different from the other jobs, e.g. `{"seed": "1"}`.
+      config: of the training.
+      progress: how far it is.
+    """
+
+    number: int
+    overrides: Mapping[str, str]
+    config: TrainConfig
+    progress: Progress = field(default_factory=Progress)
+
+    @property
+    def label(self) -> str:
+        """The overrides in one line."""
+        return " ".join(f"{key}={value}" for key, value in self.overrides.items()) or "-"
+
+    @property
+    def num_gpus(self) -> int:
+        """How many GPUs it takes a place on."""
+        return self.config.plan.num_gpus
+
+    def program(self) -> str:
+        """The same for jobs that compile the same programs."""
+        data = to_dict(self.config)
+        for key in ("run", "seed", "num_timesteps", "search"):
+            del data[key]
+        data["plan"].pop("memory_fraction")
+        return repr(data)
 
 
 def jobs_of(configs: Sequence[TrainConfig]) -> tuple[Job, ...]:

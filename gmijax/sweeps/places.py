@@ -52,6 +52,10 @@ class Places:
     def __init__(self, slices: Sequence[Slice]) -> None:
         self._free = list(slices)
 
+    def has_room(self) -> bool:
+        """Whether any place is free."""
+        return bool(self._free)
+
     def take(self, num_gpus: int) -> Place | None:
         """A place on each of `num_gpus` GPUs, those with the most free ones; None: not now."""
         by_gpu: dict[int, list[Slice]] = {}

@@ -13,7 +13,7 @@ from rich.table import Table
 from gmijax.config.schema import to_dict
 from gmijax.config.sweep import SweepConfig
 from gmijax.runs.folder import write_json, write_text
-from gmijax.sweeps.jobs import Job, Progress, SweepPaths
+from gmijax.sweeps.jobs import Job, SweepPaths
 from gmijax.version import __version__
 
 CURVE_POINTS = 200
@@ -23,13 +23,12 @@ _QUARTILES = (25, 75)
 def write_report(
     status: str,
     jobs: Sequence[Job],
-    progress: Mapping[int, Progress],
     sweep: SweepConfig,
     paths: SweepPaths,
     wall_s: float,
 ) -> dict[str, Any]:
     """Writes the files; returns the content of `sweep.json`."""
-    rows = [_row(job, progress[job.number], paths) for job in jobs]
+    rows = [_row(job, paths) for job in jobs]
     done = [row for row in rows if row["state"] == "completed"]
     data = {
         "status": status,
@@ -42,7 +41,7 @@ def write_report(
     }
     write_json(paths.sweep, data)
     write_text(paths.table, _csv(rows))
-    draw_curves(jobs, progress, sweep, paths)
+    draw_curves(jobs, sweep, paths)
     return data
 
 
@@ -66,9 +65,7 @@ def ranking(rows: Sequence[Mapping[str, Any]], sweep: SweepConfig) -> Table:
     return table
 
 
-def draw_curves(
-    jobs: Sequence[Job], progress: Mapping[int, Progress], sweep: SweepConfig, paths: SweepPaths
-) -> bool:
+def draw_curves(jobs: Sequence[Job], sweep: SweepConfig, paths: SweepPaths) -> bool:
     """Draws the objective over environment steps: one line for all seeds of the same settings.
 
     The line is the interquartile mean over the seeds, the band the range between the quartiles
@@ -76,7 +73,7 @@ def draw_curves(
     """
     groups: dict[str, list[list[tuple[int, float]]]] = {}
     for job in jobs:
-        if curve := progress[job.number].curve:
+        if curve := job.progress.curve:
             own = {key: value for key, value in job.overrides.items() if key != "seed"}
             label = " ".join(f"{key}={value}" for key, value in own.items()) or "all seeds"
             groups.setdefault(label, []).append(curve)
@@ -116,7 +113,8 @@ def spread(
     return steps, (values * inside).sum(axis=0) / inside.sum(axis=0), low, high
 
 
-def _row(job: Job, progress: Progress, paths: SweepPaths) -> dict[str, Any]:
+def _row(job: Job, paths: SweepPaths) -> dict[str, Any]:
+    progress = job.progress
     return {
         "job": job.number,
         "overrides": dict(job.overrides),

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable
 
 from gmijax.config.schema import to_dict
 from gmijax.config.sweep import SweepConfig
@@ -14,8 +14,9 @@ from gmijax.runs.history import MetricsReader
 from gmijax.supervise.backends.backend import Backend
 from gmijax.supervise.launcher import StopSignals
 from gmijax.sweeps.children import Child, start, wait_for_groups
-from gmijax.sweeps.jobs import Job, Progress, SweepPaths, placed
+from gmijax.sweeps.jobs import Job, SweepPaths, placed
 from gmijax.sweeps.places import Place, Places
+from gmijax.sweeps.study import Study
 
 _TICK_S = 0.1
 _KILL_AFTER_S = 15.0
@@ -26,8 +27,8 @@ class Scheduler:
     """Starts jobs where there is room, reads how far they are, and ends them when told to.
 
     Args:
-      jobs: all of the sweep.
-      progress: of each job by its number; those that are `waiting` are run.
+      jobs: those that are known; those that are `waiting` are run. More come from the study.
+      study: see above; is told how jobs do.
       sweep: settings.
       paths: files of the sweep.
       plan: its slices are the places of the jobs.
@@ -37,16 +38,17 @@ class Scheduler:
 
     def __init__(
         self,
-        jobs: Sequence[Job],
-        progress: Mapping[int, Progress],
+        jobs: list[Job],
+        study: Study,
         sweep: SweepConfig,
         paths: SweepPaths,
         plan: Plan,
         backend: Backend,
         on_tick: Callable[[], None],
     ) -> None:
-        self._queue = [job for job in jobs if progress[job.number].state == "waiting"]
-        self._progress, self._sweep, self._paths = progress, sweep, paths
+        self._jobs, self._study = jobs, study
+        self._queue = [job for job in jobs if job.progress.state == "waiting"]
+        self._sweep, self._paths = sweep, paths
         self._plan, self._backend, self._on_tick = plan, backend, on_tick
         self._places = Places(plan.slices)
         self._running: dict[int, Child] = {}
@@ -61,12 +63,13 @@ class Scheduler:
           JobInterrupted: a signal came; all jobs have saved and ended.
         """
         try:
+            self._start_what_fits()
             while self._queue or self._running:
                 if signals.have_come:
                     self._stop(signals)
                     raise JobInterrupted("interrupted")
-                self._start_what_fits()
                 self._look()
+                self._start_what_fits()
                 self._on_tick()
                 time.sleep(_TICK_S)
         finally:
@@ -74,17 +77,25 @@ class Scheduler:
 
     def _start_what_fits(self) -> None:
         for job in list(self._queue):
-            program = job.program()
             # The others would compile the same; when it has, they find it in the cache.
-            if self._compiling.get(program, job.number) != job.number:
+            if self._compiling.get(job.program(), job.number) != job.number:
                 continue
-            place = self._places.take(job.num_gpus)
-            if place is None:
+            if not self._start_if_it_fits(job):
                 return  # In order, so that a large job is not passed by forever.
             self._queue.remove(job)
-            if program not in self._compiled:
-                self._compiling[program] = job.number
-            self._start(job, place)
+        while not self._queue and self._places.has_room() and (job := self._study.next()):
+            self._jobs.append(job)
+            if not self._start_if_it_fits(job):
+                self._queue.append(job)
+
+    def _start_if_it_fits(self, job: Job) -> bool:
+        place = self._places.take(job.num_gpus)
+        if place is None:
+            return False
+        if (program := job.program()) not in self._compiled:
+            self._compiling[program] = job.number
+        self._start(job, place)
+        return True
 
     def _start(self, job: Job, place: Place) -> None:
         run = self._paths.job(job.number)
@@ -94,8 +105,7 @@ class Scheduler:
         self._running[job.number] = child
         self._backend.started(place.slices[0].gmi, child.process.pid)
         self._readers[job.number] = MetricsReader(run.metrics)
-        progress = self._progress[job.number]
-        progress.state, progress.place = "running", place.label
+        job.progress.state, job.progress.place = "running", place.label
 
     def _variables(self, place: Place) -> dict[str, str]:
         if not place.devices:
@@ -109,23 +119,30 @@ class Scheduler:
 
     def _look(self) -> None:
         for number, child in list(self._running.items()):
-            progress = self._progress[number]
+            job, progress = child.job, child.job.progress
             progress.wall_s = child.wall_s
             for line in self._readers[number].new():
                 progress.take(line, self._sweep)
-                self._has_compiled(child.job)
+                self._has_compiled(job)
             if child.has_ended():
-                self._finish(number)
+                self._finish(child)
+            elif not child.is_pruned and self._study.is_hopeless(job):
+                child.is_pruned = True
+                child.ask_to_stop()
 
-    def _finish(self, number: int) -> None:
-        child, progress = self._running.pop(number), self._progress[number]
+    def _finish(self, child: Child) -> None:
+        job, progress = child.job, child.job.progress
+        del self._running[job.number]
         wait_for_groups([child], _KILL_AFTER_S)
-        interrupted, error = child.close()
+        is_interrupted, error = child.close()
         self._places.give_back(child.place)
-        self._has_compiled(child.job)
-        progress.read(self._paths.job(number), self._sweep)
+        self._has_compiled(job)
+        progress.read(self._paths.job(job.number), self._sweep)
         progress.place, progress.error = "", error
-        progress.state = "interrupted" if interrupted else "failed" if error else "completed"
+        progress.state = "failed" if error else "completed"
+        if is_interrupted:
+            progress.state = "pruned" if child.is_pruned else "interrupted"
+        self._study.tell(job)
 
     def _has_compiled(self, job: Job) -> None:
         """Its metrics are there, or it has ended: nobody waits for it any more."""
@@ -150,7 +167,5 @@ class Scheduler:
         left = list(self._running.values())
         for child in left:
             child.kill()
-        wait_for_groups(left, _KILL_AFTER_S)
-        for number in list(self._running):
-            self._finish(number)
-            self._progress[number].state = "interrupted"
+        for child in left:
+            self._finish(child)

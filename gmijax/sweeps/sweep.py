@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Sequence
 from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
@@ -20,12 +20,11 @@ from gmijax.errors import ConfigError, JobInterrupted, SweepFailed
 from gmijax.machine.snapshot import Machine, detect_machine
 from gmijax.partition.plan import Plan
 from gmijax.partition.planner import make_plan
-from gmijax.runs.folder import create_run, given_run, locked, read_json
+from gmijax.runs.folder import create_run, given_run, locked, read_json, write_json
 from gmijax.supervise.backends import open_backend
 from gmijax.supervise.launcher import stop_signals
 from gmijax.sweeps.jobs import (
     Job,
-    Progress,
     SweepPaths,
     jobs_of,
     require_placeable,
@@ -34,7 +33,25 @@ from gmijax.sweeps.jobs import (
 from gmijax.sweeps.leases import leased
 from gmijax.sweeps.report import ranking, write_report
 from gmijax.sweeps.scheduler import Scheduler
+from gmijax.sweeps.space import Space
+from gmijax.sweeps.study import MakeJob, NoStudy, OptunaStudy, Study
 from gmijax.sweeps.view import SweepView
+
+
+class Request(NamedTuple):
+    """A sweep to be run.
+
+    Attributes:
+      settings: how jobs share the GPUs, and what they are compared by.
+      space: what the keys of jobs may be.
+      make_job: a job with values of the space.
+      jobs: all of a grid; of another sampler some that stand for all, to be checked.
+    """
+
+    settings: SweepConfig
+    space: Space
+    make_job: MakeJob
+    jobs: tuple[Job, ...]
 
 
 class SweepResult(NamedTuple):
@@ -61,20 +78,17 @@ def sweep(configs: Sequence[TrainConfig], *, show: bool = False, **settings: Any
       settings: keys of `sweep.*`.
 
     Raises:
-      ConfigError, SweepFailed, JobInterrupted: as `run_jobs`.
+      ConfigError, SweepFailed, JobInterrupted: as `run_request`.
     """
-    return run_jobs(from_dict(SweepConfig, settings), jobs_of(configs), show=show)
+    jobs = jobs_of(configs)
+    request = Request(from_dict(SweepConfig, settings), {}, lambda n, _: jobs[n], jobs)
+    return run_request(request, show=show)
 
 
-def run_jobs(settings: SweepConfig, jobs: Sequence[Job], *, show: bool = False) -> SweepResult:
+def run_request(request: Request, *, show: bool = False) -> SweepResult:
     """Trains all jobs, as many at a time as the settings say, and compares them.
 
-    Called again with the same jobs and folder, it runs those that are not complete.
-
-    Args:
-      settings: how jobs share the GPUs, and what they are compared by.
-      jobs: at least one; all with the same `run.dir` or `run.name`, the folder of the sweep.
-      show: print live progress and the ranking.
+    Called again with the same request and folder, it runs those that are not complete.
 
     Raises:
       ConfigError: bad input, before anything was started.
@@ -82,15 +96,16 @@ def run_jobs(settings: SweepConfig, jobs: Sequence[Job], *, show: bool = False) 
       JobInterrupted: SIGINT, SIGTERM, SIGHUP or SIGUSR1 came, and all jobs have saved and ended.
     """
     started_s = time.monotonic()
-    jobs = tuple(replace(job, config=with_task(job.config)) for job in jobs)
-    machine, console = detect_machine(), open_console(show=show)
-    plan = plan_of(settings, machine)
-    require_placeable(jobs, plan.layout.num_gpus)
-    paths = _open(jobs)
+    settings, machine, console = request.settings, detect_machine(), open_console(show=show)
+    request = request._replace(jobs=tuple(map(_with_task, request.jobs)))
+    plan = plan_of(settings, machine, {job.config.plan.backend for job in request.jobs})
+    require_placeable(request.jobs, plan.layout.num_gpus)
+    paths = _open(request.jobs)
     with locked(paths.lock, f"run.dir={paths.root}"):
-        progress = _note(settings, jobs, paths)
-        _announce(console, paths, plan, jobs, progress)
-        view = SweepView(console, jobs, progress, settings)
+        jobs, study = _beginning(request, paths)
+        write_report("running", jobs, settings, paths, 0.0)
+        _announce(console, paths, plan, request, jobs)
+        view = SweepView(console, jobs, settings)
         status = "failed"
         try:
             with stop_signals() as signals, ExitStack() as held:
@@ -98,33 +113,44 @@ def run_jobs(settings: SweepConfig, jobs: Sequence[Job], *, show: bool = False) 
                 held.enter_context(leased(devices, console.print, lambda: signals.have_come))
                 backend = held.enter_context(open_backend(plan, machine, paths))
                 held.enter_context(view)
-                Scheduler(jobs, progress, settings, paths, plan, backend, view.update).run(signals)
-            failed = [job for job in jobs if progress[job.number].state != "completed"]
+                scheduler = Scheduler(jobs, study, settings, paths, plan, backend, view.update)
+                scheduler.run(signals)
+            failed = [job for job in jobs if job.progress.state == "failed"]
             status = "failed" if failed else "completed"
         except JobInterrupted as error:
             status = "interrupted"
             error.add_note(f"the same command with run.dir={paths.root} goes on")
             raise
         finally:
-            wall_s = time.monotonic() - started_s
-            report = write_report(status, jobs, progress, settings, paths, wall_s)
+            report = write_report(status, jobs, settings, paths, time.monotonic() - started_s)
     console.print(ranking(report["jobs"], settings))
     console.print(f"{view.line()}\nsummary: {paths.sweep}", markup=False)
     if failed:
-        first = progress[failed[0].number]
         raise SweepFailed(
-            f"{len(failed)} of {len(jobs)} jobs failed; job {failed[0].number}: {first.error}"
+            f"{len(failed)} of {len(jobs)} jobs failed; job {failed[0].number}: "
+            f"{failed[0].progress.error}"
         )
     return SweepResult(paths.root, report)
 
 
-def plan_of(settings: SweepConfig, machine: Machine) -> Plan:
-    """Places for jobs as the slices of GMIs that do not know each other."""
+def _with_task(job: Job) -> Job:
+    return replace(job, config=with_task(job.config))
+
+
+def plan_of(settings: SweepConfig, machine: Machine, backends: Collection[str]) -> Plan:
+    """Places for jobs as the slices of GMIs that do not know each other.
+
+    Args:
+      settings: of the sweep.
+      machine: where it is.
+      backends: `plan.backend` of the jobs; where they differ each must bring its own.
+    """
+    wanted: Any = next(iter(backends)) if len(backends) == 1 else "auto"
     gpus = settings.gpus
     if gpus is None:
         gpus = max(1, len(machine.gpus))
     try:
-        config = PlanConfig(gpus=gpus, gmis_per_gpu=settings.jobs_per_gpu)
+        config = PlanConfig(gpus=gpus, gmis_per_gpu=settings.jobs_per_gpu, backend=wanted)
         return make_plan(config, ReduceConfig(), 1, machine, template="tcg")
     except ConfigError as error:
         said = str(error).replace("plan.gmis_per_gpu", "sweep.jobs_per_gpu")
@@ -138,44 +164,56 @@ def _open(jobs: Sequence[Job]) -> SweepPaths:
     if folder is None or not folder.exists():
         return SweepPaths(create_run(run.dir, run.name, "sweep").root)
     paths = SweepPaths(folder.resolve())
-    if not paths.sweep.exists() and any(path != paths.lock for path in folder.iterdir()):
+    if not paths.request.exists() and any(path != paths.lock for path in folder.iterdir()):
         raise ConfigError(f"run.dir={folder}: is no folder of a sweep, and not empty")
     return paths
 
 
-def _note(settings: SweepConfig, jobs: Sequence[Job], paths: SweepPaths) -> dict[int, Progress]:
-    """How far the jobs are; refuses a folder with other jobs."""
-    wanted = [dict(job.overrides) for job in jobs]
-    if paths.sweep.exists():
-        there = [row["overrides"] for row in read_json(paths.sweep)["jobs"]]
-        if there != wanted:
-            raise ConfigError(
-                f"run.dir={paths.root}: holds a sweep of {len(there)} other jobs; give the same "
-                "lists, or another folder"
-            )
-    progress = {job.number: Progress() for job in jobs}
+def _beginning(request: Request, paths: SweepPaths) -> tuple[list[Job], Study]:
+    """The jobs that are known, as far as an earlier command has come, and where more come from.
+
+    Raises:
+      ConfigError: the folder holds another sweep, or a package is missing.
+    """
+    settings, wanted = request.settings, _described(request)
+    if paths.request.exists() and read_json(paths.request) != wanted:
+        raise ConfigError(
+            f"run.dir={paths.root}: holds another sweep; give the same lists, or another folder"
+        )
+    study: Study = NoStudy()
+    jobs = list(request.jobs)
+    if settings.sampler != "grid":
+        study = OptunaStudy(settings, request.space, request.make_job, paths.study)
+        jobs = [_with_task(job) for job in study.earlier()]
     for job in jobs:
-        run, own = paths.job(job.number), progress[job.number]
-        own.state = state_of(run, job.config)
-        own.read(run, settings)
-    write_report("running", jobs, progress, settings, paths, 0.0)
-    return progress
+        run = paths.job(job.number)
+        job.progress.read(run, settings)
+        job.progress.state = state_of(run, job.config)
+        if job.progress.state == "waiting" and settings.sampler != "grid":
+            job.progress.state = "pruned"  # The study knows that it has ended.
+    write_json(paths.request, wanted)
+    return jobs, study
+
+
+def _described(request: Request) -> dict[str, Any]:
+    """What must be the same where a sweep goes on."""
+    if request.settings.sampler == "grid":
+        return {"jobs": [dict(job.overrides) for job in request.jobs]}
+    sampler = {"sampler": request.settings.sampler, "seed": request.settings.seed}
+    return sampler | {"space": {key: list(values) for key, values in request.space.items()}}
 
 
 def _announce(
-    console: Console,
-    paths: SweepPaths,
-    plan: Plan,
-    jobs: Sequence[Job],
-    progress: Mapping[int, Progress],
+    console: Console, paths: SweepPaths, plan: Plan, request: Request, jobs: Sequence[Job]
 ) -> None:
-    console.print(f"sweep folder: {paths.root}", markup=False)
-    done = sum(own.state == "completed" for own in progress.values())
+    settings = request.settings
+    total = len(request.jobs) if settings.sampler == "grid" else settings.trials
+    done = sum(job.progress.state == "completed" for job in jobs)
     more = f", {done} of them complete already" if done else ""
-    gmis = len(plan.slices)
+    console.print(f"sweep folder: {paths.root}", markup=False)
     console.print(
-        f"{len(jobs)} jobs{more}, {gmis} at a time on {plan.layout.num_gpus} GPUs, backend "
-        f"{plan.backend}",
+        f"{total} jobs{more}, {len(plan.slices)} at a time on {plan.layout.num_gpus} GPUs, "
+        f"backend {plan.backend}",
         markup=False,
     )
     for reason in plan.reasons:

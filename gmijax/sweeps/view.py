@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Any, Self
 
 from rich.console import Console, Group
@@ -17,7 +17,7 @@ from gmijax.sweeps.jobs import Job, Progress
 
 _HEADINGS = ("job", "overrides", "place", "progress", "steps/s", "best", "ETA", "state")
 _MOST_ROWS = 30
-_ORDER = ("running", "failed", "interrupted", "waiting", "completed")
+_ORDER = ("running", "failed", "interrupted", "waiting", "pruned", "completed")
 
 
 class SweepView:
@@ -25,8 +25,7 @@ class SweepView:
 
     Args:
       console: nothing is shown on a quiet one.
-      jobs: all of the sweep.
-      progress: of each job by its number.
+      jobs: those that are known; more may be added to the list.
       sweep: settings.
     """
 
@@ -34,10 +33,9 @@ class SweepView:
         self,
         console: Console,
         jobs: Sequence[Job],
-        progress: Mapping[int, Progress],
         sweep: SweepConfig,
     ) -> None:
-        self._console, self._jobs, self._progress, self._sweep = console, jobs, progress, sweep
+        self._console, self._jobs, self._sweep = console, jobs, sweep
         self._started_s = time.monotonic()
         self._done_before = self._count("completed")
         self._states: dict[int, str] = {}
@@ -60,7 +58,7 @@ class SweepView:
             self._live.update(Group(self._table(), Text(self.line())))
             return
         for job in self._jobs:
-            progress = self._progress[job.number]
+            progress = job.progress
             if self._states.get(job.number, "waiting") != progress.state:
                 self._states[job.number] = progress.state
                 self._console.print(self._change(job, progress), markup=False)
@@ -70,15 +68,13 @@ class SweepView:
         hours = (time.monotonic() - self._started_s) / 3600
         done = self._count("completed") - self._done_before
         rate = sum(
-            progress.env_steps_per_s
-            for progress in self._progress.values()
-            if progress.state == "running"
+            job.progress.env_steps_per_s for job in self._jobs if job.progress.state == "running"
         )
         counts = ", ".join(f"{n} {state}" for state in _ORDER if (n := self._count(state)))
         return f"{counts}; {rate:,.0f} steps/s, {done / hours:,.1f} trainings/h"
 
     def _count(self, state: str) -> int:
-        return sum(progress.state == state for progress in self._progress.values())
+        return sum(job.progress.state == state for job in self._jobs)
 
     def _change(self, job: Job, progress: Progress) -> str:
         what = f"job {job.number} {job.label}: {progress.state}"
@@ -96,13 +92,13 @@ class SweepView:
             table.add_column(heading, no_wrap=heading != "overrides")
         rows = sorted(self._jobs, key=lambda job: _ORDER.index(self._state(job)))
         for job in rows[:_MOST_ROWS]:
-            table.add_row(*map(escape, self._row(job, self._progress[job.number])))
+            table.add_row(*map(escape, self._row(job, job.progress)))
         if len(rows) > _MOST_ROWS:
             table.add_row("", f"and {len(rows) - _MOST_ROWS} more")
         return table
 
     def _state(self, job: Job) -> str:
-        return self._progress[job.number].state
+        return job.progress.state
 
     def _row(self, job: Job, progress: Progress) -> tuple[str, ...]:
         total = job.config.num_timesteps

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import sys
 import threading
 from pathlib import Path
 from typing import Any
@@ -12,15 +13,25 @@ import pytest
 from supervision import machine
 
 from gmijax.cli.compose import compose
-from gmijax.cli.grid import build_sweep, expand
+from gmijax.cli.grid import build_sweep
 from gmijax.config.sweep import SweepConfig
 from gmijax.errors import ConfigError
 from gmijax.runs.folder import write_json
-from gmijax.sweeps.jobs import Progress, SweepPaths, jobs_of, placed, require_placeable, state_of
+from gmijax.sweeps.jobs import (
+    Job,
+    Progress,
+    State,
+    SweepPaths,
+    jobs_of,
+    placed,
+    require_placeable,
+    state_of,
+)
 from gmijax.sweeps.leases import leased
 from gmijax.sweeps.places import Places
 from gmijax.sweeps.report import ranked, spread
-from gmijax.sweeps.sweep import plan_of
+from gmijax.sweeps.study import OptunaStudy
+from gmijax.sweeps.sweep import Request, plan_of
 
 
 @pytest.mark.parametrize(
@@ -48,15 +59,22 @@ from gmijax.sweeps.sweep import plan_of
 def test_lists_become_every_combination(
     overrides: tuple[str, ...], expected: list[dict[str, str]]
 ) -> None:
-    assert expand(overrides) == expected
+    assert [dict(job.overrides) for job in build_sweep(overrides).jobs] == expected
+
+
+def test_jobs_have_the_configuration_of_the_same_single_training() -> None:
+    lists = ("env=ant,ball_balance", "seed=0,1", "algo.policy_hidden_layer_sizes=[8,8],[4]")
+    for job in build_sweep((*lists, "num_envs=512")).jobs:
+        told = [f"{key}={value}" for key, value in job.overrides.items()]
+        assert job.config == compose(*told, "num_envs=512")
 
 
 @pytest.mark.parametrize(
     ("overrides", "said"),
     [
-        (("seed=range(3,3)",), "seed: an empty list"),
+        (("seed=range(3,3)",), "an empty list"),
         (("seed=1,1",), "a value that comes twice"),
-        (("algo.learning_rate=interval(0,1)",), "expected values, not an interval"),
+        (("algo.learning_rate=interval(0,1)",), "an interval has no list of values"),
         (("seed=range(200)", "num_envs=range(1,200)"), "39,800 jobs; at most 10,000"),
         (("sweep.jobs_per_gpu=1,2",), "expected one value"),
         (("run.dir=a,b",), "expected one value"),
@@ -65,6 +83,13 @@ def test_lists_become_every_combination(
         (("seed=0,1", "algo.learnin_rate=1"), "unknown key algo.learnin_rate"),
         (("seed=0,x",), "seed"),
         (("env=ant,nobody",), "env=nobody: unknown"),
+        (("sweep.sampler=tpe", "seed=0,1"), "needs sweep.trials"),
+        (("sweep.trials=3", "seed=0,1"), "sweep.sampler=grid runs all of them"),
+        (("sweep.pruner=asha", "seed=0,1"), "not with sweep.sampler=grid"),
+        (
+            ("sweep.sampler=tpe", "sweep.trials=3", "algo.discounting=interval(0.9,2.5)"),
+            "algo.discounting=2.5",
+        ),
     ],
 )
 def test_bad_lists_are_refused(overrides: tuple[str, ...], said: str) -> None:
@@ -102,7 +127,7 @@ def test_jobs_that_place_themselves_are_refused(overrides: tuple[str, ...], said
 
 def gpu_plan(gpus: int, jobs_per_gpu: int) -> Any:
     here = machine(gpus, mps_control=Path("/usr/bin/nvidia-cuda-mps-control"))
-    return plan_of(SweepConfig(jobs_per_gpu=jobs_per_gpu), here)
+    return plan_of(SweepConfig(jobs_per_gpu=jobs_per_gpu), here, {"auto"})
 
 
 def test_jobs_go_to_the_gpu_with_most_room_and_large_ones_to_several() -> None:
@@ -212,3 +237,79 @@ def test_a_gpu_goes_to_one_sweep_at_a_time(
     assert got.wait(10.0)
     other.join()
     assert said == ["another sweep has GPU-1: waiting until it ends"]
+
+
+def study(folder: Path, *overrides: str) -> tuple[Request, OptunaStudy]:
+    request = build_sweep(overrides)
+    journal = folder / "study.log"
+    return request, OptunaStudy(request.settings, request.space, request.make_job, journal)
+
+
+TOY = ("sweep.sampler=tpe", "algo.learning_rate=tag(log,interval(1e-5,1e-2))", "sweep.trials=24")
+
+
+def toy_objective(job: Job) -> float:
+    """Best at a learning rate of 4e-3."""
+    return -abs(np.log(job.config.algo.learning_rate) - np.log(4e-3))
+
+
+def end(job: Job, state: State, value: float | None = None) -> Job:
+    job.progress.state, job.progress.value = state, value
+    return job
+
+
+def test_tpe_finds_better_than_the_default(tmp_path: Path) -> None:
+    _, trials = study(tmp_path, *TOY)
+    values = []
+    while job := trials.next():
+        values.append(toy_objective(job))
+        trials.tell(end(job, "completed", values[-1]))
+    assert len(values) == 24
+    default = toy_objective(jobs_of([compose("algo.learning_rate=1e-3")])[0])
+    assert max(values) > default
+    # It looks where it was good before.
+    assert np.median(values[-6:]) > np.median(values[:10])
+
+
+def test_a_study_goes_on_with_what_was_running(tmp_path: Path) -> None:
+    _, first = study(tmp_path, *TOY)
+    jobs = [job for _ in range(4) if (job := first.next()) is not None]
+    first.tell(end(jobs[0], "completed", 1.0))
+    first.tell(end(jobs[1], "failed"))
+    first.tell(end(jobs[2], "interrupted"))
+    _, second = study(tmp_path, *TOY)
+    assert [job.number for job in second.earlier()] == [0, 1]
+    again = [second.next(), second.next(), second.next()]
+    assert [job.number for job in again if job] == [2, 3, 4]
+    assert [job.overrides for job in again[:2] if job] == [job.overrides for job in jobs[2:]]
+
+
+@pytest.mark.parametrize("pruner", ["asha", "median"])
+def test_a_job_that_is_worse_than_others_were_is_hopeless(pruner: str, tmp_path: Path) -> None:
+    _, trials = study(tmp_path, *TOY, f"sweep.pruner={pruner}", "num_timesteps=100")
+
+    def course(value: float) -> bool:
+        job = trials.next()
+        assert job is not None
+        for steps in range(1, 101):
+            job.progress.env_steps, job.progress.value = steps, value
+            if trials.is_hopeless(job):
+                trials.tell(end(job, "pruned", value))
+                return True
+        trials.tell(end(job, "completed", value))
+        return False
+
+    assert not course(15.0)
+    hopeless = [course(float(value)) for value in (12, 13, 14, 15, 16)]
+    assert not all(hopeless)
+    assert course(-5.0)
+    _, kept = study(tmp_path, *TOY)
+    assert len(kept.earlier()) == 7
+
+
+def test_a_sampler_without_its_package_is_bad_input(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(sys.modules, "optuna", None)
+    with pytest.raises(ConfigError, match=r"pip install 'gmijax\[sweep\]'"):
+        study(tmp_path, *TOY)

@@ -1,0 +1,163 @@
+"""Where the jobs of a sweep come from: a list, or an Optuna study that looks at their results."""
+
+from __future__ import annotations
+
+import importlib
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any, Protocol
+
+from gmijax.config.sweep import SweepConfig
+from gmijax.errors import ConfigError
+from gmijax.sweeps.jobs import Job
+from gmijax.sweeps.space import Interval, Space, as_text
+
+MakeJob = Callable[[int, Mapping[str, str]], Job]
+_REPORTS = 100
+"""Values that a pruner gets of a whole job."""
+
+
+class Study(Protocol):
+    """Hands out jobs, and is told what became of them."""
+
+    def next(self) -> Job | None:
+        """Another job; None: there is none, now or any more."""
+        ...
+
+    def is_hopeless(self, job: Job) -> bool:
+        """Whether a job that runs should give its place to another one."""
+        ...
+
+    def tell(self, job: Job) -> None:
+        """A job has ended."""
+        ...
+
+
+class NoStudy:
+    """All jobs were known from the beginning."""
+
+    def next(self) -> Job | None:
+        """See `Study`."""
+        return None
+
+    def is_hopeless(self, job: Job) -> bool:
+        """See `Study`."""
+        del job
+        return False
+
+    def tell(self, job: Job) -> None:
+        """See `Study`."""
+
+
+class OptunaStudy:
+    """Jobs as the trials of an Optuna study, which a file keeps.
+
+    Trials that a killed sweep left running are handed out again first, with their numbers.
+
+    Args:
+      settings: sampler, pruner and number of trials.
+      space: what trials choose from.
+      make_job: a job with such values.
+      journal: the file.
+    """
+
+    def __init__(
+        self, settings: SweepConfig, space: Space, make_job: MakeJob, journal: Path
+    ) -> None:
+        self._settings, self._space, self._make_job = settings, space, make_job
+        self._optuna = optuna = _optuna()
+        optuna.logging.set_verbosity(optuna.logging.WARNING)
+        backend = optuna.storages.journal.JournalFileBackend(str(journal))
+        self._study = optuna.create_study(
+            study_name="sweep",
+            storage=optuna.storages.JournalStorage(backend),
+            load_if_exists=True,
+            direction=settings.direction,
+            sampler=_sampler(optuna, settings),
+            pruner=_pruner(optuna, settings),
+        )
+        self._distributions = {key: _distribution(optuna, v) for key, v in space.items()}
+        self._left = [trial for trial in self._study.trials if not trial.state.is_finished()]
+        self._trials: dict[int, Any] = {}
+        self._reported: dict[int, int] = {}
+
+    def earlier(self) -> list[Job]:
+        """The jobs of trials that have ended, as an earlier command left them."""
+        return [
+            self._make_job(trial.number, self._chosen(trial.params))
+            for trial in self._study.trials
+            if trial.state.is_finished()
+        ]
+
+    def next(self) -> Job | None:
+        """See `Study`."""
+        if self._left:
+            found = self._left.pop(0)
+            trial = self._optuna.trial.Trial(self._study, found._trial_id)
+        elif self._settings.trials is None or len(self._study.trials) >= self._settings.trials:
+            return None
+        else:
+            trial = self._study.ask(self._distributions)
+        self._trials[trial.number] = trial
+        return self._make_job(trial.number, self._chosen(trial.params))
+
+    def is_hopeless(self, job: Job) -> bool:
+        """See `Study`."""
+        trial, progress = self._trials[job.number], job.progress
+        place = _REPORTS * progress.env_steps // job.config.num_timesteps
+        if progress.value is None or place <= self._reported.get(job.number, 0):
+            return False
+        self._reported[job.number] = place
+        trial.report(progress.value, place)
+        return trial.should_prune()
+
+    def tell(self, job: Job) -> None:
+        """See `Study`."""
+        states, progress = self._optuna.trial.TrialState, job.progress
+        number = job.number
+        if progress.state == "completed" and progress.value is not None:
+            self._study.tell(number, progress.value)
+        elif progress.state == "pruned":
+            self._study.tell(number, state=states.PRUNED)
+        elif progress.state in ("completed", "failed"):
+            self._study.tell(number, state=states.FAIL)
+
+    def _chosen(self, params: Mapping[str, Any]) -> dict[str, str]:
+        chosen: dict[str, str] = {}
+        for key, values in self._space.items():
+            found = params[key]
+            chosen[key] = as_text(found, values) if isinstance(values, Interval) else found
+        return chosen
+
+
+def _optuna() -> Any:
+    try:
+        # By name, because it is not installed everywhere.
+        return importlib.import_module("optuna")
+    except ImportError:
+        raise ConfigError(
+            "sweep.sampler, sweep.pruner: need the package optuna (pip install 'gmijax[sweep]')"
+        ) from None
+
+
+def _distribution(optuna: Any, values: Any) -> Any:
+    kinds = optuna.distributions
+    if not isinstance(values, Interval):
+        return kinds.CategoricalDistribution(values.values)
+    kind = kinds.IntDistribution if values.is_integer else kinds.FloatDistribution
+    return kind(values.low, values.high, log=values.is_log)
+
+
+def _sampler(optuna: Any, settings: SweepConfig) -> Any:
+    samplers = optuna.samplers
+    if settings.sampler == "tpe":
+        # Trials that still run count as bad ones, or several at once would be nearly the same.
+        return samplers.TPESampler(seed=settings.seed, constant_liar=True)
+    return samplers.RandomSampler(seed=settings.seed)
+
+
+def _pruner(optuna: Any, settings: SweepConfig) -> Any:
+    pruners = optuna.pruners
+    if settings.pruner == "asha":
+        return pruners.SuccessiveHalvingPruner()
+    return pruners.MedianPruner() if settings.pruner == "median" else pruners.NopPruner()
