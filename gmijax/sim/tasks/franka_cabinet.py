@@ -239,7 +239,7 @@ def observe(ids: FrankaCabinetIds, state: physics.PhysicsState, pose: FrankaCabi
     """The observation [23] from the state and the poses."""
     values = jnp.concatenate(
         [
-            ids.joints.scaled(state.qpos),
+            ids.joints.scaled(state.qpos[ids.joints.qpos]),
             JOINT_VELOCITY_SCALE * state.qvel[ids.joints.qvel],
             pose.handle - pose.grasp,
             state.qpos[ids.drawer_joint.qpos],

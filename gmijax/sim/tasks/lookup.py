@@ -36,9 +36,9 @@ class Joints:
     lower: npt.NDArray[np.float32]
     upper: npt.NDArray[np.float32]
 
-    def scaled(self, qpos: Array) -> Array:
-        """Positions [J] in `qpos` [nq], -1 at the lower limit and 1 at the upper one."""
-        return (2.0 * qpos[self.qpos] - self.upper - self.lower) / (self.upper - self.lower)
+    def scaled(self, positions: Array) -> Array:
+        """`positions` [J], -1 at the lower limit and 1 at the upper one."""
+        return (2.0 * positions - self.upper - self.lower) / (self.upper - self.lower)
 
 
 def find_joints(mj_model: mujoco.MjModel, names: Sequence[str]) -> Joints:

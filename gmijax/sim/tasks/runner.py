@@ -98,6 +98,7 @@ def pose_of(ids: RunnerIds, state: physics.PhysicsState) -> RunnerPose:
     # to drifting sideways, which can only be an oversight.
     angle = jnp.arctan2(to_target[1], to_target[0]) - yaw
     forward = rotations.rotate(quat, jnp.array([1.0, 0.0, 0.0]))
+    joints = state.qpos[ids.joints.qpos]
     return RunnerPose(
         position=position,
         velocity=rotations.rotate_back(quat, state.qvel[:3]),
@@ -107,7 +108,7 @@ def pose_of(ids: RunnerIds, state: physics.PhysicsState) -> RunnerPose:
         angle_to_target=rotations.wrap(angle),
         upright=1.0 - 2.0 * (quat[1] ** 2 + quat[2] ** 2),
         heading=forward[:2] @ to_target / jnp.linalg.norm(to_target),
-        joints=ids.joints.scaled(state.qpos),
+        joints=ids.joints.scaled(joints),
         joint_velocities=state.qvel[ids.joints.qvel],
     )
 

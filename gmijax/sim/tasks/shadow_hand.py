@@ -270,11 +270,11 @@ def observe(
     ids: ShadowHandIds, state: physics.PhysicsState, touch: Touch, goal: Array, action: Array
 ) -> Array:
     """The observation [211] from the state, the goal [4] and the last action [20]."""
-    cube = cube_of(ids, state)
+    joints, cube = state.qpos[ids.joints.qpos], cube_of(ids, state)
     to_cube = rotations.product(cube.quat, rotations.conjugate(goal))
     values = jnp.concatenate(
         [
-            ids.joints.scaled(state.qpos),
+            ids.joints.scaled(joints),
             VELOCITY_SCALE * state.qvel[ids.joints.qvel],
             JOINT_TORQUE_SCALE * touch.joint_torques,
             *(cube.position, cube.quat, cube.velocity, VELOCITY_SCALE * cube.angular_velocity),
