@@ -14,9 +14,9 @@ import jax.numpy as jnp
 from gmijax.a3c.returns import Returns, n_step_returns, vtrace
 from gmijax.config import A3cConfig
 from gmijax.learning.learner import Learner, TrainState, acting_moments
-from gmijax.learning.losses import bound_loss, clipped_surrogate
 from gmijax.learning.normalize import Moments, moments_of, normalize, without_outliers
 from gmijax.learning.policy import ActorCritic, ActorCriticParams, entropy, kl_divergence, log_prob
+from gmijax.learning.updates import bound_loss, clipped_surrogate
 from gmijax.types import Array
 
 A3cLearner: TypeAlias = Learner[A3cConfig]

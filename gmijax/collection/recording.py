@@ -14,8 +14,8 @@ import jax
 import numpy as np
 
 from gmijax.collection.programs import Counts, Step
-from gmijax.learning.metrics import EpisodeWindow, JsonlSink
 from gmijax.learning.physics_health import OverflowCount, check_diverged, overflow_line
+from gmijax.learning.training_log import EpisodeWindow, JsonlSink
 from gmijax.runs.dataset import DataPaths
 from gmijax.runs.folder import write_json
 from gmijax.supervise.child import ChildLink

@@ -291,7 +291,7 @@ def _warp(system: SystemInfo) -> Iterator[str]:
     found, wanted = system.versions.get("warp-lang"), system.wanted_warp
     command = "(pip install 'gmijax[warp]')"
     if found is None:
-        faster = ", ".join(sorted(task for task, how in ON_GPU.items() if how.auto == "warp"))
+        faster = ", ".join(sorted(ON_GPU))
         yield f"MJX-Warp is the faster physics for {faster}: needs warp-lang {command}"
     elif wanted is not None and found != wanted:
         yield f"MJX-Warp was made for warp-lang {wanted}, and {found} is installed {command}"

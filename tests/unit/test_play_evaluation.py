@@ -166,6 +166,11 @@ def test_a_renderer_that_fails_for_another_reason_says_why(
         pictures.film(config_of("video=auto"), paths, quiet)
 
 
+def test_a_film_that_was_asked_for_of_a_task_without_a_model_is_an_error(quiet: Console):
+    with pytest.raises(GmijaxError, match="point has no model that could be filmed; the returns"):
+        evaluation._accept_nothing_to_see(config_of("video=gif"), "point", quiet)
+
+
 def test_a_missing_opengl_is_noticed_by_the_child(tmp_path: Path):
     pytest.importorskip("mujoco")
     write_json(RunPaths(tmp_path).config, to_dict(config_of()))
