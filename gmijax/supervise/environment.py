@@ -59,8 +59,9 @@ def gmi_environment(
     kept = {name: value for name, value in inherited.items() if name not in dropped}
     # One thread beside a GPU: there the host only moves small arrays, and the GMIs of all GPUs
     # share the cores.
-    defaults = dict.fromkeys(_THREAD_LIMITS, str(len(share.cpus) or 1))
-    defaults[COMPILATION_CACHE] = str(cache_dir)
+    defaults: dict[str, str] = {COMPILATION_CACHE: str(cache_dir)}
+    for name in _THREAD_LIMITS:
+        defaults[name] = str(len(share.cpus) or 1)
     if plan.backend == "cpu":
         own = _cpu(share, inherited.get(_XLA_FLAGS, ""))
     else:
