@@ -8,7 +8,7 @@ from __future__ import annotations
 import dataclasses
 import shutil
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import Any, Final
 
 from gmijax.autotune.grid import Measured, NotRunnable, Point
@@ -18,7 +18,7 @@ from gmijax.errors import ConfigError, GmijaxError, JobInterrupted
 from gmijax.machine.snapshot import Machine
 from gmijax.runs.folder import RunPaths, write_json
 from gmijax.supervise.gmi_process import GmiStatus
-from gmijax.supervise.launcher import Launch, run_gmis
+from gmijax.supervise.launcher import Launch, OnTick, run_gmis
 from gmijax.supervise.supervisor import Timeouts
 
 _TIMEOUTS: Final = Timeouts(
@@ -38,7 +38,7 @@ def profile(
     run: RunPaths,
     *,
     limit_s: float,
-    on_tick: Callable[[Sequence[GmiStatus]], None],
+    on_tick: OnTick,
     on_warning: Callable[[str], None],
 ) -> Measured | NotRunnable:
     """Runs a short job at a point; `run` is its folder, of which logs are kept.
@@ -54,14 +54,6 @@ def profile(
         return NotRunnable(str(error))
     write_json(run.config, to_dict(config))
     write_json(run.plan, plan.to_dict())
-    deadline_s = time.monotonic() + limit_s
-
-    def watch(gmis: tuple[GmiStatus, ...]) -> None:
-        on_tick(gmis)
-        if time.monotonic() > deadline_s:
-            states = ", ".join(f"GMI {gmi.gmi} {gmi.state}" for gmi in gmis)
-            raise ProfileLate(f"no end within {limit_s:.0f} s ({states})")
-
     launch = Launch(
         plan=plan,
         machine=machine,
@@ -74,7 +66,7 @@ def profile(
         is_enough=workload.enough(plan, run),
     )
     try:
-        run_gmis(launch, watch)
+        run_gmis(launch, _until(limit_s, on_tick))
         return workload.read(plan, run)
     except JobInterrupted:
         raise
@@ -85,3 +77,16 @@ def profile(
         return NotRunnable(f"no result to read: {type(error).__name__}: {error}")
     finally:
         shutil.rmtree(run.checkpoints, ignore_errors=True)
+
+
+def _until(limit_s: float, on_tick: OnTick) -> OnTick:
+    """`on_tick`, which raises ProfileLate once `limit_s` is over."""
+    deadline_s = time.monotonic() + limit_s
+
+    def watch(gmis: tuple[GmiStatus, ...]) -> None:
+        on_tick(gmis)
+        if time.monotonic() > deadline_s:
+            states = ", ".join(f"GMI {gmi.gmi} {gmi.state}" for gmi in gmis)
+            raise ProfileLate(f"no end within {limit_s:.0f} s ({states})")
+
+    return watch

@@ -14,7 +14,7 @@ from compile_options import CPU_OPTIONS
 
 from gmijax.cli.compose import compose
 from gmijax.config import EnvConfig
-from gmijax.config.randomization import RANDOMIZED_LEAVES, LeafRange
+from gmijax.config.env import RANDOMIZED_LEAVES, LeafRange
 from gmijax.config.schema import from_dict
 from gmijax.errors import ConfigError
 from gmijax.sim import episode, physics, wrappers
