@@ -5,25 +5,21 @@ Whatever goes wrong in the job is an answer, not an error.
 
 from __future__ import annotations
 
-import dataclasses
 import shutil
 import time
 from collections.abc import Callable
-from typing import Any, Final
+from typing import Any
 
 from gmijax.autotune.grid import Measured, NotRunnable, Point
 from gmijax.autotune.workloads import Mode, Workload
 from gmijax.config.schema import to_dict
 from gmijax.errors import ConfigError, GmijaxError, JobInterrupted
 from gmijax.machine.snapshot import Machine
+from gmijax.partition.plan import Plan
 from gmijax.runs.folder import RunPaths, write_json
 from gmijax.supervise.gmi_process import GmiStatus
 from gmijax.supervise.launcher import Launch, OnTick, run_gmis
 from gmijax.supervise.supervisor import Timeouts
-
-_TIMEOUTS: Final = Timeouts(
-    start_timeout_s=60.0, stall_timeout_s=60.0, stop_timeout_s=3.0, grace_s=3.0
-)
 
 
 class ProfileLate(Exception):
@@ -54,17 +50,7 @@ def profile(
         return NotRunnable(str(error))
     write_json(run.config, to_dict(config))
     write_json(run.plan, plan.to_dict())
-    launch = Launch(
-        plan=plan,
-        machine=machine,
-        run=run,
-        kind=workload.kind,
-        timeouts=dataclasses.replace(
-            _TIMEOUTS, start_timeout_s=2 * limit_s, stall_timeout_s=2 * limit_s
-        ),
-        on_warning=on_warning,
-        is_enough=workload.enough(plan, run),
-    )
+    launch = _launch(workload, plan, machine, run, limit_s, on_warning)
     try:
         run_gmis(launch, _until(limit_s, on_tick))
         return workload.read(plan, run)
@@ -77,6 +63,28 @@ def profile(
         return NotRunnable(f"no result to read: {type(error).__name__}: {error}")
     finally:
         shutil.rmtree(run.checkpoints, ignore_errors=True)
+
+
+def _launch(
+    workload: Workload[Any],
+    plan: Plan,
+    machine: Machine,
+    run: RunPaths,
+    limit_s: float,
+    on_warning: Callable[[str], None],
+) -> Launch:
+    never_s = 2 * limit_s  # The profile's own limit comes before those of its GMIs.
+    return Launch(
+        plan=plan,
+        machine=machine,
+        run=run,
+        kind=workload.kind,
+        timeouts=Timeouts(
+            start_timeout_s=never_s, stall_timeout_s=never_s, stop_timeout_s=3.0, grace_s=3.0
+        ),
+        on_warning=on_warning,
+        is_enough=workload.enough(plan, run),
+    )
 
 
 def _until(limit_s: float, on_tick: OnTick) -> OnTick:
