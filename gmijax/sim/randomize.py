@@ -20,7 +20,7 @@ import numpy.typing as npt
 from mujoco import mjx
 
 from gmijax.config import EnvConfig
-from gmijax.config.randomization import NEVER_ZERO, RANDOMIZED_LEAVES, LeafRange
+from gmijax.config.env import NEVER_ZERO, RANDOMIZED_LEAVES, LeafRange
 from gmijax.errors import ConfigError
 from gmijax.sim.interface import Env
 from gmijax.sim.registry import make_env

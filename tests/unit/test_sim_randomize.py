@@ -15,7 +15,7 @@ from toy_env import point_mass_env
 
 from gmijax.cli.compose import compose
 from gmijax.config import EnvConfig
-from gmijax.config.randomization import RANDOMIZED_LEAVES, LeafRange
+from gmijax.config.env import RANDOMIZED_LEAVES, LeafRange
 from gmijax.config.schema import from_dict
 from gmijax.errors import ConfigError
 from gmijax.sim import episode, physics, wrappers
