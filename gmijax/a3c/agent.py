@@ -18,7 +18,6 @@ import numpy.typing as npt
 
 from gmijax.a3c.a3c import Unrolls
 from gmijax.a3c.job_registers import JobRegisters, Orders, Report
-from gmijax.a3c.outgoing import Outgoing
 from gmijax.a3c.rollout import UnrollPrograms, num_counts
 from gmijax.collectives.channel.sender import Sender
 from gmijax.config import A3cConfig, TrainConfig
@@ -39,6 +38,9 @@ from gmijax.supervise.child import ChildLink
 from gmijax.types import Array
 
 _PAUSE_S = 0.02
+_POLL_S = 0.0002
+_SLICE_S = 0.5
+"""Longest wait for room before the agent looks for orders again."""
 
 
 class _Sent(NamedTuple):
@@ -50,17 +52,7 @@ class _Sent(NamedTuple):
 
 
 class Agent:
-    """One serving GMI.
-
-    Args:
-      config: of the run.
-      env: its environments.
-      index: place among the agents, 0 for the first.
-      trainers: ids of the GMIs that train, for messages.
-      registers: of the job.
-      sender: of experience.
-      link: to the controller.
-    """
+    """One serving GMI, number `index` of the agents; `trainers` are named in errors."""
 
     def __init__(
         self,
@@ -80,7 +72,6 @@ class Agent:
         self._trainers = trainers
         self._registers = registers
         self._sender = sender
-        self._outgoing = Outgoing(config, config.algo, sender)
         self._link = link
         self._learner = make_learner(env.spec, config.algo)
         self._report = Report(
@@ -91,6 +82,7 @@ class Agent:
         self._weights_seen = 0
         self._version = 0
         self._unrolls = 0
+        self._wait_s = 0.0
 
     def run(self) -> dict[str, Any]:
         """Acts until the leading trainer ends the job.
@@ -124,7 +116,7 @@ class Agent:
             "unrolls": self._unrolls,
             "wall_s": time.monotonic() - started,
             "send_s": self._report.send_s,
-            "wait_s": self._outgoing.waited_s,
+            "wait_s": self._wait_s,
             "dropped": int(self._report.dropped),
             "compile_s": compile_s,
             "device": describe_device(),
@@ -179,14 +171,15 @@ class Agent:
         if not self._hand_over(arrays, unroll.version, env_state, started):
             return
         sender, occupancy = self._sender, self._sender.occupancy()
-        self._outgoing.flush_if_starving()
+        if not sender.least_occupancy():  # A trainer has nothing to do: it need not wait for more.
+            sender.flush()
         self._unrolls += 1
         self._report = self._report._replace(
             env_steps=self._report.env_steps + arrays["reward"].size,
             bytes_sent=float(sender.num_bytes),
             dropped=float(sender.dropped),
             send_s=self._report.send_s + time.monotonic() - started,
-            wait_s=self._outgoing.waited_s,
+            wait_s=self._wait_s,
             occupancy=occupancy,
             stats=self._report.stats + stats,
         )
@@ -203,7 +196,7 @@ class Agent:
         """Sends an unroll; False if the job ends and nobody wants it any more."""
         limit_s = self._config.reduce.timeout_s
         try:
-            while not self._outgoing.offer(arrays, version, partial(_is_idle, env_state)):
+            while not self._offer(arrays, version, env_state):
                 # Trainers that wait for a checkpoint make no room until it is complete.
                 if self._obey(env_state):
                     return False
@@ -216,19 +209,47 @@ class Agent:
             return False
         return True
 
+    def _offer(
+        self, arrays: dict[str, npt.NDArray[Any]], version: int, env_state: BatchState
+    ) -> bool:
+        """Whether the channels took an unroll within a moment; waits on an idle device count."""
+        if self._is_ahead(arrays, env_state):
+            return False
+        costs, before_s = _is_idle(env_state), self._sender.waited_s
+        is_sent = self._sender.send(arrays, version, _SLICE_S)
+        if costs:
+            self._wait_s += self._sender.waited_s - before_s
+        return is_sent
+
+    def _is_ahead(self, arrays: dict[str, npt.NDArray[Any]], env_state: BatchState) -> bool:
+        """Waits a moment while `max_ahead` unrolls wait for every trainer; whether they still do.
+
+        More of them in the channel would only make experience older.
+        """
+        channel = self._config.channel
+        if channel.when_full != "block":
+            return False
+        size = sum(array.nbytes for array in arrays.values())
+        most = (self._algo.max_ahead - 0.5) * size / channel.capacity_bytes
+        deadline_s = time.monotonic() + _SLICE_S
+        while self._sender.least_occupancy() > most:
+            costs, now_s = _is_idle(env_state), time.monotonic()
+            if now_s > deadline_s:
+                return True
+            time.sleep(_POLL_S)
+            if costs:
+                self._wait_s += time.monotonic() - now_s
+        return False
+
     def _obey(self, env_state: BatchState) -> bool:
         """Adds to the checkpoint that is wanted, if any; returns whether the job ends."""
         self._look()
-        if self._orders.checkpoint not in (None, self._report.checkpoint):
-            self._save(env_state)
-        return self._orders.is_ending
-
-    def _save(self, env_state: BatchState) -> None:
         steps = self._orders.checkpoint
-        assert steps is not None
-        save_envs(self._link.run, steps, self._link.gmi, env_state)
-        self._report = self._report._replace(checkpoint=steps)
-        self._publish()
+        if steps is not None and steps != self._report.checkpoint:
+            save_envs(self._link.run, steps, self._link.gmi, env_state)
+            self._report = self._report._replace(checkpoint=steps)
+            self._publish()
+        return self._orders.is_ending
 
     def _look(self) -> bool:
         """Takes up new orders; returns whether there ever were any."""

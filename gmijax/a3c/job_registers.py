@@ -19,10 +19,8 @@ _NO_CHECKPOINT = -1
 class Orders(NamedTuple):
     """What the leading trainer wants of all agents.
 
-    Attributes:
-      checkpoint: environment steps of the checkpoint to which every agent is to add its
-        environments, None for none.
-      is_ending: whether agents are to end when they have done so.
+    To add their environments to the `checkpoint` of so many environment steps, if there is one,
+    and whether to end when they have done so.
     """
 
     checkpoint: int | None

@@ -32,15 +32,9 @@ _PAUSE_S = 0.02
 
 
 class Leader:
-    """The duties of the first trainer, beside training.
+    """The duties of the first trainer, beside training, from `env_steps` on.
 
-    Args:
-      config: of the run.
-      env: one of the environments, for its names.
-      registers: of the job.
-      link: to the controller.
-      agents: ids of the GMIs that act, in the order of their reports.
-      env_steps: learnt from so far.
+    `agents` are in the order of their reports.
     """
 
     def __init__(

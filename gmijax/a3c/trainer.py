@@ -14,11 +14,10 @@ import jax.numpy as jnp
 import numpy as np
 import numpy.typing as npt
 
-from gmijax.a3c.a3c import Unrolls
+from gmijax.a3c.a3c import Unrolls, make_update
 from gmijax.a3c.job_registers import JobRegisters
 from gmijax.a3c.leader import Leader
 from gmijax.a3c.report import MAX_COUNTED, BatchCounts, UpdateFigures, histogram_of
-from gmijax.a3c.update import make_update
 from gmijax.collectives.channel.batcher import Batch, Batcher
 from gmijax.collectives.interface import Reducer
 from gmijax.config import A3cConfig, TrainConfig
@@ -35,16 +34,9 @@ _SLICE_S = 0.5
 
 
 class Trainer:
-    """One training GMI.
+    """One training GMI; `env` is not stepped, it is there for its sizes.
 
-    Args:
-      config: of the run.
-      env: one of the environments, for its sizes; it is not stepped.
-      agents: ids of the GMIs that act.
-      registers: of the job.
-      receiver: of experience.
-      reducer: among the trainers.
-      link: to the controller.
+    `receiver` gives it the experience of `agents`, and `reducer` is among the trainers.
     """
 
     def __init__(

@@ -14,14 +14,7 @@ from gmijax.supervise.child import ChildLink
 
 
 class Gmi:
-    """This process as one of the GMIs of a job: talks to the others and to the controller.
-
-    What the methods do, see `Role`. Messages and collective calls count as progress.
-
-    Attributes:
-      layout: GPU -> GMIs.
-      rank: id of this GMI.
-    """
+    """This process as GMI `rank` of a job; what the methods do, see `Role`."""
 
     def __init__(
         self, layout: Layout, messenger: Messenger, reducer: GroupReducer, link: ChildLink
@@ -35,7 +28,7 @@ class Gmi:
 
     @property
     def stop_requested(self) -> bool:
-        """Whether the controller asked for an end."""
+        """See `Role.stop_requested`."""
         return self._link.stop_requested
 
     def reduce(self, data: Any, op: Operation, group: Iterable[int] | None) -> Any:
@@ -72,11 +65,7 @@ def enter(gmi: Gmi) -> None:
 
 
 def here(what: str) -> Gmi:
-    """The GMI that this process is.
-
-    Raises:
-      ConfigError: it is none, so that `what` makes no sense.
-    """
+    """The GMI that this process is; ConfigError if it is none, so that `what` makes no sense."""
     if not _here:
         raise ConfigError(f"{what}: only inside a GMI, in the role's run; see gmijax.launch")
     return _here[0]
@@ -100,13 +89,9 @@ class Role(ABC):
 
     @abstractmethod
     def run(self, *args: Any) -> Any:
-        """The routine of the GMI.
+        """The routine of the GMI; `args` are what `gmijax.launch` got after the role.
 
-        Args:
-          args: what `gmijax.launch` got after the role.
-
-        Returns:
-          Anything that can be pickled; `launch` returns it. Arrays of jax come back as numpy's.
+        It returns anything that can be pickled; arrays of jax come back from `launch` as numpy's.
         """
 
     @property
@@ -178,13 +163,8 @@ class Role(ABC):
     def recv(self, src: int, timeout_s: float | None = None) -> Any:
         """Waits for the next message of GMI `src`, and returns it.
 
-        Args:
-          src: id of a GMI.
-          timeout_s: longest wait; None: what `gmijax.launch` was told.
-
-        Returns:
-          What was sent; its arrays are this GMI's own. Those of jax are jax's still where they
-          could stay on the GPU, and numpy's else.
+        Its arrays are this GMI's own; those of jax are jax's still where they could stay on the
+        GPU, and numpy's else. With `timeout_s=None` the wait is what `gmijax.launch` was told.
 
         Raises:
           PeerLost: that GMI is gone, and has left no message.
@@ -193,8 +173,5 @@ class Role(ABC):
         return here("recv").recv(src, timeout_s)
 
     def progress(self, step: int) -> None:
-        """Tells the controller how far this GMI is; cheap enough for every step.
-
-        Messages and collective calls count as progress by themselves.
-        """
+        """Reports how far this GMI is, as messages and collective calls do; cheap."""
         here("progress").progress(step)

@@ -41,19 +41,8 @@ class Batcher:
     """A trainer's end of the channels: makes batches of unrolls from several agents, in turn.
 
     A batch that lies in one transfer is a slice of it, without a copy, and holds its memory until
-    the next batch is asked for. Otherwise unrolls are stacked in memory of the batcher's own.
-
-    Args:
-      rank: of this trainer.
-      sources: the ways from all agents, each with what reads its messages.
-      new_stack: makes, from a spec and a size, what batches of several arrivals are stacked in.
-      held: closed at the end.
-
-    Attributes:
-      batches: given out.
-      unrolls: environments' unrolls that arrived.
-      transfers: messages that arrived.
-      num_bytes: in all channels, as they travelled.
+    the next batch is asked for. Otherwise unrolls are stacked in what `new_stack` makes.
+    It counts `batches` given out, `unrolls`, `transfers` and `num_bytes` that arrived.
     """
 
     def __init__(
@@ -186,16 +175,13 @@ class _Arrival:
         self.release = release
         self._transfer = transfer
         self._agents = agents
-        self._taken = 0
-
-    @property
-    def left(self) -> int:
-        return self._transfer.num_envs - self._taken
+        self.left = transfer.num_envs
 
     def take(self, count: int) -> Batch:
         """The next unrolls, as they travelled."""
-        low, high = self._taken, self._taken + count
-        self._taken = high
+        low = self._transfer.num_envs - self.left
+        high = low + count
+        self.left -= count
         arrays = self._transfer.arrays
         if count < self._transfer.num_envs:  # A part of an array on a device is a copy.
             arrays = {name: array[:, low:high] for name, array in arrays.items()}
@@ -203,16 +189,7 @@ class _Arrival:
 
 
 class Stack:
-    """A batch that is put together from several arrivals, here in host memory.
-
-    Args:
-      spec: the channels.
-      size: B, unrolls of the batch.
-
-    Attributes:
-      spec, size: the same.
-      filled: unrolls that are in it.
-    """
+    """A batch of `size` unrolls from several arrivals, here in host memory; `filled` are in it."""
 
     def __init__(self, spec: Spec, size: int) -> None:
         self.spec, self.size = spec, size

@@ -35,18 +35,10 @@ WORTH_IT = 0.95
 
 
 class TransferSize:
-    """Doubles the size as long as a byte gets cheaper, then keeps the best.
+    """Doubles `num_bytes` as long as a byte gets cheaper, then keeps the best; or keeps to a size.
 
     The price of a transfer is fixed plus so much a byte, so that there is no use in going on
     once it has stopped falling; larger transfers only make experience older.
-
-    Args:
-      fixed_bytes: a size to keep to; None: found by trying.
-      max_bytes: largest size to try.
-
-    Attributes:
-      num_bytes: the size to use now.
-      is_settled: whether it will not change any more.
     """
 
     def __init__(self, fixed_bytes: int | None, max_bytes: int) -> None:
@@ -77,18 +69,10 @@ class TransferSize:
 class Compressor:
     """Fills transfers with pieces, one transfer at a time; a `Packer`.
 
-    Args:
-      migrator: gives transfers their way and their memory.
-      size: how large they should be.
-      max_transfer_bytes: largest sum of all channels and the table's rows for pieces.
-
-    Attributes:
-      transfers: number handed over.
-      num_bytes: in their channels.
+    `max_transfer_bytes` bounds the sum of all channels and the table's rows for pieces.
     """
 
     def __init__(self, migrator: Migrator, size: TransferSize, max_transfer_bytes: int) -> None:
-        self.transfers = self.num_bytes = 0
         self._migrator = migrator
         self._size = size
         self._max_transfer_bytes = max_transfer_bytes
@@ -117,8 +101,6 @@ class Compressor:
         started_s = time.perf_counter()
         num_bytes = transfer.commit()
         self._size.record(num_bytes, transfer.spent_s + time.perf_counter() - started_s)
-        self.transfers += 1
-        self.num_bytes += num_bytes
 
     def _begin(self, piece: Piece) -> _OpenTransfer | None:
         # With its row of the table, which may be larger than a small piece.
@@ -178,14 +160,7 @@ class _OpenTransfer:
 
 
 class Transfer(NamedTuple):
-    """A transfer as the trainer reads it.
-
-    Attributes:
-      spec: the channels.
-      num_envs: of all pieces together.
-      versions: [num_envs] int64.
-      arrays: by channel, [S, num_envs, ...] as they travelled; views.
-    """
+    """A transfer as the trainer reads it: versions [N] int64, and views [S, N, ...] by channel."""
 
     spec: Spec
     num_envs: int
@@ -195,7 +170,7 @@ class Transfer(NamedTuple):
 
 def read_transfer(message: Message) -> Transfer:
     """What a `Compressor` made; a `Decode`."""
-    head, table, *parts = message.parts
+    head, table, *parts = message
     spec, table = Spec.decode(head), table.view(np.int64).reshape(-1, 2)
     room, pieces = table[0].tolist()
     counts, versions = table[1 : 1 + pieces].T

@@ -19,12 +19,7 @@ W = TypeVar("W", bound=ChannelWriter)
 
 
 class Migrator(Generic[W]):
-    """Routes the transfers of one agent.
-
-    Args:
-      writers: the ways to all trainers.
-      near: ranks of the trainers on the agent's GPU.
-    """
+    """Routes the transfers of one agent over `writers`; `near` are ranks on the agent's GPU."""
 
     def __init__(self, writers: Sequence[W], near: Sequence[int]) -> None:
         self._writers = tuple(writers)

@@ -44,15 +44,9 @@ def slot_offsets(spec: Spec, num_envs: int) -> tuple[list[int], int]:
 
 
 class SlotWriter(PipeWriter):
-    """The way to one trainer: notes, and slots that are used in turn.
+    """The way to one trainer: notes through a pipe, and slots that are used in turn.
 
-    Args:
-      block: of the pipes that the notes travel through.
-      peer: rank of the trainer.
-      capacity_bytes: GPU memory for it.
-
-    Attributes:
-      num_slots, slot_bytes: set when the first rollout shows how large it is.
+    The first rollout shows how large `num_slots` and `slot_bytes` are.
     """
 
     def __init__(self, block: PipeBlock, peer: int, capacity_bytes: int) -> None:
@@ -79,11 +73,8 @@ class SlotWriter(PipeWriter):
 class ResidentPacker:
     """Leaves rollouts on the device; a `Packer`.
 
-    Args:
-      migrator: the ways to the agent's trainers, all on its GPU.
-      writers: the same ways.
-      capacity_bytes: GPU memory for each trainer.
-      new_memory: how the processes share memory of the GPU.
+    `writers` are the ways of `migrator`, all to trainers on the agent's GPU, with
+    `capacity_bytes` of its memory for each.
     """
 
     def __init__(
@@ -93,7 +84,6 @@ class ResidentPacker:
         capacity_bytes: int,
         new_memory: NewMemory,
     ) -> None:
-        self.transfers = self.num_bytes = 0
         self._migrator = migrator
         self._writers = tuple(writers)
         self._capacity_bytes = capacity_bytes
@@ -126,8 +116,6 @@ class ResidentPacker:
         views[1][:] = np.frombuffer(self._ticket, np.uint8)
         views[2].view(NOTE)[0] = (offset, piece.num_envs, piece.version)
         writer.commit()
-        self.transfers += 1
-        self.num_bytes += self._slot_bytes
         return True
 
     def flush(self) -> None:
@@ -182,11 +170,12 @@ class ResidentDecoder:
         Raises:
           CudaError: the agent's memory cannot be read here.
         """
-        spec = Spec.decode(message.parts[0])
-        offset, num_envs, version = message.parts[2].view(NOTE)[0].tolist()
+        head, ticket, note = message
+        spec = Spec.decode(head)
+        offset, num_envs, version = note.view(NOTE)[0].tolist()
         if self._memory is None:
             self._memory = self._new_memory()
-            self._memory.open(message.parts[1].tobytes())
+            self._memory.open(ticket.tobytes())
         if offset not in self._views:
             self._views[offset] = {
                 channel.name: self._memory.view(

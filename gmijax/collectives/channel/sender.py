@@ -19,15 +19,7 @@ CLOSE_TIMEOUT_S = 5.0
 
 
 class Packer(Protocol):
-    """What makes messages of pieces: a `Compressor`, or what takes its place.
-
-    Attributes:
-      transfers: messages committed.
-      num_bytes: in all channels, as they travel.
-    """
-
-    transfers: int
-    num_bytes: int
+    """What makes messages of pieces: a `Compressor`, a `UniPacker` or a `ResidentPacker`."""
 
     def try_add(self, piece: Piece) -> bool:
         """Takes `piece`, or says that there is no room; then the same piece must come again."""
@@ -35,24 +27,18 @@ class Packer(Protocol):
 
     def flush(self) -> None:
         """Hands over what waits for more to come."""
-        ...
 
 
 class Sender:
-    """An agent's end of the channels.
+    """An agent's end of the channels; `held` is closed with it.
 
-    Args:
-      dispenser: splits rollouts.
-      packer: makes messages of the pieces.
-      migrator: the ways to the trainers.
-      max_waiting: None: `send` waits for room and nothing is ever dropped. Otherwise it never
-        waits: what finds no room is copied and queued, and a queue of more pieces than this
-        loses its oldest. What is in the channel already is a trainer's and stays.
-      on_device: see below.
-      held: closed at the end.
+    With `max_waiting=None`, `send` waits for room and nothing is ever dropped. Otherwise it never
+    waits: what finds no room is copied and queued, and a queue of more pieces than this loses
+    its oldest. What is in the channel already is a trainer's and stays.
 
     Attributes:
       on_device: whether it takes arrays of the device; otherwise numpy's.
+      num_bytes: sent, in all channels, as they travel.
       dropped: pieces that nobody gets, with `max_waiting`; after `close` also those that still
         waited.
       waited_s: time spent waiting for room.
@@ -75,7 +61,7 @@ class Sender:
         self._max_waiting = max_waiting
         self._held = held
         self._waiting: deque[Piece] = deque()
-        self.dropped = 0
+        self.num_bytes = self.dropped = 0
         self.waited_s = 0.0
         self._is_pending = False
         self._is_open = True
@@ -89,8 +75,8 @@ class Sender:
           timeout_s: longest wait for room (`when_full=block`).
 
         Returns:
-          False if no trainer made room in time. Then, and after an error, a part may have been
-          sent: call it again with the same experience until it is done, or send nothing any more.
+          False if no trainer made room in time. Then, and after an error, call it again with the
+          same experience until it is done: a part may have been sent.
 
         Raises:
           PeerLost: the process of a trainer is gone.
@@ -113,16 +99,6 @@ class Sender:
     def flush(self) -> None:
         """Hands over what waits for more to come; trainers cannot see it before."""
         self._packer.flush()
-
-    @property
-    def transfers(self) -> int:
-        """Messages committed."""
-        return self._packer.transfers
-
-    @property
-    def num_bytes(self) -> int:
-        """Bytes committed, in all channels, as they travel."""
-        return self._packer.num_bytes
 
     def occupancy(self) -> float:
         """Of the fullest way to a trainer, 0 to 1."""
@@ -152,7 +128,7 @@ class Sender:
         """Whether all that waits was taken in time."""
         deadline_s = time.monotonic() + timeout_s
         while self._waiting:
-            if not self._packer.try_add(self._waiting[0]) and not self._wait(deadline_s):
+            if not self._try_add(self._waiting[0]) and not self._wait(deadline_s):
                 return False
             self._waiting.popleft()
         return True
@@ -162,7 +138,7 @@ class Sender:
         piece, started_s = self._waiting[0], time.monotonic()
         try:
             took = wait_until(
-                lambda: self._packer.try_add(piece) or None,
+                lambda: self._try_add(piece) or None,
                 self._migrator.why_lost,
                 deadline_s - started_s,
             )
@@ -170,12 +146,17 @@ class Sender:
             self.waited_s += time.monotonic() - started_s
         return took is not None
 
+    def _try_add(self, piece: Piece) -> bool:
+        is_taken = self._packer.try_add(piece)
+        self.num_bytes += is_taken * sum(piece.spec.sizes(piece.num_envs))
+        return is_taken
+
     def _queue(self, pieces: Sequence[Piece], max_waiting: int) -> None:
         """Takes all pieces at once."""
         for piece in pieces:
-            while self._waiting and self._packer.try_add(self._waiting[0]):
+            while self._waiting and self._try_add(self._waiting[0]):
                 self._waiting.popleft()
-            if not self._waiting and self._packer.try_add(piece):
+            if not self._waiting and self._try_add(piece):
                 continue
             self._waiting.append(piece.copy())
             if len(self._waiting) > max_waiting:

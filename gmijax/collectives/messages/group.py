@@ -43,10 +43,8 @@ class _Call(NamedTuple):
 class GroupReducer:
     """One rank's collective calls.
 
-    Args:
-      messenger: this rank's messages.
-      build: makes the reducer of all ranks for buffers of a length; called when it is first
-        needed, by all ranks in the same call.
+    `build` makes the reducer of all ranks for buffers of a length, when it is first needed: by
+    all ranks in the same call.
     """
 
     def __init__(self, messenger: Messenger, build: Callable[[int], HostExchange]) -> None:
