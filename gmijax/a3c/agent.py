@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
+from dataclasses import dataclass
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -51,32 +52,23 @@ class _Sent(NamedTuple):
     version: int
 
 
+@dataclass
 class Agent:
     """One serving GMI, number `index` of the agents; `trainers` are named in errors."""
 
-    def __init__(
-        self,
-        config: TrainConfig,
-        env: BatchedEnv,
-        index: int,
-        trainers: tuple[int, ...],
-        registers: JobRegisters,
-        sender: Sender,
-        link: ChildLink,
-    ) -> None:
-        assert isinstance(config.algo, A3cConfig)
-        self._config = config
-        self._algo = config.algo
-        self._env = env
-        self._index = index
-        self._trainers = trainers
-        self._registers = registers
-        self._sender = sender
-        self._link = link
-        self._learner = make_learner(env.spec, config.algo)
-        self._report = Report(
-            None, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, np.zeros(num_counts(env), np.float64)
-        )
+    config: TrainConfig
+    env: BatchedEnv
+    index: int
+    trainers: tuple[int, ...]
+    registers: JobRegisters
+    sender: Sender
+    link: ChildLink
+
+    def __post_init__(self) -> None:
+        assert isinstance(self.config.algo, A3cConfig)
+        self._algo = self.config.algo
+        self._learner = make_learner(self.env.spec, self._algo)
+        self._report = Report.of_nothing(num_counts(self.env))
         self._orders_seen = 0
         self._orders = Orders(None, is_ending=False)
         self._weights_seen = 0
@@ -93,20 +85,20 @@ class Agent:
         Raises:
           CollectiveTimeout: trainers do not start, or take nothing any more.
         """
-        self._link.beat("compiling", 0)
+        self.link.beat("compiling", 0)
         started = time.monotonic()
         # Of the right shapes; those to act with are read later.
-        start = jax.jit(partial(init_learner, self._learner, self._env.spec.obs_size))
+        start = jax.jit(partial(init_learner, self._learner, self.env.spec.obs_size))
         weights = acting_weights(self._learner, start(jax.random.key(0)))
-        env_state = first_envs(self._env, self._config, self._index, gmi=self._link.gmi)
+        env_state = first_envs(self.env, self.config, self.index, gmi=self.link.gmi)
         num_pieces = self._algo.pieces_per_unroll
         num_steps = self._algo.unroll_length // num_pieces
         program = UnrollPrograms(
-            *(self._env, self._learner.networks, num_steps, num_pieces, weights, env_state),
-            stays=self._sender.on_device,
+            *(self.env, self._learner.networks, num_steps, num_pieces, weights, env_state),
+            stays=self.sender.on_device,
         )
         compile_s = time.monotonic() - started
-        self._link.beat("ready", 0)
+        self.link.beat("ready", 0)
         self._wait_for_start()
         started = time.monotonic()
         self._loop(program, weights, env_state)
@@ -124,7 +116,7 @@ class Agent:
 
     def _wait_for_start(self) -> None:
         """Returns when the leading trainer has written its first orders and weights."""
-        limit_s = self._config.run.start_timeout_s
+        limit_s = self.config.run.start_timeout_s
         started = time.monotonic()
         while not self._look():
             if time.monotonic() - started > limit_s:
@@ -157,20 +149,20 @@ class Agent:
         self, weights: ActingWeights, unpack: Callable[[npt.NDArray[np.float32]], ActingWeights]
     ) -> ActingWeights:
         """The newest weights published; `weights` if there are no newer ones."""
-        if (snapshot := self._registers.weights.read(self._weights_seen)) is None:
+        if (snapshot := self.registers.weights.read(self._weights_seen)) is None:
             return weights
         self._weights_seen, self._version = snapshot.count, snapshot.tag
         return unpack(snapshot.values.view(np.float32))
 
     def _send(self, unroll: _Sent, env_state: BatchState) -> None:
         arrays: dict[str, Any] = unroll.experience._asdict()
-        if not self._sender.on_device:
+        if not self.sender.on_device:
             arrays = {name: np.asarray(values) for name, values in arrays.items()}
         stats = np.asarray(unroll.stats, np.float64)
         started = time.monotonic()
         if not self._hand_over(arrays, unroll.version, env_state, started):
             return
-        sender, occupancy = self._sender, self._sender.occupancy()
+        sender, occupancy = self.sender, self.sender.occupancy()
         if not sender.least_occupancy():  # A trainer has nothing to do: it need not wait for more.
             sender.flush()
         self._unrolls += 1
@@ -184,7 +176,7 @@ class Agent:
             stats=self._report.stats + stats,
         )
         self._publish()
-        self._link.beat("running", self._unrolls)
+        self.link.beat("running", self._unrolls)
 
     def _hand_over(
         self,
@@ -194,7 +186,7 @@ class Agent:
         started: float,
     ) -> bool:
         """Sends an unroll; False if the job ends and nobody wants it any more."""
-        limit_s = self._config.reduce.timeout_s
+        limit_s = self.config.reduce.timeout_s
         try:
             while not self._offer(arrays, version, env_state):
                 # Trainers that wait for a checkpoint make no room until it is complete.
@@ -202,7 +194,7 @@ class Agent:
                     return False
                 if time.monotonic() - started > limit_s:
                     raise self._late("send", limit_s)
-                self._link.beat("running", self._unrolls)
+                self.link.beat("running", self._unrolls)
         except PipeClosed:
             if not self._obey(env_state):
                 raise
@@ -215,10 +207,10 @@ class Agent:
         """Whether the channels took an unroll within a moment; waits on an idle device count."""
         if self._is_ahead(arrays, env_state):
             return False
-        costs, before_s = _is_idle(env_state), self._sender.waited_s
-        is_sent = self._sender.send(arrays, version, _SLICE_S)
+        costs, before_s = _is_idle(env_state), self.sender.waited_s
+        is_sent = self.sender.send(arrays, version, _SLICE_S)
         if costs:
-            self._wait_s += self._sender.waited_s - before_s
+            self._wait_s += self.sender.waited_s - before_s
         return is_sent
 
     def _is_ahead(self, arrays: dict[str, npt.NDArray[Any]], env_state: BatchState) -> bool:
@@ -226,13 +218,13 @@ class Agent:
 
         More of them in the channel would only make experience older.
         """
-        channel = self._config.channel
+        channel = self.config.channel
         if channel.when_full != "block":
             return False
         size = sum(array.nbytes for array in arrays.values())
         most = (self._algo.max_ahead - 0.5) * size / channel.capacity_bytes
         deadline_s = time.monotonic() + _SLICE_S
-        while self._sender.least_occupancy() > most:
+        while self.sender.least_occupancy() > most:
             costs, now_s = _is_idle(env_state), time.monotonic()
             if now_s > deadline_s:
                 return True
@@ -246,22 +238,22 @@ class Agent:
         self._look()
         steps = self._orders.checkpoint
         if steps is not None and steps != self._report.checkpoint:
-            save_envs(self._link.run, steps, self._link.gmi, env_state)
+            save_envs(self.link.run, steps, self.link.gmi, env_state)
             self._report = self._report._replace(checkpoint=steps)
             self._publish()
         return self._orders.is_ending
 
     def _look(self) -> bool:
         """Takes up new orders; returns whether there ever were any."""
-        if (snapshot := self._registers.orders.read(self._orders_seen)) is not None:
+        if (snapshot := self.registers.orders.read(self._orders_seen)) is not None:
             self._orders_seen, self._orders = snapshot.count, Orders.unpack(snapshot.values)
         return self._orders_seen > 0
 
     def _publish(self) -> None:
-        self._registers.reports[self._index].publish(self._report.pack())
+        self.registers.reports[self.index].publish(self._report.pack())
 
     def _late(self, what: str, limit_s: float) -> CollectiveTimeout:
-        return CollectiveTimeout(self._link.gmi, self._trainers, what, self._unrolls, limit_s)
+        return CollectiveTimeout(self.link.gmi, self.trainers, what, self._unrolls, limit_s)
 
 
 def _is_idle(env_state: BatchState) -> bool:

@@ -60,6 +60,11 @@ class Report(NamedTuple):
     occupancy: float
     stats: npt.NDArray[np.float64]
 
+    @classmethod
+    def of_nothing(cls, num_stats: int) -> Report:
+        """That of an agent which has done nothing."""
+        return cls(None, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, np.zeros(num_stats))
+
     def pack(self) -> npt.NDArray[np.float64]:
         """As numbers for the register; environment steps are exact up to 2^53."""
         head = [_number(self.checkpoint), *self[1:-1]]

@@ -70,7 +70,7 @@ class Reporter:
         self.dropped = 0
         zeros, unpack = ravel_pytree(no_counts(env.spec, env.overflows))
         self._unpack: Any = unpack
-        self._before = Report._make([None, *[0.0] * 6, np.zeros(zeros.size)])
+        self._before = Report.of_nothing(zeros.size)
         self._env_steps = env_steps
         self._updates: list[tuple[UpdateFigures, float]] = []
         self._stale = 0.0

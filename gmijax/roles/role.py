@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Iterable
+from dataclasses import dataclass
 from typing import Any
 
 from gmijax.collectives.messages.group import GroupReducer, Operation
@@ -13,45 +14,47 @@ from gmijax.partition.layout import Layout
 from gmijax.supervise.child import ChildLink
 
 
+@dataclass
 class Gmi:
-    """This process as GMI `rank` of a job; what the methods do, see `Role`."""
+    """This process as one of the GMIs of a job; what the methods do, see `Role`."""
 
-    def __init__(
-        self, layout: Layout, messenger: Messenger, reducer: GroupReducer, link: ChildLink
-    ) -> None:
-        self.layout = layout
-        self.rank = messenger.rank
-        self._messenger = messenger
-        self._reducer = reducer
-        self._link = link
-        self._steps = 0
+    layout: Layout
+    messenger: Messenger
+    reducer: GroupReducer
+    link: ChildLink
+    steps: int = 0
+
+    @property
+    def rank(self) -> int:
+        """See `Role.rank`."""
+        return self.messenger.rank
 
     @property
     def stop_requested(self) -> bool:
         """See `Role.stop_requested`."""
-        return self._link.stop_requested
+        return self.link.stop_requested
 
     def reduce(self, data: Any, op: Operation, group: Iterable[int] | None) -> Any:
         """See `Role.collective`."""
-        result = self._reducer.reduce(self.layout.gmis if group is None else group, data, op)
-        self.progress(self._steps)
+        result = self.reducer.reduce(self.layout.gmis if group is None else group, data, op)
+        self.progress(self.steps)
         return result
 
     def send(self, data: Any, dst: int) -> None:
         """See `Role.send`."""
-        self._messenger.send(data, dst)
-        self.progress(self._steps)
+        self.messenger.send(data, dst)
+        self.progress(self.steps)
 
     def recv(self, src: int, timeout_s: float | None) -> Any:
         """See `Role.recv`."""
-        data = self._messenger.recv(src, timeout_s=timeout_s)
-        self.progress(self._steps)
+        data = self.messenger.recv(src, timeout_s=timeout_s)
+        self.progress(self.steps)
         return data
 
     def progress(self, step: int) -> None:
         """See `Role.progress`."""
-        self._steps = step
-        self._link.beat("running", step)
+        self.steps = step
+        self.link.beat("running", step)
 
 
 # One process is one GMI, so this is as global as the process: managers that a role's module makes

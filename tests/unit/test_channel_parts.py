@@ -118,11 +118,11 @@ def test_without_room_or_after_an_error_a_send_goes_on_where_it_was(
     one = sum(array[:, :1].nbytes for array in rollout().values())
     large = rollout(0, 3 * (2**20 // one))
     if is_lost:
-        pair.sender._migrator.check()  # The next look is a while away.
-        pair.sender._migrator.why_lost = lambda: PeerLost(0, 1, "send", 0)
+        pair.sender.migrator.check()  # The next look is a while away.
+        pair.sender.migrator.why_lost = lambda: PeerLost(0, 1, "send", 0)
         with pytest.raises(PeerLost):
             pair.sender.send(large, 0, 0.3)
-        pair.sender._migrator.why_lost = lambda: None
+        pair.sender.migrator.why_lost = lambda: None
     else:
         assert not pair.sender.send(large, 0, 0.01)
         assert pair.sender.waited_s > 0

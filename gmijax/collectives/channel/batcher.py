@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import time
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from typing import NamedTuple, TypeAlias
 
 import numpy as np
@@ -75,7 +76,8 @@ class Batcher:
           PipeClosed: all agents have closed, and too few are left.
           CollectiveError: a message is damaged.
         """
-        self._check_agents()
+        if time.monotonic() >= self._next_look_s and (error := self._why_lost()) is not None:
+            raise error
         self._resize(batch_size)
         deadline_s = time.monotonic() + timeout_s
         while True:
@@ -144,10 +146,6 @@ class Batcher:
         lost = (error for error in found if not isinstance(error, PipeClosed))
         return next((error for error in lost if error is not None), None)
 
-    def _check_agents(self) -> None:
-        if time.monotonic() >= self._next_look_s and (error := self._why_lost()) is not None:
-            raise error
-
     def _resize(self, batch_size: int) -> None:
         """Makes what is stacked for batches of another size the first of the next arrivals."""
         if batch_size < 1:
@@ -165,27 +163,26 @@ class Batcher:
             self._current = None
 
 
+@dataclass
 class _Arrival:
-    """A transfer of which a part may be in batches already."""
+    """A transfer of which a part may be in batches already; `left` unrolls are not."""
 
-    def __init__(
-        self, transfer: Transfer, agents: npt.NDArray[np.int64], release: Callable[[], None]
-    ) -> None:
-        self.spec = transfer.spec
-        self.release = release
-        self._transfer = transfer
-        self._agents = agents
-        self.left = transfer.num_envs
+    transfer: Transfer
+    agents: npt.NDArray[np.int64]
+    release: Callable[[], None]
+
+    def __post_init__(self) -> None:
+        self.spec, self.left = self.transfer.spec, self.transfer.num_envs
 
     def take(self, count: int) -> Batch:
         """The next unrolls, as they travelled."""
-        low = self._transfer.num_envs - self.left
+        low = self.transfer.num_envs - self.left
         high = low + count
         self.left -= count
-        arrays = self._transfer.arrays
-        if count < self._transfer.num_envs:  # A part of an array on a device is a copy.
+        arrays = self.transfer.arrays
+        if count < self.transfer.num_envs:  # A part of an array on a device is a copy.
             arrays = {name: array[:, low:high] for name, array in arrays.items()}
-        return Batch(arrays, self._transfer.versions[low:high], self._agents[low:high])
+        return Batch(arrays, self.transfer.versions[low:high], self.agents[low:high])
 
 
 class Stack:

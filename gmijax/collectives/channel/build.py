@@ -161,9 +161,8 @@ def _device_sender(
     """The end of an agent that leaves its experience on the GPU, for the trainers there."""
     from gmijax.collectives.channel.resident import ResidentPacker, SlotWriter
 
-    writers = [SlotWriter(block, peer, config.capacity_bytes) for peer in near]
-    migrator = Migrator(writers, near)
-    packer = ResidentPacker(migrator, writers, config.capacity_bytes, DEVICE_MEMORY)
+    migrator = Migrator([SlotWriter(block, peer, config.capacity_bytes) for peer in near], near)
+    packer = ResidentPacker(migrator, config.capacity_bytes, DEVICE_MEMORY)
     held.callback(packer.close)
     held.callback(migrator.close)
     dispenser = Dispenser(max_piece_bytes=None)

@@ -15,6 +15,7 @@ from __future__ import annotations
 
 import statistics
 import time
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -115,48 +116,42 @@ class Compressor:
         writer, views = opened
         views[0][:] = head
         table = views[1].view(np.int64).reshape(-1, 2)
+        table[:] = 0
         arrays = piece.spec.arrays_in(views[2:], room)
         return _OpenTransfer(writer, piece.spec, table, arrays, room)
 
 
+@dataclass
 class _OpenTransfer:
-    """A transfer that is being filled."""
+    """A transfer that is being filled, with `room` for environments."""
 
-    def __init__(
-        self,
-        writer: ChannelWriter,
-        spec: Spec,
-        table: npt.NDArray[np.int64],
-        arrays: dict[str, Array],
-        room: int,
-    ) -> None:
-        self.spent_s = 0.0
-        self._writer = writer
-        self._spec = spec
-        self._table = table
-        self._arrays = arrays
-        self._room = room
-        self._filled = self._pieces = 0
-        table[:] = 0
+    writer: ChannelWriter
+    spec: Spec
+    table: npt.NDArray[np.int64]
+    arrays: dict[str, Array]
+    room: int
+    filled: int = 0
+    pieces: int = 0
+    spent_s: float = 0.0
 
     @property
     def is_full(self) -> bool:
-        return self._filled == self._room or self._pieces == len(self._table) - 1
+        return self.filled == self.room or self.pieces == len(self.table) - 1
 
     def takes(self, piece: Piece) -> bool:
-        return piece.spec == self._spec and self._filled + piece.num_envs <= self._room
+        return piece.spec == self.spec and self.filled + piece.num_envs <= self.room
 
     def add(self, piece: Piece) -> None:
-        low, high = self._filled, self._filled + piece.num_envs
+        low, high = self.filled, self.filled + piece.num_envs
         for name, array in piece.channels.items():
-            write_channel(self._arrays[name][:, low:high], array)
-        self._filled, self._pieces = high, self._pieces + 1
-        self._table[self._pieces] = piece.num_envs, piece.version
+            write_channel(self.arrays[name][:, low:high], array)
+        self.filled, self.pieces = high, self.pieces + 1
+        self.table[self.pieces] = piece.num_envs, piece.version
 
     def commit(self) -> int:
-        self._table[0] = self._room, self._pieces
-        self._writer.commit()
-        return sum(self._spec.sizes(self._filled))
+        self.table[0] = self.room, self.pieces
+        self.writer.commit()
+        return sum(self.spec.sizes(self.filled))
 
 
 class Transfer(NamedTuple):

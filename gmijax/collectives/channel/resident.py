@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import contextlib
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import jax
@@ -70,24 +71,15 @@ class SlotWriter(PipeWriter):
         return self.outstanding_messages * self.slot_bytes / self._capacity_bytes
 
 
+@dataclass
 class ResidentPacker:
-    """Leaves rollouts on the device; a `Packer`.
+    """Leaves rollouts on the device, in `capacity_bytes` for each trainer; a `Packer`."""
 
-    `writers` are the ways of `migrator`, all to trainers on the agent's GPU, with
-    `capacity_bytes` of its memory for each.
-    """
+    migrator: Migrator[SlotWriter]
+    capacity_bytes: int
+    new_memory: NewMemory
 
-    def __init__(
-        self,
-        migrator: Migrator[SlotWriter],
-        writers: Sequence[SlotWriter],
-        capacity_bytes: int,
-        new_memory: NewMemory,
-    ) -> None:
-        self._migrator = migrator
-        self._writers = tuple(writers)
-        self._capacity_bytes = capacity_bytes
-        self._new_memory = new_memory
+    def __post_init__(self) -> None:
         self._memory: DeviceMemory | None = None
         self._ticket = b""
         self._head = np.zeros(0, np.uint8)
@@ -103,12 +95,12 @@ class ResidentPacker:
           CudaError: memory of the GPU cannot be shared.
         """
         memory = self._prepare(piece)
-        opened = self._migrator.try_open([self._head.size, TICKET_BYTES, NOTE.itemsize])
+        opened = self.migrator.try_open([self._head.size, TICKET_BYTES, NOTE.itemsize])
         if opened is None:
             return False
         writer, views = opened
         slot = writer.messages % writer.num_slots
-        place = self._writers.index(writer) * writer.num_slots + slot
+        place = self.migrator.writers.index(writer) * writer.num_slots + slot
         offset = place * self._slot_bytes
         for begin, channel in zip(self._offsets, piece.spec.channels, strict=True):
             memory.write(offset + begin, piece.channels[channel.name])  # pyright: ignore[reportArgumentType]
@@ -124,12 +116,12 @@ class ResidentPacker:
     def close(self) -> None:
         """Frees the memory when the trainers have read all, or some time has passed."""
         with contextlib.suppress(GmijaxError):  # A trainer that is gone wants nothing.
-            wait_until(self._is_read, self._migrator.why_lost, CLOSE_TIMEOUT_S)
+            wait_until(self._is_read, self.migrator.why_lost, CLOSE_TIMEOUT_S)
         if self._memory is not None:
             self._memory.close()
 
     def _is_read(self) -> bool | None:
-        return not any(writer.outstanding_messages for writer in self._writers) or None
+        return not any(writer.outstanding_messages for writer in self.migrator.writers) or None
 
     def _prepare(self, piece: Piece) -> DeviceMemory:
         """The memory; its slots are made when the first rollout shows how large they are."""
@@ -142,16 +134,16 @@ class ResidentPacker:
             return self._memory
         self._head, self._num_envs = piece.spec.encode(), piece.num_envs
         self._offsets, self._slot_bytes = slot_offsets(piece.spec, piece.num_envs)
-        num_slots = self._capacity_bytes // self._slot_bytes
+        num_slots = self.capacity_bytes // self._slot_bytes
         if num_slots < _LEAST_SLOTS:
             raise ConfigError(
-                f"channel.capacity_mib={self._capacity_bytes >> 20}: must hold {_LEAST_SLOTS} "
+                f"channel.capacity_mib={self.capacity_bytes >> 20}: must hold {_LEAST_SLOTS} "
                 f"rollouts of {self._slot_bytes} bytes"
             )
-        memory = self._new_memory()
-        self._ticket = memory.create(len(self._writers) * num_slots * self._slot_bytes)
+        memory = self.new_memory()
+        self._ticket = memory.create(len(self.migrator.writers) * num_slots * self._slot_bytes)
         self._memory = memory
-        for writer in self._writers:
+        for writer in self.migrator.writers:
             writer.num_slots, writer.slot_bytes = num_slots, self._slot_bytes
         return memory
 

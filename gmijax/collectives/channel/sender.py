@@ -6,6 +6,7 @@ import contextlib
 import time
 from collections import deque
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Protocol
 
 from gmijax.collectives.channel.dispenser import Dispenser, Piece
@@ -29,6 +30,7 @@ class Packer(Protocol):
         """Hands over what waits for more to come."""
 
 
+@dataclass
 class Sender:
     """An agent's end of the channels; `held` is closed with it.
 
@@ -44,25 +46,17 @@ class Sender:
       waited_s: time spent waiting for room.
     """
 
-    def __init__(
-        self,
-        dispenser: Dispenser,
-        packer: Packer,
-        migrator: Migrator,
-        *,
-        max_waiting: int | None,
-        on_device: bool,
-        held: contextlib.ExitStack,
-    ) -> None:
-        self.on_device = on_device
-        self._dispenser = dispenser
-        self._packer = packer
-        self._migrator = migrator
-        self._max_waiting = max_waiting
-        self._held = held
-        self._waiting: deque[Piece] = deque()
+    dispenser: Dispenser
+    packer: Packer
+    migrator: Migrator
+    max_waiting: int | None
+    on_device: bool
+    held: contextlib.ExitStack
+
+    def __post_init__(self) -> None:
         self.num_bytes = self.dropped = 0
         self.waited_s = 0.0
+        self._waiting: deque[Piece] = deque()
         self._is_pending = False
         self._is_open = True
 
@@ -84,29 +78,29 @@ class Sender:
           ConfigError: not such arrays, or an unroll that is too large for the channel.
           CudaError: memory of the GPU cannot be shared.
         """
-        self._migrator.check()
+        self.migrator.check()
         # If pending it is the same rollout as before, which is split already.
-        pieces = [] if self._is_pending else self._dispenser.split(experience, version)
+        pieces = [] if self._is_pending else self.dispenser.split(experience, version)
         self._is_pending = True  # Also after an error: some of it may have been sent.
-        if self._max_waiting is None:
+        if self.max_waiting is None:
             self._waiting.extend(pieces)
             self._is_pending = not self._drain(timeout_s)
         else:
-            self._queue(pieces, self._max_waiting)
+            self._queue(pieces, self.max_waiting)
             self._is_pending = False
         return not self._is_pending
 
     def flush(self) -> None:
         """Hands over what waits for more to come; trainers cannot see it before."""
-        self._packer.flush()
+        self.packer.flush()
 
     def occupancy(self) -> float:
         """Of the fullest way to a trainer, 0 to 1."""
-        return self._migrator.occupancy()
+        return self.migrator.occupancy()
 
     def least_occupancy(self) -> float:
         """Of the emptiest way that the next transfer may take, 0 to 1."""
-        return self._migrator.least_occupancy()
+        return self.migrator.least_occupancy()
 
     def close(self) -> None:
         """Flushes, and tells the trainers that nothing more comes. Idempotent.
@@ -121,8 +115,8 @@ class Sender:
             self._drain(CLOSE_TIMEOUT_S)
         self.dropped += len(self._waiting)
         self._waiting.clear()
-        self._packer.flush()  # Another one may.
-        self._held.close()
+        self.packer.flush()  # Another one may.
+        self.held.close()
 
     def _drain(self, timeout_s: float) -> bool:
         """Whether all that waits was taken in time."""
@@ -139,7 +133,7 @@ class Sender:
         try:
             took = wait_until(
                 lambda: self._try_add(piece) or None,
-                self._migrator.why_lost,
+                self.migrator.why_lost,
                 deadline_s - started_s,
             )
         finally:
@@ -147,7 +141,7 @@ class Sender:
         return took is not None
 
     def _try_add(self, piece: Piece) -> bool:
-        is_taken = self._packer.try_add(piece)
+        is_taken = self.packer.try_add(piece)
         self.num_bytes += is_taken * sum(piece.spec.sizes(piece.num_envs))
         return is_taken
 
