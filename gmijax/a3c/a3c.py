@@ -95,11 +95,10 @@ class Targets(NamedTuple):
 class A3cLosses(NamedTuple):
     """Means over a minibatch, [] float32 each, under the weights of its unrolls.
 
-    Weights are 1 in the mean over all minibatches of a batch, and not in each of them.
+    Weights are 1 in the mean over all minibatches of a batch, and not in each of them. For the
+    losses see `a3c_loss`.
 
     Attributes:
-      policy_loss: see `a3c_loss`.
-      value_loss: likewise.
       entropy: of the policy, in nats.
       kl: divergence of the policy from itself before the first pass, in nats.
       behaviour_kl: of the policy before the first pass from those that acted, estimated.

@@ -45,12 +45,10 @@ class Share(NamedTuple):
     """One GMI's part of a serving job.
 
     Attributes:
-      env: the environments; an agent uses their sizes only.
       rank: place among the GMIs that simulate (an agent: among the agents).
       first_unroll: unrolls that earlier jobs have written of this GMI's part.
       num_unrolls: unrolls that are left to be made.
       writer: takes the experience, None where it is not kept.
-      barrier: returns when all GMIs of the job have called it.
     """
 
     config: ServeConfig

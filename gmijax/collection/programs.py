@@ -88,13 +88,12 @@ class Step(NamedTuple):
     """One step of N environments, as it is kept; over an unroll with a leading axis [T].
 
     Attributes:
-      obs: [N, O] what was observed before the action.
-      action: [N, A] as chosen, before the task clips it.
-      log_prob: [N] log density of the action under the policy.
+      obs: [N, O], before the action.
+      action: [N, A], before the task clips it.
+      log_prob: [N], log density of the action under the policy.
       reward: [N].
-      terminated: [N] bool, the task has ended.
-      truncated: [N] bool, time ran out.
-      next_obs: [N, O] what the action led to, before any reset; None where it is not kept.
+      terminated, truncated: [N] bool, the task has ended; time ran out.
+      next_obs: [N, O], before any reset; None where it is not kept.
     """
 
     obs: Array

@@ -1,8 +1,7 @@
 """Mean and sum of nested data over some ranks, by messages between them.
 
-Each rank adds up one part of the numbers, in order of rank, and sends the result to all: what
-travels is twice the data whatever the number of ranks, and the result is bit-identical on all.
-Small data go to everybody at once, which saves one of the two journeys.
+Each rank adds up one part of the numbers, in order of rank, and sends the result to all: the
+result is bit-identical. Small data go to everybody at once, which saves one of the two journeys.
 
 This takes any data and any group. For the mean of many float32 over all ranks the strategies of
 `gmijax.collectives.build` are faster; they take one length, that of the first such call.

@@ -123,10 +123,9 @@ class Messenger:
             raise CollectiveTimeout(self.rank, tuple(late), "flush", 0, allowed_s)
 
     def settle(self, timeout_s: float) -> bool:
-        """Whether all that stays on the GPU has been received within `timeout_s`.
+        """Whether all that stays on the GPU, and goes with this process, was received in time.
 
-        It goes with this process, which must not end before. What others have sent is taken
-        meanwhile, so that two that end do not wait for each other.
+        What others have sent is taken meanwhile, so that two that end do not wait for each other.
         """
         return wait_until(lambda: self._is_settled() or None, lambda: None, timeout_s) is not None
 

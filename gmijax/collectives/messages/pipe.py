@@ -14,9 +14,8 @@ buffers needs no buffer of its own.
     first, second = reader.get(timeout_s=5.0)                  # read-only views [bytes] uint8
     reader.release()
 
-What is in the ring: `pipe_format.py`. What the checksum costs and what it finds:
-`docs/channels.md`. Which order of memory accesses this relies on:
-`docs/decisions/shared-memory-exchange.md`.
+What is in the ring: `pipe_format.py`; the checksum: `docs/channels.md`; the order of memory
+accesses: `docs/decisions/shared-memory-exchange.md`.
 """
 
 from __future__ import annotations
@@ -99,8 +98,7 @@ class PipeWriter:
         Raises:
           CollectiveTimeout: there was no room in time.
           PeerLost: the reader's process is gone, and there is no room.
-          PipeClosed: the reader has closed the pipe.
-          CollectiveError: larger than `max_message_bytes`.
+          PipeClosed, CollectiveError: see `try_reserve`.
         """
         is_put = wait_until(
             lambda: self.try_put(parts) or None,

@@ -1,10 +1,8 @@
 """Registers in shared memory: one writer each, any number of readers, nobody ever waits.
 
-A register holds the newest value only. Its writer has two places and writes them in turn, so that
-a reader that copies one is disturbed only if the writer begins to publish for the second time
-meanwhile; a counter of what was begun tells it so, and it looks again, or leaves it for later (a
-seqlock with two places). Made for weights: trainers publish them when they have new ones, agents
-look between two unrolls. On the order of memory accesses: `gmijax.collectives.waits.Fence`.
+A register holds the newest value only. It is a seqlock with two places, written in turn: a reader
+that copies one is disturbed only if the writer begins to publish for the second time meanwhile,
+which a counter tells it. On the order of memory accesses: `gmijax.collectives.waits.Fence`.
 
     fd = create_registers()                             # the controller
     registers = open_registers(fd, [64, 4096])          # every process, with the same sizes
