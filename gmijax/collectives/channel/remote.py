@@ -66,7 +66,8 @@ class _End:
         if len(head) != _HEADER.size or (header := _HEADER.unpack(head))[0] != MAGIC:
             # Only who has the secret could send it.
             raise CollectiveError(f"rank {self._rank}: no message of a channel from {self.peer}")
-        received = _Received(*header[1:], parts)
+        _, kind, sequence = header
+        received = _Received(kind, sequence, parts)
         self._has_left = self._has_left or received.kind == GOODBYE
         return received
 
