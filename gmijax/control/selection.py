@@ -17,7 +17,7 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from gmijax.collectives.shared_block import create_exchange
+from gmijax.collectives.host.shared_block import create_exchange
 from gmijax.machine.snapshot import Machine
 from gmijax.partition.plan import Plan
 from gmijax.partition.reduction import (

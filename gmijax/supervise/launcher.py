@@ -17,7 +17,7 @@ from pathlib import Path
 from types import FrameType
 from typing import Final
 
-from gmijax.collectives.shared_block import create_exchange
+from gmijax.collectives.host.shared_block import create_exchange
 from gmijax.config import RunConfig, ServeRunConfig
 from gmijax.errors import BackendUnavailable, GmijaxError, JobInterrupted
 from gmijax.partition.backend_choice import WHAT_SHARE_LOSES

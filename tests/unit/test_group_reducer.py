@@ -10,12 +10,12 @@ from typing import Any, TypeVar
 import numpy as np
 import pytest
 
-from gmijax.collectives.host import HostExchange
+from gmijax.collectives.host.host_exchange import HostExchange
+from gmijax.collectives.host.shared_block import create_exchange
 from gmijax.collectives.interface import FloatBuffer
 from gmijax.collectives.messages.group import AT_ONCE_BYTES, GroupReducer
 from gmijax.collectives.messages.messenger import MIN_CAPACITY_BYTES, Messenger
 from gmijax.collectives.messages.pipe_block import PipeBlock, create_pipes
-from gmijax.collectives.shared_block import create_exchange
 from gmijax.errors import CollectiveError
 
 RANKS = 3

@@ -14,11 +14,11 @@ from toy_env import point_mass
 
 from gmijax.cli.compose import compose
 from gmijax.collectives.build import SoloReducer
-from gmijax.collectives.device_links import DeviceLinks
-from gmijax.collectives.host import HostExchange
-from gmijax.collectives.host_links import HostLinks
+from gmijax.collectives.device.device_links import DeviceLinks
+from gmijax.collectives.host.host_exchange import HostExchange
+from gmijax.collectives.host.host_links import HostLinks
+from gmijax.collectives.host.shared_block import LANES, create_exchange
 from gmijax.collectives.program import Exchange
-from gmijax.collectives.shared_block import LANES, create_exchange
 from gmijax.collectives.strategies import stages
 from gmijax.learning.learner import (
     acting_weights,

@@ -14,7 +14,7 @@ from gmijax.collectives.channel.migrator import Migrator
 from gmijax.collectives.channel.sender import Packer, Sender
 from gmijax.collectives.channel.transport import ChannelReader, ChannelWriter
 from gmijax.collectives.channel.unichannel import UniDecoder, UniPacker
-from gmijax.collectives.device_memory import NewMemory, cuda_memory
+from gmijax.collectives.device.device_memory import NewMemory, cuda_memory
 from gmijax.collectives.messages.pipe import PipeReader, PipeWriter
 from gmijax.collectives.messages.pipe_block import PipeBlock, create_pipes
 from gmijax.config.channel import ChannelConfig

@@ -24,7 +24,7 @@ from gmijax.collectives.channel.dispenser import Piece
 from gmijax.collectives.channel.migrator import Migrator
 from gmijax.collectives.channel.sender import CLOSE_TIMEOUT_S
 from gmijax.collectives.channel.spec import Spec
-from gmijax.collectives.device_memory import TICKET_BYTES, DeviceMemory, NewMemory
+from gmijax.collectives.device.device_memory import TICKET_BYTES, DeviceMemory, NewMemory
 from gmijax.collectives.messages.pipe import Bytes, Message, PipeWriter
 from gmijax.collectives.messages.pipe_block import PipeBlock
 from gmijax.collectives.shared_memory import round_up

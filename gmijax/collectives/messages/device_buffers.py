@@ -15,7 +15,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from gmijax.collectives.device_memory import DeviceMemory, NewMemory
+from gmijax.collectives.device.device_memory import DeviceMemory, NewMemory
 
 LEAST_BYTES: Final = 4096
 """Smaller arrays are through the host as soon as through the device."""

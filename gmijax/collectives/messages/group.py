@@ -15,7 +15,7 @@ from typing import Any, Final, Literal, NamedTuple, get_args
 import numpy as np
 import numpy.typing as npt
 
-from gmijax.collectives.host import HostExchange
+from gmijax.collectives.host.host_exchange import HostExchange
 from gmijax.collectives.interface import FloatBuffer
 from gmijax.collectives.messages.mailboxes import COLLECTIVE
 from gmijax.collectives.messages.messenger import Messenger
