@@ -249,8 +249,8 @@ def _bindings(system: SystemInfo) -> Iterator[str]:
         return
     state = f"{found} is installed" if found else "it is not installed"
     yield (
-        "gradients of GMIs that share a GPU go through host memory: reduce.strategy=one_shot "
-        f"needs cuda-bindings{BINDINGS[cuda]}, and {state} (pip install 'gmijax[cuda{cuda}]')"
+        "GMIs on GPUs cannot train together: their exchanges need "
+        f"cuda-bindings{BINDINGS[cuda]}, and {state} (pip install 'gmijax[cuda{cuda}]')"
     )
 
 

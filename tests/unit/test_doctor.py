@@ -216,7 +216,7 @@ def test_commands_for_a_split_are_printed(
 
 
 BINDINGS_MISSING = (
-    "gradients of GMIs that share a GPU go through host memory: reduce.strategy=one_shot needs "
+    "GMIs on GPUs cannot train together: their exchanges need "
     "cuda-bindings>=13, and {} (pip install 'gmijax[cuda13]')"
 )
 
