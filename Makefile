@@ -47,8 +47,8 @@ test-all: $(READY)  ## all tests, slow ones too
 	$(BIN)/python -m pytest $(TEST_WORKERS) -m '' $(TEST_ARGS)
 
 soak: $(READY)  ## faults from fresh seeds, then a long run's memory; SOAK_MINUTES in all
-	mkdir -p runs
-	$(BIN)/python -m tests.faults.many --minutes $$(($(SOAK_MINUTES) / 2)) --out runs/soak-faults.json
+	GMIJAX_FAULT_SEEDS=$$(seq -s, $$(date +%s) $$(($$(date +%s) + $(SOAK_MINUTES) / 30))) \
+	  $(BIN)/python -m pytest -m '' -n 0 tests/faults/test_faults.py
 	$(BIN)/python -m tests.faults.soak --minutes $$(($(SOAK_MINUTES) / 2))
 
 wheel-test: $(READY)  ## builds the wheel and tries it outside the checkout

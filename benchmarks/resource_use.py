@@ -33,9 +33,9 @@ from gmijax.learning.learner import Learner, acting_weights, init_learner, make_
 from gmijax.learning.unroll import act
 from gmijax.machine.nvidia import nvml_session
 from gmijax.ppo.ppo import Samples, learn, no_stats
-from gmijax.sim.build import make_training_env
 from gmijax.sim.interface import EnvSpec
-from gmijax.sim.wrappers import BatchedEnv, env_keys
+from gmijax.sim.randomize import make_worlds
+from gmijax.sim.wrappers import BatchedEnv, env_keys, training_env
 
 SECONDS = 2.0
 """How long each task runs: the monitor wants a tenth of a second at least."""
@@ -175,7 +175,8 @@ def _stages(config: TrainConfig, impl: str) -> Iterator[Stage]:
     """Agent, trainer and simulator, with random experience where they need some."""
     algo, num_envs = config.algo, config.envs_per_gmi
     assert isinstance(algo, PpoConfig)
-    env = make_training_env(config.env, impl, seed=0, first_env=0, num_envs=num_envs)
+    worlds = make_worlds(config.env, impl, seed=0, first_env=0, num_envs=num_envs)
+    env = training_env(worlds)
     learner, key = make_learner(env.spec, algo), jax.random.key(0)
     state = init_learner(learner, env.spec.obs_size, key)
     envs = jax.jit(env.init)(env.model, env_keys(key, 0, num_envs))

@@ -59,7 +59,7 @@ def main(argv: Sequence[str]) -> int:
         sys.stdout.write(json.dumps(found.to_dict(), indent=2) + "\n")
     else:
         width = None if sys.stdout.isatty() else 140
-        show(found, Console(highlight=False, soft_wrap=True, width=width))
+        show(found, Console(highlight=False, soft_wrap=True, markup=False, width=width))
     return EXIT_BROKEN if found.problems else EXIT_OK
 
 
@@ -115,30 +115,25 @@ def show(found: Diagnosis, console: Console) -> None:
     machine = system.machine
     console.print(
         f"gmijax {__version__}, Python {sys.version.split()[0]}, {len(machine.cpu_cores)} CPU "
-        f"cores, NVIDIA driver {machine.driver_version or 'none'}",
-        markup=False,
+        f"cores, NVIDIA driver {machine.driver_version or 'none'}"
     )
     for gpu in machine.gpus:
         mig = "on" if gpu.mig_enabled else "off" if gpu.mig_supported else "none"
+        major, minor = gpu.compute_capability
         console.print(
             f"GPU {gpu.index}: {gpu.name}, {gpu.memory_mib} MiB, compute capability "
-            f"{gpu.compute_capability[0]}.{gpu.compute_capability[1]}, MIG {mig}",
-            markup=False,
+            f"{major}.{minor}, MIG {mig}"
         )
         for one in gpu.instances:
-            console.print(
-                f"  {one.profile}: {one.num_sms} SMs, {one.memory_mib} MiB, {one.uuid}",
-                markup=False,
-            )
-    devices = ", ".join(system.jax.devices)
-    console.print(f"jax sees: {devices or system.jax.error}", markup=False)
+            console.print(f"  {one.profile}: {one.num_sms} SMs, {one.memory_mib} MiB, {one.uuid}")
+    console.print(f"jax sees: {', '.join(system.jax.devices) or system.jax.error}")
     installed = [f"{name} {number}" for name, number in system.versions.items() if number]
-    console.print(f"packages: {', '.join(installed)}\n", markup=False)
+    console.print(f"packages: {', '.join(installed)}\n")
     console.print(_table(found))
     for note in found.notes:
-        console.print(f"note: {note}", markup=False)
+        console.print(f"note: {note}")
     for problem in found.problems:
-        console.print(f"problem: {problem}", markup=False)
+        console.print(f"problem: {problem}")
     if not found.problems:
         console.print("nothing is broken")
 
@@ -148,8 +143,7 @@ def _table(found: Diagnosis) -> Table:
     for heading in ("kind", "name", "usable", "why"):
         table.add_column(heading, overflow="fold", no_wrap=heading != "why")
     for ability in found.abilities:
-        usable = "yes" if ability.usable else "no"
-        table.add_row(ability.kind, ability.name, usable, ability.why.replace("[", r"\["))
+        table.add_row(ability.kind, ability.name, "yes" if ability.usable else "no", ability.why)
     return table
 
 

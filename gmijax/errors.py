@@ -72,18 +72,26 @@ class GmiFailed(GmijaxError):
       reason: one line: the GMI's own error, its exit code, or the signal that ended it.
       iteration: training iterations that it had done.
       error: its own exception, None where it left none.
+      exit_code: of its process, negative for the signal that ended it; 0 while it ran.
       is_final: whether to try again cannot help, whatever the cause.
       seen_s: when the failure was seen, `time.monotonic`.
     """
 
     def __init__(
-        self, gmi: int, reason: str, *, iteration: int = 0, error: ReportedError | None = None
+        self,
+        gmi: int,
+        reason: str,
+        *,
+        iteration: int = 0,
+        error: ReportedError | None = None,
+        exit_code: int = 0,
     ) -> None:
         super().__init__(f"GMI {gmi} failed: {reason}")
         self.gmi = gmi
         self.reason = reason
         self.iteration = iteration
         self.error = error
+        self.exit_code = exit_code
         self.is_final = False
         self.seen_s = time.monotonic()
 
@@ -93,25 +101,15 @@ class CollectiveError(GmijaxError):
 
 
 class PeerLost(CollectiveError):
-    """The process of another GMI is gone.
-
-    Attributes:
-      rank: the rank that noticed.
-      peer: the rank that is gone.
-    """
+    """The process of another GMI, of rank `peer`, is gone."""
 
     def __init__(self, rank: int, peer: int, operation: str, step: int) -> None:
         super().__init__(f"rank {rank}: peer {peer} is gone during {operation}, step {step}")
-        self.rank, self.peer, self.operation, self.step = rank, peer, operation, step
+        self.peer = peer
 
 
 class CollectiveTimeout(CollectiveError):
-    """Other GMIs did not arrive in time.
-
-    Attributes:
-      rank: the rank that waited.
-      missing: the ranks that did not arrive.
-    """
+    """Other GMIs, those of the ranks in `missing`, did not arrive in time."""
 
     def __init__(
         self, rank: int, missing: tuple[int, ...], operation: str, step: int, timeout_s: float
@@ -120,21 +118,14 @@ class CollectiveTimeout(CollectiveError):
             f"rank {rank}: waited {timeout_s:g} s in {operation}, step {step}, "
             f"for ranks {list(missing)}"
         )
-        self.rank, self.missing, self.operation, self.step = rank, missing, operation, step
-        self.timeout_s = timeout_s
+        self.missing = missing
 
 
 class PipeClosed(CollectiveError):
-    """The other end of a pipe was closed on purpose: nothing more comes, or is wanted.
-
-    Attributes:
-      rank: the rank that noticed.
-      peer: the rank that closed.
-    """
+    """The other end of a pipe was closed on purpose: nothing more comes, or is wanted."""
 
     def __init__(self, rank: int, peer: int, operation: str) -> None:
         super().__init__(f"rank {rank}: peer {peer} has closed its pipe, in {operation}")
-        self.rank, self.peer, self.operation = rank, peer, operation
 
 
 class CudaError(CollectiveError):

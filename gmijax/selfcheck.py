@@ -8,7 +8,7 @@ integers, which all kinds hold exactly; what may differ is the rounding of the r
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from types import MappingProxyType
 from typing import Final, NamedTuple, TypeAlias
 
@@ -65,8 +65,6 @@ That is where wrong products were reported, and it compiles at once: what XLA tr
 takes it seconds a product. CPUs ignore them.
 """
 
-Multiply: TypeAlias = Callable[[jax.Array, jax.Array, Precision], jax.Array]
-
 _LARGEST_FACTOR: Final = 8
 
 
@@ -91,8 +89,6 @@ class Product(NamedTuple):
 
 def check_share(plan: Plan, gmi: int) -> float:
     """Checks this GMI's share if the plan says so; returns the time it took in seconds.
-
-    Call it after the processes of a job have met (`join_world`): it uses the device.
 
     Raises:
       SelfCheckFailed: a product is wrong; says which, how much, and the share.
@@ -119,18 +115,14 @@ def check_share(plan: Plan, gmi: int) -> float:
 
 
 def compare_products(
-    sizes: Sequence[tuple[int, int, int]] | None = None,
-    precisions: Sequence[Precision] = PRECISIONS,
-    multiply: Multiply | None = None,
-    compiler_options: Options | None = None,
+    sizes: Sequence[tuple[int, int, int]] | None = None, compiler_options: Options | None = None
 ) -> Iterator[Product]:
     """Multiplies on the default device, and compares with float64."""
-    product = multiply or _multiply
 
     def all_kinds(factors: list[tuple[jax.Array, jax.Array]]) -> list[jax.Array]:
         # One program for all kinds: they compile at the same time.
-        pairs = zip(factors, precisions, strict=True)
-        return [product(left, right, kind) for (left, right), kind in pairs]
+        pairs = zip(factors, PRECISIONS, strict=True)
+        return [_multiply(left, right, kind) for (left, right), kind in pairs]
 
     compiled = jax.jit(all_kinds, compiler_options=dict(compiler_options or {}))
     draw = np.random.default_rng(0)
@@ -139,9 +131,9 @@ def compare_products(
         expected = left.astype(np.float64) @ right.astype(np.float64)
         # Rounded outside of the program, which could else compute in another type than asked.
         factors = [
-            (jnp.asarray(left, kind.dtype), jnp.asarray(right, kind.dtype)) for kind in precisions
+            (jnp.asarray(left, kind.dtype), jnp.asarray(right, kind.dtype)) for kind in PRECISIONS
         ]
-        for kind, found in zip(precisions, compiled(factors), strict=True):
+        for kind, found in zip(PRECISIONS, compiled(factors), strict=True):
             yield Product(kind, (m, k, n), _error(np.asarray(found, np.float32), expected))
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import sys
 from pathlib import Path
 
-from supervision import machine, make_job, plan_config, reduce_config
+from supervision import machine, make_launch, plan_config, reduce_config
 
 from gmijax.machine.mps_control import find_mps_control
 from gmijax.partition.planner import make_plan
@@ -21,7 +21,7 @@ def main() -> None:
     config = plan_config(gmis_per_gpu=len(modes), backend=backend_name)
     plan = make_plan(config, reduce_config(), 8, here)
     with open_backend(plan, here, run) as backend:
-        Supervisor(make_job(run, modes, backend, plan)).run()
+        Supervisor(make_launch(run, modes, plan), backend).run()
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""A GMI without jax: `python fake_gmi.py MODE...`; the tests' stand-in for the real worker."""
+"""A GMI without jax, the stand-in for the real worker; `FAKE_GMI_MODES` says what each does."""
 
 from __future__ import annotations
 
@@ -20,7 +20,10 @@ TICK_S = 0.02
 
 
 def clean(link: ChildLink) -> None:
-    """Three iterations and out."""
+    """Three iterations and out; shows its cores and leaves a mark in what GMIs share."""
+    sys.stdout.write(f"{sorted(os.sched_getaffinity(0))}\n")
+    if link.exchange_fd is not None:
+        os.pwrite(link.exchange_fd, b"x", link.gmi)
     for iteration in range(3):
         link.beat("running", iteration)
         time.sleep(TICK_S)
@@ -150,7 +153,7 @@ MODES: dict[str, Callable[[ChildLink], None]] = {
 
 def main() -> None:
     link = ChildLink.from_environment()
-    mode = MODES[sys.argv[1]]
+    mode = MODES[os.environ["FAKE_GMI_MODES"].split(",")[link.gmi]]
     if mode is not silent:
         link.beat("starting", 0)
         link.begin_compiling()

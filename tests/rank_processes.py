@@ -19,8 +19,8 @@ from typing import Any
 import pytest
 
 from gmijax.collectives.build import Membership, build_reducer
+from gmijax.collectives.host.shared_block import create_exchange
 from gmijax.collectives.interface import Reducer
-from gmijax.collectives.shared_block import create_exchange
 from gmijax.errors import CollectiveTimeout, GmijaxError, PeerLost
 from gmijax.partition.layout import Layout
 from gmijax.supervise.child import ENV_EXCHANGE_FD

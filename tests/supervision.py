@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import os
-import sys
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -15,9 +14,9 @@ from gmijax.machine.snapshot import Machine
 from gmijax.partition.plan import Plan
 from gmijax.partition.planner import make_plan
 from gmijax.runs.folder import RunPaths
-from gmijax.supervise.backends import Backend, open_backend
-from gmijax.supervise.environment import gmi_environment
-from gmijax.supervise.supervisor import Job, Timeouts
+from gmijax.supervise.backends import open_backend
+from gmijax.supervise.kinds import JobKind
+from gmijax.supervise.supervisor import Launch, Supervisor, Timeouts
 
 CHECKOUT = Path(errors.__file__).parents[1]
 TESTS = Path(__file__).parent
@@ -42,43 +41,37 @@ def machine(num_gpus: int, **changes: Any) -> Machine:
     return Machine(**{**values, **changes})
 
 
-def make_job(
-    run: RunPaths,
-    modes: Sequence[str],
-    backend: Backend,
-    plan: Plan,
-    *,
-    command: Callable[[int], list[str]] | None = None,
-    compile_once: bool = True,
-    inherited_fds: Mapping[str, int] | None = None,
-    **timeouts_s: float,
-) -> Job:
-    """A job whose GMI i runs `fake_gmi.py modes[i]`."""
-
-    def environment(gmi: int) -> Mapping[str, str]:
-        inherited = {**os.environ, "PYTHONPATH": str(CHECKOUT)}
-        return gmi_environment(plan, gmi, inherited, run.root, backend.environment(gmi))
-
-    limits = {"start": 20.0, "stall": 20.0, "stop": 20.0, "grace": 2.0} | timeouts_s
-    return Job(
+def make_launch(
+    run: RunPaths, modes: Sequence[str], plan: Plan, *, compile_once: bool = True, **limits: float
+) -> Launch:
+    """A job whose GMI i runs `fake_gmi` with `modes[i]`."""
+    limits_s = {"start": 20.0, "stall": 20.0, "stop": 20.0, "grace": 2.0} | limits
+    return Launch(
+        plan=plan,
+        machine=machine(0),
         run=run,
-        gmis=range(len(modes)),
-        command=command or (lambda gmi: [sys.executable, str(TESTS / "fake_gmi.py"), modes[gmi]]),
-        environment=environment,
-        backend=backend,
+        kind=JobKind("fake_gmi", compile_once=compile_once),
         timeouts=Timeouts(
-            start_timeout_s=limits["start"],
-            stall_timeout_s=limits["stall"],
-            stop_timeout_s=limits["stop"],
-            grace_s=limits["grace"],
+            start_timeout_s=limits_s["start"],
+            stall_timeout_s=limits_s["stall"],
+            stop_timeout_s=limits_s["stop"],
+            grace_s=limits_s["grace"],
         ),
-        inherited_fds=inherited_fds or {},
-        compile_once=compile_once,
+        variables={
+            "PYTHONPATH": f"{CHECKOUT}{os.pathsep}{TESTS}",
+            "FAKE_GMI_MODES": ",".join(modes),
+        },
     )
 
 
-def cpu_job(run: RunPaths, modes: Sequence[str], **changes: Any) -> Job:
-    """A job on the cpu backend."""
+def cpu_supervisor(
+    run: RunPaths,
+    modes: Sequence[str],
+    inherited_fds: Mapping[str, int] | None = None,
+    **changes: Any,
+) -> Supervisor:
+    """Of a job on the cpu backend."""
     here = machine(0)
     plan = make_plan(plan_config(gmis_per_gpu=len(modes)), reduce_config(), 8, here)
-    return make_job(run, modes, open_backend(plan, here, run), plan, **changes)
+    backend = open_backend(plan, here, run)
+    return Supervisor(make_launch(run, modes, plan, **changes), backend, inherited_fds)

@@ -1,22 +1,43 @@
-"""Advantage actor-critic on batches of whole unrolls: targets, loss, gradients (arXiv:1602.01783).
+"""Advantage actor-critic on batches of whole unrolls (arXiv:1602.01783): targets, loss, update.
 
-These are pure functions; `gmijax.a3c.update` compiles them. With the defaults this is what
-the field calls APPO: V-trace, a clipped surrogate, and several passes over a batch.
+With the defaults this is what the field calls APPO: V-trace, a clipped surrogate, and several
+passes over a batch.
 """
 
 from __future__ import annotations
 
-from typing import NamedTuple, TypeAlias
+from functools import partial
+from typing import Any, NamedTuple, TypeAlias
 
 import jax
 import jax.numpy as jnp
 
 from gmijax.a3c.returns import Returns, n_step_returns, vtrace
+from gmijax.collectives.interface import Peers, Reducer, TracedStep
 from gmijax.config import A3cConfig
-from gmijax.learning.learner import Learner, TrainState, acting_moments
-from gmijax.learning.losses import bound_loss, clipped_surrogate
-from gmijax.learning.normalize import Moments, moments_of, normalize, without_outliers
+from gmijax.learning.learner import (
+    Learner,
+    TrainState,
+    acting_moments,
+    acting_weights,
+    pack_weights,
+    rate_figures,
+)
+from gmijax.learning.normalize import (
+    Moments,
+    merge,
+    merge_all,
+    moments_of,
+    normalize,
+    without_outliers,
+)
 from gmijax.learning.policy import ActorCritic, ActorCriticParams, entropy, kl_divergence, log_prob
+from gmijax.learning.updates import (
+    bound_loss,
+    clipped_surrogate,
+    minibatch_order,
+    run_updates,
+)
 from gmijax.types import Array
 
 A3cLearner: TypeAlias = Learner[A3cConfig]
@@ -78,11 +99,10 @@ class Targets(NamedTuple):
 class A3cLosses(NamedTuple):
     """Means over a minibatch, [] float32 each, under the weights of its unrolls.
 
-    Weights are 1 in the mean over all minibatches of a batch, and not in each of them.
+    Weights are 1 in the mean over all minibatches of a batch, and not in each of them. For the
+    losses see `a3c_loss`.
 
     Attributes:
-      policy_loss: see `a3c_loss`.
-      value_loss: likewise.
       entropy: of the policy, in nats.
       kl: divergence of the policy from itself before the first pass, in nats.
       behaviour_kl: of the policy before the first pass from those that acted, estimated.
@@ -254,6 +274,49 @@ def gradients(
     )
 
 
-def batch_moments(learner: A3cLearner, state: TrainState, batch: Unrolls) -> Moments:
-    """Statistics [O] of a batch's observations."""
-    return moments_of(without_outliers(acting_moments(learner, state), batch.state), 2)
+class Updated(NamedTuple):
+    """Results of an update, beside the state.
+
+    Attributes:
+      weights: [W] float32, to publish; see `pack_weights`.
+      losses: means over all minibatches of all trainers, [] each.
+      rates: of all minibatches, see `rate_figures`.
+    """
+
+    weights: Array
+    losses: A3cLosses
+    rates: dict[str, Array]
+
+
+def make_update(learner: A3cLearner, reducer: Reducer) -> TracedStep:
+    """The update as a program: `(state, (batch, weight)) -> (state, (), Updated)`.
+
+    The batch has unrolls [T, B]. The weight [B] is 0 for unrolls that are too old to learn from;
+    the others weigh alike on all trainers, and the mean over all of them is 1.
+    """
+    return reducer.program(partial(update, learner), donates_own=False)
+
+
+def update(
+    learner: A3cLearner,
+    peers: Peers,
+    _: Any,
+    state: TrainState,
+    weighted: tuple[Unrolls, Array],
+) -> tuple[TrainState, tuple[()], Updated]:
+    """See `make_update`."""
+    batch, weight = weighted
+    targets = batch_targets(learner, state, batch, weight)
+    observed = without_outliers(acting_moments(learner, state), batch.state)
+    everyone = peers.gather(moments_of(observed, 2))
+    order = minibatch_order(learner.config, state, peers.rank(), batch.reward.shape[1])
+    state, losses, rates = run_updates(
+        learner, peers, gradients, state, batch, targets, order, after=everyone
+    )
+    # Counts the batch, which makes a new version of the policy, and takes in its statistics.
+    state = state._replace(
+        obs_moments=merge(state.obs_moments, merge_all(everyone)), iteration=state.iteration + 1
+    )
+    weights = pack_weights(acting_weights(learner, state))
+    means = jax.tree.map(jnp.mean, losses)
+    return state, (), Updated(weights, means, rate_figures(learner.config, rates))

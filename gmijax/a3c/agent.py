@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
+from dataclasses import dataclass
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -18,7 +19,6 @@ import numpy.typing as npt
 
 from gmijax.a3c.a3c import Unrolls
 from gmijax.a3c.job_registers import JobRegisters, Orders, Report
-from gmijax.a3c.outgoing import Outgoing
 from gmijax.a3c.rollout import UnrollPrograms, num_counts
 from gmijax.collectives.channel.sender import Sender
 from gmijax.config import A3cConfig, TrainConfig
@@ -39,6 +39,9 @@ from gmijax.supervise.child import ChildLink
 from gmijax.types import Array
 
 _PAUSE_S = 0.02
+_POLL_S = 0.0002
+_SLICE_S = 0.5
+"""Longest wait for room before the agent looks for orders again."""
 
 
 class _Sent(NamedTuple):
@@ -49,48 +52,29 @@ class _Sent(NamedTuple):
     version: int
 
 
+@dataclass
 class Agent:
-    """One serving GMI.
+    """One serving GMI, number `index` of the agents; `trainers` are named in errors."""
 
-    Args:
-      config: of the run.
-      env: its environments.
-      index: place among the agents, 0 for the first.
-      trainers: ids of the GMIs that train, for messages.
-      registers: of the job.
-      sender: of experience.
-      link: to the controller.
-    """
+    config: TrainConfig
+    env: BatchedEnv
+    index: int
+    trainers: tuple[int, ...]
+    registers: JobRegisters
+    sender: Sender
+    link: ChildLink
 
-    def __init__(
-        self,
-        config: TrainConfig,
-        env: BatchedEnv,
-        index: int,
-        trainers: tuple[int, ...],
-        registers: JobRegisters,
-        sender: Sender,
-        link: ChildLink,
-    ) -> None:
-        assert isinstance(config.algo, A3cConfig)
-        self._config = config
-        self._algo = config.algo
-        self._env = env
-        self._index = index
-        self._trainers = trainers
-        self._registers = registers
-        self._sender = sender
-        self._outgoing = Outgoing(config, config.algo, sender)
-        self._link = link
-        self._learner = make_learner(env.spec, config.algo)
-        self._report = Report(
-            None, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, np.zeros(num_counts(env), np.float64)
-        )
+    def __post_init__(self) -> None:
+        assert isinstance(self.config.algo, A3cConfig)
+        self._algo = self.config.algo
+        self._learner = make_learner(self.env.spec, self._algo)
+        self._report = Report.of_nothing(num_counts(self.env))
         self._orders_seen = 0
         self._orders = Orders(None, is_ending=False)
         self._weights_seen = 0
         self._version = 0
         self._unrolls = 0
+        self._wait_s = 0.0
 
     def run(self) -> dict[str, Any]:
         """Acts until the leading trainer ends the job.
@@ -101,20 +85,20 @@ class Agent:
         Raises:
           CollectiveTimeout: trainers do not start, or take nothing any more.
         """
-        self._link.beat("compiling", 0)
+        self.link.beat("compiling", 0)
         started = time.monotonic()
         # Of the right shapes; those to act with are read later.
-        start = jax.jit(partial(init_learner, self._learner, self._env.spec.obs_size))
+        start = jax.jit(partial(init_learner, self._learner, self.env.spec.obs_size))
         weights = acting_weights(self._learner, start(jax.random.key(0)))
-        env_state = first_envs(self._env, self._config, self._index, gmi=self._link.gmi)
+        env_state = first_envs(self.env, self.config, self.index, gmi=self.link.gmi)
         num_pieces = self._algo.pieces_per_unroll
         num_steps = self._algo.unroll_length // num_pieces
         program = UnrollPrograms(
-            *(self._env, self._learner.networks, num_steps, num_pieces, weights, env_state),
-            stays=self._sender.on_device,
+            *(self.env, self._learner.networks, num_steps, num_pieces, weights, env_state),
+            stays=self.sender.on_device,
         )
         compile_s = time.monotonic() - started
-        self._link.beat("ready", 0)
+        self.link.beat("ready", 0)
         self._wait_for_start()
         started = time.monotonic()
         self._loop(program, weights, env_state)
@@ -124,7 +108,7 @@ class Agent:
             "unrolls": self._unrolls,
             "wall_s": time.monotonic() - started,
             "send_s": self._report.send_s,
-            "wait_s": self._outgoing.waited_s,
+            "wait_s": self._wait_s,
             "dropped": int(self._report.dropped),
             "compile_s": compile_s,
             "device": describe_device(),
@@ -132,7 +116,7 @@ class Agent:
 
     def _wait_for_start(self) -> None:
         """Returns when the leading trainer has written its first orders and weights."""
-        limit_s = self._config.run.start_timeout_s
+        limit_s = self.config.run.start_timeout_s
         started = time.monotonic()
         while not self._look():
             if time.monotonic() - started > limit_s:
@@ -165,33 +149,34 @@ class Agent:
         self, weights: ActingWeights, unpack: Callable[[npt.NDArray[np.float32]], ActingWeights]
     ) -> ActingWeights:
         """The newest weights published; `weights` if there are no newer ones."""
-        if (snapshot := self._registers.weights.read(self._weights_seen)) is None:
+        if (snapshot := self.registers.weights.read(self._weights_seen)) is None:
             return weights
         self._weights_seen, self._version = snapshot.count, snapshot.tag
         return unpack(snapshot.values.view(np.float32))
 
     def _send(self, unroll: _Sent, env_state: BatchState) -> None:
         arrays: dict[str, Any] = unroll.experience._asdict()
-        if not self._sender.on_device:
+        if not self.sender.on_device:
             arrays = {name: np.asarray(values) for name, values in arrays.items()}
         stats = np.asarray(unroll.stats, np.float64)
         started = time.monotonic()
         if not self._hand_over(arrays, unroll.version, env_state, started):
             return
-        sender, occupancy = self._sender, self._sender.occupancy()
-        self._outgoing.flush_if_starving()
+        sender, occupancy = self.sender, self.sender.occupancy()
+        if not sender.least_occupancy():  # A trainer has nothing to do: it need not wait for more.
+            sender.flush()
         self._unrolls += 1
         self._report = self._report._replace(
             env_steps=self._report.env_steps + arrays["reward"].size,
             bytes_sent=float(sender.num_bytes),
             dropped=float(sender.dropped),
             send_s=self._report.send_s + time.monotonic() - started,
-            wait_s=self._outgoing.waited_s,
+            wait_s=self._wait_s,
             occupancy=occupancy,
             stats=self._report.stats + stats,
         )
         self._publish()
-        self._link.beat("running", self._unrolls)
+        self.link.beat("running", self._unrolls)
 
     def _hand_over(
         self,
@@ -201,46 +186,74 @@ class Agent:
         started: float,
     ) -> bool:
         """Sends an unroll; False if the job ends and nobody wants it any more."""
-        limit_s = self._config.reduce.timeout_s
+        limit_s = self.config.reduce.timeout_s
         try:
-            while not self._outgoing.offer(arrays, version, partial(_is_idle, env_state)):
+            while not self._offer(arrays, version, env_state):
                 # Trainers that wait for a checkpoint make no room until it is complete.
                 if self._obey(env_state):
                     return False
                 if time.monotonic() - started > limit_s:
                     raise self._late("send", limit_s)
-                self._link.beat("running", self._unrolls)
+                self.link.beat("running", self._unrolls)
         except PipeClosed:
             if not self._obey(env_state):
                 raise
             return False
         return True
 
+    def _offer(
+        self, arrays: dict[str, npt.NDArray[Any]], version: int, env_state: BatchState
+    ) -> bool:
+        """Whether the channels took an unroll within a moment; waits on an idle device count."""
+        if self._is_ahead(arrays, env_state):
+            return False
+        costs, before_s = _is_idle(env_state), self.sender.waited_s
+        is_sent = self.sender.send(arrays, version, _SLICE_S)
+        if costs:
+            self._wait_s += self.sender.waited_s - before_s
+        return is_sent
+
+    def _is_ahead(self, arrays: dict[str, npt.NDArray[Any]], env_state: BatchState) -> bool:
+        """Waits a moment while `max_ahead` unrolls wait for every trainer; whether they still do.
+
+        More of them in the channel would only make experience older.
+        """
+        channel = self.config.channel
+        if channel.when_full != "block":
+            return False
+        size = sum(array.nbytes for array in arrays.values())
+        most = (self._algo.max_ahead - 0.5) * size / channel.capacity_bytes
+        deadline_s = time.monotonic() + _SLICE_S
+        while self.sender.least_occupancy() > most:
+            costs, now_s = _is_idle(env_state), time.monotonic()
+            if now_s > deadline_s:
+                return True
+            time.sleep(_POLL_S)
+            if costs:
+                self._wait_s += time.monotonic() - now_s
+        return False
+
     def _obey(self, env_state: BatchState) -> bool:
         """Adds to the checkpoint that is wanted, if any; returns whether the job ends."""
         self._look()
-        if self._orders.checkpoint not in (None, self._report.checkpoint):
-            self._save(env_state)
-        return self._orders.is_ending
-
-    def _save(self, env_state: BatchState) -> None:
         steps = self._orders.checkpoint
-        assert steps is not None
-        save_envs(self._link.run, steps, self._link.gmi, env_state)
-        self._report = self._report._replace(checkpoint=steps)
-        self._publish()
+        if steps is not None and steps != self._report.checkpoint:
+            save_envs(self.link.run, steps, self.link.gmi, env_state)
+            self._report = self._report._replace(checkpoint=steps)
+            self._publish()
+        return self._orders.is_ending
 
     def _look(self) -> bool:
         """Takes up new orders; returns whether there ever were any."""
-        if (snapshot := self._registers.orders.read(self._orders_seen)) is not None:
+        if (snapshot := self.registers.orders.read(self._orders_seen)) is not None:
             self._orders_seen, self._orders = snapshot.count, Orders.unpack(snapshot.values)
         return self._orders_seen > 0
 
     def _publish(self) -> None:
-        self._registers.reports[self._index].publish(self._report.pack())
+        self.registers.reports[self.index].publish(self._report.pack())
 
     def _late(self, what: str, limit_s: float) -> CollectiveTimeout:
-        return CollectiveTimeout(self._link.gmi, self._trainers, what, self._unrolls, limit_s)
+        return CollectiveTimeout(self.link.gmi, self.trainers, what, self._unrolls, limit_s)
 
 
 def _is_idle(env_state: BatchState) -> bool:

@@ -19,10 +19,8 @@ _NO_CHECKPOINT = -1
 class Orders(NamedTuple):
     """What the leading trainer wants of all agents.
 
-    Attributes:
-      checkpoint: environment steps of the checkpoint to which every agent is to add its
-        environments, None for none.
-      is_ending: whether agents are to end when they have done so.
+    To add their environments to the `checkpoint` of so many environment steps, if there is one,
+    and whether to end when they have done so.
     """
 
     checkpoint: int | None
@@ -61,6 +59,11 @@ class Report(NamedTuple):
     wait_s: float
     occupancy: float
     stats: npt.NDArray[np.float64]
+
+    @classmethod
+    def of_nothing(cls, num_stats: int) -> Report:
+        """That of an agent which has done nothing."""
+        return cls(None, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, np.zeros(num_stats))
 
     def pack(self) -> npt.NDArray[np.float64]:
         """As numbers for the register; environment steps are exact up to 2^53."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import statistics
 import time
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -31,39 +32,26 @@ from gmijax.supervise.child import ChildLink
 _PAUSE_S = 0.02
 
 
+@dataclass
 class Leader:
-    """The duties of the first trainer, beside training.
+    """The duties of the first trainer, beside training; `agents` are in the order of reports."""
 
-    Args:
-      config: of the run.
-      env: one of the environments, for its names.
-      registers: of the job.
-      link: to the controller.
-      agents: ids of the GMIs that act, in the order of their reports.
-      env_steps: learnt from so far.
-    """
+    config: TrainConfig
+    env: BatchedEnv
+    registers: JobRegisters
+    link: ChildLink
+    agents: tuple[int, ...]
+    env_steps: int
 
-    def __init__(
-        self,
-        config: TrainConfig,
-        env: BatchedEnv,
-        registers: JobRegisters,
-        link: ChildLink,
-        agents: tuple[int, ...],
-        env_steps: int,
-    ) -> None:
-        self._config = config
-        self._registers = registers
-        self._link = link
-        self._agents = agents
-        self._seen = [0] * len(agents)
-        self._reports: list[Report | None] = [None] * len(agents)
+    def __post_init__(self) -> None:
+        self._seen = [0] * len(self.agents)
+        self._reports: list[Report | None] = [None] * len(self.agents)
         self._pending: CheckpointMeta | None = None
         self._checkpoint: Path | None = None
-        self._log = TrainingLog.open(config.env.label, link.run, env_steps)
-        self._reporter = Reporter(self._log, env, env_steps)
+        self._log = TrainingLog.open(self.config.env.label, self.link.run, self.env_steps)
+        self._reporter = Reporter(self._log, self.env, self.env_steps)
         self._started = time.monotonic()
-        self._first_steps = self._env_steps = env_steps
+        self._first_steps = self.env_steps
         self._updates = 0
         self._wall_s = 0.0
 
@@ -74,7 +62,7 @@ class Leader:
 
     def publish(self, weights: npt.NDArray[np.float32], version: int) -> None:
         """Gives agents new weights [W]; never waits for them."""
-        self._registers.weights.publish(weights, tag=version)
+        self.registers.weights.publish(weights, tag=version)
 
     def record(
         self,
@@ -85,7 +73,7 @@ class Leader:
         state: TrainState,
     ) -> None:
         """Takes one update into the metrics."""
-        self._env_steps, self._updates = env_steps, updates
+        self.env_steps, self._updates = env_steps, updates
         self._reporter.add(counts, figures)
         if self._reporter.is_due:
             self._hear()
@@ -97,20 +85,20 @@ class Leader:
         Nobody waits: the agents add their environments when they look. Until then no other
         checkpoint is begun.
         """
-        every = self._config.run.checkpoint_every
+        every = self.config.run.checkpoint_every
         if self._pending is not None:
             self._hear()
             if not self._missing():
                 self._finish_checkpoint()
         elif every and self._updates % every == 0:
             self._begin_checkpoint(state)
-            self._order(self._env_steps, is_ending=False)
+            self._order(self.env_steps, is_ending=False)
 
     def end(self) -> None:
         """Tells the agents to add to the last checkpoint and to end."""
         if self._pending is not None:  # It would be given up for this one: see it through.
             self._wait_for_agents()
-        self._order(self._env_steps, is_ending=True)
+        self._order(self.env_steps, is_ending=True)
 
     def finish(self, state: TrainState) -> None:
         """Writes the last checkpoint and the last line of metrics."""
@@ -129,11 +117,11 @@ class Leader:
         pps, ttop = (_median(rates) for rates in (reporter.pps, reporter.ttop))
         return {
             "status": status,
-            "env_steps": self._env_steps,
+            "env_steps": self.env_steps,
             "iterations": self._updates,
             "train_wall_s": self._wall_s,
             "compile_s": compile_s,
-            "env_steps_per_s": (self._env_steps - self._first_steps) / self._wall_s,
+            "env_steps_per_s": (self.env_steps - self._first_steps) / self._wall_s,
             "step_per_s_inference": pps,
             "step_per_s_train": ttop,
             "pps": pps,
@@ -149,17 +137,17 @@ class Leader:
 
     def _write_line(self, state: TrainState) -> None:
         self._reporter.write(
-            self._env_steps,
+            self.env_steps,
             [report for report in self._reports if report is not None],
             learning_rate=float(state.learning_rate),
             noise_std=float(jnp.mean(jnp.exp(state.params.log_std))),
         )
 
     def _order(self, checkpoint: int | None, *, is_ending: bool) -> None:
-        self._registers.orders.publish(Orders(checkpoint, is_ending).pack())
+        self.registers.orders.publish(Orders(checkpoint, is_ending).pack())
 
     def _hear(self) -> None:
-        for index, register in enumerate(self._registers.reports):
+        for index, register in enumerate(self.registers.reports):
             if (snapshot := register.read(self._seen[index])) is not None:
                 self._seen[index] = snapshot.count
                 self._reports[index] = Report.unpack(snapshot.values)
@@ -168,13 +156,13 @@ class Leader:
         """Agents that have not added to the pending checkpoint."""
         wanted = self._pending.env_steps if self._pending else None
         theirs = [None if report is None else report.checkpoint for report in self._reports]
-        return [gmi for gmi, has in zip(self._agents, theirs, strict=True) if has != wanted]
+        return [gmi for gmi, has in zip(self.agents, theirs, strict=True) if has != wanted]
 
     def _begin_checkpoint(self, state: TrainState) -> None:
-        require_finite(state.params, self._config.env.label, self._env_steps)
-        save_learner(self._link.run, self._env_steps, state)
+        require_finite(state.params, self.config.env.label, self.env_steps)
+        save_learner(self.link.run, self.env_steps, state)
         self._pending = checkpoint_meta(
-            self._config, self._env_steps, len(self._agents), self._log.last_return
+            self.config, self.env_steps, len(self.agents), self._log.last_return
         )
 
     def _wait_for_agents(self) -> None:
@@ -183,15 +171,15 @@ class Leader:
         Raises:
           CollectiveTimeout: some did not; nothing gets the checkpoint's name.
         """
-        limit_s = self._config.reduce.timeout_s
+        limit_s = self.config.reduce.timeout_s
         started = time.monotonic()
         self._hear()
         while missing := self._missing():
             if time.monotonic() - started > limit_s:
                 raise CollectiveTimeout(
-                    self._link.gmi, tuple(missing), "checkpoint", self._updates, limit_s
+                    self.link.gmi, tuple(missing), "checkpoint", self._updates, limit_s
                 )
-            self._link.beat("running", self._updates)
+            self.link.beat("running", self._updates)
             time.sleep(_PAUSE_S)
             self._hear()
         self._finish_checkpoint()
@@ -199,7 +187,7 @@ class Leader:
     def _finish_checkpoint(self) -> None:
         assert self._pending is not None
         self._checkpoint = finish_checkpoint(
-            self._link.run, self._pending, self._config.run.keep_checkpoints
+            self.link.run, self._pending, self.config.run.keep_checkpoints
         )
         self._pending = None
 

@@ -8,8 +8,7 @@ Staleness: how many versions of the policy lie between acting and learning.
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping, Sequence
-from types import MappingProxyType
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import jax
@@ -28,11 +27,6 @@ MAX_COUNTED = 127
 
 LINE_EVERY_S = 0.5
 """Updates may be much faster than anybody can read: a line is of all since the one before."""
-
-_OF_RATES: Mapping[str, Callable[[Any], Any]] = MappingProxyType(
-    {"mean": np.mean, "min": np.min, "max": np.max}
-)
-"""How figures of several updates are joined to those of a line."""
 
 
 class BatchCounts(NamedTuple):
@@ -54,13 +48,7 @@ class BatchCounts(NamedTuple):
 
 
 class UpdateFigures(NamedTuple):
-    """Figures of an update.
-
-    Attributes:
-      losses: on the host.
-      rates: likewise, see `rate_figures`.
-      update_s: seconds that it took.
-    """
+    """Losses of an update, its learning rates (`rate_figures`), and the seconds that it took."""
 
     losses: A3cLosses
     rates: dict[str, Any]
@@ -68,19 +56,10 @@ class UpdateFigures(NamedTuple):
 
 
 class Reporter:
-    """Turns updates into lines, a line for half a second of them.
+    """Turns updates into lines, a line for half a second of them, from `env_steps` on.
 
-    Args:
-      log: takes the lines; at `env_steps`.
-      env: one of the environments, for its names.
-      env_steps: learnt from so far.
-
-    Attributes:
-      log: see above.
-      pps: predictions per second of every line.
-      ttop: training samples per second of every line.
-      bytes_per_s: of experience, of every line.
-      dropped: pieces of experience that were dropped for lack of room.
+    Of every line it keeps `pps`, `ttop` and the `bytes_per_s` of experience; `dropped` counts
+    pieces of experience that were dropped for lack of room.
     """
 
     def __init__(self, log: TrainingLog, env: BatchedEnv, env_steps: int) -> None:
@@ -91,7 +70,7 @@ class Reporter:
         self.dropped = 0
         zeros, unpack = ravel_pytree(no_counts(env.spec, env.overflows))
         self._unpack: Any = unpack
-        self._before = Report._make([None, *[0.0] * 6, np.zeros(zeros.size)])
+        self._before = Report.of_nothing(zeros.size)
         self._env_steps = env_steps
         self._updates: list[tuple[UpdateFigures, float]] = []
         self._stale = 0.0
@@ -119,11 +98,7 @@ class Reporter:
     ) -> None:
         """Writes the line of the updates since the last one; nothing if there were none.
 
-        Args:
-          env_steps: learnt from by trainers.
-          reports: the newest of every agent.
-          learning_rate: after the last update.
-          noise_std: mean standard deviation of the policy.
+        `reports` are the newest of every agent.
 
         Raises:
           NonFiniteError: too many steps of the agents diverged.
@@ -167,7 +142,10 @@ class Reporter:
         averaged: Any = np.mean(losses, axis=0, dtype=np.float64)
         means = dict(zip(A3cLosses._fields, map(float, averaged), strict=True))
         del means["weight"]  # 1, over a batch.
-        joined = {name: float(_OF_RATES[name]([one[name] for one in rates])) for name in rates[0]}
+        # As their names say: the mean of the means, the least and the largest of all.
+        joined = {
+            name: float(getattr(np, name)([one[name] for one in rates])) for name in rates[0]
+        }
         return (
             means,
             joined,

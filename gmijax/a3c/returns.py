@@ -76,18 +76,10 @@ def vtrace(
     are given apart, because a mean that is subtracted from A must be weighted too. With all
     ratios 1 and lam 1 this is `n_step_returns`.
 
-    Args:
-      rewards: [T, N], as are all arrays.
-      values: V(s_t) of the policy that learns.
-      next_values: V(s_{t+1}) before any auto-reset.
-      terminated: 1.0 where the task ended.
-      truncated: 1.0 where time ran out.
-      ratios: probability of the action under the policy that learns, over that under the one
-        that acted.
-      discount: per step, 0 to 1.
-      lam: lambda, 0 to 1.
-      rho_clip: decides which policy's values v approaches.
-      trace_clip: limits variance.
+    All arrays are [T, N]. `values` are V(s_t) of the policy that learns, `next_values` V(s_{t+1})
+    before any auto-reset, `ratios` the probability of the action under the policy that learns
+    over that under the one that acted. `rho_clip` decides which policy's values v approaches,
+    `trace_clip` limits variance.
     """
     rho = jnp.minimum(rho_clip, ratios)
     discounts = discount * (1.0 - terminated)

@@ -64,16 +64,10 @@ def join(pieces: Sequence[tuple[Unrolls, Counts]]) -> tuple[Unrolls, Array]:
 
 
 class UnrollPrograms:
-    """The compiled programs of an agent's unrolls.
+    """The compiled programs of an agent's unrolls, of `num_pieces` pieces of `num_steps` each.
 
-    Args:
-      env: its environments.
-      networks: that act.
-      num_steps: of a piece.
-      num_pieces: of an unroll.
-      weights: an example.
-      env_state: likewise.
-      stays: whether unrolls stay on the device; else they go where the host can read them.
+    `weights` and `env_state` are examples. Unrolls that do not stay on the device go where the
+    host can read them.
     """
 
     def __init__(

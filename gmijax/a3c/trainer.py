@@ -7,6 +7,7 @@ agents their orders, writes metrics and the shared part of checkpoints.
 from __future__ import annotations
 
 import time
+from dataclasses import dataclass
 from typing import Any
 
 import jax
@@ -14,11 +15,10 @@ import jax.numpy as jnp
 import numpy as np
 import numpy.typing as npt
 
-from gmijax.a3c.a3c import Unrolls
+from gmijax.a3c.a3c import Unrolls, make_update
 from gmijax.a3c.job_registers import JobRegisters
 from gmijax.a3c.leader import Leader
 from gmijax.a3c.report import MAX_COUNTED, BatchCounts, UpdateFigures, histogram_of
-from gmijax.a3c.update import make_update
 from gmijax.collectives.channel.batcher import Batch, Batcher
 from gmijax.collectives.interface import Reducer
 from gmijax.config import A3cConfig, TrainConfig
@@ -34,41 +34,27 @@ _SLICE_S = 0.5
 """Longest wait for experience before the trainer says that it is alive."""
 
 
+@dataclass
 class Trainer:
-    """One training GMI.
+    """One training GMI; `env` is not stepped, it is there for its sizes.
 
-    Args:
-      config: of the run.
-      env: one of the environments, for its sizes; it is not stepped.
-      agents: ids of the GMIs that act.
-      registers: of the job.
-      receiver: of experience.
-      reducer: among the trainers.
-      link: to the controller.
+    `receiver` gives it the experience of `agents`, and `reducer` is among the trainers.
     """
 
-    def __init__(
-        self,
-        config: TrainConfig,
-        env: BatchedEnv,
-        agents: tuple[int, ...],
-        registers: JobRegisters,
-        receiver: Batcher,
-        reducer: Reducer,
-        link: ChildLink,
-    ) -> None:
-        assert isinstance(config.algo, A3cConfig)
-        self._config = config
-        self._algo = config.algo
-        self._env = env
-        self._agents = agents
-        self._registers = registers
-        self._receiver = receiver
-        self._reducer = reducer
-        self._link = link
-        self._batch_size = self._algo.batch_of(config.envs_per_gmi)
-        self._learner = make_learner(env.spec, self._algo)
-        self._update = make_update(self._learner, reducer)
+    config: TrainConfig
+    env: BatchedEnv
+    agents: tuple[int, ...]
+    registers: JobRegisters
+    receiver: Batcher
+    reducer: Reducer
+    link: ChildLink
+
+    def __post_init__(self) -> None:
+        assert isinstance(self.config.algo, A3cConfig)
+        self._algo = self.config.algo
+        self._batch_size = self._algo.batch_of(self.config.envs_per_gmi)
+        self._learner = make_learner(self.env.spec, self._algo)
+        self._update = make_update(self._learner, self.reducer)
         self._env_steps = 0
         self._updates = 0
         self._version = 0
@@ -85,29 +71,30 @@ class Trainer:
           ParameterMismatch: the trainers' parameters differ.
           CollectiveError: another GMI is gone or stuck.
         """
-        self._link.beat("compiling", 0)
+        self.link.beat("compiling", 0)
         started = time.monotonic()
-        leads = self._reducer.rank == 0
+        leads = self.reducer.rank == 0
         if not leads:
             # The leader compiles first, the others take its programs from the cache: those that
             # each of them would tune could differ in the last bit.
-            self._reducer.all_gather(np.zeros(1, np.float32))
+            self.reducer.all_gather(np.zeros(1, np.float32))
         # The same key as synchronous training uses: the same first policy.
-        state, self._env_steps = first_state(self._learner, self._env.spec.obs_size, self._config)
+        state, self._env_steps = first_state(self._learner, self.env.spec.obs_size, self.config)
         self._version = int(state.iteration)
         self._update.trace((), state, self._example())
         self._update.compile()
         if leads:
-            self._reducer.all_gather(np.zeros(1, np.float32))
+            self.reducer.all_gather(np.zeros(1, np.float32))
         pack = jax.jit(lambda state: pack_weights(acting_weights(self._learner, state)))
         first = np.asarray(pack(state))
         compile_s = time.monotonic() - started
-        self._link.beat("ready", 0)
+        self.link.beat("ready", 0)
         self._require_equal(state)  # And so all trainers have compiled.
         if not leads:
             return {"status": self._loop(state, None), "updates": self._updates}
-        config, env, agents = self._config, self._env, self._agents
-        leader = Leader(config, env, self._registers, self._link, agents, self._env_steps)
+        leader = Leader(
+            self.config, self.env, self.registers, self.link, self.agents, self._env_steps
+        )
         try:
             leader.start(first, self._version)
             status = self._loop(state, leader)
@@ -116,7 +103,7 @@ class Trainer:
         return leader.outcome(status, compile_s)
 
     def _require_equal(self, state: TrainState) -> None:
-        require_equal(self._reducer, state.params, self._env_steps)
+        require_equal(self.reducer, state.params, self._env_steps)
 
     def _loop(self, state: TrainState, leader: Leader | None) -> str:
         """Returns the status for the outcome."""
@@ -133,24 +120,24 @@ class Trainer:
             self._version += 1
             self._updates += 1
             self._env_steps += round(counts.fresh) * self._algo.unroll_length
-            where = f"{self._config.env.label}, up to env step {self._env_steps}"
+            where = f"{self.config.env.label}, up to env step {self._env_steps}"
             check_losses(where, losses._asdict())
             is_stopped = counts.stop > 0
-            is_last = is_stopped or self._env_steps >= self._config.num_timesteps
+            is_last = is_stopped or self._env_steps >= self.config.num_timesteps
             if leader is not None:
                 leader.publish(weights, self._version)
                 figures = UpdateFigures(losses, rates, time.monotonic() - started)
                 leader.record(self._env_steps, self._updates, counts, figures, state)
                 if not is_last:
                     leader.checkpoint_now_and_then(state)
-            self._link.beat("running", self._updates)
+            self.link.beat("running", self._updates)
             if is_last:
                 break
         if leader is not None:
             leader.end()
         self._require_equal(state)
         # Agents that wait for room may go: the order to end is published by now.
-        self._receiver.close()
+        self.receiver.close()
         if leader is not None:
             leader.finish(state)
         return "stopped" if is_stopped else "completed"
@@ -159,16 +146,16 @@ class Trainer:
         """The next batch with at least one unroll that is fresh enough, and the wait for it."""
         started = since = time.monotonic()
         # At first the agents may still compile.
-        times = self._config
+        times = self.config
         limit_s = times.reduce.timeout_s if self._updates else times.run.start_timeout_s
         while True:
             try:
-                batch = self._receiver.receive(self._batch_size, _SLICE_S)
+                batch = self.receiver.receive(self._batch_size, _SLICE_S)
             except CollectiveTimeout as error:
                 waited_s = time.monotonic() - since
                 if waited_s > limit_s:
                     raise CollectiveTimeout(
-                        self._link.gmi, error.missing, "receive", self._updates, limit_s
+                        self.link.gmi, error.missing, "receive", self._updates, limit_s
                     ) from None
             else:
                 if self._weights_of(batch).any():
@@ -176,7 +163,7 @@ class Trainer:
                 self._passed_over += histogram_of(self._version - batch.versions)
                 since = time.monotonic()
             if self._updates:
-                self._link.beat("running", self._updates)
+                self.link.beat("running", self._updates)
 
     def _weights_of(self, batch: Batch) -> npt.NDArray[np.float32]:
         """[B]: 1 for unrolls within the bound of staleness, 0 for others."""
@@ -187,16 +174,16 @@ class Trainer:
 
     def _scale(self, counts: BatchCounts) -> np.float32:
         """Weight of a fresh unroll, equal to that of any other of the job."""
-        return np.float32(self._reducer.world_size * self._batch_size / counts.fresh)
+        return np.float32(self.reducer.world_size * self._batch_size / counts.fresh)
 
     def _meet(self, batch: Batch, waited_s: float) -> BatchCounts:
         """Tells the other trainers of this batch, and hears of theirs."""
         fresh = float(self._weights_of(batch).sum())
         behind = histogram_of(self._version - batch.versions) + self._passed_over
         self._passed_over[:] = 0.0
-        head = [self._link.stop_requested, fresh, float(behind.sum()) - fresh, waited_s]
+        head = [self.link.stop_requested, fresh, float(behind.sum()) - fresh, waited_s]
         mine = np.concatenate([head, behind])
-        gathered = self._reducer.all_gather(mine.astype(np.float32))
+        gathered = self.reducer.all_gather(mine.astype(np.float32))
         stop, fresh, stale, _ = (float(x) for x in gathered[:, :4].sum(axis=0))
         return BatchCounts(
             stop, fresh, stale, float(gathered[:, 3].max()), gathered[:, 4:].sum(axis=0)
@@ -204,7 +191,7 @@ class Trainer:
 
     def _example(self) -> tuple[Unrolls, Any]:
         """Shapes of a batch and its weights."""
-        steps, size, spec = self._algo.unroll_length, self._batch_size, self._env.spec
+        steps, size, spec = self._algo.unroll_length, self._batch_size, self.env.spec
 
         def floats(*shape: int) -> Any:
             return jax.ShapeDtypeStruct(shape, jnp.float32)

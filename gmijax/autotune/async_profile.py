@@ -74,12 +74,8 @@ def measured_of(lines: Sequence[Line], num_agents: int, memory_mib: float) -> Me
     """Rates of one serving GMI, and of a serving and a training GPU, from a profile.
 
     Trainers could learn from TTOP x (update + wait for a batch) / update, agents could make PPS /
-    (1 - the part of their time for which they had to wait for room).
-
-    Args:
-      lines: those that `window_start` names, and the one before them.
-      num_agents: all of them, on one GPU.
-      memory_mib: largest peak of any GMI.
+    (1 - the part of their time for which they had to wait for room). `lines` are those that
+    `window_start` names, and the one before them.
     """
     before, *seen = lines
     duration_s = seen[-1]["wall_s"] - before["wall_s"]
@@ -100,16 +96,3 @@ def measured_of(lines: Sequence[Line], num_agents: int, memory_mib: float) -> Me
         acting_per_s=pps / (1.0 - min(idle, MOST_IDLE)),
         learning_per_s=ttop * (update_s + receive_s) / update_s,
     )
-
-
-def read(run: RunPaths, iterations: int, num_agents: int, memory_mib: float) -> Measured:
-    """Figures of one GMI from the run folder of a profile.
-
-    Raises:
-      ValueError: too few lines of metrics.
-    """
-    lines = read_metrics(run.metrics)[:-1]  # The last may hold the end of the job.
-    start = window_start(lines, iterations)
-    if start is None:
-        raise ValueError(f"{len(lines)} lines of metrics are too few")
-    return measured_of(lines[start - 1 :], num_agents, memory_mib)

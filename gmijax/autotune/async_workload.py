@@ -15,7 +15,7 @@ import dataclasses
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Final
 
-from gmijax.autotune import async_profile
+from gmijax.autotune.async_profile import Enough, measured_of, window_start
 from gmijax.autotune.grid import Measured, Point
 from gmijax.autotune.workloads import Mode, Split, Workload, peak_memory_mib, results_of
 from gmijax.config import AUTO, PlanConfig, TrainConfig
@@ -25,6 +25,7 @@ from gmijax.machine.snapshot import Machine
 from gmijax.partition.placement import place, serving_and_training
 from gmijax.partition.plan import Plan
 from gmijax.runs.folder import RunPaths
+from gmijax.runs.history import read_metrics
 from gmijax.supervise.gmi_process import GmiStatus
 from gmijax.supervise.kinds import groups_of, training_kind, training_plan
 
@@ -108,13 +109,17 @@ class A3cWorkload(Workload[TrainConfig]):
 
     def enough(self, plan: Plan, run: RunPaths) -> Callable[[Sequence[GmiStatus]], bool]:
         """See `Workload`."""
-        return async_profile.Enough(self.config, plan, run)
+        return Enough(self.config, plan, run)
 
     def read(self, plan: Plan, run: RunPaths) -> Measured:
-        """See `Workload`."""
+        """See `Workload`; raises ValueError for too few lines of metrics."""
+        lines = read_metrics(run.metrics)[:-1]  # The last may hold the end of the job.
+        start = window_start(lines, self.config.search.iterations)
+        if start is None:
+            raise ValueError(f"{len(lines)} lines of metrics are too few")
         num_agents = len(groups_of(plan)[0].gmis)
         memory_mib = peak_memory_mib(results_of(plan, run))
-        return async_profile.read(run, self.config.search.iterations, num_agents, memory_mib)
+        return measured_of(lines[start - 1 :], num_agents, memory_mib)
 
     def projected(self, point: Point, measured: Measured) -> float:
         """See `Workload`."""
@@ -150,13 +155,7 @@ class A3cWorkload(Workload[TrainConfig]):
 
 
 def throughput(split: Split, acting_per_s: float, learning_per_s: float) -> float:
-    """Environment steps a second that are acted upon and learnt from.
-
-    Args:
-      split: GPUs of each kind.
-      acting_per_s: environment steps a second that one serving GPU can make.
-      learning_per_s: those that one training GPU can learn from.
-    """
+    """Environment steps a second that are made and learnt from, given those of one GPU each."""
     return min(split.serving * acting_per_s, split.training * learning_per_s)
 
 
@@ -191,11 +190,7 @@ def _with_gmis(plan: PlanConfig, point: Point) -> PlanConfig:
 
 
 def _without_auto(plan: PlanConfig) -> PlanConfig:
-    """The plan as if nothing were `auto` in it.
-
-    Raises:
-      ConfigError: numbers of GMIs are given, and to be searched for too.
-    """
+    """The plan as if nothing were `auto` in it; raises ConfigError for numbers that are given."""
     if plan.gmis_per_gpu != AUTO:
         return plan
     for key, where in (

@@ -10,19 +10,13 @@ _COARSE_SIZES: Final = 2
 
 
 class Point(NamedTuple):
-    """A point of the grid.
+    """A point of the grid."""
 
-    Attributes:
-      gmis_per_gpu: GMIs on every GPU; where others train, those that act on every GPU that acts.
-      num_envs: environments per GMI.
-      impl: physics implementation.
-      trainers: training GMIs on every GPU that trains; 0: every GMI does everything.
-    """
-
+    # GMIs on every GPU; where others train, those that act on every GPU that acts.
     gmis_per_gpu: int
-    num_envs: int
-    impl: str
-    trainers: int = 0
+    num_envs: int  # Environments per GMI.
+    impl: str  # Physics implementation.
+    trainers: int = 0  # Training GMIs on every GPU that trains; 0: every GMI does everything.
 
     @property
     def gmis(self) -> str:
@@ -63,14 +57,10 @@ class Measured(NamedTuple):
 
 
 class NotRunnable(NamedTuple):
-    """A point that cannot run.
+    """A point that cannot run."""
 
-    Attributes:
-      reason: why, in one line.
-      limit_s: the time within which it did not end; None where something else was the matter.
-    """
-
-    reason: str
+    reason: str  # Why, in one line.
+    # The time within which it did not end; None where something else was the matter.
     limit_s: float | None = None
 
 
@@ -92,9 +82,7 @@ def as_printed(grid: Grid) -> Grid:
 def coarse(grid: Grid) -> Grid:
     """Every third row, with the largest size and the third below it.
 
-    The row with the fewest GMIs is among them: it is the measure of all others. It comes first,
-    because the fewer GMIs, the sooner they have started, and time may run out. Smaller sizes are
-    left to the climb: where there is room for more environments, few are hardly ever the answer.
+    The row with the fewest GMIs comes first: it starts soonest, and all others are measured by it.
     """
     sizes = sorted(grid.num_envs, reverse=True)[::_STRIDE]
     return Grid(
@@ -103,11 +91,6 @@ def coarse(grid: Grid) -> Grid:
         grid.impls,
         _some_rows(grid.trainers),
     )
-
-
-def first_row(grid: Grid) -> Grid:
-    """The row with the fewest GMIs of a grid that begins with it."""
-    return grid._replace(gmis_per_gpu=grid.gmis_per_gpu[:1], trainers=grid.trainers[:1])
 
 
 def neighbours(point: Point, grid: Grid) -> list[Point]:

@@ -5,25 +5,21 @@ Whatever goes wrong in the job is an answer, not an error.
 
 from __future__ import annotations
 
-import dataclasses
 import shutil
 import time
-from collections.abc import Callable, Sequence
-from typing import Any, Final
+from collections.abc import Callable
+from typing import Any
 
 from gmijax.autotune.grid import Measured, NotRunnable, Point
 from gmijax.autotune.workloads import Mode, Workload
 from gmijax.config.schema import to_dict
 from gmijax.errors import ConfigError, GmijaxError, JobInterrupted
 from gmijax.machine.snapshot import Machine
+from gmijax.partition.plan import Plan
 from gmijax.runs.folder import RunPaths, write_json
 from gmijax.supervise.gmi_process import GmiStatus
-from gmijax.supervise.launcher import Launch, run_gmis
+from gmijax.supervise.launcher import Launch, OnTick, run_gmis
 from gmijax.supervise.supervisor import Timeouts
-
-_TIMEOUTS: Final = Timeouts(
-    start_timeout_s=60.0, stall_timeout_s=60.0, stop_timeout_s=3.0, grace_s=3.0
-)
 
 
 class ProfileLate(Exception):
@@ -38,7 +34,7 @@ def profile(
     run: RunPaths,
     *,
     limit_s: float,
-    on_tick: Callable[[Sequence[GmiStatus]], None],
+    on_tick: OnTick,
     on_warning: Callable[[str], None],
 ) -> Measured | NotRunnable:
     """Runs a short job at a point; `run` is its folder, of which logs are kept.
@@ -54,27 +50,9 @@ def profile(
         return NotRunnable(str(error))
     write_json(run.config, to_dict(config))
     write_json(run.plan, plan.to_dict())
-    deadline_s = time.monotonic() + limit_s
-
-    def watch(gmis: tuple[GmiStatus, ...]) -> None:
-        on_tick(gmis)
-        if time.monotonic() > deadline_s:
-            states = ", ".join(f"GMI {gmi.gmi} {gmi.state}" for gmi in gmis)
-            raise ProfileLate(f"no end within {limit_s:.0f} s ({states})")
-
-    launch = Launch(
-        plan=plan,
-        machine=machine,
-        run=run,
-        kind=workload.kind,
-        timeouts=dataclasses.replace(
-            _TIMEOUTS, start_timeout_s=2 * limit_s, stall_timeout_s=2 * limit_s
-        ),
-        on_warning=on_warning,
-        is_enough=workload.enough(plan, run),
-    )
+    launch = _launch(workload, plan, machine, run, limit_s, on_warning)
     try:
-        run_gmis(launch, watch)
+        run_gmis(launch, _until(limit_s, on_tick))
         return workload.read(plan, run)
     except JobInterrupted:
         raise
@@ -85,3 +63,38 @@ def profile(
         return NotRunnable(f"no result to read: {type(error).__name__}: {error}")
     finally:
         shutil.rmtree(run.checkpoints, ignore_errors=True)
+
+
+def _launch(
+    workload: Workload[Any],
+    plan: Plan,
+    machine: Machine,
+    run: RunPaths,
+    limit_s: float,
+    on_warning: Callable[[str], None],
+) -> Launch:
+    never_s = 2 * limit_s  # The profile's own limit comes before those of its GMIs.
+    return Launch(
+        plan=plan,
+        machine=machine,
+        run=run,
+        kind=workload.kind,
+        timeouts=Timeouts(
+            start_timeout_s=never_s, stall_timeout_s=never_s, stop_timeout_s=3.0, grace_s=3.0
+        ),
+        on_warning=on_warning,
+        is_enough=workload.enough(plan, run),
+    )
+
+
+def _until(limit_s: float, on_tick: OnTick) -> OnTick:
+    """`on_tick`, which raises ProfileLate once `limit_s` is over."""
+    deadline_s = time.monotonic() + limit_s
+
+    def watch(gmis: tuple[GmiStatus, ...]) -> None:
+        on_tick(gmis)
+        if time.monotonic() > deadline_s:
+            states = ", ".join(f"GMI {gmi.gmi} {gmi.state}" for gmi in gmis)
+            raise ProfileLate(f"no end within {limit_s:.0f} s ({states})")
+
+    return watch

@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Any
 
 from rich.console import Console
-from rich.markup import escape
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
@@ -30,7 +29,7 @@ class SearchDisplay:
         self._console = console
         self._started_s = time.monotonic()
         self._bar = Progress(
-            TextColumn("{task.description}"),
+            TextColumn("{task.description}", markup=False),
             BarColumn(),
             TimeElapsedColumn(),
             TextColumn(f"of at most {budget_s:.0f} s"),
@@ -54,12 +53,12 @@ class SearchDisplay:
         self._bar.update(
             self._task,
             completed=time.monotonic() - self._started_s,
-            description=escape(f"{what}: GMI {slowest.gmi} {slowest.state}"),
+            description=f"{what}: GMI {slowest.gmi} {slowest.state}",
         )
 
     def done(self, what: str, point: Point, result: Measured | NotRunnable, wall_s: float) -> None:
         """Prints what a profile found."""
-        self._console.print(f"{what}: {_found(point, result)} ({wall_s:.0f} s)", markup=False)
+        self._console.print(f"{what}: {_found(point, result)} ({wall_s:.0f} s)")
 
 
 def verdict(outcome: Outcome, grid: Grid, num_gpus: int, split: Split | None = None) -> str:
@@ -107,7 +106,7 @@ def table(outcome: Outcome, isolated: Results) -> Table:
         note = "best" if one == outcome.best else ""
         if isinstance(result, NotRunnable):
             cells += ["-"] * (6 if has_trainers else 4)
-            note = escape(result.reason[:_LONGEST_REASON])
+            note = result.reason[:_LONGEST_REASON]
         else:
             sat = "" if one.saturation is None else f"{one.saturation:.2f}"
             cells += [f"{result.env_steps_per_s:,.0f}", f"{one.projected:,.0f}"]

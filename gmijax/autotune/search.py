@@ -36,7 +36,6 @@ from gmijax.autotune.grid import (
     Point,
     as_printed,
     coarse,
-    first_row,
     neighbours,
 )
 
@@ -58,53 +57,34 @@ def top_of_one(measured: Measured) -> float:
 
 
 class Rules(NamedTuple):
-    """How the grid is searched.
+    """How the grid is searched."""
 
-    Attributes:
-      estimate: environment steps a second of the whole job, line 20.
-      alpha: a row ends when Sat falls below it; the paper has below 0.1.
-      tolerance: relative difference of throughput that counts as none.
-      coarse_first: first every third row with the largest size and the third below it, then the
-        neighbours of the best point, until none of them is better; else the whole grid in the
-        paper's order.
-      top: what Sat goes by.
-    """
-
+    # Environment steps a second of the whole job, line 20.
     estimate: Callable[[Point, Measured], float]
-    alpha: float
-    tolerance: float
+    alpha: float  # A row ends when Sat falls below it; the paper has below 0.1.
+    tolerance: float  # Relative difference of throughput that counts as none.
+    # First every third row with the largest size and the third below it, then the neighbours
+    # of the best point, until none of them is better; else the whole grid in the paper's
+    # order.
     coarse_first: bool
-    top: Callable[[Measured], float] = top_of_one
+    top: Callable[[Measured], float] = top_of_one  # What Sat goes by.
 
 
 class Visited(NamedTuple):
-    """A point that was looked at.
-
-    Attributes:
-      point: which one.
-      result: what it did, or why it cannot run.
-      saturation: Sat, None for the first of its row that ran.
-      projected: environment steps a second of the whole job; 0 where it cannot run.
-    """
+    """A point that was looked at."""
 
     point: Point
-    result: Measured | NotRunnable
-    saturation: float | None
-    projected: float
+    result: Measured | NotRunnable  # What it did, or why it cannot run.
+    saturation: float | None  # Sat, None for the first of its row that ran.
+    projected: float  # Environment steps a second of the whole job; 0 where it cannot run.
 
 
 class Outcome(NamedTuple):
-    """Result of a search.
+    """Result of a search."""
 
-    Attributes:
-      visited: all points that were looked at, in order.
-      best: the best of them, None where nothing ran.
-      complete: whether the search ended by its rules, and not for want of time.
-    """
-
-    visited: tuple[Visited, ...]
-    best: Visited | None
-    complete: bool
+    visited: tuple[Visited, ...]  # All points that were looked at, in order.
+    best: Visited | None  # The best of them, None where nothing ran.
+    complete: bool  # Whether the search ended by its rules, and not for want of time.
 
 
 def saturation(
@@ -224,14 +204,13 @@ def _rows(book: _Book, grid: Grid) -> None:
 def _first_look(book: _Book, grid: Grid) -> None:
     """The coarse rows; smaller sizes only as long as nothing runs.
 
-    The first row, with the fewest GMIs, comes first with all implementations: one that was
-    clearly slower there did not catch up with more where both were measured, and a profile takes
-    half a minute.
+    An implementation that is clearly slower in the first row did not catch up where both were
+    measured, and a profile takes half a minute.
     """
     sizes = grid.num_envs
     while sizes and book.best() is None:
         part = coarse(grid._replace(num_envs=sizes))
-        _rows(book, first_row(part))
+        _rows(book, part._replace(gmis_per_gpu=part.gmis_per_gpu[:1], trainers=part.trainers[:1]))
         _rows(book, part._replace(impls=_worth_more(book, grid.impls)))
         sizes = tuple(size for size in sizes if size < part.num_envs[0])
 

@@ -20,7 +20,6 @@ from typing import Any
 from gmijax.autotune.grid import Measured, NotRunnable, Point
 from gmijax.config.schema import require_positive
 from gmijax.errors import ConfigError
-from gmijax.runs.cache import cache_folder
 from gmijax.runs.folder import read_json, write_json
 
 _DIGEST_LENGTH = 10
@@ -34,15 +33,10 @@ class ProfileStore:
     """
 
     def __init__(self, folder: Path, key: Mapping[str, Any], note: Callable[[str], None]) -> None:
-        """Reads what there is.
+        """Reads what there is; raises ConfigError for a folder that cannot be used.
 
-        Args:
-          folder: where the files of all devices and tasks are.
-          key: everything that decides what a point does; `device` and `task` name the file.
-          note: gets a sentence where a broken file was moved aside.
-
-        Raises:
-          ConfigError: the folder cannot be used.
+        `key` is everything that decides what a point does; `device` and `task` name the file.
+        `note` gets a sentence where a broken file was moved aside.
         """
         self._key = dict(key)
         self._note = note
@@ -63,11 +57,7 @@ class ProfileStore:
         return _result(record) if record else None
 
     def put(self, mode: str, point: Point, result: Measured | NotRunnable, wall_s: float) -> None:
-        """Keeps what a point did; the file is written at once, as a whole.
-
-        Raises:
-          ConfigError: it cannot be written.
-        """
+        """Keeps what a point did, in the file too; raises ConfigError if that cannot be."""
         if isinstance(result, NotRunnable):
             said = {"not_runnable": result.reason, "limit_s": result.limit_s, "wall_s": wall_s}
         else:
@@ -96,11 +86,6 @@ class ProfileStore:
             what = " ".join(str(error).split()) or type(error).__name__
             self._note(f"profile store {self.path} is broken ({what}): moved to {aside}")
             return {}
-
-
-def default_folder() -> Path:
-    """Where profiles are kept unless `search.store` names a folder."""
-    return cache_folder() / "profiles"
 
 
 @contextmanager
@@ -135,11 +120,7 @@ def _slug(text: object) -> str:
 
 
 def _result(record: Mapping[str, Any]) -> Measured | NotRunnable:
-    """Result of a profile in the file; versions without trainers left some figures out.
-
-    Raises:
-      ConfigError, ValueError, TypeError: it is broken.
-    """
+    """Result of a profile in the file; versions without trainers left some figures out."""
     if record.get("not_runnable") is not None:
         return NotRunnable(str(record["not_runnable"]), record.get("limit_s"))
     found = Measured(*(float(record.get(name) or 0.0) for name in Measured._fields))

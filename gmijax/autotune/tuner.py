@@ -9,7 +9,7 @@ from __future__ import annotations
 import time
 from contextlib import suppress
 from pathlib import Path
-from typing import Any, NamedTuple, overload
+from typing import Any, NamedTuple
 
 from rich.console import Console
 
@@ -19,8 +19,9 @@ from gmijax.autotune.profile import ProfileLate, profile
 from gmijax.autotune.report import SearchDisplay, draw, plain_data, table, verdict
 from gmijax.autotune.search import Outcome, OutOfBudget, Rules, Visited
 from gmijax.autotune.search import search as search_grid
-from gmijax.autotune.store import ProfileStore, default_folder
+from gmijax.autotune.store import ProfileStore
 from gmijax.autotune.workloads import (
+    C,
     Mode,
     PpoWorkload,
     ServeWorkload,
@@ -34,6 +35,7 @@ from gmijax.errors import ConfigError, GmijaxError, JobInterrupted
 from gmijax.machine.snapshot import Machine
 from gmijax.partition.backend_choice import candidates, require_num_gpus
 from gmijax.partition.layout import Layout
+from gmijax.runs.cache import cache_folder
 from gmijax.runs.folder import RunPaths, create_run, write_json
 from gmijax.sim.impl import choose_impl
 
@@ -68,11 +70,7 @@ class SearchResult(NamedTuple):
 
 
 def workload_of(config: TrainConfig | ServeConfig) -> Workload[Any]:
-    """A job as a workload.
-
-    Raises:
-      ConfigError: one that cannot be profiled.
-    """
+    """A job as a workload; raises ConfigError for one that cannot be profiled."""
     if isinstance(config, ServeConfig):
         return ServeWorkload(config)
     return A3cWorkload(config) if config.is_asynchronous else PpoWorkload(config)
@@ -83,19 +81,7 @@ def is_auto(config: TrainConfig | ServeConfig) -> bool:
     return AUTO in (config.num_envs, config.plan.gmis_per_gpu)
 
 
-@overload
-def with_auto_decided(
-    config: TrainConfig, machine: Machine, console: Console
-) -> tuple[TrainConfig, tuple[str, ...]]: ...
-
-
-@overload
-def with_auto_decided(
-    config: ServeConfig, machine: Machine, console: Console
-) -> tuple[ServeConfig, tuple[str, ...]]: ...
-
-
-def with_auto_decided(config: Any, machine: Machine, console: Console) -> Any:
+def with_auto_decided(config: C, machine: Machine, console: Console) -> tuple[C, tuple[str, ...]]:
     """The job with what is `auto` found by a search, and why in words.
 
     Instant where the profile store has it. What has to be profiled is kept in a folder of its
@@ -115,10 +101,7 @@ def with_auto_decided(config: Any, machine: Machine, console: Console) -> Any:
 
 
 class Search:
-    """One search.
-
-    Attributes:
-      run: its folder, None until something has to be profiled.
+    """One search; `run` is its folder, None until something has to be profiled.
 
     Raises:
       ConfigError: what no point can change: a backend that is not there, too few GPUs.
@@ -135,8 +118,9 @@ class Search:
             min(grid.gmis_per_gpu), min(grid.num_envs), grid.impls[0], min(grid.trainers)
         )
         workload.plan_at(fewest, "corun", machine)
-        folder = Path(self._settings.store) if self._settings.store else default_folder()
-        self._store = ProfileStore(folder, workload.store_key(machine), self._note)
+        named = self._settings.store
+        folder = Path(named) if named else cache_folder() / "profiles"
+        self._store = ProfileStore(folder, workload.store_key(machine), self._console.print)
         self._display = SearchDisplay(console, self._settings.budget_s)
         self._deadline_s = 0.0
         self._isolated: dict[Point, Measured | NotRunnable] = {}
@@ -175,8 +159,8 @@ class Search:
         if self.run is not None:
             write_json(self.run.search_report, report)
             draw(outcome, self.run.search_png, f"{label}, {device}")
-            self._note(f"report: {self.run.search_report}")
-        self._note(reason)
+            self._console.print(f"report: {self.run.search_report}")
+        self._console.print(reason)
         run_dir = None if self.run is None else self.run.root
         gmis_per_gpu, num_envs, impl, trainers = best.point
         return SearchResult(run_dir, gmis_per_gpu, num_envs, impl, reason, report, trainers, split)
@@ -238,7 +222,7 @@ class Search:
                 self.run.profile(f"{mode}-{point.gmis_key}x{point.num_envs}-{point.impl}"),
                 limit_s=limit_s,
                 on_tick=lambda gmis: self._display.watch(what, gmis),
-                on_warning=self._note,
+                on_warning=self._console.print,
             )
         except ProfileLate as late:
             if limit_s < self._settings.profile_timeout_s:
@@ -260,9 +244,6 @@ class Search:
         first = outcome.visited[0]
         why = first.result.reason if isinstance(first.result, NotRunnable) else ""
         raise GmijaxError(f"no point of the search can run; the first, {first.point}: {why}")
-
-    def _note(self, text: str) -> None:
-        self._console.print(text, markup=False)
 
 
 def _grid(workload: Workload[Any], machine: Machine) -> Grid:

@@ -91,27 +91,28 @@ def choices(group: str) -> list[str]:
 def build(name: str, cls: type[C], overrides: Sequence[str]) -> C:
     """The configuration of a command; raises as `compose`."""
     overrides = [part for text in overrides for part in with_custom_task(name, text)]
-    data = compose_dict(name, [*_algorithm_of_resumed(name, overrides), *overrides])
+    items = parse(overrides)
+    data = compose_dict(name, [*_algorithm_of_resumed(name, items), *overrides])
     if cls is ServeConfig:
-        _check_task_key(parse(overrides))
-        data = _with_task_of_run(data, overrides)
+        _check_task_key(items)
+        data = _with_task_of_run(data, items)
     if cls is TrainConfig:
-        _check_task_key(parse(overrides))
+        _check_task_key(items)
         # With `auto` the command that started the run is given again, whole.
         resume = data["run"].get("resume") if isinstance(data["run"], dict) else None
         if resume not in (None, "auto"):
-            data = _on_top_of_saved(data, overrides, str(resume))
+            data = _on_top_of_saved(data, items, str(resume))
     for key, value in flatten(data).items():  # What the environment has may be anything.
         if isinstance(value, str):
             _require_text(f"{key}={value}")
     return from_dict(cls, data)
 
 
-def _algorithm_of_resumed(name: str, overrides: Sequence[str]) -> list[str]:
-    """`algo=` of the run that `overrides` resume: its algorithm decides which keys there are."""
+def _algorithm_of_resumed(name: str, items: Sequence[Override]) -> list[str]:
+    """`algo=` of the run that overrides resume: its algorithm decides which keys there are."""
     if name != "train":
         return []
-    given = {item.key_or_group: str(item.value()) for item in parse(overrides)}
+    given = {item.key_or_group: str(item.value()) for item in items}
     resume = given.get("run.resume", "null")
     if "algo" in given or resume in ("null", "None", "", "auto"):
         return []
@@ -140,7 +141,7 @@ def _check_override(name: str, item: Override) -> None:
         raise ConfigError(f"{item.input_line}: expected key=value")
     # Hydra's own settings are for jobs that hydra runs; here they would do nothing.
     if re.split(r"[./]", key)[0] == "hydra":
-        raise _unknown_key(key, _known_keys(name))
+        raise _unknown_key(key, defaults(name, ()))
     if item.is_sweep_override():
         raise ConfigError(f"{item.input_line}: expected one value (a list stands in brackets)")
     options = choices(key)
@@ -177,8 +178,7 @@ def _unknown_key(key: str, known: Iterable[str]) -> ConfigError:
 
 def parse(overrides: Sequence[str]) -> list[Override]:
     """Overrides by Hydra's grammar; raises ConfigError."""
-    parser = OverridesParser.create()
-    return [_parsed(parser, text) for text in overrides]
+    return [_parsed(text) for text in overrides]
 
 
 def _require_text(text: str) -> None:
@@ -187,10 +187,10 @@ def _require_text(text: str) -> None:
         raise ConfigError(f"{text!r}: expected text without control characters")
 
 
-def _parsed(parser: OverridesParser, text: str) -> Override:
+def _parsed(text: str) -> Override:
     _require_text(text)
     try:
-        return parser.parse_overrides([text])[0]
+        return OverridesParser.create().parse_overrides([text])[0]
     except RecursionError:
         raise ConfigError(f"{text}: nested too deeply") from None
     except ValueError:  # Python's own limit.
@@ -202,7 +202,7 @@ def _parsed(parser: OverridesParser, text: str) -> Override:
 
 
 def _on_top_of_saved(
-    data: dict[str, Any], overrides: Sequence[str], resume: str
+    data: dict[str, Any], items: Sequence[Override], resume: str
 ) -> dict[str, Any]:
     """The saved configuration of the resumed run, changed where the command line says so.
 
@@ -210,12 +210,12 @@ def _on_top_of_saved(
     """
     saved = saved_config_of(resume, "run.resume")
     saved["run"].update(dir=None, name=None)
-    items = parse(overrides)
     suite = saved["env"].get("suite", "gmijax")
     task = saved["env"].get("name") if suite == "gmijax" else suite
     if task in choices("env") and all(item.key_or_group != "env" for item in items):
-        algo = _algorithm_of_resumed("train", overrides)
-        data = compose_dict("train", [f"env={task}", *algo, *overrides])
+        given = [str(item.input_line) for item in items]
+        algo = _algorithm_of_resumed("train", items)
+        data = compose_dict("train", [f"env={task}", *algo, *given])
     merged = _merged(data, saved)
     if "randomization" in saved["env"]:  # A leaf that the run left out stays out.
         merged["env"]["randomization"] = saved["env"]["randomization"]
@@ -237,9 +237,8 @@ def _on_top_of_saved(
     return merged
 
 
-def _with_task_of_run(data: dict[str, Any], overrides: Sequence[str]) -> dict[str, Any]:
+def _with_task_of_run(data: dict[str, Any], items: Sequence[Override]) -> dict[str, Any]:
     """With `run.dir` and without `env=`: the task of that run, changed where `env.*` says so."""
-    items = parse(overrides)
     run_dir = data["run"].get("dir") if isinstance(data["run"], dict) else None
     if run_dir is None or any(item.key_or_group == "env" for item in items):
         return data
@@ -275,14 +274,10 @@ def _copy_key(key: str, source: dict[str, Any], target: dict[str, Any]) -> bool:
 def _one_line(name: str, error: Exception) -> str:
     text = " ".join(str(error).split())
     if match := re.search(r"Key '([^']+)' is not in struct full_key: (\S+)", text):
-        return str(_unknown_key(match[2], _known_keys(name)))
+        return str(_unknown_key(match[2], defaults(name, ())))
     if match := re.search(r"Could not override '([^']+)'", text):
-        return str(_unknown_key(match[1], _known_keys(name)))
+        return str(_unknown_key(match[1], defaults(name, ())))
     return text
-
-
-def _known_keys(name: str) -> list[str]:
-    return list(defaults(name, ()))
 
 
 def defaults(name: str, overrides: Sequence[str]) -> dict[str, Any]:

@@ -20,12 +20,10 @@ import numpy as np
 
 from gmijax.collection.programs import (
     ActingPolicy,
-    Counts,
     Keep,
     Step,
     infer,
     next_keys,
-    no_counts,
     simulate,
     unroll,
 )
@@ -34,6 +32,7 @@ from gmijax.collectives.messages.pipe import Message, PipeReader, PipeWriter
 from gmijax.collectives.messages.pipe_block import PipeBlock
 from gmijax.config import ServeConfig
 from gmijax.errors import PipeClosed
+from gmijax.learning.unroll import Counts, no_counts
 from gmijax.sim.wrappers import BatchedEnv, BatchState, env_keys
 from gmijax.supervise.child import ChildLink
 from gmijax.types import Array
@@ -46,15 +45,10 @@ class Share(NamedTuple):
     """One GMI's part of a serving job.
 
     Attributes:
-      config: of the job.
-      link: to the controller.
-      env: the environments; an agent uses their sizes only.
-      policy: who acts.
       rank: place among the GMIs that simulate (an agent: among the agents).
       first_unroll: unrolls that earlier jobs have written of this GMI's part.
       num_unrolls: unrolls that are left to be made.
       writer: takes the experience, None where it is not kept.
-      barrier: returns when all GMIs of the job have called it.
     """
 
     config: ServeConfig
@@ -83,11 +77,7 @@ class Share(NamedTuple):
         return jax.jit(self.env.init)(self.env.model, keys)
 
     def record(self, unrolls: Iterable[tuple[Step | None, Counts]]) -> dict[str, Any]:
-        """Takes unrolls until there are no more; returns the outcome for `result.json`.
-
-        Raises:
-          NonFiniteError: too many worlds gave numbers that are not finite or beyond all bounds.
-        """
+        """Takes unrolls until there are no more; returns the outcome for `result.json`."""
         steps_per_unroll = self.config.envs_per_gmi * self.config.unroll_length
         stats = CollectionStats(self.link, self.env.spec.name, steps_per_unroll)
         try:
@@ -107,7 +97,7 @@ def collect(share: Share) -> dict[str, Any]:
     """Simulator and agent in one GMI: makes its unrolls; the outcome for `result.json`.
 
     Raises:
-      NonFiniteError: the simulation produced NaN or infinity.
+      NonFiniteError: too many worlds gave numbers that are not finite or beyond all bounds.
       CollectiveError: another GMI is gone or stuck before all have begun.
     """
     started_s = time.monotonic()
@@ -178,12 +168,7 @@ class Peer:
         self._writer.put(arrays, self._timeout_s)
 
     def recv(self) -> Message:
-        """Waits for the other one's arrays; they are valid until the next call.
-
-        Raises:
-          PipeClosed: the other one has ended well.
-          PeerLost, CollectiveTimeout: it is gone, or did not answer in time.
-        """
+        """Waits for the other one's arrays, valid until the next call; PipeClosed at its end."""
         return self._reader.get(self._timeout_s)
 
     def close(self) -> None:
@@ -212,12 +197,10 @@ def run_simulator(share: Share, agent: Peer) -> dict[str, Any]:
 
 
 class _Simulator:
-    """The steps of one simulator.
+    """The steps of one simulator, and how long the latest took.
 
-    Attributes:
-      simulate_s: of the latest steps, from actions on the host to observations on the host.
-      exchange_s: of the same steps, from observations on the host to actions on the host: both
-        pipes, the agent, and waiting while it serves others.
+    `simulate_s` is from actions to observations on the host. `exchange_s` is from observations to
+    actions on the host: both pipes, the agent, and waiting while it serves others.
     """
 
     def __init__(self, share: Share, agent: Peer, state: Any) -> None:
@@ -229,9 +212,10 @@ class _Simulator:
             np.zeros((config.envs_per_gmi, spec.action_size), np.float32),
             np.zeros(config.envs_per_gmi, np.float32),
         )
+        self._no_counts = no_counts(spec, share.env.overflows)
         program = jax.jit(partial(simulate, share.env, share.keep), donate_argnums=(1,))
         self._program = program.lower(
-            share.env.model, self._state, no_counts(share.env), *self._actions
+            share.env.model, self._state, self._no_counts, *self._actions
         ).compile()
         self.simulate_s: deque[float] = deque(maxlen=config.latency_steps)
         self.exchange_s: deque[float] = deque(maxlen=config.latency_steps)
@@ -245,7 +229,7 @@ class _Simulator:
             yield self._unroll()
 
     def _unroll(self) -> tuple[Step | None, Counts]:
-        counts, steps = no_counts(self._share.env), []
+        counts, steps = self._no_counts, []
         for _ in range(self._share.config.unroll_length):
             started_s = time.perf_counter()
             self._state, self._bits, counts, step = self._program(
@@ -262,7 +246,7 @@ class _Simulator:
 
     def _exchange(self) -> None:
         self._agent.send(np.asarray(self._state.env.obs), np.asarray(self._bits))
-        action, log_prob = self._agent.recv().parts
+        action, log_prob = self._agent.recv()
         # Copies: the pipe's memory is used again, and jax may keep what it is given.
         num_envs = self._share.config.envs_per_gmi
         self._actions = (
@@ -283,7 +267,7 @@ def run_agent(share: Share, simulators: Sequence[Peer]) -> dict[str, Any]:
     while left:
         for peer in tuple(left):
             try:
-                obs, bits = peer.recv().parts
+                obs, bits = peer.recv()
             except PipeClosed:
                 left.remove(peer)
                 continue

@@ -20,22 +20,22 @@ from gmijax.learning.checkpoint import digest, restore_learner
 from gmijax.learning.learner import Learner, acting_moments, init_learner, make_learner
 from gmijax.learning.normalize import normalize
 from gmijax.learning.policy import log_prob as log_density
-from gmijax.learning.unroll import policy_noise
+from gmijax.learning.unroll import Counts, Outcome, count, outcome_of, policy_noise
+from gmijax.learning.unroll import unroll as run_steps
 from gmijax.runs.resume import trained_config
 from gmijax.sim.interface import EnvSpec
-from gmijax.sim.wrappers import BatchedEnv, BatchState, EpisodeSums, split_keys, zero_counts
+from gmijax.sim.wrappers import BatchedEnv, BatchState, StepOutput, split_keys
 from gmijax.types import Array, PRNGKey, PyTree
 
 RANDOM: Final = "random"
 
 
 class ActingPolicy(NamedTuple):
-    """What chooses actions.
+    """What chooses actions, with its weights on the device.
 
     Attributes:
       choose: `(weights, obs [N, O], keys [N]) -> (actions [N, A], log densities [N])`; consumes
         the keys. The log density of a policy that does not sample is 0.
-      weights: what `choose` needs, on the device.
       digest: hexadecimal SHA-256 of the weights, or `random`.
     """
 
@@ -57,12 +57,7 @@ def random_policy(spec: EnvSpec) -> ActingPolicy:
 
 
 def trained_policy(checkpoint: Path, spec: EnvSpec, *, deterministic: bool) -> ActingPolicy:
-    """The policy of a checkpoint.
-
-    Args:
-      checkpoint: its folder, in the folder of its run.
-      spec: sizes of the environment.
-      deterministic: act with the mean; else sample.
+    """The policy of a checkpoint's folder, which acts with the mean or samples.
 
     Raises:
       ConfigError: the checkpoint is broken, or of an environment with other sizes.
@@ -93,13 +88,12 @@ class Step(NamedTuple):
     """One step of N environments, as it is kept; over an unroll with a leading axis [T].
 
     Attributes:
-      obs: [N, O] what was observed before the action.
-      action: [N, A] as chosen, before the task clips it.
-      log_prob: [N] log density of the action under the policy.
+      obs: [N, O], before the action.
+      action: [N, A], before the task clips it.
+      log_prob: [N], log density of the action under the policy.
       reward: [N].
-      terminated: [N] bool, the task has ended.
-      truncated: [N] bool, time ran out.
-      next_obs: [N, O] what the action led to, before any reset; None where it is not kept.
+      terminated, truncated: [N] bool, the task has ended; time ran out.
+      next_obs: [N, O], before any reset; None where it is not kept.
     """
 
     obs: Array
@@ -111,25 +105,27 @@ class Step(NamedTuple):
     next_obs: Array | None
 
 
-class Counts(NamedTuple):
-    """What happened in some steps; add those of several.
-
-    Attributes:
-      episodes: sums over the episodes that ended.
-      diverged: [] worlds that were ended because of a bad number: `any`, and by its source.
-      overflowed: [] steps for which a buffer of the simulator was too small, by which.
-    """
-
-    episodes: EpisodeSums
-    diverged: dict[str, Array]
-    overflowed: dict[str, Array]
-
-
 class Keep(NamedTuple):
     """What of every step a program hands out."""
 
     steps: bool
     next_obs: bool
+
+    def of(
+        self, before: BatchState, log_prob: Array, action: Array, out: StepOutput
+    ) -> Step | None:
+        """The step, if it is kept."""
+        if not self.steps:
+            return None
+        return Step(
+            obs=before.env.obs,
+            action=action,
+            log_prob=log_prob,
+            reward=out.reward,
+            terminated=out.terminated,
+            truncated=out.truncated,
+            next_obs=out.next_obs if self.next_obs else None,
+        )
 
 
 def unroll(
@@ -143,14 +139,18 @@ def unroll(
 ) -> tuple[BatchState, Step | None, Counts]:
     """T steps; returns the state, the steps [T, N] (None if not kept), and sums over all."""
 
-    def step(before: BatchState, _: None) -> tuple[BatchState, tuple[Step | None, Counts]]:
+    def choose(before: BatchState) -> tuple[BatchState, Array, Array]:
         drawn, keys = split_keys(before)
         action, log_prob = policy.choose(weights, before.env.obs, keys)
-        after, counts, kept = _advance(env, model, drawn, action, log_prob, keep)
-        return after, (kept, counts)
+        return drawn, log_prob, action
 
-    state, (steps, counts) = jax.lax.scan(step, state, None, length=length)
-    return state, steps, jax.tree.map(lambda x: jnp.sum(x, axis=0, dtype=jnp.float32), counts)
+    def kept(
+        before: BatchState, log_prob: Array, action: Array, out: StepOutput
+    ) -> tuple[Step | None, Array, Outcome]:
+        return keep.of(before, log_prob, action, out), out.reward, outcome_of(out)
+
+    state, (steps, rewards, outcomes) = run_steps(env, choose, length, kept, model, state)
+    return state, steps, count(rewards, outcomes)
 
 
 def simulate(
@@ -164,27 +164,19 @@ def simulate(
 ) -> tuple[BatchState, Array, Counts, Step | None]:
     """The simulator's half of a step: physics, then keys for the next action.
 
-    Args:
-      env: the environments.
-      keep: what of the step is handed out.
-      model: their physics model.
-      state: after `next_keys`, so that its keys are those of this step.
-      counts: of the steps before.
-      action: [N, A] of the agent.
-      log_prob: [N] of the agent.
+    The keys of `state` are those of this step (`next_keys`); actions [N, A] and log densities [N]
+    are the agent's.
 
     Returns:
       The state, random bits [N, ...] uint32 for the agent's next draw, the counts with those of
       this step, and the step.
     """
-    after, new, step = _advance(env, model, state, action, log_prob, keep)
+    after, out = env.step(model, state, action)
+    one = jax.tree.map(lambda x: x[None], (out.reward, outcome_of(out)))
+    counts = jax.tree.map(jnp.add, counts, count(*one))
+    step = keep.of(state, log_prob, action, out)
     after, bits = next_keys(after)
-    return after, bits, jax.tree.map(lambda a, b: a + b.astype(jnp.float32), counts, new), step
-
-
-def no_counts(env: BatchedEnv) -> Counts:
-    """Counts before the first step."""
-    return Counts(*zero_counts(env.spec, env.overflows))
+    return after, bits, counts, step
 
 
 def next_keys(state: BatchState) -> tuple[BatchState, Array]:
@@ -196,28 +188,3 @@ def next_keys(state: BatchState) -> tuple[BatchState, Array]:
 def infer(policy: ActingPolicy, weights: PyTree, obs: Array, bits: Array) -> tuple[Array, Array]:
     """The agent's half of a step: actions [N, A] and log densities [N]."""
     return policy.choose(weights, obs, jax.random.wrap_key_data(bits))
-
-
-def _advance(
-    env: BatchedEnv,
-    model: PyTree,
-    state: BatchState,
-    action: Array,
-    log_prob: Array,
-    keep: Keep,
-) -> tuple[BatchState, Counts, Step | None]:
-    after, out = env.step(model, state, action)
-    kept = (
-        Step(
-            state.env.obs,
-            action,
-            log_prob,
-            out.reward,
-            out.terminated,
-            out.truncated,
-            out.next_obs if keep.next_obs else None,
-        )
-        if keep.steps
-        else None
-    )
-    return after, Counts(out.finished, out.diverged, out.overflowed), kept

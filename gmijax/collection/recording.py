@@ -13,9 +13,10 @@ from typing import Any, BinaryIO
 import jax
 import numpy as np
 
-from gmijax.collection.programs import Counts, Step
-from gmijax.learning.metrics import EpisodeWindow, JsonlSink
+from gmijax.collection.programs import Step
 from gmijax.learning.physics_health import OverflowCount, check_diverged, overflow_line
+from gmijax.learning.training_log import EpisodeWindow, JsonlSink
+from gmijax.learning.unroll import Counts
 from gmijax.runs.dataset import DataPaths
 from gmijax.runs.folder import write_json
 from gmijax.supervise.child import ChildLink
@@ -24,9 +25,7 @@ from gmijax.supervise.child import ChildLink
 class ShardWriter:
     """Writes the shards of one GMI in order, in a thread, while the next unroll is made.
 
-    Attributes:
-      num_written: shards that are finished and safe, by this writer.
-      num_bytes: their size.
+    `num_written` of them, of `num_bytes` in all, are finished and safe.
     """
 
     def __init__(
@@ -104,12 +103,7 @@ def _write_whole(path: Path, save: Callable[[BinaryIO], None]) -> int:
 
 
 class CollectionStats:
-    """Counts unrolls; the clock starts when it is made.
-
-    Attributes:
-      env_steps: environment steps so far.
-      num_unrolls: unrolls so far.
-    """
+    """Counts unrolls and environment steps; the clock starts when it is made."""
 
     def __init__(self, link: ChildLink, env_name: str, steps_per_unroll: int) -> None:
         self.env_steps = self.num_unrolls = 0

@@ -7,16 +7,16 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
-from gmijax.collectives.host import HostExchange
+from gmijax.collectives.host.host_exchange import HostExchange
+from gmijax.collectives.host.shared_block import LANES
 from gmijax.collectives.interface import FloatBuffer, Reducer, Step, TracedStep
-from gmijax.collectives.shared_block import LANES
 from gmijax.collectives.strategies import stages
 from gmijax.errors import ConfigError, DeviceMemoryUnavailable
 from gmijax.partition.layout import Layout
 from gmijax.partition.reduction import require_strategy, why_no_bindings
 
 if TYPE_CHECKING:
-    from gmijax.collectives.device_links import Device
+    from gmijax.collectives.device.device_links import Device
     from gmijax.collectives.program import Exchange
 
 
@@ -77,7 +77,7 @@ def build_reducer(strategy: str, membership: Membership) -> Reducer:
 def _built(
     strategy: str, membership: Membership, control: HostExchange, host: HostExchange
 ) -> Reducer:
-    from gmijax.collectives.host_links import HostLinks  # Imports jax.
+    from gmijax.collectives.host.host_links import HostLinks  # Imports jax.
     from gmijax.collectives.program import Exchange
 
     layout, num_floats = membership.layout, _room(membership)
@@ -87,7 +87,7 @@ def _built(
         if device is None or all(stage.link == "host" for stage in parts):
             links = HostLinks(host, num_floats)
         else:
-            from gmijax.collectives.device_links import DeviceLinks
+            from gmijax.collectives.device.device_links import DeviceLinks
 
             links = DeviceLinks(control, host, layout, num_floats, parts, device)
         exchange = Exchange(links, parts, host.rank, host.world_size)
@@ -183,10 +183,10 @@ def _device() -> Device | None:
         return None
     if reason := why_no_bindings():
         raise ConfigError(f"GMIs that train together on GPUs: {reason}")
-    from gmijax.collectives.cuda_memory import CudaMemory
-    from gmijax.collectives.cuda_queue import CudaQueue
-    from gmijax.collectives.device_links import Device
-    from gmijax.collectives.nccl_ring import nccl_ring
+    from gmijax.collectives.device.cuda_memory import CudaMemory
+    from gmijax.collectives.device.cuda_queue import CudaQueue
+    from gmijax.collectives.device.device_links import Device
+    from gmijax.collectives.device.nccl_ring import nccl_ring
 
     return Device(CudaMemory, CudaQueue, nccl_ring)
 

@@ -14,8 +14,8 @@ from typing import Any, TextIO
 
 from rich.console import Console
 from rich.live import Live
-from rich.markup import escape
 from rich.table import Table
+from rich.text import Text
 
 from gmijax.partition.plan import Plan
 from gmijax.runs.folder import RunPaths
@@ -34,20 +34,12 @@ class _Careful:
 
     def write(self, text: str) -> int:
         """Writes, or does nothing once that has failed."""
-        if self._stream is not None:
-            try:
-                self._stream.write(text)
-            except (OSError, ValueError):
-                self._drop(self._stream)
+        self._try(lambda stream: stream.write(text))
         return len(text)
 
     def flush(self) -> None:
         """See `write`."""
-        if self._stream is not None:
-            try:
-                self._stream.flush()
-            except (OSError, ValueError):
-                self._drop(self._stream)
+        self._try(lambda stream: stream.flush())
 
     def isatty(self) -> bool:
         """Whether it is a terminal."""
@@ -55,29 +47,36 @@ class _Careful:
             return self._stream is not None and self._stream.isatty()
         return False
 
-    def _drop(self, stream: TextIO) -> None:
-        self._stream = None
-        # What is left in its buffer would fail once more when Python ends.
-        with suppress(OSError, ValueError):
-            nowhere = os.open(os.devnull, os.O_WRONLY)
-            os.dup2(nowhere, stream.fileno())
-            os.close(nowhere)
+    def _try(self, act: Callable[[TextIO], object]) -> None:
+        stream = self._stream
+        if stream is None:
+            return
+        try:
+            act(stream)
+        except (OSError, ValueError):
+            self._stream = None
+            # What is left in its buffer would fail once more when Python ends.
+            with suppress(OSError, ValueError):
+                nowhere = os.open(os.devnull, os.O_WRONLY)
+                os.dup2(nowhere, stream.fileno())
+                os.close(nowhere)
 
 
 def open_console(*, show: bool) -> Console:
     """Where a job prints what the user may read: standard output, or nowhere."""
     # Without a standard output (`>&-`) it is None.
     stream: Any = _Careful(sys.stdout if show else None)
-    return Console(file=stream, quiet=not show, soft_wrap=True, highlight=False)
+    # Paths, tasks and errors may look like markup.
+    return Console(file=stream, quiet=not show, soft_wrap=True, highlight=False, markup=False)
 
 
 def announce(console: Console, run: RunPaths, plan: Plan, what: str, lines: Sequence[str]) -> None:
     """Prints where a job is, its plan (`what`: the end of that line), and why it is so."""
     layout = [list(gmis) for gmis in plan.layout.gmis_of_gpu]
-    console.print(f"run folder: {run.root}", markup=False)
-    console.print(f"plan: layout {layout}, backend {plan.backend}, {what}", markup=False)
+    console.print(f"run folder: {run.root}")
+    console.print(f"plan: layout {layout}, backend {plan.backend}, {what}")
     for line in (*plan.reasons, *lines):
-        console.print(f"  {line}", markup=False)
+        console.print(f"  {line}")
 
 
 class ConsoleProgress:
@@ -115,7 +114,7 @@ class ConsoleProgress:
         if self._has_panel:
             self._live.stop()
         if self._line:
-            self._console.print(self._text(), highlight=False)
+            self._console.print(self._text())
 
     def update(self, gmis: Sequence[GmiStatus]) -> None:
         """Called about 20 times a second."""
@@ -125,7 +124,7 @@ class ConsoleProgress:
             self._show(gmis)
         except Exception as error:
             self._is_off = True
-            self._console.print(f"no progress from here on: {error!r}", markup=False)
+            self._console.print(f"no progress from here on: {error!r}")
 
     def _show(self, gmis: Sequence[GmiStatus]) -> None:
         if (line := self._latest()) is not None:
@@ -143,18 +142,17 @@ class ConsoleProgress:
         waited = now - self._shown_s > _LINE_EVERY_S
         if states != self._shown[0] or (steps != self._shown[1] and waited):
             text = f"{self._text()}  " if self._line else ""
-            self._console.print(f"{text}[{states}]", markup=False, highlight=False, soft_wrap=True)
+            self._console.print(f"{text}[{states}]")
             self._shown, self._shown_s = (states, steps), now
 
     def _panel(self, gmis: Sequence[GmiStatus]) -> Table:
         grid = Table.grid()
         done = min(self._line.get("env_steps", 0) / self._num_timesteps, 1.0)
         filled = round(done * _BAR_WIDTH)
-        bar = f"[green]{'━' * filled}[/][dim]{'━' * (_BAR_WIDTH - filled)}[/]"
-        grid.add_row(f"{bar} {self._text() if self._line else 'starting'}")
+        bar = ("━" * filled, "green"), ("━" * (_BAR_WIDTH - filled), "dim")
+        grid.add_row(Text.assemble(*bar, f" {self._text() if self._line else 'starting'}"))
         for gmi in gmis:
-            state = escape(gmi.state)
-            grid.add_row(f"[dim]GMI {gmi.gmi}: {state}, iteration {gmi.iteration}[/]")
+            grid.add_row(Text(f"GMI {gmi.gmi}: {gmi.state}, iteration {gmi.iteration}", "dim"))
         return grid
 
     def _text(self) -> str:

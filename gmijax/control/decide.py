@@ -22,27 +22,16 @@ C = TypeVar("C", TrainConfig, ServeConfig)
 
 
 class Decided(NamedTuple, Generic[C]):
-    """A job that is ready to start.
+    """A job that is ready to start."""
 
-    Attributes:
-      config: with nothing `auto` in it that GMIs would have to decide.
-      plan: of the job.
-      machine: where it runs.
-      reasons: what was decided beside the plan, in words.
-    """
-
-    config: C
-    plan: Plan
-    machine: Machine
-    reasons: tuple[str, ...]
+    config: C  # With nothing `auto` in it that GMIs would have to decide.
+    plan: Plan  # Of the job.
+    machine: Machine  # Where it runs.
+    reasons: tuple[str, ...]  # What was decided beside the plan, in words.
 
 
 def with_task(config: C) -> C:
-    """The configuration with its task pinned.
-
-    Raises:
-      ConfigError: no such task, or a custom task's file is not the one that a run noted.
-    """
+    """With its task pinned; raises ConfigError for none, or a file that a run did not note."""
     require_task(str(config.env.name), config.env.suite)
     return dataclasses.replace(config, env=source.pinned(config.env))
 

@@ -31,59 +31,30 @@ _CUDA_13_DRIVER: Final = 580
 """CUDA 13 needs a driver of this branch."""
 
 
-class Range(NamedTuple):
-    """Versions from `least` on, and before `below` if that is given."""
-
-    least: tuple[int, ...]
-    below: tuple[int, ...] | None = None
-
-    def __str__(self) -> str:
-        upper = f",<{_text(self.below)}" if self.below else ""
-        return f">={_text(self.least)}{upper}"
-
-    def has(self, version: str) -> bool:
-        """Whether `version` is in it."""
-        numbers = _numbers(version)
-        return numbers >= self.least and (self.below is None or numbers < self.below)
-
-
-BINDINGS: Final[Mapping[int, Range]] = MappingProxyType(
-    {12: Range(LEAST_BINDINGS, (13,)), 13: Range((13,))}
+BINDINGS: Final[Mapping[int, str]] = MappingProxyType(
+    {12: f">={'.'.join(map(str, LEAST_BINDINGS))},<13", 13: ">=13"}
 )
 """Which cuda-bindings the extras `cuda12` and `cuda13` bring: earlier ones hold the GIL."""
 
 
 class Ability(NamedTuple):
-    """Something that gmijax has, and whether it can be used here.
+    """Something that gmijax has, and whether it can be used here."""
 
-    Attributes:
-      kind: `backend`, `reducer`, `intra`, `physics` or `env`.
-      name: as the configuration has it.
-      usable: whether it can be used.
-      why: the reason, or what to know about it.
-    """
-
-    kind: str
-    name: str
-    usable: bool
-    why: str
+    kind: str  # `backend`, `reducer`, `intra`, `physics` or `env`.
+    name: str  # As the configuration has it.
+    usable: bool  # Whether it can be used.
+    why: str  # The reason, or what to know about it.
 
 
 @dataclass(frozen=True)
 class Diagnosis:
-    """The answer.
+    """The answer."""
 
-    Attributes:
-      system: what it is made from.
-      abilities: what can be used and what not.
-      problems: what is broken and should work, one sentence each; none on a healthy machine.
-      notes: what is worth knowing.
-    """
-
-    system: SystemInfo
-    abilities: tuple[Ability, ...]
+    system: SystemInfo  # What it is made from.
+    abilities: tuple[Ability, ...]  # What can be used and what not.
+    # What is broken and should work, one sentence each; none on a healthy machine.
     problems: tuple[str, ...]
-    notes: tuple[str, ...]
+    notes: tuple[str, ...]  # What is worth knowing.
 
     def to_dict(self) -> dict[str, Any]:
         """Plain data for `--json`."""
@@ -213,17 +184,13 @@ def _jax_problems(system: SystemInfo) -> Iterator[str]:
     usable = [gpu for gpu in system.machine.gpus if device_of(gpu)]
     num_seen = len(system.jax.devices)
     if system.jax.error and usable:
-        yield f"jax cannot use the GPUs that NVML lists: {system.jax.error}{_cuda_advice(system)}"
+        plugins = [system.versions[f"jax-cuda{cuda}-plugin"] for cuda in (12, 13)]
+        advice = "" if any(plugins) else f" (pip install 'gmijax[cuda{_cuda_major(system)}]')"
+        yield f"jax cannot use the GPUs that NVML lists: {system.jax.error}{advice}"
     elif system.jax.error:
         yield f"jax does not work: {system.jax.error}"
     elif usable and not any(gpu.instances for gpu in usable) and num_seen != len(usable):
         yield f"jax sees {num_seen} GPUs, and NVML lists {len(usable)}"
-
-
-def _cuda_advice(system: SystemInfo) -> str:
-    if any(system.versions[f"jax-cuda{cuda}-plugin"] for cuda in (12, 13)):
-        return ""
-    return f" (pip install 'gmijax[cuda{_cuda_major(system)}]')"
 
 
 def _notes(system: SystemInfo) -> Iterator[str]:
@@ -277,13 +244,13 @@ def _missing_pieces(system: SystemInfo) -> Iterator[str]:
 
 def _bindings(system: SystemInfo) -> Iterator[str]:
     cuda = _cuda_major(system)
-    wanted, found = BINDINGS[cuda], system.versions.get("cuda-bindings")
-    if found is not None and wanted.has(found):
+    found = system.versions.get("cuda-bindings")
+    if found is not None and bindings_fit(found, cuda):
         return
     state = f"{found} is installed" if found else "it is not installed"
     yield (
-        "gradients of GMIs that share a GPU go through host memory: reduce.strategy=one_shot "
-        f"needs cuda-bindings{wanted}, and {state} (pip install 'gmijax[cuda{cuda}]')"
+        "GMIs on GPUs cannot train together: their exchanges need "
+        f"cuda-bindings{BINDINGS[cuda]}, and {state} (pip install 'gmijax[cuda{cuda}]')"
     )
 
 
@@ -291,15 +258,13 @@ def _warp(system: SystemInfo) -> Iterator[str]:
     found, wanted = system.versions.get("warp-lang"), system.wanted_warp
     command = "(pip install 'gmijax[warp]')"
     if found is None:
-        faster = ", ".join(sorted(task for task, how in ON_GPU.items() if how.auto == "warp"))
+        faster = ", ".join(sorted(ON_GPU))
         yield f"MJX-Warp is the faster physics for {faster}: needs warp-lang {command}"
     elif wanted is not None and found != wanted:
         yield f"MJX-Warp was made for warp-lang {wanted}, and {found} is installed {command}"
 
 
-def _numbers(version: str) -> tuple[int, ...]:
-    return tuple(int(number) for number in re.findall(r"\d+", version)[:3])
-
-
-def _text(numbers: tuple[int, ...]) -> str:
-    return ".".join(map(str, numbers))
+def bindings_fit(version: str, cuda: int) -> bool:
+    """Whether this cuda-bindings is in `BINDINGS` of a CUDA."""
+    numbers = tuple(int(number) for number in re.findall(r"\d+", version)[:3])
+    return numbers >= (13,) if cuda == 13 else LEAST_BINDINGS <= numbers < (13,)

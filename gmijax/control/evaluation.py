@@ -10,10 +10,9 @@ import dataclasses
 import os
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, Final, NamedTuple
+from typing import Any, Final
 
 from rich.console import Console
-from rich.markup import escape
 from rich.table import Table
 
 from gmijax.config import PlanConfig, PlayConfig, ReduceConfig
@@ -42,23 +41,7 @@ _MOST_DIGITS: Final = 18
 """Of env steps; a longer number is no file name."""
 
 
-class Evaluation(NamedTuple):
-    """Result of playing a checkpoint.
-
-    Attributes:
-      returns: the content of `returns.json`.
-      returns_json: that file.
-      videos: the films that were made.
-      html: the page that was written, None if there is none.
-    """
-
-    returns: dict[str, Any]
-    returns_json: Path
-    videos: tuple[Path, ...]
-    html: Path | None
-
-
-def play(config: PlayConfig, *, show: bool = False) -> Evaluation:
+def play(config: PlayConfig, *, show: bool = False) -> None:
     """Runs one episode per environment with the policy of a checkpoint, and films some of them.
 
     Args:
@@ -70,39 +53,47 @@ def play(config: PlayConfig, *, show: bool = False) -> Evaluation:
       GmiFailed: the evaluation failed.
       GmijaxError: a film was asked for and could not be made; the returns are there.
     """
+    config, changed = _opened(config)
+    paths = _prepare(config)
+    console = open_console(show=show)
+    console.print(f"checkpoint: {config.checkpoint}")
+    if changed:
+        console.print(changed)
+    with console.status(f"playing {config.num_envs} episodes"):
+        run_gmis(_launch(config, paths, detect_machine()))
+    returns = read_json(paths.returns)
+    console.print(_table(returns))
+    console.print(f"returns: {paths.returns}")
+    if not paths.model.exists():
+        _accept_nothing_to_see(config, returns["env"], console)
+        return
+    if config.html != "off":
+        write_page(config, paths, console)
+    if config.video != "none":
+        film(config, paths, console)
+
+
+def _opened(config: PlayConfig) -> tuple[PlayConfig, str | None]:
+    """With its checkpoint, run and task found and checked, and how the task's file has changed.
+
+    All before a process is started, which would find it bad too.
+    """
     if config.html == "on" and not has_brax():
         raise ConfigError(
             "html=on: needs the package brax (pip install 'gmijax[brax]'); "
             "allowed without it are auto, off"
         )
     checkpoint = _find(config)
-    meta = CheckpointMeta.read(checkpoint)
-    # Before a process is started, which would find it bad too.
     saved, _ = trained_config(checkpoint)
     env = source.opened(saved, config.run.env)
     require_task(str(env.name), env.suite)
+    if config.randomize == "on" and not env.randomization:
+        raise ConfigError("randomize=on: env.randomization of the run names nothing to draw")
     run = dataclasses.replace(config.run, dir=str(checkpoint.parents[1]))
     if env.suite == "custom":
         run = dataclasses.replace(run, env=env.name, env_sha256=env.source_sha256)
     config = dataclasses.replace(config, checkpoint=str(checkpoint), run=run)
-    if config.randomize == "on" and not env.randomization:
-        raise ConfigError("randomize=on: env.randomization of the run names nothing to draw")
-    paths = _prepare(config, meta.env_steps)
-    console = open_console(show=show)
-    console.print(f"checkpoint: {checkpoint}", markup=False)
-    if changed := source.changes(env, dataclasses.asdict(saved)):
-        console.print(changed, markup=False)
-    with console.status(f"playing {config.num_envs} episodes"):
-        run_gmis(_launch(config, paths, detect_machine()))
-    returns = read_json(paths.returns)
-    console.print(_table(returns))
-    console.print(f"returns: {paths.returns}", markup=False)
-    if not paths.model.exists():
-        _accept_nothing_to_see(config, returns["env"], console)
-        return Evaluation(returns, paths.returns, (), None)
-    html = None if config.html == "off" else write_page(config, paths, console)
-    videos = () if config.video == "none" else film(config, paths, console)
-    return Evaluation(returns, paths.returns, videos, html)
+    return config, source.changes(env, dataclasses.asdict(saved))
 
 
 def _find(config: PlayConfig) -> Path:
@@ -136,8 +127,9 @@ def _at_step(run: Path, env_steps: int) -> Path:
     return checkpoint
 
 
-def _prepare(config: PlayConfig, env_steps: int) -> PlayPaths:
+def _prepare(config: PlayConfig) -> PlayPaths:
     run = Path(str(config.run.dir))
+    env_steps = CheckpointMeta.read(Path(str(config.checkpoint))).env_steps
     root = run / "play" / f"{env_steps:0{STEP_DIGITS}d}"
     paths = PlayPaths(root)
     try:
@@ -170,14 +162,14 @@ def _accept_nothing_to_see(config: PlayConfig, env: str, console: Console) -> No
     if config.video not in ("auto", "none") or config.html == "on":
         raise GmijaxError(reason)
     if config.video == "auto":
-        console.print(reason, markup=False)
+        console.print(reason)
 
 
 def _table(returns: Mapping[str, Any]) -> Table:
     how = "mean actions" if returns["deterministic"] else "sampled actions"
     diverged = returns["num_diverged"]
     table = Table(
-        title=escape(f"{returns['env']} after {returns['env_steps']:,} env steps, {how}"),
+        title=f"{returns['env']} after {returns['env_steps']:,} env steps, {how}",
         caption=(
             f"{returns['num_envs']} episodes: {returns['num_terminated']} terminated"
             f"{f' ({diverged} of them diverged)' if diverged else ''}, "
@@ -192,5 +184,5 @@ def _table(returns: Mapping[str, Any]) -> Table:
     rows |= {f"  {name}": term for name, term in returns["terms"].items()}
     rows |= returns["metrics"]
     for name, row in rows.items():
-        table.add_row(escape(name), *(f"{row[key]:.2f}" for key in ("mean", "std", "min", "max")))
+        table.add_row(name, *(f"{row[key]:.2f}" for key in ("mean", "std", "min", "max")))
     return table

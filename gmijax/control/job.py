@@ -78,7 +78,7 @@ def train(config: TrainConfig, *, show: bool = False) -> Result:
         announce(console, run, plan, what, (*decided.reasons, *changes, *beginning.notes))
         _Job(decided, run, console).run_to_the_end(beginning, started_s)
     summary = read_json(run.summary)
-    console.print(train_outcome(summary, run), markup=False)
+    console.print(train_outcome(summary, run))
     return Result(run.root, summary)
 
 
@@ -89,7 +89,9 @@ class _Job:
         self._config, self._plan, self._machine, _ = decided
         self._run = run
         self._console = console
-        self._attempts = Attempts(run, self._config.run.max_restarts, self._launch_at, self._say)
+        self._attempts = Attempts(
+            run, self._config.run.max_restarts, self._launch_at, console.print
+        )
 
     def run_to_the_end(self, beginning: StartPoint, started_s: float) -> None:
         """Runs it, with restarts; writes the summary however it ends."""
@@ -130,7 +132,7 @@ class _Job:
             run=self._run,
             kind=training_kind(config),
             timeouts=timeouts_of(config.run),
-            on_warning=self._say,
+            on_warning=self._console.print,
         )
 
     def _look_again(self) -> None:
@@ -141,10 +143,7 @@ class _Job:
         write_json(self._run.plan, self._plan.to_dict())
         for note in notes:
             add_event(self._run.events, "plan", what=note)
-            self._say(note)
-
-    def _say(self, text: str) -> None:
-        self._console.print(text, markup=False)
+            self._console.print(note)
 
 
 def _from(config: TrainConfig, checkpoint: Path | None) -> TrainConfig:
@@ -160,7 +159,7 @@ def _finished(config: TrainConfig, run: RunPaths, console: Console) -> Result:
         plan = Plan.from_dict(read_json(run.plan))
         summary = train_summary(config, plan, run, "completed", 0.0, [])
         write_json(run.summary, summary)
-    console.print(f"nothing is left to do: {run.root}", markup=False)
+    console.print(f"nothing is left to do: {run.root}")
     return Result(run.root, summary)
 
 

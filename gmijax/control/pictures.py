@@ -22,22 +22,21 @@ _GL: Final = "MUJOCO_GL"
 _FALLBACK_GLS: Final = ("egl", "osmesa")
 
 
-def write_page(config: PlayConfig, paths: PlayPaths, console: Console) -> Path | None:
+def write_page(config: PlayConfig, paths: PlayPaths, console: Console) -> None:
     """Writes the page in a child of its own: Brax's libraries may fail as they like."""
     if not has_brax():
-        return None
+        return
     # A page is quickly made, and the GPU may be training.
     environment = {"PJRT_NPROC": "4", **os.environ, "JAX_PLATFORMS": "cpu"}
     with console.status("writing the page"), paths.page_log.open("wb") as log:
         exit_code = _child("gmijax.sim.page", paths, environment, log)
     if exit_code == 0:
-        console.print(f"page: {paths.html}", markup=False)
-        return paths.html
+        console.print(f"page: {paths.html}")
+        return
     reason = f"no page: {last_line(paths.page_log)} (log: {paths.page_log})"
     if config.html == "on":
         raise GmijaxError(f"{reason}; the returns were evaluated")
-    console.print(reason, markup=False)
-    return None
+    console.print(reason)
 
 
 def has_brax() -> bool:
@@ -45,7 +44,7 @@ def has_brax() -> bool:
     return importlib.util.find_spec("brax") is not None
 
 
-def film(config: PlayConfig, paths: PlayPaths, console: Console) -> tuple[Path, ...]:
+def film(config: PlayConfig, paths: PlayPaths, console: Console) -> None:
     """Films with the first OpenGL that works; each is tried in a fresh interpreter."""
     users = os.environ.get(_GL)
     tried = tuple(dict.fromkeys((users, *_FALLBACK_GLS) if users else _FALLBACK_GLS))
@@ -54,10 +53,9 @@ def film(config: PlayConfig, paths: PlayPaths, console: Console) -> tuple[Path, 
         with console.status(f"filming with {gl}"):
             exit_code = _render(gl, paths)
         if exit_code == 0:
-            videos = tuple(path for path in (paths.mp4, paths.gif) if path.exists())
-            for video in videos:
-                console.print(f"video: {video}", markup=False)
-            return videos
+            for video in filter(Path.exists, (paths.mp4, paths.gif)):
+                console.print(f"video: {video}")
+            return
         if not _is_for_want_of_gl(exit_code):
             raise GmijaxError(f"no video: {_why(exit_code, paths)}; the returns were evaluated")
     reason = (
@@ -67,8 +65,7 @@ def film(config: PlayConfig, paths: PlayPaths, console: Console) -> tuple[Path, 
     )
     if config.video != "auto":
         raise GmijaxError(reason)
-    console.print(reason, markup=False)
-    return ()
+    console.print(reason)
 
 
 def _is_for_want_of_gl(exit_code: int) -> bool:

@@ -35,40 +35,25 @@ _FRAME = re.compile(r'^ +File "(.+)", line (\d+), in (.+)$', re.MULTILINE)
 
 
 class Restart(NamedTuple):
-    """One time that a job was started again, for `summary.json`.
+    """One time that a job was started again, for `summary.json`."""
 
-    Attributes:
-      time: of the fault, ISO 8601.
-      gmi: which one failed first.
-      cause: in one line.
-      iteration: that it had done.
-      checkpoint: that the job went on from, None from its beginning.
-    """
-
-    time: str
-    gmi: int
-    cause: str
-    iteration: int
-    checkpoint: str | None
+    time: str  # Of the fault, ISO 8601.
+    gmi: int  # The one that failed first.
+    cause: str  # In one line.
+    iteration: int  # Iterations that it had done.
+    checkpoint: str | None  # Where the job went on from; None: its beginning.
 
 
 @dataclass
 class Attempts:
-    """The attempts at one job.
-
-    Attributes:
-      run: the run folder.
-      max_restarts: without a newer checkpoint in between.
-      launch_at: what to start from a checkpoint (None: from the beginning), by number of the
-        attempt; raises ConfigError if nothing can be started any more.
-      say: takes a line for the user.
-      restarts: those so far.
-    """
+    """The attempts at one job."""
 
     run: RunPaths
-    max_restarts: int
+    max_restarts: int  # Without a newer checkpoint in between.
+    # What to start from a checkpoint (None: from the beginning), by number of the attempt;
+    # raises ConfigError if nothing can be started any more.
     launch_at: Callable[[Path | None, int], Launch]
-    say: Callable[[str], None]
+    say: Callable[[str], None]  # Takes a line for the user.
     restarts: list[Restart] = field(default_factory=list)
     _seen_s: float = 0.0
 

@@ -2,17 +2,14 @@
 
 from __future__ import annotations
 
-import dataclasses
-
 from gmijax.autotune.tuner import Search, SearchResult, is_auto, workload_of
 from gmijax.config import TrainConfig
 from gmijax.config.schema import to_dict
 from gmijax.control.console import open_console
+from gmijax.control.decide import with_task
 from gmijax.errors import ConfigError
 from gmijax.machine.snapshot import detect_machine
 from gmijax.runs.folder import create_run, write_json
-from gmijax.sim import source
-from gmijax.sim.registry import require_task
 
 
 def search(config: TrainConfig, *, show: bool = False) -> SearchResult:
@@ -37,12 +34,11 @@ def search(config: TrainConfig, *, show: bool = False) -> SearchResult:
             f"num_envs={config.num_envs}, plan.gmis_per_gpu={config.plan.gmis_per_gpu}: nothing "
             "to search for; make one of them auto"
         )
-    require_task(str(config.env.name), config.env.suite)
-    config = dataclasses.replace(config, env=source.pinned(config.env))
+    config = with_task(config)
     console = open_console(show=show)
     started = Search(workload_of(config), detect_machine(), console)
     # After everything else was checked: nothing is left of a search that was refused.
     started.run = create_run(config.run.dir, config.run.name, f"{config.env.slug}-search")
     write_json(started.run.config, to_dict(config))
-    console.print(f"run folder: {started.run.root}", markup=False)
+    console.print(f"run folder: {started.run.root}")
     return started.result()

@@ -17,7 +17,7 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from gmijax.collectives.shared_block import create_exchange
+from gmijax.collectives.host.shared_block import create_exchange
 from gmijax.machine.snapshot import Machine
 from gmijax.partition.plan import Plan
 from gmijax.partition.reduction import (
@@ -48,17 +48,11 @@ _TYPICAL_INPUTS, _TYPICAL_OUTPUTS = 64, 16
 
 
 class Probe(NamedTuple):
-    """One thing to measure.
+    """One thing to measure."""
 
-    Attributes:
-      strategy: a reduction strategy.
-      intra: exchange inside a GPU; `one_shot` has `ipc` only.
-      num_floats: P, length of the buffers.
-    """
-
-    strategy: str
-    intra: str
-    num_floats: int
+    strategy: str  # A reduction strategy.
+    intra: str  # Exchange inside a GPU; `one_shot` has `ipc` only.
+    num_floats: int  # P, length of the buffers.
 
     @property
     def name(self) -> str:
@@ -192,10 +186,9 @@ def block_variable(number: int) -> str:
 
 
 def estimated_floats(*hidden: Sequence[int]) -> int:
-    """About how many parameters networks with these hidden layers have, as a power of two.
+    """About how many parameters such networks have; only a GMI knows their first and last layer.
 
-    Only a GMI knows the sizes of observations and actions, and strategies differ by more than
-    what these change. Powers of two, so that similar networks share a measurement.
+    A power of two, so that similar networks share a measurement.
     """
     exact = 0
     for widths in hidden:

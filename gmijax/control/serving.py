@@ -112,7 +112,7 @@ def serve(config: ServeConfig, *, show: bool = False) -> Served:
         write_json(run.plan, job.plan.to_dict())
         _announce(console, job, kept, run)
         summary = _run(job, kept, run, console)
-    console.print(serve_outcome(summary, run), markup=False)
+    console.print(serve_outcome(summary, run))
     return Served(run.root, summary, None if job.data is None else job.data.root)
 
 
@@ -220,7 +220,7 @@ def _run(job: _Job, kept: int, run: RunPaths, console: Console) -> dict[str, Any
         run=run,
         kind=serving_kind(job.config),
         timeouts=timeouts_of(job.config.run),
-        on_warning=lambda text: console.print(text, markup=False),
+        on_warning=console.print,
     )
     with recorded(run, partial(_what_is_left, job), record), progress:
         run_gmis(launch, progress.update)
@@ -259,9 +259,8 @@ def _announce(console: Console, job: _Job, kept: int, run: RunPaths) -> None:
     )
     announce(console, run, plan, what, job.reasons)
     if job.config.run.dir is not None:
-        console.print(f"policy: {job.config.run.dir}", markup=False)
+        console.print(f"policy: {job.config.run.dir}")
     if kept and job.data is not None:
         console.print(
             f"continuing {job.data.root}: {kept} of {job.wanted_unrolls} shards are there",
-            markup=False,
         )

@@ -12,19 +12,13 @@ from gmijax.runs.resume import CheckpointMeta, choose_checkpoint, newest_checkpo
 
 
 class StartPoint(NamedTuple):
-    """Where a job begins.
+    """Where a job begins."""
 
-    Attributes:
-      folder: the run folder if it exists already, None if a new one is to be made.
-      checkpoint: what the job goes on from, None from its beginning.
-      is_complete: whether the checkpoint has all steps that are wanted.
-      notes: sentences for the user.
-    """
-
-    folder: RunPaths | None
-    checkpoint: Path | None
-    is_complete: bool
-    notes: tuple[str, ...]
+    # The run folder if it exists already, None if a new one is to be made.
+    folder: RunPaths | None = None
+    checkpoint: Path | None = None  # What the job goes on from, None from its beginning.
+    is_complete: bool = False  # Whether the checkpoint has all steps that are wanted.
+    notes: tuple[str, ...] = ()  # Sentences for the user.
 
     def open(self, config: TrainConfig) -> RunPaths:
         """The run folder; raises as `create_run`."""
@@ -43,7 +37,7 @@ def find_start_point(config: TrainConfig) -> StartPoint:
         return _go_on_or_start(config)
     require_new_run(config.run.dir, config.run.name)
     if config.run.resume is None:
-        return StartPoint(None, None, is_complete=False, notes=())
+        return StartPoint()
     checkpoint, notes = choose_checkpoint(config.run.resume, "run.resume")
     meta = _require_fit(config, checkpoint, config.run.resume)
     if meta.env_steps >= config.num_timesteps:
@@ -51,7 +45,7 @@ def find_start_point(config: TrainConfig) -> StartPoint:
             f"num_timesteps={config.num_timesteps}: the checkpoint has {meta.env_steps} "
             "steps already; give more in all"
         )
-    return StartPoint(None, checkpoint, is_complete=False, notes=notes)
+    return StartPoint(checkpoint=checkpoint, notes=notes)
 
 
 def _go_on_or_start(config: TrainConfig) -> StartPoint:
@@ -61,12 +55,12 @@ def _go_on_or_start(config: TrainConfig) -> StartPoint:
     if not folder.is_dir():
         if folder.exists():
             raise ConfigError(f"{shown} is no folder")
-        return StartPoint(None, None, is_complete=False, notes=())
+        return StartPoint()
     run = RunPaths(folder.resolve())
     if not run.config.exists():
         if any(path != run.lock for path in folder.iterdir()):
             raise ConfigError(f"{shown} is no run folder, and not empty")
-        return StartPoint(run, None, is_complete=False, notes=())
+        return StartPoint(run)
     # The folder of a checkpoint that may not be there yet.
     env, algo = trained_config(run.checkpoint(0))
     saved, wanted = (env.label, algo.name), (config.env.label, config.algo.name)
@@ -76,7 +70,7 @@ def _go_on_or_start(config: TrainConfig) -> StartPoint:
         )
     found = newest_checkpoint(folder)
     if found.checkpoint is None:
-        return StartPoint(run, None, is_complete=False, notes=found.passed_over)
+        return StartPoint(run, notes=found.passed_over)
     meta = _require_fit(config, found.checkpoint, "auto")
     is_complete = meta.env_steps >= config.num_timesteps
     return StartPoint(run, found.checkpoint, is_complete, found.passed_over)

@@ -32,38 +32,25 @@ _CUDA_VARIABLES: Final = ("XLA_CLIENT_MEM_FRACTION", "XLA_PYTHON_CLIENT_MEM_FRAC
 
 
 class JaxView(NamedTuple):
-    """Devices that jax sees in a process that is started as a GMI would be.
+    """Devices that jax sees in a process that is started as a GMI would be."""
 
-    Attributes:
-      platform: `cpu` or `gpu`; None where jax failed.
-      devices: the kind of every device.
-      error: why it failed, in one line.
-    """
-
-    platform: str | None
-    devices: tuple[str, ...] = ()
-    error: str | None = None
+    platform: str | None  # `cpu` or `gpu`; None where jax failed.
+    devices: tuple[str, ...] = ()  # The kind of every device.
+    error: str | None = None  # Why it failed, in one line.
 
 
 class SystemInfo(NamedTuple):
-    """State of this machine.
+    """State of this machine."""
 
-    Attributes:
-      machine: GPUs, driver, MPS.
-      jax: what jax sees.
-      versions: of packages, None for one that is not installed.
-      variables: the environment.
-      nvml_error: why NVML fails although it is installed, None where it does not.
-      mps_error: why an MPS daemon cannot be started, None where it can or was not tried.
-      wanted_warp: the one warp-lang that mujoco-mjx was made for, None where it names none.
-    """
-
-    machine: Machine
-    jax: JaxView
-    versions: Mapping[str, str | None]
-    variables: Mapping[str, str] = MappingProxyType({})
+    machine: Machine  # GPUs, driver, MPS.
+    jax: JaxView  # What jax sees.
+    versions: Mapping[str, str | None]  # Of packages, None for one that is not installed.
+    variables: Mapping[str, str] = MappingProxyType({})  # The environment.
+    # Why NVML fails although it is installed, None where it does not.
     nvml_error: str | None = None
+    # Why an MPS daemon cannot be started, None where it can or was not tried.
     mps_error: str | None = None
+    # The one warp-lang that mujoco-mjx was made for, None where it names none.
     wanted_warp: str | None = None
 
 

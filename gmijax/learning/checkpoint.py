@@ -13,8 +13,6 @@ import hashlib
 import math
 import os
 import shutil
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import TypeVar
 
@@ -174,16 +172,16 @@ def _partial(paths: RunPaths, env_steps: int) -> Path:
 
 
 def _save(folder: Path, tree: PyTree) -> None:
-    # Orbax takes device arrays for parts of arrays of the whole jax world.
+    # Of the host, so that a checkpoint says nothing of devices.
     arrays = jax.tree.map(np.asarray, _storable(tree))
-    with _as_one_process(), ocp.StandardCheckpointer() as checkpointer:
+    with ocp.StandardCheckpointer() as checkpointer:
         checkpointer.save(folder.resolve(), arrays)
 
 
 def _restore(folder: Path, template: T) -> T:
     plain = jax.tree.map(np.asarray, _storable(template))
     try:
-        with _as_one_process(), ocp.StandardCheckpointer() as checkpointer:
+        with ocp.StandardCheckpointer() as checkpointer:
             restored = checkpointer.restore(folder.resolve(), plain)
     except Exception as error:
         # Orbax raises a plain `Exception` for an array that it cannot read. Anything else, such
@@ -193,22 +191,6 @@ def _restore(folder: Path, template: T) -> T:
         lines = str(error).strip().splitlines() or [type(error).__name__]
         raise ConfigError(f"checkpoint {folder} does not fit this job: {lines[0]}") from error
     return jax.tree.map(_restored, template, restored)
-
-
-@contextmanager
-def _as_one_process() -> Iterator[None]:
-    """Lets orbax see this process alone.
-
-    GMIs that form rings are processes of one jax world, in which orbax would have them write one
-    checkpoint together, through a service of jax that is gone by then. Here each writes folders
-    of its own, and the training loop has a barrier.
-    """
-    count, index = jax.process_count, jax.process_index
-    jax.process_count, jax.process_index = lambda *_: 1, lambda *_: 0
-    try:
-        yield
-    finally:
-        jax.process_count, jax.process_index = count, index
 
 
 def _is_key(leaf: jax.Array) -> bool:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from functools import partial, reduce
+from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -20,8 +20,8 @@ from gmijax.learning.learner import Learner, TrainState, acting_weights
 from gmijax.learning.unroll import act, unroll
 from gmijax.sim.divergence import diverged_by_source, end_diverged
 from gmijax.sim.interface import Env, EnvState
-from gmijax.sim.wrappers import BatchedEnv, BatchState, env_keys, vectorise
-from gmijax.types import Array, PRNGKey, PyTree
+from gmijax.sim.wrappers import BatchState, env_keys, select_worlds, training_env, vectorise
+from gmijax.types import Array, PyTree
 
 CHUNK_STEPS = 50
 """Steps of the compiled program: at most so many are wasted after the last episode's end."""
@@ -95,7 +95,7 @@ def run_episodes(
     length = env.spec.episode_length
     limit = length if options.max_steps is None else min(options.max_steps, length)
     keys = env_keys(jax.random.key(options.seed), 0, options.num_envs)
-    batch = jax.jit(partial(_start, env))(env.model, keys)
+    batch = jax.jit(training_env(env).init)(env.model, keys)
     arguments = (env.model, state, jnp.asarray(limit, jnp.int32))
     chunk = jax.jit(partial(_run_chunk, env, learner, options))
     compiled = chunk.lower(*arguments, batch).compile()
@@ -124,13 +124,6 @@ def run_episodes(
         compile_s=compile_s,
         run_s=run_s,
     )
-
-
-def _start(env: Env, model: PyTree, keys: PRNGKey) -> BatchState:
-    zero = jnp.zeros(keys.shape)
-    terms = dict.fromkeys(env.spec.reward_terms, zero)
-    no_head_start = jnp.zeros(keys.shape, jnp.int32)
-    return BatchState(vectorise(env).reset(model, keys), zero, terms, no_head_start)
 
 
 def _run_chunk(
@@ -164,10 +157,10 @@ def _run_chunk(
             before.head_start,
         )
         running = _is_running(before.env, limit)
-        kept = _where(running, after, before)
+        kept = select_worlds(running, after, before)
         return kept, (_shown_qpos(env, kept.env, options.num_shown), running & bad)
 
-    stopping: Any = BatchedEnv(env.spec, model, partial(_start, env), step)
+    stopping: Any = training_env(env)._replace(model=model, step=step)
     batch, (qpos, diverged) = unroll(
         stopping, choose, CHUNK_STEPS, lambda *step: step[-1], model, batch
     )
@@ -176,20 +169,13 @@ def _run_chunk(
 
 def _without_bad_numbers(env: Env, before: EnvState, state: EnvState) -> tuple[EnvState, Array]:
     """Ends diverged worlds as training does, where they last were: they may be filmed."""
-    bad = reduce(jnp.logical_or, diverged_by_source(env, state).values())
+    bad = diverged_by_source(env, state)["any"]
     ended = end_diverged(before, state, bad)
-    return ended._replace(physics=_where(bad, before.physics, ended.physics)), bad
+    return ended._replace(physics=select_worlds(bad, before.physics, ended.physics)), bad
 
 
 def _is_running(state: EnvState, limit: Array | int) -> Array:
     return ~(state.terminated | state.truncated) & (state.steps < limit)
-
-
-def _where(chosen: Array, new: PyTree, old: PyTree) -> PyTree:
-    def pick(a: Array, b: Array) -> Array:
-        return jnp.where(jnp.expand_dims(chosen, range(1, a.ndim)), a, b)
-
-    return jax.tree.map(pick, new, old)
 
 
 def _shown_qpos(env: Env, state: EnvState, num_shown: int) -> Array:

@@ -10,7 +10,7 @@ import statistics
 import time
 from collections.abc import Callable
 from functools import partial
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import numpy as np
@@ -26,13 +26,6 @@ _BLOCKS = 3
 _BLOCK_S = 1.0
 
 
-class Throughput(NamedTuple):
-    """Environment steps per second of all GMIs together."""
-
-    step_per_s_sim: float
-    step_per_s_inference: float
-
-
 class ThroughputMeter:
     """Measures both rates; every GMI of the job must use it in the same way."""
 
@@ -43,29 +36,36 @@ class ThroughputMeter:
         self._num_envs = config.envs_per_gmi
         self._steps = config.algo.unroll_length
         self._reducer = reducer
-        self._programs: list[Any] = [
-            jax.jit(partial(_moved, env, choose, self._steps), donate_argnums=(2,))
-            for choose in (partial(_random, env), partial(_policy, learner))
-        ]
+        self._programs: dict[str, Any] = {
+            name: jax.jit(partial(_moved, env, choose, self._steps), donate_argnums=(2,))
+            for name, choose in (
+                ("step_per_s_sim", partial(_random, env)),
+                ("step_per_s_inference", partial(_policy, learner)),
+            )
+        }
 
     def trace(self, state: TrainState, env_state: BatchState) -> None:
         """Traces both programs; part of the start, whose time limit it needs."""
-        lowered = (program.lower(self._model, state, env_state) for program in self._programs)
-        self._programs = list(lowered)
+        for name, program in self._programs.items():
+            self._programs[name] = program.lower(self._model, state, env_state)
 
     def compile(self) -> None:
         """Compiles what was traced."""
-        self._programs = [program.compile() for program in self._programs]
+        for name, program in self._programs.items():
+            self._programs[name] = program.compile()
 
     def measure(
         self, state: TrainState, env_state: BatchState, beat: Callable[[], None]
-    ) -> Throughput:
-        """Measures; `env_state` is donated, `beat` is called after every unroll."""
-        rates = []
-        for program in self._programs:
-            rate, env_state = self._rate(partial(program, self._model, state), env_state, beat)
-            rates.append(rate)
-        return Throughput(*rates)
+    ) -> dict[str, float]:
+        """Environment steps per second of all GMIs together, by name in the summary.
+
+        `env_state` is donated, `beat` is called after every unroll.
+        """
+        rates: dict[str, float] = {}
+        for name, program in self._programs.items():
+            move = partial(program, self._model, state)
+            rates[name], env_state = self._rate(move, env_state, beat)
+        return rates
 
     def _rate(
         self,

@@ -1,4 +1,4 @@
-"""Updates on minibatches, whatever the loss."""
+"""Updates on minibatches, whatever the loss, and the parts of losses that PPO and A3C share."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ from collections.abc import Callable
 from typing import Any, TypeAlias
 
 import jax
+import jax.numpy as jnp
 
 from gmijax.collectives.interface import Peers
 from gmijax.config import AlgoConfig
@@ -17,6 +18,9 @@ from gmijax.types import Array, PyTree
 Gradients: TypeAlias = Callable[[Learner, ActorCriticParams, Any, Any, Array], tuple[Any, Any]]
 """`(learner, params, data, context, indices) -> (gradient, losses)` of a minibatch of `data`;
 the losses are a named tuple of [] float32, with a property `steering_kl`."""
+
+_ACTION_BOUND = 1.1
+"""Means beyond this are penalised; actions are clipped to 1, and a little room is harmless."""
 
 
 def minibatch_order(config: AlgoConfig, state: TrainState, rank: Array, size: int) -> Array:
@@ -67,3 +71,17 @@ def run_updates(
 
     state, (losses, rates) = jax.lax.scan(update, state, order)
     return state, losses, rates
+
+
+def clipped_surrogate(ratio: Array, advantage: Array, epsilon: float) -> Array:
+    """Gain [...] of every sample, to be maximised (PPO, arXiv:1707.06347, equation 7).
+
+    A change of the policy gains nothing beyond a probability ratio of 1 +- `epsilon`.
+    """
+    clipped = jnp.clip(ratio, 1.0 - epsilon, 1.0 + epsilon)
+    return jnp.minimum(ratio * advantage, clipped * advantage)
+
+
+def bound_loss(mean: Array) -> Array:
+    """Squared distance [...] of action means [..., A] from [-1.1, 1.1]."""
+    return jnp.sum(jnp.maximum(jnp.abs(mean) - _ACTION_BOUND, 0.0) ** 2, -1)

@@ -68,23 +68,19 @@ def split_commands(gpu: Gpu, wanted: str) -> tuple[str, ...]:
 
 
 def place_instances(
-    parts: Sequence[int], sizes: Mapping[int, _Size] = _EIGHTHS
+    parts: Sequence[int],
+    sizes: Mapping[int, _Size] = _EIGHTHS,
+    taken: frozenset[int] = frozenset(),
 ) -> tuple[int, ...] | None:
     """Memory slices where instances of `parts` SM slices begin, None where they do not fit."""
-    return _place(tuple(parts), frozenset(), sizes) if sum(parts) <= max(sizes) else None
-
-
-def _place(
-    parts: tuple[int, ...], taken: frozenset[int], sizes: Mapping[int, _Size]
-) -> tuple[int, ...] | None:
     if not parts:
         return ()
+    if sum(parts) > max(sizes):
+        return None
     memory, starts = sizes[parts[0]]
     for start in reversed(starts):
         cells = frozenset(range(start, start + memory))
-        if cells & taken:
-            continue
-        rest = _place(parts[1:], taken | cells, sizes)
+        rest = None if cells & taken else place_instances(parts[1:], sizes, taken | cells)
         if rest is not None:
             return (start, *rest)
     return None

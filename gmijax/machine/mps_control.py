@@ -100,14 +100,12 @@ class MpsControl:
         """Processes of the daemon's servers; none before the first client came."""
         return _numbers(self._command("get_server_list"))
 
-    def client_pids(self, server: int) -> tuple[int, ...]:
-        """Processes that are clients of a server."""
-        return _numbers(self._command(f"get_client_list {server}"))
-
     def all_client_pids(self) -> dict[int, int]:
         """Client -> its server, over all servers of the daemon."""
         return {
-            client: server for server in self.server_pids() for client in self.client_pids(server)
+            client: server
+            for server in self.server_pids()
+            for client in _numbers(self._command(f"get_client_list {server}"))
         }
 
     def terminate_client(self, server: int, client: int) -> None:

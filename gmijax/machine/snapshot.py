@@ -104,8 +104,13 @@ def visible_gpus(gpus: tuple[Gpu, ...], selection: str | None) -> tuple[Gpu, ...
     chosen: dict[int, Gpu] = {}
     for entry in selection.replace(" ", "").split(","):
         fits = [part for gpu in gpus if (part := _named_part(gpu, entry))]
-        if len(fits) != 1 or not _add(chosen, fits[0]):
+        if len(fits) != 1:
             break
+        [part] = fits
+        before = chosen[part.index].instances if part.index in chosen else ()
+        if part.index in chosen and set(part.instances) <= set(before):
+            break
+        chosen[part.index] = part._replace(instances=(*before, *part.instances))
     return tuple(chosen.values())
 
 
@@ -117,16 +122,6 @@ def _named_part(gpu: Gpu, entry: str) -> Gpu | None:
         return gpu
     named = tuple(one for one in gpu.instances if entry and one.uuid.startswith(entry))
     return gpu._replace(instances=named) if len(named) == 1 else None
-
-
-def _add(chosen: dict[int, Gpu], part: Gpu) -> bool:
-    """Adds a GPU, or one more instance of it; False if that is there already."""
-    before = chosen.get(part.index)
-    if before is not None and set(part.instances) <= set(before.instances):
-        return False
-    more = before.instances if before is not None else ()
-    chosen[part.index] = part._replace(instances=(*more, *part.instances))
-    return True
 
 
 def _cpu_cores() -> tuple[int, ...]:

@@ -40,8 +40,8 @@ def choose_backend(
     if not machine.gpus:
         return "cpu", "no usable NVIDIA GPU here, so GPUs are virtual"
     most = max(len(gmis) for gmis in layout.gmis_of_gpu)
-    if _takes_mig(plan, layout, machine, serves):
-        return "mig", _why_mig(plan, layout, machine, serves)
+    if why_mig := _why_mig(plan, layout, machine, serves):
+        return "mig", why_mig
     if most == 1 and not plan.needs_mps:
         return "share", "one GMI on every GPU has nothing to share, and MPS would only add risk"
     oldest = min(gpu.compute_capability for gpu in candidates(plan, machine))
@@ -140,38 +140,22 @@ def candidates(plan: PlanConfig, machine: Machine) -> tuple[Gpu, ...]:
     return tuple(by_index[index] for index in plan.gpus)
 
 
-def _takes_mig(plan: PlanConfig, layout: Layout, machine: Machine, serves: bool) -> bool:
-    """Whether there are enough GPUs with instances, and reason to prefer them."""
-    divided = [gpu for gpu in candidates(plan, machine) if gpu.instances]
-    whole = [gpu for gpu in candidates(plan, machine) if not gpu.mig_enabled]
+def _why_mig(plan: PlanConfig, layout: Layout, machine: Machine, serves: bool) -> str | None:
+    """Why instances are taken; None if too few GPUs have any, or whole ones are better."""
+    usable = candidates(plan, machine)
+    divided = [gpu for gpu in usable if gpu.instances]
     if len(divided) < layout.num_gpus or plan.needs_mps:
-        return False
-    if len(whole) < layout.num_gpus:
-        return True
+        return None
+    if sum(not gpu.mig_enabled for gpu in usable) < layout.num_gpus:
+        why = "the GPUs here are in MIG mode"
+        faster = "; MPS on a whole GPU would let the GMIs exchange gradients faster"
+        return why if serves else why + faster
+    sizes = [len(gmis) for gmis in layout.gmis_of_gpu]
+    is_crowded = any(size > len(gpu.instances) for size, gpu in zip(sizes, divided, strict=False))
     # One GMI alone does better with a whole GPU than with a part of one.
-    shares = max(len(gmis) for gmis in layout.gmis_of_gpu) > 1
-    return serves and shares and not _needs_missing_mps(divided, layout, machine)
-
-
-def _needs_missing_mps(divided: list[Gpu], layout: Layout, machine: Machine) -> bool:
-    crowded = any(
-        len(gmis) > len(gpu.instances)
-        for gpu, gmis in zip(divided, layout.gmis_of_gpu, strict=False)
-    )
-    return crowded and machine.mps_control is None
-
-
-def _why_mig(plan: PlanConfig, layout: Layout, machine: Machine, serves: bool) -> str:
-    whole = [gpu for gpu in candidates(plan, machine) if not gpu.mig_enabled]
-    forced = len(whole) < layout.num_gpus
-    why = (
-        "the GPUs here are in MIG mode"
-        if forced
-        else "serving needs no exchange, and instances do not disturb each other"
-    )
-    if not serves:
-        return f"{why}; MPS on a whole GPU would let the GMIs exchange gradients faster"
-    return why
+    if not serves or max(sizes) == 1 or (is_crowded and machine.mps_control is None):
+        return None
+    return "serving needs no exchange, and instances do not disturb each other"
 
 
 def _why_no_mig(machine: Machine) -> str | None:

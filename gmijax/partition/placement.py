@@ -48,11 +48,11 @@ def place(plan: PlanConfig) -> Placement:
     serving, training, indices = serving_and_training(plan)
     num_gpus = 1 + max(*serving, *training)
     layout: list[list[int]] = [[] for _ in range(num_gpus)]
-    for number in range(len(training) * training_gmis):
-        layout[training[number // training_gmis]].append(number)
-    trainers = tuple(range(len(training) * training_gmis))
-    for number in range(len(serving) * serving_gmis):
-        layout[serving[number // serving_gmis]].append(len(trainers) + number)
+    homes = [gpu for gpu in training for _ in range(training_gmis)]
+    trainers = tuple(range(len(homes)))
+    homes += [gpu for gpu in serving for _ in range(serving_gmis)]
+    for gmi, gpu in enumerate(homes):
+        layout[gpu].append(gmi)
     placed = dataclasses.replace(
         plan,
         gpus=num_gpus if indices is None else indices,
@@ -102,57 +102,48 @@ def serving_and_training(
     Raises:
       ConfigError: as `place`.
     """
+    named = None if isinstance(plan.gpus, int) else plan.gpus
     serving, training = plan.serving_gpus, plan.training_gpus
     if serving is None and training is None:
-        return _by_default(plan)
+        if plan.num_gpus == 1:
+            return [0], [0], named
+        training = max(1, plan.num_gpus // _TRAINING_SHARE)
+        serving = plan.num_gpus - training
     for key, value in (("serving_gpus", serving), ("training_gpus", training)):
         if value is None or not value or (isinstance(value, int) and value < 1):
             raise ConfigError(
                 f"plan.{key}={'null' if value is None else value}: there must be serving and "
                 "training GPUs; give both keys, numbers of at least 1 or lists of indices"
             )
-    if isinstance(serving, int) and isinstance(training, int):
-        return _in_turn(plan, serving, training)
-    if isinstance(serving, int) or isinstance(training, int):
+    if isinstance(serving, tuple) and isinstance(training, tuple):
+        return _by_index(serving, training, named)
+    if not (isinstance(serving, int) and isinstance(training, int)):
         raise ConfigError(
             f"plan.serving_gpus={serving}, plan.training_gpus={training}: expected two numbers "
             "or two lists of indices"
         )
-    assert serving is not None
-    assert training is not None
+    total = serving + training
+    if named is not None and len(named) != total:
+        raise ConfigError(
+            f"plan.gpus={list(named)}: plan.serving_gpus={serving} and "
+            f"plan.training_gpus={training} take {total}"
+        )
+    return list(range(serving)), list(range(serving, total)), named
+
+
+def _by_index(
+    serving: tuple[int, ...], training: tuple[int, ...], named: tuple[int, ...] | None
+) -> tuple[list[int], list[int], tuple[int, ...]]:
     for key, value in (("serving_gpus", serving), ("training_gpus", training)):
         if len(set(value)) != len(value) or min(value) < 0:
             raise ConfigError(f"plan.{key}={list(value)}: expected distinct indices of GPUs")
     indices = tuple(sorted({*serving, *training}))
-    if not isinstance(plan.gpus, int) and set(plan.gpus) != set(indices):
+    if named is not None and set(named) != set(indices):
         raise ConfigError(
-            f"plan.gpus={list(plan.gpus)}: plan.serving_gpus and plan.training_gpus name "
+            f"plan.gpus={list(named)}: plan.serving_gpus and plan.training_gpus name "
             f"{list(indices)}"
         )
     return [indices.index(i) for i in serving], [indices.index(i) for i in training], indices
-
-
-def _in_turn(
-    plan: PlanConfig, serving: int, training: int
-) -> tuple[list[int], list[int], tuple[int, ...] | None]:
-    """The first GPUs serve, the next train; those of `plan.gpus` if it lists them."""
-    total = serving + training
-    if not isinstance(plan.gpus, int) and len(plan.gpus) != total:
-        raise ConfigError(
-            f"plan.gpus={list(plan.gpus)}: plan.serving_gpus={serving} and "
-            f"plan.training_gpus={training} take {total}"
-        )
-    indices = None if isinstance(plan.gpus, int) else plan.gpus
-    return list(range(serving)), list(range(serving, total)), indices
-
-
-def _by_default(plan: PlanConfig) -> tuple[list[int], list[int], tuple[int, ...] | None]:
-    indices = None if isinstance(plan.gpus, int) else plan.gpus
-    count = plan.num_gpus
-    if count == 1:
-        return [0], [0], indices
-    training = max(1, count // _TRAINING_SHARE)
-    return list(range(count - training)), list(range(count - training, count)), indices
 
 
 def _shown(positions: list[int], indices: tuple[int, ...] | None) -> list[int]:

@@ -13,7 +13,6 @@ from typing import Any
 from gmijax.config import BackendName, Priority, TemplateName
 from gmijax.errors import ConfigError
 from gmijax.partition.layout import Layout
-from gmijax.partition.templates import HOLISTIC, TRAINER, group_of
 
 MAX_MEMORY_FRACTION = 0.9
 """Limit of the sum of memory fractions on one GPU: CUDA contexts, NCCL and Warp need the rest."""
@@ -55,7 +54,8 @@ class Plan:
       strategy: gradient reduction, `none` for one GMI.
       intra: exchange inside one GPU.
       reasons: what was decided for an `auto`, and why, one sentence each.
-      roles: what every GMI does, in order of id (see `gmijax.partition.templates`).
+      roles: what every GMI does, in order of id (see `gmijax.partition.templates`); none where
+        that is classes of the user's own.
       self_check: every GMI compares matrix products with float64 when it starts.
       selection: with `reduce.selection=measured` what the paper says and what was measured.
       may_share: where the daemons of `mps` cannot be started, the GMIs may take turns instead.
@@ -71,8 +71,8 @@ class Plan:
     num_envs_per_gmi: int
     strategy: str
     intra: str
+    roles: tuple[str, ...]
     reasons: tuple[str, ...] = ()
-    roles: tuple[str, ...] = ()
     self_check: bool = False
     may_share: bool = False
     selection: Mapping[str, Any] = field(default_factory=dict)
@@ -92,12 +92,6 @@ class Plan:
                     f"{total:.2f} of its memory; at most {MAX_MEMORY_FRACTION} in sum"
                 )
 
-    @property
-    def training_layout(self) -> Layout:
-        """Where those that average gradients live, by their ranks: all GMIs, or the trainers."""
-        training = group_of(self.layout, self.roles, TRAINER)
-        return self.layout if training is None else training.layout
-
     def to_dict(self) -> dict[str, Any]:
         """Plain data for `plan.json`."""
         data = asdict(self)
@@ -113,6 +107,5 @@ class Plan:
             Slice(**{**item, "cpus": tuple(item["cpus"])}) for item in data["slices"]
         )
         fields["reasons"] = tuple(data["reasons"])
-        # Plans had no roles when there was one template.
-        fields["roles"] = tuple(data.get("roles", ())) or (HOLISTIC,) * fields["layout"].num_gmis
+        fields["roles"] = tuple(data["roles"])
         return cls(**fields)

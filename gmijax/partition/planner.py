@@ -2,11 +2,7 @@
 
 from __future__ import annotations
 
-import dataclasses
-import re
-from collections import Counter
 from collections.abc import Collection, Sequence
-from itertools import pairwise
 
 from gmijax.config import BackendName, PlanConfig, ReduceConfig, TemplateName
 from gmijax.errors import ConfigError
@@ -24,11 +20,8 @@ from gmijax.partition.reduction import (
     why_not_intra,
     why_not_under,
 )
-from gmijax.partition.shares import gpu_slices, mps_priorities, sm_percents
-from gmijax.partition.templates import DESCRIPTIONS, TRAINER, Group, group_of, roles_of
-
-_CLIENTS_OF_OLD_DRIVERS, _CLIENTS_OF_NEW_DRIVERS, _NEW_DRIVER = 48, 60, 590
-_SLICES_OF_A_GPU = 7
+from gmijax.partition.shares import make_slices
+from gmijax.partition.templates import DESCRIPTIONS, TRAINER, group_of, roles_of
 
 _NO_RINGS_ON_CPU = (
     "between virtual GPUs host memory is faster than any ring, ask for it with reduce.strategy={}"
@@ -47,16 +40,8 @@ def make_plan(
 ) -> Plan:
     """Decides everything that is `auto` and checks the rest against the machine.
 
-    Args:
-      plan: what the user wants.
-      reduce: how gradients are to be averaged.
-      num_envs: N, environments per GMI.
-      machine: what there is.
-      template: what `plan.template=auto` means.
-      trainers: ids of the GMIs that train, for the template `decoupled`.
-
-    Returns:
-      The plan; its `reasons` say what was decided and why, one sentence each.
+    `num_envs` is N, environments per GMI; `template` what `plan.template=auto` means; `trainers`
+    are the ids of the GMIs that train, for the template `decoupled`.
 
     Raises:
       BackendUnavailable: the wanted backend cannot be had on this machine.
@@ -68,20 +53,11 @@ def make_plan(
     chosen = template if plan.template == "auto" else plan.template
     backend = _backend(plan, layout, machine, chosen in ("tcg", "tdg"), reasons)
     gpus = choose_gpus(plan, layout, machine, backend, reasons) if backend != "cpu" else ()
-    slices = _slices(plan, layout, gpus, backend, machine, reasons)
+    roles = roles_of(chosen, layout, trainers)
+    slices = make_slices(plan, layout, gpus, backend, machine, roles, reasons)
     if plan.template == "auto":
         reasons.append(f"template {chosen}: {DESCRIPTIONS[chosen]}")
-    roles = roles_of(chosen, layout, trainers)
-    training = group_of(layout, roles, TRAINER)
-    first = mps_priorities(plan, layout, backend, training.gmis if training else ())
-    slices = tuple(
-        dataclasses.replace(share, priority=priority)
-        for share, priority in zip(slices, first, strict=True)
-    )
-    strategy, intra = "none", "host"
-    if training is not None:
-        strategy = _strategy(reduce, training, backend, reasons)
-        intra = _intra(reduce, strategy, layout, backend, reasons)
+    strategy, intra = _reduction(reduce, layout, roles, backend, reasons)
     return Plan(
         layout=layout,
         slices=slices,
@@ -90,13 +66,10 @@ def make_plan(
         num_envs_per_gmi=num_envs,
         strategy=strategy,
         intra=intra,
-        reasons=tuple(reasons),
         roles=roles,
+        reasons=tuple(reasons),
         self_check=_self_check(plan, slices, backend, machine),
-        may_share=plan.backend == "auto"
-        and backend == "mps"
-        and not plan.needs_mps
-        and all(gpu.compute_mode == "default" for gpu in gpus),
+        may_share=_may_share(plan, gpus, backend),
     )
 
 
@@ -115,14 +88,6 @@ def num_gmis_of(plan: PlanConfig) -> tuple[int, str]:
         raise ConfigError("plan.gmis_per_gpu=auto: not decided yet; expected an integer")
     gpus = f", plan.gpus={num_gpus}" if num_gpus > 1 else ""
     return num_gpus * each, f"plan.gmis_per_gpu={each}{gpus}"
-
-
-def split_cores(cores: Sequence[int], num_gmis: int) -> tuple[tuple[int, ...], ...]:
-    """Cores of every GMI: contiguous and disjoint, or one each in turn if there are too few."""
-    if len(cores) < num_gmis:
-        return tuple((cores[gmi % len(cores)],) for gmi in range(num_gmis))
-    bounds = [gmi * len(cores) // num_gmis for gmi in range(num_gmis + 1)]
-    return tuple(tuple(cores[low:high]) for low, high in pairwise(bounds))
 
 
 def _layout(plan: PlanConfig) -> Layout:
@@ -149,49 +114,6 @@ def _backend(
     return plan.backend
 
 
-def _check_num_clients(
-    slices: Sequence[Slice], gpus: Sequence[Gpu], backend: BackendName, machine: Machine
-) -> None:
-    if backend not in ("mps", "mig"):
-        return
-    new = machine.driver_major >= _NEW_DRIVER
-    whole = _CLIENTS_OF_NEW_DRIVERS if new else _CLIENTS_OF_OLD_DRIVERS
-    profiles = {one.uuid: one.profile for gpu in gpus for one in gpu.instances}
-    for device, most in Counter(share.device for share in slices).items():
-        limit, where = whole, "a GPU"
-        if backend == "mig":
-            # The driver lowers the limit in proportion to the instance.
-            part = int((re.search(r"(\d)g", profiles[device]) or ["1", "1"])[1])
-            limit = max(1, whole * part // _SLICES_OF_A_GPU)
-            where = f"a MIG instance {profiles[device]}"
-        if most > limit:
-            raise ConfigError(
-                f"plan.gmis_per_gpu={most}: MPS of driver {machine.driver_version} allows at "
-                f"most {limit} processes on {where}"
-            )
-
-
-def _slices(
-    plan: PlanConfig,
-    layout: Layout,
-    gpus: Sequence[Gpu],
-    backend: BackendName,
-    machine: Machine,
-    reasons: list[str],
-) -> tuple[Slice, ...]:
-    caps = sm_percents(plan, layout, gpus, backend, reasons)
-    if backend != "cpu":
-        slices = gpu_slices(plan, layout, gpus, caps, backend)
-        _check_num_clients(slices, gpus, backend, machine)
-        return slices
-    if plan.memory_fraction is not None:
-        reasons.append("plan.memory_fraction is not used on the cpu backend")
-    cores_of = split_cores(machine.cpu_cores, layout.num_gmis)
-    return tuple(
-        Slice(gmi, layout.gpu_of(gmi), "cpu", None, None, cores_of[gmi]) for gmi in layout.gmis
-    )
-
-
 def _self_check(
     plan: PlanConfig, slices: Sequence[Slice], backend: BackendName, machine: Machine
 ) -> bool:
@@ -202,11 +124,30 @@ def _self_check(
     return is_theirs or any((share.sm_percent or 100.0) < 100.0 for share in slices)
 
 
+def _may_share(plan: PlanConfig, gpus: Sequence[Gpu], backend: BackendName) -> bool:
+    takes_turns_else = plan.backend == "auto" and backend == "mps" and not plan.needs_mps
+    return takes_turns_else and all(gpu.compute_mode == "default" for gpu in gpus)
+
+
+def _reduction(
+    reduce: ReduceConfig,
+    layout: Layout,
+    roles: tuple[str, ...],
+    backend: BackendName,
+    reasons: list[str],
+) -> tuple[str, str]:
+    """How those that train average gradients, and how they exchange inside one GPU."""
+    training = group_of(layout, roles, TRAINER)
+    if training is None:
+        return "none", "host"
+    strategy = _strategy(reduce, training.layout, backend, reasons)
+    return strategy, _intra(reduce, strategy, layout, backend, reasons)
+
+
 def _strategy(
-    reduce: ReduceConfig, training: Group, backend: BackendName, reasons: list[str]
+    reduce: ReduceConfig, layout: Layout, backend: BackendName, reasons: list[str]
 ) -> str:
-    """How those that train average gradients; `none` if there is only one."""
-    layout = training.layout
+    """How those that train, in `layout`, average gradients; `none` if there is only one."""
     if reduce.strategy != "auto":
         require_strategy(reduce.strategy, layout, backend)
     if layout.num_gmis == 1:
@@ -214,10 +155,10 @@ def _strategy(
         return "none"
     if reduce.strategy != "auto":
         return reduce.strategy
-    choice = select_strategy(layout)
-    no_ring = why_not_under(choice.strategy, layout, backend)
-    if backend == "cpu" and needs_ring(choice.strategy, layout):
-        no_ring = _NO_RINGS_ON_CPU.format(choice.strategy)
+    paper, why = select_strategy(layout)
+    no_ring = why_not_under(paper, layout, backend)
+    if backend == "cpu" and needs_ring(paper, layout):
+        no_ring = _NO_RINGS_ON_CPU.format(paper)
     no_one_shot = why_not_under("one_shot", layout, backend)
     # With one GMI on each GPU one ring over all is as fast.
     wants_one_shot = no_ring is not None or not is_one_per_gpu(layout)
@@ -225,20 +166,17 @@ def _strategy(
     if wants_one_shot and no_one_shot is None:
         reasons.append(
             "strategy one_shot: GMIs that share GPUs train faster with exchanges on them; "
-            f"Algorithm 1 says {choice.strategy} ({choice.why}), as reduce.selection=paper does"
+            f"Algorithm 1 says {paper} ({why}), as reduce.selection=paper does"
         )
         return "one_shot"
-    slow = ""
     # Under other backends there is no memory of a GPU to share, whatever is installed.
-    if wants_one_shot and backend in ("mps", "share"):
-        slow = f"; one_shot would train faster: {no_one_shot}"
+    is_slow = wants_one_shot and backend in ("mps", "share")
+    slow = f"; one_shot would train faster: {no_one_shot}" if is_slow else ""
     if no_ring is not None:
-        reasons.append(
-            f"strategy mpr: Algorithm 1 says {choice.strategy} ({choice.why}); {no_ring}{slow}"
-        )
+        reasons.append(f"strategy mpr: Algorithm 1 says {paper} ({why}); {no_ring}{slow}")
         return "mpr"
-    reasons.append(f"strategy {choice.strategy}: {choice.why} (Algorithm 1){slow}")
-    return choice.strategy
+    reasons.append(f"strategy {paper}: {why} (Algorithm 1){slow}")
+    return paper
 
 
 def _intra(

@@ -18,7 +18,8 @@ from gmijax.version import versions_of
 
 _BINDINGS = "cuda-bindings"
 LEAST_BINDINGS = (12, 9, 1)
-"""Of CUDA 12; earlier ones hold the GIL in calls that wait in CUDA."""
+"""Of CUDA 12; earlier ones hold the GIL in calls that wait in CUDA for other GMIs, so that the
+thread that looks whether these live cannot run."""
 
 _INSTALL = "(pip install 'gmijax[cuda13]', with a driver before 580 'gmijax[cuda12]')"
 
@@ -105,7 +106,16 @@ def why_no_bindings() -> str | None:
     """None if a program can hand numbers to other processes from a GPU, else the reason."""
     if not _is_installed("cuda", "cuda.bindings"):
         return f"exchanges between GMIs on GPUs need the package cuda-bindings {_INSTALL}"
-    return _why_too_old(versions_of([_BINDINGS])[_BINDINGS])
+    installed = versions_of([_BINDINGS])[_BINDINGS] or ""
+    numbers = tuple(map(int, re.findall(r"\d+", installed)[:3]))
+    if not numbers or numbers >= LEAST_BINDINGS:
+        return None
+    least = ".".join(map(str, LEAST_BINDINGS))
+    return (
+        f"exchanges between GMIs on GPUs need cuda-bindings {least} or newer, and {installed} is "
+        f"installed (pip install 'cuda-bindings>={least},<13' with CUDA 12, "
+        "'cuda-bindings>=13' with 13)"
+    )
 
 
 def needs_ring(strategy: str, layout: Layout) -> bool:
@@ -140,20 +150,6 @@ def is_even(layout: Layout) -> bool:
 def _is_installed(*modules: str) -> bool:
     """Whether all modules can be imported; the packages of each come before it."""
     return all(importlib.util.find_spec(module) is not None for module in modules)
-
-
-def _why_too_old(installed: str | None) -> str | None:
-    # Before, a call that waits in CUDA for other GMIs kept all threads of Python from running,
-    # also the one that looks whether these live.
-    numbers = tuple(int(number) for number in re.findall(r"\d+", installed or "")[:3])
-    if not numbers or numbers >= LEAST_BINDINGS:
-        return None
-    least = ".".join(map(str, LEAST_BINDINGS))
-    return (
-        f"exchanges between GMIs on GPUs need cuda-bindings {least} or newer, and {installed} is "
-        f"installed (pip install 'cuda-bindings>={least},<13' with CUDA 12, "
-        "'cuda-bindings>=13' with 13)"
-    )
 
 
 def _none(layout: Layout) -> str | None:

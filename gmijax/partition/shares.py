@@ -1,19 +1,23 @@
-"""How much of its GPU a GMI gets: SM caps, memory fractions, MIG instances. Pure functions.
+"""How much a GMI gets: SM caps, memory fractions, MIG instances, cores. Pure functions.
 
 Which SM caps are safe, and how that was found out: docs/shares.md.
 """
 
 from __future__ import annotations
 
+import re
 from collections import Counter
-from collections.abc import Collection, Sequence
-from typing import Final
+from collections.abc import Sequence
+from itertools import pairwise
+from typing import Final, NamedTuple
 
 from gmijax.config import BackendName, PlanConfig, Priority
 from gmijax.errors import ConfigError
-from gmijax.machine.nvidia import Gpu, MigInstance
+from gmijax.machine.nvidia import Gpu
+from gmijax.machine.snapshot import Machine
 from gmijax.partition.layout import Layout
 from gmijax.partition.plan import Slice
+from gmijax.partition.templates import TRAINER, has_role
 
 DEFAULT_MEMORY_FRACTION: Final = 0.8
 """Part of a GPU's (or MIG instance's) memory that its GMIs reserve together."""
@@ -22,24 +26,83 @@ CLEAN_SM_PERCENT: Final = ((1, 13), (23, 27), (47, 51), (90, 100))
 """SM caps at which no wrong half-precision products were reported (H200, driver 580)."""
 
 _HOPPER: Final = 9
+_CLIENTS_OF_OLD_DRIVERS, _CLIENTS_OF_NEW_DRIVERS, _NEW_DRIVER = 48, 60, 590
+_SLICES_OF_A_GPU: Final = 7
 
 
-def sm_percents(
-    plan: PlanConfig, layout: Layout, gpus: Sequence[Gpu], backend: BackendName, reasons: list[str]
-) -> tuple[float | None, ...]:
-    """The SM cap of every GMI in percent, in order of id; None for no cap.
-
-    Args:
-      plan: what the user wants; `even` is 100 / GMIs of the GPU, or the next clean value above.
-      layout: which GMI is where.
-      gpus: the GPUs of the job; none on the cpu backend.
-      backend: only `mps` can cap.
-      reasons: takes a sentence on what was decided.
+def make_slices(
+    plan: PlanConfig,
+    layout: Layout,
+    gpus: Sequence[Gpu],
+    backend: BackendName,
+    machine: Machine,
+    roles: Sequence[str],
+    reasons: list[str],
+) -> tuple[Slice, ...]:
+    """The share of every GMI, in order of id; `gpus` are those of the job, none on `cpu`.
 
     Raises:
-      ConfigError: a backend that cannot, not one value per GMI, or a cap at which wrong results
-        were reported, unless `plan.force_sm_percent`.
+      ConfigError: a share that the backend cannot enforce, that is not safe, or is not one for
+        each GMI; more GMIs on a GPU than MPS has room for.
     """
+    caps = _sm_percents(plan, layout, gpus, backend, reasons)
+    priorities = _priorities(plan, layout, backend, roles)
+    if backend == "cpu":
+        if plan.memory_fraction is not None:
+            reasons.append("plan.memory_fraction is not used on the cpu backend")
+        cores_of = split_cores(machine.cpu_cores, layout.num_gmis)
+        return tuple(
+            Slice(gmi, layout.gpu_of(gmi), "cpu", None, None, cores_of[gmi]) for gmi in layout.gmis
+        )
+    homes = _homes_of(layout, gpus, backend)
+    if plan.memory_fraction is not None:
+        memory = _one_each("plan.memory_fraction", plan.memory_fraction, layout)
+    else:
+        sharing = Counter(home.memory for home in homes)
+        memory = [round(DEFAULT_MEMORY_FRACTION / sharing[home.memory], 4) for home in homes]
+    if backend in ("mps", "mig"):
+        _require_room_for_clients(homes, machine)
+    return tuple(
+        Slice(gmi, layout.gpu_of(gmi), home.device, caps[gmi], memory[gmi], (), priorities[gmi])
+        for gmi, home in enumerate(homes)
+    )
+
+
+def split_cores(cores: Sequence[int], num_gmis: int) -> tuple[tuple[int, ...], ...]:
+    """Cores of every GMI: contiguous and disjoint, or one each in turn if there are too few."""
+    if len(cores) < num_gmis:
+        return tuple((cores[gmi % len(cores)],) for gmi in range(num_gmis))
+    bounds = [gmi * len(cores) // num_gmis for gmi in range(num_gmis + 1)]
+    return tuple(tuple(cores[low:high]) for low, high in pairwise(bounds))
+
+
+def is_clean(sm_percent: float) -> bool:
+    """Whether no wrong results were reported at this cap."""
+    return any(low <= sm_percent <= high for low, high in CLEAN_SM_PERCENT)
+
+
+def assign_instances(num_sms: Sequence[int], num_gmis: int) -> tuple[int, ...]:
+    """Places in `num_sms` (SMs of the instances of a GPU) of its GMIs, in order.
+
+    Every GMI gets an instance of its own while there are any, the largest first. Each further
+    one goes where it leaves most SMs to each GMI.
+    """
+    load = [0] * len(num_sms)
+    chosen: list[int] = []
+    for _ in range(num_gmis):
+        best = max(
+            range(len(num_sms)),
+            key=lambda place: (load[place] == 0, num_sms[place] / (load[place] + 1), -place),
+        )
+        load[best] += 1
+        chosen.append(best)
+    return tuple(chosen)
+
+
+def _sm_percents(
+    plan: PlanConfig, layout: Layout, gpus: Sequence[Gpu], backend: BackendName, reasons: list[str]
+) -> tuple[float | None, ...]:
+    """The SM cap of every GMI in percent; None for no cap."""
     wanted = plan.sm_percent
     if wanted is None:
         return (None,) * layout.num_gmis
@@ -61,14 +124,10 @@ def sm_percents(
     return caps
 
 
-def mps_priorities(
-    plan: PlanConfig, layout: Layout, backend: BackendName, trainers: Collection[int]
+def _priorities(
+    plan: PlanConfig, layout: Layout, backend: BackendName, roles: Sequence[str]
 ) -> tuple[Priority | None, ...]:
-    """The priority of every GMI's kernels, in order of id; None where all are alike.
-
-    Raises:
-      ConfigError: a backend that cannot, not one value per GMI, or nobody to put first.
-    """
+    """The priority of every GMI's kernels; None where all are alike."""
     wanted = plan.mps_priority
     if wanted is None:
         return (None,) * layout.num_gmis
@@ -79,83 +138,58 @@ def mps_priorities(
         if len(wanted) != layout.num_gmis:
             raise ConfigError(f"{what}: {len(wanted)} values for {layout.num_gmis} GMIs")
         return wanted
-    if len(trainers) in (0, layout.num_gmis):
+    trains = [has_role(own, TRAINER) for own in roles]
+    if all(trains) or not any(trains):
         raise ConfigError(
             f"{what}: needs GMIs that train and GMIs that do not (algo=a3c, "
             "plan.template=tdg_ex), here all are alike"
         )
-    return tuple("normal" if gmi in trainers else "below_normal" for gmi in layout.gmis)
+    return tuple("normal" if first else "below_normal" for first in trains)
 
 
-def is_clean(sm_percent: float) -> bool:
-    """Whether no wrong results were reported at this cap."""
-    return any(low <= sm_percent <= high for low, high in CLEAN_SM_PERCENT)
+class _Home(NamedTuple):
+    """Where a GMI lives.
 
-
-def gpu_slices(
-    plan: PlanConfig,
-    layout: Layout,
-    gpus: Sequence[Gpu],
-    caps: Sequence[float | None],
-    backend: BackendName,
-) -> tuple[Slice, ...]:
-    """The share of every GMI on a GPU, in order of id.
-
-    Raises:
-      ConfigError: not one memory fraction per GMI.
+    Attributes:
+      device: UUID of the GPU or of the MIG instance.
+      memory: what it shares memory with others by: the GPU, and a GPU instance of it.
+      profile: of the MIG instance, None for a whole GPU.
     """
-    homes = _instances_of(layout, gpus) if backend == "mig" else (None,) * layout.num_gmis
-    memory = [
-        (layout.gpu_of(gmi), home.gpu_instance if home else None) for gmi, home in enumerate(homes)
-    ]
-    sharing = Counter(memory)
-    given = (
-        None
-        if plan.memory_fraction is None
-        else _one_each("plan.memory_fraction", plan.memory_fraction, layout)
-    )
-    slices: list[Slice] = []
-    for gmi, home in enumerate(homes):
-        gpu = layout.gpu_of(gmi)
-        even = round(DEFAULT_MEMORY_FRACTION / sharing[memory[gmi]], 4)
-        slices.append(
-            Slice(
-                gmi=gmi,
-                gpu=gpu,
-                device=home.uuid if home else gpus[gpu].uuid,
-                sm_percent=caps[gmi],
-                memory_fraction=given[gmi] if given else even,
-                cpus=(),
+
+    device: str
+    memory: tuple[int, int | None]
+    profile: str | None
+
+
+def _homes_of(layout: Layout, gpus: Sequence[Gpu], backend: BackendName) -> list[_Home]:
+    """The home of every GMI, in order of id."""
+    homes: dict[int, _Home] = {}
+    for place, (gpu, gmis) in enumerate(zip(gpus, layout.gmis_of_gpu, strict=True)):
+        if backend != "mig":
+            homes |= dict.fromkeys(gmis, _Home(gpu.uuid, (place, None), None))
+            continue
+        chosen = assign_instances([one.num_sms for one in gpu.instances], len(gmis))
+        for gmi, number in zip(gmis, chosen, strict=True):
+            one = gpu.instances[number]
+            homes[gmi] = _Home(one.uuid, (place, one.gpu_instance), one.profile)
+    return [homes[gmi] for gmi in layout.gmis]
+
+
+def _require_room_for_clients(homes: Sequence[_Home], machine: Machine) -> None:
+    new = machine.driver_major >= _NEW_DRIVER
+    whole = _CLIENTS_OF_NEW_DRIVERS if new else _CLIENTS_OF_OLD_DRIVERS
+    for (_, profile), most in Counter((home.device, home.profile) for home in homes).items():
+        limit, where = whole, "a GPU"
+        if profile is not None:
+            # The driver lowers the limit in proportion to the instance.
+            part = int((re.search(r"(\d)g", profile) or ["1", "1"])[1])
+            limit = max(1, whole * part // _SLICES_OF_A_GPU)
+            where = f"a MIG instance {profile}"
+        if most > limit:
+            raise ConfigError(
+                f"plan.gmis_per_gpu={most}: MPS of driver {machine.driver_version} allows at "
+                f"most {limit} processes on {where}"
             )
-        )
-    return tuple(slices)
-
-
-def assign_instances(num_sms: Sequence[int], num_gmis: int) -> tuple[int, ...]:
-    """Places in `num_sms` (SMs of the instances of a GPU) of its GMIs, in order.
-
-    Every GMI gets an instance of its own while there are any, the largest first. Each further
-    one goes where it leaves most SMs to each GMI.
-    """
-    load = [0] * len(num_sms)
-    chosen: list[int] = []
-    for _ in range(num_gmis):
-        best = max(
-            range(len(num_sms)),
-            key=lambda place: (load[place] == 0, num_sms[place] / (load[place] + 1), -place),
-        )
-        load[best] += 1
-        chosen.append(best)
-    return tuple(chosen)
-
-
-def _instances_of(layout: Layout, gpus: Sequence[Gpu]) -> tuple[MigInstance, ...]:
-    """The MIG instance of every GMI, in order of id."""
-    homes: dict[int, MigInstance] = {}
-    for gpu, gmis in zip(gpus, layout.gmis_of_gpu, strict=True):
-        places = assign_instances([one.num_sms for one in gpu.instances], len(gmis))
-        homes |= {gmi: gpu.instances[place] for gmi, place in zip(gmis, places, strict=True)}
-    return tuple(homes[gmi] for gmi in layout.gmis)
 
 
 def _even_percent(num_gmis: int, gpu: Gpu) -> float:

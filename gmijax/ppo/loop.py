@@ -122,10 +122,9 @@ class TrainingLoop:
         if self._meter is not None and not stopped:
             # Written before: whatever happens to the measurement, the training is done.
             write_json(self._link.paths.result, done)
-            rates = self._meter.measure(
+            done |= self._meter.measure(
                 state, env_state, lambda: self._link.beat("running", self._iterations)
             )
-            done |= rates._asdict()
         return done
 
     def _first_envs(self) -> Any:

@@ -22,7 +22,6 @@ from gmijax.learning.learner import (
     acting_weights,
     rate_figures,
 )
-from gmijax.learning.losses import bound_loss, clipped_surrogate
 from gmijax.learning.normalize import (
     Moments,
     merge,
@@ -35,7 +34,12 @@ from gmijax.learning.normalize import (
 )
 from gmijax.learning.policy import ActorCritic, ActorCriticParams, entropy, kl_divergence, log_prob
 from gmijax.learning.unroll import Counts, Outcome, act, count, no_counts, outcome_of, unroll
-from gmijax.learning.updates import minibatch_order, run_updates
+from gmijax.learning.updates import (
+    bound_loss,
+    clipped_surrogate,
+    minibatch_order,
+    run_updates,
+)
 from gmijax.sim.interface import EnvSpec
 from gmijax.sim.wrappers import BatchedEnv, BatchState, StepOutput
 from gmijax.types import Array, PyTree

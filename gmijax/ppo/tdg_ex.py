@@ -11,7 +11,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from functools import partial
-from typing import Any, NamedTuple, Protocol, TypeAlias
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
 
 import jax
 import jax.numpy as jnp
@@ -40,20 +40,11 @@ from gmijax.sim.wrappers import BatchedEnv, BatchState
 from gmijax.supervise.heartbeat import GmiState
 from gmijax.types import Array, PyTree
 
+if TYPE_CHECKING:
+    from gmijax.collectives.messages.messenger import Messenger
+
 _Answers: TypeAlias = tuple[list[Samples], list[FloatBuffer]]
 """Of every worker: samples [T, N] and packed statistics."""
-
-
-class Mail(Protocol):
-    """Messages between GMIs, see `gmijax.collectives.messages.messenger`."""
-
-    def send(self, tree: Any, dst: int) -> None:
-        """Sends nested data to GMI `dst`, without waiting for it."""
-        ...
-
-    def recv(self, src: int, *, timeout_s: float | None = None) -> Any:
-        """Waits for the next message of GMI `src`."""
-        ...
 
 
 class RolloutWorkers(NamedTuple):
@@ -65,7 +56,7 @@ class RolloutWorkers(NamedTuple):
       start_timeout_s: longest wait for the first rollout: they may still compile.
     """
 
-    mail: Mail
+    mail: Messenger
     gmis: tuple[int, ...]
     start_timeout_s: float
 
@@ -130,7 +121,7 @@ def serve_rollouts(
     env: BatchedEnv,
     learner: PpoLearner,
     env_state: BatchState,
-    mail: Mail,
+    mail: Messenger,
     trainer: int,
     on_state: Callable[[GmiState, int], None],
 ) -> int:

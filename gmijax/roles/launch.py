@@ -94,7 +94,11 @@ def launch(
         "device_messages": device_messages,
         "script": shipping.own_script(),
     }
-    _write(run, plan, config, parcels)
+    write_json(run.plan, plan.to_dict())
+    write_json(run.config, config)
+    for gmi, parcel in enumerate(parcels):
+        run.gmi(gmi).root.mkdir()
+        run.gmi(gmi).role.write_bytes(parcel)
     timeouts = Timeouts(
         start_timeout_s=start_timeout_s,
         stall_timeout_s=math.inf if stall_timeout_s is None else stall_timeout_s,
@@ -110,28 +114,27 @@ def launch(
     return [shipping.load(output) for output in outputs]
 
 
-def _job(
-    plan: Plan, machine: Machine, run: RunPaths, timeouts: Timeouts, capacity_bytes: int
-) -> Launch:
-    return Launch(
-        plan=plan,
-        machine=machine,
-        run=run,
-        # Roles wait for each other, so they start together.
-        kind=JobKind(
-            "gmijax.roles.worker", compile_once=False, shared=partial(pipes, capacity_bytes)
-        ),
-        timeouts=timeouts,
-        on_warning=lambda text: warnings.warn(text, RuntimeWarning, stacklevel=2),
-    )
-
-
 def _require_no_gmi() -> None:
     if ENV_GMI in os.environ:
         raise ConfigError(
             "gmijax.launch: called inside a GMI; in the file of a role, call it below "
             'if __name__ == "__main__":'
         )
+
+
+def _job(
+    plan: Plan, machine: Machine, run: RunPaths, timeouts: Timeouts, capacity_bytes: int
+) -> Launch:
+    # Roles wait for each other, so they start together.
+    shared = partial(pipes, capacity_bytes)
+    return Launch(
+        plan=plan,
+        machine=machine,
+        run=run,
+        kind=JobKind("gmijax.roles.worker", compile_once=False, shared=shared),
+        timeouts=timeouts,
+        on_warning=lambda text: warnings.warn(text, RuntimeWarning, stacklevel=2),
+    )
 
 
 def _roles(role: Role | Sequence[Role], plan: Plan) -> list[Role]:
@@ -175,14 +178,6 @@ def _parcel(role: Role, args: tuple[Any, ...]) -> bytes:
             f"{str(error).splitlines()[0] if str(error) else type(error).__name__}; it is pickled "
             "when the job starts, so make what is no plain data in run"
         ) from error
-
-
-def _write(run: RunPaths, plan: Plan, config: dict[str, Any], parcels: Sequence[bytes]) -> None:
-    write_json(run.plan, plan.to_dict())
-    write_json(run.config, config)
-    for gmi, parcel in enumerate(parcels):
-        run.gmi(gmi).root.mkdir()
-        run.gmi(gmi).role.write_bytes(parcel)
 
 
 def _output(run: RunPaths, gmi: int) -> bytes:

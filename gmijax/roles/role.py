@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Iterable
+from dataclasses import dataclass
 from typing import Any
 
 from gmijax.collectives.messages.group import GroupReducer, Operation
@@ -13,52 +14,47 @@ from gmijax.partition.layout import Layout
 from gmijax.supervise.child import ChildLink
 
 
+@dataclass
 class Gmi:
-    """This process as one of the GMIs of a job: talks to the others and to the controller.
+    """This process as one of the GMIs of a job; what the methods do, see `Role`."""
 
-    What the methods do, see `Role`. Messages and collective calls count as progress.
+    layout: Layout
+    messenger: Messenger
+    reducer: GroupReducer
+    link: ChildLink
+    steps: int = 0
 
-    Attributes:
-      layout: GPU -> GMIs.
-      rank: id of this GMI.
-    """
-
-    def __init__(
-        self, layout: Layout, messenger: Messenger, reducer: GroupReducer, link: ChildLink
-    ) -> None:
-        self.layout = layout
-        self.rank = messenger.rank
-        self._messenger = messenger
-        self._reducer = reducer
-        self._link = link
-        self._steps = 0
+    @property
+    def rank(self) -> int:
+        """See `Role.rank`."""
+        return self.messenger.rank
 
     @property
     def stop_requested(self) -> bool:
-        """Whether the controller asked for an end."""
-        return self._link.stop_requested
+        """See `Role.stop_requested`."""
+        return self.link.stop_requested
 
     def reduce(self, data: Any, op: Operation, group: Iterable[int] | None) -> Any:
         """See `Role.collective`."""
-        result = self._reducer.reduce(self.layout.gmis if group is None else group, data, op)
-        self.progress(self._steps)
+        result = self.reducer.reduce(self.layout.gmis if group is None else group, data, op)
+        self.progress(self.steps)
         return result
 
     def send(self, data: Any, dst: int) -> None:
         """See `Role.send`."""
-        self._messenger.send(data, dst)
-        self.progress(self._steps)
+        self.messenger.send(data, dst)
+        self.progress(self.steps)
 
     def recv(self, src: int, timeout_s: float | None) -> Any:
         """See `Role.recv`."""
-        data = self._messenger.recv(src, timeout_s=timeout_s)
-        self.progress(self._steps)
+        data = self.messenger.recv(src, timeout_s=timeout_s)
+        self.progress(self.steps)
         return data
 
     def progress(self, step: int) -> None:
         """See `Role.progress`."""
-        self._steps = step
-        self._link.beat("running", step)
+        self.steps = step
+        self.link.beat("running", step)
 
 
 # One process is one GMI, so this is as global as the process: managers that a role's module makes
@@ -72,11 +68,7 @@ def enter(gmi: Gmi) -> None:
 
 
 def here(what: str) -> Gmi:
-    """The GMI that this process is.
-
-    Raises:
-      ConfigError: it is none, so that `what` makes no sense.
-    """
+    """The GMI that this process is; ConfigError if it is none, so that `what` makes no sense."""
     if not _here:
         raise ConfigError(f"{what}: only inside a GMI, in the role's run; see gmijax.launch")
     return _here[0]
@@ -100,13 +92,9 @@ class Role(ABC):
 
     @abstractmethod
     def run(self, *args: Any) -> Any:
-        """The routine of the GMI.
+        """The routine of the GMI; `args` are what `gmijax.launch` got after the role.
 
-        Args:
-          args: what `gmijax.launch` got after the role.
-
-        Returns:
-          Anything that can be pickled; `launch` returns it. Arrays of jax come back as numpy's.
+        It returns anything that can be pickled; arrays of jax come back from `launch` as numpy's.
         """
 
     @property
@@ -178,13 +166,8 @@ class Role(ABC):
     def recv(self, src: int, timeout_s: float | None = None) -> Any:
         """Waits for the next message of GMI `src`, and returns it.
 
-        Args:
-          src: id of a GMI.
-          timeout_s: longest wait; None: what `gmijax.launch` was told.
-
-        Returns:
-          What was sent; its arrays are this GMI's own. Those of jax are jax's still where they
-          could stay on the GPU, and numpy's else.
+        Its arrays are this GMI's own; those of jax are jax's still where they could stay on the
+        GPU, and numpy's else. With `timeout_s=None` the wait is what `gmijax.launch` was told.
 
         Raises:
           PeerLost: that GMI is gone, and has left no message.
@@ -193,8 +176,5 @@ class Role(ABC):
         return here("recv").recv(src, timeout_s)
 
     def progress(self, step: int) -> None:
-        """Tells the controller how far this GMI is; cheap enough for every step.
-
-        Messages and collective calls count as progress by themselves.
-        """
+        """Reports how far this GMI is, as messages and collective calls do; cheap."""
         here("progress").progress(step)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import sys
 from typing import TYPE_CHECKING, Any
 
-from gmijax.collectives.host import HostExchange
+from gmijax.collectives.host.host_exchange import HostExchange
 from gmijax.collectives.messages.group import GroupReducer
 from gmijax.collectives.messages.messenger import Messenger
 from gmijax.collectives.messages.pipe_block import PipeBlock
@@ -78,7 +78,7 @@ def _device_buffers(plan: Plan, gmi: int) -> DeviceBuffers | None:
     neighbours = [peer for peer in plan.layout.neighbours_of(gmi) if peer != gmi]
     if not neighbours or why_not_intra("ipc", plan.backend):
         return None
-    from gmijax.collectives.device_memory import cuda_memory
+    from gmijax.collectives.device.device_memory import cuda_memory
     from gmijax.collectives.messages.device_buffers import DeviceBuffers
 
     return DeviceBuffers(neighbours, cuda_memory)

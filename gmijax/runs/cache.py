@@ -38,16 +38,9 @@ def compilation_cache_dir() -> Path:
 def drop_broken_programs(cache: Path, logs: Iterable[Path]) -> int:
     """Removes entries of programs that GMIs could not read, so that the next job writes them.
 
-    JAX writes an entry in place and never writes over one that is there. A process that is killed
-    meanwhile, or a full disk, leaves half an entry: every GMI of every later job would then
-    compile that program by itself.
-
-    Args:
-      cache: the folder, `JAX_COMPILATION_CACHE_DIR` of the GMIs.
-      logs: stderr of the GMIs.
-
-    Returns:
-      The number of files removed: all entries of these programs, good ones too.
+    JAX writes an entry in place and never over one that is there: a process that is killed
+    meanwhile, or a full disk, leaves half an entry for every later job. `logs` are what GMIs wrote
+    to stderr. Returns the number of files removed: all entries of these programs, good ones too.
     """
     names: set[str] = set()
     for log in logs:

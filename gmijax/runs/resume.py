@@ -19,29 +19,20 @@ _CHUNK_BYTES: Final = 1 << 20
 
 @dataclass(frozen=True)
 class CheckpointMeta:
-    """Meta data of a checkpoint.
+    """Meta data of a checkpoint."""
 
-    Attributes:
-      env: task name.
-      algo: training algorithm.
-      env_steps: environment steps of the whole job so far.
-      num_gmis: K of the job that wrote it.
-      num_envs: N of that job, environments per GMI.
-      hidden: widths of the policy and of the value network.
-      impl: physics implementation; environment states of one cannot be used by the other.
-      mean_return: of the latest episodes before it, None while none had ended.
-      files: size in bytes and CRC-32 of every other file, by its path in the checkpoint; empty
-        in those of older versions.
-    """
-
-    env: str
-    algo: str
-    env_steps: int
-    num_gmis: int
-    num_envs: int
+    env: str  # Task name.
+    algo: str  # Training algorithm.
+    env_steps: int  # Environment steps of the whole job so far.
+    num_gmis: int  # K of the job that wrote it.
+    num_envs: int  # N of that job, environments per GMI.
+    # Widths of the policy and of the value network.
     hidden: tuple[tuple[int, ...], tuple[int, ...]]
-    impl: str
+    impl: str  # Physics implementation; environment states of one cannot be used by the other.
+    # Of the latest episodes before it, None while none had ended.
     mean_return: float | None = None
+    # Size in bytes and CRC-32 of every other file, by its path in the checkpoint; empty in
+    # those of older versions.
     files: Mapping[str, tuple[int, ...]] = field(default_factory=dict)
 
     def to_dict(self) -> dict[str, object]:
@@ -62,15 +53,10 @@ class CheckpointMeta:
 
 
 class Found(NamedTuple):
-    """Checkpoints of a run folder.
+    """Checkpoints of a run folder."""
 
-    Attributes:
-      checkpoint: the newest one that is whole, None if there is none.
-      passed_over: newer ones, each with what is wrong with it.
-    """
-
-    checkpoint: Path | None
-    passed_over: tuple[str, ...]
+    checkpoint: Path | None  # The newest one that is whole, None if there is none.
+    passed_over: tuple[str, ...]  # Newer ones, each with what is wrong with it.
 
 
 def newest_checkpoint(folder: Path) -> Found:
@@ -117,10 +103,8 @@ def find_checkpoint(wanted: str, key: str) -> Path:
 def choose_checkpoint(wanted: str, key: str) -> tuple[Path, tuple[str, ...]]:
     """The checkpoint that `wanted` names, and what was passed over for it (see `Found`).
 
-    It names `last`, a run folder, or a checkpoint folder.
-
-    `last` is the run below `runs/` with the newest checkpoint; a run folder means its newest one
-    that is whole.
+    A checkpoint folder, a run folder (its newest one that is whole), or `last`: the run below
+    `runs/` with the newest checkpoint.
 
     Raises:
       ConfigError: there is none.

@@ -9,6 +9,8 @@ them by mistake is not mistaken for a rare failure of the solver.
 
 from __future__ import annotations
 
+from functools import reduce
+
 import jax
 import jax.numpy as jnp
 
@@ -20,8 +22,8 @@ MAX_POSITION = 1e10
 
 
 def sources(term_names: tuple[str, ...]) -> tuple[str, ...]:
-    """Where a bad number can be: physics, observation, or a term of the reward."""
-    return ("physics", "observation", *(f"reward/{name}" for name in term_names))
+    """Names of what counts bad numbers: anywhere, physics, observation, a term of the reward."""
+    return ("any", "physics", "observation", *(f"reward/{name}" for name in term_names))
 
 
 def diverged_by_source(env: Env, state: EnvState) -> dict[str, Array]:
@@ -34,9 +36,8 @@ def diverged_by_source(env: Env, state: EnvState) -> dict[str, Array]:
         "physics": ~within(jax.vmap(env.qpos)(state), MAX_POSITION),
         "observation": ~within(state.obs, env.spec.max_abs_obs),
     }
-    return bad | {
-        f"reward/{name}": ~jnp.isfinite(value) for name, value in state.reward_terms.items()
-    }
+    bad |= {f"reward/{name}": ~jnp.isfinite(value) for name, value in state.reward_terms.items()}
+    return bad | {"any": reduce(jnp.logical_or, bad.values())}
 
 
 def end_diverged(before: EnvState, state: EnvState, diverged: Array) -> EnvState:

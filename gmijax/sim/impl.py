@@ -24,31 +24,22 @@ class WarpSizes(NamedTuple):
     constraints_per_env: int
 
 
-class OnGpu(NamedTuple):
-    """How a task runs on a GPU.
-
-    Attributes:
-      auto: what `physics.impl=auto` chooses.
-      warp_sizes: None for the sizes of MJX-JAX, which hold all that can ever be unless the model
-        limits them (`max_contact_points`, `max_geom_pairs`).
-    """
-
-    auto: Impl
-    warp_sizes: WarpSizes | None = None
-
-
-ON_GPU: Mapping[str, OnGpu] = MappingProxyType(
+ON_GPU: Mapping[str, WarpSizes | None] = MappingProxyType(
     {
-        "ant": OnGpu("warp"),
-        "anymal": OnGpu("warp"),
-        "ball_balance": OnGpu("warp"),
-        "franka_cabinet": OnGpu("warp"),
-        "humanoid": OnGpu("warp"),
+        "ant": None,
+        "anymal": None,
+        "ball_balance": None,
+        "franka_cabinet": None,
+        "humanoid": None,
         # MJX-JAX keeps the 12 deepest contacts, Warp all: up to 10 under random actions, 20 fit.
-        "shadow_hand": OnGpu("warp", WarpSizes(contacts_per_env=12, constraints_per_env=108)),
+        "shadow_hand": WarpSizes(contacts_per_env=12, constraints_per_env=108),
     }
 )
-"""The tasks by name; a task that is not here runs in JAX, with the sizes of MJX-JAX."""
+"""Tasks for which `physics.impl=auto` chooses MJX-Warp on a GPU, and the sizes of its buffers.
+
+None: the sizes of MJX-JAX, which hold all that can ever be unless the model limits them
+(`max_contact_points`, `max_geom_pairs`). A task that is not here runs in JAX, with those sizes.
+"""
 
 
 def choose_impl(
@@ -76,7 +67,6 @@ def choose_impl(
     if impl == "jax":
         return "jax", "asked for"
     is_gpu = device_platform in ("gpu", "cuda")
-    on_gpu = ON_GPU.get(task or "")
     if impl == "warp":
         if not warp_installed:
             raise ConfigError(
@@ -88,6 +78,6 @@ def choose_impl(
         return "jax", f"MJX-Warp is slow on {device_platform}"
     if not warp_installed:
         return "jax", "warp-lang is not installed"
-    if on_gpu is not None and on_gpu.auto == "warp":
+    if task in ON_GPU:
         return "warp", f"the faster one for {task} on a GPU"
     return "jax", "not tuned for MJX-Warp; ask for it with physics.impl=warp"

@@ -11,7 +11,7 @@ import json
 import os
 import sys
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeAlias
 
 import mujoco
 import numpy as np
@@ -22,17 +22,12 @@ from gmijax.sim.render import Trajectory, load_trajectory, real_time
 
 MAX_FPS = 60.0
 
+Floats: TypeAlias = npt.NDArray[np.float32]
+
 _LAST_VISIBLE_GROUP = 2
 """MuJoCo's own viewers draw geoms of groups 0 to 2, unless they are told otherwise."""
 
 _DRAWN = ("PLANE", "HFIELD", "SPHERE", "CAPSULE", "CYLINDER", "BOX", "MESH")
-
-
-class Poses(NamedTuple):
-    """Where the bodies are: `pos` [B, 3] metres and `rot` [B, 4] unit quaternions."""
-
-    pos: npt.NDArray[np.float32]
-    rot: npt.NDArray[np.float32]
 
 
 class Frame(NamedTuple):
@@ -69,10 +64,10 @@ def page(model: mujoco.MjModel, trajectory: Trajectory) -> str:
     _check_shapes(model)
     timing = real_time(trajectory.control_dt_s, MAX_FPS)
     qpos = trajectory.qpos[: trajectory.lengths[0] + 1 : timing.stride, 0]
-    frames: list[Any] = [
-        Frame(Transform(pos=poses.pos, rot=poses.rot))  # pyright: ignore[reportArgumentType]
-        for poses in map(lambda row: poses_of(model, row), qpos)
-    ]
+    frames: list[Any] = []
+    for row in qpos:
+        pos, rot = poses_of(model, row)
+        frames.append(Frame(Transform(pos=pos, rot=rot)))  # pyright: ignore[reportArgumentType]
     _paint(model)
     system = mjcf.load_model(model)
     data = json.loads(brax_json.dumps(system, frames))
@@ -82,12 +77,12 @@ def page(model: mujoco.MjModel, trajectory: Trajectory) -> str:
     return html.render_from_json(json.dumps(data), "100vh", colab=False, base_url=None)
 
 
-def poses_of(model: mujoco.MjModel, qpos: npt.NDArray[Any]) -> Poses:
-    """Poses of all bodies but the world at `qpos` [nq]."""
+def poses_of(model: mujoco.MjModel, qpos: npt.NDArray[Any]) -> tuple[Floats, Floats]:
+    """Positions [B, 3] and quaternions [B, 4] of all bodies but the world at `qpos` [nq]."""
     data = mujoco.MjData(model)
     data.qpos[:] = qpos
     mujoco.mj_kinematics(model, data)
-    return Poses(data.xpos[1:].astype(np.float32), data.xquat[1:].astype(np.float32))
+    return data.xpos[1:].astype(np.float32), data.xquat[1:].astype(np.float32)
 
 
 def _check_shapes(model: mujoco.MjModel) -> None:

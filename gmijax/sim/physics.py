@@ -96,7 +96,7 @@ class Physics:
           Positions [nbody, 3] in metres and unit quaternions [nbody, 4], both in the world, as
           `xpos` and `xquat` of the data that `step` lets its caller read.
         """
-        data = mjx.make_data(self.jax_model, device=jax.local_devices()[0]).replace(qpos=qpos)
+        data = mjx.make_data(self.jax_model).replace(qpos=qpos)
         data = mjx.kinematics(self.jax_model, data)
         return data.xpos, data.xquat
 
@@ -177,9 +177,12 @@ def load(asset: str, *, impl: str, substeps: int, max_envs: int | None = None) -
     text = resources.files("gmijax.sim").joinpath("assets", f"{asset}.xml").read_text()
     mj_model = mujoco.MjModel.from_xml_string(text)
     chosen, _ = choose_impl(impl, jax.default_backend(), asset)
-    sizes = ON_GPU[asset].warp_sizes if asset in ON_GPU else None
     return from_mj_model(
-        mj_model, impl=chosen, substeps=substeps, max_envs=max_envs, warp_sizes=sizes
+        mj_model,
+        impl=chosen,
+        substeps=substeps,
+        max_envs=max_envs,
+        warp_sizes=ON_GPU.get(asset),
     )
 
 
@@ -204,7 +207,7 @@ def from_mj_model(
     chosen, _ = choose_impl(impl, jax.default_backend())
     jax_model = _put(mj_model, "jax")
     if chosen == "jax":
-        blank = partial(mjx.make_data, jax_model, device=jax.local_devices()[0])
+        blank = partial(mjx.make_data, jax_model)
         return Physics(chosen, mj_model, jax_model, jax_model, blank, substeps)
     model = _put(mj_model, chosen)
     # Warp prints a line per world and step when the solver meets its iteration limit. Here it is
@@ -217,8 +220,7 @@ def from_mj_model(
 
 def _put(mj_model: mujoco.MjModel, impl: Impl) -> mjx.Model:
     try:
-        # By itself MJX takes the first device of all processes, which may be another GMI's.
-        return mjx.put_model(mj_model, device=jax.local_devices()[0], impl=impl)
+        return mjx.put_model(mj_model, impl=impl)
     except (NotImplementedError, ValueError) as error:
         name = mj_model.names.split(b"\0")[0].decode()  # The model's own name comes first.
         raise ConfigError(
@@ -229,8 +231,7 @@ def _put(mj_model: mujoco.MjModel, impl: Impl) -> mjx.Model:
 
 def _jax_sizes(mj_model: mujoco.MjModel) -> WarpSizes:
     """MJX-JAX's sizes: a row for every contact and constraint that can ever be."""
-    device = jax.local_devices()[0]
-    bounds = mjx.make_data(mj_model, device=device, impl="jax")._impl
+    bounds = mjx.make_data(mj_model, impl="jax")._impl
     return WarpSizes(bounds.ncon, bounds.nefc)
 
 
@@ -240,7 +241,6 @@ def _warp_blank(
     # Contacts are shared by all worlds, rows are per world.
     template = mjx.make_data(
         mj_model,
-        device=jax.local_devices()[0],
         impl="warp",
         naconmax=max(sizes.contacts_per_env, 1) * max_envs,
         njmax=max(sizes.constraints_per_env, 1),

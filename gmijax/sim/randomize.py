@@ -1,4 +1,4 @@
-"""Domain randomisation: every world has a physics model of its own, drawn once.
+"""Worlds as a configuration describes them; domain randomisation: each has a model of its own.
 
 The draws of a world depend on the seed and on its number in the whole job only, so k GMIs with n
 worlds simulate what one with k x n does, and a resumed job finds its worlds again without having
@@ -19,9 +19,11 @@ import numpy as np
 import numpy.typing as npt
 from mujoco import mjx
 
-from gmijax.config.randomization import NEVER_ZERO, RANDOMIZED_LEAVES, LeafRange
+from gmijax.config import EnvConfig
+from gmijax.config.env import NEVER_ZERO, RANDOMIZED_LEAVES, LeafRange
 from gmijax.errors import ConfigError
 from gmijax.sim.interface import Env
+from gmijax.sim.registry import make_env
 from gmijax.sim.wrappers import env_keys
 from gmijax.types import PRNGKey
 
@@ -36,6 +38,30 @@ _MASS_LEAVES = ("body_mass", "dof_armature")
 """Leaves on which the constants depend that `mj_setConst` computes."""
 
 _CONSTANTS = ("body_subtreemass", "body_invweight0", "dof_invweight0", "tendon_invweight0")
+
+
+def make_worlds(config: EnvConfig, impl: str, *, seed: int, first_env: int, num_envs: int) -> Env:
+    """The task, its worlds randomised where the configuration says so.
+
+    Args:
+      config: task and randomisation.
+      impl: MJX implementation, decided.
+      seed: of the run.
+      first_env: number of the first of these worlds in the whole job.
+      num_envs: N.
+    """
+    env = make_env(
+        str(config.name),
+        suite=config.suite,
+        impl=impl,
+        episode_length=config.episode_length,
+        max_envs=num_envs,
+        source_sha256=config.source_sha256,
+    )
+    if config.randomize != "on":
+        return env
+    ranges = config.randomization
+    return randomized(env, ranges, seed=seed, first_env=first_env, num_envs=num_envs)
 
 
 def randomized(

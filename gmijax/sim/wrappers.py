@@ -8,8 +8,7 @@ k processes with n environments each see the samples of one process with k x n, 
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import reduce
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -18,6 +17,8 @@ from gmijax.errors import ConfigError
 from gmijax.sim.divergence import diverged_by_source, end_diverged, sources
 from gmijax.sim.interface import OVERFLOWS, Env, EnvSpec, EnvState
 from gmijax.types import Array, PRNGKey, PyTree
+
+T = TypeVar("T")
 
 _HEAD_START = 0x68656164
 """Folded into a world's key for the length of its first episode."""
@@ -68,7 +69,7 @@ class StepOutput(NamedTuple):
       truncated: [N] bool, time ran out.
       finished: the whole episodes that ended in this step; none that had a head start.
       diverged: [] int32, worlds that were ended because of a bad number (they count as
-        terminated), and by where it was: `any` and `gmijax.sim.divergence.sources`.
+        terminated), by where it was: `gmijax.sim.divergence.sources`.
       overflowed: [] int32, worlds for which a buffer was too small, by `OVERFLOWS`; empty if
         nothing can overflow.
     """
@@ -126,13 +127,16 @@ def auto_reset(env: Env, model: PyTree, state: EnvState) -> EnvState:
 
     A world's key moves on only if the world is reset, so when other worlds end does not matter.
     """
-    done = state.terminated | state.truncated
-    fresh = env.reset(model, state.key)
+    return select_worlds(state.terminated | state.truncated, env.reset(model, state.key), state)
 
-    def pick(new: Array, old: Array) -> Array:
-        return jnp.where(jnp.expand_dims(done, range(1, old.ndim)), new, old)
 
-    return jax.tree.map(pick, fresh, state)
+def select_worlds(chosen: Array, new: T, old: T) -> T:
+    """`new` in the `chosen` worlds [N], else `old`; every leaf has a leading axis [N]."""
+
+    def select(a: Array, b: Array) -> Array:
+        return jnp.where(jnp.expand_dims(chosen, range(1, b.ndim)), a, b)
+
+    return jax.tree.map(select, new, old)
 
 
 def cut_first_episodes(spec: EnvSpec, before: BatchState, state: EnvState) -> EnvState:
@@ -176,7 +180,7 @@ def zero_counts(
     terms, metrics = dict.fromkeys(spec.reward_terms, zero), dict.fromkeys(spec.metrics, zero)
     return (
         EpisodeSums(zero, zero, zero, terms, metrics),
-        dict.fromkeys(("any", *sources(spec.reward_terms)), zero),
+        dict.fromkeys(sources(spec.reward_terms), zero),
         dict.fromkeys(overflows, zero),
     )
 
@@ -222,7 +226,6 @@ def training_env(env: Env, *, random_ep_len: bool = False) -> BatchedEnv:
         if random_ep_len:  # Else it changes nothing, and costs MJX-JAX 4 % of ant's iteration.
             stepped = cut_first_episodes(env.spec, state, stepped)
         bad = diverged_by_source(env, stepped)
-        bad["any"] = reduce(jnp.logical_or, bad.values())
         stepped = end_diverged(state.env, stepped, bad["any"])
         returns, terms, finished = episode_statistics(state, stepped)
         output = StepOutput(

@@ -99,7 +99,8 @@ class ChildLink:
             raise ConfigError(
                 f"{ENV_GMI} and {ENV_RUN_DIR} must be set: GMIs are started by gmijax.train"
             ) from None
-        pin_to_cpus(environment.get(ENV_CPUS, ""))
+        if (cpus := environment.get(ENV_CPUS)) and hasattr(os, "sched_setaffinity"):
+            os.sched_setaffinity(0, {int(cpu) for cpu in cpus.split(",")})
         lifeline_fd = inherited_fd(environment, ENV_LIFELINE_FD)
         if lifeline_fd is not None:
             _leave_signals_to_controller()
@@ -184,12 +185,6 @@ def _leave_signals_to_controller() -> None:
     if sys.__stderr__ is not None:
         faulthandler.enable(sys.__stderr__)
         faulthandler.register(STACKS_SIGNAL, sys.__stderr__, all_threads=True)
-
-
-def pin_to_cpus(cpus: str) -> None:
-    """Restricts this process to the cores in `cpus`, e.g. `0,1,5`; empty for no restriction."""
-    if cpus and hasattr(os, "sched_setaffinity"):
-        os.sched_setaffinity(0, {int(cpu) for cpu in cpus.split(",")})
 
 
 def _end_now() -> None:

@@ -1,16 +1,18 @@
-"""Environment variables of a GMI: a pure function of the plan.
+"""Environment variables of a GMI: a function of the plan and the installed jaxlib.
 
 They must be set before the GMI imports jax; that is why every GMI is a fresh interpreter.
 """
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Final
 
 from gmijax.partition.plan import Plan, Slice
 from gmijax.supervise.child import ENV_CPUS, ENV_GMI, ENV_WAITS
+from gmijax.version import versions_of
 
 # The old and the new name of one JAX setting; JAX refuses to start when both are set.
 _MEMORY_FRACTION, _OLD_MEMORY_FRACTION = (
@@ -26,7 +28,11 @@ _THREAD_LIMITS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 
 _SMALLEST_POOL = 4
 
-_NCCL_INTERFACE = "NCCL_SOCKET_IFNAME"
+_FUSION_EMITTERS = "--xla_cpu_use_fusion_emitters"
+"""Physics of long kinematic chains runs up to a thousand times slower with them."""
+
+_FIRST_JAXLIB_WITHOUT_FLAG = (0, 11, 1)
+"""From here on XLA ends the process when it meets the flag, as with any unknown one."""
 
 
 def gmi_environment(
@@ -46,35 +52,23 @@ def gmi_environment(
       gmi: id of the GMI.
       inherited: the controller's own variables.
       cache_dir: compilation cache, unless the user has set one.
-      backend_environment: what the backend adds; its `XLA_FLAGS` are appended to the user's.
+      backend_environment: what the backend adds.
     """
     share = plan.slices[gmi]
-    environment = dict(inherited)
-    for name in (_OLD_MEMORY_FRACTION, _MEMORY_FRACTION, _SM_PERCENT):
-        environment.pop(name, None)
-    environment.update(_cpu(share) if plan.backend == "cpu" else _gpu(share))
-    environment.update(_common(share))
-    environment.setdefault(COMPILATION_CACHE, str(cache_dir))
+    dropped = (_OLD_MEMORY_FRACTION, _MEMORY_FRACTION, _SM_PERCENT, ENV_WAITS)
+    kept = {name: value for name, value in inherited.items() if name not in dropped}
+    # One thread beside a GPU: there the host only moves small arrays, and the GMIs of all GPUs
+    # share the cores.
+    defaults: dict[str, str] = {COMPILATION_CACHE: str(cache_dir)}
     for name in _THREAD_LIMITS:
-        # One thread beside a GPU: there the host only moves small arrays, and the GMIs of all
-        # GPUs share the cores.
-        environment.setdefault(name, str(len(share.cpus) or 1))
-    added = dict(backend_environment)
-    flags = extend_xla_flags(environment.get(_XLA_FLAGS, ""), added.pop(_XLA_FLAGS, ""))
-    environment.pop(ENV_WAITS, None)  # Of the job that this one may be started from.
-    if plan.backend != "cpu":
+        defaults[name] = str(len(share.cpus) or 1)
+    if plan.backend == "cpu":
+        own = _cpu(share, inherited.get(_XLA_FLAGS, ""))
+    else:
+        own = _gpu(share)
         # All GMIs are on this host, and NCCL's sockets are open to whoever reaches them.
-        environment.setdefault(_NCCL_INTERFACE, "lo")
-    if flags:
-        environment[_XLA_FLAGS] = flags
-    return {**environment, **added}
-
-
-def extend_xla_flags(users: str, added: str) -> str:
-    """The user's flags and those of `added` that the user has not set."""
-    taken = {flag.partition("=")[0] for flag in users.split()}
-    more = [flag for flag in added.split() if flag.partition("=")[0] not in taken]
-    return " ".join([*users.split(), *more])
+        defaults["NCCL_SOCKET_IFNAME"] = "lo"
+    return {**defaults, **kept, **own, **_common(share), **backend_environment}
 
 
 def _common(share: Slice) -> dict[str, str]:
@@ -89,12 +83,18 @@ def _common(share: Slice) -> dict[str, str]:
     }
 
 
-def _cpu(share: Slice) -> dict[str, str]:
+def _cpu(share: Slice, users_flags: str) -> dict[str, str]:
     cores = len(share.cpus)
     # XLA's pool of exactly two threads can hang on batched physics, so two and three cores
     # get a larger one.
     pool = 1 if cores == 1 else max(_SMALLEST_POOL, cores)
-    return {"JAX_PLATFORMS": "cpu", "CUDA_VISIBLE_DEVICES": "", "PJRT_NPROC": str(pool)}
+    variables = {"JAX_PLATFORMS": "cpu", "CUDA_VISIBLE_DEVICES": "", "PJRT_NPROC": str(pool)}
+    # Read from the package's metadata: the controller must not import jax.
+    jaxlib = versions_of(["jaxlib"])["jaxlib"] or ""
+    numbers = tuple(map(int, re.findall(r"\d+", jaxlib)[:3]))
+    if () < numbers < _FIRST_JAXLIB_WITHOUT_FLAG and _FUSION_EMITTERS not in users_flags:
+        variables[_XLA_FLAGS] = f"{users_flags} {_FUSION_EMITTERS}=false".strip()
+    return variables
 
 
 def _gpu(share: Slice) -> dict[str, str]:

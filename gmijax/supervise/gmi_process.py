@@ -51,6 +51,12 @@ class GmiStatus(NamedTuple):
 class GmiProcess:
     """A started GMI, the leader of its own session and process group.
 
+    It inherits its lifeline, its heartbeat and `inherited_fds`, nothing else. With `waits` it
+    compiles nothing before `let_go`.
+
+    Raises:
+      GmiFailed: the program cannot be started.
+
     Attributes:
       gmi: its id.
       waits: whether it may not compile yet.
@@ -64,73 +70,43 @@ class GmiProcess:
     def __init__(
         self,
         gmi: int,
-        process: subprocess.Popen[bytes],
-        lifeline: GuardPipe,
-        block: HeartbeatBlock,
-        paths: GmiPaths,
-        *,
-        waits: bool,
-    ) -> None:
-        self.gmi = gmi
-        self.waits = waits
-        self.exit_code: int | None = None
-        self.progress_s = time.monotonic()
-        self._process = process
-        self._lifeline = lifeline
-        self._block = block
-        self.paths = paths
-        self.beat = Heartbeat("starting", 0, process.pid)
-        self._num_beats = 0
-        self._was_ready = False
-
-    @classmethod
-    def start(
-        cls,
-        gmi: int,
         command: Sequence[str],
         environment: Mapping[str, str],
         run: RunPaths,
         inherited_fds: Mapping[str, int],
         *,
         waits: bool = False,
-    ) -> GmiProcess:
-        """Starts a fresh interpreter that inherits its lifeline, `inherited_fds`, nothing else.
-
-        With `waits` it compiles nothing before `let_go`.
-
-        Raises:
-          GmiFailed: the program cannot be started.
-        """
-        paths = run.gmi(gmi)
-        paths.root.mkdir(parents=True, exist_ok=True)
-        for stale in (paths.error, paths.result):
+    ) -> None:
+        self.gmi = gmi
+        self.waits = waits
+        self.exit_code: int | None = None
+        self.paths = run.gmi(gmi)
+        self.paths.root.mkdir(parents=True, exist_ok=True)
+        for stale in (self.paths.error, self.paths.result):
             stale.unlink(missing_ok=True)
-        lifeline, heartbeat_fd = GuardPipe(), HeartbeatBlock.create()
-        inherited = {
-            ENV_LIFELINE_FD: lifeline.read_end,
-            ENV_HEARTBEAT_FD: heartbeat_fd,
-            **inherited_fds,
-        }
+        self._lifeline, heartbeat_fd = GuardPipe(), HeartbeatBlock.create()
+        own = {ENV_LIFELINE_FD: self._lifeline.read_end, ENV_HEARTBEAT_FD: heartbeat_fd}
+        inherited = {**own, **inherited_fds}
         variables = {name: str(fd) for name, fd in inherited.items()}
         if waits:
             variables[ENV_WAITS] = "1"
+        variables = {**environment, **variables, ENV_RUN_DIR: str(run.root)}
         try:
-            process = _spawn(
-                command,
-                {**environment, **variables, ENV_RUN_DIR: str(run.root)},
-                paths,
-                tuple(inherited.values()),
-            )
-            return cls(gmi, process, lifeline, HeartbeatBlock(heartbeat_fd), paths, waits=waits)
+            self._block = HeartbeatBlock(heartbeat_fd)
+            self._process = _spawn(command, variables, self.paths, tuple(inherited.values()))
         except OSError as error:
-            lifeline.close()
+            self._lifeline.close()
             raise GmiFailed(gmi, f"cannot start {command[0]}: {error.strerror}") from error
         except BaseException:
-            lifeline.close()
+            self._lifeline.close()
             raise
         finally:
-            os.close(lifeline.read_end)
+            os.close(self._lifeline.read_end)
             os.close(heartbeat_fd)
+        self.progress_s = time.monotonic()
+        self.beat = Heartbeat("starting", 0, self.pid)
+        self._num_beats = 0
+        self._was_ready = False
 
     @property
     def pid(self) -> int:
@@ -159,7 +135,7 @@ class GmiProcess:
         if self.exit_code is None and self._has_ended():
             # Before the zombie is reaped its group's number cannot go to somebody else.
             others = members_of(self.pid)
-            self.send(signal.SIGKILL)
+            self.kill()
             wait_until_gone(others, _GROUP_ENDS_S)
             self.exit_code = self._process.wait()
             self._refresh()
@@ -201,15 +177,15 @@ class GmiProcess:
 
     def end_as_done(self) -> None:
         """Ends a GMI that has said that it is done, but whose process stays."""
-        self.send(signal.SIGKILL)
+        self.kill()
         self._process.wait()
         self.exit_code = 0
 
-    def send(self, number: signal.Signals) -> None:
-        """Sends a signal to the GMI and to everything it started; nothing once it is reaped."""
+    def kill(self) -> None:
+        """Kills the GMI and everything it started; nothing once it is reaped."""
         if self.exit_code is None:
             with suppress(ProcessLookupError, PermissionError):
-                os.killpg(self.pid, number)
+                os.killpg(self.pid, signal.SIGKILL)
 
     def close(self) -> None:
         """Drops the lifeline: a process that is still there ends itself."""

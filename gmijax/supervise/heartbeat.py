@@ -99,8 +99,3 @@ class HeartbeatBlock:
             return None
         data: Mapping[str, str] = json.loads(self._memory[_HEADER_BYTES : _HEADER_BYTES + size])
         return ReportedError(**data)
-
-    def close(self) -> None:
-        """Lets the memory go."""
-        self._numbers.release()
-        self._memory.close()

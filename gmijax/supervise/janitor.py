@@ -17,7 +17,6 @@ import sys
 import time
 from collections.abc import Iterable
 from contextlib import suppress
-from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -28,23 +27,6 @@ from gmijax.machine.processes import GuardPipe, ProcessId, identify, wait_until_
 _GMIS_END_THEMSELVES_S = 8.0
 _DAEMON_ENDS_S = 10.0
 _LATE_DAEMON_S = 2.0
-
-
-@dataclass
-class _Duties:
-    """Processes and daemons that the controller has started so far."""
-
-    gmis: list[ProcessId] = field(default_factory=list)
-    daemons: list[MpsControl] = field(default_factory=list)
-    is_clean: bool = False
-
-    def learn(self, line: str) -> None:
-        message: dict[str, Any] = json.loads(line)
-        if "daemon" in message:
-            self.daemons.append(MpsControl(Path(message["program"]), Path(message["daemon"])))
-        elif "gmi" in message:
-            self.gmis.append(ProcessId(*message["gmi"]))
-        self.is_clean |= "clean" in message
 
 
 class JanitorLink:
@@ -82,12 +64,12 @@ class JanitorLink:
         if process := identify(pid):
             self._tell({"gmi": list(process)})
 
-    def dismiss(self, timeout_s: float = _DAEMON_ENDS_S) -> None:
+    def dismiss(self) -> None:
         """Says that everything is clean and waits for the janitor to end."""
         self._tell({"clean": True})
         self._pipe.close()
         try:
-            self._process.wait(timeout_s)
+            self._process.wait(_DAEMON_ENDS_S)
         except subprocess.TimeoutExpired:
             self._process.kill()
             self._process.wait()
@@ -105,7 +87,7 @@ class JanitorLink:
         self._pipe.write(json.dumps(message).encode() + b"\n")
 
 
-def quit_daemon(control: MpsControl, timeout_s: float = _DAEMON_ENDS_S) -> None:
+def quit_daemon(control: MpsControl) -> None:
     """Ends a daemon that gmijax has started, and removes its pipe directory.
 
     A daemon or server that does not end when asked is killed: nobody else knows of it.
@@ -116,8 +98,8 @@ def quit_daemon(control: MpsControl, timeout_s: float = _DAEMON_ENDS_S) -> None:
         pids |= set(control.server_pids())
     processes = [process for pid in pids if (process := identify(pid))]
     with suppress(BackendUnavailable):
-        control.quit(timeout_s)
-    for process in wait_until_gone(processes, timeout_s):
+        control.quit(_DAEMON_ENDS_S)
+    for process in wait_until_gone(processes, _DAEMON_ENDS_S):
         with suppress(ProcessLookupError):
             os.kill(process.pid, signal.SIGKILL)
     shutil.rmtree(control.pipe_directory, ignore_errors=True)
@@ -127,42 +109,40 @@ def main(lines: Iterable[str] = sys.stdin) -> int:
     """Learns until the pipe ends, then cleans up unless the controller has."""
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
         signal.signal(number, signal.SIG_IGN)
-    duties = _Duties()
+    gmis: list[ProcessId] = []
+    daemons: list[MpsControl] = []
     for line in lines:
-        duties.learn(line)
-    if not duties.is_clean:
-        _clean(duties)
+        message: dict[str, Any] = json.loads(line)
+        if "clean" in message:
+            return 0
+        if "daemon" in message:
+            daemons.append(MpsControl(Path(message["program"]), Path(message["daemon"])))
+        else:
+            gmis.append(ProcessId(*message["gmi"]))
+    # The GMIs notice by themselves that the controller is gone.
+    if left := wait_until_gone(gmis, _GMIS_END_THEMSELVES_S):
+        _kill(left, daemons)
+    for control in daemons:
+        # The controller may have been killed while it was starting this one.
+        deadline_s = time.monotonic() + _LATE_DAEMON_S
+        while not control.is_answering() and time.monotonic() < deadline_s:
+            time.sleep(_LATE_DAEMON_S / 10)
+        quit_daemon(control)
     return 0
 
 
-def _clean(duties: _Duties) -> None:
-    # The GMIs notice by themselves that the controller is gone.
-    left = wait_until_gone(duties.gmis, _GMIS_END_THEMSELVES_S)
-    if left:
-        for control in duties.daemons:
-            _terminate_clients(control)
-        for process in left:
-            if process.is_running():
-                with suppress(ProcessLookupError):
-                    os.killpg(process.pid, signal.SIGKILL)
-        wait_until_gone(left, _DAEMON_ENDS_S)
-    for control in duties.daemons:
-        _wait_for_late_daemon(control)
-        quit_daemon(control)
-
-
-def _wait_for_late_daemon(control: MpsControl) -> None:
-    # The controller may have been killed while it was starting this one.
-    deadline_s = time.monotonic() + _LATE_DAEMON_S
-    while not control.is_answering() and time.monotonic() < deadline_s:
-        time.sleep(_LATE_DAEMON_S / 10)
-
-
-def _terminate_clients(control: MpsControl) -> None:
-    # All clients of an own daemon are GMIs of the job.
-    with suppress(BackendUnavailable):
-        for client, server in control.all_client_pids().items():
-            control.terminate_client(server, client)
+def _kill(gmis: Iterable[ProcessId], daemons: Iterable[MpsControl]) -> None:
+    """Ends GMIs that did not end by themselves, first on the GPU."""
+    for control in daemons:
+        # All clients of an own daemon are GMIs of the job.
+        with suppress(BackendUnavailable):
+            for client, server in control.all_client_pids().items():
+                control.terminate_client(server, client)
+    for process in gmis:
+        if process.is_running():
+            with suppress(ProcessLookupError):
+                os.killpg(process.pid, signal.SIGKILL)
+    wait_until_gone(gmis, _DAEMON_ENDS_S)
 
 
 if __name__ == "__main__":

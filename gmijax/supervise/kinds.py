@@ -66,12 +66,12 @@ SYNCHRONOUS: Final = JobKind("gmijax.workers.worker")
 def training_kind(config: TrainConfig) -> JobKind:
     """The kind of a training job."""
     if config.is_asynchronous:
-        module = "gmijax.workers.async_worker"
-        return JobKind(module, compile_once=False, shared=partial(_registers_and_channels, config))
-    if config.plan.template == "tdg_ex":
-        module = "gmijax.workers.worker"
-        return JobKind(module, compile_once=False, shared=partial(pipes, ROLLOUT_PIPE_BYTES))
-    return SYNCHRONOUS
+        shared = partial(_registers_and_channels, config)
+    elif config.plan.template == "tdg_ex":
+        shared = partial(pipes, ROLLOUT_PIPE_BYTES)
+    else:
+        return SYNCHRONOUS
+    return JobKind(SYNCHRONOUS.module, compile_once=False, shared=shared)
 
 
 def serving_kind(config: ServeConfig) -> JobKind:

@@ -9,30 +9,27 @@ from __future__ import annotations
 import dataclasses
 import os
 import signal
-import sys
 import threading
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager, suppress
-from dataclasses import dataclass, field
 from pathlib import Path
 from types import FrameType
 from typing import Final
 
-from gmijax.collectives.shared_block import create_exchange
+from gmijax.collectives.host.shared_block import create_exchange
 from gmijax.config import RunConfig, ServeRunConfig
 from gmijax.errors import BackendUnavailable, GmijaxError, JobInterrupted
-from gmijax.machine.snapshot import Machine
 from gmijax.partition.backend_choice import WHAT_SHARE_LOSES
 from gmijax.partition.plan import Plan
 from gmijax.runs.cache import compilation_cache_dir, drop_broken_programs
 from gmijax.runs.folder import RunPaths, read_json, write_json
 from gmijax.supervise.backends import Backend, open_backend
 from gmijax.supervise.child import ENV_EXCHANGE_FD
-from gmijax.supervise.environment import COMPILATION_CACHE, gmi_environment
+from gmijax.supervise.environment import COMPILATION_CACHE
 from gmijax.supervise.gmi_process import GmiStatus
 from gmijax.supervise.kinds import JobKind
-from gmijax.supervise.supervisor import Job, Supervisor, Timeouts
+from gmijax.supervise.supervisor import Launch, Supervisor, Timeouts
 
 STOP_SIGNALS: Final = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGUSR1)
 """What asks a job to save and end: Ctrl-C, batch systems, a terminal that is closed."""
@@ -40,35 +37,6 @@ STOP_SIGNALS: Final = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGU
 _AGAIN_S = 1.0
 
 OnTick = Callable[[tuple[GmiStatus, ...]], None]
-
-
-@dataclass(frozen=True, kw_only=True)
-class Launch:
-    """What to run in the GMIs of a plan.
-
-    Attributes:
-      plan: where GMIs live and what they share.
-      machine: where this is; see `detect_machine`.
-      run: the run folder; what the GMIs read from it is there already.
-      kind: what the GMIs run, and what they share beside the block that reducers use.
-      timeouts: time limits.
-      stops_gracefully: a first one of `STOP_SIGNALS` asks the GMIs to finish by themselves;
-        otherwise signals do what Python does with them.
-      variables: more environment variables of every GMI.
-      on_warning: told in a sentence when the job runs otherwise than planned.
-      is_enough: whether the GMIs are to finish now, as after a first signal, and the job has done
-        what it was for; None: it ends by itself.
-    """
-
-    plan: Plan
-    machine: Machine
-    run: RunPaths
-    kind: JobKind
-    timeouts: Timeouts
-    stops_gracefully: bool = True
-    variables: Mapping[str, str] = field(default_factory=dict)
-    on_warning: Callable[[str], None] = lambda _: None
-    is_enough: Callable[[tuple[GmiStatus, ...]], bool] | None = None
 
 
 def run_gmis(
@@ -86,33 +54,19 @@ def run_gmis(
       ConfigError: a GMI rejected its input.
       JobInterrupted: a signal came, and every GMI has ended.
     """
-    plan, kind = launch.plan, launch.kind
+    plan = launch.plan
     with ExitStack() as held:
         # First, so that it ends last: a signal must not cut off the end of the backend.
         if launch.stops_gracefully and signals is None:
             signals = held.enter_context(stop_signals())
-        inherited = _shared_blocks(held, kind, plan)
+        inherited = _shared_blocks(held, launch.kind, plan)
         launch, backend = _enter_backend(held, launch)
 
-        def environment(gmi: int) -> dict[str, str]:
-            return environment_of(launch, gmi, backend.environment(gmi))
-
-        supervisor = Supervisor(
-            Job(
-                run=launch.run,
-                gmis=plan.layout.gmis,
-                command=lambda _: [sys.executable, "-m", kind.module],
-                environment=environment,
-                backend=backend,
-                timeouts=launch.timeouts,
-                inherited_fds=inherited,
-                compile_once=kind.compile_once,
-            )
-        )
+        supervisor = Supervisor(launch, backend, inherited)
         if signals is not None:
             signals.forward_to(supervisor.request_stop)
         try:
-            supervisor.run(_ticks(launch, supervisor, on_tick))
+            supervisor.run(on_tick)
         finally:
             programs = Path(os.environ.get(COMPILATION_CACHE) or compilation_cache_dir())
             drop_broken_programs(
@@ -130,21 +84,6 @@ def _shared_blocks(held: ExitStack, kind: JobKind, plan: Plan) -> dict[str, int]
         opened[name] = create()
         held.callback(os.close, opened[name])
     return opened
-
-
-def _ticks(launch: Launch, supervisor: Supervisor, on_tick: OnTick | None) -> OnTick:
-    """`on_tick`, and the order to finish when it is enough."""
-    is_enough = launch.is_enough
-
-    def tick(gmis: tuple[GmiStatus, ...]) -> None:
-        nonlocal is_enough
-        if on_tick is not None:
-            on_tick(gmis)
-        if is_enough is not None and is_enough(gmis):
-            supervisor.ask_to_finish()
-            is_enough = None
-
-    return tick
 
 
 @contextmanager
@@ -183,13 +122,6 @@ def timeouts_of(limits: RunConfig | ServeRunConfig) -> Timeouts:
         stop_timeout_s=limits.stop_timeout_s,
         grace_s=limits.grace_s,
     )
-
-
-def environment_of(launch: Launch, gmi: int, added: Mapping[str, str]) -> dict[str, str]:
-    """All environment variables of a GMI; `added` are those of its backend."""
-    own, cache = dict(os.environ), compilation_cache_dir()
-    variables = gmi_environment(launch.plan, gmi, own, cache, added)
-    return {**variables, **launch.variables}
 
 
 def _enter_backend(held: ExitStack, launch: Launch) -> tuple[Launch, Backend]:

@@ -6,17 +6,29 @@ raises. Whether the job is tried again is decided by `gmijax.control.restarts`.
 
 from __future__ import annotations
 
-import signal
+import os
+import sys
 import time
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 
-from gmijax.errors import GmiFailed, JobInterrupted
+from gmijax.errors import CollectiveTimeout, ConfigError, GmiFailed, JobInterrupted
+from gmijax.machine.snapshot import Machine
+from gmijax.partition.plan import Plan
+from gmijax.runs.cache import compilation_cache_dir
 from gmijax.runs.folder import RunPaths
 from gmijax.supervise.backends.backend import Backend
-from gmijax.supervise.failures import Failure, describe_exit, first_cause
+from gmijax.supervise.environment import gmi_environment
+from gmijax.supervise.failures import (
+    describe_exit,
+    ended_with,
+    first_cause,
+    first_line,
+    is_consequence,
+)
 from gmijax.supervise.gmi_process import GmiProcess, GmiStatus
+from gmijax.supervise.kinds import JobKind
 
 _POLL_S = 0.05
 _SETTLE_S = 1.0
@@ -43,41 +55,61 @@ class Timeouts:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Job:
-    """What to start and how.
+class Launch:
+    """What to run in the GMIs of a plan.
 
     Attributes:
-      run: the run folder.
-      gmis: ids of the GMIs, in the order of their start.
-      command: program and arguments of a GMI.
-      environment: all environment variables of a GMI (see `gmi_environment`); the supervisor
-        adds the run folder, the lifeline and the exchange.
-      backend: an entered backend.
+      plan: where GMIs live and what they share.
+      machine: where this is; see `detect_machine`.
+      run: the run folder; what the GMIs read from it is there already.
+      kind: what the GMIs run, and what they share beside the block that reducers use.
       timeouts: time limits.
-      inherited_fds: open files that every GMI inherits, by the environment variable that will
-        hold the number of the descriptor.
-      compile_once: the first GMI compiles while the others load what they need and wait, so
-        that they find its programs in the compilation cache.
+      stops_gracefully: the first signal of `STOP_SIGNALS` asks the GMIs to finish by themselves;
+        otherwise signals do what Python does with them.
+      variables: more environment variables of every GMI.
+      on_warning: called with a sentence when the job runs otherwise than planned.
+      is_enough: whether the GMIs are to finish now, as after a first signal, and the job has done
+        what it was for; None: it ends by itself.
     """
 
+    plan: Plan
+    machine: Machine
     run: RunPaths
-    gmis: Sequence[int]
-    command: Callable[[int], Sequence[str]]
-    environment: Callable[[int], Mapping[str, str]]
-    backend: Backend
+    kind: JobKind
     timeouts: Timeouts
-    inherited_fds: Mapping[str, int] = field(default_factory=dict)
-    compile_once: bool = True
+    stops_gracefully: bool = True
+    variables: Mapping[str, str] = field(default_factory=dict)
+    on_warning: Callable[[str], None] = lambda _: None
+    is_enough: Callable[[tuple[GmiStatus, ...]], bool] | None = None
+
+
+def environment_of(launch: Launch, gmi: int, added: Mapping[str, str]) -> dict[str, str]:
+    """All environment variables of a GMI; `added` are those of its backend."""
+    own, cache = dict(os.environ), compilation_cache_dir()
+    variables = gmi_environment(launch.plan, gmi, own, cache, added)
+    return {**variables, **launch.variables}
 
 
 class Supervisor:
-    """Runs one job once."""
+    """Runs one job once.
 
-    def __init__(self, job: Job) -> None:
-        self._job = job
+    Args:
+      launch: what to run.
+      backend: that of the plan, entered.
+      inherited_fds: open files that every GMI inherits, by the environment variable that will
+        hold the number of the descriptor.
+    """
+
+    def __init__(
+        self, launch: Launch, backend: Backend, inherited_fds: Mapping[str, int] | None = None
+    ) -> None:
+        self._launch = launch
+        self._backend = backend
+        self._inherited_fds = inherited_fds or {}
         self._started: dict[int, GmiProcess] = {}
         self._all_ready_s: float | None = None
         self._stop_requests = 0
+        self._is_enough = launch.is_enough
         self._stop_deadline_s: float | None = None
 
     def request_stop(self) -> None:
@@ -93,12 +125,12 @@ class Supervisor:
             process.ask_to_stop()
 
     def status(self) -> tuple[GmiStatus, ...]:
-        """Where every GMI stands, in the order of `Job.gmis`."""
+        """Where every GMI stands, in order of id."""
         return tuple(
             self._started[gmi].status()
             if gmi in self._started
             else GmiStatus(gmi, "waiting", 0, None, None)
-            for gmi in self._job.gmis
+            for gmi in self._launch.plan.layout.gmis
         )
 
     def run(self, on_tick: Callable[[tuple[GmiStatus, ...]], None] | None = None) -> None:
@@ -111,7 +143,7 @@ class Supervisor:
           JobInterrupted: a stop was requested, and every GMI has ended.
         """
         try:
-            for gmi in self._job.gmis:
+            for gmi in self._launch.plan.layout.gmis:
                 self._start(gmi)
             while self._alive():
                 self._raise_failure()
@@ -140,17 +172,18 @@ class Supervisor:
         return [process for process in self._started.values() if process.exit_code is None]
 
     def _start(self, gmi: int) -> None:
-        job = self._job
-        process = GmiProcess.start(
+        launch, backend = self._launch, self._backend
+        process = GmiProcess(
             gmi,
-            job.command(gmi),
-            job.environment(gmi),
-            job.run,
-            job.inherited_fds,
-            waits=job.compile_once and bool(self._started),
+            [sys.executable, "-m", launch.kind.module],
+            environment_of(launch, gmi, backend.environment(gmi)),
+            launch.run,
+            self._inherited_fds,
+            # The first one compiles for all.
+            waits=launch.kind.compile_once and bool(self._started),
         )
         self._started[gmi] = process
-        job.backend.started(gmi, process.pid)
+        backend.started(process.pid)
 
     def _let_go(self) -> None:
         """Lets those compile that wait for the first one, once it has."""
@@ -166,20 +199,22 @@ class Supervisor:
             return
         # A GMI that lost its peer can be quicker to end than that peer is to be seen dead.
         deadline_s = time.monotonic() + _SETTLE_S
-        while first_cause(failures).is_consequence and time.monotonic() < deadline_s:
+        while is_consequence(first_cause(failures)) and time.monotonic() < deadline_s:
             time.sleep(_POLL_S)
             failures = self._poll_failures()
         cause = first_cause(failures)
-        if cause.is_timeout and (alive := self._alive()):
+        if ended_with(cause, CollectiveTimeout) and (alive := self._alive()):
             # Whoever is waited for runs, and has not said anything for longest.
             stuck = min(alive, key=lambda process: process.progress_s)
             self._collect_stacks()
             iteration = stuck.beat.iteration
             what = f"made no progress after iteration {iteration}; GMI {cause.gmi} {cause.reason}"
             raise GmiFailed(stuck.gmi, what, iteration=iteration)
-        raise cause.to_error()
+        if cause.error is not None and ended_with(cause, ConfigError):
+            raise ConfigError(first_line(cause.error.message))  # Bad input stays bad input.
+        raise cause
 
-    def _poll_failures(self) -> list[Failure]:
+    def _poll_failures(self) -> list[GmiFailed]:
         return [
             describe_exit(
                 process.gmi,
@@ -193,6 +228,9 @@ class Supervisor:
         ]
 
     def _handle_stop(self) -> None:
+        if self._is_enough is not None and self._is_enough(self.status()):
+            self._is_enough = None
+            self.ask_to_finish()
         if not self._stop_requests:
             return
         if self._stop_requests > 1:
@@ -201,21 +239,21 @@ class Supervisor:
             raise JobInterrupted("stopped before training began")
         now_s = time.monotonic()
         if self._stop_deadline_s is None:
-            self._stop_deadline_s = now_s + self._job.timeouts.stop_timeout_s
+            self._stop_deadline_s = now_s + self._launch.timeouts.stop_timeout_s
             for process in self._alive():
                 process.ask_to_stop()
         elif now_s > self._stop_deadline_s:
             late = [process.gmi for process in self._alive()]
             raise JobInterrupted(
                 f"stopped on request; GMIs {late} did not finish within "
-                f"{self._job.timeouts.stop_timeout_s:g} s and were ended"
+                f"{self._launch.timeouts.stop_timeout_s:g} s and were ended"
             )
 
     def _verify_shares(self) -> None:
         # One that has ended already cannot be asked for any more.
         alive = {process.gmi: process.beat.pid for process in self._alive()}
         try:
-            self._job.backend.verify(alive)
+            self._backend.verify(alive)
         except GmiFailed as error:
             # One that failed meanwhile has lost its share by that, and may have taken the
             # others' with it.
@@ -230,16 +268,16 @@ class Supervisor:
             state = process.beat.state
             if process.waits:
                 continue  # The one that it waits for has a time limit.
-            if state == "done" and now_s - process.progress_s > self._job.timeouts.grace_s:
+            if state == "done" and now_s - process.progress_s > self._launch.timeouts.grace_s:
                 process.end_as_done()
                 continue
             if state in ("starting", "compiling"):
-                limit_s, since_s = self._job.timeouts.start_timeout_s, process.progress_s
+                limit_s, since_s = self._launch.timeouts.start_timeout_s, process.progress_s
                 what = "did not start and compile"
             elif self._all_ready_s is not None:
                 # A GMI that is ready waits for the others without a beat: its clock starts
                 # when the last one is ready.
-                limit_s = self._job.timeouts.stall_timeout_s
+                limit_s = self._launch.timeouts.stall_timeout_s
                 since_s = max(process.progress_s, self._all_ready_s)
                 what = f"made no progress after iteration {process.beat.iteration}"
             else:
@@ -277,12 +315,12 @@ class Supervisor:
         for process in alive:
             # Whatever is wrong with the backend, the processes must end.
             with suppress(Exception):
-                self._job.backend.terminate(process.gmi, process.beat.pid)
+                self._backend.terminate(process.gmi, process.beat.pid)
         for process in alive:
             process.order_end()
-        alive = _wait_for_end(alive, self._job.timeouts.grace_s)
+        alive = _wait_for_end(alive, self._launch.timeouts.grace_s)
         for process in alive:
-            process.send(signal.SIGKILL)
+            process.kill()
         alive = _wait_for_end(alive, _SWEEP_S)
         for process in self._started.values():
             process.close()

@@ -103,7 +103,7 @@ class Scheduler:
         order, log = self._paths.order(job.number), self._paths.log(job.number)
         child = start(job, place, to_dict(config), order, log, self._variables(place))
         self._running[job.number] = child
-        self._backend.started(place.slices[0].gmi, child.process.pid)
+        self._backend.started(child.process.pid)
         self._readers[job.number] = MetricsReader(run.metrics)
         job.progress.state, job.progress.place = "running", place.label
 

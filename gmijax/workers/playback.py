@@ -43,7 +43,7 @@ def _run(link: ChildLink) -> None:
     from gmijax.learning.checkpoint import restore_learner
     from gmijax.learning.episodes import Options, run_episodes
     from gmijax.learning.learner import init_learner, make_learner
-    from gmijax.sim.build import make_worlds
+    from gmijax.sim.randomize import make_worlds
 
     impl = _impl(config, checkpoint, env_config)
     played = dataclasses.replace(env_config, randomize=config.randomize)

@@ -1,8 +1,11 @@
-"""Main of a GMI in synchronous training: `python -m gmijax.workers.worker`.
+"""Main of a GMI in training: `python -m gmijax.workers.worker`.
 
-Started by the supervisor and by nobody else. Reads the run folder, plugs in the concrete reducer,
-trains, and writes `result.json` or `error.json`. With the template `tdg_ex` one GMI of every GPU
-trains and the others make its rollouts; the trainers of all GPUs average their gradients.
+Started by the supervisor and by nobody else. Reads the run folder, does what the plan gives to
+this GMI, and writes `result.json` or `error.json`.
+
+With the template `tdg_ex` one GMI of every GPU trains and the others make its rollouts; in
+asynchronous jobs agents send experience to trainers through channels. Trainers average their
+gradients.
 """
 
 from __future__ import annotations
@@ -11,19 +14,16 @@ import sys
 from contextlib import ExitStack
 from typing import TYPE_CHECKING, Any
 
-from gmijax.config import PpoConfig, TrainConfig
+from gmijax.config import A3cConfig, TrainConfig
+from gmijax.config.schema import from_dict
 from gmijax.partition.plan import Plan
-from gmijax.partition.templates import AGENT, TRAINER, has_role
+from gmijax.partition.templates import AGENT, TRAINER, Group, has_role
+from gmijax.runs.folder import read_json
 from gmijax.supervise.child import ENV_PIPES_FD, ChildLink, required_fd, run_gmi
-from gmijax.supervise.kinds import groups_of
-from gmijax.workers.trainers import (
-    environments_of,
-    exchange_used,
-    read_job,
-    trainers_reducer,
-)
+from gmijax.supervise.kinds import ENV_CHANNELS_FD, ENV_REGISTERS_FD, groups_of, topology_of
 
 if TYPE_CHECKING:
+    from gmijax.collectives.interface import Reducer
     from gmijax.collectives.messages.pipe_block import PipeBlock
     from gmijax.sim.wrappers import BatchedEnv
 
@@ -34,40 +34,51 @@ def main() -> int:
 
 
 def _run(link: ChildLink) -> dict[str, Any]:
-    config, plan = read_job(link)
-    assert isinstance(config.algo, PpoConfig)  # Others have a main of their own.
-    simulating, trainers = groups_of(plan)
-    trains = link.gmi in trainers.gmis
+    config = from_dict(TrainConfig, read_json(link.run.config))
+    plan = Plan.from_dict(read_json(link.run.plan))
     # jax starts here, in the environment that the plan prepared.
-    from gmijax.collectives.messages.messenger import Messenger
-    from gmijax.collectives.messages.pipe_block import PipeBlock
-    from gmijax.learning.updates import exchange_size
-    from gmijax.ppo.loop import TrainingLoop
-    from gmijax.ppo.ppo import PpoLosses
-    from gmijax.ppo.tdg_ex import RolloutWorkers
     from gmijax.selfcheck import check_share
 
     check_share(plan, link.gmi)
+    simulating, _ = groups_of(plan)
+    # A trainer that steps no environment takes the sizes from those of the first GMI that does.
     place = simulating.gmis.index(link.gmi) if link.gmi in simulating.gmis else 0
-    env = environments_of(config, place)
-    workers = None
+    env = _environments(config, place)
     with ExitStack() as held:
-        if plan.template == "tdg_ex":
-            block = PipeBlock(required_fd(ENV_PIPES_FD), link.gmi)
-            held.callback(block.close)
-            if not trains:
-                return _serve(config, plan, place, env, block, link)
-            mail = Messenger(block, config.reduce.timeout_s)
-            here = _neighbours(plan, link.gmi, AGENT)
-            workers = RolloutWorkers(mail, here, config.run.start_timeout_s)
-        num_floats = exchange_size(env.spec, config.algo, PpoLosses)
-        reducer = trainers_reducer(config, plan, trainers, link, num_floats)
-        held.callback(reducer.close)
-        loop = TrainingLoop(config, env, reducer, link, workers)
-        return loop.run() | exchange_used(plan, reducer)
+        if isinstance(config.algo, A3cConfig):
+            return _run_asynchronous(config, plan, place, env, link, held)
+        return _run_synchronous(config, plan, place, env, link, held)
 
 
-def _serve(
+def _run_synchronous(
+    config: TrainConfig,
+    plan: Plan,
+    place: int,
+    env: BatchedEnv,
+    link: ChildLink,
+    held: ExitStack,
+) -> dict[str, Any]:
+    from gmijax.collectives.messages.messenger import Messenger
+    from gmijax.collectives.messages.pipe_block import PipeBlock
+    from gmijax.ppo.loop import TrainingLoop
+    from gmijax.ppo.ppo import PpoLosses
+    from gmijax.ppo.tdg_ex import RolloutWorkers
+
+    trainers, workers = groups_of(plan)[1], None
+    if plan.template == "tdg_ex":
+        block = PipeBlock(required_fd(ENV_PIPES_FD), link.gmi)
+        held.callback(block.close)
+        if link.gmi not in trainers.gmis:
+            return _serve_rollouts(config, plan, place, env, block, link)
+        mail = Messenger(block, config.reduce.timeout_s)
+        here = _neighbours(plan, link.gmi, AGENT)
+        workers = RolloutWorkers(mail, here, config.run.start_timeout_s)
+    reducer = _trainers_reducer(config, plan, trainers, link, env, PpoLosses)
+    held.callback(reducer.close)
+    return TrainingLoop(config, env, reducer, link, workers).run() | exchange_used(plan, reducer)
+
+
+def _serve_rollouts(
     config: TrainConfig,
     plan: Plan,
     place: int,
@@ -77,6 +88,7 @@ def _serve(
 ) -> dict[str, Any]:
     """Makes rollouts for the trainer on the same GPU."""
     from gmijax.collectives.messages.messenger import Messenger
+    from gmijax.config import PpoConfig
     from gmijax.learning.learner import make_learner
     from gmijax.learning.start import first_envs
     from gmijax.ppo.tdg_ex import serve_rollouts
@@ -90,6 +102,93 @@ def _serve(
     rollouts = serve_rollouts(env, learner, state, mail, trainer, link.beat)
     mail.flush()
     return {"status": "completed", "rollouts": rollouts}
+
+
+def _run_asynchronous(
+    config: TrainConfig,
+    plan: Plan,
+    place: int,
+    env: BatchedEnv,
+    link: ChildLink,
+    held: ExitStack,
+) -> dict[str, Any]:
+    from gmijax.a3c.a3c import A3cLosses
+    from gmijax.a3c.agent import Agent
+    from gmijax.a3c.job_registers import open_job_registers
+    from gmijax.a3c.rollout import num_counts
+    from gmijax.a3c.trainer import Trainer
+    from gmijax.collectives.channel.build import open_receiver, open_sender
+    from gmijax.learning.learner import num_weights
+
+    agents, trainers = groups_of(plan)
+    registers = open_job_registers(
+        required_fd(ENV_REGISTERS_FD),
+        num_weights(env.spec, config.algo),
+        num_counts(env),
+        len(agents.gmis),
+    )
+    channels = config.channel, topology_of(plan), link.gmi, required_fd(ENV_CHANNELS_FD)
+    if link.gmi in agents.gmis:
+        sender = open_sender(*channels)
+        held.callback(sender.close)
+        return Agent(config, env, place, trainers.gmis, registers, sender, link).run()
+    receiver = open_receiver(*channels)
+    held.callback(receiver.close)
+    reducer = _trainers_reducer(config, plan, trainers, link, env, A3cLosses)
+    held.callback(reducer.close)
+    trainer = Trainer(config, env, agents.gmis, registers, receiver, reducer, link)
+    return trainer.run() | exchange_used(plan, reducer)
+
+
+def _environments(config: TrainConfig, place: int) -> BatchedEnv:
+    """The environments of the GMI that is number `place` of those that simulate."""
+    from gmijax.sim.randomize import make_worlds
+    from gmijax.sim.wrappers import training_env
+
+    worlds = make_worlds(
+        config.env,
+        config.physics.impl,
+        seed=config.seed,
+        first_env=place * config.envs_per_gmi,
+        num_envs=config.envs_per_gmi,
+    )
+    return training_env(worlds, random_ep_len=config.algo.init_at_random_ep_len)
+
+
+def _trainers_reducer(
+    config: TrainConfig,
+    plan: Plan,
+    trainers: Group,
+    link: ChildLink,
+    env: BatchedEnv,
+    losses: Any,
+) -> Reducer:
+    """The reducer among the trainers, whose ranks are their places in the group.
+
+    It averages a gradient and the parts of the loss, the named tuple `losses`.
+    """
+    from gmijax.collectives.build import Membership, build_reducer
+    from gmijax.learning.updates import exchange_size
+
+    membership = Membership(
+        layout=trainers.layout,
+        rank=trainers.gmis.index(link.gmi),
+        num_floats=exchange_size(env.spec, config.algo, losses),
+        exchange_fd=link.exchange_fd,
+        timeout_s=config.reduce.timeout_s,
+        rendezvous_timeout_s=config.run.start_timeout_s,
+        intra=plan.intra,
+        # Whoever asks for it by name is told that it does not work.
+        host_if_unavailable=config.reduce.intra == "auto" and config.reduce.strategy != "one_shot",
+    )
+    return build_reducer(plan.strategy, membership)
+
+
+def exchange_used(plan: Plan, reducer: Reducer) -> dict[str, str]:
+    """For the summary: the exchange in use, where it may differ from the plan's strategy."""
+    if reducer.strategy != plan.strategy:
+        return {"strategy": reducer.strategy, "intra": "host"}
+    return {"intra": reducer.intra} if plan.strategy == "har" else {}
 
 
 def _neighbours(plan: Plan, gmi: int, role: str) -> tuple[int, ...]:

@@ -15,23 +15,10 @@ import pytest
 from compiled_tasks import EPISODE_LENGTH, NUM_ENVS, CompiledTask
 from task_cases import CASES, OracleLimit
 
+from gmijax.cli.compose import compose
 from gmijax.sim import physics
-
-
-def test_shapes_and_dtypes_are_those_of_the_spec(task: CompiledTask):
-    spec = task.env.spec
-    state, out = jax.eval_shape(task.batch.step, task.env.model, task.start(), task.actions(0))
-    for obs in (state.env.obs, out.next_obs):
-        assert (obs.shape, obs.dtype) == ((NUM_ENVS, spec.obs_size), jnp.float32)
-    assert (out.reward.shape, out.reward.dtype) == ((NUM_ENVS,), jnp.float32)
-    for flag in (out.terminated, out.truncated):
-        assert (flag.shape, flag.dtype) == ((NUM_ENVS,), jnp.bool_)
-    assert spec.action_size == task.env.mj_model.nu
-    assert set(state.env.reward_terms) == set(spec.reward_terms)
-    assert set(out.finished.term_sums) == set(spec.reward_terms)
-    assert set(state.env.metrics) == set(spec.metrics) == set(out.finished.metric_sums)
-    assert spec.episode_length == EPISODE_LENGTH
-    assert jax.eval_shape(task.env.qpos, state.env).shape == (NUM_ENVS, task.env.mj_model.nq)
+from gmijax.sim.randomize import randomized
+from gmijax.sim.wrappers import BatchState, StepOutput
 
 
 def test_equal_keys_give_equal_resets_and_different_keys_different_ones(task: CompiledTask):
@@ -46,6 +33,8 @@ def test_random_steps_stay_finite_and_rewards_are_the_sum_of_their_terms(task: C
     returns = terms = ended = 0.0
     for i in range(200):
         state, out = task.step(task.env.model, state, task.actions(i))
+        if i == 0:
+            check_shapes(task, state, out)
         assert np.isfinite(out.next_obs).all()
         assert np.isfinite(out.reward).all()
         assert not any(int(count) for count in out.overflowed.values())
@@ -57,6 +46,22 @@ def test_random_steps_stay_finite_and_rewards_are_the_sum_of_their_terms(task: C
         ended += int(out.finished.count)
     assert ended >= NUM_ENVS * (200 // EPISODE_LENGTH)
     assert returns == pytest.approx(terms, rel=1e-4, abs=1e-2)
+    assert len(task.traces) == 1
+
+
+def check_shapes(task: CompiledTask, state: BatchState, out: StepOutput) -> None:
+    """Shapes, dtypes and names are those of the spec."""
+    spec = task.env.spec
+    for obs in (state.env.obs, out.next_obs):
+        assert (obs.shape, obs.dtype) == ((NUM_ENVS, spec.obs_size), jnp.float32)
+    assert (out.reward.shape, out.reward.dtype) == ((NUM_ENVS,), jnp.float32)
+    for flag in (out.terminated, out.truncated):
+        assert (flag.shape, flag.dtype) == ((NUM_ENVS,), jnp.bool_)
+    assert spec.action_size == task.env.mj_model.nu
+    assert set(state.env.reward_terms) == set(spec.reward_terms) == set(out.finished.term_sums)
+    assert set(state.env.metrics) == set(spec.metrics) == set(out.finished.metric_sums)
+    assert spec.episode_length == EPISODE_LENGTH
+    assert task.env.qpos(state.env).shape == (NUM_ENVS, task.env.mj_model.nq)
 
 
 def test_time_limit_truncates_and_a_new_random_episode_begins(task: CompiledTask):
@@ -100,11 +105,13 @@ def test_a_fatal_position_terminates_its_own_world_only(task: CompiledTask):
         assert float(out.reward[0]) == float(out.finished.term_sums["death"])
 
 
-def test_step_is_traced_once(task: CompiledTask):
-    state = task.start(seed=5)
-    for i in range(2):
-        state, _ = task.step(task.env.model, state, task.actions(i))
-    assert len(task.traces) == 1
+def test_the_ranges_of_its_randomisation_fit_its_model(task: CompiledTask):
+    config = compose(f"env={task.env.spec.name}", "env.randomize=on").env
+    assert config.randomize == "on"
+    many = randomized(task.env, config.randomization, seed=0, first_env=0, num_envs=2)
+    for leaf in config.randomization:
+        values = np.asarray(getattr(many.model, leaf))
+        assert not np.array_equal(values[0], values[1])
 
 
 def test_one_physics_step_is_that_of_mujoco_in_c(task: CompiledTask):

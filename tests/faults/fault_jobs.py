@@ -10,7 +10,6 @@ import os
 import shutil
 import subprocess
 import sys
-import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from functools import cache
@@ -61,16 +60,12 @@ class Report(NamedTuple):
       leaks: what it left.
       lost: checkpoints that it should have gone on from and did not.
       is_equal: whether it learnt what the undisturbed run did, bit by bit.
-      commands: how often the command was given.
-      seconds: all of it.
     """
 
     came: list[Came]
     leaks: list[str]
     lost: list[str]
     is_equal: bool
-    commands: int
-    seconds: float
 
     @property
     def is_good(self) -> bool:
@@ -88,7 +83,7 @@ def undisturbed(cwd: Path) -> list[np.ndarray]:
 
 def run_job(faults: Sequence[Fault], cwd: Path, expected: list[np.ndarray]) -> Report:
     """Runs a job with faults to its end in `cwd`, which is made; raises nothing."""
-    started_s, job = time.monotonic(), _Job(faults, cwd)
+    job = _Job(faults, cwd)
     leaks = []
     with _disk(cwd / "disk", any(fault.kind == "disk_full" for fault in faults)):
         try:
@@ -99,8 +94,7 @@ def run_job(faults: Sequence[Fault], cwd: Path, expected: list[np.ndarray]) -> R
         if leaks or job.wrong:
             big = shutil.ignore_patterns("filler")
             shutil.copytree(cwd / "disk", cwd / "kept", ignore=big, dirs_exist_ok=True)
-    seconds = round(time.monotonic() - started_s, 1)
-    return Report(job.came(), leaks, job.lost, job.is_equal, job.commands, seconds)
+    return Report(job.came(), leaks, job.lost, job.is_equal)
 
 
 @cache

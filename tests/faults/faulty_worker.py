@@ -145,7 +145,7 @@ def _inject_in_training(faults: Faults) -> None:
     import jax
     import jax.numpy as jnp
 
-    from gmijax.collectives.host import HostExchange
+    from gmijax.collectives.host.host_exchange import HostExchange
     from gmijax.collectives.program import ProgramStep
     from gmijax.learning import checkpoint
     from gmijax.learning.training_log import TrainingLog

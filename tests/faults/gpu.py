@@ -30,12 +30,13 @@ OVERRIDES = (
 )
 
 CONTROLLER = """
-import sys
+import dataclasses, sys
 from gmijax.cli.command import command
 from gmijax.config import TrainConfig
-from gmijax.control import job, kinds
-kinds.SYNCHRONOUS = kinds.Plain("tests.faults.gpu_worker")
-sys.exit(command("train", TrainConfig, lambda c: bool(job.train(c, show=True)) - 1, sys.argv[1:]))
+from gmijax.control import job
+from gmijax.supervise.kinds import SYNCHRONOUS
+job.training_kind = lambda _: dataclasses.replace(SYNCHRONOUS, module="tests.faults.gpu_worker")
+sys.exit(command("train", TrainConfig, job.train, sys.argv[1:]))
 """
 
 

@@ -1,10 +1,13 @@
 """Some kinds of faults, and all of them once where slow tests run.
 
-`python -m tests.faults.many` has as many as are wanted. Every start of a job costs five seconds.
+`GMIJAX_FAULT_SEEDS=7,8 pytest -m '' tests/faults/test_faults.py` draws more decks, from
+these seeds; a failure prints the report of the job and keeps its folder. Every start of a job
+costs five seconds.
 """
 
 from __future__ import annotations
 
+import os
 import random
 import shutil
 from pathlib import Path
@@ -14,14 +17,14 @@ import pytest
 from fault_jobs import kinds_here, run_job, undisturbed
 from fault_plan import KINDS, Fault, draw_jobs, place_faults
 
-SEED = 0
+SEEDS = (0, *map(int, filter(None, os.environ.get("GMIJAX_FAULT_SEEDS", "").split(","))))
 QUICK = (
     ("stdout_gone", "slow", "kill_named", "raise_part", "term_all", "checkpoint_byte"),
     ("stdout_closed", "stop", "nan", "disk_full"),
 )
 JOBS = (
-    *(place_faults(kinds, random.Random(SEED)) for kinds in QUICK),
-    *draw_jobs(SEED, len(KINDS), tuple(KINDS)),
+    *(place_faults(kinds, random.Random(0)) for kinds in QUICK),
+    *(job for seed in SEEDS for job in draw_jobs(seed, len(KINDS), tuple(KINDS))),
 )
 
 
@@ -32,7 +35,8 @@ def expected(tmp_path_factory: pytest.TempPathFactory) -> list[np.ndarray]:
 
 
 def test_a_deck_has_every_kind_once():
-    assert sorted(fault.kind for job in JOBS[len(QUICK) :] for fault in job) == sorted(KINDS)
+    drawn = [fault.kind for job in JOBS[len(QUICK) :] for fault in job]
+    assert sorted(drawn) == sorted([*KINDS] * len(SEEDS))
 
 
 @pytest.mark.timeout(600)
@@ -41,7 +45,7 @@ def test_a_deck_has_every_kind_once():
     [
         pytest.param(
             job,
-            id="-".join(fault.kind for fault in job),
+            id=f"{number}-" + "-".join(fault.kind for fault in job),
             marks=() if number < len(QUICK) else pytest.mark.slow,
         )
         for number, job in enumerate(JOBS)

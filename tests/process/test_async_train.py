@@ -58,7 +58,7 @@ def two_and_two(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.mark.timeout(300)
-def test_the_summary_has_the_figures_of_the_paper(two_and_two: Path) -> None:
+def test_what_a_job_leaves_has_the_figures_of_the_paper(two_and_two: Path) -> None:
     summary = _read(two_and_two / "summary.json")
     assert (summary["status"], summary["algo"]) == ("completed", "a3c")
     # Unrolls that were too old do not count: a few updates more may have been needed.
@@ -74,12 +74,8 @@ def test_the_summary_has_the_figures_of_the_paper(two_and_two: Path) -> None:
     assert summary["ttop"] > 0
     assert 0 <= summary["staleness"]["mean"] <= summary["staleness"]["p99"] <= MAX_COUNTED
     assert summary["dropped"] == 0
-    assert Path(summary["checkpoint"]).is_dir()
-
-
-def test_lines_tell_of_acting_learning_and_what_lies_between(two_and_two: Path) -> None:
     lines = [json.loads(text) for text in (two_and_two / "metrics.jsonl").read_text().splitlines()]
-    assert lines[-1]["env_steps"] == _read(two_and_two / "summary.json")["env_steps"]
+    assert lines[-1]["env_steps"] == summary["env_steps"]
     assert {
         *("async/pps", "async/ttop", "async/staleness_mean", "async/staleness_p99"),
         *("channel/occupancy", "channel/bytes_per_s", "channel/dropped", "time/receive_s"),
@@ -89,16 +85,11 @@ def test_lines_tell_of_acting_learning_and_what_lies_between(two_and_two: Path) 
     agents = [_read(two_and_two / f"gmi_{gmi}" / "result.json") for gmi in (2, 3)]
     acted = sum(result["env_steps"] for result in agents)
     assert acted >= lines[-1]["env_steps"]
-
-
-def test_every_agent_adds_its_environments_to_the_checkpoint(two_and_two: Path) -> None:
+    # Every agent has added its environments.
     checkpoint = find_checkpoint(str(two_and_two), "test")
-    assert sorted(p.name for p in checkpoint.iterdir()) == [
-        "gmi_2",
-        "gmi_3",
-        "learner",
-        "meta.json",
-    ]
+    assert str(checkpoint) == summary["checkpoint"]
+    names = sorted(path.name for path in checkpoint.iterdir())
+    assert names == ["gmi_2", "gmi_3", "learner", "meta.json"]
 
 
 @pytest.mark.timeout(300)
@@ -107,14 +98,6 @@ def test_its_checkpoint_plays(two_and_two: Path) -> None:
     done = train(f"run.dir={two_and_two}", *quiet, cwd=two_and_two.parent, command="play")
     assert done.returncode == 0, done.stderr
     assert list(two_and_two.glob("play/*/returns.json"))
-
-
-@pytest.mark.parametrize("way", ["channel.design=uni", "channel.when_full=drop_oldest"])
-def test_a_job_learns_whichever_way_experience_goes(way: str, tmp_path: Path) -> None:
-    steps = 30 * UPDATE
-    done = train(*SMALL, way, f"num_timesteps={steps}", "run.dir=run", cwd=tmp_path)
-    assert done.returncode == 0, done.stderr
-    assert _read(tmp_path / "run" / "summary.json")["env_steps"] >= steps
 
 
 @pytest.mark.timeout(300)
@@ -133,10 +116,12 @@ def test_a_job_goes_on_from_its_checkpoint(two_and_two: Path) -> None:
 
 @pytest.mark.timeout(120)
 def test_trainers_on_several_gpus_reduce_in_rings(tmp_path: Path) -> None:
+    """With a queue that drops what is old: nobody waits for room."""
     cwd = tmp_path
     done = train(
         *SMALL, "plan.serving_gpus=[0,1]", "plan.training_gpus=[0,1]", "run.dir=run",
-        "reduce.strategy=har", f"num_timesteps={20 * 2 * UPDATE}", cwd=cwd,
+        "channel.when_full=drop_oldest", "reduce.strategy=har",
+        f"num_timesteps={20 * 2 * UPDATE}", cwd=cwd,
     )  # fmt: skip
     assert done.returncode == 0, done.stderr
     plan = _read(cwd / "run" / "summary.json")["plan"]
@@ -144,9 +129,8 @@ def test_trainers_on_several_gpus_reduce_in_rings(tmp_path: Path) -> None:
 
 
 @pytest.mark.timeout(120)
-@pytest.mark.parametrize("victim", [0, 2], ids=["trainer", "agent"])
-def test_a_killed_gmi_ends_the_job_and_is_named(victim: int, tmp_path: Path) -> None:
-    cwd, shm = tmp_path, shared_memory()
+def test_a_killed_agent_ends_the_job_and_is_named(tmp_path: Path) -> None:
+    cwd, shm, victim = tmp_path, shared_memory(), 2
     run = cwd / "run"
     job = start(*SMALL, FOREVER, "plan.serving_gmis_per_gpu=2", "run.dir=run", cwd=cwd)
     wait_until(lambda: iteration_of(run, 0) and iteration_of(run, 2), 90, "updates")
@@ -165,9 +149,10 @@ def test_a_killed_gmi_ends_the_job_and_is_named(victim: int, tmp_path: Path) -> 
 
 @pytest.mark.timeout(120)
 def test_an_interrupt_saves_the_whole_job(tmp_path: Path) -> None:
+    """Of one whose experience travels tensor by tensor."""
     cwd = tmp_path
     run = cwd / "run"
-    job = start(*SMALL, FOREVER, "plan.gpus=2", "run.dir=run", cwd=cwd)
+    job = start(*SMALL, FOREVER, "plan.gpus=2", "channel.design=uni", "run.dir=run", cwd=cwd)
     wait_until(lambda: iteration_of(run, 0) and iteration_of(run, 1), 90, "updates")
     job.send_signal(signal.SIGINT)
     assert job.wait(timeout=40) == 130

@@ -70,9 +70,6 @@ def test_a_task_of_ones_own_trains_in_two_gmis_resumes_and_plays(tmp_path: Path)
     done = train(f"run.dir={run}", "num_envs=2", cwd=tmp_path, command="play")
     assert done.returncode == 0, done.stderr
     assert "point has no model that could be filmed" in done.stdout
-    done = train(f"run.dir={run}", "video=gif", cwd=tmp_path, command="play")
-    assert done.returncode == 1
-    assert "point has no model that could be filmed; the returns were evaluated" in done.stderr
 
 
 def test_an_environment_of_brax_trains(tmp_path: Path):

@@ -9,16 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from test_custom_task import SMALL, TASK
-from training_jobs import (
-    gmi_pid,
-    iteration_of,
-    kill,
-    learner_arrays,
-    pids_of,
-    start,
-    train,
-    wait_until,
-)
+from training_jobs import iteration_of, learner_arrays, pids_of, start, train, wait_until
 
 pytestmark = pytest.mark.timeout(600)
 
@@ -56,27 +47,12 @@ def test_trainers_of_two_gpus_stay_equal_and_a_run_goes_on(home: Path):
     done = train(*two, f"num_timesteps={2 * STEPS}", "run.name=two", cwd=home)
     assert done.returncode == 0, done.stderr
     assert "reduction mpr" in done.stdout
-    more = (f"num_timesteps={2 * STEPS + STEPS // 2}", "plan.gpus=1", "run.name=more")
+    # The environments of the servants are not saved: what follows may be any other template.
+    more = (f"num_timesteps={3 * STEPS}", "plan.gpus=1", "plan.template=auto", "run.name=more")
     done = train("run.resume=runs/two", *more, cwd=home)
     assert done.returncode == 0, done.stderr
     lines = (home / "runs" / "more" / "metrics.jsonl").read_text().splitlines()
-    steps = [json.loads(line)["env_steps"] for line in lines]
-    assert steps == [STEPS, 2 * STEPS, 2 * STEPS + STEPS // 2]
-    # The environments of the servants are not saved: what follows may be any other template.
-    alone = ("run.resume=runs/two", "plan.template=auto", f"num_timesteps={3 * STEPS}")
-    done = train(*alone, "run.name=alone", cwd=home)
-    assert done.returncode == 0, done.stderr
-
-
-def test_a_killed_servant_is_named(home: Path, request: pytest.FixtureRequest):
-    process = start(*JOB, *APART, "num_timesteps=1e9", "run.name=kill", cwd=home)
-    request.addfinalizer(process.kill)
-    run = home / "runs" / "kill"
-    wait_until(lambda: iteration_of(run, 0) > 2, 240, "training")
-    kill(gmi_pid(run, 2) or 0)
-    assert process.wait(timeout=60) == 1
-    assert "GMI 2 failed: ended by SIGKILL" in (home / "stderr.txt").read_text()
-    assert not pids_of(run)
+    assert [json.loads(line)["env_steps"] for line in lines] == [STEPS, 2 * STEPS, 3 * STEPS]
 
 
 def test_a_stop_saves_and_ends_all(home: Path, request: pytest.FixtureRequest):

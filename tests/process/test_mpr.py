@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from gmijax.collectives.shared_block import Geometry, attach, process_of
+from gmijax.collectives.host.shared_block import Geometry, attach, process_of
 from tests.rank_processes import Ranks
 
 

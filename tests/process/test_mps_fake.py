@@ -7,14 +7,15 @@ import signal
 import subprocess
 import sys
 import time
+from collections.abc import Callable
 from contextlib import ExitStack
 from pathlib import Path
 
 import pytest
-from supervision import CHECKOUT, TESTS, gpu, machine, make_job, plan_config, reduce_config
+from supervision import CHECKOUT, TESTS, gpu, machine, make_launch, plan_config, reduce_config
 
 from gmijax.errors import BackendUnavailable, GmiFailed, JobInterrupted
-from gmijax.machine.mps_control import PIPE_VARIABLE, MpsControl, find_mps_control
+from gmijax.machine.mps_control import PIPE_VARIABLE, MpsControl
 from gmijax.machine.nvidia import MigInstance
 from gmijax.machine.processes import ProcessId, identify, wait_until_gone
 from gmijax.machine.snapshot import Machine, detect_machine
@@ -59,6 +60,8 @@ def mps(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> FakeMps:
     monkeypatch.setenv("PATH", f"{folder}{os.pathsep}{os.environ['PATH']}")
     monkeypatch.setenv("FAKE_MPS_JOURNAL", str(journal))
     monkeypatch.setenv("PYTHONPATH", str(CHECKOUT))
+    # What is no client by then is none.
+    monkeypatch.setattr("gmijax.supervise.backends.mps._CLIENTS_APPEAR_S", 1.0)
     return FakeMps(program, journal)
 
 
@@ -73,36 +76,53 @@ def mps_plan(here: Machine, num_gpus: int, gmis_per_gpu: int) -> Plan:
     return make_plan(config, reduce_config(), 8, here)
 
 
-def train_and_stop(run: RunPaths, here: Machine, plan: Plan, modes: list[str]) -> list[Path]:
+def two_clients(mps: FakeMps) -> tuple[Machine, Plan]:
+    """A machine with a GPU, and a plan of two GMIs on it."""
+    here = machine(1, mps_control=mps.program)
+    return here, mps_plan(here, num_gpus=1, gmis_per_gpu=2)
+
+
+def train_and_stop(
+    run: RunPaths,
+    here: Machine,
+    plan: Plan,
+    modes: list[str],
+    look: Callable[[list[Path]], None] = lambda _: None,
+) -> list[Path]:
     """Runs a job until all GMIs iterate, then stops it; returns its daemons' directories."""
     with open_backend(plan, here, run) as backend:
         directories = [Path(backend.environment(gmi)[PIPE_VARIABLE]) for gmi in plan.layout.gmis]
-        supervisor = Supervisor(make_job(run, modes, backend, plan))
+        supervisor = Supervisor(make_launch(run, modes, plan), backend)
         stopped: list[bool] = []
 
         def stop_once(status: tuple[GmiStatus, ...]) -> None:
             if not stopped and all(s.state == "running" for s in status):
+                look(directories)
                 supervisor.request_stop()
                 stopped.append(True)
 
-        with pytest.raises(JobInterrupted):
+        with pytest.raises(JobInterrupted, match="every GMI has finished by itself"):
             supervisor.run(stop_once)
     return directories
 
 
-def test_one_private_daemon_per_gpu_that_is_gone_afterwards(mps: FakeMps, run: RunPaths):
-    here = machine(2, mps_control=find_mps_control())
-    plan = mps_plan(here, num_gpus=2, gmis_per_gpu=2)
-    with open_backend(plan, here, run) as backend:
-        directories = [Path(backend.environment(gmi)[PIPE_VARIABLE]) for gmi in range(4)]
-        assert directories[0] == directories[1] != directories[2] == directories[3]
+def test_clients_get_a_private_daemon_per_gpu_that_is_gone_afterwards(mps: FakeMps, run: RunPaths):
+    here = machine(2, mps_control=mps.program)
+    seen: list[ProcessId | None] = []
+
+    def look(directories: list[Path]) -> None:
         assert all(path.stat().st_mode & 0o777 == 0o700 for path in directories)
-        daemons = [MpsControl(mps.program, path).daemon_pid() for path in set(directories)]
-        assert all(pid and identify(pid) for pid in daemons)
+        pids = [MpsControl(mps.program, path).daemon_pid() for path in directories]
+        seen.extend(identify(pid or 0) for pid in pids)
+
+    plan = mps_plan(here, num_gpus=2, gmis_per_gpu=1)
+    directories = train_and_stop(run, here, plan, ["mps_client", "mps_client"], look)
+    assert (run.gmi(0).root / "saved").exists()
     assert [uuid for uuid, _ in mps.told("start")] == [gpu(0).uuid, gpu(1).uuid]
-    assert len(mps.told("quit")) == 2
-    assert not [pid for pid in daemons if pid and identify(pid)]
-    assert not [path for path in directories if path.exists()]
+    assert len(set(seen)) == len(mps.told("quit")) == 2
+    assert not mps.told("terminate_client")
+    assert not [process for process in seen if process is None or process.is_running()]
+    assert not [path for path in (*directories, run.janitor_log) if path.exists()]
 
 
 def test_an_interrupted_end_leaves_the_daemons_to_the_janitor(
@@ -111,8 +131,7 @@ def test_an_interrupted_end_leaves_the_daemons_to_the_janitor(
     def interrupted(_: MpsControl) -> None:
         raise KeyboardInterrupt
 
-    here = machine(1, mps_control=find_mps_control())
-    plan = mps_plan(here, num_gpus=1, gmis_per_gpu=2)
+    here, plan = two_clients(mps)
     monkeypatch.setattr("gmijax.supervise.backends.mps.quit_daemon", interrupted)
     backend = open_backend(plan, here, run)
     with ExitStack() as held:
@@ -127,19 +146,8 @@ def test_an_interrupted_end_leaves_the_daemons_to_the_janitor(
     assert not directory.exists()
 
 
-def test_job_of_clients_is_verified_and_stops(mps: FakeMps, run: RunPaths):
-    here = machine(1, mps_control=find_mps_control())
-    plan = mps_plan(here, num_gpus=1, gmis_per_gpu=2)
-    directories = train_and_stop(run, here, plan, ["mps_client", "mps_client"])
-    assert (run.gmi(0).root / "saved").exists()
-    assert not mps.told("terminate_client")
-    assert not directories[0].exists()
-    assert not run.janitor_log.exists()
-
-
 def test_gmi_that_is_no_client_is_refused(mps: FakeMps, run: RunPaths):
-    here = machine(1, mps_control=find_mps_control())
-    plan = mps_plan(here, num_gpus=1, gmis_per_gpu=2)
+    here, plan = two_clients(mps)
     with (
         pytest.raises(
             GmiFailed,
@@ -147,24 +155,22 @@ def test_gmi_that_is_no_client_is_refused(mps: FakeMps, run: RunPaths):
         ),
         open_backend(plan, here, run) as backend,
     ):
-        Supervisor(make_job(run, ["mps_client", "train"], backend, plan)).run()
+        Supervisor(make_launch(run, ["mps_client", "train"], plan), backend).run()
     assert not [path for path in mps.pipe_directories() if path.exists()]
 
 
 def test_gmi_that_fails_while_shares_are_verified_is_the_one_to_blame(mps: FakeMps, run: RunPaths):
-    here = machine(1, mps_control=find_mps_control())
-    plan = mps_plan(here, num_gpus=1, gmis_per_gpu=2)
-    # GMI 1 is no client, fails half a second later, and the daemon is asked for three.
+    here, plan = two_clients(mps)
+    # GMI 1 is no client, fails half a second later, and the daemon is asked for one.
     with (
         pytest.raises(GmiFailed, match="GMI 1 failed: ended by SIGSEGV"),
         open_backend(plan, here, run) as backend,
     ):
-        Supervisor(make_job(run, ["mps_client", "die_late"], backend, plan)).run()
+        Supervisor(make_launch(run, ["mps_client", "die_late"], plan), backend).run()
 
 
 def test_daemon_that_is_gone_when_shares_are_verified_is_a_failure(mps: FakeMps, run: RunPaths):
-    here = machine(1, mps_control=find_mps_control())
-    plan = mps_plan(here, num_gpus=1, gmis_per_gpu=2)
+    here, plan = two_clients(mps)
     with open_backend(plan, here, run) as backend:
         MpsControl(mps.program, mps.pipe_directories()[0]).quit()
         with pytest.raises(
@@ -173,28 +179,8 @@ def test_daemon_that_is_gone_when_shares_are_verified_is_a_failure(mps: FakeMps,
             backend.verify({0: os.getpid(), 1: os.getpid()})
 
 
-def test_stranger_to_somebodys_daemon_may_be_of_another_namespace(
-    mps: FakeMps, run: RunPaths, tmp_path: Path
-):
-    pipe_directory = tmp_path / "operator"
-    pipe_directory.mkdir()
-    control = MpsControl(mps.program, pipe_directory)
-    control.start(gpu(0).uuid, tmp_path / "operator-logs")
-    here = machine(1, mps_control=mps.program, operator_daemon=pipe_directory)
-    plan = mps_plan(here, num_gpus=1, gmis_per_gpu=1)
-    try:
-        with (
-            open_backend(plan, here, run) as backend,
-            pytest.raises(GmiFailed, match=r"GMI 0 failed: .* PID namespace"),
-        ):
-            backend.verify({0: os.getpid()})
-    finally:
-        control.quit()
-
-
 def test_clients_are_terminated_before_they_are_killed(mps: FakeMps, run: RunPaths):
-    here = machine(1, mps_control=find_mps_control())
-    plan = mps_plan(here, num_gpus=1, gmis_per_gpu=2)
+    here, plan = two_clients(mps)
     pids: list[int | None] = []
 
     def kill_first(status: tuple[GmiStatus, ...]) -> None:
@@ -207,22 +193,8 @@ def test_clients_are_terminated_before_they_are_killed(mps: FakeMps, run: RunPat
         pytest.raises(GmiFailed, match="GMI 0 failed: ended by SIGKILL"),
         open_backend(plan, here, run) as backend,
     ):
-        Supervisor(make_job(run, ["mps_client", "mps_client"], backend, plan)).run(kill_first)
+        Supervisor(make_launch(run, ["mps_client", "mps_client"], plan), backend).run(kill_first)
     assert [int(client) for _, client in mps.told("terminate_client")] == [pids[1]]
-
-
-def test_daemon_that_does_not_start_leaves_nothing(
-    mps: FakeMps, run: RunPaths, monkeypatch: pytest.MonkeyPatch
-):
-    monkeypatch.setenv("FAKE_MPS_BROKEN", "1")
-    here = machine(1, mps_control=find_mps_control())
-    plan = mps_plan(here, num_gpus=1, gmis_per_gpu=2)
-    with (
-        pytest.raises(BackendUnavailable, match="exit code 1: An instance of this daemon"),
-        open_backend(plan, here, run),
-    ):
-        pass
-    assert not [path for path in mps.pipe_directories() if path.exists()]
 
 
 def small_job(run: RunPaths, here: Machine, plan: Plan, told: list[str]) -> Launch:
@@ -243,7 +215,7 @@ def test_job_takes_turns_where_no_daemon_can_be_started(
     mps: FakeMps, run: RunPaths, monkeypatch: pytest.MonkeyPatch
 ):
     monkeypatch.setenv("FAKE_MPS_BROKEN", "1")
-    here = machine(1, mps_control=find_mps_control())
+    here = machine(1, mps_control=mps.program)
     plan = make_plan(plan_config(gmis_per_gpu=2), reduce_config(), 8, here)
     assert plan.backend == "mps"
     told: list[str] = []
@@ -261,9 +233,9 @@ def test_daemon_that_was_asked_for_and_does_not_start_ends_the_job(
     mps: FakeMps, run: RunPaths, monkeypatch: pytest.MonkeyPatch
 ):
     monkeypatch.setenv("FAKE_MPS_BROKEN", "1")
-    here = machine(1, mps_control=mps.program)
     with pytest.raises(BackendUnavailable, match="exit code 1: An instance of this daemon"):
-        run_gmis(small_job(run, here, mps_plan(here, num_gpus=1, gmis_per_gpu=2), []))
+        run_gmis(small_job(run, *two_clients(mps), []))
+    assert not [path for path in mps.pipe_directories() if path.exists()]
 
 
 def test_gmis_that_share_a_mig_instance_get_a_daemon_for_it(mps: FakeMps, run: RunPaths):
@@ -281,19 +253,6 @@ def test_gmis_that_share_a_mig_instance_get_a_daemon_for_it(mps: FakeMps, run: R
     assert [device for device, _ in mps.told("start")] == ["MIG-large"]
     assert len(mps.told("quit")) == 1
     assert not directories[0].exists()
-
-
-def test_gmi_of_a_shared_instance_that_is_no_client_is_named(mps: FakeMps, run: RunPaths):
-    divided = gpu(0, mig_enabled=True)._replace(
-        instances=(MigInstance("MIG-only", "7g.141gb", 0, 132, 143000),)
-    )
-    here = machine(1, gpus=(divided,), mps_control=mps.program)
-    plan = make_plan(plan_config(gmis_per_gpu=2, backend="mig"), reduce_config(), 8, here)
-    with (
-        pytest.raises(GmiFailed, match=r"GMI 1 failed: its process \d+ is no client of"),
-        open_backend(plan, here, run) as backend,
-    ):
-        Supervisor(make_job(run, ["mps_client", "train"], backend, plan)).run()
 
 
 def test_daemon_of_somebody_else_is_used_and_left_alone(
@@ -317,14 +276,17 @@ def test_daemon_of_somebody_else_is_used_and_left_alone(
         assert len(mps.told("start")) == 1
         assert not mps.told("quit")
         assert identify(daemon) is not None
+        # A stranger to it may be of another namespace.
+        with (
+            open_backend(plan, here, run) as backend,
+            pytest.raises(GmiFailed, match=r"GMI 0 failed: .* PID namespace"),
+        ):
+            backend.verify({0: os.getpid()})
     finally:
         control.quit()
 
 
-@pytest.mark.parametrize("is_stuck", [False, True])
-def test_janitor_cleans_up_after_a_killed_controller(
-    mps: FakeMps, run: RunPaths, tmp_path: Path, is_stuck: bool
-):
+def test_janitor_cleans_up_after_a_killed_controller(mps: FakeMps, run: RunPaths, tmp_path: Path):
     with (tmp_path / "controller.log").open("wb") as log:
         controller = subprocess.Popen(
             [
@@ -338,20 +300,19 @@ def test_janitor_cleans_up_after_a_killed_controller(
         [directory] = mps.pipe_directories()
         daemon = identify(MpsControl(mps.program, directory).daemon_pid() or 0)
         assert daemon is not None
-        if is_stuck:
-            os.kill(clients[0].pid, signal.SIGSTOP)
+        os.kill(clients[0].pid, signal.SIGSTOP)
     finally:
         controller.kill()
         controller.wait()
-    # A stuck GMI gets 8 s to end by itself before the janitor kills it.
+    # The stopped GMI gets 8 s to end by itself before the janitor kills it.
     assert not wait_until_gone([*clients, daemon], timeout_s=20)
     deadline_s = time.monotonic() + 10
     while directory.exists() and time.monotonic() < deadline_s:
         time.sleep(0.05)
     assert not directory.exists()
     assert len(mps.told("quit")) == 1
-    terminated = [int(client) for _, client in mps.told("terminate_client")]
-    assert terminated == ([clients[0].pid] if is_stuck else [])
+    # The other one has ended by itself.
+    assert [int(client) for _, client in mps.told("terminate_client")] == [clients[0].pid]
 
 
 def _wait_for_clients(mps: FakeMps, number: int) -> list[ProcessId]:

@@ -157,14 +157,6 @@ def test_a_script_that_starts_jobs_when_it_is_loaded_is_told_how_to_stop(tmp_pat
     assert 'if __name__ == "__main__":' in done.stderr
 
 
-TASK = """
-from tests.toy_env import point_mass_env
-
-def make(*, impl, max_envs):
-    return point_mass_env(100)
-"""
-
-
 def run_example(name: str, folder: Path, *options: str) -> str:
     command = [sys.executable, str(CHECKOUT / "examples" / name), *options]
     environment = {**os.environ, "PYTHONPATH": str(CHECKOUT)}
@@ -180,7 +172,8 @@ def test_the_stencil_is_the_same_over_three_gmis(tmp_path: Path) -> None:
 
 
 def test_the_custom_role_learns(tmp_path: Path) -> None:
-    (tmp_path / "point.py").write_text(TASK)
+    task = "from tests.toy_env import point_mass_env\nmake = lambda **_: point_mass_env(100)\n"
+    (tmp_path / "point.py").write_text(task)
     words = run_example("custom_role.py", tmp_path, "point.py:make", "2", "15").split()
     first, last = float(words[1]), float(words[3].rstrip(","))
     assert last > first + 20.0

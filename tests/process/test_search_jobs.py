@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from typing import Any
 
 import pytest
 from training_jobs import POINT_TASK, pids_of, train
@@ -25,12 +26,32 @@ GRID = (
 )
 
 
-def test_a_search_answers_survives_a_crash_and_serves_a_training(tmp_path: Path):
-    (tmp_path / "point.py").write_text(TASK)
-    done = train(*JOB, *GRID, "run.dir=s", cwd=tmp_path, command="search")
+def search(*overrides: str, cwd: Path) -> dict[str, Any]:
+    """Report of a search, of whose profiles nothing but logs is left."""
+    (cwd / "point.py").write_text(TASK)
+    done = train(*overrides, "run.dir=s", cwd=cwd, command="search")
     assert done.returncode == 0, done.stderr
-    report = json.loads((tmp_path / "s" / "search.json").read_text())
+    report = json.loads((cwd / "s" / "search.json").read_text())
     assert report["complete"]
+    assert report["reason"] in done.stdout
+    for run in (cwd / "s" / "profiles").iterdir():
+        assert pids_of(run) == []
+        assert not (run / "checkpoints").exists()
+    return report
+
+
+def trained_with_auto(report: dict[str, Any], *overrides: str, cwd: Path) -> Path:
+    """The run of a job for which nothing was profiled, because the store has all of it."""
+    auto = ("num_envs=auto", "plan.gmis_per_gpu=auto")
+    done = train(*overrides, *auto, "run.dir=t", cwd=cwd)
+    assert done.returncode == 0, done.stderr
+    assert report["reason"] in done.stdout
+    assert not (cwd / "runs").exists()
+    return cwd / "t"
+
+
+def test_a_search_answers_survives_a_crash_and_serves_a_training(tmp_path: Path):
+    report = search(*JOB, *GRID, cwd=tmp_path)
     points = {(one["gmis_per_gpu"], one["num_envs"]): one for one in report["points"]}
     assert set(points) == {(2, 16), (2, 24), (1, 16), (1, 24)}
     for gmis in (1, 2):
@@ -41,18 +62,8 @@ def test_a_search_answers_survives_a_crash_and_serves_a_training(tmp_path: Path)
         assert 100 < one["memory_mib"] < 10_000  # The whole process's, on a CPU.
         assert (one["reduce_s"] > 0) == (gmis == 2)
     assert report["best"]["num_envs"] == 16
-    assert report["reason"] in done.stdout
-    for run in (tmp_path / "s" / "profiles").iterdir():
-        assert pids_of(run) == []
-        assert not (run / "checkpoints").exists()
-
-    # The store has all of it: nothing is profiled, and the job has what was found.
-    auto = ("num_envs=auto", "plan.gmis_per_gpu=auto")
-    done = train(*JOB, *GRID, *auto, "num_timesteps=64", "run.dir=t", cwd=tmp_path)
-    assert done.returncode == 0, done.stderr
-    assert report["reason"] in done.stdout
-    assert not (tmp_path / "runs").exists()
-    config = json.loads((tmp_path / "t" / "config.json").read_text())
+    run = trained_with_auto(report, *JOB, *GRID, "num_timesteps=64", cwd=tmp_path)
+    config = json.loads((run / "config.json").read_text())
     found = (config["num_envs"], config["plan"]["gmis_per_gpu"])
     assert found == (16, report["best"]["gmis_per_gpu"])
 
@@ -68,14 +79,11 @@ def test_what_takes_too_long_is_ended_and_not_runnable(tmp_path: Path):
 
 
 def test_an_asynchronous_job_gets_gmis_and_gpus_that_act_and_train(tmp_path: Path):
-    (tmp_path / "point.py").write_text(TASK)
     job = (
         *JOB, "algo=a3c", "algo.num_minibatches=2", "plan.gpus=3", "reduce.timeout_s=60",
         "search.gmis_per_gpu=[2,1]", "search.num_envs=[16]", "search.iterations=3",
     )  # fmt: skip
-    done = train(*job, "run.dir=s", cwd=tmp_path, command="search")
-    assert done.returncode == 0, done.stderr
-    report = json.loads((tmp_path / "s" / "search.json").read_text())
+    report = search(*job, cwd=tmp_path)
     points = {(one["gmis_per_gpu"], one["trainers"]): one for one in report["points"]}
     assert set(points) == {(2, 1), (1, 1)}
     for (gmis, _), one in points.items():
@@ -87,16 +95,8 @@ def test_an_asynchronous_job_gets_gmis_and_gpus_that_act_and_train(tmp_path: Pat
     best = report["best"]
     assert best["serving_gpus"] + best["training_gpus"] == 3
     assert f"{best['serving_gpus']} GPU" in report["reason"]
-    for run in (tmp_path / "s" / "profiles").iterdir():
-        assert pids_of(run) == []
-        assert not (run / "checkpoints").exists()
-
-    auto = ("num_envs=auto", "plan.gmis_per_gpu=auto")
-    done = train(*job, *auto, "num_timesteps=640", "run.dir=t", cwd=tmp_path)
-    assert done.returncode == 0, done.stderr
-    assert report["reason"] in done.stdout
-    assert not (tmp_path / "runs").exists()
-    plan = json.loads((tmp_path / "t" / "plan.json").read_text())
+    run = trained_with_auto(report, *job, "num_timesteps=640", cwd=tmp_path)
+    plan = json.loads((run / "plan.json").read_text())
     assert plan["roles"].count("trainer") == best["training_gpus"]
     assert len(plan["roles"]) == sum(
         gpus * gmis

@@ -9,17 +9,20 @@ import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import pytest
-from supervision import CHECKOUT, TESTS, cpu_job
+from supervision import CHECKOUT, TESTS, cpu_supervisor, machine
 from training_jobs import heartbeat_of
 
 from gmijax.errors import ConfigError, GmiFailed, JobInterrupted
 from gmijax.machine.processes import ProcessId, identify, wait_until_gone
+from gmijax.partition.shares import split_cores
 from gmijax.runs.folder import RunPaths, read_json
+from gmijax.supervise.backends import Backend
 from gmijax.supervise.child import ENV_EXCHANGE_FD
 from gmijax.supervise.gmi_process import GmiStatus
-from gmijax.supervise.supervisor import Job, Supervisor
+from gmijax.supervise.supervisor import Supervisor
 
 pytestmark = pytest.mark.timeout(30)
 
@@ -31,9 +34,10 @@ def run(tmp_path: Path) -> RunPaths:
     return RunPaths(tmp_path)
 
 
-def run_job(job: Job, act: Callable[[Supervisor, Ticks], None] = lambda _, __: None) -> Ticks:
+def run_job(
+    supervisor: Supervisor, act: Callable[[Supervisor, Ticks], None] = lambda _, __: None
+) -> Ticks:
     """Runs a job, calls `act` at every tick, checks that no process is left."""
-    supervisor = Supervisor(job)
     ticks: Ticks = []
 
     def on_tick(status: tuple[GmiStatus, ...]) -> None:
@@ -52,127 +56,136 @@ def all_iterate(ticks: Ticks) -> bool:
     return all(status.state == "running" for status in ticks[-1])
 
 
-def test_clean_end_reports_progress_and_lets_the_first_compile_alone(run: RunPaths):
-    ticks = run_job(cpu_job(run, ["clean", "clean"]))
+def once_all_iterate(act: Callable[[Supervisor, Ticks], None]) -> Callable[..., None]:
+    """Acts at the first tick at which all GMIs iterate."""
+    acted: list[bool] = []
+
+    def at_tick(supervisor: Supervisor, ticks: Ticks) -> None:
+        if all_iterate(ticks) and not acted:
+            acted.append(True)
+            act(supervisor, ticks)
+
+    return at_tick
+
+
+def test_the_first_compiles_alone_and_all_have_their_cores_and_what_they_share(run: RunPaths):
+    exchange = os.memfd_create("")
+    try:
+        ticks = run_job(cpu_supervisor(run, ["clean", "clean"], {ENV_EXCHANGE_FD: exchange}))
+        assert os.pread(exchange, 10, 0) == b"xx"
+    finally:
+        os.close(exchange)
     assert [status.state for status in ticks[0]] == ["starting", "waiting"]
     first_of_second = next(tick for tick in ticks if tick[1].state != "waiting")
     assert first_of_second[0].state in ("ready", "running", "done")
     assert [status.exit_code for status in ticks[-1]] != [None, None]
+    cores = split_cores(machine(0).cpu_cores, 2)
+    assert [run.gmi(gmi).stdout.read_text().strip() for gmi in (0, 1)] == [
+        str(list(own)) for own in cores
+    ]
 
 
-def test_all_start_together_without_compile_once(run: RunPaths):
-    ticks = run_job(cpu_job(run, ["clean", "clean"], compile_once=False))
-    assert all(status.pid for status in ticks[0])
-
-
-def test_failing_gmi_is_named_with_exit_code_and_last_line(run: RunPaths):
-    with pytest.raises(GmiFailed, match="GMI 1 failed: exit code 3: the last line"):
-        run_job(cpu_job(run, ["deaf", "exit_3", "deaf"]))
-
-
-def test_failing_gmi_is_named_with_its_own_error(run: RunPaths):
-    with pytest.raises(GmiFailed, match=r"GMI 0 failed: exit code 1: ValueError: the sum is off$"):
-        run_job(cpu_job(run, ["raise_value_error", "deaf"]))
-    assert "ValueError" in read_json(run.gmi(0).error)["traceback"]
+@pytest.mark.parametrize(
+    ("modes", "changes", "message"),
+    [
+        (["deaf", "exit_3"], {}, "GMI 1 failed: exit code 3: the last line"),
+        (
+            ["raise_value_error", "deaf"],
+            {},
+            r"GMI 0 failed: exit code 1: ValueError: the sum is off$",
+        ),
+        # A GMI that lost its peer does not hide the peer.
+        (
+            ["lose_peer", "die_late"],
+            {"compile_once": False},
+            "GMI 1 failed: ended by SIGSEGV",
+        ),
+        (
+            ["wait_in_vain", "stall"],
+            {"compile_once": False},
+            r"GMI 1 failed: made no progress after iteration 5; GMI 0 exit code 1: Collective",
+        ),
+        (
+            ["train", "stall"],
+            {"stall": 0.5},
+            r"GMI 1 failed: made no progress after iteration 5 within 0.5 s",
+        ),
+        (
+            ["silent", "clean"],
+            {"start": 0.5},
+            r"GMI 0 failed: did not start and compile within 0.5 s",
+        ),
+        # One that hears no order is killed after the grace time.
+        (["stubborn", "exit_3"], {"grace": 0.5}, "GMI 1 failed"),
+    ],
+)
+def test_the_gmi_that_fails_is_named(
+    run: RunPaths, modes: list[str], changes: dict[str, Any], message: str
+):
+    with pytest.raises(GmiFailed, match=message):
+        run_job(cpu_supervisor(run, modes, **changes))
+    if "stall" in modes:  # Its threads' stacks are in its log.
+        assert "in stall" in run.gmi(1).stderr.read_text()
+    if "raise_value_error" in modes:
+        assert "ValueError" in read_json(run.gmi(0).error)["traceback"]
+    if "stubborn" in modes:
+        assert (run.gmi(0).root / "stopping").exists()
 
 
 def test_bad_input_found_by_a_gmi_is_a_config_error(run: RunPaths):
     with pytest.raises(ConfigError, match=r"^env.name=antt: did you mean ant\?$"):
-        run_job(cpu_job(run, ["raise_config_error"]))
+        run_job(cpu_supervisor(run, ["raise_config_error"]))
 
 
 def test_killed_gmi_is_named_and_the_others_end_within_seconds(run: RunPaths):
     killed_s: list[float] = []
 
-    def kill_second(supervisor: Supervisor, ticks: Ticks) -> None:
-        pid = ticks[-1][1].pid
-        if all_iterate(ticks) and pid and not killed_s:
-            os.kill(pid, signal.SIGKILL)
-            killed_s.append(time.monotonic())
+    def kill_second(_: Supervisor, ticks: Ticks) -> None:
+        os.kill(ticks[-1][1].pid or 0, signal.SIGKILL)
+        killed_s.append(time.monotonic())
 
     with pytest.raises(GmiFailed, match="GMI 1 failed: ended by SIGKILL"):
-        run_job(cpu_job(run, ["train", "train", "train"]), kill_second)
+        run_job(cpu_supervisor(run, ["train", "train", "train"]), once_all_iterate(kill_second))
     assert time.monotonic() - killed_s[0] < 20  # Not by a time limit of the job.
 
 
-def test_gmi_that_lost_its_peer_does_not_hide_the_peer(run: RunPaths):
-    with pytest.raises(GmiFailed, match="GMI 1 failed: ended by SIGSEGV"):
-        run_job(cpu_job(run, ["lose_peer", "die_late"], compile_once=False))
-
-
-def test_gmi_that_others_wait_for_in_vain_is_named_and_leaves_its_stacks(run: RunPaths):
-    message = r"GMI 1 failed: made no progress after iteration 5; GMI 0 exit code 1: Collective"
-    with pytest.raises(GmiFailed, match=message):
-        run_job(cpu_job(run, ["wait_in_vain", "stall"], compile_once=False))
-    assert "in stall" in run.gmi(1).stderr.read_text()
-
-
-def test_gmi_that_hears_no_order_is_killed_after_the_grace_time(run: RunPaths):
-    with pytest.raises(GmiFailed, match="GMI 1"):
-        run_job(cpu_job(run, ["stubborn", "exit_3"], grace=0.5, stall=30))
-    assert (run.gmi(0).root / "stopping").exists()
-
-
 def test_gmi_that_is_done_but_stays_has_ended_well(run: RunPaths):
-    run_job(cpu_job(run, ["linger", "clean"], grace=0.3))
+    run_job(cpu_supervisor(run, ["linger", "clean"], grace=0.3))
 
 
-@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP, signal.SIGUSR1, signal.SIGINT])
-def test_gmis_leave_signals_to_the_controller(run: RunPaths, number: signal.Signals):
+def test_gmis_leave_signals_to_the_controller_and_finish_when_asked(run: RunPaths):
     sent = []
 
     def send_then_stop(supervisor: Supervisor, ticks: Ticks) -> None:
         if all_iterate(ticks) and not sent:
             sent.extend(status.pid for status in ticks[-1])
-            for pid in sent:
-                os.kill(pid, number)
-        # Its effect would have come by then: both have iterated on.
+            for number in (signal.SIGTERM, signal.SIGHUP, signal.SIGUSR1, signal.SIGINT):
+                for pid in sent:
+                    os.kill(pid, number)
+        # Their effect would have come by then: both have iterated on.
         if sent and all(status.iteration > 20 for status in ticks[-1]):
             supervisor.ask_to_finish()
 
-    run_job(cpu_job(run, ["train", "train"]), send_then_stop)
+    run_job(cpu_supervisor(run, ["train", "train"]), send_then_stop)
     assert all((run.gmi(gmi).root / "saved").exists() for gmi in (0, 1))
 
 
-def test_gmi_without_progress_leaves_the_stacks_of_its_threads(run: RunPaths):
-    with pytest.raises(GmiFailed, match="made no progress after iteration 5"):
-        run_job(cpu_job(run, ["stall"], stall=0.5))
-    assert "in stall" in run.gmi(0).stderr.read_text()
+def test_missing_program_half_way_ends_those_that_run(
+    run: RunPaths, monkeypatch: pytest.MonkeyPatch
+):
+    def lose_python(*_: object) -> None:
+        monkeypatch.setattr(sys, "executable", "/no/such/python")
 
-
-def test_gmi_that_never_beats_fails_the_start(run: RunPaths):
-    with pytest.raises(GmiFailed, match=r"GMI 0 failed: did not start and compile within 0.5 s"):
-        run_job(cpu_job(run, ["silent", "clean"], start=0.5))
-
-
-def test_gmi_without_progress_fails(run: RunPaths):
-    with pytest.raises(
-        GmiFailed, match=r"GMI 1 failed: made no progress after iteration 5 within 0.5 s"
-    ):
-        run_job(cpu_job(run, ["train", "stall"], stall=0.5))
-
-
-def test_missing_program_half_way_ends_those_that_run(run: RunPaths):
-    good = cpu_job(run, ["deaf", "deaf"]).command
-
-    def command(gmi: int) -> list[str]:
-        return list(good(gmi)) if gmi == 0 else ["/no/such/python"]
-
+    monkeypatch.setattr(Backend, "started", lose_python)
     with pytest.raises(GmiFailed, match="GMI 1 failed: cannot start /no/such/python: No such"):
-        run_job(cpu_job(run, ["deaf", "deaf"], command=command))
+        run_job(cpu_supervisor(run, ["deaf", "deaf"]))
 
 
-def test_stop_request_lets_all_finish_and_save(run: RunPaths):
-    stopped: list[bool] = []
-
-    def stop_once(supervisor: Supervisor, ticks: Ticks) -> None:
-        if not stopped and all_iterate(ticks):
-            supervisor.request_stop()
-            stopped.append(True)
-
-    with pytest.raises(JobInterrupted, match="every GMI has finished by itself"):
-        run_job(cpu_job(run, ["train", "train"]), stop_once)
-    assert all((run.gmi(gmi).root / "saved").exists() for gmi in (0, 1))
+def test_a_stop_request_lets_gmis_save_and_names_those_that_are_late(run: RunPaths):
+    stop = once_all_iterate(lambda supervisor, _: supervisor.request_stop())
+    with pytest.raises(JobInterrupted, match=r"GMIs \[1\] did not finish within 1 s"):
+        run_job(cpu_supervisor(run, ["train", "deaf"], stop=1.0), stop)
+    assert (run.gmi(0).root / "saved").exists()
 
 
 def test_second_stop_request_ends_at_once(run: RunPaths):
@@ -181,70 +194,21 @@ def test_second_stop_request_ends_at_once(run: RunPaths):
             supervisor.request_stop()
 
     with pytest.raises(JobInterrupted, match="second request"):
-        run_job(cpu_job(run, ["deaf", "deaf"]), stop_again)
-
-
-def test_gmi_that_does_not_stop_in_time_is_named(run: RunPaths):
-    stopped: list[bool] = []
-
-    def stop_once(supervisor: Supervisor, ticks: Ticks) -> None:
-        if not stopped and all_iterate(ticks):
-            supervisor.request_stop()
-            stopped.append(True)
-
-    with pytest.raises(JobInterrupted, match=r"GMIs \[1\] did not finish within 0.5 s"):
-        run_job(cpu_job(run, ["train", "deaf"], stop=0.5), stop_once)
+        run_job(cpu_supervisor(run, ["deaf", "deaf"]), stop_again)
 
 
 def test_stop_request_while_compiling_ends_at_once(run: RunPaths):
-    def stop(supervisor: Supervisor, ticks: Ticks) -> None:
-        supervisor.request_stop()
-
-    with pytest.raises(JobInterrupted):
-        run_job(cpu_job(run, ["silent", "silent"]), stop)
+    with pytest.raises(JobInterrupted, match="before training began"):
+        run_job(cpu_supervisor(run, ["silent", "silent"]), lambda s, _: s.request_stop())
 
 
 def test_exception_of_the_callback_ends_all(run: RunPaths):
-    def fail(supervisor: Supervisor, ticks: Ticks) -> None:
-        if all_iterate(ticks):
-            raise ZeroDivisionError
+    def fail(_: Supervisor, __: Ticks) -> None:
+        raise ZeroDivisionError
 
     with pytest.raises(ZeroDivisionError):
-        run_job(cpu_job(run, ["deaf", "busy"]), fail)
+        run_job(cpu_supervisor(run, ["deaf", "busy"]), once_all_iterate(fail))
     assert identify(read_json(run.gmi(1).root / "helper.json")["pid"]) is None
-
-
-def test_exchange_file_reaches_every_gmi(run: RunPaths):
-    exchange = os.memfd_create("")
-    code = (
-        "import os; from gmijax.supervise.child import ChildLink;"
-        "link = ChildLink.from_environment();"
-        "os.pwrite(link.exchange_fd, b'x', link.gmi)"
-    )
-    try:
-        run_job(
-            cpu_job(
-                run,
-                ["clean"] * 3,
-                command=lambda gmi: [sys.executable, "-c", code],
-                inherited_fds={ENV_EXCHANGE_FD: exchange},
-            )
-        )
-        assert os.pread(exchange, 10, 0) == b"xxx"
-    finally:
-        os.close(exchange)
-
-
-def test_gmi_is_pinned_to_its_cores(run: RunPaths):
-    code = (
-        "import os; from gmijax.supervise.child import ChildLink;"
-        "ChildLink.from_environment(); print(sorted(os.sched_getaffinity(0)))"
-    )
-    job = cpu_job(run, ["clean"] * 2, command=lambda gmi: [sys.executable, "-c", code])
-    run_job(job)
-    for gmi in (0, 1):
-        cores = [int(core) for core in job.environment(gmi)["GMIJAX_CPUS"].split(",")]
-        assert run.gmi(gmi).stdout.read_text().strip() == str(cores)
 
 
 def test_killed_controller_leaves_no_process_and_no_helper_of_a_gmi(run: RunPaths, tmp_path: Path):

@@ -15,13 +15,10 @@ STEPS = NUM_ENVS * 2
 
 
 # Each of the others compiles for a minute or more; `tests/contract` has all of them.
-QUICK = ("ant", "ball_balance")
-
-
 @pytest.mark.parametrize(
     "task",
     [
-        pytest.param(task, marks=() if task in QUICK else pytest.mark.slow)
+        pytest.param(task, marks=() if task == "ball_balance" else pytest.mark.slow)
         for task in sorted(TASKS)
     ],
 )

@@ -9,7 +9,6 @@ from concurrent.futures import ThreadPoolExecutor
 
 import jax
 import numpy as np
-import pytest
 from toy_env import point_mass
 from training_jobs import wait_until
 
@@ -61,23 +60,6 @@ class _NoRoom:
 
     least_occupancy = occupancy
 
-    def close(self) -> None:
-        pass
-
-
-@pytest.fixture
-def config():
-    return compose(*OVERRIDES)
-
-
-def _registers(config) -> JobRegisters:
-    fd = create_registers()
-    try:
-        weights = num_weights(ENV.spec, config.algo)
-        return open_job_registers(fd, weights, num_counts(ENV), num_agents=1)
-    finally:
-        os.close(fd)
-
 
 class _Publisher(_NoRoom):
     """Takes everything, and publishes `packed` as version 4 when it is sent the first unroll."""
@@ -98,7 +80,10 @@ class _Publisher(_NoRoom):
 
 def _agent(tmp_path, config):
     """Registers with version 3 of the weights and the order to begin, link, weights, learner."""
-    registers, link = _registers(config), ChildLink(1, RunPaths(tmp_path), None, None)
+    fd, link = create_registers(), ChildLink(1, RunPaths(tmp_path), None, None)
+    size = num_weights(ENV.spec, config.algo)
+    registers = open_job_registers(fd, size, num_counts(ENV), num_agents=1)
+    os.close(fd)
     link.paths.root.mkdir(parents=True)
     learner = make_learner(ENV.spec, config.algo)
     weights = acting_weights(learner, init_learner(learner, ENV.spec.obs_size, jax.random.key(0)))
@@ -107,7 +92,7 @@ def _agent(tmp_path, config):
     return registers, link, weights, learner
 
 
-def test_newer_weights_are_taken_up_within_an_unroll(tmp_path, config) -> None:
+def test_newer_weights_are_taken_up_within_an_unroll(tmp_path) -> None:
     config = compose(*OVERRIDES, "algo.weights_every=2")
     registers, link, weights, learner = _agent(tmp_path, config)
     bolder = weights._replace(params=weights.params._replace(log_std=weights.params.log_std + 1.0))
@@ -131,8 +116,9 @@ def test_newer_weights_are_taken_up_within_an_unroll(tmp_path, config) -> None:
         np.testing.assert_allclose(experience["log_prob"][steps], want, rtol=1e-4, atol=1e-4)
 
 
-def test_an_agent_without_room_still_adds_to_a_checkpoint(tmp_path, config) -> None:
+def test_an_agent_without_room_still_adds_to_a_checkpoint(tmp_path) -> None:
     """At the end trainers wait for a pending checkpoint, and take nothing meanwhile."""
+    config = compose(*OVERRIDES)
     registers, link, _, _ = _agent(tmp_path, config)
     sender = _NoRoom()
 

@@ -56,5 +56,5 @@ def test_fresh_unrolls_weigh_as_much_as_those_of_all_trainers(tmp_path) -> None:
     mine = trainer._meet(batch, waited_s)
     assert (trainer._weights_of(batch) * trainer._scale(mine)).tolist() == [4, 0, 0, 0]
     # With another trainer that has four of four.
-    trainer._reducer.world_size = 2
+    trainer.reducer.world_size = 2
     assert float(trainer._scale(mine._replace(fresh=5.0))) == pytest.approx(8 / 5)

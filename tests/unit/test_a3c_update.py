@@ -13,10 +13,9 @@ from axis_peers import run_together
 from jax.flatten_util import ravel_pytree
 from toy_env import point_mass
 
-from gmijax.a3c.a3c import A3cLosses, Unrolls, batch_targets, gradients
+from gmijax.a3c.a3c import A3cLosses, Unrolls, batch_targets, gradients, update
 from gmijax.a3c.report import histogram_of, mean_and_p99
 from gmijax.a3c.rollout import UnrollPrograms, collect
-from gmijax.a3c.update import update
 from gmijax.cli.compose import compose
 from gmijax.collectives.program import PeersOfOne
 from gmijax.learning.learner import (
@@ -162,19 +161,8 @@ def _together(learner, state, both, weight):
     return run_together(step, (), state, (halves, weight.reshape(2, N)))
 
 
-def test_two_trainers_stay_equal_and_take_in_both_batches(config) -> None:
-    learner, state, envs = _start(config, num_envs=2 * N)
-    _, both, _ = _unrolled(learner, state, envs)
-    states, _, _ = _together(learner, state, both, jnp.ones(2 * N))
-    a, b = (jax.tree.map(lambda x, k=k: x[k], states) for k in range(2))
-    jax.tree.map(np.testing.assert_array_equal, a.params, b.params)
-    jax.tree.map(np.testing.assert_array_equal, a.obs_moments, b.obs_moments)
-    seen = both.state.reshape(-1, ENV.spec.obs_size)
-    np.testing.assert_allclose(a.obs_moments.mean, seen.mean(0), rtol=1e-4, atol=1e-5)
-    assert float(a.obs_moments.count) == len(seen)
-
-
-def test_fresh_unrolls_weigh_alike_however_many_a_trainer_has(config) -> None:
+def test_two_trainers_stay_equal_and_weigh_fresh_unrolls_alike(config) -> None:
+    """However many of them each has."""
     plain = dataclasses.replace(
         config, num_minibatches=1, num_updates_per_batch=1, normalize_advantage=False
     )
@@ -184,24 +172,35 @@ def test_fresh_unrolls_weigh_alike_however_many_a_trainer_has(config) -> None:
     fresh = np.array([1.0] + [0.0] * (N - 1) + [1.0] * N, np.float32)
     weight = jnp.asarray(fresh * len(fresh) / fresh.sum())
     alone, said = _alone(learner)(state, both, weight)
-    together, _, also = jax.tree.map(lambda x: x[0], _together(learner, state, both, weight))
-    np.testing.assert_allclose(said.losses, also.losses, rtol=1e-4, atol=1e-6)
+    states, _, told = _together(learner, state, both, weight)
+    a, b = (jax.tree.map(lambda x, k=k: x[k], states) for k in range(2))
+    jax.tree.map(np.testing.assert_array_equal, a.params, b.params)
+    jax.tree.map(np.testing.assert_array_equal, a.obs_moments, b.obs_moments)
+    seen = both.state.reshape(-1, ENV.spec.obs_size)
+    np.testing.assert_allclose(a.obs_moments.mean, seen.mean(0), rtol=1e-4, atol=1e-5)
+    assert float(a.obs_moments.count) == len(seen)
+    losses = A3cLosses(*(x[0] for x in told.losses))
+    np.testing.assert_allclose(said.losses, losses, rtol=1e-4, atol=1e-6)
     # Adam divides by the gradient's size: its moments tell how large it was.
     np.testing.assert_allclose(
-        *(ravel_pytree(one.opt_state)[0] for one in (alone, together)), rtol=1e-3, atol=1e-6
+        *(ravel_pytree(one.opt_state)[0] for one in (alone, a)), rtol=1e-3, atol=1e-6
     )
     only_fresh = jax.tree.map(lambda x: x[:, fresh > 0], both)
     _, theirs = _alone(learner)(state, only_fresh, jnp.ones(N + 1))
-    np.testing.assert_allclose(also.losses, theirs.losses, rtol=1e-4, atol=1e-6)
+    np.testing.assert_allclose(losses, theirs.losses, rtol=1e-4, atol=1e-6)
 
 
 def test_a_minibatch_of_stale_unrolls_does_not_dilute_the_divergence(start, batch) -> None:
     learner, state, _ = start
     moved = state.params._replace(log_std=state.params.log_std + 0.1)
-    told = []
-    for fresh in (np.ones(N), np.r_[1.0, np.zeros(N - 1)], np.zeros(N)):
-        context = batch_targets(learner, state, batch, jnp.asarray(fresh, jnp.float32))
-        told.append(gradients(learner, moved, batch, context, jnp.arange(N))[1])
+
+    @jax.jit
+    def losses_of(fresh):
+        targets = batch_targets(learner, state, batch, fresh)
+        return gradients(learner, moved, batch, targets, jnp.arange(N))[1]
+
+    shares = (np.ones(N), np.r_[1.0, np.zeros(N - 1)], np.zeros(N))
+    told = [losses_of(np.asarray(fresh, np.float32)) for fresh in shares]
     # Of a trainer with fresh unrolls only, one with a twelfth, and one with none.
     means = A3cLosses(*(sum(parts) / len(parts) for parts in zip(*told, strict=True)))
     np.testing.assert_allclose(means.steering_kl, told[0].kl, rtol=1e-4)

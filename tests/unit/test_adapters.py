@@ -6,7 +6,6 @@ import importlib.util
 import subprocess
 import sys
 from importlib.machinery import ModuleSpec
-from pathlib import Path
 from types import ModuleType, SimpleNamespace
 from typing import Any, NamedTuple
 
@@ -16,15 +15,15 @@ import numpy as np
 import pytest
 from brax import envs
 from brax.envs.wrappers import training
-from compile_options import CPU_OPTIONS
+from training_jobs import POINT_TASK
 
 from gmijax.errors import ConfigError
 from gmijax.sim.adapters.theirs import adapt, observation
 from gmijax.sim.registry import make_env
 from gmijax.sim.wrappers import env_keys, time_limit, training_env
 
-SWING_UP = f"{Path(__file__).parents[2] / 'examples' / 'custom_task.py'}:make"
 NUM_ENVS = 3
+LENGTH = 5
 
 
 class Counter:
@@ -147,6 +146,8 @@ def test_an_environment_of_brax_brings_its_model_and_length():
 @pytest.mark.parametrize(
     ("name", "options", "message"),
     [
+        ("antt", {}, r"^env=antt: unknown task; allowed are ant, anymal, ball_balance, "),
+        ("ant", {"episode_length": 0}, r"^env\.episode_length=0: must be at least 1$"),
         ("antt", {"suite": "brax"}, r"^env\.name=antt: Brax has .*did you mean ant\?$"),
         (
             "ant",
@@ -205,64 +206,64 @@ class Theirs(NamedTuple):
     """Our task under Brax's wrappers, as Brax's training makes it."""
 
     env: Any
+    step: Any
     states: list[Any]
 
 
 @pytest.fixture(scope="module")
-def swing_up() -> Theirs:
-    env = make_env(SWING_UP, api="brax")
-    wrapped = training.wrap(env, episode_length=5)
+def ours(tmp_path_factory: pytest.TempPathFactory) -> Theirs:
+    file = tmp_path_factory.mktemp("task") / "point.py"
+    file.write_text(POINT_TASK)
+    env = make_env(f"{file}:make", api="brax")
+    wrapped = training.wrap(env, episode_length=LENGTH)
     keys = jax.random.split(jax.random.PRNGKey(0), NUM_ENVS)
     states = [jax.jit(wrapped.reset)(keys)]
-    step = jax.jit(wrapped.step, compiler_options=CPU_OPTIONS)
+    step = jax.jit(wrapped.step)
     for _ in range(6):
         states.append(step(states[-1], jnp.full((NUM_ENVS, 1), 0.3)))
-    return Theirs(env, states)
+    return Theirs(env, step, states)
 
 
-def test_ours_is_an_environment_of_brax(swing_up: Theirs):
-    env = swing_up.env
+def test_ours_is_an_environment_of_brax(ours: Theirs):
+    env = ours.env
     assert envs.Env in type(env).mro()
-    assert (env.observation_size, env.action_size, env.backend) == (5, 1, "mjx")
-    assert (env.episode_length, env.dt, env.mj_model.nq) == (500, pytest.approx(0.02), 2)
-    for state in swing_up.states:
-        assert state.obs.shape == (NUM_ENVS, 5)
+    assert (env.observation_size, env.action_size, env.backend) == (2, 1, "mjx")
+    assert (env.episode_length, env.dt, env.mj_model) == (20, pytest.approx(0.1), None)
+    for state in ours.states:
+        assert state.obs.shape == (NUM_ENVS, 2)
         assert (state.reward.shape, state.done.shape) == ((NUM_ENVS,), (NUM_ENVS,))
 
 
-def test_terms_of_the_reward_are_brax_metrics_and_sum_to_it(swing_up: Theirs):
-    for state in swing_up.states[1:]:
-        assert set(state.metrics) == {"reward/upright", "reward/centre", "reward/effort"}
+def test_terms_of_the_reward_are_brax_metrics_and_sum_to_it(ours: Theirs):
+    for state in ours.states[1:]:
+        assert set(state.metrics) == {"reward/near", "reward/effort"}
         np.testing.assert_allclose(sum(state.metrics.values()), state.reward, atol=1e-6)
-    summed = swing_up.states[5].info["episode_metrics"]
-    total = sum(np.asarray(summed[name]) for name in swing_up.states[5].metrics)
+    summed = ours.states[LENGTH].info["episode_metrics"]
+    total = sum(np.asarray(summed[name]) for name in ours.states[LENGTH].metrics)
     np.testing.assert_allclose(total, summed["sum_reward"], rtol=1e-5)
 
 
-def test_brax_truncates_ours_at_its_own_limit_and_starts_over(swing_up: Theirs):
-    ends = [np.asarray(state.done).tolist() for state in swing_up.states]
-    assert ends == [[0.0] * NUM_ENVS] * 5 + [[1.0] * NUM_ENVS, [0.0] * NUM_ENVS]
-    assert swing_up.states[5].info["truncation"].tolist() == [1.0] * NUM_ENVS
-    np.testing.assert_array_equal(swing_up.states[5].obs, swing_up.states[0].obs)
-    assert swing_up.states[6].pipeline_state.steps.tolist() == [1] * NUM_ENVS
+def test_brax_truncates_ours_at_its_own_limit_and_starts_over(ours: Theirs):
+    ends = [np.asarray(state.done).tolist() for state in ours.states]
+    assert ends == [[0.0] * NUM_ENVS] * LENGTH + [[1.0] * NUM_ENVS, [0.0] * NUM_ENVS]
+    assert ours.states[LENGTH].info["truncation"].tolist() == [1.0] * NUM_ENVS
+    np.testing.assert_array_equal(ours.states[LENGTH].obs, ours.states[0].obs)
+    assert ours.states[LENGTH + 1].pipeline_state.steps.tolist() == [1] * NUM_ENVS
 
 
-def test_ours_keeps_the_metrics_of_brax_evaluation(swing_up: Theirs):
-    wrapped = training.EvalWrapper(training.wrap(swing_up.env, episode_length=5))
+def test_ours_keeps_the_metrics_of_brax_evaluation(ours: Theirs):
+    wrapped = training.EvalWrapper(training.wrap(ours.env, episode_length=LENGTH))
     keys = jax.random.split(jax.random.PRNGKey(0), NUM_ENVS)
     first: Any = jax.eval_shape(wrapped.reset, keys)
     then: Any = jax.eval_shape(wrapped.step, first, jnp.zeros((NUM_ENVS, 1)))
-    assert set(then.metrics) == {"reward", "reward/upright", "reward/centre", "reward/effort"}
+    assert set(then.metrics) == {"reward", "reward/near", "reward/effort"}
     assert jax.tree.structure(then) == jax.tree.structure(first)
 
 
-def test_an_end_by_the_task_is_no_truncation():
-    env = make_env(SWING_UP, api="brax")
-    wrapped = training.wrap(env, episode_length=5)
-    state: Any = wrapped.reset(jax.random.split(jax.random.PRNGKey(0), NUM_ENVS))
-    ours = state.pipeline_state
-    thrown = ours.physics._replace(qvel=ours.physics.qvel.at[0, 0].set(500.0))
-    state = state.replace(pipeline_state=ours._replace(physics=thrown))
-    state = jax.jit(wrapped.step, compiler_options=CPU_OPTIONS)(state, jnp.zeros((NUM_ENVS, 1)))
+def test_an_end_by_the_task_is_no_truncation(ours: Theirs):
+    state = ours.states[0]
+    position, velocity = state.pipeline_state.physics
+    thrown = state.pipeline_state._replace(physics=(position.at[0].set(9.0), velocity))
+    state = ours.step(state.replace(pipeline_state=thrown), jnp.zeros((NUM_ENVS, 1)))
     assert state.done.tolist() == [1.0, 0.0, 0.0]
     assert state.info["truncation"].tolist() == [0.0] * NUM_ENVS

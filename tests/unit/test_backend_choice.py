@@ -29,7 +29,10 @@ def planned(
     **changes: Any,
 ) -> Plan:
     fake_nvml.install(monkeypatch, *boards)
-    here = Machine(list_gpus(), (0, 1), mps_control=control, driver_version="580.159.03")
+    here = Machine(
+        *(list_gpus(), (0, 1), control, "580.159.03"),
+        operator_daemon=Path("/tmp/nvidia-mps") if V100 in boards else None,
+    )
     config = plan_config(**{"gmis_per_gpu": 2, **changes})
     return make_plan(config, reduce_config(), 64, here, **(make or {}))
 
@@ -40,12 +43,12 @@ SERVE = {"template": "tcg"}
 @pytest.mark.parametrize(
     ("boards", "control", "make", "backend", "why"),
     [
-        ((H200_MIG_OFF,), MPS, {}, "mps", "and can exchange gradients"),
+        ((H200_MIG_OFF,), MPS, {}, "mps", "with an own daemon, and can exchange gradients"),
         ((H200_MIG_OFF,), MPS, SERVE, "mps", "no MIG instances to keep them apart"),
         ((H200_MIG_OFF, A100_SEVEN), MPS, {}, "mps", "and can exchange gradients"),
         ((H200_MIG_OFF, A100_SEVEN), MPS, SERVE, "mig", "serving needs no exchange"),
         ((A100_SEVEN,), MPS, {}, "mig", "in MIG mode; MPS on a whole GPU would"),
-        ((V100,), MPS, SERVE, "mps", "compute capability 7.0 has no MIG"),
+        ((V100,), MPS, SERVE, "mps", "the daemon that runs here; compute capability 7.0 has"),
         ((P100,), MPS, {}, "share", "warning: MPS of a GPU of compute capability 6.0"),
         (
             (H200_MIG_OFF,),

@@ -1,4 +1,4 @@
-"""Where the cache is, with and without a home."""
+"""Where the cache is, with and without a home; what is broken in it is removed."""
 
 from __future__ import annotations
 
@@ -9,11 +9,15 @@ from pathlib import Path
 import pytest
 from supervision import plan_config, reduce_config
 
-from gmijax.autotune.store import default_folder
 from gmijax.errors import ConfigError
 from gmijax.machine.snapshot import detect_machine
 from gmijax.partition.planner import make_plan
-from gmijax.runs.cache import cache_folder, compilation_cache_dir, why_temporary
+from gmijax.runs.cache import (
+    cache_folder,
+    compilation_cache_dir,
+    drop_broken_programs,
+    why_temporary,
+)
 
 
 @pytest.fixture
@@ -31,7 +35,6 @@ def homeless(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 def test_without_a_home_the_cache_is_a_folder_of_this_users_alone(homeless: Path):
     assert compilation_cache_dir() == homeless / "xla"
-    assert default_folder() == homeless / "profiles"
     assert homeless.stat().st_mode & 0o777 == 0o700
     assert cache_folder() == homeless
     plan = make_plan(plan_config(backend="cpu"), reduce_config(), 8, detect_machine())
@@ -61,13 +64,24 @@ def test_a_folder_that_is_named_needs_no_home(homeless: Path, monkeypatch: pytes
     assert not homeless.exists()
 
 
-def test_a_home_that_cannot_be_written_is_none(homeless: Path, monkeypatch: pytest.MonkeyPatch):
+def test_the_cache_is_in_a_home_that_can_be_written(
+    homeless: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
     monkeypatch.setattr(Path, "home", lambda: Path("/proc/nowhere"))
     assert cache_folder() == homeless
-
-
-def test_the_cache_is_in_the_home(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.delenv("XDG_CACHE_HOME", raising=False)
     monkeypatch.setattr(Path, "home", lambda: tmp_path)
     assert cache_folder() == tmp_path / ".cache" / "gmijax"
     assert why_temporary() is None
+
+
+def test_programs_that_could_not_be_read_are_removed(tmp_path: Path):
+    cache, log = tmp_path / "cache", tmp_path / "stderr.log"
+    cache.mkdir()
+    for name in ("jit_step-0a-cache", "jit_step-0b-cache", "jit_step_two-0c-cache"):
+        (cache / name).touch()
+    log.write_text(
+        "x.py:782: UserWarning: Error reading persistent compilation cache entry for 'jit_step': "
+        "ZstdError: zstd decompress error\n  warnings.warn(\n"
+    )
+    assert drop_broken_programs(cache, [log, tmp_path / "none"]) == 2
+    assert [path.name for path in cache.iterdir()] == ["jit_step_two-0c-cache"]

@@ -81,16 +81,6 @@ def test_batches_slice_and_stack(make_pair: Any, design: str, batch: int) -> Non
         pair.receiver.receive(batch, 0.0)
 
 
-def test_every_unroll_knows_its_policy_and_its_agent(make_pair: Any) -> None:
-    pair = make_pair()
-    for version in (7, 8):
-        pair.sender.send(rollout(), version, 1.0)
-    pair.sender.flush()
-    batch = pair.receiver.receive(2 * N, 0.0)
-    assert batch.versions.tolist() == [7] * N + [8] * N
-    assert batch.agents.tolist() == [0] * (2 * N)
-
-
 def test_a_timeout_loses_nothing_and_the_batch_size_may_change(make_pair: Any) -> None:
     pair = make_pair()
     pair.sender.send(rollout(), 0, 1.0)
@@ -109,22 +99,33 @@ def test_small_rollouts_travel_together_large_ones_are_cut(make_pair: Any) -> No
     pair = make_pair(transfer_kib=1)
     for send in range(20):
         pair.sender.send(rollout(send * N), 0, 1.0)
-    assert pair.sender.transfers == 20 // (1024 // (N * one))
+    pair.sender.flush()
+    assert pair.numbers(20 * N)[-1] == 20 * N - 1
+    assert pair.receiver.transfers == 20 // (1024 // (N * one))
     large = max_piece_bytes(2**20) // one + 1
-    pair.sender.flush()
-    before = pair.sender.transfers
     pair.sender.send(rollout(20 * N, large), 0, 1.0)
-    assert pair.sender.transfers - before == 2
     pair.sender.flush()
-    assert pair.numbers(20 * N + large)[-1] == 20 * N + large - 1
+    before = pair.receiver.transfers
+    assert pair.numbers(large)[-1] == 20 * N + large - 1
+    assert pair.receiver.transfers - before == 2
 
 
-def test_without_room_a_blocked_send_goes_on_where_it_was(make_pair: Any) -> None:
+@pytest.mark.parametrize("is_lost", [False, True])
+def test_without_room_or_after_an_error_a_send_goes_on_where_it_was(
+    make_pair: Any, is_lost: bool
+) -> None:
     pair = make_pair()
     one = sum(array[:, :1].nbytes for array in rollout().values())
     large = rollout(0, 3 * (2**20 // one))
-    assert not pair.sender.send(large, 0, 0.01)
-    assert pair.sender.waited_s > 0
+    if is_lost:
+        pair.sender.migrator.check()  # The next look is a while away.
+        pair.sender.migrator.why_lost = lambda: PeerLost(0, 1, "send", 0)
+        with pytest.raises(PeerLost):
+            pair.sender.send(large, 0, 0.3)
+        pair.sender.migrator.why_lost = lambda: None
+    else:
+        assert not pair.sender.send(large, 0, 0.01)
+        assert pair.sender.waited_s > 0
     got = pair.numbers(1000)
     while not pair.sender.send(large, 0, 0.0):
         got += pair.numbers(1000)
@@ -164,30 +165,14 @@ def test_what_still_waits_at_the_end_is_counted_as_dropped(make_pair: Any) -> No
     assert pair.sender.dropped == dropped + 3
 
 
-def test_after_an_error_a_send_goes_on_where_it_was(make_pair: Any) -> None:
-    pair = make_pair()
-    one = sum(array[:, :1].nbytes for array in rollout().values())
-    large = rollout(0, 3 * (2**20 // one))
-    pair.sender._migrator.check()  # The next look is a while away.
-    pair.sender._migrator.why_lost = lambda: PeerLost(0, 1, "send", 0)
-    with pytest.raises(PeerLost):
-        pair.sender.send(large, 0, 0.3)
-    got = pair.numbers(1000)
-    pair.sender._migrator.why_lost = lambda: None
-    while not pair.sender.send(large, 0, 0.0):
-        got += pair.numbers(1000)
-    pair.sender.close()
-    while len(got) + 1000 <= len(large["bootstrap"][0]):
-        got += pair.numbers(1000)
-    assert got == list(range(len(got)))
-
-
-def test_many_tiny_pieces_fit_with_their_table(make_pair: Any) -> None:
+def test_many_tiny_pieces_fit_with_their_versions_and_agents(make_pair: Any) -> None:
     pair = make_pair(transfer_kib=240)
     for number in range(100):
         assert pair.sender.send({"reward": np.full((1, 1), number, np.float32)}, number, 1.0)
     pair.sender.flush()
-    assert pair.receiver.receive(100, 1.0).versions.tolist() == list(range(100))
+    batch = pair.receiver.receive(100, 1.0)
+    assert batch.versions.tolist() == list(range(100))
+    assert batch.agents.tolist() == [0] * 100
 
 
 def test_float16_halves_a_channel_and_saturates(make_pair: Any) -> None:

@@ -84,28 +84,27 @@ def test_a_checkpoint_lists_its_files_and_is_on_the_disk_before_it_has_its_name(
     assert newest_checkpoint(run.root) == (checkpoint.resolve(), ())
 
 
+UNEVEN = (None, 9.0, 1.0, -3.0, None, 2.0)
+
+
 @pytest.mark.parametrize(
-    ("keep", "left"),
+    ("returns", "keep", "left"),
     [
-        (None, [1, 2, 3, 4, 5, 6]),
-        (5, [2, 3, 4, 5, 6]),
-        (3, [2, 5, 6]),
-        (2, [2, 6]),
-        (1, [2, 6]),
+        (UNEVEN, None, [1, 2, 3, 4, 5, 6]),
+        (UNEVEN, 5, [2, 3, 4, 5, 6]),
+        (UNEVEN, 3, [2, 5, 6]),
+        (UNEVEN, 2, [2, 6]),
+        (UNEVEN, 1, [2, 6]),
+        ((1.0, 2.0, 3.0), 1, [3]),  # The last is the best.
     ],
 )
-def test_the_last_and_the_best_checkpoint_stay(tmp_path: Path, keep: int | None, left: list[int]):
+def test_the_last_and_the_best_checkpoint_stay(
+    tmp_path: Path, returns: tuple[float | None, ...], keep: int | None, left: list[int]
+):
     run = RunPaths(tmp_path)
-    for env_steps, mean in enumerate([None, 9.0, 1.0, -3.0, None, 2.0], start=1):
+    for env_steps, mean in enumerate(returns, start=1):
         save(run, env_steps, mean, keep)
     assert sorted(int(path.name) for path in run.checkpoints.iterdir()) == left
-
-
-def test_one_checkpoint_is_enough_where_the_last_is_the_best(tmp_path: Path):
-    run = RunPaths(tmp_path)
-    for env_steps in (1, 2, 3):
-        save(run, env_steps, float(env_steps), keep=1)
-    assert [int(path.name) for path in run.checkpoints.iterdir()] == [3]
 
 
 def test_a_broken_checkpoint_of_the_same_step_is_replaced(tmp_path: Path):

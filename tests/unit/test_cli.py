@@ -1,4 +1,4 @@
-"""Overrides that are refused, and what they say."""
+"""Command lines: what is refused, in one line and with exit code 2, and what is not."""
 
 from __future__ import annotations
 
@@ -8,82 +8,144 @@ from pathlib import Path
 import pytest
 from command_lines import run
 
+import gmijax
 from gmijax.cli.command import command
 from gmijax.cli.compose import compose
-from gmijax.config import PlayConfig
+from gmijax.config import PlayConfig, TrainConfig
 from gmijax.errors import ConfigError
 
+LONG = "a" * 300
+A3C = "algo=a3c"
+APART = "plan.serving_gpus, plan.training_gpus: GPUs [1] both act and train and others"
 
-@pytest.mark.parametrize(
-    ("overrides", "message"),
-    [
-        (("env=ant,ball_balance",), r"^env=ant,ball_balance: expected one value \(a list "),
-        (("plan.gpus=0,1",), r"^plan\.gpus=0,1: expected one value"),
-        (("seed=range(1,3)",), r"^seed=range\(1,3\): expected one value"),
-        (("hydra.run.dir=x",), r"^unknown key hydra\.run\.dir: did you mean run\.dir\?$"),
-        (("+foo.bar=1",), "^unknown key foo"),
-        (("env.name=ant",), "^env.name=ant: choose the task with env=ant$"),
-        (("env=ball_balance", "env.name=ant"), "choose the task with env=ant$"),
-        (("algo.learning_rate=.inf",), "expected a finite number"),
-        (("algo.desired_kl=nan",), "^algo.desired_kl=nan: expected a finite number$"),
-        (("run=null",), "^run=None: expected a group of keys$"),
-    ],
-)
-def test_refused_overrides_are_told_in_one_line(overrides: tuple[str, ...], message: str):
-    with pytest.raises(ConfigError, match=message) as error:
-        compose(*overrides)
-    assert "\n" not in str(error.value)
+REFUSED: list[tuple[str, str, str]] = [
+    # Keys and options that are not there.
+    ("train", "env=antt", "env=antt: unknown: did you mean ant?"),
+    ("train", "num_env=3", "unknown key num_env: did you mean num_envs?"),
+    ("train", "algo.gamma=0.9", "unknown key algo.gamma"),
+    ("train", "+foo.bar=1", "unknown key foo"),
+    ("train", "hydra.run.dir=x", "unknown key hydra.run.dir: did you mean run.dir?"),
+    ("train", "--verbose", "unknown option --verbose"),
+    ("train", "ant", "ant: expected key=value"),
+    ("serve", "policy=random output.shards=1", "unknown key output.shards"),
+    ("play", "vidoe=gif", "unknown key vidoe: did you mean video?"),
+    ("play", "env.name=ant", "unknown key env"),
+    # Values of a wrong type, or out of range.
+    ("train", "num_envs=many", "num_envs=many: expected an integer"),
+    ("train", "num_envs=0", "num_envs=0: must be at least 1"),
+    ("train", "num_envs=3 algo.unroll_length=1", "do not divide into algo.num_minibatches=4"),
+    ("train", "seed=range(1,3)", "seed=range(1,3): expected one value"),
+    ("train", "plan.gpus=0,1", "plan.gpus=0,1: expected one value (a list "),
+    ("train", "run=null", "run=None: expected a group of keys"),
+    ("train", "run.dir={1:2}", "run.dir={1: 2}: expected text or null"),
+    ("train", "algo.learning_rate=inf", "algo.learning_rate=inf: expected a finite number"),
+    ("train", "algo.desired_kl=nan", "algo.desired_kl=nan: expected a finite number"),
+    ("train", "algo.learning_rate=1", "must be between 1e-05 and 0.01 with algo.learning_rate_s"),
+    ("train", "run.max_restarts=-1", "run.max_restarts=-1: must be at least 0"),
+    ("train", "run.keep_checkpoints=0", "run.keep_checkpoints=0: must be at least 1"),
+    ("train", "run.stop_timeout_s=0", "run.stop_timeout_s=0.0: must be greater than 0"),
+    ("serve", "policy=random num_envs=0", "num_envs=0: must be at least 1"),
+    ("serve", "policy=random latency_steps=-1", "latency_steps=-1: must be between"),
+    ("serve", "policy=clever", "policy=clever: expected one of trained, random"),
+    ("play", "video=avi", "video=avi: expected one of auto, mp4"),
+    ("play", "num_envs=2 video_envs=3", "video_envs=3: must be between 1 and 2"),
+    # Tasks.
+    ("train", "env=ant,ball_balance", "env=ant,ball_balance: expected one value"),
+    ("train", "env.name=ant", "env.name=ant: choose the task with env=ant"),
+    ("train", "env=ball_balance env.name=ant", "choose the task with env=ant"),
+    ("train", "env=brax", "env.name: must be given with env=brax, e.g. env.name=ant"),
+    ("train", "env=nowhere.py:make", "env=nowhere.py:make: no such file"),
+    ("train", "env=nowhere.py", "env=nowhere.py: expected PATH.py:FUNCTION"),
+    ("train", f"env={LONG}.py:f", "a.py:f: no such file"),
+    ("train", "env=ant env.randomize=maybe", "env.randomize=maybe: expected one of off, on"),
+    ("train", "env=ant env.randomization.body_mass.range=[2,1]", "expected [lowest, highest]"),
+    (
+        *("train", "env=ant env.randomization.body_mass.operation=x"),
+        "expected one of scale, add, set",
+    ),
+    (
+        *("train", "env=ant +env.randomization.body_mas={operation:scale,range:[1,2]}"),
+        "env.randomization.body_mas: cannot be randomized: did you mean body_mass?",
+    ),
+    # Plans and reductions.
+    ("train", "plan.backend=mps", "plan.backend=mps"),
+    ("train", "plan.backend=mig", "plan.backend=mig"),
+    ("train", "plan.backend=share", "plan.backend=share"),
+    ("train", "plan.backend=fpga", "expected one of auto, mps, mig, share, cpu"),
+    ("train", "plan.gpus=0", "plan.gpus=0: must be at least 1"),
+    ("train", "plan.gpus=1e6", "plan.gmis_per_gpu=1: makes 1000000 GMIs on 1000000 GPUs"),
+    ("train", "plan.gpus=100 plan.gmis_per_gpu=11", "at most 1024 are allowed"),
+    ("train", f"{A3C} plan.gpus=100 plan.serving_gmis_per_gpu=11", "at most 1024 are allowed"),
+    ("train", f"{A3C} plan.training_gpus=1e9", "at most 1024 are allowed"),
+    ("train", "plan.layout=[[0,2]]", "GMI ids must be 0 to 1"),
+    ("train", "reduce.strategy=telepathy", "expected one of auto, mpr, mrr, har, flat"),
+    ("train", "reduce.strategy=mrr plan.layout=[[0,1],[2]]", "cannot run on layout [[0,1],[2]]"),
+    ("train", "reduce.strategy=mrr plan.gmis_per_gpu=2", "mrr: cannot run on layout [[0,1]]: its"),
+    ("train", "reduce.strategy=flat plan.gmis_per_gpu=2", "NCCL before 2.30"),
+    ("train", "reduce.intra=ipc plan.gmis_per_gpu=2", "reduce.intra=ipc: cannot run on layout"),
+    (
+        *("train", "reduce.strategy=mpr reduce.selection=measured"),
+        "measured: needs reduce.strategy=auto, not mpr",
+    ),
+    ("serve", "policy=random plan.template=tcg_ex", "not for gmijax.serve; allowed are auto, tcg"),
+    ("serve", "policy=random plan.template=tgc", "plan.template=tgc: expected one of auto, tcg"),
+    # Folders and policies.
+    ("train", "run.dir=.", "the run folder exists already"),
+    ("train", "run.resume=nowhere", "run.resume=nowhere: no such folder"),
+    ("train", "run.resume=last", "no run with a checkpoint"),
+    ("train", "run.resume=auto", "run.resume=auto: needs run.dir or run.name, the folder to go"),
+    ("serve", "run.dir=nowhere", "run.dir=nowhere: no such folder"),
+    ("serve", "", "policy=trained: needs run.dir=RUN"),
+    ("serve", "policy=random deterministic=true", "random actions have no mean"),
+    ("play", "run.dir=nowhere", "run.dir=nowhere: no such folder"),
+    # Searches.
+    ("search", "num_envs=64 plan.gmis_per_gpu=2", "nothing to search for; make one of them auto"),
+    ("search", "search.gmis_per_gpu=[2,2]", "search.gmis_per_gpu=[2, 2]: expected distinct"),
+    ("search", "search.num_envs=[]", "search.num_envs=[]: expected distinct numbers"),
+    ("search", "search.num_envs=[0]", "search.num_envs=0: must be at least 1"),
+    ("search", "search.impls=[cuda]", "search.impls=cuda: allowed are jax, warp"),
+    ("search", "search.alpha=-1", "search.alpha=-1.0: must be at least 0"),
+    ("search", "search.budget_s=2", "search.budget_s=2: too small for one profile"),
+    ("search", "plan.backend=mps", "plan.backend=mps"),
+    ("search", "plan.template=tdg_ex", "plan.template=tcg_ex only"),
+    ("search", "plan.layout=[]", "plan.layout=[]: every GPU needs at least one GMI"),
+    ("search", f"{A3C} search.mode=both", "search.mode=both: with algo=a3c allowed is corun"),
+    ("search", f"{A3C} plan.serving_gpus=[0,1] plan.training_gpus=[1]", APART),
+    ("search", f"{A3C} plan.serving_gmis_per_gpu=3", "give search.gmis_per_gpu=[3], or"),
+    ("search", f"{A3C} plan.training_gmis_per_gpu=2", "give search.training_gmis_per_gpu=[2]"),
+    ("search", f"{A3C} plan.gmis_per_gpu=4", "plan.gmis_per_gpu=4: with the decoupled template"),
+    ("search", f"{A3C} plan.serving_gpus=1", "plan.training_gpus=null: there must be serving"),
+    ("search", f"{A3C} plan.layout=[[0],[1]]", "plan.layout=[[0], [1]]: with the decoupled"),
+    ("search", f"{A3C} search.training_gmis_per_gpu=[]", "search.training_gmis_per_gpu=[]: exp"),
+    ("search", f"{A3C} reduce.selection=measured", "reduce.selection=measured"),
+    # What is hardly a command line.
+    ("train", "-env=\n", "unknown option -env=\\n: allowed"),
+    ("train", "\r", r"'\r': expected text without control characters"),
+    ("train", "run.name=a\nb", "expected text without control characters"),
+    ("train", "run.dir=a\0b", "expected text without control characters"),
+    ("train", "run.dir=\udcff", r"'run.dir=\udcff': expected text without control"),
+    ("train", "+=-0.0", "+=-0.0: expected key=value"),
+    ("train", f"seed={'9' * 5000}", "a number has too many digits"),
+    ("train", f"seed={'[' * 3000}{']' * 3000}", "nested too deeply"),
+    ("train", f"{LONG}=1", "aaa=1: File name too long"),
+    ("train", f"{LONG}/x=1", "aaa/x=1: File name too long"),
+    ("train", f"run.resume={LONG}", "aaa: no such folder"),
+    ("serve", f"run.dir={LONG}", "aaa: no such folder"),
+    ("play", f"checkpoint={LONG}", "aaa: expected the folder of a checkpoint"),
+    ("play", f"checkpoint='{'9' * 5000}'", "999: expected the folder of a checkpoint"),
+]
 
 
-def test_a_task_may_be_named_twice():
-    assert compose("env=ant", "env.name=ant") == compose("env=ant")
-
-
-def test_play_has_no_task_to_choose(capsys: pytest.CaptureFixture[str]):
-    assert command("play", PlayConfig, lambda _, **__: None, ["env.name=ant"]) == 2
-    assert "unknown key env" in capsys.readouterr().err
-
-
-@pytest.mark.parametrize(
-    ("command", "line", "said"),
-    [
-        ("train", "-env=\n", "unknown option -env=\\n: allowed"),
-        ("train", "\r", r"'\r': expected text without control characters"),
-        ("train", "run.name=a\nb", "expected text without control characters"),
-        ("train", "run.dir=a\0b", "expected text without control characters"),
-        ("train", "run.dir=\udcff", r"'run.dir=\udcff': expected text without control"),
-        ("train", f"seed={'9' * 5000}", "a number has too many digits"),
-        ("train", f"seed={'[' * 3000}{']' * 3000}", "nested too deeply"),
-        ("train", f"{'a' * 300}=1", "aaa=1: File name too long"),
-        ("train", f"{'a' * 300}/x=1", "aaa/x=1: File name too long"),
-        ("train", f"run.resume={'a' * 300}", "aaa: no such folder"),
-        ("train", "plan.gpus=1e6", "plan.gmis_per_gpu=1: makes 1000000 GMIs on 1000000 GPUs"),
-        ("train", "run.dir={1:2}", "run.dir={1: 2}: expected text or null"),
-        ("train", "+=-0.0", "+=-0.0: expected key=value"),
-        ("search", "plan.layout=[]", "plan.layout=[]: every GPU needs at least one GMI"),
-        ("serve", f"run.dir={'a' * 300}", "aaa: no such folder"),
-        ("play", f"checkpoint={'a' * 300}", "aaa: expected the folder of a checkpoint"),
-        ("play", f"checkpoint='{'9' * 5000}'", "999: expected the folder of a checkpoint"),
-        ("train", f"env={'a' * 300}.py:f", "a.py:f: no such file"),
-    ],
-)
-def test_a_strange_line_is_refused_in_one_line(command: str, line: str, said: str, tmp_path: Path):
-    done = run(command, line, cwd=tmp_path)
-    assert done.code == 2
+@pytest.mark.parametrize(("command", "line", "said"), REFUSED)
+def test_bad_input_is_one_line_and_starts_nothing(
+    command: str, line: str, said: str, tmp_path: Path
+):
+    done = run(command, *filter(None, line.split(" ")), cwd=tmp_path)
+    assert done.code == 2, done.stderr
     assert said in done.stderr
     assert len(done.stderr.splitlines()) == 1
-
-
-def test_more_gmis_than_a_host_can_run_are_refused_before_they_are_counted_out():
-    for overrides in (
-        ("plan.gmis_per_gpu=1025",),
-        ("plan.gpus=100", "plan.gmis_per_gpu=11"),
-        ("algo=a3c", "plan.gpus=100", "plan.serving_gmis_per_gpu=11"),
-        ("algo=a3c", "plan.training_gpus=1e9"),
-    ):
-        with pytest.raises(ConfigError, match=r"at most 1024 are allowed$"):
-            compose(*overrides)
-    assert compose("plan.gpus=1024").plan.gpus == 1024
+    assert done.stdout == ""
+    assert list(tmp_path.iterdir()) == []
 
 
 @pytest.mark.parametrize("value", ["a\nb", os.fsdecode(b"a\xffb")])
@@ -91,3 +153,24 @@ def test_what_the_environment_has_is_text_too(value: str, monkeypatch: pytest.Mo
     monkeypatch.setenv("A_NAME", value)
     with pytest.raises(ConfigError, match=r"^'run\.name=a.*b': expected text without"):
         compose("run.name=${oc.env:A_NAME}")
+
+
+def test_a_task_may_be_named_twice_and_a_plan_may_have_1024_gmis():
+    assert compose("env=ant", "env.name=ant") == compose("env=ant")
+    assert compose("plan.gpus=1024").plan.gpus == 1024
+
+
+def test_help_lists_every_key(capsys: pytest.CaptureFixture[str]):
+    assert command("train", TrainConfig, gmijax.train, ["--help"]) == 0
+    said = capsys.readouterr().out
+    for key in ("num_envs", "plan.gmis_per_gpu", "algo.learning_rate", "run.resume", "seed"):
+        assert f"\n{key} " in said
+    assert command("play", PlayConfig, gmijax.train, ["num_envs=4", "-h"]) == 0
+
+
+def test_cfg_job_prints_the_composed_configuration(capsys: pytest.CaptureFixture[str]):
+    line = ["--cfg", "job", "env=ant", "num_timesteps=30e6"]
+    assert command("train", TrainConfig, gmijax.train, line) == 0
+    said = capsys.readouterr().out
+    assert "num_timesteps: 30000000" in said
+    assert "name: ant" in said

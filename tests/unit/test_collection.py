@@ -17,13 +17,11 @@ from toy_env import point_mass
 import gmijax
 from gmijax.collection.programs import (
     ActingPolicy,
-    Counts,
     Keep,
     Step,
     _gaussian,
     infer,
     next_keys,
-    no_counts,
     random_policy,
     simulate,
     unroll,
@@ -33,6 +31,7 @@ from gmijax.errors import NonFiniteError
 from gmijax.learning.learner import Learner, init_learner, make_learner
 from gmijax.learning.normalize import no_samples
 from gmijax.learning.physics_health import TOLERATED_STEPS
+from gmijax.learning.unroll import Counts, no_counts
 from gmijax.runs.dataset import DataPaths
 from gmijax.runs.folder import RunPaths
 from gmijax.sim.wrappers import BatchedEnv, env_keys
@@ -91,7 +90,7 @@ def test_an_unroll_keeps_what_happened(unrolled: Unrolled):
 def test_halves_of_steps_make_the_same_experience_as_an_unroll(unrolled: Unrolled):
     env, _, policy, whole, counts = unrolled
     state, bits = next_keys(start(env))
-    total, kept = no_counts(env), []
+    total, kept = no_counts(env.spec, env.overflows), []
     half_a, half_s = jax.jit(partial(infer, policy)), jax.jit(partial(simulate, env, ALL))
     for _ in range(T):
         action, density = half_a(policy.weights, state.env.obs, bits)
@@ -156,7 +155,7 @@ def stats_of(folder: Path) -> CollectionStats:
 
 
 def test_too_many_bad_worlds_end_serving_and_the_term_is_named(tmp_path: Path):
-    stats, counts = stats_of(tmp_path), no_counts(point_mass())
+    stats, counts = stats_of(tmp_path), no_counts(point_mass().spec)
     few = {"any": jnp.asarray(TOLERATED_STEPS), "reward/near": jnp.asarray(TOLERATED_STEPS)}
     stats.add(counts._replace(diverged=counts.diverged | few))
     assert stats.outcome()["diverged_steps"] == TOLERATED_STEPS
@@ -170,7 +169,7 @@ def test_too_many_bad_worlds_end_serving_and_the_term_is_named(tmp_path: Path):
 def test_full_buffers_are_counted_and_the_first_is_told(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ):
-    stats, counts = stats_of(tmp_path), no_counts(point_mass())
+    stats, counts = stats_of(tmp_path), no_counts(point_mass().spec)
     for count in (0, 5, 7):
         stats.add(counts._replace(overflowed={"contact": jnp.asarray(count)}))
     stats.close()

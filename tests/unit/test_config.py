@@ -16,18 +16,15 @@ from gmijax.learning.learner import adapted_learning_rate
 from gmijax.sim.registry import task_names
 
 
-@pytest.mark.parametrize("value", [float("inf"), float("-inf"), float("nan"), 10**400])
-def test_numbers_are_finite(value: float):
+def test_numbers_are_finite():
     data: dict[str, Any] = to_dict(compose())
-    data["reduce"]["timeout_s"] = value
-    with pytest.raises(ConfigError, match=r"^reduce\.timeout_s=.*: expected a finite number$"):
-        from_dict(TrainConfig, data)
-
-
-@pytest.mark.parametrize("value", [float("inf"), float("nan")])
-def test_integers_are_finite(value: float):
-    with pytest.raises(ConfigError, match=r"^seed=.*: expected an integer$"):
-        from_dict(TrainConfig, {**to_dict(compose()), "seed": value})
+    for value in (float("inf"), float("nan")):
+        with pytest.raises(ConfigError, match=r"^seed=.*: expected an integer$"):
+            from_dict(TrainConfig, {**data, "seed": value})
+    for value in (float("inf"), float("-inf"), float("nan"), 10**400):
+        data["reduce"]["timeout_s"] = value
+        with pytest.raises(ConfigError, match=r"^reduce\.timeout_s=.*: expected a finite number$"):
+            from_dict(TrainConfig, data)
 
 
 @pytest.mark.parametrize("rate", [9e-6, 0.011])
@@ -68,3 +65,25 @@ def test_every_task_has_the_papers_networks_and_one_scale_of_rewards(task: str, 
     assert settings.policy_hidden_layer_sizes == wanted
     assert settings.value_hidden_layer_sizes == wanted
     assert settings.reward_scaling == compose(f"env={task}").algo.reward_scaling
+
+
+def test_steps_of_serving_are_split_over_the_gmis_that_simulate():
+    config = compose("policy=random", "num_envs=8", "num_timesteps=100", command="serve")
+    assert config.unroll_length == 64
+    assert config.unrolls_per_gmi(1) == 1
+    short = dataclasses.replace(config, unroll_length=2)
+    assert short.unrolls_per_gmi(2) == 4  # 4 x 2 GMIs x 8 x 2 = 128 >= 100
+
+
+def test_a_pipe_takes_two_steps_of_a_thousand_numbers_per_environment():
+    config = compose("policy=random", "num_envs=4096", command="serve")
+    assert config.pipe_bytes >= 2 * 4096 * 1000 * 4
+
+
+def test_undecided_numbers_are_refused_where_numbers_are_needed():
+    for config in (
+        compose(command="search"),
+        compose("num_envs=auto", "policy=random", command="serve"),
+    ):
+        with pytest.raises(ConfigError, match="num_envs=auto: not decided yet"):
+            _ = config.envs_per_gmi

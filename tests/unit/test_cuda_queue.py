@@ -49,7 +49,7 @@ def test_a_wait_for_a_flag_waits_for_what_came_before_it_where_the_gpu_can(
     can_flush: int, expected: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     calls: list[tuple[Any, ...]] = []
-    name = "gmijax.collectives.cuda_queue"
+    name = "gmijax.collectives.device.cuda_queue"
     for module, fake in zip(("runtime", "driver"), bindings(can_flush, calls), strict=True):
         monkeypatch.setitem(sys.modules, f"cuda.bindings.{module}", fake)
     monkeypatch.delitem(sys.modules, name, raising=False)

@@ -52,6 +52,10 @@ def test_a_healthy_gpu(monkeypatch: pytest.MonkeyPatch):
     assert ability(found, "reducer", "mpr") == (True, "e.g. with layout [[0,1]]")
     assert "there is only one" in ability(found, "reducer", "mrr")[1]
     assert "humanoid" in ability(found, "physics", "warp")[1]
+    found = diagnose(seen(machine_of(monkeypatch, H200_MIG_OFF), mps_error="not permitted"))
+    assert ability(found, "backend", "mps") == (False, "not permitted")
+    assert any("fall back to share" in note for note in found.notes)
+    assert found.problems == ()
 
 
 def test_a_machine_without_a_gpu_is_healthy(monkeypatch: pytest.MonkeyPatch):
@@ -62,7 +66,7 @@ def test_a_machine_without_a_gpu_is_healthy(monkeypatch: pytest.MonkeyPatch):
     assert ability(found, "intra", "host") == (True, "with cpu")
 
 
-def test_gpus_that_jax_does_not_see_are_a_problem(monkeypatch: pytest.MonkeyPatch):
+def test_gpus_that_nothing_can_use_are_a_problem(monkeypatch: pytest.MonkeyPatch):
     here = machine_of(monkeypatch, H200_MIG_OFF)
     no_plugin = INSTALLED | {"jax-cuda12-plugin": None, "jax-cuda13-plugin": None}
     found = diagnose(seen(here, JaxView(None, error="no cuda"), versions=no_plugin))
@@ -71,9 +75,6 @@ def test_gpus_that_jax_does_not_see_are_a_problem(monkeypatch: pytest.MonkeyPatc
     )
     found = diagnose(seen(machine_of(monkeypatch, H200_MIG_OFF, H200_MIG_OFF)))
     assert found.problems == ("jax sees 1 GPUs, and NVML lists 2",)
-
-
-def test_mig_mode_without_instances_is_a_problem(monkeypatch: pytest.MonkeyPatch):
     found = diagnose(seen(machine_of(monkeypatch, H200_MIG_OFF, H200_MIG_EMPTY)))
     [problem] = found.problems
     assert problem.startswith("GPU 1 is in MIG mode and has no instance")
@@ -86,14 +87,6 @@ def test_instances_are_listed(monkeypatch: pytest.MonkeyPatch):
     assert ability(found, "backend", "share") == (False, "all GPUs are in MIG mode")
     plain = json.loads(json.dumps(found.to_dict()))
     assert plain["gpus"][0]["instances"][6]["num_sms"] == 14
-
-
-def test_mps_that_does_not_start_is_told(monkeypatch: pytest.MonkeyPatch):
-    here = machine_of(monkeypatch, H200_MIG_OFF)
-    found = diagnose(seen(here, mps_error="not permitted"))
-    assert ability(found, "backend", "mps") == (False, "not permitted")
-    assert any("fall back to share" in note for note in found.notes)
-    assert found.problems == ()
 
 
 def test_what_is_missing_or_broken_is_a_problem(monkeypatch: pytest.MonkeyPatch):
@@ -172,23 +165,20 @@ def test_the_report_names_everything(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ):
     found = diagnose(seen(machine_of(monkeypatch, A100_SEVEN, H200_MIG_EMPTY)))
-    doctor.show(found, Console(highlight=False, width=140, soft_wrap=True))
+    doctor.show(found, Console(markup=False, width=140, soft_wrap=True))
     said = capsys.readouterr().out
     for part in ("1g.10gb: 14 SMs", "MIG on", "[[0],[1]]", "problem: GPU 1", "NVIDIA H200"):
         assert part in said
 
 
-@pytest.mark.parametrize(("broken", "code"), [(None, 0), ("version mismatch", 1)])
 def test_exit_code_says_whether_something_is_broken(
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-    broken: str | None,
-    code: int,
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ):
-    here = seen(machine_of(monkeypatch, H200_MIG_OFF), nvml_error=broken)
-    monkeypatch.setattr(doctor, "look", lambda: here)
-    assert doctor.main(["--json"]) == code
-    assert json.loads(capsys.readouterr().out)["ok"] == (code == 0)
+    for broken, code in ((None, 0), ("version mismatch", 1)):
+        here = seen(machine_of(monkeypatch, H200_MIG_OFF), nvml_error=broken)
+        monkeypatch.setattr(doctor, "look", lambda here=here: here)
+        assert doctor.main(["--json"]) == code
+        assert json.loads(capsys.readouterr().out)["ok"] == (code == 0)
 
 
 @pytest.mark.parametrize(
@@ -226,7 +216,7 @@ def test_commands_for_a_split_are_printed(
 
 
 BINDINGS_MISSING = (
-    "gradients of GMIs that share a GPU go through host memory: reduce.strategy=one_shot needs "
+    "GMIs on GPUs cannot train together: their exchanges need "
     "cuda-bindings>=13, and {} (pip install 'gmijax[cuda13]')"
 )
 
@@ -241,9 +231,7 @@ BINDINGS_MISSING = (
             BINDINGS_MISSING.format("12.9.4 is installed"),
         ),
         ("580.159.03", {"cuda-bindings": "13.5.0"}, None),
-        ("570.86.10", {}, "cuda-bindings>=12.9.1,<13, and it is not installed (pip install '"),
         ("570.86.10", {"cuda-bindings": "12.9.0"}, "12.9.0 is installed (pip install 'gmijax[cu"),
-        ("570.86.10", {"cuda-bindings": "13.5.0"}, "13.5.0 is installed (pip install 'gmijax[cu"),
         ("570.86.10", {"cuda-bindings": "12.9.1"}, None),
         # What jax has counts, where the driver takes both.
         (
@@ -276,9 +264,7 @@ def test_without_mps_or_warp_the_fast_path_is_not_whole(monkeypatch: pytest.Monk
     [note] = diagnose(seen(here, versions=FAST, wanted_warp="1.18.0")).notes
     assert note.startswith("MJX-Warp was made for warp-lang 1.18.0, and 1.0 is installed")
     assert diagnose(seen(here, versions=FAST, wanted_warp="1.0")).notes == ()
-
-
-def test_between_instances_there_is_no_fast_path_to_complete(monkeypatch: pytest.MonkeyPatch):
+    # Between instances there is no fast path to complete.
     assert diagnose(seen(machine_of(monkeypatch, A100_SEVEN))).notes == ()
 
 

@@ -9,7 +9,7 @@ import pytest
 from supervision import machine, plan_config, reduce_config
 
 from gmijax.partition.planner import make_plan
-from gmijax.workers.trainers import exchange_used
+from gmijax.workers.worker import exchange_used
 
 
 @pytest.mark.parametrize(

@@ -10,9 +10,9 @@ from concurrent.futures import ThreadPoolExecutor
 
 import pytest
 
-from gmijax.collectives.barrier import Barrier
-from gmijax.collectives.failure_detector import FailureDetector
-from gmijax.collectives.shared_block import SharedBlock, attach, create_exchange
+from gmijax.collectives.host.barrier import Barrier
+from gmijax.collectives.host.failure_detector import FailureDetector
+from gmijax.collectives.host.shared_block import SharedBlock, attach, create_exchange
 from gmijax.errors import CollectiveTimeout, CudaError, PeerLost
 
 NEVER = threading.Event()
@@ -133,7 +133,7 @@ def test_the_watch_of_a_step_looks_at_those_who_have_arrived_after_it(
 def test_an_error_of_ones_own_stays_what_it_is(
     blocks: list[SharedBlock], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("gmijax.collectives.barrier.SETTLE_S", 0.1)
+    monkeypatch.setattr("gmijax.collectives.host.barrier.SETTLE_S", 0.1)
     first, *_ = barriers_of(blocks, 5.0, 5.0, 5.0)
     with pytest.raises(RuntimeError, match="out of memory"), first.explained():
         raise RuntimeError("out of memory")
@@ -164,5 +164,5 @@ def test_a_process_is_looked_at_after_its_counter(
     def all_before_is_seen() -> None:
         blocks[1].lines["pid"][1] = pid
 
-    monkeypatch.setattr("gmijax.collectives.failure_detector.fence", all_before_is_seen)
+    monkeypatch.setattr("gmijax.collectives.host.failure_detector.fence", all_before_is_seen)
     FailureDetector(blocks[0], "sum", 1, 1.0).look(lambda: [1], now=True)  # Nobody is gone.

@@ -10,12 +10,12 @@ from typing import Any, TypeVar
 import numpy as np
 import pytest
 
-from gmijax.collectives.host import HostExchange
+from gmijax.collectives.host.host_exchange import HostExchange
+from gmijax.collectives.host.shared_block import create_exchange
 from gmijax.collectives.interface import FloatBuffer
 from gmijax.collectives.messages.group import AT_ONCE_BYTES, GroupReducer
 from gmijax.collectives.messages.messenger import MIN_CAPACITY_BYTES, Messenger
 from gmijax.collectives.messages.pipe_block import PipeBlock, create_pipes
-from gmijax.collectives.shared_block import create_exchange
 from gmijax.errors import CollectiveError
 
 RANKS = 3
@@ -62,7 +62,7 @@ def groups(build: Any = None, timeout_s: float = 20.0) -> list[GroupReducer]:
     ]
 
 
-def by_messages(buffers: list[FloatBuffer], count: int) -> list[Callable[[int], FloatBuffer]]:
+def by_messages(buffers: list[FloatBuffer], count: int) -> Callable[[int], FloatBuffer]:
     """The mean of the first `count` numbers, as small or large data of any group."""
     members = groups()
 
@@ -70,7 +70,7 @@ def by_messages(buffers: list[FloatBuffer], count: int) -> list[Callable[[int], 
         members[rank]._num_floats = 1  # Another length is by messages, however large.
         return members[rank].reduce(range(RANKS), buffers[rank][:count], "mean")
 
-    return [mean]
+    return mean
 
 
 def test_the_mean_of_three_has_the_same_bits_on_every_way(pool: ThreadPoolExecutor) -> None:
@@ -80,8 +80,8 @@ def test_the_mean_of_three_has_the_same_bits_on_every_way(pool: ThreadPoolExecut
     assert (expected != (buffers[0] + buffers[1] + buffers[2]) / np.float32(3)).any()
     exchanges = hosts(LARGE)
     ways = {
-        "small": by_messages(buffers, SMALL)[0],
-        "large": by_messages(buffers, LARGE)[0],
+        "small": by_messages(buffers, SMALL),
+        "large": by_messages(buffers, LARGE),
         "of all": lambda rank: exchanges[rank].mean(buffers[rank]),
     }
     for name, way in ways.items():

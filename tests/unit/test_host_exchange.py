@@ -13,9 +13,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from gmijax.collectives.host import HostExchange, chunk
+from gmijax.collectives.host.host_exchange import HostExchange, chunk
+from gmijax.collectives.host.shared_block import create_exchange
 from gmijax.collectives.interface import FloatBuffer
-from gmijax.collectives.shared_block import create_exchange
 from gmijax.errors import CollectiveError, CollectiveTimeout
 
 LATE_S = 0.5

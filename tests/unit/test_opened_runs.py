@@ -65,11 +65,10 @@ def opened(kind: str, *overrides: str) -> Any:
     return job.train(gmijax.compose("run.resume=theirs", *overrides))
 
 
-KINDS = pytest.mark.parametrize("kind", ["play", "serve", "resume"])
-
-
-@KINDS
-def test_a_file_that_has_changed_is_not_executed(kind: str, run: RunPaths, starts: None):
+@pytest.mark.parametrize("kind", ["play", "serve", "resume"])
+def test_only_the_noted_file_or_one_that_is_named_is_executed(
+    kind: str, run: RunPaths, starts: None
+):
     with pytest.raises(ConfigError) as error:
         opened(kind)
     file = Path("point.py").resolve()
@@ -77,27 +76,15 @@ def test_a_file_that_has_changed_is_not_executed(kind: str, run: RunPaths, start
         f"env={file}:make: not the file that the run noted (its SHA-256 differs), so it is not "
         f"executed; env={file}:make says that it is meant as it is now"
     )
-
-
-@KINDS
-def test_a_file_of_which_nothing_is_noted_is_not_executed(kind: str, run: RunPaths, starts: None):
-    saved = read_json(run.config)
-    del saved["env"]["source_sha256"]
-    write_json(run.config, saved)
-    with pytest.raises(ConfigError, match="is not executed"):
-        opened(kind)
-
-
-@KINDS
-def test_who_names_the_file_means_it(kind: str, run: RunPaths, starts: None):
     with pytest.raises(StartedError):
         opened(kind, "env=point.py:make")
-
-
-@KINDS
-def test_an_equal_file_is_the_runs(kind: str, run: RunPaths, starts: None):
     Path("point.py").write_text("def make(): ...\n")
     with pytest.raises(StartedError):
+        opened(kind)
+    saved = read_json(run.config)
+    del saved["env"]["source_sha256"]  # Nothing is noted.
+    write_json(run.config, saved)
+    with pytest.raises(ConfigError, match="is not executed"):
         opened(kind)
 
 

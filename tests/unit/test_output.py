@@ -1,4 +1,4 @@
-"""What a job prints cannot end it; broken programs in the cache are removed."""
+"""What a job prints cannot end it, and holds no markup and nothing that a terminal obeys."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import io
 import os
 import subprocess
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -13,14 +14,16 @@ import pytest
 from rich.console import Console
 from supervision import CHECKOUT
 
+from gmijax.control import evaluation
 from gmijax.control.console import ConsoleProgress, open_console
-from gmijax.runs.cache import drop_broken_programs
+from gmijax.errors import printable
+from gmijax.supervise.failures import last_line
 from gmijax.supervise.gmi_process import GmiStatus
 
 PRINTS = """
 from gmijax.control.console import open_console
 console = open_console(show=True)
-for number in range(200_000):
+for number in range(8_000):
     console.print(f"line {number}")
 open("done", "w").close()
 """
@@ -28,7 +31,7 @@ open("done", "w").close()
 
 @pytest.mark.parametrize("shell", ["{0} | head -n 1", "{0} >&-", "{0} > /dev/full"])
 def test_a_reader_that_is_gone_does_not_end_the_job(tmp_path: Path, shell: str):
-    (tmp_path / "prints.py").write_text(PRINTS.replace("200_000", "20_000"))
+    (tmp_path / "prints.py").write_text(PRINTS)
     done = subprocess.run(
         ["bash", "-c", f"set -o pipefail; {shell.format(f'{sys.executable} prints.py')}"],
         cwd=tmp_path,
@@ -43,7 +46,7 @@ def test_a_reader_that_is_gone_does_not_end_the_job(tmp_path: Path, shell: str):
 
 
 def test_names_in_brackets_are_printed_as_they_are(capsys: pytest.CaptureFixture[str]):
-    open_console(show=True).print("runs/[lr=0.1] a[/b]", markup=False)
+    open_console(show=True).print("runs/[lr=0.1] a[/b]")
     assert capsys.readouterr().out == "runs/[lr=0.1] a[/b]\n"
 
 
@@ -57,19 +60,6 @@ def test_a_display_that_fails_is_given_up(capsys: pytest.CaptureFixture[str]):
     assert capsys.readouterr().out == "no progress from here on: RuntimeError('off')\n"
 
 
-def test_programs_that_could_not_be_read_are_removed(tmp_path: Path):
-    cache, log = tmp_path / "cache", tmp_path / "stderr.log"
-    cache.mkdir()
-    for name in ("jit_step-0a-cache", "jit_step-0b-cache", "jit_step_two-0c-cache"):
-        (cache / name).touch()
-    log.write_text(
-        "x.py:782: UserWarning: Error reading persistent compilation cache entry for 'jit_step': "
-        "ZstdError: zstd decompress error\n  warnings.warn(\n"
-    )
-    assert drop_broken_programs(cache, [log, tmp_path / "none"]) == 2
-    assert [path.name for path in cache.iterdir()] == ["jit_step_two-0c-cache"]
-
-
 SYNC = {"env_steps": 500, "env_steps_per_s": 1234.5, "return": 7.25}
 EXPERIENCE = {
     **{"async/pps": 2000.0, "async/ttop": 1500.0, "async/staleness_mean": 2.5},
@@ -77,33 +67,10 @@ EXPERIENCE = {
 }
 
 
-class Lines:
-    """A file of metrics with one line."""
-
-    def __init__(self, line: dict[str, Any]) -> None:
-        self._line: dict[str, Any] | None = line
-
-    def latest(self) -> dict[str, Any] | None:
-        line, self._line = self._line, None
-        return line
-
-
-def said_at_the_end(line: dict[str, Any]) -> str:
-    console = Console(file=io.StringIO(), width=300)
-    with ConsoleProgress(console, Lines(line).latest, 1000) as progress:
-        progress.update(())
-    assert isinstance(console.file, io.StringIO)
-    return console.file.getvalue().splitlines()[-1]
-
-
-def test_a_synchronous_job_tells_its_rate_and_return():
-    said = said_at_the_end(SYNC)
-    assert said.startswith("50 %  500 steps  1,234 steps/s  return 7.25")
-
-
 @pytest.mark.parametrize(
-    ("line", "part"),
+    ("more", "part"),
     [
+        ({}, "50 %  500 steps  1,234 steps/s  return 7.25"),
         (EXPERIENCE, "PPS 2,000  TTOP 1,500  staleness 2.5  channels 25% full, 3 MB/s, 4 dropped"),
         (
             {**EXPERIENCE, "async/staleness_mean": None, "channel/occupancy": None},
@@ -111,5 +78,60 @@ def test_a_synchronous_job_tells_its_rate_and_return():
         ),
     ],
 )
-def test_an_asynchronous_job_tells_of_its_channels(line: dict[str, Any], part: str):
-    assert part in said_at_the_end({**SYNC, **line})
+def test_a_job_tells_its_rate_and_return_or_of_its_channels(more: dict[str, Any], part: str):
+    lines: Iterator[dict[str, Any]] = iter([{**SYNC, **more}])
+    said = io.StringIO()
+    with ConsoleProgress(
+        Console(file=said, width=300, markup=False), lambda: next(lines, None), 1000
+    ) as progress:
+        progress.update(())
+    assert part in said.getvalue().splitlines()[-1]
+
+
+def test_the_panel_of_a_job_shows_what_a_gmi_says():
+    said = io.StringIO()
+    shown = ConsoleProgress(Console(file=said), lambda: None, 10)
+    Console(file=said).print(shown._panel([GmiStatus(0, "[/odd]", 3, None, None)]))
+    assert "GMI 0: [/odd], iteration 3" in said.getvalue()
+
+
+@pytest.mark.parametrize(
+    ("text", "shown"),
+    [
+        ("plain text, ä and 日本", "plain text, ä and 日本"),
+        ("\x1b[31mred\x1b[0m", "red"),
+        ("\x1b]0;title\x07after", "after"),
+        ("\x1b]8;;http://x\x1b\\link", "link"),
+        ("\x1b[2J\x1b[1;1Hover", "over"),
+        ("\x1bcreset", "reset"),
+        ("a\tb\x00\x08\x7f\x9b", "a b"),
+        ("left\u202eright", "leftright"),
+        ("half\x1b", "half"),
+    ],
+)
+def test_what_a_terminal_would_obey_is_gone(text: str, shown: str):
+    assert printable(text) == shown
+
+
+def test_the_last_line_of_a_gmi_is_printable(tmp_path: Path):
+    log = tmp_path / "stderr.log"
+    log.write_bytes(b"first\n\x1b[31mValueError: [b]\xff\x1b[0m\x07\n\x1b[0m\n\n")
+    assert last_line(log) == "ValueError: [b]\ufffd"
+
+
+def test_names_in_the_table_of_play_may_look_like_markup():
+    row = dict.fromkeys(("mean", "std", "min", "max"), 1.0)
+    numbers = ("num_envs", "num_terminated", "num_truncated", "num_cut_off", "num_diverged")
+    returns: dict[str, Any] = {
+        **dict.fromkeys((*numbers, "env_steps", "compile_s", "run_s"), 1),
+        "env": "a[/b].py:make",
+        "deterministic": True,
+        "return": row,
+        "length": row,
+        "terms": {"near[/]": row},
+        "metrics": {"[red]x": row},
+    }
+    said = io.StringIO()
+    Console(file=said, width=200, markup=False).print(evaluation._table(returns))
+    for name in ("a[/b].py:make", "near[/]", "[red]x"):
+        assert name in said.getvalue()

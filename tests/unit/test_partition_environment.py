@@ -12,10 +12,11 @@ from supervision import gpu, machine, plan_config, reduce_config
 from gmijax.machine.nvidia import Gpu, MigInstance
 from gmijax.partition.plan import Plan
 from gmijax.partition.planner import make_plan
+from gmijax.supervise import environment as environment_module
 from gmijax.supervise.backends import BACKENDS
-from gmijax.supervise.backends.cpu import NO_FUSION_EMITTERS, cpu_environment
-from gmijax.supervise.environment import extend_xla_flags, gmi_environment
+from gmijax.supervise.environment import gmi_environment
 
+NO_EMITTERS = "--xla_cpu_use_fusion_emitters=false"
 GOLDEN = Path(__file__).parents[1] / "golden"
 INHERITED = {
     "PATH": "/usr/bin",
@@ -24,7 +25,7 @@ INHERITED = {
     "CUDA_VISIBLE_DEVICES": "0,1",
 }
 FROM_BACKEND = {
-    "cpu": cpu_environment((0, 10, 2)),
+    "cpu": {},
     "share": {"CUDA_MPS_PIPE_DIRECTORY": "/runs/a/mps/none"},
     "mig": {"CUDA_MPS_PIPE_DIRECTORY": "/runs/a/mps/none"},
     "mps": {"CUDA_MPS_PIPE_DIRECTORY": "/tmp/gmijax-1"},
@@ -67,12 +68,6 @@ def test_environment_is_the_golden_one(backend: str):
     assert found == json.loads((GOLDEN / f"environment_{backend}.json").read_text())
 
 
-def test_users_choices_are_kept():
-    users = {"JAX_COMPILATION_CACHE_DIR": "/mine", "OMP_NUM_THREADS": "7"}
-    found = environment(planned("cpu"), 0, **users)
-    assert {name: found[name] for name in users} == users
-
-
 def test_inherited_share_is_overwritten():
     found = environment(
         planned("share"),
@@ -97,50 +92,38 @@ def test_thread_pool_never_has_two_threads(num_cores: int, pool: str):
 
 
 @pytest.mark.parametrize(
-    ("users", "added", "both"),
+    ("jaxlib", "users", "flags"),
     [
-        ("", "", ""),
-        ("--a=1", "", "--a=1"),
-        ("", "--b=2", "--b=2"),
-        ("--a=1 --c", "--b=2", "--a=1 --c --b=2"),
-        ("--b=true", "--b=false", "--b=true"),
+        ("0.10.2", "", NO_EMITTERS),
+        ("0.11.0.dev3", "--a=1 --c", f"--a=1 --c {NO_EMITTERS}"),
+        ("0.10.2", "--xla_cpu_use_fusion_emitters=true", "--xla_cpu_use_fusion_emitters=true"),
+        # XLA would abort.
+        ("0.11.1", "--a=1", "--a=1"),
+        ("0.12.0", "", None),
+        (None, "", None),
     ],
 )
-def test_xla_flags_are_extended_and_the_users_win(users: str, added: str, both: str):
-    assert extend_xla_flags(users, added) == both
-
-
-@pytest.mark.parametrize(
-    ("jaxlib", "accepted"),
-    [
-        ((0, 10, 2), True),
-        ((0, 11, 0), True),
-        ((0, 11, 1), False),
-        ((0, 12, 0), False),
-        (None, False),
-    ],
-)
-def test_xla_flag_is_left_out_where_xla_would_abort(
-    jaxlib: tuple[int, ...] | None, accepted: bool
+def test_xla_flag_is_added_where_jaxlib_knows_it_and_the_user_has_not(
+    jaxlib: str | None, users: str, flags: str | None, monkeypatch: pytest.MonkeyPatch
 ):
-    assert (cpu_environment(jaxlib) == {"XLA_FLAGS": NO_FUSION_EMITTERS}) == accepted
+    monkeypatch.setattr(environment_module, "versions_of", lambda _: {"jaxlib": jaxlib})
+    inherited = {"XLA_FLAGS": users} if users else {}
+    assert environment(planned("cpu"), **inherited).get("XLA_FLAGS") == flags
 
 
 @pytest.mark.parametrize(("backend", "interface"), [("cpu", None), ("share", "lo")])
-def test_rings_on_one_host_listen_on_its_loopback_interface(backend: str, interface: str | None):
-    inherited = {"GMIJAX_WAITS": "1"}
-    found = gmi_environment(planned(backend), 0, inherited, Path("/cache"), {})
+def test_rings_on_one_host_listen_on_its_loopback_interface_and_users_choices_are_kept(
+    backend: str, interface: str | None
+):
+    found = environment(planned(backend), GMIJAX_WAITS="1")
     assert found.get("NCCL_SOCKET_IFNAME") == interface
     assert "GMIJAX_WAITS" not in found
-    users = {"NCCL_SOCKET_IFNAME": "eth0"}
-    assert users.items() <= gmi_environment(planned(backend), 0, users, Path("/c"), {}).items()
-
-
-def test_inputs_are_not_changed():
-    inherited, backend = dict(INHERITED), {"XLA_FLAGS": "--b=2"}
-    gmi_environment(planned("cpu"), 0, inherited, Path("/cache"), backend)
-    assert inherited == INHERITED
-    assert backend == {"XLA_FLAGS": "--b=2"}
+    users = {
+        "NCCL_SOCKET_IFNAME": "eth0",
+        "JAX_COMPILATION_CACHE_DIR": "/mine",
+        "OMP_NUM_THREADS": "7",
+    }
+    assert users.items() <= environment(planned(backend), **users).items()
 
 
 def test_a_priority_becomes_the_number_of_the_driver():

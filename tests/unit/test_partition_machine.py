@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 from collections.abc import Callable
 from pathlib import Path
-from types import SimpleNamespace
 from typing import NoReturn
 
 import fake_nvml
@@ -17,8 +16,8 @@ from gmijax.errors import BackendUnavailable
 from gmijax.machine import nvidia
 from gmijax.machine import snapshot as machine_module
 from gmijax.machine.mps_control import MpsControl, find_mps_control
-from gmijax.machine.nvidia import Gpu, driver_version, list_gpus
-from gmijax.machine.snapshot import Machine, detect_machine, visible_gpus
+from gmijax.machine.nvidia import driver_version, list_gpus
+from gmijax.machine.snapshot import detect_machine, visible_gpus
 from gmijax.partition.planner import make_plan
 
 THREE = (gpu(0), gpu(1), gpu(2))
@@ -45,16 +44,15 @@ def test_cuda_visible_devices_is_read_as_cuda_reads_it(selection: str | None, in
     assert [gpu.index for gpu in visible_gpus(THREE, selection)] == indices
 
 
-@pytest.mark.parametrize(("version", "major"), [("580.159.03", 580), (None, 0), ("", 0)])
-def test_driver_branch(version: str | None, major: int):
-    assert Machine((), (0,), driver_version=version).driver_major == major
+def failing(code: int) -> Callable[..., NoReturn]:
+    def fail(*_: object) -> NoReturn:
+        raise pynvml.NVMLError(code)
+
+    return fail
 
 
 def test_machine_without_a_driver(monkeypatch: pytest.MonkeyPatch):
-    def fail() -> None:
-        raise pynvml.NVMLError(pynvml.NVML_ERROR_LIBRARY_NOT_FOUND)
-
-    monkeypatch.setattr(pynvml, "nvmlInit", fail)
+    monkeypatch.setattr(pynvml, "nvmlInit", failing(pynvml.NVML_ERROR_LIBRARY_NOT_FOUND))
     assert list_gpus() == ()
     assert driver_version() is None
     here = detect_machine()
@@ -62,46 +60,55 @@ def test_machine_without_a_driver(monkeypatch: pytest.MonkeyPatch):
     assert here.cpu_cores == tuple(sorted(os.sched_getaffinity(0)))
 
 
-def test_gpus_are_described(monkeypatch: pytest.MonkeyPatch):
-    def no_mig(handle: object) -> tuple[int, int]:
-        raise pynvml.NVMLError(pynvml.NVML_ERROR_NOT_SUPPORTED)
+@pytest.mark.parametrize(
+    ("board", "is_supported", "is_enabled", "profiles"),
+    [
+        (fake_nvml.V100, False, False, []),
+        (fake_nvml.H200_MIG_OFF, True, False, []),
+        (fake_nvml.H200_MIG_EMPTY, True, True, []),
+        (fake_nvml.A100_SEVEN, True, True, ["1g.10gb"] * 7),
+        # With holes between them.
+        (fake_nvml.H200_MIXED, True, True, ["3g.71gb", "2g.35gb", "1g.18gb", "1g.18gb"]),
+    ],
+)
+def test_gpus_and_their_instances_are_listed(
+    board: fake_nvml.Board,
+    is_supported: bool,
+    is_enabled: bool,
+    profiles: list[str],
+    monkeypatch: pytest.MonkeyPatch,
+):
+    fake_nvml.install(monkeypatch, board)
+    [found] = list_gpus()
+    assert found[:5] == (0, "GPU-0-uuid", board.name, board.memory_mib, board.capability)
+    assert (found.mig_supported, found.mig_enabled) == (is_supported, is_enabled)
+    assert [one.profile for one in found.instances] == profiles
+    assert [one[0:1] + one[2:] for one in found.instances] == [
+        (one.uuid, one.gpu_instance, one.num_sms, one.memory_mib) for one in board.mig or () if one
+    ]
 
-    faked = {
-        "nvmlInit": lambda: None,
-        "nvmlShutdown": lambda: None,
-        "nvmlDeviceGetCount": lambda: 1,
-        "nvmlDeviceGetHandleByIndex": lambda index: index,
-        "nvmlDeviceGetUUID": lambda handle: "GPU-a",
-        "nvmlDeviceGetName": lambda handle: "NVIDIA H200",
-        "nvmlDeviceGetMemoryInfo": lambda handle: SimpleNamespace(total=143771 * 2**20),
-        "nvmlDeviceGetCudaComputeCapability": lambda handle: (9, 0),
-        "nvmlDeviceGetMigMode": no_mig,
-        "nvmlSystemGetDriverVersion": lambda: "580.159.03",
-    }
-    for name, function in faked.items():
-        monkeypatch.setattr(pynvml, name, function)
-    assert list_gpus() == (Gpu(0, "GPU-a", "NVIDIA H200", 143771, (9, 0), mig_enabled=False),)
-    assert driver_version() == "580.159.03"
-    monkeypatch.setattr(pynvml, "nvmlDeviceGetMigMode", lambda handle: (1, 1))
-    assert list_gpus()[0].mig_enabled
 
+def test_gpus_that_nvml_cannot_describe_are_left_out(
+    no_devices: Path, monkeypatch: pytest.MonkeyPatch
+):
+    fake_nvml.install(monkeypatch, fake_nvml.V100, fake_nvml.V100)
+    good, lost = pynvml.nvmlDeviceGetHandleByIndex, pynvml.NVML_ERROR_GPU_IS_LOST
 
-def test_gpu_that_nvml_cannot_describe_is_left_out(monkeypatch: pytest.MonkeyPatch):
-    def lost(*_: object) -> NoReturn:
-        raise pynvml.NVMLError(pynvml.NVML_ERROR_GPU_IS_LOST)
+    def second_only(index: int) -> object:
+        return good(index) if index else failing(lost)()
 
-    def describe(index: int) -> Gpu:
-        return gpu(index) if index else lost()
-
-    monkeypatch.setattr(pynvml, "nvmlInit", lambda: None)
-    monkeypatch.setattr(pynvml, "nvmlShutdown", lambda: None)
-    monkeypatch.setattr(pynvml, "nvmlDeviceGetCount", lambda: 2)
-    monkeypatch.setattr(pynvml, "nvmlSystemGetDriverVersion", lost)
-    monkeypatch.setattr("gmijax.machine.nvidia._describe", describe)
-    assert list_gpus() == (gpu(1),)
-    assert driver_version() is None
-    monkeypatch.setattr(pynvml, "nvmlDeviceGetCount", lost)
-    assert list_gpus() == ()
+    monkeypatch.setattr(pynvml, "nvmlDeviceGetHandleByIndex", second_only)
+    here = detect_machine()
+    assert ([found.index for found in here.gpus], here.gpu_problem) == ([1], None)
+    # If none can be described the driver is broken.
+    monkeypatch.setattr(pynvml, "nvmlDeviceGetHandleByIndex", failing(lost))
+    here = detect_machine()
+    assert (here.gpus, here.gpu_problem) == ((), str(pynvml.NVMLError(lost)))
+    monkeypatch.setattr(pynvml, "nvmlDeviceGetCount", failing(lost))
+    monkeypatch.setattr(pynvml, "nvmlSystemGetDriverVersion", failing(lost))
+    assert (list_gpus(), driver_version()) == ((), None)
+    fake_nvml.install(monkeypatch)
+    assert detect_machine().gpu_problem is None
 
 
 def script(folder: Path, text: str) -> Path:
@@ -112,14 +119,12 @@ def script(folder: Path, text: str) -> Path:
     return program
 
 
-def test_control_program_is_found_in_path_first(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    program = script(tmp_path / "bin", "true")
-    monkeypatch.setenv("PATH", str(tmp_path / "bin"))
-    assert find_mps_control() == program
-
-
-def test_answers_of_the_daemon_are_read(tmp_path: Path):
+def test_control_program_is_found_in_path_and_its_answers_are_read(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
     program = script(tmp_path, 'read line; [ "$line" = get_server_list ] && echo 12 && echo " 34"')
+    monkeypatch.setenv("PATH", str(tmp_path))
+    assert find_mps_control() == program
     control = MpsControl(program, tmp_path)
     assert control.server_pids() == (12, 34)
     assert control.daemon_pid() is None
@@ -140,37 +145,15 @@ def test_daemon_gets_none_of_the_users_settings_for_mps(
     )
 
 
-def test_daemon_that_is_not_there_is_told_in_one_line(tmp_path: Path):
+def test_daemon_or_program_that_is_not_there_is_told_in_one_line(tmp_path: Path):
     control = MpsControl(script(tmp_path, "echo Cannot find MPS; exit 1"), tmp_path)
     assert not control.is_answering()
     with pytest.raises(BackendUnavailable, match=r"terminate_client 1 2: Cannot find MPS$"):
         control.terminate_client(1, 2)
-
-
-def test_missing_control_program_is_told(tmp_path: Path):
     control = MpsControl(tmp_path / "none", tmp_path)
     assert not control.is_answering()
     with pytest.raises(BackendUnavailable, match=r"cannot start .*none -d"):
         control.start("GPU-a", tmp_path / "logs")
-
-
-def test_operator_daemon_counts_only_if_it_answers(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-):
-    monkeypatch.setattr(machine_module, "list_gpus", lambda: THREE)
-    monkeypatch.setenv("CUDA_MPS_PIPE_DIRECTORY", str(tmp_path))
-    monkeypatch.setenv("PATH", f"{tmp_path}{os.pathsep}{os.environ['PATH']}")
-    script(tmp_path, "exit 1")
-    assert detect_machine().operator_daemon is None
-    script(tmp_path, "exit 0")
-    assert detect_machine().operator_daemon == tmp_path
-
-
-def failing(code: int) -> Callable[[], NoReturn]:
-    def fail() -> NoReturn:
-        raise pynvml.NVMLError(code)
-
-    return fail
 
 
 @pytest.fixture
@@ -184,16 +167,19 @@ def no_devices(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return folder
 
 
-@pytest.mark.parametrize("others", [{}, {"gmis_per_gpu": 2}, {"gpus": 2}])
 def test_auto_does_not_go_on_without_gpus_where_the_driver_is_broken(
-    others: dict[str, int], no_devices: Path, monkeypatch: pytest.MonkeyPatch
+    no_devices: Path, monkeypatch: pytest.MonkeyPatch
 ):
     monkeypatch.setattr(pynvml, "nvmlInit", failing(pynvml.NVML_ERROR_LIB_RM_VERSION_MISMATCH))
     here = detect_machine()
     with pytest.raises(BackendUnavailable, match=r"^plan\.backend=auto: .* does not work: RM has"):
-        make_plan(plan_config(**others), reduce_config(), 8, here)
-    plan = make_plan(plan_config(backend="cpu", **others), reduce_config(), 8, here)
+        make_plan(plan_config(), reduce_config(), 8, here)
+    plan = make_plan(plan_config(backend="cpu"), reduce_config(), 8, here)
     assert plan.backend == "cpu"
+    # Who hides all GPUs need not have a driver that works.
+    for selection in ("", "-1"):
+        monkeypatch.setenv("CUDA_VISIBLE_DEVICES", selection)
+        assert make_plan(plan_config(), reduce_config(), 8, detect_machine()).backend == "cpu"
 
 
 @pytest.mark.parametrize("code", ["LIBRARY_NOT_FOUND", "DRIVER_NOT_LOADED"])
@@ -208,28 +194,6 @@ def test_a_driver_that_is_absent_although_its_devices_are_there_is_broken(
     problem = detect_machine().gpu_problem
     assert problem is not None
     assert problem.endswith(f"although there is {no_devices / 'nvidia0'}")
-
-
-def test_gpus_of_which_none_can_be_described_are_a_broken_driver(
-    no_devices: Path, monkeypatch: pytest.MonkeyPatch
-):
-    fake_nvml.install(monkeypatch, fake_nvml.V100)
-    assert detect_machine().gpu_problem is None
-    lost = pynvml.NVML_ERROR_GPU_IS_LOST
-    monkeypatch.setattr(pynvml, "nvmlDeviceGetHandleByIndex", lambda _: failing(lost)())
-    here = detect_machine()
-    assert (here.gpus, here.gpu_problem) == ((), str(pynvml.NVMLError(lost)))
-    fake_nvml.install(monkeypatch)
-    assert detect_machine().gpu_problem is None
-
-
-@pytest.mark.parametrize("selection", ["", "-1"])
-def test_who_hides_all_gpus_need_not_have_a_driver_that_works(
-    selection: str, no_devices: Path, monkeypatch: pytest.MonkeyPatch
-):
-    monkeypatch.setattr(pynvml, "nvmlInit", failing(pynvml.NVML_ERROR_LIB_RM_VERSION_MISMATCH))
-    monkeypatch.setenv("CUDA_VISIBLE_DEVICES", selection)
-    assert make_plan(plan_config(), reduce_config(), 8, detect_machine()).backend == "cpu"
 
 
 @pytest.mark.parametrize(("device", "what"), [("kfd", "a GPU for ROCm"), ("accel0", "a TPU")])
@@ -266,9 +230,11 @@ def test_a_strangers_daemon_is_not_used(
     assert here.operator_daemon == (pipe if is_used else None)
     said = f"warning: {pipe} belongs to user {owner}, so the MPS daemon there is not used; "
     assert [text.startswith(said) for text in here.warnings] == [True] * (not is_used)
-    # Who names it has decided.
+    # Who names it has decided; but it must answer.
     monkeypatch.setenv("CUDA_MPS_PIPE_DIRECTORY", str(pipe))
     assert detect_machine().operator_daemon == pipe
+    script(tmp_path, "exit 1")
+    assert detect_machine().operator_daemon is None
 
 
 def test_a_link_of_a_strangers_to_a_directory_of_roots_is_not_used(tmp_path: Path):

@@ -34,34 +34,6 @@ def planned(here: Machine, **changes: Any) -> Plan:
     return make_plan(plan_config(**changes), reduce_config(), 64, here)
 
 
-def test_seven_equal_instances_are_listed(monkeypatch: pytest.MonkeyPatch):
-    [gpu] = machine_of(monkeypatch, fake_nvml.A100_SEVEN).gpus
-    assert gpu.mig_enabled
-    assert [one.profile for one in gpu.instances] == ["1g.10gb"] * 7
-    assert {(one.num_sms, one.memory_mib) for one in gpu.instances} == {(14, 9728)}
-    assert len({one.uuid for one in gpu.instances}) == 7
-
-
-def test_holes_between_instances_are_passed_over(monkeypatch: pytest.MonkeyPatch):
-    [gpu] = machine_of(monkeypatch, fake_nvml.H200_MIXED).gpus
-    assert [one.profile for one in gpu.instances] == ["3g.71gb", "2g.35gb", "1g.18gb", "1g.18gb"]
-
-
-@pytest.mark.parametrize(
-    ("board", "supported", "enabled"),
-    [
-        (fake_nvml.H200_MIG_OFF, True, False),
-        (fake_nvml.H200_MIG_EMPTY, True, True),
-        (fake_nvml.V100, False, False),
-    ],
-)
-def test_gpus_without_instances(
-    monkeypatch: pytest.MonkeyPatch, board: fake_nvml.Board, supported: bool, enabled: bool
-):
-    [gpu] = machine_of(monkeypatch, board).gpus
-    assert (gpu.mig_supported, gpu.mig_enabled, gpu.instances) == (supported, enabled, ())
-
-
 def test_cuda_visible_devices_may_name_instances(monkeypatch: pytest.MonkeyPatch):
     gpus = machine_of(monkeypatch, fake_nvml.A100_SEVEN, fake_nvml.H200_MIXED).gpus
     first, mixed = (fake_nvml.instance_uuid(0, place) for place in (4, 2)), gpus[1].instances[0]
@@ -102,25 +74,16 @@ def test_plan_over_uneven_instances(monkeypatch: pytest.MonkeyPatch):
     assert (plan.strategy, plan.intra) == ("mpr", "host")
 
 
-def test_gmis_that_share_memory_split_it(monkeypatch: pytest.MonkeyPatch):
+def test_gmis_that_share_instances_split_memory_and_need_mps(monkeypatch: pytest.MonkeyPatch):
     here = machine_of(monkeypatch, fake_nvml.A100_HALVES)
     plan = planned(here, gmis_per_gpu=3, backend="mig")
     assert [share.memory_fraction for share in plan.slices] == [0.8, 0.4, 0.4]
-
-
-def test_more_gmis_than_instances_need_mps(monkeypatch: pytest.MonkeyPatch):
-    here = machine_of(monkeypatch, fake_nvml.A100_HALVES)
     with pytest.raises(BackendUnavailable, match=r"3 MIG instances for 4 GMIs, and MPS"):
         planned(here, gmis_per_gpu=4, backend="mig")
     here = machine_of(monkeypatch, fake_nvml.A100_SEVEN, control=MPS)
     assert planned(here, gmis_per_gpu=42, backend="mig").layout.num_gmis == 42
     with pytest.raises(ConfigError, match=r"at most 6 processes on a MIG instance 1g\.10gb"):
         planned(here, gmis_per_gpu=43, backend="mig")
-
-
-def test_memory_over_the_limit_of_an_instance_is_refused(monkeypatch: pytest.MonkeyPatch):
-    here = machine_of(monkeypatch, fake_nvml.A100_SEVEN, control=MPS)
-    assert planned(here, gmis_per_gpu=7, backend="mig", memory_fraction=0.9)
     with pytest.raises(ConfigError, match="2 GMIs on MIG-"):
         planned(here, gmis_per_gpu=8, backend="mig", memory_fraction=0.5)
 
@@ -158,11 +121,6 @@ def test_a_gmi_sees_its_instance_and_no_daemon(monkeypatch: pytest.MonkeyPatch, 
     assert found["CUDA_VISIBLE_DEVICES"] == fake_nvml.instance_uuid(0, 1)
     assert found["XLA_CLIENT_MEM_FRACTION"] == "0.8"
     assert list(Path(found["CUDA_MPS_PIPE_DIRECTORY"]).iterdir()) == []
-
-
-def test_instance_that_is_gone_is_told(monkeypatch: pytest.MonkeyPatch, tmp_path: Path):
-    here = machine_of(monkeypatch, fake_nvml.A100_SEVEN)
-    plan = planned(here, backend="mig")
     gone = machine_of(monkeypatch, fake_nvml.H200_MIXED)
     with pytest.raises(BackendUnavailable, match="of GMI 0 does not exist"):
         open_backend(plan, gone, RunPaths(tmp_path))
@@ -198,21 +156,20 @@ def test_old_instances_are_destroyed_first(monkeypatch: pytest.MonkeyPatch):
     )
 
 
-@pytest.mark.parametrize("wanted", ["3g,3g,1g", "7g,1g", "1g,1g,1g,1g,1g,1g,1g,1g", "4g,4g"])
-def test_what_does_not_fit_is_refused(wanted: str):
-    with pytest.raises(ConfigError, match="do not fit side by side"):
+@pytest.mark.parametrize(
+    ("wanted", "why"),
+    [
+        *((text, "do not fit side by side") for text in ("3g,3g,1g", "7g,1g", "4g,4g")),
+        ("1g,1g,1g,1g,1g,1g,1g,1g", "do not fit side by side"),
+        *((text, "expected a list of 1g, 2g, 3g, 4g, 7g") for text in ("5g", "big", "1g,,1g")),
+        ("1g.5tb", "expected a list of"),
+        # Another profile of the same size is not mistaken.
+        ("3g.71gb,1g.35gb", r"1g\.35gb is not supported; 1g of .* is 1g\.18gb"),
+    ],
+)
+def test_a_split_that_cannot_be_is_refused(wanted: str, why: str):
+    with pytest.raises(ConfigError, match=why):
         split_commands(board("NVIDIA H200", 143771), wanted)
-
-
-@pytest.mark.parametrize("wanted", ["5g", "big", "1g,,1g", "1g.5tb"])
-def test_what_is_no_size_is_refused(wanted: str):
-    with pytest.raises(ConfigError, match="expected a list of 1g, 2g, 3g, 4g, 7g"):
-        split_commands(board("NVIDIA H200", 143771), wanted)
-
-
-def test_another_profile_of_the_same_size_is_not_mistaken():
-    with pytest.raises(ConfigError, match=r"1g\.35gb is not supported; 1g of .* is 1g\.18gb"):
-        split_commands(board("NVIDIA H200", 143771), "3g.71gb,1g.35gb")
 
 
 def test_instances_do_not_overlap():

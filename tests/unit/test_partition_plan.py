@@ -16,9 +16,12 @@ from gmijax.machine.snapshot import Machine
 from gmijax.partition import reduction
 from gmijax.partition.layout import Layout
 from gmijax.partition.plan import Plan, Slice
-from gmijax.partition.planner import make_plan, split_cores
+from gmijax.partition.planner import make_plan
+from gmijax.partition.shares import split_cores
 
 MPS = Path("/usr/bin/nvidia-cuda-mps-control")
+ON_MPS = machine(1, mps_control=MPS)
+NEW_DRIVER = machine(1, mps_control=MPS, driver_version="590.44")
 
 
 def planned(here: Machine, reduce: dict[str, Any] | None = None, **changes: Any) -> Plan:
@@ -48,12 +51,7 @@ def test_plan_survives_json(num_gpus: int):
 def test_plan_refuses_slices_that_do_not_fit_the_layout():
     slices = (Slice(1, 0, "cpu", None, None, ()),)
     with pytest.raises(ConfigError, match="do not match layout"):
-        Plan(Layout(((0,),)), slices, "cpu", "tcg_ex", 8, "none", "host")
-
-
-def test_running_daemon_is_named_in_the_reason():
-    here = machine(1, mps_control=MPS, operator_daemon=Path("/tmp/nvidia-mps"))
-    assert "the daemon that runs here" in planned(here, gmis_per_gpu=2).reasons[0]
+        Plan(Layout(((0,),)), slices, "cpu", "tcg_ex", 8, "none", "host", ("trainer",))
 
 
 def test_every_auto_has_a_reason_and_explicit_choices_have_none():
@@ -70,106 +68,55 @@ def test_every_auto_has_a_reason_and_explicit_choices_have_none():
     assert explicit.reasons == ()
 
 
+TWO_BY_TWO = {"gpus": 2, "gmis_per_gpu": 2}
+UNEVEN = {"layout": ((0, 1), (2,))}
+DEVICE = {"selection": "device"}
+
+
 @pytest.mark.parametrize(
-    ("changes", "strategy", "why"),
+    ("backend", "is_installed", "reduce", "changes", "strategy", "why"),
     [
-        ({}, "none", "one GMI"),
-        ({"gmis_per_gpu": 2}, "mpr", "(Algorithm 1)"),
-        ({"gpus": 2, "gmis_per_gpu": 2}, "mpr", "Algorithm 1 says mrr"),
-        ({"gpus": 2, "gmis_per_gpu": 3}, "mpr", "Algorithm 1 says har"),
-        ({"layout": ((0, 1), (2,))}, "mpr", "Algorithm 1 says har"),
+        ("cpu", True, {}, {}, "none", "one GMI"),
+        ("cpu", True, {}, {"gmis_per_gpu": 2}, "mpr", "(Algorithm 1)"),
+        ("cpu", True, {}, TWO_BY_TWO, "mpr", "Algorithm 1 says mrr"),
+        ("cpu", True, {}, UNEVEN, "mpr", "Algorithm 1 says har"),
+        ("share", True, DEVICE, TWO_BY_TWO, "one_shot", "GMIs that share"),
+        ("share", True, DEVICE, {"gmis_per_gpu": 3}, "one_shot", "GMIs that share"),
+        ("share", True, DEVICE, UNEVEN, "one_shot", "GMIs that share"),
+        # One program trains on all GPUs.
+        ("share", True, DEVICE, {"gpus": 2}, "mrr", "(Algorithm 1)"),
+        ("share", True, {"selection": "paper"}, TWO_BY_TWO, "mrr", "(Algorithm 1)"),
+        ("share", True, {"selection": "paper"}, {"gmis_per_gpu": 3}, "mpr", "(Algorithm 1)"),
+        ("share", True, DEVICE | {"intra": "host"}, {"gmis_per_gpu": 2}, "mpr", "(Algorithm 1)"),
+        ("share", False, DEVICE, {"gmis_per_gpu": 2}, "mpr", "(Algorithm 1)"),
+        ("share", False, DEVICE, TWO_BY_TWO, "mpr", "Algorithm 1 says mrr"),
+        ("share", False, DEVICE, {"gpus": 2}, "mpr", "Algorithm 1 says mrr"),
+        ("share", False, {"selection": "paper"}, {"gmis_per_gpu": 2}, "mpr", "(Algorithm 1)"),
+        ("share", False, DEVICE | {"intra": "host"}, {"gmis_per_gpu": 2}, "mpr", "(Algorithm 1)"),
+        ("cpu", False, DEVICE, {"gmis_per_gpu": 2}, "mpr", "(Algorithm 1)"),
     ],
 )
-def test_auto_tells_what_algorithm_1_says_and_keeps_to_host_memory(
-    changes: dict[str, Any], strategy: str, why: str
+def test_auto_exchanges_on_gpus_where_it_can_else_by_algorithm_1_and_says_why(
+    backend: str,
+    is_installed: bool,
+    reduce: dict[str, Any],
+    changes: dict[str, Any],
+    strategy: str,
+    why: str,
+    monkeypatch: pytest.MonkeyPatch,
 ):
-    plan = planned(machine(0), **changes)
+    monkeypatch.setattr(reduction, "_is_installed", lambda *_: is_installed)
+    plan = planned(machine(0 if backend == "cpu" else 2), reduce, backend=backend, **changes)
     assert plan.strategy == strategy
     (reason,) = [text for text in plan.reasons if text.startswith("strategy")]
     assert reason.startswith(f"strategy {strategy}: ")
     assert why in reason
-
-
-@pytest.mark.parametrize(
-    ("changes", "selection", "strategy"),
-    [
-        ({"gpus": 2, "gmis_per_gpu": 2}, "device", "one_shot"),
-        ({"gmis_per_gpu": 3}, "device", "one_shot"),
-        ({"layout": ((0, 1), (2,))}, "device", "one_shot"),
-        # One program trains on all GPUs.
-        ({"gpus": 2}, "device", "mrr"),
-        ({"gpus": 2, "gmis_per_gpu": 2}, "paper", "mrr"),
-        ({"gmis_per_gpu": 3}, "paper", "mpr"),
-    ],
-)
-@pytest.mark.parametrize("is_installed", [True, False])
-def test_gmis_that_share_a_gpu_exchange_on_it_where_they_can(
-    changes: dict[str, Any],
-    selection: str,
-    strategy: str,
-    is_installed: bool,
-    monkeypatch: pytest.MonkeyPatch,
-):
-    monkeypatch.setattr(reduction, "_is_installed", lambda *_: is_installed)
-    by_paper = planned(machine(2), {"selection": "paper"}, backend="share", **changes).strategy
-    assert is_installed or by_paper == "mpr"
-    plan = planned(machine(2), {"selection": selection}, backend="share", **changes)
-    assert plan.strategy == (strategy if is_installed else by_paper)
-    (reason,) = [text for text in plan.reasons if text.startswith("strategy")]
-    assert ("one_shot: GMIs that share" in reason) == (is_installed and strategy == "one_shot")
-    assert "Algorithm 1" in reason
-    assert plan.intra == ("ipc" if is_installed else "host")
-
-
-@pytest.mark.parametrize(
-    ("reduce", "changes", "backend", "is_told"),
-    [
-        ({}, {"gmis_per_gpu": 2}, "share", True),
-        ({}, {"gmis_per_gpu": 2, "gpus": 2}, "share", True),
-        ({"selection": "paper"}, {"gmis_per_gpu": 2}, "share", False),
-        ({"intra": "host"}, {"gmis_per_gpu": 2}, "share", False),
-        ({}, {"gpus": 2}, "share", True),  # There are no rings either.
-        ({}, {"gmis_per_gpu": 2}, "cpu", False),
-    ],
-)
-def test_a_plan_that_leaves_the_fast_path_says_what_would_bring_it(
-    reduce: dict[str, Any],
-    changes: dict[str, Any],
-    backend: str,
-    is_told: bool,
-    monkeypatch: pytest.MonkeyPatch,
-):
-    monkeypatch.setattr(reduction, "_is_installed", lambda *_: False)
-    plan = planned(machine(2), {"selection": "device"} | reduce, backend=backend, **changes)
-    (reason,) = [text for text in plan.reasons if text.startswith("strategy")]
+    # A plan that leaves the fast path says what would bring it.
     lacking = "one_shot would train faster: exchanges between GMIs on GPUs need the package cuda-b"
-    assert (lacking in reason) == is_told
-
-
-def test_who_wants_host_memory_gets_what_algorithm_1_says(monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr(reduction, "_is_installed", lambda *_: True)
-    reduce = {"selection": "device", "intra": "host"}
-    plan = planned(machine(1), reduce, backend="share", gmis_per_gpu=2)
-    assert (plan.strategy, plan.intra) == ("mpr", "host")
-
-
-@pytest.mark.parametrize(
-    ("reduce", "changes", "message"),
-    [
-        (
-            {"strategy": "mrr"},
-            {"layout": ((0, 1), (2,))},
-            r"mrr: .* \[\[0,1\],\[2\]\]: every",
-        ),
-        ({"strategy": "flat"}, {"gpus": 2, "gmis_per_gpu": 2}, r"flat: .*NCCL before 2\.30"),
-        ({"intra": "ipc"}, {"gmis_per_gpu": 2}, r"intra=ipc: .*\[\[0,1\]\]: CUDA IPC needs"),
-    ],
-)
-def test_a_reduction_that_cannot_run_is_refused(
-    reduce: dict[str, Any], changes: dict[str, Any], message: str
-):
-    with pytest.raises(ConfigError, match=message):
-        make_plan(plan_config(**changes), reduce_config(**reduce), 64, machine(0))
+    is_device = reduce.get("selection", "device") == "device" and reduce.get("intra") != "host"
+    assert (lacking in reason) == (backend == "share" and not is_installed and is_device)
+    on_gpu = backend == "share" and is_installed and reduce.get("intra") != "host"
+    assert plan.intra == ("ipc" if on_gpu else "host")
 
 
 @pytest.mark.parametrize(
@@ -182,16 +129,21 @@ def test_a_reduction_that_cannot_run_is_refused(
         (machine(1), {"sm_percent": 50.0, "backend": "share"}, "only the mps backend"),
         (machine(0), {"sm_percent": 50.0}, "only the mps backend can cap SMs, the backend is cpu"),
         (machine(1), {"gmis_per_gpu": 2, "memory_fraction": 0.5}, "would reserve 1.00"),
+        (ON_MPS, {"gmis_per_gpu": 49}, "MPS of driver 580.159.03 allows at most 48"),
+        (NEW_DRIVER, {"gmis_per_gpu": 61}, "MPS of driver 590.44 allows at most 60"),
         (
-            machine(1, mps_control=MPS),
-            {"gmis_per_gpu": 49},
-            "MPS of driver 580.159.03 allows at most 48",
+            machine(0),
+            {"layout": ((0, 1), (2,)), "strategy": "mrr"},
+            r"mrr: .*,\[2\]\]: every ring",
         ),
+        (machine(0), {"gmis_per_gpu": 2, "intra": "ipc"}, r"ipc: .*\[\[0,1\]\]: CUDA IPC needs"),
     ],
 )
 def test_values_that_do_not_fit_are_refused(here: Machine, changes: dict[str, Any], message: str):
+    reduce = {key: value for key, value in changes.items() if key in ("strategy", "intra")}
+    plan = {key: value for key, value in changes.items() if key not in reduce}
     with pytest.raises(ConfigError, match=message):
-        planned(here, **changes)
+        planned(here, reduce, **plan)
 
 
 @pytest.mark.parametrize(
@@ -218,22 +170,10 @@ def test_gpus_in_mig_mode_are_passed_over():
         planned(here, gpus=3)
 
 
-def test_new_drivers_allow_more_clients():
-    here = machine(1, mps_control=MPS, driver_version="590.44")
-    assert planned(here, gmis_per_gpu=60).layout.num_gmis == 60
-    with pytest.raises(ConfigError, match="at most 60"):
-        planned(here, gmis_per_gpu=61)
-
-
-def test_memory_is_split_over_the_gmis_of_a_gpu():
-    plan = planned(machine(2), layout=((0, 1), (2,)))
+def test_memory_is_split_over_the_gmis_of_a_gpu_and_gpus_can_be_chosen_by_index():
+    plan = planned(machine(3), gpus=(2, 0), layout=((0, 1), (2,)))
     assert [share.memory_fraction for share in plan.slices] == [0.4, 0.4, 0.8]
-    assert [share.device for share in plan.slices] == [gpu(0).uuid, gpu(0).uuid, gpu(1).uuid]
-
-
-def test_gpus_can_be_chosen_by_index():
-    plan = planned(machine(3), gpus=(2, 0))
-    assert [share.device for share in plan.slices] == [gpu(2).uuid, gpu(0).uuid]
+    assert [share.device for share in plan.slices] == [gpu(2).uuid, gpu(2).uuid, gpu(0).uuid]
 
 
 def test_any_number_of_gpus_is_virtual_on_cpu():

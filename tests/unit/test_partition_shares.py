@@ -28,11 +28,8 @@ def caps(plan: Plan) -> list[float | None]:
     return [share.sm_percent for share in plan.slices]
 
 
-def test_there_is_no_cap_by_default():
+def test_every_gmi_can_have_its_own_share_and_none_is_the_default():
     assert caps(planned()) == [None, None]
-
-
-def test_every_gmi_can_have_its_own_share():
     plan = planned(sm_percent=(50.0, 25.0), memory_fraction=(0.5, 0.2))
     assert caps(plan) == [50.0, 25.0]
     assert [share.memory_fraction for share in plan.slices] == [0.5, 0.2]
@@ -49,10 +46,8 @@ def test_one_value_per_gmi_or_one_for_all(key: str):
 )
 def test_even_shares_keep_clear_of_bad_values_on_hopper(gmis_per_gpu: int, cap: float):
     assert caps(planned(gmis_per_gpu, sm_percent="even")) == [cap] * gmis_per_gpu
-
-
-def test_even_shares_elsewhere_are_plain():
-    assert caps(planned(3, sm_percent="even", here={"gpus": AMPERE})) == [33.3] * 3
+    plain = planned(gmis_per_gpu, sm_percent="even", here={"gpus": AMPERE})
+    assert caps(plain) == [round(100 / gmis_per_gpu, 1)] * gmis_per_gpu
 
 
 @pytest.mark.parametrize("percent", [14.0, 20.0, 33.0, 46.0, 66.0, 89.9])
@@ -66,15 +61,12 @@ def test_bad_values_are_refused_on_hopper_unless_forced(percent: float):
     assert caps(planned(sm_percent=percent, here={"gpus": AMPERE})) == [percent] * 2
 
 
-def test_no_value_between_the_clean_ones_counts_as_clean():
+def test_no_cap_between_the_clean_ones_or_measured_to_be_wrong_counts_as_clean():
     assert [percent for percent in range(1, 101) if is_clean(percent)] == [
         *range(1, 14), *range(23, 28), *range(47, 52), *range(90, 101)
     ]  # fmt: skip
     assert is_clean(12.5)
     assert not is_clean(13.5)
-
-
-def test_no_cap_that_was_measured_to_be_wrong_counts_as_clean():
     rows = json.loads(MEASURED.read_text())["rows"]
     wrong = [
         row["sm_percent"] for row in rows if any(product["wrong"] for product in row["products"])
@@ -110,6 +102,7 @@ def priorities(plan: Plan) -> list[str | None]:
 
 def test_trainers_go_first_where_that_is_wanted():
     assert priorities(planned(3)) == [None] * 3
+    assert planned(1, mps_priority=("normal",)).backend == "mps"
     apart = {"template": "decoupled", "mps_priority": "trainers_first"}
     first = make_plan(
         plan_config(gmis_per_gpu=3, **apart), reduce_config(), 64, machine(1, mps_control=MPS),
@@ -120,10 +113,6 @@ def test_trainers_go_first_where_that_is_wanted():
         "below_normal",
         "normal",
     ]
-
-
-def test_a_priority_asks_for_mps():
-    assert planned(1, mps_priority=("normal",)).backend == "mps"
 
 
 @pytest.mark.parametrize(

@@ -8,6 +8,7 @@ from collections.abc import Iterator
 from typing import Any, NamedTuple
 
 import numpy as np
+import numpy.typing as npt
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -50,6 +51,10 @@ def open_ends() -> Iterator[Ends]:
     os.close(fd)
 
 
+def raw(num_bytes: int) -> npt.NDArray[np.uint8]:
+    return np.zeros(num_bytes, np.uint8)
+
+
 def test_lines_are_cache_lines() -> None:
     assert LINE.itemsize == END.itemsize == LINE_BYTES == 64
     assert HEAD.itemsize <= LINE_BYTES
@@ -68,12 +73,12 @@ def test_messages_come_out_whole_and_in_order(sizes: list[list[int]], is_put: li
             wanted = next(todo, None) if puts else None
             if wanted is not None:
                 parts = [np.random.default_rng(number).bytes(size) for size in wanted]
-                if ends.writer.try_put(parts, tag=number):
+                if ends.writer.try_put([np.frombuffer(part, np.uint8) for part in parts]):
                     waiting.append(parts)
             message = None if puts else ends.reader.try_get()
             assert puts or (message is None) == (not waiting)
             if message is not None:
-                assert [part.tobytes() for part in message.parts] == waiting.pop(0)
+                assert [part.tobytes() for part in message] == waiting.pop(0)
         assert ends.writer.messages - len(waiting) == ends.reader.messages + (message is not None)
         assert ends.writer.released_messages == ends.reader.messages
 
@@ -82,22 +87,21 @@ def test_the_largest_message_fits_wherever_the_ring_stands(ends: Ends) -> None:
     largest = ends.writer.max_message_bytes
     whole = largest - message_bytes([0])
     for number in range(50):
-        ends.writer.put([bytes(64 * number)], timeout_s=0.0)
+        ends.writer.put([raw(64 * number)], timeout_s=0.0)
         ends.reader.get(timeout_s=0.0)
         ends.reader.release()
         ends.writer.put([np.full(whole, number, np.uint8)], timeout_s=0.0)
-        assert (ends.reader.get(timeout_s=0.0).parts[0] == number).all()
+        assert (ends.reader.get(timeout_s=0.0)[0] == number).all()
         ends.reader.release()
     with pytest.raises(CollectiveError, match=f"at most {largest}"):
-        ends.writer.try_put([bytes(whole + 1)])
+        ends.writer.try_put([raw(whole + 1)])
 
 
 def test_arrays_of_any_strides_are_written_without_a_copy_of_theirs(ends: Ends) -> None:
     values = np.arange(60, dtype=np.float32).reshape(3, 4, 5)
-    ends.writer.put([values[:, 1:3], np.array([True, False])], timeout_s=1.0, tag=7)
+    ends.writer.put([values[:, 1:3], np.array([True, False])], timeout_s=1.0)
     message = ends.reader.get(timeout_s=1.0)
-    assert message.tag == 7
-    received = message.parts[0].view(np.float32).reshape(3, 2, 5)
+    received = message[0].view(np.float32).reshape(3, 2, 5)
     np.testing.assert_array_equal(received, values[:, 1:3])
     assert not received.flags.writeable
     assert received.ctypes.data % 64 == 0
@@ -106,33 +110,29 @@ def test_arrays_of_any_strides_are_written_without_a_copy_of_theirs(ends: Ends) 
 def test_a_full_pipe_and_an_empty_one_wait_no_longer_than_told(ends: Ends) -> None:
     with pytest.raises(CollectiveTimeout, match=r"rank 1: waited 0.01 s in get.* ranks \[0\]"):
         ends.reader.get(timeout_s=0.01)
-    while ends.writer.try_put([bytes(1000)]):
+    while ends.writer.try_put([raw(1000)]):
         pass
     with pytest.raises(CollectiveTimeout, match=r"rank 0: waited 0.01 s in put.* ranks \[1\]"):
-        ends.writer.put([bytes(1000)], timeout_s=0.01)
+        ends.writer.put([raw(1000)], timeout_s=0.01)
     assert ends.blocks[0].outstanding_bytes(1) == ends.writer.outstanding_bytes > 6000
     held = ends.reader.try_get()
     assert held is not None
-    assert not ends.writer.try_put([bytes(1000)]), "views of the reader must not be overwritten"
+    assert not ends.writer.try_put([raw(1000)]), "views of the reader must not be overwritten"
     ends.reader.release()
-    assert ends.writer.try_put([bytes(900)])
+    assert ends.writer.try_put([raw(900)])
 
 
-def test_a_closed_pipe_gives_what_is_in_it_and_then_says_so(ends: Ends) -> None:
-    ends.writer.put([b"last"], timeout_s=1.0)
-    ends.writer.close()
-    assert ends.reader.get(timeout_s=1.0).parts[0].tobytes() == b"last"
-    with pytest.raises(PipeClosed, match="peer 0 has closed"):
-        ends.reader.get(timeout_s=1.0)
-    ends.reader.close()
-    with pytest.raises(PipeClosed, match="peer 1 has closed"):
-        ends.writer.put([b"more"], timeout_s=1.0)
-
-
-def test_a_process_that_leaves_is_not_waited_for(ends: Ends) -> None:
-    ends.blocks[0].close()
+@pytest.mark.parametrize("is_all", [False, True], ids=["pipe", "process"])
+def test_what_is_closed_gives_what_is_in_it_and_then_says_so(ends: Ends, is_all: bool) -> None:
+    ends.writer.put([raw(4)], timeout_s=1.0)
+    (ends.blocks[0] if is_all else ends.writer).close()
+    assert ends.reader.get(timeout_s=1.0)[0].size == 4
     with pytest.raises(PipeClosed, match="peer 0 has closed"):
         ends.reader.get(timeout_s=5.0)
+    ends.reader.close()
+    if not is_all:
+        with pytest.raises(PipeClosed, match="peer 1 has closed"):
+            ends.writer.put([raw(4)], timeout_s=1.0)
 
 
 @pytest.mark.parametrize("offset", [0, 8, 16, 24, 32, 40, 64, 128, 1151])
@@ -155,9 +155,6 @@ def test_senseless_numbers_and_other_blocks_are_refused(ends: Ends) -> None:
     assert len(os.listdir("/proc/self/fd")) == descriptors
     empty = os.memfd_create("empty", os.MFD_CLOEXEC)
     with pytest.raises(CollectiveError, match="rank 1: no pipes at descriptor"):
-        PipeBlock(empty, 1)
-    os.pwrite(empty, bytes(64), 0)
-    with pytest.raises(CollectiveError, match=r"it begins with \(0, 0\), not"):
         PipeBlock(empty, 1)
     os.close(empty)
 
@@ -197,7 +194,7 @@ def test_there_is_a_fence_wherever_the_order_of_accesses_counts(
         end._own = Noted(end._own, seen)
         end._fence = lambda: seen.append("fence")
     seen.clear()
-    ends.writer.put([b"one"], timeout_s=0.0)
+    ends.writer.put([raw(3)], timeout_s=0.0)
     assert seen == ["fence", "fence", "read position"]
     ends.reader.get(timeout_s=0.0)
     seen.clear()
@@ -207,10 +204,8 @@ def test_there_is_a_fence_wherever_the_order_of_accesses_counts(
     assert seen[-1] == "fence"
 
 
-@pytest.mark.parametrize("page_bytes", [4096, 65536])
-def test_rings_begin_at_pages_of_this_machine(
-    page_bytes: int, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_rings_begin_at_pages_of_this_machine(monkeypatch: pytest.MonkeyPatch) -> None:
+    page_bytes = 65536
     monkeypatch.setattr("mmap.PAGESIZE", page_bytes)
     fd = create_pipes(2, 2 * page_bytes)
     block = PipeBlock(fd, 0)

@@ -87,43 +87,40 @@ def test_jobs_are_told_that_experience_could_stay_on_the_gpu(
     overrides: tuple[str, ...], is_told: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(reduction, "_is_installed", lambda *_: True)
-    config = compose("env=ant", "algo=a3c", "plan.backend=share", *overrides)
-    plan = training_plan(config, machine(2))
+    here, share = machine(2), ("env=ant", "algo=a3c", "plan.backend=share")
+    plan = training_plan(compose(*share, *overrides), here)
     assert any("channel.transport=device keeps" in why for why in plan.reasons) == is_told
-
-
-def test_experience_cannot_stay_on_a_gpu_where_nobody_trains(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    monkeypatch.setattr(reduction, "_is_installed", lambda *_: True)
-    apart = ("plan.serving_gpus=1", "plan.training_gpus=1", "channel.transport=device")
-    config = compose("env=ant", "algo=a3c", "plan.backend=share", *apart)
-    with pytest.raises(ConfigError, match="agent 1 is on GPU 0 of the job, where nobody trains"):
-        training_plan(config, machine(2))
+    if "plan.serving_gpus=1" in overrides:
+        config = compose(*share, *overrides, "channel.transport=device")
+        with pytest.raises(ConfigError, match="agent 1 is on GPU 0 of the job, where nobody tr"):
+            training_plan(config, here)
 
 
 UNEVEN = Layout(((3, 1), (0, 2, 4)))
 
 
-def test_colocated_templates_give_every_gmi_the_same_roles():
-    assert roles_of("tcg", UNEVEN) == ("simulator+agent",) * 5
-    assert roles_of("tcg_ex", UNEVEN) == ("simulator+agent+trainer",) * 5
-
-
-def test_dedicated_templates_have_one_agent_or_trainer_on_every_gpu():
-    assert roles_of("tdg", UNEVEN) == ("agent", "agent", "simulator", "simulator", "simulator")
-    assert roles_of("tdg_ex", UNEVEN)[:3] == ("trainer", "trainer", "simulator+agent")
+@pytest.mark.parametrize(
+    ("template", "trainers", "roles"),
+    [
+        ("tcg", (), ("simulator+agent",) * 5),
+        ("tcg_ex", (), ("simulator+agent+trainer",) * 5),
+        ("tdg", (), ("agent", "agent", "simulator", "simulator", "simulator")),
+        ("tdg_ex", (), ("trainer", "trainer", *("simulator+agent",) * 3)),
+        (
+            "decoupled",
+            (2, 4),
+            (*("simulator+agent",) * 2, "trainer", "simulator+agent", "trainer"),
+        ),
+    ],
+)
+def test_roles_by_template(template, trainers, roles):
+    assert roles_of(template, UNEVEN, trainers) == roles
 
 
 @pytest.mark.parametrize("template", ["tdg", "tdg_ex"])
 def test_dedicated_templates_need_two_gmis_on_every_gpu(template):
     with pytest.raises(ConfigError, match=r"GPU 1 of layout \[\[0,1\],\[2\]\] has one GMI"):
         roles_of(template, Layout(((0, 1), (2,))))
-
-
-def test_decoupled_trains_where_it_is_told():
-    roles = roles_of("decoupled", UNEVEN, trainers=(2, 4))
-    assert roles == (*("simulator+agent",) * 2, "trainer", "simulator+agent", "trainer")
 
 
 def test_a_group_has_ranks_of_its_own_and_no_empty_gpu():
@@ -135,35 +132,18 @@ def test_a_group_has_ranks_of_its_own_and_no_empty_gpu():
     assert group_of(layout, ("agent",) * 5, TRAINER) is None
 
 
-def test_the_plan_carries_roles_and_only_trainers_reduce():
-    def planned(**changes) -> Plan:
-        return make_plan(plan_config(**changes), reduce_config(), 8, machine(0))
+def test_only_trainers_reduce_and_their_layout_decides_how():
+    def planned(gpus: int, gmis_per_gpu: int, template: str, strategy: str = "auto") -> Plan:
+        config = plan_config(gpus=gpus, gmis_per_gpu=gmis_per_gpu, template=template)
+        return make_plan(config, reduce_config(strategy=strategy), 8, machine(0))
 
-    assert planned(gpus=2, gmis_per_gpu=2, template="tdg").strategy == "none"
-    assert planned(gpus=1, gmis_per_gpu=3, template="tdg_ex").strategy == "none"
-    two = planned(gpus=2, gmis_per_gpu=2, template="tdg_ex")
+    assert planned(2, 2, "tdg").strategy == "none"
+    assert planned(1, 3, "tdg_ex").strategy == "none"
+    two = planned(2, 2, "tdg_ex")
     assert two.strategy == "mpr"
     assert two.roles == ("trainer", "simulator+agent") * 2
     assert Plan.from_dict(json.loads(json.dumps(two.to_dict()))) == two
-
-
-def test_the_layout_of_the_trainers_decides_how_they_reduce():
-    def planned(strategy: str, gmis_per_gpu: int = 2) -> Plan:
-        config = plan_config(gpus=2, gmis_per_gpu=gmis_per_gpu, template="tdg_ex")
-        return make_plan(config, reduce_config(strategy=strategy), 8, machine(0))
-
-    plan = planned("flat")  # One trainer on every GPU, whatever else is there.
-    assert plan.strategy == "flat"
-    assert plan.training_layout.gmis_of_gpu == ((0,), (1,))
-    assert planned("mrr").strategy == "mrr"
-    alone = plan_config(gpus=1, gmis_per_gpu=2, template="tdg_ex")
-    with pytest.raises(
-        ConfigError, match=r"reduce\.strategy=flat: cannot run on layout \[\[0\]\]"
-    ):
-        make_plan(alone, reduce_config(strategy="flat"), 8, machine(0))
-
-
-def test_plans_of_older_versions_have_holistic_gmis():
-    data = make_plan(plan_config(gmis_per_gpu=2), reduce_config(), 8, machine(0)).to_dict()
-    del data["roles"]
-    assert Plan.from_dict(data).roles == ("simulator+agent+trainer",) * 2
+    flat = planned(2, 2, "tdg_ex", "flat")  # One trainer on every GPU, whatever else is there.
+    assert flat.strategy == "flat"
+    with pytest.raises(ConfigError, match=r"strategy=flat: cannot run on layout \[\[0\]\]"):
+        planned(1, 2, "tdg_ex", "flat")

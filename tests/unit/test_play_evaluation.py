@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import shutil
-import subprocess
-import sys
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -20,7 +18,7 @@ from gmijax.machine.nvidia import Gpu
 from gmijax.machine.snapshot import Machine
 from gmijax.runs.folder import EXIT_NO_GL, META, PlayPaths, RunPaths, write_json
 from gmijax.runs.resume import CheckpointMeta
-from gmijax.supervise.launcher import environment_of
+from gmijax.supervise.supervisor import environment_of
 
 
 def config_of(*overrides: str) -> PlayConfig:
@@ -69,13 +67,13 @@ def test_a_checkpoint_outside_of_its_run_is_bad_input(run: RunPaths, tmp_path: P
 @pytest.mark.parametrize(
     ("overrides", "message"),
     [
-        (("run.dir=nowhere",), "run.dir=nowhere: no such folder"),
         (("run.dir=last",), "run.dir=last: no run with a checkpoint in runs/"),
+        (("run.dir={other}", "checkpoint={run}/checkpoints/000000000100"), "not of run.dir="),
         (("run.dir={run}", "checkpoint=7"), "checkpoint=7: no such checkpoint.*are 100, 2000"),
         (("checkpoint=nowhere",), "checkpoint=nowhere: expected the folder of a checkpoint"),
     ],
 )
-def test_a_checkpoint_that_is_not_there_is_bad_input(
+def test_a_checkpoint_that_cannot_be_meant_is_bad_input(
     run: RunPaths,
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
@@ -84,7 +82,8 @@ def test_a_checkpoint_that_is_not_there_is_bad_input(
 ):
     (tmp_path / "empty").mkdir()
     monkeypatch.chdir(tmp_path / "empty")
-    config = config_of(*(text.format(run=run.root) for text in overrides))
+    other = shutil.copytree(run.root, tmp_path / "runs" / "y")
+    config = config_of(*(text.format(run=run.root, other=other) for text in overrides))
     with pytest.raises(ConfigError, match=message):
         evaluation._find(config)
 
@@ -95,14 +94,6 @@ def test_worlds_cannot_be_drawn_from_no_ranges(run: RunPaths, monkeypatch: pytes
     config = config_of(f"run.dir={run.root}", "randomize=on")
     with pytest.raises(ConfigError, match="names nothing to draw"):
         evaluation.play(config)
-
-
-def test_a_checkpoint_of_another_run_is_bad_input(run: RunPaths, tmp_path: Path):
-    other = tmp_path / "runs" / "y"
-    shutil.copytree(run.root, other)
-    config = config_of(f"run.dir={other}", f"checkpoint={run.checkpoint(100)}")
-    with pytest.raises(ConfigError, match=r"not of run\.dir"):
-        evaluation._find(config)
 
 
 def test_playing_leaves_a_gpu_to_the_job_that_trains_on_it(run: RunPaths):
@@ -131,17 +122,26 @@ def test_every_opengl_is_tried_the_users_first(
         return {"glfw": EXIT_NO_GL, "egl": -11, "osmesa": 0}[gl]
 
     monkeypatch.setattr(pictures, "_render", render)
-    assert pictures.film(config_of(), PlayPaths(tmp_path), quiet) == ()
+    pictures.film(config_of(), PlayPaths(tmp_path), quiet)
     assert tried == ["glfw", "egl", "osmesa"]
 
 
-@pytest.mark.parametrize(("exit_code", "name"), [(-9, "SIGKILL"), (-15, "SIGTERM")])
-def test_a_renderer_that_somebody_ended_is_no_missing_opengl(
-    tmp_path: Path, quiet: Console, monkeypatch: pytest.MonkeyPatch, exit_code: int, name: str
+@pytest.mark.parametrize(
+    ("exit_code", "why"),
+    [
+        (-9, "the renderer was ended by SIGKILL: OSError: disk full"),
+        (-15, "the renderer was ended by SIGTERM"),
+        (1, "OSError: disk full"),
+    ],
+)
+def test_a_renderer_that_fails_for_another_reason_says_why(
+    tmp_path: Path, quiet: Console, monkeypatch: pytest.MonkeyPatch, exit_code: int, why: str
 ):
+    paths = PlayPaths(tmp_path)
+    paths.render_log.write_text("Traceback\nOSError: disk full\n")
     monkeypatch.setattr(pictures, "_render", lambda *_: exit_code)
-    with pytest.raises(GmijaxError, match=f"no video: the renderer was ended by {name} .*log: "):
-        pictures.film(config_of("video=auto"), PlayPaths(tmp_path), quiet)
+    with pytest.raises(GmijaxError, match=f"no video: {why}.*log: "):
+        pictures.film(config_of("video=auto"), paths, quiet)
 
 
 def test_without_opengl_only_a_film_that_was_asked_for_is_an_error(
@@ -151,19 +151,14 @@ def test_without_opengl_only_a_film_that_was_asked_for_is_an_error(
     monkeypatch.setattr(pictures, "_render", lambda *_: EXIT_NO_GL)
     paths = PlayPaths(tmp_path)
     paths.render_log.write_text("Traceback\nImportError: no library\n")
-    assert pictures.film(config_of("video=auto"), paths, quiet) == ()
+    pictures.film(config_of("video=auto"), paths, quiet)
     with pytest.raises(GmijaxError, match=r"egl, osmesa.*libegl1.*libosmesa6.*no library.*log: "):
         pictures.film(config_of("video=gif"), paths, quiet)
 
 
-def test_a_renderer_that_fails_for_another_reason_says_why(
-    tmp_path: Path, quiet: Console, monkeypatch: pytest.MonkeyPatch
-):
-    paths = PlayPaths(tmp_path)
-    paths.render_log.write_text("Traceback\nOSError: disk full\n")
-    monkeypatch.setattr(pictures, "_render", lambda *_: 1)
-    with pytest.raises(GmijaxError, match="no video: OSError: disk full"):
-        pictures.film(config_of("video=auto"), paths, quiet)
+def test_a_film_that_was_asked_for_of_a_task_without_a_model_is_an_error(quiet: Console):
+    with pytest.raises(GmijaxError, match="point has no model that could be filmed; the returns"):
+        evaluation._accept_nothing_to_see(config_of("video=gif"), "point", quiet)
 
 
 def test_a_missing_opengl_is_noticed_by_the_child(tmp_path: Path):
@@ -171,9 +166,3 @@ def test_a_missing_opengl_is_noticed_by_the_child(tmp_path: Path):
     write_json(RunPaths(tmp_path).config, to_dict(config_of()))
     code = pictures._render("no-such-gl", PlayPaths(tmp_path))
     assert code == EXIT_NO_GL, PlayPaths(tmp_path).render_log.read_text()
-
-
-def test_the_controller_loads_no_jax():
-    code = "import sys, gmijax.play; print(sorted({'jax', 'mujoco', 'flax'} & sys.modules.keys()))"
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert done.stdout.strip() == "[]"

@@ -1,6 +1,7 @@
 """Losses and advantages of PPO, against hand arithmetic and plain loops."""
 
 import dataclasses
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -16,32 +17,34 @@ T, N = 7, 3
 NEUTRAL = UpdateContext(jnp.zeros(()), jnp.ones(()), jnp.zeros(A))
 
 
-@pytest.fixture(scope="module")
-def networks():
-    return make_actor_critic(A, (8,), (8,), 1.0)
+NETWORKS = make_actor_critic(A, (8,), (8,), 1.0)
+LOSS = jax.jit(ppo_loss, static_argnames=("networks", "config"))
 
 
 @pytest.fixture(scope="module")
-def params(networks):
-    return networks.init(jax.random.key(0), O)
+def params():
+    return jax.jit(NETWORKS.init, static_argnums=1)(jax.random.key(0), O)
 
 
-@pytest.fixture(scope="module")
-def config():
-    return dataclasses.replace(compose().algo, entropy_cost=0.0, bound_cost=0.0, value_cost=0.0)
+def _loss(params, samples: Samples, context: UpdateContext = NEUTRAL, **costs: Any):
+    """Loss and its parts with the clipped surrogate alone, and `costs`."""
+    only = {"entropy_cost": 0.0, "bound_cost": 0.0, "value_cost": 0.0, "clip_value_loss": False}
+    config = dataclasses.replace(compose().algo, **(only | costs))
+    return LOSS(params, samples, context, networks=NETWORKS, config=config)
 
 
-def _samples(networks, params, advantage: float, log_ratio: float = 0.0) -> Samples:
+@jax.jit
+def _samples(params, advantage: float, log_ratio: float = 0.0) -> Samples:
     """Samples whose probability ratio under `params` is exp(log_ratio)."""
     obs = jax.random.normal(jax.random.key(1), (B, O))
-    mean = networks.action_mean(params, obs)
+    mean = NETWORKS.action_mean(params, obs)
     action = mean + 0.3
     return Samples(
         obs=obs,
         action=action,
         log_prob=log_prob(mean, params.log_std, action) - log_ratio,
         mean=mean,
-        value=networks.state_value(params, obs),
+        value=NETWORKS.state_value(params, obs),
         advantage=jnp.full(B, advantage),
     )
 
@@ -53,51 +56,41 @@ def _samples(networks, params, advantage: float, log_ratio: float = 0.0) -> Samp
         (1.0, 0.5, 0.5),  # a loss of probability of a good action is not
         (-1.0, 0.5, -0.8),  # for a bad action the pessimist takes the clipped value
         (-1.0, 1.5, -1.5),
+        (1.0, 1.0, 1.0),  # before the first update
     ],
 )
-def test_the_surrogate_is_clipped(networks, params, config, advantage, ratio, surrogate) -> None:
-    samples = _samples(networks, params, advantage, float(np.log(ratio)))
-    loss, metrics = ppo_loss(params, samples, NEUTRAL, networks, config)
+def test_the_surrogate_is_clipped(params, advantage, ratio, surrogate) -> None:
+    loss, metrics = _loss(params, _samples(params, advantage, float(np.log(ratio))))
     np.testing.assert_allclose(loss, -surrogate, rtol=1e-5)
-    assert metrics.clip_fraction == 1.0
+    assert metrics.clip_fraction == float(ratio != 1.0)
+    np.testing.assert_allclose(metrics.kl, 0.0, atol=1e-6)  # The policy has not moved.
 
 
-def test_zero_advantage_gives_no_policy_gradient(networks, params, config) -> None:
-    samples = _samples(networks, params, 0.0)
-    grads = jax.grad(lambda p: ppo_loss(p, samples, NEUTRAL, networks, config)[0])(params)
+def test_zero_advantage_gives_no_policy_gradient(params) -> None:
+    grads = jax.jit(jax.grad(lambda p: _loss(p, _samples(params, 0.0))[0]))(params)
     for leaf in jax.tree.leaves(grads):
         np.testing.assert_allclose(leaf, 0.0, atol=1e-6)
 
 
-def test_no_divergence_before_the_first_update(networks, params, config) -> None:
-    _, metrics = ppo_loss(params, _samples(networks, params, 1.0), NEUTRAL, networks, config)
-    np.testing.assert_allclose(metrics.kl, 0.0, atol=1e-6)
-    assert metrics.clip_fraction == 0.0
-
-
-def test_value_loss_is_half_the_squared_error_to_the_target(networks, params, config) -> None:
-    config = dataclasses.replace(config, value_cost=1.0, clip_value_loss=False)
+def test_value_loss_is_half_the_squared_error_to_the_target(params) -> None:
     # target - value = advantage = 2, so the loss is 2 ** 2 / 2
-    _, metrics = ppo_loss(params, _samples(networks, params, 2.0), NEUTRAL, networks, config)
+    _, metrics = _loss(params, _samples(params, 2.0))
     np.testing.assert_allclose(metrics.value_loss, 2.0, rtol=1e-5)
 
 
-def test_advantages_are_shifted_and_scaled_by_the_context(networks, params, config) -> None:
+def test_advantages_are_shifted_and_scaled_by_the_context(params) -> None:
     context = NEUTRAL._replace(advantage_mean=jnp.asarray(1.0), advantage_std=jnp.asarray(2.0))
-    loss, _ = ppo_loss(params, _samples(networks, params, 5.0), context, networks, config)
+    loss, _ = _loss(params, _samples(params, 5.0), context)
     np.testing.assert_allclose(loss, -2.0, rtol=1e-5)
 
 
-def test_means_out_of_bounds_cost(networks, params, config) -> None:
-    far = params._replace(log_std=params.log_std)
+def test_means_out_of_bounds_cost(params) -> None:
     bias = jax.tree_util.tree_map_with_path(
-        lambda path, x: x + 2.0 if path[-1].key == "bias" and x.shape == (A,) else x, far.policy
+        lambda path, x: x + 2.0 if path[-1].key == "bias" and x.shape == (A,) else x, params.policy
     )
-    far = far._replace(policy=bias)
-    samples = _samples(networks, far, 0.0)
-    costly = dataclasses.replace(config, bound_cost=1.0)
+    far = params._replace(policy=bias)
     # means are about 2: two actions, (2 - 1.1) ** 2 each
-    loss, _ = ppo_loss(far, samples, NEUTRAL, networks, costly)
+    loss, _ = _loss(far, _samples(far, 0.0), bound_cost=1.0)
     np.testing.assert_allclose(loss, 2 * 0.9**2, rtol=0.1)
 
 
@@ -121,32 +114,27 @@ def _steps(seed: int = 0):
     return (*reals, terminated.astype(np.float32), truncated.astype(np.float32))
 
 
-def test_equals_a_plain_loop() -> None:
+GAE = jax.jit(gae, static_argnames=("discount", "lam"))
+
+
+@pytest.mark.parametrize("lam", [0.0, 0.8, 1.0])
+def test_advantages_are_those_of_a_plain_loop(lam: float) -> None:
     rewards, values, next_values, terminated, truncated = _steps()
     expected = np.zeros((T, N))
     later = np.zeros(N)
     for t in reversed(range(T)):
         delta = rewards[t] + 0.9 * (1 - terminated[t]) * next_values[t] - values[t]
-        later = delta + 0.9 * 0.8 * (1 - np.maximum(terminated[t], truncated[t])) * later
+        later = delta + 0.9 * lam * (1 - np.maximum(terminated[t], truncated[t])) * later
         expected[t] = later
-    actual = jax.jit(gae, static_argnames=("discount", "lam"))(
-        rewards, values, next_values, terminated, truncated, discount=0.9, lam=0.8
-    )
+    actual = GAE(rewards, values, next_values, terminated, truncated, discount=0.9, lam=lam)
     np.testing.assert_allclose(actual, expected, atol=1e-5)
-
-
-def test_lambda_zero_gives_the_td_error() -> None:
-    rewards, values, next_values, terminated, truncated = _steps()
-    actual = gae(rewards, values, next_values, terminated, truncated, discount=0.9, lam=0.0)
-    expected = rewards + 0.9 * (1 - terminated) * next_values - values
-    np.testing.assert_allclose(actual, expected, atol=1e-6)
 
 
 def test_lambda_one_without_ends_gives_discounted_returns_minus_values() -> None:
     rewards, values, _, _, _ = _steps()
-    none = jnp.zeros((T, N))
-    next_values = np.concatenate([values[1:], np.full((1, N), 2.0)])
-    actual = gae(rewards, values, next_values, none, none, discount=0.9, lam=1.0)
+    none = np.zeros((T, N), np.float32)
+    next_values = np.concatenate([values[1:], np.full((1, N), 2.0, np.float32)])
+    actual = GAE(rewards, values, next_values, none, none, discount=0.9, lam=1.0)
     returns = np.full(N, 2.0)
     for t in reversed(range(T)):
         returns = rewards[t] + 0.9 * returns
@@ -154,10 +142,8 @@ def test_lambda_one_without_ends_gives_discounted_returns_minus_values() -> None
 
 
 def test_a_truncated_step_bootstraps_and_a_terminated_one_does_not() -> None:
-    one, zero = jnp.ones((1, 1)), jnp.zeros((1, 1))
-    value, next_value = 0.5 * one, 10.0 * one
     # reward 1 + 0.9 * 10 - 0.5 = 9.5, against 1 - 0.5 = 0.5
-    truncated = gae(one, value, next_value, zero, one, discount=0.9, lam=0.95)
-    terminated = gae(one, value, next_value, one, zero, discount=0.9, lam=0.95)
-    np.testing.assert_allclose(truncated, 9.5 * one, rtol=1e-6)
-    np.testing.assert_allclose(terminated, 0.5 * one, rtol=1e-6)
+    ends = jnp.array([[0.0, 1.0]])
+    steps = jnp.ones((1, 2)), jnp.full((1, 2), 0.5), jnp.full((1, 2), 10.0)
+    advantages = gae(*steps, ends, 1.0 - ends, discount=0.9, lam=0.95)
+    np.testing.assert_allclose(advantages, [[9.5, 0.5]], rtol=1e-6)

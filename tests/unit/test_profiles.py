@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import json
-import subprocess
-import sys
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import pytest
@@ -26,15 +25,22 @@ def store(folder: Path, **changes: object) -> tuple[ProfileStore, list[str]]:
 def test_what_was_put_is_there_for_the_next_search(tmp_path: Path):
     first, _ = store(tmp_path / "new" / "folder")
     assert first.get("corun", POINT) is None
+    large, trainers = POINT._replace(num_envs=16384), POINT._replace(trainers=2)
     first.put("corun", POINT, MEASURED, 21.0)
-    first.put("corun", POINT._replace(num_envs=16384), NotRunnable("out of memory"), 5.0)
+    first.put("corun", large, NotRunnable("out of memory"), 5.0)
+    first.put("corun", trainers, MEASURED._replace(acting_per_s=5.0), 21.0)
     second, notes = store(tmp_path / "new" / "folder")
     assert second.get("corun", POINT) == MEASURED
-    assert second.get("corun", POINT._replace(num_envs=16384)) == NotRunnable("out of memory")
+    assert second.get("corun", large) == NotRunnable("out of memory")
+    assert second.get("corun", trainers) == MEASURED._replace(acting_per_s=5.0)
     for other in (POINT._replace(gmis_per_gpu=2), POINT._replace(impl="warp")):
         assert second.get("corun", other) is None
     assert second.get("isolated", POINT) is None
     assert notes == []
+    content = json.loads(first.path.read_text())
+    assert content["key"] == KEY
+    assert content["profiles"]["corun 4x2048 jax"] == {**MEASURED._asdict(), "wall_s": 21.0}
+    assert content["profiles"]["corun 4+2x2048 jax"]["acting_per_s"] == 5.0
 
 
 def test_another_device_task_or_version_has_a_file_of_its_own(tmp_path: Path):
@@ -82,24 +88,6 @@ def test_a_folder_that_cannot_be_used_is_bad_input(tmp_path: Path):
         store(tmp_path / "file" / "x")
 
 
-def test_the_file_can_be_read_by_others(tmp_path: Path):
-    first, _ = store(tmp_path)
-    first.put("corun", POINT, MEASURED, 21.0)
-    content = json.loads(first.path.read_text())
-    assert content["key"] == KEY
-    assert content["profiles"] == {"corun 4x2048 jax": {**MEASURED._asdict(), "wall_s": 21.0}}
-
-
-def test_trainers_are_part_of_the_point(tmp_path: Path):
-    first, _ = store(tmp_path)
-    with_trainers, rates = POINT._replace(trainers=2), MEASURED._replace(acting_per_s=5.0)
-    first.put("corun", with_trainers, rates, 21.0)
-    assert first.get("corun", POINT) is None
-    second, _ = store(tmp_path)
-    assert second.get("corun", with_trainers) == rates
-    assert "corun 4+2x2048 jax" in json.loads(first.path.read_text())["profiles"]
-
-
 def test_files_of_versions_without_trainers_can_be_read(tmp_path: Path):
     path = store(tmp_path)[0].path
     figures = {"env_steps_per_s": 345_000.5, "memory_mib": 812.25, "iteration_s": 0.095}
@@ -110,31 +98,17 @@ def test_files_of_versions_without_trainers_can_be_read(tmp_path: Path):
     assert notes == []
 
 
-def test_two_searches_at_once_keep_what_both_found(tmp_path: Path):
-    first, _ = store(tmp_path)
-    second, _ = store(tmp_path)
-    points = [POINT._replace(num_envs=2**power) for power in range(4)]
-    for number, point in enumerate(points):
-        (first, second)[number % 2].put("corun", point, MEASURED, 1.0)
-    third, _ = store(tmp_path)
-    assert [third.get("corun", point) for point in points] == [MEASURED] * 4
+def test_searches_at_once_keep_what_all_of_them_found(tmp_path: Path):
+    points = [POINT._replace(num_envs=size) for size in range(1, 31)]
+    stores = [store(tmp_path)[0] for _ in range(3)]
 
+    def put_all(mine: ProfileStore, some: list[Point]) -> None:
+        for point in some:
+            mine.put("corun", point, MEASURED, 1.0)
 
-def test_searches_write_one_after_the_other(tmp_path: Path):
-    script = f"""
-import sys
-from pathlib import Path
-from test_profiles import MEASURED, POINT, store
-mine, _ = store(Path({str(tmp_path)!r}))
-for size in range(20):
-    mine.put("corun", POINT._replace(num_envs=20 * int(sys.argv[1]) + size), MEASURED, 1.0)
-"""
-    started = [
-        subprocess.Popen([sys.executable, "-c", script, str(number)], cwd=Path(__file__).parent)
-        for number in range(3)
-    ]
-    assert [one.wait(timeout=60) for one in started] == [0, 0, 0]
+    with ThreadPoolExecutor(3) as pool:
+        done = [pool.submit(put_all, mine, points[k::3]) for k, mine in enumerate(stores)]
+        assert [one.result(timeout=60) for one in done] == [None] * 3
     found, notes = store(tmp_path)
-    kept = [found.get("corun", POINT._replace(num_envs=size)) for size in range(60)]
-    assert kept == [MEASURED] * 60
+    assert [found.get("corun", point) for point in points] == [MEASURED] * 30
     assert notes == []

@@ -21,17 +21,8 @@ def test_an_unknown_name_is_an_attribute_error() -> None:
         _ = getattr(gmijax, "trian")  # noqa: B009
 
 
-@pytest.mark.parametrize(
-    "module",
-    [
-        "gmijax",
-        "gmijax.cli.compose",
-        "gmijax.control.job",
-        "gmijax.control.evaluation",
-        "gmijax.control.serving",
-    ],
-)
-def test_the_controller_loads_neither_jax_nor_mujoco(module: str) -> None:
-    code = f"import {module}, sys; print(sorted({{'jax', 'mujoco', 'flax'}} & sys.modules.keys()))"
+def test_the_controller_loads_neither_jax_nor_mujoco() -> None:
+    modules = "gmijax, gmijax.train, gmijax.serve, gmijax.search, gmijax.play, gmijax.doctor"
+    code = f"import {modules}, sys; print({{'jax', 'mujoco', 'flax'}} & sys.modules.keys())"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert done.stdout.strip() == "[]"
+    assert done.stdout.strip() == "set()"

@@ -11,7 +11,7 @@ from functools import partial
 import numpy as np
 import pytest
 
-from gmijax.collectives.messages.registers import Snapshot, create_registers, open_registers
+from gmijax.collectives.messages.registers import create_registers, open_registers
 from gmijax.collectives.waits import Fence
 from gmijax.errors import CollectiveError, ConfigError
 
@@ -79,18 +79,6 @@ def test_a_value_that_is_torn_is_not_given_out(fd) -> None:
     assert (snapshot.count, snapshot.tag, snapshot.values.view(np.int32)[0]) == (3, 2, 2)
 
 
-def test_a_value_is_whole_while_the_next_one_is_written(fd) -> None:
-    writer, reader = open_registers(fd, [16])[0], open_registers(fd, [16])[0]
-    writer.publish(np.full(4, 1, np.int32), tag=1)
-    looks: list[Snapshot | None] = []
-    for number in (2, 3):
-        # Both before and after the values of the next one are there.
-        writer._fence = Interrupted(*[lambda: looks.append(reader.read())] * 2)
-        writer.publish(np.full(4, number, np.int32), tag=number)
-    found = [(look.tag, look.values[0]) for look in looks if look]
-    assert found == [(1, 1), (1, 1), (2, 2), (2, 2)]
-
-
 def test_a_reader_gives_up_on_a_writer_that_is_always_faster(fd) -> None:
     writer, reader = open_registers(fd, [16])[0], open_registers(fd, [16])[0]
     writer.publish(np.zeros(4, np.int32))
@@ -133,10 +121,8 @@ def test_readers_of_another_process_see_whole_values_only(fd) -> None:
                 if (snapshot := reader.read(seen[-1] if seen else 0)) is not None:
                     values = snapshot.values.view(np.int32)
                     assert (values == snapshot.tag).all()
-                    assert (snapshot.tag, values.size) == (
-                        snapshot.count,
-                        size // 4 - snapshot.tag % 100,
-                    )
+                    assert values.size == size // 4 - snapshot.tag % 100
+                    assert snapshot.tag == snapshot.count
                     seen.append(snapshot.count)
         finally:
             writer.kill()
@@ -155,10 +141,8 @@ def test_what_does_not_fit_is_refused(fd) -> None:
         open_registers(fd, [8])
 
 
-@pytest.mark.parametrize("page_bytes", [4096, 65536])
-def test_registers_begin_at_pages_of_this_machine(
-    fd, page_bytes: int, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_registers_begin_at_pages_of_this_machine(fd, monkeypatch: pytest.MonkeyPatch) -> None:
+    page_bytes = 65536
     monkeypatch.setattr("mmap.PAGESIZE", page_bytes)
     first, second = open_registers(fd, [8, 64])
     begin = first._line.ctypes.data

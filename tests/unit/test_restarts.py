@@ -21,12 +21,14 @@ from gmijax.control.restarts import (
     with_gpus_left,
 )
 from gmijax.errors import BackendUnavailable, ConfigError, GmiFailed, ReportedError
+from gmijax.partition import reduction
 from gmijax.runs.folder import META, RunPaths, read_json, write_json
 from gmijax.runs.resume import CheckpointMeta
 from gmijax.supervise.kinds import training_plan
 from gmijax.supervise.launcher import StopSignals
 
 TRACE = 'Traceback:\n  File "task.py", line {line}, in step\n    x\nValueError: at 0x{address}\n'
+Act = Callable[[StopSignals], None]
 
 
 def error(kind: str = "ValueError", *, iteration: int = 3, line: int = 5) -> GmiFailed:
@@ -45,36 +47,43 @@ def save(run: RunPaths, env_steps: int) -> Path:
 
 
 class Job:
-    """Attempts of which each does what the next of `acts` does."""
+    """Attempts, at most three without a newer checkpoint; each does what the next act says."""
 
-    def __init__(self, run: RunPaths, monkeypatch: pytest.MonkeyPatch, max_restarts: int) -> None:
+    def __init__(self, run: RunPaths, monkeypatch: pytest.MonkeyPatch) -> None:
         self.run = run
-        self.started_from: list[Path | None] = []
-        self.said: list[str] = []
-        self.acts: Iterator[Callable[[StopSignals], None]] = iter(())
-        self.attempts = Attempts(run, max_restarts, self._launch_at, self.said.append)
-        monkeypatch.setattr(restarts, "run_gmis", self._run_gmis)
+        self.started_from: list[int | None] = []
+        self.acts: Iterator[Act] = iter(())
+        self.attempts = Attempts(run, 2, self._launch_at, lambda _: None)
+        monkeypatch.setattr(restarts, "run_gmis", lambda _, __, signals: next(self.acts)(signals))
 
-    def go(self, *acts: Callable[[StopSignals], None]) -> None:
+    def go(self, *acts: Act, origin: Path | None = None) -> None:
         self.acts = iter(acts)
-        self.attempts.run_to_the_end(None, lambda _: None)
+        self.attempts.run_to_the_end(origin, lambda _: None)
+
+    def gives_up(self, *acts: Act) -> str:
+        """The note of the failure that the job ends with."""
+        with pytest.raises(GmiFailed) as caught:
+            self.go(*acts)
+        return "; ".join(getattr(caught.value, "__notes__", []))
 
     def events(self) -> list[str]:
         return [json.loads(line)["event"] for line in self.run.events.read_text().splitlines()]
 
+    def dies(self, *saves: int, breaks: int | None = None, why: Exception | None = None) -> Act:
+        """An attempt that saves checkpoints and fails."""
+
+        def act(_: StopSignals) -> None:
+            for env_steps in saves:
+                save(self.run, env_steps)
+            if breaks is not None:
+                (self.run.checkpoint(breaks) / META).write_text("{")
+            raise why or killed()
+
+        return act
+
     def _launch_at(self, checkpoint: Path | None, attempt: int) -> Any:
-        self.started_from.append(checkpoint)
+        self.started_from.append(None if checkpoint is None else int(checkpoint.name))
         return attempt
-
-    def _run_gmis(self, launch: Any, on_tick: Any, signals: StopSignals) -> None:
-        next(self.acts)(signals)
-
-
-def fail(error: Exception) -> Callable[[StopSignals], None]:
-    def act(_: StopSignals) -> None:
-        raise error
-
-    return act
 
 
 def fine(_: StopSignals) -> None:
@@ -88,17 +97,12 @@ def run(tmp_path: Path) -> RunPaths:
 
 @pytest.fixture
 def job(run: RunPaths, monkeypatch: pytest.MonkeyPatch) -> Job:
-    return Job(run, monkeypatch, max_restarts=2)
+    return Job(run, monkeypatch)
 
 
 def test_a_killed_gmi_starts_the_job_again_from_its_newest_checkpoint(job: Job, run: RunPaths):
-    def save_and_fail(_: StopSignals) -> None:
-        save(run, 100)
-        save(run, 200)
-        raise killed()
-
-    job.go(fail(killed()), save_and_fail, fine)
-    assert job.started_from == [None, None, run.checkpoint(200)]
+    job.go(job.dies(), job.dies(100, 200), fine)
+    assert job.started_from == [None, None, 200]
     assert [(r.gmi, r.checkpoint) for r in job.attempts.restarts] == [
         (0, None),
         (0, str(run.checkpoint(200))),
@@ -106,96 +110,59 @@ def test_a_killed_gmi_starts_the_job_again_from_its_newest_checkpoint(job: Job, 
     assert job.events() == ["start", "fault", "start", "fault", "start", "end"]
 
 
-def test_a_newer_checkpoint_sets_the_count_back(job: Job, run: RunPaths):
-    def save_and_fail(env_steps: int) -> Callable[[StopSignals], None]:
-        def act(_: StopSignals) -> None:
-            save(run, env_steps)
-            raise killed()
-
-        return act
-
-    ends = [killed() for _ in range(3)]
-    job.go(
-        fail(ends[0]), fail(ends[1]), save_and_fail(100), fail(ends[2]), save_and_fail(200), fine
-    )
+def test_a_newer_checkpoint_sets_the_count_back(job: Job):
+    dies = job.dies()
+    job.go(dies, dies, job.dies(100), dies, job.dies(200), fine)
     assert len(job.attempts.restarts) == 5
 
 
 def test_without_a_newer_checkpoint_the_count_ends(job: Job):
-    with pytest.raises(GmiFailed) as caught:
-        job.go(*(fail(killed()) for _ in range(4)))
+    assert "run.max_restarts=2" in job.gives_up(*[job.dies()] * 4)
     assert len(job.attempts.restarts) == 2
-    assert "run.max_restarts=2" in caught.value.__notes__[0]
     assert job.events()[-2:] == ["fault", "gave_up"]
 
 
 def test_an_older_checkpoint_does_not_set_the_count_back(job: Job, run: RunPaths):
-    def break_and_fail(_: StopSignals) -> None:
-        (run.checkpoint(200) / META).write_text("{")
-        raise killed()
-
     save(run, 100)
-    dies = fail(killed())
-
-    def save_and_fail(_: StopSignals) -> None:
-        save(run, 200)
-        raise killed()
-
-    with pytest.raises(GmiFailed):
-        job.go(save_and_fail, dies, break_and_fail, fine)
-    assert len(job.attempts.restarts) == 2
-    assert job.started_from == [None, run.checkpoint(200), run.checkpoint(200)]
+    job.gives_up(job.dies(200), job.dies(), job.dies(breaks=200), fine)
+    assert job.started_from == [None, 200, 200]
 
 
 def test_a_job_whose_checkpoints_are_all_broken_starts_at_its_origin(job: Job, run: RunPaths):
     other = save(RunPaths(run.root / "other"), 50)
-
-    def save_and_fail(_: StopSignals) -> None:
-        save(run, 100)
-        raise killed()
-
-    def break_and_fail(_: StopSignals) -> None:
-        (run.checkpoint(100) / META).write_text("{")
-        raise killed()
-
-    job.acts = iter((save_and_fail, break_and_fail, fine))
-    job.attempts.run_to_the_end(other, lambda _: None)
-    assert job.started_from == [other, run.checkpoint(100), other]
+    job.go(job.dies(100), job.dies(breaks=100), fine, origin=other)
+    assert job.started_from == [50, 100, 50]
 
 
-def test_a_backend_that_cannot_be_had_again_is_told_with_the_fault(job: Job):
-    with pytest.raises(GmiFailed, match="GMI 0 failed: ended by SIGKILL") as caught:
-        job.go(fail(killed()), fail(BackendUnavailable("the daemon does not answer")))
-    assert "cannot start again: the daemon does not answer" in caught.value.__notes__
+def test_what_cannot_be_had_again_is_told_with_the_fault(job: Job):
+    gone = BackendUnavailable("the daemon does not answer")
+    said = job.gives_up(job.dies(), job.dies(why=gone))
+    assert "cannot start again: the daemon does not answer" in said
+
+    def launch_at(checkpoint: Path | None, attempt: int) -> Any:
+        raise ConfigError("GPUs [1] of the job are gone")
+
+    job.attempts.launch_at = launch_at
+    assert "cannot start again: GPUs [1] of the job are gone" in job.gives_up()
 
 
-def test_a_backend_that_cannot_be_had_at_all_is_bad_input(job: Job):
-    with pytest.raises(BackendUnavailable):
-        job.go(fail(BackendUnavailable("the daemon does not answer")))
+@pytest.mark.parametrize("why", [BackendUnavailable("no daemon"), ConfigError("env.name=antt")])
+def test_bad_input_at_the_first_attempt_is_no_fault(job: Job, why: Exception):
+    with pytest.raises(type(why)):
+        job.go(job.dies(why=why), fine)
 
 
 @pytest.mark.parametrize("kind", ["NonFiniteError", "ParameterMismatch", "SelfCheckFailed"])
 def test_what_would_come_again_ends_the_job(job: Job, kind: str):
-    with pytest.raises(GmiFailed):
-        job.go(fail(error(kind)), fine)
+    job.gives_up(job.dies(why=error(kind)), fine)
     assert not job.attempts.restarts
 
 
-def test_bad_input_ends_the_job(job: Job):
-    with pytest.raises(ConfigError):
-        job.go(fail(ConfigError("env.name=antt")), fine)
-
-
 def test_the_same_error_at_the_same_iteration_ends_the_job(job: Job):
-    with pytest.raises(GmiFailed) as caught:
-        job.go(fail(error()), fail(error()), fine)
+    assert "same iteration (3) twice" in job.gives_up(*[job.dies(why=error())] * 2, fine)
     assert len(job.attempts.restarts) == 1
-    assert "same iteration (3) twice" in caught.value.__notes__[0]
-
-
-@pytest.mark.parametrize("other", [error(iteration=4), error(line=6), error("KeyError"), killed()])
-def test_another_error_is_tried_again(other: GmiFailed):
-    assert why_not_again(other, error()) is None
+    for other in (error(iteration=4), error(line=6), error("KeyError"), killed()):
+        assert why_not_again(other, error()) is None
 
 
 def test_a_failure_while_the_job_stops_is_not_tried_again(job: Job):
@@ -203,21 +170,8 @@ def test_a_failure_while_the_job_stops_is_not_tried_again(job: Job):
         signals.handle(signal.SIGTERM)
         raise killed()
 
-    with pytest.raises(GmiFailed):
-        job.go(stop_and_fail, fine)
+    job.gives_up(stop_and_fail, fine)
     assert job.started_from == [None]
-
-
-def test_a_machine_that_cannot_go_on_is_told_with_the_fault(job: Job):
-    def launch_at(checkpoint: Path | None, attempt: int) -> Any:
-        if attempt:
-            raise ConfigError("GPUs [1] of the job are gone")
-        return attempt
-
-    job.attempts.launch_at = launch_at
-    with pytest.raises(GmiFailed, match="GMI 0 failed: ended by SIGKILL") as caught:
-        job.go(fail(killed()))
-    assert "cannot start again: GPUs [1] of the job are gone" in caught.value.__notes__
 
 
 def test_logs_of_a_failed_attempt_are_kept(run: RunPaths):
@@ -279,56 +233,54 @@ FOUR = machine(4)
 LEFT = machine(0, gpus=(gpu(0), gpu(2), gpu(3)), driver_version="580.159.03")
 
 
-def test_a_job_that_has_its_gpus_stays_as_it_is():
-    config = compose("env=ant", "plan.gpus=2", "plan.backend=share")
+@pytest.mark.parametrize(
+    ("overrides", "strategies", "layout", "devices"),
+    [
+        (
+            ("plan.gpus=4", "plan.gmis_per_gpu=2"),
+            *(("mrr", "mrr"), "[[0,1],[2,3],[4,5]]", [0, 0, 2, 2, 3, 3]),
+        ),
+        # Algorithm 1 decides again for what is left.
+        (("plan.gpus=2", "plan.gmis_per_gpu=2"), ("mrr", "mpr"), "[[0,1]]", [0, 0]),
+        # An uneven layout loses its row.
+        (
+            ("plan.layout=[[0],[1,2],[3,4,5]]",),
+            *(("har", "har"), "[[0],[1,2,3]]", [0, 2, 2, 2]),
+        ),
+    ],
+)
+def test_a_lost_gpu_shrinks_the_plan(
+    monkeypatch: pytest.MonkeyPatch,
+    overrides: tuple[str, ...],
+    strategies: tuple[str, str],
+    layout: str,
+    devices: list[int],
+):
+    monkeypatch.setattr(reduction, "_is_installed", lambda *_: True)
+    config = compose(
+        *("env=ant", "plan.backend=share", "num_envs=64", "run.elastic=true"),
+        *("reduce.intra=host", *overrides),
+    )
     plan = training_plan(config, FOUR)
     assert with_gpus_left(config, plan, FOUR) == (config, plan, ())
-
-
-def test_a_lost_gpu_shrinks_the_plan():
-    config = compose(
-        *("env=ant", "plan.gpus=4", "plan.gmis_per_gpu=2", "plan.backend=share", "num_envs=64"),
-        *("run.elastic=true", "reduce.intra=host"),
-    )
-    plan = training_plan(config, FOUR)
     config, shrunk, notes = with_gpus_left(config, plan, LEFT)
-    assert [share.device for share in shrunk.slices] == [
-        gpu(index).uuid for index in (0, 0, 2, 2, 3, 3)
-    ]
-    assert (shrunk.num_envs_per_gmi, shrunk.strategy) == (64, "mrr")
-    assert notes[0].startswith("GPUs [1] of the job are gone: going on with 3")
-
-
-def test_algorithm_1_decides_again_for_what_is_left():
-    config = compose(
-        *("env=ant", "plan.gpus=2", "plan.gmis_per_gpu=2", "plan.backend=share"),
-        *("run.elastic=true", "reduce.intra=host"),
-    )
-    plan = training_plan(config, FOUR)
-    _, shrunk, _ = with_gpus_left(config, plan, LEFT)
-    assert (plan.strategy, shrunk.strategy) == ("mrr", "mpr")
-
-
-def test_an_uneven_layout_loses_its_row():
-    config = compose(
-        *("env=ant", "plan.layout=[[0],[1,2],[3,4,5]]", "plan.backend=share", "run.elastic=true")
-    )
-    plan = training_plan(config, FOUR)
-    _, shrunk, _ = with_gpus_left(config, plan, LEFT)
-    assert str(shrunk.layout) == "[[0],[1,2,3]]"
+    assert [share.device for share in shrunk.slices] == [gpu(index).uuid for index in devices]
+    assert (plan.strategy, shrunk.strategy) == strategies
+    assert (str(shrunk.layout), shrunk.num_envs_per_gmi) == (layout, 64)
+    assert notes[0].startswith("GPUs [1] of the job are gone: going on with ")
 
 
 @pytest.mark.parametrize(
     ("overrides", "message"),
     [
-        (["run.elastic=false"], r"GPUs \[1\] of the job are gone; run\.elastic=true would go on"),
-        (["run.elastic=true", "plan.gpus=[1]"], "gone, and no other one is left"),
+        (
+            ("plan.gpus=2",),
+            r"GPUs \[1\] of the job are gone; run\.elastic=true would go on with the 1 left",
+        ),
+        (("run.elastic=true", "plan.gpus=[1]"), r"GPUs \[0\] .* gone, and no other one is left"),
     ],
 )
-def test_what_cannot_go_on_is_told(overrides: list[str], message: str):
-    config = compose("env=ant", "plan.gpus=2", "plan.backend=share", *overrides)
-    plan = training_plan(config, FOUR)
-    lost = [0] if "plan.gpus=[1]" in overrides else [1]
-    assert lost
-    with pytest.raises(ConfigError, match=message.replace(r"\[1\]", rf"\[{lost[0]}\]")):
-        with_gpus_left(config, plan, LEFT)
+def test_what_cannot_go_on_is_told(overrides: tuple[str, ...], message: str):
+    config = compose("env=ant", "plan.backend=share", *overrides)
+    with pytest.raises(ConfigError, match=message):
+        with_gpus_left(config, training_plan(config, FOUR), LEFT)

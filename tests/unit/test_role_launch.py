@@ -118,11 +118,6 @@ def test_the_manager_says_what_is_missing() -> None:
         manager.allreduce(np.ones(1))
 
 
-def test_a_plan_is_needed() -> None:
-    with pytest.raises(ConfigError, match=r"^plan=None: expected a plan of gmijax.plan"):
-        gmijax.launch(None, Stuck())
-
-
 def test_a_folder_that_is_run_is_found_by_its_file(tmp_path: Path, monkeypatch: Any) -> None:
     main = ModuleType("__main__")
     main.__file__, main.__spec__ = str(tmp_path / "__main__.py"), ModuleSpec("__main__", None)
@@ -137,3 +132,5 @@ def test_roles_talk_only_in_a_gmi() -> None:
         Talk(1).send(1, 0)
     with pytest.raises(ConfigError, match=r"^rank: only inside a GMI"):
         _ = Talk(1).rank
+    with pytest.raises(ConfigError, match=r"^plan=None: expected a plan of gmijax.plan"):
+        gmijax.launch(None, Stuck())

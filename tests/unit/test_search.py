@@ -12,7 +12,6 @@ from benchmarks.run import RESULTS
 from gmijax.autotune.grid import Grid, Measured, NotRunnable, Point, coarse, neighbours
 from gmijax.autotune.search import (
     Outcome,
-    OutOfBudget,
     Profile,
     Rules,
     estimate,
@@ -68,46 +67,36 @@ def test_as_printed_rows_go_from_most_gmis_and_sizes_up():
         assert sizes == list(PAPER.num_envs[: len(sizes)])
 
 
-def test_saturation_ends_a_row():
-    # Memory doubles each time. 100 -> 150 is Sat 0.5; 150 -> 160 is 0.067, below alpha.
-    outcome = search(ONE_ROW, row(100, 150, 160, 1000), AS_PRINTED)
-    assert [n for _, n in points(outcome)] == [1, 2, 4]
-    sats = [one.saturation for one in outcome.visited]
-    assert sats[0] is None
-    assert sats[1:] == pytest.approx([0.5, 10 / 150])
-
-
-def test_the_point_that_saturates_is_a_candidate():
-    outcome = search(ONE_ROW, row(100, 150, 160, 1000), AS_PRINTED)
-    assert outcome.best
-    assert outcome.best.point.num_envs == 4
-
-
-def test_a_higher_alpha_stops_earlier():
-    outcome = search(ONE_ROW, row(100, 150, 160, 1000), AS_PRINTED._replace(alpha=0.6))
-    assert [n for _, n in points(outcome)] == [1, 2]
-
-
-def test_what_cannot_run_is_skipped_and_recorded():
-    outcome = search(ONE_ROW, row(100, None, 300, None), AS_PRINTED)
-    assert [n for _, n in points(outcome)] == [1, 2, 4, 8]
-    assert outcome.visited[1].result == NotRunnable("out of memory")
-    assert outcome.best
-    assert outcome.best.point.num_envs == 4
-    # Against the last that ran: throughput x 3, memory x 4.
-    assert outcome.visited[2].saturation == pytest.approx(2 / 3)
-
-
-def test_the_first_that_runs_is_a_candidate_even_alone():
-    outcome = search(ONE_ROW, row(None, 70, None, None), AS_PRINTED)
-    assert outcome.best
-    assert outcome.best.point == Point(1, 2, "jax")
-
-
-def test_where_nothing_runs_there_is_no_answer():
-    outcome = search(ONE_ROW, row(None, None, None, None), AS_PRINTED)
-    assert outcome.best is None
+@pytest.mark.parametrize(
+    ("values", "alpha", "sizes", "sats", "best"),
+    [
+        # Memory doubles each time: 150 -> 160 is Sat 0.067; the point that saturates is one too.
+        ((100, 150, 160, 1000), 0.1, [1, 2, 4], [0.5, 10 / 150], 4),
+        ((100, 150, 160, 1000), 0.6, [1, 2], [0.5], 2),
+        # What cannot run is skipped: against the last that ran, throughput x 3, memory x 4.
+        ((100, None, 300, None), 0.1, [1, 2, 4, 8], [2 / 3], 4),
+        # The first that runs is a candidate, even alone.
+        ((None, 70, None, None), 0.1, [1, 2, 4, 8], [], 2),
+        ((None, None, None, None), 0.1, [1, 2, 4, 8], [], None),
+    ],
+)
+def test_a_row(
+    values: tuple[float | None, ...],
+    alpha: float,
+    sizes: list[int],
+    sats: list[float],
+    best: int | None,
+):
+    outcome = search(ONE_ROW, row(*values), AS_PRINTED._replace(alpha=alpha))
     assert outcome.complete
+    assert [n for _, n in points(outcome)] == sizes
+    found = [one.saturation for one in outcome.visited if one.saturation is not None]
+    assert found == pytest.approx(sats)
+    refused = [one for one in outcome.visited if isinstance(one.result, NotRunnable)]
+    assert [one.point.num_envs for one in refused] == [
+        size for size, value in zip(ONE_ROW.num_envs, values, strict=True) if value is None
+    ]
+    assert (outcome.best and outcome.best.point.num_envs) == best
 
 
 @pytest.mark.parametrize(
@@ -118,13 +107,10 @@ def test_saturation(top: float, memory: float, sat: float):
     assert saturation(measured(100, 100), measured(top, memory)) == sat
 
 
-def test_estimate_is_gmis_times_gpus_times_throughput():
+def test_estimate_is_gmis_times_gpus_times_throughput_less_the_larger_exchange():
     assert estimate(4, 1, measured(100.0, reduce_s=0.2)) == 400
     assert estimate(4, 2, measured(100.0)) == 800
     assert estimate(1, 2, measured(100.0)) == 200
-
-
-def test_estimate_charges_the_larger_exchange():
     # t = 4: 2 x 3/4; on two GPUs 2 x 7/8: the exchange grows by 7/6, 0.3 s to 0.35 s.
     slowed = 800 * 1.0 / 1.05
     assert estimate(4, 2, measured(100.0, reduce_s=0.3)) == pytest.approx(slowed)
@@ -170,16 +156,19 @@ def test_the_coarse_grid_keeps_one_gmi_and_the_largest_size():
 
 def test_the_climb_ends_at_a_top_whose_neighbours_are_lower():
     def hill(point: Point) -> Measured:
-        gmis_per_gpu, num_envs, impl, _ = point
+        gmis_per_gpu, num_envs, impl, trainers = point
         height = 100 - 3 * abs(gmis_per_gpu - 6) - 10 * abs(math.log2(num_envs / 1024))
+        height -= 10 * abs(trainers - 2)
         return measured(height / gmis_per_gpu, num_envs) if impl == "jax" else measured(1.0)
 
-    outcome = search(PAPER._replace(impls=("jax", "warp")), hill, COARSE._replace(tolerance=0))
+    grid = PAPER._replace(impls=("jax", "warp"), trainers=(1, 2, 3, 4))
+    assert coarse(grid).trainers == (1, 4)
+    outcome = search(grid, hill, COARSE._replace(tolerance=0))
     assert outcome.best
-    assert outcome.best.point == Point(6, 1024, "jax")
-    assert len(points(outcome)) == len(set(outcome.visited))
-    around = neighbours(outcome.best.point, PAPER)
-    assert len(around) == 4
+    assert outcome.best.point == Point(6, 1024, "jax", 2)
+    assert len(outcome.visited) == len(set(outcome.visited)) < 640 / 4
+    around = neighbours(outcome.best.point, grid)
+    assert len(around) == 6
     assert set(around) <= {one.point for one in outcome.visited}
 
 
@@ -207,23 +196,6 @@ def test_smaller_sizes_are_looked_at_when_no_larger_one_runs():
     assert outcome.best.point.num_envs == 512
 
 
-def test_out_of_budget_ends_with_what_there_is():
-    calls = 0
-
-    def profile(point: Point) -> Measured:
-        nonlocal calls
-        calls += 1
-        if calls > 2:
-            raise OutOfBudget
-        return gpu(point)
-
-    outcome = search(PAPER, profile, COARSE)
-    assert not outcome.complete
-    assert len(outcome.visited) == 2
-    assert outcome.best
-    assert outcome.best.point == Point(1, 16384, "jax")
-
-
 def test_rows_differ_in_trainers_too():
     """A row has a number of agents and of trainers: Sat compares sizes of the same row only."""
 
@@ -238,29 +210,10 @@ def test_rows_differ_in_trainers_too():
     assert outcome.best.point == Point(2, 2, "jax", 1)
     assert str(outcome.best.point) == "2 + 1 x 2, jax"
     assert str(Point(2, 2, "jax")) == "2 x 2, jax"
-
-
-def test_the_climb_goes_along_trainers_too():
-    def hill(point: Point) -> Measured:
-        height = 100 - 3 * abs(point.gmis_per_gpu - 6) - 10 * abs(point.trainers - 2)
-        return measured(height / point.gmis_per_gpu, point.num_envs)
-
-    grid = Grid(tuple(range(1, 11)), (64,), ("jax",), trainers=(1, 2, 3, 4))
-    found = search(grid, hill, COARSE._replace(tolerance=0.0))
-    assert coarse(grid).trainers == (1, 4)
-    assert found.best
-    assert found.best.point == Point(6, 64, "jax", 2)
-    assert len(found.visited) < 40 / 2
-
-
-def test_of_equals_the_one_with_the_fewest_gmis_wins_trainers_included():
-    def profile(point: Point) -> Measured:
-        return measured(100.0 / point.gmis_per_gpu)
-
-    grid = Grid((1, 2), (1,), ("jax",), trainers=(1, 2))
-    found = search(grid, profile, AS_PRINTED).best
-    assert found
-    assert found.point == Point(1, 1, "jax", 1)
+    # Of equals the one with the fewest GMIs wins, trainers included.
+    equal = search(grid, lambda point: measured(100.0 / point.gmis_per_gpu), AS_PRINTED).best
+    assert equal
+    assert equal.point == Point(1, 1, "jax", 1)
 
 
 def test_sat_goes_by_what_the_job_gains():
@@ -275,30 +228,19 @@ def test_sat_goes_by_what_the_job_gains():
     assert [one.saturation for one in whole.visited] == [None, 1.0, 1.0]
 
 
-def test_the_faster_implementation_is_part_of_the_answer():
+@pytest.mark.parametrize(("factor", "rows"), [(2.0, {1}), (1.05, {1, 4, 7, 10})])
+def test_an_implementation_that_is_clearly_slower_is_left_after_the_first_row(
+    factor: float, rows: set[int]
+):
     def profile(point: Point) -> Measured:
         one = gpu(point)
-        factor = 2 if point.impl == "warp" else 1
-        return one._replace(env_steps_per_s=factor * one.env_steps_per_s)
+        faster = factor if point.impl == "warp" else 1.0
+        return one._replace(env_steps_per_s=faster * one.env_steps_per_s)
 
     outcome = search(PAPER._replace(impls=("jax", "warp")), profile, COARSE)
     assert outcome.best
     assert outcome.best.point.impl == "warp"
-    # The slower one is left alone after the first row.
-    assert [k for one in outcome.visited if one.point.impl == "jax" for k in one.point[:1]] == [
-        1,
-        1,
-    ]
-
-
-def test_an_implementation_that_is_nearly_as_fast_is_looked_at_too():
-    def profile(point: Point) -> Measured:
-        factor = 1.05 if point.impl == "warp" else 1.0
-        one = gpu(point)
-        return one._replace(env_steps_per_s=factor * one.env_steps_per_s)
-
-    outcome = search(PAPER._replace(impls=("jax", "warp")), profile, COARSE)
-    assert {one.point.gmis_per_gpu for one in outcome.visited if one.point.impl == "jax"} > {1}
+    assert {p.point.gmis_per_gpu for p in outcome.visited if p.point.impl == "jax"} == rows
 
 
 def test_points_of_an_h200_give_the_same_answer_with_fewer_profiles():

@@ -17,12 +17,12 @@ from supervision import machine
 from gmijax.autotune import tuner
 from gmijax.autotune.grid import Measured, NotRunnable, Point
 from gmijax.autotune.profile import ProfileLate
+from gmijax.autotune.report import draw
 from gmijax.autotune.tuner import Search, SearchResult, with_auto_decided
 from gmijax.autotune.workloads import PpoWorkload, Workload
 from gmijax.cli.compose import compose
 from gmijax.config import TrainConfig
-from gmijax.control import searching
-from gmijax.errors import ConfigError, GmijaxError, JobInterrupted
+from gmijax.errors import ConfigError, JobInterrupted
 from gmijax.machine.host_limits import Host
 from gmijax.machine.snapshot import Machine
 
@@ -52,13 +52,17 @@ def scaling(point: Point, mode: str) -> Measured:
     return Measured(contention * 1000.0 * point.num_envs, 100.0 + point.num_envs, 0.1)
 
 
+Use = Callable[[Answer], Profiles]
+
+
 @pytest.fixture
-def profiles(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Callable[[Answer], Profiles]:
+def profiles(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Use:
     monkeypatch.chdir(tmp_path)
 
     def use(answer: Answer) -> Profiles:
         used = Profiles(answer)
         monkeypatch.setattr(tuner, "profile", used)
+        monkeypatch.setattr(tuner, "draw", lambda *_: None)  # It takes a second.
         return used
 
     return use
@@ -71,13 +75,14 @@ def wanted(*overrides: str) -> TrainConfig:
 
 def found(*overrides: str, here: Machine | None = None) -> tuple[SearchResult, str]:
     said = io.StringIO()
-    console = Console(file=said, width=400)
+    console = Console(file=said, width=400, markup=False)
     result = Search(PpoWorkload(wanted(*overrides)), here or machine(0), console).result()
     return result, said.getvalue()
 
 
-def test_a_second_search_profiles_nothing(profiles: Callable[[Answer], Profiles]):
+def test_a_second_search_profiles_nothing(profiles: Use, monkeypatch: pytest.MonkeyPatch):
     first = profiles(scaling)
+    monkeypatch.setattr(tuner, "draw", draw)
     result, said = found()
     assert (result.gmis_per_gpu, result.num_envs, result.impl) == (4, 128, "jax")
     assert len(first.asked) == 6
@@ -100,7 +105,7 @@ def test_a_second_search_profiles_nothing(profiles: Callable[[Answer], Profiles]
     assert second.run_dir is None
 
 
-def test_an_interrupted_search_goes_on_where_it_was(profiles: Callable[[Answer], Profiles]):
+def test_an_interrupted_search_goes_on_where_it_was(profiles: Use):
     def interrupted(point: Point, mode: str) -> Measured:
         if point == Point(2, 128, "jax"):
             raise JobInterrupted("stopped")
@@ -117,22 +122,23 @@ def test_an_interrupted_search_goes_on_where_it_was(profiles: Callable[[Answer],
     assert result.num_envs == 128
 
 
-def test_what_cannot_run_is_remembered_too(profiles: Callable[[Answer], Profiles]):
+def test_what_cannot_run_is_told_and_remembered(profiles: Use):
+    reason = "cannot run on layout [[0,1]]: see [/tmp/x]"  # It may look like markup.
+
     def small(point: Point, mode: str) -> Measured | NotRunnable:
-        if point.gmis_per_gpu == 4:
-            return NotRunnable("GMI 0 failed: RESOURCE_EXHAUSTED")
-        return scaling(point, mode)
+        return NotRunnable(reason) if point.gmis_per_gpu == 4 else scaling(point, mode)
 
     profiles(small)
     result, said = found()
     assert result.gmis_per_gpu == 2
-    assert "4 x 64, jax (corun): not runnable: GMI 0 failed: RESOURCE_EXHAUSTED" in said
+    assert f"4 x 64, jax (corun): not runnable: {reason}" in said
+    assert said.count(reason) == 4  # Two points, each when it is profiled and in the table.
     assert profiles(scaling).asked == []
     assert found()[0].gmis_per_gpu == 2
 
 
 def test_points_for_which_the_host_is_too_small_are_told_and_not_started(
-    profiles: Callable[[Answer], Profiles],
+    profiles: Use,
 ):
     few = machine(0, host=Host(memory_mib=1500))
     asked = profiles(scaling)
@@ -148,23 +154,7 @@ def test_points_for_which_the_host_is_too_small_are_told_and_not_started(
         found("plan.gmis_per_gpu=64", here=few)
 
 
-def test_a_reason_may_look_like_markup(profiles: Callable[[Answer], Profiles]):
-    reason = "cannot run on layout [[0,1]]: see [/tmp/x]"
-
-    def odd(point: Point, mode: str) -> Measured | NotRunnable:
-        return NotRunnable(reason) if point.gmis_per_gpu == 4 else scaling(point, mode)
-
-    profiles(odd)
-    assert found()[1].count(reason) == 4  # Two points, each when it is profiled and in the table.
-
-
-def test_where_nothing_runs_the_first_reason_is_told(profiles: Callable[[Answer], Profiles]):
-    profiles(lambda *_: NotRunnable("no such thing"))
-    with pytest.raises(GmijaxError, match=r"no point of the search can run; .*no such thing"):
-        found()
-
-
-def test_a_profile_that_hangs_cannot_run(profiles: Callable[[Answer], Profiles]):
+def test_a_profile_that_hangs_cannot_run(profiles: Use):
     def late(point: Point, mode: str) -> Measured:
         if point.num_envs == 128:
             raise ProfileLate("no end within 5 s (GMI 0 compiling)")
@@ -182,7 +172,7 @@ def test_a_profile_that_hangs_cannot_run(profiles: Callable[[Answer], Profiles])
     assert {point.num_envs for point, _ in again.asked} == {128}
 
 
-def test_a_profile_cut_off_by_the_budget_is_no_answer(profiles: Callable[[Answer], Profiles]):
+def test_a_profile_cut_off_by_the_budget_is_no_answer(profiles: Use):
     def slow(point: Point, mode: str) -> Measured:
         if point != Point(4, 64, "jax"):
             raise ProfileLate("cut off")
@@ -193,25 +183,14 @@ def test_a_profile_cut_off_by_the_budget_is_no_answer(profiles: Callable[[Answer
     assert (result.gmis_per_gpu, result.num_envs) == (4, 64)
     assert not result.report["complete"]
     assert "the budget ended the search after 1 points" in result.reason
+    with pytest.raises(ConfigError, match=r"^search\.budget_s=10: too small for one profile"):
+        found("search.budget_s=10", "search.num_envs=[128]")
     rest = profiles(scaling)
     found()
     assert rest.asked[0] == (Point(4, 128, "jax"), "corun")
 
 
-def test_a_budget_too_small_for_one_profile_is_bad_input(
-    profiles: Callable[[Answer], Profiles],
-):
-    def late(*_: object) -> Measured:
-        raise ProfileLate("cut off")
-
-    profiles(late)
-    with pytest.raises(ConfigError, match=r"^search\.budget_s=10: too small for one profile"):
-        found("search.budget_s=10")
-    with pytest.raises(ConfigError, match=r"^search\.budget_s=2: too small for one profile"):
-        wanted("search.budget_s=2")
-
-
-def test_what_is_given_is_not_searched(profiles: Callable[[Answer], Profiles]):
+def test_what_is_given_is_not_searched(profiles: Use):
     asked = profiles(scaling).asked
     assert found("plan.gmis_per_gpu=3")[0].gmis_per_gpu == 3
     assert {point.gmis_per_gpu for point, _ in asked} == {3}
@@ -220,7 +199,7 @@ def test_what_is_given_is_not_searched(profiles: Callable[[Answer], Profiles]):
     assert [point for point, _ in asked] == [Point(2, 96, "jax")]
 
 
-def test_both_modes_tell_how_far_they_differ(profiles: Callable[[Answer], Profiles]):
+def test_both_modes_tell_how_far_they_differ(profiles: Use):
     asked = profiles(scaling).asked
     result, said = found("search.mode=both")
     modes = [mode for _, mode in asked]
@@ -232,7 +211,7 @@ def test_both_modes_tell_how_far_they_differ(profiles: Callable[[Answer], Profil
     assert ratios == {4: pytest.approx(0.9), 2: pytest.approx(0.9), 1: None}
 
 
-def test_one_gmi_is_said_plainly(profiles: Callable[[Answer], Profiles]):
+def test_one_gmi_is_said_plainly(profiles: Use):
     profiles(lambda point, _: Measured(1e6 / point.gmis_per_gpu, 100.0 + point.num_envs, 0.1))
     result, _ = found()
     assert (result.gmis_per_gpu, result.num_envs) == (1, 64)
@@ -241,57 +220,20 @@ def test_one_gmi_is_said_plainly(profiles: Callable[[Answer], Profiles]):
     )
 
 
-def test_a_job_with_auto_gets_the_answer_and_the_reason(profiles: Callable[[Answer], Profiles]):
-    profiles(scaling)
-    config, reasons = with_auto_decided(wanted(), machine(0), Console(quiet=True))
-    assert (config.num_envs, config.plan.gmis_per_gpu) == (128, 4)
-    assert config.physics.impl == "jax"
-    assert reasons[0].startswith("4 GMIs per GPU with 128 environments each, jax: ")
-    given = compose("num_envs=64")
-    assert with_auto_decided(given, machine(0), Console(quiet=True)) == (given, ())
-
-
 def test_a_job_with_too_few_gpus_is_refused_before_anything_is_profiled(
-    profiles: Callable[[Answer], Profiles],
+    profiles: Use,
 ):
     asked = profiles(scaling)
     config = dataclasses.replace(wanted(), plan=dataclasses.replace(wanted().plan, gpus=3))
     with pytest.raises(ConfigError, match=r"plan\.gpus=3: this machine has 2 usable GPUs"):
         with_auto_decided(config, machine(2, mps_control=MPS), Console(quiet=True))
+    given = compose("num_envs=64")
+    assert with_auto_decided(given, machine(0), Console(quiet=True)) == (given, ())
     assert asked.asked == []
 
 
-@pytest.mark.parametrize(
-    ("overrides", "message"),
-    [
-        (("num_envs=64", "plan.gmis_per_gpu=2"), "nothing to search for; make one of them auto"),
-        (("search.gmis_per_gpu=[2,2]",), r"search\.gmis_per_gpu=\[2, 2\]: expected distinct"),
-        (("search.num_envs=[]",), r"search\.num_envs=\[\]: expected distinct numbers"),
-        (("search.num_envs=[0]",), r"search\.num_envs=0: must be at least 1"),
-        (("search.impls=[cuda]",), r"search\.impls=cuda: allowed are jax, warp"),
-        (("search.alpha=-1",), r"search\.alpha=-1\.0: must be at least 0"),
-        (("search.mode=alone",), r"search\.mode=alone: expected one of corun, isolated, both"),
-        (("plan.backend=mps",), r"plan\.backend=mps"),
-        (("plan.template=tdg_ex",), r"plan\.template=tcg_ex only"),
-    ],
-)
-def test_bad_input_starts_nothing(
-    overrides: tuple[str, ...], message: str, profiles: Callable[[Answer], Profiles]
-):
-    asked = profiles(scaling).asked
-    with pytest.raises(ConfigError, match=message):
-        searching.search(wanted(*overrides))
-    assert asked == []
-    assert not Path("runs").exists()
-
-
-def test_undecided_numbers_are_refused_where_numbers_are_needed():
-    with pytest.raises(ConfigError, match="num_envs=auto: not decided yet"):
-        _ = wanted().envs_per_gmi
-
-
 def test_isolated_is_one_gmi_of_those_that_corun():
-    workload = PpoWorkload(wanted())
+    workload = PpoWorkload(wanted("plan.gpus=2"))
     here = machine(0, cpu_cores=(0, 1, 2, 3))
     together = workload.plan_at(Point(2, 64, "jax"), "corun", here)
     alone = workload.plan_at(Point(2, 64, "jax"), "isolated", here)
@@ -299,14 +241,10 @@ def test_isolated_is_one_gmi_of_those_that_corun():
     assert together.strategy != alone.strategy == "none"
     assert alone.slices == together.slices[:1]
     assert alone.slices[0].cpus == (0, 1)
-
-
-def test_isolated_on_a_gpu_has_an_even_share_of_sms_and_memory():
-    workload = PpoWorkload(wanted("plan.gpus=2"))
+    # On a GPU it has an even share of SMs and memory.
     here = machine(2, mps_control=MPS)
     together = workload.plan_at(Point(4, 64, "jax"), "corun", here)
-    alone = workload.plan_at(Point(4, 64, "jax"), "isolated", here)
+    (share,) = workload.plan_at(Point(4, 64, "jax"), "isolated", here).slices
     assert together.layout.num_gpus == 1
-    assert [share.sm_percent for share in together.slices] == [None] * 4
-    (share,) = alone.slices
+    assert [one.sm_percent for one in together.slices] == [None] * 4
     assert (share.sm_percent, share.memory_fraction) == (25.0, 0.2)

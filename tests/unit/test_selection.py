@@ -11,7 +11,6 @@ from supervision import machine, plan_config, reduce_config
 
 from gmijax.control import selection
 from gmijax.control.selection import Probe, candidates, estimated_floats, with_measured
-from gmijax.errors import ConfigError
 from gmijax.partition import reduction
 from gmijax.partition.plan import Plan
 from gmijax.partition.planner import make_plan
@@ -23,7 +22,7 @@ def plan(**changes: Any) -> Plan:
     return make_plan(plan_config(**changes), reduce_config(), 64, MACHINE)
 
 
-@pytest.fixture
+@pytest.fixture(autouse=True)
 def with_bindings(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(reduction, "_is_installed", lambda *_: True)
 
@@ -41,7 +40,6 @@ def measured(monkeypatch: pytest.MonkeyPatch) -> list[Sequence[Probe]]:
     return calls
 
 
-@pytest.mark.usefixtures("with_bindings")
 @pytest.mark.parametrize(
     ("changes", "intra", "names"),
     [
@@ -62,7 +60,6 @@ def test_everything_that_can_run_is_measured_once(
     assert [probe.name for probe in candidates(plan(**changes), 100, intra)] == names
 
 
-@pytest.mark.usefixtures("with_bindings")
 def test_the_fastest_is_taken_and_kept(tmp_path: Path, measured: list[Sequence[Probe]]) -> None:
     first = with_measured(plan(gmis_per_gpu=2), MACHINE, 100, folder=tmp_path)
     assert (first.strategy, first.intra) == ("har", "ipc")
@@ -81,7 +78,6 @@ def test_the_fastest_is_taken_and_kept(tmp_path: Path, measured: list[Sequence[P
     assert Plan.from_dict(first.to_dict()) == first
 
 
-@pytest.mark.usefixtures("with_bindings")
 def test_a_way_that_does_not_work_here_is_not_taken(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -93,16 +89,13 @@ def test_a_way_that_does_not_work_here_is_not_taken(
         assert "har+ipc not usable: no such memory" in chosen.reasons[-1]
 
 
-@pytest.mark.usefixtures("with_bindings")
-@pytest.mark.parametrize("content", ["{", "[]", "{}", '{"mpr": {}}'])
-def test_a_broken_file_is_measured_again(
-    content: str, tmp_path: Path, measured: list[Sequence[Probe]]
-) -> None:
+def test_a_broken_file_is_measured_again(tmp_path: Path, measured: list[Sequence[Probe]]) -> None:
     with_measured(plan(gmis_per_gpu=2), MACHINE, 100, folder=tmp_path)
     (kept,) = tmp_path.iterdir()
-    kept.write_text(content)
-    with_measured(plan(gmis_per_gpu=2), MACHINE, 100, folder=tmp_path)
-    assert len(measured) == 2
+    for number, content in enumerate(("{", "[]", "{}", '{"mpr": {}}'), start=2):
+        kept.write_text(content)
+        with_measured(plan(gmis_per_gpu=2), MACHINE, 100, folder=tmp_path)
+        assert len(measured) == number
 
 
 def test_one_gmi_has_nothing_to_measure(tmp_path: Path, measured: list[Sequence[Probe]]) -> None:
@@ -123,8 +116,3 @@ def test_sizes_are_about_those_of_the_networks(hidden: tuple[int, ...], exact: i
     found = estimated_floats(hidden, hidden)
     assert exact / 2 <= found <= exact * 2
     assert found & (found - 1) == 0
-
-
-def test_a_strategy_that_is_named_is_not_measured() -> None:
-    with pytest.raises(ConfigError, match=r"measured: needs reduce\.strategy=auto, not mpr"):
-        reduce_config(strategy="mpr", selection="measured")

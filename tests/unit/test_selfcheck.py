@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+from collections.abc import Callable
 from pathlib import Path
 
 import jax
@@ -17,28 +18,25 @@ from gmijax.partition.planner import make_plan
 from gmijax.selfcheck import PRECISIONS, SIZES, Precision, check_share, compare_products
 
 MEASURED = Path(__file__).parents[2] / "benchmarks/results/sm-shares-nvidia-h200.json"
+RIGHT = selfcheck._multiply
 SMALL = ((64, 128, 32), (32, 64, 96))
-
-
-def right(left: jax.Array, right: jax.Array, kind: Precision) -> jax.Array:
-    return jnp.matmul(left, right, precision=kind.algorithm)
 
 
 def one_tile_missing(left: jax.Array, other: jax.Array, kind: Precision) -> jax.Array:
     """Half-precision products without the last 16 terms of one tile."""
-    product = right(left, other, kind)
+    product = RIGHT(left, other, kind)
     if kind.dtype == "float32":
         return product
-    return product.at[:16, :16].add(-right(left[:16, -16:], other[-16:, :16], kind))
+    return product.at[:16, :16].add(-RIGHT(left[:16, -16:], other[-16:, :16], kind))
 
 
 def not_finite(left: jax.Array, other: jax.Array, kind: Precision) -> jax.Array:
-    return right(left, other, kind).at[0, 0].set(jnp.nan)
+    return RIGHT(left, other, kind).at[0, 0].set(jnp.nan)
 
 
 def in_less_than_float32(left: jax.Array, other: jax.Array, kind: Precision) -> jax.Array:
     """As if float32 were computed in bfloat16."""
-    product = right(left, other, kind)
+    product = RIGHT(left, other, kind)
     return product if kind.dtype != "float32" else jax.lax.reduce_precision(product, 8, 7)
 
 
@@ -58,8 +56,11 @@ def test_right_products_pass():
         (in_less_than_float32, {"tf32", "float32"}),
     ],
 )
-def test_wrong_products_are_found(multiply: selfcheck.Multiply, wrong: set[str]):
-    found = list(compare_products(SMALL, multiply=multiply))
+def test_wrong_products_are_found(
+    multiply: Callable[..., jax.Array], wrong: set[str], monkeypatch: pytest.MonkeyPatch
+):
+    monkeypatch.setattr(selfcheck, "_multiply", multiply)
+    found = list(compare_products(SMALL))
     assert {product.precision.name for product in found if product.is_wrong} == wrong
 
 
@@ -87,13 +88,8 @@ def test_every_cap_that_was_measured_to_be_wrong_would_be_found():
 
 
 def test_options_that_xla_no_longer_has_are_left_out(monkeypatch: pytest.MonkeyPatch):
-    plan = make_plan(plan_config(self_check="on"), reduce_config(), 8, machine(0))
     monkeypatch.setattr(selfcheck, "SIZES", SMALL)
     monkeypatch.setattr(selfcheck, "LIBRARIES", {"gone": {"xla_gpu_option_that_is_gone": True}})
-    assert check_share(plan, 0) > 0.0
-
-
-def test_nothing_is_multiplied_where_the_plan_does_not_ask(monkeypatch: pytest.MonkeyPatch):
-    plan = make_plan(plan_config(), reduce_config(), 8, machine(0))
-    monkeypatch.setattr(selfcheck, "compare_products", lambda **_: pytest.fail("multiplied"))
-    assert check_share(plan, 0) == 0.0
+    for self_check in ("on", "off"):
+        plan = make_plan(plan_config(self_check=self_check), reduce_config(), 8, machine(0))
+        assert (check_share(plan, 0) > 0.0) == (self_check == "on")

@@ -11,7 +11,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gmijax.collectives.shared_block import LINE, Geometry, attach, create_exchange
+from gmijax.collectives.host.shared_block import LINE, Geometry, attach, create_exchange
 from gmijax.errors import CollectiveError, ConfigError
 
 

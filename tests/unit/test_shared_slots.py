@@ -13,10 +13,10 @@ from fake_device_memory import FakeDeviceMemory
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gmijax.collectives.device_links import Order
-from gmijax.collectives.host import HostExchange
-from gmijax.collectives.shared_block import create_exchange
-from gmijax.collectives.shared_slots import SharedSlots
+from gmijax.collectives.device.device_links import Order
+from gmijax.collectives.device.shared_slots import SharedSlots
+from gmijax.collectives.host.host_exchange import HostExchange
+from gmijax.collectives.host.shared_block import create_exchange
 from gmijax.errors import DeviceMemoryUnavailable
 
 SIZE = 5
@@ -98,7 +98,7 @@ def test_memory_stays_until_all_are_through_with_it(pair: Pair) -> None:
 
 @pytest.mark.timeout(20)
 def test_who_is_gone_is_not_waited_for(pair: Pair, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("gmijax.collectives.shared_slots.CLOSE_S", 1e9)
+    monkeypatch.setattr("gmijax.collectives.device.shared_slots.CLOSE_S", 1e9)
     hosts, (owner, _), closed = pair
     hosts[1].barrier.leave()
     owner.close()
@@ -107,7 +107,7 @@ def test_who_is_gone_is_not_waited_for(pair: Pair, monkeypatch: pytest.MonkeyPat
 
 @pytest.mark.timeout(20)
 def test_who_failed_does_not_wait_to_close(pair: Pair, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("gmijax.collectives.shared_slots.CLOSE_S", 1e9)
+    monkeypatch.setattr("gmijax.collectives.device.shared_slots.CLOSE_S", 1e9)
     _, (owner, _), closed = pair
     try:
         raise ZeroDivisionError

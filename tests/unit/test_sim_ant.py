@@ -40,9 +40,9 @@ def test_velocity_is_seen_from_the_torso(model):
 
 def test_joints_are_minus_one_and_one_at_their_limits(model):
     ids = ant.look_up(model)
-    for limits, expected in ((ids.lower, -1.0), (ids.upper, 1.0)):
+    for limits, expected in ((ids.joints.lower, -1.0), (ids.joints.upper, 1.0)):
         qpos = model.qpos0.copy()
-        qpos[ids.joint_qpos] = limits
+        qpos[ids.joints.qpos] = limits
         np.testing.assert_allclose(ant.pose_of(ids, state(qpos)).joints, expected, atol=1e-5)
 
 
@@ -51,8 +51,8 @@ def test_reset_noise_stays_within_the_limits(model):
     qpos, qvel = jax.vmap(lambda key: ant.draw_start(ids, model, key))(
         jax.random.split(jax.random.key(0), 64)
     )
-    joints = qpos[:, ids.joint_qpos]
-    assert (joints >= ids.lower).all()
-    assert (joints <= ids.upper).all()
+    joints = qpos[:, ids.joints.qpos]
+    assert (joints >= ids.joints.lower).all()
+    assert (joints <= ids.joints.upper).all()
     np.testing.assert_array_equal(qpos[:, :7], np.tile(model.qpos0[:7].astype("f4"), (64, 1)))
     assert float(jnp.abs(qvel).max()) <= 0.1

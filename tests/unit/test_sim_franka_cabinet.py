@@ -109,7 +109,7 @@ def test_pose_is_that_of_the_model_in_c(world: physics.Physics):
 
 def test_observation_scales_joints_and_is_clipped(world: physics.Physics):
     ids = task.look_up(world.mj_model)
-    qpos = np.append(ids.upper, 0.25).astype(np.float32)
+    qpos = np.append(ids.joints.upper, 0.25).astype(np.float32)
     qvel = np.array([100.0, -100.0, 2.0, *[0.0] * 6, 0.5], np.float32)
     state = physics.PhysicsState(jnp.array(qpos), jnp.array(qvel), jnp.zeros(10))
     obs = task.observe(ids, state, pose(grasp=(0.0, 0.1, 0.2), handle=(0.3, 0.0, 0.5)))
@@ -124,12 +124,12 @@ def test_start_is_noisy_within_the_limits_and_the_drawer_is_closed(world: physic
     qpos = jax.vmap(lambda key: task.draw_start(ids, model, key))(
         jax.random.split(jax.random.key(0), 64)
     )
-    joints, rest = qpos[:, ids.joint_qpos], model.key("start").qpos[ids.joint_qpos]
-    assert (joints >= ids.lower).all()
-    assert (joints <= ids.upper).all()
+    joints, rest = qpos[:, ids.joints.qpos], model.key("start").qpos[ids.joints.qpos]
+    assert (joints >= ids.joints.lower).all()
+    assert (joints <= ids.joints.upper).all()
     assert float(jnp.abs(joints - rest).max()) <= task.JOINT_NOISE + 1e-6
     assert float(joints[:, :7].std(axis=0).min()) > 0.05
-    assert (qpos[:, ids.drawer_qpos] == 0.0).all()
+    assert (qpos[:, ids.drawer_joint.qpos] == 0.0).all()
 
 
 def solve_arm(model: mujoco.MjModel, qpos: npt.NDArray[np.float64], hand_m: list[float]) -> None:

@@ -25,7 +25,7 @@ def test_motors_are_in_the_order_of_the_joints_and_push_as_their_gears_say(model
     data = mujoco.MjData(model)
     data.ctrl[:] = np.linspace(-1.0, 1.0, model.nu)
     mujoco.mj_forward(model, data)
-    torques = data.qfrc_actuator[humanoid.look_up(model).joint_qvel]
+    torques = data.qfrc_actuator[humanoid.look_up(model).joints.qvel]
     strength = humanoid.motor_strength(model)
     np.testing.assert_allclose(torques, 135.0 * strength * data.ctrl, rtol=1e-6)
     assert strength[humanoid.JOINTS.index("left_hip_y")] == 1.0

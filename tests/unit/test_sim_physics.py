@@ -11,11 +11,9 @@ from mujoco import mjx
 from gmijax.errors import ConfigError
 from gmijax.sim import impl as implementations
 from gmijax.sim import physics
-from gmijax.sim.impl import OnGpu, WarpSizes
+from gmijax.sim.impl import WarpSizes
 from gmijax.sim.physics import PhysicsState, choose_impl, from_mj_model
 from gmijax.sim.registry import TASKS
-
-# Halves the time to compile; other devices do not know the option.
 
 PENDULUM_OVER_FLOOR = """
 <mujoco>
@@ -55,14 +53,16 @@ def test_choice_of_implementation(
     assert why in reason
 
 
-def test_warp_without_warp_lang_says_what_to_install():
-    with pytest.raises(ConfigError, match=r"physics\.impl=warp: needs the package warp-lang"):
-        choose_impl("warp", "gpu", warp_installed=False)
-
-
-def test_unknown_implementation():
-    with pytest.raises(ConfigError, match=r"physics\.impl=cuda: allowed are auto, jax, warp"):
-        choose_impl("cuda", "gpu")
+@pytest.mark.parametrize(
+    ("impl", "message"),
+    [
+        ("warp", r"physics\.impl=warp: needs the package warp-lang"),
+        ("cuda", r"physics\.impl=cuda: allowed are auto, jax, warp"),
+    ],
+)
+def test_an_implementation_that_cannot_be_had(impl: str, message: str):
+    with pytest.raises(ConfigError, match=message):
+        choose_impl(impl, "gpu", warp_installed=False)
 
 
 def test_actuators_with_memory_are_refused():
@@ -74,38 +74,27 @@ def test_actuators_with_memory_are_refused():
         from_mj_model(mujoco.MjModel.from_xml_string(text), impl="jax", substeps=1)
 
 
-def test_the_small_state_forgets_nothing_that_the_next_step_needs():
+def test_the_small_state_forgets_nothing_and_substeps_are_steps_in_a_row():
     # The same compiled step, once fed with the whole data of the step before and once with data
     # rebuilt from the carried state: equal to the last bit, through contact and joint limit.
-    world = from_mj_model(
-        mujoco.MjModel.from_xml_string(PENDULUM_OVER_FLOOR), impl="jax", substeps=1
-    )
-    step = jax.jit(lambda data: mjx.step(world.model, data), compiler_options=CPU_OPTIONS)
-    whole = small = world.blank()
-    for ctrl in np.random.default_rng(0).uniform(-1, 1, (100, 1)).astype(np.float32):
-        whole = step(whole.replace(ctrl=jnp.array(ctrl)))
-        carried = PhysicsState(small.qpos, small.qvel, small.qacc_warmstart)
-        kept = {name: value for name, value in carried._asdict().items() if value is not None}
-        small = step(world.blank().replace(ctrl=jnp.array(ctrl), **kept))
-        for name in ("qpos", "qvel", "qacc_warmstart", "sensordata"):
-            np.testing.assert_array_equal(getattr(whole, name), getattr(small, name))
-
-
-def test_substeps_are_steps_in_a_row():
     model = mujoco.MjModel.from_xml_string(PENDULUM_OVER_FLOOR)
-    one, three = (from_mj_model(model, impl="jax", substeps=n) for n in (1, 3))
-    ctrl = jnp.array([0.3])
-    single = jax.jit(one.step, compiler_options=CPU_OPTIONS)
-    start = state = one.start(jnp.zeros(1), jnp.zeros(1))
-    for _ in range(2):
-        state, _ = single(one.model, state, ctrl)
-    state, sensors = single(one.model, state, ctrl)
-    at_once, last_sensors = jax.jit(three.step, compiler_options=CPU_OPTIONS)(
-        three.model, start, ctrl
-    )
-    np.testing.assert_allclose(at_once.qpos, state.qpos, rtol=1e-5)
-    np.testing.assert_allclose(last_sensors, sensors, rtol=1e-4, atol=1e-5)
-    assert three.control_dt_s == pytest.approx(0.03)
+    world = from_mj_model(model, impl="jax", substeps=3)
+    step = jax.jit(lambda data: mjx.step(world.model, data), compiler_options=CPU_OPTIONS)
+    at_once = jax.jit(world.step, compiler_options=CPU_OPTIONS)
+    assert world.control_dt_s == pytest.approx(0.03)
+    whole = small = world.blank()
+    for ctrl in np.random.default_rng(0).uniform(-1, 1, (30, 1)).astype(np.float32):
+        start = PhysicsState(whole.qpos, whole.qvel, whole.qacc_warmstart)
+        for _ in range(world.substeps):
+            whole = step(whole.replace(ctrl=jnp.array(ctrl)))
+            carried = PhysicsState(small.qpos, small.qvel, small.qacc_warmstart)
+            kept = {name: value for name, value in carried._asdict().items() if value is not None}
+            small = step(world.blank().replace(ctrl=jnp.array(ctrl), **kept))
+            for name in ("qpos", "qvel", "qacc_warmstart", "sensordata"):
+                np.testing.assert_array_equal(getattr(whole, name), getattr(small, name))
+        moved, sensors = at_once(world.model, start, jnp.array(ctrl))
+        np.testing.assert_allclose(moved.qpos, whole.qpos, rtol=1e-4, atol=1e-5)
+        np.testing.assert_allclose(sensors, whole.sensordata, rtol=1e-3, atol=1e-3)
 
 
 ARM_AND_FREE_BOX = """
@@ -144,16 +133,15 @@ def test_poses_are_those_of_mujoco_in_c(impl: str):
 
 
 def test_auto_chooses_by_task(monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr(implementations, "ON_GPU", {"ant": OnGpu("warp")})
-    assert choose_impl("auto", "gpu", "ant", warp_installed=True)[0] == "warp"
-    assert choose_impl("auto", "gpu", "ball_balance", warp_installed=True)[0] == "jax"
-    assert choose_impl("auto", "gpu", "franka_cabinet", warp_installed=True)[0] == "jax"
-    assert choose_impl("auto", "gpu", warp_installed=True)[0] == "jax"
-    assert choose_impl("auto", "cpu", "ant", warp_installed=True)[0] == "jax"
-
-
-def test_every_task_has_an_entry_for_gpus():
     assert set(implementations.ON_GPU) == set(TASKS)
+    monkeypatch.setattr(implementations, "ON_GPU", {"ant": None})
+    for task, platform, chosen in (
+        ("ant", "gpu", "warp"),
+        ("ball_balance", "gpu", "jax"),
+        (None, "gpu", "jax"),
+        ("ant", "cpu", "jax"),
+    ):
+        assert choose_impl("auto", platform, task, warp_installed=True)[0] == chosen
 
 
 @pytest.mark.parametrize("impl", ["jax", "warp"])

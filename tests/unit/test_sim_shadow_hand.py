@@ -1,3 +1,5 @@
+from collections.abc import Iterator
+
 import jax
 import jax.numpy as jnp
 import mujoco
@@ -18,16 +20,18 @@ def model() -> mujoco.MjModel:
     return physics.load("shadow_hand", impl="jax", substeps=shadow_hand.SUBSTEPS).mj_model
 
 
-@pytest.fixture
-def frozen_env(monkeypatch: pytest.MonkeyPatch) -> Env:
+@pytest.fixture(scope="module")
+def frozen_env() -> Iterator[Env]:
     """The task in a world where nothing moves: only what the task adds to physics is left."""
 
     def stand_still(world, model, state, ctrl, read):
         zeros = jnp.zeros((shadow_hand.NUM_TIPS, 13)), jnp.zeros((shadow_hand.NUM_TIPS, 6))
         return state, shadow_hand.Touch(jnp.zeros(24), *zeros)
 
-    monkeypatch.setattr(physics.Physics, "step", stand_still)
-    return shadow_hand.make(impl="jax")
+    with pytest.MonkeyPatch.context() as patched:
+        patched.setattr(physics.Physics, "step", stand_still)
+        env = shadow_hand.make(impl="jax")
+        yield env._replace(reset=jax.jit(env.reset), step=jax.jit(env.step))
 
 
 def keys(seed: int) -> jax.Array:
@@ -67,8 +71,8 @@ def test_rotations_are_turns_about_y_then_about_x():
 def test_a_start_has_coupled_joints_a_nearly_flat_hand_and_the_cube_above_it(model):
     ids = shadow_hand.look_up(model)
     qpos = jax.vmap(lambda key: shadow_hand.draw_start(ids, model, key))(keys(1))
-    assert (qpos[:, ids.joint_qpos] >= 0.2 * ids.lower).all()
-    assert (qpos[:, ids.joint_qpos] <= 0.2 * ids.upper).all()
+    assert (qpos[:, ids.joints.qpos] >= 0.2 * ids.joints.lower).all()
+    assert (qpos[:, ids.joints.qpos] <= 0.2 * ids.joints.upper).all()
     for equality in range(model.neq):
         follower, leader = (
             model.jnt_qposadr[objects[equality]] for objects in (model.eq_obj1id, model.eq_obj2id)
@@ -114,8 +118,8 @@ def test_reward_by_hand(model):
 
 
 def test_a_reached_goal_pays_and_only_then_another_one_is_drawn(frozen_env: Env):
-    state = jax.jit(frozen_env.reset)(frozen_env.model, jax.random.key(4))
-    step, action = jax.jit(frozen_env.step), jnp.zeros(20)
+    state = frozen_env.reset(frozen_env.model, jax.random.key(4))
+    step, action = frozen_env.step, jnp.zeros(20)
     missed = step(frozen_env.model, state, action)
     assert float(missed.reward_terms["success"]) == float(missed.metrics["successes"]) == 0.0
     np.testing.assert_array_equal(missed.task.goal, state.task.goal)
@@ -136,16 +140,15 @@ def test_a_reached_goal_pays_and_only_then_another_one_is_drawn(frozen_env: Env)
 
 
 def test_a_cube_that_fell_ends_the_episode(frozen_env: Env):
-    state = jax.jit(frozen_env.reset)(frozen_env.model, jax.random.key(5))
-    step = jax.jit(frozen_env.step)
+    state = frozen_env.reset(frozen_env.model, jax.random.key(5))
     for height, fallen in ((0.33, False), (0.31, True)):  # the goal is at 0.56, the limit 0.24
         qpos = state.physics.qpos.at[24:27].set(jnp.array([0.0, -0.39, height]))
         moved = state._replace(physics=state.physics._replace(qpos=qpos))
-        assert bool(step(frozen_env.model, moved, jnp.zeros(20)).terminated) is fallen
+        assert bool(frozen_env.step(frozen_env.model, moved, jnp.zeros(20)).terminated) is fallen
 
 
 def test_the_observation_of_a_start_knows_the_fingertips_and_is_clipped(frozen_env: Env):
-    state = jax.jit(frozen_env.reset)(frozen_env.model, jax.random.key(6))
+    state = frozen_env.reset(frozen_env.model, jax.random.key(6))
     data = mujoco.MjData(frozen_env.mj_model)
     data.qpos[:] = state.physics.qpos
     mujoco.mj_forward(frozen_env.mj_model, data)
@@ -156,7 +159,7 @@ def test_the_observation_of_a_start_knows_the_fingertips_and_is_clipped(frozen_e
     np.testing.assert_allclose(state.obs[72:79], state.physics.qpos[CUBE], atol=1e-6)
     np.testing.assert_allclose(state.obs[85:88], shadow_hand.GOAL_M)
     fast = state.physics._replace(qvel=jnp.full(30, 100.0))
-    after = jax.jit(frozen_env.step)(frozen_env.model, state._replace(physics=fast), jnp.ones(20))
+    after = frozen_env.step(frozen_env.model, state._replace(physics=fast), jnp.ones(20))
     np.testing.assert_array_equal(after.obs[24:48], 5.0)
     np.testing.assert_array_equal(after.obs[191:], 1.0)
 

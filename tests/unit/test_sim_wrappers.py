@@ -1,8 +1,12 @@
 """The wrappers on a task whose every number can be done in the head.
 
 The toy walks one unit per step from a random start in [0, 1), and falls over at 3 or more. Its
-reward is 1 for walking plus 10 times the action.
+reward is 1 for walking plus 10 times the action. Without a limit of its own an episode ends in
+three steps.
 """
+
+from functools import cache
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -12,12 +16,13 @@ import pytest
 from gmijax.errors import ConfigError
 from gmijax.sim import episode
 from gmijax.sim.interface import Env, EnvSpec, EnvState
-from gmijax.sim.wrappers import env_keys, split_keys, time_limit, training_env
+from gmijax.sim.wrappers import BatchedEnv, env_keys, split_keys, time_limit, training_env
 
 SPEC = EnvSpec("toy", 1, 1, 1.0, 100, ("walk", "push"))
+PUSH = 0.5
 
 
-def toy(episode_length: int, max_envs: int | None = None) -> Env:
+def toy(episode_length: int) -> Env:
     def reset(model: None, key: jax.Array) -> EnvState:
         key, draw = jax.random.split(key)
         position = jax.random.uniform(draw, (1,))
@@ -25,118 +30,146 @@ def toy(episode_length: int, max_envs: int | None = None) -> Env:
 
     def step(model: None, state: EnvState, action: jax.Array) -> EnvState:
         position = state.physics + 1.0
-        terms = {"walk": jnp.ones(()), "push": 10.0 * action[0]}
+        terms = {"walk": 1.0 + 0.0 * position[0], "push": 10.0 * action[0]}
         reward = terms["walk"] + terms["push"], terms
         return episode.advance(state, position, (), position, reward, position[0] >= 3.0)
 
-    env = Env(SPEC, None, reset, step, None, lambda state: state.physics, max_envs)
-    return time_limit(env, episode_length)
+    return time_limit(
+        Env(SPEC, None, reset, step, None, lambda state: state.physics), episode_length
+    )
 
 
-def run(episode_length: int, steps: int, num_envs: int = 2):
-    env = training_env(toy(episode_length))
-    state = env.init(None, env_keys(jax.random.key(0), 0, num_envs))
-    outputs = []
-    for _ in range(steps):
-        state, out = env.step(None, state, jnp.full((num_envs, 1), 0.5))
-        outputs.append(out)
-    return state, outputs
+def compiled(env: Env, *, random_ep_len: bool = False) -> BatchedEnv:
+    batched = training_env(env, random_ep_len=random_ep_len)
+    return batched._replace(init=jax.jit(batched.init), step=jax.jit(batched.step))
 
 
-def test_time_limit_truncates_and_statistics_are_of_the_finished_episodes():
-    state, outputs = run(episode_length=2, steps=2)
-    assert [out.truncated.tolist() for out in outputs] == [[False] * 2, [True] * 2]
-    assert not any(out.terminated.any() for out in outputs)
+@cache
+def worlds(episode_length: int) -> BatchedEnv:
+    return compiled(toy(episode_length))
+
+
+@cache
+def worlds_with_head_starts(episode_length: int) -> BatchedEnv:
+    return compiled(toy(episode_length), random_ep_len=True)
+
+
+def start(env: BatchedEnv, num_envs: int, first: int = 0, seed: int = 0) -> Any:
+    return env.init(None, env_keys(jax.random.key(seed), first, num_envs))
+
+
+def step(env: BatchedEnv, state: Any) -> Any:
+    return env.step(None, state, jnp.full((*state.env.reward.shape, 1), PUSH))
+
+
+def test_time_limit_truncates_and_a_new_episode_begins_elsewhere():
+    env = worlds(2)
+    first = start(env, 2)
+    after, going_on = step(env, first)
+    assert int(going_on.finished.count) == 0
+    assert after.return_sum.tolist() == [6.0, 6.0]
+    assert after.term_sums["push"].tolist() == [5.0, 5.0]
+    state, out = step(env, after)
+    assert [o.truncated.tolist() for o in (going_on, out)] == [[False] * 2, [True] * 2]
+    assert not out.terminated.any()
     # Two environments, two steps of 1 + 5 each.
-    finished = outputs[1].finished
+    finished = out.finished
     assert (int(finished.count), float(finished.return_sum)) == (2, 24.0)
     assert int(finished.length_sum) == 4
     assert {k: float(v) for k, v in finished.term_sums.items()} == {"walk": 4.0, "push": 20.0}
-    assert int(outputs[0].finished.count) == 0
+    # The outcome is of the old episode, the state of the new one.
+    np.testing.assert_allclose(out.next_obs, first.env.obs + 2.0)
+    assert (state.env.obs < 1.0).all()
+    assert (state.env.obs != first.env.obs).all()
     assert state.return_sum.tolist() == [0.0, 0.0]
     assert state.env.steps.tolist() == [0, 0]
 
 
 def test_an_episode_that_ends_by_itself_at_the_limit_is_not_truncated():
-    _, outputs = run(episode_length=3, steps=3)
-    assert outputs[2].terminated.all()
-    assert not outputs[2].truncated.any()
-
-
-def test_outcome_is_the_old_episode_and_the_new_one_starts_elsewhere():
-    state, outputs = run(episode_length=2, steps=2)
-    first = training_env(toy(2)).init(None, env_keys(jax.random.key(0), 0, 2))
-    np.testing.assert_allclose(outputs[1].next_obs, first.env.obs + 2.0)
-    assert (state.env.obs < 1.0).all()
-    assert (state.env.obs != first.env.obs).all()
-
-
-def test_running_sums_go_on_until_the_episode_ends():
-    state, _ = run(episode_length=5, steps=2)
-    assert state.return_sum.tolist() == [12.0, 12.0]
-    assert state.term_sums["push"].tolist() == [10.0, 10.0]
-    assert state.env.steps.tolist() == [2, 2]
+    env = worlds(3)
+    state = start(env, 2)
+    for _ in range(3):
+        state, out = step(env, state)
+    assert out.terminated.all()
+    assert not out.truncated.any()
 
 
 def test_two_halves_see_what_the_whole_sees():
-    key = jax.random.key(3)
-    env = training_env(toy(2))
     parts = []
     for first, count in ((0, 4), (0, 2), (2, 2)):
-        state = env.init(None, env_keys(key, first, count))
-        state, noise_keys = split_keys(state)
-        for _ in range(2):
-            state, _ = env.step(None, state, jnp.zeros((count, 1)))
-        state, out = env.step(None, state, jnp.zeros((count, 1)))
-        parts.append((out.next_obs, state.env.obs, jax.random.key_data(noise_keys)))
+        state, noise_keys = split_keys(start(worlds(2), count, first, seed=3))
+        for _ in range(3):
+            state, out = step(worlds(2), state)
+        head_start = start(worlds_with_head_starts(1000), count, first, seed=3).head_start
+        noise = jax.random.key_data(noise_keys)
+        parts.append((out.next_obs, state.env.obs, noise, head_start))
     for whole, left, right in zip(*parts, strict=True):
         np.testing.assert_array_equal(whole, np.concatenate([left, right]))
 
 
 def test_split_keys_never_hands_out_the_same_key_twice():
-    state = training_env(toy(2)).init(None, env_keys(jax.random.key(0), 0, 3))
-    state, first = split_keys(state)
+    state, first = split_keys(start(worlds(2), 2))
     state, second = split_keys(state)
     drawn = np.concatenate([jax.random.key_data(keys) for keys in (first, second, state.env.key)])
-    assert len(np.unique(drawn, axis=0)) == 9
+    assert len(np.unique(drawn, axis=0)) == 6
 
 
 def test_more_environments_than_the_model_was_made_for():
-    env = training_env(toy(2, max_envs=2))
+    env = training_env(toy(2)._replace(max_envs=2))
     with pytest.raises(ConfigError, match="num_envs=3: toy was made for at most 2"):
-        env.init(None, env_keys(jax.random.key(0), 0, 3))
+        start(env, 3)
 
 
 def test_first_episodes_end_at_random_times_and_do_not_count():
     # The toy ends by itself after three steps: what is shorter was cut.
-    env = training_env(toy(3), random_ep_len=True)
-    state = env.init(None, env_keys(jax.random.key(0), 0, 64))
+    env = worlds_with_head_starts(3)
+    state = start(env, 64)
     head_start = state.head_start
     assert set(head_start.tolist()) == {0, 1, 2}
-    for step in (1, 2, 3):
-        state, out = env.step(None, state, jnp.zeros((64, 1)))
-        np.testing.assert_array_equal(out.truncated, (head_start == 3 - step) & (step < 3))
-        np.testing.assert_array_equal(out.terminated, (step == 3) & (head_start == 0))
+    for number in (1, 2, 3):
+        state, out = step(env, state)
+        np.testing.assert_array_equal(out.truncated, (head_start == 3 - number) & (number < 3))
+        np.testing.assert_array_equal(out.terminated, (number == 3) & (head_start == 0))
         assert int(out.finished.count) == int(out.terminated.sum())
     assert not state.head_start.any()
     assert state.env.steps.tolist() == head_start.tolist()
 
 
 def test_an_episode_that_ends_by_itself_with_a_head_start_does_not_count():
-    env = training_env(toy(1000), random_ep_len=True)
-    state = env.init(None, env_keys(jax.random.key(0), 0, 8))
+    env = worlds_with_head_starts(1000)
+    state = start(env, 4)
     assert (state.head_start > 0).all()
-    for count in (0, 8):
+    for count in (0, 4):
         for _ in range(3):
-            state, out = env.step(None, state, jnp.zeros((8, 1)))
+            state, out = step(env, state)
         assert out.terminated.all()
         assert int(out.finished.count) == count
 
 
-def test_head_starts_are_those_of_the_world_whoever_has_it():
-    env = training_env(toy(1000), random_ep_len=True)
-    whole, left, right = (
-        env.init(None, env_keys(jax.random.key(3), first, count)).head_start
-        for first, count in ((0, 4), (0, 2), (2, 2))
-    )
-    np.testing.assert_array_equal(whole, np.concatenate([left, right]))
+def test_worlds_with_bad_numbers_end_without_reward_and_start_over():
+    env = worlds(100)
+    state = start(env, 4)
+    # A position of 1e7 is possible, an observation is not.
+    position = jnp.array([0.0, jnp.nan, 1e12, 1e7])[:, None] - 1.0
+    state = state._replace(env=state.env._replace(physics=position, obs=jnp.ones((4, 1))))
+    after, out = step(env, state)
+    assert out.terminated.tolist() == [False, True, True, True]
+    np.testing.assert_array_equal(out.next_obs[1:], 1.0)
+    assert out.reward.tolist() == [6.0, 0.0, 0.0, 0.0]
+    assert {name: int(count) for name, count in out.diverged.items()} == {
+        **{"any": 3, "physics": 2, "observation": 3, "reward/walk": 1, "reward/push": 0},
+    }
+    assert after.env.steps.tolist() == [1, 0, 0, 0]
+    assert np.isfinite(after.env.obs).all()
+    assert out.overflowed == {}  # There are no buffers that could be full.
+
+
+def test_worlds_that_met_a_full_buffer_are_counted_by_buffer():
+    def overflow(state: EnvState) -> jax.Array:
+        return jnp.stack([jnp.ones((), bool), state.obs[0] > 1.5])
+
+    env = compiled(toy(100)._replace(overflow=overflow))
+    _, out = step(env, start(env, 8))
+    counts = {name: int(count) for name, count in out.overflowed.items()}
+    assert counts == {"contact": 8, "constraint": int((out.next_obs[:, 0] > 1.5).sum())}
+    assert 0 < counts["constraint"] < 8

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 from gmijax.cli.compose import compose
 from gmijax.config import TrainConfig
 from gmijax.config.schema import to_dict
+from gmijax.control import decide, serving
 from gmijax.control.start_point import find_start_point
 from gmijax.errors import ConfigError
 from gmijax.runs.folder import META, RunPaths, write_json
@@ -47,30 +49,23 @@ def test_auto_starts_where_there_is_nothing(tmp_path: Path):
         assert (beginning.checkpoint, beginning.is_complete) == (None, False)
 
 
-def test_auto_starts_again_where_there_is_no_checkpoint_yet(run: RunPaths):
-    assert find_start_point(config_of(run.root))[:2] == (run, None)
-
-
 def test_auto_goes_on_from_the_newest_checkpoint_that_is_whole(run: RunPaths):
+    assert find_start_point(config_of(run.root))[:2] == (run, None)
     save(run, 100)
     (save(run, 200) / META).write_text("{")
     beginning = find_start_point(config_of(run.root))
     assert beginning[:3] == (run, run.checkpoint(100), False)
     assert "000000000200: passed over" in beginning.notes[0]
-
-
-def test_auto_has_nothing_to_do_in_a_run_that_is_complete(run: RunPaths):
-    save(run, 100)
     assert find_start_point(config_of(run.root, "num_timesteps=100")).is_complete
 
 
 def test_auto_refuses_the_folder_of_another_task(run: RunPaths):
     message = r"^run\.resume=auto: .*/run holds a run of ant with ppo, not humanoid with ppo$"
-    with pytest.raises(ConfigError, match=message):
-        find_start_point(compose("env=humanoid", f"run.dir={run.root}", "run.resume=auto"))
-    save(run, 100)
-    with pytest.raises(ConfigError, match=message):
-        find_start_point(compose("env=humanoid", f"run.dir={run.root}", "run.resume=auto"))
+    config = compose("env=humanoid", f"run.dir={run.root}", "run.resume=auto")
+    for _ in ("without a checkpoint", "with one"):
+        with pytest.raises(ConfigError, match=message):
+            find_start_point(config)
+        save(run, 100)
 
 
 def test_auto_refuses_other_networks_and_another_seed(run: RunPaths):
@@ -89,24 +84,21 @@ def test_auto_leaves_a_folder_with_something_else_alone(tmp_path: Path):
         find_start_point(config_of(tmp_path / "thesis.tex"))
 
 
-def test_auto_needs_a_folder():
-    with pytest.raises(ConfigError, match=r"^run\.resume=auto: needs run\.dir or run\.name"):
-        compose("env=ant", "run.resume=auto")
-
-
-@pytest.mark.parametrize(
-    ("override", "message"),
-    [
-        ("run.max_restarts=-1", "run.max_restarts=-1: must be at least 0"),
-        ("run.keep_checkpoints=0", "run.keep_checkpoints=0: must be at least 1"),
-        ("run.stop_timeout_s=0", "run.stop_timeout_s=0.0: must be greater than 0"),
-    ],
-)
-def test_bad_values_are_named(override: str, message: str):
-    with pytest.raises(ConfigError, match=message):
-        compose("env=ant", override)
-
-
 def test_a_folder_that_exists_is_refused_before_anything_else(run: RunPaths):
     with pytest.raises(ConfigError, match="the run folder exists already"):
         find_start_point(compose("env=ant", f"run.dir={run.root}", "num_envs=auto"))
+
+
+def test_serve_refuses_a_name_that_is_taken_before_it_searches(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    def search(*_: Any) -> None:
+        pytest.fail("searched first")
+
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "runs" / "mine").mkdir(parents=True)
+    monkeypatch.setattr(decide, "with_auto_decided", search)
+    overrides = ("policy=random", "num_envs=auto", "run.name=mine")
+    config = compose(*overrides, command="serve")
+    with pytest.raises(ConfigError, match=r"^run\.name=runs/mine: the run folder exists already$"):
+        serving.serve(config)

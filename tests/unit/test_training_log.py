@@ -2,40 +2,31 @@
 
 from __future__ import annotations
 
+import json
 import multiprocessing
 import threading
 import time
 from pathlib import Path
-from typing import Any
 
 import jax.numpy as jnp
 import pytest
 from toy_env import metrics_from, point_mass
 
 from gmijax.errors import NonFiniteError
-from gmijax.learning.metrics import EpisodeWindow, Line, TensorBoardSink
 from gmijax.learning.physics_health import TOLERATED_STEPS
 from gmijax.learning.report_thread import ReportThread
-from gmijax.learning.training_log import TrainingLog
+from gmijax.learning.training_log import (
+    EpisodeWindow,
+    JsonlSink,
+    TensorBoardSink,
+    TrainingLog,
+)
 from gmijax.learning.unroll import Counts, no_counts
 from gmijax.ppo.loop import report
 from gmijax.sim.interface import OVERFLOWS
 from gmijax.sim.wrappers import EpisodeSums
 
 SPEC = point_mass().spec
-
-
-class Lines:
-    """A sink that keeps what it is given."""
-
-    def __init__(self) -> None:
-        self.lines: list[dict[str, Any]] = []
-
-    def write(self, line: Line) -> None:
-        self.lines.append(dict(line))
-
-    def close(self) -> None:
-        return None
 
 
 def _counts(overflowed: dict[str, int] | None = None, **diverged: int) -> Counts:
@@ -62,22 +53,23 @@ def test_a_loss_that_is_not_finite_is_named() -> None:
 
 
 def test_the_first_overflow_is_told_and_all_are_logged(
-    capsys: pytest.CaptureFixture[str],
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    sink = Lines()
+    sink = JsonlSink(tmp_path / "metrics.jsonl")
     log = TrainingLog("point_mass", (sink,), 0)
     for iteration, count in enumerate((0, 5, 7), start=1):
         full = dict.fromkeys(OVERFLOWS, 0) | {"contact": count}
         report(log, 64 * iteration, metrics_from(_counts(full)), {})
-    assert [line["physics/contact_overflow_steps"] for line in sink.lines] == [0.0, 5.0, 7.0]
-    assert [line["physics/constraint_overflow_steps"] for line in sink.lines] == [0.0] * 3
+    # Where nothing can overflow no line speaks of it.
+    report(TrainingLog("point_mass", (sink,), 0), 64, metrics_from(_counts()), {})
+    sink.close()
+    lines = [json.loads(line) for line in (tmp_path / "metrics.jsonl").read_text().splitlines()]
+    assert [line.get("physics/contact_overflow_steps") for line in lines] == [0.0, 5.0, 7.0, None]
+    assert [line.get("physics/constraint_overflow_steps") for line in lines] == [0, 0, 0, None]
     assert log.overflows.steps == {"contact": 12.0, "constraint": 0.0}
     told = capsys.readouterr().err.splitlines()
     assert len(told) == 1
     assert told[0].startswith("point_mass: MJX-Warp's contact buffer was too small in 5 ")
-    # Where nothing can overflow no line speaks of it.
-    report(TrainingLog("point_mass", (sink,), 0), 64, metrics_from(_counts()), {})
-    assert not [name for name in sink.lines[-1] if name.startswith("physics/")]
 
 
 def test_reports_come_in_order_from_a_thread_of_their_own_and_errors_with_the_next_call() -> None:

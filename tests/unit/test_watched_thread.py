@@ -8,7 +8,7 @@ import threading
 
 import pytest
 
-from gmijax.collectives.watched_thread import WatchedThread
+from gmijax.collectives.device.watched_thread import WatchedThread
 
 
 def test_results_and_errors_come_back_in_order() -> None:
@@ -25,7 +25,7 @@ def test_a_process_with_a_stuck_call_ends_all_the_same() -> None:
     # The function at exit stands for a library that waits for its call for ever.
     code = """
 import atexit, threading
-from gmijax.collectives.watched_thread import WatchedThread
+from gmijax.collectives.device.watched_thread import WatchedThread
 atexit.register(threading.Event().wait)
 def wait(done):
     assert not done.wait(0.2)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import time
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from typing import NamedTuple, TypeAlias
 
 import numpy as np
@@ -41,19 +42,8 @@ class Batcher:
     """A trainer's end of the channels: makes batches of unrolls from several agents, in turn.
 
     A batch that lies in one transfer is a slice of it, without a copy, and holds its memory until
-    the next batch is asked for. Otherwise unrolls are stacked in memory of the batcher's own.
-
-    Args:
-      rank: of this trainer.
-      sources: the ways from all agents, each with what reads its messages.
-      new_stack: makes, from a spec and a size, what batches of several arrivals are stacked in.
-      held: closed at the end.
-
-    Attributes:
-      batches: given out.
-      unrolls: environments' unrolls that arrived.
-      transfers: messages that arrived.
-      num_bytes: in all channels, as they travelled.
+    the next batch is asked for. Otherwise unrolls are stacked in what `new_stack` makes.
+    It counts `batches` given out, `unrolls`, `transfers` and `num_bytes` that arrived.
     """
 
     def __init__(
@@ -86,7 +76,8 @@ class Batcher:
           PipeClosed: all agents have closed, and too few are left.
           CollectiveError: a message is damaged.
         """
-        self._check_agents()
+        if time.monotonic() >= self._next_look_s and (error := self._why_lost()) is not None:
+            raise error
         self._resize(batch_size)
         deadline_s = time.monotonic() + timeout_s
         while True:
@@ -155,10 +146,6 @@ class Batcher:
         lost = (error for error in found if not isinstance(error, PipeClosed))
         return next((error for error in lost if error is not None), None)
 
-    def _check_agents(self) -> None:
-        if time.monotonic() >= self._next_look_s and (error := self._why_lost()) is not None:
-            raise error
-
     def _resize(self, batch_size: int) -> None:
         """Makes what is stacked for batches of another size the first of the next arrivals."""
         if batch_size < 1:
@@ -176,43 +163,30 @@ class Batcher:
             self._current = None
 
 
+@dataclass
 class _Arrival:
-    """A transfer of which a part may be in batches already."""
+    """A transfer of which a part may be in batches already; `left` unrolls are not."""
 
-    def __init__(
-        self, transfer: Transfer, agents: npt.NDArray[np.int64], release: Callable[[], None]
-    ) -> None:
-        self.spec = transfer.spec
-        self.release = release
-        self._transfer = transfer
-        self._agents = agents
-        self._taken = 0
+    transfer: Transfer
+    agents: npt.NDArray[np.int64]
+    release: Callable[[], None]
 
-    @property
-    def left(self) -> int:
-        return self._transfer.num_envs - self._taken
+    def __post_init__(self) -> None:
+        self.spec, self.left = self.transfer.spec, self.transfer.num_envs
 
     def take(self, count: int) -> Batch:
         """The next unrolls, as they travelled."""
-        low, high = self._taken, self._taken + count
-        self._taken = high
-        arrays = self._transfer.arrays
-        if count < self._transfer.num_envs:  # A part of an array on a device is a copy.
+        low = self.transfer.num_envs - self.left
+        high = low + count
+        self.left -= count
+        arrays = self.transfer.arrays
+        if count < self.transfer.num_envs:  # A part of an array on a device is a copy.
             arrays = {name: array[:, low:high] for name, array in arrays.items()}
-        return Batch(arrays, self._transfer.versions[low:high], self._agents[low:high])
+        return Batch(arrays, self.transfer.versions[low:high], self.agents[low:high])
 
 
 class Stack:
-    """A batch that is put together from several arrivals, here in host memory.
-
-    Args:
-      spec: the channels.
-      size: B, unrolls of the batch.
-
-    Attributes:
-      spec, size: the same.
-      filled: unrolls that are in it.
-    """
+    """A batch of `size` unrolls from several arrivals, here in host memory; `filled` are in it."""
 
     def __init__(self, spec: Spec, size: int) -> None:
         self.spec, self.size = spec, size

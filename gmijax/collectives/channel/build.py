@@ -14,7 +14,7 @@ from gmijax.collectives.channel.migrator import Migrator
 from gmijax.collectives.channel.sender import Packer, Sender
 from gmijax.collectives.channel.transport import ChannelReader, ChannelWriter
 from gmijax.collectives.channel.unichannel import UniDecoder, UniPacker
-from gmijax.collectives.device_memory import NewMemory, cuda_memory
+from gmijax.collectives.device.device_memory import NewMemory, cuda_memory
 from gmijax.collectives.messages.pipe import PipeReader, PipeWriter
 from gmijax.collectives.messages.pipe_block import PipeBlock, create_pipes
 from gmijax.config.channel import ChannelConfig
@@ -32,14 +32,10 @@ DEVICE_MEMORY: NewMemory = cuda_memory
 
 @dataclass(frozen=True, kw_only=True)
 class ChannelTopology:
-    """Who sends, who receives, and where they are.
+    """Ranks that send and ranks that receive, and the GPU of all K.
 
-    Attributes:
-      agents: ranks that send.
-      trainers: ranks that receive.
-      gpu_of: index of every rank's GPU, K entries.
-      addresses: with `transport=zmq`, where the trainer of a pair (agent, trainer) listens, as
-        `host:port`.
+    With `transport=zmq`, `addresses` says where the trainer of a pair (agent, trainer) listens,
+    as `host:port`.
     """
 
     agents: tuple[int, ...]
@@ -55,7 +51,7 @@ class ChannelTopology:
             )
 
     def address(self, agent: int, trainer: int) -> str:
-        """Where `trainer` listens for `agent`."""
+        """See above."""
         if self.addresses is None or (agent, trainer) not in self.addresses:
             raise ConfigError(
                 f"channel.transport=zmq: needs an address for agent {agent} and trainer {trainer}"
@@ -91,13 +87,7 @@ def create_channels(config: ChannelConfig, topology: ChannelTopology) -> int:
 def open_sender(
     config: ChannelConfig, topology: ChannelTopology, rank: int, fd: int | None
 ) -> Sender:
-    """The end of agent `rank`.
-
-    Args:
-      config: what the user asked for.
-      topology: who takes part.
-      rank: this agent.
-      fd: descriptor from `create_channels`, None with `transport=zmq`.
+    """The end of agent `rank`; `fd` is from `create_channels`, None with `transport=zmq`.
 
     Raises:
       ConfigError: something is missing.
@@ -171,9 +161,8 @@ def _device_sender(
     """The end of an agent that leaves its experience on the GPU, for the trainers there."""
     from gmijax.collectives.channel.resident import ResidentPacker, SlotWriter
 
-    writers = [SlotWriter(block, peer, config.capacity_bytes) for peer in near]
-    migrator = Migrator(writers, near)
-    packer = ResidentPacker(migrator, writers, config.capacity_bytes, DEVICE_MEMORY)
+    migrator = Migrator([SlotWriter(block, peer, config.capacity_bytes) for peer in near], near)
+    packer = ResidentPacker(migrator, config.capacity_bytes, DEVICE_MEMORY)
     held.callback(packer.close)
     held.callback(migrator.close)
     dispenser = Dispenser(max_piece_bytes=None)

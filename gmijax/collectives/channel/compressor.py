@@ -15,6 +15,7 @@ from __future__ import annotations
 
 import statistics
 import time
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -35,18 +36,10 @@ WORTH_IT = 0.95
 
 
 class TransferSize:
-    """Doubles the size as long as a byte gets cheaper, then keeps the best.
+    """Doubles `num_bytes` as long as a byte gets cheaper, then keeps the best; or keeps to a size.
 
     The price of a transfer is fixed plus so much a byte, so that there is no use in going on
     once it has stopped falling; larger transfers only make experience older.
-
-    Args:
-      fixed_bytes: a size to keep to; None: found by trying.
-      max_bytes: largest size to try.
-
-    Attributes:
-      num_bytes: the size to use now.
-      is_settled: whether it will not change any more.
     """
 
     def __init__(self, fixed_bytes: int | None, max_bytes: int) -> None:
@@ -77,18 +70,10 @@ class TransferSize:
 class Compressor:
     """Fills transfers with pieces, one transfer at a time; a `Packer`.
 
-    Args:
-      migrator: gives transfers their way and their memory.
-      size: how large they should be.
-      max_transfer_bytes: largest sum of all channels and the table's rows for pieces.
-
-    Attributes:
-      transfers: number handed over.
-      num_bytes: in their channels.
+    `max_transfer_bytes` bounds the sum of all channels and the table's rows for pieces.
     """
 
     def __init__(self, migrator: Migrator, size: TransferSize, max_transfer_bytes: int) -> None:
-        self.transfers = self.num_bytes = 0
         self._migrator = migrator
         self._size = size
         self._max_transfer_bytes = max_transfer_bytes
@@ -117,8 +102,6 @@ class Compressor:
         started_s = time.perf_counter()
         num_bytes = transfer.commit()
         self._size.record(num_bytes, transfer.spent_s + time.perf_counter() - started_s)
-        self.transfers += 1
-        self.num_bytes += num_bytes
 
     def _begin(self, piece: Piece) -> _OpenTransfer | None:
         # With its row of the table, which may be larger than a small piece.
@@ -133,59 +116,46 @@ class Compressor:
         writer, views = opened
         views[0][:] = head
         table = views[1].view(np.int64).reshape(-1, 2)
+        table[:] = 0
         arrays = piece.spec.arrays_in(views[2:], room)
         return _OpenTransfer(writer, piece.spec, table, arrays, room)
 
 
+@dataclass
 class _OpenTransfer:
-    """A transfer that is being filled."""
+    """A transfer that is being filled, with `room` for environments."""
 
-    def __init__(
-        self,
-        writer: ChannelWriter,
-        spec: Spec,
-        table: npt.NDArray[np.int64],
-        arrays: dict[str, Array],
-        room: int,
-    ) -> None:
-        self.spent_s = 0.0
-        self._writer = writer
-        self._spec = spec
-        self._table = table
-        self._arrays = arrays
-        self._room = room
-        self._filled = self._pieces = 0
-        table[:] = 0
+    writer: ChannelWriter
+    spec: Spec
+    table: npt.NDArray[np.int64]
+    arrays: dict[str, Array]
+    room: int
+    filled: int = 0
+    pieces: int = 0
+    spent_s: float = 0.0
 
     @property
     def is_full(self) -> bool:
-        return self._filled == self._room or self._pieces == len(self._table) - 1
+        return self.filled == self.room or self.pieces == len(self.table) - 1
 
     def takes(self, piece: Piece) -> bool:
-        return piece.spec == self._spec and self._filled + piece.num_envs <= self._room
+        return piece.spec == self.spec and self.filled + piece.num_envs <= self.room
 
     def add(self, piece: Piece) -> None:
-        low, high = self._filled, self._filled + piece.num_envs
+        low, high = self.filled, self.filled + piece.num_envs
         for name, array in piece.channels.items():
-            write_channel(self._arrays[name][:, low:high], array)
-        self._filled, self._pieces = high, self._pieces + 1
-        self._table[self._pieces] = piece.num_envs, piece.version
+            write_channel(self.arrays[name][:, low:high], array)
+        self.filled, self.pieces = high, self.pieces + 1
+        self.table[self.pieces] = piece.num_envs, piece.version
 
     def commit(self) -> int:
-        self._table[0] = self._room, self._pieces
-        self._writer.commit()
-        return sum(self._spec.sizes(self._filled))
+        self.table[0] = self.room, self.pieces
+        self.writer.commit()
+        return sum(self.spec.sizes(self.filled))
 
 
 class Transfer(NamedTuple):
-    """A transfer as the trainer reads it.
-
-    Attributes:
-      spec: the channels.
-      num_envs: of all pieces together.
-      versions: [num_envs] int64.
-      arrays: by channel, [S, num_envs, ...] as they travelled; views.
-    """
+    """A transfer as the trainer reads it: versions [N] int64, and views [S, N, ...] by channel."""
 
     spec: Spec
     num_envs: int
@@ -195,7 +165,7 @@ class Transfer(NamedTuple):
 
 def read_transfer(message: Message) -> Transfer:
     """What a `Compressor` made; a `Decode`."""
-    head, table, *parts = message.parts
+    head, table, *parts = message
     spec, table = Spec.decode(head), table.view(np.int64).reshape(-1, 2)
     room, pieces = table[0].tolist()
     counts, versions = table[1 : 1 + pieces].T

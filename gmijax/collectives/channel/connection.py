@@ -54,12 +54,8 @@ _WATCHED: Final = (
 class Connection:
     """One end of a connection: frames in and out, and whether the other end is there.
 
-    Args:
-      address: `host:port`.
-      rank: of this process.
-      peer: rank of the other one.
-      max_frame_bytes: who sends a longer part of a message is cut off.
-      listens: here, or the other end does.
+    One end of `address` (`host:port`) listens. Who sends a part of more than `max_frame_bytes` is
+    cut off.
 
     Raises:
       CollectiveError: an address that cannot be.
@@ -83,11 +79,16 @@ class Connection:
         self._socket.setsockopt(zmq.MAXMSGSIZE, max_frame_bytes)
         self._monitor = self._socket.get_monitor_socket(_WATCHED)
         try:
-            _authenticate(self._socket, server_key, listens=listens)
             if listens:
+                self._socket.setsockopt(zmq.CURVE_SERVER, 1)
+                self._socket.setsockopt(zmq.CURVE_SECRETKEY, server_key)
                 self._socket.setsockopt(zmq.USE_FD, _listening(address))
                 self._socket.bind(f"tcp://{address}")
             else:
+                own_public, own_secret = zmq.curve_keypair()
+                self._socket.setsockopt(zmq.CURVE_SERVERKEY, zmq.curve_public(server_key))
+                self._socket.setsockopt(zmq.CURVE_PUBLICKEY, own_public)
+                self._socket.setsockopt(zmq.CURVE_SECRETKEY, own_secret)
                 self._socket.connect(f"tcp://{address}")
         except (OSError, ValueError, OverflowError, zmq.ZMQError) as error:
             self.close()
@@ -127,8 +128,8 @@ class Connection:
     def _note(self, event: int, descriptor: int) -> None:
         """Tells connections of the peer from those of strangers, who end without a handshake.
 
-        ZeroMQ does not say whose handshake succeeded. Where several are under way it is seen when
-        the others have ended, which ZeroMQ sees to within half a minute.
+        ZeroMQ does not say whose handshake succeeded: it shows when the others have ended, which
+        ZeroMQ sees to within half a minute.
         """
         if event == zmq.EVENT_HANDSHAKE_SUCCEEDED:
             self._handshakes += 1
@@ -143,7 +144,7 @@ class Connection:
             self._strangers, self._handshakes = set(), 0
 
     def close(self) -> None:
-        """Leaves at once, but for what is not on the wire; calling it twice is fine."""
+        """Leaves at once, but for what is not on the wire. Idempotent."""
         if not self.is_closed:
             linger_ms = 0 if self.is_cut() else _LINGER_MS
             self.is_closed = True
@@ -151,18 +152,6 @@ class Connection:
             self._monitor.close()
             self._socket.close(linger_ms)
             self._context.term()
-
-
-def _authenticate(end: zmq.Socket[Any], server_key: bytes, *, listens: bool) -> None:
-    """Makes one end take part in nothing but a handshake of those who know the secret."""
-    if listens:
-        end.setsockopt(zmq.CURVE_SERVER, 1)
-        end.setsockopt(zmq.CURVE_SECRETKEY, server_key)
-        return
-    own_public, own_secret = zmq.curve_keypair()
-    end.setsockopt(zmq.CURVE_SERVERKEY, zmq.curve_public(server_key))
-    end.setsockopt(zmq.CURVE_PUBLICKEY, own_public)
-    end.setsockopt(zmq.CURVE_SECRETKEY, own_secret)
 
 
 def _server_key(address: str) -> bytes:

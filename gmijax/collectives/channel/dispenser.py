@@ -12,13 +12,9 @@ from gmijax.errors import ConfigError
 
 
 class Piece(NamedTuple):
-    """Experience of some environments, by channel.
+    """Experience of N environments, made with one version of the policy.
 
-    Attributes:
-      spec: the channels.
-      num_envs: N.
-      version: of the policy that acted.
-      channels: arrays by channel, views of what the agent gave.
+    Its arrays are views of what the agent gave.
     """
 
     spec: Spec
@@ -46,11 +42,7 @@ class Dispenser:
         self._spec: Spec | None = None
 
     def split(self, experience: Experience | Any, version: int) -> list[Piece]:
-        """The pieces of one rollout, in order of environment.
-
-        Args:
-          experience: arrays by channel, as a mapping or a NamedTuple.
-          version: of the policy that acted.
+        """The pieces of one rollout (a mapping or a NamedTuple), in order of environment.
 
         Raises:
           ConfigError: not such arrays, others than the first time, or too large ones.
@@ -67,7 +59,13 @@ class Dispenser:
             raise ConfigError(f"experience: got {spec}, the first was {self._spec}")
         if self._max_piece_bytes is None:
             return [Piece(self._spec, num_envs, version, channels)]
-        pieces = -(-num_envs // self._envs_per_piece(self._max_piece_bytes, spec))
+        one, most = sum(spec.sizes(1)), self._max_piece_bytes
+        if one > most:
+            raise ConfigError(
+                f"experience: {one} bytes for one environment, at most {most}; "
+                "channel.capacity_mib must be larger, or the unroll shorter"
+            )
+        pieces = -(-num_envs // (most // one))
         step = -(-num_envs // pieces)  # As equal as can be.
         found = []
         for low in range(0, num_envs, step):
@@ -75,15 +73,6 @@ class Dispenser:
             part = {name: array[:, low:high] for name, array in channels.items()}
             found.append(Piece(self._spec, high - low, version, part))
         return found
-
-    def _envs_per_piece(self, max_bytes: int, spec: Spec) -> int:
-        one = sum(spec.sizes(1))
-        if one > max_bytes:
-            raise ConfigError(
-                f"experience: {one} bytes for one environment, at most {max_bytes}; "
-                "channel.capacity_mib must be larger, or the unroll shorter"
-            )
-        return max_bytes // one
 
     def _check_names(self, spec: Spec) -> None:
         allowed = [channel.name for channel in spec.channels if channel.dtype == "float32"]

@@ -19,15 +19,10 @@ W = TypeVar("W", bound=ChannelWriter)
 
 
 class Migrator(Generic[W]):
-    """Routes the transfers of one agent.
-
-    Args:
-      writers: the ways to all trainers.
-      near: ranks of the trainers on the agent's GPU.
-    """
+    """Routes the transfers of one agent over `writers`; `near` are ranks on the agent's GPU."""
 
     def __init__(self, writers: Sequence[W], near: Sequence[int]) -> None:
-        self._writers = tuple(writers)
+        self.writers = tuple(writers)
         self._candidates = [w for w in writers if w.peer in near] or list(writers)
         self._transfers = 0
         self._next_look_s = time.monotonic()
@@ -52,7 +47,7 @@ class Migrator(Generic[W]):
 
     def why_lost(self) -> GmijaxError | None:
         """Why some trainer will never read again, the dead first; None if all may."""
-        asked = (writer.why_lost("send", self._transfers) for writer in self._writers)
+        asked = (writer.why_lost("send", self._transfers) for writer in self.writers)
         found = [error for error in asked if error is not None]
         dead = (error for error in found if isinstance(error, PeerLost))
         return next(dead, found[0] if found else None)
@@ -67,7 +62,7 @@ class Migrator(Generic[W]):
 
     def occupancy(self) -> float:
         """How full the fullest way is, 0 to 1."""
-        return max(writer.occupancy() for writer in self._writers)
+        return max(writer.occupancy() for writer in self.writers)
 
     def least_occupancy(self) -> float:
         """How full the emptiest way is that the next transfer may take, 0 to 1."""
@@ -75,7 +70,7 @@ class Migrator(Generic[W]):
 
     def close(self) -> None:
         """Tells all trainers that nothing more comes."""
-        for writer in self._writers:
+        for writer in self.writers:
             writer.close()
 
     def _by_load(self) -> list[W]:

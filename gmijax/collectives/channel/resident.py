@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import contextlib
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import jax
@@ -23,7 +24,7 @@ from gmijax.collectives.channel.dispenser import Piece
 from gmijax.collectives.channel.migrator import Migrator
 from gmijax.collectives.channel.sender import CLOSE_TIMEOUT_S
 from gmijax.collectives.channel.spec import Spec
-from gmijax.collectives.device_memory import TICKET_BYTES, DeviceMemory, NewMemory
+from gmijax.collectives.device.device_memory import TICKET_BYTES, DeviceMemory, NewMemory
 from gmijax.collectives.messages.pipe import Bytes, Message, PipeWriter
 from gmijax.collectives.messages.pipe_block import PipeBlock
 from gmijax.collectives.shared_memory import round_up
@@ -44,15 +45,9 @@ def slot_offsets(spec: Spec, num_envs: int) -> tuple[list[int], int]:
 
 
 class SlotWriter(PipeWriter):
-    """The way to one trainer: notes, and slots that are used in turn.
+    """The way to one trainer: notes through a pipe, and slots that are used in turn.
 
-    Args:
-      block: of the pipes that the notes travel through.
-      peer: rank of the trainer.
-      capacity_bytes: GPU memory for it.
-
-    Attributes:
-      num_slots, slot_bytes: set when the first rollout shows how large it is.
+    The first rollout shows how large `num_slots` and `slot_bytes` are.
     """
 
     def __init__(self, block: PipeBlock, peer: int, capacity_bytes: int) -> None:
@@ -76,28 +71,15 @@ class SlotWriter(PipeWriter):
         return self.outstanding_messages * self.slot_bytes / self._capacity_bytes
 
 
+@dataclass
 class ResidentPacker:
-    """Leaves rollouts on the device; a `Packer`.
+    """Leaves rollouts on the device, in `capacity_bytes` for each trainer; a `Packer`."""
 
-    Args:
-      migrator: the ways to the agent's trainers, all on its GPU.
-      writers: the same ways.
-      capacity_bytes: GPU memory for each trainer.
-      new_memory: how the processes share memory of the GPU.
-    """
+    migrator: Migrator[SlotWriter]
+    capacity_bytes: int
+    new_memory: NewMemory
 
-    def __init__(
-        self,
-        migrator: Migrator[SlotWriter],
-        writers: Sequence[SlotWriter],
-        capacity_bytes: int,
-        new_memory: NewMemory,
-    ) -> None:
-        self.transfers = self.num_bytes = 0
-        self._migrator = migrator
-        self._writers = tuple(writers)
-        self._capacity_bytes = capacity_bytes
-        self._new_memory = new_memory
+    def __post_init__(self) -> None:
         self._memory: DeviceMemory | None = None
         self._ticket = b""
         self._head = np.zeros(0, np.uint8)
@@ -113,12 +95,12 @@ class ResidentPacker:
           CudaError: memory of the GPU cannot be shared.
         """
         memory = self._prepare(piece)
-        opened = self._migrator.try_open([self._head.size, TICKET_BYTES, NOTE.itemsize])
+        opened = self.migrator.try_open([self._head.size, TICKET_BYTES, NOTE.itemsize])
         if opened is None:
             return False
         writer, views = opened
         slot = writer.messages % writer.num_slots
-        place = self._writers.index(writer) * writer.num_slots + slot
+        place = self.migrator.writers.index(writer) * writer.num_slots + slot
         offset = place * self._slot_bytes
         for begin, channel in zip(self._offsets, piece.spec.channels, strict=True):
             memory.write(offset + begin, piece.channels[channel.name])  # pyright: ignore[reportArgumentType]
@@ -126,8 +108,6 @@ class ResidentPacker:
         views[1][:] = np.frombuffer(self._ticket, np.uint8)
         views[2].view(NOTE)[0] = (offset, piece.num_envs, piece.version)
         writer.commit()
-        self.transfers += 1
-        self.num_bytes += self._slot_bytes
         return True
 
     def flush(self) -> None:
@@ -136,12 +116,12 @@ class ResidentPacker:
     def close(self) -> None:
         """Frees the memory when the trainers have read all, or some time has passed."""
         with contextlib.suppress(GmijaxError):  # A trainer that is gone wants nothing.
-            wait_until(self._is_read, self._migrator.why_lost, CLOSE_TIMEOUT_S)
+            wait_until(self._is_read, self.migrator.why_lost, CLOSE_TIMEOUT_S)
         if self._memory is not None:
             self._memory.close()
 
     def _is_read(self) -> bool | None:
-        return not any(writer.outstanding_messages for writer in self._writers) or None
+        return not any(writer.outstanding_messages for writer in self.migrator.writers) or None
 
     def _prepare(self, piece: Piece) -> DeviceMemory:
         """The memory; its slots are made when the first rollout shows how large they are."""
@@ -154,16 +134,16 @@ class ResidentPacker:
             return self._memory
         self._head, self._num_envs = piece.spec.encode(), piece.num_envs
         self._offsets, self._slot_bytes = slot_offsets(piece.spec, piece.num_envs)
-        num_slots = self._capacity_bytes // self._slot_bytes
+        num_slots = self.capacity_bytes // self._slot_bytes
         if num_slots < _LEAST_SLOTS:
             raise ConfigError(
-                f"channel.capacity_mib={self._capacity_bytes >> 20}: must hold {_LEAST_SLOTS} "
+                f"channel.capacity_mib={self.capacity_bytes >> 20}: must hold {_LEAST_SLOTS} "
                 f"rollouts of {self._slot_bytes} bytes"
             )
-        memory = self._new_memory()
-        self._ticket = memory.create(len(self._writers) * num_slots * self._slot_bytes)
+        memory = self.new_memory()
+        self._ticket = memory.create(len(self.migrator.writers) * num_slots * self._slot_bytes)
         self._memory = memory
-        for writer in self._writers:
+        for writer in self.migrator.writers:
             writer.num_slots, writer.slot_bytes = num_slots, self._slot_bytes
         return memory
 
@@ -182,11 +162,12 @@ class ResidentDecoder:
         Raises:
           CudaError: the agent's memory cannot be read here.
         """
-        spec = Spec.decode(message.parts[0])
-        offset, num_envs, version = message.parts[2].view(NOTE)[0].tolist()
+        head, ticket, note = message
+        spec = Spec.decode(head)
+        offset, num_envs, version = note.view(NOTE)[0].tolist()
         if self._memory is None:
             self._memory = self._new_memory()
-            self._memory.open(message.parts[1].tobytes())
+            self._memory.open(ticket.tobytes())
         if offset not in self._views:
             self._views[offset] = {
                 channel.name: self._memory.view(

@@ -6,6 +6,7 @@ import contextlib
 import time
 from collections import deque
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Protocol
 
 from gmijax.collectives.channel.dispenser import Dispenser, Piece
@@ -19,15 +20,7 @@ CLOSE_TIMEOUT_S = 5.0
 
 
 class Packer(Protocol):
-    """What makes messages of pieces: a `Compressor`, or what takes its place.
-
-    Attributes:
-      transfers: messages committed.
-      num_bytes: in all channels, as they travel.
-    """
-
-    transfers: int
-    num_bytes: int
+    """What makes messages of pieces: a `Compressor`, a `UniPacker` or a `ResidentPacker`."""
 
     def try_add(self, piece: Piece) -> bool:
         """Takes `piece`, or says that there is no room; then the same piece must come again."""
@@ -35,48 +28,35 @@ class Packer(Protocol):
 
     def flush(self) -> None:
         """Hands over what waits for more to come."""
-        ...
 
 
+@dataclass
 class Sender:
-    """An agent's end of the channels.
+    """An agent's end of the channels; `held` is closed with it.
 
-    Args:
-      dispenser: splits rollouts.
-      packer: makes messages of the pieces.
-      migrator: the ways to the trainers.
-      max_waiting: None: `send` waits for room and nothing is ever dropped. Otherwise it never
-        waits: what finds no room is copied and queued, and a queue of more pieces than this
-        loses its oldest. What is in the channel already is a trainer's and stays.
-      on_device: see below.
-      held: closed at the end.
+    With `max_waiting=None`, `send` waits for room and nothing is ever dropped. Otherwise it never
+    waits: what finds no room is copied and queued, and a queue of more pieces than this loses
+    its oldest. What is in the channel already is a trainer's and stays.
 
     Attributes:
       on_device: whether it takes arrays of the device; otherwise numpy's.
+      num_bytes: sent, in all channels, as they travel.
       dropped: pieces that nobody gets, with `max_waiting`; after `close` also those that still
         waited.
       waited_s: time spent waiting for room.
     """
 
-    def __init__(
-        self,
-        dispenser: Dispenser,
-        packer: Packer,
-        migrator: Migrator,
-        *,
-        max_waiting: int | None,
-        on_device: bool,
-        held: contextlib.ExitStack,
-    ) -> None:
-        self.on_device = on_device
-        self._dispenser = dispenser
-        self._packer = packer
-        self._migrator = migrator
-        self._max_waiting = max_waiting
-        self._held = held
-        self._waiting: deque[Piece] = deque()
-        self.dropped = 0
+    dispenser: Dispenser
+    packer: Packer
+    migrator: Migrator
+    max_waiting: int | None
+    on_device: bool
+    held: contextlib.ExitStack
+
+    def __post_init__(self) -> None:
+        self.num_bytes = self.dropped = 0
         self.waited_s = 0.0
+        self._waiting: deque[Piece] = deque()
         self._is_pending = False
         self._is_open = True
 
@@ -89,8 +69,8 @@ class Sender:
           timeout_s: longest wait for room (`when_full=block`).
 
         Returns:
-          False if no trainer made room in time. Then, and after an error, a part may have been
-          sent: call it again with the same experience until it is done, or send nothing any more.
+          False if no trainer made room in time. Then, and after an error, call it again with the
+          same experience until it is done: a part may have been sent.
 
         Raises:
           PeerLost: the process of a trainer is gone.
@@ -98,39 +78,29 @@ class Sender:
           ConfigError: not such arrays, or an unroll that is too large for the channel.
           CudaError: memory of the GPU cannot be shared.
         """
-        self._migrator.check()
+        self.migrator.check()
         # If pending it is the same rollout as before, which is split already.
-        pieces = [] if self._is_pending else self._dispenser.split(experience, version)
+        pieces = [] if self._is_pending else self.dispenser.split(experience, version)
         self._is_pending = True  # Also after an error: some of it may have been sent.
-        if self._max_waiting is None:
+        if self.max_waiting is None:
             self._waiting.extend(pieces)
             self._is_pending = not self._drain(timeout_s)
         else:
-            self._queue(pieces, self._max_waiting)
+            self._queue(pieces, self.max_waiting)
             self._is_pending = False
         return not self._is_pending
 
     def flush(self) -> None:
         """Hands over what waits for more to come; trainers cannot see it before."""
-        self._packer.flush()
-
-    @property
-    def transfers(self) -> int:
-        """Messages committed."""
-        return self._packer.transfers
-
-    @property
-    def num_bytes(self) -> int:
-        """Bytes committed, in all channels, as they travel."""
-        return self._packer.num_bytes
+        self.packer.flush()
 
     def occupancy(self) -> float:
         """Of the fullest way to a trainer, 0 to 1."""
-        return self._migrator.occupancy()
+        return self.migrator.occupancy()
 
     def least_occupancy(self) -> float:
         """Of the emptiest way that the next transfer may take, 0 to 1."""
-        return self._migrator.least_occupancy()
+        return self.migrator.least_occupancy()
 
     def close(self) -> None:
         """Flushes, and tells the trainers that nothing more comes. Idempotent.
@@ -145,14 +115,14 @@ class Sender:
             self._drain(CLOSE_TIMEOUT_S)
         self.dropped += len(self._waiting)
         self._waiting.clear()
-        self._packer.flush()  # Another one may.
-        self._held.close()
+        self.packer.flush()  # Another one may.
+        self.held.close()
 
     def _drain(self, timeout_s: float) -> bool:
         """Whether all that waits was taken in time."""
         deadline_s = time.monotonic() + timeout_s
         while self._waiting:
-            if not self._packer.try_add(self._waiting[0]) and not self._wait(deadline_s):
+            if not self._try_add(self._waiting[0]) and not self._wait(deadline_s):
                 return False
             self._waiting.popleft()
         return True
@@ -162,20 +132,25 @@ class Sender:
         piece, started_s = self._waiting[0], time.monotonic()
         try:
             took = wait_until(
-                lambda: self._packer.try_add(piece) or None,
-                self._migrator.why_lost,
+                lambda: self._try_add(piece) or None,
+                self.migrator.why_lost,
                 deadline_s - started_s,
             )
         finally:
             self.waited_s += time.monotonic() - started_s
         return took is not None
 
+    def _try_add(self, piece: Piece) -> bool:
+        is_taken = self.packer.try_add(piece)
+        self.num_bytes += is_taken * sum(piece.spec.sizes(piece.num_envs))
+        return is_taken
+
     def _queue(self, pieces: Sequence[Piece], max_waiting: int) -> None:
         """Takes all pieces at once."""
         for piece in pieces:
-            while self._waiting and self._packer.try_add(self._waiting[0]):
+            while self._waiting and self._try_add(self._waiting[0]):
                 self._waiting.popleft()
-            if not self._waiting and self._packer.try_add(piece):
+            if not self._waiting and self._try_add(piece):
                 continue
             self._waiting.append(piece.copy())
             if len(self._waiting) > max_waiting:

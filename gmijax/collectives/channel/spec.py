@@ -29,14 +29,9 @@ DTYPES = ("float32", "bool")
 
 
 class Channel(NamedTuple):
-    """One kind of data.
+    """One kind of data, e.g. `state`: S steps, `shape` follows S and N.
 
-    Attributes:
-      name: e.g. `state`.
-      steps: S, number of steps.
-      shape: what follows S and N.
-      dtype: on both sides, `float32` or `bool`.
-      wire_dtype: on the way, `float16` where that was asked for.
+    `dtype`: `float32` or `bool`, on both sides; `wire_dtype`: `float16` where that was asked for.
     """
 
     name: str
@@ -93,11 +88,7 @@ def _decode(text: bytes) -> Spec:
 
 
 def spec_of(experience: Experience, float16: Collection[str]) -> tuple[Spec, int]:
-    """The spec of `experience` and its number of environments.
-
-    Args:
-      experience: arrays by channel.
-      float16: channels that travel as float16.
+    """The spec of `experience`, of which `float16` travel so, and its number of environments.
 
     Raises:
       ConfigError: arrays that are not [S, N, ...] float32 or bool, or differ in N.

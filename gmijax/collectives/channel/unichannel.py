@@ -4,8 +4,8 @@ One experience is what all environments of an agent see in one step. So a rollou
 C channels is T x C messages, which the trainer puts together. A channel with fewer steps comes
 with the last ones. Same routing, back-pressure, checks and batches as with channels.
 
-The parts of a message are the spec, a table (step, channel, N, policy version), and the tensor;
-its tag says whether it is the last of its rollout.
+The parts of a message are the spec, a table (step, channel, N, policy version, whether it is the
+last of its rollout), and the tensor.
 """
 
 from __future__ import annotations
@@ -21,14 +21,9 @@ from gmijax.collectives.messages.pipe import Message
 
 
 class UniPacker:
-    """Takes the place of the compressor; a `Packer`.
-
-    Args:
-      migrator: gives every rollout its way.
-    """
+    """Takes the place of the compressor; a `Packer`."""
 
     def __init__(self, migrator: Migrator) -> None:
-        self.transfers = self.num_bytes = 0
         self._migrator = migrator
         self._writer: ChannelWriter | None = None
         self._todo: list[tuple[int, int]] = []
@@ -50,7 +45,7 @@ class UniPacker:
     def _try_send(self, piece: Piece, step: int, place: int) -> bool:
         channel = piece.spec.channels[place]
         head = piece.spec.encode()
-        sizes = [head.size, 32, channel.wire_bytes(piece.num_envs) // channel.steps]
+        sizes = [head.size, 40, channel.wire_bytes(piece.num_envs) // channel.steps]
         if self._writer is None:  # All of a rollout go to one trainer.
             opened = self._migrator.try_open(sizes)
         else:
@@ -60,20 +55,16 @@ class UniPacker:
             return False
         self._writer, views = opened
         views[0][:] = head
-        views[1].view(np.int64)[:] = step, place, piece.num_envs, piece.version
+        is_last = len(self._todo) == 1
+        views[1].view(np.int64)[:] = step, place, piece.num_envs, piece.version, is_last
         into = views[2].view(channel.wire_dtype).reshape(piece.num_envs, *channel.shape)
         write_channel(into, piece.channels[channel.name][step])
-        self._writer.commit(tag=int(len(self._todo) == 1))
-        self.transfers += 1
-        self.num_bytes += sizes[2]
+        self._writer.commit()
         return True
 
 
 class UniDecoder:
-    """Puts the rollouts of one agent together; a `Decode`.
-
-    A rollout lies in memory of the decoder's own until the next one begins.
-    """
+    """Puts the rollouts of one agent together, in memory that the next one uses; a `Decode`."""
 
     def __init__(self) -> None:
         self._arrays: dict[str, Array] = {}
@@ -81,17 +72,18 @@ class UniDecoder:
 
     def __call__(self, message: Message) -> Transfer | None:
         """The rollout of which `message` is the last tensor; None before."""
-        spec = Spec.decode(message.parts[0])
-        step, place, num_envs, version = message.parts[1].view(np.int64).tolist()
+        head, table, tensor = message
+        spec = Spec.decode(head)
+        step, place, num_envs, version, is_last = table.view(np.int64).tolist()
         if self._shape != (spec, num_envs):
             self._shape = spec, num_envs
             self._arrays = {
                 c.name: np.empty(c.full_shape(num_envs), c.dtype) for c in spec.channels
             }
         channel = spec.channels[place]
-        values = message.parts[2].view(channel.wire_dtype).reshape(num_envs, *channel.shape)
+        values = tensor.view(channel.wire_dtype).reshape(num_envs, *channel.shape)
         self._arrays[channel.name][step] = values
-        if not message.tag:
+        if not is_last:
             return None
         versions = np.full(num_envs, version, np.int64)
         return Transfer(spec.unpacked(), num_envs, versions, self._arrays)

@@ -15,7 +15,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from gmijax.collectives.device_memory import DeviceMemory, NewMemory
+from gmijax.collectives.device.device_memory import DeviceMemory, NewMemory
 
 LEAST_BYTES: Final = 4096
 """Smaller arrays are through the host as soon as through the device."""
@@ -28,14 +28,7 @@ _MAX_VIEWS = 256
 
 
 class BufferedArray(NamedTuple):
-    """Where an array lies; it travels in its place.
-
-    Attributes:
-      ticket: of the sender's block.
-      offset: in the block, bytes.
-      shape: of the array.
-      dtype: its name.
-    """
+    """Where an array lies (bytes in the block of `ticket`); it travels in its place."""
 
     ticket: bytes
     offset: int
@@ -52,16 +45,7 @@ class _Held(NamedTuple):
 
 
 class DeviceBuffers:
-    """One rank's arrays to its neighbours on the GPU, and theirs to it.
-
-    Args:
-      neighbours: other ranks on this rank's GPU.
-      new_memory: how processes share memory of the GPU.
-      part_bytes: for the arrays on their way to one neighbour.
-
-    Attributes:
-      peers: the neighbours.
-    """
+    """One rank's arrays to its neighbours on the GPU (`peers`), and theirs to it."""
 
     def __init__(
         self,
@@ -83,10 +67,7 @@ class DeviceBuffers:
     def put(self, array: Any, dst: int, released_frames: int) -> BufferedArray | None:
         """Puts an array where rank `dst` finds it; None: it must travel through the host.
 
-        Args:
-          array: of anything.
-          dst: a rank.
-          released_frames: how many frames of this rank's messages `dst` has released so far.
+        `released_frames`: how many frames of this rank's messages `dst` has released so far.
         """
         if dst not in self._parts or not _fits(array) or not self._is_made():
             return None

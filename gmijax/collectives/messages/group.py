@@ -1,8 +1,7 @@
 """Mean and sum of nested data over some ranks, by messages between them.
 
-Each rank adds up one part of the numbers, in order of rank, and sends the result to all: what
-travels is twice the data whatever the number of ranks, and the result is bit-identical on all.
-Small data go to everybody at once, which saves one of the two journeys.
+Each rank adds up one part of the numbers, in order of rank, and sends the result to all: the
+result is bit-identical. Small data go to everybody at once, which saves one of the two journeys.
 
 This takes any data and any group. For the mean of many float32 over all ranks the strategies of
 `gmijax.collectives.build` are faster; they take one length, that of the first such call.
@@ -16,7 +15,7 @@ from typing import Any, Final, Literal, NamedTuple, get_args
 import numpy as np
 import numpy.typing as npt
 
-from gmijax.collectives.host import HostExchange
+from gmijax.collectives.host.host_exchange import HostExchange
 from gmijax.collectives.interface import FloatBuffer
 from gmijax.collectives.messages.mailboxes import COLLECTIVE
 from gmijax.collectives.messages.messenger import Messenger
@@ -43,10 +42,8 @@ class _Call(NamedTuple):
 class GroupReducer:
     """One rank's collective calls.
 
-    Args:
-      messenger: this rank's messages.
-      build: makes the reducer of all ranks for buffers of a length; called when it is first
-        needed, by all ranks in the same call.
+    `build` makes the reducer of all ranks for buffers of a length, when it is first needed: by
+    all ranks in the same call.
     """
 
     def __init__(self, messenger: Messenger, build: Callable[[int], HostExchange]) -> None:

@@ -39,11 +39,7 @@ def frames_of(
 ) -> list[Frame]:
     """The message that carries `tree`, as frames of at most `frame_bytes`; views of its arrays.
 
-    Args:
-      tree: nested data.
-      tag: `DATA` or `COLLECTIVE`.
-      frame_bytes: see above.
-      put: see `flatten`.
+    For `put` see `flatten`.
     """
     skeleton, arrays = flatten(tree, put=put)
     parts = [np.frombuffer(skeleton, np.uint8), *map(as_bytes, arrays)]
@@ -64,11 +60,7 @@ def frames_of(
 
 
 class Outbox:
-    """What is on its way to one rank.
-
-    Attributes:
-      frames: that are in the pipe, or wait for it.
-    """
+    """What is on its way to one rank; `frames` counts those that ever were."""
 
     def __init__(self, writer: PipeWriter, rank: int) -> None:
         self.frames = 0
@@ -155,12 +147,8 @@ class Outbox:
 class Inbox:
     """Puts the frames of one rank together to messages; any of them may end anywhere.
 
-    Attributes:
-      ready: complete messages by tag, in order of arrival.
-      received: how many there were.
-
-    Args:
-      get: see `unflatten`.
+    Complete ones are in `ready`, by tag and in order of arrival; `received` counts them. For
+    `get` see `unflatten`.
     """
 
     def __init__(self, get: Callable[[Any], Any] | None = None) -> None:

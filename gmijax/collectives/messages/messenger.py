@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import contextlib
 import time
-from collections.abc import Callable
+from functools import partial
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
@@ -31,16 +31,7 @@ class Messenger:
     """One rank's messages to all others, and theirs to it.
 
     Messages from one rank to another arrive in order, each tag in an order of its own. One
-    thread only may use it.
-
-    Args:
-      block: this process's view of the pipes, of at least `MIN_CAPACITY_BYTES` each.
-      timeout_s: longest wait for a message, unless `recv` says else.
-      device: keeps arrays on the GPU that ranks share; None: they go through the host.
-
-    Attributes:
-      rank: this rank.
-      world_size: K, number of ranks.
+    thread only may use it. Where there is no `device`, all arrays go through the host.
     """
 
     def __init__(
@@ -76,21 +67,21 @@ class Messenger:
             return
         if dst not in self._outboxes:
             self._outboxes[dst] = Outbox(PipeWriter(self._block, dst), self.rank)
-        outbox = self._outboxes[dst]
-        frames = frames_of(tree, tag, self._frame_bytes, self._put(dst, outbox))
-        outbox.post(frames, self._timeout_s)
-        if self._device is not None:
-            self._device.mark_sent(dst, outbox.frames)
+        outbox, device = self._outboxes[dst], self._device
+        if device is None:
+            outbox.post(frames_of(tree, tag, self._frame_bytes), self._timeout_s)
+            return
+        put = partial(device.put, dst=dst, released_frames=outbox.released_frames)
+        outbox.post(frames_of(tree, tag, self._frame_bytes, put), self._timeout_s)
+        device.mark_sent(dst, outbox.frames)
 
     def recv(self, src: int, *, tag: int = DATA, timeout_s: float | None = None) -> Any:
         """Returns the next message with this tag from rank `src`; its arrays are the caller's.
 
-        After a timeout the same message can be waited for again.
-
         Raises:
           ConfigError: no such rank.
           PeerLost: its process is gone, and has left no message.
-          CollectiveTimeout: none came in time.
+          CollectiveTimeout: none came in time; it can be waited for again.
         """
         self._check(src, "src")
         inbox = self._inbox(src)
@@ -132,19 +123,11 @@ class Messenger:
             raise CollectiveTimeout(self.rank, tuple(late), "flush", 0, allowed_s)
 
     def settle(self, timeout_s: float) -> bool:
-        """Whether all that stays on the GPU has been received within `timeout_s`.
+        """Whether all that stays on the GPU, and goes with this process, was received in time.
 
-        It goes with this process, which must not end before. What others have sent is taken
-        meanwhile, so that two that end do not wait for each other.
+        What others have sent is taken meanwhile, so that two that end do not wait for each other.
         """
         return wait_until(lambda: self._is_settled() or None, lambda: None, timeout_s) is not None
-
-    def _put(self, dst: int, outbox: Outbox) -> Callable[[Any], Any]:
-        device = self._device
-        if device is None:
-            return lambda _: None
-        released = outbox.released_frames
-        return lambda value: device.put(value, dst, released)
 
     def _is_settled(self) -> bool:
         if self._device is None:
@@ -170,7 +153,7 @@ class Messenger:
         while tag is None or not ready[tag]:
             if (frame := reader.try_get()) is None:
                 return False
-            self._inbox(src).feed(frame.parts)
+            self._inbox(src).feed(frame)
             # What stayed on the GPU is copied by now: its place is free with the frame.
             reader.release()
         return True

@@ -8,15 +8,14 @@ buffers needs no buffer of its own.
     fd = create_pipes(world_size=2, capacity_bytes=2**20)      # in the controller
 
     writer = PipeWriter(PipeBlock(fd, rank=0), peer=1)         # in rank 0
-    writer.put([b"name", array], timeout_s=5.0)
+    writer.put([array, other], timeout_s=5.0)
 
     reader = PipeReader(PipeBlock(fd, rank=1), peer=0)         # in rank 1
-    name, values = reader.get(timeout_s=5.0).parts             # read-only views [bytes] uint8
+    first, second = reader.get(timeout_s=5.0)                  # read-only views [bytes] uint8
     reader.release()
 
-What is in the ring: `pipe_format.py`. What the checksum costs and what it finds:
-`docs/channels.md`. Which order of memory accesses this relies on:
-`docs/decisions/shared-memory-exchange.md`.
+What is in the ring: `pipe_format.py`; the checksum: `docs/channels.md`; the order of memory
+accesses: `docs/decisions/shared-memory-exchange.md`.
 """
 
 from __future__ import annotations
@@ -24,7 +23,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any, NamedTuple, TypeAlias
 
-import numpy as np
 import numpy.typing as npt
 
 from gmijax.collectives.messages.pipe_block import PipeBlock
@@ -43,37 +41,16 @@ from gmijax.collectives.messages.pipe_format import (
 from gmijax.collectives.waits import Fence, wait_until
 from gmijax.errors import CollectiveError, CollectiveTimeout, GmijaxError, PipeClosed
 
-Part: TypeAlias = bytes | bytearray | memoryview | npt.NDArray[Any]
-"""What `put` takes: bytes of any kind, or an array of numbers with whatever strides."""
-
-
-class Message(NamedTuple):
-    """What came out of a pipe.
-
-    Attributes:
-      tag: what the writer gave.
-      parts: read-only views [bytes] uint8 of the ring, aligned to 64 bytes; valid until
-        `PipeReader.release` or the next `get`.
-    """
-
-    tag: int
-    parts: tuple[Bytes, ...]
+Message: TypeAlias = tuple[Bytes, ...]
+"""Its parts: read-only views [bytes] uint8 of the ring, aligned to 64 bytes; valid until
+`PipeReader.release` or the next `get`."""
 
 
 class PipeWriter:
-    """The writing end of the pipe from `block.rank` to `peer`; a `ChannelWriter`.
+    """The writing end of the pipe from `block.rank` to `peer`.
 
-    A message may take half of the ring, see `max_message_bytes`: then there is room for it, at
-    the latest, when the reader has released all before it.
-
-    Args:
-      block: this process's view of the pipes.
-      peer: rank of the reader.
-
-    Attributes:
-      peer: the same.
-      max_message_bytes: of the largest message, see above.
-      messages: committed so far.
+    A message may take half of the ring (`max_message_bytes`): then there is room for it, at
+    the latest, when the reader has released all before it. `messages` counts those committed.
 
     Raises:
       CollectiveError: not enough shared memory.
@@ -115,42 +92,36 @@ class PipeWriter:
         """Why the reader will never read again, None if it may."""
         return self._block.why_lost(self.peer, operation, step)
 
-    def put(self, parts: Sequence[Part], timeout_s: float, *, tag: int = 0) -> None:
-        """Writes one message made of `parts`, when there is room.
+    def put(self, parts: Sequence[npt.NDArray[Any]], timeout_s: float) -> None:
+        """Writes one message made of arrays of whatever strides, when there is room.
 
         Raises:
           CollectiveTimeout: there was no room in time.
           PeerLost: the reader's process is gone, and there is no room.
-          PipeClosed: the reader has closed the pipe.
-          CollectiveError: larger than `max_message_bytes`.
+          PipeClosed, CollectiveError: see `try_reserve`.
         """
-        views = wait_until(
-            lambda: self.try_reserve([_size(part) for part in parts]),
+        is_put = wait_until(
+            lambda: self.try_put(parts) or None,
             lambda: self.why_lost("put", self.messages),
             timeout_s,
         )
-        if views is None:
+        if is_put is None:
             rank, step = self._block.rank, self.messages
             raise CollectiveTimeout(rank, (self.peer,), "put", step, timeout_s)
-        self._fill(views, parts, tag)
 
-    def try_put(self, parts: Sequence[Part], *, tag: int = 0) -> bool:
+    def try_put(self, parts: Sequence[npt.NDArray[Any]]) -> bool:
         """As `put`, but without waiting: whether there was room."""
-        views = self.try_reserve([_size(part) for part in parts])
-        if views is not None:
-            self._fill(views, parts, tag)
-        return views is not None
+        if (views := self.try_reserve([part.nbytes for part in parts])) is None:
+            return False
+        for view, part in zip(views, parts, strict=True):
+            view.view(part.dtype).reshape(part.shape)[...] = part
+        self.commit()
+        return True
 
     def try_reserve(self, sizes: Sequence[int]) -> list[Bytes] | None:
-        """Memory for the parts of the next message, to be filled before `commit`.
+        """Memory for parts of so many bytes, to be filled before `commit`; None if there is none.
 
-        A reservation that is never committed is dropped by the next one.
-
-        Args:
-          sizes: bytes of every part.
-
-        Returns:
-          One array [bytes] uint8 for each part, aligned to 64 bytes; None if there is no room.
+        It is aligned to 64 bytes. A reservation that is never committed is dropped by the next.
 
         Raises:
           PipeClosed: the reader has closed the pipe.
@@ -173,15 +144,15 @@ class PipeWriter:
         self._reserved = _Reservation(begin, gap, length, tuple(sizes))
         return split_parts(self._ring, begin, sizes)
 
-    def commit(self, *, tag: int = 0) -> None:
-        """Hands the reserved message to the reader, with `tag`, a uint64 of the caller's."""
+    def commit(self) -> None:
+        """Hands the reserved message to the reader."""
         if self._reserved is None:
             raise CollectiveError(f"rank {self._block.rank}: commit without reserve")
         (begin, gap, length, sizes), self._reserved = self._reserved, None
         if gap:
             start = self._position % self._block.capacity_bytes
             seal_gap(self._ring, start, gap, self.messages)
-        seal_message(self._ring, begin, sizes, sequence=self.messages, tag=tag)
+        seal_message(self._ring, begin, sizes, self.messages)
         self.messages += 1
         self._position += gap + length
         self._fence()
@@ -192,25 +163,11 @@ class PipeWriter:
         self._fence()
         self._own["closed"][0] = 1
 
-    def _fill(self, views: list[Bytes], parts: Sequence[Part], tag: int) -> None:
-        for view, part in zip(views, parts, strict=True):
-            if isinstance(part, np.ndarray):
-                view.view(part.dtype).reshape(part.shape)[...] = part
-            else:
-                view[:] = np.frombuffer(part, np.uint8)
-        self.commit(tag=tag)
-
 
 class PipeReader:
-    """The reading end of the pipe from `peer` to `block.rank`; a `ChannelReader`.
+    """The reading end of the pipe from `peer` to `block.rank`.
 
-    Args:
-      block: this process's view of the pipes.
-      peer: rank of the writer.
-
-    Attributes:
-      peer: the same.
-      messages: released so far.
+    `messages` counts those released.
     """
 
     def __init__(self, block: PipeBlock, peer: int) -> None:
@@ -286,9 +243,8 @@ class PipeReader:
         if header.kind == GAP:
             position += header.length
             header = read_header(ring, position % len(ring), self.messages)
-        parts = read_parts(ring, position % len(ring), header)
         self._next_position = position + header.length
-        return Message(header.tag, parts)
+        return read_parts(ring, position % len(ring), header)
 
 
 class _Reservation(NamedTuple):
@@ -298,7 +254,3 @@ class _Reservation(NamedTuple):
     gap: int
     length: int
     sizes: tuple[int, ...]
-
-
-def _size(part: Part) -> int:
-    return part.nbytes if isinstance(part, np.ndarray | memoryview) else len(part)

@@ -30,18 +30,9 @@ from gmijax.config.schema import require_at_least, require_between
 from gmijax.errors import CollectiveError, ConfigError, GmijaxError, PeerLost, PipeClosed
 from gmijax.machine.processes import ProcessId, own_process
 
-MAGIC = 0x50494D47  # "GMIP" in memory on a little-endian machine
-VERSION = 2
 LINE_BYTES = 64
 
-HEAD = np.dtype(
-    [
-        ("magic", np.uint32),
-        ("version", np.uint32),
-        ("world_size", np.uint64),
-        ("capacity_bytes", np.uint64),
-    ]
-)
+HEAD = np.dtype([("world_size", np.uint64), ("capacity_bytes", np.uint64)])
 LINE = np.dtype(
     [
         ("pid", np.uint64),  # 0 until the rank has come
@@ -70,35 +61,24 @@ class PipeMemory(NamedTuple):
 
 
 def create_pipes(world_size: int, capacity_bytes: int) -> int:
-    """Makes an empty block and returns its descriptor, for the controller.
+    """Makes an empty block for K processes and returns its descriptor, for the controller.
 
-    Args:
-      world_size: K, number of processes.
-      capacity_bytes: of every pipe, rounded up to whole pages; a message may take half of it.
-
-    Raises:
-      ConfigError: numbers that make no sense.
+    Pipes of `capacity_bytes` are rounded up to whole pages; a message may take half of one.
+    Raises ConfigError for numbers that make no sense.
     """
     require_at_least("world_size", world_size, 1)
     require_between("capacity_bytes", capacity_bytes, mmap.PAGESIZE, 2**40)
     capacity_bytes = whole_pages(capacity_bytes)
     fd = create_file("pipes", _block_bytes(world_size, capacity_bytes))
-    head = np.array([(MAGIC, VERSION, world_size, capacity_bytes)], HEAD)
+    head = np.array([(world_size, capacity_bytes)], HEAD)
     os.pwrite(fd, head.tobytes(), 0)
     return fd
 
 
 class PipeBlock:
-    """One process's view of all pipes, from which the others know it as `rank`.
+    """One process's view of all pipes of capacity C, from which the others know it as `rank`.
 
-    Args:
-      fd: descriptor from `create_pipes`; the caller keeps it and may close it at once.
-      rank: 0 to K - 1.
-
-    Attributes:
-      rank: the same.
-      world_size: K.
-      capacity_bytes: C, of every pipe.
+    The caller keeps the descriptor from `create_pipes` and may close it at once.
 
     Raises:
       ConfigError: no such rank.
@@ -108,9 +88,7 @@ class PipeBlock:
     def __init__(self, fd: int, rank: int) -> None:
         try:
             head = np.frombuffer(os.pread(fd, HEAD.itemsize, 0), HEAD)[0].item()
-            if head[:2] != (MAGIC, VERSION):
-                raise ValueError(f"it begins with {head[:2]}, not {(MAGIC, VERSION)}")
-            _, _, self.world_size, self.capacity_bytes = head
+            self.world_size, self.capacity_bytes = head
             size = _block_bytes(self.world_size, self.capacity_bytes)
             mapping = mmap.mmap(fd, size, flags=mmap.MAP_SHARED)
         except (OSError, ValueError, IndexError) as error:  # IndexError: an empty file.
@@ -156,11 +134,7 @@ class PipeBlock:
         return self._pipes[src, dst]
 
     def allocate(self, dst: int) -> None:
-        """Gives the pipe from this rank to `dst` its memory.
-
-        Raises:
-          CollectiveError: there is not enough.
-        """
+        """Gives the pipe from this rank to `dst` its memory; CollectiveError if there is none."""
         size = mmap.PAGESIZE + self.capacity_bytes
         try:
             # A lack of memory shows here and not at the first touch, which would kill us.

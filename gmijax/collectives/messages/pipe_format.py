@@ -29,8 +29,8 @@ Bytes: TypeAlias = npt.NDArray[np.uint8]
 ALIGNMENT = 64
 MESSAGE, GAP = 0x4D494D47, 0x47494D47  # "GMIM" and "GMIG" in memory on a little-endian machine
 
-_HEADER = struct.Struct("=6Q")
-_CHECKSUM = 5  # Place in the header.
+_HEADER = struct.Struct("=5Q")
+_CHECKSUM = 4  # Place in the header.
 
 
 class Header(NamedTuple):
@@ -40,7 +40,6 @@ class Header(NamedTuple):
     num_parts: int
     sequence: int
     length: int
-    tag: int
     checksum: int = 0
 
 
@@ -64,16 +63,14 @@ def split_parts(ring: Bytes, begin: int, sizes: Sequence[int]) -> list[Bytes]:
 
 def seal_gap(ring: Bytes, begin: int, length: int, sequence: int) -> None:
     """Writes the header of a gap of `length` bytes before message `sequence`."""
-    _seal(ring, begin, Header(GAP, 0, sequence, length, 0), ALIGNMENT)
+    _seal(ring, begin, Header(GAP, 0, sequence, length), ALIGNMENT)
 
 
-def seal_message(
-    ring: Bytes, begin: int, sizes: Sequence[int], *, sequence: int, tag: int
-) -> None:
+def seal_message(ring: Bytes, begin: int, sizes: Sequence[int], sequence: int) -> None:
     """Writes header and sizes of a message whose parts are in place."""
     length = message_bytes(sizes)
     ring[begin + ALIGNMENT : begin + ALIGNMENT + 8 * len(sizes)].view(np.uint64)[:] = sizes
-    _seal(ring, begin, Header(MESSAGE, len(sizes), sequence, length, tag), length)
+    _seal(ring, begin, Header(MESSAGE, len(sizes), sequence, length), length)
 
 
 def read_header(ring: Bytes, begin: int, sequence: int) -> Header:

@@ -1,10 +1,8 @@
 """Registers in shared memory: one writer each, any number of readers, nobody ever waits.
 
-A register holds the newest value only. Its writer has two places and writes them in turn, so that
-a reader that copies one is disturbed only if the writer begins to publish for the second time
-meanwhile; a counter of what was begun tells it so, and it looks again, or leaves it for later (a
-seqlock with two places). Made for weights: trainers publish them when they have new ones, agents
-look between two unrolls. On the order of memory accesses: `gmijax.collectives.waits.Fence`.
+A register holds the newest value only. It is a seqlock with two places, written in turn: a reader
+that copies one is disturbed only if the writer begins to publish for the second time meanwhile,
+which a counter tells it. On the order of memory accesses: `gmijax.collectives.waits.Fence`.
 
     fd = create_registers()                             # the controller
     registers = open_registers(fd, [64, 4096])          # every process, with the same sizes
@@ -42,12 +40,9 @@ _LOOKS = 3
 
 
 class Snapshot(NamedTuple):
-    """The newest value of a register.
+    """The newest value of a register: a copy of its bytes, [length] uint8, and the writer's tag.
 
-    Attributes:
-      count: how often the register had been published; give it to the next `read`.
-      tag: the writer's number for the value.
-      values: a copy of its bytes, [length] uint8.
+    `count` says how often the register had been published; give it to the next `read`.
     """
 
     count: int
@@ -87,8 +82,7 @@ class Register:
     def read(self, after: int = 0) -> Snapshot | None:
         """The newest value if it was published after the `after`-th, else None; never waits.
 
-        None, too, if the writer was faster than this reader three times over: the next call
-        finds a newer one.
+        None, too, if the writer was faster three times over: the next call finds a newer one.
         """
         for _ in range(_LOOKS):
             count = int(self._line["count"][0])
@@ -112,11 +106,7 @@ def create_registers() -> int:
 
 
 def open_registers(fd: int, sizes_bytes: Sequence[int]) -> list[Register]:
-    """Maps the registers; the caller keeps `fd` and may close it at once.
-
-    Args:
-      fd: descriptor from `create_registers`.
-      sizes_bytes: room of every register, the same for all processes.
+    """Maps registers of such sizes; the caller keeps `fd` and may close it at once.
 
     Raises:
       ConfigError: no registers, or a size that makes no sense.

@@ -49,13 +49,10 @@ def unflatten(
     buffers: Sequence[Bytes],
     get: Callable[[Any], Any] | None = None,
 ) -> Any:
-    """The tree with a skeleton, and these bytes in place of its arrays.
+    """Inverts `flatten`, of a process of the same job: unpickling runs code.
 
-    Args:
-      skeleton: of `flatten`, in a process of the same job: unpickling runs code.
-      buffers: one per array, [number of its bytes] uint8; the arrays of the tree are views of
-        them. Arrays of jax come back as arrays of numpy.
-      get: inverts `put`.
+    The arrays of the tree are views of `buffers`, [number of its bytes] uint8 each; those of jax
+    come back as numpy's. `get` inverts `put`.
     """
     return _Unpickler(skeleton, buffers, get).load()
 

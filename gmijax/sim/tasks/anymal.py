@@ -18,9 +18,10 @@ import mujoco
 import numpy as np
 import numpy.typing as npt
 
-from gmijax.sim import episode, lookup, physics, rotations
+from gmijax.sim import episode, physics, rotations
 from gmijax.sim.interface import Env, EnvSpec, EnvState
 from gmijax.sim.rewards import RewardTerm, term_names, total_reward
+from gmijax.sim.tasks import lookup
 from gmijax.types import Array, PRNGKey, PyTree
 
 DEFAULT_EPISODE_LENGTH = 2500
@@ -62,14 +63,12 @@ class AnymalIds:
     """Addresses in the model and the pose in which the robot stands.
 
     Attributes:
-      joint_qpos: [12] where the joints lie in `qpos`.
-      joint_qvel: [12] where they lie in `qvel`.
+      joints: the 12 driven ones.
       shanks: [4] bodies whose origins are the knees.
       standing: [12] joint positions, radians.
     """
 
-    joint_qpos: lookup.Addresses
-    joint_qvel: lookup.Addresses
+    joints: lookup.Joints
     shanks: lookup.Addresses
     standing: npt.NDArray[np.float32]
 
@@ -128,7 +127,7 @@ def make(*, impl: str = "auto", max_envs: int | None = None) -> Env:
             model,
             state.physics,
             jnp.asarray(ids.standing) + ACTION_SCALE_RAD * action,
-            lambda data: (data.qfrc_actuator[ids.joint_qvel], data.xpos[ids.shanks]),
+            lambda data: (data.qfrc_actuator[ids.joints.qvel], data.xpos[ids.shanks]),
         )
         view = AnymalView(*errors(moved, state.task.command), torques)
         task, metrics = add_errors(state, view)
@@ -142,12 +141,11 @@ def make(*, impl: str = "auto", max_envs: int | None = None) -> Env:
 
 def look_up(mj_model: mujoco.MjModel) -> AnymalIds:
     """Finds the model's addresses by name, and the pose of its keyframe `stand`."""
-    joint_qpos, joint_qvel = lookup.joint_addresses(mj_model, JOINTS)
+    joints = lookup.find_joints(mj_model, JOINTS)
     return AnymalIds(
-        joint_qpos,
-        joint_qvel,
+        joints,
         np.array([mj_model.body(name).id for name in SHANKS]),
-        mj_model.key("stand").qpos[joint_qpos].astype(np.float32),
+        mj_model.key("stand").qpos[joints.qpos].astype(np.float32),
     )
 
 
@@ -160,8 +158,8 @@ def draw_start(ids: AnymalIds, mj_model: mujoco.MjModel, key: PRNGKey) -> tuple[
     velocities = jax.random.uniform(velocity_key, shape, minval=-noise, maxval=noise)
     qpos = jnp.array(mj_model.key("stand").qpos, jnp.float32)
     return (
-        qpos.at[ids.joint_qpos].set(factors * ids.standing),
-        jnp.zeros(mj_model.nv).at[ids.joint_qvel].set(velocities),
+        qpos.at[ids.joints.qpos].set(factors * ids.standing),
+        jnp.zeros(mj_model.nv).at[ids.joints.qvel].set(velocities),
     )
 
 
@@ -225,8 +223,8 @@ def observe(ids: AnymalIds, state: physics.PhysicsState, command: Array, action:
             ANGULAR_VELOCITY_SCALE * state.qvel[3:6],
             gravity_direction(state),
             command * jnp.array([VELOCITY_SCALE, VELOCITY_SCALE, ANGULAR_VELOCITY_SCALE]),
-            state.qpos[ids.joint_qpos] - ids.standing,
-            JOINT_VELOCITY_SCALE * state.qvel[ids.joint_qvel],
+            state.qpos[ids.joints.qpos] - ids.standing,
+            JOINT_VELOCITY_SCALE * state.qvel[ids.joints.qvel],
             action,
         ]
     )

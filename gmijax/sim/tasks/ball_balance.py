@@ -15,11 +15,11 @@ import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
-import numpy.typing as npt
 
-from gmijax.sim import episode, lookup, physics
+from gmijax.sim import episode, physics
 from gmijax.sim.interface import Env, EnvSpec, EnvState
 from gmijax.sim.rewards import RewardTerm, term_names, total_reward
+from gmijax.sim.tasks import lookup
 from gmijax.types import Array, PRNGKey, PyTree
 
 DEFAULT_EPISODE_LENGTH = 500
@@ -53,25 +53,19 @@ class BallBalanceTask(NamedTuple):
 
 @dataclass(frozen=True)
 class BallBalanceIds:
-    """Addresses in the model and the knees' limits.
+    """Addresses in the model.
 
     Attributes:
-      knee_qpos: [3] where the knees lie in `qpos`.
-      knee_qvel: [3] where they lie in `qvel`.
+      knees: the 3 driven joints.
       ball_qpos: where the ball's position starts in `qpos`.
       ball_qvel: where the ball's velocity starts in `qvel`.
       sensors: [12] three upward forces, then three torques, in `sensordata`.
-      lower: [3] lower limits, radians.
-      upper: [3] upper limits, radians.
     """
 
-    knee_qpos: lookup.Addresses
-    knee_qvel: lookup.Addresses
+    knees: lookup.Joints
     ball_qpos: int
     ball_qvel: int
     sensors: lookup.Addresses
-    lower: npt.NDArray[np.float32]
-    upper: npt.NDArray[np.float32]
 
 
 class BallBalanceView(NamedTuple):
@@ -115,7 +109,7 @@ def make(*, impl: str = "auto", max_envs: int | None = None) -> Env:
 
     def step(model: PyTree, state: EnvState, action: Array) -> EnvState:
         change = ACTION_SPEED_RAD_PER_S * world.control_dt_s * jnp.clip(action, -1.0, 1.0)
-        targets = jnp.clip(state.task.targets + change, ids.lower, ids.upper)
+        targets = jnp.clip(state.task.targets + change, ids.knees.lower, ids.knees.upper)
         moved, sensordata = world.step(model, state.physics, targets)
         ball, ball_velocity = ball_of(ids, moved)
         reward = total_reward(TERMS, BallBalanceView(ball, ball_velocity))
@@ -131,12 +125,11 @@ def look_up(mj_model: mujoco.MjModel) -> BallBalanceIds:
     forces = lookup.sensor_addresses(mj_model, [f"hip_{leg}_force" for leg in LEGS])
     torques = lookup.sensor_addresses(mj_model, [f"hip_{leg}_torque" for leg in LEGS])
     return BallBalanceIds(
-        *lookup.joint_addresses(mj_model, KNEES),
+        lookup.find_joints(mj_model, KNEES),
         *lookup.free_joint_addresses(mj_model, "ball"),
         # Of each force only z, along which the leg carries: the load on three legs says where
         # the ball is and how hard it lands. The task's size leaves room for three forces.
         np.concatenate([forces[2::3], torques]),
-        *lookup.joint_ranges(mj_model, KNEES),
     )
 
 
@@ -171,8 +164,8 @@ def observe(ids: BallBalanceIds, state: physics.PhysicsState, hip_sensors: Array
     """The observation [24] from the state and raw hip sensors [12]."""
     values = jnp.concatenate(
         [
-            state.qpos[ids.knee_qpos],
-            state.qvel[ids.knee_qvel],
+            state.qpos[ids.knees.qpos],
+            state.qvel[ids.knees.qvel],
             *ball_of(ids, state),
             SENSOR_SCALE * hip_sensors,
         ]

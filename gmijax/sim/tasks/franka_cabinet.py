@@ -16,11 +16,11 @@ import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
-import numpy.typing as npt
 
-from gmijax.sim import episode, lookup, physics, rotations
+from gmijax.sim import episode, physics, rotations
 from gmijax.sim.interface import Env, EnvSpec, EnvState
 from gmijax.sim.rewards import Replacement, RewardTerm, term_names, total_reward
+from gmijax.sim.tasks import lookup
 from gmijax.types import Array, PRNGKey, PyTree
 
 DEFAULT_EPISODE_LENGTH = 500
@@ -60,29 +60,21 @@ class FrankaCabinetTask(NamedTuple):
 
 @dataclass(frozen=True)
 class FrankaCabinetIds:
-    """Addresses in the model and the driven joints' limits.
+    """Addresses in the model.
 
     Attributes:
-      joint_qpos: [9] where the driven joints lie in `qpos`.
-      joint_qvel: [9] where they lie in `qvel`.
-      drawer_qpos: [1] where the drawer's opening lies in `qpos`.
-      drawer_qvel: [1] where its speed lies in `qvel`.
+      joints: the 9 driven ones.
+      drawer_joint: the one along which the drawer opens.
       hand: the hand's number among the bodies.
       fingers: [2] numbers of the left and the right finger.
       drawer: number of the drawer.
-      lower: [9] lower limits, radians and metres.
-      upper: [9] upper limits, radians and metres.
     """
 
-    joint_qpos: lookup.Addresses
-    joint_qvel: lookup.Addresses
-    drawer_qpos: lookup.Addresses
-    drawer_qvel: lookup.Addresses
+    joints: lookup.Joints
+    drawer_joint: lookup.Joints
     hand: int
     fingers: lookup.Addresses
     drawer: int
-    lower: npt.NDArray[np.float32]
-    upper: npt.NDArray[np.float32]
 
 
 class FrankaCabinetPose(NamedTuple):
@@ -179,17 +171,17 @@ def make(*, impl: str = "auto", max_envs: int | None = None) -> Env:
         key, draw = jax.random.split(key)
         start = world.start(draw_start(ids, world.mj_model, draw), jnp.zeros(world.mj_model.nv))
         obs = observe(ids, start, pose_of(ids, *world.poses(start.qpos)))
-        task = FrankaCabinetTask(start.qpos[ids.joint_qpos])
+        task = FrankaCabinetTask(start.qpos[ids.joints.qpos])
         return episode.begin(spec, start, task, obs, key)
 
     def step(model: PyTree, state: EnvState, action: Array) -> EnvState:
         action = jnp.clip(action, -1.0, 1.0)
         change = ACTION_SPEEDS * world.control_dt_s * action
-        targets = jnp.clip(state.task.targets + change, ids.lower, ids.upper)
+        targets = jnp.clip(state.task.targets + change, ids.joints.lower, ids.joints.upper)
         moved, poses = world.step(
             model, state.physics, targets, lambda data: (data.xpos, data.xquat)
         )
-        pose, drawer_m = pose_of(ids, *poses), moved.qpos[ids.drawer_qpos[0]]
+        pose, drawer_m = pose_of(ids, *poses), moved.qpos[ids.drawer_joint.qpos[0]]
         opened = drawer_m > OPEN_M
         reward = total_reward(
             TERMS,
@@ -209,12 +201,11 @@ def make(*, impl: str = "auto", max_envs: int | None = None) -> Env:
 def look_up(mj_model: mujoco.MjModel) -> FrankaCabinetIds:
     """Finds the model's addresses by name."""
     return FrankaCabinetIds(
-        *lookup.joint_addresses(mj_model, JOINTS),
-        *lookup.joint_addresses(mj_model, ["drawer"]),
+        lookup.find_joints(mj_model, JOINTS),
+        lookup.find_joints(mj_model, ["drawer"]),
         mj_model.body("hand").id,
         bodies(mj_model, ("finger_left", "finger_right")),
         mj_model.body("drawer").id,
-        *lookup.joint_ranges(mj_model, JOINTS),
     )
 
 
@@ -222,8 +213,8 @@ def draw_start(ids: FrankaCabinetIds, mj_model: mujoco.MjModel, key: PRNGKey) ->
     """Random `qpos` [10]: noise on arm and fingers, the drawer closed."""
     start = np.asarray(mj_model.key("start").qpos, np.float32)
     noise = jax.random.uniform(key, (ACTION_SIZE,), minval=-JOINT_NOISE, maxval=JOINT_NOISE)
-    joints = jnp.clip(start[ids.joint_qpos] + noise, ids.lower, ids.upper)
-    return jnp.array(start).at[ids.joint_qpos].set(joints)
+    joints = jnp.clip(start[ids.joints.qpos] + noise, ids.joints.lower, ids.joints.upper)
+    return jnp.array(start).at[ids.joints.qpos].set(joints)
 
 
 def pose_of(ids: FrankaCabinetIds, xpos: Array, xquat: Array) -> FrankaCabinetPose:
@@ -246,14 +237,13 @@ def is_behind(pose: FrankaCabinetPose) -> Array:
 
 def observe(ids: FrankaCabinetIds, state: physics.PhysicsState, pose: FrankaCabinetPose) -> Array:
     """The observation [23] from the state and the poses."""
-    joints = state.qpos[ids.joint_qpos]
     values = jnp.concatenate(
         [
-            (2.0 * joints - ids.upper - ids.lower) / (ids.upper - ids.lower),
-            JOINT_VELOCITY_SCALE * state.qvel[ids.joint_qvel],
+            ids.joints.scaled(state.qpos[ids.joints.qpos]),
+            JOINT_VELOCITY_SCALE * state.qvel[ids.joints.qvel],
             pose.handle - pose.grasp,
-            state.qpos[ids.drawer_qpos],
-            state.qvel[ids.drawer_qvel],
+            state.qpos[ids.drawer_joint.qpos],
+            state.qvel[ids.drawer_joint.qvel],
         ]
     )
     return jnp.clip(values, -OBS_LIMIT, OBS_LIMIT)

@@ -118,7 +118,7 @@ def make(*, impl: str = "auto", max_envs: int | None = None) -> Env:
             model,
             state.physics,
             action,
-            lambda data: (data.qfrc_actuator[ids.joint_qvel], data.sensordata[ids.sensors]),
+            lambda data: (data.qfrc_actuator[ids.joints.qvel], data.sensordata[ids.sensors]),
         )
         pose = runner.pose_of(ids, moved)
         speed = runner.speed_to_target(state.physics, moved, world.control_dt_s)

@@ -13,9 +13,9 @@ import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
-import numpy.typing as npt
 
-from gmijax.sim import lookup, physics, rotations
+from gmijax.sim import physics, rotations
+from gmijax.sim.tasks import lookup
 from gmijax.types import Array, PRNGKey
 
 TARGET_M = (1000.0, 0.0)
@@ -29,21 +29,15 @@ SPEED = "speed_m_per_s"
 
 @dataclass(frozen=True)
 class RunnerIds:
-    """Addresses in the model of a robot with J joints, and the joints' limits.
+    """Addresses in the model of a robot.
 
     Attributes:
-      joint_qpos: [J] where the joints lie in `qpos`.
-      joint_qvel: [J] where they lie in `qvel`.
+      joints: the J driven ones.
       sensors: [6 F] where the forces and torques of F feet lie in `sensordata`.
-      lower: [J] lower limits, radians.
-      upper: [J] upper limits, radians.
     """
 
-    joint_qpos: lookup.Addresses
-    joint_qvel: lookup.Addresses
+    joints: lookup.Joints
     sensors: lookup.Addresses
-    lower: npt.NDArray[np.float32]
-    upper: npt.NDArray[np.float32]
 
 
 class RunnerPose(NamedTuple):
@@ -77,23 +71,22 @@ class RunnerPose(NamedTuple):
 def look_up(mj_model: mujoco.MjModel, joints: Sequence[str], sensors: Sequence[str]) -> RunnerIds:
     """Finds the addresses of `joints` and of the feet's `sensors` by name."""
     return RunnerIds(
-        *lookup.joint_addresses(mj_model, joints),
-        lookup.sensor_addresses(mj_model, sensors),
-        *lookup.joint_ranges(mj_model, joints),
+        lookup.find_joints(mj_model, joints), lookup.sensor_addresses(mj_model, sensors)
     )
 
 
 def draw_start(ids: RunnerIds, mj_model: mujoco.MjModel, key: PRNGKey) -> tuple[Array, Array]:
     """Random `qpos` [nq] and `qvel` [nv]: the torso in its place, noise on the joints only."""
     position_key, velocity_key = jax.random.split(key)
-    shape, noise = ids.lower.shape, JOINT_NOISE_RAD
-    rest = np.clip(np.zeros(shape, np.float32), ids.lower, ids.upper)
+    lower, upper = ids.joints.lower, ids.joints.upper
+    shape, noise = lower.shape, JOINT_NOISE_RAD
+    rest = np.clip(np.zeros(shape, np.float32), lower, upper)
     joints = rest + jax.random.uniform(position_key, shape, minval=-noise, maxval=noise)
     noise = VELOCITY_NOISE_RAD_PER_S
     velocities = jax.random.uniform(velocity_key, shape, minval=-noise, maxval=noise)
     qpos = jnp.array(mj_model.qpos0, jnp.float32)
-    qpos = qpos.at[ids.joint_qpos].set(jnp.clip(joints, ids.lower, ids.upper))
-    return qpos, jnp.zeros(mj_model.nv).at[ids.joint_qvel].set(velocities)
+    qpos = qpos.at[ids.joints.qpos].set(jnp.clip(joints, lower, upper))
+    return qpos, jnp.zeros(mj_model.nv).at[ids.joints.qvel].set(velocities)
 
 
 def pose_of(ids: RunnerIds, state: physics.PhysicsState) -> RunnerPose:
@@ -105,7 +98,7 @@ def pose_of(ids: RunnerIds, state: physics.PhysicsState) -> RunnerPose:
     # to drifting sideways, which can only be an oversight.
     angle = jnp.arctan2(to_target[1], to_target[0]) - yaw
     forward = rotations.rotate(quat, jnp.array([1.0, 0.0, 0.0]))
-    joints = state.qpos[ids.joint_qpos]
+    joints = state.qpos[ids.joints.qpos]
     return RunnerPose(
         position=position,
         velocity=rotations.rotate_back(quat, state.qvel[:3]),
@@ -115,8 +108,8 @@ def pose_of(ids: RunnerIds, state: physics.PhysicsState) -> RunnerPose:
         angle_to_target=rotations.wrap(angle),
         upright=1.0 - 2.0 * (quat[1] ** 2 + quat[2] ** 2),
         heading=forward[:2] @ to_target / jnp.linalg.norm(to_target),
-        joints=(2.0 * joints - ids.upper - ids.lower) / (ids.upper - ids.lower),
-        joint_velocities=state.qvel[ids.joint_qvel],
+        joints=ids.joints.scaled(joints),
+        joint_velocities=state.qvel[ids.joints.qvel],
     )
 
 

@@ -21,9 +21,10 @@ import numpy as np
 import numpy.typing as npt
 from mujoco import mjx
 
-from gmijax.sim import episode, lookup, physics, rotations
+from gmijax.sim import episode, physics, rotations
 from gmijax.sim.interface import Env, EnvSpec, EnvState
 from gmijax.sim.rewards import RewardTerm, term_names, total_reward
+from gmijax.sim.tasks import lookup
 from gmijax.types import Array, PRNGKey, PyTree
 
 DEFAULT_EPISODE_LENGTH = 600
@@ -70,29 +71,23 @@ class ShadowHandTask(NamedTuple):
 
 @dataclass(frozen=True)
 class ShadowHandIds:
-    """Addresses in the model and the joints' limits.
+    """Addresses in the model.
 
     Attributes:
-      joint_qpos: [24] where the joints lie in `qpos`.
-      joint_qvel: [24] where they lie in `qvel`.
+      joints: the 24 of the hand.
       cube_qpos: where the cube's position and quaternion start in `qpos`.
       cube_qvel: where its velocities start in `qvel`.
       tip_bodies: [5] numbers of the fingers' last links.
       tip_offsets: [5, 3] where on these links the tips are, metres.
       sensors: [60] `SENSORS` in `sensordata`.
-      lower: [24] lower limits, radians.
-      upper: [24] upper limits, radians.
     """
 
-    joint_qpos: lookup.Addresses
-    joint_qvel: lookup.Addresses
+    joints: lookup.Joints
     cube_qpos: int
     cube_qvel: int
     tip_bodies: lookup.Addresses
     tip_offsets: npt.NDArray[np.float32]
     sensors: lookup.Addresses
-    lower: npt.NDArray[np.float32]
-    upper: npt.NDArray[np.float32]
 
 
 class Touch(NamedTuple):
@@ -187,12 +182,11 @@ def look_up(mj_model: mujoco.MjModel) -> ShadowHandIds:
     """Finds the model's addresses by name."""
     sites = [mj_model.site(f"{tip}_tip") for tip in TIPS]
     return ShadowHandIds(
-        *lookup.joint_addresses(mj_model, JOINTS),
+        lookup.find_joints(mj_model, JOINTS),
         *lookup.free_joint_addresses(mj_model, "cube"),
         np.array([site.bodyid[0] for site in sites]),
         np.array([site.pos for site in sites], np.float32),
         lookup.sensor_addresses(mj_model, SENSORS),
-        *lookup.joint_ranges(mj_model, JOINTS),
     )
 
 
@@ -206,11 +200,11 @@ def draw_rotation(key: PRNGKey) -> Array:
 def draw_start(ids: ShadowHandIds, mj_model: mujoco.MjModel, key: PRNGKey) -> Array:
     """Random `qpos` [31]: a hand nearly flat, the cube above it in any rotation."""
     joint_key, position_key, rotation_key = jax.random.split(key, 3)
-    lower, upper = JOINT_NOISE * ids.lower, JOINT_NOISE * ids.upper
+    lower, upper = JOINT_NOISE * ids.joints.lower, JOINT_NOISE * ids.joints.upper
     joints = jax.random.uniform(joint_key, lower.shape, minval=lower, maxval=upper)
     # Drawn apart from each other, two coupled joints would snap together in the first step.
     joints = joints.at[FOLLOWERS].set(joints[FOLLOWERS - 1])
-    qpos = jnp.array(mj_model.qpos0, jnp.float32).at[ids.joint_qpos].set(joints)
+    qpos = jnp.array(mj_model.qpos0, jnp.float32).at[ids.joints.qpos].set(joints)
     noise = jax.random.uniform(position_key, (3,), minval=-CUBE_NOISE_M, maxval=CUBE_NOISE_M)
     position = qpos[ids.cube_qpos : ids.cube_qpos + 3] + noise
     cube = jnp.concatenate([position, draw_rotation(rotation_key)])
@@ -226,7 +220,7 @@ def next_goal(task: ShadowHandTask, reached: Array, key: PRNGKey) -> tuple[Shado
 
 def targets_of(ids: ShadowHandIds, action: Array) -> Array:
     """Position targets [20], radians: the driven joints' lower limits at -1, upper at 1."""
-    lower, upper = ids.lower[DRIVEN], ids.upper[DRIVEN]
+    lower, upper = ids.joints.lower[DRIVEN], ids.joints.upper[DRIVEN]
     return 0.5 * (action + 1.0) * (upper - lower) + lower
 
 
@@ -250,7 +244,7 @@ def touch_at_rest(ids: ShadowHandIds, xpos: Array, xquat: Array) -> Touch:
 def touch_of(ids: ShadowHandIds, data: mjx.Data) -> Touch:
     """What a physics step left in its data."""
     velocities, forces = data.sensordata[ids.sensors].reshape(2, NUM_TIPS, 6)
-    torques = data.qfrc_actuator[ids.joint_qvel]
+    torques = data.qfrc_actuator[ids.joints.qvel]
     return Touch(torques, tips_of(ids, data.xpos, data.xquat, velocities), forces)
 
 
@@ -276,12 +270,12 @@ def observe(
     ids: ShadowHandIds, state: physics.PhysicsState, touch: Touch, goal: Array, action: Array
 ) -> Array:
     """The observation [211] from the state, the goal [4] and the last action [20]."""
-    joints, cube = state.qpos[ids.joint_qpos], cube_of(ids, state)
+    joints, cube = state.qpos[ids.joints.qpos], cube_of(ids, state)
     to_cube = rotations.product(cube.quat, rotations.conjugate(goal))
     values = jnp.concatenate(
         [
-            (2.0 * joints - ids.upper - ids.lower) / (ids.upper - ids.lower),
-            VELOCITY_SCALE * state.qvel[ids.joint_qvel],
+            ids.joints.scaled(joints),
+            VELOCITY_SCALE * state.qvel[ids.joints.qvel],
             JOINT_TORQUE_SCALE * touch.joint_torques,
             *(cube.position, cube.quat, cube.velocity, VELOCITY_SCALE * cube.angular_velocity),
             *(jnp.array(GOAL_M), goal, to_cube),

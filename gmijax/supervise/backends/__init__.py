@@ -1,4 +1,4 @@
-"""Ways to give a GMI its share of a GPU. A new one is one file and one line in `BACKENDS`."""
+"""Ways to give a GMI its share of a GPU. A new one is a class and one line in `BACKENDS`."""
 
 from __future__ import annotations
 
@@ -10,13 +10,10 @@ from gmijax.machine.snapshot import Machine
 from gmijax.partition.plan import Plan
 from gmijax.runs.folder import RunPaths
 from gmijax.supervise.backends.backend import Backend
-from gmijax.supervise.backends.cpu import CpuBackend
-from gmijax.supervise.backends.mig import MigBackend
-from gmijax.supervise.backends.mps import MpsBackend
-from gmijax.supervise.backends.share import ShareBackend
+from gmijax.supervise.backends.mps import MigBackend, MpsBackend, ShareBackend
 
 BACKENDS: Mapping[BackendName, type[Backend]] = MappingProxyType(
-    {"mps": MpsBackend, "mig": MigBackend, "share": ShareBackend, "cpu": CpuBackend}
+    {"mps": MpsBackend, "mig": MigBackend, "share": ShareBackend, "cpu": Backend}
 )
 
 

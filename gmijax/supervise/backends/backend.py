@@ -14,24 +14,21 @@ from gmijax.supervise.janitor import JanitorLink
 class Backend:
     """Enforces the shares of a plan while it is entered; leaving it undoes what it did.
 
-    This one enforces nothing: it starts the janitor, which ends the GMIs if the controller is
-    killed. Leave it only after every GMI has ended.
+    This one, for `cpu`, enforces nothing: GMIs pin themselves to their cores. It starts the
+    janitor, which ends the GMIs if the controller is killed. Leave it after every GMI has ended.
 
     Raises:
-      BackendUnavailable: it cannot be had on this machine.
+      BackendUnavailable: it cannot be had on this machine; nothing is left behind.
     """
 
     def __init__(self, plan: Plan, machine: Machine, run: RunPaths) -> None:
-        del plan, machine
+        del machine
+        self.plan = plan
         self.run = run
         self._janitor: JanitorLink | None = None
 
     def __enter__(self) -> Self:
-        """Sets up what the GMIs need.
-
-        Raises:
-          BackendUnavailable: it cannot be had on this machine; nothing is left behind.
-        """
+        """Sets up what the GMIs need."""
         self._janitor = JanitorLink(self.run.janitor_log)
         return self
 
@@ -42,16 +39,12 @@ class Backend:
             self._janitor = None
 
     def environment(self, gmi: int) -> Mapping[str, str]:
-        """The backend's own environment variables of a GMI.
-
-        `XLA_FLAGS` among them are added to the user's, see `gmi_environment`.
-        """
+        """The backend's own environment variables of a GMI."""
         del gmi
         return {}
 
-    def started(self, gmi: int, pid: int) -> None:
+    def started(self, pid: int) -> None:
         """Tells the backend that a GMI runs as the process group `pid`."""
-        del gmi
         if self._janitor is not None:
             self._janitor.watch_gmi(pid)
 

@@ -1,15 +1,16 @@
-"""Backend `mps`: the GMIs of a GPU run at the same time under NVIDIA's Multi-Process Service.
+"""Backends of GPUs: GMIs run at the same time under NVIDIA's Multi-Process Service, or do not.
 
-One daemon per GPU (or MIG instance), with a pipe directory of its own: a fatal fault of one
+One daemon per GPU (or shared MIG instance), with a pipe directory of its own: a fatal fault of one
 client ends every client of its server, so GPUs must not share a server. A daemon that somebody
 else has started is used and never stopped.
 """
 
 from __future__ import annotations
 
-import os
+import dataclasses
 import tempfile
 import time
+from collections import Counter
 from collections.abc import Collection, Mapping
 from contextlib import suppress
 from pathlib import Path
@@ -39,23 +40,22 @@ class MpsBackend(Backend):
       plan: its slices name the devices.
       machine: where the control program is, and whether somebody's daemon runs.
       run: logs go below its `mps` folder.
-      gmis: those that are clients; None for all.
+      clients: those GMIs that are clients of a daemon; None for all.
 
     Raises:
       BackendUnavailable: the control program is not installed.
     """
 
     def __init__(
-        self, plan: Plan, machine: Machine, run: RunPaths, gmis: Collection[int] | None = None
+        self, plan: Plan, machine: Machine, run: RunPaths, clients: Collection[int] | None = None
     ) -> None:
         super().__init__(plan, machine, run)
-        clients = plan.layout.gmis if gmis is None else gmis
+        clients = plan.layout.gmis if clients is None else clients
         self._devices = {gmi: plan.slices[gmi].device for gmi in clients}
         if machine.mps_control is None and self._devices:
             raise BackendUnavailable(
                 f"plan.backend={plan.backend}: nvidia-cuda-mps-control was not found"
             )
-        self._backend = plan.backend
         self._program = machine.mps_control or Path()
         self._operator = machine.operator_daemon
         self._controls: dict[str, MpsControl] = {}
@@ -88,13 +88,17 @@ class MpsBackend(Backend):
             self._quit_all()
         super().__exit__(*exc)
 
-    def is_client(self, gmi: int) -> bool:
-        """Whether a GMI is to be a client of a daemon."""
-        return gmi in self._devices
-
     def environment(self, gmi: int) -> Mapping[str, str]:
-        """Where the GMI's daemon listens."""
-        return {PIPE_VARIABLE: str(self._control_of(gmi).pipe_directory)}
+        """Where the GMI's daemon listens, or a directory where none does.
+
+        CUDA takes the latter for "no MPS", silently. It is below the run folder because there
+        nobody else can start a daemon in it.
+        """
+        if gmi in self._devices:
+            return {PIPE_VARIABLE: str(self._control_of(gmi).pipe_directory)}
+        directory = self.run.mps / "none"
+        directory.mkdir(parents=True, exist_ok=True)
+        return {PIPE_VARIABLE: str(directory)}
 
     def verify(self, pids: Mapping[int, int]) -> None:
         """Checks with the daemons that every GMI that is to be a client is one.
@@ -130,9 +134,10 @@ class MpsBackend(Backend):
         return self._controls[self._devices[gmi]]
 
     def _start_daemon(self, device: str, log_directory: Path) -> None:
+        parent = tempfile.gettempdir()
+        parent = parent if len(parent) <= _LONGEST_PARENT else "/tmp"
         # mkdtemp makes it readable for nobody else.
-        directory = Path(tempfile.mkdtemp(prefix="gmijax-", dir=_short_parent()))
-        control = MpsControl(self._program, directory)
+        control = MpsControl(self._program, Path(tempfile.mkdtemp(prefix="gmijax-", dir=parent)))
         self._controls[device] = control
         if self._janitor is not None:
             self._janitor.watch_daemon(control)
@@ -141,23 +146,27 @@ class MpsBackend(Backend):
         while not control.is_answering():
             if time.monotonic() > deadline_s:
                 raise BackendUnavailable(
-                    f"plan.backend={self._backend}: the daemon of {device} does not answer "
+                    f"plan.backend={self.plan.backend}: the daemon of {device} does not answer "
                     f"within {_ANSWER_S:g} s; see {log_directory}"
                 )
             time.sleep(_POLL_S)
 
     def _strangers(self, pids: Mapping[int, int]) -> dict[int, int]:
-        pids = {gmi: pid for gmi, pid in pids.items() if self.is_client(gmi)}
-        clients: dict[MpsControl, Mapping[int, int]] = {}
-        for gmi in pids:
-            control = self._control_of(gmi)
-            if control in clients:  # Also if it has none yet.
+        """Those of the GMIs that are to be clients and are not."""
+        found: dict[MpsControl, Mapping[int, int]] = {}
+        strangers: dict[int, int] = {}
+        for gmi, pid in pids.items():
+            if gmi not in self._devices:
                 continue
+            control = self._control_of(gmi)
             try:
-                clients[control] = control.all_client_pids()
+                if control not in found:
+                    found[control] = control.all_client_pids()
             except BackendUnavailable as error:
                 raise GmiFailed(gmi, f"cannot ask whether it is an MPS client: {error}") from error
-        return {gmi: pid for gmi, pid in pids.items() if pid not in clients[self._control_of(gmi)]}
+            if pid not in found[control]:
+                strangers[gmi] = pid
+        return strangers
 
     def _advice(self) -> str:
         if self._operator is None:
@@ -179,6 +188,34 @@ class MpsBackend(Backend):
         self._controls = {}
 
 
-def _short_parent() -> str:
-    parent = tempfile.gettempdir()
-    return parent if len(parent) <= _LONGEST_PARENT or os.name != "posix" else "/tmp"
+class MigBackend(MpsBackend):
+    """A GMI lives in a MIG instance, with SMs, cache and memory of its own.
+
+    Attaches to the instances that an administrator has made, and never changes a GPU's mode. GMIs
+    that share an instance run at the same time under a daemon of the job's own.
+    https://docs.nvidia.com/datacenter/tesla/mig-user-guide/
+
+    Raises:
+      BackendUnavailable: an instance of the plan does not exist (any more), or MPS, to share
+        one, is not installed.
+    """
+
+    def __init__(self, plan: Plan, machine: Machine, run: RunPaths) -> None:
+        existing = {one.uuid for gpu in machine.gpus for one in gpu.instances}
+        for share in plan.slices:
+            if share.device not in existing:
+                raise BackendUnavailable(
+                    f"plan.backend=mig: instance {share.device} of GMI {share.gmi} does not exist"
+                )
+        sharing = Counter(share.device for share in plan.slices)
+        clients = [share.gmi for share in plan.slices if sharing[share.device] > 1]
+        # A daemon of somebody else is for other devices than the job's instances.
+        own_only = dataclasses.replace(machine, operator_daemon=None)
+        super().__init__(plan, own_only, run, clients)
+
+
+class ShareBackend(MpsBackend):
+    """GMIs of a GPU take turns, as the driver does by default, away from any MPS daemon."""
+
+    def __init__(self, plan: Plan, machine: Machine, run: RunPaths) -> None:
+        super().__init__(plan, machine, run, clients=())

@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import mujoco
 import numpy as np
 import numpy.typing as npt
+
+from gmijax.types import Array
 
 Addresses = npt.NDArray[np.int64]
 
@@ -17,12 +20,36 @@ def sensor_addresses(mj_model: mujoco.MjModel, names: Sequence[str]) -> Addresse
     return np.concatenate([np.arange(start, start + size) for start, size in spans])
 
 
-def joint_addresses(mj_model: mujoco.MjModel, names: Sequence[str]) -> tuple[Addresses, Addresses]:
-    """Where hinge and slide joints `names` lie in `qpos` and in `qvel`."""
+@dataclass(frozen=True)
+class Joints:
+    """Addresses and limits of J hinge and slide joints.
+
+    Attributes:
+      qpos: [J] where they lie in `qpos`.
+      qvel: [J] where they lie in `qvel`.
+      lower: [J] lower limits, radians or metres.
+      upper: [J] upper limits.
+    """
+
+    qpos: Addresses
+    qvel: Addresses
+    lower: npt.NDArray[np.float32]
+    upper: npt.NDArray[np.float32]
+
+    def scaled(self, positions: Array) -> Array:
+        """`positions` [J], -1 at the lower limit and 1 at the upper one."""
+        return (2.0 * positions - self.upper - self.lower) / (self.upper - self.lower)
+
+
+def find_joints(mj_model: mujoco.MjModel, names: Sequence[str]) -> Joints:
+    """The hinge and slide joints `names`."""
     joints = [mj_model.joint(name) for name in names]
-    return (
+    ranges = np.array([joint.range for joint in joints], np.float32)
+    return Joints(
         np.array([joint.qposadr[0] for joint in joints]),
         np.array([joint.dofadr[0] for joint in joints]),
+        ranges[:, 0],
+        ranges[:, 1],
     )
 
 
@@ -30,11 +57,3 @@ def free_joint_addresses(mj_model: mujoco.MjModel, name: str) -> tuple[int, int]
     """Where a free joint starts in `qpos` (7 long) and in `qvel` (6 long)."""
     joint = mj_model.joint(name)
     return int(joint.qposadr[0]), int(joint.dofadr[0])
-
-
-def joint_ranges(
-    mj_model: mujoco.MjModel, names: Sequence[str]
-) -> tuple[npt.NDArray[np.float32], npt.NDArray[np.float32]]:
-    """Lower and upper limits of joints `names`, radians or metres."""
-    ranges = np.array([mj_model.joint(name).range for name in names], np.float32)
-    return ranges[:, 0], ranges[:, 1]

@@ -7,15 +7,15 @@ from collections.abc import Sequence
 import numpy as np
 import numpy.typing as npt
 
-from gmijax.collectives.barrier import Barrier
-from gmijax.collectives.interface import FloatBuffer
-from gmijax.collectives.shared_block import (
+from gmijax.collectives.host.barrier import Barrier
+from gmijax.collectives.host.shared_block import (
     FLOATS_PER_LINE,
     MAX_GATHER_FLOATS,
     SharedBlock,
     attach,
     process_of,
 )
+from gmijax.collectives.interface import FloatBuffer
 from gmijax.collectives.strategies import Groups
 from gmijax.errors import CollectiveError
 

@@ -103,6 +103,6 @@ NewMemory: TypeAlias = Callable[[], DeviceMemory]
 
 def cuda_memory() -> DeviceMemory:
     """A block on the GPU that this process sees; needs cuda-bindings, and imports jax."""
-    from gmijax.collectives.cuda_memory import CudaMemory
+    from gmijax.collectives.device.cuda_memory import CudaMemory
 
     return CudaMemory()

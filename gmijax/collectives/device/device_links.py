@@ -16,12 +16,12 @@ import jax.numpy as jnp
 import numpy as np
 import numpy.typing as npt
 
-from gmijax.collectives.device_memory import DeviceQueue, NewMemory
-from gmijax.collectives.host import HostExchange
-from gmijax.collectives.host_links import HostLinks
-from gmijax.collectives.lockstep import LockstepRunner
+from gmijax.collectives.device.device_memory import DeviceQueue, NewMemory
+from gmijax.collectives.device.lockstep import LockstepRunner
+from gmijax.collectives.device.shared_slots import SharedSlots, agreed
+from gmijax.collectives.host.host_exchange import HostExchange
+from gmijax.collectives.host.host_links import HostLinks
 from gmijax.collectives.program import Exchange, ProgramPeers
-from gmijax.collectives.shared_slots import SharedSlots, agreed
 from gmijax.collectives.strategies import Groups, Stage
 from gmijax.collectives.waits import Fence
 from gmijax.partition.layout import Layout

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 import numpy.typing as npt
 
-from gmijax.collectives.cuda_queue import checked, runtime
+from gmijax.collectives.device.cuda_queue import checked, runtime
 from gmijax.errors import CudaError
 
 HANDLE_BYTES = 64

@@ -13,8 +13,8 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 
-from gmijax.collectives.failure_detector import FailureDetector
-from gmijax.collectives.shared_block import SharedBlock, check_peer
+from gmijax.collectives.host.failure_detector import FailureDetector
+from gmijax.collectives.host.shared_block import SharedBlock, check_peer
 from gmijax.collectives.waits import LIVENESS_PERIOD_S, MAX_SLEEP_S, MIN_SLEEP_S, SPIN_S, Fence
 from gmijax.errors import CollectiveError, CudaError
 

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, TypeVar
 import jax
 import numpy as np
 
-from gmijax.collectives.host import HostExchange
+from gmijax.collectives.host.host_exchange import HostExchange
 from gmijax.collectives.interface import FloatBuffer
 from gmijax.collectives.strategies import Stage
 from gmijax.errors import GmijaxError
@@ -91,7 +91,7 @@ class HostLinks:
         started = time.monotonic()
         try:
             if stream:
-                from gmijax.collectives.cuda_queue import fetch, store
+                from gmijax.collectives.device.cuda_queue import fetch, store
 
                 result = np.empty(rows * num_floats, np.float32)
                 call(fetch(stream, source, num_floats), result)

@@ -11,7 +11,7 @@ import time
 from collections.abc import Callable
 from typing import NoReturn
 
-from gmijax.collectives.shared_block import SharedBlock, process_of
+from gmijax.collectives.host.shared_block import SharedBlock, process_of
 from gmijax.collectives.waits import LIVENESS_PERIOD_S, fence
 from gmijax.errors import CollectiveTimeout, PeerLost
 

@@ -9,13 +9,13 @@ from contextlib import suppress
 import numpy as np
 import numpy.typing as npt
 
-from gmijax.collectives.device_memory import (
+from gmijax.collectives.device.device_memory import (
     TICKET_BYTES,
     DeviceMemory,
     DeviceQueue,
     NewMemory,
 )
-from gmijax.collectives.host import HostExchange
+from gmijax.collectives.host.host_exchange import HostExchange
 from gmijax.collectives.waits import fence, wait_until
 from gmijax.errors import DeviceMemoryUnavailable, PeerLost
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 import importlib
 from typing import Any
 
-from gmijax.collectives.host import HostExchange
-from gmijax.collectives.shared_slots import agreed
+from gmijax.collectives.device.shared_slots import agreed
+from gmijax.collectives.host.host_exchange import HostExchange
 from gmijax.collectives.strategies import Groups
 
 _WISH = "rings between GPUs"

@@ -6,8 +6,8 @@ import atexit
 from collections.abc import Callable
 from typing import TypeVar
 
-from gmijax.collectives.host import HostExchange
-from gmijax.collectives.watched_thread import WatchedThread, end_at_once
+from gmijax.collectives.device.watched_thread import WatchedThread, end_at_once
+from gmijax.collectives.host.host_exchange import HostExchange
 
 T = TypeVar("T")
 

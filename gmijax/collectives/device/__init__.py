@@ -1,0 +1,1 @@
+"""Exchanges on the streams of GPUs, through their memory and NCCL."""

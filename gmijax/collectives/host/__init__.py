@@ -1,0 +1,1 @@
+"""Exchanges through shared memory of the host."""

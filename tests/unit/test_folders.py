@@ -1,0 +1,119 @@
+"""Folders: which shards of experience count, what may be continued, files that are whole."""
+
+from __future__ import annotations
+
+import json
+import os
+import resource
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from gmijax.errors import ConfigError
+from gmijax.runs.dataset import DataPaths, open_dataset
+from gmijax.runs.folder import add_event, locked, read_json, write_json
+
+
+def make_shard(paths: DataPaths, rank: int, index: int) -> None:
+    shard = paths.shard(rank, index)
+    shard.arrays.parent.mkdir(parents=True, exist_ok=True)
+    shard.arrays.write_bytes(b"12345")
+    write_json(shard.about, {"num_bytes": 5})
+
+
+def test_shards_count_from_the_first_on_without_a_gap(tmp_path: Path):
+    paths = DataPaths(tmp_path)
+    for index in (0, 1, 3):
+        make_shard(paths, 2, index)
+    assert paths.num_finished(2) == 2
+    assert paths.num_finished(0) == 0
+    assert [shard.arrays.name for shard in paths.finished()] == ["000000.npz", "000001.npz"]
+
+
+def test_an_unfinished_shard_does_not_count(tmp_path: Path):
+    paths = DataPaths(tmp_path)
+    shard = paths.shard(0, 0)
+    for harm in (
+        lambda: shard.arrays.write_bytes(b"123"),
+        shard.about.unlink,
+        lambda: shard.about.write_text('{"num_by'),
+    ):
+        make_shard(paths, 0, 0)
+        assert paths.num_finished(0) == 1
+        harm()
+        assert paths.num_finished(0) == 0
+    (tmp_path / "gmi_000.bak").mkdir()  # Nor does a copy of a folder.
+    assert not list(paths.finished())
+
+
+def test_only_the_same_experience_is_continued(tmp_path: Path):
+    paths = DataPaths(tmp_path / "new")
+    open_dataset(paths, {"seed": 1, "num_envs": 4})
+    open_dataset(paths, {"seed": 1, "num_envs": 4})
+    with pytest.raises(ConfigError, match="holds experience with seed=1, this job would add 2"):
+        open_dataset(paths, {"seed": 2, "num_envs": 4})
+    for content in ("{", "[]"):
+        paths.dataset.write_text(content)
+        with pytest.raises(ConfigError, match=r"dataset.json: broken \("):
+            open_dataset(paths, {"seed": 1})
+
+
+def test_a_folder_with_something_else_is_left_alone(tmp_path: Path):
+    (tmp_path / "thesis.tex").write_text("")
+    with pytest.raises(ConfigError, match="not empty and holds no experience"):
+        open_dataset(DataPaths(tmp_path), {"seed": 1})
+    assert [path.name for path in tmp_path.iterdir()] == ["thesis.tex"]
+
+
+def test_one_job_at_a_time_writes_into_a_folder(tmp_path: Path):
+    paths = DataPaths(tmp_path)
+    with (
+        locked(paths.lock, "output.dir=x"),
+        pytest.raises(ConfigError, match=r"output\.dir=x: another job writes"),
+        locked(paths.lock, "output.dir=x"),
+    ):
+        pass
+    with locked(paths.lock, "output.dir=x"):
+        pass
+
+
+@pytest.fixture
+def umask() -> Iterator[None]:
+    before = os.umask(0o022)
+    yield
+    os.umask(before)
+
+
+@pytest.mark.parametrize(("mask", "mode"), [(0o022, 0o644), (0o077, 0o600), (0o002, 0o664)])
+def test_files_are_for_whom_the_umask_lets_read_them(
+    mask: int, mode: int, tmp_path: Path, umask: None
+):
+    os.umask(mask)
+    for _ in range(2):
+        write_json(tmp_path / "new.json", {"a": 1})
+        assert (tmp_path / "new.json").stat().st_mode & 0o777 == mode
+
+
+def test_what_cannot_be_written_leaves_the_old_file_and_nothing_else(tmp_path: Path):
+    path = tmp_path / "a.json"
+    write_json(path, {"a": 1})
+    with pytest.raises(TypeError):
+        write_json(path, {"a": object()})
+    assert read_json(path) == {"a": 1}
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_half_an_event_is_taken_back_where_the_disk_is_full(tmp_path: Path):
+    path = tmp_path / "events.jsonl"
+    add_event(path, "start")
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    # Python ignores the signal that would come with it.
+    resource.setrlimit(resource.RLIMIT_FSIZE, (path.stat().st_size + 10, limits[1]))
+    try:
+        add_event(path, "fault")
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    add_event(path, "end")
+    events = [json.loads(line)["event"] for line in path.read_text().splitlines()]
+    assert events == ["start", "end"]
