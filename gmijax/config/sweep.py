@@ -18,9 +18,10 @@ class SweepConfig(KeyGroup):
     gpus: int | tuple[int, ...] | None = doc(
         "number of GPUs, or their indices as nvidia-smi lists them; null: all", default=None
     )
-    jobs_per_gpu: int = doc(
-        "jobs that run at the same time on every GPU (without one: on the machine)",
-        default=1,
+    jobs_per_gpu: int | Literal["auto"] = doc(
+        "jobs that run at the same time on every GPU (without one: on the machine); auto: as many "
+        "as make the most steps, by profiling",
+        default="auto",
         low=1,
     )
     objective: str = doc(

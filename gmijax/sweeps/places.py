@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
+from typing import Any
 
-from gmijax.config import TrainConfig
-from gmijax.partition.plan import Slice
+from gmijax.config import PlanConfig, ReduceConfig, TrainConfig
+from gmijax.config.sweep import SweepConfig
+from gmijax.errors import ConfigError
+from gmijax.machine.snapshot import Machine
+from gmijax.partition.plan import Plan, Slice
+from gmijax.partition.planner import make_plan
 
 
 @dataclass(frozen=True)
@@ -44,6 +49,26 @@ class Place:
             else plan.gmis_per_gpu
         )
         return max(0.01, int(1e4 * fraction / gmis) / 1e4)
+
+
+def places_of(settings: SweepConfig, machine: Machine, backends: Collection[str]) -> Plan:
+    """A plan whose slices are the places: of GMIs that have nothing to do with each other.
+
+    Args:
+      settings: of the sweep.
+      machine: where it is.
+      backends: `plan.backend` of the jobs; where they differ each must bring its own.
+    """
+    wanted: Any = next(iter(backends)) if len(backends) == 1 else "auto"
+    gpus, each = settings.gpus, settings.jobs_per_gpu
+    if gpus is None:
+        gpus = max(1, len(machine.gpus))
+    try:
+        config = PlanConfig(gpus=gpus, gmis_per_gpu=1 if each == "auto" else each, backend=wanted)
+        return make_plan(config, ReduceConfig(), 1, machine, template="tcg")
+    except ConfigError as error:
+        said = str(error).replace("plan.gmis_per_gpu", "sweep.jobs_per_gpu")
+        raise ConfigError(said.replace("plan.gpus", "sweep.gpus")) from None
 
 
 class Places:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Collection, Sequence
+from collections.abc import Sequence
 from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
@@ -11,18 +11,18 @@ from typing import Any, NamedTuple
 
 from rich.console import Console
 
-from gmijax.config import PlanConfig, ReduceConfig, TrainConfig
+from gmijax.config import TrainConfig
 from gmijax.config.schema import from_dict
 from gmijax.config.sweep import SweepConfig
 from gmijax.control.console import open_console
 from gmijax.control.decide import with_task
 from gmijax.errors import ConfigError, JobInterrupted, SweepFailed
-from gmijax.machine.snapshot import Machine, detect_machine
+from gmijax.machine.snapshot import detect_machine
 from gmijax.partition.plan import Plan
-from gmijax.partition.planner import make_plan
 from gmijax.runs.folder import create_run, given_run, locked, read_json, write_json
 from gmijax.supervise.backends import open_backend
 from gmijax.supervise.launcher import stop_signals
+from gmijax.sweeps.density import with_density
 from gmijax.sweeps.jobs import (
     Job,
     SweepPaths,
@@ -31,6 +31,7 @@ from gmijax.sweeps.jobs import (
     state_of,
 )
 from gmijax.sweeps.leases import leased
+from gmijax.sweeps.places import places_of
 from gmijax.sweeps.report import ranking, write_report
 from gmijax.sweeps.scheduler import Scheduler
 from gmijax.sweeps.space import Space
@@ -98,19 +99,24 @@ def run_request(request: Request, *, show: bool = False) -> SweepResult:
     started_s = time.monotonic()
     settings, machine, console = request.settings, detect_machine(), open_console(show=show)
     request = request._replace(jobs=tuple(map(_with_task, request.jobs)))
-    plan = plan_of(settings, machine, {job.config.plan.backend for job in request.jobs})
+    backends = {job.config.plan.backend for job in request.jobs}
+    # Before anything is started: whether there are such GPUs, and room for so many jobs.
+    plan = places_of(settings, machine, backends)
     require_placeable(request.jobs, plan.layout.num_gpus)
     paths = _open(request.jobs)
     with locked(paths.lock, f"run.dir={paths.root}"):
         jobs, study = _beginning(request, paths)
         write_report("running", jobs, settings, paths, 0.0)
-        _announce(console, paths, plan, request, jobs)
+        console.print(f"sweep folder: {paths.root}")
         view = SweepView(console, jobs, settings)
         status = "failed"
         try:
             with stop_signals() as signals, ExitStack() as held:
                 devices = {share.device for share in plan.slices} - {"cpu"}
                 held.enter_context(leased(devices, console.print, lambda: signals.have_come))
+                settings = with_density(settings, request.jobs, machine, console, signals)
+                plan = places_of(settings, machine, backends)
+                _announce(console, plan, request, jobs)
                 backend = held.enter_context(open_backend(plan, machine, paths))
                 held.enter_context(view)
                 scheduler = Scheduler(jobs, study, settings, paths, plan, backend, view.update)
@@ -124,7 +130,7 @@ def run_request(request: Request, *, show: bool = False) -> SweepResult:
         finally:
             report = write_report(status, jobs, settings, paths, time.monotonic() - started_s)
     console.print(ranking(report["jobs"], settings))
-    console.print(f"{view.line()}\nsummary: {paths.sweep}", markup=False)
+    console.print(f"{view.line()}\nsummary: {paths.sweep}")
     if failed:
         raise SweepFailed(
             f"{len(failed)} of {len(jobs)} jobs failed; job {failed[0].number}: "
@@ -135,26 +141,6 @@ def run_request(request: Request, *, show: bool = False) -> SweepResult:
 
 def _with_task(job: Job) -> Job:
     return replace(job, config=with_task(job.config))
-
-
-def plan_of(settings: SweepConfig, machine: Machine, backends: Collection[str]) -> Plan:
-    """Places for jobs as the slices of GMIs that do not know each other.
-
-    Args:
-      settings: of the sweep.
-      machine: where it is.
-      backends: `plan.backend` of the jobs; where they differ each must bring its own.
-    """
-    wanted: Any = next(iter(backends)) if len(backends) == 1 else "auto"
-    gpus = settings.gpus
-    if gpus is None:
-        gpus = max(1, len(machine.gpus))
-    try:
-        config = PlanConfig(gpus=gpus, gmis_per_gpu=settings.jobs_per_gpu, backend=wanted)
-        return make_plan(config, ReduceConfig(), 1, machine, template="tcg")
-    except ConfigError as error:
-        said = str(error).replace("plan.gmis_per_gpu", "sweep.jobs_per_gpu")
-        raise ConfigError(said.replace("plan.gpus", "sweep.gpus")) from None
 
 
 def _open(jobs: Sequence[Job]) -> SweepPaths:
@@ -203,18 +189,14 @@ def _described(request: Request) -> dict[str, Any]:
     return sampler | {"space": {key: list(values) for key, values in request.space.items()}}
 
 
-def _announce(
-    console: Console, paths: SweepPaths, plan: Plan, request: Request, jobs: Sequence[Job]
-) -> None:
+def _announce(console: Console, plan: Plan, request: Request, jobs: Sequence[Job]) -> None:
     settings = request.settings
     total = len(request.jobs) if settings.sampler == "grid" else settings.trials
     done = sum(job.progress.state == "completed" for job in jobs)
     more = f", {done} of them complete already" if done else ""
-    console.print(f"sweep folder: {paths.root}", markup=False)
     console.print(
         f"{total} jobs{more}, {len(plan.slices)} at a time on {plan.layout.num_gpus} GPUs, "
-        f"backend {plan.backend}",
-        markup=False,
+        f"backend {plan.backend}"
     )
     for reason in plan.reasons:
-        console.print(f"  {reason}", markup=False)
+        console.print(f"  {reason}")

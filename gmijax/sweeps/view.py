@@ -8,7 +8,6 @@ from typing import Any, Self
 
 from rich.console import Console, Group
 from rich.live import Live
-from rich.markup import escape
 from rich.table import Table
 from rich.text import Text
 
@@ -61,7 +60,7 @@ class SweepView:
             progress = job.progress
             if self._states.get(job.number, "waiting") != progress.state:
                 self._states[job.number] = progress.state
-                self._console.print(self._change(job, progress), markup=False)
+                self._console.print(self._change(job, progress))
 
     def line(self) -> str:
         """How far the whole sweep is."""
@@ -92,7 +91,7 @@ class SweepView:
             table.add_column(heading, no_wrap=heading != "overrides")
         rows = sorted(self._jobs, key=lambda job: _ORDER.index(self._state(job)))
         for job in rows[:_MOST_ROWS]:
-            table.add_row(*map(escape, self._row(job, job.progress)))
+            table.add_row(*self._row(job, job.progress))
         if len(rows) > _MOST_ROWS:
             table.add_row("", f"and {len(rows) - _MOST_ROWS} more")
         return table

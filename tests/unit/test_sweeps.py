@@ -12,11 +12,16 @@ import numpy as np
 import pytest
 from supervision import machine
 
+from gmijax.autotune.grid import Measured, NotRunnable
 from gmijax.cli.compose import compose
 from gmijax.cli.grid import build_sweep
 from gmijax.config.sweep import SweepConfig
+from gmijax.control.console import open_console
 from gmijax.errors import ConfigError
 from gmijax.runs.folder import write_json
+from gmijax.supervise.launcher import StopSignals
+from gmijax.sweeps import density
+from gmijax.sweeps.density import with_density
 from gmijax.sweeps.jobs import (
     Job,
     Progress,
@@ -28,10 +33,10 @@ from gmijax.sweeps.jobs import (
     state_of,
 )
 from gmijax.sweeps.leases import leased
-from gmijax.sweeps.places import Places
+from gmijax.sweeps.places import Places, places_of
 from gmijax.sweeps.report import ranked, spread
 from gmijax.sweeps.study import OptunaStudy
-from gmijax.sweeps.sweep import Request, plan_of
+from gmijax.sweeps.sweep import Request
 
 
 @pytest.mark.parametrize(
@@ -127,7 +132,7 @@ def test_jobs_that_place_themselves_are_refused(overrides: tuple[str, ...], said
 
 def gpu_plan(gpus: int, jobs_per_gpu: int) -> Any:
     here = machine(gpus, mps_control=Path("/usr/bin/nvidia-cuda-mps-control"))
-    return plan_of(SweepConfig(jobs_per_gpu=jobs_per_gpu), here, {"auto"})
+    return places_of(SweepConfig(jobs_per_gpu=jobs_per_gpu), here, {"auto"})
 
 
 def test_jobs_go_to_the_gpu_with_most_room_and_large_ones_to_several() -> None:
@@ -313,3 +318,65 @@ def test_a_sampler_without_its_package_is_bad_input(
     monkeypatch.setitem(sys.modules, "optuna", None)
     with pytest.raises(ConfigError, match=r"pip install 'gmijax\[sweep\]'"):
         study(tmp_path, *TOY)
+
+
+@pytest.mark.parametrize(
+    ("rates", "num_jobs", "best", "profiled"),
+    [
+        ((10.0, 19.0, 30.0, 31.0), 100, 4, [1, 2, 4, 8]),
+        ((10.0, 9.0), 100, 1, [1, 2]),
+        ((10.0, 19.0, None), 100, 2, [1, 2, 4]),
+        ((10.0, 20.0, 40.0, 41.0), 3, 3, [1, 2, 4, 8]),
+    ],
+    ids=["more gain nothing", "two are slower", "memory ends", "no more than there are"],
+)
+def test_jobs_at_a_time_by_profiling(
+    rates: tuple[float | None, ...],
+    num_jobs: int,
+    best: int,
+    profiled: list[int],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    done: list[int] = []
+
+    def profile(_: SweepConfig, __: Job, count: int, *___: Any) -> Measured | NotRunnable:
+        done.append(count)
+        rate = rates[len(done) - 1]
+        return NotRunnable("no memory") if rate is None else Measured(rate / count, 100.0, 0.1)
+
+    monkeypatch.setattr(density, "_profile", profile)
+    jobs = jobs_of([compose(f"seed={seed}") for seed in range(num_jobs)])
+    here = machine(1, mps_control=Path("/usr/bin/nvidia-cuda-mps-control"))
+    for _ in range(2):  # The second time by the store.
+        found = with_density(SweepConfig(), jobs, here, open_console(show=False), StopSignals())
+        assert found.jobs_per_gpu == best
+    assert done == profiled
+
+
+def test_without_a_gpu_a_job_has_two_cores() -> None:
+    here, jobs = machine(0, cpu_cores=tuple(range(8))), jobs_of([compose()])
+    quiet = open_console(show=False)
+    assert with_density(SweepConfig(), jobs, here, quiet, StopSignals()).jobs_per_gpu == 4
+    asked = SweepConfig(jobs_per_gpu=7)
+    assert with_density(asked, jobs, here, quiet, StopSignals()) == asked
+
+
+def test_a_profile_counts_while_all_jobs_train(monkeypatch: pytest.MonkeyPatch) -> None:
+    now_s = 0.0
+    monkeypatch.setattr(density.time, "monotonic", lambda: now_s)
+    jobs = jobs_of([compose(f"seed={seed}") for seed in range(2)])
+    window = density._Window(jobs, 60.0)
+    while not window.is_over():
+        now_s += 0.5
+        jobs[0].progress.env_steps += 50
+        # The second one compiles for ten seconds.
+        jobs[1].progress.env_steps += 50 if now_s > 10.0 else 0
+    assert window.steps_per_s == pytest.approx(200.0)
+    assert window.iteration_s == pytest.approx(0.5)
+    assert 14.0 < now_s < 18.0
+    late = density._Window(jobs, 5.0)
+    now_s += 6.0
+    assert late.is_over()
+    assert late.steps_per_s is None

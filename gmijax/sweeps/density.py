@@ -1,0 +1,185 @@
+"""`sweep.jobs_per_gpu=auto`: how many jobs at a time make the most steps, by profiling.
+
+One job, two, four and so on train at the same time on one GPU, until more of them gain nothing or
+cannot run. What was measured is kept in the profile store of `gmijax.search`.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import signal
+import tempfile
+import time
+from collections.abc import Sequence
+from pathlib import Path
+
+from rich.console import Console
+
+from gmijax.autotune.grid import Measured, NotRunnable, Point
+from gmijax.autotune.store import ProfileStore
+from gmijax.autotune.tuner import workload_of
+from gmijax.config.sweep import SweepConfig
+from gmijax.errors import GmijaxError, JobInterrupted
+from gmijax.machine.snapshot import Machine
+from gmijax.runs.cache import cache_folder
+from gmijax.runs.folder import read_json
+from gmijax.supervise.backends import open_backend
+from gmijax.supervise.launcher import StopSignals
+from gmijax.sweeps.jobs import Job, SweepPaths
+from gmijax.sweeps.places import places_of
+from gmijax.sweeps.scheduler import Scheduler
+from gmijax.sweeps.study import NoStudy
+
+COUNTS = (1, 2, 4, 8, 16, 32)
+GAIN = 0.05
+"""Twice as many jobs must make so many more steps together; each makes half of them then."""
+
+_WINDOW_S = 4.0
+_LEAST_ITERATIONS = 6
+_CORES_OF_A_JOB = 2
+_FOREVER = 10**12
+
+
+def with_density(
+    settings: SweepConfig,
+    jobs: Sequence[Job],
+    machine: Machine,
+    console: Console,
+    signals: StopSignals,
+) -> SweepConfig:
+    """The settings with a number of jobs per GPU.
+
+    Of jobs of several kinds the one that allows the fewest decides.
+
+    Raises:
+      ConfigError: a job that cannot be profiled.
+      JobInterrupted: a signal came.
+    """
+    if settings.jobs_per_gpu != "auto":
+        return settings
+    if not machine.gpus:
+        count = max(1, len(machine.cpu_cores) // _CORES_OF_A_JOB)
+        console.print(f"sweep.jobs_per_gpu={count}: {_CORES_OF_A_JOB} cores for each job")
+        return dataclasses.replace(settings, jobs_per_gpu=count)
+    kinds: dict[object, Job] = {}
+    for job in jobs:
+        config = job.config
+        kinds.setdefault((config.env.label, config.num_envs, config.algo.name), job)
+    counts = [_best(settings, job, machine, console, signals) for job in kinds.values()]
+    most = -(-len(jobs) // max(1, len(machine.gpus)))
+    return dataclasses.replace(settings, jobs_per_gpu=max(1, min(*counts, most)))
+
+
+def _best(
+    settings: SweepConfig, job: Job, machine: Machine, console: Console, signals: StopSignals
+) -> int:
+    """The number of such jobs that makes the most steps on one GPU."""
+    config = job.config
+    key = workload_of(config).store_key(machine) | {"job": "sweep"}
+    store = ProfileStore(cache_folder() / "profiles", key, console.print)
+    best, best_rate = 1, 0.0
+    for count in COUNTS:
+        point = Point(count, config.envs_per_gmi, str(config.physics.impl))
+        found = store.get("sweep", point)
+        if found is None:
+            started_s = time.monotonic()
+            found = _profile(settings, job, count, machine, signals)
+            store.put("sweep", point, found, time.monotonic() - started_s)
+        if isinstance(found, NotRunnable):
+            console.print(
+                f"  {config.env.label}: {count} jobs at a time cannot run: {found.reason}"
+            )
+            break
+        rate = count * found.env_steps_per_s
+        console.print(
+            f"  {config.env.label}: {count} jobs at a time make {rate:,.0f} steps/s, "
+            f"{found.memory_mib:,.0f} MiB each"
+        )
+        if rate < best_rate * (1 + GAIN):
+            break
+        best, best_rate = count, rate
+    console.print(f"sweep.jobs_per_gpu={best} for {config.env.label}")
+    return best
+
+
+def _profile(
+    settings: SweepConfig, job: Job, count: int, machine: Machine, signals: StopSignals
+) -> Measured | NotRunnable:
+    """Trains with `count` copies for a few seconds; what each of them did."""
+    gpus = settings.gpus if isinstance(settings.gpus, tuple) else None
+    settings = dataclasses.replace(settings, jobs_per_gpu=count, gpus=gpus[:1] if gpus else 1)
+    limit_s = job.config.search.profile_timeout_s
+    with tempfile.TemporaryDirectory(prefix="gmijax-") as scratch:
+        paths = SweepPaths(Path(scratch))
+        jobs = [_copy(job, seed) for seed in range(count)]
+        inner = StopSignals()
+        window = _Window(jobs, limit_s)
+
+        def tick() -> None:
+            if window.is_over() or signals.have_come:
+                inner.handle(signal.SIGTERM)
+
+        try:
+            plan = places_of(settings, machine, {job.config.plan.backend})
+            with open_backend(plan, machine, paths) as backend:
+                Scheduler(jobs, NoStudy(), settings, paths, plan, backend, tick).run(inner)
+        except JobInterrupted:
+            if signals.have_come:
+                raise
+        except GmijaxError as error:
+            return NotRunnable(" ".join(str(error).split()))
+        if (rate := window.steps_per_s) is None:
+            failed = next((j.progress.error for j in jobs if j.progress.error), None)
+            return NotRunnable(failed or f"no end within {limit_s:.0f} s", limit_s)
+        return Measured(rate / count, _memory_mib(paths, jobs), window.iteration_s)
+
+
+def _copy(job: Job, seed: int) -> Job:
+    run = dataclasses.replace(
+        job.config.run, checkpoint_every=0, measure_throughput=False, max_restarts=0
+    )
+    config = dataclasses.replace(job.config, seed=seed, num_timesteps=_FOREVER, run=run)
+    return Job(seed, {}, config)
+
+
+class _Window:
+    """Steps of jobs while all of them train.
+
+    Attributes:
+      steps_per_s: of all together; None where they did not come so far.
+      iteration_s: seconds of an iteration of the first job.
+    """
+
+    def __init__(self, jobs: Sequence[Job], limit_s: float) -> None:
+        self._jobs = jobs
+        self._deadline_s = time.monotonic() + limit_s
+        self._seen = [{0} for _ in jobs]
+        self._start: tuple[float, list[int]] | None = None
+        self.steps_per_s: float | None = None
+        self.iteration_s = 0.0
+
+    def is_over(self) -> bool:
+        """Looks at the jobs; whether enough was seen, or one has failed, or it takes too long."""
+        now_s = time.monotonic()
+        steps = [job.progress.env_steps for job in self._jobs]
+        for seen, own in zip(self._seen, steps, strict=True):
+            seen.add(own)
+        # The first iterations of some fall into the compilation of others.
+        if self._start is None and min(map(len, self._seen)) > 2:
+            self._start = now_s, steps
+            self._seen = [{own} for own in steps]
+        if self._start is not None and min(map(len, self._seen)) > _LEAST_ITERATIONS:
+            started_s, before = self._start
+            if now_s - started_s >= _WINDOW_S:
+                self.steps_per_s = (sum(steps) - sum(before)) / (now_s - started_s)
+                self.iteration_s = (now_s - started_s) / (len(self._seen[0]) - 1)
+                return True
+        has_failed = any(job.progress.state == "failed" for job in self._jobs)
+        return has_failed or now_s > self._deadline_s
+
+
+def _memory_mib(paths: SweepPaths, jobs: Sequence[Job]) -> float:
+    """Peak memory of the largest job, MiB."""
+    found = [paths.job(job.number).gmi(0).result for job in jobs]
+    devices = [read_json(path)["device"] for path in found if path.exists()]
+    return max([device.get("peak_memory_mib") or 1.0 for device in devices], default=1.0)
