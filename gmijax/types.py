@@ -1,8 +1,9 @@
 """Array aliases and the legend of size letters that docstrings use.
 
 T: steps of one rollout.  N: environments of one GMI.  O: size of an observation.
-A: size of an action.  K: number of GMIs.  P: number of parameters.
-B: samples of one minibatch.  [] is a scalar.
+A: size of an action.  K: number of GMIs that train.  P: numbers that are reduced at once, those
+of the gradient with the parts of the loss.  B: samples of one minibatch; in channels environments
+of one batch.  [] is a scalar.
 """
 
 from __future__ import annotations

@@ -28,8 +28,9 @@ class Stage(NamedTuple):
     Attributes:
       kind: all members of a group get their sum, or what each of them has, which the program
         sums in the order of the group, or what its first member has.
-      link: how the numbers move.
-      groups: ranks; those that are in none keep what they have.
+      link: how the numbers move; slots gather and broadcast only.
+      groups: ranks; those that are in none keep what they have. Stages through slots all have the
+        same ones, with every rank in one of them.
     """
 
     kind: Kind

@@ -1,4 +1,4 @@
-"""Processes of this host, asked about in /proc, pipes to our own, a port for them; stdlib only."""
+"""Processes of this host, asked about in /proc, and pipes to our own; stdlib only."""
 
 from __future__ import annotations
 

@@ -124,7 +124,7 @@ def needs_ring(strategy: str, layout: Layout) -> bool:
 
 
 def is_one_per_gpu(layout: Layout) -> bool:
-    """Whether rings can be part of one program on all GPUs: it has each of them once."""
+    """Whether one GMI on each of several GPUs trains: a ring over all is the whole exchange."""
     return layout.num_gpus > 1 and layout.num_gmis == layout.num_gpus
 
 
@@ -194,7 +194,7 @@ class Strategy(NamedTuple):
 
     Attributes:
       why_not: None if it can run on a layout, else the reason in words.
-      has_ring: whether GMIs of several GPUs talk to each other past the host's memory.
+      has_ring: whether it forms rings of NCCL between GPUs.
       ways: how GMIs of one GPU may exchange (`reduce.intra`); `host` for those that do not care.
     """
 
@@ -213,4 +213,4 @@ STRATEGIES: Mapping[str, Strategy] = MappingProxyType(
         "one_shot": Strategy(_anywhere, ways=("ipc",)),
     }
 )
-"""How they are built: `gmijax.collectives.build`."""
+"""The strategies by name. What their ranks do: `gmijax.collectives.strategies.stages`."""

@@ -290,8 +290,7 @@ def update_context(learner: PpoLearner, state: TrainState, stats: RolloutStats) 
     mean, std = stats.advantage.mean, std_of(stats.advantage)
     if not learner.config.normalize_advantage:
         mean, std = jnp.zeros(()), jnp.ones(())
-    # A copy, because the updates donate the parameters that it would alias.
-    return UpdateContext(mean, std, jnp.copy(state.params.log_std))
+    return UpdateContext(mean, std, state.params.log_std)
 
 
 def learn(

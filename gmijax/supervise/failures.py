@@ -51,8 +51,8 @@ def first_cause(failures: Sequence[GmiFailed]) -> GmiFailed:
     """The failure that most likely caused the others.
 
     A GMI that lost its peer may be seen to fail before that peer is; so a signal, and any
-    error that is not about a peer, goes before errors of the exchange. While GMIs meet to form
-    rings, jax aborts those whose peer is gone; so SIGABRT comes after all other causes.
+    error that is not about a peer, goes before errors of the exchange. A library
+    may abort a process whose peer is gone; so SIGABRT comes after all other causes.
     """
     return min(
         failures,

@@ -1,7 +1,7 @@
 """Starts the GMIs of a plan and watches them to their end, with all that they share. No jax here.
 
 What GMIs share is made here and gone when `run_gmis` returns: blocks of memory without a name,
-a reserved port for those that form rings, the backend with its daemons.
+and the backend with its daemons. The processes themselves are `gmijax.supervise.supervisor`'s.
 """
 
 from __future__ import annotations

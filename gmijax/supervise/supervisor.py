@@ -68,8 +68,8 @@ class Launch:
         otherwise signals do what Python does with them.
       variables: more environment variables of every GMI.
       on_warning: called with a sentence when the job runs otherwise than planned.
-      is_enough: whether the GMIs are to finish now, as after a first signal, and the job has done
-        what it was for; None: it ends by itself.
+      is_enough: true once the job has what it needs: the GMIs then finish as after a first
+        signal; None: it ends by itself.
     """
 
     plan: Plan

@@ -158,7 +158,7 @@ def _server_key(address: str) -> bytes:
     """The secret key of whoever listens, as ZeroMQ writes keys."""
     given = os.environ.get(ENV_KEY, "").encode()
     if given and len(given) < _SHORTEST_KEY:
-        raise ConfigError(f"{ENV_KEY}: a secret of at least {_SHORTEST_KEY} characters, please")
+        raise ConfigError(f"{ENV_KEY}: a secret must have at least {_SHORTEST_KEY} characters")
     if not given and not _is_loopback(address.rpartition(":")[0]):
         raise ConfigError(
             f"channel.transport=zmq: {address} can be reached by others, so set {ENV_KEY} to the "

@@ -111,7 +111,7 @@ class Sender:
         if not self._is_open:
             return
         self._is_open = False
-        with contextlib.suppress(GmijaxError):  # A trainer that is gone wants nothing.
+        with contextlib.suppress(GmijaxError):  # Nothing to send to a trainer that is gone.
             self._drain(CLOSE_TIMEOUT_S)
         self.dropped += len(self._waiting)
         self._waiting.clear()

@@ -152,7 +152,8 @@ class DeviceLinks(HostLinks):
     def _new_slots(
         self, layout: Layout, stages: Sequence[Stage], new_memory: NewMemory
     ) -> SharedSlots:
-        rank, groups = self._control.rank, stages[0].groups
+        rank = self._control.rank
+        groups = next(stage.groups for stage in stages if stage.link == "slots")
         group = next(group for group in groups if rank in group)
         owners = group[:1]
         if len(group) == layout.num_gmis:
@@ -178,6 +179,7 @@ class DeviceLinks(HostLinks):
                 if stage.kind == "gather":
                     self._slots.gather(queue, stream, source, target, num_floats, rows=most)
                 else:
+                    assert stage.kind == "broadcast"  # Slots add nothing up.
                     self._slots.broadcast(queue, stream, source, target, num_floats)
         elif stage.link == "ring" and stage.groups in self._rings:
             with self._exchanging(stream, place, num_floats) as queue:

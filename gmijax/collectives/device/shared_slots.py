@@ -113,10 +113,6 @@ class SharedSlots:
             self._wait(queue, stream, member)
         queue.copy(stream, target, self._slot(0), num_bytes)
 
-    def restart(self) -> None:
-        """Begins again with the same one of the two slots on all ranks, when none is at work."""
-        self._num_writes = 0
-
     def close(self) -> None:
         """Gives the mappings back. Idempotent.
 

@@ -1,6 +1,6 @@
 """A thread for calls that may never come back.
 
-A collective in a GPU library or in gloo waits for a peer that died or hangs, and Python cannot
+A collective of a GPU library waits for a peer that died or hangs, and Python cannot
 interrupt it. So such a call runs in this thread, and the rank's own thread looks at the peers.
 """
 

@@ -1,7 +1,7 @@
 """How ranks wait for each other: counters in shared memory, no sockets, no locks.
 
-Every rank owns a counter that only goes up. To arrive is to raise one's own counter by one; to
-wait is to read the others' until all have reached one's own. A call is one or two arrivals, and
+Every rank owns a counter that only goes up. A rank arrives by adding one to its counter, and
+waits until the counters of all others have come as far. A call is one or two arrivals, and
 all ranks make the same calls in the same order, so equal counters mean the same place.
 """
 
@@ -49,16 +49,6 @@ class Barrier:
         self._is_open = False
         self._fence = Fence()
         self._arrive()
-
-    def rendezvous(self) -> None:
-        """Waits until all ranks have attached; the first call does so too.
-
-        Raises:
-          CollectiveError: ranks attached with different numbers.
-          PeerLost, CollectiveTimeout: as in `wait`.
-        """
-        self._operation = "start"
-        self._wait_for_all()
 
     def restart(self) -> None:
         """Says that the calls so far belong to the start: the next one is the first."""

@@ -16,7 +16,7 @@ from gmijax.collectives.waits import LIVENESS_PERIOD_S, fence
 from gmijax.errors import CollectiveTimeout, PeerLost
 
 SILENCE_S = 0.7
-"""A rank that has not beaten for so long does not wait: three beats are missing."""
+"""A rank without a beat for this long is not waiting: three beats are missing."""
 
 
 class FailureDetector:
