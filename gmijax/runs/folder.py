@@ -185,6 +185,15 @@ def locked(lock: Path, what: str) -> Iterator[None]:
         os.close(fd)
 
 
+def is_locked(lock: Path) -> bool:
+    """Whether a job holds a folder, see `locked`."""
+    try:
+        with locked(lock, str(lock)):
+            return False
+    except ConfigError:
+        return lock.exists()
+
+
 def write_json(path: Path, data: Mapping[str, Any]) -> None:
     """Writes `data` as `write_text` does."""
     write_text(path, json.dumps(data, indent=2) + "\n")

@@ -10,6 +10,7 @@ from gmijax.config.sweep import SweepConfig
 from gmijax.errors import JobInterrupted
 from gmijax.machine.mps_control import PIPE_VARIABLE
 from gmijax.partition.plan import Plan
+from gmijax.runs.folder import is_locked
 from gmijax.runs.history import MetricsReader
 from gmijax.supervise.backends.backend import Backend
 from gmijax.supervise.launcher import StopSignals
@@ -79,6 +80,10 @@ class Scheduler:
         for job in list(self._queue):
             # The others would compile the same; when it has, they find it in the cache.
             if self._compiling.get(job.program(), job.number) != job.number:
+                continue
+            # A killed sweep's process of the job may still save.
+            run = self._paths.job(job.number)
+            if run.lock.exists() and is_locked(run.lock):
                 continue
             if not self._start_if_it_fits(job):
                 return  # In order, so that a large job is not passed by forever.

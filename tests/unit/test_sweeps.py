@@ -18,7 +18,7 @@ from gmijax.cli.grid import build_sweep
 from gmijax.config.sweep import SweepConfig
 from gmijax.control.console import open_console
 from gmijax.errors import ConfigError
-from gmijax.runs.folder import write_json
+from gmijax.runs.folder import is_locked, locked, write_json
 from gmijax.supervise.launcher import StopSignals
 from gmijax.sweeps import density
 from gmijax.sweeps.density import with_density
@@ -323,9 +323,9 @@ def test_a_sampler_without_its_package_is_bad_input(
 @pytest.mark.parametrize(
     ("rates", "num_jobs", "best", "profiled"),
     [
-        ((10.0, 19.0, 30.0, 31.0), 100, 4, [1, 2, 4, 8]),
-        ((10.0, 9.0), 100, 1, [1, 2]),
-        ((10.0, 19.0, None), 100, 2, [1, 2, 4]),
+        ((10.0, 19.0, 30.0, 31.0), 9, 4, [1, 2, 4, 8]),
+        ((10.0, 9.0), 9, 1, [1, 2]),
+        ((10.0, 19.0, None), 9, 2, [1, 2, 4]),
         ((10.0, 20.0, 40.0, 41.0), 3, 3, [1, 2, 4, 8]),
     ],
     ids=["more gain nothing", "two are slower", "memory ends", "no more than there are"],
@@ -380,3 +380,12 @@ def test_a_profile_counts_while_all_jobs_train(monkeypatch: pytest.MonkeyPatch) 
     now_s += 6.0
     assert late.is_over()
     assert late.steps_per_s is None
+
+
+def test_a_folder_that_a_job_holds_is_known(tmp_path: Path) -> None:
+    lock = tmp_path / ".lock"
+    assert not is_locked(tmp_path / "nowhere" / ".lock")
+    assert not is_locked(lock)
+    with locked(lock, "here"):
+        assert is_locked(lock)
+    assert not is_locked(lock)
