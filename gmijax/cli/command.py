@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import re
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
-from typing import TypeVar
+from typing import Any
 
 from omegaconf import OmegaConf
 
@@ -16,45 +16,51 @@ from gmijax.cli.help import print_help
 from gmijax.config.schema import to_dict
 from gmijax.control.exit_codes import exit_code_of
 from gmijax.errors import ConfigError
-from gmijax.sweeps.sweep import run_request
-
-C = TypeVar("C")
+from gmijax.sweeps.sweep import Request, run_request
 
 
-def command(name: str, cls: type[C], run: Callable[..., object], argv: Sequence[str]) -> int:
-    """Runs one of the commands; returns its exit code."""
+def command(
+    name: str,
+    cls: type[Any],
+    run: Callable[..., object],
+    argv: Sequence[str],
+    *,
+    make: Callable[[Sequence[str]], Any] | None = None,
+    shown: Callable[[Any], Mapping[str, Any]] = to_dict,
+) -> int:
+    """Runs one of the commands; returns its exit code.
+
+    Args:
+      name: of the command.
+      cls: its keys, as `--help` prints them.
+      run: gets what `make` returned.
+      argv: the command line.
+      make: what the overrides stand for; None: a configuration `cls`.
+      shown: what `--cfg job` prints of it.
+    """
 
     def whole() -> None:
         if "--help" in argv or "-h" in argv:
             print_help(name, cls, partial(defaults, name), choices)
             return
         overrides, show = _split_options(argv)
-        config = build(name, cls, overrides)
+        made = build(name, cls, overrides) if make is None else make(overrides)
         if show:
-            sys.stdout.write(OmegaConf.to_yaml(OmegaConf.create(to_dict(config))))
+            sys.stdout.write(OmegaConf.to_yaml(OmegaConf.create(dict(shown(made)))))
         else:
-            run(config, show=True)
+            run(made, show=True)
 
     return exit_code_of(name, whole)
 
 
 def sweep_command(argv: Sequence[str]) -> int:
     """Runs `gmijax.sweep`, or `gmijax.train -m`; returns its exit code."""
+    return command("sweep", SweepHelp, run_request, argv, make=build_sweep, shown=_shown_sweep)
 
-    def whole() -> None:
-        if "--help" in argv or "-h" in argv:
-            print_help("sweep", SweepHelp, partial(defaults, "sweep"), choices)
-            return
-        overrides, show = _split_options(argv)
-        request = build_sweep(overrides)
-        if show:
-            jobs = [dict(job.overrides) for job in request.jobs]
-            shown = {"sweep": to_dict(request.settings), "jobs": jobs}
-            sys.stdout.write(OmegaConf.to_yaml(OmegaConf.create(shown)))
-        else:
-            run_request(request, show=True)
 
-    return exit_code_of("sweep", whole)
+def _shown_sweep(request: Request) -> dict[str, Any]:
+    jobs = [dict(job.overrides) for job in request.jobs]
+    return {"sweep": to_dict(request.settings), "jobs": jobs}
 
 
 def _split_options(argv: Sequence[str]) -> tuple[list[str], bool]:

@@ -8,12 +8,25 @@ from pathlib import Path
 import jax
 import jax.numpy as jnp
 
-from gmijax.config import TrainConfig
+from gmijax.config import ServeConfig, TrainConfig
 from gmijax.learning.checkpoint import has_envs, restore_envs, restore_learner
 from gmijax.learning.learner import Learner, TrainState, init_learner
 from gmijax.runs.folder import RunPaths, read_json
 from gmijax.runs.resume import CheckpointMeta
+from gmijax.sim.interface import Env
+from gmijax.sim.randomize import make_worlds
 from gmijax.sim.wrappers import BatchedEnv, BatchState, env_keys
+
+
+def worlds_of(config: TrainConfig | ServeConfig, place: int) -> Env:
+    """The worlds of the GMI that is number `place` of those that simulate."""
+    return make_worlds(
+        config.env,
+        config.physics.impl,
+        seed=config.seed,
+        first_env=place * config.envs_per_gmi,
+        num_envs=config.envs_per_gmi,
+    )
 
 
 def first_state(learner: Learner, obs_size: int, config: TrainConfig) -> tuple[TrainState, int]:

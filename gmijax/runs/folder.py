@@ -187,11 +187,13 @@ def locked(lock: Path, what: str) -> Iterator[None]:
 
 def is_locked(lock: Path) -> bool:
     """Whether a job holds a folder, see `locked`."""
+    if not lock.exists():
+        return False
     try:
         with locked(lock, str(lock)):
             return False
     except ConfigError:
-        return lock.exists()
+        return True
 
 
 def write_json(path: Path, data: Mapping[str, Any]) -> None:

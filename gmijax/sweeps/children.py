@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from gmijax.errors import GmijaxError
-from gmijax.machine.processes import GuardPipe, members_of
+from gmijax.machine.processes import GuardPipe
 from gmijax.runs.folder import write_json
 from gmijax.sweeps.jobs import Job
 from gmijax.sweeps.places import Place
@@ -114,15 +114,6 @@ def start(
     finally:
         os.close(pipe.read_end)
     return Child(job, place, log, process, pipe)
-
-
-def wait_for_groups(children: list[Child], timeout_s: float) -> None:
-    """Waits until nothing of these process groups is left."""
-    deadline_s = time.monotonic() + timeout_s
-    while time.monotonic() < deadline_s:
-        if not any(members_of(child.process.pid) for child in children):
-            return
-        time.sleep(0.05)
 
 
 def _last_words(log: Path) -> str:

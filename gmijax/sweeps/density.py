@@ -116,7 +116,8 @@ def _profile(
         window = _Window(jobs, limit_s)
 
         def tick() -> None:
-            if window.is_over() or signals.have_come:
+            # Once: a second signal would end the jobs before they say how much memory they took.
+            if not inner.have_come and (window.is_over() or signals.have_come):
                 inner.handle(signal.SIGTERM)
 
         try:

@@ -6,6 +6,7 @@ import dataclasses
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 from pathlib import Path
 from typing import Any, Literal, TypeAlias
 
@@ -112,13 +113,14 @@ class Job:
     @property
     def label(self) -> str:
         """The overrides in one line."""
-        return " ".join(f"{key}={value}" for key, value in self.overrides.items()) or "-"
+        return label_of(self.overrides) or "-"
 
     @property
     def num_gpus(self) -> int:
         """How many GPUs it takes a place on."""
         return self.config.plan.num_gpus
 
+    @cached_property
     def program(self) -> str:
         """The same for jobs that compile the same programs."""
         data = to_dict(self.config)
@@ -126,6 +128,11 @@ class Job:
             del data[key]
         data["plan"].pop("memory_fraction")
         return repr(data)
+
+
+def label_of(overrides: Mapping[str, str]) -> str:
+    """Overrides in one line."""
+    return " ".join(f"{key}={value}" for key, value in overrides.items())
 
 
 def jobs_of(configs: Sequence[TrainConfig]) -> tuple[Job, ...]:

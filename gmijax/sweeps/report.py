@@ -13,7 +13,7 @@ from rich.table import Table
 from gmijax.config.schema import to_dict
 from gmijax.config.sweep import SweepConfig
 from gmijax.runs.folder import write_json, write_text
-from gmijax.sweeps.jobs import Job, SweepPaths
+from gmijax.sweeps.jobs import Job, SweepPaths, label_of
 from gmijax.version import __version__
 
 CURVE_POINTS = 200
@@ -59,7 +59,7 @@ def ranking(rows: Sequence[Mapping[str, Any]], sweep: SweepConfig) -> Table:
     for heading in ("rank", "job", "overrides", f"best {sweep.objective}", "steps", "state"):
         table.add_column(heading)
     for rank, row in enumerate(ranked(rows, sweep), 1):
-        label = " ".join(f"{key}={value}" for key, value in row["overrides"].items())
+        label = label_of(row["overrides"])
         shown = f"{row['value']:.4g}", f"{row['env_steps']:,}"
         table.add_row(str(rank), str(row["job"]), label, *shown, row["state"])
     return table
@@ -75,7 +75,7 @@ def draw_curves(jobs: Sequence[Job], sweep: SweepConfig, paths: SweepPaths) -> b
     for job in jobs:
         if curve := job.progress.curve:
             own = {key: value for key, value in job.overrides.items() if key != "seed"}
-            label = " ".join(f"{key}={value}" for key, value in own.items()) or "all seeds"
+            label = label_of(own) or "all seeds"
             groups.setdefault(label, []).append(curve)
     if not groups:
         return False

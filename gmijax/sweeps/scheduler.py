@@ -9,12 +9,13 @@ from gmijax.config.schema import to_dict
 from gmijax.config.sweep import SweepConfig
 from gmijax.errors import JobInterrupted
 from gmijax.machine.mps_control import PIPE_VARIABLE
+from gmijax.machine.processes import members_of, wait_until_gone
 from gmijax.partition.plan import Plan
 from gmijax.runs.folder import is_locked
 from gmijax.runs.history import MetricsReader
 from gmijax.supervise.backends.backend import Backend
 from gmijax.supervise.launcher import StopSignals
-from gmijax.sweeps.children import Child, start, wait_for_groups
+from gmijax.sweeps.children import Child, start
 from gmijax.sweeps.jobs import Job, SweepPaths, placed
 from gmijax.sweeps.places import Place, Places
 from gmijax.sweeps.study import Study
@@ -79,11 +80,10 @@ class Scheduler:
     def _start_what_fits(self) -> None:
         for job in list(self._queue):
             # The others would compile the same; when it has, they find it in the cache.
-            if self._compiling.get(job.program(), job.number) != job.number:
+            if self._compiling.get(job.program, job.number) != job.number:
                 continue
             # A killed sweep's process of the job may still save.
-            run = self._paths.job(job.number)
-            if run.lock.exists() and is_locked(run.lock):
+            if is_locked(self._paths.job(job.number).lock):
                 continue
             if not self._start_if_it_fits(job):
                 return  # In order, so that a large job is not passed by forever.
@@ -97,7 +97,7 @@ class Scheduler:
         place = self._places.take(job.num_gpus)
         if place is None:
             return False
-        if (program := job.program()) not in self._compiled:
+        if (program := job.program) not in self._compiled:
             self._compiling[program] = job.number
         self._start(job, place)
         return True
@@ -138,7 +138,7 @@ class Scheduler:
     def _finish(self, child: Child) -> None:
         job, progress = child.job, child.job.progress
         del self._running[job.number]
-        wait_for_groups([child], _KILL_AFTER_S)
+        wait_until_gone(members_of(child.process.pid), _KILL_AFTER_S)
         is_interrupted, error = child.close()
         self._places.give_back(child.place)
         self._has_compiled(job)
@@ -151,7 +151,7 @@ class Scheduler:
 
     def _has_compiled(self, job: Job) -> None:
         """Its metrics are there, or it has ended: nobody waits for it any more."""
-        program = job.program()
+        program = job.program
         if self._compiling.get(program) == job.number:
             del self._compiling[program]
             self._compiled.add(program)

@@ -98,7 +98,7 @@ def run_request(request: Request, *, show: bool = False) -> SweepResult:
     """
     started_s = time.monotonic()
     settings, machine, console = request.settings, detect_machine(), open_console(show=show)
-    request = request._replace(jobs=tuple(map(_with_task, request.jobs)))
+    request = _with_tasks(request)
     backends = {job.config.plan.backend for job in request.jobs}
     # Before anything is started: whether there are such GPUs, and room for so many jobs.
     plan = places_of(settings, machine, backends)
@@ -113,7 +113,9 @@ def run_request(request: Request, *, show: bool = False) -> SweepResult:
         try:
             with stop_signals() as signals, ExitStack() as held:
                 devices = {share.device for share in plan.slices} - {"cpu"}
-                held.enter_context(leased(devices, console.print, lambda: signals.have_come))
+                wait = leased(devices, console.print, lambda: signals.have_come)
+                if not held.enter_context(wait):
+                    raise JobInterrupted("interrupted")
                 settings = with_density(settings, request.jobs, machine, console, signals)
                 plan = places_of(settings, machine, backends)
                 _announce(console, plan, request, jobs)
@@ -139,8 +141,16 @@ def run_request(request: Request, *, show: bool = False) -> SweepResult:
     return SweepResult(paths.root, report)
 
 
-def _with_task(job: Job) -> Job:
-    return replace(job, config=with_task(job.config))
+def _with_tasks(request: Request) -> Request:
+    """The request with the tasks of all jobs pinned, also of those that are still to be made."""
+
+    def pinned(job: Job) -> Job:
+        return replace(job, config=with_task(job.config))
+
+    return request._replace(
+        jobs=tuple(map(pinned, request.jobs)),
+        make_job=lambda number, chosen: pinned(request.make_job(number, chosen)),
+    )
 
 
 def _open(jobs: Sequence[Job]) -> SweepPaths:
@@ -170,7 +180,7 @@ def _beginning(request: Request, paths: SweepPaths) -> tuple[list[Job], Study]:
     jobs = list(request.jobs)
     if settings.sampler != "grid":
         study = OptunaStudy(settings, request.space, request.make_job, paths.study)
-        jobs = [_with_task(job) for job in study.earlier()]
+        jobs = study.earlier()
     for job in jobs:
         run = paths.job(job.number)
         job.progress.read(run, settings)

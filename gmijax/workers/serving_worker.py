@@ -45,19 +45,12 @@ def _run(link: ChildLink) -> dict[str, Any]:
 
     from gmijax.collection.collectors import Share
     from gmijax.devices import describe_device
+    from gmijax.learning.start import worlds_of
     from gmijax.selfcheck import check_share
-    from gmijax.sim.randomize import make_worlds
     from gmijax.sim.wrappers import training_env
 
     check_share(plan, link.gmi)
-    worlds = make_worlds(
-        config.env,
-        config.physics.impl,
-        seed=config.seed,
-        first_env=rank * config.envs_per_gmi,
-        num_envs=config.envs_per_gmi,
-    )
-    env = training_env(worlds)
+    env = training_env(worlds_of(config, rank))
     policy = _policy(config, env.spec)
     first, num_unrolls = _unrolls(config, rank, len(group.gmis)) if own == SIMULATOR else (0, 0)
     with ExitStack() as held:

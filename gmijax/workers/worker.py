@@ -142,17 +142,11 @@ def _run_asynchronous(
 
 def _environments(config: TrainConfig, place: int) -> BatchedEnv:
     """The environments of the GMI that is number `place` of those that simulate."""
-    from gmijax.sim.randomize import make_worlds
+    from gmijax.learning.start import worlds_of
     from gmijax.sim.wrappers import training_env
 
-    worlds = make_worlds(
-        config.env,
-        config.physics.impl,
-        seed=config.seed,
-        first_env=place * config.envs_per_gmi,
-        num_envs=config.envs_per_gmi,
-    )
-    return training_env(worlds, random_ep_len=config.algo.init_at_random_ep_len)
+    random_ep_len = config.algo.init_at_random_ep_len
+    return training_env(worlds_of(config, place), random_ep_len=random_ep_len)
 
 
 def _trainers_reducer(

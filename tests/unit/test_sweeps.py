@@ -111,8 +111,8 @@ def test_configurations_differ_by_what_they_are_named() -> None:
         {"num_envs": "32", "seed": "1"},
     ]
     assert jobs[0].label == "num_envs=16 seed=0"
-    assert len({job.program() for job in jobs}) == 2
-    assert len({job.program() for job in jobs_of([compose(f"seed={s}") for s in "01"])}) == 1
+    assert len({job.program for job in jobs}) == 2
+    assert len({job.program for job in jobs_of([compose(f"seed={s}") for s in "01"])}) == 1
 
 
 @pytest.mark.parametrize(

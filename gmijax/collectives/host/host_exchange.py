@@ -81,10 +81,7 @@ class HostExchange:
           groups: who reduces with whom.
           place: which exchange of its program this is, see `Barrier.begin`.
         """
-        block, group = self._begin("sum", source, place), _group_of(self.rank, groups)
-        slots = block.slots[self.barrier.step % 2, :, : source.size]
-        slots[self.rank] = source
-        self._meet()
+        slots, group = self._shared("sum", source, groups, place)
         if group:
             part = chunk(source.size, group.index(self.rank), len(group))
             # In place: nobody else reads this part of the first member's slot.
@@ -97,10 +94,7 @@ class HostExchange:
         self, source: FloatBuffer, target: FloatBuffer, groups: Groups, place: int = 0
     ) -> None:
         """Writes what the first of the rank's group has as `source` [n] into `target` [n]."""
-        block, group = self._begin("broadcast", source, place), _group_of(self.rank, groups)
-        slots = block.slots[self.barrier.step % 2, :, : source.size]
-        slots[self.rank] = source
-        self._meet()
+        slots, group = self._shared("broadcast", source, groups, place)
         target[:] = slots[group[0] if group else self.rank]
         self.barrier.end()
 
@@ -108,10 +102,7 @@ class HostExchange:
         self, source: FloatBuffer, target: FloatBuffer, groups: Groups, place: int = 0
     ) -> None:
         """Writes what all of the rank's group have as `source` [n] into `target` [m, n]."""
-        block, group = self._begin("gather", source, place), _group_of(self.rank, groups)
-        slots = block.slots[self.barrier.step % 2, :, : source.size]
-        slots[self.rank] = source
-        self._meet()
+        slots, group = self._shared("gather", source, groups, place)
         for row, member in zip(target, group or (self.rank,), strict=False):
             row[:] = slots[member]
         self.barrier.end()
@@ -160,7 +151,10 @@ class HostExchange:
             self.barrier.leave()
             self._block = None
 
-    def _begin(self, operation: str, source: FloatBuffer, place: int) -> SharedBlock:
+    def _shared(
+        self, operation: str, source: FloatBuffer, groups: Groups, place: int
+    ) -> tuple[FloatBuffer, Sequence[int]]:
+        """Opens a call; what all ranks have as `source` [K, n], and the members of the group."""
         block = self._open_block(operation)
         room = block.slots.shape[2]
         if source.dtype != np.float32 or source.ndim != 1 or source.size > room:
@@ -169,7 +163,10 @@ class HostExchange:
                 f"most {room} float32"
             )
         self.barrier.begin(operation, source.size, place)
-        return block
+        slots = block.slots[self.barrier.step % 2, :, : source.size]
+        slots[self.rank] = source
+        self._meet()
+        return slots, _group_of(self.rank, groups)
 
     def _meet(self) -> None:
         self.barrier.wait()
