@@ -121,9 +121,9 @@ def test_a_role_that_ends_its_process_has_returned_nothing() -> None:
 
 def test_an_interrupt_lets_roles_finish(tmp_path: Path) -> None:
     def interrupt() -> None:
-        while (beat := heartbeat_of(tmp_path / "run", 1)) is None or beat.state != "running":
+        # A later iteration than the first: both have met in a collective, so both have begun.
+        while (beat := heartbeat_of(tmp_path / "run", 1)) is None or beat.iteration < 5:
             time.sleep(0.02)
-        time.sleep(0.3)
         os.kill(os.getpid(), signal.SIGINT)
 
     threading.Thread(target=interrupt, daemon=True).start()
