@@ -2,17 +2,15 @@
 
 The same trainings as whole commands, start and compiling included: one after another, several at
 a time under MPS, and several under plain sharing. Each command has a cache of compiled programs of
-its own, empty at first, unless `--warm`. Adds its runs to
-`benchmarks/results/sweeps-<device>.json`, with commit, date and settings.
+its own, empty at first, unless `--warm`. Adds a call to
+`benchmarks/results/sweeps-<device>.json`.
 """
 
 from __future__ import annotations
 
 import argparse
-import datetime
 import json
 import os
-import platform
 import statistics
 import subprocess
 import sys
@@ -21,20 +19,14 @@ import time
 from pathlib import Path
 from typing import Any
 
-from benchmarks.run import RESULTS
-from gmijax.machine.snapshot import detect_machine
-from gmijax.runs.folder import write_json
-from gmijax.version import versions_of
-
-PACKAGES = ("jax", "jaxlib", "mujoco", "mujoco-mjx", "warp-lang")
+from benchmarks.records import RESULTS, ResultsFile, device_name, file_name
 
 
 def main() -> int:
     """Measures what the command line asks for; returns 1 if a sweep failed, else 0."""
     arguments = _arguments()
-    machine = detect_machine()
-    device = machine.gpus[0].name if machine.gpus else "cpu"
-    path = arguments.out / f"sweeps-{device.replace(' ', '-').lower()}.json"
+    path = arguments.out / file_name("sweeps", device_name())
+    book = ResultsFile(path, "sweeps", vars(arguments))
     ways = [(n, "auto") for n in arguments.at_once] + [(n, "share") for n in arguments.shared]
     runs: list[dict[str, Any]] = []
     for repeat in range(arguments.repeats):
@@ -42,7 +34,8 @@ def main() -> int:
             runs.append(_run(arguments, at_once, backend, repeat))
             sys.stdout.write(f"{json.dumps(runs[-1])}\n")
             sys.stdout.flush()
-            _add(path, arguments, device, machine.driver_version, runs)
+            with book.changing() as results:
+                results["runs"] = runs
     for at_once, backend in ways:
         rates = [
             run["trainings_per_hour"]
@@ -79,43 +72,6 @@ def _run(arguments: argparse.Namespace, at_once: int, backend: str, repeat: int)
         "values": [job["value"] for job in jobs],
         "states": [job["state"] for job in jobs],
     }
-
-
-def _add(
-    path: Path,
-    arguments: argparse.Namespace,
-    device: str,
-    driver: str | None,
-    runs: list[dict[str, Any]],
-) -> None:
-    """Puts this call beside the earlier ones of the file."""
-    calls = json.loads(path.read_text())["calls"] if path.exists() else []
-    started = runs[0]["wall_s"]
-    own = {
-        "commit": _commit(),
-        "date": datetime.date.today().isoformat(),
-        "device": device,
-        "driver": driver,
-        "host": f"{os.cpu_count()} cores, {platform.platform()}",
-        "versions": versions_of(PACKAGES),
-        "overrides": arguments.overrides,
-        "jobs": arguments.jobs,
-        "is_warm": arguments.warm,
-        "first_wall_s": started,
-        "runs": runs,
-    }
-    rest = [call for call in calls if call["first_wall_s"] != started]
-    path.parent.mkdir(parents=True, exist_ok=True)
-    write_json(path, {"suite": "sweeps", "calls": [*rest, own]})
-
-
-def _commit() -> str:
-    """The commit of the checkout, with a plus where files differ from it."""
-    said = [
-        subprocess.run(["git", *words], capture_output=True, text=True, check=False).stdout.strip()
-        for words in (("rev-parse", "--short", "HEAD"), ("status", "--porcelain", "gmijax"))
-    ]
-    return f"{said[0]}{'+' if said[1] else ''}" or "unknown"
 
 
 def _arguments() -> argparse.Namespace:
