@@ -1,8 +1,8 @@
 """Compares the paper's resource model with measured ratios of co-located to dedicated GMIs.
 
 `python -m benchmarks.resource_model benchmarks/results/serving-nvidia-h200.json` prints a Markdown
-table of the last call in each file of `python -m benchmarks.serving`. The paper's ratios of R and
-its alpha stand in for what was not measured; `--resources` reads R from a file of
+table of the cases in files of `python -m benchmarks.serving` whose stages were timed. The paper's
+ratios of R and its alpha stand in for what was not measured; `--resources` reads R from a file of
 `python -m benchmarks.resource_use`.
 
 Training has no such table: its iteration is one program, whose stages are not timed apart.
@@ -43,13 +43,16 @@ def main() -> int:
 
 
 def cases_of(file: Path) -> list[dict[str, Any]]:
-    """The cases of a file's last call whose stages were timed; the others are named."""
-    cases = read_calls(file)[-1].results.get("cases")
-    if not isinstance(cases, list):
-        raise ConfigError(f"{file}: no file of benchmarks.serving")
-    if missing := [case["name"] for case in cases if "simulator_s" not in case]:
-        sys.stderr.write(f"{file}: left out, no times of its stages: {'; '.join(missing)}\n")
-    return [case for case in cases if "simulator_s" in case]
+    """The cases whose stages were timed, of the file's last call that has any.
+
+    Raises:
+      ConfigError: there are none.
+    """
+    for call in reversed(read_calls(file)):
+        cases = call.results.get("cases")
+        if isinstance(cases, list) and (timed := [c for c in cases if "simulator_s" in c]):
+            return timed
+    raise ConfigError(f"{file}: no case with times of its stages")
 
 
 def resources_of(name: str, uses: Mapping[str, Any]) -> dict[str, float]:

@@ -84,7 +84,9 @@ def measure(setting: Setting, arguments: argparse.Namespace, scratch: Path) -> d
             except RuntimeError as error:
                 sys.stderr.write(f"{setting.name}, {template}: {error}\n")
                 return {"name": setting.name, "failed": str(error)}
-    case: dict[str, Any] = {"name": setting.name, **setting._asdict(), "runs": runs}
+    first = next(found[0] for found in runs.values() if found)
+    case: dict[str, Any] = {"name": setting.name, **setting._asdict(), "impl": first.get("impl")}
+    case["runs"] = runs
     for template, name in (("tcg", "colocated"), ("tdg", "dedicated")):
         if runs[template]:
             case[name] = statistics.median(run["step_per_s_inference"] for run in runs[template])

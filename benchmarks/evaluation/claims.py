@@ -8,12 +8,20 @@ from benchmarks.evaluation.figures import (
     NOT_MEASURED,
     WHOLE_RUN,
     bounds,
-    call_of,
     markdown,
     ratio,
+    results_of,
     shown,
 )
-from benchmarks.evaluation.other_tables import BACKENDS, SERVING, USE, model_fit, serving_rate
+from benchmarks.evaluation.other_tables import (
+    IMPLS,
+    SERVING,
+    USE,
+    model_fit,
+    mps_and_share,
+    mps_over_share,
+    serving_rate,
+)
 from benchmarks.evaluation.paper import LGR, lgr_gain
 from benchmarks.evaluation.tables import LAYOUTS, fixed_total_ratios
 
@@ -30,8 +38,7 @@ def claims() -> list[str]:
 
 
 def _model() -> Iterator[list[str]]:
-    call = call_of(USE)
-    uses = call.results["tasks"] if call else {}
+    uses = results_of(USE).get("tasks", {})
     busy = [stage["sm"] for stages in uses.values() for stage in stages.values()]
     yield [
         *("Fig. 1b", "utilisation of a GPU by one process", "below 50 %, mean 32 %"),
@@ -44,15 +51,15 @@ def _model() -> Iterator[list[str]]:
         f"measured over predicted: {model_fit()}",
         "[reduction](#a-mean-alone)",
     ]
-    served = call_of(SERVING)
-    gains = [c["colocated"] / c["dedicated"] for c in served.results["cases"]] if served else []
+    served = results_of(SERVING).get("cases", ())
+    gains = [one["colocated"] / one["dedicated"] for one in served if "dedicated" in one]
     yield ["Table 3", "TCG over TDG, serving", "2.5", bounds(gains), TEMPLATE_LINK]
     trained = [ratio(f"templates-{task}", *TEMPLATES) for task in ("ant", "humanoid")]
     yield ["Table 4", "TCG_EX over TDG_EX, training", "5", bounds(trained), TEMPLATE_LINK]
     answers = [
         f"{best['gmis_per_gpu']} x {best['num_envs']:,} ({best['impl']})"
         for file in ("search-ant-jax-h200", "search-ant-one_shot-h200")
-        if (searched := call_of(file)) and (best := searched.results["best"])
+        if (best := results_of(file).get("best"))
     ]
     yield [
         *("Algorithm 2", "GMIs and environments by profiling", ""),
@@ -62,7 +69,7 @@ def _model() -> Iterator[list[str]]:
 
 
 def _overall() -> Iterator[list[str]]:
-    several = [serving_rate(BACKENDS, f"ant {n} x {8192 // n}, mps", "jax") for n in (2, 4, 8)]
+    several = [mps_and_share("ant", gmis)[0] for gmis in (2, 4, 8)]
     one = shown(serving_rate(SERVING, "ant 1 x 8192, mps"), ",.0f")
     yield [
         *("Fig. 7a", "serving with GMIs over one process", "2.62 at most, mean 2.08"),
@@ -80,16 +87,10 @@ def _overall() -> Iterator[list[str]]:
 
 
 def _studies() -> Iterator[list[str]]:
-    gains = {}
-    for task, impl in (("ant", "jax"), ("humanoid", "warp")):
-        rates = [
-            [serving_rate(BACKENDS, f"{task} {n} x {8192 // n}, {b}", impl) for n in (2, 4, 8)]
-            for b in ("mps", "share")
-        ]
-        gains[task] = [mps / share for mps, share in zip(*rates, strict=True) if mps and share]
+    gains = {task: bounds([mps_over_share(task, n) for n in (2, 4, 8)]) for task in IMPLS}
     yield [
         *("Fig. 8", "MPS and MIG over plain sharing", "both above 1"),
-        "; ".join(f"{task} {bounds(found)}" for task, found in gains.items())
+        "; ".join(f"{task} {found}" for task, found in gains.items())
         + f" with 2 to 8 GMIs; MIG, three GMIs, BallBalance: {NOT_MEASURED}",
         BACKEND_LINK,
     ]

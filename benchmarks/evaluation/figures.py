@@ -46,24 +46,33 @@ def figure(values: Sequence[float]) -> Figure | None:
 
 
 def call_of(file: str) -> Call | None:
-    """The call of `<file>.json` that counts: the newest of those with the most cases measured.
+    """The call of `<file>.json` that counts: the newest of those that measured most.
 
-    So a later call of a few cases (`--only`) does not hide the others. None without a file.
+    So a later call of a few cases does not hide the others. None without a file.
     """
     path = RESULTS / f"{file}.json"
     if not path.exists():
         return None
     calls = list(enumerate(read_calls(path)))
-    return max(calls, key=lambda one: (len(list(_repeats(one[1].results))), one[0]))[1]
+    return max(calls, key=lambda one: (_count(one[1].results), one[0]))[1]
+
+
+def results_of(file: str) -> Mapping[str, Any]:
+    """What that call measured; nothing without a file."""
+    call = call_of(file)
+    return call.results if call else {}
 
 
 def rate(file: str, case: str, key: str = TRAINING) -> Figure | None:
     """A figure of the summaries of a case of `<file>.json`."""
-    call = call_of(file)
-    cases = call.results["cases"] if call else {}
-    runs = cases[case]["runs"] if case in cases else ()
-    summaries = [run["summary"] for run in runs if "summary" in run]
-    return figure([one[key] for one in summaries if one.get(key) is not None])
+    found = summaries(file, case)
+    return figure([one[key] for one in found if one.get(key) is not None])
+
+
+def summaries(file: str, case: str) -> list[Mapping[str, Any]]:
+    """Of the runs of a case that succeeded."""
+    runs = results_of(file).get("cases", {}).get(case, {}).get("runs", ())
+    return [run["summary"] for run in runs if "summary" in run]
 
 
 def ratio(file: str, case: str, base: str, key: str = TRAINING) -> float | None:
@@ -120,6 +129,12 @@ def origin(call: Call) -> str:
         shown = str(least) if least == most else f"{least} to {most}"
         parts.append(f"{shown} {'run' if most == 1 else 'runs'} of each case")
     return ", ".join(parts)
+
+
+def _count(results: Mapping[str, Any]) -> int:
+    """How much was measured: cases with runs, or rows of whatever the suite has."""
+    lists = [results.get(key, ()) for key in ("cases", "rows", "points", "runs", "tasks")]
+    return len(list(_repeats(results))) or max(map(len, lists))
 
 
 def _repeats(results: Mapping[str, Any]) -> Iterator[int]:

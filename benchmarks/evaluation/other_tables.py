@@ -10,18 +10,17 @@ from benchmarks.cases import TASKS
 from benchmarks.evaluation.figures import (
     NOT_MEASURED,
     bounds,
-    call_of,
     figure,
     markdown,
     rate,
+    results_of,
     shown,
     source,
 )
 from benchmarks.records import RESULTS
 from benchmarks.resource_model import cases_of, predicted_gain
-from gmijax.runs.folder import read_json
 
-SERVING, BACKENDS = "serving-nvidia-h200", "serving-backends-nvidia-h200"
+SERVING, OLD_BACKENDS = "serving-nvidia-h200", "serving-backends-nvidia-h200"
 USE, REDUCTION = "resource-use-nvidia-h200", "reduction-nvidia-h200"
 IMPLS = {"ant": "jax", "humanoid": "warp"}
 """Which MJX each task was served with."""
@@ -31,27 +30,46 @@ RATES = ("step_per_s_sim", "step_per_s_inference", "step_per_s_train")
 
 def serving_rate(file: str, name: str, impl: str | None = None) -> float | None:
     """Steps/s of a serving case; several implementations may have one name in an old file."""
-    call = call_of(file)
-    for case in call.results["cases"] if call else ():
+    for case in results_of(file).get("cases", ()):
         if case["name"] == name and impl in (None, case.get("impl", impl)):
             return case["colocated"]
     return None
 
 
+def backends_file() -> str:
+    """Which file has serving under both backends."""
+    cases = results_of(SERVING).get("cases", ())
+    return SERVING if any(case["backend"] == "share" for case in cases) else OLD_BACKENDS
+
+
+def mps_and_share(task: str, gmis: int) -> tuple[float | None, float | None]:
+    """Steps/s of serving with 8192 environments in all, under both backends."""
+    name, file = f"{task} {gmis} x {8192 // gmis}", backends_file()
+    mps, share = (
+        serving_rate(file, f"{name}, {backend}", IMPLS[task]) for backend in ("mps", "share")
+    )
+    return mps, share
+
+
+def mps_over_share(task: str, gmis: int) -> float | None:
+    """The ratio of the two."""
+    mps, share = mps_and_share(task, gmis)
+    return mps / share if mps and share else None
+
+
 def backends() -> list[str]:
-    """MPS against plain sharing, and against one process."""
-    rows = []
-    for task, impl in IMPLS.items():
-        for gmis in (2, 3, 4, 8):
-            name = f"{task} {gmis} x {8192 // gmis}"
-            mps, share = (
-                serving_rate(BACKENDS, f"{name}, {backend}", impl) for backend in ("mps", "share")
-            )
-            gain = mps / share if mps and share else None
-            cells = [shown(mps, ",.0f"), shown(share, ",.0f"), shown(gain), NOT_MEASURED]
-            rows.append([f"`{task}`", f"{gmis} x {8192 // gmis:,}", *cells])
+    """MPS against plain sharing."""
+    rows = [
+        [
+            *(f"`{task}`", f"{gmis} x {8192 // gmis:,}"),
+            *(shown(value, ",.0f") for value in mps_and_share(task, gmis)),
+            *(shown(mps_over_share(task, gmis)), NOT_MEASURED),
+        ]
+        for task in IMPLS
+        for gmis in (2, 3, 4, 8)
+    ]
     head = "task | GMIs x environments | `mps`, steps/s: | `share`, steps/s: | ratio: | MIG:"
-    return [*markdown(head, rows), *source(BACKENDS)]
+    return [*markdown(head, rows), *source(backends_file())]
 
 
 def serving_templates() -> list[str]:
@@ -71,8 +89,8 @@ def serving_templates() -> list[str]:
 
 def resource_use() -> list[str]:
     """What the tasks of an iteration take of a GPU."""
-    call, rows = call_of(USE), []
-    for task, uses in call.results["tasks"].items() if call else ():
+    rows = []
+    for task, uses in results_of(USE).get("tasks", {}).items():
         for stage in ("simulator", "agent", "trainer"):
             use = uses[stage]
             cells = [f"{1e3 * use['seconds']:.2f}", f"{use['sm']:.0%}", f"{use['memory']:.2%}"]
@@ -87,10 +105,10 @@ def search() -> list[str]:
     files |= {"search-ant-warp-7-and-1-h200": "warp", "search-ant-warp-1-h200": "warp"}
     rows = []
     for file, impl in files.items():
-        call = call_of(file)
-        for p in call.results["points"] if call else ():
+        results = results_of(file)
+        for p in results.get("points", ()):
             if p["impl"] == impl and p.get("projected"):
-                best = "**answer**" if _is_answer(p, call.results["best"]) else ""
+                best = "**answer**" if _is_answer(p, results["best"]) else ""
                 size = f"{p['gmis_per_gpu']} x {p['num_envs']:,}"
                 rows.append([f"`{file}`", impl, size, f"{p['projected']:,.0f}", best])
     head = "search | MJX | GMIs x environments | steps/s of the GPU: |"
@@ -103,8 +121,8 @@ def _is_answer(point: dict[str, Any], best: dict[str, Any]) -> bool:
 
 def reduction() -> list[str]:
     """A mean of 1.5 million numbers, alone and in a chain."""
-    call, rows = call_of(REDUCTION), []
-    for row in call.results["rows"] if call else ():
+    rows = []
+    for row in results_of(REDUCTION).get("rows", ()):
         if row["num_floats"] == 1_500_000:
             times = [
                 f"{1e3 * row[key]:.3f}" for key in ("median_s", "p10_s", "p90_s", "chained_s")
@@ -125,8 +143,7 @@ def read_layout(text: str) -> str:
 
 def model_fit() -> str:
     """Measured over predicted time of all reductions of the paper's strategies."""
-    call = call_of(REDUCTION)
-    rows = call.results["rows"] if call else ()
+    rows = results_of(REDUCTION).get("rows", ())
     fits = [row["median_s"] / row["predicted_s"] for row in rows if row["predicted_s"]]
     return bounds(fits, ".3g")
 
@@ -153,8 +170,7 @@ def learning() -> list[str]:
 
 def _learnt() -> Iterator[tuple[str, str, dict[str, Any]]]:
     for path in sorted([*RESULTS.glob("learn-*.json"), *RESULTS.glob("entropy-franka_c*.json")]):
-        call = call_of(path.stem)
-        for name, case in call.results["cases"].items() if call else ():
+        for name, case in results_of(path.stem)["cases"].items():
             if any("summary" in run for run in case["runs"]):
                 yield path.stem, name, case
 
@@ -180,8 +196,8 @@ def throughput() -> list[str]:
 
 def faults() -> list[str]:
     """Seconds from a fault until all GMIs train again."""
-    call, kinds = call_of("faults-h200"), {}
-    for row in call.results["rows"] if call else ():
+    kinds: dict[str, list[float]] = {}
+    for row in results_of("faults-h200").get("rows", ()):
         kinds.setdefault(row["fault"], []).append(row["seconds"])
     rows = [[kind, shown(figure(seconds), ".0f")] for kind, seconds in kinds.items()]
     return [*markdown("fault | seconds until all GMIs train again:", rows), *source("faults-h200")]
@@ -189,8 +205,8 @@ def faults() -> list[str]:
 
 def sm_shares() -> list[str]:
     """At which caps on SMs half-precision products were right."""
-    call, rows = call_of("sm-shares-nvidia-h200"), []
-    for row in call.results["rows"] if call else ():
+    rows = []
+    for row in results_of("sm-shares-nvidia-h200").get("rows", ()):
         wrong = {p["library"] for p in row["products"] if p["wrong"]}
         verdict = f"**wrong** ({', '.join(sorted(wrong))})" if wrong else "right"
         rates = [f"{value:.0f}" for value in row["tflops"].values()]
@@ -202,7 +218,7 @@ def sm_shares() -> list[str]:
 def stencil() -> list[str]:
     """Four GMIs that share a grid against one process."""
     rows = []
-    for run in read_json(RESULTS / "stencil-nvidia-h200.json")["runs"]:
+    for run in results_of("stencil-nvidia-h200").get("runs", ()):
         slower = run["us_per_step"] / run["one_us_per_step"]
         times = (f"{run[key]:.0f}" for key in ("us_per_step", "one_us_per_step"))
         rows.append([run["size"], f"`{run['backend']}`", *times, f"{slower:.2f}"])

@@ -32,11 +32,11 @@ def advice() -> list[str]:
         ],
         [
             *("one large synchronous training on one GPU", "**no**: `plan.gmis_per_gpu=1`"),
-            f"{fixed} of one process with as many environments",
+            f"{fixed} times the steps/s of one process with as many environments",
         ],
         [
             *("one training on several GPUs", "one GMI on each"),
-            f"{shown(over_one)} times one GPU on four",
+            f"four GPUs make {shown(over_one)} times the steps/s of one",
         ],
         [
             *("asynchronous training", "try synchronous training first"),

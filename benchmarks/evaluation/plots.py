@@ -14,7 +14,7 @@ from matplotlib.backends.backend_svg import FigureCanvasSVG
 from matplotlib.figure import Figure as Picture
 
 from benchmarks.evaluation.figures import ratio
-from benchmarks.evaluation.other_tables import BACKENDS, serving_rate
+from benchmarks.evaluation.other_tables import IMPLS, mps_over_share
 from benchmarks.evaluation.paper import lgr_gain
 from benchmarks.evaluation.tables import LAYOUTS, fixed_total_ratios, small_gmis
 from gmijax.runs.folder import write_text
@@ -33,14 +33,10 @@ def summary() -> Bars:
     for gmis in (4, 10):
         gain = small[gmis] / small[1] if {1, gmis} <= small.keys() else None
         kept[f"{gmis} small GMIs over one small process"] = gain
-    for task, impl in (("ant", "jax"), ("humanoid", "warp")):
+    for task in IMPLS:
         for gmis in (2, 8):
-            mps, share = (
-                serving_rate(BACKENDS, f"{task} {gmis} x {8192 // gmis}, {backend}", impl)
-                for backend in ("mps", "share")
-            )
-            gain = mps / share if mps and share else None
-            kept[f"MPS over plain sharing, {task}, {gmis} GMIs"] = gain
+            name = f"MPS over plain sharing, {task}, {gmis} GMIs"
+            kept[name] = mps_over_share(task, gmis)
     return kept
 
 

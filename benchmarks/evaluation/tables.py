@@ -9,13 +9,14 @@ from benchmarks.evaluation.figures import (
     NOT_MEASURED,
     WHOLE_RUN,
     Figure,
-    call_of,
     figure,
     markdown,
     rate,
     ratio,
+    results_of,
     shown,
     source,
+    summaries,
 )
 from benchmarks.evaluation.paper import CHANNELS, LGR, lgr_gain
 
@@ -54,8 +55,8 @@ def pair(file: str, case: str, base: str) -> tuple[Figure | None, Figure | None]
     """Steps/s of two cases, of one call."""
     if file != "exchange-in-program-h200":
         return rate(file, case), rate(file, base)
-    call = call_of(file)  # Two trees in each of its own calls; the old one has all cases.
-    for one in call.results["calls"] if call else ():
+    # Two trees in each of its own calls; the old one has all cases.
+    for one in results_of(file).get("calls", ()):
         if {case, base} <= one["cases"].keys():
             several, alone = (
                 figure([run["steps_per_s"] for run in one["cases"][name]["base"]])
@@ -158,10 +159,8 @@ def num_env() -> list[str]:
 
 
 def _memory(file: str, name: str) -> str:
-    call = call_of(file)
-    case = call.results["cases"].get(name) if call else None
-    runs = [run["summary"]["device"] for run in case["runs"] if "summary" in run] if case else []
-    return shown(figure([one["peak_memory_mib"] for one in runs]), ",.0f")
+    found = [summary["device"]["peak_memory_mib"] for summary in summaries(file, name)]
+    return shown(figure(found), ",.0f")
 
 
 ASYNC = (
@@ -225,10 +224,9 @@ SMALL = "search-ant-one_shot-h200"
 
 def small_gmis() -> dict[int, float]:
     """Steps/s of a GPU by the number of GMIs with 2,048 environments each, MJX-Warp."""
-    call = call_of(SMALL)
     return {
         point["gmis_per_gpu"]: point["projected"]
-        for point in (call.results["points"] if call else ())
+        for point in results_of(SMALL).get("points", ())
         if (point["impl"], point["num_envs"]) == ("warp", 2048)
     }
 
@@ -246,11 +244,11 @@ def many_small() -> list[str]:
 
 def sweeps() -> list[str]:
     """Trainings per hour, where they were measured."""
-    call = call_of("sweeps-nvidia-h200")
-    if call is None:
+    runs = results_of("sweeps-nvidia-h200").get("runs", ())
+    if not runs:
         return [f"Trainings per hour of a sweep: {NOT_MEASURED} (`python -m benchmarks.sweeps`)."]
     ways: dict[tuple[int, str], list[float]] = {}
-    for run in call.results["runs"]:
+    for run in runs:
         if run["code"] == 0:
             ways.setdefault((run["at_once"], run["backend"]), []).append(run["trainings_per_hour"])
     rows = [[str(n), backend, shown(figure(rates), ".1f")] for (n, backend), rates in ways.items()]

@@ -103,7 +103,7 @@ def test_a_measured_case_is_predicted_by_equation_2():
 
 def test_a_file_of_another_suite_is_refused():
     file = RESULTS / "ant-1gpu.json"
-    with pytest.raises(ConfigError, match=r"ant-1gpu.json: no file of benchmarks.serving"):
+    with pytest.raises(ConfigError, match=r"ant-1gpu.json: no case with times of its stages"):
         cases_of(file)
 
 
