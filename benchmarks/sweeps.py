@@ -62,6 +62,7 @@ def _run(arguments: argparse.Namespace, at_once: int, backend: str, repeat: int)
         report = json.loads((folder / "sweep.json").read_text())
         jobs = report["jobs"]
     return {
+        "way": f"{at_once} at once, {backend}",
         "at_once": at_once,
         "backend": backend,
         "repeat": repeat,

@@ -138,9 +138,13 @@ def _count(results: Mapping[str, Any]) -> int:
 
 
 def _repeats(results: Mapping[str, Any]) -> Iterator[int]:
-    cases = results.get("cases")
-    for case in cases.values() if isinstance(cases, Mapping) else ():
-        if done := sum("summary" in run for run in case.get("runs", ())):
+    """How often each case was measured, of those that were."""
+    cases = results.get("cases", ())
+    for case in cases.values() if isinstance(cases, Mapping) else cases:
+        runs = case.get("runs", ())
+        if isinstance(runs, Mapping):  # Of serving, by template.
+            yield max(map(len, runs.values()))
+        elif done := sum("summary" in run for run in runs):
             yield done
 
 

@@ -247,12 +247,12 @@ def sweeps() -> list[str]:
     runs = results_of("sweeps-nvidia-h200").get("runs", ())
     if not runs:
         return [f"Trainings per hour of a sweep: {NOT_MEASURED} (`python -m benchmarks.sweeps`)."]
-    ways: dict[tuple[int, str], list[float]] = {}
+    ways: dict[str, list[float]] = {}
     for run in runs:
         if run["code"] == 0:
-            ways.setdefault((run["at_once"], run["backend"]), []).append(run["trainings_per_hour"])
-    rows = [[str(n), backend, shown(figure(rates), ".1f")] for (n, backend), rates in ways.items()]
-    head = "trainings at once: | backend | trainings per hour:"
+            ways.setdefault(run["way"], []).append(run["trainings_per_hour"])
+    rows = [[way, shown(figure(rates), ".1f")] for way, rates in ways.items()]
+    head = "trainings | trainings per hour:"
     return [*markdown(head, rows), *source("sweeps-nvidia-h200")]
 
 

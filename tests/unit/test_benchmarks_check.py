@@ -8,6 +8,7 @@ import pytest
 
 from benchmarks.evaluation import check
 from benchmarks.evaluation.figures import look_up
+from benchmarks.evaluation.page import TABLES
 from gmijax.errors import ConfigError
 
 REFERENCE = "ant-1gpu.json#4 GMIs x 2048, mps/step_per_s_train"
@@ -23,6 +24,11 @@ def findings(folder: Path, text: str) -> list[str]:
 def test_every_figure_of_the_documents_is_that_of_its_file():
     # `python -m benchmarks evaluation` writes what is marked, and says what a table is called.
     assert [str(finding) for finding in check.check()] == []
+
+
+def test_the_page_of_the_evaluation_has_every_table():
+    page = (check.ROOT / "docs" / "evaluation.md").read_text()
+    assert {match[2] for match in check.TABLE.finditer(page)} == set(TABLES)
 
 
 def test_a_wrong_digit_is_found(tmp_path: Path):
