@@ -97,22 +97,24 @@ class ResultsFile:
         self.path = path
         self._suite = suite
         self._lock = threading.Lock()
-        self._earlier = [call._asdict() for call in read_calls(path)] if path.exists() else []
-        self._call = _begin(settings, device)._asdict()
-        if resume and self._earlier:
-            last = self._earlier.pop()
-            if other := [key for key in _SAME if last[key] != self._call[key]]:
+        self._call = _begin(settings, device)
+        if resume and path.exists():
+            last = read_calls(path)[-1]
+            if other := [key for key in _SAME if getattr(last, key) != getattr(self._call, key)]:
                 raise ConfigError(f"{path}: its last call has another {other[0]}: begin a new one")
             self._call = last
-        self.results: dict[str, Any] = self._call["results"]
+        self.results: dict[str, Any] = self._call.results
 
     @contextmanager
     def changing(self) -> Iterator[dict[str, Any]]:
         """Lets one thread at a time change `results`, then writes the file."""
         with self._lock:
             yield self.results
-            calls = [*self._earlier, self._call]
-            write_json(self.path, {"format": FORMAT, "suite": self._suite, "calls": calls})
+            # Read again: another command may have added a call since.
+            found = read_calls(self.path) if self.path.exists() else []
+            calls = [call for call in found if call.date != self._call.date] + [self._call]
+            data = {"format": FORMAT, "suite": self._suite}
+            write_json(self.path, {**data, "calls": [call._asdict() for call in calls]})
 
 
 def read_calls(path: Path) -> list[Call]:
@@ -149,7 +151,7 @@ def _begin(settings: Mapping[str, Any], device: str | None) -> Call:
     return Call(
         commit=commit,
         is_dirty=is_dirty,
-        date=datetime.now().astimezone().isoformat(timespec="seconds"),
+        date=datetime.now().astimezone().isoformat(timespec="microseconds"),
         host=f"{platform.node()}, {os.cpu_count()} cores, {platform.platform()}",
         device=device or ", ".join(f"{n} x {name}" for name, n in counts.items()) or "cpu",
         driver=machine.driver_version,

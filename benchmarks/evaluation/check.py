@@ -34,7 +34,7 @@ MEASUREMENTS = tuple(
         r"\b[\d.]+ ?% (?:of (?:a|the|one) (?:GPU|SMs|rate|time)|faster|slower|fewer)\b",
         r"\b(?:after|took|takes|in) [\d.]+ (?:s|ms|us|min|minutes|seconds|hours)\b",
         r"\b[\d.]+ (?:GB/s|TFLOP/s|trainings/h)",
-        r"\breturns? of \d",
+        r"\breturns? of \d[\d,.]*\b(?! episodes)",
     )
 )
 """What looks like a measurement: rates, large counts, ratios, parts, seconds to a mark."""

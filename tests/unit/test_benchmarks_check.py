@@ -78,7 +78,10 @@ def test_what_looks_like_a_measurement_needs_a_file(tmp_path: Path, text: str):
 
 
 def test_prose_needs_no_marks(tmp_path: Path):
-    text = "8,192 environments, 0.91 kg, twice, within 0.2 s, 1.5M parameters, every 25 s, 600 MiB"
+    text = (
+        "8,192 environments, 0.91 kg, twice, within 0.2 s, 1.5M parameters, every 25 s, 600 MiB,"
+    )
+    text += " the mean return of 64 episodes, 5 % more"
     assert findings(tmp_path, text) == []
 
 

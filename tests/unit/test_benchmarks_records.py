@@ -39,6 +39,14 @@ def test_another_call_is_added(file: Path):
     assert [call.results for call in read_calls(file)] == [{"number": 1}, {"number": 2}]
 
 
+def test_calls_that_go_on_at_the_same_time_keep_each_other(file: Path):
+    books = [ResultsFile(file, "a", {}) for _ in range(2)]
+    for number, book in enumerate((*books, books[0])):
+        with book.changing() as results:
+            results["number"] = number
+    assert sorted(call.results["number"] for call in read_calls(file)) == [1, 2]
+
+
 def test_only_a_call_of_the_same_code_is_gone_on_with(file: Path, monkeypatch: pytest.MonkeyPatch):
     add(file, 1)
     add(file, 2, resume=True)
