@@ -26,8 +26,7 @@ Bars = dict[str, float | None]
 def summary() -> Bars:
     """What several GMIs on a GPU gain and lose."""
     kept: Bars = {
-        f"one training in {what}, over one process": gain
-        for what, gain in fixed_total_ratios().items()
+        f"in {what}, over one process": gain for what, gain in fixed_total_ratios().items()
     }
     small = small_gmis()
     for gmis in (4, 10):

@@ -21,39 +21,41 @@ from benchmarks.evaluation.figures import (
 from benchmarks.evaluation.paper import CHANNELS, LGR, lgr_gain
 
 LAYOUTS = {"2G2T": "2 GPUs x 2", "2G3T": "2 GPUs x 3", "4G4T": "4 GPUs x 4"}
+TWO_TREES = "exchange-in-program-h200"
 ONE_GPU = (
-    ("4 GMIs, MJX-JAX", "ant-1gpu-one_shot", "4 GMIs x 2048, mps", "1 GMI x 8192"),
-    (
-        *("2 GMIs, MJX-Warp", "scaling-one_shot"),
-        *("1 GPUs x 2 GMIs x 4096", "1 GPUs x 1 GMIs x 8192"),
+    *(
+        ("4 GMIs, MJX-JAX", file, "4 GMIs x 2048, mps", "1 GMI x 8192")
+        for file in ("ant-1gpu-one_shot", "ant-1gpu")
     ),
-    ("4 GMIs, MJX-Warp", "exchange-in-program-h200", "4x2048", "1x8192"),
-    ("2 GMIs, MJX-Warp, another day", "exchange-in-program-h200", "2x4096", "1x8192"),
+    *(
+        ("2 GMIs, MJX-Warp", file, "1 GPUs x 2 GMIs x 4096", "1 GPUs x 1 GMIs x 8192")
+        for file in ("scaling-one_shot", "scaling")
+    ),
+    ("2 GMIs, MJX-Warp", TWO_TREES, "2x4096", "1x8192"),
+    ("4 GMIs, MJX-Warp", TWO_TREES, "4x2048", "1x8192"),
 )
-"""What, file, several GMIs, one process: ant, 8192 environments on a GPU, as jobs exchange now."""
+"""What, file, several GMIs, one process: ant, 8192 environments on a GPU, under MPS."""
 
 OTHERS = (
-    ("4 GMIs, MJX-JAX, through host memory", "ant-1gpu", "4 GMIs x 2048, mps", "1 GMI x 8192"),
-    ("the same without MPS", "ant-1gpu", "4 GMIs x 2048, share", "1 GMI x 8192"),
-    (
-        *("2 GMIs, MJX-Warp, `har`", "scaling"),
-        *("1 GPUs x 2 GMIs x 4096", "1 GPUs x 1 GMIs x 8192"),
-    ),
-    ("2 GPUs, 2 GMIs on each, MJX-Warp", "exchange-in-program-h200", "2gpu-2x4096", "2gpu-1x8192"),
+    ("4 GMIs, MJX-JAX, no MPS", "ant-1gpu", "4 GMIs x 2048, share", "1 GMI x 8192"),
+    ("2 GPUs, 2 GMIs on each, MJX-Warp", TWO_TREES, "2gpu-2x4096", "2gpu-1x8192"),
     *(
         (
-            *(f"{gpus} GPUs, 2 GMIs on each, MJX-Warp, `har`", "scaling"),
+            *(f"{gpus} GPUs, 2 GMIs on each, MJX-Warp", "scaling"),
             *(f"{gpus} GPUs x 2 GMIs x 4096", f"{gpus} GPUs x 1 GMIs x 8192"),
         )
         for gpus in (2, 4)
     ),
 )
-"""The same with other exchanges, and on more GPUs against one process on each."""
+"""The same without MPS, and on more GPUs against one process on each."""
+
+IN_GPU_MEMORY = ("one_shot", "auto")
+"""Exchanges that do not pass the host: `auto` where a file does not say what it became."""
 
 
 def pair(file: str, case: str, base: str) -> tuple[Figure | None, Figure | None]:
     """Steps/s of two cases, of one call."""
-    if file != "exchange-in-program-h200":
+    if file != TWO_TREES:
         return rate(file, case), rate(file, base)
     # Two trees in each of its own calls; the old one has all cases.
     for one in results_of(file).get("calls", ()):
@@ -66,13 +68,22 @@ def pair(file: str, case: str, base: str) -> tuple[Figure | None, Figure | None]
     return None, None
 
 
+def exchange_of(file: str, case: str) -> str:
+    """By which strategy the GMIs of a case exchanged gradients."""
+    found = summaries(file, case)
+    return found[0]["plan"]["strategy"] if found else "auto"
+
+
 def fixed_total_ratios() -> dict[str, float | None]:
-    """Several GMIs on one GPU over one process with as many environments."""
-    found = {what: pair(file, case, base) for what, file, case, base in ONE_GPU}
-    return {
-        what: several.median / alone.median if several and alone else None
-        for what, (several, alone) in found.items()
-    }
+    """Several GMIs on one GPU over one process with as many environments, as jobs exchange now."""
+    ratios = {}
+    for what, file, case, base in ONE_GPU:
+        if exchange_of(file, case) in IN_GPU_MEMORY:
+            several, alone = pair(file, case, base)
+            ratios[f"{what} ({file})"] = (
+                several.median / alone.median if several and alone else None
+            )
+    return ratios
 
 
 def fixed_total() -> list[str]:
@@ -81,8 +92,9 @@ def fixed_total() -> list[str]:
     for what, file, case, base in (*ONE_GPU, *OTHERS):
         several, alone = pair(file, case, base)
         gain = several.median / alone.median if several and alone else None
-        rows.append([what, shown(several, ",.0f"), shown(alone, ",.0f"), shown(gain)])
-    head = "ant, 8,192 environments on each GPU | GMIs, steps/s: | one process, steps/s: | ratio:"
+        rates = (shown(value, ",.0f") for value in (several, alone))
+        rows.append([what, f"`{exchange_of(file, case)}`", *rates, shown(gain), f"`{file}`"])
+    head = "on each GPU | exchange | GMIs, steps/s: | one process, steps/s: | ratio: | file"
     files = dict.fromkeys(file for _, file, *_ in (*ONE_GPU, *OTHERS))
     return [*markdown(head, rows), *source(*files)]
 
@@ -92,9 +104,10 @@ def training_backends() -> list[str]:
     rows = []
     for file, what in (("ant-1gpu", "4 GMIs x 2048"), ("ant-2gpu", "2 GPUs x 2 GMIs x 2048")):
         names = [f"{what}, {backend}" for backend in ("mps", "share")]
-        rates = [shown(rate(file, name), ",.0f") for name in names]
-        rows.append([what, *rates, shown(ratio(file, names[0], names[1]))])
-    head = "ant, MJX-JAX, through host memory | `mps`, steps/s: | `share`, steps/s: | ratio:"
+        rates = (shown(rate(file, name), ",.0f") for name in names)
+        exchange = f"`{exchange_of(file, names[0])}`"
+        rows.append([what, exchange, *rates, shown(ratio(file, names[0], names[1]))])
+    head = "ant, MJX-JAX | exchange | `mps`, steps/s: | `share`, steps/s: | ratio:"
     return [*markdown(head, rows), *source("ant-1gpu", "ant-2gpu")]
 
 
