@@ -22,9 +22,12 @@ from gmijax.deploy import exporting
 from gmijax.deploy.files import stablehlo_content
 from gmijax.deploy.trained import trained_policy
 from gmijax.errors import ConfigError
+from gmijax.machine.nvidia import Gpu
+from gmijax.machine.snapshot import Machine
 from gmijax.runs.folder import ExportPaths, RunPaths, write_bytes
 from gmijax.sim.physics import PhysicsState
 from gmijax.sim.tasks import ball_balance
+from gmijax.supervise.supervisor import environment_of
 from gmijax.workers.exporter import names_of
 
 EXAMPLE = Path(__file__).parents[2] / "examples" / "exported_policy.py"
@@ -144,12 +147,16 @@ def exporting_config(*overrides: str) -> ExportConfig:
     return found[0]
 
 
-def test_the_files_are_those_of_the_checkpoint(run: RunPaths):
+def test_an_export_leaves_a_gpu_to_the_job_that_trains_on_it(
+    run: RunPaths, monkeypatch: pytest.MonkeyPatch
+):
+    machine = Machine(gpus=(Gpu(0, "GPU-1", "some GPU", 80000, (9, 0), False),), cpu_cores=(0, 1))
+    monkeypatch.setattr(exporting, "detect_machine", lambda: machine)
     config, _, _ = exporting.open_run(exporting_config(f"run.dir={run.root}"))
     paths = exporting._prepare(config)
     assert paths == ExportPaths(run.root / "export" / f"{ENV_STEPS:012d}")
-    launch = exporting._launch(paths)
-    assert launch.plan.backend == "cpu", "GPUs may be training"
+    environment = environment_of(exporting._launch(paths), 0, {})
+    assert (environment["JAX_PLATFORMS"], environment["CUDA_VISIBLE_DEVICES"]) == ("cpu", "")
 
 
 def test_a_fault_while_writing_leaves_the_old_file(tmp_path: Path, monkeypatch: Any):
