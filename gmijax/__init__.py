@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from gmijax.control.job import Result, train
     from gmijax.control.searching import search
     from gmijax.control.serving import Served, serve
+    from gmijax.deploy.policy import load_policy
     from gmijax.roles.launch import launch
     from gmijax.roles.manager import GMIManager, plan
     from gmijax.roles.role import Role
@@ -31,6 +32,7 @@ __all__ = [
     "__version__",
     "compose",
     "launch",
+    "load_policy",
     "make_env",
     "plan",
     "search",
@@ -48,6 +50,7 @@ _HOMES = {
     "SweepResult": "gmijax.sweeps.sweep",
     "compose": "gmijax.cli.compose",
     "launch": "gmijax.roles.launch",
+    "load_policy": "gmijax.deploy.policy",
     "make_env": "gmijax.sim.registry",
     "plan": "gmijax.roles.manager",
     "search": "gmijax.control.searching",

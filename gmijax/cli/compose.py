@@ -156,7 +156,7 @@ def with_custom_task(name: str, override: str) -> tuple[str, ...]:
     if key != "env" or not re.search(r"\.py(:|$)", value):
         return (override,)
     quoted = value.replace("\\", "\\\\").replace("'", "\\'")
-    if name == "play":  # Which task it is the run says.
+    if name in ("play", "export"):  # Which task it is the run says.
         return (f"run.env='{quoted}'",)
     return "env=custom", f"env.name='{quoted}'"
 

@@ -14,7 +14,7 @@ import math
 import os
 import shutil
 from pathlib import Path
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -149,6 +149,25 @@ def restore_learner(checkpoint: Path, template: T) -> T:
       ConfigError: the checkpoint does not fit the template.
     """
     return _restore(checkpoint / LEARNER, template)
+
+
+def learner_sizes(checkpoint: Path) -> tuple[int, int]:
+    """O and A, lengths of an observation and of an action, of the policy in a checkpoint.
+
+    Raises:
+      ConfigError: the checkpoint holds no learner's state.
+    """
+    folder = (checkpoint / LEARNER).resolve()
+    try:
+        with ocp.StandardCheckpointer() as checkpointer:
+            saved: Any = checkpointer.metadata(folder).item_metadata
+        (obs_size,), (action_size,) = (
+            saved["obs_moments"]["mean"].shape,
+            saved["params"]["log_std"].shape,
+        )
+    except (AttributeError, KeyError, OSError, TypeError, ValueError) as error:
+        raise ConfigError(f"checkpoint {folder}: holds no policy") from error
+    return obs_size, action_size
 
 
 def restore_envs(checkpoint: Path, gmi: int, template: T) -> T:

@@ -5,6 +5,7 @@
 `<run>/gmi_<id>/{stdout.log,stderr.log,error.json,result.json,metrics.jsonl}`
 `<run>/gmi_<id>/attempt_<n>/`: the same files of attempts that failed
 `<run>/play/<12-digit env steps>/`: a played checkpoint, see `PlayPaths`
+`<run>/export/<12-digit env steps>/`: an exported policy, see `ExportPaths`
 """
 
 from __future__ import annotations
@@ -120,6 +121,16 @@ class PlayPaths(_Folder):
         return self.returns, self.trajectory, self.model, *watched, self.render_log, self.page_log
 
 
+class ExportPaths(_Folder):
+    """Files of one exported policy; its folder also has the files of a run with one GMI."""
+
+    def __init__(self, root: Path) -> None:
+        super().__init__(root)
+        self.onnx = root / "policy.onnx"
+        self.stablehlo = root / "policy.stablehlo"
+        self.metadata = root / "policy.json"  # Written last.
+
+
 def create_run(
     run_dir: str | None, name: str | None, prefix: str, now: datetime | None = None
 ) -> RunPaths:
@@ -202,6 +213,11 @@ def write_json(path: Path, data: Mapping[str, Any]) -> None:
 
 
 def write_text(path: Path, text: str) -> None:
+    """Writes a text as `write_bytes` does."""
+    write_bytes(path, text.encode())
+
+
+def write_bytes(path: Path, content: bytes) -> None:
     """Writes a file so that a reader sees the old one or the new one, never half a file.
 
     Also after a loss of power: its content is on the disk before its name is.
@@ -209,8 +225,8 @@ def write_text(path: Path, text: str) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
     temporary = path.with_name(f".{path.name}.{os.getpid()}-{threading.get_ident()}")
     try:
-        with temporary.open("w") as file:
-            file.write(text)
+        with temporary.open("wb") as file:
+            file.write(content)
             file.flush()
             os.fsync(file.fileno())
         os.replace(temporary, path)
@@ -220,7 +236,7 @@ def write_text(path: Path, text: str) -> None:
 
 
 def remove_temporary(folder: Path) -> None:
-    """Removes what processes left in a folder that were killed within `write_text`."""
+    """Removes what processes left in a folder that were killed within `write_bytes`."""
     for path in folder.glob(".*"):
         if _TEMPORARY.fullmatch(path.name):
             path.unlink(missing_ok=True)

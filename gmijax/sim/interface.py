@@ -29,6 +29,8 @@ class EnvSpec(NamedTuple):
       max_abs_obs: an observation beyond this tells that the physics diverges; the world is ended
         (see `gmijax.sim.divergence`).
       metrics: names of the numbers that judge an episode beside its return, such as successes.
+      obs_terms: parts of an observation in order, name and length each; they go into exported
+        policies. Empty where nobody says.
     """
 
     name: str
@@ -39,6 +41,7 @@ class EnvSpec(NamedTuple):
     reward_terms: tuple[str, ...]
     max_abs_obs: float = 1e5
     metrics: tuple[str, ...] = ()
+    obs_terms: tuple[tuple[str, int], ...] = ()
 
 
 class EnvState(NamedTuple):

@@ -34,9 +34,7 @@ def _run(link: ChildLink) -> None:
     config = from_dict(PlayConfig, read_json(link.run.config))
     checkpoint = Path(str(config.checkpoint))
     env_config, algo = trained_config(checkpoint)
-    if config.run.env is not None:
-        noted = {"name": config.run.env, "source_sha256": config.run.env_sha256}
-        env_config = dataclasses.replace(env_config, **noted)
+    env_config = config.run.task(env_config)
     # jax starts here, in the environment that the plan prepared.
     import jax
 

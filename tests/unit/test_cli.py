@@ -49,6 +49,7 @@ REFUSED: list[tuple[str, str, str]] = [
     ("serve", "policy=clever", "policy=clever: expected one of trained, random"),
     ("play", "video=avi", "video=avi: expected one of auto, mp4"),
     ("play", "num_envs=2 video_envs=3", "video_envs=3: must be between 1 and 2"),
+    ("export", "format=pt", "format=pt: expected one of onnx, stablehlo, all"),
     # Tasks.
     ("train", "env=ant,ball_balance", "env=ant,ball_balance: expected one value"),
     ("train", "env.name=ant", "env.name=ant: choose the task with env=ant"),
@@ -98,6 +99,8 @@ REFUSED: list[tuple[str, str, str]] = [
     ("serve", "", "policy=trained: needs run.dir=RUN"),
     ("serve", "policy=random deterministic=true", "random actions have no mean"),
     ("play", "run.dir=nowhere", "run.dir=nowhere: no such folder"),
+    ("export", "run.dir=nowhere", "run.dir=nowhere: no such folder"),
+    ("export", "checkpoint=nowhere", "checkpoint=nowhere: expected the folder of a checkpoint"),
     # Searches.
     ("search", "num_envs=64 plan.gmis_per_gpu=2", "nothing to search for; make one of them auto"),
     ("search", "search.gmis_per_gpu=[2,2]", "search.gmis_per_gpu=[2, 2]: expected distinct"),

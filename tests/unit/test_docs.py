@@ -21,6 +21,7 @@ FOLDERS = ("gmijax", "configs", "tests", "docs", "benchmarks", "examples", ".ci"
 
 QUOTED_PATH = re.compile(rf"`((?:{'|'.join(map(re.escape, FOLDERS))})/[\w./-]*)`")
 LINK = re.compile(r"!?\[[^\]]*\]\(([^)\s]+)\)")
+OBS_ROW = re.compile(r"^\| (\d+)(?:-(\d+))? \|", re.MULTILINE)
 REWARD_ROW = re.compile(r"^\| `(\w+)` \|.*\| (-?[\d.]+) \|$", re.MULTILINE)
 
 
@@ -36,11 +37,21 @@ def linked_paths(text: str) -> list[str]:
     return [target for target in targets if target and not re.match(r"[a-z]+:", target)]
 
 
+def section_of(task: str) -> str:
+    """The section of a task."""
+    sections = re.split(r"^## ", TASKS_PAGE.read_text(), flags=re.MULTILINE)
+    return next(text for text in sections if text.startswith(f"`{task}`"))
+
+
 def documented_weights(task: str) -> Mapping[str, float]:
     """The table of rewards in the section of a task."""
-    sections = re.split(r"^## ", TASKS_PAGE.read_text(), flags=re.MULTILINE)
-    section = next(text for text in sections if text.startswith(f"`{task}`"))
-    return {name: float(weight) for name, weight in REWARD_ROW.findall(section)}
+    return {name: float(weight) for name, weight in REWARD_ROW.findall(section_of(task))}
+
+
+def documented_lengths(task: str) -> list[int]:
+    """How many values of an observation every row of the task's table is about."""
+    table = section_of(task).partition("### Observation")[2].partition("### Action")[0]
+    return [int(last or first) - int(first) + 1 for first, last in OBS_ROW.findall(table)]
 
 
 def test_every_folder_of_the_package_is_in_the_architecture():
@@ -81,3 +92,10 @@ def test_only_relative_links_outside_of_code_are_looked_at():
 def test_reward_terms_and_weights_are_those_of_the_code(task: str):
     terms = importlib.import_module(TASKS[task]).TERMS
     assert documented_weights(task) == {name: term.weight for name, term in terms.items()}
+
+
+@pytest.mark.parametrize("task", sorted(TASKS))
+def test_parts_of_an_observation_are_those_of_the_table(task: str):
+    module = importlib.import_module(TASKS[task])
+    assert documented_lengths(task) == [length for _, length in module.OBS_TERMS]
+    assert sum(length for _, length in module.OBS_TERMS) == module.OBS_SIZE

@@ -26,6 +26,13 @@ SUBSTEPS = 3
 # A running ant stays below 100, the sensors of a landing foot included.
 MAX_ABS_OBS = 500.0
 OBS_SIZE = 60
+OBS_TERMS = (
+    *runner.TORSO_TERMS,
+    ("joint_position", 8),
+    ("joint_velocity", 8),
+    ("foot_force_and_torque", 24),
+    ("last_action", 8),
+)
 ACTION_SIZE = 8
 DEATH_HEIGHT_M = 0.31
 DEATH_REWARD = -2.0
@@ -74,6 +81,7 @@ def make(*, impl: str = "auto", max_envs: int | None = None) -> Env:
         reward_terms=term_names(TERMS, DEATH),
         max_abs_obs=MAX_ABS_OBS,
         metrics=(runner.SPEED,),
+        obs_terms=OBS_TERMS,
     )
 
     def reset(model: PyTree, key: PRNGKey) -> EnvState:

@@ -27,6 +27,16 @@ from gmijax.types import Array, PRNGKey, PyTree
 DEFAULT_EPISODE_LENGTH = 2500
 SUBSTEPS = 4
 OBS_SIZE = 48
+OBS_TERMS = (
+    ("base_velocity", 3),
+    ("base_angular_velocity", 3),
+    ("gravity_direction", 3),
+    ("commanded_velocity", 2),
+    ("commanded_yaw_rate", 1),
+    ("joint_position", 12),
+    ("joint_velocity", 12),
+    ("last_action", 12),
+)
 ACTION_SIZE = 12
 OBS_LIMIT = 5.0
 ACTION_SCALE_RAD = 0.5
@@ -111,6 +121,7 @@ def make(*, impl: str = "auto", max_envs: int | None = None) -> Env:
         episode_length=DEFAULT_EPISODE_LENGTH,
         reward_terms=term_names(TERMS, FLOOR),
         metrics=METRICS,
+        obs_terms=OBS_TERMS,
     )
 
     def reset(model: PyTree, key: PRNGKey) -> EnvState:

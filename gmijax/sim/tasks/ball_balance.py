@@ -27,6 +27,14 @@ SUBSTEPS = 2
 # A ball in play stays below 50, the impact of its fall included.
 MAX_ABS_OBS = 500.0
 OBS_SIZE = 24
+OBS_TERMS = (
+    ("knee_position", 3),
+    ("knee_velocity", 3),
+    ("ball_position", 3),
+    ("ball_velocity", 3),
+    ("hip_force_z", 3),
+    ("hip_torque", 9),
+)
 ACTION_SIZE = 3
 OBS_LIMIT = 5.0
 ACTION_SPEED_RAD_PER_S = 20.0
@@ -96,6 +104,7 @@ def make(*, impl: str = "auto", max_envs: int | None = None) -> Env:
         episode_length=DEFAULT_EPISODE_LENGTH,
         reward_terms=term_names(TERMS),
         max_abs_obs=MAX_ABS_OBS,
+        obs_terms=OBS_TERMS,
     )
 
     def reset(model: PyTree, key: PRNGKey) -> EnvState:

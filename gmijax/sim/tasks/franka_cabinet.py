@@ -26,6 +26,13 @@ from gmijax.types import Array, PRNGKey, PyTree
 DEFAULT_EPISODE_LENGTH = 500
 SUBSTEPS = 2
 OBS_SIZE = 23
+OBS_TERMS = (
+    ("joint_position", 9),
+    ("joint_velocity", 9),
+    ("gripper_to_handle", 3),
+    ("drawer_position", 1),
+    ("drawer_velocity", 1),
+)
 ACTION_SIZE = 9
 OBS_LIMIT = 5.0
 # rad/s of the arm's targets and m/s of the fingers' at full action.
@@ -164,6 +171,7 @@ def make(*, impl: str = "auto", max_envs: int | None = None) -> Env:
         episode_length=DEFAULT_EPISODE_LENGTH,
         reward_terms=term_names(TERMS, BEHIND),
         metrics=("drawer_m", "opened"),
+        obs_terms=OBS_TERMS,
     )
 
     def reset(model: PyTree, key: PRNGKey) -> EnvState:

@@ -29,6 +29,14 @@ SUBSTEPS = 4
 # Random actions stay below 100, the sensors of a landing foot included.
 MAX_ABS_OBS = 500.0
 OBS_SIZE = 108
+OBS_TERMS = (
+    *runner.TORSO_TERMS,
+    ("joint_position", 21),
+    ("joint_velocity", 21),
+    ("joint_torque", 21),
+    ("foot_force_and_torque", 12),
+    ("last_action", 21),
+)
 ACTION_SIZE = 21
 DEATH_HEIGHT_M = 0.8
 DEATH_REWARD = -1.0
@@ -100,6 +108,7 @@ def make(*, impl: str = "auto", max_envs: int | None = None) -> Env:
         reward_terms=term_names(TERMS, DEATH),
         max_abs_obs=MAX_ABS_OBS,
         metrics=(runner.SPEED,),
+        obs_terms=OBS_TERMS,
     )
 
     def reset(model: PyTree, key: PRNGKey) -> EnvState:

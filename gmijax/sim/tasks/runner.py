@@ -26,6 +26,18 @@ VELOCITY_NOISE_RAD_PER_S = 0.1
 SPEED = "speed_m_per_s"
 """The metric of these tasks: `mean_speed` over the episode."""
 
+TORSO_TERMS = (
+    ("torso_height", 1),
+    ("torso_velocity", 3),
+    ("torso_angular_velocity", 3),
+    ("yaw", 1),
+    ("roll", 1),
+    ("angle_to_target", 1),
+    ("upright", 1),
+    ("heading", 1),
+)
+"""With what their observations begin."""
+
 
 @dataclass(frozen=True)
 class RunnerIds:

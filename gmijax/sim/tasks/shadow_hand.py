@@ -30,6 +30,19 @@ from gmijax.types import Array, PRNGKey, PyTree
 DEFAULT_EPISODE_LENGTH = 600
 SUBSTEPS = 2
 OBS_SIZE = 211
+OBS_TERMS = (
+    ("joint_position", 24),
+    ("joint_velocity", 24),
+    ("joint_torque", 24),
+    ("cube_pose", 7),
+    ("cube_velocity", 3),
+    ("cube_angular_velocity", 3),
+    ("goal_pose", 7),
+    ("goal_to_cube_rotation", 4),
+    ("fingertip_pose_and_velocity", 65),
+    ("fingertip_force_and_torque", 30),
+    ("last_action", 20),
+)
 ACTION_SIZE = 20
 OBS_LIMIT = 5.0
 VELOCITY_SCALE = 0.2
@@ -150,6 +163,7 @@ def make(*, impl: str = "auto", max_envs: int | None = None) -> Env:
         episode_length=DEFAULT_EPISODE_LENGTH,
         reward_terms=term_names(TERMS),
         metrics=("successes", "rotation_error_rad"),
+        obs_terms=OBS_TERMS,
     )
 
     def reset(model: PyTree, key: PRNGKey) -> EnvState:
