@@ -14,6 +14,7 @@ from gmijax.config.algo import (
 )
 from gmijax.config.channel import ChannelConfig
 from gmijax.config.env import EnvConfig, PhysicsConfig
+from gmijax.config.evaluation import EvalConfig
 from gmijax.config.plan import (
     BackendName,
     PlanConfig,
@@ -38,6 +39,7 @@ __all__ = [
     "BackendName",
     "ChannelConfig",
     "EnvConfig",
+    "EvalConfig",
     "OutputConfig",
     "PhysicsConfig",
     "PlanConfig",
