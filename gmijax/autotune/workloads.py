@@ -214,7 +214,9 @@ class PpoWorkload(Workload[TrainConfig]):
         run = dataclasses.replace(
             config.run, resume=None, checkpoint_every=0, measure_throughput=False
         )
-        return self.with_point(point, num_timesteps=config.search.iterations * steps, run=run)
+        no_eval = dataclasses.replace(config.eval, every=None)
+        steps = config.search.iterations * steps
+        return self.with_point(point, num_timesteps=steps, run=run, eval=no_eval)
 
     def read(self, plan: Plan, run: RunPaths) -> Measured:
         """See `Workload`."""

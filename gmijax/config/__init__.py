@@ -14,6 +14,7 @@ from gmijax.config.algo import (
 )
 from gmijax.config.channel import ChannelConfig
 from gmijax.config.env import EnvConfig, PhysicsConfig
+from gmijax.config.evaluation import EvalConfig
 from gmijax.config.export import ExportConfig
 from gmijax.config.plan import (
     BackendName,
@@ -39,6 +40,7 @@ __all__ = [
     "BackendName",
     "ChannelConfig",
     "EnvConfig",
+    "EvalConfig",
     "ExportConfig",
     "OutputConfig",
     "PhysicsConfig",

@@ -36,7 +36,10 @@ class PlayConfig(KeyGroup):
 
     run: PlayRunConfig
     physics: PhysicsConfig
-    checkpoint: str | None = doc("folder of a checkpoint, or its env steps; null: the latest")
+    checkpoint: str | None = doc(
+        "folder of a checkpoint, its env steps, or `best`: the one with the best return, in an "
+        "evaluation if there are any; null: the latest"
+    )
     num_envs: int = doc("N, environments, one episode each", low=1)
     seed: int = doc("seed of the episodes' starts and of sampled actions", low=0, high=2**31 - 1)
     deterministic: bool = doc("act with the policy's mean; false: sample actions")

@@ -8,6 +8,7 @@ from typing import Literal, TypeAlias
 from gmijax.config.algo import A3cConfig, PpoConfig
 from gmijax.config.channel import ChannelConfig
 from gmijax.config.env import EnvConfig, PhysicsConfig
+from gmijax.config.evaluation import EvalConfig
 from gmijax.config.plan import PlanConfig, ReduceConfig
 from gmijax.config.run import RunConfig
 from gmijax.config.schema import KeyGroup, doc
@@ -31,6 +32,7 @@ class TrainConfig(KeyGroup):
     reduce: ReduceConfig
     channel: ChannelConfig
     run: RunConfig
+    eval: EvalConfig
     search: SearchConfig
     num_envs: int | Literal["auto"] = doc(
         "N, environments per GMI; auto: what a search finds (docs/search.md)", low=1
@@ -48,6 +50,11 @@ class TrainConfig(KeyGroup):
             raise ConfigError(
                 "reduce.selection=measured: for jobs in which every GMI trains; with "
                 "plan.template=tdg_ex allowed are paper, device"
+            )
+        if self.eval.every is not None and self.is_asynchronous:
+            raise ConfigError(
+                f"eval.every={self.eval.every}: with algo=a3c agents act all the time, and nobody "
+                "evaluates; allowed is null (gmijax.play evaluates a checkpoint)"
             )
         if self.num_envs != "auto":
             self._check_num_envs(self.num_envs)

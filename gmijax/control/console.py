@@ -84,20 +84,21 @@ class ConsoleProgress:
 
     Args:
       console: nothing is shown on a quiet one.
-      latest: the line of metrics that came since the last call, None if there is none.
+      new: the lines of metrics that came since the last call.
       num_timesteps: environment steps of the whole job.
     """
 
     def __init__(
         self,
         console: Console,
-        latest: Callable[[], dict[str, Any] | None],
+        new: Callable[[], Sequence[dict[str, Any]]],
         num_timesteps: int,
     ) -> None:
         self._console = console
-        self._latest = latest
+        self._new = new
         self._num_timesteps = num_timesteps
         self._line: dict[str, Any] = {}
+        self._evaluated: float | None = None
         self._first: tuple[float, int] | None = None
         self._shown: tuple[str, int | None] = ("", None)
         self._shown_s = 0.0
@@ -127,8 +128,9 @@ class ConsoleProgress:
             self._console.print(f"no progress from here on: {error!r}")
 
     def _show(self, gmis: Sequence[GmiStatus]) -> None:
-        if (line := self._latest()) is not None:
+        for line in self._new():
             self._line = line
+            self._evaluated = line.get("eval/return", self._evaluated)
             if self._first is None:
                 self._first = (time.monotonic(), line["env_steps"])
         if self._has_panel:
@@ -158,10 +160,12 @@ class ConsoleProgress:
     def _text(self) -> str:
         line = self._line
         mean = line.get("return")
+        evaluated = "" if self._evaluated is None else f"eval {self._evaluated:.2f}  "
         return (
             f"{100 * min(line['env_steps'] / self._num_timesteps, 1):.0f} %  "
             f"{line['env_steps']:,} steps  {_rates(line)}  "
-            f"return {'-' if mean is None else format(mean, '.2f')}  ETA {self._eta()}"
+            f"return {'-' if mean is None else format(mean, '.2f')}  {evaluated}"
+            f"ETA {self._eta()}"
         )
 
     def _eta(self) -> str:

@@ -23,7 +23,12 @@ from gmijax.errors import ConfigError, GmijaxError
 from gmijax.machine.snapshot import Machine, detect_machine
 from gmijax.partition.planner import make_plan
 from gmijax.runs.folder import META, STEP_DIGITS, PlayPaths, RunPaths, read_json, write_json
-from gmijax.runs.resume import CheckpointMeta, find_checkpoint, trained_config
+from gmijax.runs.resume import (
+    CheckpointMeta,
+    best_checkpoint,
+    find_checkpoint,
+    trained_config,
+)
 from gmijax.sim import source
 from gmijax.sim.registry import require_task
 from gmijax.supervise.kinds import JobKind
@@ -114,12 +119,14 @@ def open_run(config: C) -> tuple[C, EnvConfig, str | None]:
 def _find(config: PlayConfig | ExportConfig) -> Path:
     """The checkpoint that the configuration names."""
     wanted, run_dir = config.checkpoint, config.run.dir
-    if wanted is None or (wanted.isdecimal() and len(wanted) <= _MOST_DIGITS):
+    if wanted in (None, "best") or (wanted.isdecimal() and len(wanted) <= _MOST_DIGITS):
         latest = find_checkpoint(run_dir or "last", "run.dir")
+        if wanted == "best":
+            return best_checkpoint(latest.parents[1]) or latest
         return latest if wanted is None else _at_step(latest.parents[1], int(wanted))
     if not os.path.isfile(Path(wanted) / META):  # Unlike `Path.is_file` it takes any text.
         raise ConfigError(
-            f"checkpoint={wanted}: expected the folder of a checkpoint, or its env steps"
+            f"checkpoint={wanted}: expected the folder of a checkpoint, its env steps, or best"
         )
     checkpoint = Path(wanted).resolve()
     if run_dir is not None:

@@ -96,8 +96,8 @@ class _Job:
     def run_to_the_end(self, beginning: StartPoint, started_s: float) -> None:
         """Runs it, with restarts; writes the summary however it ends."""
         config, run = self._config, self._run
-        latest = MetricsReader(run.metrics).latest
-        progress = ConsoleProgress(self._console, latest, config.num_timesteps)
+        new = MetricsReader(run.metrics).new
+        progress = ConsoleProgress(self._console, new, config.num_timesteps)
 
         def record(status: str, plan: Plan) -> None:
             add_event(run.events, status)

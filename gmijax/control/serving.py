@@ -187,19 +187,20 @@ class _CollectedLines:
         self._lines: dict[int, dict[str, Any]] = {}
         self._steps_before = steps_before
 
-    def latest(self) -> dict[str, Any] | None:
-        """Sums of steps and rates and the mean return, None if nothing is new."""
+    def new(self) -> list[dict[str, Any]]:
+        """One line with sums of steps and rates and the mean return; none if nothing is new."""
         new = {gmi: line for gmi, reader in self._readers.items() if (line := reader.latest())}
         self._lines |= new
         if not new:
-            return None
+            return []
         lines = self._lines.values()
         returns = [line["return"] for line in lines if line["return"] is not None]
-        return {
+        line = {
             "env_steps": self._steps_before + sum(line["env_steps"] for line in lines),
             "env_steps_per_s": sum(line["env_steps_per_s"] for line in lines),
             "return": sum(returns) / len(returns) if returns else None,
         }
+        return [line]
 
 
 def _run(job: _Job, kept: int, run: RunPaths, console: Console) -> dict[str, Any]:
@@ -207,7 +208,7 @@ def _run(job: _Job, kept: int, run: RunPaths, console: Console) -> dict[str, Any
     started_s = time.monotonic()
     lines = _CollectedLines(run, job.simulators, kept * job.steps_per_unroll)
     total = job.wanted_unrolls * job.steps_per_unroll
-    progress = ConsoleProgress(console, lines.latest, total)
+    progress = ConsoleProgress(console, lines.new, total)
 
     def record(status: str, plan: Plan) -> None:
         wall_s = time.monotonic() - started_s

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import dataclasses
 import hashlib
-import math
 import os
 import shutil
 from pathlib import Path
@@ -25,7 +24,7 @@ from gmijax.collectives.interface import Reducer
 from gmijax.config import TrainConfig
 from gmijax.errors import ConfigError, NonFiniteError, ParameterMismatch
 from gmijax.runs.folder import META, RunPaths, write_json
-from gmijax.runs.resume import CheckpointMeta, file_check
+from gmijax.runs.resume import CheckpointMeta, file_check, rank_of
 from gmijax.types import PyTree
 
 T = TypeVar("T")
@@ -34,7 +33,11 @@ LEARNER = "learner"
 
 
 def checkpoint_meta(
-    config: TrainConfig, env_steps: int, num_gmis: int, mean_return: float | None
+    config: TrainConfig,
+    env_steps: int,
+    num_gmis: int,
+    mean_return: float | None,
+    eval_return: float | None = None,
 ) -> CheckpointMeta:
     """Content of `meta.json` for a checkpoint of this run by `num_gmis` GMIs."""
     algo = config.algo
@@ -47,6 +50,7 @@ def checkpoint_meta(
         hidden=(algo.policy_hidden_layer_sizes, algo.value_hidden_layer_sizes),
         impl=config.physics.impl,
         mean_return=mean_return,
+        eval_return=eval_return,
     )
 
 
@@ -84,7 +88,7 @@ def finish_checkpoint(paths: RunPaths, meta: CheckpointMeta, keep: int | None = 
     Args:
       paths: the run folder.
       meta: what the checkpoint holds; the list of its files is added.
-      keep: how many checkpoints stay, among them always the one with the best return and the
+      keep: how many checkpoints stay, among them always the best one (see `rank_of`) and the
         last one; None: all.
     """
     final, partial = paths.checkpoint(meta.env_steps), _partial(paths, meta.env_steps)
@@ -105,20 +109,11 @@ def finish_checkpoint(paths: RunPaths, meta: CheckpointMeta, keep: int | None = 
 
 def _remove_old(paths: RunPaths, keep: int) -> None:
     found = sorted(path.parent for path in paths.checkpoints.glob(f"[0-9]*/{META}"))
-    returns = {path: _return_of(path) for path in found}
-    best = max(reversed(found), key=lambda path: returns[path])
+    best = max(reversed(found), key=rank_of)
     others = [path for path in found if path != best]
     num_others = max(keep - 1, int(best != found[-1]))
     for path in others[: max(0, len(others) - num_others)]:
         _remove(path)
-
-
-def _return_of(checkpoint: Path) -> float:
-    try:
-        mean = CheckpointMeta.read(checkpoint).mean_return
-    except ConfigError:
-        return -math.inf
-    return -math.inf if mean is None else mean
 
 
 def _remove(checkpoint: Path) -> None:

@@ -135,7 +135,7 @@ class TrainingLog:
     """The lines of a training job, which refuse what is not finite.
 
     Attributes:
-      last_s: time of the last line.
+      last_s: time of the last line, or of the end of the pause after it.
       line_s: seconds from line to line.
       last_return: mean return of the latest episodes, None while none has ended.
       overflows: environment steps for which a buffer of the simulator was too small.
@@ -174,6 +174,7 @@ class TrainingLog:
         *,
         simulated: float | None = None,
         now_s: float | None = None,
+        paused_s: float = 0.0,
     ) -> None:
         """Writes a line.
 
@@ -184,6 +185,7 @@ class TrainingLog:
           others: what else is to stand there.
           simulated: how many steps `counts` are of, None for those learnt from.
           now_s: time of the line, None for now.
+          paused_s: seconds after it in which nobody trained; not in the rate of the next line.
 
         Raises:
           NonFiniteError: too many steps diverged, or a loss is NaN or infinite.
@@ -215,7 +217,7 @@ class TrainingLog:
         }
         for sink in self._sinks:
             sink.write(line)
-        self.last_s, self._env_steps = now_s, env_steps
+        self.last_s, self._env_steps = now_s + paused_s, env_steps
 
     def close(self) -> None:
         """Flushes the lines."""

@@ -53,9 +53,16 @@ class MetricsReader:
 
 
 def draw_returns(metrics: Path, picture: Path, title: str) -> bool:
-    """Draws mean episode return over environment steps; False where no episode has ended."""
-    lines = [line for line in read_metrics(metrics) if line.get("return") is not None]
-    if not lines:
+    """Draws mean episode return over environment steps, with that of evaluations if there are any.
+
+    False where no episode has ended.
+    """
+    lines = read_metrics(metrics)
+    training, evaluations = (
+        [(line["env_steps"], line[key]) for line in lines if line.get(key) is not None]
+        for key in ("return", "eval/return")
+    )
+    if not training and not evaluations:
         return False
     # Imported here: it costs half a second that no other use of this module should pay.
     from matplotlib.backends.backend_agg import FigureCanvasAgg
@@ -64,7 +71,10 @@ def draw_returns(metrics: Path, picture: Path, title: str) -> bool:
     figure = Figure(figsize=(7, 4), layout="constrained")
     FigureCanvasAgg(figure)
     axes = figure.add_subplot()
-    axes.plot([x["env_steps"] for x in lines], [x["return"] for x in lines])
+    axes.plot(*zip(*training, strict=True), label="training")
+    if evaluations:
+        axes.plot(*zip(*evaluations, strict=True), marker="o", label="evaluation")
+        axes.legend(fontsize="small")
     axes.set(title=title, xlabel="environment steps", ylabel="mean episode return")
     axes.grid(alpha=0.3)
     figure.savefig(picture, dpi=120)

@@ -173,6 +173,15 @@ def require_placeable(jobs: Sequence[Job], num_gpus: int) -> None:
             )
 
 
+def require_objective(jobs: Sequence[Job], sweep: SweepConfig) -> None:
+    """Raises ConfigError if jobs are to be ranked by evaluations that they do not make."""
+    if sweep.objective.startswith("eval/") and any(job.config.eval.every is None for job in jobs):
+        raise ConfigError(
+            f"sweep.objective={sweep.objective}: needs eval.every, environment steps between "
+            "evaluations"
+        )
+
+
 def placed(job: Job, run: RunPaths, place: Place, backend: BackendName) -> TrainConfig:
     """The configuration of a job in its run folder and its place."""
     wanted = job.config.plan

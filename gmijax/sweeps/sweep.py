@@ -27,6 +27,7 @@ from gmijax.sweeps.jobs import (
     Job,
     SweepPaths,
     jobs_of,
+    require_objective,
     require_placeable,
     state_of,
 )
@@ -103,6 +104,7 @@ def run_request(request: Request, *, show: bool = False) -> SweepResult:
     # Before anything is started: whether there are such GPUs, and room for so many jobs.
     plan = places_of(settings, machine, backends)
     require_placeable(request.jobs, plan.layout.num_gpus)
+    require_objective(request.jobs, settings)
     paths = _open(request.jobs)
     with locked(paths.lock, f"run.dir={paths.root}"):
         jobs, study = _beginning(request, paths)

@@ -44,13 +44,27 @@ def test_limits_are_those_of_the_learner(end: int):
     assert float(kept) == pytest.approx(limit)
 
 
-@pytest.mark.parametrize("group", ["plan", "reduce", "run", "search", "channel"])
+@pytest.mark.parametrize("group", ["plan", "reduce", "run", "eval", "search", "channel"])
 def test_a_default_is_the_same_in_code_and_on_the_command_line(group: str):
     """But for groups whose defaults differ from task to task."""
     composed = getattr(compose(), group)
     for field in dataclasses.fields(composed):
         if field.default is not dataclasses.MISSING:
             assert (field.name, field.default) == (field.name, getattr(composed, field.name))
+
+
+@pytest.mark.parametrize(
+    ("overrides", "message"),
+    [
+        (("eval.every=0",), r"^eval\.every=0: must be at least 1$"),
+        (("eval.every=-5",), r"^eval\.every=-5: must be at least 1$"),
+        (("eval.episodes=0",), r"^eval\.episodes=0: must be at least 1$"),
+        (("eval.every=100", "algo=a3c"), r"^eval\.every=100: with algo=a3c .* allowed is null"),
+    ],
+)
+def test_evaluations_that_cannot_be_are_refused(overrides: tuple[str, ...], message: str):
+    with pytest.raises(ConfigError, match=message):
+        compose(*overrides)
 
 
 # Hidden layers in Table 5 of the paper; 256:128:64 for all others.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import shutil
 from pathlib import Path
 
@@ -41,7 +42,10 @@ def test_the_latest_checkpoint_is_played_unless_one_is_named(
     run: RunPaths, monkeypatch: pytest.MonkeyPatch
 ):
     monkeypatch.chdir(run.root.parents[1])
-    first, latest = run.checkpoint(100), run.checkpoint(2000)
+    first, latest, best = (run.checkpoint(steps) for steps in (100, 2000, 300))
+    meta = CheckpointMeta.read(latest)
+    write_json(latest / META, dataclasses.replace(meta, eval_return=-2.0).to_dict())
+    write_json(best / META, dataclasses.replace(meta, eval_return=-1.0).to_dict())
     for overrides, expected in (
         ((), latest),
         (("run.dir=last",), latest),
@@ -49,6 +53,8 @@ def test_the_latest_checkpoint_is_played_unless_one_is_named(
         ((f"run.dir={run.root}", "checkpoint=100"), first),
         ((f"checkpoint={first}",), first),
         ((f"run.dir={run.root}", f"checkpoint={first}"), first),
+        ((f"run.dir={run.root}", "checkpoint=best"), best),
+        (("checkpoint=best",), best),
     ):
         assert evaluation._find(config_of(*overrides)) == expected
 

@@ -29,6 +29,7 @@ from gmijax.sweeps.jobs import (
     SweepPaths,
     jobs_of,
     placed,
+    require_objective,
     require_placeable,
     state_of,
 )
@@ -128,6 +129,23 @@ def test_jobs_that_place_themselves_are_refused(overrides: tuple[str, ...], said
     with pytest.raises(ConfigError) as raised:
         require_placeable(jobs_of([compose(*overrides)]), 2)
     assert said in str(raised.value)
+
+
+def test_jobs_are_ranked_by_evaluations_if_they_make_some() -> None:
+    sweep = SweepConfig(objective="eval/return")
+    with pytest.raises(ConfigError, match=r"^sweep\.objective=eval/return: needs eval\.every"):
+        require_objective(jobs_of([compose()]), sweep)
+    [job] = jobs_of([compose("eval.every=100")])
+    require_objective([job], sweep)
+    for steps, more in (
+        (50, {}),
+        (100, {"eval/return": 2.0}),
+        (150, {}),
+        (200, {"eval/return": 1.0}),
+    ):
+        job.progress.take({"env_steps": steps, "return": 9.0, **more}, sweep)
+    assert job.progress.value == 2.0
+    assert job.progress.curve == [(100, 2.0), (200, 1.0)]
 
 
 def gpu_plan(gpus: int, jobs_per_gpu: int) -> Any:
