@@ -14,7 +14,9 @@ class ExportConfig(KeyGroup):
     """Everything that `python -m gmijax.export` can be told."""
 
     run: PlayRunConfig
-    checkpoint: str | None = doc("folder of a checkpoint, or its env steps; null: the latest")
+    checkpoint: str | None = doc(
+        "folder of a checkpoint, its env steps, or `best`; null: the latest"
+    )
     format: Literal["onnx", "stablehlo", "all"] = doc(
         "what to write: onnx for ONNX Runtime and others, stablehlo for jax.export, or all"
     )
