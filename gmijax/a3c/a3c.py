@@ -37,6 +37,7 @@ from gmijax.learning.updates import (
     clipped_surrogate,
     minibatch_order,
     run_updates,
+    saturated_fraction,
 )
 from gmijax.types import Array
 
@@ -106,6 +107,7 @@ class A3cLosses(NamedTuple):
       entropy: of the policy, in nats.
       kl: divergence of the policy from itself before the first pass, in nats.
       behaviour_kl: of the policy before the first pass from those that acted, estimated.
+      saturated_fraction: see the function of this name.
       weight: mean weight of the unrolls.
     """
 
@@ -114,6 +116,7 @@ class A3cLosses(NamedTuple):
     entropy: Array
     kl: Array
     behaviour_kl: Array
+    saturated_fraction: Array
     weight: Array
 
     @property
@@ -235,6 +238,7 @@ def a3c_loss(
         bonus,
         _mean(moved, weight),
         targets.behaviour_kl,
+        _mean(saturated_fraction(mean), weight),
         jnp.mean(weight),
     )
 

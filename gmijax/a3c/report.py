@@ -8,7 +8,7 @@ Staleness: how many versions of the policy lie between acting and learning.
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 import jax
@@ -94,11 +94,11 @@ class Reporter:
         return None if figures is None else {"mean": figures[0], "p99": figures[1]}
 
     def write(
-        self, env_steps: int, reports: Sequence[Report], learning_rate: float, noise_std: float
+        self, env_steps: int, reports: Sequence[Report], figures: Mapping[str, float]
     ) -> None:
         """Writes the line of the updates since the last one; nothing if there were none.
 
-        `reports` are the newest of every agent.
+        `reports` are the newest of every agent, `figures` those of the learner as it is.
 
         Raises:
           NonFiniteError: too many steps of the agents diverged.
@@ -123,7 +123,7 @@ class Reporter:
         self.log.write(
             env_steps,
             jax.tree.map(float, self._unpack(stats)),
-            Learnt(losses, learning_rate, rates, noise_std),
+            Learnt(losses, figures, rates),
             others,
             simulated=predictions,
             now_s=now_s,

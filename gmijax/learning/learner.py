@@ -151,6 +151,17 @@ def rate_figures(config: AlgoConfig, rates: Array) -> dict[str, Array]:
     return {"mean": jnp.mean(rates), "min": jnp.min(rates), "max": jnp.max(rates)}
 
 
+def policy_figures(state: TrainState) -> dict[str, Array]:
+    """Figures of the policy as it is, [] each, by the names that they are logged under.
+
+    The learning rate, and of the standard deviations of its actions the mean and, of several,
+    the smallest.
+    """
+    std = jnp.exp(state.params.log_std)
+    figures = {"policy/learning_rate": state.learning_rate, "policy/noise_std": jnp.mean(std)}
+    return figures if std.size == 1 else figures | {"policy/noise_std_min": jnp.min(std)}
+
+
 def adapted_learning_rate(rate: Array, kl: Array, desired_kl: float) -> Array:
     """Steers the rate to keep the KL divergence per update near `desired_kl`.
 

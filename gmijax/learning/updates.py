@@ -85,3 +85,8 @@ def clipped_surrogate(ratio: Array, advantage: Array, epsilon: float) -> Array:
 def bound_loss(mean: Array) -> Array:
     """Squared distance [...] of action means [..., A] from [-1.1, 1.1]."""
     return jnp.sum(jnp.maximum(jnp.abs(mean) - _ACTION_BOUND, 0.0) ** 2, -1)
+
+
+def saturated_fraction(mean: Array) -> Array:
+    """Share [...] of action means [..., A] beyond [-1, 1], where the environment clips them."""
+    return jnp.mean((jnp.abs(mean) > 1.0).astype(jnp.float32), -1)

@@ -242,5 +242,5 @@ def report(
     `times` are seconds by name, written as they are. Raises as `TrainingLog.write`.
     """
     host: Any = jax.tree.map(float, jax.device_get(metrics))
-    learnt = Learnt(host.losses._asdict(), host.learning_rate, host.rates, host.noise_std)
+    learnt = Learnt(host.losses._asdict(), host.figures, host.rates)
     log.write(env_steps, host.counts, learnt, times)

@@ -20,6 +20,7 @@ from gmijax.learning.learner import (
     Learner,
     TrainState,
     acting_weights,
+    policy_figures,
     rate_figures,
 )
 from gmijax.learning.normalize import (
@@ -39,6 +40,7 @@ from gmijax.learning.updates import (
     clipped_surrogate,
     minibatch_order,
     run_updates,
+    saturated_fraction,
 )
 from gmijax.sim.interface import EnvSpec
 from gmijax.sim.wrappers import BatchedEnv, BatchState, StepOutput
@@ -85,11 +87,13 @@ class RolloutStats(NamedTuple):
     Attributes:
       obs: moments of the raw observations, [O].
       advantage: moments of the advantages, [].
+      target: moments of the value function's targets, [].
       counts: sums over all steps.
     """
 
     obs: Moments
     advantage: Moments
+    target: Moments
     counts: Counts
 
 
@@ -108,13 +112,25 @@ class UpdateContext(NamedTuple):
 
 
 class PpoLosses(NamedTuple):
-    """Means over a minibatch, [] float32 each."""
+    """Means over a minibatch, [] float32 each.
+
+    Attributes:
+      policy_loss: minus the clipped surrogate.
+      value_loss: half the squared error of the values, clipped if that is wanted.
+      entropy: of the policy, in nats.
+      kl: divergence of the policy from the one that made the rollout, in nats.
+      clip_fraction: share of samples whose probability ratio is beyond the clip range.
+      value_clip_fraction: share of samples whose value has moved beyond the clip range.
+      saturated_fraction: see the function of this name.
+    """
 
     policy_loss: Array
     value_loss: Array
     entropy: Array
     kl: Array
     clip_fraction: Array
+    value_clip_fraction: Array
+    saturated_fraction: Array
 
     @property
     def steering_kl(self) -> Array:
@@ -131,16 +147,14 @@ class IterationMetrics(NamedTuple):
     Attributes:
       counts: sums over all steps.
       losses: means over all minibatches of the iteration.
-      learning_rate: after the last update.
-      rates: of all updates, see `rate_figures`.
-      noise_std: mean standard deviation of the policy.
+      figures: others by the names that they are logged under.
+      rates: of the learning rates of all updates, see `rate_figures`.
     """
 
     counts: Counts
     losses: PpoLosses
-    learning_rate: Array
+    figures: dict[str, Array]
     rates: dict[str, Array]
-    noise_std: Array
 
 
 def rollout(
@@ -164,6 +178,7 @@ def rollout(
     stats = RolloutStats(
         obs=moments_of(without_outliers(weights.moments, steps.obs), 2),
         advantage=moments_of(samples.advantage, 2),
+        target=moments_of(samples.value + samples.advantage, 2),
         counts=count(steps.reward, outcomes),
     )
     return env_state, samples, stats
@@ -226,12 +241,14 @@ def flatten(samples: Samples) -> Samples:
 def merge_stats(stacked: RolloutStats) -> RolloutStats:
     """Statistics of all GMIs together; every leaf of `stacked` has a leading axis [K]."""
     counts = jax.tree.map(lambda x: jnp.sum(x, axis=0), stacked.counts)
-    return RolloutStats(merge_all(stacked.obs), merge_all(stacked.advantage), counts)
+    moments = (merge_all(part) for part in (stacked.obs, stacked.advantage, stacked.target))
+    return RolloutStats(*moments, counts)
 
 
 def no_stats(spec: EnvSpec, overflows: tuple[str, ...] = ()) -> RolloutStats:
     """Zeros in the structure of `RolloutStats`."""
-    return RolloutStats(no_samples((spec.obs_size,)), no_samples(()), no_counts(spec, overflows))
+    shapes = (spec.obs_size,), (), ()
+    return RolloutStats(*map(no_samples, shapes), no_counts(spec, overflows))
 
 
 def ppo_loss(
@@ -249,7 +266,8 @@ def ppo_loss(
     advantage = (samples.advantage - context.advantage_mean) / context.advantage_std
     ratio = jnp.exp(log_prob(mean, params.log_std, samples.action) - samples.log_prob)
     policy_loss = -jnp.mean(clipped_surrogate(ratio, advantage, config.clipping_epsilon))
-    value_loss = _value_loss(networks.state_value(params, samples.obs), samples, config)
+    value = networks.state_value(params, samples.obs)
+    value_loss = _value_loss(value, samples, config)
     bonus = entropy(params.log_std)
     loss = (
         policy_loss
@@ -258,8 +276,19 @@ def ppo_loss(
         + config.bound_cost * jnp.mean(bound_loss(mean))
     )
     kl = jnp.mean(kl_divergence(samples.mean, context.old_log_std, mean, params.log_std))
-    outside = jnp.mean((jnp.abs(ratio - 1.0) > config.clipping_epsilon).astype(jnp.float32))
-    return loss, PpoLosses(policy_loss, value_loss, bonus, kl, outside)
+    return loss, PpoLosses(
+        policy_loss,
+        value_loss,
+        bonus,
+        kl,
+        clip_fraction=_share(jnp.abs(ratio - 1.0) > config.clipping_epsilon),
+        value_clip_fraction=_share(jnp.abs(value - samples.value) > config.clipping_epsilon),
+        saturated_fraction=jnp.mean(saturated_fraction(mean)),
+    )
+
+
+def _share(where: Array) -> Array:
+    return jnp.mean(where.astype(jnp.float32))
 
 
 def _value_loss(value: Array, samples: Samples, config: PpoConfig) -> Array:
@@ -324,9 +353,21 @@ def finish(
     state = state._replace(
         obs_moments=merge(state.obs_moments, stats.obs), iteration=state.iteration + 1
     )
-    std = jnp.mean(jnp.exp(state.params.log_std))
-    figures = rate_figures(learner.config, rates)
-    return state, IterationMetrics(stats.counts, losses, state.learning_rate, figures, std)
+    figures = {
+        **policy_figures(state),
+        "value/explained_variance": explained_variance(stats),
+    }
+    spread = rate_figures(learner.config, rates)
+    return state, IterationMetrics(stats.counts, losses, figures, spread)
+
+
+def explained_variance(stats: RolloutStats) -> Array:
+    """Share [] of the variance of the targets that the values of the rollout explain.
+
+    1 where they are the targets, 0 where a constant would do as well, or where nothing varies.
+    """
+    target, error = stats.target.m2, stats.advantage.m2  # An advantage is target minus value.
+    return jnp.where(target > 0.0, 1.0 - error / jnp.where(target > 0.0, target, 1.0), 0.0)
 
 
 def iterate(

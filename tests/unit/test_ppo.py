@@ -9,8 +9,16 @@ import numpy as np
 import pytest
 
 from gmijax.cli.compose import compose
+from gmijax.learning.normalize import moments_of
 from gmijax.learning.policy import entropy, kl_divergence, log_prob, make_actor_critic
-from gmijax.ppo.ppo import Samples, UpdateContext, gae, ppo_loss
+from gmijax.ppo.ppo import (
+    RolloutStats,
+    Samples,
+    UpdateContext,
+    explained_variance,
+    gae,
+    ppo_loss,
+)
 
 B, O, A = 6, 3, 2
 T, N = 7, 3
@@ -92,6 +100,28 @@ def test_means_out_of_bounds_cost(params) -> None:
     # means are about 2: two actions, (2 - 1.1) ** 2 each
     loss, _ = _loss(far, _samples(far, 0.0), bound_cost=1.0)
     np.testing.assert_allclose(loss, 2 * 0.9**2, rtol=0.1)
+
+
+def test_shares_of_clipped_values_and_of_saturated_actions(params) -> None:
+    samples = _samples(params, 0.0)
+    # Of six values four have moved by more than the clip range of 0.2.
+    moved = samples._replace(value=samples.value + jnp.array([0.0, 0.1, 0.3, -0.3, 0.5, 0.21]))
+    assert float(_loss(params, moved)[1].value_clip_fraction) == pytest.approx(4 / 6)
+    # One of the two actions is clipped by the environment wherever the robot is.
+    last = f"Dense_{len(NETWORKS.policy.hidden)}"
+    layers = params.policy["params"]
+    far = {**layers, last: {**layers[last], "bias": jnp.array([0.0, -2.0])}}
+    _, metrics = _loss(params._replace(policy={"params": far}), samples)
+    assert float(metrics.saturated_fraction) == 0.5
+
+
+def test_explained_variance_by_hand() -> None:
+    targets, values = jnp.array([1.0, 2.0, 3.0, 4.0]), jnp.array([1.5, 2.0, 3.0, 3.5])
+    stats = RolloutStats(None, moments_of(targets - values, 1), moments_of(targets, 1), None)
+    # Errors of -0.5, 0, 0, 0.5: their squares sum to 0.5, those of the targets to 5.
+    np.testing.assert_allclose(explained_variance(stats), 0.9, rtol=1e-6)
+    constant = stats._replace(target=moments_of(jnp.ones(4), 1))
+    assert float(explained_variance(constant)) == 0.0
 
 
 def test_gaussian_formulas() -> None:
