@@ -37,6 +37,9 @@ class ActorCriticConfig(KeyGroup):
         "factor on rewards before learning (logged returns are unscaled)", positive=True
     )
     normalize_observations: bool = doc("normalise observations with running statistics")
+    obs_std_floor: float = doc(
+        "smallest standard deviation that observations are divided by", default=1e-4, low=1e-4
+    )
     policy_hidden_layer_sizes: tuple[int, ...] = doc("widths of the policy network", low=1)
     value_hidden_layer_sizes: tuple[int, ...] = doc("widths of the value network", low=1)
     init_noise_std: float = doc("standard deviation of the first policy", positive=True)
@@ -73,6 +76,25 @@ class PpoConfig(ActorCriticConfig):
         "fixed, or steered to keep the policy's KL divergence per update near desired_kl"
     )
     normalize_advantage: bool = doc("normalise advantages over all samples of all GMIs")
+    obs_outliers: Literal["clip", "diverged"] = doc(
+        "what does not enter the statistics of observations as it is: what is more than 20 "
+        "standard deviations off is clipped to that (clip), or worlds that diverge before the "
+        "rollout or their episode ends are left out (diverged)",
+        default="clip",
+    )
+    warmup_unroll: bool = doc(
+        "begin with a rollout that only fills the statistics of observations; it is not learnt "
+        "from and not counted",
+        default=False,
+    )
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.warmup_unroll and not self.normalize_observations:
+            raise ConfigError(
+                "algo.warmup_unroll=true: has nothing to fill with "
+                "algo.normalize_observations=false"
+            )
 
 
 @dataclass(frozen=True, kw_only=True)

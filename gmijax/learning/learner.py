@@ -13,7 +13,7 @@ import optax
 from jax.flatten_util import ravel_pytree
 
 from gmijax.config import ADAPTIVE_LEARNING_RATE_RANGE, AlgoConfig
-from gmijax.learning.normalize import Moments, no_samples
+from gmijax.learning.normalize import Moments, no_samples, with_std_floor
 from gmijax.learning.policy import ActorCritic, ActorCriticParams, make_actor_critic
 from gmijax.sim.interface import EnvSpec
 from gmijax.types import Array, PRNGKey, PyTree
@@ -86,7 +86,7 @@ def init_learner(learner: Learner, obs_size: int, key: PRNGKey) -> TrainState:
 def acting_moments(learner: Learner, state: TrainState) -> Moments:
     """The statistics that observations are normalised with (none if switched off)."""
     if learner.config.normalize_observations:
-        return state.obs_moments
+        return with_std_floor(state.obs_moments, learner.config.obs_std_floor)
     return no_samples(state.obs_moments.mean.shape)
 
 

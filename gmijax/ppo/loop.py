@@ -14,9 +14,10 @@ from pathlib import Path
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
-from gmijax.collectives.interface import Reducer
+from gmijax.collectives.interface import Reducer, TracedStep
 from gmijax.config import PpoConfig, TrainConfig
 from gmijax.devices import describe_device
 from gmijax.errors import CollectiveError
@@ -65,6 +66,7 @@ class TrainingLoop:
         self._reducer = reducer
         self._link = link
         self._leader = reducer.rank == 0
+        self._warms_up = config.algo.warmup_unroll and config.run.resume is None
         self._learner = make_learner(env.spec, config.algo)
         self._remote: RemoteIteration | None = None
         num_simulating = reducer.world_size
@@ -102,6 +104,8 @@ class TrainingLoop:
         compile_s = time.monotonic() - started - waited_s
         self._link.beat("ready", 0)
         self._meet()  # Everybody has compiled: the clock may start.
+        if self._warms_up:
+            state, env_state = warm_up(self._iteration, state, env_state)
         log = self._open_log()
         first_steps, started = self._env_steps, time.monotonic()
         state, env_state, stopped = self._train(state, env_state, log)
@@ -232,6 +236,20 @@ class TrainingLoop:
         # The first iteration fills caches and pools, and its metrics come late.
         steady = iteration_s[1:] or iteration_s
         return self._steps_per_iteration / statistics.median(steady) if steady else None
+
+
+def warm_up(iteration: TracedStep, state: TrainState, env_state: Any) -> tuple[TrainState, Any]:
+    """Makes an iteration of which only the statistics of observations are kept.
+
+    Both arguments are donated.
+
+    Returns:
+      `state` with these statistics, and the environments where the iteration has left them.
+    """
+    first = jax.tree.map(jnp.copy, state)
+    after, env_state, _ = iteration(state, env_state)
+    iteration.wait()
+    return first._replace(obs_moments=after.obs_moments), env_state
 
 
 def report(

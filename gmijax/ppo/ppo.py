@@ -28,6 +28,7 @@ from gmijax.learning.normalize import (
     merge,
     merge_all,
     moments_of,
+    moments_of_those,
     no_samples,
     normalize,
     std_of,
@@ -59,6 +60,7 @@ class Transition(NamedTuple):
     next_obs: Array
     terminated: Array
     truncated: Array
+    is_diverged: Array | None  # None where nobody asks.
 
 
 class Samples(NamedTuple):
@@ -169,19 +171,42 @@ def rollout(
     def keep(
         before: BatchState, mean: Array, action: Array, out: StepOutput
     ) -> tuple[Transition, Outcome]:
-        step = out.reward, out.next_obs, out.terminated, out.truncated
+        bad = out.is_diverged if learner.config.obs_outliers == "diverged" else None
+        step = out.reward, out.next_obs, out.terminated, out.truncated, bad
         return Transition(before.env.obs, action, mean, *step), outcome_of(out)
 
     choose, length = partial(act, learner.networks, weights), learner.config.unroll_length
     env_state, (steps, outcomes) = unroll(env, choose, length, keep, model, env_state)
     samples = _with_advantages(learner, weights, steps)
     stats = RolloutStats(
-        obs=moments_of(without_outliers(weights.moments, steps.obs), 2),
+        obs=_obs_moments(weights.moments, steps),
         advantage=moments_of(samples.advantage, 2),
         target=moments_of(samples.value + samples.advantage, 2),
         counts=count(steps.reward, outcomes),
     )
     return env_state, samples, stats
+
+
+def _obs_moments(moments: Moments, steps: Transition) -> Moments:
+    if steps.is_diverged is None:
+        return moments_of(without_outliers(moments, steps.obs), 2)
+    ended = steps.terminated | steps.truncated
+    return moments_of_those(~until_diverged(steps.is_diverged, ended), steps.obs)
+
+
+def until_diverged(is_diverged: Array, ended: Array) -> Array:
+    """Which steps [T, N] belong to an episode that ends later on because its world diverged.
+
+    Long before a number leaves all bounds it is thousands of times the usual.
+    """
+
+    def back(later: Array, step: tuple[Array, Array]) -> tuple[Array, Array]:
+        bad, over = step
+        wild = bad | (later & ~over)
+        return wild, wild
+
+    none = jnp.zeros_like(ended[0])
+    return jax.lax.scan(back, none, (is_diverged, ended), reverse=True)[1]
 
 
 def _with_advantages(learner: PpoLearner, weights: ActingWeights, steps: Transition) -> Samples:

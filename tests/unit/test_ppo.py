@@ -18,6 +18,7 @@ from gmijax.ppo.ppo import (
     explained_variance,
     gae,
     ppo_loss,
+    until_diverged,
 )
 
 B, O, A = 6, 3, 2
@@ -122,6 +123,14 @@ def test_explained_variance_by_hand() -> None:
     np.testing.assert_allclose(explained_variance(stats), 0.9, rtol=1e-6)
     constant = stats._replace(target=moments_of(jnp.ones(4), 1))
     assert float(explained_variance(constant)) == 0.0
+
+
+def test_all_of_an_episode_that_ends_by_divergence_is_left_out() -> None:
+    #                        starts over after step 1, and diverges in step 4
+    ended = jnp.array([[0, 1, 0, 0, 1, 0], [0, 0, 0, 0, 0, 0]], bool).T
+    bad = jnp.array([[0, 0, 0, 0, 1, 0], [0, 0, 0, 0, 0, 0]], bool).T
+    wanted = np.array([[0, 0, 1, 1, 1, 0], [0, 0, 0, 0, 0, 0]], bool).T
+    np.testing.assert_array_equal(until_diverged(bad, ended), wanted)
 
 
 def test_gaussian_formulas() -> None:

@@ -29,6 +29,7 @@ from gmijax.learning.learner import (
 )
 from gmijax.learning.updates import exchange_size, minibatch_order
 from gmijax.partition.layout import Layout
+from gmijax.ppo.loop import warm_up
 from gmijax.ppo.ppo import (
     PpoLosses,
     flatten,
@@ -208,6 +209,17 @@ def test_it_learns_to_stand_still_and_normalises_between_iterations(learner, alo
             assert float(metrics.losses.clip_fraction) < 1.0
     assert int(state.iteration) == 80
     assert np.mean(returns[-10:]) > np.mean(returns[:10]) + 0.4
+
+
+def test_a_warm_up_fills_the_statistics_and_nothing_else(learner, alone) -> None:
+    state, envs = warm_up(alone, *_start(learner))
+    first, _ = _start(learner)
+    assert float(state.obs_moments.count) == T * N
+    assert float(jnp.max(state.obs_moments.m2)) > 0.0
+    for name in ("params", "opt_state", "learning_rate", "iteration"):
+        jax.tree.map(np.testing.assert_array_equal, getattr(state, name), getattr(first, name))
+    state, envs, _ = alone(state, envs)  # It goes on from there.
+    assert float(state.obs_moments.count) == 2 * T * N
 
 
 def test_no_learning_rate_is_lost_and_no_number_is_written_twice(config, alone) -> None:
