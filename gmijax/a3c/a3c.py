@@ -22,12 +22,15 @@ from gmijax.learning.learner import (
     acting_weights,
     pack_weights,
     rate_figures,
+    state_values,
 )
 from gmijax.learning.normalize import (
     Moments,
+    in_units,
     merge,
     merge_all,
     moments_of,
+    moments_of_those,
     normalize,
     without_outliers,
 )
@@ -84,6 +87,7 @@ class Targets(NamedTuple):
       advantage: [T, B], normalised if that is wanted.
       step_weight: [T, B] of the policy gradient: V-trace's, and 0 where `_is_learnt` says so.
       behaviour_kl: [], its estimated divergence from the policies that acted, in nats.
+      value_moments: see `TrainState`.
     """
 
     weight: Array
@@ -95,6 +99,7 @@ class Targets(NamedTuple):
     advantage: Array
     step_weight: Array
     behaviour_kl: Array
+    value_moments: Moments | None = None
 
 
 class A3cLosses(NamedTuple):
@@ -134,13 +139,14 @@ def batch_targets(
     rewards, and leave nothing for the advantages.
     """
     networks, config, params = learner.networks, learner.config, state.params
-    moments = acting_moments(learner, state)
+    weights = acting_weights(learner, state)
+    moments = weights.moments
     obs = normalize(moments, jnp.concatenate([batch.state, batch.bootstrap]))
     mean = networks.action_mean(params, obs[:-1])
     logs = log_prob(mean, params.log_std, batch.action)
     log_ratios = logs - batch.log_prob
     ratios = jnp.exp(log_ratios)
-    returns = returns_of(batch, networks.state_value(params, obs), ratios, config)
+    returns = returns_of(batch, state_values(networks, weights, obs), ratios, config)
     advantage = _normalised(returns, weight, config)
     # Copies, because the updates donate the state that they would alias.
     copied_moments, log_std = jax.tree.map(jnp.copy, (moments, params.log_std))
@@ -155,6 +161,12 @@ def batch_targets(
         step_weight=jnp.where(_is_learnt(ratios, advantage, config), 0.0, returns.rho),
         # An estimate that is never negative and needs the actions only.
         behaviour_kl=_mean(ratios - 1.0 - log_ratios, weight),
+    )
+
+
+def _target_moments(targets: Targets) -> Moments:
+    return moments_of_those(
+        jnp.broadcast_to(targets.weight > 0, targets.value.shape), targets.value
     )
 
 
@@ -223,7 +235,10 @@ def a3c_loss(
     logs = log_prob(mean, params.log_std, batch.action)
     values = networks.state_value(params, obs)
     policy_loss = _mean(_policy_terms(logs, targets, config), weight)
-    value_loss = 0.5 * _mean((values - targets.value) ** 2, weight)
+    target = targets.value
+    if targets.value_moments is not None:
+        target = in_units(targets.value_moments, target)
+    value_loss = 0.5 * _mean((values - target) ** 2, weight)
     bonus = entropy(params.log_std)
     loss = (
         policy_loss
@@ -312,14 +327,18 @@ def update(
     batch, weight = weighted
     targets = batch_targets(learner, state, batch, weight)
     observed = without_outliers(acting_moments(learner, state), batch.state)
-    everyone = peers.gather(moments_of(observed, 2))
+    learnt = None if state.value_moments is None else _target_moments(targets)
+    everyone = peers.gather((moments_of(observed, 2), learnt))
+    if state.value_moments is not None:
+        state = state._replace(value_moments=merge(state.value_moments, merge_all(everyone[1])))
+        targets = targets._replace(value_moments=state.value_moments)
     order = minibatch_order(learner.config, state, peers.rank(), batch.reward.shape[1])
     state, losses, rates = run_updates(
         learner, peers, gradients, state, batch, targets, order, after=everyone
     )
     # Counts the batch, which makes a new version of the policy, and takes in its statistics.
     state = state._replace(
-        obs_moments=merge(state.obs_moments, merge_all(everyone)), iteration=state.iteration + 1
+        obs_moments=merge(state.obs_moments, merge_all(everyone[0])), iteration=state.iteration + 1
     )
     weights = pack_weights(acting_weights(learner, state))
     means = jax.tree.map(jnp.mean, losses)

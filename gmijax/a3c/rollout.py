@@ -12,7 +12,7 @@ from jax.flatten_util import ravel_pytree
 
 from gmijax.a3c.a3c import Unrolls
 from gmijax.devices import host_sharding
-from gmijax.learning.learner import ActingWeights
+from gmijax.learning.learner import ActingWeights, state_values
 from gmijax.learning.normalize import normalize
 from gmijax.learning.policy import ActorCritic, log_prob
 from gmijax.learning.unroll import Counts, Outcome, act, count, no_counts, outcome_of, unroll
@@ -47,7 +47,7 @@ def collect(
     choose = partial(act, networks, weights)
     env_state, (kept, next_obs, outcomes) = unroll(env, choose, num_steps, keep, model, env_state)
     # A second pass over all rows is simple, and cheap beside the physics.
-    values = networks.state_value(weights.params, normalize(weights.moments, next_obs))
+    values = state_values(networks, weights, normalize(weights.moments, next_obs))
     kept = kept._replace(
         cut_value=jnp.where(kept.done[..., 1], values, 0.0), bootstrap=env_state.env.obs[None]
     )

@@ -37,6 +37,11 @@ class ActorCriticConfig(KeyGroup):
         "factor on rewards before learning (logged returns are unscaled)", positive=True
     )
     normalize_observations: bool = doc("normalise observations with running statistics")
+    normalize_values: bool = doc(
+        "the value function learns its targets in standard deviations from their running mean; "
+        "value_cost, and with PPO the clip of the value loss, count in this unit",
+        default=False,
+    )
     obs_std_floor: float = doc(
         "smallest standard deviation that observations are divided by", default=1e-4, low=1e-4
     )

@@ -13,7 +13,7 @@ import optax
 from jax.flatten_util import ravel_pytree
 
 from gmijax.config import ADAPTIVE_LEARNING_RATE_RANGE, AlgoConfig
-from gmijax.learning.normalize import Moments, no_samples, with_std_floor
+from gmijax.learning.normalize import Moments, from_units, no_samples, with_std_floor
 from gmijax.learning.policy import ActorCritic, ActorCriticParams, make_actor_critic
 from gmijax.sim.interface import EnvSpec
 from gmijax.types import Array, PRNGKey, PyTree
@@ -34,6 +34,8 @@ class TrainState(NamedTuple):
       learning_rate: [] float32.
       iteration: [] int32, finished iterations.
       key: base of the shuffling keys; never consumed, only folded with iteration and rank.
+      value_moments: statistics of the targets of the value function, whose unit its network has;
+        None where values are not normalised.
     """
 
     params: ActorCriticParams
@@ -42,6 +44,7 @@ class TrainState(NamedTuple):
     learning_rate: Array
     iteration: Array
     key: PRNGKey
+    value_moments: Moments | None = None
 
 
 class Learner(NamedTuple, Generic[C]):
@@ -80,6 +83,7 @@ def init_learner(learner: Learner, obs_size: int, key: PRNGKey) -> TrainState:
         learning_rate=jnp.asarray(learner.config.learning_rate, jnp.float32),
         iteration=jnp.zeros((), jnp.int32),
         key=shuffle_key,
+        value_moments=no_samples(()) if learner.config.normalize_values else None,
     )
 
 
@@ -96,15 +100,25 @@ class ActingWeights(NamedTuple):
     Attributes:
       params: weights of policy and value function.
       moments: statistics that observations are normalised with.
+      value_moments: see `TrainState`.
     """
 
     params: ActorCriticParams
     moments: Moments
+    value_moments: Moments | None = None
 
 
 def acting_weights(learner: Learner, state: TrainState) -> ActingWeights:
     """The weights to act with when the learner has `state`."""
-    return ActingWeights(state.params, acting_moments(learner, state))
+    return ActingWeights(state.params, acting_moments(learner, state), state.value_moments)
+
+
+def state_values(networks: ActorCritic, weights: ActingWeights, obs: Array) -> Array:
+    """Values [...] of normalised observations [..., O], in the unit of scaled rewards."""
+    values = networks.state_value(weights.params, obs)
+    if weights.value_moments is None:
+        return values
+    return from_units(weights.value_moments, values)
 
 
 def pack_weights(weights: ActingWeights) -> Array:
@@ -126,7 +140,8 @@ def learner_shapes(spec: EnvSpec, config: AlgoConfig) -> TrainState:
 def num_weights(spec: EnvSpec, config: AlgoConfig) -> int:
     """W, length of the packed weights."""
     state = learner_shapes(spec, config)
-    return sum(leaf.size for leaf in jax.tree.leaves((state.params, state.obs_moments)))
+    weights = ActingWeights(state.params, state.obs_moments, state.value_moments)
+    return sum(leaf.size for leaf in jax.tree.leaves(weights))
 
 
 def apply_gradients(

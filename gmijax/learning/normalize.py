@@ -106,10 +106,20 @@ def std_of(moments: Moments) -> Array:
     return jnp.where(moments.count > 0, jnp.maximum(jnp.sqrt(variance), MIN_STD), 1.0)
 
 
+def in_units(moments: Moments, samples: Array) -> Array:
+    """`samples` [..., S] in standard deviations from the mean; `from_units` inverts it."""
+    return (samples - moments.mean) / std_of(moments)
+
+
+def from_units(moments: Moments, samples: Array) -> Array:
+    """Inverts `in_units`."""
+    return moments.mean + std_of(moments) * samples
+
+
 def normalize(moments: Moments, samples: Array) -> Array:
     """`samples` [..., S] in standard deviations from the mean, clipped to +-OBS_CLIP.
 
     As they are while there are no statistics: their unit is not known, and so no limit.
     """
     limit = jnp.where(moments.count > 0, OBS_CLIP, jnp.inf)
-    return jnp.clip((samples - moments.mean) / std_of(moments), -limit, limit)
+    return jnp.clip(in_units(moments, samples), -limit, limit)

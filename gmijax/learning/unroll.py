@@ -60,9 +60,9 @@ def act(
     networks: ActorCritic, weights: ActingWeights, state: BatchState
 ) -> tuple[BatchState, Array, Array]:
     """Draws one action per environment: `(state, mean [N, A], action [N, A])`."""
-    params, moments = weights
+    params = weights.params
     state, keys = split_keys(state)
-    mean = networks.action_mean(params, normalize(moments, state.env.obs))
+    mean = networks.action_mean(params, normalize(weights.moments, state.env.obs))
     noise = policy_noise(keys, networks.policy.out)
     return state, mean, mean + jnp.exp(params.log_std) * noise
 

@@ -239,7 +239,7 @@ class TrainingLoop:
 
 
 def warm_up(iteration: TracedStep, state: TrainState, env_state: Any) -> tuple[TrainState, Any]:
-    """Makes an iteration of which only the statistics of observations are kept.
+    """Makes an iteration of which only the statistics of observations and targets are kept.
 
     Both arguments are donated.
 
@@ -249,7 +249,8 @@ def warm_up(iteration: TracedStep, state: TrainState, env_state: Any) -> tuple[T
     first = jax.tree.map(jnp.copy, state)
     after, env_state, _ = iteration(state, env_state)
     iteration.wait()
-    return first._replace(obs_moments=after.obs_moments), env_state
+    warm = first._replace(obs_moments=after.obs_moments, value_moments=after.value_moments)
+    return warm, env_state
 
 
 def report(

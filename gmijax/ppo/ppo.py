@@ -22,9 +22,11 @@ from gmijax.learning.learner import (
     acting_weights,
     policy_figures,
     rate_figures,
+    state_values,
 )
 from gmijax.learning.normalize import (
     Moments,
+    in_units,
     merge,
     merge_all,
     moments_of,
@@ -106,11 +108,13 @@ class UpdateContext(NamedTuple):
       advantage_mean: [] over all samples of all GMIs (0 where not normalised).
       advantage_std: [] likewise (1 where not normalised).
       old_log_std: [A] of the policy that made the rollout.
+      value_moments: see `TrainState`.
     """
 
     advantage_mean: Array
     advantage_std: Array
     old_log_std: Array
+    value_moments: Moments | None = None
 
 
 class PpoLosses(NamedTuple):
@@ -210,12 +214,12 @@ def until_diverged(is_diverged: Array, ended: Array) -> Array:
 
 
 def _with_advantages(learner: PpoLearner, weights: ActingWeights, steps: Transition) -> Samples:
-    networks, config, (params, moments) = learner.networks, learner.config, weights
-    obs = normalize(moments, steps.obs)
-    values = networks.state_value(params, obs)
+    networks, config = learner.networks, learner.config
+    obs = normalize(weights.moments, steps.obs)
+    values = state_values(networks, weights, obs)
     # V(s_{t+1}) is V of the next row, except where an episode ended and the next row is the
     # first observation of another one; a second pass over all rows is simple and cheap.
-    next_values = networks.state_value(params, normalize(moments, steps.next_obs))
+    next_values = state_values(networks, weights, normalize(weights.moments, steps.next_obs))
     advantage = gae(
         config.reward_scaling * steps.reward,
         values,
@@ -225,7 +229,7 @@ def _with_advantages(learner: PpoLearner, weights: ActingWeights, steps: Transit
         discount=config.discounting,
         lam=config.gae_lambda,
     )
-    logs = log_prob(steps.mean, params.log_std, steps.action)
+    logs = log_prob(steps.mean, weights.params.log_std, steps.action)
     return Samples(obs, steps.action, logs, steps.mean, values, advantage)
 
 
@@ -292,7 +296,10 @@ def ppo_loss(
     ratio = jnp.exp(log_prob(mean, params.log_std, samples.action) - samples.log_prob)
     policy_loss = -jnp.mean(clipped_surrogate(ratio, advantage, config.clipping_epsilon))
     value = networks.state_value(params, samples.obs)
-    value_loss = _value_loss(value, samples, config)
+    old, target = samples.value, samples.value + samples.advantage
+    if context.value_moments is not None:
+        old, target = (in_units(context.value_moments, x) for x in (old, target))
+    value_loss = _value_loss(value, old, target, config)
     bonus = entropy(params.log_std)
     loss = (
         policy_loss
@@ -307,7 +314,7 @@ def ppo_loss(
         bonus,
         kl,
         clip_fraction=_share(jnp.abs(ratio - 1.0) > config.clipping_epsilon),
-        value_clip_fraction=_share(jnp.abs(value - samples.value) > config.clipping_epsilon),
+        value_clip_fraction=_share(jnp.abs(value - old) > config.clipping_epsilon),
         saturated_fraction=jnp.mean(saturated_fraction(mean)),
     )
 
@@ -316,12 +323,11 @@ def _share(where: Array) -> Array:
     return jnp.mean(where.astype(jnp.float32))
 
 
-def _value_loss(value: Array, samples: Samples, config: PpoConfig) -> Array:
-    target = samples.value + samples.advantage
+def _value_loss(value: Array, old: Array, target: Array, config: PpoConfig) -> Array:
     error = (value - target) ** 2
     if config.clip_value_loss:
-        step = jnp.clip(value - samples.value, -config.clipping_epsilon, config.clipping_epsilon)
-        error = jnp.maximum(error, (samples.value + step - target) ** 2)
+        step = jnp.clip(value - old, -config.clipping_epsilon, config.clipping_epsilon)
+        error = jnp.maximum(error, (old + step - target) ** 2)
     return 0.5 * jnp.mean(error)
 
 
@@ -344,7 +350,7 @@ def update_context(learner: PpoLearner, state: TrainState, stats: RolloutStats) 
     mean, std = stats.advantage.mean, std_of(stats.advantage)
     if not learner.config.normalize_advantage:
         mean, std = jnp.zeros(()), jnp.ones(())
-    return UpdateContext(mean, std, state.params.log_std)
+    return UpdateContext(mean, std, state.params.log_std, state.value_moments)
 
 
 def learn(
@@ -357,6 +363,8 @@ def learn(
     """All updates of an iteration, on flat samples and this GMI's statistics."""
     everyone = peers.gather(stats)
     stats = merge_stats(everyone)
+    if state.value_moments is not None:
+        state = state._replace(value_moments=merge(state.value_moments, stats.target))
     context = update_context(learner, state, stats)
     order = minibatch_order(learner.config, state, peers.rank(), samples.advantage.shape[0])
     state, losses, rates = run_updates(

@@ -226,10 +226,15 @@ def test_learning_rates_of_all_minibatches_are_told(config) -> None:
     "changes",
     [
         {"clipping_epsilon": 0.2},
-        {"clipping_epsilon": 0.2, "vtrace": False},
+        {
+            "clipping_epsilon": 0.2,
+            "vtrace": False,
+            "normalize_values": True,
+            "reward_scaling": 100.0,
+        },
         {"num_updates_per_batch": 1},
     ],
-    ids=["vtrace-clip", "clip", "vtrace"],
+    ids=["vtrace-clip", "clip-normalised-values", "vtrace"],
 )
 def test_it_learns_to_stand_still_from_a_policy_that_lags(config, changes) -> None:
     learner, state, envs = _start(

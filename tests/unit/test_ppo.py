@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 
 from gmijax.cli.compose import compose
-from gmijax.learning.normalize import moments_of
+from gmijax.learning.learner import ActingWeights, state_values
+from gmijax.learning.normalize import Moments, from_units, moments_of, no_samples
 from gmijax.learning.policy import entropy, kl_divergence, log_prob, make_actor_critic
 from gmijax.ppo.ppo import (
     RolloutStats,
@@ -85,6 +86,22 @@ def test_value_loss_is_half_the_squared_error_to_the_target(params) -> None:
     # target - value = advantage = 2, so the loss is 2 ** 2 / 2
     _, metrics = _loss(params, _samples(params, 2.0))
     np.testing.assert_allclose(metrics.value_loss, 2.0, rtol=1e-5)
+
+
+def test_values_are_learnt_in_the_unit_of_their_targets(params) -> None:
+    samples = _samples(params, 0.0)
+    # Targets have the mean 50 and the standard deviation 10, and the network says v of that unit.
+    unit = Moments(jnp.asarray(4.0), jnp.asarray(50.0), jnp.asarray(400.0))
+    network = samples.value
+    samples = samples._replace(value=from_units(unit, network), advantage=jnp.full(B, 20.0))
+    context = NEUTRAL._replace(value_moments=unit)
+    _, metrics = _loss(params, samples, context, clip_value_loss=True)
+    # 20 are two standard deviations; nothing has moved, so nothing is clipped.
+    np.testing.assert_allclose(metrics.value_loss, 0.5 * 2.0**2, rtol=1e-4)
+    assert float(metrics.value_clip_fraction) == 0.0
+    weights = ActingWeights(params, no_samples((O,)), unit)
+    values = state_values(NETWORKS, weights, samples.obs)
+    np.testing.assert_allclose(values, samples.value, rtol=1e-5)
 
 
 def test_advantages_are_shifted_and_scaled_by_the_context(params) -> None:

@@ -27,6 +27,7 @@ from gmijax.learning.learner import (
     init_learner,
     make_learner,
 )
+from gmijax.learning.normalize import std_of
 from gmijax.learning.updates import exchange_size, minibatch_order
 from gmijax.partition.layout import Layout
 from gmijax.ppo.loop import warm_up
@@ -209,6 +210,30 @@ def test_it_learns_to_stand_still_and_normalises_between_iterations(learner, alo
             assert float(metrics.losses.clip_fraction) < 1.0
     assert int(state.iteration) == 80
     assert np.mean(returns[-10:]) > np.mean(returns[:10]) + 0.4
+
+
+def test_it_learns_with_normalised_values_whatever_their_scale(config) -> None:
+    mine = make_learner(
+        ENV.spec,
+        dataclasses.replace(
+            config,
+            reward_scaling=100.0,
+            normalize_values=True,
+            obs_outliers="diverged",
+            obs_std_floor=1e-2,
+        ),
+    )
+    step = _compiled(SoloReducer().program(functools.partial(iterate, ENV, mine)), mine)
+    state, envs = warm_up(step, *_start(mine))
+    returns = []
+    for _ in range(60):
+        state, envs, metrics = step(state, envs)
+        returns.append(float(metrics.counts.reward_sum) / (T * N))
+    assert state.value_moments is not None
+    assert float(state.obs_moments.count) == float(state.value_moments.count) == 61 * T * N
+    assert float(std_of(state.value_moments)) > 10.0
+    assert np.mean(returns[-10:]) > np.mean(returns[:10]) + 0.4
+    assert float(metrics.figures["value/explained_variance"]) > 0.3
 
 
 def test_a_warm_up_fills_the_statistics_and_nothing_else(learner, alone) -> None:
