@@ -5,6 +5,8 @@ Checkpoints hold a `TrainState` whatever the algorithm, so that all can be playe
 
 from __future__ import annotations
 
+import math
+from collections.abc import Sequence
 from typing import Generic, NamedTuple, TypeVar
 
 import jax
@@ -151,11 +153,14 @@ def apply_gradients(
 
     `kl` [] is the divergence that the adaptive schedule looks at; see `adapted_learning_rate`.
     """
-    rate = state.learning_rate
-    if learner.config.learning_rate_schedule == "adaptive_kl":
-        rate = adapted_learning_rate(rate, kl, learner.config.desired_kl)
+    config, rate = learner.config, state.learning_rate
+    if config.learning_rate_schedule == "adaptive_kl":
+        rate = adapted_learning_rate(rate, kl, config.desired_kl, config.learning_rate_range)
     updates, opt_state = learner.optimizer.update(grads, state.opt_state, state.params)
-    params = jax.tree.map(lambda p, u: p - rate * u, state.params, updates)
+    params: ActorCriticParams = jax.tree.map(lambda p, u: p - rate * u, state.params, updates)
+    if config.min_noise_std > 0.0:  # A bound within the loss would have no gradient beyond it.
+        lowest = math.log(config.min_noise_std)
+        params = params._replace(log_std=jnp.maximum(params.log_std, lowest))
     return state._replace(params=params, opt_state=opt_state, learning_rate=rate)
 
 
@@ -177,14 +182,19 @@ def policy_figures(state: TrainState) -> dict[str, Array]:
     return figures if std.size == 1 else figures | {"policy/noise_std_min": jnp.min(std)}
 
 
-def adapted_learning_rate(rate: Array, kl: Array, desired_kl: float) -> Array:
-    """Steers the rate to keep the KL divergence per update near `desired_kl`.
+def adapted_learning_rate(
+    rate: Array,
+    kl: Array,
+    desired_kl: float,
+    limits: Sequence[float] = ADAPTIVE_LEARNING_RATE_RANGE,
+) -> Array:
+    """Steers the rate to keep the KL divergence near `desired_kl`.
 
     Divided by 1.5 above twice the target, multiplied by 1.5 below half of it (the rule of
-    Isaac Gym's trainers), within [1e-5, 1e-2]. No change below 1e-6: that is the first update
+    Isaac Gym's trainers), within `limits`. No change below 1e-6: that is the first update
     on a rollout, where the policy has not moved yet and the rest is rounding.
     """
-    low, high = ADAPTIVE_LEARNING_RATE_RANGE
+    low, high = limits
     slower = jnp.maximum(rate / _LEARNING_RATE_STEP, low)
     faster = jnp.minimum(rate * _LEARNING_RATE_STEP, high)
     too_slow = (kl < 0.5 * desired_kl) & (kl > _UNMOVED_KL)

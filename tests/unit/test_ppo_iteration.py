@@ -4,6 +4,7 @@ import os
 import re
 from collections.abc import Iterator
 from contextlib import contextmanager
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -18,7 +19,7 @@ from gmijax.collectives.device.device_links import DeviceLinks
 from gmijax.collectives.host.host_exchange import HostExchange
 from gmijax.collectives.host.host_links import HostLinks
 from gmijax.collectives.host.shared_block import LANES, create_exchange
-from gmijax.collectives.program import Exchange
+from gmijax.collectives.program import Exchange, PeersOfOne
 from gmijax.collectives.strategies import stages
 from gmijax.learning.learner import (
     acting_weights,
@@ -28,7 +29,7 @@ from gmijax.learning.learner import (
     make_learner,
 )
 from gmijax.learning.normalize import std_of
-from gmijax.learning.updates import exchange_size, minibatch_order
+from gmijax.learning.updates import exchange_size, minibatch_order, run_updates
 from gmijax.partition.layout import Layout
 from gmijax.ppo.loop import warm_up
 from gmijax.ppo.ppo import (
@@ -112,6 +113,40 @@ def test_every_sample_is_visited_once_per_epoch_in_orders_that_differ(learner) -
 def test_the_learning_rate_follows_the_divergence(rate: float, kl: float, adapted: float) -> None:
     found = adapted_learning_rate(jnp.float32(rate), jnp.float32(kl), 0.01)
     assert float(found) == pytest.approx(adapted)
+
+
+class _Kl(NamedTuple):
+    steering_kl: jax.Array
+
+
+def test_the_schedule_may_act_once_an_epoch_on_the_mean_and_noise_has_a_floor(config) -> None:
+    """Three epochs of four minibatches, whose divergences are given."""
+    mine = make_learner(
+        ENV.spec,
+        dataclasses.replace(
+            config,
+            adapt_every="epoch",
+            learning_rate_schedule="adaptive_kl",
+            learning_rate_range=(9e-4, 1e-2),
+            desired_kl=0.01,
+            min_noise_std=0.6,
+        ),
+    )
+    state, _ = _start(mine)
+    kls = jnp.array([0.1, 0, 0, 0, 0.004, 0.004, 0, 0.004, 0.1, 0.1, 0.1, 0.1])
+
+    def gradients_of(learner, params, data, context, indices):
+        grads = jax.tree.map(jnp.zeros_like, params)
+        return grads._replace(log_std=jnp.ones(1)), _Kl(data[indices[0]])
+
+    order = jnp.arange(12)[:, None]
+    state, _, rates = jax.jit(
+        lambda state: run_updates(mine, PeersOfOne(), gradients_of, state, kls, None, order, None)
+    )(state)
+    # Means of 0.025 (lower, to the floor), 0.003 (raise), 0.1 (lower, to the floor).
+    wanted = [1e-3] * 3 + [9e-4] * 4 + [1.35e-3] * 4 + [9e-4]
+    np.testing.assert_allclose(rates, wanted, rtol=1e-5)
+    np.testing.assert_allclose(jnp.exp(state.params.log_std), 0.6, rtol=1e-6)
 
 
 @pytest.fixture(scope="module")
