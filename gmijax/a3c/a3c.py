@@ -34,10 +34,11 @@ from gmijax.learning.normalize import (
     normalize,
     without_outliers,
 )
-from gmijax.learning.policy import ActorCritic, ActorCriticParams, entropy, kl_divergence, log_prob
+from gmijax.learning.policy import ActorCritic, ActorCriticParams
 from gmijax.learning.updates import (
     bound_loss,
     clipped_surrogate,
+    mean_of_states,
     minibatch_order,
     run_updates,
     saturated_fraction,
@@ -80,7 +81,7 @@ class Targets(NamedTuple):
       weight: [B], 0 for unrolls that are too old to learn from; the others weigh alike, so that
         the mean over the batches of all trainers is 1.
       moments: statistics that observations are normalised with.
-      mean: [T, B, A] of that policy.
+      output: [T, B, H] of that policy's network.
       log_std: [A] likewise.
       log_prob: [T, B], of the actions under that policy.
       value: [T, B], target of the value function.
@@ -92,7 +93,7 @@ class Targets(NamedTuple):
 
     weight: Array
     moments: Moments
-    mean: Array
+    output: Array
     log_std: Array
     log_prob: Array
     value: Array
@@ -142,8 +143,8 @@ def batch_targets(
     weights = acting_weights(learner, state)
     moments = weights.moments
     obs = normalize(moments, jnp.concatenate([batch.state, batch.bootstrap]))
-    mean = networks.action_mean(params, obs[:-1])
-    logs = log_prob(mean, params.log_std, batch.action)
+    output = networks.output(params, obs[:-1])
+    logs = networks.distribution.log_prob(output, params.log_std, batch.action)
     log_ratios = logs - batch.log_prob
     ratios = jnp.exp(log_ratios)
     returns = returns_of(batch, state_values(networks, weights, obs), ratios, config)
@@ -153,7 +154,7 @@ def batch_targets(
     return Targets(
         weight=weight,
         moments=copied_moments,
-        mean=mean,
+        output=output,
         log_std=log_std,
         log_prob=logs,
         value=returns.value,
@@ -231,29 +232,31 @@ def a3c_loss(
     far one batch may move the policy, are two questions (arXiv:2110.00641, section 3).
     """
     weight, obs = targets.weight, normalize(targets.moments, batch.state)
-    mean = networks.action_mean(params, obs)
-    logs = log_prob(mean, params.log_std, batch.action)
+    output, distribution = networks.output(params, obs), networks.distribution
+    mode = distribution.mode(output)
+    logs = distribution.log_prob(output, params.log_std, batch.action)
     values = networks.state_value(params, obs)
     policy_loss = _mean(_policy_terms(logs, targets, config), weight)
     target = targets.value
     if targets.value_moments is not None:
         target = in_units(targets.value_moments, target)
     value_loss = 0.5 * _mean((values - target) ** 2, weight)
-    bonus = entropy(params.log_std)
+    entropy = distribution.entropy(output, params.log_std)
+    bonus = mean_of_states(entropy)
     loss = (
         policy_loss
         + config.value_cost * value_loss
         - config.entropy_cost * bonus * jnp.mean(weight)
-        + config.bound_cost * _mean(bound_loss(mean), weight)
+        + config.bound_cost * _mean(bound_loss(mode), weight)
     )
-    moved = kl_divergence(targets.mean, targets.log_std, mean, params.log_std)
+    moved = distribution.kl_divergence(targets.output, targets.log_std, output, params.log_std)
     return loss, A3cLosses(
         policy_loss,
         value_loss,
         bonus,
         _mean(moved, weight),
         targets.behaviour_kl,
-        _mean(saturated_fraction(mean), weight),
+        _mean(saturated_fraction(mode), weight),
         jnp.mean(weight),
     )
 
@@ -282,7 +285,7 @@ def gradients(
     minibatch: Unrolls = jax.tree.map(lambda x: x[:, indices], batch)
     theirs = targets._replace(
         weight=targets.weight[indices],
-        mean=targets.mean[:, indices],
+        output=targets.output[:, indices],
         log_prob=targets.log_prob[:, indices],
         value=targets.value[:, indices],
         advantage=targets.advantage[:, indices],

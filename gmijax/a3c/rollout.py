@@ -14,7 +14,7 @@ from gmijax.a3c.a3c import Unrolls
 from gmijax.devices import host_sharding
 from gmijax.learning.learner import ActingWeights, state_values
 from gmijax.learning.normalize import normalize
-from gmijax.learning.policy import ActorCritic, log_prob
+from gmijax.learning.policy import ActorCritic
 from gmijax.learning.unroll import Counts, Outcome, act, count, no_counts, outcome_of, unroll
 from gmijax.sim.wrappers import BatchedEnv, BatchState, StepOutput
 from gmijax.types import Array, PyTree
@@ -31,14 +31,14 @@ def collect(
     """Runs steps with one version of the policy: an unroll, or a piece of one."""
 
     def keep(
-        before: BatchState, mean: Array, action: Array, out: StepOutput
+        before: BatchState, output: Array, action: Array, out: StepOutput
     ) -> tuple[Unrolls, Array, Outcome]:
         kept = Unrolls(
             state=before.env.obs,
             action=action,
             reward=out.reward,
             done=jnp.stack([out.terminated, out.truncated], axis=-1),
-            log_prob=log_prob(mean, weights.params.log_std, action),
+            log_prob=networks.distribution.log_prob(output, weights.params.log_std, action),
             cut_value=jnp.zeros_like(out.reward),
             bootstrap=jnp.zeros(()),
         )

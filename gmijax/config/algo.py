@@ -57,6 +57,16 @@ class ActorCriticConfig(KeyGroup):
     )
     policy_hidden_layer_sizes: tuple[int, ...] = doc("widths of the policy network", low=1)
     value_hidden_layer_sizes: tuple[int, ...] = doc("widths of the value network", low=1)
+    distribution_type: Literal["normal", "tanh_normal"] = doc(
+        "actions are drawn from a Gaussian, which the environment clips to [-1, 1], or from the "
+        "tanh of one",
+        default="normal",
+    )
+    state_dependent_std: bool = doc(
+        "the policy's network gives the standard deviation too; false: it is the same in all "
+        "states",
+        default=False,
+    )
     init_noise_std: float = doc("standard deviation of the first policy", positive=True)
     min_noise_std: float = doc(
         "the policy's standard deviation is kept at or above this", default=0.0, low=0.0
@@ -74,6 +84,11 @@ class ActorCriticConfig(KeyGroup):
             raise ConfigError(
                 f"algo.learning_rate_range={list(limits)}: expected two numbers, the smaller one "
                 "first"
+            )
+        if self.min_noise_std and self.state_dependent_std:
+            raise ConfigError(
+                f"algo.min_noise_std={self.min_noise_std!r}: must be 0 with "
+                "algo.state_dependent_std=true"
             )
         if self.init_noise_std < self.min_noise_std:
             raise ConfigError(

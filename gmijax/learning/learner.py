@@ -15,6 +15,7 @@ import optax
 from jax.flatten_util import ravel_pytree
 
 from gmijax.config import ADAPTIVE_LEARNING_RATE_RANGE, AlgoConfig
+from gmijax.learning.distributions import DISTRIBUTIONS
 from gmijax.learning.normalize import Moments, from_units, no_samples, with_std_floor
 from gmijax.learning.policy import ActorCritic, ActorCriticParams, make_actor_critic
 from gmijax.sim.interface import EnvSpec
@@ -61,7 +62,7 @@ def make_learner(spec: EnvSpec, config: C) -> Learner[C]:
     """The learner for an environment's sizes."""
     return Learner(
         networks=make_actor_critic(
-            spec.action_size,
+            DISTRIBUTIONS[config.distribution_type](spec.action_size, config.state_dependent_std),
             config.policy_hidden_layer_sizes,
             config.value_hidden_layer_sizes,
             config.init_noise_std,

@@ -108,3 +108,8 @@ def bound_loss(mean: Array) -> Array:
 def saturated_fraction(mean: Array) -> Array:
     """Share [...] of action means [..., A] beyond [-1, 1], where the environment clips them."""
     return jnp.mean((jnp.abs(mean) > 1.0).astype(jnp.float32), -1)
+
+
+def mean_of_states(values: Array) -> Array:
+    """Mean [] of `values` [...], or [] where they are the same in all states."""
+    return jnp.mean(values) if values.ndim else values

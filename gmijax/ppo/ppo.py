@@ -36,11 +36,12 @@ from gmijax.learning.normalize import (
     std_of,
     without_outliers,
 )
-from gmijax.learning.policy import ActorCritic, ActorCriticParams, entropy, kl_divergence, log_prob
+from gmijax.learning.policy import ActorCritic, ActorCriticParams
 from gmijax.learning.unroll import Counts, Outcome, act, count, no_counts, outcome_of, unroll
 from gmijax.learning.updates import (
     bound_loss,
     clipped_surrogate,
+    mean_of_states,
     minibatch_order,
     run_updates,
     saturated_fraction,
@@ -57,7 +58,7 @@ class Transition(NamedTuple):
 
     obs: Array
     action: Array
-    mean: Array
+    output: Array
     reward: Array
     next_obs: Array
     terminated: Array
@@ -72,7 +73,7 @@ class Samples(NamedTuple):
       obs: [..., O], normalised as the policy saw it.
       action: [..., A], before clipping.
       log_prob: [...], of the action when it was drawn.
-      mean: [..., A], of the policy when the action was drawn.
+      output: [..., H], of the policy's network when the action was drawn.
       value: [...], estimate when the action was drawn.
       advantage: [...], not normalised.
     """
@@ -80,7 +81,7 @@ class Samples(NamedTuple):
     obs: Array
     action: Array
     log_prob: Array
-    mean: Array
+    output: Array
     value: Array
     advantage: Array
 
@@ -173,11 +174,11 @@ def rollout(
     """Runs T steps; the environments' state, samples [T, N], and this GMI's statistics."""
 
     def keep(
-        before: BatchState, mean: Array, action: Array, out: StepOutput
+        before: BatchState, output: Array, action: Array, out: StepOutput
     ) -> tuple[Transition, Outcome]:
         bad = out.is_diverged if learner.config.obs_outliers == "diverged" else None
         step = out.reward, out.next_obs, out.terminated, out.truncated, bad
-        return Transition(before.env.obs, action, mean, *step), outcome_of(out)
+        return Transition(before.env.obs, action, output, *step), outcome_of(out)
 
     choose, length = partial(act, learner.networks, weights), learner.config.unroll_length
     env_state, (steps, outcomes) = unroll(env, choose, length, keep, model, env_state)
@@ -229,8 +230,8 @@ def _with_advantages(learner: PpoLearner, weights: ActingWeights, steps: Transit
         discount=config.discounting,
         lam=config.gae_lambda,
     )
-    logs = log_prob(steps.mean, weights.params.log_std, steps.action)
-    return Samples(obs, steps.action, logs, steps.mean, values, advantage)
+    logs = networks.distribution.log_prob(steps.output, weights.params.log_std, steps.action)
+    return Samples(obs, steps.action, logs, steps.output, values, advantage)
 
 
 def gae(
@@ -291,23 +292,27 @@ def ppo_loss(
 
     The minibatch mean is plain: the mean over GMIs of equal minibatches is the mean over all.
     """
-    mean = networks.action_mean(params, samples.obs)
+    output, distribution = networks.output(params, samples.obs), networks.distribution
+    mode = distribution.mode(output)
     advantage = (samples.advantage - context.advantage_mean) / context.advantage_std
-    ratio = jnp.exp(log_prob(mean, params.log_std, samples.action) - samples.log_prob)
+    logs = distribution.log_prob(output, params.log_std, samples.action)
+    ratio = jnp.exp(logs - samples.log_prob)
     policy_loss = -jnp.mean(clipped_surrogate(ratio, advantage, config.clipping_epsilon))
     value = networks.state_value(params, samples.obs)
     old, target = samples.value, samples.value + samples.advantage
     if context.value_moments is not None:
         old, target = (in_units(context.value_moments, x) for x in (old, target))
     value_loss = _value_loss(value, old, target, config)
-    bonus = entropy(params.log_std)
+    bonus = mean_of_states(distribution.entropy(output, params.log_std))
     loss = (
         policy_loss
         + config.value_cost * value_loss
         - config.entropy_cost * bonus
-        + config.bound_cost * jnp.mean(bound_loss(mean))
+        + config.bound_cost * jnp.mean(bound_loss(mode))
     )
-    kl = jnp.mean(kl_divergence(samples.mean, context.old_log_std, mean, params.log_std))
+    kl = jnp.mean(
+        distribution.kl_divergence(samples.output, context.old_log_std, output, params.log_std)
+    )
     return loss, PpoLosses(
         policy_loss,
         value_loss,
@@ -315,7 +320,7 @@ def ppo_loss(
         kl,
         clip_fraction=_share(jnp.abs(ratio - 1.0) > config.clipping_epsilon),
         value_clip_fraction=_share(jnp.abs(value - old) > config.clipping_epsilon),
-        saturated_fraction=jnp.mean(saturated_fraction(mean)),
+        saturated_fraction=jnp.mean(saturated_fraction(mode)),
     )
 
 

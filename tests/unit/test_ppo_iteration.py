@@ -247,7 +247,7 @@ def test_it_learns_to_stand_still_and_normalises_between_iterations(learner, alo
     assert np.mean(returns[-10:]) > np.mean(returns[:10]) + 0.4
 
 
-def test_it_learns_with_normalised_values_whatever_their_scale(config) -> None:
+def test_it_learns_with_another_distribution_and_normalised_values_of_any_scale(config) -> None:
     mine = make_learner(
         ENV.spec,
         dataclasses.replace(
@@ -256,6 +256,8 @@ def test_it_learns_with_normalised_values_whatever_their_scale(config) -> None:
             normalize_values=True,
             obs_outliers="diverged",
             obs_std_floor=1e-2,
+            distribution_type="tanh_normal",
+            state_dependent_std=True,
         ),
     )
     step = _compiled(SoloReducer().program(functools.partial(iterate, ENV, mine)), mine)
