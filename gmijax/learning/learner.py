@@ -66,6 +66,7 @@ def make_learner(spec: EnvSpec, config: C) -> Learner[C]:
             config.policy_hidden_layer_sizes,
             config.value_hidden_layer_sizes,
             config.init_noise_std,
+            spec.actor_obs_size,
         ),
         # The learning rate is in the state, because the adaptive schedule changes it.
         optimizer=optax.chain(

@@ -54,25 +54,36 @@ class ActorCriticParams(NamedTuple):
 
 
 class ActorCritic(NamedTuple):
-    """The two networks; their weights are passed in."""
+    """The two networks; their weights are passed in.
+
+    Attributes:
+      policy: the network whose output the distribution takes.
+      value: the value function.
+      init_noise_std: standard deviation of the first policy.
+      distribution: of actions.
+      actor_obs_size: `policy` sees the first so many numbers of an observation; None: all.
+    """
 
     policy: Mlp
     value: Mlp
     init_noise_std: float
     distribution: Distribution
+    actor_obs_size: int | None = None
 
     def init(self, key: PRNGKey, obs_size: int) -> ActorCriticParams:
         """First weights; consumes `key`."""
         policy_key, value_key = jax.random.split(key)
         obs = jnp.zeros((1, obs_size))
         return ActorCriticParams(
-            policy=self.policy.init(policy_key, obs),
+            policy=self.policy.init(policy_key, obs[:, : self.actor_obs_size]),
             value=self.value.init(value_key, obs),
             log_std=jnp.full((self.distribution.action_size,), jnp.log(self.init_noise_std)),
         )
 
     def output(self, params: ActorCriticParams, obs: Array) -> Array:
         """What `distribution` takes [..., H], for normalised observations [..., O]."""
+        if self.actor_obs_size is not None:
+            obs = obs[..., : self.actor_obs_size]
         return jnp.asarray(self.policy.apply(params.policy, obs))
 
     def action_mean(self, params: ActorCriticParams, obs: Array) -> Array:
@@ -89,12 +100,14 @@ def make_actor_critic(
     policy_hidden: tuple[int, ...],
     value_hidden: tuple[int, ...],
     init_noise_std: float,
+    actor_obs_size: int | None = None,
 ) -> ActorCritic:
-    """Networks with the given hidden widths."""
+    """Networks with the given hidden widths; for the rest see `ActorCritic`."""
     # A small output layer makes the first policy's mean about zero wherever the robot is.
     return ActorCritic(
         policy=Mlp(tuple(policy_hidden), distribution.output_size, 0.01),
         value=Mlp(tuple(value_hidden), 1, 1.0),
         init_noise_std=init_noise_std,
         distribution=distribution,
+        actor_obs_size=actor_obs_size,
     )

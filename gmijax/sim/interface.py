@@ -29,6 +29,8 @@ class EnvSpec(NamedTuple):
       max_abs_obs: an observation beyond this tells that the physics diverges; the world is ended
         (see `gmijax.sim.divergence`).
       metrics: names of the numbers that judge an episode beside its return, such as successes.
+      actor_obs_size: the policy sees the first so many numbers of an observation, the value
+        function all of them (an asymmetric actor-critic); None: both see all.
     """
 
     name: str
@@ -39,6 +41,7 @@ class EnvSpec(NamedTuple):
     reward_terms: tuple[str, ...]
     max_abs_obs: float = 1e5
     metrics: tuple[str, ...] = ()
+    actor_obs_size: int | None = None
 
 
 class EnvState(NamedTuple):

@@ -134,6 +134,17 @@ def test_shares_of_clipped_values_and_of_saturated_actions(params) -> None:
     assert float(metrics.saturated_fraction) == 0.5
 
 
+def test_the_policy_does_not_see_what_is_behind_its_part_of_an_observation() -> None:
+    networks = NETWORKS._replace(actor_obs_size=2)
+    params = networks.init(jax.random.key(0), O)
+    obs = jnp.array([[1.0, 2.0, 3.0], [1.0, 2.0, -4.0]])
+    first, second = networks.action_mean(params, obs)
+    np.testing.assert_array_equal(first, second)
+    assert not jnp.equal(*networks.state_value(params, obs))
+    # Whoever has no more than what the policy sees gets the same actions.
+    np.testing.assert_array_equal(networks.action_mean(params, obs[:, :2]), [first, second])
+
+
 def test_explained_variance_by_hand() -> None:
     targets, values = jnp.array([1.0, 2.0, 3.0, 4.0]), jnp.array([1.5, 2.0, 3.0, 3.5])
     stats = RolloutStats(None, moments_of(targets - values, 1), moments_of(targets, 1), None)
