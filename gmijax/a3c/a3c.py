@@ -38,6 +38,7 @@ from gmijax.learning.policy import ActorCritic, ActorCriticParams
 from gmijax.learning.updates import (
     bound_loss,
     clipped_surrogate,
+    explained_variance,
     mean_of_states,
     minibatch_order,
     run_updates,
@@ -88,6 +89,7 @@ class Targets(NamedTuple):
       advantage: [T, B], normalised if that is wanted.
       step_weight: [T, B] of the policy gradient: V-trace's, and 0 where `_is_learnt` says so.
       behaviour_kl: [], its estimated divergence from the policies that acted, in nats.
+      fit: moments of the values' targets, and of these minus the values.
       value_moments: see `TrainState`.
     """
 
@@ -100,6 +102,7 @@ class Targets(NamedTuple):
     advantage: Array
     step_weight: Array
     behaviour_kl: Array
+    fit: tuple[Moments, Moments]
     value_moments: Moments | None = None
 
 
@@ -147,7 +150,9 @@ def batch_targets(
     logs = networks.distribution.log_prob(output, params.log_std, batch.action)
     log_ratios = logs - batch.log_prob
     ratios = jnp.exp(log_ratios)
-    returns = returns_of(batch, state_values(networks, weights, obs), ratios, config)
+    values = state_values(networks, weights, obs)
+    returns = returns_of(batch, values, ratios, config)
+    fresh_moments = partial(moments_of_those, jnp.broadcast_to(weight > 0, ratios.shape))
     advantage = _normalised(returns, weight, config)
     # Copies, because the updates donate the state that they would alias.
     copied_moments, log_std = jax.tree.map(jnp.copy, (moments, params.log_std))
@@ -162,12 +167,7 @@ def batch_targets(
         step_weight=jnp.where(_is_learnt(ratios, advantage, config), 0.0, returns.rho),
         # An estimate that is never negative and needs the actions only.
         behaviour_kl=_mean(ratios - 1.0 - log_ratios, weight),
-    )
-
-
-def _target_moments(targets: Targets) -> Moments:
-    return moments_of_those(
-        jnp.broadcast_to(targets.weight > 0, targets.value.shape), targets.value
+        fit=(fresh_moments(returns.value), fresh_moments(returns.value - values[:-1])),
     )
 
 
@@ -303,11 +303,13 @@ class Updated(NamedTuple):
       weights: [W] float32, to publish; see `pack_weights`.
       losses: means over all minibatches of all trainers, [] each.
       rates: of all minibatches, see `rate_figures`.
+      explained_variance: [], see the function of this name.
     """
 
     weights: Array
     losses: A3cLosses
     rates: dict[str, Array]
+    explained_variance: Array
 
 
 def make_update(learner: A3cLearner, reducer: Reducer) -> TracedStep:
@@ -330,10 +332,10 @@ def update(
     batch, weight = weighted
     targets = batch_targets(learner, state, batch, weight)
     observed = without_outliers(acting_moments(learner, state), batch.state)
-    learnt = None if state.value_moments is None else _target_moments(targets)
-    everyone = peers.gather((moments_of(observed, 2), learnt))
+    everyone = peers.gather((moments_of(observed, 2), *targets.fit))
+    seen, target, error = map(merge_all, everyone)
     if state.value_moments is not None:
-        state = state._replace(value_moments=merge(state.value_moments, merge_all(everyone[1])))
+        state = state._replace(value_moments=merge(state.value_moments, target))
         targets = targets._replace(value_moments=state.value_moments)
     order = minibatch_order(learner.config, state, peers.rank(), batch.reward.shape[1])
     state, losses, rates = run_updates(
@@ -341,8 +343,9 @@ def update(
     )
     # Counts the batch, which makes a new version of the policy, and takes in its statistics.
     state = state._replace(
-        obs_moments=merge(state.obs_moments, merge_all(everyone[0])), iteration=state.iteration + 1
+        obs_moments=merge(state.obs_moments, seen), iteration=state.iteration + 1
     )
     weights = pack_weights(acting_weights(learner, state))
     means = jax.tree.map(jnp.mean, losses)
-    return state, (), Updated(weights, means, rate_figures(learner.config, rates))
+    explained = explained_variance(target, error)
+    return state, (), Updated(weights, means, rate_figures(learner.config, rates), explained)

@@ -48,10 +48,14 @@ class BatchCounts(NamedTuple):
 
 
 class UpdateFigures(NamedTuple):
-    """Losses of an update, its learning rates (`rate_figures`), and the seconds that it took."""
+    """Losses and learning rates (`rate_figures`) of an update, and the seconds that it took.
+
+    For `explained_variance` see the function of this name.
+    """
 
     losses: A3cLosses
     rates: dict[str, Any]
+    explained_variance: float
     update_s: float
 
 
@@ -138,7 +142,7 @@ class Reporter:
     def _of_updates(self) -> tuple[dict[str, float], dict[str, float], dict[str, Any]]:
         """Means of the losses, figures of the learning rates, and the rest."""
         figures, receive_s = zip(*self._updates, strict=True)
-        losses, rates, update_s = zip(*figures, strict=True)
+        losses, rates, explained, update_s = zip(*figures, strict=True)
         averaged: Any = np.mean(losses, axis=0, dtype=np.float64)
         means = dict(zip(A3cLosses._fields, map(float, averaged), strict=True))
         del means["weight"]  # 1, over a batch.
@@ -150,6 +154,7 @@ class Reporter:
             means,
             joined,
             {
+                "value/explained_variance": float(np.mean(explained)),
                 "async/updates": len(self._updates),
                 "time/update_s": float(np.mean(update_s)),
                 "time/receive_s": float(np.mean(receive_s)),

@@ -11,6 +11,7 @@ import jax.numpy as jnp
 from gmijax.collectives.interface import Peers
 from gmijax.config import AlgoConfig
 from gmijax.learning.learner import Learner, TrainState, apply_gradients, learner_shapes
+from gmijax.learning.normalize import Moments
 from gmijax.learning.policy import ActorCriticParams
 from gmijax.sim.interface import EnvSpec
 from gmijax.types import Array, PyTree
@@ -113,3 +114,16 @@ def saturated_fraction(mean: Array) -> Array:
 def mean_of_states(values: Array) -> Array:
     """Mean [] of `values` [...], or [] where they are the same in all states."""
     return jnp.mean(values) if values.ndim else values
+
+
+def explained_variance(target: Moments, error: Moments) -> Array:
+    """Share [] of the variance of the values' targets that the values explain.
+
+    1 where they are the targets, 0 where a constant would do as well, or where nothing varies.
+
+    Args:
+      target: of the targets of some samples.
+      error: of the targets minus the values of the same.
+    """
+    varies = target.m2 > 0.0
+    return jnp.where(varies, 1.0 - error.m2 / jnp.where(varies, target.m2, 1.0), 0.0)

@@ -41,6 +41,7 @@ from gmijax.learning.unroll import Counts, Outcome, act, count, no_counts, outco
 from gmijax.learning.updates import (
     bound_loss,
     clipped_surrogate,
+    explained_variance,
     mean_of_states,
     minibatch_order,
     run_updates,
@@ -393,19 +394,10 @@ def finish(
     )
     figures = {
         **policy_figures(state),
-        "value/explained_variance": explained_variance(stats),
+        "value/explained_variance": explained_variance(stats.target, stats.advantage),
     }
     spread = rate_figures(learner.config, rates)
     return state, IterationMetrics(stats.counts, losses, figures, spread)
-
-
-def explained_variance(stats: RolloutStats) -> Array:
-    """Share [] of the variance of the targets that the values of the rollout explain.
-
-    1 where they are the targets, 0 where a constant would do as well, or where nothing varies.
-    """
-    target, error = stats.target.m2, stats.advantage.m2  # An advantage is target minus value.
-    return jnp.where(target > 0.0, 1.0 - error / jnp.where(target > 0.0, target, 1.0), 0.0)
 
 
 def iterate(

@@ -188,6 +188,8 @@ def test_two_trainers_stay_equal_and_weigh_fresh_unrolls_alike(config) -> None:
     only_fresh = jax.tree.map(lambda x: x[:, fresh > 0], both)
     _, theirs = _alone(learner)(state, only_fresh, jnp.ones(N + 1))
     np.testing.assert_allclose(losses, theirs.losses, rtol=1e-4, atol=1e-6)
+    for one in (said.explained_variance, told.explained_variance[0]):
+        np.testing.assert_allclose(one, theirs.explained_variance, rtol=1e-3, atol=1e-4)
 
 
 def test_a_minibatch_of_stale_unrolls_does_not_dilute_the_divergence(start, batch) -> None:
