@@ -14,13 +14,8 @@ from gmijax.learning.learner import ActingWeights, state_values
 from gmijax.learning.normalize import Moments, from_units, moments_of, no_samples
 from gmijax.learning.policy import make_actor_critic
 from gmijax.learning.updates import explained_variance
-from gmijax.ppo.ppo import (
-    Samples,
-    UpdateContext,
-    gae,
-    ppo_loss,
-    until_diverged,
-)
+from gmijax.ppo.ppo import UpdateContext, ppo_loss
+from gmijax.ppo.rollout import Samples, gae, until_diverged
 
 B, O, A = 6, 3, 2
 T, N = 7, 3

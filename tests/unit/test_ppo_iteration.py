@@ -32,15 +32,8 @@ from gmijax.learning.normalize import std_of
 from gmijax.learning.updates import exchange_size, minibatch_order, run_updates
 from gmijax.partition.layout import Layout
 from gmijax.ppo.loop import warm_up
-from gmijax.ppo.ppo import (
-    PpoLosses,
-    flatten,
-    gradients,
-    iterate,
-    merge_stats,
-    rollout,
-    update_context,
-)
+from gmijax.ppo.ppo import PpoLosses, gradients, iterate, update_context
+from gmijax.ppo.rollout import flatten, merge_stats, rollout
 from gmijax.sim.wrappers import env_keys
 
 N, T = 32, 8
