@@ -31,7 +31,8 @@ from gmijax.config import PpoConfig, TrainConfig
 from gmijax.learning.learner import Learner, acting_weights, init_learner, make_learner
 from gmijax.learning.unroll import act
 from gmijax.machine.nvidia import nvml_session
-from gmijax.ppo.ppo import Samples, learn, no_stats
+from gmijax.ppo.ppo import learn
+from gmijax.ppo.rollout import Samples, no_stats
 from gmijax.sim.interface import EnvSpec
 from gmijax.sim.randomize import make_worlds
 from gmijax.sim.wrappers import BatchedEnv, env_keys, training_env

@@ -13,7 +13,7 @@ import hashlib
 import os
 import shutil
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, TypeVar, cast
 
 import jax
 import jax.numpy as jnp
@@ -74,7 +74,7 @@ def require_finite(params: PyTree, env_name: str, env_steps: int) -> None:
 
 def save_learner(paths: RunPaths, env_steps: int, learner_state: PyTree) -> None:
     """Writes the shared part of the checkpoint at `env_steps`, not yet under its name."""
-    _save(_partial(paths, env_steps) / LEARNER, learner_state)
+    _save(_partial(paths, env_steps) / LEARNER, _present(learner_state))
 
 
 def save_envs(paths: RunPaths, env_steps: int, gmi: int, env_state: PyTree) -> None:
@@ -143,7 +143,9 @@ def restore_learner(checkpoint: Path, template: T) -> T:
     Raises:
       ConfigError: the checkpoint does not fit the template.
     """
-    return _restore(checkpoint / LEARNER, template)
+    fields = _present(template)
+    restored = _restore(checkpoint / LEARNER, fields)
+    return restored if fields is template else cast("Any", template)._replace(**restored)
 
 
 def learner_sizes(checkpoint: Path) -> tuple[int, int]:
@@ -205,6 +207,13 @@ def _restore(folder: Path, template: T) -> T:
         lines = str(error).strip().splitlines() or [type(error).__name__]
         raise ConfigError(f"checkpoint {folder} does not fit this job: {lines[0]}") from error
     return jax.tree.map(_restored, template, restored)
+
+
+def _present(state: Any) -> Any:
+    """The fields of a named tuple that are not None: older checkpoints do not know the others."""
+    if not hasattr(state, "_asdict"):
+        return state
+    return {name: part for name, part in state._asdict().items() if part is not None}
 
 
 def _is_key(leaf: jax.Array) -> bool:

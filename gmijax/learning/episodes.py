@@ -198,8 +198,10 @@ def _run_chunk(
     step_all = vectorise(env).step
 
     def choose(before: BatchState) -> tuple[BatchState, Array, Array]:
-        drawn, mean, noisy = act(learner.networks, weights, before)
-        return drawn, mean, mean if options.deterministic else noisy
+        drawn, output, action = act(learner.networks, weights, before)
+        if options.deterministic:
+            action = learner.networks.distribution.mode(output)
+        return drawn, output, action
 
     def step(model: PyTree, before: BatchState, action: Array) -> tuple[BatchState, Any]:
         moved = step_all(model, before.env, action)

@@ -120,15 +120,13 @@ class Learnt(NamedTuple):
 
     Attributes:
       losses: parts of the loss by name.
-      learning_rate: after the last update.
-      rates: of all updates, see `rate_figures`.
-      noise_std: mean standard deviation of the policy.
+      figures: others by the names that they are logged under.
+      rates: of the learning rates of all updates, see `rate_figures`.
     """
 
     losses: Mapping[str, float]
-    learning_rate: float
+    figures: Mapping[str, float]
     rates: Mapping[str, float]
-    noise_std: float
 
 
 class TrainingLog:
@@ -210,9 +208,8 @@ class TrainingLog:
             **overflow_line(counts.overflowed),
             "reward_per_step": counts.reward_sum / simulated if simulated else None,
             **{f"loss/{name}": value for name, value in learnt.losses.items()},
-            "policy/learning_rate": learnt.learning_rate,
+            **learnt.figures,
             **{f"policy/learning_rate_{name}": rate for name, rate in learnt.rates.items()},
-            "policy/noise_std": learnt.noise_std,
             **others,
         }
         for sink in self._sinks:

@@ -14,9 +14,10 @@ from pathlib import Path
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
-from gmijax.collectives.interface import Reducer
+from gmijax.collectives.interface import Reducer, TracedStep
 from gmijax.config import PpoConfig, TrainConfig
 from gmijax.devices import describe_device
 from gmijax.errors import CollectiveError
@@ -67,6 +68,7 @@ class TrainingLoop:
         self._reducer = reducer
         self._link = link
         self._leader = reducer.rank == 0
+        self._warms_up = config.algo.warmup_unroll and config.run.resume is None
         self._learner = make_learner(env.spec, config.algo)
         self._remote: RemoteIteration | None = None
         num_simulating = reducer.world_size
@@ -110,6 +112,8 @@ class TrainingLoop:
         compile_s = time.monotonic() - started - waited_s
         self._link.beat("ready", 0)
         self._meet()  # Everybody has compiled: the clock may start.
+        if self._warms_up:
+            state, env_state = warm_up(self._iteration, state, env_state)
         log = self._open_log()
         first_steps, started = self._env_steps, time.monotonic()
         state, env_state, stopped = self._train(state, env_state, log)
@@ -270,6 +274,21 @@ class TrainingLoop:
         return self._steps_per_iteration / statistics.median(steady) if steady else None
 
 
+def warm_up(iteration: TracedStep, state: TrainState, env_state: Any) -> tuple[TrainState, Any]:
+    """Makes an iteration of which only the statistics of observations and targets are kept.
+
+    Both arguments are donated.
+
+    Returns:
+      `state` with these statistics, and the environments where the iteration has left them.
+    """
+    first = jax.tree.map(jnp.copy, state)
+    after, env_state, _ = iteration(state, env_state)
+    iteration.wait()
+    warm = first._replace(obs_moments=after.obs_moments, value_moments=after.value_moments)
+    return warm, env_state
+
+
 def report(
     log: TrainingLog,
     env_steps: int,
@@ -282,7 +301,7 @@ def report(
     `times` are seconds by name, written as they are. Raises as `TrainingLog.write`.
     """
     host: Any = jax.tree.map(float, jax.device_get(metrics))
-    learnt = Learnt(host.losses._asdict(), host.learning_rate, host.rates, host.noise_std)
+    learnt = Learnt(host.losses._asdict(), host.figures, host.rates)
     if evaluation is None:
         log.write(env_steps, host.counts, learnt, times)
         return

@@ -31,6 +31,8 @@ class EnvSpec(NamedTuple):
       metrics: names of the numbers that judge an episode beside its return, such as successes.
       obs_terms: parts of an observation in order, name and length each; they go into exported
         policies. Empty where nobody says.
+      actor_obs_size: the policy sees the first so many numbers of an observation, the value
+        function all of them (an asymmetric actor-critic); None: both see all.
     """
 
     name: str
@@ -42,6 +44,7 @@ class EnvSpec(NamedTuple):
     max_abs_obs: float = 1e5
     metrics: tuple[str, ...] = ()
     obs_terms: tuple[tuple[str, int], ...] = ()
+    actor_obs_size: int | None = None
 
 
 class EnvState(NamedTuple):

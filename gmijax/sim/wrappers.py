@@ -67,9 +67,11 @@ class StepOutput(NamedTuple):
       reward: [N] float32.
       terminated: [N] bool, the task has ended.
       truncated: [N] bool, time ran out.
+      is_diverged: [N] bool, the world was ended because of a bad number (it counts as
+        terminated).
       finished: the whole episodes that ended in this step; none that had a head start.
-      diverged: [] int32, worlds that were ended because of a bad number (they count as
-        terminated), by where it was: `gmijax.sim.divergence.sources`.
+      diverged: [] int32, worlds that were ended because of a bad number, by where it was:
+        `gmijax.sim.divergence.sources`.
       overflowed: [] int32, worlds for which a buffer was too small, by `OVERFLOWS`; empty if
         nothing can overflow.
     """
@@ -78,6 +80,7 @@ class StepOutput(NamedTuple):
     reward: Array
     terminated: Array
     truncated: Array
+    is_diverged: Array
     finished: EpisodeSums
     diverged: dict[str, Array]
     overflowed: dict[str, Array]
@@ -233,6 +236,7 @@ def training_env(env: Env, *, random_ep_len: bool = False) -> BatchedEnv:
             reward=stepped.reward,
             terminated=stepped.terminated,
             truncated=stepped.truncated,
+            is_diverged=bad["any"],
             finished=finished,
             diverged={name: jnp.sum(where, dtype=jnp.int32) for name, where in bad.items()},
             overflowed=overflowed(env, stepped),

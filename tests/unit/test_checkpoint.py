@@ -6,13 +6,16 @@ import math
 import os
 import zlib
 from pathlib import Path
+from typing import Any, NamedTuple
 
+import jax
 import jax.numpy as jnp
+import numpy as np
 import orbax.checkpoint as ocp
 import pytest
 
 from gmijax.errors import ConfigError
-from gmijax.learning.checkpoint import finish_checkpoint, restore_learner
+from gmijax.learning.checkpoint import finish_checkpoint, restore_learner, save_learner
 from gmijax.runs.folder import RunPaths
 from gmijax.runs.resume import (
     CheckpointMeta,
@@ -53,6 +56,37 @@ def test_checkpoint_that_does_not_fit_is_bad_input(
 def test_failure_of_the_device_is_not_the_checkpoints(monkeypatch: pytest.MonkeyPatch):
     with pytest.raises(RuntimeError, match="RESOURCE_EXHAUSTED"):
         restore_with(RuntimeError("RESOURCE_EXHAUSTED"), monkeypatch)
+
+
+class Before(NamedTuple):
+    weights: Any
+    moments: Any
+
+
+class Now(NamedTuple):
+    weights: Any
+    moments: Any
+    more: Any = None
+
+
+def test_a_checkpoint_from_before_a_field_fits_where_the_field_is_not_used(tmp_path: Path):
+    run = RunPaths(tmp_path)
+    known = Before({"w": jnp.arange(3.0)}, (jnp.ones(()), jnp.zeros(2)))
+    like = Now({"w": jnp.zeros(3)}, (jnp.zeros(()), jnp.zeros(2)))
+
+    def saved(env_steps: int, state: Any) -> Path:
+        save_learner(run, env_steps, state)
+        meta = CheckpointMeta("ant", "ppo", env_steps, 1, 8, ((8,), (8,)), "jax")
+        return finish_checkpoint(run, meta)
+
+    old = saved(1, known)
+    new = saved(2, Now(known.weights, known.moments, jnp.full(2, 7.0)))
+    found = restore_learner(old, like)
+    assert found.more is None
+    jax.tree.map(np.testing.assert_array_equal, tuple(found)[:2], tuple(known))
+    assert restore_learner(new, like._replace(more=jnp.zeros(2))).more.tolist() == [7.0, 7.0]
+    with pytest.raises(ConfigError, match="does not fit this job"):
+        restore_learner(old, like._replace(more=jnp.zeros(2)))
 
 
 def save(
