@@ -23,13 +23,13 @@ ACTION_SIZE = 3
 TINY = ("env=ball_balance", "algo.policy_hidden_layer_sizes=[16,8]", "num_envs=16")
 
 
-def make_run(root: Path, *overrides: str) -> RunPaths:
+def make_run(root: Path, *overrides: str, actor_obs_size: int | None = None) -> RunPaths:
     """A run folder with one checkpoint, at ENV_STEPS; some of its actions are beyond +-1."""
     config = gmijax.compose(*TINY, *overrides)
     run = RunPaths(root)
     write_json(run.config, to_dict(config))
     # Nothing is computed by jax: that would be compiled, leaf by leaf.
-    spec = EnvSpec("x", OBS_SIZE, ACTION_SIZE, 0.0, 0, ())
+    spec = EnvSpec("x", OBS_SIZE, ACTION_SIZE, 0.0, 0, (), actor_obs_size=actor_obs_size)
     shapes, rng = learner_shapes(spec, config.algo), np.random.default_rng(0)
 
     def weights(leaf: Any) -> np.ndarray:

@@ -12,8 +12,8 @@ import numpy as np
 
 from gmijax.config import AlgoConfig
 from gmijax.learning.checkpoint import learner_sizes, restore_learner
-from gmijax.learning.learner import ActingWeights, acting_weights, init_learner, make_learner
-from gmijax.learning.normalize import OBS_CLIP, normalize, std_of
+from gmijax.learning.learner import acting_weights, init_learner, make_learner
+from gmijax.learning.normalize import OBS_CLIP, Moments, normalize, std_of
 from gmijax.runs.resume import CheckpointMeta, trained_config
 from gmijax.sim.interface import EnvSpec
 from gmijax.types import Array
@@ -26,7 +26,7 @@ class TrainedPolicy(NamedTuple):
     Attributes:
       act: raw observations [N, O] to actions [N, A] in [-1, 1], the mean of the policy; pure, to
         be traced.
-      obs_size: O.
+      obs_size: O, of what the policy sees; not what only the value function saw.
       action_size: A.
       metadata: what it is, as plain data; what only the environment knows is not in it.
     """
@@ -44,15 +44,17 @@ def trained_policy(checkpoint: Path) -> TrainedPolicy:
       ConfigError: the checkpoint cannot be read, or does not lie in the folder of its run.
     """
     env, algo = trained_config(checkpoint)
-    obs_size, action_size = learner_sizes(checkpoint)
+    full_size, obs_size, action_size = learner_sizes(checkpoint)
     # Networks are made for the sizes of an environment, and nothing else of it.
-    spec = EnvSpec(env.label, obs_size, action_size, 0.0, 0, ())
+    spec = EnvSpec(env.label, full_size, action_size, 0.0, 0, (), actor_obs_size=obs_size)
     learner = make_learner(spec, algo)
-    state = jax.jit(lambda key: init_learner(learner, obs_size, key))(jax.random.key(0))
+    state = jax.jit(lambda key: init_learner(learner, full_size, key))(jax.random.key(0))
     weights = acting_weights(learner, restore_learner(checkpoint, state))
+    count, mean, m2 = weights.moments
+    moments = Moments(count, mean[:obs_size], m2[:obs_size])
 
     def act(obs: Array) -> Array:
-        normalized = normalize(weights.moments, obs)
+        normalized = normalize(moments, obs)
         # As every environment clips them.
         return jnp.clip(learner.networks.action_mean(weights.params, normalized), -1.0, 1.0)
 
@@ -63,7 +65,7 @@ def trained_policy(checkpoint: Path) -> TrainedPolicy:
         "obs_size": obs_size,
         "action_size": action_size,
         **_networks(algo),
-        **_normalizer(algo, weights),
+        **_normalizer(algo, moments),
         "gmijax_version": __version__,
         "jax_version": versions_of(["jax"])["jax"],
     }
@@ -78,9 +80,8 @@ def _networks(algo: AlgoConfig) -> dict[str, Any]:
     }
 
 
-def _normalizer(algo: AlgoConfig, weights: ActingWeights) -> dict[str, Any]:
+def _normalizer(algo: AlgoConfig, moments: Moments) -> dict[str, Any]:
     """Mean and standard deviation [O] of observations, and where they are clipped after it."""
-    moments = weights.moments
     # As `normalize` does, which leaves observations alone that nothing is known of.
     knows = algo.normalize_observations and float(moments.count) > 0
     return {

@@ -148,8 +148,12 @@ def restore_learner(checkpoint: Path, template: T) -> T:
     return restored if fields is template else cast("Any", template)._replace(**restored)
 
 
-def learner_sizes(checkpoint: Path) -> tuple[int, int]:
-    """O and A, lengths of an observation and of an action, of the policy in a checkpoint.
+def learner_sizes(checkpoint: Path) -> tuple[int, int, int]:
+    """Sizes of the policy in a checkpoint.
+
+    Returns:
+      O, length of an observation; how many of its first numbers the policy sees; A, length of an
+      action.
 
     Raises:
       ConfigError: the checkpoint holds no learner's state.
@@ -158,13 +162,12 @@ def learner_sizes(checkpoint: Path) -> tuple[int, int]:
     try:
         with ocp.StandardCheckpointer() as checkpointer:
             saved: Any = checkpointer.metadata(folder).item_metadata
-        (obs_size,), (action_size,) = (
-            saved["obs_moments"]["mean"].shape,
-            saved["params"]["log_std"].shape,
-        )
+        (obs_size,) = saved["obs_moments"]["mean"].shape
+        (action_size,) = saved["params"]["log_std"].shape
+        actor_obs_size, _ = saved["params"]["policy"]["params"]["Dense_0"]["kernel"].shape
     except (AttributeError, KeyError, OSError, TypeError, ValueError) as error:
         raise ConfigError(f"checkpoint {folder}: holds no policy") from error
-    return obs_size, action_size
+    return obs_size, actor_obs_size, action_size
 
 
 def restore_envs(checkpoint: Path, gmi: int, template: T) -> T:

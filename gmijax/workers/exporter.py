@@ -53,12 +53,13 @@ def names_of(env: Env) -> dict[str, Any]:
     `qpos`. None: not known.
     """
     spec, model = env.spec, env.mj_model
+    seen = spec.actor_obs_size or spec.obs_size
     num_values = sum(length for _, length in spec.obs_terms)
     actuators = [] if model is None else [model.actuator(i).name for i in range(model.nu)]
     joints = [] if model is None else [model.joint(i).name for i in range(model.njnt)]
     return {
         "control_dt_s": spec.control_dt_s,
-        "obs_terms": list(map(list, spec.obs_terms)) if num_values == spec.obs_size else None,
+        "obs_terms": list(map(list, spec.obs_terms)) if num_values == seen else None,
         "action_names": actuators if len(actuators) == spec.action_size else None,
         "joint_names": joints or None,
     }

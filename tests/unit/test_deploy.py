@@ -50,7 +50,8 @@ def expected(run: RunPaths, obs: np.ndarray) -> np.ndarray:
     with ocp.StandardCheckpointer() as checkpointer:
         saved: Any = checkpointer.restore(run.checkpoint(ENV_STEPS) / "learner")
     moments = saved["obs_moments"]
-    x = (obs - moments["mean"]) / np.sqrt(moments["m2"] / moments["count"])
+    seen = slice(obs.shape[-1])
+    x = (obs - moments["mean"][seen]) / np.sqrt(moments["m2"][seen] / moments["count"])
     x = np.clip(x, -10.0, 10.0)
     layers = saved["params"]["policy"]["params"]
     for i in range(3):
@@ -86,6 +87,13 @@ def test_a_policy_without_a_normaliser_sees_observations_as_they_are(tmp_path: P
     about = gmijax.load_policy(bare.checkpoint(ENV_STEPS)).metadata
     assert (set(about["obs_mean"]), set(about["obs_std"])) == ({0.0}, {1.0})
     assert about["obs_clip"] is None
+
+
+def test_what_only_the_value_function_saw_is_not_asked_for(tmp_path: Path):
+    run = make_run(tmp_path / "run", actor_obs_size=20)
+    policy, obs = gmijax.load_policy(run.root), np.random.default_rng(0).normal(size=(7, 20))
+    assert (policy.obs_size, len(policy.metadata["obs_mean"])) == (20, 20)
+    np.testing.assert_allclose(policy(obs), expected(run, obs), atol=2e-5)
 
 
 @pytest.mark.parametrize("shape", [(), (23,), (2, 25), (2, 2, 24)])
