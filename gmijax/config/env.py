@@ -79,6 +79,14 @@ class EnvConfig(KeyGroup):
     )
     # Digest of a custom task's file: the run itself notes it.
     source_sha256: str | None = None
+    rewards: Mapping[str, float] = dataclasses.field(
+        default_factory=dict,
+        metadata={"doc": "weights of the reward's terms (docs/tasks.md); 0: the term is left out"},
+    )
+    settings: Mapping[str, float] = dataclasses.field(
+        default_factory=dict,
+        metadata={"doc": "numbers of the task, such as the height of a fall (docs/tasks.md)"},
+    )
     randomize: Literal["off", "on"] = doc(
         "whether every world has a physics model of its own, drawn from env.randomization",
         default="off",

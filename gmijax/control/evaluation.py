@@ -25,7 +25,7 @@ from gmijax.partition.planner import make_plan
 from gmijax.runs.folder import META, STEP_DIGITS, PlayPaths, RunPaths, read_json, write_json
 from gmijax.runs.resume import CheckpointMeta, find_checkpoint, trained_config
 from gmijax.sim import source
-from gmijax.sim.registry import require_task
+from gmijax.sim.registry import require_env
 from gmijax.supervise.kinds import JobKind
 from gmijax.supervise.launcher import Launch, run_gmis
 from gmijax.supervise.supervisor import Timeouts
@@ -86,7 +86,7 @@ def _opened(config: PlayConfig) -> tuple[PlayConfig, str | None]:
     checkpoint = _find(config)
     saved, _ = trained_config(checkpoint)
     env = source.opened(saved, config.run.env)
-    require_task(str(env.name), env.suite)
+    require_env(env)
     if config.randomize == "on" and not env.randomization:
         raise ConfigError("randomize=on: env.randomization of the run names nothing to draw")
     run = dataclasses.replace(config.run, dir=str(checkpoint.parents[1]))

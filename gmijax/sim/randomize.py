@@ -57,6 +57,8 @@ def make_worlds(config: EnvConfig, impl: str, *, seed: int, first_env: int, num_
         episode_length=config.episode_length,
         max_envs=num_envs,
         source_sha256=config.source_sha256,
+        rewards=config.rewards,
+        settings=config.settings,
     )
     if config.randomize != "on":
         return env

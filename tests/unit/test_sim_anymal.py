@@ -7,6 +7,7 @@ import pytest
 from gmijax.sim import physics
 from gmijax.sim.registry import make_env
 from gmijax.sim.tasks import anymal
+from gmijax.sim.tasks.settings import AnymalSettings
 
 HIGH_KNEES = jnp.full((4, 3), 0.3)
 
@@ -87,7 +88,7 @@ def test_a_robot_with_one_knee_on_the_floor_has_fallen():
 def test_starts_and_commands_fill_their_ranges(model):
     ids = anymal.look_up(model)
     keys = jax.random.split(jax.random.key(0), 256)
-    qpos, qvel = jax.vmap(lambda key: anymal.draw_start(ids, model, key))(keys)
+    qpos, qvel = jax.vmap(lambda key: anymal.draw_start(ids, model, key, AnymalSettings()))(keys)
     factors = np.asarray(qpos[:, ids.joints.qpos]) / ids.standing
     assert 0.5 <= factors.min() < 0.52
     assert 1.48 < factors.max() <= 1.5
@@ -95,7 +96,7 @@ def test_starts_and_commands_fill_their_ranges(model):
         qpos[:, :7], np.tile([0, 0, 0.62, 1, 0, 0, 0], (256, 1)).astype("f4")
     )
     assert float(jnp.abs(qvel).max()) <= 0.1
-    commands = np.asarray(jax.vmap(anymal.draw_command)(keys))
+    commands = np.asarray(jax.vmap(lambda key: anymal.draw_command(key, AnymalSettings()))(keys))
     assert (np.abs(commands) <= [2.0, 1.0, 1.0]).all()
     assert (commands.max(axis=0) > [1.8, 0.9, 0.9]).all()
     assert (commands.min(axis=0) < [-1.8, -0.9, -0.9]).all()

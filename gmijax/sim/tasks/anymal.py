@@ -9,6 +9,7 @@ LH, RF, RH. Isaac Gym's paper: arXiv:2108.10470.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -20,8 +21,9 @@ import numpy.typing as npt
 
 from gmijax.sim import episode, physics, rotations
 from gmijax.sim.interface import Env, EnvSpec, EnvState
-from gmijax.sim.rewards import RewardTerm, term_names, total_reward
+from gmijax.sim.rewards import RewardTerm, term_names, total_reward, with_weights
 from gmijax.sim.tasks import lookup
+from gmijax.sim.tasks.settings import AnymalSettings, settings_from
 from gmijax.types import Array, PRNGKey, PyTree
 
 DEFAULT_EPISODE_LENGTH = 2500
@@ -29,15 +31,11 @@ SUBSTEPS = 4
 OBS_SIZE = 48
 ACTION_SIZE = 12
 OBS_LIMIT = 5.0
-ACTION_SCALE_RAD = 0.5
 VELOCITY_SCALE = 2.0
 ANGULAR_VELOCITY_SCALE = 0.25
 JOINT_VELOCITY_SCALE = 0.05
-COMMAND_LIMITS = (2.0, 1.0, 1.0)  # m/s forwards, m/s to the left, rad/s
 KNEE_RADIUS_M = 0.065
 BASE_HALF_SIZE_M = (0.525, 0.16, 0.09)
-START_FACTOR = (0.5, 1.5)
-VELOCITY_NOISE_RAD_PER_S = 0.1
 
 LEGS = ("LF", "LH", "RF", "RH")
 JOINTS = tuple(f"{leg}_{joint}" for leg in LEGS for joint in ("HAA", "HFE", "KFE"))
@@ -97,8 +95,15 @@ FLOOR = "floor"
 METRICS: tuple[str, ...] = ("velocity_error_m_per_s", "yaw_rate_error_rad_per_s")
 
 
-def make(*, impl: str = "auto", max_envs: int | None = None) -> Env:
+def make(
+    *,
+    impl: str = "auto",
+    max_envs: int | None = None,
+    rewards: Mapping[str, float] | None = None,
+    settings: Mapping[str, float] | None = None,
+) -> Env:
     """Makes the task without its time limit; see `gmijax.sim.registry.make_env`."""
+    terms, chosen = with_weights(TERMS, rewards), settings_from(AnymalSettings, settings)
     world = physics.load("anymal", impl=impl, substeps=SUBSTEPS, max_envs=max_envs)
     ids = look_up(world.mj_model)
     # A number that is not finite outlives the clipping of observations or shows in `qpos`, so
@@ -109,15 +114,15 @@ def make(*, impl: str = "auto", max_envs: int | None = None) -> Env:
         action_size=ACTION_SIZE,
         control_dt_s=world.control_dt_s,
         episode_length=DEFAULT_EPISODE_LENGTH,
-        reward_terms=term_names(TERMS, FLOOR),
+        reward_terms=term_names(terms, FLOOR),
         metrics=METRICS,
     )
 
     def reset(model: PyTree, key: PRNGKey) -> EnvState:
         del model  # nothing that a reset draws depends on it
         key, start_key, command_key = jax.random.split(key, 3)
-        start = world.start(*draw_start(ids, world.mj_model, start_key))
-        task = AnymalTask(draw_command(command_key), jnp.zeros(()), jnp.zeros(()))
+        start = world.start(*draw_start(ids, world.mj_model, start_key, chosen))
+        task = AnymalTask(draw_command(command_key, chosen), jnp.zeros(()), jnp.zeros(()))
         obs = observe(ids, start, task.command, jnp.zeros(ACTION_SIZE))
         return episode.begin(spec, start, task, obs, key)
 
@@ -126,12 +131,12 @@ def make(*, impl: str = "auto", max_envs: int | None = None) -> Env:
         moved, (torques, knees) = world.step(
             model,
             state.physics,
-            jnp.asarray(ids.standing) + ACTION_SCALE_RAD * action,
+            jnp.asarray(ids.standing) + chosen.action_scale_rad * action,
             lambda data: (data.qfrc_actuator[ids.joints.qvel], data.xpos[ids.shanks]),
         )
         view = AnymalView(*errors(moved, state.task.command), torques)
         task, metrics = add_errors(state, view)
-        reward = not_below_zero(total_reward(TERMS, view))
+        reward = not_below_zero(total_reward(terms, view))
         obs = observe(ids, moved, task.command, action)
         down = has_fallen(moved, knees)
         return episode.advance(state, moved, task, obs, reward, down, metrics)
@@ -149,11 +154,13 @@ def look_up(mj_model: mujoco.MjModel) -> AnymalIds:
     )
 
 
-def draw_start(ids: AnymalIds, mj_model: mujoco.MjModel, key: PRNGKey) -> tuple[Array, Array]:
+def draw_start(
+    ids: AnymalIds, mj_model: mujoco.MjModel, key: PRNGKey, settings: AnymalSettings
+) -> tuple[Array, Array]:
     """Random `qpos` [19] and `qvel` [18]: the base in its place, the legs near standing."""
     position_key, velocity_key = jax.random.split(key)
-    shape, noise = (ACTION_SIZE,), VELOCITY_NOISE_RAD_PER_S
-    least, most = START_FACTOR
+    shape, noise = (ACTION_SIZE,), settings.joint_velocity_noise_rad_per_s
+    least, most = settings.start_factor_min, settings.start_factor_max
     factors = jax.random.uniform(position_key, shape, minval=least, maxval=most)
     velocities = jax.random.uniform(velocity_key, shape, minval=-noise, maxval=noise)
     qpos = jnp.array(mj_model.key("stand").qpos, jnp.float32)
@@ -163,9 +170,15 @@ def draw_start(ids: AnymalIds, mj_model: mujoco.MjModel, key: PRNGKey) -> tuple[
     )
 
 
-def draw_command(key: PRNGKey) -> Array:
+def draw_command(key: PRNGKey, settings: AnymalSettings) -> Array:
     """Wanted speed forwards and to the left, m/s, and of yaw, rad/s [3]."""
-    limits = jnp.array(COMMAND_LIMITS)
+    limits = jnp.array(
+        (
+            settings.command_forward_m_per_s,
+            settings.command_left_m_per_s,
+            settings.command_yaw_rad_per_s,
+        )
+    )
     return jax.random.uniform(key, (3,), minval=-limits, maxval=limits)
 
 
