@@ -260,6 +260,8 @@ def _with_task_of_run(data: dict[str, Any], items: Sequence[Override]) -> dict[s
     if run_dir is None or any(item.key_or_group == "env" for item in items):
         return data
     saved = saved_config_of(str(run_dir), "run.dir")["env"]
+    # A policy that has learnt needs no easy episodes, unless they are asked for.
+    saved["curriculum"] = data["env"]["curriculum"]
     merged = {**data, "env": {**data["env"], **saved}}
     for item in items:
         if item.key_or_group.startswith("env."):

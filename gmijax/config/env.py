@@ -75,7 +75,15 @@ class EnvConfig(KeyGroup):
         "robot models at first use), with env=custom PATH.py:FUNCTION"
     )
     episode_length: int | None = doc(
-        "steps after which an episode is truncated (time limit); null: the task's own", low=1
+        "steps of the task after which an episode is truncated (time limit); null: its own", low=1
+    )
+    history: int = doc(
+        "observations of so many steps are one, the oldest first (docs/tasks.md)",
+        default=1,
+        low=1,
+    )
+    action_repeat: int = doc(
+        "steps of the task that every action is taken for; rewards are summed", default=1, low=1
     )
     # Digest of a custom task's file: the run itself notes it.
     source_sha256: str | None = None
@@ -86,6 +94,10 @@ class EnvConfig(KeyGroup):
     settings: Mapping[str, float] = dataclasses.field(
         default_factory=dict,
         metadata={"doc": "numbers of the task, such as the height of a fall (docs/tasks.md)"},
+    )
+    curriculum: Literal["off", "on"] = doc(
+        "whether a world's episodes get harder as they succeed, in tasks that can (docs/tasks.md)",
+        default="off",
     )
     randomize: Literal["off", "on"] = doc(
         "whether every world has a physics model of its own, drawn from env.randomization",

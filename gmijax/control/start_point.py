@@ -88,6 +88,11 @@ def _require_fit(config: TrainConfig, checkpoint: Path, wanted: str) -> Checkpoi
     ):
         if have != want:
             raise ConfigError(f"run.resume={wanted}: checkpoint of {name} {have}, not {want}")
+    trained, _ = trained_config(checkpoint)
+    for key in ("history", "action_repeat", "curriculum"):  # The worlds have other states then.
+        have, want = getattr(trained, key), getattr(config.env, key)
+        if have != want:
+            raise ConfigError(f"env.{key}={want}: a resumed run keeps its {have}")
     seed = read_json(RunPaths(checkpoint.parent.parent).config)["seed"]
     if config.seed != seed:
         raise ConfigError(f"seed={config.seed}: a resumed run keeps its seed {seed}")

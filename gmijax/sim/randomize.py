@@ -22,6 +22,7 @@ from mujoco import mjx
 from gmijax.config import EnvConfig
 from gmijax.config.env import NEVER_ZERO, RANDOMIZED_LEAVES, LeafRange
 from gmijax.errors import ConfigError
+from gmijax.sim.interaction import action_repeat, observation_history
 from gmijax.sim.interface import Env
 from gmijax.sim.registry import make_env
 from gmijax.sim.wrappers import env_keys
@@ -41,7 +42,7 @@ _CONSTANTS = ("body_subtreemass", "body_invweight0", "dof_invweight0", "tendon_i
 
 
 def make_worlds(config: EnvConfig, impl: str, *, seed: int, first_env: int, num_envs: int) -> Env:
-    """The task, its worlds randomised where the configuration says so.
+    """The task with what the configuration puts around it, its worlds randomised if it says so.
 
     Args:
       config: task and randomisation.
@@ -59,7 +60,9 @@ def make_worlds(config: EnvConfig, impl: str, *, seed: int, first_env: int, num_
         source_sha256=config.source_sha256,
         rewards=config.rewards,
         settings=config.settings,
+        curriculum=config.curriculum == "on",
     )
+    env = observation_history(action_repeat(env, config.action_repeat), config.history)
     if config.randomize != "on":
         return env
     ranges = config.randomization

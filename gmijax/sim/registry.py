@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, Literal, overload
 from gmijax.config import EnvConfig
 from gmijax.errors import ConfigError
 from gmijax.sim import source
-from gmijax.sim.tasks.settings import SETTINGS, settings_from
+from gmijax.sim.tasks.settings import CURRICULA, SETTINGS, settings_from
 
 if TYPE_CHECKING:
     from gmijax.sim.interface import Env
@@ -70,13 +70,23 @@ def require_task(name: str, suite: str = "gmijax") -> None:
 def require_env(env: EnvConfig) -> None:
     """Raises ConfigError unless the task of a configuration may be had so; needs no jax."""
     require_task(str(env.name), env.suite)
-    _require_changes(str(env.name), env.suite, env.rewards, env.settings)
+    has_curriculum = env.curriculum == "on"
+    _require_changes(str(env.name), env.suite, env.rewards, env.settings, has_curriculum)
 
 
 def _require_changes(
-    name: str, suite: str, rewards: Mapping[str, float], settings: Mapping[str, float]
+    name: str,
+    suite: str,
+    rewards: Mapping[str, float],
+    settings: Mapping[str, float],
+    curriculum: bool,
 ) -> None:
-    """Raises ConfigError for settings that a task cannot have. Terms are known to its module."""
+    """Raises ConfigError for what a task cannot have. Terms are known to its module alone."""
+    if curriculum and suite != "custom" and not (suite == "gmijax" and name in CURRICULA):
+        raise ConfigError(
+            f"env.curriculum=on: {name} has none; allowed are {', '.join(CURRICULA)} and "
+            "env=PATH.py:FUNCTION"
+        )
     if suite == "gmijax":
         settings_from(SETTINGS[name], settings)
     elif suite in _PACKAGES:
@@ -99,6 +109,7 @@ def make_env(
     source_sha256: str | None = ...,
     rewards: Mapping[str, float] = ...,
     settings: Mapping[str, float] = ...,
+    curriculum: bool = ...,
     api: Literal["gmijax"] = ...,
 ) -> Env: ...
 
@@ -114,6 +125,7 @@ def make_env(
     source_sha256: str | None = ...,
     rewards: Mapping[str, float] = ...,
     settings: Mapping[str, float] = ...,
+    curriculum: bool = ...,
     api: Literal["brax"],
 ) -> Any: ...
 
@@ -128,6 +140,7 @@ def make_env(
     source_sha256: str | None = None,
     rewards: Mapping[str, float] = _NONE,
     settings: Mapping[str, float] = _NONE,
+    curriculum: bool = False,
     api: Literal["gmijax", "brax"] = "gmijax",
 ) -> Any:
     """Makes a task, with its time limit.
@@ -142,6 +155,7 @@ def make_env(
       source_sha256: digest of a custom task's file, which is not executed with another one.
       rewards: weights of terms of the reward by name, in place of the task's own.
       settings: numbers of the task by name (`gmijax.sim.tasks.settings`), as `rewards`.
+      curriculum: whether a world's episodes get harder as they succeed.
       api: `gmijax` for an `Env`, `brax` for a `brax.envs.Env` without a time limit, as Brax's
         wrappers want it.
 
@@ -158,20 +172,28 @@ def make_env(
         raise ConfigError(f"env.episode_length={episode_length}: must be at least 1")
     if suite == "gmijax" and ".py:" in name:
         suite = "custom"
-    if suite not in ("gmijax", *SUITES):
-        raise ConfigError(f"suite={suite}: allowed are gmijax, {', '.join(SUITES)}")
-    require_task(name, suite)
-    _require_changes(name, suite, rewards, settings)
-    given: dict[str, Any] = {"impl": impl, "max_envs": max_envs}
-    if suite not in _PACKAGES:
-        given |= {"rewards": rewards, "settings": settings}
-    if suite == "custom":
-        given["source_sha256"] = source_sha256
-    make = importlib.import_module(TASKS[name] if suite == "gmijax" else SUITES[suite]).make
-    env: Env = make(**given) if suite == "gmijax" else make(name, **given)
+    changes: dict[str, Any] = {"rewards": rewards, "settings": settings, "curriculum": curriculum}
+    noted = {"source_sha256": source_sha256} if suite == "custom" else {}
+    env = _make(name, suite, changes, impl=impl, max_envs=max_envs, **noted)
     if api == "brax":
         require_task("", "brax")
         return importlib.import_module("gmijax.sim.adapters.to_brax").BraxEnv(env)
     from gmijax.sim.wrappers import time_limit
 
     return time_limit(env, episode_length or env.spec.episode_length)
+
+
+def _make(name: str, suite: str, changes: Mapping[str, Any], **options: Any) -> Env:
+    """A task without its time limit; it gets those `changes` that are any."""
+    if suite not in ("gmijax", *SUITES):
+        raise ConfigError(f"suite={suite}: allowed are gmijax, {', '.join(SUITES)}")
+    require_task(name, suite)
+    _require_changes(name, suite, **changes)
+    options |= {key: value for key, value in changes.items() if value}
+    if suite == "gmijax":
+        env: Env = importlib.import_module(TASKS[name]).make(**options)
+    else:
+        env = importlib.import_module(SUITES[suite]).make(name, **options)
+    if changes["curriculum"] and env.next_episode is None:
+        raise ConfigError(f"env.curriculum=on: {env.spec.name} has no next_episode to carry it on")
+    return env

@@ -22,7 +22,7 @@ from gmijax.sim import physics
 from gmijax.sim.randomize import randomized
 from gmijax.sim.registry import TASKS
 from gmijax.sim.rewards import RewardTerm
-from gmijax.sim.tasks.settings import SETTINGS
+from gmijax.sim.tasks.settings import CURRICULA, SETTINGS
 from gmijax.sim.wrappers import BatchState, StepOutput
 
 
@@ -137,9 +137,12 @@ def test_every_setting_is_read_and_terms_without_weight_are_not_traced(
     read.clear()  # Of the checks of a new one.
     monkeypatch.setattr(module, "settings_from", lambda cls, given: settings)
     monkeypatch.setattr(module, "TERMS", terms)
-    env = module.make(impl=task.impl, max_envs=1, rewards=dict.fromkeys(terms, 0.0))
+    curriculum = {"curriculum": True} if name in CURRICULA else {}
+    env = module.make(impl=task.impl, max_envs=1, rewards=dict.fromkeys(terms, 0.0), **curriculum)
     state = jax.eval_shape(env.reset, env.model, jax.random.key(0))
     jax.eval_shape(env.step, env.model, state, task.actions(0)[0])
+    if curriculum:
+        assert jax.eval_shape(env.next_episode, env.model, state) == state
     assert env.spec.reward_terms == task.env.spec.reward_terms
     assert {field.name for field in dataclasses.fields(settings)} <= read
 

@@ -165,6 +165,7 @@ def test_an_environment_of_brax_brings_its_model_and_length():
             {"settings": {"x": 1}},
             r"^unknown key env\.settings\.x: allowed are death",
         ),
+        ("ant", {"curriculum": True}, "^env.curriculum=on: ant has none; allowed are anymal and"),
         ("ant", {"suite": "gym"}, "^suite=gym: allowed are gmijax, brax, playground, custom$"),
         ("ant", {"api": "gym"}, "^api=gym: allowed are gmijax, brax$"),
         ("ant", {"api": "brax", "episode_length": 3}, "give it to Brax's EpisodeWrapper"),

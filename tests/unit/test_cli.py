@@ -99,6 +99,9 @@ REFUSED: list[tuple[str, str, str]] = [
     ("train", "env=ant +env.settings.goal_m=1", "unknown key env.settings.goal_m: allowed are"),
     ("serve", "env=anymal env.settings.action_scale_rad=0 policy=random", "=0.0: must be greater"),
     ("train", "env=anymal env.settings.start_factor_min=2", "min=2.0: must be at most env.set"),
+    ("train", "env=ant env.curriculum=on", "env.curriculum=on: ant has none; allowed are anymal"),
+    ("train", "env.history=0", "env.history=0: must be at least 1"),
+    ("train", "env.action_repeat=0", "env.action_repeat=0: must be at least 1"),
     ("train", "reduce.intra=ipc plan.gmis_per_gpu=2", "reduce.intra=ipc: cannot run on layout"),
     (
         *("train", "reduce.strategy=mpr reduce.selection=measured"),

@@ -26,11 +26,12 @@ def make(
     source_sha256: str | None = None,
     rewards: Mapping[str, float] | None = None,
     settings: Mapping[str, float] | None = None,
+    curriculum: bool = False,
 ) -> Env:
     """Calls `FUNCTION(impl=..., max_envs=...)` of `PATH.py:FUNCTION`, and checks what it returns.
 
     With `source_sha256` a file of another digest is not executed. `rewards` and `settings` are
-    handed on where they are not empty.
+    handed on where they are not empty, `curriculum` where it is true.
 
     Raises:
       ConfigError: the file or the function cannot be had, it takes no such argument, it fails, or
@@ -43,7 +44,8 @@ def make(
         names = [key for key, value in vars(module).items() if inspect.isfunction(value)]
         raise ConfigError(f"env={name}: no function {function} there{suggestion(function, names)}")
     what = f"env={path.name}:{function}"
-    given = {name: dict(x) for name, x in (("rewards", rewards), ("settings", settings)) if x}
+    changes = {"rewards": rewards, "settings": settings, "curriculum": curriculum}
+    given = {key: value for key, value in changes.items() if value}
     for group in given:
         _require_argument(found, group, what)
     env = attempt(what, found, impl=impl, max_envs=max_envs, **given)
@@ -56,7 +58,7 @@ def _require_argument(function: Callable[..., Any], group: str, what: str) -> No
     kinds = inspect.signature(function).parameters
     takes_all = any(kind.kind is inspect.Parameter.VAR_KEYWORD for kind in kinds.values())
     if group not in kinds and not takes_all:
-        raise ConfigError(f"env.{group}: {what} has no argument `{group}` to take them")
+        raise ConfigError(f"env.{group}: {what} has no argument `{group}` to take it")
 
 
 def _load(path: Path, source_sha256: str | None) -> ModuleType:

@@ -49,11 +49,14 @@ class AnymalTask(NamedTuple):
       command: [3] wanted speed forwards and to the left, m/s, and of yaw, rad/s.
       velocity_error_sum: [] of the episode's steps so far, m/s.
       yaw_rate_error_sum: [] of the episode's steps so far, rad/s.
+      share: [] of the commands' ranges that `command` was drawn from, carried on from episode to
+        episode by the curriculum; None without one.
     """
 
     command: Array
     velocity_error_sum: Array
     yaw_rate_error_sum: Array
+    share: Array | None = None
 
 
 @dataclass(frozen=True)
@@ -93,6 +96,11 @@ TERMS = {
 }
 FLOOR = "floor"
 METRICS: tuple[str, ...] = ("velocity_error_m_per_s", "yaw_rate_error_rad_per_s")
+SHARE = "command_share"
+"""The metric of the curriculum."""
+
+SUCCESS_M_PER_S = 0.25
+"""Largest mean velocity error of an episode that succeeds."""
 
 
 def make(
@@ -101,8 +109,13 @@ def make(
     max_envs: int | None = None,
     rewards: Mapping[str, float] | None = None,
     settings: Mapping[str, float] | None = None,
+    curriculum: bool = False,
 ) -> Env:
-    """Makes the task without its time limit; see `gmijax.sim.registry.make_env`."""
+    """Makes the task without its time limit; see `gmijax.sim.registry.make_env`.
+
+    With `curriculum` the commands of a world begin with a part of their ranges, which grows with
+    every episode that succeeds.
+    """
     terms, chosen = with_weights(TERMS, rewards), settings_from(AnymalSettings, settings)
     world = physics.load("anymal", impl=impl, substeps=SUBSTEPS, max_envs=max_envs)
     ids = look_up(world.mj_model)
@@ -115,16 +128,24 @@ def make(
         control_dt_s=world.control_dt_s,
         episode_length=DEFAULT_EPISODE_LENGTH,
         reward_terms=term_names(terms, FLOOR),
-        metrics=METRICS,
+        metrics=(*METRICS, SHARE) if curriculum else METRICS,
     )
+
+    def begin(key: PRNGKey, share: Array | None) -> EnvState:
+        key, start_key, command_key = jax.random.split(key, 3)
+        start = world.start(*draw_start(ids, world.mj_model, start_key, chosen))
+        command = draw_command(command_key, chosen, share)
+        task = AnymalTask(command, jnp.zeros(()), jnp.zeros(()), share)
+        obs = observe(ids, start, task.command, jnp.zeros(ACTION_SIZE))
+        return episode.begin(spec, start, task, obs, key)
 
     def reset(model: PyTree, key: PRNGKey) -> EnvState:
         del model  # nothing that a reset draws depends on it
-        key, start_key, command_key = jax.random.split(key, 3)
-        start = world.start(*draw_start(ids, world.mj_model, start_key, chosen))
-        task = AnymalTask(draw_command(command_key, chosen), jnp.zeros(()), jnp.zeros(()))
-        obs = observe(ids, start, task.command, jnp.zeros(ACTION_SIZE))
-        return episode.begin(spec, start, task, obs, key)
+        return begin(key, jnp.float32(chosen.curriculum_start) if curriculum else None)
+
+    def next_episode(model: PyTree, ended: EnvState) -> EnvState:
+        del model
+        return begin(ended.key, next_share(ended, chosen.curriculum_growth))
 
     def step(model: PyTree, state: EnvState, action: Array) -> EnvState:
         action = jnp.clip(action, -1.0, 1.0)
@@ -141,7 +162,8 @@ def make(
         down = has_fallen(moved, knees)
         return episode.advance(state, moved, task, obs, reward, down, metrics)
 
-    return world.env(spec, reset, step)
+    env = world.env(spec, reset, step)
+    return env._replace(next_episode=next_episode) if curriculum else env
 
 
 def look_up(mj_model: mujoco.MjModel) -> AnymalIds:
@@ -170,8 +192,8 @@ def draw_start(
     )
 
 
-def draw_command(key: PRNGKey, settings: AnymalSettings) -> Array:
-    """Wanted speed forwards and to the left, m/s, and of yaw, rad/s [3]."""
+def draw_command(key: PRNGKey, settings: AnymalSettings, share: Array | None = None) -> Array:
+    """Wanted speed forwards and to the left, m/s, and of yaw, rad/s [3], from a `share` of all."""
     limits = jnp.array(
         (
             settings.command_forward_m_per_s,
@@ -179,7 +201,14 @@ def draw_command(key: PRNGKey, settings: AnymalSettings) -> Array:
             settings.command_yaw_rad_per_s,
         )
     )
+    limits = limits if share is None else share * limits
     return jax.random.uniform(key, (3,), minval=-limits, maxval=limits)
+
+
+def next_share(ended: EnvState, growth: float) -> Array:
+    """The share [] of the commands' ranges after an episode: more if it lasted and followed."""
+    succeeded = ended.truncated & (ended.metrics[METRICS[0]] <= SUCCESS_M_PER_S)
+    return jnp.minimum(ended.task.share + jnp.where(succeeded, growth, 0.0), 1.0)
 
 
 def gravity_direction(state: physics.PhysicsState) -> Array:
@@ -203,9 +232,11 @@ def add_errors(before: EnvState, view: AnymalView) -> tuple[AnymalTask, dict[str
         before.task.command,
         before.task.velocity_error_sum + view.velocity_error,
         before.task.yaw_rate_error_sum + view.yaw_rate_error,
+        before.task.share,
     )
     means = jnp.stack([task.velocity_error_sum, task.yaw_rate_error_sum]) / (before.steps + 1)
-    return task, dict(zip(METRICS, means, strict=True))
+    metrics = dict(zip(METRICS, means, strict=True))
+    return task, metrics if task.share is None else metrics | {SHARE: task.share}
 
 
 def not_below_zero(reward: tuple[Array, dict[str, Array]]) -> tuple[Array, dict[str, Array]]:

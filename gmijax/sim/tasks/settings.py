@@ -84,6 +84,16 @@ class AnymalSettings(TaskSettings):
         "start: noise of every joint's velocity, +-rad/s", default=0.1, low=0
     )
 
+    curriculum_start: float = doc(
+        "env.curriculum=on: share of the commands' ranges that a world begins with",
+        default=0.25,
+        low=0,
+        high=1,
+    )
+    curriculum_growth: float = doc(
+        "env.curriculum=on: added to that share by an episode that succeeds", default=0.25, low=0
+    )
+
     def __post_init__(self) -> None:
         super().__post_init__()
         self._require_order("start_factor_min", "start_factor_max")
@@ -164,3 +174,6 @@ SETTINGS: Mapping[str, type[TaskSettings]] = MappingProxyType(
     }
 )
 """Name of a task -> its settings."""
+
+CURRICULA = ("anymal",)
+"""Tasks whose `make` takes `curriculum=True`."""
