@@ -36,7 +36,7 @@ NEVER_ZERO = ("body_mass", "geom_friction", "pair_friction")
 
 @dataclass(frozen=True, kw_only=True)
 class LeafRange:
-    """How one leaf of the physics model is drawn, once for every world of the job."""
+    """How one leaf of the physics model is drawn."""
 
     operation: Literal["scale", "add", "set"] = doc(
         "what the drawn number does to the model's own value"
@@ -99,8 +99,9 @@ class EnvConfig(KeyGroup):
         "whether a world's episodes get harder as they succeed, in tasks that can (docs/tasks.md)",
         default="off",
     )
-    randomize: Literal["off", "on"] = doc(
-        "whether every world has a physics model of its own, drawn from env.randomization",
+    randomize: Literal["off", "on", "episode"] = doc(
+        "whether every world has a physics model of its own, drawn from env.randomization: once, "
+        "or for every episode",
         default="off",
     )
     randomization: Mapping[str, LeafRange] = dataclasses.field(
@@ -117,8 +118,10 @@ class EnvConfig(KeyGroup):
             )
         for leaf, drawn in self.randomization.items():
             drawn.check(leaf)
-        if self.randomize == "on" and not self.randomization:
-            raise ConfigError("env.randomize=on: env.randomization names nothing to draw")
+        if self.randomize != "off" and not self.randomization:
+            raise ConfigError(
+                f"env.randomize={self.randomize}: env.randomization names nothing to draw"
+            )
 
     @property
     def label(self) -> str:
