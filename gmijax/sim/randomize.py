@@ -68,7 +68,7 @@ def make_worlds(config: EnvConfig, impl: str, *, seed: int, first_env: int, num_
     env = observation_history(action_repeat(env, config.action_repeat), config.history)
     ranges = config.randomization
     if config.randomize == "episode":
-        return randomized_by_episode(env, ranges, seed=seed)
+        return randomized_by_episode(env, ranges, seed=seed, num_models=POOL)
     if config.randomize == "off":
         return env
     return randomized(env, ranges, seed=seed, first_env=first_env, num_envs=num_envs)
@@ -114,7 +114,7 @@ class Drawn(NamedTuple):
 
 
 def randomized_by_episode(
-    env: Env, ranges: Mapping[str, LeafRange], *, seed: int, num_models: int = POOL
+    env: Env, ranges: Mapping[str, LeafRange], *, seed: int, num_models: int
 ) -> Env:
     """The task with another model in every episode, one of `num_models` that all GMIs draw alike.
 
