@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import shutil
 from pathlib import Path
-from types import SimpleNamespace
 
 import pytest
 from rich.console import Console
 
 from gmijax.cli.command import command
-from gmijax.config import PlayConfig
+from gmijax.config import EnvConfig, PlayConfig
 from gmijax.config.schema import to_dict
 from gmijax.control import evaluation, pictures
 from gmijax.errors import ConfigError, GmijaxError
@@ -89,7 +88,7 @@ def test_a_checkpoint_that_cannot_be_meant_is_bad_input(
 
 
 def test_worlds_cannot_be_drawn_from_no_ranges(run: RunPaths, monkeypatch: pytest.MonkeyPatch):
-    env = SimpleNamespace(name="ant", suite="gmijax", randomization={})
+    env = EnvConfig(name="ant", episode_length=9)
     monkeypatch.setattr(evaluation, "trained_config", lambda checkpoint: (env, None))
     config = config_of(f"run.dir={run.root}", "randomize=on")
     with pytest.raises(ConfigError, match="names nothing to draw"):
