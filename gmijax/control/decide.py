@@ -15,7 +15,7 @@ from gmijax.partition.plan import Plan
 from gmijax.partition.planner import make_plan
 from gmijax.sim import source
 from gmijax.sim.impl import choose_impl
-from gmijax.sim.registry import require_task
+from gmijax.sim.registry import require_env
 from gmijax.supervise.kinds import training_plan
 
 C = TypeVar("C", TrainConfig, ServeConfig)
@@ -31,8 +31,8 @@ class Decided(NamedTuple, Generic[C]):
 
 
 def with_task(config: C) -> C:
-    """With its task pinned; raises ConfigError for none, or a file that a run did not note."""
-    require_task(str(config.env.name), config.env.suite)
+    """With its task pinned; raises ConfigError as `require_env` and `source.pinned`."""
+    require_env(config.env)
     return dataclasses.replace(config, env=source.pinned(config.env))
 
 

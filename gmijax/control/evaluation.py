@@ -30,7 +30,7 @@ from gmijax.runs.resume import (
     trained_config,
 )
 from gmijax.sim import source
-from gmijax.sim.registry import require_task
+from gmijax.sim.registry import require_env
 from gmijax.supervise.kinds import JobKind
 from gmijax.supervise.launcher import Launch, run_gmis
 from gmijax.supervise.supervisor import Timeouts
@@ -108,7 +108,7 @@ def open_run(config: C) -> tuple[C, EnvConfig, str | None]:
     checkpoint = _find(config)
     saved, _ = trained_config(checkpoint)
     env = source.opened(saved, config.run.env)
-    require_task(str(env.name), env.suite)
+    require_env(env)
     run = dataclasses.replace(config.run, dir=str(checkpoint.parents[1]))
     if env.suite == "custom":
         run = dataclasses.replace(run, env=env.name, env_sha256=env.source_sha256)

@@ -137,10 +137,15 @@ def _with_checkpoint(config: ServeConfig) -> ServeConfig:
         return config
     checkpoint = find_checkpoint(config.run.dir, "run.dir")
     meta = CheckpointMeta.read(checkpoint)
-    trained_config(checkpoint)  # What is broken shows here, and not in every GMI.
+    trained, _ = trained_config(checkpoint)  # What is broken shows here, and not in every GMI.
     if meta.env != config.env.label:
         raise ConfigError(
             f"env={config.env.label}: run.dir={config.run.dir} was trained on {meta.env}"
+        )
+    if trained.history != config.env.history:
+        raise ConfigError(
+            f"env.history={config.env.history}: run.dir={config.run.dir} was trained with "
+            f"{trained.history}"
         )
     physics = config.physics
     if physics.impl == "auto" and meta.impl == "jax":

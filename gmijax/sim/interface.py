@@ -92,6 +92,10 @@ class Env(NamedTuple):
         if nothing can overflow.
       model_axes: `in_axes` of `model` for `vmap` over worlds: None if they share it, else a tree
         with 0 at the leaves that have a leading axis [N] (see `gmijax.sim.randomize`).
+      next_episode: `(model, ended EnvState) -> EnvState`, the episode that follows one of the same
+        world, for tasks that carry something on in `task`, such as the level of a curriculum.
+        None: `reset(model, ended.key)`. Of a world that diverged `task` is that of one step
+        earlier.
     """
 
     spec: EnvSpec
@@ -103,3 +107,4 @@ class Env(NamedTuple):
     max_envs: int | None = None
     overflow: Callable[[EnvState], Array] | None = None
     model_axes: PyTree = None
+    next_episode: Callable[[PyTree, EnvState], EnvState] | None = None

@@ -44,7 +44,8 @@ def _run(link: ChildLink) -> None:
     from gmijax.sim.randomize import make_worlds
 
     impl = _impl(config, checkpoint, env_config)
-    played = dataclasses.replace(env_config, randomize=config.randomize)
+    # At its full range: what was learnt in the end is what counts.
+    played = dataclasses.replace(env_config, randomize=config.randomize, curriculum="off")
     env = make_worlds(played, impl, seed=config.seed, first_env=0, num_envs=config.num_envs)
     _check_camera(config.camera, env)
     learner = make_learner(env.spec, algo)

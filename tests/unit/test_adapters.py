@@ -175,6 +175,18 @@ def test_an_environment_of_brax_brings_its_model_and_length():
             {"suite": "brax", "impl": "warp"},
             r"^physics\.impl=warp: .*allowed are auto, jax",
         ),
+        ("ant", {"suite": "brax", "rewards": {"a": 1}}, r"^env\.rewards\.a: not with env=brax"),
+        (
+            "ant",
+            {"rewards": {"enrgy": 1}},
+            r"^unknown key env\.rewards\.enrgy: did you mean",
+        ),
+        (
+            "ant",
+            {"settings": {"x": 1}},
+            r"^unknown key env\.settings\.x: allowed are death",
+        ),
+        ("ant", {"curriculum": True}, "^env.curriculum=on: ant has none; allowed are anymal and"),
         ("ant", {"suite": "gym"}, "^suite=gym: allowed are gmijax, brax, playground, custom$"),
         ("ant", {"api": "gym"}, "^api=gym: allowed are gmijax, brax$"),
         ("ant", {"api": "brax", "episode_length": 3}, "give it to Brax's EpisodeWrapper"),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import importlib
 from typing import Any
 
 import jax.numpy as jnp
@@ -13,7 +14,8 @@ from gmijax.config import ADAPTIVE_LEARNING_RATE_RANGE, TrainConfig
 from gmijax.config.schema import from_dict, to_dict
 from gmijax.errors import ConfigError
 from gmijax.learning.learner import adapted_learning_rate
-from gmijax.sim.registry import task_names
+from gmijax.sim.registry import TASKS, task_names
+from gmijax.sim.tasks.settings import SETTINGS
 
 
 def test_numbers_are_finite():
@@ -73,6 +75,20 @@ def test_a_default_is_the_same_in_code_and_on_the_command_line(group: str):
 def test_evaluations_that_cannot_be_are_refused(overrides: tuple[str, ...], message: str):
     with pytest.raises(ConfigError, match=message):
         compose(*overrides)
+
+
+@pytest.mark.parametrize("task", task_names())
+def test_weights_and_settings_are_those_of_the_task(task: str):
+    composed = compose(f"env={task}").env
+    terms = importlib.import_module(TASKS[task]).TERMS
+    assert composed.rewards == {name: term.weight for name, term in terms.items()}
+    assert composed.settings == dataclasses.asdict(SETTINGS[task]())
+
+
+def test_names_of_a_custom_task_are_free():
+    told = ("env=some.py:make", "env.rewards.near=2", "env.settings.length_m=0.5")
+    config = compose(*told).env
+    assert (config.rewards, config.settings) == ({"near": 2.0}, {"length_m": 0.5})
 
 
 # Hidden layers in Table 5 of the paper; 256:128:64 for all others.

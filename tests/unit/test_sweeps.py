@@ -70,9 +70,13 @@ def test_lists_become_every_combination(
 
 def test_jobs_have_the_configuration_of_the_same_single_training() -> None:
     lists = ("env=ant,ball_balance", "seed=0,1", "algo.policy_hidden_layer_sizes=[8,8],[4]")
-    for job in build_sweep((*lists, "num_envs=512")).jobs:
-        told = [f"{key}={value}" for key, value in job.overrides.items()]
-        assert job.config == compose(*told, "num_envs=512")
+    weights = ("env=ant", "env.rewards.energy=-0.1,-0.2", "env.settings.death_reward=-1")
+    own = ("env=some.py:make", "env.rewards.near=1,2")
+    for sweep in (lists, weights, own):
+        for job in build_sweep((*sweep, "num_envs=512")).jobs:
+            told = [f"{key}={value}" for key, value in job.overrides.items()]
+            fixed = [text for text in sweep if "," not in text]
+            assert job.config == compose(*fixed, *told, "num_envs=512")
 
 
 @pytest.mark.parametrize(

@@ -44,6 +44,12 @@ def check_env(env: Any, what: str) -> None:
     _check_state(env, moved, key, f"{what}: step")
     if change := _change(state, moved):
         raise ConfigError(f"{what}: step must keep all shapes and dtypes, but {change}")
+    if env.next_episode is not None:
+        again = attempt(
+            f"{what}: next_episode", jax.eval_shape, env.next_episode, env.model, moved
+        )
+        if change := _change(state, again):
+            raise ConfigError(f"{what}: next_episode must give what reset does, but {change}")
     _check_qpos(env, state, what)
 
 
