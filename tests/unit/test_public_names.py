@@ -23,6 +23,7 @@ def test_an_unknown_name_is_an_attribute_error() -> None:
 
 def test_the_controller_loads_neither_jax_nor_mujoco() -> None:
     modules = "gmijax, gmijax.train, gmijax.serve, gmijax.search, gmijax.play, gmijax.doctor"
+    modules += ", gmijax.demo, gmijax.list_envs, gmijax.__main__"
     code = f"import {modules}, sys; print({{'jax', 'mujoco', 'flax'}} & sys.modules.keys())"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "set()"
