@@ -24,6 +24,7 @@ from gmijax.control.summary import train_outcome, train_summary
 from gmijax.machine.snapshot import detect_machine
 from gmijax.partition.plan import Plan
 from gmijax.runs.folder import RunPaths, add_event, locked, read_json, write_json
+from gmijax.runs.git import record_git
 from gmijax.runs.history import MetricsReader, copy_history, draw_returns
 from gmijax.runs.resume import CheckpointMeta, saved_config
 from gmijax.sim import source
@@ -70,6 +71,7 @@ def train(config: TrainConfig, *, show: bool = False) -> Result:
         changed = source.changes(config.env, saved_config(beginning.checkpoint)["env"])
     run = beginning.open(config)
     with locked(run.lock, f"run.dir={run.root}"):
+        record_git(run, Path.cwd())
         what = (
             f"{plan.num_envs_per_gmi} environments per GMI, template {plan.template}, reduction "
             f"{plan.strategy}"
