@@ -85,6 +85,8 @@ class RunPaths(_Folder):
         self.lock = root / ".lock"  # Held by the job that writes into the folder.
         self.git = root / "git.json"  # Commit and branch of the user's code.
         self.git_diff = root / "git.diff"  # Its changes since that commit.
+        self.wandb = root / "wandb.json"  # Its run at Weights & Biases, and how far that is.
+        self.wandb_log = root / "wandb.log"  # Errors of sending to it; gone without any.
         self.events = root / "events.jsonl"  # Starts, faults and restarts of the job.
         self.search_report = root / "search.json"
         self.search_png = root / "search.png"
