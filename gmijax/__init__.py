@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from gmijax.roles.launch import launch
     from gmijax.roles.manager import GMIManager, plan
     from gmijax.roles.role import Role
-    from gmijax.sim.registry import make_env, task_names
+    from gmijax.sim.registry import make_env, make_vector_env, task_names
     from gmijax.sweeps.sweep import SweepResult, sweep
 
 __all__ = [
@@ -32,6 +32,7 @@ __all__ = [
     "compose",
     "launch",
     "make_env",
+    "make_vector_env",
     "plan",
     "search",
     "serve",
@@ -49,6 +50,7 @@ _HOMES = {
     "compose": "gmijax.cli.compose",
     "launch": "gmijax.roles.launch",
     "make_env": "gmijax.sim.registry",
+    "make_vector_env": "gmijax.sim.registry",
     "plan": "gmijax.roles.manager",
     "search": "gmijax.control.searching",
     "serve": "gmijax.control.serving",
