@@ -70,8 +70,13 @@ def task_of(name: str) -> Task:
         and isinstance(node.value, ast.Constant)
     }
     about = (ast.get_docstring(module) or "").splitlines()[0].partition(" (")[0]
-    sizes = (numbers.get(x) for x in ("OBS_SIZE", "ACTION_SIZE", "DEFAULT_EPISODE_LENGTH"))
-    return Task(name, *sizes, about.partition(": ")[2].rstrip("."))
+    return Task(
+        name,
+        numbers.get("OBS_SIZE"),
+        numbers.get("ACTION_SIZE"),
+        numbers.get("DEFAULT_EPISODE_LENGTH"),
+        about.partition(": ")[2].rstrip("."),
+    )
 
 
 def suite_lines() -> list[str]:

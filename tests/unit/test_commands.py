@@ -86,10 +86,11 @@ def test_nothing_heavy_is_imported_before_the_verb_is_known():
 @pytest.mark.parametrize("name", TASKS)
 def test_listed_sizes_are_those_that_the_task_describes(name: str):
     task = task_of(name)
-    described = importlib.import_module(TASKS[name])
-    assert f"Observation [{task.obs_size}]" in described.__doc__
-    assert f"Action [{task.action_size}]" in described.__doc__
-    assert task.episode_length == described.DEFAULT_EPISODE_LENGTH
+    module = importlib.import_module(TASKS[name])
+    described = str(module.__doc__)
+    assert f"Observation [{task.obs_size}]" in described
+    assert f"Action [{task.action_size}]" in described
+    assert task.episode_length == module.DEFAULT_EPISODE_LENGTH
     assert task.description
 
 

@@ -55,8 +55,8 @@ class GmijaxVectorEnv(VectorEnv[Array, Array, Array]):
         """Starts new episodes in all worlds; without a seed others than before."""
         super().reset(seed=seed, options=options)
         key = jax.random.key(int(self.np_random.integers(2**31)))
-        self._state = self._init(self._model, env_keys(key, 0, self.num_envs))
-        return self._state.env.obs, {}
+        self._state = state = self._init(self._model, env_keys(key, 0, self.num_envs))
+        return state.env.obs, {}
 
     def step(self, actions: Array) -> tuple[Array, Array, Array, Array, dict[str, Any]]:
         """One control step of all worlds under actions [N, A]."""
@@ -67,9 +67,10 @@ class GmijaxVectorEnv(VectorEnv[Array, Array, Array]):
             raise gym.error.InvalidAction(
                 f"actions of shape {actions.shape}: expected {self.action_space.shape}"
             )
-        self._state, out = self._step(self._model, self._state, actions)
+        state, out = self._step(self._model, self._state, actions)
+        self._state = state
         info = {FINAL_OBS: out.next_obs, f"_{FINAL_OBS}": out.terminated | out.truncated}
-        return self._state.env.obs, out.reward, out.terminated, out.truncated, info
+        return state.env.obs, out.reward, out.terminated, out.truncated, info
 
 
 def vector_env(
