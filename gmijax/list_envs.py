@@ -62,13 +62,13 @@ def task_of(name: str) -> Task:
     assert spec is not None
     assert spec.origin is not None
     module = ast.parse(Path(spec.origin).read_text())
-    numbers = {
-        node.targets[0].id: node.value.value
-        for node in module.body
-        if isinstance(node, ast.Assign)
-        and isinstance(node.targets[0], ast.Name)
-        and isinstance(node.value, ast.Constant)
-    }
+    numbers: dict[str, int] = {}
+    for node in module.body:
+        match node:
+            case ast.Assign(targets=[ast.Name(id=key)], value=ast.Constant(value=int(number))):
+                numbers[key] = number
+            case _:
+                pass
     about = (ast.get_docstring(module) or "").splitlines()[0].partition(" (")[0]
     return Task(
         name,
