@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from gmijax.roles.launch import launch
     from gmijax.roles.manager import GMIManager, plan
     from gmijax.roles.role import Role
-    from gmijax.sim.registry import make_env, task_names
+    from gmijax.sim.registry import make_env, make_vector_env, task_names
     from gmijax.sweeps.sweep import SweepResult, sweep
 
 __all__ = [
@@ -34,6 +34,7 @@ __all__ = [
     "launch",
     "load_policy",
     "make_env",
+    "make_vector_env",
     "plan",
     "search",
     "serve",
@@ -52,6 +53,7 @@ _HOMES = {
     "launch": "gmijax.roles.launch",
     "load_policy": "gmijax.deploy.policy",
     "make_env": "gmijax.sim.registry",
+    "make_vector_env": "gmijax.sim.registry",
     "plan": "gmijax.roles.manager",
     "search": "gmijax.control.searching",
     "serve": "gmijax.control.serving",

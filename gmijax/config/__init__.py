@@ -29,6 +29,7 @@ from gmijax.config.run import RunConfig
 from gmijax.config.search import AUTO, SearchConfig
 from gmijax.config.serve import OutputConfig, ServeConfig, ServeRunConfig
 from gmijax.config.train import ALGORITHMS, AlgoConfig, TrainConfig
+from gmijax.config.wandb import WandbConfig
 
 __all__ = [
     "ADAPTIVE_LEARNING_RATE_RANGE",
@@ -57,4 +58,5 @@ __all__ = [
     "StrategyName",
     "TemplateName",
     "TrainConfig",
+    "WandbConfig",
 ]

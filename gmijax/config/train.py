@@ -13,6 +13,7 @@ from gmijax.config.plan import PlanConfig, ReduceConfig
 from gmijax.config.run import RunConfig
 from gmijax.config.schema import KeyGroup, doc
 from gmijax.config.search import SearchConfig
+from gmijax.config.wandb import WandbConfig
 from gmijax.errors import ConfigError
 
 AlgoConfig: TypeAlias = PpoConfig | A3cConfig
@@ -34,6 +35,7 @@ class TrainConfig(KeyGroup):
     run: RunConfig
     eval: EvalConfig
     search: SearchConfig
+    wandb: WandbConfig
     num_envs: int | Literal["auto"] = doc(
         "N, environments per GMI; auto: what a search finds (docs/search.md)", low=1
     )

@@ -21,9 +21,11 @@ from gmijax.control.decide import Decided, decide, with_task
 from gmijax.control.restarts import Attempts, clear_unfinished, with_gpus_left
 from gmijax.control.start_point import StartPoint, find_start_point
 from gmijax.control.summary import train_outcome, train_summary
+from gmijax.control.wandb_link import followed, require_wandb
 from gmijax.machine.snapshot import detect_machine
 from gmijax.partition.plan import Plan
 from gmijax.runs.folder import RunPaths, add_event, locked, read_json, write_json
+from gmijax.runs.git import record_git
 from gmijax.runs.history import MetricsReader, copy_history, draw_returns
 from gmijax.runs.resume import CheckpointMeta, saved_config
 from gmijax.sim import source
@@ -59,6 +61,7 @@ def train(config: TrainConfig, *, show: bool = False) -> Result:
     """
     started_s = time.monotonic()
     config = with_task(config)
+    require_wandb(config)
     beginning = find_start_point(config)
     console = open_console(show=show)
     if beginning.is_complete and beginning.folder is not None:
@@ -70,6 +73,7 @@ def train(config: TrainConfig, *, show: bool = False) -> Result:
         changed = source.changes(config.env, saved_config(beginning.checkpoint)["env"])
     run = beginning.open(config)
     with locked(run.lock, f"run.dir={run.root}"):
+        record_git(run, Path.cwd())
         what = (
             f"{plan.num_envs_per_gmi} environments per GMI, template {plan.template}, reduction "
             f"{plan.strategy}"
@@ -108,7 +112,11 @@ class _Job:
             draw_returns(run.metrics, run.returns_png, f"{config.env.label}, {config.algo.name}")
 
         write_json(run.plan, self._plan.to_dict())
-        with recorded(run, partial(_what_is_left, run), record):
+        # Recorded first, so that the summary is sent too.
+        with (
+            followed(config, run, beginning.checkpoint, self._console.print),
+            recorded(run, partial(_what_is_left, run), record),
+        ):
             self._prepare(beginning)
             with progress:
                 self._attempts.run_to_the_end(beginning.checkpoint, progress.update)

@@ -20,7 +20,7 @@ from gmijax.learning.physics_health import (
     overflow_line,
 )
 from gmijax.runs.folder import RunPaths
-from gmijax.runs.history import read_metrics
+from gmijax.runs.history import read_metrics, scalars
 
 WINDOW_EPISODES = 100
 """Means over episodes are taken over at least this many of the latest ones."""
@@ -97,11 +97,8 @@ class TensorBoardSink:
         """Takes one iteration's metrics; `env_steps` is the x axis."""
         steps = int(line["env_steps"] or 0)
         values = [
-            self._summary.Value(
-                tag=name if "/" in name else f"train/{name}", simple_value=float(value)
-            )
-            for name, value in line.items()
-            if value is not None and name != "env_steps"
+            self._summary.Value(tag=name, simple_value=value)
+            for name, value in scalars(line).items()
         ]
         summary = self._summary(value=values)
         self._writer.write_event(self._event(wall_time=time.time(), step=steps, summary=summary))

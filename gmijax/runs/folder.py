@@ -1,6 +1,7 @@
 """Every file name of a run folder, and how files in it are written. No jax here.
 
 `<run>/config.json plan.json summary.json metrics.jsonl events.jsonl returns.png tensorboard/`
+`<run>/git.json git.diff`
 `<run>/checkpoints/<12-digit env steps>/meta.json`
 `<run>/gmi_<id>/{stdout.log,stderr.log,error.json,result.json,metrics.jsonl}`
 `<run>/gmi_<id>/attempt_<n>/`: the same files of attempts that failed
@@ -83,6 +84,10 @@ class RunPaths(_Folder):
         self.mps = root / "mps"  # Logs of MPS daemons that the job starts.
         self.janitor_log = root / "janitor.log"  # Errors of the janitor; gone without any.
         self.lock = root / ".lock"  # Held by the job that writes into the folder.
+        self.git = root / "git.json"  # Commit and branch of the user's code.
+        self.git_diff = root / "git.diff"  # Its changes since that commit.
+        self.wandb = root / "wandb.json"  # Its run at Weights & Biases, and how far that is.
+        self.wandb_log = root / "wandb.log"  # Errors of sending to it; gone without any.
         self.events = root / "events.jsonl"  # Starts, faults and restarts of the job.
         self.search_report = root / "search.json"
         self.search_png = root / "search.png"

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -50,6 +50,15 @@ class MetricsReader:
         complete = new[: new.rfind(b"\n") + 1]
         self._offset += len(complete)
         return [json.loads(line) for line in complete.splitlines()]
+
+
+def scalars(line: Mapping[str, float | int | None]) -> dict[str, float]:
+    """The numbers of a line by the names of their curves; `env_steps` is the x axis."""
+    return {
+        name if "/" in name else f"train/{name}": float(value)
+        for name, value in line.items()
+        if value is not None and name != "env_steps"
+    }
 
 
 def draw_returns(metrics: Path, picture: Path, title: str) -> bool:

@@ -14,6 +14,8 @@ from gmijax.sim import source
 from gmijax.sim.tasks.settings import CURRICULA, SETTINGS, settings_from
 
 if TYPE_CHECKING:
+    from gymnasium.vector import VectorEnv
+
     from gmijax.sim.interface import Env
 
 TASKS: Mapping[str, str] = MappingProxyType(
@@ -181,6 +183,52 @@ def make_env(
     from gmijax.sim.wrappers import time_limit
 
     return time_limit(env, episode_length or env.spec.episode_length)
+
+
+def make_vector_env(
+    name: str,
+    num_envs: int,
+    *,
+    arrays: Literal["numpy", "torch", "jax"] = "numpy",
+    suite: str = "gmijax",
+    impl: str = "auto",
+    episode_length: int | None = None,
+) -> VectorEnv[Any, Any, Any]:
+    """Makes N environments with Gymnasium's interface, for training with another library.
+
+    Example:
+      >>> envs = make_vector_env("ant", 4096, arrays="torch")
+      >>> obs, info = envs.reset(seed=0)
+
+    Args:
+      name: see `make_env`.
+      num_envs: N.
+      arrays: what goes in and comes out: of `torch` on the GPU of jax without a copy (DLPack),
+        where both use one.
+      suite: see `make_env`.
+      impl: see `make_env`.
+      episode_length: see `make_env`.
+
+    Returns:
+      A `gmijax.sim.adapters.to_gymnasium.GmijaxVectorEnv`, for other arrays than those of jax
+      in a wrapper of Gymnasium. It starts over in the step that ends an episode, and has the last
+      observation in `info["final_obs"]`.
+
+    Raises:
+      ConfigError: as `make_env`; `num_envs` below 1; a package that is not installed.
+    """
+    if arrays not in ("numpy", "torch", "jax"):
+        raise ConfigError(f"arrays={arrays}: allowed are numpy, torch, jax")
+    if num_envs < 1:
+        raise ConfigError(f"num_envs={num_envs}: must be at least 1")
+    if importlib.util.find_spec("gymnasium") is None:
+        raise ConfigError("make_vector_env: needs gymnasium (pip install 'gmijax[gymnasium]')")
+    if importlib.util.find_spec(arrays) is None:
+        raise ConfigError(f"arrays={arrays}: needs the package {arrays}")
+    env = make_env(name, suite=suite, impl=impl, episode_length=episode_length, max_envs=num_envs)
+    return importlib.import_module("gmijax.sim.adapters.to_gymnasium").vector_env(
+        env, num_envs, arrays
+    )
 
 
 def _make(name: str, suite: str, changes: Mapping[str, Any], **options: Any) -> Env:

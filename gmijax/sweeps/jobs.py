@@ -124,7 +124,7 @@ class Job:
     def program(self) -> str:
         """The same for jobs that compile the same programs."""
         data = to_dict(self.config)
-        for key in ("run", "seed", "num_timesteps", "search"):
+        for key in ("run", "seed", "num_timesteps", "search", "wandb"):
             del data[key]
         data["plan"].pop("memory_fraction")
         return repr(data)
@@ -193,7 +193,9 @@ def placed(job: Job, run: RunPaths, place: Place, backend: BackendName) -> Train
         self_check="off" if wanted.self_check == "auto" else wanted.self_check,
     )
     own = dataclasses.replace(job.config.run, dir=str(run.root), name=None, resume="auto")
-    return dataclasses.replace(job.config, plan=plan, run=own)
+    wandb = job.config.wandb
+    wandb = dataclasses.replace(wandb, group=wandb.group or run.root.parent.name)
+    return dataclasses.replace(job.config, plan=plan, run=own, wandb=wandb)
 
 
 def state_of(run: RunPaths, config: TrainConfig) -> State:

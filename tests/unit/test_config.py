@@ -54,7 +54,7 @@ def test_limits_are_those_of_the_learner(end: int):
     assert float(kept) == pytest.approx(limit)
 
 
-@pytest.mark.parametrize("group", ["plan", "reduce", "run", "eval", "search", "channel"])
+@pytest.mark.parametrize("group", ["plan", "reduce", "run", "eval", "search", "channel", "wandb"])
 def test_a_default_is_the_same_in_code_and_on_the_command_line(group: str):
     """But for groups whose defaults differ from task to task."""
     composed = getattr(compose(), group)

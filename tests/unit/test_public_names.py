@@ -22,7 +22,17 @@ def test_an_unknown_name_is_an_attribute_error() -> None:
 
 
 def test_the_controller_loads_neither_jax_nor_mujoco() -> None:
-    commands = ("train", "serve", "search", "play", "export", "doctor")
+    commands = (
+        "train",
+        "serve",
+        "search",
+        "play",
+        "export",
+        "doctor",
+        "demo",
+        "list_envs",
+        "__main__",
+    )
     modules = ", ".join(("gmijax", *(f"gmijax.{name}" for name in commands)))
     code = f"import {modules}, sys; print({{'jax', 'mujoco', 'flax'}} & sys.modules.keys())"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)

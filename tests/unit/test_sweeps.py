@@ -192,6 +192,7 @@ def test_jobs_divide_the_memory_of_a_gpu(
     assert config.plan.memory_fraction == fraction
     assert config.plan.backend == "mps"
     assert (config.run.dir, config.run.resume) == (str(tmp_path / "007"), "auto")
+    assert config.wandb.group == tmp_path.name
 
 
 def test_too_many_jobs_for_the_machine_are_refused() -> None:
