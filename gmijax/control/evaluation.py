@@ -27,8 +27,8 @@ from gmijax.runs.resume import CheckpointMeta, find_checkpoint, trained_config
 from gmijax.sim import source
 from gmijax.sim.registry import require_task
 from gmijax.supervise.kinds import JobKind
+from gmijax.supervise.launch import Timeouts
 from gmijax.supervise.launcher import Launch, run_gmis
-from gmijax.supervise.supervisor import Timeouts
 
 MEMORY_FRACTION: Final = 0.1
 """Most of a GPU's memory that playing takes: beside a training job that reserves 0.8."""

@@ -24,9 +24,9 @@ from gmijax.partition.plan import Plan
 from gmijax.runs.folder import RunPaths, add_event, remove_temporary
 from gmijax.runs.history import copy_history
 from gmijax.runs.resume import CheckpointMeta, newest_checkpoint
-from gmijax.supervise.gmi_process import GmiStatus
 from gmijax.supervise.kinds import training_plan
 from gmijax.supervise.launcher import Launch, OnTick, StopSignals, run_gmis, stop_signals
+from gmijax.supervise.watched_gmi import GmiStatus
 
 _LASTING = ("NonFiniteError", "ParameterMismatch", "SelfCheckFailed")
 """Errors of a GMI that the next attempt would meet too."""
