@@ -13,6 +13,7 @@ from gmijax.config.algo import (
     PpoConfig,
 )
 from gmijax.config.channel import ChannelConfig
+from gmijax.config.cluster import ClusterConfig
 from gmijax.config.env import EnvConfig, PhysicsConfig
 from gmijax.config.plan import (
     BackendName,
@@ -37,6 +38,7 @@ __all__ = [
     "AlgoConfig",
     "BackendName",
     "ChannelConfig",
+    "ClusterConfig",
     "EnvConfig",
     "OutputConfig",
     "PhysicsConfig",
