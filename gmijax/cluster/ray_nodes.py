@@ -207,8 +207,6 @@ def _end_with(process: ProcessId) -> None:
 
 
 def _import_ray() -> Any:
-    # Its defaults for a user at a terminal: notes on its environment variables, usage reports.
-    os.environ.setdefault("RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO", "0")
     try:
         import ray
         import ray.util.scheduling_strategies

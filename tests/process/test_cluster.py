@@ -108,15 +108,6 @@ def test_two_nodes_learn_the_bits_of_two_gpus_of_one_machine(
     assert not pids_of(there)
 
 
-def test_more_nodes_than_there_are_is_one_line(cluster: Cluster, tmp_path: Path) -> None:
-    wanted = ("cluster.nodes=3", "cluster.wait_s=0", "run.dir=run")
-    done = train(*POINT, TWO, RAY, cluster.address, *wanted, cwd=tmp_path)
-    assert done.returncode == 2, done.stderr
-    [line] = done.stderr.splitlines()
-    assert "cluster.nodes=3: the cluster has 2 nodes with 2 CPUs" in line
-    assert not (tmp_path / "run").exists()
-
-
 def test_a_job_outlives_a_gmi_and_a_node_and_nothing_outlives_its_controller(
     cluster: Cluster, tmp_path: Path
 ) -> None:

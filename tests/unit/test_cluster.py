@@ -106,6 +106,32 @@ def test_without_ray_or_a_cluster_the_line_says_what_to_do(
         RayCluster(ClusterConfig())
 
 
+def test_fewer_nodes_than_asked_for_are_refused_once_the_wait_is_over(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    class Ray:
+        is_initialized = staticmethod(lambda: True)
+
+        @staticmethod
+        def nodes() -> list[dict[str, Any]]:
+            return [
+                {"Alive": True, "Resources": {"CPU": 4.0}},
+                {"Alive": True, "Resources": {"CPU": 1.0}},
+                {"Alive": False, "Resources": {"CPU": 4.0}},
+            ]
+
+        @staticmethod
+        def wait(*_: Any, **__: Any) -> None:
+            """Nothing is asked."""
+
+    monkeypatch.setattr(ray_nodes, "_import_ray", Ray)
+    cluster = RayCluster(ClusterConfig(wait_s=0.0))
+    with pytest.raises(ConfigError, match="nodes=2: the cluster has 1 nodes with 2 CPUs, and no"):
+        cluster.join(2, 2)
+    with pytest.raises(ConfigError, match="nodes=auto: the cluster has 0 nodes with 8 CPUs"):
+        cluster.join(8, None)
+
+
 def test_nodes_with_other_versions_are_refused() -> None:
     job = a_job(a_node(), {**own_versions(), "jax": "0.1"})
     with pytest.raises(ConfigError, match=r"node 10\.0\.0\.2 has jax 0\.1, this one has"):
