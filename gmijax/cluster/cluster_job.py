@@ -40,6 +40,7 @@ class ClusterJob:
     def __init__(self, config: TrainConfig) -> None:
         self._config = config
         self._joined: list[Joined] = []
+        self._signals: StopSignals | None = None
         self._num_cpus = num_gmis_of(config.plan)[0]
 
     def __enter__(self) -> Self:
@@ -69,9 +70,14 @@ class ClusterJob:
 
         Raises:
           ConfigError: as `join`; fewer nodes, and the job may not go on with them.
+          JobInterrupted: a signal came.
         """
+        least, signals = 1 if elastic else num_nodes, self._signals
         self._joined = self._cluster.join(
-            self._num_cpus, num_nodes, least=1 if elastic else num_nodes
+            self._num_cpus,
+            num_nodes,
+            least=least,
+            is_unwanted=lambda: signals is not None and signals.have_come,
         )
         self._require_alike()
         return self._machines()
@@ -82,6 +88,7 @@ class ClusterJob:
         Raises:
           GmiFailed, ConfigError, JobInterrupted: as `run_gmis`.
         """
+        self._signals = signals
         sent = dataclasses.replace(launch, on_warning=print, is_enough=None)
         token, addresses = secrets.token_bytes(32), []
         for place, (node, facts) in enumerate(self._joined):

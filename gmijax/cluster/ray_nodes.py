@@ -3,17 +3,18 @@
 from __future__ import annotations
 
 import os
+import signal
 import socket
 import threading
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from typing import Any, Final, NamedTuple
 
 from gmijax.cluster.node import Facts, Node
 from gmijax.cluster.remote_gmi import LOST_S, RemoteNode
 from gmijax.config import ClusterConfig
-from gmijax.errors import ConfigError
+from gmijax.errors import ConfigError, JobInterrupted
 from gmijax.machine.processes import ProcessId, identify
 
 PASSED_ON: Final = ("JAX_", "XLA_", "NCCL_", "OMP_", "OPENBLAS_", "MKL_", "MUJOCO_", "PYTHONPATH")
@@ -52,16 +53,24 @@ class RayCluster:
         if self._is_own:
             self._connect(config.address)
 
-    def join(self, num_cpus: int, wanted: int | None, least: int | None = None) -> list[Joined]:
+    def join(
+        self,
+        num_cpus: int,
+        wanted: int | None,
+        least: int | None = None,
+        is_unwanted: Callable[[], bool] = lambda: False,
+    ) -> list[Joined]:
         """Puts an actor on each of several nodes that have so many CPUs left.
 
         Args:
           num_cpus: of each.
           wanted: how many nodes; None: all that have the CPUs.
           least: how many will do when the wait is over; None: `wanted`.
+          is_unwanted: whether the user has asked for an end meanwhile.
 
         Raises:
           ConfigError: there are fewer nodes, they have no room, or one cannot take part.
+          JobInterrupted: it is unwanted.
         """
         self.leave()
         deadline_s = time.monotonic() + self._config.wait_s
@@ -77,6 +86,8 @@ class RayCluster:
                     f"{num_cpus} CPUs, and no more came within cluster.wait_s="
                     f"{self._config.wait_s:g} s"
                 )
+            if is_unwanted():
+                raise JobInterrupted("stopped while it waited for nodes")
             time.sleep(_POLL_S)
         self._place(num_cpus, min(found, wanted or found), deadline_s)
         return self._joined()
@@ -116,6 +127,7 @@ class RayCluster:
         elif address not in ("auto", "local"):
             raise ConfigError(f"{what}: expected auto, local or host:port")
         options = {"include_dashboard": False} if address == "local" else {}
+        before = signal.getsignal(signal.SIGTERM)
         try:
             self._ray.init(address=address, log_to_driver=False, logging_level="ERROR", **options)
         except Exception as error:
@@ -123,6 +135,9 @@ class RayCluster:
                 f"{what}: no cluster of Ray there ({_first_line(error)}); `ray start --head` "
                 "starts one, `ray start --address=host:port` adds a node"
             ) from None
+        finally:
+            if threading.current_thread() is threading.main_thread():
+                signal.signal(signal.SIGTERM, before)  # Ray has put its own there.
 
     def _num_nodes(self, num_cpus: int) -> int:
         alive = [node for node in self._ray.nodes() if node["Alive"]]

@@ -19,7 +19,7 @@ from gmijax.cluster.node import Facts, Node, Seen, address_of, own_versions
 from gmijax.cluster.ray_nodes import Joined, RayCluster
 from gmijax.cluster.remote_gmi import RemoteNode
 from gmijax.config import ClusterConfig, PlanConfig, ReduceConfig
-from gmijax.errors import ConfigError
+from gmijax.errors import ConfigError, JobInterrupted
 from gmijax.machine.snapshot import Machine
 from gmijax.partition.plan import Plan
 from gmijax.partition.planner import make_plan
@@ -130,6 +130,9 @@ def test_fewer_nodes_than_asked_for_are_refused_once_the_wait_is_over(
         cluster.join(2, 2)
     with pytest.raises(ConfigError, match="nodes=auto: the cluster has 0 nodes with 8 CPUs"):
         cluster.join(8, None)
+    patient = RayCluster(ClusterConfig(wait_s=100.0))
+    with pytest.raises(JobInterrupted, match="while it waited for nodes"):
+        patient.join(2, 2, is_unwanted=lambda: True)
 
 
 def test_nodes_with_other_versions_are_refused() -> None:
