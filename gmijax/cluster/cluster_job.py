@@ -61,9 +61,8 @@ class ClusterJob:
         """
         wanted = self._config.cluster.nodes
         self._joined = self._cluster.join(self._num_cpus, None if wanted == "auto" else wanted)
-        self._require_alike()
-        self._require_shared(run_root)
-        return self._machines()
+        self._run_root = run_root
+        return self._checked()
 
     def join_again(self, num_nodes: int, *, elastic: bool) -> Mapping[str, Machine]:
         """Finds nodes for another attempt: so many, or fewer once the wait is over.
@@ -79,8 +78,7 @@ class ClusterJob:
             least=least,
             is_unwanted=lambda: signals is not None and signals.have_come,
         )
-        self._require_alike()
-        return self._machines()
+        return self._checked()
 
     def run(self, launch: Launch, on_tick: OnTick, signals: StopSignals) -> None:
         """Runs all GMIs of a plan on the nodes that have joined; see `run_gmis`.
@@ -113,7 +111,10 @@ class ClusterJob:
         finally:
             self._cluster.leave()
 
-    def _machines(self) -> Mapping[str, Machine]:
+    def _checked(self) -> Mapping[str, Machine]:
+        """The machines of the nodes, by address, once these can take part."""
+        self._require_alike()
+        self._require_shared(self._run_root)
         named: dict[str, Machine] = {}
         for place, (node, facts) in enumerate(self._joined):
             # Several nodes may be on one machine.

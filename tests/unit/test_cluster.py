@@ -19,14 +19,15 @@ from gmijax.cluster.node import Facts, Node, Seen, address_of, own_versions
 from gmijax.cluster.ray_nodes import Joined, RayCluster
 from gmijax.cluster.remote_gmi import RemoteNode
 from gmijax.config import ClusterConfig, PlanConfig, ReduceConfig
-from gmijax.errors import ConfigError, JobInterrupted
+from gmijax.control.restarts import with_nodes_left
+from gmijax.errors import ConfigError, GmiFailed, JobInterrupted, ReportedError
 from gmijax.machine.snapshot import Machine
 from gmijax.partition.plan import Plan
 from gmijax.partition.planner import make_plan
 from gmijax.runs.folder import GmiPaths
-from gmijax.supervise.failures import describe_exit, is_consequence
+from gmijax.supervise.failures import describe_exit, first_cause, is_consequence
 from gmijax.supervise.heartbeat import Heartbeat
-from gmijax.supervise.kinds import JobKind
+from gmijax.supervise.kinds import JobKind, training_plan
 
 
 class FakeAnswer:
@@ -181,6 +182,25 @@ def test_the_plan_of_nodes_has_each_nodes_shares_under_global_ids() -> None:
         make_plan(settings[0], ReduceConfig(strategy="har"), 16, machine(0), nodes=here)
     with pytest.raises(ConfigError, match="GPUs of several nodes are not supported yet"):
         make_plan(*settings, machine(1), nodes={"a": machine(1)})
+
+
+def test_a_job_goes_on_with_the_nodes_that_are_left() -> None:
+    config = compose("env=ball_balance", "cluster.engine=ray", "num_envs=16", "seed=3")
+    plan = training_plan(config, machine(0), nodes={"a": machine(0), "b": machine(0)})
+    assert with_nodes_left(config, plan, {"c": machine(0), "b": machine(0)})[1] == ()
+    left, [note] = with_nodes_left(config, plan, {"b": machine(0)})
+    assert (left.nodes, left.layout.num_gmis, left.strategy) == (("b",), 1, "none")
+    assert "1 nodes of the job are gone: going on with 1, layout [[0]]" in note
+    assert left.reasons[-1] == note
+
+
+def test_who_waited_in_vain_comes_before_who_lost_that_one() -> None:
+    lost, late = (
+        GmiFailed(gmi, error, error=ReportedError(error, "", ""), exit_code=1)
+        for gmi, error in ((0, "PeerLost"), (2, "CollectiveTimeout"))
+    )
+    assert first_cause([lost, late]) is late
+    assert first_cause([lost, late, killed := GmiFailed(3, "", exit_code=-9)]) is killed
 
 
 def test_a_lost_node_is_the_cause_that_its_gmis_give(tmp_path: Path) -> None:
