@@ -14,7 +14,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import pytest
-import two_ray_nodes
 from training_jobs import (
     FOREVER,
     POINT,
@@ -39,6 +38,7 @@ pytestmark = [
     pytest.mark.timeout(400),
 ]
 
+TWO_NODES = Path(__file__).parents[1] / "two_ray_nodes.py"
 TWO, RAY = "plan.gmis_per_gpu=2", "cluster.engine=ray"
 
 
@@ -55,7 +55,7 @@ def cluster(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Cluster]:
     with (
         log.open("wb") as stderr,
         subprocess.Popen(
-            [sys.executable, two_ray_nodes.__file__],
+            [sys.executable, str(TWO_NODES)],
             env=child_environment(),
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
