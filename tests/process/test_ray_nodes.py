@@ -18,7 +18,6 @@ from training_jobs import (
     FOREVER,
     POINT,
     STEPS,
-    TINY,
     child_environment,
     gmi_pid,
     iteration_of,
@@ -87,10 +86,10 @@ def test_two_nodes_learn_the_bits_of_two_gpus_of_one_machine(
 ) -> None:
     steps = f"num_timesteps={3 * 4 * STEPS}"
     here = ("plan.gpus=2", "reduce.strategy=har", "run.dir=here")
-    done = train(*TINY, TWO, *here, steps, cwd=tmp_path)
+    done = train(*POINT, TWO, *here, steps, cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     nodes = (RAY, cluster.address, "cluster.nodes=2", "run.dir=there")
-    done = train(*TINY, TWO, *nodes, steps, cwd=tmp_path)
+    done = train(*POINT, TWO, *nodes, steps, cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     there = tmp_path / "there"
     expected = learner_arrays(tmp_path / "here")
