@@ -24,8 +24,8 @@ from gmijax.machine.snapshot import Machine, detect_machine
 from gmijax.partition.planner import make_plan
 from gmijax.runs.folder import RunPaths, read_json, write_json
 from gmijax.supervise.kinds import JobKind
+from gmijax.supervise.launch import Timeouts
 from gmijax.supervise.launcher import Launch, run_gmis
-from gmijax.supervise.supervisor import Timeouts
 
 SHARES = (
     *(10, 12, 13, 14, 16, 18, 20, 22, 23, 25, 27, 28, 30, 33, 36, 40),

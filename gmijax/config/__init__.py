@@ -13,6 +13,7 @@ from gmijax.config.algo import (
     PpoConfig,
 )
 from gmijax.config.channel import ChannelConfig
+from gmijax.config.cluster import ClusterConfig
 from gmijax.config.env import EnvConfig, PhysicsConfig
 from gmijax.config.evaluation import EvalConfig
 from gmijax.config.export import ExportConfig
@@ -40,6 +41,7 @@ __all__ = [
     "AlgoConfig",
     "BackendName",
     "ChannelConfig",
+    "ClusterConfig",
     "EnvConfig",
     "EvalConfig",
     "ExportConfig",

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Literal, TypeAlias
 
 from gmijax.config.algo import A3cConfig, PpoConfig
 from gmijax.config.channel import ChannelConfig
+from gmijax.config.cluster import ClusterConfig
 from gmijax.config.env import EnvConfig, PhysicsConfig
 from gmijax.config.evaluation import EvalConfig
 from gmijax.config.plan import PlanConfig, ReduceConfig
@@ -36,6 +37,7 @@ class TrainConfig(KeyGroup):
     eval: EvalConfig
     search: SearchConfig
     wandb: WandbConfig
+    cluster: ClusterConfig = field(default_factory=ClusterConfig)
     num_envs: int | Literal["auto"] = doc(
         "N, environments per GMI; auto: what a search finds (docs/search.md)", low=1
     )
@@ -60,6 +62,8 @@ class TrainConfig(KeyGroup):
             )
         if self.num_envs != "auto":
             self._check_num_envs(self.num_envs)
+        if self.cluster.engine is not None:
+            self._check_on_nodes()
 
     @property
     def is_asynchronous(self) -> bool:
@@ -72,6 +76,28 @@ class TrainConfig(KeyGroup):
         if self.num_envs == "auto":
             raise ConfigError("num_envs=auto: not decided yet; expected an integer")
         return self.num_envs
+
+    def _check_on_nodes(self) -> None:
+        for key, value, allowed in (
+            ("algo", self.algo.name, ("ppo",)),
+            ("plan.template", self.plan.template, ("auto", "tcg_ex")),
+            ("plan.backend", self.plan.backend, ("auto", "cpu")),
+            ("reduce.selection", self.reduce.selection, ("paper", "device")),
+        ):
+            if value not in allowed:
+                raise ConfigError(
+                    f"{key}={value}: not with cluster.engine={self.cluster.engine} yet; allowed "
+                    f"are {', '.join(allowed)}"
+                )
+        for key, value in (
+            ("num_envs", self.num_envs),
+            ("plan.gmis_per_gpu", self.plan.gmis_per_gpu),
+        ):
+            if value == "auto":
+                raise ConfigError(
+                    f"{key}=auto: a search is for one machine; with "
+                    f"cluster.engine={self.cluster.engine} give a number"
+                )
 
     def _check_num_envs(self, num_envs: int) -> None:
         if isinstance(self.algo, A3cConfig):

@@ -19,7 +19,7 @@ from rich.text import Text
 
 from gmijax.partition.plan import Plan
 from gmijax.runs.folder import RunPaths
-from gmijax.supervise.gmi_process import GmiStatus
+from gmijax.supervise.watched_gmi import GmiStatus
 
 _LINE_EVERY_S = 5.0
 _BAR_WIDTH = 30

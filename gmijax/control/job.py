@@ -8,17 +8,24 @@ from __future__ import annotations
 
 import dataclasses
 import time
+from contextlib import ExitStack
 from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
 from rich.console import Console
 
+from gmijax.cluster.cluster_job import ClusterJob
 from gmijax.config import TrainConfig
 from gmijax.config.schema import to_dict
 from gmijax.control.console import ConsoleProgress, announce, open_console
 from gmijax.control.decide import Decided, decide, with_task
-from gmijax.control.restarts import Attempts, clear_unfinished, with_gpus_left
+from gmijax.control.restarts import (
+    Attempts,
+    clear_unfinished,
+    with_gpus_left,
+    with_nodes_left,
+)
 from gmijax.control.start_point import StartPoint, find_start_point
 from gmijax.control.summary import train_outcome, train_summary
 from gmijax.control.wandb_link import followed, require_wandb
@@ -66,7 +73,22 @@ def train(config: TrainConfig, *, show: bool = False) -> Result:
     console = open_console(show=show)
     if beginning.is_complete and beginning.folder is not None:
         return _finished(config, beginning.folder, console)
-    decided = decide(_from(config, beginning.checkpoint), console)
+    with ExitStack() as held:
+        cluster, nodes = None, None
+        if config.cluster.engine is not None:
+            cluster = held.enter_context(ClusterJob(config))
+            nodes = cluster.join(beginning.root(config))
+        decided = decide(_from(config, beginning.checkpoint), console, nodes)
+        return _train(decided, beginning, console, cluster, started_s)
+
+
+def _train(
+    decided: Decided[TrainConfig],
+    beginning: StartPoint,
+    console: Console,
+    cluster: ClusterJob | None,
+    started_s: float,
+) -> Result:
     config, plan = decided.config, decided.plan
     changed = None
     if beginning.checkpoint is not None:
@@ -80,7 +102,7 @@ def train(config: TrainConfig, *, show: bool = False) -> Result:
         )
         changes = () if changed is None else (changed,)
         announce(console, run, plan, what, (*decided.reasons, *changes, *beginning.notes))
-        _Job(decided, run, console).run_to_the_end(beginning, started_s)
+        _Job(decided, run, console, cluster).run_to_the_end(beginning, started_s)
     summary = read_json(run.summary)
     console.print(train_outcome(summary, run))
     return Result(run.root, summary)
@@ -89,12 +111,23 @@ def train(config: TrainConfig, *, show: bool = False) -> Result:
 class _Job:
     """A training job that is ready to start."""
 
-    def __init__(self, decided: Decided[TrainConfig], run: RunPaths, console: Console) -> None:
+    def __init__(
+        self,
+        decided: Decided[TrainConfig],
+        run: RunPaths,
+        console: Console,
+        cluster: ClusterJob | None,
+    ) -> None:
         self._config, self._plan, self._machine, _ = decided
         self._run = run
         self._console = console
+        self._cluster = cluster
         self._attempts = Attempts(
-            run, self._config.run.max_restarts, self._launch_at, console.print
+            run,
+            self._config.run.max_restarts,
+            self._launch_at,
+            console.print,
+            cluster.run if cluster is not None else None,
         )
 
     def run_to_the_end(self, beginning: StartPoint, started_s: float) -> None:
@@ -144,9 +177,15 @@ class _Job:
         )
 
     def _look_again(self) -> None:
-        """Takes the machine as it is after a fault: GPUs and daemons may be gone."""
-        self._machine = detect_machine()
-        self._config, self._plan, notes = with_gpus_left(self._config, self._plan, self._machine)
+        """Takes machines as they are after a fault: nodes, GPUs and daemons may be gone."""
+        if self._cluster is not None:
+            num_nodes, elastic = len(self._plan.nodes), self._config.run.elastic
+            nodes = self._cluster.join_again(num_nodes, elastic=elastic)
+            self._plan, notes = with_nodes_left(self._config, self._plan, nodes)
+        else:
+            self._machine = detect_machine()
+            left = with_gpus_left(self._config, self._plan, self._machine)
+            self._config, self._plan, notes = left
         # Also where nothing has changed: the attempt before may have run with another backend.
         write_json(self._run.plan, self._plan.to_dict())
         for note in notes:

@@ -7,7 +7,14 @@ from typing import NamedTuple
 
 from gmijax.config import EnvConfig, TrainConfig
 from gmijax.errors import ConfigError
-from gmijax.runs.folder import RunPaths, create_run, given_run, read_json, require_new_run
+from gmijax.runs.folder import (
+    RUNS,
+    RunPaths,
+    create_run,
+    given_run,
+    read_json,
+    require_new_run,
+)
 from gmijax.runs.resume import CheckpointMeta, choose_checkpoint, newest_checkpoint, trained_config
 
 
@@ -19,6 +26,12 @@ class StartPoint(NamedTuple):
     checkpoint: Path | None = None  # What the job goes on from, None from its beginning.
     is_complete: bool = False  # Whether the checkpoint has all steps that are wanted.
     notes: tuple[str, ...] = ()  # Sentences for the user.
+
+    def root(self, config: TrainConfig) -> Path:
+        """Where the run folder is or will be, or the folder that it will be made in."""
+        if self.folder is not None:
+            return self.folder.root
+        return given_run(config.run.dir, config.run.name) or RUNS
 
     def open(self, config: TrainConfig) -> RunPaths:
         """The run folder; raises as `create_run`."""

@@ -263,6 +263,7 @@ def _of_plan(plan: Plan) -> dict[str, Any]:
     return {
         "backend": plan.backend,
         "layout": [list(gmis) for gmis in plan.layout.gmis_of_gpu],
+        "nodes": plan.nodes_data(),
         "num_envs_per_gmi": plan.num_envs_per_gmi,
         "template": plan.template,
         "roles": list(plan.roles),

@@ -104,6 +104,10 @@ class RunPaths(_Folder):
         """Files of one GMI."""
         return GmiPaths(self.root / f"gmi_{gmi}")
 
+    def node(self, node: int) -> RunPaths:
+        """Logs of what one of several nodes starts beside its GMIs."""
+        return RunPaths(self.root / f"node_{node}")
+
 
 class PlayPaths(_Folder):
     """Files of one played checkpoint; its folder also has the files of a run with one GMI."""

@@ -51,13 +51,15 @@ def first_cause(failures: Sequence[GmiFailed]) -> GmiFailed:
     """The failure that most likely caused the others.
 
     A GMI that lost its peer may be seen to fail before that peer is; so a signal, and any
-    error that is not about a peer, goes before errors of the exchange. A library
+    error that is not about a peer, goes before errors of the exchange. A peer that is lost to
+    one may have given up on another that it waited for. A library
     may abort a process whose peer is gone; so SIGABRT comes after all other causes.
     """
     return min(
         failures,
         key=lambda failure: (
             is_consequence(failure),
+            ended_with(failure, PeerLost, PipeClosed),
             failure.exit_code == -signal.SIGABRT,
             failure.exit_code >= 0,
         ),

@@ -155,7 +155,9 @@ def require_placeable(jobs: Sequence[Job], num_gpus: int) -> None:
     if not jobs:
         raise ConfigError("sweep: there is no job in it")
     for job in jobs:
-        plan = job.config.plan
+        plan, engine = job.config.plan, job.config.cluster.engine
+        if engine is not None:
+            raise ConfigError(f"cluster.engine={engine}: a sweep is for one machine; use null")
         if not isinstance(plan.gpus, int):
             raise ConfigError(
                 f"plan.gpus={list(plan.gpus)}: a sweep chooses the GPUs of its jobs; expected a "

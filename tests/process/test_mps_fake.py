@@ -23,10 +23,11 @@ from gmijax.partition.plan import Plan
 from gmijax.partition.planner import make_plan
 from gmijax.runs.folder import RunPaths, read_json, write_json
 from gmijax.supervise.backends import open_backend
-from gmijax.supervise.gmi_process import GmiStatus
 from gmijax.supervise.kinds import JobKind
+from gmijax.supervise.launch import Timeouts
 from gmijax.supervise.launcher import Launch, run_gmis
-from gmijax.supervise.supervisor import Supervisor, Timeouts
+from gmijax.supervise.supervisor import Supervisor
+from gmijax.supervise.watched_gmi import GmiStatus
 
 pytestmark = pytest.mark.timeout(60)
 

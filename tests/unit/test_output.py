@@ -17,7 +17,7 @@ from gmijax.control import evaluation
 from gmijax.control.console import ConsoleProgress, open_console
 from gmijax.errors import printable
 from gmijax.supervise.failures import last_line
-from gmijax.supervise.gmi_process import GmiStatus
+from gmijax.supervise.watched_gmi import GmiStatus
 
 PRINTS = """
 from gmijax.control.console import open_console
