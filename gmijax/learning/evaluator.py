@@ -7,6 +7,7 @@ a run begin in the same states, and how many GMIs share the episodes makes no di
 
 from __future__ import annotations
 
+import dataclasses
 import math
 import time
 from collections.abc import Callable
@@ -50,11 +51,12 @@ class Evaluation(NamedTuple):
 def evaluation_worlds(config: TrainConfig, rank: int, world_size: int) -> Env:
     """The worlds in which the GMI with this rank evaluates.
 
-    As many on each, so that all run the same program: there may be more than episodes.
+    As many on each, so that all run the same program: there may be more than episodes. Without a
+    curriculum, so that evaluations can be compared.
     """
     num_envs = -(-config.eval.episodes // world_size)
     return make_worlds(
-        config.env,
+        dataclasses.replace(config.env, curriculum="off"),
         config.physics.impl,
         seed=config.seed,
         first_env=FIRST_WORLD + rank * num_envs,

@@ -94,6 +94,7 @@ def observation_history(env: Env, length: int) -> Env:
     return env._replace(
         spec=env.spec._replace(
             obs_size=past + size,
+            obs_terms=env.spec.obs_terms * length if seen == size else (),
             actor_obs_size=None if env.spec.actor_obs_size is None else past + seen,
         ),
         reset=reset,

@@ -109,8 +109,10 @@ def _bits(state: EnvState) -> EnvState:
 
 
 def test_past_observations_go_before_new_ones_and_a_start_fills_all():
-    env = observation_history(toy(), 3)
-    assert env.spec.obs_size == 3
+    one = toy()
+    one = one._replace(spec=one.spec._replace(obs_terms=(("position", 1),)))
+    env = observation_history(one, 3)
+    assert (env.spec.obs_size, env.spec.obs_terms) == (3, (("position", 1),) * 3)
     state = env.reset(None, jax.random.key(1))
     x = float(state.obs[0])
     assert state.obs.tolist() == pytest.approx([x, x, x])
