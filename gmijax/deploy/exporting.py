@@ -26,8 +26,8 @@ from gmijax.runs.folder import (
 )
 from gmijax.runs.resume import CheckpointMeta
 from gmijax.supervise.kinds import JobKind
+from gmijax.supervise.launch import Timeouts
 from gmijax.supervise.launcher import Launch, run_gmis
-from gmijax.supervise.supervisor import Timeouts
 
 _TIMEOUTS: Final = Timeouts(
     start_timeout_s=600.0, stall_timeout_s=600.0, stop_timeout_s=60.0, grace_s=10.0
