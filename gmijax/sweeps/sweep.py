@@ -184,9 +184,8 @@ def _beginning(request: Request, paths: SweepPaths) -> tuple[list[Job], Study]:
     for job in jobs:
         run = paths.job(job.number)
         job.progress.read(run, settings)
-        job.progress.state = state_of(run, job.config)
-        if job.progress.state == "waiting" and settings.sampler != "grid":
-            job.progress.state = "pruned"  # The study knows that it has ended.
+        if job.progress.state != "pruned":
+            job.progress.state = state_of(run, job.config)
     write_json(paths.request, wanted)
     return jobs, study
 

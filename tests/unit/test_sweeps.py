@@ -250,12 +250,14 @@ def study(folder: Path, *overrides: str) -> tuple[Request, OptunaStudy]:
     return request, OptunaStudy(request.settings, request.space, request.make_job, journal)
 
 
-TOY = ("sweep.sampler=tpe", "algo.learning_rate=tag(log,interval(1e-5,1e-2))", "sweep.trials=24")
+TOY = ("sweep.sampler=tpe", "algo.learning_rate=tag(log,interval(1e-5,1e-2))", "sweep.trials=8")
 
 
 def toy_objective(job: Job) -> float:
-    """Best at a learning rate of 4e-3."""
-    return -abs(np.log(job.config.algo.learning_rate) - np.log(4e-3))
+    """Best at a learning rate of 4e-3 and an entropy cost of 2e-3."""
+    algo = job.config.algo
+    far = abs(np.log(algo.learning_rate) - np.log(4e-3))
+    return -far - 300.0 * abs(algo.entropy_cost - 2e-3)
 
 
 def end(job: Job, state: State, value: float | None = None) -> Job:
@@ -263,30 +265,46 @@ def end(job: Job, state: State, value: float | None = None) -> Job:
     return job
 
 
-def test_tpe_finds_better_than_the_default(tmp_path: Path) -> None:
-    _, trials = study(tmp_path, *TOY)
-    values = []
-    while job := trials.next():
-        values.append(toy_objective(job))
-        trials.tell(end(job, "completed", values[-1]))
-    assert len(values) == 24
-    default = toy_objective(jobs_of([compose("algo.learning_rate=1e-3")])[0])
-    assert max(values) > default
-    # It looks where it was good before.
-    assert np.median(values[-6:]) > np.median(values[:10])
+def test_eight_trials_of_tpe_find_better_than_the_default_and_than_chance(tmp_path: Path) -> None:
+    request = build_sweep([*TOY, "algo.entropy_cost=interval(0,1e-2)"])
+
+    def best(sampler: Any, seed: int) -> float:
+        settings = dataclasses.replace(request.settings, sampler=sampler, seed=seed)
+        journal = tmp_path / f"{sampler}{seed}.log"
+        trials = OptunaStudy(settings, request.space, request.make_job, journal)
+        values = []
+        while job := trials.next():
+            values.append(toy_objective(job))
+            trials.tell(end(job, "completed", values[-1]))
+        assert len(values) == 8
+        return max(values)
+
+    default = toy_objective(jobs_of([compose("algo.entropy_cost=1e-2")])[0])
+    tpe = [best("tpe", seed) for seed in range(6)]
+    assert min(tpe) > default
+    assert np.mean(tpe) > np.mean([best("random", seed) for seed in range(6)])
 
 
-def test_a_study_goes_on_with_what_was_running(tmp_path: Path) -> None:
+def test_a_study_goes_on_with_what_was_running_and_what_failed(tmp_path: Path) -> None:
     _, first = study(tmp_path, *TOY)
-    jobs = [job for _ in range(4) if (job := first.next()) is not None]
+    jobs = [job for _ in range(5) if (job := first.next()) is not None]
     first.tell(end(jobs[0], "completed", 1.0))
-    first.tell(end(jobs[1], "failed"))
+    first.tell(end(jobs[1], "failed", 0.5))
     first.tell(end(jobs[2], "interrupted"))
+    first.tell(end(jobs[3], "pruned", 0.1))
     _, second = study(tmp_path, *TOY)
-    assert [job.number for job in second.earlier()] == [0, 1]
-    again = [second.next(), second.next(), second.next()]
-    assert [job.number for job in again if job] == [2, 3, 4]
-    assert [job.overrides for job in again[:2] if job] == [job.overrides for job in jobs[2:]]
+    earlier = [(job.number, job.progress.state) for job in second.earlier()]
+    assert earlier == [(0, "waiting"), (3, "pruned")]
+    again = [second.next() for _ in range(4)]
+    assert [job.number for job in again if job] == [1, 2, 4, 5]
+    assert [job.overrides for job in again[:3] if job] == [jobs[k].overrides for k in (1, 2, 4)]
+    # The first command has begun with these numbers.
+    assert again[3] is not None
+    assert again[3].overrides not in [job.overrides for job in jobs]
+    # A job that ended before goes on for more steps.
+    (job, _) = second.earlier()
+    assert not second.is_hopeless(job)
+    second.tell(end(job, "completed", 2.0))
 
 
 @pytest.mark.parametrize("pruner", ["asha", "median"])
