@@ -18,7 +18,7 @@ from gmijax.collectives.device.device_links import DeviceLinks
 from gmijax.collectives.host.host_exchange import HostExchange
 from gmijax.collectives.host.host_links import HostLinks
 from gmijax.collectives.host.shared_block import LANES, create_exchange
-from gmijax.collectives.program import Exchange
+from gmijax.collectives.program import Exchange, PeersOfOne
 from gmijax.collectives.strategies import stages
 from gmijax.learning.learner import (
     acting_weights,
@@ -95,6 +95,19 @@ def test_every_sample_is_visited_once_per_epoch_in_orders_that_differ(learner) -
     assert not np.array_equal(first[0], first[1])
     assert not np.array_equal(first, order(rank=1, iteration=0).reshape(3, -1))
     assert not np.array_equal(first, order(rank=0, iteration=1).reshape(3, -1))
+
+
+@pytest.mark.parametrize("schedule", ["fixed", "adaptive_kl"])
+def test_learning_rates_share_a_program(config, schedule: str) -> None:
+    programs = set()
+    for rate in (1e-3, 2e-3):
+        changed = dataclasses.replace(
+            config, learning_rate=rate, learning_rate_schedule=schedule, num_updates_per_batch=1
+        )
+        learner = make_learner(ENV.spec, changed)
+        step = functools.partial(iterate, ENV, learner, PeersOfOne())
+        programs.add(jax.jit(step).lower(ENV.model, *_start(learner)).as_text())
+    assert len(programs) == 1
 
 
 @pytest.mark.parametrize(
