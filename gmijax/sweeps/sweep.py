@@ -31,7 +31,7 @@ from gmijax.sweeps.jobs import (
     state_of,
 )
 from gmijax.sweeps.leases import leased
-from gmijax.sweeps.places import places_of
+from gmijax.sweeps.places import Places, places_of
 from gmijax.sweeps.report import ranking, write_report
 from gmijax.sweeps.scheduler import Scheduler
 from gmijax.sweeps.space import Space
@@ -121,7 +121,8 @@ def run_request(request: Request, *, show: bool = False) -> SweepResult:
                 _announce(console, plan, request, jobs)
                 backend = held.enter_context(open_backend(plan, machine, paths))
                 held.enter_context(view)
-                scheduler = Scheduler(jobs, study, settings, paths, plan, backend, view.update)
+                places = Places(plan, machine)
+                scheduler = Scheduler(jobs, study, settings, paths, places, backend, view.update)
                 scheduler.run(signals)
             failed = [job for job in jobs if job.progress.state == "failed"]
             status = "failed" if failed else "completed"
