@@ -19,6 +19,7 @@ from gmijax.supervise.backends.backend import Backend
 from gmijax.supervise.failures import may_be_anothers
 from gmijax.supervise.launcher import StopSignals
 from gmijax.sweeps.children import Child, start
+from gmijax.sweeps.compiled import CompiledPrograms
 from gmijax.sweeps.hparams import write_hparams
 from gmijax.sweeps.jobs import Job, SweepPaths, placed
 from gmijax.sweeps.places import Place, Places
@@ -62,7 +63,7 @@ class Scheduler:
         self._alone: set[int] = set()
         self._running: dict[int, Child] = {}
         self._readers: dict[int, MetricsReader] = {}
-        self._compiled: set[str] = set()
+        self._compiled = CompiledPrograms()
         self._compiling: dict[str, int] = {}
 
     def run(self, signals: StopSignals) -> None:
@@ -104,8 +105,8 @@ class Scheduler:
         place = self._places.take(job.num_gpus, alone=job.number in self._alone)
         if place is None:
             return False
-        if (program := job.program) not in self._compiled:
-            self._compiling[program] = job.number
+        if not self._compiled.holds(job):
+            self._compiling[job.program] = job.number
         self._start(job, place)
         return True
 
@@ -132,7 +133,7 @@ class Scheduler:
             for line in self._readers[number].new():
                 progress.take(line, self._sweep)
                 progress.updated_s = progress.updated_s or time.monotonic()
-                self._has_compiled(job)
+                self._nobody_waits_for(job, has_compiled=True)
             if child.has_ended():
                 self._finish(child)
             elif not child.is_pruned and self._study.is_hopeless(job):
@@ -145,7 +146,7 @@ class Scheduler:
         wait_until_gone(members_of(child.process.pid), _KILL_AFTER_S)
         is_interrupted, error = child.close()
         self._places.give_back(child.place)
-        self._has_compiled(job)
+        self._nobody_waits_for(job, has_compiled=False)
         run = self._paths.job(job.number)
         progress.read(run, self._sweep)
         progress.place, progress.error, progress.ended_s = "", error, time.monotonic()
@@ -168,12 +169,11 @@ class Scheduler:
         may_restart = job.config.run.max_restarts > 0 and job.number not in self._alone
         return has_daemon and may_restart and may_be_anothers(error)
 
-    def _has_compiled(self, job: Job) -> None:
-        """Its metrics are there, or it has ended: nobody waits for it any more."""
-        program = job.program
-        if self._compiling.get(program) == job.number:
-            del self._compiling[program]
-            self._compiled.add(program)
+    def _nobody_waits_for(self, job: Job, *, has_compiled: bool) -> None:
+        """Its metrics are there, or it has ended, perhaps before it had compiled."""
+        if self._compiling.get(job.program) == job.number:
+            del self._compiling[job.program]
+            self._compiled.add(job, is_lasting=has_compiled)
 
     def _stop(self, signals: StopSignals) -> None:
         """Asks all jobs to save and end; the same signal again ends them at once."""
