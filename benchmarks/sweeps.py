@@ -12,6 +12,7 @@ from __future__ import annotations
 import argparse
 import datetime
 import json
+import math
 import os
 import platform
 import signal
@@ -54,7 +55,7 @@ class Benchmark:
         self._arguments = arguments
         device = machine.gpus[0].name if machine.gpus else "cpu"
         self.path = arguments.out / f"sweeps-{device.replace(' ', '-').lower()}.json"
-        self.deadline_s = time.monotonic() + arguments.deadline_s
+        self.deadline_s = time.monotonic() + (arguments.deadline_s or math.inf)
         self.runs: list[dict[str, Any]] = []
         self._head = {
             "commit": _commit(),
@@ -224,7 +225,7 @@ def _arguments() -> argparse.Namespace:
     parser.add_argument("--mix", default="", help="also a mix of these tasks, e.g. ant,humanoid")
     parser.add_argument("--auto", action="store_true", help="also sweep.jobs_per_gpu=auto")
     parser.add_argument("--repeats", type=int, default=3)
-    parser.add_argument("--deadline-s", type=float, default=float("inf"), help="for all of it")
+    parser.add_argument("--deadline-s", type=float, help="seconds for all of it")
     parser.add_argument(
         "--warm",
         action="store_true",

@@ -40,14 +40,16 @@ def test_steps_of_a_job_are_on_the_clock_of_its_sweep(tmp_path: Path) -> None:
     np.testing.assert_array_equal(curve[1], [64, 128, 192])
 
 
-def benchmark(folder: Path, monkeypatch: pytest.MonkeyPatch, deadline_s: float) -> Benchmark:
+def benchmark(
+    folder: Path, monkeypatch: pytest.MonkeyPatch, deadline_s: float | None
+) -> Benchmark:
     """Sweeps of 60 s each, the third one interrupted if there is no deadline."""
     now_s = 0.0
     done: list[Way] = []
 
     def sweep(way: Way, repeat: int, *_: object) -> dict[str, Any]:
         nonlocal now_s
-        if deadline_s == float("inf") and len(done) == 2:
+        if deadline_s is None and len(done) == 2:
             raise KeyboardInterrupt
         done.append(way)
         now_s += 60.0
@@ -80,7 +82,7 @@ def test_what_is_through_is_kept_when_it_is_interrupted(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     for _ in range(2):
-        told = benchmark(tmp_path, monkeypatch, deadline_s=float("inf"))
+        told = benchmark(tmp_path, monkeypatch, deadline_s=None)
         told._head["started"] += str(len(list(tmp_path.iterdir())))
         with pytest.raises(KeyboardInterrupt):
             told.run(WAYS)
