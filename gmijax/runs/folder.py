@@ -188,21 +188,34 @@ def locked(lock: Path, what: str) -> Iterator[None]:
     Raises:
       ConfigError: another job holds it, or it cannot be locked.
     """
-    # A file: network file systems lock no folders, and files only if they are open for writing.
     try:
-        fd = os.open(lock, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o644)
+        fd = try_lock(lock)
     except OSError as error:
-        raise ConfigError(f"{what}: {error.strerror}") from None
+        raise ConfigError(f"{what}: cannot be locked ({error.strerror})") from None
+    if fd is None:
+        raise ConfigError(f"{what}: another job writes into this folder now")
     try:
-        try:
-            fcntl.flock(fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            raise ConfigError(f"{what}: another job writes into this folder now") from None
-        except OSError as error:
-            raise ConfigError(f"{lock}: cannot be locked ({error.strerror})") from None
         yield
     finally:
         os.close(fd)
+
+
+def try_lock(lock: Path) -> int | None:
+    """A descriptor that holds a lock until it is closed; None: another process holds it.
+
+    Raises:
+      OSError: it cannot be locked.
+    """
+    # A file: network file systems lock no folders, and files only if they are open for writing.
+    fd = os.open(lock, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o644)
+    try:
+        fcntl.flock(fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except OSError as error:
+        os.close(fd)
+        if isinstance(error, BlockingIOError):
+            return None
+        raise
+    return fd
 
 
 def is_locked(lock: Path) -> bool:
@@ -210,10 +223,12 @@ def is_locked(lock: Path) -> bool:
     if not lock.exists():
         return False
     try:
-        with locked(lock, str(lock)):
-            return False
-    except ConfigError:
-        return True
+        fd = try_lock(lock)
+    except OSError:
+        return False  # Whoever wants it is told why it cannot be had.
+    if fd is not None:
+        os.close(fd)
+    return fd is None
 
 
 def write_json(path: Path, data: Mapping[str, Any]) -> None:

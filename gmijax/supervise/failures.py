@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import signal
 from collections.abc import Sequence
 from pathlib import Path
@@ -17,6 +18,9 @@ from gmijax.errors import (
     ReportedError,
     printable,
 )
+
+_GPU_FAULT = re.compile(r"CUDA_ERROR_(?!OUT_OF_MEMORY)|ended by SIGABRT|MPS daemon")
+"""In what a job says that lost its GPU. XLA aborts where it cannot raise."""
 
 _TAIL_BYTES = 8192
 _MAX_LINE = 300
@@ -64,6 +68,15 @@ def first_cause(failures: Sequence[GmiFailed]) -> GmiFailed:
             failure.exit_code >= 0,
         ),
     )
+
+
+def may_be_anothers(reason: str) -> bool:
+    """Whether the fault can be that of another client of the same MPS daemon.
+
+    A fatal fault of one client ends all clients on its GPU, and CUDA does not say whose it was
+    (https://docs.nvidia.com/deploy/mps/, "Memory protection and error containment").
+    """
+    return _GPU_FAULT.search(reason) is not None
 
 
 def signal_name(number: int) -> str:

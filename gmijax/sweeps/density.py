@@ -26,7 +26,7 @@ from gmijax.runs.folder import read_json
 from gmijax.supervise.backends import open_backend
 from gmijax.supervise.launcher import StopSignals
 from gmijax.sweeps.jobs import Job, SweepPaths
-from gmijax.sweeps.places import places_of
+from gmijax.sweeps.places import Places, places_of
 from gmijax.sweeps.scheduler import Scheduler
 from gmijax.sweeps.study import NoStudy
 
@@ -123,7 +123,8 @@ def _profile(
         try:
             plan = places_of(settings, machine, {job.config.plan.backend})
             with open_backend(plan, machine, paths) as backend:
-                Scheduler(jobs, NoStudy(), settings, paths, plan, backend, tick).run(inner)
+                places = Places(plan, machine)
+                Scheduler(jobs, NoStudy(), settings, paths, places, backend, tick).run(inner)
         except JobInterrupted:
             if signals.have_come:
                 raise

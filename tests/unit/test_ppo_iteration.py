@@ -93,6 +93,19 @@ def test_every_sample_is_visited_once_per_epoch_in_orders_that_differ(learner) -
     assert not np.array_equal(first, order(rank=0, iteration=1).reshape(3, -1))
 
 
+@pytest.mark.parametrize("schedule", ["fixed", "adaptive_kl"])
+def test_learning_rates_share_a_program(config, schedule: str) -> None:
+    programs = set()
+    for rate in (1e-3, 2e-3):
+        changed = dataclasses.replace(
+            config, learning_rate=rate, learning_rate_schedule=schedule, num_updates_per_batch=1
+        )
+        learner = make_learner(ENV.spec, changed)
+        step = functools.partial(iterate, ENV, learner, PeersOfOne())
+        programs.add(jax.jit(step).lower(ENV.model, *_start(learner)).as_text())
+    assert len(programs) == 1
+
+
 @pytest.mark.parametrize(
     ("rate", "kl", "adapted"),
     [
