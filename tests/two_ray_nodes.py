@@ -34,7 +34,9 @@ def main() -> None:
         sys.stdin.read()
     finally:
         for node in (*cluster.worker_nodes, cluster.head_node):
-            cluster.remove_node(node, allow_graceful=False)
+            # A test may have killed it.
+            is_there = node.all_processes["raylet"][0].process.poll() is None
+            cluster.remove_node(node, allow_graceful=is_there)
 
 
 if __name__ == "__main__":
