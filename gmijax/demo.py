@@ -11,8 +11,9 @@ from typing import Final
 
 from gmijax.cli.compose import build, compose
 from gmijax.config import PlayConfig
-from gmijax.control import evaluation, job
+from gmijax.control import job
 from gmijax.control.exit_codes import exit_code_of
+from gmijax.deploy import playing
 from gmijax.machine.snapshot import detect_machine
 from gmijax.runs.folder import RunPaths
 
@@ -48,7 +49,7 @@ def demo(overrides: Sequence[str]) -> None:
     short = [f"{key}={value}" for key, value in own.items() if key not in given]
     config = compose(*short, *overrides)
     result = job.train(config, show=True)
-    evaluation.play(build("play", PlayConfig, [f"run.dir={result.run_dir}"]), show=True)
+    playing.play(build("play", PlayConfig, [f"run.dir={result.run_dir}"]), show=True)
     curve = RunPaths(result.run_dir).returns_png
     films = sorted(result.run_dir.glob("play/*/*.mp4"))
     sys.stdout.write(

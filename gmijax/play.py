@@ -6,12 +6,12 @@ import sys
 
 from gmijax.cli.command import command
 from gmijax.config import PlayConfig
-from gmijax.control import evaluation
+from gmijax.deploy import playing
 
 
 def main(argv: list[str]) -> int:
     """Returns the exit code."""
-    return command("play", PlayConfig, evaluation.play, argv)
+    return command("play", PlayConfig, playing.play, argv)
 
 
 if __name__ == "__main__":

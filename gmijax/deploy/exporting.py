@@ -13,7 +13,7 @@ from typing import Final
 from gmijax.config import ExportConfig, PlanConfig, ReduceConfig
 from gmijax.config.schema import to_dict
 from gmijax.control.console import open_console
-from gmijax.control.evaluation import open_run
+from gmijax.deploy.playing import open_run
 from gmijax.errors import ConfigError
 from gmijax.machine.snapshot import detect_machine
 from gmijax.partition.planner import make_plan

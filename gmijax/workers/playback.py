@@ -1,4 +1,4 @@
-"""Main of the evaluating child of `gmijax.play`, started by `gmijax.control.evaluation` only.
+"""Main of the evaluating child of `gmijax.play`, started by `gmijax.deploy.playing` only.
 
 Restores a policy, runs episodes with it, and writes their returns and a trajectory to film.
 """

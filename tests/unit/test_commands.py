@@ -57,7 +57,7 @@ def test_a_demo_trains_plays_and_says_what_to_look_at(
         played.mp4.touch()
 
     monkeypatch.setattr(demo.job, "train", train)
-    monkeypatch.setattr(demo.evaluation, "play", play)
+    monkeypatch.setattr(demo.playing, "play", play)
     assert main(["demo", "num_timesteps=42", "seed=3"]) == 0
     said = capsys.readouterr().out
     assert f"return while it learnt: {run.returns_png}\n" in said

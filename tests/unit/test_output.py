@@ -13,8 +13,8 @@ import pytest
 from rich.console import Console
 from supervision import CHECKOUT
 
-from gmijax.control import evaluation
 from gmijax.control.console import ConsoleProgress, open_console
+from gmijax.deploy import playing
 from gmijax.errors import printable
 from gmijax.supervise.failures import last_line
 from gmijax.supervise.watched_gmi import GmiStatus
@@ -145,6 +145,6 @@ def test_names_in_the_table_of_play_may_look_like_markup():
         "metrics": {"[red]x": row},
     }
     said = io.StringIO()
-    Console(file=said, width=200, markup=False).print(evaluation._table(returns))
+    Console(file=said, width=200, markup=False).print(playing._table(returns))
     for name in ("a[/b].py:make", "near[/]", "[red]x"):
         assert name in said.getvalue()

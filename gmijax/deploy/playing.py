@@ -18,7 +18,7 @@ from rich.table import Table
 from gmijax.config import EnvConfig, ExportConfig, PlanConfig, PlayConfig, ReduceConfig
 from gmijax.config.schema import to_dict
 from gmijax.control.console import open_console
-from gmijax.control.pictures import film, has_brax, write_page
+from gmijax.deploy.pictures import film, has_brax, write_page
 from gmijax.errors import ConfigError, GmijaxError
 from gmijax.machine.snapshot import Machine, detect_machine
 from gmijax.partition.planner import make_plan
