@@ -17,8 +17,8 @@ import pytest
 from gmijax.autotune import tuner
 from gmijax.cli.command import command as run_command
 from gmijax.config import ExportConfig, PlayConfig, ServeConfig, TrainConfig
-from gmijax.control import decide, evaluation, job, searching, selection, serving
-from gmijax.deploy import exporting
+from gmijax.control import decide, job, searching, selection, serving
+from gmijax.deploy import exporting, playing
 from gmijax.machine.snapshot import Machine
 
 COMMANDS: Mapping[str, type[Any]] = {
@@ -34,7 +34,7 @@ BODIES: Mapping[str, Any] = {
     "train": job.train,
     "serve": serving.serve,
     "search": searching.search,
-    "play": evaluation.play,
+    "play": playing.play,
     "export": exporting.export,
 }
 """What they run."""
