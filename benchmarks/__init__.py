@@ -1,1 +1,4 @@
-"""Benchmarks: cases as data (`cases`), one runner (`python -m benchmarks.run`)."""
+"""Benchmarks: cases as data (`cases`), a runner (`python -m benchmarks.run`), and their results.
+
+All benchmarks write by `records`; `python -m benchmarks` keeps the documents equal to the files.
+"""

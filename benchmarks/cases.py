@@ -53,7 +53,7 @@ def _templates(task: str, num_envs: int) -> tuple[Case, ...]:
     shared = (
         *(f"env={task}", f"num_envs={num_envs}", f"num_timesteps={12 * 32 * 2 * num_envs}"),
         *("plan.backend=mps", "run.measure_throughput=false", "run.checkpoint_every=0"),
-        # The resource model has rollout, updates and exchanges apart.
+        # Both as the paper has them: gradients through host memory.
         "reduce.selection=paper",
     )
     return (

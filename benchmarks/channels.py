@@ -1,7 +1,7 @@
 """Measures the experience channels: `python -m benchmarks.channels`, without training anything.
 
 First a count: a million unrolls through shared memory, three agents and two trainers with random
-pauses. Then speed: channels against the uni-channel for the sizes of the tasks. Writes
+pauses. Then speed: channels against the uni-channel for the sizes of the tasks. Adds a call to
 `benchmarks/results/channels-<cores>-cores.json`.
 
 Every process runs without jax, so this needs no GPU.
@@ -20,7 +20,7 @@ from typing import Any, Literal
 import numpy as np
 
 from benchmarks.channel_job import ChannelJob
-from benchmarks.run import RESULTS
+from benchmarks.records import RESULTS, ResultsFile
 from gmijax.collectives.channel.build import ChannelTopology
 from gmijax.config.channel import ChannelConfig
 
@@ -45,6 +45,8 @@ def main() -> int:
     parser.add_argument("--passes", type=int, default=3, help="to take the median of")
     parser.add_argument("--out", type=Path, default=RESULTS, help="folder of the JSON file")
     arguments = parser.parse_args()
+    path = arguments.out / f"channels-{os.cpu_count()}-cores.json"
+    book = ResultsFile(path, "channels", {**vars(arguments), "steps": STEPS}, device="cpu")
     exact = count(arguments.unrolls)
     sys.stdout.write(f"count: {json.dumps(exact)}\n")
     rows = []
@@ -52,11 +54,8 @@ def main() -> int:
         for task, envs in ((task, envs) for task in SIZES for envs in arguments.envs):
             rows.append(compare(task, envs, transport, arguments))
             sys.stdout.write(line(rows[-1]) + "\n")
-    results = {"cores": os.cpu_count(), "steps": STEPS, "count": exact, "rows": rows}
-    results |= {"agents": arguments.agents, "trainers": arguments.trainers}
-    path = arguments.out / f"channels-{os.cpu_count()}-cores.json"
-    arguments.out.mkdir(parents=True, exist_ok=True)
-    path.write_text(json.dumps(results, indent=1) + "\n")
+            with book.changing() as results:
+                results.update(count=exact, rows=rows)
     sys.stdout.write(f"written: {path}\n")
     return 1 if exact["failed"] or any(exact[key] for key in FAULTS) else 0
 

@@ -1,19 +1,18 @@
 """Draws the return curves of suites: `python -m benchmarks.plot OUT.png ant-1gpu ...`.
 
-Left over environment steps, right over wall-clock seconds of training, where runs that shared
-their GPU are left out.
+The last call of every suite counts. Left over environment steps, right over wall-clock seconds of
+training, where runs that shared their GPU are left out.
 """
 
 from __future__ import annotations
 
-import json
 import sys
 from pathlib import Path
 
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from benchmarks.run import RESULTS
+from benchmarks.records import RESULTS, read_calls
 
 
 def main(picture: str, suites: list[str]) -> None:
@@ -23,7 +22,7 @@ def main(picture: str, suites: list[str]) -> None:
     over_steps, over_time = figure.subplots(1, 2, sharey=True)
     number = 0
     for suite in suites:
-        results = json.loads((RESULTS / f"{suite}.json").read_text())
+        results = read_calls(RESULTS / f"{suite}.json")[-1].results
         for name, case in results["cases"].items():
             done = [run for run in case["runs"] if "curve" in run]
             for k, run in enumerate(done):

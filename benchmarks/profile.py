@@ -4,13 +4,13 @@
 simulator and the whole iteration, each as a program of its own in this process, and traces some
 rounds of each. It says how long a round takes, how many kernels it has, how long none of them
 runs, which ones take longest, and how long the products of its matrices and its bytes would take
-at the rates that this device reaches by itself. Writes `profile-<task>-<device>.json`.
+at the rates that this device reaches by itself. Adds a call to
+`benchmarks/results/profile-<task>-<device>.json`.
 """
 
 from __future__ import annotations
 
 import argparse
-import json
 import re
 import sys
 import tempfile
@@ -24,7 +24,7 @@ import jax
 import jax.numpy as jnp
 from jax.profiler import ProfileData
 
-from benchmarks.run import RESULTS
+from benchmarks.records import RESULTS, ResultsFile, file_name
 from benchmarks.stages import Stage, stages
 from gmijax import compose
 from gmijax.config import PpoConfig, TrainConfig
@@ -33,6 +33,9 @@ from gmijax.sim.impl import choose_impl
 
 WARM_UP, TIMED, TRACED = 2, 10, 2
 """Rounds of a stage: first, then timed, then traced."""
+
+KEPT = 60
+"""Kernels of a stage that the file has."""
 
 _METADATA = re.compile(r"%?([\w.-]+) = .*metadata={[^}]*op_name=\"([^\"]*)\"")
 
@@ -80,23 +83,18 @@ def main() -> int:
     config = compose(*arguments.overrides)
     assert isinstance(config.algo, PpoConfig)
     impl, _ = choose_impl(config.physics.impl, jax.default_backend(), config.env.name)
+    device = jax.local_devices()[0].device_kind
+    path = arguments.out / file_name(f"profile-{config.env.slug}", device)
+    file = ResultsFile(path, "profile", vars(arguments), device=device)
     rates = measure_rates()
-    found: dict[str, Any] = {
-        "device": jax.local_devices()[0].device_kind,
-        "jax": jax.__version__,
-        "overrides": arguments.overrides,
-        "impl": impl,
-        "rates": rates._asdict(),
-        "stages": {},
-    }
+    with file.changing() as results:
+        results.update(impl=impl, rates=rates._asdict(), stages={})
     for stage in stages(config, impl):
         if stage.name in arguments.stages:
             row = profile(stage, rates, products(stage.name, config, stage))
-            found["stages"][stage.name] = row
+            with file.changing() as results:
+                results["stages"][stage.name] = row
             _print(stage.name, row, arguments.top)
-    device = found["device"].replace(" ", "-").lower()
-    path = arguments.out / f"profile-{config.env.slug}-{device}.json"
-    path.write_text(json.dumps(found, indent=1) + "\n")
     sys.stdout.write(f"written: {path}\n")
     return 0
 
@@ -228,7 +226,7 @@ def by_time(kernels: Iterable[Kernel], names: dict[str, str]) -> list[dict[str, 
         }
         for (instruction, name), times in groups.items()
     ]
-    return sorted(rows, key=lambda row: -row["ms"])
+    return sorted(rows, key=lambda row: -row["ms"])[:KEPT]
 
 
 def _print(name: str, row: dict[str, Any], top: int) -> None:

@@ -2,20 +2,20 @@
 
 Every strategy runs on every layout that it takes, with buffers of three sizes, in real GMIs, all
 under one backend. Two large probes give the bandwidths of the cost model, whose prediction stands
-beside each measurement. Writes `benchmarks/results/reduction-<device>.json`.
+beside each measurement. Adds a call to
+`benchmarks/results/reduction-<device>.json`.
 """
 
 from __future__ import annotations
 
 import argparse
 import json
-import os
 import sys
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
-from benchmarks.run import RESULTS
+from benchmarks.records import RESULTS, ResultsFile, device_name, file_name
 from gmijax.collectives.strategies import BYTES_PER_FLOAT, predicted_s
 from gmijax.config import PlanConfig, ReduceConfig
 from gmijax.control.selection import Probe, candidates, measure
@@ -55,11 +55,10 @@ def main() -> int:
     except ConfigError as error:
         sys.stderr.write(f"{error}\n")
         return 2
-    results = measure_all(plans, set(layouts), machine, arguments)
-    device = results["device"]
-    path = arguments.out / f"reduction-{device.replace(' ', '-').lower()}.json"
-    arguments.out.mkdir(parents=True, exist_ok=True)
-    path.write_text(json.dumps(results, indent=1) + "\n")
+    path = arguments.out / file_name("reduction", "cpu" if backend == "cpu" else device_name())
+    book = ResultsFile(path, "reduction", {**vars(arguments), "backend": backend})
+    with book.changing() as results:
+        results.update(measure_all(plans, set(layouts), machine, arguments))
     for row in results["rows"]:
         sys.stdout.write(line(row) + "\n")
     for text in gains(results["rows"]):
@@ -77,7 +76,6 @@ def measure_all(
     """All rows; one job for each layout, and the bandwidths by two of them."""
     found: list[tuple[Layout, Probe, dict[str, Any]]] = []
     bandwidths: dict[str, float | None] = dict.fromkeys(PROBES)
-    device = ""
     for layout, plan in plans.items():
         probes = [p for size in arguments.sizes for p in candidates(plan, size)]
         probes = probes if layout in wanted else []
@@ -90,13 +88,8 @@ def measure_all(
                 bandwidths[large[probe]] = PROBE_FLOATS * BYTES_PER_FLOAT / row["median_s"]
             else:
                 found.append((layout, probe, row))
-        device = rows[0]["device"]
         sys.stderr.write(f"measured: {layout}\n")
-    first = next(iter(plans.values()))
     return {
-        "device": device,
-        "backend": first.backend,
-        "cores": os.cpu_count(),
         "probe_floats": PROBE_FLOATS,
         "bytes_per_s": bandwidths,
         "rows": [_row(layout, probe, row, bandwidths) for layout, probe, row in found],
@@ -166,7 +159,7 @@ def _row(
         "name": probe.name,
         **probe._asdict(),
         "is_algorithm_1": probe.strategy == select_strategy(layout).strategy,
-        **{key: value for key, value in row.items() if key != "device"},
+        **row,
         "predicted_s": predicted,
     }
 

@@ -4,14 +4,13 @@
 iteration one after the other in one process, each alone on the GPU and over and over. While it
 does, NVML's performance monitor (GPM, from Hopper on) reads which part of the SMs is busy, and
 the compiler has said what memory its program takes. R is the larger part of the two (equation 1).
-Writes `benchmarks/results/resource-use-<device>.json`, which `python -m benchmarks.resource_model
---resources` reads.
+Adds a call to `benchmarks/results/resource-use-<device>.json`, which `python -m
+benchmarks.resource_model --resources` reads.
 """
 
 from __future__ import annotations
 
 import argparse
-import json
 import os
 import sys
 import time
@@ -23,7 +22,7 @@ import jax.numpy as jnp
 import pynvml
 
 from benchmarks.paper_model import dominant_resource
-from benchmarks.run import RESULTS
+from benchmarks.records import RESULTS, ResultsFile, file_name
 from benchmarks.stages import Stage, stages
 from gmijax import compose
 from gmijax.machine.nvidia import nvml_session
@@ -104,9 +103,9 @@ def main() -> int:
         sys.stderr.write(f"--gpu {arguments.gpu}: NVML cannot watch it: {error}\n")
         return 2
     device = jax.local_devices()[0].device_kind
-    path = arguments.out / f"resource-use-{device.replace(' ', '-').lower()}.json"
-    found = {"device": device, "num_envs": arguments.num_envs, "impl": arguments.impl}
-    path.write_text(json.dumps({**found, "tasks": rows}, indent=1) + "\n")
+    path = arguments.out / file_name("resource-use", device)
+    with ResultsFile(path, "resource-use", vars(arguments), device=device).changing() as results:
+        results["tasks"] = rows
     for task, uses in rows.items():
         for name, use in uses.items():
             sys.stdout.write(

@@ -1,24 +1,23 @@
 """Runs suites of training commands and keeps what they measured.
 
 `python -m benchmarks.run ant-1gpu --repeats 3` runs the cases in turn (A B C A B C ...), prints
-the medians, and writes `benchmarks/results/<suite>.json` with every run in it. With `--gpus 4`
-as many runs go on at a time as there are GPUs for, each alone on its own. `--together 3` puts
-three at a time on each GPU, under an MPS daemon that runs already: what they learn is the same,
-their seconds are not, and each run says how many they were.
+the medians, and adds a call with every run in it to `benchmarks/results/<suite>.json`. With
+`--gpus 4` as many runs go on at a time as there are GPUs for, each alone on its own.
+`--together 3` puts three at a time on each GPU, under an MPS daemon that runs already: what they
+learn is the same, their seconds are not, and each run says how many they were. `--resume` goes on
+with the last call, if code and machine are still the same.
 """
 
 from __future__ import annotations
 
 import argparse
 import itertools
-import json
 import math
 import re
 import statistics
 import subprocess
 import sys
 import tempfile
-import threading
 from collections.abc import Collection, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
@@ -26,10 +25,12 @@ from typing import Any
 
 from benchmarks.cases import SUITES, Case
 from benchmarks.free_gpus import FreeGpus
+from benchmarks.records import RESULTS, ResultsFile
+from gmijax.errors import ConfigError
 from gmijax.machine.snapshot import detect_machine
+from gmijax.runs.folder import RunPaths, read_json
 from gmijax.runs.history import read_metrics
 
-RESULTS = Path(__file__).parent / "results"
 RATES = ("step_per_s_sim", "step_per_s_inference", "step_per_s_train")
 CURVE_POINTS = 60
 
@@ -59,23 +60,29 @@ def main() -> int:
             sys.stderr.write(f"{case.name}: left out, it needs {case.gpus} GPUs\n")
     if arguments.together > 1 and (reason := why_not_together(cases, arguments.gpus)):
         parser.error(f"--together {arguments.together}: {reason}")
-    arguments.out.mkdir(parents=True, exist_ok=True)
     wanted = {case.name for case in cases}
-    books = {
-        suite: ResultsFile(
-            arguments.out / f"{suite}.json",
-            suite,
-            keep=names if arguments.resume else names - wanted,
-        )
-        for suite in arguments.suites
-        if wanted & (names := {case.name for case in SUITES[suite]})
-    }
+    suites = [s for s in arguments.suites if any(case.name in wanted for case in SUITES[s])]
+    try:
+        books = {suite: _book(suite, wanted, arguments) for suite in suites}
+    except ConfigError as error:
+        parser.error(str(error))
     with tempfile.TemporaryDirectory() as scratch:
         free = FreeGpus(arguments.gpus, arguments.together) if arguments.gpus else None
         run_all(books, wanted, arguments.repeats, arguments.runs or Path(scratch), free)
     for book in books.values():
         sys.stdout.write(f"{table(book.results)}\nwritten: {book.path}\n")
-    return int(any(book.failures() for book in books.values()))
+    return int(any(failures(book.results) for book in books.values()))
+
+
+def _book(suite: str, wanted: Collection[str], arguments: argparse.Namespace) -> ResultsFile:
+    """The file of a suite, with a call that has the suite's wanted cases."""
+    path = arguments.out / f"{suite}.json"
+    book = ResultsFile(path, suite, vars(arguments), resume=arguments.resume)
+    known = book.results.setdefault("cases", {})
+    for case in SUITES[suite]:
+        if case.name in wanted:
+            known.setdefault(case.name, {"command": command(case), "runs": []})
+    return book
 
 
 def why_not_together(cases: list[Case], gpus: int | None) -> str | None:
@@ -89,57 +96,35 @@ def why_not_together(cases: list[Case], gpus: int | None) -> str | None:
     return None
 
 
-class ResultsFile:
-    """The runs of a suite, in memory and on disk: an interruption loses the running ones only.
+def missing(
+    results: Mapping[str, Any], cases: Collection[Case], repeats: int, gpus: int | None
+) -> list[tuple[int, Case]]:
+    """Runs to be made of `cases`: those that have not succeeded, none that needs more GPUs.
 
-    Attributes:
-      path: the JSON file, written after every run.
-      results: its content.
+    Every case once before any case again.
     """
+    done = {
+        (run["repeat"], name)
+        for name, case in results["cases"].items()
+        for run in case["runs"]
+        if "summary" in run
+    }
+    return [
+        (repeat, case)
+        for repeat in range(repeats)
+        for case in cases
+        if (repeat, case.name) not in done and case.gpus <= (gpus or case.gpus)
+    ]
 
-    def __init__(self, path: Path, suite: str, *, keep: Collection[str]) -> None:
-        """Starts from what is on disk of the cases `keep`."""
-        found = json.loads(path.read_text())["cases"] if keep and path.exists() else {}
-        kept = {name: case for name, case in found.items() if name in keep}
-        for case in kept.values():  # What failed is tried again.
-            case["runs"] = [run for run in case["runs"] if "summary" in run]
-        self.path = path
-        self.results: dict[str, Any] = {
-            "suite": suite,
-            "cases": {
-                case.name: kept.get(case.name, {"command": command(case), "runs": []})
-                for case in SUITES[suite]
-            },
-        }
-        self._lock = threading.Lock()
 
-    def missing(
-        self, wanted: Collection[str], repeats: int, gpus: int | None
-    ) -> list[tuple[int, Case]]:
-        """Runs to be made of the cases with the names `wanted`; none that needs more GPUs.
-
-        Every case once before any case again.
-        """
-        cases = self.results["cases"]
-        return [
-            (repeat, case)
-            for repeat in range(repeats)
-            for case in SUITES[self.results["suite"]]
-            if case.name in wanted
-            and len(cases[case.name]["runs"]) <= repeat
-            and case.gpus <= (gpus or case.gpus)
-        ]
-
-    def add(self, case: Case, run: Mapping[str, Any]) -> None:
-        """Takes in one run; may be called from any thread."""
-        with self._lock:
-            self.results["cases"][case.name]["runs"].append(run)
-            self.path.write_text(json.dumps(self.results, indent=1) + "\n")
-
-    def failures(self) -> list[str]:
-        """Names of the cases of which a run failed."""
-        cases = self.results["cases"].items()
-        return [name for name, case in cases if any("failed" in run for run in case["runs"])]
+def failures(results: Mapping[str, Any]) -> list[str]:
+    """Names of the cases of which a repeat failed, and did not succeed later."""
+    return [
+        name
+        for name, case in results["cases"].items()
+        if {run["repeat"] for run in case["runs"]}
+        - {run["repeat"] for run in case["runs"] if "summary" in run}
+    ]
 
 
 def run_all(
@@ -151,27 +136,39 @@ def run_all(
 ) -> None:
     """Runs the cases `wanted` until each has `repeats` runs; in turn without `free`."""
 
-    def run(book: ResultsFile, repeat: int, case: Case) -> None:
+    def run(suite: str, repeat: int, case: Case) -> None:
         # Letters and digits only: the folder is a value on a command line.
         name = re.sub(r"[^a-zA-Z0-9]+", "-", case.name)
-        folder = unused(runs / f"{book.results['suite']}-{name}-{repeat}")
+        folder = unused(runs / f"{suite}-{name}-{repeat}")
         folder_override = f"run.dir={folder}"
         # Runs that go on at the same time are noted as they end: who is which must be told.
         note: dict[str, Any] = {"repeat": repeat}
         if free is None:
-            book.add(case, {**run_case(case, repeat, (folder_override,), folder), **note})
+            add(suite, case, {**run_case(case, repeat, (folder_override,), folder), **note})
             return
         with free.taken(case.gpus) as taken:
             done = run_case(case, repeat, (*free.overrides(taken), folder_override), folder)
         if free.together > 1:
             note["together"] = free.together
-        book.add(case, {**done, **note})
+        add(suite, case, {**done, **note})
+
+    def add(suite: str, case: Case, run: dict[str, Any]) -> None:
+        """Takes in one run, and writes: an interruption loses the running ones only."""
+        with books[suite].changing() as results:
+            kept = results["cases"][case.name]
+            kept["config"] = run.pop("config", kept.get("config"))
+            kept["runs"].append(run)
 
     with ThreadPoolExecutor(free.count * free.together if free else 1) as pool:
         started = [
-            pool.submit(run, book, repeat, case)
-            for book in books.values()
-            for repeat, case in book.missing(wanted, repeats, free and free.count)
+            pool.submit(run, suite, repeat, case)
+            for suite, book in books.items()
+            for repeat, case in missing(
+                book.results,
+                [case for case in SUITES[suite] if case.name in wanted],
+                repeats,
+                free and free.count,
+            )
         ]
         try:
             for one in started:
@@ -213,13 +210,14 @@ def command(case: Case) -> str:
 
 
 def outcome(folder: Path) -> dict[str, Any]:
-    """The summary of a run, its curve thinned out, and medians of times, losses and rates."""
-    lines = read_metrics(folder / "metrics.jsonl")
+    """Configuration, summary and thinned curve of a run, and medians of what it logged."""
+    lines = read_metrics(RunPaths(folder).metrics)
     kept = lines[:: max(1, len(lines) // CURVE_POINTS)]
     kept += [] if kept[-1] is lines[-1] else lines[-1:]
     names = [key for key in lines[-1] if key.startswith(("time/", "loss/", "async/"))]
     return {
-        "summary": json.loads((folder / "summary.json").read_text()),
+        "config": read_json(RunPaths(folder).config),
+        "summary": read_json(RunPaths(folder).summary),
         "curve": [[line["env_steps"], line["wall_s"], line["return"]] for line in kept],
         "metrics": {k: v for k, v in lines[-1].items() if k.startswith("metric/")},
         "diverged_steps": sum(line["diverged_steps"] for line in lines),
@@ -234,10 +232,13 @@ def _median_of(lines: list[dict[str, Any]], name: str) -> float | None:
 
 
 def table(results: dict[str, Any]) -> str:
-    """Medians over the runs, one row per case, with the ratio to the first case."""
+    """Medians over the runs of a call, one row per case, with the ratio to the first case.
+
+    The spread is that of the rate of training, of the fastest run less the slowest.
+    """
     rows = [
-        f"{'case':32} {'sim':>10} {'inference':>10} {'train':>10} {'ratio':>6} {'return':>8} "
-        f"{'MiB':>7}"
+        f"{'case':32} {'sim':>10} {'inference':>10} {'train':>10} {'spread':>6} {'ratio':>6} "
+        f"{'return':>8} {'MiB':>7}"
     ]
     first: float | None = None
     for name, case in results["cases"].items():
@@ -250,7 +251,12 @@ def table(results: dict[str, Any]) -> str:
         shown = " ".join(f"{rate:10,.0f}" for rate in rates)
         final = median(summaries, "final_return")
         memory = median([summary["device"] for summary in summaries], "peak_memory_mib")
-        rows.append(f"{name:32} {shown} {rates[-1] / first:6.2f} {final:8,.0f} {memory:7,.0f}")
+        trained = [summary["step_per_s_train"] for summary in summaries]
+        spread = (max(trained) - min(trained)) / rates[-1]
+        rows.append(
+            f"{name:32} {shown} {spread:6.1%} {rates[-1] / first:6.2f} {final:8,.0f} "
+            f"{memory:7,.0f}"
+        )
     return "\n".join(rows)
 
 

@@ -1,9 +1,10 @@
 """Measures serving: `python -m benchmarks.serving`, simulator and agent together and apart.
 
 The same environments act with random actions in m GMIs (template `tcg`), and in m GMIs that
-simulate plus one that infers (`tdg`). With `--backends mps share` both run under both. Writes
-`benchmarks/results/serving-<device>.json`, which `benchmarks.resource_model` reads: `simulator_s`,
-`agent_s` and `com_s` are medians of the stages of one dedicated step of all environments of a GMI.
+simulate plus one that infers (`tdg`). With `--backends mps share` both run under both. Adds a call
+to `benchmarks/results/serving-<device>.json`, which `benchmarks.resource_model` reads:
+`simulator_s`, `agent_s` and `com_s` are medians of the stages of one dedicated step of all
+environments of a GMI.
 """
 
 from __future__ import annotations
@@ -11,6 +12,7 @@ from __future__ import annotations
 import argparse
 import json
 import os
+import statistics
 import subprocess
 import sys
 import tempfile
@@ -18,7 +20,7 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from benchmarks.run import RESULTS
+from benchmarks.records import RESULTS, ResultsFile, device_name, file_name
 
 Summary = Mapping[str, Any]
 
@@ -47,16 +49,17 @@ class Setting(NamedTuple):
 def main() -> int:
     """Measures what the command line asks for; returns 1 if a job failed, else 0."""
     arguments = _arguments()
-    results: dict[str, Any] = {"device": None, "cases": []}
+    path = arguments.out / file_name("serving", device_name())
+    book = ResultsFile(path, "serving", vars(arguments))
+    cases: list[dict[str, Any]] = []
     with tempfile.TemporaryDirectory() as scratch:
         for setting in settings(arguments):
-            case = measure(setting, arguments, Path(scratch))
-            results["device"] = results["device"] or case.pop("device", None)
-            results["cases"].append(case)
-            sys.stdout.write(f"{line(case)}\n")
+            cases.append(measure(setting, arguments, Path(scratch)))
+            sys.stdout.write(f"{line(cases[-1])}\n")
             sys.stdout.flush()
-            _write(results, arguments.out)
-    return int(any("failed" in case for case in results["cases"]))
+            with book.changing() as results:
+                results["cases"] = cases
+    return int(any("failed" in case for case in cases))
 
 
 def settings(arguments: argparse.Namespace) -> Iterator[Setting]:
@@ -70,7 +73,7 @@ def settings(arguments: argparse.Namespace) -> Iterator[Setting]:
 def measure(setting: Setting, arguments: argparse.Namespace, scratch: Path) -> dict[str, Any]:
     """Both templates in turn, as often as wanted; a case of `benchmarks.resource_model`.
 
-    Throughputs are the best of the repeats: whatever else runs can only make them lower.
+    Throughputs and times are medians over the repeats; every repeat's summary is kept.
     """
     runs: dict[str, list[Summary]] = {"tcg": [], "tdg": []}
     for repeat in range(arguments.repeats):
@@ -81,19 +84,18 @@ def measure(setting: Setting, arguments: argparse.Namespace, scratch: Path) -> d
             except RuntimeError as error:
                 sys.stderr.write(f"{setting.name}, {template}: {error}\n")
                 return {"name": setting.name, "failed": str(error)}
-    best = {
-        template: max(found, key=lambda run: run["step_per_s_inference"])
-        for template, found in runs.items()
-        if found
-    }
-    device = next(iter(best.values()))["device"]
-    case = {"name": setting.name, **setting._asdict(), "device": device["kind"], "runs": runs}
-    if "tcg" in best:
-        case["colocated"] = best["tcg"]["step_per_s_inference"]
-    if "tdg" in best:
-        stages = {name: ms["p50"] / 1e3 for name, ms in best["tdg"]["stages_ms"].items()}
+    first = next(found[0] for found in runs.values() if found)
+    case: dict[str, Any] = {"name": setting.name, **setting._asdict(), "impl": first.get("impl")}
+    case["runs"] = runs
+    for template, name in (("tcg", "colocated"), ("tdg", "dedicated")):
+        if runs[template]:
+            case[name] = statistics.median(run["step_per_s_inference"] for run in runs[template])
+    if runs["tdg"]:
+        stages = {
+            name: statistics.median(run["stages_ms"][name]["p50"] / 1e3 for run in runs["tdg"])
+            for name in ("simulate", "infer", "exchange")
+        }
         case |= {
-            "dedicated": best["tdg"]["step_per_s_inference"],
             "simulator_s": stages["simulate"],
             "agent_s": stages["infer"],
             # Pipes, copies between host and device, and waiting for the agent's turn.
@@ -160,18 +162,9 @@ def _arguments() -> argparse.Namespace:
 
 
 def _environment() -> dict[str, str]:
-
     checkout = str(Path(__file__).resolve().parent.parent)
     path = os.pathsep.join(filter(None, (checkout, os.environ.get("PYTHONPATH"))))
     return {**os.environ, "PYTHONPATH": path}
-
-
-def _write(results: Mapping[str, Any], folder: Path) -> None:
-    if results["device"] is not None:
-        folder.mkdir(parents=True, exist_ok=True)
-        name = results["device"].replace(" ", "-").lower()
-        path = folder / f"serving-{name}.json"
-        path.write_text(json.dumps(results, indent=1) + "\n")
 
 
 if __name__ == "__main__":

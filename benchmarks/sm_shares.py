@@ -2,22 +2,21 @@
 
 A GMI for every cap, under an MPS daemon of its own making, compares products in bfloat16, float16,
 TF32 and float32 with float64, by cuBLASLt and cuBLAS; then measures, alone, how fast products are.
-`--libraries cublaslt cublas xla` adds what XLA chooses by trying, which takes minutes. Writes
-`benchmarks/results/sm-shares-<device>.json` and prints the table of docs/shares.md. On a machine
+`--libraries cublaslt cublas xla` adds what XLA chooses by trying, which takes minutes. Adds a
+call to `benchmarks/results/sm-shares-<device>.json` and prints a table. On a machine
 without a GPU nothing is capped; that tries the machinery only.
 """
 
 from __future__ import annotations
 
 import argparse
-import json
 import sys
 import tempfile
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
-from benchmarks.run import RESULTS
+from benchmarks.records import RESULTS, ResultsFile, device_name, file_name
 from benchmarks.sm_share_rank import LIBRARIES
 from gmijax.config import PlanConfig, ReduceConfig
 from gmijax.errors import ConfigError, GmiFailed
@@ -25,8 +24,8 @@ from gmijax.machine.snapshot import Machine, detect_machine
 from gmijax.partition.planner import make_plan
 from gmijax.runs.folder import RunPaths, read_json, write_json
 from gmijax.supervise.kinds import JobKind
+from gmijax.supervise.launch import Timeouts
 from gmijax.supervise.launcher import Launch, run_gmis
-from gmijax.supervise.supervisor import Timeouts
 
 SHARES = (
     *(10, 12, 13, 14, 16, 18, 20, 22, 23, 25, 27, 28, 30, 33, 36, 40),
@@ -58,19 +57,18 @@ def main() -> int:
     parser.add_argument("--out", type=Path, default=RESULTS, help="folder of the JSON file")
     arguments = parser.parse_args()
     machine = detect_machine()
+    path = arguments.out / file_name("sm-shares", device_name())
+    book = ResultsFile(path, "sm-shares", vars(arguments))
     rows: list[dict[str, Any]] = []
     try:
         for start in range(0, len(arguments.shares), max(1, arguments.at_once)):
             batch = arguments.shares[start : start + max(1, arguments.at_once)]
             rows += measure_all(batch, arguments.libraries, machine)
+            with book.changing() as results:
+                results["rows"] = rows
     except ConfigError as error:
         sys.stderr.write(f"benchmarks.sm_shares: {error}\n")
         return 2
-    device = next((row["device"] for row in rows if "device" in row), "none")
-    results = {"device": device, "driver": machine.driver_version, "rows": rows}
-    path = arguments.out / f"sm-shares-{device.replace(' ', '-').lower()}.json"
-    arguments.out.mkdir(parents=True, exist_ok=True)
-    path.write_text(json.dumps(results, indent=1) + "\n")
     sys.stdout.write("\n".join([*table(rows), f"written: {path}", ""]))
     return int(any("failed" in row for row in rows))
 

@@ -13,7 +13,8 @@ from gmijax.collectives.program import PeersOfOne
 from gmijax.config import PpoConfig, TrainConfig
 from gmijax.learning.learner import Learner, acting_weights, init_learner, make_learner
 from gmijax.learning.unroll import act
-from gmijax.ppo.ppo import Samples, iterate, learn, no_stats
+from gmijax.ppo.ppo import iterate, learn
+from gmijax.ppo.rollout import Samples, no_stats
 from gmijax.sim.interface import EnvSpec
 from gmijax.sim.randomize import make_worlds
 from gmijax.sim.wrappers import BatchedEnv, env_keys, training_env

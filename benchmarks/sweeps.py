@@ -1,133 +1,208 @@
 """Trainings per hour of sweeps: `python -m benchmarks.sweeps`.
 
-The same trainings as whole commands, start and compiling included: one after another, several at
-a time under MPS, and several under plain sharing. Each command has a cache of compiled programs of
-its own, empty at first, unless `--warm`. Adds its runs to
-`benchmarks/results/sweeps-<device>.json`, with commit, date and settings.
+The same trainings as sweeps with one at a time, several under MPS, several under plain sharing,
+a mix of tasks, and as many as `auto` takes. A sweep counts from the start of its first job to the
+end of its last, start-up included; beside it stand the steps per second while all places train.
+Writes `benchmarks/results/sweeps-<device>.json` after every sweep. What is interrupted or meets
+the deadline keeps what is through; a sweep that would not end in time is not started.
 """
 
 from __future__ import annotations
 
 import argparse
-import datetime
 import json
+import math
 import os
-import platform
+import signal
 import statistics
 import subprocess
 import sys
 import tempfile
 import time
+from collections.abc import Sequence
+from contextlib import suppress
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
-from benchmarks.run import RESULTS
-from gmijax.machine.snapshot import detect_machine
-from gmijax.runs.folder import write_json
-from gmijax.version import versions_of
+from benchmarks.records import RESULTS, ResultsFile, file_name
+from benchmarks.steady import curve_of, steady_rate
+from gmijax.machine.snapshot import Machine, detect_machine
+from gmijax.runs.folder import read_json
 
-PACKAGES = ("jax", "jaxlib", "mujoco", "mujoco-mjx", "warp-lang")
+_STOP_S = 15.0
+"""For a sweep that meets the deadline to save and end."""
+
+
+class Way(NamedTuple):
+    """How to run the trainings of a sweep."""
+
+    at_once: str  # Jobs on the GPU, or `auto`.
+    backend: str
+    tasks: str  # Tasks of a mix, with commas; empty: that of the command line.
+
+    def __str__(self) -> str:
+        return f"{self.at_once} at once, {self.backend}{', ' * bool(self.tasks)}{self.tasks}"
+
+
+class Benchmark:
+    """The sweeps of one call, in its file after each of them."""
+
+    def __init__(self, arguments: argparse.Namespace, machine: Machine) -> None:
+        self._arguments = arguments
+        device = machine.gpus[0].name if machine.gpus else "cpu"
+        path = arguments.out / file_name("sweeps", device)
+        self.file = ResultsFile(path, "sweeps", vars(arguments))
+        self.deadline_s = time.monotonic() + (arguments.deadline_s or math.inf)
+        self.runs: list[dict[str, Any]] = []
+
+    def run(self, ways: Sequence[Way]) -> None:
+        """Every way as often as wanted, all of them once before one comes twice."""
+        with tempfile.TemporaryDirectory() as scratch:
+            cache = Path(scratch) / "xla" if self._arguments.warm else None
+            if cache is not None:
+                for tasks in dict.fromkeys(way.tasks for way in ways):
+                    self._sweep(Way("1", "auto", tasks), 0, cache, ("num_timesteps=1",))
+            for repeat in range(self._arguments.repeats):
+                for way in ways:
+                    if self._has_time(way):
+                        self.runs.append(self._sweep(way, repeat, cache))
+                        sys.stdout.write(f"{json.dumps(self.runs[-1])}\n")
+                        sys.stdout.flush()
+                        with self.file.changing() as results:
+                            results.update(medians=self.medians(ways), runs=self.runs)
+
+    def medians(self, ways: Sequence[Way]) -> dict[str, dict[str, Any]]:
+        """Of the sweeps that are through, by way."""
+        found: dict[str, dict[str, Any]] = {}
+        for way in ways:
+            own = [run for run in self.runs if run["way"] == str(way)]
+            if done := [run for run in own if run["status"] == "completed"]:
+                rates = [run["trainings_per_hour"] for run in done]
+                steady = [rate for run in done if (rate := run["steady_steps_per_s"])]
+                found[str(way)] = {
+                    "sweeps": len(done),
+                    "trainings_per_hour": statistics.median(rates),
+                    # Never, where trainings are too short to overlap.
+                    "steady_steps_per_s": statistics.median(steady) if steady else None,
+                }
+        return found
+
+    def _has_time(self, way: Way) -> bool:
+        before = [run["command_s"] for run in self.runs if run["way"] == str(way)]
+        return time.monotonic() + max(before, default=0.0) < self.deadline_s - _STOP_S
+
+    def _sweep(
+        self, way: Way, repeat: int, cache: Path | None, more: Sequence[str] = ()
+    ) -> dict[str, Any]:
+        """One sweep as a whole command."""
+        tasks = way.tasks.split(",") if way.tasks else []
+        seeds = max(1, self._arguments.jobs // max(1, len(tasks))) if not more else 1
+        with tempfile.TemporaryDirectory() as scratch:
+            folder = Path(scratch) / "sweep"
+            command = [sys.executable, "-m", "gmijax.sweep", "run.measure_throughput=false"]
+            command += [
+                *self._arguments.overrides,
+                *([f"env={way.tasks}"] if tasks else []),
+                *more,
+            ]
+            command += [f"seed=range({seeds})", f"sweep.jobs_per_gpu={way.at_once}"]
+            command += [f"plan.backend={way.backend}", "sweep.gpus=1", f"run.dir={folder}"]
+            started_s = time.monotonic()
+            code = self._command(command, cache or Path(scratch) / "xla")
+            command_s = round(time.monotonic() - started_s, 2)
+            if not (folder / "sweep.json").exists():
+                raise SystemExit(f"no result of {' '.join(command)}")
+            report = read_json(folder / "sweep.json")
+            curves = [curve for row in report["jobs"] if (curve := curve_of(row))]
+        jobs, each = report["jobs"], report["sweep"]["jobs_per_gpu"]
+        return {
+            "way": str(way),
+            "repeat": repeat,
+            "status": report["status"],
+            "code": code,
+            "jobs_per_gpu": each,
+            "command_s": command_s,
+            "trainings_per_hour": report["trainings_per_hour"],
+            "steady_steps_per_s": steady_rate(curves, min(each, len(jobs)))
+            if isinstance(each, int)
+            else None,
+            "first_update_s": [job["first_update_s"] for job in jobs],
+            "job_wall_s": [job["wall_s"] for job in jobs],
+            "values": [job["value"] for job in jobs],
+            "states": [job["state"] for job in jobs],
+        }
+
+    def _command(self, command: Sequence[str], cache: Path) -> int:
+        """Runs a sweep; asks it to save and end at the deadline, or when this is interrupted."""
+        variables = {**os.environ, "JAX_COMPILATION_CACHE_DIR": str(cache)}
+        # In a session of its own, so that Ctrl-C comes to it once.
+        process = subprocess.Popen(command, env=variables, start_new_session=True)
+        try:
+            with suppress(subprocess.TimeoutExpired):
+                return process.wait(max(0.0, self.deadline_s - _STOP_S - time.monotonic()))
+        finally:
+            if process.poll() is None:
+                process.send_signal(signal.SIGINT)
+                with suppress(subprocess.TimeoutExpired):
+                    process.wait(_STOP_S)
+                process.kill()
+        return process.wait()
 
 
 def main() -> int:
     """Measures what the command line asks for; returns 1 if a sweep failed, else 0."""
-    arguments = _arguments()
-    machine = detect_machine()
-    device = machine.gpus[0].name if machine.gpus else "cpu"
-    path = arguments.out / f"sweeps-{device.replace(' ', '-').lower()}.json"
-    ways = [(n, "auto") for n in arguments.at_once] + [(n, "share") for n in arguments.shared]
-    runs: list[dict[str, Any]] = []
-    for repeat in range(arguments.repeats):
-        for at_once, backend in ways:
-            runs.append(_run(arguments, at_once, backend, repeat))
-            sys.stdout.write(f"{json.dumps(runs[-1])}\n")
-            sys.stdout.flush()
-            _add(path, arguments, device, machine.driver_version, runs)
-    for at_once, backend in ways:
-        rates = [
-            run["trainings_per_hour"]
-            for run in runs
-            if (run["at_once"], run["backend"]) == (at_once, backend) and run["code"] == 0
-        ]
-        if rates:
-            median = statistics.median(rates)
-            sys.stdout.write(f"{at_once} at once, {backend}: {median:.1f} trainings/h\n")
-    return int(any(run["code"] for run in runs))
+    signal.signal(signal.SIGTERM, signal.default_int_handler)
+    arguments, machine = _arguments(), detect_machine()
+    shared = arguments.shared if machine.gpus else []
+    ways = [Way(str(n), "auto", "") for n in arguments.at_once]
+    ways += [Way(str(n), "share", "") for n in shared]
+    if arguments.mix:
+        ways += [Way(str(n), "auto", arguments.mix) for n in arguments.at_once]
+    if arguments.auto:
+        ways.append(Way("auto", "auto", ""))
+    benchmark = Benchmark(arguments, machine)
+    code = 0
+    try:
+        benchmark.run(ways)
+    except KeyboardInterrupt:
+        code = 130
+    medians = benchmark.medians(ways)
+    for way, row in medians.items():
+        steady = row["steady_steps_per_s"]
+        shown = "-" if steady is None else f"{steady:,.0f}"
+        sys.stdout.write(
+            f"{way}: {row['trainings_per_hour']:.1f} trainings/h, {shown} steps/s while all "
+            f"places train ({row['sweeps']} sweeps)\n"
+        )
+    if arguments.auto and (share := _auto_to_best(medians)) is not None:
+        sys.stdout.write(f"auto makes {share:.0%} of the trainings of the best of the others\n")
+    return code or int(any(run["status"] == "failed" for run in benchmark.runs))
 
 
-def _run(arguments: argparse.Namespace, at_once: int, backend: str, repeat: int) -> dict[str, Any]:
-    """One sweep as a whole command."""
-    with tempfile.TemporaryDirectory() as scratch:
-        folder = Path(scratch) / "sweep"
-        command = [sys.executable, "-m", "gmijax.sweep", *arguments.overrides]
-        command += [f"seed=range({arguments.jobs})", f"sweep.jobs_per_gpu={at_once}"]
-        command += [f"plan.backend={backend}", "sweep.gpus=1", f"run.dir={folder}"]
-        cache = {} if arguments.warm else {"JAX_COMPILATION_CACHE_DIR": f"{scratch}/xla"}
-        started_s = time.monotonic()
-        code = subprocess.run(command, env={**os.environ, **cache}, check=False).returncode
-        wall_s = time.monotonic() - started_s
-        report = json.loads((folder / "sweep.json").read_text())
-        jobs = report["jobs"]
-    return {
-        "at_once": at_once,
-        "backend": backend,
-        "repeat": repeat,
-        "code": code,
-        "wall_s": round(wall_s, 2),
-        "trainings_per_hour": 3600 * arguments.jobs / wall_s,
-        "job_wall_s": [job["wall_s"] for job in jobs],
-        "values": [job["value"] for job in jobs],
-        "states": [job["state"] for job in jobs],
-    }
-
-
-def _add(
-    path: Path,
-    arguments: argparse.Namespace,
-    device: str,
-    driver: str | None,
-    runs: list[dict[str, Any]],
-) -> None:
-    """Puts this call beside the earlier ones of the file."""
-    calls = json.loads(path.read_text())["calls"] if path.exists() else []
-    started = runs[0]["wall_s"]
-    own = {
-        "commit": _commit(),
-        "date": datetime.date.today().isoformat(),
-        "device": device,
-        "driver": driver,
-        "host": f"{os.cpu_count()} cores, {platform.platform()}",
-        "versions": versions_of(PACKAGES),
-        "overrides": arguments.overrides,
-        "jobs": arguments.jobs,
-        "is_warm": arguments.warm,
-        "first_wall_s": started,
-        "runs": runs,
-    }
-    rest = [call for call in calls if call["first_wall_s"] != started]
-    path.parent.mkdir(parents=True, exist_ok=True)
-    write_json(path, {"suite": "sweeps", "calls": [*rest, own]})
-
-
-def _commit() -> str:
-    """The commit of the checkout, with a plus where files differ from it."""
-    said = [
-        subprocess.run(["git", *words], capture_output=True, text=True, check=False).stdout.strip()
-        for words in (("rev-parse", "--short", "HEAD"), ("status", "--porcelain", "gmijax"))
-    ]
-    return f"{said[0]}{'+' if said[1] else ''}" or "unknown"
+def _auto_to_best(medians: dict[str, dict[str, Any]]) -> float | None:
+    rates = {way: row["trainings_per_hour"] for way, row in medians.items()}
+    auto = rates.pop(str(Way("auto", "auto", "")), None)
+    others = [rate for way, rate in rates.items() if way.count(",") == 1]  # No mixes.
+    return auto / max(others) if auto and others else None
 
 
 def _arguments() -> argparse.Namespace:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("overrides", nargs="*", help="of the trainings, e.g. env=ant")
-    parser.add_argument("--jobs", type=int, default=8, help="seeds to train")
+    parser.add_argument("--jobs", type=int, default=8, help="trainings of a sweep")
     parser.add_argument("--at-once", type=int, nargs="*", default=[1, 2, 4, 8])
     parser.add_argument("--shared", type=int, nargs="*", default=[4], help="without MPS")
+    parser.add_argument("--mix", default="", help="also a mix of these tasks, e.g. ant,humanoid")
+    parser.add_argument("--auto", action="store_true", help="also sweep.jobs_per_gpu=auto")
     parser.add_argument("--repeats", type=int, default=3)
-    parser.add_argument("--warm", action="store_true", help="with what is compiled already")
+    parser.add_argument("--deadline-s", type=float, help="seconds for all of it")
+    parser.add_argument(
+        "--warm",
+        action="store_true",
+        help="with compiled programs from a short training before; otherwise each sweep compiles",
+    )
     parser.add_argument("--out", type=Path, default=RESULTS, help="folder of the JSON file")
-    return parser.parse_args()
+    return parser.parse_intermixed_args()
 
 
 if __name__ == "__main__":

@@ -10,7 +10,7 @@ import mujoco
 import gmijax
 from gmijax.sim import episode, physics
 from gmijax.sim.interface import Env, EnvSpec
-from gmijax.sim.rewards import RewardTerm, term_names, total_reward
+from gmijax.sim.rewards import RewardTerm, term_names, total_reward, with_weights
 
 MJCF = """<mujoco><option timestep="0.01" iterations="2"><flag eulerdamp="disable"/></option>
 <worldbody><light pos="0 -2 3"/><camera name="track" pos="0 -4 1" xyaxes="1 0 0 0 0.2 1"/>
@@ -28,11 +28,12 @@ TERMS = {
 }
 
 
-def make(*, impl="auto", max_envs=None) -> Env:
+def make(*, impl="auto", max_envs=None, rewards=None) -> Env:
     """The task: observation [5], action [1], 50 steps a second, 500 of them an episode."""
     mj_model = mujoco.MjModel.from_xml_string(MJCF)
     world = physics.from_mj_model(mj_model, impl=impl, substeps=2, max_envs=max_envs)
-    spec = EnvSpec("swing_up", 5, 1, world.control_dt_s, 500, term_names(TERMS))
+    terms = with_weights(TERMS, rewards)  # As `env.rewards.effort=-0.1` says.
+    spec = EnvSpec("swing_up", 5, 1, world.control_dt_s, 500, term_names(terms))
 
     def observe(now):
         return jnp.array([now.qpos[0], jnp.cos(now.qpos[1]), jnp.sin(now.qpos[1]), *now.qvel])
@@ -46,7 +47,7 @@ def make(*, impl="auto", max_envs=None) -> Env:
     def step(model, state, action):
         action = jnp.clip(action, -1.0, 1.0)
         now, _ = world.step(model, state.physics, action)
-        reward = total_reward(TERMS, View(now.qpos, action))
+        reward = total_reward(terms, View(now.qpos, action))
         return episode.advance(state, now, (), observe(now), reward, jnp.abs(now.qpos[0]) > 2.2)
 
     return world.env(spec, reset, step)

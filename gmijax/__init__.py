@@ -16,10 +16,11 @@ if TYPE_CHECKING:
     from gmijax.control.job import Result, train
     from gmijax.control.searching import search
     from gmijax.control.serving import Served, serve
+    from gmijax.deploy.policy import load_policy
     from gmijax.roles.launch import launch
     from gmijax.roles.manager import GMIManager, plan
     from gmijax.roles.role import Role
-    from gmijax.sim.registry import make_env, task_names
+    from gmijax.sim.registry import make_env, make_vector_env, task_names
     from gmijax.sweeps.sweep import SweepResult, sweep
 
 __all__ = [
@@ -31,7 +32,9 @@ __all__ = [
     "__version__",
     "compose",
     "launch",
+    "load_policy",
     "make_env",
+    "make_vector_env",
     "plan",
     "search",
     "serve",
@@ -48,7 +51,9 @@ _HOMES = {
     "SweepResult": "gmijax.sweeps.sweep",
     "compose": "gmijax.cli.compose",
     "launch": "gmijax.roles.launch",
+    "load_policy": "gmijax.deploy.policy",
     "make_env": "gmijax.sim.registry",
+    "make_vector_env": "gmijax.sim.registry",
     "plan": "gmijax.roles.manager",
     "search": "gmijax.control.searching",
     "serve": "gmijax.control.serving",

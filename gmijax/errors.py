@@ -4,6 +4,7 @@ GmijaxError
 ├── ConfigError              bad input; commands print one line and exit with code 2
 │   └── BackendUnavailable   the wanted backend cannot be had on this machine
 ├── GmiFailed                a GMI ended with an error or a signal, or stopped making progress
+├── NodeLost                 a machine of a job on several nodes is gone, or does not answer
 ├── CollectiveError          an exchange between GMIs failed
 │   ├── PeerLost             the process of another GMI is gone
 │   ├── CollectiveTimeout    another GMI did not arrive in time
@@ -94,6 +95,10 @@ class GmiFailed(GmijaxError):
         self.exit_code = exit_code
         self.is_final = False
         self.seen_s = time.monotonic()
+
+
+class NodeLost(GmijaxError):
+    """A machine of a job on several nodes is gone, or does not answer; named as a GMI's error."""
 
 
 class CollectiveError(GmijaxError):

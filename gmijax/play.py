@@ -6,7 +6,13 @@ import sys
 
 from gmijax.cli.command import command
 from gmijax.config import PlayConfig
-from gmijax.control import evaluation
+from gmijax.deploy import playing
+
+
+def main(argv: list[str]) -> int:
+    """Returns the exit code."""
+    return command("play", PlayConfig, playing.play, argv)
+
 
 if __name__ == "__main__":
-    sys.exit(command("play", PlayConfig, evaluation.play, sys.argv[1:]))
+    sys.exit(main(sys.argv[1:]))

@@ -8,5 +8,11 @@ from gmijax.cli.command import command
 from gmijax.config import TrainConfig
 from gmijax.control import searching
 
+
+def main(argv: list[str]) -> int:
+    """Returns the exit code."""
+    return command("search", TrainConfig, searching.search, argv)
+
+
 if __name__ == "__main__":
-    sys.exit(command("search", TrainConfig, searching.search, sys.argv[1:]))
+    sys.exit(main(sys.argv[1:]))

@@ -8,5 +8,11 @@ from gmijax.cli.command import command
 from gmijax.config import ServeConfig
 from gmijax.control import serving
 
+
+def main(argv: list[str]) -> int:
+    """Returns the exit code."""
+    return command("serve", ServeConfig, serving.serve, argv)
+
+
 if __name__ == "__main__":
-    sys.exit(command("serve", ServeConfig, serving.serve, sys.argv[1:]))
+    sys.exit(main(sys.argv[1:]))

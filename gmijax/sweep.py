@@ -6,5 +6,11 @@ import sys
 
 from gmijax.cli.command import sweep_command
 
+
+def main(argv: list[str]) -> int:
+    """Returns the exit code."""
+    return sweep_command(argv)
+
+
 if __name__ == "__main__":
-    sys.exit(sweep_command(sys.argv[1:]))
+    sys.exit(main(sys.argv[1:]))

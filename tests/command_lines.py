@@ -16,8 +16,9 @@ import pytest
 
 from gmijax.autotune import tuner
 from gmijax.cli.command import command as run_command
-from gmijax.config import PlayConfig, ServeConfig, TrainConfig
+from gmijax.config import ExportConfig, PlayConfig, ServeConfig, TrainConfig
 from gmijax.control import decide, evaluation, job, searching, selection, serving
+from gmijax.deploy import exporting
 from gmijax.machine.snapshot import Machine
 
 COMMANDS: Mapping[str, type[Any]] = {
@@ -25,6 +26,7 @@ COMMANDS: Mapping[str, type[Any]] = {
     "serve": ServeConfig,
     "search": TrainConfig,
     "play": PlayConfig,
+    "export": ExportConfig,
 }
 """The commands with their configurations."""
 
@@ -33,6 +35,7 @@ BODIES: Mapping[str, Any] = {
     "serve": serving.serve,
     "search": searching.search,
     "play": evaluation.play,
+    "export": exporting.export,
 }
 """What they run."""
 
@@ -72,7 +75,7 @@ def _nothing_starts(machine: Machine, cwd: Path) -> Iterator[None]:
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(cwd)
         patch.setenv("XDG_CACHE_HOME", str(cwd / "cache"))
-        for module in (decide, searching, evaluation):
+        for module in (decide, searching, evaluation, exporting):
             patch.setattr(module, "detect_machine", lambda: machine)
         patch.setattr(Path, "mkdir", _mkdir)
         patch.setattr(tempfile, "mkstemp", _would_start)

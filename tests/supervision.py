@@ -16,7 +16,8 @@ from gmijax.partition.planner import make_plan
 from gmijax.runs.folder import RunPaths
 from gmijax.supervise.backends import open_backend
 from gmijax.supervise.kinds import JobKind
-from gmijax.supervise.supervisor import Launch, Supervisor, Timeouts
+from gmijax.supervise.launch import Launch, Timeouts
+from gmijax.supervise.supervisor import Supervisor
 
 CHECKOUT = Path(errors.__file__).parents[1]
 TESTS = Path(__file__).parent

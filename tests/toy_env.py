@@ -59,4 +59,4 @@ def point_mass_env(episode_length: int = 20) -> Env:
 def metrics_from(counts: Counts) -> IterationMetrics:
     """Of an iteration with such rollouts, and zeros of its updates."""
     zero = jnp.zeros(())
-    return IterationMetrics(counts, PpoLosses(*[zero] * 5), zero, {}, zero)
+    return IterationMetrics(counts, PpoLosses(*[zero] * len(PpoLosses._fields)), {}, {})

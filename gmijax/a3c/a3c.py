@@ -22,21 +22,27 @@ from gmijax.learning.learner import (
     acting_weights,
     pack_weights,
     rate_figures,
+    state_values,
 )
 from gmijax.learning.normalize import (
     Moments,
+    in_units,
     merge,
     merge_all,
     moments_of,
+    moments_of_those,
     normalize,
     without_outliers,
 )
-from gmijax.learning.policy import ActorCritic, ActorCriticParams, entropy, kl_divergence, log_prob
+from gmijax.learning.policy import ActorCritic, ActorCriticParams
 from gmijax.learning.updates import (
     bound_loss,
     clipped_surrogate,
+    explained_variance,
+    mean_of_states,
     minibatch_order,
     run_updates,
+    saturated_fraction,
 )
 from gmijax.types import Array
 
@@ -76,24 +82,28 @@ class Targets(NamedTuple):
       weight: [B], 0 for unrolls that are too old to learn from; the others weigh alike, so that
         the mean over the batches of all trainers is 1.
       moments: statistics that observations are normalised with.
-      mean: [T, B, A] of that policy.
+      output: [T, B, H] of that policy's network.
       log_std: [A] likewise.
       log_prob: [T, B], of the actions under that policy.
       value: [T, B], target of the value function.
       advantage: [T, B], normalised if that is wanted.
       step_weight: [T, B] of the policy gradient: V-trace's, and 0 where `_is_learnt` says so.
       behaviour_kl: [], its estimated divergence from the policies that acted, in nats.
+      fit: moments of the values' targets, and of these minus the values.
+      value_moments: see `TrainState`.
     """
 
     weight: Array
     moments: Moments
-    mean: Array
+    output: Array
     log_std: Array
     log_prob: Array
     value: Array
     advantage: Array
     step_weight: Array
     behaviour_kl: Array
+    fit: tuple[Moments, Moments]
+    value_moments: Moments | None = None
 
 
 class A3cLosses(NamedTuple):
@@ -106,6 +116,7 @@ class A3cLosses(NamedTuple):
       entropy: of the policy, in nats.
       kl: divergence of the policy from itself before the first pass, in nats.
       behaviour_kl: of the policy before the first pass from those that acted, estimated.
+      saturated_fraction: see the function of this name.
       weight: mean weight of the unrolls.
     """
 
@@ -114,6 +125,7 @@ class A3cLosses(NamedTuple):
     entropy: Array
     kl: Array
     behaviour_kl: Array
+    saturated_fraction: Array
     weight: Array
 
     @property
@@ -131,20 +143,23 @@ def batch_targets(
     rewards, and leave nothing for the advantages.
     """
     networks, config, params = learner.networks, learner.config, state.params
-    moments = acting_moments(learner, state)
+    weights = acting_weights(learner, state)
+    moments = weights.moments
     obs = normalize(moments, jnp.concatenate([batch.state, batch.bootstrap]))
-    mean = networks.action_mean(params, obs[:-1])
-    logs = log_prob(mean, params.log_std, batch.action)
+    output = networks.output(params, obs[:-1])
+    logs = networks.distribution.log_prob(output, params.log_std, batch.action)
     log_ratios = logs - batch.log_prob
     ratios = jnp.exp(log_ratios)
-    returns = returns_of(batch, networks.state_value(params, obs), ratios, config)
+    values = state_values(networks, weights, obs)
+    returns = returns_of(batch, values, ratios, config)
+    fresh_moments = partial(moments_of_those, jnp.broadcast_to(weight > 0, ratios.shape))
     advantage = _normalised(returns, weight, config)
     # Copies, because the updates donate the state that they would alias.
     copied_moments, log_std = jax.tree.map(jnp.copy, (moments, params.log_std))
     return Targets(
         weight=weight,
         moments=copied_moments,
-        mean=mean,
+        output=output,
         log_std=log_std,
         log_prob=logs,
         value=returns.value,
@@ -152,6 +167,7 @@ def batch_targets(
         step_weight=jnp.where(_is_learnt(ratios, advantage, config), 0.0, returns.rho),
         # An estimate that is never negative and needs the actions only.
         behaviour_kl=_mean(ratios - 1.0 - log_ratios, weight),
+        fit=(fresh_moments(returns.value), fresh_moments(returns.value - values[:-1])),
     )
 
 
@@ -216,25 +232,31 @@ def a3c_loss(
     far one batch may move the policy, are two questions (arXiv:2110.00641, section 3).
     """
     weight, obs = targets.weight, normalize(targets.moments, batch.state)
-    mean = networks.action_mean(params, obs)
-    logs = log_prob(mean, params.log_std, batch.action)
+    output, distribution = networks.output(params, obs), networks.distribution
+    mode = distribution.mode(output)
+    logs = distribution.log_prob(output, params.log_std, batch.action)
     values = networks.state_value(params, obs)
     policy_loss = _mean(_policy_terms(logs, targets, config), weight)
-    value_loss = 0.5 * _mean((values - targets.value) ** 2, weight)
-    bonus = entropy(params.log_std)
+    target = targets.value
+    if targets.value_moments is not None:
+        target = in_units(targets.value_moments, target)
+    value_loss = 0.5 * _mean((values - target) ** 2, weight)
+    entropy = distribution.entropy(output, params.log_std)
+    bonus = mean_of_states(entropy)
     loss = (
         policy_loss
         + config.value_cost * value_loss
         - config.entropy_cost * bonus * jnp.mean(weight)
-        + config.bound_cost * _mean(bound_loss(mean), weight)
+        + config.bound_cost * _mean(bound_loss(mode), weight)
     )
-    moved = kl_divergence(targets.mean, targets.log_std, mean, params.log_std)
+    moved = distribution.kl_divergence(targets.output, targets.log_std, output, params.log_std)
     return loss, A3cLosses(
         policy_loss,
         value_loss,
         bonus,
         _mean(moved, weight),
         targets.behaviour_kl,
+        _mean(saturated_fraction(mode), weight),
         jnp.mean(weight),
     )
 
@@ -263,7 +285,7 @@ def gradients(
     minibatch: Unrolls = jax.tree.map(lambda x: x[:, indices], batch)
     theirs = targets._replace(
         weight=targets.weight[indices],
-        mean=targets.mean[:, indices],
+        output=targets.output[:, indices],
         log_prob=targets.log_prob[:, indices],
         value=targets.value[:, indices],
         advantage=targets.advantage[:, indices],
@@ -281,11 +303,13 @@ class Updated(NamedTuple):
       weights: [W] float32, to publish; see `pack_weights`.
       losses: means over all minibatches of all trainers, [] each.
       rates: of all minibatches, see `rate_figures`.
+      explained_variance: [], see the function of this name.
     """
 
     weights: Array
     losses: A3cLosses
     rates: dict[str, Array]
+    explained_variance: Array
 
 
 def make_update(learner: A3cLearner, reducer: Reducer) -> TracedStep:
@@ -308,15 +332,20 @@ def update(
     batch, weight = weighted
     targets = batch_targets(learner, state, batch, weight)
     observed = without_outliers(acting_moments(learner, state), batch.state)
-    everyone = peers.gather(moments_of(observed, 2))
+    everyone = peers.gather((moments_of(observed, 2), *targets.fit))
+    seen, target, error = map(merge_all, everyone)
+    if state.value_moments is not None:
+        state = state._replace(value_moments=merge(state.value_moments, target))
+        targets = targets._replace(value_moments=state.value_moments)
     order = minibatch_order(learner.config, state, peers.rank(), batch.reward.shape[1])
     state, losses, rates = run_updates(
         learner, peers, gradients, state, batch, targets, order, after=everyone
     )
     # Counts the batch, which makes a new version of the policy, and takes in its statistics.
     state = state._replace(
-        obs_moments=merge(state.obs_moments, merge_all(everyone)), iteration=state.iteration + 1
+        obs_moments=merge(state.obs_moments, seen), iteration=state.iteration + 1
     )
     weights = pack_weights(acting_weights(learner, state))
     means = jax.tree.map(jnp.mean, losses)
-    return state, (), Updated(weights, means, rate_figures(learner.config, rates))
+    explained = explained_variance(target, error)
+    return state, (), Updated(weights, means, rate_figures(learner.config, rates), explained)

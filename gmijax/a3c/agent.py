@@ -10,7 +10,6 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -87,9 +86,11 @@ class Agent:
         """
         self.link.beat("compiling", 0)
         started = time.monotonic()
-        # Of the right shapes; those to act with are read later.
-        start = jax.jit(partial(init_learner, self._learner, self.env.spec.obs_size))
-        weights = acting_weights(self._learner, start(jax.random.key(0)))
+        learner, obs_size = self._learner, self.env.spec.obs_size
+        # Of the right shapes; those to act with are read later. Without the learning rate, so that
+        # jobs that differ in it alone have the same programs.
+        start = jax.jit(lambda key: acting_weights(learner, init_learner(learner, obs_size, key)))
+        weights = start(jax.random.key(0))
         env_state = first_envs(self.env, self.config, self.index, gmi=self.link.gmi)
         num_pieces = self._algo.pieces_per_unroll
         num_steps = self._algo.unroll_length // num_pieces

@@ -8,7 +8,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import jax.numpy as jnp
 import numpy as np
 import numpy.typing as npt
 
@@ -23,7 +22,7 @@ from gmijax.learning.checkpoint import (
     require_finite,
     save_learner,
 )
-from gmijax.learning.learner import TrainState
+from gmijax.learning.learner import TrainState, policy_figures
 from gmijax.learning.training_log import TrainingLog
 from gmijax.runs.resume import CheckpointMeta
 from gmijax.sim.wrappers import BatchedEnv
@@ -139,8 +138,7 @@ class Leader:
         self._reporter.write(
             self.env_steps,
             [report for report in self._reports if report is not None],
-            learning_rate=float(state.learning_rate),
-            noise_std=float(jnp.mean(jnp.exp(state.params.log_std))),
+            {name: float(value) for name, value in policy_figures(state).items()},
         )
 
     def _order(self, checkpoint: int | None, *, is_ending: bool) -> None:

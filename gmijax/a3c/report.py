@@ -8,7 +8,7 @@ Staleness: how many versions of the policy lie between acting and learning.
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 import jax
@@ -48,10 +48,14 @@ class BatchCounts(NamedTuple):
 
 
 class UpdateFigures(NamedTuple):
-    """Losses of an update, its learning rates (`rate_figures`), and the seconds that it took."""
+    """Losses and learning rates (`rate_figures`) of an update, and the seconds that it took.
+
+    For `explained_variance` see the function of this name.
+    """
 
     losses: A3cLosses
     rates: dict[str, Any]
+    explained_variance: float
     update_s: float
 
 
@@ -94,11 +98,11 @@ class Reporter:
         return None if figures is None else {"mean": figures[0], "p99": figures[1]}
 
     def write(
-        self, env_steps: int, reports: Sequence[Report], learning_rate: float, noise_std: float
+        self, env_steps: int, reports: Sequence[Report], figures: Mapping[str, float]
     ) -> None:
         """Writes the line of the updates since the last one; nothing if there were none.
 
-        `reports` are the newest of every agent.
+        `reports` are the newest of every agent, `figures` those of the learner as it is.
 
         Raises:
           NonFiniteError: too many steps of the agents diverged.
@@ -123,7 +127,7 @@ class Reporter:
         self.log.write(
             env_steps,
             jax.tree.map(float, self._unpack(stats)),
-            Learnt(losses, learning_rate, rates, noise_std),
+            Learnt(losses, figures, rates),
             others,
             simulated=predictions,
             now_s=now_s,
@@ -138,7 +142,7 @@ class Reporter:
     def _of_updates(self) -> tuple[dict[str, float], dict[str, float], dict[str, Any]]:
         """Means of the losses, figures of the learning rates, and the rest."""
         figures, receive_s = zip(*self._updates, strict=True)
-        losses, rates, update_s = zip(*figures, strict=True)
+        losses, rates, explained, update_s = zip(*figures, strict=True)
         averaged: Any = np.mean(losses, axis=0, dtype=np.float64)
         means = dict(zip(A3cLosses._fields, map(float, averaged), strict=True))
         del means["weight"]  # 1, over a batch.
@@ -150,6 +154,7 @@ class Reporter:
             means,
             joined,
             {
+                "value/explained_variance": float(np.mean(explained)),
                 "async/updates": len(self._updates),
                 "time/update_s": float(np.mean(update_s)),
                 "time/receive_s": float(np.mean(receive_s)),

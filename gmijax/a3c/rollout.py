@@ -12,9 +12,9 @@ from jax.flatten_util import ravel_pytree
 
 from gmijax.a3c.a3c import Unrolls
 from gmijax.devices import host_sharding
-from gmijax.learning.learner import ActingWeights
+from gmijax.learning.learner import ActingWeights, state_values
 from gmijax.learning.normalize import normalize
-from gmijax.learning.policy import ActorCritic, log_prob
+from gmijax.learning.policy import ActorCritic
 from gmijax.learning.unroll import Counts, Outcome, act, count, no_counts, outcome_of, unroll
 from gmijax.sim.wrappers import BatchedEnv, BatchState, StepOutput
 from gmijax.types import Array, PyTree
@@ -31,14 +31,14 @@ def collect(
     """Runs steps with one version of the policy: an unroll, or a piece of one."""
 
     def keep(
-        before: BatchState, mean: Array, action: Array, out: StepOutput
+        before: BatchState, output: Array, action: Array, out: StepOutput
     ) -> tuple[Unrolls, Array, Outcome]:
         kept = Unrolls(
             state=before.env.obs,
             action=action,
             reward=out.reward,
             done=jnp.stack([out.terminated, out.truncated], axis=-1),
-            log_prob=log_prob(mean, weights.params.log_std, action),
+            log_prob=networks.distribution.log_prob(output, weights.params.log_std, action),
             cut_value=jnp.zeros_like(out.reward),
             bootstrap=jnp.zeros(()),
         )
@@ -47,7 +47,7 @@ def collect(
     choose = partial(act, networks, weights)
     env_state, (kept, next_obs, outcomes) = unroll(env, choose, num_steps, keep, model, env_state)
     # A second pass over all rows is simple, and cheap beside the physics.
-    values = networks.state_value(weights.params, normalize(weights.moments, next_obs))
+    values = state_values(networks, weights, normalize(weights.moments, next_obs))
     kept = kept._replace(
         cut_value=jnp.where(kept.done[..., 1], values, 0.0), bootstrap=env_state.env.obs[None]
     )

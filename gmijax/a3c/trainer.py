@@ -116,7 +116,7 @@ class Trainer:
             state, _, updated = self._update(state, (unrolls, weight))
             self._update.wait()
             weights = np.asarray(updated.weights)
-            losses, rates = jax.device_get((updated.losses, updated.rates))
+            _, losses, rates, explained = jax.device_get(updated._replace(weights=None))
             self._version += 1
             self._updates += 1
             self._env_steps += round(counts.fresh) * self._algo.unroll_length
@@ -126,7 +126,7 @@ class Trainer:
             is_last = is_stopped or self._env_steps >= self.config.num_timesteps
             if leader is not None:
                 leader.publish(weights, self._version)
-                figures = UpdateFigures(losses, rates, time.monotonic() - started)
+                figures = UpdateFigures(losses, rates, explained, time.monotonic() - started)
                 leader.record(self._env_steps, self._updates, counts, figures, state)
                 if not is_last:
                     leader.checkpoint_now_and_then(state)

@@ -11,8 +11,8 @@ from gmijax.config import A3cConfig, TrainConfig
 from gmijax.partition.plan import Plan
 from gmijax.runs.folder import RunPaths
 from gmijax.runs.history import read_metrics
-from gmijax.supervise.gmi_process import GmiStatus
 from gmijax.supervise.kinds import groups_of
+from gmijax.supervise.watched_gmi import GmiStatus
 
 FEWEST_LINES: Final = 3
 """Lines of metrics that a profile goes by, each of half a second or of one batch."""

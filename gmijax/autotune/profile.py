@@ -17,9 +17,9 @@ from gmijax.errors import ConfigError, GmijaxError, JobInterrupted
 from gmijax.machine.snapshot import Machine
 from gmijax.partition.plan import Plan
 from gmijax.runs.folder import RunPaths, write_json
-from gmijax.supervise.gmi_process import GmiStatus
+from gmijax.supervise.launch import Timeouts
 from gmijax.supervise.launcher import Launch, OnTick, run_gmis
-from gmijax.supervise.supervisor import Timeouts
+from gmijax.supervise.watched_gmi import GmiStatus
 
 
 class ProfileLate(Exception):

@@ -15,7 +15,7 @@ from rich.table import Table
 from gmijax.autotune.grid import Grid, Measured, NotRunnable, Point
 from gmijax.autotune.search import Outcome, Visited
 from gmijax.autotune.workloads import Split
-from gmijax.supervise.gmi_process import GmiStatus
+from gmijax.supervise.watched_gmi import GmiStatus
 
 Results = Mapping[Point, Measured | NotRunnable]
 

@@ -28,8 +28,8 @@ from gmijax.partition.plan import Plan
 from gmijax.partition.planner import make_plan
 from gmijax.runs.folder import RunPaths, read_json
 from gmijax.runs.history import read_metrics
-from gmijax.supervise.gmi_process import GmiStatus
 from gmijax.supervise.kinds import JobKind, serving_kind, training_kind
+from gmijax.supervise.watched_gmi import GmiStatus
 from gmijax.version import __version__, versions_of
 
 Mode = Literal["corun", "isolated"]
@@ -214,7 +214,9 @@ class PpoWorkload(Workload[TrainConfig]):
         run = dataclasses.replace(
             config.run, resume=None, checkpoint_every=0, measure_throughput=False
         )
-        return self.with_point(point, num_timesteps=config.search.iterations * steps, run=run)
+        no_eval = dataclasses.replace(config.eval, every=None)
+        steps = config.search.iterations * steps
+        return self.with_point(point, num_timesteps=steps, run=run, eval=no_eval)
 
     def read(self, plan: Plan, run: RunPaths) -> Measured:
         """See `Workload`."""

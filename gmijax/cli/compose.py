@@ -33,6 +33,9 @@ _COMPOSED: Mapping[str, type[Any]] = {
     "serve": ServeConfig,
 }
 
+_NAMED_BY_TASK = ("env.rewards.", "env.settings.")
+"""Groups of keys whose names are the task's; those of a custom task only its file knows."""
+
 _NOT_TEXT = ("Cc", "Cs", "Zl", "Zp")
 """Unicode's categories of control characters, surrogates, and ends of lines and paragraphs."""
 
@@ -92,7 +95,7 @@ def build(name: str, cls: type[C], overrides: Sequence[str]) -> C:
     """The configuration of a command; raises as `compose`."""
     overrides = [part for text in overrides for part in with_custom_task(name, text)]
     items = parse(overrides)
-    data = compose_dict(name, [*_algorithm_of_resumed(name, items), *overrides])
+    data = compose_dict(name, [*_choices_of_run(name, items), *overrides])
     if cls is ServeConfig:
         _check_task_key(items)
         data = _with_task_of_run(data, items)
@@ -108,28 +111,42 @@ def build(name: str, cls: type[C], overrides: Sequence[str]) -> C:
     return from_dict(cls, data)
 
 
-def _algorithm_of_resumed(name: str, items: Sequence[Override]) -> list[str]:
-    """`algo=` of the run that overrides resume: its algorithm decides which keys there are."""
-    if name != "train":
-        return []
+def _choices_of_run(name: str, items: Sequence[Override]) -> list[str]:
+    """`env=` and `algo=` of the run to resume or to serve: they decide which keys there are."""
+    key = {"train": "run.resume", "serve": "run.dir"}.get(name, "")
     given = {item.key_or_group: str(item.value()) for item in items}
-    resume = given.get("run.resume", "null")
-    if "algo" in given or resume in ("null", "None", "", "auto"):
+    run = given.get(key, "null")
+    if run in ("null", "None", "", "auto"):
         return []
-    algo = saved_config_of(resume, "run.resume")["algo"].get("name", "ppo")
-    return [f"algo={algo}"]
+    saved = saved_config_of(run, key)
+    suite = saved["env"].get("suite", "gmijax")
+    chosen = {"env": saved["env"].get("name") if suite == "gmijax" else suite}
+    if name == "train":
+        chosen["algo"] = saved["algo"].get("name", "ppo")
+    return [
+        f"{group}={value}"
+        for group, value in chosen.items()
+        if group not in given and value in choices(group)
+    ]
 
 
 def compose_dict(name: str, overrides: Sequence[str]) -> dict[str, Any]:
     """The plain data of a command's configuration; raises ConfigError."""
-    for item in parse(overrides):
+    items = parse(overrides)
+    for item in items:
         _check_override(name, item)
+    chosen = {item.key_or_group: str(item.value()) for item in items}
+    if chosen.get("env") == "custom":
+        overrides = [
+            f"++{text}" if text.startswith(_NAMED_BY_TASK) else text for text in overrides
+        ]
     try:
         with initialize_config_dir(str(config_dir()), version_base=None):
             config = hydra_compose(name, overrides=list(overrides))
         data = OmegaConf.to_container(config, resolve=True, throw_on_missing=True)
     except (HydraException, OmegaConfBaseException) as error:
-        raise ConfigError(_one_line(name, error)) from None
+        groups = [f"{key}={value}" for key, value in chosen.items() if value in choices(key)]
+        raise ConfigError(_one_line(name, error, groups)) from None
     except OSError as error:  # Hydra looks for a file with the name of the key.
         raise ConfigError(f"{max(overrides, key=len, default=name)}: {error.strerror}") from None
     return typing.cast("dict[str, Any]", data)
@@ -156,7 +173,7 @@ def with_custom_task(name: str, override: str) -> tuple[str, ...]:
     if key != "env" or not re.search(r"\.py(:|$)", value):
         return (override,)
     quoted = value.replace("\\", "\\\\").replace("'", "\\'")
-    if name == "play":  # Which task it is the run says.
+    if name in ("play", "export"):  # Which task it is the run says.
         return (f"run.env='{quoted}'",)
     return "env=custom", f"env.name='{quoted}'"
 
@@ -173,6 +190,11 @@ def _check_task_key(items: Sequence[Override]) -> None:
 
 
 def _unknown_key(key: str, known: Iterable[str]) -> ConfigError:
+    group, dot, name = key.rpartition(".")
+    if group + dot in _NAMED_BY_TASK:
+        names = [one.removeprefix(group + dot) for one in known if one.startswith(group + dot)]
+        none = f": this task has none in {group}"
+        return ConfigError(f"unknown key {key}{suggestion(name, names) if names else none}")
     return ConfigError(f"unknown key {key}{suggestion(key, known)}")
 
 
@@ -211,11 +233,6 @@ def _on_top_of_saved(
     saved = saved_config_of(resume, "run.resume")
     saved["run"].update(dir=None, name=None)
     suite = saved["env"].get("suite", "gmijax")
-    task = saved["env"].get("name") if suite == "gmijax" else suite
-    if task in choices("env") and all(item.key_or_group != "env" for item in items):
-        given = [str(item.input_line) for item in items]
-        algo = _algorithm_of_resumed("train", items)
-        data = compose_dict("train", [f"env={task}", *algo, *given])
     merged = _merged(data, saved)
     if "randomization" in saved["env"]:  # A leaf that the run left out stays out.
         merged["env"]["randomization"] = saved["env"]["randomization"]
@@ -243,6 +260,8 @@ def _with_task_of_run(data: dict[str, Any], items: Sequence[Override]) -> dict[s
     if run_dir is None or any(item.key_or_group == "env" for item in items):
         return data
     saved = saved_config_of(str(run_dir), "run.dir")["env"]
+    # A policy that has learnt needs no easy episodes, unless they are asked for.
+    saved["curriculum"] = data["env"]["curriculum"]
     merged = {**data, "env": {**data["env"], **saved}}
     for item in items:
         if item.key_or_group.startswith("env."):
@@ -271,12 +290,12 @@ def _copy_key(key: str, source: dict[str, Any], target: dict[str, Any]) -> bool:
     return last in source
 
 
-def _one_line(name: str, error: Exception) -> str:
+def _one_line(name: str, error: Exception, groups: Sequence[str]) -> str:
     text = " ".join(str(error).split())
     if match := re.search(r"Key '([^']+)' is not in struct full_key: (\S+)", text):
-        return str(_unknown_key(match[2], defaults(name, ())))
+        return str(_unknown_key(match[2], defaults(name, groups)))
     if match := re.search(r"Could not override '([^']+)'", text):
-        return str(_unknown_key(match[1], defaults(name, ())))
+        return str(_unknown_key(match[1], defaults(name, groups)))
     return text
 
 

@@ -19,8 +19,7 @@ import jax.numpy as jnp
 from gmijax.learning.checkpoint import digest, restore_learner
 from gmijax.learning.learner import Learner, acting_moments, init_learner, make_learner
 from gmijax.learning.normalize import normalize
-from gmijax.learning.policy import log_prob as log_density
-from gmijax.learning.unroll import Counts, Outcome, count, outcome_of, policy_noise
+from gmijax.learning.unroll import Counts, Outcome, count, outcome_of
 from gmijax.learning.unroll import unroll as run_steps
 from gmijax.runs.resume import trained_config
 from gmijax.sim.interface import EnvSpec
@@ -67,20 +66,21 @@ def trained_policy(checkpoint: Path, spec: EnvSpec, *, deterministic: bool) -> A
     state = restore_learner(checkpoint, start)
     weights = state.params, acting_moments(learner, state)
     sha = digest(weights).astype("uint16").tobytes().hex()
-    return ActingPolicy(_gaussian(learner, spec.action_size, deterministic), weights, sha)
+    return ActingPolicy(_trained(learner, deterministic), weights, sha)
 
 
-def _gaussian(
-    learner: Learner, size: int, deterministic: bool
+def _trained(
+    learner: Learner, deterministic: bool
 ) -> Callable[[PyTree, Array, PRNGKey], tuple[Array, Array]]:
     def choose(weights: PyTree, obs: Array, keys: PRNGKey) -> tuple[Array, Array]:
         params, moments = weights
-        mean = learner.networks.action_mean(params, normalize(moments, obs))
+        output = networks.output(params, normalize(moments, obs))
         if deterministic:
-            return mean, jnp.zeros(obs.shape[:1])
-        action = mean + jnp.exp(params.log_std) * policy_noise(keys, size)
-        return action, log_density(mean, params.log_std, action)
+            return distribution.mode(output), jnp.zeros(obs.shape[:1])
+        action = distribution.sample(output, params.log_std, keys)
+        return action, distribution.log_prob(output, params.log_std, action)
 
+    networks, distribution = learner.networks, learner.networks.distribution
     return choose
 
 

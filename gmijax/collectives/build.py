@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+import socket
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypeAlias
 
 from gmijax.collectives.host.host_exchange import HostExchange
 from gmijax.collectives.host.shared_block import LANES
 from gmijax.collectives.interface import FloatBuffer, Reducer, Step, TracedStep
+from gmijax.collectives.nodes.meeting import Nodes, connect
+from gmijax.collectives.nodes.mesh import Mesh
+from gmijax.collectives.nodes.node_exchange import NodeExchange
 from gmijax.collectives.strategies import stages
 from gmijax.errors import ConfigError, DeviceMemoryUnavailable
 from gmijax.partition.layout import Layout
@@ -19,6 +23,8 @@ if TYPE_CHECKING:
     from gmijax.collectives.device.device_links import Device
     from gmijax.collectives.program import Exchange
 
+
+_Lane: TypeAlias = HostExchange | NodeExchange
 
 GATHERED_FLOATS = 1024
 """Of each rank; more where P leaves room for them."""
@@ -32,12 +38,14 @@ class Membership:
       layout: where all ranks live; the rank of a GMI is its id.
       rank: this GMI's.
       num_floats: P, length of the largest buffer whose mean is taken.
-      exchange_fd: descriptor of the shared block, None where there is one rank.
+      exchange_fd: descriptor of the shared block of this node, None where there is one rank.
       timeout_s: longest wait for other ranks.
       rendezvous_timeout_s: the same in the first call, when others may still start or compile.
       intra: how the GMIs of one GPU exchange numbers in HAR, `host` or `ipc`.
       host_if_unavailable: whether ranks go through host memory, with a warning, where the memory
         of GPUs cannot be shared.
+      nodes: in a job on several nodes what its leaders know of each other.
+      listener: the node's listening socket, in such a job; its leader's from here on.
     """
 
     layout: Layout
@@ -48,6 +56,8 @@ class Membership:
     rendezvous_timeout_s: float
     intra: str = "host"
     host_if_unavailable: bool = False
+    nodes: Nodes | None = None
+    listener: socket.socket | None = None
 
 
 def build_reducer(strategy: str, membership: Membership) -> Reducer:
@@ -62,7 +72,7 @@ def build_reducer(strategy: str, membership: Membership) -> Reducer:
     require_strategy(strategy, membership.layout)
     if membership.layout.num_gmis == 1:
         return SoloReducer(strategy)
-    control, host = (_lane(strategy, membership, lane) for lane in range(LANES))
+    control, host = _lanes(strategy, membership)
     try:
         return _built(strategy, membership, control, host)
     except DeviceMemoryUnavailable as error:
@@ -74,9 +84,7 @@ def build_reducer(strategy: str, membership: Membership) -> Reducer:
         return _built(instead, replace(membership, intra="host"), control, host)
 
 
-def _built(
-    strategy: str, membership: Membership, control: HostExchange, host: HostExchange
-) -> Reducer:
+def _built(strategy: str, membership: Membership, control: _Lane, host: _Lane) -> Reducer:
     from gmijax.collectives.host.host_links import HostLinks  # Imports jax.
     from gmijax.collectives.program import Exchange
 
@@ -84,9 +92,11 @@ def _built(
     parts = stages(strategy, layout, membership.intra)
     device, links = DEVICE(), None
     try:
-        if device is None or all(stage.link == "host" for stage in parts):
+        if device is None or all(stage.link in ("host", "nodes") for stage in parts):
             links = HostLinks(host, num_floats)
         else:
+            assert isinstance(control, HostExchange)  # Others are refused on several nodes.
+            assert isinstance(host, HostExchange)
             from gmijax.collectives.device.device_links import DeviceLinks
 
             links = DeviceLinks(control, host, layout, num_floats, parts, device)
@@ -109,8 +119,8 @@ class SharedReducer:
         self,
         strategy: str,
         intra: str,
-        control: HostExchange,
-        host: HostExchange,
+        control: _Lane,
+        host: _Lane,
         exchange: Exchange,
     ) -> None:
         self.rank, self.world_size = host.rank, host.world_size
@@ -154,20 +164,50 @@ class SoloReducer:
         """Does nothing: there is nothing to release."""
 
 
-def _lane(strategy: str, membership: Membership, lane: int) -> HostExchange:
+def _lanes(strategy: str, membership: Membership) -> Sequence[_Lane]:
     if membership.exchange_fd is None:
         raise ConfigError(
             f"reduce.strategy={strategy}: needs the shared block of the job's controller"
         )
-    return HostExchange(
-        membership.exchange_fd,
-        membership.rank,
-        membership.layout.num_gmis,
-        _room(membership),
-        timeout_s=membership.timeout_s,
-        rendezvous_timeout_s=membership.rendezvous_timeout_s,
-        lane=lane,
-    )
+    layout, rank = membership.layout, membership.rank
+    here = layout.gmis_of_node[layout.node_of(rank)]
+    lanes = [
+        HostExchange(
+            *(membership.exchange_fd, here.index(rank), len(here), _room(membership)),
+            timeout_s=membership.timeout_s,
+            rendezvous_timeout_s=membership.rendezvous_timeout_s,
+            lane=lane,
+            first_rank=here[0],
+        )
+        for lane in range(LANES)
+    ]
+    return lanes if layout.num_nodes == 1 else _over_nodes(membership, lanes, leader=here[0])
+
+
+def _over_nodes(
+    membership: Membership, lanes: Sequence[HostExchange], leader: int
+) -> Sequence[NodeExchange]:
+    """The lanes with what goes on between nodes; leaders wait here for each other."""
+    layout, rank = membership.layout, membership.rank
+    nodes, listener = membership.nodes, membership.listener
+    if nodes is None or listener is None:
+        raise ConfigError(f"layout {layout} on {layout.num_nodes} nodes: needs their addresses")
+    with listener:
+        if rank != leader:
+            return [NodeExchange(lane, layout, rank, None) for lane in lanes]
+        sockets = connect(nodes, listener, len(lanes), membership.rendezvous_timeout_s)
+    meshes = [
+        Mesh(
+            *(connections, nodes.node, [gmis[0] for gmis in layout.gmis_of_node]),
+            timeout_s=membership.timeout_s,
+            rendezvous_timeout_s=membership.rendezvous_timeout_s,
+            on_wait=lane.beat,
+        )
+        for connections, lane in zip(sockets, lanes, strict=True)
+    ]
+    return [
+        NodeExchange(lane, layout, rank, mesh) for lane, mesh in zip(lanes, meshes, strict=True)
+    ]
 
 
 def _room(membership: Membership) -> int:

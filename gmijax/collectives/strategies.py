@@ -14,8 +14,9 @@ from gmijax.partition.layout import Layout
 from gmijax.partition.reduction import is_even, leaders
 
 Kind: TypeAlias = Literal["sum", "gather", "broadcast"]
-Link: TypeAlias = Literal["host", "slots", "ring"]
-"""Through shared memory of the host, memory of the GPUs that all map, or NCCL between GPUs."""
+Link: TypeAlias = Literal["host", "slots", "ring", "nodes"]
+"""Through shared memory of the host, memory of the GPUs that all map, NCCL between GPUs, sockets
+between nodes."""
 
 
 Groups: TypeAlias = tuple[tuple[int, ...], ...]
@@ -52,11 +53,15 @@ def stages(strategy: str, layout: Layout, intra: str = "host") -> Sequence[Stage
       travels is K - t buffers to each GPU, for a ring of K it would be two: it is made for
       networks whose messages cost more than their bytes.
 
+    On several nodes all of them do that inside, their first ranks sum, and give it to the others.
+
     Args:
       strategy: a key of `COSTS`.
       layout: where the ranks live; the strategy must be allowed there.
       intra: `host` or `ipc`, the link inside a GPU for `har`.
     """
+    if layout.num_nodes > 1:
+        return _over_nodes(stages(strategy, layout.of_one_node, intra), layout.gmis_of_node)
     gpus, everyone = layout.gmis_of_gpu, (tuple(layout.gmis),)
     if strategy == "mpr":
         return [Stage("sum", "host", everyone)]
@@ -85,6 +90,23 @@ def stages(strategy: str, layout: Layout, intra: str = "host") -> Sequence[Stage
         # Not a sum of NCCL's: its order may differ from ring to ring.
         return [inside, Stage("gather", "ring", rings)]
     return [inside, Stage("sum", "ring", (leaders(layout),)), Stage("broadcast", link, led)]
+
+
+def _over_nodes(inside: Sequence[Stage], nodes: Groups) -> Sequence[Stage]:
+    """What one node does as done by all, a sum over their first ranks, and back."""
+    if len(nodes[0]) == 1:
+        inside = []
+    everywhere = [
+        stage._replace(
+            groups=tuple(
+                tuple(rank + node[0] for rank in group) for node in nodes for group in stage.groups
+            )
+        )
+        for stage in inside
+    ]
+    between = Stage("sum", "nodes", (tuple(node[0] for node in nodes),))
+    back = [Stage("broadcast", "host", nodes)] if inside else []
+    return [*everywhere, between, *back]
 
 
 def _first(leader: int, group: Sequence[int]) -> tuple[int, ...]:
@@ -139,10 +161,26 @@ COSTS: Mapping[str, Callable[[int, int, float, float, float], float]] = {
 """Time of every strategy, as a function of (g, t, M_p, B1, B2)."""
 
 
-def predicted_s(strategy: str, layout: Layout, num_floats: int, b1: float, b2: float) -> float:
+def nodes_s(n: int, m_p: float, b3: float) -> float:
+    """Seconds of the exchange between the leaders of n nodes: 2 (n - 1) M_p / (n B3).
+
+    Not in the paper. Each sums its part of the buffer, and sends it to the others.
+    """
+    return 2 * (n - 1) * m_p / (n * b3)
+
+
+def predicted_s(
+    strategy: str,
+    layout: Layout,
+    num_floats: int,
+    b1: float,
+    b2: float,
+    b3: float | None = None,
+) -> float:
     """Seconds that one mean of `num_floats` float32 should take.
 
-    In an uneven layout t is the number of GMIs on the fullest GPU: the others wait for it.
+    In an uneven layout t is the number of GMIs on the fullest GPU: the others wait for it. On
+    several nodes it is the time inside one of them and that between them.
 
     Args:
       strategy: a key of `COSTS`.
@@ -150,6 +188,7 @@ def predicted_s(strategy: str, layout: Layout, num_floats: int, b1: float, b2: f
       num_floats: P.
       b1: bytes a second between GMIs through host memory.
       b2: bytes a second of a ring between GPUs.
+      b3: bytes a second between nodes; needed where there are several.
 
     Raises:
       ConfigError: a bandwidth that is not positive, or another strategy.
@@ -158,5 +197,11 @@ def predicted_s(strategy: str, layout: Layout, num_floats: int, b1: float, b2: f
         raise ConfigError(f"strategy={strategy}: expected one of {', '.join(COSTS)}")
     if b1 <= 0 or b2 <= 0:
         raise ConfigError(f"b1={b1:g}, b2={b2:g}: bandwidths must be positive")
-    most = max(len(gmis) for gmis in layout.gmis_of_gpu)
-    return COSTS[strategy](layout.num_gpus, most, num_floats * BYTES_PER_FLOAT, b1, b2)
+    m_p, node = num_floats * BYTES_PER_FLOAT, layout.of_one_node
+    most = max(len(gmis) for gmis in node.gmis_of_gpu)
+    inside_s = COSTS[strategy](node.num_gpus, most, m_p, b1, b2)
+    if layout.num_nodes == 1:
+        return inside_s
+    if b3 is None or b3 <= 0:
+        raise ConfigError(f"b3={b3}: bandwidths must be positive")
+    return inside_s + nodes_s(layout.num_nodes, m_p, b3)

@@ -13,7 +13,10 @@ from gmijax.config.algo import (
     PpoConfig,
 )
 from gmijax.config.channel import ChannelConfig
+from gmijax.config.cluster import ClusterConfig
 from gmijax.config.env import EnvConfig, PhysicsConfig
+from gmijax.config.evaluation import EvalConfig
+from gmijax.config.export import ExportConfig
 from gmijax.config.plan import (
     BackendName,
     PlanConfig,
@@ -27,6 +30,7 @@ from gmijax.config.run import RunConfig
 from gmijax.config.search import AUTO, SearchConfig
 from gmijax.config.serve import OutputConfig, ServeConfig, ServeRunConfig
 from gmijax.config.train import ALGORITHMS, AlgoConfig, TrainConfig
+from gmijax.config.wandb import WandbConfig
 
 __all__ = [
     "ADAPTIVE_LEARNING_RATE_RANGE",
@@ -37,7 +41,10 @@ __all__ = [
     "AlgoConfig",
     "BackendName",
     "ChannelConfig",
+    "ClusterConfig",
     "EnvConfig",
+    "EvalConfig",
+    "ExportConfig",
     "OutputConfig",
     "PhysicsConfig",
     "PlanConfig",
@@ -53,4 +60,5 @@ __all__ = [
     "StrategyName",
     "TemplateName",
     "TrainConfig",
+    "WandbConfig",
 ]

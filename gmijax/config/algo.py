@@ -9,7 +9,7 @@ from gmijax.config.schema import KeyGroup, doc
 from gmijax.errors import ConfigError
 
 ADAPTIVE_LEARNING_RATE_RANGE = (1e-5, 1e-2)
-"""Where the adaptive schedule keeps the learning rate, and so where it must begin."""
+"""Where the adaptive schedule keeps the learning rate unless told otherwise."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -31,15 +31,46 @@ class ActorCriticConfig(KeyGroup):
     learning_rate: float = doc(
         "step size of Adam (the first one, if the schedule is adaptive)", positive=True
     )
+    learning_rate_range: tuple[float, ...] = doc(
+        "where the adaptive schedule keeps the learning rate: least and largest",
+        default=ADAPTIVE_LEARNING_RATE_RANGE,
+        positive=True,
+    )
+    adapt_every: Literal["minibatch", "epoch"] = doc(
+        "when the adaptive schedule acts: with every minibatch, or with the last one of an epoch, "
+        "on the mean divergence over it",
+        default="minibatch",
+    )
     desired_kl: float = doc("target of the adaptive schedule", positive=True)
     max_grad_norm: float = doc("gradients are scaled down to this global norm", positive=True)
     reward_scaling: float = doc(
         "factor on rewards before learning (logged returns are unscaled)", positive=True
     )
     normalize_observations: bool = doc("normalise observations with running statistics")
+    normalize_values: bool = doc(
+        "the value function learns its targets in standard deviations from their running mean; "
+        "value_cost, and with PPO the clip of the value loss, count in this unit",
+        default=False,
+    )
+    obs_std_floor: float = doc(
+        "smallest standard deviation that observations are divided by", default=1e-4, low=1e-4
+    )
     policy_hidden_layer_sizes: tuple[int, ...] = doc("widths of the policy network", low=1)
     value_hidden_layer_sizes: tuple[int, ...] = doc("widths of the value network", low=1)
+    distribution_type: Literal["normal", "tanh_normal"] = doc(
+        "actions are drawn from a Gaussian, which the environment clips to [-1, 1], or from the "
+        "tanh of one",
+        default="normal",
+    )
+    state_dependent_std: bool = doc(
+        "the policy's network gives the standard deviation too; false: it is the same in all "
+        "states",
+        default=False,
+    )
     init_noise_std: float = doc("standard deviation of the first policy", positive=True)
+    min_noise_std: float = doc(
+        "the policy's standard deviation is kept at or above this", default=0.0, low=0.0
+    )
     init_at_random_ep_len: bool = doc(
         "cut the first episode of every world at a random time, so that worlds do not go through "
         "their episodes in step; those episodes are not counted in returns",
@@ -48,7 +79,23 @@ class ActorCriticConfig(KeyGroup):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        low, high = ADAPTIVE_LEARNING_RATE_RANGE
+        limits = self.learning_rate_range
+        if len(limits) != 2 or not limits[0] < limits[1]:
+            raise ConfigError(
+                f"algo.learning_rate_range={list(limits)}: expected two numbers, the smaller one "
+                "first"
+            )
+        if self.min_noise_std and self.state_dependent_std:
+            raise ConfigError(
+                f"algo.min_noise_std={self.min_noise_std!r}: must be 0 with "
+                "algo.state_dependent_std=true"
+            )
+        if self.init_noise_std < self.min_noise_std:
+            raise ConfigError(
+                f"algo.init_noise_std={self.init_noise_std!r}: must be at least "
+                f"algo.min_noise_std={self.min_noise_std!r}"
+            )
+        low, high = limits
         if self.learning_rate_schedule == "adaptive_kl" and not low <= self.learning_rate <= high:
             raise ConfigError(
                 f"algo.learning_rate={self.learning_rate!r}: must be between {low} and {high} "
@@ -70,9 +117,28 @@ class PpoConfig(ActorCriticConfig):
     clipping_epsilon: float = doc("clip range of the probability ratio", positive=True)
     clip_value_loss: bool = doc("clip the value loss with clipping_epsilon too")
     learning_rate_schedule: Literal["fixed", "adaptive_kl"] = doc(
-        "fixed, or steered to keep the policy's KL divergence per update near desired_kl"
+        "fixed, or steered to keep the policy's KL divergence since the rollout near desired_kl"
     )
     normalize_advantage: bool = doc("normalise advantages over all samples of all GMIs")
+    obs_outliers: Literal["clip", "diverged"] = doc(
+        "what does not enter the statistics of observations as it is: what is more than 20 "
+        "standard deviations off is clipped to that (clip), or worlds that diverge before the "
+        "rollout or their episode ends are left out (diverged)",
+        default="clip",
+    )
+    warmup_unroll: bool = doc(
+        "begin with a rollout that only fills the statistics of observations; it is not learnt "
+        "from and not counted",
+        default=False,
+    )
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.warmup_unroll and not self.normalize_observations:
+            raise ConfigError(
+                "algo.warmup_unroll=true: has nothing to fill with "
+                "algo.normalize_observations=false"
+            )
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -36,7 +36,7 @@ NEVER_ZERO = ("body_mass", "geom_friction", "pair_friction")
 
 @dataclass(frozen=True, kw_only=True)
 class LeafRange:
-    """How one leaf of the physics model is drawn, once for every world of the job."""
+    """How one leaf of the physics model is drawn."""
 
     operation: Literal["scale", "add", "set"] = doc(
         "what the drawn number does to the model's own value"
@@ -75,12 +75,33 @@ class EnvConfig(KeyGroup):
         "robot models at first use), with env=custom PATH.py:FUNCTION"
     )
     episode_length: int | None = doc(
-        "steps after which an episode is truncated (time limit); null: the task's own", low=1
+        "steps of the task after which an episode is truncated (time limit); null: its own", low=1
+    )
+    history: int = doc(
+        "observations of so many steps are one, the oldest first (docs/tasks.md)",
+        default=1,
+        low=1,
+    )
+    action_repeat: int = doc(
+        "steps of the task that every action is taken for; rewards are summed", default=1, low=1
     )
     # Digest of a custom task's file: the run itself notes it.
     source_sha256: str | None = None
-    randomize: Literal["off", "on"] = doc(
-        "whether every world has a physics model of its own, drawn from env.randomization",
+    rewards: Mapping[str, float] = dataclasses.field(
+        default_factory=dict,
+        metadata={"doc": "weights of the reward's terms (docs/tasks.md); 0: the term is left out"},
+    )
+    settings: Mapping[str, float] = dataclasses.field(
+        default_factory=dict,
+        metadata={"doc": "numbers of the task, such as the height of a fall (docs/tasks.md)"},
+    )
+    curriculum: Literal["off", "on"] = doc(
+        "whether a world's episodes get harder as they succeed, in tasks that can (docs/tasks.md)",
+        default="off",
+    )
+    randomize: Literal["off", "on", "episode"] = doc(
+        "whether every world has a physics model of its own, drawn from env.randomization: once, "
+        "or for every episode",
         default="off",
     )
     randomization: Mapping[str, LeafRange] = dataclasses.field(
@@ -97,8 +118,10 @@ class EnvConfig(KeyGroup):
             )
         for leaf, drawn in self.randomization.items():
             drawn.check(leaf)
-        if self.randomize == "on" and not self.randomization:
-            raise ConfigError("env.randomize=on: env.randomization names nothing to draw")
+        if self.randomize != "off" and not self.randomization:
+            raise ConfigError(
+                f"env.randomize={self.randomize}: env.randomization names nothing to draw"
+            )
 
     @property
     def label(self) -> str:

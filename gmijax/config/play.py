@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
+import dataclasses
 from dataclasses import dataclass
 from typing import Literal
 
-from gmijax.config.env import PhysicsConfig
+from gmijax.config.env import EnvConfig, PhysicsConfig
 from gmijax.config.schema import KeyGroup, doc, require_between
 
 
 @dataclass(frozen=True, kw_only=True)
 class PlayRunConfig:
-    """The run to play."""
+    """The run whose policy is played or exported."""
 
     dir: str | None = doc("run folder, or `last`; null: the run of `checkpoint`, else `last`")
     env: str | None = doc(
@@ -22,6 +23,12 @@ class PlayRunConfig:
     # Digest of that file: the controller notes it for its child.
     env_sha256: str | None = None
 
+    def task(self, env: EnvConfig) -> EnvConfig:
+        """The task `env` of the run, with the file that the controller has noted for its child."""
+        if self.env is None:
+            return env
+        return dataclasses.replace(env, name=self.env, source_sha256=self.env_sha256)
+
 
 @dataclass(frozen=True, kw_only=True)
 class PlayConfig(KeyGroup):
@@ -29,7 +36,10 @@ class PlayConfig(KeyGroup):
 
     run: PlayRunConfig
     physics: PhysicsConfig
-    checkpoint: str | None = doc("folder of a checkpoint, or its env steps; null: the latest")
+    checkpoint: str | None = doc(
+        "folder of a checkpoint, its env steps, or `best`: the one with the best return, in an "
+        "evaluation if there are any; null: the latest"
+    )
     num_envs: int = doc("N, environments, one episode each", low=1)
     seed: int = doc("seed of the episodes' starts and of sampled actions", low=0, high=2**31 - 1)
     deterministic: bool = doc("act with the policy's mean; false: sample actions")

@@ -23,7 +23,7 @@ class RunConfig(KeyGroup):
     checkpoint_every: int = doc("iterations between checkpoints; 0: only at the end", low=0)
     keep_checkpoints: int | None = doc(
         "checkpoints that are kept: the last ones, among them always the one with the best "
-        "return; null: all",
+        "return, in an evaluation if there are any; null: all",
         low=1,
     )
     max_restarts: int = doc(

@@ -104,7 +104,8 @@ class ServeConfig(KeyGroup):
     @property
     def pipe_bytes(self) -> int:
         """Capacity of a pipe between simulator and agent; a step's message may take half of it."""
-        return max(_MIN_PIPE_BYTES, self.envs_per_gmi * _PIPE_BYTES_PER_ENV)
+        per_env = _PIPE_BYTES_PER_ENV * self.env.history
+        return max(_MIN_PIPE_BYTES, self.envs_per_gmi * per_env)
 
     def unrolls_per_gmi(self, num_simulators: int) -> int:
         """Unrolls of each GMI that simulates, enough for `num_timesteps` in all."""

@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Literal, TypeAlias
 
 from gmijax.config.algo import A3cConfig, PpoConfig
 from gmijax.config.channel import ChannelConfig
+from gmijax.config.cluster import ClusterConfig
 from gmijax.config.env import EnvConfig, PhysicsConfig
+from gmijax.config.evaluation import EvalConfig
 from gmijax.config.plan import PlanConfig, ReduceConfig
 from gmijax.config.run import RunConfig
 from gmijax.config.schema import KeyGroup, doc
 from gmijax.config.search import SearchConfig
+from gmijax.config.wandb import WandbConfig
 from gmijax.errors import ConfigError
 
 AlgoConfig: TypeAlias = PpoConfig | A3cConfig
@@ -31,7 +34,10 @@ class TrainConfig(KeyGroup):
     reduce: ReduceConfig
     channel: ChannelConfig
     run: RunConfig
+    eval: EvalConfig
     search: SearchConfig
+    wandb: WandbConfig
+    cluster: ClusterConfig = field(default_factory=ClusterConfig)
     num_envs: int | Literal["auto"] = doc(
         "N, environments per GMI; auto: what a search finds (docs/search.md)", low=1
     )
@@ -49,8 +55,15 @@ class TrainConfig(KeyGroup):
                 "reduce.selection=measured: for jobs in which every GMI trains; with "
                 "plan.template=tdg_ex allowed are paper, device"
             )
+        if self.eval.every is not None and self.is_asynchronous:
+            raise ConfigError(
+                f"eval.every={self.eval.every}: with algo=a3c agents act all the time, and nobody "
+                "evaluates; allowed is null (gmijax.play evaluates a checkpoint)"
+            )
         if self.num_envs != "auto":
             self._check_num_envs(self.num_envs)
+        if self.cluster.engine is not None:
+            self._check_on_nodes()
 
     @property
     def is_asynchronous(self) -> bool:
@@ -63,6 +76,28 @@ class TrainConfig(KeyGroup):
         if self.num_envs == "auto":
             raise ConfigError("num_envs=auto: not decided yet; expected an integer")
         return self.num_envs
+
+    def _check_on_nodes(self) -> None:
+        for key, value, allowed in (
+            ("algo", self.algo.name, ("ppo",)),
+            ("plan.template", self.plan.template, ("auto", "tcg_ex")),
+            ("plan.backend", self.plan.backend, ("auto", "cpu")),
+            ("reduce.selection", self.reduce.selection, ("paper", "device")),
+        ):
+            if value not in allowed:
+                raise ConfigError(
+                    f"{key}={value}: not with cluster.engine={self.cluster.engine} yet; allowed "
+                    f"are {', '.join(allowed)}"
+                )
+        for key, value in (
+            ("num_envs", self.num_envs),
+            ("plan.gmis_per_gpu", self.plan.gmis_per_gpu),
+        ):
+            if value == "auto":
+                raise ConfigError(
+                    f"{key}=auto: a search is for one machine; with "
+                    f"cluster.engine={self.cluster.engine} give a number"
+                )
 
     def _check_num_envs(self, num_envs: int) -> None:
         if isinstance(self.algo, A3cConfig):

@@ -13,16 +13,15 @@ from contextlib import suppress
 from typing import Any, TextIO
 
 from rich.console import Console
-from rich.live import Live
 from rich.table import Table
 from rich.text import Text
 
+from gmijax.control.display import LiveDisplay, bar, clock
 from gmijax.partition.plan import Plan
 from gmijax.runs.folder import RunPaths
-from gmijax.supervise.gmi_process import GmiStatus
+from gmijax.supervise.watched_gmi import GmiStatus
 
 _LINE_EVERY_S = 5.0
-_BAR_WIDTH = 30
 
 
 class _Careful:
@@ -84,57 +83,49 @@ class ConsoleProgress:
 
     Args:
       console: nothing is shown on a quiet one.
-      latest: the line of metrics that came since the last call, None if there is none.
+      new: the lines of metrics that came since the last call.
       num_timesteps: environment steps of the whole job.
     """
 
     def __init__(
         self,
         console: Console,
-        latest: Callable[[], dict[str, Any] | None],
+        new: Callable[[], Sequence[dict[str, Any]]],
         num_timesteps: int,
     ) -> None:
         self._console = console
-        self._latest = latest
+        self._new = new
         self._num_timesteps = num_timesteps
         self._line: dict[str, Any] = {}
+        self._evaluated: float | None = None
         self._first: tuple[float, int] | None = None
         self._shown: tuple[str, int | None] = ("", None)
         self._shown_s = 0.0
-        self._is_off = console.quiet
-        self._has_panel = console.is_terminal and not console.quiet
-        self._live = Live(console=console, refresh_per_second=4, transient=True)
+        self._display = LiveDisplay(console)
 
     def __enter__(self) -> ConsoleProgress:
-        if self._has_panel:
-            self._live.start()
+        self._display.__enter__()
         return self
 
     def __exit__(self, *exc: Any) -> None:
-        if self._has_panel:
-            self._live.stop()
+        self._display.__exit__(*exc)
         if self._line:
             self._console.print(self._text())
 
     def update(self, gmis: Sequence[GmiStatus]) -> None:
         """Called about 20 times a second."""
-        if self._is_off:
-            return
-        try:
-            self._show(gmis)
-        except Exception as error:
-            self._is_off = True
-            self._console.print(f"no progress from here on: {error!r}")
+        self._display.show(lambda: self._show(gmis))
 
-    def _show(self, gmis: Sequence[GmiStatus]) -> None:
-        if (line := self._latest()) is not None:
+    def _show(self, gmis: Sequence[GmiStatus]) -> Table | None:
+        for line in self._new():
             self._line = line
+            self._evaluated = line.get("eval/return", self._evaluated)
             if self._first is None:
                 self._first = (time.monotonic(), line["env_steps"])
-        if self._has_panel:
-            self._live.update(self._panel(gmis))
-        else:
-            self._print_now_and_then(gmis)
+        if self._display.has_panel:
+            return self._panel(gmis)
+        self._print_now_and_then(gmis)
+        return None
 
     def _print_now_and_then(self, gmis: Sequence[GmiStatus]) -> None:
         states, steps = _states(gmis), self._line.get("env_steps")
@@ -148,9 +139,8 @@ class ConsoleProgress:
     def _panel(self, gmis: Sequence[GmiStatus]) -> Table:
         grid = Table.grid()
         done = min(self._line.get("env_steps", 0) / self._num_timesteps, 1.0)
-        filled = round(done * _BAR_WIDTH)
-        bar = ("━" * filled, "green"), ("━" * (_BAR_WIDTH - filled), "dim")
-        grid.add_row(Text.assemble(*bar, f" {self._text() if self._line else 'starting'}"))
+        text = self._text() if self._line else "starting"
+        grid.add_row(Text.assemble(bar(done), f" {text}"))
         for gmi in gmis:
             grid.add_row(Text(f"GMI {gmi.gmi}: {gmi.state}, iteration {gmi.iteration}", "dim"))
         return grid
@@ -158,10 +148,12 @@ class ConsoleProgress:
     def _text(self) -> str:
         line = self._line
         mean = line.get("return")
+        evaluated = "" if self._evaluated is None else f"eval {self._evaluated:.2f}  "
         return (
             f"{100 * min(line['env_steps'] / self._num_timesteps, 1):.0f} %  "
             f"{line['env_steps']:,} steps  {_rates(line)}  "
-            f"return {'-' if mean is None else format(mean, '.2f')}  ETA {self._eta()}"
+            f"return {'-' if mean is None else format(mean, '.2f')}  {evaluated}"
+            f"ETA {self._eta()}"
         )
 
     def _eta(self) -> str:
@@ -169,9 +161,7 @@ class ConsoleProgress:
             return "-"
         since_s, steps = self._first
         rate = (self._line["env_steps"] - steps) / (time.monotonic() - since_s)
-        left_s = max(0.0, (self._num_timesteps - self._line["env_steps"]) / rate)
-        minutes, seconds = divmod(round(left_s), 60)
-        return f"{minutes // 60}:{minutes % 60:02d}:{seconds:02d}"
+        return clock(max(0.0, (self._num_timesteps - self._line["env_steps"]) / rate))
 
 
 def _states(gmis: Sequence[GmiStatus]) -> str:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Mapping
 from typing import Generic, NamedTuple, TypeVar
 
 from rich.console import Console
@@ -15,7 +16,7 @@ from gmijax.partition.plan import Plan
 from gmijax.partition.planner import make_plan
 from gmijax.sim import source
 from gmijax.sim.impl import choose_impl
-from gmijax.sim.registry import require_task
+from gmijax.sim.registry import require_env
 from gmijax.supervise.kinds import training_plan
 
 C = TypeVar("C", TrainConfig, ServeConfig)
@@ -31,25 +32,27 @@ class Decided(NamedTuple, Generic[C]):
 
 
 def with_task(config: C) -> C:
-    """With its task pinned; raises ConfigError for none, or a file that a run did not note."""
-    require_task(str(config.env.name), config.env.suite)
+    """With its task pinned; raises ConfigError as `require_env` and `source.pinned`."""
+    require_env(config.env)
     return dataclasses.replace(config, env=source.pinned(config.env))
 
 
-def decide(config: C, console: Console) -> Decided[C]:
+def decide(config: C, console: Console, nodes: Mapping[str, Machine] | None = None) -> Decided[C]:
     """Numbers of GMIs and environments, plan, reduction and physics of a job, in this order.
+
+    `nodes` are the machines of a job on several, by address.
 
     Raises:
       ConfigError, GmijaxError, JobInterrupted: as `with_auto_decided` and `make_plan`.
     """
-    machine = detect_machine()
+    machine = next(iter(nodes.values())) if nodes else detect_machine()
     config, found = with_auto_decided(config, machine, console)
     if isinstance(config, ServeConfig):
         # Nobody trains, so nobody averages gradients.
         nothing, num_envs = ReduceConfig(), config.envs_per_gmi
         plan = make_plan(config.plan, nothing, num_envs, machine, template="tcg")
     else:
-        plan = training_plan(config, machine)
+        plan = training_plan(config, machine, nodes=nodes)
         if config.reduce.selection == "measured":
             algo = config.algo
             hidden = (algo.policy_hidden_layer_sizes, algo.value_hidden_layer_sizes)

@@ -8,22 +8,31 @@ from __future__ import annotations
 
 import dataclasses
 import time
+from contextlib import ExitStack
 from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
 from rich.console import Console
 
+from gmijax.cluster.cluster_job import ClusterJob
 from gmijax.config import TrainConfig
 from gmijax.config.schema import to_dict
 from gmijax.control.console import ConsoleProgress, announce, open_console
 from gmijax.control.decide import Decided, decide, with_task
-from gmijax.control.restarts import Attempts, clear_unfinished, with_gpus_left
+from gmijax.control.restarts import (
+    Attempts,
+    clear_unfinished,
+    with_gpus_left,
+    with_nodes_left,
+)
 from gmijax.control.start_point import StartPoint, find_start_point
 from gmijax.control.summary import train_outcome, train_summary
+from gmijax.control.wandb_link import followed, require_wandb
 from gmijax.machine.snapshot import detect_machine
 from gmijax.partition.plan import Plan
 from gmijax.runs.folder import RunPaths, add_event, locked, read_json, write_json
+from gmijax.runs.git import record_git
 from gmijax.runs.history import MetricsReader, copy_history, draw_returns
 from gmijax.runs.resume import CheckpointMeta, saved_config
 from gmijax.sim import source
@@ -59,24 +68,41 @@ def train(config: TrainConfig, *, show: bool = False) -> Result:
     """
     started_s = time.monotonic()
     config = with_task(config)
+    require_wandb(config)
     beginning = find_start_point(config)
     console = open_console(show=show)
     if beginning.is_complete and beginning.folder is not None:
         return _finished(config, beginning.folder, console)
-    decided = decide(_from(config, beginning.checkpoint), console)
+    with ExitStack() as held:
+        cluster, nodes = None, None
+        if config.cluster.engine is not None:
+            cluster = held.enter_context(ClusterJob(config))
+            nodes = cluster.join(beginning.root(config))
+        decided = decide(_from(config, beginning.checkpoint), console, nodes)
+        return _train(decided, beginning, console, cluster, started_s)
+
+
+def _train(
+    decided: Decided[TrainConfig],
+    beginning: StartPoint,
+    console: Console,
+    cluster: ClusterJob | None,
+    started_s: float,
+) -> Result:
     config, plan = decided.config, decided.plan
     changed = None
     if beginning.checkpoint is not None:
         changed = source.changes(config.env, saved_config(beginning.checkpoint)["env"])
     run = beginning.open(config)
     with locked(run.lock, f"run.dir={run.root}"):
+        record_git(run, Path.cwd())
         what = (
             f"{plan.num_envs_per_gmi} environments per GMI, template {plan.template}, reduction "
             f"{plan.strategy}"
         )
         changes = () if changed is None else (changed,)
         announce(console, run, plan, what, (*decided.reasons, *changes, *beginning.notes))
-        _Job(decided, run, console).run_to_the_end(beginning, started_s)
+        _Job(decided, run, console, cluster).run_to_the_end(beginning, started_s)
     summary = read_json(run.summary)
     console.print(train_outcome(summary, run))
     return Result(run.root, summary)
@@ -85,19 +111,30 @@ def train(config: TrainConfig, *, show: bool = False) -> Result:
 class _Job:
     """A training job that is ready to start."""
 
-    def __init__(self, decided: Decided[TrainConfig], run: RunPaths, console: Console) -> None:
+    def __init__(
+        self,
+        decided: Decided[TrainConfig],
+        run: RunPaths,
+        console: Console,
+        cluster: ClusterJob | None,
+    ) -> None:
         self._config, self._plan, self._machine, _ = decided
         self._run = run
         self._console = console
+        self._cluster = cluster
         self._attempts = Attempts(
-            run, self._config.run.max_restarts, self._launch_at, console.print
+            run,
+            self._config.run.max_restarts,
+            self._launch_at,
+            console.print,
+            cluster.run if cluster is not None else None,
         )
 
     def run_to_the_end(self, beginning: StartPoint, started_s: float) -> None:
         """Runs it, with restarts; writes the summary however it ends."""
         config, run = self._config, self._run
-        latest = MetricsReader(run.metrics).latest
-        progress = ConsoleProgress(self._console, latest, config.num_timesteps)
+        new = MetricsReader(run.metrics).new
+        progress = ConsoleProgress(self._console, new, config.num_timesteps)
 
         def record(status: str, plan: Plan) -> None:
             add_event(run.events, status)
@@ -108,7 +145,11 @@ class _Job:
             draw_returns(run.metrics, run.returns_png, f"{config.env.label}, {config.algo.name}")
 
         write_json(run.plan, self._plan.to_dict())
-        with recorded(run, partial(_what_is_left, run), record):
+        # Recorded first, so that the summary is sent too.
+        with (
+            followed(config, run, beginning.checkpoint, self._console.print),
+            recorded(run, partial(_what_is_left, run), record),
+        ):
             self._prepare(beginning)
             with progress:
                 self._attempts.run_to_the_end(beginning.checkpoint, progress.update)
@@ -136,9 +177,15 @@ class _Job:
         )
 
     def _look_again(self) -> None:
-        """Takes the machine as it is after a fault: GPUs and daemons may be gone."""
-        self._machine = detect_machine()
-        self._config, self._plan, notes = with_gpus_left(self._config, self._plan, self._machine)
+        """Takes machines as they are after a fault: nodes, GPUs and daemons may be gone."""
+        if self._cluster is not None:
+            num_nodes, elastic = len(self._plan.nodes), self._config.run.elastic
+            nodes = self._cluster.join_again(num_nodes, elastic=elastic)
+            self._plan, notes = with_nodes_left(self._config, self._plan, nodes)
+        else:
+            self._machine = detect_machine()
+            left = with_gpus_left(self._config, self._plan, self._machine)
+            self._config, self._plan, notes = left
         # Also where nothing has changed: the attempt before may have run with another backend.
         write_json(self._run.plan, self._plan.to_dict())
         for note in notes:

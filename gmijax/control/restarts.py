@@ -11,7 +11,7 @@ import dataclasses
 import re
 import shutil
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from datetime import datetime
 from pathlib import Path
@@ -24,9 +24,9 @@ from gmijax.partition.plan import Plan
 from gmijax.runs.folder import RunPaths, add_event, remove_temporary
 from gmijax.runs.history import copy_history
 from gmijax.runs.resume import CheckpointMeta, newest_checkpoint
-from gmijax.supervise.gmi_process import GmiStatus
 from gmijax.supervise.kinds import training_plan
 from gmijax.supervise.launcher import Launch, OnTick, StopSignals, run_gmis, stop_signals
+from gmijax.supervise.watched_gmi import GmiStatus
 
 _LASTING = ("NonFiniteError", "ParameterMismatch", "SelfCheckFailed")
 """Errors of a GMI that the next attempt would meet too."""
@@ -54,6 +54,8 @@ class Attempts:
     # raises ConfigError if nothing can be started any more.
     launch_at: Callable[[Path | None, int], Launch]
     say: Callable[[str], None]  # Takes a line for the user.
+    # Runs an attempt to its end; see `run_gmis`.
+    run_attempt: Callable[[Launch, OnTick, StopSignals], None] | None = None
     restarts: list[Restart] = field(default_factory=list)
     _seen_s: float = 0.0
 
@@ -94,7 +96,8 @@ class Attempts:
             raise JobInterrupted("stopped between two attempts")
         add_event(self.run.events, "start", attempt=number, checkpoint=_text(checkpoint))
         try:
-            run_gmis(launch, self._ticks(on_tick, number), signals)
+            run = self.run_attempt or run_gmis
+            run(launch, self._ticks(on_tick, number), signals)
         except BackendUnavailable as error:
             if not number:
                 raise
@@ -216,6 +219,21 @@ def with_gpus_left(
         f"{shrunk.num_envs_per_gmi} environments per GMI as before"
     )
     return config, dataclasses.replace(shrunk, reasons=(*shrunk.reasons, note)), (note,)
+
+
+def with_nodes_left(
+    config: TrainConfig, plan: Plan, nodes: Mapping[str, Machine]
+) -> tuple[Plan, tuple[str, ...]]:
+    """The plan for the nodes that a job has now, and sentences for the user if they are fewer."""
+    again = training_plan(config, next(iter(nodes.values())), nodes=nodes)
+    num_lost = len(plan.nodes) - len(nodes)
+    if not num_lost:
+        return again, ()
+    note = (
+        f"{num_lost} nodes of the job are gone: going on with {len(nodes)}, layout "
+        f"{again.layout}; {again.num_envs_per_gmi} environments per GMI as before"
+    )
+    return dataclasses.replace(again, reasons=(*again.reasons, note)), (note,)
 
 
 def _lost(plan: Plan, machine: Machine) -> set[int]:

@@ -137,10 +137,15 @@ def _with_checkpoint(config: ServeConfig) -> ServeConfig:
         return config
     checkpoint = find_checkpoint(config.run.dir, "run.dir")
     meta = CheckpointMeta.read(checkpoint)
-    trained_config(checkpoint)  # What is broken shows here, and not in every GMI.
+    trained, _ = trained_config(checkpoint)  # What is broken shows here, and not in every GMI.
     if meta.env != config.env.label:
         raise ConfigError(
             f"env={config.env.label}: run.dir={config.run.dir} was trained on {meta.env}"
+        )
+    if trained.history != config.env.history:
+        raise ConfigError(
+            f"env.history={config.env.history}: run.dir={config.run.dir} was trained with "
+            f"{trained.history}"
         )
     physics = config.physics
     if physics.impl == "auto" and meta.impl == "jax":
@@ -187,19 +192,20 @@ class _CollectedLines:
         self._lines: dict[int, dict[str, Any]] = {}
         self._steps_before = steps_before
 
-    def latest(self) -> dict[str, Any] | None:
-        """Sums of steps and rates and the mean return, None if nothing is new."""
+    def new(self) -> list[dict[str, Any]]:
+        """One line with sums of steps and rates and the mean return; none if nothing is new."""
         new = {gmi: line for gmi, reader in self._readers.items() if (line := reader.latest())}
         self._lines |= new
         if not new:
-            return None
+            return []
         lines = self._lines.values()
         returns = [line["return"] for line in lines if line["return"] is not None]
-        return {
+        line = {
             "env_steps": self._steps_before + sum(line["env_steps"] for line in lines),
             "env_steps_per_s": sum(line["env_steps_per_s"] for line in lines),
             "return": sum(returns) / len(returns) if returns else None,
         }
+        return [line]
 
 
 def _run(job: _Job, kept: int, run: RunPaths, console: Console) -> dict[str, Any]:
@@ -207,7 +213,7 @@ def _run(job: _Job, kept: int, run: RunPaths, console: Console) -> dict[str, Any
     started_s = time.monotonic()
     lines = _CollectedLines(run, job.simulators, kept * job.steps_per_unroll)
     total = job.wanted_unrolls * job.steps_per_unroll
-    progress = ConsoleProgress(console, lines.latest, total)
+    progress = ConsoleProgress(console, lines.new, total)
 
     def record(status: str, plan: Plan) -> None:
         wall_s = time.monotonic() - started_s

@@ -5,9 +5,16 @@ from __future__ import annotations
 from pathlib import Path
 from typing import NamedTuple
 
-from gmijax.config import TrainConfig
+from gmijax.config import EnvConfig, TrainConfig
 from gmijax.errors import ConfigError
-from gmijax.runs.folder import RunPaths, create_run, given_run, read_json, require_new_run
+from gmijax.runs.folder import (
+    RUNS,
+    RunPaths,
+    create_run,
+    given_run,
+    read_json,
+    require_new_run,
+)
 from gmijax.runs.resume import CheckpointMeta, choose_checkpoint, newest_checkpoint, trained_config
 
 
@@ -19,6 +26,12 @@ class StartPoint(NamedTuple):
     checkpoint: Path | None = None  # What the job goes on from, None from its beginning.
     is_complete: bool = False  # Whether the checkpoint has all steps that are wanted.
     notes: tuple[str, ...] = ()  # Sentences for the user.
+
+    def root(self, config: TrainConfig) -> Path:
+        """Where the run folder is or will be, or the folder that it will be made in."""
+        if self.folder is not None:
+            return self.folder.root
+        return given_run(config.run.dir, config.run.name) or RUNS
 
     def open(self, config: TrainConfig) -> RunPaths:
         """The run folder; raises as `create_run`."""
@@ -88,10 +101,26 @@ def _require_fit(config: TrainConfig, checkpoint: Path, wanted: str) -> Checkpoi
     ):
         if have != want:
             raise ConfigError(f"run.resume={wanted}: checkpoint of {name} {have}, not {want}")
+    trained, _ = trained_config(checkpoint)
+    for key, have in _memory_of(trained).items():
+        if have != _memory_of(config.env)[key]:
+            want = getattr(config.env, key)
+            raise ConfigError(f"env.{key}={want}: a resumed run keeps its {have}")
     seed = read_json(RunPaths(checkpoint.parent.parent).config)["seed"]
     if config.seed != seed:
         raise ConfigError(f"seed={config.seed}: a resumed run keeps its seed {seed}")
     return meta
+
+
+def _memory_of(env: EnvConfig) -> dict[str, object]:
+    """The keys on which it depends what worlds remember, and so what a checkpoint has of them."""
+    return {
+        "history": env.history,
+        "action_repeat": env.action_repeat,
+        "curriculum": env.curriculum,
+        # Models that are drawn once are not saved.
+        "randomize": "episode" if env.randomize == "episode" else "off or on",
+    }
 
 
 def _shown(hidden: tuple[tuple[int, ...], ...]) -> str:

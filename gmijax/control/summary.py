@@ -14,7 +14,7 @@ from gmijax.learning.physics_health import overflow_warnings
 from gmijax.partition.plan import Plan
 from gmijax.runs.folder import RunPaths, read_json
 from gmijax.runs.history import read_metrics
-from gmijax.runs.resume import CheckpointMeta
+from gmijax.runs.resume import CheckpointMeta, best_checkpoint
 from gmijax.version import __version__, versions_of
 
 _ASYNCHRONOUS = ("pps", "ttop", "staleness", "bytes_per_s", "dropped")
@@ -56,6 +56,7 @@ def train_summary(
         **{key: result.get(key) for key in _RATES},
         **{key: result[key] for key in _ASYNCHRONOUS if key in result},
         "final_return": result.get("final_return"),
+        "eval": _evaluations(run),
         "overflow_steps": result.get("overflow_steps") or {},
         "checkpoint": str(checkpoints[-1]) if checkpoints else None,
         "restarts": list(restarts),
@@ -73,6 +74,20 @@ def _last_known(run: RunPaths) -> dict[str, Any]:
     return {"env_steps": lines[-1]["env_steps"], "final_return": lines[-1]["return"]}
 
 
+def _evaluations(run: RunPaths) -> dict[str, Any] | None:
+    """The last evaluation, and the best one with its checkpoint; None if there was none."""
+    lines = [line for line in read_metrics(run.metrics) if line.get("eval/return") is not None]
+    if not lines:
+        return None
+    last = {"env_steps": lines[-1]["env_steps"], "return": lines[-1]["eval/return"]}
+    checkpoint = best_checkpoint(run.root)
+    meta = None if checkpoint is None else CheckpointMeta.read(checkpoint)
+    if meta is None or meta.eval_return is None:
+        return {"last": last, "best": None}
+    best = {"env_steps": meta.env_steps, "return": meta.eval_return}
+    return {"last": last, "best": {**best, "checkpoint": str(checkpoint)}}
+
+
 def train_outcome(summary: Data, run: RunPaths) -> str:
     """The summary in a few lines for people."""
     times = len(summary["restarts"])
@@ -84,8 +99,20 @@ def train_outcome(summary: Data, run: RunPaths) -> str:
         f"final return {_shown(summary['final_return'], '.2f')}"
         f"{f', started again {times} times' if times else ''}\n"
         f"env steps/s: {sim} simulation, {inference} with inference, {train} with training\n"
+        f"{_of_evaluations(summary.get('eval'))}"
         f"checkpoint: {summary['checkpoint']}\nsummary: {run.summary}"
     ) + overflow_warnings(summary["overflow_steps"])
+
+
+def _of_evaluations(found: Data | None) -> str:
+    """A line, or nothing."""
+    if not found:
+        return ""
+    last, best = found["last"], found["best"]
+    where = f", best {best['return']:.2f}: {best['checkpoint']}" if best else ""
+    return (
+        f"evaluation: return {last['return']:.2f} after {last['env_steps']:,} env steps{where}\n"
+    )
 
 
 def serve_summary(
@@ -236,6 +263,7 @@ def _of_plan(plan: Plan) -> dict[str, Any]:
     return {
         "backend": plan.backend,
         "layout": [list(gmis) for gmis in plan.layout.gmis_of_gpu],
+        "nodes": plan.nodes_data(),
         "num_envs_per_gmi": plan.num_envs_per_gmi,
         "template": plan.template,
         "roles": list(plan.roles),

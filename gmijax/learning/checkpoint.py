@@ -10,11 +10,10 @@ from __future__ import annotations
 
 import dataclasses
 import hashlib
-import math
 import os
 import shutil
 from pathlib import Path
-from typing import TypeVar
+from typing import Any, TypeVar, cast
 
 import jax
 import jax.numpy as jnp
@@ -25,7 +24,7 @@ from gmijax.collectives.interface import Reducer
 from gmijax.config import TrainConfig
 from gmijax.errors import ConfigError, NonFiniteError, ParameterMismatch
 from gmijax.runs.folder import META, RunPaths, write_json
-from gmijax.runs.resume import CheckpointMeta, file_check
+from gmijax.runs.resume import CheckpointMeta, file_check, rank_of
 from gmijax.types import PyTree
 
 T = TypeVar("T")
@@ -34,7 +33,11 @@ LEARNER = "learner"
 
 
 def checkpoint_meta(
-    config: TrainConfig, env_steps: int, num_gmis: int, mean_return: float | None
+    config: TrainConfig,
+    env_steps: int,
+    num_gmis: int,
+    mean_return: float | None,
+    eval_return: float | None = None,
 ) -> CheckpointMeta:
     """Content of `meta.json` for a checkpoint of this run by `num_gmis` GMIs."""
     algo = config.algo
@@ -47,6 +50,7 @@ def checkpoint_meta(
         hidden=(algo.policy_hidden_layer_sizes, algo.value_hidden_layer_sizes),
         impl=config.physics.impl,
         mean_return=mean_return,
+        eval_return=eval_return,
     )
 
 
@@ -70,7 +74,7 @@ def require_finite(params: PyTree, env_name: str, env_steps: int) -> None:
 
 def save_learner(paths: RunPaths, env_steps: int, learner_state: PyTree) -> None:
     """Writes the shared part of the checkpoint at `env_steps`, not yet under its name."""
-    _save(_partial(paths, env_steps) / LEARNER, learner_state)
+    _save(_partial(paths, env_steps) / LEARNER, _present(learner_state))
 
 
 def save_envs(paths: RunPaths, env_steps: int, gmi: int, env_state: PyTree) -> None:
@@ -84,7 +88,7 @@ def finish_checkpoint(paths: RunPaths, meta: CheckpointMeta, keep: int | None = 
     Args:
       paths: the run folder.
       meta: what the checkpoint holds; the list of its files is added.
-      keep: how many checkpoints stay, among them always the one with the best return and the
+      keep: how many checkpoints stay, among them always the best one (see `rank_of`) and the
         last one; None: all.
     """
     final, partial = paths.checkpoint(meta.env_steps), _partial(paths, meta.env_steps)
@@ -105,20 +109,11 @@ def finish_checkpoint(paths: RunPaths, meta: CheckpointMeta, keep: int | None = 
 
 def _remove_old(paths: RunPaths, keep: int) -> None:
     found = sorted(path.parent for path in paths.checkpoints.glob(f"[0-9]*/{META}"))
-    returns = {path: _return_of(path) for path in found}
-    best = max(reversed(found), key=lambda path: returns[path])
+    best = max(reversed(found), key=rank_of)
     others = [path for path in found if path != best]
     num_others = max(keep - 1, int(best != found[-1]))
     for path in others[: max(0, len(others) - num_others)]:
         _remove(path)
-
-
-def _return_of(checkpoint: Path) -> float:
-    try:
-        mean = CheckpointMeta.read(checkpoint).mean_return
-    except ConfigError:
-        return -math.inf
-    return -math.inf if mean is None else mean
 
 
 def _remove(checkpoint: Path) -> None:
@@ -148,7 +143,31 @@ def restore_learner(checkpoint: Path, template: T) -> T:
     Raises:
       ConfigError: the checkpoint does not fit the template.
     """
-    return _restore(checkpoint / LEARNER, template)
+    fields = _present(template)
+    restored = _restore(checkpoint / LEARNER, fields)
+    return restored if fields is template else cast("Any", template)._replace(**restored)
+
+
+def learner_sizes(checkpoint: Path) -> tuple[int, int, int]:
+    """Sizes of the policy in a checkpoint.
+
+    Returns:
+      O, length of an observation; how many of its first numbers the policy sees; A, length of an
+      action.
+
+    Raises:
+      ConfigError: the checkpoint holds no learner's state.
+    """
+    folder = (checkpoint / LEARNER).resolve()
+    try:
+        with ocp.StandardCheckpointer() as checkpointer:
+            saved: Any = checkpointer.metadata(folder).item_metadata
+        (obs_size,) = saved["obs_moments"]["mean"].shape
+        (action_size,) = saved["params"]["log_std"].shape
+        actor_obs_size, _ = saved["params"]["policy"]["params"]["Dense_0"]["kernel"].shape
+    except (AttributeError, KeyError, OSError, TypeError, ValueError) as error:
+        raise ConfigError(f"checkpoint {folder}: holds no policy") from error
+    return obs_size, actor_obs_size, action_size
 
 
 def restore_envs(checkpoint: Path, gmi: int, template: T) -> T:
@@ -191,6 +210,13 @@ def _restore(folder: Path, template: T) -> T:
         lines = str(error).strip().splitlines() or [type(error).__name__]
         raise ConfigError(f"checkpoint {folder} does not fit this job: {lines[0]}") from error
     return jax.tree.map(_restored, template, restored)
+
+
+def _present(state: Any) -> Any:
+    """The fields of a named tuple that are not None: older checkpoints do not know the others."""
+    if not hasattr(state, "_asdict"):
+        return state
+    return {name: part for name, part in state._asdict().items() if part is not None}
 
 
 def _is_key(leaf: jax.Array) -> bool:

@@ -1,4 +1,4 @@
-"""Whole episodes with a trained policy: one per environment, nothing learned.
+"""Whole episodes with a policy: one per environment, nothing learned.
 
 An episode runs in chunks of one compiled program. A world whose episode is over stands still
 until the last one has ended, so no automatic reset is needed.
@@ -21,14 +21,14 @@ from gmijax.learning.unroll import act, unroll
 from gmijax.sim.divergence import diverged_by_source, end_diverged
 from gmijax.sim.interface import Env, EnvState
 from gmijax.sim.wrappers import BatchState, env_keys, select_worlds, training_env, vectorise
-from gmijax.types import Array, PyTree
+from gmijax.types import Array, PRNGKey, PyTree
 
 CHUNK_STEPS = 50
 """Steps of the compiled program: at most so many are wasted after the last episode's end."""
 
 
 class Options(NamedTuple):
-    """Options of `run_episodes`.
+    """How to run episodes.
 
     Attributes:
       num_envs: N.
@@ -36,6 +36,7 @@ class Options(NamedTuple):
       seed: seed of starts and noise.
       deterministic: act with the policy's mean instead of sampling.
       max_steps: where episodes are cut off, None for nowhere.
+      first_env: number of the first environment, from which its random key comes.
     """
 
     num_envs: int
@@ -43,6 +44,7 @@ class Options(NamedTuple):
     seed: int
     deterministic: bool
     max_steps: int | None
+    first_env: int = 0
 
 
 class Episodes(NamedTuple):
@@ -58,7 +60,7 @@ class Episodes(NamedTuple):
       metrics: [N] each, the task's metrics at the end.
       qpos: [L + 1, E, nq] positions of the first E worlds, from the start to the end of the
         longest of their episodes; L is that episode's length.
-      compile_s: seconds until the first step could run.
+      compile_s: seconds that tracing and compiling took.
       run_s: seconds of simulation.
     """
 
@@ -74,6 +76,74 @@ class Episodes(NamedTuple):
     run_s: float
 
 
+class EpisodeRunner:
+    """Programs that run episodes to their ends, made once for weights of the same shapes.
+
+    Args:
+      env: one world, with its time limit.
+      learner: the networks.
+      options: how to run, and how many episodes.
+    """
+
+    def __init__(self, env: Env, learner: Learner, options: Options) -> None:
+        length, most = env.spec.episode_length, options.max_steps
+        self._limit = length if most is None else min(most, length)
+        self._model, self._options = env.model, options
+        self._keys = env_keys(jax.random.key(options.seed), options.first_env, options.num_envs)
+        self._begin: Any = jax.jit(partial(_begin, env, options.num_shown))
+        self._chunk: Any = jax.jit(partial(_run_chunk, env, learner, options))
+        self._compile_s = 0.0
+
+    def trace(self, state: TrainState) -> None:
+        """Traces the programs; `state` has the shapes of those that will be given to `run`."""
+        started = time.monotonic()
+        batch, _ = jax.eval_shape(self._begin, self._model, self._keys)
+        self._begin = self._begin.lower(self._model, self._keys)
+        self._chunk = self._chunk.lower(self._model, state, self._step_limit(), batch)
+        self._compile_s += time.monotonic() - started
+
+    def compile(self) -> None:
+        """Compiles what was traced, or takes it from the cache."""
+        started = time.monotonic()
+        self._begin, self._chunk = self._begin.compile(), self._chunk.compile()
+        self._compile_s += time.monotonic() - started
+
+    def run(self, state: TrainState, go_on: Callable[[int, bool], bool]) -> Episodes:
+        """Runs an episode in each environment.
+
+        Args:
+          state: weights and the observations' statistics.
+          go_on: called after every chunk with the number of chunks done, and whether any episode
+            still runs; says whether to run another chunk.
+        """
+        started = time.monotonic()
+        batch, shown = self._begin(self._model, self._keys)
+        qpos = [np.asarray(shown)[None]]
+        diverged = np.zeros(self._options.num_envs, bool)
+        for done in range(1, -(-self._limit // CHUNK_STEPS) + 1):
+            batch, moved, bad, running = self._chunk(self._model, state, self._step_limit(), batch)
+            qpos.append(np.asarray(moved))
+            diverged |= np.asarray(bad)
+            if not go_on(done, bool(np.asarray(running).any())):
+                break
+        lengths = np.asarray(batch.env.steps)
+        return Episodes(
+            returns=np.asarray(batch.return_sum),
+            lengths=lengths,
+            terminated=np.asarray(batch.env.terminated),
+            truncated=np.asarray(batch.env.truncated),
+            diverged=diverged,
+            terms={name: np.asarray(sums) for name, sums in batch.term_sums.items()},
+            metrics={name: np.asarray(values) for name, values in batch.env.metrics.items()},
+            qpos=np.concatenate(qpos)[: int(lengths[: self._options.num_shown].max()) + 1],
+            compile_s=self._compile_s,
+            run_s=time.monotonic() - started,
+        )
+
+    def _step_limit(self) -> Array:
+        return jnp.asarray(self._limit, jnp.int32)
+
+
 def run_episodes(
     env: Env,
     learner: Learner,
@@ -81,7 +151,7 @@ def run_episodes(
     options: Options,
     on_progress: Callable[[int], None],
 ) -> Episodes:
-    """Runs episodes to their ends.
+    """Compiles and runs episodes, once.
 
     Args:
       env: one world, with its time limit.
@@ -91,39 +161,22 @@ def run_episodes(
       on_progress: called with 0 when the program has been compiled, and with the number of
         chunks of `CHUNK_STEPS` done after every one.
     """
-    started = time.monotonic()
-    length = env.spec.episode_length
-    limit = length if options.max_steps is None else min(options.max_steps, length)
-    keys = env_keys(jax.random.key(options.seed), 0, options.num_envs)
-    batch = jax.jit(training_env(env).init)(env.model, keys)
-    arguments = (env.model, state, jnp.asarray(limit, jnp.int32))
-    chunk = jax.jit(partial(_run_chunk, env, learner, options))
-    compiled = chunk.lower(*arguments, batch).compile()
-    qpos = [np.asarray(_shown_qpos(env, batch.env, options.num_shown))[None]]
-    diverged = np.zeros(options.num_envs, bool)
-    compile_s = time.monotonic() - started
+    runner = EpisodeRunner(env, learner, options)
+    runner.trace(state)
+    runner.compile()
     on_progress(0)
-    for done in range(1, -(-limit // CHUNK_STEPS) + 1):
-        batch, moved, bad = compiled(*arguments, batch)
-        qpos.append(np.asarray(moved))
-        diverged |= np.asarray(bad)
-        on_progress(done)
-        if not np.asarray(_is_running(batch.env, limit)).any():
-            break
-    run_s = time.monotonic() - started - compile_s
-    lengths = np.asarray(batch.env.steps)
-    return Episodes(
-        returns=np.asarray(batch.return_sum),
-        lengths=lengths,
-        terminated=np.asarray(batch.env.terminated),
-        truncated=np.asarray(batch.env.truncated),
-        diverged=diverged,
-        terms={name: np.asarray(sums) for name, sums in batch.term_sums.items()},
-        metrics={name: np.asarray(values) for name, values in batch.env.metrics.items()},
-        qpos=np.concatenate(qpos)[: int(lengths[: options.num_shown].max()) + 1],
-        compile_s=compile_s,
-        run_s=run_s,
-    )
+
+    def go_on(chunks: int, running: bool) -> bool:
+        on_progress(chunks)
+        return running
+
+    return runner.run(state, go_on)
+
+
+def _begin(env: Env, num_shown: int, model: PyTree, keys: PRNGKey) -> tuple[BatchState, Array]:
+    """Environments at their starts, and qpos [E, nq]."""
+    batch = training_env(env).init(model, keys)
+    return batch, _shown_qpos(env, batch.env, num_shown)
 
 
 def _run_chunk(
@@ -134,18 +187,21 @@ def _run_chunk(
     state: TrainState,
     limit: Array,
     batch: BatchState,
-) -> tuple[BatchState, Array, Array]:
+) -> tuple[BatchState, Array, Array, Array]:
     """Moves every world by up to `CHUNK_STEPS`.
 
     Returns:
-      The state, qpos [CHUNK_STEPS, E, nq], and which worlds diverged meanwhile, [N] bool.
+      The state, qpos [CHUNK_STEPS, E, nq], which worlds diverged meanwhile, and whose episodes
+      still run, [N] bool both.
     """
     weights = acting_weights(learner, state)
     step_all = vectorise(env).step
 
     def choose(before: BatchState) -> tuple[BatchState, Array, Array]:
-        drawn, mean, noisy = act(learner.networks, weights, before)
-        return drawn, mean, mean if options.deterministic else noisy
+        drawn, output, action = act(learner.networks, weights, before)
+        if options.deterministic:
+            action = learner.networks.distribution.mode(output)
+        return drawn, output, action
 
     def step(model: PyTree, before: BatchState, action: Array) -> tuple[BatchState, Any]:
         moved = step_all(model, before.env, action)
@@ -164,7 +220,7 @@ def _run_chunk(
     batch, (qpos, diverged) = unroll(
         stopping, choose, CHUNK_STEPS, lambda *step: step[-1], model, batch
     )
-    return batch, qpos, jnp.any(diverged, axis=0)
+    return batch, qpos, jnp.any(diverged, axis=0), _is_running(batch.env, limit)
 
 
 def _without_bad_numbers(env: Env, before: EnvState, state: EnvState) -> tuple[EnvState, Array]:

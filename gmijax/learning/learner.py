@@ -5,6 +5,8 @@ Checkpoints hold a `TrainState` whatever the algorithm, so that all can be playe
 
 from __future__ import annotations
 
+import math
+from collections.abc import Sequence
 from typing import Generic, NamedTuple, TypeVar
 
 import jax
@@ -13,7 +15,8 @@ import optax
 from jax.flatten_util import ravel_pytree
 
 from gmijax.config import ADAPTIVE_LEARNING_RATE_RANGE, AlgoConfig
-from gmijax.learning.normalize import Moments, no_samples
+from gmijax.learning.distributions import DISTRIBUTIONS
+from gmijax.learning.normalize import Moments, from_units, no_samples, with_std_floor
 from gmijax.learning.policy import ActorCritic, ActorCriticParams, make_actor_critic
 from gmijax.sim.interface import EnvSpec
 from gmijax.types import Array, PRNGKey, PyTree
@@ -34,6 +37,8 @@ class TrainState(NamedTuple):
       learning_rate: [] float32.
       iteration: [] int32, finished iterations.
       key: base of the shuffling keys; never consumed, only folded with iteration and rank.
+      value_moments: statistics of the targets of the value function, whose unit its network has;
+        None where values are not normalised.
     """
 
     params: ActorCriticParams
@@ -42,6 +47,7 @@ class TrainState(NamedTuple):
     learning_rate: Array
     iteration: Array
     key: PRNGKey
+    value_moments: Moments | None = None
 
 
 class Learner(NamedTuple, Generic[C]):
@@ -56,10 +62,11 @@ def make_learner(spec: EnvSpec, config: C) -> Learner[C]:
     """The learner for an environment's sizes."""
     return Learner(
         networks=make_actor_critic(
-            spec.action_size,
+            DISTRIBUTIONS[config.distribution_type](spec.action_size, config.state_dependent_std),
             config.policy_hidden_layer_sizes,
             config.value_hidden_layer_sizes,
             config.init_noise_std,
+            spec.actor_obs_size,
         ),
         # The learning rate is in the state, because the adaptive schedule changes it.
         optimizer=optax.chain(
@@ -80,13 +87,14 @@ def init_learner(learner: Learner, obs_size: int, key: PRNGKey) -> TrainState:
         learning_rate=jnp.asarray(learner.config.learning_rate, jnp.float32),
         iteration=jnp.zeros((), jnp.int32),
         key=shuffle_key,
+        value_moments=no_samples(()) if learner.config.normalize_values else None,
     )
 
 
 def acting_moments(learner: Learner, state: TrainState) -> Moments:
     """The statistics that observations are normalised with (none if switched off)."""
     if learner.config.normalize_observations:
-        return state.obs_moments
+        return with_std_floor(state.obs_moments, learner.config.obs_std_floor)
     return no_samples(state.obs_moments.mean.shape)
 
 
@@ -96,15 +104,25 @@ class ActingWeights(NamedTuple):
     Attributes:
       params: weights of policy and value function.
       moments: statistics that observations are normalised with.
+      value_moments: see `TrainState`.
     """
 
     params: ActorCriticParams
     moments: Moments
+    value_moments: Moments | None = None
 
 
 def acting_weights(learner: Learner, state: TrainState) -> ActingWeights:
     """The weights to act with when the learner has `state`."""
-    return ActingWeights(state.params, acting_moments(learner, state))
+    return ActingWeights(state.params, acting_moments(learner, state), state.value_moments)
+
+
+def state_values(networks: ActorCritic, weights: ActingWeights, obs: Array) -> Array:
+    """Values [...] of normalised observations [..., O], in the unit of scaled rewards."""
+    values = networks.state_value(weights.params, obs)
+    if weights.value_moments is None:
+        return values
+    return from_units(weights.value_moments, values)
 
 
 def pack_weights(weights: ActingWeights) -> Array:
@@ -126,7 +144,8 @@ def learner_shapes(spec: EnvSpec, config: AlgoConfig) -> TrainState:
 def num_weights(spec: EnvSpec, config: AlgoConfig) -> int:
     """W, length of the packed weights."""
     state = learner_shapes(spec, config)
-    return sum(leaf.size for leaf in jax.tree.leaves((state.params, state.obs_moments)))
+    weights = ActingWeights(state.params, state.obs_moments, state.value_moments)
+    return sum(leaf.size for leaf in jax.tree.leaves(weights))
 
 
 def apply_gradients(
@@ -136,11 +155,14 @@ def apply_gradients(
 
     `kl` [] is the divergence that the adaptive schedule looks at; see `adapted_learning_rate`.
     """
-    rate = state.learning_rate
-    if learner.config.learning_rate_schedule == "adaptive_kl":
-        rate = adapted_learning_rate(rate, kl, learner.config.desired_kl)
+    config, rate = learner.config, state.learning_rate
+    if config.learning_rate_schedule == "adaptive_kl":
+        rate = adapted_learning_rate(rate, kl, config.desired_kl, config.learning_rate_range)
     updates, opt_state = learner.optimizer.update(grads, state.opt_state, state.params)
-    params = jax.tree.map(lambda p, u: p - rate * u, state.params, updates)
+    params: ActorCriticParams = jax.tree.map(lambda p, u: p - rate * u, state.params, updates)
+    if config.min_noise_std > 0.0:  # A bound within the loss would have no gradient beyond it.
+        lowest = math.log(config.min_noise_std)
+        params = params._replace(log_std=jnp.maximum(params.log_std, lowest))
     return state._replace(params=params, opt_state=opt_state, learning_rate=rate)
 
 
@@ -151,14 +173,30 @@ def rate_figures(config: AlgoConfig, rates: Array) -> dict[str, Array]:
     return {"mean": jnp.mean(rates), "min": jnp.min(rates), "max": jnp.max(rates)}
 
 
-def adapted_learning_rate(rate: Array, kl: Array, desired_kl: float) -> Array:
-    """Steers the rate to keep the KL divergence per update near `desired_kl`.
+def policy_figures(state: TrainState) -> dict[str, Array]:
+    """Figures of the policy as it is, [] each, by the names that they are logged under.
+
+    The learning rate, and of the standard deviations of its actions the mean and, of several,
+    the smallest.
+    """
+    std = jnp.exp(state.params.log_std)
+    figures = {"policy/learning_rate": state.learning_rate, "policy/noise_std": jnp.mean(std)}
+    return figures if std.size == 1 else figures | {"policy/noise_std_min": jnp.min(std)}
+
+
+def adapted_learning_rate(
+    rate: Array,
+    kl: Array,
+    desired_kl: float,
+    limits: Sequence[float] = ADAPTIVE_LEARNING_RATE_RANGE,
+) -> Array:
+    """Steers the rate to keep the KL divergence near `desired_kl`.
 
     Divided by 1.5 above twice the target, multiplied by 1.5 below half of it (the rule of
-    Isaac Gym's trainers), within [1e-5, 1e-2]. No change below 1e-6: that is the first update
+    Isaac Gym's trainers), within `limits`. No change below 1e-6: that is the first update
     on a rollout, where the policy has not moved yet and the rest is rounding.
     """
-    low, high = ADAPTIVE_LEARNING_RATE_RANGE
+    low, high = limits
     slower = jnp.maximum(rate / _LEARNING_RATE_STEP, low)
     faster = jnp.minimum(rate * _LEARNING_RATE_STEP, high)
     too_slow = (kl < 0.5 * desired_kl) & (kl > _UNMOVED_KL)

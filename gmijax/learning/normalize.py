@@ -21,7 +21,8 @@ OBS_CLIP = 10.0
 OUTLIER_STD = 20.0
 """Samples farther from the mean than this count as this far in the statistics."""
 
-_MIN_STD = 1e-4
+MIN_STD = 1e-4
+"""No standard deviation is smaller: that of constant samples is 0."""
 
 
 class Moments(NamedTuple):
@@ -52,6 +53,23 @@ def without_outliers(moments: Moments, samples: Array) -> Array:
 def no_samples(shape: tuple[int, ...]) -> Moments:
     """The neutral element of `merge`."""
     return Moments(jnp.zeros(()), jnp.zeros(shape), jnp.zeros(shape))
+
+
+def with_std_floor(moments: Moments, floor: float) -> Moments:
+    """`moments` with no standard deviation below `floor`; no samples stay none."""
+    if floor <= MIN_STD:  # `std_of` sees to that.
+        return moments
+    return moments._replace(m2=jnp.maximum(moments.m2, floor**2 * moments.count))
+
+
+def moments_of_those(chosen: Array, samples: Array) -> Moments:
+    """Moments of the `chosen` [...] bool of `samples` [..., S]."""
+    axes = tuple(range(chosen.ndim))
+    where = jnp.expand_dims(chosen, range(chosen.ndim, samples.ndim))
+    count = jnp.sum(chosen, dtype=jnp.float32)
+    mean = jnp.sum(jnp.where(where, samples, 0.0), axes) / jnp.maximum(count, 1.0)
+    m2 = jnp.sum(jnp.where(where, (samples - mean) ** 2, 0.0), axes)
+    return Moments(count, mean, m2)
 
 
 def moments_of(samples: Array, num_sample_axes: int) -> Moments:
@@ -85,7 +103,17 @@ def merge_all(stacked: Moments) -> Moments:
 def std_of(moments: Moments) -> Array:
     """Standard deviation, 1 while there are no samples; never below 1e-4."""
     variance = moments.m2 / jnp.maximum(moments.count, 1.0)
-    return jnp.where(moments.count > 0, jnp.maximum(jnp.sqrt(variance), _MIN_STD), 1.0)
+    return jnp.where(moments.count > 0, jnp.maximum(jnp.sqrt(variance), MIN_STD), 1.0)
+
+
+def in_units(moments: Moments, samples: Array) -> Array:
+    """`samples` [..., S] in standard deviations from the mean; `from_units` inverts it."""
+    return (samples - moments.mean) / std_of(moments)
+
+
+def from_units(moments: Moments, samples: Array) -> Array:
+    """Inverts `in_units`."""
+    return moments.mean + std_of(moments) * samples
 
 
 def normalize(moments: Moments, samples: Array) -> Array:
@@ -94,4 +122,4 @@ def normalize(moments: Moments, samples: Array) -> Array:
     As they are while there are no statistics: their unit is not known, and so no limit.
     """
     limit = jnp.where(moments.count > 0, OBS_CLIP, jnp.inf)
-    return jnp.clip((samples - moments.mean) / std_of(moments), -limit, limit)
+    return jnp.clip(in_units(moments, samples), -limit, limit)

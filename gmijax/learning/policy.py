@@ -1,7 +1,8 @@
-"""Gaussian policy and value function: two separate multi-layer perceptrons.
+"""Policy and value function: two separate multi-layer perceptrons.
 
 The sizes are those of the paper's Table 5 (256:128:64 for most tasks); ELU activations and a
-state-independent standard deviation are what Isaac Gym's PPO uses for the same tasks.
+state-independent standard deviation are what Isaac Gym's PPO uses for the same tasks. What the
+output of the policy's network means is said by its distribution.
 """
 
 from __future__ import annotations
@@ -12,9 +13,8 @@ import flax.linen as nn
 import jax
 import jax.numpy as jnp
 
+from gmijax.learning.distributions import Distribution
 from gmijax.types import Array, PRNGKey, PyTree
-
-_HALF_LOG_2PI = 0.9189385332046727
 
 
 class Mlp(nn.Module):
@@ -42,9 +42,10 @@ class ActorCriticParams(NamedTuple):
     """Weights of both networks.
 
     Attributes:
-      policy: weights of the network that gives the mean action.
+      policy: weights of the network whose output the distribution takes.
       value: weights of the value network.
-      log_std: [A] logarithm of the policy's standard deviation.
+      log_std: [A] logarithm of the policy's standard deviation, or of the part of it that all
+        states share.
     """
 
     policy: PyTree
@@ -53,25 +54,41 @@ class ActorCriticParams(NamedTuple):
 
 
 class ActorCritic(NamedTuple):
-    """The two networks; their weights are passed in."""
+    """The two networks; their weights are passed in.
+
+    Attributes:
+      policy: the network whose output the distribution takes.
+      value: the value function.
+      init_noise_std: standard deviation of the first policy.
+      distribution: of actions.
+      actor_obs_size: `policy` sees the first so many numbers of an observation; None: all.
+    """
 
     policy: Mlp
     value: Mlp
     init_noise_std: float
+    distribution: Distribution
+    actor_obs_size: int | None = None
 
     def init(self, key: PRNGKey, obs_size: int) -> ActorCriticParams:
         """First weights; consumes `key`."""
         policy_key, value_key = jax.random.split(key)
         obs = jnp.zeros((1, obs_size))
         return ActorCriticParams(
-            policy=self.policy.init(policy_key, obs),
+            policy=self.policy.init(policy_key, obs[:, : self.actor_obs_size]),
             value=self.value.init(value_key, obs),
-            log_std=jnp.full((self.policy.out,), jnp.log(self.init_noise_std)),
+            log_std=jnp.full((self.distribution.action_size,), jnp.log(self.init_noise_std)),
         )
 
-    def action_mean(self, params: ActorCriticParams, obs: Array) -> Array:
-        """Mean action [..., A] for normalised observations [..., O]."""
+    def output(self, params: ActorCriticParams, obs: Array) -> Array:
+        """What `distribution` takes [..., H], for normalised observations [..., O]."""
+        if self.actor_obs_size is not None:
+            obs = obs[..., : self.actor_obs_size]
         return jnp.asarray(self.policy.apply(params.policy, obs))
+
+    def action_mean(self, params: ActorCriticParams, obs: Array) -> Array:
+        """The action without noise [..., A] for normalised observations [..., O]."""
+        return self.distribution.mode(self.output(params, obs))
 
     def state_value(self, params: ActorCriticParams, obs: Array) -> Array:
         """Value estimates [...] for normalised observations [..., O]."""
@@ -79,33 +96,18 @@ class ActorCritic(NamedTuple):
 
 
 def make_actor_critic(
-    action_size: int,
+    distribution: Distribution,
     policy_hidden: tuple[int, ...],
     value_hidden: tuple[int, ...],
     init_noise_std: float,
+    actor_obs_size: int | None = None,
 ) -> ActorCritic:
-    """Networks for `action_size` actions with the given hidden widths."""
+    """Networks with the given hidden widths; for the rest see `ActorCritic`."""
     # A small output layer makes the first policy's mean about zero wherever the robot is.
     return ActorCritic(
-        policy=Mlp(tuple(policy_hidden), action_size, 0.01),
+        policy=Mlp(tuple(policy_hidden), distribution.output_size, 0.01),
         value=Mlp(tuple(value_hidden), 1, 1.0),
         init_noise_std=init_noise_std,
+        distribution=distribution,
+        actor_obs_size=actor_obs_size,
     )
-
-
-def log_prob(mean: Array, log_std: Array, action: Array) -> Array:
-    """Log density [...] of `action` [..., A] under the Gaussian."""
-    z = (action - mean) * jnp.exp(-log_std)
-    return jnp.sum(-0.5 * z**2 - log_std - _HALF_LOG_2PI, axis=-1)
-
-
-def entropy(log_std: Array) -> Array:
-    """Entropy [] of the Gaussian with `log_std` [A], in nats."""
-    return jnp.sum(log_std + 0.5 + _HALF_LOG_2PI)
-
-
-def kl_divergence(old_mean: Array, old_log_std: Array, mean: Array, log_std: Array) -> Array:
-    """KL(old || new) [...] between two diagonal Gaussians [..., A], in nats."""
-    variance_ratio = jnp.exp(2.0 * (old_log_std - log_std))
-    distance = ((old_mean - mean) * jnp.exp(-log_std)) ** 2
-    return jnp.sum(0.5 * (variance_ratio + distance - 1.0) + log_std - old_log_std, axis=-1)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from functools import partial
 from pathlib import Path
 
 import jax
@@ -16,6 +15,7 @@ from gmijax.runs.resume import CheckpointMeta
 from gmijax.sim.interface import Env
 from gmijax.sim.randomize import make_worlds
 from gmijax.sim.wrappers import BatchedEnv, BatchState, env_keys
+from gmijax.types import Array, PRNGKey
 
 
 def worlds_of(config: TrainConfig | ServeConfig, place: int) -> Env:
@@ -36,7 +36,12 @@ def first_state(learner: Learner, obs_size: int, config: TrainConfig) -> tuple[T
       ConfigError: the checkpoint to go on from does not fit.
     """
     key = jax.random.split(jax.random.key(config.seed))[0]
-    state = jax.jit(partial(init_learner, learner, obs_size))(key)
+
+    def start(key: PRNGKey, rate: Array) -> TrainState:
+        return init_learner(learner, obs_size, key)._replace(learning_rate=rate)
+
+    # An argument: jobs that differ in it alone have the same programs.
+    state = jax.jit(start)(key, jnp.asarray(config.algo.learning_rate, jnp.float32))
     if config.run.resume is None:
         return state, 0
     checkpoint = Path(config.run.resume)

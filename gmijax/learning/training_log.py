@@ -20,7 +20,7 @@ from gmijax.learning.physics_health import (
     overflow_line,
 )
 from gmijax.runs.folder import RunPaths
-from gmijax.runs.history import read_metrics
+from gmijax.runs.history import read_metrics, scalars
 
 WINDOW_EPISODES = 100
 """Means over episodes are taken over at least this many of the latest ones."""
@@ -97,11 +97,8 @@ class TensorBoardSink:
         """Takes one iteration's metrics; `env_steps` is the x axis."""
         steps = int(line["env_steps"] or 0)
         values = [
-            self._summary.Value(
-                tag=name if "/" in name else f"train/{name}", simple_value=float(value)
-            )
-            for name, value in line.items()
-            if value is not None and name != "env_steps"
+            self._summary.Value(tag=name, simple_value=value)
+            for name, value in scalars(line).items()
         ]
         summary = self._summary(value=values)
         self._writer.write_event(self._event(wall_time=time.time(), step=steps, summary=summary))
@@ -120,22 +117,20 @@ class Learnt(NamedTuple):
 
     Attributes:
       losses: parts of the loss by name.
-      learning_rate: after the last update.
-      rates: of all updates, see `rate_figures`.
-      noise_std: mean standard deviation of the policy.
+      figures: others by the names that they are logged under.
+      rates: of the learning rates of all updates, see `rate_figures`.
     """
 
     losses: Mapping[str, float]
-    learning_rate: float
+    figures: Mapping[str, float]
     rates: Mapping[str, float]
-    noise_std: float
 
 
 class TrainingLog:
     """The lines of a training job, which refuse what is not finite.
 
     Attributes:
-      last_s: time of the last line.
+      last_s: time of the last line, or of the end of the pause after it.
       line_s: seconds from line to line.
       last_return: mean return of the latest episodes, None while none has ended.
       overflows: environment steps for which a buffer of the simulator was too small.
@@ -174,6 +169,7 @@ class TrainingLog:
         *,
         simulated: float | None = None,
         now_s: float | None = None,
+        paused_s: float = 0.0,
     ) -> None:
         """Writes a line.
 
@@ -184,6 +180,7 @@ class TrainingLog:
           others: what else is to stand there.
           simulated: how many steps `counts` are of, None for those learnt from.
           now_s: time of the line, None for now.
+          paused_s: seconds after it in which nobody trained; not in the rate of the next line.
 
         Raises:
           NonFiniteError: too many steps diverged, or a loss is NaN or infinite.
@@ -208,14 +205,13 @@ class TrainingLog:
             **overflow_line(counts.overflowed),
             "reward_per_step": counts.reward_sum / simulated if simulated else None,
             **{f"loss/{name}": value for name, value in learnt.losses.items()},
-            "policy/learning_rate": learnt.learning_rate,
+            **learnt.figures,
             **{f"policy/learning_rate_{name}": rate for name, rate in learnt.rates.items()},
-            "policy/noise_std": learnt.noise_std,
             **others,
         }
         for sink in self._sinks:
             sink.write(line)
-        self.last_s, self._env_steps = now_s, env_steps
+        self.last_s, self._env_steps = now_s + paused_s, env_steps
 
     def close(self) -> None:
         """Flushes the lines."""

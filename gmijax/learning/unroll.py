@@ -20,12 +20,13 @@ from gmijax.sim.wrappers import (
     split_keys,
     zero_counts,
 )
-from gmijax.types import Array, PRNGKey, PyTree
+from gmijax.types import Array, PyTree
 
 K = TypeVar("K")
 
 Choose: TypeAlias = Callable[[BatchState], tuple[BatchState, Array, Array]]
-"""`(state) -> (state, mean [N, A], action [N, A])`; draws its keys from the environments'."""
+"""`(state) -> (state, what it knows of the action [N, ...], action [N, A])`; draws its keys from
+the environments'."""
 
 Outcome: TypeAlias = tuple[EpisodeSums, dict[str, Array], dict[str, Array]]
 """`finished`, `diverged` and `overflowed` of a `StepOutput`."""
@@ -47,24 +48,14 @@ class Counts(NamedTuple):
     overflowed: dict[str, Array]
 
 
-def policy_noise(keys: PRNGKey, action_size: int) -> Array:
-    """Standard normal noise [N, A], each row from the key of its own environment.
-
-    Rows depend on the environment alone, so the way environments are spread over GMIs does not
-    change the samples.
-    """
-    return jax.vmap(lambda key: jax.random.normal(key, (action_size,)))(keys)
-
-
 def act(
     networks: ActorCritic, weights: ActingWeights, state: BatchState
 ) -> tuple[BatchState, Array, Array]:
-    """Draws one action per environment: `(state, mean [N, A], action [N, A])`."""
-    params, moments = weights
+    """Draws one action per environment: `(state, output of the network [N, H], action [N, A])`."""
+    params = weights.params
     state, keys = split_keys(state)
-    mean = networks.action_mean(params, normalize(moments, state.env.obs))
-    noise = policy_noise(keys, networks.policy.out)
-    return state, mean, mean + jnp.exp(params.log_std) * noise
+    output = networks.output(params, normalize(weights.moments, state.env.obs))
+    return state, output, networks.distribution.sample(output, params.log_std, keys)
 
 
 def unroll(
@@ -81,7 +72,8 @@ def unroll(
       env: the environments.
       choose: see `Choose`, for example `act`.
       length: T.
-      keep: `(state before, mean, action, output of the step)` to what is kept of a step.
+      keep: `(state before, what is known of the action, action, outcome)` to what is kept of a
+        step.
       model: physics model of the environments.
       state: their state.
 
@@ -90,9 +82,9 @@ def unroll(
     """
 
     def step(before: BatchState, _: None) -> tuple[BatchState, K]:
-        drawn, mean, action = choose(before)
+        drawn, known, action = choose(before)
         after, out = env.step(model, drawn, action)
-        return after, keep(before, mean, action, out)
+        return after, keep(before, known, action, out)
 
     return jax.lax.scan(step, state, None, length=length)
 

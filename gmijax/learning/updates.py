@@ -11,6 +11,7 @@ import jax.numpy as jnp
 from gmijax.collectives.interface import Peers
 from gmijax.config import AlgoConfig
 from gmijax.learning.learner import Learner, TrainState, apply_gradients, learner_shapes
+from gmijax.learning.normalize import Moments
 from gmijax.learning.policy import ActorCriticParams
 from gmijax.sim.interface import EnvSpec
 from gmijax.types import Array, PyTree
@@ -62,14 +63,32 @@ def run_updates(
     Returns:
       The new state; losses and learning rates of all updates, with a leading axis.
     """
+    config = learner.config
+
+    def mean_gradient(state: TrainState, indices: Array) -> tuple[Any, Any]:
+        return peers.mean(gradients(learner, state.params, data, context, indices), after=after)
 
     def update(state: TrainState, indices: Array) -> tuple[TrainState, tuple[Any, Array]]:
-        grads, losses = gradients(learner, state.params, data, context, indices)
-        grads, losses = peers.mean((grads, losses), after=after)
+        grads, losses = mean_gradient(state, indices)
         state = apply_gradients(learner, state, grads, losses.steering_kl)
         return state, (losses, state.learning_rate)
 
-    state, (losses, rates) = jax.lax.scan(update, state, order)
+    def update_in_epoch(
+        before: tuple[TrainState, Array], step: tuple[Array, Array]
+    ) -> tuple[tuple[TrainState, Array], tuple[Any, Array]]:
+        (state, total), (indices, is_last) = before, step
+        grads, losses = mean_gradient(state, indices)
+        total += losses.steering_kl
+        kl = jnp.where(is_last, total / config.num_minibatches, 0.0)  # 0 steers nothing.
+        state = apply_gradients(learner, state, grads, kl)
+        return (state, jnp.where(is_last, 0.0, total)), (losses, state.learning_rate)
+
+    if config.adapt_every == "minibatch":
+        state, (losses, rates) = jax.lax.scan(update, state, order)
+    else:
+        is_last = (jnp.arange(len(order)) + 1) % config.num_minibatches == 0
+        begun = state, jnp.zeros(())
+        (state, _), (losses, rates) = jax.lax.scan(update_in_epoch, begun, (order, is_last))
     return state, losses, rates
 
 
@@ -85,3 +104,26 @@ def clipped_surrogate(ratio: Array, advantage: Array, epsilon: float) -> Array:
 def bound_loss(mean: Array) -> Array:
     """Squared distance [...] of action means [..., A] from [-1.1, 1.1]."""
     return jnp.sum(jnp.maximum(jnp.abs(mean) - _ACTION_BOUND, 0.0) ** 2, -1)
+
+
+def saturated_fraction(mean: Array) -> Array:
+    """Share [...] of action means [..., A] beyond [-1, 1], where the environment clips them."""
+    return jnp.mean((jnp.abs(mean) > 1.0).astype(jnp.float32), -1)
+
+
+def mean_of_states(values: Array) -> Array:
+    """Mean [] of `values` [...], or [] where they are the same in all states."""
+    return jnp.mean(values) if values.ndim else values
+
+
+def explained_variance(target: Moments, error: Moments) -> Array:
+    """Share [] of the variance of the values' targets that the values explain.
+
+    1 where they are the targets, 0 where a constant would do as well, or where nothing varies.
+
+    Args:
+      target: of the targets of some samples.
+      error: of the targets minus the values of the same.
+    """
+    varies = target.m2 > 0.0
+    return jnp.where(varies, 1.0 - error.m2 / jnp.where(varies, target.m2, 1.0), 0.0)

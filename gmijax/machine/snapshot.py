@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import json
 import os
 import platform
-from collections.abc import Iterator
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
 
 from gmijax.machine.host_limits import (
@@ -27,6 +28,9 @@ from gmijax.runs.cache import why_temporary
 _HIDES_ALL = ("", "-1", "NoDevFiles")
 """Values of `CUDA_VISIBLE_DEVICES` that say on purpose that there are no GPUs."""
 
+DAEMONS_VARIABLE = "GMIJAX_MPS_DAEMONS"
+"""Tells a job of a sweep the daemons that the sweep has for it: JSON, see `Machine.daemons`."""
+
 _DEVICES = Path("/dev")
 _OTHERS = {"kfd": "a GPU for ROCm", "accel[0-9]*": "a TPU"}
 
@@ -42,6 +46,7 @@ class Machine:
       mps_control: program of the MPS daemon, None where it is not installed.
       driver_version: of the NVIDIA driver, None without one.
       operator_daemon: pipe directory of a running MPS daemon that somebody else started.
+      daemons: the same for a job of a sweep, by UUID of the GPU or MIG instance.
       host: what is left of memory, threads and open files.
       gpu_problem: why there are no GPUs although NVIDIA's driver is there; None where it works,
         there is none, or the user hides all GPUs.
@@ -53,9 +58,14 @@ class Machine:
     mps_control: Path | None = None
     driver_version: str | None = None
     operator_daemon: Path | None = None
+    daemons: Mapping[str, Path] = field(default_factory=dict)
     host: Host = UNKNOWN_HOST
     gpu_problem: str | None = None
     warnings: tuple[str, ...] = ()
+
+    def daemon_of(self, device: str) -> Path | None:
+        """Pipe directory of the daemon that runs for a device, None where a job starts its own."""
+        return self.daemons.get(device, self.operator_daemon)
 
     @property
     def driver_major(self) -> int:
@@ -82,6 +92,7 @@ def detect_machine() -> Machine:
         mps_control=mps_control,
         driver_version=driver_version(),
         operator_daemon=daemon,
+        daemons=_daemons_of_sweep(mps_control) if mps_control else {},
         host=detect_host(),
         gpu_problem=None if listed or is_hidden else gpu_problem(),
         warnings=(
@@ -143,6 +154,13 @@ def _operator_daemon(program: Path) -> tuple[Path | None, str | None]:
             f"{PIPE_VARIABLE}={directory} says that it is to be"
         )
     return (directory if MpsControl(program, directory).is_answering() else None), None
+
+
+def _daemons_of_sweep(program: Path) -> dict[str, Path]:
+    """Those of `DAEMONS_VARIABLE` that answer."""
+    told = json.loads(os.environ.get(DAEMONS_VARIABLE, "{}"))
+    found = {device: Path(directory) for device, directory in told.items()}
+    return {key: path for key, path in found.items() if MpsControl(program, path).is_answering()}
 
 
 def _strange_owner(directory: Path) -> int | None:

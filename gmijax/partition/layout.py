@@ -1,4 +1,4 @@
-"""Which GMI lives on which GPU: pure data, checked when it is made."""
+"""Which GMI lives on which GPU of which node: pure data, checked when it is made."""
 
 from __future__ import annotations
 
@@ -14,11 +14,19 @@ class Layout:
     `Layout(((0, 1, 2), (3, 4, 5)))` is two GPUs with three GMIs each. Positions count GPUs of
     the job (0 is its first), not the machine's indices. Uneven layouts are allowed.
 
+    With several nodes all of them are alike: the GPUs are split evenly and in order, and so are
+    the ids.
+
+    Attributes:
+      gmis_of_gpu: ids by GPU.
+      num_nodes: how many machines.
+
     Raises:
       ConfigError: no GPU, a GPU without a GMI, or ids that are not 0 .. K-1, each once.
     """
 
     gmis_of_gpu: tuple[tuple[int, ...], ...]
+    num_nodes: int = 1
 
     def __post_init__(self) -> None:
         if not self.gmis_of_gpu or any(not gmis for gmis in self.gmis_of_gpu):
@@ -27,6 +35,13 @@ class Layout:
         if ids != list(range(len(ids))):
             raise ConfigError(
                 f"plan.layout={self}: GMI ids must be 0 to {len(ids) - 1}, each exactly once"
+            )
+
+        sizes = {len(gmis) for gmis in self.gmis_of_node}
+        ids_of_nodes = [gmi for gmis in self.gmis_of_node for gmi in gmis]
+        if self.num_gpus % self.num_nodes or len(sizes) > 1 or ids_of_nodes != ids:
+            raise ConfigError(
+                f"plan.layout={self}: {self.num_nodes} nodes must be alike, with ids in order"
             )
 
     @classmethod
@@ -38,6 +53,16 @@ class Layout:
                 for gpu in range(num_gpus)
             )
         )
+
+    def on_nodes(self, num_nodes: int) -> Layout:
+        """The layout in which each of so many nodes has this one."""
+        step = self.num_gmis
+        rows = tuple(
+            tuple(gmi + node * step for gmi in gmis)
+            for node in range(num_nodes)
+            for gmis in self.gmis_of_gpu
+        )
+        return Layout(rows, num_nodes)
 
     def __str__(self) -> str:
         """As the user writes it: `[[0,1],[2]]`."""
@@ -65,3 +90,21 @@ class Layout:
     def neighbours_of(self, gmi: int) -> tuple[int, ...]:
         """All GMIs on the GPU of `gmi`, itself included."""
         return self.gmis_of_gpu[self.gpu_of(gmi)]
+
+    @property
+    def gmis_of_node(self) -> tuple[tuple[int, ...], ...]:
+        """GMI ids of every node in order; the place of an id is its rank in the node."""
+        each = self.num_gpus // self.num_nodes
+        nodes = (
+            self.gmis_of_gpu[node * each : (node + 1) * each] for node in range(self.num_nodes)
+        )
+        return tuple(tuple(sorted(gmi for gpu in gpus for gmi in gpu)) for gpus in nodes)
+
+    def node_of(self, gmi: int) -> int:
+        """Position of the node that holds `gmi`."""
+        return gmi * self.num_nodes // self.num_gmis
+
+    @property
+    def of_one_node(self) -> Layout:
+        """The layout that every node has by itself, with ids from 0."""
+        return Layout(self.gmis_of_gpu[: self.num_gpus // self.num_nodes])

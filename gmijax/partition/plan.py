@@ -58,6 +58,7 @@ class Plan:
         that is classes of the user's own.
       self_check: every GMI compares matrix products with float64 when it starts.
       selection: with `reduce.selection=measured` what the paper says and what was measured.
+      nodes: addresses of the nodes of the layout, in order; none in a job on one machine.
       may_share: where the daemons of `mps` cannot be started, the GMIs may take turns instead.
 
     Raises:
@@ -76,8 +77,11 @@ class Plan:
     self_check: bool = False
     may_share: bool = False
     selection: Mapping[str, Any] = field(default_factory=dict)
+    nodes: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
+        if self.layout.num_nodes != max(1, len(self.nodes)):
+            raise ConfigError(f"plan: nodes {self.nodes} do not match layout {self.layout}")
         if [s.gmi for s in self.slices] != list(self.layout.gmis):
             raise ConfigError(f"plan: slices {self.slices} do not match layout {self.layout}")
         if self.roles and len(self.roles) != self.layout.num_gmis:
@@ -96,13 +100,21 @@ class Plan:
         """Plain data for `plan.json`."""
         data = asdict(self)
         data["layout"] = [list(gmis) for gmis in self.layout.gmis_of_gpu]
+        data["nodes"] = self.nodes_data()
         return data
+
+    def nodes_data(self) -> list[dict[str, Any]]:
+        """Address and GMIs of every node; the place of a GMI in the list is its rank there."""
+        pairs = zip(self.nodes, self.layout.gmis_of_node, strict=False)
+        return [{"address": address, "gmis": list(gmis)} for address, gmis in pairs]
 
     @classmethod
     def from_dict(cls, data: Mapping[str, Any]) -> Plan:
         """Inverts `to_dict`, after a round trip through JSON too."""
         fields = dict(data)
-        fields["layout"] = Layout(tuple(tuple(gmis) for gmis in data["layout"]))
+        nodes = tuple(node["address"] for node in data.get("nodes", ()))
+        rows = tuple(tuple(gmis) for gmis in data["layout"])
+        fields["nodes"], fields["layout"] = nodes, Layout(rows, max(1, len(nodes)))
         fields["slices"] = tuple(
             Slice(**{**item, "cpus": tuple(item["cpus"])}) for item in data["slices"]
         )

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+import dataclasses
+from collections.abc import Collection, Mapping, Sequence
 
 from gmijax.config import BackendName, PlanConfig, ReduceConfig, TemplateName
+from gmijax.config.plan import MAX_GMIS
 from gmijax.errors import ConfigError
 from gmijax.machine.host_limits import require_room
 from gmijax.machine.nvidia import Gpu
@@ -18,6 +20,7 @@ from gmijax.partition.reduction import (
     require_strategy,
     select_strategy,
     why_not_intra,
+    why_not_strategy,
     why_not_under,
 )
 from gmijax.partition.shares import make_slices
@@ -37,11 +40,13 @@ def make_plan(
     *,
     template: TemplateName = "tcg_ex",
     trainers: Collection[int] = (),
+    nodes: Mapping[str, Machine] | None = None,
 ) -> Plan:
     """Decides everything that is `auto` and checks the rest against the machine.
 
     `num_envs` is N, environments per GMI; `template` what `plan.template=auto` means; `trainers`
-    are the ids of the GMIs that train, for the template `decoupled`.
+    are the ids of the GMIs that train, for the template `decoupled`. With `nodes`, machines by
+    address, each of them gets what `plan` says; `machine` is the first.
 
     Raises:
       BackendUnavailable: the wanted backend cannot be had on this machine.
@@ -55,6 +60,9 @@ def make_plan(
     gpus = choose_gpus(plan, layout, machine, backend, reasons) if backend != "cpu" else ()
     roles = roles_of(chosen, layout, trainers)
     slices = make_slices(plan, layout, gpus, backend, machine, roles, reasons)
+    if nodes is not None:
+        layout, slices = _on_nodes(plan, layout, backend, roles, nodes, reasons)
+        roles *= len(nodes)
     if plan.template == "auto":
         reasons.append(f"template {chosen}: {DESCRIPTIONS[chosen]}")
     strategy, intra = _reduction(reduce, layout, roles, backend, reasons)
@@ -70,6 +78,7 @@ def make_plan(
         reasons=tuple(reasons),
         self_check=_self_check(plan, slices, backend, machine),
         may_share=_may_share(plan, gpus, backend),
+        nodes=tuple(nodes or ()),
     )
 
 
@@ -88,6 +97,34 @@ def num_gmis_of(plan: PlanConfig) -> tuple[int, str]:
         raise ConfigError("plan.gmis_per_gpu=auto: not decided yet; expected an integer")
     gpus = f", plan.gpus={num_gpus}" if num_gpus > 1 else ""
     return num_gpus * each, f"plan.gmis_per_gpu={each}{gpus}"
+
+
+def _on_nodes(
+    plan: PlanConfig,
+    layout: Layout,
+    backend: BackendName,
+    roles: tuple[str, ...],
+    nodes: Mapping[str, Machine],
+    reasons: list[str],
+) -> tuple[Layout, tuple[Slice, ...]]:
+    """Layout and slices of all nodes; `layout` and `roles` are of each."""
+    if backend != "cpu":
+        raise ConfigError(
+            "cluster.engine=ray: GPUs of several nodes are not supported yet; plan.backend=cpu "
+            "goes on without them"
+        )
+    if (num_gmis := len(nodes) * layout.num_gmis) > MAX_GMIS:
+        raise ConfigError(
+            f"cluster.nodes={len(nodes)}: makes {num_gmis} GMIs; at most {MAX_GMIS} are allowed"
+        )
+    slices: list[Slice] = []
+    for place, machine in enumerate(nodes.values()):
+        require_host(*num_gmis_of(plan), plan, machine)
+        for share in make_slices(plan, layout, (), backend, machine, roles, []):
+            gmi, gpu = share.gmi + place * layout.num_gmis, share.gpu + place * layout.num_gpus
+            slices.append(dataclasses.replace(share, gmi=gmi, gpu=gpu))
+    reasons.append(f"nodes {', '.join(nodes)}: {layout.num_gmis} GMIs on each of {len(nodes)}")
+    return layout.on_nodes(len(nodes)), tuple(slices)
 
 
 def _layout(plan: PlanConfig) -> Layout:
@@ -158,7 +195,7 @@ def _strategy(
     paper, why = select_strategy(layout)
     no_ring = why_not_under(paper, layout, backend)
     if backend == "cpu" and needs_ring(paper, layout):
-        no_ring = _NO_RINGS_ON_CPU.format(paper)
+        no_ring = why_not_strategy(paper, layout) or _NO_RINGS_ON_CPU.format(paper)
     no_one_shot = why_not_under("one_shot", layout, backend)
     # With one GMI on each GPU one ring over all is as fast.
     wants_one_shot = no_ring is not None or not is_one_per_gpu(layout)

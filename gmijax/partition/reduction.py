@@ -34,8 +34,13 @@ class Choice(NamedTuple):
 def select_strategy(layout: Layout) -> Choice:
     """Algorithm 1 of the paper (section 4.1), exactly as printed.
 
-    It looks at the layout alone: how many GPUs, and how many GMIs each of them has.
+    It looks at the layout alone: how many GPUs, and how many GMIs each of them has. On several
+    nodes, of which the paper does not speak, it is the answer for one of them: between nodes
+    one leader of each exchanges, whatever they do inside.
     """
+    if layout.num_nodes > 1:
+        inside = select_strategy(layout.of_one_node)
+        return inside._replace(why=f"in every node {inside.why}; their leaders exchange")
     num_gpus = layout.num_gpus
     if num_gpus <= 1:
         return Choice("mpr", "all GMIs are on one GPU, so they average in host memory")
@@ -59,7 +64,19 @@ def select_strategy(layout: Layout) -> Choice:
 
 def why_not_strategy(strategy: str, layout: Layout) -> str | None:
     """None if `strategy` can run on `layout`, else the reason in words."""
+    if layout.num_nodes > 1 and strategy != "none":
+        return why_not_across_nodes(strategy)
     return STRATEGIES[strategy].why_not(layout)
+
+
+def why_not_across_nodes(strategy: str) -> str | None:
+    """None if `strategy` can be what each of several nodes does inside, else the reason."""
+    if strategy == "mpr":
+        return None
+    return (
+        "on several nodes exchanges go through host memory in each of them and sockets between "
+        "them; allowed are auto, mpr"
+    )
 
 
 def why_not_intra(intra: str, backend: str) -> str | None:

@@ -90,4 +90,7 @@ def group_of(layout: Layout, roles: Iterable[str], role: str) -> Group | None:
     ranks = (
         tuple(rank for rank, gmi in enumerate(gmis) if gmi in here) for here in layout.gmis_of_gpu
     )
-    return Group(gmis, Layout(tuple(here for here in ranks if here)))
+    gpus = tuple(here for here in ranks if here)
+    # Where all GPUs take part, so do all nodes; other templates are of one machine.
+    is_whole = len(gpus) == layout.num_gpus
+    return Group(gmis, Layout(gpus, layout.num_nodes if is_whole else 1))

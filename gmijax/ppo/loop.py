@@ -14,9 +14,10 @@ from pathlib import Path
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
-from gmijax.collectives.interface import Reducer
+from gmijax.collectives.interface import Reducer, TracedStep
 from gmijax.config import PpoConfig, TrainConfig
 from gmijax.devices import describe_device
 from gmijax.errors import CollectiveError
@@ -28,6 +29,7 @@ from gmijax.learning.checkpoint import (
     save_envs,
     save_learner,
 )
+from gmijax.learning.evaluator import Evaluation, Evaluator, evaluation_worlds
 from gmijax.learning.learner import TrainState, make_learner
 from gmijax.learning.report_thread import ReportThread
 from gmijax.learning.start import first_envs, first_state
@@ -36,6 +38,7 @@ from gmijax.learning.training_log import Learnt, TrainingLog
 from gmijax.ppo.ppo import IterationMetrics, iterate
 from gmijax.ppo.tdg_ex import RemoteIteration, RolloutWorkers
 from gmijax.runs.folder import write_json
+from gmijax.runs.resume import best_evaluation
 from gmijax.sim.wrappers import BatchedEnv
 from gmijax.supervise.child import ChildLink
 
@@ -65,6 +68,7 @@ class TrainingLoop:
         self._reducer = reducer
         self._link = link
         self._leader = reducer.rank == 0
+        self._warms_up = config.algo.warmup_unroll and config.run.resume is None
         self._learner = make_learner(env.spec, config.algo)
         self._remote: RemoteIteration | None = None
         num_simulating = reducer.world_size
@@ -80,6 +84,10 @@ class TrainingLoop:
         # Who has no environments cannot measure how fast they are.
         if config.run.measure_throughput and self._remote is None:
             self._meter = ThroughputMeter(env, self._learner, config, reducer)
+        self._evaluator: Evaluator | None = None
+        if config.eval.every is not None:
+            worlds = evaluation_worlds(config, reducer.rank, reducer.world_size)
+            self._evaluator = Evaluator(worlds, self._learner, config, reducer)
         self._env_steps = 0
         self._iterations = 0
         self._checkpoint: Path | None = None
@@ -97,15 +105,20 @@ class TrainingLoop:
         """
         started = time.monotonic()
         state, self._env_steps = first_state(self._learner, self._env.spec.obs_size, self._config)
+        if self._evaluator is not None:
+            self._evaluator.best = best_evaluation(self._link.run.root, self._env_steps)
         env_state = self._first_envs()
         waited_s = self._compile(state, env_state)
         compile_s = time.monotonic() - started - waited_s
         self._link.beat("ready", 0)
         self._meet()  # Everybody has compiled: the clock may start.
+        if self._warms_up:
+            state, env_state = warm_up(self._iteration, state, env_state)
         log = self._open_log()
         first_steps, started = self._env_steps, time.monotonic()
         state, env_state, stopped = self._train(state, env_state, log)
-        wall_s = time.monotonic() - started
+        eval_s = 0.0 if self._evaluator is None else self._evaluator.wall_s
+        wall_s = time.monotonic() - started - eval_s
         done = {
             "status": "stopped" if stopped else "completed",
             "env_steps": self._env_steps,
@@ -144,10 +157,14 @@ class TrainingLoop:
         self._iteration.trace(self._env.model, state, env_state)
         if self._meter is not None:
             self._meter.trace(state, env_state)
+        if self._evaluator is not None:
+            self._evaluator.trace(state)
         waited_s = self._link.begin_compiling()
         self._iteration.compile()
         if self._meter is not None:
             self._meter.compile()
+        if self._evaluator is not None:
+            self._evaluator.compile()
         return waited_s
 
     def _open_log(self) -> TrainingLog:
@@ -177,20 +194,36 @@ class TrainingLoop:
         self, state: TrainState, env_state: Any, thread: ReportThread, log: TrainingLog
     ) -> tuple[TrainState, Any, bool]:
         every = self._config.run.checkpoint_every
-        stop = False
+        stop, evaluation = False, None
         while self._env_steps < self._config.num_timesteps and not stop:
             state, env_state, metrics = self._iteration(state, env_state)
             self._env_steps += self._steps_per_iteration
             self._iterations += 1
-            thread.report(self._env_steps, metrics, self._times())
+            evaluation = self._evaluate(state)
+            thread.report(self._env_steps, metrics, self._times(), evaluation)
             # Counted from the run's start, so that it says the same after a restart.
             self._link.beat("running", self._env_steps // self._steps_per_iteration)
             stop = self._agree_to_stop()
             is_last = stop or self._env_steps >= self._config.num_timesteps
-            if not is_last and every and self._iterations % every == 0:
-                self._save(state, env_state, thread, log)
-        self._save(state, env_state, thread, log)
+            is_due = every and self._iterations % every == 0
+            if not is_last and (is_due or (evaluation is not None and evaluation.is_best)):
+                self._save(state, env_state, thread, log, evaluation)
+        self._save(state, env_state, thread, log, evaluation)
         return state, env_state, stop
+
+    def _evaluate(self, state: TrainState) -> Evaluation | None:
+        """Evaluates if it is time to, in the same iteration on all GMIs."""
+        env_steps, before = self._env_steps, self._env_steps - self._steps_per_iteration
+        is_end = env_steps >= self._config.num_timesteps
+        if self._evaluator is None or not (is_end or self._evaluator.is_due(env_steps, before)):
+            return None
+        self._iteration.wait()  # The time of its line.
+        iteration = env_steps // self._steps_per_iteration
+        return self._evaluator.run(
+            state,
+            lambda: self._link.beat("running", iteration),
+            lambda: self._link.stop_requested,
+        )
 
     def _times(self) -> dict[str, float]:
         """Seconds of parts of an iteration, where they are known."""
@@ -206,7 +239,12 @@ class TrainingLoop:
         return bool(self._reducer.all_gather(mine).any())
 
     def _save(
-        self, state: TrainState, env_state: Any, thread: ReportThread, log: TrainingLog
+        self,
+        state: TrainState,
+        env_state: Any,
+        thread: ReportThread,
+        log: TrainingLog,
+        evaluation: Evaluation | None,
     ) -> None:
         self._iteration.wait()
         thread.wait()  # A resumed run goes on from the lines up to its checkpoint.
@@ -219,7 +257,9 @@ class TrainingLoop:
             save_learner(run, steps, state)
         self._meet()
         if self._leader:
-            meta = checkpoint_meta(config, steps, self._reducer.world_size, log.last_return)
+            num_gmis, returns = self._reducer.world_size, log.last_return
+            evaluated = None if evaluation is None else evaluation.mean_return
+            meta = checkpoint_meta(config, steps, num_gmis, returns, evaluated)
             finish_checkpoint(run, meta, config.run.keep_checkpoints)
         self._meet()  # Nobody may look for the folder before it has its name.
         self._checkpoint = run.checkpoint(steps)
@@ -234,13 +274,42 @@ class TrainingLoop:
         return self._steps_per_iteration / statistics.median(steady) if steady else None
 
 
+def warm_up(iteration: TracedStep, state: TrainState, env_state: Any) -> tuple[TrainState, Any]:
+    """Makes an iteration of which only the statistics of observations and targets are kept.
+
+    Both arguments are donated.
+
+    Returns:
+      `state` with these statistics, and the environments where the iteration has left them.
+    """
+    first = jax.tree.map(jnp.copy, state)
+    after, env_state, _ = iteration(state, env_state)
+    iteration.wait()
+    warm = first._replace(obs_moments=after.obs_moments, value_moments=after.value_moments)
+    return warm, env_state
+
+
 def report(
-    log: TrainingLog, env_steps: int, metrics: IterationMetrics, times: Mapping[str, float]
+    log: TrainingLog,
+    env_steps: int,
+    metrics: IterationMetrics,
+    times: Mapping[str, float],
+    evaluation: Evaluation | None = None,
 ) -> None:
     """Waits for the iteration that ended at `env_steps` and writes its line.
 
     `times` are seconds by name, written as they are. Raises as `TrainingLog.write`.
     """
     host: Any = jax.tree.map(float, jax.device_get(metrics))
-    learnt = Learnt(host.losses._asdict(), host.learning_rate, host.rates, host.noise_std)
-    log.write(env_steps, host.counts, learnt, times)
+    learnt = Learnt(host.losses._asdict(), host.figures, host.rates)
+    if evaluation is None:
+        log.write(env_steps, host.counts, learnt, times)
+        return
+    log.write(
+        env_steps,
+        host.counts,
+        learnt,
+        {**times, **evaluation.metrics},
+        now_s=evaluation.started_s,
+        paused_s=evaluation.wall_s,
+    )

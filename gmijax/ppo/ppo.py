@@ -1,4 +1,4 @@
-"""PPO from top to bottom: rollout, advantages, losses, updates, iteration (arXiv:1707.06347).
+"""PPO from a rollout to new weights: losses, updates, iteration (arXiv:1707.06347).
 
 These are pure functions. `iterate` is one program of each GMI, in which it exchanges numbers with
 its peers. Programs hold nothing that depends on a GMI's rank, so that all GMIs share one entry of
@@ -7,90 +7,29 @@ the compilation cache.
 
 from __future__ import annotations
 
-from functools import partial
-from typing import NamedTuple, TypeAlias
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 
 from gmijax.collectives.interface import Peers
 from gmijax.config import PpoConfig
-from gmijax.learning.learner import (
-    ActingWeights,
-    Learner,
-    TrainState,
-    acting_weights,
-    rate_figures,
-)
-from gmijax.learning.normalize import (
-    Moments,
-    merge,
-    merge_all,
-    moments_of,
-    no_samples,
-    normalize,
-    std_of,
-    without_outliers,
-)
-from gmijax.learning.policy import ActorCritic, ActorCriticParams, entropy, kl_divergence, log_prob
-from gmijax.learning.unroll import Counts, Outcome, act, count, no_counts, outcome_of, unroll
+from gmijax.learning.learner import TrainState, acting_weights, policy_figures, rate_figures
+from gmijax.learning.normalize import Moments, in_units, merge, std_of
+from gmijax.learning.policy import ActorCritic, ActorCriticParams
+from gmijax.learning.unroll import Counts
 from gmijax.learning.updates import (
     bound_loss,
     clipped_surrogate,
+    explained_variance,
+    mean_of_states,
     minibatch_order,
     run_updates,
+    saturated_fraction,
 )
-from gmijax.sim.interface import EnvSpec
-from gmijax.sim.wrappers import BatchedEnv, BatchState, StepOutput
+from gmijax.ppo.rollout import PpoLearner, RolloutStats, Samples, flatten, merge_stats, rollout
+from gmijax.sim.wrappers import BatchedEnv, BatchState
 from gmijax.types import Array, PyTree
-
-PpoLearner: TypeAlias = Learner[PpoConfig]
-
-
-class Transition(NamedTuple):
-    """One step of all environments; leading axis [N], or [T, N] of a rollout."""
-
-    obs: Array
-    action: Array
-    mean: Array
-    reward: Array
-    next_obs: Array
-    terminated: Array
-    truncated: Array
-
-
-class Samples(NamedTuple):
-    """Inputs of the loss, for every step; leading axes are [T, N], [T * N] or [B].
-
-    Attributes:
-      obs: [..., O], normalised as the policy saw it.
-      action: [..., A], before clipping.
-      log_prob: [...], of the action when it was drawn.
-      mean: [..., A], of the policy when the action was drawn.
-      value: [...], estimate when the action was drawn.
-      advantage: [...], not normalised.
-    """
-
-    obs: Array
-    action: Array
-    log_prob: Array
-    mean: Array
-    value: Array
-    advantage: Array
-
-
-class RolloutStats(NamedTuple):
-    """Statistics of a rollout that GMIs exchange; see `merge_stats`.
-
-    Attributes:
-      obs: moments of the raw observations, [O].
-      advantage: moments of the advantages, [].
-      counts: sums over all steps.
-    """
-
-    obs: Moments
-    advantage: Moments
-    counts: Counts
 
 
 class UpdateContext(NamedTuple):
@@ -100,21 +39,35 @@ class UpdateContext(NamedTuple):
       advantage_mean: [] over all samples of all GMIs (0 where not normalised).
       advantage_std: [] likewise (1 where not normalised).
       old_log_std: [A] of the policy that made the rollout.
+      value_moments: see `TrainState`.
     """
 
     advantage_mean: Array
     advantage_std: Array
     old_log_std: Array
+    value_moments: Moments | None = None
 
 
 class PpoLosses(NamedTuple):
-    """Means over a minibatch, [] float32 each."""
+    """Means over a minibatch, [] float32 each.
+
+    Attributes:
+      policy_loss: minus the clipped surrogate.
+      value_loss: half the squared error of the values, clipped if that is wanted.
+      entropy: of the policy, in nats.
+      kl: divergence of the policy from the one that made the rollout, in nats.
+      clip_fraction: share of samples whose probability ratio is beyond the clip range.
+      value_clip_fraction: share of samples whose value has moved beyond the clip range.
+      saturated_fraction: see the function of this name.
+    """
 
     policy_loss: Array
     value_loss: Array
     entropy: Array
     kl: Array
     clip_fraction: Array
+    value_clip_fraction: Array
+    saturated_fraction: Array
 
     @property
     def steering_kl(self) -> Array:
@@ -131,107 +84,14 @@ class IterationMetrics(NamedTuple):
     Attributes:
       counts: sums over all steps.
       losses: means over all minibatches of the iteration.
-      learning_rate: after the last update.
-      rates: of all updates, see `rate_figures`.
-      noise_std: mean standard deviation of the policy.
+      figures: others by the names that they are logged under.
+      rates: of the learning rates of all updates, see `rate_figures`.
     """
 
     counts: Counts
     losses: PpoLosses
-    learning_rate: Array
+    figures: dict[str, Array]
     rates: dict[str, Array]
-    noise_std: Array
-
-
-def rollout(
-    env: BatchedEnv,
-    learner: PpoLearner,
-    model: PyTree,
-    weights: ActingWeights,
-    env_state: BatchState,
-) -> tuple[BatchState, Samples, RolloutStats]:
-    """Runs T steps; the environments' state, samples [T, N], and this GMI's statistics."""
-
-    def keep(
-        before: BatchState, mean: Array, action: Array, out: StepOutput
-    ) -> tuple[Transition, Outcome]:
-        step = out.reward, out.next_obs, out.terminated, out.truncated
-        return Transition(before.env.obs, action, mean, *step), outcome_of(out)
-
-    choose, length = partial(act, learner.networks, weights), learner.config.unroll_length
-    env_state, (steps, outcomes) = unroll(env, choose, length, keep, model, env_state)
-    samples = _with_advantages(learner, weights, steps)
-    stats = RolloutStats(
-        obs=moments_of(without_outliers(weights.moments, steps.obs), 2),
-        advantage=moments_of(samples.advantage, 2),
-        counts=count(steps.reward, outcomes),
-    )
-    return env_state, samples, stats
-
-
-def _with_advantages(learner: PpoLearner, weights: ActingWeights, steps: Transition) -> Samples:
-    networks, config, (params, moments) = learner.networks, learner.config, weights
-    obs = normalize(moments, steps.obs)
-    values = networks.state_value(params, obs)
-    # V(s_{t+1}) is V of the next row, except where an episode ended and the next row is the
-    # first observation of another one; a second pass over all rows is simple and cheap.
-    next_values = networks.state_value(params, normalize(moments, steps.next_obs))
-    advantage = gae(
-        config.reward_scaling * steps.reward,
-        values,
-        next_values,
-        steps.terminated.astype(jnp.float32),
-        steps.truncated.astype(jnp.float32),
-        discount=config.discounting,
-        lam=config.gae_lambda,
-    )
-    logs = log_prob(steps.mean, params.log_std, steps.action)
-    return Samples(obs, steps.action, logs, steps.mean, values, advantage)
-
-
-def gae(
-    rewards: Array,
-    values: Array,
-    next_values: Array,
-    terminated: Array,
-    truncated: Array,
-    *,
-    discount: float,
-    lam: float,
-) -> Array:
-    """Advantages [T, N]; all arrays are [T, N] (Schulman et al. 2016, arXiv:1506.02438).
-
-        delta_t = r_t + discount * (1 - terminated_t) * V(s_{t+1}) - V(s_t)
-        A_t     = delta_t + discount * lam * (1 - ended_t) * A_{t+1}
-
-    `next_values[t]` is V(s_{t+1}) before any auto-reset: a truncated step bootstraps from it, a
-    terminated one does not, and neither lets the next episode's advantages through.
-    """
-    deltas = rewards + discount * (1.0 - terminated) * next_values - values
-    decay = discount * lam * (1.0 - jnp.maximum(terminated, truncated))
-
-    def back(later: Array, step: tuple[Array, Array]) -> tuple[Array, Array]:
-        delta, factor = step
-        advantage = delta + factor * later
-        return advantage, advantage
-
-    return jax.lax.scan(back, jnp.zeros_like(deltas[0]), (deltas, decay), reverse=True)[1]
-
-
-def flatten(samples: Samples) -> Samples:
-    """[T, N, ...] to [T * N, ...]."""
-    return jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), samples)
-
-
-def merge_stats(stacked: RolloutStats) -> RolloutStats:
-    """Statistics of all GMIs together; every leaf of `stacked` has a leading axis [K]."""
-    counts = jax.tree.map(lambda x: jnp.sum(x, axis=0), stacked.counts)
-    return RolloutStats(merge_all(stacked.obs), merge_all(stacked.advantage), counts)
-
-
-def no_stats(spec: EnvSpec, overflows: tuple[str, ...] = ()) -> RolloutStats:
-    """Zeros in the structure of `RolloutStats`."""
-    return RolloutStats(no_samples((spec.obs_size,)), no_samples(()), no_counts(spec, overflows))
 
 
 def ppo_loss(
@@ -245,29 +105,47 @@ def ppo_loss(
 
     The minibatch mean is plain: the mean over GMIs of equal minibatches is the mean over all.
     """
-    mean = networks.action_mean(params, samples.obs)
+    output, distribution = networks.output(params, samples.obs), networks.distribution
+    mode = distribution.mode(output)
     advantage = (samples.advantage - context.advantage_mean) / context.advantage_std
-    ratio = jnp.exp(log_prob(mean, params.log_std, samples.action) - samples.log_prob)
+    logs = distribution.log_prob(output, params.log_std, samples.action)
+    ratio = jnp.exp(logs - samples.log_prob)
     policy_loss = -jnp.mean(clipped_surrogate(ratio, advantage, config.clipping_epsilon))
-    value_loss = _value_loss(networks.state_value(params, samples.obs), samples, config)
-    bonus = entropy(params.log_std)
+    value = networks.state_value(params, samples.obs)
+    old, target = samples.value, samples.value + samples.advantage
+    if context.value_moments is not None:
+        old, target = (in_units(context.value_moments, x) for x in (old, target))
+    value_loss = _value_loss(value, old, target, config)
+    bonus = mean_of_states(distribution.entropy(output, params.log_std))
     loss = (
         policy_loss
         + config.value_cost * value_loss
         - config.entropy_cost * bonus
-        + config.bound_cost * jnp.mean(bound_loss(mean))
+        + config.bound_cost * jnp.mean(bound_loss(mode))
     )
-    kl = jnp.mean(kl_divergence(samples.mean, context.old_log_std, mean, params.log_std))
-    outside = jnp.mean((jnp.abs(ratio - 1.0) > config.clipping_epsilon).astype(jnp.float32))
-    return loss, PpoLosses(policy_loss, value_loss, bonus, kl, outside)
+    kl = jnp.mean(
+        distribution.kl_divergence(samples.output, context.old_log_std, output, params.log_std)
+    )
+    return loss, PpoLosses(
+        policy_loss,
+        value_loss,
+        bonus,
+        kl,
+        clip_fraction=_share(jnp.abs(ratio - 1.0) > config.clipping_epsilon),
+        value_clip_fraction=_share(jnp.abs(value - old) > config.clipping_epsilon),
+        saturated_fraction=jnp.mean(saturated_fraction(mode)),
+    )
 
 
-def _value_loss(value: Array, samples: Samples, config: PpoConfig) -> Array:
-    target = samples.value + samples.advantage
+def _share(where: Array) -> Array:
+    return jnp.mean(where.astype(jnp.float32))
+
+
+def _value_loss(value: Array, old: Array, target: Array, config: PpoConfig) -> Array:
     error = (value - target) ** 2
     if config.clip_value_loss:
-        step = jnp.clip(value - samples.value, -config.clipping_epsilon, config.clipping_epsilon)
-        error = jnp.maximum(error, (samples.value + step - target) ** 2)
+        step = jnp.clip(value - old, -config.clipping_epsilon, config.clipping_epsilon)
+        error = jnp.maximum(error, (old + step - target) ** 2)
     return 0.5 * jnp.mean(error)
 
 
@@ -290,7 +168,7 @@ def update_context(learner: PpoLearner, state: TrainState, stats: RolloutStats) 
     mean, std = stats.advantage.mean, std_of(stats.advantage)
     if not learner.config.normalize_advantage:
         mean, std = jnp.zeros(()), jnp.ones(())
-    return UpdateContext(mean, std, state.params.log_std)
+    return UpdateContext(mean, std, state.params.log_std, state.value_moments)
 
 
 def learn(
@@ -303,6 +181,8 @@ def learn(
     """All updates of an iteration, on flat samples and this GMI's statistics."""
     everyone = peers.gather(stats)
     stats = merge_stats(everyone)
+    if state.value_moments is not None:
+        state = state._replace(value_moments=merge(state.value_moments, stats.target))
     context = update_context(learner, state, stats)
     order = minibatch_order(learner.config, state, peers.rank(), samples.advantage.shape[0])
     state, losses, rates = run_updates(
@@ -324,9 +204,12 @@ def finish(
     state = state._replace(
         obs_moments=merge(state.obs_moments, stats.obs), iteration=state.iteration + 1
     )
-    std = jnp.mean(jnp.exp(state.params.log_std))
-    figures = rate_figures(learner.config, rates)
-    return state, IterationMetrics(stats.counts, losses, state.learning_rate, figures, std)
+    figures = {
+        **policy_figures(state),
+        "value/explained_variance": explained_variance(stats.target, stats.advantage),
+    }
+    spread = rate_figures(learner.config, rates)
+    return state, IterationMetrics(stats.counts, losses, figures, spread)
 
 
 def iterate(

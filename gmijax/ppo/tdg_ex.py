@@ -26,16 +26,8 @@ from gmijax.learning.learner import (
     init_learner,
     pack_weights,
 )
-from gmijax.ppo.ppo import (
-    IterationMetrics,
-    PpoLearner,
-    Samples,
-    flatten,
-    learn,
-    merge_stats,
-    no_stats,
-    rollout,
-)
+from gmijax.ppo.ppo import IterationMetrics, learn
+from gmijax.ppo.rollout import PpoLearner, Samples, flatten, merge_stats, no_stats, rollout
 from gmijax.sim.wrappers import BatchedEnv, BatchState
 from gmijax.supervise.heartbeat import GmiState
 from gmijax.types import Array, PyTree

@@ -1,10 +1,12 @@
 """Every file name of a run folder, and how files in it are written. No jax here.
 
 `<run>/config.json plan.json summary.json metrics.jsonl events.jsonl returns.png tensorboard/`
+`<run>/git.json git.diff`
 `<run>/checkpoints/<12-digit env steps>/meta.json`
 `<run>/gmi_<id>/{stdout.log,stderr.log,error.json,result.json,metrics.jsonl}`
 `<run>/gmi_<id>/attempt_<n>/`: the same files of attempts that failed
 `<run>/play/<12-digit env steps>/`: a played checkpoint, see `PlayPaths`
+`<run>/export/<12-digit env steps>/`: an exported policy, see `ExportPaths`
 """
 
 from __future__ import annotations
@@ -82,6 +84,10 @@ class RunPaths(_Folder):
         self.mps = root / "mps"  # Logs of MPS daemons that the job starts.
         self.janitor_log = root / "janitor.log"  # Errors of the janitor; gone without any.
         self.lock = root / ".lock"  # Held by the job that writes into the folder.
+        self.git = root / "git.json"  # Commit and branch of the user's code.
+        self.git_diff = root / "git.diff"  # Its changes since that commit.
+        self.wandb = root / "wandb.json"  # Its run at Weights & Biases, and how far that is.
+        self.wandb_log = root / "wandb.log"  # Errors of sending to it; gone without any.
         self.events = root / "events.jsonl"  # Starts, faults and restarts of the job.
         self.search_report = root / "search.json"
         self.search_png = root / "search.png"
@@ -97,6 +103,10 @@ class RunPaths(_Folder):
     def gmi(self, gmi: int) -> GmiPaths:
         """Files of one GMI."""
         return GmiPaths(self.root / f"gmi_{gmi}")
+
+    def node(self, node: int) -> RunPaths:
+        """Logs of what one of several nodes starts beside its GMIs."""
+        return RunPaths(self.root / f"node_{node}")
 
 
 class PlayPaths(_Folder):
@@ -118,6 +128,16 @@ class PlayPaths(_Folder):
         """All files that a new evaluation replaces."""
         watched = self.mp4, self.gif, self.html
         return self.returns, self.trajectory, self.model, *watched, self.render_log, self.page_log
+
+
+class ExportPaths(_Folder):
+    """Files of one exported policy; its folder also has the files of a run with one GMI."""
+
+    def __init__(self, root: Path) -> None:
+        super().__init__(root)
+        self.onnx = root / "policy.onnx"
+        self.stablehlo = root / "policy.stablehlo"
+        self.metadata = root / "policy.json"  # Written last.
 
 
 def create_run(
@@ -168,21 +188,34 @@ def locked(lock: Path, what: str) -> Iterator[None]:
     Raises:
       ConfigError: another job holds it, or it cannot be locked.
     """
-    # A file: network file systems lock no folders, and files only if they are open for writing.
     try:
-        fd = os.open(lock, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o644)
+        fd = try_lock(lock)
     except OSError as error:
-        raise ConfigError(f"{what}: {error.strerror}") from None
+        raise ConfigError(f"{what}: cannot be locked ({error.strerror})") from None
+    if fd is None:
+        raise ConfigError(f"{what}: another job writes into this folder now")
     try:
-        try:
-            fcntl.flock(fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            raise ConfigError(f"{what}: another job writes into this folder now") from None
-        except OSError as error:
-            raise ConfigError(f"{lock}: cannot be locked ({error.strerror})") from None
         yield
     finally:
         os.close(fd)
+
+
+def try_lock(lock: Path) -> int | None:
+    """A descriptor that holds a lock until it is closed; None: another process holds it.
+
+    Raises:
+      OSError: it cannot be locked.
+    """
+    # A file: network file systems lock no folders, and files only if they are open for writing.
+    fd = os.open(lock, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o644)
+    try:
+        fcntl.flock(fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except OSError as error:
+        os.close(fd)
+        if isinstance(error, BlockingIOError):
+            return None
+        raise
+    return fd
 
 
 def is_locked(lock: Path) -> bool:
@@ -190,10 +223,12 @@ def is_locked(lock: Path) -> bool:
     if not lock.exists():
         return False
     try:
-        with locked(lock, str(lock)):
-            return False
-    except ConfigError:
-        return True
+        fd = try_lock(lock)
+    except OSError:
+        return False  # Whoever wants it is told why it cannot be had.
+    if fd is not None:
+        os.close(fd)
+    return fd is None
 
 
 def write_json(path: Path, data: Mapping[str, Any]) -> None:
@@ -202,6 +237,11 @@ def write_json(path: Path, data: Mapping[str, Any]) -> None:
 
 
 def write_text(path: Path, text: str) -> None:
+    """Writes a text as `write_bytes` does."""
+    write_bytes(path, text.encode())
+
+
+def write_bytes(path: Path, content: bytes) -> None:
     """Writes a file so that a reader sees the old one or the new one, never half a file.
 
     Also after a loss of power: its content is on the disk before its name is.
@@ -209,8 +249,8 @@ def write_text(path: Path, text: str) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
     temporary = path.with_name(f".{path.name}.{os.getpid()}-{threading.get_ident()}")
     try:
-        with temporary.open("w") as file:
-            file.write(text)
+        with temporary.open("wb") as file:
+            file.write(content)
             file.flush()
             os.fsync(file.fileno())
         os.replace(temporary, path)
@@ -220,7 +260,7 @@ def write_text(path: Path, text: str) -> None:
 
 
 def remove_temporary(folder: Path) -> None:
-    """Removes what processes left in a folder that were killed within `write_text`."""
+    """Removes what processes left in a folder that were killed within `write_bytes`."""
     for path in folder.glob(".*"):
         if _TEMPORARY.fullmatch(path.name):
             path.unlink(missing_ok=True)

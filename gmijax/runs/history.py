@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -52,10 +52,26 @@ class MetricsReader:
         return [json.loads(line) for line in complete.splitlines()]
 
 
+def scalars(line: Mapping[str, float | int | None]) -> dict[str, float]:
+    """The numbers of a line by the names of their curves; `env_steps` is the x axis."""
+    return {
+        name if "/" in name else f"train/{name}": float(value)
+        for name, value in line.items()
+        if value is not None and name != "env_steps"
+    }
+
+
 def draw_returns(metrics: Path, picture: Path, title: str) -> bool:
-    """Draws mean episode return over environment steps; False where no episode has ended."""
-    lines = [line for line in read_metrics(metrics) if line.get("return") is not None]
-    if not lines:
+    """Draws mean episode return over environment steps, with that of evaluations if there are any.
+
+    False where no episode has ended.
+    """
+    lines = read_metrics(metrics)
+    training, evaluations = (
+        [(line["env_steps"], line[key]) for line in lines if line.get(key) is not None]
+        for key in ("return", "eval/return")
+    )
+    if not training and not evaluations:
         return False
     # Imported here: it costs half a second that no other use of this module should pay.
     from matplotlib.backends.backend_agg import FigureCanvasAgg
@@ -64,7 +80,10 @@ def draw_returns(metrics: Path, picture: Path, title: str) -> bool:
     figure = Figure(figsize=(7, 4), layout="constrained")
     FigureCanvasAgg(figure)
     axes = figure.add_subplot()
-    axes.plot([x["env_steps"] for x in lines], [x["return"] for x in lines])
+    axes.plot(*zip(*training, strict=True), label="training")
+    if evaluations:
+        axes.plot(*zip(*evaluations, strict=True), marker="o", label="evaluation")
+        axes.legend(fontsize="small")
     axes.set(title=title, xlabel="environment steps", ylabel="mean episode return")
     axes.grid(alpha=0.3)
     figure.savefig(picture, dpi=120)

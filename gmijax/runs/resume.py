@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 import zlib
 from collections.abc import Mapping
@@ -31,6 +32,8 @@ class CheckpointMeta:
     impl: str  # Physics implementation; environment states of one cannot be used by the other.
     # Of the latest episodes before it, None while none had ended.
     mean_return: float | None = None
+    # Of the evaluation at `env_steps`, None if there was none.
+    eval_return: float | None = None
     # Size in bytes and CRC-32 of every other file, by its path in the checkpoint; empty in
     # those of older versions.
     files: Mapping[str, tuple[int, ...]] = field(default_factory=dict)
@@ -68,6 +71,37 @@ def newest_checkpoint(folder: Path) -> Found:
             return Found(path.parent.resolve(), tuple(passed_over))
         passed_over.append(f"checkpoint {path.parent}: passed over, {wrong}")
     return Found(None, tuple(passed_over))
+
+
+def best_checkpoint(folder: Path) -> Path | None:
+    """The best checkpoint of a run folder, by `rank_of`, whose files are as they were written."""
+    found = sorted(meta.parent for meta in folder.glob(f"checkpoints/[0-9]*/{META}"))
+    ranked = sorted(reversed(found), key=rank_of, reverse=True)
+    return next((path.resolve() for path in ranked if what_is_broken(path) is None), None)
+
+
+def best_evaluation(folder: Path, env_steps: int) -> float:
+    """The best mean return of the evaluations of a run folder up to `env_steps`, -inf for none.
+
+    Of those that have a checkpoint, and the best one always has.
+    """
+    metas = folder.glob(f"checkpoints/[0-9]*/{META}")
+    found = (rank_of(meta.parent) for meta in metas if int(meta.parent.name) <= env_steps)
+    return max((mean for is_evaluated, mean in found if is_evaluated), default=-math.inf)
+
+
+def rank_of(checkpoint: Path) -> tuple[bool, float]:
+    """What checkpoints are ranked by, the best one has the largest.
+
+    Its evaluation; one without comes after all that have one, by its mean return in training.
+    """
+    try:
+        meta = CheckpointMeta.read(checkpoint)
+    except ConfigError:
+        return False, -math.inf
+    if meta.eval_return is not None:
+        return True, meta.eval_return
+    return False, -math.inf if meta.mean_return is None else meta.mean_return
 
 
 def what_is_broken(checkpoint: Path) -> str | None:

@@ -29,6 +29,10 @@ class EnvSpec(NamedTuple):
       max_abs_obs: an observation beyond this tells that the physics diverges; the world is ended
         (see `gmijax.sim.divergence`).
       metrics: names of the numbers that judge an episode beside its return, such as successes.
+      obs_terms: parts of an observation in order, name and length each; they go into exported
+        policies. Empty where nobody says.
+      actor_obs_size: the policy sees the first so many numbers of an observation, the value
+        function all of them (an asymmetric actor-critic); None: both see all.
     """
 
     name: str
@@ -39,6 +43,8 @@ class EnvSpec(NamedTuple):
     reward_terms: tuple[str, ...]
     max_abs_obs: float = 1e5
     metrics: tuple[str, ...] = ()
+    obs_terms: tuple[tuple[str, int], ...] = ()
+    actor_obs_size: int | None = None
 
 
 class EnvState(NamedTuple):
@@ -86,6 +92,10 @@ class Env(NamedTuple):
         if nothing can overflow.
       model_axes: `in_axes` of `model` for `vmap` over worlds: None if they share it, else a tree
         with 0 at the leaves that have a leading axis [N] (see `gmijax.sim.randomize`).
+      next_episode: `(model, ended EnvState) -> EnvState`, the episode that follows one of the same
+        world, for tasks that carry something on in `task`, such as the level of a curriculum.
+        None: `reset(model, ended.key)`. Of a world that diverged `task` is that of one step
+        earlier.
     """
 
     spec: EnvSpec
@@ -97,3 +107,4 @@ class Env(NamedTuple):
     max_envs: int | None = None
     overflow: Callable[[EnvState], Array] | None = None
     model_axes: PyTree = None
+    next_episode: Callable[[PyTree, EnvState], EnvState] | None = None

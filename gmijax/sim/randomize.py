@@ -10,7 +10,7 @@ from __future__ import annotations
 import copy
 import zlib
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -22,14 +22,18 @@ from mujoco import mjx
 from gmijax.config import EnvConfig
 from gmijax.config.env import NEVER_ZERO, RANDOMIZED_LEAVES, LeafRange
 from gmijax.errors import ConfigError
-from gmijax.sim.interface import Env
+from gmijax.sim.interaction import action_repeat, observation_history
+from gmijax.sim.interface import Env, EnvState
 from gmijax.sim.registry import make_env
 from gmijax.sim.wrappers import env_keys
-from gmijax.types import PRNGKey
+from gmijax.types import Array, PRNGKey, PyTree
 
 Floats = npt.NDArray[np.float32]
 Ids = npt.NDArray[np.intp]
 Leaves = dict[str, Floats]
+
+POOL = 1024
+"""Models of which `env.randomize=episode` takes one for every episode."""
 
 _STREAM = zlib.crc32(b"domain randomisation")
 """Folded into the job's key. Small numbers are taken: `split` hands out what they would give."""
@@ -41,7 +45,7 @@ _CONSTANTS = ("body_subtreemass", "body_invweight0", "dof_invweight0", "tendon_i
 
 
 def make_worlds(config: EnvConfig, impl: str, *, seed: int, first_env: int, num_envs: int) -> Env:
-    """The task, its worlds randomised where the configuration says so.
+    """The task with what the configuration puts around it, its worlds randomised if it says so.
 
     Args:
       config: task and randomisation.
@@ -57,10 +61,16 @@ def make_worlds(config: EnvConfig, impl: str, *, seed: int, first_env: int, num_
         episode_length=config.episode_length,
         max_envs=num_envs,
         source_sha256=config.source_sha256,
+        rewards=config.rewards,
+        settings=config.settings,
+        curriculum=config.curriculum == "on",
     )
-    if config.randomize != "on":
-        return env
+    env = observation_history(action_repeat(env, config.action_repeat), config.history)
     ranges = config.randomization
+    if config.randomize == "episode":
+        return randomized_by_episode(env, ranges, seed=seed, num_models=POOL)
+    if config.randomize == "off":
+        return env
     return randomized(env, ranges, seed=seed, first_env=first_env, num_envs=num_envs)
 
 
@@ -94,6 +104,69 @@ def randomized(
         {name: jnp.asarray(v, jnp.float32) for name, v in leaves.items()}
     )
     return env._replace(model=model, model_axes=axes)
+
+
+class Drawn(NamedTuple):
+    """A task's memory, and which model its world has in this episode, [] int32."""
+
+    task: PyTree
+    number: Array
+
+
+def randomized_by_episode(
+    env: Env, ranges: Mapping[str, LeafRange], *, seed: int, num_models: int
+) -> Env:
+    """The task with another model in every episode, one of `num_models` that all GMIs draw alike.
+
+    The models are drawn beforehand, because MuJoCo in C computes what follows from their masses.
+    A world takes its own out of the pool in every step.
+
+    Args, Raises: as `randomized`.
+    """
+    pool = randomized(env, ranges, seed=seed, first_env=0, num_envs=num_models)
+    per_model = [axis is not None for axis in _leaves(pool.model_axes)]
+
+    def own(model: PyTree, number: Array) -> PyTree:
+        leaves, tree = jax.tree.flatten(model, is_leaf=_is_none)
+        chosen = zip(leaves, per_model, strict=True)
+        return jax.tree.unflatten(tree, [leaf[number] if per else leaf for leaf, per in chosen])
+
+    def draw(key: PRNGKey) -> tuple[PRNGKey, Array]:
+        key, drawn = jax.random.split(key)
+        return key, jax.random.randint(drawn, (), 0, num_models)
+
+    def reset(model: PyTree, key: PRNGKey) -> EnvState:
+        key, number = draw(key)
+        state = env.reset(own(model, number), key)
+        return state._replace(task=Drawn(state.task, number))
+
+    def step(model: PyTree, state: EnvState, action: Array) -> EnvState:
+        before, number = state._replace(task=state.task.task), state.task.number
+        after = env.step(own(model, number), before, action)
+        return after._replace(task=Drawn(after.task, number))
+
+    again = env.next_episode
+
+    def next_episode(model: PyTree, ended: EnvState) -> EnvState:
+        assert again is not None
+        key, number = draw(ended.key)
+        state = again(own(model, number), ended._replace(task=ended.task.task, key=key))
+        return state._replace(task=Drawn(state.task, number))
+
+    return env._replace(
+        model=pool.model,
+        reset=reset,
+        step=step,
+        next_episode=None if again is None else next_episode,
+    )
+
+
+def _is_none(leaf: Any) -> bool:
+    return leaf is None
+
+
+def _leaves(tree: PyTree) -> list[Any]:
+    return jax.tree.leaves(tree, is_leaf=_is_none)
 
 
 def _drawn(env: Env, keys: PRNGKey, leaf: str, drawn: LeafRange) -> Floats:

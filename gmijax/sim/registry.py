@@ -8,10 +8,14 @@ from collections.abc import Mapping
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, Literal, overload
 
+from gmijax.config import EnvConfig
 from gmijax.errors import ConfigError
 from gmijax.sim import source
+from gmijax.sim.tasks.settings import CURRICULA, SETTINGS, settings_from
 
 if TYPE_CHECKING:
+    from gymnasium.vector import VectorEnv
+
     from gmijax.sim.interface import Env
 
 TASKS: Mapping[str, str] = MappingProxyType(
@@ -24,7 +28,8 @@ TASKS: Mapping[str, str] = MappingProxyType(
         "shadow_hand": "gmijax.sim.tasks.shadow_hand",
     }
 )
-"""Name -> module with `make(*, impl, max_envs) -> Env` and `DEFAULT_EPISODE_LENGTH`."""
+"""Name -> module with `make(*, impl, max_envs, rewards, settings) -> Env`, `TERMS` and
+`DEFAULT_EPISODE_LENGTH`."""
 
 SUITES: Mapping[str, str] = MappingProxyType(
     {
@@ -38,6 +43,9 @@ SUITES: Mapping[str, str] = MappingProxyType(
 _PACKAGES: Mapping[str, str] = MappingProxyType(
     {"brax": "brax", "playground": "mujoco_playground"}
 )
+
+
+_NONE: Mapping[str, float] = MappingProxyType({})
 
 
 def task_names() -> tuple[str, ...]:
@@ -61,6 +69,37 @@ def require_task(name: str, suite: str = "gmijax") -> None:
         raise ConfigError(f"env={name}: unknown task; allowed are {', '.join(task_names())}")
 
 
+def require_env(env: EnvConfig) -> None:
+    """Raises ConfigError unless the task of a configuration may be had so; needs no jax."""
+    require_task(str(env.name), env.suite)
+    has_curriculum = env.curriculum == "on"
+    _require_changes(str(env.name), env.suite, env.rewards, env.settings, has_curriculum)
+
+
+def _require_changes(
+    name: str,
+    suite: str,
+    rewards: Mapping[str, float],
+    settings: Mapping[str, float],
+    curriculum: bool,
+) -> None:
+    """Raises ConfigError for what a task cannot have. Terms are known to its module alone."""
+    if curriculum and suite != "custom" and not (suite == "gmijax" and name in CURRICULA):
+        raise ConfigError(
+            f"env.curriculum=on: {name} has none; allowed are {', '.join(CURRICULA)} and "
+            "env=PATH.py:FUNCTION"
+        )
+    if suite == "gmijax":
+        settings_from(SETTINGS[name], settings)
+    elif suite in _PACKAGES:
+        for group, given in (("rewards", rewards), ("settings", settings)):
+            if given:
+                raise ConfigError(
+                    f"env.{group}.{next(iter(given))}: not with env={suite}, whose environments "
+                    "are taken as they are; allowed are our tasks and env=PATH.py:FUNCTION"
+                )
+
+
 @overload
 def make_env(
     name: str,
@@ -70,6 +109,9 @@ def make_env(
     episode_length: int | None = ...,
     max_envs: int | None = ...,
     source_sha256: str | None = ...,
+    rewards: Mapping[str, float] = ...,
+    settings: Mapping[str, float] = ...,
+    curriculum: bool = ...,
     api: Literal["gmijax"] = ...,
 ) -> Env: ...
 
@@ -83,6 +125,9 @@ def make_env(
     episode_length: int | None = ...,
     max_envs: int | None = ...,
     source_sha256: str | None = ...,
+    rewards: Mapping[str, float] = ...,
+    settings: Mapping[str, float] = ...,
+    curriculum: bool = ...,
     api: Literal["brax"],
 ) -> Any: ...
 
@@ -95,6 +140,9 @@ def make_env(
     episode_length: int | None = None,
     max_envs: int | None = None,
     source_sha256: str | None = None,
+    rewards: Mapping[str, float] = _NONE,
+    settings: Mapping[str, float] = _NONE,
+    curriculum: bool = False,
     api: Literal["gmijax", "brax"] = "gmijax",
 ) -> Any:
     """Makes a task, with its time limit.
@@ -107,12 +155,16 @@ def make_env(
       max_envs: upper bound of environments stepped at once; only `warp` needs it, to size the
         contact buffer that they share. None: `gmijax.sim.physics.WARP_MAX_ENVS`.
       source_sha256: digest of a custom task's file, which is not executed with another one.
+      rewards: weights of terms of the reward by name, in place of the task's own.
+      settings: numbers of the task by name (`gmijax.sim.tasks.settings`), as `rewards`.
+      curriculum: whether a world's episodes get harder as they succeed.
       api: `gmijax` for an `Env`, `brax` for a `brax.envs.Env` without a time limit, as Brax's
         wrappers want it.
 
     Raises:
-      ConfigError: an unknown name, a package or implementation that cannot be had, a length
-        below 1, or a length for `brax`, whose `EpisodeWrapper` takes it.
+      ConfigError: an unknown name of a task, a term or a setting, a package or implementation
+        that cannot be had, a length below 1, or a length for `brax`, whose `EpisodeWrapper`
+        takes it.
     """
     if api not in ("gmijax", "brax"):
         raise ConfigError(f"api={api}: allowed are gmijax, brax")
@@ -122,7 +174,9 @@ def make_env(
         raise ConfigError(f"env.episode_length={episode_length}: must be at least 1")
     if suite == "gmijax" and ".py:" in name:
         suite = "custom"
-    env = _make(name, suite, impl, max_envs, source_sha256)
+    changes: dict[str, Any] = {"rewards": rewards, "settings": settings, "curriculum": curriculum}
+    noted = {"source_sha256": source_sha256} if suite == "custom" else {}
+    env = _make(name, suite, changes, impl=impl, max_envs=max_envs, **noted)
     if api == "brax":
         require_task("", "brax")
         return importlib.import_module("gmijax.sim.adapters.to_brax").BraxEnv(env)
@@ -131,14 +185,63 @@ def make_env(
     return time_limit(env, episode_length or env.spec.episode_length)
 
 
-def _make(
-    name: str, suite: str, impl: str, max_envs: int | None, source_sha256: str | None
-) -> Env:
+def make_vector_env(
+    name: str,
+    num_envs: int,
+    *,
+    arrays: Literal["numpy", "torch", "jax"] = "numpy",
+    suite: str = "gmijax",
+    impl: str = "auto",
+    episode_length: int | None = None,
+) -> VectorEnv[Any, Any, Any]:
+    """Makes N environments with Gymnasium's interface, for training with another library.
+
+    Example:
+      >>> envs = make_vector_env("ant", 4096, arrays="torch")
+      >>> obs, info = envs.reset(seed=0)
+
+    Args:
+      name: see `make_env`.
+      num_envs: N.
+      arrays: what goes in and comes out: of `torch` on the GPU of jax without a copy (DLPack),
+        where both use one.
+      suite: see `make_env`.
+      impl: see `make_env`.
+      episode_length: see `make_env`.
+
+    Returns:
+      A `gmijax.sim.adapters.to_gymnasium.GmijaxVectorEnv`, for other arrays than those of jax
+      in a wrapper of Gymnasium. It starts over in the step that ends an episode, and has the last
+      observation in `info["final_obs"]`.
+
+    Raises:
+      ConfigError: as `make_env`; `num_envs` below 1; a package that is not installed.
+    """
+    if arrays not in ("numpy", "torch", "jax"):
+        raise ConfigError(f"arrays={arrays}: allowed are numpy, torch, jax")
+    if num_envs < 1:
+        raise ConfigError(f"num_envs={num_envs}: must be at least 1")
+    if importlib.util.find_spec("gymnasium") is None:
+        raise ConfigError("make_vector_env: needs gymnasium (pip install 'gmijax[gymnasium]')")
+    if importlib.util.find_spec(arrays) is None:
+        raise ConfigError(f"arrays={arrays}: needs the package {arrays}")
+    env = make_env(name, suite=suite, impl=impl, episode_length=episode_length, max_envs=num_envs)
+    return importlib.import_module("gmijax.sim.adapters.to_gymnasium").vector_env(
+        env, num_envs, arrays
+    )
+
+
+def _make(name: str, suite: str, changes: Mapping[str, Any], **options: Any) -> Env:
+    """A task without its time limit; it gets those `changes` that are any."""
     if suite not in ("gmijax", *SUITES):
         raise ConfigError(f"suite={suite}: allowed are gmijax, {', '.join(SUITES)}")
     require_task(name, suite)
+    _require_changes(name, suite, **changes)
+    options |= {key: value for key, value in changes.items() if value}
     if suite == "gmijax":
-        return importlib.import_module(TASKS[name]).make(impl=impl, max_envs=max_envs)
-    noted = {"source_sha256": source_sha256} if suite == "custom" else {}
-    module = importlib.import_module(SUITES[suite])
-    return module.make(name, impl=impl, max_envs=max_envs, **noted)
+        env: Env = importlib.import_module(TASKS[name]).make(**options)
+    else:
+        env = importlib.import_module(SUITES[suite]).make(name, **options)
+    if changes["curriculum"] and env.next_episode is None:
+        raise ConfigError(f"env.curriculum=on: {env.spec.name} has no next_episode to carry it on")
+    return env

@@ -1,7 +1,7 @@
 """Rewards as named, weighted terms.
 
-A task lists its terms as data, so that logs show every addend and a weight of zero costs
-nothing. The logged addends always sum to the reward.
+A task lists its terms as data, so that logs show every addend, and `env.rewards` changes their
+weights. A weight of zero costs nothing. The logged addends always sum to the reward.
 """
 
 from __future__ import annotations
@@ -11,6 +11,8 @@ from typing import Generic, NamedTuple, TypeVar
 
 import jax.numpy as jnp
 
+from gmijax.config.schema import suggestion
+from gmijax.errors import ConfigError
 from gmijax.types import Array
 
 View = TypeVar("View")
@@ -43,10 +45,26 @@ class Replacement(NamedTuple):
     value: float
 
 
+def with_weights(
+    terms: Mapping[str, RewardTerm[View]], weights: Mapping[str, float] | None
+) -> Mapping[str, RewardTerm[View]]:
+    """The terms, with another weight where `weights` names one.
+
+    Raises:
+      ConfigError: an unknown name.
+    """
+    changed = dict(terms)
+    for name, weight in (weights or {}).items():
+        if name not in terms:
+            raise ConfigError(f"unknown key env.rewards.{name}{suggestion(name, terms)}")
+        changed[name] = terms[name]._replace(weight=weight)
+    return changed
+
+
 def total_reward(
     terms: Mapping[str, RewardTerm[View]], view: View, replacement: Replacement | None = None
 ) -> tuple[Array, dict[str, Array]]:
-    """Returns the reward [] and its addends by name; terms of weight 0 are not traced.
+    """Returns the reward [] and its addends by name; terms of weight 0 are zero, and not traced.
 
     Args:
       terms: the task's terms, in the order in which they are logged.
@@ -54,7 +72,8 @@ def total_reward(
       replacement: takes the place of all terms where it applies.
     """
     values = {
-        name: term.weight * term.fn(view) for name, term in terms.items() if term.weight != 0.0
+        name: jnp.zeros(()) if term.weight == 0.0 else term.weight * term.fn(view)
+        for name, term in terms.items()
     }
     if replacement is not None:
         values = {name: jnp.where(replacement.when, 0.0, value) for name, value in values.items()}
@@ -66,5 +85,4 @@ def term_names(
     terms: Mapping[str, RewardTerm[View]], replacement: str | None = None
 ) -> tuple[str, ...]:
     """The names that `total_reward` logs, in its order."""
-    names = tuple(name for name, term in terms.items() if term.weight != 0.0)
-    return names if replacement is None else (*names, replacement)
+    return tuple(terms) if replacement is None else (*terms, replacement)

@@ -67,9 +67,11 @@ class StepOutput(NamedTuple):
       reward: [N] float32.
       terminated: [N] bool, the task has ended.
       truncated: [N] bool, time ran out.
+      is_diverged: [N] bool, the world was ended because of a bad number (it counts as
+        terminated).
       finished: the whole episodes that ended in this step; none that had a head start.
-      diverged: [] int32, worlds that were ended because of a bad number (they count as
-        terminated), by where it was: `gmijax.sim.divergence.sources`.
+      diverged: [] int32, worlds that were ended because of a bad number, by where it was:
+        `gmijax.sim.divergence.sources`.
       overflowed: [] int32, worlds for which a buffer was too small, by `OVERFLOWS`; empty if
         nothing can overflow.
     """
@@ -78,6 +80,7 @@ class StepOutput(NamedTuple):
     reward: Array
     terminated: Array
     truncated: Array
+    is_diverged: Array
     finished: EpisodeSums
     diverged: dict[str, Array]
     overflowed: dict[str, Array]
@@ -116,9 +119,11 @@ def time_limit(env: Env, episode_length: int) -> Env:
 
 def vectorise(env: Env) -> Env:
     """The same environment for N worlds at once; they share the model, or most of its leaves."""
+    again = env.next_episode
     return env._replace(
         reset=jax.vmap(env.reset, in_axes=(env.model_axes, 0)),
         step=jax.vmap(env.step, in_axes=(env.model_axes, 0, 0)),
+        next_episode=None if again is None else jax.vmap(again, in_axes=(env.model_axes, 0)),
     )
 
 
@@ -127,7 +132,10 @@ def auto_reset(env: Env, model: PyTree, state: EnvState) -> EnvState:
 
     A world's key moves on only if the world is reset, so when other worlds end does not matter.
     """
-    return select_worlds(state.terminated | state.truncated, env.reset(model, state.key), state)
+    ended = state.terminated | state.truncated
+    again = env.next_episode
+    fresh = env.reset(model, state.key) if again is None else again(model, state)
+    return select_worlds(ended, fresh, state)
 
 
 def select_worlds(chosen: Array, new: T, old: T) -> T:
@@ -227,12 +235,16 @@ def training_env(env: Env, *, random_ep_len: bool = False) -> BatchedEnv:
             stepped = cut_first_episodes(env.spec, state, stepped)
         bad = diverged_by_source(env, stepped)
         stepped = end_diverged(state.env, stepped, bad["any"])
+        if env.next_episode is not None:  # What is carried on must be finite.
+            kept = select_worlds(bad["any"], state.env.task, stepped.task)
+            stepped = stepped._replace(task=kept)
         returns, terms, finished = episode_statistics(state, stepped)
         output = StepOutput(
             next_obs=stepped.obs,
             reward=stepped.reward,
             terminated=stepped.terminated,
             truncated=stepped.truncated,
+            is_diverged=bad["any"],
             finished=finished,
             diverged={name: jnp.sum(where, dtype=jnp.int32) for name, where in bad.items()},
             overflowed=overflowed(env, stepped),

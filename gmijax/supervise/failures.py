@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import signal
 from collections.abc import Sequence
 from pathlib import Path
@@ -17,6 +18,9 @@ from gmijax.errors import (
     ReportedError,
     printable,
 )
+
+_GPU_FAULT = re.compile(r"CUDA_ERROR_(?!OUT_OF_MEMORY)|ended by SIGABRT|MPS daemon")
+"""In what a job says that lost its GPU. XLA aborts where it cannot raise."""
 
 _TAIL_BYTES = 8192
 _MAX_LINE = 300
@@ -51,17 +55,28 @@ def first_cause(failures: Sequence[GmiFailed]) -> GmiFailed:
     """The failure that most likely caused the others.
 
     A GMI that lost its peer may be seen to fail before that peer is; so a signal, and any
-    error that is not about a peer, goes before errors of the exchange. A library
+    error that is not about a peer, goes before errors of the exchange. A peer that is lost to
+    one may have given up on another that it waited for. A library
     may abort a process whose peer is gone; so SIGABRT comes after all other causes.
     """
     return min(
         failures,
         key=lambda failure: (
             is_consequence(failure),
+            ended_with(failure, PeerLost, PipeClosed),
             failure.exit_code == -signal.SIGABRT,
             failure.exit_code >= 0,
         ),
     )
+
+
+def may_be_anothers(reason: str) -> bool:
+    """Whether the fault can be that of another client of the same MPS daemon.
+
+    A fatal fault of one client ends all clients on its GPU, and CUDA does not say whose it was
+    (https://docs.nvidia.com/deploy/mps/, "Memory protection and error containment").
+    """
+    return _GPU_FAULT.search(reason) is not None
 
 
 def signal_name(number: int) -> str:

@@ -5,10 +5,8 @@ from __future__ import annotations
 import os
 import signal
 import subprocess
-import time
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
-from typing import NamedTuple
 
 from gmijax.errors import GmiFailed, ReportedError
 from gmijax.machine.processes import GuardPipe, members_of, wait_until_gone
@@ -24,31 +22,14 @@ from gmijax.supervise.child import (
     STACKS_SIGNAL,
     STOP_BYTE,
 )
-from gmijax.supervise.heartbeat import Heartbeat, HeartbeatBlock
+from gmijax.supervise.heartbeat import HeartbeatBlock
+from gmijax.supervise.watched_gmi import WatchedGmi
 
 _GROUP_ENDS_S = 2.0
 """A killed process is gone in milliseconds, unless a driver holds it."""
 
 
-class GmiStatus(NamedTuple):
-    """Where a GMI stands.
-
-    Attributes:
-      gmi: its id.
-      state: `waiting` until it may compile, else what it says (see `heartbeat`).
-      iteration: training iterations done.
-      pid: its process, None before the start.
-      exit_code: None while it runs; negative for the signal that ended it.
-    """
-
-    gmi: int
-    state: str
-    iteration: int
-    pid: int | None
-    exit_code: int | None
-
-
-class GmiProcess:
+class GmiProcess(WatchedGmi):
     """A started GMI, the leader of its own session and process group.
 
     It inherits its lifeline, its heartbeat and `inherited_fds`, nothing else. With `waits` it
@@ -56,15 +37,6 @@ class GmiProcess:
 
     Raises:
       GmiFailed: the program cannot be started.
-
-    Attributes:
-      gmi: its id.
-      waits: whether it may not compile yet.
-      exit_code: None while it runs; negative for the signal that ended it.
-      beat: the newest heartbeat that `poll` saw.
-      paths: files of this GMI.
-      progress_s: when it was started, let go, or its heartbeat last seen to be a new one;
-        `time.monotonic`.
     """
 
     def __init__(
@@ -77,12 +49,9 @@ class GmiProcess:
         *,
         waits: bool = False,
     ) -> None:
-        self.gmi = gmi
-        self.waits = waits
-        self.exit_code: int | None = None
-        self.paths = run.gmi(gmi)
-        self.paths.root.mkdir(parents=True, exist_ok=True)
-        for stale in (self.paths.error, self.paths.result):
+        paths = run.gmi(gmi)
+        paths.root.mkdir(parents=True, exist_ok=True)
+        for stale in (paths.error, paths.result):
             stale.unlink(missing_ok=True)
         self._lifeline, heartbeat_fd = GuardPipe(), HeartbeatBlock.create()
         own = {ENV_LIFELINE_FD: self._lifeline.read_end, ENV_HEARTBEAT_FD: heartbeat_fd}
@@ -93,7 +62,7 @@ class GmiProcess:
         variables = {**environment, **variables, ENV_RUN_DIR: str(run.root)}
         try:
             self._block = HeartbeatBlock(heartbeat_fd)
-            self._process = _spawn(command, variables, self.paths, tuple(inherited.values()))
+            self._process = _spawn(command, variables, paths, tuple(inherited.values()))
         except OSError as error:
             self._lifeline.close()
             raise GmiFailed(gmi, f"cannot start {command[0]}: {error.strerror}") from error
@@ -103,34 +72,15 @@ class GmiProcess:
         finally:
             os.close(self._lifeline.read_end)
             os.close(heartbeat_fd)
-        self.progress_s = time.monotonic()
-        self.beat = Heartbeat("starting", 0, self.pid)
-        self._num_beats = 0
-        self._was_ready = False
-
-    @property
-    def pid(self) -> int:
-        """The process that was started, leader of its group."""
-        return self._process.pid
-
-    @property
-    def is_ready(self) -> bool:
-        """Whether the GMI has once been ready, or has ended well without saying so."""
-        return self._was_ready or self.exit_code == 0
+        super().__init__(gmi, paths, self._process.pid, waits=waits)
 
     @property
     def error(self) -> ReportedError | None:
-        """The exception that it said it ends with, None without one."""
+        """See `WatchedGmi`."""
         return self._block.read_error()
 
-    def status(self) -> GmiStatus:
-        """A snapshot for progress displays."""
-        beat = self.beat
-        state = "waiting" if self.waits else beat.state
-        return GmiStatus(self.gmi, state, beat.iteration, beat.pid, self.exit_code)
-
     def poll(self) -> int | None:
-        """Reads the heartbeat and the exit code; ends what is left of an ended GMI's group."""
+        """See `WatchedGmi`."""
         self._refresh()
         if self.exit_code is None and self._has_ended():
             # Before the zombie is reaped its group's number cannot go to somebody else.
@@ -141,26 +91,17 @@ class GmiProcess:
             self._refresh()
         return self.exit_code
 
-    def let_go(self) -> None:
-        """Lets a GMI compile that was started to wait."""
-        self.waits = False
-        self.progress_s = time.monotonic()
-        self._lifeline.write(GO_BYTE)
-
     def ask_to_stop(self) -> None:
-        """Asks the GMI to finish its iteration, save and end."""
+        """See `WatchedGmi`."""
         self._lifeline.write(STOP_BYTE)
 
     def order_end(self) -> None:
-        """Makes the GMI and all that it started end at once, without saving."""
+        """See `WatchedGmi`."""
         self._lifeline.write(END_BYTE)
 
     def request_stacks(self) -> int | None:
-        """Has the GMI write the stacks of its threads to its log; the log's size before.
-
-        None where it has not started far enough for that: the signal would end it.
-        """
-        if self.exit_code is not None or not self._num_beats:
+        """See `WatchedGmi`."""
+        if self.exit_code is not None or not self.beats:
             return None
         size = self.log_bytes
         with suppress(ProcessLookupError, PermissionError):
@@ -169,26 +110,26 @@ class GmiProcess:
 
     @property
     def log_bytes(self) -> int:
-        """Size of what it has written to stderr."""
+        """See `WatchedGmi`."""
         try:
             return self.paths.stderr.stat().st_size
         except OSError:
             return 0
 
     def end_as_done(self) -> None:
-        """Ends a GMI that has said that it is done, but whose process stays."""
+        """See `WatchedGmi`."""
         self.kill()
         self._process.wait()
         self.exit_code = 0
 
     def kill(self) -> None:
-        """Kills the GMI and everything it started; nothing once it is reaped."""
+        """See `WatchedGmi`."""
         if self.exit_code is None:
             with suppress(ProcessLookupError, PermissionError):
                 os.killpg(self.pid, signal.SIGKILL)
 
     def close(self) -> None:
-        """Drops the lifeline: a process that is still there ends itself."""
+        """See `WatchedGmi`."""
         self._lifeline.close()
 
     def _has_ended(self) -> bool:
@@ -199,12 +140,10 @@ class GmiProcess:
             return True
 
     def _refresh(self) -> None:
-        beats = self._block.beats
-        # A beat with equal content counts as progress too.
-        if beats != self._num_beats and (beat := self._block.read()):
-            self.beat, self._num_beats = beat, beats
-            self._was_ready |= beat.is_ready
-            self.progress_s = time.monotonic()
+        self._heard(self._block.beats, self._block.read())
+
+    def _tell_to_go(self) -> None:
+        self._lifeline.write(GO_BYTE)
 
 
 def _spawn(

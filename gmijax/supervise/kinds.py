@@ -93,7 +93,12 @@ def _registers_and_channels(config: TrainConfig, plan: Plan) -> SharedBlocks:
     return {ENV_REGISTERS_FD: create_registers, ENV_CHANNELS_FD: channels}
 
 
-def training_plan(config: TrainConfig, machine: Machine, num_envs: int | None = None) -> Plan:
+def training_plan(
+    config: TrainConfig,
+    machine: Machine,
+    num_envs: int | None = None,
+    nodes: Mapping[str, Machine] | None = None,
+) -> Plan:
     """The plan of a training job, with `num_envs` per GMI if it is given; see `make_plan`.
 
     Raises:
@@ -103,7 +108,7 @@ def training_plan(config: TrainConfig, machine: Machine, num_envs: int | None = 
     """
     num_envs = num_envs or config.envs_per_gmi
     if not config.is_asynchronous:
-        return make_plan(config.plan, config.reduce, num_envs, machine)
+        return make_plan(config.plan, config.reduce, num_envs, machine, nodes=nodes)
     _require_asynchronous(config)
     if config.plan.layout is None:
         require_host(*num_gmis_of(config.plan), config.plan, machine)

@@ -11,7 +11,7 @@ import os
 import signal
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from types import FrameType
@@ -27,9 +27,10 @@ from gmijax.runs.folder import RunPaths, read_json, write_json
 from gmijax.supervise.backends import Backend, open_backend
 from gmijax.supervise.child import ENV_EXCHANGE_FD
 from gmijax.supervise.environment import COMPILATION_CACHE
-from gmijax.supervise.gmi_process import GmiStatus
 from gmijax.supervise.kinds import JobKind
-from gmijax.supervise.supervisor import Launch, Supervisor, Timeouts
+from gmijax.supervise.launch import Launch, Timeouts
+from gmijax.supervise.supervisor import Supervisor
+from gmijax.supervise.watched_gmi import GmiStatus
 
 STOP_SIGNALS: Final = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGUSR1)
 """What asks a job to save and end: Ctrl-C, batch systems, a terminal that is closed."""
@@ -59,7 +60,7 @@ def run_gmis(
         # First, so that it ends last: a signal must not cut off the end of the backend.
         if launch.stops_gracefully and signals is None:
             signals = held.enter_context(stop_signals())
-        inherited = _shared_blocks(held, launch.kind, plan)
+        inherited = shared_blocks(held, launch.kind, plan)
         launch, backend = _enter_backend(held, launch)
 
         supervisor = Supervisor(launch, backend, inherited)
@@ -68,13 +69,16 @@ def run_gmis(
         try:
             supervisor.run(on_tick)
         finally:
-            programs = Path(os.environ.get(COMPILATION_CACHE) or compilation_cache_dir())
-            drop_broken_programs(
-                programs, [launch.run.gmi(gmi).stderr for gmi in plan.layout.gmis]
-            )
+            drop_unreadable(launch.run, plan.layout.gmis)
 
 
-def _shared_blocks(held: ExitStack, kind: JobKind, plan: Plan) -> dict[str, int]:
+def drop_unreadable(run: RunPaths, gmis: Iterable[int]) -> None:
+    """Removes programs from this machine's cache that one of the GMIs could not read."""
+    programs = Path(os.environ.get(COMPILATION_CACHE) or compilation_cache_dir())
+    drop_broken_programs(programs, [run.gmi(gmi).stderr for gmi in gmis])
+
+
+def shared_blocks(held: ExitStack, kind: JobKind, plan: Plan) -> dict[str, int]:
     """Descriptors of the memory that the GMIs share, by the variable that names each."""
     opened: dict[str, int] = {}
     blocks = dict(kind.shared(plan))

@@ -6,20 +6,13 @@ raises. Whether the job is tried again is decided by `gmijax.control.restarts`.
 
 from __future__ import annotations
 
-import os
-import sys
 import time
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, field
+from functools import partial
 
 from gmijax.errors import CollectiveTimeout, ConfigError, GmiFailed, JobInterrupted
-from gmijax.machine.snapshot import Machine
-from gmijax.partition.plan import Plan
-from gmijax.runs.cache import compilation_cache_dir
-from gmijax.runs.folder import RunPaths
 from gmijax.supervise.backends.backend import Backend
-from gmijax.supervise.environment import gmi_environment
 from gmijax.supervise.failures import (
     describe_exit,
     ended_with,
@@ -27,67 +20,14 @@ from gmijax.supervise.failures import (
     first_line,
     is_consequence,
 )
-from gmijax.supervise.gmi_process import GmiProcess, GmiStatus
-from gmijax.supervise.kinds import JobKind
+from gmijax.supervise.launch import Launch, StartGmi, start_gmi
+from gmijax.supervise.watched_gmi import GmiStatus, WatchedGmi
 
 _POLL_S = 0.05
 _SETTLE_S = 1.0
 _SWEEP_S = 10.0
 _STACKS_S = 3.0
 """Longest wait for stacks to be written; a process that is stopped never does."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class Timeouts:
-    """How long the supervisor waits.
-
-    Attributes:
-      start_timeout_s: for a GMI to compile, counted from its start or from its last beat.
-      stall_timeout_s: between two beats of a GMI that is past compiling.
-      stop_timeout_s: for all GMIs to finish by themselves after a request to stop.
-      grace_s: for a GMI to end at once, on the order to; for one that is done to be gone.
-    """
-
-    start_timeout_s: float
-    stall_timeout_s: float
-    stop_timeout_s: float
-    grace_s: float
-
-
-@dataclass(frozen=True, kw_only=True)
-class Launch:
-    """What to run in the GMIs of a plan.
-
-    Attributes:
-      plan: where GMIs live and what they share.
-      machine: where this is; see `detect_machine`.
-      run: the run folder; what the GMIs read from it is there already.
-      kind: what the GMIs run, and what they share beside the block that reducers use.
-      timeouts: time limits.
-      stops_gracefully: the first signal of `STOP_SIGNALS` asks the GMIs to finish by themselves;
-        otherwise signals do what Python does with them.
-      variables: more environment variables of every GMI.
-      on_warning: called with a sentence when the job runs otherwise than planned.
-      is_enough: true once the job has what it needs: the GMIs then finish as after a first
-        signal; None: it ends by itself.
-    """
-
-    plan: Plan
-    machine: Machine
-    run: RunPaths
-    kind: JobKind
-    timeouts: Timeouts
-    stops_gracefully: bool = True
-    variables: Mapping[str, str] = field(default_factory=dict)
-    on_warning: Callable[[str], None] = lambda _: None
-    is_enough: Callable[[tuple[GmiStatus, ...]], bool] | None = None
-
-
-def environment_of(launch: Launch, gmi: int, added: Mapping[str, str]) -> dict[str, str]:
-    """All environment variables of a GMI; `added` are those of its backend."""
-    own, cache = dict(os.environ), compilation_cache_dir()
-    variables = gmi_environment(launch.plan, gmi, own, cache, added)
-    return {**variables, **launch.variables}
 
 
 class Supervisor:
@@ -98,15 +38,20 @@ class Supervisor:
       backend: that of the plan, entered.
       inherited_fds: open files that every GMI inherits, by the environment variable that will
         hold the number of the descriptor.
+      start: starts a GMI, `(gmi, waits)`; None: on this machine.
     """
 
     def __init__(
-        self, launch: Launch, backend: Backend, inherited_fds: Mapping[str, int] | None = None
+        self,
+        launch: Launch,
+        backend: Backend,
+        inherited_fds: Mapping[str, int] | None = None,
+        start: StartGmi | None = None,
     ) -> None:
         self._launch = launch
         self._backend = backend
-        self._inherited_fds = inherited_fds or {}
-        self._started: dict[int, GmiProcess] = {}
+        self._start_gmi = start or partial(start_gmi, launch, backend, inherited_fds or {})
+        self._started: dict[int, WatchedGmi] = {}
         self._all_ready_s: float | None = None
         self._stop_requests = 0
         self._is_enough = launch.is_enough
@@ -168,22 +113,16 @@ class Supervisor:
         if self._stop_requests:
             raise JobInterrupted("stopped on request; every GMI has finished by itself")
 
-    def _alive(self) -> list[GmiProcess]:
+    def _alive(self) -> list[WatchedGmi]:
         return [process for process in self._started.values() if process.exit_code is None]
 
     def _start(self, gmi: int) -> None:
-        launch, backend = self._launch, self._backend
-        process = GmiProcess(
-            gmi,
-            [sys.executable, "-m", launch.kind.module],
-            environment_of(launch, gmi, backend.environment(gmi)),
-            launch.run,
-            self._inherited_fds,
-            # The first one compiles for all.
-            waits=launch.kind.compile_once and bool(self._started),
-        )
+        node_of = self._launch.plan.layout.node_of
+        # The first one of a node compiles for all there.
+        is_first = all(node_of(other) != node_of(gmi) for other in self._started)
+        process = self._start_gmi(gmi, self._launch.kind.compile_once and not is_first)
         self._started[gmi] = process
-        backend.started(process.pid)
+        self._backend.started(process.pid)
 
     def _let_go(self) -> None:
         """Lets those compile that wait for the first one, once it has."""
@@ -199,7 +138,10 @@ class Supervisor:
             return
         # A GMI that lost its peer can be quicker to end than that peer is to be seen dead.
         deadline_s = time.monotonic() + _SETTLE_S
-        while is_consequence(first_cause(failures)) and time.monotonic() < deadline_s:
+        # Nor is a node that is lost known to be so at once.
+        while is_consequence(first_cause(failures)) and (
+            time.monotonic() < deadline_s or any(p.is_silent for p in self._started.values())
+        ):
             time.sleep(_POLL_S)
             failures = self._poll_failures()
         cause = first_cause(failures)
@@ -327,7 +269,7 @@ class Supervisor:
         return [process.pid for process in alive]
 
 
-def _wait_for_end(processes: Sequence[GmiProcess], timeout_s: float) -> list[GmiProcess]:
+def _wait_for_end(processes: Sequence[WatchedGmi], timeout_s: float) -> list[WatchedGmi]:
     """Waits until all have ended; returns those that have not."""
     deadline_s = time.monotonic() + timeout_s
     alive = [process for process in processes if process.poll() is None]

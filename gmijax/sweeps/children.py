@@ -6,10 +6,9 @@ import os
 import signal
 import subprocess
 import sys
-import time
 from collections.abc import Mapping
 from contextlib import suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -31,7 +30,6 @@ class Child:
     Attributes:
       job: what it trains.
       place: where.
-      started_s: when, by the monotonic clock.
       is_pruned: whether it was asked to end because others are better.
       is_killed: whether it was ended by force, as the whole sweep is.
     """
@@ -41,14 +39,8 @@ class Child:
     log: Path
     process: subprocess.Popen[bytes]
     pipe: GuardPipe
-    started_s: float = field(default_factory=time.monotonic)
     is_pruned: bool = False
     is_killed: bool = False
-
-    @property
-    def wall_s(self) -> float:
-        """Seconds since its start."""
-        return time.monotonic() - self.started_s
 
     def has_ended(self) -> bool:
         """Whether the process is gone."""

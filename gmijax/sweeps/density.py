@@ -26,7 +26,7 @@ from gmijax.runs.folder import read_json
 from gmijax.supervise.backends import open_backend
 from gmijax.supervise.launcher import StopSignals
 from gmijax.sweeps.jobs import Job, SweepPaths
-from gmijax.sweeps.places import places_of
+from gmijax.sweeps.places import Places, places_of
 from gmijax.sweeps.scheduler import Scheduler
 from gmijax.sweeps.study import NoStudy
 
@@ -123,7 +123,8 @@ def _profile(
         try:
             plan = places_of(settings, machine, {job.config.plan.backend})
             with open_backend(plan, machine, paths) as backend:
-                Scheduler(jobs, NoStudy(), settings, paths, plan, backend, tick).run(inner)
+                places = Places(plan, machine)
+                Scheduler(jobs, NoStudy(), settings, paths, places, backend, tick).run(inner)
         except JobInterrupted:
             if signals.have_come:
                 raise
@@ -139,7 +140,9 @@ def _copy(job: Job, seed: int) -> Job:
     run = dataclasses.replace(
         job.config.run, checkpoint_every=0, measure_throughput=False, max_restarts=0
     )
-    config = dataclasses.replace(job.config, seed=seed, num_timesteps=_FOREVER, run=run)
+    no_eval = dataclasses.replace(job.config.eval, every=None)
+    changes = {"seed": seed, "num_timesteps": _FOREVER, "run": run, "eval": no_eval}
+    config = dataclasses.replace(job.config, **changes)
     return Job(seed, {}, config)
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -57,8 +58,10 @@ class Progress:
       env_steps: environment steps so far.
       env_steps_per_s: of the last iteration; 0 while it does not run.
       value: best value of the objective so far, None before there is one.
-      wall_s: seconds of its process in this sweep.
-      place: GPUs and slot where it runs, in words.
+      started_s: when this command started it, by the monotonic clock.
+      updated_s: when the first line of metrics came after that.
+      ended_s: when it ended after that.
+      place: GPUs and places where it runs, in words.
       error: why it failed, in one line.
       curve: environment steps and objective of every line of metrics that has one.
     """
@@ -67,10 +70,19 @@ class Progress:
     env_steps: int = 0
     env_steps_per_s: float = 0.0
     value: float | None = None
-    wall_s: float = 0.0
+    started_s: float | None = None
+    updated_s: float | None = None
+    ended_s: float | None = None
     place: str = ""
     error: str | None = None
     curve: list[tuple[int, float]] = field(default_factory=list)
+
+    @property
+    def wall_s(self) -> float:
+        """Seconds from its start to its end, or until now."""
+        if self.started_s is None:
+            return 0.0
+        return (self.ended_s or time.monotonic()) - self.started_s
 
     def take(self, line: Mapping[str, Any], sweep: SweepConfig) -> None:
         """Takes in a line of metrics."""
@@ -124,9 +136,10 @@ class Job:
     def program(self) -> str:
         """The same for jobs that compile the same programs."""
         data = to_dict(self.config)
-        for key in ("run", "seed", "num_timesteps", "search"):
+        for key in ("run", "seed", "num_timesteps", "search", "wandb"):
             del data[key]
         data["plan"].pop("memory_fraction")
+        data["algo"].pop("learning_rate")  # It is in the learner's state.
         return repr(data)
 
 
@@ -146,6 +159,19 @@ def jobs_of(configs: Sequence[TrainConfig]) -> tuple[Job, ...]:
     )
 
 
+def trainings_per_hour(jobs: Sequence[Job]) -> float | None:
+    """Of the jobs that this command has run, from the first start to the last end, or until now.
+
+    None: it has not started any.
+    """
+    run = [job.progress for job in jobs if job.progress.started_s is not None]
+    if not run:
+        return None
+    first_s = min(progress.started_s or 0.0 for progress in run)
+    last_s = max(progress.ended_s or time.monotonic() for progress in run)
+    return 3600 * sum(progress.state == "completed" for progress in run) / (last_s - first_s)
+
+
 def require_placeable(jobs: Sequence[Job], num_gpus: int) -> None:
     """Refuses jobs that say themselves where they run, or that no place is large enough for.
 
@@ -155,7 +181,9 @@ def require_placeable(jobs: Sequence[Job], num_gpus: int) -> None:
     if not jobs:
         raise ConfigError("sweep: there is no job in it")
     for job in jobs:
-        plan = job.config.plan
+        plan, engine = job.config.plan, job.config.cluster.engine
+        if engine is not None:
+            raise ConfigError(f"cluster.engine={engine}: a sweep is for one machine; use null")
         if not isinstance(plan.gpus, int):
             raise ConfigError(
                 f"plan.gpus={list(plan.gpus)}: a sweep chooses the GPUs of its jobs; expected a "
@@ -173,7 +201,18 @@ def require_placeable(jobs: Sequence[Job], num_gpus: int) -> None:
             )
 
 
-def placed(job: Job, run: RunPaths, place: Place, backend: BackendName) -> TrainConfig:
+def require_objective(jobs: Sequence[Job], sweep: SweepConfig) -> None:
+    """Raises ConfigError if jobs are to be ranked by evaluations that they do not make."""
+    if sweep.objective.startswith("eval/") and any(job.config.eval.every is None for job in jobs):
+        raise ConfigError(
+            f"sweep.objective={sweep.objective}: needs eval.every, environment steps between "
+            "evaluations"
+        )
+
+
+def placed(
+    job: Job, run: RunPaths, place: Place, backend: BackendName | Literal["auto"]
+) -> TrainConfig:
     """The configuration of a job in its run folder and its place."""
     wanted = job.config.plan
     plan = dataclasses.replace(
@@ -184,7 +223,9 @@ def placed(job: Job, run: RunPaths, place: Place, backend: BackendName) -> Train
         self_check="off" if wanted.self_check == "auto" else wanted.self_check,
     )
     own = dataclasses.replace(job.config.run, dir=str(run.root), name=None, resume="auto")
-    return dataclasses.replace(job.config, plan=plan, run=own)
+    wandb = job.config.wandb
+    wandb = dataclasses.replace(wandb, group=wandb.group or run.root.parent.name)
+    return dataclasses.replace(job.config, plan=plan, run=own, wandb=wandb)
 
 
 def state_of(run: RunPaths, config: TrainConfig) -> State:

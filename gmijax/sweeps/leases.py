@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import fcntl
 import os
 import time
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import ExitStack, contextmanager
 
 from gmijax.runs.cache import cache_folder
+from gmijax.runs.folder import try_lock
 
 _POLL_S = 0.2
 
@@ -29,21 +29,14 @@ def leased(
         # In one order, so that two sweeps do not wait for each other.
         for device in sorted(set(devices)):
             folder.mkdir(parents=True, exist_ok=True)
-            fd = os.open(folder / f"{device}.lock", os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
-            held.callback(os.close, fd)
-            if not _locked(fd):
+            lock = folder / f"{device}.lock"
+            if (fd := try_lock(lock)) is None:
                 say(f"another sweep has {device}: waiting until it ends")
-            while not _locked(fd):
+            while fd is None:
                 if is_over():
                     yield False
                     return
                 time.sleep(_POLL_S)
+                fd = try_lock(lock)
+            held.callback(os.close, fd)
         yield True
-
-
-def _locked(fd: int) -> bool:
-    try:
-        fcntl.flock(fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except BlockingIOError:
-        return False
-    return True

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections.abc import Collection
 from dataclasses import dataclass
 from typing import Any
 
@@ -16,9 +16,17 @@ from gmijax.partition.planner import make_plan
 
 @dataclass(frozen=True)
 class Place:
-    """Where a job runs: a slice of each of its GPUs."""
+    """Where a job runs.
+
+    Attributes:
+      slices: one of each of its GPUs.
+      label: in words, e.g. `GPU 0 place 1` by the index of nvidia-smi; without GPUs `place 1`.
+      kept_free: others of its GPUs, where nobody else runs meanwhile.
+    """
 
     slices: tuple[Slice, ...]
+    label: str
+    kept_free: tuple[Slice, ...] = ()
 
     @property
     def devices(self) -> tuple[str, ...]:
@@ -29,11 +37,6 @@ class Place:
     def cpus(self) -> tuple[int, ...]:
         """Cores of its processes."""
         return tuple(sorted({cpu for share in self.slices for cpu in share.cpus}))
-
-    @property
-    def label(self) -> str:
-        """In words, e.g. `GPU 0.1`: the second place on the first GPU."""
-        return " ".join(f"{share.gpu}.{share.gmi}" for share in self.slices)
 
     def memory_fraction(self, config: TrainConfig) -> float | None:
         """For each GMI of a job that is put here; None where memory is not divided."""
@@ -72,27 +75,44 @@ def places_of(settings: SweepConfig, machine: Machine, backends: Collection[str]
 
 
 class Places:
-    """All places of a sweep, free and taken."""
+    """All places of a sweep, free and taken; see `places_of` for the plan."""
 
-    def __init__(self, slices: Sequence[Slice]) -> None:
-        self._free = list(slices)
+    def __init__(self, plan: Plan, machine: Machine) -> None:
+        self._free = list(plan.slices)
+        index_of = {gpu.uuid: gpu.index for gpu in machine.gpus}
+        index_of |= {one.uuid: gpu.index for gpu in machine.gpus for one in gpu.instances}
+        self._all: dict[int, list[Slice]] = {}
+        self._labels: dict[int, str] = {}
+        for share in plan.slices:
+            here = self._all.setdefault(share.gpu, [])
+            gpu = f"GPU {index_of[share.device]} " if share.device in index_of else ""
+            self._labels[share.gmi] = f"{gpu}place {len(here)}"
+            here.append(share)
 
     def has_room(self) -> bool:
         """Whether any place is free."""
         return bool(self._free)
 
-    def take(self, num_gpus: int) -> Place | None:
-        """A place on each of `num_gpus` GPUs, those with the most free ones; None: not now."""
+    def take(self, num_gpus: int, *, alone: bool = False) -> Place | None:
+        """A place on each of `num_gpus` GPUs, those with the most free ones; None: not now.
+
+        With `alone` they are GPUs on which nobody else runs, now or until it is given back.
+        """
         by_gpu: dict[int, list[Slice]] = {}
         for share in self._free:
             by_gpu.setdefault(share.gpu, []).append(share)
+        if alone:
+            by_gpu = {gpu: free for gpu, free in by_gpu.items() if free == self._all[gpu]}
         emptiest = sorted(by_gpu.values(), key=len, reverse=True)[:num_gpus]
         if len(emptiest) < num_gpus:
             return None
         taken = tuple(free[0] for free in emptiest)
-        self._free = [share for share in self._free if share not in taken]
-        return Place(taken)
+        others = tuple(share for free in emptiest for share in free[1:]) if alone else ()
+        self._free = [share for share in self._free if share not in (*taken, *others)]
+        label = ", ".join(self._labels[share.gmi] for share in taken)
+        return Place(taken, f"{label} alone" if alone else label, others)
 
     def give_back(self, place: Place) -> None:
         """The job that was there has ended."""
-        self._free = sorted([*self._free, *place.slices], key=lambda share: share.gmi)
+        free = [*self._free, *place.slices, *place.kept_free]
+        self._free = sorted(free, key=lambda share: share.gmi)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import io
+import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -13,7 +14,7 @@ from rich.table import Table
 from gmijax.config.schema import to_dict
 from gmijax.config.sweep import SweepConfig
 from gmijax.runs.folder import write_json, write_text
-from gmijax.sweeps.jobs import Job, SweepPaths, label_of
+from gmijax.sweeps.jobs import Job, SweepPaths, label_of, trainings_per_hour
 from gmijax.version import __version__
 
 CURVE_POINTS = 200
@@ -28,13 +29,13 @@ def write_report(
     wall_s: float,
 ) -> dict[str, Any]:
     """Writes the files; returns the content of `sweep.json`."""
-    rows = [_row(job, paths) for job in jobs]
-    done = [row for row in rows if row["state"] == "completed"]
+    first_s = min((job.progress.started_s or math.inf for job in jobs), default=math.inf)
+    rows = [_row(job, paths, first_s) for job in jobs]
     data = {
         "status": status,
         "sweep": to_dict(sweep),
         "wall_s": round(wall_s, 3),
-        "trainings_per_hour": 3600.0 * len(done) / wall_s if wall_s else None,
+        "trainings_per_hour": trainings_per_hour(jobs),
         "ranking": [row["job"] for row in ranked(rows, sweep)],
         "jobs": rows,
         "versions": {"gmijax": __version__},
@@ -113,8 +114,9 @@ def spread(
     return steps, (values * inside).sum(axis=0) / inside.sum(axis=0), low, high
 
 
-def _row(job: Job, paths: SweepPaths) -> dict[str, Any]:
+def _row(job: Job, paths: SweepPaths, first_s: float) -> dict[str, Any]:
     progress = job.progress
+    start_s, update_s = progress.started_s, progress.updated_s
     return {
         "job": job.number,
         "overrides": dict(job.overrides),
@@ -122,6 +124,8 @@ def _row(job: Job, paths: SweepPaths) -> dict[str, Any]:
         "state": progress.state,
         "value": progress.value,
         "env_steps": progress.env_steps,
+        "start_s": None if start_s is None else round(start_s - first_s, 3),
+        "first_update_s": None if not start_s or not update_s else round(update_s - start_s, 3),
         "wall_s": round(progress.wall_s, 3),
         "error": progress.error,
     }

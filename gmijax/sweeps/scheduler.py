@@ -2,20 +2,25 @@
 
 from __future__ import annotations
 
+import json
 import time
 from collections.abc import Callable
+from contextlib import suppress
 
 from gmijax.config.schema import to_dict
 from gmijax.config.sweep import SweepConfig
 from gmijax.errors import JobInterrupted
 from gmijax.machine.mps_control import PIPE_VARIABLE
 from gmijax.machine.processes import members_of, wait_until_gone
-from gmijax.partition.plan import Plan
-from gmijax.runs.folder import is_locked
+from gmijax.machine.snapshot import DAEMONS_VARIABLE
+from gmijax.runs.folder import add_event, is_locked
 from gmijax.runs.history import MetricsReader
 from gmijax.supervise.backends.backend import Backend
+from gmijax.supervise.failures import may_be_anothers
 from gmijax.supervise.launcher import StopSignals
 from gmijax.sweeps.children import Child, start
+from gmijax.sweeps.compiled import CompiledPrograms
+from gmijax.sweeps.hparams import write_hparams
 from gmijax.sweeps.jobs import Job, SweepPaths, placed
 from gmijax.sweeps.places import Place, Places
 from gmijax.sweeps.study import Study
@@ -28,13 +33,16 @@ _KILL_AFTER_S = 15.0
 class Scheduler:
     """Starts jobs where there is room, reads how far they are, and ends them when told to.
 
+    A job that fails ends alone. But where it shared an MPS daemon, and the fault may have been
+    that of another client, it is run once more, from its last checkpoint and alone on its GPU.
+
     Args:
       jobs: those that are known; those that are `waiting` are run. More come from the study.
       study: see above; is told how jobs do.
       sweep: settings.
       paths: files of the sweep.
-      plan: its slices are the places of the jobs.
-      backend: of the plan, entered.
+      places: of the jobs.
+      backend: of the plan of the places, entered.
       on_tick: called ten times a second.
     """
 
@@ -44,18 +52,18 @@ class Scheduler:
         study: Study,
         sweep: SweepConfig,
         paths: SweepPaths,
-        plan: Plan,
+        places: Places,
         backend: Backend,
         on_tick: Callable[[], None],
     ) -> None:
         self._jobs, self._study = jobs, study
         self._queue = [job for job in jobs if job.progress.state == "waiting"]
         self._sweep, self._paths = sweep, paths
-        self._plan, self._backend, self._on_tick = plan, backend, on_tick
-        self._places = Places(plan.slices)
+        self._places, self._backend, self._on_tick = places, backend, on_tick
+        self._alone: set[int] = set()
         self._running: dict[int, Child] = {}
         self._readers: dict[int, MetricsReader] = {}
-        self._compiled: set[str] = set()
+        self._compiled = CompiledPrograms()
         self._compiling: dict[str, int] = {}
 
     def run(self, signals: StopSignals) -> None:
@@ -94,41 +102,38 @@ class Scheduler:
                 self._queue.append(job)
 
     def _start_if_it_fits(self, job: Job) -> bool:
-        place = self._places.take(job.num_gpus)
+        place = self._places.take(job.num_gpus, alone=job.number in self._alone)
         if place is None:
             return False
-        if (program := job.program) not in self._compiled:
-            self._compiling[program] = job.number
+        if not self._compiled.holds(job):
+            self._compiling[job.program] = job.number
         self._start(job, place)
         return True
 
     def _start(self, job: Job, place: Place) -> None:
         run = self._paths.job(job.number)
-        config = placed(job, run, place, self._plan.backend)
+        # Alone on a GPU a job does as it would without a sweep.
+        backend = "auto" if self._sweep.jobs_per_gpu == 1 else self._backend.plan.backend
+        config = placed(job, run, place, backend)
         order, log = self._paths.order(job.number), self._paths.log(job.number)
-        child = start(job, place, to_dict(config), order, log, self._variables(place))
+        variables = variables_of(place, self._backend)
+        self._readers[job.number] = reader = MetricsReader(run.metrics)
+        progress = job.progress
+        progress.read(run, self._sweep)
+        reader.new()  # Those are an earlier attempt's.
+        child = start(job, place, to_dict(config), order, log, variables)
         self._running[job.number] = child
         self._backend.started(child.process.pid)
-        self._readers[job.number] = MetricsReader(run.metrics)
-        job.progress.state, job.progress.place = "running", place.label
-
-    def _variables(self, place: Place) -> dict[str, str]:
-        if not place.devices:
-            return {}
-        found = {"CUDA_VISIBLE_DEVICES": ",".join(place.devices)}
-        # The daemon of one GPU is of no use to a job that has several.
-        pipe = self._backend.environment(place.slices[0].gmi).get(PIPE_VARIABLE)
-        if pipe is not None and len(place.devices) == 1:
-            found[PIPE_VARIABLE] = pipe
-        return found
+        progress.state, progress.place, progress.error = "running", place.label, None
+        progress.started_s, progress.updated_s, progress.ended_s = time.monotonic(), None, None
 
     def _look(self) -> None:
         for number, child in list(self._running.items()):
             job, progress = child.job, child.job.progress
-            progress.wall_s = child.wall_s
             for line in self._readers[number].new():
                 progress.take(line, self._sweep)
-                self._has_compiled(job)
+                progress.updated_s = progress.updated_s or time.monotonic()
+                self._nobody_waits_for(job, has_compiled=True)
             if child.has_ended():
                 self._finish(child)
             elif not child.is_pruned and self._study.is_hopeless(job):
@@ -141,20 +146,34 @@ class Scheduler:
         wait_until_gone(members_of(child.process.pid), _KILL_AFTER_S)
         is_interrupted, error = child.close()
         self._places.give_back(child.place)
-        self._has_compiled(job)
-        progress.read(self._paths.job(job.number), self._sweep)
-        progress.place, progress.error = "", error
+        self._nobody_waits_for(job, has_compiled=False)
+        run = self._paths.job(job.number)
+        progress.read(run, self._sweep)
+        progress.place, progress.error, progress.ended_s = "", error, time.monotonic()
         progress.state = "failed" if error else "completed"
         if is_interrupted:
             progress.state = "pruned" if child.is_pruned else "interrupted"
+        elif error and self._may_be_anothers(job, error):
+            self._alone.add(job.number)
+            self._queue.append(job)
+            progress.state, progress.error = "waiting", f"again, alone on its GPU, after {error}"
+            add_event(run.events, "again", reason=progress.error)
+            return
+        with suppress(OSError):  # A full disk must not end the sweep.
+            write_hparams(job, run, self._sweep.objective)
         self._study.tell(job)
 
-    def _has_compiled(self, job: Job) -> None:
-        """Its metrics are there, or it has ended: nobody waits for it any more."""
-        program = job.program
-        if self._compiling.get(program) == job.number:
-            del self._compiling[program]
-            self._compiled.add(program)
+    def _may_be_anothers(self, job: Job, error: str) -> bool:
+        """Whether a job that may start again failed by what another one may have done."""
+        has_daemon = self._backend.plan.backend in ("mps", "mig")
+        may_restart = job.config.run.max_restarts > 0 and job.number not in self._alone
+        return has_daemon and may_restart and may_be_anothers(error)
+
+    def _nobody_waits_for(self, job: Job, *, has_compiled: bool) -> None:
+        """Its metrics are there, or it has ended, perhaps before it had compiled."""
+        if self._compiling.get(job.program) == job.number:
+            del self._compiling[job.program]
+            self._compiled.add(job, is_lasting=has_compiled)
 
     def _stop(self, signals: StopSignals) -> None:
         """Asks all jobs to save and end; the same signal again ends them at once."""
@@ -174,3 +193,16 @@ class Scheduler:
             child.kill()
         for child in left:
             self._finish(child)
+
+
+def variables_of(place: Place, backend: Backend) -> dict[str, str]:
+    """What tells a job at a place its GPUs, and the daemon of each; a dead daemon is renewed."""
+    if not place.devices:
+        return {}
+    daemons: dict[str, str] = {}
+    for share in place.slices:
+        backend.renew(share.gmi)
+        if pipe := backend.environment(share.gmi).get(PIPE_VARIABLE):
+            daemons[share.device] = pipe
+    devices = ",".join(place.devices)
+    return {"CUDA_VISIBLE_DEVICES": devices, DAEMONS_VARIABLE: json.dumps(daemons)}

@@ -16,6 +16,9 @@ MakeJob = Callable[[int, Mapping[str, str]], Job]
 _REPORTS = 100
 """Values that a pruner gets of a whole job."""
 
+_MOST_RANDOM = 10
+"""Trials before TPE begins, with many of them: Optuna's default. With few, a quarter of them."""
+
 
 class Study(Protocol):
     """Hands out jobs, and is told what became of them."""
@@ -52,7 +55,8 @@ class NoStudy:
 class OptunaStudy:
     """Jobs as the trials of an Optuna study, which a file keeps.
 
-    Trials that a killed sweep left running are handed out again first, with their numbers.
+    Trials that a killed sweep left running, and failed ones, which stay open in the study, are
+    handed out again first, with their numbers.
 
     Args:
       settings: sampler, pruner and number of trials.
@@ -68,26 +72,29 @@ class OptunaStudy:
         self._optuna = optuna = _optuna()
         optuna.logging.set_verbosity(optuna.logging.WARNING)
         backend = optuna.storages.journal.JournalFileBackend(str(journal))
-        self._study = optuna.create_study(
+        self._study = study = optuna.create_study(
             study_name="sweep",
             storage=optuna.storages.JournalStorage(backend),
             load_if_exists=True,
             direction=settings.direction,
-            sampler=_sampler(optuna, settings),
             pruner=_pruner(optuna, settings),
         )
+        # A command that goes on draws others than the first one did.
+        study.sampler = _sampler(optuna, settings, settings.seed + len(study.trials))
         self._distributions = {key: _distribution(optuna, v) for key, v in space.items()}
-        self._left = [trial for trial in self._study.trials if not trial.state.is_finished()]
+        self._left = [trial for trial in study.trials if not trial.state.is_finished()]
         self._trials: dict[int, Any] = {}
-        self._reported: dict[int, int] = {}
+        self._reported = {t.number: max(t.intermediate_values, default=0) for t in self._left}
 
     def earlier(self) -> list[Job]:
-        """The jobs of trials that have ended, as an earlier command left them."""
-        return [
-            self._make_job(trial.number, self._chosen(trial.params))
-            for trial in self._study.trials
-            if trial.state.is_finished()
-        ]
+        """The jobs of trials that have ended, the pruned ones marked as such."""
+        jobs = []
+        for trial in self._study.trials:
+            if trial.state.is_finished():
+                jobs.append(self._make_job(trial.number, self._chosen(trial.params)))
+                if trial.state == self._optuna.trial.TrialState.PRUNED:
+                    jobs[-1].progress.state = "pruned"
+        return jobs
 
     def next(self) -> Job | None:
         """See `Study`."""
@@ -103,7 +110,9 @@ class OptunaStudy:
 
     def is_hopeless(self, job: Job) -> bool:
         """See `Study`."""
-        trial, progress = self._trials[job.number], job.progress
+        trial, progress = self._trials.get(job.number), job.progress
+        if trial is None:
+            return False  # It has ended before, and goes on for more steps.
         place = _REPORTS * progress.env_steps // job.config.num_timesteps
         if progress.value is None or place <= self._reported.get(job.number, 0):
             return False
@@ -114,13 +123,14 @@ class OptunaStudy:
     def tell(self, job: Job) -> None:
         """See `Study`."""
         states, progress = self._optuna.trial.TrialState, job.progress
-        number = job.number
-        if progress.state == "completed" and progress.value is not None:
-            self._study.tell(number, progress.value)
-        elif progress.state == "pruned":
-            self._study.tell(number, state=states.PRUNED)
-        elif progress.state in ("completed", "failed"):
-            self._study.tell(number, state=states.FAIL)
+        value, state = progress.value, None
+        if progress.state == "pruned":
+            value, state = None, states.PRUNED
+        elif progress.state != "completed":
+            return  # The same sweep, run again, goes on with it.
+        elif value is None:
+            state = states.FAIL
+        self._study.tell(job.number, value, state=state, skip_if_finished=True)
 
     def _chosen(self, params: Mapping[str, Any]) -> dict[str, str]:
         chosen: dict[str, str] = {}
@@ -148,12 +158,13 @@ def _distribution(optuna: Any, values: Any) -> Any:
     return kind(values.low, values.high, log=values.is_log)
 
 
-def _sampler(optuna: Any, settings: SweepConfig) -> Any:
+def _sampler(optuna: Any, settings: SweepConfig, seed: int) -> Any:
     samplers = optuna.samplers
     if settings.sampler == "tpe":
+        random = min(_MOST_RANDOM, max(1, (settings.trials or 0) // 4))
         # Trials that still run count as bad ones, or several at once would be nearly the same.
-        return samplers.TPESampler(seed=settings.seed, constant_liar=True)
-    return samplers.RandomSampler(seed=settings.seed)
+        return samplers.TPESampler(seed=seed, n_startup_trials=random, constant_liar=True)
+    return samplers.RandomSampler(seed=seed)
 
 
 def _pruner(optuna: Any, settings: SweepConfig) -> Any:

@@ -27,11 +27,12 @@ from gmijax.sweeps.jobs import (
     Job,
     SweepPaths,
     jobs_of,
+    require_objective,
     require_placeable,
     state_of,
 )
 from gmijax.sweeps.leases import leased
-from gmijax.sweeps.places import places_of
+from gmijax.sweeps.places import Places, places_of
 from gmijax.sweeps.report import ranking, write_report
 from gmijax.sweeps.scheduler import Scheduler
 from gmijax.sweeps.space import Space
@@ -103,6 +104,7 @@ def run_request(request: Request, *, show: bool = False) -> SweepResult:
     # Before anything is started: whether there are such GPUs, and room for so many jobs.
     plan = places_of(settings, machine, backends)
     require_placeable(request.jobs, plan.layout.num_gpus)
+    require_objective(request.jobs, settings)
     paths = _open(request.jobs)
     with locked(paths.lock, f"run.dir={paths.root}"):
         jobs, study = _beginning(request, paths)
@@ -121,7 +123,8 @@ def run_request(request: Request, *, show: bool = False) -> SweepResult:
                 _announce(console, plan, request, jobs)
                 backend = held.enter_context(open_backend(plan, machine, paths))
                 held.enter_context(view)
-                scheduler = Scheduler(jobs, study, settings, paths, plan, backend, view.update)
+                places = Places(plan, machine)
+                scheduler = Scheduler(jobs, study, settings, paths, places, backend, view.update)
                 scheduler.run(signals)
             failed = [job for job in jobs if job.progress.state == "failed"]
             status = "failed" if failed else "completed"
@@ -184,9 +187,8 @@ def _beginning(request: Request, paths: SweepPaths) -> tuple[list[Job], Study]:
     for job in jobs:
         run = paths.job(job.number)
         job.progress.read(run, settings)
-        job.progress.state = state_of(run, job.config)
-        if job.progress.state == "waiting" and settings.sampler != "grid":
-            job.progress.state = "pruned"  # The study knows that it has ended.
+        if job.progress.state != "pruned":
+            job.progress.state = state_of(run, job.config)
     write_json(paths.request, wanted)
     return jobs, study
 

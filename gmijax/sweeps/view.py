@@ -2,20 +2,20 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Sequence
 from typing import Any, Self
 
 from rich.console import Console, Group
-from rich.live import Live
 from rich.table import Table
 from rich.text import Text
 
 from gmijax.config.sweep import SweepConfig
-from gmijax.sweeps.jobs import Job, Progress
+from gmijax.control.display import LiveDisplay, bar, clock
+from gmijax.sweeps.jobs import Job, Progress, trainings_per_hour
 
-_HEADINGS = ("job", "overrides", "place", "progress", "steps/s", "best", "ETA", "state")
+_HEADINGS = ("job", "overrides", "GPU and place", "progress", "{}", "best", "ETA", "state")
 _MOST_ROWS = 30
+_BAR_WIDTH = 10
 _ORDER = ("running", "failed", "interrupted", "waiting", "pruned", "completed")
 
 
@@ -28,52 +28,43 @@ class SweepView:
       sweep: settings.
     """
 
-    def __init__(
-        self,
-        console: Console,
-        jobs: Sequence[Job],
-        sweep: SweepConfig,
-    ) -> None:
+    def __init__(self, console: Console, jobs: Sequence[Job], sweep: SweepConfig) -> None:
         self._console, self._jobs, self._sweep = console, jobs, sweep
-        self._started_s = time.monotonic()
-        self._done_before = self._count("completed")
         self._states: dict[int, str] = {}
-        self._has_panel = console.is_terminal and not console.quiet
-        self._live = Live(console=console, refresh_per_second=2, transient=True)
+        self._display = LiveDisplay(console)
 
     def __enter__(self) -> Self:
-        if self._has_panel:
-            self._live.start()
+        self._display.__enter__()
         return self
 
     def __exit__(self, *exc: Any) -> None:
-        if self._has_panel:
-            self._live.stop()
-        self.update()
+        self._display.__exit__(*exc)
+        self._display.show(self._print_changes)
 
     def update(self) -> None:
         """Called about ten times a second."""
-        if self._has_panel and self._live.is_started:
-            self._live.update(Group(self._table(), Text(self.line())))
-            return
-        for job in self._jobs:
-            progress = job.progress
-            if self._states.get(job.number, "waiting") != progress.state:
-                self._states[job.number] = progress.state
-                self._console.print(self._change(job, progress))
+        self._display.show(self._show)
 
     def line(self) -> str:
         """How far the whole sweep is."""
-        hours = (time.monotonic() - self._started_s) / 3600
-        done = self._count("completed") - self._done_before
-        rate = sum(
-            job.progress.env_steps_per_s for job in self._jobs if job.progress.state == "running"
-        )
-        counts = ", ".join(f"{n} {state}" for state in _ORDER if (n := self._count(state)))
-        return f"{counts}; {rate:,.0f} steps/s, {done / hours:,.1f} trainings/h"
+        states = [job.progress.state for job in self._jobs]
+        counts = ", ".join(f"{states.count(state)} {state}" for state in _ORDER if state in states)
+        running = [job.progress for job in self._jobs if job.progress.state == "running"]
+        rate = sum(progress.env_steps_per_s for progress in running)
+        per_hour = trainings_per_hour(self._jobs) or 0.0
+        return f"{counts}; {rate:,.0f} steps/s, {per_hour:,.1f} trainings/h"
 
-    def _count(self, state: str) -> int:
-        return sum(job.progress.state == state for job in self._jobs)
+    def _show(self) -> Group | None:
+        self._print_changes()
+        return Group(self._table(), Text(self.line())) if self._display.has_panel else None
+
+    def _print_changes(self) -> None:
+        """States of jobs that are new; those that the table shows only if one has failed."""
+        for job in self._jobs:
+            before, now = self._states.get(job.number, "waiting"), job.progress.state
+            self._states[job.number] = now
+            if before != now and (now == "failed" or not self._display.has_panel):
+                self._console.print(self._change(job, job.progress))
 
     def _change(self, job: Job, progress: Progress) -> str:
         what = f"job {job.number} {job.label}: {progress.state}"
@@ -88,29 +79,28 @@ class SweepView:
     def _table(self) -> Table:
         table = Table(box=None, pad_edge=False)
         for heading in _HEADINGS:
-            table.add_column(heading, no_wrap=heading != "overrides")
-        rows = sorted(self._jobs, key=lambda job: _ORDER.index(self._state(job)))
+            name = heading.format(self._sweep.objective)
+            table.add_column(name, no_wrap=heading not in ("overrides", "state"))
+        rows = sorted(self._jobs, key=lambda job: _ORDER.index(job.progress.state))
         for job in rows[:_MOST_ROWS]:
-            table.add_row(*self._row(job, job.progress))
+            table.add_row(*_row(job, job.progress))
         if len(rows) > _MOST_ROWS:
             table.add_row("", f"and {len(rows) - _MOST_ROWS} more")
         return table
 
-    def _state(self, job: Job) -> str:
-        return job.progress.state
 
-    def _row(self, job: Job, progress: Progress) -> tuple[str, ...]:
-        total = job.config.num_timesteps
-        part = min(progress.env_steps / total, 1.0)
-        rate = progress.env_steps_per_s
-        left_s = (total - progress.env_steps) / rate if rate else None
-        return (
-            str(job.number),
-            job.label,
-            progress.place,
-            f"{part:.0%}",
-            f"{rate:,.0f}" if rate else "",
-            "" if progress.value is None else f"{progress.value:.4g}",
-            "" if left_s is None else f"{left_s:,.0f} s",
-            progress.error or progress.state,
-        )
+def _row(job: Job, progress: Progress) -> tuple[str | Text, ...]:
+    total, rate = job.config.num_timesteps, progress.env_steps_per_s
+    part = min(progress.env_steps / total, 1.0)
+    left_s = max(0.0, total - progress.env_steps) / rate if rate else None
+    return (
+        str(job.number),
+        # As text: overrides and errors may look like markup.
+        Text(job.label),
+        progress.place,
+        Text.assemble(bar(part, _BAR_WIDTH), f" {part:.0%}"),
+        f"{progress.curve[-1][1]:.4g}" if progress.curve else "",
+        "" if progress.value is None else f"{progress.value:.4g}",
+        "" if left_s is None else clock(left_s),
+        Text(f"{progress.state}: {progress.error}" if progress.error else progress.state),
+    )

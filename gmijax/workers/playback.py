@@ -1,4 +1,4 @@
-"""Main of the evaluating child of `gmijax.play`, started by `gmijax.control.evaluation` only.
+"""Main of the evaluating child of `gmijax.play`, started by `gmijax.deploy.playing` only.
 
 Restores a policy, runs episodes with it, and writes their returns and a trajectory to film.
 """
@@ -34,9 +34,7 @@ def _run(link: ChildLink) -> None:
     config = from_dict(PlayConfig, read_json(link.run.config))
     checkpoint = Path(str(config.checkpoint))
     env_config, algo = trained_config(checkpoint)
-    if config.run.env is not None:
-        noted = {"name": config.run.env, "source_sha256": config.run.env_sha256}
-        env_config = dataclasses.replace(env_config, **noted)
+    env_config = config.run.task(env_config)
     # jax starts here, in the environment that the plan prepared.
     import jax
 
@@ -46,7 +44,8 @@ def _run(link: ChildLink) -> None:
     from gmijax.sim.randomize import make_worlds
 
     impl = _impl(config, checkpoint, env_config)
-    played = dataclasses.replace(env_config, randomize=config.randomize)
+    # At its full range: what was learnt in the end is what counts.
+    played = dataclasses.replace(env_config, randomize=config.randomize, curriculum="off")
     env = make_worlds(played, impl, seed=config.seed, first_env=0, num_envs=config.num_envs)
     _check_camera(config.camera, env)
     learner = make_learner(env.spec, algo)

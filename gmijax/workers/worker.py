@@ -162,8 +162,10 @@ def _trainers_reducer(
     It averages a gradient and the parts of the loss, the named tuple `losses`.
     """
     from gmijax.collectives.build import Membership, build_reducer
+    from gmijax.collectives.nodes.meeting import inherited_nodes
     from gmijax.learning.updates import exchange_size
 
+    nodes, listener = inherited_nodes()
     membership = Membership(
         layout=trainers.layout,
         rank=trainers.gmis.index(link.gmi),
@@ -174,6 +176,8 @@ def _trainers_reducer(
         intra=plan.intra,
         # Whoever asks for it by name is told that it does not work.
         host_if_unavailable=config.reduce.intra == "auto" and config.reduce.strategy != "one_shot",
+        nodes=nodes,
+        listener=listener,
     )
     return build_reducer(plan.strategy, membership)
 

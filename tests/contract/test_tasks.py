@@ -5,6 +5,8 @@ A task's programs are compiled once, for `NUM_ENVS` environments, and shared by 
 
 from __future__ import annotations
 
+import dataclasses
+import importlib
 from typing import Any
 
 import jax
@@ -18,6 +20,9 @@ from task_cases import CASES, OracleLimit
 from gmijax.cli.compose import compose
 from gmijax.sim import physics
 from gmijax.sim.randomize import randomized
+from gmijax.sim.registry import TASKS
+from gmijax.sim.rewards import RewardTerm
+from gmijax.sim.tasks.settings import CURRICULA, SETTINGS
 from gmijax.sim.wrappers import BatchState, StepOutput
 
 
@@ -112,6 +117,34 @@ def test_the_ranges_of_its_randomisation_fit_its_model(task: CompiledTask):
     for leaf in config.randomization:
         values = np.asarray(getattr(many.model, leaf))
         assert not np.array_equal(values[0], values[1])
+
+
+def test_every_setting_is_read_and_terms_without_weight_are_not_traced(
+    task: CompiledTask, monkeypatch: pytest.MonkeyPatch
+):
+    name = task.env.spec.name
+    module, read = importlib.import_module(TASKS[name]), set()
+
+    class Recorded(SETTINGS[name]):
+        def __getattribute__(self, key: str) -> Any:
+            read.add(key)
+            return super().__getattribute__(key)
+
+    def untraced(view: Any) -> Any:
+        raise AssertionError
+
+    settings, terms = Recorded(), {key: RewardTerm(untraced, 1.0) for key in module.TERMS}
+    read.clear()  # Of the checks of a new one.
+    monkeypatch.setattr(module, "settings_from", lambda cls, given: settings)
+    monkeypatch.setattr(module, "TERMS", terms)
+    curriculum = {"curriculum": True} if name in CURRICULA else {}
+    env = module.make(impl=task.impl, max_envs=1, rewards=dict.fromkeys(terms, 0.0), **curriculum)
+    state = jax.eval_shape(env.reset, env.model, jax.random.key(0))
+    jax.eval_shape(env.step, env.model, state, task.actions(0)[0])
+    if curriculum:
+        assert jax.eval_shape(env.next_episode, env.model, state) == state
+    assert env.spec.reward_terms == task.env.spec.reward_terms
+    assert {field.name for field in dataclasses.fields(settings)} <= read
 
 
 def test_one_physics_step_is_that_of_mujoco_in_c(task: CompiledTask):

@@ -16,6 +16,7 @@ from training_jobs import train
         ("search", ["num_env=3"], "unknown key num_env: did you mean num_envs?"),
         ("serve", ["policy=random", "num_envs=0"], "num_envs=0: must be at least 1"),
         ("play", [], "run.dir=last: no run with a checkpoint"),
+        ("export", [], "run.dir=last: no run with a checkpoint"),
         ("doctor", ["gpu=x"], "gpu=x: allowed are --json"),
     ],
 )

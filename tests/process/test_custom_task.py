@@ -18,14 +18,14 @@ from gmijax.sim.interface import Env, EnvSpec
 
 SPEC = EnvSpec("point", 1, 1, 0.1, 5, ("near", "effort"))
 
-def make(*, impl, max_envs):
+def make(*, impl, max_envs, settings):
     def reset(model, key):
         key, draw = jax.random.split(key)
         start = jax.random.uniform(draw, (1,))
         return episode.begin(SPEC, start, (), start, key)
 
     def step(model, state, action):
-        moved = state.physics + 0.1 * action
+        moved = state.physics + settings["pace"] * action
         terms = {"near": -jnp.abs(moved[0]), "effort": -0.1 * action[0] ** 2}
         reward = terms["near"] + terms["effort"], terms
         return episode.advance(state, moved, (), moved, reward, moved[0] > 3.0)
@@ -42,7 +42,8 @@ SMALL = (
 def test_a_task_of_ones_own_trains_in_two_gmis_resumes_and_plays(tmp_path: Path):
     file = tmp_path / "point.py"
     file.write_text(TASK)
-    task = ("env=point.py:make", *SMALL, "num_timesteps=256", "plan.gpus=2")
+    changes = ("env.settings.pace=0.1", "env.history=3", "env.action_repeat=2")
+    task = ("env=point.py:make", *changes, *SMALL, "num_timesteps=256", "plan.gpus=2")
     done = train(*task, cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     (run,) = (tmp_path / "runs").iterdir()
@@ -51,7 +52,7 @@ def test_a_task_of_ones_own_trains_in_two_gmis_resumes_and_plays(tmp_path: Path)
     assert config["env"]["name"] == f"{file}:make"
     assert len(config["env"]["source_sha256"]) == 64
     line = json.loads((run / "metrics.jsonl").read_text().splitlines()[-1])
-    assert line["episode_length"] == 5.0
+    assert line["episode_length"] == 3.0  # Actions, of which the last is taken for one step.
     assert line["return"] == pytest.approx(line["reward/near"] + line["reward/effort"], rel=1e-4)
 
     file.write_text(TASK.replace('{"near": -', '{"near": jnp.log(-1.0 - 0 * moved[0]) - '))

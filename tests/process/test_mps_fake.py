@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import signal
 import subprocess
@@ -14,19 +15,26 @@ from pathlib import Path
 import pytest
 from supervision import CHECKOUT, TESTS, gpu, machine, make_launch, plan_config, reduce_config
 
+from gmijax.cli.compose import compose
+from gmijax.config.sweep import SweepConfig
 from gmijax.errors import BackendUnavailable, GmiFailed, JobInterrupted
 from gmijax.machine.mps_control import PIPE_VARIABLE, MpsControl
 from gmijax.machine.nvidia import MigInstance
 from gmijax.machine.processes import ProcessId, identify, wait_until_gone
-from gmijax.machine.snapshot import Machine, detect_machine
+from gmijax.machine.snapshot import DAEMONS_VARIABLE, Machine, detect_machine
 from gmijax.partition.plan import Plan
 from gmijax.partition.planner import make_plan
 from gmijax.runs.folder import RunPaths, read_json, write_json
 from gmijax.supervise.backends import open_backend
-from gmijax.supervise.gmi_process import GmiStatus
 from gmijax.supervise.kinds import JobKind
-from gmijax.supervise.launcher import Launch, run_gmis
-from gmijax.supervise.supervisor import Supervisor, Timeouts
+from gmijax.supervise.launch import Timeouts
+from gmijax.supervise.launcher import Launch, StopSignals, run_gmis
+from gmijax.supervise.supervisor import Supervisor
+from gmijax.supervise.watched_gmi import GmiStatus
+from gmijax.sweeps.jobs import SweepPaths, jobs_of
+from gmijax.sweeps.places import Places, places_of
+from gmijax.sweeps.scheduler import Scheduler, variables_of
+from gmijax.sweeps.study import NoStudy
 
 pytestmark = pytest.mark.timeout(60)
 
@@ -284,6 +292,59 @@ def test_daemon_of_somebody_else_is_used_and_left_alone(
             backend.verify({0: os.getpid()})
     finally:
         control.quit()
+
+
+def test_a_fatal_fault_ends_one_job_of_a_sweep_and_its_neighbours_go_on(
+    mps: FakeMps, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    monkeypatch.setattr("gmijax.sweeps.children.MODULE", "fake_training_job")
+    monkeypatch.setenv("JAX_COMPILATION_CACHE_DIR", str(tmp_path))
+    monkeypatch.setenv("PYTHONPATH", f"{CHECKOUT}{os.pathsep}{TESTS}")
+    here = machine(2, mps_control=mps.program)
+    # Of programs of their own, so that none waits for another one to compile.
+    jobs = list(jobs_of([compose(f"seed={n}", f"num_envs={n + 1}") for n in range(6)]))
+    settings, paths = SweepConfig(jobs_per_gpu=3), SweepPaths(tmp_path)
+    plan = places_of(settings, here, {"auto"})
+    with open_backend(plan, here, paths) as backend:
+        places = Places(plan, here)
+        scheduler = Scheduler(jobs, NoStudy(), settings, paths, places, backend, lambda: None)
+        scheduler.run(StopSignals())
+    states = [job.progress.state for job in jobs]
+    assert states == ["completed", "failed", *["completed"] * 4]
+    assert "CUDA_ERROR_LAUNCH_FAILED" in str(jobs[1].progress.error)
+    starts = [(paths.job(n).root / "starts").read_text().splitlines() for n in range(6)]
+    assert [len(lines) for lines in starts] == [1, 2, 1, 2, 1, 2]
+    # From their checkpoints, and nobody beside them: it could be the fault of each.
+    assert {starts[n][1] for n in (1, 3, 5)} == {"from step 5 beside 0"}
+    assert [job.progress.value for job in jobs] == [10.0, 5.0, 10.0, 10.0, 10.0, 10.0]
+
+
+def test_a_job_with_several_gpus_uses_the_daemons_of_its_sweep(
+    mps: FakeMps, run: RunPaths, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    here = machine(2, mps_control=mps.program)
+    settings = SweepConfig(jobs_per_gpu=2)
+    plan = places_of(settings, here, {"auto"})
+    paths = SweepPaths(tmp_path / "sweep")
+    monkeypatch.setattr("gmijax.machine.snapshot.list_gpus", lambda: here.gpus)
+    with open_backend(plan, here, paths) as backend:
+        place = Places(plan, here).take(2)
+        assert place is not None
+        assert place.label == "GPU 0 place 0, GPU 1 place 0"
+        for name, value in variables_of(place, backend).items():
+            monkeypatch.setenv(name, value)
+        of_job = detect_machine()
+        assert [gpu.uuid for gpu in of_job.gpus] == [gpu(0).uuid, gpu(1).uuid]
+        with open_backend(mps_plan(of_job, num_gpus=2, gmis_per_gpu=1), of_job, run) as own:
+            directories = [own.environment(gmi)[PIPE_VARIABLE] for gmi in (0, 1)]
+        assert directories == [backend.environment(gmi)[PIPE_VARIABLE] for gmi in (0, 2)]
+        assert (len(mps.told("start")), len(mps.told("quit"))) == (2, 0)
+
+        MpsControl(mps.program, Path(directories[1])).quit()
+        again = json.loads(variables_of(place, backend)[DAEMONS_VARIABLE])
+        assert again[gpu(0).uuid] == directories[0]
+        assert MpsControl(mps.program, Path(again[gpu(1).uuid])).is_answering()
+    assert not [path for path in mps.pipe_directories() if path.exists()]
 
 
 def test_janitor_cleans_up_after_a_killed_controller(mps: FakeMps, run: RunPaths, tmp_path: Path):

@@ -21,8 +21,8 @@ from gmijax.partition.shares import split_cores
 from gmijax.runs.folder import RunPaths, read_json
 from gmijax.supervise.backends import Backend
 from gmijax.supervise.child import ENV_EXCHANGE_FD
-from gmijax.supervise.gmi_process import GmiStatus
 from gmijax.supervise.supervisor import Supervisor
+from gmijax.supervise.watched_gmi import GmiStatus
 
 pytestmark = pytest.mark.timeout(30)
 

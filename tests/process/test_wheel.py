@@ -109,6 +109,7 @@ def test_train_help_lists_keys_outside_the_checkout(python: Path, tmp_path: Path
     text = run([python, "-m", "gmijax.train", "--help"], tmp_path)
     for key in ("num_timesteps", "plan.gmis_per_gpu", "algo.learning_rate", "run.dir"):
         assert key in text
+    assert run([python.parent / "gmijax", "train", "--help"], tmp_path) == text
     assert list(tmp_path.iterdir()) == [], "--help must leave nothing behind"
 
 

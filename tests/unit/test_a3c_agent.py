@@ -25,7 +25,6 @@ from gmijax.learning.learner import (
     pack_weights,
 )
 from gmijax.learning.normalize import normalize
-from gmijax.learning.policy import log_prob
 from gmijax.runs.folder import RunPaths
 from gmijax.supervise.child import ChildLink
 
@@ -102,8 +101,9 @@ def test_newer_weights_are_taken_up_within_an_unroll(tmp_path) -> None:
 
     def told(experience, theirs):
         obs = normalize(theirs.moments, experience["state"])
-        mean = learner.networks.action_mean(theirs.params, obs)
-        return log_prob(mean, theirs.params.log_std, experience["action"])
+        networks, params = learner.networks, theirs.params
+        output = networks.output(params, obs)
+        return networks.distribution.log_prob(output, params.log_std, experience["action"])
 
     first, second, third = (experience for experience, _ in sender.taken)
     for experience, steps, theirs in (

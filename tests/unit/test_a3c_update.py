@@ -188,6 +188,8 @@ def test_two_trainers_stay_equal_and_weigh_fresh_unrolls_alike(config) -> None:
     only_fresh = jax.tree.map(lambda x: x[:, fresh > 0], both)
     _, theirs = _alone(learner)(state, only_fresh, jnp.ones(N + 1))
     np.testing.assert_allclose(losses, theirs.losses, rtol=1e-4, atol=1e-6)
+    for one in (said.explained_variance, told.explained_variance[0]):
+        np.testing.assert_allclose(one, theirs.explained_variance, rtol=1e-3, atol=1e-4)
 
 
 def test_a_minibatch_of_stale_unrolls_does_not_dilute_the_divergence(start, batch) -> None:
@@ -226,10 +228,15 @@ def test_learning_rates_of_all_minibatches_are_told(config) -> None:
     "changes",
     [
         {"clipping_epsilon": 0.2},
-        {"clipping_epsilon": 0.2, "vtrace": False},
+        {
+            "clipping_epsilon": 0.2,
+            "vtrace": False,
+            "normalize_values": True,
+            "reward_scaling": 100.0,
+        },
         {"num_updates_per_batch": 1},
     ],
-    ids=["vtrace-clip", "clip", "vtrace"],
+    ids=["vtrace-clip", "clip-normalised-values", "vtrace"],
 )
 def test_it_learns_to_stand_still_from_a_policy_that_lags(config, changes) -> None:
     learner, state, envs = _start(

@@ -17,8 +17,11 @@ from brax import envs
 from brax.envs.wrappers import training
 from training_jobs import POINT_TASK
 
+from gmijax.cli.compose import compose
 from gmijax.errors import ConfigError
+from gmijax.learning.learner import make_learner
 from gmijax.sim.adapters.theirs import adapt, observation
+from gmijax.sim.adapters.to_brax import BraxEnv
 from gmijax.sim.registry import make_env
 from gmijax.sim.wrappers import env_keys, time_limit, training_env
 
@@ -70,6 +73,23 @@ def test_the_policy_sees_the_entry_state_or_all_entries_by_name():
     assert observation({"b": some, "state": more, "a": some}).tolist() == [5.0]
     assert observation({"b": more, "a": some}).tolist() == [0.0, 1.0, 5.0]
     assert observation(some).dtype == jnp.float32
+
+
+def test_the_policy_sees_the_first_part_and_the_value_function_all():
+    obs = {"state": jnp.arange(2.0), "privileged_state": {"b": jnp.array(8.0), "a": jnp.ones(1)}}
+    assert observation(obs).tolist() == [0.0, 1.0, 1.0, 8.0]
+    env = adapt(Counter(), name="theirs", episode_length=9)
+    assert (env.spec.obs_size, env.spec.actor_obs_size) == (8, 3)
+    networks = make_learner(env.spec, compose().algo).networks
+    params = jax.eval_shape(lambda: networks.init(jax.random.key(0), env.spec.obs_size))
+    sizes = [
+        tree["params"]["Dense_0"]["kernel"].shape[0] for tree in (params.policy, params.value)
+    ]
+    assert sizes == [3, 8]
+    theirs = BraxEnv(env)
+    assert theirs.observation_size == {"state": (3,), "privileged_state": (8,)}
+    given: Any = theirs.reset(jax.random.key(0)).obs
+    assert {name: part.shape for name, part in given.items()} == theirs.observation_size
 
 
 def test_pictures_are_refused():
@@ -140,6 +160,7 @@ def test_an_environment_of_brax_without_a_model_still_trains():
 def test_an_environment_of_brax_brings_its_model_and_length():
     env = make_env("inverted_pendulum", suite="brax")
     assert env.mj_model.nq == 2
+    assert env.spec.actor_obs_size is None
     assert env.spec[1:5] == (4, 1, pytest.approx(0.04), 1000)
 
 
@@ -154,6 +175,18 @@ def test_an_environment_of_brax_brings_its_model_and_length():
             {"suite": "brax", "impl": "warp"},
             r"^physics\.impl=warp: .*allowed are auto, jax",
         ),
+        ("ant", {"suite": "brax", "rewards": {"a": 1}}, r"^env\.rewards\.a: not with env=brax"),
+        (
+            "ant",
+            {"rewards": {"enrgy": 1}},
+            r"^unknown key env\.rewards\.enrgy: did you mean",
+        ),
+        (
+            "ant",
+            {"settings": {"x": 1}},
+            r"^unknown key env\.settings\.x: allowed are death",
+        ),
+        ("ant", {"curriculum": True}, "^env.curriculum=on: ant has none; allowed are anymal and"),
         ("ant", {"suite": "gym"}, "^suite=gym: allowed are gmijax, brax, playground, custom$"),
         ("ant", {"api": "gym"}, "^api=gym: allowed are gmijax, brax$"),
         ("ant", {"api": "brax", "episode_length": 3}, "give it to Brax's EpisodeWrapper"),

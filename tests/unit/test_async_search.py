@@ -23,8 +23,8 @@ from gmijax.cli.compose import compose
 from gmijax.config import TrainConfig
 from gmijax.errors import ConfigError
 from gmijax.runs.folder import RunPaths
-from gmijax.supervise.gmi_process import GmiStatus
 from gmijax.supervise.kinds import training_plan
+from gmijax.supervise.watched_gmi import GmiStatus
 
 GRID = (
     *("search.gmis_per_gpu=[2,1]", "search.num_envs=[64,128]", "search.order=as_printed"),

@@ -1,31 +1,48 @@
-"""What the runner of benchmarks keeps of a file that is there."""
+"""What the runner of benchmarks runs, and adds to a file that is there."""
 
 from __future__ import annotations
 
-import json
+import sys
 from pathlib import Path
+from typing import Any
 
-from benchmarks.run import ResultsFile
+import pytest
+
+from benchmarks import run
+from benchmarks.cases import SUITES
+from benchmarks.records import read_calls
 
 SUITE, FIRST, SECOND = "lgr-ant-mrr", "2G2T mrr", "4G4T mrr"
+CASES = SUITES[SUITE]
+SUMMARY = {**dict.fromkeys(run.RATES, 2.0), "final_return": 1.0, "device": {"peak_memory_mib": 1}}
 
 
-def _on_disk(path: Path) -> Path:
-    runs = [{"summary": {}}, {"failed": "why"}]
-    path.write_text(json.dumps({"cases": {name: {"runs": runs} for name in (FIRST, SECOND)}}))
-    return path
+def test_only_what_is_missing_is_run_and_what_failed_again():
+    runs = [{"repeat": 0, "failed": "why"}, {"repeat": 1, "summary": {}}]
+    results = {"cases": {FIRST: {"runs": runs}, SECOND: {"runs": []}}}
+    wanted = [(repeat, case.name) for repeat, case in run.missing(results, CASES[:1], 3, None)]
+    assert wanted == [(0, FIRST), (2, FIRST)]
+    assert run.missing(results, CASES[1:], 1, 2) == []  # It needs four GPUs.
+    assert run.failures(results) == [FIRST]
+    runs.append({"repeat": 0, "summary": {}})
+    assert run.failures(results) == []
 
 
-def test_cases_that_are_kept_lose_what_failed_only(tmp_path: Path) -> None:
-    book = ResultsFile(_on_disk(tmp_path / "a.json"), SUITE, keep={FIRST})
-    kept, fresh = (book.results["cases"][name] for name in (FIRST, SECOND))
-    assert kept["runs"] == [{"summary": {}}]
-    assert fresh["runs"] == []
+def test_running_again_adds_a_call(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    made: list[int] = []
 
+    def run_case(*_: Any) -> dict[str, Any]:
+        made.append(len(made))
+        return {"summary": SUMMARY, "config": {"seed": len(made)}}
 
-def test_only_what_is_wanted_and_missing_is_run(tmp_path: Path) -> None:
-    book = ResultsFile(_on_disk(tmp_path / "a.json"), SUITE, keep={FIRST})
-    wanted = [(repeat, case.name) for repeat, case in book.missing({FIRST}, 2, None)]
-    assert wanted == [(1, FIRST)]
-    assert [case.name for _, case in book.missing({FIRST, SECOND}, 1, 4)] == [SECOND]
-    assert book.missing({SECOND}, 1, 2) == []
+    monkeypatch.setattr(run, "run_case", run_case)
+    command = ["run", SUITE, "--only", FIRST, "--repeats", "2", "--out", str(tmp_path)]
+    for more in ((), (), ("--resume",)):
+        monkeypatch.setattr(sys, "argv", [*command, *more])
+        assert run.main() == 0
+    calls = read_calls(tmp_path / f"{SUITE}.json")
+    assert len(made) == 4  # There was nothing to resume.
+    assert [list(call.results["cases"]) for call in calls] == [[FIRST], [FIRST]]
+    case = calls[1].results["cases"][FIRST]
+    assert [one["repeat"] for one in case["runs"]] == [0, 1]
+    assert case["config"] == {"seed": 4}

@@ -2,18 +2,27 @@
 
 from __future__ import annotations
 
+import math
 import os
 import zlib
 from pathlib import Path
+from typing import Any, NamedTuple
 
+import jax
 import jax.numpy as jnp
+import numpy as np
 import orbax.checkpoint as ocp
 import pytest
 
 from gmijax.errors import ConfigError
-from gmijax.learning.checkpoint import finish_checkpoint, restore_learner
+from gmijax.learning.checkpoint import finish_checkpoint, restore_learner, save_learner
 from gmijax.runs.folder import RunPaths
-from gmijax.runs.resume import CheckpointMeta, newest_checkpoint
+from gmijax.runs.resume import (
+    CheckpointMeta,
+    best_checkpoint,
+    best_evaluation,
+    newest_checkpoint,
+)
 
 
 def restore_with(error: Exception, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -49,11 +58,49 @@ def test_failure_of_the_device_is_not_the_checkpoints(monkeypatch: pytest.Monkey
         restore_with(RuntimeError("RESOURCE_EXHAUSTED"), monkeypatch)
 
 
-def save(run: RunPaths, env_steps: int, mean_return: float | None, keep: int | None) -> Path:
+class Before(NamedTuple):
+    weights: Any
+    moments: Any
+
+
+class Now(NamedTuple):
+    weights: Any
+    moments: Any
+    more: Any = None
+
+
+def test_a_checkpoint_from_before_a_field_fits_where_the_field_is_not_used(tmp_path: Path):
+    run = RunPaths(tmp_path)
+    known = Before({"w": jnp.arange(3.0)}, (jnp.ones(()), jnp.zeros(2)))
+    like = Now({"w": jnp.zeros(3)}, (jnp.zeros(()), jnp.zeros(2)))
+
+    def saved(env_steps: int, state: Any) -> Path:
+        save_learner(run, env_steps, state)
+        meta = CheckpointMeta("ant", "ppo", env_steps, 1, 8, ((8,), (8,)), "jax")
+        return finish_checkpoint(run, meta)
+
+    old = saved(1, known)
+    new = saved(2, Now(known.weights, known.moments, jnp.full(2, 7.0)))
+    found = restore_learner(old, like)
+    assert found.more is None
+    jax.tree.map(np.testing.assert_array_equal, tuple(found)[:2], tuple(known))
+    assert restore_learner(new, like._replace(more=jnp.zeros(2))).more.tolist() == [7.0, 7.0]
+    with pytest.raises(ConfigError, match="does not fit this job"):
+        restore_learner(old, like._replace(more=jnp.zeros(2)))
+
+
+def save(
+    run: RunPaths,
+    env_steps: int,
+    mean_return: float | None,
+    keep: int | None,
+    eval_return: float | None = None,
+) -> Path:
     folder = run.checkpoints / f".{env_steps:012d}.partial" / "learner"
     folder.mkdir(parents=True)
     (folder / "weights").write_bytes(b"0123456789")
-    meta = CheckpointMeta("ant", "ppo", env_steps, 1, 8, ((8,), (8,)), "jax", mean_return)
+    of_run = ("ant", "ppo", env_steps, 1, 8, ((8,), (8,)), "jax")
+    meta = CheckpointMeta(*of_run, mean_return, eval_return)
     return finish_checkpoint(run, meta, keep)
 
 
@@ -105,6 +152,22 @@ def test_the_last_and_the_best_checkpoint_stay(
     for env_steps, mean in enumerate(returns, start=1):
         save(run, env_steps, mean, keep)
     assert sorted(int(path.name) for path in run.checkpoints.iterdir()) == left
+
+
+def test_the_best_in_an_evaluation_stays_and_is_known_again(tmp_path: Path):
+    run = RunPaths(tmp_path)
+    assert best_checkpoint(run.root) is None
+    save(run, 1, 9.0, 2)
+    assert best_checkpoint(run.root) == run.checkpoint(1)  # While there is no evaluation.
+    for env_steps, evaluated in ((2, 3.0), (3, 5.0), (4, None), (5, 4.0), (6, None), (7, 4.0)):
+        save(run, env_steps, float(-env_steps), 2, evaluated)
+    assert sorted(int(path.name) for path in run.checkpoints.iterdir()) == [3, 7]
+    assert best_checkpoint(run.root) == run.checkpoint(3)
+    assert best_evaluation(run.root, 7) == 5.0
+    # What a restart has not reached again does not count.
+    assert best_evaluation(run.root, 2) == -math.inf
+    (run.checkpoint(3) / "learner" / "weights").write_bytes(b"")
+    assert best_checkpoint(run.root) == run.checkpoint(7)
 
 
 def test_a_broken_checkpoint_of_the_same_step_is_replaced(tmp_path: Path):

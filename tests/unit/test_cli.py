@@ -49,6 +49,7 @@ REFUSED: list[tuple[str, str, str]] = [
     ("serve", "policy=clever", "policy=clever: expected one of trained, random"),
     ("play", "video=avi", "video=avi: expected one of auto, mp4"),
     ("play", "num_envs=2 video_envs=3", "video_envs=3: must be between 1 and 2"),
+    ("export", "format=pt", "format=pt: expected one of onnx, stablehlo, all"),
     # Tasks.
     ("train", "env=ant,ball_balance", "env=ant,ball_balance: expected one value"),
     ("train", "env.name=ant", "env.name=ant: choose the task with env=ant"),
@@ -57,7 +58,7 @@ REFUSED: list[tuple[str, str, str]] = [
     ("train", "env=nowhere.py:make", "env=nowhere.py:make: no such file"),
     ("train", "env=nowhere.py", "env=nowhere.py: expected PATH.py:FUNCTION"),
     ("train", f"env={LONG}.py:f", "a.py:f: no such file"),
-    ("train", "env=ant env.randomize=maybe", "env.randomize=maybe: expected one of off, on"),
+    ("train", "env=ant env.randomize=maybe", "env.randomize=maybe: expected one of off, on, epi"),
     ("train", "env=ant env.randomization.body_mass.range=[2,1]", "expected [lowest, highest]"),
     (
         *("train", "env=ant env.randomization.body_mass.operation=x"),
@@ -82,6 +83,26 @@ REFUSED: list[tuple[str, str, str]] = [
     ("train", "reduce.strategy=mrr plan.layout=[[0,1],[2]]", "cannot run on layout [[0,1],[2]]"),
     ("train", "reduce.strategy=mrr plan.gmis_per_gpu=2", "mrr: cannot run on layout [[0,1]]: its"),
     ("train", "reduce.strategy=flat plan.gmis_per_gpu=2", "NCCL before 2.30"),
+    # What is changed about a task.
+    (
+        "train",
+        "env=ant env.rewards.enrgy=1",
+        "key env.rewards.enrgy: did you mean energy?",
+    ),
+    (
+        "train",
+        "env=anymal env.rewards.x=1",
+        "env.rewards.x: allowed are torque, velocity, yaw_",
+    ),
+    ("train", "env=brax env.name=ant env.rewards.x=1", "x: this task has none in env.rewards"),
+    ("train", "env=ant env.rewards.energy=low", "env.rewards.energy=low: expected a finite num"),
+    ("train", "env=ant env.settings.goal_m=1", "unknown key env.settings.goal_m: allowed are"),
+    ("train", "env=ant +env.settings.goal_m=1", "unknown key env.settings.goal_m: allowed are"),
+    ("serve", "env=anymal env.settings.action_scale_rad=0 policy=random", "=0.0: must be greater"),
+    ("train", "env=anymal env.settings.start_factor_min=2", "min=2.0: must be at most env.set"),
+    ("train", "env=ant env.curriculum=on", "env.curriculum=on: ant has none; allowed are anymal"),
+    ("train", "env.history=0", "env.history=0: must be at least 1"),
+    ("train", "env.action_repeat=0", "env.action_repeat=0: must be at least 1"),
     ("train", "reduce.intra=ipc plan.gmis_per_gpu=2", "reduce.intra=ipc: cannot run on layout"),
     (
         *("train", "reduce.strategy=mpr reduce.selection=measured"),
@@ -98,6 +119,8 @@ REFUSED: list[tuple[str, str, str]] = [
     ("serve", "", "policy=trained: needs run.dir=RUN"),
     ("serve", "policy=random deterministic=true", "random actions have no mean"),
     ("play", "run.dir=nowhere", "run.dir=nowhere: no such folder"),
+    ("export", "run.dir=nowhere", "run.dir=nowhere: no such folder"),
+    ("export", "checkpoint=nowhere", "checkpoint=nowhere: expected the folder of a checkpoint"),
     # Searches.
     ("search", "num_envs=64 plan.gmis_per_gpu=2", "nothing to search for; make one of them auto"),
     ("search", "search.gmis_per_gpu=[2,2]", "search.gmis_per_gpu=[2, 2]: expected distinct"),

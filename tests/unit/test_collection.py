@@ -19,7 +19,7 @@ from gmijax.collection.programs import (
     ActingPolicy,
     Keep,
     Step,
-    _gaussian,
+    _trained,
     infer,
     next_keys,
     random_policy,
@@ -57,7 +57,7 @@ def unrolled() -> Unrolled:
     env = point_mass(episode_length=8)
     learner, size = make_learner(env.spec, algo), env.spec.obs_size
     state = jax.jit(lambda key: init_learner(learner, size, key))(jax.random.key(3))
-    choose = _gaussian(learner, env.spec.action_size, deterministic=False)
+    choose = _trained(learner, deterministic=False)
     policy = ActingPolicy(choose, (state.params, no_samples((size,))), "x")
     program = jax.jit(partial(unroll, env, policy, T, ALL))
     _, steps, counts = program(env.model, policy.weights, start(env))
@@ -113,7 +113,7 @@ def test_random_actions_fill_their_range_with_even_density():
 
 
 def test_a_deterministic_policy_acts_with_its_mean(unrolled: Unrolled):
-    choose = _gaussian(unrolled.learner, unrolled.env.spec.action_size, deterministic=True)
+    choose = _trained(unrolled.learner, deterministic=True)
     obs, weights = jnp.ones((N, 2)), unrolled.policy.weights
     first, density = choose(weights, obs, env_keys(jax.random.key(1), 0, N))
     second, _ = choose(weights, obs, env_keys(jax.random.key(2), 0, N))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import importlib
 from typing import Any
 
 import jax.numpy as jnp
@@ -13,7 +14,8 @@ from gmijax.config import ADAPTIVE_LEARNING_RATE_RANGE, TrainConfig
 from gmijax.config.schema import from_dict, to_dict
 from gmijax.errors import ConfigError
 from gmijax.learning.learner import adapted_learning_rate
-from gmijax.sim.registry import task_names
+from gmijax.sim.registry import TASKS, task_names
+from gmijax.sim.tasks.settings import SETTINGS
 
 
 def test_numbers_are_finite():
@@ -37,6 +39,14 @@ def test_adaptive_learning_rate_begins_where_it_is_kept(rate: float):
     dataclasses.replace(algo, learning_rate=rate, learning_rate_schedule="fixed")
 
 
+def test_a_range_of_learning_rates_has_two_ends():
+    for wrong in ((1e-3,), (1e-2, 1e-5), (1e-3, 1e-3)):
+        with pytest.raises(ConfigError, match="expected two numbers, the smaller one first"):
+            dataclasses.replace(compose().algo, learning_rate_range=wrong)
+    wide = compose("algo.learning_rate_range=[1e-6,1e-3]", "algo.learning_rate=2e-6").algo
+    assert wide.learning_rate_range == (1e-6, 1e-3)
+
+
 @pytest.mark.parametrize("end", [0, 1])
 def test_limits_are_those_of_the_learner(end: int):
     limit, kl = ADAPTIVE_LEARNING_RATE_RANGE[end], (1.0, 1e-9)[end]
@@ -44,13 +54,41 @@ def test_limits_are_those_of_the_learner(end: int):
     assert float(kept) == pytest.approx(limit)
 
 
-@pytest.mark.parametrize("group", ["plan", "reduce", "run", "search", "channel"])
+@pytest.mark.parametrize("group", ["plan", "reduce", "run", "eval", "search", "channel", "wandb"])
 def test_a_default_is_the_same_in_code_and_on_the_command_line(group: str):
     """But for groups whose defaults differ from task to task."""
     composed = getattr(compose(), group)
     for field in dataclasses.fields(composed):
         if field.default is not dataclasses.MISSING:
             assert (field.name, field.default) == (field.name, getattr(composed, field.name))
+
+
+@pytest.mark.parametrize(
+    ("overrides", "message"),
+    [
+        (("eval.every=0",), r"^eval\.every=0: must be at least 1$"),
+        (("eval.every=-5",), r"^eval\.every=-5: must be at least 1$"),
+        (("eval.episodes=0",), r"^eval\.episodes=0: must be at least 1$"),
+        (("eval.every=100", "algo=a3c"), r"^eval\.every=100: with algo=a3c .* allowed is null"),
+    ],
+)
+def test_evaluations_that_cannot_be_are_refused(overrides: tuple[str, ...], message: str):
+    with pytest.raises(ConfigError, match=message):
+        compose(*overrides)
+
+
+@pytest.mark.parametrize("task", task_names())
+def test_weights_and_settings_are_those_of_the_task(task: str):
+    composed = compose(f"env={task}").env
+    terms = importlib.import_module(TASKS[task]).TERMS
+    assert composed.rewards == {name: term.weight for name, term in terms.items()}
+    assert composed.settings == dataclasses.asdict(SETTINGS[task]())
+
+
+def test_names_of_a_custom_task_are_free():
+    told = ("env=some.py:make", "env.rewards.near=2", "env.settings.length_m=0.5")
+    config = compose(*told).env
+    assert (config.rewards, config.settings) == ({"near": 2.0}, {"length_m": 0.5})
 
 
 # Hidden layers in Table 5 of the paper; 256:128:64 for all others.

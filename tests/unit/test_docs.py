@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import dataclasses
 import importlib
 import re
 from collections.abc import Mapping
@@ -11,6 +12,7 @@ from pathlib import Path
 import pytest
 
 from gmijax.sim.registry import TASKS
+from gmijax.sim.tasks.settings import SETTINGS
 
 ROOT = Path(__file__).parents[2]
 PACKAGE = ROOT / "gmijax"
@@ -21,7 +23,8 @@ FOLDERS = ("gmijax", "configs", "tests", "docs", "benchmarks", "examples", ".ci"
 
 QUOTED_PATH = re.compile(rf"`((?:{'|'.join(map(re.escape, FOLDERS))})/[\w./-]*)`")
 LINK = re.compile(r"!?\[[^\]]*\]\(([^)\s]+)\)")
-REWARD_ROW = re.compile(r"^\| `(\w+)` \|.*\| (-?[\d.]+) \|$", re.MULTILINE)
+OBS_ROW = re.compile(r"^\| (\d+)(?:-(\d+))? \|", re.MULTILINE)
+NUMBER_ROW = re.compile(r"^\| `(\w+)` \| (.*) \| (-?[\d.]+) \|$", re.MULTILINE)
 
 
 def documents() -> list[Path]:
@@ -36,11 +39,23 @@ def linked_paths(text: str) -> list[str]:
     return [target for target in targets if target and not re.match(r"[a-z]+:", target)]
 
 
-def documented_weights(task: str) -> Mapping[str, float]:
-    """The table of rewards in the section of a task."""
+def part_of_task(task: str, heading: str) -> str:
+    """What stands under a heading in the section of a task."""
     sections = re.split(r"^## ", TASKS_PAGE.read_text(), flags=re.MULTILINE)
     section = next(text for text in sections if text.startswith(f"`{task}`"))
-    return {name: float(weight) for name, weight in REWARD_ROW.findall(section)}
+    return re.split(rf"^### {heading}$", section, flags=re.MULTILINE)[1].partition("\n### ")[0]
+
+
+def documented_weights(task: str) -> Mapping[str, float]:
+    """The table of rewards in the section of a task."""
+    rows = NUMBER_ROW.findall(part_of_task(task, "Reward"))
+    return {name: float(weight) for name, _, weight in rows}
+
+
+def documented_lengths(task: str) -> list[int]:
+    """How many values of an observation every row of the task's table is about."""
+    table = part_of_task(task, "Observation")
+    return [int(last or first) - int(first) + 1 for first, last in OBS_ROW.findall(table)]
 
 
 def test_every_folder_of_the_package_is_in_the_architecture():
@@ -81,3 +96,20 @@ def test_only_relative_links_outside_of_code_are_looked_at():
 def test_reward_terms_and_weights_are_those_of_the_code(task: str):
     terms = importlib.import_module(TASKS[task]).TERMS
     assert documented_weights(task) == {name: term.weight for name, term in terms.items()}
+
+
+@pytest.mark.parametrize("task", sorted(TASKS))
+def test_parts_of_an_observation_are_those_of_the_table(task: str):
+    module = importlib.import_module(TASKS[task])
+    assert documented_lengths(task) == [length for _, length in module.OBS_TERMS]
+    assert sum(length for _, length in module.OBS_TERMS) == module.OBS_SIZE
+
+
+@pytest.mark.parametrize("task", sorted(TASKS))
+def test_settings_are_those_of_the_code(task: str):
+    documented = NUMBER_ROW.findall(part_of_task(task, "Settings"))
+    settings = SETTINGS[task]()
+    assert [(name, meaning, float(default)) for name, meaning, default in documented] == [
+        (field.name, field.metadata["doc"], getattr(settings, field.name))
+        for field in dataclasses.fields(settings)
+    ]

@@ -1,6 +1,7 @@
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -9,9 +10,11 @@ from gmijax.learning.normalize import (
     merge,
     merge_all,
     moments_of,
+    moments_of_those,
     no_samples,
     normalize,
     std_of,
+    with_std_floor,
     without_outliers,
 )
 
@@ -59,6 +62,34 @@ def test_constant_inputs_and_outliers_stay_finite() -> None:
     moments = moments_of(jnp.ones((10, 4)), 1)
     assert np.all(std_of(moments) > 0)
     np.testing.assert_array_equal(normalize(moments, jnp.full(4, 100.0)), OBS_CLIP)
+
+
+def test_an_input_that_was_constant_at_first_is_not_blinded_by_a_floor() -> None:
+    constant = moments_of(jnp.zeros((10_000, 1)), 1)
+    # A drawer that opens by 0.39 in one sample of a thousand.
+    later = jnp.zeros((10_000, 1)).at[::1000].set(0.39)
+
+    def seen(floor: float, value: float) -> float:
+        known = with_std_floor(constant, floor)
+        moments = merge(constant, moments_of(without_outliers(known, later), 1))
+        return float(normalize(with_std_floor(moments, floor), jnp.array([value]))[0])
+
+    assert seen(1e-4, 0.002) == OBS_CLIP  # Two millimetres read as all.
+    assert seen(1e-2, 0.002) == pytest.approx(0.2, abs=0.02)
+    assert with_std_floor(no_samples((3,)), 0.1).m2.sum() == 0.0
+
+
+def test_moments_of_some_samples_are_those_of_them_alone() -> None:
+    samples = jnp.asarray(_samples(0, 24)).reshape(6, 4, -1)
+    chosen = jnp.asarray(np.random.default_rng(1).random((6, 4)) < 0.6)
+    wild = jnp.where(chosen[..., None], samples, jnp.inf)
+    jax.tree.map(
+        lambda x, y: np.testing.assert_allclose(x, y, rtol=1e-4, atol=1e-5),
+        moments_of_those(chosen, wild),
+        moments_of(samples[np.asarray(chosen)], 1),
+    )
+    nobody = moments_of_those(jnp.zeros((6, 4), bool), wild)
+    assert all(float(jnp.sum(part)) == 0.0 for part in nobody)
 
 
 def test_observations_pass_unchanged_without_samples() -> None:

@@ -14,9 +14,10 @@ import pytest
 import gmijax
 from gmijax.cli.command import command
 from gmijax.cli.compose import build
-from gmijax.config import PlayConfig
+from gmijax.config import ExportConfig, PlayConfig
 from gmijax.config.schema import to_dict
-from gmijax.control import evaluation, job, restarts, serving
+from gmijax.control import job, restarts, serving
+from gmijax.deploy import exporting, playing
 from gmijax.errors import ConfigError
 from gmijax.runs.folder import META, RunPaths, read_json, write_json
 from gmijax.runs.resume import CheckpointMeta
@@ -53,19 +54,21 @@ def starts(monkeypatch: pytest.MonkeyPatch) -> None:
     def run_gmis(*_: Any) -> None:
         raise StartedError
 
-    for module in (evaluation, restarts, serving):
+    for module in (playing, exporting, restarts, serving):
         monkeypatch.setattr(module, "run_gmis", run_gmis)
 
 
 def opened(kind: str, *overrides: str) -> Any:
     if kind == "play":
-        return evaluation.play(build("play", PlayConfig, ("run.dir=theirs", *overrides)))
+        return playing.play(build("play", PlayConfig, ("run.dir=theirs", *overrides)))
+    if kind == "export":
+        return exporting.export(build("export", ExportConfig, ("run.dir=theirs", *overrides)))
     if kind == "serve":
         return serving.serve(gmijax.compose("run.dir=theirs", *overrides, command="serve"))
     return job.train(gmijax.compose("run.resume=theirs", *overrides))
 
 
-@pytest.mark.parametrize("kind", ["play", "serve", "resume"])
+@pytest.mark.parametrize("kind", ["play", "export", "serve", "resume"])
 def test_only_the_noted_file_or_one_that_is_named_is_executed(
     kind: str, run: RunPaths, starts: None
 ):
@@ -89,7 +92,7 @@ def test_only_the_noted_file_or_one_that_is_named_is_executed(
 
 
 def test_play_says_it_in_one_line(run: RunPaths, capsys: pytest.CaptureFixture[str]):
-    assert command("play", PlayConfig, evaluation.play, ["run.dir=theirs"]) == 2
+    assert command("play", PlayConfig, playing.play, ["run.dir=theirs"]) == 2
     assert len(capsys.readouterr().err.splitlines()) == 1
 
 

@@ -6,7 +6,6 @@ import io
 import os
 import subprocess
 import sys
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -14,11 +13,11 @@ import pytest
 from rich.console import Console
 from supervision import CHECKOUT
 
-from gmijax.control import evaluation
 from gmijax.control.console import ConsoleProgress, open_console
+from gmijax.deploy import playing
 from gmijax.errors import printable
 from gmijax.supervise.failures import last_line
-from gmijax.supervise.gmi_process import GmiStatus
+from gmijax.supervise.watched_gmi import GmiStatus
 
 PRINTS = """
 from gmijax.control.console import open_console
@@ -79,18 +78,32 @@ EXPERIENCE = {
     ],
 )
 def test_a_job_tells_its_rate_and_return_or_of_its_channels(more: dict[str, Any], part: str):
-    lines: Iterator[dict[str, Any]] = iter([{**SYNC, **more}])
-    said = io.StringIO()
-    with ConsoleProgress(
-        Console(file=said, width=300, markup=False), lambda: next(lines, None), 1000
-    ) as progress:
+    assert part in _told([{**SYNC, **more}])
+
+
+def test_a_job_tells_its_latest_evaluation():
+    evaluated = {**SYNC, "eval/return": 9.5}
+    assert "return 7.25  eval 9.50  ETA" in _told([evaluated, SYNC])
+    assert "eval" not in _told([SYNC])
+
+
+def _told(lines: list[dict[str, Any]]) -> str:
+    """What is told in the end of a job that wrote these lines at once."""
+    left, said = list(lines), io.StringIO()
+
+    def new() -> list[dict[str, Any]]:
+        found = left.copy()
+        left.clear()
+        return found
+
+    with ConsoleProgress(Console(file=said, width=300, markup=False), new, 1000) as progress:
         progress.update(())
-    assert part in said.getvalue().splitlines()[-1]
+    return said.getvalue().splitlines()[-1]
 
 
 def test_the_panel_of_a_job_shows_what_a_gmi_says():
     said = io.StringIO()
-    shown = ConsoleProgress(Console(file=said), lambda: None, 10)
+    shown = ConsoleProgress(Console(file=said), list, 10)
     Console(file=said).print(shown._panel([GmiStatus(0, "[/odd]", 3, None, None)]))
     assert "GMI 0: [/odd], iteration 3" in said.getvalue()
 
@@ -132,6 +145,6 @@ def test_names_in_the_table_of_play_may_look_like_markup():
         "metrics": {"[red]x": row},
     }
     said = io.StringIO()
-    Console(file=said, width=200, markup=False).print(evaluation._table(returns))
+    Console(file=said, width=200, markup=False).print(playing._table(returns))
     for name in ("a[/b].py:make", "near[/]", "[red]x"):
         assert name in said.getvalue()

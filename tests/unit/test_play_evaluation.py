@@ -2,23 +2,23 @@
 
 from __future__ import annotations
 
+import dataclasses
 import shutil
 from pathlib import Path
-from types import SimpleNamespace
 
 import pytest
 from rich.console import Console
 
 from gmijax.cli.command import command
-from gmijax.config import PlayConfig
+from gmijax.config import EnvConfig, PlayConfig
 from gmijax.config.schema import to_dict
-from gmijax.control import evaluation, pictures
+from gmijax.deploy import pictures, playing
 from gmijax.errors import ConfigError, GmijaxError
 from gmijax.machine.nvidia import Gpu
 from gmijax.machine.snapshot import Machine
 from gmijax.runs.folder import EXIT_NO_GL, META, PlayPaths, RunPaths, write_json
 from gmijax.runs.resume import CheckpointMeta
-from gmijax.supervise.supervisor import environment_of
+from gmijax.supervise.launch import environment_of
 
 
 def config_of(*overrides: str) -> PlayConfig:
@@ -42,7 +42,10 @@ def test_the_latest_checkpoint_is_played_unless_one_is_named(
     run: RunPaths, monkeypatch: pytest.MonkeyPatch
 ):
     monkeypatch.chdir(run.root.parents[1])
-    first, latest = run.checkpoint(100), run.checkpoint(2000)
+    first, latest, best = (run.checkpoint(steps) for steps in (100, 2000, 300))
+    meta = CheckpointMeta.read(latest)
+    write_json(latest / META, dataclasses.replace(meta, eval_return=-2.0).to_dict())
+    write_json(best / META, dataclasses.replace(meta, eval_return=-1.0).to_dict())
     for overrides, expected in (
         ((), latest),
         (("run.dir=last",), latest),
@@ -50,8 +53,10 @@ def test_the_latest_checkpoint_is_played_unless_one_is_named(
         ((f"run.dir={run.root}", "checkpoint=100"), first),
         ((f"checkpoint={first}",), first),
         ((f"run.dir={run.root}", f"checkpoint={first}"), first),
+        ((f"run.dir={run.root}", "checkpoint=best"), best),
+        (("checkpoint=best",), best),
     ):
-        assert evaluation._find(config_of(*overrides)) == expected
+        assert playing._find(config_of(*overrides)) == expected
 
 
 def test_a_checkpoint_outside_of_its_run_is_bad_input(run: RunPaths, tmp_path: Path):
@@ -60,7 +65,7 @@ def test_a_checkpoint_outside_of_its_run_is_bad_input(run: RunPaths, tmp_path: P
     with pytest.raises(
         ConfigError, match=r"no config\.json .* can only be used in its run folder"
     ):
-        evaluation.play(config_of(f"checkpoint={copied}"))
+        playing.play(config_of(f"checkpoint={copied}"))
     assert list(copied.parent.iterdir()) == [copied]
 
 
@@ -85,21 +90,21 @@ def test_a_checkpoint_that_cannot_be_meant_is_bad_input(
     other = shutil.copytree(run.root, tmp_path / "runs" / "y")
     config = config_of(*(text.format(run=run.root, other=other) for text in overrides))
     with pytest.raises(ConfigError, match=message):
-        evaluation._find(config)
+        playing._find(config)
 
 
 def test_worlds_cannot_be_drawn_from_no_ranges(run: RunPaths, monkeypatch: pytest.MonkeyPatch):
-    env = SimpleNamespace(name="ant", suite="gmijax", randomization={})
-    monkeypatch.setattr(evaluation, "trained_config", lambda checkpoint: (env, None))
+    env = EnvConfig(name="ant", episode_length=None)
+    monkeypatch.setattr(playing, "trained_config", lambda checkpoint: (env, None))
     config = config_of(f"run.dir={run.root}", "randomize=on")
     with pytest.raises(ConfigError, match="names nothing to draw"):
-        evaluation.play(config)
+        playing.play(config)
 
 
 def test_playing_leaves_a_gpu_to_the_job_that_trains_on_it(run: RunPaths):
     machine = Machine(gpus=(Gpu(0, "GPU-1", "some GPU", 80000, (9, 0), False),), cpu_cores=(0, 1))
     config = config_of(f"run.dir={run.root}", "num_envs=4", "video_envs=1")
-    launch = evaluation._launch(config, PlayPaths(run.root), machine)
+    launch = playing._launch(config, PlayPaths(run.root), machine)
     environment = environment_of(launch, 0, {})
     assert environment["XLA_CLIENT_MEM_FRACTION"] == "0.1"
     assert environment["XLA_PYTHON_CLIENT_PREALLOCATE"] == "false"
@@ -158,7 +163,7 @@ def test_without_opengl_only_a_film_that_was_asked_for_is_an_error(
 
 def test_a_film_that_was_asked_for_of_a_task_without_a_model_is_an_error(quiet: Console):
     with pytest.raises(GmijaxError, match="point has no model that could be filmed; the returns"):
-        evaluation._accept_nothing_to_see(config_of("video=gif"), "point", quiet)
+        playing._accept_nothing_to_see(config_of("video=gif"), "point", quiet)
 
 
 def test_a_missing_opengl_is_noticed_by_the_child(tmp_path: Path):

@@ -9,15 +9,20 @@ import numpy as np
 import pytest
 
 from gmijax.cli.compose import compose
-from gmijax.learning.policy import entropy, kl_divergence, log_prob, make_actor_critic
-from gmijax.ppo.ppo import Samples, UpdateContext, gae, ppo_loss
+from gmijax.learning.distributions import DISTRIBUTIONS, Normal
+from gmijax.learning.learner import ActingWeights, state_values
+from gmijax.learning.normalize import Moments, from_units, moments_of, no_samples
+from gmijax.learning.policy import make_actor_critic
+from gmijax.learning.updates import explained_variance
+from gmijax.ppo.ppo import UpdateContext, ppo_loss
+from gmijax.ppo.rollout import Samples, gae, until_diverged
 
 B, O, A = 6, 3, 2
 T, N = 7, 3
 NEUTRAL = UpdateContext(jnp.zeros(()), jnp.ones(()), jnp.zeros(A))
 
 
-NETWORKS = make_actor_critic(A, (8,), (8,), 1.0)
+NETWORKS = make_actor_critic(Normal(A), (8,), (8,), 1.0)
 LOSS = jax.jit(ppo_loss, static_argnames=("networks", "config"))
 
 
@@ -37,13 +42,13 @@ def _loss(params, samples: Samples, context: UpdateContext = NEUTRAL, **costs: A
 def _samples(params, advantage: float, log_ratio: float = 0.0) -> Samples:
     """Samples whose probability ratio under `params` is exp(log_ratio)."""
     obs = jax.random.normal(jax.random.key(1), (B, O))
-    mean = NETWORKS.action_mean(params, obs)
+    mean = NETWORKS.output(params, obs)
     action = mean + 0.3
     return Samples(
         obs=obs,
         action=action,
-        log_prob=log_prob(mean, params.log_std, action) - log_ratio,
-        mean=mean,
+        log_prob=NETWORKS.distribution.log_prob(mean, params.log_std, action) - log_ratio,
+        output=mean,
         value=NETWORKS.state_value(params, obs),
         advantage=jnp.full(B, advantage),
     )
@@ -78,6 +83,22 @@ def test_value_loss_is_half_the_squared_error_to_the_target(params) -> None:
     np.testing.assert_allclose(metrics.value_loss, 2.0, rtol=1e-5)
 
 
+def test_values_are_learnt_in_the_unit_of_their_targets(params) -> None:
+    samples = _samples(params, 0.0)
+    # Targets have the mean 50 and the standard deviation 10, and the network says v of that unit.
+    unit = Moments(jnp.asarray(4.0), jnp.asarray(50.0), jnp.asarray(400.0))
+    network = samples.value
+    samples = samples._replace(value=from_units(unit, network), advantage=jnp.full(B, 20.0))
+    context = NEUTRAL._replace(value_moments=unit)
+    _, metrics = _loss(params, samples, context, clip_value_loss=True)
+    # 20 are two standard deviations; nothing has moved, so nothing is clipped.
+    np.testing.assert_allclose(metrics.value_loss, 0.5 * 2.0**2, rtol=1e-4)
+    assert float(metrics.value_clip_fraction) == 0.0
+    weights = ActingWeights(params, no_samples((O,)), unit)
+    values = state_values(NETWORKS, weights, samples.obs)
+    np.testing.assert_allclose(values, samples.value, rtol=1e-5)
+
+
 def test_advantages_are_shifted_and_scaled_by_the_context(params) -> None:
     context = NEUTRAL._replace(advantage_mean=jnp.asarray(1.0), advantage_std=jnp.asarray(2.0))
     loss, _ = _loss(params, _samples(params, 5.0), context)
@@ -94,16 +115,96 @@ def test_means_out_of_bounds_cost(params) -> None:
     np.testing.assert_allclose(loss, 2 * 0.9**2, rtol=0.1)
 
 
+def test_shares_of_clipped_values_and_of_saturated_actions(params) -> None:
+    samples = _samples(params, 0.0)
+    # Of six values four have moved by more than the clip range of 0.2.
+    moved = samples._replace(value=samples.value + jnp.array([0.0, 0.1, 0.3, -0.3, 0.5, 0.21]))
+    assert float(_loss(params, moved)[1].value_clip_fraction) == pytest.approx(4 / 6)
+    # One of the two actions is clipped by the environment wherever the robot is.
+    last = f"Dense_{len(NETWORKS.policy.hidden)}"
+    layers = params.policy["params"]
+    far = {**layers, last: {**layers[last], "bias": jnp.array([0.0, -2.0])}}
+    _, metrics = _loss(params._replace(policy={"params": far}), samples)
+    assert float(metrics.saturated_fraction) == 0.5
+
+
+def test_the_policy_does_not_see_what_is_behind_its_part_of_an_observation() -> None:
+    networks = NETWORKS._replace(actor_obs_size=2)
+    params = networks.init(jax.random.key(0), O)
+    obs = jnp.array([[1.0, 2.0, 3.0], [1.0, 2.0, -4.0]])
+    first, second = networks.action_mean(params, obs)
+    np.testing.assert_array_equal(first, second)
+    assert not jnp.equal(*networks.state_value(params, obs))
+    # Whoever has no more than what the policy sees gets the same actions.
+    np.testing.assert_array_equal(networks.action_mean(params, obs[:, :2]), [first, second])
+
+
+def test_explained_variance_by_hand() -> None:
+    targets, values = jnp.array([1.0, 2.0, 3.0, 4.0]), jnp.array([1.5, 2.0, 3.0, 3.5])
+    error = moments_of(targets - values, 1)
+    # Errors of -0.5, 0, 0, 0.5: their squares sum to 0.5, those of the targets to 5.
+    np.testing.assert_allclose(explained_variance(moments_of(targets, 1), error), 0.9, rtol=1e-6)
+    assert float(explained_variance(moments_of(jnp.ones(4), 1), error)) == 0.0
+
+
+def test_all_of_an_episode_that_ends_by_divergence_is_left_out() -> None:
+    #                        starts over after step 1, and diverges in step 4
+    ended = jnp.array([[0, 1, 0, 0, 1, 0], [0, 0, 0, 0, 0, 0]], bool).T
+    bad = jnp.array([[0, 0, 0, 0, 1, 0], [0, 0, 0, 0, 0, 0]], bool).T
+    wanted = np.array([[0, 0, 1, 1, 1, 0], [0, 0, 0, 0, 0, 0]], bool).T
+    np.testing.assert_array_equal(until_diverged(bad, ended), wanted)
+
+
 def test_gaussian_formulas() -> None:
+    normal = Normal(2)
     mean, log_std, action = np.zeros(2), np.log([1.0, 2.0]), np.array([1.0, 2.0])
     # both actions are one standard deviation off: -1/2 - log std - log(2 pi) / 2 each
     expected = -1.0 - np.log(2.0) - np.log(2 * np.pi)
-    np.testing.assert_allclose(log_prob(mean, log_std, action), expected, rtol=1e-6)
+    np.testing.assert_allclose(normal.log_prob(mean, log_std, action), expected, rtol=1e-6)
     expected = np.log(2.0) + 1.0 + np.log(2 * np.pi)
-    np.testing.assert_allclose(entropy(jnp.asarray(log_std)), expected, rtol=1e-6)
+    np.testing.assert_allclose(normal.entropy(mean, jnp.asarray(log_std)), expected, rtol=1e-6)
     # KL(N(0, 1) || N(1, 2)) = log 2 + (1 + 1) / 8 - 1/2 per dimension
-    kl = kl_divergence(np.zeros(1), np.zeros(1), np.ones(1), np.log([2.0]))
+    kl = Normal(1).kl_divergence(np.zeros(1), np.zeros(1), np.ones(1), np.log([2.0]))
     np.testing.assert_allclose(kl, np.log(2.0) + 0.25 - 0.5, rtol=1e-6)
+
+
+@pytest.mark.parametrize("name", DISTRIBUTIONS)
+@pytest.mark.parametrize("state_dependent_std", [False, True])
+def test_a_distribution_is_what_it_says_of_its_samples(name: str, state_dependent_std) -> None:
+    """One action, so that densities can be summed up and samples be counted."""
+    distribution = DISTRIBUTIONS[name](1, state_dependent_std)
+    assert distribution.output_size == 1 + state_dependent_std
+    added = [-0.2] * state_dependent_std
+    old, new = jnp.array([0.3, *added]), jnp.array([0.5, *added])
+    log_std = jnp.log(jnp.array([0.6]))
+    end = 0.9999 if name == "tanh_normal" else 6.0
+    grid = jnp.linspace(-end, end, 20_001)
+    width = grid[1] - grid[0]
+    logs, later = (distribution.log_prob(x, log_std, grid[:, None]) for x in (old, new))
+    density = jnp.exp(logs)
+    np.testing.assert_allclose(jnp.sum(density) * width, 1.0, atol=2e-3)
+    entropy = jnp.mean(distribution.entropy(old, log_std))
+    np.testing.assert_allclose(entropy, -jnp.sum(density * logs) * width, atol=5e-3)
+    divergence = distribution.kl_divergence(old, log_std, new, log_std)
+    np.testing.assert_allclose(divergence, jnp.sum(density * (logs - later)) * width, atol=5e-3)
+    outputs = jnp.broadcast_to(old, (4000, len(old)))
+    drawn = distribution.sample(outputs, log_std, jax.random.split(jax.random.key(0), 4000))
+    assert drawn.shape == distribution.mode(outputs).shape == (4000, 1)
+    mean = jnp.sum(density * grid) * width
+    np.testing.assert_allclose(jnp.mean(drawn), mean, atol=0.04)
+    # Half of them lie below the median, which the mode is of all of these.
+    np.testing.assert_allclose(jnp.mean(drawn < distribution.mode(old)), 0.5, atol=0.03)
+
+
+def test_actions_at_the_edge_have_finite_densities_and_gradients() -> None:
+    squashed = DISTRIBUTIONS["tanh_normal"](1, False)
+
+    def log_density(mean):
+        return squashed.log_prob(mean, jnp.zeros(1), jnp.ones(1))
+
+    value, slope = jax.value_and_grad(log_density)(jnp.array([20.0]))
+    assert jnp.isfinite(value)
+    assert jnp.isfinite(slope).all()
 
 
 def _steps(seed: int = 0):

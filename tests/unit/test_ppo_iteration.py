@@ -4,6 +4,7 @@ import os
 import re
 from collections.abc import Iterator
 from contextlib import contextmanager
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -18,7 +19,7 @@ from gmijax.collectives.device.device_links import DeviceLinks
 from gmijax.collectives.host.host_exchange import HostExchange
 from gmijax.collectives.host.host_links import HostLinks
 from gmijax.collectives.host.shared_block import LANES, create_exchange
-from gmijax.collectives.program import Exchange
+from gmijax.collectives.program import Exchange, PeersOfOne
 from gmijax.collectives.strategies import stages
 from gmijax.learning.learner import (
     acting_weights,
@@ -27,17 +28,12 @@ from gmijax.learning.learner import (
     init_learner,
     make_learner,
 )
-from gmijax.learning.updates import exchange_size, minibatch_order
+from gmijax.learning.normalize import std_of
+from gmijax.learning.updates import exchange_size, minibatch_order, run_updates
 from gmijax.partition.layout import Layout
-from gmijax.ppo.ppo import (
-    PpoLosses,
-    flatten,
-    gradients,
-    iterate,
-    merge_stats,
-    rollout,
-    update_context,
-)
+from gmijax.ppo.loop import warm_up
+from gmijax.ppo.ppo import PpoLosses, gradients, iterate, update_context
+from gmijax.ppo.rollout import flatten, merge_stats, rollout
 from gmijax.sim.wrappers import env_keys
 
 N, T = 32, 8
@@ -97,6 +93,19 @@ def test_every_sample_is_visited_once_per_epoch_in_orders_that_differ(learner) -
     assert not np.array_equal(first, order(rank=0, iteration=1).reshape(3, -1))
 
 
+@pytest.mark.parametrize("schedule", ["fixed", "adaptive_kl"])
+def test_learning_rates_share_a_program(config, schedule: str) -> None:
+    programs = set()
+    for rate in (1e-3, 2e-3):
+        changed = dataclasses.replace(
+            config, learning_rate=rate, learning_rate_schedule=schedule, num_updates_per_batch=1
+        )
+        learner = make_learner(ENV.spec, changed)
+        step = functools.partial(iterate, ENV, learner, PeersOfOne())
+        programs.add(jax.jit(step).lower(ENV.model, *_start(learner)).as_text())
+    assert len(programs) == 1
+
+
 @pytest.mark.parametrize(
     ("rate", "kl", "adapted"),
     [
@@ -110,6 +119,40 @@ def test_every_sample_is_visited_once_per_epoch_in_orders_that_differ(learner) -
 def test_the_learning_rate_follows_the_divergence(rate: float, kl: float, adapted: float) -> None:
     found = adapted_learning_rate(jnp.float32(rate), jnp.float32(kl), 0.01)
     assert float(found) == pytest.approx(adapted)
+
+
+class _Kl(NamedTuple):
+    steering_kl: jax.Array
+
+
+def test_the_schedule_may_act_once_an_epoch_on_the_mean_and_noise_has_a_floor(config) -> None:
+    """Three epochs of four minibatches, whose divergences are given."""
+    mine = make_learner(
+        ENV.spec,
+        dataclasses.replace(
+            config,
+            adapt_every="epoch",
+            learning_rate_schedule="adaptive_kl",
+            learning_rate_range=(9e-4, 1e-2),
+            desired_kl=0.01,
+            min_noise_std=0.6,
+        ),
+    )
+    state, _ = _start(mine)
+    kls = jnp.array([0.1, 0, 0, 0, 0.004, 0.004, 0, 0.004, 0.1, 0.1, 0.1, 0.1])
+
+    def gradients_of(learner, params, data, context, indices):
+        grads = jax.tree.map(jnp.zeros_like, params)
+        return grads._replace(log_std=jnp.ones(1)), _Kl(data[indices[0]])
+
+    order = jnp.arange(12)[:, None]
+    state, _, rates = jax.jit(
+        lambda state: run_updates(mine, PeersOfOne(), gradients_of, state, kls, None, order, None)
+    )(state)
+    # Means of 0.025 (lower, to the floor), 0.003 (raise), 0.1 (lower, to the floor).
+    wanted = [1e-3] * 3 + [9e-4] * 4 + [1.35e-3] * 4 + [9e-4]
+    np.testing.assert_allclose(rates, wanted, rtol=1e-5)
+    np.testing.assert_allclose(jnp.exp(state.params.log_std), 0.6, rtol=1e-6)
 
 
 @pytest.fixture(scope="module")
@@ -210,6 +253,43 @@ def test_it_learns_to_stand_still_and_normalises_between_iterations(learner, alo
     assert np.mean(returns[-10:]) > np.mean(returns[:10]) + 0.4
 
 
+def test_it_learns_with_another_distribution_and_normalised_values_of_any_scale(config) -> None:
+    mine = make_learner(
+        ENV.spec,
+        dataclasses.replace(
+            config,
+            reward_scaling=100.0,
+            normalize_values=True,
+            obs_outliers="diverged",
+            obs_std_floor=1e-2,
+            distribution_type="tanh_normal",
+            state_dependent_std=True,
+        ),
+    )
+    step = _compiled(SoloReducer().program(functools.partial(iterate, ENV, mine)), mine)
+    state, envs = warm_up(step, *_start(mine))
+    returns = []
+    for _ in range(60):
+        state, envs, metrics = step(state, envs)
+        returns.append(float(metrics.counts.reward_sum) / (T * N))
+    assert state.value_moments is not None
+    assert float(state.obs_moments.count) == float(state.value_moments.count) == 61 * T * N
+    assert float(std_of(state.value_moments)) > 10.0
+    assert np.mean(returns[-10:]) > np.mean(returns[:10]) + 0.4
+    assert float(metrics.figures["value/explained_variance"]) > 0.3
+
+
+def test_a_warm_up_fills_the_statistics_and_nothing_else(learner, alone) -> None:
+    state, envs = warm_up(alone, *_start(learner))
+    first, _ = _start(learner)
+    assert float(state.obs_moments.count) == T * N
+    assert float(jnp.max(state.obs_moments.m2)) > 0.0
+    for name in ("params", "opt_state", "learning_rate", "iteration"):
+        jax.tree.map(np.testing.assert_array_equal, getattr(state, name), getattr(first, name))
+    state, envs, _ = alone(state, envs)  # It goes on from there.
+    assert float(state.obs_moments.count) == 2 * T * N
+
+
 def test_no_learning_rate_is_lost_and_no_number_is_written_twice(config, alone) -> None:
     """GPUs would copy it within host memory, for which the host waits (`IterationMetrics`)."""
     _check_no_number_is_written_twice(alone)
@@ -221,7 +301,7 @@ def test_no_learning_rate_is_lost_and_no_number_is_written_twice(config, alone) 
     # The first update has not moved yet, the others each lower the rate.
     rates = [1e-3 / 1.5**k for k in range(4)]
     _, _, told = _compiled(step, mine)(*_start(mine))
-    assert float(told.learning_rate) == pytest.approx(rates[-1])
+    assert float(told.figures["policy/learning_rate"]) == pytest.approx(rates[-1])
     assert {k: float(v) for k, v in told.rates.items()} == pytest.approx(
         {"mean": np.mean(rates), "min": rates[-1], "max": rates[0]}
     )

@@ -22,7 +22,9 @@ def test_an_unknown_name_is_an_attribute_error() -> None:
 
 
 def test_the_controller_loads_neither_jax_nor_mujoco() -> None:
-    modules = "gmijax, gmijax.train, gmijax.serve, gmijax.search, gmijax.play, gmijax.doctor"
+    commands = ("train", "serve", "search", "sweep", "play", "export", "doctor")
+    others = ("demo", "list_envs", "__main__")
+    modules = ", ".join(("gmijax", *(f"gmijax.{name}" for name in (*commands, *others))))
     code = f"import {modules}, sys; print({{'jax', 'mujoco', 'flax'}} & sys.modules.keys())"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "set()"

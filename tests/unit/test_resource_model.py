@@ -20,11 +20,12 @@ from benchmarks.paper_model import (
     throughput,
     training_gain,
 )
+from benchmarks.records import RESULTS
 from benchmarks.resource_model import (
+    cases_of,
     measured_gain,
     predicted_gain,
     resources_of,
-    training_case,
 )
 from gmijax.errors import ConfigError
 
@@ -93,26 +94,17 @@ def test_what_takes_no_time_has_no_throughput():
         throughput(1.0, 0.0, 1.0, 0.0)
 
 
-def test_a_suite_of_templates_is_a_case_of_training():
-    def run(rate: float, rollout_s: float, update_s: float, reduce_s: float | None) -> dict:
-        times = {"time/rollout_s": rollout_s, "time/update_s": update_s}
-        medians = times | {"time/reduce_s": reduce_s}
-        return {"runs": [{"summary": {"step_per_s_train": rate}, "medians": medians}]}
-
-    cases = {
-        "2 GMIs, tcg_ex": run(300.0, 6.0, 3.0, 1.0),
-        "3 GMIs, tdg_ex": run(200.0, 9.0, 2, None),
-    }
-    case = training_case("templates-ant", cases)
-    assert [case[f"{part}_s"] for part in ("simulator", "trainer", "reduce", "com")] == [
-        6,
-        2,
-        1,
-        3,
-    ]
+def test_a_measured_case_is_predicted_by_equation_2():
+    case = {"simulator_s": 6.0, "agent_s": 1.0, "com_s": 14.0, "colocated": 3.0, "dedicated": 2.0}
+    # Three times the time, at 10 / 8.6 times the resource.
+    assert predicted_gain(case) == pytest.approx(3 * 8.6 / 10)
     assert measured_gain(case) == 1.5
-    # (6 * 10 + 2 * 0.3 * 2) / 8 = 7.65 of 10, and 8 + 3 over 8 + 1.
-    assert predicted_gain(case) == pytest.approx(0.765 * 11 / 9)
+
+
+def test_a_file_of_another_suite_is_refused():
+    file = RESULTS / "ant-1gpu.json"
+    with pytest.raises(ConfigError, match=r"ant-1gpu.json: no case with times of its stages"):
+        cases_of(file)
 
 
 def test_resources_are_the_larger_part_and_go_by_the_environment() -> None:

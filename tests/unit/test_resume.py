@@ -111,9 +111,24 @@ def test_what_an_older_version_did_not_save_is_filled_in_for_the_runs_own_task(r
     assert config.num_envs == 8
 
 
+def test_a_run_keeps_what_it_changed_about_its_task(run: RunPaths):
+    saved = read_json(run.config)
+    saved["env"]["rewards"]["energy"] = -0.5
+    del saved["env"]["rewards"]["alive"], saved["env"]["settings"]  # Of an older version.
+    write_json(run.config, saved)
+    resumed = compose(f"run.resume={run.root}", "env.rewards.progress=2").env
+    served = compose(f"run.dir={run.root}", "env.rewards.progress=2", command="serve").env
+    for env in (resumed, served):
+        asked = compose("env=ant", "env.rewards.progress=2", "env.rewards.energy=-0.5").env
+        assert (env.rewards["energy"], env.settings) == (-0.5, asked.settings)
+        assert env.rewards["progress"] == 2.0
+    assert compose(f"run.resume={run.root}").env.rewards["alive"] == 0.5
+
+
 @pytest.mark.parametrize(
     ("override", "message"),
     [
+        ("env.rewards.balance=1", r"unknown key env\.rewards\.balance: allowed are"),
         ("+foo.bar=1", "unknown key foo"),
         ("+algo.foo=1", "unknown key algo.foo"),
         ("tuned=ant_ppo", "tuned=ant_ppo: a run that is resumed keeps its settings"),

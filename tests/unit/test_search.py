@@ -8,7 +8,7 @@ from collections.abc import Callable
 
 import pytest
 
-from benchmarks.run import RESULTS
+from benchmarks.records import RESULTS
 from gmijax.autotune.grid import Grid, Measured, NotRunnable, Point, coarse, neighbours
 from gmijax.autotune.search import (
     Outcome,

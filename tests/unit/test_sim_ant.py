@@ -5,6 +5,7 @@ import pytest
 
 from gmijax.sim import physics
 from gmijax.sim.tasks import ant
+from gmijax.sim.tasks.settings import AntSettings
 
 
 def state(qpos: np.ndarray, qvel: np.ndarray | None = None) -> physics.PhysicsState:
@@ -48,7 +49,7 @@ def test_joints_are_minus_one_and_one_at_their_limits(model):
 
 def test_reset_noise_stays_within_the_limits(model):
     ids = ant.look_up(model)
-    qpos, qvel = jax.vmap(lambda key: ant.draw_start(ids, model, key))(
+    qpos, qvel = jax.vmap(lambda key: ant.draw_start(ids, model, key, AntSettings()))(
         jax.random.split(jax.random.key(0), 64)
     )
     joints = qpos[:, ids.joints.qpos]

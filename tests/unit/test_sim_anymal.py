@@ -5,8 +5,10 @@ import numpy as np
 import pytest
 
 from gmijax.sim import physics
+from gmijax.sim.adapters.checks import check_env
 from gmijax.sim.registry import make_env
 from gmijax.sim.tasks import anymal
+from gmijax.sim.tasks.settings import AnymalSettings
 
 HIGH_KNEES = jnp.full((4, 3), 0.3)
 
@@ -87,7 +89,7 @@ def test_a_robot_with_one_knee_on_the_floor_has_fallen():
 def test_starts_and_commands_fill_their_ranges(model):
     ids = anymal.look_up(model)
     keys = jax.random.split(jax.random.key(0), 256)
-    qpos, qvel = jax.vmap(lambda key: anymal.draw_start(ids, model, key))(keys)
+    qpos, qvel = jax.vmap(lambda key: anymal.draw_start(ids, model, key, AnymalSettings()))(keys)
     factors = np.asarray(qpos[:, ids.joints.qpos]) / ids.standing
     assert 0.5 <= factors.min() < 0.52
     assert 1.48 < factors.max() <= 1.5
@@ -95,7 +97,7 @@ def test_starts_and_commands_fill_their_ranges(model):
         qpos[:, :7], np.tile([0, 0, 0.62, 1, 0, 0, 0], (256, 1)).astype("f4")
     )
     assert float(jnp.abs(qvel).max()) <= 0.1
-    commands = np.asarray(jax.vmap(anymal.draw_command)(keys))
+    commands = np.asarray(jax.vmap(lambda key: anymal.draw_command(key, AnymalSettings()))(keys))
     assert (np.abs(commands) <= [2.0, 1.0, 1.0]).all()
     assert (commands.max(axis=0) > [1.8, 0.9, 0.9]).all()
     assert (commands.min(axis=0) < [-1.8, -0.9, -0.9]).all()
@@ -125,12 +127,36 @@ def test_servos_hold_the_standing_pose(model):
     assert not anymal.has_fallen(standing, knees)
 
 
-def test_metrics_are_means_over_the_steps_of_the_episode(monkeypatch: pytest.MonkeyPatch):
-    def glide(world, model, state, ctrl, read):
-        """In place of physics: the base gets faster by what the first joint is told."""
-        faster = state._replace(qvel=state.qvel.at[0].add(ctrl[0]))
-        return faster, (jnp.zeros(anymal.ACTION_SIZE), HIGH_KNEES)
+def glide(world, model, state, ctrl, read):
+    """In place of physics: the base gets faster by what the first joint is told."""
+    faster = state._replace(qvel=state.qvel.at[0].add(ctrl[0]))
+    return faster, (jnp.zeros(anymal.ACTION_SIZE), HIGH_KNEES)
 
+
+def test_commands_grow_with_the_episodes_that_succeed(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(physics.Physics, "step", glide)
+    settings = {"curriculum_start": 0.25, "curriculum_growth": 0.5}
+    env = make_env("anymal", impl="jax", curriculum=True, settings=settings, episode_length=5)
+    check_env(env, "anymal")
+    assert env.spec.metrics == (*anymal.METRICS, anymal.SHARE)
+    assert env.next_episode is not None
+    keys = jax.random.split(jax.random.key(0), 64)
+    first = jax.jit(jax.vmap(env.reset, in_axes=(None, 0)))(env.model, keys)
+    assert (jnp.abs(first.task.command) <= 0.25 * jnp.array([2.0, 1.0, 1.0])).all()
+    assert float(jnp.abs(first.task.command[:, 0]).max()) > 0.45
+    again, shares = jax.jit(jax.vmap(env.next_episode, in_axes=(None, 0))), []
+    near, far = ({name: jnp.full(64, x) for name in env.spec.metrics} for x in (0.2, 0.3))
+    true, false = jnp.ones(64, bool), jnp.zeros(64, bool)
+    state = first
+    for metrics, in_time in ((near, false), (far, true), (near, true), (near, true)):
+        state = again(env.model, state._replace(metrics=metrics, truncated=in_time))
+        shares.append(float(state.task.share[0]))
+    assert shares == [0.25, 0.25, 0.75, 1.0]
+    assert float(jnp.abs(state.task.command[:, 0]).max()) > 1.8
+    assert not np.array_equal(state.task.command, first.task.command)
+
+
+def test_metrics_are_means_over_the_steps_of_the_episode(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(physics.Physics, "step", glide)
     env = make_env("anymal", impl="jax")
     now, step = jax.jit(env.reset)(env.model, jax.random.key(0)), jax.jit(env.step)

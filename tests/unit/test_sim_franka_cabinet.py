@@ -7,7 +7,9 @@ import pytest
 
 from gmijax.sim import physics
 from gmijax.sim.tasks import franka_cabinet as task
+from gmijax.sim.tasks.settings import FrankaCabinetSettings
 
+SETTINGS = FrankaCabinetSettings()
 CENTRE_OF_HANDLE_M = np.array([0.344, 0.0, 0.7262])
 # Columns are the hand's axes: fingers point into the cabinet, one above the other.
 HAND_AT_HANDLE = np.array([[0.0, 0.0, -1.0], [-1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
@@ -35,7 +37,9 @@ def pose(
 
 
 def view(pose: task.FrankaCabinetPose, drawer_m: float = 0.0) -> task.FrankaCabinetView:
-    return task.FrankaCabinetView(pose, jnp.array(drawer_m), jnp.zeros(task.ACTION_SIZE))
+    return task.FrankaCabinetView(
+        pose, jnp.array(drawer_m), jnp.zeros(task.ACTION_SIZE), SETTINGS.open_m
+    )
 
 
 def value(term: str, view: task.FrankaCabinetView) -> float:
@@ -121,13 +125,13 @@ def test_observation_scales_joints_and_is_clipped(world: physics.Physics):
 def test_start_is_noisy_within_the_limits_and_the_drawer_is_closed(world: physics.Physics):
     model = world.mj_model
     ids = task.look_up(model)
-    qpos = jax.vmap(lambda key: task.draw_start(ids, model, key))(
+    qpos = jax.vmap(lambda key: task.draw_start(ids, model, key, SETTINGS))(
         jax.random.split(jax.random.key(0), 64)
     )
     joints, rest = qpos[:, ids.joints.qpos], model.key("start").qpos[ids.joints.qpos]
     assert (joints >= ids.joints.lower).all()
     assert (joints <= ids.joints.upper).all()
-    assert float(jnp.abs(joints - rest).max()) <= task.JOINT_NOISE + 1e-6
+    assert float(jnp.abs(joints - rest).max()) <= SETTINGS.joint_noise + 1e-6
     assert float(joints[:, :7].std(axis=0).min()) > 0.05
     assert (qpos[:, ids.drawer_joint.qpos] == 0.0).all()
 
@@ -170,16 +174,16 @@ def test_the_drawer_can_be_opened_by_the_handle(world: physics.Physics):
     model, limits = world.mj_model, world.mj_model.jnt_range[:9]
     data, ids = mujoco.MjData(model), task.look_up(model)
     mujoco.mj_resetDataKeyframe(model, data, model.key("start").id)
-    targets, step = data.ctrl.copy(), task.ACTION_SPEEDS * world.control_dt_s
+    targets, step = data.ctrl.copy(), task.action_speeds(SETTINGS) * world.control_dt_s
     for wanted in wanted_positions(model):
         targets += step * np.clip((wanted - targets) / step, -1.0, 1.0)
         data.ctrl = np.clip(targets, limits[:, 0], limits[:, 1])
         mujoco.mj_step(model, data, world.substeps)
         seen = task.pose_of(ids, jnp.array(data.xpos), jnp.array(data.xquat))
         assert not task.is_behind(seen)
-        if data.joint("drawer").qpos[0] > task.OPEN_M:
+        if data.joint("drawer").qpos[0] > SETTINGS.open_m:
             break
-    assert data.joint("drawer").qpos[0] > task.OPEN_M
+    assert data.joint("drawer").qpos[0] > SETTINGS.open_m
     # The fingers hold the handle: it was pulled, not pushed along.
     assert task.around(view(seen)) == 0.5
     assert data.ncon >= 2

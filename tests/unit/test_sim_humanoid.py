@@ -5,6 +5,7 @@ import pytest
 
 from gmijax.sim import physics
 from gmijax.sim.tasks import humanoid, runner
+from gmijax.sim.tasks.settings import HumanoidSettings
 
 
 @pytest.fixture(scope="module")
@@ -77,7 +78,7 @@ def test_a_kneeling_humanoid_rests_on_its_knees(model):
     mujoco.mj_forward(model, data)
     touching = {model.geom(geom).name for contact in data.contact for geom in contact.geom}
     assert {"right_knee", "left_knee"} <= touching
-    assert data.qpos[2] > humanoid.DEATH_HEIGHT_M
+    assert data.qpos[2] > HumanoidSettings().death_height_m
 
 
 def test_what_is_only_seen_has_no_mass(model):

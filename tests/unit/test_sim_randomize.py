@@ -18,9 +18,9 @@ from gmijax.config import EnvConfig
 from gmijax.config.env import RANDOMIZED_LEAVES, LeafRange
 from gmijax.config.schema import from_dict
 from gmijax.errors import ConfigError
-from gmijax.sim import episode, physics, wrappers
+from gmijax.sim import episode, physics, randomize, wrappers
 from gmijax.sim.interface import Env, EnvSpec, EnvState
-from gmijax.sim.randomize import make_worlds, randomized
+from gmijax.sim.randomize import make_worlds, randomized, randomized_by_episode
 from gmijax.sim.wrappers import env_keys, training_env
 
 NUM_ENVS = 4
@@ -232,6 +232,32 @@ def sharing_the_model(env: Env) -> Env:
     return env._replace(
         reset=jax.vmap(env.reset, in_axes=(None, 0)), step=jax.vmap(env.step, in_axes=(None, 0, 0))
     )
+
+
+def test_every_episode_may_have_a_model_of_its_own(env: Env, monkeypatch: pytest.MonkeyPatch):
+    def step(model: Any, state: EnvState, action: jax.Array) -> EnvState:
+        return state._replace(
+            obs=model.dof_damping, truncated=jnp.ones((), bool), steps=state.steps + 1
+        )
+
+    ranges = {"dof_damping": ALL_LEAVES["dof_damping"]}
+    pool = randomized(env, ranges, seed=3, first_env=0, num_envs=8).model
+    drawn = randomized_by_episode(env._replace(step=step), ranges, seed=3, num_models=8)
+    assert drawn.model_axes is None
+    batch = training_env(drawn)
+    state, moved = batch.init(drawn.model, env_keys(jax.random.key(1), 0, 16)), jax.jit(batch.step)
+    seen = []
+    for _ in range(3):
+        numbers = np.asarray(state.env.task.number)
+        state, out = moved(drawn.model, state, jnp.zeros((16, 2)))
+        np.testing.assert_array_equal(out.next_obs, pool.dof_damping[numbers])
+        seen.append(numbers)
+    assert not np.array_equal(seen[0], seen[1])
+    assert set(np.concatenate(seen)) == set(range(8))
+    config = compose("env=ball_balance", "env.randomize=episode").env
+    monkeypatch.setattr(randomize, "POOL", 3)
+    worlds = make_worlds(config, "jax", seed=0, first_env=0, num_envs=2)
+    assert worlds.model.body_mass.shape[0] == 3
 
 
 @pytest.mark.parametrize(

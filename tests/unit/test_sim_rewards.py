@@ -20,14 +20,14 @@ TERMS = {
     "cost": RewardTerm[View](lambda v: v.speed**2, -0.5),
     "off": RewardTerm[View](never, 0.0),
 }
-OF_TERMS = {"speed": 6.0, "cost": -4.5}
+OF_TERMS = {"speed": 6.0, "cost": -4.5, "off": 0.0}
 
 
 @pytest.mark.parametrize(
     ("dead", "terms"),
     [
         (None, OF_TERMS),
-        (True, {"speed": 0.0, "cost": 0.0, "death": -2.0}),
+        (True, {"speed": 0.0, "cost": 0.0, "off": 0.0, "death": -2.0}),
         (False, {**OF_TERMS, "death": 0.0}),
     ],
 )

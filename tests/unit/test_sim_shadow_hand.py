@@ -10,6 +10,7 @@ from gmijax.sim import physics, rotations
 from gmijax.sim.interface import Env
 from gmijax.sim.rewards import total_reward
 from gmijax.sim.tasks import shadow_hand
+from gmijax.sim.tasks.settings import ShadowHandSettings
 
 NUM_KEYS = 64
 CUBE = slice(24, 31)
@@ -70,7 +71,9 @@ def test_rotations_are_turns_about_y_then_about_x():
 
 def test_a_start_has_coupled_joints_a_nearly_flat_hand_and_the_cube_above_it(model):
     ids = shadow_hand.look_up(model)
-    qpos = jax.vmap(lambda key: shadow_hand.draw_start(ids, model, key))(keys(1))
+    qpos = jax.vmap(lambda key: shadow_hand.draw_start(ids, model, key, ShadowHandSettings()))(
+        keys(1)
+    )
     assert (qpos[:, ids.joints.qpos] >= 0.2 * ids.joints.lower).all()
     assert (qpos[:, ids.joints.qpos] <= 0.2 * ids.joints.upper).all()
     for equality in range(model.neq):
@@ -110,7 +113,7 @@ def test_reward_by_hand(model):
     qpos[CUBE] = [0.03, -0.39, 0.60, *np.asarray(rotations.turn(jnp.array([0.0, 0.0, 1.0]), 0.4))]
     state = physics.PhysicsState(jnp.array(qpos), jnp.zeros(model.nv), jnp.zeros(model.nv))
     identity, action = jnp.array([1.0, 0.0, 0.0, 0.0]), jnp.full(20, 0.5)
-    view = shadow_hand.view_of(ids, state, identity, action)
+    view = shadow_hand.view_of(ids, state, identity, action, 0.1)
     # 3 cm beside and 4 cm above the goal; 0.4 rad away from it; twenty actions of 0.5.
     reward, terms = total_reward(shadow_hand.TERMS, view)
     assert float(reward) == pytest.approx(-0.5 + 2.0 - 0.001, abs=1e-4)

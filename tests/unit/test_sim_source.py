@@ -63,6 +63,24 @@ def test_a_task_in_a_file_is_made_with_its_own_length(tmp_path: Path):
     assert make_env(written(tmp_path, TASK), episode_length=7).spec.episode_length == 7
 
 
+def test_a_task_gets_the_weights_and_settings_that_it_takes(tmp_path: Path):
+    name = written(tmp_path, TASK.replace("impl, max_envs", "impl, max_envs, settings"))
+    with pytest.raises(ConfigError, match=r"^env\.rewards: .*no argument `rewards` to take it$"):
+        make_env(name, rewards={"near": 2.0}, settings={"length": 7})
+    taken = TASK.replace("impl, max_envs", "impl, max_envs, settings").replace(
+        "    return Env(", "    assert settings == {'length': 7}\n    return Env("
+    )
+    make_env(written(tmp_path, taken), settings={"length": 7})
+
+
+def test_a_curriculum_needs_a_task_that_carries_something_on(tmp_path: Path):
+    with pytest.raises(ConfigError, match=r"^env\.curriculum: .* no argument `curriculum` to"):
+        make_env(written(tmp_path, TASK), curriculum=True)
+    deaf = TASK.replace("impl, max_envs", "impl, max_envs, curriculum=False")
+    with pytest.raises(ConfigError, match=r"^env\.curriculum=on: point has no next_episode"):
+        make_env(written(tmp_path, deaf), curriculum=True)
+
+
 def test_a_task_may_import_what_lies_beside_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(sys, "path", list(sys.path))
     (tmp_path / "beside_the_task.py").write_text("WEIGHT = 2.0\n")

@@ -43,6 +43,20 @@ def save(run: RunPaths, env_steps: int) -> Path:
     return run.checkpoint(env_steps)
 
 
+@pytest.mark.parametrize(
+    ("key", "kept"),
+    [
+        ("history=3", "1"),
+        ("action_repeat=2", "1"),
+        ("randomize=episode", "off or on"),
+    ],
+)
+def test_a_resumed_run_keeps_what_its_worlds_remember(run: RunPaths, key: str, kept: str):
+    save(run, 100)
+    with pytest.raises(ConfigError, match=f"^env.{key}: a resumed run keeps its {kept}$"):
+        find_start_point(config_of(run.root, f"env.{key}"))
+
+
 def test_auto_starts_where_there_is_nothing(tmp_path: Path):
     for folder in (tmp_path / "none", tmp_path):
         beginning = find_start_point(config_of(folder))

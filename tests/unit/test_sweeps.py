@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import sys
 import threading
 from pathlib import Path
 from typing import Any
@@ -19,24 +18,24 @@ from gmijax.config.sweep import SweepConfig
 from gmijax.control.console import open_console
 from gmijax.errors import ConfigError
 from gmijax.runs.folder import is_locked, locked, write_json
+from gmijax.supervise.failures import may_be_anothers
 from gmijax.supervise.launcher import StopSignals
 from gmijax.sweeps import density
+from gmijax.sweeps.compiled import CompiledPrograms
 from gmijax.sweeps.density import with_density
 from gmijax.sweeps.jobs import (
     Job,
     Progress,
-    State,
     SweepPaths,
     jobs_of,
     placed,
+    require_objective,
     require_placeable,
     state_of,
 )
 from gmijax.sweeps.leases import leased
 from gmijax.sweeps.places import Places, places_of
 from gmijax.sweeps.report import ranked, spread
-from gmijax.sweeps.study import OptunaStudy
-from gmijax.sweeps.sweep import Request
 
 
 @pytest.mark.parametrize(
@@ -69,9 +68,13 @@ def test_lists_become_every_combination(
 
 def test_jobs_have_the_configuration_of_the_same_single_training() -> None:
     lists = ("env=ant,ball_balance", "seed=0,1", "algo.policy_hidden_layer_sizes=[8,8],[4]")
-    for job in build_sweep((*lists, "num_envs=512")).jobs:
-        told = [f"{key}={value}" for key, value in job.overrides.items()]
-        assert job.config == compose(*told, "num_envs=512")
+    weights = ("env=ant", "env.rewards.energy=-0.1,-0.2", "env.settings.death_reward=-1")
+    own = ("env=some.py:make", "env.rewards.near=1,2")
+    for sweep in (lists, weights, own):
+        for job in build_sweep((*sweep, "num_envs=512")).jobs:
+            told = [f"{key}={value}" for key, value in job.overrides.items()]
+            fixed = [text for text in sweep if "," not in text]
+            assert job.config == compose(*fixed, *told, "num_envs=512")
 
 
 @pytest.mark.parametrize(
@@ -112,7 +115,24 @@ def test_configurations_differ_by_what_they_are_named() -> None:
     ]
     assert jobs[0].label == "num_envs=16 seed=0"
     assert len({job.program for job in jobs}) == 2
-    assert len({job.program for job in jobs_of([compose(f"seed={s}") for s in "01"])}) == 1
+    alike = [compose(f"seed={n}", f"algo.learning_rate={n + 1}e-4") for n in range(2)]
+    assert len({job.program for job in jobs_of(alike)}) == 1
+
+
+def test_what_a_job_has_compiled_is_known_to_later_sweeps(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("JAX_COMPILATION_CACHE_DIR", str(tmp_path))
+    first, alike, other = jobs_of(
+        [compose("seed=0"), compose("seed=1", "algo.learning_rate=1e-4"), compose("num_envs=16")]
+    )
+    programs = CompiledPrograms()
+    programs.add(first, is_lasting=False)  # It has failed before.
+    assert programs.holds(alike)
+    assert not CompiledPrograms().holds(alike)
+    programs.add(first, is_lasting=True)
+    assert CompiledPrograms().holds(alike)
+    assert not CompiledPrograms().holds(other)
 
 
 @pytest.mark.parametrize(
@@ -130,19 +150,36 @@ def test_jobs_that_place_themselves_are_refused(overrides: tuple[str, ...], said
     assert said in str(raised.value)
 
 
-def gpu_plan(gpus: int, jobs_per_gpu: int) -> Any:
+def test_jobs_are_ranked_by_evaluations_if_they_make_some() -> None:
+    sweep = SweepConfig(objective="eval/return")
+    with pytest.raises(ConfigError, match=r"^sweep\.objective=eval/return: needs eval\.every"):
+        require_objective(jobs_of([compose()]), sweep)
+    [job] = jobs_of([compose("eval.every=100")])
+    require_objective([job], sweep)
+    for steps, more in (
+        (50, {}),
+        (100, {"eval/return": 2.0}),
+        (150, {}),
+        (200, {"eval/return": 1.0}),
+    ):
+        job.progress.take({"env_steps": steps, "return": 9.0, **more}, sweep)
+    assert job.progress.value == 2.0
+    assert job.progress.curve == [(100, 2.0), (200, 1.0)]
+
+
+def gpu_places(gpus: int, jobs_per_gpu: int) -> tuple[str, Places]:
     here = machine(gpus, mps_control=Path("/usr/bin/nvidia-cuda-mps-control"))
-    return places_of(SweepConfig(jobs_per_gpu=jobs_per_gpu), here, {"auto"})
+    plan = places_of(SweepConfig(jobs_per_gpu=jobs_per_gpu), here, {"auto"})
+    return plan.backend, Places(plan, here)
 
 
 def test_jobs_go_to_the_gpu_with_most_room_and_large_ones_to_several() -> None:
-    plan = gpu_plan(2, 2)
-    assert plan.backend == "mps"
-    places = Places(plan.slices)
+    backend, places = gpu_places(2, 2)
+    assert backend == "mps"
     first, second = places.take(1), places.take(1)
     assert first is not None
     assert second is not None
-    assert {first.label, second.label} == {"0.0", "1.2"}
+    assert {first.label, second.label} == {"GPU 0 place 0", "GPU 1 place 0"}
     both = places.take(2)
     assert both is not None
     assert len(set(both.devices)) == 2
@@ -150,6 +187,40 @@ def test_jobs_go_to_the_gpu_with_most_room_and_large_ones_to_several() -> None:
     places.give_back(first)
     assert places.take(2) is None
     assert places.take(1) == first
+
+
+def test_a_job_alone_has_all_places_of_its_gpu() -> None:
+    _, places = gpu_places(2, 2)
+    first, second = places.take(1), places.take(1)
+    assert first is not None
+    assert second is not None
+    assert places.take(1, alone=True) is None
+    places.give_back(second)
+    alone = places.take(1, alone=True)
+    assert alone is not None
+    assert alone.label == "GPU 1 place 0 alone"
+    assert alone.devices == second.devices
+    assert places.take(1) is not None
+    assert places.take(1) is None
+    places.give_back(alone)
+    again = places.take(1)
+    assert again == second
+
+
+@pytest.mark.parametrize(
+    ("reason", "expected"),
+    [
+        ("exit code 1: JaxRuntimeError: INTERNAL: CUDA_ERROR_ILLEGAL_ADDRESS: an illegal", True),
+        ("exit code 1: cannot ask whether it is an MPS client: MPS daemon in /tmp/x: no", True),
+        ("ended by SIGABRT: F0000 stream.cc Check failed", True),
+        ("exit code 1: NonFiniteError: point, up to env step 64: loss/policy_loss is nan", False),
+        ("exit code 1: JaxRuntimeError: RESOURCE_EXHAUSTED: Out of memory", False),
+        ("JaxRuntimeError: INTERNAL: CUDA_ERROR_OUT_OF_MEMORY: out of memory", False),
+        ("ended by SIGKILL: not killed by gmijax; perhaps the machine ran out of memory", False),
+    ],
+)
+def test_a_fault_of_the_gpu_may_be_anothers(reason: str, expected: bool) -> None:
+    assert may_be_anothers(f"GMI 0 failed: {reason}") == expected
 
 
 @pytest.mark.parametrize(
@@ -164,17 +235,18 @@ def test_jobs_divide_the_memory_of_a_gpu(
     overrides: tuple[str, ...], fraction: float, tmp_path: Path
 ) -> None:
     (job,) = jobs_of([compose(*overrides)])
-    place = Places(gpu_plan(1, 4).slices).take(1)
+    place = gpu_places(1, 4)[1].take(1)
     assert place is not None
     config = placed(job, SweepPaths(tmp_path).job(7), place, "mps")
     assert config.plan.memory_fraction == fraction
     assert config.plan.backend == "mps"
     assert (config.run.dir, config.run.resume) == (str(tmp_path / "007"), "auto")
+    assert config.wandb.group == tmp_path.name
 
 
 def test_too_many_jobs_for_the_machine_are_refused() -> None:
     with pytest.raises(ConfigError, match=r"sweep\.jobs_per_gpu=2000"):
-        gpu_plan(1, 2000)
+        gpu_places(1, 2000)
 
 
 def test_progress_keeps_the_best_value() -> None:
@@ -242,82 +314,6 @@ def test_a_gpu_goes_to_one_sweep_at_a_time(
     assert got.wait(10.0)
     other.join()
     assert said == ["another sweep has GPU-1: waiting until it ends"]
-
-
-def study(folder: Path, *overrides: str) -> tuple[Request, OptunaStudy]:
-    request = build_sweep(overrides)
-    journal = folder / "study.log"
-    return request, OptunaStudy(request.settings, request.space, request.make_job, journal)
-
-
-TOY = ("sweep.sampler=tpe", "algo.learning_rate=tag(log,interval(1e-5,1e-2))", "sweep.trials=24")
-
-
-def toy_objective(job: Job) -> float:
-    """Best at a learning rate of 4e-3."""
-    return -abs(np.log(job.config.algo.learning_rate) - np.log(4e-3))
-
-
-def end(job: Job, state: State, value: float | None = None) -> Job:
-    job.progress.state, job.progress.value = state, value
-    return job
-
-
-def test_tpe_finds_better_than_the_default(tmp_path: Path) -> None:
-    _, trials = study(tmp_path, *TOY)
-    values = []
-    while job := trials.next():
-        values.append(toy_objective(job))
-        trials.tell(end(job, "completed", values[-1]))
-    assert len(values) == 24
-    default = toy_objective(jobs_of([compose("algo.learning_rate=1e-3")])[0])
-    assert max(values) > default
-    # It looks where it was good before.
-    assert np.median(values[-6:]) > np.median(values[:10])
-
-
-def test_a_study_goes_on_with_what_was_running(tmp_path: Path) -> None:
-    _, first = study(tmp_path, *TOY)
-    jobs = [job for _ in range(4) if (job := first.next()) is not None]
-    first.tell(end(jobs[0], "completed", 1.0))
-    first.tell(end(jobs[1], "failed"))
-    first.tell(end(jobs[2], "interrupted"))
-    _, second = study(tmp_path, *TOY)
-    assert [job.number for job in second.earlier()] == [0, 1]
-    again = [second.next(), second.next(), second.next()]
-    assert [job.number for job in again if job] == [2, 3, 4]
-    assert [job.overrides for job in again[:2] if job] == [job.overrides for job in jobs[2:]]
-
-
-@pytest.mark.parametrize("pruner", ["asha", "median"])
-def test_a_job_that_is_worse_than_others_were_is_hopeless(pruner: str, tmp_path: Path) -> None:
-    _, trials = study(tmp_path, *TOY, f"sweep.pruner={pruner}", "num_timesteps=100")
-
-    def course(value: float) -> bool:
-        job = trials.next()
-        assert job is not None
-        for steps in range(1, 101):
-            job.progress.env_steps, job.progress.value = steps, value
-            if trials.is_hopeless(job):
-                trials.tell(end(job, "pruned", value))
-                return True
-        trials.tell(end(job, "completed", value))
-        return False
-
-    assert not course(15.0)
-    hopeless = [course(float(value)) for value in (12, 13, 14, 15, 16)]
-    assert not all(hopeless)
-    assert course(-5.0)
-    _, kept = study(tmp_path, *TOY)
-    assert len(kept.earlier()) == 7
-
-
-def test_a_sampler_without_its_package_is_bad_input(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setitem(sys.modules, "optuna", None)
-    with pytest.raises(ConfigError, match=r"pip install 'gmijax\[sweep\]'"):
-        study(tmp_path, *TOY)
 
 
 @pytest.mark.parametrize(

@@ -13,6 +13,7 @@ import pytest
 from toy_env import metrics_from, point_mass
 
 from gmijax.errors import NonFiniteError
+from gmijax.learning.evaluator import Evaluation
 from gmijax.learning.physics_health import TOLERATED_STEPS
 from gmijax.learning.report_thread import ReportThread
 from gmijax.learning.training_log import (
@@ -101,6 +102,24 @@ def test_a_report_that_cannot_come_is_not_waited_for() -> None:
     thread.stop()
     assert time.monotonic() - started < 1.5  # It waits 2 s for one that may come.
     is_there.set()
+
+
+def test_an_evaluation_is_in_the_line_of_its_iteration_and_in_no_rate() -> None:
+    written: list[dict[str, float]] = []
+
+    class Sink:
+        def write(self, line: dict[str, float]) -> None:
+            written.append(line)
+
+    log = TrainingLog("point_mass", (Sink(),), 0)
+    started_s, metrics = log.last_s, metrics_from(_counts())
+    evaluation = Evaluation(started_s + 2.0, 7.0, {"eval/return": 3.0, "time/eval_s": 7.0}, True)
+    report(log, 100, metrics, {}, evaluation)
+    report(log, 200, metrics, {}, evaluation._replace(started_s=started_s + 10.0))
+    assert [line["eval/return"] for line in written] == [3.0, 3.0]
+    assert [line["env_steps_per_s"] for line in written] == pytest.approx([50.0, 100.0])
+    assert log.line_s == pytest.approx([2.0, 1.0])
+    assert written[1]["wall_s"] == pytest.approx(10.0)
 
 
 def test_terms_and_metrics_are_means_over_episodes() -> None:

@@ -111,11 +111,14 @@ class FailureDetector:
 
     def _raise_lost(self, peer: int) -> NoReturn:
         self._block.lines["blamed"][self._block.rank] = peer + 1
-        raise PeerLost(self._block.rank, peer, self._operation, self._step)
+        first = self._block.first_rank
+        raise PeerLost(self._block.rank + first, peer + first, self._operation, self._step)
 
     def _raise_timeout(self, missing: list[int], waited_s: float) -> NoReturn:
         self._block.lines["blamed"][self._block.rank] = missing[0] + 1
         waited_s = min(round(waited_s, 2), self._timeout_s)
+        first = self._block.first_rank
+        ranks = tuple(peer + first for peer in missing)
         raise CollectiveTimeout(
-            self._block.rank, tuple(missing), self._operation, self._step, waited_s
+            self._block.rank + first, ranks, self._operation, self._step, waited_s
         )

@@ -40,6 +40,7 @@ class HostExchange:
       timeout_s: longest wait for other ranks.
       rendezvous_timeout_s: the same in the first call, when others may still start or compile.
       lane: of the block; those who use one thread of calls each take a lane each.
+      first_rank: see `SharedBlock`.
 
     Attributes:
       rank, world_size: the same.
@@ -61,11 +62,13 @@ class HostExchange:
         timeout_s: float,
         rendezvous_timeout_s: float,
         lane: int = 0,
+        first_rank: int = 0,
     ) -> None:
         self.rank = rank
         self.world_size = world_size
-        self._block: SharedBlock | None = attach(fd, rank, world_size, num_floats, lane)
-        self.barrier = Barrier(self._block, timeout_s, rendezvous_timeout_s)
+        block = attach(fd, rank, world_size, num_floats, lane)._replace(first_rank=first_rank)
+        self._block: SharedBlock | None = block
+        self.barrier = Barrier(block, timeout_s, rendezvous_timeout_s)
 
     def sum(
         self, source: FloatBuffer, target: FloatBuffer, groups: Groups, place: int = 0
@@ -144,6 +147,10 @@ class HostExchange:
     def is_gone(self, peer: int) -> bool:
         """Whether an attached peer has closed its exchange, or its process has ended."""
         return not process_of(self._open_block("is_gone"), peer).is_running()
+
+    def beat(self) -> None:
+        """Tells the others that this rank waits, for somebody who is not in this block."""
+        self._open_block("beat").lines["beats"][self.rank] += 1
 
     def close(self) -> None:
         """Gives the memory back. Idempotent."""

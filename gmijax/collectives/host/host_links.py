@@ -12,6 +12,7 @@ import numpy as np
 
 from gmijax.collectives.host.host_exchange import HostExchange
 from gmijax.collectives.interface import FloatBuffer
+from gmijax.collectives.nodes.node_exchange import NodeExchange
 from gmijax.collectives.strategies import Stage
 from gmijax.errors import GmijaxError
 
@@ -27,11 +28,11 @@ class HostLinks:
     A program waits in its exchanges for the other ranks, so calls return when it is computed.
 
     Args:
-      host: this rank's use of the shared block.
+      host: this rank's use of the shared block, and of the connections between nodes.
       num_floats: P, length of the largest buffer.
     """
 
-    def __init__(self, host: HostExchange, num_floats: int) -> None:
+    def __init__(self, host: HostExchange | NodeExchange, num_floats: int) -> None:
         self.room = num_floats
         self._host = host
         self._failure: GmijaxError | None = None
@@ -52,6 +53,10 @@ class HostLinks:
         }
 
         def reduce(values: FloatBuffer, result: FloatBuffer) -> None:
+            if stage.link == "nodes":
+                assert isinstance(self._host, NodeExchange)
+                self._host.sum_between_nodes(values, result, place)
+                return
             if stage.kind == "gather":
                 result = result.reshape(rows, -1)
             calls[stage.kind](values, result, stage.groups, place)

@@ -86,6 +86,8 @@ class SharedBlock(NamedTuple):
       flags: [whole pages, FLOATS_PER_LINE] uint32, of which [rank, 0] counts how often the device
         of a rank has written its slots; 1 says that the rank is through with slots in device
         memory, and 2 to 3 which exchanges it has come to (`device_links.Order`).
+      first_rank: rank in the job of this block's first one, for what is said of lost peers: with
+        several nodes each has a block.
     """
 
     rank: int
@@ -93,6 +95,7 @@ class SharedBlock(NamedTuple):
     gathered: npt.NDArray[np.float32]
     slots: npt.NDArray[np.float32]
     flags: npt.NDArray[np.uint32]
+    first_rank: int = 0
 
 
 def create_exchange() -> int:

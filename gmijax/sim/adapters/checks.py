@@ -30,6 +30,12 @@ def check_env(env: Any, what: str) -> None:
         size = getattr(spec, name)
         if not isinstance(size, int) or size < 1:
             raise ConfigError(f"{what}: spec.{name}={size!r}: must be an integer of at least 1")
+    seen = spec.actor_obs_size
+    if seen is not None and not (isinstance(seen, int) and 1 <= seen <= spec.obs_size):
+        raise ConfigError(
+            f"{what}: spec.actor_obs_size={seen!r}: must be an integer from 1 to "
+            f"spec.obs_size={spec.obs_size}, or None"
+        )
     key = jax.eval_shape(lambda: jax.random.key(0))
     action = jax.ShapeDtypeStruct((spec.action_size,), jnp.float32)
     state = attempt(f"{what}: reset", jax.eval_shape, env.reset, env.model, key)
@@ -38,6 +44,12 @@ def check_env(env: Any, what: str) -> None:
     _check_state(env, moved, key, f"{what}: step")
     if change := _change(state, moved):
         raise ConfigError(f"{what}: step must keep all shapes and dtypes, but {change}")
+    if env.next_episode is not None:
+        again = attempt(
+            f"{what}: next_episode", jax.eval_shape, env.next_episode, env.model, moved
+        )
+        if change := _change(state, again):
+            raise ConfigError(f"{what}: next_episode must give what reset does, but {change}")
     _check_qpos(env, state, what)
 
 

@@ -6,8 +6,10 @@ import hashlib
 import importlib.util
 import inspect
 import sys
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from types import ModuleType
+from typing import Any
 
 from gmijax.config.schema import suggestion
 from gmijax.errors import ConfigError
@@ -22,14 +24,18 @@ def make(
     impl: str = "auto",
     max_envs: int | None = None,
     source_sha256: str | None = None,
+    rewards: Mapping[str, float] | None = None,
+    settings: Mapping[str, float] | None = None,
+    curriculum: bool = False,
 ) -> Env:
     """Calls `FUNCTION(impl=..., max_envs=...)` of `PATH.py:FUNCTION`, and checks what it returns.
 
-    With `source_sha256` a file of another digest is not executed.
+    With `source_sha256` a file of another digest is not executed. `rewards` and `settings` are
+    handed on where they are not empty, `curriculum` where it is true.
 
     Raises:
-      ConfigError: the file or the function cannot be had, it fails, or what it returns is no
-        environment; one line, with the place.
+      ConfigError: the file or the function cannot be had, it takes no such argument, it fails, or
+        what it returns is no environment; one line, with the place.
     """
     path, function = split(name)
     module = attempt(f"env={path}", _load, path, source_sha256)
@@ -38,10 +44,21 @@ def make(
         names = [key for key, value in vars(module).items() if inspect.isfunction(value)]
         raise ConfigError(f"env={name}: no function {function} there{suggestion(function, names)}")
     what = f"env={path.name}:{function}"
-    env = attempt(what, found, impl=impl, max_envs=max_envs)
+    changes = {"rewards": rewards, "settings": settings, "curriculum": curriculum}
+    given = {key: value for key, value in changes.items() if value}
+    for group in given:
+        _require_argument(found, group, what)
+    env = attempt(what, found, impl=impl, max_envs=max_envs, **given)
     check_env(env, what)
     check_start(env, what)
     return env
+
+
+def _require_argument(function: Callable[..., Any], group: str, what: str) -> None:
+    kinds = inspect.signature(function).parameters
+    takes_all = any(kind.kind is inspect.Parameter.VAR_KEYWORD for kind in kinds.values())
+    if group not in kinds and not takes_all:
+        raise ConfigError(f"env.{group}: {what} has no argument `{group}` to take it")
 
 
 def _load(path: Path, source_sha256: str | None) -> ModuleType:

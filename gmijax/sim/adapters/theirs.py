@@ -21,6 +21,10 @@ from gmijax.sim.adapters.checks import check_env
 from gmijax.sim.interface import Env, EnvSpec, EnvState
 from gmijax.types import Array, PRNGKey, PyTree
 
+POLICY_OBS, PRIVILEGED_OBS = "state", "privileged_state"
+"""Entries of observations that are dicts, with Playground's names: the policy sees the first one,
+the value function both."""
+
 REWARD = "reward"
 """The one term of the reward: theirs come as a sum."""
 
@@ -35,9 +39,9 @@ def adapt(
 ) -> Env:
     """Makes an `Env` of theirs.
 
-    Observations that are dicts: the entry `state` where there is one (what their PPO gives to
-    the policy; what only their critic may see is left out), else all entries in the order of
-    their names. Scalars of `metrics` are summed over the episode, as Brax's `EpisodeWrapper`
+    Observations that are dicts: the entry `state` where there is one, which the policy sees, and
+    behind it `privileged_state`, which the value function sees too; else all entries in the order
+    of their names. Scalars of `metrics` are summed over the episode, as Brax's `EpisodeWrapper`
     does. `done` terminates, unless `info["truncation"]` says that time ran out.
 
     Args:
@@ -61,6 +65,7 @@ def adapt(
         episode_length=episode_length,
         reward_terms=(REWARD,),
         metrics=tuple(sorted(key for key, value in start.metrics.items() if value.shape == ())),
+        actor_obs_size=_actor_obs_size(start.obs),
     )
 
     def positions(state: EnvState) -> Array:
@@ -103,14 +108,25 @@ def require_jax(impl: str, suite: str) -> None:
 
 
 def observation(obs: Any) -> Array:
-    """The vector [O] that is learnt from, see `adapt`."""
+    """The vector [O] that is learnt from, with what the policy sees in front; see `adapt`."""
     return jnp.concatenate([jnp.ravel(part).astype(jnp.float32) for part in _parts(obs).values()])
 
 
 def _parts(obs: Any) -> dict[str, Any]:
-    if isinstance(obs, Mapping) and "state" in obs:
-        obs = {"state": obs["state"]}
+    if not (isinstance(obs, Mapping) and POLICY_OBS in obs):
+        return _named(obs)
+    privileged = {name: part for name, part in obs.items() if name == PRIVILEGED_OBS}
+    return _named({POLICY_OBS: obs[POLICY_OBS]}) | _named(privileged)  # In this order.
+
+
+def _named(obs: Any) -> dict[str, Any]:
     return {jax.tree_util.keystr(at): leaf for at, leaf in jax.tree.leaves_with_path(obs)}
+
+
+def _actor_obs_size(obs: Any) -> int | None:
+    if not (isinstance(obs, Mapping) and {POLICY_OBS, PRIVILEGED_OBS} <= obs.keys()):
+        return None
+    return sum(leaf.size for leaf in jax.tree.leaves(obs[POLICY_OBS]))
 
 
 def _obs_size(obs: Any, name: str) -> int:

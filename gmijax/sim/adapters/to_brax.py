@@ -9,6 +9,7 @@ import jax.numpy as jnp
 from brax.envs.base import Env, State
 
 from gmijax.sim import interface
+from gmijax.sim.adapters.theirs import POLICY_OBS, PRIVILEGED_OBS
 from gmijax.types import Array, PyTree
 
 _KEY = "gmijax_key"
@@ -20,7 +21,8 @@ class BraxEnv(Env):
     It has no time limit: `brax.envs.training.wrap(env, episode_length=env.episode_length)` sets
     it, and `info["truncation"]`. `metrics` has every term of the reward as `reward/<name>`, which
     Brax sums over episodes; the task's own metrics are values of a moment, and stand in
-    `info["task_metrics"]`.
+    `info["task_metrics"]`. Where only the value function sees all of an observation it is a dict,
+    as in Playground: `state` for the policy, `privileged_state` for the value function.
 
     Brax's automatic reset goes back to the first start of a world, not to a new one.
     """
@@ -32,7 +34,7 @@ class BraxEnv(Env):
         """Starts an episode from a key, new-style or plain integers [2]."""
         if not jnp.issubdtype(rng.dtype, jax.dtypes.prng_key):
             rng = jax.random.wrap_key_data(rng)
-        return _to_state(self._env.reset(self._env.model, rng), {}, {})
+        return _to_state(self._env.spec, self._env.reset(self._env.model, rng), {}, {})
 
     def step(self, state: State, action: Array) -> State:
         """One control step of one world under `action` [A]."""
@@ -40,12 +42,13 @@ class BraxEnv(Env):
         before: Any = state.pipeline_state
         key = jax.random.wrap_key_data(state.info[_KEY])
         moved = self._env.step(self._env.model, before._replace(key=key), action)
-        return _to_state(moved, state.info, state.metrics)
+        return _to_state(self._env.spec, moved, state.info, state.metrics)
 
     @property
-    def observation_size(self) -> int:
-        """O."""
-        return self._env.spec.obs_size
+    def observation_size(self) -> Any:
+        """O, or the shapes of the entries `state` and `privileged_state`."""
+        size, seen = self._env.spec.obs_size, self._env.spec.actor_obs_size
+        return size if seen is None else {POLICY_OBS: (seen,), PRIVILEGED_OBS: (size,)}
 
     @property
     def action_size(self) -> int:
@@ -73,7 +76,15 @@ class BraxEnv(Env):
         return self._env.mj_model
 
 
-def _to_state(state: interface.EnvState, info: dict[str, Any], metrics: dict[str, Array]) -> State:
+def _to_state(
+    spec: interface.EnvSpec,
+    state: interface.EnvState,
+    info: dict[str, Any],
+    metrics: dict[str, Array],
+) -> State:
+    obs: Any = state.obs
+    if spec.actor_obs_size is not None:
+        obs = {POLICY_OBS: obs[..., : spec.actor_obs_size], PRIVILEGED_OBS: obs}
     # What Brax's wrappers have put into `info` and `metrics` stays.
     terms = {f"reward/{name}": value for name, value in state.reward_terms.items()}
     mine: dict[str, PyTree] = {
@@ -82,7 +93,7 @@ def _to_state(state: interface.EnvState, info: dict[str, Any], metrics: dict[str
     }
     return State(
         pipeline_state=state._replace(key=()),  # pyright: ignore[reportArgumentType]
-        obs=state.obs,
+        obs=obs,
         reward=state.reward,
         done=(state.terminated | state.truncated).astype(jnp.float32),
         metrics={**metrics, **terms},

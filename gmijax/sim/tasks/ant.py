@@ -8,6 +8,7 @@ Action [8]: joint torques, hip then ankle of legs 1 to 4.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import NamedTuple
 
 import jax
@@ -16,9 +17,10 @@ import mujoco
 
 from gmijax.sim import episode, physics
 from gmijax.sim.interface import Env, EnvSpec, EnvState
-from gmijax.sim.rewards import Replacement, RewardTerm, term_names, total_reward
+from gmijax.sim.rewards import Replacement, RewardTerm, term_names, total_reward, with_weights
 from gmijax.sim.tasks import runner
 from gmijax.sim.tasks.runner import RunnerIds, RunnerPose, draw_start, pose_of, speed_to_target
+from gmijax.sim.tasks.settings import AntSettings, settings_from
 from gmijax.types import Array, PRNGKey, PyTree
 
 DEFAULT_EPISODE_LENGTH = 1000
@@ -26,9 +28,14 @@ SUBSTEPS = 3
 # A running ant stays below 100, the sensors of a landing foot included.
 MAX_ABS_OBS = 500.0
 OBS_SIZE = 60
+OBS_TERMS = (
+    *runner.TORSO_TERMS,
+    ("joint_position", 8),
+    ("joint_velocity", 8),
+    ("foot_force_and_torque", 24),
+    ("last_action", 8),
+)
 ACTION_SIZE = 8
-DEATH_HEIGHT_M = 0.31
-DEATH_REWARD = -2.0
 JOINT_VELOCITY_SCALE = 0.2
 FOOT_SENSOR_SCALE = 0.1
 
@@ -61,8 +68,15 @@ TERMS = {
 DEATH = "death"
 
 
-def make(*, impl: str = "auto", max_envs: int | None = None) -> Env:
+def make(
+    *,
+    impl: str = "auto",
+    max_envs: int | None = None,
+    rewards: Mapping[str, float] | None = None,
+    settings: Mapping[str, float] | None = None,
+) -> Env:
     """Makes the task without its time limit; see `gmijax.sim.registry.make_env`."""
+    terms, chosen = with_weights(TERMS, rewards), settings_from(AntSettings, settings)
     world = physics.load("ant", impl=impl, substeps=SUBSTEPS, max_envs=max_envs)
     ids = look_up(world.mj_model)
     spec = EnvSpec(
@@ -71,15 +85,16 @@ def make(*, impl: str = "auto", max_envs: int | None = None) -> Env:
         action_size=ACTION_SIZE,
         control_dt_s=world.control_dt_s,
         episode_length=DEFAULT_EPISODE_LENGTH,
-        reward_terms=term_names(TERMS, DEATH),
+        reward_terms=term_names(terms, DEATH),
         max_abs_obs=MAX_ABS_OBS,
         metrics=(runner.SPEED,),
+        obs_terms=OBS_TERMS,
     )
 
     def reset(model: PyTree, key: PRNGKey) -> EnvState:
         del model  # nothing that a reset draws depends on it
         key, draw = jax.random.split(key)
-        start = world.start(*draw_start(ids, world.mj_model, draw))
+        start = world.start(*draw_start(ids, world.mj_model, draw, chosen))
         # The feet's sensors read zero: to fill them in would take a whole physics step, and an
         # automatic reset happens, under `where`, in every step of every world.
         zeros = jnp.zeros(len(ids.sensors)), jnp.zeros(ACTION_SIZE)
@@ -90,8 +105,8 @@ def make(*, impl: str = "auto", max_envs: int | None = None) -> Env:
         moved, sensordata = world.step(model, state.physics, action)
         pose = pose_of(ids, moved)
         view = AntView(pose, action, speed_to_target(state.physics, moved, world.control_dt_s))
-        dead = pose.position[2] < DEATH_HEIGHT_M
-        reward = total_reward(TERMS, view, Replacement(DEATH, dead, DEATH_REWARD))
+        dead = pose.position[2] < chosen.death_height_m
+        reward = total_reward(terms, view, Replacement(DEATH, dead, chosen.death_reward))
         obs = observe(pose, sensordata[ids.sensors], action)
         metrics = {runner.SPEED: runner.mean_speed(pose, state.steps + 1, world.control_dt_s)}
         return episode.advance(state, moved, (), obs, reward, dead, metrics)

@@ -9,6 +9,7 @@ LH, RF, RH. Isaac Gym's paper: arXiv:2108.10470.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -20,24 +21,31 @@ import numpy.typing as npt
 
 from gmijax.sim import episode, physics, rotations
 from gmijax.sim.interface import Env, EnvSpec, EnvState
-from gmijax.sim.rewards import RewardTerm, term_names, total_reward
+from gmijax.sim.rewards import RewardTerm, term_names, total_reward, with_weights
 from gmijax.sim.tasks import lookup
+from gmijax.sim.tasks.settings import AnymalSettings, settings_from
 from gmijax.types import Array, PRNGKey, PyTree
 
 DEFAULT_EPISODE_LENGTH = 2500
 SUBSTEPS = 4
 OBS_SIZE = 48
+OBS_TERMS = (
+    ("base_velocity", 3),
+    ("base_angular_velocity", 3),
+    ("gravity_direction", 3),
+    ("commanded_velocity", 2),
+    ("commanded_yaw_rate", 1),
+    ("joint_position", 12),
+    ("joint_velocity", 12),
+    ("last_action", 12),
+)
 ACTION_SIZE = 12
 OBS_LIMIT = 5.0
-ACTION_SCALE_RAD = 0.5
 VELOCITY_SCALE = 2.0
 ANGULAR_VELOCITY_SCALE = 0.25
 JOINT_VELOCITY_SCALE = 0.05
-COMMAND_LIMITS = (2.0, 1.0, 1.0)  # m/s forwards, m/s to the left, rad/s
 KNEE_RADIUS_M = 0.065
 BASE_HALF_SIZE_M = (0.525, 0.16, 0.09)
-START_FACTOR = (0.5, 1.5)
-VELOCITY_NOISE_RAD_PER_S = 0.1
 
 LEGS = ("LF", "LH", "RF", "RH")
 JOINTS = tuple(f"{leg}_{joint}" for leg in LEGS for joint in ("HAA", "HFE", "KFE"))
@@ -51,11 +59,14 @@ class AnymalTask(NamedTuple):
       command: [3] wanted speed forwards and to the left, m/s, and of yaw, rad/s.
       velocity_error_sum: [] of the episode's steps so far, m/s.
       yaw_rate_error_sum: [] of the episode's steps so far, rad/s.
+      share: [] of the commands' ranges that `command` was drawn from, carried on from episode to
+        episode by the curriculum; None without one.
     """
 
     command: Array
     velocity_error_sum: Array
     yaw_rate_error_sum: Array
+    share: Array | None = None
 
 
 @dataclass(frozen=True)
@@ -95,10 +106,27 @@ TERMS = {
 }
 FLOOR = "floor"
 METRICS: tuple[str, ...] = ("velocity_error_m_per_s", "yaw_rate_error_rad_per_s")
+SHARE = "command_share"
+"""The metric of the curriculum."""
+
+SUCCESS_M_PER_S = 0.25
+"""Largest mean velocity error of an episode that succeeds."""
 
 
-def make(*, impl: str = "auto", max_envs: int | None = None) -> Env:
-    """Makes the task without its time limit; see `gmijax.sim.registry.make_env`."""
+def make(
+    *,
+    impl: str = "auto",
+    max_envs: int | None = None,
+    rewards: Mapping[str, float] | None = None,
+    settings: Mapping[str, float] | None = None,
+    curriculum: bool = False,
+) -> Env:
+    """Makes the task without its time limit; see `gmijax.sim.registry.make_env`.
+
+    With `curriculum` the commands of a world begin with a part of their ranges, which grows with
+    every episode that succeeds.
+    """
+    terms, chosen = with_weights(TERMS, rewards), settings_from(AnymalSettings, settings)
     world = physics.load("anymal", impl=impl, substeps=SUBSTEPS, max_envs=max_envs)
     ids = look_up(world.mj_model)
     # A number that is not finite outlives the clipping of observations or shows in `qpos`, so
@@ -109,34 +137,44 @@ def make(*, impl: str = "auto", max_envs: int | None = None) -> Env:
         action_size=ACTION_SIZE,
         control_dt_s=world.control_dt_s,
         episode_length=DEFAULT_EPISODE_LENGTH,
-        reward_terms=term_names(TERMS, FLOOR),
-        metrics=METRICS,
+        reward_terms=term_names(terms, FLOOR),
+        metrics=(*METRICS, SHARE) if curriculum else METRICS,
+        obs_terms=OBS_TERMS,
     )
+
+    def begin(key: PRNGKey, share: Array | None) -> EnvState:
+        key, start_key, command_key = jax.random.split(key, 3)
+        start = world.start(*draw_start(ids, world.mj_model, start_key, chosen))
+        command = draw_command(command_key, chosen, share)
+        task = AnymalTask(command, jnp.zeros(()), jnp.zeros(()), share)
+        obs = observe(ids, start, task.command, jnp.zeros(ACTION_SIZE))
+        return episode.begin(spec, start, task, obs, key)
 
     def reset(model: PyTree, key: PRNGKey) -> EnvState:
         del model  # nothing that a reset draws depends on it
-        key, start_key, command_key = jax.random.split(key, 3)
-        start = world.start(*draw_start(ids, world.mj_model, start_key))
-        task = AnymalTask(draw_command(command_key), jnp.zeros(()), jnp.zeros(()))
-        obs = observe(ids, start, task.command, jnp.zeros(ACTION_SIZE))
-        return episode.begin(spec, start, task, obs, key)
+        return begin(key, jnp.float32(chosen.curriculum_start) if curriculum else None)
+
+    def next_episode(model: PyTree, ended: EnvState) -> EnvState:
+        del model
+        return begin(ended.key, next_share(ended, chosen.curriculum_growth))
 
     def step(model: PyTree, state: EnvState, action: Array) -> EnvState:
         action = jnp.clip(action, -1.0, 1.0)
         moved, (torques, knees) = world.step(
             model,
             state.physics,
-            jnp.asarray(ids.standing) + ACTION_SCALE_RAD * action,
+            jnp.asarray(ids.standing) + chosen.action_scale_rad * action,
             lambda data: (data.qfrc_actuator[ids.joints.qvel], data.xpos[ids.shanks]),
         )
         view = AnymalView(*errors(moved, state.task.command), torques)
         task, metrics = add_errors(state, view)
-        reward = not_below_zero(total_reward(TERMS, view))
+        reward = not_below_zero(total_reward(terms, view))
         obs = observe(ids, moved, task.command, action)
         down = has_fallen(moved, knees)
         return episode.advance(state, moved, task, obs, reward, down, metrics)
 
-    return world.env(spec, reset, step)
+    env = world.env(spec, reset, step)
+    return env._replace(next_episode=next_episode) if curriculum else env
 
 
 def look_up(mj_model: mujoco.MjModel) -> AnymalIds:
@@ -149,11 +187,13 @@ def look_up(mj_model: mujoco.MjModel) -> AnymalIds:
     )
 
 
-def draw_start(ids: AnymalIds, mj_model: mujoco.MjModel, key: PRNGKey) -> tuple[Array, Array]:
+def draw_start(
+    ids: AnymalIds, mj_model: mujoco.MjModel, key: PRNGKey, settings: AnymalSettings
+) -> tuple[Array, Array]:
     """Random `qpos` [19] and `qvel` [18]: the base in its place, the legs near standing."""
     position_key, velocity_key = jax.random.split(key)
-    shape, noise = (ACTION_SIZE,), VELOCITY_NOISE_RAD_PER_S
-    least, most = START_FACTOR
+    shape, noise = (ACTION_SIZE,), settings.joint_velocity_noise_rad_per_s
+    least, most = settings.start_factor_min, settings.start_factor_max
     factors = jax.random.uniform(position_key, shape, minval=least, maxval=most)
     velocities = jax.random.uniform(velocity_key, shape, minval=-noise, maxval=noise)
     qpos = jnp.array(mj_model.key("stand").qpos, jnp.float32)
@@ -163,10 +203,23 @@ def draw_start(ids: AnymalIds, mj_model: mujoco.MjModel, key: PRNGKey) -> tuple[
     )
 
 
-def draw_command(key: PRNGKey) -> Array:
-    """Wanted speed forwards and to the left, m/s, and of yaw, rad/s [3]."""
-    limits = jnp.array(COMMAND_LIMITS)
+def draw_command(key: PRNGKey, settings: AnymalSettings, share: Array | None = None) -> Array:
+    """Wanted speed forwards and to the left, m/s, and of yaw, rad/s [3], from a `share` of all."""
+    limits = jnp.array(
+        (
+            settings.command_forward_m_per_s,
+            settings.command_left_m_per_s,
+            settings.command_yaw_rad_per_s,
+        )
+    )
+    limits = limits if share is None else share * limits
     return jax.random.uniform(key, (3,), minval=-limits, maxval=limits)
+
+
+def next_share(ended: EnvState, growth: float) -> Array:
+    """The share [] of the commands' ranges after an episode: more if it lasted and followed."""
+    succeeded = ended.truncated & (ended.metrics[METRICS[0]] <= SUCCESS_M_PER_S)
+    return jnp.minimum(ended.task.share + jnp.where(succeeded, growth, 0.0), 1.0)
 
 
 def gravity_direction(state: physics.PhysicsState) -> Array:
@@ -190,9 +243,11 @@ def add_errors(before: EnvState, view: AnymalView) -> tuple[AnymalTask, dict[str
         before.task.command,
         before.task.velocity_error_sum + view.velocity_error,
         before.task.yaw_rate_error_sum + view.yaw_rate_error,
+        before.task.share,
     )
     means = jnp.stack([task.velocity_error_sum, task.yaw_rate_error_sum]) / (before.steps + 1)
-    return task, dict(zip(METRICS, means, strict=True))
+    metrics = dict(zip(METRICS, means, strict=True))
+    return task, metrics if task.share is None else metrics | {SHARE: task.share}
 
 
 def not_below_zero(reward: tuple[Array, dict[str, Array]]) -> tuple[Array, dict[str, Array]]:

@@ -8,6 +8,7 @@ Action [3]: speed of the knees' position targets.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -18,8 +19,9 @@ import numpy as np
 
 from gmijax.sim import episode, physics
 from gmijax.sim.interface import Env, EnvSpec, EnvState
-from gmijax.sim.rewards import RewardTerm, term_names, total_reward
+from gmijax.sim.rewards import RewardTerm, term_names, total_reward, with_weights
 from gmijax.sim.tasks import lookup
+from gmijax.sim.tasks.settings import BallBalanceSettings, settings_from
 from gmijax.types import Array, PRNGKey, PyTree
 
 DEFAULT_EPISODE_LENGTH = 500
@@ -27,15 +29,18 @@ SUBSTEPS = 2
 # A ball in play stays below 50, the impact of its fall included.
 MAX_ABS_OBS = 500.0
 OBS_SIZE = 24
+OBS_TERMS = (
+    ("knee_position", 3),
+    ("knee_velocity", 3),
+    ("ball_position", 3),
+    ("ball_velocity", 3),
+    ("hip_force_z", 3),
+    ("hip_torque", 9),
+)
 ACTION_SIZE = 3
 OBS_LIMIT = 5.0
-ACTION_SPEED_RAD_PER_S = 20.0
 SENSOR_SCALE = 0.05
-GOAL_M = (0.0, 0.0, 0.7)
-FALLEN_HEIGHT_M = 0.15
-START_DISTANCE_M = (0.001, 0.5)
-START_HEIGHT_M = (1.0, 2.0)
-START_SPEED_M_PER_S = 5.0
+START_DISTANCE_MIN_M = 0.001
 
 LEGS = (1, 2, 3)
 KNEES = tuple(f"knee_{leg}" for leg in LEGS)
@@ -69,23 +74,31 @@ class BallBalanceIds:
 
 
 class BallBalanceView(NamedTuple):
-    """What the reward reads: the ball's position [3] in metres and velocity [3] in m/s."""
+    """What the reward reads: positions [3] in metres, of the ball and the goal, and m/s [3]."""
 
     ball: Array
     ball_velocity: Array
+    goal: Array
 
 
 def balance(view: BallBalanceView) -> Array:
     """1 for a ball at rest in the goal, less with distance and with speed."""
-    distance = jnp.linalg.norm(view.ball - jnp.array(GOAL_M))
+    distance = jnp.linalg.norm(view.ball - view.goal)
     return 1.0 / (1.0 + distance) / (1.0 + jnp.linalg.norm(view.ball_velocity))
 
 
 TERMS = {"balance": RewardTerm[BallBalanceView](balance, 1.0)}
 
 
-def make(*, impl: str = "auto", max_envs: int | None = None) -> Env:
+def make(
+    *,
+    impl: str = "auto",
+    max_envs: int | None = None,
+    rewards: Mapping[str, float] | None = None,
+    settings: Mapping[str, float] | None = None,
+) -> Env:
     """Makes the task without its time limit; see `gmijax.sim.registry.make_env`."""
+    terms, chosen = with_weights(TERMS, rewards), settings_from(BallBalanceSettings, settings)
     world = physics.load("ball_balance", impl=impl, substeps=SUBSTEPS, max_envs=max_envs)
     ids = look_up(world.mj_model)
     spec = EnvSpec(
@@ -94,27 +107,29 @@ def make(*, impl: str = "auto", max_envs: int | None = None) -> Env:
         action_size=ACTION_SIZE,
         control_dt_s=world.control_dt_s,
         episode_length=DEFAULT_EPISODE_LENGTH,
-        reward_terms=term_names(TERMS),
+        reward_terms=term_names(terms),
         max_abs_obs=MAX_ABS_OBS,
+        obs_terms=OBS_TERMS,
     )
 
     def reset(model: PyTree, key: PRNGKey) -> EnvState:
         del model  # nothing that a reset draws depends on it
         key, draw = jax.random.split(key)
-        start = world.start(*draw_start(ids, world.mj_model, draw))
+        start = world.start(*draw_start(ids, world.mj_model, draw, chosen))
         # The hips' sensors read zero: to fill them in would take a whole physics step, and an
         # automatic reset happens, under `where`, in every step of every world.
         obs = observe(ids, start, jnp.zeros(len(ids.sensors)))
         return episode.begin(spec, start, BallBalanceTask(jnp.zeros(ACTION_SIZE)), obs, key)
 
     def step(model: PyTree, state: EnvState, action: Array) -> EnvState:
-        change = ACTION_SPEED_RAD_PER_S * world.control_dt_s * jnp.clip(action, -1.0, 1.0)
+        change = chosen.action_speed_rad_per_s * world.control_dt_s * jnp.clip(action, -1.0, 1.0)
         targets = jnp.clip(state.task.targets + change, ids.knees.lower, ids.knees.upper)
         moved, sensordata = world.step(model, state.physics, targets)
         ball, ball_velocity = ball_of(ids, moved)
-        reward = total_reward(TERMS, BallBalanceView(ball, ball_velocity))
+        goal = jnp.array((0.0, 0.0, chosen.goal_height_m))
+        reward = total_reward(terms, BallBalanceView(ball, ball_velocity, goal))
         obs = observe(ids, moved, sensordata[ids.sensors])
-        fallen = ball[2] < FALLEN_HEIGHT_M
+        fallen = ball[2] < chosen.fallen_height_m
         return episode.advance(state, moved, BallBalanceTask(targets), obs, reward, fallen)
 
     return world.env(spec, reset, step)
@@ -133,19 +148,22 @@ def look_up(mj_model: mujoco.MjModel) -> BallBalanceIds:
     )
 
 
-def draw_start(ids: BallBalanceIds, mj_model: mujoco.MjModel, key: PRNGKey) -> tuple[Array, Array]:
+def draw_start(
+    ids: BallBalanceIds, mj_model: mujoco.MjModel, key: PRNGKey, settings: BallBalanceSettings
+) -> tuple[Array, Array]:
     """Random `qpos` [20] and `qvel` [18]: the tray at rest, the ball above it, falling inwards."""
     direction_key, distance_key, height_key, speed_key = jax.random.split(key, 4)
     direction = jax.random.uniform(direction_key, maxval=2.0 * jnp.pi)
     outwards = jnp.stack([jnp.cos(direction), jnp.sin(direction)])
-    nearest, farthest = START_DISTANCE_M
+    nearest, farthest = START_DISTANCE_MIN_M, settings.start_distance_max_m
     distance = jax.random.uniform(distance_key, minval=nearest, maxval=farthest)
-    height = jax.random.uniform(height_key, minval=START_HEIGHT_M[0], maxval=START_HEIGHT_M[1])
+    lowest, highest = settings.start_height_min_m, settings.start_height_max_m
+    height = jax.random.uniform(height_key, minval=lowest, maxval=highest)
     # The farther out, the faster inwards, so that a ball crosses the tray but seldom misses it.
-    speed = jax.random.uniform(speed_key, maxval=START_SPEED_M_PER_S)
+    speed = jax.random.uniform(speed_key, maxval=settings.start_speed_m_per_s)
     speed = speed * (distance - nearest) / (farthest - nearest)
     ball = jnp.append(distance * outwards, height)
-    velocity = jnp.append(-speed * outwards, -START_SPEED_M_PER_S)
+    velocity = jnp.append(-speed * outwards, -settings.start_speed_m_per_s)
     qpos = jax.lax.dynamic_update_slice(
         jnp.array(mj_model.qpos0, jnp.float32), ball, (ids.ball_qpos,)
     )

@@ -8,7 +8,7 @@ Action [9]: speed of the position targets of arm 7 and fingers 2.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -16,23 +16,28 @@ import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
+import numpy.typing as npt
 
 from gmijax.sim import episode, physics, rotations
 from gmijax.sim.interface import Env, EnvSpec, EnvState
-from gmijax.sim.rewards import Replacement, RewardTerm, term_names, total_reward
+from gmijax.sim.rewards import Replacement, RewardTerm, term_names, total_reward, with_weights
 from gmijax.sim.tasks import lookup
+from gmijax.sim.tasks.settings import FrankaCabinetSettings, settings_from
 from gmijax.types import Array, PRNGKey, PyTree
 
 DEFAULT_EPISODE_LENGTH = 500
 SUBSTEPS = 2
 OBS_SIZE = 23
+OBS_TERMS = (
+    ("joint_position", 9),
+    ("joint_velocity", 9),
+    ("gripper_to_handle", 3),
+    ("drawer_position", 1),
+    ("drawer_velocity", 1),
+)
 ACTION_SIZE = 9
 OBS_LIMIT = 5.0
-# rad/s of the arm's targets and m/s of the fingers' at full action.
-ACTION_SPEEDS = np.array([7.5] * 7 + [0.75] * 2, np.float32)
 JOINT_VELOCITY_SCALE = 0.1
-# Of every driven joint, the fingers' too: 0.125 m, so that most start wide open or closed.
-JOINT_NOISE = 0.125
 # Between the fingers' pads. The figures' source has a point where the fingers begin, and 0.04 m
 # askew from there; a gripper that holds the handle is 0.06 m away from it.
 GRASP_IN_HAND_M = (0.0, 0.0, 0.0584 + 0.045)
@@ -42,8 +47,6 @@ HANDLE_IN_DRAWER_M = (0.3, 0.01, 0.0)
 NEAR_M = 0.02
 FINGER_REACH_M = 0.04
 BEHIND_M = 0.04
-BEHIND_REWARD = -1.0
-OPEN_M = 0.39
 
 JOINTS = (*(f"joint_{i}" for i in range(1, 8)), "finger_left", "finger_right")
 
@@ -96,11 +99,19 @@ class FrankaCabinetPose(NamedTuple):
 
 
 class FrankaCabinetView(NamedTuple):
-    """What the reward terms read: the poses, the drawer's opening in metres, the action."""
+    """What the reward terms read.
+
+    Attributes:
+      pose: of gripper and handle.
+      drawer_m: [] the drawer's opening, metres.
+      action: [9] clipped.
+      open_m: from which opening on the drawer counts as open.
+    """
 
     pose: FrankaCabinetPose
     drawer_m: Array
     action: Array
+    open_m: float
 
 
 def closeness(view: FrankaCabinetView) -> Array:
@@ -147,46 +158,56 @@ TERMS = {
     "action": RewardTerm[FrankaCabinetView](lambda v: jnp.sum(v.action**2), -0.01),
     "ajar": RewardTerm[FrankaCabinetView](lambda v: beyond(0.01, v), 0.5),
     "half_open": RewardTerm[FrankaCabinetView](lambda v: beyond(0.2, v) * around(v), 1.0),
-    "open": RewardTerm[FrankaCabinetView](lambda v: beyond(OPEN_M, v) * around(v), 2.0),
+    "open": RewardTerm[FrankaCabinetView](lambda v: beyond(v.open_m, v) * around(v), 2.0),
 }
 BEHIND = "behind"
 
 
-def make(*, impl: str = "auto", max_envs: int | None = None) -> Env:
+def make(
+    *,
+    impl: str = "auto",
+    max_envs: int | None = None,
+    rewards: Mapping[str, float] | None = None,
+    settings: Mapping[str, float] | None = None,
+) -> Env:
     """Makes the task without its time limit; see `gmijax.sim.registry.make_env`."""
+    terms, chosen = with_weights(TERMS, rewards), settings_from(FrankaCabinetSettings, settings)
     world = physics.load("franka_cabinet", impl=impl, substeps=SUBSTEPS, max_envs=max_envs)
-    ids = look_up(world.mj_model)
+    ids, speeds = look_up(world.mj_model), action_speeds(chosen)
     spec = EnvSpec(
         name="franka_cabinet",
         obs_size=OBS_SIZE,
         action_size=ACTION_SIZE,
         control_dt_s=world.control_dt_s,
         episode_length=DEFAULT_EPISODE_LENGTH,
-        reward_terms=term_names(TERMS, BEHIND),
+        reward_terms=term_names(terms, BEHIND),
         metrics=("drawer_m", "opened"),
+        obs_terms=OBS_TERMS,
     )
 
     def reset(model: PyTree, key: PRNGKey) -> EnvState:
         del model  # nothing that a reset draws depends on it
         key, draw = jax.random.split(key)
-        start = world.start(draw_start(ids, world.mj_model, draw), jnp.zeros(world.mj_model.nv))
+        start = world.start(
+            draw_start(ids, world.mj_model, draw, chosen), jnp.zeros(world.mj_model.nv)
+        )
         obs = observe(ids, start, pose_of(ids, *world.poses(start.qpos)))
         task = FrankaCabinetTask(start.qpos[ids.joints.qpos])
         return episode.begin(spec, start, task, obs, key)
 
     def step(model: PyTree, state: EnvState, action: Array) -> EnvState:
         action = jnp.clip(action, -1.0, 1.0)
-        change = ACTION_SPEEDS * world.control_dt_s * action
+        change = speeds * world.control_dt_s * action
         targets = jnp.clip(state.task.targets + change, ids.joints.lower, ids.joints.upper)
         moved, poses = world.step(
             model, state.physics, targets, lambda data: (data.xpos, data.xquat)
         )
         pose, drawer_m = pose_of(ids, *poses), moved.qpos[ids.drawer_joint.qpos[0]]
-        opened = drawer_m > OPEN_M
+        opened = drawer_m > chosen.open_m
         reward = total_reward(
-            TERMS,
-            FrankaCabinetView(pose, drawer_m, action),
-            Replacement(BEHIND, is_behind(pose), BEHIND_REWARD),
+            terms,
+            FrankaCabinetView(pose, drawer_m, action, chosen.open_m),
+            Replacement(BEHIND, is_behind(pose), chosen.behind_reward),
         )
         metrics = {"drawer_m": drawer_m, "opened": opened.astype(jnp.float32)}
         task, obs = FrankaCabinetTask(targets), observe(ids, moved, pose)
@@ -209,10 +230,20 @@ def look_up(mj_model: mujoco.MjModel) -> FrankaCabinetIds:
     )
 
 
-def draw_start(ids: FrankaCabinetIds, mj_model: mujoco.MjModel, key: PRNGKey) -> Array:
+def action_speeds(settings: FrankaCabinetSettings) -> npt.NDArray[np.float32]:
+    """Of the targets at full action [9]: rad/s of the arm's, m/s of the fingers'."""
+    arm, finger = settings.arm_speed_rad_per_s, settings.finger_speed_m_per_s
+    return np.array([arm] * 7 + [finger] * 2, np.float32)
+
+
+def draw_start(
+    ids: FrankaCabinetIds, mj_model: mujoco.MjModel, key: PRNGKey, settings: FrankaCabinetSettings
+) -> Array:
     """Random `qpos` [10]: noise on arm and fingers, the drawer closed."""
     start = np.asarray(mj_model.key("start").qpos, np.float32)
-    noise = jax.random.uniform(key, (ACTION_SIZE,), minval=-JOINT_NOISE, maxval=JOINT_NOISE)
+    # The fingers' too: by 0.125 m, so that most start wide open or closed.
+    most = settings.joint_noise
+    noise = jax.random.uniform(key, (ACTION_SIZE,), minval=-most, maxval=most)
     joints = jnp.clip(start[ids.joints.qpos] + noise, ids.joints.lower, ids.joints.upper)
     return jnp.array(start).at[ids.joints.qpos].set(joints)
 

@@ -9,6 +9,7 @@ Action [21]: joint torques, each joint with a gear of its own.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import NamedTuple
 
 import jax
@@ -19,9 +20,10 @@ import numpy.typing as npt
 
 from gmijax.sim import episode, physics
 from gmijax.sim.interface import Env, EnvSpec, EnvState
-from gmijax.sim.rewards import Replacement, RewardTerm, term_names, total_reward
+from gmijax.sim.rewards import Replacement, RewardTerm, term_names, total_reward, with_weights
 from gmijax.sim.tasks import runner
 from gmijax.sim.tasks.runner import RunnerIds, RunnerPose
+from gmijax.sim.tasks.settings import HumanoidSettings, settings_from
 from gmijax.types import Array, PRNGKey, PyTree
 
 DEFAULT_EPISODE_LENGTH = 1000
@@ -29,9 +31,15 @@ SUBSTEPS = 4
 # Random actions stay below 100, the sensors of a landing foot included.
 MAX_ABS_OBS = 500.0
 OBS_SIZE = 108
+OBS_TERMS = (
+    *runner.TORSO_TERMS,
+    ("joint_position", 21),
+    ("joint_velocity", 21),
+    ("joint_torque", 21),
+    ("foot_force_and_torque", 12),
+    ("last_action", 21),
+)
 ACTION_SIZE = 21
-DEATH_HEIGHT_M = 0.8
-DEATH_REWARD = -1.0
 ANGULAR_VELOCITY_SCALE = 0.25
 JOINT_VELOCITY_SCALE = 0.1
 FORCE_SCALE = 0.01
@@ -87,8 +95,15 @@ TERMS = {
 DEATH = "death"
 
 
-def make(*, impl: str = "auto", max_envs: int | None = None) -> Env:
+def make(
+    *,
+    impl: str = "auto",
+    max_envs: int | None = None,
+    rewards: Mapping[str, float] | None = None,
+    settings: Mapping[str, float] | None = None,
+) -> Env:
     """Makes the task without its time limit; see `gmijax.sim.registry.make_env`."""
+    terms, chosen = with_weights(TERMS, rewards), settings_from(HumanoidSettings, settings)
     world = physics.load("humanoid", impl=impl, substeps=SUBSTEPS, max_envs=max_envs)
     ids, strength = look_up(world.mj_model), motor_strength(world.mj_model)
     spec = EnvSpec(
@@ -97,15 +112,16 @@ def make(*, impl: str = "auto", max_envs: int | None = None) -> Env:
         action_size=ACTION_SIZE,
         control_dt_s=world.control_dt_s,
         episode_length=DEFAULT_EPISODE_LENGTH,
-        reward_terms=term_names(TERMS, DEATH),
+        reward_terms=term_names(terms, DEATH),
         max_abs_obs=MAX_ABS_OBS,
         metrics=(runner.SPEED,),
+        obs_terms=OBS_TERMS,
     )
 
     def reset(model: PyTree, key: PRNGKey) -> EnvState:
         del model  # nothing that a reset draws depends on it
         key, draw = jax.random.split(key)
-        start = world.start(*runner.draw_start(ids, world.mj_model, draw))
+        start = world.start(*runner.draw_start(ids, world.mj_model, draw, chosen))
         # Forces read zero: to fill them in would take a whole physics step, and an automatic
         # reset happens, under `where`, in every step of every world.
         forces, sensors = jnp.zeros(ACTION_SIZE), jnp.zeros(len(ids.sensors))
@@ -123,8 +139,8 @@ def make(*, impl: str = "auto", max_envs: int | None = None) -> Env:
         pose = runner.pose_of(ids, moved)
         speed = runner.speed_to_target(state.physics, moved, world.control_dt_s)
         view = HumanoidView(pose, action, speed, jnp.asarray(strength))
-        dead = pose.position[2] < DEATH_HEIGHT_M
-        reward = total_reward(TERMS, view, Replacement(DEATH, dead, DEATH_REWARD))
+        dead = pose.position[2] < chosen.death_height_m
+        reward = total_reward(terms, view, Replacement(DEATH, dead, chosen.death_reward))
         obs = observe(pose, forces, sensors, action)
         metrics = {runner.SPEED: runner.mean_speed(pose, state.steps + 1, world.control_dt_s)}
         return episode.advance(state, moved, (), obs, reward, dead, metrics)

@@ -16,15 +16,26 @@ import numpy as np
 
 from gmijax.sim import physics, rotations
 from gmijax.sim.tasks import lookup
+from gmijax.sim.tasks.settings import RunnerSettings
 from gmijax.types import Array, PRNGKey
 
 TARGET_M = (1000.0, 0.0)
 UPRIGHT = 0.93
 AHEAD = 0.8
-JOINT_NOISE_RAD = 0.2
-VELOCITY_NOISE_RAD_PER_S = 0.1
 SPEED = "speed_m_per_s"
 """The metric of these tasks: `mean_speed` over the episode."""
+
+TORSO_TERMS = (
+    ("torso_height", 1),
+    ("torso_velocity", 3),
+    ("torso_angular_velocity", 3),
+    ("yaw", 1),
+    ("roll", 1),
+    ("angle_to_target", 1),
+    ("upright", 1),
+    ("heading", 1),
+)
+"""With what their observations begin."""
 
 
 @dataclass(frozen=True)
@@ -75,14 +86,16 @@ def look_up(mj_model: mujoco.MjModel, joints: Sequence[str], sensors: Sequence[s
     )
 
 
-def draw_start(ids: RunnerIds, mj_model: mujoco.MjModel, key: PRNGKey) -> tuple[Array, Array]:
+def draw_start(
+    ids: RunnerIds, mj_model: mujoco.MjModel, key: PRNGKey, settings: RunnerSettings
+) -> tuple[Array, Array]:
     """Random `qpos` [nq] and `qvel` [nv]: the torso in its place, noise on the joints only."""
     position_key, velocity_key = jax.random.split(key)
     lower, upper = ids.joints.lower, ids.joints.upper
-    shape, noise = lower.shape, JOINT_NOISE_RAD
+    shape, noise = lower.shape, settings.joint_noise_rad
     rest = np.clip(np.zeros(shape, np.float32), lower, upper)
     joints = rest + jax.random.uniform(position_key, shape, minval=-noise, maxval=noise)
-    noise = VELOCITY_NOISE_RAD_PER_S
+    noise = settings.joint_velocity_noise_rad_per_s
     velocities = jax.random.uniform(velocity_key, shape, minval=-noise, maxval=noise)
     qpos = jnp.array(mj_model.qpos0, jnp.float32)
     qpos = qpos.at[ids.joints.qpos].set(jnp.clip(joints, lower, upper))

@@ -11,6 +11,7 @@ Action [20]: position targets of the driven joints, -1 to 1 between their limits
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -23,23 +24,33 @@ from mujoco import mjx
 
 from gmijax.sim import episode, physics, rotations
 from gmijax.sim.interface import Env, EnvSpec, EnvState
-from gmijax.sim.rewards import RewardTerm, term_names, total_reward
+from gmijax.sim.rewards import RewardTerm, term_names, total_reward, with_weights
 from gmijax.sim.tasks import lookup
+from gmijax.sim.tasks.settings import ShadowHandSettings, settings_from
 from gmijax.types import Array, PRNGKey, PyTree
 
 DEFAULT_EPISODE_LENGTH = 600
 SUBSTEPS = 2
 OBS_SIZE = 211
+OBS_TERMS = (
+    ("joint_position", 24),
+    ("joint_velocity", 24),
+    ("joint_torque", 24),
+    ("cube_pose", 7),
+    ("cube_velocity", 3),
+    ("cube_angular_velocity", 3),
+    ("goal_pose", 7),
+    ("goal_to_cube_rotation", 4),
+    ("fingertip_pose_and_velocity", 65),
+    ("fingertip_force_and_torque", 30),
+    ("last_action", 20),
+)
 ACTION_SIZE = 20
 OBS_LIMIT = 5.0
 VELOCITY_SCALE = 0.2
 JOINT_TORQUE_SCALE = 10.0
 TIP_SENSOR_SCALE = 10.0
 GOAL_M = (0.0, -0.39, 0.56)
-REACHED_RAD = 0.1
-FALLEN_M = 0.24
-CUBE_NOISE_M = 0.01
-JOINT_NOISE = 0.2
 
 JOINTS = (
     *("WRJ1", "WRJ0"),
@@ -138,8 +149,15 @@ TERMS = {
 }
 
 
-def make(*, impl: str = "auto", max_envs: int | None = None) -> Env:
+def make(
+    *,
+    impl: str = "auto",
+    max_envs: int | None = None,
+    rewards: Mapping[str, float] | None = None,
+    settings: Mapping[str, float] | None = None,
+) -> Env:
     """Makes the task without its time limit; see `gmijax.sim.registry.make_env`."""
+    terms, chosen = with_weights(TERMS, rewards), settings_from(ShadowHandSettings, settings)
     world = physics.load("shadow_hand", impl=impl, substeps=SUBSTEPS, max_envs=max_envs)
     ids = look_up(world.mj_model)
     spec = EnvSpec(
@@ -148,14 +166,15 @@ def make(*, impl: str = "auto", max_envs: int | None = None) -> Env:
         action_size=ACTION_SIZE,
         control_dt_s=world.control_dt_s,
         episode_length=DEFAULT_EPISODE_LENGTH,
-        reward_terms=term_names(TERMS),
+        reward_terms=term_names(terms),
         metrics=("successes", "rotation_error_rad"),
+        obs_terms=OBS_TERMS,
     )
 
     def reset(model: PyTree, key: PRNGKey) -> EnvState:
         del model  # nothing that a reset draws depends on it
         key, start_key, goal_key = jax.random.split(key, 3)
-        qpos = draw_start(ids, world.mj_model, start_key)
+        qpos = draw_start(ids, world.mj_model, start_key, chosen)
         start = world.start(qpos, jnp.zeros(world.mj_model.nv))
         task = ShadowHandTask(draw_rotation(goal_key), jnp.zeros(()))
         touch = touch_at_rest(ids, *world.poses(qpos))
@@ -166,12 +185,12 @@ def make(*, impl: str = "auto", max_envs: int | None = None) -> Env:
         action = jnp.clip(action, -1.0, 1.0)
         targets = targets_of(ids, action)
         moved, touch = world.step(model, state.physics, targets, lambda data: touch_of(ids, data))
-        view = view_of(ids, moved, state.task.goal, action)
-        reward = total_reward(TERMS, view)
+        view = view_of(ids, moved, state.task.goal, action, chosen.reached_rad)
+        reward = total_reward(terms, view)
         task, key = next_goal(state.task, view.reached, state.key)
         metrics = {"successes": task.successes, "rotation_error_rad": view.error_rad}
         obs = observe(ids, moved, touch, task.goal, action)
-        fallen = view.distance_m >= FALLEN_M
+        fallen = view.distance_m >= chosen.fallen_m
         after = episode.advance(state, moved, task, obs, reward, fallen, metrics)
         return after._replace(key=key)
 
@@ -197,15 +216,18 @@ def draw_rotation(key: PRNGKey) -> Array:
     return rotations.product(rotations.turn(x, about_x), rotations.turn(y, about_y))
 
 
-def draw_start(ids: ShadowHandIds, mj_model: mujoco.MjModel, key: PRNGKey) -> Array:
+def draw_start(
+    ids: ShadowHandIds, mj_model: mujoco.MjModel, key: PRNGKey, settings: ShadowHandSettings
+) -> Array:
     """Random `qpos` [31]: a hand nearly flat, the cube above it in any rotation."""
     joint_key, position_key, rotation_key = jax.random.split(key, 3)
-    lower, upper = JOINT_NOISE * ids.joints.lower, JOINT_NOISE * ids.joints.upper
+    share, most = settings.joint_noise, settings.cube_noise_m
+    lower, upper = share * ids.joints.lower, share * ids.joints.upper
     joints = jax.random.uniform(joint_key, lower.shape, minval=lower, maxval=upper)
     # Drawn apart from each other, two coupled joints would snap together in the first step.
     joints = joints.at[FOLLOWERS].set(joints[FOLLOWERS - 1])
     qpos = jnp.array(mj_model.qpos0, jnp.float32).at[ids.joints.qpos].set(joints)
-    noise = jax.random.uniform(position_key, (3,), minval=-CUBE_NOISE_M, maxval=CUBE_NOISE_M)
+    noise = jax.random.uniform(position_key, (3,), minval=-most, maxval=most)
     position = qpos[ids.cube_qpos : ids.cube_qpos + 3] + noise
     cube = jnp.concatenate([position, draw_rotation(rotation_key)])
     return jax.lax.dynamic_update_slice(qpos, cube, (ids.cube_qpos,))
@@ -257,13 +279,17 @@ def cube_of(ids: ShadowHandIds, state: physics.PhysicsState) -> CubePose:
 
 
 def view_of(
-    ids: ShadowHandIds, state: physics.PhysicsState, goal: Array, action: Array
+    ids: ShadowHandIds,
+    state: physics.PhysicsState,
+    goal: Array,
+    action: Array,
+    reached_rad: float,
 ) -> ShadowHandView:
     """What the reward of a step reads, with the goal [4] that the step was to reach."""
     cube = cube_of(ids, state)
     error = rotations.angle(rotations.product(cube.quat, rotations.conjugate(goal)))
     distance = jnp.linalg.norm(cube.position - jnp.array(GOAL_M))
-    return ShadowHandView(distance, error, error <= REACHED_RAD, action)
+    return ShadowHandView(distance, error, error <= reached_rad, action)
 
 
 def observe(

@@ -43,6 +43,13 @@ class Backend:
         del gmi
         return {}
 
+    def renew(self, gmi: int) -> None:
+        """Before a GMI starts later than others: restores what it needs and has died meanwhile.
+
+        Raises:
+          BackendUnavailable: that cannot be done.
+        """
+
     def started(self, pid: int) -> None:
         """Tells the backend that a GMI runs as the process group `pid`."""
         if self._janitor is not None:

@@ -57,20 +57,22 @@ class MpsBackend(Backend):
                 f"plan.backend={plan.backend}: nvidia-cuda-mps-control was not found"
             )
         self._program = machine.mps_control or Path()
-        self._operator = machine.operator_daemon
-        self._controls: dict[str, MpsControl] = {}
+        # Daemons of somebody else, and those that this job starts.
+        self._theirs = {
+            device: MpsControl(self._program, pipe)
+            for device in self._devices.values()
+            if (pipe := machine.daemon_of(device)) is not None
+        }
+        self._own: dict[str, MpsControl] = {}
         self._unresponsive: set[str] = set()
 
     def __enter__(self) -> Self:
         """Starts a daemon per GPU, or attaches to the one that runs."""
         super().__enter__()
-        if self._operator is not None:
-            control = MpsControl(self._program, self._operator)
-            self._controls = dict.fromkeys(self._devices.values(), control)
-            return self
         try:
-            for place, device in enumerate(dict.fromkeys(self._devices.values())):
-                self._start_daemon(device, self.run.mps / f"gpu_{place}")
+            for device in dict.fromkeys(self._devices.values()):
+                if device not in self._theirs:
+                    self._start_daemon(device)
         except BaseException:
             self._quit_all()
             super().__exit__(None, None, None)
@@ -79,13 +81,12 @@ class MpsBackend(Backend):
 
     def __exit__(self, *exc: Any) -> None:
         """Quits the own daemons once their clients have left."""
-        if self._operator is None:
-            deadline_s = time.monotonic() + _CLIENTS_LEAVE_S
-            for control in self._controls.values():
-                with suppress(BackendUnavailable):
-                    while control.all_client_pids() and time.monotonic() < deadline_s:
-                        time.sleep(_POLL_S)
-            self._quit_all()
+        deadline_s = time.monotonic() + _CLIENTS_LEAVE_S
+        for control in self._own.values():
+            with suppress(BackendUnavailable):
+                while control.all_client_pids() and time.monotonic() < deadline_s:
+                    time.sleep(_POLL_S)
+        self._quit_all()
         super().__exit__(*exc)
 
     def environment(self, gmi: int) -> Mapping[str, str]:
@@ -100,6 +101,13 @@ class MpsBackend(Backend):
         directory.mkdir(parents=True, exist_ok=True)
         return {PIPE_VARIABLE: str(directory)}
 
+    def renew(self, gmi: int) -> None:
+        """Starts the GMI's daemon anew if it is an own one that no longer answers."""
+        device = self._devices.get(gmi)
+        if device in self._own and not self._own[device].is_answering():
+            quit_daemon(self._own[device])
+            self._start_daemon(device)
+
     def verify(self, pids: Mapping[int, int]) -> None:
         """Checks with the daemons that every GMI that is to be a client is one.
 
@@ -112,7 +120,7 @@ class MpsBackend(Backend):
                 raise GmiFailed(
                     gmi,
                     f"its process {pid} is no client of the MPS daemon in "
-                    f"{self._control_of(gmi).pipe_directory}; {self._advice()}",
+                    f"{self._control_of(gmi).pipe_directory}; {self._advice(gmi)}",
                 )
             time.sleep(_POLL_S)
 
@@ -121,7 +129,7 @@ class MpsBackend(Backend):
         device = self._devices.get(gmi)
         if device is None or device in self._unresponsive:
             return
-        control = self._controls[device]
+        control = self._control_of(gmi)
         try:
             server = control.all_client_pids().get(pid)
             if server is not None:
@@ -131,14 +139,17 @@ class MpsBackend(Backend):
             self._unresponsive.add(device)
 
     def _control_of(self, gmi: int) -> MpsControl:
-        return self._controls[self._devices[gmi]]
+        device = self._devices[gmi]
+        return self._own.get(device) or self._theirs[device]
 
-    def _start_daemon(self, device: str, log_directory: Path) -> None:
+    def _start_daemon(self, device: str) -> None:
+        place = list(dict.fromkeys(self._devices.values())).index(device)
+        log_directory = self.run.mps / f"gpu_{place}"
         parent = tempfile.gettempdir()
         parent = parent if len(parent) <= _LONGEST_PARENT else "/tmp"
         # mkdtemp makes it readable for nobody else.
         control = MpsControl(self._program, Path(tempfile.mkdtemp(prefix="gmijax-", dir=parent)))
-        self._controls[device] = control
+        self._own[device] = control
         if self._janitor is not None:
             self._janitor.watch_daemon(control)
         control.start(device, log_directory)
@@ -168,8 +179,8 @@ class MpsBackend(Backend):
                 strangers[gmi] = pid
         return strangers
 
-    def _advice(self) -> str:
-        if self._operator is None:
+    def _advice(self, gmi: int) -> str:
+        if self._devices[gmi] not in self._theirs:
             return f"see its logs in {self.run.mps}, or use plan.backend=share"
         return (
             "gmijax did not start this daemon: if it runs in another PID namespace (outside of "
@@ -179,13 +190,13 @@ class MpsBackend(Backend):
 
     def _quit_all(self) -> None:
         try:
-            for control in self._controls.values():
+            for control in self._own.values():
                 quit_daemon(control)
         except BaseException:  # Ctrl-C in a process that lives on.
             if self._janitor is not None:
                 self._janitor.take_over()
             raise
-        self._controls = {}
+        self._own = {}
 
 
 class MigBackend(MpsBackend):
@@ -208,7 +219,11 @@ class MigBackend(MpsBackend):
                     f"plan.backend=mig: instance {share.device} of GMI {share.gmi} does not exist"
                 )
         sharing = Counter(share.device for share in plan.slices)
-        clients = [share.gmi for share in plan.slices if sharing[share.device] > 1]
+        clients = [
+            share.gmi
+            for share in plan.slices
+            if sharing[share.device] > 1 or share.device in machine.daemons
+        ]
         # A daemon of somebody else is for other devices than the job's instances.
         own_only = dataclasses.replace(machine, operator_daemon=None)
         super().__init__(plan, own_only, run, clients)

@@ -10,25 +10,32 @@ import dataclasses
 import os
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, TypeVar
 
 from rich.console import Console
 from rich.table import Table
 
-from gmijax.config import PlanConfig, PlayConfig, ReduceConfig
+from gmijax.config import EnvConfig, ExportConfig, PlanConfig, PlayConfig, ReduceConfig
 from gmijax.config.schema import to_dict
 from gmijax.control.console import open_console
-from gmijax.control.pictures import film, has_brax, write_page
+from gmijax.deploy.pictures import film, has_brax, write_page
 from gmijax.errors import ConfigError, GmijaxError
 from gmijax.machine.snapshot import Machine, detect_machine
 from gmijax.partition.planner import make_plan
 from gmijax.runs.folder import META, STEP_DIGITS, PlayPaths, RunPaths, read_json, write_json
-from gmijax.runs.resume import CheckpointMeta, find_checkpoint, trained_config
+from gmijax.runs.resume import (
+    CheckpointMeta,
+    best_checkpoint,
+    find_checkpoint,
+    trained_config,
+)
 from gmijax.sim import source
-from gmijax.sim.registry import require_task
+from gmijax.sim.registry import require_env
 from gmijax.supervise.kinds import JobKind
+from gmijax.supervise.launch import Timeouts
 from gmijax.supervise.launcher import Launch, run_gmis
-from gmijax.supervise.supervisor import Timeouts
+
+C = TypeVar("C", PlayConfig, ExportConfig)
 
 MEMORY_FRACTION: Final = 0.1
 """Most of a GPU's memory that playing takes: beside a training job that reserves 0.8."""
@@ -74,37 +81,52 @@ def play(config: PlayConfig, *, show: bool = False) -> None:
 
 
 def _opened(config: PlayConfig) -> tuple[PlayConfig, str | None]:
-    """With its checkpoint, run and task found and checked, and how the task's file has changed.
-
-    All before a process is started, which would find it bad too.
-    """
+    """As `open_run`, with what only playing asks for checked too."""
     if config.html == "on" and not has_brax():
         raise ConfigError(
             "html=on: needs the package brax (pip install 'gmijax[brax]'); "
             "allowed without it are auto, off"
         )
+    config, env, changed = open_run(config)
+    if config.randomize == "on" and not env.randomization:
+        raise ConfigError("randomize=on: env.randomization of the run names nothing to draw")
+    return config, changed
+
+
+def open_run(config: C) -> tuple[C, EnvConfig, str | None]:
+    """Finds and checks the checkpoint, run and task of a configuration.
+
+    All before a process is started, which would find them bad too.
+
+    Returns:
+      The configuration with what was found, the task, and how its file has changed (None if it
+      has not).
+
+    Raises:
+      ConfigError: no such run or checkpoint, or its task cannot be had.
+    """
     checkpoint = _find(config)
     saved, _ = trained_config(checkpoint)
     env = source.opened(saved, config.run.env)
-    require_task(str(env.name), env.suite)
-    if config.randomize == "on" and not env.randomization:
-        raise ConfigError("randomize=on: env.randomization of the run names nothing to draw")
+    require_env(env)
     run = dataclasses.replace(config.run, dir=str(checkpoint.parents[1]))
     if env.suite == "custom":
         run = dataclasses.replace(run, env=env.name, env_sha256=env.source_sha256)
     config = dataclasses.replace(config, checkpoint=str(checkpoint), run=run)
-    return config, source.changes(env, dataclasses.asdict(saved))
+    return config, env, source.changes(env, dataclasses.asdict(saved))
 
 
-def _find(config: PlayConfig) -> Path:
+def _find(config: PlayConfig | ExportConfig) -> Path:
     """The checkpoint that the configuration names."""
     wanted, run_dir = config.checkpoint, config.run.dir
-    if wanted is None or (wanted.isdecimal() and len(wanted) <= _MOST_DIGITS):
+    if wanted in (None, "best") or (wanted.isdecimal() and len(wanted) <= _MOST_DIGITS):
         latest = find_checkpoint(run_dir or "last", "run.dir")
+        if wanted == "best":
+            return best_checkpoint(latest.parents[1]) or latest
         return latest if wanted is None else _at_step(latest.parents[1], int(wanted))
     if not os.path.isfile(Path(wanted) / META):  # Unlike `Path.is_file` it takes any text.
         raise ConfigError(
-            f"checkpoint={wanted}: expected the folder of a checkpoint, or its env steps"
+            f"checkpoint={wanted}: expected the folder of a checkpoint, its env steps, or best"
         )
     checkpoint = Path(wanted).resolve()
     if run_dir is not None:

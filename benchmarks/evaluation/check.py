@@ -1,0 +1,144 @@
+"""Compares the figures in README.md and docs/ with the files of results.
+
+A figure in a text stands in a marker, `<!-- figure: FILE.json#PATH FORMAT -->1.42<!-- /figure -->`
+(`figures.look_up` says what a path is; the format is Python's), and a table between
+`<!-- table: NAME -->` and `<!-- /table -->`. `fill` writes what belongs there. What looks like a
+measurement elsewhere is a finding, but for code, decisions (of their day) and lines that end with
+`<!-- no figure -->`: limits, examples, and what others report.
+"""
+
+from __future__ import annotations
+
+import difflib
+import re
+from collections.abc import Iterator
+from pathlib import Path
+from typing import NamedTuple
+
+from benchmarks.evaluation.figures import look_up
+from benchmarks.evaluation.page import TABLES
+from benchmarks.evaluation.plots import FOLDER, PICTURES, is_current
+from gmijax.errors import ConfigError
+
+ROOT = Path(__file__).parents[2]
+FIGURE = re.compile(r"(<!-- figure: ([^>]+?) (\S+) -->)(.*?)(<!-- /figure -->)")
+TABLE = re.compile(r"(<!-- table: (\S+) -->\n)(.*?)(<!-- /table -->)", re.DOTALL)
+NO_FIGURE = "<!-- no figure -->"
+MEASUREMENTS = tuple(
+    re.compile(pattern)
+    for pattern in (
+        r"\d[\d,.]*\s*[kM]?\s*(?:env(?:ironment)? )?steps(?:/s| per second| a second)",
+        r"\b\d{1,3}(?:,\d{3}){2,}\b|\b\d{3},\d{3}\b",
+        r"\b\d+\.\d+x? times\b|\b\d+(?:\.\d+)? times (?:as fast|faster|slower|the steps)\b",
+        r"\b\d+\.\d+x\b",
+        r"\b[\d.]+ ?% (?:of (?:a|the|one) (?:GPU|SMs|rate|time)|faster|slower|fewer)\b",
+        r"\b(?:after|took|takes|in) [\d.]+ (?:s|ms|us|min|minutes|seconds|hours)\b",
+        r"\b[\d.]+ (?:GB/s|TFLOP/s|trainings/h)",
+        r"\breturns? of \d[\d,.]*\b(?! episodes)",
+    )
+)
+"""What looks like a measurement: rates, large counts, ratios, parts, seconds to a mark."""
+
+
+class Finding(NamedTuple):
+    """A figure without a file, or one that differs from it.
+
+    Attributes:
+      file: the document.
+      line: in it.
+      text: what stands there.
+      said: what the file of results says.
+    """
+
+    file: str
+    line: int
+    text: str
+    said: str
+
+    def __str__(self) -> str:
+        return f"{self.file}:{self.line}: {self.text!r}: {self.said}"
+
+
+def documents(root: Path = ROOT) -> list[Path]:
+    """All that is checked. Decisions are not: their figures are of their day."""
+    found = [root / "README.md", *sorted((root / "docs").glob("*.md"))]
+    return [path for path in found if path.exists()]
+
+
+def fill(text: str) -> str:
+    """A document with every marked figure and table as the files say.
+
+    Raises:
+      ConfigError: a figure without a file, or a table that is none of ours.
+    """
+    text = FIGURE.sub(lambda m: m[1] + _figure(m[2], m[3]) + m[5], text)
+    return TABLE.sub(lambda m: m[1] + _table(m[2]) + m[4], text)
+
+
+def check(root: Path = ROOT) -> list[Finding]:
+    """All findings; none means that every figure is as its file says."""
+    found = [finding for path in documents(root) for finding in in_document(path, root)]
+    for name in PICTURES:
+        if not is_current(name):
+            path = (FOLDER / f"{name}.svg").relative_to(ROOT).as_posix()
+            found.append(Finding(path, 1, name, "its numbers are not those of the files"))
+    return found
+
+
+def in_document(path: Path, root: Path = ROOT) -> Iterator[Finding]:
+    """Findings in one document."""
+    text, name = path.read_text(), path.relative_to(root).as_posix()
+    for match in (*FIGURE.finditer(text), *TABLE.finditer(text)):
+        yield from _compared(name, text, match)
+    yield from _unmarked(name, text)
+
+
+def _compared(name: str, text: str, match: re.Match[str]) -> Iterator[Finding]:
+    """What a marked figure or table differs in."""
+    line = text.count("\n", 0, match.start()) + 1
+    stands = match[len(match.groups()) - 1]
+    try:
+        wanted = _figure(match[2], match[3]) if match.re is FIGURE else _table(match[2])
+    except (ConfigError, ValueError) as error:
+        yield Finding(name, line, stands, str(error))
+        return
+    if match.re is TABLE:
+        yield from _differences(name, stands, wanted, line + 1)
+    elif stands != wanted:
+        yield Finding(name, line, stands, f"{match[2]} is {wanted}")
+
+
+def _differences(name: str, stands: str, wanted: str, first: int = 1) -> Iterator[Finding]:
+    old, new = stands.splitlines(), wanted.splitlines()
+    for tag, a, b, c, d in difflib.SequenceMatcher(None, old, new, autojunk=False).get_opcodes():
+        if tag != "equal":
+            line = first + a
+            said = f"the files say {' / '.join(new[c:d])!r}"
+            yield Finding(name, line, " / ".join(old[a:b]), said)
+
+
+def _unmarked(name: str, text: str) -> Iterator[Finding]:
+    def blank(match: re.Match[str]) -> str:
+        return re.sub(r"[^\n]", " ", match[0])
+
+    for pattern in (TABLE, FIGURE, re.compile(r"```.*?```", re.DOTALL), re.compile(r"`[^`\n]*`")):
+        text = pattern.sub(blank, text)
+    for number, line in enumerate(text.splitlines(), 1):
+        if line.rstrip().endswith(NO_FIGURE):
+            continue
+        end = 0
+        found = (match for pattern in MEASUREMENTS for match in pattern.finditer(line))
+        for match in sorted(found, key=re.Match.start):
+            if match.start() >= end:  # Else it is a part of the one before.
+                yield Finding(name, number, match[0], "looks like a measurement and names no file")
+                end = match.end()
+
+
+def _figure(reference: str, form: str) -> str:
+    return format(look_up(reference), form)
+
+
+def _table(name: str) -> str:
+    if name not in TABLES:
+        raise ConfigError(f"table {name}: allowed are {', '.join(TABLES)}")
+    return "\n".join(TABLES[name]()) + "\n"

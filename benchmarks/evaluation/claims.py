@@ -1,0 +1,155 @@
+"""The paper's claims, one row each, beside what was measured here."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+from benchmarks.evaluation.figures import (
+    NOT_MEASURED,
+    WHOLE_RUN,
+    bounds,
+    markdown,
+    ratio,
+    results_of,
+    shown,
+)
+from benchmarks.evaluation.other_tables import (
+    IMPLS,
+    SERVING,
+    USE,
+    model_fit,
+    mps_and_share,
+    mps_over_share,
+    serving_rate,
+)
+from benchmarks.evaluation.paper import LGR, lgr_gain
+from benchmarks.evaluation.tables import LAYOUTS, fixed_total_ratios
+
+BACKEND_LINK = "[backends](#backends)"
+TEMPLATE_LINK = "[templates](#one-gmi-for-all-tasks-or-one-for-each)"
+FIXED_LINK = "[fixed total](#one-training-in-several-gmis)"
+TEMPLATES = ("2 GMIs x 2048, tcg_ex", "2 + 1 GMIs x 2048, tdg_ex")
+
+
+def claims() -> list[str]:
+    """The table of all claims."""
+    head = "paper | what it says | the paper's | here | section"
+    return markdown(head, [*_model(), *_overall(), *_studies(), *_asynchronous()])
+
+
+def _model() -> Iterator[list[str]]:
+    uses = results_of(USE).get("tasks", {})
+    busy = [stage["sm"] for stages in uses.values() for stage in stages.values()]
+    yield [
+        *("Fig. 1b", "utilisation of a GPU by one process", "below 50 %, mean 32 %"),
+        f"{bounds(busy, '.0%')} of SMs busy in a stage; of a job: {NOT_MEASURED}",
+        "[stages](#what-a-stage-takes-of-a-gpu)",
+    ]
+    yield ["Table 1", "MPS and MIG as backends", "", f"MPS; MIG {NOT_MEASURED}", BACKEND_LINK]
+    yield [
+        *("Table 2", "cost of MPR, MRR, HAR by bytes", "a formula"),
+        f"measured over predicted: {model_fit()}",
+        "[reduction](#a-mean-alone)",
+    ]
+    served = results_of(SERVING).get("cases", ())
+    gains = [one["colocated"] / one["dedicated"] for one in served if "dedicated" in one]
+    yield ["Table 3", "TCG over TDG, serving", "2.5", bounds(gains), TEMPLATE_LINK]
+    trained = [ratio(f"templates-{task}", *TEMPLATES) for task in ("ant", "humanoid")]
+    yield ["Table 4", "TCG_EX over TDG_EX, training", "5", bounds(trained), TEMPLATE_LINK]
+    answers = [
+        f"{best['gmis_per_gpu']} x {best['num_envs']:,} ({best['impl']})"
+        for file in ("search-ant-jax-h200", "search-ant-one_shot-h200")
+        if (best := results_of(file).get("best"))
+    ]
+    yield [
+        *("Algorithm 2", "GMIs and environments by profiling", ""),
+        f"ant: {', '.join(answers) or NOT_MEASURED}; other tasks: {NOT_MEASURED}",
+        "[search](#the-search)",
+    ]
+
+
+def _overall() -> Iterator[list[str]]:
+    several = [mps_and_share("ant", gmis)[0] for gmis in (2, 4, 8)]
+    one = shown(serving_rate(SERVING, "ant 1 x 8192, mps"), ",.0f")
+    yield [
+        *("Fig. 7a", "serving with GMIs over one process", "2.62 at most, mean 2.08"),
+        f"no ratio of one call; ant, one GPU: {bounds(several, ',.0f')} steps/s by 2 to 8 GMIs, "
+        f"{one} by one; peak against peak, more GPUs: {NOT_MEASURED}",
+        BACKEND_LINK,
+    ]
+    yield [
+        *("Fig. 7b", "synchronous training over NCCL", "2.81 at most, mean 1.86"),
+        f"ant, one GPU, as many environments: {bounds([*fixed_total_ratios().values()])}; "
+        f"other tasks, peak against peak: {NOT_MEASURED}",
+        FIXED_LINK,
+    ]
+    yield ["Fig. 7c", "the same over Horovod", "2.34 at most, mean 1.75", NOT_MEASURED, ""]
+
+
+def _studies() -> Iterator[list[str]]:
+    gains = {task: bounds([mps_over_share(task, n) for n in (2, 4, 8)]) for task in IMPLS}
+    yield [
+        *("Fig. 8", "MPS and MIG over plain sharing", "both above 1"),
+        "; ".join(f"{task} {found}" for task, found in gains.items())
+        + f" with 2 to 8 GMIs; MIG, three GMIs, BallBalance: {NOT_MEASURED}",
+        BACKEND_LINK,
+    ]
+    for task in LGR:
+        ours, own = (
+            [ratio(f"lgr-{task}{end}", f"{at} {way}", f"{at} mpr") for at in LAYOUTS]
+            for end, way in (("-one_shot", "one_shot"), ("", "har"))
+        )
+        yield [
+            *("LGR", f"`{task}`, over MPR, three layouts"),
+            " ".join(f"{lgr_gain(task, at):.2f}" for at in LAYOUTS),
+            f"`one_shot` {' '.join(map(shown, ours))}; the paper's HAR {bounds(own)}",
+            "[LGR](#reduction-of-gradients-in-training)",
+        ]
+    more = [
+        ratio(f"tasks-{impl}", f"{task} {impl} 8192", f"{task} {impl} 2048")
+        for task in ("ant", "humanoid")
+        for impl in ("jax", "warp")
+    ]
+    yield [
+        *("Fig. 9", "throughput from 512 to 8,192 environments", "grows ever less"),
+        f"2,048 to 8,192: {bounds(more)} times; 512: {NOT_MEASURED}",
+        "[environments](#environments-of-one-gmi)",
+    ]
+    yield [
+        *("Fig. 10", "reward over time, AT, AY, HM, more GPUs", "GMIs ahead"),
+        f"ant: no faster with GMIs; AY, HM with GMIs: {NOT_MEASURED}",
+        "[reward](#reward-over-time)",
+    ]
+
+
+def _asynchronous() -> Iterator[list[str]]:
+    several = {
+        "two": ("async-2gpu", "1 + 1 GPUs, 4 agents + 2 trainers", "1 + 1 GPUs, one process each"),
+        "four": (
+            *("async-4gpu", "3 + 1 GPUs, 4 agents + 2 trainers, har, batches of 4 agents"),
+            "3 + 1 GPUs, one process each",
+        ),
+        "four through host memory": (
+            *("async-4gpu", "3 + 1 GPUs, 4 agents + 2 trainers"),
+            "3 + 1 GPUs, one process each",
+        ),
+    }
+    for key, what, paper in (
+        *(("pps", "A3C with GMIs, PPS", "1.88, mean of 2 and 4 GPUs"),),
+        *(("ttop", "A3C with GMIs, TTOP", "1.65, mean of 2 and 4 GPUs"),),
+    ):
+        found = [f"{shown(ratio(*one, key))} on {gpus}" for gpus, one in several.items()]
+        whole = [f"{shown(ratio(*one, WHOLE_RUN))} on {gpus}" for gpus, one in several.items()]
+        here = f"{', '.join(found)}; by whole runs {', '.join(whole)}"
+        yield ["Fig. 11", what, paper, here, "[A3C](#asynchronous-training)"]
+    names = ("anymal multi", "anymal uni")
+    found = [shown(ratio("async-channels", *names, key)) for key in ("pps", "ttop", WHOLE_RUN)]
+    yield [
+        *("MCC", "channels over UCC, two GPUs: AY", "1.06 PPS, 1.13 TTOP"),
+        f"{found[0]}, {found[1]}; by whole runs {found[2]}",
+        "[channels](#channels)",
+    ]
+    yield [
+        *("MCC", "FC; both on four GPUs", "1.04 to 1.08 PPS, 1.24 to 1.32 TTOP"),
+        *(NOT_MEASURED, "[channels](#channels)"),
+    ]

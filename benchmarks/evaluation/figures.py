@@ -1,0 +1,199 @@
+"""Figures out of files of results: looked up by path, medians over repeats, ratios in one call."""
+
+from __future__ import annotations
+
+import math
+import statistics
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any, NamedTuple
+
+from benchmarks.records import RESULTS, Call, read_calls
+from gmijax.errors import ConfigError
+
+NOT_MEASURED = "not measured"
+TRAINING = "step_per_s_train"
+WHOLE_RUN = "env_steps_per_s"
+
+
+class Figure(NamedTuple):
+    """A median over repeats.
+
+    Attributes:
+      median: of the repeats.
+      low: the smallest of them.
+      high: the largest.
+      repeats: how many there are.
+    """
+
+    median: float
+    low: float
+    high: float
+    repeats: int
+
+    def shown(self, form: str = ",.0f") -> str:
+        """The median; with several repeats also from where to where they go."""
+        text = format(self.median, form)
+        if self.repeats == 1:
+            return text
+        return f"{text} ({self.low:{form}} to {self.high:{form}}, n={self.repeats})"
+
+
+def figure(values: Sequence[float]) -> Figure | None:
+    """The median of what was measured, None of nothing."""
+    if not values:
+        return None
+    return Figure(statistics.median(values), min(values), max(values), len(values))
+
+
+def call_of(file: str) -> Call | None:
+    """The call of `<file>.json` that counts: the newest of those that measured most.
+
+    So a later call of a few cases does not hide the others. None without a file.
+    """
+    path = RESULTS / f"{file}.json"
+    if not path.exists():
+        return None
+    calls = list(enumerate(read_calls(path)))
+    return max(calls, key=lambda one: (_count(one[1].results), one[0]))[1]
+
+
+def results_of(file: str) -> Mapping[str, Any]:
+    """What that call measured; nothing without a file."""
+    call = call_of(file)
+    return call.results if call else {}
+
+
+def rate(file: str, case: str, key: str = TRAINING) -> Figure | None:
+    """A figure of the summaries of a case of `<file>.json`."""
+    found = summaries(file, case)
+    return figure([one[key] for one in found if one.get(key) is not None])
+
+
+def summaries(file: str, case: str) -> list[Mapping[str, Any]]:
+    """Of the runs of a case that succeeded."""
+    runs = results_of(file).get("cases", {}).get(case, {}).get("runs", ())
+    return [run["summary"] for run in runs if "summary" in run]
+
+
+def ratio(file: str, case: str, base: str, key: str = TRAINING) -> float | None:
+    """Median of `case` over that of `base`: of one call, so of one machine."""
+    over, under = rate(file, case, key), rate(file, base, key)
+    return over.median / under.median if over and under else None
+
+
+def shown(value: Figure | float | None, form: str = ".2f") -> str:
+    """A cell of a table."""
+    if value is None or (isinstance(value, float) and math.isnan(value)):
+        return NOT_MEASURED
+    return value.shown(form) if isinstance(value, Figure) else format(value, form)
+
+
+def bounds(values: Sequence[float | None], form: str = ".2f") -> str:
+    """`0.83 to 0.96`, of those that were measured."""
+    found = [value for value in values if value is not None]
+    if not found:
+        return NOT_MEASURED
+    low, high = format(min(found), form), format(max(found), form)
+    return low if low == high else f"{low} to {high}"
+
+
+def markdown(head: str, rows: Sequence[Sequence[str]]) -> list[str]:
+    """A table; the columns of `head` are divided by `|`, those of numbers end with a colon."""
+    names = [name.strip() for name in head.split("|")]
+    rule = ["---:" if name.endswith(":") else "---" for name in names]
+    lines = [[name.removesuffix(":") for name in names], rule, *rows]
+    return [f"| {' | '.join(cells)} |" for cells in lines]
+
+
+def source(*files: str) -> list[str]:
+    """A line for each file: with what its call was made."""
+    return ["", *(_source_of(file) for file in files)]
+
+
+def _source_of(file: str) -> str:
+    call = call_of(file)
+    if call is None:
+        return f"- `{file}.json`: {NOT_MEASURED}"
+    return f"- [`{file}.json`](../benchmarks/results/{file}.json): {origin(call)}"
+
+
+def origin(call: Call) -> str:
+    """Commit, date, device, driver and repeats of a call; `unknown` where the file is silent."""
+    commits = [one[:10] for one in (call.commit or "unknown").split(", ")]
+    parts = [f"commit {', '.join(commits)}" + (" with changes" if call.is_dirty else "")]
+    parts.append(call.date[:10] if call.date else "date unknown")
+    parts.append(call.device or "device unknown")
+    parts += [f"driver {call.driver}"] if call.driver else []
+    if repeats := sorted(set(_repeats(call.results))):
+        least, most = repeats[0], repeats[-1]
+        shown = str(least) if least == most else f"{least} to {most}"
+        parts.append(f"{shown} {'run' if most == 1 else 'runs'} of each case")
+    return ", ".join(parts)
+
+
+def _count(results: Mapping[str, Any]) -> int:
+    """How much was measured: cases with runs, or rows of whatever the suite has."""
+    lists = [results.get(key, ()) for key in ("cases", "rows", "points", "runs", "tasks")]
+    return len(list(_repeats(results))) or max(map(len, lists))
+
+
+def _repeats(results: Mapping[str, Any]) -> Iterator[int]:
+    """How often each case was measured, of those that were."""
+    cases = results.get("cases", ())
+    for case in cases.values() if isinstance(cases, Mapping) else cases:
+        runs = case.get("runs", ())
+        if isinstance(runs, Mapping):  # Of serving, by template.
+            yield max(map(len, runs.values()))
+        elif done := sum("summary" in run for run in runs):
+            yield done
+
+
+def look_up(reference: str) -> float:
+    """The value of `FILE.json#PATH`, or of `FILE.json#PATH over PATH`.
+
+    A path has keys divided by `/`; `*` is every item of a list, whose median counts; a number is
+    one item, and so is a name that the item has as `name`. `cases/` and `runs/*/summary/` may be
+    left out. The newest call of the file that has all of the reference is taken.
+
+    Raises:
+      ConfigError: no call has it.
+    """
+    file, _, rest = reference.partition("#")
+    for call in reversed(read_calls(RESULTS / file)):
+        values = [list(_at(call.results, path.strip())) for path in rest.split(" over ")]
+        if all(values):
+            medians = [statistics.median(found) for found in values]
+            return medians[0] / medians[1] if len(medians) > 1 else medians[0]
+    raise ConfigError(f"{file} has no {rest}")
+
+
+def _at(node: Any, path: str) -> Iterator[float]:
+    if not path:
+        if isinstance(node, int | float):
+            yield node
+    elif isinstance(node, Mapping):
+        yield from _in_mapping(node, path)
+    elif isinstance(node, list):
+        first, _, rest = path.partition("/")
+        for number, item in enumerate(node):
+            name = item.get("name") if isinstance(item, Mapping) else None
+            if first in ("*", str(number)):
+                yield from _at(item, rest)
+            elif name is not None and _is_first(name, path):
+                yield from _at(item, path[len(name) + 1 :])
+
+
+def _in_mapping(node: Mapping[str, Any], path: str) -> Iterator[float]:
+    # A key may have a slash in it: the longest that fits.
+    if fit := [key for key in node if _is_first(key, path)]:
+        key = max(fit, key=len)
+        yield from _at(node[key], path[len(key) + 1 :])
+    elif "cases" in node:
+        yield from _at(node["cases"], path)
+    elif "runs" in node:
+        for run in node["runs"]:
+            yield from _at(run.get("summary"), path)
+
+
+def _is_first(key: str, path: str) -> bool:
+    return path == key or path.startswith(f"{key}/")

@@ -1,0 +1,286 @@
+"""The tables of training, synchronous and asynchronous."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from types import MappingProxyType
+
+from benchmarks.evaluation.figures import (
+    NOT_MEASURED,
+    WHOLE_RUN,
+    Figure,
+    figure,
+    markdown,
+    rate,
+    ratio,
+    results_of,
+    shown,
+    source,
+    summaries,
+)
+from benchmarks.evaluation.paper import CHANNELS, LGR, lgr_gain
+
+LAYOUTS = {"2G2T": "2 GPUs x 2", "2G3T": "2 GPUs x 3", "4G4T": "4 GPUs x 4"}
+TWO_TREES = "exchange-in-program-h200"
+ONE_GPU = (
+    *(
+        ("4 GMIs, MJX-JAX", file, "4 GMIs x 2048, mps", "1 GMI x 8192")
+        for file in ("ant-1gpu-one_shot", "ant-1gpu")
+    ),
+    *(
+        ("2 GMIs, MJX-Warp", file, "1 GPUs x 2 GMIs x 4096", "1 GPUs x 1 GMIs x 8192")
+        for file in ("scaling-one_shot", "scaling")
+    ),
+    ("2 GMIs, MJX-Warp", TWO_TREES, "2x4096", "1x8192"),
+    ("4 GMIs, MJX-Warp", TWO_TREES, "4x2048", "1x8192"),
+)
+"""What, file, several GMIs, one process: ant, 8192 environments on a GPU, under MPS."""
+
+OTHERS = (
+    ("4 GMIs, MJX-JAX, no MPS", "ant-1gpu", "4 GMIs x 2048, share", "1 GMI x 8192"),
+    ("2 GPUs, 2 GMIs on each, MJX-Warp", TWO_TREES, "2gpu-2x4096", "2gpu-1x8192"),
+    *(
+        (
+            *(f"{gpus} GPUs, 2 GMIs on each, MJX-Warp", "scaling"),
+            *(f"{gpus} GPUs x 2 GMIs x 4096", f"{gpus} GPUs x 1 GMIs x 8192"),
+        )
+        for gpus in (2, 4)
+    ),
+)
+"""The same without MPS, and on more GPUs against one process on each."""
+
+IN_GPU_MEMORY = ("one_shot", "auto")
+"""Exchanges that do not pass the host: `auto` where a file does not say what it became."""
+
+
+def pair(file: str, case: str, base: str) -> tuple[Figure | None, Figure | None]:
+    """Steps/s of two cases, of one call."""
+    if file != TWO_TREES:
+        return rate(file, case), rate(file, base)
+    # Two trees in each of its own calls; the old one has all cases.
+    for one in results_of(file).get("calls", ()):
+        if {case, base} <= one["cases"].keys():
+            several, alone = (
+                figure([run["steps_per_s"] for run in one["cases"][name]["base"]])
+                for name in (case, base)
+            )
+            return several, alone
+    return None, None
+
+
+def exchange_of(file: str, case: str) -> str:
+    """By which strategy the GMIs of a case exchanged gradients."""
+    found = summaries(file, case)
+    return found[0]["plan"]["strategy"] if found else "auto"
+
+
+def fixed_total_ratios() -> dict[str, float | None]:
+    """Several GMIs on one GPU over one process with as many environments, as jobs exchange now."""
+    ratios = {}
+    for what, file, case, base in ONE_GPU:
+        if exchange_of(file, case) in IN_GPU_MEMORY:
+            several, alone = pair(file, case, base)
+            ratios[f"{what} ({file})"] = (
+                several.median / alone.median if several and alone else None
+            )
+    return ratios
+
+
+def fixed_total() -> list[str]:
+    """The same environments in one process on each GPU, and in several."""
+    rows = []
+    for what, file, case, base in (*ONE_GPU, *OTHERS):
+        several, alone = pair(file, case, base)
+        gain = several.median / alone.median if several and alone else None
+        rates = (shown(value, ",.0f") for value in (several, alone))
+        rows.append([what, f"`{exchange_of(file, case)}`", *rates, shown(gain), f"`{file}`"])
+    head = "on each GPU | exchange | GMIs, steps/s: | one process, steps/s: | ratio: | file"
+    files = dict.fromkeys(file for _, file, *_ in (*ONE_GPU, *OTHERS))
+    return [*markdown(head, rows), *source(*files)]
+
+
+def training_backends() -> list[str]:
+    """MPS against plain sharing, in training."""
+    rows = []
+    for file, what in (("ant-1gpu", "4 GMIs x 2048"), ("ant-2gpu", "2 GPUs x 2 GMIs x 2048")):
+        names = [f"{what}, {backend}" for backend in ("mps", "share")]
+        rates = (shown(rate(file, name), ",.0f") for name in names)
+        exchange = f"`{exchange_of(file, names[0])}`"
+        rows.append([what, exchange, *rates, shown(ratio(file, names[0], names[1]))])
+    head = "ant, MJX-JAX | exchange | `mps`, steps/s: | `share`, steps/s: | ratio:"
+    return [*markdown(head, rows), *source("ant-1gpu", "ant-2gpu")]
+
+
+def weak_scaling() -> list[str]:
+    """8192 environments on every GPU."""
+    rows = []
+    for file, gmis, way in (
+        *(("scaling", 1, "`flat`"), ("scaling-one_shot", 2, "`one_shot`")),
+        ("scaling", 2, "`har`"),
+    ):
+        names = [f"{gpus} GPUs x {gmis} GMIs x {8192 // gmis}" for gpus in (1, 2, 4, 8)]
+        for gpus, name in zip((1, 2, 4, 8), names, strict=True):
+            gain = ratio(file, name, names[0])
+            cells = [shown(rate(file, name), ",.0f"), shown(gain), shown(gain and gain / gpus)]
+            rows.append([f"{gpus} x {gmis} x {8192 // gmis:,}", way, *cells])
+    head = "GPUs x GMIs x environments | exchange | steps/s: | over one GPU: | of ideal:"
+    return [*markdown(head, rows), *source("scaling", "scaling-one_shot")]
+
+
+def templates() -> list[str]:
+    """Trainers among their simulators against trainers apart."""
+    rows = []
+    for task in ("ant", "humanoid"):
+        both = ("2 GMIs x 2048, tcg_ex", "2 + 1 GMIs x 2048, tdg_ex")
+        rates = [shown(rate(f"templates-{task}", name), ",.0f") for name in both]
+        rows.append([f"`{task}`", *rates, shown(ratio(f"templates-{task}", *both)), "5"])
+    head = "task | `tcg_ex`, steps/s: | `tdg_ex`, steps/s: | ratio: | the paper's:"
+    return [*markdown(head, rows), *source("templates-ant", "templates-humanoid")]
+
+
+def lgr() -> list[str]:
+    """Every reduction that was measured in training against `mpr` of the same call."""
+    rows, files = [], []
+    for task in LGR:
+        for file, ways in (
+            (f"lgr-{task}-one_shot", ("one_shot",)),
+            (f"lgr-{task}", ("har",)),
+        ):
+            files.append(file)
+            for layout, way in ((layout, way) for way in ways for layout in LAYOUTS):
+                gain = ratio(file, f"{layout} {way}", f"{layout} mpr")
+                cells = [shown(rate(file, f"{layout} {name}"), ",.0f") for name in ("mpr", way)]
+                paper = f"{lgr_gain(task, layout):.2f}"
+                rows.append([f"`{task}`", LAYOUTS[layout], f"`{way}`", *cells, shown(gain), paper])
+    head = "task | GMIs | exchange | `mpr`, steps/s: | steps/s: | ratio: | the paper's:"
+    return [*markdown(head, rows), *source(*files)]
+
+
+def num_env() -> list[str]:
+    """Throughput and memory over environments, one GMI."""
+    rows = []
+    for task in ("ant", "humanoid"):
+        for impl in ("jax", "warp"):
+            for envs in (512, 2048, 8192, 32768):
+                name, file = f"{task} {impl} {envs}", f"tasks-{impl}"
+                cells = [shown(rate(file, name), ",.0f"), _memory(file, name)]
+                rows.append([f"`{task}`", f"{envs:,}", impl, *cells])
+    return [
+        *markdown("task | environments: | MJX | steps/s: | memory, MiB:", rows),
+        *source("tasks-jax", "tasks-warp"),
+    ]
+
+
+def _memory(file: str, name: str) -> str:
+    found = [summary["device"]["peak_memory_mib"] for summary in summaries(file, name)]
+    return shown(figure(found), ",.0f")
+
+
+ASYNC = (
+    ("async-1gpu", "sync, 1 GMI x 8192", "sync, 1 GMI x 8192", ""),
+    ("async-1gpu", "1 agent x 8192 + 1 trainer", "sync, 1 GMI x 8192", ""),
+    ("async-1gpu", "2 agents x 4096 + 1 trainer", "sync, 1 GMI x 8192", ""),
+    ("async-1gpu", "4 agents x 2048 + 1 trainer", "sync, 1 GMI x 8192", ""),
+    *(
+        ("async-2gpu", name, "1 + 1 GPUs, one process each", "1.88 PPS, 1.65 TTOP")
+        for name in ("1 + 1 GPUs, one process each", "1 + 1 GPUs, 4 agents + 2 trainers")
+    ),
+    *(
+        ("async-4gpu", name, "3 + 1 GPUs, one process each", "1.88 PPS, 1.65 TTOP")
+        for name in (
+            *("3 + 1 GPUs, one process each", "3 + 1 GPUs, 4 agents + 2 trainers"),
+            "3 + 1 GPUs, 4 agents + 2 trainers, har, batches of 4 agents",
+        )
+    ),
+)
+"""File, case, what it is compared with, the paper's mean over two and four GPUs."""
+
+
+def asynchronous() -> list[str]:
+    """Agents and trainers: medians of report lines, and whole runs."""
+    rows = []
+    for file, case, base, paper in ASYNC:
+        name = case if case.startswith(("1 +", "3 +")) else f"1 GPU, {case}"
+        cells = [shown(rate(file, case, key), ",.0f") for key in ("pps", "ttop", WHOLE_RUN)]
+        gains = [shown(ratio(file, case, base, key)) for key in ("pps", "ttop", WHOLE_RUN)]
+        if case == base:
+            gains, paper = ["1"] * 3, "1" if paper else ""
+        if file == "async-1gpu":  # One process that does both has no PPS of its own.
+            gains = ["", shown(ratio(file, case, base)), gains[2]]
+            cells[1] = shown(rate(file, case), ",.0f")
+            cells[0] = "" if case == base else cells[0]
+        final = shown(rate(file, case, "final_return"), ",.0f")
+        rows.append([name, *cells, " / ".join(filter(None, gains)), paper, final])
+    head = (
+        "ant | PPS: | TTOP: | steps/s of the whole run: | ratios: | the paper's: "
+        "| return at the end:"
+    )
+    return [*markdown(head, rows), *source("async-1gpu", "async-2gpu", "async-4gpu")]
+
+
+def channels() -> list[str]:
+    """Channels against tensor by tensor, in jobs."""
+    rows = []
+    keys = ("pps", "ttop", WHOLE_RUN)
+    for task, gpus in (("ant", 2), ("humanoid", 2), *CHANNELS):
+        names = f"{task} multi", f"{task} uni"
+        found = [ratio("async-channels", *names, key) if gpus == 2 else None for key in keys]
+        pairs = CHANNELS.get((task, gpus))
+        paper = " / ".join(f"{multi / uni:.2f}" for uni, multi in pairs) if pairs else ""
+        rows.append([f"`{task}`", str(gpus), *map(shown, found), paper])
+    head = "task | GPUs: | PPS: | TTOP: | whole run: | the paper's PPS / TTOP:"
+    return [*markdown(head, rows), *source("async-channels")]
+
+
+SMALL = "search-ant-one_shot-h200"
+
+
+def small_gmis() -> dict[int, float]:
+    """Steps/s of a GPU by the number of GMIs with 2,048 environments each, MJX-Warp."""
+    return {
+        point["gmis_per_gpu"]: point["projected"]
+        for point in results_of(SMALL).get("points", ())
+        if (point["impl"], point["num_envs"]) == ("warp", 2048)
+    }
+
+
+def many_small() -> list[str]:
+    """What a GPU makes of several small processes."""
+    rates = small_gmis()
+    rows = [
+        [f"{gmis} x 2,048", f"{value:,.0f}", shown(value / rates[1] if 1 in rates else None)]
+        for gmis, value in sorted(rates.items())
+    ]
+    head = "GMIs x environments each, ant, MJX-Warp | steps/s of the GPU: | over one:"
+    return [*markdown(head, rows), *source(SMALL)]
+
+
+def sweeps() -> list[str]:
+    """Trainings per hour, where they were measured."""
+    runs = results_of("sweeps-nvidia-h200").get("runs", ())
+    if not runs:
+        return [f"Trainings per hour of a sweep: {NOT_MEASURED} (`python -m benchmarks.sweeps`)."]
+    ways: dict[str, list[float]] = {}
+    for run in runs:
+        if run["code"] == 0:
+            ways.setdefault(run["way"], []).append(run["trainings_per_hour"])
+    rows = [[way, shown(figure(rates), ".1f")] for way, rates in ways.items()]
+    head = "trainings | trainings per hour:"
+    return [*markdown(head, rows), *source("sweeps-nvidia-h200")]
+
+
+TRAINING_TABLES: MappingProxyType[str, Callable[[], list[str]]] = MappingProxyType(
+    {
+        "fixed-total": fixed_total,
+        "training-backends": training_backends,
+        "weak-scaling": weak_scaling,
+        "templates": templates,
+        "lgr": lgr,
+        "num-env": num_env,
+        "async": asynchronous,
+        "channels": channels,
+        "many-small": many_small,
+        "sweeps": sweeps,
+    }
+)
+"""By the name that documents use: `<!-- table: NAME -->`."""

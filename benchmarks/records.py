@@ -1,0 +1,216 @@
+"""Files of results: one writer and one reader for all benchmarks.
+
+A file holds calls. A call is one command on one machine, with the code and the machine that it was
+made with, and the suite's own results. Another call is added to the file; nothing is overwritten.
+A file from before this format is read as one call, and what it does not say is unknown.
+"""
+
+from __future__ import annotations
+
+import os
+import platform
+import shlex
+import subprocess
+import sys
+import threading
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from datetime import datetime
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from gmijax.control.system_info import REQUIRED
+from gmijax.errors import ConfigError
+from gmijax.machine.snapshot import detect_machine
+from gmijax.runs.folder import read_json, write_json
+from gmijax.version import versions_of
+
+RESULTS = Path(__file__).parent / "results"
+FORMAT = 2
+COMMIT_VARIABLE = "GMIJAX_COMMIT"
+"""The commit, where the code is a copy without `.git`: `git describe --always --dirty`."""
+
+_ROOT = Path(__file__).parents[1]
+_MEASURED = ("gmijax", "configs", "benchmarks", ":!benchmarks/results")
+_VERSIONS = (*REQUIRED, "warp-lang", "nccl4py", "cuda-bindings", "optuna")
+_SAME = ("commit", "is_dirty", "host", "device", "driver", "versions")
+"""What must be equal for a call to be gone on with."""
+
+
+class Call(NamedTuple):
+    """One command on one machine; what a file does not say is None.
+
+    Attributes:
+      commit: of the code.
+      is_dirty: whether files differed from that commit.
+      date: when it began, ISO 8601.
+      host: name, cores and system of the machine.
+      device: its GPUs, or `cpu`.
+      driver: version of NVIDIA's driver.
+      versions: of packages.
+      command: as it was typed.
+      settings: all of its options, defaults too.
+      results: what it measured; every suite has a form of its own.
+    """
+
+    commit: str | None = None
+    is_dirty: bool | None = None
+    date: str | None = None
+    host: Any = None
+    device: str | None = None
+    driver: str | None = None
+    versions: Mapping[str, str | None] | None = None
+    command: str | None = None
+    settings: Mapping[str, Any] | None = None
+    results: Any = None
+
+
+class ResultsFile:
+    """The results of a call that goes on, in memory and on disk.
+
+    Attributes:
+      path: the file; it has the call after the first change.
+      results: of this call.
+    """
+
+    def __init__(
+        self,
+        path: Path,
+        suite: str,
+        settings: Mapping[str, Any],
+        *,
+        resume: bool = False,
+        device: str | None = None,
+    ) -> None:
+        """Begins a call, or goes on with the file's last one.
+
+        Args:
+          path: the file.
+          suite: what was measured.
+          settings: all options of the command.
+          resume: go on with the last call.
+          device: what was measured on, if not all GPUs of the machine.
+
+        Raises:
+          ConfigError: `resume`, and the last call was on other code or another machine.
+        """
+        self.path = path
+        self._suite = suite
+        self._lock = threading.Lock()
+        self._call = _begin(settings, device)
+        if resume and path.exists():
+            last = read_calls(path)[-1]
+            if other := [key for key in _SAME if getattr(last, key) != getattr(self._call, key)]:
+                raise ConfigError(f"{path}: its last call has another {other[0]}: begin a new one")
+            self._call = last
+        self.results: dict[str, Any] = self._call.results
+
+    @contextmanager
+    def changing(self) -> Iterator[dict[str, Any]]:
+        """Lets one thread at a time change `results`, then writes the file."""
+        with self._lock:
+            yield self.results
+            # Read again: another command may have added a call since.
+            found = read_calls(self.path) if self.path.exists() else []
+            calls = [call for call in found if call.date != self._call.date] + [self._call]
+            data = {"format": FORMAT, "suite": self._suite}
+            write_json(self.path, {**data, "calls": [call._asdict() for call in calls]})
+
+
+def read_calls(path: Path) -> list[Call]:
+    """The calls in a file, oldest first.
+
+    Raises:
+      ConfigError: there is no such file.
+    """
+    if not path.exists():
+        raise ConfigError(f"{path}: no such file of results")
+    found = read_json(path)
+    if found.get("format") == FORMAT:
+        return [Call(**call) for call in found["calls"]]
+    return [_of_old_file(found)]
+
+
+def file_name(suite: str, device: str) -> str:
+    """`serving-nvidia-h200.json`."""
+    return f"{suite}-{device.replace(' ', '-').lower()}.json"
+
+
+def device_name() -> str:
+    """The first GPU that a job may use here, or `cpu`."""
+    gpus = detect_machine().gpus
+    return gpus[0].name if gpus else "cpu"
+
+
+def _begin(settings: Mapping[str, Any], device: str | None) -> Call:
+    machine = detect_machine()
+    commit, is_dirty = code_version()
+    counts = {gpu.name: 0 for gpu in machine.gpus}
+    for gpu in machine.gpus:
+        counts[gpu.name] += 1
+    return Call(
+        commit=commit,
+        is_dirty=is_dirty,
+        date=datetime.now().astimezone().isoformat(timespec="microseconds"),
+        host=f"{platform.node()}, {os.cpu_count()} cores, {platform.platform()}",
+        device=device or ", ".join(f"{n} x {name}" for name, n in counts.items()) or "cpu",
+        driver=machine.driver_version,
+        versions={"python": platform.python_version(), **versions_of(_VERSIONS)},
+        command=shlex.join(["python", *sys.orig_argv[1:]]),
+        settings={key: _plain(value) for key, value in settings.items()},
+        results={},
+    )
+
+
+def code_version() -> tuple[str | None, bool | None]:
+    """The commit of the checkout, and whether what can change a result differs from it."""
+    if given := os.environ.get(COMMIT_VARIABLE):
+        return given.removesuffix("-dirty"), given.endswith("-dirty")
+    commit = _git("rev-parse", "HEAD")
+    changed = _git("status", "--porcelain", "--", *_MEASURED)
+    return commit or None, None if changed is None else bool(changed)
+
+
+def _git(*words: str) -> str | None:
+    try:
+        done = subprocess.run(
+            ["git", *words], cwd=_ROOT, capture_output=True, text=True, check=False
+        )
+    except OSError:
+        return None
+    return done.stdout.strip() if done.returncode == 0 else None
+
+
+def _plain(value: Any) -> Any:
+    """What JSON gives back as it was."""
+    if isinstance(value, Path):
+        return str(value)
+    if isinstance(value, Sequence) and not isinstance(value, str):
+        return [_plain(one) for one in value]
+    return value
+
+
+def _of_old_file(found: Mapping[str, Any]) -> Call:
+    """An old file says little of where it is from; summaries of runs in it name the device."""
+    summaries = list(_summaries(found))
+    kinds = {summary["device"]["kind"]: 0 for summary in summaries if summary.get("device")}
+    versions = next((s["versions"] for s in summaries if s.get("versions")), None)
+    device = found.get("device") or ", ".join(kinds) or found.get("machine")
+    known = {key: found.get(key) for key in ("commit", "date", "host", "driver", "command")}
+    trees = [tree for tree in found.get("trees", {}).values() if isinstance(tree, str)]
+    known["commit"] = known["commit"] or ", ".join(trees) or None
+    return Call(
+        **known, device=device, versions=found.get("versions") or versions, results=dict(found)
+    )
+
+
+def _summaries(found: Any) -> Iterator[Mapping[str, Any]]:
+    if isinstance(found, Mapping):
+        if "summary" in found:
+            yield found["summary"]
+        else:
+            for part in found.values():
+                yield from _summaries(part)
+    elif isinstance(found, list):
+        for part in found:
+            yield from _summaries(part)

@@ -1,0 +1,64 @@
+"""`gmijax VERB ...`, the same as `python -m gmijax.VERB ...`: every command under one name."""
+
+from __future__ import annotations
+
+import importlib
+import sys
+from collections.abc import Mapping, Sequence
+from types import MappingProxyType
+from typing import Final
+
+from gmijax.version import __version__
+
+VERBS: Final[Mapping[str, str]] = MappingProxyType(
+    {
+        "train": "trains a policy in one or several GMIs",
+        "play": "evaluates a checkpoint, and films it",
+        "serve": "collects experience with a trained policy or random actions",
+        "search": "finds environments per GMI and GMIs per GPU by profiling",
+        "sweep": "runs many trainings, several at a time on every GPU",
+        "export": "writes a policy as files for robots: ONNX, StableHLO",
+        "doctor": "says what this machine can do for gmijax, what it cannot, and why",
+        "list-envs": "lists the tasks",
+        "demo": "trains a small task shortly, and films it",
+    }
+)
+"""Command -> what it does. `main(argv)` of the module of that name runs it, `-` read as `_`."""
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Runs a command; returns its exit code. Only that command's packages are imported."""
+    verb, *rest = (sys.argv[1:] if argv is None else argv) or ("--help",)
+    if verb in ("-h", "--help"):
+        sys.stdout.write(_usage())
+        return 0
+    if verb == "--version":
+        sys.stdout.write(f"gmijax {__version__}\n")
+        return 0
+    if verb in ("-sc", "--shell-completion"):
+        from gmijax.cli.completion import complete
+
+        return complete(rest, VERBS)
+    if verb not in VERBS:
+        from gmijax.config.schema import suggestion
+
+        sys.stderr.write(f"gmijax: unknown command {verb!r}{suggestion(verb, VERBS)}\n")
+        return 2
+    return importlib.import_module(f"gmijax.{verb.replace('-', '_')}").main(rest)
+
+
+def _usage() -> str:
+    lines = [f"  {verb:<10} {what}" for verb, what in VERBS.items()]
+    return "\n".join(
+        (
+            "usage: gmijax COMMAND [key=value ...] [--help]",
+            "       gmijax --version\n",
+            *lines,
+            "\nEvery command has its own --help. Completion of commands, keys and values in bash:",
+            '  eval "$(gmijax -sc install=bash)"\n',
+        )
+    )
+
+
+if __name__ == "__main__":
+    sys.exit(main())

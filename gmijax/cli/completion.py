@@ -1,0 +1,46 @@
+"""Completion of commands, keys and values in a shell, by Hydra's own plugins (bash, fish, zsh)."""
+
+from __future__ import annotations
+
+import os
+import sys
+from collections.abc import Iterable, Sequence
+
+from hydra import initialize_config_dir
+from hydra.core.global_hydra import GlobalHydra
+
+from gmijax.cli.compose import config_dir
+from gmijax.control.exit_codes import exit_code_of
+from gmijax.errors import ConfigError
+
+
+def complete(argv: Sequence[str], verbs: Iterable[str]) -> int:
+    """Answers `gmijax -sc ...` as programs of Hydra do; returns the exit code.
+
+    Args:
+      argv: `install=SHELL`, which prints a script to `eval`, `uninstall=SHELL`, or what that
+        script asks: `query=SHELL`, with the line typed so far in the variable COMP_LINE.
+      verbs: the commands.
+    """
+    return exit_code_of("completion", lambda: _complete(argv, verbs))
+
+
+def _complete(argv: Sequence[str], verbs: Iterable[str]) -> None:
+    name = None
+    if any(text.startswith("query=") for text in argv):
+        # Hydra's plugins know programs without commands: they get the line without our name.
+        line = os.environ.get("COMP_LINE", "").lstrip().partition(" ")[2].lstrip()
+        name, separator, _ = line.partition(" ")
+        if not separator:
+            sys.stdout.write("\n".join(verbs) + "\n")
+            return
+        if not (config_dir() / f"{name}.yaml").is_file():
+            return  # It takes no keys.
+        os.environ["COMP_LINE"] = line
+    with initialize_config_dir(str(config_dir()), version_base=None):
+        hydra = GlobalHydra.instance().hydra
+        assert hydra is not None
+        try:
+            hydra.shell_completion(name, list(argv))
+        except ValueError as error:
+            raise ConfigError(f"-sc {' '.join(argv)}: {' '.join(str(error).split())}") from None

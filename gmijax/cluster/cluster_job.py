@@ -1,0 +1,159 @@
+"""A job on the nodes of a cluster: checks before it starts, one attempt, what is left after it."""
+
+from __future__ import annotations
+
+import dataclasses
+import os
+import secrets
+import tempfile
+import time
+from collections.abc import Mapping
+from contextlib import suppress
+from pathlib import Path
+from typing import Any, Self
+
+from gmijax.cluster.node import own_versions
+from gmijax.cluster.ray_nodes import Joined, RayCluster
+from gmijax.collectives.nodes.meeting import Nodes
+from gmijax.config import TrainConfig
+from gmijax.errors import ConfigError, GmiFailed
+from gmijax.machine.snapshot import Machine
+from gmijax.partition.planner import num_gmis_of
+from gmijax.supervise.backends.backend import Backend
+from gmijax.supervise.launcher import Launch, OnTick, StopSignals
+from gmijax.supervise.supervisor import Supervisor
+from gmijax.supervise.watched_gmi import WatchedGmi
+
+_SHOWS_S = 20.0
+"""Network file systems show what others have written late, some after seconds."""
+
+_POLL_S = 0.2
+
+
+class ClusterJob:
+    """The nodes of a training job, to be entered with `with`.
+
+    Args:
+      config: of the job, with `cluster.engine`.
+    """
+
+    def __init__(self, config: TrainConfig) -> None:
+        self._config = config
+        self._joined: list[Joined] = []
+        self._signals: StopSignals | None = None
+        self._num_cpus = num_gmis_of(config.plan)[0]
+
+    def __enter__(self) -> Self:
+        self._cluster = RayCluster(self._config.cluster)
+        return self
+
+    def __exit__(self, *exc: Any) -> None:
+        self._cluster.close()
+
+    def join(self, run_root: Path) -> Mapping[str, Machine]:
+        """Finds the nodes of the first attempt; their machines by address.
+
+        Args:
+          run_root: the run folder, which may not be there yet.
+
+        Raises:
+          ConfigError: too few nodes, or one that cannot take part.
+        """
+        wanted = self._config.cluster.nodes
+        self._joined = self._cluster.join(self._num_cpus, None if wanted == "auto" else wanted)
+        self._run_root = run_root
+        return self._checked()
+
+    def join_again(self, num_nodes: int, *, elastic: bool) -> Mapping[str, Machine]:
+        """Finds nodes for another attempt: so many, or fewer once the wait is over.
+
+        Raises:
+          ConfigError: as `join`; fewer nodes, and the job may not go on with them.
+          JobInterrupted: a signal came.
+        """
+        least, signals = 1 if elastic else num_nodes, self._signals
+        self._joined = self._cluster.join(
+            self._num_cpus,
+            num_nodes,
+            least=least,
+            is_unwanted=lambda: signals is not None and signals.have_come,
+        )
+        return self._checked()
+
+    def run(self, launch: Launch, on_tick: OnTick, signals: StopSignals) -> None:
+        """Runs all GMIs of a plan on the nodes that have joined; see `run_gmis`.
+
+        Raises:
+          GmiFailed, ConfigError, JobInterrupted: as `run_gmis`.
+        """
+        self._signals = signals
+        sent = dataclasses.replace(launch, on_warning=print, is_enough=None)
+        token, addresses = secrets.token_bytes(32), []
+        for place, (node, facts) in enumerate(self._joined):
+            addresses.append(node.call("open", sent, place, facts.address))
+        for place, (node, _) in enumerate(self._joined):
+            node.call("introduce", Nodes(place, tuple(addresses), token))
+        first = [gmis[0] for gmis in launch.plan.layout.gmis_of_node]
+        for gmi, (node, _) in zip(first, self._joined, strict=True):
+            if node.lost is not None:
+                raise GmiFailed(gmi, node.lost)
+
+        def start(gmi: int, waits: bool) -> WatchedGmi:
+            node = self._joined[launch.plan.layout.node_of(gmi)].remote
+            return node.start(gmi, waits, launch.run.gmi(gmi))
+
+        # Backends are entered on the nodes.
+        backend = Backend(launch.plan, launch.machine, launch.run)
+        supervisor = Supervisor(launch, backend, start=start)
+        signals.forward_to(supervisor.request_stop)
+        try:
+            supervisor.run(on_tick)
+        finally:
+            self._cluster.leave()
+
+    def _checked(self) -> Mapping[str, Machine]:
+        """The machines of the nodes, by address, once these can take part."""
+        self._require_alike()
+        self._require_shared(self._run_root)
+        named: dict[str, Machine] = {}
+        for place, (node, facts) in enumerate(self._joined):
+            # Several nodes may be on one machine.
+            name = f"{node.address}#{place}" if node.address in named else node.address
+            named[name] = facts.machine
+        return named
+
+    def _require_alike(self) -> None:
+        own = own_versions()
+        for node, facts in self._joined:
+            for what, version in own.items():
+                if (theirs := facts.versions.get(what)) != version:
+                    raise ConfigError(
+                        f"cluster.engine=ray: node {node.address} has {what} {theirs}, this one "
+                        f"has {version}; all nodes must have the same"
+                    )
+
+    def _require_shared(self, run_root: Path) -> None:
+        folder = run_root.absolute()
+        while not folder.is_dir():
+            folder = folder.parent
+        content = secrets.token_hex(8)
+        try:
+            fd, name = tempfile.mkstemp(prefix=".gmijax-probe-", dir=folder)
+        except OSError as error:
+            raise ConfigError(f"run.dir={run_root}: {folder}: {error.strerror}") from None
+        try:
+            with os.fdopen(fd, "w") as file:
+                file.write(content)
+            deadline_s = time.monotonic() + _SHOWS_S
+            blind = [node for node, _ in self._joined]
+            while blind := [node for node in blind if not node.call("sees", name, content)]:
+                if time.monotonic() > deadline_s or any(node.lost for node in blind):
+                    raise ConfigError(
+                        f"run.dir={run_root}: node {blind[0].address} does not see {folder} or "
+                        "cannot write to it; the run folder must be on a file system that all "
+                        "nodes share"
+                    )
+                time.sleep(_POLL_S)
+        finally:
+            with suppress(OSError):
+                Path(name).unlink()

@@ -1,0 +1,201 @@
+"""What one node does for a job: an actor of Ray, which starts and holds the GMIs of its machine.
+
+It holds what GMIs of one machine share and their lifelines, so they end with it. What becomes of
+them is decided by the controller's supervisor.
+"""
+
+from __future__ import annotations
+
+import fcntl
+import os
+import platform
+import signal
+import socket
+import struct
+from collections.abc import Mapping
+from contextlib import ExitStack, suppress
+from pathlib import Path
+from typing import Any, Final, Literal, NamedTuple
+
+from gmijax.collectives.nodes.meeting import ENV_LISTENER_FD, ENV_NODES_FD, Nodes, listen
+from gmijax.errors import ConfigError, GmiFailed, GmijaxError, ReportedError
+from gmijax.machine.snapshot import Machine, detect_machine
+from gmijax.supervise.backends import open_backend
+from gmijax.supervise.gmi_process import GmiProcess
+from gmijax.supervise.heartbeat import Heartbeat
+from gmijax.supervise.launch import Launch, StartGmi, start_gmi
+from gmijax.supervise.launcher import drop_unreadable, shared_blocks
+from gmijax.version import __version__, versions_of
+
+COMPARED: Final = ("jax", "jaxlib", "numpy", "mujoco", "mujoco-mjx", "flax", "optax")
+"""Packages whose versions all nodes must have alike, beside Python and gmijax."""
+
+Order = Literal["let_go", "ask_to_stop", "order_end", "end_as_done", "kill"]
+"""Methods of a `GmiProcess` that the controller may call."""
+
+_SIOCGIFADDR: Final = 0x8915
+
+
+class Facts(NamedTuple):
+    """What a node is."""
+
+    address: str  # IP address for the exchange with other nodes.
+    machine: Machine
+    versions: dict[str, str | None]
+
+
+class Seen(NamedTuple):
+    """What a node knows of a GMI; see `WatchedGmi`."""
+
+    exit_code: int | None
+    beats: int
+    beat: Heartbeat
+    error: ReportedError | None
+    log_bytes: int
+
+
+class Node:
+    """This machine's part of a job.
+
+    Args:
+      variables: environment variables of the controller that its GMIs get.
+      folder: working directory of the controller, taken where it is here too.
+      interface: network interface of the exchange; None: that of `address`.
+      address: IP address by which Ray knows this machine.
+    """
+
+    def __init__(
+        self, variables: Mapping[str, str], folder: str, interface: str | None, address: str
+    ) -> None:
+        # Ray sets one thread for who has said nothing; GMIs get what fits their cores.
+        os.environ.pop("OMP_NUM_THREADS", None)
+        os.environ.update(variables)
+        signal.pthread_sigmask(signal.SIG_UNBLOCK, [signal.SIGINT])
+        if Path(folder).is_dir():
+            os.chdir(folder)
+        self._interface, self._address = interface, address
+        self._held = ExitStack()
+        self._launch: Launch | None = None
+        self._listener: socket.socket | None = None
+        self._blocks: dict[str, int] = {}
+        self._start: StartGmi | None = None
+        self._started: dict[int, GmiProcess] = {}
+        self._num_gmis = 0
+
+    def facts(self) -> Facts | str:
+        """What this machine is, or why it cannot take part."""
+        try:
+            address = address_of(self._interface) if self._interface else self._address
+            return Facts(address, detect_machine(), own_versions())
+        except GmijaxError as error:
+            return str(error)
+
+    def sees(self, probe: str, content: str) -> bool:
+        """Whether a file is here as the controller has written it, and its folder can be written.
+
+        A network file system may show it late, so it is asked again.
+        """
+        with suppress(OSError):
+            path = Path(probe)
+            os.listdir(path.parent)  # Has the file system look again.
+            return path.read_text() == content and os.access(path.parent, os.W_OK)
+        return False
+
+    def open(self, launch: Launch, node: int, address: str) -> tuple[str, int]:
+        """Makes what the GMIs share; returns where their leader will listen."""
+        self._launch = launch
+        own = launch.run.node(node)
+        own.root.mkdir(exist_ok=True)
+        self._held.callback(_remove_if_empty, own.root)
+        self._blocks = shared_blocks(self._held, launch.kind, launch.plan)
+        self._backend = self._held.enter_context(open_backend(launch.plan, detect_machine(), own))
+        if launch.plan.layout.num_nodes == 1:
+            return address, 0
+        self._listener = self._held.enter_context(listen(address))
+        self._blocks[ENV_LISTENER_FD] = self._listener.fileno()
+        return address, self._listener.getsockname()[1]
+
+    def introduce(self, nodes: Nodes) -> None:
+        """Takes the addresses of all leaders; GMIs can be started from here on."""
+        assert self._launch is not None
+        if self._listener is not None:
+            self._blocks[ENV_NODES_FD] = nodes.to_file()
+            self._held.callback(os.close, self._blocks[ENV_NODES_FD])
+        self._num_gmis = len(self._launch.plan.layout.gmis_of_node[nodes.node])
+        launch, backend, blocks = self._launch, self._backend, self._blocks
+        self._start = lambda gmi, waits: start_gmi(launch, backend, blocks, gmi, waits)
+
+    def start(self, gmi: int, waits: bool) -> int | str:
+        """Starts a GMI; its process, or why there is none."""
+        assert self._start is not None
+        try:
+            process = self._start(gmi, waits)
+        except GmiFailed as error:
+            return error.reason
+        assert isinstance(process, GmiProcess)
+        self._started[gmi] = process
+        self._backend.started(process.pid)
+        if len(self._started) == self._num_gmis and self._listener is not None:
+            self._listener.close()  # From here on it is their leader's alone.
+        return process.pid
+
+    def poll(self) -> dict[int, Seen]:
+        """How every GMI is."""
+        for process in self._started.values():
+            process.poll()
+        return {
+            gmi: Seen(one.exit_code, one.beats, one.beat, one.error, one.log_bytes)
+            for gmi, one in self._started.items()
+        }
+
+    def order(self, gmi: int, order: Order) -> None:
+        """Does what the controller says with a GMI."""
+        getattr(self._started[gmi], order)()
+
+    def request_stacks(self, gmi: int) -> int | None:
+        """See `WatchedGmi`."""
+        return self._started[gmi].request_stacks()
+
+    def close(self) -> None:
+        """Gives back what was made; every GMI has ended by then, or ends now."""
+        for process in self._started.values():
+            process.poll()
+            process.kill()
+            process.poll()
+            process.close()
+        if self._launch is not None:
+            drop_unreadable(self._launch.run, self._started)
+        self._held.close()
+
+
+def own_versions() -> dict[str, str | None]:
+    """Versions of all that computes, on this machine."""
+    return {
+        "gmijax": __version__,
+        "python": platform.python_version(),
+        **versions_of(COMPARED),
+    }
+
+
+def address_of(interface: str) -> str:
+    """The IPv4 address of a network interface.
+
+    Raises:
+      ConfigError: there is no such one here, or it has none.
+    """
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as asking:
+        request = struct.pack("256s", interface.encode()[:15])
+        try:
+            answer: Any = fcntl.ioctl(asking.fileno(), _SIOCGIFADDR, request)
+        except OSError:
+            names = ", ".join(name for _, name in socket.if_nameindex())
+            raise ConfigError(
+                f"cluster.interface={interface}: node {platform.node()} has no such interface "
+                f"with an IPv4 address; it has {names}"
+            ) from None
+    return socket.inet_ntoa(answer[20:24])
+
+
+def _remove_if_empty(folder: Path) -> None:
+    with suppress(OSError):
+        folder.rmdir()

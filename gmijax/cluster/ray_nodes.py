@@ -1,0 +1,244 @@
+"""Nodes of a cluster of Ray, with an actor of the job on each. The only file that knows Ray."""
+
+from __future__ import annotations
+
+import os
+import signal
+import socket
+import threading
+import time
+from collections.abc import Callable, Sequence
+from contextlib import suppress
+from typing import Any, Final, NamedTuple
+
+from gmijax.cluster.node import Facts, Node
+from gmijax.cluster.remote_gmi import LOST_S, RemoteNode
+from gmijax.config import ClusterConfig
+from gmijax.errors import ConfigError, JobInterrupted
+from gmijax.machine.processes import ProcessId, identify
+
+PASSED_ON: Final = ("JAX_", "XLA_", "NCCL_", "OMP_", "OPENBLAS_", "MKL_", "MUJOCO_", "PYTHONPATH")
+"""Beginnings of variables of the controller that GMIs on other nodes get; the rest is theirs."""
+
+_POLL_S = 0.25
+_CONNECT_S = 5.0
+_PLACE_S = 15.0
+_ACTORS_S = 120.0
+_CLOSE_S = 30.0
+
+
+class Joined(NamedTuple):
+    """A node that takes part in a job."""
+
+    remote: RemoteNode
+    facts: Facts
+
+
+class RayCluster:
+    """A cluster of Ray, from the connection to `close`.
+
+    Args:
+      config: which one.
+
+    Raises:
+      ConfigError: ray is not installed, or there is no cluster.
+    """
+
+    def __init__(self, config: ClusterConfig) -> None:
+        self._config = config
+        self._ray: Any = _import_ray()
+        self._group: Any = None
+        self._actors: list[Any] = []
+        self._is_own = not self._ray.is_initialized()
+        if self._is_own:
+            self._connect(config.address)
+
+    def join(
+        self,
+        num_cpus: int,
+        wanted: int | None,
+        least: int | None = None,
+        is_unwanted: Callable[[], bool] = lambda: False,
+    ) -> list[Joined]:
+        """Puts an actor on each of several nodes that have so many CPUs left.
+
+        Args:
+          num_cpus: of each.
+          wanted: how many nodes; None: all that have the CPUs.
+          least: how many will do when the wait is over; None: `wanted`.
+          is_unwanted: whether the user has asked for an end meanwhile.
+
+        Raises:
+          ConfigError: there are fewer nodes, they have no room, or one cannot take part.
+          JobInterrupted: it is unwanted.
+        """
+        self.leave()
+        deadline_s = time.monotonic() + self._config.wait_s
+        least = max(1, least or wanted or 1)
+        while True:
+            found = self._num_nodes(num_cpus)
+            is_over = time.monotonic() >= deadline_s
+            if found >= (wanted or 1) or (is_over and found >= least):
+                break
+            if is_over:
+                raise ConfigError(
+                    f"cluster.nodes={wanted or 'auto'}: the cluster has {found} nodes with "
+                    f"{num_cpus} CPUs, and no more came within cluster.wait_s="
+                    f"{self._config.wait_s:g} s"
+                )
+            if is_unwanted():
+                raise JobInterrupted("stopped while it waited for nodes")
+            time.sleep(_POLL_S)
+        self._place(num_cpus, min(found, wanted or found), deadline_s)
+        return self._joined()
+
+    def leave(self) -> None:
+        """Ends the actors, and with them what is left of their GMIs. Idempotent."""
+        ray = self._ray
+        asked = []
+        for actor in self._actors:
+            with suppress(Exception):
+                asked.append(actor.close.remote())
+        with suppress(Exception):
+            ray.wait(asked, num_returns=len(asked), timeout=_CLOSE_S)
+        for actor in self._actors:
+            with suppress(Exception):
+                ray.kill(actor)
+        self._actors = []
+        if self._group is not None:
+            with suppress(Exception):
+                ray.util.remove_placement_group(self._group)
+            self._group = None
+
+    def close(self) -> None:
+        """Leaves the cluster. Idempotent."""
+        self.leave()
+        if self._is_own:
+            self._ray.shutdown()
+
+    def _connect(self, address: str) -> None:
+        host, _, port = address.rpartition(":")
+        what = f"cluster.address={address}"
+        if port.isdigit():
+            try:
+                socket.create_connection((host, int(port)), _CONNECT_S).close()
+            except OSError as error:
+                raise ConfigError(f"{what}: nobody answers there ({error})") from None
+        elif address not in ("auto", "local"):
+            raise ConfigError(f"{what}: expected auto, local or host:port")
+        options = {"include_dashboard": False} if address == "local" else {}
+        before = signal.getsignal(signal.SIGTERM)
+        try:
+            self._ray.init(address=address, log_to_driver=False, logging_level="ERROR", **options)
+        except Exception as error:
+            raise ConfigError(
+                f"{what}: no cluster of Ray there ({_first_line(error)}); `ray start --head` "
+                "starts one, `ray start --address=host:port` adds a node"
+            ) from None
+        finally:
+            if threading.current_thread() is threading.main_thread():
+                signal.signal(signal.SIGTERM, before)  # Ray has put its own there.
+
+    def _num_nodes(self, num_cpus: int) -> int:
+        alive = [node for node in self._ray.nodes() if node["Alive"]]
+        return sum(node["Resources"].get("CPU", 0) >= num_cpus for node in alive)
+
+    def _place(self, num_cpus: int, num_nodes: int, deadline_s: float) -> None:
+        ray = self._ray
+        self._group = ray.util.placement_group(
+            [{"CPU": num_cpus}] * num_nodes, strategy="STRICT_SPREAD"
+        )
+        # Ray needs a moment also where there is room.
+        if not self._group.wait(max(_PLACE_S, deadline_s - time.monotonic())):
+            self.leave()
+            raise ConfigError(
+                f"cluster.nodes={self._config.nodes}: no {num_nodes} nodes with {num_cpus} free "
+                f"CPUs each within cluster.wait_s={self._config.wait_s:g} s"
+            )
+        variables = {k: v for k, v in os.environ.items() if k.startswith(PASSED_ON)}
+        arguments = (variables, os.getcwd(), self._config.interface)
+        remote = ray.remote(_NodeActor)
+        for bundle in range(num_nodes):
+            strategy = ray.util.scheduling_strategies.PlacementGroupSchedulingStrategy(
+                self._group, placement_group_bundle_index=bundle
+            )
+            options = {"num_cpus": 0, "scheduling_strategy": strategy}
+            self._actors.append(remote.options(**options).remote(*arguments))
+
+    def _joined(self) -> list[Joined]:
+        ray = self._ray
+        try:
+            answers = ray.get([actor.facts.remote() for actor in self._actors], timeout=_ACTORS_S)
+        except Exception as error:
+            self.leave()
+            raise ConfigError(
+                f"cluster.engine=ray: a node cannot start its part of the job "
+                f"({_last_line(error)}); gmijax must be installed on all nodes"
+            ) from None
+        if problems := [answer for answer in answers if isinstance(answer, str)]:
+            self.leave()
+            raise ConfigError(problems[0])
+        return [
+            Joined(RemoteNode(self._ask_of(actor), position, facts.address), facts)
+            for position, (actor, facts) in enumerate(zip(self._actors, answers, strict=True))
+        ]
+
+    def _ask_of(self, actor: Any) -> Any:
+        def ask(method: str, *arguments: Any) -> _RayAnswer:
+            return _RayAnswer(self._ray, getattr(actor, method).remote(*arguments))
+
+        return ask
+
+
+class _RayAnswer:
+    """See `Answer`."""
+
+    def __init__(self, ray: Any, reference: Any) -> None:
+        self._ray, self._reference = ray, reference
+
+    def is_there(self) -> bool:
+        return bool(self._ray.wait([self._reference], timeout=0)[0])
+
+    def get(self) -> Any:
+        return self._ray.get(self._reference, timeout=LOST_S)
+
+
+class _NodeActor(Node):
+    """A `Node` that asks Ray for its address, and ends with the raylet of its machine."""
+
+    def __init__(self, variables: dict[str, str], folder: str, interface: str | None) -> None:
+        address = _import_ray().util.get_node_ip_address()
+        super().__init__(variables, folder, interface, address)
+        # Ray ends the actor then too, but later, and not while the raylet is a zombie.
+        raylet = identify(int(os.environ.get("RAY_RAYLET_PID", "0")))
+        if raylet is not None:
+            threading.Thread(target=_end_with, args=(raylet,), daemon=True).start()
+
+
+def _end_with(process: ProcessId) -> None:
+    while process.is_running():
+        time.sleep(_POLL_S)
+    os._exit(1)
+
+
+def _import_ray() -> Any:
+    try:
+        import ray
+        import ray.util.scheduling_strategies
+    except ImportError:
+        raise ConfigError(
+            "cluster.engine=ray: the package ray is not installed (pip install 'gmijax[ray]')"
+        ) from None
+    return ray
+
+
+def _first_line(error: Exception) -> str:
+    return next(iter(_lines(error)), type(error).__name__)
+
+
+def _last_line(error: Exception) -> str:
+    return next(reversed(_lines(error)), type(error).__name__)
+
+
+def _lines(error: Exception) -> Sequence[str]:
+    return [line.strip() for line in str(error).splitlines() if line.strip()]

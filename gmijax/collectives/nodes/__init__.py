@@ -1,0 +1,1 @@
+"""Exchange between the nodes of a job."""

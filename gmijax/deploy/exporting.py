@@ -1,0 +1,96 @@
+"""The controller of `gmijax.export`: from a checkpoint to files that need no gmijax. No jax here.
+
+A child does the work, `gmijax.workers.exporter`, as the one GMI of a small plan. It runs on the
+CPU: nothing is simulated, and GPUs may be training.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+from pathlib import Path
+from typing import Final
+
+from gmijax.config import ExportConfig, PlanConfig, ReduceConfig
+from gmijax.config.schema import to_dict
+from gmijax.control.console import open_console
+from gmijax.deploy.playing import open_run
+from gmijax.errors import ConfigError
+from gmijax.machine.snapshot import detect_machine
+from gmijax.partition.planner import make_plan
+from gmijax.runs.folder import (
+    STEP_DIGITS,
+    ExportPaths,
+    RunPaths,
+    remove_temporary,
+    write_json,
+)
+from gmijax.runs.resume import CheckpointMeta
+from gmijax.supervise.kinds import JobKind
+from gmijax.supervise.launch import Timeouts
+from gmijax.supervise.launcher import Launch, run_gmis
+
+_TIMEOUTS: Final = Timeouts(
+    start_timeout_s=600.0, stall_timeout_s=600.0, stop_timeout_s=60.0, grace_s=10.0
+)
+
+
+def export(config: ExportConfig, *, show: bool = False) -> ExportPaths:
+    """Writes the policy of a checkpoint as files; returns where they are.
+
+    Args:
+      config: what to export; see `python -m gmijax.export --help`.
+      show: print the paths of the files.
+
+    Raises:
+      ConfigError: bad input, e.g. no such checkpoint, or a package that is not installed.
+      GmiFailed: the export failed.
+    """
+    _require_packages(config)
+    config, _, changed = open_run(config)
+    paths = _prepare(config)
+    console = open_console(show=show)
+    console.print(f"checkpoint: {config.checkpoint}")
+    if changed:
+        console.print(changed)
+    with console.status("exporting the policy"):
+        run_gmis(_launch(paths))
+    if config.format in ("onnx", "all"):
+        console.print(f"ONNX: {paths.onnx}")
+    if config.format in ("stablehlo", "all"):
+        console.print(f"StableHLO: {paths.stablehlo}")
+    console.print(f"metadata: {paths.metadata}")
+    return paths
+
+
+def _require_packages(config: ExportConfig) -> None:
+    if config.format == "stablehlo":
+        return
+    if importlib.util.find_spec("jax2onnx") is None:
+        raise ConfigError(
+            f"format={config.format}: needs the package jax2onnx (pip install 'gmijax[export]'); "
+            "allowed without it is stablehlo"
+        )
+
+
+def _prepare(config: ExportConfig) -> ExportPaths:
+    run = Path(str(config.run.dir))
+    env_steps = CheckpointMeta.read(Path(str(config.checkpoint))).env_steps
+    root = run / "export" / f"{env_steps:0{STEP_DIGITS}d}"
+    try:
+        write_json(RunPaths(root).config, to_dict(config))
+        remove_temporary(root)
+    except OSError as error:
+        raise ConfigError(f"run.dir={run}: cannot write to {root} ({error.strerror})") from None
+    return ExportPaths(root)
+
+
+def _launch(paths: ExportPaths) -> Launch:
+    machine = detect_machine()
+    return Launch(
+        plan=make_plan(PlanConfig(backend="cpu"), ReduceConfig(), 1, machine),
+        machine=machine,
+        run=RunPaths(paths.root),
+        kind=JobKind("gmijax.workers.exporter"),
+        timeouts=_TIMEOUTS,
+        stops_gracefully=False,
+    )

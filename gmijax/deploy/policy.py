@@ -1,0 +1,135 @@
+"""`gmijax.load_policy`: a trained or exported policy as a function of observations.
+
+An exported file needs no checkpoint; an ONNX file needs not even jax.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+import json
+import os
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from gmijax.errors import ConfigError
+from gmijax.runs.folder import read_json
+from gmijax.runs.resume import find_checkpoint
+
+_Actions = npt.NDArray[np.float32]
+
+
+class Policy:
+    """A policy that acts deterministically: `policy(obs) -> actions`.
+
+    Attributes:
+      obs_size: O, length of an observation.
+      action_size: A, length of an action.
+      metadata: what the policy is, as `policy.json` of an export says it.
+    """
+
+    def __init__(
+        self,
+        act: Callable[[_Actions], npt.ArrayLike],
+        obs_size: int,
+        action_size: int,
+        metadata: Mapping[str, Any],
+    ) -> None:
+        self._act = act
+        self.obs_size = obs_size
+        self.action_size = action_size
+        self.metadata = metadata
+
+    def __call__(self, obs: npt.ArrayLike) -> _Actions:
+        """Actions [N, A] in [-1, 1] for raw observations [N, O]; [A] for one observation [O].
+
+        Raises:
+          ConfigError: observations of another shape.
+        """
+        given = np.asarray(obs, np.float32)
+        if given.ndim not in (1, 2) or given.shape[-1] != self.obs_size:
+            raise ConfigError(
+                f"obs: shape {list(given.shape)}, expected [{self.obs_size}] or "
+                f"[N, {self.obs_size}]"
+            )
+        actions = np.asarray(self._act(np.atleast_2d(given)))
+        return actions[0] if given.ndim == 1 else actions
+
+
+def load_policy(path: str | os.PathLike[str]) -> Policy:
+    """Loads a trained policy.
+
+    Args:
+      path: a run folder (its newest checkpoint), a checkpoint folder, `last`, or a file that
+        `python -m gmijax.export` wrote, `.onnx` or `.stablehlo`.
+
+    Example:
+      >>> policy = load_policy("runs/ant-ppo-20260101-120000")
+      >>> actions = policy(np.zeros(policy.obs_size))
+
+    Raises:
+      ConfigError: there is no such folder or file, or it holds no policy.
+    """
+    text = os.fspath(path)
+    kinds = {".onnx": _from_onnx, ".stablehlo": _from_stablehlo}
+    kind = kinds.get(os.path.splitext(text)[1])
+    if kind is None:
+        return _from_checkpoint(find_checkpoint(text, "path"))
+    if not os.path.isfile(text):  # Unlike `Path.is_file` it takes any text.
+        raise ConfigError(f"path={text}: no such file")
+    return kind(Path(text))
+
+
+def _from_checkpoint(checkpoint: Path) -> Policy:
+    import jax
+
+    from gmijax.deploy.trained import trained_policy
+
+    trained = trained_policy(checkpoint)
+    return Policy(jax.jit(trained.act), trained.obs_size, trained.action_size, trained.metadata)
+
+
+def _from_onnx(path: Path) -> Policy:
+    if importlib.util.find_spec("onnxruntime") is None:
+        raise ConfigError(
+            f"path={path}: needs the package onnxruntime (pip install 'gmijax[export]')"
+        )
+    import onnxruntime
+
+    try:
+        session = onnxruntime.InferenceSession(path, providers=["CPUExecutionProvider"])
+    except Exception as error:  # Its exceptions have no base of their own.
+        raise ConfigError(f"path={path}: not an ONNX model ({_first_line(error)})") from error
+    texts = session.get_modelmeta().custom_metadata_map
+    if "gmijax_version" not in texts:
+        raise ConfigError(f"path={path}: not written by gmijax.export")
+    metadata = {name: json.loads(text) for name, text in texts.items()}
+    inputs, outputs = session.get_inputs(), session.get_outputs()
+
+    def act(obs: _Actions) -> npt.ArrayLike:
+        return np.asarray(session.run([outputs[0].name], {inputs[0].name: obs})[0])
+
+    return Policy(act, metadata["obs_size"], metadata["action_size"], metadata)
+
+
+def _from_stablehlo(path: Path) -> Policy:
+    import jax
+
+    try:
+        exported = jax.export.deserialize(bytearray(path.read_bytes()))
+        (obs,), (actions,) = exported.in_avals, exported.out_avals
+        (_, obs_size), (_, action_size) = obs.shape, actions.shape
+    except Exception as error:  # Bytes of anything else fail in any way.
+        raise ConfigError(
+            f"path={path}: not a policy of gmijax.export ({_first_line(error)})"
+        ) from error
+    beside = path.with_suffix(".json")
+    metadata = read_json(beside) if beside.is_file() else {}
+    return Policy(jax.jit(exported.call), int(obs_size), int(action_size), metadata)
+
+
+def _first_line(error: Exception) -> str:
+    return (str(error).strip().splitlines() or [type(error).__name__])[0]

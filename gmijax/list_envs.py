@@ -1,0 +1,97 @@
+"""`gmijax list-envs`: the tasks, and whose tasks there are beside ours. Loads no jax."""
+
+from __future__ import annotations
+
+import ast
+import importlib.util
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Final, NamedTuple
+
+from rich.console import Console
+from rich.table import Table
+
+from gmijax.errors import ConfigError
+from gmijax.sim.registry import SUITES, TASKS, require_task
+
+USAGE: Final = """usage: gmijax list-envs
+
+Lists the tasks with the lengths of their observations and actions, and the suites of others.
+"""
+
+
+class Task(NamedTuple):
+    """What is known of a task without jax; None for what its module does not say as a number."""
+
+    name: str
+    obs_size: int | None
+    action_size: int | None
+    episode_length: int | None
+    description: str
+
+
+def main(argv: Sequence[str]) -> int:
+    """Runs the command; returns the exit code."""
+    if argv:
+        if argv[0] in ("-h", "--help"):
+            sys.stdout.write(USAGE)
+            return 0
+        sys.stderr.write(f"gmijax.list_envs: {argv[0]}: allowed is --help\n")
+        return 2
+    table = Table(box=None, pad_edge=False)
+    table.add_column("env", no_wrap=True)
+    for heading in ("observations", "actions", "steps"):
+        table.add_column(heading, justify="right")
+    table.add_column("task")
+    for task in map(task_of, sorted(TASKS)):
+        sizes = (task.obs_size, task.action_size, task.episode_length)
+        table.add_row(task.name, *("-" if x is None else str(x) for x in sizes), task.description)
+    width = None if sys.stdout.isatty() else 140
+    console = Console(highlight=False, markup=False, soft_wrap=True, width=width)
+    console.print(table)
+    console.print()
+    for line in suite_lines():
+        console.print(line)
+    return 0
+
+
+def task_of(name: str) -> Task:
+    """Reads the module of a task without running it: that would import jax."""
+    spec = importlib.util.find_spec(TASKS[name])
+    assert spec is not None
+    assert spec.origin is not None
+    module = ast.parse(Path(spec.origin).read_text())
+    numbers: dict[str, int] = {}
+    for node in module.body:
+        match node:
+            case ast.Assign(targets=[ast.Name(id=key)], value=ast.Constant(value=int(number))):
+                numbers[key] = number
+            case _:
+                pass
+    about = (ast.get_docstring(module) or "").splitlines()[0].partition(" (")[0]
+    return Task(
+        name,
+        numbers.get("OBS_SIZE"),
+        numbers.get("ACTION_SIZE"),
+        numbers.get("DEFAULT_EPISODE_LENGTH"),
+        about.partition(": ")[2].rstrip("."),
+    )
+
+
+def suite_lines() -> list[str]:
+    """A line for each suite of others: how a task of it is named, or what must be installed."""
+    lines = []
+    for suite in SUITES:
+        try:
+            require_task("", suite)
+        except ConfigError as error:
+            if suite != "custom":
+                lines.append(str(error))
+            continue
+        lines.append(f"env={suite} env.name=NAME: installed")
+    return [*lines, "env=PATH.py:FUNCTION: a task of your own (docs/custom-task.md)"]
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

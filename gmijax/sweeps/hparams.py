@@ -1,0 +1,47 @@
+"""What TensorBoard's HParams tab shows of a job: its overrides and its best objective."""
+
+from __future__ import annotations
+
+import time
+from typing import Any
+
+from gmijax.runs.folder import RunPaths
+from gmijax.sweeps.jobs import Job
+
+_SUFFIX = ".hparams"
+
+
+def write_hparams(job: Job, run: RunPaths, objective: str) -> None:
+    """Adds to the TensorBoard folder of a job that has ended, if it has a value.
+
+    The objective is the scalar `hparam/<objective>`: the curves have tags of their own.
+
+    Raises:
+      OSError: it cannot be written.
+    """
+    value, steps = job.progress.value, job.progress.env_steps
+    if value is None or not job.overrides:
+        return
+    # Imported here: it costs a tenth of a second that no other use of this module should pay.
+    from tensorboardX.event_file_writer import EventsWriter
+    from tensorboardX.proto import event_pb2
+    from tensorboardX.summary import hparams, scalar
+
+    event: Any = vars(event_pb2)["Event"]  # Made by protobuf at run time.
+    tag = f"hparam/{objective}"
+    chosen = {key: _value(text) for key, text in job.overrides.items()}
+    run.tensorboard.mkdir(parents=True, exist_ok=True)
+    writer = EventsWriter(str(run.tensorboard / "events"), _SUFFIX)
+    for summary in (*hparams(chosen, {tag: value}), scalar(tag, value)):
+        writer.write_event(event(wall_time=time.time(), step=steps, summary=summary))
+    writer.close()
+
+
+def _value(text: str) -> float | bool | str:
+    """A value as it stands in an override; TensorBoard sorts and filters numbers as such."""
+    if text.lower() in ("true", "false"):
+        return text.lower() == "true"
+    try:
+        return float(text)
+    except ValueError:
+        return text

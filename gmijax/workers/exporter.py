@@ -1,0 +1,69 @@
+"""Main of the child of `gmijax.export`, started by `gmijax.deploy.exporting` only."""
+
+from __future__ import annotations
+
+import dataclasses
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from gmijax.config import ExportConfig
+from gmijax.config.schema import from_dict
+from gmijax.runs.folder import ExportPaths, read_json, write_bytes, write_json
+from gmijax.runs.resume import trained_config
+from gmijax.supervise.child import ChildLink, run_gmi
+
+if TYPE_CHECKING:
+    from gmijax.sim.interface import Env
+
+
+def main() -> int:
+    """Writes the files; returns the exit code."""
+    return run_gmi(_run)
+
+
+def _run(link: ChildLink) -> None:
+    config = from_dict(ExportConfig, read_json(link.run.config))
+    checkpoint = Path(str(config.checkpoint))
+    env_config, _ = trained_config(checkpoint)
+    env_config = dataclasses.replace(config.run.task(env_config), randomize="off")
+    # jax starts here, in the environment that the plan prepared.
+    from gmijax.deploy.files import onnx_content, stablehlo_content
+    from gmijax.deploy.trained import trained_policy
+    from gmijax.sim.randomize import make_worlds
+
+    link.beat("compiling", 0)
+    policy = trained_policy(checkpoint)
+    # Only asked for names: nothing is simulated.
+    env = make_worlds(env_config, "jax", seed=0, first_env=0, num_envs=1)
+    metadata = {**policy.metadata, **names_of(env)}
+    paths = ExportPaths(link.run.root)
+    if config.format in ("onnx", "all"):
+        write_bytes(paths.onnx, onnx_content(policy, metadata))
+    if config.format in ("stablehlo", "all"):
+        write_bytes(paths.stablehlo, stablehlo_content(policy))
+    # Written last: whoever sees it finds the others.
+    write_json(paths.metadata, metadata)
+
+
+def names_of(env: Env) -> dict[str, Any]:
+    """What only the environment knows of its policies: what they see and drive, and how often.
+
+    Actions have names where the model has one actuator for each; joints are in the order of
+    `qpos`. None: not known.
+    """
+    spec, model = env.spec, env.mj_model
+    seen = spec.actor_obs_size or spec.obs_size
+    num_values = sum(length for _, length in spec.obs_terms)
+    actuators = [] if model is None else [model.actuator(i).name for i in range(model.nu)]
+    joints = [] if model is None else [model.joint(i).name for i in range(model.njnt)]
+    return {
+        "control_dt_s": spec.control_dt_s,
+        "obs_terms": list(map(list, spec.obs_terms)) if num_values == seen else None,
+        "action_names": actuators if len(actuators) == spec.action_size else None,
+        "joint_names": joints or None,
+    }
+
+
+if __name__ == "__main__":
+    sys.exit(main())

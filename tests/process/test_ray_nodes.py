@@ -1,0 +1,161 @@
+"""Training over two nodes of Ray on this machine: equal results, faults, bad input."""
+
+from __future__ import annotations
+
+import importlib.util
+import json
+import os
+import signal
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import pytest
+from training_jobs import (
+    FOREVER,
+    POINT,
+    STEPS,
+    child_environment,
+    gmi_pid,
+    iteration_of,
+    kill,
+    learner_arrays,
+    pids_of,
+    shared_memory,
+    start,
+    train,
+    wait_until,
+)
+
+from gmijax.machine.processes import identify
+
+pytestmark = [
+    pytest.mark.skipif(importlib.util.find_spec("ray") is None, reason="ray is not installed"),
+    pytest.mark.timeout(400),
+]
+
+TWO_NODES = Path(__file__).parents[1] / "two_ray_nodes.py"
+TWO, RAY = "plan.gmis_per_gpu=2", "cluster.engine=ray"
+
+
+class Cluster(NamedTuple):
+    """Two nodes of Ray."""
+
+    address: str  # As an override.
+    second_raylet: int  # Process of the node that does not lead the cluster.
+
+
+@pytest.fixture(scope="module")
+def cluster(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Cluster]:
+    log = tmp_path_factory.mktemp("ray") / "stderr.txt"
+    with (
+        log.open("wb") as stderr,
+        subprocess.Popen(
+            [sys.executable, str(TWO_NODES)],
+            env=child_environment(),
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            stderr=stderr,
+        ) as process,
+    ):
+        assert process.stdout is not None
+        lines = (json.loads(line) for line in process.stdout if line.startswith(b"{"))
+        said: dict[str, Any] | None = next(lines, None)
+        assert said is not None, log.read_text()
+        yield Cluster(f"cluster.address={said['address']}", said["second_raylet"])
+        process.communicate(timeout=60)
+
+
+def children_of(parent: int) -> list[int]:
+    """Processes that a process has started."""
+    tasks = Path(f"/proc/{parent}/task").glob("*/children")
+    return [int(pid) for task in tasks for pid in task.read_text().split()]
+
+
+def events(run: Path, event: str) -> list[dict[str, Any]]:
+    path = run / "events.jsonl"
+    lines = path.read_text().splitlines() if path.exists() else []
+    return [found for line in lines if (found := json.loads(line))["event"] == event]
+
+
+def test_two_nodes_learn_the_bits_of_two_gpus_of_one_machine(
+    cluster: Cluster, tmp_path: Path
+) -> None:
+    steps = f"num_timesteps={3 * 4 * STEPS}"
+    here = ("plan.gpus=2", "reduce.strategy=har", "run.dir=here")
+    done = train(*POINT, TWO, *here, steps, cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    nodes = (RAY, cluster.address, "cluster.nodes=2", "run.dir=there")
+    done = train(*POINT, TWO, *nodes, steps, cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    there = tmp_path / "there"
+    expected = learner_arrays(tmp_path / "here")
+    assert len(expected) > 10
+    for array, other in zip(learner_arrays(there), expected, strict=True):
+        np.testing.assert_array_equal(array, other)
+
+    plan = json.loads((there / "plan.json").read_text())
+    summary = json.loads((there / "summary.json").read_text())
+    assert plan["layout"] == [[0, 1], [2, 3]]
+    assert [node["gmis"] for node in plan["nodes"]] == [[0, 1], [2, 3]]
+    assert summary["plan"]["nodes"] == plan["nodes"]
+    assert all((there / f"gmi_{gmi}" / "stderr.log").exists() for gmi in range(4))
+    assert not list(there.glob("node_*"))
+    assert not pids_of(there)
+
+
+def test_a_job_outlives_a_gmi_and_a_node_and_nothing_outlives_its_controller(
+    cluster: Cluster, tmp_path: Path
+) -> None:
+    memory = shared_memory()
+    run = tmp_path / "run"
+    job = (
+        *(*POINT, FOREVER, TWO, RAY, "run.dir=run", "run.resume=auto"),
+        *("run.max_restarts=3", "run.elastic=true", "cluster.wait_s=1", "run.checkpoint_every=5"),
+    )
+    controller = start(*job, cluster.address, cwd=tmp_path)
+    try:
+        said = tmp_path / "stderr.txt"
+
+        def wait(condition: Any, what: str) -> Any:
+            return wait_until(
+                lambda: condition() or controller.poll() is not None, 120, f"{what}: {said}"
+            )
+
+        wait(lambda: iteration_of(run, 3) > 6, "the job trains")
+        kill(gmi_pid(run, 3) or 0)
+        wait(lambda: len(events(run, "recovered")) == 1, "it goes on without GMI 3")
+        [fault] = events(run, "fault")
+        assert fault["gmi"] == 3
+        assert "SIGKILL" in fault["cause"]
+
+        os.kill(cluster.second_raylet, signal.SIGKILL)
+        wait(lambda: len(events(run, "recovered")) == 2, "it goes on without the second node")
+        fault = events(run, "fault")[-1]
+        assert "node 1 (" in fault["cause"]
+        assert "is gone" in fault["cause"]
+        wait(lambda: iteration_of(run, 1) > iteration_of(run, 3), "two GMIs train")
+        assert json.loads((run / "plan.json").read_text())["layout"] == [[0, 1]]
+
+        controller.send_signal(signal.SIGTERM)
+        assert controller.wait(60) == 130, said.read_text()
+        assert not pids_of(run)
+        summary = json.loads((run / "summary.json").read_text())
+        assert (summary["status"], len(summary["restarts"])) == ("interrupted", 2)
+
+        # With a cluster of its own, which must end with it too.
+        controller = start(*job, "cluster.address=local", cwd=tmp_path)
+        wait(lambda: iteration_of(run, 1) > 0, "it goes on from its checkpoint")
+        started = [*pids_of(run), *children_of(controller.pid)]
+        left = [process for pid in started if (process := identify(pid))]
+        assert len(left) > 2
+        kill(controller.pid)
+        controller.wait()
+        wait_until(lambda: not any(p.is_running() for p in left), 60, "all processes gone")
+        assert shared_memory() <= memory
+    finally:
+        kill(controller.pid)
+        controller.wait()

@@ -1,0 +1,93 @@
+"""Figures in the documents are those of the files of results; what has no file is found."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from benchmarks.evaluation import check
+from benchmarks.evaluation.figures import look_up
+from benchmarks.evaluation.page import TABLES
+from gmijax.errors import ConfigError
+
+REFERENCE = "ant-1gpu.json#4 GMIs x 2048, mps/step_per_s_train"
+MARKED = f"<!-- figure: {REFERENCE} over 1 GMI x 8192/step_per_s_train .2f -->%s<!-- /figure -->\n"
+
+
+def findings(folder: Path, text: str) -> list[str]:
+    path = folder / "README.md"
+    path.write_text(text)
+    return [str(finding) for finding in check.in_document(path, folder)]
+
+
+def test_every_figure_of_the_documents_is_that_of_its_file():
+    # `python -m benchmarks evaluation` writes what is marked, and says what a table is called.
+    assert [str(finding) for finding in check.check()] == []
+
+
+def test_the_page_of_the_evaluation_has_every_table():
+    page = (check.ROOT / "docs" / "evaluation.md").read_text()
+    assert {match[2] for match in check.TABLE.finditer(page)} == set(TABLES)
+
+
+def test_a_wrong_digit_is_found(tmp_path: Path):
+    assert findings(tmp_path, "a\n" + MARKED % "0.72") == []
+    (found,) = findings(tmp_path, "a\n" + MARKED % "0.73")
+    assert found.startswith("README.md:2: '0.73': ant-1gpu.json#")
+    assert found.endswith(" is 0.72")
+
+
+def test_a_wrong_digit_in_a_table_is_found(tmp_path: Path):
+    text = check.fill("<!-- table: templates -->\n<!-- /table -->\n")
+    assert findings(tmp_path, text) == []
+    (found,) = findings(tmp_path, text.replace("| 1.29 |", "| 1.39 |"))
+    assert found.startswith("README.md:4: '| `ant` |")
+    assert "| 1.29 |" in found
+
+
+@pytest.mark.parametrize(
+    ("reference", "said"),
+    [
+        ("none.json#a/b", "no such file of results"),
+        (f"{REFERENCE} over none/step_per_s_train", "ant-1gpu.json has no"),
+    ],
+)
+def test_a_figure_without_a_file_is_found(tmp_path: Path, reference: str, said: str):
+    (found,) = findings(tmp_path, f"<!-- figure: {reference} .2f -->0.72<!-- /figure -->\n")
+    assert said in found
+
+
+def test_a_table_that_is_none_of_ours_is_found(tmp_path: Path):
+    (found,) = findings(tmp_path, "<!-- table: none -->\n<!-- /table -->\n")
+    assert "table none: allowed are advice, " in found
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        *("It makes 1,635,487 steps/s.", "It is 1.42 times as fast.", "4 times faster with four"),
+        *("a return of 7,000", "learnt after 57 s", "0.2 M steps a second", "38 % of the GPU"),
+    ],
+)
+def test_what_looks_like_a_measurement_needs_a_file(tmp_path: Path, text: str):
+    (found,) = findings(tmp_path, f"{text}\n")
+    assert found.endswith("looks like a measurement and names no file")
+    assert findings(tmp_path, f"{text} <!-- no figure -->\n") == []
+    assert findings(tmp_path, f"`{text}`\n```\n{text}\n```\n") == []
+
+
+def test_prose_needs_no_marks(tmp_path: Path):
+    text = (
+        "8,192 environments, 0.91 kg, twice, within 0.2 s, 1.5M parameters, every 25 s, 600 MiB,"
+    )
+    text += " the mean return of 64 episodes, 5 % more"
+    assert findings(tmp_path, text) == []
+
+
+def test_paths_take_medians_names_and_keys_with_slashes():
+    assert look_up(REFERENCE) == pytest.approx(1_180_954, abs=1)  # The second of three.
+    assert look_up("serving-nvidia-h200.json#ant 1 x 8192, mps/colocated") > 1e6
+    assert look_up("templates-ant.json#2 GMIs x 2048, tcg_ex/runs/0/medians/time/rollout_s") < 1
+    with pytest.raises(ConfigError, match="has no"):
+        look_up("ant-1gpu.json#4 GMIs x 2048, mps/none")

@@ -1,0 +1,82 @@
+"""Files of results say what they are from, keep every call, and are read if they are old."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+
+from benchmarks import records
+from benchmarks.records import COMMIT_VARIABLE, RESULTS, ResultsFile, read_calls
+from gmijax.errors import ConfigError
+
+
+def add(path: Path, number: int, **options: bool) -> None:
+    with ResultsFile(path, "a", {"out": path, "sizes": (1, 2)}, **options).changing() as results:
+        results["number"] = number
+
+
+@pytest.fixture
+def file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.setenv(COMMIT_VARIABLE, "abc-dirty")
+    return tmp_path / "a.json"
+
+
+def test_a_call_says_with_what_it_was_made(file: Path):
+    add(file, 1)
+    (call,) = read_calls(file)
+    assert (call.commit, call.is_dirty) == ("abc", True)
+    assert call.settings == {"out": str(file), "sizes": [1, 2]}
+    assert all((call.date, call.host, call.device, call.command))
+    assert call.versions is not None
+    assert call.versions["jax"]
+
+
+def test_another_call_is_added(file: Path):
+    for number in (1, 2):
+        add(file, number)
+    assert [call.results for call in read_calls(file)] == [{"number": 1}, {"number": 2}]
+
+
+def test_calls_that_go_on_at_the_same_time_keep_each_other(file: Path):
+    books = [ResultsFile(file, "a", {}) for _ in range(2)]
+    for number, book in enumerate((*books, books[0])):
+        with book.changing() as results:
+            results["number"] = number
+    assert sorted(call.results["number"] for call in read_calls(file)) == [1, 2]
+
+
+def test_only_a_call_of_the_same_code_is_gone_on_with(file: Path, monkeypatch: pytest.MonkeyPatch):
+    add(file, 1)
+    add(file, 2, resume=True)
+    assert [call.results for call in read_calls(file)] == [{"number": 2}]
+    monkeypatch.setenv(COMMIT_VARIABLE, "def")
+    with pytest.raises(ConfigError, match="its last call has another commit"):
+        add(file, 3, resume=True)
+
+
+def test_an_old_file_is_one_call_whose_origin_is_unknown_and_stays(file: Path):
+    summary = {"device": {"kind": "NVIDIA H200"}, "versions": {"jax": "0.11.2"}}
+    old = {"suite": "a", "cases": {"b": {"runs": [{"summary": summary}]}}}
+    file.write_text(json.dumps(old))
+    for calls in (1, 2):
+        first = read_calls(file)[0]
+        assert (first.commit, first.date, first.host) == (None, None, None)
+        assert (first.device, first.versions) == ("NVIDIA H200", {"jax": "0.11.2"})
+        assert first.results == old
+        assert len(read_calls(file)) == calls
+        add(file, 2)
+
+
+def test_the_commit_of_a_checkout_is_found(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.delenv(COMMIT_VARIABLE, raising=False)
+    monkeypatch.setattr(records, "_git", lambda verb, *_: {"rev-parse": "abc"}.get(verb, " M a"))
+    assert records.code_version() == ("abc", True)
+    monkeypatch.setattr(records, "_git", lambda *_: None)
+    assert records.code_version() == (None, None)
+
+
+@pytest.mark.parametrize("path", sorted(RESULTS.glob("*.json")), ids=lambda path: path.stem)
+def test_every_file_of_results_can_be_read(path: Path):
+    assert all(call.results for call in read_calls(path))

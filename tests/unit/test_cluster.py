@@ -1,0 +1,250 @@
+"""Jobs on several nodes without Ray: bad input, what a node says and does, nodes that are lost."""
+
+from __future__ import annotations
+
+import builtins
+import os
+import signal
+from pathlib import Path
+from typing import Any
+
+import pytest
+from supervision import machine
+
+from gmijax import compose
+from gmijax.cluster import node as nodes
+from gmijax.cluster import ray_nodes
+from gmijax.cluster.cluster_job import ClusterJob
+from gmijax.cluster.node import Facts, Node, Seen, address_of, own_versions
+from gmijax.cluster.ray_nodes import Joined, RayCluster
+from gmijax.cluster.remote_gmi import RemoteNode
+from gmijax.config import ClusterConfig, PlanConfig, ReduceConfig
+from gmijax.control.restarts import with_nodes_left
+from gmijax.errors import ConfigError, GmiFailed, JobInterrupted, ReportedError
+from gmijax.machine.snapshot import Machine
+from gmijax.partition.plan import Plan
+from gmijax.partition.planner import make_plan
+from gmijax.runs.folder import GmiPaths
+from gmijax.supervise.failures import describe_exit, first_cause, is_consequence
+from gmijax.supervise.heartbeat import Heartbeat
+from gmijax.supervise.kinds import JobKind, training_plan
+
+
+class FakeAnswer:
+    """An answer that is there."""
+
+    def __init__(self, value: Any) -> None:
+        self.value = value
+
+    def is_there(self) -> bool:
+        return True
+
+    def get(self) -> Any:
+        if isinstance(self.value, Exception):
+            raise self.value
+        return self.value
+
+
+def a_node(**answers: Any) -> RemoteNode:
+    def ask(method: str, *_: Any) -> FakeAnswer:
+        return FakeAnswer(answers.get(method))
+
+    return RemoteNode(ask, 1, "10.0.0.2")
+
+
+def a_job(node: RemoteNode, versions: dict[str, str | None] | None = None) -> ClusterJob:
+    job = ClusterJob(compose("env=ball_balance", "cluster.engine=ray", "num_envs=16"))
+    job._joined = [Joined(node, Facts(node.address, machine(0), versions or own_versions()))]
+    return job
+
+
+@pytest.mark.parametrize(
+    ("overrides", "message"),
+    [
+        (("cluster.engine=slurm",), "cluster.engine=slurm: expected one of ray or null"),
+        (("cluster.address=ray://head:10001",), "must be started on a node of the cluster"),
+        (("cluster.engine=ray", "algo=a3c"), "algo=a3c: not with cluster.engine=ray yet"),
+        (("cluster.engine=ray", "plan.template=tdg_ex"), "template=tdg_ex: not with cluster"),
+        (("cluster.engine=ray", "plan.backend=mps"), "allowed are auto, cpu"),
+        (("cluster.engine=ray", "num_envs=auto"), "num_envs=auto: a search is for one machine"),
+        (("cluster.nodes=0",), "cluster.nodes=0: must be at least 1"),
+    ],
+)
+def test_what_cannot_be_on_nodes_is_refused_by_its_key(
+    overrides: tuple[str, ...], message: str
+) -> None:
+    with pytest.raises(ConfigError, match=message):
+        compose("env=ball_balance", *overrides)
+
+
+def test_without_ray_or_a_cluster_the_line_says_what_to_do(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    class Ray:
+        is_initialized = staticmethod(lambda: False)
+
+        @staticmethod
+        def init(**_: Any) -> None:
+            raise ConnectionError("Could not find any running Ray instance.\nMore words.")
+
+    monkeypatch.setattr(ray_nodes, "_import_ray", Ray)
+    with pytest.raises(ConfigError, match=r"address=auto: no cluster .*`ray start --head`"):
+        RayCluster(ClusterConfig())
+    with pytest.raises(ConfigError, match=r"address=127\.0\.0\.1:1: nobody answers there"):
+        RayCluster(ClusterConfig(address="127.0.0.1:1"))
+    with pytest.raises(ConfigError, match="expected auto, local or host:port"):
+        RayCluster(ClusterConfig(address="somewhere"))
+    monkeypatch.undo()
+    real = builtins.__import__
+
+    def no_ray(name: str, *arguments: Any) -> Any:
+        if name.partition(".")[0] == "ray":
+            raise ImportError(name)
+        return real(name, *arguments)
+
+    monkeypatch.setattr(builtins, "__import__", no_ray)
+    with pytest.raises(ConfigError, match=r"ray is not installed \(pip install 'gmijax\[ray\]'"):
+        RayCluster(ClusterConfig())
+
+
+def test_fewer_nodes_than_asked_for_are_refused_once_the_wait_is_over(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    class Ray:
+        is_initialized = staticmethod(lambda: True)
+
+        @staticmethod
+        def nodes() -> list[dict[str, Any]]:
+            return [
+                {"Alive": True, "Resources": {"CPU": 4.0}},
+                {"Alive": True, "Resources": {"CPU": 1.0}},
+                {"Alive": False, "Resources": {"CPU": 4.0}},
+            ]
+
+        @staticmethod
+        def wait(*_: Any, **__: Any) -> None:
+            """Nothing is asked."""
+
+    monkeypatch.setattr(ray_nodes, "_import_ray", Ray)
+    cluster = RayCluster(ClusterConfig(wait_s=0.0))
+    with pytest.raises(ConfigError, match="nodes=2: the cluster has 1 nodes with 2 CPUs, and no"):
+        cluster.join(2, 2)
+    with pytest.raises(ConfigError, match="nodes=auto: the cluster has 0 nodes with 8 CPUs"):
+        cluster.join(8, None)
+    patient = RayCluster(ClusterConfig(wait_s=100.0))
+    with pytest.raises(JobInterrupted, match="while it waited for nodes"):
+        patient.join(2, 2, is_unwanted=lambda: True)
+
+
+def test_nodes_with_other_versions_are_refused() -> None:
+    job = a_job(a_node(), {**own_versions(), "jax": "0.1"})
+    with pytest.raises(ConfigError, match=r"node 10\.0\.0\.2 has jax 0\.1, this one has"):
+        job._require_alike()
+
+
+def test_a_run_folder_that_a_node_does_not_see_is_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("gmijax.cluster.cluster_job._SHOWS_S", 0.0)
+    with pytest.raises(ConfigError, match=r"node 10\.0\.0\.2 does not see .* or cannot write"):
+        a_job(a_node(sees=False))._require_shared(tmp_path / "runs" / "new")
+    a_job(a_node(sees=True))._require_shared(tmp_path / "runs" / "new")
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_node_sees_what_is_in_a_file(tmp_path: Path) -> None:
+    (tmp_path / "probe").write_text("secret")
+    sees = Node.__new__(Node).sees
+    assert sees(str(tmp_path / "probe"), "secret")
+    assert not sees(str(tmp_path / "probe"), "other")
+    assert not sees(str(tmp_path / "nothing"), "secret")
+
+
+def test_an_interface_is_an_address_or_a_line_that_names_those_there_are() -> None:
+    assert address_of("lo") == "127.0.0.1"
+    with pytest.raises(ConfigError, match=r"cluster.interface=eth99: .*it has lo"):
+        address_of("eth99")
+
+
+def test_the_plan_of_nodes_has_each_nodes_shares_under_global_ids() -> None:
+    here = {"10.0.0.1": machine(0), "10.0.0.2": machine(0)}
+    settings = PlanConfig(gmis_per_gpu=2), ReduceConfig(), 16
+    plan = make_plan(*settings, machine(0), nodes=here)
+    assert plan.layout.gmis_of_gpu == ((0, 1), (2, 3))
+    assert [share.gpu for share in plan.slices] == [0, 0, 1, 1]
+    assert plan.slices[2].cpus == plan.slices[0].cpus
+    assert plan.strategy == "mpr"
+    assert plan.nodes_data()[1] == {"address": "10.0.0.2", "gmis": [2, 3]}
+    assert Plan.from_dict(plan.to_dict()) == plan
+    old = {key: value for key, value in plan.to_dict().items() if key != "nodes"}
+    assert Plan.from_dict(old | {"layout": [[0, 1], [2, 3]]}).layout.num_nodes == 1
+    with pytest.raises(ConfigError, match=r"har: cannot run on layout .*allowed are auto, mpr"):
+        make_plan(settings[0], ReduceConfig(strategy="har"), 16, machine(0), nodes=here)
+    with pytest.raises(ConfigError, match="GPUs of several nodes are not supported yet"):
+        make_plan(*settings, machine(1), nodes={"a": machine(1)})
+
+
+def test_a_job_goes_on_with_the_nodes_that_are_left() -> None:
+    config = compose("env=ball_balance", "cluster.engine=ray", "num_envs=16", "seed=3")
+    plan = training_plan(config, machine(0), nodes={"a": machine(0), "b": machine(0)})
+    assert with_nodes_left(config, plan, {"c": machine(0), "b": machine(0)})[1] == ()
+    left, [note] = with_nodes_left(config, plan, {"b": machine(0)})
+    assert (left.nodes, left.layout.num_gmis, left.strategy) == (("b",), 1, "none")
+    assert "1 nodes of the job are gone: going on with 1, layout [[0]]" in note
+    assert left.reasons[-1] == note
+
+
+def test_who_waited_in_vain_comes_before_who_lost_that_one() -> None:
+    lost, late = (
+        GmiFailed(gmi, error, error=ReportedError(error, "", ""), exit_code=1)
+        for gmi, error in ((0, "PeerLost"), (2, "CollectiveTimeout"))
+    )
+    assert first_cause([lost, late]) is late
+    assert first_cause([lost, late, killed := GmiFailed(3, "", exit_code=-9)]) is killed
+
+
+def test_a_lost_node_is_the_cause_that_its_gmis_give(tmp_path: Path) -> None:
+    seen = {2: Seen(None, 1, Heartbeat("running", 7, 99), None, 0)}
+    answers: dict[str, Any] = {"start": 99, "poll": seen}
+    node = a_node()
+    node._ask = lambda method, *_: FakeAnswer(answers[method])
+    gmi = node.start(2, False, GmiPaths(tmp_path))
+    gmi.poll()  # Asks.
+    assert gmi.poll() is None
+    assert gmi.beat.iteration == 7
+    assert gmi.is_ready
+    answers["poll"] = RuntimeError("The actor died.\nits node has died")
+    while gmi.poll() is None:
+        pass
+    failure = describe_exit(2, gmi.exit_code or 0, gmi.error, gmi.paths.stderr)
+    assert "NodeLost: node 1 (10.0.0.2) is gone: its node has died" in failure.reason
+    assert not is_consequence(failure)
+    assert gmi.request_stacks() is None
+    gmi.kill()
+
+
+def test_a_node_starts_polls_and_ends_gmis(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from supervision import make_launch
+
+    from gmijax.collectives.nodes.meeting import Nodes
+    from gmijax.runs.folder import RunPaths
+
+    monkeypatch.setattr(nodes, "detect_machine", lambda: machine(0))
+    monkeypatch.chdir(tmp_path)
+    plan = make_plan(PlanConfig(), ReduceConfig(), 16, machine(0), nodes={"a": Machine((), (0,))})
+    launch = make_launch(RunPaths(tmp_path), ["train"], plan)
+    assert isinstance(launch.kind, JobKind)
+    node = Node({"JAX_THING": "1"}, str(tmp_path), None, "127.0.0.1")
+    assert os.environ["JAX_THING"] == "1"
+    host, port = node.open(launch, 0, "127.0.0.1")
+    node.introduce(Nodes(0, ((host, port),), b"token"))
+    pid = node.start(0, False)
+    assert isinstance(pid, int)
+    node.order(0, "kill")
+    while (seen := node.poll()[0]).exit_code is None:
+        pass
+    assert seen.exit_code == -signal.SIGKILL
+    node.close()
+    assert not (tmp_path / "node_0").exists()

@@ -1,0 +1,133 @@
+"""The command `gmijax`: its verbs, the list of tasks, completion in a shell."""
+
+from __future__ import annotations
+
+import importlib
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from gmijax import demo
+from gmijax.__main__ import VERBS, main
+from gmijax.config import PlayConfig, TrainConfig
+from gmijax.control.job import Result
+from gmijax.list_envs import task_of
+from gmijax.runs.folder import PlayPaths, RunPaths
+from gmijax.sim.registry import TASKS
+from gmijax.version import __version__
+
+
+@pytest.mark.parametrize("argv", [[], ["--help"], ["-h"]])
+def test_help_has_a_line_for_every_verb(argv: list[str], capsys: pytest.CaptureFixture[str]):
+    assert main(argv) == 0
+    lines = capsys.readouterr().out.splitlines()
+    for verb, what in VERBS.items():
+        assert f"{verb} {what}" in [" ".join(line.split()) for line in lines]
+
+
+@pytest.mark.parametrize("verb", VERBS)
+def test_every_verb_is_a_module_with_help(verb: str, capsys: pytest.CaptureFixture[str]):
+    assert main([verb, "--help"]) == 0
+    assert f"{verb.replace('_', '-')}" in capsys.readouterr().out.splitlines()[0]
+    assert callable(importlib.import_module(f"gmijax.{verb.replace('-', '_')}").main)
+
+
+def test_arguments_and_exit_code_are_those_of_the_verb(capsys: pytest.CaptureFixture[str]):
+    assert main(["train", "num_env=3"]) == 2
+    assert "unknown key num_env: did you mean num_envs?" in capsys.readouterr().err
+    assert main(["list-envs", "ant"]) == 2
+    assert main(["demo", "num_timesteps=0"]) == 2
+
+
+def test_a_demo_trains_plays_and_says_what_to_look_at(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+):
+    run, played = RunPaths(tmp_path), PlayPaths(tmp_path / "play" / "000000000042")
+
+    def train(config: TrainConfig, *, show: bool) -> Result:
+        assert (config.env.name, config.num_timesteps, config.seed) == ("ball_balance", 42, 3)
+        run.returns_png.touch()
+        return Result(tmp_path, {})
+
+    def play(config: PlayConfig, *, show: bool) -> None:
+        assert config.run.dir == str(tmp_path)
+        played.root.mkdir(parents=True)
+        played.mp4.touch()
+
+    monkeypatch.setattr(demo.job, "train", train)
+    monkeypatch.setattr(demo.playing, "play", play)
+    assert main(["demo", "num_timesteps=42", "seed=3"]) == 0
+    said = capsys.readouterr().out
+    assert f"return while it learnt: {run.returns_png}\n" in said
+    assert f"film: {played.mp4}\n" in said
+
+
+def test_an_unknown_verb_is_one_line_with_a_suggestion(capsys: pytest.CaptureFixture[str]):
+    assert main(["trian"]) == 2
+    assert capsys.readouterr().err == "gmijax: unknown command 'trian': did you mean train?\n"
+
+
+def test_version(capsys: pytest.CaptureFixture[str]):
+    assert main(["--version"]) == 0
+    assert capsys.readouterr().out == f"gmijax {__version__}\n"
+
+
+def test_nothing_heavy_is_imported_before_the_verb_is_known():
+    code = (
+        "import sys, gmijax.__main__ as m; m.main(['--help']); "
+        "print({'hydra', 'numpy', 'rich', 'jax'} & sys.modules.keys())"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.splitlines()[-1] == "set()"
+
+
+@pytest.mark.parametrize("name", TASKS)
+def test_listed_sizes_are_those_that_the_task_describes(name: str):
+    task = task_of(name)
+    module = importlib.import_module(TASKS[name])
+    described = str(module.__doc__)
+    assert f"Observation [{task.obs_size}]" in described
+    assert f"Action [{task.action_size}]" in described
+    assert task.episode_length == module.DEFAULT_EPISODE_LENGTH
+    assert task.description
+
+
+def test_list_envs_names_tasks_and_suites(capsys: pytest.CaptureFixture[str]):
+    assert main(["list-envs"]) == 0
+    said = capsys.readouterr().out
+    for name in (*TASKS, "env=brax", "env=playground", "env=PATH.py:FUNCTION"):
+        assert name in said
+
+
+@pytest.mark.parametrize(
+    ("line", "answer"),
+    [
+        ("gmijax tr", list(VERBS)),
+        ("gmijax ", list(VERBS)),
+        ("gmijax train env=an", ["env=ant", "env=anymal"]),
+        ("gmijax train env=ant plan.gm", ["plan.gmis_per_gpu="]),
+        ("gmijax play vid", ["video=", "video_envs="]),
+        ("gmijax doctor ", []),
+    ],
+)
+def test_completion_of_a_line(
+    line: str,
+    answer: list[str],
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+):
+    monkeypatch.setenv("COMP_LINE", line)
+    assert main(["-sc", "query=bash"]) == 0
+    assert capsys.readouterr().out.split() == answer
+
+
+def test_the_script_for_bash_is_that_of_hydra(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+):
+    monkeypatch.setattr(sys, "argv", ["/bin/gmijax"])
+    assert main(["-sc", "install=bash"]) == 0
+    assert capsys.readouterr().out.rstrip().endswith("-F hydra_bash_completion gmijax")
+    assert main(["-sc", "install=csh"]) == 2
+    assert "No completion plugin for 'csh' found" in capsys.readouterr().err

@@ -1,0 +1,197 @@
+"""Exchange between the leaders of nodes: leaders as threads of one process, real sockets."""
+
+from __future__ import annotations
+
+import os
+import socket
+import threading
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import ExitStack
+from typing import Any
+
+import numpy as np
+import pytest
+
+from gmijax.collectives.build import Membership, SharedReducer, build_reducer
+from gmijax.collectives.host.shared_block import create_exchange
+from gmijax.collectives.nodes import meeting
+from gmijax.collectives.nodes.meeting import Nodes, connect, listen
+from gmijax.collectives.nodes.mesh import Mesh
+from gmijax.collectives.strategies import Stage, har_s, mpr_s, nodes_s, predicted_s, stages
+from gmijax.errors import CollectiveError, CollectiveTimeout, ConfigError, PeerLost
+from gmijax.partition.layout import Layout
+from gmijax.partition.reduction import select_strategy, why_not_strategy
+
+TOKEN = b"secret"
+HERE = "127.0.0.1"
+
+
+def meet(tokens: Sequence[bytes], timeout_s: float = 10.0) -> list[Any]:
+    """The connections of every leader, or its error."""
+    with ExitStack() as held:
+        listeners = [held.enter_context(listen(HERE)) for _ in tokens]
+        addresses = tuple((HERE, one.getsockname()[1]) for one in listeners)
+
+        def come(node: int) -> Any:
+            try:
+                nodes = Nodes(node, addresses, tokens[node])
+                return connect(nodes, listeners[node], 1, timeout_s)[0]
+            except CollectiveError as error:
+                return error
+
+        with ThreadPoolExecutor(len(tokens)) as pool:
+            return list(pool.map(come, range(len(tokens))))
+
+
+@pytest.fixture
+def meshes(request: pytest.FixtureRequest) -> Iterator[list[Mesh]]:
+    num_nodes, timeout_s = getattr(request, "param", (3, 10.0))
+    found = [
+        Mesh(
+            *(sockets, node, [10 * node for node in range(num_nodes)]),
+            timeout_s=timeout_s,
+            rendezvous_timeout_s=timeout_s,
+            on_wait=lambda: None,
+        )
+        for node, sockets in enumerate(meet([TOKEN] * num_nodes))
+    ]
+    yield found
+    for mesh in found:
+        mesh.close()
+
+
+def at_once(*calls: Callable[[], Any]) -> list[Any]:
+    def run(call: Callable[[], Any]) -> Any:
+        try:
+            return call()
+        except CollectiveError as error:
+            return error
+
+    with ThreadPoolExecutor(len(calls)) as pool:
+        return list(pool.map(run, calls))
+
+
+@pytest.mark.parametrize("num_floats", [1, 33, 400_000])
+def test_a_sum_is_in_the_order_of_nodes_with_the_same_bits_on_all(
+    meshes: list[Mesh], num_floats: int
+) -> None:
+    values = np.random.default_rng(0).normal(size=(3, num_floats)).astype(np.float32) * 1e3
+    sums = at_once(*(lambda k=k: meshes[k].sum(values[k], 1) for k in range(3)))
+    for total in sums:
+        np.testing.assert_array_equal(total, (values[0] + values[1]) + values[2])
+
+
+def test_a_gather_is_in_the_order_of_nodes(meshes: list[Mesh]) -> None:
+    rows = at_once(*(lambda k=k: meshes[k].gather(np.full(2, k, np.float32)) for k in range(3)))
+    assert all(row.tolist() == [[0, 0], [1, 1], [2, 2]] for row in rows)
+
+
+@pytest.mark.parametrize("meshes", [(2, 10.0)], indirect=True)
+def test_a_leader_that_hangs_up_and_one_that_does_something_else_are_named(
+    meshes: list[Mesh],
+) -> None:
+    ones = np.ones(100, np.float32)
+    different = at_once(lambda: meshes[0].sum(ones, 1), lambda: meshes[1].sum(ones[:50], 1))
+    assert [type(error) for error in different] == [CollectiveError] * 2
+    assert "rank 0 calls sum, rank 10 something else" in str(different[0])
+    meshes[1].close()
+    with pytest.raises(PeerLost, match="peer 10 is gone during all_gather between nodes"):
+        meshes[0].gather(ones)
+
+
+@pytest.mark.parametrize("meshes", [(2, 0.3)], indirect=True)
+def test_a_leader_that_does_not_come_is_named_in_time(meshes: list[Mesh]) -> None:
+    with pytest.raises(CollectiveTimeout, match=r"0\.3 s in sum between nodes.*ranks \[10\]"):
+        meshes[0].sum(np.ones(3, np.float32), 1)
+
+
+def test_who_does_not_know_the_secret_stays_out(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(meeting, "_STRANGER_S", 0.5)
+    answers = meet([TOKEN, b"guess"], timeout_s=1.0)
+    assert "leaders of other nodes did not come" in str(answers[0])
+    assert "node 1 cannot reach node 0 at 127.0.0.1" in str(answers[1])
+
+
+def test_what_leaders_know_goes_through_a_file() -> None:
+    nodes = Nodes(1, ((HERE, 1234), ("10.0.0.2", 99)), os.urandom(32))
+    fd = nodes.to_file()
+    try:
+        assert Nodes.from_file(fd) == nodes
+    finally:
+        os.close(fd)
+
+
+def test_small_things_go_over_nodes_in_order_of_rank() -> None:
+    layout = Layout.even(1, 2).on_nodes(2)
+    with ExitStack() as held:
+        listeners = [listen(HERE) for _ in range(2)]
+        addresses = tuple((HERE, one.getsockname()[1]) for one in listeners)
+        blocks = [create_exchange() for _ in range(2)]
+        for fd in blocks:
+            held.callback(os.close, fd)
+
+        def gather(rank: int) -> Any:
+            node = layout.node_of(rank)
+            membership = Membership(
+                layout=layout,
+                rank=rank,
+                num_floats=10,
+                exchange_fd=blocks[node],
+                timeout_s=10,
+                rendezvous_timeout_s=10,
+                nodes=Nodes(node, addresses, TOKEN),
+                listener=socket.socket(fileno=os.dup(listeners[node].fileno())),
+            )
+            reducer = build_reducer("mpr", membership)
+            assert isinstance(reducer, SharedReducer)
+            try:
+                return [reducer.all_gather(np.full(2, rank + k, np.float32)) for k in range(3)]
+            finally:
+                met.wait()
+                reducer.close()
+
+        met = threading.Barrier(4)
+        for rows in at_once(*(lambda rank=rank: gather(rank) for rank in range(4))):
+            assert [row[:, 1].tolist() for row in rows] == [
+                [k, k + 1, k + 2, k + 3] for k in range(3)
+            ]
+        for listener in listeners:
+            listener.close()
+
+
+@pytest.mark.parametrize(
+    ("gpus", "gmis", "nodes", "strategy", "seconds"),
+    [
+        (1, 4, 1, "mpr", mpr_s(1, 4, 400, 2, 3)),
+        (1, 4, 2, "mpr", mpr_s(1, 4, 400, 2, 3) + nodes_s(2, 400, 5)),
+        (2, 1, 4, "mrr", har_s(2, 1, 400, 2, 3) * 2 + nodes_s(4, 400, 5)),
+        (2, 4, 3, "har", har_s(2, 4, 400, 2, 3) + nodes_s(3, 400, 5)),
+    ],
+)
+def test_algorithm_1_and_its_cost_are_those_of_a_node_and_the_way_between(
+    gpus: int, gmis: int, nodes: int, strategy: str, seconds: float
+) -> None:
+    layout = Layout.even(gpus, gmis).on_nodes(nodes)
+    assert select_strategy(layout).strategy == strategy
+    assert predicted_s(strategy, layout, 100, 2, 3, 5) == pytest.approx(seconds)
+
+
+def test_a_layout_on_nodes_has_global_ids_and_ranks_in_nodes() -> None:
+    layout = Layout(((0, 2), (1,))).on_nodes(2)
+    assert layout.gmis_of_gpu == ((0, 2), (1,), (3, 5), (4,))
+    assert layout.gmis_of_node == ((0, 1, 2), (3, 4, 5))
+    assert [layout.node_of(gmi) for gmi in layout.gmis] == [0, 0, 0, 1, 1, 1]
+    assert layout.of_one_node == Layout(((0, 2), (1,)))
+    with pytest.raises(ConfigError, match="2 nodes must be alike"):
+        Layout(((0, 1), (2,)), 2)
+
+
+def test_the_stages_of_nodes_are_those_of_har_on_as_many_gpus() -> None:
+    assert stages("mpr", Layout.even(1, 2).on_nodes(2)) == [
+        Stage("sum", "host", ((0, 1), (2, 3))),
+        Stage("sum", "nodes", ((0, 2),)),
+        Stage("broadcast", "host", ((0, 1), (2, 3))),
+    ]
+    assert stages("mpr", Layout.even(1, 1).on_nodes(3)) == [Stage("sum", "nodes", ((0, 1, 2),))]
+    assert "allowed are auto, mpr" in str(why_not_strategy("har", Layout.even(1, 2).on_nodes(2)))

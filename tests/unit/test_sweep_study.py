@@ -1,0 +1,112 @@
+"""Jobs from Optuna: what is drawn, what is tried again, what is ended early."""
+
+from __future__ import annotations
+
+import dataclasses
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from gmijax.cli.compose import compose
+from gmijax.cli.grid import build_sweep
+from gmijax.errors import ConfigError
+from gmijax.sweeps.jobs import Job, State, jobs_of
+from gmijax.sweeps.study import OptunaStudy
+from gmijax.sweeps.sweep import Request
+
+
+def study(folder: Path, *overrides: str) -> tuple[Request, OptunaStudy]:
+    request = build_sweep(overrides)
+    journal = folder / "study.log"
+    return request, OptunaStudy(request.settings, request.space, request.make_job, journal)
+
+
+TOY = ("sweep.sampler=tpe", "algo.learning_rate=tag(log,interval(1e-5,1e-2))", "sweep.trials=8")
+
+
+def toy_objective(job: Job) -> float:
+    """Best at a learning rate of 4e-3 and an entropy cost of 2e-3."""
+    algo = job.config.algo
+    far = abs(np.log(algo.learning_rate) - np.log(4e-3))
+    return -far - 300.0 * abs(algo.entropy_cost - 2e-3)
+
+
+def end(job: Job, state: State, value: float | None = None) -> Job:
+    job.progress.state, job.progress.value = state, value
+    return job
+
+
+def test_eight_trials_of_tpe_find_better_than_the_default_and_than_chance(tmp_path: Path) -> None:
+    request = build_sweep([*TOY, "algo.entropy_cost=interval(0,1e-2)"])
+
+    def best(sampler: Any, seed: int) -> float:
+        settings = dataclasses.replace(request.settings, sampler=sampler, seed=seed)
+        journal = tmp_path / f"{sampler}{seed}.log"
+        trials = OptunaStudy(settings, request.space, request.make_job, journal)
+        values = []
+        while job := trials.next():
+            values.append(toy_objective(job))
+            trials.tell(end(job, "completed", values[-1]))
+        assert len(values) == 8
+        return max(values)
+
+    default = toy_objective(jobs_of([compose("algo.entropy_cost=1e-2")])[0])
+    tpe = [best("tpe", seed) for seed in range(6)]
+    assert min(tpe) > default
+    assert np.mean(tpe) > np.mean([best("random", seed) for seed in range(6)])
+
+
+def test_a_study_goes_on_with_what_was_running_and_what_failed(tmp_path: Path) -> None:
+    _, first = study(tmp_path, *TOY)
+    jobs = [job for _ in range(5) if (job := first.next()) is not None]
+    first.tell(end(jobs[0], "completed", 1.0))
+    first.tell(end(jobs[1], "failed", 0.5))
+    first.tell(end(jobs[2], "interrupted"))
+    first.tell(end(jobs[3], "pruned", 0.1))
+    _, second = study(tmp_path, *TOY)
+    earlier = [(job.number, job.progress.state) for job in second.earlier()]
+    assert earlier == [(0, "waiting"), (3, "pruned")]
+    again = [second.next() for _ in range(4)]
+    assert [job.number for job in again if job] == [1, 2, 4, 5]
+    assert [job.overrides for job in again[:3] if job] == [jobs[k].overrides for k in (1, 2, 4)]
+    # The first command has begun with these numbers.
+    assert again[3] is not None
+    assert again[3].overrides not in [job.overrides for job in jobs]
+    # A job that ended before goes on for more steps.
+    (job, _) = second.earlier()
+    assert not second.is_hopeless(job)
+    second.tell(end(job, "completed", 2.0))
+
+
+@pytest.mark.parametrize("pruner", ["asha", "median"])
+def test_a_job_that_is_worse_than_others_were_is_hopeless(pruner: str, tmp_path: Path) -> None:
+    _, trials = study(tmp_path, *TOY, f"sweep.pruner={pruner}", "num_timesteps=100")
+
+    def course(value: float) -> bool:
+        job = trials.next()
+        assert job is not None
+        for steps in range(1, 101):
+            job.progress.env_steps, job.progress.value = steps, value
+            if trials.is_hopeless(job):
+                trials.tell(end(job, "pruned", value))
+                return True
+        trials.tell(end(job, "completed", value))
+        return False
+
+    assert not course(15.0)
+    hopeless = [course(float(value)) for value in (12, 13, 14, 15, 16)]
+    assert not all(hopeless)
+    assert course(-5.0)
+    _, kept = study(tmp_path, *TOY)
+    assert len(kept.earlier()) == 7
+
+
+def test_a_sampler_without_its_package_is_bad_input(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(sys.modules, "optuna", None)
+    with pytest.raises(ConfigError, match=r"pip install 'gmijax\[sweep\]'"):
+        study(tmp_path, *TOY)

@@ -1,0 +1,166 @@
+"""What is shown of a sweep: a live table, whose errors end it alone, TensorBoard, rates."""
+
+from __future__ import annotations
+
+import io
+import struct
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import pytest
+from rich.console import Console
+from tensorboardX.proto import event_pb2, plugin_hparams_pb2
+
+from gmijax.cli.compose import compose
+from gmijax.config.sweep import SweepConfig
+from gmijax.control import display
+from gmijax.control.console import ConsoleProgress, open_console
+from gmijax.errors import printable
+from gmijax.runs.folder import RunPaths
+from gmijax.sweeps.hparams import write_hparams
+from gmijax.sweeps.jobs import Job, SweepPaths, jobs_of
+from gmijax.sweeps.report import write_report
+from gmijax.sweeps.view import SweepView
+
+
+def running_jobs() -> list[Job]:
+    jobs = list(jobs_of([compose(f"seed={seed}", "num_timesteps=1000") for seed in range(4)]))
+    now_s = time.monotonic()
+    for job, steps in zip(jobs, (500, 250, 1000, 0), strict=True):
+        progress = job.progress
+        for at, value in ((100, 9.0), (steps, 2.5)) if steps else ():
+            line = {"env_steps": at, "env_steps_per_s": 50.0, "return": value}
+            progress.take(line, SweepConfig())
+            progress.updated_s = now_s - 1790.0
+        if steps:
+            progress.state, progress.started_s = "running", now_s - 1800.0
+            progress.place = f"GPU 3 place {job.number}"
+    done = jobs[2].progress
+    done.state, done.ended_s, done.place, done.env_steps_per_s = "completed", now_s, "", 0.0
+    jobs[3].progress.error = "again, alone on its GPU, after CUDA_ERROR_[/x]"
+    return jobs
+
+
+class Terminal(io.StringIO):
+    """A terminal that may be closed."""
+
+    is_closed_by_user = False
+
+    def isatty(self) -> bool:
+        return True
+
+    def write(self, text: str) -> int:
+        if self.is_closed_by_user:
+            raise BrokenPipeError
+        return super().write(text)
+
+
+def view_on(stream: Any, jobs: list[Job]) -> SweepView:
+    console = Console(
+        file=stream, force_terminal=stream.isatty(), width=160, markup=False, color_system=None
+    )
+    return SweepView(console, jobs, SweepConfig())
+
+
+def test_the_table_says_of_each_job_where_and_how_far_it_is() -> None:
+    terminal = Terminal()
+    with view_on(terminal, running_jobs()) as view:
+        view.update()
+        shown = terminal.getvalue()
+    lines = [printable(line).split() for line in shown.splitlines()]
+    rows = {words[0]: " ".join(words) for words in reversed(lines) if words}
+    assert "overrides GPU and place progress return best ETA state" in rows["job"]
+    assert rows["0"].endswith("50% 2.5 9 0:00:10 running")
+    assert "seed=0 GPU 3 place 0" in rows["0"]
+    assert rows["1"].endswith("25% 2.5 9 0:00:15 running")
+    assert rows["2"].endswith("100% 2.5 9 completed")
+    assert "waiting: again, alone on its GPU, after CUDA_ERROR_[/x]" in rows["3"]
+    assert "2 running, 1 waiting, 1 completed; 100 steps/s, 2.0 trainings/h" in shown
+
+
+def test_without_a_terminal_every_change_is_a_line() -> None:
+    said, jobs = io.StringIO(), running_jobs()
+    with view_on(said, jobs) as view:
+        view.update()
+        view.update()
+        jobs[0].progress.state, jobs[0].progress.error = "failed", "GMI 0 failed: NonFiniteError"
+    lines = said.getvalue().splitlines()
+    assert lines[:2] == [f"job {n} seed={n}: running on GPU 3 place {n}" for n in range(2)]
+    assert lines[2].startswith("job 2 seed=2: completed after 1800 s, best return 9; 2 running")
+    assert lines[3:] == ["job 0 seed=0: failed: GMI 0 failed: NonFiniteError"]
+
+
+@pytest.mark.parametrize("what", ["a terminal that is closed", "a row that cannot be made"])
+def test_an_error_of_the_view_ends_the_view_alone(
+    what: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(display, "_REFRESH_S", 0.0)
+    terminal, jobs = Terminal(), running_jobs()
+    monkeypatch.setattr(sys, "stdout", terminal)
+    with SweepView(open_console(show=True), jobs, SweepConfig()) as view:
+        view.update()
+        if what == "a terminal that is closed":
+            terminal.is_closed_by_user = True
+        else:
+            jobs[0].progress.state = "nowhere"  # type: ignore[assignment]
+        view.update()
+        before = terminal.getvalue()
+        assert "seed=0" in before
+        view.update()
+    assert terminal.getvalue() == before
+    if what == "a row that cannot be made":
+        assert before.count("no progress from here on: ValueError") == 1
+
+
+def test_a_sweep_and_a_training_are_shown_by_the_same_display() -> None:
+    console = open_console(show=False)
+    shown = SweepView(console, [], SweepConfig()), ConsoleProgress(console, lambda: None, 1)
+    assert {type(one._display) for one in shown} == {display.LiveDisplay}
+
+
+def test_overrides_and_value_of_a_job_are_there_for_the_hparams_tab(tmp_path: Path) -> None:
+    chosen = {"algo.learning_rate": "1e-4", "env": "ant", "algo.clip_value_loss": "true"}
+    job, run = Job(0, chosen, compose()), RunPaths(tmp_path)
+    write_hparams(job, run, "return")
+    assert not run.tensorboard.exists()  # Without a value there is nothing to compare.
+    job.progress.value, job.progress.env_steps = 7.5, 640
+    write_hparams(job, run, "return")
+    (path,) = run.tensorboard.iterdir()
+    values = [(event.step, value) for event in events(path) for value in event.summary.value]
+    (scalar,) = [value for step, value in values if value.tag == "hparam/return" and step == 640]
+    assert scalar.simple_value == 7.5
+    said = {v.tag.rpartition("/")[2]: v.metadata.plugin_data.content for _, v in values}
+    plugin_data = vars(plugin_hparams_pb2)["HParamsPluginData"]
+    started = plugin_data.FromString(said["session_start_info"]).session_start_info.hparams
+    assert started["algo.learning_rate"].number_value == 1e-4
+    assert started["env"].string_value == "ant"
+    assert started["algo.clip_value_loss"].bool_value is True
+    experiment = plugin_data.FromString(said["experiment"]).experiment
+    assert [info.name.tag for info in experiment.metric_infos] == ["hparam/return"]
+    assert plugin_data.FromString(said["session_end_info"]).HasField("session_end_info")
+
+
+def events(path: Path) -> list[Any]:
+    """The events of a file of records: length, its checksum, content, its checksum."""
+    data, found = path.read_bytes(), []
+    while data:
+        (length,) = struct.unpack("<Q", data[:8])
+        found.append(vars(event_pb2)["Event"].FromString(data[12 : 12 + length]))
+        data = data[16 + length :]
+    return found
+
+
+def test_throughput_is_of_the_jobs_that_a_command_has_run(tmp_path: Path) -> None:
+    jobs = running_jobs()
+    jobs[3].progress.state, jobs[3].progress.error = "completed", None  # By an earlier command.
+    for job in jobs[:2]:
+        job.progress.state, job.progress.ended_s = "completed", jobs[2].progress.ended_s
+    report = write_report("completed", jobs, SweepConfig(), SweepPaths(tmp_path), 9999.0)
+    assert report["trainings_per_hour"] == pytest.approx(3 * 2.0, rel=1e-3)
+    rows = report["jobs"]
+    assert [row["first_update_s"] for row in rows] == [10.0, 10.0, 10.0, None]
+    assert [row["start_s"] for row in rows] == [0.0, 0.0, 0.0, None]
+    assert rows[0]["wall_s"] == 1800.0
+    assert rows[3]["wall_s"] == 0.0
