@@ -103,18 +103,15 @@ def measure_rates() -> Rates:
     """Products of 4096 x 4096 matrices, and a copy of 256 MiB; smaller on a CPU."""
     on_gpu = jax.default_backend() == "gpu"
     size, floats = (4096, 1 << 26) if on_gpu else (512, 1 << 22)
-    square = jnp.full((size, size), 0.5, jnp.float32)
-
-    def chain(a: jax.Array) -> jax.Array:
-        return jax.lax.fori_loop(0, 20, lambda _, b: (b @ a) * (2.0 / size), a)
-
+    # Its powers are itself, so numbers stay as they are.
+    square, long = jnp.full((size, size), 1.0 / size), jnp.ones(floats)
+    chain = jax.jit(lambda a: jax.lax.fori_loop(0, 20, lambda _, b: b @ a, a))
+    copy = jax.jit(lambda x: x + 1.0)
     flop = 20 * 2.0 * size**3
-    long = jnp.ones(floats)
-    copy_s = seconds(lambda: jax.jit(lambda x: x + 1.0)(long))
     return Rates(
-        flop / seconds(lambda: jax.jit(chain)(square)),
-        flop / seconds(lambda: jax.jit(chain)(square.astype(jnp.bfloat16))),
-        2 * 4 * floats / copy_s,
+        flop / seconds(lambda: chain(square)),
+        flop / seconds(lambda: chain(square.astype(jnp.bfloat16))),
+        2 * 4 * floats / seconds(lambda: copy(long)),
     )
 
 
