@@ -14,8 +14,6 @@ import argparse
 import os
 import sys
 import time
-from collections.abc import Callable, Iterator
-from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -25,17 +23,9 @@ import pynvml
 
 from benchmarks.paper_model import dominant_resource
 from benchmarks.records import RESULTS, ResultsFile, file_name
+from benchmarks.stages import Stage, stages
 from gmijax import compose
-from gmijax.collectives.program import PeersOfOne
-from gmijax.config import PpoConfig, TrainConfig
-from gmijax.learning.learner import Learner, acting_weights, init_learner, make_learner
-from gmijax.learning.unroll import act
 from gmijax.machine.nvidia import nvml_session
-from gmijax.ppo.ppo import learn
-from gmijax.ppo.rollout import Samples, no_stats
-from gmijax.sim.interface import EnvSpec
-from gmijax.sim.randomize import make_worlds
-from gmijax.sim.wrappers import BatchedEnv, env_keys, training_env
 
 SECONDS = 2.0
 """How long each task runs: the monitor wants a tenth of a second at least."""
@@ -58,22 +48,6 @@ class Use(NamedTuple):
     def dominant(self) -> str:
         """`sm` or `memory`, equation 1."""
         return dominant_resource(self.sm, 1.0, self.memory, 1.0)
-
-
-class Stage(NamedTuple):
-    """One task of an iteration.
-
-    Attributes:
-      name: simulator, agent or trainer.
-      program: from (given, state) to the next state, what a GMI does in an iteration.
-      given: what it reads.
-      state: the first one.
-    """
-
-    name: str
-    program: Callable[[Any, Any], Any]
-    given: Any
-    state: Any
 
 
 class Monitor:
@@ -148,7 +122,9 @@ def _task(name: str, arguments: argparse.Namespace, monitor: Monitor) -> dict[st
         f"env={name}", f"physics.impl={arguments.impl}", f"num_envs={arguments.num_envs}"
     )
     found = {}
-    for stage in _stages(config, arguments.impl):
+    for stage in stages(config, arguments.impl):
+        if stage.name == "iteration":
+            continue
         use = _measured(stage, monitor)
         found[stage.name] = {**use._asdict(), "dominant": use.dominant}
     return found
@@ -169,63 +145,6 @@ def _measured(stage: Stage, monitor: Monitor) -> Use:
         count += 4
     busy, seconds = monitor.busy_sms(), time.monotonic() - started
     return Use(seconds / count, busy, memory / monitor.memory_bytes)
-
-
-def _stages(config: TrainConfig, impl: str) -> Iterator[Stage]:
-    """Agent, trainer and simulator, with random experience where they need some."""
-    algo, num_envs = config.algo, config.envs_per_gmi
-    assert isinstance(algo, PpoConfig)
-    worlds = make_worlds(config.env, impl, seed=0, first_env=0, num_envs=num_envs)
-    env = training_env(worlds)
-    learner, key = make_learner(env.spec, algo), jax.random.key(0)
-    state = init_learner(learner, env.spec.obs_size, key)
-    envs = jax.jit(env.init)(env.model, env_keys(key, 0, num_envs))
-    zeros = jnp.zeros((num_envs, env.spec.action_size))
-    actions = jax.random.uniform(key, zeros.shape, minval=-1.0)
-    samples = _samples(num_envs * algo.unroll_length, env.spec, key)
-    stats = no_stats(env.spec, env.overflows)
-    yield Stage("agent", partial(_act, learner), state, (envs, zeros))
-    yield Stage("trainer", partial(_train, learner), (samples, stats), state)
-    yield Stage("simulator", partial(_simulate, env, algo), (env.model, actions), envs)
-
-
-def _simulate(env: BatchedEnv, algo: PpoConfig, given: Any, envs: Any) -> Any:
-    """T steps of all environments."""
-    model, actions = given
-
-    def step(_: Any, envs: Any) -> Any:
-        return env.step(model, envs, actions)[0]
-
-    return jax.lax.fori_loop(0, algo.unroll_length, step, envs)
-
-
-def _act(learner: Learner, state: Any, carry: Any) -> Any:
-    """T actions for all environments."""
-    weights = acting_weights(learner, state)
-
-    def step(_: Any, carry: Any) -> Any:
-        envs, total = carry
-        # Other observations in every step, or the network would be evaluated only once.
-        obs = envs.env.obs + 1e-9 * total[:, :1]
-        envs = envs._replace(env=envs.env._replace(obs=obs))
-        envs, _, action = act(learner.networks, weights, envs)
-        return envs, total + action
-
-    return jax.lax.fori_loop(0, learner.config.unroll_length, step, carry)
-
-
-def _train(learner: Learner, given: Any, state: Any) -> Any:
-    """All updates of an iteration."""
-    samples, stats = given
-    return learn(learner, PeersOfOne(), state, samples, stats)[0]
-
-
-def _samples(count: int, spec: EnvSpec, key: jax.Array) -> Samples:
-    """Random samples: how long an update takes does not depend on what is in them."""
-    shapes = (spec.obs_size,), (spec.action_size,), ()
-    obs, action, advantage = (jax.random.normal(key, (count, *shape)) for shape in shapes)
-    zeros = jnp.zeros(count)
-    return Samples(obs, action, zeros, jnp.zeros_like(action), zeros, advantage)
 
 
 if __name__ == "__main__":

@@ -17,7 +17,6 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 import numpy.typing as npt
-from mujoco import mjx
 
 from gmijax.config import EnvConfig
 from gmijax.config.env import NEVER_ZERO, RANDOMIZED_LEAVES, LeafRange
@@ -90,6 +89,8 @@ def randomized(
       ConfigError: a task without a model of MJX, a name that the model does not have, a draw that
         could not change anything, or values that no body, joint or contact can have.
     """
+    from mujoco import mjx  # A second to import, which tasks without it need not pay.
+
     if not isinstance(env.model, mjx.Model):
         raise ConfigError(f"env.randomize=on: {env.spec.name} has no model of MJX to draw")
     key = jax.random.fold_in(jax.random.key(seed), _STREAM)
