@@ -75,7 +75,7 @@ def _nothing_starts(machine: Machine, cwd: Path) -> Iterator[None]:
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(cwd)
         patch.setenv("XDG_CACHE_HOME", str(cwd / "cache"))
-        for module in (decide, searching, evaluation, exporting):
+        for module in (decide, searching, playing, exporting):
             patch.setattr(module, "detect_machine", lambda: machine)
         patch.setattr(Path, "mkdir", _mkdir)
         patch.setattr(tempfile, "mkstemp", _would_start)

@@ -35,8 +35,9 @@ def main() -> None:
     finally:
         for node in (*cluster.worker_nodes, cluster.head_node):
             # A test may have killed it.
-            is_there = node.all_processes["raylet"][0].process.poll() is None
-            cluster.remove_node(node, allow_graceful=is_there)
+            if node is not None:
+                is_there = node.all_processes["raylet"][0].process.poll() is None
+                cluster.remove_node(node, allow_graceful=is_there)
 
 
 if __name__ == "__main__":
