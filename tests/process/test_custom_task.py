@@ -18,7 +18,7 @@ from gmijax.sim.interface import Env, EnvSpec
 
 SPEC = EnvSpec("point", 1, 1, 0.1, 5, ("near", "effort"))
 
-def make(*, impl, max_envs, settings):
+def make(*, impl, max_envs, settings={"pace": 0.1}):
     def reset(model, key):
         key, draw = jax.random.split(key)
         start = jax.random.uniform(draw, (1,))

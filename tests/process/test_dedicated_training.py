@@ -13,7 +13,7 @@ from training_jobs import iteration_of, learner_arrays, pids_of, start, train, w
 
 pytestmark = pytest.mark.timeout(600)
 
-JOB = ("env=point.py:make", "env.settings.pace=0.1", *SMALL)
+JOB = ("env=point.py:make", *SMALL)
 APART = ("plan.gmis_per_gpu=3", "plan.template=tdg_ex")
 STEPS = 2 * 16 * 4
 """Environment steps of an iteration: two GMIs, 16 environments, 4 steps."""
