@@ -295,7 +295,8 @@ def _one_line(name: str, error: Exception, groups: Sequence[str]) -> str:
     if match := re.search(r"Key '([^']+)' is not in struct full_key: (\S+)", text):
         return str(_unknown_key(match[2], defaults(name, groups)))
     if match := re.search(r"Could not override '([^']+)'", text):
-        return str(_unknown_key(match[1], defaults(name, groups)))
+        # It may be one of the groups: without them, or this would be asked again and again.
+        return str(_unknown_key(match[1], defaults(name, ())))
     return text
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib.util
 import json
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -135,8 +136,8 @@ def test_a_job_outlives_a_gmi_and_a_node_and_nothing_outlives_its_controller(
         os.kill(cluster.second_raylet, signal.SIGKILL)
         wait(lambda: len(events(run, "recovered")) == 2, "it goes on without the second node")
         fault = events(run, "fault")[-1]
-        assert "node 1 (" in fault["cause"]
-        assert "is gone" in fault["cause"]
+        # Which position it had depends on how Ray placed the actors of the second attempt.
+        assert re.search(r"node [01] \(.*\) is gone", fault["cause"])
         wait(lambda: iteration_of(run, 1) > iteration_of(run, 3), "two GMIs train")
         assert json.loads((run / "plan.json").read_text())["layout"] == [[0, 1]]
 

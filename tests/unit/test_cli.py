@@ -30,6 +30,8 @@ REFUSED: list[tuple[str, str, str]] = [
     ("serve", "policy=random output.shards=1", "unknown key output.shards"),
     ("play", "vidoe=gif", "unknown key vidoe: did you mean video?"),
     ("play", "env.name=ant", "unknown key env"),
+    ("play", "env=ant", "unknown key env: did you mean run.env?"),
+    ("export", "run.dir=x tuned=ant_ppo", "unknown key tuned: allowed are checkpoint"),
     # Values of a wrong type, or out of range.
     ("train", "num_envs=many", "num_envs=many: expected an integer"),
     ("train", "num_envs=0", "num_envs=0: must be at least 1"),
