@@ -6,6 +6,7 @@ from collections.abc import Callable, Iterator
 from types import MappingProxyType
 from typing import Any
 
+from benchmarks import node_scaling as scaling
 from benchmarks.cases import TASKS
 from benchmarks.evaluation.figures import (
     NOT_MEASURED,
@@ -148,6 +149,16 @@ def model_fit() -> str:
     return bounds(fits, ".3g")
 
 
+def node_scaling() -> list[str]:
+    """What the cost model predicts for several nodes, and how far off it was on one."""
+    fits = [f"{bounds(scaling.model_fit(way), '.2g')} (`{way}`)" for way in scaling.PATHS]
+    fit = (
+        f"Measured over predicted time of a mean on one node, one GMI on each GPU: "
+        f"{' and '.join(fits)}; all strategies and layouts: {model_fit()}."
+    )
+    return [*scaling.table(), "", fit, *source(scaling.BANDWIDTHS, scaling.RATES)]
+
+
 def learning() -> list[str]:
     """What every task reached over its seeds, and how long that took alone on a GPU."""
     rows = []
@@ -233,6 +244,7 @@ OTHER_TABLES: MappingProxyType[str, Callable[[], list[str]]] = MappingProxyType(
         "resource-use": resource_use,
         "search": search,
         "reduction": reduction,
+        "node-scaling": node_scaling,
         "learning": learning,
         "throughput": throughput,
         "faults": faults,
