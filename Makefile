@@ -23,7 +23,7 @@ TEST_WORKERS ?= -n 2 --dist loadfile --no-loadscope-reorder
 SOAK_MINUTES ?= 60
 
 .DEFAULT_GOAL := help
-.PHONY: help venv train test test-all soak wheel-test lint types imports format check clean
+.PHONY: help venv train test test-all soak wheel-test docs docs-pages docs-serve lint types imports format check clean
 
 help:  ## this list
 	@sed -nE 's/^([a-z-]+):.*## (.*)/\1|\2/p' Makefile | awk -F'|' '{printf "make %-11s %s\n", $$1, $$2}'
@@ -54,6 +54,19 @@ soak: $(READY)  ## faults from fresh seeds, then a long run's memory; SOAK_MINUT
 wheel-test: $(READY)  ## builds the wheel and tries it outside the checkout
 	$(BIN)/python -m pytest tests/process/test_wheel.py $(TEST_ARGS)
 
+$(VENV)/.docs-ready: $(READY)
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -e '.[docs]'
+	@touch $@
+
+docs-pages: $(VENV)/.docs-ready
+	$(BIN)/python -m docs.pages
+
+docs: docs-pages  ## the documentation as a site in build/docs/site; fails on a dead link
+	$(BIN)/zensical build --clean --strict
+
+docs-serve: docs-pages  ## the same at http://localhost:8000, built again when a document changes
+	$(BIN)/zensical serve
+
 lint: $(READY)  ## ruff: rules and format
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
@@ -71,5 +84,5 @@ format: $(READY)  ## rewrites the sources: order of imports, layout
 check: lint types imports  ## everything but the tests
 
 clean:  ## removes the environment, caches and build artefacts; keeps runs/
-	rm -rf $(VENV) build dist .pytest_cache .ruff_cache .import_linter_cache .hypothesis
+	rm -rf $(VENV) .cache build dist .pytest_cache .ruff_cache .import_linter_cache .hypothesis
 	find . -name __pycache__ -type d -not -path './.git/*' -prune -exec rm -rf {} +

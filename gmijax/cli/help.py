@@ -1,16 +1,39 @@
-"""The page that `--help` prints: every key of a configuration, with its default and meaning."""
+"""Every key of a configuration with its default and meaning, and the page that `--help` prints."""
 
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import sys
 import types
 import typing
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 from rich.console import Console
 from rich.table import Table
+
+
+class Key(NamedTuple):
+    """A key of a configuration, as `--help` and the reference show it.
+
+    Attributes:
+      choice: what it belongs to, e.g. `algo=a3c`, or nothing.
+      name: dotted, e.g. `algo.learning_rate`.
+      kind: its type.
+      default: as it would be written on a command line.
+      meaning: one line.
+      allowed: the only values, if they are few.
+      limits: smallest, largest (or None), and whether it must be greater than 0.
+    """
+
+    choice: str
+    name: str
+    kind: Any
+    default: str
+    meaning: str
+    allowed: tuple[str, ...]
+    limits: tuple[float | None, float | None, bool]
 
 
 def print_help(
@@ -20,28 +43,45 @@ def print_help(
     choices: Callable[[str], Sequence[str]],
 ) -> None:
     """Prints how a command is used, and every key with its default and meaning."""
-    values = defaults_of(())
     table = Table(box=None, pad_edge=False)
     for heading in ("key", "default", "meaning"):
         table.add_column(heading, overflow="fold", no_wrap=heading == "key")
-    last, defaults = "", values
-    for choice, key, meaning, allowed in _documented(cls):
-        if choice != last:
-            # The same key may have another default there.
-            defaults = defaults_of((choice,)) if choice else values
-            table.add_row(f"with {choice}:" if choice else "")
-        last = choice
-        shown = _shown_default(key, defaults)
-        table.add_row(key, shown, f"{meaning}{f' ({allowed})' if allowed else ''}")
+    keys, last = list(keys_of(cls, defaults_of)), ""
+    for key in keys:
+        if key.choice != last:
+            table.add_row(f"with {key.choice}:" if key.choice else "")
+        last = key.choice
+        allowed = f" ({'|'.join(key.allowed)})" if key.allowed else ""
+        table.add_row(key.name, key.default, f"{key.meaning}{allowed}")
     console = Console(width=None if sys.stdout.isatty() else 140, highlight=False, markup=False)
     console.print(f"usage: python -m gmijax.{name} [key=value ...] [--cfg job] [--help]\n")
     for group in ("env", "algo", "plan"):
-        if group in {key.split(".")[0] for key in values} and choices(group):
+        if group in {key.name.split(".")[0] for key in keys} and choices(group):
             console.print(f"{group}= one of: {', '.join(choices(group))}")
             if group == "env":
                 console.print("or env=PATH.py:FUNCTION, a task of your own (docs/custom-task.md)")
     console.print()
     console.print(table)
+
+
+def keys_of(
+    cls: type[Any], defaults_of: Callable[[Sequence[str]], Mapping[str, Any]]
+) -> Iterator[Key]:
+    """Every key that a user may set, in the order of the dataclasses.
+
+    Args:
+      cls: the configuration of a command.
+      defaults_of: the values of all keys by dotted name, with some overrides.
+    """
+    for choice, fields in itertools.groupby(_documented(cls), key=lambda found: found[0]):
+        # The same key may have another default there.
+        values = defaults_of((choice,) if choice else ())
+        for _, name, kind, metadata in fields:
+            literal = typing.get_origin(kind) is typing.Literal
+            allowed = tuple(map(str, typing.get_args(kind))) if literal else ()
+            limits = metadata.get("limits", (None, None, False))
+            default = _shown_default(name, values)
+            yield Key(choice, name, kind, default, metadata["doc"], allowed, limits)
 
 
 def _shown_default(key: str, values: Mapping[str, Any]) -> str:
@@ -54,8 +94,8 @@ def _shown_default(key: str, values: Mapping[str, Any]) -> str:
 
 def _documented(
     cls: type[Any], prefix: str = "", choice: str = ""
-) -> Iterator[tuple[str, str, str, str]]:
-    """Every key: the choice that it belongs to (e.g. `algo=a3c`, or none), name, meaning, type."""
+) -> Iterator[tuple[str, str, Any, Mapping[str, Any]]]:
+    """Every key: the choice that it belongs to, name, type, what `doc` says of it."""
     hints = typing.get_type_hints(cls)
     for field in dataclasses.fields(cls):
         kind = hints[field.name]
@@ -65,12 +105,8 @@ def _documented(
             name = typing.get_args(typing.get_type_hints(tree).get("name"))
             chosen = f"{field.name}={name[0]}" if len(trees) > 1 else choice
             yield from _documented(tree, f"{prefix}{field.name}.", chosen)
-        if trees:
-            continue
-        literal = typing.get_origin(kind) is typing.Literal
-        allowed = "|".join(map(str, typing.get_args(kind))) if literal else ""
-        if "doc" in field.metadata:  # Others are not for users to set.
-            yield choice, prefix + field.name, field.metadata["doc"], allowed
+        if not trees and "doc" in field.metadata:  # Others are not for users to set.
+            yield choice, prefix + field.name, kind, field.metadata
 
 
 def _is_tree(kind: Any) -> bool:

@@ -6,11 +6,16 @@ import ast
 import dataclasses
 import importlib
 import re
-from collections.abc import Mapping
+import tomllib
+from collections.abc import Iterator, Mapping
 from pathlib import Path
+from typing import Any
 
 import pytest
 
+import gmijax
+from docs.pages import COMMANDS, USAGES, command_page, link_documents, linked_paths, python_page
+from gmijax.__main__ import VERBS
 from gmijax.sim.registry import TASKS
 from gmijax.sim.tasks.settings import SETTINGS
 
@@ -22,7 +27,6 @@ TASKS_PAGE = ROOT / "docs" / "tasks.md"
 FOLDERS = ("gmijax", "configs", "tests", "docs", "benchmarks", "examples", ".ci")
 
 QUOTED_PATH = re.compile(rf"`((?:{'|'.join(map(re.escape, FOLDERS))})/[\w./-]*)`")
-LINK = re.compile(r"!?\[[^\]]*\]\(([^)\s]+)\)")
 OBS_ROW = re.compile(r"^\| (\d+)(?:-(\d+))? \|", re.MULTILINE)
 NUMBER_ROW = re.compile(r"^\| `(\w+)` \| (.*) \| (-?[\d.]+) \|$", re.MULTILINE)
 
@@ -32,11 +36,11 @@ def documents() -> list[Path]:
     return [*alone, *sorted((ROOT / "docs").rglob("*.md"))]
 
 
-def linked_paths(text: str) -> list[str]:
-    """Targets of the links of a document that are paths, without the part behind `#`."""
-    prose = re.sub(r"```.*?```", "", text, flags=re.DOTALL)
-    targets = [target.partition("#")[0] for target in LINK.findall(prose)]
-    return [target for target in targets if target and not re.match(r"[a-z]+:", target)]
+def pages_of(navigation: list[dict[str, Any]]) -> Iterator[str]:
+    """The pages that the navigation of the site names."""
+    for entry in navigation:
+        for value in entry.values():
+            yield from [value] if isinstance(value, str) else pages_of(value)
 
 
 def part_of_task(task: str, heading: str) -> str:
@@ -90,6 +94,51 @@ def test_relative_links_point_somewhere(document: Path):
 def test_only_relative_links_outside_of_code_are_looked_at():
     text = "[a](b.md#c) ![d](img/e.png) [f](https://g.org) [h](#i)\n```\n[j](k.md)\n```"
     assert linked_paths(text) == ["b.md", "img/e.png"]
+
+
+def test_every_document_is_in_the_navigation_of_the_site(tmp_path: Path):
+    named = set(pages_of(tomllib.loads((ROOT / "zensical.toml").read_text())["project"]["nav"]))
+    documents = {path.relative_to(ROOT).as_posix() for path in (ROOT / "docs").glob("*.md")}
+    assert sorted(documents - named) == []
+    link_documents(tmp_path)
+    written = {path.relative_to(tmp_path).as_posix() for path in tmp_path.rglob("*.md")}
+    generated = {f"reference/{name}.md" for name in (*COMMANDS, "other-commands", "python")}
+    assert sorted(named - written - generated) == []
+    assert sorted(generated - named) == []
+
+
+def test_the_site_has_every_decision_and_result_that_is_linked(tmp_path: Path):
+    link_documents(tmp_path)
+    for folder in ("docs/decisions", "benchmarks/results"):
+        names = {path.name for path in (ROOT / folder).iterdir() if path.is_file()}
+        assert {path.name for path in (tmp_path / folder).iterdir()} == {*names, "index.md"}
+        listed = linked_paths((tmp_path / folder / "index.md").read_text())
+        assert set(listed) == names
+
+
+def test_every_command_and_public_name_has_a_place_in_the_reference():
+    assert {*COMMANDS, *USAGES} == set(VERBS)
+    named = re.findall(r"heading: gmijax\.(\w+)", python_page())
+    assert named == [name for name in gmijax.__all__ if name != "__version__"]
+
+
+def test_a_page_of_keys_shows_values_limits_default_and_meaning():
+    rows = command_page("play").splitlines()
+    seed = next(row for row in rows if row.startswith("| `seed`"))
+    assert "| int, 0 to 2147483647 | `0` | seed of the episodes' starts" in seed
+    assert any("| `auto`, `mp4`, `gif`, `both`, `none` | `auto` |" in row for row in rows)
+
+
+def test_a_page_of_a_command_like_train_shows_what_differs_alone():
+    keys = re.findall(r"^\| `([\w.]+)`", command_page("search"), flags=re.MULTILINE)
+    assert keys == ["num_envs", "plan.gmis_per_gpu"]
+
+
+@pytest.mark.parametrize("document", documents(), ids=lambda path: path.stem)
+def test_a_list_stands_below_an_empty_line(document: Path):
+    prose = re.sub(r"```.*?```", "", document.read_text(), flags=re.DOTALL)
+    # Below a paragraph the site would show it as part of that; GitHub shows a list.
+    assert re.findall(r"(?:\A|\n\n)([^\n#| -].*)\n(?:- |1\. )", prose) == []
 
 
 @pytest.mark.parametrize("task", sorted(TASKS))

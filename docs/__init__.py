@@ -1,0 +1,1 @@
+"""The documents, and `docs/pages.py`, which makes a site of them."""
