@@ -295,8 +295,9 @@ def _one_line(name: str, error: Exception, groups: Sequence[str]) -> str:
     if match := re.search(r"Key '([^']+)' is not in struct full_key: (\S+)", text):
         return str(_unknown_key(match[2], defaults(name, groups)))
     if match := re.search(r"Could not override '([^']+)'", text):
-        # It may be one of the groups: without them, or this would be asked again and again.
-        return str(_unknown_key(match[1], defaults(name, ())))
+        # It may be one of the groups: without it, or this would be asked again and again.
+        others = [group for group in groups if group.partition("=")[0] != match[1]]
+        return str(_unknown_key(match[1], defaults(name, others)))
     return text
 
 
