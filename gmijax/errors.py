@@ -39,6 +39,12 @@ def printable(text: str) -> str:
     return "".join(c for c in shown if unicodedata.category(c) not in ("Cc", "Cf"))
 
 
+def lines_of(error: BaseException) -> list[str]:
+    """The lines of what an error says that are not empty; its type's name if it says nothing."""
+    lines = [line.strip() for line in str(error).splitlines()]
+    return [line for line in lines if line] or [type(error).__name__]
+
+
 class GmijaxError(Exception):
     """Base of all errors that gmijax raises on purpose."""
 

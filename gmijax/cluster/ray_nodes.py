@@ -7,14 +7,14 @@ import signal
 import socket
 import threading
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from contextlib import suppress
 from typing import Any, Final, NamedTuple
 
 from gmijax.cluster.node import Facts, Node
 from gmijax.cluster.remote_gmi import LOST_S, RemoteNode
 from gmijax.config import ClusterConfig
-from gmijax.errors import ConfigError, JobInterrupted
+from gmijax.errors import ConfigError, JobInterrupted, lines_of
 from gmijax.machine.processes import ProcessId, identify
 
 PASSED_ON: Final = ("JAX_", "XLA_", "NCCL_", "OMP_", "OPENBLAS_", "MKL_", "MUJOCO_", "PYTHONPATH")
@@ -132,7 +132,7 @@ class RayCluster:
             self._ray.init(address=address, log_to_driver=False, logging_level="ERROR", **options)
         except Exception as error:
             raise ConfigError(
-                f"{what}: no cluster of Ray there ({_first_line(error)}); `ray start --head` "
+                f"{what}: no cluster of Ray there ({lines_of(error)[0]}); `ray start --head` "
                 "starts one, `ray start --address=host:port` adds a node"
             ) from None
         finally:
@@ -173,7 +173,7 @@ class RayCluster:
             self.leave()
             raise ConfigError(
                 f"cluster.engine=ray: a node cannot start its part of the job "
-                f"({_last_line(error)}); gmijax must be installed on all nodes"
+                f"({lines_of(error)[-1]}); gmijax must be installed on all nodes"
             ) from None
         if problems := [answer for answer in answers if isinstance(answer, str)]:
             self.leave()
@@ -230,15 +230,3 @@ def _import_ray() -> Any:
             "cluster.engine=ray: the package ray is not installed (pip install 'gmijax[ray]')"
         ) from None
     return ray
-
-
-def _first_line(error: Exception) -> str:
-    return next(iter(_lines(error)), type(error).__name__)
-
-
-def _last_line(error: Exception) -> str:
-    return next(reversed(_lines(error)), type(error).__name__)
-
-
-def _lines(error: Exception) -> Sequence[str]:
-    return [line.strip() for line in str(error).splitlines() if line.strip()]

@@ -9,7 +9,7 @@ from contextlib import suppress
 from typing import Any, Final, Protocol
 
 from gmijax.cluster.node import Order, Seen
-from gmijax.errors import GmiFailed, ReportedError
+from gmijax.errors import GmiFailed, ReportedError, lines_of
 from gmijax.runs.folder import GmiPaths
 from gmijax.supervise.watched_gmi import WatchedGmi
 
@@ -103,9 +103,7 @@ class RemoteNode:
         return self._seen.get(gmi)
 
     def _lose(self, error: Exception) -> None:
-        lines = [line.strip() for line in str(error).splitlines() if line.strip()]
-        why = lines[-1] if lines else type(error).__name__
-        self.lost = f"node {self._position} ({self.address}) is gone: {why}"
+        self.lost = f"node {self._position} ({self.address}) is gone: {lines_of(error)[-1]}"
         self.is_silent = False
 
 

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from gmijax.errors import ConfigError
+from gmijax.errors import ConfigError, lines_of
 from gmijax.runs.folder import read_json
 from gmijax.runs.resume import find_checkpoint
 
@@ -102,7 +102,7 @@ def _from_onnx(path: Path) -> Policy:
     try:
         session = onnxruntime.InferenceSession(path, providers=["CPUExecutionProvider"])
     except Exception as error:  # Its exceptions have no base of their own.
-        raise ConfigError(f"path={path}: not an ONNX model ({_first_line(error)})") from error
+        raise ConfigError(f"path={path}: not an ONNX model ({lines_of(error)[0]})") from error
     texts = session.get_modelmeta().custom_metadata_map
     if "gmijax_version" not in texts:
         raise ConfigError(f"path={path}: not written by gmijax.export")
@@ -124,12 +124,8 @@ def _from_stablehlo(path: Path) -> Policy:
         (_, obs_size), (_, action_size) = obs.shape, actions.shape
     except Exception as error:  # Bytes of anything else fail in any way.
         raise ConfigError(
-            f"path={path}: not a policy of gmijax.export ({_first_line(error)})"
+            f"path={path}: not a policy of gmijax.export ({lines_of(error)[0]})"
         ) from error
     beside = path.with_suffix(".json")
     metadata = read_json(beside) if beside.is_file() else {}
     return Policy(jax.jit(exported.call), int(obs_size), int(action_size), metadata)
-
-
-def _first_line(error: Exception) -> str:
-    return (str(error).strip().splitlines() or [type(error).__name__])[0]

@@ -22,7 +22,7 @@ import orbax.checkpoint as ocp
 
 from gmijax.collectives.interface import Reducer
 from gmijax.config import TrainConfig
-from gmijax.errors import ConfigError, NonFiniteError, ParameterMismatch
+from gmijax.errors import ConfigError, NonFiniteError, ParameterMismatch, lines_of
 from gmijax.runs.folder import META, RunPaths, write_json
 from gmijax.runs.resume import CheckpointMeta, file_check, rank_of
 from gmijax.types import PyTree
@@ -207,8 +207,9 @@ def _restore(folder: Path, template: T) -> T:
         # as a device without enough memory, does not say that the checkpoint is bad.
         if not isinstance(error, ValueError | KeyError | OSError) and type(error) is not Exception:
             raise
-        lines = str(error).strip().splitlines() or [type(error).__name__]
-        raise ConfigError(f"checkpoint {folder} does not fit this job: {lines[0]}") from error
+        raise ConfigError(
+            f"checkpoint {folder} does not fit this job: {lines_of(error)[0]}"
+        ) from error
     return jax.tree.map(_restored, template, restored)
 
 

@@ -6,13 +6,14 @@ import os
 import sys
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from pathlib import Path
 
 from gmijax.machine.snapshot import Machine
 from gmijax.partition.plan import Plan
 from gmijax.runs.cache import compilation_cache_dir
 from gmijax.runs.folder import RunPaths
 from gmijax.supervise.backends.backend import Backend
-from gmijax.supervise.environment import gmi_environment
+from gmijax.supervise.environment import COMPILATION_CACHE, gmi_environment
 from gmijax.supervise.gmi_process import GmiProcess
 from gmijax.supervise.kinds import JobKind
 from gmijax.supervise.watched_gmi import GmiStatus, WatchedGmi
@@ -62,6 +63,11 @@ class Launch:
     variables: Mapping[str, str] = field(default_factory=dict)
     on_warning: Callable[[str], None] = lambda _: None
     is_enough: Callable[[tuple[GmiStatus, ...]], bool] | None = None
+
+
+def program_cache() -> Path:
+    """Where GMIs that this process starts keep the programs that they compile."""
+    return Path(os.environ.get(COMPILATION_CACHE) or compilation_cache_dir())
 
 
 def environment_of(launch: Launch, gmi: int, added: Mapping[str, str]) -> dict[str, str]:

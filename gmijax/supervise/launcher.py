@@ -13,7 +13,6 @@ import threading
 import time
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import ExitStack, contextmanager, suppress
-from pathlib import Path
 from types import FrameType
 from typing import Final
 
@@ -22,13 +21,12 @@ from gmijax.config import RunConfig, ServeRunConfig
 from gmijax.errors import BackendUnavailable, GmijaxError, JobInterrupted
 from gmijax.partition.backend_choice import WHAT_SHARE_LOSES
 from gmijax.partition.plan import Plan
-from gmijax.runs.cache import compilation_cache_dir, drop_broken_programs
+from gmijax.runs.cache import drop_broken_programs
 from gmijax.runs.folder import RunPaths, read_json, write_json
 from gmijax.supervise.backends import Backend, open_backend
 from gmijax.supervise.child import ENV_EXCHANGE_FD
-from gmijax.supervise.environment import COMPILATION_CACHE
 from gmijax.supervise.kinds import JobKind
-from gmijax.supervise.launch import Launch, Timeouts
+from gmijax.supervise.launch import Launch, Timeouts, program_cache
 from gmijax.supervise.supervisor import Supervisor
 from gmijax.supervise.watched_gmi import GmiStatus
 
@@ -74,8 +72,7 @@ def run_gmis(
 
 def drop_unreadable(run: RunPaths, gmis: Iterable[int]) -> None:
     """Removes programs from this machine's cache that one of the GMIs could not read."""
-    programs = Path(os.environ.get(COMPILATION_CACHE) or compilation_cache_dir())
-    drop_broken_programs(programs, [run.gmi(gmi).stderr for gmi in gmis])
+    drop_broken_programs(program_cache(), [run.gmi(gmi).stderr for gmi in gmis])
 
 
 def shared_blocks(held: ExitStack, kind: JobKind, plan: Plan) -> dict[str, int]:

@@ -34,6 +34,7 @@ class WatchedGmi(ABC):
 
     Attributes:
       gmi: its id.
+      pid: the process that was started, leader of its group.
       waits: whether it may not compile yet.
       exit_code: None while it runs; negative for the signal that ended it.
       beat: the newest heartbeat that `poll` saw.
@@ -54,13 +55,8 @@ class WatchedGmi(ABC):
         self.beat = Heartbeat("starting", 0, pid)
         self.beats = 0
         self.progress_s = time.monotonic()
-        self._pid = pid
+        self.pid = pid
         self._was_ready = False
-
-    @property
-    def pid(self) -> int:
-        """The process that was started, leader of its group."""
-        return self._pid
 
     @property
     def is_ready(self) -> bool:

@@ -12,15 +12,15 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from gmijax.control.exit_codes import EXIT_INTERRUPTED
 from gmijax.errors import GmijaxError
 from gmijax.machine.processes import GuardPipe
 from gmijax.runs.folder import write_json
+from gmijax.supervise.failures import last_line
 from gmijax.sweeps.jobs import Job
 from gmijax.sweeps.places import Place
 
 MODULE = "gmijax.workers.training_job"
-_INTERRUPTED = 130
-_LONGEST_ERROR = 300
 
 
 @dataclass
@@ -63,9 +63,9 @@ class Child:
         code = self.process.wait()
         if code == 0:
             return False, None
-        if code == _INTERRUPTED or self.is_killed:
+        if code == EXIT_INTERRUPTED or self.is_killed:
             return True, None
-        return False, _last_words(self.log) or f"exit code {code}"
+        return False, last_line(self.log).removeprefix("gmijax.train: ") or f"exit code {code}"
 
 
 def start(
@@ -106,9 +106,3 @@ def start(
     finally:
         os.close(pipe.read_end)
     return Child(job, place, log, process, pipe)
-
-
-def _last_words(log: Path) -> str:
-    lines = [line for line in log.read_text(errors="replace").splitlines() if line.strip()]
-    said = lines[-1].removeprefix("gmijax.train: ") if lines else ""
-    return said[:_LONGEST_ERROR]

@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 import hashlib
-import os
 from contextlib import suppress
 from pathlib import Path
 
-from gmijax.runs.cache import compilation_cache_dir
-from gmijax.supervise.environment import COMPILATION_CACHE
+from gmijax.supervise.launch import program_cache
 from gmijax.sweeps.jobs import Job
 from gmijax.version import __version__, versions_of
 
@@ -23,7 +21,7 @@ class CompiledPrograms:
     """
 
     def __init__(self) -> None:
-        self._folder = Path(os.environ.get(COMPILATION_CACHE) or compilation_cache_dir())
+        self._folder = program_cache()
         self._versions = repr((__version__, versions_of(_PACKAGES)))
         self._own: set[str] = set()
 
