@@ -7,6 +7,8 @@ nor mujoco.
 from __future__ import annotations
 
 import importlib
+import sys
+from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
 from gmijax.version import __version__
@@ -61,6 +63,18 @@ _HOMES = {
     "task_names": "gmijax.sim.registry",
     "train": "gmijax.control.job",
 }
+
+
+class _Package(ModuleType):
+    """`gmijax.train` is the function, also once the command's module of that name is imported."""
+
+    def __setattr__(self, name: str, value: Any) -> None:
+        # The import system makes every submodule an attribute of its package.
+        if not (name in _HOMES and isinstance(value, ModuleType)):
+            super().__setattr__(name, value)
+
+
+sys.modules[__name__].__class__ = _Package
 
 
 def __getattr__(name: str) -> Any:

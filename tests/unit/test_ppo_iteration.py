@@ -194,14 +194,16 @@ def test_exchanges_in_the_program_change_nothing_but_its_place(
     with _exchange(strategy, size) as exchange:
         step = exchange.program(functools.partial(iterate, ENV, learner))
         results = []
+        told_s = 0.0
         for iteration in (alone, _compiled(step, learner)):
             state, envs = _start(learner)
             for _ in range(3):
                 state, envs, metrics = iteration(state, envs)
+                # Each tells what is through by then, which may be two iterations or none.
+                told_s += step.exchange_s or 0.0
             iteration.wait()
             results.append((state.params, state.obs_moments, envs.env.obs, metrics))
-        assert step.exchange_s is not None
-        assert step.exchange_s > 0
+        assert told_s > 0
     _close(*results, atol=1e-4)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import subprocess
 import sys
 
@@ -14,6 +15,12 @@ def test_every_public_name_can_be_had() -> None:
     assert sorted(gmijax.__all__) == dir(gmijax)
     for name in gmijax.__all__:
         assert getattr(gmijax, name) is not None
+
+
+def test_a_function_stays_what_it_is_when_the_command_of_its_name_is_imported() -> None:
+    for name in ("train", "serve", "search", "sweep"):
+        assert callable(importlib.import_module(f"gmijax.{name}").main)
+        assert getattr(gmijax, name).__name__ == name
 
 
 def test_an_unknown_name_is_an_attribute_error() -> None:
