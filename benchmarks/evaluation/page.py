@@ -6,24 +6,32 @@ from collections.abc import Callable
 from types import MappingProxyType
 
 from benchmarks.evaluation.claims import claims
-from benchmarks.evaluation.figures import NOT_MEASURED, bounds, call_of, markdown, ratio, shown
+from benchmarks.evaluation.figures import bounds, markdown, ratio, shown
 from benchmarks.evaluation.other_tables import OTHER_TABLES
 from benchmarks.evaluation.plots import summary
-from benchmarks.evaluation.tables import TRAINING_TABLES, fixed_total_ratios, small_gmis
+from benchmarks.evaluation.sweep_tables import over_one_after_another, sweep_rates, sweeps
+from benchmarks.evaluation.tables import (
+    TRAINING_TABLES,
+    fixed_total_ratios,
+    small_gmis,
+)
 
 
 def advice() -> list[str]:
     """Who gains from GMIs, and who does not."""
     small = small_gmis()
     tenfold = small[10] / small[1] if {1, 10} <= small.keys() else None
+    fewest = min((rate.repeats for rate in sweep_rates().values()), default=0)
+    eightfold = over_one_after_another("8 at once, auto")
     sharing = [gain for name, gain in summary().items() if name.startswith("MPS")]
     fixed = bounds([*fixed_total_ratios().values()])
     over_one = ratio("scaling", "4 GPUs x 1 GMIs x 8192", "1 GPUs x 1 GMIs x 8192")
     rows = [
         [
             *("many small trainings on one GPU (seeds, a sweep)", "**yes**: `gmijax.sweep`"),
-            f"ten GMIs with 2,048 environments each make {shown(tenfold)} times the steps/s of one"
-            + ("" if call_of("sweeps-nvidia-h200") else f"; trainings per hour: {NOT_MEASURED}"),
+            f"eight trainings at once: {shown(eightfold)} times the trainings per hour of one "
+            f"after another, in {fewest} sweep{'s' * (fewest > 1)} each; "
+            f"ten GMIs: {shown(tenfold)} times the steps/s of one",
         ],
         [
             *("several processes on one GPU anyway", "**yes**, under MPS"),
@@ -47,6 +55,6 @@ def advice() -> list[str]:
 
 
 TABLES: MappingProxyType[str, Callable[[], list[str]]] = MappingProxyType(
-    {"advice": advice, "claims": claims, **TRAINING_TABLES, **OTHER_TABLES}
+    {"advice": advice, "claims": claims, "sweeps": sweeps, **TRAINING_TABLES, **OTHER_TABLES}
 )
 """By the name that documents use: `<!-- table: NAME -->`."""

@@ -6,7 +6,6 @@ from collections.abc import Callable
 from types import MappingProxyType
 
 from benchmarks.evaluation.figures import (
-    NOT_MEASURED,
     WHOLE_RUN,
     Figure,
     figure,
@@ -255,20 +254,6 @@ def many_small() -> list[str]:
     return [*markdown(head, rows), *source(SMALL)]
 
 
-def sweeps() -> list[str]:
-    """Trainings per hour, where they were measured."""
-    runs = results_of("sweeps-nvidia-h200").get("runs", ())
-    if not runs:
-        return [f"Trainings per hour of a sweep: {NOT_MEASURED} (`python -m benchmarks.sweeps`)."]
-    ways: dict[str, list[float]] = {}
-    for run in runs:
-        if run["code"] == 0:
-            ways.setdefault(run["way"], []).append(run["trainings_per_hour"])
-    rows = [[way, shown(figure(rates), ".1f")] for way, rates in ways.items()]
-    head = "trainings | trainings per hour:"
-    return [*markdown(head, rows), *source("sweeps-nvidia-h200")]
-
-
 TRAINING_TABLES: MappingProxyType[str, Callable[[], list[str]]] = MappingProxyType(
     {
         "fixed-total": fixed_total,
@@ -280,7 +265,6 @@ TRAINING_TABLES: MappingProxyType[str, Callable[[], list[str]]] = MappingProxyTy
         "async": asynchronous,
         "channels": channels,
         "many-small": many_small,
-        "sweeps": sweeps,
     }
 )
 """By the name that documents use: `<!-- table: NAME -->`."""
