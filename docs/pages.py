@@ -26,6 +26,7 @@ from gmijax.config import ExportConfig, PlayConfig, ServeConfig, TrainConfig
 
 ROOT: Final = Path(__file__).resolve().parents[1]
 PAGES: Final = ROOT / "build" / "docs" / "pages"
+STYLE: Final = ROOT / "docs" / "site.css"
 
 COMMANDS: Final[Mapping[str, type[Any]]] = {
     "train": TrainConfig,
@@ -50,6 +51,7 @@ def main() -> int:
     """Writes all pages anew; returns the exit code."""
     shutil.rmtree(PAGES, ignore_errors=True)
     link_documents(PAGES)
+    (PAGES / "docs" / STYLE.name).symlink_to(STYLE)
     folder = PAGES / "reference"
     folder.mkdir()
     for name in COMMANDS:

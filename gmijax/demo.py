@@ -20,8 +20,8 @@ from gmijax.runs.folder import RunPaths
 USAGE: Final = """usage: gmijax demo [key=value ...]
 
 Trains env=ball_balance shortly in runs/, plays its last checkpoint and films it.
-Takes the keys of `gmijax train`. Without num_timesteps: seconds of training on a GPU, a minute or
-two on two CPU cores.
+Takes the keys of `gmijax train`. Without num_timesteps: seconds of training on a GPU, minutes on
+two CPU cores.
 """
 
 CPU_STEPS: Final = 300_000

@@ -238,8 +238,8 @@ class Search:
             return outcome.best
         if not outcome.visited:
             raise ConfigError(
-                f"search.budget_s={self._settings.budget_s:g}: too small for one profile; the "
-                "first was cut off"
+                f"search.budget_s={self._settings.budget_s:g}: too small for one profile; give "
+                "more, or smaller sizes in search.num_envs"
             )
         first = outcome.visited[0]
         why = first.result.reason if isinstance(first.result, NotRunnable) else ""

@@ -46,7 +46,8 @@ def print_help(
     table = Table(box=None, pad_edge=False)
     for heading in ("key", "default", "meaning"):
         table.add_column(heading, overflow="fold", no_wrap=heading == "key")
-    keys, last = list(keys_of(cls, defaults_of)), ""
+    # Those without a group, such as num_timesteps, are looked for most.
+    keys, last = sorted(keys_of(cls, defaults_of), key=lambda key: "." in key.name), ""
     for key in keys:
         if key.choice != last:
             table.add_row(f"with {key.choice}:" if key.choice else "")
@@ -54,10 +55,10 @@ def print_help(
         allowed = f" ({'|'.join(key.allowed)})" if key.allowed else ""
         table.add_row(key.name, key.default, f"{key.meaning}{allowed}")
     console = Console(width=None if sys.stdout.isatty() else 140, highlight=False, markup=False)
-    console.print(f"usage: python -m gmijax.{name} [key=value ...] [--cfg job] [--help]\n")
+    console.print(f"usage: python -m gmijax.{name} [key=value ...] [--cfg job] [--help]")
     for group in ("env", "algo", "plan"):
-        if group in {key.name.split(".")[0] for key in keys} and choices(group):
-            console.print(f"{group}= one of: {', '.join(choices(group))}")
+        if group in {key.name.split(".")[0] for key in keys} and len(choices(group)) > 1:
+            console.print(f"\n{group}= one of: {', '.join(choices(group))}")
             if group == "env":
                 console.print("or env=PATH.py:FUNCTION, a task of your own (docs/custom-task.md)")
     console.print()
@@ -86,7 +87,10 @@ def keys_of(
 
 def _shown_default(key: str, values: Mapping[str, Any]) -> str:
     if key in values:
-        return "null" if values[key] is None else str(values[key])
+        value = values[key]
+        if isinstance(value, bool):
+            return str(value).lower()
+        return "null" if value is None else str(value)
     # A group whose keys are the user's to choose: their names tell more than all their values.
     names = {name.removeprefix(f"{key}.").split(".")[0] for name in values if f"{key}." in name}
     return ", ".join(sorted(names)) or "{}"

@@ -109,7 +109,8 @@ class ConsoleProgress:
 
     def __exit__(self, *exc: Any) -> None:
         self._display.__exit__(*exc)
-        if self._line:
+        # A panel is gone then; what a line has said is not said again.
+        if self._line and (self._display.has_panel or self._line["env_steps"] != self._shown[1]):
             self._console.print(self._text())
 
     def update(self, gmis: Sequence[GmiStatus]) -> None:

@@ -91,17 +91,22 @@ def _evaluations(run: RunPaths) -> dict[str, Any] | None:
 def train_outcome(summary: Data, run: RunPaths) -> str:
     """The summary in a few lines for people."""
     times = len(summary["restarts"])
-    sim, inference, train = (
-        _shown(summary[f"step_per_s_{what}"], ",.0f") for what in ("sim", "inference", "train")
-    )
     return (
         f"{summary['status']}: {summary['env_steps']:,} env steps in {summary['wall_s']:.0f} s, "
         f"final return {_shown(summary['final_return'], '.2f')}"
         f"{f', started again {times} times' if times else ''}\n"
-        f"env steps/s: {sim} simulation, {inference} with inference, {train} with training\n"
+        f"{_of_rates(summary)}"
         f"{_of_evaluations(summary.get('eval'))}"
         f"checkpoint: {summary['checkpoint']}\nsummary: {run.summary}"
     ) + overflow_warnings(summary["overflow_steps"])
+
+
+def _of_rates(summary: Data) -> str:
+    """A line of those that were measured, or nothing."""
+    names = {"sim": "simulation", "inference": "with inference", "train": "with training"}
+    rates = {name: summary[f"step_per_s_{key}"] for key, name in names.items()}
+    found = [f"{rate:,.0f} {name}" for name, rate in rates.items() if rate is not None]
+    return f"env steps/s: {', '.join(found)}\n" if found else ""
 
 
 def _of_evaluations(found: Data | None) -> str:

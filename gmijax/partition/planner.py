@@ -226,8 +226,11 @@ def _intra(
             )
         return reduce.intra
     if reason := why_not_intra("ipc", backend):
-        reasons.append(f"intra host: GMIs of a GPU exchange through shared host memory; {reason}")
+        if strategy != "none":
+            reasons.append(
+                f"intra host: GMIs of a GPU exchange through shared host memory; {reason}"
+            )
         return "host"
-    if strategy != "one_shot":
+    if strategy not in ("one_shot", "none"):
         reasons.append("intra ipc: with har GMIs of a GPU exchange through memory of the GPU")
     return "ipc"

@@ -172,13 +172,14 @@ def make_env(
         raise ConfigError("episode_length: give it to Brax's EpisodeWrapper with api=brax")
     if episode_length is not None and episode_length < 1:
         raise ConfigError(f"env.episode_length={episode_length}: must be at least 1")
+    if api == "brax":
+        require_task("", "brax")
     if suite == "gmijax" and ".py:" in name:
         suite = "custom"
     changes: dict[str, Any] = {"rewards": rewards, "settings": settings, "curriculum": curriculum}
     noted = {"source_sha256": source_sha256} if suite == "custom" else {}
     env = _make(name, suite, changes, impl=impl, max_envs=max_envs, **noted)
     if api == "brax":
-        require_task("", "brax")
         return importlib.import_module("gmijax.sim.adapters.to_brax").BraxEnv(env)
     from gmijax.sim.wrappers import time_limit
 

@@ -67,7 +67,9 @@ def places_of(settings: SweepConfig, machine: Machine, backends: Collection[str]
     if gpus is None:
         gpus = max(1, len(machine.gpus))
     try:
-        config = PlanConfig(gpus=gpus, gmis_per_gpu=1 if each == "auto" else each, backend=wanted)
+        count = 1 if each == "auto" else each
+        # Jobs plan their own GMIs; that the template is given keeps it out of what is said.
+        config = PlanConfig(gpus=gpus, gmis_per_gpu=count, backend=wanted, template="tcg")
         return make_plan(config, ReduceConfig(), 1, machine, template="tcg")
     except ConfigError as error:
         said = str(error).replace("plan.gmis_per_gpu", "sweep.jobs_per_gpu")

@@ -52,7 +52,8 @@ class SweepView:
         running = [job.progress for job in self._jobs if job.progress.state == "running"]
         rate = sum(progress.env_steps_per_s for progress in running)
         per_hour = trainings_per_hour(self._jobs) or 0.0
-        return f"{counts}; {rate:,.0f} steps/s, {per_hour:,.1f} trainings/h"
+        steps = f"{rate:,.0f} steps/s, " if rate else ""
+        return f"{counts}; {steps}{per_hour:,.1f} trainings/h"
 
     def _show(self) -> Group | None:
         self._print_changes()

@@ -38,6 +38,18 @@ def test_a_wrong_digit_is_found(tmp_path: Path):
     assert found.endswith(" is 0.72")
 
 
+def test_a_decision_says_that_its_figures_are_of_their_day(tmp_path: Path):
+    path = tmp_path / "docs" / "decisions" / "why.md"
+    path.parent.mkdir(parents=True)
+    path.write_text("It took 26 ms.\n")
+    assert len(list(check.in_document(path, tmp_path))) == 1
+    path.write_text("It took 26 ms, as measured then.\n")
+    assert list(check.in_document(path, tmp_path)) == []
+    path.write_text("As measured then.\n" + MARKED % "0.73")
+    assert len(list(check.in_document(path, tmp_path))) == 1
+    assert check.documents(tmp_path) == [path]
+
+
 def test_a_wrong_digit_in_a_table_is_found(tmp_path: Path):
     text = check.fill("<!-- table: templates -->\n<!-- /table -->\n")
     assert findings(tmp_path, text) == []

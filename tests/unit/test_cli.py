@@ -190,6 +190,7 @@ def test_help_lists_every_key(capsys: pytest.CaptureFixture[str]):
     said = capsys.readouterr().out
     for key in ("num_envs", "plan.gmis_per_gpu", "algo.learning_rate", "run.resume", "seed"):
         assert f"\n{key} " in said
+    assert said.index("\nnum_envs ") < said.index("\nenv.name ")
     assert command("play", PlayConfig, gmijax.train, ["num_envs=4", "-h"]) == 0
 
 

@@ -14,8 +14,10 @@ from rich.console import Console
 from supervision import CHECKOUT
 
 from gmijax.control.console import ConsoleProgress, open_console
+from gmijax.control.summary import train_outcome
 from gmijax.deploy import playing
 from gmijax.errors import printable
+from gmijax.runs.folder import RunPaths
 from gmijax.supervise.failures import last_line
 from gmijax.supervise.watched_gmi import GmiStatus
 
@@ -87,8 +89,37 @@ def test_a_job_tells_its_latest_evaluation():
     assert "eval" not in _told([SYNC])
 
 
+def test_without_a_terminal_a_line_is_printed_once():
+    assert len(_lines([SYNC])) == 1
+
+
+@pytest.mark.parametrize(
+    ("rates", "line"),
+    [
+        ((30.0, 20.0, 1000.0), "30 simulation, 20 with inference, 1,000 with training"),
+        ((None, None, 1000.0), "1,000 with training"),
+        ((None, None, None), ""),
+    ],
+)
+def test_a_summary_has_the_rates_that_were_measured(
+    tmp_path: Path, rates: tuple[float | None, ...], line: str
+):
+    names = ("step_per_s_sim", "step_per_s_inference", "step_per_s_train")
+    summary = {
+        **{"status": "completed", "env_steps": 10, "wall_s": 1.0, "restarts": [], "eval": None},
+        **{"final_return": None, "checkpoint": None, "overflow_steps": {}},
+        **dict(zip(names, rates, strict=True)),
+    }
+    told = train_outcome(summary, RunPaths(tmp_path)).splitlines()
+    assert [text for text in told if "steps/s" in text] == [f"env steps/s: {line}"] * bool(line)
+
+
 def _told(lines: list[dict[str, Any]]) -> str:
     """What is told in the end of a job that wrote these lines at once."""
+    return _lines(lines)[-1]
+
+
+def _lines(lines: list[dict[str, Any]]) -> list[str]:
     left, said = list(lines), io.StringIO()
 
     def new() -> list[dict[str, Any]]:
@@ -98,7 +129,7 @@ def _told(lines: list[dict[str, Any]]) -> str:
 
     with ConsoleProgress(Console(file=said, width=300, markup=False), new, 1000) as progress:
         progress.update(())
-    return said.getvalue().splitlines()[-1]
+    return said.getvalue().splitlines()
 
 
 def test_the_panel_of_a_job_shows_what_a_gmi_says():

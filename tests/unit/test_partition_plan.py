@@ -68,6 +68,13 @@ def test_every_auto_has_a_reason_and_explicit_choices_have_none():
     assert explicit.reasons == ()
 
 
+def test_one_gmi_is_not_told_how_it_would_exchange():
+    alone = make_plan(plan_config(), reduce_config(intra="auto"), 64, machine(0))
+    told = {reason.split()[0] for reason in alone.reasons}
+    assert "strategy" in told
+    assert "intra" not in told
+
+
 TWO_BY_TWO = {"gpus": 2, "gmis_per_gpu": 2}
 UNEVEN = {"layout": ((0, 1), (2,))}
 DEVICE = {"selection": "device"}
