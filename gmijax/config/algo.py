@@ -57,6 +57,11 @@ class ActorCriticConfig(KeyGroup):
     )
     policy_hidden_layer_sizes: tuple[int, ...] = doc("widths of the policy network", low=1)
     value_hidden_layer_sizes: tuple[int, ...] = doc("widths of the value network", low=1)
+    precision: Literal["float32", "bfloat16"] = doc(
+        "what the hidden layers of both networks compute in, for acting and learning; weights, "
+        "output layers, losses and optimizer are float32",
+        default="float32",
+    )
     distribution_type: Literal["normal", "tanh_normal"] = doc(
         "actions are drawn from a Gaussian, which the environment clips to [-1, 1], or from the "
         "tanh of one",

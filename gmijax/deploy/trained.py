@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -25,7 +26,7 @@ class TrainedPolicy(NamedTuple):
 
     Attributes:
       act: raw observations [N, O] to actions [N, A] in [-1, 1], the mean of the policy; pure, to
-        be traced.
+        be traced; in float32, whatever it was trained in.
       obs_size: O, of what the policy sees; not what only the value function saw.
       action_size: A.
       metadata: what it is, as plain data; what only the environment knows is not in it.
@@ -47,7 +48,8 @@ def trained_policy(checkpoint: Path) -> TrainedPolicy:
     full_size, obs_size, action_size = learner_sizes(checkpoint)
     # Networks are made for the sizes of an environment, and nothing else of it.
     spec = EnvSpec(env.label, full_size, action_size, 0.0, 0, (), actor_obs_size=obs_size)
-    learner = make_learner(spec, algo)
+    # Weights are float32, and not every runtime has another format.
+    learner = make_learner(spec, replace(algo, precision="float32"))
     state = jax.jit(lambda key: init_learner(learner, full_size, key))(jax.random.key(0))
     weights = acting_weights(learner, restore_learner(checkpoint, state))
     count, mean, m2 = weights.moments

@@ -67,6 +67,7 @@ def make_learner(spec: EnvSpec, config: C) -> Learner[C]:
             config.value_hidden_layer_sizes,
             config.init_noise_std,
             spec.actor_obs_size,
+            config.precision,
         ),
         # The learning rate is in the state, because the adaptive schedule changes it.
         optimizer=optax.chain(

@@ -44,7 +44,7 @@ class Samples(NamedTuple):
     """Inputs of the loss, for every step; leading axes are [T, N], [T * N] or [B].
 
     Attributes:
-      obs: [..., O], normalised as the policy saw it.
+      obs: [..., O], normalised as the policy saw it, in the precision of its hidden layers.
       action: [..., A], before clipping.
       log_prob: [...], of the action when it was drawn.
       output: [..., H], of the policy's network when the action was drawn.
@@ -143,6 +143,7 @@ def _with_advantages(learner: PpoLearner, weights: ActingWeights, steps: Transit
         lam=config.gae_lambda,
     )
     logs = networks.distribution.log_prob(steps.output, weights.params.log_std, steps.action)
+    obs = obs.astype(networks.policy.dtype)  # The first layer would: fewer bytes to shuffle.
     return Samples(obs, steps.action, logs, steps.output, values, advantage)
 
 

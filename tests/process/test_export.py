@@ -23,9 +23,9 @@ pytestmark = pytest.mark.timeout(600)
 
 @pytest.fixture(scope="module")
 def exported(tmp_path_factory: pytest.TempPathFactory) -> ExportPaths:
-    """All files of a policy with random weights, in its run folder."""
+    """All files of a policy with random weights, in its run folder; they compute in float32."""
     home = tmp_path_factory.mktemp("home")
-    run = make_run(home / "runs" / "made")
+    run = make_run(home / "runs" / "made", "algo.precision=bfloat16")
     done = train("run.dir=last", cwd=home, command="export")
     assert done.returncode == 0, done.stderr
     paths = ExportPaths(run.root / "export" / f"{ENV_STEPS:012d}")

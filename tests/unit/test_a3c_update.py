@@ -117,6 +117,15 @@ def test_an_unroll_is_what_the_environments_did(config) -> None:
     assert cuts > 0
 
 
+def test_in_bfloat16_a_trainer_computes_the_policy_that_acted(config) -> None:
+    learner, state, envs = _start(dataclasses.replace(config, precision="bfloat16"))
+    got = _unrolled(learner, state, envs)[1]
+    targets = jax.jit(partial(batch_targets, learner))(state, got, jnp.ones(N))
+    np.testing.assert_allclose(targets.log_prob, got.log_prob, atol=1e-5)
+    assert float(targets.behaviour_kl) < 1e-6
+    assert {x.dtype for x in (*got, targets.output) if x.dtype != bool} == {jnp.dtype("float32")}
+
+
 def test_pieces_make_the_unroll_that_they_are_parts_of(start) -> None:
     learner, state, envs = start
     weights = acting_weights(learner, state)

@@ -89,6 +89,12 @@ def test_a_policy_without_a_normaliser_sees_observations_as_they_are(tmp_path: P
     assert about["obs_clip"] is None
 
 
+def test_a_policy_that_was_trained_in_bfloat16_computes_in_float32(tmp_path: Path):
+    run = make_run(tmp_path / "run", "algo.precision=bfloat16")
+    obs = np.random.default_rng(0).normal(scale=20.0, size=(100, 24))
+    np.testing.assert_allclose(gmijax.load_policy(run.root)(obs), expected(run, obs), atol=2e-5)
+
+
 def test_what_only_the_value_function_saw_is_not_asked_for(tmp_path: Path):
     run = make_run(tmp_path / "run", actor_obs_size=20)
     policy, obs = gmijax.load_policy(run.root), np.random.default_rng(0).normal(size=(7, 20))

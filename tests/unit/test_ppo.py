@@ -3,6 +3,7 @@
 import dataclasses
 from typing import Any
 
+import flax.linen as nn
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -12,7 +13,7 @@ from gmijax.cli.compose import compose
 from gmijax.learning.distributions import DISTRIBUTIONS, Normal
 from gmijax.learning.learner import ActingWeights, state_values
 from gmijax.learning.normalize import Moments, from_units, moments_of, no_samples
-from gmijax.learning.policy import make_actor_critic
+from gmijax.learning.policy import elu, make_actor_critic
 from gmijax.learning.updates import explained_variance
 from gmijax.ppo.ppo import UpdateContext, ppo_loss
 from gmijax.ppo.rollout import Samples, gae, until_diverged
@@ -126,6 +127,29 @@ def test_shares_of_clipped_values_and_of_saturated_actions(params) -> None:
     far = {**layers, last: {**layers[last], "bias": jnp.array([0.0, -2.0])}}
     _, metrics = _loss(params._replace(policy={"params": far}), samples)
     assert float(metrics.saturated_fraction) == 0.5
+
+
+def test_the_derivative_of_elu_comes_from_its_output_and_is_the_same() -> None:
+    x = jnp.linspace(-100.0, 100.0, 4001)
+    mine, theirs = (jax.jit(jax.vmap(jax.value_and_grad(f)))(x) for f in (elu, nn.elu))
+    np.testing.assert_array_equal(mine, theirs)
+
+
+def test_hidden_layers_compute_in_bfloat16_and_all_else_in_float32(params) -> None:
+    half = make_actor_critic(Normal(A), (8,), (8,), 1.0, precision="bfloat16")
+    obs = jax.random.normal(jax.random.key(1), (B, O))
+
+    def loss(params, networks):
+        values = networks.state_value(params, obs)
+        return jnp.sum(values**2), (values, networks.output(params, obs))
+
+    derived = jax.jit(jax.grad(loss, has_aux=True), static_argnums=1)
+    (mine, outputs), (theirs, exact) = derived(params, half), derived(params, NETWORKS)
+    assert not jnp.array_equal(outputs[0], exact[0])
+    pairs = zip(*map(jax.tree.leaves, ((outputs, mine.value), (exact, theirs.value))), strict=True)
+    for a, b in pairs:
+        assert a.dtype == jnp.float32
+        np.testing.assert_allclose(a, b, atol=0.03 * float(jnp.max(jnp.abs(b))))
 
 
 def test_the_policy_does_not_see_what_is_behind_its_part_of_an_observation() -> None:

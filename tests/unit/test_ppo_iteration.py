@@ -281,6 +281,29 @@ def test_it_learns_with_another_distribution_and_normalised_values_of_any_scale(
     assert float(metrics.figures["value/explained_variance"]) > 0.3
 
 
+def test_it_learns_in_bfloat16_and_updates_the_policy_that_acted(config) -> None:
+    mine = make_learner(ENV.spec, dataclasses.replace(config, precision="bfloat16"))
+    step = _compiled(SoloReducer().program(functools.partial(iterate, ENV, mine)), mine)
+    state, envs = _start(mine)
+    returns = []
+    for _ in range(60):
+        state, envs, metrics = step(state, envs)
+        returns.append(float(metrics.counts.reward_sum) / (T * N))
+    assert np.mean(returns[-10:]) > np.mean(returns[:10]) + 0.4
+    assert {leaf.dtype for leaf in jax.tree.leaves((state.params, state.opt_state[1].mu))} == {
+        jnp.dtype("float32")
+    }
+    # Learning computes what acting did, though its batches are others: nothing has moved yet.
+    roll_out = jax.jit(functools.partial(rollout, ENV, mine))
+    samples, stats = roll_out(ENV.model, acting_weights(mine, state), envs)[1:]
+    assert samples.obs.dtype == jnp.bfloat16
+    context = update_context(mine, state, merge_stats(jax.tree.map(lambda x: x[None], stats)))
+    first = jax.jit(functools.partial(gradients, mine))
+    _, losses = first(state.params, flatten(samples), context, jnp.arange(5, 69))
+    assert abs(float(losses.kl)) < 1e-6
+    assert float(losses.clip_fraction) == float(losses.value_clip_fraction) == 0.0
+
+
 def test_a_warm_up_fills_the_statistics_and_nothing_else(learner, alone) -> None:
     state, envs = warm_up(alone, *_start(learner))
     first, _ = _start(learner)
