@@ -49,8 +49,8 @@ class BatchState(NamedTuple):
       env: all worlds; its `obs` [N, O] is the one after auto-reset, to act on next.
       return_sum: [N] float32, return of the running episode so far.
       term_sums: [N] float32 each, what every term has added to it.
-      head_start: [N] int32, steps by which the first episode of a world is shorter than its
-        time limit; 0 after it.
+      head_start: [N] int32, steps by which the running episode of a world is shorter than its
+        time limit: the first one, and with `keep_random_ep_len` those after a failure; else 0.
     """
 
     env: EnvState
@@ -148,7 +148,7 @@ def select_worlds(chosen: Array, new: T, old: T) -> T:
 
 
 def cut_first_episodes(spec: EnvSpec, before: BatchState, state: EnvState) -> EnvState:
-    """`state` [N], truncated where a first episode that had a head start is out of time."""
+    """`state` [N], truncated where an episode that had a head start is out of time."""
     time_left = spec.episode_length - before.head_start - state.steps
     out_of_time = (before.head_start > 0) & (time_left <= 0)
     return state._replace(truncated=(state.truncated | out_of_time) & ~state.terminated)
@@ -201,7 +201,9 @@ def overflowed(env: Env, state: EnvState) -> dict[str, Array]:
     return dict(zip(OVERFLOWS, counts, strict=True))
 
 
-def training_env(env: Env, *, random_ep_len: bool = False) -> BatchedEnv:
+def training_env(
+    env: Env, *, random_ep_len: bool = False, keep_random_ep_len: bool = False
+) -> BatchedEnv:
     """N auto-resetting copies of `env`, with statistics of the episodes that end.
 
     Args:
@@ -209,6 +211,9 @@ def training_env(env: Env, *, random_ep_len: bool = False) -> BatchedEnv:
       random_ep_len: the first episode of a world is as long as if it had begun before, by a
         random part of the time limit. Otherwise worlds that do not end by themselves all end in
         the same step, and all samples of an update are of the same moment of an episode.
+      keep_random_ep_len: an episode that ends by itself leaves the rest of its time to the next
+        one. Otherwise worlds that fail at first lose their random part, and all that learn not
+        to at about the same time are in step from then on.
 
     `init` raises ConfigError for more environments than `env.max_envs`.
     """
@@ -249,7 +254,11 @@ def training_env(env: Env, *, random_ep_len: bool = False) -> BatchedEnv:
             diverged={name: jnp.sum(where, dtype=jnp.int32) for name, where in bad.items()},
             overflowed=overflowed(env, stepped),
         )
-        head_start = jnp.where(stepped.terminated | stepped.truncated, 0, state.head_start)
+        ended = stepped.terminated | stepped.truncated
+        head_start = jnp.where(ended, 0, state.head_start)
+        if keep_random_ep_len:
+            used = state.head_start + stepped.steps
+            head_start = jnp.where(ended & (used < env.spec.episode_length), used, head_start)
         after = BatchState(auto_reset(batched, model, stepped), returns, terms, head_start)
         return after, output
 
