@@ -19,7 +19,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -108,7 +108,8 @@ class Benchmark:
             command += [f"seed=range({seeds})", f"sweep.jobs_per_gpu={way.at_once}"]
             command += [f"plan.backend={way.backend}", "sweep.gpus=1", f"run.dir={folder}"]
             started_s = time.monotonic()
-            code = self._command(command, cache or Path(scratch) / "xla")
+            variables = {"JAX_COMPILATION_CACHE_DIR": str(cache or Path(scratch) / "xla")}
+            code = run_command(command, self.deadline_s, variables)
             command_s = round(time.monotonic() - started_s, 2)
             if not (folder / "sweep.json").exists():
                 raise SystemExit(f"no result of {' '.join(command)}")
@@ -132,21 +133,31 @@ class Benchmark:
             "states": [job["state"] for job in jobs],
         }
 
-    def _command(self, command: Sequence[str], cache: Path) -> int:
-        """Runs a sweep; asks it to save and end at the deadline, or when this is interrupted."""
-        variables = {**os.environ, "JAX_COMPILATION_CACHE_DIR": str(cache)}
-        # In a session of its own, so that Ctrl-C comes to it once.
-        process = subprocess.Popen(command, env=variables, start_new_session=True)
-        try:
+
+def run_command(
+    command: Sequence[str], deadline_s: float, variables: Mapping[str, str] | None = None
+) -> int:
+    """Runs a sweep; asks it to save and end at the deadline, or when this is interrupted.
+
+    Args:
+      command: of the sweep.
+      deadline_s: by the monotonic clock.
+      variables: of the environment, besides those of this process.
+    """
+    # In a session of its own, so that Ctrl-C comes to it once.
+    process = subprocess.Popen(
+        command, env={**os.environ, **(variables or {})}, start_new_session=True
+    )
+    try:
+        with suppress(subprocess.TimeoutExpired):
+            return process.wait(max(0.0, deadline_s - _STOP_S - time.monotonic()))
+    finally:
+        if process.poll() is None:
+            process.send_signal(signal.SIGINT)
             with suppress(subprocess.TimeoutExpired):
-                return process.wait(max(0.0, self.deadline_s - _STOP_S - time.monotonic()))
-        finally:
-            if process.poll() is None:
-                process.send_signal(signal.SIGINT)
-                with suppress(subprocess.TimeoutExpired):
-                    process.wait(_STOP_S)
-                process.kill()
-        return process.wait()
+                process.wait(_STOP_S)
+            process.kill()
+    return process.wait()
 
 
 def main() -> int:

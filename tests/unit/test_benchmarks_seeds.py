@@ -1,0 +1,116 @@
+"""How the benchmark of seeds reads its rows, and what it keeps."""
+
+from __future__ import annotations
+
+import argparse
+import json
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from benchmarks import seeds
+from benchmarks.records import read_calls
+from benchmarks.seeds import Benchmark, Row, checked, row_of
+from gmijax.errors import ConfigError
+
+
+def arguments(folder: Path, **changes: Any) -> argparse.Namespace:
+    own: dict[str, Any] = {
+        **{"overrides": ["env=ball_balance"], "row": [], "seeds": 4, "at_once": "2"},
+        **{"deadline_s": None, "runs": folder / "runs", "analyse": [], "out": folder / "results"},
+    }
+    return argparse.Namespace(**{**own, **changes})
+
+
+def write_sweep(folder: Path, finals: Mapping[str, float], status: str = "completed") -> None:
+    """A sweep whose jobs rise to 1 and end at `finals`; seed -> reward."""
+    jobs = []
+    for number, (seed, final) in enumerate(finals.items()):
+        run = folder / f"{number:03d}"
+        run.mkdir(parents=True)
+        rewards = [1.0] * 20 + [final] * 20
+        text = "".join(json.dumps({"reward_per_step": value}) + "\n" for value in rewards)
+        (run / "metrics.jsonl").write_text(text)
+        job = {"overrides": {"seed": seed}, "wall_s": 5.0, "state": "completed"}
+        jobs.append({**job, "run_dir": f"/elsewhere/{run.name}"})
+    jobs.append({**jobs[0], "state": "interrupted"})
+    report = {"status": status, "trainings_per_hour": 100.0, "jobs": jobs}
+    (folder / "sweep.json").write_text(json.dumps(report))
+
+
+def test_a_row_has_a_name_and_overrides() -> None:
+    assert row_of("baseline") == Row("baseline", ())
+    told = "no clip: algo.clip_value_loss=false 'algo.learning_rate_range=[1e-6, 1e-2]'"
+    expected = ("algo.clip_value_loss=false", "algo.learning_rate_range=[1e-6, 1e-2]")
+    assert row_of(told) == Row("no clip", expected)
+
+
+def test_bad_input_is_told_before_anything_is_trained(tmp_path: Path) -> None:
+    for changes, message in (
+        ({"analyse": [tmp_path]}, "has no sweep.json"),
+        ({}, "nothing to do"),
+    ):
+        with pytest.raises(ConfigError, match=message):
+            checked(arguments(tmp_path, **changes), [])
+    for rows, message in (
+        ([Row("a", ()), Row("a", ())], "--row a: two rows have this name"),
+        ([Row("a", ("algo.clip_valu_loss=false",))], "clip_valu_loss"),
+    ):
+        with pytest.raises(ConfigError, match=message):
+            checked(arguments(tmp_path), rows)
+    assert checked(arguments(tmp_path), [Row("a", ("seed=1",))]) == "ball_balance"
+
+
+def test_rows_are_kept_one_by_one_and_compared_with_the_first(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    commands: list[Sequence[str]] = []
+
+    def run(command: Sequence[str], _: float) -> int:
+        commands.append(command)
+        if len(commands) == 3:
+            raise KeyboardInterrupt
+        folder = Path(command[-1].partition("=")[2])
+        write_sweep(folder, {"0": 0.95, "1": 0.9 if "seed=range(4)" in command else 0.1})
+        return 0
+
+    monkeypatch.setattr(seeds, "run_command", run)
+    write_sweep(tmp_path / "before", {"0": 0.95, "1": 0.5})
+    found = Benchmark(arguments(tmp_path), "ball_balance")
+    found.analyse(tmp_path / "before")
+    with pytest.raises(KeyboardInterrupt):
+        found.run([Row("no clip", ("algo.clip_value_loss=false",)), Row("b", ()), Row("c", ())])
+    (call,) = read_calls(found.file.path)
+    assert found.file.path.name == "seeds-ball_balance-cpu.json"
+    before, row, _ = call.results["rows"]
+    assert (before["row"], before["seeds"], before["successes"], before["unfinished"]) == (
+        *("before", 2, 1),
+        1,
+    )
+    assert "p_final" not in before
+    assert (row["overrides"], row["successes"]) == (["algo.clip_value_loss=false"], 2)
+    assert row["p_successes"] == 1.0
+    assert [one["seed"] for one in row["each"]] == ["0", "1"]
+    assert "algo.clip_value_loss=false" in commands[0]
+    assert f"run.dir={tmp_path}/runs/no-clip" in commands[0]
+    assert "no clip: 2 of 2" in capsys.readouterr().out
+
+
+def test_no_row_is_begun_that_would_not_end_in_time(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    now_s = 0.0
+
+    def run(command: Sequence[str], _: float) -> int:
+        nonlocal now_s
+        now_s += 60.0
+        write_sweep(Path(command[-1].partition("=")[2]), {"0": 1.0})
+        return 0
+
+    monkeypatch.setattr(seeds.time, "monotonic", lambda: now_s)
+    monkeypatch.setattr(seeds, "run_command", run)
+    found = Benchmark(arguments(tmp_path, deadline_s=150.0), "ball_balance")
+    found.run([Row(name, ()) for name in "abc"])
+    assert [row["row"] for row in found.rows] == ["a", "b"]
