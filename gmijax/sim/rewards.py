@@ -36,13 +36,15 @@ class Replacement(NamedTuple):
 
     Attributes:
       name: under which it is logged; it is a term like any other, zero while `when` is false.
-      when: [] bool, whether it applies; all other terms are then zero.
+      when: [] bool, whether it applies.
       value: the reward where it applies.
+      keeps: share of all other terms that stay where it applies; with 1 it is one more addend.
     """
 
     name: str
     when: Array
     value: float
+    keeps: float = 0.0
 
 
 def with_weights(
@@ -76,7 +78,11 @@ def total_reward(
         for name, term in terms.items()
     }
     if replacement is not None:
-        values = {name: jnp.where(replacement.when, 0.0, value) for name, value in values.items()}
+        keeps, when = replacement.keeps, replacement.when
+        values = {
+            name: jnp.where(when, keeps * value if keeps else 0.0, value)
+            for name, value in values.items()
+        }
         values[replacement.name] = jnp.where(replacement.when, replacement.value, 0.0)
     return sum(values.values(), jnp.zeros(())), values
 

@@ -5,6 +5,7 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
+from gmijax.errors import ConfigError
 from gmijax.sim import physics
 from gmijax.sim.tasks import franka_cabinet as task
 from gmijax.sim.tasks.settings import FrankaCabinetSettings
@@ -36,10 +37,11 @@ def pose(
     )
 
 
-def view(pose: task.FrankaCabinetPose, drawer_m: float = 0.0) -> task.FrankaCabinetView:
-    return task.FrankaCabinetView(
-        pose, jnp.array(drawer_m), jnp.zeros(task.ACTION_SIZE), SETTINGS.open_m
-    )
+def view(
+    pose: task.FrankaCabinetPose, drawer_m: float = 0.0, scale_m: float = SETTINGS.distance_scale_m
+) -> task.FrankaCabinetView:
+    action = jnp.zeros(task.ACTION_SIZE)
+    return task.FrankaCabinetView(pose, jnp.array(drawer_m), action, SETTINGS.open_m, scale_m)
 
 
 def value(term: str, view: task.FrankaCabinetView) -> float:
@@ -50,6 +52,26 @@ def test_closeness_doubles_within_two_centimetres():
     assert value("distance", view(pose(handle=(0.5, 0.0, 0.5)))) == pytest.approx(2.0 / 1.25**2)
     assert value("distance", view(pose(handle=(0.021, 0.0, 0.5)))) == pytest.approx(2.0, rel=1e-2)
     assert value("distance", view(pose(handle=(0.019, 0.0, 0.5)))) == pytest.approx(4.0, rel=1e-2)
+
+
+def test_closeness_is_a_quarter_at_its_scale():
+    at = pose(handle=(0.2, 0.0, 0.5))
+    assert value("distance", view(at, scale_m=0.2)) == pytest.approx(2.0 / 4.0)
+    near = pose(handle=(0.01, 0.0, 0.5))
+    assert value("distance", view(near, scale_m=0.2)) == pytest.approx(4.0 / 1.0025**2)
+
+
+@pytest.mark.parametrize("opened", [False, True])
+def test_an_open_drawer_truncates_unless_it_shall_terminate(opened: bool):
+    for terminates, expected in ((0.0, (False, opened)), (1.0, (opened, False))):
+        settings = FrankaCabinetSettings(open_terminates=terminates)
+        found = task.ends(jnp.array(opened), settings)
+        assert tuple(bool(end) for end in found) == expected
+
+
+def test_whether_an_open_drawer_terminates_is_no_share():
+    with pytest.raises(ConfigError, match=r"env.settings.open_terminates=0.5: must be 0 or 1"):
+        FrankaCabinetSettings(open_terminates=0.5)
 
 
 def test_alignment_keeps_the_sign_of_each_axis():

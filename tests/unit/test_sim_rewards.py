@@ -37,3 +37,14 @@ def test_reward_is_the_weighted_sum_or_its_replacement(dead: bool | None, terms:
     assert {name: float(value) for name, value in values.items()} == terms
     assert float(reward) == sum(terms.values())
     assert term_names(TERMS, None if dead is None else "death") == tuple(terms)
+
+
+@pytest.mark.parametrize(("is_dead", "expected"), [(True, (1.5, -1.125)), (False, (6.0, -4.5))])
+def test_a_replacement_may_keep_a_share_of_the_other_terms(
+    is_dead: bool, expected: tuple[float, float]
+):
+    replacement = Replacement("death", jnp.array(is_dead), -2.0, keeps=0.25)
+    reward, values = total_reward(TERMS, View(jnp.array(3.0)), replacement)
+    assert (float(values["speed"]), float(values["cost"])) == expected
+    assert float(values["death"]) == (-2.0 if is_dead else 0.0)
+    assert float(reward) == sum(float(value) for value in values.values())

@@ -106,19 +106,22 @@ class FrankaCabinetView(NamedTuple):
       drawer_m: [] the drawer's opening, metres.
       action: [9] clipped.
       open_m: from which opening on the drawer counts as open.
+      distance_scale_m: see the settings.
     """
 
     pose: FrankaCabinetPose
     drawer_m: Array
     action: Array
     open_m: float
+    distance_scale_m: float
 
 
 def closeness(view: FrankaCabinetView) -> Array:
     """1 where the gripper meets the handle, less with distance; doubled when near."""
     way = view.pose.handle - view.pose.grasp
     squared = way @ way
-    return (1.0 + squared) ** -2 * jnp.where(squared <= NEAR_M**2, 2.0, 1.0)
+    shape = (1.0 + squared / view.distance_scale_m**2) ** -2
+    return shape * jnp.where(squared <= NEAR_M**2, 2.0, 1.0)
 
 
 def alignment(view: FrankaCabinetView) -> Array:
@@ -206,17 +209,25 @@ def make(
         opened = drawer_m > chosen.open_m
         reward = total_reward(
             terms,
-            FrankaCabinetView(pose, drawer_m, action, chosen.open_m),
-            Replacement(BEHIND, is_behind(pose), chosen.behind_reward),
+            FrankaCabinetView(pose, drawer_m, action, chosen.open_m, chosen.distance_scale_m),
+            Replacement(BEHIND, is_behind(pose), chosen.behind_reward, chosen.behind_keeps),
         )
         metrics = {"drawer_m": drawer_m, "opened": opened.astype(jnp.float32)}
         task, obs = FrankaCabinetTask(targets), observe(ids, moved, pose)
-        # Nothing is lost by an open drawer: as a termination it would cost all that could still
-        # be earned, and policies learn to stop just short of it.
-        never = jnp.zeros((), bool)
-        return episode.advance(state, moved, task, obs, reward, never, metrics, opened)
+        terminated, truncated = ends(opened, chosen)
+        return episode.advance(state, moved, task, obs, reward, terminated, metrics, truncated)
 
     return world.env(spec, reset, step)
+
+
+def ends(opened: Array, settings: FrankaCabinetSettings) -> tuple[Array, Array]:
+    """Whether an open drawer [] terminates the episode, and whether it truncates it.
+
+    Nothing is lost by a truncation: a termination costs all that could still be earned, unless
+    the term `open` pays for it, and policies learn to stop just short of it.
+    """
+    never = jnp.zeros((), bool)
+    return (opened, never) if settings.open_terminates else (never, opened)
 
 
 def look_up(mj_model: mujoco.MjModel) -> FrankaCabinetIds:

@@ -140,9 +140,30 @@ class FrankaCabinetSettings(TaskSettings):
         default=0.39,
         positive=True,
     )
+    open_terminates: float = doc(
+        "1: an open drawer terminates the episode, and nothing that could still be earned counts",
+        default=0.0,
+        low=0,
+        high=1,
+    )
+    distance_scale_m: float = doc(
+        "distance from the handle at which `distance` is a quarter of the most, m",
+        default=1.0,
+        positive=True,
+    )
     behind_reward: float = doc(
         "reward of a step with a finger through the drawer's front", default=-1.0
     )
+    behind_keeps: float = doc(
+        "share of the other terms that such a step keeps", default=0.0, low=0, high=1
+    )
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.open_terminates not in (0.0, 1.0):
+            raise ConfigError(
+                f"{self.prefix}open_terminates={self.open_terminates!r}: must be 0 or 1"
+            )
 
 
 @dataclass(frozen=True, kw_only=True)
