@@ -8,6 +8,7 @@ k processes with n environments each see the samples of one process with k x n, 
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from typing import NamedTuple, TypeVar
 
 import jax
@@ -257,6 +258,7 @@ def training_env(env: Env, *, random_ep_len: bool = False) -> BatchedEnv:
     return BatchedEnv(env.spec, env.model, init, step, overflows)
 
 
+@partial(jax.jit, static_argnames="num_envs")
 def env_keys(key: PRNGKey, first_env: int, num_envs: int) -> PRNGKey:
     """Keys [N] of environments `first_env` to `first_env + num_envs - 1` of a whole job.
 
