@@ -255,7 +255,8 @@ def training_env(env: Env, *, random_ep_len: bool = False) -> BatchedEnv:
         return after, output
 
     overflows = () if env.overflow is None else OVERFLOWS
-    return BatchedEnv(env.spec, env.model, init, step, overflows)
+    # Traced once for all programs with it; what they are made of stays the same.
+    return BatchedEnv(env.spec, env.model, init, jax.jit(step, inline=True), overflows)
 
 
 @partial(jax.jit, static_argnames="num_envs")
