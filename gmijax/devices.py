@@ -3,10 +3,26 @@
 from __future__ import annotations
 
 import resource
+import threading
+from contextlib import suppress
 from typing import Any
 
 import jax
 from jax.sharding import Sharding, SingleDeviceSharding
+
+
+def start_device() -> None:
+    """Starts this process's device in a thread of its own, while the caller imports.
+
+    CUDA spends a second or more in its driver. Whoever uses the device first waits for the rest,
+    and gets the error if there is one.
+    """
+
+    def start() -> None:
+        with suppress(Exception):
+            jax.local_devices()
+
+    threading.Thread(target=start, name="device", daemon=True).start()
 
 
 def host_sharding() -> Sharding | None:

@@ -54,7 +54,7 @@ def train_summary(
         "env_steps": result.get("env_steps"),
         "wall_s": wall_s,
         **{key: result.get(key) for key in _RATES},
-        **{key: result[key] for key in _ASYNCHRONOUS if key in result},
+        **{key: result[key] for key in (*_ASYNCHRONOUS, "start_s") if key in result},
         "final_return": result.get("final_return"),
         "eval": _evaluations(run),
         "overflow_steps": result.get("overflow_steps") or {},

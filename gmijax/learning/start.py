@@ -35,7 +35,7 @@ def first_state(learner: Learner, obs_size: int, config: TrainConfig) -> tuple[T
     Raises:
       ConfigError: the checkpoint to go on from does not fit.
     """
-    key = jax.random.split(jax.random.key(config.seed))[0]
+    key = _keys(config.seed)[0]
 
     def start(key: PRNGKey, rate: Array) -> TrainState:
         return init_learner(learner, obs_size, key)._replace(learning_rate=rate)
@@ -51,6 +51,13 @@ def first_state(learner: Learner, obs_size: int, config: TrainConfig) -> tuple[T
     if wanted != read_json(RunPaths(checkpoint.parent.parent).config)["algo"]["learning_rate"]:
         state = state._replace(learning_rate=jnp.asarray(wanted, jnp.float32))
     return state, CheckpointMeta.read(checkpoint).env_steps
+
+
+@jax.jit
+def _keys(seed: int) -> tuple[PRNGKey, PRNGKey]:
+    """Those of the learner and of the environments of a job."""
+    learner, envs = jax.random.split(jax.random.key(seed))
+    return learner, envs
 
 
 def first_envs(
@@ -74,7 +81,7 @@ def first_envs(
       num_gmis: only from a checkpoint of so many GMIs, None for any.
     """
     num_envs = config.envs_per_gmi
-    key = jax.random.split(jax.random.key(config.seed))[1]
+    key = _keys(config.seed)[1]
     resume = None if config.run.resume is None else Path(config.run.resume)
     meta = None if resume is None else CheckpointMeta.read(resume)
     if meta is not None:  # Other environments than the first run's: never its starts again.

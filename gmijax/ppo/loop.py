@@ -104,10 +104,12 @@ class TrainingLoop:
           CollectiveError: another GMI is gone or stuck.
         """
         started = time.monotonic()
+        self._link.end_part("environments")
         state, self._env_steps = first_state(self._learner, self._env.spec.obs_size, self._config)
         if self._evaluator is not None:
             self._evaluator.best = best_evaluation(self._link.run.root, self._env_steps)
         env_state = self._first_envs()
+        self._link.end_part("states")
         waited_s = self._compile(state, env_state)
         compile_s = time.monotonic() - started - waited_s
         self._link.beat("ready", 0)
@@ -125,6 +127,7 @@ class TrainingLoop:
             "iterations": self._iterations,
             "train_wall_s": wall_s,
             "compile_s": compile_s,
+            "start_s": self._link.start_s | {"first_update": next(iter(log.line_s), None)},
             "env_steps_per_s": (self._env_steps - first_steps) / wall_s,
             "step_per_s_train": self._median_rate(log.line_s),
             "final_return": log.last_return,
@@ -165,6 +168,7 @@ class TrainingLoop:
             self._meter.compile()
         if self._evaluator is not None:
             self._evaluator.compile()
+        self._link.end_part("compiling")
         return waited_s
 
     def _open_log(self) -> TrainingLog:

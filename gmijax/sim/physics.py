@@ -16,6 +16,7 @@ from typing import NamedTuple, TypeAlias, TypeVar
 import jax
 import jax.numpy as jnp
 import mujoco
+import numpy as np
 from mujoco import mjx
 
 from gmijax.errors import ConfigError
@@ -249,7 +250,8 @@ def _warp_blank(
     # Zeros are made where they are used: as constants of the compiled program they would be
     # tens of megabytes.
     kept = [
-        jax.ShapeDtypeStruct(leaf.shape, leaf.dtype) if not jnp.any(leaf) else leaf
+        # Looked at by numpy: jax would make a program for every shape.
+        jax.ShapeDtypeStruct(leaf.shape, leaf.dtype) if not np.any(leaf) else leaf
         for leaf in leaves
     ]
 

@@ -8,6 +8,7 @@ k processes with n environments each see the samples of one process with k x n, 
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from typing import NamedTuple, TypeVar
 
 import jax
@@ -263,9 +264,11 @@ def training_env(
         return after, output
 
     overflows = () if env.overflow is None else OVERFLOWS
-    return BatchedEnv(env.spec, env.model, init, step, overflows)
+    # Traced once for all programs with it; what they are made of stays the same.
+    return BatchedEnv(env.spec, env.model, init, jax.jit(step, inline=True), overflows)
 
 
+@partial(jax.jit, static_argnames="num_envs")
 def env_keys(key: PRNGKey, first_env: int, num_envs: int) -> PRNGKey:
     """Keys [N] of environments `first_env` to `first_env + num_envs - 1` of a whole job.
 

@@ -33,6 +33,7 @@ def main() -> int:
 
 
 def _run(link: ChildLink) -> dict[str, Any]:
+    link.keep_garbage()
     config = from_dict(ServeConfig, read_json(link.run.config))
     plan = Plan.from_dict(read_json(link.run.plan))
     roles = plan.roles[link.gmi]

@@ -34,11 +34,14 @@ def main() -> int:
 
 
 def _run(link: ChildLink) -> dict[str, Any]:
+    link.keep_garbage()
     config = from_dict(TrainConfig, read_json(link.run.config))
     plan = Plan.from_dict(read_json(link.run.plan))
     # jax starts here, in the environment that the plan prepared.
+    from gmijax.devices import start_device
     from gmijax.selfcheck import check_share
 
+    start_device()
     check_share(plan, link.gmi)
     simulating, _ = groups_of(plan)
     # A trainer that steps no environment takes the sizes from those of the first GMI that does.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import os
 import signal
 from collections.abc import Iterator
@@ -47,6 +48,23 @@ def block() -> Iterator[tuple[int, HeartbeatBlock]]:
     fd = HeartbeatBlock.create()
     yield fd, HeartbeatBlock(fd)
     os.close(fd)
+
+
+def test_garbage_is_kept_until_a_gmi_is_ready(tmp_path: Path):
+    link = ChildLink(0, RunPaths(tmp_path), None, None)
+    seen = []
+    try:
+        link.keep_garbage()
+        for state in ("starting", "compiling", "ready"):
+            link.beat(state, 0)
+            seen.append(gc.isenabled())
+        gc.disable()  # By a role of the user's own, say: that is theirs.
+        link.beat("running", 1)
+        seen.append(gc.isenabled())
+    finally:
+        gc.enable()
+        gc.unfreeze()
+    assert seen == [False, False, True, False]
 
 
 def test_beats_and_errors_reach_whoever_has_the_memory(

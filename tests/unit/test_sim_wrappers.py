@@ -62,6 +62,27 @@ def step(env: BatchedEnv, state: Any) -> Any:
     return env.step(None, state, jnp.full((*state.env.reward.shape, 1), PUSH))
 
 
+def test_programs_with_the_same_environments_share_a_trace():
+    calls = []
+    task = toy(2)
+
+    def counted(*arguments: Any) -> EnvState:
+        calls.append(1)
+        return task.step(*arguments)
+
+    env = training_env(task._replace(step=counted))
+    state, actions = start(env, 2), jnp.zeros((2, 1))
+    for scale in (1.0, 2.0):
+        jax.jit(lambda s, a, by=scale: env.step(None, s, by * a)).lower(state, actions)
+    assert len(calls) == 1
+
+
+def test_keys_of_environments_are_those_of_fold_in():
+    key = jax.random.key(2**31 - 1)
+    one_by_one = [jax.random.key_data(jax.random.fold_in(key, 2**30 + i)) for i in range(3)]
+    np.testing.assert_array_equal(jax.random.key_data(env_keys(key, 2**30, 3)), one_by_one)
+
+
 def test_time_limit_truncates_and_a_new_episode_begins_elsewhere():
     env = worlds(2)
     first = start(env, 2)
