@@ -14,8 +14,8 @@ import os
 import socket
 import struct
 import time
-from collections.abc import Mapping
-from contextlib import suppress
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager, suppress
 from typing import Final, NamedTuple
 
 from gmijax.collectives.shared_memory import create_file
@@ -78,6 +78,16 @@ Sockets = Mapping[int, socket.socket]
 def listen(address: str) -> socket.socket:
     """A socket that listens at a free port of this IP address."""
     return socket.create_server((address, 0), backlog=128)
+
+
+@contextmanager
+def reserved_address(host: str) -> Iterator[str]:
+    """`host:port`, which cannot go to somebody else before the GMI that gets it listens there."""
+    # Bound without listening, and shared with this user: connections go to who listens.
+    with socket.socket() as holder:
+        holder.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEPORT, 1)
+        holder.bind((host, 0))
+        yield f"{host}:{holder.getsockname()[1]}"
 
 
 def connect(
