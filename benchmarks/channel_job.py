@@ -5,12 +5,11 @@ from __future__ import annotations
 import json
 import os
 import signal
-import socket
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager
+from collections.abc import Sequence
+from contextlib import ExitStack
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
@@ -19,6 +18,7 @@ import numpy as np
 
 from benchmarks.channel_ranks import ENV_FD, Options
 from gmijax.collectives.channel.build import ChannelTopology, create_channels
+from gmijax.collectives.nodes.meeting import reserved_address
 from gmijax.config.channel import ChannelConfig
 
 DEFAULTS: Options = {
@@ -42,17 +42,23 @@ class ChannelJob:
       folder: for results.
       config: of the channels.
       topology: who takes part.
+      node_of: the node of every rank, as if they were on several; None: all are on one.
       task: what differs from `DEFAULTS`.
     """
 
     def __init__(
-        self, folder: Path, config: ChannelConfig, topology: ChannelTopology, **task: Any
+        self,
+        folder: Path,
+        config: ChannelConfig,
+        topology: ChannelTopology,
+        node_of: Sequence[int] | None = None,
+        **task: Any,
     ) -> None:
         self._held = ExitStack()
         self._folder = folder
         self._processes: dict[int, subprocess.Popen[bytes]] = {}
-        if config.transport == "zmq":
-            topology = self._with_addresses(topology)
+        if config.transport == "zmq" or node_of is not None:
+            topology = self._with_addresses(topology, node_of or range(len(topology.gpu_of)))
         self.topology = topology
         self._fd = create_channels(config, topology)
         self._held.callback(os.close, self._fd)
@@ -125,22 +131,15 @@ class ChannelJob:
         addresses = [[*pair, where] for pair, where in (self.topology.addresses or {}).items()]
         return {**vars(self.topology), "addresses": addresses}
 
-    def _with_addresses(self, topology: ChannelTopology) -> ChannelTopology:
+    def _with_addresses(
+        self, topology: ChannelTopology, node_of: Sequence[int]
+    ) -> ChannelTopology:
         return replace(
             topology,
             addresses={
-                (agent, trainer): self._held.enter_context(reserved_address())
+                (agent, trainer): self._held.enter_context(reserved_address("127.0.0.1"))
                 for agent in topology.agents
                 for trainer in topology.trainers
+                if node_of[agent] != node_of[trainer]
             },
         )
-
-
-@contextmanager
-def reserved_address() -> Iterator[str]:
-    """`127.0.0.1:port`, which cannot go to somebody else before its server starts."""
-    # Bound without listening, and shared: connections go to who listens.
-    with socket.socket() as holder:
-        holder.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEPORT, 1)
-        holder.bind(("127.0.0.1", 0))
-        yield f"127.0.0.1:{holder.getsockname()[1]}"

@@ -1,7 +1,8 @@
 """What trainers and agents tell each other, in registers that nobody ever waits for.
 
 Register 0: orders of the leading trainer. Register 1: the newest weights, with the policy's
-version as tag. Then one per agent: what it has done so far. Experience travels elsewhere.
+version as tag. Then one per agent: what it has done so far. Experience travels elsewhere. On
+several nodes the values also travel between them (`gmijax/workers/node_registers.py`).
 """
 
 from __future__ import annotations
@@ -11,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from gmijax.collectives.messages.registers import Register, open_registers
+from gmijax.collectives.messages.registers import AnyRegister, open_registers
 
 _NO_CHECKPOINT = -1
 
@@ -81,16 +82,21 @@ class Report(NamedTuple):
 class JobRegisters(NamedTuple):
     """All registers of a job, see the module."""
 
-    orders: Register
-    weights: Register
-    reports: tuple[Register, ...]
+    orders: AnyRegister
+    weights: AnyRegister
+    reports: tuple[AnyRegister, ...]
+
+
+def register_bytes(num_weights: int, num_stats: int) -> tuple[int, int, int]:
+    """Sizes of orders, weights and a report."""
+    report_bytes = 8 * (len(Report._fields) - 1 + num_stats)
+    return 8 * len(Orders._fields), 4 * num_weights, report_bytes
 
 
 def open_job_registers(fd: int, num_weights: int, num_stats: int, num_agents: int) -> JobRegisters:
     """Maps the registers of a job; `fd` is from `create_registers`."""
-    report_bytes = 8 * (len(Report._fields) - 1 + num_stats)
-    sizes = [8 * len(Orders._fields), 4 * num_weights, *[report_bytes] * num_agents]
-    orders, weights, *reports = open_registers(fd, sizes)
+    *shared, report_bytes = register_bytes(num_weights, num_stats)
+    orders, weights, *reports = open_registers(fd, [*shared, *[report_bytes] * num_agents])
     return JobRegisters(orders, weights, tuple(reports))
 
 

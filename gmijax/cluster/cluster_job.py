@@ -12,12 +12,13 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any, Self
 
-from gmijax.cluster.node import own_versions
+from gmijax.cluster.node import Opened, own_versions
 from gmijax.cluster.ray_nodes import Joined, RayCluster
 from gmijax.collectives.nodes.meeting import Nodes
 from gmijax.config import TrainConfig
 from gmijax.errors import ConfigError, GmiFailed
 from gmijax.machine.snapshot import Machine
+from gmijax.partition.placement import most_gmis_of_a_node
 from gmijax.partition.planner import num_gmis_of
 from gmijax.supervise.backends.backend import Backend
 from gmijax.supervise.launcher import Launch, OnTick, StopSignals
@@ -41,7 +42,7 @@ class ClusterJob:
         self._config = config
         self._joined: list[Joined] = []
         self._signals: StopSignals | None = None
-        self._num_cpus = num_gmis_of(config.plan)[0]
+        self._num_cpus = _cpus_of_a_node(config)
 
     def __enter__(self) -> Self:
         self._cluster = RayCluster(self._config.cluster)
@@ -88,11 +89,13 @@ class ClusterJob:
         """
         self._signals = signals
         sent = dataclasses.replace(launch, on_warning=print, is_enough=None)
-        token, addresses = secrets.token_bytes(32), []
+        token, addresses, calls = secrets.token_bytes(32), [], {}
         for place, (node, facts) in enumerate(self._joined):
-            addresses.append(node.call("open", sent, place, facts.address))
+            opened = node.call("open", sent, place, facts.address) or Opened(("", 0), {})
+            addresses.append(opened.leader)
+            calls |= opened.calls
         for place, (node, _) in enumerate(self._joined):
-            node.call("introduce", Nodes(place, tuple(addresses), token))
+            node.call("introduce", Nodes(place, tuple(addresses), token, calls))
         first = [gmis[0] for gmis in launch.plan.layout.gmis_of_node]
         for gmi, (node, _) in zip(first, self._joined, strict=True):
             if node.lost is not None:
@@ -124,6 +127,13 @@ class ClusterJob:
 
     def _require_alike(self) -> None:
         own = own_versions()
+        if not self._config.is_asynchronous:
+            del own["pyzmq"]
+        elif own["pyzmq"] is None:
+            raise ConfigError(
+                "cluster.engine=ray: experience between nodes needs the package pyzmq "
+                "(pip install 'gmijax[ray]')"
+            )
         for node, facts in self._joined:
             for what, version in own.items():
                 if (theirs := facts.versions.get(what)) != version:
@@ -157,3 +167,16 @@ class ClusterJob:
         finally:
             with suppress(OSError):
                 Path(name).unlink()
+
+
+def _cpus_of_a_node(config: TrainConfig) -> int:
+    """CPUs that every node must have: one for each of its GMIs, however many nodes are left."""
+    if not config.is_asynchronous:
+        return num_gmis_of(config.plan)[0]
+    wanted = config.cluster.nodes
+    assert wanted != "auto"
+    most = most_gmis_of_a_node(config.plan, wanted)
+    for fewer in range(1, wanted if config.run.elastic else 1):
+        with suppress(ConfigError):  # Then the job will not go on with so few.
+            most = max(most, most_gmis_of_a_node(config.plan, fewer))
+    return most

@@ -17,7 +17,13 @@ from contextlib import ExitStack, suppress
 from pathlib import Path
 from typing import Any, Final, Literal, NamedTuple
 
-from gmijax.collectives.nodes.meeting import ENV_LISTENER_FD, ENV_NODES_FD, Nodes, listen
+from gmijax.collectives.nodes.meeting import (
+    ENV_LISTENER_FD,
+    ENV_NODES_FD,
+    Nodes,
+    listen,
+    reserved_address,
+)
 from gmijax.errors import ConfigError, GmiFailed, GmijaxError, ReportedError
 from gmijax.machine.snapshot import Machine, detect_machine
 from gmijax.supervise.backends import open_backend
@@ -27,7 +33,7 @@ from gmijax.supervise.launch import Launch, StartGmi, start_gmi
 from gmijax.supervise.launcher import drop_unreadable, shared_blocks
 from gmijax.version import __version__, versions_of
 
-COMPARED: Final = ("jax", "jaxlib", "numpy", "mujoco", "mujoco-mjx", "flax", "optax")
+COMPARED: Final = ("jax", "jaxlib", "numpy", "mujoco", "mujoco-mjx", "flax", "optax", "pyzmq")
 """Packages whose versions all nodes must have alike, beside Python and gmijax."""
 
 Order = Literal["let_go", "ask_to_stop", "order_end", "end_as_done", "kill"]
@@ -42,6 +48,13 @@ class Facts(NamedTuple):
     address: str  # IP address for the exchange with other nodes.
     machine: Machine
     versions: dict[str, str | None]
+
+
+class Opened(NamedTuple):
+    """Where GMIs of a node will listen."""
+
+    leader: tuple[str, int]
+    calls: dict[tuple[int, int], str]  # See `Nodes`.
 
 
 class Seen(NamedTuple):
@@ -101,19 +114,25 @@ class Node:
             return path.read_text() == content and os.access(path.parent, os.W_OK)
         return False
 
-    def open(self, launch: Launch, node: int, address: str) -> tuple[str, int]:
-        """Makes what the GMIs share; returns where their leader will listen."""
+    def open(self, launch: Launch, node: int, address: str) -> Opened:
+        """Makes what the GMIs share; returns where they will listen."""
         self._launch = launch
         own = launch.run.node(node)
         own.root.mkdir(exist_ok=True)
         self._held.callback(_remove_if_empty, own.root)
         self._blocks = shared_blocks(self._held, launch.kind, launch.plan)
         self._backend = self._held.enter_context(open_backend(launch.plan, detect_machine(), own))
-        if launch.plan.layout.num_nodes == 1:
-            return address, 0
+        layout = launch.plan.layout
+        if layout.num_nodes == 1:
+            return Opened((address, 0), {})
         self._listener = self._held.enter_context(listen(address))
         self._blocks[ENV_LISTENER_FD] = self._listener.fileno()
-        return address, self._listener.getsockname()[1]
+        calls = {
+            pair: self._held.enter_context(reserved_address(address))
+            for pair in launch.kind.calls(launch.plan)
+            if layout.node_of(pair[0]) == node
+        }
+        return Opened((address, self._listener.getsockname()[1]), calls)
 
     def introduce(self, nodes: Nodes) -> None:
         """Takes the addresses of all leaders; GMIs can be started from here on."""

@@ -61,7 +61,7 @@ def stages(strategy: str, layout: Layout, intra: str = "host") -> Sequence[Stage
       intra: `host` or `ipc`, the link inside a GPU for `har`.
     """
     if layout.num_nodes > 1:
-        return _over_nodes(stages(strategy, layout.of_one_node, intra), layout.gmis_of_node)
+        return _over_nodes(stages(strategy, layout.of_node(0), intra), layout.gmis_of_node)
     gpus, everyone = layout.gmis_of_gpu, (tuple(layout.gmis),)
     if strategy == "mpr":
         return [Stage("sum", "host", everyone)]
@@ -197,7 +197,7 @@ def predicted_s(
         raise ConfigError(f"strategy={strategy}: expected one of {', '.join(COSTS)}")
     if b1 <= 0 or b2 <= 0:
         raise ConfigError(f"b1={b1:g}, b2={b2:g}: bandwidths must be positive")
-    m_p, node = num_floats * BYTES_PER_FLOAT, layout.of_one_node
+    m_p, node = num_floats * BYTES_PER_FLOAT, layout.of_node(0)
     most = max(len(gmis) for gmis in node.gmis_of_gpu)
     inside_s = COSTS[strategy](node.num_gpus, most, m_p, b1, b2)
     if layout.num_nodes == 1:

@@ -79,8 +79,7 @@ class TrainConfig(KeyGroup):
 
     def _check_on_nodes(self) -> None:
         for key, value, allowed in (
-            ("algo", self.algo.name, ("ppo",)),
-            ("plan.template", self.plan.template, ("auto", "tcg_ex")),
+            ("plan.template", self.plan.template, ("auto", "tcg_ex", "decoupled")),
             ("plan.backend", self.plan.backend, ("auto", "cpu")),
             ("reduce.selection", self.reduce.selection, ("paper", "device")),
         ):
@@ -98,6 +97,12 @@ class TrainConfig(KeyGroup):
                     f"{key}=auto: a search is for one machine; with "
                     f"cluster.engine={self.cluster.engine} give a number"
                 )
+
+        if self.is_asynchronous and self.cluster.nodes == "auto":
+            raise ConfigError(
+                "cluster.nodes=auto: with algo=a3c give a number, because the GPUs of all nodes "
+                "together are divided into those that act and those that train"
+            )
 
     def _check_num_envs(self, num_envs: int) -> None:
         if isinstance(self.algo, A3cConfig):

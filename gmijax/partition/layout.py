@@ -14,15 +14,15 @@ class Layout:
     `Layout(((0, 1, 2), (3, 4, 5)))` is two GPUs with three GMIs each. Positions count GPUs of
     the job (0 is its first), not the machine's indices. Uneven layouts are allowed.
 
-    With several nodes all of them are alike: the GPUs are split evenly and in order, and so are
-    the ids.
+    With several nodes the GPUs are split evenly and in order.
 
     Attributes:
       gmis_of_gpu: ids by GPU.
       num_nodes: how many machines.
 
     Raises:
-      ConfigError: no GPU, a GPU without a GMI, or ids that are not 0 .. K-1, each once.
+      ConfigError: no GPU, a GPU without a GMI, ids that are not 0 .. K-1, each once, or GPUs that
+        cannot be split.
     """
 
     gmis_of_gpu: tuple[tuple[int, ...], ...]
@@ -36,13 +36,16 @@ class Layout:
             raise ConfigError(
                 f"plan.layout={self}: GMI ids must be 0 to {len(ids) - 1}, each exactly once"
             )
-
-        sizes = {len(gmis) for gmis in self.gmis_of_node}
-        ids_of_nodes = [gmi for gmis in self.gmis_of_node for gmi in gmis]
-        if self.num_gpus % self.num_nodes or len(sizes) > 1 or ids_of_nodes != ids:
+        if self.num_gpus % self.num_nodes:
             raise ConfigError(
-                f"plan.layout={self}: {self.num_nodes} nodes must be alike, with ids in order"
+                f"plan.layout={self}: {self.num_gpus} GPUs are not as many on each of "
+                f"{self.num_nodes} nodes"
             )
+
+    @property
+    def is_alike(self) -> bool:
+        """Whether the GMIs of all nodes are placed alike, with ids in order."""
+        return self == self.of_node(0).on_nodes(self.num_nodes)
 
     @classmethod
     def even(cls, num_gpus: int, gmis_per_gpu: int) -> Layout:
@@ -102,9 +105,10 @@ class Layout:
 
     def node_of(self, gmi: int) -> int:
         """Position of the node that holds `gmi`."""
-        return gmi * self.num_nodes // self.num_gmis
+        return self.gpu_of(gmi) * self.num_nodes // self.num_gpus
 
-    @property
-    def of_one_node(self) -> Layout:
-        """The layout that every node has by itself, with ids from 0."""
-        return Layout(self.gmis_of_gpu[: self.num_gpus // self.num_nodes])
+    def of_node(self, node: int) -> Layout:
+        """The layout of one node, with ranks in the node in place of ids."""
+        each, ids = self.num_gpus // self.num_nodes, self.gmis_of_node[node]
+        gpus = self.gmis_of_gpu[node * each : (node + 1) * each]
+        return Layout(tuple(tuple(ids.index(gmi) for gmi in gmis) for gmis in gpus))

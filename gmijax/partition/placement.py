@@ -10,6 +10,7 @@ from typing import NamedTuple
 
 from gmijax.config import PlanConfig
 from gmijax.errors import ConfigError
+from gmijax.partition.layout import Layout
 
 _TRAINING_SHARE = 4
 """With several GPUs one in four trains, at least one: physics takes much longer than updates."""
@@ -29,8 +30,11 @@ class Placement(NamedTuple):
     reason: str
 
 
-def place(plan: PlanConfig) -> Placement:
+def place(plan: PlanConfig, num_nodes: int = 1) -> Placement:
     """Decides which GPUs serve and which train, and numbers their GMIs.
+
+    On several nodes `plan.gpus` is of each, and the GPUs of all of them count on from node to
+    node, as if they were of one machine.
 
     `plan.serving_gpus` and `plan.training_gpus` are both numbers of GPUs, of which the first
     serve and the next train, or both lists of indices; a GPU in both lists does both. Without
@@ -45,8 +49,12 @@ def place(plan: PlanConfig) -> Placement:
             "plan.serving_gpus and plan.training_gpus, and the GMIs on each"
         )
     serving_gmis, training_gmis = _counts(plan)
+    if num_nodes > 1:
+        plan = dataclasses.replace(plan, gpus=plan.num_gpus * num_nodes)
     serving, training, indices = serving_and_training(plan)
     num_gpus = 1 + max(*serving, *training)
+    if num_nodes > 1:
+        _require_whole_nodes(num_gpus, indices, num_nodes)
     layout: list[list[int]] = [[] for _ in range(num_gpus)]
     homes = [gpu for gpu in training for _ in range(training_gmis)]
     trainers = tuple(range(len(homes)))
@@ -66,6 +74,26 @@ def place(plan: PlanConfig) -> Placement:
         f"{training_gmis} training GMIs on each of GPUs {_shown(training, indices)}"
     )
     return Placement(placed, trainers, reason)
+
+
+def most_gmis_of_a_node(plan: PlanConfig, num_nodes: int) -> int:
+    """How many GMIs of an asynchronous job the fullest of so many nodes has.
+
+    Raises:
+      ConfigError: as `place`.
+    """
+    rows = place(plan, num_nodes).plan.layout
+    assert rows is not None
+    return max(map(len, Layout(rows, num_nodes).gmis_of_node))
+
+
+def _require_whole_nodes(num_gpus: int, indices: tuple[int, ...] | None, num_nodes: int) -> None:
+    last = num_gpus - 1 if indices is None else max(indices)
+    if last != num_gpus - 1 or num_gpus % num_nodes:
+        raise ConfigError(
+            f"plan.serving_gpus, plan.training_gpus: take {num_gpus} GPUs, the last is number "
+            f"{last}; on {num_nodes} nodes every node must have as many, and each act or train"
+        )
 
 
 def num_gmis_of(plan: PlanConfig) -> tuple[int, str]:

@@ -24,7 +24,7 @@ from gmijax.partition.reduction import (
     why_not_under,
 )
 from gmijax.partition.shares import make_slices
-from gmijax.partition.templates import DESCRIPTIONS, TRAINER, group_of, roles_of
+from gmijax.partition.templates import DESCRIPTIONS, TRAINER, group_of, nodes_of, roles_of
 
 _NO_RINGS_ON_CPU = (
     "between virtual GPUs host memory is faster than any ring, ask for it with reduce.strategy={}"
@@ -46,23 +46,27 @@ def make_plan(
 
     `num_envs` is N, environments per GMI; `template` what `plan.template=auto` means; `trainers`
     are the ids of the GMIs that train, for the template `decoupled`. With `nodes`, machines by
-    address, each of them gets what `plan` says; `machine` is the first.
+    address, each of them gets what `plan` says, or with `decoupled` its part of `plan.layout`;
+    `machine` is the first.
 
     Raises:
       BackendUnavailable: the wanted backend cannot be had on this machine.
       ConfigError: a value that does not fit the machine or the backend.
     """
-    require_host(*num_gmis_of(plan), plan, machine)
+    if nodes is None:
+        require_host(*num_gmis_of(plan), plan, machine)
     layout = _layout(plan)
     reasons: list[str] = list(machine.warnings)
     chosen = template if plan.template == "auto" else plan.template
     backend = _backend(plan, layout, machine, chosen in ("tcg", "tdg"), reasons)
+    if nodes is not None:
+        layout = _on_nodes(layout, chosen, backend, nodes, reasons)
     gpus = choose_gpus(plan, layout, machine, backend, reasons) if backend != "cpu" else ()
     roles = roles_of(chosen, layout, trainers)
-    slices = make_slices(plan, layout, gpus, backend, machine, roles, reasons)
-    if nodes is not None:
-        layout, slices = _on_nodes(plan, layout, backend, roles, nodes, reasons)
-        roles *= len(nodes)
+    if nodes is None:
+        slices = make_slices(plan, layout, gpus, backend, machine, roles, reasons)
+    else:
+        slices = _slices_of_nodes(plan, layout, backend, roles, nodes, reasons)
     if plan.template == "auto":
         reasons.append(f"template {chosen}: {DESCRIPTIONS[chosen]}")
     strategy, intra = _reduction(reduce, layout, roles, backend, reasons)
@@ -100,31 +104,49 @@ def num_gmis_of(plan: PlanConfig) -> tuple[int, str]:
 
 
 def _on_nodes(
+    layout: Layout,
+    template: TemplateName,
+    backend: BackendName,
+    nodes: Mapping[str, Machine],
+    reasons: list[str],
+) -> Layout:
+    """The layout of all nodes; `layout` is that of each, with `decoupled` of all together."""
+    if backend != "cpu":
+        raise ConfigError(
+            "cluster.engine=ray: GPUs of several nodes are not supported yet; plan.backend=cpu "
+            "goes on without them"
+        )
+    is_whole = template == "decoupled"
+    if (num_gmis := layout.num_gmis * (1 if is_whole else len(nodes))) > MAX_GMIS:
+        raise ConfigError(
+            f"cluster.nodes={len(nodes)}: makes {num_gmis} GMIs; at most {MAX_GMIS} are allowed"
+        )
+    count = f"{layout.num_gmis} GMIs " + ("on all" if is_whole else "on each")
+    reasons.append(f"nodes {', '.join(nodes)}: {count} of {len(nodes)}")
+    if is_whole:
+        return Layout(layout.gmis_of_gpu, len(nodes))
+    return layout.on_nodes(len(nodes))
+
+
+def _slices_of_nodes(
     plan: PlanConfig,
     layout: Layout,
     backend: BackendName,
     roles: tuple[str, ...],
     nodes: Mapping[str, Machine],
     reasons: list[str],
-) -> tuple[Layout, tuple[Slice, ...]]:
-    """Layout and slices of all nodes; `layout` and `roles` are of each."""
-    if backend != "cpu":
-        raise ConfigError(
-            "cluster.engine=ray: GPUs of several nodes are not supported yet; plan.backend=cpu "
-            "goes on without them"
-        )
-    if (num_gmis := len(nodes) * layout.num_gmis) > MAX_GMIS:
-        raise ConfigError(
-            f"cluster.nodes={len(nodes)}: makes {num_gmis} GMIs; at most {MAX_GMIS} are allowed"
-        )
-    slices: list[Slice] = []
-    for place, machine in enumerate(nodes.values()):
-        require_host(*num_gmis_of(plan), plan, machine)
-        for share in make_slices(plan, layout, (), backend, machine, roles, []):
-            gmi, gpu = share.gmi + place * layout.num_gmis, share.gpu + place * layout.num_gpus
-            slices.append(dataclasses.replace(share, gmi=gmi, gpu=gpu))
-    reasons.append(f"nodes {', '.join(nodes)}: {layout.num_gmis} GMIs on each of {len(nodes)}")
-    return layout.on_nodes(len(nodes)), tuple(slices)
+) -> tuple[Slice, ...]:
+    """The share of every GMI of its node."""
+    slices: dict[int, Slice] = {}
+    for place, (name, machine) in enumerate(nodes.items()):
+        here, gmis = layout.of_node(place), layout.gmis_of_node[place]
+        require_host(here.num_gmis, f"cluster.nodes={len(nodes)}, node {name}", plan, machine)
+        theirs = [roles[gmi] for gmi in gmis]
+        said = [] if place else reasons  # What is said of all is said once.
+        for share in make_slices(plan, here, (), backend, machine, theirs, said):
+            gmi, gpu = gmis[share.gmi], share.gpu + place * here.num_gpus
+            slices[gmi] = dataclasses.replace(share, gmi=gmi, gpu=gpu)
+    return tuple(slices[gmi] for gmi in layout.gmis)
 
 
 def _layout(plan: PlanConfig) -> Layout:
@@ -177,6 +199,14 @@ def _reduction(
     training = group_of(layout, roles, TRAINER)
     if training is None:
         return "none", "host"
+    of_ranks = [training.layout.node_of(rank) for rank in range(len(training.gmis))]
+    nodes = nodes_of(layout, training.gmis)
+    is_split = [nodes[node] for node in of_ranks] == [layout.node_of(g) for g in training.gmis]
+    if not (is_split and training.layout.is_alike):
+        raise ConfigError(
+            f"plan.training_gpus: of layout {layout} GMIs {list(training.gmis)} train, and nodes "
+            "that train must have as many of them on as many GPUs, numbered in order of the nodes"
+        )
     strategy = _strategy(reduce, training.layout, backend, reasons)
     return strategy, _intra(reduce, strategy, layout, backend, reasons)
 

@@ -39,7 +39,7 @@ def select_strategy(layout: Layout) -> Choice:
     one leader of each exchanges, whatever they do inside.
     """
     if layout.num_nodes > 1:
-        inside = select_strategy(layout.of_one_node)
+        inside = select_strategy(layout.of_node(0))
         return inside._replace(why=f"in every node {inside.why}; their leaders exchange")
     num_gpus = layout.num_gpus
     if num_gpus <= 1:

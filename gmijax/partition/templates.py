@@ -46,7 +46,8 @@ class Group(NamedTuple):
 
     Attributes:
       gmis: their ids in order; a GMI's rank in the group is its position here.
-      layout: where they are, with ranks in place of ids; GPUs without one of them are left out.
+      layout: where they are, with ranks in place of ids; GPUs and nodes without one of them are
+        left out. Its nodes are those only if these are alike: who reduces asks for that.
     """
 
     gmis: tuple[int, ...]
@@ -91,6 +92,10 @@ def group_of(layout: Layout, roles: Iterable[str], role: str) -> Group | None:
         tuple(rank for rank, gmi in enumerate(gmis) if gmi in here) for here in layout.gmis_of_gpu
     )
     gpus = tuple(here for here in ranks if here)
-    # Where all GPUs take part, so do all nodes; other templates are of one machine.
-    is_whole = len(gpus) == layout.num_gpus
-    return Group(gmis, Layout(gpus, layout.num_nodes if is_whole else 1))
+    num_nodes = len(nodes_of(layout, gmis))
+    return Group(gmis, Layout(gpus, 1 if len(gpus) % num_nodes else num_nodes))
+
+
+def nodes_of(layout: Layout, gmis: Iterable[int]) -> tuple[int, ...]:
+    """Positions of the nodes that have some of these GMIs, in order."""
+    return tuple(sorted({layout.node_of(gmi) for gmi in gmis}))

@@ -7,7 +7,7 @@ asynchronous jobs ask here who the others are. No jax here.
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from types import MappingProxyType
@@ -52,11 +52,13 @@ class JobKind:
       module: main of every GMI, started by name.
       compile_once: whether all GMIs run the same programs, so that one compiles them for all.
       shared: the memory that the GMIs of a plan share, beside that of the reducer.
+      calls: between GMIs of different nodes, which connect by TCP: who listens, and who calls.
     """
 
     module: str
     compile_once: bool = True
     shared: Callable[[Plan], SharedBlocks] = lambda _: MappingProxyType({})
+    calls: Callable[[Plan], Sequence[tuple[int, int]]] = lambda _: ()
 
 
 SYNCHRONOUS: Final = JobKind("gmijax.workers.worker")
@@ -67,7 +69,8 @@ def training_kind(config: TrainConfig) -> JobKind:
     """The kind of a training job."""
     if config.is_asynchronous:
         shared = partial(_registers_and_channels, config)
-    elif config.plan.template == "tdg_ex":
+        return JobKind(SYNCHRONOUS.module, compile_once=False, shared=shared, calls=calls_of)
+    if config.plan.template == "tdg_ex":
         shared = partial(pipes, ROLLOUT_PIPE_BYTES)
     else:
         return SYNCHRONOUS
@@ -110,9 +113,9 @@ def training_plan(
     if not config.is_asynchronous:
         return make_plan(config.plan, config.reduce, num_envs, machine, nodes=nodes)
     _require_asynchronous(config)
-    if config.plan.layout is None:
+    if config.plan.layout is None and nodes is None:
         require_host(*num_gmis_of(config.plan), config.plan, machine)
-    placed = place(config.plan)
+    placed = place(config.plan, len(nodes or (None,)))
     plan = make_plan(
         placed.plan,
         config.reduce,
@@ -120,6 +123,7 @@ def training_plan(
         machine,
         template="decoupled",
         trainers=placed.trainers,
+        nodes=nodes,
     )
     topology, channel = topology_of(plan), config.channel
     _require_experience_for_all(topology)
@@ -137,7 +141,8 @@ def _require_asynchronous(config: TrainConfig) -> None:
     """Refuses settings that asynchronous jobs cannot have."""
     if config.channel.transport == "zmq":
         raise ConfigError(
-            "channel.transport=zmq: the GMIs of a job are on one host; allowed are memory, device"
+            "channel.transport=zmq: GMIs of one host use its memory, and those of different hosts "
+            "TCP without being told; allowed are memory, device"
         )
     if unknown := [name for name in config.channel.float16 if name not in FLOAT_CHANNELS]:
         raise ConfigError(
@@ -184,6 +189,18 @@ def groups_of(plan: Plan) -> tuple[Group, Group]:
     assert agents is not None
     assert trainers is not None
     return agents, trainers
+
+
+def calls_of(plan: Plan) -> tuple[tuple[int, int], ...]:
+    """Who listens and who calls, of the GMIs of an asynchronous job that are on different nodes.
+
+    Agents call trainers with their experience, the leading trainer calls agents with weights.
+    """
+    agents, trainers = (group.gmis for group in groups_of(plan))
+    pairs = [(trainer, agent) for trainer in trainers for agent in agents]
+    pairs += [(agent, trainers[0]) for agent in agents]
+    node_of = plan.layout.node_of
+    return tuple(pair for pair in pairs if node_of(pair[0]) != node_of(pair[1]))
 
 
 def topology_of(plan: Plan) -> ChannelTopology:

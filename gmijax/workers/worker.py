@@ -12,12 +12,15 @@ from __future__ import annotations
 
 import sys
 from contextlib import ExitStack
+from dataclasses import replace
+from socket import socket
 from typing import TYPE_CHECKING, Any
 
+from gmijax.collectives.nodes.meeting import Nodes, inherited_nodes
 from gmijax.config import A3cConfig, TrainConfig
 from gmijax.config.schema import from_dict
 from gmijax.partition.plan import Plan
-from gmijax.partition.templates import AGENT, TRAINER, Group, has_role
+from gmijax.partition.templates import AGENT, TRAINER, Group, has_role, nodes_of
 from gmijax.runs.folder import read_json
 from gmijax.supervise.child import ENV_PIPES_FD, ChildLink, required_fd, run_gmi
 from gmijax.supervise.kinds import ENV_CHANNELS_FD, ENV_REGISTERS_FD, groups_of, topology_of
@@ -76,7 +79,7 @@ def _run_synchronous(
         mail = Messenger(block, config.reduce.timeout_s)
         here = _neighbours(plan, link.gmi, AGENT)
         workers = RolloutWorkers(mail, here, config.run.start_timeout_s)
-    reducer = _trainers_reducer(config, plan, trainers, link, env, PpoLosses)
+    reducer = _trainers_reducer(config, plan, trainers, link, env, PpoLosses, *inherited_nodes())
     held.callback(reducer.close)
     return TrainingLoop(config, env, reducer, link, workers).run() | exchange_used(plan, reducer)
 
@@ -122,22 +125,26 @@ def _run_asynchronous(
     from gmijax.a3c.trainer import Trainer
     from gmijax.collectives.channel.build import open_receiver, open_sender
     from gmijax.learning.learner import num_weights
+    from gmijax.workers.node_registers import Sizes, over_nodes
 
     agents, trainers = groups_of(plan)
-    registers = open_job_registers(
-        required_fd(ENV_REGISTERS_FD),
-        num_weights(env.spec, config.algo),
-        num_counts(env),
-        len(agents.gmis),
-    )
-    channels = config.channel, topology_of(plan), link.gmi, required_fd(ENV_CHANNELS_FD)
+    sizes = Sizes(num_weights(env.spec, config.algo), num_counts(env))
+    registers = open_job_registers(required_fd(ENV_REGISTERS_FD), *sizes, len(agents.gmis))
+    topology, (nodes, listener) = topology_of(plan), inherited_nodes()
+    if nodes is not None and listener is not None:
+        held.callback(listener.close)
+        addresses = {(agent, trainer): at for (trainer, agent), at in nodes.calls.items()}
+        topology = replace(topology, addresses=addresses, secret=nodes.token)
+        at_leader = agents.gmis, trainers.gmis[0], held
+        registers = over_nodes(registers, sizes, nodes, link.gmi, *at_leader)
+    channels = config.channel, topology, link.gmi, required_fd(ENV_CHANNELS_FD)
     if link.gmi in agents.gmis:
         sender = open_sender(*channels)
         held.callback(sender.close)
         return Agent(config, env, place, trainers.gmis, registers, sender, link).run()
     receiver = open_receiver(*channels)
     held.callback(receiver.close)
-    reducer = _trainers_reducer(config, plan, trainers, link, env, A3cLosses)
+    reducer = _trainers_reducer(config, plan, trainers, link, env, A3cLosses, nodes, listener)
     held.callback(reducer.close)
     trainer = Trainer(config, env, agents.gmis, registers, receiver, reducer, link)
     return trainer.run() | exchange_used(plan, reducer)
@@ -163,16 +170,18 @@ def _trainers_reducer(
     link: ChildLink,
     env: BatchedEnv,
     losses: Any,
+    nodes: Nodes | None,
+    listener: socket | None,
 ) -> Reducer:
     """The reducer among the trainers, whose ranks are their places in the group.
 
     It averages a gradient and the parts of the loss, the named tuple `losses`.
     """
     from gmijax.collectives.build import Membership, build_reducer
-    from gmijax.collectives.nodes.meeting import inherited_nodes
     from gmijax.learning.updates import exchange_size
 
-    nodes, listener = inherited_nodes()
+    if nodes is not None:
+        nodes = nodes.among(nodes_of(plan.layout, trainers.gmis))
     membership = Membership(
         layout=trainers.layout,
         rank=trainers.gmis.index(link.gmi),

@@ -21,7 +21,9 @@ KINDS = get_type_hints(ChannelConfig)
 # Where experience stays on the device it needs agents and trainers on one: tests of its own.
 TRANSPORTS = [name for name in get_args(KINDS["transport"]) if name != "device"]
 # A design goes through any transport alike, so each of both is here at least once.
-WAYS = [*(("multi", transport) for transport in TRANSPORTS), ("uni", "memory")]
+WAYS = [*(("multi", transport, None) for transport in TRANSPORTS), ("uni", "memory", None)]
+# And both transports at once: of agents 0 and 1 with trainer 4, and of agent 2 with trainer 3.
+WAYS += [("multi", "memory", (0, 0, 1, 1, 0))]
 HERE = str(Path(__file__).parents[1])
 TOPOLOGY = ChannelTopology(agents=(0, 1, 2), trainers=(3, 4), gpu_of=(0, 0, 1, 2, 3))
 
@@ -44,16 +46,16 @@ def require_all_once(job: ChannelJob, count: int) -> None:
         np.testing.assert_array_equal(np.sort(np.concatenate(parts)), np.arange(count))
 
 
-@pytest.mark.parametrize(("design", "transport"), WAYS)
+@pytest.mark.parametrize(("design", "transport", "node_of"), WAYS)
 def test_nothing_is_lost_doubled_torn_or_out_of_order(
-    design: Any, transport: Any, tmp_path: Path
+    design: Any, transport: Any, node_of: Any, tmp_path: Path
 ) -> None:
     """10^5 unrolls with pauses; batches neither fit into transfers nor the other way round."""
-    require_zmq(transport)
+    require_zmq("zmq" if node_of else transport)
     count = 33_600
     task = {"count": count, "envs": 200, "batch": 77, "steps": 2, "pause_chance": 0.1}
     settings = config(design=design, transport=transport)
-    with ChannelJob(tmp_path, settings, TOPOLOGY, **task).start() as job:
+    with ChannelJob(tmp_path, settings, TOPOLOGY, node_of, **task).start() as job:
         for rank in job.ranks:
             assert job.result(rank)["error"] is None, job.result(rank)
         require_all_once(job, count)

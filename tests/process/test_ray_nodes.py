@@ -108,6 +108,51 @@ def test_two_nodes_learn_the_bits_of_two_gpus_of_one_machine(
     assert not pids_of(there)
 
 
+def test_agents_on_one_node_teach_trainers_on_the_other_and_outlive_one_of_them(
+    cluster: Cluster, tmp_path: Path
+) -> None:
+    run, memory = tmp_path / "run", shared_memory()
+    job = start(
+        *(*POINT[:-1], "algo=a3c", FOREVER, RAY, cluster.address, "cluster.nodes=2"),
+        *("plan.serving_gmis_per_gpu=2", "run.dir=run", "run.max_restarts=1"),
+        *("algo.policy_hidden_layer_sizes=[16]", "algo.value_hidden_layer_sizes=[16]"),
+        "run.checkpoint_every=50",
+        cwd=tmp_path,
+    )
+    said = tmp_path / "stderr.txt"
+
+    def wait(condition: Any, what: str) -> Any:
+        return wait_until(
+            lambda: condition() or job.poll() is not None, 120, f"{what}: {said.read_text()}"
+        )
+
+    try:
+        wait(lambda: list(run.glob("checkpoints/[0-9]*")), "agents have added to a checkpoint")
+        assert job.poll() is None, said.read_text()
+        kill(gmi_pid(run, 2) or 0)
+        wait(lambda: len(events(run, "recovered")) == 1, "it goes on")
+        [fault] = events(run, "fault")
+        assert (fault["gmi"], "SIGKILL" in fault["cause"]) == (2, True)
+        before = int(Path(events(run, "start")[-1]["checkpoint"]).name)
+        job.send_signal(signal.SIGTERM)
+        assert job.wait(60) == 130, said.read_text()
+    finally:
+        kill(job.pid)
+        job.wait()
+    summary = json.loads((run / "summary.json").read_text())
+    plan = summary["plan"]
+    assert (summary["status"], plan["layout"]) == ("interrupted", [[1, 2], [0]])
+    assert [node["gmis"] for node in plan["nodes"]] == [[1, 2], [0]]
+    assert summary["env_steps"] > before
+    # They act with what the trainer publishes, and send all of it.
+    assert summary["staleness"]["mean"] < 50
+    assert summary["dropped"] == 0
+    names = {path.name for path in Path(summary["checkpoint"]).iterdir()}
+    assert names == {"gmi_1", "gmi_2", "learner", "meta.json"}
+    assert not pids_of(run)
+    assert shared_memory() <= memory
+
+
 def test_a_job_outlives_a_gmi_and_a_node_and_nothing_outlives_its_controller(
     cluster: Cluster, tmp_path: Path
 ) -> None:

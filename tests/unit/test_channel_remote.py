@@ -2,17 +2,17 @@
 
 from __future__ import annotations
 
+import os
 import socket
 import threading
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
 import pytest
 
-from benchmarks.channel_job import reserved_address
 from gmijax.errors import CollectiveError, ConfigError, PeerLost, PipeClosed
 
 pytest.importorskip("zmq")
@@ -22,8 +22,19 @@ import zmq
 from gmijax.collectives.channel import remote
 from gmijax.collectives.channel.connection import ENV_KEY
 from gmijax.collectives.channel.remote import RemoteReader, RemoteWriter
+from gmijax.collectives.nodes.meeting import reserved_address
 
 CAPACITY = 2**20
+# What ZeroMQ says first (https://rfc.zeromq.org/spec/23), with CURVE, as one that listens.
+GREETING = b"\xff" + bytes(8) + b"\x7f\x03\x00" + b"CURVE".ljust(20, b"\0") + b"\x01" + bytes(31)
+PLAIN = {
+    "silent": b"",
+    "http": b"GET / HTTP/1.0\r\n\r\n",
+    "noise": os.urandom(2**20),
+    "oversized": GREETING + b"\x06" + (2**40).to_bytes(8, "big"),
+}
+"""What strangers send who do not use ZeroMQ."""
+
 FORGED = remote._HEADER.pack(remote.MAGIC, remote.DATA, 0), b""
 
 
@@ -37,7 +48,7 @@ def cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 @pytest.fixture
 def address() -> Iterator[str]:
-    with reserved_address() as reserved:
+    with reserved_address("127.0.0.1") as reserved:
         yield reserved
 
 
@@ -71,7 +82,7 @@ def why_lost(reader: RemoteReader, looks: int) -> Any:
 
 
 @contextmanager
-def stranger(kind: str, address: str, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+def stranger(kind: str, address: str) -> Iterator[None]:
     """Somebody else at the port, who tries to deliver something."""
     host, _, port = address.rpartition(":")
     if kind == "zeromq":
@@ -80,27 +91,30 @@ def stranger(kind: str, address: str, monkeypatch: pytest.MonkeyPatch) -> Iterat
             end.connect(f"tcp://{address}")
             end.send_multipart(FORGED)
             yield
-    elif kind == "other secret":
-        monkeypatch.setenv(ENV_KEY, "that of another job")
-        writer = RemoteWriter(address, 0, 1, CAPACITY)
+    elif kind == "other job":
+        writer = RemoteWriter(address, 0, 1, CAPACITY, os.urandom(32))
         send(writer, 66)
         yield
         assert not writer._connection.is_up()
         writer._connection.close()
     else:
         with socket.create_connection((host, int(port)), timeout=5.0) as plain:
-            plain.sendall(b"GET / HTTP/1.0\r\n\r\n" if kind == "http" else b"")
-        yield
+            with suppress(ConnectionError):
+                plain.sendall(PLAIN[kind])
+                # Others are hung up on after the greeting, and not only when they have given up.
+                while kind in ("noise", "oversized") and plain.recv(4096):
+                    pass
+            yield
 
 
-@pytest.mark.parametrize("kind", ["silent", "http", "zeromq", "other secret"])
+@pytest.mark.parametrize("kind", [*PLAIN, "zeromq", "other job"])
 def test_a_stranger_delivers_nothing_and_is_not_the_end_of_the_agent(
-    kind: str, address: str, monkeypatch: pytest.MonkeyPatch
+    kind: str, address: str
 ) -> None:
-    reader, writer = RemoteReader(address, 1, 0), RemoteWriter(address, 0, 1, CAPACITY)
+    reader, writer = RemoteReader(address, 1, 0, CAPACITY), RemoteWriter(address, 0, 1, CAPACITY)
     send(writer, 1)
     assert receive(reader, 1) == [1]
-    with stranger(kind, address, monkeypatch):
+    with stranger(kind, address):
         assert why_lost(reader, 6) is None
         assert reader._sequence == 1
     send(writer, 2)
@@ -111,7 +125,7 @@ def test_a_stranger_delivers_nothing_and_is_not_the_end_of_the_agent(
 
 
 def test_an_agent_stays_until_its_trainer_has_taken_all(address: str) -> None:
-    reader, writer = RemoteReader(address, 1, 0), RemoteWriter(address, 0, 1, CAPACITY)
+    reader, writer = RemoteReader(address, 1, 0, CAPACITY), RemoteWriter(address, 0, 1, CAPACITY)
     send(writer, 1, 2)
     assert receive(reader, 1) == [1]
     closing = threading.Thread(target=writer.close)
@@ -130,7 +144,7 @@ def test_an_agent_stays_until_its_trainer_has_taken_all(address: str) -> None:
 def test_an_agent_does_not_wait_for_a_trainer_that_is_not_there(
     is_there: bool, address: str
 ) -> None:
-    reader = RemoteReader(address, 1, 0) if is_there else None
+    reader = RemoteReader(address, 1, 0, CAPACITY) if is_there else None
     writer = RemoteWriter(address, 0, 1, CAPACITY)
     send(writer, 1)
     if reader is not None:
@@ -144,13 +158,13 @@ def test_an_agent_does_not_wait_for_a_trainer_that_is_not_there(
 
 def test_an_address_that_cannot_be_is_named() -> None:
     with pytest.raises(CollectiveError, match=r"no connection with rank 0 at 127.0.0.1 "):
-        RemoteReader("127.0.0.1", 1, 0)
+        RemoteReader("127.0.0.1", 1, 0, CAPACITY)
     with pytest.raises(CollectiveError, match=r"no connection with rank 1 at 127.0.0.1 "):
         RemoteWriter("127.0.0.1", 0, 1, CAPACITY)
 
 
 def test_what_is_no_message_of_a_channel_is_an_error(address: str) -> None:
-    reader, writer = RemoteReader(address, 1, 0), RemoteWriter(address, 0, 1, CAPACITY)
+    reader, writer = RemoteReader(address, 1, 0, CAPACITY), RemoteWriter(address, 0, 1, CAPACITY)
     for junk in (b"", b"junk", b"x" * remote._HEADER.size):
         writer._connection.send([junk])
         with pytest.raises(CollectiveError, match="rank 1: no message of a channel from 0"):
@@ -161,31 +175,39 @@ def test_what_is_no_message_of_a_channel_is_an_error(address: str) -> None:
     reader.close()
 
 
-def test_a_message_that_is_too_long_is_not_taken(
-    address: str, monkeypatch: pytest.MonkeyPatch
+def test_a_message_that_is_too_long_is_not_taken_and_what_follows_is_an_error(
+    address: str,
 ) -> None:
-    monkeypatch.setattr(remote, "MAX_PART_BYTES", 2**16)
-    reader, writer = RemoteReader(address, 1, 0), RemoteWriter(address, 0, 1, CAPACITY)
-    assert writer.max_message_bytes == 2**16
-    longest = [end._connection._socket.getsockopt(zmq.MAXMSGSIZE) for end in (reader, writer)]
-    assert longest == [2**16 + 4096, 4096]
-    writer.close()
-    reader.close()
+    """Also from one who has the secret: the connection ends, and the next one misses a message."""
+    reader, writer = RemoteReader(address, 1, 0, CAPACITY), RemoteWriter(address, 0, 1, CAPACITY)
+    assert writer.max_message_bytes == CAPACITY // 2
+    send(writer, 1)
+    assert receive(reader, 1) == [1]
+    writer._connection.send([FORGED[0], bytes(CAPACITY // 2 + remote.MAX_ANSWER_BYTES + 1)])
+    writer._sequence += 1
+    send(writer, 3)
+    with pytest.raises(CollectiveError, match="message 1 from rank 0 is lost, here is message 2"):
+        receive(reader, 1)
+    # An agent takes nothing but answers.
+    limit = writer._connection._socket.getsockopt(zmq.MAXMSGSIZE)
+    assert limit == remote.MAX_ANSWER_BYTES
+    for end in (writer, reader):
+        end._connection.close()
 
 
 def test_a_network_needs_a_secret_that_is_given(
     cache: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     with pytest.raises(ConfigError, match=rf"^channel\.transport=zmq: 0\.0\.0\.0:1 .* {ENV_KEY}"):
-        RemoteReader("0.0.0.0:1", 1, 0)
+        RemoteReader("0.0.0.0:1", 1, 0, CAPACITY)
     monkeypatch.setenv(ENV_KEY, "short")
     with pytest.raises(ConfigError, match="at least 16 characters"):
-        RemoteReader("127.0.0.1:1", 1, 0)
+        RemoteReader("127.0.0.1:1", 1, 0, CAPACITY)
     assert not cache.exists()
 
 
 def test_the_secret_of_a_user_is_for_nobody_else(address: str, cache: Path) -> None:
-    RemoteReader(address, 1, 0).close()
+    RemoteReader(address, 1, 0, CAPACITY).close()
     [key] = cache.iterdir()
     assert key.stat().st_mode & 0o777 == 0o600
     assert len(key.read_text()) == 64

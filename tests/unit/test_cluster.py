@@ -18,6 +18,7 @@ from gmijax.cluster.cluster_job import ClusterJob
 from gmijax.cluster.node import Facts, Node, Seen, address_of, own_versions
 from gmijax.cluster.ray_nodes import Joined, RayCluster
 from gmijax.cluster.remote_gmi import RemoteNode
+from gmijax.collectives.nodes.meeting import Nodes
 from gmijax.config import ClusterConfig, PlanConfig, ReduceConfig
 from gmijax.control.restarts import with_nodes_left
 from gmijax.errors import ConfigError, GmiFailed, JobInterrupted, ReportedError
@@ -27,7 +28,7 @@ from gmijax.partition.planner import make_plan
 from gmijax.runs.folder import GmiPaths
 from gmijax.supervise.failures import describe_exit, first_cause, is_consequence
 from gmijax.supervise.heartbeat import Heartbeat
-from gmijax.supervise.kinds import JobKind, training_plan
+from gmijax.supervise.kinds import JobKind, calls_of, training_plan
 
 
 class FakeAnswer:
@@ -63,7 +64,7 @@ def a_job(node: RemoteNode, versions: dict[str, str | None] | None = None) -> Cl
     [
         (("cluster.engine=slurm",), "cluster.engine=slurm: expected one of ray or null"),
         (("cluster.address=ray://head:10001",), "must be started on a node of the cluster"),
-        (("cluster.engine=ray", "algo=a3c"), "algo=a3c: not with cluster.engine=ray yet"),
+        (("cluster.engine=ray", "algo=a3c"), "nodes=auto: with algo=a3c give a number"),
         (("cluster.engine=ray", "plan.template=tdg_ex"), "template=tdg_ex: not with cluster"),
         (("cluster.engine=ray", "plan.backend=mps"), "allowed are auto, cpu"),
         (("cluster.engine=ray", "num_envs=auto"), "num_envs=auto: a search is for one machine"),
@@ -184,6 +185,74 @@ def test_the_plan_of_nodes_has_each_nodes_shares_under_global_ids() -> None:
         make_plan(*settings, machine(1), nodes={"a": machine(1)})
 
 
+def asynchronous_plan(*overrides: str, nodes: int = 2) -> Plan:
+    settings = ("env=ball_balance", "algo=a3c", "cluster.engine=ray", "num_envs=16")
+    config = compose(*settings, f"cluster.nodes={nodes}", *overrides)
+    machines = {f"10.0.0.{node}": machine(0) for node in range(nodes)}
+    return training_plan(config, machine(0), nodes=machines)
+
+
+@pytest.mark.parametrize(
+    ("overrides", "nodes", "layout", "of_nodes", "strategy"),
+    [
+        ((), 2, [[1], [0]], [[1], [0]], "none"),
+        (("plan.serving_gmis_per_gpu=2",), 2, [[1, 2], [0]], [[1, 2], [0]], "none"),
+        (("plan.gpus=2",), 2, [[1], [2], [3], [0]], [[1, 2], [0, 3]], "none"),
+        (("plan.training_gmis_per_gpu=2",), 2, [[2], [0, 1]], [[2], [0, 1]], "mpr"),
+        (
+            ("plan.serving_gpus=[0,1]", "plan.training_gpus=[0,1]"),
+            *(2, [[0, 2], [1, 3]], [[0, 2], [1, 3]], "mpr"),
+        ),
+        (("plan.serving_gpus=2", "plan.training_gpus=2"), 4, None, [[2], [3], [0], [1]], "mpr"),
+    ],
+)
+def test_agents_and_trainers_are_placed_over_the_gpus_of_all_nodes(
+    overrides: tuple[str, ...], nodes: int, layout: Any, of_nodes: Any, strategy: str
+) -> None:
+    plan = asynchronous_plan(*overrides, nodes=nodes)
+    assert plan.to_dict()["layout"] == (layout or of_nodes)
+    assert [node["gmis"] for node in plan.nodes_data()] == of_nodes
+    assert plan.strategy == strategy
+    assert [share.gmi for share in plan.slices] == list(plan.layout.gmis)
+    assert [plan.layout.gpu_of(share.gmi) for share in plan.slices] == [s.gpu for s in plan.slices]
+    assert Plan.from_dict(plan.to_dict()) == plan
+
+
+def test_who_calls_whom_over_nodes() -> None:
+    plan = asynchronous_plan("plan.gpus=2", "plan.training_gmis_per_gpu=2")
+    assert plan.nodes_data()[1]["gmis"] == [0, 1, 4]  # Trainers 0 and 1, agents 2 to 4.
+    experience, weights = ((0, 2), (0, 3), (1, 2), (1, 3)), ((2, 0), (3, 0))
+    assert calls_of(plan) == (*experience, *weights)
+
+
+@pytest.mark.parametrize(
+    ("overrides", "message"),
+    [
+        (("plan.serving_gpus=2", "plan.training_gpus=1"), "take 3 GPUs, .*as many"),
+        (("plan.serving_gpus=[0]", "plan.training_gpus=[3]"), "the last is number 3; on 2"),
+        (
+            ("plan.gpus=2", "plan.serving_gpus=[0]", "plan.training_gpus=[1,2,3]"),
+            "as many of them",
+        ),
+        (("channel.transport=zmq",), "TCP without being told"),
+        (("plan.layout=[[0]]",), "with the decoupled template give"),
+    ],
+)
+def test_placements_that_nodes_cannot_have_are_refused(
+    overrides: tuple[str, ...], message: str
+) -> None:
+    with pytest.raises(ConfigError, match=message):
+        asynchronous_plan(*overrides)
+
+
+def test_nodes_know_the_calls_and_count_leaders_among_those_that_train() -> None:
+    nodes = Nodes(2, (("a", 1), ("b", 2), ("c", 3)), b"secret", {(0, 3): "a:4"})
+    fd = nodes.to_file()
+    assert Nodes.from_file(fd) == nodes
+    os.close(fd)
+    assert nodes.among((1, 2))[:2] == (1, (("b", 2), ("c", 3)))
+
+
 def test_a_job_goes_on_with_the_nodes_that_are_left() -> None:
     config = compose("env=ball_balance", "cluster.engine=ray", "num_envs=16", "seed=3")
     plan = training_plan(config, machine(0), nodes={"a": machine(0), "b": machine(0)})
@@ -228,7 +297,6 @@ def test_a_node_starts_polls_and_ends_gmis(
 ) -> None:
     from supervision import make_launch
 
-    from gmijax.collectives.nodes.meeting import Nodes
     from gmijax.runs.folder import RunPaths
 
     monkeypatch.setattr(nodes, "detect_machine", lambda: machine(0))
@@ -238,8 +306,9 @@ def test_a_node_starts_polls_and_ends_gmis(
     assert isinstance(launch.kind, JobKind)
     node = Node({"JAX_THING": "1"}, str(tmp_path), None, "127.0.0.1")
     assert os.environ["JAX_THING"] == "1"
-    host, port = node.open(launch, 0, "127.0.0.1")
-    node.introduce(Nodes(0, ((host, port),), b"token"))
+    opened = node.open(launch, 0, "127.0.0.1")
+    assert opened.calls == {}
+    node.introduce(Nodes(0, (opened.leader,), b"token"))
     pid = node.start(0, False)
     assert isinstance(pid, int)
     node.order(0, "kill")

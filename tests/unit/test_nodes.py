@@ -182,9 +182,13 @@ def test_a_layout_on_nodes_has_global_ids_and_ranks_in_nodes() -> None:
     assert layout.gmis_of_gpu == ((0, 2), (1,), (3, 5), (4,))
     assert layout.gmis_of_node == ((0, 1, 2), (3, 4, 5))
     assert [layout.node_of(gmi) for gmi in layout.gmis] == [0, 0, 0, 1, 1, 1]
-    assert layout.of_one_node == Layout(((0, 2), (1,)))
-    with pytest.raises(ConfigError, match="2 nodes must be alike"):
-        Layout(((0, 1), (2,)), 2)
+    assert layout.is_alike
+    assert layout.of_node(1) == Layout(((0, 2), (1,)))
+    apart = Layout(((1, 2), (0,)), 2)
+    assert [apart.node_of(gmi) for gmi in apart.gmis] == [1, 0, 0]
+    assert not apart.is_alike
+    with pytest.raises(ConfigError, match="3 GPUs are not as many on each of 2 nodes"):
+        Layout(((0,), (1,), (2,)), 2)
 
 
 def test_the_stages_of_nodes_are_those_of_har_on_as_many_gpus() -> None:

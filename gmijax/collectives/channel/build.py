@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from contextlib import ExitStack
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 from gmijax.collectives.channel.batcher import Batcher, Stack
@@ -34,14 +34,17 @@ DEVICE_MEMORY: NewMemory = cuda_memory
 class ChannelTopology:
     """Ranks that send and ranks that receive, and the GPU of all K.
 
-    With `transport=zmq`, `addresses` says where the trainer of a pair (agent, trainer) listens,
-    as `host:port`.
+    Attributes:
+      addresses: where the trainer of a pair (agent, trainer) listens, as `host:port`: of all pairs
+        with `transport=zmq`; with `memory` of those on different nodes, which then use TCP too.
+      secret: by which both ends of such a pair know each other; None: see `connection.py`.
     """
 
     agents: tuple[int, ...]
     trainers: tuple[int, ...]
     gpu_of: tuple[int, ...]
     addresses: Mapping[tuple[int, int], str] | None = None
+    secret: bytes | None = field(default=None, repr=False)
 
     def __post_init__(self) -> None:
         if not self.agents or not self.trainers:
@@ -50,13 +53,14 @@ class ChannelTopology:
                 "least one of each"
             )
 
-    def address(self, agent: int, trainer: int) -> str:
-        """See above."""
-        if self.addresses is None or (agent, trainer) not in self.addresses:
+    def address(self, agent: int, trainer: int, config: ChannelConfig) -> str | None:
+        """See above; None for a pair that uses memory."""
+        address = (self.addresses or {}).get((agent, trainer))
+        if address is None and config.transport == "zmq":
             raise ConfigError(
                 f"channel.transport=zmq: needs an address for agent {agent} and trainer {trainer}"
             )
-        return self.addresses[agent, trainer]
+        return address
 
 
 def require_memory(config: ChannelConfig, topology: ChannelTopology) -> None:
@@ -97,17 +101,17 @@ def open_sender(
     near = [peer for peer in trainers if topology.gpu_of[peer] == topology.gpu_of[rank]]
     if config.transport == "device":
         return _device_sender(config, _open_block(rank, fd, held), near, held)
-    if config.transport == "zmq":
-        from gmijax.collectives.channel.remote import RemoteWriter
-
-        addresses = {peer: topology.address(rank, peer) for peer in trainers}
-        writers: list[ChannelWriter] = [
-            RemoteWriter(address, rank, peer, config.capacity_bytes)
-            for peer, address in addresses.items()
-        ]
-    else:
+    writers: list[ChannelWriter] = []
+    addresses = {peer: topology.address(rank, peer, config) for peer in trainers}
+    far = {peer: at for peer, at in addresses.items() if at}
+    if len(far) < len(addresses):
         block = _open_block(rank, fd, held)
-        writers = [PipeWriter(block, peer) for peer in trainers]
+        writers += [PipeWriter(block, peer) for peer in addresses if peer not in far]
+    if far:
+        from gmijax.collectives.channel.remote import RemoteWriter  # Needs pyzmq.
+
+        settings = config.capacity_bytes, topology.secret
+        writers += [RemoteWriter(at, rank, peer, *settings) for peer, at in far.items()]
     migrator = Migrator(writers, near)
     held.callback(migrator.close)
     most = max_piece_bytes(config.capacity_bytes)
@@ -130,16 +134,17 @@ def open_receiver(
 ) -> Batcher:
     """The end of trainer `rank`; arguments and errors as `open_sender`."""
     held = ExitStack()
-    if config.transport == "zmq":
-        from gmijax.collectives.channel.remote import RemoteReader
-
-        addresses = {peer: topology.address(peer, rank) for peer in topology.agents}
-        readers: list[ChannelReader] = [
-            RemoteReader(address, rank, peer) for peer, address in addresses.items()
-        ]
-    else:
+    readers: list[ChannelReader] = []
+    addresses = {peer: topology.address(peer, rank, config) for peer in topology.agents}
+    far = {peer: at for peer, at in addresses.items() if at}
+    if len(far) < len(addresses):
         block = _open_block(rank, fd, held)
-        readers = [PipeReader(block, peer) for peer in topology.agents]
+        readers += [PipeReader(block, peer) for peer in addresses if peer not in far]
+    if far:
+        from gmijax.collectives.channel.remote import RemoteReader  # Needs pyzmq.
+
+        settings = config.capacity_bytes, topology.secret
+        readers += [RemoteReader(at, rank, peer, *settings) for peer, at in far.items()]
     for reader in readers:
         held.callback(reader.close)
     if config.transport == "device":

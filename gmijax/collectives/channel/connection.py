@@ -1,9 +1,10 @@
 """One end of a TCP connection between two processes, by pyzmq, for those who share a secret.
 
 ZeroMQ's CURVE encrypts and authenticates. Whoever listens has a pair of keys that follows from the
-secret, and its public half is told to nobody: without it no handshake succeeds. The secret is in
-`GMIJAX_CHANNEL_KEY`, the same for all processes of a job; between processes of one user on one
-host a file that only this user can read takes its place.
+secret, and its public half is told to nobody: without it no handshake succeeds. The GMIs of a job
+on several nodes are given the job's; in other processes it is in `GMIJAX_CHANNEL_KEY`, the same
+for all of them, and between processes of one user on one host a file that only this user can read
+takes its place.
 """
 
 from __future__ import annotations
@@ -54,8 +55,15 @@ _WATCHED: Final = (
 class Connection:
     """One end of a connection: frames in and out, and whether the other end is there.
 
-    One end of `address` (`host:port`) listens. Who sends a part of more than `max_frame_bytes` is
-    cut off.
+    Args:
+      address: `host:port`, at which one of the two listens.
+      rank: of this process, for messages.
+      peer: that of the other one.
+      max_frame_bytes: who sends a longer part of a message is cut off.
+      listens: whether this is the end that listens.
+      secret: of the job; None: see the module.
+      newest_only: of messages that wait, at either end, the last one takes the place of all
+        others; they have one part.
 
     Raises:
       CollectiveError: an address that cannot be.
@@ -63,7 +71,15 @@ class Connection:
     """
 
     def __init__(
-        self, address: str, rank: int, peer: int, max_frame_bytes: int, *, listens: bool
+        self,
+        address: str,
+        rank: int,
+        peer: int,
+        max_frame_bytes: int,
+        *,
+        listens: bool,
+        secret: bytes | None = None,
+        newest_only: bool = False,
     ) -> None:
         self.rank, self.peer = rank, peer
         self.is_closed = False
@@ -71,12 +87,13 @@ class Connection:
         self._strangers: set[int] = set()
         self._handshakes = 0
         self._was_up = False
-        server_key = _server_key(address)
+        server_key = _server_key(address, secret)
         self._context = zmq.Context()
         self._socket = self._context.socket(zmq.DEALER)
         for option, value in _OPTIONS.items():
             self._socket.setsockopt(option, value)
         self._socket.setsockopt(zmq.MAXMSGSIZE, max_frame_bytes)
+        self._socket.setsockopt(zmq.CONFLATE, newest_only)
         self._monitor = self._socket.get_monitor_socket(_WATCHED)
         try:
             if listens:
@@ -154,9 +171,9 @@ class Connection:
             self._context.term()
 
 
-def _server_key(address: str) -> bytes:
+def _server_key(address: str, secret: bytes | None) -> bytes:
     """The secret key of whoever listens, as ZeroMQ writes keys."""
-    given = os.environ.get(ENV_KEY, "").encode()
+    given = secret or os.environ.get(ENV_KEY, "").encode()
     if given and len(given) < _SHORTEST_KEY:
         raise ConfigError(f"{ENV_KEY}: a secret must have at least {_SHORTEST_KEY} characters")
     if not given and not _is_loopback(address.rpartition(":")[0]):

@@ -28,14 +28,18 @@ DATA, GOODBYE, RELEASED = 1, 2, 3
 _HEADER: Final = struct.Struct("<IIQ")
 """magic, kind, sequence."""
 
-MAX_PART_BYTES: Final = 2**30
-"""Longest part of a message: who sends a longer one is cut off."""
+_MAX_PART_BYTES: Final = 2**30
 
-_MAX_ANSWER_BYTES: Final = 4096
+MAX_ANSWER_BYTES: Final = 4096
 """Longest part that an agent gets: a header, and what ZeroMQ's handshake takes."""
 
 _FAREWELL_S: Final = 5.0
 """How long an agent that closes waits for its trainer to take what is on the way."""
+
+
+def max_part_bytes(capacity_bytes: int) -> int:
+    """Longest part of a message with channels of such capacity: longer ones are cut off."""
+    return min(capacity_bytes // 2, _MAX_PART_BYTES)
 
 
 class _Received(NamedTuple):
@@ -78,9 +82,18 @@ class RemoteWriter(_End):
     Of its load only what comes from this agent is known.
     """
 
-    def __init__(self, address: str, rank: int, peer: int, capacity_bytes: int) -> None:
-        super().__init__(Connection(address, rank, peer, _MAX_ANSWER_BYTES, listens=False))
-        self.max_message_bytes = min(capacity_bytes // 2, MAX_PART_BYTES)
+    def __init__(
+        self,
+        address: str,
+        rank: int,
+        peer: int,
+        capacity_bytes: int,
+        secret: bytes | None = None,
+    ) -> None:
+        super().__init__(
+            Connection(address, rank, peer, MAX_ANSWER_BYTES, listens=False, secret=secret)
+        )
+        self.max_message_bytes = max_part_bytes(capacity_bytes)
         self._capacity_bytes = capacity_bytes
         self._released = self._on_the_way = 0
         self._lengths: deque[int] = deque()
@@ -152,9 +165,16 @@ class RemoteWriter(_End):
 class RemoteReader(_End):
     """The way from agent `peer`, for which the trainer listens at `address`; as a `PipeReader`."""
 
-    def __init__(self, address: str, rank: int, peer: int) -> None:
-        longest = MAX_PART_BYTES + _MAX_ANSWER_BYTES
-        super().__init__(Connection(address, rank, peer, longest, listens=True))
+    def __init__(
+        self,
+        address: str,
+        rank: int,
+        peer: int,
+        capacity_bytes: int,
+        secret: bytes | None = None,
+    ) -> None:
+        longest = max_part_bytes(capacity_bytes) + MAX_ANSWER_BYTES
+        super().__init__(Connection(address, rank, peer, longest, listens=True, secret=secret))
         self._is_held = self._is_cut = self._is_empty = False
 
     def try_get(self) -> Message | None:

@@ -16,7 +16,7 @@ register two places of its size, each on pages of its own.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 import numpy.typing as npt
@@ -48,6 +48,18 @@ class Snapshot(NamedTuple):
     count: int
     tag: int
     values: npt.NDArray[np.uint8]
+
+
+class AnyRegister(Protocol):
+    """A register in shared memory, or one that other nodes have too."""
+
+    def publish(self, values: npt.NDArray[Any], tag: int = 0) -> None:
+        """See `Register`."""
+        ...
+
+    def read(self, after: int = 0) -> Snapshot | None:
+        """See `Register`."""
+        ...
 
 
 class Register:

@@ -14,8 +14,9 @@ import os
 import socket
 import struct
 import time
-from collections.abc import Mapping
-from contextlib import suppress
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
+from types import MappingProxyType
 from typing import Final, NamedTuple
 
 from gmijax.collectives.shared_memory import create_file
@@ -34,30 +35,40 @@ _STRANGER_S = 5.0
 
 
 class Nodes(NamedTuple):
-    """What the leaders of a job know of each other.
+    """What the GMIs of a job know of those of other nodes.
 
     Attributes:
       node: whose view this is, position of its node.
       addresses: where the leader of every node listens, in order: IP address and port.
       token: the secret of the job.
+      calls: where one GMI listens for another by itself, `host:port` by (listens, calls).
     """
 
     node: int
     addresses: tuple[tuple[str, int], ...]
     token: bytes
+    calls: Mapping[tuple[int, int], str] = MappingProxyType({})
 
     def to_file(self) -> int:
         """A descriptor of memory without a name that holds it; the caller closes it."""
         fd = create_file("nodes")
-        text = json.dumps([self.node, self.addresses, self.token.hex()])
+        calls = [[*pair, address] for pair, address in self.calls.items()]
+        text = json.dumps([self.node, self.addresses, self.token.hex(), calls])
         os.pwrite(fd, text.encode(), 0)
         return fd
 
     @classmethod
     def from_file(cls, fd: int) -> Nodes:
         """Inverts `to_file`."""
-        node, addresses, token = json.loads(os.pread(fd, os.fstat(fd).st_size, 0))
-        return cls(node, tuple((host, port) for host, port in addresses), bytes.fromhex(token))
+        node, found, token, calls = json.loads(os.pread(fd, os.fstat(fd).st_size, 0))
+        addresses = tuple((host, port) for host, port in found)
+        pairs = {(listener, caller): address for listener, caller, address in calls}
+        return cls(node, addresses, bytes.fromhex(token), pairs)
+
+    def among(self, nodes: Sequence[int]) -> Nodes:
+        """The leaders of these nodes alone, this one among them."""
+        addresses = tuple(self.addresses[node] for node in nodes)
+        return self._replace(node=nodes.index(self.node), addresses=addresses)
 
 
 def inherited_nodes() -> tuple[Nodes | None, socket.socket | None]:
@@ -78,6 +89,16 @@ Sockets = Mapping[int, socket.socket]
 def listen(address: str) -> socket.socket:
     """A socket that listens at a free port of this IP address."""
     return socket.create_server((address, 0), backlog=128)
+
+
+@contextmanager
+def reserved_address(host: str) -> Iterator[str]:
+    """`host:port`, which cannot go to somebody else before the GMI that gets it listens there."""
+    # Bound without listening, and shared with this user: connections go to who listens.
+    with socket.socket() as holder:
+        holder.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEPORT, 1)
+        holder.bind((host, 0))
+        yield f"{host}:{holder.getsockname()[1]}"
 
 
 def connect(

@@ -1,0 +1,156 @@
+"""Registers between processes of different nodes: the newest values travel, and nobody waits.
+
+    mine = RemoteRegisters(0, {7: address}, [64, 4096], [16], listens=False, secret=secret)
+    mine.own(1).publish(array, tag=7)        # to all of `addresses`
+    mine.of(7, 0).read(after=0)              # None if nothing is newer
+
+Whoever publishes sends the newest values of all its registers in one message. Of the messages
+that wait, at either end, ZeroMQ keeps the last one only: who reads seldom gets what is newest, and
+takes no memory meanwhile. Connections are those of experience (`connection.py`).
+
+Wire format: for every register of the sender `_HEAD`, then their bytes.
+"""
+
+from __future__ import annotations
+
+import struct
+import time
+from collections.abc import Mapping, Sequence
+from typing import Any, Final
+
+import numpy as np
+import numpy.typing as npt
+
+from gmijax.collectives.channel.connection import Connection
+from gmijax.collectives.channel.remote import MAX_ANSWER_BYTES
+from gmijax.collectives.messages.registers import AnyRegister, Snapshot
+from gmijax.errors import CollectiveError
+
+_HEAD: Final = struct.Struct("<QqQ")
+"""How often it was published, its tag, its length in bytes."""
+
+_FAREWELL_S: Final = 5.0
+_PAUSE_S: Final = 1e-3
+
+
+class RemoteRegisters:
+    """The registers of this process that others read, and theirs.
+
+    Args:
+      rank: of this process, for messages.
+      addresses: where it meets each of the others, `host:port` by rank.
+      own_bytes: sizes of its registers.
+      their_bytes: sizes of the registers of each of the others.
+      listens: whether it listens at the addresses, or calls.
+      secret: of the job.
+
+    Raises:
+      CollectiveError: an address that cannot be.
+    """
+
+    def __init__(
+        self,
+        rank: int,
+        addresses: Mapping[int, str],
+        own_bytes: Sequence[int],
+        their_bytes: Sequence[int],
+        *,
+        listens: bool,
+        secret: bytes,
+    ) -> None:
+        self._rank, self._their_bytes = rank, their_bytes
+        # What ZeroMQ's handshake takes may be longer than the values.
+        longest = _HEAD.size * len(their_bytes) + sum(their_bytes) + MAX_ANSWER_BYTES
+        self._connections = {
+            peer: Connection(
+                *(address, rank, peer, longest), listens=listens, secret=secret, newest_only=True
+            )
+            for peer, address in addresses.items()
+        }
+        self._own = [_nothing() for _ in own_bytes]
+        self._theirs = {peer: [_nothing() for _ in their_bytes] for peer in addresses}
+
+    def own(self, place: int, local: AnyRegister | None = None) -> RemoteRegister:
+        """A register of this process; `local` is for readers of its node."""
+        return RemoteRegister(self, place, None, local)
+
+    def of(self, peer: int, place: int) -> RemoteRegister:
+        """A register of `peer`."""
+        return RemoteRegister(self, place, peer, None)
+
+    def publish(self, place: int, values: npt.NDArray[Any], tag: int) -> None:
+        """See `Register`; those that are not there yet get it with the next one."""
+        data = np.ascontiguousarray(values).reshape(-1).view(np.uint8)
+        self._own[place] = Snapshot(self._own[place].count + 1, tag, data.copy())
+        heads = [_HEAD.pack(one.count, one.tag, one.values.size) for one in self._own]
+        message = b"".join([*heads, *(one.values.data for one in self._own)])
+        for connection in self._connections.values():
+            connection.try_send([message])
+
+    def read(self, peer: int, place: int, after: int) -> Snapshot | None:
+        """See `Register`.
+
+        Raises:
+          CollectiveError: what came is no message of such registers.
+        """
+        while (frames := self._connections[peer].try_receive()) is not None:
+            self._theirs[peer] = self._unpacked(peer, frames)
+        newest = self._theirs[peer][place]
+        return newest if newest.count > after else None
+
+    def wait_for_ends(self) -> None:
+        """Waits until the others have gone, some seconds at most.
+
+        What was published last could be lost if this process went first.
+        """
+        deadline_s = time.monotonic() + _FAREWELL_S
+        while any(connection.is_up() for connection in self._connections.values()):
+            if time.monotonic() > deadline_s:
+                break
+            time.sleep(_PAUSE_S)
+
+    def close(self) -> None:
+        """Leaves at once. Idempotent."""
+        for connection in self._connections.values():
+            connection.close()
+
+    def _unpacked(self, peer: int, frames: Sequence[Any]) -> list[Snapshot]:
+        """The values of a message, which stay in its memory."""
+        data = np.frombuffer(frames[0], np.uint8)
+        begin = _HEAD.size * len(self._their_bytes)
+        found: list[Snapshot] = []
+        if data.size >= begin:
+            heads = _HEAD.iter_unpack(data[:begin].data)
+            for (count, tag, length), most in zip(heads, self._their_bytes, strict=True):
+                if length <= min(most, data.size - begin):
+                    found.append(Snapshot(count, tag, data[begin : begin + length]))
+                    begin += length
+        if len(found) < len(self._their_bytes) or begin != data.size:
+            # Only who has the secret could send it.
+            raise CollectiveError(f"rank {self._rank}: no message of registers from rank {peer}")
+        return found
+
+
+class RemoteRegister:
+    """One of `RemoteRegisters`, as a `Register`: one end writes it, the other reads."""
+
+    def __init__(
+        self, registers: RemoteRegisters, place: int, peer: int | None, local: AnyRegister | None
+    ) -> None:
+        self._registers, self._place = registers, place
+        self._peer, self._local = peer, local
+
+    def publish(self, values: npt.NDArray[Any], tag: int = 0) -> None:
+        """See `Register`."""
+        if self._local is not None:
+            self._local.publish(values, tag)
+        self._registers.publish(self._place, values, tag)
+
+    def read(self, after: int = 0) -> Snapshot | None:
+        """See `Register`."""
+        assert self._peer is not None
+        return self._registers.read(self._peer, self._place, after)
+
+
+def _nothing() -> Snapshot:
+    return Snapshot(0, 0, np.zeros(0, np.uint8))
