@@ -163,8 +163,11 @@ def _check_override(name: str, item: Override) -> None:
         raise ConfigError(f"{item.input_line}: expected one value (a list stands in brackets)")
     options = choices(key)
     if options and not item.is_delete() and item.value() not in options:
-        close = suggestion(str(item.value()), options)
-        raise ConfigError(f"{key}={item.value()}: unknown{close}")
+        # Of two or three the closest name is a guess: `algo=sac` is no slip for a3c.
+        few = f": allowed are {', '.join(options)}" if len(options) < 4 else ""
+        raise ConfigError(
+            f"{key}={item.value()}: unknown{few or suggestion(str(item.value()), options)}"
+        )
 
 
 def with_custom_task(name: str, override: str) -> tuple[str, ...]:

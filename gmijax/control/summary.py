@@ -90,11 +90,11 @@ def _evaluations(run: RunPaths) -> dict[str, Any] | None:
 
 def train_outcome(summary: Data, run: RunPaths) -> str:
     """The summary in a few lines for people."""
-    times = len(summary["restarts"])
+    times, mean = len(summary["restarts"]), summary["final_return"]
+    learnt = "no episode has ended" if mean is None else f"final return {mean:.2f}"
     return (
         f"{summary['status']}: {summary['env_steps']:,} env steps in {summary['wall_s']:.0f} s, "
-        f"final return {_shown(summary['final_return'], '.2f')}"
-        f"{f', started again {times} times' if times else ''}\n"
+        f"{learnt}{f', started again {times} times' if times else ''}\n"
         f"{_of_rates(summary)}"
         f"{_of_evaluations(summary.get('eval'))}"
         f"checkpoint: {summary['checkpoint']}\nsummary: {run.summary}"

@@ -225,7 +225,7 @@ def make_vector_env(
     if importlib.util.find_spec("gymnasium") is None:
         raise ConfigError("make_vector_env: needs gymnasium (pip install 'gmijax[gymnasium]')")
     if importlib.util.find_spec(arrays) is None:
-        raise ConfigError(f"arrays={arrays}: needs the package {arrays}")
+        raise ConfigError(f"arrays={arrays}: needs {arrays} (pip install {arrays})")
     env = make_env(name, suite=suite, impl=impl, episode_length=episode_length, max_envs=num_envs)
     return importlib.import_module("gmijax.sim.adapters.to_gymnasium").vector_env(
         env, num_envs, arrays

@@ -55,14 +55,16 @@ def ranked(rows: Sequence[Mapping[str, Any]], sweep: SweepConfig) -> list[Mappin
 
 
 def ranking(rows: Sequence[Mapping[str, Any]], sweep: SweepConfig) -> Table:
-    """The ranking for people."""
+    """The ranking for people; below it jobs without a value, such as those that have failed."""
     table = Table(box=None, pad_edge=False)
     for heading in ("rank", "job", "overrides", f"best {sweep.objective}", "steps", "state"):
         table.add_column(heading)
-    for rank, row in enumerate(ranked(rows, sweep), 1):
-        label = label_of(row["overrides"])
-        shown = f"{row['value']:.4g}", f"{row['env_steps']:,}"
-        table.add_row(str(rank), str(row["job"]), label, *shown, row["state"])
+    listed = [(str(rank), row) for rank, row in enumerate(ranked(rows, sweep), 1)]
+    listed += [("-", row) for row in rows if row["value"] is None]
+    for rank, row in listed:
+        value = "-" if row["value"] is None else f"{row['value']:.4g}"
+        label, steps = label_of(row["overrides"]), f"{row['env_steps']:,}"
+        table.add_row(rank, str(row["job"]), label, value, steps, row["state"])
     return table
 
 

@@ -206,10 +206,9 @@ def _announce(console: Console, plan: Plan, request: Request, jobs: Sequence[Job
     total = len(request.jobs) if settings.sampler == "grid" else settings.trials
     done = sum(job.progress.state == "completed" for job in jobs)
     more = f", {done} of them complete already" if done else ""
-    gpus = plan.layout.num_gpus
     console.print(
-        f"{total} job{'s' * (total != 1)}{more}, {len(plan.slices)} at a time "
-        f"on {gpus} GPU{'s' * (gpus != 1)}, backend {plan.backend}"
+        f"{total} jobs{more}, {len(plan.slices)} at a time on {plan.layout.num_gpus} GPUs, "
+        f"backend {plan.backend}"
     )
     for reason in plan.reasons:
         console.print(f"  {reason}")

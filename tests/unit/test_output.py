@@ -112,6 +112,7 @@ def test_a_summary_has_the_rates_that_were_measured(
     }
     told = train_outcome(summary, RunPaths(tmp_path)).splitlines()
     assert [text for text in told if "steps/s" in text] == [f"env steps/s: {line}"] * bool(line)
+    assert told[0].endswith("in 1 s, no episode has ended")
 
 
 def _told(lines: list[dict[str, Any]]) -> str:

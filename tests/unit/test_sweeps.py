@@ -35,7 +35,7 @@ from gmijax.sweeps.jobs import (
 )
 from gmijax.sweeps.leases import leased
 from gmijax.sweeps.places import Places, places_of
-from gmijax.sweeps.report import ranked, spread
+from gmijax.sweeps.report import ranked, ranking, spread
 
 
 @pytest.mark.parametrize(
@@ -274,6 +274,15 @@ def test_the_ranking_has_the_best_first_and_nothing_without_a_value() -> None:
     rows = [{"job": n, "value": value} for n, value in enumerate((1.0, None, 3.0))]
     assert [row["job"] for row in ranked(rows, SweepConfig())] == [2, 0]
     assert [row["job"] for row in ranked(rows, SweepConfig(direction="minimize"))] == [0, 2]
+
+
+def test_the_table_lists_jobs_without_a_value_below_the_ranking() -> None:
+    more = {"overrides": {}, "env_steps": 10, "state": "completed"}
+    rows = [{"job": n, "value": value, **more} for n, value in enumerate((1.0, None, 3.0))]
+    rank, job, _, value, *_ = ranking(rows, SweepConfig()).columns
+    assert list(rank.cells) == ["1", "2", "-"]
+    assert list(job.cells) == ["2", "0", "1"]
+    assert list(value.cells) == ["3", "1", "-"]
 
 
 def test_the_middle_of_curves_leaves_out_the_outer_quarters() -> None:
