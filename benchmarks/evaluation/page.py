@@ -8,6 +8,7 @@ from types import MappingProxyType
 from benchmarks.evaluation.claims import claims
 from benchmarks.evaluation.figures import NOT_MEASURED, bounds, call_of, markdown, ratio, shown
 from benchmarks.evaluation.other_tables import OTHER_TABLES
+from benchmarks.evaluation.peer_tables import peers
 from benchmarks.evaluation.plots import summary
 from benchmarks.evaluation.tables import TRAINING_TABLES, fixed_total_ratios, small_gmis
 
@@ -47,6 +48,6 @@ def advice() -> list[str]:
 
 
 TABLES: MappingProxyType[str, Callable[[], list[str]]] = MappingProxyType(
-    {"advice": advice, "claims": claims, **TRAINING_TABLES, **OTHER_TABLES}
+    {"advice": advice, "claims": claims, "peers": peers, **TRAINING_TABLES, **OTHER_TABLES}
 )
 """By the name that documents use: `<!-- table: NAME -->`."""
