@@ -32,7 +32,8 @@ COMMIT_VARIABLE = "GMIJAX_COMMIT"
 
 _ROOT = Path(__file__).parents[1]
 _MEASURED = ("gmijax", "configs", "benchmarks", ":!benchmarks/results")
-_VERSIONS = (*REQUIRED, "warp-lang", "nccl4py", "cuda-bindings", "optuna")
+_OPTIONAL = ("warp-lang", "nccl4py", "cuda-bindings", "optuna", "brax", "playground")
+_VERSIONS = (*REQUIRED, *_OPTIONAL)
 _SAME = ("commit", "is_dirty", "host", "device", "driver", "versions")
 """What must be equal for a call to be gone on with."""
 

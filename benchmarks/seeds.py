@@ -26,9 +26,9 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import gmijax
+from benchmarks.command import run_command
 from benchmarks.outcomes import Outcome, against, outcome_of, summary
 from benchmarks.records import RESULTS, ResultsFile, device_name, file_name
-from benchmarks.sweeps import run_command
 from gmijax.errors import ConfigError
 from gmijax.runs.folder import RunPaths, read_json
 from gmijax.runs.history import read_metrics

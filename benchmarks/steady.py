@@ -1,4 +1,4 @@
-"""Steps per second of jobs that run at the same time, while all of them train."""
+"""Steps per second of trainings that are under way: of one, or of several at the same time."""
 
 from __future__ import annotations
 
@@ -24,6 +24,23 @@ def curve_of(row: Mapping[str, Any]) -> Curve | None:
     first_s = row["start_s"] + row["first_update_s"]
     seconds = [first_s + line["wall_s"] - lines[0]["wall_s"] for line in lines]
     return np.array(seconds), np.array([line["env_steps"] for line in lines])
+
+
+def settled_rate(curve: Sequence[tuple[float, int]], skip: float = 0.2) -> float | None:
+    """Steps per second after the first part of one training, which holds compilation.
+
+    Args:
+      curve: seconds and environment steps by then, oldest first.
+      skip: the part of all steps that is left out; counted from the first point behind it.
+
+    Returns:
+      None where less than two points are left.
+    """
+    kept = [point for point in curve if point[1] >= skip * curve[-1][1]]
+    if len(kept) < 2:
+        return None
+    (first_s, first), (last_s, last) = kept[0], kept[-1]
+    return (last - first) / (last_s - first_s)
 
 
 def steady_rate(curves: Sequence[Curve], at_once: int) -> float | None:

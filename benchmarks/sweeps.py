@@ -12,25 +12,20 @@ from __future__ import annotations
 import argparse
 import json
 import math
-import os
 import signal
 import statistics
-import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Mapping, Sequence
-from contextlib import suppress
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from benchmarks.command import STOP_S, run_command
 from benchmarks.records import RESULTS, ResultsFile, file_name
 from benchmarks.steady import curve_of, steady_rate
 from gmijax.machine.snapshot import Machine, detect_machine
 from gmijax.runs.folder import read_json
-
-_STOP_S = 15.0
-"""For a sweep that meets the deadline to save and end."""
 
 
 class Way(NamedTuple):
@@ -89,7 +84,7 @@ class Benchmark:
 
     def _has_time(self, way: Way) -> bool:
         before = [run["command_s"] for run in self.runs if run["way"] == str(way)]
-        return time.monotonic() + max(before, default=0.0) < self.deadline_s - _STOP_S
+        return time.monotonic() + max(before, default=0.0) < self.deadline_s - STOP_S
 
     def _sweep(
         self, way: Way, repeat: int, cache: Path | None, more: Sequence[str] = ()
@@ -132,32 +127,6 @@ class Benchmark:
             "values": [job["value"] for job in jobs],
             "states": [job["state"] for job in jobs],
         }
-
-
-def run_command(
-    command: Sequence[str], deadline_s: float, variables: Mapping[str, str] | None = None
-) -> int:
-    """Runs a sweep; asks it to save and end at the deadline, or when this is interrupted.
-
-    Args:
-      command: of the sweep.
-      deadline_s: by the monotonic clock.
-      variables: of the environment, besides those of this process.
-    """
-    # In a session of its own, so that Ctrl-C comes to it once.
-    process = subprocess.Popen(
-        command, env={**os.environ, **(variables or {})}, start_new_session=True
-    )
-    try:
-        with suppress(subprocess.TimeoutExpired):
-            return process.wait(max(0.0, deadline_s - _STOP_S - time.monotonic()))
-    finally:
-        if process.poll() is None:
-            process.send_signal(signal.SIGINT)
-            with suppress(subprocess.TimeoutExpired):
-                process.wait(_STOP_S)
-            process.kill()
-    return process.wait()
 
 
 def main() -> int:

@@ -8,6 +8,7 @@ from types import MappingProxyType
 from benchmarks.evaluation.claims import claims
 from benchmarks.evaluation.figures import bounds, markdown, ratio, shown
 from benchmarks.evaluation.other_tables import OTHER_TABLES
+from benchmarks.evaluation.peer_tables import peers
 from benchmarks.evaluation.plots import summary
 from benchmarks.evaluation.sweep_tables import over_one_after_another, sweep_rates, sweeps
 from benchmarks.evaluation.tables import (
@@ -55,6 +56,13 @@ def advice() -> list[str]:
 
 
 TABLES: MappingProxyType[str, Callable[[], list[str]]] = MappingProxyType(
-    {"advice": advice, "claims": claims, "sweeps": sweeps, **TRAINING_TABLES, **OTHER_TABLES}
+    {
+        "advice": advice,
+        "claims": claims,
+        "peers": peers,
+        "sweeps": sweeps,
+        **TRAINING_TABLES,
+        **OTHER_TABLES,
+    }
 )
 """By the name that documents use: `<!-- table: NAME -->`."""

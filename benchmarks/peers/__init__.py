@@ -1,0 +1,1 @@
+"""Training by other libraries beside gmijax, on one machine in one call."""

@@ -1,0 +1,118 @@
+"""One training of a comparison: its command, its environment, and what it left behind."""
+
+from __future__ import annotations
+
+import os
+import shlex
+import sys
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from benchmarks.peers.comparisons import (
+    BRAX,
+    COMPARISONS,
+    MJLAB,
+    REPORTS,
+    brax_training,
+    mjlab_training,
+)
+from benchmarks.peers.table import OURS, case_name
+from gmijax.runs.folder import RunPaths, read_json, write_json
+from gmijax.runs.history import read_metrics
+
+_ROOT = Path(__file__).parents[2]
+_MODULES: Mapping[str, str] = {BRAX: "brax_ppo", MJLAB: "mjlab_ppo"}
+_WARM_REPORTS = 2  # The second part of a training by Brax may be compiled once more.
+_WARM_MEMORY = 0.05  # Of the GPU, for each of ours that compile at the same time.
+_SCRIPT_FLAGS: Mapping[str, str] = {
+    "gmijax": "--xla_gpu_graph_min_graph_size=1",
+    "brax": "--xla_gpu_graph_min_graph_size=1",
+    "playground": "--xla_gpu_triton_gemm_any=True",
+}
+"""What Brax's and Playground's training scripts tell XLA; Brax's too where the task is ours."""
+
+
+class Side(NamedTuple):
+    """A comparison's training by one of the two libraries.
+
+    Attributes:
+      comparison: its name.
+      trainer: `OURS`, or the comparison's `peer`.
+      more: overrides of the command line, behind those of the comparison.
+      mjlab: interpreter of an environment with mjlab.
+    """
+
+    comparison: str
+    trainer: str
+    more: tuple[str, ...] = ()
+    mjlab: str = ""
+
+    def __str__(self) -> str:
+        return case_name(self.comparison, self.trainer)
+
+    @property
+    def told(self) -> Any:
+        """What tells the whole training: the command of ours, the arguments of the other's."""
+        if self.trainer == OURS:
+            return shlex.join(["python", "-m", "gmijax.train", *self._overrides])
+        return self._training(seed=0)
+
+    def command(self, folder: Path, seed: int) -> list[str]:
+        """The whole training; leaves its files in `folder`, which is there."""
+        if self.trainer == OURS:
+            return self._train(folder, f"seed={seed}")
+        return self._by_peer(folder, self._training(seed=seed))
+
+    def short_command(self, folder: Path, *, has_gpu: bool) -> list[str]:
+        """A short training with the same programs."""
+        if self.trainer == OURS:
+            memory = (f"plan.memory_fraction={_WARM_MEMORY}",) if has_gpu else ()
+            return self._train(folder, "num_timesteps=1", *memory)
+        return self._by_peer(folder, self._training(seed=0, is_short=True))
+
+    def variables(self, cache: Path, *, is_short: bool) -> dict[str, str]:
+        """Of the environment; `cache` keeps compiled programs, unless the user has one."""
+        folder = os.environ.get("JAX_COMPILATION_CACHE_DIR", str(cache))
+        variables = {"JAX_COMPILATION_CACHE_DIR": folder}
+        if self.trainer == MJLAB:
+            variables["PYTHONPATH"] = str(_ROOT)  # Not with the packages of this environment.
+        if self.trainer == BRAX:
+            suite = COMPARISONS[self.comparison].suite
+            flags = f"{os.environ.get('XLA_FLAGS', '')} {_SCRIPT_FLAGS[suite]}"
+            variables["XLA_FLAGS"] = flags.strip()
+            variables["JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS"] = "0"  # As our jobs do.
+            if is_short or suite == "playground":  # Playground's script never does.
+                variables["XLA_PYTHON_CLIENT_PREALLOCATE"] = "false"
+        return variables
+
+    def curve(self, folder: Path) -> list[tuple[float, int]]:
+        """Seconds and environment steps by then, of a training that has ended."""
+        if self.trainer == OURS:
+            lines = read_metrics(RunPaths(folder / "run").metrics)
+            return [(line["wall_s"], line["env_steps"]) for line in lines]
+        return [(seconds, steps) for seconds, steps in read_json(folder / "out.json")["curve"]]
+
+    @property
+    def _overrides(self) -> tuple[str, ...]:
+        one = ("plan.gpus=1", "plan.gmis_per_gpu=1", "run.measure_throughput=false")
+        return (*COMPARISONS[self.comparison].overrides, *one, *self.more)
+
+    def _train(self, folder: Path, *more: str) -> list[str]:
+        told = (*self._overrides, *more, f"run.dir={folder / 'run'}")
+        return [sys.executable, "-m", "gmijax.train", *told]
+
+    def _training(self, *, seed: int, is_short: bool = False) -> dict[str, Any]:
+        """What the process of the other library is told."""
+        comparison = COMPARISONS[self.comparison]
+        if self.trainer == MJLAB:
+            told = mjlab_training(comparison, self.more, seed=seed)
+            return {**told, "iterations": 2} if is_short else told
+        reports = _WARM_REPORTS if is_short else REPORTS
+        return brax_training(comparison, self.more, reports=reports, seed=seed)._asdict()
+
+    def _by_peer(self, folder: Path, training: dict[str, Any]) -> list[str]:
+        write_json(folder / "in.json", training)
+        files = (str(folder / name) for name in ("in.json", "out.json"))
+        python = self.mjlab if self.trainer == MJLAB else sys.executable
+        return [python, "-m", f"benchmarks.peers.{_MODULES[self.trainer]}", *files]

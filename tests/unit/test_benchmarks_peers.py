@@ -1,0 +1,221 @@
+"""What the benchmark beside other libraries tells both sides, how it counts, and what it keeps."""
+
+from __future__ import annotations
+
+import argparse
+import importlib.util
+import inspect
+import json
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import pytest
+from brax.training.agents.ppo import networks, train
+
+from benchmarks import command
+from benchmarks.evaluation import peer_tables
+from benchmarks.peers import __main__ as peers
+from benchmarks.peers.brax_ppo import replicated
+from benchmarks.peers.comparisons import (
+    BRAX,
+    COMPARISONS,
+    MJLAB,
+    REPORTS,
+    Comparison,
+    brax_training,
+)
+from benchmarks.peers.side import Side
+from benchmarks.peers.table import OURS, row
+from benchmarks.records import read_calls
+from benchmarks.steady import settled_rate
+from gmijax.cli.compose import compose
+from gmijax.errors import ConfigError
+
+WITH_BRAX = [name for name, one in COMPARISONS.items() if one.peer == BRAX]
+
+
+@pytest.mark.parametrize("name", WITH_BRAX)
+def test_both_sides_learn_from_as_many_samples(name: str):
+    config = compose(*COMPARISONS[name].overrides)
+    told = brax_training(COMPARISONS[name]).arguments
+    minibatch = told["batch_size"] * told["unroll_length"]
+    assert told["num_envs"] == config.num_envs
+    iteration = config.num_envs * config.algo.unroll_length
+    assert minibatch * told["num_minibatches"] == iteration
+    assert told["num_minibatches"] == config.algo.num_minibatches
+    assert told["num_updates_per_batch"] == config.algo.num_updates_per_batch
+    # What Brax asserts, and that all parts of its training have as many iterations.
+    assert told["batch_size"] * told["num_minibatches"] % told["num_envs"] == 0
+    assert told["num_timesteps"] % (REPORTS * iteration) == 0
+    assert 0.5 < told["num_timesteps"] / config.num_timesteps < 1.5
+
+
+@pytest.mark.parametrize("name", WITH_BRAX)
+def test_brax_takes_all_that_it_is_told(name: str):
+    told = brax_training(COMPARISONS[name])
+    assert told.arguments.keys() <= inspect.signature(train.train).parameters.keys()
+    taken = inspect.signature(networks.make_ppo_networks).parameters
+    assert told.networks.keys() <= taken.keys()
+    # Its distribution through tanh always has a standard deviation of its own in every state.
+    if told.networks["distribution_type"] == "tanh_normal":
+        assert told.networks["state_dependent_std"]
+
+
+def test_a_short_training_has_the_same_parts():
+    whole, short = (brax_training(COMPARISONS["Brax's ant"], reports=n).arguments for n in (10, 2))
+    assert whole["num_timesteps"] == 5 * short["num_timesteps"]
+    assert (whole["num_evals"] - 1, short["num_evals"] - 1) == (10, 2)
+
+
+def test_mjlab_gets_as_many_environments_and_steps_and_no_packages_of_ours(tmp_path: Path):
+    name = "anymal, and mjlab's Go1"
+    side = Side(name, MJLAB, ("num_envs=1024",), mjlab="/mjlab/bin/python")
+    assert (side.told["num_envs"], side.told["iterations"]) == (1024, round(5e6 / 1024 / 24))
+    words = side.short_command(tmp_path, has_gpu=True)
+    assert words[:3] == ["/mjlab/bin/python", "-m", "benchmarks.peers.mjlab_ppo"]
+    assert json.loads(Path(words[3]).read_text())["iterations"] == 2
+    assert Path(side.variables(tmp_path, is_short=False)["PYTHONPATH"], "benchmarks").is_dir()
+    cells = row({}, name)
+    assert (cells[1], cells[4]) == ("mjlab", "another task")
+
+
+def test_overrides_change_both_sides_and_bad_ones_are_told():
+    side = Side("ant, MJX-JAX", BRAX, ("num_envs=512", "algo.learning_rate_schedule=fixed"))
+    assert side.told["arguments"]["batch_size"] == 128
+    assert side.told["arguments"]["learning_rate_schedule"] == "NONE"
+    assert side._replace(trainer=OURS).told.endswith("algo.learning_rate_schedule=fixed")
+    with pytest.raises(ConfigError, match=r"algo\.unroll_length=81: Brax needs 16 equal unrolls"):
+        brax_training(COMPARISONS["Brax's ant"], ("algo.unroll_length=81",))
+    with pytest.raises(ConfigError, match="algo=a3c: Brax trains by ppo"):
+        brax_training(Comparison(("env=ant", "algo=a3c")))
+    with pytest.raises(ConfigError, match="--only 'cat': in no name"):
+        list(peers.wanted_sides(["ant", "cat"], ()))
+    with pytest.raises(ConfigError, match="num_env"):
+        list(peers.wanted_sides(["ant, MJX-JAX"], ("num_env=3",)))
+
+
+def test_what_lacks_a_package_is_left_out(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+):
+    def found(name: str) -> object:
+        return None if name == "mujoco_playground" else object()
+
+    monkeypatch.setattr(importlib.util, "find_spec", found)
+    sides = list(peers.wanted_sides(["Brax's", "Cartpole", "mjlab"], ()))
+    assert [side.comparison for side in sides] == ["Brax's ant"] * 2 + ["Brax's humanoid"] * 2
+    assert capsys.readouterr().err.splitlines() == [
+        "Playground's CartpoleBalance: left out, the package mujoco_playground is not installed",
+        "anymal, and mjlab's Go1: left out, give --mjlab the python of where mjlab is",
+    ]
+
+
+def test_the_rate_is_of_what_is_behind_a_fifth_of_the_steps():
+    # The first program compiles for 40 seconds, then 100 steps take a second.
+    curve = [(40.0, 100), (41.5, 200), (42.5, 300), (43.5, 400), (46.5, 1000)]
+    assert settled_rate(curve) == pytest.approx(800 / 5)
+    assert settled_rate(curve, skip=0.4) == pytest.approx(600 / 3)
+    assert settled_rate(curve[:1]) is None
+
+
+def test_the_stand_in_makes_one_row_for_each_device():
+    tree = {"a": jnp.arange(3), "b": (jnp.float32(2.0),)}
+    made = replicated(tree, jax.local_devices())
+    assert made["a"].shape == (jax.local_device_count(), 3)
+    out: Any = jax.pmap(lambda one: jax.tree.map(lambda leaf: leaf + 1, one))(made)
+    assert out["a"][0].tolist() == [1, 2, 3]
+    assert out["b"][0].dtype == jnp.float32
+
+
+def test_a_command_is_asked_to_end_in_time():
+    processes = [command.start(["sleep", "60"], {}), command.start(["true"], {})]
+    deadline_s = time.monotonic() + command.STOP_S + 0.1
+    assert command.wait_until(deadline_s, *processes) == [-2, 0]
+
+
+class Fake:
+    """Commands of 60 seconds on a clock that only they move; Brax's fail where asked to."""
+
+    def __init__(self, broken: str = "") -> None:
+        self.now_s, self.broken = 0.0, broken
+
+    def start(self, told: Sequence[str], variables: dict[str, str], log: Any) -> Any:
+        assert "JAX_COMPILATION_CACHE_DIR" in variables
+        return told, log
+
+    def wait_until(self, deadline_s: float, *processes: Any) -> list[int]:
+        del deadline_s
+        self.now_s += 60.0
+        return [self._end(told, log) for told, log in processes]
+
+    def _end(self, told: Sequence[str], log: Any) -> int:
+        if self.broken and any(self.broken in word for word in told):
+            log.write(b"no such task\n")
+            return 1
+        points = [(10.0 + n, 100 * n) for n in range(1, 11)]
+        if "gmijax.train" in told:
+            folder = Path(told[-1].removeprefix("run.dir="))
+            folder.mkdir()
+            lines = [json.dumps({"wall_s": 0.5 * s, "env_steps": steps}) for s, steps in points]
+            (folder / "metrics.jsonl").write_text("\n".join(lines) + "\n")
+        else:
+            Path(told[-1]).write_text(json.dumps({"curve": points}))
+        return 0
+
+
+def benchmark(
+    monkeypatch: pytest.MonkeyPatch, folder: Path, fake: Fake, *only: str, **options: Any
+) -> peers.Benchmark:
+    for name in ("start", "wait_until"):
+        monkeypatch.setattr(peers, name, getattr(fake, name))
+    monkeypatch.setattr(peers.os, "cpu_count", lambda: 8)
+    arguments = {"repeats": 3, "timeout_s": 600.0, "deadline_s": None, **options}
+    sides = [side for side in peers.wanted_sides(only, ()) if "Warp" not in side.comparison]
+    with monkeypatch.context() as patched:
+        patched.setattr(peers.time, "monotonic", lambda: fake.now_s)
+        made = peers.Benchmark(argparse.Namespace(out=folder, **arguments), folder, sides)
+        made.run()
+    return made
+
+
+def test_no_training_is_started_that_would_not_end_in_time(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    # A minute to compile, then the two sides in turn; the sixth training would end at 420 s.
+    made = benchmark(monkeypatch, tmp_path, Fake(), "ant, MJX-JAX", deadline_s=400.0)
+    runs = [made.file.results["cases"][f"ant, MJX-JAX, {one}"]["runs"] for one in (OURS, BRAX)]
+    assert [[run["repeat"] for run in own] for own in runs] == [[0, 1, 2], [0, 1]]
+    rates = [own[0]["summary"]["steps_per_s"] for own in runs]
+    assert rates == pytest.approx([200.0, 100.0])
+    assert runs[0][0]["summary"]["command_s"] == 60.0
+    assert not made.has_failed
+    assert list(made.file.results["cases"]) == ["ant, MJX-JAX, gmijax", "ant, MJX-JAX, Brax"]
+    kept = read_calls(made.file.path)[-1].results
+    assert kept == json.loads(json.dumps(made.file.results))
+
+
+def test_what_does_not_compile_is_told_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    made = benchmark(monkeypatch, tmp_path, Fake("brax_ppo"), "ant, MJX-JAX", repeats=2)
+    cases = made.file.results["cases"]
+    assert cases["ant, MJX-JAX, Brax"]["runs"] == [{"repeat": 0, "failed": "no such task"}]
+    assert len(cases["ant, MJX-JAX, gmijax"]["runs"]) == 2
+    assert made.has_failed
+
+
+def test_the_table_takes_the_newest_call_that_measured_both_sides(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    monkeypatch.setattr(peer_tables, "RESULTS", tmp_path)
+    assert peer_tables.peers()[0].endswith("not measured (`python -m benchmarks.peers`).")
+    made = benchmark(monkeypatch, tmp_path, Fake(), "ant, MJX-JAX", repeats=1)
+    benchmark(monkeypatch, tmp_path / "2", Fake("gmijax.train"), "ant, MJX-JAX", repeats=1)
+    calls = [json.loads(made.file.path.read_text())["calls"][0]]
+    calls += json.loads((tmp_path / "2" / made.file.path.name).read_text())["calls"]
+    path = tmp_path / f"{peer_tables.PEERS}.json"
+    path.write_text(json.dumps({"format": 2, "suite": "peers", "calls": calls}))
+    table = peer_tables.peers()
+    assert "| ant, MJX-JAX | Brax | 200 | 100 | 2.00 | 60.0 | 60.0 |" in table
+    assert sum("not measured" in line for line in table) == len(COMPARISONS) - 1
