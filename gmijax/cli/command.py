@@ -60,7 +60,8 @@ def sweep_command(argv: Sequence[str]) -> int:
 
 def _shown_sweep(request: Request) -> dict[str, Any]:
     jobs = [dict(job.overrides) for job in request.jobs]
-    return {"sweep": to_dict(request.settings), "jobs": jobs}
+    nodes = {"cluster": to_dict(request.cluster)} if request.cluster.engine else {}
+    return {"sweep": to_dict(request.settings), **nodes, "jobs": jobs}
 
 
 def _split_options(argv: Sequence[str]) -> tuple[list[str], bool]:

@@ -11,7 +11,7 @@ from typing import Any
 from hydra.core.override_parser.types import Glob, IntervalSweep, Override
 
 from gmijax.cli.compose import build, choices, compose_dict, parse, with_custom_task
-from gmijax.config import TrainConfig
+from gmijax.config import ClusterConfig, TrainConfig
 from gmijax.config.schema import from_dict, to_dict
 from gmijax.config.sweep import SweepConfig
 from gmijax.errors import ConfigError
@@ -39,12 +39,21 @@ def build_sweep(overrides: Sequence[str]) -> Request:
     """
     overrides = [part for text in overrides for part in with_custom_task("train", text)]
     given = list(zip(overrides, parse(overrides), strict=True))
-    own = [text for text, item in given if item.key_or_group.split(".")[0] == "sweep"]
-    fixed = [text for text, item in given if text not in own and not item.is_sweep_override()]
+    whole = ("run.", "sweep.", "cluster.")
     for text, item in given:
-        if item.is_sweep_override() and item.key_or_group.startswith(("run.", "sweep.")):
+        if item.is_sweep_override() and item.key_or_group.startswith(whole):
             raise ConfigError(f"{text}: expected one value (a list stands in brackets)")
+
+    def of_group(group: str) -> list[str]:
+        return [text for text, item in given if item.key_or_group.split(".")[0] == group]
+
+    own, nodes = of_group("sweep"), of_group("cluster")
+    fixed = [
+        text for text, item in given if text not in own + nodes and not item.is_sweep_override()
+    ]
     settings = from_dict(SweepConfig, compose_dict("sweep", own)["sweep"])
+    # Nodes are the sweep's; each job is a training on one machine.
+    cluster = from_dict(ClusterConfig, compose_dict("train", nodes)["cluster"])
     space = {item.key_or_group: _values(item) for _, item in given if item.is_sweep_override()}
 
     config_of = _Composer(fixed, [key for key in space if choices(key)])
@@ -54,7 +63,7 @@ def build_sweep(overrides: Sequence[str]) -> Request:
 
     points = grid(space) if settings.sampler == "grid" else corners(space)
     jobs = [make_job(number, chosen) for number, chosen in enumerate(points)]
-    return Request(settings, space, make_job, tuple(jobs))
+    return Request(settings, space, make_job, tuple(jobs), cluster)
 
 
 class _Composer:

@@ -3,16 +3,14 @@
 from __future__ import annotations
 
 import dataclasses
-import os
 import secrets
-import tempfile
-import time
 from collections.abc import Mapping
 from contextlib import suppress
 from pathlib import Path
 from typing import Any, Self
 
-from gmijax.cluster.node import Opened, own_versions
+from gmijax.cluster.checks import by_name, require_alike, require_shared
+from gmijax.cluster.node import Opened, TrainingNode
 from gmijax.cluster.ray_nodes import Joined, RayCluster
 from gmijax.collectives.nodes.meeting import Nodes
 from gmijax.config import TrainConfig
@@ -24,11 +22,6 @@ from gmijax.supervise.backends.backend import Backend
 from gmijax.supervise.launcher import Launch, OnTick, StopSignals
 from gmijax.supervise.supervisor import Supervisor
 from gmijax.supervise.watched_gmi import WatchedGmi
-
-_SHOWS_S = 20.0
-"""Network file systems show what others have written late, some after seconds."""
-
-_POLL_S = 0.2
 
 
 class ClusterJob:
@@ -45,7 +38,7 @@ class ClusterJob:
         self._num_cpus = _cpus_of_a_node(config)
 
     def __enter__(self) -> Self:
-        self._cluster = RayCluster(self._config.cluster)
+        self._cluster = RayCluster(self._config.cluster, TrainingNode)
         return self
 
     def __exit__(self, *exc: Any) -> None:
@@ -116,57 +109,9 @@ class ClusterJob:
 
     def _checked(self) -> Mapping[str, Machine]:
         """The machines of the nodes, by address, once these can take part."""
-        self._require_alike()
-        self._require_shared(self._run_root)
-        named: dict[str, Machine] = {}
-        for place, (node, facts) in enumerate(self._joined):
-            # Several nodes may be on one machine.
-            name = f"{node.address}#{place}" if node.address in named else node.address
-            named[name] = facts.machine
-        return named
-
-    def _require_alike(self) -> None:
-        own = own_versions()
-        if not self._config.is_asynchronous:
-            del own["pyzmq"]
-        elif own["pyzmq"] is None:
-            raise ConfigError(
-                "cluster.engine=ray: experience between nodes needs the package pyzmq "
-                "(pip install 'gmijax[ray]')"
-            )
-        for node, facts in self._joined:
-            for what, version in own.items():
-                if (theirs := facts.versions.get(what)) != version:
-                    raise ConfigError(
-                        f"cluster.engine=ray: node {node.address} has {what} {theirs}, this one "
-                        f"has {version}; all nodes must have the same"
-                    )
-
-    def _require_shared(self, run_root: Path) -> None:
-        folder = run_root.absolute()
-        while not folder.is_dir():
-            folder = folder.parent
-        content = secrets.token_hex(8)
-        try:
-            fd, name = tempfile.mkstemp(prefix=".gmijax-probe-", dir=folder)
-        except OSError as error:
-            raise ConfigError(f"run.dir={run_root}: {folder}: {error.strerror}") from None
-        try:
-            with os.fdopen(fd, "w") as file:
-                file.write(content)
-            deadline_s = time.monotonic() + _SHOWS_S
-            blind = [node for node, _ in self._joined]
-            while blind := [node for node in blind if not node.call("sees", name, content)]:
-                if time.monotonic() > deadline_s or any(node.lost for node in blind):
-                    raise ConfigError(
-                        f"run.dir={run_root}: node {blind[0].address} does not see {folder} or "
-                        "cannot write to it; the run folder must be on a file system that all "
-                        "nodes share"
-                    )
-                time.sleep(_POLL_S)
-        finally:
-            with suppress(OSError):
-                Path(name).unlink()
+        require_alike(self._joined, has_tcp=self._config.is_asynchronous)
+        require_shared(self._joined, self._run_root)
+        return {name: node.facts.machine for name, node in by_name(self._joined).items()}
 
 
 def _cpus_of_a_node(config: TrainConfig) -> int:

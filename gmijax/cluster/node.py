@@ -1,4 +1,4 @@
-"""What one node does for a job: an actor of Ray, which starts and holds the GMIs of its machine.
+"""What one node does for a job, in an actor of Ray: it starts and holds processes of its machine.
 
 It holds what GMIs of one machine share and their lifelines, so they end with it. What becomes of
 them is decided by the controller's supervisor.
@@ -68,7 +68,7 @@ class Seen(NamedTuple):
 
 
 class Node:
-    """This machine's part of a job.
+    """This machine's part of a job: what every kind of job needs of it.
 
     Args:
       variables: environment variables of the controller that its GMIs get.
@@ -87,13 +87,6 @@ class Node:
         if Path(folder).is_dir():
             os.chdir(folder)
         self._interface, self._address = interface, address
-        self._held = ExitStack()
-        self._launch: Launch | None = None
-        self._listener: socket.socket | None = None
-        self._blocks: dict[str, int] = {}
-        self._start: StartGmi | None = None
-        self._started: dict[int, GmiProcess] = {}
-        self._num_gmis = 0
 
     def facts(self) -> Facts | str:
         """What this machine is, or why it cannot take part."""
@@ -113,6 +106,25 @@ class Node:
             os.listdir(path.parent)  # Has the file system look again.
             return path.read_text() == content and os.access(path.parent, os.W_OK)
         return False
+
+    def close(self) -> None:
+        """Ends what is left, and gives back what was made."""
+
+
+class TrainingNode(Node):
+    """The GMIs of a training job on this machine, and what they share."""
+
+    def __init__(
+        self, variables: Mapping[str, str], folder: str, interface: str | None, address: str
+    ) -> None:
+        super().__init__(variables, folder, interface, address)
+        self._held = ExitStack()
+        self._launch: Launch | None = None
+        self._listener: socket.socket | None = None
+        self._blocks: dict[str, int] = {}
+        self._start: StartGmi | None = None
+        self._started: dict[int, GmiProcess] = {}
+        self._num_gmis = 0
 
     def open(self, launch: Launch, node: int, address: str) -> Opened:
         """Makes what the GMIs share; returns where they will listen."""
@@ -176,7 +188,7 @@ class Node:
         return self._started[gmi].request_stacks()
 
     def close(self) -> None:
-        """Gives back what was made; every GMI has ended by then, or ends now."""
+        """See `Node`."""
         for process in self._started.values():
             process.poll()
             process.kill()

@@ -39,13 +39,14 @@ class RayCluster:
 
     Args:
       config: which one.
+      kind: what the actors hold.
 
     Raises:
       ConfigError: ray is not installed, or there is no cluster.
     """
 
-    def __init__(self, config: ClusterConfig) -> None:
-        self._config = config
+    def __init__(self, config: ClusterConfig, kind: type[Node]) -> None:
+        self._config, self._kind = config, kind
         self._ray: Any = _import_ray()
         self._group: Any = None
         self._actors: list[Any] = []
@@ -59,14 +60,19 @@ class RayCluster:
         wanted: int | None,
         least: int | None = None,
         is_unwanted: Callable[[], bool] = lambda: False,
+        most_gpus: int | None = 0,
     ) -> list[Joined]:
         """Puts an actor on each of several nodes that have so many CPUs left.
+
+        Where GPUs are wanted and there are any, only nodes with GPUs count, and each gives as many
+        as the one with the fewest has.
 
         Args:
           num_cpus: of each.
           wanted: how many nodes; None: all that have the CPUs.
           least: how many will do when the wait is over; None: `wanted`.
           is_unwanted: whether the user has asked for an end meanwhile.
+          most_gpus: of each; None: all.
 
         Raises:
           ConfigError: there are fewer nodes, they have no room, or one cannot take part.
@@ -76,20 +82,23 @@ class RayCluster:
         deadline_s = time.monotonic() + self._config.wait_s
         least = max(1, least or wanted or 1)
         while True:
-            found = self._num_nodes(num_cpus)
+            gpus = self._gpus_of_nodes(num_cpus, most_gpus)
+            found = len(gpus)
             is_over = time.monotonic() >= deadline_s
             if found >= (wanted or 1) or (is_over and found >= least):
                 break
             if is_over:
                 raise ConfigError(
                     f"cluster.nodes={wanted or 'auto'}: the cluster has {found} nodes with "
-                    f"{num_cpus} CPUs, and no more came within cluster.wait_s="
-                    f"{self._config.wait_s:g} s"
+                    f"{num_cpus} CPUs{' and a GPU' if any(gpus) else ''}, and no more came within "
+                    f"cluster.wait_s={self._config.wait_s:g} s"
                 )
             if is_unwanted():
                 raise JobInterrupted("stopped while it waited for nodes")
             time.sleep(_POLL_S)
-        self._place(num_cpus, min(found, wanted or found), deadline_s)
+        num_nodes = min(found, wanted or found)
+        bundle = {"CPU": num_cpus} | ({"GPU": few} if (few := gpus[num_nodes - 1]) else {})
+        self._place(bundle, num_nodes, deadline_s)
         return self._joined()
 
     def leave(self) -> None:
@@ -98,7 +107,7 @@ class RayCluster:
         asked = []
         for actor in self._actors:
             with suppress(Exception):
-                asked.append(actor.close.remote())
+                asked.append(actor.ask.remote("close"))
         with suppress(Exception):
             ray.wait(asked, num_returns=len(asked), timeout=_CLOSE_S)
         for actor in self._actors:
@@ -139,36 +148,42 @@ class RayCluster:
             if threading.current_thread() is threading.main_thread():
                 signal.signal(signal.SIGTERM, before)  # Ray has put its own there.
 
-    def _num_nodes(self, num_cpus: int) -> int:
-        alive = [node for node in self._ray.nodes() if node["Alive"]]
-        return sum(node["Resources"].get("CPU", 0) >= num_cpus for node in alive)
+    def _gpus_of_nodes(self, num_cpus: int, most_gpus: int | None) -> list[int]:
+        """GPUs to be had of each node that has the CPUs, those with the most first."""
+        alive = [node["Resources"] for node in self._ray.nodes() if node["Alive"]]
+        gpus = [int(own.get("GPU", 0)) for own in alive if own.get("CPU", 0) >= num_cpus]
+        if most_gpus is not None:
+            gpus = [min(own, most_gpus) for own in gpus]
+        return sorted(filter(None, gpus), reverse=True) or gpus
 
-    def _place(self, num_cpus: int, num_nodes: int, deadline_s: float) -> None:
+    def _place(self, bundle: dict[str, int], num_nodes: int, deadline_s: float) -> None:
         ray = self._ray
-        self._group = ray.util.placement_group(
-            [{"CPU": num_cpus}] * num_nodes, strategy="STRICT_SPREAD"
-        )
+        self._group = ray.util.placement_group([bundle] * num_nodes, strategy="STRICT_SPREAD")
         # Ray needs a moment also where there is room.
         if not self._group.wait(max(_PLACE_S, deadline_s - time.monotonic())):
             self.leave()
+            room = ", ".join(f"{count} {name}s" for name, count in bundle.items())
             raise ConfigError(
-                f"cluster.nodes={self._config.nodes}: no {num_nodes} nodes with {num_cpus} free "
-                f"CPUs each within cluster.wait_s={self._config.wait_s:g} s"
+                f"cluster.nodes={self._config.nodes}: no {num_nodes} nodes with {room} free each "
+                f"within cluster.wait_s={self._config.wait_s:g} s"
             )
         variables = {k: v for k, v in os.environ.items() if k.startswith(PASSED_ON)}
-        arguments = (variables, os.getcwd(), self._config.interface)
+        arguments = (self._kind, variables, os.getcwd(), self._config.interface)
         remote = ray.remote(_NodeActor)
-        for bundle in range(num_nodes):
+        for position in range(num_nodes):
             strategy = ray.util.scheduling_strategies.PlacementGroupSchedulingStrategy(
-                self._group, placement_group_bundle_index=bundle
+                self._group, placement_group_bundle_index=position
             )
+            # Ray shows an actor the GPUs that it has asked for itself.
             options = {"num_cpus": 0, "scheduling_strategy": strategy}
+            options["num_gpus"] = bundle.get("GPU", 0)
             self._actors.append(remote.options(**options).remote(*arguments))
 
     def _joined(self) -> list[Joined]:
         ray = self._ray
         try:
-            answers = ray.get([actor.facts.remote() for actor in self._actors], timeout=_ACTORS_S)
+            asked = [actor.ask.remote("facts") for actor in self._actors]
+            answers = ray.get(asked, timeout=_ACTORS_S)
         except Exception as error:
             self.leave()
             raise ConfigError(
@@ -185,7 +200,7 @@ class RayCluster:
 
     def _ask_of(self, actor: Any) -> Any:
         def ask(method: str, *arguments: Any) -> _RayAnswer:
-            return _RayAnswer(self._ray, getattr(actor, method).remote(*arguments))
+            return _RayAnswer(self._ray, actor.ask.remote(method, *arguments))
 
         return ask
 
@@ -203,16 +218,22 @@ class _RayAnswer:
         return self._ray.get(self._reference, timeout=LOST_S)
 
 
-class _NodeActor(Node):
-    """A `Node` that asks Ray for its address, and ends with the raylet of its machine."""
+class _NodeActor:
+    """Holds a `Node`, and ends with the raylet of its machine."""
 
-    def __init__(self, variables: dict[str, str], folder: str, interface: str | None) -> None:
+    def __init__(
+        self, kind: type[Node], variables: dict[str, str], folder: str, interface: str | None
+    ) -> None:
         address = _import_ray().util.get_node_ip_address()
-        super().__init__(variables, folder, interface, address)
+        self._node = kind(variables, folder, interface, address)
         # Ray ends the actor then too, but later, and not while the raylet is a zombie.
         raylet = identify(int(os.environ.get("RAY_RAYLET_PID", "0")))
         if raylet is not None:
             threading.Thread(target=_end_with, args=(raylet,), daemon=True).start()
+
+    def ask(self, method: str, *arguments: Any) -> Any:
+        """Calls a method of the node."""
+        return getattr(self._node, method)(*arguments)
 
 
 def _end_with(process: ProcessId) -> None:

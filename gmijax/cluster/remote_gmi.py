@@ -8,7 +8,7 @@ from collections.abc import Callable
 from contextlib import suppress
 from typing import Any, Final, Protocol
 
-from gmijax.cluster.node import Order, Seen
+from gmijax.cluster.node import Seen
 from gmijax.errors import GmiFailed, ReportedError, lines_of
 from gmijax.runs.folder import GmiPaths
 from gmijax.supervise.watched_gmi import WatchedGmi
@@ -54,7 +54,7 @@ class RemoteNode:
         self.lost: str | None = None
         self.is_silent = False
         self._ask, self._position = ask, position
-        self._seen: dict[int, Seen] = {}
+        self._seen: dict[int, Any] = {}
         self._asked: Answer | None = None
         self._asked_s = 0.0
 
@@ -79,14 +79,14 @@ class RemoteNode:
             self._lose(error)
             return None
 
-    def order(self, gmi: int, order: Order) -> None:
-        """Has it do something with a GMI, without waiting for that."""
+    def order(self, child: int, order: str) -> None:
+        """Has it do something with a GMI or another child, without waiting for that."""
         if self.lost is None:
             with suppress(Exception):  # The next poll tells.
-                self._ask("order", gmi, order)
+                self._ask("order", child, order)
 
-    def look(self, gmi: int) -> Seen | None:
-        """The newest that is known of a GMI; None before the first answer."""
+    def look(self, child: int) -> Any:
+        """The newest that its `poll` told of a child; None before the first answer."""
         now_s = time.monotonic()
         if self.lost is None and self._asked is not None and self._asked.is_there():
             try:
@@ -100,7 +100,7 @@ class RemoteNode:
         self.is_silent = self.lost is None and waited_s > SILENT_S
         if self.is_silent and waited_s > LOST_S:
             self._lose(TimeoutError(f"it does not answer for {LOST_S:g} s"))
-        return self._seen.get(gmi)
+        return self._seen.get(child)
 
     def _lose(self, error: Exception) -> None:
         self.lost = f"node {self._position} ({self.address}) is gone: {lines_of(error)[-1]}"
@@ -132,7 +132,7 @@ class RemoteGmi(WatchedGmi):
         """See `WatchedGmi`."""
         if self.exit_code is not None:
             return self.exit_code
-        seen = self._node.look(self.gmi)
+        seen: Seen | None = self._node.look(self.gmi)
         self.is_silent = self._node.is_silent
         if seen is not None:
             self._heard(seen.beats, seen.beat)

@@ -1,4 +1,4 @@
-"""Processes of the jobs of a sweep: each is a controller of its own."""
+"""Processes of the jobs of a sweep, on their machine: each is a controller of its own."""
 
 from __future__ import annotations
 
@@ -6,103 +6,105 @@ import os
 import signal
 import subprocess
 import sys
+import time
 from collections.abc import Mapping
 from contextlib import suppress
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
-from gmijax.control.exit_codes import EXIT_INTERRUPTED
 from gmijax.errors import GmijaxError
-from gmijax.machine.processes import GuardPipe
+from gmijax.machine.processes import GuardPipe, members_of
 from gmijax.runs.folder import write_json
 from gmijax.supervise.failures import last_line
-from gmijax.sweeps.jobs import Job
-from gmijax.sweeps.places import Place
 
 MODULE = "gmijax.workers.training_job"
 
+_STAY_S = 15.0
+"""Longest wait for the rest of a process group whose leader has ended."""
 
-@dataclass
+
+class Seen(NamedTuple):
+    """What is known of a child.
+
+    Attributes:
+      exit_code: None while it runs; negative for the signal that ended it.
+      said: the last line that it printed, once it has ended.
+    """
+
+    exit_code: int | None
+    said: str = ""
+
+
 class Child:
     """The process of a job.
 
-    Attributes:
-      job: what it trains.
-      place: where.
-      is_pruned: whether it was asked to end because others are better.
-      is_killed: whether it was ended by force, as the whole sweep is.
+    Args:
+      config: of the training, with everything that its place decides.
+      cpus: its cores.
+      order: file for what the process is told.
+      log: file for what it prints; continued if it exists.
+      variables: environment variables beside those of this process.
+
+    Raises:
+      GmijaxError: it cannot be started.
     """
 
-    job: Job
-    place: Place
-    log: Path
-    process: subprocess.Popen[bytes]
-    pipe: GuardPipe
-    is_pruned: bool = False
-    is_killed: bool = False
+    def __init__(
+        self,
+        config: Mapping[str, Any],
+        cpus: tuple[int, ...],
+        order: Path,
+        log: Path,
+        variables: Mapping[str, str],
+    ) -> None:
+        write_json(order, {"config": config, "cpus": list(cpus)})
+        self._log = log
+        self._pipe = GuardPipe()
+        self._ended_s: float | None = None
+        try:
+            with log.open("ab") as output:
+                self._process = subprocess.Popen(
+                    [sys.executable, "-m", MODULE, str(order), str(self._pipe.read_end)],
+                    env={**os.environ, **variables},
+                    stdin=subprocess.DEVNULL,
+                    stdout=output,
+                    stderr=output,
+                    pass_fds=(self._pipe.read_end,),
+                    # Ctrl-C is for the sweep, which asks its jobs.
+                    start_new_session=True,
+                )
+        except OSError as error:
+            self._pipe.close()
+            raise GmijaxError(f"{order.stem}: cannot be started ({error.strerror})") from None
+        finally:
+            os.close(self._pipe.read_end)
 
-    def has_ended(self) -> bool:
-        """Whether the process is gone."""
-        return self.process.poll() is not None
+    @property
+    def pid(self) -> int:
+        """Its number; that of its process group too."""
+        return self._process.pid
+
+    def look(self) -> Seen:
+        """How it is; it has ended when its process group has, or is late with that."""
+        code = self._process.poll()
+        if code is None:
+            return Seen(None)
+        self._ended_s = self._ended_s or time.monotonic()
+        if members_of(self.pid) and time.monotonic() - self._ended_s < _STAY_S:
+            return Seen(None)
+        return Seen(code, last_line(self._log))
 
     def ask_to_stop(self) -> None:
         """Asks it to save and end."""
         with suppress(ProcessLookupError):
-            self.process.send_signal(signal.SIGTERM)
+            self._process.send_signal(signal.SIGTERM)
 
     def kill(self) -> None:
         """Ends it now; its GMIs end with it."""
-        self.is_killed = True
         with suppress(ProcessLookupError):
-            os.killpg(self.process.pid, signal.SIGKILL)
+            os.killpg(self.pid, signal.SIGKILL)
 
-    def close(self) -> tuple[bool, str | None]:
-        """After its end: whether it was interrupted, and why it failed (None: it did not)."""
-        self.pipe.close()
-        code = self.process.wait()
-        if code == 0:
-            return False, None
-        if code == EXIT_INTERRUPTED or self.is_killed:
-            return True, None
-        return False, last_line(self.log).removeprefix("gmijax.train: ") or f"exit code {code}"
-
-
-def start(
-    job: Job,
-    place: Place,
-    config: Mapping[str, Any],
-    order: Path,
-    log: Path,
-    variables: Mapping[str, str],
-) -> Child:
-    """Starts a job.
-
-    Args:
-      job: what to train.
-      place: where it goes.
-      config: of the training, with everything that the place decides.
-      order: file for what the process is told.
-      log: file for what it prints; continued if it exists.
-      variables: environment variables beside those of this process.
-    """
-    write_json(order, {"config": config, "cpus": list(place.cpus)})
-    pipe = GuardPipe()
-    try:
-        with log.open("ab") as output:
-            process = subprocess.Popen(
-                [sys.executable, "-m", MODULE, str(order), str(pipe.read_end)],
-                env={**os.environ, **variables},
-                stdin=subprocess.DEVNULL,
-                stdout=output,
-                stderr=output,
-                pass_fds=(pipe.read_end,),
-                # Ctrl-C is for the sweep, which asks its jobs.
-                start_new_session=True,
-            )
-    except OSError as error:
-        pipe.close()
-        raise GmijaxError(f"job {job.number}: cannot be started ({error.strerror})") from None
-    finally:
-        os.close(pipe.read_end)
-    return Child(job, place, log, process, pipe)
+    def close(self) -> None:
+        """After its end."""
+        self._pipe.close()
+        self._process.wait()

@@ -12,6 +12,7 @@ import tempfile
 import time
 from collections.abc import Sequence
 from pathlib import Path
+from typing import NamedTuple
 
 from rich.console import Console
 
@@ -19,14 +20,13 @@ from gmijax.autotune.grid import Measured, NotRunnable, Point
 from gmijax.autotune.store import ProfileStore
 from gmijax.autotune.tuner import workload_of
 from gmijax.config.sweep import SweepConfig
-from gmijax.errors import GmijaxError, JobInterrupted
-from gmijax.machine.snapshot import Machine
+from gmijax.errors import GmijaxError, JobInterrupted, NodeLost
 from gmijax.runs.cache import cache_folder
 from gmijax.runs.folder import read_json
-from gmijax.supervise.backends import open_backend
 from gmijax.supervise.launcher import StopSignals
+from gmijax.sweeps.host import Host
 from gmijax.sweeps.jobs import Job, SweepPaths
-from gmijax.sweeps.places import Places, places_of
+from gmijax.sweeps.places import Places, Site, places_of
 from gmijax.sweeps.scheduler import Scheduler
 from gmijax.sweeps.study import NoStudy
 
@@ -43,13 +43,23 @@ _FOREVER = 10**12
 def with_density(
     settings: SweepConfig,
     jobs: Sequence[Job],
-    machine: Machine,
+    hosts: Sequence[Host],
     console: Console,
     signals: StopSignals,
+    scratch: Path | None = None,
 ) -> SweepConfig:
     """The settings with a number of jobs per GPU.
 
-    Of jobs of several kinds the one that allows the fewest decides.
+    Of jobs of several kinds the one that allows the fewest decides. GPUs are measured on the first
+    of several machines, of machines without any the smallest decides.
+
+    Args:
+      settings: of the sweep.
+      jobs: of it, some of each kind.
+      hosts: its machines; backends are not entered.
+      console: told what was found.
+      signals: end it.
+      scratch: folder for what is measured, which the first machine sees; None: a temporary one.
 
     Raises:
       ConfigError: a job that cannot be profiled.
@@ -57,25 +67,33 @@ def with_density(
     """
     if settings.jobs_per_gpu != "auto":
         return settings
-    if not machine.gpus:
-        count = max(1, len(machine.cpu_cores) // _CORES_OF_A_JOB)
+    if not hosts[0].machine.gpus:
+        fewest = min(len(host.machine.cpu_cores) for host in hosts)
+        count = max(1, fewest // _CORES_OF_A_JOB)
         console.print(f"sweep.jobs_per_gpu={count}: {_CORES_OF_A_JOB} cores for each job")
         return dataclasses.replace(settings, jobs_per_gpu=count)
     kinds: dict[object, Job] = {}
     for job in jobs:
         config = job.config
         kinds.setdefault((config.env.label, config.num_envs, config.algo.name), job)
-    counts = [_best(settings, job, machine, console, signals) for job in kinds.values()]
-    most = -(-len(jobs) // max(1, len(machine.gpus)))
+    bench = _Bench(hosts[0], scratch, signals)
+    counts = [_best(settings, job, bench, console) for job in kinds.values()]
+    most = -(-len(jobs) // sum(len(host.machine.gpus) for host in hosts))
     return dataclasses.replace(settings, jobs_per_gpu=max(1, min(*counts, most)))
 
 
-def _best(
-    settings: SweepConfig, job: Job, machine: Machine, console: Console, signals: StopSignals
-) -> int:
+class _Bench(NamedTuple):
+    """Where it is measured."""
+
+    host: Host
+    scratch: Path | None
+    signals: StopSignals
+
+
+def _best(settings: SweepConfig, job: Job, bench: _Bench, console: Console) -> int:
     """The number of such jobs that makes the most steps on one GPU."""
     config = job.config
-    key = workload_of(config).store_key(machine) | {"job": "sweep"}
+    key = workload_of(config).store_key(bench.host.machine) | {"job": "sweep"}
     store = ProfileStore(cache_folder() / "profiles", key, console.print)
     best, best_rate = 1, 0.0
     for count in COUNTS:
@@ -83,7 +101,7 @@ def _best(
         found = store.get("sweep", point)
         if found is None:
             started_s = time.monotonic()
-            found = _profile(settings, job, count, machine, signals)
+            found = _profile(settings, job, count, bench)
             store.put("sweep", point, found, time.monotonic() - started_s)
         if isinstance(found, NotRunnable):
             console.print(
@@ -102,15 +120,14 @@ def _best(
     return best
 
 
-def _profile(
-    settings: SweepConfig, job: Job, count: int, machine: Machine, signals: StopSignals
-) -> Measured | NotRunnable:
+def _profile(settings: SweepConfig, job: Job, count: int, bench: _Bench) -> Measured | NotRunnable:
     """Trains with `count` copies for a few seconds; what each of them did."""
+    host, signals = bench.host, bench.signals
     gpus = settings.gpus if isinstance(settings.gpus, tuple) else None
     settings = dataclasses.replace(settings, jobs_per_gpu=count, gpus=gpus[:1] if gpus else 1)
     limit_s = job.config.search.profile_timeout_s
-    with tempfile.TemporaryDirectory(prefix="gmijax-") as scratch:
-        paths = SweepPaths(Path(scratch))
+    with tempfile.TemporaryDirectory(prefix="gmijax-", dir=bench.scratch) as folder:
+        paths = SweepPaths(Path(folder))
         jobs = [_copy(job, seed) for seed in range(count)]
         inner = StopSignals()
         window = _Window(jobs, limit_s)
@@ -121,10 +138,15 @@ def _profile(
                 inner.handle(signal.SIGTERM)
 
         try:
-            plan = places_of(settings, machine, {job.config.plan.backend})
-            with open_backend(plan, machine, paths) as backend:
-                places = Places(plan, machine)
-                Scheduler(jobs, NoStudy(), settings, paths, places, backend, tick).run(inner)
+            plan = places_of(settings, host.machine, {job.config.plan.backend})
+            places = Places([Site(plan, host.machine)])
+            try:
+                host.open(plan, paths)
+                Scheduler(jobs, NoStudy(), settings, paths, places, [host], tick).run(inner)
+            finally:
+                host.shut()
+        except NodeLost:
+            raise
         except JobInterrupted:
             if signals.have_come:
                 raise

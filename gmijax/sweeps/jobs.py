@@ -62,6 +62,7 @@ class Progress:
       updated_s: when the first line of metrics came after that.
       ended_s: when it ended after that.
       place: GPUs and places where it runs, in words.
+      node: address of the node where it runs or ran last; None: this machine.
       error: why it failed, in one line.
       curve: environment steps and objective of every line of metrics that has one.
     """
@@ -74,6 +75,7 @@ class Progress:
     updated_s: float | None = None
     ended_s: float | None = None
     place: str = ""
+    node: str | None = None
     error: str | None = None
     curve: list[tuple[int, float]] = field(default_factory=list)
 
@@ -181,9 +183,7 @@ def require_placeable(jobs: Sequence[Job], num_gpus: int) -> None:
     if not jobs:
         raise ConfigError("sweep: there is no job in it")
     for job in jobs:
-        plan, engine = job.config.plan, job.config.cluster.engine
-        if engine is not None:
-            raise ConfigError(f"cluster.engine={engine}: a sweep is for one machine; use null")
+        plan = job.config.plan
         if not isinstance(plan.gpus, int):
             raise ConfigError(
                 f"plan.gpus={list(plan.gpus)}: a sweep chooses the GPUs of its jobs; expected a "

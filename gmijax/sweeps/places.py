@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection
+from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
-from gmijax.config import PlanConfig, ReduceConfig, TrainConfig
+from gmijax.config import BackendName, PlanConfig, ReduceConfig, TrainConfig
 from gmijax.config.sweep import SweepConfig
 from gmijax.errors import ConfigError
 from gmijax.machine.snapshot import Machine
@@ -20,13 +20,20 @@ class Place:
 
     Attributes:
       slices: one of each of its GPUs.
-      label: in words, e.g. `GPU 0 place 1` by the index of nvidia-smi; without GPUs `place 1`.
+      label: in words, e.g. `GPU 0 place 1` by the index of nvidia-smi; without GPUs `place 1`, on
+        a node after its address.
       kept_free: others of its GPUs, where nobody else runs meanwhile.
+      site: index of its machine.
+      backend: of that machine's places.
+      is_whole_gpu: whether GPUs have one place each.
     """
 
     slices: tuple[Slice, ...]
     label: str
-    kept_free: tuple[Slice, ...] = ()
+    kept_free: tuple[Slice, ...]
+    site: int
+    backend: BackendName
+    is_whole_gpu: bool
 
     @property
     def devices(self) -> tuple[str, ...]:
@@ -43,15 +50,15 @@ class Place:
         fraction = self.slices[0].memory_fraction
         if fraction is None:
             return None
-        plan = config.plan
-        gmis = (
-            plan.serving_gmis_per_gpu + plan.training_gmis_per_gpu
-            if config.is_asynchronous
-            else 1
-            if plan.gmis_per_gpu == "auto"
-            else plan.gmis_per_gpu
-        )
-        return max(0.01, int(1e4 * fraction / gmis) / 1e4)
+        return max(0.01, int(1e4 * fraction / gmis_of_place(config)) / 1e4)
+
+
+def gmis_of_place(config: TrainConfig) -> int:
+    """How many GMIs a job has at each of its places."""
+    plan = config.plan
+    if config.is_asynchronous:
+        return plan.serving_gmis_per_gpu + plan.training_gmis_per_gpu
+    return 1 if plan.gmis_per_gpu == "auto" else plan.gmis_per_gpu
 
 
 def places_of(settings: SweepConfig, machine: Machine, backends: Collection[str]) -> Plan:
@@ -76,45 +83,99 @@ def places_of(settings: SweepConfig, machine: Machine, backends: Collection[str]
         raise ConfigError(said.replace("plan.gpus", "sweep.gpus")) from None
 
 
-class Places:
-    """All places of a sweep, free and taken; see `places_of` for the plan."""
+class Site(NamedTuple):
+    """A machine with places.
 
-    def __init__(self, plan: Plan, machine: Machine) -> None:
-        self._free = list(plan.slices)
-        index_of = {gpu.uuid: gpu.index for gpu in machine.gpus}
-        index_of |= {one.uuid: gpu.index for gpu in machine.gpus for one in gpu.instances}
-        self._all: dict[int, list[Slice]] = {}
-        self._labels: dict[int, str] = {}
-        for share in plan.slices:
-            here = self._all.setdefault(share.gpu, [])
-            gpu = f"GPU {index_of[share.device]} " if share.device in index_of else ""
-            self._labels[share.gmi] = f"{gpu}place {len(here)}"
-            here.append(share)
+    Attributes:
+      plan: see `places_of`.
+      machine: what it was made for.
+      name: address of a node; None: this machine.
+    """
+
+    plan: Plan
+    machine: Machine
+    name: str | None = None
+
+
+class Places:
+    """All places of a sweep, free and taken; a job's are all on one machine.
+
+    Args:
+      sites: where they are.
+    """
+
+    def __init__(self, sites: Sequence[Site]) -> None:
+        self._sites = list(sites)
+        self._free = [list(site.plan.slices) for site in sites]
+        self._all = [_by_gpu(site.plan.slices) for site in sites]
+        self._labels = [_labels(site) for site in sites]
+        self.left = set(range(len(sites)))
 
     def has_room(self) -> bool:
         """Whether any place is free."""
-        return bool(self._free)
+        return any(self._free)
 
-    def take(self, num_gpus: int, *, alone: bool = False) -> Place | None:
-        """A place on each of `num_gpus` GPUs, those with the most free ones; None: not now.
+    def take(
+        self, num_gpus: int, *, alone: bool = False, avoid: Collection[int] = ()
+    ) -> Place | None:
+        """A place on each of `num_gpus` GPUs of a machine, those with the most free ones.
 
-        With `alone` they are GPUs on which nobody else runs, now or until it is given back.
+        With `alone` they are GPUs on which nobody else runs, now or until it is given back. The
+        machines of `avoid` are left out. None: not now.
         """
-        by_gpu: dict[int, list[Slice]] = {}
-        for share in self._free:
-            by_gpu.setdefault(share.gpu, []).append(share)
-        if alone:
-            by_gpu = {gpu: free for gpu, free in by_gpu.items() if free == self._all[gpu]}
-        emptiest = sorted(by_gpu.values(), key=len, reverse=True)[:num_gpus]
-        if len(emptiest) < num_gpus:
+        found: list[tuple[int, list[list[Slice]]]] = []
+        for site in sorted(self.left.difference(avoid)):
+            by_gpu = _by_gpu(self._free[site])
+            if alone:
+                here = self._all[site]
+                by_gpu = {gpu: free for gpu, free in by_gpu.items() if free == here[gpu]}
+            emptiest = sorted(by_gpu.values(), key=len, reverse=True)[:num_gpus]
+            if len(emptiest) == num_gpus:
+                found.append((site, emptiest))
+        if not found:
             return None
+        site, emptiest = max(found, key=lambda one: sum(map(len, one[1])))
         taken = tuple(free[0] for free in emptiest)
         others = tuple(share for free in emptiest for share in free[1:]) if alone else ()
-        self._free = [share for share in self._free if share not in (*taken, *others)]
-        label = ", ".join(self._labels[share.gmi] for share in taken)
-        return Place(taken, f"{label} alone" if alone else label, others)
+        gone = (*taken, *others)
+        self._free[site] = [share for share in self._free[site] if share not in gone]
+        label = ", ".join(self._labels[site][share.gmi] for share in taken)
+        return Place(
+            taken,
+            f"{label} alone" if alone else label,
+            others,
+            site,
+            self._sites[site].plan.backend,
+            is_whole_gpu=all(len(here) == 1 for here in self._all[site].values()),
+        )
 
     def give_back(self, place: Place) -> None:
         """The job that was there has ended."""
-        free = [*self._free, *place.slices, *place.kept_free]
-        self._free = sorted(free, key=lambda share: share.gmi)
+        if place.site in self.left:
+            free = [*self._free[place.site], *place.slices, *place.kept_free]
+            self._free[place.site] = sorted(free, key=lambda share: share.gmi)
+
+    def drop(self, site: int) -> None:
+        """The machine is gone."""
+        self.left.discard(site)
+        self._free[site] = []
+
+
+def _by_gpu(slices: Iterable[Slice]) -> dict[int, list[Slice]]:
+    found: dict[int, list[Slice]] = {}
+    for share in slices:
+        found.setdefault(share.gpu, []).append(share)
+    return found
+
+
+def _labels(site: Site) -> dict[int, str]:
+    """Slices in words."""
+    index_of = {gpu.uuid: gpu.index for gpu in site.machine.gpus}
+    index_of |= {one.uuid: gpu.index for gpu in site.machine.gpus for one in gpu.instances}
+    node = f"{site.name} " if site.name else ""
+    labels: dict[int, str] = {}
+    for here in _by_gpu(site.plan.slices).values():
+        for place, share in enumerate(here):
+            gpu = f"GPU {index_of[share.device]} " if share.device in index_of else ""
+            labels[share.gmi] = f"{node}{gpu}place {place}"
+    return labels

@@ -124,6 +124,7 @@ def _row(job: Job, paths: SweepPaths, first_s: float) -> dict[str, Any]:
         "overrides": dict(job.overrides),
         "run_dir": str(paths.job(job.number).root),
         "state": progress.state,
+        "node": progress.node,
         "value": progress.value,
         "env_steps": progress.env_steps,
         "start_s": None if start_s is None else round(start_s - first_s, 3),

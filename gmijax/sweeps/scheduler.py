@@ -2,24 +2,22 @@
 
 from __future__ import annotations
 
-import json
 import time
-from collections.abc import Callable
+from collections import Counter
+from collections.abc import Callable, Sequence
 from contextlib import suppress
+from dataclasses import dataclass
 
 from gmijax.config.schema import to_dict
 from gmijax.config.sweep import SweepConfig
-from gmijax.errors import JobInterrupted
-from gmijax.machine.mps_control import PIPE_VARIABLE
-from gmijax.machine.processes import members_of, wait_until_gone
-from gmijax.machine.snapshot import DAEMONS_VARIABLE
+from gmijax.control.exit_codes import EXIT_INTERRUPTED
+from gmijax.errors import JobInterrupted, NodeLost
 from gmijax.runs.folder import add_event, is_locked
 from gmijax.runs.history import MetricsReader
-from gmijax.supervise.backends.backend import Backend
 from gmijax.supervise.failures import may_be_anothers
 from gmijax.supervise.launcher import StopSignals
-from gmijax.sweeps.children import Child, start
-from gmijax.sweeps.compiled import CompiledPrograms
+from gmijax.sweeps.children import Seen
+from gmijax.sweeps.host import Host, Start
 from gmijax.sweeps.hparams import write_hparams
 from gmijax.sweeps.jobs import Job, SweepPaths, placed
 from gmijax.sweeps.places import Place, Places
@@ -27,7 +25,54 @@ from gmijax.sweeps.study import Study
 
 _TICK_S = 0.1
 _KILL_AFTER_S = 15.0
-"""Beyond what a job gives its GMIs to save and end."""
+"""Beyond what a job gives its GMIs to save and end; for killed ones to be gone."""
+
+
+@dataclass
+class _Running:
+    """A job that runs.
+
+    Attributes:
+      job: what it trains.
+      place: where.
+      host: the machine.
+      child: its number there.
+      reader: of its metrics.
+      is_pruned: whether it was asked to end because others are better.
+      is_killed: whether it was ended by force, as the whole sweep is.
+    """
+
+    job: Job
+    place: Place
+    host: Host
+    child: int
+    reader: MetricsReader
+    is_pruned: bool = False
+    is_killed: bool = False
+
+    def look(self) -> Seen | None:
+        """How it is; None: that is not known."""
+        return self.host.look(self.child)
+
+    def order_stop(self) -> None:
+        """Asks it to save and end."""
+        self.host.order(self.child, "ask_to_stop")
+
+    def is_over(self) -> bool:
+        """Whether it has ended, or its machine is gone."""
+        seen = self.look()
+        return self.host.lost is not None or (seen is not None and seen.exit_code is not None)
+
+    def outcome(self) -> tuple[bool, str | None]:
+        """After its end: whether it was interrupted, and why it failed (None: it did not)."""
+        seen = self.look() or Seen(None)
+        if seen.exit_code == 0:
+            return False, None
+        if seen.exit_code == EXIT_INTERRUPTED or self.is_killed:
+            return True, None
+        if seen.exit_code is None:
+            return False, self.host.lost
+        return False, seen.said.removeprefix("gmijax.train: ") or f"exit code {seen.exit_code}"
 
 
 class Scheduler:
@@ -35,6 +80,7 @@ class Scheduler:
 
     A job that fails ends alone. But where it shared an MPS daemon, and the fault may have been
     that of another client, it is run once more, from its last checkpoint and alone on its GPU.
+    Jobs of a machine that is gone run again on others, as often as `run.max_restarts` says.
 
     Args:
       jobs: those that are known; those that are `waiting` are run. More come from the study.
@@ -42,7 +88,7 @@ class Scheduler:
       sweep: settings.
       paths: files of the sweep.
       places: of the jobs.
-      backend: of the plan of the places, entered.
+      hosts: machines of the places, in that order; opened.
       on_tick: called ten times a second.
     """
 
@@ -53,24 +99,24 @@ class Scheduler:
         sweep: SweepConfig,
         paths: SweepPaths,
         places: Places,
-        backend: Backend,
+        hosts: Sequence[Host],
         on_tick: Callable[[], None],
     ) -> None:
         self._jobs, self._study = jobs, study
         self._queue = [job for job in jobs if job.progress.state == "waiting"]
         self._sweep, self._paths = sweep, paths
-        self._places, self._backend, self._on_tick = places, backend, on_tick
+        self._places, self._hosts, self._on_tick = places, hosts, on_tick
         self._alone: set[int] = set()
-        self._running: dict[int, Child] = {}
-        self._readers: dict[int, MetricsReader] = {}
-        self._compiled = CompiledPrograms()
-        self._compiling: dict[str, int] = {}
+        self._nodes_lost: Counter[int] = Counter()
+        self._running: dict[int, _Running] = {}
+        self._compiling: dict[tuple[int, str], int] = {}
 
     def run(self, signals: StopSignals) -> None:
         """Returns when all jobs have ended.
 
         Raises:
           JobInterrupted: a signal came; all jobs have saved and ended.
+          NodeLost: no machine is left.
         """
         try:
             self._start_what_fits()
@@ -79,6 +125,8 @@ class Scheduler:
                     self._stop(signals)
                     raise JobInterrupted("interrupted")
                 self._look()
+                if not self._places.left:
+                    raise NodeLost(f"no node is left: {self._hosts[-1].lost}")
                 self._start_what_fits()
                 self._on_tick()
                 time.sleep(_TICK_S)
@@ -87,99 +135,124 @@ class Scheduler:
 
     def _start_what_fits(self) -> None:
         for job in list(self._queue):
-            # The others would compile the same; when it has, they find it in the cache.
-            if self._compiling.get(job.program, job.number) != job.number:
-                continue
-            # A killed sweep's process of the job may still save.
+            # A killed process of the job, or one of a machine that is gone, may still save.
             if is_locked(self._paths.job(job.number).lock):
                 continue
-            if not self._start_if_it_fits(job):
+            if self._start_if_it_fits(job):
+                self._queue.remove(job)
+            elif not self._compiling_sites(job):
                 return  # In order, so that a large job is not passed by forever.
-            self._queue.remove(job)
         while not self._queue and self._places.has_room() and (job := self._study.next()):
             self._jobs.append(job)
             if not self._start_if_it_fits(job):
                 self._queue.append(job)
 
     def _start_if_it_fits(self, job: Job) -> bool:
-        place = self._places.take(job.num_gpus, alone=job.number in self._alone)
+        # Others compile the same there; when they have, it is found in the cache.
+        avoid = self._compiling_sites(job)
+        place = self._places.take(job.num_gpus, alone=job.number in self._alone, avoid=avoid)
         if place is None:
             return False
-        if not self._compiled.holds(job):
-            self._compiling[job.program] = job.number
-        self._start(job, place)
+        try:
+            self._start(job, place)
+        except NodeLost:
+            self._drop_lost()
+            return False
         return True
 
+    def _compiling_sites(self, job: Job) -> set[int]:
+        """Machines where another job compiles the same programs."""
+        return {site for site, program in self._compiling if program == job.program}
+
     def _start(self, job: Job, place: Place) -> None:
-        run = self._paths.job(job.number)
+        run, host = self._paths.job(job.number), self._hosts[place.site]
         # Alone on a GPU a job does as it would without a sweep.
-        backend = "auto" if self._sweep.jobs_per_gpu == 1 else self._backend.plan.backend
-        config = placed(job, run, place, backend)
-        order, log = self._paths.order(job.number), self._paths.log(job.number)
-        variables = variables_of(place, self._backend)
-        self._readers[job.number] = reader = MetricsReader(run.metrics)
-        progress = job.progress
+        config = placed(job, run, place, "auto" if place.is_whole_gpu else place.backend)
+        progress, reader = job.progress, MetricsReader(run.metrics)
         progress.read(run, self._sweep)
         reader.new()  # Those are an earlier attempt's.
-        child = start(job, place, to_dict(config), order, log, variables)
-        self._running[job.number] = child
-        self._backend.started(child.process.pid)
+        files = self._paths.order(job.number), self._paths.log(job.number)
+        started = host.start(Start(place, to_dict(config), *files, job.program))
+        if not started.has_programs:
+            self._compiling[place.site, job.program] = job.number
+        self._running[job.number] = _Running(job, place, host, started.child, reader)
         progress.state, progress.place, progress.error = "running", place.label, None
+        progress.node = host.name
         progress.started_s, progress.updated_s, progress.ended_s = time.monotonic(), None, None
 
     def _look(self) -> None:
-        for number, child in list(self._running.items()):
-            job, progress = child.job, child.job.progress
-            for line in self._readers[number].new():
+        for running in list(self._running.values()):
+            job, progress = running.job, running.job.progress
+            is_over = running.is_over()
+            for line in running.reader.new():
                 progress.take(line, self._sweep)
                 progress.updated_s = progress.updated_s or time.monotonic()
-                self._nobody_waits_for(job, has_compiled=True)
-            if child.has_ended():
-                self._finish(child)
-            elif not child.is_pruned and self._study.is_hopeless(job):
-                child.is_pruned = True
-                child.ask_to_stop()
+                self._nobody_waits_for(running, has_compiled=True)
+            if is_over:
+                self._finish(running)
+            elif not running.is_pruned and self._study.is_hopeless(job):
+                running.is_pruned = True
+                running.order_stop()
+        self._drop_lost()
 
-    def _finish(self, child: Child) -> None:
-        job, progress = child.job, child.job.progress
+    def _finish(self, running: _Running) -> None:
+        job, progress, host = running.job, running.job.progress, running.host
         del self._running[job.number]
-        wait_until_gone(members_of(child.process.pid), _KILL_AFTER_S)
-        is_interrupted, error = child.close()
-        self._places.give_back(child.place)
-        self._nobody_waits_for(job, has_compiled=False)
+        is_interrupted, error = running.outcome()
+        is_lost = error is not None and error == host.lost
+        host.order(running.child, "close")
+        self._places.give_back(running.place)
+        self._nobody_waits_for(running, has_compiled=False)
         run = self._paths.job(job.number)
         progress.read(run, self._sweep)
         progress.place, progress.error, progress.ended_s = "", error, time.monotonic()
         progress.state = "failed" if error else "completed"
-        if is_interrupted:
-            progress.state = "pruned" if child.is_pruned else "interrupted"
-        elif error and self._may_be_anothers(job, error):
-            self._alone.add(job.number)
-            self._queue.append(job)
-            progress.state, progress.error = "waiting", f"again, alone on its GPU, after {error}"
-            add_event(run.events, "again", reason=progress.error)
+        if is_interrupted or (is_lost and running.is_pruned):
+            progress.state = "pruned" if running.is_pruned else "interrupted"
+        elif error and (again := self._why_again(running, error, is_lost=is_lost)):
+            # It came before the others; one that waits for a whole GPU must not hold them up.
+            self._queue.insert(0 if is_lost else len(self._queue), job)
+            progress.state, progress.error = "waiting", again
+            add_event(run.events, "again", reason=again)
             return
         with suppress(OSError):  # A full disk must not end the sweep.
             write_hparams(job, run, self._sweep.objective)
         self._study.tell(job)
 
-    def _may_be_anothers(self, job: Job, error: str) -> bool:
-        """Whether a job that may start again failed by what another one may have done."""
-        has_daemon = self._backend.plan.backend in ("mps", "mig")
+    def _why_again(self, running: _Running, error: str, *, is_lost: bool) -> str | None:
+        """Why a job that failed runs once more, if that may help."""
+        job = running.job
+        if is_lost:
+            self._nodes_lost[job.number] += 1
+            # It may be what ends them.
+            is_allowed = self._nodes_lost[job.number] <= job.config.run.max_restarts
+            return f"again, after {error}" if is_allowed else None
+        # The fault may be that of another client of its daemon.
+        has_daemon = running.place.backend in ("mps", "mig")
         may_restart = job.config.run.max_restarts > 0 and job.number not in self._alone
-        return has_daemon and may_restart and may_be_anothers(error)
+        if has_daemon and may_restart and may_be_anothers(error):
+            self._alone.add(job.number)
+            return f"again, alone on its GPU, after {error}"
+        return None
 
-    def _nobody_waits_for(self, job: Job, *, has_compiled: bool) -> None:
+    def _nobody_waits_for(self, running: _Running, *, has_compiled: bool) -> None:
         """Its metrics are there, or it has ended, perhaps before it had compiled."""
-        if self._compiling.get(job.program) == job.number:
-            del self._compiling[job.program]
-            self._compiled.add(job, is_lasting=has_compiled)
+        job, key = running.job, (running.place.site, running.job.program)
+        if self._compiling.get(key) == job.number:
+            del self._compiling[key]
+            with suppress(NodeLost):
+                running.host.add_program(job.program, has_compiled)
+
+    def _drop_lost(self) -> None:
+        for site in list(self._places.left):
+            if self._hosts[site].lost is not None:
+                self._places.drop(site)
 
     def _stop(self, signals: StopSignals) -> None:
         """Asks all jobs to save and end; the same signal again ends them at once."""
-        for child in self._running.values():
-            child.ask_to_stop()
-        limits = [child.job.config.run for child in self._running.values()]
+        for running in self._running.values():
+            running.order_stop()
+        limits = [running.job.config.run for running in self._running.values()]
         longest_s = max((run.stop_timeout_s + run.grace_s for run in limits), default=0.0)
         deadline_s = time.monotonic() + longest_s + _KILL_AFTER_S
         while self._running and time.monotonic() < deadline_s and signals.requests < 2:
@@ -189,20 +262,11 @@ class Scheduler:
 
     def _kill_all(self) -> None:
         left = list(self._running.values())
-        for child in left:
-            child.kill()
-        for child in left:
-            self._finish(child)
-
-
-def variables_of(place: Place, backend: Backend) -> dict[str, str]:
-    """What tells a job at a place its GPUs, and the daemon of each; a dead daemon is renewed."""
-    if not place.devices:
-        return {}
-    daemons: dict[str, str] = {}
-    for share in place.slices:
-        backend.renew(share.gmi)
-        if pipe := backend.environment(share.gmi).get(PIPE_VARIABLE):
-            daemons[share.device] = pipe
-    devices = ",".join(place.devices)
-    return {"CUDA_VISIBLE_DEVICES": devices, DAEMONS_VARIABLE: json.dumps(daemons)}
+        for running in left:
+            running.is_killed = True
+            running.host.order(running.child, "kill")
+        deadline_s = time.monotonic() + 2 * _KILL_AFTER_S
+        for running in left:
+            while not running.is_over() and time.monotonic() < deadline_s:
+                time.sleep(_TICK_S)
+            self._finish(running)

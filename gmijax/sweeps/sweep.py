@@ -3,26 +3,25 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
-from contextlib import ExitStack
+from collections.abc import Iterator, Sequence
+from contextlib import ExitStack, closing, contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
 from rich.console import Console
 
-from gmijax.config import TrainConfig
+from gmijax.config import ClusterConfig, TrainConfig
 from gmijax.config.schema import from_dict
 from gmijax.config.sweep import SweepConfig
 from gmijax.control.console import open_console
 from gmijax.control.decide import with_task
 from gmijax.errors import ConfigError, JobInterrupted, SweepFailed
 from gmijax.machine.snapshot import detect_machine
-from gmijax.partition.plan import Plan
-from gmijax.runs.folder import create_run, given_run, locked, read_json, write_json
-from gmijax.supervise.backends import open_backend
-from gmijax.supervise.launcher import stop_signals
+from gmijax.runs.folder import RUNS, create_run, given_run, locked, read_json, write_json
+from gmijax.supervise.launcher import StopSignals, stop_signals
 from gmijax.sweeps.density import with_density
+from gmijax.sweeps.host import Host, LocalHost
 from gmijax.sweeps.jobs import (
     Job,
     SweepPaths,
@@ -31,13 +30,15 @@ from gmijax.sweeps.jobs import (
     require_placeable,
     state_of,
 )
-from gmijax.sweeps.leases import leased
-from gmijax.sweeps.places import Places, places_of
+from gmijax.sweeps.nodes import nodes_of
+from gmijax.sweeps.places import Places, Site, places_of
 from gmijax.sweeps.report import ranking, write_report
 from gmijax.sweeps.scheduler import Scheduler
 from gmijax.sweeps.space import Space
 from gmijax.sweeps.study import MakeJob, NoStudy, OptunaStudy, Study
 from gmijax.sweeps.view import SweepView
+
+_LEASE_POLL_S = 0.2
 
 
 class Request(NamedTuple):
@@ -48,12 +49,14 @@ class Request(NamedTuple):
       space: what the keys of jobs may be.
       make_job: a job with values of the space.
       jobs: all of a grid; of another sampler some that stand for all, to be checked.
+      cluster: the nodes that they run on; without an engine it is this machine.
     """
 
     settings: SweepConfig
     space: Space
     make_job: MakeJob
     jobs: tuple[Job, ...]
+    cluster: ClusterConfig = ClusterConfig()
 
 
 class SweepResult(NamedTuple):
@@ -75,15 +78,20 @@ def sweep(configs: Sequence[TrainConfig], *, show: bool = False, **settings: Any
       >>> sweep([compose("env=ant", f"seed={seed}") for seed in range(4)], jobs_per_gpu=2)
 
     Args:
-      configs: at least one; all with the same `run.dir` or `run.name`, the folder of the sweep.
+      configs: at least one; all with the same `run.dir` or `run.name`, the folder of the sweep,
+        and the same `cluster`, whose nodes the jobs run on.
       show: print live progress and the ranking.
       settings: keys of `sweep.*`.
 
     Raises:
       ConfigError, SweepFailed, JobInterrupted: as `run_request`.
     """
-    jobs = jobs_of(configs)
-    request = Request(from_dict(SweepConfig, settings), {}, lambda n, _: jobs[n], jobs)
+    clusters = {config.cluster for config in configs}
+    if len(clusters) > 1:
+        raise ConfigError("cluster: a sweep has one; give all configurations the same")
+    jobs = jobs_of([replace(config, cluster=ClusterConfig()) for config in configs])
+    own = from_dict(SweepConfig, settings)
+    request = Request(own, {}, lambda n, _: jobs[n], jobs, *clusters)
     return run_request(request, show=show)
 
 
@@ -98,42 +106,49 @@ def run_request(request: Request, *, show: bool = False) -> SweepResult:
       JobInterrupted: SIGINT, SIGTERM, SIGHUP or SIGUSR1 came, and all jobs have saved and ended.
     """
     started_s = time.monotonic()
-    settings, machine, console = request.settings, detect_machine(), open_console(show=show)
+    console = open_console(show=show)
     request = _with_tasks(request)
-    backends = {job.config.plan.backend for job in request.jobs}
-    # Before anything is started: whether there are such GPUs, and room for so many jobs.
-    plan = places_of(settings, machine, backends)
-    require_placeable(request.jobs, plan.layout.num_gpus)
-    require_objective(request.jobs, settings)
-    paths = _open(request.jobs)
-    with locked(paths.lock, f"run.dir={paths.root}"):
-        jobs, study = _beginning(request, paths)
-        write_report("running", jobs, settings, paths, 0.0)
-        console.print(f"sweep folder: {paths.root}")
-        view = SweepView(console, jobs, settings)
-        status = "failed"
-        try:
-            with stop_signals() as signals, ExitStack() as held:
-                devices = {share.device for share in plan.slices} - {"cpu"}
-                wait = leased(devices, console.print, lambda: signals.have_come)
-                if not held.enter_context(wait):
-                    raise JobInterrupted("interrupted")
-                settings = with_density(settings, request.jobs, machine, console, signals)
-                plan = places_of(settings, machine, backends)
-                _announce(console, plan, request, jobs)
-                backend = held.enter_context(open_backend(plan, machine, paths))
-                held.enter_context(view)
-                places = Places(plan, machine)
-                scheduler = Scheduler(jobs, study, settings, paths, places, backend, view.update)
-                scheduler.run(signals)
-            failed = [job for job in jobs if job.progress.state == "failed"]
-            status = "failed" if failed else "completed"
-        except JobInterrupted as error:
-            status = "interrupted"
-            error.add_note(f"the same command with run.dir={paths.root} goes on")
-            raise
-        finally:
-            report = write_report(status, jobs, settings, paths, time.monotonic() - started_s)
+    with _hosts_of(request) as hosts:
+        # Before anything is started: whether there are such GPUs, and room for so many jobs.
+        sites = _sites(request.settings, request, hosts)
+        require_placeable(request.jobs, min(site.plan.layout.num_gpus for site in sites))
+        require_objective(request.jobs, request.settings)
+        paths = _open(request.jobs)
+        with locked(paths.lock, f"run.dir={paths.root}"):
+            return _run(request, hosts, paths, console, started_s)
+
+
+def _run(
+    request: Request, hosts: Sequence[Host], paths: SweepPaths, console: Console, started_s: float
+) -> SweepResult:
+    """Runs the sweep of a folder that is locked, on machines where nothing is started yet."""
+    settings = request.settings
+    jobs, study = _beginning(request, paths)
+    write_report("running", jobs, settings, paths, 0.0)
+    console.print(f"sweep folder: {paths.root}")
+    view = SweepView(console, jobs, settings)
+    status = "failed"
+    try:
+        with stop_signals() as signals, ExitStack() as held:
+            _lease(hosts, _sites(settings, request, hosts), console, signals)
+            scratch = paths.root if hosts[0].name else None
+            settings = with_density(settings, request.jobs, hosts, console, signals, scratch)
+            sites = _sites(settings, request, hosts)
+            _announce(console, sites, request, jobs)
+            for number, (host, site) in enumerate(zip(hosts, sites, strict=True)):
+                held.callback(host.shut)
+                host.open(site.plan, paths.node(number) if host.name else paths)
+            held.enter_context(view)
+            places = Places(sites)
+            Scheduler(jobs, study, settings, paths, places, hosts, view.update).run(signals)
+        failed = [job for job in jobs if job.progress.state == "failed"]
+        status = "failed" if failed else "completed"
+    except JobInterrupted as error:
+        status = "interrupted"
+        error.add_note(f"the same command with run.dir={paths.root} goes on")
+        raise
+    finally:
+        report = write_report(status, jobs, settings, paths, time.monotonic() - started_s)
     console.print(ranking(report["jobs"], settings))
     console.print(f"{view.line()}\nsummary: {paths.sweep}")
     if failed:
@@ -142,6 +157,46 @@ def run_request(request: Request, *, show: bool = False) -> SweepResult:
             f"{failed[0].progress.error}"
         )
     return SweepResult(paths.root, report)
+
+
+@contextmanager
+def _hosts_of(request: Request) -> Iterator[Sequence[Host]]:
+    """The machines of a sweep while it is entered: nodes of its cluster, or this one."""
+    if request.cluster.engine is not None:
+        run = request.jobs[0].config.run
+        root = given_run(run.dir, run.name) or RUNS
+        with nodes_of(request.cluster, request.settings, request.jobs, root) as nodes:
+            yield nodes
+        return
+    with closing(LocalHost(detect_machine())) as host:
+        yield [host]
+
+
+def _sites(settings: SweepConfig, request: Request, hosts: Sequence[Host]) -> list[Site]:
+    backends = {job.config.plan.backend for job in request.jobs}
+    plans = [places_of(settings, host.machine, backends) for host in hosts]
+    return [Site(plan, host.machine, host.name) for plan, host in zip(plans, hosts, strict=True)]
+
+
+def _lease(
+    hosts: Sequence[Host], sites: Sequence[Site], console: Console, signals: StopSignals
+) -> None:
+    """Holds the GPUs of all places; waits for those that another sweep has.
+
+    Raises:
+      JobInterrupted: a signal came.
+    """
+    # In one order, so that two sweeps do not wait for each other.
+    for host, site in sorted(zip(hosts, sites, strict=True), key=lambda both: both[0].name or ""):
+        devices = {share.device for share in site.plan.slices} - {"cpu"}
+        told = None
+        while (other := host.lease(devices)) is not None:
+            if other != told:
+                console.print(f"another sweep has {other}: waiting until it ends")
+            if signals.have_come:
+                raise JobInterrupted("interrupted")
+            told = other
+            time.sleep(_LEASE_POLL_S)
 
 
 def _with_tasks(request: Request) -> Request:
@@ -201,14 +256,19 @@ def _described(request: Request) -> dict[str, Any]:
     return sampler | {"space": {key: list(values) for key, values in request.space.items()}}
 
 
-def _announce(console: Console, plan: Plan, request: Request, jobs: Sequence[Job]) -> None:
+def _announce(
+    console: Console, sites: Sequence[Site], request: Request, jobs: Sequence[Job]
+) -> None:
     settings = request.settings
     total = len(request.jobs) if settings.sampler == "grid" else settings.trials
     done = sum(job.progress.state == "completed" for job in jobs)
     more = f", {done} of them complete already" if done else ""
+    places = sum(len(site.plan.slices) for site in sites)
+    gpus = sum(site.plan.layout.num_gpus for site in sites)
+    nodes = f" of nodes {', '.join(site.name for site in sites if site.name)}"
     console.print(
-        f"{total} jobs{more}, {len(plan.slices)} at a time on {plan.layout.num_gpus} GPUs, "
-        f"backend {plan.backend}"
+        f"{total} jobs{more}, {places} at a time on {gpus} GPUs{nodes if sites[0].name else ''}, "
+        f"backend {sites[0].plan.backend}"
     )
-    for reason in plan.reasons:
+    for reason in dict.fromkeys(reason for site in sites for reason in site.plan.reasons):
         console.print(f"  {reason}")

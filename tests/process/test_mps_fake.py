@@ -9,7 +9,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable
-from contextlib import ExitStack
+from contextlib import ExitStack, closing
 from pathlib import Path
 
 import pytest
@@ -31,9 +31,10 @@ from gmijax.supervise.launch import Timeouts
 from gmijax.supervise.launcher import Launch, StopSignals, run_gmis
 from gmijax.supervise.supervisor import Supervisor
 from gmijax.supervise.watched_gmi import GmiStatus
+from gmijax.sweeps.host import LocalHost, variables_of
 from gmijax.sweeps.jobs import SweepPaths, jobs_of
-from gmijax.sweeps.places import Places, places_of
-from gmijax.sweeps.scheduler import Scheduler, variables_of
+from gmijax.sweeps.places import Places, Site, places_of
+from gmijax.sweeps.scheduler import Scheduler
 from gmijax.sweeps.study import NoStudy
 
 pytestmark = pytest.mark.timeout(60)
@@ -305,9 +306,10 @@ def test_a_fatal_fault_ends_one_job_of_a_sweep_and_its_neighbours_go_on(
     jobs = list(jobs_of([compose(f"seed={n}", f"num_envs={n + 1}") for n in range(6)]))
     settings, paths = SweepConfig(jobs_per_gpu=3), SweepPaths(tmp_path)
     plan = places_of(settings, here, {"auto"})
-    with open_backend(plan, here, paths) as backend:
-        places = Places(plan, here)
-        scheduler = Scheduler(jobs, NoStudy(), settings, paths, places, backend, lambda: None)
+    with closing(LocalHost(here)) as host:
+        host.open(plan, paths)
+        places = Places([Site(plan, here)])
+        scheduler = Scheduler(jobs, NoStudy(), settings, paths, places, [host], lambda: None)
         scheduler.run(StopSignals())
     states = [job.progress.state for job in jobs]
     assert states == ["completed", "failed", *["completed"] * 4]
@@ -328,7 +330,7 @@ def test_a_job_with_several_gpus_uses_the_daemons_of_its_sweep(
     paths = SweepPaths(tmp_path / "sweep")
     monkeypatch.setattr("gmijax.machine.snapshot.list_gpus", lambda: here.gpus)
     with open_backend(plan, here, paths) as backend:
-        place = Places(plan, here).take(2)
+        place = Places([Site(plan, here)]).take(2)
         assert place is not None
         assert place.label == "GPU 0 place 0, GPU 1 place 0"
         for name, value in variables_of(place, backend).items():

@@ -7,19 +7,17 @@ import json
 import os
 import re
 import signal
-import subprocess
-import sys
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import pytest
+from ray_cluster import RAY, Cluster, two_nodes
 from training_jobs import (
     FOREVER,
     POINT,
     STEPS,
-    child_environment,
     gmi_pid,
     iteration_of,
     kill,
@@ -38,36 +36,13 @@ pytestmark = [
     pytest.mark.timeout(400),
 ]
 
-TWO_NODES = Path(__file__).parents[1] / "two_ray_nodes.py"
-TWO, RAY = "plan.gmis_per_gpu=2", "cluster.engine=ray"
-
-
-class Cluster(NamedTuple):
-    """Two nodes of Ray."""
-
-    address: str  # As an override.
-    second_raylet: int  # Process of the node that does not lead the cluster.
+TWO = "plan.gmis_per_gpu=2"
 
 
 @pytest.fixture(scope="module")
 def cluster(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Cluster]:
-    log = tmp_path_factory.mktemp("ray") / "stderr.txt"
-    with (
-        log.open("wb") as stderr,
-        subprocess.Popen(
-            [sys.executable, str(TWO_NODES)],
-            env=child_environment(),
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            stderr=stderr,
-        ) as process,
-    ):
-        assert process.stdout is not None
-        lines = (json.loads(line) for line in process.stdout if line.startswith(b"{"))
-        said: dict[str, Any] | None = next(lines, None)
-        assert said is not None, log.read_text()
-        yield Cluster(f"cluster.address={said['address']}", said["second_raylet"])
-        process.communicate(timeout=60)
+    with two_nodes(tmp_path_factory.mktemp("ray") / "stderr.txt") as nodes:
+        yield nodes
 
 
 def children_of(parent: int) -> list[int]:

@@ -14,8 +14,8 @@ from supervision import machine
 from gmijax import compose
 from gmijax.cluster import node as nodes
 from gmijax.cluster import ray_nodes
-from gmijax.cluster.cluster_job import ClusterJob
-from gmijax.cluster.node import Facts, Node, Seen, address_of, own_versions
+from gmijax.cluster.checks import by_name, require_alike, require_shared
+from gmijax.cluster.node import Facts, Node, Seen, TrainingNode, address_of, own_versions
 from gmijax.cluster.ray_nodes import Joined, RayCluster
 from gmijax.cluster.remote_gmi import RemoteNode
 from gmijax.collectives.nodes.meeting import Nodes
@@ -53,10 +53,8 @@ def a_node(**answers: Any) -> RemoteNode:
     return RemoteNode(ask, 1, "10.0.0.2")
 
 
-def a_job(node: RemoteNode, versions: dict[str, str | None] | None = None) -> ClusterJob:
-    job = ClusterJob(compose("env=ball_balance", "cluster.engine=ray", "num_envs=16"))
-    job._joined = [Joined(node, Facts(node.address, machine(0), versions or own_versions()))]
-    return job
+def joined(node: RemoteNode, versions: dict[str, str | None] | None = None) -> list[Joined]:
+    return [Joined(node, Facts(node.address, machine(0), versions or own_versions()))]
 
 
 @pytest.mark.parametrize(
@@ -90,11 +88,11 @@ def test_without_ray_or_a_cluster_the_line_says_what_to_do(
 
     monkeypatch.setattr(ray_nodes, "_import_ray", Ray)
     with pytest.raises(ConfigError, match=r"address=auto: no cluster .*`ray start --head`"):
-        RayCluster(ClusterConfig())
+        RayCluster(ClusterConfig(), Node)
     with pytest.raises(ConfigError, match=r"address=127\.0\.0\.1:1: nobody answers there"):
-        RayCluster(ClusterConfig(address="127.0.0.1:1"))
+        RayCluster(ClusterConfig(address="127.0.0.1:1"), Node)
     with pytest.raises(ConfigError, match="expected auto, local or host:port"):
-        RayCluster(ClusterConfig(address="somewhere"))
+        RayCluster(ClusterConfig(address="somewhere"), Node)
     monkeypatch.undo()
     real = builtins.__import__
 
@@ -105,7 +103,7 @@ def test_without_ray_or_a_cluster_the_line_says_what_to_do(
 
     monkeypatch.setattr(builtins, "__import__", no_ray)
     with pytest.raises(ConfigError, match=r"ray is not installed \(pip install 'gmijax\[ray\]'"):
-        RayCluster(ClusterConfig())
+        RayCluster(ClusterConfig(), Node)
 
 
 def test_fewer_nodes_than_asked_for_are_refused_once_the_wait_is_over(
@@ -127,29 +125,34 @@ def test_fewer_nodes_than_asked_for_are_refused_once_the_wait_is_over(
             """Nothing is asked."""
 
     monkeypatch.setattr(ray_nodes, "_import_ray", Ray)
-    cluster = RayCluster(ClusterConfig(wait_s=0.0))
+    cluster = RayCluster(ClusterConfig(wait_s=0.0), Node)
     with pytest.raises(ConfigError, match="nodes=2: the cluster has 1 nodes with 2 CPUs, and no"):
         cluster.join(2, 2)
     with pytest.raises(ConfigError, match="nodes=auto: the cluster has 0 nodes with 8 CPUs"):
         cluster.join(8, None)
-    patient = RayCluster(ClusterConfig(wait_s=100.0))
+    patient = RayCluster(ClusterConfig(wait_s=100.0), Node)
     with pytest.raises(JobInterrupted, match="while it waited for nodes"):
         patient.join(2, 2, is_unwanted=lambda: True)
 
 
+def test_several_nodes_of_a_machine_have_names_of_their_own() -> None:
+    nodes = [*joined(a_node()), *joined(a_node())]
+    assert by_name(nodes) == {"10.0.0.2": nodes[0], "10.0.0.2#1": nodes[1]}
+
+
 def test_nodes_with_other_versions_are_refused() -> None:
-    job = a_job(a_node(), {**own_versions(), "jax": "0.1"})
+    nodes = joined(a_node(), {**own_versions(), "jax": "0.1"})
     with pytest.raises(ConfigError, match=r"node 10\.0\.0\.2 has jax 0\.1, this one has"):
-        job._require_alike()
+        require_alike(nodes)
 
 
 def test_a_run_folder_that_a_node_does_not_see_is_refused(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("gmijax.cluster.cluster_job._SHOWS_S", 0.0)
+    monkeypatch.setattr("gmijax.cluster.checks._SHOWS_S", 0.0)
     with pytest.raises(ConfigError, match=r"node 10\.0\.0\.2 does not see .* or cannot write"):
-        a_job(a_node(sees=False))._require_shared(tmp_path / "runs" / "new")
-    a_job(a_node(sees=True))._require_shared(tmp_path / "runs" / "new")
+        require_shared(joined(a_node(sees=False)), tmp_path / "runs" / "new")
+    require_shared(joined(a_node(sees=True)), tmp_path / "runs" / "new")
     assert not list(tmp_path.iterdir())
 
 
@@ -304,7 +307,7 @@ def test_a_node_starts_polls_and_ends_gmis(
     plan = make_plan(PlanConfig(), ReduceConfig(), 16, machine(0), nodes={"a": Machine((), (0,))})
     launch = make_launch(RunPaths(tmp_path), ["train"], plan)
     assert isinstance(launch.kind, JobKind)
-    node = Node({"JAX_THING": "1"}, str(tmp_path), None, "127.0.0.1")
+    node = TrainingNode({"JAX_THING": "1"}, str(tmp_path), None, "127.0.0.1")
     assert os.environ["JAX_THING"] == "1"
     opened = node.open(launch, 0, "127.0.0.1")
     assert opened.calls == {}

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import threading
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +22,7 @@ from gmijax.supervise.launcher import StopSignals
 from gmijax.sweeps import density
 from gmijax.sweeps.compiled import CompiledPrograms
 from gmijax.sweeps.density import with_density
+from gmijax.sweeps.host import LocalHost
 from gmijax.sweeps.jobs import (
     Job,
     Progress,
@@ -33,8 +33,7 @@ from gmijax.sweeps.jobs import (
     require_placeable,
     state_of,
 )
-from gmijax.sweeps.leases import leased
-from gmijax.sweeps.places import Places, places_of
+from gmijax.sweeps.places import Places, Site, places_of
 from gmijax.sweeps.report import ranked, ranking, spread
 
 
@@ -127,12 +126,12 @@ def test_what_a_job_has_compiled_is_known_to_later_sweeps(
         [compose("seed=0"), compose("seed=1", "algo.learning_rate=1e-4"), compose("num_envs=16")]
     )
     programs = CompiledPrograms()
-    programs.add(first, is_lasting=False)  # It has failed before.
-    assert programs.holds(alike)
-    assert not CompiledPrograms().holds(alike)
-    programs.add(first, is_lasting=True)
-    assert CompiledPrograms().holds(alike)
-    assert not CompiledPrograms().holds(other)
+    programs.add(first.program, is_lasting=False)  # It has failed before.
+    assert programs.holds(alike.program)
+    assert not CompiledPrograms().holds(alike.program)
+    programs.add(first.program, is_lasting=True)
+    assert CompiledPrograms().holds(alike.program)
+    assert not CompiledPrograms().holds(other.program)
 
 
 @pytest.mark.parametrize(
@@ -170,7 +169,7 @@ def test_jobs_are_ranked_by_evaluations_if_they_make_some() -> None:
 def gpu_places(gpus: int, jobs_per_gpu: int) -> tuple[str, Places]:
     here = machine(gpus, mps_control=Path("/usr/bin/nvidia-cuda-mps-control"))
     plan = places_of(SweepConfig(jobs_per_gpu=jobs_per_gpu), here, {"auto"})
-    return plan.backend, Places(plan, here)
+    return plan.backend, Places([Site(plan, here)])
 
 
 def test_jobs_go_to_the_gpu_with_most_room_and_large_ones_to_several() -> None:
@@ -301,28 +300,13 @@ def test_a_gpu_goes_to_one_sweep_at_a_time(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    said: list[str] = []
-    waiting, got = threading.Event(), threading.Event()
-
-    def second() -> None:
-        def say(text: str) -> None:
-            said.append(text)
-            waiting.set()
-
-        with leased(["GPU-1"], say, lambda: False):
-            got.set()
-
-    with leased(["GPU-1"], said.append, lambda: False) as is_held:
-        assert is_held
-        other = threading.Thread(target=second)
-        other.start()
-        assert waiting.wait(10.0)
-        assert not got.is_set()
-        with leased(["GPU-1"], lambda _: None, lambda: True) as is_held_twice:
-            assert not is_held_twice
-    assert got.wait(10.0)
-    other.join()
-    assert said == ["another sweep has GPU-1: waiting until it ends"]
+    first, second = LocalHost(machine(0)), LocalHost(machine(0))
+    assert first.lease(["GPU-1", "GPU-2"]) is None
+    assert second.lease(["GPU-2", "GPU-3"]) == "GPU-2"
+    assert first.lease(["GPU-3"]) is None  # Who does not get all holds none.
+    first.close()
+    assert second.lease(["GPU-2", "GPU-3"]) is None
+    second.close()
 
 
 @pytest.mark.parametrize(
@@ -353,19 +337,22 @@ def test_jobs_at_a_time_by_profiling(
 
     monkeypatch.setattr(density, "_profile", profile)
     jobs = jobs_of([compose(f"seed={seed}") for seed in range(num_jobs)])
-    here = machine(1, mps_control=Path("/usr/bin/nvidia-cuda-mps-control"))
+    hosts = [LocalHost(machine(1, mps_control=Path("/usr/bin/nvidia-cuda-mps-control")))]
     for _ in range(2):  # The second time by the store.
-        found = with_density(SweepConfig(), jobs, here, open_console(show=False), StopSignals())
+        found = with_density(SweepConfig(), jobs, hosts, open_console(show=False), StopSignals())
         assert found.jobs_per_gpu == best
     assert done == profiled
 
 
 def test_without_a_gpu_a_job_has_two_cores() -> None:
-    here, jobs = machine(0, cpu_cores=tuple(range(8))), jobs_of([compose()])
+    jobs, small = jobs_of([compose()]), LocalHost(machine(0, cpu_cores=tuple(range(8))))
+    large = LocalHost(machine(0, cpu_cores=tuple(range(64))))
     quiet = open_console(show=False)
-    assert with_density(SweepConfig(), jobs, here, quiet, StopSignals()).jobs_per_gpu == 4
+    for hosts in ([small], [large, small]):
+        found = with_density(SweepConfig(), jobs, hosts, quiet, StopSignals())
+        assert found.jobs_per_gpu == 4
     asked = SweepConfig(jobs_per_gpu=7)
-    assert with_density(asked, jobs, here, quiet, StopSignals()) == asked
+    assert with_density(asked, jobs, [small], quiet, StopSignals()) == asked
 
 
 def test_a_profile_counts_while_all_jobs_train(monkeypatch: pytest.MonkeyPatch) -> None:

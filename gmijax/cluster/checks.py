@@ -1,0 +1,79 @@
+"""What is asked of all nodes before anything is started: equal versions, a folder that all see."""
+
+from __future__ import annotations
+
+import os
+import secrets
+import tempfile
+import time
+from collections.abc import Sequence
+from contextlib import suppress
+from pathlib import Path
+
+from gmijax.cluster.node import own_versions
+from gmijax.cluster.ray_nodes import Joined
+from gmijax.errors import ConfigError
+
+_SHOWS_S = 20.0
+"""Network file systems show what others have written late, some after seconds."""
+
+_POLL_S = 0.2
+
+
+def by_name(joined: Sequence[Joined]) -> dict[str, Joined]:
+    """Nodes by address, in order; those after the first of a machine have their place added."""
+    named: dict[str, Joined] = {}
+    for place, node in enumerate(joined):
+        address = node.remote.address
+        named[f"{address}#{place}" if address in named else address] = node
+    return named
+
+
+def require_alike(joined: Sequence[Joined], *, has_tcp: bool = False) -> None:
+    """Raises ConfigError if a node has other versions than this machine.
+
+    With `has_tcp` experience goes between nodes, for which pyzmq must be there too.
+    """
+    own = own_versions()
+    if not has_tcp:
+        del own["pyzmq"]
+    elif own["pyzmq"] is None:
+        raise ConfigError(
+            "cluster.engine=ray: experience between nodes needs the package pyzmq "
+            "(pip install 'gmijax[ray]')"
+        )
+    for node, facts in joined:
+        for what, version in own.items():
+            if (theirs := facts.versions.get(what)) != version:
+                raise ConfigError(
+                    f"cluster.engine=ray: node {node.address} has {what} {theirs}, this one "
+                    f"has {version}; all nodes must have the same"
+                )
+
+
+def require_shared(joined: Sequence[Joined], run_root: Path) -> None:
+    """Raises ConfigError if a node does not see the run folder, or what will hold it."""
+    folder = run_root.absolute()
+    while not folder.is_dir():
+        folder = folder.parent
+    content = secrets.token_hex(8)
+    try:
+        fd, name = tempfile.mkstemp(prefix=".gmijax-probe-", dir=folder)
+    except OSError as error:
+        raise ConfigError(f"run.dir={run_root}: {folder}: {error.strerror}") from None
+    try:
+        with os.fdopen(fd, "w") as file:
+            file.write(content)
+        deadline_s = time.monotonic() + _SHOWS_S
+        blind = [node for node, _ in joined]
+        while blind := [node for node in blind if not node.call("sees", name, content)]:
+            if time.monotonic() > deadline_s or any(node.lost for node in blind):
+                raise ConfigError(
+                    f"run.dir={run_root}: node {blind[0].address} does not see {folder} or "
+                    "cannot write to it; the run folder must be on a file system that all "
+                    "nodes share"
+                )
+            time.sleep(_POLL_S)
+    finally:
+        with suppress(OSError):
+            Path(name).unlink()

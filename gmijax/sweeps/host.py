@@ -1,0 +1,183 @@
+"""A machine that runs jobs of a sweep: what the scheduler asks of it, and this machine itself."""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Iterable, Mapping
+from contextlib import ExitStack
+from pathlib import Path
+from typing import Any, Literal, NamedTuple, Protocol
+
+from gmijax.machine.mps_control import PIPE_VARIABLE
+from gmijax.machine.snapshot import DAEMONS_VARIABLE, Machine
+from gmijax.partition.plan import Plan
+from gmijax.runs.cache import cache_folder
+from gmijax.runs.folder import RunPaths, try_lock
+from gmijax.supervise.backends import open_backend
+from gmijax.supervise.backends.backend import Backend
+from gmijax.sweeps.children import Child, Seen
+from gmijax.sweeps.compiled import CompiledPrograms
+from gmijax.sweeps.places import Place
+
+Order = Literal["ask_to_stop", "kill", "close"]
+
+
+class Start(NamedTuple):
+    """A job to be started; see `Child` and `CompiledPrograms`."""
+
+    place: Place
+    config: Mapping[str, Any]
+    order: Path
+    log: Path
+    program: str
+
+
+class Started(NamedTuple):
+    """A job that was started.
+
+    Attributes:
+      child: its number on the machine, new for each start.
+      has_programs: whether the machine's cache holds its programs.
+    """
+
+    child: int
+    has_programs: bool
+
+
+class Host(Protocol):
+    """A machine; calls that need an answer raise `NodeLost` if it is gone.
+
+    Attributes:
+      name: address of a node; None: this machine.
+      machine: what it has.
+    """
+
+    name: str | None
+    machine: Machine
+
+    @property
+    def lost(self) -> str | None:
+        """Why it is gone; None while it answers."""
+        ...
+
+    def lease(self, devices: Iterable[str]) -> str | None:
+        """Holds all devices for this sweep; if another one has any, its UUID, and holds none."""
+        ...
+
+    def open(self, plan: Plan, run: RunPaths) -> None:
+        """Enters the backend of a plan of places.
+
+        Raises:
+          BackendUnavailable: it cannot be had there.
+        """
+        ...
+
+    def start(self, start: Start) -> Started:
+        """Starts a job.
+
+        Raises:
+          GmijaxError: it cannot be started, or its daemon not be renewed.
+        """
+        ...
+
+    def look(self, child: int) -> Seen | None:
+        """The newest that is known of a child, None before anything is."""
+        ...
+
+    def order(self, child: int, order: Order) -> None:
+        """Has a method of a child called."""
+        ...
+
+    def add_program(self, program: str, is_lasting: bool) -> None:
+        """See `CompiledPrograms`."""
+        ...
+
+    def shut(self) -> None:
+        """Leaves the backend; all children have ended."""
+        ...
+
+
+class LocalHost:
+    """This machine; see `Host`."""
+
+    name: str | None = None
+    lost: str | None = None
+
+    def __init__(self, machine: Machine) -> None:
+        self.machine = machine
+        self._leases, self._entered = ExitStack(), ExitStack()
+        self._backend: Backend | None = None
+        self._compiled = CompiledPrograms()
+        self._children: dict[int, Child] = {}
+        self._num_started = 0
+
+    def lease(self, devices: Iterable[str]) -> str | None:
+        """See `Host`; they are held until `close`."""
+        folder = cache_folder() / "leases"
+        with ExitStack() as taken:
+            for device in set(devices):
+                folder.mkdir(parents=True, exist_ok=True)
+                if (fd := try_lock(folder / f"{device}.lock")) is None:
+                    return device
+                taken.callback(os.close, fd)
+            self._leases.push(taken.pop_all())
+        return None
+
+    def open(self, plan: Plan, run: RunPaths) -> None:
+        """See `Host`."""
+        self._backend = self._entered.enter_context(open_backend(plan, self.machine, run))
+
+    def start(self, start: Start) -> Started:
+        """See `Host`."""
+        assert self._backend is not None
+        variables = variables_of(start.place, self._backend)
+        child = Child(start.config, start.place.cpus, start.order, start.log, variables)
+        self._backend.started(child.pid)
+        self._num_started += 1
+        self._children[self._num_started] = child
+        return Started(self._num_started, self._compiled.holds(start.program))
+
+    def look(self, child: int) -> Seen | None:
+        """See `Host`."""
+        return self._children[child].look()
+
+    def look_at_all(self) -> dict[int, Seen]:
+        """How all children are that are not closed."""
+        return {number: child.look() for number, child in self._children.items()}
+
+    def order(self, child: int, order: Order) -> None:
+        """See `Host`."""
+        getattr(self._children[child], order)()
+        if order == "close":
+            del self._children[child]
+
+    def add_program(self, program: str, is_lasting: bool) -> None:
+        """See `Host`."""
+        self._compiled.add(program, is_lasting=is_lasting)
+
+    def shut(self) -> None:
+        """See `Host`."""
+        self._backend = None
+        self._entered.close()
+
+    def close(self) -> None:
+        """Ends what is left, and gives back all."""
+        for number in list(self._children):
+            self.order(number, "kill")
+            self.order(number, "close")
+        self.shut()
+        self._leases.close()
+
+
+def variables_of(place: Place, backend: Backend) -> dict[str, str]:
+    """What tells a job at a place its GPUs, and the daemon of each; a dead daemon is renewed."""
+    if not place.devices:
+        return {}
+    daemons: dict[str, str] = {}
+    for share in place.slices:
+        backend.renew(share.gmi)
+        if pipe := backend.environment(share.gmi).get(PIPE_VARIABLE):
+            daemons[share.device] = pipe
+    devices = ",".join(place.devices)
+    return {"CUDA_VISIBLE_DEVICES": devices, DAEMONS_VARIABLE: json.dumps(daemons)}

@@ -1,0 +1,336 @@
+"""A sweep over nodes without Ray: places, nodes that are lost, who compiles, what Ray is asked."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
+
+import pytest
+from supervision import gpu, machine
+
+from gmijax import sweep
+from gmijax.cli.compose import compose
+from gmijax.cli.grid import build_sweep
+from gmijax.cluster import ray_nodes
+from gmijax.cluster.node import Facts, Node
+from gmijax.cluster.ray_nodes import Joined, RayCluster
+from gmijax.cluster.remote_gmi import RemoteNode
+from gmijax.config import ClusterConfig
+from gmijax.config.sweep import SweepConfig
+from gmijax.errors import BackendUnavailable, ConfigError, NodeLost
+from gmijax.machine.snapshot import Machine
+from gmijax.partition.plan import Plan
+from gmijax.runs.folder import RunPaths, read_json
+from gmijax.supervise.launcher import StopSignals
+from gmijax.sweeps import scheduler
+from gmijax.sweeps.children import Seen
+from gmijax.sweeps.host import Order, Start, Started
+from gmijax.sweeps.jobs import Job, SweepPaths, jobs_of
+from gmijax.sweeps.nodes import RemoteHost, SweepNode, nodes_of, num_cpus_of
+from gmijax.sweeps.places import Places, Site, places_of
+from gmijax.sweeps.report import write_report
+from gmijax.sweeps.scheduler import Scheduler
+from gmijax.sweeps.study import NoStudy
+
+
+class FakeHost:
+    """A node whose jobs go on until `end` says how they end."""
+
+    def __init__(self, name: str) -> None:
+        self.name: str | None = name
+        self.machine = machine(0)
+        self.lost: str | None = None
+        self.running: dict[int, int] = {}  # Jobs by their children.
+        self.seen: dict[int, Seen] = {}
+        self.started: list[int] = []
+        self.programs: set[str] = set()
+        self._numbers = itertools.count()
+
+    def lease(self, devices: Iterable[str]) -> str | None:
+        del devices
+
+    def open(self, plan: Plan, run: RunPaths) -> None:
+        del plan, run
+
+    def start(self, start: Start) -> Started:
+        if self.lost is not None:
+            raise NodeLost(self.lost)
+        Path(start.config["run"]["dir"]).mkdir(exist_ok=True)
+        child = next(self._numbers)
+        self.running[child] = int(start.order.stem)
+        self.started.append(self.running[child])
+        return Started(child, start.program in self.programs)
+
+    def look(self, child: int) -> Seen | None:
+        return self.seen.get(child)
+
+    def order(self, child: int, order: Order) -> None:
+        if order == "kill":
+            self.seen[child] = Seen(-9)
+        if order == "close":
+            del self.running[child]
+
+    def add_program(self, program: str, is_lasting: bool) -> None:
+        del is_lasting
+        self.programs.add(program)
+
+    def shut(self) -> None:
+        """Nothing is open."""
+
+    def end(self, exit_code: int = 0) -> None:
+        """Ends all jobs that run there."""
+        self.seen |= {child: Seen(exit_code, "CUDA_ERROR_X") for child in self.running}
+
+
+class Sweep:
+    """Jobs on two nodes, with two places each unless told otherwise."""
+
+    def __init__(self, folder: Path, jobs: Iterable[Job], jobs_per_gpu: int = 2) -> None:
+        self.jobs, self.paths = list(jobs), SweepPaths(folder)
+        self.settings = SweepConfig(jobs_per_gpu=jobs_per_gpu)
+        self.nodes = FakeHost("a"), FakeHost("b")
+        plan = places_of(self.settings, machine(0), {"auto"})
+        self.places = Places([Site(plan, node.machine, node.name) for node in self.nodes])
+
+    def run(self, *steps: Any) -> None:
+        """Runs it; the steps are called one after another, the last one in every tick."""
+        left = list(steps)
+
+        def tick() -> None:
+            (left.pop(0) if len(left) > 1 else left[0])()
+
+        args = self.jobs, NoStudy(), self.settings, self.paths, self.places, self.nodes, tick
+        Scheduler(*args).run(StopSignals())
+
+    def states(self) -> list[str]:
+        return [job.progress.state for job in self.jobs]
+
+    def end_all(self) -> None:
+        for node in self.nodes:
+            node.end()
+
+
+@pytest.fixture(autouse=True)
+def no_waiting(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(scheduler, "_TICK_S", 0.0)
+
+
+def jobs(count: int, *overrides: str) -> list[Job]:
+    """Jobs whose programs differ, so that none waits for another."""
+    return list(jobs_of([compose(f"num_envs={16 * (n + 1)}", *overrides) for n in range(count)]))
+
+
+def gpu_nodes(*num_gpus: int) -> Places:
+    sites = []
+    for node, count in enumerate(num_gpus):
+        here = machine(count, mps_control=Path("/usr/bin/nvidia-cuda-mps-control"))
+        sites.append(
+            Site(places_of(SweepConfig(jobs_per_gpu=2), here, {"auto"}), here, f"n{node}")
+        )
+    return Places(sites)
+
+
+def test_jobs_go_to_the_node_with_most_room_and_never_on_two() -> None:
+    places = gpu_nodes(2, 2)
+    both = places.take(2)
+    assert both is not None
+    assert (both.site, both.label) == (0, "n0 GPU 0 place 0, n0 GPU 1 place 0")
+    assert both.devices == (gpu(0).uuid, gpu(1).uuid)
+    singles = [place for _ in range(4) if (place := places.take(1))]
+    assert [place.site for place in singles] == [1, 1, 0, 0]
+    assert places.take(1, avoid={1}) is None
+    assert places.take(1) is not None
+    assert places.take(2) is None
+    other = places.take(1, avoid={0})
+    assert other is not None
+    assert (other.site, other.backend, other.is_whole_gpu) == (1, "mps", False)
+
+
+def test_places_of_a_node_that_is_gone_are_not_taken_or_given_back() -> None:
+    places = gpu_nodes(1, 1)
+    place = places.take(1)
+    assert place is not None
+    places.drop(place.site)
+    places.give_back(place)
+    assert [taken.site for _ in range(3) if (taken := places.take(1))] == [1, 1]
+    assert not places.has_room()
+    places.drop(1)
+    assert not places.left
+
+
+def test_jobs_of_a_node_that_is_lost_run_again_on_the_other(tmp_path: Path) -> None:
+    sweep = Sweep(tmp_path, jobs(6))
+    first, second = sweep.nodes
+
+    def lose() -> None:
+        assert (first.started, second.started) == ([0, 2], [1, 3])
+        second.lost = "node 1 (b) is gone: no power"
+
+    shown: list[tuple[str, str | None]] = []
+
+    def look() -> None:
+        shown.append((sweep.jobs[1].progress.state, sweep.jobs[1].progress.error))
+        sweep.end_all()
+
+    sweep.run(lose, look)
+    assert sweep.states() == ["completed"] * 6
+    assert shown[0] == ("waiting", "again, after node 1 (b) is gone: no power")
+    assert first.started[:2] == [0, 2]
+    assert sorted(first.started[2:4]) == [1, 3]  # Before those that have not run.
+    assert {job.progress.node for job in sweep.jobs} == {"a"}
+    events = (sweep.paths.job(1).events).read_text()
+    assert "no power" in events
+    rows = write_report("completed", sweep.jobs, sweep.settings, sweep.paths, 1.0)["jobs"]
+    assert [row["node"] for row in rows] == ["a"] * 6
+    assert read_json(sweep.paths.sweep)["jobs"] == rows
+
+
+def test_a_job_that_may_not_start_again_fails_with_its_node(tmp_path: Path) -> None:
+    sweep = Sweep(tmp_path, jobs(2, "run.max_restarts=0"))
+
+    def lose() -> None:
+        sweep.nodes[1].lost = "node 1 (b) is gone"
+
+    sweep.run(lose, sweep.end_all)
+    assert sweep.states() == ["completed", "failed"]
+    assert sweep.jobs[1].progress.error == "node 1 (b) is gone"
+
+
+def test_without_a_node_the_sweep_ends_and_says_why(tmp_path: Path) -> None:
+    sweep = Sweep(tmp_path, jobs(6))
+
+    def lose() -> None:
+        for node in sweep.nodes:
+            node.lost = f"node {node.name} is gone"
+
+    with pytest.raises(NodeLost, match="no node is left: node b is gone"):
+        sweep.run(lose)
+    assert sweep.states() == ["waiting"] * 6
+
+
+def test_a_node_that_is_lost_at_a_start_costs_the_job_nothing(tmp_path: Path) -> None:
+    sweep = Sweep(tmp_path, jobs(2))
+    sweep.nodes[0].lost = "node 0 (a) is gone"
+    sweep.run(sweep.end_all)
+    assert sweep.nodes[1].started == [0, 1]
+    assert sweep.states() == ["completed"] * 2
+
+
+def test_equal_programs_compile_once_on_each_node(tmp_path: Path) -> None:
+    alike = jobs_of([compose(f"seed={seed}") for seed in range(6)])
+    sweep = Sweep(tmp_path, alike)
+    starts: list[tuple[int, int]] = []
+
+    def look() -> None:
+        starts.append((len(sweep.nodes[0].started), len(sweep.nodes[1].started)))
+        if len(starts) == 3:
+            sweep.nodes[0].end()
+        if len(starts) > 6:
+            sweep.end_all()
+
+    sweep.run(look)
+    assert starts[:3] == [(1, 1)] * 3
+    assert starts[3] == (3, 1)  # The second node still compiles.
+    assert sweep.states() == ["completed"] * 6
+
+
+def test_what_a_node_refuses_is_raised_here_and_does_not_lose_it() -> None:
+    here = SweepNode.__new__(SweepNode)
+    here._host = FakeHost("b")  # type: ignore[assignment]
+
+    def refuse(*_: Any) -> None:
+        raise BackendUnavailable("no daemon")
+
+    here._host.open = refuse  # type: ignore[method-assign]
+
+    class Answer:
+        def __init__(self, value: Any) -> None:
+            self.get = lambda: value
+
+        def is_there(self) -> bool:
+            return True
+
+    node = RemoteNode(lambda method, *args: Answer(getattr(here, method)(*args)), 1, "10.0.0.2")
+    host = RemoteHost(Joined(node, Facts("10.0.0.2", Machine((), (0,)), {})), "10.0.0.2")
+    plan = places_of(SweepConfig(jobs_per_gpu=1), machine(0), {"auto"})
+    with pytest.raises(BackendUnavailable, match="no daemon"):
+        host.open(plan, RunPaths(Path("nowhere")))
+    assert host.lost is None
+    node.lost = "node 1 (10.0.0.2) is gone"
+    with pytest.raises(NodeLost, match="is gone"):
+        host.open(plan, RunPaths(Path("nowhere")))
+    host.shut()
+
+
+def test_the_nodes_are_the_sweeps_and_each_job_is_on_one_machine() -> None:
+    request = build_sweep(("seed=0,1", "algo=a3c", "cluster.engine=ray", "cluster.nodes=2"))
+    assert request.cluster == ClusterConfig(engine="ray", nodes=2)
+    assert {job.config.cluster for job in request.jobs} == {ClusterConfig()}
+    with pytest.raises(ConfigError, match=r"cluster\.nodes=1,2: expected one value"):
+        build_sweep(("seed=0,1", "cluster.nodes=1,2"))
+    configs = [compose("cluster.engine=ray", f"cluster.nodes={nodes}") for nodes in (1, 2)]
+    with pytest.raises(ConfigError, match="cluster: a sweep has one"):
+        sweep(configs)
+
+
+@pytest.mark.parametrize(
+    ("settings", "overrides", "num_cpus"),
+    [
+        ({}, (), 1),
+        ({"jobs_per_gpu": 3}, (), 3),
+        ({"jobs_per_gpu": 3, "gpus": 2}, ("plan.gmis_per_gpu=2",), 12),
+    ],
+)
+def test_ray_is_asked_for_a_cpu_for_every_gmi(
+    settings: dict[str, Any], overrides: tuple[str, ...], num_cpus: int
+) -> None:
+    assert num_cpus_of(SweepConfig(**settings), jobs(2, *overrides)) == num_cpus
+
+
+def test_indices_of_gpus_are_refused_on_nodes(tmp_path: Path) -> None:
+    with (
+        pytest.raises(ConfigError, match=r"sweep\.gpus=\[0, 1\]: Ray chooses the GPUs"),
+        nodes_of(ClusterConfig(engine="ray"), SweepConfig(gpus=(0, 1)), jobs(1), tmp_path),
+    ):
+        pass
+
+
+@pytest.mark.parametrize(
+    ("gpus", "wanted", "most", "expected"),
+    [
+        ((0, 0, 0), 2, None, (2, {"CPU": 2})),
+        ((0, 4, 8), 2, None, (2, {"CPU": 2, "GPU": 4})),
+        ((0, 4, 8), None, None, (2, {"CPU": 2, "GPU": 4})),
+        ((0, 4, 8), None, 2, (2, {"CPU": 2, "GPU": 2})),
+        ((0, 4, 8), 1, None, (1, {"CPU": 2, "GPU": 8})),
+        ((0, 4, 8), None, 0, (3, {"CPU": 2})),
+        ((0, 4, 8), 3, None, "the cluster has 2 nodes with 2 CPUs and a GPU"),
+    ],
+)
+def test_nodes_with_gpus_are_taken_where_there_are_any(
+    gpus: tuple[int, ...],
+    wanted: int | None,
+    most: int | None,
+    expected: Any,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    class Ray:
+        is_initialized = staticmethod(lambda: True)
+        nodes = staticmethod(
+            lambda: [{"Alive": True, "Resources": {"CPU": 4.0, "GPU": float(n)}} for n in gpus]
+        )
+        wait = staticmethod(lambda *_, **__: None)
+
+    placed: list[Any] = []
+    monkeypatch.setattr(ray_nodes, "_import_ray", Ray)
+    monkeypatch.setattr(RayCluster, "_place", lambda _, bundle, n, __: placed.append((n, bundle)))
+    monkeypatch.setattr(RayCluster, "_joined", lambda _: [])
+    cluster = RayCluster(ClusterConfig(wait_s=0.0), Node)
+    if isinstance(expected, str):
+        with pytest.raises(ConfigError, match=expected):
+            cluster.join(2, wanted, most_gpus=most)
+    else:
+        cluster.join(2, wanted, most_gpus=most)
+        assert placed == [expected]
