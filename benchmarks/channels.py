@@ -109,7 +109,7 @@ def measure(
         sends = min(sends, 1000)
     config = ChannelConfig(design=design, transport=transport)
     topology = topology_of(arguments.agents, arguments.trainers)
-    job_task = {"count": sends * envs, "envs": envs, "batch": envs, "steps": STEPS}
+    job_task: dict[str, Any] = {"count": sends * envs, "envs": envs, "batch": envs, "steps": STEPS}
     job_task |= {"sizes": (obs, act), "fast": True, "timeout_s": 60.0}
     with (
         tempfile.TemporaryDirectory() as folder,
