@@ -10,7 +10,7 @@ quicker, and half as many bytes are moved. Weights, and all that comes of a netw
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import flax.linen as nn
 import jax
@@ -40,6 +40,13 @@ def _elu_backward(y: Array, gradient: Array) -> tuple[Array]:
 elu.defvjp(_elu_forward, _elu_backward)
 
 
+def _all_but_bias(*arrays: Any, dtype: Any = None, inexact: bool = True) -> list[Any]:
+    # A bias stays float32: its gradient is then summed over all samples in float32.
+    del inexact
+    x, kernel, bias = arrays
+    return [x.astype(dtype), kernel.astype(dtype), bias]
+
+
 class Mlp(nn.Module):
     """Dense layers with ELU between them.
 
@@ -60,7 +67,10 @@ class Mlp(nn.Module):
         """Maps [..., in] to [..., out] float32."""
         scaled = nn.initializers.orthogonal(jnp.sqrt(2.0))
         for width in self.hidden:
-            x = elu(nn.Dense(width, dtype=self.dtype, kernel_init=scaled)(x))
+            hidden = nn.Dense(
+                width, dtype=self.dtype, kernel_init=scaled, promote_dtype=_all_but_bias
+            )
+            x = elu(hidden(x).astype(self.dtype))
         return nn.Dense(self.out, kernel_init=nn.initializers.orthogonal(self.out_scale))(x)
 
 
