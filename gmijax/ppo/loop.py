@@ -162,9 +162,7 @@ class TrainingLoop:
             self._meter.trace(state, env_state)
         if self._evaluator is not None:
             self._evaluator.trace(state)
-        self._link.end_part("tracing")
         waited_s = self._link.begin_compiling()
-        self._link.end_part("waiting")
         self._iteration.compile()
         if self._meter is not None:
             self._meter.compile()

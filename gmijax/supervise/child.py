@@ -144,11 +144,11 @@ class ChildLink:
         Where all GMIs run the same programs one compiles them while the others load what they
         need and wait here; then they find the programs in the compilation cache.
         """
-        started_s = time.monotonic()
+        self.end_part("tracing")
         self._turn.wait()
-        waited_s = time.monotonic() - started_s
+        self.end_part("waiting")
         self.beat("compiling", 0)
-        return waited_s
+        return self.start_s["waiting"]
 
     def beat(self, state: GmiState, iteration: int) -> None:
         """Reports progress; costs microseconds."""
