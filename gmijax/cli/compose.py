@@ -162,6 +162,8 @@ def _check_override(name: str, item: Override) -> None:
     if item.is_sweep_override():
         raise ConfigError(f"{item.input_line}: expected one value (a list stands in brackets)")
     options = choices(key)
+    if options and item.is_delete() and not isinstance(item.value(), str | None):
+        raise ConfigError(f"{item.input_line}: expected ~{key}")
     if options and not item.is_delete() and item.value() not in options:
         # Of two or three the closest name is a guess: `algo=sac` is no slip for a3c.
         few = f": allowed are {', '.join(options)}" if len(options) < 4 else ""

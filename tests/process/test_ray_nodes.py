@@ -83,6 +83,11 @@ def test_two_nodes_learn_the_bits_of_two_gpus_of_one_machine(
     assert not pids_of(there)
 
 
+def _steps_learnt(run: Path) -> int:
+    lines = (run / "metrics.jsonl").read_text().splitlines()
+    return json.loads(lines[-1])["env_steps"] if lines else 0
+
+
 def test_agents_on_one_node_teach_trainers_on_the_other_and_outlive_one_of_them(
     cluster: Cluster, tmp_path: Path
 ) -> None:
@@ -109,6 +114,7 @@ def test_agents_on_one_node_teach_trainers_on_the_other_and_outlive_one_of_them(
         [fault] = events(run, "fault")
         assert (fault["gmi"], "SIGKILL" in fault["cause"]) == (2, True)
         before = int(Path(events(run, "start")[-1]["checkpoint"]).name)
+        wait(lambda: _steps_learnt(run) > before, "it learns on")
         job.send_signal(signal.SIGTERM)
         assert job.wait(60) == 130, said.read_text()
     finally:

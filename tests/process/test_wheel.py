@@ -95,7 +95,7 @@ def test_import_comes_from_the_wheel_and_loads_no_jax(python: Path, tmp_path: Pa
         import sys
         import gmijax, gmijax.train
         loaded = sorted({"jax", "mujoco", "flax", "optax"} & sys.modules.keys())
-        print(gmijax.__file__, gmijax.train.__file__, loaded, sep="\\n")
+        print(gmijax.__file__, sys.modules["gmijax.train"].__file__, loaded, sep="\\n")
     """
     lines = run([python, "-c", "\n".join(map(str.strip, code.splitlines()))], tmp_path)
     package, module, loaded = lines.split("\n")[:3]

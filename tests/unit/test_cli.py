@@ -28,6 +28,7 @@ REFUSED: list[tuple[str, str, str]] = [
     ("train", "hydra.run.dir=x", "unknown key hydra.run.dir: did you mean run.dir?"),
     ("train", "--verbose", "unknown option --verbose"),
     ("train", "ant", "ant: expected key=value"),
+    ("train", "~env=nan", "~env=nan: expected ~env"),
     ("serve", "policy=random output.shards=1", "unknown key output.shards"),
     ("play", "vidoe=gif", "unknown key vidoe: did you mean video?"),
     ("play", "env.name=ant", "unknown key env"),
