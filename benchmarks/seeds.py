@@ -16,6 +16,7 @@ from __future__ import annotations
 import argparse
 import json
 import math
+import re
 import shlex
 import signal
 import sys
@@ -39,6 +40,11 @@ class Row(NamedTuple):
 
     name: str
     overrides: Sequence[str]
+
+    @property
+    def folder(self) -> str:
+        """Its name, as a command line takes it: a comma would be a list of folders."""
+        return re.sub(r"[^A-Za-z0-9_.-]+", "-", self.name)
 
 
 def row_of(text: str) -> Row:
@@ -69,7 +75,7 @@ class Benchmark:
             if time.monotonic() + longest_s > self._deadline_s:
                 break
             with tempfile.TemporaryDirectory() as scratch:
-                folder = (self._arguments.runs or Path(scratch)) / row.name.replace(" ", "-")
+                folder = (self._arguments.runs or Path(scratch)) / row.folder
                 longest_s = max(longest_s, self._sweep(row, folder))
 
     def _sweep(self, row: Row, folder: Path) -> float:
@@ -183,8 +189,8 @@ def checked(arguments: argparse.Namespace, rows: Sequence[Row]) -> str:
     config = gmijax.compose(*arguments.overrides)
     for row in rows:
         gmijax.compose(*arguments.overrides, *row.overrides)
-    names = [row.name for row in rows]
-    if twice := [name for name in names if names.count(name) > 1]:
+    folders = [row.folder for row in rows]
+    if twice := [row.name for row in rows if folders.count(row.folder) > 1]:
         raise ConfigError(f"--row {twice[0]}: two rows have this name")
     for folder in arguments.analyse:
         if not (folder / "sweep.json").exists():

@@ -45,6 +45,7 @@ def test_a_row_has_a_name_and_overrides() -> None:
     told = "no clip: algo.clip_value_loss=false 'algo.learning_rate_range=[1e-6, 1e-2]'"
     expected = ("algo.clip_value_loss=false", "algo.learning_rate_range=[1e-6, 1e-2]")
     assert row_of(told) == Row("no clip", expected)
+    assert Row("apart, no clip", ()).folder == "apart-no-clip"
 
 
 def test_bad_input_is_told_before_anything_is_trained(tmp_path: Path) -> None:
