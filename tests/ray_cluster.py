@@ -42,3 +42,9 @@ def two_nodes(log: Path) -> Iterator[Cluster]:
         assert said is not None, log.read_text()
         yield Cluster(f"cluster.address={said['address']}", said["second_raylet"])
         process.communicate(timeout=60)
+
+
+def events(run: Path, event: str) -> list[dict[str, Any]]:
+    path = run / "events.jsonl"
+    lines = path.read_text().splitlines() if path.exists() else []
+    return [found for line in lines if (found := json.loads(line))["event"] == event]

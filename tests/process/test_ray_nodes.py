@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from ray_cluster import RAY, Cluster, two_nodes
+from ray_cluster import RAY, Cluster, events, two_nodes
 from training_jobs import (
     FOREVER,
     POINT,
@@ -30,6 +30,7 @@ from training_jobs import (
 )
 
 from gmijax.machine.processes import identify
+from gmijax.runs.history import read_metrics
 
 pytestmark = [
     pytest.mark.skipif(importlib.util.find_spec("ray") is None, reason="ray is not installed"),
@@ -49,12 +50,6 @@ def children_of(parent: int) -> list[int]:
     """Processes that a process has started."""
     tasks = Path(f"/proc/{parent}/task").glob("*/children")
     return [int(pid) for task in tasks for pid in task.read_text().split()]
-
-
-def events(run: Path, event: str) -> list[dict[str, Any]]:
-    path = run / "events.jsonl"
-    lines = path.read_text().splitlines() if path.exists() else []
-    return [found for line in lines if (found := json.loads(line))["event"] == event]
 
 
 def test_two_nodes_learn_the_bits_of_two_gpus_of_one_machine(
@@ -84,8 +79,8 @@ def test_two_nodes_learn_the_bits_of_two_gpus_of_one_machine(
 
 
 def _steps_learnt(run: Path) -> int:
-    lines = (run / "metrics.jsonl").read_text().splitlines()
-    return json.loads(lines[-1])["env_steps"] if lines else 0
+    lines = read_metrics(run / "metrics.jsonl")
+    return lines[-1]["env_steps"] if lines else 0
 
 
 def test_agents_on_one_node_teach_trainers_on_the_other_and_outlive_one_of_them(

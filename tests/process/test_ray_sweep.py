@@ -8,11 +8,12 @@ import os
 import re
 import signal
 from pathlib import Path
-from typing import Any
 
 import pytest
-from ray_cluster import RAY, two_nodes
+from ray_cluster import RAY, events, two_nodes
 from training_jobs import POINT, STEPS, kill, pids_of, shared_memory, start, wait_until
+
+from gmijax.runs.history import read_metrics
 
 pytestmark = [
     pytest.mark.skipif(importlib.util.find_spec("ray") is None, reason="ray is not installed"),
@@ -37,10 +38,6 @@ def is_below(pid: int, ancestor: int) -> bool:
             return False
         pid = int(status.partition("PPid:")[2].split()[0])
     return pid == ancestor
-
-
-def lines_of(path: Path) -> list[dict[str, Any]]:
-    return [json.loads(line) for line in path.read_text().splitlines()]
 
 
 def test_a_sweep_over_two_nodes_finishes_on_one_when_the_other_is_killed(tmp_path: Path) -> None:
@@ -74,16 +71,16 @@ def test_a_sweep_over_two_nodes_finishes_on_one_when_the_other_is_killed(tmp_pat
     assert [row["state"] for row in rows] == ["completed"] * 8
     assert [row["env_steps"] for row in rows] == [LONG] * 4 + [SHORT] * 4
     again = {
-        row["node"]: events
+        row["node"]: found
         for row, run in zip(rows, runs, strict=True)
-        if (events := [one for one in lines_of(run / "events.jsonl") if one["event"] == "again"])
+        if (found := events(run, "again"))
     }
     [node] = again  # Those of the node that was killed ran on the other one.
     assert {row["node"] for row in rows[4:]} == {node}
-    for events in again.values():
-        assert re.search(r"again, after node [01] \(.*\) is gone", events[0]["reason"])
+    for found in again.values():
+        assert re.search(r"again, after node [01] \(.*\) is gone", found[0]["reason"])
     for run in runs:  # From a checkpoint, with one curve.
-        steps = [line["env_steps"] for line in lines_of(run / "metrics.jsonl")]
+        steps = [line["env_steps"] for line in read_metrics(run / "metrics.jsonl")]
         assert steps == sorted(set(steps))
     assert not any(pids_of(run) for run in runs)
     assert shared_memory() <= memory
