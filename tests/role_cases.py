@@ -95,11 +95,13 @@ class Talk(gmijax.Role):
 
 
 class Wait(gmijax.Role):
-    """Waits for a message that never comes; notes what that gives."""
+    """GMI 0 waits for a message of GMI 1 that never comes, GMI 2 later for both."""
 
     def run(self, folder: str, ends: str) -> str:
+        here, seen = Path(folder) / "here", Path(folder) / "seen"
         if self.rank == 1:
-            self.recv(0)
+            here.touch()
+            self.recv(0, timeout_s=60)
             if ends == "kill":
                 os.kill(os.getpid(), signal.SIGKILL)
             if ends == "raise":
@@ -107,17 +109,16 @@ class Wait(gmijax.Role):
             if ends == "sleep":
                 time.sleep(60)
             return "done"
-        if self.rank == 0:
-            self.send("go", 1)
+        while not (here if self.rank == 0 else seen).exists():
+            time.sleep(0.01)
+        if self.rank == 2:
+            self.collective(np.ones(100_000))
+        self.send("go", 1)
         began_s = time.monotonic()
         try:
-            if self.rank == 0:
-                self.recv(1)
-            else:
-                self.collective(np.ones(100_000))
+            self.recv(1)
         except (PeerLost, CollectiveTimeout) as error:
-            text = f"{type(error).__name__} {time.monotonic() - began_s:.1f} {error}"
-            (Path(folder) / f"seen_{self.rank}").write_text(text)
+            seen.write_text(f"{type(error).__name__} {time.monotonic() - began_s:.1f}")
             # Long enough for the test to see who is blamed although all others fail later.
             time.sleep(1.0)
             raise

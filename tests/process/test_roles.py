@@ -96,16 +96,17 @@ def test_timeouts_lose_nothing_and_different_data_are_told() -> None:
 )
 def test_the_gmi_that_fails_is_named(ends: str, message: str, seen: str, tmp_path: Path) -> None:
     run = tmp_path / "run"
+    timeout_s = 1.5 if ends == "sleep" else 30.0
     with pytest.raises(GmiFailed, match=message) as caught:
-        launch(three(), role_cases.Wait(), str(tmp_path), ends, run_dir=str(run), timeout_s=1.5)
+        launch(three(), role_cases.Wait(), str(tmp_path), ends, run_dir=str(run), timeout_s=timeout_s)
     notes = "\n".join(caught.value.__notes__)
     assert f"run folder: {run}" in notes
     assert ends != "raise" or 'raise ZeroDivisionError("the sum is off")' in notes
     assert not pids_of(run)
     if seen:  # The others are ended by the controller, before they notice.
-        kind, waited_s, *_ = (tmp_path / "seen_0").read_text().split()
+        kind, waited_s = (tmp_path / "seen").read_text().split()
         assert kind == seen
-        assert float(waited_s) < (1.2 if seen == "PeerLost" else 3.0)
+        assert float(waited_s) < 20.0  # Neither until GMI 1 wakes up, nor until a time limit.
 
 
 def test_a_role_without_progress_ends_the_job() -> None:
