@@ -19,7 +19,7 @@ from gmijax.collectives.device.device_memory import TICKET_BYTES
 
 
 class FakeDeviceMemory:
-    """A `DeviceMemory` that processes of one user share."""
+    """A `CudaMemory` that processes of one user share."""
 
     def __init__(self) -> None:
         self._mapping: mmap.mmap | None = None
@@ -37,14 +37,7 @@ class FakeDeviceMemory:
         os.close(opened)
 
     def write(self, offset: int, values: jax.Array) -> None:
-        self.start_write(offset, values)
-        self.finish_writes()
-
-    def start_write(self, offset: int, values: jax.Array) -> None:
         self._region(offset, values.shape, values.dtype)[...] = np.asarray(values)
-
-    def finish_writes(self) -> None:
-        pass
 
     def view(self, offset: int, shape: tuple[int, ...], dtype=np.float32) -> jax.Array:
         region = self._region(offset, shape, np.dtype(dtype))
@@ -65,7 +58,7 @@ class FakeDeviceMemory:
 
 
 class FakeQueue:
-    """A `DeviceQueue` that does at once what it is given, as a stream of its own would."""
+    """A `CudaQueue` that does at once what it is given, as a stream of its own would."""
 
     def __init__(self, flags: np.ndarray) -> None:
         self._flags = flags

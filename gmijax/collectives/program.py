@@ -11,13 +11,14 @@ from __future__ import annotations
 import functools
 import itertools
 from collections.abc import Callable, Sequence
-from typing import Any, Protocol, TypeVar
+from typing import Any, TypeVar
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
 
+from gmijax.collectives.host.host_links import HostLinks
 from gmijax.collectives.interface import Step
 from gmijax.collectives.strategies import Stage
 from gmijax.collectives.xla_call import Buffer, register
@@ -27,45 +28,6 @@ from gmijax.errors import CollectiveError
 T = TypeVar("T")
 
 _serial = itertools.count()
-
-
-class Links(Protocol):
-    """How the exchanges of one rank move numbers; addresses are those of its device.
-
-    All calls take `(stream, place, source, target, num_floats)`: the stream of the device (0 on
-    a CPU), which exchange of its program it is, and the addresses of [n] float32 and the result.
-
-    Attributes:
-      room: length of the largest buffer whose sum is taken.
-    """
-
-    room: int
-
-    def start(self, exchange: Exchange) -> None:
-        """Tries them, together with all other ranks; raises DeviceMemoryUnavailable on all."""
-        ...
-
-    def reduce(
-        self, stage: Stage, stream: int, place: int, source: int, target: int, num_floats: int
-    ) -> None:
-        """`target` becomes what the stage makes of `source`: [n], or [m, n] if it gathers."""
-        ...
-
-    def run(self, program: Callable[[], T], *, is_last: bool) -> T:
-        """Runs a program that has exchanges in it, or (`is_last`) waits for the last one.
-
-        Raises:
-          PeerLost, CollectiveTimeout, CollectiveError: see `TracedStep`.
-        """
-        ...
-
-    def exchange_s(self) -> float | None:
-        """Seconds that exchanges took which are through, and were not told before."""
-        ...
-
-    def close(self) -> None:
-        """Releases what they hold. Idempotent."""
-        ...
 
 
 class Exchange:
@@ -78,9 +40,11 @@ class Exchange:
       world_size: K.
     """
 
-    def __init__(self, links: Links, stages: Sequence[Stage], rank: int, world_size: int) -> None:
+    def __init__(
+        self, links: HostLinks, stages: Sequence[Stage], rank: int, world_size: int
+    ) -> None:
         self.rank, self.world_size = rank, world_size
-        self._links: Links | None = links
+        self._links: HostLinks | None = links
         self._stages = stages
         # The same on all ranks, which make as many: it is part of their programs.
         self._name = f"gmijax_exchange_{next(_serial)}"
@@ -209,7 +173,7 @@ class ProgramStep:
     def __init__(
         self,
         exchange: Exchange | None,
-        links: Links | None,
+        links: HostLinks | None,
         step: Step,
         *,
         donates_own: bool = True,

@@ -27,7 +27,7 @@ OVERHEAD_BYTES = 16 * 1024
 """More than header, spec and alignment of a message take."""
 
 DEVICE_MEMORY: NewMemory = cuda_memory
-"""Makes the `DeviceMemory` by which agents and trainers of `transport=device` share their GPU."""
+"""Makes the memory by which agents and trainers of `transport=device` share their GPU."""
 
 
 @dataclass(frozen=True, kw_only=True)

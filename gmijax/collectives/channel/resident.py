@@ -12,7 +12,7 @@ from __future__ import annotations
 import contextlib
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import jax
 import jax.numpy as jnp
@@ -24,12 +24,15 @@ from gmijax.collectives.channel.dispenser import Piece
 from gmijax.collectives.channel.migrator import Migrator
 from gmijax.collectives.channel.sender import CLOSE_TIMEOUT_S
 from gmijax.collectives.channel.spec import Spec
-from gmijax.collectives.device.device_memory import TICKET_BYTES, DeviceMemory, NewMemory
+from gmijax.collectives.device.device_memory import TICKET_BYTES, NewMemory
 from gmijax.collectives.messages.pipe import Bytes, Message, PipeWriter
 from gmijax.collectives.messages.pipe_block import PipeBlock
 from gmijax.collectives.shared_memory import round_up
 from gmijax.collectives.waits import wait_until
 from gmijax.errors import ConfigError, GmijaxError
+
+if TYPE_CHECKING:
+    from gmijax.collectives.device.cuda_memory import CudaMemory
 
 _ALIGNMENT = 256
 _LEAST_SLOTS = 2
@@ -80,7 +83,7 @@ class ResidentPacker:
     new_memory: NewMemory
 
     def __post_init__(self) -> None:
-        self._memory: DeviceMemory | None = None
+        self._memory: CudaMemory | None = None
         self._ticket = b""
         self._head = np.zeros(0, np.uint8)
         self._num_envs = 0
@@ -123,7 +126,7 @@ class ResidentPacker:
     def _is_read(self) -> bool | None:
         return not any(writer.outstanding_messages for writer in self.migrator.writers) or None
 
-    def _prepare(self, piece: Piece) -> DeviceMemory:
+    def _prepare(self, piece: Piece) -> CudaMemory:
         """The memory; its slots are made when the first rollout shows how large they are."""
         if self._memory is not None:
             if piece.num_envs != self._num_envs:
@@ -153,7 +156,7 @@ class ResidentDecoder:
 
     def __init__(self, new_memory: NewMemory) -> None:
         self._new_memory = new_memory
-        self._memory: DeviceMemory | None = None
+        self._memory: CudaMemory | None = None
         self._views: dict[int, dict[str, jax.Array]] = {}
 
     def __call__(self, message: Message) -> Transfer:

@@ -11,18 +11,21 @@ import numpy as np
 import numpy.typing as npt
 
 from gmijax.collectives.device.cuda_queue import checked, runtime
+from gmijax.collectives.device.device_memory import TICKET_BYTES
 from gmijax.errors import CudaError
 
-HANDLE_BYTES = 64
 GRANULE_BYTES = 2 << 20
 """CUDA shares whole granules: a smaller block would show others what else lies in it."""
 
 
 class CudaMemory:
-    """A `DeviceMemory` on the one GPU that this process sees.
+    """A block of memory of the one GPU that this process sees.
 
     One process makes the block, others open it, on the same GPU or another of the host. On one
     GPU they must run at the same time under one MPS daemon, or without any.
+
+    Attributes:
+      address: of its first byte on this process's device.
 
     Raises:
       CudaError: from every method.
@@ -41,7 +44,7 @@ class CudaMemory:
         )
 
     def create(self, num_bytes: int) -> bytes:
-        """See `DeviceMemory`."""
+        """Makes the block; returns what another process needs to open it."""
         size = -(-num_bytes // GRANULE_BYTES) * GRANULE_BYTES
         (pointer,) = checked(
             runtime.cudaMalloc(size), f"get {size >> 20} MiB of GPU memory for the exchange"
@@ -52,12 +55,12 @@ class CudaMemory:
             runtime.cudaFree(self.address)
             self.address = 0
         (handle,) = checked(result, "share GPU memory with other processes")
-        return ctypes.string_at(int(handle.getPtr()), HANDLE_BYTES)
+        return ctypes.string_at(int(handle.getPtr()), TICKET_BYTES)
 
     def open(self, ticket: bytes) -> None:
-        """See `DeviceMemory`."""
+        """Maps the block that another process has made."""
         handle = runtime.cudaIpcMemHandle_t()
-        ctypes.memmove(int(handle.getPtr()), ticket, HANDLE_BYTES)
+        ctypes.memmove(int(handle.getPtr()), ticket, TICKET_BYTES)
         (pointer,) = checked(
             runtime.cudaIpcOpenMemHandle(handle, runtime.cudaIpcMemLazyEnablePeerAccess),
             "map GPU memory of another process",
@@ -65,12 +68,7 @@ class CudaMemory:
         self.address = int(pointer)
 
     def write(self, offset: int, values: jax.Array) -> None:
-        """See `DeviceMemory`."""
-        self.start_write(offset, values)
-        self.finish_writes()
-
-    def start_write(self, offset: int, values: jax.Array) -> None:
-        """See `DeviceMemory`."""
+        """Copies `values` to `offset` bytes; on return they are there for all processes."""
         values.block_until_ready()
         to_device = runtime.cudaMemcpyKind.cudaMemcpyDeviceToDevice
         source, target = values.unsafe_buffer_pointer(), self.address + offset
@@ -78,15 +76,12 @@ class CudaMemory:
             runtime.cudaMemcpyAsync(target, source, values.nbytes, to_device, self._stream),
             "copy into shared GPU memory",
         )
-
-    def finish_writes(self) -> None:
-        """See `DeviceMemory`."""
         checked(runtime.cudaStreamSynchronize(self._stream), "copy into shared GPU memory")
 
     def view(
         self, offset: int, shape: tuple[int, ...], dtype: npt.DTypeLike = np.float32
     ) -> jax.Array:
-        """See `DeviceMemory`."""
+        """The array at `offset` bytes in place: a program reads what is there when it runs."""
         pointer = self.address + offset
         view = jnp.asarray(_Region(pointer, shape, np.dtype(dtype)))
         if view.unsafe_buffer_pointer() != pointer:
@@ -94,7 +89,7 @@ class CudaMemory:
         return view
 
     def close(self) -> None:
-        """See `DeviceMemory`."""
+        """Gives the mapping back; no view may be in use."""
         if self.address and not self._is_owner:
             # Whatever comes of it: nothing is left to be done with the memory.
             runtime.cudaIpcCloseMemHandle(self.address)

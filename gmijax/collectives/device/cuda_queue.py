@@ -17,7 +17,9 @@ driver: Any = importlib.import_module("cuda.bindings.driver")
 
 
 class CudaQueue:
-    """A `DeviceQueue`: copies, and stream memory operations on flags in memory of the host.
+    """Work for a stream of the device, which does it in order; all addresses are the device's.
+
+    Copies, and stream memory operations on flags in memory of the host.
 
     Args:
       flags: [whole pages, line] uint32, shared by processes; not of a file with a name, which
@@ -46,7 +48,7 @@ class CudaQueue:
         self._clock: tuple[Any, Any] | None = None
 
     def copy(self, stream: int, target: int, source: int, num_bytes: int) -> None:
-        """See `DeviceQueue`."""
+        """Copies bytes."""
         checked(
             runtime.cudaMemcpyAsync(target, source, num_bytes, self._kind, stream), "queue a copy"
         )
@@ -54,40 +56,40 @@ class CudaQueue:
     def copy_rows(
         self, stream: int, target: int, source: int, pitch: int, num_bytes: int, rows: int
     ) -> None:
-        """See `DeviceQueue`."""
+        """Copies `num_bytes` of each row to the next ones in `target`; rows are `pitch` apart."""
         copied = runtime.cudaMemcpy2DAsync(
             target, num_bytes, source, pitch, num_bytes, rows, self._kind, stream
         )
         checked(copied, "queue a copy")
 
     def clear(self, stream: int, target: int, num_bytes: int) -> None:
-        """See `DeviceQueue`."""
+        """Sets bytes to zero."""
         checked(runtime.cudaMemsetAsync(target, 0, num_bytes, stream), "clear memory")
 
     def raise_flag(self, stream: int, rank: int, count: int) -> None:
-        """See `DeviceQueue`."""
+        """Sets a flag when all before it is done, and seen by who sees the flag."""
         # No flags: with the barrier that makes what was written before visible to all.
         flag = self._flags + rank * self._line_bytes
         _queued(driver.cuStreamWriteValue32(stream, flag, count, 0), "write")
 
     def wait_for_flag(self, stream: int, rank: int, count: int) -> None:
-        """See `DeviceQueue`."""
+        """Holds the stream until a flag has come to `count`."""
         flag = self._flags + rank * self._line_bytes
         _queued(driver.cuStreamWaitValue32(stream, flag, count, self._wait), "wait for")
 
     def start_clock(self, stream: int) -> None:
-        """See `DeviceQueue`."""
+        """From here on the stream's time counts, until `stop_clock`."""
         self._clock = self._idle_clocks.pop() if self._idle_clocks else (_event(), _event())
         checked(runtime.cudaEventRecord(self._clock[0], stream), "record an event")
 
     def stop_clock(self, stream: int) -> None:
-        """See `DeviceQueue`."""
+        """See `start_clock`."""
         assert self._clock is not None
         checked(runtime.cudaEventRecord(self._clock[1], stream), "record an event")
         self._clocks.append(self._clock)
 
     def clocked_s(self) -> float:
-        """See `DeviceQueue`."""
+        """Seconds that counted and have not been told before; of clocks that have stopped."""
         total_ms = 0.0
         success = runtime.cudaError_t.cudaSuccess
         while self._clocks and runtime.cudaEventQuery(self._clocks[0][1])[0] == success:
@@ -97,7 +99,7 @@ class CudaQueue:
         return total_ms / 1e3
 
     def close(self) -> None:
-        """See `DeviceQueue`."""
+        """Gives the flags back. Idempotent."""
         if self._host:
             runtime.cudaHostUnregister(self._host)
             self._host = 0

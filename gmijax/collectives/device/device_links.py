@@ -9,15 +9,16 @@ from __future__ import annotations
 import zlib
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from typing import NamedTuple, Protocol, TypeVar
+from typing import TYPE_CHECKING, NamedTuple, TypeVar
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import numpy.typing as npt
 
-from gmijax.collectives.device.device_memory import DeviceQueue, NewMemory
+from gmijax.collectives.device.device_memory import NewMemory
 from gmijax.collectives.device.lockstep import LockstepRunner
+from gmijax.collectives.device.nccl_ring import NcclRing
 from gmijax.collectives.device.shared_slots import SharedSlots, agreed
 from gmijax.collectives.host.host_exchange import HostExchange
 from gmijax.collectives.host.host_links import HostLinks
@@ -26,6 +27,9 @@ from gmijax.collectives.strategies import Groups, Stage
 from gmijax.collectives.waits import Fence
 from gmijax.partition.layout import Layout
 from gmijax.partition.reduction import leaders
+
+if TYPE_CHECKING:
+    from gmijax.collectives.device.cuda_queue import CudaQueue
 
 T = TypeVar("T")
 
@@ -69,26 +73,6 @@ class Order:
         return None
 
 
-class Ring(Protocol):
-    """Collectives between some ranks, each on another GPU; adds work to a stream."""
-
-    def gather(self, stream: int, source: int, target: int, num_floats: int) -> None:
-        """`target` [m, n] becomes what all members have."""
-        ...
-
-    def sum(self, stream: int, source: int, target: int, num_floats: int) -> None:
-        """`target` [n] becomes the sum over the members."""
-        ...
-
-    def broadcast(self, stream: int, source: int, target: int, num_floats: int) -> None:
-        """`target` [n] becomes what the first member has."""
-        ...
-
-    def close(self) -> None:
-        """Gives the communicator back. Idempotent."""
-        ...
-
-
 class Device(NamedTuple):
     """What links of a device are made of.
 
@@ -100,12 +84,12 @@ class Device(NamedTuple):
     """
 
     new_memory: NewMemory
-    new_queue: Callable[[npt.NDArray[np.uint32]], DeviceQueue]
-    new_ring: Callable[[HostExchange, Groups], Ring | None] | None
+    new_queue: Callable[[npt.NDArray[np.uint32]], CudaQueue]
+    new_ring: Callable[[HostExchange, Groups], NcclRing | None] | None
 
 
 class DeviceLinks(HostLinks):
-    """`Links` of strategies that leave the host; all ranks of the job make theirs together.
+    """Links of strategies that leave the host; all ranks of the job make theirs together.
 
     Stages through the host go the way of `HostLinks`, and so do rings on a CPU.
 
@@ -135,10 +119,10 @@ class DeviceLinks(HostLinks):
         self._control = control
         self._device = device
         self._runner = LockstepRunner(control, num_floats)
-        self._queue: DeviceQueue | None = None
+        self._queue: CudaQueue | None = None
         self._order: Order | None = None
         self._slots: SharedSlots | None = None
-        self._rings: dict[Groups, Ring | None] = {}
+        self._rings: dict[Groups, NcclRing | None] = {}
         try:
             if any(stage.link == "slots" for stage in stages):
                 self._slots = self._new_slots(layout, stages, device.new_memory)
@@ -163,7 +147,7 @@ class DeviceLinks(HostLinks):
         return SharedSlots(self._control, self.room, group, owners, new_memory, _WISH)
 
     def start(self, exchange: Exchange) -> None:
-        """See `Links`."""
+        """See `HostLinks`."""
         agreed(self._control, _WISH, self._open)
         failure = self._runner.settle(lambda: self._try(exchange))
         agreed(self._control, _WISH, lambda: _raise(failure))
@@ -172,7 +156,7 @@ class DeviceLinks(HostLinks):
     def reduce(
         self, stage: Stage, stream: int, place: int, source: int, target: int, num_floats: int
     ) -> None:
-        """See `Links`."""
+        """See `HostLinks`."""
         most = max(len(group) for group in stage.groups)
         if stage.link == "slots" and self._slots is not None:
             with self._exchanging(stream, place, num_floats) as queue:
@@ -192,17 +176,17 @@ class DeviceLinks(HostLinks):
             super().reduce(stage, stream, place, source, target, num_floats)
 
     def run(self, program: Callable[[], T], *, is_last: bool) -> T:
-        """See `Links`."""
+        """See `HostLinks`."""
         run = self._runner.settle if is_last else self._runner.step
         return run(lambda: self._explained(program))
 
     def exchange_s(self) -> float:
-        """See `Links`: each from the time that this rank's numbers were there."""
+        """See `HostLinks`: each from the time that this rank's numbers were there."""
         on_device_s = 0.0 if self._queue is None else self._queue.clocked_s()
         return super().exchange_s() + on_device_s
 
     def close(self) -> None:
-        """See `Links`; what a device may still be at stays until the process ends."""
+        """See `HostLinks`; what a device may still be at stays until the process ends."""
         if self._runner.is_caught:
             return
         self._runner.close()
@@ -212,7 +196,7 @@ class DeviceLinks(HostLinks):
         self._queue, self._order, self._slots, self._rings = None, None, None, {}
 
     @contextmanager
-    def _exchanging(self, stream: int, place: int, num_floats: int) -> Iterator[DeviceQueue]:
+    def _exchanging(self, stream: int, place: int, num_floats: int) -> Iterator[CudaQueue]:
         """Counts the time, and makes sure that other ranks come to the same exchange."""
         if self._queue is None or self._order is None:
             raise RuntimeError("the exchange is closed")

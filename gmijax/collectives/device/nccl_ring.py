@@ -13,7 +13,7 @@ _WISH = "rings between GPUs"
 
 
 class NcclRing:
-    """This rank's communicator, as `Ring`.
+    """This rank's collectives with others, each on another GPU; adds work to a stream.
 
     Args:
       nccl: the module `nccl.bindings.nccl`.
@@ -25,21 +25,21 @@ class NcclRing:
         self._float, self._sum = int(nccl.DataType.Float32), int(nccl.RedOp.Sum)
 
     def gather(self, stream: int, source: int, target: int, num_floats: int) -> None:
-        """See `Ring`."""
+        """`target` [m, n] becomes what all members have."""
         self._nccl.all_gather(source, target, num_floats, self._float, self._comm, stream)
 
     def sum(self, stream: int, source: int, target: int, num_floats: int) -> None:
-        """See `Ring`."""
+        """`target` [n] becomes the sum over the members."""
         kind = self._float, self._sum
         self._nccl.all_reduce(source, target, num_floats, *kind, self._comm, stream)
 
     def broadcast(self, stream: int, source: int, target: int, num_floats: int) -> None:
-        """See `Ring`."""
+        """`target` [n] becomes what the first member has."""
         kind = self._float, 0
         self._nccl.broadcast(source, target, num_floats, *kind, self._comm, stream)
 
     def close(self) -> None:
-        """See `Ring`."""
+        """Gives the communicator back. Idempotent."""
         if self._comm is not None:
             self._nccl.comm_destroy(self._comm)
         self._comm = None

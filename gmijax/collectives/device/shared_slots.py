@@ -5,19 +5,19 @@ from __future__ import annotations
 import sys
 from collections.abc import Callable, Sequence
 from contextlib import suppress
+from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
 
-from gmijax.collectives.device.device_memory import (
-    TICKET_BYTES,
-    DeviceMemory,
-    DeviceQueue,
-    NewMemory,
-)
+from gmijax.collectives.device.device_memory import TICKET_BYTES, NewMemory
 from gmijax.collectives.host.host_exchange import HostExchange
 from gmijax.collectives.waits import fence, wait_until
 from gmijax.errors import DeviceMemoryUnavailable, PeerLost
+
+if TYPE_CHECKING:
+    from gmijax.collectives.device.cuda_memory import CudaMemory
+    from gmijax.collectives.device.cuda_queue import CudaQueue
 
 NOTE_BYTES = 240
 """What a rank tells the others at each step of the start: a ticket, or why it failed."""
@@ -63,7 +63,7 @@ class SharedSlots:
         self._row_bytes = -(-num_floats // FLOATS_PER_ROW_UNIT) * FLOATS_PER_ROW_UNIT * 4
         self._members, self._rank = tuple(members), host.rank
         self._owners, self._is_owner = tuple(owners), host.rank == owners[0]
-        self._memories: list[DeviceMemory] = []
+        self._memories: list[CudaMemory] = []
         self._num_writes = 0
         self._host: HostExchange | None = host
         host.flags[host.rank, 1] = 0
@@ -76,7 +76,7 @@ class SharedSlots:
 
     def gather(
         self,
-        queue: DeviceQueue,
+        queue: CudaQueue,
         stream: int,
         source: int,
         target: int,
@@ -103,7 +103,7 @@ class SharedSlots:
             queue.clear(stream, target + count * num_bytes, (rows - count) * num_bytes)
 
     def broadcast(
-        self, queue: DeviceQueue, stream: int, source: int, target: int, num_floats: int
+        self, queue: CudaQueue, stream: int, source: int, target: int, num_floats: int
     ) -> None:
         """Queues a copy of what the first member has; as `gather`, but `target` has [n]."""
         num_bytes = 4 * num_floats
@@ -129,14 +129,14 @@ class SharedSlots:
             memory.close()
         self._memories = []
 
-    def _write(self, queue: DeviceQueue, stream: int, source: int, num_bytes: int) -> None:
+    def _write(self, queue: CudaQueue, stream: int, source: int, num_bytes: int) -> None:
         self._num_writes += 1
         own = self._slot(self._members.index(self._rank)) - self._memories[0].address
         for memory in self._memories:
             queue.copy(stream, memory.address + own, source, num_bytes)
         queue.raise_flag(stream, self._rank, self._num_writes & 0xFFFFFFFF)
 
-    def _wait(self, queue: DeviceQueue, stream: int, member: int) -> None:
+    def _wait(self, queue: CudaQueue, stream: int, member: int) -> None:
         if member != self._rank:
             queue.wait_for_flag(stream, member, self._num_writes & 0xFFFFFFFF)
 

@@ -23,13 +23,17 @@ T = TypeVar("T")
 
 
 class HostLinks:
-    """`Links` of all strategies on a CPU, and of those that go through the host on a GPU.
+    """How the exchanges of one rank move numbers: here all of them through the host.
 
-    A program waits in its exchanges for the other ranks, so calls return when it is computed.
+    So it is with all strategies on a CPU, and on a GPU with those that do not leave the host. A
+    program waits in its exchanges for the other ranks, so calls return when it is computed.
 
     Args:
       host: this rank's use of the shared block, and of the connections between nodes.
       num_floats: P, length of the largest buffer.
+
+    Attributes:
+      room: the same.
     """
 
     def __init__(self, host: HostExchange | NodeExchange, num_floats: int) -> None:
@@ -39,32 +43,48 @@ class HostLinks:
         self._exchange_s = 0.0
 
     def start(self, exchange: Exchange) -> None:
-        """Does nothing: there is nothing to agree on."""
+        """Tries the links, together with all other ranks; nothing here can fail.
+
+        Raises:
+          DeviceMemoryUnavailable: they do not work; on all ranks alike.
+        """
 
     def reduce(
         self, stage: Stage, stream: int, place: int, source: int, target: int, num_floats: int
     ) -> None:
-        """See `Links`."""
+        """`target` becomes what the stage makes of `source`.
+
+        Args:
+          stage: of the strategy.
+          stream: of the device, 0 on a CPU.
+          place: which exchange of its program it is.
+          source: address on the device of [n] float32.
+          target: address of the result, [n], or [m, n] if the stage gathers.
+          num_floats: n.
+        """
         rows = max(map(len, stage.groups)) if stage.kind == "gather" else 1
-        calls = {
-            "sum": self._host.sum,
-            "gather": self._host.gather,
-            "broadcast": self._host.broadcast,
-        }
+        started = time.monotonic()
+        try:
+            if stream:
+                from gmijax.collectives.device.cuda_queue import fetch, store
 
-        def reduce(values: FloatBuffer, result: FloatBuffer) -> None:
-            if stage.link == "nodes":
-                assert isinstance(self._host, NodeExchange)
-                self._host.sum_between_nodes(values, result, place)
-                return
-            if stage.kind == "gather":
-                result = result.reshape(rows, -1)
-            calls[stage.kind](values, result, stage.groups, place)
-
-        self._exchange(reduce, stream, source, num_floats, target, rows)
+                result = np.empty(rows * num_floats, np.float32)
+                self._reduce(stage, place, fetch(stream, source, num_floats), result)
+                store(stream, target, result)
+            else:
+                values, result = _at(source, num_floats), _at(target, rows * num_floats)
+                self._reduce(stage, place, values, result)
+        except GmijaxError as error:
+            self._failure = error
+            raise
+        self._exchange_s += time.monotonic() - started
 
     def run(self, program: Callable[[], T], *, is_last: bool) -> T:
-        """See `Links`."""
+        """Runs a program that has exchanges in it, or (`is_last`) waits for the last one.
+
+        Raises:
+          PeerLost, CollectiveTimeout, CollectiveError: see `TracedStep`.
+        """
         del is_last
         return self._explained(lambda: jax.block_until_ready(program()))
 
@@ -77,36 +97,21 @@ class HostLinks:
             raise
 
     def exchange_s(self) -> float:
-        """See `Links`."""
+        """Seconds that exchanges took which are through, and were not told before."""
         seconds, self._exchange_s = self._exchange_s, 0.0
         return seconds
 
     def close(self) -> None:
-        """Does nothing: the shared block is the reducer's."""
+        """Releases what the links hold beside the shared block, which is the reducer's."""
 
-    def _exchange(
-        self,
-        call: Callable[[FloatBuffer, FloatBuffer], None],
-        stream: int,
-        source: int,
-        num_floats: int,
-        target: int,
-        rows: int,
-    ) -> None:
-        started = time.monotonic()
-        try:
-            if stream:
-                from gmijax.collectives.device.cuda_queue import fetch, store
-
-                result = np.empty(rows * num_floats, np.float32)
-                call(fetch(stream, source, num_floats), result)
-                store(stream, target, result)
-            else:
-                call(_at(source, num_floats), _at(target, rows * num_floats))
-        except GmijaxError as error:
-            self._failure = error
-            raise
-        self._exchange_s += time.monotonic() - started
+    def _reduce(self, stage: Stage, place: int, values: FloatBuffer, result: FloatBuffer) -> None:
+        if stage.link == "nodes":
+            assert isinstance(self._host, NodeExchange)
+            self._host.sum_between_nodes(values, result, place)
+            return
+        if stage.kind == "gather":
+            result = result.reshape(-1, values.size)
+        getattr(self._host, stage.kind)(values, result, stage.groups, place)
 
 
 def _at(address: int, num_floats: int) -> FloatBuffer:
