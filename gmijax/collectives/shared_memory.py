@@ -9,7 +9,11 @@ from __future__ import annotations
 import mmap
 import os
 
+import numpy as np
+
+from gmijax.collectives.waits import fence
 from gmijax.errors import CollectiveError
+from gmijax.machine.processes import ProcessId, own_process
 
 
 def create_file(name: str, num_bytes: int = 0) -> int:
@@ -37,6 +41,27 @@ def map_file(fd: int, num_bytes: int, who: str) -> mmap.mmap:
             f"{who}: cannot map {num_bytes / 2**20:.1f} MiB of shared memory at descriptor {fd} "
             f"({error.strerror})"
         ) from None
+
+
+def take_line(line: np.void, rank: int) -> None:
+    """Notes this process in the line that tells others of `rank`.
+
+    Raises:
+      CollectiveError: the rank is taken.
+    """
+    if line["pid"]:
+        raise CollectiveError(f"rank {rank} is taken already by process {line['pid']}")
+    process = own_process()
+    line["start_ticks"] = process.start_ticks
+    fence()  # A pid with another start would seem to be a process that is gone.
+    line["pid"] = process.pid
+
+
+def process_of(line: np.void) -> ProcessId:
+    """The process that has taken a line; that with pid 0, which never runs, if none has."""
+    pid = int(line["pid"])
+    fence()  # See `take_line`.
+    return ProcessId(pid, int(line["start_ticks"]))
 
 
 def round_up(value: int, multiple: int) -> int:

@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 from gmijax.collectives.host.host_exchange import HostExchange, chunk
 from gmijax.collectives.host.shared_block import create_exchange
 from gmijax.collectives.interface import FloatBuffer
-from gmijax.errors import CollectiveError, CollectiveTimeout
+from gmijax.errors import CollectiveError, CollectiveTimeout, PeerLost
 
 LATE_S = 0.5
 
@@ -108,6 +108,33 @@ def test_a_gathered_result_belongs_to_the_caller(alone: HostExchange) -> None:
         alone.all_gather(np.full(3, value, np.float32))
     gathered += 1.0
     np.testing.assert_array_equal(gathered, np.full((1, 3), 2.0))
+
+
+def test_ranks_with_different_lengths_name_both() -> None:
+    fd = create_exchange()
+    ranks = [
+        HostExchange(fd, rank, 2, size, timeout_s=10.0, rendezvous_timeout_s=10.0)
+        for rank, size in enumerate((5000, 200_000))
+    ]
+    os.close(fd)
+
+    def told(rank: HostExchange) -> str:
+        with pytest.raises(CollectiveError) as caught:
+            rank.mean(np.zeros(10, np.float32))
+        return str(caught.value)
+
+    with ThreadPoolExecutor(2) as pool:
+        first, second = pool.map(told, ranks)
+    fit = "do not fit together: num_floats is"
+    assert first == f"rank 0 and rank 1 {fit} 5000 for rank 0, and 200000 for rank 1"
+    assert second == f"rank 1 and rank 0 {fit} 200000 for rank 1, and 5000 for rank 0"
+
+
+def test_a_rank_that_has_closed_is_lost_to_those_who_still_call() -> None:
+    first, second = make_ranks(2, 10)
+    second.close()
+    with pytest.raises(PeerLost, match="peer 1 is gone during sum, step 1"):
+        first.mean(np.zeros(10, np.float32))
 
 
 def test_no_call_follows_a_call_that_failed() -> None:

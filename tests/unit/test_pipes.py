@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 import os
 from collections.abc import Iterator
 from typing import Any, NamedTuple
@@ -23,7 +22,8 @@ from gmijax.collectives.messages.pipe_block import (
     create_pipes,
 )
 from gmijax.collectives.messages.pipe_format import message_bytes
-from gmijax.errors import CollectiveError, CollectiveTimeout, ConfigError, PipeClosed
+from gmijax.collectives.shared_memory import process_of, take_line
+from gmijax.errors import CollectiveError, CollectiveTimeout, PipeClosed
 
 CAPACITY = 8192
 
@@ -143,11 +143,7 @@ def test_a_damaged_message_is_found(ends: Ends, offset: int) -> None:
         ends.reader.get(timeout_s=1.0)
 
 
-def test_senseless_numbers_and_other_blocks_are_refused(ends: Ends) -> None:
-    with pytest.raises(ConfigError, match="capacity_bytes=100: must be between"):
-        create_pipes(2, 100)
-    with pytest.raises(ConfigError, match=r"rank=2: must be 0 to world_size - 1 = 1"):
-        PipeBlock(ends.fd, 2)
+def test_a_rank_that_is_taken_and_other_memory_are_refused(ends: Ends) -> None:
     descriptors = len(os.listdir("/proc/self/fd"))
     for _ in range(3):
         with pytest.raises(CollectiveError, match="rank 1 is taken already by process"):
@@ -179,16 +175,13 @@ def test_there_is_a_fence_wherever_the_order_of_accesses_counts(
 ) -> None:
     """That they stand there: what they do cannot be seen on x86, which keeps the order anyway."""
     seen: list[str] = []
-    monkeypatch.setattr(
-        "gmijax.collectives.messages.pipe_block.fence", lambda: seen.append("fence")
-    )
-    block: Any = copy.copy(ends.blocks[0])
-    block._lines = [Noted(np.zeros((), LINE), seen) for _ in range(2)]
-    block._take_rank()
+    monkeypatch.setattr("gmijax.collectives.shared_memory.fence", lambda: seen.append("fence"))
+    line: Any = Noted(np.zeros((), LINE), seen)
+    take_line(line, 0)
     assert seen == ["read pid", "write start_ticks", "fence", "write pid"]
     seen.clear()
-    assert block.why_lost(0, "get", 0) is None
-    assert seen == ["read pid", "fence", "read start_ticks", "read has_left"]
+    assert process_of(line).is_running()
+    assert seen == ["read pid", "fence", "read start_ticks"]
     both: list[Any] = [ends.writer, ends.reader]
     for end in both:
         end._own = Noted(end._own, seen)

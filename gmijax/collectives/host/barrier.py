@@ -7,15 +7,15 @@ all ranks make the same calls in the same order, so equal counters mean the same
 
 from __future__ import annotations
 
-import os
+import math
 import threading
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 
 from gmijax.collectives.host.failure_detector import FailureDetector
-from gmijax.collectives.host.shared_block import SharedBlock, check_peer
-from gmijax.collectives.waits import LIVENESS_PERIOD_S, MAX_SLEEP_S, MIN_SLEEP_S, SPIN_S, Fence
+from gmijax.collectives.host.shared_block import SharedBlock
+from gmijax.collectives.waits import LIVENESS_PERIOD_S, Fence, wait_until
 from gmijax.errors import CollectiveError, CudaError
 
 OPERATIONS = ("sum", "gather", "broadcast", "all_gather", "step")
@@ -105,7 +105,7 @@ class Barrier:
         """
         detector = self._detector()
         while not done.wait(LIVENESS_PERIOD_S):
-            detector.look(lambda: self._peers, now=True, is_patient=True)
+            detector.look(lambda: self._peers, is_patient=True)
             if detector.is_late:
                 detector.give_up(self._peers)
 
@@ -149,7 +149,7 @@ class Barrier:
         detector = self._detector()
         deadline_s = time.monotonic() + SETTLE_S
         while time.monotonic() < deadline_s:
-            detector.look(lambda: self._peers, now=True)
+            detector.look(lambda: self._peers)
             time.sleep(0.02)
         if silent := detector.silent(self._peers):
             detector.give_up(silent)
@@ -160,22 +160,27 @@ class Barrier:
 
     def _wait_for_all(self) -> None:
         self._wait()  # counters of 1: all have attached
+        num_floats, rank = self._block.lines["num_floats"], self._block.rank
         for peer in self._peers:
-            check_peer(self._block, peer)
+            if num_floats[peer] != num_floats[rank]:
+                raise CollectiveError(
+                    f"rank {rank} and rank {peer} do not fit together: num_floats is "
+                    f"{num_floats[rank]} for rank {rank}, and {num_floats[peer]} for rank {peer}"
+                )
 
     def _wait(self, *, is_patient: bool = False) -> None:
-        target = int(self._sequence[self._block.rank])
-        start = time.monotonic()
-        detector, pause_s = self._detector(), MIN_SLEEP_S
-        missing = self._missing(self._peers, target)
-        while missing:
-            if time.monotonic() - start < SPIN_S:
-                os.sched_yield()
-            else:
-                time.sleep(pause_s)
-                pause_s = min(2 * pause_s, MAX_SLEEP_S)
-                detector.look(lambda: self._missing(self._peers, target), is_patient=is_patient)
+        target, missing = int(self._sequence[self._block.rank]), self._peers
+        detector = self._detector()
+
+        def arrived() -> bool | None:
+            nonlocal missing
             missing = self._missing(missing, target)
+            return None if missing else True
+
+        def look() -> None:
+            detector.look(lambda: self._missing(self._peers, target), is_patient=is_patient)
+
+        wait_until(arrived, look, math.inf)
         self._fence()
 
     def _detector(self) -> FailureDetector:

@@ -11,8 +11,9 @@ import time
 from collections.abc import Callable
 from typing import NoReturn
 
-from gmijax.collectives.host.shared_block import SharedBlock, process_of
-from gmijax.collectives.waits import LIVENESS_PERIOD_S, fence
+from gmijax.collectives.host.shared_block import SharedBlock
+from gmijax.collectives.shared_memory import process_of
+from gmijax.collectives.waits import fence
 from gmijax.errors import CollectiveTimeout, PeerLost
 
 SILENCE_S = 0.7
@@ -34,7 +35,7 @@ class FailureDetector:
         self._operation = operation
         self._step = step
         self._timeout_s = timeout_s
-        self._start_s = self._clock_s = self._next_look_s = time.monotonic()
+        self._start_s = self._clock_s = time.monotonic()
         self._heard: dict[int, tuple[int, float]] = {}
 
     @property
@@ -42,40 +43,34 @@ class FailureDetector:
         """Whether the time is up."""
         return self._waited_s() >= self._timeout_s
 
-    def look(
-        self, missing: Callable[[], list[int]], *, now: bool = False, is_patient: bool = False
-    ) -> None:
-        """Looks at those who are missing, five times a second at most unless `now`.
+    def look(self, missing: Callable[[], list[int]], *, is_patient: bool = False) -> None:
+        """Looks at those who are missing; to be called five times a second.
 
         Args:
           missing: ranks that have not arrived, read anew at every call.
-          now: look even if the last time was a moment ago.
           is_patient: the time starts anew while all who are missing are heard of.
 
         Raises:
           PeerLost: the process of one of them is gone.
           CollectiveTimeout: the time is up.
         """
-        now_s, late = time.monotonic(), self.is_late
-        if not (now or late or now_s >= self._next_look_s):
-            return
-        self._next_look_s = now_s + LIVENESS_PERIOD_S
         self._block.lines["beats"][self._block.rank] += 1
         self._check_alive(missing)
-        self._listen(now_s)
-        if is_patient and (left := missing()) and not self.silent(left):
-            self._clock_s, late = now_s, False
-        if late and (left := missing()):
+        self._listen()
+        left = missing()
+        if is_patient and left and not self.silent(left):
+            self._clock_s = time.monotonic()
+        elif left and self.is_late:
             self.give_up(left)
 
     def give_up(self, missing: list[int]) -> NoReturn:
         """Raises CollectiveTimeout for those of `missing` who do not wait themselves."""
-        self._raise_timeout(self.silent(missing) or missing, self._waited_s())
+        self._raise_timeout(self.silent(missing) or missing)
 
     def silent(self, missing: list[int]) -> list[int]:
         """Those of `missing` who do not wait themselves, as far as this rank has heard."""
-        now_s = time.monotonic()
-        return [peer for peer in missing if self._silence_s(peer, now_s) > SILENCE_S]
+        since_s, never = time.monotonic() - SILENCE_S, (0, self._start_s)
+        return [peer for peer in missing if self._heard.get(peer, never)[1] < since_s]
 
     def _check_alive(self, missing: Callable[[], list[int]]) -> None:
         gone = [peer for peer in missing() if self._is_gone(peer)]
@@ -90,7 +85,7 @@ class FailureDetector:
         cause = blamed(gone[0]) - 1
         if cause in (self._block.rank, *gone) or self._is_gone(cause):
             self._raise_lost(gone[0] if cause == self._block.rank else cause)
-        self._raise_timeout([cause], self._waited_s())
+        self._raise_timeout([cause])
 
     def _waited_s(self) -> float:
         return time.monotonic() - self._clock_s
@@ -99,24 +94,22 @@ class FailureDetector:
         # A rank that has not attached cannot be told from one that is still starting.
         attached = self._block.lines["sequence"][peer]
         fence()  # Its process was noted before.
-        return bool(attached) and not process_of(self._block, peer).is_running()
+        return bool(attached) and not process_of(self._block.lines[peer]).is_running()
 
-    def _listen(self, now_s: float) -> None:
+    def _listen(self) -> None:
+        now_s = time.monotonic()
         for peer, beats in enumerate(self._block.lines["beats"].tolist()):
             if self._heard.get(peer, (None,))[0] != beats:
                 self._heard[peer] = beats, now_s
-
-    def _silence_s(self, peer: int, now_s: float) -> float:
-        return now_s - self._heard.get(peer, (0, self._start_s))[1]
 
     def _raise_lost(self, peer: int) -> NoReturn:
         self._block.lines["blamed"][self._block.rank] = peer + 1
         first = self._block.first_rank
         raise PeerLost(self._block.rank + first, peer + first, self._operation, self._step)
 
-    def _raise_timeout(self, missing: list[int], waited_s: float) -> NoReturn:
+    def _raise_timeout(self, missing: list[int]) -> NoReturn:
         self._block.lines["blamed"][self._block.rank] = missing[0] + 1
-        waited_s = min(round(waited_s, 2), self._timeout_s)
+        waited_s = min(round(self._waited_s(), 2), self._timeout_s)
         first = self._block.first_rank
         ranks = tuple(peer + first for peer in missing)
         raise CollectiveTimeout(

@@ -13,9 +13,9 @@ from gmijax.collectives.host.shared_block import (
     MAX_GATHER_FLOATS,
     SharedBlock,
     attach,
-    process_of,
 )
 from gmijax.collectives.interface import FloatBuffer
+from gmijax.collectives.shared_memory import process_of
 from gmijax.collectives.strategies import Groups
 from gmijax.errors import CollectiveError
 
@@ -46,7 +46,6 @@ class HostExchange:
       rank, world_size: the same.
 
     Raises:
-      ConfigError: numbers that make no sense.
       CollectiveError: no memory, not such a descriptor, or the rank is taken; and, from every
         call: ranks make different calls, an earlier one failed, or after `close`.
       PeerLost, CollectiveTimeout: (from every call) a rank is gone, or did not arrive in time.
@@ -146,7 +145,7 @@ class HostExchange:
 
     def is_gone(self, peer: int) -> bool:
         """Whether an attached peer has closed its exchange, or its process has ended."""
-        return not process_of(self._open_block("is_gone"), peer).is_running()
+        return not process_of(self._open_block("is_gone").lines[peer]).is_running()
 
     def beat(self) -> None:
         """Tells the others that this rank waits, for somebody who is not in this block."""

@@ -22,12 +22,14 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from gmijax.collectives.shared_memory import create_file, map_file, round_up, whole_pages
-from gmijax.errors import CollectiveError, ConfigError
-from gmijax.machine.processes import ProcessId, own_process
+from gmijax.collectives.shared_memory import (
+    create_file,
+    map_file,
+    round_up,
+    take_line,
+    whole_pages,
+)
 
-MAGIC = 0x58494D47  # "GMIX" in memory on a little-endian machine
-VERSION = 4
 MAX_GATHER_FLOATS = 16384  # 64 KiB a rank
 FLOATS_PER_LINE = 16
 LANES = 2
@@ -35,22 +37,16 @@ LANES = 2
 
 LINE = np.dtype(
     [
-        ("magic", np.uint32),
-        ("version", np.uint16),
-        ("world_size", np.uint16),
-        ("rank", np.uint16),
-        ("blamed", np.uint16),  # 1 + the rank for which this one gave up; 0: it has not
-        ("beats", np.uint32),  # goes up while the rank waits for others
-        ("num_floats", np.uint64),
         ("pid", np.uint64),  # 0 once the rank has closed its reducer
         ("start_ticks", np.uint64),
+        ("num_floats", np.uint64),
         ("call", np.uint64, (2,)),  # what the rank is calling, by parity of the step
         ("sequence", np.uint64),  # 0: not attached; 1: attached; then one up per arrival
+        ("beats", np.uint64),  # goes up while the rank waits for others
+        ("blamed", np.uint64),  # 1 + the rank for which this one gave up; 0: it has not
     ]
 )
 """What one rank tells the others; exactly one cache line, so that ranks do not share any."""
-
-SHAPE_FIELDS = ("magic", "version", "world_size", "rank", "num_floats")
 
 
 class Geometry(NamedTuple):
@@ -110,7 +106,7 @@ def attach(fd: int, rank: int, world_size: int, num_floats: int, lane: int = 0) 
     """Maps the block and makes this process known as `rank`.
 
     The block gets its size here, from whoever comes first; the caller keeps `fd` and may close
-    it at once. Ranks that attach with other numbers are found out by `check_peer`.
+    it at once. Ranks that attach with other numbers are found out in their first call.
 
     Args:
       fd: descriptor from `create_exchange`.
@@ -120,57 +116,22 @@ def attach(fd: int, rank: int, world_size: int, num_floats: int, lane: int = 0) 
       lane: below `LANES`.
 
     Raises:
-      ConfigError: numbers that make no sense.
       CollectiveError: no memory, not such a descriptor, or the rank is taken.
     """
-    if not 0 <= rank < world_size:
-        raise ConfigError(f"rank={rank}: must be between 0 and world_size - 1 = {world_size - 1}")
-    if num_floats < 1:
-        raise ConfigError(f"num_floats={num_floats}: must be at least 1")
-    block = _map(fd, rank, world_size, num_floats, lane)
-    line = block.lines[rank]
-    if line["sequence"]:
-        raise CollectiveError(f"rank {rank} is taken already by process {line['pid']}")
-    line["magic"], line["version"] = MAGIC, VERSION
-    line["world_size"], line["rank"], line["num_floats"] = world_size, rank, num_floats
-    line["pid"], line["start_ticks"] = own_process()
-    return block
-
-
-def check_peer(block: SharedBlock, peer: int) -> None:
-    """Checks that an attached `peer` sees the block as this rank does.
-
-    Raises:
-      CollectiveError: it does not; the message names both ranks and what differs.
-    """
-    own, other = block.lines[block.rank], block.lines[peer]
-    for field in SHAPE_FIELDS:
-        expected = peer if field == "rank" else own[field]
-        if other[field] != expected:
-            raise CollectiveError(
-                f"rank {block.rank} and rank {peer} do not fit together: {field} is "
-                f"{expected} for rank {block.rank}, and {other[field]} for rank {peer}"
-            )
-
-
-def process_of(block: SharedBlock, peer: int) -> ProcessId:
-    """The process behind an attached `peer`."""
-    line = block.lines[peer]
-    return ProcessId(int(line["pid"]), int(line["start_ticks"]))
-
-
-def _map(fd: int, rank: int, world_size: int, num_floats: int, lane: int) -> SharedBlock:
     geometry = Geometry.of(world_size, num_floats)
     mapping = map_file(fd, geometry.size, f"rank {rank}")
 
     def floats(offset: int, count: int) -> npt.NDArray[np.float32]:
         return np.frombuffer(mapping, np.float32, count, offset)
 
+    lines = np.frombuffer(mapping, LINE, LANES * world_size).reshape(LANES, -1)[lane]
+    take_line(lines[rank], rank)
+    lines["num_floats"][rank] = num_floats
     gathered = floats(geometry.gathered, LANES * 2 * world_size * MAX_GATHER_FLOATS)
     slots = floats(geometry.slots, 2 * world_size * geometry.row_floats)
     return SharedBlock(
         rank=rank,
-        lines=np.frombuffer(mapping, LINE, LANES * world_size).reshape(LANES, -1)[lane],
+        lines=lines,
         gathered=gathered.reshape(LANES, 2, world_size, MAX_GATHER_FLOATS)[lane],
         slots=slots.reshape(2, world_size, geometry.row_floats)[:, :, :num_floats],
         flags=np.frombuffer(mapping, np.uint32, -1, geometry.flags).reshape(-1, FLOATS_PER_LINE),

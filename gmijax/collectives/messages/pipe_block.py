@@ -24,11 +24,9 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from gmijax.collectives.shared_memory import create_file, whole_pages
+from gmijax.collectives.shared_memory import create_file, process_of, take_line, whole_pages
 from gmijax.collectives.waits import fence
-from gmijax.config.schema import require_at_least, require_between
-from gmijax.errors import CollectiveError, ConfigError, GmijaxError, PeerLost, PipeClosed
-from gmijax.machine.processes import ProcessId, own_process
+from gmijax.errors import CollectiveError, GmijaxError, PeerLost, PipeClosed
 
 LINE_BYTES = 64
 
@@ -64,10 +62,7 @@ def create_pipes(world_size: int, capacity_bytes: int) -> int:
     """Makes an empty block for K processes and returns its descriptor, for the controller.
 
     Pipes of `capacity_bytes` are rounded up to whole pages; a message may take half of one.
-    Raises ConfigError for numbers that make no sense.
     """
-    require_at_least("world_size", world_size, 1)
-    require_between("capacity_bytes", capacity_bytes, mmap.PAGESIZE, 2**40)
     capacity_bytes = whole_pages(capacity_bytes)
     fd = create_file("pipes", _block_bytes(world_size, capacity_bytes))
     head = np.array([(world_size, capacity_bytes)], HEAD)
@@ -81,7 +76,6 @@ class PipeBlock:
     The caller keeps the descriptor from `create_pipes` and may close it at once.
 
     Raises:
-      ConfigError: no such rank.
       CollectiveError: no such block, or the rank is taken.
     """
 
@@ -94,19 +88,16 @@ class PipeBlock:
         except (OSError, ValueError, IndexError) as error:  # IndexError: an empty file.
             raise CollectiveError(f"rank {rank}: no pipes at descriptor {fd} ({error})") from None
         self.rank = rank
-        self._require_rank(rank)
         self._lines = np.frombuffer(mapping, LINE, self.world_size, LINE_BYTES)
         self._pipes: dict[tuple[int, int], PipeMemory] = {}
-        self._take_rank()
+        take_line(self._lines[rank], rank)
         self._fd = os.dup(fd)
         self._mapping: mmap.mmap | None = mapping
 
     def why_lost(self, peer: int, operation: str, step: int) -> GmijaxError | None:
         """PipeClosed if `peer` has left, PeerLost if its process is gone; None if it may come."""
         line = self._lines[peer]
-        pid = int(line["pid"])
-        fence()  # See `_take_rank`.
-        is_gone = pid and not ProcessId(pid, int(line["start_ticks"])).is_running()
+        is_gone = line["pid"] and not process_of(line).is_running()
         if line["has_left"]:
             return PipeClosed(self.rank, peer, operation)
         return PeerLost(self.rank, peer, operation, step) if is_gone else None
@@ -155,23 +146,8 @@ class PipeBlock:
             self._mapping = None  # Unmapped with the last array on it.
 
     def _offset(self, src: int, dst: int) -> int:
-        self._require_rank(src)
-        self._require_rank(dst)
         place = src * self.world_size + dst
         return _lines_end(self.world_size) + place * (self.capacity_bytes + mmap.PAGESIZE)
-
-    def _require_rank(self, rank: int) -> None:
-        if not 0 <= rank < self.world_size:
-            raise ConfigError(f"rank={rank}: must be 0 to world_size - 1 = {self.world_size - 1}")
-
-    def _take_rank(self) -> None:
-        line = self._lines[self.rank]
-        if line["pid"]:
-            raise CollectiveError(f"rank {self.rank} is taken already by process {line['pid']}")
-        process = own_process()
-        line["start_ticks"] = process.start_ticks
-        fence()  # A pid with another start would seem to be a process that is gone.
-        line["pid"] = process.pid
 
 
 def _lines_end(world_size: int) -> int:

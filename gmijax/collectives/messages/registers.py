@@ -23,16 +23,14 @@ import numpy.typing as npt
 
 from gmijax.collectives.shared_memory import create_file, map_file, whole_pages
 from gmijax.collectives.waits import Fence
-from gmijax.errors import CollectiveError, ConfigError
 
 LINE = np.dtype(
     [
-        ("size", np.uint64),  # 0 until somebody has come
         ("count", np.uint64),  # how often the register was published
         ("begun", np.uint64),  # how often that was begun: `count`, or one more
         ("tag", np.uint64, (2,)),
         ("length", np.uint64, (2,)),
-        ("pad", np.uint64, (1,)),
+        ("pad", np.uint64, (2,)),
     ]
 )
 
@@ -71,16 +69,8 @@ class Register:
         self._fence = Fence()
 
     def publish(self, values: npt.NDArray[Any], tag: int = 0) -> None:
-        """Replaces the value; one process only may do so. Costs a copy.
-
-        Raises:
-          CollectiveError: more bytes than the register has room for.
-        """
+        """Replaces the value; one process only may do so. Costs a copy."""
         data = np.ascontiguousarray(values).reshape(-1).view(np.uint8)
-        if data.size > self._places.shape[1]:
-            raise CollectiveError(
-                f"{data.size} bytes for a register of {self._places.shape[1]} bytes"
-            )
         count = int(self._line["count"][0]) + 1
         place = count % 2
         self._line["begun"][0] = count
@@ -102,7 +92,7 @@ class Register:
                 return None
             self._fence()
             place = count % 2
-            length = min(int(self._line["length"][0, place]), self._places.shape[1])
+            length = int(self._line["length"][0, place])
             tag = int(self._line["tag"][0, place])
             values = self._places[place, :length].copy()
             self._fence()
@@ -121,24 +111,15 @@ def open_registers(fd: int, sizes_bytes: Sequence[int]) -> list[Register]:
     """Maps registers of such sizes; the caller keeps `fd` and may close it at once.
 
     Raises:
-      ConfigError: no registers, or a size that makes no sense.
-      CollectiveError: no memory, or processes that come with different sizes.
+      CollectiveError: no memory.
     """
-    if not sizes_bytes or min(sizes_bytes) < 1:
-        raise ConfigError(f"sizes_bytes={list(sizes_bytes)}: every register needs at least 1 byte")
     rooms = [whole_pages(size) for size in sizes_bytes]
     offset = whole_pages(len(rooms) * LINE.itemsize)
     mapping = map_file(fd, offset + 2 * sum(rooms), "registers")
     lines = np.frombuffer(mapping, LINE, len(rooms))
     registers = []
     for index, (size, room) in enumerate(zip(sizes_bytes, rooms, strict=True)):
-        line = lines[index : index + 1]
-        if int(line["size"][0]) not in (0, size):
-            raise CollectiveError(
-                f"register {index} has {line['size'][0]} bytes for another process, {size} here"
-            )
-        line["size"][0] = size
         places = np.frombuffer(mapping, np.uint8, 2 * room, offset).reshape(2, room)
-        registers.append(Register(line, places[:, :size]))
+        registers.append(Register(lines[index : index + 1], places[:, :size]))
         offset += 2 * room
     return registers
