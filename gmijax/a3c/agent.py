@@ -16,9 +16,9 @@ import jax
 import numpy as np
 import numpy.typing as npt
 
-from gmijax.a3c.a3c import Unrolls
 from gmijax.a3c.job_registers import JobRegisters, Orders, Report
 from gmijax.a3c.rollout import UnrollPrograms, num_counts
+from gmijax.a3c.targets import Unrolls
 from gmijax.collectives.channel.sender import Sender
 from gmijax.config import A3cConfig, TrainConfig
 from gmijax.devices import describe_device

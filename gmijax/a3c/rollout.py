@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 from jax.flatten_util import ravel_pytree
 
-from gmijax.a3c.a3c import Unrolls
+from gmijax.a3c.targets import Unrolls
 from gmijax.devices import host_sharding
 from gmijax.learning.learner import ActingWeights, state_values
 from gmijax.learning.normalize import normalize

@@ -15,10 +15,11 @@ import jax.numpy as jnp
 import numpy as np
 import numpy.typing as npt
 
-from gmijax.a3c.a3c import Unrolls, make_update
+from gmijax.a3c.a3c import make_update
 from gmijax.a3c.job_registers import JobRegisters
 from gmijax.a3c.leader import Leader
 from gmijax.a3c.report import MAX_COUNTED, BatchCounts, UpdateFigures, histogram_of
+from gmijax.a3c.targets import Unrolls
 from gmijax.collectives.channel.batcher import Batch, Batcher
 from gmijax.collectives.interface import Reducer
 from gmijax.config import A3cConfig, TrainConfig
@@ -89,7 +90,8 @@ class Trainer:
         first = np.asarray(pack(state))
         compile_s = time.monotonic() - started
         self.link.beat("ready", 0)
-        self._require_equal(state)  # And so all trainers have compiled.
+        # And so all trainers have compiled.
+        require_equal(self.reducer, state.params, self._env_steps)
         if not leads:
             return {"status": self._loop(state, None), "updates": self._updates}
         leader = Leader(
@@ -101,9 +103,6 @@ class Trainer:
         finally:
             leader.close()
         return leader.outcome(status, compile_s)
-
-    def _require_equal(self, state: TrainState) -> None:
-        require_equal(self.reducer, state.params, self._env_steps)
 
     def _loop(self, state: TrainState, leader: Leader | None) -> str:
         """Returns the status for the outcome."""
@@ -135,7 +134,7 @@ class Trainer:
                 break
         if leader is not None:
             leader.end()
-        self._require_equal(state)
+        require_equal(self.reducer, state.params, self._env_steps)
         # Agents that wait for room may go: the order to end is published by now.
         self.receiver.close()
         if leader is not None:

@@ -6,23 +6,23 @@ import socket
 import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, TypeAlias
+from typing import TypeAlias
 
+import jax
+
+from gmijax.collectives.device.device_links import Device, DeviceLinks
 from gmijax.collectives.host.host_exchange import HostExchange
+from gmijax.collectives.host.host_links import HostLinks
 from gmijax.collectives.host.shared_block import LANES
 from gmijax.collectives.interface import FloatBuffer, Reducer, Step, TracedStep
 from gmijax.collectives.nodes.meeting import Nodes, connect
 from gmijax.collectives.nodes.mesh import Mesh
 from gmijax.collectives.nodes.node_exchange import NodeExchange
+from gmijax.collectives.program import Exchange, ProgramStep
 from gmijax.collectives.strategies import stages
 from gmijax.errors import ConfigError, DeviceMemoryUnavailable
 from gmijax.partition.layout import Layout
 from gmijax.partition.reduction import require_strategy, why_no_bindings
-
-if TYPE_CHECKING:
-    from gmijax.collectives.device.device_links import Device
-    from gmijax.collectives.program import Exchange
-
 
 _Lane: TypeAlias = HostExchange | NodeExchange
 
@@ -72,7 +72,7 @@ def build_reducer(strategy: str, membership: Membership) -> Reducer:
     require_strategy(strategy, membership.layout)
     if membership.layout.num_gmis == 1:
         return SoloReducer(strategy)
-    control, host = _lanes(strategy, membership)
+    control, host = _lanes(membership)
     try:
         return _built(strategy, membership, control, host)
     except DeviceMemoryUnavailable as error:
@@ -85,9 +85,6 @@ def build_reducer(strategy: str, membership: Membership) -> Reducer:
 
 
 def _built(strategy: str, membership: Membership, control: _Lane, host: _Lane) -> Reducer:
-    from gmijax.collectives.host.host_links import HostLinks  # Imports jax.
-    from gmijax.collectives.program import Exchange
-
     layout, num_floats = membership.layout, _room(membership)
     parts = stages(strategy, layout, membership.intra)
     device, links = DEVICE(), None
@@ -97,8 +94,6 @@ def _built(strategy: str, membership: Membership, control: _Lane, host: _Lane) -
         else:
             assert isinstance(control, HostExchange)  # Others are refused on several nodes.
             assert isinstance(host, HostExchange)
-            from gmijax.collectives.device.device_links import DeviceLinks
-
             links = DeviceLinks(control, host, layout, num_floats, parts, device)
         exchange = Exchange(links, parts, host.rank, host.world_size)
         links.start(exchange)
@@ -156,19 +151,14 @@ class SoloReducer:
 
     def program(self, step: Step, *, donates_own: bool = True) -> TracedStep:
         """See `Reducer`."""
-        from gmijax.collectives.program import ProgramStep  # Imports jax.
-
         return ProgramStep(None, None, step, donates_own=donates_own)
 
     def close(self) -> None:
         """Does nothing: there is nothing to release."""
 
 
-def _lanes(strategy: str, membership: Membership) -> Sequence[_Lane]:
-    if membership.exchange_fd is None:
-        raise ConfigError(
-            f"reduce.strategy={strategy}: needs the shared block of the job's controller"
-        )
+def _lanes(membership: Membership) -> Sequence[_Lane]:
+    assert membership.exchange_fd is not None
     layout, rank = membership.layout, membership.rank
     here = layout.gmis_of_node[layout.node_of(rank)]
     lanes = [
@@ -217,15 +207,12 @@ def _room(membership: Membership) -> int:
 
 def _device() -> Device | None:
     """What links of this process's GPU are made of; None on a CPU."""
-    import jax
-
     if jax.local_devices()[0].platform != "gpu":
         return None
     if reason := why_no_bindings():
         raise ConfigError(f"GMIs that train together on GPUs: {reason}")
     from gmijax.collectives.device.cuda_memory import CudaMemory
     from gmijax.collectives.device.cuda_queue import CudaQueue
-    from gmijax.collectives.device.device_links import Device
     from gmijax.collectives.device.nccl_ring import nccl_ring
 
     return Device(CudaMemory, CudaQueue, nccl_ring)

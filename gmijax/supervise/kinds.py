@@ -33,7 +33,7 @@ ENV_REGISTERS_FD: Final = "GMIJAX_REGISTERS_FD"
 ENV_CHANNELS_FD: Final = "GMIJAX_CHANNELS_FD"
 
 FLOAT_CHANNELS: Final = ("state", "action", "reward", "log_prob", "cut_value", "bootstrap")
-"""Channels of an unroll that could travel with half the bits; see `gmijax.a3c.a3c.Unrolls`."""
+"""Channels of an unroll that could travel with half the bits; see `gmijax.a3c.targets.Unrolls`."""
 
 _ADVICE: Final = (
     "channels through host memory; channel.transport=device keeps experience on its GPU, which "

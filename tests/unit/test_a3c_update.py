@@ -13,9 +13,10 @@ from axis_peers import run_together
 from jax.flatten_util import ravel_pytree
 from toy_env import point_mass
 
-from gmijax.a3c.a3c import A3cLosses, Unrolls, batch_targets, gradients, update
+from gmijax.a3c.a3c import A3cLosses, gradients, update
 from gmijax.a3c.report import histogram_of, mean_and_p99
 from gmijax.a3c.rollout import UnrollPrograms, collect
+from gmijax.a3c.targets import Unrolls, batch_targets
 from gmijax.cli.compose import compose
 from gmijax.collectives.program import PeersOfOne
 from gmijax.learning.learner import (

@@ -18,7 +18,7 @@ from gmijax.collectives.host.shared_block import create_exchange
 from gmijax.collectives.nodes import meeting
 from gmijax.collectives.nodes.meeting import Nodes, connect, listen
 from gmijax.collectives.nodes.mesh import Mesh
-from gmijax.collectives.strategies import Stage, har_s, mpr_s, nodes_s, predicted_s, stages
+from gmijax.collectives.strategies import COSTS, Stage, nodes_s, predicted_s, stages
 from gmijax.errors import CollectiveError, CollectiveTimeout, ConfigError, PeerLost
 from gmijax.partition.layout import Layout
 from gmijax.partition.reduction import select_strategy, why_not_strategy
@@ -163,10 +163,10 @@ def test_small_things_go_over_nodes_in_order_of_rank() -> None:
 @pytest.mark.parametrize(
     ("gpus", "gmis", "nodes", "strategy", "seconds"),
     [
-        (1, 4, 1, "mpr", mpr_s(1, 4, 400, 2, 3)),
-        (1, 4, 2, "mpr", mpr_s(1, 4, 400, 2, 3) + nodes_s(2, 400, 5)),
-        (2, 1, 4, "mrr", har_s(2, 1, 400, 2, 3) * 2 + nodes_s(4, 400, 5)),
-        (2, 4, 3, "har", har_s(2, 4, 400, 2, 3) + nodes_s(3, 400, 5)),
+        (1, 4, 1, "mpr", COSTS["mpr"](1, 4, 400, 2, 3)),
+        (1, 4, 2, "mpr", COSTS["mpr"](1, 4, 400, 2, 3) + nodes_s(2, 400, 5)),
+        (2, 1, 4, "mrr", COSTS["har"](2, 1, 400, 2, 3) * 2 + nodes_s(4, 400, 5)),
+        (2, 4, 3, "har", COSTS["har"](2, 4, 400, 2, 3) + nodes_s(3, 400, 5)),
     ],
 )
 def test_algorithm_1_and_its_cost_are_those_of_a_node_and_the_way_between(

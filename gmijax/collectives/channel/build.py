@@ -88,10 +88,8 @@ def create_channels(config: ChannelConfig, topology: ChannelTopology) -> int:
     return create_pipes(len(topology.gpu_of), pipe_bytes)
 
 
-def open_sender(
-    config: ChannelConfig, topology: ChannelTopology, rank: int, fd: int | None
-) -> Sender:
-    """The end of agent `rank`; `fd` is from `create_channels`, None with `transport=zmq`.
+def open_sender(config: ChannelConfig, topology: ChannelTopology, rank: int, fd: int) -> Sender:
+    """The end of agent `rank`; `fd` is from `create_channels`.
 
     Raises:
       ConfigError: something is missing.
@@ -129,9 +127,7 @@ def open_sender(
     )
 
 
-def open_receiver(
-    config: ChannelConfig, topology: ChannelTopology, rank: int, fd: int | None
-) -> Batcher:
+def open_receiver(config: ChannelConfig, topology: ChannelTopology, rank: int, fd: int) -> Batcher:
     """The end of trainer `rank`; arguments and errors as `open_sender`."""
     held = ExitStack()
     readers: list[ChannelReader] = []
@@ -174,9 +170,7 @@ def _device_sender(
     return Sender(dispenser, packer, migrator, max_waiting=None, on_device=True, held=held)
 
 
-def _open_block(rank: int, fd: int | None, held: ExitStack) -> PipeBlock:
-    if fd is None:
-        raise ConfigError("channel.transport=memory: needs the channels of the job's controller")
+def _open_block(rank: int, fd: int, held: ExitStack) -> PipeBlock:
     block = PipeBlock(fd, rank)
     held.callback(block.close)
     return block

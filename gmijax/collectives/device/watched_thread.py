@@ -11,27 +11,11 @@ import os
 import sys
 import threading
 from collections.abc import Callable
+from concurrent.futures import Future
 from queue import SimpleQueue
-from typing import Generic, TypeVar, cast
+from typing import Any, TypeVar
 
 T = TypeVar("T")
-
-
-class _Call(Generic[T]):
-    """One call and what came of it."""
-
-    def __init__(self, function: Callable[[], T]) -> None:
-        self.done = threading.Event()
-        self.error: BaseException | None = None
-        self.value: T | None = None
-        self._function = function
-
-    def run(self) -> None:
-        try:
-            self.value = self._function()
-        except BaseException as error:  # Raised again in the thread that waits.
-            self.error = error
-        self.done.set()
 
 
 class WatchedThread:
@@ -47,7 +31,7 @@ class WatchedThread:
     """
 
     def __init__(self, name: str) -> None:
-        self._calls: SimpleQueue[_Call | None] = SimpleQueue()
+        self._calls: SimpleQueue[tuple[Future[Any], Callable[[], Any]] | None] = SimpleQueue()
         self.is_stuck = False
         threading.Thread(target=self._serve, name=name, daemon=True).start()
 
@@ -58,25 +42,29 @@ class WatchedThread:
           function: runs in the watched thread's thread.
           wait: returns when the event is set, or raises, which gives the call up.
         """
-        call = _Call(function)
-        self._calls.put(call)
+        call: Future[T] = Future()
+        done = threading.Event()
+        call.add_done_callback(lambda _: done.set())
+        self._calls.put((call, function))
         try:
-            wait(call.done)
+            wait(done)
         except BaseException:
             self._give_up()
             raise
-        if call.error is not None:
-            raise call.error
-        return cast(T, call.value)  # There is a value where there is no error.
+        return call.result()
 
     def close(self) -> None:
         """Ends the thread; calling it twice is fine."""
         self._calls.put(None)
 
     def _serve(self) -> None:
-        while (call := self._calls.get()) is not None:
-            call.run()
-            del call  # Nothing of it may outlive the caller's interest.
+        while (given := self._calls.get()) is not None:
+            call, function = given
+            try:
+                call.set_result(function())
+            except BaseException as error:  # Raised again in the thread that waits.
+                call.set_exception(error)
+            del given, call, function  # Nothing of it may outlive the caller's interest.
 
     def _give_up(self) -> None:
         if not self.is_stuck:
