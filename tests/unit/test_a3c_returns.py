@@ -58,19 +58,6 @@ def test_vtrace_is_the_sum_of_the_paper(steps, lam, rho_clip, trace_clip) -> Non
     np.testing.assert_allclose(got.rho, np.minimum(rho_clip, ratios))
 
 
-def test_on_policy_vtrace_is_the_n_step_return(steps) -> None:
-    # Within an episode V(s_{t+1}) is one number, whichever row it stands in.
-    ended = np.maximum(steps["terminated"], steps["truncated"])[:-1] > 0
-    steps["next_values"][:-1] = np.where(ended, steps["next_values"][:-1], steps["values"][1:])
-    arrays = tuple(map(jnp.asarray, steps.values()))
-    plain = n_step_returns(*arrays, discount=0.97)
-    traced = vtrace(
-        *arrays, ratios=jnp.ones((T, N)), discount=0.97, lam=1.0, rho_clip=1.0, trace_clip=1.0
-    )
-    np.testing.assert_allclose(traced.value, plain.value, rtol=1e-5, atol=1e-5)
-    np.testing.assert_allclose(traced.advantage, plain.advantage, rtol=1e-5, atol=1e-5)
-
-
 def test_n_step_returns_by_hand() -> None:
     # Two steps, discount 0.5: bootstrap 8 -> 2 + 4 = 6 -> 1 + 3 = 4; terminated: 2 -> 1 + 1;
     # truncated at the first step with a value of 10 behind it: 1 + 5.

@@ -197,18 +197,6 @@ def test_there_is_a_fence_wherever_the_order_of_accesses_counts(
     assert seen[-1] == "fence"
 
 
-def test_rings_begin_at_pages_of_this_machine(monkeypatch: pytest.MonkeyPatch) -> None:
-    page_bytes = 65536
-    monkeypatch.setattr("mmap.PAGESIZE", page_bytes)
-    fd = create_pipes(2, 2 * page_bytes)
-    block = PipeBlock(fd, 0)
-    begin = block._lines.ctypes.data - LINE_BYTES
-    offsets = [block.pipe(0, dst).ring.ctypes.data - begin for dst in (0, 1)]
-    assert offsets == [2 * page_bytes, 5 * page_bytes]
-    block.close()
-    os.close(fd)
-
-
 def test_unused_pipes_cost_no_memory() -> None:
     fd = create_pipes(16, 2**26)
     block = PipeBlock(fd, 3)

@@ -126,12 +126,3 @@ def test_readers_of_another_process_see_whole_values_only(fd) -> None:
         finally:
             writer.kill()
     assert seen == sorted(set(seen))
-
-
-def test_registers_begin_at_pages_of_this_machine(fd, monkeypatch: pytest.MonkeyPatch) -> None:
-    page_bytes = 65536
-    monkeypatch.setattr("mmap.PAGESIZE", page_bytes)
-    first, second = open_registers(fd, [8, 64])
-    begin = first._line.ctypes.data
-    assert first._places.ctypes.data - begin == page_bytes
-    assert second._places.ctypes.data - begin == 3 * page_bytes

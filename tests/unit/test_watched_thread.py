@@ -4,21 +4,6 @@ from __future__ import annotations
 
 import subprocess
 import sys
-import threading
-
-import pytest
-
-from gmijax.collectives.device.watched_thread import WatchedThread
-
-
-def test_results_and_errors_come_back_in_order() -> None:
-    thread = WatchedThread("test")
-    assert [thread.run(lambda n=n: n * n, threading.Event.wait) for n in range(3)] == [0, 1, 4]
-    with pytest.raises(ZeroDivisionError):
-        thread.run(lambda: 1 // 0, threading.Event.wait)
-    assert thread.run(lambda: "still there", threading.Event.wait) == "still there"
-    thread.close()
-    thread.close()
 
 
 def test_a_process_with_a_stuck_call_ends_all_the_same() -> None:

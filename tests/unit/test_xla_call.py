@@ -58,9 +58,3 @@ def test_what_it_raises_fails_the_program(name: str) -> None:
     with pytest.raises(jax.errors.JaxRuntimeError, match="test_add_two: 3 axes"):
         jax.block_until_ready(jax.jit(lambda x: _call(name, x))(jnp.ones((1, 2, 3))))
     jax.block_until_ready(jax.jit(lambda x: _call(name, x))(jnp.ones((1, 2))))  # Not for ever.
-
-
-def test_attributes_are_integers(name: str) -> None:
-    call = jax.ffi.ffi_call(name, jax.ShapeDtypeStruct((), jnp.float32), has_side_effect=True)
-    with pytest.raises(jax.errors.JaxRuntimeError, match="attribute 0 is no int64"):
-        jax.block_until_ready(jax.jit(lambda x: call(x, least="text"))(jnp.ones(1)))
