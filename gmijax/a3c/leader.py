@@ -11,8 +11,9 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from gmijax.a3c.a3c import Updated
 from gmijax.a3c.job_registers import JobRegisters, Orders, Report
-from gmijax.a3c.report import BatchCounts, Reporter, UpdateFigures
+from gmijax.a3c.report import BatchCounts, Reporter
 from gmijax.config import TrainConfig
 from gmijax.devices import describe_device
 from gmijax.errors import CollectiveTimeout
@@ -68,12 +69,13 @@ class Leader:
         env_steps: int,
         updates: int,
         counts: BatchCounts,
-        figures: UpdateFigures,
+        updated: Updated,
+        update_s: float,
         state: TrainState,
     ) -> None:
-        """Takes one update into the metrics."""
+        """Takes one update, of `update_s` seconds, into the metrics."""
         self.env_steps, self._updates = env_steps, updates
-        self._reporter.add(counts, figures)
+        self._reporter.add(counts, updated, update_s)
         if self._reporter.is_due:
             self._hear()
             self._write_line(state)

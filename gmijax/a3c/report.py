@@ -16,7 +16,7 @@ import numpy as np
 import numpy.typing as npt
 from jax.flatten_util import ravel_pytree
 
-from gmijax.a3c.a3c import A3cLosses
+from gmijax.a3c.a3c import A3cLosses, Updated
 from gmijax.a3c.job_registers import Report
 from gmijax.learning.training_log import Learnt, TrainingLog
 from gmijax.learning.unroll import no_counts
@@ -47,18 +47,6 @@ class BatchCounts(NamedTuple):
     staleness: npt.NDArray[np.float32]
 
 
-class UpdateFigures(NamedTuple):
-    """Losses and learning rates (`rate_figures`) of an update, and the seconds that it took.
-
-    For `explained_variance` see the function of this name.
-    """
-
-    losses: A3cLosses
-    rates: dict[str, Any]
-    explained_variance: float
-    update_s: float
-
-
 class Reporter:
     """Turns updates into lines, a line for half a second of them, from `env_steps` on.
 
@@ -76,7 +64,7 @@ class Reporter:
         self._unpack: Any = unpack
         self._before = Report.of_nothing(zeros.size)
         self._env_steps = env_steps
-        self._updates: list[tuple[UpdateFigures, float]] = []
+        self._updates: list[tuple[Updated, float, float]] = []
         self._stale = 0.0
         self._recent = np.zeros(MAX_COUNTED + 1, np.float32)
         self._whole = np.zeros(MAX_COUNTED + 1, np.float64)
@@ -86,9 +74,9 @@ class Reporter:
         """Whether the last line is old enough."""
         return time.monotonic() - self.log.last_s >= LINE_EVERY_S
 
-    def add(self, counts: BatchCounts, figures: UpdateFigures) -> None:
-        """Takes in one update."""
-        self._updates.append((figures, counts.receive_s))
+    def add(self, counts: BatchCounts, updated: Updated, update_s: float) -> None:
+        """Takes in one update, of so many seconds."""
+        self._updates.append((updated, update_s, counts.receive_s))
         self._stale += counts.stale
         self._recent += counts.staleness
 
@@ -141,8 +129,8 @@ class Reporter:
 
     def _of_updates(self) -> tuple[dict[str, float], dict[str, float], dict[str, Any]]:
         """Means of the losses, figures of the learning rates, and the rest."""
-        figures, receive_s = zip(*self._updates, strict=True)
-        losses, rates, explained, update_s = zip(*figures, strict=True)
+        updates, update_s, receive_s = zip(*self._updates, strict=True)
+        _, losses, rates, explained = zip(*updates, strict=True)
         averaged: Any = np.mean(losses, axis=0, dtype=np.float64)
         means = dict(zip(A3cLosses._fields, map(float, averaged), strict=True))
         del means["weight"]  # 1, over a batch.

@@ -18,7 +18,7 @@ import numpy.typing as npt
 from gmijax.a3c.a3c import make_update
 from gmijax.a3c.job_registers import JobRegisters
 from gmijax.a3c.leader import Leader
-from gmijax.a3c.report import MAX_COUNTED, BatchCounts, UpdateFigures, histogram_of
+from gmijax.a3c.report import MAX_COUNTED, BatchCounts, histogram_of
 from gmijax.a3c.targets import Unrolls
 from gmijax.collectives.channel.batcher import Batch, Batcher
 from gmijax.collectives.interface import Reducer
@@ -115,18 +115,18 @@ class Trainer:
             state, _, updated = self._update(state, (unrolls, weight))
             self._update.wait()
             weights = np.asarray(updated.weights)
-            _, losses, rates, explained = jax.device_get(updated._replace(weights=None))
+            updated = jax.device_get(updated._replace(weights=None))
             self._version += 1
             self._updates += 1
             self._env_steps += round(counts.fresh) * self._algo.unroll_length
             where = f"{self.config.env.label}, up to env step {self._env_steps}"
-            check_losses(where, losses._asdict())
+            check_losses(where, updated.losses._asdict())
             is_stopped = counts.stop > 0
             is_last = is_stopped or self._env_steps >= self.config.num_timesteps
             if leader is not None:
                 leader.publish(weights, self._version)
-                figures = UpdateFigures(losses, rates, explained, time.monotonic() - started)
-                leader.record(self._env_steps, self._updates, counts, figures, state)
+                update_s = time.monotonic() - started
+                leader.record(self._env_steps, self._updates, counts, updated, update_s, state)
                 if not is_last:
                     leader.checkpoint_now_and_then(state)
             self.link.beat("running", self._updates)

@@ -26,9 +26,7 @@ def round_trip(tree: Any, *, scalars: bool = False) -> Any:
     return unflatten(skeleton, [as_bytes(array).copy() for array in arrays])
 
 
-def test_any_nesting_comes_back() -> None:
-    assert same(round_trip(nested(3)), nested(3))
-    # More than numbers is pickled as it is.
+def test_more_than_numbers_is_pickled_as_it_is() -> None:
     masked = np.ma.array([1.0, 2.0], mask=[True, False])
     back = round_trip([masked, np.array([None, "text"], object)])
     assert back[0].mask.tolist() == [True, False]
@@ -156,7 +154,7 @@ def test_a_rank_may_end_when_what_it_left_on_the_device_is_received() -> None:
     second.recv(0)
     for sender, receiver in ((first, 1), (second, 0)):
         sender.send(jnp.arange(5000.0), receiver)
-    first.flush(0.01)
+    first.flush()
     assert not first.settle(0.01)  # It has taken what came, so the other one may end.
     assert second.settle(0.01)
     assert first.settle(0.01)

@@ -99,7 +99,7 @@ class Messenger:
             self._read(src)
         return bool(self._inbox(src).ready[tag])
 
-    def flush(self, timeout_s: float | None = None) -> None:
+    def flush(self) -> None:
         """Waits until all that was sent lies in shared memory, where it outlives this process.
 
         What stays on the GPU does not: see `settle`.
@@ -108,15 +108,14 @@ class Messenger:
           PeerLost: a receiver is gone, and has not taken all.
           CollectiveTimeout: receivers have not made room in time; names them.
         """
-        allowed_s = self._timeout_s if timeout_s is None else timeout_s
-        deadline_s = time.monotonic() + allowed_s
+        deadline_s = time.monotonic() + self._timeout_s
         late = [
             dst
             for dst, outbox in self._outboxes.items()
             if not outbox.wait_until_empty(deadline_s - time.monotonic())
         ]
         if late:
-            raise CollectiveTimeout(self.rank, tuple(late), "flush", 0, allowed_s)
+            raise CollectiveTimeout(self.rank, tuple(late), "flush", 0, self._timeout_s)
 
     def settle(self, timeout_s: float) -> bool:
         """Whether all that stays on the GPU, and goes with this process, was received in time.

@@ -21,7 +21,7 @@ accesses: `docs/decisions/shared-memory-exchange.md`.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, NamedTuple, TypeAlias
+from typing import Any, TypeAlias
 
 import numpy.typing as npt
 
@@ -66,7 +66,8 @@ class PipeWriter:
         self._read_position = self._reader["position"]
         self._position = 0
         self._fence = Fence()
-        self._reserved: _Reservation | None = None
+        # Offset of the next message in the ring, bytes skipped before it, its size, its parts'.
+        self._reserved: tuple[int, int, int, tuple[int, ...]] | None = None
 
     @property
     def outstanding_bytes(self) -> int:
@@ -141,7 +142,7 @@ class PipeWriter:
             return None
         self._fence()  # What the reader released was read before it is overwritten.
         begin = 0 if gap else start
-        self._reserved = _Reservation(begin, gap, length, tuple(sizes))
+        self._reserved = begin, gap, length, tuple(sizes)
         return split_parts(self._ring, begin, sizes)
 
     def commit(self) -> None:
@@ -245,12 +246,3 @@ class PipeReader:
             header = read_header(ring, position % len(ring), self.messages)
         self._next_position = position + header.length
         return read_parts(ring, position % len(ring), header)
-
-
-class _Reservation(NamedTuple):
-    """Where the next message goes: offset in the ring, bytes skipped before it, its size."""
-
-    begin: int
-    gap: int
-    length: int
-    sizes: tuple[int, ...]
