@@ -7,10 +7,8 @@ import stat
 from collections.abc import Iterator
 
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 
-from gmijax.collectives.host.shared_block import LINE, Geometry, attach, create_exchange
+from gmijax.collectives.host.shared_block import LANES, LINE, attach, create_exchange
 from gmijax.errors import CollectiveError
 
 
@@ -21,28 +19,29 @@ def exchange_fd() -> Iterator[int]:
     os.close(fd)
 
 
-@given(st.integers(1, 64), st.integers(1, 10_000_000))
+@pytest.mark.parametrize(("world_size", "num_floats"), [(1, 1), (3, 17), (16, 10_003)])
 def test_parts_of_the_block_do_not_overlap_and_begin_at_cache_lines(
-    world_size: int, num_floats: int
+    world_size: int, num_floats: int, exchange_fd: int
 ) -> None:
-    at = Geometry.of(world_size, num_floats)
-    assert at.gathered >= 2 * world_size * 64
-    assert at.slots >= at.gathered + 4 * world_size * 65536
-    assert at.row_floats >= num_floats
-    assert at.flags >= at.slots + 2 * world_size * at.row_floats * 4
-    assert at.size >= at.flags + world_size * 64
-    assert [offset % 64 for offset in (at.gathered, at.slots, at.flags)] == [0, 0, 0]
-    assert at.row_floats % 16 == 0
+    first, second = (attach(exchange_fd, 0, world_size, num_floats, lane) for lane in range(LANES))
+    parts = [first.lines["beats"], second.lines["beats"], first.gathered, second.gathered]
+    parts += [first.slots, first.flags]
+    for number, part in enumerate(parts):
+        part[...] = number
+    for number, part in enumerate(parts):
+        assert (part == number).all()
+    assert not any(part.ctypes.data % 64 for part in (first.lines, *parts[2:]))
+    assert not any(stride % 64 for stride in first.slots.strides[:2])
 
 
 @pytest.mark.parametrize("page_bytes", [4096, 65536])
 def test_what_a_gpu_maps_is_whole_pages_of_this_machine(
-    page_bytes: int, monkeypatch: pytest.MonkeyPatch
+    page_bytes: int, exchange_fd: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("mmap.PAGESIZE", page_bytes)
-    at = Geometry.of(3, 100)
-    assert at.flags % page_bytes == 0
-    assert at.size - at.flags == page_bytes
+    block = attach(exchange_fd, 0, 3, 100)
+    assert (block.flags.ctypes.data - block.lines.ctypes.data) % page_bytes == 0
+    assert block.flags.nbytes == page_bytes
 
 
 def test_a_line_is_one_cache_line() -> None:

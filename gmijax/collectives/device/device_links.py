@@ -210,10 +210,9 @@ class DeviceLinks(HostLinks):
         yield self._queue
         self._queue.stop_clock(stream)
 
-    def _open(self) -> bytes:
+    def _open(self) -> None:
         self._queue = self._device.new_queue(self._control.flags)
         self._order = Order(self._control.flags, self._control.rank, self._control.world_size)
-        return b""
 
     def _try(self, exchange: Exchange) -> Exception | None:
         """First exchanges of known numbers; what went wrong with them."""
@@ -236,7 +235,6 @@ class DeviceLinks(HostLinks):
         return None
 
 
-def _raise(failure: Exception | None) -> bytes:
+def _raise(failure: Exception | None) -> None:
     if failure is not None:
         raise failure
-    return b""

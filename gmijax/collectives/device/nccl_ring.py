@@ -54,18 +54,15 @@ def nccl_ring(host: HostExchange, groups: Groups) -> NcclRing | None:
     found: list[NcclRing] = []
     group = next((group for group in groups if host.rank in group), ())
 
-    def make_id() -> bytes:
-        if not group or group[0] != host.rank:
-            return b""
-        return bytes(_nccl().get_unique_id())
+    def make_id() -> bytes | None:
+        return bytes(_nccl().get_unique_id()) if group and group[0] == host.rank else None
 
-    def join() -> bytes:
+    def join() -> None:
         if group:
             nccl = _nccl()
             unique = nccl.UniqueId.from_buffer(ids[group[0]][:_ID_BYTES].tobytes())
             place = group.index(host.rank)
             found.append(NcclRing(nccl, nccl.comm_init_rank(len(group), unique, place)))
-        return b""
 
     ids = agreed(host, _WISH, make_id)
     agreed(host, _WISH, join)

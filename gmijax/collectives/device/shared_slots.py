@@ -162,14 +162,15 @@ class SharedSlots:
         size = 2 * len(self._members) * self._row_bytes
         return self._memories[0].create(size) if self._is_owner else b""
 
-    def _map(self, tickets: npt.NDArray[np.uint8]) -> bytes:
+    def _map(self, tickets: npt.NDArray[np.uint8]) -> None:
         for owner, memory in zip(self._owners, self._memories, strict=True):
             if not (self._is_owner and owner == self._owners[0]):
                 memory.open(tickets[owner][:TICKET_BYTES].tobytes())
-        return b""
 
 
-def agreed(host: HostExchange, wish: str, step: Callable[[], bytes]) -> npt.NDArray[np.uint8]:
+def agreed(
+    host: HostExchange, wish: str, step: Callable[[], bytes | None]
+) -> npt.NDArray[np.uint8]:
     """Does a step of the start; returns what it returned on every rank [K, NOTE_BYTES].
 
     All ranks of the job call this, and they go on together or not at all.
@@ -178,7 +179,7 @@ def agreed(host: HostExchange, wish: str, step: Callable[[], bytes]) -> npt.NDAr
       DeviceMemoryUnavailable: it failed on one of them, and why it did there.
     """
     try:
-        note, has_failed = step(), False
+        note, has_failed = step() or b"", False
     # Whatever it is, of CUDA, of jax or of an import: there is another way, through the host.
     except Exception as error:
         said = " ".join(str(error).split())

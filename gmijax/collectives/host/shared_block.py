@@ -49,28 +49,6 @@ LINE = np.dtype(
 """What one rank tells the others; exactly one cache line, so that ranks do not share any."""
 
 
-class Geometry(NamedTuple):
-    """Where the parts of a block begin, in bytes, and how large the whole is."""
-
-    gathered: int
-    slots: int
-    row_floats: int
-    flags: int
-    size: int
-
-    @classmethod
-    def of(cls, world_size: int, num_floats: int) -> Geometry:
-        """The geometry for K ranks and P floats."""
-        row_floats = round_up(max(num_floats, 1), FLOATS_PER_LINE)
-        gathered = LANES * world_size * LINE.itemsize
-        floats = LANES * 2 * world_size * MAX_GATHER_FLOATS
-        slots = whole_pages(gathered + floats * 4)
-        # Whole pages, because a GPU maps pages.
-        flags = whole_pages(slots + 2 * world_size * row_floats * 4)
-        size = flags + whole_pages(world_size * LINE.itemsize)
-        return cls(gathered, slots, row_floats, flags, size)
-
-
 class SharedBlock(NamedTuple):
     """The mapped block as arrays; the mapping lives as long as one of them does.
 
@@ -118,21 +96,23 @@ def attach(fd: int, rank: int, world_size: int, num_floats: int, lane: int = 0) 
     Raises:
       CollectiveError: no memory, not such a descriptor, or the rank is taken.
     """
-    geometry = Geometry.of(world_size, num_floats)
-    mapping = map_file(fd, geometry.size, f"rank {rank}")
-
-    def floats(offset: int, count: int) -> npt.NDArray[np.float32]:
-        return np.frombuffer(mapping, np.float32, count, offset)
-
+    row_floats = round_up(num_floats, FLOATS_PER_LINE)
+    gathered_at = LANES * world_size * LINE.itemsize
+    num_gathered = LANES * 2 * world_size * MAX_GATHER_FLOATS
+    # Whole pages, because a GPU maps pages.
+    slots_at = whole_pages(gathered_at + 4 * num_gathered)
+    flags_at = whole_pages(slots_at + 4 * 2 * world_size * row_floats)
+    size = flags_at + whole_pages(world_size * LINE.itemsize)
+    mapping = map_file(fd, size, f"rank {rank}")
     lines = np.frombuffer(mapping, LINE, LANES * world_size).reshape(LANES, -1)[lane]
     take_line(lines[rank], rank)
     lines["num_floats"][rank] = num_floats
-    gathered = floats(geometry.gathered, LANES * 2 * world_size * MAX_GATHER_FLOATS)
-    slots = floats(geometry.slots, 2 * world_size * geometry.row_floats)
+    gathered = np.frombuffer(mapping, np.float32, num_gathered, gathered_at)
+    slots = np.frombuffer(mapping, np.float32, 2 * world_size * row_floats, slots_at)
     return SharedBlock(
         rank=rank,
         lines=lines,
         gathered=gathered.reshape(LANES, 2, world_size, MAX_GATHER_FLOATS)[lane],
-        slots=slots.reshape(2, world_size, geometry.row_floats)[:, :, :num_floats],
-        flags=np.frombuffer(mapping, np.uint32, -1, geometry.flags).reshape(-1, FLOATS_PER_LINE),
+        slots=slots.reshape(2, world_size, row_floats)[:, :, :num_floats],
+        flags=np.frombuffer(mapping, np.uint32, -1, flags_at).reshape(-1, FLOATS_PER_LINE),
     )
