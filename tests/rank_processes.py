@@ -22,7 +22,8 @@ from gmijax.collectives.interface import Reducer
 from gmijax.errors import CollectiveTimeout, GmijaxError, PeerLost
 from gmijax.partition.layout import Layout
 from gmijax.supervise.child import ENV_EXCHANGE_FD
-from tests.rank_bodies import BODIES, Options
+from tests import rank_bodies
+from tests.rank_bodies import Options
 
 WAIT_S = 90.0
 REPOSITORY = Path(__file__).resolve().parents[1]
@@ -168,7 +169,7 @@ def main(options: Options) -> None:
     try:
         reducer = make_reducer(options)
         try:
-            result |= BODIES[options["body"]](reducer, options)
+            result |= getattr(rank_bodies, options["body"])(reducer, options)
         finally:
             reducer.close()
             reducer.close()

@@ -12,6 +12,7 @@ import numpy.typing as npt
 
 from gmijax.collectives.device.cuda_queue import checked, runtime
 from gmijax.collectives.device.device_memory import TICKET_BYTES
+from gmijax.collectives.shared_memory import round_up
 from gmijax.errors import CudaError
 
 GRANULE_BYTES = 2 << 20
@@ -45,7 +46,7 @@ class CudaMemory:
 
     def create(self, num_bytes: int) -> bytes:
         """Makes the block; returns what another process needs to open it."""
-        size = -(-num_bytes // GRANULE_BYTES) * GRANULE_BYTES
+        size = round_up(num_bytes, GRANULE_BYTES)
         (pointer,) = checked(
             runtime.cudaMalloc(size), f"get {size >> 20} MiB of GPU memory for the exchange"
         )

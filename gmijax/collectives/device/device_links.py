@@ -23,7 +23,7 @@ from gmijax.collectives.device.shared_slots import SharedSlots, agreed
 from gmijax.collectives.host.host_exchange import HostExchange
 from gmijax.collectives.host.host_links import HostLinks
 from gmijax.collectives.program import Exchange, ProgramPeers
-from gmijax.collectives.strategies import Groups, Stage
+from gmijax.collectives.strategies import Groups, Stage, group_of
 from gmijax.collectives.waits import Fence
 from gmijax.partition.layout import Layout
 from gmijax.partition.reduction import leaders
@@ -137,8 +137,7 @@ class DeviceLinks(HostLinks):
         self, layout: Layout, stages: Sequence[Stage], new_memory: NewMemory
     ) -> SharedSlots:
         rank = self._control.rank
-        groups = next(stage.groups for stage in stages if stage.link == "slots")
-        group = next(group for group in groups if rank in group)
+        group = group_of(rank, next(part.groups for part in stages if part.link == "slots"))
         owners = group[:1]
         if len(group) == layout.num_gmis:
             # On every GPU: the own first, then the following ones, so that not all write to one.

@@ -7,7 +7,7 @@ from typing import Any
 
 from gmijax.collectives.device.shared_slots import agreed
 from gmijax.collectives.host.host_exchange import HostExchange
-from gmijax.collectives.strategies import Groups
+from gmijax.collectives.strategies import Groups, group_of
 
 _WISH = "rings between GPUs"
 
@@ -52,7 +52,7 @@ def nccl_ring(host: HostExchange, groups: Groups) -> NcclRing | None:
       DeviceMemoryUnavailable: NCCL is not to be had, or refuses; on all ranks alike.
     """
     found: list[NcclRing] = []
-    group = next((group for group in groups if host.rank in group), ())
+    group = group_of(host.rank, groups)
 
     def make_id() -> bytes | None:
         return bytes(_nccl().get_unique_id()) if group and group[0] == host.rank else None

@@ -12,6 +12,7 @@ import numpy.typing as npt
 
 from gmijax.collectives.device.device_memory import TICKET_BYTES, NewMemory
 from gmijax.collectives.host.host_exchange import HostExchange
+from gmijax.collectives.shared_memory import round_up
 from gmijax.collectives.waits import fence, wait_until
 from gmijax.errors import DeviceMemoryUnavailable, PeerLost
 
@@ -25,8 +26,8 @@ NOTE_BYTES = 240
 CLOSE_S = 10.0
 """How long an owner waits for others that still use its memory; longer than a last step takes."""
 
-FLOATS_PER_ROW_UNIT = 64
-"""Slots begin at multiples of 256 bytes, as allocations of jax do."""
+SLOT_ALIGNMENT = 256
+"""Slots begin at multiples of so many bytes, as allocations of jax do."""
 
 
 class SharedSlots:
@@ -60,7 +61,7 @@ class SharedSlots:
         new_memory: NewMemory,
         wish: str,
     ) -> None:
-        self._row_bytes = -(-num_floats // FLOATS_PER_ROW_UNIT) * FLOATS_PER_ROW_UNIT * 4
+        self._row_bytes = round_up(4 * num_floats, SLOT_ALIGNMENT)
         self._members, self._rank = tuple(members), host.rank
         self._owners, self._is_owner = tuple(owners), host.rank == owners[0]
         self._memories: list[CudaMemory] = []

@@ -16,7 +16,7 @@ from gmijax.collectives.host.shared_block import (
 )
 from gmijax.collectives.interface import FloatBuffer
 from gmijax.collectives.shared_memory import process_of
-from gmijax.collectives.strategies import Groups
+from gmijax.collectives.strategies import Groups, group_of
 from gmijax.errors import CollectiveError
 
 PIECE_FLOATS = 32768
@@ -172,7 +172,7 @@ class HostExchange:
         slots = block.slots[self.barrier.step % 2, :, : source.size]
         slots[self.rank] = source
         self._meet()
-        return slots, _group_of(self.rank, groups)
+        return slots, group_of(self.rank, groups)
 
     def _meet(self) -> None:
         self.barrier.wait()
@@ -204,7 +204,3 @@ def _add(slots: FloatBuffer, members: Sequence[int], part: slice) -> None:
             total = slots[members[0], start:end]
             for member in members[1:]:
                 total += slots[member, start:end]
-
-
-def _group_of(rank: int, groups: Groups) -> Sequence[int]:
-    return next((group for group in groups if rank in group), ())

@@ -16,6 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from gmijax.collectives.device.device_memory import NewMemory
+from gmijax.collectives.shared_memory import round_up
 
 if TYPE_CHECKING:
     from gmijax.collectives.device.cuda_memory import CudaMemory
@@ -147,5 +148,5 @@ def _gap(held: Collection[_Held], num_bytes: int, capacity: int) -> int | None:
     for one in held:
         if begin + num_bytes <= one.begin:
             break
-        begin = -(-one.end // _ALIGNMENT) * _ALIGNMENT
+        begin = round_up(one.end, _ALIGNMENT)
     return begin if begin + num_bytes <= capacity else None
