@@ -2,20 +2,17 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any, TypeVar
 
 import numpy as np
 import pytest
+from shared_ranks import host_ranks, pipe_blocks
 
-from gmijax.collectives.host.host_exchange import HostExchange
-from gmijax.collectives.host.shared_block import create_exchange
 from gmijax.collectives.interface import FloatBuffer
 from gmijax.collectives.messages.group import AT_ONCE_BYTES, GroupReducer
-from gmijax.collectives.messages.messenger import MIN_CAPACITY_BYTES, Messenger
-from gmijax.collectives.messages.pipe_block import PipeBlock, create_pipes
+from gmijax.collectives.messages.messenger import Messenger
 from gmijax.errors import CollectiveError
 
 RANKS = 3
@@ -36,29 +33,11 @@ def on_all(pool: ThreadPoolExecutor, call: Callable[[int], T]) -> list[T]:
     return [one.result() for one in [pool.submit(call, rank) for rank in range(RANKS)]]
 
 
-def hosts(num_floats: int, timeout_s: float = 20.0) -> list[HostExchange]:
-    fd = create_exchange()
-    try:
-        return [
-            HostExchange(
-                fd, rank, RANKS, num_floats, timeout_s=timeout_s, rendezvous_timeout_s=timeout_s
-            )
-            for rank in range(RANKS)
-        ]
-    finally:
-        os.close(fd)
-
-
 def groups(build: Any = None, timeout_s: float = 20.0) -> list[GroupReducer]:
     """Of all ranks; `build(rank, num_floats)` makes the reducers for large means."""
-    fd = create_pipes(RANKS, MIN_CAPACITY_BYTES)
-    try:
-        blocks = [PipeBlock(fd, rank) for rank in range(RANKS)]
-    finally:
-        os.close(fd)
     return [
         GroupReducer(Messenger(block, timeout_s), lambda size, rank=block.rank: build(rank, size))
-        for block in blocks
+        for block in pipe_blocks(RANKS)
     ]
 
 
@@ -78,7 +57,7 @@ def test_the_mean_of_three_has_the_same_bits_on_every_way(pool: ThreadPoolExecut
     buffers = [rng.normal(size=LARGE).astype(np.float32) for _ in range(RANKS)]
     expected = (buffers[0] + buffers[1] + buffers[2]) * np.float32(1 / 3)
     assert (expected != (buffers[0] + buffers[1] + buffers[2]) / np.float32(3)).any()
-    exchanges = hosts(LARGE)
+    exchanges = host_ranks(*[LARGE] * RANKS)
     ways = {
         "small": by_messages(buffers, SMALL),
         "large": by_messages(buffers, LARGE),
@@ -110,7 +89,7 @@ def test_ranks_that_ask_for_different_operations_are_told_both(pool: ThreadPoolE
 @pytest.mark.parametrize("first", [0, 1])
 def test_so_are_those_of_which_some_go_by_a_reducer(first: int, pool: ThreadPoolExecutor) -> None:
     """Whoever comes first; the others find it in the reducer's wait or in their messages."""
-    exchanges = hosts(LARGE, timeout_s=1.0)
+    exchanges = host_ranks(*[LARGE] * RANKS, timeout_s=1.0)
     members = groups(lambda rank, _: exchanges[rank], timeout_s=10.0)
     operations = ("mean", "sum", "mean")
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -12,29 +11,13 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from shared_ranks import host_ranks
 
 from gmijax.collectives.host.host_exchange import HostExchange, chunk
-from gmijax.collectives.host.shared_block import create_exchange
 from gmijax.collectives.interface import FloatBuffer
 from gmijax.errors import CollectiveError, CollectiveTimeout, PeerLost
 
 LATE_S = 0.5
-
-
-def make_ranks(
-    world_size: int, num_floats: int, timeout_s: float = 10.0, start_s: float | None = None
-) -> Sequence[HostExchange]:
-    fd = create_exchange()
-    ranks = [
-        HostExchange(
-            *(fd, rank, world_size, num_floats),
-            timeout_s=timeout_s,
-            rendezvous_timeout_s=start_s or timeout_s,
-        )
-        for rank in range(world_size)
-    ]
-    os.close(fd)
-    return ranks
 
 
 def on_all_ranks(
@@ -46,7 +29,7 @@ def on_all_ranks(
 
 @pytest.fixture
 def alone() -> Iterator[HostExchange]:
-    (rank,) = make_ranks(1, 10)
+    (rank,) = host_ranks(10)
     yield rank
     rank.close()
 
@@ -75,7 +58,7 @@ def test_the_mean_is_the_sum_in_order_of_rank_times_one_over_k(
     for buffer in buffers[1:]:
         expected += buffer
     expected *= np.float32(1.0 / world_size)
-    ranks = make_ranks(world_size, num_floats)
+    ranks = host_ranks(*[num_floats] * world_size)
     for mean in on_all_ranks(ranks, lambda rank: rank.mean(buffers[rank.rank])):
         np.testing.assert_array_equal(mean, expected)
 
@@ -90,7 +73,7 @@ def test_groups_sum_by_themselves_and_ranks_in_none_keep_what_they_have() -> Non
         rank.broadcast(own, found[2], groups)
         return found
 
-    found = on_all_ranks(make_ranks(5, 100), call)
+    found = on_all_ranks(host_ranks(*[100] * 5), call)
     for rank, (total, first) in enumerate([(3, 2), (3, 2), (4, 4), (24, 8), (24, 8)]):
         np.testing.assert_array_equal(found[rank], np.repeat([[total], [total], [first]], 100, 1))
 
@@ -98,7 +81,7 @@ def test_groups_sum_by_themselves_and_ranks_in_none_keep_what_they_have() -> Non
 def test_values_that_are_not_finite_stay_so_without_a_warning() -> None:
     huge = np.finfo(np.float32).max
     buffers = np.array([[np.nan, np.inf, np.inf, huge], [0.0, 0.0, -np.inf, huge]], np.float32)
-    for mean in on_all_ranks(make_ranks(2, 4), lambda rank: rank.mean(buffers[rank.rank])):
+    for mean in on_all_ranks(host_ranks(4, 4), lambda rank: rank.mean(buffers[rank.rank])):
         np.testing.assert_array_equal(mean, [np.nan, np.inf, np.nan, np.inf])
 
 
@@ -111,34 +94,27 @@ def test_a_gathered_result_belongs_to_the_caller(alone: HostExchange) -> None:
 
 
 def test_ranks_with_different_lengths_name_both() -> None:
-    fd = create_exchange()
-    ranks = [
-        HostExchange(fd, rank, 2, size, timeout_s=10.0, rendezvous_timeout_s=10.0)
-        for rank, size in enumerate((5000, 200_000))
-    ]
-    os.close(fd)
-
     def told(rank: HostExchange) -> str:
         with pytest.raises(CollectiveError) as caught:
             rank.mean(np.zeros(10, np.float32))
         return str(caught.value)
 
     with ThreadPoolExecutor(2) as pool:
-        first, second = pool.map(told, ranks)
+        first, second = pool.map(told, host_ranks(5000, 200_000))
     fit = "do not fit together: num_floats is"
     assert first == f"rank 0 and rank 1 {fit} 5000 for rank 0, and 200000 for rank 1"
     assert second == f"rank 1 and rank 0 {fit} 200000 for rank 1, and 5000 for rank 0"
 
 
 def test_a_rank_that_has_closed_is_lost_to_those_who_still_call() -> None:
-    first, second = make_ranks(2, 10)
+    first, second = host_ranks(10, 10)
     second.close()
     with pytest.raises(PeerLost, match="peer 1 is gone during sum, step 1"):
         first.mean(np.zeros(10, np.float32))
 
 
 def test_no_call_follows_a_call_that_failed() -> None:
-    rank = make_ranks(2, 10, timeout_s=0.05)[0]
+    rank = host_ranks(10, 10, timeout_s=0.05)[0]
     with pytest.raises(CollectiveTimeout, match=r"0.05 s in sum, step 1, for ranks \[1\]"):
         rank.mean(np.zeros(10, np.float32))
     with pytest.raises(CollectiveError, match="after a call that did not finish"):
@@ -175,7 +151,7 @@ def test_closing_twice_is_fine_calling_after_it_is_not(alone: HostExchange) -> N
 
 
 def test_the_call_after_an_introduction_is_the_first_and_may_take_longer() -> None:
-    ranks = make_ranks(2, 4, LATE_S / 4, 20 * LATE_S)
+    ranks = host_ranks(4, 4, timeout_s=LATE_S / 4, start_s=20 * LATE_S)
 
     def gather_late() -> None:
         ranks[1].introduce(np.ones(3, np.float32))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from typing import Any
 
 import jax
@@ -10,12 +9,12 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from fake_device_memory import FakeDeviceMemory
+from shared_ranks import pipe_blocks
 
 from gmijax.collectives.messages.device_buffers import DeviceBuffers
 from gmijax.collectives.messages.mailboxes import COLLECTIVE, DATA, MAX_PARTS, Inbox, frames_of
 from gmijax.collectives.messages.messenger import MIN_CAPACITY_BYTES, Messenger
 from gmijax.collectives.messages.pipe import message_bytes
-from gmijax.collectives.messages.pipe_block import PipeBlock, create_pipes
 from gmijax.collectives.messages.trees import as_bytes, flatten, unflatten
 from gmijax.errors import CollectiveTimeout, ConfigError
 from tests.role_cases import nested, same
@@ -72,11 +71,7 @@ def test_every_frame_fits_into_the_smallest_pipe() -> None:
 
 @pytest.fixture
 def alone() -> Messenger:
-    fd = create_pipes(2, MIN_CAPACITY_BYTES)
-    try:
-        return Messenger(PipeBlock(fd, 0), timeout_s=0.05)
-    finally:
-        os.close(fd)
+    return Messenger(pipe_blocks(2)[0], timeout_s=0.05)
 
 
 def test_who_does_not_take_what_was_sent_is_named(alone: Messenger) -> None:
@@ -106,15 +101,10 @@ def posts(
     count: int, part_bytes: int = 1 << 20, timeout_s: float = 5.0, memory: Any = FakeDeviceMemory
 ) -> list[Messenger]:
     """Messengers of `count` ranks that share memory of a device, in this process."""
-    fd = create_pipes(count, MIN_CAPACITY_BYTES)
-    try:
-        blocks = [PipeBlock(fd, rank) for rank in range(count)]
-    finally:
-        os.close(fd)
     others = [[peer for peer in range(count) if peer != rank] for rank in range(count)]
     return [
         Messenger(block, timeout_s, DeviceBuffers(peers, memory, part_bytes))
-        for block, peers in zip(blocks, others, strict=True)
+        for block, peers in zip(pipe_blocks(count), others, strict=True)
     ]
 
 

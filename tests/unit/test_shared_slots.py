@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from typing import TypeAlias
@@ -12,11 +11,11 @@ import pytest
 from fake_device_memory import FakeDeviceMemory
 from hypothesis import given
 from hypothesis import strategies as st
+from shared_ranks import host_ranks
 
 from gmijax.collectives.device.device_links import Order
 from gmijax.collectives.device.shared_slots import SharedSlots
 from gmijax.collectives.host.host_exchange import HostExchange
-from gmijax.collectives.host.shared_block import create_exchange
 from gmijax.errors import DeviceMemoryUnavailable
 
 SIZE = 5
@@ -26,9 +25,7 @@ Pair: TypeAlias = tuple[list[HostExchange], list[SharedSlots], list[str]]
 
 @pytest.fixture
 def host() -> Iterator[HostExchange]:
-    fd = create_exchange()
-    exchange = HostExchange(fd, 0, 1, SIZE, timeout_s=1.0, rendezvous_timeout_s=1.0)
-    os.close(fd)
+    (exchange,) = host_ranks(SIZE)
     yield exchange
     exchange.close()
 
@@ -66,12 +63,7 @@ def pair() -> Iterator[Pair]:
             super().close()
             closed.append("closed")
 
-    fd = create_exchange()
-    hosts = [
-        HostExchange(fd, rank, 2, SIZE, timeout_s=20.0, rendezvous_timeout_s=20.0)
-        for rank in (0, 1)
-    ]
-    os.close(fd)
+    hosts = host_ranks(SIZE, SIZE)
     with ThreadPoolExecutor(2) as pool:
         making = [
             pool.submit(SharedSlots, host, SIZE, [0, 1], [0], Noted, "wish") for host in hosts

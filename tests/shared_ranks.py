@@ -1,0 +1,33 @@
+"""All ranks of a job in this process: their ends of its shared memory."""
+
+from __future__ import annotations
+
+import os
+
+from gmijax.collectives.host.host_exchange import HostExchange
+from gmijax.collectives.host.shared_block import create_exchange
+from gmijax.collectives.messages.messenger import MIN_CAPACITY_BYTES
+from gmijax.collectives.messages.pipe_block import PipeBlock, create_pipes
+
+
+def host_ranks(
+    *num_floats: int, timeout_s: float = 20.0, start_s: float | None = None
+) -> list[HostExchange]:
+    """A rank for each of `num_floats`, the length of its largest buffer."""
+    fd, times = create_exchange(), (timeout_s, start_s or timeout_s)
+    ranks = [
+        HostExchange(
+            *(fd, rank, len(num_floats), size), timeout_s=times[0], rendezvous_timeout_s=times[1]
+        )
+        for rank, size in enumerate(num_floats)
+    ]
+    os.close(fd)
+    return ranks
+
+
+def pipe_blocks(world_size: int, capacity_bytes: int = MIN_CAPACITY_BYTES) -> list[PipeBlock]:
+    """The block of pipes as every rank sees it."""
+    fd = create_pipes(world_size, capacity_bytes)
+    blocks = [PipeBlock(fd, rank) for rank in range(world_size)]
+    os.close(fd)
+    return blocks
