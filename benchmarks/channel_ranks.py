@@ -25,7 +25,7 @@ from gmijax.collectives.channel.spec import Array
 from gmijax.config.channel import ChannelConfig
 from gmijax.config.schema import from_dict
 from gmijax.errors import CollectiveTimeout, GmijaxError, PeerLost, PipeClosed
-from gmijax.supervise.child import required_fd
+from gmijax.supervise.child import inherited_fd
 
 ENV_FD = "GMIJAX_CHANNELS_FD"
 Options = dict[str, Any]
@@ -123,7 +123,7 @@ def run(task: Options) -> Options:
     if task["fake_device"]:
         use_fake_device(task["fake_device"])
     topology, config = ChannelTopology(**given), from_dict(ChannelConfig, task["channel"])
-    fd = required_fd(ENV_FD)
+    fd = inherited_fd(os.environ, ENV_FD)
     if task["rank"] in topology.agents:
         sender = open_sender(config, topology, task["rank"], fd)
         mark("open", task)

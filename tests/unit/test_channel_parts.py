@@ -228,6 +228,8 @@ def test_what_cannot_be_had_is_refused_before_a_process_starts() -> None:
         ChannelConfig(capacity_mib=1, transfer_kib=300)
     with pytest.raises(ConfigError, match=r"channel\.design=uni allows only block"):
         ChannelConfig(design="uni", when_full="drop_oldest")
+    with pytest.raises(ConfigError, match="needs the channels of the job's controller"):
+        open_sender(config, TOPOLOGY, 0, None)
     pytest.importorskip("zmq")
     with pytest.raises(ConfigError, match="needs an address for agent 0 and trainer 1"):
-        open_sender(ChannelConfig(transport="zmq"), TOPOLOGY, 0, -1)
+        open_sender(ChannelConfig(transport="zmq"), TOPOLOGY, 0, None)

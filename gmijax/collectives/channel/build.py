@@ -88,8 +88,10 @@ def create_channels(config: ChannelConfig, topology: ChannelTopology) -> int:
     return create_pipes(len(topology.gpu_of), pipe_bytes)
 
 
-def open_sender(config: ChannelConfig, topology: ChannelTopology, rank: int, fd: int) -> Sender:
-    """The end of agent `rank`; `fd` is from `create_channels`.
+def open_sender(
+    config: ChannelConfig, topology: ChannelTopology, rank: int, fd: int | None
+) -> Sender:
+    """The end of agent `rank`; `fd` is from `create_channels`, None with `transport=zmq`.
 
     Raises:
       ConfigError: something is missing.
@@ -127,7 +129,9 @@ def open_sender(config: ChannelConfig, topology: ChannelTopology, rank: int, fd:
     )
 
 
-def open_receiver(config: ChannelConfig, topology: ChannelTopology, rank: int, fd: int) -> Batcher:
+def open_receiver(
+    config: ChannelConfig, topology: ChannelTopology, rank: int, fd: int | None
+) -> Batcher:
     """The end of trainer `rank`; arguments and errors as `open_sender`."""
     held = ExitStack()
     readers: list[ChannelReader] = []
@@ -170,7 +174,9 @@ def _device_sender(
     return Sender(dispenser, packer, migrator, max_waiting=None, on_device=True, held=held)
 
 
-def _open_block(rank: int, fd: int, held: ExitStack) -> PipeBlock:
+def _open_block(rank: int, fd: int | None, held: ExitStack) -> PipeBlock:
+    if fd is None:
+        raise ConfigError("channel.transport=memory: needs the channels of the job's controller")
     block = PipeBlock(fd, rank)
     held.callback(block.close)
     return block
