@@ -82,7 +82,7 @@ class SharedSlots:
         source: int,
         target: int,
         num_floats: int,
-        rows: int = 0,
+        rows: int,
     ) -> None:
         """Queues a write, and a copy of what all members wrote.
 
@@ -96,8 +96,6 @@ class SharedSlots:
         """
         num_bytes = 4 * num_floats
         self._write(queue, stream, source, num_bytes)
-        for member in self._members:
-            self._wait(queue, stream, member)
         count = len(self._members)
         queue.copy_rows(stream, target, self._slot(0), self._row_bytes, num_bytes, count)
         if rows > count:
@@ -109,9 +107,6 @@ class SharedSlots:
         """Queues a copy of what the first member has; as `gather`, but `target` has [n]."""
         num_bytes = 4 * num_floats
         self._write(queue, stream, source, num_bytes)
-        # All of them: whoever writes this slot again must know that all have read the other one.
-        for member in self._members:
-            self._wait(queue, stream, member)
         queue.copy(stream, target, self._slot(0), num_bytes)
 
     def close(self) -> None:
@@ -131,15 +126,19 @@ class SharedSlots:
         self._memories = []
 
     def _write(self, queue: CudaQueue, stream: int, source: int, num_bytes: int) -> None:
+        """Queues a write of this rank's slots, and a wait for all other members' writes.
+
+        For all of them: whoever writes a slot again must know that all have read the other one.
+        """
         self._num_writes += 1
+        count = self._num_writes & 0xFFFFFFFF
         own = self._slot(self._members.index(self._rank)) - self._memories[0].address
         for memory in self._memories:
             queue.copy(stream, memory.address + own, source, num_bytes)
-        queue.raise_flag(stream, self._rank, self._num_writes & 0xFFFFFFFF)
-
-    def _wait(self, queue: CudaQueue, stream: int, member: int) -> None:
-        if member != self._rank:
-            queue.wait_for_flag(stream, member, self._num_writes & 0xFFFFFFFF)
+        queue.raise_flag(stream, self._rank, count)
+        for member in self._members:
+            if member != self._rank:
+                queue.wait_for_flag(stream, member, count)
 
     def _slot(self, place: int) -> int:
         """Address of the slot in use of the member at `place`, on the own GPU."""
@@ -188,7 +187,8 @@ def agreed(
     sent = np.zeros(1 + NOTE_BYTES, np.float32)  # One number a byte: no float has odd bits.
     sent[0] = has_failed
     sent[1 : 1 + len(note)] = np.frombuffer(note, np.uint8)
-    everyone = host.introduce(sent)
+    everyone = host.all_gather(sent)
+    host.barrier.restart()  # Others may still compile in the call after it.
     notes = everyone[:, 1:].astype(np.uint8)
     if failed := np.flatnonzero(everyone[:, 0]).tolist():
         why = notes[failed[0]].tobytes().rstrip(b"\0").decode(errors="replace")

@@ -132,12 +132,6 @@ class HostExchange:
         total *= np.float32(1.0 / self.world_size)
         return total
 
-    def introduce(self, values: FloatBuffer) -> FloatBuffer:
-        """`all_gather` as part of the start: others may still compile in the call after it."""
-        gathered = self.all_gather(values)
-        self.barrier.restart()
-        return gathered
-
     @property
     def flags(self) -> npt.NDArray[np.uint32]:
         """See `SharedBlock`."""
@@ -162,12 +156,6 @@ class HostExchange:
     ) -> tuple[FloatBuffer, Sequence[int]]:
         """Opens a call; what all ranks have as `source` [K, n], and the members of the group."""
         block = self._open_block(operation)
-        room = block.slots.shape[2]
-        if source.dtype != np.float32 or source.ndim != 1 or source.size > room:
-            raise CollectiveError(
-                f"{operation} of {source.dtype} {list(source.shape)}: expected a vector of at "
-                f"most {room} float32"
-            )
         self.barrier.begin(operation, source.size, place)
         slots = block.slots[self.barrier.step % 2, :, : source.size]
         slots[self.rank] = source
