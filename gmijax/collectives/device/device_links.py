@@ -46,10 +46,7 @@ class Order:
     a step finds all others there: so one of two ranks sees it before the next step, whoever is
     ahead.
 
-    Args:
-      flags: [pages, line] uint32, see `SharedBlock`; the second 64 bits of each line are used.
-      rank: this one.
-      world_size: K.
+    It uses the second 64 bits of each line of `flags`, see `SharedBlock`.
     """
 
     def __init__(self, flags: npt.NDArray[np.uint32], rank: int, world_size: int) -> None:

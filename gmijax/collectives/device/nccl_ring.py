@@ -15,9 +15,7 @@ _WISH = "rings between GPUs"
 class NcclRing:
     """This rank's collectives with others, each on another GPU; adds work to a stream.
 
-    Args:
-      nccl: the module `nccl.bindings.nccl`.
-      comm: from it.
+    `nccl` is the module `nccl.bindings.nccl`, and `comm` a communicator of it.
     """
 
     def __init__(self, nccl: Any, comm: Any) -> None:

@@ -84,15 +84,9 @@ class SharedSlots:
         num_floats: int,
         rows: int,
     ) -> None:
-        """Queues a write, and a copy of what all members wrote.
+        """Queues a write of [n] float32, and a copy of what all members wrote.
 
-        Args:
-          queue: of these slots.
-          stream: of the device, where it is queued.
-          source: address of [n] float32.
-          target: address of [rows, n] float32.
-          num_floats: n.
-          rows: of the target, which are zero beyond those of the members; at least as many.
+        Rows of `target` [rows, n], at least as many as members, are zero beyond theirs.
         """
         num_bytes = 4 * num_floats
         self._write(queue, stream, source, num_bytes)

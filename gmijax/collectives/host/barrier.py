@@ -29,13 +29,7 @@ SETTLE_S = 2.0
 
 
 class Barrier:
-    """One rank's side of the waiting.
-
-    Args:
-      block: the shared block.
-      timeout_s: longest wait for the other ranks.
-      rendezvous_timeout_s: the same in the first call, when others may still start or compile.
-    """
+    """One rank's side of the waiting; for the times see `HostExchange`."""
 
     def __init__(self, block: SharedBlock, timeout_s: float, rendezvous_timeout_s: float) -> None:
         self.step = 0
@@ -55,12 +49,9 @@ class Barrier:
         self._first_step = self.step + 1
 
     def begin(self, operation: str, count: int, place: int = 0) -> None:
-        """Opens a call of `operation` with `count` floats; `end` closes it.
+        """Opens a call of `operation` (see `OPERATIONS`) with `count` floats; `end` closes it.
 
-        Args:
-          operation: one of `OPERATIONS`.
-          count: of floats.
-          place: which exchange of its program this is.
+        `place` says which exchange of its program it is.
 
         Raises:
           CollectiveError: an earlier call failed, or (first call only) ranks attached with

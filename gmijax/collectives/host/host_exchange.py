@@ -42,9 +42,6 @@ class HostExchange:
       lane: of the block; those who use one thread of calls each take a lane each.
       first_rank: see `SharedBlock`.
 
-    Attributes:
-      rank, world_size: the same.
-
     Raises:
       CollectiveError: no memory, not such a descriptor, or the rank is taken; and, from every
         call: ranks make different calls, an earlier one failed, or after `close`.
@@ -75,13 +72,8 @@ class HostExchange:
         """Writes the sum over the rank's group of `source` [n] into `target` [n], n <= P.
 
         Every member sums a part of it in the order of the group, so each number is computed once.
-        For a rank in no group the target gets the source.
-
-        Args:
-          source: of this rank; may be the target.
-          target: for the sum.
-          groups: who reduces with whom.
-          place: which exchange of its program this is, see `Barrier.begin`.
+        For a rank in no group the target gets the source, which may be the target. For `place`
+        see `Barrier.begin`.
         """
         slots, group = self._shared("sum", source, groups, place)
         if group:
