@@ -22,11 +22,6 @@ Groups: TypeAlias = tuple[tuple[int, ...], ...]
 """Ranks that exchange with each other; no rank is in two of them, some may be in none."""
 
 
-def group_of(rank: int, groups: Groups) -> Sequence[int]:
-    """The group that `rank` is in; empty if it is in none."""
-    return next((group for group in groups if rank in group), ())
-
-
 class Stage(NamedTuple):
     """One part of a reduction.
 

@@ -151,22 +151,17 @@ def test_closing_twice_is_fine_calling_after_it_is_not(alone: HostExchange) -> N
         alone.mean(np.ones(10, np.float32))
 
 
-def test_the_call_after_a_step_of_the_start_may_take_longer() -> None:
+def test_the_call_after_an_introduction_is_the_first_and_may_take_longer() -> None:
     ranks = host_ranks(4, 4, timeout_s=LATE_S / 4, start_s=20 * LATE_S)
 
-    def start(rank: HostExchange) -> FloatBuffer:
-        everyone = rank.all_gather(np.full(3, rank.rank, np.float32))
-        rank.barrier.restart()
-        return everyone.sum(1)
-
     def gather_late() -> None:
-        start(ranks[1])
+        ranks[1].introduce(np.ones(3, np.float32))
         time.sleep(LATE_S)
         ranks[1].all_gather(np.ones(1, np.float32))
 
     late = threading.Thread(target=gather_late)
     late.start()
-    np.testing.assert_array_equal(start(ranks[0]), [0, 3])
+    np.testing.assert_array_equal(ranks[0].introduce(np.zeros(3, np.float32)).sum(1), [0, 3])
     assert ranks[0].all_gather(np.zeros(1, np.float32)).shape == (2, 1)
     late.join()
     with pytest.raises(CollectiveTimeout, match="step 3"):

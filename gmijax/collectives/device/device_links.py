@@ -23,7 +23,7 @@ from gmijax.collectives.device.shared_slots import SharedSlots, agreed
 from gmijax.collectives.host.host_exchange import HostExchange
 from gmijax.collectives.host.host_links import HostLinks
 from gmijax.collectives.program import Exchange, ProgramPeers
-from gmijax.collectives.strategies import Groups, Stage, group_of
+from gmijax.collectives.strategies import Groups, Stage
 from gmijax.collectives.waits import Fence
 from gmijax.partition.layout import Layout
 from gmijax.partition.reduction import leaders
@@ -134,7 +134,8 @@ class DeviceLinks(HostLinks):
         self, layout: Layout, stages: Sequence[Stage], new_memory: NewMemory
     ) -> SharedSlots:
         rank = self._control.rank
-        group = group_of(rank, next(part.groups for part in stages if part.link == "slots"))
+        groups = next(stage.groups for stage in stages if stage.link == "slots")
+        group = next(group for group in groups if rank in group)
         owners = group[:1]
         if len(group) == layout.num_gmis:
             # On every GPU: the own first, then the following ones, so that not all write to one.
@@ -206,9 +207,10 @@ class DeviceLinks(HostLinks):
         yield self._queue
         self._queue.stop_clock(stream)
 
-    def _open(self) -> None:
+    def _open(self) -> bytes:
         self._queue = self._device.new_queue(self._control.flags)
         self._order = Order(self._control.flags, self._control.rank, self._control.world_size)
+        return b""
 
     def _try(self, exchange: Exchange) -> Exception | None:
         """First exchanges of known numbers; what went wrong with them."""
@@ -231,6 +233,7 @@ class DeviceLinks(HostLinks):
         return None
 
 
-def _raise(failure: Exception | None) -> None:
+def _raise(failure: Exception | None) -> bytes:
     if failure is not None:
         raise failure
+    return b""

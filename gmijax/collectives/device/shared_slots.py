@@ -12,7 +12,6 @@ import numpy.typing as npt
 
 from gmijax.collectives.device.device_memory import TICKET_BYTES, NewMemory
 from gmijax.collectives.host.host_exchange import HostExchange
-from gmijax.collectives.shared_memory import round_up
 from gmijax.collectives.waits import fence, wait_until
 from gmijax.errors import DeviceMemoryUnavailable, PeerLost
 
@@ -26,8 +25,8 @@ NOTE_BYTES = 240
 CLOSE_S = 10.0
 """How long an owner waits for others that still use its memory; longer than a last step takes."""
 
-SLOT_ALIGNMENT = 256
-"""Slots begin at multiples of so many bytes, as allocations of jax do."""
+FLOATS_PER_ROW_UNIT = 64
+"""Slots begin at multiples of 256 bytes, as allocations of jax do."""
 
 
 class SharedSlots:
@@ -61,7 +60,7 @@ class SharedSlots:
         new_memory: NewMemory,
         wish: str,
     ) -> None:
-        self._row_bytes = round_up(4 * num_floats, SLOT_ALIGNMENT)
+        self._row_bytes = -(-num_floats // FLOATS_PER_ROW_UNIT) * FLOATS_PER_ROW_UNIT * 4
         self._members, self._rank = tuple(members), host.rank
         self._owners, self._is_owner = tuple(owners), host.rank == owners[0]
         self._memories: list[CudaMemory] = []
@@ -156,15 +155,14 @@ class SharedSlots:
         size = 2 * len(self._members) * self._row_bytes
         return self._memories[0].create(size) if self._is_owner else b""
 
-    def _map(self, tickets: npt.NDArray[np.uint8]) -> None:
+    def _map(self, tickets: npt.NDArray[np.uint8]) -> bytes:
         for owner, memory in zip(self._owners, self._memories, strict=True):
             if not (self._is_owner and owner == self._owners[0]):
                 memory.open(tickets[owner][:TICKET_BYTES].tobytes())
+        return b""
 
 
-def agreed(
-    host: HostExchange, wish: str, step: Callable[[], bytes | None]
-) -> npt.NDArray[np.uint8]:
+def agreed(host: HostExchange, wish: str, step: Callable[[], bytes]) -> npt.NDArray[np.uint8]:
     """Does a step of the start; returns what it returned on every rank [K, NOTE_BYTES].
 
     All ranks of the job call this, and they go on together or not at all.
@@ -173,7 +171,7 @@ def agreed(
       DeviceMemoryUnavailable: it failed on one of them, and why it did there.
     """
     try:
-        note, has_failed = step() or b"", False
+        note, has_failed = step(), False
     # Whatever it is, of CUDA, of jax or of an import: there is another way, through the host.
     except Exception as error:
         said = " ".join(str(error).split())
@@ -181,8 +179,7 @@ def agreed(
     sent = np.zeros(1 + NOTE_BYTES, np.float32)  # One number a byte: no float has odd bits.
     sent[0] = has_failed
     sent[1 : 1 + len(note)] = np.frombuffer(note, np.uint8)
-    everyone = host.all_gather(sent)
-    host.barrier.restart()  # Others may still compile in the call after it.
+    everyone = host.introduce(sent)
     notes = everyone[:, 1:].astype(np.uint8)
     if failed := np.flatnonzero(everyone[:, 0]).tolist():
         why = notes[failed[0]].tobytes().rstrip(b"\0").decode(errors="replace")

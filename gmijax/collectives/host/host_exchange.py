@@ -16,7 +16,7 @@ from gmijax.collectives.host.shared_block import (
 )
 from gmijax.collectives.interface import FloatBuffer
 from gmijax.collectives.shared_memory import process_of
-from gmijax.collectives.strategies import Groups, group_of
+from gmijax.collectives.strategies import Groups
 from gmijax.errors import CollectiveError
 
 PIECE_FLOATS = 32768
@@ -124,6 +124,12 @@ class HostExchange:
         total *= np.float32(1.0 / self.world_size)
         return total
 
+    def introduce(self, values: FloatBuffer) -> FloatBuffer:
+        """`all_gather` as part of the start: others may still compile in the call after it."""
+        gathered = self.all_gather(values)
+        self.barrier.restart()
+        return gathered
+
     @property
     def flags(self) -> npt.NDArray[np.uint32]:
         """See `SharedBlock`."""
@@ -152,7 +158,7 @@ class HostExchange:
         slots = block.slots[self.barrier.step % 2, :, : source.size]
         slots[self.rank] = source
         self._meet()
-        return slots, group_of(self.rank, groups)
+        return slots, _group_of(self.rank, groups)
 
     def _meet(self) -> None:
         self.barrier.wait()
@@ -184,3 +190,7 @@ def _add(slots: FloatBuffer, members: Sequence[int], part: slice) -> None:
             total = slots[members[0], start:end]
             for member in members[1:]:
                 total += slots[member, start:end]
+
+
+def _group_of(rank: int, groups: Groups) -> Sequence[int]:
+    return next((group for group in groups if rank in group), ())
