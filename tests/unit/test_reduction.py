@@ -201,6 +201,8 @@ def test_costs_are_those_of_table_2() -> None:
 def test_predictions_take_floats_and_the_fullest_gpu() -> None:
     layout = Layout(((0, 1), (2,)))
     assert predicted_s("mpr", layout, 100, 1e3, 1e3) == pytest.approx(2 * 3 * 400 / (4 * 1e3))
+    with pytest.raises(ConfigError, match=r"bandwidths \[1.0, 1.0, 0.0\]: must be positive"):
+        predicted_s("mpr", layout, 100, 1.0, 1.0, 0.0)
 
 
 def test_one_shot_cannot_go_through_host_memory() -> None:
