@@ -16,7 +16,6 @@ from gmijax.config.channel import ChannelConfig
 from gmijax.config.cluster import ClusterConfig
 from gmijax.config.env import EnvConfig, PhysicsConfig
 from gmijax.config.evaluation import EvalConfig
-from gmijax.config.export import ExportConfig
 from gmijax.config.plan import (
     BackendName,
     PlanConfig,
@@ -25,12 +24,11 @@ from gmijax.config.plan import (
     StrategyName,
     TemplateName,
 )
-from gmijax.config.play import PlayConfig, PlayRunConfig
-from gmijax.config.run import RunConfig
+from gmijax.config.play import ExportConfig, PlayConfig, PlayRunConfig
+from gmijax.config.run import RunConfig, Timeouts, WandbConfig
 from gmijax.config.search import AUTO, SearchConfig
 from gmijax.config.serve import OutputConfig, ServeConfig, ServeRunConfig
 from gmijax.config.train import ALGORITHMS, AlgoConfig, TrainConfig
-from gmijax.config.wandb import WandbConfig
 
 __all__ = [
     "ADAPTIVE_LEARNING_RATE_RANGE",
@@ -59,6 +57,7 @@ __all__ = [
     "ServeRunConfig",
     "StrategyName",
     "TemplateName",
+    "Timeouts",
     "TrainConfig",
     "WandbConfig",
 ]
