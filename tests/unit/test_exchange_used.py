@@ -6,9 +6,9 @@ from types import SimpleNamespace
 from typing import Any
 
 import pytest
-from supervision import machine, plan_config, reduce_config
+from supervision import machine
+from supervision import planned as make_plan
 
-from gmijax.partition.planner import make_plan
 from gmijax.workers.worker import exchange_used
 
 
@@ -30,7 +30,6 @@ def test_a_fall_back_to_host_memory_is_told(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr("gmijax.partition.reduction._is_installed", lambda *_: True)
-    reduce = reduce_config(strategy=planned)
-    plan = make_plan(plan_config(gmis_per_gpu=2, backend="share"), reduce, 64, machine(1))
+    plan = make_plan(machine(1), {"strategy": planned}, gmis_per_gpu=2, backend="share")
     reducer: Any = SimpleNamespace(strategy=strategy, intra=intra)
     assert exchange_used(plan, reducer) == said

@@ -15,7 +15,6 @@ from gmijax.collectives.strategies import (
     one_shot_s,
     predicted_s,
 )
-from gmijax.config import ReduceConfig
 from gmijax.errors import ConfigError
 from gmijax.partition import reduction
 from gmijax.partition.layout import Layout
@@ -28,8 +27,6 @@ from gmijax.partition.reduction import (
     why_not_strategy,
 )
 
-SPREAD = ((0, 2), (1, 3))
-
 LAYOUTS = st.lists(st.integers(1, 5), min_size=1, max_size=6).map(
     lambda sizes: Layout(
         tuple(tuple(range(sum(sizes[:gpu]), sum(sizes[: gpu + 1]))) for gpu in range(len(sizes)))
@@ -38,24 +35,16 @@ LAYOUTS = st.lists(st.integers(1, 5), min_size=1, max_size=6).map(
 
 
 @pytest.mark.parametrize(
-    ("gmis_of_gpu", "strategy", "why"),
+    ("gmis_of_gpu", "why"),
     [
-        (((0,),), "mpr", "one GPU"),
-        (((0, 1, 2, 3, 4),), "mpr", "one GPU"),
-        (((0,), (1,)), "mrr", "1 GMIs on each of 2 GPUs"),
-        (((0, 1), (2, 3)), "mrr", "2 GMIs on each of 2 GPUs"),
-        (((0, 1, 2), (3, 4, 5), (6, 7, 8)), "mrr", "3 GMIs on each of 3 GPUs"),
-        (((0, 1, 2), (3, 4, 5)), "har", "3 GMIs on each of only 2 GPUs"),
-        (((0, 1), (2,)), "har", "different numbers of GMIs"),
-        (((0,), (1,), (2, 3)), "har", "different numbers of GMIs"),
+        (((0, 1, 2, 3, 4),), "one GPU"),
+        (((0, 1), (2, 3)), "2 GMIs on each of 2 GPUs"),
+        (((0, 1, 2), (3, 4, 5)), "3 GMIs on each of only 2 GPUs"),
+        (((0,), (1,), (2, 3)), "different numbers of GMIs"),
     ],
 )
-def test_algorithm_1_by_the_table(
-    gmis_of_gpu: tuple[tuple[int, ...], ...], strategy: str, why: str
-) -> None:
-    choice = select_strategy(Layout(gmis_of_gpu))
-    assert choice.strategy == strategy
-    assert why in choice.why
+def test_algorithm_1_says_why(gmis_of_gpu: tuple[tuple[int, ...], ...], why: str) -> None:
+    assert why in select_strategy(Layout(gmis_of_gpu)).why
 
 
 def printed_algorithm_1(mapping: list[list[int]]) -> str:
@@ -80,40 +69,28 @@ def test_algorithm_1_is_the_listing_and_its_answer_can_run(layout: Layout) -> No
 
 
 @pytest.mark.parametrize(
-    ("strategy", "gmis_of_gpu", "message"),
+    ("strategy", "gmis_of_gpu", "backend", "message"),
     [
-        ("mrr", ((0, 1), (2,)), r"mrr: cannot run on layout \[\[0,1\],\[2\]\]: .* \[2, 1\] GMIs"),
-        ("mrr", ((0, 1),), r"on layout \[\[0,1\]\]: its rings go from GPU to GPU"),
-        ("mrr", ((0, 1, 2), (3, 4, 5)), "each of the 3 first rings.* there are only 2"),
-        ("flat", ((0, 1), (2, 3)), r"flat: cannot run on layout .*NCCL before 2\.30"),
-        ("flat", ((0,),), "there is only one"),
-        ("none", ((0, 1),), "only for a job with one GMI, this one has 2"),
-        ("telepathy", ((0,),), "expected one of none, mpr, mrr, har, flat"),
+        ("mrr", ((0, 1), (2,)), None, r"mrr: cannot .* \[\[0,1\],\[2\]\]: .* \[2, 1\] GMIs"),
+        ("mrr", ((0, 1),), None, r"on layout \[\[0,1\]\]: its rings go from GPU to GPU"),
+        ("mrr", ((0, 1, 2), (3, 4, 5)), None, "each of the 3 first rings.* there are only 2"),
+        ("flat", ((0, 1), (2, 3)), None, r"flat: cannot run on layout .*NCCL before 2\.30"),
+        ("flat", ((0,),), None, "there is only one"),
+        ("none", ((0, 1),), None, "only for a job with one GMI, this one has 2"),
+        ("telepathy", ((0,),), None, "expected one of none, mpr, mrr, har, flat"),
+        # Only the backend lacks something.
+        ("one_shot", ((0,), (1,)), "cpu", r"\[1\]\]: CUDA IPC needs an NVIDIA GPU"),
+        ("one_shot", ((0,), (1,)), "mig", "there is no CUDA IPC between the instances"),
+        ("mrr", ((0,), (1,)), "mig", "rings between MIG instances are not supported"),
     ],
 )
 def test_what_cannot_run_names_strategy_layout_and_reason(
-    strategy: str, gmis_of_gpu: tuple[tuple[int, ...], ...], message: str
+    strategy: str, gmis_of_gpu: tuple[tuple[int, ...], ...], backend: str | None, message: str
 ) -> None:
-    with pytest.raises(ConfigError, match=message):
+    if backend is not None:
         require_strategy(strategy, Layout(gmis_of_gpu))
-
-
-@pytest.mark.parametrize(
-    ("strategy", "backend", "reason"),
-    [
-        ("one_shot", "cpu", "CUDA IPC needs an NVIDIA GPU"),
-        ("one_shot", "mig", "there is no CUDA IPC between the instances"),
-        ("mrr", "mig", "rings between MIG instances are not supported"),
-    ],
-)
-def test_what_a_backend_lacks_names_strategy_layout_and_reason(
-    strategy: str, backend: str, reason: str
-) -> None:
-    layout = Layout.even(2, 2)
-    require_strategy(strategy, layout)
-    expected = rf"{strategy}: cannot run on layout \[\[0,1\],\[2,3\]\]: {reason}"
-    with pytest.raises(ConfigError, match=expected):
-        require_strategy(strategy, layout, backend)
+    with pytest.raises(ConfigError, match=message):
+        require_strategy(strategy, Layout(gmis_of_gpu), backend)
 
 
 @pytest.mark.parametrize(
@@ -154,7 +131,7 @@ def test_bindings_that_hold_up_python_are_too_old(
         (((0, 1, 2), (3, 4, 5)), (0, 3)),
         (((0,), (1,)), (0, 1)),
         (((1, 2), (0, 3)), (2, 0)),  # the paper's rule, id % 2 == 0
-        (SPREAD, (0, 1)),  # the rule gives GPU 0 both, GPU 1 none
+        (((0, 2), (1, 3)), (0, 1)),  # the rule gives GPU 0 both, GPU 1 none
         (((0, 1), (2,)), (0, 2)),
     ],
 )
@@ -162,12 +139,6 @@ def test_every_gpu_has_one_leader(
     gmis_of_gpu: tuple[tuple[int, ...], ...], expected: tuple[int, ...]
 ) -> None:
     assert leaders(Layout(gmis_of_gpu)) == expected
-
-
-@given(LAYOUTS)
-def test_leaders_live_on_their_gpus(layout: Layout) -> None:
-    for leader, gmis in zip(leaders(layout), layout.gmis_of_gpu, strict=True):
-        assert leader in gmis
 
 
 def test_only_what_leaves_the_host_needs_a_ring() -> None:
@@ -201,8 +172,3 @@ def test_predictions_take_floats_and_the_fullest_gpu() -> None:
         predicted_s("mpr", layout, 100, 0.0, 1.0)
     with pytest.raises(ConfigError, match="expected one of mpr, mrr, har, flat"):
         predicted_s("none", layout, 100, 1.0, 1.0)
-
-
-def test_one_shot_cannot_go_through_host_memory() -> None:
-    with pytest.raises(ConfigError, match="one_shot goes through memory of the GPUs; allowed are"):
-        ReduceConfig(strategy="one_shot", intra="host", timeout_s=1.0)
