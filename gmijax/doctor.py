@@ -12,7 +12,7 @@ from rich.table import Table
 
 from gmijax.control.diagnosis import Diagnosis, diagnose
 from gmijax.control.exit_codes import EXIT_FAILED, EXIT_OK, exit_code_of
-from gmijax.control.system_info import look
+from gmijax.control.system_info import inspect_system
 from gmijax.errors import ConfigError
 from gmijax.machine.mig_split import split_commands
 from gmijax.machine.snapshot import Machine, detect_machine
@@ -52,7 +52,7 @@ def _answer(options: Options) -> Sequence[str]:
     if options.mig is not None:
         sys.stdout.write(split_text(options.mig, options.gpu, detect_machine()))
         return ()
-    found = diagnose(look())
+    found = diagnose(inspect_system())
     if options.as_json:
         sys.stdout.write(json.dumps(found.to_dict(), indent=2) + "\n")
     else:

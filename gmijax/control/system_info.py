@@ -54,7 +54,7 @@ class SystemInfo(NamedTuple):
     wanted_warp: str | None = None
 
 
-def look() -> SystemInfo:
+def inspect_system() -> SystemInfo:
     """Looks at this machine: asks NVML, jax (in a child), and tries to start an MPS daemon."""
     machine = detect_machine()
     return SystemInfo(

@@ -203,7 +203,7 @@ def test_exit_code_says_whether_something_is_broken(
 ):
     for broken, code in ((None, 0), ("version mismatch", 1)):
         here = system(monkeypatch, (H200_MIG_OFF,), nvml_error=broken)
-        monkeypatch.setattr(doctor, "look", lambda here=here: here)
+        monkeypatch.setattr(doctor, "inspect_system", lambda here=here: here)
         assert doctor.main(["--json"]) == code
         assert json.loads(capsys.readouterr().out)["ok"] == (code == 0)
 
