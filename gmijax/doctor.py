@@ -11,7 +11,8 @@ from rich.console import Console
 from rich.table import Table
 
 from gmijax.control.diagnosis import Diagnosis, diagnose
-from gmijax.control.system_info import look
+from gmijax.control.exit_codes import EXIT_FAILED, EXIT_OK, exit_code_of
+from gmijax.control.system_info import inspect_system
 from gmijax.errors import ConfigError
 from gmijax.machine.mig_split import split_commands
 from gmijax.machine.snapshot import Machine, detect_machine
@@ -27,9 +28,6 @@ With mig=3g,2g,1g,1g, prints the commands with which an administrator would divi
 Exit codes: 0 healthy, 1 something is broken that should work, 2 bad input.
 """
 
-# Not those of gmijax.cli.compose, whose import needs packages that may be what is broken.
-EXIT_OK, EXIT_BROKEN, EXIT_BAD_INPUT, EXIT_INTERRUPTED = 0, 1, 2, 130
-
 
 class Options(NamedTuple):
     """Options of the command line."""
@@ -44,23 +42,23 @@ def main(argv: Sequence[str]) -> int:
     if "--help" in argv or "-h" in argv:
         sys.stdout.write(USAGE)
         return EXIT_OK
-    try:
-        options = parse(argv)
-        if options.mig is not None:
-            sys.stdout.write(split_text(options.mig, options.gpu, detect_machine()))
-            return EXIT_OK
-        found = diagnose(look())
-    except ConfigError as error:
-        sys.stderr.write(f"gmijax.doctor: {error}\n")
-        return EXIT_BAD_INPUT
-    except KeyboardInterrupt:
-        return EXIT_INTERRUPTED
+    problems: list[str] = []
+    code = exit_code_of("doctor", lambda: problems.extend(_answer(parse(argv))))
+    return EXIT_FAILED if problems else code
+
+
+def _answer(options: Options) -> Sequence[str]:
+    """Prints what was asked for; returns what is broken."""
+    if options.mig is not None:
+        sys.stdout.write(split_text(options.mig, options.gpu, detect_machine()))
+        return ()
+    found = diagnose(inspect_system())
     if options.as_json:
         sys.stdout.write(json.dumps(found.to_dict(), indent=2) + "\n")
     else:
         width = None if sys.stdout.isatty() else 140
         show(found, Console(highlight=False, soft_wrap=True, markup=False, width=width))
-    return EXIT_BROKEN if found.problems else EXIT_OK
+    return found.problems
 
 
 def parse(argv: Sequence[str]) -> Options:

@@ -21,19 +21,12 @@ from gmijax.partition.plan import Plan
 
 
 class Precision(NamedTuple):
-    """One kind of matrix product.
+    """One kind of matrix product."""
 
-    Attributes:
-      name: for messages.
-      dtype: of both factors and of the result.
-      algorithm: `jax.lax.Precision` by name.
-      tolerance: largest error that rounding may cause, relative to the largest result.
-    """
-
-    name: str
-    dtype: str
-    algorithm: str
-    tolerance: float
+    name: str  # For messages.
+    dtype: str  # Of both factors and of the result.
+    algorithm: str  # `jax.lax.Precision` by name.
+    tolerance: float  # Largest error that rounding may cause, relative to the largest result.
 
 
 PRECISIONS: Final = (
@@ -69,17 +62,11 @@ _LARGEST_FACTOR: Final = 8
 
 
 class Product(NamedTuple):
-    """One product that was compared.
+    """One product that was compared."""
 
-    Attributes:
-      precision: which kind.
-      size: (M, K, N).
-      error: largest error, relative to the largest result; infinite where it is not finite.
-    """
-
-    precision: Precision
-    size: tuple[int, int, int]
-    error: float
+    precision: Precision  # Which kind.
+    size: tuple[int, int, int]  # (M, K, N).
+    error: float  # Largest error, relative to the largest result; infinite where it is not finite.
 
     @property
     def is_wrong(self) -> bool:

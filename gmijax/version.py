@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterable
 from importlib.metadata import PackageNotFoundError, requires, version
 
@@ -17,6 +18,11 @@ def versions_of(packages: Iterable[str]) -> dict[str, str | None]:
         except PackageNotFoundError:
             found[name] = None
     return found
+
+
+def numbers_of(number: str | None) -> tuple[int, ...]:
+    """The first three numbers of a version, to compare by: (0, 11, 1) of `0.11.1.dev3`."""
+    return tuple(map(int, re.findall(r"\d+", number or "")[:3]))
 
 
 def pinned_version(package: str, dependency: str) -> str | None:

@@ -5,10 +5,9 @@ from __future__ import annotations
 import sys
 from pathlib import Path
 
-from supervision import machine, make_launch, plan_config, reduce_config
+from supervision import machine, make_launch, planned
 
 from gmijax.machine.mps_control import find_mps_control
-from gmijax.partition.planner import make_plan
 from gmijax.runs.folder import RunPaths
 from gmijax.supervise.backends import open_backend
 from gmijax.supervise.supervisor import Supervisor
@@ -18,8 +17,7 @@ def main() -> None:
     run, backend_name, modes = RunPaths(Path(sys.argv[1])), sys.argv[2], sys.argv[3:]
     num_gpus = 0 if backend_name == "cpu" else 1
     here = machine(num_gpus, mps_control=find_mps_control())
-    config = plan_config(gmis_per_gpu=len(modes), backend=backend_name)
-    plan = make_plan(config, reduce_config(), 8, here)
+    plan = planned(here, gmis_per_gpu=len(modes), backend=backend_name)
     with open_backend(plan, here, run) as backend:
         Supervisor(make_launch(run, modes, plan), backend).run()
 

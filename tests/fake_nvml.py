@@ -8,6 +8,9 @@ from typing import Any, NamedTuple, NoReturn
 import pynvml
 import pytest
 
+from gmijax.machine.nvidia import list_gpus
+from gmijax.machine.snapshot import Machine
+
 MIB = 2**20
 
 
@@ -76,6 +79,13 @@ A100_HALVES = Board(
 H200_MIG_OFF = Board("NVIDIA H200", 143771, (9, 0), ())
 H200_MIG_EMPTY = Board("NVIDIA H200", 143771, (9, 0), (None,) * 7, mig_on=True)
 V100 = Board("Tesla V100-SXM2-32GB", 32768, (7, 0))
+
+
+def machine_of(monkeypatch: pytest.MonkeyPatch, *boards: Board, **changes: Any) -> Machine:
+    """A machine with these boards, and two CPU cores."""
+    install(monkeypatch, *boards)
+    driver = {"driver_version": "580.159.03"} if boards else {}
+    return Machine(list_gpus(), (0, 1), **{**driver, **changes})
 
 
 def install(monkeypatch: pytest.MonkeyPatch, *boards: Board, driver: str = "580.159.03") -> None:

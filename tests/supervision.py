@@ -13,7 +13,8 @@ from gmijax.machine.nvidia import Gpu
 from gmijax.machine.snapshot import Machine
 from gmijax.partition.plan import Plan
 from gmijax.partition.planner import make_plan
-from gmijax.runs.folder import RunPaths
+from gmijax.runs.folder import META, RunPaths, write_json
+from gmijax.runs.resume import CheckpointMeta
 from gmijax.supervise.backends import open_backend
 from gmijax.supervise.kinds import JobKind
 from gmijax.supervise.launch import Launch, Timeouts
@@ -23,8 +24,8 @@ CHECKOUT = Path(errors.__file__).parents[1]
 TESTS = Path(__file__).parent
 
 
-plan_config = PlanConfig
-reduce_config = ReduceConfig
+MPS = Path("/usr/bin/nvidia-cuda-mps-control")
+"""For faked machines: a control program of MPS that nothing starts."""
 
 
 def gpu(index: int, *, mig_enabled: bool = False) -> Gpu:
@@ -40,6 +41,18 @@ def machine(num_gpus: int, **changes: Any) -> Machine:
         "driver_version": "580.159.03" if num_gpus else None,
     }
     return Machine(**{**values, **changes})
+
+
+def planned(here: Machine, reduce: Mapping[str, Any] | None = None, **plan: Any) -> Plan:
+    """The plan of a synchronous training with these keys of `reduce` and `plan`; N is 64."""
+    return make_plan(PlanConfig(**plan), ReduceConfig(**(reduce or {})), 64, here)
+
+
+def save(run: RunPaths, env_steps: int) -> Path:
+    """A checkpoint of `ant` that holds nothing but its meta data."""
+    meta = CheckpointMeta("ant", "ppo", env_steps, 1, 8, ((8,), (8, 4)), "jax")
+    write_json(run.checkpoint(env_steps) / META, meta.to_dict())
+    return run.checkpoint(env_steps)
 
 
 def make_launch(
@@ -73,6 +86,6 @@ def cpu_supervisor(
 ) -> Supervisor:
     """Of a job on the cpu backend."""
     here = machine(0)
-    plan = make_plan(plan_config(gmis_per_gpu=len(modes)), reduce_config(), 8, here)
+    plan = planned(here, gmis_per_gpu=len(modes))
     backend = open_backend(plan, here, run)
     return Supervisor(make_launch(run, modes, plan, **changes), backend, inherited_fds)

@@ -15,24 +15,15 @@ from rich.table import Table
 
 
 class Key(NamedTuple):
-    """A key of a configuration, as `--help` and the reference show it.
+    """A key of a configuration, as `--help` and the reference show it."""
 
-    Attributes:
-      choice: what it belongs to, e.g. `algo=a3c`, or nothing.
-      name: dotted, e.g. `algo.learning_rate`.
-      kind: its type.
-      default: as it would be written on a command line.
-      meaning: one line.
-      allowed: the only values, if they are few.
-      limits: smallest, largest (or None), and whether it must be greater than 0.
-    """
-
-    choice: str
-    name: str
-    kind: Any
-    default: str
-    meaning: str
-    allowed: tuple[str, ...]
+    choice: str  # What it belongs to, e.g. `algo=a3c`, or nothing.
+    name: str  # Dotted, e.g. `algo.learning_rate`.
+    kind: Any  # Its type.
+    default: str  # As it would be written on a command line.
+    meaning: str  # One line.
+    allowed: tuple[str, ...]  # The only values, if they are few.
+    # Smallest, largest (or None), and whether it must be greater than 0.
     limits: tuple[float | None, float | None, bool]
 
 
@@ -101,7 +92,8 @@ def _documented(
 ) -> Iterator[tuple[str, str, Any, Mapping[str, Any]]]:
     """Every key: the choice that it belongs to, name, type, what `doc` says of it."""
     hints = typing.get_type_hints(cls)
-    for field in dataclasses.fields(cls):
+    # Own keys first, then those that it shares with other dataclasses.
+    for field in sorted(dataclasses.fields(cls), key=lambda x: x.name not in cls.__annotations__):
         kind = hints[field.name]
         is_union = isinstance(kind, types.UnionType)
         trees = [x for x in (typing.get_args(kind) if is_union else (kind,)) if _is_tree(x)]

@@ -6,59 +6,32 @@ the `doc` of every field. `gmijax.config.schema.from_dict` makes them from outsi
 
 from __future__ import annotations
 
-from gmijax.config.algo import (
-    ADAPTIVE_LEARNING_RATE_RANGE,
-    A3cConfig,
-    ActorCriticConfig,
-    PpoConfig,
-)
-from gmijax.config.channel import ChannelConfig
-from gmijax.config.cluster import ClusterConfig
-from gmijax.config.env import EnvConfig, PhysicsConfig
-from gmijax.config.evaluation import EvalConfig
-from gmijax.config.export import ExportConfig
-from gmijax.config.plan import (
-    BackendName,
-    PlanConfig,
-    Priority,
-    ReduceConfig,
-    StrategyName,
-    TemplateName,
-)
-from gmijax.config.play import PlayConfig, PlayRunConfig
-from gmijax.config.run import RunConfig
-from gmijax.config.search import AUTO, SearchConfig
-from gmijax.config.serve import OutputConfig, ServeConfig, ServeRunConfig
-from gmijax.config.train import ALGORITHMS, AlgoConfig, TrainConfig
-from gmijax.config.wandb import WandbConfig
-
-__all__ = [
-    "ADAPTIVE_LEARNING_RATE_RANGE",
-    "ALGORITHMS",
-    "AUTO",
-    "A3cConfig",
-    "ActorCriticConfig",
-    "AlgoConfig",
-    "BackendName",
-    "ChannelConfig",
-    "ClusterConfig",
-    "EnvConfig",
-    "EvalConfig",
-    "ExportConfig",
-    "OutputConfig",
-    "PhysicsConfig",
-    "PlanConfig",
-    "PlayConfig",
-    "PlayRunConfig",
-    "PpoConfig",
-    "Priority",
-    "ReduceConfig",
-    "RunConfig",
-    "SearchConfig",
-    "ServeConfig",
-    "ServeRunConfig",
-    "StrategyName",
-    "TemplateName",
-    "TrainConfig",
-    "WandbConfig",
-]
+from gmijax.config.algo import ADAPTIVE_LEARNING_RATE_RANGE as ADAPTIVE_LEARNING_RATE_RANGE
+from gmijax.config.algo import A3cConfig as A3cConfig
+from gmijax.config.algo import ActorCriticConfig as ActorCriticConfig
+from gmijax.config.algo import PpoConfig as PpoConfig
+from gmijax.config.channel import ChannelConfig as ChannelConfig
+from gmijax.config.cluster import ClusterConfig as ClusterConfig
+from gmijax.config.env import EnvConfig as EnvConfig
+from gmijax.config.env import PhysicsConfig as PhysicsConfig
+from gmijax.config.evaluation import EvalConfig as EvalConfig
+from gmijax.config.plan import BackendName as BackendName
+from gmijax.config.plan import PlanConfig as PlanConfig
+from gmijax.config.plan import Priority as Priority
+from gmijax.config.plan import ReduceConfig as ReduceConfig
+from gmijax.config.plan import StrategyName as StrategyName
+from gmijax.config.plan import TemplateName as TemplateName
+from gmijax.config.play import ExportConfig as ExportConfig
+from gmijax.config.play import PlayConfig as PlayConfig
+from gmijax.config.play import PlayRunConfig as PlayRunConfig
+from gmijax.config.run import RunConfig as RunConfig
+from gmijax.config.run import Timeouts as Timeouts
+from gmijax.config.run import WandbConfig as WandbConfig
+from gmijax.config.search import AUTO as AUTO
+from gmijax.config.search import SearchConfig as SearchConfig
+from gmijax.config.serve import OutputConfig as OutputConfig
+from gmijax.config.serve import ServeConfig as ServeConfig
+from gmijax.config.serve import ServeRunConfig as ServeRunConfig
+from gmijax.config.train import ALGORITHMS as ALGORITHMS
+from gmijax.config.train import AlgoConfig as AlgoConfig
+from gmijax.config.train import TrainConfig as TrainConfig

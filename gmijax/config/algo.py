@@ -14,16 +14,27 @@ ADAPTIVE_LEARNING_RATE_RANGE = (1e-5, 1e-2)
 
 @dataclass(frozen=True, kw_only=True)
 class ActorCriticConfig(KeyGroup):
-    """Keys that PPO and A3C share; those that differ in meaning are documented in each."""
+    """Keys that PPO and A3C share."""
 
     prefix = "algo."
 
-    unroll_length: int
-    num_minibatches: int
-    num_updates_per_batch: int
-    gae_lambda: float
-    normalize_advantage: bool
-    learning_rate_schedule: Literal["fixed", "adaptive_kl"]
+    unroll_length: int = doc(
+        "T, environment steps per environment and iteration (a3c: and unroll)", low=1
+    )
+    num_minibatches: int = doc("minibatches per pass over the rollout (a3c: a batch)", low=1)
+    num_updates_per_batch: int = doc("passes over the rollout (a3c: a batch), epochs", low=1)
+    gae_lambda: float = doc(
+        "lambda of generalised advantage estimation (a3c: of V-trace's returns), 0 to 1",
+        low=0.0,
+        high=1.0,
+    )
+    normalize_advantage: bool = doc(
+        "normalise advantages over all samples of all GMIs (a3c: over every batch)"
+    )
+    learning_rate_schedule: Literal["fixed", "adaptive_kl"] = doc(
+        "fixed, or steered to keep the policy's KL divergence since the rollout (a3c: per batch) "
+        "near desired_kl"
+    )
     discounting: float = doc("discount factor per step, 0 to 1", low=0.0, high=1.0)
     value_cost: float = doc("weight of the value loss", low=0.0)
     entropy_cost: float = doc("weight of the entropy bonus", low=0.0)
@@ -119,24 +130,19 @@ class ActorCriticConfig(KeyGroup):
                 "with algo.learning_rate_schedule=adaptive_kl"
             )
 
+    @property
+    def hidden_layer_sizes(self) -> tuple[tuple[int, ...], tuple[int, ...]]:
+        """Of the policy and of the value network."""
+        return self.policy_hidden_layer_sizes, self.value_hidden_layer_sizes
+
 
 @dataclass(frozen=True, kw_only=True)
 class PpoConfig(ActorCriticConfig):
     """Hyper-parameters of PPO, with Brax's names."""
 
     name: Literal["ppo"] = doc("training algorithm")
-    unroll_length: int = doc("T, environment steps per environment and iteration", low=1)
-    num_minibatches: int = doc("minibatches per pass over the rollout", low=1)
-    num_updates_per_batch: int = doc("passes over the rollout (epochs)", low=1)
-    gae_lambda: float = doc(
-        "lambda of generalised advantage estimation, 0 to 1", low=0.0, high=1.0
-    )
     clipping_epsilon: float = doc("clip range of the probability ratio", positive=True)
     clip_value_loss: bool = doc("clip the value loss with clipping_epsilon too")
-    learning_rate_schedule: Literal["fixed", "adaptive_kl"] = doc(
-        "fixed, or steered to keep the policy's KL divergence since the rollout near desired_kl"
-    )
-    normalize_advantage: bool = doc("normalise advantages over all samples of all GMIs")
     obs_outliers: Literal["clip", "diverged"] = doc(
         "what does not enter the statistics of observations as it is: what is more than 20 "
         "standard deviations off is clipped to that (clip), or worlds that diverge before the "
@@ -163,7 +169,6 @@ class A3cConfig(ActorCriticConfig):
     """Hyper-parameters of asynchronous actor-critic training, with Brax's names."""
 
     name: Literal["a3c"] = doc("training algorithm")
-    unroll_length: int = doc("T, environment steps per environment and unroll", low=1)
     weights_every: int | None = doc(
         "environment steps after which, at the latest, an agent takes up newer weights, within an "
         "unroll too; null: with every unroll",
@@ -172,12 +177,9 @@ class A3cConfig(ActorCriticConfig):
     batch_size: int | None = doc(
         "B, unrolls in one batch of one trainer; null: num_envs, the unrolls of one agent", low=1
     )
-    num_minibatches: int = doc("minibatches per pass over a batch", low=1)
-    num_updates_per_batch: int = doc("passes over a batch (epochs)", low=1)
     vtrace: bool = doc(
         "correct for the age of the policy that acted with V-trace; false: plain n-step returns"
     )
-    gae_lambda: float = doc("lambda of V-trace's returns, 0 to 1", low=0.0, high=1.0)
     rho_clip: float = doc("V-trace's upper limit of a step's probability ratio", positive=True)
     trace_clip: float = doc(
         "V-trace's upper limit of the ratio that lets later steps through", positive=True
@@ -195,10 +197,6 @@ class A3cConfig(ActorCriticConfig):
         "(channel.when_full=block)",
         low=1,
     )
-    learning_rate_schedule: Literal["fixed", "adaptive_kl"] = doc(
-        "fixed, or steered to keep the policy's KL divergence per batch near desired_kl"
-    )
-    normalize_advantage: bool = doc("normalise advantages over every batch")
 
     @property
     def pieces_per_unroll(self) -> int:

@@ -18,6 +18,14 @@ MAX_GMIS = 1024
 """More processes than one host can run; making a plan of far more would take all its memory."""
 
 
+def require_gpus(key: str, gpus: int | tuple[int, ...]) -> None:
+    """Raises ConfigError unless it is a number of GPUs, or distinct indices."""
+    if isinstance(gpus, int):
+        require_at_least(key, gpus, 1)
+    elif not gpus or len(set(gpus)) != len(gpus) or min(gpus) < 0:
+        raise ConfigError(f"{key}={list(gpus)}: expected a number of GPUs or distinct indices")
+
+
 @dataclass(frozen=True, kw_only=True)
 class PlanConfig(KeyGroup):
     """How the job is spread over GPUs."""
@@ -85,12 +93,7 @@ class PlanConfig(KeyGroup):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if isinstance(self.gpus, int):
-            require_at_least("plan.gpus", self.gpus, 1)
-        elif not self.gpus or len(set(self.gpus)) != len(self.gpus) or min(self.gpus) < 0:
-            raise ConfigError(
-                f"plan.gpus={list(self.gpus)}: expected a number of GPUs or distinct indices"
-            )
+        require_gpus("plan.gpus", self.gpus)
         self._require_few_gmis()
 
     def _require_few_gmis(self) -> None:

@@ -1,4 +1,4 @@
-"""Everything that `python -m gmijax.play` can be told."""
+"""Everything that `python -m gmijax.play` and `gmijax.export` can be told."""
 
 from __future__ import annotations
 
@@ -65,3 +65,16 @@ class PlayConfig(KeyGroup):
     def __post_init__(self) -> None:
         super().__post_init__()
         require_between("video_envs", self.video_envs, 1, self.num_envs)
+
+
+@dataclass(frozen=True, kw_only=True)
+class ExportConfig(KeyGroup):
+    """Everything that `python -m gmijax.export` can be told."""
+
+    run: PlayRunConfig
+    checkpoint: str | None = doc(
+        "folder of a checkpoint, its env steps, or `best`; null: the latest"
+    )
+    format: Literal["onnx", "stablehlo", "all"] = doc(
+        "what to write: onnx for ONNX Runtime and others, stablehlo for jax.export, or all"
+    )

@@ -1,18 +1,39 @@
-"""The run folder and the life of a job."""
+"""The run folder, the life of a job, and what is sent of it to Weights & Biases."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Literal
 
 from gmijax.config.schema import KeyGroup, doc
 from gmijax.errors import ConfigError
 
 
 @dataclass(frozen=True, kw_only=True)
-class RunConfig(KeyGroup):
-    """The run folder and the job's life."""
+class Timeouts(KeyGroup):
+    """How long a job waits for its GMIs."""
 
     prefix = "run."
+
+    start_timeout_s: float = doc(
+        "longest wait for a GMI to start and compile, seconds", positive=True
+    )
+    stall_timeout_s: float = doc(
+        "a GMI with no progress for this long has failed, seconds", positive=True
+    )
+    stop_timeout_s: float = doc(
+        "time GMIs get to finish their iteration or unroll and save when the job is told to end, "
+        "seconds",
+        positive=True,
+    )
+    grace_s: float = doc(
+        "time a GMI gets to end by itself before it is killed, seconds", positive=True
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
+class RunConfig(Timeouts):
+    """The run folder and the job's life."""
 
     dir: str | None = doc("run folder; null: runs/<env>-<algo>-<date>-<time>")
     name: str | None = doc("name of the run folder below runs/ (ignored if run.dir is given)")
@@ -35,21 +56,25 @@ class RunConfig(KeyGroup):
     measure_throughput: bool = doc(
         "after training, also measure simulation alone and simulation with inference"
     )
-    start_timeout_s: float = doc(
-        "longest wait for a GMI to start and compile, seconds", positive=True
-    )
-    stall_timeout_s: float = doc(
-        "a GMI with no progress for this long has failed, seconds", positive=True
-    )
-    stop_timeout_s: float = doc(
-        "time GMIs get to finish their iteration and save when the job is told to end, seconds",
-        positive=True,
-    )
-    grace_s: float = doc(
-        "time a GMI gets to end by itself before it is killed, seconds", positive=True
-    )
 
     def __post_init__(self) -> None:
         super().__post_init__()
         if self.resume == "auto" and self.dir is None and self.name is None:
             raise ConfigError("run.resume=auto: needs run.dir or run.name, the folder to go on in")
+
+
+@dataclass(frozen=True, kw_only=True)
+class WandbConfig(KeyGroup):
+    """Metrics, configuration and summary at Weights & Biases."""
+
+    prefix = "wandb."
+
+    mode: Literal["off", "online", "offline"] = doc(
+        "send metrics to Weights & Biases; offline: keep them in the run folder for `wandb sync`",
+        default="off",
+    )
+    project: str = doc("its project", default="gmijax")
+    group: str | None = doc(
+        "its group of runs; null: none, for jobs of a sweep the name of the sweep's folder",
+        default=None,
+    )

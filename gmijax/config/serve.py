@@ -7,6 +7,7 @@ from typing import Literal
 
 from gmijax.config.env import EnvConfig, PhysicsConfig
 from gmijax.config.plan import PlanConfig
+from gmijax.config.run import Timeouts
 from gmijax.config.schema import KeyGroup, doc
 from gmijax.config.search import AUTO, SearchConfig
 from gmijax.errors import ConfigError
@@ -16,10 +17,8 @@ _PIPE_BYTES_PER_ENV = 8192
 
 
 @dataclass(frozen=True, kw_only=True)
-class ServeRunConfig(KeyGroup):
+class ServeRunConfig(Timeouts):
     """Where the policy comes from, and the life of the job."""
-
-    prefix = "run."
 
     dir: str | None = doc(
         "trained run whose policy acts: its folder, one of its checkpoints, or `last`"
@@ -27,21 +26,8 @@ class ServeRunConfig(KeyGroup):
     name: str | None = doc(
         "name of the job's own folder below runs/; null: <env>-serve-<date>-<time>"
     )
-    start_timeout_s: float = doc(
-        "longest wait for a GMI to start and compile, seconds", positive=True
-    )
-    stall_timeout_s: float = doc(
-        "a GMI with no progress for this long has failed, seconds", positive=True
-    )
     exchange_timeout_s: float = doc(
         "longest wait for another GMI in one exchange, seconds", positive=True
-    )
-    stop_timeout_s: float = doc(
-        "time that GMIs get to finish their unroll when the job is told to end, seconds",
-        positive=True,
-    )
-    grace_s: float = doc(
-        "time a GMI gets to end by itself before it is killed, seconds", positive=True
     )
 
 

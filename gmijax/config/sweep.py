@@ -5,7 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal
 
-from gmijax.config.schema import KeyGroup, doc, require_at_least
+from gmijax.config.plan import require_gpus
+from gmijax.config.schema import KeyGroup, doc
 from gmijax.errors import ConfigError
 
 
@@ -30,7 +31,6 @@ class SweepConfig(KeyGroup):
     direction: Literal["maximize", "minimize"] = doc(
         "whether a larger or a smaller objective is better", default="maximize"
     )
-
     sampler: Literal["grid", "random", "tpe"] = doc(
         "where jobs come from: every combination of the lists (grid), or draws from lists and "
         "intervals by Optuna (random, tpe)",
@@ -46,14 +46,8 @@ class SweepConfig(KeyGroup):
     def __post_init__(self) -> None:
         super().__post_init__()
         self._require_sampler()
-        if isinstance(self.gpus, int):
-            require_at_least("sweep.gpus", self.gpus, 1)
-        elif self.gpus is not None and (
-            not self.gpus or len(set(self.gpus)) != len(self.gpus) or min(self.gpus) < 0
-        ):
-            raise ConfigError(
-                f"sweep.gpus={list(self.gpus)}: expected a number of GPUs or distinct indices"
-            )
+        if self.gpus is not None:
+            require_gpus("sweep.gpus", self.gpus)
 
     def _require_sampler(self) -> None:
         if self.sampler != "grid" and self.trials is None:

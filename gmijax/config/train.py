@@ -11,10 +11,9 @@ from gmijax.config.cluster import ClusterConfig
 from gmijax.config.env import EnvConfig, PhysicsConfig
 from gmijax.config.evaluation import EvalConfig
 from gmijax.config.plan import PlanConfig, ReduceConfig
-from gmijax.config.run import RunConfig
+from gmijax.config.run import RunConfig, WandbConfig
 from gmijax.config.schema import KeyGroup, doc
 from gmijax.config.search import SearchConfig
-from gmijax.config.wandb import WandbConfig
 from gmijax.errors import ConfigError
 
 AlgoConfig: TypeAlias = PpoConfig | A3cConfig

@@ -24,7 +24,7 @@ from gmijax.supervise.watched_gmi import GmiStatus
 _LINE_EVERY_S = 5.0
 
 
-class _Careful:
+class _BestEffortStream:
     """A text stream that is dropped at its first error: `train | head`, a closed terminal."""
 
     def __init__(self, stream: TextIO | None) -> None:
@@ -64,7 +64,7 @@ class _Careful:
 def open_console(*, show: bool) -> Console:
     """Where a job prints what the user may read: standard output, or nowhere."""
     # Without a standard output (`>&-`) it is None.
-    stream: Any = _Careful(sys.stdout if show else None)
+    stream: Any = _BestEffortStream(sys.stdout if show else None)
     # Paths, tasks and errors may look like markup.
     return Console(file=stream, quiet=not show, soft_wrap=True, highlight=False, markup=False)
 

@@ -54,9 +54,8 @@ def decide(config: C, console: Console, nodes: Mapping[str, Machine] | None = No
     else:
         plan = training_plan(config, machine, nodes=nodes)
         if config.reduce.selection == "measured":
-            algo = config.algo
-            hidden = (algo.policy_hidden_layer_sizes, algo.value_hidden_layer_sizes)
-            plan = with_measured(plan, machine, estimated_floats(*hidden), config.reduce.intra)
+            num_floats = estimated_floats(*config.algo.hidden_layer_sizes)
+            plan = with_measured(plan, machine, num_floats, config.reduce.intra)
     platform = "cpu" if plan.backend == "cpu" else "gpu"
     impl, why = choose_impl(config.physics.impl, platform, config.env.label)
     config = dataclasses.replace(config, physics=dataclasses.replace(config.physics, impl=impl))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 import sys
 import typing
 from collections.abc import Iterator, Mapping, Sequence
@@ -25,7 +24,7 @@ from gmijax.partition.reduction import (
 )
 from gmijax.sim.impl import ON_GPU, choose_impl
 from gmijax.sim.registry import SUITES, require_task, task_names
-from gmijax.version import __version__
+from gmijax.version import __version__, numbers_of
 
 _CUDA_13_DRIVER: Final = 580
 """CUDA 13 needs a driver of this branch."""
@@ -266,5 +265,5 @@ def _warp(system: SystemInfo) -> Iterator[str]:
 
 def bindings_fit(version: str, cuda: int) -> bool:
     """Whether this cuda-bindings is in `BINDINGS` of a CUDA."""
-    numbers = tuple(int(number) for number in re.findall(r"\d+", version)[:3])
+    numbers = numbers_of(version)
     return numbers >= (13,) if cuda == 13 else LEAST_BINDINGS <= numbers < (13,)

@@ -37,7 +37,7 @@ from gmijax.runs.history import MetricsReader, copy_history, draw_returns
 from gmijax.runs.resume import CheckpointMeta, saved_config
 from gmijax.sim import source
 from gmijax.supervise.kinds import training_kind
-from gmijax.supervise.launcher import Launch, recorded, timeouts_of
+from gmijax.supervise.launcher import Launch, recorded
 
 
 class Result(NamedTuple):
@@ -172,7 +172,7 @@ class _Job:
             machine=self._machine,
             run=self._run,
             kind=training_kind(config),
-            timeouts=timeouts_of(config.run),
+            timeouts=config.run,
             on_warning=self._console.print,
         )
 

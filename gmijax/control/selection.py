@@ -60,9 +60,7 @@ class Probe(NamedTuple):
         return f"{self.strategy}+{self.intra}" if self.strategy == "har" else self.strategy
 
 
-def with_measured(
-    plan: Plan, machine: Machine, num_floats: int, intra: str = "auto", folder: Path | None = None
-) -> Plan:
+def with_measured(plan: Plan, machine: Machine, num_floats: int, intra: str = "auto") -> Plan:
     """The plan with the fastest strategy and exchange, and a reason that gives the times.
 
     Args:
@@ -70,7 +68,6 @@ def with_measured(
       machine: where this is.
       num_floats: P, about; see `estimated_floats`.
       intra: the exchange that the user wants, or `auto`.
-      folder: where measurements are kept; None: in the user's cache folder.
 
     Raises:
       GmiFailed: one of the ways does not work here.
@@ -79,7 +76,7 @@ def with_measured(
     if plan.strategy == "none" or not all(has_role(roles, TRAINER) for roles in plan.roles):
         return plan
     probes = candidates(plan, num_floats, intra)
-    kept = (folder or cache_folder() / "reduction") / _file_name(plan, machine, probes)
+    kept = cache_folder() / "reduction" / _file_name(plan, machine, probes)
     found, source = _kept(kept, probes), f"from {kept}"
     if not found:
         rows = measure(plan, machine, probes, CALLS)

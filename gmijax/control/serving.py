@@ -39,7 +39,7 @@ from gmijax.runs.folder import (
 from gmijax.runs.history import MetricsReader
 from gmijax.runs.resume import CheckpointMeta, find_checkpoint, trained_config
 from gmijax.supervise.kinds import serving_kind
-from gmijax.supervise.launcher import Launch, recorded, run_gmis, timeouts_of
+from gmijax.supervise.launcher import Launch, recorded, run_gmis
 
 
 class Served(NamedTuple):
@@ -225,7 +225,7 @@ def _run(job: _Job, kept: int, run: RunPaths, console: Console) -> dict[str, Any
         machine=job.machine,
         run=run,
         kind=serving_kind(job.config),
-        timeouts=timeouts_of(job.config.run),
+        timeouts=job.config.run,
         on_warning=console.print,
     )
     with recorded(run, partial(_what_is_left, job), record), progress:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 from typing import NamedTuple
 
@@ -65,8 +66,8 @@ def _go_on_or_start(config: TrainConfig) -> StartPoint:
     folder = given_run(config.run.dir, config.run.name)
     assert folder is not None  # `RunConfig` has checked it.
     shown = f"run.resume=auto: {folder}"
-    if not folder.is_dir():
-        if folder.exists():
+    if not os.path.isdir(folder):  # Unlike `Path.is_dir` it takes any text.
+        if os.path.lexists(folder):
             raise ConfigError(f"{shown} is no folder")
         return StartPoint()
     run = RunPaths(folder.resolve())
@@ -92,12 +93,10 @@ def _go_on_or_start(config: TrainConfig) -> StartPoint:
 def _require_fit(config: TrainConfig, checkpoint: Path, wanted: str) -> CheckpointMeta:
     """The checkpoint's meta data, if the job can go on from it."""
     meta = CheckpointMeta.read(checkpoint)
-    algo = config.algo
-    hidden = (algo.policy_hidden_layer_sizes, algo.value_hidden_layer_sizes)
     for name, have, want in (
         ("task", meta.env, config.env.label),
-        ("algorithm", meta.algo, algo.name),
-        ("network widths", _shown(meta.hidden), _shown(hidden)),
+        ("algorithm", meta.algo, config.algo.name),
+        ("network widths", _shown(meta.hidden), _shown(config.algo.hidden_layer_sizes)),
     ):
         if have != want:
             raise ConfigError(f"run.resume={wanted}: checkpoint of {name} {have}, not {want}")

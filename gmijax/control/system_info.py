@@ -54,7 +54,7 @@ class SystemInfo(NamedTuple):
     wanted_warp: str | None = None
 
 
-def look() -> SystemInfo:
+def inspect_system() -> SystemInfo:
     """Looks at this machine: asks NVML, jax (in a child), and tries to start an MPS daemon."""
     machine = detect_machine()
     return SystemInfo(
@@ -77,7 +77,7 @@ def device_of(gpu: Gpu) -> str | None:
     return gpu.instances[0].uuid if gpu.instances else None
 
 
-def ask_jax(machine: Machine, timeout_s: float = PROBE_TIMEOUT_S) -> JaxView:
+def ask_jax(machine: Machine) -> JaxView:
     """Asks jax in a child with the devices that GMIs would get."""
     devices = [device for gpu in machine.gpus if (device := device_of(gpu))]
     # CUDA shows one MIG instance to a process, and no whole GPU beside it.
@@ -94,11 +94,11 @@ def ask_jax(machine: Machine, timeout_s: float = PROBE_TIMEOUT_S) -> JaxView:
             stdin=subprocess.DEVNULL,
             capture_output=True,
             text=True,
-            timeout=timeout_s,
+            timeout=PROBE_TIMEOUT_S,
             check=False,
         )
     except subprocess.TimeoutExpired:
-        return JaxView(None, error=f"no answer within {timeout_s:g} s")
+        return JaxView(None, error=f"no answer within {PROBE_TIMEOUT_S:g} s")
     if done.returncode:
         lines = done.stderr.strip().splitlines()
         return JaxView(None, error=lines[-1] if lines else f"exit code {done.returncode}")

@@ -40,17 +40,12 @@ for its core longer than it computes, and twice as many would compile at a time.
 
 
 class Host(NamedTuple):
-    """Free resources for the GMIs of a job, None where unknown or unlimited.
+    """Free resources for the GMIs of a job, None where unknown or unlimited."""
 
-    Attributes:
-      memory_mib: of the machine, or of the control group that this process is in.
-      threads: that may still be started.
-      open_files: that this process may still open.
-    """
-
+    # Of the machine, or of the control group that this process is in.
     memory_mib: float | None = None
-    threads: int | None = None
-    open_files: int | None = None
+    threads: int | None = None  # That may still be started.
+    open_files: int | None = None  # That this process may still open.
 
 
 UNKNOWN_HOST: Final = Host()

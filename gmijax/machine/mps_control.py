@@ -40,14 +40,10 @@ class MpsControl:
     """Commands to the MPS daemon of one pipe directory.
 
     Every command raises BackendUnavailable if no daemon answers, or not in time.
-
-    Attributes:
-      program: `nvidia-cuda-mps-control`.
-      pipe_directory: where the daemon listens.
     """
 
-    program: Path
-    pipe_directory: Path
+    program: Path  # `nvidia-cuda-mps-control`.
+    pipe_directory: Path  # Where the daemon listens.
 
     def start(self, device: str, log_directory: Path) -> None:
         """Starts a daemon for one GPU or MIG instance, by UUID; it outlives this process.

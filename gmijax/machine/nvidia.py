@@ -14,46 +14,28 @@ _DEVICES = Path("/dev")
 
 
 class MigInstance(NamedTuple):
-    """A MIG device as NVML lists it: a compute instance with the memory of its GPU instance.
+    """A MIG device as NVML lists it: a compute instance with the memory of its GPU instance."""
 
-    Attributes:
-      uuid: `MIG-...`, what `CUDA_VISIBLE_DEVICES` takes.
-      profile: e.g. `3g.71gb`; `1c.3g.71gb` for a part of the SMs of a GPU instance.
-      gpu_instance: number of the GPU instance; those that share one share its memory.
-      num_sms: streaming multiprocessors.
-      memory_mib: memory of the GPU instance, MiB.
-    """
-
-    uuid: str
-    profile: str
-    gpu_instance: int
-    num_sms: int
-    memory_mib: int
+    uuid: str  # `MIG-...`, what `CUDA_VISIBLE_DEVICES` takes.
+    profile: str  # E.g. `3g.71gb`; `1c.3g.71gb` for a part of the SMs of a GPU instance.
+    gpu_instance: int  # Number of the GPU instance; those that share one share its memory.
+    num_sms: int  # Streaming multiprocessors.
+    memory_mib: int  # Memory of the GPU instance, MiB.
 
 
 class Gpu(NamedTuple):
-    """A GPU as NVML lists it.
+    """A GPU as NVML lists it."""
 
-    Attributes:
-      index: place in the list of nvidia-smi.
-      uuid: `GPU-...`.
-      name: product name.
-      memory_mib: total memory, MiB.
-      compute_capability: (major, minor).
-      mig_enabled: the GPU can only be used through its MIG instances.
-      instances: those that exist, in the order of NVML; an administrator makes them.
-      mig_supported: it could be divided into MIG instances.
-      compute_mode: `default`, `exclusive` (one process, or one MPS server) or `prohibited`.
-    """
-
-    index: int
-    uuid: str
-    name: str
-    memory_mib: int
-    compute_capability: tuple[int, int]
-    mig_enabled: bool
+    index: int  # Place in the list of nvidia-smi.
+    uuid: str  # `GPU-...`.
+    name: str  # Product name.
+    memory_mib: int  # Total memory, MiB.
+    compute_capability: tuple[int, int]  # (major, minor).
+    mig_enabled: bool  # The GPU can only be used through its MIG instances.
+    # Those that exist, in the order of NVML; an administrator makes them.
     instances: tuple[MigInstance, ...] = ()
-    mig_supported: bool = False
+    mig_supported: bool = False  # It could be divided into MIG instances.
+    # `default`, `exclusive` (one process, or one MPS server) or `prohibited`.
     compute_mode: str = "default"
 
 

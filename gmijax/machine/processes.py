@@ -54,15 +54,10 @@ os.register_at_fork(after_in_child=GuardPipe._close_all)
 
 
 class ProcessId(NamedTuple):
-    """One process, told apart from a later one that got the same number.
+    """One process, told apart from a later one that got the same number."""
 
-    Attributes:
-      pid: the process's number.
-      start_ticks: when it started, clock ticks since the machine booted.
-    """
-
-    pid: int
-    start_ticks: int
+    pid: int  # The process's number.
+    start_ticks: int  # When it started, clock ticks since the machine booted.
 
     def is_running(self) -> bool:
         """Whether exactly this process runs; a zombie does not."""

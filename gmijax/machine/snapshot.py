@@ -37,31 +37,23 @@ _OTHERS = {"kfd": "a GPU for ROCm", "accel[0-9]*": "a TPU"}
 
 @dataclass(frozen=True)
 class Machine:
-    """Resources that a job may use here.
+    """Resources that a job may use here."""
 
-    Attributes:
-      gpus: GPUs that the job may use, in order of preference.
-      cpu_cores: ids of the CPU cores that a job may use: those that this process may run on, no
-        more than its control group gets time for.
-      mps_control: program of the MPS daemon, None where it is not installed.
-      driver_version: of the NVIDIA driver, None without one.
-      operator_daemon: pipe directory of a running MPS daemon that somebody else started.
-      daemons: the same for a job of a sweep, by UUID of the GPU or MIG instance.
-      host: what is left of memory, threads and open files.
-      gpu_problem: why there are no GPUs although NVIDIA's driver is there; None where it works,
-        there is none, or the user hides all GPUs.
-      warnings: what is here and is not used or cannot be, one sentence each.
-    """
-
-    gpus: tuple[Gpu, ...]
+    gpus: tuple[Gpu, ...]  # GPUs that the job may use, in order of preference.
+    # Ids of the CPU cores that a job may use: those that this process may run on, no more than its
+    # control group gets time for.
     cpu_cores: tuple[int, ...]
-    mps_control: Path | None = None
-    driver_version: str | None = None
+    mps_control: Path | None = None  # Program of the MPS daemon, None where it is not installed.
+    driver_version: str | None = None  # Of the NVIDIA driver, None without one.
+    # Pipe directory of a running MPS daemon that somebody else started.
     operator_daemon: Path | None = None
+    # The same for a job of a sweep, by UUID of the GPU or MIG instance.
     daemons: Mapping[str, Path] = field(default_factory=dict)
-    host: Host = UNKNOWN_HOST
+    host: Host = UNKNOWN_HOST  # What is left of memory, threads and open files.
+    # Why there are no GPUs although NVIDIA's driver is there; None where it works, there is none,
+    # or the user hides all GPUs.
     gpu_problem: str | None = None
-    warnings: tuple[str, ...] = ()
+    warnings: tuple[str, ...] = ()  # What is here and is not used or cannot be, one sentence each.
 
     def daemon_of(self, device: str) -> Path | None:
         """Pipe directory of the daemon that runs for a device, None where a job starts its own."""
@@ -81,6 +73,7 @@ def detect_machine() -> Machine:
     expects; GPUs keep their indices of nvidia-smi.
     """
     selection = os.environ.get("CUDA_VISIBLE_DEVICES")
+    cores = sorted(os.sched_getaffinity(0))
     listed = list_gpus()
     gpus = visible_gpus(listed, selection)
     is_hidden = selection is not None and selection.strip() in _HIDES_ALL
@@ -88,7 +81,7 @@ def detect_machine() -> Machine:
     daemon, stranger = _operator_daemon(mps_control) if mps_control else (None, None)
     return Machine(
         gpus=gpus,
-        cpu_cores=usable_cores(_cpu_cores(), CgroupLimits().cpu_quota(), platform.node()),
+        cpu_cores=usable_cores(cores, CgroupLimits().cpu_quota(), platform.node()),
         mps_control=mps_control,
         driver_version=driver_version(),
         operator_daemon=daemon,
@@ -135,18 +128,13 @@ def _named_part(gpu: Gpu, entry: str) -> Gpu | None:
     return gpu._replace(instances=named) if len(named) == 1 else None
 
 
-def _cpu_cores() -> tuple[int, ...]:
-    if hasattr(os, "sched_getaffinity"):
-        return tuple(sorted(os.sched_getaffinity(0)))
-    return tuple(range(os.cpu_count() or 1))
-
-
 def _operator_daemon(program: Path) -> tuple[Path | None, str | None]:
     """The pipe directory of a daemon that runs, or why the one that is there is left alone."""
     named = os.environ.get(PIPE_VARIABLE)
     directory = Path(named) if named else DEFAULT_PIPE_DIRECTORY
-    # Asking where there is no directory would cost a process start on every run.
-    if not directory.is_dir():
+    # Asking where there is no directory would cost a process start on every run. Unlike
+    # `Path.is_dir` this takes any text, and folders of others.
+    if not os.path.isdir(directory):
         return None, None
     if not named and (owner := _strange_owner(directory)) is not None:
         return None, (

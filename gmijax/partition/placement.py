@@ -17,17 +17,11 @@ _TRAINING_SHARE = 4
 
 
 class Placement(NamedTuple):
-    """Which GMIs an asynchronous job has.
+    """Which GMIs an asynchronous job has."""
 
-    Attributes:
-      plan: the user's wishes with GPUs and layout written out.
-      trainers: ids of the GMIs that train.
-      reason: what was decided, in words.
-    """
-
-    plan: PlanConfig
-    trainers: tuple[int, ...]
-    reason: str
+    plan: PlanConfig  # The user's wishes with GPUs and layout written out.
+    trainers: tuple[int, ...]  # Ids of the GMIs that train.
+    reason: str  # What was decided, in words.
 
 
 def place(plan: PlanConfig, num_nodes: int = 1) -> Placement:

@@ -7,14 +7,13 @@ refuses by the same rules in a GMI.
 from __future__ import annotations
 
 import importlib.util
-import re
 from collections.abc import Callable, Mapping
 from types import MappingProxyType
 from typing import NamedTuple
 
 from gmijax.errors import ConfigError
 from gmijax.partition.layout import Layout
-from gmijax.version import versions_of
+from gmijax.version import numbers_of, versions_of
 
 _BINDINGS = "cuda-bindings"
 LEAST_BINDINGS = (12, 9, 1)
@@ -123,8 +122,8 @@ def why_no_bindings() -> str | None:
     """None if a program can hand numbers to other processes from a GPU, else the reason."""
     if not _is_installed("cuda", "cuda.bindings"):
         return f"exchanges between GMIs on GPUs need the package cuda-bindings {_INSTALL}"
-    installed = versions_of([_BINDINGS])[_BINDINGS] or ""
-    numbers = tuple(map(int, re.findall(r"\d+", installed)[:3]))
+    installed = versions_of([_BINDINGS])[_BINDINGS]
+    numbers = numbers_of(installed)
     if not numbers or numbers >= LEAST_BINDINGS:
         return None
     least = ".".join(map(str, LEAST_BINDINGS))

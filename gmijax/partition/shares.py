@@ -148,17 +148,12 @@ def _priorities(
 
 
 class _Home(NamedTuple):
-    """Where a GMI lives.
+    """Where a GMI lives."""
 
-    Attributes:
-      device: UUID of the GPU or of the MIG instance.
-      memory: what it shares memory with others by: the GPU, and a GPU instance of it.
-      profile: of the MIG instance, None for a whole GPU.
-    """
-
-    device: str
+    device: str  # UUID of the GPU or of the MIG instance.
+    # What it shares memory with others by: the GPU, and a GPU instance of it.
     memory: tuple[int, int | None]
-    profile: str | None
+    profile: str | None  # Of the MIG instance, None for a whole GPU.
 
 
 def _homes_of(layout: Layout, gpus: Sequence[Gpu], backend: BackendName) -> list[_Home]:

@@ -42,15 +42,11 @@ DESCRIPTIONS: Mapping[TemplateName, str] = MappingProxyType(
 
 
 class Group(NamedTuple):
-    """The GMIs of a layout that have a role, as ranks of their own.
+    """The GMIs of a layout that have a role, as ranks of their own."""
 
-    Attributes:
-      gmis: their ids in order; a GMI's rank in the group is its position here.
-      layout: where they are, with ranks in place of ids; GPUs and nodes without one of them are
-        left out. Its nodes are those only if these are alike: who reduces asks for that.
-    """
-
-    gmis: tuple[int, ...]
+    gmis: tuple[int, ...]  # Their ids in order; a GMI's rank in the group is its position here.
+    # Where they are, with ranks in place of ids; GPUs and nodes without one of them are left out.
+    # Its nodes are those only if these are alike: who reduces asks for that.
     layout: Layout
 
 

@@ -35,24 +35,21 @@ def compilation_cache_dir() -> Path:
     return cache_folder() / "xla"
 
 
-def drop_broken_programs(cache: Path, logs: Iterable[Path]) -> int:
+def drop_broken_programs(cache: Path, logs: Iterable[Path]) -> None:
     """Removes entries of programs that GMIs could not read, so that the next job writes them.
 
     JAX writes an entry in place and never over one that is there: a process that is killed
     meanwhile, or a full disk, leaves half an entry for every later job. `logs` are what GMIs wrote
-    to stderr. Returns the number of files removed: all entries of these programs, good ones too.
+    to stderr. Goes with them: good entries of these programs.
     """
     names: set[str] = set()
     for log in logs:
         with suppress(OSError):
             names.update(_BROKEN.findall(log.read_text(errors="replace")))
-    removed = 0
     for name in names:
         for entry in cache.glob(f"{name}-*"):
             with suppress(OSError):
                 entry.unlink()
-                removed += 1
-    return removed
 
 
 def why_temporary() -> str | None:

@@ -1,13 +1,4 @@
-"""Every file name of a run folder, and how files in it are written. No jax here.
-
-`<run>/config.json plan.json summary.json metrics.jsonl events.jsonl returns.png tensorboard/`
-`<run>/git.json git.diff`
-`<run>/checkpoints/<12-digit env steps>/meta.json`
-`<run>/gmi_<id>/{stdout.log,stderr.log,error.json,result.json,metrics.jsonl}`
-`<run>/gmi_<id>/attempt_<n>/`: the same files of attempts that failed
-`<run>/play/<12-digit env steps>/`: a played checkpoint, see `PlayPaths`
-`<run>/export/<12-digit env steps>/`: an exported policy, see `ExportPaths`
-"""
+"""Every file name of a run folder, and how files in it are written. No jax here."""
 
 from __future__ import annotations
 
@@ -140,17 +131,14 @@ class ExportPaths(_Folder):
         self.metadata = root / "policy.json"  # Written last.
 
 
-def create_run(
-    run_dir: str | None, name: str | None, prefix: str, now: datetime | None = None
-) -> RunPaths:
+def create_run(run_dir: str | None, name: str | None, prefix: str) -> RunPaths:
     """Creates the run folder `run_dir`, or `runs/<name>`, or `runs/<prefix>-<date>-<time>`.
 
     Raises:
       ConfigError: the folder exists already, or cannot be made.
     """
-    stamp = (now or datetime.now()).strftime("%Y%m%d-%H%M%S")
     given = given_run(run_dir, name)
-    root = given or RUNS / f"{prefix}-{stamp}"
+    root = given or RUNS / f"{prefix}-{datetime.now():%Y%m%d-%H%M%S}"
     key = "run.dir" if run_dir else "run.name"
     for attempt in range(100):
         # Two jobs started in the same second: only a name that we made up may be changed.
@@ -281,14 +269,14 @@ def add_event(path: Path, event: str, **details: Any) -> None:
             file.truncate(end)  # The next event would stand behind half of this one.
 
 
-def last_run(key: str, runs: Path = RUNS) -> Path:
-    """The run folder below `runs` with the newest checkpoint.
+def last_run(key: str) -> Path:
+    """The run folder below `RUNS` with the newest checkpoint.
 
     Raises:
       ConfigError: there is none.
     """
     # Not the time of a folder: that changes with whatever is put into it later, e.g. films.
-    found = list(runs.glob(f"*/checkpoints/[0-9]*/{META}"))
+    found = list(RUNS.glob(f"*/checkpoints/[0-9]*/{META}"))
     if not found:
-        raise ConfigError(f"{key}=last: no run with a checkpoint in {runs}/")
+        raise ConfigError(f"{key}=last: no run with a checkpoint in {RUNS}/")
     return max(found, key=lambda meta: meta.stat().st_mtime).parents[2]

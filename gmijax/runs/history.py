@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -13,8 +13,8 @@ from gmijax.runs.folder import write_text
 
 
 def read_metrics(path: Path) -> list[dict[str, Any]]:
-    """All lines of a `metrics.jsonl`; an unfinished last line is left out."""
-    return list(_lines(path)) if path.exists() else []
+    """All complete lines of a `metrics.jsonl`; none without the file."""
+    return MetricsReader(path).new()
 
 
 def copy_history(source: Path, target: Path, env_steps: int) -> None:
@@ -49,7 +49,12 @@ class MetricsReader:
             return []
         complete = new[: new.rfind(b"\n") + 1]
         self._offset += len(complete)
-        return [json.loads(line) for line in complete.splitlines()]
+        lines: list[dict[str, Any]] = []
+        for line in complete.splitlines():
+            # A full disk may have cut off a line, with later ones right behind it.
+            with suppress(ValueError):
+                lines.append(json.loads(line))
+        return lines
 
 
 def scalars(line: Mapping[str, float | int | None]) -> dict[str, float]:
@@ -61,10 +66,10 @@ def scalars(line: Mapping[str, float | int | None]) -> dict[str, float]:
     }
 
 
-def draw_returns(metrics: Path, picture: Path, title: str) -> bool:
+def draw_returns(metrics: Path, picture: Path, title: str) -> None:
     """Draws mean episode return over environment steps, with that of evaluations if there are any.
 
-    False where no episode has ended.
+    Nothing where no episode has ended.
     """
     lines = read_metrics(metrics)
     training, evaluations = (
@@ -72,7 +77,7 @@ def draw_returns(metrics: Path, picture: Path, title: str) -> bool:
         for key in ("return", "eval/return")
     )
     if not training and not evaluations:
-        return False
+        return
     # Imported here: it costs half a second that no other use of this module should pay.
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
@@ -87,13 +92,3 @@ def draw_returns(metrics: Path, picture: Path, title: str) -> bool:
     axes.set(title=title, xlabel="environment steps", ylabel="mean episode return")
     axes.grid(alpha=0.3)
     figure.savefig(picture, dpi=120)
-    return True
-
-
-def _lines(path: Path) -> Iterator[dict[str, Any]]:
-    with path.open() as file:
-        for line in file:
-            # A full disk may have cut off a line, with later ones right behind it.
-            with suppress(ValueError):
-                if line.endswith("\n"):
-                    yield json.loads(line)

@@ -104,7 +104,7 @@ class ChildLink:
             raise ConfigError(
                 f"{ENV_GMI} and {ENV_RUN_DIR} must be set: GMIs are started by gmijax.train"
             ) from None
-        if (cpus := environment.get(ENV_CPUS)) and hasattr(os, "sched_setaffinity"):
+        if cpus := environment.get(ENV_CPUS):
             os.sched_setaffinity(0, {int(cpu) for cpu in cpus.split(",")})
         lifeline_fd = inherited_fd(environment, ENV_LIFELINE_FD)
         if lifeline_fd is not None:

@@ -5,14 +5,13 @@ They must be set before the GMI imports jax; that is why every GMI is a fresh in
 
 from __future__ import annotations
 
-import re
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Final
 
 from gmijax.partition.plan import Plan, Slice
 from gmijax.supervise.child import ENV_CPUS, ENV_GMI, ENV_WAITS
-from gmijax.version import versions_of
+from gmijax.version import numbers_of, versions_of
 
 # The old and the new name of one JAX setting; JAX refuses to start when both are set.
 _MEMORY_FRACTION, _OLD_MEMORY_FRACTION = (
@@ -90,9 +89,8 @@ def _cpu(share: Slice, users_flags: str) -> dict[str, str]:
     pool = 1 if cores == 1 else max(_SMALLEST_POOL, cores)
     variables = {"JAX_PLATFORMS": "cpu", "CUDA_VISIBLE_DEVICES": "", "PJRT_NPROC": str(pool)}
     # Read from the package's metadata: the controller must not import jax.
-    jaxlib = versions_of(["jaxlib"])["jaxlib"] or ""
-    numbers = tuple(map(int, re.findall(r"\d+", jaxlib)[:3]))
-    if () < numbers < _FIRST_JAXLIB_WITHOUT_FLAG and _FUSION_EMITTERS not in users_flags:
+    jaxlib = numbers_of(versions_of(["jaxlib"])["jaxlib"])
+    if () < jaxlib < _FIRST_JAXLIB_WITHOUT_FLAG and _FUSION_EMITTERS not in users_flags:
         variables[_XLA_FLAGS] = f"{users_flags} {_FUSION_EMITTERS}=false".strip()
     return variables
 

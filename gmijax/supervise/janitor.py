@@ -105,13 +105,13 @@ def quit_daemon(control: MpsControl) -> None:
     shutil.rmtree(control.pipe_directory, ignore_errors=True)
 
 
-def main(lines: Iterable[str] = sys.stdin) -> int:
+def main() -> int:
     """Learns until the pipe ends, then cleans up unless the controller has."""
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
         signal.signal(number, signal.SIG_IGN)
     gmis: list[ProcessId] = []
     daemons: list[MpsControl] = []
-    for line in lines:
+    for line in sys.stdin:
         message: dict[str, Any] = json.loads(line)
         if "clean" in message:
             return 0

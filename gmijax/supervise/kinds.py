@@ -46,18 +46,14 @@ SharedBlocks = Mapping[str, Callable[[], int]]
 
 @dataclass(frozen=True)
 class JobKind:
-    """Main of the GMIs of a job, and the memory that they share.
+    """Main of the GMIs of a job, and the memory that they share."""
 
-    Attributes:
-      module: main of every GMI, started by name.
-      compile_once: whether all GMIs run the same programs, so that one compiles them for all.
-      shared: the memory that the GMIs of a plan share, beside that of the reducer.
-      calls: between GMIs of different nodes, which connect by TCP: who listens, and who calls.
-    """
-
-    module: str
+    module: str  # Main of every GMI, started by name.
+    # Whether all GMIs run the same programs, so that one compiles them for all.
     compile_once: bool = True
+    # The memory that the GMIs of a plan share, beside that of the reducer.
     shared: Callable[[Plan], SharedBlocks] = lambda _: MappingProxyType({})
+    # Between GMIs of different nodes, which connect by TCP: who listens, and who calls.
     calls: Callable[[Plan], Sequence[tuple[int, int]]] = lambda _: ()
 
 
@@ -72,9 +68,8 @@ def training_kind(config: TrainConfig) -> JobKind:
         return JobKind(SYNCHRONOUS.module, compile_once=False, shared=shared, calls=calls_of)
     if config.plan.template == "tdg_ex":
         shared = partial(pipes, ROLLOUT_PIPE_BYTES)
-    else:
-        return SYNCHRONOUS
-    return JobKind(SYNCHRONOUS.module, compile_once=False, shared=shared)
+        return JobKind(SYNCHRONOUS.module, compile_once=False, shared=shared)
+    return SYNCHRONOUS
 
 
 def serving_kind(config: ServeConfig) -> JobKind:

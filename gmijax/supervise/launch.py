@@ -8,6 +8,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from gmijax.config import Timeouts
 from gmijax.machine.snapshot import Machine
 from gmijax.partition.plan import Plan
 from gmijax.runs.cache import compilation_cache_dir
@@ -20,48 +21,23 @@ from gmijax.supervise.watched_gmi import GmiStatus, WatchedGmi
 
 
 @dataclass(frozen=True, kw_only=True)
-class Timeouts:
-    """How long the supervisor waits.
-
-    Attributes:
-      start_timeout_s: for a GMI to compile, counted from its start or from its last beat.
-      stall_timeout_s: between two beats of a GMI that is past compiling.
-      stop_timeout_s: for all GMIs to finish by themselves after a request to stop.
-      grace_s: for a GMI to end at once, on the order to; for one that is done to be gone.
-    """
-
-    start_timeout_s: float
-    stall_timeout_s: float
-    stop_timeout_s: float
-    grace_s: float
-
-
-@dataclass(frozen=True, kw_only=True)
 class Launch:
-    """What to run in the GMIs of a plan.
+    """What to run in the GMIs of a plan."""
 
-    Attributes:
-      plan: where GMIs live and what they share.
-      machine: where this is; see `detect_machine`.
-      run: the run folder; what the GMIs read from it is there already.
-      kind: what the GMIs run, and what they share beside the block that reducers use.
-      timeouts: time limits.
-      stops_gracefully: the first signal of `STOP_SIGNALS` asks the GMIs to finish by themselves;
-        otherwise signals do what Python does with them.
-      variables: more environment variables of every GMI.
-      on_warning: called with a sentence when the job runs otherwise than planned.
-      is_enough: true once the job has what it needs: the GMIs then finish as after a first
-        signal; None: it ends by itself.
-    """
-
-    plan: Plan
-    machine: Machine
-    run: RunPaths
-    kind: JobKind
-    timeouts: Timeouts
+    plan: Plan  # Where GMIs live and what they share.
+    machine: Machine  # Where this is; see `detect_machine`.
+    run: RunPaths  # The run folder; what the GMIs read from it is there already.
+    kind: JobKind  # What the GMIs run, and what they share beside the block that reducers use.
+    timeouts: Timeouts  # Time limits.
+    # The first signal of `STOP_SIGNALS` asks the GMIs to finish by themselves; otherwise signals
+    # do what Python does with them.
     stops_gracefully: bool = True
+    # More environment variables of every GMI.
     variables: Mapping[str, str] = field(default_factory=dict)
+    # Called with a sentence when the job runs otherwise than planned.
     on_warning: Callable[[str], None] = lambda _: None
+    # True once the job has what it needs: the GMIs then finish as after a first signal; None: it
+    # ends by itself.
     is_enough: Callable[[tuple[GmiStatus, ...]], bool] | None = None
 
 

@@ -17,7 +17,6 @@ from types import FrameType
 from typing import Final
 
 from gmijax.collectives.host.shared_block import create_exchange
-from gmijax.config import RunConfig, ServeRunConfig
 from gmijax.errors import BackendUnavailable, GmijaxError, JobInterrupted
 from gmijax.partition.backend_choice import WHAT_SHARE_LOSES
 from gmijax.partition.plan import Plan
@@ -26,7 +25,7 @@ from gmijax.runs.folder import RunPaths, read_json, write_json
 from gmijax.supervise.backends import Backend, open_backend
 from gmijax.supervise.child import ENV_EXCHANGE_FD
 from gmijax.supervise.kinds import JobKind
-from gmijax.supervise.launch import Launch, Timeouts, program_cache
+from gmijax.supervise.launch import Launch, program_cache
 from gmijax.supervise.supervisor import Supervisor
 from gmijax.supervise.watched_gmi import GmiStatus
 
@@ -113,16 +112,6 @@ def recorded(
         # A full disk must not hide why the job failed.
         with suppress(OSError):
             record(status, Plan.from_dict(read_json(run.plan)))  # Its backend may be another.
-
-
-def timeouts_of(limits: RunConfig | ServeRunConfig) -> Timeouts:
-    """The time limits of a job, as its configuration has them."""
-    return Timeouts(
-        start_timeout_s=limits.start_timeout_s,
-        stall_timeout_s=limits.stall_timeout_s,
-        stop_timeout_s=limits.stop_timeout_s,
-        grace_s=limits.grace_s,
-    )
 
 
 def _enter_backend(held: ExitStack, launch: Launch) -> tuple[Launch, Backend]:

@@ -12,21 +12,13 @@ from gmijax.supervise.heartbeat import Heartbeat
 
 
 class GmiStatus(NamedTuple):
-    """Where a GMI stands.
+    """Where a GMI stands."""
 
-    Attributes:
-      gmi: its id.
-      state: `waiting` until it may compile, else what it says (see `heartbeat`).
-      iteration: training iterations done.
-      pid: its process, None before the start.
-      exit_code: None while it runs; negative for the signal that ended it.
-    """
-
-    gmi: int
-    state: str
-    iteration: int
-    pid: int | None
-    exit_code: int | None
+    gmi: int  # Its id.
+    state: str  # `waiting` until it may compile, else what it says (see `heartbeat`).
+    iteration: int  # Training iterations done.
+    pid: int | None  # Its process, None before the start.
+    exit_code: int | None  # None while it runs; negative for the signal that ended it.
 
 
 class WatchedGmi(ABC):

@@ -7,16 +7,14 @@ from typing import Any
 
 import fake_nvml
 import pytest
-from fake_nvml import A100_SEVEN, H200_MIG_EMPTY, H200_MIG_OFF, V100, Board
-from supervision import plan_config, reduce_config
+from fake_nvml import A100_SEVEN, H200_MIG_EMPTY, H200_MIG_OFF, V100, Board, machine_of
+from supervision import MPS
 
+from gmijax.config import PlanConfig, ReduceConfig
 from gmijax.errors import BackendUnavailable
-from gmijax.machine.nvidia import list_gpus
-from gmijax.machine.snapshot import Machine
 from gmijax.partition.plan import Plan
 from gmijax.partition.planner import make_plan
 
-MPS = Path("/usr/bin/nvidia-cuda-mps-control")
 P100 = Board("Tesla P100-SXM2-16GB", 16384, (6, 0))
 EXCLUSIVE, PROHIBITED = (H200_MIG_OFF._replace(compute_mode=mode) for mode in (3, 2))
 
@@ -28,13 +26,10 @@ def planned(
     make: dict[str, Any] | None = None,
     **changes: Any,
 ) -> Plan:
-    fake_nvml.install(monkeypatch, *boards)
-    here = Machine(
-        *(list_gpus(), (0, 1), control, "580.159.03"),
-        operator_daemon=Path("/tmp/nvidia-mps") if V100 in boards else None,
-    )
-    config = plan_config(**{"gmis_per_gpu": 2, **changes})
-    return make_plan(config, reduce_config(), 64, here, **(make or {}))
+    daemon = Path("/tmp/nvidia-mps") if V100 in boards else None
+    here = machine_of(monkeypatch, *boards, mps_control=control, operator_daemon=daemon)
+    config = PlanConfig(**{"gmis_per_gpu": 2, **changes})
+    return make_plan(config, ReduceConfig(), 64, here, **(make or {}))
 
 
 SERVE = {"template": "tcg"}
@@ -50,13 +45,7 @@ SERVE = {"template": "tcg"}
         ((A100_SEVEN,), MPS, {}, "mig", "in MIG mode; MPS on a whole GPU would"),
         ((V100,), MPS, SERVE, "mps", "the daemon that runs here; compute capability 7.0 has"),
         ((P100,), MPS, {}, "share", "warning: MPS of a GPU of compute capability 6.0"),
-        (
-            (H200_MIG_OFF,),
-            None,
-            {},
-            "share",
-            "warning: .*not installed.* 2.0 to 2.9 times as fast",
-        ),
+        ((H200_MIG_OFF,), None, {}, "share", "warning: .*not installed.* 2.0 to 2.9 times"),
         ((), None, SERVE, "cpu", "GPUs are virtual"),
     ],
 )

@@ -13,6 +13,7 @@ import pytest
 from gmijax.errors import ConfigError
 from gmijax.runs.dataset import DataPaths, open_dataset
 from gmijax.runs.folder import add_event, locked, read_json, write_json
+from gmijax.runs.history import MetricsReader, read_metrics
 
 
 def make_shard(paths: DataPaths, rank: int, index: int) -> None:
@@ -117,3 +118,15 @@ def test_half_an_event_is_taken_back_where_the_disk_is_full(tmp_path: Path):
     add_event(path, "end")
     events = [json.loads(line)["event"] for line in path.read_text().splitlines()]
     assert events == ["start", "end"]
+
+
+def test_lines_of_metrics_that_a_full_disk_has_cut_are_passed_over(tmp_path: Path):
+    path = tmp_path / "metrics.jsonl"
+    assert read_metrics(path) == []
+    path.write_text('{"env_steps": 1}\n{"env_st{"env_steps": 3}\n{"env_steps": 4}\n{"env_')
+    reader = MetricsReader(path)
+    assert [line["env_steps"] for line in reader.new()] == [1, 4]
+    with path.open("a") as file:
+        file.write('steps": 5}\n')
+    assert reader.latest() == {"env_steps": 5}
+    assert [line["env_steps"] for line in read_metrics(path)] == [1, 4, 5]

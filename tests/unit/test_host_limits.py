@@ -7,15 +7,13 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from supervision import machine, plan_config, reduce_config
+from supervision import MPS, machine, planned
 
 import gmijax
 from gmijax.errors import ConfigError
 from gmijax.machine import host_limits
 from gmijax.machine.host_limits import CgroupLimits, Host, detect_host, usable_cores
 from gmijax.machine.snapshot import Machine, detect_machine
-from gmijax.partition.plan import Plan
-from gmijax.partition.planner import make_plan
 from gmijax.supervise.kinds import training_plan
 
 SMALL = Host(memory_mib=24 * 1024, threads=30_000, open_files=20_000)
@@ -23,10 +21,6 @@ SMALL = Host(memory_mib=24 * 1024, threads=30_000, open_files=20_000)
 
 def two_cores(host: Host = SMALL) -> Machine:
     return Machine((), (0, 1), host=host)
-
-
-def planned(here: Machine, **changes: Any) -> Plan:
-    return make_plan(plan_config(**changes), reduce_config(), 64, here)
 
 
 def test_a_thousand_gmis_on_two_cores_are_refused():
@@ -59,20 +53,20 @@ def test_too_many_agents_or_trainers_are_refused(side: str):
 
 
 @pytest.mark.parametrize(
-    ("host", "said"),
+    ("host", "needs", "most"),
     [
-        (Host(memory_mib=2048), "4.69 GiB of memory (there are 2 GiB); allowed are at most 3"),
-        (Host(threads=100), "192 threads (100 may still be started); allowed are at most 4"),
-        (
-            Host(open_files=84),
-            "96 open files (84 may still be opened, see ulimit -n); allowed are at most 5",
-        ),
+        (Host(memory_mib=2048), "4.69 GiB of memory (there are 2 GiB)", 3),
+        (Host(threads=100), "192 threads (100 may still be started)", 4),
+        (Host(open_files=84), "96 open files (84 may still be opened, see ulimit -n)", 5),
     ],
 )
-def test_each_limit_is_told(host: Host, said: str):
+def test_each_limit_is_told(host: Host, needs: str, most: int):
     with pytest.raises(ConfigError) as error:
         planned(two_cores(host), gmis_per_gpu=8)
-    assert str(error.value) == (f"plan.gmis_per_gpu=8: 8 GMIs on this machine need about {said}")
+    assert str(error.value) == (
+        f"plan.gmis_per_gpu=8: 8 GMIs on this machine need about {needs}; allowed are at most "
+        f"{most}"
+    )
 
 
 def test_what_there_is_room_for_is_planned_and_one_may_always_try():
@@ -82,7 +76,7 @@ def test_what_there_is_room_for_is_planned_and_one_may_always_try():
 
 
 def test_beside_gpus_memory_counts_and_cores_do_not():
-    here = machine(1, cpu_cores=(0,), mps_control=Path("/usr/bin/mps"), host=SMALL)
+    here = machine(1, cpu_cores=(0,), mps_control=MPS, host=SMALL)
     assert planned(here, gmis_per_gpu=20).layout.num_gmis == 20
     with pytest.raises(ConfigError, match=r"39\.1 GiB of memory .*; allowed are at most 24$"):
         planned(here, gmis_per_gpu=40)

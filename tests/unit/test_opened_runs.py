@@ -12,7 +12,6 @@ from typing import Any
 import pytest
 
 import gmijax
-from gmijax.cli.command import command
 from gmijax.cli.compose import build
 from gmijax.config import ExportConfig, PlayConfig
 from gmijax.config.schema import to_dict
@@ -37,8 +36,7 @@ def run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> RunPaths:
     saved = {**to_dict(config), "env": to_dict(source.pinned(config.env))}
     paths = RunPaths(tmp_path / "theirs")
     write_json(paths.config, saved)
-    algo = config.algo
-    hidden = (algo.policy_hidden_layer_sizes, algo.value_hidden_layer_sizes)
+    hidden = config.algo.hidden_layer_sizes
     meta = CheckpointMeta("point.py:make", "ppo", 100, 1, 8, hidden, "jax")
     write_json(paths.checkpoint(100) / META, meta.to_dict())
     (tmp_path / "point.py").write_text(TRAP)
@@ -89,11 +87,6 @@ def test_only_the_noted_file_or_one_that_is_named_is_executed(
     write_json(run.config, saved)
     with pytest.raises(ConfigError, match="is not executed"):
         opened(kind)
-
-
-def test_play_says_it_in_one_line(run: RunPaths, capsys: pytest.CaptureFixture[str]):
-    assert command("play", PlayConfig, playing.play, ["run.dir=theirs"]) == 2
-    assert len(capsys.readouterr().err.splitlines()) == 1
 
 
 def test_play_hands_its_child_the_file_that_it_looked_at(run: RunPaths, starts: None):

@@ -10,15 +10,14 @@ from typing import NoReturn
 import fake_nvml
 import pynvml
 import pytest
-from supervision import gpu, plan_config, reduce_config
+from supervision import gpu, planned
 
 from gmijax.errors import BackendUnavailable
 from gmijax.machine import nvidia
 from gmijax.machine import snapshot as machine_module
 from gmijax.machine.mps_control import MpsControl, find_mps_control
-from gmijax.machine.nvidia import driver_version, list_gpus
+from gmijax.machine.nvidia import driver_version, list_gpus, nvml_problem
 from gmijax.machine.snapshot import detect_machine, visible_gpus
-from gmijax.partition.planner import make_plan
 
 THREE = (gpu(0), gpu(1), gpu(2))
 
@@ -172,14 +171,14 @@ def test_auto_does_not_go_on_without_gpus_where_the_driver_is_broken(
 ):
     monkeypatch.setattr(pynvml, "nvmlInit", failing(pynvml.NVML_ERROR_LIB_RM_VERSION_MISMATCH))
     here = detect_machine()
+    assert nvml_problem() == here.gpu_problem
     with pytest.raises(BackendUnavailable, match=r"^plan\.backend=auto: .* does not work: RM has"):
-        make_plan(plan_config(), reduce_config(), 8, here)
-    plan = make_plan(plan_config(backend="cpu"), reduce_config(), 8, here)
-    assert plan.backend == "cpu"
+        planned(here)
+    assert planned(here, backend="cpu").backend == "cpu"
     # Who hides all GPUs need not have a driver that works.
     for selection in ("", "-1"):
         monkeypatch.setenv("CUDA_VISIBLE_DEVICES", selection)
-        assert make_plan(plan_config(), reduce_config(), 8, detect_machine()).backend == "cpu"
+        assert planned(detect_machine()).backend == "cpu"
 
 
 @pytest.mark.parametrize("code", ["LIBRARY_NOT_FOUND", "DRIVER_NOT_LOADED"])
@@ -189,7 +188,7 @@ def test_a_driver_that_is_absent_although_its_devices_are_there_is_broken(
     monkeypatch.setattr(pynvml, "nvmlInit", failing(getattr(pynvml, f"NVML_ERROR_{code}")))
     assert detect_machine().gpu_problem is None
     (no_devices / "nvidiactl").touch()
-    assert detect_machine().gpu_problem is None
+    assert (detect_machine().gpu_problem, nvml_problem()) == (None, None)
     (no_devices / "nvidia0").touch()
     problem = detect_machine().gpu_problem
     assert problem is not None
@@ -203,9 +202,8 @@ def test_a_plan_says_what_else_could_compute_here(
     monkeypatch.setattr(pynvml, "nvmlInit", failing(pynvml.NVML_ERROR_LIBRARY_NOT_FOUND))
     assert detect_machine().warnings == ()
     (no_devices / device).touch()
-    plan = make_plan(plan_config(), reduce_config(), 8, detect_machine())
     said = f"warning: {no_devices / device} looks like {what}, which gmijax does not use"
-    assert plan.reasons[0] == said
+    assert planned(detect_machine()).reasons[0] == said
 
 
 @pytest.mark.parametrize(
@@ -233,6 +231,9 @@ def test_a_strangers_daemon_is_not_used(
     # Who names it has decided; but it must answer.
     monkeypatch.setenv("CUDA_MPS_PIPE_DIRECTORY", str(pipe))
     assert detect_machine().operator_daemon == pipe
+    monkeypatch.setenv("CUDA_MPS_PIPE_DIRECTORY", "x" * 300)
+    assert detect_machine().operator_daemon is None
+    monkeypatch.setenv("CUDA_MPS_PIPE_DIRECTORY", str(pipe))
     script(tmp_path, "exit 1")
     assert detect_machine().operator_daemon is None
 

@@ -3,35 +3,20 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
 
 import fake_nvml
 import pytest
-from supervision import plan_config, reduce_config
+from fake_nvml import machine_of
+from supervision import MPS, planned
 
 from gmijax.errors import BackendUnavailable, ConfigError
 from gmijax.machine.mig_split import place_instances, split_commands
-from gmijax.machine.nvidia import Gpu, list_gpus
-from gmijax.machine.snapshot import Machine, visible_gpus
-from gmijax.partition.plan import Plan
-from gmijax.partition.planner import make_plan
+from gmijax.machine.nvidia import Gpu
+from gmijax.machine.snapshot import visible_gpus
 from gmijax.partition.shares import assign_instances
 from gmijax.runs.folder import RunPaths
 from gmijax.supervise.backends import open_backend
 from gmijax.supervise.environment import gmi_environment
-
-MPS = Path("/usr/bin/nvidia-cuda-mps-control")
-
-
-def machine_of(
-    monkeypatch: pytest.MonkeyPatch, *boards: fake_nvml.Board, control: Path | None = None
-) -> Machine:
-    fake_nvml.install(monkeypatch, *boards)
-    return Machine(list_gpus(), (0, 1), mps_control=control, driver_version="580.159.03")
-
-
-def planned(here: Machine, **changes: Any) -> Plan:
-    return make_plan(plan_config(**changes), reduce_config(), 64, here)
 
 
 def test_cuda_visible_devices_may_name_instances(monkeypatch: pytest.MonkeyPatch):
@@ -80,7 +65,7 @@ def test_gmis_that_share_instances_split_memory_and_need_mps(monkeypatch: pytest
     assert [share.memory_fraction for share in plan.slices] == [0.8, 0.4, 0.4]
     with pytest.raises(BackendUnavailable, match=r"3 MIG instances for 4 GMIs, and MPS"):
         planned(here, gmis_per_gpu=4, backend="mig")
-    here = machine_of(monkeypatch, fake_nvml.A100_SEVEN, control=MPS)
+    here = machine_of(monkeypatch, fake_nvml.A100_SEVEN, mps_control=MPS)
     assert planned(here, gmis_per_gpu=42, backend="mig").layout.num_gmis == 42
     with pytest.raises(ConfigError, match=r"at most 6 processes on a MIG instance 1g\.10gb"):
         planned(here, gmis_per_gpu=43, backend="mig")
@@ -105,10 +90,10 @@ def test_mig_without_instances_is_refused(
 
 def test_rings_between_instances_are_refused_and_not_chosen(monkeypatch: pytest.MonkeyPatch):
     here = machine_of(monkeypatch, fake_nvml.A100_SEVEN, fake_nvml.H200_MIXED)
-    config = plan_config(gpus=2, gmis_per_gpu=2, backend="mig")
-    assert make_plan(config, reduce_config(), 64, here).strategy == "mpr"
+    two_by_two = {"gpus": 2, "gmis_per_gpu": 2, "backend": "mig"}
+    assert planned(here, **two_by_two).strategy == "mpr"
     with pytest.raises(ConfigError, match=r"mrr: .*: rings between MIG instances"):
-        make_plan(config, reduce_config(strategy="mrr"), 64, here)
+        planned(here, {"strategy": "mrr"}, **two_by_two)
 
 
 def test_a_gmi_sees_its_instance_and_no_daemon(monkeypatch: pytest.MonkeyPatch, tmp_path: Path):
@@ -150,10 +135,8 @@ def test_commands_of_a_split(name: str, memory_mib: int, wanted: str, profiles: 
 
 def test_old_instances_are_destroyed_first(monkeypatch: pytest.MonkeyPatch):
     [gpu] = machine_of(monkeypatch, fake_nvml.A100_SEVEN).gpus
-    assert split_commands(gpu, "7g")[:2] == (
-        "sudo nvidia-smi mig -i 0 -dci",
-        "sudo nvidia-smi mig -i 0 -dgi",
-    )
+    destroy = "sudo nvidia-smi mig -i 0 "
+    assert split_commands(gpu, "7g")[:2] == (f"{destroy}-dci", f"{destroy}-dgi")
 
 
 @pytest.mark.parametrize(

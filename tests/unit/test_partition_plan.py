@@ -3,29 +3,22 @@
 from __future__ import annotations
 
 import json
-from pathlib import Path
 from typing import Any
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from supervision import gpu, machine, plan_config, reduce_config
+from supervision import MPS, gpu, machine, planned
 
 from gmijax.errors import BackendUnavailable, ConfigError
 from gmijax.machine.snapshot import Machine
 from gmijax.partition import reduction
 from gmijax.partition.layout import Layout
 from gmijax.partition.plan import Plan, Slice
-from gmijax.partition.planner import make_plan
 from gmijax.partition.shares import split_cores
 
-MPS = Path("/usr/bin/nvidia-cuda-mps-control")
 ON_MPS = machine(1, mps_control=MPS)
 NEW_DRIVER = machine(1, mps_control=MPS, driver_version="590.44")
-
-
-def planned(here: Machine, reduce: dict[str, Any] | None = None, **changes: Any) -> Plan:
-    return make_plan(plan_config(**changes), reduce_config(**(reduce or {})), 64, here)
 
 
 def test_even_layout_numbers_gmis_gpu_by_gpu():
@@ -59,32 +52,27 @@ def test_every_auto_has_a_reason_and_explicit_choices_have_none():
     assert [reason.split()[0] for reason in plan.reasons] == [
         *("backend", "template", "strategy", "intra")
     ]
-    explicit = make_plan(
-        plan_config(gmis_per_gpu=2, backend="cpu", template="tcg_ex"),
-        reduce_config(strategy="mpr", intra="host"),
-        64,
-        machine(0),
-    )
+    # One GMI is not told how it would exchange.
+    assert [reason.split()[0] for reason in planned(machine(0)).reasons] == [
+        *("backend", "template", "strategy")
+    ]
+    reduce = {"strategy": "mpr", "intra": "host"}
+    explicit = planned(machine(0), reduce, gmis_per_gpu=2, backend="cpu", template="tcg_ex")
     assert explicit.reasons == ()
 
 
-def test_one_gmi_is_not_told_how_it_would_exchange():
-    alone = make_plan(plan_config(), reduce_config(intra="auto"), 64, machine(0))
-    told = {reason.split()[0] for reason in alone.reasons}
-    assert "strategy" in told
-    assert "intra" not in told
-
-
+TWO = {"gmis_per_gpu": 2}
 TWO_BY_TWO = {"gpus": 2, "gmis_per_gpu": 2}
 UNEVEN = {"layout": ((0, 1), (2,))}
-DEVICE = {"selection": "device"}
+DEVICE, PAPER = {"selection": "device"}, {"selection": "paper"}
+BY_HOST = {"intra": "host"}
 
 
 @pytest.mark.parametrize(
     ("backend", "is_installed", "reduce", "changes", "strategy", "why"),
     [
         ("cpu", True, {}, {}, "none", "one GMI"),
-        ("cpu", True, {}, {"gmis_per_gpu": 2}, "mpr", "(Algorithm 1)"),
+        ("cpu", True, {}, TWO, "mpr", "(Algorithm 1)"),
         ("cpu", True, {}, TWO_BY_TWO, "mpr", "Algorithm 1 says mrr"),
         ("cpu", True, {}, UNEVEN, "mpr", "Algorithm 1 says har"),
         ("share", True, DEVICE, TWO_BY_TWO, "one_shot", "GMIs that share"),
@@ -92,15 +80,15 @@ DEVICE = {"selection": "device"}
         ("share", True, DEVICE, UNEVEN, "one_shot", "GMIs that share"),
         # One program trains on all GPUs.
         ("share", True, DEVICE, {"gpus": 2}, "mrr", "(Algorithm 1)"),
-        ("share", True, {"selection": "paper"}, TWO_BY_TWO, "mrr", "(Algorithm 1)"),
-        ("share", True, {"selection": "paper"}, {"gmis_per_gpu": 3}, "mpr", "(Algorithm 1)"),
-        ("share", True, DEVICE | {"intra": "host"}, {"gmis_per_gpu": 2}, "mpr", "(Algorithm 1)"),
-        ("share", False, DEVICE, {"gmis_per_gpu": 2}, "mpr", "(Algorithm 1)"),
+        ("share", True, PAPER, TWO_BY_TWO, "mrr", "(Algorithm 1)"),
+        ("share", True, PAPER, {"gmis_per_gpu": 3}, "mpr", "(Algorithm 1)"),
+        ("share", True, BY_HOST, TWO, "mpr", "(Algorithm 1)"),
+        ("share", False, DEVICE, TWO, "mpr", "(Algorithm 1)"),
         ("share", False, DEVICE, TWO_BY_TWO, "mpr", "Algorithm 1 says mrr"),
         ("share", False, DEVICE, {"gpus": 2}, "mpr", "Algorithm 1 says mrr"),
-        ("share", False, {"selection": "paper"}, {"gmis_per_gpu": 2}, "mpr", "(Algorithm 1)"),
-        ("share", False, DEVICE | {"intra": "host"}, {"gmis_per_gpu": 2}, "mpr", "(Algorithm 1)"),
-        ("cpu", False, DEVICE, {"gmis_per_gpu": 2}, "mpr", "(Algorithm 1)"),
+        ("share", False, PAPER, TWO, "mpr", "(Algorithm 1)"),
+        ("share", False, BY_HOST, TWO, "mpr", "(Algorithm 1)"),
+        ("cpu", False, DEVICE, TWO, "mpr", "(Algorithm 1)"),
     ],
 )
 def test_auto_exchanges_on_gpus_where_it_can_else_by_algorithm_1_and_says_why(
@@ -127,7 +115,7 @@ def test_auto_exchanges_on_gpus_where_it_can_else_by_algorithm_1_and_says_why(
 
 
 @pytest.mark.parametrize(
-    ("here", "changes", "message"),
+    ("here", "plan", "message"),
     [
         (machine(1), {"gpus": 2}, "plan.gpus=2: this machine has 1 usable GPUs"),
         (machine(1), {"gpus": (0, 3)}, r"no usable GPU 3; usable are \[0\]"),
@@ -138,19 +126,11 @@ def test_auto_exchanges_on_gpus_where_it_can_else_by_algorithm_1_and_says_why(
         (machine(1), {"gmis_per_gpu": 2, "memory_fraction": 0.5}, "would reserve 1.00"),
         (ON_MPS, {"gmis_per_gpu": 49}, "MPS of driver 580.159.03 allows at most 48"),
         (NEW_DRIVER, {"gmis_per_gpu": 61}, "MPS of driver 590.44 allows at most 60"),
-        (
-            machine(0),
-            {"layout": ((0, 1), (2,)), "strategy": "mrr"},
-            r"mrr: .*,\[2\]\]: every ring",
-        ),
-        (machine(0), {"gmis_per_gpu": 2, "intra": "ipc"}, r"ipc: .*\[\[0,1\]\]: CUDA IPC needs"),
     ],
 )
-def test_values_that_do_not_fit_are_refused(here: Machine, changes: dict[str, Any], message: str):
-    reduce = {key: value for key, value in changes.items() if key in ("strategy", "intra")}
-    plan = {key: value for key, value in changes.items() if key not in reduce}
+def test_values_that_do_not_fit_are_refused(here: Machine, plan: dict[str, Any], message: str):
     with pytest.raises(ConfigError, match=message):
-        planned(here, reduce, **plan)
+        planned(here, **plan)
 
 
 @pytest.mark.parametrize(
@@ -159,7 +139,7 @@ def test_values_that_do_not_fit_are_refused(here: Machine, changes: dict[str, An
         (machine(0), "mps", "no usable NVIDIA GPU here; available here: auto, cpu$"),
         (machine(0), "share", "no usable NVIDIA GPU here; available here: auto, cpu$"),
         (machine(1), "mps", "was not found in PATH .*available here: auto, cpu, share$"),
-        (machine(1, mps_control=MPS), "mig", "have no MIG; .*: auto, cpu, share, mps$"),
+        (ON_MPS, "mig", "have no MIG; .*: auto, cpu, share, mps$"),
     ],
 )
 def test_backend_that_cannot_be_had_is_refused(here: Machine, backend: str, message: str):

@@ -7,21 +7,20 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from supervision import gpu, machine, plan_config, reduce_config
+from supervision import MPS, gpu, machine
+from supervision import planned as plan_of
 
 from gmijax.errors import ConfigError
 from gmijax.partition.plan import Plan
-from gmijax.partition.planner import make_plan
 from gmijax.partition.shares import is_clean
 
-MPS = Path("/usr/bin/nvidia-cuda-mps-control")
 MEASURED = Path(__file__).parents[2] / "benchmarks/results/sm-shares-nvidia-h200.json"
 AMPERE = (gpu(0)._replace(compute_capability=(8, 0)),)
 
 
 def planned(gmis_per_gpu: int = 2, **changes: Any) -> Plan:
     here = machine(1, mps_control=MPS, **changes.pop("here", {}))
-    return make_plan(plan_config(gmis_per_gpu=gmis_per_gpu, **changes), reduce_config(), 64, here)
+    return plan_of(here, gmis_per_gpu=gmis_per_gpu, **changes)
 
 
 def caps(plan: Plan) -> list[float | None]:
@@ -103,16 +102,10 @@ def priorities(plan: Plan) -> list[str | None]:
 def test_trainers_go_first_where_that_is_wanted():
     assert priorities(planned(3)) == [None] * 3
     assert planned(1, mps_priority=("normal",)).backend == "mps"
-    apart = {"template": "decoupled", "mps_priority": "trainers_first"}
-    first = make_plan(
-        plan_config(gmis_per_gpu=3, **apart), reduce_config(), 64, machine(1, mps_control=MPS),
-        trainers=(0,),
-    )  # fmt: skip
+    first = planned(3, template="tdg_ex", mps_priority="trainers_first")
     assert priorities(first) == ["normal", "below_normal", "below_normal"]
-    assert priorities(planned(mps_priority=("below_normal", "normal"))) == [
-        "below_normal",
-        "normal",
-    ]
+    second = planned(mps_priority=("below_normal", "normal"))
+    assert priorities(second) == ["below_normal", "normal"]
 
 
 @pytest.mark.parametrize(

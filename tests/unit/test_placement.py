@@ -5,9 +5,11 @@ from __future__ import annotations
 import json
 
 import pytest
-from supervision import machine, plan_config, reduce_config
+from supervision import machine
+from supervision import planned as plan_of
 
 from gmijax import compose
+from gmijax.config import PlanConfig, ReduceConfig
 from gmijax.errors import ConfigError
 from gmijax.partition import reduction
 from gmijax.partition.layout import Layout
@@ -19,9 +21,9 @@ from gmijax.supervise.kinds import training_plan
 
 
 def planned(**changes):
-    placed = place(plan_config(**changes))
+    placed = place(PlanConfig(**changes))
     return make_plan(
-        placed.plan, reduce_config(), 8, machine(0), template="decoupled", trainers=placed.trainers
+        placed.plan, ReduceConfig(), 8, machine(0), template="decoupled", trainers=placed.trainers
     )
 
 
@@ -46,9 +48,9 @@ def test_trainers_come_first_and_every_gpu_has_what_it_is_for(changes, layout, t
 
 
 def test_indices_are_those_of_the_machine() -> None:
-    assert place(plan_config(serving_gpus=(5, 3), training_gpus=(7,))).plan.gpus == (3, 5, 7)
-    assert place(plan_config(gpus=(4, 6))).plan.gpus == (4, 6)
-    apart = place(plan_config(gpus=(7, 2, 5), serving_gpus=2, training_gpus=1))
+    assert place(PlanConfig(serving_gpus=(5, 3), training_gpus=(7,))).plan.gpus == (3, 5, 7)
+    assert place(PlanConfig(gpus=(4, 6))).plan.gpus == (4, 6)
+    apart = place(PlanConfig(gpus=(7, 2, 5), serving_gpus=2, training_gpus=1))
     assert (apart.plan.gpus, apart.plan.layout) == ((7, 2, 5), ((1,), (2,), (0,)))
 
 
@@ -71,7 +73,7 @@ def test_indices_are_those_of_the_machine() -> None:
 )
 def test_what_cannot_be_is_refused(changes, said: str) -> None:
     with pytest.raises(ConfigError, match=said):
-        place(plan_config(**changes))
+        place(PlanConfig(**changes))
 
 
 @pytest.mark.parametrize(
@@ -134,8 +136,8 @@ def test_a_group_has_ranks_of_its_own_and_no_empty_gpu():
 
 def test_only_trainers_reduce_and_their_layout_decides_how():
     def planned(gpus: int, gmis_per_gpu: int, template: str, strategy: str = "auto") -> Plan:
-        config = plan_config(gpus=gpus, gmis_per_gpu=gmis_per_gpu, template=template)
-        return make_plan(config, reduce_config(strategy=strategy), 8, machine(0))
+        shape = {"gpus": gpus, "gmis_per_gpu": gmis_per_gpu, "template": template}
+        return plan_of(machine(0), {"strategy": strategy}, **shape)
 
     assert planned(2, 2, "tdg").strategy == "none"
     assert planned(1, 3, "tdg_ex").strategy == "none"

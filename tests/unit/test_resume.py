@@ -10,6 +10,7 @@ import shutil
 from pathlib import Path
 
 import pytest
+from supervision import save
 
 from gmijax.cli.compose import compose
 from gmijax.config.schema import to_dict
@@ -23,8 +24,7 @@ def make_run(root: Path, *env_steps: int) -> RunPaths:
     paths = RunPaths(root)
     write_json(paths.config, to_dict(compose("env=ant", "num_envs=8", "seed=5", "run.name=x")))
     for steps in env_steps:
-        meta = CheckpointMeta("ant", "ppo", steps, 1, 8, ((8,), (8, 4)), "jax")
-        write_json(paths.checkpoint(steps) / META, meta.to_dict())
+        save(paths, steps)
     return paths
 
 
@@ -33,11 +33,14 @@ def run(tmp_path: Path) -> RunPaths:
     return make_run(tmp_path / "runs" / "x", 100, 2000)
 
 
-def test_last_is_the_run_with_the_newest_checkpoint(tmp_path: Path):
-    runs = tmp_path / "runs"
+def test_last_is_the_run_with_the_newest_checkpoint(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    monkeypatch.chdir(tmp_path)
+    runs = Path("runs")
     make_run(runs / "none")
-    with pytest.raises(ConfigError, match=r"^run\.dir=last: no run with a checkpoint in .*/$"):
-        last_run("run.dir", runs)
+    with pytest.raises(ConfigError, match=r"^run\.dir=last: no run with a checkpoint in runs/$"):
+        last_run("run.dir")
     old, new = make_run(runs / "b", 900), make_run(runs / "a", 100)
     (runs / "file").touch()
     os.utime(old.checkpoint(900) / META, (1e9, 1e9))
@@ -46,7 +49,7 @@ def test_last_is_the_run_with_the_newest_checkpoint(tmp_path: Path):
     (old.root / "play").mkdir()
     (old.checkpoint(900) / "note").touch()
     (old.checkpoints / "000000001000").mkdir()
-    assert last_run("run.dir", runs) == new.root
+    assert last_run("run.dir") == new.root
 
 
 @pytest.mark.parametrize(

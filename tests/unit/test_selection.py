@@ -3,28 +3,31 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import pytest
-from supervision import machine, plan_config, reduce_config
+from supervision import MPS, machine, planned
 
 from gmijax.control import selection
 from gmijax.control.selection import Probe, candidates, estimated_floats, with_measured
 from gmijax.partition import reduction
 from gmijax.partition.plan import Plan
-from gmijax.partition.planner import make_plan
 
-MACHINE = machine(2, mps_control=Path("/bin/true"))
-
-
-def plan(**changes: Any) -> Plan:
-    return make_plan(plan_config(**changes), reduce_config(), 64, MACHINE)
+MACHINE = machine(2, mps_control=MPS)
+plan = partial(planned, MACHINE)
 
 
 @pytest.fixture(autouse=True)
 def with_bindings(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(reduction, "_is_installed", lambda *_: True)
+
+
+@pytest.fixture
+def kept_in(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    return tmp_path / "gmijax" / "reduction"
 
 
 @pytest.fixture
@@ -60,46 +63,46 @@ def test_everything_that_can_run_is_measured_once(
     assert [probe.name for probe in candidates(plan(**changes), 100, intra)] == names
 
 
-def test_the_fastest_is_taken_and_kept(tmp_path: Path, measured: list[Sequence[Probe]]) -> None:
-    first = with_measured(plan(gmis_per_gpu=2), MACHINE, 100, folder=tmp_path)
+def test_the_fastest_is_taken_and_kept(kept_in: Path, measured: list[Sequence[Probe]]) -> None:
+    first = with_measured(plan(gmis_per_gpu=2), MACHINE, 100)
     assert (first.strategy, first.intra) == ("har", "ipc")
     assert first.selection["paper"] == "mpr"
     assert first.selection["measured"] == "har+ipc"
     assert "har+ipc 1 ms" in first.reasons[-1]
     assert "measured now" in first.reasons[-1]
     assert "Algorithm 1 says mpr" in first.reasons[-1]
-    again = with_measured(plan(gmis_per_gpu=2), MACHINE, 100, folder=tmp_path)
+    again = with_measured(plan(gmis_per_gpu=2), MACHINE, 100)
     assert (again.strategy, again.selection) == (first.strategy, first.selection)
-    assert str(tmp_path) in again.reasons[-1]
+    assert str(kept_in) in again.reasons[-1]
     assert len(measured) == 1
-    with_measured(plan(gmis_per_gpu=3), MACHINE, 100, folder=tmp_path)
-    with_measured(plan(gmis_per_gpu=2), MACHINE, 200, folder=tmp_path)
+    with_measured(plan(gmis_per_gpu=3), MACHINE, 100)
+    with_measured(plan(gmis_per_gpu=2), MACHINE, 200)
     assert len(measured) == 3
     assert Plan.from_dict(first.to_dict()) == first
 
 
 def test_a_way_that_does_not_work_here_is_not_taken(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    kept_in: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     rows = [{"chained_s": 2e-3}, {"chained_s": 1e-3}, {"why_not": "no such memory"}]
     monkeypatch.setattr(selection, "measure", lambda *_: rows)
     for _ in ("measured", "kept"):
-        chosen = with_measured(plan(gmis_per_gpu=2), MACHINE, 100, folder=tmp_path)
+        chosen = with_measured(plan(gmis_per_gpu=2), MACHINE, 100)
         assert chosen.selection["measured"] == "har+host"
         assert "har+ipc not usable: no such memory" in chosen.reasons[-1]
 
 
-def test_a_broken_file_is_measured_again(tmp_path: Path, measured: list[Sequence[Probe]]) -> None:
-    with_measured(plan(gmis_per_gpu=2), MACHINE, 100, folder=tmp_path)
-    (kept,) = tmp_path.iterdir()
+def test_a_broken_file_is_measured_again(kept_in: Path, measured: list[Sequence[Probe]]) -> None:
+    with_measured(plan(gmis_per_gpu=2), MACHINE, 100)
+    (kept,) = kept_in.iterdir()
     for number, content in enumerate(("{", "[]", "{}", '{"mpr": {}}'), start=2):
         kept.write_text(content)
-        with_measured(plan(gmis_per_gpu=2), MACHINE, 100, folder=tmp_path)
+        with_measured(plan(gmis_per_gpu=2), MACHINE, 100)
         assert len(measured) == number
 
 
-def test_one_gmi_has_nothing_to_measure(tmp_path: Path, measured: list[Sequence[Probe]]) -> None:
-    assert with_measured(plan(), MACHINE, 100, folder=tmp_path).strategy == "none"
+def test_one_gmi_has_nothing_to_measure(kept_in: Path, measured: list[Sequence[Probe]]) -> None:
+    assert with_measured(plan(), MACHINE, 100).strategy == "none"
     assert not measured
 
 

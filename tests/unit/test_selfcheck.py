@@ -10,11 +10,10 @@ from pathlib import Path
 import jax
 import jax.numpy as jnp
 import pytest
-from supervision import machine, plan_config, reduce_config
+from supervision import machine, planned
 
 from gmijax import selfcheck
 from gmijax.errors import SelfCheckFailed
-from gmijax.partition.planner import make_plan
 from gmijax.selfcheck import PRECISIONS, SIZES, Precision, check_share, compare_products
 
 MEASURED = Path(__file__).parents[2] / "benchmarks/results/sm-shares-nvidia-h200.json"
@@ -65,7 +64,7 @@ def test_wrong_products_are_found(
 
 
 def test_a_wrong_share_is_named(monkeypatch: pytest.MonkeyPatch):
-    plan = make_plan(plan_config(self_check="on"), reduce_config(), 8, machine(0))
+    plan = planned(machine(0), self_check="on")
     capped = dataclasses.replace(plan.slices[0], device="GPU-0", sm_percent=33.0)
     plan = dataclasses.replace(plan, slices=(capped,))
     monkeypatch.setattr(selfcheck, "SIZES", SMALL)
@@ -91,5 +90,5 @@ def test_options_that_xla_no_longer_has_are_left_out(monkeypatch: pytest.MonkeyP
     monkeypatch.setattr(selfcheck, "SIZES", SMALL)
     monkeypatch.setattr(selfcheck, "LIBRARIES", {"gone": {"xla_gpu_option_that_is_gone": True}})
     for self_check in ("on", "off"):
-        plan = make_plan(plan_config(self_check=self_check), reduce_config(), 8, machine(0))
+        plan = planned(machine(0), self_check=self_check)
         assert (check_share(plan, 0) > 0.0) == (self_check == "on")

@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from supervision import save
 
 from gmijax.cli.compose import compose
 from gmijax.config import TrainConfig
@@ -14,9 +15,6 @@ from gmijax.control import decide, serving
 from gmijax.control.start_point import find_start_point
 from gmijax.errors import ConfigError
 from gmijax.runs.folder import META, RunPaths, write_json
-from gmijax.runs.resume import CheckpointMeta
-
-WIDTHS = ((8,), (8, 4))
 
 
 def config_of(folder: Path, *overrides: str) -> TrainConfig:
@@ -35,12 +33,6 @@ def run(tmp_path: Path) -> RunPaths:
     paths = RunPaths(tmp_path / "run")
     write_json(paths.config, to_dict(config_of(paths.root)))
     return paths
-
-
-def save(run: RunPaths, env_steps: int) -> Path:
-    meta = CheckpointMeta("ant", "ppo", env_steps, 1, 8, WIDTHS, "jax")
-    write_json(run.checkpoint(env_steps) / META, meta.to_dict())
-    return run.checkpoint(env_steps)
 
 
 @pytest.mark.parametrize(

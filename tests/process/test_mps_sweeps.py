@@ -1,0 +1,85 @@
+"""Sweeps with the daemons of a fake control program: one for each GPU, for all of its jobs."""
+
+from __future__ import annotations
+
+import json
+import os
+from contextlib import closing
+from pathlib import Path
+
+import pytest
+from fake_mps import FakeMps
+from supervision import CHECKOUT, TESTS, gpu, machine, planned
+
+from gmijax.cli.compose import compose
+from gmijax.config.sweep import SweepConfig
+from gmijax.machine.mps_control import PIPE_VARIABLE, MpsControl
+from gmijax.machine.snapshot import DAEMONS_VARIABLE, detect_machine
+from gmijax.runs.folder import RunPaths
+from gmijax.supervise.backends import open_backend
+from gmijax.supervise.launcher import StopSignals
+from gmijax.sweeps.host import LocalHost, variables_of
+from gmijax.sweeps.jobs import SweepPaths, jobs_of
+from gmijax.sweeps.places import Places, Site, places_of
+from gmijax.sweeps.scheduler import Scheduler
+from gmijax.sweeps.study import NoStudy
+
+pytestmark = pytest.mark.timeout(180)
+
+
+@pytest.fixture
+def mps(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> FakeMps:
+    return FakeMps(tmp_path, monkeypatch)
+
+
+def test_a_fatal_fault_ends_one_job_of_a_sweep_and_its_neighbours_go_on(
+    mps: FakeMps, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    monkeypatch.setattr("gmijax.sweeps.children.MODULE", "fake_training_job")
+    monkeypatch.setenv("JAX_COMPILATION_CACHE_DIR", str(tmp_path))
+    monkeypatch.setenv("PYTHONPATH", f"{CHECKOUT}{os.pathsep}{TESTS}")
+    here = machine(2, mps_control=mps.program)
+    # Of programs of their own, so that none waits for another one to compile.
+    jobs = list(jobs_of([compose(f"seed={n}", f"num_envs={n + 1}") for n in range(6)]))
+    settings, paths = SweepConfig(jobs_per_gpu=3), SweepPaths(tmp_path)
+    plan = places_of(settings, here, {"auto"})
+    with closing(LocalHost(here)) as host:
+        host.open(plan, paths)
+        places = Places([Site(plan, here)])
+        scheduler = Scheduler(jobs, NoStudy(), settings, paths, places, [host], lambda: None)
+        scheduler.run(StopSignals())
+    states = [job.progress.state for job in jobs]
+    assert states == ["completed", "failed", *["completed"] * 4]
+    assert "CUDA_ERROR_LAUNCH_FAILED" in str(jobs[1].progress.error)
+    starts = [(paths.job(n).root / "starts").read_text().splitlines() for n in range(6)]
+    assert [len(lines) for lines in starts] == [1, 2, 1, 2, 1, 2]
+    # From their checkpoints, and nobody beside them: it could be the fault of each.
+    assert {starts[n][1] for n in (1, 3, 5)} == {"from step 5 beside 0"}
+    assert [job.progress.value for job in jobs] == [10.0, 5.0, 10.0, 10.0, 10.0, 10.0]
+
+
+def test_a_job_with_several_gpus_uses_the_daemons_of_its_sweep(
+    mps: FakeMps, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    here = machine(2, mps_control=mps.program)
+    plan = places_of(SweepConfig(jobs_per_gpu=2), here, {"auto"})
+    paths, run = SweepPaths(tmp_path / "sweep"), RunPaths(tmp_path / "run")
+    monkeypatch.setattr("gmijax.machine.snapshot.list_gpus", lambda: here.gpus)
+    with open_backend(plan, here, paths) as backend:
+        place = Places([Site(plan, here)]).take(2)
+        assert place is not None
+        assert place.label == "GPU 0 place 0, GPU 1 place 0"
+        for name, value in variables_of(place, backend).items():
+            monkeypatch.setenv(name, value)
+        of_job = detect_machine()
+        assert [gpu.uuid for gpu in of_job.gpus] == [gpu(0).uuid, gpu(1).uuid]
+        with open_backend(planned(of_job, gpus=2, backend="mps"), of_job, run) as own:
+            directories = [own.environment(gmi)[PIPE_VARIABLE] for gmi in (0, 1)]
+        assert directories == [backend.environment(gmi)[PIPE_VARIABLE] for gmi in (0, 2)]
+        assert (len(mps.told("start")), len(mps.told("quit"))) == (2, 0)
+
+        MpsControl(mps.program, Path(directories[1])).quit()
+        again = json.loads(variables_of(place, backend)[DAEMONS_VARIABLE])
+        assert again[gpu(0).uuid] == directories[0]
+        assert MpsControl(mps.program, Path(again[gpu(1).uuid])).is_answering()
+    assert not mps.left()
