@@ -11,6 +11,7 @@ import pytest
 from supervision import gpu, machine
 
 from gmijax import sweep
+from gmijax.autotune.grid import Measured
 from gmijax.cli.compose import compose
 from gmijax.cli.grid import build_sweep
 from gmijax.cluster import ray_nodes
@@ -21,38 +22,30 @@ from gmijax.config import ClusterConfig
 from gmijax.config.sweep import SweepConfig
 from gmijax.errors import BackendUnavailable, ConfigError, NodeLost
 from gmijax.machine.snapshot import Machine
-from gmijax.partition.plan import Plan
 from gmijax.runs.folder import RunPaths, read_json
 from gmijax.supervise.launcher import StopSignals
-from gmijax.sweeps import scheduler
+from gmijax.sweeps import density, scheduler
 from gmijax.sweeps.children import Seen
-from gmijax.sweeps.host import Order, Start, Started
+from gmijax.sweeps.host import LocalHost, Order, Start, Started
 from gmijax.sweeps.jobs import Job, SweepPaths, jobs_of
 from gmijax.sweeps.nodes import RemoteHost, SweepNode, nodes_of, num_cpus_of
 from gmijax.sweeps.places import Places, Site, places_of
 from gmijax.sweeps.report import write_report
 from gmijax.sweeps.scheduler import Scheduler
-from gmijax.sweeps.study import NoStudy
+from gmijax.sweeps.study import Study
 
 
-class FakeHost:
+class FakeHost(LocalHost):
     """A node whose jobs go on until `end` says how they end."""
 
     def __init__(self, name: str) -> None:
-        self.name: str | None = name
-        self.machine = machine(0)
-        self.lost: str | None = None
+        super().__init__(machine(0))
+        self.name = name
         self.running: dict[int, int] = {}  # Jobs by their children.
         self.seen: dict[int, Seen] = {}
         self.started: list[int] = []
         self.programs: set[str] = set()
         self._numbers = itertools.count()
-
-    def lease(self, devices: Iterable[str]) -> str | None:
-        del devices
-
-    def open(self, plan: Plan, run: RunPaths) -> None:
-        del plan, run
 
     def start(self, start: Start) -> Started:
         if self.lost is not None:
@@ -67,17 +60,14 @@ class FakeHost:
         return self.seen.get(child)
 
     def order(self, child: int, order: Order) -> None:
-        if order == "kill":
-            self.seen[child] = Seen(-9)
+        if order in ("ask_to_stop", "kill"):
+            self.seen[child] = Seen(130)
         if order == "close":
             del self.running[child]
 
     def add_program(self, program: str, is_lasting: bool) -> None:
         del is_lasting
         self.programs.add(program)
-
-    def shut(self) -> None:
-        """Nothing is open."""
 
     def end(self, exit_code: int = 0) -> None:
         """Ends all jobs that run there."""
@@ -101,7 +91,7 @@ class Sweep:
         def tick() -> None:
             (left.pop(0) if len(left) > 1 else left[0])()
 
-        args = self.jobs, NoStudy(), self.settings, self.paths, self.places, self.nodes, tick
+        args = self.jobs, Study(), self.settings, self.paths, self.places, self.nodes, tick
         Scheduler(*args).run(StopSignals())
 
     def states(self) -> list[str]:
@@ -218,6 +208,27 @@ def test_a_node_that_is_lost_at_a_start_costs_the_job_nothing(tmp_path: Path) ->
     assert sweep.states() == ["completed"] * 2
 
 
+def test_a_profile_of_a_job_with_two_gpus_has_both(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    class Window:
+        def __init__(self, *_: Any) -> None:
+            self.steps_per_s, self.iteration_s = 100.0, 0.1
+
+        def is_over(self) -> bool:
+            return True
+
+    monkeypatch.setattr(density, "_Window", Window)
+    monkeypatch.setattr(FakeHost, "open", lambda *_: None)
+    host = FakeHost("a")
+    host.machine = machine(2, mps_control=Path("/usr/bin/nvidia-cuda-mps-control"))
+    bench = density._Bench(host, tmp_path, StopSignals())
+    for settings in (SweepConfig(), SweepConfig(gpus=(1, 0))):
+        found = density._profile(settings, jobs(1, "plan.gpus=2")[0], 1, bench)
+        assert isinstance(found, Measured)
+    assert host.started == [0, 0]
+
+
 def test_equal_programs_compile_once_on_each_node(tmp_path: Path) -> None:
     alike = jobs_of([compose(f"seed={seed}") for seed in range(6)])
     sweep = Sweep(tmp_path, alike)
@@ -238,7 +249,7 @@ def test_equal_programs_compile_once_on_each_node(tmp_path: Path) -> None:
 
 def test_what_a_node_refuses_is_raised_here_and_does_not_lose_it() -> None:
     here = SweepNode.__new__(SweepNode)
-    here._host = FakeHost("b")  # type: ignore[assignment]
+    here._host = FakeHost("b")
 
     def refuse(*_: Any) -> None:
         raise BackendUnavailable("no daemon")

@@ -48,7 +48,7 @@ class Batcher:
 
     A batch that lies in one transfer is a slice of it, without a copy, and holds its memory until
     the next batch is asked for. Otherwise unrolls are stacked in what `new_stack` makes.
-    It counts `batches` given out, `unrolls`, `transfers` and `num_bytes` that arrived.
+    It counts `batches` given out and `unrolls` that arrived.
     """
 
     def __init__(
@@ -58,7 +58,7 @@ class Batcher:
         new_stack: Callable[[Spec, int], Stack],
         held: contextlib.ExitStack,
     ) -> None:
-        self.batches = self.unrolls = self.transfers = self.num_bytes = 0
+        self.batches = self.unrolls = 0
         self._rank = rank
         self._sources = list(sources)
         self._turn = 0
@@ -131,7 +131,6 @@ class Batcher:
             if transfer is not None:
                 self._turn += place + 1
                 self.unrolls += transfer.num_envs
-                self.num_bytes += sum(transfer.spec.sizes(transfer.num_envs))
                 agents = np.full(transfer.num_envs, source[0].peer, np.int64)
                 return _Arrival(transfer, agents, source[0].release)
         return None
@@ -139,7 +138,6 @@ class Batcher:
     def _read(self, reader: ChannelReader, decode: Decode) -> Transfer | None:
         """The next transfer, valid until the reader's `release`; PipeClosed if none can come."""
         while (message := reader.try_get()) is not None:
-            self.transfers += 1
             if (transfer := decode(message)) is not None:
                 return transfer
         return None
