@@ -19,17 +19,10 @@ if TYPE_CHECKING:
     from gmijax.sim.interface import Env
 
 TASKS: Mapping[str, str] = MappingProxyType(
-    {
-        "ant": "gmijax.sim.tasks.ant",
-        "anymal": "gmijax.sim.tasks.anymal",
-        "ball_balance": "gmijax.sim.tasks.ball_balance",
-        "franka_cabinet": "gmijax.sim.tasks.franka_cabinet",
-        "humanoid": "gmijax.sim.tasks.humanoid",
-        "shadow_hand": "gmijax.sim.tasks.shadow_hand",
-    }
+    {name: f"gmijax.sim.tasks.{name}" for name in SETTINGS}
 )
-"""Name -> module with `make(*, impl, max_envs, rewards, settings) -> Env`, `TERMS` and
-`DEFAULT_EPISODE_LENGTH`."""
+"""Name of each of our tasks -> its module, with `make(*, impl, max_envs, rewards, settings)`,
+which returns an `Env`, `TERMS`, `OBS_TERMS` and `DEFAULT_EPISODE_LENGTH`."""
 
 SUITES: Mapping[str, str] = MappingProxyType(
     {
@@ -117,19 +110,7 @@ def make_env(
 
 
 @overload
-def make_env(
-    name: str,
-    *,
-    suite: str = ...,
-    impl: str = ...,
-    episode_length: int | None = ...,
-    max_envs: int | None = ...,
-    source_sha256: str | None = ...,
-    rewards: Mapping[str, float] = ...,
-    settings: Mapping[str, float] = ...,
-    curriculum: bool = ...,
-    api: Literal["brax"],
-) -> Any: ...
+def make_env(name: str, *, api: Literal["brax"], **options: Any) -> Any: ...
 
 
 def make_env(
