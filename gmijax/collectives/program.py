@@ -41,8 +41,12 @@ class Links(Protocol):
 
     room: int
 
-    def start(self, exchange: Exchange) -> None:
-        """Tries them, together with all other ranks; raises DeviceMemoryUnavailable on all."""
+    def start(self, trial: Exchange) -> None:
+        """Tries them by exchanges in the node, together with all other ranks of the job.
+
+        Raises:
+          DeviceMemoryUnavailable: they do not work; on all ranks alike.
+        """
         ...
 
     def reduce(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import pickle
 import signal
 import subprocess
 import sys
@@ -16,6 +17,8 @@ import pytest
 from supervision import CHECKOUT, TESTS, gpu, machine, make_launch, plan_config, reduce_config
 
 from gmijax.cli.compose import compose
+from gmijax.cluster.node import TrainingNode
+from gmijax.collectives.nodes.meeting import Nodes
 from gmijax.config.sweep import SweepConfig
 from gmijax.errors import BackendUnavailable, GmiFailed, JobInterrupted
 from gmijax.machine.mps_control import PIPE_VARIABLE, MpsControl
@@ -28,7 +31,7 @@ from gmijax.runs.folder import RunPaths, read_json, write_json
 from gmijax.supervise.backends import open_backend
 from gmijax.supervise.kinds import JobKind
 from gmijax.supervise.launch import Timeouts
-from gmijax.supervise.launcher import Launch, StopSignals, run_gmis
+from gmijax.supervise.launcher import Launch, StopSignals, run_gmis, taking_turns
 from gmijax.supervise.supervisor import Supervisor
 from gmijax.supervise.watched_gmi import GmiStatus
 from gmijax.sweeps.host import LocalHost, variables_of
@@ -347,6 +350,64 @@ def test_a_job_with_several_gpus_uses_the_daemons_of_its_sweep(
         assert again[gpu(0).uuid] == directories[0]
         assert MpsControl(mps.program, Path(again[gpu(1).uuid])).is_answering()
     assert not [path for path in mps.pipe_directories() if path.exists()]
+
+
+def a_node(here: Machine, monkeypatch: pytest.MonkeyPatch) -> TrainingNode:
+    monkeypatch.setattr("gmijax.cluster.node.detect_machine", lambda: here)
+    return TrainingNode({}, os.getcwd(), None, "127.0.0.1")
+
+
+def test_two_nodes_of_one_machine_use_the_daemon_of_the_first(
+    mps: FakeMps, run: RunPaths, monkeypatch: pytest.MonkeyPatch
+):
+    here = machine(1, mps_control=mps.program)
+    machines = {"a": here, "a#1": here}
+    plan = make_plan(plan_config(backend="mps"), reduce_config(), 8, here, nodes=machines)
+    launch = make_launch(run, ["mps_client", "mps_client"], plan)
+    nodes, daemons, leaders = [a_node(here, monkeypatch) for _ in range(2)], {}, []
+    with ExitStack() as held:
+        for place, node in enumerate(nodes):
+            held.callback(node.close)
+            opened = node.open(launch, place, "127.0.0.1", daemons)
+            assert not isinstance(opened, BackendUnavailable)
+            daemons |= opened.daemons
+            leaders.append(opened.leader)
+        assert daemons.keys() == {gpu(0).uuid}
+        assert len(mps.told("start")) == 1
+        for gmi, node in enumerate(nodes):
+            node.introduce(Nodes(gmi, tuple(leaders), b"token"))
+            pid = node.start(gmi, False)
+            assert isinstance(pid, int)
+            deadline_s = time.monotonic() + 30
+            while (without := node.verify({gmi: pid})) is not None:
+                assert time.monotonic() < deadline_s, without
+        failed = nodes[1].verify({1: os.getpid()})
+        assert failed is not None
+        assert failed[0] == 1
+        assert "is no client of the MPS daemon" in failed[1]
+        nodes[1].terminate(1, pid)
+        assert [int(client) for _, client in mps.told("terminate_client")] == [pid]
+    assert len(mps.told("quit")) == 1
+    assert not [path for path in mps.pipe_directories() if path.exists()]
+
+
+def test_a_node_without_a_daemon_says_so_and_takes_turns_when_asked_again(
+    mps: FakeMps, run: RunPaths, monkeypatch: pytest.MonkeyPatch
+):
+    monkeypatch.setenv("FAKE_MPS_BROKEN", "1")
+    here = machine(1, mps_control=mps.program)
+    config, nodes = plan_config(gmis_per_gpu=2), {"a": here}
+    plan = make_plan(config, reduce_config(), 8, here, nodes=nodes)
+    assert plan.backend == "mps"
+    launch = make_launch(run, ["train", "train"], plan)
+    with closing(a_node(here, monkeypatch)) as node:
+        refused = node.open(launch, 0, "127.0.0.1", {})
+        assert isinstance(refused, BackendUnavailable)
+        assert isinstance(pickle.loads(pickle.dumps(refused)), BackendUnavailable)
+        opened = node.open(taking_turns(launch, refused), 0, "127.0.0.1", {})
+        assert not isinstance(opened, BackendUnavailable)
+        assert opened.daemons == {}
+    assert Plan.from_dict(read_json(run.plan)).backend == "share"
 
 
 def test_janitor_cleans_up_after_a_killed_controller(mps: FakeMps, run: RunPaths, tmp_path: Path):

@@ -38,7 +38,7 @@ class HostLinks:
         self._failure: GmijaxError | None = None
         self._exchange_s = 0.0
 
-    def start(self, exchange: Exchange) -> None:
+    def start(self, trial: Exchange) -> None:
         """Does nothing: there is nothing to agree on."""
 
     def reduce(
@@ -55,7 +55,7 @@ class HostLinks:
         def reduce(values: FloatBuffer, result: FloatBuffer) -> None:
             if stage.link == "nodes":
                 assert isinstance(self._host, NodeExchange)
-                self._host.sum_between_nodes(values, result, place)
+                self._host.sum_of_nodes(values, result, stage.groups, place)
                 return
             if stage.kind == "gather":
                 result = result.reshape(rows, -1)
