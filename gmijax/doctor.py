@@ -20,11 +20,13 @@ from gmijax.version import __version__
 
 USAGE: Final = """usage: python -m gmijax.doctor [--json] [--help]
        python -m gmijax.doctor mig=SIZES [gpu=INDEX]
+       python -m gmijax.doctor cluster=ADDRESS [--json]
 
 Without mig=, looks at GPUs, driver, MPS, MIG, versions, and at what jax sees; says which backends,
 reducers, physics and environments can be used, and why the others cannot.
 With mig=3g,2g,1g,1g, prints the commands with which an administrator would divide a GPU so
 (gpu=INDEX as nvidia-smi lists it; else the first that can be divided). It runs none of them.
+With cluster=auto (or host:port), shows the nodes of a Ray cluster, and in what they differ.
 Exit codes: 0 healthy, 1 something is broken that should work, 2 bad input.
 """
 
@@ -35,6 +37,7 @@ class Options(NamedTuple):
     as_json: bool = False
     mig: str | None = None
     gpu: int | None = None
+    cluster: str | None = None
 
 
 def main(argv: Sequence[str]) -> int:
@@ -52,6 +55,8 @@ def _answer(options: Options) -> Sequence[str]:
     if options.mig is not None:
         sys.stdout.write(split_text(options.mig, options.gpu, detect_machine()))
         return ()
+    if options.cluster is not None:
+        return show_nodes(options.cluster, as_json=options.as_json)
     found = diagnose(inspect_system())
     if options.as_json:
         sys.stdout.write(json.dumps(found.to_dict(), indent=2) + "\n")
@@ -72,14 +77,19 @@ def parse(argv: Sequence[str]) -> Options:
             options = options._replace(mig=value)
         elif key == "gpu" and value.isdecimal():
             options = options._replace(gpu=int(value))
+        elif key == "cluster" and value:
+            options = options._replace(cluster=value)
         else:
             raise ConfigError(
-                f"{text}: allowed are --json, mig=SIZES (e.g. mig=3g,2g,1g,1g), gpu=INDEX, --help"
+                f"{text}: allowed are --json, mig=SIZES (e.g. mig=3g,2g,1g,1g), gpu=INDEX, "
+                "cluster=ADDRESS, --help"
             )
     if options.mig is None and options.gpu is not None:
         raise ConfigError(f"gpu={options.gpu}: only together with mig=SIZES")
     if options.mig is not None and options.as_json:
         raise ConfigError("--json: not together with mig=SIZES")
+    if options.mig is not None and options.cluster is not None:
+        raise ConfigError(f"cluster={options.cluster}: not together with mig=SIZES")
     return options
 
 
@@ -105,6 +115,28 @@ def split_text(wanted: str, index: int | None, machine: Machine) -> str:
         *split_commands(gpu, wanted),
     ]
     return "\n".join(lines) + "\n"
+
+
+def show_nodes(address: str, *, as_json: bool) -> Sequence[str]:
+    """Prints the nodes of a cluster, and in what they differ; returns what is broken.
+
+    Raises:
+      ConfigError: there is no such cluster.
+    """
+    from gmijax.cluster.survey import differences, lines_of_nodes, nodes_as_data, survey
+
+    nodes = survey(address)
+    problems, notes = differences(nodes)
+    if as_json:
+        data = {"ok": not problems, "nodes": nodes_as_data(nodes)}
+        data |= {"problems": problems, "notes": notes}
+        sys.stdout.write(json.dumps(data, indent=2) + "\n")
+    else:
+        said = [*lines_of_nodes(nodes), *(f"note: {note}" for note in notes)]
+        said += [f"problem: {problem}" for problem in problems]
+        said += [] if problems else ["a job can be on all of them"]
+        sys.stdout.write("\n".join(said) + "\n")
+    return problems
 
 
 def show(found: Diagnosis, console: Console) -> None:

@@ -13,12 +13,20 @@ import signal
 import subprocess
 import sys
 import time
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
 from gmijax.collectives.build import Membership, build_reducer
 from gmijax.collectives.host.shared_block import create_exchange
 from gmijax.collectives.interface import Reducer
+from gmijax.collectives.nodes.meeting import (
+    ENV_LISTENER_FD,
+    ENV_NODES_FD,
+    Nodes,
+    inherited_nodes,
+    listen,
+)
 from gmijax.errors import CollectiveTimeout, GmijaxError, PeerLost
 from gmijax.partition.layout import Layout
 from gmijax.supervise.child import ENV_EXCHANGE_FD
@@ -34,18 +42,25 @@ class Ranks:
 
     `results()` waits for all that were not killed; each result has `error` (class name or
     None), `failed_at_s` (monotonic clock, the same for all processes) and the body's own keys.
-    All ranks are on one GPU unless `layout` says something else.
+    All ranks are on one GPU unless `layout` says something else, and on `num_nodes` machines, all
+    of which are this one.
     """
 
     def __init__(self, folder: Path, world_size: int, body: str, **options: Any) -> None:
         self.folder, self.world_size = folder, world_size
-        self.fd = create_exchange()
+        self._held = ExitStack()
         self.processes: dict[int, subprocess.Popen[bytes]] = {}
         defaults = {"strategy": "mpr", "num_floats": 100, "timeout_s": 20.0, "start_s": 60.0}
         layout = [list(range(world_size))]
         # Devices by position of a GPU in the layout; none: the CPU.
-        defaults |= {"intra": "host", "layout": layout, "gpus": []}
+        defaults |= {"intra": "host", "layout": layout, "num_nodes": 1, "gpus": []}
         self._options = {**defaults, "body": body, **options}
+        self._fds = self._shared_by_nodes(self._options["num_nodes"])
+
+    @property
+    def fd(self) -> int:
+        """Descriptor of the shared block of the first node."""
+        return self._fds[0][ENV_EXCHANGE_FD]
 
     def __enter__(self) -> Ranks:
         return self
@@ -54,17 +69,19 @@ class Ranks:
         for process in self.processes.values():
             process.kill()
             process.wait()
-        os.close(self.fd)
+        self._held.close()
 
     def start(self, *ranks: int, **options: Any) -> Ranks:
         """Starts `ranks` (default: all), with `options` on top of the common ones."""
         for rank in ranks or range(self.world_size):
             given = {**self._options, "rank": rank, "folder": str(self.folder), **options}
+            inherited = self._fds[layout_of(given).node_of(rank)]
+            named = {name: str(fd) for name, fd in inherited.items()}
             with (self.folder / f"stderr_{rank}").open("wb") as stderr:
                 self.processes[rank] = subprocess.Popen(
                     [sys.executable, __file__, json.dumps(given)],
-                    env={**os.environ, **environment_of(given), ENV_EXCHANGE_FD: str(self.fd)},
-                    pass_fds=[self.fd],
+                    env={**os.environ, **environment_of(given), **named},
+                    pass_fds=list(inherited.values()),
                     stdin=subprocess.DEVNULL,
                     stdout=stderr,
                     stderr=stderr,
@@ -110,6 +127,20 @@ class Ranks:
             found.append(json.loads(path.read_text()))
         return found
 
+    def _shared_by_nodes(self, num_nodes: int) -> list[dict[str, int]]:
+        """What the ranks of each node inherit, by the variable that names its descriptor."""
+        listeners = [self._held.enter_context(listen("127.0.0.1")) for _ in range(num_nodes)]
+        addresses = tuple(("127.0.0.1", one.getsockname()[1]) for one in listeners)
+        found: list[dict[str, int]] = []
+        for node, listener in enumerate(listeners):
+            own = {ENV_EXCHANGE_FD: create_exchange()}
+            if num_nodes > 1:
+                own[ENV_NODES_FD] = Nodes(node, addresses, b"secret").to_file()
+            for fd in own.values():
+                self._held.callback(os.close, fd)
+            found.append(own | ({ENV_LISTENER_FD: listener.fileno()} if num_nodes > 1 else {}))
+        return found
+
 
 def environment_of(options: Options) -> dict[str, str]:
     """Variables of one rank."""
@@ -128,7 +159,7 @@ def environment_of(options: Options) -> dict[str, str]:
 
 def layout_of(options: Options) -> Layout:
     """The layout that the options describe."""
-    return Layout(tuple(tuple(gmis) for gmis in options["layout"]))
+    return Layout(tuple(tuple(gmis) for gmis in options["layout"]), options["num_nodes"])
 
 
 def use_fake_device_memory(kind: str) -> None:
@@ -143,6 +174,7 @@ def use_fake_device_memory(kind: str) -> None:
 def make_reducer(options: Options) -> Reducer:
     """The reducer of one rank."""
     strategy, rank, layout = options["strategy"], options["rank"], layout_of(options)
+    nodes, listener = inherited_nodes()
     if options["intra"] == "ipc" and not options["gpus"]:
         is_special = rank == options.get("special_rank")
         use_fake_device_memory(options["special"] if is_special else "fake")
@@ -157,6 +189,8 @@ def make_reducer(options: Options) -> Reducer:
             rendezvous_timeout_s=options["start_s"],
             intra=options["intra"],
             host_if_unavailable=options.get("host_if_unavailable", False),
+            nodes=nodes,
+            listener=listener,
         ),
     )
 

@@ -8,7 +8,7 @@ import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 from training_jobs import child_environment
 
@@ -16,11 +16,32 @@ TWO_NODES = Path(__file__).parent / "two_ray_nodes.py"
 RAY = "cluster.engine=ray"
 
 
-class Cluster(NamedTuple):
-    """Two nodes of Ray."""
+class Cluster:
+    """Two nodes of Ray.
 
-    address: str  # As an override.
-    second_raylet: int  # Process of the node that does not lead the cluster.
+    Attributes:
+      address: as an override.
+      second_raylet: process of the node that does not lead the cluster.
+    """
+
+    def __init__(self, process: subprocess.Popen[bytes], log: Path) -> None:
+        self._process, self._log = process, log
+        self._hear()
+
+    def add_node(self) -> None:
+        """Adds one in place of the second, which was killed."""
+        assert self._process.stdin is not None
+        self._process.stdin.write(b"add\n")
+        self._process.stdin.flush()
+        self._hear()
+
+    def _hear(self) -> None:
+        assert self._process.stdout is not None
+        lines = (json.loads(line) for line in self._process.stdout if line.startswith(b"{"))
+        said: dict[str, Any] | None = next(lines, None)
+        assert said is not None, self._log.read_text()
+        self.address = f"cluster.address={said['address']}"
+        self.second_raylet: int = said["second_raylet"]
 
 
 @contextmanager
@@ -36,11 +57,7 @@ def two_nodes(log: Path) -> Iterator[Cluster]:
             stderr=stderr,
         ) as process,
     ):
-        assert process.stdout is not None
-        lines = (json.loads(line) for line in process.stdout if line.startswith(b"{"))
-        said: dict[str, Any] | None = next(lines, None)
-        assert said is not None, log.read_text()
-        yield Cluster(f"cluster.address={said['address']}", said["second_raylet"])
+        yield Cluster(process, log)
         process.communicate(timeout=60)
 
 

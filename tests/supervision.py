@@ -43,9 +43,14 @@ def machine(num_gpus: int, **changes: Any) -> Machine:
     return Machine(**{**values, **changes})
 
 
-def planned(here: Machine, reduce: Mapping[str, Any] | None = None, **plan: Any) -> Plan:
+def planned(
+    here: Machine,
+    reduce: Mapping[str, Any] | None = None,
+    nodes: Mapping[str, Machine] | None = None,
+    **plan: Any,
+) -> Plan:
     """The plan of a synchronous training with these keys of `reduce` and `plan`; N is 64."""
-    return make_plan(PlanConfig(**plan), ReduceConfig(**(reduce or {})), 64, here)
+    return make_plan(PlanConfig(**plan), ReduceConfig(**(reduce or {})), 64, here, nodes=nodes)
 
 
 def save(run: RunPaths, env_steps: int) -> Path:

@@ -1,5 +1,7 @@
 """Two nodes of Ray on this machine, for tests: says where they are, ends with its standard input.
 
+A line there adds another node, for one that was killed.
+
 A process of its own, because Ray in the process of the tests would start threads and warn there.
 """
 
@@ -26,12 +28,14 @@ def main() -> None:
     """Starts them and waits."""
     cluster = Cluster(initialize_head=True, head_node_args={**NODE, "_system_config": QUICK})
     try:
-        second = cluster.add_node(**NODE)
-        raylet = second.all_processes["raylet"][0].process.pid
-        said = {"address": cluster.address, "second_raylet": raylet}
-        sys.stdout.write(f"\n{json.dumps(said)}\n")
-        sys.stdout.flush()
-        sys.stdin.read()
+        while True:
+            second = cluster.add_node(**NODE)
+            raylet = second.all_processes["raylet"][0].process.pid
+            said = {"address": cluster.address, "second_raylet": raylet}
+            sys.stdout.write(f"\n{json.dumps(said)}\n")
+            sys.stdout.flush()
+            if not sys.stdin.readline():
+                break
     finally:
         for node in (*cluster.worker_nodes, cluster.head_node):
             # A test may have killed it.

@@ -200,6 +200,10 @@ def _unknown_key(key: str, known: Iterable[str]) -> ConfigError:
         names = [one.removeprefix(group + dot) for one in known if one.startswith(group + dot)]
         none = f": this task has none in {group}"
         return ConfigError(f"unknown key {key}{suggestion(name, names) if names else none}")
+    if group == "cluster" and not any(one.startswith("cluster.") for one in known):
+        return ConfigError(
+            f"{key}: this command is for one machine; gmijax.train and gmijax.sweep take several"
+        )
     return ConfigError(f"unknown key {key}{suggestion(key, known)}")
 
 

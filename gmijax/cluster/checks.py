@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from contextlib import suppress
 from pathlib import Path
 
-from gmijax.cluster.node import own_versions
+from gmijax.cluster.node import ON_GPUS, own_versions
 from gmijax.cluster.ray_nodes import Joined
 from gmijax.errors import ConfigError
 
@@ -30,11 +30,11 @@ def by_name(joined: Sequence[Joined]) -> dict[str, Joined]:
 
 
 def require_alike(joined: Sequence[Joined], *, has_tcp: bool = False) -> None:
-    """Raises ConfigError if a node has other versions than this machine.
+    """Raises ConfigError if a node has other versions than this machine, or other ones for GPUs.
 
     With `has_tcp` experience goes between nodes, for which pyzmq must be there too.
     """
-    own = own_versions()
+    own, first = own_versions(), joined[0]
     if not has_tcp:
         del own["pyzmq"]
     elif own["pyzmq"] is None:
@@ -42,11 +42,15 @@ def require_alike(joined: Sequence[Joined], *, has_tcp: bool = False) -> None:
             "cluster.engine=ray: experience between nodes needs the package pyzmq "
             "(pip install 'gmijax[ray]')"
         )
+    here = dict.fromkeys(own, "this one")
+    for what in ON_GPUS:
+        own[what], here[what] = first.facts.versions.get(what), f"node {first.remote.address}"
     for node, facts in joined:
         for what, version in own.items():
-            if (theirs := facts.versions.get(what)) != version:
+            is_used = what not in ON_GPUS or bool(first.facts.machine.gpus)
+            if is_used and (theirs := facts.versions.get(what)) != version:
                 raise ConfigError(
-                    f"cluster.engine=ray: node {node.address} has {what} {theirs}, this one "
+                    f"cluster.engine=ray: node {node.address} has {what} {theirs}, {here[what]} "
                     f"has {version}; all nodes must have the same"
                 )
 

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import dataclasses
 import secrets
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
+from functools import partial
 from pathlib import Path
 from typing import Any, Self
 
@@ -14,12 +15,12 @@ from gmijax.cluster.node import Opened, TrainingNode
 from gmijax.cluster.ray_nodes import Joined, RayCluster
 from gmijax.collectives.nodes.meeting import Nodes
 from gmijax.config import TrainConfig
-from gmijax.errors import ConfigError, GmiFailed
+from gmijax.errors import BackendUnavailable, ConfigError, GmiFailed
 from gmijax.machine.snapshot import Machine
-from gmijax.partition.placement import most_gmis_of_a_node
+from gmijax.partition.placement import most_gmis_of_a_node, on_fewer_nodes
 from gmijax.partition.planner import num_gmis_of
 from gmijax.supervise.backends.backend import Backend
-from gmijax.supervise.launcher import Launch, OnTick, StopSignals
+from gmijax.supervise.launcher import Launch, OnTick, StopSignals, taking_turns
 from gmijax.supervise.supervisor import Supervisor
 from gmijax.supervise.watched_gmi import WatchedGmi
 
@@ -39,6 +40,12 @@ class ClusterJob:
 
     def __enter__(self) -> Self:
         self._cluster = RayCluster(self._config.cluster, TrainingNode)
+        plan = self._config.plan
+        on_gpus = plan.backend != "cpu" and (plan.backend != "auto" or self._cluster.has_gpus)
+        num_gpus = plan.num_gpus if on_gpus else 0
+        self._join = partial(
+            self._cluster.join, self._num_cpus, least_gpus=num_gpus, most_gpus=num_gpus
+        )
         return self
 
     def __exit__(self, *exc: Any) -> None:
@@ -54,7 +61,7 @@ class ClusterJob:
           ConfigError: too few nodes, or one that cannot take part.
         """
         wanted = self._config.cluster.nodes
-        self._joined = self._cluster.join(self._num_cpus, None if wanted == "auto" else wanted)
+        self._joined = self._join(None if wanted == "auto" else wanted)
         self._run_root = run_root
         return self._checked()
 
@@ -66,8 +73,7 @@ class ClusterJob:
           JobInterrupted: a signal came.
         """
         least, signals = 1 if elastic else num_nodes, self._signals
-        self._joined = self._cluster.join(
-            self._num_cpus,
+        self._joined = self._join(
             num_nodes,
             least=least,
             is_unwanted=lambda: signals is not None and signals.have_come,
@@ -81,14 +87,17 @@ class ClusterJob:
           GmiFailed, ConfigError, JobInterrupted: as `run_gmis`.
         """
         self._signals = signals
-        sent = dataclasses.replace(launch, on_warning=print, is_enough=None)
-        token, addresses, calls = secrets.token_bytes(32), [], {}
-        for place, (node, facts) in enumerate(self._joined):
-            opened = node.call("open", sent, place, facts.address) or Opened(("", 0), {})
-            addresses.append(opened.leader)
-            calls |= opened.calls
+        try:
+            opened = self._open(launch)
+        except BackendUnavailable as error:
+            launch = taking_turns(launch, error)
+            opened = self._open(launch)
+        addresses, calls = tuple(one.leader for one in opened), {}
+        for one in opened:
+            calls |= one.calls
+        token = secrets.token_bytes(32)
         for place, (node, _) in enumerate(self._joined):
-            node.call("introduce", Nodes(place, tuple(addresses), token, calls))
+            node.call("introduce", Nodes(place, addresses, token, calls))
         first = [gmis[0] for gmis in launch.plan.layout.gmis_of_node]
         for gmi, (node, _) in zip(first, self._joined, strict=True):
             if node.lost is not None:
@@ -98,8 +107,7 @@ class ClusterJob:
             node = self._joined[launch.plan.layout.node_of(gmi)].remote
             return node.start(gmi, waits, launch.run.gmi(gmi))
 
-        # Backends are entered on the nodes.
-        backend = Backend(launch.plan, launch.machine, launch.run)
+        backend = _BackendOfNodes(launch, self._joined)
         supervisor = Supervisor(launch, backend, start=start)
         signals.forward_to(supervisor.request_stop)
         try:
@@ -107,11 +115,43 @@ class ClusterJob:
         finally:
             self._cluster.leave()
 
+    def _open(self, launch: Launch) -> list[Opened]:
+        """What the nodes have for their GMIs; raises BackendUnavailable with a node's address."""
+        sent = dataclasses.replace(launch, on_warning=print, is_enough=None)
+        daemons: dict[str, Path] = {}
+        found: list[Opened] = []
+        for place, (node, facts) in enumerate(self._joined):
+            opened = node.call("open", sent, place, facts.address, daemons)
+            if isinstance(opened, BackendUnavailable):
+                raise BackendUnavailable(f"node {node.address}: {opened}")
+            found.append(opened or Opened(("", 0), {}, {}))  # None of a node that is gone.
+            daemons |= found[-1].daemons
+        return found
+
     def _checked(self) -> Mapping[str, Machine]:
         """The machines of the nodes, by address, once these can take part."""
         require_alike(self._joined, has_tcp=self._config.is_asynchronous)
         require_shared(self._joined, self._run_root)
         return {name: node.facts.machine for name, node in by_name(self._joined).items()}
+
+
+class _BackendOfNodes(Backend):
+    """The backends that the nodes have entered, as the supervisor asks them."""
+
+    def __init__(self, launch: Launch, joined: Sequence[Joined]) -> None:
+        super().__init__(launch.plan, launch.machine, launch.run)
+        self._nodes = [node for node, _ in joined]
+
+    def verify(self, pids: Mapping[int, int]) -> None:
+        """See `Backend`."""
+        for node, gmis in zip(self._nodes, self.plan.layout.gmis_of_node, strict=True):
+            there = {gmi: pid for gmi, pid in pids.items() if gmi in gmis}
+            if (without := node.call("verify", there)) is not None:
+                raise GmiFailed(*without)
+
+    def terminate(self, gmi: int, pid: int) -> None:
+        """See `Backend`."""
+        self._nodes[self.plan.layout.node_of(gmi)].tell("terminate", gmi, pid)
 
 
 def _cpus_of_a_node(config: TrainConfig) -> int:
@@ -123,5 +163,6 @@ def _cpus_of_a_node(config: TrainConfig) -> int:
     most = most_gmis_of_a_node(config.plan, wanted)
     for fewer in range(1, wanted if config.run.elastic else 1):
         with suppress(ConfigError):  # Then the job will not go on with so few.
-            most = max(most, most_gmis_of_a_node(config.plan, fewer))
+            left = on_fewer_nodes(config.plan, wanted, fewer)
+            most = max(most, most_gmis_of_a_node(left, fewer))
     return most

@@ -6,6 +6,7 @@ them is decided by the controller's supervisor.
 
 from __future__ import annotations
 
+import dataclasses
 import fcntl
 import os
 import platform
@@ -24,7 +25,13 @@ from gmijax.collectives.nodes.meeting import (
     listen,
     reserved_address,
 )
-from gmijax.errors import ConfigError, GmiFailed, GmijaxError, ReportedError
+from gmijax.errors import (
+    BackendUnavailable,
+    ConfigError,
+    GmiFailed,
+    GmijaxError,
+    ReportedError,
+)
 from gmijax.machine.snapshot import Machine, detect_machine
 from gmijax.supervise.backends import open_backend
 from gmijax.supervise.gmi_process import GmiProcess
@@ -35,6 +42,12 @@ from gmijax.version import __version__, versions_of
 
 COMPARED: Final = ("jax", "jaxlib", "numpy", "mujoco", "mujoco-mjx", "flax", "optax", "pyzmq")
 """Packages whose versions all nodes must have alike, beside Python and gmijax."""
+
+ON_GPUS: Final = (
+    *("jax-cuda12-plugin", "jax-cuda13-plugin", "nvidia-nccl-cu12", "nvidia-nccl-cu13"),
+    *("cuda-bindings", "warp-lang"),
+)
+"""The same for nodes whose GPUs are used; the controller may be on a machine without any."""
 
 Order = Literal["let_go", "ask_to_stop", "order_end", "end_as_done", "kill"]
 """Methods of a `GmiProcess` that the controller may call."""
@@ -51,10 +64,11 @@ class Facts(NamedTuple):
 
 
 class Opened(NamedTuple):
-    """Where GMIs of a node will listen."""
+    """What a node has for its GMIs: where they will listen, and daemons of its GPUs."""
 
     leader: tuple[str, int]
     calls: dict[tuple[int, int], str]  # See `Nodes`.
+    daemons: dict[str, Path]  # See `Machine`.
 
 
 class Seen(NamedTuple):
@@ -126,17 +140,40 @@ class TrainingNode(Node):
         self._started: dict[int, GmiProcess] = {}
         self._num_gmis = 0
 
-    def open(self, launch: Launch, node: int, address: str) -> Opened:
-        """Makes what the GMIs share; returns where they will listen."""
+    def open(
+        self, launch: Launch, node: int, address: str, daemons: Mapping[str, Path]
+    ) -> Opened | BackendUnavailable:
+        """Makes what the GMIs share, or says why this machine cannot; may be called again.
+
+        Args:
+          launch: what to run.
+          node: position of this one.
+          address: where GMIs are to listen.
+          daemons: of nodes before this one, which may be on the same machine.
+        """
+        self._held.close()  # Of another backend, which another node could not have.
+        try:
+            return self._open(launch, node, address, daemons)
+        except BackendUnavailable as error:
+            self._held.close()
+            return error
+
+    def _open(
+        self, launch: Launch, node: int, address: str, daemons: Mapping[str, Path]
+    ) -> Opened:
         self._launch = launch
         own = launch.run.node(node)
         own.root.mkdir(exist_ok=True)
         self._held.callback(_remove_if_empty, own.root)
         self._blocks = shared_blocks(self._held, launch.kind, launch.plan)
-        self._backend = self._held.enter_context(open_backend(launch.plan, detect_machine(), own))
-        layout = launch.plan.layout
+        machine, layout = detect_machine(), launch.plan.layout
+        # Who starts a second daemon for a GPU has its clients take turns with those of the first.
+        machine = dataclasses.replace(machine, daemons={**daemons, **machine.daemons})
+        backend = open_backend(launch.plan, machine, own, layout.gmis_of_node[node])
+        self._backend = self._held.enter_context(backend)
+        found = dict(backend.daemons)
         if layout.num_nodes == 1:
-            return Opened((address, 0), {})
+            return Opened((address, 0), {}, found)
         self._listener = self._held.enter_context(listen(address))
         self._blocks[ENV_LISTENER_FD] = self._listener.fileno()
         calls = {
@@ -144,7 +181,7 @@ class TrainingNode(Node):
             for pair in launch.kind.calls(launch.plan)
             if layout.node_of(pair[0]) == node
         }
-        return Opened((address, self._listener.getsockname()[1]), calls)
+        return Opened((address, self._listener.getsockname()[1]), calls, found)
 
     def introduce(self, nodes: Nodes) -> None:
         """Takes the addresses of all leaders; GMIs can be started from here on."""
@@ -169,6 +206,18 @@ class TrainingNode(Node):
         if len(self._started) == self._num_gmis and self._listener is not None:
             self._listener.close()  # From here on it is their leader's alone.
         return process.pid
+
+    def verify(self, pids: Mapping[int, int]) -> tuple[int, str] | None:
+        """See `Backend.verify`; the GMI without its share, and the reason."""
+        try:
+            self._backend.verify(pids)
+        except GmiFailed as error:
+            return error.gmi, error.reason
+        return None
+
+    def terminate(self, gmi: int, pid: int) -> None:
+        """See `Backend.terminate`."""
+        self._backend.terminate(gmi, pid)
 
     def poll(self) -> dict[int, Seen]:
         """How every GMI is."""
@@ -204,7 +253,7 @@ def own_versions() -> dict[str, str | None]:
     return {
         "gmijax": __version__,
         "python": platform.python_version(),
-        **versions_of(COMPARED),
+        **versions_of((*COMPARED, *ON_GPUS)),
     }
 
 

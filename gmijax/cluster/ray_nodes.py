@@ -56,22 +56,24 @@ class RayCluster:
 
     def join(
         self,
-        num_cpus: int,
+        num_cpus: float,
         wanted: int | None,
         least: int | None = None,
         is_unwanted: Callable[[], bool] = lambda: False,
+        least_gpus: int = 0,
         most_gpus: int | None = 0,
     ) -> list[Joined]:
         """Puts an actor on each of several nodes that have so many CPUs left.
 
-        Where GPUs are wanted and there are any, only nodes with GPUs count, and each gives as many
-        as the one with the fewest has.
+        Where GPUs may be taken and there are any, only nodes with GPUs count, and each gives as
+        many as the one with the fewest has.
 
         Args:
           num_cpus: of each.
           wanted: how many nodes; None: all that have the CPUs.
           least: how many will do when the wait is over; None: `wanted`.
           is_unwanted: whether the user has asked for an end meanwhile.
+          least_gpus: of each.
           most_gpus: of each; None: all.
 
         Raises:
@@ -82,15 +84,17 @@ class RayCluster:
         deadline_s = time.monotonic() + self._config.wait_s
         least = max(1, least or wanted or 1)
         while True:
-            gpus = self._gpus_of_nodes(num_cpus, most_gpus)
+            gpus = self._gpus_of_nodes(num_cpus, least_gpus, most_gpus)
             found = len(gpus)
             is_over = time.monotonic() >= deadline_s
             if found >= (wanted or 1) or (is_over and found >= least):
                 break
             if is_over:
+                some_gpus = " and a GPU" if any(gpus) or least_gpus else ""
+                some_gpus = f" and {least_gpus} GPUs" if least_gpus > 1 else some_gpus
                 raise ConfigError(
                     f"cluster.nodes={wanted or 'auto'}: the cluster has {found} nodes with "
-                    f"{num_cpus} CPUs{' and a GPU' if any(gpus) else ''}, and no more came within "
+                    f"{num_cpus} CPUs{some_gpus}, and no more came within "
                     f"cluster.wait_s={self._config.wait_s:g} s"
                 )
             if is_unwanted():
@@ -100,6 +104,11 @@ class RayCluster:
         bundle = {"CPU": num_cpus} | ({"GPU": few} if (few := gpus[num_nodes - 1]) else {})
         self._place(bundle, num_nodes, deadline_s)
         return self._joined()
+
+    @property
+    def has_gpus(self) -> bool:
+        """Whether a node has any, as far as Ray knows."""
+        return any(self._gpus_of_nodes(0, 0, None))
 
     def leave(self) -> None:
         """Ends the actors, and with them what is left of their GMIs. Idempotent."""
@@ -148,15 +157,16 @@ class RayCluster:
             if threading.current_thread() is threading.main_thread():
                 signal.signal(signal.SIGTERM, before)  # Ray has put its own there.
 
-    def _gpus_of_nodes(self, num_cpus: int, most_gpus: int | None) -> list[int]:
+    def _gpus_of_nodes(self, num_cpus: float, least_gpus: int, most_gpus: int | None) -> list[int]:
         """GPUs to be had of each node that has the CPUs, those with the most first."""
         alive = [node["Resources"] for node in self._ray.nodes() if node["Alive"]]
         gpus = [int(own.get("GPU", 0)) for own in alive if own.get("CPU", 0) >= num_cpus]
+        gpus = [own for own in gpus if own >= least_gpus]
         if most_gpus is not None:
             gpus = [min(own, most_gpus) for own in gpus]
         return sorted(filter(None, gpus), reverse=True) or gpus
 
-    def _place(self, bundle: dict[str, int], num_nodes: int, deadline_s: float) -> None:
+    def _place(self, bundle: dict[str, float], num_nodes: int, deadline_s: float) -> None:
         ray = self._ray
         self._group = ray.util.placement_group([bundle] * num_nodes, strategy="STRICT_SPREAD")
         # Ray needs a moment also where there is room.

@@ -79,11 +79,15 @@ class RemoteNode:
             self._lose(error)
             return None
 
-    def order(self, child: int, order: str) -> None:
-        """Has it do something with a GMI or another child, without waiting for that."""
+    def tell(self, method: str, *arguments: Any) -> None:
+        """Calls a method without waiting for it; a node does one after the other."""
         if self.lost is None:
             with suppress(Exception):  # The next poll tells.
-                self._ask("order", child, order)
+                self._ask(method, *arguments)
+
+    def order(self, child: int, order: str) -> None:
+        """Has it do something with a GMI or another child, without waiting for that."""
+        self.tell("order", child, order)
 
     def look(self, child: int) -> Any:
         """The newest that its `poll` told of a child; None before the first answer."""

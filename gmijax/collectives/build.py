@@ -92,11 +92,13 @@ def _built(strategy: str, membership: Membership, control: _Lane, host: _Lane) -
         if device is None or all(stage.link in ("host", "nodes") for stage in parts):
             links = HostLinks(host, num_floats)
         else:
-            assert isinstance(control, HostExchange)  # Others are refused on several nodes.
-            assert isinstance(host, HostExchange)
             links = DeviceLinks(control, host, layout, num_floats, parts, device)
-        exchange = Exchange(links, parts, host.rank, host.world_size)
-        links.start(exchange)
+        exchange = trial = Exchange(links, parts, host.rank, host.world_size)
+        inside = [stage for stage in parts if stage.link != "nodes"]
+        if len(inside) < len(parts):
+            # Who finds that it does not work must not leave other nodes waiting for a sum.
+            trial = Exchange(links, inside, host.local.rank, host.local.world_size)
+        links.start(trial)
     except BaseException as error:
         if links is not None:
             links.close()

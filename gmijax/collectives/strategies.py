@@ -16,8 +16,7 @@ from gmijax.partition.reduction import is_even, leaders
 Kind: TypeAlias = Literal["sum", "gather", "broadcast"]
 Link: TypeAlias = Literal["host", "slots", "ring", "nodes"]
 """Through shared memory of the host, memory of the GPUs that all map, NCCL between GPUs, sockets
-between nodes."""
-
+between nodes and memory of the host in each."""
 
 Groups: TypeAlias = tuple[tuple[int, ...], ...]
 """Ranks that exchange with each other; no rank is in two of them, some may be in none."""
@@ -31,7 +30,8 @@ class Stage(NamedTuple):
         sums in the order of the group, or what its first member has.
       link: how the numbers move; slots gather and broadcast only.
       groups: ranks; those that are in none keep what they have. Stages through slots all have the
-        same ones, with every rank in one of them.
+        same ones, with every rank in one of them. Between nodes these are the groups: what is
+        summed is what their first ranks have, and all ranks get it.
     """
 
     kind: Kind
@@ -53,7 +53,8 @@ def stages(strategy: str, layout: Layout, intra: str = "host") -> Sequence[Stage
       travels is K - t buffers to each GPU, for a ring of K it would be two: it is made for
       networks whose messages cost more than their bytes.
 
-    On several nodes all of them do that inside, their first ranks sum, and give it to the others.
+    On several nodes each of them does that inside, then their first ranks sum, and give it to the
+    others of their nodes.
 
     Args:
       strategy: a key of `COSTS`.
@@ -93,7 +94,7 @@ def stages(strategy: str, layout: Layout, intra: str = "host") -> Sequence[Stage
 
 
 def _over_nodes(inside: Sequence[Stage], nodes: Groups) -> Sequence[Stage]:
-    """What one node does as done by all, a sum over their first ranks, and back."""
+    """What one node does as done by all, and the sum over nodes."""
     if len(nodes[0]) == 1:
         inside = []
     everywhere = [
@@ -104,9 +105,7 @@ def _over_nodes(inside: Sequence[Stage], nodes: Groups) -> Sequence[Stage]:
         )
         for stage in inside
     ]
-    between = Stage("sum", "nodes", (tuple(node[0] for node in nodes),))
-    back = [Stage("broadcast", "host", nodes)] if inside else []
-    return [*everywhere, between, *back]
+    return [*everywhere, Stage("sum", "nodes", nodes)]
 
 
 def _first(leader: int, group: Sequence[int]) -> tuple[int, ...]:

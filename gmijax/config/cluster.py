@@ -26,7 +26,9 @@ class ClusterConfig(KeyGroup):
         default="auto",
     )
     nodes: int | Literal["auto"] = doc(
-        "number of nodes; auto: all that have the CPUs, not with algo=a3c", default="auto", low=1
+        "number of nodes; auto: all with the CPUs and GPUs, not with algo=a3c",
+        default="auto",
+        low=1,
     )
     interface: str | None = doc(
         "network interface of the exchange between nodes, e.g. eth1; null: that of the address by "

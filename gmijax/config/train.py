@@ -79,7 +79,6 @@ class TrainConfig(KeyGroup):
     def _check_on_nodes(self) -> None:
         for key, value, allowed in (
             ("plan.template", self.plan.template, ("auto", "tcg_ex", "decoupled")),
-            ("plan.backend", self.plan.backend, ("auto", "cpu")),
             ("reduce.selection", self.reduce.selection, ("paper", "device")),
         ):
             if value not in allowed:
@@ -94,9 +93,14 @@ class TrainConfig(KeyGroup):
             if value == "auto":
                 raise ConfigError(
                     f"{key}=auto: a search is for one machine; with "
-                    f"cluster.engine={self.cluster.engine} give a number"
+                    f"cluster.engine={self.cluster.engine} give a number (gmijax.search without "
+                    "it finds one for a node)"
                 )
-
+        if isinstance(self.plan.gpus, tuple) and self.plan.backend != "cpu":
+            raise ConfigError(
+                f"plan.gpus={list(self.plan.gpus)}: Ray chooses the GPUs of nodes; expected a "
+                "number, of each node"
+            )
         if self.is_asynchronous and self.cluster.nodes == "auto":
             raise ConfigError(
                 "cluster.nodes=auto: with algo=a3c give a number, because the GPUs of all nodes "

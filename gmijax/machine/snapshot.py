@@ -60,6 +60,12 @@ class Machine:
         return self.daemons.get(device, self.operator_daemon)
 
     @property
+    def capabilities(self) -> str:
+        """Compute capabilities of its GPUs, in words."""
+        found = sorted({gpu.compute_capability for gpu in self.gpus})
+        return ", ".join(f"{major}.{minor}" for major, minor in found) or "none"
+
+    @property
     def driver_major(self) -> int:
         """The driver's branch, e.g. 580; 0 where it is not known."""
         major = (self.driver_version or "").partition(".")[0]

@@ -57,7 +57,7 @@ def place(plan: PlanConfig, num_nodes: int = 1) -> Placement:
         layout[gpu].append(gmi)
     placed = dataclasses.replace(
         plan,
-        gpus=num_gpus if indices is None else indices,
+        gpus=num_gpus if indices is None or num_nodes > 1 else indices,
         gmis_per_gpu=1,
         layout=tuple(map(tuple, layout)),
         serving_gpus=None,
@@ -79,6 +79,28 @@ def most_gmis_of_a_node(plan: PlanConfig, num_nodes: int) -> int:
     rows = place(plan, num_nodes).plan.layout
     assert rows is not None
     return max(map(len, Layout(rows, num_nodes).gmis_of_node))
+
+
+def on_fewer_nodes(plan: PlanConfig, before: int, num_nodes: int) -> PlanConfig:
+    """The wishes for as many nodes as are left, where all of them did the same.
+
+    Raises:
+      ConfigError: indices of GPUs that differ from node to node.
+    """
+    serving, training, each = plan.serving_gpus, plan.training_gpus, plan.num_gpus
+    if num_nodes >= before or not (isinstance(serving, tuple) and isinstance(training, tuple)):
+        return plan
+
+    def of_node(node: int) -> list[set[int]]:
+        return [{i % each for i in which if i // each == node} for which in (serving, training)]
+
+    if any(of_node(node) != of_node(0) for node in range(before)):
+        raise ConfigError(
+            f"plan.serving_gpus={list(serving)}, plan.training_gpus={list(training)}: are for "
+            f"{before} nodes that do not all do the same, and {num_nodes} are left"
+        )
+    left = [tuple(i for i in which if i < each * num_nodes) for which in (serving, training)]
+    return dataclasses.replace(plan, serving_gpus=left[0], training_gpus=left[1])
 
 
 def _require_whole_nodes(num_gpus: int, indices: tuple[int, ...] | None, num_nodes: int) -> None:

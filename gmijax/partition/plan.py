@@ -67,14 +67,15 @@ class Plan:
             raise ConfigError(f"plan: slices {self.slices} do not match layout {self.layout}")
         if self.roles and len(self.roles) != self.layout.num_gmis:
             raise ConfigError(f"plan: roles {self.roles} do not match layout {self.layout}")
-        for device in dict.fromkeys((share.gpu, share.device) for share in self.slices):
-            here = [share for share in self.slices if (share.gpu, share.device) == device]
+        # Two nodes of a cluster may be one machine, with one GPU.
+        for device in dict.fromkeys(share.device for share in self.slices):
+            here = [share for share in self.slices if share.device == device]
             total = sum(share.memory_fraction or 0.0 for share in here)
             if total > MAX_MEMORY_FRACTION + 1e-9:
-                part = f"{device[1]} of GPU" if self.backend == "mig" else "GPU"
+                part = f"{device} of GPU" if self.backend == "mig" else "GPU"
                 raise ConfigError(
-                    f"plan.memory_fraction: {len(here)} GMIs on {part} {device[0]} would reserve "
-                    f"{total:.2f} of its memory; at most {MAX_MEMORY_FRACTION} in sum"
+                    f"plan.memory_fraction: {len(here)} GMIs on {part} {here[0].gpu} would "
+                    f"reserve {total:.2f} of its memory; at most {MAX_MEMORY_FRACTION} in sum"
                 )
 
     def to_dict(self) -> dict[str, Any]:

@@ -6,12 +6,12 @@ import dataclasses
 from collections.abc import Collection, Mapping, Sequence
 
 from gmijax.config import BackendName, PlanConfig, ReduceConfig, TemplateName
-from gmijax.config.plan import MAX_GMIS
 from gmijax.errors import ConfigError
 from gmijax.machine.host_limits import require_room
 from gmijax.machine.nvidia import Gpu
 from gmijax.machine.snapshot import Machine
 from gmijax.partition.backend_choice import choose_backend, choose_gpus, require_backend
+from gmijax.partition.hosts import Host, divided_between_nodes, hosts_of, on_nodes
 from gmijax.partition.layout import Layout
 from gmijax.partition.plan import Plan, Slice
 from gmijax.partition.reduction import (
@@ -58,15 +58,12 @@ def make_plan(
     layout = _layout(plan)
     reasons: list[str] = list(machine.warnings)
     chosen = template if plan.template == "auto" else plan.template
-    backend = _backend(plan, layout, machine, chosen in ("tcg", "tdg"), reasons)
     if nodes is not None:
-        layout = _on_nodes(layout, chosen, backend, nodes, reasons)
-    gpus = choose_gpus(plan, layout, machine, backend, reasons) if backend != "cpu" else ()
+        layout = on_nodes(layout, chosen, nodes, reasons)
+    hosts = hosts_of(layout, machine, nodes)
+    backend = _backend(plan, hosts, chosen in ("tcg", "tdg"), reasons)
     roles = roles_of(chosen, layout, trainers)
-    if nodes is None:
-        slices = make_slices(plan, layout, gpus, backend, machine, roles, reasons)
-    else:
-        slices = _slices_of_nodes(plan, layout, backend, roles, nodes, reasons)
+    slices, gpus = _slices(plan, hosts, backend, roles, reasons)
     if plan.template == "auto":
         reasons.append(f"template {chosen}: {DESCRIPTIONS[chosen]}")
     strategy, intra = _reduction(reduce, layout, roles, backend, reasons)
@@ -80,7 +77,7 @@ def make_plan(
         intra=intra,
         roles=roles,
         reasons=tuple(reasons),
-        self_check=_self_check(plan, slices, backend, machine),
+        self_check=_self_check(plan, slices, backend, hosts),
         may_share=_may_share(plan, gpus, backend),
         nodes=tuple(nodes or ()),
     )
@@ -103,50 +100,37 @@ def num_gmis_of(plan: PlanConfig) -> tuple[int, str]:
     return num_gpus * each, f"plan.gmis_per_gpu={each}{gpus}"
 
 
-def _on_nodes(
-    layout: Layout,
-    template: TemplateName,
-    backend: BackendName,
-    nodes: Mapping[str, Machine],
-    reasons: list[str],
-) -> Layout:
-    """The layout of all nodes; `layout` is that of each, with `decoupled` of all together."""
-    if backend != "cpu":
-        raise ConfigError(
-            "cluster.engine=ray: GPUs of several nodes are not supported yet; plan.backend=cpu "
-            "goes on without them"
-        )
-    is_whole = template == "decoupled"
-    if (num_gmis := layout.num_gmis * (1 if is_whole else len(nodes))) > MAX_GMIS:
-        raise ConfigError(
-            f"cluster.nodes={len(nodes)}: makes {num_gmis} GMIs; at most {MAX_GMIS} are allowed"
-        )
-    count = f"{layout.num_gmis} GMIs " + ("on all" if is_whole else "on each")
-    reasons.append(f"nodes {', '.join(nodes)}: {count} of {len(nodes)}")
-    if is_whole:
-        return Layout(layout.gmis_of_gpu, len(nodes))
-    return layout.on_nodes(len(nodes))
-
-
-def _slices_of_nodes(
+def _slices(
     plan: PlanConfig,
-    layout: Layout,
+    hosts: Sequence[Host],
     backend: BackendName,
-    roles: tuple[str, ...],
-    nodes: Mapping[str, Machine],
+    roles: Sequence[str],
     reasons: list[str],
-) -> tuple[Slice, ...]:
-    """The share of every GMI of its node."""
+) -> tuple[tuple[Slice, ...], tuple[Gpu, ...]]:
+    """The share of every GMI of its machine, in order of id, and the GPUs of the job."""
     slices: dict[int, Slice] = {}
-    for place, (name, machine) in enumerate(nodes.items()):
-        here, gmis = layout.of_node(place), layout.gmis_of_node[place]
-        require_host(here.num_gmis, f"cluster.nodes={len(nodes)}, node {name}", plan, machine)
-        theirs = [roles[gmi] for gmi in gmis]
+    chosen: list[Gpu] = []
+    num_gpus = 0
+    for place, host in enumerate(hosts):
+        here, gpus = host.layout, ()
         said = [] if place else reasons  # What is said of all is said once.
-        for share in make_slices(plan, here, (), backend, machine, theirs, said):
-            gmi, gpu = gmis[share.gmi], share.gpu + place * here.num_gpus
+        with host.named():
+            if host.name is not None:
+                what = f"cluster.nodes={len(hosts)}"
+                require_host(here.num_gmis, what, plan, host.machine)
+            if backend != "cpu":
+                gpus = choose_gpus(plan, here, host.machine, backend, said)
+            theirs = [roles[gmi] for gmi in host.gmis]
+            shares = make_slices(plan, here, gpus, backend, host.machine, theirs, said)
+        for share in shares:
+            gmi, gpu = host.gmis[share.gmi], share.gpu + num_gpus
             slices[gmi] = dataclasses.replace(share, gmi=gmi, gpu=gpu)
-    return tuple(slices[gmi] for gmi in layout.gmis)
+        chosen += gpus
+        num_gpus += here.num_gpus
+    in_order = [slices[gmi] for gmi in sorted(slices)]
+    if plan.memory_fraction is None:
+        in_order = divided_between_nodes(in_order, reasons)
+    return tuple(in_order), tuple(chosen)
 
 
 def _layout(plan: PlanConfig) -> Layout:
@@ -163,23 +147,36 @@ def _layout(plan: PlanConfig) -> Layout:
 
 
 def _backend(
-    plan: PlanConfig, layout: Layout, machine: Machine, serves: bool, reasons: list[str]
+    plan: PlanConfig, hosts: Sequence[Host], serves: bool, reasons: list[str]
 ) -> BackendName:
-    if plan.backend == "auto":
-        backend, reason = choose_backend(plan, layout, machine, serves=serves)
-        reasons.append(f"backend {backend}: {reason}")
-        return backend
-    require_backend(plan.backend, machine)
-    return plan.backend
+    """The backend of all machines."""
+    if plan.backend != "auto":
+        for host in hosts:
+            with host.named():
+                require_backend(plan.backend, host.machine)
+        return plan.backend
+    found: dict[BackendName, tuple[str, str | None]] = {}
+    for host in hosts:
+        with host.named():
+            backend, why = choose_backend(plan, host.layout, host.machine, serves=serves)
+        found.setdefault(backend, (why, host.name))
+    if len(found) > 1 and found.keys() != {"mps", "share"}:
+        differ = ", ".join(f"{backend} on {name}" for backend, (_, name) in found.items())
+        raise ConfigError(f"plan.backend=auto: would be {differ}; give the one that all can have")
+    backend = "share" if len(found) > 1 else next(iter(found))
+    why, name = found[backend]
+    where = f" (node {name})" if len(found) > 1 else ""
+    reasons.append(f"backend {backend}: {why}{where}")
+    return backend
 
 
 def _self_check(
-    plan: PlanConfig, slices: Sequence[Slice], backend: BackendName, machine: Machine
+    plan: PlanConfig, slices: Sequence[Slice], backend: BackendName, hosts: Sequence[Host]
 ) -> bool:
     if plan.self_check != "auto":
         return plan.self_check == "on"
     # A daemon of somebody else may cap all its clients by default, and does not tell.
-    is_theirs = backend == "mps" and machine.operator_daemon is not None
+    is_theirs = backend == "mps" and any(host.machine.operator_daemon for host in hosts)
     return is_theirs or any((share.sm_percent or 100.0) < 100.0 for share in slices)
 
 
@@ -229,6 +226,7 @@ def _strategy(
     no_one_shot = why_not_under("one_shot", layout, backend)
     # With one GMI on each GPU one ring over all is as fast.
     wants_one_shot = no_ring is not None or not is_one_per_gpu(layout)
+    wants_one_shot &= layout.of_node(0).num_gmis > 1
     wants_one_shot &= reduce.selection == "device" and reduce.intra != "host"
     if wants_one_shot and no_one_shot is None:
         reasons.append(

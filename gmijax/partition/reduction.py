@@ -63,19 +63,11 @@ def select_strategy(layout: Layout) -> Choice:
 
 def why_not_strategy(strategy: str, layout: Layout) -> str | None:
     """None if `strategy` can run on `layout`, else the reason in words."""
-    if layout.num_nodes > 1 and strategy != "none":
-        return why_not_across_nodes(strategy)
-    return STRATEGIES[strategy].why_not(layout)
-
-
-def why_not_across_nodes(strategy: str) -> str | None:
-    """None if `strategy` can be what each of several nodes does inside, else the reason."""
-    if strategy == "mpr":
-        return None
-    return (
-        "on several nodes exchanges go through host memory in each of them and sockets between "
-        "them; allowed are auto, mpr"
-    )
+    if layout.num_nodes == 1 or strategy == "none":
+        return STRATEGIES[strategy].why_not(layout)
+    # It is what each node does inside; whatever that is, their leaders exchange.
+    reason = STRATEGIES[strategy].why_not(layout.of_node(0))
+    return reason and f"in each node {reason}"
 
 
 def why_not_intra(intra: str, backend: str) -> str | None:
@@ -135,13 +127,14 @@ def why_no_bindings() -> str | None:
 
 
 def needs_ring(strategy: str, layout: Layout) -> bool:
-    """Whether GMIs form rings between GPUs."""
-    return STRATEGIES[strategy].has_ring(layout)
+    """Whether GMIs form rings between GPUs, which are in every node by itself."""
+    return STRATEGIES[strategy].has_ring(layout.of_node(0))
 
 
 def is_one_per_gpu(layout: Layout) -> bool:
     """Whether one GMI on each of several GPUs trains: a ring over all is the whole exchange."""
-    return layout.num_gpus > 1 and layout.num_gmis == layout.num_gpus
+    inside = layout.of_node(0)
+    return inside.num_gpus > 1 and inside.num_gmis == inside.num_gpus
 
 
 def leaders(layout: Layout) -> tuple[int, ...]:

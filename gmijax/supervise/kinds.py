@@ -19,7 +19,7 @@ from gmijax.collectives.messages.registers import create_registers
 from gmijax.config import ServeConfig, TrainConfig
 from gmijax.errors import ConfigError
 from gmijax.machine.snapshot import Machine
-from gmijax.partition.placement import num_gmis_of, place
+from gmijax.partition.placement import num_gmis_of, on_fewer_nodes, place
 from gmijax.partition.plan import Plan
 from gmijax.partition.planner import make_plan, require_host
 from gmijax.partition.reduction import why_not_intra
@@ -110,7 +110,12 @@ def training_plan(
     _require_asynchronous(config)
     if config.plan.layout is None and nodes is None:
         require_host(*num_gmis_of(config.plan), config.plan, machine)
-    placed = place(config.plan, len(nodes or (None,)))
+    wishes, num_nodes = config.plan, 1
+    if nodes is not None:
+        assert config.cluster.nodes != "auto"
+        num_nodes = len(nodes)
+        wishes = on_fewer_nodes(wishes, config.cluster.nodes, num_nodes)
+    placed = place(wishes, num_nodes)
     plan = make_plan(
         placed.plan,
         config.reduce,
@@ -167,6 +172,8 @@ def _require_experience_for_all(topology: ChannelTopology) -> None:
 
 def why_not_device(plan: Plan) -> str | None:
     """None if experience can stay in memory of the GPUs, else the reason."""
+    if plan.layout.num_nodes > 1:
+        return "the job is on several nodes"
     if reason := why_not_intra("ipc", plan.backend):
         return reason
     topology = topology_of(plan)

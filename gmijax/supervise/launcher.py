@@ -124,16 +124,22 @@ def _enter_backend(held: ExitStack, launch: Launch) -> tuple[Launch, Backend]:
     try:
         return launch, held.enter_context(open_backend(plan, machine, run))
     except BackendUnavailable as error:
-        if not plan.may_share:
-            raise
-        warning = f"backend share: warning: {error}; so {WHAT_SHARE_LOSES}"
+        launch = taking_turns(launch, error)
+    return launch, held.enter_context(open_backend(launch.plan, machine, run))
+
+
+def taking_turns(launch: Launch, error: BackendUnavailable) -> Launch:
+    """The job with the backend `share`, in its `plan.json` too; raises `error` if it may not."""
+    plan = launch.plan
+    if not plan.may_share:
+        raise error
+    warning = f"backend share: warning: {error}; so {WHAT_SHARE_LOSES}"
     launch.on_warning(warning)
     plan = dataclasses.replace(
         plan, backend="share", may_share=False, reasons=(*plan.reasons, warning)
     )
-    write_json(run.plan, plan.to_dict())
-    launch = dataclasses.replace(launch, plan=plan)
-    return launch, held.enter_context(open_backend(plan, machine, run))
+    write_json(launch.run.plan, plan.to_dict())
+    return dataclasses.replace(launch, plan=plan)
 
 
 class StopSignals:

@@ -82,6 +82,18 @@ def test_device_memory_that_does_not_work_is_found_by_all(
             assert result["message"].endswith(said)
 
 
+def test_device_memory_that_one_node_lacks_is_used_by_none(tmp_path: Path) -> None:
+    options = {"strategy": "one_shot", "intra": "ipc", "num_calls": 2, "layout": [[0, 1], [2, 3]]}
+    special = {"special_rank": 3, "special": "forgetful", "host_if_unavailable": True}
+    with Ranks(tmp_path, 4, "check_means", num_nodes=2, **options, **special).start() as job:
+        results = job.results()
+    assert len({result["digest"] for result in results}) == 1
+    for rank, result in enumerate(results):
+        assert result["error"] is None, result
+        said = "what was written into it; so reduce.strategy=mpr through host memory"
+        assert said in (tmp_path / f"stderr_{rank}").read_text()
+
+
 def test_a_device_that_takes_no_copies_leaves_exchanges_to_the_host(tmp_path: Path) -> None:
     options = {"strategy": "one_shot", "intra": "ipc", "num_calls": 2, "goes_on": False}
     special = {"special_rank": 1, "special": "failing_queue", "host_if_unavailable": True}

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import dataclasses
 import os
+import pickle
 import signal
 import subprocess
 import sys
 import time
 from collections.abc import Callable
-from contextlib import ExitStack
+from contextlib import ExitStack, closing
 from pathlib import Path
 
 import pytest
@@ -17,6 +18,8 @@ from fake_mps import FakeMps
 from supervision import TESTS, gpu, machine, make_launch, planned
 from training_jobs import wait_until
 
+from gmijax.cluster.node import TrainingNode
+from gmijax.collectives.nodes.meeting import Nodes
 from gmijax.errors import BackendUnavailable, GmiFailed, JobInterrupted
 from gmijax.machine.mps_control import PIPE_VARIABLE, MpsControl
 from gmijax.machine.nvidia import MigInstance
@@ -26,7 +29,7 @@ from gmijax.partition.plan import Plan
 from gmijax.runs.folder import RunPaths, read_json, write_json
 from gmijax.supervise.backends import open_backend
 from gmijax.supervise.kinds import JobKind
-from gmijax.supervise.launcher import Launch, run_gmis
+from gmijax.supervise.launcher import Launch, run_gmis, taking_turns
 from gmijax.supervise.supervisor import Supervisor
 from gmijax.supervise.watched_gmi import GmiStatus
 
@@ -237,6 +240,63 @@ def test_daemon_of_somebody_else_is_used_and_left_alone(
             backend.verify({0: os.getpid()})
     finally:
         control.quit()
+
+
+def a_node(here: Machine, monkeypatch: pytest.MonkeyPatch) -> TrainingNode:
+    monkeypatch.setattr("gmijax.cluster.node.detect_machine", lambda: here)
+    return TrainingNode({}, os.getcwd(), None, "127.0.0.1")
+
+
+def test_two_nodes_of_one_machine_use_the_daemon_of_the_first(
+    mps: FakeMps, run: RunPaths, monkeypatch: pytest.MonkeyPatch
+):
+    here = machine(1, mps_control=mps.program)
+    machines = {"a": here, "a#1": here}
+    plan = planned(here, nodes=machines, backend="mps")
+    launch = make_launch(run, ["mps_client", "mps_client"], plan)
+    nodes, daemons, leaders = [a_node(here, monkeypatch) for _ in range(2)], {}, []
+    with ExitStack() as held:
+        for place, node in enumerate(nodes):
+            held.callback(node.close)
+            opened = node.open(launch, place, "127.0.0.1", daemons)
+            assert not isinstance(opened, BackendUnavailable)
+            daemons |= opened.daemons
+            leaders.append(opened.leader)
+        assert daemons.keys() == {gpu(0).uuid}
+        assert len(mps.told("start")) == 1
+        for gmi, node in enumerate(nodes):
+            node.introduce(Nodes(gmi, tuple(leaders), b"token"))
+            pid = node.start(gmi, False)
+            assert isinstance(pid, int)
+            deadline_s = time.monotonic() + 30
+            while (without := node.verify({gmi: pid})) is not None:
+                assert time.monotonic() < deadline_s, without
+        failed = nodes[1].verify({1: os.getpid()})
+        assert failed is not None
+        assert failed[0] == 1
+        assert "is no client of the MPS daemon" in failed[1]
+        nodes[1].terminate(1, pid)
+        assert [int(client) for _, client in mps.told("terminate_client")] == [pid]
+    assert len(mps.told("quit")) == 1
+    assert not [path for path in mps.pipe_directories() if path.exists()]
+
+
+def test_a_node_without_a_daemon_says_so_and_takes_turns_when_asked_again(
+    mps: FakeMps, run: RunPaths, monkeypatch: pytest.MonkeyPatch
+):
+    monkeypatch.setenv("FAKE_MPS_BROKEN", "1")
+    here = machine(1, mps_control=mps.program)
+    plan = planned(here, nodes={"a": here}, gmis_per_gpu=2)
+    assert plan.backend == "mps"
+    launch = make_launch(run, ["train", "train"], plan)
+    with closing(a_node(here, monkeypatch)) as node:
+        refused = node.open(launch, 0, "127.0.0.1", {})
+        assert isinstance(refused, BackendUnavailable)
+        assert isinstance(pickle.loads(pickle.dumps(refused)), BackendUnavailable)
+        opened = node.open(taking_turns(launch, refused), 0, "127.0.0.1", {})
+        assert not isinstance(opened, BackendUnavailable)
+        assert opened.daemons == {}
+    assert Plan.from_dict(read_json(run.plan)).backend == "share"
 
 
 def test_janitor_cleans_up_after_a_killed_controller(mps: FakeMps, run: RunPaths, tmp_path: Path):

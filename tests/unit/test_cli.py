@@ -30,6 +30,7 @@ REFUSED: list[tuple[str, str, str]] = [
     ("train", "ant", "ant: expected key=value"),
     ("train", "~env=nan", "~env=nan: expected ~env"),
     ("serve", "policy=random output.shards=1", "unknown key output.shards"),
+    ("serve", "cluster.engine=ray", "cluster.engine: this command is for one machine"),
     ("play", "vidoe=gif", "unknown key vidoe: did you mean video?"),
     ("play", "env.name=ant", "unknown key env"),
     ("play", "env=ant", "unknown key env: did you mean run.env?"),

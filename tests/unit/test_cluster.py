@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import builtins
+import dataclasses
+import json
 import os
 import signal
 from pathlib import Path
 from typing import Any
 
 import pytest
-from supervision import machine
+from supervision import gpu, machine
 
 from gmijax import compose
 from gmijax.cluster import node as nodes
@@ -18,14 +20,22 @@ from gmijax.cluster.checks import by_name, require_alike, require_shared
 from gmijax.cluster.node import Facts, Node, Seen, TrainingNode, address_of, own_versions
 from gmijax.cluster.ray_nodes import Joined, RayCluster
 from gmijax.cluster.remote_gmi import RemoteNode
+from gmijax.cluster.survey import Surveyed, differences, lines_of_nodes, nodes_as_data
 from gmijax.collectives.nodes.meeting import Nodes
-from gmijax.config import ClusterConfig, PlanConfig, ReduceConfig
+from gmijax.config import ClusterConfig, PlanConfig, ReduceConfig, TrainConfig
 from gmijax.control.restarts import with_nodes_left
-from gmijax.errors import ConfigError, GmiFailed, JobInterrupted, ReportedError
+from gmijax.errors import (
+    BackendUnavailable,
+    ConfigError,
+    GmiFailed,
+    JobInterrupted,
+    ReportedError,
+)
 from gmijax.machine.snapshot import Machine
 from gmijax.partition.plan import Plan
 from gmijax.partition.planner import make_plan
 from gmijax.runs.folder import GmiPaths
+from gmijax.supervise.environment import gmi_environment
 from gmijax.supervise.failures import describe_exit, first_cause, is_consequence
 from gmijax.supervise.heartbeat import Heartbeat
 from gmijax.supervise.kinds import JobKind, calls_of, training_plan
@@ -64,7 +74,7 @@ def joined(node: RemoteNode, versions: dict[str, str | None] | None = None) -> l
         (("cluster.address=ray://head:10001",), "must be started on a node of the cluster"),
         (("cluster.engine=ray", "algo=a3c"), "nodes=auto: with algo=a3c give a number"),
         (("cluster.engine=ray", "plan.template=tdg_ex"), "template=tdg_ex: not with cluster"),
-        (("cluster.engine=ray", "plan.backend=mps"), "allowed are auto, cpu"),
+        (("cluster.engine=ray", "plan.gpus=[1]"), r"gpus=\[1\]: Ray chooses the GPUs of nodes"),
         (("cluster.engine=ray", "num_envs=auto"), "num_envs=auto: a search is for one machine"),
         (("cluster.nodes=0",), "cluster.nodes=0: must be at least 1"),
     ],
@@ -115,7 +125,7 @@ def test_fewer_nodes_than_asked_for_are_refused_once_the_wait_is_over(
         @staticmethod
         def nodes() -> list[dict[str, Any]]:
             return [
-                {"Alive": True, "Resources": {"CPU": 4.0}},
+                {"Alive": True, "Resources": {"CPU": 4.0, "GPU": 1.0}},
                 {"Alive": True, "Resources": {"CPU": 1.0}},
                 {"Alive": False, "Resources": {"CPU": 4.0}},
             ]
@@ -130,6 +140,9 @@ def test_fewer_nodes_than_asked_for_are_refused_once_the_wait_is_over(
         cluster.join(2, 2)
     with pytest.raises(ConfigError, match="nodes=auto: the cluster has 0 nodes with 8 CPUs"):
         cluster.join(8, None)
+    with pytest.raises(ConfigError, match=r"nodes=auto: .* has 0 nodes with 2 CPUs and 2 GPUs"):
+        cluster.join(2, None, least_gpus=2, most_gpus=2)
+    assert cluster.has_gpus
     patient = RayCluster(ClusterConfig(wait_s=100.0), Node)
     with pytest.raises(JobInterrupted, match="while it waited for nodes"):
         patient.join(2, 2, is_unwanted=lambda: True)
@@ -144,6 +157,45 @@ def test_nodes_with_other_versions_are_refused() -> None:
     nodes = joined(a_node(), {**own_versions(), "jax": "0.1"})
     with pytest.raises(ConfigError, match=r"node 10\.0\.0\.2 has jax 0\.1, this one has"):
         require_alike(nodes)
+
+
+def test_packages_for_gpus_are_compared_between_nodes_that_have_some() -> None:
+    versions = {**own_versions(), "jax-cuda13-plugin": "0.9"}
+    facts = [
+        Facts(name, machine(1), versions | {"cuda-bindings": bindings})
+        for name, bindings in (("a", "13.0"), ("b", "13.1"))
+    ]
+    nodes = [Joined(RemoteNode(a_node().call, 0, one.address), one) for one in facts]
+    require_alike(nodes[:1])
+    with pytest.raises(ConfigError, match=r"node b has cuda-bindings 13\.1, node a has 13\.0"):
+        require_alike(nodes)
+    without = [Joined(one.remote, one.facts._replace(machine=machine(0))) for one in nodes]
+    require_alike(without)
+
+
+def test_the_doctor_says_in_what_nodes_differ() -> None:
+    own = own_versions()
+    nodes = {
+        "a": Surveyed(Facts("a", machine(2), own), 0.01),
+        "b": Surveyed(Facts("b", machine(1), {**own, "jax": "0.1", "cuda-bindings": "13"}), -90.0),
+        "c": Surveyed(Facts("c", machine(0), own), 0.0),
+    }
+    problems, notes = differences(nodes)
+    assert problems == [
+        f"nodes differ in jax: {own['jax']} on a, c; 0.1 on b",
+        "nodes differ in cuda-bindings: none on a; 13 on b",
+    ]
+    assert notes == [
+        "nodes differ in GPUs: 2 x H200 on a; 1 x H200 on b; none on c",
+        "nodes differ in NVIDIA driver: 580.159.03 on a, b; none on c",
+        "the clock of b is -90.0 s from that of this machine",
+    ]
+    alike = {name: node for name, node in nodes.items() if name == "a"}
+    assert differences(alike) == ([], [])
+    [line] = lines_of_nodes(alike)
+    assert line.startswith(f"node a: gmijax {own['gmijax']}, Python")
+    assert line.endswith("GPUs 2 x H200, clock +0.010 s")
+    json.dumps(nodes_as_data(nodes))
 
 
 def test_a_run_folder_that_a_node_does_not_see_is_refused(
@@ -182,15 +234,74 @@ def test_the_plan_of_nodes_has_each_nodes_shares_under_global_ids() -> None:
     assert Plan.from_dict(plan.to_dict()) == plan
     old = {key: value for key, value in plan.to_dict().items() if key != "nodes"}
     assert Plan.from_dict(old | {"layout": [[0, 1], [2, 3]]}).layout.num_nodes == 1
-    with pytest.raises(ConfigError, match=r"har: cannot run on layout .*allowed are auto, mpr"):
-        make_plan(settings[0], ReduceConfig(strategy="har"), 16, machine(0), nodes=here)
-    with pytest.raises(ConfigError, match="GPUs of several nodes are not supported yet"):
-        make_plan(*settings, machine(1), nodes={"a": machine(1)})
+    with pytest.raises(ConfigError, match=r"mrr: cannot run on layout .*: in each node its rings"):
+        make_plan(settings[0], ReduceConfig(strategy="mrr"), 16, machine(0), nodes=here)
+
+
+def gpus_of_nodes(*num_gpus: int, **changes: Any) -> dict[str, Machine]:
+    """Nodes whose GPUs are all different, with MPS."""
+    nodes: dict[str, Machine] = {}
+    for place, count in enumerate(num_gpus):
+        gpus = tuple(
+            gpu(index)._replace(uuid=f"GPU-{place}-{index}", **changes) for index in range(count)
+        )
+        nodes[f"10.0.0.{place}"] = machine(count, gpus=gpus, mps_control=Path("/mps"))
+    return nodes
+
+
+def plan_on(nodes: dict[str, Machine], **settings: Any) -> Plan:
+    first = next(iter(nodes.values()))
+    return make_plan(PlanConfig(**settings), ReduceConfig(), 16, first, nodes=nodes)
+
+
+def test_gmis_of_nodes_share_the_gpus_of_their_node() -> None:
+    plan = plan_on(gpus_of_nodes(2, 3), gpus=2, gmis_per_gpu=2)
+    assert plan.backend == "mps"
+    devices = [share.device for share in plan.slices]
+    assert devices == [f"GPU-{node}-{gpu}" for node in (0, 1) for gpu in (0, 1) for _ in range(2)]
+    assert [share.gpu for share in plan.slices] == [0, 0, 1, 1, 2, 2, 3, 3]
+    assert {share.memory_fraction for share in plan.slices} == {0.4}
+    variables = gmi_environment(plan, 5, {}, Path("/cache"), {})
+    assert variables["CUDA_VISIBLE_DEVICES"] == "GPU-1-0"
+    assert variables["XLA_CLIENT_MEM_FRACTION"] == "0.4"
+    assert Plan.from_dict(plan.to_dict()) == plan
+
+
+def test_a_gpu_of_two_nodes_of_one_machine_has_half_of_its_memory_for_each() -> None:
+    nodes = {"a": machine(1), "a#1": machine(1)}
+    plan = plan_on(nodes, backend="share", gmis_per_gpu=2)
+    assert [share.memory_fraction for share in plan.slices] == [0.2] * 4
+    assert "nodes of one machine have the same GPUs, and divide their memory" in plan.reasons
+    with pytest.raises(ConfigError, match=r"4 GMIs on GPU 0 would reserve 1.20 of its memory"):
+        plan_on(nodes, backend="share", gmis_per_gpu=2, memory_fraction=0.3)
+
+
+def test_nodes_that_cannot_do_the_same_take_turns_or_are_refused_by_name() -> None:
+    nodes = gpus_of_nodes(1, 1)
+    bare = dataclasses.replace(nodes["10.0.0.1"], mps_control=None, driver_version="575.1")
+    plan = plan_on({**nodes, "10.0.0.1": bare}, gmis_per_gpu=2)
+    assert plan.backend == "share"
+    assert any("take turns" in why and "(node 10.0.0.1)" in why for why in plan.reasons)
+    said = "warning: node 10.0.0.1 has NVIDIA driver 575.1, node 10.0.0.0 580.159.03"
+    assert said in plan.reasons
+    with pytest.raises(
+        BackendUnavailable, match=r"node 10\.0\.0\.1: plan\.backend=mps: nvidia-cuda"
+    ):
+        plan_on({**nodes, "10.0.0.1": bare}, backend="mps", gmis_per_gpu=2)
+    with pytest.raises(ConfigError, match=r"node 10\.0\.0\.1: plan\.gpus=2: .* 1 usable"):
+        plan_on(gpus_of_nodes(2, 1), gpus=2)
+    old = gpus_of_nodes(1, 1, compute_capability=(8, 0))["10.0.0.1"]
+    with pytest.raises(ConfigError, match=r"10\.0\.0\.1 has GPUs of compute capability 8\.0"):
+        plan_on({**nodes, "10.0.0.1": old})
+
+
+def asynchronous_config(*overrides: str, nodes: int) -> TrainConfig:
+    settings = ("env=ball_balance", "algo=a3c", "cluster.engine=ray", "num_envs=16")
+    return compose(*settings, f"cluster.nodes={nodes}", *overrides)
 
 
 def asynchronous_plan(*overrides: str, nodes: int = 2) -> Plan:
-    settings = ("env=ball_balance", "algo=a3c", "cluster.engine=ray", "num_envs=16")
-    config = compose(*settings, f"cluster.nodes={nodes}", *overrides)
+    config = asynchronous_config(*overrides, nodes=nodes)
     machines = {f"10.0.0.{node}": machine(0) for node in range(nodes)}
     return training_plan(config, machine(0), nodes=machines)
 
@@ -238,6 +349,7 @@ def test_who_calls_whom_over_nodes() -> None:
             "as many of them",
         ),
         (("channel.transport=zmq",), "TCP without being told"),
+        (("channel.transport=device",), "device: the job is on several nodes; use memory"),
         (("plan.layout=[[0]]",), "with the decoupled template give"),
     ],
 )
@@ -246,6 +358,34 @@ def test_placements_that_nodes_cannot_have_are_refused(
 ) -> None:
     with pytest.raises(ConfigError, match=message):
         asynchronous_plan(*overrides)
+
+
+@pytest.mark.parametrize(
+    ("overrides", "left", "of_nodes"),
+    [
+        ((), 1, [[0, 1]]),
+        (("plan.serving_gpus=[0,1,2]", "plan.training_gpus=[0,1,2]"), 1, [[0, 1]]),
+        (
+            ("plan.gpus=2", "plan.serving_gpus=[0,2,4]", "plan.training_gpus=[1,3,5]"),
+            *(2, [[0, 2], [1, 3]]),
+        ),
+        (("plan.serving_gpus=[0,1]", "plan.training_gpus=[2]"), 2, None),
+        (("plan.serving_gpus=2", "plan.training_gpus=1"), 2, None),
+    ],
+)
+def test_agents_and_trainers_go_on_with_the_nodes_that_are_left(
+    overrides: tuple[str, ...], left: int, of_nodes: list[list[int]] | None
+) -> None:
+    config = asynchronous_config(*overrides, nodes=3)
+    plan = training_plan(config, machine(0), nodes=dict.fromkeys("abc", machine(0)))
+    nodes = dict.fromkeys("abc"[:left], machine(0))
+    if of_nodes is None:
+        with pytest.raises(ConfigError, match=r"plan\.serving_gpus.*, plan\.training_gpus"):
+            with_nodes_left(config, plan, nodes)
+    else:
+        again, [note] = with_nodes_left(config, plan, nodes)
+        assert [node["gmis"] for node in again.nodes_data()] == of_nodes
+        assert note.startswith(f"{3 - left} nodes of the job are gone: going on with {left}")
 
 
 def test_nodes_know_the_calls_and_count_leaders_among_those_that_train() -> None:
@@ -309,8 +449,9 @@ def test_a_node_starts_polls_and_ends_gmis(
     assert isinstance(launch.kind, JobKind)
     node = TrainingNode({"JAX_THING": "1"}, str(tmp_path), None, "127.0.0.1")
     assert os.environ["JAX_THING"] == "1"
-    opened = node.open(launch, 0, "127.0.0.1")
-    assert opened.calls == {}
+    opened = node.open(launch, 0, "127.0.0.1", {})
+    assert not isinstance(opened, BackendUnavailable)
+    assert (opened.calls, opened.daemons) == ({}, {})
     node.introduce(Nodes(0, (opened.leader,), b"token"))
     pid = node.start(0, False)
     assert isinstance(pid, int)

@@ -194,8 +194,17 @@ def test_a_layout_on_nodes_has_global_ids_and_ranks_in_nodes() -> None:
 def test_the_stages_of_nodes_are_those_of_har_on_as_many_gpus() -> None:
     assert stages("mpr", Layout.even(1, 2).on_nodes(2)) == [
         Stage("sum", "host", ((0, 1), (2, 3))),
-        Stage("sum", "nodes", ((0, 2),)),
-        Stage("broadcast", "host", ((0, 1), (2, 3))),
+        Stage("sum", "nodes", ((0, 1), (2, 3))),
     ]
-    assert stages("mpr", Layout.even(1, 1).on_nodes(3)) == [Stage("sum", "nodes", ((0, 1, 2),))]
-    assert "allowed are auto, mpr" in str(why_not_strategy("har", Layout.even(1, 2).on_nodes(2)))
+    assert stages("mpr", Layout.even(1, 1).on_nodes(3)) == [
+        Stage("sum", "nodes", ((0,), (1,), (2,)))
+    ]
+    assert stages("har", Layout.even(2, 1).on_nodes(2), "ipc") == [
+        Stage("gather", "slots", ((0,), (1,), (2,), (3,))),
+        Stage("gather", "ring", ((0, 1), (2, 3))),
+        Stage("sum", "nodes", ((0, 1), (2, 3))),
+    ]
+    assert why_not_strategy("har", Layout.even(1, 2).on_nodes(2)) is None
+    assert "in each node its rings go" in str(
+        why_not_strategy("mrr", Layout.even(1, 2).on_nodes(2))
+    )

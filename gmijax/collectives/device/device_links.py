@@ -22,6 +22,7 @@ from gmijax.collectives.device.nccl_ring import NcclRing
 from gmijax.collectives.device.shared_slots import SharedSlots, agreed
 from gmijax.collectives.host.host_exchange import HostExchange
 from gmijax.collectives.host.host_links import HostLinks
+from gmijax.collectives.nodes.node_exchange import NodeExchange
 from gmijax.collectives.program import Exchange, ProgramPeers
 from gmijax.collectives.strategies import Groups, Stage
 from gmijax.collectives.waits import Fence
@@ -76,19 +77,21 @@ class Device(NamedTuple):
     Attributes:
       new_memory: makes or opens memory that processes share.
       new_queue: adds work to streams, with flags [whole pages, line].
-      new_ring: makes this rank's ring; all ranks of the job call it, and get None if they are in
-        none of the groups. None itself where rings go through the host.
+      new_ring: makes this rank's ring, from groups of ranks in the node; all ranks of the job
+        call it, and get None if they are in none of the groups. None itself where rings go
+        through the host.
     """
 
     new_memory: NewMemory
     new_queue: Callable[[npt.NDArray[np.uint32]], CudaQueue]
-    new_ring: Callable[[HostExchange, Groups], NcclRing | None] | None
+    new_ring: Callable[[HostExchange | NodeExchange, Groups], NcclRing | None] | None
 
 
 class DeviceLinks(HostLinks):
     """Links of strategies that leave the host; all ranks of the job make theirs together.
 
-    Stages through the host go the way of `HostLinks`, and so do rings on a CPU.
+    Stages through the host and between nodes go the way of `HostLinks`, and so do rings on a CPU.
+    What lies on a device's stream is of one node, by ranks in the node.
 
     Args:
       control: this rank's use of the shared block from outside of programs.
@@ -105,17 +108,17 @@ class DeviceLinks(HostLinks):
 
     def __init__(
         self,
-        control: HostExchange,
-        host: HostExchange,
+        control: HostExchange | NodeExchange,
+        host: HostExchange | NodeExchange,
         layout: Layout,
         num_floats: int,
         stages: Sequence[Stage],
         device: Device,
     ) -> None:
         super().__init__(host, num_floats)
-        self._control = control
+        self._control, self._here = control, control.local
         self._device = device
-        self._runner = LockstepRunner(control, num_floats)
+        self._runner = LockstepRunner(self._here, num_floats)
         self._queue: CudaQueue | None = None
         self._order: Order | None = None
         self._slots: SharedSlots | None = None
@@ -125,7 +128,9 @@ class DeviceLinks(HostLinks):
                 self._slots = self._new_slots(layout, stages, device.new_memory)
             if (new_ring := device.new_ring) is not None:
                 rings = {stage.groups for stage in stages if stage.link == "ring"}
-                self._rings = {groups: new_ring(control, groups) for groups in sorted(rings)}
+                self._rings = {
+                    groups: new_ring(control, control.of_node(groups)) for groups in sorted(rings)
+                }
         except BaseException:
             self.close()
             raise
@@ -133,9 +138,9 @@ class DeviceLinks(HostLinks):
     def _new_slots(
         self, layout: Layout, stages: Sequence[Stage], new_memory: NewMemory
     ) -> SharedSlots:
-        rank = self._control.rank
+        rank, layout = self._here.rank, layout.of_node(0)
         groups = next(stage.groups for stage in stages if stage.link == "slots")
-        group = next(group for group in groups if rank in group)
+        group = next(group for group in self._control.of_node(groups) if rank in group)
         owners = group[:1]
         if len(group) == layout.num_gmis:
             # On every GPU: the own first, then the following ones, so that not all write to one.
@@ -143,10 +148,10 @@ class DeviceLinks(HostLinks):
             owners = first[near:] + first[:near]
         return SharedSlots(self._control, self.room, group, owners, new_memory, _WISH)
 
-    def start(self, exchange: Exchange) -> None:
+    def start(self, trial: Exchange) -> None:
         """See `HostLinks`."""
         agreed(self._control, _WISH, self._open)
-        failure = self._runner.settle(lambda: self._try(exchange))
+        failure = self._runner.settle(lambda: self._try(trial))
         agreed(self._control, _WISH, lambda: _raise(failure))
         self.exchange_s()  # Not a part of the first step.
 
@@ -198,23 +203,25 @@ class DeviceLinks(HostLinks):
         if self._queue is None or self._order is None:
             raise RuntimeError("the exchange is closed")
         if (peer := self._order.come_to(place, num_floats)) is not None:
+            rank = self._control.rank
+            other = peer - self._here.rank + rank
             raise RuntimeError(
-                f"rank {self._control.rank} and rank {peer} have come to their exchanges in "
-                f"different orders; here it is number {place} of its program, with {num_floats} "
-                "floats"
+                f"rank {rank} and rank {other} have come to their exchanges in different orders; "
+                f"here it is number {place} of its program, with {num_floats} floats"
             )
         self._queue.start_clock(stream)
         yield self._queue
         self._queue.stop_clock(stream)
 
     def _open(self) -> bytes:
-        self._queue = self._device.new_queue(self._control.flags)
-        self._order = Order(self._control.flags, self._control.rank, self._control.world_size)
+        here = self._here
+        self._queue = self._device.new_queue(here.flags)
+        self._order = Order(here.flags, here.rank, here.world_size)
         return b""
 
     def _try(self, exchange: Exchange) -> Exception | None:
-        """First exchanges of known numbers; what went wrong with them."""
-        rank, world_size = self._control.rank, self._control.world_size
+        """First exchanges of known numbers in this node; what went wrong with them."""
+        rank, world_size = self._here.rank, self._here.world_size
 
         def trial(values: jax.Array) -> tuple[jax.Array, jax.Array]:
             peers = ProgramPeers(exchange, jnp.asarray(rank))
@@ -225,10 +232,10 @@ class DeviceLinks(HostLinks):
             gathered, mean = jax.jit(trial)(jnp.full(self.room, rank + 1, jnp.float32))
             is_right = np.array_equal(gathered, np.arange(1, world_size + 1))
             is_right &= np.allclose(mean, (world_size + 1) / 2, rtol=1e-5)
-            if not is_right and not (self._control.flags[:, 0] == _FREE).any():
+            if not is_right and not (self._here.flags[:, 0] == _FREE).any():
                 raise RuntimeError("shared GPU memory does not hold what was written into it")
         except Exception as error:  # Whatever it is, the host can take part instead.
-            self._control.flags[rank, 0] = _FREE  # The others' devices wait for it.
+            self._here.flags[rank, 0] = _FREE  # The others' devices wait for it.
             return error
         return None
 

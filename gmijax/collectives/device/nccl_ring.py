@@ -7,6 +7,7 @@ from typing import Any
 
 from gmijax.collectives.device.shared_slots import agreed
 from gmijax.collectives.host.host_exchange import HostExchange
+from gmijax.collectives.nodes.node_exchange import NodeExchange
 from gmijax.collectives.strategies import Groups
 
 _WISH = "rings between GPUs"
@@ -43,17 +44,20 @@ class NcclRing:
         self._comm = None
 
 
-def nccl_ring(host: HostExchange, groups: Groups) -> NcclRing | None:
+def nccl_ring(host: HostExchange | NodeExchange, groups: Groups) -> NcclRing | None:
     """Meets the other members of this rank's group; all ranks of the job call it.
+
+    On several nodes rings are in each of them, and `groups` are of ranks in the node.
 
     Raises:
       DeviceMemoryUnavailable: NCCL is not to be had, or refuses; on all ranks alike.
     """
     found: list[NcclRing] = []
-    group = next((group for group in groups if host.rank in group), ())
+    rank = host.local.rank
+    group = next((group for group in groups if rank in group), ())
 
     def make_id() -> bytes:
-        if not group or group[0] != host.rank:
+        if not group or group[0] != rank:
             return b""
         return bytes(_nccl().get_unique_id())
 
@@ -61,7 +65,7 @@ def nccl_ring(host: HostExchange, groups: Groups) -> NcclRing | None:
         if group:
             nccl = _nccl()
             unique = nccl.UniqueId.from_buffer(ids[group[0]][:_ID_BYTES].tobytes())
-            place = group.index(host.rank)
+            place = group.index(rank)
             found.append(NcclRing(nccl, nccl.comm_init_rank(len(group), unique, place)))
         return b""
 

@@ -12,6 +12,7 @@ import numpy.typing as npt
 
 from gmijax.collectives.device.device_memory import TICKET_BYTES, NewMemory
 from gmijax.collectives.host.host_exchange import HostExchange
+from gmijax.collectives.nodes.node_exchange import NodeExchange
 from gmijax.collectives.waits import fence, wait_until
 from gmijax.errors import DeviceMemoryUnavailable, PeerLost
 
@@ -36,7 +37,7 @@ class SharedSlots:
     a rank that writes a slot again has seen the flags of the exchange in between, which come
     after all that had been read of the one before.
 
-    All ranks of the job make theirs together.
+    All ranks of the job make theirs together; on several nodes ranks are those in the node.
 
     Args:
       host: this rank's use of the shared block, to hand the blocks around.
@@ -53,7 +54,7 @@ class SharedSlots:
 
     def __init__(
         self,
-        host: HostExchange,
+        host: HostExchange | NodeExchange,
         num_floats: int,
         members: Sequence[int],
         owners: Sequence[int],
@@ -61,12 +62,13 @@ class SharedSlots:
         wish: str,
     ) -> None:
         self._row_bytes = -(-num_floats // FLOATS_PER_ROW_UNIT) * FLOATS_PER_ROW_UNIT * 4
-        self._members, self._rank = tuple(members), host.rank
-        self._owners, self._is_owner = tuple(owners), host.rank == owners[0]
+        here = host.local
+        self._members, self._rank = tuple(members), here.rank
+        self._owners, self._is_owner = tuple(owners), here.rank == owners[0]
         self._memories: list[CudaMemory] = []
         self._num_writes = 0
-        self._host: HostExchange | None = host
-        host.flags[host.rank, 1] = 0
+        self._host: HostExchange | None = here
+        here.flags[here.rank, 1] = 0
         try:
             tickets = agreed(host, wish, lambda: self._make(new_memory))
             agreed(host, wish, lambda: self._map(tickets))
@@ -162,10 +164,20 @@ class SharedSlots:
         return b""
 
 
-def agreed(host: HostExchange, wish: str, step: Callable[[], bytes]) -> npt.NDArray[np.uint8]:
-    """Does a step of the start; returns what it returned on every rank [K, NOTE_BYTES].
+def agreed(
+    host: HostExchange | NodeExchange, wish: str, step: Callable[[], bytes]
+) -> npt.NDArray[np.uint8]:
+    """Does a step of the start; returns what it returned on the ranks of this node.
 
     All ranks of the job call this, and they go on together or not at all.
+
+    Args:
+      host: this rank's use of the shared block.
+      wish: what cannot be had if the step fails, for the message.
+      step: returns at most NOTE_BYTES.
+
+    Returns:
+      [k, NOTE_BYTES], by rank in the node.
 
     Raises:
       DeviceMemoryUnavailable: it failed on one of them, and why it did there.
@@ -184,4 +196,5 @@ def agreed(host: HostExchange, wish: str, step: Callable[[], bytes]) -> npt.NDAr
     if failed := np.flatnonzero(everyone[:, 0]).tolist():
         why = notes[failed[0]].tobytes().rstrip(b"\0").decode(errors="replace")
         raise DeviceMemoryUnavailable(f"{wish}: rank {failed[0]}: {why}")
-    return notes
+    first = host.rank - host.local.rank
+    return notes[first : first + host.local.world_size]

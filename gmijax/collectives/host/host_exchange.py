@@ -135,6 +135,15 @@ class HostExchange:
         """See `SharedBlock`."""
         return self._open_block("flags").flags
 
+    @property
+    def local(self) -> HostExchange:
+        """This one: all ranks are of its host. See `NodeExchange`."""
+        return self
+
+    def of_node(self, groups: Groups) -> Groups:
+        """The groups: all ranks are of this host. See `NodeExchange`."""
+        return groups
+
     def is_gone(self, peer: int) -> bool:
         """Whether an attached peer has closed its exchange, or its process has ended."""
         return not process_of(self._open_block("is_gone").lines[peer]).is_running()

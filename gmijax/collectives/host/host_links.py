@@ -39,8 +39,8 @@ class HostLinks:
         self._failure: GmijaxError | None = None
         self._exchange_s = 0.0
 
-    def start(self, exchange: Exchange) -> None:
-        """Tries the links, together with all other ranks; nothing here can fail.
+    def start(self, trial: Exchange) -> None:
+        """Tries the links by exchanges in the node, together with all other ranks.
 
         Raises:
           DeviceMemoryUnavailable: they do not work; on all ranks alike.
@@ -104,7 +104,7 @@ class HostLinks:
     def _reduce(self, stage: Stage, place: int, values: FloatBuffer, result: FloatBuffer) -> None:
         if stage.link == "nodes":
             assert isinstance(self._host, NodeExchange)
-            self._host.sum_between_nodes(values, result, place)
+            self._host.sum_of_nodes(values, result, stage.groups, place)
             return
         if stage.kind == "gather":
             result = result.reshape(-1, values.size)

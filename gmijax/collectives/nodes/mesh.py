@@ -53,6 +53,11 @@ class Mesh:
         self._timeout_s, self._rendezvous_timeout_s = timeout_s, rendezvous_timeout_s
         self._on_wait = on_wait
         self._calls = 0
+        self._first_call = 1
+
+    def restart(self) -> None:
+        """Says that the calls so far belong to the start: the next one is the first."""
+        self._first_call = self._calls + 1
 
     def gather(self, values: FloatBuffer) -> FloatBuffer:
         """Returns [N, n]: `values` [n] of every node, in order."""
@@ -118,7 +123,8 @@ class Mesh:
 
     def _wait(self, swap: _Swap, operation: str) -> None:
         started_s = beat_s = time.monotonic()
-        timeout_s = self._timeout_s if self._calls > 1 else self._rendezvous_timeout_s
+        is_first = self._calls <= self._first_call
+        timeout_s = self._rendezvous_timeout_s if is_first else self._timeout_s
         while missing := swap.step():
             now_s = time.monotonic()
             if now_s - beat_s >= LIVENESS_PERIOD_S:

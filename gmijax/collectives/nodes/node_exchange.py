@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from gmijax.collectives.host.host_exchange import HostExchange
+from gmijax.collectives.host.shared_block import MAX_GATHER_FLOATS
 from gmijax.collectives.interface import FloatBuffer
 from gmijax.collectives.nodes.mesh import Mesh
 from gmijax.collectives.strategies import Groups
@@ -16,6 +17,9 @@ class NodeExchange:
 
     Groups are of ranks of the whole job; those of a sum, a gather or a broadcast lie in one node.
 
+    Attributes:
+      local: the use of the block of the node, by ranks in the node.
+
     Args:
       local: this rank's use of the block of its node.
       layout: of the job.
@@ -25,47 +29,63 @@ class NodeExchange:
 
     def __init__(self, local: HostExchange, layout: Layout, rank: int, mesh: Mesh | None) -> None:
         self.rank, self.world_size = rank, layout.num_gmis
-        self._local, self._mesh = local, mesh
+        self.local, self._mesh = local, mesh
         self._here = layout.gmis_of_node[layout.node_of(rank)]
 
     def sum(
         self, source: FloatBuffer, target: FloatBuffer, groups: Groups, place: int = 0
     ) -> None:
         """See `HostExchange`."""
-        self._local.sum(source, target, self._of_node(groups), place)
+        self.local.sum(source, target, self.of_node(groups), place)
 
     def broadcast(
         self, source: FloatBuffer, target: FloatBuffer, groups: Groups, place: int = 0
     ) -> None:
         """See `HostExchange`."""
-        self._local.broadcast(source, target, self._of_node(groups), place)
+        self.local.broadcast(source, target, self.of_node(groups), place)
 
     def gather(
         self, source: FloatBuffer, target: FloatBuffer, groups: Groups, place: int = 0
     ) -> None:
         """See `HostExchange`."""
-        self._local.gather(source, target, self._of_node(groups), place)
+        self.local.gather(source, target, self.of_node(groups), place)
 
-    def sum_between_nodes(self, source: FloatBuffer, target: FloatBuffer, place: int) -> None:
-        """Writes the sum over leaders of `source` [n] into `target` [n]; for others `source`."""
-        target[:] = source if self._mesh is None else self._mesh.sum(source, place)
+    def sum_of_nodes(
+        self, source: FloatBuffer, target: FloatBuffer, groups: Groups, place: int
+    ) -> None:
+        """Writes the sum over nodes into `target` [n], of what their leaders have as `source`."""
+        total = source if self._mesh is None else self._mesh.sum(source, place)
+        if self.local.world_size > 1:
+            self.broadcast(total, target, groups, place)
+        else:
+            target[:] = total
 
     def all_gather(self, values: FloatBuffer) -> FloatBuffer:
-        """Returns [K, M]: `values` [M] float32 of every rank, K M <= `MAX_GATHER_FLOATS`."""
-        here = self._local.all_gather(values)
+        """Returns [K, M]: `values` [M] float32 of every rank, M <= `MAX_GATHER_FLOATS`."""
+        here = self.local.all_gather(values)
         everywhere = np.zeros(self.world_size * values.size, np.float32)
         if self._mesh is not None:
             everywhere[:] = self._mesh.gather(here.ravel()).ravel()
-        # The leader is the first of its node.
-        return self._local.all_gather(everywhere)[0].reshape(self.world_size, -1)
+        for start in range(0, everywhere.size, MAX_GATHER_FLOATS):
+            piece = everywhere[start : start + MAX_GATHER_FLOATS]
+            piece[:] = self.local.all_gather(piece)[0]  # The leader is the first of its node.
+        return everywhere.reshape(self.world_size, -1)
+
+    def introduce(self, values: FloatBuffer) -> FloatBuffer:
+        """See `HostExchange`."""
+        gathered = self.all_gather(values)
+        self.local.barrier.restart()
+        if self._mesh is not None:
+            self._mesh.restart()
+        return gathered
 
     def close(self) -> None:
         """Gives the memory back and hangs up. Idempotent."""
-        self._local.close()
+        self.local.close()
         if self._mesh is not None:
             self._mesh.close()
 
-    def _of_node(self, groups: Groups) -> Groups:
+    def of_node(self, groups: Groups) -> Groups:
         """Those groups that are of this node, with ranks in the node."""
         first = self._here[0]
         return tuple(

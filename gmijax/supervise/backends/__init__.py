@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from types import MappingProxyType
 
 from gmijax.config import BackendName
@@ -17,10 +17,18 @@ BACKENDS: Mapping[BackendName, type[Backend]] = MappingProxyType(
 )
 
 
-def open_backend(plan: Plan, machine: Machine, run: RunPaths) -> Backend:
+def open_backend(
+    plan: Plan, machine: Machine, run: RunPaths, gmis: Collection[int] | None = None
+) -> Backend:
     """The backend of a plan, to be entered with `with`.
+
+    Args:
+      plan: what is to be enforced.
+      machine: this one.
+      run: where logs go.
+      gmis: those of this machine; None: all of the plan.
 
     Raises:
       BackendUnavailable: it cannot be had on this machine.
     """
-    return BACKENDS[plan.backend](plan, machine, run)
+    return BACKENDS[plan.backend](plan, machine, run, gmis)

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
+from pathlib import Path
 from typing import Any, Self
 
 from gmijax.machine.snapshot import Machine
@@ -21,8 +22,10 @@ class Backend:
       BackendUnavailable: it cannot be had on this machine; nothing is left behind.
     """
 
-    def __init__(self, plan: Plan, machine: Machine, run: RunPaths) -> None:
-        del machine
+    def __init__(
+        self, plan: Plan, machine: Machine, run: RunPaths, gmis: Collection[int] | None = None
+    ) -> None:
+        del machine, gmis
         self.plan = plan
         self.run = run
         self._janitor: JanitorLink | None = None
@@ -37,6 +40,11 @@ class Backend:
         if self._janitor is not None:
             self._janitor.dismiss()
             self._janitor = None
+
+    @property
+    def daemons(self) -> Mapping[str, Path]:
+        """Pipe directories of the daemons in use, by UUID of the GPU or MIG instance."""
+        return {}
 
     def environment(self, gmi: int) -> Mapping[str, str]:
         """The backend's own environment variables of a GMI."""

@@ -40,18 +40,18 @@ class MpsBackend(Backend):
       plan: its slices name the devices.
       machine: where the control program is, and whether somebody's daemon runs.
       run: logs go below its `mps` folder.
-      clients: those GMIs that are clients of a daemon; None for all.
+      gmis: those that are clients of a daemon; None for all.
 
     Raises:
       BackendUnavailable: the control program is not installed.
     """
 
     def __init__(
-        self, plan: Plan, machine: Machine, run: RunPaths, clients: Collection[int] | None = None
+        self, plan: Plan, machine: Machine, run: RunPaths, gmis: Collection[int] | None = None
     ) -> None:
         super().__init__(plan, machine, run)
-        clients = plan.layout.gmis if clients is None else clients
-        self._devices = {gmi: plan.slices[gmi].device for gmi in clients}
+        gmis = plan.layout.gmis if gmis is None else gmis
+        self._devices = {gmi: plan.slices[gmi].device for gmi in gmis}
         if machine.mps_control is None and self._devices:
             raise BackendUnavailable(
                 f"plan.backend={plan.backend}: nvidia-cuda-mps-control was not found"
@@ -88,6 +88,12 @@ class MpsBackend(Backend):
                     time.sleep(_POLL_S)
         self._quit_all()
         super().__exit__(*exc)
+
+    @property
+    def daemons(self) -> Mapping[str, Path]:
+        """See `Backend`."""
+        used = self._theirs | self._own
+        return {device: control.pipe_directory for device, control in used.items()}
 
     def environment(self, gmi: int) -> Mapping[str, str]:
         """Where the GMI's daemon listens, or a directory where none does.
@@ -211,9 +217,12 @@ class MigBackend(MpsBackend):
         one, is not installed.
     """
 
-    def __init__(self, plan: Plan, machine: Machine, run: RunPaths) -> None:
+    def __init__(
+        self, plan: Plan, machine: Machine, run: RunPaths, gmis: Collection[int] | None = None
+    ) -> None:
         existing = {one.uuid for gpu in machine.gpus for one in gpu.instances}
-        for share in plan.slices:
+        here = [plan.slices[gmi] for gmi in (plan.layout.gmis if gmis is None else gmis)]
+        for share in here:
             if share.device not in existing:
                 raise BackendUnavailable(
                     f"plan.backend=mig: instance {share.device} of GMI {share.gmi} does not exist"
@@ -221,7 +230,7 @@ class MigBackend(MpsBackend):
         sharing = Counter(share.device for share in plan.slices)
         clients = [
             share.gmi
-            for share in plan.slices
+            for share in here
             if sharing[share.device] > 1 or share.device in machine.daemons
         ]
         # A daemon of somebody else is for other devices than the job's instances.
@@ -232,5 +241,8 @@ class MigBackend(MpsBackend):
 class ShareBackend(MpsBackend):
     """GMIs of a GPU take turns, as the driver does by default, away from any MPS daemon."""
 
-    def __init__(self, plan: Plan, machine: Machine, run: RunPaths) -> None:
-        super().__init__(plan, machine, run, clients=())
+    def __init__(
+        self, plan: Plan, machine: Machine, run: RunPaths, gmis: Collection[int] | None = None
+    ) -> None:
+        del gmis
+        super().__init__(plan, machine, run, gmis=())

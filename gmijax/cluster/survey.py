@@ -1,0 +1,133 @@
+"""What the nodes of a cluster are, and in what they differ, for `gmijax.doctor`."""
+
+from __future__ import annotations
+
+import os
+import time
+from collections import Counter
+from collections.abc import Iterator, Mapping
+from typing import Any, Final, NamedTuple
+
+from gmijax.cluster.checks import by_name
+from gmijax.cluster.node import ON_GPUS, Facts, Node
+from gmijax.cluster.ray_nodes import RayCluster
+from gmijax.config import ClusterConfig
+from gmijax.machine.snapshot import Machine
+
+_LITTLE: Final = 0.001
+"""Of a CPU: it is asked of each node, and must be had where jobs run."""
+
+_CLOCKS_S: Final = 1.0
+"""Clocks that differ by more make times in logs and events hard to compare."""
+
+
+class Surveyed(NamedTuple):
+    """A node.
+
+    Attributes:
+      facts: what it is, with all GPUs of the machine.
+      clock_s: how much its clock is ahead of this machine's.
+    """
+
+    facts: Facts
+    clock_s: float
+
+
+class SurveyedNode(Node):
+    """A node that is only looked at: it sees all GPUs, whoever uses them."""
+
+    def facts(self) -> Facts | str:
+        """See `Node`."""
+        # Ray hides the GPUs that were not asked for.
+        os.environ.pop("CUDA_VISIBLE_DEVICES", None)
+        return super().facts()
+
+    def clock(self) -> float:
+        """Seconds since the epoch."""
+        return time.time()
+
+
+def survey(address: str) -> dict[str, Surveyed]:
+    """All nodes of the cluster of Ray at this address, by theirs.
+
+    Args:
+      address: as `cluster.address`.
+
+    Raises:
+      ConfigError: there is no cluster.
+    """
+    cluster = RayCluster(ClusterConfig(engine="ray", address=address, wait_s=0.0), SurveyedNode)
+    try:
+        found: dict[str, Surveyed] = {}
+        for name, node in by_name(cluster.join(_LITTLE, None)).items():
+            before_s = time.time()
+            theirs_s = node.remote.call("clock") or 0.0
+            found[name] = Surveyed(node.facts, theirs_s - (before_s + time.time()) / 2)
+        return found
+    finally:
+        cluster.close()
+
+
+def differences(nodes: Mapping[str, Surveyed]) -> tuple[list[str], list[str]]:
+    """What a job over these nodes would refuse, and what else is worth knowing, in sentences."""
+    versions = {name: node.facts.versions for name, node in nodes.items()}
+    packages = list(dict.fromkeys(what for one in versions.values() for what in one))
+    machines = {name: node.facts.machine for name, node in nodes.items()}
+    on_gpus = [name for name, machine in machines.items() if machine.gpus]
+    problems: list[str] = []
+    for what in packages:
+        asked = on_gpus if what in ON_GPUS else nodes
+        problems += _differs(what, {name: versions[name].get(what) for name in asked})
+    capabilities = {name: machines[name].capabilities for name in on_gpus}
+    problems += _differs("the compute capability of GPUs", capabilities)
+    notes = _differs("GPUs", {name: _gpus(machine) for name, machine in machines.items()})
+    notes += _differs("NVIDIA driver", {n: m.driver_version for n, m in machines.items()})
+    notes += _differs("CPU cores", {n: str(len(m.cpu_cores)) for n, m in machines.items()})
+    notes += [
+        f"the clock of {name} is {node.clock_s:+.1f} s from that of this machine"
+        for name, node in nodes.items()
+        if abs(node.clock_s) > _CLOCKS_S
+    ]
+    return problems, notes
+
+
+def lines_of_nodes(nodes: Mapping[str, Surveyed]) -> Iterator[str]:
+    """Every node in a line."""
+    for name, (facts, clock_s) in nodes.items():
+        machine = facts.machine
+        yield (
+            f"node {name}: gmijax {facts.versions['gmijax']}, Python {facts.versions['python']}, "
+            f"jax {facts.versions['jax']}, {len(machine.cpu_cores)} CPU cores, NVIDIA driver "
+            f"{machine.driver_version or 'none'}, GPUs {_gpus(machine)}, clock {clock_s:+.3f} s"
+        )
+
+
+def nodes_as_data(nodes: Mapping[str, Surveyed]) -> list[dict[str, Any]]:
+    """Plain data for `--json`."""
+    return [
+        {
+            "address": name,
+            "versions": node.facts.versions,
+            "cpu_cores": len(node.facts.machine.cpu_cores),
+            "driver": node.facts.machine.driver_version,
+            "gpus": [gpu._asdict() for gpu in node.facts.machine.gpus],
+            "clock_s": node.clock_s,
+        }
+        for name, node in nodes.items()
+    ]
+
+
+def _differs(what: str, of_nodes: Mapping[str, str | None]) -> list[str]:
+    """A sentence, if not all have the same."""
+    having: dict[str, list[str]] = {}
+    for name, value in of_nodes.items():
+        having.setdefault(value or "none", []).append(name)
+    if len(having) < 2:
+        return []
+    shown = "; ".join(f"{value} on {', '.join(names)}" for value, names in having.items())
+    return [f"nodes differ in {what}: {shown}"]
+
+
+def _gpus(machine: Machine) -> str:
+    counts = Counter(gpu.name for gpu in machine.gpus)
+    return ", ".join(f"{count} x {name}" for name, count in counts.items()) or "none"

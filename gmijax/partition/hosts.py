@@ -1,0 +1,112 @@
+"""The machines of a job: one, or the nodes of a cluster, each with its part of the layout."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from typing import NamedTuple
+
+from gmijax.config import TemplateName
+from gmijax.config.plan import MAX_GMIS
+from gmijax.errors import ConfigError
+from gmijax.machine.snapshot import Machine
+from gmijax.partition.layout import Layout
+from gmijax.partition.plan import Slice
+
+
+class Host(NamedTuple):
+    """A machine of a job, and which GMIs it has.
+
+    Attributes:
+      name: address of a node; None in a job on one machine.
+      machine: what it has.
+      layout: of its GMIs, with ranks in the node in place of ids.
+      gmis: their ids, in order.
+    """
+
+    name: str | None
+    machine: Machine
+    layout: Layout
+    gmis: tuple[int, ...]
+
+    @contextmanager
+    def named(self) -> Iterator[None]:
+        """Puts the node before what an error says."""
+        try:
+            yield
+        except ConfigError as error:
+            if self.name is None:
+                raise
+            raise type(error)(f"node {self.name}: {error}") from None
+
+
+def hosts_of(
+    layout: Layout, machine: Machine, nodes: Mapping[str, Machine] | None
+) -> tuple[Host, ...]:
+    """This machine, or the nodes, in order; `layout` is that of the whole job."""
+    if nodes is None:
+        return (Host(None, machine, layout, tuple(layout.gmis)),)
+    return tuple(
+        Host(name, theirs, layout.of_node(place), layout.gmis_of_node[place])
+        for place, (name, theirs) in enumerate(nodes.items())
+    )
+
+
+def on_nodes(
+    layout: Layout, template: TemplateName, nodes: Mapping[str, Machine], reasons: list[str]
+) -> Layout:
+    """The layout of all nodes; `layout` is that of each, with `decoupled` of all together.
+
+    Raises:
+      ConfigError: more GMIs than are allowed, or GPUs that are too different.
+    """
+    _compare_gpus(nodes, reasons)
+    is_whole = template == "decoupled"
+    if (num_gmis := layout.num_gmis * (1 if is_whole else len(nodes))) > MAX_GMIS:
+        raise ConfigError(
+            f"cluster.nodes={len(nodes)}: makes {num_gmis} GMIs; at most {MAX_GMIS} are allowed"
+        )
+    count = f"{layout.num_gmis} GMIs " + ("on all" if is_whole else "on each")
+    reasons.append(f"nodes {', '.join(nodes)}: {count} of {len(nodes)}")
+    if is_whole:
+        return Layout(layout.gmis_of_gpu, len(nodes))
+    return layout.on_nodes(len(nodes))
+
+
+def divided_between_nodes(slices: Sequence[Slice], reasons: list[str]) -> list[Slice]:
+    """With less memory for GMIs on a GPU that several nodes have: these are one machine."""
+    gpus_of: dict[str, set[int]] = {}
+    for share in slices:
+        gpus_of.setdefault(share.device, set()).add(share.gpu)
+    divided: list[Slice] = []
+    for share in slices:
+        fraction, owners = share.memory_fraction, len(gpus_of[share.device])
+        if fraction is not None and owners > 1:
+            fraction = round(fraction / owners, 4)
+        divided.append(dataclasses.replace(share, memory_fraction=fraction))
+    if divided != list(slices):
+        reasons.append("nodes of one machine have the same GPUs, and divide their memory")
+    return divided
+
+
+def _compare_gpus(nodes: Mapping[str, Machine], reasons: list[str]) -> None:
+    """Refuses GPUs that would compute other bits, and says what else differs about them."""
+    (first, one), *others = nodes.items()
+    for name, other in others:
+        if one.capabilities != other.capabilities:
+            raise ConfigError(
+                f"cluster.engine=ray: node {name} has GPUs of compute capability "
+                f"{other.capabilities}, node {first} {one.capabilities}; GMIs that learn "
+                "together need the same"
+            )
+        for what, ours, theirs in (
+            ("GPUs", _names(one), _names(other)),
+            ("NVIDIA driver", one.driver_version, other.driver_version),
+        ):
+            if one.gpus and ours != theirs:
+                reasons.append(f"warning: node {name} has {what} {theirs}, node {first} {ours}")
+
+
+def _names(machine: Machine) -> str:
+    return ", ".join(sorted({gpu.name for gpu in machine.gpus}))
