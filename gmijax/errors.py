@@ -64,11 +64,13 @@ class ReportedError(NamedTuple):
       type: its class.
       message: of the exception.
       traceback: with the message, as Python prints it.
+      missing: the ranks that it waited for in vain, of a `CollectiveTimeout`.
     """
 
     type: str
     message: str
     traceback: str
+    missing: tuple[int, ...] = ()
 
 
 class GmiFailed(GmijaxError):

@@ -162,6 +162,8 @@ def _check_override(name: str, item: Override) -> None:
     if item.is_sweep_override():
         raise ConfigError(f"{item.input_line}: expected one value (a list stands in brackets)")
     options = choices(key)
+    if item.is_delete() and (key == "env" or (key == "algo" and name != "serve")):
+        raise ConfigError(f"{item.input_line}: a job needs one; choose it with {key}=NAME")
     if options and item.is_delete() and not isinstance(item.value(), str | None):
         raise ConfigError(f"{item.input_line}: expected ~{key}")
     if options and not item.is_delete() and item.value() not in options:

@@ -178,7 +178,12 @@ def keep_logs(run: RunPaths, attempt: int) -> None:
 
 
 def clear_unfinished(run: RunPaths, checkpoint: Path | None) -> None:
-    """Leaves of a run what belongs to a checkpoint: no half-written files, no later metrics."""
+    """Leaves of a run what belongs to a checkpoint.
+
+    No half-written files, no later metrics, and no results of GMIs, which are to train again.
+    """
+    for result in run.root.glob("gmi_[0-9]*/result.json"):
+        result.unlink()
     for folder in (run.root, *run.root.glob("gmi_[0-9]*"), *run.root.glob("gmi_[0-9]*/attempt_*")):
         remove_temporary(folder)
     for hidden in run.checkpoints.glob(".*"):

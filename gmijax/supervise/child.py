@@ -22,7 +22,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any, Final
 
-from gmijax.errors import ConfigError, ReportedError
+from gmijax.errors import CollectiveTimeout, ConfigError, ReportedError
 from gmijax.runs.folder import GmiPaths, RunPaths, write_json
 from gmijax.supervise.heartbeat import GmiState, Heartbeat, HeartbeatBlock
 
@@ -161,7 +161,10 @@ class ChildLink:
     def report_error(self, error: BaseException) -> None:
         """Says why this GMI fails, also in `error.json`; end with a non-zero code after it."""
         said = ReportedError(
-            type(error).__name__, str(error), "".join(traceback.format_exception(error))
+            type(error).__name__,
+            str(error),
+            "".join(traceback.format_exception(error)),
+            error.missing if isinstance(error, CollectiveTimeout) else (),
         )
         self._block.write_error(said)
         with suppress(OSError):  # The disk may be what is wrong.

@@ -56,14 +56,17 @@ def first_cause(failures: Sequence[GmiFailed]) -> GmiFailed:
 
     A GMI that lost its peer may be seen to fail before that peer is; so a signal, and any
     error that is not about a peer, goes before errors of the exchange. A peer that is lost to
-    one may have given up on another that it waited for. A library
+    one may have given up on another that it waited for; and of those that waited in vain the one
+    is shown that waited for somebody who has not failed. A library
     may abort a process whose peer is gone; so SIGABRT comes after all other causes.
     """
+    failed = {failure.gmi for failure in failures}
     return min(
         failures,
         key=lambda failure: (
             is_consequence(failure),
             ended_with(failure, PeerLost, PipeClosed),
+            failed.issuperset(failure.error.missing if failure.error else ()),
             failure.exit_code == -signal.SIGABRT,
             failure.exit_code >= 0,
         ),

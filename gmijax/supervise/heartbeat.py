@@ -10,7 +10,6 @@ from __future__ import annotations
 import json
 import mmap
 import os
-from collections.abc import Mapping
 from typing import Any, Final, Literal, NamedTuple, get_args
 
 from gmijax.errors import ReportedError
@@ -23,8 +22,8 @@ STATES: tuple[str, ...] = get_args(GmiState)
 _BEATS, _STATE, _ITERATION, _PID, _ERROR_BYTES = range(5)
 _HEADER_BYTES: Final = 64
 _BLOCK_BYTES: Final = 1 << 16
-_MAX_MESSAGE, _MAX_TRACEBACK = 2000, 8000
-"""Characters; as JSON each may take six bytes."""
+_MAX_MESSAGE, _MAX_TRACEBACK, _MAX_MISSING = 2000, 8000, 200
+"""Characters, which as JSON may take six bytes each, and ranks."""
 
 
 class Heartbeat(NamedTuple):
@@ -80,7 +79,9 @@ class HeartbeatBlock:
     def write_error(self, error: ReportedError) -> None:
         """Says why the GMI fails; of long texts the beginning or, of a traceback, the end."""
         cut = error._replace(
-            message=error.message[:_MAX_MESSAGE], traceback=error.traceback[-_MAX_TRACEBACK:]
+            message=error.message[:_MAX_MESSAGE],
+            traceback=error.traceback[-_MAX_TRACEBACK:],
+            missing=error.missing[:_MAX_MISSING],
         )
         text = json.dumps(cut._asdict(), ensure_ascii=False).encode(errors="replace")
         self._memory[_HEADER_BYTES : _HEADER_BYTES + len(text)] = text
@@ -91,5 +92,5 @@ class HeartbeatBlock:
         size = self._numbers[_ERROR_BYTES]
         if not size:
             return None
-        data: Mapping[str, str] = json.loads(self._memory[_HEADER_BYTES : _HEADER_BYTES + size])
-        return ReportedError(**data)
+        data: dict[str, Any] = json.loads(self._memory[_HEADER_BYTES : _HEADER_BYTES + size])
+        return ReportedError(**data)._replace(missing=tuple(data["missing"]))

@@ -21,6 +21,7 @@ import numpy as np
 from fault_plan import CHECKPOINT_EVERY, ITERATIONS, KINDS, Fault
 from training_jobs import POINT_TASK, STEPS, TINY, child_environment, learner_arrays, wait_until
 
+from gmijax.runs.history import read_metrics
 from gmijax.runs.resume import newest_checkpoint
 
 LIMIT_S = 120.0
@@ -248,14 +249,9 @@ class _Job:
                 self.lost.append(f"{fault} and then {start}")
 
     def _new_events(self) -> list[dict[str, Any]]:
-        path = self._run / "events.jsonl"
-        lines = path.read_text().splitlines() if path.exists() else []
-        new, self._events_seen = lines[self._events_seen :], len(lines)
-        events = []
-        for line in new:
-            with suppress(ValueError):  # Told by `fault_checks`.
-                events.append(json.loads(line))
-        return events
+        events = read_metrics(self._run / "events.jsonl")  # What is half written: `fault_checks`.
+        new, self._events_seen = events[self._events_seen :], len(events)
+        return new
 
     def _repair_or_damage(self, kind: str) -> None:
         """What happens between two commands."""

@@ -20,6 +20,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+from gmijax.runs.history import read_metrics
 from tests.training_jobs import heartbeat_of, pids_of, wait_until
 
 OVERRIDES = (
@@ -56,9 +57,8 @@ class Job:
 
     def events(self, event: str) -> list[dict[str, Any]]:
         """Those of a kind so far."""
-        path = self.run / "events.jsonl"
-        lines = path.read_text().splitlines() if path.exists() else []
-        return [found for line in lines if (found := json.loads(line))["event"] == event]
+        found = read_metrics(self.run / "events.jsonl")
+        return [line for line in found if line["event"] == event]
 
     def wait(self, condition: Callable[[], Any], what: str) -> Any:
         """As `wait_until`, while the job runs."""
@@ -162,13 +162,12 @@ def main() -> int:
         finally:
             job.process.send_signal(signal.SIGTERM)
             code = job.process.wait()
-            events = (job.run / "events.jsonl").read_text().splitlines()
             found = {
                 "rows": rows,
                 "exit_code": code,
                 "plan": json.loads((job.run / "plan.json").read_text())["reasons"],
                 "left": pids_of(job.run),
-                "events": events[-400:],
+                "events": read_metrics(job.run / "events.jsonl")[-400:],
                 "log": (Path(folder) / "job.log").read_text()[-3000:],
                 "stacks": _stacks(job.run)[:4000],
             }

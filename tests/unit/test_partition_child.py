@@ -99,10 +99,11 @@ def test_an_error_is_told_where_nothing_can_be_written(
 
 def test_an_error_of_any_length_fits(block: tuple[int, HeartbeatBlock]):
     text = "\x00\N{GRINNING FACE}\udcff" * 10_000
-    block[1].write_error(ReportedError("E", text, text))
+    block[1].write_error(ReportedError("E", text, text, tuple(range(10_000, 20_000))))
     error = block[1].read_error()
     assert error is not None
     assert len(error.message) == 2000
+    assert error.missing == tuple(range(10_000, 10_200))
 
 
 @pytest.mark.parametrize(
@@ -135,6 +136,16 @@ def test_cause_goes_before_consequence_and_an_abort_after_other_causes(tmp_path:
         assert first_cause([*failures, killed]) == killed
     assert is_consequence(victim)
     assert not is_consequence(aborted)
+
+
+def test_of_those_that_waited_in_vain_the_first_one_is_shown(tmp_path: Path):
+    """GMI 0 waited for GMI 2, which waited for GMI 1, which hangs and has not ended."""
+    victims = [
+        describe_exit(gmi, 1, ReportedError("CollectiveTimeout", "late", "", (missing,)), tmp_path)
+        for gmi, missing in ((0, 2), (2, 1))
+    ]
+    for failures in (victims, victims[::-1]):
+        assert first_cause(failures) is victims[1]
 
 
 def test_only_the_end_of_a_long_log_is_read(tmp_path: Path):

@@ -181,9 +181,11 @@ def test_what_came_after_the_checkpoint_is_dropped(run: RunPaths):
     lines = [{"env_steps": steps} for steps in (50, 100, 150)]
     run.metrics.write_text("".join(json.dumps(line) + "\n" for line in lines) + '{"env_st')
     checkpoint = save(run, 100)
+    write_json(run.gmi(0).result, {"status": "completed", "env_steps": 150})
     (run.checkpoints / ".000000000150.partial" / "learner").mkdir(parents=True)
     clear_unfinished(run, checkpoint)
     assert [path.name for path in run.checkpoints.iterdir()] == [checkpoint.name]
+    assert not run.gmi(0).result.exists()
     assert [json.loads(line)["env_steps"] for line in run.metrics.read_text().splitlines()] == [
         50,
         100,
