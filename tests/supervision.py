@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from gmijax import errors
-from gmijax.config import PlanConfig, ReduceConfig
+from gmijax.config import PlanConfig, ReduceConfig, Timeouts
 from gmijax.machine.nvidia import Gpu
 from gmijax.machine.snapshot import Machine
 from gmijax.partition.plan import Plan
@@ -17,7 +17,7 @@ from gmijax.runs.folder import META, RunPaths, write_json
 from gmijax.runs.resume import CheckpointMeta
 from gmijax.supervise.backends import open_backend
 from gmijax.supervise.kinds import JobKind
-from gmijax.supervise.launch import Launch, Timeouts
+from gmijax.supervise.launch import Launch
 from gmijax.supervise.supervisor import Supervisor
 
 CHECKOUT = Path(errors.__file__).parents[1]

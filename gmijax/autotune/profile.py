@@ -12,12 +12,12 @@ from typing import Any
 
 from gmijax.autotune.grid import Measured, NotRunnable, Point
 from gmijax.autotune.workloads import Mode, Workload
+from gmijax.config import Timeouts
 from gmijax.config.schema import to_dict
 from gmijax.errors import ConfigError, GmijaxError, JobInterrupted
 from gmijax.machine.snapshot import Machine
 from gmijax.partition.plan import Plan
 from gmijax.runs.folder import RunPaths, write_json
-from gmijax.supervise.launch import Timeouts
 from gmijax.supervise.launcher import Launch, OnTick, run_gmis
 from gmijax.supervise.watched_gmi import GmiStatus
 

@@ -18,6 +18,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from gmijax.collectives.host.shared_block import create_exchange
+from gmijax.config import Timeouts
 from gmijax.machine.snapshot import Machine
 from gmijax.partition.plan import Plan
 from gmijax.partition.reduction import (
@@ -32,7 +33,6 @@ from gmijax.partition.templates import TRAINER, has_role
 from gmijax.runs.cache import cache_folder
 from gmijax.runs.folder import RunPaths, read_json, write_json
 from gmijax.supervise.kinds import JobKind
-from gmijax.supervise.launch import Timeouts
 from gmijax.supervise.launcher import Launch, run_gmis
 from gmijax.version import versions_of
 

@@ -11,6 +11,7 @@ from functools import partial
 from typing import Any, Final
 
 from gmijax.collectives.messages.messenger import MIN_CAPACITY_BYTES
+from gmijax.config import Timeouts
 from gmijax.config.schema import require_between, require_positive
 from gmijax.errors import ConfigError, GmiFailed, GmijaxError
 from gmijax.machine.host_limits import require_room
@@ -22,7 +23,6 @@ from gmijax.roles.role import Role
 from gmijax.runs.folder import RunPaths, create_run, read_json, write_json
 from gmijax.supervise.child import ENV_GMI
 from gmijax.supervise.kinds import JobKind, pipes
-from gmijax.supervise.launch import Timeouts
 from gmijax.supervise.launcher import Launch, run_gmis
 
 MAX_PIPE_MIB: Final = 2**14
