@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, TypeAlias
 from gmijax.collectives.messages.pipe import PipeReader, PipeWriter
 
 if TYPE_CHECKING:  # It needs pyzmq.
-    from gmijax.collectives.channel.remote import RemoteReader, RemoteWriter
+    from gmijax.collectives.channel.tcp_channel import RemoteReader, RemoteWriter
 
 ChannelWriter: TypeAlias = "PipeWriter | RemoteWriter"
 """The way from this agent to trainer `peer`."""
