@@ -22,18 +22,19 @@ class ClusterConfig(KeyGroup):
     )
     address: str = doc(
         "of the cluster: auto (that of RAY_ADDRESS, or the one that runs here), host:port, or "
-        "local: start one for this job, on this machine only",
+        "local: one for this job on this machine alone",
         default="auto",
     )
     nodes: int | Literal["auto"] = doc(
-        "number of nodes; auto: all with enough CPUs, not with algo=a3c", default="auto", low=1
+        "number of nodes; auto: all that have the CPUs, not with algo=a3c", default="auto", low=1
     )
     interface: str | None = doc(
-        "network interface of the exchange between nodes, e.g. eth1; null: the one that Ray uses",
+        "network interface of the exchange between nodes, e.g. eth1; null: that of the address by "
+        "which Ray knows a node",
         default=None,
     )
     wait_s: float = doc(
-        "longest wait for nodes, at the start and after a loss, seconds",
+        "longest wait for nodes, at the start and after one was lost, seconds",
         default=60.0,
         low=0.0,
     )
