@@ -1,4 +1,4 @@
-"""A task of one's own, a pole that a cart swings up: `python examples/custom_task.py`."""
+"""A task of your own: a pole that a cart swings up: `python examples/custom_task.py`."""
 
 import sys
 from collections import namedtuple

@@ -9,7 +9,7 @@
 #SBATCH --requeue
 #SBATCH --open-mode=append
 #
-# Trains on all nodes of a Slurm job, and goes on in the next one when its time is over:
+# Trains on all nodes of a Slurm job, and continues in the next job when its time is up:
 #   sbatch slurm.sh env=ant plan.gmis_per_gpu=16 run.dir=/shared/ant
 # Modules and environments of yours belong here.
 
@@ -17,7 +17,7 @@ set -u
 cpus=$SLURM_CPUS_PER_TASK nodes=$SLURM_JOB_NUM_NODES
 first=$(scontrol show hostnames "$SLURM_JOB_NODELIST" | head -n 1)
 export RAY_ADDRESS=$first:$((20000 + SLURM_JOB_ID % 10000))
-# Only who has the token may use this Ray; Slurm gives the variables to its tasks.
+# Only processes with the token may use this Ray; Slurm passes the variables to its tasks.
 RAY_AUTH_TOKEN=$(od -An -N32 -tx1 /dev/urandom | tr -d ' \n')
 export RAY_AUTH_MODE=token RAY_AUTH_TOKEN RAY_GRACEFUL_SHUTDOWN_DRAIN_TIMEOUT_S=0
 

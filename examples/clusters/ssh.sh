@@ -7,7 +7,7 @@ set -u
 read -ra hosts <<<"$HOSTS"
 address=${ADDRESS:-$(hostname):6379}
 bin=$(dirname "$(command -v ray)")
-# Only who has the token may use this Ray.
+# Only processes with the token may use this Ray.
 RAY_AUTH_TOKEN=$(od -An -N32 -tx1 /dev/urandom | tr -d ' \n')
 export RAY_AUTH_MODE=token RAY_AUTH_TOKEN RAY_GRACEFUL_SHUTDOWN_DRAIN_TIMEOUT_S=0
 
@@ -20,7 +20,7 @@ until ray health-check --address "$address" 2>/dev/null; do
     sleep 1
 done
 
-# The others read the token, and end their Ray when their input ends: with this script.
+# The other machines read the token, and end their Ray when this script ends.
 for host in "${hosts[@]}"; do
     exec {input}> >(exec ssh "$host" "
         read -r RAY_AUTH_TOKEN

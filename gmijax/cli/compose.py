@@ -1,4 +1,4 @@
-"""From `key=value` overrides to a checked configuration; the only user of hydra."""
+"""From `key=value` overrides to a checked configuration, by hydra."""
 
 from __future__ import annotations
 

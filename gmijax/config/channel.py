@@ -21,8 +21,8 @@ class ChannelConfig(KeyGroup):
     )
     transport: Literal["memory", "device", "zmq"] = doc(
         "memory: shared memory of this host; device: memory of the GPU, where every agent has a "
-        "trainer on its own (CUDA IPC); zmq: TCP by pyzmq, for channels that are built by hand, "
-        "not for train, which takes TCP between nodes by itself",
+        "trainer on its own (CUDA IPC); zmq: TCP by pyzmq, for channels built by hand; train "
+        "refuses it and uses TCP between nodes by itself",
         default="memory",
     )
     capacity_mib: int = doc(

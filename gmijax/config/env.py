@@ -78,7 +78,7 @@ class EnvConfig(KeyGroup):
         "steps of the task after which an episode is truncated (time limit); null: its own", low=1
     )
     history: int = doc(
-        "observations of so many steps are one, the oldest first (docs/tasks.md)",
+        "steps that one observation holds, the oldest first (docs/tasks.md)",
         default=1,
         low=1,
     )
@@ -96,12 +96,12 @@ class EnvConfig(KeyGroup):
         metadata={"doc": "numbers of the task, such as the height of a fall (docs/tasks.md)"},
     )
     curriculum: Literal["off", "on"] = doc(
-        "whether a world's episodes get harder as they succeed, in tasks that can (docs/tasks.md)",
+        "make a world's episodes harder as they succeed, in tasks that can (docs/tasks.md)",
         default="off",
     )
     randomize: Literal["off", "on", "episode"] = doc(
-        "whether every world has a physics model of its own, drawn from env.randomization: once, "
-        "or for every episode",
+        "give every world its own physics model, drawn from env.randomization: once (on), or for "
+        "every episode",
         default="off",
     )
     randomization: Mapping[str, LeafRange] = dataclasses.field(

@@ -34,19 +34,17 @@ class SearchConfig(KeyGroup):
     )
     mode: Literal["corun", "isolated", "both"] = doc(
         "profile all GMIs of a GPU at once, or one alone with its share (as the paper prints); "
-        "both: choose by corun, then profile what was run isolated too and tell the difference"
+        "both: choose by corun, then profile the same points isolated and report the ratio"
     )
     order: Literal["coarse_first", "as_printed"] = doc(
         "every third row with the largest size and the third below it, then the neighbours of the "
         "best point; or the whole grid in the order of the paper's Algorithm 2"
     )
     alpha: float = doc(
-        "a row of sizes ends when the gain of throughput by the growth of memory is below this",
+        "a row of sizes ends when gain of throughput / growth of memory is below this",
         low=0.0,
     )
-    tolerance: float = doc(
-        "relative difference of throughput that counts as none", low=0.0, high=0.5
-    )
+    tolerance: float = doc("relative difference of throughput that is ignored", low=0.0, high=0.5)
     iterations: int = doc(
         "training iterations of one profile, the first is not counted; with algo=a3c batches that "
         "are counted, at least",

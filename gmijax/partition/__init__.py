@@ -1,1 +1,1 @@
-"""Partition of GPUs into GMIs: plan, environment, backends, supervision. No jax in here."""
+"""Partition of GPUs into GMIs: layout, shares, roles, plan. Pure functions, no jax in here."""

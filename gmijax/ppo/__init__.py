@@ -1,1 +1,1 @@
-"""Proximal policy optimisation: pure update functions, and the role that runs them."""
+"""Proximal policy optimisation: rollout, losses, update, and the training loop of a GMI."""

@@ -32,7 +32,7 @@ def over_nodes(
     far = {agent: nodes.calls[agent, leader] for agent in agents if (agent, leader) in nodes.calls}
     if not far or (gmi != leader and gmi not in far):
         return local
-    from gmijax.collectives.channel.remote_registers import RemoteRegisters  # Needs pyzmq.
+    from gmijax.collectives.channel.tcp_registers import RemoteRegisters  # Needs pyzmq.
 
     orders, weights, report = register_bytes(*sizes)
     if gmi == leader:

@@ -18,7 +18,7 @@ from gmijax.collectives.waits import LIVENESS_PERIOD_S, wait_until
 from gmijax.errors import CollectiveError, CollectiveTimeout, GmijaxError, PipeClosed
 
 if TYPE_CHECKING:
-    from gmijax.collectives.channel.remote import RemoteReader  # Needs pyzmq.
+    from gmijax.collectives.channel.tcp_channel import RemoteReader  # Needs pyzmq.
 
 ChannelReader: TypeAlias = "PipeReader | RemoteReader"
 """The way from agent `peer` to this trainer: through shared memory, or by TCP."""

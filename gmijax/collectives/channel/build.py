@@ -36,7 +36,7 @@ class ChannelTopology:
     Attributes:
       addresses: where the trainer of a pair (agent, trainer) listens, as `host:port`: of all pairs
         with `transport=zmq`; with `memory` of those on different nodes, which then use TCP too.
-      secret: by which both ends of such a pair know each other; None: see `connection.py`.
+      secret: by which both ends of such a pair know each other; None: see `tcp_connection.py`.
     """
 
     agents: tuple[int, ...]
@@ -107,7 +107,7 @@ def open_sender(
         block = _open_block(rank, fd, held)
         writers += [PipeWriter(block, peer) for peer in addresses if peer not in far]
     if far:
-        from gmijax.collectives.channel.remote import RemoteWriter  # Needs pyzmq.
+        from gmijax.collectives.channel.tcp_channel import RemoteWriter  # Needs pyzmq.
 
         settings = config.capacity_bytes, topology.secret
         writers += [RemoteWriter(at, rank, peer, *settings) for peer, at in far.items()]
@@ -140,7 +140,7 @@ def open_receiver(
         block = _open_block(rank, fd, held)
         readers += [PipeReader(block, peer) for peer in addresses if peer not in far]
     if far:
-        from gmijax.collectives.channel.remote import RemoteReader  # Needs pyzmq.
+        from gmijax.collectives.channel.tcp_channel import RemoteReader  # Needs pyzmq.
 
         settings = config.capacity_bytes, topology.secret
         readers += [RemoteReader(at, rank, peer, *settings) for peer, at in far.items()]
@@ -148,7 +148,7 @@ def open_receiver(
         held.callback(reader.close)
     if config.transport == "device":
         # jax and CUDA, which channels through the host do without.
-        from gmijax.collectives.channel.resident import DeviceStack, ResidentDecoder
+        from gmijax.collectives.channel.device_channel import DeviceStack, ResidentDecoder
 
         decoders = [ResidentDecoder(DEVICE_MEMORY) for _ in readers]
         for decoder in decoders:
@@ -163,7 +163,7 @@ def _device_sender(
     config: ChannelConfig, block: PipeBlock, near: list[int], held: ExitStack
 ) -> Sender:
     """The end of an agent that leaves its experience on the GPU, for the trainers there."""
-    from gmijax.collectives.channel.resident import ResidentPacker, SlotWriter
+    from gmijax.collectives.channel.device_channel import ResidentPacker, SlotWriter
 
     migrator = Migrator([SlotWriter(block, peer, config.capacity_bytes) for peer in near], near)
     packer = ResidentPacker(migrator, config.capacity_bytes, DEVICE_MEMORY)

@@ -15,7 +15,7 @@ from gmijax.collectives.waits import LIVENESS_PERIOD_S
 from gmijax.errors import GmijaxError, PeerLost, PipeClosed
 
 if TYPE_CHECKING:
-    from gmijax.collectives.channel.remote import RemoteWriter  # Needs pyzmq.
+    from gmijax.collectives.channel.tcp_channel import RemoteWriter  # Needs pyzmq.
 
 ChannelWriter: TypeAlias = "PipeWriter | RemoteWriter"
 """The way from this agent to trainer `peer`: through shared memory, or by TCP."""

@@ -1,7 +1,7 @@
-"""Exchanges of a program as work of the device: through memory of the GPUs, and rings.
+"""Runs the stages of a reduction on a GPU's stream: by shared slots, NCCL rings or the host.
 
-No rank stops on the host for them: copies, a flag for the others, waits for their flags and a
-copy of what they wrote lie on the program's stream, between what it computes before and after.
+Slots and rings do not stop the host: copies, a flag for the others, waits for their flags and a
+copy of what they wrote are queued on the program's stream, between its other work.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Steps that the devices of all ranks run together: ranks meet before, and look at each other."""
+"""Runs a step on the devices of all ranks: they meet before and after, and watch their peers."""
 
 from __future__ import annotations
 

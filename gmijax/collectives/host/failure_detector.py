@@ -1,8 +1,8 @@
-"""Who is to blame when a rank waits too long: the dead, the silent, and those who merely wait.
+"""Finds which peer is dead or stuck when a rank has waited too long.
 
-A rank that waits says so by raising its `beats` now and then. So when time is up a peer that
-waits as well is told from one that is stuck, wherever each of them waits. A rank that gives up
-notes for whom, so that its own end is not taken for the cause.
+A rank that waits raises its `beats` now and then. So at a timeout a peer that only waits too is
+not mistaken for one that is stuck, wherever each of them waits. A rank that gives up notes whom
+it waited for, so that its own end is not taken for the cause.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""What ranks do through the shared block of their host: gather, sum, broadcast."""
+"""Gather, sum and broadcast between the ranks of one host, through its shared block."""
 
 from __future__ import annotations
 

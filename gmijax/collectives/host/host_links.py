@@ -1,4 +1,4 @@
-"""Exchanges of a program through shared memory of the host."""
+"""Runs the stages of a reduction through shared memory of the host."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What leaders of nodes do through their connections: gather, and sum in the order of nodes."""
+"""Gather and sum between the leaders of nodes, through TCP, in the order of nodes."""
 
 from __future__ import annotations
 

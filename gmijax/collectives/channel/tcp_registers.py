@@ -6,7 +6,7 @@
 
 Whoever publishes sends the newest values of all its registers in one message. Of the messages
 that wait, at either end, ZeroMQ keeps the last one only: who reads seldom gets what is newest, and
-takes no memory meanwhile. Connections are those of experience (`connection.py`).
+takes no memory meanwhile. Connections are those of experience (`tcp_connection.py`).
 
 Wire format: for every register of the sender `_HEAD`, then their bytes.
 """
@@ -21,8 +21,8 @@ from typing import Any, Final
 import numpy as np
 import numpy.typing as npt
 
-from gmijax.collectives.channel.connection import Connection
-from gmijax.collectives.channel.remote import MAX_ANSWER_BYTES
+from gmijax.collectives.channel.tcp_channel import MAX_ANSWER_BYTES
+from gmijax.collectives.channel.tcp_connection import Connection
 from gmijax.collectives.messages.registers import AnyRegister, Snapshot
 from gmijax.errors import CollectiveError
 

@@ -19,9 +19,9 @@ pytest.importorskip("zmq")
 
 import zmq
 
-from gmijax.collectives.channel import remote
-from gmijax.collectives.channel.connection import ENV_KEY
-from gmijax.collectives.channel.remote import RemoteReader, RemoteWriter
+from gmijax.collectives.channel import tcp_channel
+from gmijax.collectives.channel.tcp_channel import RemoteReader, RemoteWriter
+from gmijax.collectives.channel.tcp_connection import ENV_KEY
 from gmijax.collectives.nodes.meeting import reserved_address
 
 CAPACITY = 2**20
@@ -35,7 +35,7 @@ PLAIN = {
 }
 """What strangers send who do not use ZeroMQ."""
 
-FORGED = remote._HEADER.pack(remote.MAGIC, remote.DATA, 0), b""
+FORGED = tcp_channel._HEADER.pack(tcp_channel.MAGIC, tcp_channel.DATA, 0), b""
 
 
 @pytest.fixture(autouse=True)
@@ -173,7 +173,7 @@ def test_an_address_that_cannot_be_is_named() -> None:
 
 def test_what_is_no_message_of_a_channel_is_an_error(address: str) -> None:
     reader, writer = RemoteReader(address, 1, 0, CAPACITY), RemoteWriter(address, 0, 1, CAPACITY)
-    for junk in (b"", b"junk", b"x" * remote._HEADER.size):
+    for junk in (b"", b"junk", b"x" * tcp_channel._HEADER.size):
         writer._connection.send([junk])
         with pytest.raises(CollectiveError, match="rank 1: no message of a channel from 0"):
             receive(reader, 1)
@@ -191,13 +191,13 @@ def test_a_message_that_is_too_long_is_not_taken_and_what_follows_is_an_error(
     assert writer.max_message_bytes == CAPACITY // 2
     send(writer, 1)
     assert receive(reader, 1) == [1]
-    writer._connection.send([FORGED[0], bytes(CAPACITY // 2 + remote.MAX_ANSWER_BYTES + 1)])
+    writer._connection.send([FORGED[0], bytes(CAPACITY // 2 + tcp_channel.MAX_ANSWER_BYTES + 1)])
     writer._sequence += 1
     with pytest.raises(CollectiveError, match="message 1 from rank 0 is lost, here is message"):
         exchange(writer, reader, 20)  # Those right behind it may go down with the connection.
     # An agent takes nothing but answers.
     limit = writer._connection._socket.getsockopt(zmq.MAXMSGSIZE)
-    assert limit == remote.MAX_ANSWER_BYTES
+    assert limit == tcp_channel.MAX_ANSWER_BYTES
     for end in (writer, reader):
         end._connection.close()
 

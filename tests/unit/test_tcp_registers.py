@@ -16,7 +16,7 @@ from gmijax.errors import CollectiveError
 
 pytest.importorskip("zmq")
 
-from gmijax.collectives.channel.remote_registers import RemoteRegisters
+from gmijax.collectives.channel.tcp_registers import RemoteRegisters
 
 SECRET = os.urandom(32)
 ORDERS, WEIGHTS, REPORT = 16, 4096, 24

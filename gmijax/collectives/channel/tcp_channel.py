@@ -1,7 +1,7 @@
 """Channels between hosts: one TCP connection for every pair of agent and trainer, by pyzmq.
 
 The trainer listens, the agent connects. Messages carry a sequence number; all is encrypted and
-authenticated (`connection.py`), so that no byte of it can change on the way. The trainer
+authenticated (`tcp_connection.py`), so that no byte of it can change on the way. The trainer
 acknowledges what it has released, which bounds what is on the way. The end of a connection without
 a goodbye means that the peer is gone; so do ten seconds without ZeroMQ's own heartbeats. What a
 killed agent had not yet put on the wire is lost, and nothing else.
@@ -17,7 +17,7 @@ from typing import Any, Final, NamedTuple
 
 import numpy as np
 
-from gmijax.collectives.channel.connection import Connection
+from gmijax.collectives.channel.tcp_connection import Connection
 from gmijax.collectives.messages.pipe import Bytes, Message
 from gmijax.collectives.messages.pipe_format import message_bytes
 from gmijax.errors import CollectiveError, GmijaxError, PeerLost, PipeClosed
