@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, closing, contextmanager
@@ -215,8 +216,10 @@ def _open(jobs: Sequence[Job]) -> SweepPaths:
     """The folder of the sweep, made if it is not there."""
     run = jobs[0].config.run
     folder = given_run(run.dir, run.name)
-    if folder is None or not folder.exists():
+    if folder is None or not os.path.lexists(folder):
         return SweepPaths(create_run(run.dir, run.name, "sweep").root)
+    if not folder.is_dir():
+        raise ConfigError(f"run.dir={folder}: is no folder")
     paths = SweepPaths(folder.resolve())
     if not paths.request.exists() and any(path != paths.lock for path in folder.iterdir()):
         raise ConfigError(f"run.dir={folder}: is no folder of a sweep, and not empty")

@@ -8,6 +8,7 @@ from typing import Any
 import pytest
 from supervision import save
 
+import gmijax
 from gmijax.cli.compose import compose
 from gmijax.config import TrainConfig
 from gmijax.config.schema import to_dict
@@ -88,6 +89,16 @@ def test_auto_leaves_a_folder_with_something_else_alone(tmp_path: Path):
         find_start_point(config_of(tmp_path))
     with pytest.raises(ConfigError, match="is no folder"):
         find_start_point(config_of(tmp_path / "thesis.tex"))
+
+
+@pytest.mark.parametrize(
+    ("name", "said"),
+    [("thesis.tex", "thesis.tex: is no folder$"), ("a" * 300, r"\(File name too long\)$")],
+)
+def test_a_sweep_goes_on_in_a_folder_only(tmp_path: Path, name: str, said: str):
+    (tmp_path / "thesis.tex").touch()
+    with pytest.raises(ConfigError, match=rf"^run\.dir=.*{said}"):
+        gmijax.sweep([compose("env=ant", f"run.dir={tmp_path / name}")])
 
 
 def test_a_folder_that_exists_is_refused_before_anything_else(run: RunPaths):
