@@ -6,7 +6,9 @@ from types import SimpleNamespace
 from typing import Any
 
 import pytest
+from supervision import machine, plan_config, reduce_config
 
+from gmijax.partition.planner import make_plan
 from gmijax.workers.worker import exchange_used
 
 
@@ -21,8 +23,14 @@ from gmijax.workers.worker import exchange_used
     ],
 )
 def test_a_fall_back_to_host_memory_is_told(
-    planned: str, strategy: str, intra: str, said: dict[str, str]
+    planned: str,
+    strategy: str,
+    intra: str,
+    said: dict[str, str],
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    plan: Any = SimpleNamespace(strategy=planned)
+    monkeypatch.setattr("gmijax.partition.reduction._is_installed", lambda *_: True)
+    reduce = reduce_config(strategy=planned)
+    plan = make_plan(plan_config(gmis_per_gpu=2, backend="share"), reduce, 64, machine(1))
     reducer: Any = SimpleNamespace(strategy=strategy, intra=intra)
     assert exchange_used(plan, reducer) == said
