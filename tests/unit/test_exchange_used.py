@@ -6,6 +6,8 @@ from types import SimpleNamespace
 from typing import Any
 
 import pytest
+from supervision import machine
+from supervision import planned as make_plan
 
 from gmijax.workers.worker import exchange_used
 
@@ -21,8 +23,13 @@ from gmijax.workers.worker import exchange_used
     ],
 )
 def test_a_fall_back_to_host_memory_is_told(
-    planned: str, strategy: str, intra: str, said: dict[str, str]
+    planned: str,
+    strategy: str,
+    intra: str,
+    said: dict[str, str],
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    plan: Any = SimpleNamespace(strategy=planned)
+    monkeypatch.setattr("gmijax.partition.reduction._is_installed", lambda *_: True)
+    plan = make_plan(machine(1), {"strategy": planned}, gmis_per_gpu=2, backend="share")
     reducer: Any = SimpleNamespace(strategy=strategy, intra=intra)
     assert exchange_used(plan, reducer) == said

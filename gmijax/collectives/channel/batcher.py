@@ -6,22 +6,17 @@ import contextlib
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, NamedTuple, TypeAlias
+from typing import NamedTuple, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
 
 from gmijax.collectives.channel.compressor import Transfer
 from gmijax.collectives.channel.spec import Array, Spec
-from gmijax.collectives.messages.pipe import Message, PipeReader
+from gmijax.collectives.channel.transport import ChannelReader
+from gmijax.collectives.messages.pipe import Message
 from gmijax.collectives.waits import LIVENESS_PERIOD_S, wait_until
 from gmijax.errors import CollectiveError, CollectiveTimeout, GmijaxError, PipeClosed
-
-if TYPE_CHECKING:
-    from gmijax.collectives.channel.tcp_channel import RemoteReader  # Needs pyzmq.
-
-ChannelReader: TypeAlias = "PipeReader | RemoteReader"
-"""The way from agent `peer` to this trainer: through shared memory, or by TCP."""
 
 Decode: TypeAlias = Callable[[Message], Transfer | None]
 """Reads a message of one agent; None if it only began or continued a transfer."""

@@ -7,11 +7,12 @@ from contextlib import ExitStack
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from gmijax.collectives.channel.batcher import Batcher, ChannelReader, Stack
+from gmijax.collectives.channel.batcher import Batcher, Stack
 from gmijax.collectives.channel.compressor import Compressor, TransferSize, read_transfer
 from gmijax.collectives.channel.dispenser import Dispenser
-from gmijax.collectives.channel.migrator import ChannelWriter, Migrator
+from gmijax.collectives.channel.migrator import Migrator
 from gmijax.collectives.channel.sender import Packer, Sender
+from gmijax.collectives.channel.transport import ChannelReader, ChannelWriter
 from gmijax.collectives.channel.unichannel import UniDecoder, UniPacker
 from gmijax.collectives.device.device_memory import NewMemory, cuda_memory
 from gmijax.collectives.messages.pipe import PipeReader, PipeWriter

@@ -22,8 +22,9 @@ import numpy as np
 import numpy.typing as npt
 
 from gmijax.collectives.channel.dispenser import Piece
-from gmijax.collectives.channel.migrator import ChannelWriter, Migrator
+from gmijax.collectives.channel.migrator import Migrator
 from gmijax.collectives.channel.spec import Array, Spec, write_channel
+from gmijax.collectives.channel.transport import ChannelWriter
 from gmijax.collectives.messages.pipe import Message
 
 ROW_BYTES = 16

@@ -8,17 +8,12 @@ from __future__ import annotations
 
 import time
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Generic, TypeAlias, TypeVar
+from typing import Generic, TypeVar
 
-from gmijax.collectives.messages.pipe import Bytes, PipeWriter
+from gmijax.collectives.channel.transport import ChannelWriter
+from gmijax.collectives.messages.pipe import Bytes
 from gmijax.collectives.waits import LIVENESS_PERIOD_S
 from gmijax.errors import GmijaxError, PeerLost, PipeClosed
-
-if TYPE_CHECKING:
-    from gmijax.collectives.channel.tcp_channel import RemoteWriter  # Needs pyzmq.
-
-ChannelWriter: TypeAlias = "PipeWriter | RemoteWriter"
-"""The way from this agent to trainer `peer`: through shared memory, or by TCP."""
 
 W = TypeVar("W", bound=ChannelWriter)
 

@@ -14,8 +14,9 @@ import numpy as np
 
 from gmijax.collectives.channel.compressor import Transfer
 from gmijax.collectives.channel.dispenser import Piece
-from gmijax.collectives.channel.migrator import ChannelWriter, Migrator
+from gmijax.collectives.channel.migrator import Migrator
 from gmijax.collectives.channel.spec import Array, Spec, write_channel
+from gmijax.collectives.channel.transport import ChannelWriter
 from gmijax.collectives.messages.pipe import Message
 
 
