@@ -3,9 +3,22 @@
 from __future__ import annotations
 
 from types import MappingProxyType
+from typing import NamedTuple
 
-from benchmarks.case import Case
-from benchmarks.reduction_cases import REDUCTION
+
+class Case(NamedTuple):
+    """One command line of `python -m gmijax.train`.
+
+    Attributes:
+      name: what tables call it.
+      overrides: its hydra overrides; `{run}` in them is the number of the repeat, 0 for the first.
+      gpus: how many GPUs it needs.
+    """
+
+    name: str
+    overrides: tuple[str, ...]
+    gpus: int = 1
+
 
 TASKS = ("ant", "anymal", "ball_balance", "franka_cabinet", "humanoid", "shadow_hand")
 
@@ -24,12 +37,6 @@ _LEARNING = {
 def _learning(task: str) -> Case:
     own = _LEARNING.get(task, ())
     return Case(task, (f"env={task}", "seed={run}", *own, "run.measure_throughput=false"))
-
-
-def _entropy(cost: str) -> Case:
-    """Whether noise that is paid for finds the pull that some seeds of the task never find."""
-    own = ("num_timesteps=20e6", f"algo.entropy_cost={cost}", "run.measure_throughput=false")
-    return Case(f"entropy_cost {cost}", ("env=franka_cabinet", "seed={run}", *own))
 
 
 def _throughput(task: str, impl: str, num_envs: int) -> Case:
@@ -70,25 +77,12 @@ _THIRTY = (*_ANT, "num_timesteps=30e6")
 _TWO_GPUS = (*_THIRTY, "plan.gpus=2", "run.measure_throughput=false")
 
 
-def _capped(percent: str) -> Case:
-    steps = 24 * 16 * 4 * 4096
-    return Case(
-        f"4 GMIs x 4096, cap {percent}",
-        (
-            *_ANT,
-            *("num_envs=4096", "plan.gmis_per_gpu=4", "plan.backend=mps"),
-            *(f"plan.sm_percent={percent}", "plan.force_sm_percent=true", "plan.self_check=off"),
-            *(f"num_timesteps={steps}", "run.measure_throughput=false"),
-        ),
-    )
-
-
 _ASYNC = (*_ANT, "algo=a3c", "plan.backend=mps", "channel.capacity_mib=256")
 
 
-def _async(name: str, gpus: int, num_envs: int, *overrides: str, steps: float = 30e6) -> Case:
+def _async(name: str, gpus: int, num_envs: int, *overrides: str) -> Case:
     """Agents with `num_envs` environments each, and trainers."""
-    own = (f"num_envs={num_envs}", f"num_timesteps={steps:.0f}", *overrides)
+    own = (f"num_envs={num_envs}", "num_timesteps=30e6", *overrides)
     return Case(name, (*_ASYNC, *own), gpus)
 
 
@@ -111,6 +105,45 @@ def _channel_designs(task: str, num_envs: int) -> tuple[Case, ...]:
     )
 
 
+def _lgr(task: str, gpus: int, gmis: int, strategy: str) -> Case:
+    """A cell of the paper's table of LGR: so many GPUs with so many trainers each."""
+    return Case(
+        f"{gpus}G{gmis}T {strategy}",
+        (
+            f"env={task}",
+            "num_envs=2048",
+            # A dozen iterations of the longest rollout.
+            f"num_timesteps={12 * 32 * 2048 * gpus * gmis}",
+            f"plan.gpus={gpus}",
+            f"plan.gmis_per_gpu={gmis}",
+            "plan.backend=mps",
+            f"reduce.strategy={strategy}",
+            "run.measure_throughput=false",
+            "run.checkpoint_every=0",
+        ),
+        gpus,
+    )
+
+
+def _scaling(gpus: int, gmis: int, strategy: str) -> Case:
+    """8192 environments on every GPU: weak scaling."""
+    strategy = "auto" if gpus * gmis == 1 else strategy
+    return Case(
+        f"{gpus} GPUs x {gmis} GMIs x {8192 // gmis}",
+        (
+            "env=ant",
+            f"num_envs={8192 // gmis}",
+            f"num_timesteps={40 * 16 * 8192 * gpus}",
+            f"plan.gpus={gpus}",
+            f"plan.gmis_per_gpu={gmis}",
+            f"reduce.strategy={strategy}",
+            "run.measure_throughput=false",
+            "run.checkpoint_every=0",
+        ),
+        gpus,
+    )
+
+
 SUITES = MappingProxyType(
     {
         # Acting and learning on one GPU, with the same 8192 environments as in one GMI.
@@ -119,15 +152,6 @@ SUITES = MappingProxyType(
             _async("1 agent x 8192 + 1 trainer", 1, 8192),
             _async("2 agents x 4096 + 1 trainer", 1, 4096, "plan.serving_gmis_per_gpu=2"),
             _async("4 agents x 2048 + 1 trainer", 1, 2048, "plan.serving_gmis_per_gpu=4"),
-        ),
-        # The same with caps on SMs, the trainer's first, and with larger batches.
-        "async-1gpu-shares": (
-            _async("trainer 25 %", 1, 8192, "plan.sm_percent=[25,100]"),
-            _async("trainer 50 %, agent 50 %", 1, 8192, "plan.sm_percent=[50,50]"),
-            _async(
-                *("2 agents, batches of both", 1, 4096),
-                *("plan.serving_gmis_per_gpu=2", "algo.batch_size=8192"),
-            ),
         ),
         # One process a GPU against several, and against GPUs that do both.
         "async-2gpu": (
@@ -152,19 +176,6 @@ SUITES = MappingProxyType(
             *_channel_designs("anymal", 2048),
             *_channel_designs("humanoid", 2048),
         ),
-        # How fast and how far both learn.
-        "async-learns": (
-            Case("sync", (*_ANT, "num_envs=4096", "num_timesteps=60e6", "seed={run}")),
-            *(
-                _async(
-                    *(f"async, 2 agents x 2048 + 1 trainer, {transport}", 1, 2048),
-                    *("plan.serving_gmis_per_gpu=2", "plan.mps_priority=trainers_first"),
-                    *(f"channel.transport={transport}", "seed={run}"),
-                    steps=60e6,
-                )
-                for transport in ("memory", "device")
-            ),
-        ),
         # The same 8192 environments on one GPU: together, and in four GMIs.
         "ant-1gpu": (
             Case("1 GMI x 8192", (*_THIRTY, "num_envs=8192")),
@@ -179,8 +190,6 @@ SUITES = MappingProxyType(
         ),
         # Trainers among their simulators, and in GMIs of their own.
         **{f"templates-{task}": _templates(task, 2048) for task in ("ant", "humanoid")},
-        # What one GMI does with the environments that each of the four had.
-        "ant-small": (Case("1 GMI x 2048", (*_THIRTY, "num_envs=2048")),),
         "ant-2gpu": (
             Case(
                 "2 GPUs x 2 GMIs x 2048, mps",
@@ -193,9 +202,6 @@ SUITES = MappingProxyType(
                 2,
             ),
         ),
-        # Plain data parallelism: the same environments with one GMI on each GPU.
-        "ant-2gpu-one-each": (Case("2 GPUs x 1 GMI x 4096", (*_TWO_GPUS, "num_envs=4096"), 2),),
-        "ant-learns": (Case("1 GMI x 8192", (*_ANT, "num_envs=8192", "num_timesteps=150e6")),),
         # Every task, both implementations of MJX, one GMI.
         **{
             f"tasks-{impl}": tuple(
@@ -205,20 +211,34 @@ SUITES = MappingProxyType(
             )
             for impl in ("jax", "warp")
         },
-        # What a cap on SMs does to four GMIs; docs/shares.md.
-        "sm-shares": tuple(_capped(percent) for percent in ("null", "25", "50", "100", "33")),
         # Every task with its own settings, another seed in every repeat.
         **{f"learn-{task}": (_learning(task),) for task in TASKS},
-        # What ant learns from as many steps of the other MJX.
-        "learn-ant-jax": (
-            Case(
-                "ant jax",
-                (*_ANT, "seed={run}", "num_timesteps=60e6", "run.measure_throughput=false"),
-            ),
+        # Gradients through host memory against the best layout-aware reduction.
+        **{
+            f"lgr-{task}": tuple(
+                _lgr(task, gpus, gmis, strategy)
+                for gpus, gmis in ((2, 2), (2, 3), (4, 4))
+                for strategy in ("mpr", "har")
+            )
+            for task in ("ant", "humanoid", "shadow_hand")
+        },
+        # The same without rings, beside mpr in one run.
+        **{
+            f"lgr-{task}-one_shot": tuple(
+                _lgr(task, gpus, gmis, strategy)
+                for gpus, gmis in ((2, 2), (2, 3), (4, 4))
+                for strategy in ("mpr", "one_shot")
+            )
+            for task in ("ant", "humanoid", "shadow_hand")
+        },
+        "scaling": tuple(
+            _scaling(gpus, gmis, strategy)
+            for gmis, strategy in ((1, "flat"), (2, "har"))
+            for gpus in (1, 2, 4, 8)
         ),
-        "entropy-franka_cabinet": tuple(map(_entropy, ("0", "0.002", "0.005"))),
-        **REDUCTION,
-        "ball-cpu": (Case("2 GMIs x 512", ("env=ball_balance", "plan.gpus=2")),),
+        "scaling-one_shot": tuple(
+            _scaling(gpus, gmis, "one_shot") for gmis in (1, 2) for gpus in (1, 2, 4, 8)
+        ),
     }
 )
 """Suite -> cases. Ratios are taken within a suite, whose cases run in turn."""

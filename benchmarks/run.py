@@ -2,10 +2,8 @@
 
 `python -m benchmarks.run ant-1gpu --repeats 3` runs the cases in turn (A B C A B C ...), prints
 the medians, and adds a call with every run in it to `benchmarks/results/<suite>.json`. With
-`--gpus 4` as many runs go on at a time as there are GPUs for, each alone on its own.
-`--together 3` puts three at a time on each GPU, under an MPS daemon that runs already: what they
-learn is the same, their seconds are not, and each run says how many they were. `--resume` goes on
-with the last call, if code and machine are still the same.
+`--gpus 4` as many runs go on at a time as there are GPUs for, each alone on its own. `--resume`
+goes on with the last call, if code and machine are still the same.
 """
 
 from __future__ import annotations
@@ -20,6 +18,7 @@ import sys
 import tempfile
 from collections.abc import Collection, Mapping
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
 
@@ -27,7 +26,6 @@ from benchmarks.cases import SUITES, Case
 from benchmarks.free_gpus import FreeGpus
 from benchmarks.records import RESULTS, ResultsFile
 from gmijax.errors import ConfigError
-from gmijax.machine.snapshot import detect_machine
 from gmijax.runs.folder import RunPaths, read_json
 from gmijax.runs.history import read_metrics
 
@@ -44,7 +42,6 @@ def main() -> int:
     )
     parser.add_argument("--repeats", type=int, default=3)
     parser.add_argument("--gpus", type=int, help="run cases at the same time on so many GPUs")
-    parser.add_argument("--together", type=int, default=1, help="runs at a time on each GPU")
     parser.add_argument("--out", type=Path, default=RESULTS, help="folder of the JSON files")
     parser.add_argument("--runs", type=Path, help="keep the run folders here")
     parser.add_argument("--resume", action="store_true", help="add to the runs in the JSON file")
@@ -58,8 +55,6 @@ def main() -> int:
             parser.error(f"--gpus {arguments.gpus}: every case of these suites needs more")
         for case in large:
             sys.stderr.write(f"{case.name}: left out, it needs {case.gpus} GPUs\n")
-    if arguments.together > 1 and (reason := why_not_together(cases, arguments.gpus)):
-        parser.error(f"--together {arguments.together}: {reason}")
     wanted = {case.name for case in cases}
     suites = [s for s in arguments.suites if any(case.name in wanted for case in SUITES[s])]
     try:
@@ -67,7 +62,7 @@ def main() -> int:
     except ConfigError as error:
         parser.error(str(error))
     with tempfile.TemporaryDirectory() as scratch:
-        free = FreeGpus(arguments.gpus, arguments.together) if arguments.gpus else None
+        free = FreeGpus(arguments.gpus) if arguments.gpus else None
         run_all(books, wanted, arguments.repeats, arguments.runs or Path(scratch), free)
     for book in books.values():
         sys.stdout.write(f"{table(book.results)}\nwritten: {book.path}\n")
@@ -83,17 +78,6 @@ def _book(suite: str, wanted: Collection[str], arguments: argparse.Namespace) ->
         if case.name in wanted:
             known.setdefault(case.name, {"command": command(case), "runs": []})
     return book
-
-
-def why_not_together(cases: list[Case], gpus: int | None) -> str | None:
-    """What stands in the way of several runs on a GPU, None if nothing does."""
-    if gpus is None:
-        return "needs --gpus"
-    if large := [case.name for case in cases if case.gpus > 1]:
-        return f"{large[0]} needs several GPUs"
-    if detect_machine().operator_daemon is None:
-        return "no MPS daemon runs; start one with nvidia-cuda-mps-control -d"
-    return None
 
 
 def missing(
@@ -140,17 +124,10 @@ def run_all(
         # Letters and digits only: the folder is a value on a command line.
         name = re.sub(r"[^a-zA-Z0-9]+", "-", case.name)
         folder = unused(runs / f"{suite}-{name}-{repeat}")
-        folder_override = f"run.dir={folder}"
+        with free.taken(case.gpus) if free else nullcontext(()) as overrides:
+            done = run_case(case, repeat, (*overrides, f"run.dir={folder}"), folder)
         # Runs that go on at the same time are noted as they end: who is which must be told.
-        note: dict[str, Any] = {"repeat": repeat}
-        if free is None:
-            add(suite, case, {**run_case(case, repeat, (folder_override,), folder), **note})
-            return
-        with free.taken(case.gpus) as taken:
-            done = run_case(case, repeat, (*free.overrides(taken), folder_override), folder)
-        if free.together > 1:
-            note["together"] = free.together
-        add(suite, case, {**done, **note})
+        add(suite, case, {**done, "repeat": repeat})
 
     def add(suite: str, case: Case, run: dict[str, Any]) -> None:
         """Takes in one run, and writes: an interruption loses the running ones only."""
@@ -159,7 +136,7 @@ def run_all(
             kept["config"] = run.pop("config", kept.get("config"))
             kept["runs"].append(run)
 
-    with ThreadPoolExecutor(free.count * free.together if free else 1) as pool:
+    with ThreadPoolExecutor(free.count if free else 1) as pool:
         started = [
             pool.submit(run, suite, repeat, case)
             for suite, book in books.items()

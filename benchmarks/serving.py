@@ -2,9 +2,8 @@
 
 The same environments act with random actions in m GMIs (template `tcg`), and in m GMIs that
 simulate plus one that infers (`tdg`). With `--backends mps share` both run under both. Adds a call
-to `benchmarks/results/serving-<device>.json`, which `benchmarks.resource_model` reads:
-`simulator_s`, `agent_s` and `com_s` are medians of the stages of one dedicated step of all
-environments of a GMI.
+to `benchmarks/results/serving-<device>.json`; `simulator_s`, `agent_s` and `com_s` in it are
+medians of the stages of one dedicated step of all environments of a GMI.
 """
 
 from __future__ import annotations
@@ -71,7 +70,7 @@ def settings(arguments: argparse.Namespace) -> Iterator[Setting]:
 
 
 def measure(setting: Setting, arguments: argparse.Namespace, scratch: Path) -> dict[str, Any]:
-    """Both templates in turn, as often as wanted; a case of `benchmarks.resource_model`.
+    """Both templates in turn, as often as wanted; a case of the file.
 
     Throughputs and times are medians over the repeats; every repeat's summary is kept.
     """

@@ -26,17 +26,16 @@ def curve_of(row: Mapping[str, Any]) -> Curve | None:
     return np.array(seconds), np.array([line["env_steps"] for line in lines])
 
 
-def settled_rate(curve: Sequence[tuple[float, int]], skip: float = 0.2) -> float | None:
-    """Steps per second after the first part of one training, which holds compilation.
+def settled_rate(curve: Sequence[tuple[float, int]]) -> float | None:
+    """Steps per second after the first fifth of one training, which holds compilation.
 
     Args:
       curve: seconds and environment steps by then, oldest first.
-      skip: the part of all steps that is left out; counted from the first point behind it.
 
     Returns:
-      None where less than two points are left.
+      None where less than two points are behind it.
     """
-    kept = [point for point in curve if point[1] >= skip * curve[-1][1]]
+    kept = [point for point in curve if point[1] >= 0.2 * curve[-1][1]]
     if len(kept) < 2:
         return None
     (first_s, first), (last_s, last) = kept[0], kept[-1]

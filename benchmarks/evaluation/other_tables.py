@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from types import MappingProxyType
 from typing import Any
 
@@ -18,8 +18,8 @@ from benchmarks.evaluation.figures import (
     shown,
     source,
 )
-from benchmarks.records import RESULTS
-from benchmarks.resource_model import cases_of, predicted_gain
+from benchmarks.paper_model import Task, serving_gain
+from benchmarks.records import RESULTS, read_calls
 
 SERVING, OLD_BACKENDS = "serving-nvidia-h200", "serving-backends-nvidia-h200"
 USE, REDUCTION = "resource-use-nvidia-h200", "reduction-nvidia-h200"
@@ -75,8 +75,10 @@ def backends() -> list[str]:
 
 def serving_templates() -> list[str]:
     """Simulator and agent in one GMI against apart, with the paper's model."""
+    calls = reversed(read_calls(RESULTS / f"{SERVING}.json"))
+    timed = ([case for case in call.results["cases"] if "simulator_s" in case] for call in calls)
     rows = []
-    for case in cases_of(RESULTS / f"{SERVING}.json"):
+    for case in next(cases for cases in timed if cases):
         gain = case["colocated"] / case["dedicated"]
         rates = (f"{case[key]:,.0f}" for key in ("colocated", "dedicated"))
         times = (f"{1e3 * case[key]:.2f}" for key in ("simulator_s", "agent_s", "com_s"))
@@ -86,6 +88,12 @@ def serving_templates() -> list[str]:
         "| model: | measured:"
     )
     return [*markdown(head, rows), *source(SERVING)]
+
+
+def predicted_gain(case: Mapping[str, Any]) -> float:
+    """Throughput of co-located over dedicated GMIs by equation 2, with the paper's R and alpha."""
+    simulator, agent = Task(case["simulator_s"], 10.0), Task(case["agent_s"], 1.0)
+    return serving_gain(simulator, agent, 0.2, case["com_s"])
 
 
 def resource_use() -> list[str]:

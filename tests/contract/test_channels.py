@@ -10,9 +10,9 @@ from typing import Any, get_args, get_type_hints
 import numpy as np
 import pytest
 
-from benchmarks.channel_job import ChannelJob
 from gmijax.collectives.channel.build import ChannelTopology
 from gmijax.config.channel import ChannelConfig
+from tests.channel_job import ChannelJob
 
 pytestmark = pytest.mark.timeout(120)
 

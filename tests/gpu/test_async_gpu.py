@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 from training_jobs import train
 
-from benchmarks.channel_job import ChannelJob
 from gmijax.collectives.channel.build import ChannelTopology
 from gmijax.config.channel import ChannelConfig
+from tests.channel_job import ChannelJob
 
 pytestmark = [pytest.mark.gpu, pytest.mark.timeout(600)]
 

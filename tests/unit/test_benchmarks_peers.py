@@ -117,7 +117,6 @@ def test_the_rate_is_of_what_is_behind_a_fifth_of_the_steps():
     # The first program compiles for 40 seconds, then 100 steps take a second.
     curve = [(40.0, 100), (41.5, 200), (42.5, 300), (43.5, 400), (46.5, 1000)]
     assert settled_rate(curve) == pytest.approx(800 / 5)
-    assert settled_rate(curve, skip=0.4) == pytest.approx(600 / 3)
     assert settled_rate(curve[:1]) is None
 
 

@@ -20,13 +20,6 @@ from benchmarks.paper_model import (
     throughput,
     training_gain,
 )
-from benchmarks.records import RESULTS
-from benchmarks.resource_model import (
-    cases_of,
-    measured_gain,
-    predicted_gain,
-    resources_of,
-)
 from gmijax.errors import ConfigError
 
 # Section 5.1: R_s = 10 R_a = 5 R_t, T_s = 6 T_a = 3 T_t, alpha 0.2, beta 0.3.
@@ -92,27 +85,3 @@ def test_what_takes_no_time_has_no_throughput():
         tdg_resource(Task(0.0, 1.0), Task(0.0, 1.0), ALPHA)
     with pytest.raises(ConfigError, match="resource=0"):
         throughput(1.0, 0.0, 1.0, 0.0)
-
-
-def test_a_measured_case_is_predicted_by_equation_2():
-    case = {"simulator_s": 6.0, "agent_s": 1.0, "com_s": 14.0, "colocated": 3.0, "dedicated": 2.0}
-    # Three times the time, at 10 / 8.6 times the resource.
-    assert predicted_gain(case) == pytest.approx(3 * 8.6 / 10)
-    assert measured_gain(case) == 1.5
-
-
-def test_a_file_of_another_suite_is_refused():
-    file = RESULTS / "ant-1gpu.json"
-    with pytest.raises(ConfigError, match=r"ant-1gpu.json: no case with times of its stages"):
-        cases_of(file)
-
-
-def test_resources_are_the_larger_part_and_go_by_the_environment() -> None:
-    uses = {
-        "ant": {
-            "simulator": {"seconds": 1.0, "sm": 0.4, "memory": 0.1},
-            "agent": {"seconds": 1.0, "sm": 0.02, "memory": 0.05},
-        }
-    }
-    assert resources_of("ant 1 x 8192, mps", uses) == {"simulator_r": 0.4, "agent_r": 0.05}
-    assert resources_of("templates-humanoid", uses) == {}

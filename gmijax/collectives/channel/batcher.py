@@ -43,7 +43,7 @@ class Batcher:
 
     A batch that lies in one transfer is a slice of it, without a copy, and holds its memory until
     the next batch is asked for. Otherwise unrolls are stacked in what `new_stack` makes.
-    It counts `batches` given out, `unrolls`, `transfers` and `num_bytes` that arrived.
+    It counts `batches` given out, `unrolls` and `transfers` that arrived.
     """
 
     def __init__(
@@ -53,7 +53,7 @@ class Batcher:
         new_stack: Callable[[Spec, int], Stack],
         held: contextlib.ExitStack,
     ) -> None:
-        self.batches = self.unrolls = self.transfers = self.num_bytes = 0
+        self.batches = self.unrolls = self.transfers = 0
         self._rank = rank
         self._sources = list(sources)
         self._turn = 0
@@ -126,7 +126,6 @@ class Batcher:
             if transfer is not None:
                 self._turn += place + 1
                 self.unrolls += transfer.num_envs
-                self.num_bytes += sum(transfer.spec.sizes(transfer.num_envs))
                 agents = np.full(transfer.num_envs, source[0].peer, np.int64)
                 return _Arrival(transfer, agents, source[0].release)
         return None

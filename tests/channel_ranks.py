@@ -1,4 +1,4 @@
-"""Agents and trainers of `benchmarks.channels` and of the contract tests: processes without jax.
+"""Agents and trainers of the tests of channels: processes without jax.
 
 Every unroll has a number and says so in all its values, so that a trainer sees at once whether
 what it got is whole, and its list of numbers tells what was lost or came twice.
@@ -71,10 +71,8 @@ def numbers_of(batch: Batch) -> npt.NDArray[np.int64]:
 def act(sender: Sender, task: Options) -> Options:
     """Sends the unrolls, with random pauses."""
     rank, pauses = task["rank"], np.random.default_rng([task["rank"], os.getpid()])
-    envs, started_s = task["envs"], time.perf_counter()
-    ready = numbered(rank, 0, task)
-    for number in range(0, task["count"], envs):
-        experience: Any = ready if task["fast"] else numbered(rank, number, task)
+    for number in range(0, task["count"], task["envs"]):
+        experience: Any = numbered(rank, number, task)
         if sender.on_device and not task["fake_device"]:
             experience = importlib.import_module("jax").device_put(experience)
         if not sender.send(experience, number // 1000, task["timeout_s"]):
@@ -83,13 +81,13 @@ def act(sender: Sender, task: Options) -> Options:
         if pauses.random() < task["pause_chance"]:
             time.sleep(pauses.random() * 2e-3)
     sender.close()
-    return {"wall_s": time.perf_counter() - started_s, "dropped": sender.dropped}
+    return {"dropped": sender.dropped}
 
 
 def learn(receiver: Batcher, task: Options) -> Options:
     """Receives until all agents have closed; writes the numbers it got, by agent, to a file."""
     got: list[npt.NDArray[np.int64]] = []
-    batch_size, started_s, wall_s = task["batch"], None, 0.0
+    batch_size = task["batch"]
     while True:
         try:
             batch = receiver.receive(batch_size, task["timeout_s"])
@@ -98,15 +96,11 @@ def learn(receiver: Batcher, task: Options) -> Options:
                 break
             batch_size = 1  # What is left of a batch.
             continue
-        now_s = time.perf_counter()
-        started_s, wall_s = started_s or now_s, now_s - (started_s or now_s)
-        if not task["fast"]:
-            got.append(np.stack([batch.agents, numbers_of(batch)]))
+        got.append(np.stack([batch.agents, numbers_of(batch)]))
         time.sleep(task["busy_s"])
     if got:
         np.save(f"{task['result']}.npy", np.concatenate(got, axis=1))
-    counted = ("unrolls", "transfers", "num_bytes")
-    return {"wall_s": wall_s, **{name: getattr(receiver, name) for name in counted}}
+    return {"unrolls": receiver.unrolls}
 
 
 def mark(name: str, task: Options) -> None:

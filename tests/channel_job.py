@@ -1,4 +1,4 @@
-"""Starts agents and trainers of `benchmarks.channel_ranks`, and counts what they exchanged."""
+"""Starts agents and trainers of `tests.channel_ranks`, and counts what they exchanged."""
 
 from __future__ import annotations
 
@@ -16,10 +16,10 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.channel_ranks import ENV_FD, Options
 from gmijax.collectives.channel.build import ChannelTopology, create_channels
 from gmijax.collectives.nodes.meeting import reserved_address
 from gmijax.config.channel import ChannelConfig
+from tests.channel_ranks import ENV_FD, Options
 
 DEFAULTS: Options = {
     "count": 1000,  # unrolls of every agent
@@ -31,7 +31,6 @@ DEFAULTS: Options = {
     "pause_chance": 0.0,
     "busy_s": 0.0,  # what a trainer does with a batch
     "fake_device": None,  # folder of the device memory that is none, for transport=device
-    "fast": False,  # no numbers, nothing is checked
 }
 
 
@@ -84,7 +83,7 @@ class ChannelJob:
             given = {**self._task, "rank": rank, "result": str(self._path(rank)), **task}
             with self._path(rank).with_suffix(".stderr").open("wb") as stderr:
                 self._processes[rank] = subprocess.Popen(
-                    [sys.executable, "-m", "benchmarks.channel_ranks", json.dumps(given)],
+                    [sys.executable, "-m", "tests.channel_ranks", json.dumps(given)],
                     env={**os.environ, ENV_FD: str(self._fd)},
                     cwd=Path(__file__).resolve().parents[1],
                     pass_fds=[self._fd],
