@@ -24,11 +24,11 @@ from gmijax.errors import GmijaxError, JobInterrupted, NodeLost
 from gmijax.runs.cache import cache_folder
 from gmijax.runs.folder import read_json
 from gmijax.supervise.launcher import StopSignals
-from gmijax.sweeps.host import Host
 from gmijax.sweeps.jobs import Job, SweepPaths
+from gmijax.sweeps.nodes import Host
 from gmijax.sweeps.places import Places, Site, places_of
 from gmijax.sweeps.scheduler import Scheduler
-from gmijax.sweeps.study import NoStudy
+from gmijax.sweeps.study import Study
 
 COUNTS = (1, 2, 4, 8, 16, 32)
 GAIN = 0.05
@@ -142,7 +142,7 @@ def _profile(settings: SweepConfig, job: Job, count: int, bench: _Bench) -> Meas
             places = Places([Site(plan, host.machine)])
             try:
                 host.open(plan, paths)
-                Scheduler(jobs, NoStudy(), settings, paths, places, [host], tick).run(inner)
+                Scheduler(jobs, Study(), settings, paths, places, [host], tick).run(inner)
             finally:
                 host.shut()
         except NodeLost:

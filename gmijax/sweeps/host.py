@@ -7,7 +7,7 @@ import os
 from collections.abc import Iterable, Mapping
 from contextlib import ExitStack
 from pathlib import Path
-from typing import Any, Literal, NamedTuple, Protocol
+from typing import Any, Literal, NamedTuple
 
 from gmijax.machine.mps_control import PIPE_VARIABLE
 from gmijax.machine.snapshot import DAEMONS_VARIABLE, Machine
@@ -45,61 +45,14 @@ class Started(NamedTuple):
     has_programs: bool
 
 
-class Host(Protocol):
-    """A machine; calls that need an answer raise `NodeLost` if it is gone.
+class LocalHost:
+    """This machine.
 
     Attributes:
       name: address of a node; None: this machine.
       machine: what it has.
+      lost: why it is gone; None while it answers.
     """
-
-    name: str | None
-    machine: Machine
-
-    @property
-    def lost(self) -> str | None:
-        """Why it is gone; None while it answers."""
-        ...
-
-    def lease(self, devices: Iterable[str]) -> str | None:
-        """Holds all devices for this sweep; if another one has any, its UUID, and holds none."""
-        ...
-
-    def open(self, plan: Plan, run: RunPaths) -> None:
-        """Enters the backend of a plan of places.
-
-        Raises:
-          BackendUnavailable: it cannot be had there.
-        """
-        ...
-
-    def start(self, start: Start) -> Started:
-        """Starts a job.
-
-        Raises:
-          GmijaxError: it cannot be started, or its daemon not be renewed.
-        """
-        ...
-
-    def look(self, child: int) -> Seen | None:
-        """The newest that is known of a child, None before anything is."""
-        ...
-
-    def order(self, child: int, order: Order) -> None:
-        """Has a method of a child called."""
-        ...
-
-    def add_program(self, program: str, is_lasting: bool) -> None:
-        """See `CompiledPrograms`."""
-        ...
-
-    def shut(self) -> None:
-        """Leaves the backend; all children have ended."""
-        ...
-
-
-class LocalHost:
-    """This machine; see `Host`."""
 
     name: str | None = None
     lost: str | None = None
@@ -113,7 +66,7 @@ class LocalHost:
         self._num_started = 0
 
     def lease(self, devices: Iterable[str]) -> str | None:
-        """See `Host`; they are held until `close`."""
+        """Holds all devices until `close`; if another sweep has any, its UUID, and holds none."""
         folder = cache_folder() / "leases"
         with ExitStack() as taken:
             for device in set(devices):
@@ -125,11 +78,19 @@ class LocalHost:
         return None
 
     def open(self, plan: Plan, run: RunPaths) -> None:
-        """See `Host`."""
+        """Enters the backend of a plan of places.
+
+        Raises:
+          BackendUnavailable: it cannot be had there.
+        """
         self._backend = self._entered.enter_context(open_backend(plan, self.machine, run))
 
     def start(self, start: Start) -> Started:
-        """See `Host`."""
+        """Starts a job.
+
+        Raises:
+          GmijaxError: it cannot be started, or its daemon not be renewed.
+        """
         assert self._backend is not None
         variables = variables_of(start.place, self._backend)
         child = Child(start.config, start.place.cpus, start.order, start.log, variables)
@@ -139,7 +100,7 @@ class LocalHost:
         return Started(self._num_started, self._compiled.holds(start.program))
 
     def look(self, child: int) -> Seen | None:
-        """See `Host`."""
+        """The newest that is known of a child, None before anything is."""
         return self._children[child].look()
 
     def look_at_all(self) -> dict[int, Seen]:
@@ -147,17 +108,17 @@ class LocalHost:
         return {number: child.look() for number, child in self._children.items()}
 
     def order(self, child: int, order: Order) -> None:
-        """See `Host`."""
+        """Calls a method of a child."""
         getattr(self._children[child], order)()
         if order == "close":
             del self._children[child]
 
     def add_program(self, program: str, is_lasting: bool) -> None:
-        """See `Host`."""
+        """See `CompiledPrograms`."""
         self._compiled.add(program, is_lasting=is_lasting)
 
     def shut(self) -> None:
-        """See `Host`."""
+        """Leaves the backend; all children have ended."""
         self._backend = None
         self._entered.close()
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeAlias
 
 from gmijax.cluster.checks import by_name, require_alike, require_shared
 from gmijax.cluster.node import Node
@@ -43,7 +43,7 @@ class SweepNode(Node):
         return self._host.look_at_all()
 
     def order(self, child: int, order: Order) -> None:
-        """See `Host`."""
+        """See `LocalHost`."""
         self._host.order(child, order)
 
     def close(self) -> None:
@@ -52,7 +52,10 @@ class SweepNode(Node):
 
 
 class RemoteHost:
-    """A node as the scheduler sees it; see `Host`."""
+    """A node as the scheduler sees it, with the methods of a `LocalHost`.
+
+    Those that need an answer raise `NodeLost` if it is gone.
+    """
 
     def __init__(self, joined: Joined, name: str) -> None:
         self.name: str | None = name
@@ -62,36 +65,36 @@ class RemoteHost:
 
     @property
     def lost(self) -> str | None:
-        """See `Host`."""
+        """See `LocalHost`."""
         return self._node.lost
 
     def lease(self, devices: Iterable[str]) -> str | None:
-        """See `Host`."""
+        """See `LocalHost`."""
         return self._do("lease", tuple(devices))
 
     def open(self, plan: Plan, run: RunPaths) -> None:
-        """See `Host`."""
+        """See `LocalHost`."""
         self._run = run
         self._do("open", plan, run)
 
     def start(self, start: Start) -> Started:
-        """See `Host`."""
+        """See `LocalHost`."""
         return self._do("start", start)
 
     def look(self, child: int) -> Seen | None:
-        """See `Host`."""
+        """See `LocalHost`."""
         return self._node.look(child)
 
     def order(self, child: int, order: Order) -> None:
-        """See `Host`."""
+        """See `LocalHost`."""
         self._node.order(child, order)
 
     def add_program(self, program: str, is_lasting: bool) -> None:
-        """See `Host`."""
+        """See `LocalHost`."""
         self._do("add_program", program, is_lasting)
 
     def shut(self) -> None:
-        """See `Host`."""
+        """See `LocalHost`."""
         with suppress(NodeLost):
             self._do("shut")
         if self._run is not None:
@@ -105,6 +108,10 @@ class RemoteHost:
         if isinstance(answer, GmijaxError):
             raise answer
         return answer
+
+
+Host: TypeAlias = LocalHost | RemoteHost
+"""A machine of a sweep."""
 
 
 @contextmanager

@@ -68,11 +68,11 @@ def ranking(rows: Sequence[Mapping[str, Any]], sweep: SweepConfig) -> Table:
     return table
 
 
-def draw_curves(jobs: Sequence[Job], sweep: SweepConfig, paths: SweepPaths) -> bool:
+def draw_curves(jobs: Sequence[Job], sweep: SweepConfig, paths: SweepPaths) -> None:
     """Draws the objective over environment steps: one line for all seeds of the same settings.
 
     The line is the interquartile mean over the seeds, the band the range between the quartiles
-    (as rliable draws them, arXiv 2108.13264). False where there is nothing to draw.
+    (as rliable draws them, arXiv 2108.13264). Without any value there is no picture.
     """
     groups: dict[str, list[list[tuple[int, float]]]] = {}
     for job in jobs:
@@ -81,7 +81,7 @@ def draw_curves(jobs: Sequence[Job], sweep: SweepConfig, paths: SweepPaths) -> b
             label = label_of(own) or "all seeds"
             groups.setdefault(label, []).append(curve)
     if not groups:
-        return False
+        return
     # Imported here: it costs half a second that no other use of this module should pay.
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
@@ -98,7 +98,6 @@ def draw_curves(jobs: Sequence[Job], sweep: SweepConfig, paths: SweepPaths) -> b
     axes.grid(alpha=0.3)
     axes.legend(fontsize="small")
     figure.savefig(paths.curves, dpi=120)
-    return True
 
 
 def spread(

@@ -17,9 +17,10 @@ from gmijax.runs.history import MetricsReader
 from gmijax.supervise.failures import may_be_anothers
 from gmijax.supervise.launcher import StopSignals
 from gmijax.sweeps.children import Seen
-from gmijax.sweeps.host import Host, Start
+from gmijax.sweeps.host import Start
 from gmijax.sweeps.hparams import write_hparams
 from gmijax.sweeps.jobs import Job, SweepPaths, placed
+from gmijax.sweeps.nodes import Host
 from gmijax.sweeps.places import Place, Places
 from gmijax.sweeps.study import Study
 

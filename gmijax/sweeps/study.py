@@ -5,7 +5,7 @@ from __future__ import annotations
 import importlib
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 from gmijax.config.sweep import SweepConfig
 from gmijax.errors import ConfigError
@@ -20,39 +20,23 @@ _MOST_RANDOM = 10
 """Trials before TPE begins, with many of them: Optuna's default. With few, a quarter of them."""
 
 
-class Study(Protocol):
-    """Hands out jobs, and is told what became of them."""
+class Study:
+    """Hands out jobs, and is told what became of them; this one has none but those of the list."""
 
     def next(self) -> Job | None:
         """Another job; None: there is none, now or any more."""
-        ...
-
-    def is_hopeless(self, job: Job) -> bool:
-        """Whether a job that runs should give its place to another one."""
-        ...
-
-    def tell(self, job: Job) -> None:
-        """A job has ended."""
-        ...
-
-
-class NoStudy:
-    """All jobs were known from the beginning."""
-
-    def next(self) -> Job | None:
-        """See `Study`."""
         return None
 
     def is_hopeless(self, job: Job) -> bool:
-        """See `Study`."""
+        """Whether a job that runs should give its place to another one."""
         del job
         return False
 
     def tell(self, job: Job) -> None:
-        """See `Study`."""
+        """A job has ended."""
 
 
-class OptunaStudy:
+class OptunaStudy(Study):
     """Jobs as the trials of an Optuna study, which a file keeps.
 
     Trials that a killed sweep left running, and failed ones, which stay open in the study, are

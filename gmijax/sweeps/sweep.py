@@ -21,7 +21,7 @@ from gmijax.machine.snapshot import detect_machine
 from gmijax.runs.folder import RUNS, create_run, given_run, locked, read_json, write_json
 from gmijax.supervise.launcher import StopSignals, stop_signals
 from gmijax.sweeps.density import with_density
-from gmijax.sweeps.host import Host, LocalHost
+from gmijax.sweeps.host import LocalHost
 from gmijax.sweeps.jobs import (
     Job,
     SweepPaths,
@@ -30,12 +30,12 @@ from gmijax.sweeps.jobs import (
     require_placeable,
     state_of,
 )
-from gmijax.sweeps.nodes import nodes_of
+from gmijax.sweeps.nodes import Host, nodes_of
 from gmijax.sweeps.places import Places, Site, places_of
 from gmijax.sweeps.report import ranking, write_report
 from gmijax.sweeps.scheduler import Scheduler
 from gmijax.sweeps.space import Space
-from gmijax.sweeps.study import MakeJob, NoStudy, OptunaStudy, Study
+from gmijax.sweeps.study import MakeJob, OptunaStudy, Study
 from gmijax.sweeps.view import SweepView
 
 _LEASE_POLL_S = 0.2
@@ -234,7 +234,7 @@ def _beginning(request: Request, paths: SweepPaths) -> tuple[list[Job], Study]:
         raise ConfigError(
             f"run.dir={paths.root}: holds another sweep; give the same lists, or another folder"
         )
-    study: Study = NoStudy()
+    study = Study()
     jobs = list(request.jobs)
     if settings.sampler != "grid":
         study = OptunaStudy(settings, request.space, request.make_job, paths.study)

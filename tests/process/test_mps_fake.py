@@ -35,7 +35,7 @@ from gmijax.sweeps.host import LocalHost, variables_of
 from gmijax.sweeps.jobs import SweepPaths, jobs_of
 from gmijax.sweeps.places import Places, Site, places_of
 from gmijax.sweeps.scheduler import Scheduler
-from gmijax.sweeps.study import NoStudy
+from gmijax.sweeps.study import Study
 
 pytestmark = pytest.mark.timeout(60)
 
@@ -309,7 +309,7 @@ def test_a_fatal_fault_ends_one_job_of_a_sweep_and_its_neighbours_go_on(
     with closing(LocalHost(here)) as host:
         host.open(plan, paths)
         places = Places([Site(plan, here)])
-        scheduler = Scheduler(jobs, NoStudy(), settings, paths, places, [host], lambda: None)
+        scheduler = Scheduler(jobs, Study(), settings, paths, places, [host], lambda: None)
         scheduler.run(StopSignals())
     states = [job.progress.state for job in jobs]
     assert states == ["completed", "failed", *["completed"] * 4]

@@ -21,38 +21,30 @@ from gmijax.config import ClusterConfig
 from gmijax.config.sweep import SweepConfig
 from gmijax.errors import BackendUnavailable, ConfigError, NodeLost
 from gmijax.machine.snapshot import Machine
-from gmijax.partition.plan import Plan
 from gmijax.runs.folder import RunPaths, read_json
 from gmijax.supervise.launcher import StopSignals
 from gmijax.sweeps import scheduler
 from gmijax.sweeps.children import Seen
-from gmijax.sweeps.host import Order, Start, Started
+from gmijax.sweeps.host import LocalHost, Order, Start, Started
 from gmijax.sweeps.jobs import Job, SweepPaths, jobs_of
 from gmijax.sweeps.nodes import RemoteHost, SweepNode, nodes_of, num_cpus_of
 from gmijax.sweeps.places import Places, Site, places_of
 from gmijax.sweeps.report import write_report
 from gmijax.sweeps.scheduler import Scheduler
-from gmijax.sweeps.study import NoStudy
+from gmijax.sweeps.study import Study
 
 
-class FakeHost:
+class FakeHost(LocalHost):
     """A node whose jobs go on until `end` says how they end."""
 
     def __init__(self, name: str) -> None:
-        self.name: str | None = name
-        self.machine = machine(0)
-        self.lost: str | None = None
+        super().__init__(machine(0))
+        self.name = name
         self.running: dict[int, int] = {}  # Jobs by their children.
         self.seen: dict[int, Seen] = {}
         self.started: list[int] = []
         self.programs: set[str] = set()
         self._numbers = itertools.count()
-
-    def lease(self, devices: Iterable[str]) -> str | None:
-        del devices
-
-    def open(self, plan: Plan, run: RunPaths) -> None:
-        del plan, run
 
     def start(self, start: Start) -> Started:
         if self.lost is not None:
@@ -76,9 +68,6 @@ class FakeHost:
         del is_lasting
         self.programs.add(program)
 
-    def shut(self) -> None:
-        """Nothing is open."""
-
     def end(self, exit_code: int = 0) -> None:
         """Ends all jobs that run there."""
         self.seen |= {child: Seen(exit_code, "CUDA_ERROR_X") for child in self.running}
@@ -101,7 +90,7 @@ class Sweep:
         def tick() -> None:
             (left.pop(0) if len(left) > 1 else left[0])()
 
-        args = self.jobs, NoStudy(), self.settings, self.paths, self.places, self.nodes, tick
+        args = self.jobs, Study(), self.settings, self.paths, self.places, self.nodes, tick
         Scheduler(*args).run(StopSignals())
 
     def states(self) -> list[str]:
@@ -238,7 +227,7 @@ def test_equal_programs_compile_once_on_each_node(tmp_path: Path) -> None:
 
 def test_what_a_node_refuses_is_raised_here_and_does_not_lose_it() -> None:
     here = SweepNode.__new__(SweepNode)
-    here._host = FakeHost("b")  # type: ignore[assignment]
+    here._host = FakeHost("b")
 
     def refuse(*_: Any) -> None:
         raise BackendUnavailable("no daemon")

@@ -16,7 +16,7 @@ from tensorboardX.proto import event_pb2, plugin_hparams_pb2
 from gmijax.cli.compose import compose
 from gmijax.config.sweep import SweepConfig
 from gmijax.control import display
-from gmijax.control.console import ConsoleProgress, open_console
+from gmijax.control.console import open_console
 from gmijax.errors import printable
 from gmijax.runs.folder import RunPaths
 from gmijax.sweeps.hparams import write_hparams
@@ -112,12 +112,6 @@ def test_an_error_of_the_view_ends_the_view_alone(
     assert terminal.getvalue() == before
     if what == "a row that cannot be made":
         assert before.count("no progress from here on: ValueError") == 1
-
-
-def test_a_sweep_and_a_training_are_shown_by_the_same_display() -> None:
-    console = open_console(show=False)
-    shown = SweepView(console, [], SweepConfig()), ConsoleProgress(console, lambda: None, 1)
-    assert {type(one._display) for one in shown} == {display.LiveDisplay}
 
 
 def test_overrides_and_value_of_a_job_are_there_for_the_hparams_tab(tmp_path: Path) -> None:
