@@ -26,7 +26,7 @@ from gmijax.runs.folder import read_json
 from gmijax.supervise.launcher import StopSignals
 from gmijax.sweeps.jobs import Job, SweepPaths
 from gmijax.sweeps.nodes import Host
-from gmijax.sweeps.places import Places, Site, places_of
+from gmijax.sweeps.places import Places, Site, gmis_of_place, places_of
 from gmijax.sweeps.scheduler import Scheduler
 from gmijax.sweeps.study import Study
 
@@ -75,11 +75,27 @@ def with_density(
     kinds: dict[object, Job] = {}
     for job in jobs:
         config = job.config
-        kinds.setdefault((config.env.label, config.num_envs, config.algo.name), job)
+        kind = config.env.label, config.num_envs, config.algo.name, _size(job)
+        kinds.setdefault(kind, job)
     bench = _Bench(hosts[0], scratch, signals)
     counts = [_best(settings, job, bench, console) for job in kinds.values()]
-    most = -(-len(jobs) // sum(len(host.machine.gpus) for host in hosts))
+    most = _most(settings, jobs, hosts)
     return dataclasses.replace(settings, jobs_per_gpu=max(1, min(*counts, most)))
+
+
+def _size(job: Job) -> tuple[int, int]:
+    """GPUs of a job, and its GMIs on each."""
+    return job.num_gpus, gmis_of_place(job.config)
+
+
+def _most(settings: SweepConfig, jobs: Sequence[Job], hosts: Sequence[Host]) -> int:
+    """Jobs per GPU with which all run at the same time."""
+    gpus = settings.gpus
+    num_gpus = sum(
+        len(gpus) if isinstance(gpus, tuple) else gpus or len(host.machine.gpus) for host in hosts
+    )
+    num_jobs = settings.trials or len(jobs)
+    return -(-num_jobs * max(job.num_gpus for job in jobs) // num_gpus)
 
 
 class _Bench(NamedTuple):
@@ -91,9 +107,10 @@ class _Bench(NamedTuple):
 
 
 def _best(settings: SweepConfig, job: Job, bench: _Bench, console: Console) -> int:
-    """The number of such jobs that makes the most steps on one GPU."""
+    """The number of such jobs at a time on the GPUs of one that makes the most steps."""
     config = job.config
-    key = workload_of(config).store_key(bench.host.machine) | {"job": "sweep"}
+    own = {"job": "sweep", "size": _size(job)}
+    key = workload_of(config).store_key(bench.host.machine) | own
     store = ProfileStore(cache_folder() / "profiles", key, console.print)
     best, best_rate = 1, 0.0
     for count in COUNTS:
@@ -124,7 +141,10 @@ def _profile(settings: SweepConfig, job: Job, count: int, bench: _Bench) -> Meas
     """Trains with `count` copies for a few seconds; what each of them did."""
     host, signals = bench.host, bench.signals
     gpus = settings.gpus if isinstance(settings.gpus, tuple) else None
-    settings = dataclasses.replace(settings, jobs_per_gpu=count, gpus=gpus[:1] if gpus else 1)
+    needed = job.num_gpus
+    settings = dataclasses.replace(
+        settings, jobs_per_gpu=count, gpus=gpus[:needed] if gpus else needed
+    )
     limit_s = job.config.search.profile_timeout_s
     with tempfile.TemporaryDirectory(prefix="gmijax-", dir=bench.scratch) as folder:
         paths = SweepPaths(Path(folder))
@@ -162,9 +182,14 @@ def _copy(job: Job, seed: int) -> Job:
     run = dataclasses.replace(
         job.config.run, checkpoint_every=0, measure_throughput=False, max_restarts=0
     )
-    no_eval = dataclasses.replace(job.config.eval, every=None)
-    changes = {"seed": seed, "num_timesteps": _FOREVER, "run": run, "eval": no_eval}
-    config = dataclasses.replace(job.config, **changes)
+    config = dataclasses.replace(
+        job.config,
+        seed=seed,
+        num_timesteps=_FOREVER,
+        run=run,
+        eval=dataclasses.replace(job.config.eval, every=None),
+        wandb=dataclasses.replace(job.config.wandb, mode="off"),
+    )
     return Job(seed, {}, config)
 
 

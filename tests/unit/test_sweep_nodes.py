@@ -11,6 +11,7 @@ import pytest
 from supervision import gpu, machine
 
 from gmijax import sweep
+from gmijax.autotune.grid import Measured
 from gmijax.cli.compose import compose
 from gmijax.cli.grid import build_sweep
 from gmijax.cluster import ray_nodes
@@ -23,7 +24,7 @@ from gmijax.errors import BackendUnavailable, ConfigError, NodeLost
 from gmijax.machine.snapshot import Machine
 from gmijax.runs.folder import RunPaths, read_json
 from gmijax.supervise.launcher import StopSignals
-from gmijax.sweeps import scheduler
+from gmijax.sweeps import density, scheduler
 from gmijax.sweeps.children import Seen
 from gmijax.sweeps.host import LocalHost, Order, Start, Started
 from gmijax.sweeps.jobs import Job, SweepPaths, jobs_of
@@ -59,8 +60,8 @@ class FakeHost(LocalHost):
         return self.seen.get(child)
 
     def order(self, child: int, order: Order) -> None:
-        if order == "kill":
-            self.seen[child] = Seen(-9)
+        if order in ("ask_to_stop", "kill"):
+            self.seen[child] = Seen(130)
         if order == "close":
             del self.running[child]
 
@@ -205,6 +206,27 @@ def test_a_node_that_is_lost_at_a_start_costs_the_job_nothing(tmp_path: Path) ->
     sweep.run(sweep.end_all)
     assert sweep.nodes[1].started == [0, 1]
     assert sweep.states() == ["completed"] * 2
+
+
+def test_a_profile_of_a_job_with_two_gpus_has_both(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    class Window:
+        def __init__(self, *_: Any) -> None:
+            self.steps_per_s, self.iteration_s = 100.0, 0.1
+
+        def is_over(self) -> bool:
+            return True
+
+    monkeypatch.setattr(density, "_Window", Window)
+    monkeypatch.setattr(FakeHost, "open", lambda *_: None)
+    host = FakeHost("a")
+    host.machine = machine(2, mps_control=Path("/usr/bin/nvidia-cuda-mps-control"))
+    bench = density._Bench(host, tmp_path, StopSignals())
+    for settings in (SweepConfig(), SweepConfig(gpus=(1, 0))):
+        found = density._profile(settings, jobs(1, "plan.gpus=2")[0], 1, bench)
+        assert isinstance(found, Measured)
+    assert host.started == [0, 0]
 
 
 def test_equal_programs_compile_once_on_each_node(tmp_path: Path) -> None:

@@ -333,6 +333,36 @@ def test_jobs_at_a_time_by_profiling(
         found = with_density(SweepConfig(), jobs, hosts, open_console(show=False), StopSignals())
         assert found.jobs_per_gpu == best
     assert done == profiled
+    done.clear()  # Larger jobs are others.
+    large = jobs_of([compose("plan.gmis_per_gpu=2")])
+    with_density(SweepConfig(), large, hosts, open_console(show=False), StopSignals())
+    assert done == profiled
+
+
+@pytest.mark.parametrize(
+    ("settings", "override", "expected"),
+    [
+        ({}, "plan.gpus=1", 2),
+        ({"gpus": 1}, "plan.gpus=1", 3),
+        ({"gpus": (1,)}, "plan.gpus=1", 3),
+        ({}, "plan.gpus=2", 3),
+        ({"sampler": "tpe", "trials": 8}, "plan.gpus=1", 4),
+    ],
+)
+def test_no_more_at_a_time_than_let_all_jobs_run(
+    settings: dict[str, Any], override: str, expected: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(density, "_best", lambda *_: 32)
+    jobs = jobs_of([compose(f"seed={seed}", override) for seed in range(3)])
+    hosts, quiet = [LocalHost(machine(2))], open_console(show=False)
+    found = with_density(SweepConfig(**settings), jobs, hosts, quiet, StopSignals())
+    assert found.jobs_per_gpu == expected
+
+
+def test_a_profile_of_a_job_is_not_sent_anywhere() -> None:
+    [job] = jobs_of([compose("wandb.mode=online", "eval.every=100")])
+    profiled = density._copy(job, 1).config
+    assert (profiled.wandb.mode, profiled.eval.every) == ("off", None)
 
 
 def test_without_a_gpu_a_job_has_two_cores() -> None:
