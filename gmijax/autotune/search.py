@@ -51,23 +51,18 @@ Profile = Callable[[Point], Measured | NotRunnable]
 """What one GMI did at a point, or why it cannot; may raise OutOfBudget."""
 
 
-def top_of_one(measured: Measured) -> float:
-    """The paper's `top`."""
-    return measured.env_steps_per_s
-
-
 class Rules(NamedTuple):
     """How the grid is searched."""
 
     # Environment steps a second of the whole job, line 20.
     estimate: Callable[[Point, Measured], float]
+    top: Callable[[Measured], float]  # What Sat goes by.
     alpha: float  # A row ends when Sat falls below it; the paper has below 0.1.
     tolerance: float  # Relative difference of throughput that counts as none.
     # First every third row with the largest size and the third below it, then the neighbours
     # of the best point, until none of them is better; else the whole grid in the paper's
     # order.
     coarse_first: bool
-    top: Callable[[Measured], float] = top_of_one  # What Sat goes by.
 
 
 class Visited(NamedTuple):
@@ -87,9 +82,7 @@ class Outcome(NamedTuple):
     complete: bool  # Whether the search ended by its rules, and not for want of time.
 
 
-def saturation(
-    before: Measured, now: Measured, top: Callable[[Measured], float] = top_of_one
-) -> float:
+def saturation(before: Measured, now: Measured, top: Callable[[Measured], float]) -> float:
     """Sat, lines 13 to 15: relative gain of throughput per relative growth of memory."""
     gain = (top(now) - top(before)) / top(before)
     growth = (now.memory_mib - before.memory_mib) / before.memory_mib

@@ -14,6 +14,7 @@ import os
 import re
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
+from itertools import count
 from pathlib import Path
 from typing import Any
 
@@ -98,17 +99,15 @@ def _locked(path: Path) -> Iterator[None]:
 
 
 def _moved_aside(path: Path) -> Path:
-    for number in range(1000):
-        aside = path.with_name(f"{path.name}.broken{number or ''}")
-        if not aside.exists():
-            try:
-                os.replace(path, aside)
-            except OSError as error:
-                raise ConfigError(
-                    f"search.store={path.parent}: cannot move {path.name} ({error.strerror})"
-                ) from None
-            return aside
-    raise ConfigError(f"search.store={path.parent}: too many broken files of {path.name}")
+    names = (path.with_name(f"{path.name}.broken{number or ''}") for number in count())
+    aside = next(name for name in names if not name.exists())
+    try:
+        os.replace(path, aside)
+    except OSError as error:
+        raise ConfigError(
+            f"search.store={path.parent}: cannot move {path.name} ({error.strerror})"
+        ) from None
+    return aside
 
 
 def _name(mode: str, point: Point) -> str:

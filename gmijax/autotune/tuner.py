@@ -170,10 +170,10 @@ class Search:
         mode: Mode = "isolated" if settings.mode == "isolated" else "corun"
         rules = Rules(
             estimate=self._workload.projected,
+            top=self._workload.top,
             alpha=settings.alpha,
             tolerance=settings.tolerance,
             coarse_first=settings.order == "coarse_first",
-            top=self._workload.top,
         )
         outcome = search_grid(self._grid, lambda point: self._profile(point, mode), rules)
         if settings.mode == "both":

@@ -12,16 +12,13 @@ from typing import Any, Final, Generic, Literal, NamedTuple, TypeVar
 from gmijax.autotune.grid import Measured, Point
 from gmijax.autotune.search import estimate
 from gmijax.config import (
-    AUTO,
     PlanConfig,
-    PpoConfig,
     ReduceConfig,
     ServeConfig,
     TemplateName,
     TrainConfig,
 )
 from gmijax.config.schema import to_dict
-from gmijax.errors import ConfigError
 from gmijax.machine.snapshot import Machine
 from gmijax.partition.layout import Layout
 from gmijax.partition.plan import Plan
@@ -55,14 +52,18 @@ class Workload(ABC, Generic[C]):
       kind: what its GMIs run and share.
       plan: how the whole job is to be spread.
       reduce: how it is to reduce.
-      template: what `plan.template=auto` means.
+      template: what `plan.template=auto` means; no other can be profiled.
       trainers: numbers of training GMIs per GPU to choose from; (0,): every GMI does everything.
+
+    Raises:
+      ConfigError: a template that cannot be profiled.
     """
 
     template: TemplateName
     trainers: tuple[int, ...] = (0,)
 
     def __init__(self, config: C, kind: JobKind, reduce: ReduceConfig) -> None:
+        config.plan.require_template((self.template,), "jobs with numbers that are auto")
         self.config = config
         self.kind = kind
         self.plan = config.plan
@@ -185,20 +186,11 @@ class Workload(ABC, Generic[C]):
 
 
 class PpoWorkload(Workload[TrainConfig]):
-    """Synchronous training.
-
-    Raises:
-      ConfigError: a template that the search cannot profile.
-    """
+    """Synchronous training."""
 
     template = "tcg_ex"
 
     def __init__(self, config: TrainConfig) -> None:
-        if not isinstance(config.algo, PpoConfig) or config.plan.template not in (AUTO, "tcg_ex"):
-            raise ConfigError(
-                "num_envs=auto, plan.gmis_per_gpu=auto: with algo=ppo can be found for "
-                "plan.template=tcg_ex only; give numbers"
-            )
         super().__init__(config, training_kind(config), config.reduce)
 
     @property
@@ -234,20 +226,11 @@ class PpoWorkload(Workload[TrainConfig]):
 
 
 class ServeWorkload(Workload[ServeConfig]):
-    """Serving; experience is not written while it is profiled.
-
-    Raises:
-      ConfigError: a template that the search cannot profile.
-    """
+    """Serving; experience is not written while it is profiled."""
 
     template = "tcg"
 
     def __init__(self, config: ServeConfig) -> None:
-        if config.plan.template not in (AUTO, "tcg"):
-            raise ConfigError(
-                "num_envs=auto, plan.gmis_per_gpu=auto: can be found for plan.template=tcg only; "
-                "give numbers"
-            )
         super().__init__(config, serving_kind(config), ReduceConfig())
 
     @property

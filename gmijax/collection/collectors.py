@@ -35,7 +35,6 @@ from gmijax.errors import PipeClosed
 from gmijax.learning.unroll import Counts, no_counts
 from gmijax.sim.wrappers import BatchedEnv, BatchState, env_keys
 from gmijax.supervise.child import ChildLink
-from gmijax.types import Array
 
 WARM_UP_STEPS = 10
 """Steps before the timed ones: caches, pools and clocks settle."""
@@ -312,8 +311,4 @@ class _Agent:
 
 def _stacked(steps: Sequence[Step]) -> Step:
     """Steps [T, N] from T steps [N]."""
-
-    def stack(*leaves: Array) -> np.ndarray | Array:
-        return np.stack([np.asarray(leaf) for leaf in leaves])
-
-    return jax.tree.map(stack, *steps)
+    return jax.tree.map(lambda *leaves: np.stack([np.asarray(leaf) for leaf in leaves]), *steps)

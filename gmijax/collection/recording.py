@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import os
+import io
 import statistics
 import time
 from collections.abc import Callable, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
-from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any
 
 import jax
 import numpy as np
@@ -18,7 +17,7 @@ from gmijax.learning.physics_health import OverflowCount, check_diverged, overfl
 from gmijax.learning.training_log import EpisodeWindow, JsonlSink
 from gmijax.learning.unroll import Counts
 from gmijax.runs.dataset import DataPaths
-from gmijax.runs.folder import write_json
+from gmijax.runs.folder import remove_temporary, write_bytes, write_json
 from gmijax.supervise.child import ChildLink
 
 
@@ -41,8 +40,7 @@ class ShardWriter:
         self._pool = ThreadPoolExecutor(1, "shards")
         self._pending: Future[int] | None = None
         paths.folder(rank).mkdir(parents=True, exist_ok=True)
-        for left in paths.folder(rank).glob(".[0-9]*"):  # Of arrays, and of their JSON files.
-            left.unlink()
+        remove_temporary(paths.folder(rank))
 
     def write(self, steps: Step) -> None:
         """Takes one unroll [T, N]; waits for the one before, and raises what it met."""
@@ -70,7 +68,10 @@ class ShardWriter:
             name: np.asarray(array) for name, array in steps._asdict().items() if array is not None
         }
         shard = self._paths.shard(self._rank, index)
-        size = _write_whole(shard.arrays, lambda file: self._save(file, **arrays))
+        content = io.BytesIO()
+        self._save(content, **arrays)
+        # On the disk before its JSON file is, which says that the shard is there.
+        write_bytes(shard.arrays, content.getvalue())
         write_json(
             shard.about,
             {
@@ -79,27 +80,14 @@ class ShardWriter:
                 "env_steps": int(arrays["reward"].size),
                 # The environments of a job that goes on start anew; no episode spans the gap.
                 "starts_with_reset": index == self._first,
-                "num_bytes": size,
+                "num_bytes": content.tell(),
                 "arrays": {
                     name: {"shape": list(array.shape), "dtype": str(array.dtype)}
                     for name, array in arrays.items()
                 },
             },
         )
-        return size
-
-
-def _write_whole(path: Path, save: Callable[[BinaryIO], None]) -> int:
-    """Writes a file under another name, then renames it; returns its size in bytes."""
-    temporary = path.with_name(f".{path.name}.partial")
-    with temporary.open("wb") as file:
-        save(file)
-        file.flush()
-        # A crash of the machine must not leave a JSON file beside arrays that are not there.
-        os.fsync(file.fileno())
-        size = file.tell()
-    os.replace(temporary, path)
-    return size
+        return content.tell()
 
 
 class CollectionStats:

@@ -24,16 +24,6 @@ class Gmi:
     link: ChildLink
     steps: int = 0
 
-    @property
-    def rank(self) -> int:
-        """See `Role.rank`."""
-        return self.messenger.rank
-
-    @property
-    def stop_requested(self) -> bool:
-        """See `Role.stop_requested`."""
-        return self.link.stop_requested
-
     def reduce(self, data: Any, op: Operation, group: Iterable[int] | None) -> Any:
         """See `Role.collective`."""
         result = self.reducer.reduce(self.layout.gmis if group is None else group, data, op)
@@ -100,7 +90,7 @@ class Role(ABC):
     @property
     def rank(self) -> int:
         """Id of this GMI, 0 to `world_size - 1`."""
-        return here("rank").rank
+        return here("rank").messenger.rank
 
     @property
     def world_size(self) -> int:
@@ -124,7 +114,7 @@ class Role(ABC):
         GMIs see it at different times; those that exchange data agree first, for example by
         `self.collective(float(self.stop_requested), "sum") > 0`.
         """
-        return here("stop_requested").stop_requested
+        return here("stop_requested").link.stop_requested
 
     def collective(
         self, data: Any, op: Operation = "mean", group: Iterable[int] | None = None

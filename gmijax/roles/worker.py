@@ -24,11 +24,6 @@ _SETTLE_S = 1.0
 """After so long a GMI that only waits for others to receive says that it is alive."""
 
 
-def main() -> int:
-    """Runs this process's GMI; returns the exit code."""
-    return run_gmi(_run)
-
-
 def _run(link: ChildLink) -> dict[str, Any]:
     config = read_json(link.run.config)
     plan = Plan.from_dict(read_json(link.run.plan))
@@ -85,4 +80,4 @@ def _device_buffers(plan: Plan, gmi: int) -> DeviceBuffers | None:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(run_gmi(_run))

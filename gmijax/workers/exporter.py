@@ -17,11 +17,6 @@ if TYPE_CHECKING:
     from gmijax.sim.interface import Env
 
 
-def main() -> int:
-    """Writes the files; returns the exit code."""
-    return run_gmi(_run)
-
-
 def _run(link: ChildLink) -> None:
     config = from_dict(ExportConfig, read_json(link.run.config))
     checkpoint = Path(str(config.checkpoint))
@@ -66,4 +61,4 @@ def names_of(env: Env) -> dict[str, Any]:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(run_gmi(_run))

@@ -7,29 +7,21 @@ exchange theirs with the leader by TCP.
 from __future__ import annotations
 
 from contextlib import ExitStack
-from typing import NamedTuple
 
 from gmijax.a3c.job_registers import JobRegisters, register_bytes
 from gmijax.collectives.nodes.meeting import Nodes
 
 
-class Sizes(NamedTuple):
-    """Numbers that a policy's weights and an agent's counts are; see `open_job_registers`."""
-
-    num_weights: int
-    num_stats: int
-
-
 def over_nodes(
     local: JobRegisters,
-    sizes: Sizes,
+    sizes: tuple[int, int],
     nodes: Nodes,
     gmi: int,
     agents: tuple[int, ...],
     leader: int,
     held: ExitStack,
 ) -> JobRegisters:
-    """The registers as `gmi` uses them; `local` are those of its node.
+    """The registers as `gmi` uses them; `local` are those of its node, `sizes` as it was told.
 
     An agent on another node than the leader's stays, when `held` closes after a success, until the
     leader has gone.

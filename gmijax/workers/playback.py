@@ -25,11 +25,6 @@ if TYPE_CHECKING:
     from gmijax.sim.interface import Env
 
 
-def main() -> int:
-    """Runs the evaluation; returns the exit code."""
-    return run_gmi(_run)
-
-
 def _run(link: ChildLink) -> None:
     config = from_dict(PlayConfig, read_json(link.run.config))
     checkpoint = Path(str(config.checkpoint))
@@ -160,4 +155,4 @@ def _write_trajectory(paths: PlayPaths, env: Env, episodes: Episodes, num_shown:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(run_gmi(_run))

@@ -29,11 +29,6 @@ STEPS = 4
 """Whole steps between two waits for the device; training waits after dozens."""
 
 
-def main() -> int:
-    """Measures and writes `result.json`; returns 0."""
-    return run_gmi(_measure)
-
-
 def _measure(link: ChildLink) -> dict[str, Any]:
     plan, task = Plan.from_dict(read_json(link.run.plan)), read_json(link.run.config)
     link.beat("ready", 0)
@@ -109,4 +104,4 @@ def _timed(call: Callable[[], Any]) -> float:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(run_gmi(_measure))

@@ -27,11 +27,6 @@ if TYPE_CHECKING:
     from gmijax.sim.interface import EnvSpec
 
 
-def main() -> int:
-    """Runs this process's GMI; returns the exit code."""
-    return run_gmi(_run)
-
-
 def _run(link: ChildLink) -> dict[str, Any]:
     link.keep_garbage()
     config = from_dict(ServeConfig, read_json(link.run.config))
@@ -148,4 +143,4 @@ def _reducer(config: ServeConfig, plan: Plan, link: ChildLink) -> Reducer:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(run_gmi(_run))

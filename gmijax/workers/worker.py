@@ -125,10 +125,10 @@ def _run_asynchronous(
     from gmijax.a3c.trainer import Trainer
     from gmijax.collectives.channel.build import open_receiver, open_sender
     from gmijax.learning.learner import num_weights
-    from gmijax.workers.node_registers import Sizes, over_nodes
+    from gmijax.workers.node_registers import over_nodes
 
     agents, trainers = groups_of(plan)
-    sizes = Sizes(num_weights(env.spec, config.algo), num_counts(env))
+    sizes = num_weights(env.spec, config.algo), num_counts(env)
     registers = open_job_registers(required_fd(ENV_REGISTERS_FD), *sizes, len(agents.gmis))
     topology, (nodes, listener) = topology_of(plan), inherited_nodes()
     if nodes is not None and listener is not None:

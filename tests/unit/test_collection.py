@@ -125,7 +125,7 @@ def test_a_deterministic_policy_acts_with_its_mean(unrolled: Unrolled):
 def test_shards_are_whole_and_say_what_they_are(compress: bool, tmp_path: Path):
     paths = DataPaths(tmp_path)
     paths.folder(1).mkdir()
-    for name in (".000002.npz.partial", ".000002.json.h2x_9k"):
+    for name in (".000002.npz.12-34", ".000002.json.12-34"):
         (paths.folder(1) / name).write_bytes(b"left by a job that was killed")
     writer = ShardWriter(paths, 1, 2, {"seed": 5}, compress=compress)
     full = partial(np.full, (T, N), dtype=np.float32)
