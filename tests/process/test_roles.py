@@ -98,7 +98,9 @@ def test_the_gmi_that_fails_is_named(ends: str, message: str, seen: str, tmp_pat
     run = tmp_path / "run"
     timeout_s = 1.5 if ends == "sleep" else 30.0
     with pytest.raises(GmiFailed, match=message) as caught:
-        launch(three(), role_cases.Wait(), str(tmp_path), ends, run_dir=str(run), timeout_s=timeout_s)
+        launch(
+            three(), role_cases.Wait(), str(tmp_path), ends, run_dir=str(run), timeout_s=timeout_s
+        )
     notes = "\n".join(caught.value.__notes__)
     assert f"run folder: {run}" in notes
     assert ends != "raise" or 'raise ZeroDivisionError("the sum is off")' in notes
@@ -133,49 +135,42 @@ def test_an_interrupt_lets_roles_finish(tmp_path: Path) -> None:
         launch(plan, role_cases.UntilStopped(), run_dir=str(tmp_path / "run"))
 
 
-def run_script(folder: Path, end: str) -> subprocess.CompletedProcess[str]:
-    (folder / "give.py").write_text(SCRIPT + end)
+def python(*words: str | Path) -> subprocess.CompletedProcess[str]:
     environment = {**os.environ, "PYTHONPATH": str(CHECKOUT)}
-    command = [sys.executable, "give.py"]
-    return subprocess.run(
-        command, cwd=folder, env=environment, capture_output=True, text=True, timeout=40
-    )
+    command = [sys.executable, *map(str, words)]
+    return subprocess.run(command, env=environment, capture_output=True, text=True, timeout=60)
 
 
 def test_a_script_sends_and_returns_objects_of_its_own_classes(tmp_path: Path) -> None:
-    done = run_script(
-        tmp_path,
-        'if __name__ == "__main__":\n'
+    (tmp_path / "give.py").write_text(
+        SCRIPT + 'if __name__ == "__main__":\n'
         '    found = gmijax.launch(gmijax.plan(gmis_per_gpu=2, backend="cpu"), Give())\n'
         "    print(found == [Found(1), Found(0)])\n",
     )
+    done = python("give.py")
     assert done.stdout == "True\n", done.stderr
 
 
 def test_a_script_that_starts_jobs_when_it_is_loaded_is_told_how_to_stop(tmp_path: Path) -> None:
-    done = run_script(tmp_path, 'gmijax.launch(gmijax.plan(backend="cpu"), Give())\n')
+    end = 'gmijax.launch(gmijax.plan(backend="cpu"), Give())\n'
+    (tmp_path / "give.py").write_text(SCRIPT + end)
+    done = python("give.py")
     assert "ConfigError: gmijax.launch: called inside a GMI" in done.stderr
     assert 'if __name__ == "__main__":' in done.stderr
 
 
-def run_example(name: str, folder: Path, *options: str) -> str:
-    command = [sys.executable, str(CHECKOUT / "examples" / name), *options]
-    environment = {**os.environ, "PYTHONPATH": str(CHECKOUT)}
-    done = subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True)
-    assert done.returncode == 0, done.stderr
-    return done.stdout
-
-
-def test_the_stencil_is_the_same_over_three_gmis(tmp_path: Path) -> None:
+def test_the_stencil_is_the_same_over_three_gmis() -> None:
     options = ("gmis=3", "size=48", "steps=40", "backend=cpu")
-    found = json.loads(run_example("stencil.py", tmp_path, *options))
-    assert found["difference"] == 0.0
+    done = python(CHECKOUT / "examples" / "stencil.py", *options)
+    assert json.loads(done.stdout)["difference"] == 0.0, done.stderr
 
 
 def test_the_custom_role_learns(tmp_path: Path) -> None:
     task = "from tests.toy_env import point_mass_env\nmake = lambda **_: point_mass_env(100)\n"
     (tmp_path / "point.py").write_text(task)
-    words = run_example("custom_role.py", tmp_path, "point.py:make", "2", "15").split()
+    done = python(CHECKOUT / "examples" / "custom_role.py", "point.py:make", "2", "15")
+    words = done.stdout.split()
+    assert words, done.stderr
     first, last = float(words[1]), float(words[3].rstrip(","))
     assert last > first + 20.0
     assert words[-1] == "True"

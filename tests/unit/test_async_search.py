@@ -176,15 +176,12 @@ ONE = Measured(50.0, 100.0, 0.1, 0.0, acting_per_s=100.0, learning_per_s=300.0)
     ],
 )
 def test_the_projection(overrides: tuple[str, ...], projected: float, split: Split | None):
-    workload = A3cWorkload(wanted(*overrides))
-    assert workload.projected(Point(2, 64, "jax", 1), ONE) == pytest.approx(projected)
+    workload, point = A3cWorkload(wanted(*overrides)), Point(2, 64, "jax", 1)
+    assert workload.projected(point, ONE) == pytest.approx(projected)
     assert workload.split(ONE) == split
-
-
-def test_waits_on_both_sides_are_in_the_projection():
-    workload = A3cWorkload(wanted("plan.gpus=4"))
-    half = ONE._replace(env_steps_per_s=25.0)
-    assert workload.projected(Point(2, 64, "jax", 1), half) == pytest.approx(150.0)
+    # Waits on both sides are in it.
+    half = ONE._replace(env_steps_per_s=ONE.env_steps_per_s / 2)
+    assert workload.projected(point, half) == pytest.approx(projected / 2)
 
 
 def test_placements_are_kept_apart_in_the_store():

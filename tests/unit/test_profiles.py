@@ -58,8 +58,6 @@ def test_another_device_task_or_version_has_a_file_of_its_own(tmp_path: Path):
     [
         "{",
         "[]",
-        '"text"',
-        "{}",
         '{"profiles": []}',
         '{"profiles": {"corun 4x2048 jax": {"wall_s": 3}}}',
         '{"profiles": {"corun 4x2048 jax": {"env_steps_per_s": "fast", "wall_s": 3}}}',
