@@ -334,7 +334,7 @@ def test_jobs_at_a_time_by_profiling(
         assert found.jobs_per_gpu == best
     assert done == profiled
     done.clear()  # Larger jobs are others.
-    large = jobs_of([compose(f"seed={seed}", "plan.gmis_per_gpu=2") for seed in range(num_jobs)])
+    large = jobs_of([compose("plan.gmis_per_gpu=2")])
     with_density(SweepConfig(), large, hosts, open_console(show=False), StopSignals())
     assert done == profiled
 
