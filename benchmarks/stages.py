@@ -13,8 +13,8 @@ from gmijax.collectives.program import PeersOfOne
 from gmijax.config import PpoConfig, TrainConfig
 from gmijax.learning.learner import Learner, acting_weights, init_learner, make_learner
 from gmijax.learning.unroll import act
-from gmijax.ppo.ppo import iterate, learn
-from gmijax.ppo.rollout import Samples, no_stats
+from gmijax.ppo.ppo import Samples, iterate, learn
+from gmijax.ppo.statistics import no_stats
 from gmijax.sim.interface import EnvSpec
 from gmijax.sim.randomize import make_worlds
 from gmijax.sim.wrappers import BatchedEnv, env_keys, training_env
@@ -95,8 +95,8 @@ def _iterate(env: BatchedEnv, learner: Learner, model: Any, carry: Any) -> Any:
 
 
 def _samples(count: int, spec: EnvSpec, key: jax.Array) -> Samples:
-    """Random samples: how long an update takes does not depend on what is in them."""
+    """Random samples [1, count]: how long an update takes does not depend on what is in them."""
     shapes = (spec.obs_size,), (spec.action_size,), ()
-    obs, action, advantage = (jax.random.normal(key, (count, *shape)) for shape in shapes)
-    zeros = jnp.zeros(count)
+    obs, action, advantage = (jax.random.normal(key, (1, count, *shape)) for shape in shapes)
+    zeros = jnp.zeros((1, count))
     return Samples(obs, action, zeros, jnp.zeros_like(action), zeros, advantage)

@@ -17,7 +17,7 @@ from jax.flatten_util import ravel_pytree
 from gmijax.config import ADAPTIVE_LEARNING_RATE_RANGE, AlgoConfig
 from gmijax.learning.distributions import DISTRIBUTIONS
 from gmijax.learning.normalize import Moments, from_units, no_samples, with_std_floor
-from gmijax.learning.policy import ActorCritic, ActorCriticParams, make_actor_critic
+from gmijax.learning.policy import ActorCritic, ActorCriticParams, Mlp
 from gmijax.sim.interface import EnvSpec
 from gmijax.types import Array, PRNGKey, PyTree
 
@@ -60,14 +60,14 @@ class Learner(NamedTuple, Generic[C]):
 
 def make_learner(spec: EnvSpec, config: C) -> Learner[C]:
     """The learner for an environment's sizes."""
+    make_distribution, precision = DISTRIBUTIONS[config.distribution_type], config.precision
+    distribution = make_distribution(spec.action_size, config.state_dependent_std)
+    # A small output layer makes the first policy's mean about zero wherever the robot is.
+    policy = Mlp(config.policy_hidden_layer_sizes, distribution.output_size, 0.01, precision)
+    value = Mlp(config.value_hidden_layer_sizes, 1, 1.0, precision)
     return Learner(
-        networks=make_actor_critic(
-            DISTRIBUTIONS[config.distribution_type](spec.action_size, config.state_dependent_std),
-            config.policy_hidden_layer_sizes,
-            config.value_hidden_layer_sizes,
-            config.init_noise_std,
-            spec.actor_obs_size,
-            config.precision,
+        networks=ActorCritic(
+            policy, value, config.init_noise_std, distribution, spec.actor_obs_size
         ),
         # The learning rate is in the state, because the adaptive schedule changes it.
         optimizer=optax.chain(

@@ -7,6 +7,7 @@ can share them: each sends the moments of its own rollout.
 
 from __future__ import annotations
 
+import math
 from functools import reduce
 from typing import NamedTuple
 
@@ -75,9 +76,7 @@ def moments_of_those(chosen: Array, samples: Array) -> Moments:
 def moments_of(samples: Array, num_sample_axes: int) -> Moments:
     """Moments over the first `num_sample_axes` axes of `samples`."""
     axes = tuple(range(num_sample_axes))
-    count = 1.0
-    for axis in axes:
-        count *= samples.shape[axis]
+    count = float(math.prod(samples.shape[:num_sample_axes]))
     mean = jnp.mean(samples, axis=axes)
     return Moments(jnp.asarray(count), mean, jnp.sum((samples - mean) ** 2, axis=axes))
 

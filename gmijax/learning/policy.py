@@ -17,7 +17,7 @@ import jax
 import jax.numpy as jnp
 from jax.typing import DTypeLike
 
-from gmijax.learning.distributions import Distribution
+from gmijax.learning.distributions import Normal
 from gmijax.types import Array, PRNGKey, PyTree
 
 
@@ -103,7 +103,7 @@ class ActorCritic(NamedTuple):
     policy: Mlp
     value: Mlp
     init_noise_std: float
-    distribution: Distribution
+    distribution: Normal
     actor_obs_size: int | None = None
 
     def init(self, key: PRNGKey, obs_size: int) -> ActorCriticParams:
@@ -129,22 +129,3 @@ class ActorCritic(NamedTuple):
     def state_value(self, params: ActorCriticParams, obs: Array) -> Array:
         """Value estimates [...] for normalised observations [..., O]."""
         return jnp.asarray(self.value.apply(params.value, obs))[..., 0]
-
-
-def make_actor_critic(
-    distribution: Distribution,
-    policy_hidden: tuple[int, ...],
-    value_hidden: tuple[int, ...],
-    init_noise_std: float,
-    actor_obs_size: int | None = None,
-    precision: DTypeLike = jnp.float32,
-) -> ActorCritic:
-    """Networks with the given hidden widths; for the rest see `ActorCritic` and `Mlp`."""
-    # A small output layer makes the first policy's mean about zero wherever the robot is.
-    return ActorCritic(
-        policy=Mlp(tuple(policy_hidden), distribution.output_size, 0.01, precision),
-        value=Mlp(tuple(value_hidden), 1, 1.0, precision),
-        init_noise_std=init_noise_std,
-        distribution=distribution,
-        actor_obs_size=actor_obs_size,
-    )

@@ -11,15 +11,9 @@ import jax.numpy as jnp
 from gmijax.learning.learner import ActingWeights
 from gmijax.learning.normalize import normalize
 from gmijax.learning.policy import ActorCritic
+from gmijax.sim.divergence import sources
 from gmijax.sim.interface import EnvSpec
-from gmijax.sim.wrappers import (
-    BatchedEnv,
-    BatchState,
-    EpisodeSums,
-    StepOutput,
-    split_keys,
-    zero_counts,
-)
+from gmijax.sim.wrappers import BatchedEnv, BatchState, EpisodeSums, StepOutput, split_keys
 from gmijax.types import Array, PyTree
 
 K = TypeVar("K")
@@ -104,5 +98,11 @@ def count(rewards: Array, outcomes: Outcome) -> Counts:
 
 def no_counts(spec: EnvSpec, overflows: tuple[str, ...] = ()) -> Counts:
     """Zeros in the structure of `Counts`."""
-    episodes, diverged, overflowed = zero_counts(spec, overflows)
-    return Counts(episodes, jnp.zeros(()), diverged, overflowed)
+    zero = jnp.zeros(())
+    terms, metrics = dict.fromkeys(spec.reward_terms, zero), dict.fromkeys(spec.metrics, zero)
+    return Counts(
+        EpisodeSums(zero, zero, zero, terms, metrics),
+        zero,
+        dict.fromkeys(sources(spec.reward_terms), zero),
+        dict.fromkeys(overflows, zero),
+    )

@@ -26,8 +26,8 @@ from gmijax.learning.learner import (
     init_learner,
     pack_weights,
 )
-from gmijax.ppo.ppo import IterationMetrics, learn
-from gmijax.ppo.rollout import PpoLearner, Samples, flatten, merge_stats, no_stats, rollout
+from gmijax.ppo.ppo import IterationMetrics, PpoLearner, Samples, learn, rollout
+from gmijax.ppo.statistics import merge_stats, no_stats
 from gmijax.sim.wrappers import BatchedEnv, BatchState
 from gmijax.supervise.heartbeat import GmiState
 from gmijax.types import Array, PyTree
@@ -159,8 +159,8 @@ def _learn_from(
 ) -> tuple[TrainState, tuple[()], IterationMetrics]:
     """Updates on the rollouts of several GMIs, whose environments stand one behind the other."""
     samples, packed = answers
-    flat = flatten(jax.tree.map(lambda *parts: jnp.concatenate(parts, axis=1), *samples))
+    joined = jax.tree.map(lambda *parts: jnp.concatenate(parts, axis=1), *samples)
     unpack = ravel_pytree(no_stats(env.spec, env.overflows))[1]
     stats = merge_stats(jax.vmap(unpack)(jnp.stack(packed)))
-    state, metrics = learn(learner, peers, state, flat, stats)
+    state, metrics = learn(learner, peers, state, joined, stats)
     return state, (), metrics

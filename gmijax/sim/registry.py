@@ -19,17 +19,10 @@ if TYPE_CHECKING:
     from gmijax.sim.interface import Env
 
 TASKS: Mapping[str, str] = MappingProxyType(
-    {
-        "ant": "gmijax.sim.tasks.ant",
-        "anymal": "gmijax.sim.tasks.anymal",
-        "ball_balance": "gmijax.sim.tasks.ball_balance",
-        "franka_cabinet": "gmijax.sim.tasks.franka_cabinet",
-        "humanoid": "gmijax.sim.tasks.humanoid",
-        "shadow_hand": "gmijax.sim.tasks.shadow_hand",
-    }
+    {name: f"gmijax.sim.tasks.{name}" for name in SETTINGS}
 )
-"""Name -> module with `make(*, impl, max_envs, rewards, settings) -> Env`, `TERMS` and
-`DEFAULT_EPISODE_LENGTH`."""
+"""Name of each of our tasks -> its module, with `make(*, impl, max_envs, rewards, settings)`,
+which returns an `Env`, `TERMS`, `OBS_TERMS` and `DEFAULT_EPISODE_LENGTH`."""
 
 SUITES: Mapping[str, str] = MappingProxyType(
     {

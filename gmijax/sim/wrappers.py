@@ -15,7 +15,7 @@ import jax
 import jax.numpy as jnp
 
 from gmijax.errors import ConfigError
-from gmijax.sim.divergence import diverged_by_source, end_diverged, sources
+from gmijax.sim.divergence import diverged_by_source, end_diverged
 from gmijax.sim.interface import OVERFLOWS, Env, EnvSpec, EnvState
 from gmijax.types import Array, PRNGKey, PyTree
 
@@ -179,19 +179,6 @@ def episode_statistics(
     )
     going_on = {name: jnp.where(over, 0.0, value) for name, value in terms.items()}
     return jnp.where(over, 0.0, returns), going_on, finished
-
-
-def zero_counts(
-    spec: EnvSpec, overflows: tuple[str, ...]
-) -> tuple[EpisodeSums, dict[str, Array], dict[str, Array]]:
-    """Zeros [] float32 for the `finished`, `diverged` and `overflowed` of a `StepOutput`."""
-    zero = jnp.zeros(())
-    terms, metrics = dict.fromkeys(spec.reward_terms, zero), dict.fromkeys(spec.metrics, zero)
-    return (
-        EpisodeSums(zero, zero, zero, terms, metrics),
-        dict.fromkeys(sources(spec.reward_terms), zero),
-        dict.fromkeys(overflows, zero),
-    )
 
 
 def overflowed(env: Env, state: EnvState) -> dict[str, Array]:

@@ -2,8 +2,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
 from gmijax.learning.normalize import (
     OBS_CLIP,
@@ -24,10 +22,9 @@ def _samples(seed: int, count: int) -> np.ndarray:
     return rng.normal(rng.normal(), 1.0 + rng.random(), size=(count, 4)).astype(np.float32)
 
 
-@settings(deadline=None, max_examples=25)
-@given(st.integers(0, 1000), st.lists(st.sampled_from((1, 2, 50)), min_size=1, max_size=5))
-def test_moments_of_parts_merge_to_the_moments_of_all(seed: int, sizes: list[int]) -> None:
-    parts = [_samples(seed + k, size) for k, size in enumerate(sizes)]
+@pytest.mark.parametrize("sizes", [(1,), (2, 50, 1), (1, 1, 2, 50, 50)])
+def test_moments_of_parts_merge_to_the_moments_of_all(sizes: tuple[int, ...]) -> None:
+    parts = [_samples(k, size) for k, size in enumerate(sizes)]
     moments = [no_samples((4,)), *(moments_of(jnp.asarray(part), 1) for part in parts)]
     merged = merge_all(jax.tree.map(lambda *x: jnp.stack(x), *moments))
     everything = np.concatenate(parts).astype(np.float64)
@@ -36,14 +33,6 @@ def test_moments_of_parts_merge_to_the_moments_of_all(seed: int, sizes: list[int
     np.testing.assert_allclose(
         merged.m2, ((everything - everything.mean(0)) ** 2).sum(0), rtol=1e-3, atol=1e-3
     )
-
-
-@settings(deadline=None, max_examples=25)
-@given(st.integers(0, 1000))
-def test_merge_is_associative(seed: int) -> None:
-    a, b, c = (moments_of(jnp.asarray(_samples(seed + k, 5 + k)), 1) for k in range(3))
-    left, right = merge(merge(a, b), c), merge(a, merge(b, c))
-    jax.tree.map(lambda x, y: np.testing.assert_allclose(x, y, rtol=1e-3, atol=1e-3), left, right)
 
 
 def test_outliers_do_not_widen_the_statistics_but_changes_do() -> None:

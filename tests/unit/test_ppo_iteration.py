@@ -32,8 +32,8 @@ from gmijax.learning.normalize import std_of
 from gmijax.learning.updates import exchange_size, minibatch_order, run_updates
 from gmijax.partition.layout import Layout
 from gmijax.ppo.loop import warm_up
-from gmijax.ppo.ppo import PpoLosses, gradients, iterate, update_context
-from gmijax.ppo.rollout import flatten, merge_stats, rollout
+from gmijax.ppo.ppo import PpoLosses, gradients, iterate, rollout, update_context
+from gmijax.ppo.statistics import merge_stats
 from gmijax.sim.wrappers import env_keys
 
 N, T = 32, 8
@@ -70,6 +70,10 @@ def _start(learner, num_envs: int = N, first: int = 0):
 
 def _close(a, b, atol=1e-6):
     jax.tree.map(lambda x, y: np.testing.assert_allclose(x, y, rtol=1e-4, atol=atol), a, b)
+
+
+def _flat(samples):
+    return jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), samples)
 
 
 def _compiled(iteration, learner):
@@ -217,7 +221,7 @@ def test_shards_of_minibatches_give_the_update_of_the_whole(learner) -> None:
     def collected(num_envs: int, first: int):
         envs = _start(learner, num_envs, first)[1]
         _, samples, stats = roll_out(ENV.model, acting_weights(learner, state), envs)
-        return flatten(samples), stats
+        return _flat(samples), stats
 
     shards, shard_stats = zip(collected(N, 0), collected(N, N), strict=True)
     whole, whole_stats = collected(2 * N, 0)
@@ -241,18 +245,20 @@ def test_shards_of_minibatches_give_the_update_of_the_whole(learner) -> None:
     np.testing.assert_allclose(sharded.learning_rate, single.learning_rate)
 
 
-def test_it_learns_to_stand_still_and_normalises_between_iterations(learner, alone) -> None:
-    state, envs = _start(learner)
+def _learnt(step, state, envs):
+    """State, environments and last metrics after iterations in which the return has risen."""
     returns = []
-    for iteration in range(1, 81):
-        state, envs, metrics = alone(state, envs)
+    for _ in range(60):
+        state, envs, metrics = step(state, envs)
         returns.append(float(metrics.counts.reward_sum) / (T * N))
-        if iteration == 1:
-            assert float(state.obs_moments.count) == T * N
-            # The first ratio of every iteration is 1, so the first losses see no clipping at all.
-            assert float(metrics.losses.clip_fraction) < 1.0
-    assert int(state.iteration) == 80
     assert np.mean(returns[-10:]) > np.mean(returns[:10]) + 0.4
+    return state, envs, metrics
+
+
+def test_it_learns_to_stand_still(learner, alone) -> None:
+    state, _, _ = _learnt(alone, *_start(learner))
+    assert int(state.iteration) == 60
+    assert float(state.obs_moments.count) == 60 * T * N
 
 
 def test_it_learns_with_another_distribution_and_normalised_values_of_any_scale(config) -> None:
@@ -269,27 +275,17 @@ def test_it_learns_with_another_distribution_and_normalised_values_of_any_scale(
         ),
     )
     step = _compiled(SoloReducer().program(functools.partial(iterate, ENV, mine)), mine)
-    state, envs = warm_up(step, *_start(mine))
-    returns = []
-    for _ in range(60):
-        state, envs, metrics = step(state, envs)
-        returns.append(float(metrics.counts.reward_sum) / (T * N))
+    state, _, metrics = _learnt(step, *warm_up(step, *_start(mine)))
     assert state.value_moments is not None
     assert float(state.obs_moments.count) == float(state.value_moments.count) == 61 * T * N
     assert float(std_of(state.value_moments)) > 10.0
-    assert np.mean(returns[-10:]) > np.mean(returns[:10]) + 0.4
     assert float(metrics.figures["value/explained_variance"]) > 0.3
 
 
 def test_it_learns_in_bfloat16_and_updates_the_policy_that_acted(config) -> None:
     mine = make_learner(ENV.spec, dataclasses.replace(config, precision="bfloat16"))
     step = _compiled(SoloReducer().program(functools.partial(iterate, ENV, mine)), mine)
-    state, envs = _start(mine)
-    returns = []
-    for _ in range(60):
-        state, envs, metrics = step(state, envs)
-        returns.append(float(metrics.counts.reward_sum) / (T * N))
-    assert np.mean(returns[-10:]) > np.mean(returns[:10]) + 0.4
+    state, envs, _ = _learnt(step, *_start(mine))
     assert {leaf.dtype for leaf in jax.tree.leaves((state.params, state.opt_state[1].mu))} == {
         jnp.dtype("float32")
     }
@@ -299,7 +295,7 @@ def test_it_learns_in_bfloat16_and_updates_the_policy_that_acted(config) -> None
     assert samples.obs.dtype == jnp.bfloat16
     context = update_context(mine, state, merge_stats(jax.tree.map(lambda x: x[None], stats)))
     first = jax.jit(functools.partial(gradients, mine))
-    _, losses = first(state.params, flatten(samples), context, jnp.arange(5, 69))
+    _, losses = first(state.params, _flat(samples), context, jnp.arange(5, 69))
     assert abs(float(losses.kl)) < 1e-6
     assert float(losses.clip_fraction) == float(losses.value_clip_fraction) == 0.0
 

@@ -194,7 +194,7 @@ SETTINGS: Mapping[str, type[TaskSettings]] = MappingProxyType(
         "shadow_hand": ShadowHandSettings,
     }
 )
-"""Name of a task -> its settings."""
+"""Name of a task -> its settings; the list of our tasks."""
 
 CURRICULA = ("anymal",)
 """Tasks whose `make` takes `curriculum=True`."""
