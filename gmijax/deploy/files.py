@@ -11,9 +11,6 @@ import jax.numpy as jnp
 
 from gmijax.deploy.trained import TrainedPolicy
 
-OBS: Final = "obs"
-ACTION: Final = "action"
-
 _OPSET: Final = 17
 """Holds all that a policy needs, and is old enough for the runtimes that robots have."""
 
@@ -34,8 +31,8 @@ def onnx_content(policy: TrainedPolicy, metadata: Mapping[str, Any]) -> bytes:
         inputs=[("N", policy.obs_size)],
         model_name="policy",
         opset=_OPSET,
-        input_names=[OBS],
-        output_names=[ACTION],
+        input_names=["obs"],
+        output_names=["action"],
     )
     model.ir_version = onnx.helper.find_min_ir_version_for(model.opset_import)
     texts = {name: json.dumps(value) for name, value in metadata.items()}

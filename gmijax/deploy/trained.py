@@ -66,20 +66,14 @@ def trained_policy(checkpoint: Path) -> TrainedPolicy:
         "env_steps": CheckpointMeta.read(checkpoint).env_steps,
         "obs_size": obs_size,
         "action_size": action_size,
-        **_networks(algo),
+        "algo": algo.name,
+        "policy_hidden_layer_sizes": list(algo.policy_hidden_layer_sizes),
+        "value_hidden_layer_sizes": list(algo.value_hidden_layer_sizes),
         **_normalizer(algo, moments),
         "gmijax_version": __version__,
         "jax_version": versions_of(["jax"])["jax"],
     }
     return TrainedPolicy(act, obs_size, action_size, metadata)
-
-
-def _networks(algo: AlgoConfig) -> dict[str, Any]:
-    return {
-        "algo": algo.name,
-        "policy_hidden_layer_sizes": list(algo.policy_hidden_layer_sizes),
-        "value_hidden_layer_sizes": list(algo.value_hidden_layer_sizes),
-    }
 
 
 def _normalizer(algo: AlgoConfig, moments: Moments) -> dict[str, Any]:

@@ -83,7 +83,11 @@ class Physics:
         return self.mj_model.opt.timestep * self.substeps
 
     def start(self, qpos: Array, qvel: Array) -> PhysicsState:
-        """The state of a world at `qpos` [nq], `qvel` [nv] with no history."""
+        """The state of a world at `qpos` [nq], `qvel` [nv] with no history.
+
+        What only a physics step knows, such as sensors, is not computed: an automatic reset
+        happens, under `where`, in every step of every world.
+        """
         overflow = None if self.impl == "jax" else jnp.zeros(len(OVERFLOWS), bool)
         return PhysicsState(qpos, qvel, jnp.zeros_like(qvel), overflow)
 

@@ -26,11 +26,15 @@ from gmijax.sim.tasks.settings import CURRICULA, SETTINGS
 from gmijax.sim.wrappers import BatchState, StepOutput
 
 
-def test_equal_keys_give_equal_resets_and_different_keys_different_ones(task: CompiledTask):
+def test_equal_keys_give_equal_resets_and_all_are_different_and_within_limits(task: CompiledTask):
     first, again, other = task.start(0), task.start(0), task.start(1)
     np.testing.assert_array_equal(first.env.obs, again.env.obs)
     assert not np.array_equal(first.env.obs, other.env.obs)
     assert len(np.unique(first.env.obs, axis=0)) == NUM_ENVS
+    limited = task.mj_model.jnt_limited.astype(bool)
+    joints = np.asarray(first.env.physics.qpos)[:, task.mj_model.jnt_qposadr[limited]]
+    lower, upper = task.mj_model.jnt_range[limited].T
+    assert ((joints >= lower - 1e-6) & (joints <= upper + 1e-6)).all()
 
 
 def test_random_steps_stay_finite_and_rewards_are_the_sum_of_their_terms(task: CompiledTask):
@@ -96,7 +100,9 @@ def test_a_fatal_position_terminates_its_own_world_only(task: CompiledTask):
     if hazard is None:
         pytest.skip("only time ends this task")
     state = task.start()
-    moved = state.env.physics._replace(qpos=hazard(state.env.physics.qpos))
+    (at, numbers), qpos = hazard, state.env.physics.qpos
+    there = qpos.at[0, at : at + len(numbers)].set(jnp.array(numbers))
+    moved = state.env.physics._replace(qpos=there)
     actions = task.actions(0)
     _, untouched = task.step(task.env.model, state, actions)
     fallen = state._replace(env=state.env._replace(physics=moved))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib.util
+import math
 from typing import Any
 
 import gymnasium as gym
@@ -77,7 +78,11 @@ def test_wrappers_of_gymnasium_fit(envs: VectorEnv[Any, Any, Any]):
 
 
 def test_misuse_is_told(envs: VectorEnv[Any, Any, Any]):
-    fresh = vector_env(point_mass_env(LENGTH), NUM_ENVS, "jax")
+    env = point_mass_env(LENGTH)
+    # As one of Brax that does not say how long a step is.
+    fresh = vector_env(
+        env._replace(spec=env.spec._replace(control_dt_s=math.nan)), NUM_ENVS, "jax"
+    )
     with pytest.raises(gym.error.ResetNeeded, match="reset"):
         fresh.step(np.zeros((NUM_ENVS, 1)))
     envs.reset(seed=0)
@@ -90,17 +95,15 @@ def test_misuse_is_told(envs: VectorEnv[Any, Any, Any]):
     [
         (0, "numpy", "num_envs=0: must be at least 1"),
         (4, "cupy", "arrays=cupy: allowed are numpy, torch, jax"),
+        (4, "numpy", r"pip install 'gmijax\[gymnasium\]'"),
     ],
 )
-def test_bad_input_is_refused(num_envs: int, arrays: Any, message: str):
+def test_bad_input_or_a_package_that_is_missing_is_told(
+    num_envs: int, arrays: Any, message: str, monkeypatch: pytest.MonkeyPatch
+):
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
     with pytest.raises(ConfigError, match=message):
         make_vector_env("ant", num_envs, arrays=arrays)
-
-
-def test_a_package_that_is_missing_is_told(monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
-    with pytest.raises(ConfigError, match=r"pip install 'gmijax\[gymnasium\]'"):
-        make_vector_env("ant", 4)
 
 
 def test_arrays_of_torch():

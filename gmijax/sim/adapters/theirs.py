@@ -55,7 +55,9 @@ def adapt(
       ConfigError: observations that are no vectors, or a state that changes its shape.
     """
     start = jax.eval_shape(theirs.reset, jax.random.key_data(jax.random.key(0)))
-    if mj_model is not None and (qpos is None or _shape(qpos, start) != (mj_model.nq,)):
+    if mj_model is not None and (
+        qpos is None or jax.eval_shape(qpos, start).shape != (mj_model.nq,)
+    ):
         mj_model = qpos = None
     spec = EnvSpec(
         name=name,
@@ -136,10 +138,6 @@ def _obs_size(obs: Any, name: str) -> int:
                 f"env.name={name}: the observation{at} has shape {leaf.shape}; allowed are vectors"
             )
     return sum(leaf.size for leaf in _parts(obs).values())
-
-
-def _shape(function: Callable[[Any], Array], state: Any) -> tuple[int, ...]:
-    return jax.eval_shape(function, state).shape
 
 
 def _alike(before: PyTree, after: PyTree) -> PyTree:

@@ -39,11 +39,7 @@ class GmijaxVectorEnv(VectorEnv[Array, Array, Array]):
         self.single_action_space = gym.spaces.Box(-1.0, 1.0, (spec.action_size,))
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self.action_space = batch_space(self.single_action_space, num_envs)
-        self.metadata = {
-            "autoreset_mode": AutoresetMode.SAME_STEP,
-            "render_modes": [],
-            "render_fps": round(1 / spec.control_dt_s),
-        }
+        self.metadata = {"autoreset_mode": AutoresetMode.SAME_STEP, "render_modes": []}
         batched = training_env(env)
         self._model = env.model
         self._init, self._step = jax.jit(batched.init), jax.jit(batched.step)

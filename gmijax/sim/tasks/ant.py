@@ -13,13 +13,12 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-import mujoco
 
 from gmijax.sim import episode, physics
 from gmijax.sim.interface import Env, EnvSpec, EnvState
 from gmijax.sim.rewards import Replacement, RewardTerm, term_names, total_reward, with_weights
 from gmijax.sim.tasks import runner
-from gmijax.sim.tasks.runner import RunnerIds, RunnerPose, draw_start, pose_of, speed_to_target
+from gmijax.sim.tasks.runner import RunnerPose
 from gmijax.sim.tasks.settings import AntSettings, settings_from
 from gmijax.types import Array, PRNGKey, PyTree
 
@@ -78,7 +77,7 @@ def make(
     """Makes the task without its time limit; see `gmijax.sim.registry.make_env`."""
     terms, chosen = with_weights(TERMS, rewards), settings_from(AntSettings, settings)
     world = physics.load("ant", impl=impl, substeps=SUBSTEPS, max_envs=max_envs)
-    ids = look_up(world.mj_model)
+    ids = runner.look_up(world.mj_model, JOINTS, SENSORS)
     spec = EnvSpec(
         name="ant",
         obs_size=OBS_SIZE,
@@ -92,19 +91,18 @@ def make(
     )
 
     def reset(model: PyTree, key: PRNGKey) -> EnvState:
-        del model  # nothing that a reset draws depends on it
         key, draw = jax.random.split(key)
-        start = world.start(*draw_start(ids, world.mj_model, draw, chosen))
-        # The feet's sensors read zero: to fill them in would take a whole physics step, and an
-        # automatic reset happens, under `where`, in every step of every world.
+        start = world.start(*runner.draw_start(ids, world.mj_model, draw, chosen))
+        # Sensors read zero: a reset runs no physics, see `Physics.start`.
         zeros = jnp.zeros(len(ids.sensors)), jnp.zeros(ACTION_SIZE)
-        return episode.begin(spec, start, (), observe(pose_of(ids, start), *zeros), key)
+        return episode.begin(spec, start, (), observe(runner.pose_of(ids, start), *zeros), key)
 
     def step(model: PyTree, state: EnvState, action: Array) -> EnvState:
         action = jnp.clip(action, -1.0, 1.0)
         moved, sensordata = world.step(model, state.physics, action)
-        pose = pose_of(ids, moved)
-        view = AntView(pose, action, speed_to_target(state.physics, moved, world.control_dt_s))
+        pose = runner.pose_of(ids, moved)
+        speed = runner.speed_to_target(state.physics, moved, world.control_dt_s)
+        view = AntView(pose, action, speed)
         dead = pose.position[2] < chosen.death_height_m
         reward = total_reward(terms, view, Replacement(DEATH, dead, chosen.death_reward))
         obs = observe(pose, sensordata[ids.sensors], action)
@@ -112,11 +110,6 @@ def make(
         return episode.advance(state, moved, (), obs, reward, dead, metrics)
 
     return world.env(spec, reset, step)
-
-
-def look_up(mj_model: mujoco.MjModel) -> RunnerIds:
-    """Finds the model's addresses by name."""
-    return runner.look_up(mj_model, JOINTS, SENSORS)
 
 
 def observe(pose: RunnerPose, foot_sensors: Array, action: Array) -> Array:

@@ -151,11 +151,9 @@ def make(
         return episode.begin(spec, start, task, obs, key)
 
     def reset(model: PyTree, key: PRNGKey) -> EnvState:
-        del model  # nothing that a reset draws depends on it
         return begin(key, jnp.float32(chosen.curriculum_start) if curriculum else None)
 
     def next_episode(model: PyTree, ended: EnvState) -> EnvState:
-        del model
         return begin(ended.key, next_share(ended, chosen.curriculum_growth))
 
     def step(model: PyTree, state: EnvState, action: Array) -> EnvState:

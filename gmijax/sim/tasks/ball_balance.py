@@ -113,11 +113,9 @@ def make(
     )
 
     def reset(model: PyTree, key: PRNGKey) -> EnvState:
-        del model  # nothing that a reset draws depends on it
         key, draw = jax.random.split(key)
         start = world.start(*draw_start(ids, world.mj_model, draw, chosen))
-        # The hips' sensors read zero: to fill them in would take a whole physics step, and an
-        # automatic reset happens, under `where`, in every step of every world.
+        # Sensors read zero: a reset runs no physics, see `Physics.start`.
         obs = observe(ids, start, jnp.zeros(len(ids.sensors)))
         return episode.begin(spec, start, BallBalanceTask(jnp.zeros(ACTION_SIZE)), obs, key)
 

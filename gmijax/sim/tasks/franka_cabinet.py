@@ -8,7 +8,7 @@ Action [9]: speed of the position targets of arm 7 and fingers 2.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -189,7 +189,6 @@ def make(
     )
 
     def reset(model: PyTree, key: PRNGKey) -> EnvState:
-        del model  # nothing that a reset draws depends on it
         key, draw = jax.random.split(key)
         start = world.start(
             draw_start(ids, world.mj_model, draw, chosen), jnp.zeros(world.mj_model.nv)
@@ -236,7 +235,7 @@ def look_up(mj_model: mujoco.MjModel) -> FrankaCabinetIds:
         lookup.find_joints(mj_model, JOINTS),
         lookup.find_joints(mj_model, ["drawer"]),
         mj_model.body("hand").id,
-        bodies(mj_model, ("finger_left", "finger_right")),
+        np.array([mj_model.body(f"finger_{side}").id for side in ("left", "right")]),
         mj_model.body("drawer").id,
     )
 
@@ -289,8 +288,3 @@ def observe(ids: FrankaCabinetIds, state: physics.PhysicsState, pose: FrankaCabi
         ]
     )
     return jnp.clip(values, -OBS_LIMIT, OBS_LIMIT)
-
-
-def bodies(mj_model: mujoco.MjModel, names: Sequence[str]) -> lookup.Addresses:
-    """Numbers of bodies `names` in the model."""
-    return np.array([mj_model.body(name).id for name in names])

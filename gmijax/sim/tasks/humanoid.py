@@ -22,7 +22,7 @@ from gmijax.sim import episode, physics
 from gmijax.sim.interface import Env, EnvSpec, EnvState
 from gmijax.sim.rewards import Replacement, RewardTerm, term_names, total_reward, with_weights
 from gmijax.sim.tasks import runner
-from gmijax.sim.tasks.runner import RunnerIds, RunnerPose
+from gmijax.sim.tasks.runner import RunnerPose
 from gmijax.sim.tasks.settings import HumanoidSettings, settings_from
 from gmijax.types import Array, PRNGKey, PyTree
 
@@ -105,7 +105,8 @@ def make(
     """Makes the task without its time limit; see `gmijax.sim.registry.make_env`."""
     terms, chosen = with_weights(TERMS, rewards), settings_from(HumanoidSettings, settings)
     world = physics.load("humanoid", impl=impl, substeps=SUBSTEPS, max_envs=max_envs)
-    ids, strength = look_up(world.mj_model), motor_strength(world.mj_model)
+    ids = runner.look_up(world.mj_model, JOINTS, SENSORS)
+    strength = motor_strength(world.mj_model)
     spec = EnvSpec(
         name="humanoid",
         obs_size=OBS_SIZE,
@@ -119,11 +120,9 @@ def make(
     )
 
     def reset(model: PyTree, key: PRNGKey) -> EnvState:
-        del model  # nothing that a reset draws depends on it
         key, draw = jax.random.split(key)
         start = world.start(*runner.draw_start(ids, world.mj_model, draw, chosen))
-        # Forces read zero: to fill them in would take a whole physics step, and an automatic
-        # reset happens, under `where`, in every step of every world.
+        # Forces read zero: a reset runs no physics, see `Physics.start`.
         forces, sensors = jnp.zeros(ACTION_SIZE), jnp.zeros(len(ids.sensors))
         obs = observe(runner.pose_of(ids, start), forces, sensors, jnp.zeros(ACTION_SIZE))
         return episode.begin(spec, start, (), obs, key)
@@ -146,11 +145,6 @@ def make(
         return episode.advance(state, moved, (), obs, reward, dead, metrics)
 
     return world.env(spec, reset, step)
-
-
-def look_up(mj_model: mujoco.MjModel) -> RunnerIds:
-    """Finds the model's addresses by name."""
-    return runner.look_up(mj_model, JOINTS, SENSORS)
 
 
 def motor_strength(mj_model: mujoco.MjModel) -> npt.NDArray[np.float32]:

@@ -172,7 +172,6 @@ def make(
     )
 
     def reset(model: PyTree, key: PRNGKey) -> EnvState:
-        del model  # nothing that a reset draws depends on it
         key, start_key, goal_key = jax.random.split(key, 3)
         qpos = draw_start(ids, world.mj_model, start_key, chosen)
         start = world.start(qpos, jnp.zeros(world.mj_model.nv))
@@ -256,8 +255,7 @@ def tips_of(ids: ShadowHandIds, xpos: Array, xquat: Array, velocities: Array) ->
 def touch_at_rest(ids: ShadowHandIds, xpos: Array, xquat: Array) -> Touch:
     """A start: nothing moves, and the servos' targets are where the joints are.
 
-    The tips' sensors read zero: to fill them in would take a whole physics step, and an
-    automatic reset happens, under `where`, in every step of every world.
+    The tips' sensors read zero: a reset runs no physics, see `Physics.start`.
     """
     zeros = jnp.zeros((NUM_TIPS, 6))
     return Touch(jnp.zeros(len(JOINTS)), tips_of(ids, xpos, xquat, zeros), zeros)
