@@ -2,11 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Sequence
 from typing import NamedTuple
-
-import jax
-import jax.numpy as jnp
 
 
 class OracleLimit(NamedTuple):
@@ -29,49 +26,29 @@ class TaskCase(NamedTuple):
     """One task.
 
     Attributes:
-      hazard: moves world 0 of `qpos` [N, nq] to where the next step ends the episode; None for a
-        task that only time ends.
+      hazard: where in `qpos` [nq] a world is moved so that the next step ends the episode, and
+        the numbers there; None for a task that only time ends.
       oracle: how near to C MuJoCo one physics step must be.
       energy_gain: what a passive robot may gain, as a fraction of the most that it has in motion.
       penetration_m: how deep random actions may press two bodies into each other, metres.
     """
 
-    hazard: Callable[[jax.Array], jax.Array] | None
+    hazard: tuple[int, Sequence[float]] | None
     oracle: OracleLimit
     energy_gain: float = 0.01
     penetration_m: float = 0.01
 
 
-def lowered_ant(qpos: jax.Array) -> jax.Array:
-    return qpos.at[0, 2].set(0.25)
-
-
-def lowered_anymal(qpos: jax.Array) -> jax.Array:
-    return qpos.at[0, 2].set(0.2)
-
-
-def lowered_humanoid(qpos: jax.Array) -> jax.Array:
-    return qpos.at[0, 2].set(0.7)
-
-
-def dropped_ball(qpos: jax.Array) -> jax.Array:
-    return qpos.at[0, 13:16].set(jnp.array([2.0, 0.0, 0.1]))
-
-
-def dropped_cube(qpos: jax.Array) -> jax.Array:
-    return qpos.at[0, 24:27].set(jnp.array([0.0, -0.39, 0.25]))
-
-
 CASES = {
     "ant": TaskCase(
-        lowered_ant,
+        (2, [0.25]),
         # The trajectory ends before the first foot touches the floor: C turns the edges of that
         # contact's friction pyramid by another angle about the normal than MJX 3.17 does.
         OracleLimit(qvel=1e-4, sensors=1e-3, ctrl=0.3, steps=7),
         penetration_m=0.16,  # Random torques throw the light feet about with 20 m/s.
     ),
     "ball_balance": TaskCase(
-        dropped_ball,
+        (13, [2.0, 0.0, 0.1]),
         # MuJoCo 4 in C predicts how a `connect` will move with the bodies' rotation (the term
         # with the Jacobian's time derivative), MJX 3.17 does not: they part with the legs' speed
         # squared. The ball lands on the tray in step 84.
@@ -86,19 +63,19 @@ CASES = {
         penetration_m=0.03,
     ),
     "anymal": TaskCase(
-        lowered_anymal,
+        (2, [0.2]),
         # As with ant, the trajectory ends before a foot touches the floor.
         OracleLimit(qvel=1e-3, sensors=0.0, ctrl=0.3, steps=24),
         penetration_m=0.08,
     ),
     "humanoid": TaskCase(
-        lowered_humanoid,
+        (2, [0.7]),
         # As with ant and anymal.
         OracleLimit(qvel=1e-3, sensors=0.01, ctrl=0.3, steps=20),
         penetration_m=0.12,
     ),
     "shadow_hand": TaskCase(
-        dropped_cube,
+        (24, [0.0, -0.39, 0.25]),
         # Two fingertips touch. The cube does not yet: as with ant's feet, its friction differs.
         OracleLimit(qvel=2e-3, sensors=0.03, ctrl=0.3, steps=16),
         penetration_m=0.015,

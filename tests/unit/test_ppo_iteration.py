@@ -261,11 +261,13 @@ def test_it_learns_to_stand_still(learner, alone) -> None:
     assert float(state.obs_moments.count) == 60 * T * N
 
 
-def test_it_learns_with_another_distribution_and_normalised_values_of_any_scale(config) -> None:
+def test_it_learns_with_other_settings_and_updates_the_policy_that_acted(config) -> None:
+    """In bfloat16, with a tanh, and with values of any scale."""
     mine = make_learner(
         ENV.spec,
         dataclasses.replace(
             config,
+            precision="bfloat16",
             reward_scaling=100.0,
             normalize_values=True,
             obs_outliers="diverged",
@@ -275,20 +277,13 @@ def test_it_learns_with_another_distribution_and_normalised_values_of_any_scale(
         ),
     )
     step = _compiled(SoloReducer().program(functools.partial(iterate, ENV, mine)), mine)
-    state, _, metrics = _learnt(step, *warm_up(step, *_start(mine)))
+    state, envs, metrics = _learnt(step, *warm_up(step, *_start(mine)))
     assert state.value_moments is not None
     assert float(state.obs_moments.count) == float(state.value_moments.count) == 61 * T * N
     assert float(std_of(state.value_moments)) > 10.0
     assert float(metrics.figures["value/explained_variance"]) > 0.3
-
-
-def test_it_learns_in_bfloat16_and_updates_the_policy_that_acted(config) -> None:
-    mine = make_learner(ENV.spec, dataclasses.replace(config, precision="bfloat16"))
-    step = _compiled(SoloReducer().program(functools.partial(iterate, ENV, mine)), mine)
-    state, envs, _ = _learnt(step, *_start(mine))
-    assert {leaf.dtype for leaf in jax.tree.leaves((state.params, state.opt_state[1].mu))} == {
-        jnp.dtype("float32")
-    }
+    learnt = jax.tree.leaves((state.params, state.opt_state[1].mu))
+    assert {leaf.dtype for leaf in learnt} == {jnp.dtype("float32")}
     # Learning computes what acting did, though its batches are others: nothing has moved yet.
     roll_out = jax.jit(functools.partial(rollout, ENV, mine))
     samples, stats = roll_out(ENV.model, acting_weights(mine, state), envs)[1:]

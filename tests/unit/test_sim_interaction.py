@@ -1,74 +1,29 @@
-"""Repeated actions and past observations, and tasks that carry something on between episodes.
-
-The toy walks one unit per step from a random start in [0, 1), and falls over at 3 or more. Its
-reward is 1 for walking plus 10 times the action.
-"""
+"""Repeated actions and past observations, and tasks that carry something on between episodes."""
 
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from toy_env import point_mass_env
+from toy_env import point_mass_env, walker
+from training_jobs import POINT_TASK
 
 from gmijax.cli.compose import compose
 from gmijax.errors import ConfigError
-from gmijax.sim import episode
 from gmijax.sim.adapters.checks import check_env
 from gmijax.sim.interaction import action_repeat, observation_history
-from gmijax.sim.interface import Env, EnvSpec, EnvState
+from gmijax.sim.interface import EnvState
 from gmijax.sim.randomize import make_worlds
-from gmijax.sim.wrappers import env_keys, time_limit, training_env
-
-SPEC = EnvSpec("toy", 1, 1, 0.5, 100, ("walk", "push"), metrics=("level",))
-CUSTOM = """
-from toy_env import point_mass_env
-def make(*, impl, max_envs):
-    return point_mass_env()
-"""
-
-
-class Level(NamedTuple):
-    level: jax.Array
-    bad: jax.Array
-
-
-def toy(episode_length: int = 100, *, carries: bool = False, seen: list[Any] | None = None) -> Env:
-    """With `carries` a level grows by one with every episode that runs out of time."""
-
-    def begin(key: jax.Array, level: jax.Array) -> EnvState:
-        key, draw = jax.random.split(key)
-        position = jax.random.uniform(draw, (1,))
-        return episode.begin(SPEC, position, Level(level, jnp.zeros(())), position, key)
-
-    def reset(model: Any, key: jax.Array) -> EnvState:
-        return begin(key, jnp.zeros(()))
-
-    def next_episode(model: Any, ended: EnvState) -> EnvState:
-        return begin(ended.key, ended.task.level + ended.truncated)
-
-    def step(model: Any, state: EnvState, action: jax.Array) -> EnvState:
-        assert state.obs.shape == (1,)
-        position = state.physics + 1.0
-        terms = {"walk": jnp.ones(()), "push": 10.0 * action[0]}
-        # An action above 1 breaks the world, and what it remembers.
-        task = Level(state.task.level + jnp.where(action[0] > 1, jnp.nan, 0.0), state.task.bad)
-        obs = position + task.level * 0.0
-        reward = terms["walk"] + terms["push"], terms
-        metrics = {"level": task.level}
-        return episode.advance(state, position, task, obs, reward, position[0] >= 3.0, metrics)
-
-    env = Env(SPEC, None, reset, step, None, lambda state: state.physics)
-    return time_limit(env._replace(next_episode=next_episode) if carries else env, episode_length)
+from gmijax.sim.wrappers import env_keys, training_env
 
 
 def test_an_action_is_repeated_until_the_episode_ends():
-    env = action_repeat(toy(), 2)
-    assert (env.spec.control_dt_s, env.spec.episode_length) == (1.0, 50)
+    env = action_repeat(walker(), 2)
+    assert (env.spec.control_dt_s, env.spec.episode_length) == (2.0, 50)
     start = env.reset(None, jax.random.key(0))
     step = jax.jit(env.step)
     first = step(None, start, jnp.array([0.5]))
@@ -85,7 +40,7 @@ def test_an_action_is_repeated_until_the_episode_ends():
 
 
 def test_the_time_limit_counts_the_steps_of_the_task():
-    env = action_repeat(toy(episode_length=3 - 2), 2)
+    env = action_repeat(walker(episode_length=3 - 2), 2)
     assert env.spec.episode_length == 1
     ended = env.step(None, env.reset(None, jax.random.key(0)), jnp.zeros(1))
     assert (float(ended.reward), bool(ended.truncated), bool(ended.terminated)) == (1, True, False)
@@ -109,7 +64,7 @@ def _bits(state: EnvState) -> EnvState:
 
 
 def test_past_observations_go_before_new_ones_and_a_start_fills_all():
-    one = toy()
+    one = walker()
     one = one._replace(spec=one.spec._replace(obs_terms=(("position", 1),)))
     env = observation_history(one, 3)
     assert (env.spec.obs_size, env.spec.obs_terms) == (3, (("position", 1),) * 3)
@@ -123,7 +78,7 @@ def test_past_observations_go_before_new_ones_and_a_start_fills_all():
 
 
 def test_what_only_the_value_function_sees_has_no_past():
-    env = toy()
+    env = walker()
 
     def privileged(state: EnvState) -> EnvState:
         return state._replace(obs=jnp.append(state.obs, 100.0 + state.steps))
@@ -132,7 +87,7 @@ def test_what_only_the_value_function_sees_has_no_past():
         return privileged(env.step(model, state._replace(obs=state.obs[:1]), action))
 
     env_of_both = env._replace(
-        spec=SPEC._replace(obs_size=2, actor_obs_size=1),
+        spec=env.spec._replace(obs_size=2, actor_obs_size=1),
         reset=lambda model, key: privileged(env.reset(model, key)),
         step=step,
     )
@@ -145,14 +100,8 @@ def test_what_only_the_value_function_sees_has_no_past():
     assert state.obs.tolist() == pytest.approx([x, x + 1, x + 2, 102.0])
 
 
-def test_off_is_the_environment_itself():
-    env = toy()
-    assert action_repeat(env, 1) is env
-    assert observation_history(env, 1) is env
-
-
 def test_the_configuration_puts_both_around_a_task(tmp_path: Path):
-    (tmp_path / "point.py").write_text(CUSTOM)
+    (tmp_path / "point.py").write_text(POINT_TASK)
     told = (f"env={tmp_path}/point.py:make", "env.history=3", "env.action_repeat=2")
     env = make_worlds(compose(*told).env, "jax", seed=0, first_env=0, num_envs=2)
     assert env.spec.obs_size == 6
@@ -162,8 +111,8 @@ def test_the_configuration_puts_both_around_a_task(tmp_path: Path):
 
 
 def test_what_a_task_carries_on_survives_resets_and_bad_numbers():
-    env = observation_history(toy(episode_length=2, carries=True), 2)
-    check_env(env, "toy")
+    env = observation_history(walker(episode_length=2, carries=True), 2)
+    check_env(env, "walker")
     batch = training_env(env)
     state, step = batch.init(None, env_keys(jax.random.key(0), 0, 3)), jax.jit(batch.step)
     # The third world breaks in its second episode: it keeps the level of its first one.
@@ -176,7 +125,7 @@ def test_what_a_task_carries_on_survives_resets_and_bad_numbers():
         assert (state.env.key != before.env.key)[over].all()
     assert state.env.task.level.tolist() == [2.0, 2.0, 2.0]
     assert float(out.finished.metric_sums["level"]) == 1.0
-    plain = training_env(toy(episode_length=2))
+    plain = training_env(walker(episode_length=2))
     state = plain.init(None, env_keys(jax.random.key(0), 0, 3))
     for _ in range(4):
         state, _ = plain.step(None, state, jnp.zeros((3, 1)))
@@ -184,7 +133,7 @@ def test_what_a_task_carries_on_survives_resets_and_bad_numbers():
 
 
 def test_the_next_episode_must_be_as_the_first():
-    env = toy(carries=True)
+    env = walker(carries=True)
     bad = env._replace(next_episode=lambda model, ended: ended._replace(task=()))
-    with pytest.raises(ConfigError, match=r"^toy: next_episode must give what reset does, but"):
-        check_env(bad, "toy")
+    with pytest.raises(ConfigError, match=r"^walker: next_episode must give what reset does, but"):
+        check_env(bad, "walker")

@@ -35,22 +35,26 @@ PENDULUM_OVER_FLOOR = """
 
 
 @pytest.mark.parametrize(
-    ("impl", "platform", "warp_installed", "chosen", "why"),
+    ("impl", "platform", "task", "chosen", "why"),
     [
-        ("auto", "cpu", True, "jax", "slow on cpu"),
-        ("auto", "gpu", False, "jax", "not installed"),
-        ("auto", "gpu", True, "jax", "physics.impl=warp"),
-        ("auto", "cuda", True, "jax", "physics.impl=warp"),
-        ("jax", "gpu", True, "jax", "asked for"),
-        ("warp", "cpu", True, "warp", "asked for"),
+        ("auto", "cpu", "ant", "jax", "slow on cpu"),
+        ("auto", "gpu", "ant", "warp", "the faster one for ant"),
+        ("auto", "cuda", "theirs", "jax", "physics.impl=warp"),
+        ("auto", "gpu", None, "jax", "physics.impl=warp"),
+        ("jax", "gpu", "ant", "jax", "asked for"),
+        ("warp", "cpu", None, "warp", "asked for"),
     ],
 )
 def test_choice_of_implementation(
-    impl: str, platform: str, warp_installed: bool, chosen: str, why: str
+    impl: str, platform: str, task: str | None, chosen: str, why: str
 ):
-    choice, reason = choose_impl(impl, platform, warp_installed=warp_installed)
+    assert set(implementations.ON_GPU) == set(TASKS)
+    choice, reason = choose_impl(impl, platform, task, warp_installed=True)
     assert choice == chosen
     assert why in reason
+    if chosen == "warp" and impl == "auto":
+        without = choose_impl(impl, platform, task, warp_installed=False)
+        assert without == ("jax", "warp-lang is not installed")
 
 
 @pytest.mark.parametrize(
@@ -130,18 +134,6 @@ def test_poses_are_those_of_mujoco_in_c(impl: str):
         xpos, xquat = poses(jnp.array(data.qpos, jnp.float32))
         np.testing.assert_allclose(xpos, data.xpos, atol=1e-5)
         np.testing.assert_allclose(xquat, data.xquat, atol=1e-5)
-
-
-def test_auto_chooses_by_task(monkeypatch: pytest.MonkeyPatch):
-    assert set(implementations.ON_GPU) == set(TASKS)
-    monkeypatch.setattr(implementations, "ON_GPU", {"ant": None})
-    for task, platform, chosen in (
-        ("ant", "gpu", "warp"),
-        ("ball_balance", "gpu", "jax"),
-        (None, "gpu", "jax"),
-        ("ant", "cpu", "jax"),
-    ):
-        assert choose_impl("auto", platform, task, warp_installed=True)[0] == chosen
 
 
 @pytest.mark.parametrize("impl", ["jax", "warp"])

@@ -11,7 +11,6 @@ import mujoco
 import numpy as np
 import pytest
 from compile_options import CPU_OPTIONS
-from toy_env import point_mass_env
 
 from gmijax.cli.compose import compose
 from gmijax.config import EnvConfig
@@ -213,25 +212,6 @@ def motion_in_c(mj_model: mujoco.MjModel) -> np.ndarray:
     for _ in range(STEPS):
         mujoco.mj_step(mj_model, data)
     return np.array(data.qvel)
-
-
-def test_off_is_the_program_of_a_library_without_randomisation(monkeypatch: pytest.MonkeyPatch):
-    env = point_mass_env()
-
-    def program() -> str:
-        worlds = training_env(env)
-        state = worlds.init(env.model, env_keys(jax.random.key(0), 0, NUM_ENVS))
-        return str(jax.make_jaxpr(worlds.step)(env.model, state, jnp.zeros((NUM_ENVS, 1))))
-
-    off = program()
-    monkeypatch.setattr(wrappers, "vectorise", sharing_the_model)
-    assert off == program()
-
-
-def sharing_the_model(env: Env) -> Env:
-    return env._replace(
-        reset=jax.vmap(env.reset, in_axes=(None, 0)), step=jax.vmap(env.step, in_axes=(None, 0, 0))
-    )
 
 
 def test_every_episode_may_have_a_model_of_its_own(env: Env, monkeypatch: pytest.MonkeyPatch):

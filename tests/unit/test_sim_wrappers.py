@@ -1,9 +1,4 @@
-"""The wrappers on a task whose every number can be done in the head.
-
-The toy walks one unit per step from a random start in [0, 1), and falls over at 3 or more. Its
-reward is 1 for walking plus 10 times the action. Without a limit of its own an episode ends in
-three steps.
-"""
+"""The wrappers on a task whose every number can be done in the head."""
 
 from functools import cache
 from typing import Any
@@ -12,31 +7,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from toy_env import walker
 
 from gmijax.errors import ConfigError
-from gmijax.sim import episode
-from gmijax.sim.interface import Env, EnvSpec, EnvState
-from gmijax.sim.wrappers import BatchedEnv, env_keys, split_keys, time_limit, training_env
+from gmijax.sim.interface import Env, EnvState
+from gmijax.sim.wrappers import BatchedEnv, env_keys, split_keys, training_env
 
-SPEC = EnvSpec("toy", 1, 1, 1.0, 100, ("walk", "push"))
 PUSH = 0.5
-
-
-def toy(episode_length: int) -> Env:
-    def reset(model: None, key: jax.Array) -> EnvState:
-        key, draw = jax.random.split(key)
-        position = jax.random.uniform(draw, (1,))
-        return episode.begin(SPEC, position, (), position, key)
-
-    def step(model: None, state: EnvState, action: jax.Array) -> EnvState:
-        position = state.physics + 1.0
-        terms = {"walk": 1.0 + 0.0 * position[0], "push": 10.0 * action[0]}
-        reward = terms["walk"] + terms["push"], terms
-        return episode.advance(state, position, (), position, reward, position[0] >= 3.0)
-
-    return time_limit(
-        Env(SPEC, None, reset, step, None, lambda state: state.physics), episode_length
-    )
 
 
 def compiled(env: Env, *, random_ep_len: bool = False, keep: bool = False) -> BatchedEnv:
@@ -46,12 +23,12 @@ def compiled(env: Env, *, random_ep_len: bool = False, keep: bool = False) -> Ba
 
 @cache
 def worlds(episode_length: int) -> BatchedEnv:
-    return compiled(toy(episode_length))
+    return compiled(walker(episode_length))
 
 
 @cache
 def worlds_with_head_starts(episode_length: int) -> BatchedEnv:
-    return compiled(toy(episode_length), random_ep_len=True)
+    return compiled(walker(episode_length), random_ep_len=True)
 
 
 def start(env: BatchedEnv, num_envs: int, first: int = 0, seed: int = 0) -> Any:
@@ -64,7 +41,7 @@ def step(env: BatchedEnv, state: Any) -> Any:
 
 def test_programs_with_the_same_environments_share_a_trace():
     calls = []
-    task = toy(2)
+    task = walker(2)
 
     def counted(*arguments: Any) -> EnvState:
         calls.append(1)
@@ -106,15 +83,6 @@ def test_time_limit_truncates_and_a_new_episode_begins_elsewhere():
     assert state.env.steps.tolist() == [0, 0]
 
 
-def test_an_episode_that_ends_by_itself_at_the_limit_is_not_truncated():
-    env = worlds(3)
-    state = start(env, 2)
-    for _ in range(3):
-        state, out = step(env, state)
-    assert out.terminated.all()
-    assert not out.truncated.any()
-
-
 def test_two_halves_see_what_the_whole_sees():
     parts = []
     for first, count in ((0, 4), (0, 2), (2, 2)):
@@ -136,13 +104,13 @@ def test_split_keys_never_hands_out_the_same_key_twice():
 
 
 def test_more_environments_than_the_model_was_made_for():
-    env = training_env(toy(2)._replace(max_envs=2))
-    with pytest.raises(ConfigError, match="num_envs=3: toy was made for at most 2"):
+    env = training_env(walker(2)._replace(max_envs=2))
+    with pytest.raises(ConfigError, match="num_envs=3: walker was made for at most 2"):
         start(env, 3)
 
 
 def test_first_episodes_end_at_random_times_and_do_not_count():
-    # The toy ends by itself after three steps: what is shorter was cut.
+    # It ends by itself after three steps: what is shorter was cut.
     env = worlds_with_head_starts(3)
     state = start(env, 64)
     head_start = state.head_start
@@ -156,21 +124,10 @@ def test_first_episodes_end_at_random_times_and_do_not_count():
     assert state.env.steps.tolist() == head_start.tolist()
 
 
-def test_an_episode_that_ends_by_itself_with_a_head_start_does_not_count():
-    env = worlds_with_head_starts(1000)
-    state = start(env, 4)
-    assert (state.head_start > 0).all()
-    for count in (0, 4):
-        for _ in range(3):
-            state, out = step(env, state)
-        assert out.terminated.all()
-        assert int(out.finished.count) == count
-
-
 def test_kept_time_limits_stay_an_episode_length_apart_whatever_fails_between():
-    # The toy ends by itself after three steps, so that each five steps have a whole episode,
+    # It ends by itself after three steps, so that each five steps have a whole episode,
     # which counts, and one of two steps, which does not.
-    env = compiled(toy(5), random_ep_len=True, keep=True)
+    env = compiled(walker(5), random_ep_len=True, keep=True)
     state = start(env, 64)
     first = np.asarray(state.head_start)
     assert set(first.tolist()) == {0, 1, 2, 3, 4}
@@ -208,7 +165,7 @@ def test_worlds_that_met_a_full_buffer_are_counted_by_buffer():
     def overflow(state: EnvState) -> jax.Array:
         return jnp.stack([jnp.ones((), bool), state.obs[0] > 1.5])
 
-    env = compiled(toy(100)._replace(overflow=overflow))
+    env = compiled(walker(100)._replace(overflow=overflow))
     _, out = step(env, start(env, 8))
     counts = {name: int(count) for name, count in out.overflowed.items()}
     assert counts == {"contact": 8, "constraint": int((out.next_obs[:, 0] > 1.5).sum())}
