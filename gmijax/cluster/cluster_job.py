@@ -107,7 +107,7 @@ class ClusterJob:
             node = self._joined[launch.plan.layout.node_of(gmi)].remote
             return node.start(gmi, waits, launch.run.gmi(gmi))
 
-        backend = _BackendOfNodes(launch, self._joined)
+        backend = BackendOfNodes(launch, self._joined)
         supervisor = Supervisor(launch, backend, start=start)
         signals.forward_to(supervisor.request_stop)
         try:
@@ -135,7 +135,7 @@ class ClusterJob:
         return {name: node.facts.machine for name, node in by_name(self._joined).items()}
 
 
-class _BackendOfNodes(Backend):
+class BackendOfNodes(Backend):
     """The backends that the nodes have entered, as the supervisor asks them."""
 
     def __init__(self, launch: Launch, joined: Sequence[Joined]) -> None:

@@ -277,6 +277,10 @@ def test_two_nodes_of_one_machine_use_the_daemon_of_the_first(
         assert "is no client of the MPS daemon" in failed[1]
         nodes[1].terminate(1, pid)
         assert [int(client) for _, client in mps.told("terminate_client")] == [pid]
+        for gmi, node in enumerate(nodes):
+            node.order(gmi, "kill")
+            while node.poll()[gmi].exit_code is None:
+                time.sleep(0.05)
     assert len(mps.told("quit")) == 1
     assert not [path for path in mps.pipe_directories() if path.exists()]
 

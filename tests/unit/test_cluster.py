@@ -11,17 +11,27 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from supervision import gpu, machine
+from supervision import gpu, machine, make_launch
 
 from gmijax import compose
 from gmijax.cluster import node as nodes
 from gmijax.cluster import ray_nodes
 from gmijax.cluster.checks import by_name, require_alike, require_shared
-from gmijax.cluster.node import Facts, Node, Seen, TrainingNode, address_of, own_versions
+from gmijax.cluster.cluster_job import BackendOfNodes, ClusterJob
+from gmijax.cluster.node import (
+    Facts,
+    Node,
+    Opened,
+    Seen,
+    TrainingNode,
+    address_of,
+    own_versions,
+)
 from gmijax.cluster.ray_nodes import Joined, RayCluster
 from gmijax.cluster.remote_gmi import RemoteNode
 from gmijax.cluster.survey import Surveyed, differences, lines_of_nodes, nodes_as_data
 from gmijax.collectives.nodes.meeting import Nodes
+from gmijax.collectives.strategies import stages
 from gmijax.config import ClusterConfig, PlanConfig, ReduceConfig, TrainConfig
 from gmijax.control.restarts import with_nodes_left
 from gmijax.errors import (
@@ -34,7 +44,7 @@ from gmijax.errors import (
 from gmijax.machine.snapshot import Machine
 from gmijax.partition.plan import Plan
 from gmijax.partition.planner import make_plan
-from gmijax.runs.folder import GmiPaths
+from gmijax.runs.folder import GmiPaths, RunPaths
 from gmijax.supervise.environment import gmi_environment
 from gmijax.supervise.failures import describe_exit, first_cause, is_consequence
 from gmijax.supervise.heartbeat import Heartbeat
@@ -267,6 +277,19 @@ def test_gmis_of_nodes_share_the_gpus_of_their_node() -> None:
     assert Plan.from_dict(plan.to_dict()) == plan
 
 
+@pytest.mark.parametrize(
+    ("gpus", "gmis", "strategy"),
+    [(1, 2, "one_shot"), (2, 2, "one_shot"), (2, 1, "mrr"), (1, 1, "mpr")],
+)
+def test_nodes_with_gpus_do_inside_what_one_machine_does(
+    gpus: int, gmis: int, strategy: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("gmijax.partition.reduction._is_installed", lambda *_: True)
+    plan = plan_on(gpus_of_nodes(gpus, gpus), gpus=gpus, gmis_per_gpu=gmis)
+    assert plan.strategy == strategy
+    assert [stage.link for stage in stages(strategy, plan.layout)][-1] == "nodes"
+
+
 def test_a_gpu_of_two_nodes_of_one_machine_has_half_of_its_memory_for_each() -> None:
     nodes = {"a": machine(1), "a#1": machine(1)}
     plan = plan_on(nodes, backend="share", gmis_per_gpu=2)
@@ -435,13 +458,42 @@ def test_a_lost_node_is_the_cause_that_its_gmis_give(tmp_path: Path) -> None:
     gmi.kill()
 
 
+def test_what_nodes_say_of_backends_is_heard_with_their_address(tmp_path: Path) -> None:
+    plan = plan_on(gpus_of_nodes(1, 1), gmis_per_gpu=2)
+    launch = make_launch(RunPaths(tmp_path), ["train"] * 4, plan)
+    opened = Opened(("10.0.0.2", 1), {}, {})
+    told: list[tuple[Any, ...]] = []
+
+    class Returned(FakeAnswer):
+        def get(self) -> Any:
+            return self.value  # An error too, if a node returns one.
+
+    def node(**answers: Any) -> Joined:
+        def ask(method: str, *arguments: Any) -> FakeAnswer:
+            told.append((method, *arguments))
+            return Returned(answers.get(method))
+
+        return joined(RemoteNode(ask, 1, "10.0.0.2"))[0]
+
+    nodes = [
+        node(open=opened),
+        node(open=BackendUnavailable("no daemon"), verify=(2, "no client")),
+    ]
+    job = ClusterJob(compose("env=ball_balance", "cluster.engine=ray", "num_envs=16"))
+    job._joined = nodes
+    with pytest.raises(BackendUnavailable, match=r"node 10\.0\.0\.2: no daemon"):
+        job._open(launch)
+    backend = BackendOfNodes(launch, nodes)
+    with pytest.raises(GmiFailed, match="GMI 2 failed: no client"):
+        backend.verify({0: 10, 1: 11, 2: 12, 3: 13})
+    assert told[-2:] == [("verify", {0: 10, 1: 11}), ("verify", {2: 12, 3: 13})]
+    backend.terminate(3, 13)
+    assert told[-1] == ("terminate", 3, 13)
+
+
 def test_a_node_starts_polls_and_ends_gmis(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from supervision import make_launch
-
-    from gmijax.runs.folder import RunPaths
-
     monkeypatch.setattr(nodes, "detect_machine", lambda: machine(0))
     monkeypatch.chdir(tmp_path)
     plan = make_plan(PlanConfig(), ReduceConfig(), 16, machine(0), nodes={"a": Machine((), (0,))})

@@ -214,6 +214,7 @@ def test_exit_code_says_whether_something_is_broken(
         (["--jsn"], "--jsn: allowed are --json, mig=SIZES"),
         (["gpu=1"], "gpu=1: only together with mig="),
         (["mig=3g", "--json"], "--json: not together with mig="),
+        (["mig=3g", "cluster=auto"], "cluster=auto: not together with mig="),
         (["mig=9g"], "mig=9g: expected a list of 1g, 2g, 3g, 4g, 7g"),
         (["mig=1g", "gpu=4"], "gpu=4: no such GPU; usable are [0]"),
     ],

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from gmijax.collectives.build import Membership, SharedReducer, build_reducer
-from gmijax.collectives.host.shared_block import create_exchange
+from gmijax.collectives.host.shared_block import MAX_GATHER_FLOATS, create_exchange
 from gmijax.collectives.nodes import meeting
 from gmijax.collectives.nodes.meeting import Nodes, connect, listen
 from gmijax.collectives.nodes.mesh import Mesh
@@ -146,14 +146,19 @@ def test_small_things_go_over_nodes_in_order_of_rank() -> None:
             reducer = build_reducer("mpr", membership)
             assert isinstance(reducer, SharedReducer)
             try:
-                return [reducer.all_gather(np.full(2, rank + k, np.float32)) for k in range(3)]
+                # Of all together the last is more than goes through memory at once.
+                sizes = (2, 2, MAX_GATHER_FLOATS // 2)
+                return [
+                    reducer.all_gather(np.full(size, rank + k, np.float32))
+                    for k, size in enumerate(sizes)
+                ]
             finally:
                 met.wait()
                 reducer.close()
 
         met = threading.Barrier(4)
         for rows in at_once(*(lambda rank=rank: gather(rank) for rank in range(4))):
-            assert [row[:, 1].tolist() for row in rows] == [
+            assert [row[:, -1].tolist() for row in rows] == [
                 [k, k + 1, k + 2, k + 3] for k in range(3)
             ]
         for listener in listeners:

@@ -43,7 +43,7 @@ class Batcher:
 
     A batch that lies in one transfer is a slice of it, without a copy, and holds its memory until
     the next batch is asked for. Otherwise unrolls are stacked in what `new_stack` makes.
-    It counts `batches` given out and `unrolls` that arrived.
+    It counts `batches` given out, `unrolls` and `transfers` that arrived.
     """
 
     def __init__(
@@ -53,7 +53,7 @@ class Batcher:
         new_stack: Callable[[Spec, int], Stack],
         held: contextlib.ExitStack,
     ) -> None:
-        self.batches = self.unrolls = 0
+        self.batches = self.unrolls = self.transfers = 0
         self._rank = rank
         self._sources = list(sources)
         self._turn = 0
