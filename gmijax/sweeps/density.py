@@ -162,7 +162,7 @@ def _copy(job: Job, seed: int) -> Job:
     run = dataclasses.replace(
         job.config.run, checkpoint_every=0, measure_throughput=False, max_restarts=0
     )
-    no_eval = dataclasses.replace(job.config.eval, every=None)
+    no_eval = dataclasses.replace(job.config.eval, every=None, video=False)
     changes = {"seed": seed, "num_timesteps": _FOREVER, "run": run, "eval": no_eval}
     config = dataclasses.replace(job.config, **changes)
     return Job(seed, {}, config)
