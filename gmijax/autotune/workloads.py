@@ -206,7 +206,7 @@ class PpoWorkload(Workload[TrainConfig]):
         run = dataclasses.replace(
             config.run, resume=None, checkpoint_every=0, measure_throughput=False
         )
-        no_eval = dataclasses.replace(config.eval, every=None)
+        no_eval = dataclasses.replace(config.eval, every=None, video=False)
         steps = config.search.iterations * steps
         return self.with_point(point, num_timesteps=steps, run=run, eval=no_eval)
 

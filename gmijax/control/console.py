@@ -8,8 +8,8 @@ from __future__ import annotations
 import os
 import sys
 import time
-from collections.abc import Callable, Sequence
-from contextlib import suppress
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager, suppress
 from typing import Any, TextIO
 
 from rich.console import Console
@@ -67,6 +67,17 @@ def open_console(*, show: bool) -> Console:
     stream: Any = _BestEffortStream(sys.stdout if show else None)
     # Paths, tasks and errors may look like markup.
     return Console(file=stream, quiet=not show, soft_wrap=True, highlight=False, markup=False)
+
+
+@contextmanager
+def doing(console: Console, what: str) -> Iterator[None]:
+    """Says what is done, on a terminal for as long as it takes, elsewhere in a line."""
+    if console.is_terminal:
+        with console.status(what):
+            yield
+    else:
+        console.print(what)
+        yield
 
 
 def announce(console: Console, run: RunPaths, plan: Plan, what: str, lines: Sequence[str]) -> None:

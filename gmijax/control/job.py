@@ -20,6 +20,7 @@ from gmijax.config import TrainConfig
 from gmijax.config.schema import to_dict
 from gmijax.control.console import ConsoleProgress, announce, open_console
 from gmijax.control.decide import Decided, decide, with_task
+from gmijax.control.films import filmed, find_opengl
 from gmijax.control.restarts import (
     Attempts,
     clear_unfinished,
@@ -70,6 +71,7 @@ def train(config: TrainConfig, *, show: bool = False) -> Result:
     config = with_task(config)
     require_wandb(config)
     beginning = find_start_point(config)
+    opengl = None if beginning.is_complete else find_opengl(config)
     console = open_console(show=show)
     if beginning.is_complete and beginning.folder is not None:
         return _finished(config, beginning.folder, console)
@@ -79,7 +81,7 @@ def train(config: TrainConfig, *, show: bool = False) -> Result:
             cluster = held.enter_context(ClusterJob(config))
             nodes = cluster.join(beginning.root(config))
         decided = decide(_from(config, beginning.checkpoint), console, nodes)
-        return _train(decided, beginning, console, cluster, started_s)
+        return _train(decided, beginning, console, cluster, opengl, started_s)
 
 
 def _train(
@@ -87,6 +89,7 @@ def _train(
     beginning: StartPoint,
     console: Console,
     cluster: ClusterJob | None,
+    opengl: str | None,
     started_s: float,
 ) -> Result:
     config, plan = decided.config, decided.plan
@@ -102,7 +105,7 @@ def _train(
         )
         changes = () if changed is None else (changed,)
         announce(console, run, plan, what, (*decided.reasons, *changes, *beginning.notes))
-        _Job(decided, run, console, cluster).run_to_the_end(beginning, started_s)
+        _Job(decided, run, console, cluster, opengl).run_to_the_end(beginning, started_s)
     summary = read_json(run.summary)
     console.print(train_outcome(summary, run))
     return Result(run.root, summary)
@@ -117,11 +120,13 @@ class _Job:
         run: RunPaths,
         console: Console,
         cluster: ClusterJob | None,
+        opengl: str | None,
     ) -> None:
         self._config, self._plan, self._machine, _ = decided
         self._run = run
         self._console = console
         self._cluster = cluster
+        self._opengl = opengl
         self._attempts = Attempts(
             run,
             self._config.run.max_restarts,
@@ -145,9 +150,10 @@ class _Job:
             draw_returns(run.metrics, run.returns_png, f"{config.env.label}, {config.algo.name}")
 
         write_json(run.plan, self._plan.to_dict())
-        # Recorded first, so that the summary is sent too.
+        # Recorded first, so that the summary is sent too, and filmed before all is sent.
         with (
             followed(config, run, beginning.checkpoint, self._console.print),
+            filmed(self._opengl, run, self._console.print),
             recorded(run, partial(_what_is_left, run), record),
         ):
             self._prepare(beginning)

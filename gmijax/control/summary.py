@@ -97,6 +97,7 @@ def train_outcome(summary: Data, run: RunPaths) -> str:
         f"{learnt}{f', started again {times} times' if times else ''}\n"
         f"{_of_rates(summary)}"
         f"{_of_evaluations(summary.get('eval'))}"
+        f"{_of_videos(run)}"
         f"checkpoint: {summary['checkpoint']}\nsummary: {run.summary}"
     ) + overflow_warnings(summary["overflow_steps"])
 
@@ -118,6 +119,12 @@ def _of_evaluations(found: Data | None) -> str:
     return (
         f"evaluation: return {last['return']:.2f} after {last['env_steps']:,} env steps{where}\n"
     )
+
+
+def _of_videos(run: RunPaths) -> str:
+    """A line, or nothing."""
+    newest = max(run.videos.glob("[0-9]*.mp4"), default=None)
+    return "" if newest is None else f"video: {newest}\n"
 
 
 def serve_summary(

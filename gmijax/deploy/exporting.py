@@ -7,24 +7,15 @@ CPU: nothing is simulated, and GPUs may be training.
 from __future__ import annotations
 
 import importlib.util
-from pathlib import Path
 from typing import Final
 
 from gmijax.config import ExportConfig, PlanConfig, ReduceConfig
-from gmijax.config.schema import to_dict
-from gmijax.control.console import open_console
-from gmijax.deploy.playing import open_run
+from gmijax.control.console import doing, open_console
+from gmijax.deploy.playing import open_run, output_folder
 from gmijax.errors import ConfigError
 from gmijax.machine.snapshot import detect_machine
 from gmijax.partition.planner import make_plan
-from gmijax.runs.folder import (
-    STEP_DIGITS,
-    ExportPaths,
-    RunPaths,
-    remove_temporary,
-    write_json,
-)
-from gmijax.runs.resume import CheckpointMeta
+from gmijax.runs.folder import ExportPaths, RunPaths
 from gmijax.supervise.kinds import JobKind
 from gmijax.supervise.launch import Timeouts
 from gmijax.supervise.launcher import Launch, run_gmis
@@ -47,12 +38,12 @@ def export(config: ExportConfig, *, show: bool = False) -> ExportPaths:
     """
     _require_packages(config)
     config, _, changed = open_run(config)
-    paths = _prepare(config)
+    paths = ExportPaths(output_folder(config, "export"))
     console = open_console(show=show)
     console.print(f"checkpoint: {config.checkpoint}")
     if changed:
         console.print(changed)
-    with console.status("exporting the policy"):
+    with doing(console, "exporting the policy"):
         run_gmis(_launch(paths))
     if config.format in ("onnx", "all"):
         console.print(f"ONNX: {paths.onnx}")
@@ -70,18 +61,6 @@ def _require_packages(config: ExportConfig) -> None:
             f"format={config.format}: needs the package jax2onnx (pip install 'gmijax[export]'); "
             "allowed without it is stablehlo"
         )
-
-
-def _prepare(config: ExportConfig) -> ExportPaths:
-    run = Path(str(config.run.dir))
-    env_steps = CheckpointMeta.read(Path(str(config.checkpoint))).env_steps
-    root = run / "export" / f"{env_steps:0{STEP_DIGITS}d}"
-    try:
-        write_json(RunPaths(root).config, to_dict(config))
-        remove_temporary(root)
-    except OSError as error:
-        raise ConfigError(f"run.dir={run}: cannot write to {root} ({error.strerror})") from None
-    return ExportPaths(root)
 
 
 def _launch(paths: ExportPaths) -> Launch:

@@ -4,22 +4,20 @@ from __future__ import annotations
 
 import importlib.util
 import os
-import signal
 import subprocess
 import sys
 from collections.abc import Mapping
 from pathlib import Path
-from typing import IO, Final
+from typing import IO
 
 from rich.console import Console
 
 from gmijax.config import PlayConfig
+from gmijax.control.console import doing
 from gmijax.errors import GmijaxError
+from gmijax.machine.opengl import environment_with, is_missing, opengls, what_is_missing
 from gmijax.runs.folder import EXIT_NO_GL, PlayPaths
 from gmijax.supervise.failures import last_line, signal_name
-
-_GL: Final = "MUJOCO_GL"
-_FALLBACK_GLS: Final = ("egl", "osmesa")
 
 
 def write_page(config: PlayConfig, paths: PlayPaths, console: Console) -> None:
@@ -28,7 +26,7 @@ def write_page(config: PlayConfig, paths: PlayPaths, console: Console) -> None:
         return
     # A page is quickly made, and the GPU may be training.
     environment = {"PJRT_NPROC": "4", **os.environ, "JAX_PLATFORMS": "cpu"}
-    with console.status("writing the page"), paths.page_log.open("wb") as log:
+    with doing(console, "writing the page"), paths.page_log.open("wb") as log:
         exit_code = _child("gmijax.sim.page", paths, environment, log)
     if exit_code == 0:
         console.print(f"page: {paths.html}")
@@ -46,33 +44,24 @@ def has_brax() -> bool:
 
 def film(config: PlayConfig, paths: PlayPaths, console: Console) -> None:
     """Films with the first OpenGL that works; each is tried in a fresh interpreter."""
-    users = os.environ.get(_GL)
-    tried = tuple(dict.fromkeys((users, *_FALLBACK_GLS) if users else _FALLBACK_GLS))
+    tried = opengls("egl", "osmesa")
     exit_code = EXIT_NO_GL
     for gl in tried:
-        with console.status(f"filming with {gl}"):
+        with doing(console, f"filming with {gl}"):
             exit_code = _render(gl, paths)
         if exit_code == 0:
             for video in filter(Path.exists, (paths.mp4, paths.gif)):
                 console.print(f"video: {video}")
             return
-        if not _is_for_want_of_gl(exit_code):
+        if not is_missing(exit_code):
             raise GmijaxError(f"no video: {_why(exit_code, paths)}; the returns were evaluated")
     reason = (
-        f"no video: no headless OpenGL (EGL or OSMesa) is to be had, tried {', '.join(tried)}; "
-        "install it with `apt-get install libegl1` or `apt-get install libosmesa6`; "
+        f"no video: {what_is_missing(tried)}; "
         f"the last one: {_why(exit_code, paths)}; the returns were evaluated"
     )
     if config.video != "auto":
         raise GmijaxError(reason)
     console.print(reason)
-
-
-def _is_for_want_of_gl(exit_code: int) -> bool:
-    # A broken driver may end the process with a signal instead of an error. These two come from
-    # somebody else: the user, a batch system, or the machine when it runs out of memory.
-    sent = (-signal.SIGKILL, -signal.SIGTERM)
-    return exit_code == EXIT_NO_GL or (exit_code < 0 and exit_code not in sent)
 
 
 def _why(exit_code: int, paths: PlayPaths) -> str:
@@ -82,11 +71,8 @@ def _why(exit_code: int, paths: PlayPaths) -> str:
 
 
 def _render(gl: str, paths: PlayPaths) -> int:
-    environment = {**os.environ, _GL: gl}
-    # MuJoCo sets it to what fits MUJOCO_GL, and refuses any other value.
-    environment.pop("PYOPENGL_PLATFORM", None)
     with paths.render_log.open("ab") as log:
-        return _child("gmijax.sim.render", paths, environment, log)
+        return _child("gmijax.sim.render", paths, environment_with(gl), log)
 
 
 def _child(module: str, paths: PlayPaths, environment: Mapping[str, str], log: IO[bytes]) -> int:

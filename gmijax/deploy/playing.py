@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 import os
-from collections.abc import Mapping
+from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import Any, Final, TypeVar
 
@@ -17,12 +17,20 @@ from rich.table import Table
 
 from gmijax.config import EnvConfig, ExportConfig, PlanConfig, PlayConfig, ReduceConfig
 from gmijax.config.schema import to_dict
-from gmijax.control.console import open_console
+from gmijax.control.console import doing, open_console
 from gmijax.deploy.pictures import film, has_brax, write_page
 from gmijax.errors import ConfigError, GmijaxError
 from gmijax.machine.snapshot import Machine, detect_machine
 from gmijax.partition.planner import make_plan
-from gmijax.runs.folder import META, STEP_DIGITS, PlayPaths, RunPaths, read_json, write_json
+from gmijax.runs.folder import (
+    META,
+    STEP_DIGITS,
+    PlayPaths,
+    RunPaths,
+    read_json,
+    remove_temporary,
+    write_json,
+)
 from gmijax.runs.resume import (
     CheckpointMeta,
     best_checkpoint,
@@ -61,12 +69,13 @@ def play(config: PlayConfig, *, show: bool = False) -> None:
       GmijaxError: a film was asked for and could not be made; the returns are there.
     """
     config, changed = _opened(config)
-    paths = _prepare(config)
+    # A film of an earlier evaluation must not lie beside the returns of this one.
+    paths = PlayPaths(output_folder(config, "play", lambda root: PlayPaths(root).results()))
     console = open_console(show=show)
     console.print(f"checkpoint: {config.checkpoint}")
     if changed:
         console.print(changed)
-    with console.status(f"playing {config.num_envs} episodes"):
+    with doing(console, f"playing {config.num_envs} episodes"):
         run_gmis(_launch(config, paths, detect_machine()))
     returns = read_json(paths.returns)
     console.print(_table(returns))
@@ -149,19 +158,32 @@ def _at_step(run: Path, env_steps: int) -> Path:
     return checkpoint
 
 
-def _prepare(config: PlayConfig) -> PlayPaths:
+def output_folder(
+    config: PlayConfig | ExportConfig,
+    name: str,
+    stale: Callable[[Path], Iterable[Path]] = lambda _: (),
+) -> Path:
+    """Where what is made of a checkpoint goes: `<run>/<name>/<env steps>`, with the configuration.
+
+    Args:
+      config: with what `open_run` found.
+      name: see above.
+      stale: files that may be there from before, in such a folder; they are removed.
+
+    Raises:
+      ConfigError: it cannot be written.
+    """
     run = Path(str(config.run.dir))
     env_steps = CheckpointMeta.read(Path(str(config.checkpoint))).env_steps
-    root = run / "play" / f"{env_steps:0{STEP_DIGITS}d}"
-    paths = PlayPaths(root)
+    root = run / name / f"{env_steps:0{STEP_DIGITS}d}"
     try:
         write_json(RunPaths(root).config, to_dict(config))
-        # A film of an earlier evaluation must not lie beside the returns of this one.
-        for path in paths.results():
+        remove_temporary(root)
+        for path in stale(root):
             path.unlink(missing_ok=True)
     except OSError as error:
         raise ConfigError(f"run.dir={run}: cannot write to {root} ({error.strerror})") from None
-    return paths
+    return root
 
 
 def _launch(config: PlayConfig, paths: PlayPaths, machine: Machine) -> Launch:

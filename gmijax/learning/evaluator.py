@@ -18,8 +18,10 @@ import numpy.typing as npt
 
 from gmijax.collectives.interface import Reducer
 from gmijax.config import TrainConfig
+from gmijax.learning.episode_films import EpisodeFilms
 from gmijax.learning.episodes import EpisodeRunner, Episodes, Options
 from gmijax.learning.learner import Learner, TrainState
+from gmijax.runs.folder import RunPaths
 from gmijax.sim.interface import Env
 from gmijax.sim.randomize import make_worlds
 
@@ -72,13 +74,19 @@ class Evaluator:
       learner: the networks.
       config: of the run.
       reducer: among the GMIs that train.
+      run: the run folder, in which the leader leaves what is to be filmed.
 
     Attributes:
       best: the best mean return of the run so far, -inf while there is none.
       wall_s: seconds of all evaluations together.
+
+    Raises:
+      ConfigError: the task cannot be filmed, and is to be.
     """
 
-    def __init__(self, env: Env, learner: Learner, config: TrainConfig, reducer: Reducer) -> None:
+    def __init__(
+        self, env: Env, learner: Learner, config: TrainConfig, reducer: Reducer, run: RunPaths
+    ) -> None:
         assert config.eval.every is not None
         self._every, self._num_episodes = config.eval.every, config.eval.episodes
         self._reducer = reducer
@@ -94,6 +102,9 @@ class Evaluator:
             first_env=FIRST_WORLD + first,
         )
         self._runner = EpisodeRunner(env, learner, options)
+        self._films: EpisodeFilms | None = None
+        if config.eval.video and reducer.rank == 0:
+            self._films = EpisodeFilms(config, env, run)
         self.best = -math.inf
         self.wall_s = 0.0
 
@@ -110,12 +121,17 @@ class Evaluator:
         return env_steps // self._every > last_steps // self._every
 
     def run(
-        self, state: TrainState, beat: Callable[[], None], must_stop: Callable[[], bool]
+        self,
+        state: TrainState,
+        env_steps: int,
+        beat: Callable[[], None],
+        must_stop: Callable[[], bool],
     ) -> Evaluation:
         """Evaluates; collective.
 
         Args:
           state: what to evaluate; equal on all GMIs.
+          env_steps: of the whole job, of which `state` is the outcome.
           beat: called after every part of the episodes.
           must_stop: whether the job is to end; if so on any GMI, the evaluation is given up.
 
@@ -139,6 +155,8 @@ class Evaluator:
         is_best = metrics.get("eval/return", -math.inf) > self.best
         if is_best:
             self.best = metrics["eval/return"]
+        if self._films is not None and not is_given_up:
+            self._films.take(env_steps, episodes)
         wall_s = time.monotonic() - started
         self.wall_s += wall_s
         if metrics:

@@ -87,7 +87,7 @@ class TrainingLoop:
         self._evaluator: Evaluator | None = None
         if config.eval.every is not None:
             worlds = evaluation_worlds(config, reducer.rank, reducer.world_size)
-            self._evaluator = Evaluator(worlds, self._learner, config, reducer)
+            self._evaluator = Evaluator(worlds, self._learner, config, reducer, link.run)
         self._env_steps = 0
         self._iterations = 0
         self._checkpoint: Path | None = None
@@ -225,6 +225,7 @@ class TrainingLoop:
         iteration = env_steps // self._steps_per_iteration
         return self._evaluator.run(
             state,
+            env_steps,
             lambda: self._link.beat("running", iteration),
             lambda: self._link.stop_requested,
         )

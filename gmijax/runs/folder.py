@@ -72,6 +72,8 @@ class RunPaths(_Folder):
         self.tensorboard = root / "tensorboard"
         self.returns_png = root / "returns.png"
         self.checkpoints = root / "checkpoints"
+        self.videos = root / "videos"
+        self.filmed_model = self.videos / "model.mjb"  # While there is something left to film.
         self.mps = root / "mps"  # Logs of MPS daemons that the job starts.
         self.janitor_log = root / "janitor.log"  # Errors of the janitor; gone without any.
         self.lock = root / ".lock"  # Held by the job that writes into the folder.
@@ -79,6 +81,7 @@ class RunPaths(_Folder):
         self.git_diff = root / "git.diff"  # Its changes since that commit.
         self.wandb = root / "wandb.json"  # Its run at Weights & Biases, and how far that is.
         self.wandb_log = root / "wandb.log"  # Errors of sending to it; gone without any.
+        self.film_log = root / "film.log"  # Errors of filming evaluations; gone without any.
         self.events = root / "events.jsonl"  # Starts, faults and restarts of the job.
         self.search_report = root / "search.json"
         self.search_png = root / "search.png"
@@ -86,6 +89,14 @@ class RunPaths(_Folder):
     def checkpoint(self, env_steps: int) -> Path:
         """The checkpoint after `env_steps` environment steps."""
         return self.checkpoints / f"{env_steps:0{STEP_DIGITS}d}"
+
+    def video(self, env_steps: int) -> Path:
+        """The film of the evaluation after `env_steps` environment steps."""
+        return self.videos / f"{env_steps:0{STEP_DIGITS}d}.mp4"
+
+    def to_film(self, env_steps: int) -> Path:
+        """The trajectory of which that film is to be made; gone when it has been."""
+        return self.video(env_steps).with_suffix(".npz")
 
     def profile(self, name: str) -> RunPaths:
         """The run folder of a profile of a search; it keeps no checkpoints."""

@@ -18,7 +18,8 @@ import numpy as np
 import numpy.typing as npt
 
 from gmijax.runs.folder import PlayPaths
-from gmijax.sim.render import Trajectory, load_trajectory, real_time
+from gmijax.sim.render import real_time
+from gmijax.sim.trajectory import Trajectory, load_trajectory
 
 MAX_FPS = 60.0
 

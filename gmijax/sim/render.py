@@ -1,4 +1,7 @@
-"""Main of the filming child of `gmijax.play`: `python -m gmijax.sim.render PLAY_FOLDER`. No jax.
+"""Draws films. Main of the filming child of `gmijax.play`. No jax here.
+
+`python -m gmijax.sim.render PLAY_FOLDER` films a played checkpoint; without a folder it tells by
+its exit code whether it could.
 
 Draws a trajectory with MuJoCo, without a display, through the OpenGL that MUJOCO_GL names. That
 choice is made when mujoco is imported and cannot be changed after, hence a child of its own.
@@ -9,7 +12,7 @@ from __future__ import annotations
 import math
 import os
 import sys
-from collections.abc import Generator, Iterator, Mapping
+from collections.abc import Generator, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from itertools import chain
 from pathlib import Path
@@ -23,6 +26,7 @@ import numpy.typing as npt
 from gmijax.config import PlayConfig
 from gmijax.config.schema import from_dict
 from gmijax.runs.folder import EXIT_NO_GL, PlayPaths, RunPaths, read_json
+from gmijax.sim.trajectory import Trajectory, load_trajectory
 
 MP4_MAX_FPS, GIF_MAX_FPS = 30.0, 15.0
 
@@ -66,52 +70,55 @@ class Timing(NamedTuple):
     fps: float
 
 
-class Trajectory(NamedTuple):
-    """What is filmed; see `gmijax.runs.folder.PlayPaths`.
-
-    Attributes:
-      qpos: [L + 1, E, nq].
-      lengths: [E] steps of every episode.
-      control_dt_s: seconds per step.
-    """
-
-    qpos: npt.NDArray[np.float32]
-    lengths: npt.NDArray[np.int32]
-    control_dt_s: float
-
-
-def main() -> int:
+def main(arguments: Sequence[str]) -> int:
     """Films the folder's trajectory; returns the exit code."""
-    folder = Path(sys.argv[1])
+    if not arguments:
+        return EXIT_NO_GL if _stage(None, (64, 64), None) is None else 0
+    folder = Path(arguments[0])
     config = from_dict(PlayConfig, read_json(RunPaths(folder).config))
     paths = PlayPaths(folder)
     grid = grid_of(config.video_envs)
-    tile = tile_size(config.width, config.height, grid)
+    stage = _stage(paths.model, tile_size(config.width, config.height, grid), config.camera)
+    if stage is None:
+        return EXIT_NO_GL
+    made = {"gif": (paths.gif,), "both": (paths.mp4, paths.gif)}.get(config.video, (paths.mp4,))
+    film(made, load_trajectory(paths.trajectory), stage, grid)
+    return 0
+
+
+def _stage(model: Path | None, size: tuple[int, int], camera: str | None) -> Stage | None:
+    """See `Stage`; None where OpenGL cannot be had, and why on standard error."""
     try:
         # Whatever goes wrong up to the first picture is the fault of this OpenGL: a library
         # that is missing shows as any of half a dozen errors, at import or later.
-        stage = Stage(paths.model, tile, config.camera)
+        return Stage(model, size, camera)
     except Exception as error:
         sys.stderr.write(f"{type(error).__name__}: {error}\n")
-        return EXIT_NO_GL
-    film(paths, load_trajectory(paths.trajectory), stage, grid, config.video)
-    return 0
+        return None
 
 
 class Stage:
     """A model, a camera, and an off-screen OpenGL context.
 
+    Args:
+      model: file in MuJoCo's binary format; None: an empty world.
+      size: width and height of a picture, pixels.
+      camera: see `choose_camera`.
+
     Raises:
       Exception: of any type, where OpenGL cannot be had.
     """
 
-    def __init__(self, model: Path, tile: tuple[int, int], camera: str | None) -> None:
+    def __init__(self, model: Path | None, size: tuple[int, int], camera: str | None) -> None:
         import mujoco
 
         self._mujoco = mujoco
-        self._model = mujoco.MjModel.from_binary_path(str(model))
+        if model is None:
+            self._model = mujoco.MjModel.from_xml_string("<mujoco/>")
+        else:
+            self._model = mujoco.MjModel.from_binary_path(str(model))
         self._data = mujoco.MjData(self._model)
-        width, height = tile
+        width, height = size
         # The buffer of the model's author need not hold the picture that is wanted.
         self._model.vis.global_.offwidth = max(self._model.vis.global_.offwidth, width)
         self._model.vis.global_.offheight = max(self._model.vis.global_.offheight, height)
@@ -143,12 +150,6 @@ def choose_camera(model: Any, wanted: str | None) -> int:
     tracking = (int(modes.mjCAMLIGHT_TRACK), int(modes.mjCAMLIGHT_TRACKCOM))
     following = [i for i in range(model.ncam) if int(model.cam_mode[i]) in tracking]
     return next(iter(following), 0 if names else -1)
-
-
-def load_trajectory(path: Path) -> Trajectory:
-    """Reads what `gmijax.workers.playback` wrote."""
-    with np.load(path) as data:
-        return Trajectory(data["qpos"], data["lengths"], float(data["control_dt_s"]))
 
 
 def real_time(control_dt_s: float, max_fps: float) -> Timing:
@@ -203,21 +204,19 @@ def frames(
 
 
 def film(
-    paths: PlayPaths, trajectory: Trajectory, stage: Stage, grid: tuple[int, int], video: str
+    made: Sequence[Path], trajectory: Trajectory, stage: Stage, grid: tuple[int, int]
 ) -> None:
-    """Writes the film as mp4, as gif or as both; every picture is drawn once."""
-    mp4, gif = video in ("auto", "mp4", "both"), video in ("gif", "both")
+    """Writes the film to each of `made`, .mp4 or .gif; every picture is drawn once."""
+    mp4 = any(path.suffix == ".mp4" for path in made)
     timing = real_time(trajectory.control_dt_s, MP4_MAX_FPS if mp4 else GIF_MAX_FPS)
     slower = real_time(1.0 / timing.fps, GIF_MAX_FPS)
     drawn = frames(trajectory, stage, grid, timing.stride)
     first = next(drawn)
     with ExitStack() as stack:
         writers: list[tuple[Writer, int]] = []
-        if mp4:
-            writers.append((stack.enter_context(_writer(paths.mp4, first, timing.fps)), 1))
-        if gif:
-            writer = stack.enter_context(_writer(paths.gif, first, slower.fps))
-            writers.append((writer, slower.stride))
+        for path in made:
+            every, fps = (1, timing.fps) if path.suffix == ".mp4" else (slower.stride, slower.fps)
+            writers.append((stack.enter_context(_writer(path, first, fps)), every))
         for number, frame in enumerate(chain([first], drawn)):
             for writer, every in writers:
                 if number % every == 0:
@@ -243,4 +242,4 @@ def _writer(path: Path, first: Image, fps: float) -> Iterator[Writer]:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(main(sys.argv[1:]))

@@ -187,7 +187,7 @@ def _copy(job: Job, seed: int) -> Job:
         seed=seed,
         num_timesteps=_FOREVER,
         run=run,
-        eval=dataclasses.replace(job.config.eval, every=None),
+        eval=dataclasses.replace(job.config.eval, every=None, video=False),
         wandb=dataclasses.replace(job.config.wandb, mode="off"),
     )
     return Job(seed, {}, config)

@@ -140,18 +140,13 @@ def _check_camera(camera: str | None, env: Env) -> None:
 
 
 def _write_trajectory(paths: PlayPaths, env: Env, episodes: Episodes, num_shown: int) -> None:
-    import mujoco
-    import numpy as np
+    from gmijax.sim.trajectory import Trajectory, save_model, save_trajectory
 
     if env.mj_model is None:  # The controller sees that there is nothing to film.
         return
-    mujoco.mj_saveModel(env.mj_model, str(paths.model))
-    np.savez(
-        paths.trajectory,
-        qpos=episodes.qpos,
-        lengths=episodes.lengths[:num_shown],
-        control_dt_s=env.spec.control_dt_s,
-    )
+    save_model(paths.model, env.mj_model)
+    lengths = episodes.lengths[:num_shown]
+    save_trajectory(paths.trajectory, Trajectory(episodes.qpos, lengths, env.spec.control_dt_s))
 
 
 if __name__ == "__main__":

@@ -35,27 +35,17 @@ def main(root: Path) -> int:
 
 
 def follow(run: RunPaths, config: Mapping[str, Any]) -> None:
-    """Logs the lines of metrics as they come, until standard input ends.
+    """Logs lines of metrics and films of evaluations as they come, until standard input ends.
 
     What was logged under the run's id before, by the run that it resumes, is not logged again:
     Weights & Biases takes steps in ascending order only.
     """
     import wandb
 
-    said = config["wandb"]
     known = read_json(run.wandb) if run.wandb.exists() else {}
-    last = known.get("env_steps", -1)
-    board = wandb.init(
-        id=known.get("id", secrets.token_hex(4)),
-        resume="allow",
-        name=run.root.name,
-        project=said["project"],
-        group=said["group"],
-        config=dict(config),
-        dir=run.root,
-        settings=wandb.Settings(mode=said["mode"], silent=True, console="off"),
-    )
-    write_json(run.wandb, {"id": board.id, "env_steps": last})
+    last, filmed = known.get("env_steps", -1), known.get("filmed_env_steps", -1)
+    board = _open(run, config, known.get("id", secrets.token_hex(4)))
+    write_json(run.wandb, {**known, "id": board.id, "env_steps": last})
     reader = MetricsReader(run.metrics)
     is_over = False
     while not is_over:
@@ -64,11 +54,36 @@ def follow(run: RunPaths, config: Mapping[str, Any]) -> None:
         for line in new:
             last = line["env_steps"]
             board.log(scalars(line), step=last)
-        if new:
-            write_json(run.wandb, {"id": board.id, "env_steps": last})
+        film = max(run.videos.glob("[0-9]*.mp4"), default=None)
+        is_new = film is not None and int(film.stem) > filmed and last >= 0
+        if film is not None and is_new:
+            filmed = int(film.stem)
+            video = wandb.Video(str(film), caption=f"{filmed} env steps", format="mp4")
+            # It comes later than the line of its evaluation, whose step has gone by.
+            board.log({"eval/video": video}, step=last)
+        if new or is_new:
+            reached = {"env_steps": last, "filmed_env_steps": filmed}
+            write_json(run.wandb, {"id": board.id, **reached})
     summary = read_json(run.summary) if run.summary.exists() else {"status": "failed"}
     board.summary.update(summary)
     board.finish(exit_code=int(summary["status"] == "failed"))
+
+
+def _open(run: RunPaths, config: Mapping[str, Any], board_id: str) -> Any:
+    """The run at Weights & Biases."""
+    import wandb
+
+    said = config["wandb"]
+    return wandb.init(
+        id=board_id,
+        resume="allow",
+        name=run.root.name,
+        project=said["project"],
+        group=said["group"],
+        config=dict(config),
+        dir=run.root,
+        settings=wandb.Settings(mode=said["mode"], silent=True, console="off"),
+    )
 
 
 if __name__ == "__main__":

@@ -208,12 +208,16 @@ def test_a_package_that_is_missing_is_told_with_its_command():
         make_env("CartpoleBalance", suite="playground")
 
 
-def test_models_that_cannot_be_downloaded_are_one_line(monkeypatch: pytest.MonkeyPatch):
+def test_what_playground_cannot_make_is_one_line(monkeypatch: pytest.MonkeyPatch):
     def load(name: str, config: Any) -> None:
+        if name == "Reacher":
+            raise AttributeError("'MjSpec' object has no attribute 'find_body'")
         raise subprocess.CalledProcessError(128, ["git", "clone"])
 
     registry = SimpleNamespace(
-        ALL_ENVS=("Go1Joystick",), get_default_config=lambda name: {"name": name}, load=load
+        ALL_ENVS=("Go1Joystick", "Reacher"),
+        get_default_config=lambda name: {"name": name},
+        load=load,
     )
     package = ModuleType("mujoco_playground")
     package.__dict__.update(__spec__=ModuleSpec(package.__name__, None), registry=registry)
@@ -225,6 +229,8 @@ def test_models_that_cannot_be_downloaded_are_one_line(monkeypatch: pytest.Monke
         make_env("Go1Joystick", suite="playground")
     with pytest.raises(ConfigError, match="did you mean Go1Joystick"):
         make_env("Go1Joystic", suite="playground")
+    with pytest.raises(ConfigError, match=r"^env\.name=Reacher fails: AttributeError: 'MjSpec'"):
+        make_env("Reacher", suite="playground")
 
 
 def test_playground_as_ours():

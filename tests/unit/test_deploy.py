@@ -163,7 +163,7 @@ def test_an_export_leaves_a_gpu_to_the_job_that_trains_on_it(
     machine = Machine(gpus=(Gpu(0, "GPU-1", "some GPU", 80000, (9, 0), False),), cpu_cores=(0, 1))
     monkeypatch.setattr(exporting, "detect_machine", lambda: machine)
     config, _, _ = exporting.open_run(exporting_config(f"run.dir={run.root}"))
-    paths = exporting._prepare(config)
+    paths = ExportPaths(exporting.output_folder(config, "export"))
     assert paths == ExportPaths(run.root / "export" / f"{ENV_STEPS:012d}")
     environment = environment_of(exporting._launch(paths), 0, {})
     assert (environment["JAX_PLATFORMS"], environment["CUDA_VISIBLE_DEVICES"]) == ("cpu", "")

@@ -6,6 +6,7 @@ import dataclasses
 import itertools
 import threading
 from collections.abc import Callable
+from pathlib import Path
 
 import jax
 import numpy as np
@@ -18,8 +19,11 @@ from gmijax.config import TrainConfig
 from gmijax.learning.episodes import CHUNK_STEPS
 from gmijax.learning.evaluator import Evaluation, Evaluator
 from gmijax.learning.learner import init_learner, make_learner
+from gmijax.runs.folder import RunPaths
 
 EPISODES = 5
+NOWHERE = RunPaths(Path("nowhere"))
+"""The run folder: nothing is filmed."""
 ENV = point_mass_env(episode_length=2 * CHUNK_STEPS + 10)
 
 
@@ -67,14 +71,14 @@ def evaluate(
 
     def run(rank: int) -> None:
         reducer = SoloReducer() if num_gmis == 1 else gathering.of(rank)
-        evaluator = Evaluator(ENV, learner, config, reducer)
+        evaluator = Evaluator(ENV, learner, config, reducer, NOWHERE)
         evaluator.trace(state)
         evaluator.compile()
 
         def beat() -> None:
             beats[rank] += 1
 
-        found[rank] = evaluator.run(state, beat, lambda: must_stop(rank, beats[rank]))
+        found[rank] = evaluator.run(state, 64, beat, lambda: must_stop(rank, beats[rank]))
 
     threads = [threading.Thread(target=run, args=(rank,)) for rank in range(num_gmis)]
     for thread in threads:
@@ -114,11 +118,11 @@ def test_all_give_up_when_one_has_heard_that_the_job_is_to_end(config: TrainConf
 
 def test_an_evaluation_is_the_best_if_none_before_was_as_good(config: TrainConfig) -> None:
     learner = make_learner(ENV.spec, config.algo)
-    evaluator = Evaluator(ENV, learner, config, SoloReducer())
+    evaluator = Evaluator(ENV, learner, config, SoloReducer(), NOWHERE)
     states = [init_learner(learner, ENV.spec.obs_size, jax.random.key(k)) for k in (1, 2, 3)]
     evaluator.trace(states[0])
     evaluator.compile()
-    found = [evaluator.run(state, lambda: None, lambda: False) for state in (*states, *states)]
+    found = [evaluator.run(state, 64, lambda: None, lambda: False) for state in (*states, *states)]
     returns = [evaluation.metrics["eval/return"] for evaluation in found]
     assert returns[:3] == returns[3:]  # The same starts each time.
     records = [value for k, value in enumerate(returns) if value > max(returns[:k], default=-1e9)]
@@ -126,12 +130,12 @@ def test_an_evaluation_is_the_best_if_none_before_was_as_good(config: TrainConfi
     assert evaluator.best == max(returns)
     assert evaluator.wall_s == pytest.approx(sum(e.wall_s for e in found))
     evaluator.best = 1e9  # Of a run that goes on.
-    assert not evaluator.run(states[0], lambda: None, lambda: False).is_best
+    assert not evaluator.run(states[0], 64, lambda: None, lambda: False).is_best
 
 
 def test_evaluations_come_whenever_so_many_steps_are_done(config: TrainConfig) -> None:
     learner = make_learner(ENV.spec, config.algo)
-    evaluator = Evaluator(ENV, learner, config, SoloReducer())
+    evaluator = Evaluator(ENV, learner, config, SoloReducer(), NOWHERE)
     steps = range(0, 500, 64)
     due = [end for start, end in itertools.pairwise(steps) if evaluator.is_due(end, start)]
     assert due == [128, 256, 320, 448]

@@ -17,7 +17,7 @@ import pytest
 
 from gmijax.runs.folder import PlayPaths
 from gmijax.sim.page import page
-from gmijax.sim.render import Trajectory
+from gmijax.sim.trajectory import Trajectory
 
 NUM_STEPS = 10
 CONTROL_DT_S = 0.01

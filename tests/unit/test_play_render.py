@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from gmijax.sim import render
+from gmijax.sim.trajectory import Trajectory, load_trajectory, save_trajectory
 
 
 @pytest.mark.parametrize(
@@ -53,7 +54,7 @@ class PaintedStage:
 
 def test_worlds_whose_episode_is_over_stand_still_and_dim():
     qpos = np.array([[[100.0], [200.0]]] * 5, np.float32)
-    trajectory = render.Trajectory(qpos, np.array([4, 1]), 0.1)
+    trajectory = Trajectory(qpos, np.array([4, 1]), 0.1)
     pictures = list(render.frames(trajectory, PaintedStage(), (2, 1), 1))
     assert [picture[0, :, 0].tolist() for picture in pictures] == [
         [100, 200],
@@ -64,8 +65,8 @@ def test_worlds_whose_episode_is_over_stand_still_and_dim():
 
 def test_trajectory_is_read_back(tmp_path: Path):
     qpos = np.arange(12, dtype=np.float32).reshape(3, 2, 2)
-    np.savez(tmp_path / "t.npz", qpos=qpos, lengths=[2, 1], control_dt_s=0.02)
-    trajectory = render.load_trajectory(tmp_path / "t.npz")
+    save_trajectory(tmp_path / "t.npz", Trajectory(qpos, np.array([2, 1], np.int32), 0.02))
+    trajectory = load_trajectory(tmp_path / "t.npz")
     np.testing.assert_array_equal(trajectory.qpos, qpos)
     assert trajectory.lengths.tolist() == [2, 1]
     assert trajectory.control_dt_s == 0.02

@@ -28,6 +28,8 @@ def tell(what, **said):
         file.write(json.dumps({"what": what, **said}) + "\\n")
 def Settings(**said):
     return said
+def Video(path, caption, format):
+    return {"film": os.path.basename(path), "caption": caption, "format": format}
 def init(*, id, dir, **said):
     if os.environ.get("FAKE_FAILS"):
         raise RuntimeError("no\\nnetwork")
@@ -79,17 +81,23 @@ def follow(
 
 def test_lines_configuration_and_summary_are_sent(tmp_path: Path, fake: Path):
     run = a_run(tmp_path / "run")
+    run.videos.mkdir()
+    run.video(64).touch()
     config = compose("wandb.mode=online", "wandb.project=p", "wandb.group=g", "seed=7")
     assert follow(run, config, (64, 128), summary={"status": "completed", "x": 1}) == []
     begin, *logged, end = told(fake)
     assert begin["config"]["seed"] == 7
     assert (begin["project"], begin["group"], begin["name"]) == ("p", "g", "run")
     assert begin["settings"]["mode"] == "online"
-    assert logged == [
+    lines = [line for line in logged if "eval/video" not in line["values"]]
+    assert lines == [
         {"what": "log", "step": steps, "values": {"loss/policy": steps / 2}} for steps in (64, 128)
     ]
+    (film,) = [line["values"]["eval/video"] for line in logged if line not in lines]
+    assert film == {"film": run.video(64).name, "caption": "64 env steps", "format": "mp4"}
     assert end == {"what": "finish", "exit_code": 0, "summary": {"status": "completed", "x": 1}}
-    assert json.loads(run.wandb.read_text()) == {"id": begin["id"], "env_steps": 128}
+    reached = {"env_steps": 128, "filmed_env_steps": 64}
+    assert json.loads(run.wandb.read_text()) == {"id": begin["id"], **reached}
     assert not run.wandb_log.exists()
 
 

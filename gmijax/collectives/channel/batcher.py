@@ -133,6 +133,7 @@ class Batcher:
     def _read(self, reader: ChannelReader, decode: Decode) -> Transfer | None:
         """The next transfer, valid until the reader's `release`; PipeClosed if none can come."""
         while (message := reader.try_get()) is not None:
+            self.transfers += 1
             if (transfer := decode(message)) is not None:
                 return transfer
         return None

@@ -21,7 +21,8 @@ def make(name: str, *, impl: str = "auto", max_envs: int | None = None) -> Env:
     """Makes one of Playground's environments with its default configuration, in MJX-JAX.
 
     Raises:
-      ConfigError: an unknown name, MJX-Warp, or models that could not be downloaded.
+      ConfigError: an unknown name, MJX-Warp, models that could not be downloaded, or one that
+        Playground cannot make with the installed version of MuJoCo.
     """
     del max_envs  # MJX-JAX has no limit.
     require_jax(impl, "Playground")
@@ -32,15 +33,19 @@ def make(name: str, *, impl: str = "auto", max_envs: int | None = None) -> Env:
     config = registry.get_default_config(name)
     if "impl" in config:
         config.impl = "jax"
+    theirs = attempt(f"env.name={name}", _load, registry, name, config)
+    return from_playground(theirs, name=f"playground/{name}", episode_length=config.episode_length)
+
+
+def _load(registry: Any, name: str, config: Any) -> Any:
     try:
-        theirs = registry.load(name, config=config)
+        return registry.load(name, config=config)
     except (OSError, subprocess.CalledProcessError) as error:
         raise ConfigError(
             f"env.name={name}: Playground could not download its robot models to "
             f"{_menagerie_folder()}: make the task once where git reaches GitHub, or copy that "
             "folder here; the dm_control tasks need none"
         ) from error
-    return from_playground(theirs, name=f"playground/{name}", episode_length=config.episode_length)
 
 
 def from_playground(theirs: Any, *, name: str, episode_length: int = 1000) -> Env:

@@ -1,0 +1,51 @@
+"""What a GMI does for films of evaluations: it leaves trajectories for who draws them."""
+
+from __future__ import annotations
+
+import sys
+
+from gmijax.config import TrainConfig
+from gmijax.errors import ConfigError
+from gmijax.learning.episodes import Episodes
+from gmijax.runs.folder import RunPaths
+from gmijax.sim.interface import Env
+from gmijax.sim.trajectory import Trajectory, save_model, save_trajectory
+
+
+class EpisodeFilms:
+    """Leaves the first episode of evaluations in the run folder (see `gmijax.control.films`).
+
+    Args:
+      config: of the run.
+      env: the worlds in which evaluations are made.
+      run: the run folder.
+
+    Raises:
+      ConfigError: the task has no model that could be drawn.
+    """
+
+    def __init__(self, config: TrainConfig, env: Env, run: RunPaths) -> None:
+        if env.mj_model is None:
+            raise ConfigError(
+                f"eval.video={config.eval.video}: {env.spec.name} has no model that could be "
+                "filmed; allowed is false"
+            )
+        assert config.eval.every is not None
+        self._every = int(config.eval.video) * config.eval.every
+        self._end = config.num_timesteps
+        self._last_steps = 0
+        self._control_dt_s, self._run = env.spec.control_dt_s, run
+        save_model(run.filmed_model, env.mj_model)
+
+    def take(self, env_steps: int, episodes: Episodes) -> None:
+        """Leaves the first of `episodes`, evaluated after `env_steps`, if it is to be filmed."""
+        is_due = env_steps // self._every > self._last_steps // self._every
+        if not (is_due or env_steps >= self._end):
+            return
+        self._last_steps = env_steps
+        trajectory = Trajectory(episodes.qpos, episodes.lengths[:1], self._control_dt_s)
+        try:
+            save_trajectory(self._run.to_film(env_steps), trajectory)
+        except OSError as error:
+            # A full disk must not end what this only shows.
+            sys.stderr.write(f"eval.video: no film after {env_steps} env steps ({error})\n")

@@ -1,0 +1,66 @@
+"""Which headless OpenGL draws films here; each is tried in a fresh interpreter. No jax here.
+
+MuJoCo chooses it when it is imported, from MUJOCO_GL.
+"""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+from collections.abc import Sequence
+from typing import Final
+
+from gmijax.errors import printable
+from gmijax.runs.folder import EXIT_NO_GL
+
+_GL: Final = "MUJOCO_GL"
+
+
+def opengls(*others: str) -> tuple[str, ...]:
+    """What to try, in order: the user's MUJOCO_GL, then `others`."""
+    return tuple(dict.fromkeys(filter(None, (os.environ.get(_GL), *others))))
+
+
+def environment_with(gl: str) -> dict[str, str]:
+    """This process's environment variables, for a child that is to draw with `gl`."""
+    environment = {**os.environ, _GL: gl}
+    # MuJoCo sets it to what fits MUJOCO_GL, and refuses any other value.
+    environment.pop("PYOPENGL_PLATFORM", None)
+    return environment
+
+
+def first_opengl(tried: Sequence[str]) -> tuple[str | None, str]:
+    """The first of `tried` that draws here, None for none; and what the last one said."""
+    said = ""
+    for gl in tried:
+        done = subprocess.run(
+            [sys.executable, "-m", "gmijax.sim.render"],
+            env=environment_with(gl),
+            stdin=subprocess.DEVNULL,
+            capture_output=True,
+            text=True,
+            errors="replace",
+            check=False,
+        )
+        if done.returncode == 0:
+            return gl, ""
+        said = next(iter(done.stderr.strip().splitlines()), f"exit code {done.returncode}")
+    return None, printable(said)
+
+
+def is_missing(exit_code: int) -> bool:
+    """Whether a child of `gmijax.sim.render` ended for want of its OpenGL."""
+    # A broken driver may end the process with a signal instead of an error. These two come from
+    # somebody else: the user, a batch system, or the machine when it runs out of memory.
+    sent = (-signal.SIGKILL, -signal.SIGTERM)
+    return exit_code == EXIT_NO_GL or (exit_code < 0 and exit_code not in sent)
+
+
+def what_is_missing(tried: Sequence[str]) -> str:
+    """Says that none of them works, and what helps."""
+    return (
+        f"no headless OpenGL (EGL or OSMesa) is to be had, tried {', '.join(tried)}; "
+        "install it with `apt-get install libegl1` or `apt-get install libosmesa6`"
+    )

@@ -1,0 +1,75 @@
+"""Main of the process that films the evaluations of a run: `film_writer.py RUN_DIR`. No jax.
+
+A process of its own, so that nothing of it can end or delay training. It draws one film at a time,
+of what the leader has left in `<run>/videos/`. If drawing is slower than evaluations come, only
+the newest of those that wait is filmed. Its standard input ends when the job does: it films what
+is left if it was told to finish, and else ends at once.
+"""
+
+from __future__ import annotations
+
+import os
+import sys
+import threading
+from pathlib import Path
+from typing import Final
+
+from gmijax.control.films import FINISH
+from gmijax.runs.folder import RunPaths
+from gmijax.sim.render import Stage, film
+from gmijax.sim.trajectory import load_trajectory
+
+_SIZE: Final = (640, 480)
+_POLL_S: Final = 1.0
+_NICE: Final = 10
+"""Training goes first where there are not enough cores for both."""
+
+
+def main(root: Path) -> int:
+    """Returns the exit code: 0, or 1 with one line on standard error."""
+    os.nice(_NICE)
+    is_over = threading.Event()
+    threading.Thread(target=_listen, args=(is_over,), daemon=True).start()
+    try:
+        follow(RunPaths(root), is_over)
+    # Whatever it is, training goes on without it.
+    except Exception as error:
+        sys.stderr.write(f"{type(error).__name__}: {' '.join(str(error).split())}\n")
+        return 1
+    return 0
+
+
+def follow(run: RunPaths, is_over: threading.Event) -> None:
+    """Films trajectories as they come, until it is over and none is left."""
+    for unfinished in run.videos.glob(".[0-9]*.mp4"):
+        unfinished.unlink()
+    stage: Stage | None = None
+    while True:
+        # Asked first: what was left before the end is seen then.
+        is_last = is_over.is_set()
+        *passed_over, newest = (None, *sorted(run.videos.glob("[0-9]*.npz")))
+        for path in filter(None, passed_over):
+            path.unlink()
+        if newest is not None:
+            stage = stage or Stage(run.filmed_model, _SIZE, None)
+            film((newest.with_suffix(".mp4"),), load_trajectory(newest), stage, (1, 1))
+            newest.unlink()
+        elif is_last:
+            break
+        else:
+            is_over.wait(_POLL_S)
+
+
+def _listen(is_over: threading.Event) -> None:
+    """Waits for the end of the job."""
+    said = b""
+    # Not by `sys.stdin`, whose lock Python wants when it ends.
+    while part := os.read(sys.stdin.fileno(), len(FINISH)):
+        said += part
+    if said != FINISH:
+        os._exit(0)  # Also in the middle of a film.
+    is_over.set()
+
+
+if __name__ == "__main__":
+    sys.exit(main(Path(sys.argv[1])))
