@@ -49,10 +49,12 @@ def point_mass_env(episode_length: int = 20) -> Env:
     def step(model, state, action):
         x, v = state.physics
         action = jnp.clip(action, -1.0, 1.0)
-        v = 0.9 * v + 0.2 * action[0] * model
+        v = 0.9 * v + 0.2 * action[0] * model["gain"]
         return outcome(x + 0.3 * v, v, action, state.steps + 1, state.key)
 
-    env = Env(spec, jnp.ones(()), reset, step, None, lambda state: state.physics[0][None])
+    # As models of MuJoCo, it has an array without elements.
+    model = {"gain": jnp.ones(()), "none": jnp.zeros((0, 3))}
+    env = Env(spec, model, reset, step, None, lambda state: state.physics[0][None])
     return time_limit(env, episode_length)
 
 
