@@ -18,6 +18,8 @@ os.environ.setdefault("PJRT_NPROC", "4")
 # it survives `make clean` and serves several checkouts; gmijax hands it on to the GMIs.
 _CACHE_HOME = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
 os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(_CACHE_HOME / "gmijax-tests"))
+# Programs of the tests' own process too, of which most compile in less than jax's least second.
+os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0")
 
 
 # A shell ignores SIGINT in what it starts in the background, nohup SIGHUP; gmijax leaves ignored
@@ -38,6 +40,11 @@ def _has_gpu() -> bool:
         return pynvml.nvmlDeviceGetCount() > 0
     finally:
         pynvml.nvmlShutdown()
+
+
+# LLVM's -O0 compiles in a fifth of the time; most programs of tests run for less than that.
+if not _has_gpu():
+    os.environ.setdefault("JAX_DISABLE_MOST_OPTIMIZATIONS", "1")
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:

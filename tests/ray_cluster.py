@@ -58,7 +58,7 @@ def two_nodes(log: Path) -> Iterator[Cluster]:
         ) as process,
     ):
         yield Cluster(process, log)
-        process.communicate(timeout=60)
+        process.communicate(timeout=120)
 
 
 def events(run: Path, event: str) -> list[dict[str, Any]]:

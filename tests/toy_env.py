@@ -33,14 +33,16 @@ def point_mass_env(episode_length: int = 20) -> Env:
     def step(model, state, action):
         x, v = state.physics
         action = jnp.clip(action, -1.0, 1.0)
-        v = 0.9 * v + 0.2 * action[0] * model
+        v = 0.9 * v + 0.2 * action[0] * model["gain"]
         x = x + 0.3 * v
         terms = {"near": 1.0 - x**2, "effort": -0.01 * jnp.sum(action**2)}
         reward, metrics = (sum(terms.values()), terms), {"distance": jnp.abs(x)}
         gone = jnp.abs(x) > 3.0
         return episode.advance(state, (x, v), (), jnp.stack([x, v]), reward, gone, metrics)
 
-    env = Env(spec, jnp.ones(()), reset, step, None, lambda state: state.physics[0][None])
+    # As models of MuJoCo, it has an array without elements.
+    model = {"gain": jnp.ones(()), "none": jnp.zeros((0, 3))}
+    env = Env(spec, model, reset, step, None, lambda state: state.physics[0][None])
     return time_limit(env, episode_length)
 
 

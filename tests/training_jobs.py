@@ -20,6 +20,7 @@ from gmijax.supervise.heartbeat import Heartbeat, HeartbeatBlock
 TINY = (
     *("env=ball_balance", "num_envs=16", "algo.unroll_length=4", "algo.num_minibatches=2"),
     *("algo.num_updates_per_batch=2", "run.measure_throughput=false", "run.grace_s=3"),
+    *("algo.policy_hidden_layer_sizes=[8]", "algo.value_hidden_layer_sizes=[8]"),
     "run.max_restarts=0",
 )
 STEPS = 16 * 4
@@ -170,9 +171,9 @@ def kill_somebody(
     job = start(*POINT, FOREVER, *overrides, "run.dir=run", cwd=cwd)
     time.sleep(draw.uniform(*within_s))
     kill(draw.choice([job.pid, *filter(None, (gmi_pid(run, gmi) for gmi in range(2)))]))
-    code = job.wait(timeout=30)
+    code = job.wait(timeout=90)
     assert code in (1, -signal.SIGKILL), (cwd / "stderr.txt").read_text()
-    wait_until(lambda: not pids_of(run), 10, f"all GMIs of {cwd.name} gone")
+    wait_until(lambda: not pids_of(run), 60, f"all GMIs of {cwd.name} gone")
 
 
 def shared_memory() -> set[str]:

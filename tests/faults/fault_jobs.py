@@ -19,7 +19,7 @@ from typing import Any, NamedTuple
 import fault_checks
 import numpy as np
 from fault_plan import CHECKPOINT_EVERY, ITERATIONS, KINDS, Fault
-from training_jobs import POINT_TASK, STEPS, TINY, child_environment, learner_arrays, wait_until
+from training_jobs import POINT, POINT_TASK, STEPS, child_environment, learner_arrays, wait_until
 
 from gmijax.runs.history import read_metrics
 from gmijax.runs.resume import newest_checkpoint
@@ -33,10 +33,9 @@ _COMMAND_S = 600.0
 _DISK_MIB = 64
 _HERE = Path(__file__).resolve().parent
 _COMMAND = (
-    *("env=point.py:make", *TINY[1:-1], "plan.gpus=2", "plan.backend=cpu", "reduce.strategy=mpr"),
+    *(*POINT[:-1], "plan.gpus=2", "plan.backend=cpu", "reduce.strategy=mpr"),
     *(f"num_timesteps={ITERATIONS * 2 * STEPS}", f"run.checkpoint_every={CHECKPOINT_EVERY}"),
-    *("run.keep_checkpoints=3", "run.resume=auto", "algo.num_updates_per_batch=1"),
-    *(f"algo.{who}_hidden_layer_sizes=[8]" for who in ("policy", "value")),
+    *("run.keep_checkpoints=3", "run.resume=auto"),
 )
 _SHORT = ("reduce.timeout_s=6", "run.stall_timeout_s=12")
 

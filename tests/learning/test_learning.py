@@ -21,8 +21,9 @@ from gmijax.runs.history import read_metrics
     ids=["ppo", "a3c"],
 )
 def test_ball_balance_learns_in_two_gmis(
-    overrides: tuple[str, ...], reached: float, tmp_path: Path
+    overrides: tuple[str, ...], reached: float, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    monkeypatch.setenv("JAX_DISABLE_MOST_OPTIMIZATIONS", "0")  # It runs for minutes.
     shared = ("env=ball_balance", "num_timesteps=500e3", "run.dir=run")
     done = train(*shared, *overrides, cwd=tmp_path, timeout_s=880)
     assert done.returncode == 0, done.stderr

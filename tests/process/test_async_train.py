@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import json
 import signal
-import time
+import subprocess
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +16,7 @@ from training_jobs import (
     FOREVER,
     POINT,
     POINT_TASK,
+    STEPS,
     gmi_pid,
     iteration_of,
     kill,
@@ -29,16 +31,10 @@ from training_jobs import (
 from gmijax.a3c.report import MAX_COUNTED
 from gmijax.runs.resume import find_checkpoint
 
-N, T = 16, 4
-UPDATE = N * T
+UPDATE = STEPS
 """Environment steps of one batch of one trainer."""
 
-SMALL = (
-    *(POINT[0], "algo=a3c", f"num_envs={N}", f"algo.unroll_length={T}"),
-    *("algo.num_minibatches=2", "algo.num_updates_per_batch=2", "run.grace_s=3"),
-    *("algo.policy_hidden_layer_sizes=[16]", "algo.value_hidden_layer_sizes=[16]"),
-    *("reduce.timeout_s=30", "run.max_restarts=0"),
-)
+SMALL = (*POINT, "algo=a3c", "reduce.timeout_s=30")
 
 
 def _read(path: Path) -> dict[str, Any]:
@@ -93,11 +89,31 @@ def test_what_a_job_leaves_has_the_figures_of_the_paper(two_and_two: Path) -> No
 
 
 @pytest.mark.timeout(300)
-def test_its_checkpoint_plays(two_and_two: Path) -> None:
-    quiet = ("video=none", "html=off")
-    done = train(f"run.dir={two_and_two}", *quiet, cwd=two_and_two.parent, command="play")
-    assert done.returncode == 0, done.stderr
-    assert list(two_and_two.glob("play/*/returns.json"))
+def test_its_checkpoint_plays_the_same_for_a_seed(two_and_two: Path) -> None:
+    wanted = ("num_envs=4", "max_steps=40", "deterministic=false", "seed=1")
+    folder = two_and_two / "play" / find_checkpoint(str(two_and_two), "test").name
+    played = []
+    for _ in range(2):
+        done = train(
+            *(f"run.dir={two_and_two}", *wanted, "video=none", "html=off"),
+            cwd=two_and_two.parent,
+            command="play",
+        )
+        assert done.returncode == 0, done.stderr
+        played.append(_read(folder / "returns.json"))
+    returns = played[0]
+    assert returns["episodes"] == played[1]["episodes"]
+    assert str(folder / "returns.json") in done.stdout
+    assert "effort" in done.stdout
+    assert returns["env_steps"] == int(folder.name)
+    assert len(returns["episodes"]) == returns["num_envs"] == 4
+    mean = sum(item["return"] for item in returns["episodes"]) / 4
+    assert returns["return"]["mean"] == pytest.approx(mean, rel=1e-5)
+    assert f"{mean:.2f}" in done.stdout
+    for item in returns["episodes"]:
+        assert not (item["terminated"] and item["truncated"])
+        assert item["return"] == pytest.approx(sum(item["terms"].values()), rel=1e-4)
+    assert not {"video.mp4", "view.html"} & {path.name for path in folder.iterdir()}
 
 
 @pytest.mark.timeout(300)
@@ -114,32 +130,28 @@ def test_a_job_goes_on_from_its_checkpoint(two_and_two: Path) -> None:
     assert lines[0]["env_steps"] < before < lines[-1]["env_steps"]
 
 
-@pytest.mark.timeout(120)
-def test_trainers_on_several_gpus_reduce_in_rings(tmp_path: Path) -> None:
-    """With a queue that drops what is old: nobody waits for room."""
-    cwd = tmp_path
-    done = train(
-        *SMALL, "plan.serving_gpus=[0,1]", "plan.training_gpus=[0,1]", "run.dir=run",
-        "channel.when_full=drop_oldest", "reduce.strategy=har",
-        f"num_timesteps={20 * 2 * UPDATE}", cwd=cwd,
-    )  # fmt: skip
-    assert done.returncode == 0, done.stderr
-    plan = _read(cwd / "run" / "summary.json")["plan"]
-    assert (plan["layout"], plan["strategy"]) == ([[0, 2], [1, 3]], "har")
+def wait_for_updates(job: subprocess.Popen[bytes], run: Path, gmis: Iterable[int]) -> None:
+    def is_there() -> bool:
+        return job.poll() is not None or all(iteration_of(run, gmi) for gmi in gmis)
+
+    wait_until(is_there, 120, "updates")
+    assert job.poll() is None, (run.parent / "stderr.txt").read_text()
 
 
-@pytest.mark.timeout(120)
+@pytest.mark.timeout(300)
 def test_a_killed_agent_ends_the_job_and_is_named(tmp_path: Path) -> None:
     cwd, shm, victim = tmp_path, shared_memory(), 2
     run = cwd / "run"
-    job = start(*SMALL, FOREVER, "plan.serving_gmis_per_gpu=2", "run.dir=run", cwd=cwd)
-    wait_until(lambda: iteration_of(run, 0) and iteration_of(run, 2), 90, "updates")
+    job = start(
+        *(*SMALL, FOREVER, "plan.serving_gmis_per_gpu=2", "run.dir=run"),
+        "channel.when_full=drop_oldest",
+        cwd=cwd,
+    )
+    wait_for_updates(job, run, (0, 2))
     pid = gmi_pid(run, victim)
     assert pid is not None
-    killed = time.monotonic()
     kill(pid)
-    assert job.wait(timeout=20) == 1
-    assert time.monotonic() - killed < 10
+    assert job.wait(timeout=90) == 1
     assert pids_of(run) == []
     error = (cwd / "stderr.txt").read_text()
     assert f"GMI {victim} failed" in error
@@ -147,18 +159,26 @@ def test_a_killed_agent_ends_the_job_and_is_named(tmp_path: Path) -> None:
     assert shared_memory() <= shm
 
 
-@pytest.mark.timeout(120)
+@pytest.mark.timeout(300)
 def test_an_interrupt_saves_the_whole_job(tmp_path: Path) -> None:
-    """Of one whose experience travels tensor by tensor."""
+    """Of trainers on several GPUs, which reduce in rings; experience travels tensor by tensor."""
     cwd = tmp_path
     run = cwd / "run"
-    job = start(*SMALL, FOREVER, "plan.gpus=2", "channel.design=uni", "run.dir=run", cwd=cwd)
-    wait_until(lambda: iteration_of(run, 0) and iteration_of(run, 1), 90, "updates")
+    job = start(
+        *(*SMALL, FOREVER, "run.dir=run", "plan.serving_gpus=[0,1]", "plan.training_gpus=[0,1]"),
+        *("reduce.strategy=har", "channel.design=uni"),
+        cwd=cwd,
+    )
+    wait_for_updates(job, run, range(4))
     job.send_signal(signal.SIGINT)
-    assert job.wait(timeout=40) == 130
+    assert job.wait(timeout=90) == 130
     assert pids_of(run) == []
-    assert _read(run / "summary.json")["status"] == "interrupted"
-    assert (find_checkpoint(str(run), "test") / "gmi_1").is_dir()
+    summary = _read(run / "summary.json")
+    assert summary["status"] == "interrupted"
+    plan = summary["plan"]
+    assert (plan["layout"], plan["strategy"]) == ([[0, 2], [1, 3]], "har")
+    saved = find_checkpoint(str(run), "test")
+    assert all((saved / name).is_dir() for name in ("learner", "gmi_2", "gmi_3"))
 
 
 @pytest.mark.parametrize(

@@ -11,10 +11,7 @@ from training_jobs import POINT, STEPS, learner_arrays, train
 
 TWO = 2 * STEPS
 """Environment steps of one iteration of two GMIs."""
-JOB = (
-    *(*POINT, "plan.gpus=2", "run.keep_checkpoints=null", "run.checkpoint_every=0"),
-    *("algo.policy_hidden_layer_sizes=[8]", "algo.value_hidden_layer_sizes=[8]"),
-)
+JOB = (*POINT, "plan.gpus=2", "run.keep_checkpoints=null", "run.checkpoint_every=0")
 EVALUATED = ("eval.episodes=5", f"eval.every={2 * TWO}", "run.dir=run", "run.resume=auto")
 
 

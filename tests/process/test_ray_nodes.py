@@ -116,7 +116,7 @@ def test_agents_teach_trainers_of_two_nodes_and_of_one_when_the_other_dies(
         steps = int(Path(events(run, "start")[-1]["checkpoint"]).name)
         wait(lambda: _steps_learnt(run) > steps, "it learns on")
         job.send_signal(signal.SIGTERM)
-        assert job.wait(60) == 130, said.read_text()
+        assert job.wait(120) == 130, said.read_text()
     finally:
         kill(job.pid)
         job.wait()
@@ -167,7 +167,7 @@ def test_a_job_outlives_a_gmi_and_a_node_and_nothing_outlives_its_controller(
         assert json.loads((run / "plan.json").read_text())["layout"] == [[0, 1]]
 
         controller.send_signal(signal.SIGTERM)
-        assert controller.wait(60) == 130, said.read_text()
+        assert controller.wait(120) == 130, said.read_text()
         assert not pids_of(run)
         summary = json.loads((run / "summary.json").read_text())
         assert (summary["status"], len(summary["restarts"])) == ("interrupted", 2)

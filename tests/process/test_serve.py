@@ -61,14 +61,14 @@ def finished(folder: Path) -> int:
 
 def test_what_is_auto_is_found_first(home: Path):
     wanted = ("num_envs=auto", "plan.gmis_per_gpu=auto", "num_timesteps=128", "run.name=auto")
-    grid = ("search.gmis_per_gpu=[1]", "search.num_envs=[8,16]", "search.order=as_printed")
+    grid = ("search.gmis_per_gpu=[1]", "search.num_envs=[16]", "search.order=as_printed")
     few = ("search.iterations=2", "search.alpha=0", "search.store=profiles")
     task = ("env=point.py:make", "policy=random", *TINY[1:])
     done = serve(*task, *wanted, *grid, *few, cwd=home)
     assert done.returncode == 0, done.stderr
     plan = summary_of(home, "auto")["plan"]
     assert plan["layout"] == [[0]]
-    assert plan["num_envs_per_gmi"] in (8, 16)
+    assert plan["num_envs_per_gmi"] == 16
     assert "env steps/s" in done.stdout
     assert len(list((home / "profiles").glob("*.json"))) == 1
 
@@ -121,7 +121,7 @@ def test_after_a_kill_the_same_command_goes_on(home: Path, request: pytest.Fixtu
     request.addfinalizer(process.kill)
     wait_until(lambda: finished(folder) >= 3, 240, "three shards")
     kill(gmi_pid(run, 0) or 0)
-    assert process.wait(timeout=60) == 1
+    assert process.wait(timeout=120) == 1
     said = (home / "stderr.txt").read_text()
     assert "GMI 0 failed: ended by SIGKILL" in said
     assert not pids_of(run)
@@ -154,12 +154,12 @@ def test_after_a_kill_the_same_command_goes_on(home: Path, request: pytest.Fixtu
 
 
 def test_an_interrupted_job_leaves_whole_shards(home: Path, request: pytest.FixtureRequest):
-    job = (*RANDOM, "plan.gmis_per_gpu=3", "plan.template=tdg", "num_timesteps=1e9")
+    job = (*RANDOM, "plan.gmis_per_gpu=2", "plan.template=tdg", "num_timesteps=1e9")
     process = start(*job, "run.name=int", "output.dir=int", cwd=home, command="serve")
     request.addfinalizer(process.kill)
     wait_until(lambda: finished(home / "int") >= 2, 240, "two shards")
     process.send_signal(signal.SIGINT)
-    assert process.wait(timeout=60) == 130
+    assert process.wait(timeout=120) == 130
     assert "the same command makes the rest" in (home / "stderr.txt").read_text()
     folder = home / "int"
     assert len(list(folder.rglob("*.npz"))) == finished(folder) >= 2

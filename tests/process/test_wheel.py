@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import subprocess
 import sys
@@ -117,5 +118,9 @@ def test_it_trains_outside_the_checkout(python: Path, tmp_path: Path):
     steps = f"num_timesteps={2 * STEPS}"
     said = run([python, "-m", "gmijax.train", *TINY, steps, "run.dir=run"], tmp_path)
     assert "completed" in said
-    assert (tmp_path / "run" / "summary.json").is_file()
-    assert any((tmp_path / "run" / "checkpoints").iterdir())
+    summary = json.loads((tmp_path / "run" / "summary.json").read_text())
+    assert (summary["env"], summary["env_steps"]) == ("ball_balance", 2 * STEPS)
+    lines = [json.loads(x) for x in (tmp_path / "run" / "metrics.jsonl").read_text().splitlines()]
+    assert [line["env_steps"] for line in lines] == [STEPS, 2 * STEPS]
+    assert all(line["diverged_steps"] == 0 for line in lines)
+    assert (tmp_path / "run" / "checkpoints" / f"{2 * STEPS:012d}").is_dir()
