@@ -110,7 +110,19 @@ def make_env(
 
 
 @overload
-def make_env(name: str, *, api: Literal["brax"], **options: Any) -> Any: ...
+def make_env(
+    name: str,
+    *,
+    suite: str = ...,
+    impl: str = ...,
+    episode_length: int | None = ...,
+    max_envs: int | None = ...,
+    source_sha256: str | None = ...,
+    rewards: Mapping[str, float] = ...,
+    settings: Mapping[str, float] = ...,
+    curriculum: bool = ...,
+    api: Literal["brax"],
+) -> Any: ...
 
 
 def make_env(
