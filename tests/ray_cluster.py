@@ -41,7 +41,7 @@ def two_nodes(log: Path) -> Iterator[Cluster]:
         said: dict[str, Any] | None = next(lines, None)
         assert said is not None, log.read_text()
         yield Cluster(f"cluster.address={said['address']}", said["second_raylet"])
-        process.communicate(timeout=60)
+        process.communicate(timeout=120)
 
 
 def events(run: Path, event: str) -> list[dict[str, Any]]:
