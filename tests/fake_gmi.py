@@ -111,14 +111,14 @@ def wait_in_vain(link: ChildLink) -> None:
 
 
 def die_late(link: ChildLink) -> None:
-    """Names a helper as its process; that is gone half a second before this one."""
+    """Names a helper as its process; that is gone a moment before this one."""
     helper = os.fork()
     if helper == 0:
         time.sleep(0.2)
         os._exit(0)
     write_json(link.paths.root / "helper.json", {"pid": helper})
     os.waitpid(helper, 0)
-    time.sleep(0.5)
+    time.sleep(0.3)
     os.kill(os.getpid(), signal.SIGSEGV)
 
 

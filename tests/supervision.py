@@ -46,7 +46,7 @@ def make_launch(
     run: RunPaths, modes: Sequence[str], plan: Plan, *, compile_once: bool = True, **limits: float
 ) -> Launch:
     """A job whose GMI i runs `fake_gmi` with `modes[i]`."""
-    limits_s = {"start": 20.0, "stall": 20.0, "stop": 20.0, "grace": 2.0} | limits
+    limits_s = {"start": 90.0, "stall": 90.0, "stop": 90.0, "grace": 2.0} | limits
     return Launch(
         plan=plan,
         machine=machine(0),
