@@ -240,7 +240,7 @@ def test_any_line_is_taken_or_refused_in_one_line(command: str, folder: Path) ->
 
     @seed(_SEED)
     @settings(
-        max_examples=int(_MORE) if _MORE else 75,
+        max_examples=int(_MORE) if _MORE else 40,
         deadline=None,
         database=None,
         suppress_health_check=list(HealthCheck),
