@@ -14,6 +14,7 @@ from pathlib import Path
 
 import pytest
 from supervision import CHECKOUT, TESTS, gpu, machine, make_launch, plan_config, reduce_config
+from training_jobs import wait_until
 
 from gmijax.cli.compose import compose
 from gmijax.config.sweep import SweepConfig
@@ -37,7 +38,7 @@ from gmijax.sweeps.places import Places, Site, places_of
 from gmijax.sweeps.scheduler import Scheduler
 from gmijax.sweeps.study import NoStudy
 
-pytestmark = pytest.mark.timeout(60)
+pytestmark = pytest.mark.timeout(180)
 
 
 class FakeMps:
@@ -151,7 +152,7 @@ def test_an_interrupted_end_leaves_the_daemons_to_the_janitor(
         assert process is not None
         with pytest.raises(KeyboardInterrupt):
             held.close()
-    assert not wait_until_gone([process], 30)
+    assert not wait_until_gone([process], 90)
     assert not directory.exists()
 
 
@@ -170,7 +171,7 @@ def test_gmi_that_is_no_client_is_refused(mps: FakeMps, run: RunPaths):
 
 def test_gmi_that_fails_while_shares_are_verified_is_the_one_to_blame(mps: FakeMps, run: RunPaths):
     here, plan = two_clients(mps)
-    # GMI 1 is no client, fails half a second later, and the daemon is asked for one.
+    # GMI 1 is no client, fails a moment later, and the daemon is asked for one.
     with (
         pytest.raises(GmiFailed, match="GMI 1 failed: ended by SIGSEGV"),
         open_backend(plan, here, run) as backend,
@@ -209,7 +210,7 @@ def test_clients_are_terminated_before_they_are_killed(mps: FakeMps, run: RunPat
 def small_job(run: RunPaths, here: Machine, plan: Plan, told: list[str]) -> Launch:
     """Its GMIs end at once: `this` is the module of the standard library."""
     write_json(run.plan, plan.to_dict())
-    timeouts = Timeouts(start_timeout_s=20, stall_timeout_s=20, stop_timeout_s=20, grace_s=2)
+    timeouts = Timeouts(start_timeout_s=90, stall_timeout_s=90, stop_timeout_s=90, grace_s=2)
     return Launch(
         plan=plan,
         machine=here,
@@ -368,11 +369,8 @@ def test_janitor_cleans_up_after_a_killed_controller(mps: FakeMps, run: RunPaths
         controller.kill()
         controller.wait()
     # The stopped GMI gets 8 s to end by itself before the janitor kills it.
-    assert not wait_until_gone([*clients, daemon], timeout_s=20)
-    deadline_s = time.monotonic() + 10
-    while directory.exists() and time.monotonic() < deadline_s:
-        time.sleep(0.05)
-    assert not directory.exists()
+    assert not wait_until_gone([*clients, daemon], timeout_s=90)
+    wait_until(lambda: not directory.exists(), 60, "its folder is gone")
     assert len(mps.told("quit")) == 1
     # The other one has ended by itself.
     assert [int(client) for _, client in mps.told("terminate_client")] == [clients[0].pid]
