@@ -21,7 +21,7 @@ from tests import role_cases
 from tests.supervision import CHECKOUT
 from tests.training_jobs import heartbeat_of, pids_of
 
-pytestmark = pytest.mark.timeout(60)
+pytestmark = pytest.mark.timeout(180)
 
 SCRIPT = """
 import gmijax
@@ -44,7 +44,7 @@ def run_folders_apart(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def launch(plan: object, role: object, *args: object, **options: object) -> list:
-    return gmijax.launch(plan, role, *args, **{"timeout_s": 10.0, "grace_s": 2.0, **options})
+    return gmijax.launch(plan, role, *args, **{"timeout_s": 60.0, "grace_s": 2.0, **options})
 
 
 def three() -> object:
@@ -138,7 +138,7 @@ def test_an_interrupt_lets_roles_finish(tmp_path: Path) -> None:
 def python(*words: str | Path) -> subprocess.CompletedProcess[str]:
     environment = {**os.environ, "PYTHONPATH": str(CHECKOUT)}
     command = [sys.executable, *map(str, words)]
-    return subprocess.run(command, env=environment, capture_output=True, text=True, timeout=60)
+    return subprocess.run(command, env=environment, capture_output=True, text=True, timeout=150)
 
 
 def test_a_script_sends_and_returns_objects_of_its_own_classes(tmp_path: Path) -> None:

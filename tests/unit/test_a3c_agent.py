@@ -132,10 +132,10 @@ def test_an_agent_without_room_still_adds_to_a_checkpoint(tmp_path) -> None:
         try:
             assert sender.was_asked.wait(timeout=60)
             registers.orders.publish(Orders(5, is_ending=False).pack())
-            wait_until(lambda: added(5), 10, "environments in the checkpoint")
+            wait_until(lambda: added(5), 60, "environments in the checkpoint")
         finally:
             registers.orders.publish(Orders(9, is_ending=True).pack())
-        told = outcome.result(timeout=20)
+        told = outcome.result(timeout=120)
     assert told["unrolls"] == 0
     assert 0 < told["wait_s"] <= sender.waited_s
     assert added(9)
