@@ -98,7 +98,9 @@ def test_the_gmi_that_fails_is_named(ends: str, message: str, seen: str, tmp_pat
     run = tmp_path / "run"
     timeout_s = 1.5 if ends == "sleep" else 30.0
     with pytest.raises(GmiFailed, match=message) as caught:
-        launch(three(), role_cases.Wait(), str(tmp_path), ends, run_dir=str(run), timeout_s=timeout_s)
+        launch(
+            three(), role_cases.Wait(), str(tmp_path), ends, run_dir=str(run), timeout_s=timeout_s
+        )
     notes = "\n".join(caught.value.__notes__)
     assert f"run folder: {run}" in notes
     assert ends != "raise" or 'raise ZeroDivisionError("the sum is off")' in notes
