@@ -42,7 +42,7 @@ def pair() -> Iterator[tuple[RemoteRegisters, RemoteRegisters]]:
 
 
 def wait(read: Callable[[], Any]) -> Any:
-    deadline_s = time.monotonic() + 10.0
+    deadline_s = time.monotonic() + 60.0
     while (found := read()) is None:
         assert time.monotonic() < deadline_s
         time.sleep(1e-3)
@@ -76,7 +76,7 @@ def test_who_reads_seldom_gets_what_is_newest_and_whole(
     for number in range(1, last + 1):
         leader.own(1).publish(np.full(WEIGHTS // 4, number, np.float32), tag=number)
     seen: list[int] = []
-    deadline_s = time.monotonic() + 10.0
+    deadline_s = time.monotonic() + 60.0
     while not seen or seen[-1] < last:
         assert time.monotonic() < deadline_s, seen[-3:]
         if (found := weights.read(after=seen[-1] + 1 if seen else 1)) is not None:
@@ -112,8 +112,9 @@ def test_another_secret_gets_and_gives_nothing() -> None:
 
 
 def test_an_agent_that_is_done_waits_for_the_end_of_the_leader(
-    pair: tuple[RemoteRegisters, RemoteRegisters],
+    pair: tuple[RemoteRegisters, RemoteRegisters], monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    monkeypatch.setattr("gmijax.collectives.channel.remote_registers._FAREWELL_S", 60.0)
     leader, agent = pair
     agent.wait_for_ends()  # Nobody has come yet.
     leader.own(0).publish(np.array([1, 2]))
@@ -121,4 +122,4 @@ def test_an_agent_that_is_done_waits_for_the_end_of_the_leader(
     leader.close()
     started_s = time.monotonic()
     agent.wait_for_ends()
-    assert time.monotonic() - started_s < 4.0
+    assert time.monotonic() - started_s < 30.0
