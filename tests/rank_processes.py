@@ -21,6 +21,8 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
+import pytest
+
 from gmijax.collectives.build import Membership, build_reducer
 from gmijax.collectives.host.shared_block import create_exchange
 from gmijax.collectives.interface import Reducer
@@ -118,12 +120,20 @@ class Ranks:
         """What `ranks` (default: all) came to, once their processes have ended."""
         found = []
         for rank in ranks or range(self.world_size):
-            # Before that it says where it is, see `main`.
-            assert self.processes[rank].ends_within(WAIT_S + 10.0)
+            self._wait_for_end(rank)
             path = self.folder / f"result_{rank}"
             assert path.exists(), (self.folder / f"stderr_{rank}").read_text()
             found.append(json.loads(path.read_text()))
         return found
+
+    def _wait_for_end(self, rank: int) -> None:
+        process = self.processes[rank]
+        if not process.ends_within(WAIT_S):
+            process.send_signal(signal.SIGUSR1)  # It says where it is, see `main`.
+            time.sleep(1.0)
+            has_result = (self.folder / f"result_{rank}").exists()
+            said = (self.folder / f"stderr_{rank}").read_text()
+            pytest.fail(f"rank {rank} does not end, has a result: {has_result}\n{said}")
 
 
 def start_rank(options: Options, exchange: int, stderr: int) -> RankProcess:
@@ -235,7 +245,7 @@ def make_reducer(options: Options) -> Reducer:
 
 def main(options: Options) -> None:
     """One rank: builds its reducer, runs the body, writes the result."""
-    faulthandler.dump_traceback_later(WAIT_S, exit=True)
+    faulthandler.register(signal.SIGUSR1, all_threads=True)
     result: Options = {"error": None}
     failure: GmijaxError | None = None
     try:

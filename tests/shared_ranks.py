@@ -11,13 +11,16 @@ from gmijax.collectives.messages.pipe_block import PipeBlock, create_pipes
 
 
 def host_ranks(
-    *num_floats: int, timeout_s: float = 20.0, start_s: float | None = None
+    *num_floats: int, timeout_s: float = 20.0, start_s: float | None = None, first_rank: int = 0
 ) -> list[HostExchange]:
     """A rank for each of `num_floats`, the length of its largest buffer."""
-    fd, times = create_exchange(), (timeout_s, start_s or timeout_s)
+    fd = create_exchange()
     ranks = [
         HostExchange(
-            *(fd, rank, len(num_floats), size), timeout_s=times[0], rendezvous_timeout_s=times[1]
+            *(fd, rank, len(num_floats), size),
+            timeout_s=timeout_s,
+            rendezvous_timeout_s=start_s or timeout_s,
+            first_rank=first_rank,
         )
         for rank, size in enumerate(num_floats)
     ]

@@ -31,14 +31,7 @@ _serial = itertools.count()
 
 
 class Exchange:
-    """One rank's exchanges in programs, by a strategy's stages.
-
-    Args:
-      links: of this rank.
-      stages: of the strategy.
-      rank: of this process.
-      world_size: K.
-    """
+    """One rank's exchanges in programs, by a strategy's stages."""
 
     def __init__(
         self, links: HostLinks, stages: Sequence[Stage], rank: int, world_size: int
@@ -107,9 +100,7 @@ class Exchange:
 class ProgramPeers:
     """The ranks of an exchange as a program sees them: `Peers`.
 
-    Args:
-      exchange: this rank's.
-      rank: [] int32, an argument of the program, so that all ranks have the same one.
+    `rank` [] int32 is an argument of the program, so that all ranks have the same one.
     """
 
     def __init__(self, exchange: Exchange, rank: jax.Array) -> None:
@@ -162,12 +153,7 @@ class ProgramStep:
     """A step as one program of each rank: `TracedStep`.
 
     A call returns when the device has been given all of it, and the call before is computed.
-
-    Args:
-      exchange: this rank's; None in a job with one rank.
-      links: of the exchange.
-      step: see `Step`.
-      donates_own: see `Reducer.program`.
+    In a job with one rank there are no `exchange` and no `links`.
     """
 
     def __init__(

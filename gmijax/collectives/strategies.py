@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from typing import Literal, NamedTuple, TypeAlias
 
+from gmijax.errors import ConfigError
 from gmijax.partition.layout import Layout
 from gmijax.partition.reduction import is_even, leaders
 
@@ -20,11 +21,6 @@ between nodes."""
 
 Groups: TypeAlias = tuple[tuple[int, ...], ...]
 """Ranks that exchange with each other; no rank is in two of them, some may be in none."""
-
-
-def group_of(rank: int, groups: Groups) -> Sequence[int]:
-    """The group that `rank` is in; empty if it is in none."""
-    return next((group for group in groups if rank in group), ())
 
 
 class Stage(NamedTuple):
@@ -164,7 +160,12 @@ def predicted_s(
       b1: bytes a second between GMIs through host memory.
       b2: bytes a second of a ring between GPUs.
       b3: bytes a second between nodes; needed where there are several.
+
+    Raises:
+      ConfigError: a bandwidth that is not positive.
     """
+    if min(known := [b for b in (b1, b2, b3) if b is not None]) <= 0:
+        raise ConfigError(f"bandwidths {known}: must be positive")
     m_p, node = num_floats * BYTES_PER_FLOAT, layout.of_node(0)
     most = max(len(gmis) for gmis in node.gmis_of_gpu)
     inside_s = COSTS[strategy](node.num_gpus, most, m_p, b1, b2)

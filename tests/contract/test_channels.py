@@ -92,23 +92,6 @@ def test_an_agent_that_finds_no_room_waits_as_told(transport: Any, tmp_path: Pat
         assert result["ended_s"] - started_s < 10.0
 
 
-def test_an_agent_that_need_not_wait_counts_what_it_drops(tmp_path: Path) -> None:
-    topology = ChannelTopology(agents=(0, 1), trainers=(2,), gpu_of=(0, 0, 0))
-    count, envs = 40_000, 100
-    task = {"count": count, "envs": envs, "batch": envs, "sizes": (50, 2)}
-    settings = config(when_full="drop_oldest", max_waiting=2)
-    with ChannelJob(tmp_path, settings, topology, **task) as job:
-        job.start(2, busy_s=0.02).wait_for("open")
-        job.start(0, 1)
-        assert [job.result(rank)["error"] for rank in job.ranks] == [None] * 3
-        for agent in topology.agents:
-            dropped, got = job.result(agent)["dropped"], job.numbers(2, agent)
-            assert 0 < dropped < count // envs
-            assert got.size + dropped * envs == count
-            assert (np.diff(got) > 0).all()
-            assert got[-1] == count - 1  # The oldest go, not the newest.
-
-
 @pytest.mark.parametrize(
     ("transport", "victim"), [("memory", 0), ("zmq", 0), ("zmq", 4), ("device", 0)]
 )

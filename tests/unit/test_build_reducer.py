@@ -1,4 +1,4 @@
-"""The reducer of a job with one trainer."""
+"""Strategies by name."""
 
 from __future__ import annotations
 
@@ -6,10 +6,29 @@ from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
+import pytest
 
 from gmijax.collectives.build import SoloReducer
 from gmijax.collectives.interface import Peers
+from gmijax.collectives.strategies import COSTS
+from gmijax.partition.layout import Layout
+from gmijax.partition.reduction import why_not_strategy
 from gmijax.types import Array
+
+
+@pytest.mark.parametrize(
+    ("layout", "usable"),
+    [
+        (Layout.even(1, 1), {"none", "mpr", "har", "one_shot"}),
+        (Layout.even(1, 2), {"mpr", "har", "one_shot"}),
+        (Layout.even(2, 1), {"mpr", "mrr", "har", "flat", "one_shot"}),
+        (Layout.even(2, 2), {"mpr", "mrr", "har", "one_shot"}),
+        (Layout.even(2, 3), {"mpr", "har", "one_shot"}),
+        (Layout(((0, 1), (2,))), {"mpr", "har", "one_shot"}),
+    ],
+)
+def test_which_strategies_a_layout_allows(layout: Layout, usable: set[str]) -> None:
+    assert {name for name in ("none", *COSTS) if not why_not_strategy(name, layout)} == usable
 
 
 def test_one_gmi_keeps_its_own_numbers() -> None:

@@ -173,8 +173,6 @@ def test_an_agent_does_not_wait_for_a_trainer_that_is_not_there(
 def test_an_address_that_cannot_be_is_named() -> None:
     with pytest.raises(CollectiveError, match=r"no connection with rank 0 at 127.0.0.1 "):
         RemoteReader("127.0.0.1", 1, 0, CAPACITY)
-    with pytest.raises(CollectiveError, match=r"no connection with rank 1 at 127.0.0.1 "):
-        RemoteWriter("127.0.0.1", 0, 1, CAPACITY)
 
 
 def test_what_is_no_message_of_a_channel_is_an_error(address: str) -> None:

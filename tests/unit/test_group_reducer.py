@@ -68,27 +68,11 @@ def test_the_mean_of_three_has_the_same_bits_on_every_way(pool: ThreadPoolExecut
             assert found.tobytes() == expected[: found.size].tobytes(), name
 
 
-def test_ranks_that_ask_for_different_operations_are_told_both(pool: ThreadPoolExecutor) -> None:
-    members = groups()
-    operations = ("mean", "sum", "mean")
-
-    def reduce(rank: int) -> str:
-        with pytest.raises(CollectiveError) as caught:
-            members[rank].reduce(range(RANKS), np.ones(4, np.float32), operations[rank])
-        return str(caught.value)
-
-    told = on_all(pool, reduce)
-    assert told[0] == (
-        "rank 0 asks for the mean of 4 numbers of float32, "
-        "rank 1 for the sum of 4 numbers of float32"
-    )
-    assert "rank 1 asks for the sum" in told[1]
-    assert "rank 2 asks for the mean" in told[2]
-
-
 @pytest.mark.parametrize("first", [0, 1])
-def test_so_are_those_of_which_some_go_by_a_reducer(first: int, pool: ThreadPoolExecutor) -> None:
-    """Whoever comes first; the others find it in the reducer's wait or in their messages."""
+def test_ranks_that_ask_for_different_things_are_told_both(
+    first: int, pool: ThreadPoolExecutor
+) -> None:
+    """By messages and by a reducer, whoever comes first."""
     exchanges = host_ranks(*[LARGE] * RANKS, timeout_s=1.0)
     members = groups(lambda rank, _: exchanges[rank], timeout_s=10.0)
     operations = ("mean", "sum", "mean")

@@ -72,21 +72,6 @@ def test_algorithm_1_is_the_listing_and_its_answer_can_run(layout: Layout) -> No
 
 
 @pytest.mark.parametrize(
-    ("layout", "usable"),
-    [
-        (Layout.even(1, 1), {"none", "mpr", "har", "one_shot"}),
-        (Layout.even(1, 2), {"mpr", "har", "one_shot"}),
-        (Layout.even(2, 1), {"mpr", "mrr", "har", "flat", "one_shot"}),
-        (Layout.even(2, 2), {"mpr", "mrr", "har", "one_shot"}),
-        (Layout.even(2, 3), {"mpr", "har", "one_shot"}),
-        (Layout(((0, 1), (2,))), {"mpr", "har", "one_shot"}),
-    ],
-)
-def test_which_strategies_a_layout_allows(layout: Layout, usable: set[str]) -> None:
-    assert {name for name in ("none", *COSTS) if not why_not_strategy(name, layout)} == usable
-
-
-@pytest.mark.parametrize(
     ("strategy", "gmis_of_gpu", "message"),
     [
         ("mrr", ((0, 1), (2,)), r"mrr: cannot run on layout \[\[0,1\],\[2\]\]: .* \[2, 1\] GMIs"),
@@ -201,6 +186,8 @@ def test_costs_are_those_of_table_2() -> None:
 def test_predictions_take_floats_and_the_fullest_gpu() -> None:
     layout = Layout(((0, 1), (2,)))
     assert predicted_s("mpr", layout, 100, 1e3, 1e3) == pytest.approx(2 * 3 * 400 / (4 * 1e3))
+    with pytest.raises(ConfigError, match=r"bandwidths \[1.0, 1.0, 0.0\]: must be positive"):
+        predicted_s("mpr", layout, 100, 1.0, 1.0, 0.0)
 
 
 def test_one_shot_cannot_go_through_host_memory() -> None:

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from training_jobs import wait_until
 
 from gmijax.collectives.nodes.meeting import reserved_address
 from gmijax.errors import CollectiveError
@@ -42,11 +43,7 @@ def pair() -> Iterator[tuple[RemoteRegisters, RemoteRegisters]]:
 
 
 def wait(read: Callable[[], Any]) -> Any:
-    deadline_s = time.monotonic() + 60.0
-    while (found := read()) is None:
-        assert time.monotonic() < deadline_s
-        time.sleep(1e-3)
-    return found
+    return wait_until(read, 60.0, "a newer value")
 
 
 def test_a_reader_gets_the_newest_of_every_register_also_of_what_came_before_it_was_there(
@@ -75,13 +72,11 @@ def test_who_reads_seldom_gets_what_is_newest_and_whole(
     last = 2000
     for number in range(1, last + 1):
         leader.own(1).publish(np.full(WEIGHTS // 4, number, np.float32), tag=number)
-    seen: list[int] = []
-    deadline_s = time.monotonic() + 60.0
-    while not seen or seen[-1] < last:
-        assert time.monotonic() < deadline_s, seen[-3:]
-        if (found := weights.read(after=seen[-1] + 1 if seen else 1)) is not None:
-            assert (found.values.view(np.float32) == found.tag).all()
-            seen.append(found.tag)
+    seen = [0]
+    while seen[-1] < last:
+        found = wait(lambda: weights.read(after=seen[-1] + 1))
+        assert (found.values.view(np.float32) == found.tag).all()
+        seen.append(found.tag)
     assert seen == sorted(set(seen))
     assert len(seen) < last  # Most were never here.
 

@@ -23,13 +23,6 @@ SIZE = 5
 Pair: TypeAlias = tuple[list[HostExchange], list[SharedSlots], list[str]]
 
 
-@pytest.fixture
-def host() -> Iterator[HostExchange]:
-    (exchange,) = host_ranks(SIZE)
-    yield exchange
-    exchange.close()
-
-
 class Counted(FakeDeviceMemory):
     """Counts those that are open; the second one cannot be had."""
 
@@ -46,7 +39,8 @@ class Counted(FakeDeviceMemory):
         Counted.num_open -= 1
 
 
-def test_what_was_made_before_a_failure_is_closed(host: HostExchange) -> None:
+def test_what_was_made_before_a_failure_is_closed() -> None:
+    (host,) = host_ranks(SIZE)
     said = "wish: rank 0: no more memory"
     with pytest.raises(DeviceMemoryUnavailable, match=said):
         SharedSlots(host, SIZE, [0], [0, 0], Counted, "wish")

@@ -23,7 +23,7 @@ from gmijax.collectives.device.shared_slots import SharedSlots, agreed
 from gmijax.collectives.host.host_exchange import HostExchange
 from gmijax.collectives.host.host_links import HostLinks
 from gmijax.collectives.program import Exchange, ProgramPeers
-from gmijax.collectives.strategies import Groups, Stage, group_of
+from gmijax.collectives.strategies import Groups, Stage
 from gmijax.collectives.waits import Fence
 from gmijax.partition.layout import Layout
 from gmijax.partition.reduction import leaders
@@ -46,10 +46,7 @@ class Order:
     a step finds all others there: so one of two ranks sees it before the next step, whoever is
     ahead.
 
-    Args:
-      flags: [pages, line] uint32, see `SharedBlock`; the second 64 bits of each line are used.
-      rank: this one.
-      world_size: K.
+    It uses the second 64 bits of each line of `flags`, see `SharedBlock`.
     """
 
     def __init__(self, flags: npt.NDArray[np.uint32], rank: int, world_size: int) -> None:
@@ -137,7 +134,8 @@ class DeviceLinks(HostLinks):
         self, layout: Layout, stages: Sequence[Stage], new_memory: NewMemory
     ) -> SharedSlots:
         rank = self._control.rank
-        group = group_of(rank, next(part.groups for part in stages if part.link == "slots"))
+        groups = next(stage.groups for stage in stages if stage.link == "slots")
+        group = next(group for group in groups if rank in group)
         owners = group[:1]
         if len(group) == layout.num_gmis:
             # On every GPU: the own first, then the following ones, so that not all write to one.
@@ -209,9 +207,10 @@ class DeviceLinks(HostLinks):
         yield self._queue
         self._queue.stop_clock(stream)
 
-    def _open(self) -> None:
+    def _open(self) -> bytes:
         self._queue = self._device.new_queue(self._control.flags)
         self._order = Order(self._control.flags, self._control.rank, self._control.world_size)
+        return b""
 
     def _try(self, exchange: Exchange) -> Exception | None:
         """First exchanges of known numbers; what went wrong with them."""
@@ -234,6 +233,7 @@ class DeviceLinks(HostLinks):
         return None
 
 
-def _raise(failure: Exception | None) -> None:
+def _raise(failure: Exception | None) -> bytes:
     if failure is not None:
         raise failure
+    return b""

@@ -13,12 +13,7 @@ T = TypeVar("T")
 
 
 class LockstepRunner:
-    """One rank's part in steps of all ranks.
-
-    Args:
-      host: this rank's use of the shared block.
-      num_floats: P, which all ranks must agree on.
-    """
+    """One rank's part in steps of all ranks, which must agree on `num_floats`."""
 
     def __init__(self, host: HostExchange, num_floats: int) -> None:
         self._barrier = host.barrier

@@ -7,7 +7,7 @@ from typing import Any
 
 from gmijax.collectives.device.shared_slots import agreed
 from gmijax.collectives.host.host_exchange import HostExchange
-from gmijax.collectives.strategies import Groups, group_of
+from gmijax.collectives.strategies import Groups
 
 _WISH = "rings between GPUs"
 
@@ -15,9 +15,7 @@ _WISH = "rings between GPUs"
 class NcclRing:
     """This rank's collectives with others, each on another GPU; adds work to a stream.
 
-    Args:
-      nccl: the module `nccl.bindings.nccl`.
-      comm: from it.
+    `nccl` is the module `nccl.bindings.nccl`, and `comm` a communicator of it.
     """
 
     def __init__(self, nccl: Any, comm: Any) -> None:
@@ -52,17 +50,20 @@ def nccl_ring(host: HostExchange, groups: Groups) -> NcclRing | None:
       DeviceMemoryUnavailable: NCCL is not to be had, or refuses; on all ranks alike.
     """
     found: list[NcclRing] = []
-    group = group_of(host.rank, groups)
+    group = next((group for group in groups if host.rank in group), ())
 
-    def make_id() -> bytes | None:
-        return bytes(_nccl().get_unique_id()) if group and group[0] == host.rank else None
+    def make_id() -> bytes:
+        if not group or group[0] != host.rank:
+            return b""
+        return bytes(_nccl().get_unique_id())
 
-    def join() -> None:
+    def join() -> bytes:
         if group:
             nccl = _nccl()
             unique = nccl.UniqueId.from_buffer(ids[group[0]][:_ID_BYTES].tobytes())
             place = group.index(host.rank)
             found.append(NcclRing(nccl, nccl.comm_init_rank(len(group), unique, place)))
+        return b""
 
     ids = agreed(host, _WISH, make_id)
     agreed(host, _WISH, join)

@@ -12,7 +12,6 @@ import numpy.typing as npt
 
 from gmijax.collectives.device.device_memory import TICKET_BYTES, NewMemory
 from gmijax.collectives.host.host_exchange import HostExchange
-from gmijax.collectives.shared_memory import round_up
 from gmijax.collectives.waits import fence, wait_until
 from gmijax.errors import DeviceMemoryUnavailable, PeerLost
 
@@ -26,8 +25,8 @@ NOTE_BYTES = 240
 CLOSE_S = 10.0
 """How long an owner waits for others that still use its memory; longer than a last step takes."""
 
-SLOT_ALIGNMENT = 256
-"""Slots begin at multiples of so many bytes, as allocations of jax do."""
+FLOATS_PER_ROW_UNIT = 64
+"""Slots begin at multiples of 256 bytes, as allocations of jax do."""
 
 
 class SharedSlots:
@@ -61,7 +60,7 @@ class SharedSlots:
         new_memory: NewMemory,
         wish: str,
     ) -> None:
-        self._row_bytes = round_up(4 * num_floats, SLOT_ALIGNMENT)
+        self._row_bytes = -(-num_floats // FLOATS_PER_ROW_UNIT) * FLOATS_PER_ROW_UNIT * 4
         self._members, self._rank = tuple(members), host.rank
         self._owners, self._is_owner = tuple(owners), host.rank == owners[0]
         self._memories: list[CudaMemory] = []
@@ -82,22 +81,14 @@ class SharedSlots:
         source: int,
         target: int,
         num_floats: int,
-        rows: int = 0,
+        rows: int,
     ) -> None:
-        """Queues a write, and a copy of what all members wrote.
+        """Queues a write of [n] float32, and a copy of what all members wrote.
 
-        Args:
-          queue: of these slots.
-          stream: of the device, where it is queued.
-          source: address of [n] float32.
-          target: address of [rows, n] float32.
-          num_floats: n.
-          rows: of the target, which are zero beyond those of the members; at least as many.
+        Rows of `target` [rows, n], at least as many as members, are zero beyond theirs.
         """
         num_bytes = 4 * num_floats
         self._write(queue, stream, source, num_bytes)
-        for member in self._members:
-            self._wait(queue, stream, member)
         count = len(self._members)
         queue.copy_rows(stream, target, self._slot(0), self._row_bytes, num_bytes, count)
         if rows > count:
@@ -109,9 +100,6 @@ class SharedSlots:
         """Queues a copy of what the first member has; as `gather`, but `target` has [n]."""
         num_bytes = 4 * num_floats
         self._write(queue, stream, source, num_bytes)
-        # All of them: whoever writes this slot again must know that all have read the other one.
-        for member in self._members:
-            self._wait(queue, stream, member)
         queue.copy(stream, target, self._slot(0), num_bytes)
 
     def close(self) -> None:
@@ -131,15 +119,19 @@ class SharedSlots:
         self._memories = []
 
     def _write(self, queue: CudaQueue, stream: int, source: int, num_bytes: int) -> None:
+        """Queues a write of this rank's slots, and a wait for all other members' writes.
+
+        For all of them: whoever writes a slot again must know that all have read the other one.
+        """
         self._num_writes += 1
+        count = self._num_writes & 0xFFFFFFFF
         own = self._slot(self._members.index(self._rank)) - self._memories[0].address
         for memory in self._memories:
             queue.copy(stream, memory.address + own, source, num_bytes)
-        queue.raise_flag(stream, self._rank, self._num_writes & 0xFFFFFFFF)
-
-    def _wait(self, queue: CudaQueue, stream: int, member: int) -> None:
-        if member != self._rank:
-            queue.wait_for_flag(stream, member, self._num_writes & 0xFFFFFFFF)
+        queue.raise_flag(stream, self._rank, count)
+        for member in self._members:
+            if member != self._rank:
+                queue.wait_for_flag(stream, member, count)
 
     def _slot(self, place: int) -> int:
         """Address of the slot in use of the member at `place`, on the own GPU."""
@@ -163,15 +155,14 @@ class SharedSlots:
         size = 2 * len(self._members) * self._row_bytes
         return self._memories[0].create(size) if self._is_owner else b""
 
-    def _map(self, tickets: npt.NDArray[np.uint8]) -> None:
+    def _map(self, tickets: npt.NDArray[np.uint8]) -> bytes:
         for owner, memory in zip(self._owners, self._memories, strict=True):
             if not (self._is_owner and owner == self._owners[0]):
                 memory.open(tickets[owner][:TICKET_BYTES].tobytes())
+        return b""
 
 
-def agreed(
-    host: HostExchange, wish: str, step: Callable[[], bytes | None]
-) -> npt.NDArray[np.uint8]:
+def agreed(host: HostExchange, wish: str, step: Callable[[], bytes]) -> npt.NDArray[np.uint8]:
     """Does a step of the start; returns what it returned on every rank [K, NOTE_BYTES].
 
     All ranks of the job call this, and they go on together or not at all.
@@ -180,7 +171,7 @@ def agreed(
       DeviceMemoryUnavailable: it failed on one of them, and why it did there.
     """
     try:
-        note, has_failed = step() or b"", False
+        note, has_failed = step(), False
     # Whatever it is, of CUDA, of jax or of an import: there is another way, through the host.
     except Exception as error:
         said = " ".join(str(error).split())

@@ -29,13 +29,7 @@ SETTLE_S = 2.0
 
 
 class Barrier:
-    """One rank's side of the waiting.
-
-    Args:
-      block: the shared block.
-      timeout_s: longest wait for the other ranks.
-      rendezvous_timeout_s: the same in the first call, when others may still start or compile.
-    """
+    """One rank's side of the waiting; for the times see `HostExchange`."""
 
     def __init__(self, block: SharedBlock, timeout_s: float, rendezvous_timeout_s: float) -> None:
         self.step = 0
@@ -55,12 +49,9 @@ class Barrier:
         self._first_step = self.step + 1
 
     def begin(self, operation: str, count: int, place: int = 0) -> None:
-        """Opens a call of `operation` with `count` floats; `end` closes it.
+        """Opens a call of `operation` (see `OPERATIONS`) with `count` floats; `end` closes it.
 
-        Args:
-          operation: one of `OPERATIONS`.
-          count: of floats.
-          place: which exchange of its program this is.
+        `place` says which exchange of its program it is.
 
         Raises:
           CollectiveError: an earlier call failed, or (first call only) ranks attached with
@@ -129,12 +120,13 @@ class Barrier:
         # A peer may be one step ahead, not two: for the second it needs this rank in the first.
         # Two words by parity therefore suffice.
         words = self._block.lines["call"][:, self.step % 2]
-        own = words[self._block.rank]
+        own, first = words[self._block.rank], self._block.first_rank
         for peer in self._peers:
             if words[peer] != own:
                 raise CollectiveError(
-                    f"step {self.step}: rank {self._block.rank} calls {_describe(int(own))}, "
-                    f"rank {peer} calls {_describe(int(words[peer]))}"
+                    f"step {self.step}: rank {first + self._block.rank} calls "
+                    f"{_describe(int(own))}, rank {first + peer} calls "
+                    f"{_describe(int(words[peer]))}"
                 )
 
     def end(self) -> None:
@@ -160,12 +152,13 @@ class Barrier:
 
     def _wait_for_all(self) -> None:
         self._wait()  # counters of 1: all have attached
-        num_floats, rank = self._block.lines["num_floats"], self._block.rank
+        sizes, rank = self._block.lines["num_floats"], self._block.rank
         for peer in self._peers:
-            if num_floats[peer] != num_floats[rank]:
+            if sizes[peer] != sizes[rank]:
+                own, other = (f"rank {self._block.first_rank + one}" for one in (rank, peer))
                 raise CollectiveError(
-                    f"rank {rank} and rank {peer} do not fit together: num_floats is "
-                    f"{num_floats[rank]} for rank {rank}, and {num_floats[peer]} for rank {peer}"
+                    f"{own} and {other} do not fit together: num_floats is {sizes[rank]} for "
+                    f"{own}, and {sizes[peer]} for {other}"
                 )
 
     def _wait(self, *, is_patient: bool = False) -> None:

@@ -21,14 +21,7 @@ SILENCE_S = 0.7
 
 
 class FailureDetector:
-    """One wait of one rank, from its start.
-
-    Args:
-      block: the shared block.
-      operation: what the rank is calling.
-      step: number of the call.
-      timeout_s: longest wait.
-    """
+    """One wait of one rank, from its start, in `operation`, which is call number `step`."""
 
     def __init__(self, block: SharedBlock, operation: str, step: int, timeout_s: float) -> None:
         self._block = block

@@ -16,7 +16,7 @@ from gmijax.collectives.host.shared_block import (
 )
 from gmijax.collectives.interface import FloatBuffer
 from gmijax.collectives.shared_memory import process_of
-from gmijax.collectives.strategies import Groups, group_of
+from gmijax.collectives.strategies import Groups
 from gmijax.errors import CollectiveError
 
 PIECE_FLOATS = 32768
@@ -41,9 +41,6 @@ class HostExchange:
       rendezvous_timeout_s: the same in the first call, when others may still start or compile.
       lane: of the block; those who use one thread of calls each take a lane each.
       first_rank: see `SharedBlock`.
-
-    Attributes:
-      rank, world_size: the same.
 
     Raises:
       CollectiveError: no memory, not such a descriptor, or the rank is taken; and, from every
@@ -75,13 +72,8 @@ class HostExchange:
         """Writes the sum over the rank's group of `source` [n] into `target` [n], n <= P.
 
         Every member sums a part of it in the order of the group, so each number is computed once.
-        For a rank in no group the target gets the source.
-
-        Args:
-          source: of this rank; may be the target.
-          target: for the sum.
-          groups: who reduces with whom.
-          place: which exchange of its program this is, see `Barrier.begin`.
+        For a rank in no group the target gets the source, which may be the target. For `place`
+        see `Barrier.begin`.
         """
         slots, group = self._shared("sum", source, groups, place)
         if group:
@@ -162,17 +154,11 @@ class HostExchange:
     ) -> tuple[FloatBuffer, Sequence[int]]:
         """Opens a call; what all ranks have as `source` [K, n], and the members of the group."""
         block = self._open_block(operation)
-        room = block.slots.shape[2]
-        if source.dtype != np.float32 or source.ndim != 1 or source.size > room:
-            raise CollectiveError(
-                f"{operation} of {source.dtype} {list(source.shape)}: expected a vector of at "
-                f"most {room} float32"
-            )
         self.barrier.begin(operation, source.size, place)
         slots = block.slots[self.barrier.step % 2, :, : source.size]
         slots[self.rank] = source
         self._meet()
-        return slots, group_of(self.rank, groups)
+        return slots, _group_of(self.rank, groups)
 
     def _meet(self) -> None:
         self.barrier.wait()
@@ -204,3 +190,7 @@ def _add(slots: FloatBuffer, members: Sequence[int], part: slice) -> None:
             total = slots[members[0], start:end]
             for member in members[1:]:
                 total += slots[member, start:end]
+
+
+def _group_of(rank: int, groups: Groups) -> Sequence[int]:
+    return next((group for group in groups if rank in group), ())

@@ -30,10 +30,7 @@ class HostLinks:
 
     Args:
       host: this rank's use of the shared block, and of the connections between nodes.
-      num_floats: P, length of the largest buffer.
-
-    Attributes:
-      room: the same.
+      num_floats: P, length of the largest buffer; the attribute `room`.
     """
 
     def __init__(self, host: HostExchange | NodeExchange, num_floats: int) -> None:

@@ -84,14 +84,8 @@ def attach(fd: int, rank: int, world_size: int, num_floats: int, lane: int = 0) 
     """Maps the block and makes this process known as `rank`.
 
     The block gets its size here, from whoever comes first; the caller keeps `fd` and may close
-    it at once. Ranks that attach with other numbers are found out in their first call.
-
-    Args:
-      fd: descriptor from `create_exchange`.
-      rank: 0 to `world_size - 1`.
-      world_size: K, number of ranks.
-      num_floats: P, length of the buffers whose mean is taken.
-      lane: below `LANES`.
+    it at once. Ranks that attach with other numbers are found out in their first call. For the
+    arguments see `HostExchange`.
 
     Raises:
       CollectiveError: no memory, not such a descriptor, or the rank is taken.

@@ -3,8 +3,8 @@
 Each rank adds up one part of the numbers, in order of rank, and sends the result to all: the
 result is bit-identical. Small data go to everybody at once, which saves one of the two journeys.
 
-This takes any data and any group. For the mean of many float32 over all ranks the strategies of
-`gmijax.collectives.build` are faster; they take one length, that of the first such call.
+This takes any data and any group. The mean of many float32 over all ranks goes through the shared
+block of the host, which is faster; it takes one length, that of the first such call.
 """
 
 from __future__ import annotations

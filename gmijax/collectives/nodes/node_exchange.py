@@ -14,7 +14,7 @@ from gmijax.partition.layout import Layout
 class NodeExchange:
     """`HostExchange` of a job on several nodes, with a sum between nodes.
 
-    Groups are of ranks of the whole job; those of a sum or a broadcast lie in one node.
+    Groups are of ranks of the whole job; those of a sum, a gather or a broadcast lie in one node.
 
     Args:
       local: this rank's use of the block of its node.
@@ -39,6 +39,12 @@ class NodeExchange:
     ) -> None:
         """See `HostExchange`."""
         self._local.broadcast(source, target, self._of_node(groups), place)
+
+    def gather(
+        self, source: FloatBuffer, target: FloatBuffer, groups: Groups, place: int = 0
+    ) -> None:
+        """See `HostExchange`."""
+        self._local.gather(source, target, self._of_node(groups), place)
 
     def sum_between_nodes(self, source: FloatBuffer, target: FloatBuffer, place: int) -> None:
         """Writes the sum over leaders of `source` [n] into `target` [n]; for others `source`."""
