@@ -1,7 +1,8 @@
 """Runs small bodies of code in several real processes that share one reducer.
 
-`Ranks` starts this file as a script, once a rank. A child builds its reducer, runs the body
-named in its options and writes what the body returns, or how it failed, to a JSON file.
+This file is a script too: a server that has loaded jax, which is most of what a rank costs, and
+forks for every rank that `Ranks` starts. A rank builds its reducer, runs the body named in its
+options and writes what the body returns, or how it failed, to a JSON file.
 """
 
 from __future__ import annotations
@@ -9,11 +10,14 @@ from __future__ import annotations
 import faulthandler
 import json
 import os
+import select
 import signal
+import socket
 import subprocess
 import sys
 import time
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -39,11 +43,31 @@ WAIT_S = 90.0
 REPOSITORY = Path(__file__).resolve().parents[1]
 
 
+class RankProcess:
+    """A process that a server has forked."""
+
+    def __init__(self, pid: int, pidfd: int) -> None:
+        self.pid = pid
+        self._pidfd = pidfd
+
+    def send_signal(self, number: signal.Signals) -> None:
+        with suppress(ProcessLookupError):  # It has ended.
+            signal.pidfd_send_signal(self._pidfd, number)
+
+    def ends_within(self, limit_s: float) -> bool:
+        return bool(select.select([self._pidfd], [], [], limit_s)[0])
+
+    def close(self) -> None:
+        self.send_signal(signal.SIGKILL)
+        assert self.ends_within(WAIT_S)
+        os.close(self._pidfd)
+
+
 class Ranks:
     """Processes of one job: a context manager that leaves none behind.
 
-    `results()` waits for all that were not killed; each result has `error` (class name or
-    None), `failed_at_s` (monotonic clock, the same for all processes) and the body's own keys.
+    `results()` waits for all that were not killed; each result has `error` (class name or None)
+    and the body's own keys.
     All ranks are on one GPU unless `layout` says something else, and on `num_nodes` machines, all
     of which are this one.
     """
@@ -51,7 +75,7 @@ class Ranks:
     def __init__(self, folder: Path, world_size: int, body: str, **options: Any) -> None:
         self.folder, self.world_size = folder, world_size
         self._held = ExitStack()
-        self.processes: dict[int, subprocess.Popen[bytes]] = {}
+        self.processes: dict[int, RankProcess] = {}
         defaults = {"strategy": "mpr", "num_floats": 100, "timeout_s": 20.0, "start_s": 60.0}
         layout = [list(range(world_size))]
         # Devices by position of a GPU in the layout; none: the CPU.
@@ -69,8 +93,7 @@ class Ranks:
 
     def __exit__(self, *_: object) -> None:
         for process in self.processes.values():
-            process.kill()
-            process.wait()
+            process.close()
         self._held.close()
 
     def start(self, *ranks: int, **options: Any) -> Ranks:
@@ -78,16 +101,8 @@ class Ranks:
         for rank in ranks or range(self.world_size):
             given = {**self._options, "rank": rank, "folder": str(self.folder), **options}
             inherited = self._fds[layout_of(given).node_of(rank)]
-            named = {name: str(fd) for name, fd in inherited.items()}
             with (self.folder / f"stderr_{rank}").open("wb") as stderr:
-                self.processes[rank] = subprocess.Popen(
-                    [sys.executable, __file__, json.dumps(given)],
-                    env={**os.environ, **environment_of(given), **named},
-                    pass_fds=list(inherited.values()),
-                    stdin=subprocess.DEVNULL,
-                    stdout=stderr,
-                    stderr=stderr,
-                )
+                self.processes[rank] = start_rank(given, inherited, stderr.fileno())
         return self
 
     def wait_for(self, mark: str) -> None:
@@ -98,10 +113,10 @@ class Ranks:
                 said = self.folder / f"stderr_{rank}"
                 assert time.monotonic() < deadline, f"no {mark}: {said.read_text()}"
                 # It may leave the mark and end, in this order, since we looked.
-                assert process.poll() is None or (self.folder / f"{mark}_{rank}").exists(), (
+                has_ended = process.ends_within(0.01)
+                assert not has_ended or (self.folder / f"{mark}_{rank}").exists(), (
                     f"no {mark}: {said.read_text()}"
                 )
-                time.sleep(0.01)
 
     def named_memory(self) -> set[Path]:
         """Files below /dev/shm that the running ranks have mapped."""
@@ -112,10 +127,9 @@ class Ranks:
             if "/dev/shm" in line
         }
 
-    def signal(self, rank: int, number: signal.Signals) -> float:
-        """Sends a signal to `rank`; returns when, monotonic clock."""
+    def signal(self, rank: int, number: signal.Signals) -> None:
+        """Sends a signal to `rank`."""
         self.processes[rank].send_signal(number)
-        return time.monotonic()
 
     def results(self, *ranks: int) -> list[dict[str, Any]]:
         """What `ranks` (default: all) came to, once their processes have ended."""
@@ -143,9 +157,7 @@ class Ranks:
 
     def _wait_for_end(self, rank: int) -> None:
         process = self.processes[rank]
-        try:
-            process.wait(WAIT_S)
-        except subprocess.TimeoutExpired:
+        if not process.ends_within(WAIT_S):
             process.send_signal(signal.SIGUSR1)  # It says where it is, see `main`.
             time.sleep(1.0)
             has_result = (self.folder / f"result_{rank}").exists()
@@ -153,14 +165,73 @@ class Ranks:
             pytest.fail(f"rank {rank} does not end, has a result: {has_result}\n{said}")
 
 
-def environment_of(options: Options) -> dict[str, str]:
-    """Variables of one rank."""
+def start_rank(options: Options, inherited: dict[str, int], stderr: int) -> RankProcess:
+    """Has a server fork a process with these open files, named by variables."""
+    _, server = _server("cuda" if options["gpus"] else "cpu")
+    variables = {**os.environ, **environment_of(options)}
+    message = json.dumps([options, variables, list(inherited)])
+    socket.send_fds(server, [message.encode()], [stderr, *inherited.values()])
+    pid, (pidfd,), _, _ = socket.recv_fds(server, 100, 1)
+    return RankProcess(int(pid), pidfd)
+
+
+@cache
+def _server(platform: str) -> tuple[subprocess.Popen[bytes], socket.socket]:
+    """Starts the server of a platform; it ends, with its ranks, when this process does."""
+    own, its = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
     path = os.pathsep.join(filter(None, (str(REPOSITORY), os.environ.get("PYTHONPATH"))))
+    process = subprocess.Popen(
+        # The warning of jax is meant for parents that compute; this one only imports.
+        [sys.executable, "-W", "ignore:os.fork", __file__, str(its.fileno())],
+        env={**os.environ, "PYTHONPATH": path, "JAX_PLATFORMS": platform},
+        pass_fds=[its.fileno()],
+        stdin=subprocess.DEVNULL,
+    )
+    its.close()
+    return process, own
+
+
+def serve(requests: socket.socket) -> Options:
+    """Forks at every request; returns in the new process, the options of its rank."""
+    import fake_device_memory  # noqa: F401
+    import jax.numpy  # noqa: F401
+
+    ranks: set[int] = set()
+    while True:
+        message, fds, _, _ = socket.recv_fds(requests, 1 << 20, 4)
+        # Until now what has ended was a zombie, so that its number was nobody else's.
+        ranks -= {pid for pid in ranks if os.waitpid(pid, os.WNOHANG)[0]}
+        if not message:
+            for pid in ranks:
+                os.kill(pid, signal.SIGKILL)
+            sys.exit()
+        pid = os.fork()
+        if pid == 0:
+            requests.close()
+            return _become_rank(message, *fds)
+        ranks.add(pid)
+        fds.append(os.pidfd_open(pid))
+        socket.send_fds(requests, [str(pid).encode()], fds[-1:])
+        for fd in fds:
+            os.close(fd)
+
+
+def _become_rank(message: bytes, stderr: int, *inherited: int) -> Options:
+    options, variables, names = json.loads(message)
+    for standard in (1, 2):
+        os.dup2(stderr, standard)
+    os.close(stderr)
+    os.environ.clear()
+    os.environ.update(variables)
+    os.environ.update({name: str(fd) for name, fd in zip(names, inherited, strict=True)})
+    return options
+
+
+def environment_of(options: Options) -> dict[str, str]:
+    """What the variables of one rank have more than those of the tests."""
     if not options["gpus"]:
-        return {"PYTHONPATH": path, "JAX_PLATFORMS": "cpu"}
+        return {}
     return {
-        "PYTHONPATH": path,
-        "JAX_PLATFORMS": "cuda",
         "CUDA_VISIBLE_DEVICES": str(options["gpus"][layout_of(options).gpu_of(options["rank"])]),
         "XLA_PYTHON_CLIENT_PREALLOCATE": "false",
         "XLA_FLAGS": "--xla_gpu_shard_autotuning=false",
@@ -221,7 +292,6 @@ def main(options: Options) -> None:
     except GmijaxError as error:
         failure = error
         result |= {"error": type(error).__name__, "message": str(error)}
-        result["failed_at_s"] = time.monotonic()
         if isinstance(error, PeerLost):
             result["peer"] = error.peer
         if isinstance(error, CollectiveTimeout):
@@ -234,4 +304,4 @@ def main(options: Options) -> None:
 
 
 if __name__ == "__main__":
-    main(json.loads(sys.argv[1]))
+    main(serve(socket.socket(fileno=int(sys.argv[1]))))

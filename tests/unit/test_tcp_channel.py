@@ -130,7 +130,10 @@ def test_a_stranger_delivers_nothing_and_is_not_the_end_of_the_agent(
     send(writer, 2)
     assert receive(reader, 1) == [2]
     writer._connection.close()  # As if it were killed.
-    assert isinstance(why_lost(reader, 6), PeerLost)
+    error = None
+    while error is None:  # Until the test's own limit.
+        error = why_lost(reader, 1)
+    assert isinstance(error, PeerLost)
     reader.close()
 
 
@@ -143,7 +146,7 @@ def test_an_agent_stays_until_its_trainer_has_taken_all(address: str) -> None:
     closing.join(0.3)
     assert closing.is_alive()
     assert receive(reader, 1) == [2]
-    closing.join(2.0)
+    closing.join(60.0)
     assert not closing.is_alive()
     with pytest.raises(PipeClosed):
         receive(reader, 1)
@@ -152,8 +155,9 @@ def test_an_agent_stays_until_its_trainer_has_taken_all(address: str) -> None:
 
 @pytest.mark.parametrize("is_there", [True, False])
 def test_an_agent_does_not_wait_for_a_trainer_that_is_not_there(
-    is_there: bool, address: str
+    is_there: bool, address: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    monkeypatch.setattr("gmijax.collectives.channel.remote._FAREWELL_S", 60.0)
     reader = RemoteReader(address, 1, 0, CAPACITY) if is_there else None
     writer = RemoteWriter(address, 0, 1, CAPACITY)
     send(writer, 1)
@@ -163,7 +167,7 @@ def test_an_agent_does_not_wait_for_a_trainer_that_is_not_there(
         reader.close()
     started_s = time.monotonic()
     writer.close()
-    assert time.monotonic() - started_s < 4.0  # Less than for one that is.
+    assert time.monotonic() - started_s < 30.0  # Less than for one that is.
 
 
 def test_an_address_that_cannot_be_is_named() -> None:
