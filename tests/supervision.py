@@ -53,6 +53,22 @@ def planned(
     return make_plan(PlanConfig(**plan), ReduceConfig(**(reduce or {})), 64, here, nodes=nodes)
 
 
+def gpus_of_nodes(*num_gpus: int, **changes: Any) -> dict[str, Machine]:
+    """Nodes whose GPUs are all different, with MPS."""
+    nodes: dict[str, Machine] = {}
+    for place, count in enumerate(num_gpus):
+        gpus = tuple(
+            gpu(index)._replace(uuid=f"GPU-{place}-{index}", **changes) for index in range(count)
+        )
+        nodes[f"10.0.0.{place}"] = machine(count, gpus=gpus, mps_control=Path("/mps"))
+    return nodes
+
+
+def plan_on(nodes: dict[str, Machine], **settings: Any) -> Plan:
+    first = next(iter(nodes.values()))
+    return make_plan(PlanConfig(**settings), ReduceConfig(), 16, first, nodes=nodes)
+
+
 def save(run: RunPaths, env_steps: int) -> Path:
     """A checkpoint of `ant` that holds nothing but its meta data."""
     meta = CheckpointMeta("ant", "ppo", env_steps, 1, 8, ((8,), (8, 4)), "jax")

@@ -27,7 +27,7 @@ def write_page(config: PlayConfig, paths: PlayPaths, console: Console) -> None:
     # A page is quickly made, and the GPU may be training.
     environment = {"PJRT_NPROC": "4", **os.environ, "JAX_PLATFORMS": "cpu"}
     with doing(console, "writing the page"), paths.page_log.open("wb") as log:
-        exit_code = _child("gmijax.sim.page", paths, environment, log)
+        exit_code = _child("gmijax.workers.page_writer", paths, environment, log)
     if exit_code == 0:
         console.print(f"page: {paths.html}")
         return
@@ -72,7 +72,7 @@ def _why(exit_code: int, paths: PlayPaths) -> str:
 
 def _render(gl: str, paths: PlayPaths) -> int:
     with paths.render_log.open("ab") as log:
-        return _child("gmijax.sim.render", paths, environment_with(gl), log)
+        return _child("gmijax.workers.play_film", paths, environment_with(gl), log)
 
 
 def _child(module: str, paths: PlayPaths, environment: Mapping[str, str], log: IO[bytes]) -> int:

@@ -1,7 +1,7 @@
 """The controller of `gmijax.play`: from a checkpoint to returns and a film. No jax here.
 
 Two children do the work, each a fresh interpreter: `gmijax.workers.playback` runs the episodes
-as the one GMI of a small plan, `gmijax.sim.render` films them.
+as the one GMI of a small plan, `gmijax.workers.play_film` films them.
 """
 
 from __future__ import annotations

@@ -36,7 +36,7 @@ def first_opengl(tried: Sequence[str]) -> tuple[str | None, str]:
     said = ""
     for gl in tried:
         done = subprocess.run(
-            [sys.executable, "-m", "gmijax.sim.render"],
+            [sys.executable, "-m", "gmijax.workers.play_film"],
             env=environment_with(gl),
             stdin=subprocess.DEVNULL,
             capture_output=True,
@@ -51,7 +51,7 @@ def first_opengl(tried: Sequence[str]) -> tuple[str | None, str]:
 
 
 def is_missing(exit_code: int) -> bool:
-    """Whether a child of `gmijax.sim.render` ended for want of its OpenGL."""
+    """Whether a child of `gmijax.workers.play_film` ended for want of its OpenGL."""
     # A broken driver may end the process with a signal instead of an error. These two come from
     # somebody else: the user, a batch system, or the machine when it runs out of memory.
     sent = (-signal.SIGKILL, -signal.SIGTERM)

@@ -16,8 +16,8 @@ from typing import Final
 
 from gmijax.control.films import FINISH
 from gmijax.runs.folder import RunPaths
-from gmijax.sim.render import Stage, film
 from gmijax.sim.trajectory import load_trajectory
+from gmijax.workers.play_film import Stage, film
 
 _SIZE: Final = (640, 480)
 _POLL_S: Final = 1.0

@@ -16,8 +16,8 @@ import numpy as np
 import pytest
 
 from gmijax.runs.folder import PlayPaths
-from gmijax.sim.page import page
 from gmijax.sim.trajectory import Trajectory
+from gmijax.workers.page_writer import page
 
 NUM_STEPS = 10
 CONTROL_DT_S = 0.01

@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from gmijax.sim import render
 from gmijax.sim.trajectory import Trajectory, load_trajectory, save_trajectory
+from gmijax.workers import play_film
 
 
 @pytest.mark.parametrize(
@@ -21,7 +21,7 @@ from gmijax.sim.trajectory import Trajectory, load_trajectory, save_trajectory
     ],
 )
 def test_films_play_in_real_time(control_dt_s: float, max_fps: float, stride: int, fps: float):
-    timing = render.real_time(control_dt_s, max_fps)
+    timing = play_film.real_time(control_dt_s, max_fps)
     assert timing.stride == stride
     assert timing.fps == pytest.approx(fps)
 
@@ -30,17 +30,17 @@ def test_films_play_in_real_time(control_dt_s: float, max_fps: float, stride: in
     ("num_tiles", "grid"), [(1, (1, 1)), (2, (2, 1)), (3, (2, 2)), (5, (3, 2)), (9, (3, 3))]
 )
 def test_grid_is_as_square_as_possible(num_tiles: int, grid: tuple[int, int]):
-    assert render.grid_of(num_tiles) == grid
+    assert play_film.grid_of(num_tiles) == grid
 
 
 def test_tiles_have_even_sides_and_fit_the_picture():
-    assert render.tile_size(641, 481, (1, 1)) == (640, 480)
-    assert render.tile_size(640, 480, (3, 2)) == (212, 240)
+    assert play_film.tile_size(641, 481, (1, 1)) == (640, 480)
+    assert play_film.tile_size(640, 480, (3, 2)) == (212, 240)
 
 
 def test_tiles_are_laid_row_by_row_and_gaps_are_black():
     tiles = [np.full((2, 4, 3), value, np.uint8) for value in (10, 20, 30)]
-    picture = render.compose(tiles, (2, 2))
+    picture = play_film.compose(tiles, (2, 2))
     assert picture.shape == (4, 8, 3)
     assert picture[::2, ::4, 0].tolist() == [[10, 20], [30, 0]]
 
@@ -55,7 +55,7 @@ class PaintedStage:
 def test_worlds_whose_episode_is_over_stand_still_and_dim():
     qpos = np.array([[[100.0], [200.0]]] * 5, np.float32)
     trajectory = Trajectory(qpos, np.array([4, 1]), 0.1)
-    pictures = list(render.frames(trajectory, PaintedStage(), (2, 1), 1))
+    pictures = list(play_film.frames(trajectory, PaintedStage(), (2, 1), 1))
     assert [picture[0, :, 0].tolist() for picture in pictures] == [
         [100, 200],
         [100, 200],
@@ -90,4 +90,4 @@ def test_a_tracking_camera_is_preferred(camera: str, wanted: str | None, index: 
     import mujoco
 
     model = mujoco.MjModel.from_xml_string(MODEL.format(camera=camera))
-    assert render.choose_camera(model, wanted) == index
+    assert play_film.choose_camera(model, wanted) == index

@@ -1,6 +1,6 @@
 """Draws films. Main of the filming child of `gmijax.play`. No jax here.
 
-`python -m gmijax.sim.render PLAY_FOLDER` films a played checkpoint; without a folder it tells by
+`play_film.py PLAY_FOLDER` films a played checkpoint; without a folder it tells by
 its exit code whether it could.
 
 Draws a trajectory with MuJoCo, without a display, through the OpenGL that MUJOCO_GL names. That

@@ -1,4 +1,4 @@
-"""Main of the page-writing child of `gmijax.play`: `python -m gmijax.sim.page PLAY_FOLDER`.
+"""Main of the page-writing child of `gmijax.play`, `page_writer.py PLAY_FOLDER`.
 
 Turns the trajectory of the first world into a page that shows it in 3D in a browser, with the
 viewer of `brax.io.html`. The page holds the geometry and the motion; the viewer itself comes from
@@ -18,8 +18,8 @@ import numpy as np
 import numpy.typing as npt
 
 from gmijax.runs.folder import PlayPaths
-from gmijax.sim.render import real_time
 from gmijax.sim.trajectory import Trajectory, load_trajectory
+from gmijax.workers.play_film import real_time
 
 MAX_FPS = 60.0
 

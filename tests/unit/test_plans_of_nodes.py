@@ -1,0 +1,206 @@
+"""Plans over several nodes: shares, strategies, roles, and what is left when a node is lost."""
+
+from __future__ import annotations
+
+import dataclasses
+import os
+from pathlib import Path
+from typing import Any
+
+import pytest
+from supervision import gpus_of_nodes, machine, plan_on
+
+from gmijax import compose
+from gmijax.collectives.nodes.meeting import Nodes
+from gmijax.collectives.strategies import stages
+from gmijax.config import PlanConfig, ReduceConfig, TrainConfig
+from gmijax.control.restarts import with_nodes_left
+from gmijax.errors import (
+    BackendUnavailable,
+    ConfigError,
+)
+from gmijax.partition.plan import Plan
+from gmijax.partition.planner import make_plan
+from gmijax.supervise.environment import gmi_environment
+from gmijax.supervise.kinds import calls_of, training_plan
+
+
+def test_the_plan_of_nodes_has_each_nodes_shares_under_global_ids() -> None:
+    here = {"10.0.0.1": machine(0), "10.0.0.2": machine(0)}
+    settings = PlanConfig(gmis_per_gpu=2), ReduceConfig(), 16
+    plan = make_plan(*settings, machine(0), nodes=here)
+    assert plan.layout.gmis_of_gpu == ((0, 1), (2, 3))
+    assert [share.gpu for share in plan.slices] == [0, 0, 1, 1]
+    assert plan.slices[2].cpus == plan.slices[0].cpus
+    assert plan.strategy == "mpr"
+    assert plan.nodes_data()[1] == {"address": "10.0.0.2", "gmis": [2, 3]}
+    assert Plan.from_dict(plan.to_dict()) == plan
+    old = {key: value for key, value in plan.to_dict().items() if key != "nodes"}
+    assert Plan.from_dict(old | {"layout": [[0, 1], [2, 3]]}).layout.num_nodes == 1
+    with pytest.raises(ConfigError, match=r"mrr: cannot run on layout .*: in each node its rings"):
+        make_plan(settings[0], ReduceConfig(strategy="mrr"), 16, machine(0), nodes=here)
+
+
+def test_gmis_of_nodes_share_the_gpus_of_their_node() -> None:
+    plan = plan_on(gpus_of_nodes(2, 3), gpus=2, gmis_per_gpu=2)
+    assert plan.backend == "mps"
+    devices = [share.device for share in plan.slices]
+    assert devices == [f"GPU-{node}-{gpu}" for node in (0, 1) for gpu in (0, 1) for _ in range(2)]
+    assert [share.gpu for share in plan.slices] == [0, 0, 1, 1, 2, 2, 3, 3]
+    assert {share.memory_fraction for share in plan.slices} == {0.4}
+    variables = gmi_environment(plan, 5, {}, Path("/cache"), {})
+    assert variables["CUDA_VISIBLE_DEVICES"] == "GPU-1-0"
+    assert variables["XLA_CLIENT_MEM_FRACTION"] == "0.4"
+    assert Plan.from_dict(plan.to_dict()) == plan
+
+
+@pytest.mark.parametrize(
+    ("gpus", "gmis", "strategy"),
+    [(1, 2, "one_shot"), (2, 2, "one_shot"), (2, 1, "mrr"), (1, 1, "mpr")],
+)
+def test_nodes_with_gpus_do_inside_what_one_machine_does(
+    gpus: int, gmis: int, strategy: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("gmijax.partition.reduction._is_installed", lambda *_: True)
+    plan = plan_on(gpus_of_nodes(gpus, gpus), gpus=gpus, gmis_per_gpu=gmis)
+    assert plan.strategy == strategy
+    assert [stage.link for stage in stages(strategy, plan.layout)][-1] == "nodes"
+
+
+def test_a_gpu_of_two_nodes_of_one_machine_has_half_of_its_memory_for_each() -> None:
+    nodes = {"a": machine(1), "a#1": machine(1)}
+    plan = plan_on(nodes, backend="share", gmis_per_gpu=2)
+    assert [share.memory_fraction for share in plan.slices] == [0.2] * 4
+    assert "nodes of one machine have the same GPUs, and divide their memory" in plan.reasons
+    with pytest.raises(ConfigError, match=r"4 GMIs on GPU 0 would reserve 1.20 of its memory"):
+        plan_on(nodes, backend="share", gmis_per_gpu=2, memory_fraction=0.3)
+
+
+def test_nodes_that_cannot_do_the_same_take_turns_or_are_refused_by_name() -> None:
+    nodes = gpus_of_nodes(1, 1)
+    bare = dataclasses.replace(nodes["10.0.0.1"], mps_control=None, driver_version="575.1")
+    plan = plan_on({**nodes, "10.0.0.1": bare}, gmis_per_gpu=2)
+    assert plan.backend == "share"
+    assert any("take turns" in why and "(node 10.0.0.1)" in why for why in plan.reasons)
+    said = "warning: node 10.0.0.1 has NVIDIA driver 575.1, node 10.0.0.0 580.159.03"
+    assert said in plan.reasons
+    with pytest.raises(
+        BackendUnavailable, match=r"node 10\.0\.0\.1: plan\.backend=mps: nvidia-cuda"
+    ):
+        plan_on({**nodes, "10.0.0.1": bare}, backend="mps", gmis_per_gpu=2)
+    with pytest.raises(ConfigError, match=r"node 10\.0\.0\.1: plan\.gpus=2: .* 1 usable"):
+        plan_on(gpus_of_nodes(2, 1), gpus=2)
+    old = gpus_of_nodes(1, 1, compute_capability=(8, 0))["10.0.0.1"]
+    with pytest.raises(ConfigError, match=r"10\.0\.0\.1 has GPUs of compute capability 8\.0"):
+        plan_on({**nodes, "10.0.0.1": old})
+
+
+def asynchronous_config(*overrides: str, nodes: int) -> TrainConfig:
+    settings = ("env=ball_balance", "algo=a3c", "cluster.engine=ray", "num_envs=16")
+    return compose(*settings, f"cluster.nodes={nodes}", *overrides)
+
+
+def asynchronous_plan(*overrides: str, nodes: int = 2) -> Plan:
+    config = asynchronous_config(*overrides, nodes=nodes)
+    machines = {f"10.0.0.{node}": machine(0) for node in range(nodes)}
+    return training_plan(config, machine(0), nodes=machines)
+
+
+@pytest.mark.parametrize(
+    ("overrides", "nodes", "layout", "of_nodes", "strategy"),
+    [
+        ((), 2, [[1], [0]], [[1], [0]], "none"),
+        (("plan.serving_gmis_per_gpu=2",), 2, [[1, 2], [0]], [[1, 2], [0]], "none"),
+        (("plan.gpus=2",), 2, [[1], [2], [3], [0]], [[1, 2], [0, 3]], "none"),
+        (("plan.training_gmis_per_gpu=2",), 2, [[2], [0, 1]], [[2], [0, 1]], "mpr"),
+        (
+            ("plan.serving_gpus=[0,1]", "plan.training_gpus=[0,1]"),
+            *(2, [[0, 2], [1, 3]], [[0, 2], [1, 3]], "mpr"),
+        ),
+        (("plan.serving_gpus=2", "plan.training_gpus=2"), 4, None, [[2], [3], [0], [1]], "mpr"),
+    ],
+)
+def test_agents_and_trainers_are_placed_over_the_gpus_of_all_nodes(
+    overrides: tuple[str, ...], nodes: int, layout: Any, of_nodes: Any, strategy: str
+) -> None:
+    plan = asynchronous_plan(*overrides, nodes=nodes)
+    assert plan.to_dict()["layout"] == (layout or of_nodes)
+    assert [node["gmis"] for node in plan.nodes_data()] == of_nodes
+    assert plan.strategy == strategy
+    assert [share.gmi for share in plan.slices] == list(plan.layout.gmis)
+    assert [plan.layout.gpu_of(share.gmi) for share in plan.slices] == [s.gpu for s in plan.slices]
+    assert Plan.from_dict(plan.to_dict()) == plan
+
+
+def test_who_calls_whom_over_nodes() -> None:
+    plan = asynchronous_plan("plan.gpus=2", "plan.training_gmis_per_gpu=2")
+    assert plan.nodes_data()[1]["gmis"] == [0, 1, 4]  # Trainers 0 and 1, agents 2 to 4.
+    experience, weights = ((0, 2), (0, 3), (1, 2), (1, 3)), ((2, 0), (3, 0))
+    assert calls_of(plan) == (*experience, *weights)
+
+
+@pytest.mark.parametrize(
+    ("overrides", "message"),
+    [
+        (("plan.serving_gpus=2", "plan.training_gpus=1"), "take 3 GPUs, .*as many"),
+        (("plan.serving_gpus=[0]", "plan.training_gpus=[3]"), "the last is number 3; on 2"),
+        (
+            ("plan.gpus=2", "plan.serving_gpus=[0]", "plan.training_gpus=[1,2,3]"),
+            "as many of them",
+        ),
+        (("channel.transport=zmq",), "TCP without being told"),
+        (("channel.transport=device",), "device: the job is on several nodes; use memory"),
+        (("plan.layout=[[0]]",), "with the decoupled template give"),
+    ],
+)
+def test_placements_that_nodes_cannot_have_are_refused(
+    overrides: tuple[str, ...], message: str
+) -> None:
+    with pytest.raises(ConfigError, match=message):
+        asynchronous_plan(*overrides)
+
+
+@pytest.mark.parametrize(
+    ("overrides", "left", "of_nodes"),
+    [
+        ((), 1, [[0, 1]]),
+        (("plan.serving_gpus=[0,1,2]", "plan.training_gpus=[0,1,2]"), 1, [[0, 1]]),
+        (
+            ("plan.gpus=2", "plan.serving_gpus=[0,2,4]", "plan.training_gpus=[1,3,5]"),
+            *(2, [[0, 2], [1, 3]]),
+        ),
+        (("plan.serving_gpus=[0,1]", "plan.training_gpus=[2]"), 2, None),
+        (("plan.serving_gpus=2", "plan.training_gpus=1"), 2, None),
+    ],
+)
+def test_agents_and_trainers_go_on_with_the_nodes_that_are_left(
+    overrides: tuple[str, ...], left: int, of_nodes: list[list[int]] | None
+) -> None:
+    config = asynchronous_config(*overrides, nodes=3)
+    plan = training_plan(config, machine(0), nodes=dict.fromkeys("abc", machine(0)))
+    nodes = dict.fromkeys("abc"[:left], machine(0))
+    if of_nodes is None:
+        with pytest.raises(ConfigError, match=r"plan\.serving_gpus.*, plan\.training_gpus"):
+            with_nodes_left(config, plan, nodes)
+    else:
+        again, [note] = with_nodes_left(config, plan, nodes)
+        assert [node["gmis"] for node in again.nodes_data()] == of_nodes
+        assert note.startswith(f"{3 - left} nodes of the job are gone: going on with {left}")
+
+
+def test_nodes_know_the_calls_and_count_leaders_among_those_that_train() -> None:
+    nodes = Nodes(2, (("a", 1), ("b", 2), ("c", 3)), b"secret", {(0, 3): "a:4"})
+    fd = nodes.to_file()
+    assert Nodes.from_file(fd) == nodes
+    os.close(fd)
+    assert nodes.among((1, 2))[:2] == (1, (("b", 2), ("c", 3)))
+
+
+def test_a_job_goes_on_with_the_nodes_that_are_left() -> None:
+    config = compose("env=ball_balance", "cluster.engine=ray", "num_envs=16", "seed=3")
+    plan = training_plan(config, machine(0), nodes={"a": machine(0), "b": machine(0)})
+    assert with_nodes_left(config, plan, {"c": machine(0), "b": machine(0)})[1] == ()
+    left, [note] = with_nodes_left(config, plan, {"b": machine(0)})
+    assert (left.nodes, left.layout.num_gmis, left.strategy) == (("b",), 1, "none")
+    assert "1 nodes of the job are gone: going on with 1, layout [[0]]" in note
+    assert left.reasons[-1] == note
