@@ -86,7 +86,7 @@ class Talk(gmijax.Role):
         assert self.recv(left) == "last"
         group = (0, 2)
         total = self.collective(np.arange(5) * rank, "sum", group) if rank in group else None
-        # The mean of many float32 over all goes by the plan's strategy, other lengths do not.
+        # The mean of many float32 over all goes through a shared block, other lengths do not.
         for length in (10_000, 10_000, 9_999):
             grads = self.collective([np.arange(length, dtype=np.float32) * rank])
             assert (grads[0] == np.arange(length, dtype=np.float32)).all()

@@ -27,7 +27,6 @@ def plan(
     backend: BackendChoice = "auto",
     sm_percent: float | Sequence[float] | None = None,
     memory_fraction: float | Sequence[float] | None = None,
-    strategy: Literal["auto", "mpr", "mrr", "har", "flat", "one_shot"] = "mpr",
 ) -> Plan:
     """A plan for roles of one's own on this machine; see `gmijax.launch`.
 
@@ -40,8 +39,6 @@ def plan(
       sm_percent: cap on the SMs of every GMI in percent (mps), or one for each; None for no cap.
       memory_fraction: part of a GPU's memory for every GMI, or one for each; None: 0.8 split
         evenly.
-      strategy: how the mean of many float32 over all GMIs is taken (docs/reduction.md); `auto`
-        by the layout. A role's data pass through host memory, so `mpr` has the least to do.
 
     Raises:
       ConfigError: bad input, or this machine cannot do it.
@@ -56,8 +53,8 @@ def plan(
     }
     # As from a command line: what is no number, or not among the allowed, is told in one line.
     wanted = from_dict(PlanConfig, {key: _plain(value) for key, value in given.items()}, "plan.")
-    intra = "auto" if strategy == "one_shot" else "host"
-    reduce = ReduceConfig(strategy=strategy, intra=intra, timeout_s=1.0)
+    # A role's data are in host memory, so other strategies have nothing to offer.
+    reduce = ReduceConfig(strategy="mpr", intra="host", timeout_s=1.0)
     made = make_plan(wanted, reduce, 0, detect_machine())
     # What the templates call roles are parts of reinforcement learning.
     reasons = tuple(reason for reason in made.reasons if not reason.startswith("template "))

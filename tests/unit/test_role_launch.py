@@ -16,7 +16,6 @@ import gmijax
 from gmijax.errors import ConfigError
 from gmijax.roles.shipping import own_script
 from tests.role_cases import Stuck, Talk
-from tests.supervision import machine
 
 
 def two() -> Any:
@@ -86,14 +85,6 @@ def test_a_plan_of_roles_names_no_template() -> None:
     assert (plan.backend, plan.strategy, plan.roles) == ("cpu", "mpr", ())
     assert not [reason for reason in plan.reasons if "template" in reason]
     assert gmijax.plan(backend="cpu").strategy == "none"
-
-
-def test_a_plan_of_roles_goes_by_the_layout_whatever_training_does(monkeypatch: Any) -> None:
-    monkeypatch.setattr("gmijax.partition.reduction._is_installed", lambda *_: True)
-    monkeypatch.setattr("gmijax.roles.manager.detect_machine", lambda: machine(2))
-    plan = gmijax.plan(2, 2, backend="share", strategy="auto")
-    assert (plan.strategy, plan.intra) == ("mrr", "host")
-    assert gmijax.plan(2, 2, backend="share", strategy="one_shot").intra == "ipc"
 
 
 def test_the_manager_says_what_is_missing() -> None:
