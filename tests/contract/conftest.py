@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import importlib.util
+from collections.abc import Iterator
 
+import jax
 import pytest
 from compiled_tasks import CompiledTask
 
@@ -28,6 +30,16 @@ def _variants() -> list[object]:
         for name in sorted(TASKS)
     ]
     return [*with_jax, *with_warp]
+
+
+@pytest.fixture(scope="module", autouse=True)
+def all_optimizations() -> Iterator[None]:
+    """Without them a reset of franka_cabinet alone takes minutes."""
+    name = "jax_disable_most_optimizations"
+    before = jax.config.read(name)
+    jax.config.update(name, False)
+    yield
+    jax.config.update(name, before)
 
 
 @pytest.fixture(scope="session", params=_variants())
