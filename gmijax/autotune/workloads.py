@@ -63,7 +63,7 @@ class Workload(ABC, Generic[C]):
     trainers: tuple[int, ...] = (0,)
 
     def __init__(self, config: C, kind: JobKind, reduce: ReduceConfig) -> None:
-        config.plan.require_template((self.template,), "jobs with numbers that are auto")
+        config.plan.require_template((self.template,), "a search (numbers that are auto)")
         self.config = config
         self.kind = kind
         self.plan = config.plan

@@ -127,7 +127,11 @@ REFUSED: list[tuple[str, str, str]] = [
     ("search", "search.alpha=-1", "search.alpha=-1.0: must be at least 0"),
     ("search", "search.budget_s=2", "search.budget_s=2: too small for one profile"),
     ("search", "plan.backend=mps", "plan.backend=mps"),
-    ("search", "plan.template=tdg_ex", "plan.template=tcg_ex only"),
+    (
+        "search",
+        "plan.template=tdg_ex",
+        "not for a search (numbers that are auto); allowed are auto, tcg_ex",
+    ),
     ("search", "plan.layout=[]", "plan.layout=[]: every GPU needs at least one GMI"),
     ("search", f"{A3C} search.mode=both", "search.mode=both: with algo=a3c allowed is corun"),
     ("search", f"{A3C} plan.serving_gpus=[0,1] plan.training_gpus=[1]", APART),

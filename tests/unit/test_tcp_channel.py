@@ -157,7 +157,7 @@ def test_an_agent_stays_until_its_trainer_has_taken_all(address: str) -> None:
 def test_an_agent_does_not_wait_for_a_trainer_that_is_not_there(
     is_there: bool, address: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("gmijax.collectives.channel.remote._FAREWELL_S", 60.0)
+    monkeypatch.setattr("gmijax.collectives.channel.tcp_channel._FAREWELL_S", 60.0)
     reader = RemoteReader(address, 1, 0, CAPACITY) if is_there else None
     writer = RemoteWriter(address, 0, 1, CAPACITY)
     send(writer, 1)

@@ -109,7 +109,7 @@ def test_another_secret_gets_and_gives_nothing() -> None:
 def test_an_agent_that_is_done_waits_for_the_end_of_the_leader(
     pair: tuple[RemoteRegisters, RemoteRegisters], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("gmijax.collectives.channel.remote_registers._FAREWELL_S", 60.0)
+    monkeypatch.setattr("gmijax.collectives.channel.tcp_registers._FAREWELL_S", 60.0)
     leader, agent = pair
     agent.wait_for_ends()  # Nobody has come yet.
     leader.own(0).publish(np.array([1, 2]))
