@@ -12,6 +12,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import pytest
+from training_jobs import wait_until
 
 import gmijax
 from gmijax.errors import CollectiveError, CollectiveTimeout, ConfigError, PeerLost
@@ -109,8 +110,8 @@ class Wait(gmijax.Role):
             if ends == "sleep":
                 time.sleep(60)
             return "done"
-        while not (here if self.rank == 0 else seen).exists():
-            time.sleep(0.01)
+        awaited = here if self.rank == 0 else seen
+        wait_until(awaited.exists, 60, f"{awaited.name} is there")
         if self.rank == 2:
             self.collective(np.ones(100_000))
         self.send("go", 1)

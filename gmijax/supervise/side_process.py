@@ -94,5 +94,16 @@ class SideProcess:
             self._say(f"{self._what}: {last_line(self._log) or how}")
 
 
+def exit_code_beside(work: Callable[[], None]) -> int:
+    """Does the work of such a process; returns its exit code: 0, or 1 with a line on stderr."""
+    try:
+        work()
+    # Whatever it is, training goes on without it.
+    except Exception as error:
+        sys.stderr.write(f"{type(error).__name__}: {' '.join(str(error).split())}\n")
+        return 1
+    return 0
+
+
 def _nothing(_: str) -> None:
     """Says nothing."""

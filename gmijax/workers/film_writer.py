@@ -17,6 +17,7 @@ from typing import Final
 from gmijax.control.films import FINISH
 from gmijax.runs.folder import RunPaths
 from gmijax.sim.trajectory import load_trajectory
+from gmijax.supervise.side_process import exit_code_beside
 from gmijax.workers.play_film import Stage, film
 
 _SIZE: Final = (640, 480)
@@ -30,13 +31,7 @@ def main(root: Path) -> int:
     os.nice(_NICE)
     is_over = threading.Event()
     threading.Thread(target=_listen, args=(is_over,), daemon=True).start()
-    try:
-        follow(RunPaths(root), is_over)
-    # Whatever it is, training goes on without it.
-    except Exception as error:
-        sys.stderr.write(f"{type(error).__name__}: {' '.join(str(error).split())}\n")
-        return 1
-    return 0
+    return exit_code_beside(lambda: follow(RunPaths(root), is_over))
 
 
 def follow(run: RunPaths, is_over: threading.Event) -> None:

@@ -17,6 +17,7 @@ from typing import Any
 
 from gmijax.runs.folder import RunPaths, read_json, write_json
 from gmijax.runs.history import MetricsReader, scalars
+from gmijax.supervise.side_process import exit_code_beside
 
 _POLL_S = 2.0
 
@@ -25,13 +26,7 @@ def main(root: Path) -> int:
     """Returns the exit code: 0, or 1 with one line on standard error."""
     # In one piece: what is left in a buffer would not wake up `select`.
     config = json.loads(os.read(sys.stdin.fileno(), 1 << 20))
-    try:
-        follow(RunPaths(root), config)
-    # Whatever it is, training goes on without it.
-    except Exception as error:
-        sys.stderr.write(f"{type(error).__name__}: {' '.join(str(error).split())}\n")
-        return 1
-    return 0
+    return exit_code_beside(lambda: follow(RunPaths(root), config))
 
 
 def follow(run: RunPaths, config: Mapping[str, Any]) -> None:
