@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import ctypes
 import importlib
+import weakref
 from collections import deque
 from typing import Any
 
@@ -137,14 +139,25 @@ def _event() -> Any:
     return checked(runtime.cudaEventCreate(), "make an event")[0]
 
 
-def fetch(stream: int, source: int, num_floats: int) -> npt.NDArray[np.float32]:
-    """A copy in host memory of [n] float32 of the device, once the stream has come to it."""
-    values = np.empty(num_floats, np.float32)
+def pinned(num_floats: int) -> npt.NDArray[np.float32]:
+    """New memory of the host, [n], that the GPU reads and writes by itself.
+
+    Copies from and to other memory go through a buffer of the driver, piece by piece. It is
+    released with the last array of it: who is interrupted may leave a thread that still uses it.
+    """
+    allocated = runtime.cudaHostAlloc(4 * num_floats, runtime.cudaHostAllocPortable)
+    (address,) = checked(allocated, "pin memory of the host")
+    memory = (ctypes.c_float * num_floats).from_address(int(address))
+    weakref.finalize(memory, runtime.cudaFreeHost, address).atexit = False
+    return np.ctypeslib.as_array(memory)
+
+
+def fetch(stream: int, source: int, target: npt.NDArray[np.float32]) -> None:
+    """Copies [n] float32 of the device to `target`, once the stream has come to it."""
     kind = runtime.cudaMemcpyKind.cudaMemcpyDeviceToHost
-    copied = runtime.cudaMemcpyAsync(values.ctypes.data, source, values.nbytes, kind, stream)
+    copied = runtime.cudaMemcpyAsync(target.ctypes.data, source, target.nbytes, kind, stream)
     checked(copied, "copy from the GPU")
     checked(runtime.cudaStreamSynchronize(stream), "copy from the GPU")
-    return values
 
 
 def store(stream: int, target: int, values: npt.NDArray[np.float32]) -> None:

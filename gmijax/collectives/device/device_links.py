@@ -196,6 +196,7 @@ class DeviceLinks(HostLinks):
             if held is not None:
                 held.close()
         self._queue, self._order, self._slots, self._rings = None, None, None, {}
+        super().close()
 
     @contextmanager
     def _exchanging(self, stream: int, place: int, num_floats: int) -> Iterator[CudaQueue]:

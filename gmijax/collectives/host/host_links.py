@@ -38,6 +38,7 @@ class HostLinks:
         self._host = host
         self._failure: GmijaxError | None = None
         self._exchange_s = 0.0
+        self._pinned: dict[str, FloatBuffer] = {}  # On a GPU: what exchanges go through.
 
     def start(self, trial: Exchange) -> None:
         """Tries the links by exchanges in the node, together with all other ranks.
@@ -65,8 +66,11 @@ class HostLinks:
             if stream:
                 from gmijax.collectives.device.cuda_queue import fetch, store
 
-                result = np.empty(rows * num_floats, np.float32)
-                self._reduce(stage, place, fetch(stream, source, num_floats), result)
+                # Free again on return: `store` waits, and the host takes one exchange at a time.
+                values = self._buffer("source", num_floats)
+                result = self._buffer("target", rows * num_floats)
+                fetch(stream, source, values)
+                self._reduce(stage, place, values, result)
                 store(stream, target, result)
             else:
                 values, result = _at(source, num_floats), _at(target, rows * num_floats)
@@ -100,6 +104,15 @@ class HostLinks:
 
     def close(self) -> None:
         """Releases what the links hold beside the shared block, which is the reducer's."""
+        self._pinned = {}
+
+    def _buffer(self, use: str, num_floats: int) -> FloatBuffer:
+        """[n] in host memory, the same for each exchange: new memory costs page faults."""
+        from gmijax.collectives.device.cuda_queue import pinned
+
+        if use not in self._pinned or self._pinned[use].size < num_floats:
+            self._pinned[use] = pinned(num_floats)
+        return self._pinned[use][:num_floats]
 
     def _reduce(self, stage: Stage, place: int, values: FloatBuffer, result: FloatBuffer) -> None:
         if stage.link == "nodes":
