@@ -71,7 +71,7 @@ def linked_paths(text: str) -> list[str]:
 def link_documents(pages: Path) -> None:
     """Links README.md (as the first page), docs/ and all that they link to into a folder.
 
-    A folder that is linked to gets a page with a list of its files.
+    A folder that is linked to gets a page with a list of its files, unless it has a README.md.
 
     Raises:
       FileNotFoundError: a link to a file that does not exist.
@@ -88,9 +88,10 @@ def link_documents(pages: Path) -> None:
         (place if path.is_dir() else place.parent).mkdir(parents=True, exist_ok=True)
         if path.is_dir():
             files = sorted(file for file in path.iterdir() if file.is_file())
-            lines = [f"- [{_title(file)}]({file.name})" for file in files]
-            title = path.relative_to(ROOT).as_posix().removeprefix("docs/").capitalize()
-            (place / "index.md").write_text("\n".join([f"# {title}", "", *lines, ""]))
+            if path / "README.md" not in files:
+                lines = [f"- [{file.name}]({file.name})" for file in files]
+                title = f"# Files in {path.relative_to(ROOT).as_posix()}"
+                (place / "index.md").write_text("\n".join([title, "", *lines, ""]))
             waiting += files
             continue
         place.symlink_to(path.resolve(strict=True))
@@ -99,20 +100,13 @@ def link_documents(pages: Path) -> None:
             waiting += [(path.parent / link).resolve() for link in links]
 
 
-def _title(path: Path) -> str:
-    heading = (
-        re.search(r"^# (.+)$", path.read_text(), re.MULTILINE) if path.suffix == ".md" else None
-    )
-    return heading[1] if heading else path.name
-
-
 def command_page(name: str) -> str:
     """The keys of a command: values, default, meaning; in groups, as Markdown."""
     keys = list(keys_of(COMMANDS[name], partial(defaults, name)))
     lines = [
         f"# gmijax {name}",
         "",
-        f"`python -m gmijax.{name} [key=value ...] [--cfg job] [--help]`",
+        f"`gmijax {name} [key=value ...] [--cfg job] [--help]`",
     ]
     if name in LIKE_TRAIN:
         trains = set(keys_of(COMMANDS["train"], partial(defaults, "train")))
@@ -133,12 +127,12 @@ def _choices_of(name: str, keys: Sequence[Key]) -> Iterator[str]:
             yield from ("", f"`{group}=` is one of {listed}{own if group == 'env' else ''}.")
         if group == "env":
             task = f"Defaults below are those of `env={defaults(name, ())['env.name']}`."
-            ask = f"`python -m gmijax.{name} env=ant --cfg job` prints those of another task."
+            ask = f"`gmijax {name} env=ant --cfg job` prints those of another task."
             yield from ("", f"{task} {ask}")
 
 
 def _tables(keys: Sequence[Key]) -> Iterator[str]:
-    general = "Without a group"
+    general = "Top level"
     groups: dict[str, list[Key]] = {general: []}
     for key in keys:
         group = f"`{key.name.partition('.')[0]}`" if "." in key.name else general

@@ -6,14 +6,15 @@ from collections.abc import Callable
 from types import MappingProxyType
 
 from benchmarks.evaluation.claims import claims
-from benchmarks.evaluation.figures import bounds, markdown, ratio, shown
+from benchmarks.evaluation.figures import bounds, markdown, shown
 from benchmarks.evaluation.other_tables import OTHER_TABLES
 from benchmarks.evaluation.peer_tables import peers
-from benchmarks.evaluation.plots import summary
+from benchmarks.evaluation.plots import mps_gains
 from benchmarks.evaluation.sweep_tables import over_one_after_another, sweep_rates, sweeps
 from benchmarks.evaluation.tables import (
     TRAINING_TABLES,
     fixed_total_ratios,
+    over_one_gpu,
     small_gmis,
 )
 
@@ -24,35 +25,33 @@ def advice() -> list[str]:
     tenfold = small[10] / small[1] if {1, 10} <= small.keys() else None
     fewest = min((rate.repeats for rate in sweep_rates().values()), default=0)
     eightfold = over_one_after_another("8 at once, auto")
-    sharing = [gain for name, gain in summary().items() if name.startswith("MPS")]
     fixed = bounds([*fixed_total_ratios().values()])
-    over_one = ratio("scaling", "4 GPUs x 1 GMIs x 8192", "1 GPUs x 1 GMIs x 8192")
     rows = [
         [
             *("many small trainings on one GPU (seeds, a sweep)", "**yes**: `gmijax.sweep`"),
             f"eight trainings at once: {shown(eightfold)} times the trainings per hour of one "
-            f"after another, in {fewest} sweep{'s' * (fewest > 1)} each; "
+            f"after another ({fewest} sweep{'s' * (fewest > 1)} of each kind); "
             f"ten GMIs: {shown(tenfold)} times the steps/s of one",
         ],
         [
             *("several processes on one GPU anyway", "**yes**, under MPS"),
-            f"{bounds(sharing)} times the steps/s of plain sharing "
+            f"{bounds([*mps_gains().values()])} times the steps/s of plain sharing "
             "(serving ant and humanoid, 2 to 8 GMIs)",
         ],
         [
-            *("one large synchronous training on one GPU", "**no**: `plan.gmis_per_gpu=1`"),
+            *("one large synchronous training on one GPU", "**no** (the default)"),
             f"{fixed} times the steps/s of one process with as many environments",
         ],
         [
             *("one training on several GPUs", "one GMI on each"),
-            f"four GPUs make {shown(over_one)} times the steps/s of one",
+            f"four GPUs make {shown(over_one_gpu(4))} times the steps/s of one",
         ],
         [
             *("asynchronous training", "try synchronous training first"),
             "slower on one GPU; runs on more were too short to tell",
         ],
     ]
-    return markdown("you have | GMIs | measured on NVIDIA H200s, ant", rows)
+    return markdown("you have | several GMIs per GPU? | measured on NVIDIA H200s, ant", rows)
 
 
 TABLES: MappingProxyType[str, Callable[[], list[str]]] = MappingProxyType(

@@ -126,6 +126,11 @@ def weak_scaling() -> list[str]:
     return [*markdown(head, rows), *source("scaling", "scaling-one_shot")]
 
 
+def over_one_gpu(gpus: int) -> float | None:
+    """Steps/s of several GPUs with one GMI on each, over those of one GPU."""
+    return ratio("scaling", f"{gpus} GPUs x 1 GMIs x 8192", "1 GPUs x 1 GMIs x 8192")
+
+
 def templates() -> list[str]:
     """Trainers among their simulators against trainers apart."""
     rows = []

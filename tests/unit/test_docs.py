@@ -28,6 +28,8 @@ FOLDERS = ("gmijax", "configs", "tests", "docs", "benchmarks", "examples", ".ci"
 
 QUOTED_PATH = re.compile(rf"`((?:{'|'.join(map(re.escape, FOLDERS))})/[\w./-]*)`")
 OBS_ROW = re.compile(r"^\| (\d+)(?:-(\d+))? \|", re.MULTILINE)
+FENCE = re.compile(r"^```.*?^```", re.DOTALL | re.MULTILINE)
+ANCHOR_LINK = re.compile(r"\]\(([\w./-]*)#([^)\s]+)\)")
 NUMBER_ROW = re.compile(r"^\| `(\w+)` \| (.*) \| (-?[\d.]+) \|$", re.MULTILINE)
 
 
@@ -41,6 +43,13 @@ def pages_of(navigation: list[dict[str, Any]]) -> Iterator[str]:
     for entry in navigation:
         for value in entry.values():
             yield from [value] if isinstance(value, str) else pages_of(value)
+
+
+def anchors_of(document: Path) -> set[str]:
+    """The names by which GitHub and the site both know a heading."""
+    headings = re.findall(r"^#+ (.+)$", FENCE.sub("", document.read_text()), flags=re.MULTILINE)
+    on_github = {re.sub(r"[^\w -]", "", title.lower()).replace(" ", "-") for title in headings}
+    return {name for name in on_github if "--" not in name}
 
 
 def part_of_task(task: str, heading: str) -> str:
@@ -91,6 +100,13 @@ def test_relative_links_point_somewhere(document: Path):
     assert [path for path in linked if not (document.parent / path).exists()] == []
 
 
+@pytest.mark.parametrize("document", documents(), ids=lambda path: path.stem)
+def test_links_into_documents_name_a_heading(document: Path):
+    links = ANCHOR_LINK.findall(FENCE.sub("", document.read_text()))
+    targets = [(document.parent / path if path else document, name) for path, name in links]
+    assert [f"{path}#{name}" for path, name in targets if name not in anchors_of(path)] == []
+
+
 def test_only_relative_links_outside_of_code_are_looked_at():
     text = "[a](b.md#c) ![d](img/e.png) [f](https://g.org) [h](#i)\n```\n[j](k.md)\n```"
     assert linked_paths(text) == ["b.md", "img/e.png"]
@@ -109,11 +125,11 @@ def test_every_document_is_in_the_navigation_of_the_site(tmp_path: Path):
 
 def test_the_site_has_every_decision_and_result_that_is_linked(tmp_path: Path):
     link_documents(tmp_path)
-    for folder in ("docs/decisions", "benchmarks/results"):
-        names = {path.name for path in (ROOT / folder).iterdir() if path.is_file()}
-        assert {path.name for path in (tmp_path / folder).iterdir()} == {*names, "index.md"}
-        listed = linked_paths((tmp_path / folder / "index.md").read_text())
-        assert set(listed) == names
+    for folder, index in (("docs/decisions", "README.md"), ("benchmarks/results", "index.md")):
+        names = {path.name for path in (ROOT / folder).iterdir() if path.is_file()} - {index}
+        assert {path.name for path in (tmp_path / folder).iterdir()} == {*names, index}
+        listed = linked_paths((tmp_path / folder / index).read_text())
+        assert sorted(listed) == sorted(names)
 
 
 def test_every_command_and_public_name_has_a_place_in_the_reference():
