@@ -64,7 +64,7 @@ def compose(*overrides: str, command: str = "train", env: Callable[..., Any] | N
       env: a function `make(*, impl, max_envs) -> gmijax.sim.interface.Env` at the top level of a
         file, in place of `env=path/to/file.py:make`.
 
-    Example:
+    Examples:
       >>> compose("env=ant", "num_envs=512").num_envs
       512
 

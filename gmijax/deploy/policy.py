@@ -66,7 +66,7 @@ def load_policy(path: str | os.PathLike[str]) -> Policy:
       path: a run folder (its newest checkpoint), a checkpoint folder, `last`, or a file that
         `python -m gmijax.export` wrote, `.onnx` or `.stablehlo`.
 
-    Example:
+    Examples:
       >>> policy = load_policy("runs/ant-ppo-20260101-120000")
       >>> actions = policy(np.zeros(policy.obs_size))
 

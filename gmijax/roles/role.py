@@ -72,7 +72,7 @@ class Role(ABC):
     environments and other things of jax are made in `run`. The class must be at the top level of
     a file or a module, where the GMI finds it by name.
 
-    Example:
+    Examples:
       >>> class Average(Role):
       ...     def run(self):
       ...         return self.collective(float(self.rank))

@@ -190,7 +190,7 @@ def make_vector_env(
 ) -> VectorEnv[Any, Any, Any]:
     """Makes N environments with Gymnasium's interface, for training with another library.
 
-    Example:
+    Examples:
       >>> envs = make_vector_env("ant", 4096, arrays="torch")
       >>> obs, info = envs.reset(seed=0)
 

@@ -75,7 +75,7 @@ class SweepResult(NamedTuple):
 def sweep(configs: Sequence[TrainConfig], *, show: bool = False, **settings: Any) -> SweepResult:
     """Trains with every configuration, several at a time on every GPU, and compares them.
 
-    Example:
+    Examples:
       >>> sweep([compose("env=ant", f"seed={seed}") for seed in range(4)], jobs_per_gpu=2)
 
     Args:

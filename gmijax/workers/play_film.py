@@ -155,7 +155,7 @@ def choose_camera(model: Any, wanted: str | None) -> int:
 def real_time(control_dt_s: float, max_fps: float) -> Timing:
     """The finest timing with at most `max_fps` frames per second.
 
-    Example:
+    Examples:
       >>> real_time(0.01, 30.0)
       Timing(stride=4, fps=25.0)
     """

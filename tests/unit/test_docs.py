@@ -88,6 +88,12 @@ def test_every_module_of_the_package_says_what_it_is_for():
     assert [path for path in modules if not ast.get_docstring(ast.parse(path.read_text()))] == []
 
 
+def test_the_site_shows_examples_as_code():
+    # Below `Example:` mkdocstrings takes `>>>` for quotations.
+    modules = sorted(PACKAGE.rglob("*.py"))
+    assert [path for path in modules if re.search(r"^ *Example:\n", path.read_text(), re.M)] == []
+
+
 @pytest.mark.parametrize("document", documents(), ids=lambda path: path.stem)
 def test_paths_that_a_document_names_exist(document: Path):
     quoted = QUOTED_PATH.findall(document.read_text())
