@@ -10,7 +10,7 @@ from benchmarks.evaluation.figures import bounds, markdown, shown
 from benchmarks.evaluation.other_tables import OTHER_TABLES
 from benchmarks.evaluation.peer_tables import peers
 from benchmarks.evaluation.plots import mps_gains
-from benchmarks.evaluation.sweep_tables import over_one_after_another, sweep_rates, sweeps
+from benchmarks.evaluation.sweep_tables import first_gains, sweeps
 from benchmarks.evaluation.tables import (
     TRAINING_TABLES,
     fixed_total_ratios,
@@ -23,14 +23,13 @@ def advice() -> list[str]:
     """Who gains from GMIs, and who does not."""
     small = small_gmis()
     tenfold = small[10] / small[1] if {1, 10} <= small.keys() else None
-    fewest = min((rate.repeats for rate in sweep_rates().values()), default=0)
-    eightfold = over_one_after_another("8 at once, auto")
+    eightfold = first_gains().get("8 at once, auto")
     fixed = bounds([*fixed_total_ratios().values()])
     rows = [
         [
             *("many small trainings on one GPU (seeds, a sweep)", "**yes**: `gmijax.sweep`"),
             f"eight trainings at once: {shown(eightfold)} times the trainings per hour of one "
-            f"after another ({fewest} sweep{'s' * (fewest > 1)} of each kind); "
+            f"after another{'' if eightfold and eightfold.repeats > 1 else ' (1 sweep of each)'}; "
             f"ten GMIs: {shown(tenfold)} times the steps/s of one",
         ],
         [

@@ -2,59 +2,114 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Mapping
+from typing import Any, NamedTuple, TypeAlias
+
 from benchmarks.evaluation.figures import (
     NOT_MEASURED,
     Figure,
-    call_of,
     figure,
     markdown,
-    results_of,
+    origin,
     shown,
-    source,
 )
+from benchmarks.records import RESULTS, Call, read_calls
 
-SWEEPS = "sweeps-nvidia-h200"
+SWEEPS = RESULTS / "sweeps-nvidia-h200.json"
 ONE_AFTER_ANOTHER = "1 at once, auto"
+HEAD = "at once | sweeps: | trainings per hour: | over one after another: | steps/s in all:"
+
+Run: TypeAlias = Mapping[str, Any]
 
 
-def sweep_rates() -> dict[str, Figure]:
-    """Trainings per hour, by the way the sweeps were run."""
-    ways: dict[str, list[float]] = {}
-    for run in results_of(SWEEPS).get("runs", ()):
-        if run["code"] == 0:
-            ways.setdefault(run["way"], []).append(run["trainings_per_hour"])
-    return {way: found for way, rates in ways.items() if (found := figure(rates))}
+class SameTrainings(NamedTuple):
+    """Sweeps of the same trainings; a call has time for one of each way or so.
+
+    Attributes:
+      calls: that ran them.
+      runs: of each of the calls, those that succeeded, by way.
+    """
+
+    calls: list[Call]
+    runs: list[dict[str, list[Run]]]
+
+    def rates(self, key: str = "trainings_per_hour") -> dict[str, Figure]:
+        """A figure of all sweeps, by way."""
+        return _figures(
+            {way: _of(key, own) for way, own in by_way.items()} for by_way in self.runs
+        )
+
+    def gains(self) -> dict[str, Figure]:
+        """Trainings per hour over those of one after another, each ratio of one call."""
+        ratios: list[dict[str, list[float]]] = []
+        for by_way in self.runs:
+            rates = SameTrainings([], [by_way]).rates()
+            if one := rates.pop(ONE_AFTER_ANOTHER, None):
+                ratios.append({way: [rate.median / one.median] for way, rate in rates.items()})
+        return _figures(ratios)
 
 
-def over_one_after_another(way: str) -> float | None:
-    """Trainings per hour over those of the same trainings one after another."""
-    rates = sweep_rates()
-    if not {way, ONE_AFTER_ANOTHER} <= rates.keys():
-        return None
-    return rates[way].median / rates[ONE_AFTER_ANOTHER].median
+def same_trainings() -> dict[str, SameTrainings]:
+    """By what the trainings are, in Markdown; first those of the file's first call."""
+    found: dict[str, SameTrainings] = {}
+    for call in read_calls(SWEEPS) if SWEEPS.exists() else ():
+        here: dict[str, dict[str, list[Run]]] = {}
+        for run in call.results["runs"]:
+            at_once, backend, *tasks = run["way"].split(", ")
+            if run["code"] == 0:
+                by_way = here.setdefault(_described(call, tasks), {})
+                by_way.setdefault(f"{at_once}, {backend}", []).append(run)
+        for what, by_way in here.items():
+            same = found.setdefault(what, SameTrainings([], []))
+            same.calls.append(call)
+            same.runs.append(by_way)
+    return found
+
+
+def first_gains() -> dict[str, Figure]:
+    """What the trainings of the file's first call gain at once, over one after another."""
+    return next((same.gains() for same in same_trainings().values()), {})
 
 
 def sweeps() -> list[str]:
     """Trainings per hour, where they were measured."""
-    call = call_of(SWEEPS)
-    if call is None or call.settings is None:
-        return [f"Trainings per hour of a sweep: {NOT_MEASURED} (`python -m benchmarks.sweeps`)."]
-    settings = ", ".join(f"`{one}`" for one in call.settings["overrides"])
-    compiled = "programs compiled before" if call.settings["warm"] else "each sweep compiles"
-    rows = [
-        [
-            way,
-            str(found.repeats),
-            shown(found, ".1f"),
-            shown(over_one_after_another(way)),
-            shown(call.results["medians"][way]["steady_steps_per_s"], ",.0f"),
+    lines: list[str] = []
+    for what, same in same_trainings().items():
+        gains, steps = same.gains(), same.rates("steady_steps_per_s")
+        rows = [
+            [
+                way,
+                str(rate.repeats),
+                shown(rate, ".1f"),
+                "1" if way == ONE_AFTER_ANOTHER else shown(gains.get(way)),
+                shown(steps.get(way), ",.0f"),
+            ]
+            for way, rate in same.rates().items()
         ]
-        for way, found in sweep_rates().items()
+        file = f"[`{SWEEPS.name}`](../benchmarks/results/{SWEEPS.name})"
+        calls = [f"- {file}: {origin(call)}" for call in same.calls]
+        lines += [what, "", *markdown(HEAD, rows), "", *calls, ""]
+    return lines[:-1] or [
+        f"Trainings per hour of a sweep: {NOT_MEASURED} (`python -m benchmarks.sweeps`)."
     ]
-    head = "at once | sweeps: | trainings per hour: | over one after another: | steps/s in all:"
-    return [
-        f"{call.settings['jobs']} trainings with {settings}; {compiled}.",
-        "",
-        *markdown(head, rows),
-        *source(SWEEPS),
-    ]
+
+
+def _described(call: Call, tasks: list[str]) -> str:
+    assert call.settings is not None
+    overrides = ", ".join(f"`{one}`" for one in call.settings["overrides"])
+    mix = f" of {tasks[0].replace(',', ', ')}" if tasks else ""
+    compiled = "programs compiled before" if call.settings["warm"] else "each sweep compiles"
+    return f"{call.settings['jobs']} trainings{mix} with {overrides}; {compiled}."
+
+
+def _of(key: str, runs: Iterable[Run]) -> list[float]:
+    return [run[key] for run in runs if run[key] is not None]
+
+
+def _figures(found: Iterable[dict[str, list[float]]]) -> dict[str, Figure]:
+    """What several calls measured, together."""
+    together: dict[str, list[float]] = {}
+    for one in found:
+        for way, values in one.items():
+            together.setdefault(way, []).extend(values)
+    return {way: median for way, values in together.items() if (median := figure(values))}
