@@ -250,7 +250,7 @@ def test_a_lost_node_is_the_cause_that_its_gmis_give(tmp_path: Path) -> None:
     while gmi.poll() is None:
         pass
     failure = describe_exit(2, gmi.exit_code or 0, gmi.error, gmi.paths.stderr)
-    assert "NodeLost: node 1 (10.0.0.2) is gone: its node has died" in failure.reason
+    assert failure.reason == "NodeLost: node 1 (10.0.0.2) is gone: its node has died"
     assert not is_consequence(failure)
     assert gmi.request_stacks() is None
     gmi.kill()
