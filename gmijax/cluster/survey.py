@@ -35,11 +35,11 @@ class Surveyed(NamedTuple):
 class SurveyedNode(Node):
     """A node that is only looked at: it sees all GPUs, whoever uses them."""
 
-    def facts(self) -> Facts | str:
+    def facts(self, version: str) -> Facts | str:
         """See `Node`."""
         # Ray hides the GPUs that were not asked for.
         os.environ.pop("CUDA_VISIBLE_DEVICES", None)
-        return super().facts()
+        return super().facts(version)
 
     def clock(self) -> float:
         """Seconds since the epoch."""
