@@ -3,7 +3,7 @@
 `python -m benchmarks.node_scaling` prints a Markdown table for the networks of clusters, with the
 cost model of reductions (`predicted_s`), bandwidths inside a node as measured on H200s
 (`python -m benchmarks.reduction`), and iterations as long as they were in training on one GPU.
-Several nodes with GPUs are not supported yet, so none of it could be measured.
+No machines with GPUs were there to measure any of it.
 """
 
 from __future__ import annotations

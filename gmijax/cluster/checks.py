@@ -6,13 +6,15 @@ import os
 import secrets
 import tempfile
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
 
-from gmijax.cluster.node import ON_GPUS, own_versions
+from gmijax.cluster.node import ON_GPUS, Facts, own_versions
 from gmijax.cluster.ray_nodes import Joined
 from gmijax.errors import ConfigError
+from gmijax.machine.differences import differences_in
+from gmijax.machine.snapshot import Machine
 
 _SHOWS_S = 20.0
 """Network file systems show what others have written late, some after seconds."""
@@ -29,30 +31,32 @@ def by_name(joined: Sequence[Joined]) -> dict[str, Joined]:
     return named
 
 
+def differences_in_versions(nodes: Mapping[str, Facts], unused: Sequence[str] = ()) -> list[str]:
+    """In what versions they differ, in sentences; packages for GPUs count where there are some."""
+    packages = dict.fromkeys(what for facts in nodes.values() for what in facts.versions)
+    found: list[str] = []
+    for what in (package for package in packages if package not in unused):
+        asked = {n: f for n, f in nodes.items() if what not in ON_GPUS or f.machine.gpus}
+        found += differences_in(what, {n: f.versions.get(what) for n, f in asked.items()})
+    return found
+
+
 def require_alike(joined: Sequence[Joined], *, has_tcp: bool = False) -> None:
     """Raises ConfigError if a node has other versions than this machine, or other ones for GPUs.
 
     With `has_tcp` experience goes between nodes, for which pyzmq must be there too.
     """
-    own, first = own_versions(), joined[0]
-    if not has_tcp:
-        del own["pyzmq"]
-    elif own["pyzmq"] is None:
+    # This machine may have no GPUs: it does not use them.
+    here = Facts("", Machine((), ()), own_versions())
+    if has_tcp and here.versions["pyzmq"] is None:
         raise ConfigError(
             "cluster.engine=ray: experience between nodes needs the package pyzmq "
             "(pip install 'gmijax[ray]')"
         )
-    here = dict.fromkeys(own, "this one")
-    for what in ON_GPUS:
-        own[what], here[what] = first.facts.versions.get(what), f"node {first.remote.address}"
-    for node, facts in joined:
-        for what, version in own.items():
-            is_used = what not in ON_GPUS or bool(first.facts.machine.gpus)
-            if is_used and (theirs := facts.versions.get(what)) != version:
-                raise ConfigError(
-                    f"cluster.engine=ray: node {node.address} has {what} {theirs}, {here[what]} "
-                    f"has {version}; all nodes must have the same"
-                )
+    nodes = {name: node.facts for name, node in by_name(joined).items()}
+    unused = () if has_tcp else ("pyzmq",)
+    if problems := differences_in_versions({"this machine": here, **nodes}, unused):
+        raise ConfigError(f"cluster.engine=ray: {problems[0]}; all nodes must have the same")
 
 
 def require_shared(joined: Sequence[Joined], run_root: Path) -> None:

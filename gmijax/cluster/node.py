@@ -32,6 +32,7 @@ from gmijax.errors import (
     GmijaxError,
     ReportedError,
 )
+from gmijax.machine.differences import differences_in
 from gmijax.machine.snapshot import Machine, detect_machine
 from gmijax.supervise.backends import open_backend
 from gmijax.supervise.gmi_process import GmiProcess
@@ -102,8 +103,15 @@ class Node:
             os.chdir(folder)
         self._interface, self._address = interface, address
 
-    def facts(self) -> Facts | str:
-        """What this machine is, or why it cannot take part."""
+    def facts(self, version: str) -> Facts | str:
+        """What this machine is, or why it cannot take part.
+
+        Args:
+          version: of gmijax in the controller; another one may not understand the facts.
+        """
+        versions = {"this machine": version, self._address: __version__}
+        if differ := differences_in("gmijax", versions):
+            return f"cluster.engine=ray: {differ[0]}; all nodes must have the same"
         try:
             address = address_of(self._interface) if self._interface else self._address
             return Facts(address, detect_machine(), own_versions())

@@ -16,6 +16,7 @@ from gmijax.cluster.remote_gmi import LOST_S, RemoteNode
 from gmijax.config import ClusterConfig
 from gmijax.errors import ConfigError, JobInterrupted, lines_of
 from gmijax.machine.processes import ProcessId, identify
+from gmijax.version import __version__
 
 PASSED_ON: Final = ("JAX_", "XLA_", "NCCL_", "OMP_", "OPENBLAS_", "MKL_", "MUJOCO_", "PYTHONPATH")
 """Beginnings of variables of the controller that GMIs on other nodes get; the rest is theirs."""
@@ -135,27 +136,39 @@ class RayCluster:
             self._ray.shutdown()
 
     def _connect(self, address: str) -> None:
-        host, _, port = address.rpartition(":")
+        found = self._found() if address == "auto" else address
+        host, _, port = found.rpartition(":")
         what = f"cluster.address={address}"
-        if port.isdigit():
+        if port.isdigit() and "/" not in host:
+            # Ray would try for minutes.
             try:
                 socket.create_connection((host, int(port)), _CONNECT_S).close()
             except OSError as error:
-                raise ConfigError(f"{what}: nobody answers there ({error})") from None
+                where = "there" if found == address else f"at {found}"
+                raise ConfigError(f"{what}: nobody answers {where} ({error})") from None
         elif address not in ("auto", "local"):
             raise ConfigError(f"{what}: expected auto, local or host:port")
-        options = {"include_dashboard": False} if address == "local" else {}
+        options: dict[str, Any] = {"include_dashboard": False} if address == "local" else {}
         before = signal.getsignal(signal.SIGTERM)
         try:
-            self._ray.init(address=address, log_to_driver=False, logging_level="ERROR", **options)
+            # What Ray has to say of an error is in what it raises.
+            options |= {"log_to_driver": False, "logging_level": "CRITICAL"}
+            self._ray.init(address=address, **options)
         except Exception as error:
             raise ConfigError(
                 f"{what}: no cluster of Ray there ({lines_of(error)[0]}); `ray start --head` "
-                "starts one, `ray start --address=host:port` adds a node"
+                "starts one, `ray start --address=host:port` adds a node, and all need the same "
+                "RAY_AUTH_TOKEN"
             ) from None
         finally:
             if threading.current_thread() is threading.main_thread():
                 signal.signal(signal.SIGTERM, before)  # Ray has put its own there.
+
+    def _found(self) -> str:
+        """What `auto` stands for: also a cluster that has ended, whose address Ray has kept."""
+        with suppress(Exception):  # Not a public function. Without it Ray tries by itself.
+            return self._ray._private.services.get_ray_address_from_environment("auto", None)
+        return "auto"
 
     def _gpus_of_nodes(self, num_cpus: float, least_gpus: int, most_gpus: int | None) -> list[int]:
         """GPUs to be had of each node that has the CPUs, those with the most first."""
@@ -192,13 +205,13 @@ class RayCluster:
     def _joined(self) -> list[Joined]:
         ray = self._ray
         try:
-            asked = [actor.ask.remote("facts") for actor in self._actors]
+            asked = [actor.ask.remote("facts", __version__) for actor in self._actors]
             answers = ray.get(asked, timeout=_ACTORS_S)
         except Exception as error:
             self.leave()
             raise ConfigError(
                 f"cluster.engine=ray: a node cannot start its part of the job "
-                f"({lines_of(error)[-1]}); gmijax must be installed on all nodes"
+                f"({lines_of(error)[-1]}); all nodes must have the same gmijax"
             ) from None
         if problems := [answer for answer in answers if isinstance(answer, str)]:
             self.leave()

@@ -4,15 +4,14 @@ from __future__ import annotations
 
 import os
 import time
-from collections import Counter
 from collections.abc import Iterator, Mapping
 from typing import Any, Final, NamedTuple
 
-from gmijax.cluster.checks import by_name
-from gmijax.cluster.node import ON_GPUS, Facts, Node
+from gmijax.cluster.checks import by_name, differences_in_versions
+from gmijax.cluster.node import Facts, Node
 from gmijax.cluster.ray_nodes import RayCluster
 from gmijax.config import ClusterConfig
-from gmijax.machine.snapshot import Machine
+from gmijax.machine.differences import differences_in, differences_in_gpus, gpu_names
 
 _LITTLE: Final = 0.001
 """Of a CPU: it is asked of each node, and must be had where jobs run."""
@@ -36,11 +35,11 @@ class Surveyed(NamedTuple):
 class SurveyedNode(Node):
     """A node that is only looked at: it sees all GPUs, whoever uses them."""
 
-    def facts(self) -> Facts | str:
+    def facts(self, version: str) -> Facts | str:
         """See `Node`."""
         # Ray hides the GPUs that were not asked for.
         os.environ.pop("CUDA_VISIBLE_DEVICES", None)
-        return super().facts()
+        return super().facts(version)
 
     def clock(self) -> float:
         """Seconds since the epoch."""
@@ -70,25 +69,16 @@ def survey(address: str) -> dict[str, Surveyed]:
 
 def differences(nodes: Mapping[str, Surveyed]) -> tuple[list[str], list[str]]:
     """What a job over these nodes would refuse, and what else is worth knowing, in sentences."""
-    versions = {name: node.facts.versions for name, node in nodes.items()}
-    packages = list(dict.fromkeys(what for one in versions.values() for what in one))
     machines = {name: node.facts.machine for name, node in nodes.items()}
-    on_gpus = [name for name, machine in machines.items() if machine.gpus]
-    problems: list[str] = []
-    for what in packages:
-        asked = on_gpus if what in ON_GPUS else nodes
-        problems += _differs(what, {name: versions[name].get(what) for name in asked})
-    capabilities = {name: machines[name].capabilities for name in on_gpus}
-    problems += _differs("the compute capability of GPUs", capabilities)
-    notes = _differs("GPUs", {name: _gpus(machine) for name, machine in machines.items()})
-    notes += _differs("NVIDIA driver", {n: m.driver_version for n, m in machines.items()})
-    notes += _differs("CPU cores", {n: str(len(m.cpu_cores)) for n, m in machines.items()})
+    problems = differences_in_versions({name: node.facts for name, node in nodes.items()})
+    on_gpus, notes = differences_in_gpus(machines)
+    notes += differences_in("CPU cores", {n: str(len(m.cpu_cores)) for n, m in machines.items()})
     notes += [
         f"the clock of {name} is {node.clock_s:+.1f} s from that of this machine"
         for name, node in nodes.items()
         if abs(node.clock_s) > _CLOCKS_S
     ]
-    return problems, notes
+    return problems + on_gpus, notes
 
 
 def lines_of_nodes(nodes: Mapping[str, Surveyed]) -> Iterator[str]:
@@ -98,7 +88,8 @@ def lines_of_nodes(nodes: Mapping[str, Surveyed]) -> Iterator[str]:
         yield (
             f"node {name}: gmijax {facts.versions['gmijax']}, Python {facts.versions['python']}, "
             f"jax {facts.versions['jax']}, {len(machine.cpu_cores)} CPU cores, NVIDIA driver "
-            f"{machine.driver_version or 'none'}, GPUs {_gpus(machine)}, clock {clock_s:+.3f} s"
+            f"{machine.driver_version or 'none'}, GPUs {gpu_names(machine)}, "
+            f"clock {clock_s:+.3f} s"
         )
 
 
@@ -115,19 +106,3 @@ def nodes_as_data(nodes: Mapping[str, Surveyed]) -> list[dict[str, Any]]:
         }
         for name, node in nodes.items()
     ]
-
-
-def _differs(what: str, of_nodes: Mapping[str, str | None]) -> list[str]:
-    """A sentence, if not all have the same."""
-    having: dict[str, list[str]] = {}
-    for name, value in of_nodes.items():
-        having.setdefault(value or "none", []).append(name)
-    if len(having) < 2:
-        return []
-    shown = "; ".join(f"{value} on {', '.join(names)}" for value, names in having.items())
-    return [f"nodes differ in {what}: {shown}"]
-
-
-def _gpus(machine: Machine) -> str:
-    counts = Counter(gpu.name for gpu in machine.gpus)
-    return ", ".join(f"{count} x {name}" for name, count in counts.items()) or "none"

@@ -38,6 +38,12 @@ class Stage(NamedTuple):
     link: Link
     groups: Groups
 
+    def reads(self, rank: int) -> bool:
+        """Whether somebody gets what this rank has; else it is only given something."""
+        if self.kind == "broadcast" or self.link == "nodes":
+            return not any(rank in group[1:] for group in self.groups)
+        return True
+
 
 def stages(strategy: str, layout: Layout, intra: str = "host") -> Sequence[Stage]:
     """What ranks do one after the other to have the sum over all of them, by strategy.

@@ -59,6 +59,10 @@ class RunConfig(Timeouts):
 
     def __post_init__(self) -> None:
         super().__post_init__()
+        if self.dir is not None and "://" in self.dir:
+            raise ConfigError(
+                f"run.dir={self.dir}: expected the path of a folder; mount what is elsewhere"
+            )
         if self.resume == "auto" and self.dir is None and self.name is None:
             raise ConfigError("run.resume=auto: needs run.dir or run.name, the folder to go on in")
 

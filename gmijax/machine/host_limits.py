@@ -39,7 +39,7 @@ GMIS_PER_CORE = 16
 for its core longer than it computes, and twice as many would compile at a time."""
 
 
-class Host(NamedTuple):
+class HostLimits(NamedTuple):
     """Free resources for the GMIs of a job, None where unknown or unlimited."""
 
     # Of the machine, or of the control group that this process is in.
@@ -48,16 +48,16 @@ class Host(NamedTuple):
     open_files: int | None = None  # That this process may still open.
 
 
-UNKNOWN_HOST: Final = Host()
+UNKNOWN_HOST: Final = HostLimits()
 """Takes any number of GMIs."""
 
 
-def detect_host() -> Host:
+def detect_host() -> HostLimits:
     """Looks at this machine, and at the limits that this process is under."""
     groups = CgroupLimits()
     page_mib = os.sysconf("SC_PAGE_SIZE") / 2**20
     open_files = resource.getrlimit(resource.RLIMIT_NOFILE)[0]
-    return Host(
+    return HostLimits(
         memory_mib=_least(os.sysconf("SC_PHYS_PAGES") * page_mib, groups.memory_mib()),
         threads=_least(_threads_of_user(), _threads_of_machine(), groups.threads()),
         open_files=None
@@ -66,7 +66,9 @@ def detect_host() -> Host:
     )
 
 
-def require_room(num_gmis: int, what: str, host: Host, num_cores: int, *, on_cpu: bool) -> None:
+def require_room(
+    num_gmis: int, what: str, host: HostLimits, num_cores: int, *, on_cpu: bool
+) -> None:
     """Raises ConfigError if a job has more GMIs than the host takes; one is always allowed.
 
     Args:
@@ -158,7 +160,7 @@ class CgroupLimits:
 
 
 def _needs(
-    num_gmis: int, host: Host, num_cores: int, *, on_cpu: bool
+    num_gmis: int, host: HostLimits, num_cores: int, *, on_cpu: bool
 ) -> Iterator[tuple[int, str]]:
     """For how many GMIs each thing is enough, and what to say if that is too few."""
 

@@ -12,7 +12,7 @@ from pathlib import Path
 from gmijax.machine.host_limits import (
     UNKNOWN_HOST,
     CgroupLimits,
-    Host,
+    HostLimits,
     detect_host,
     usable_cores,
 )
@@ -49,7 +49,7 @@ class Machine:
     operator_daemon: Path | None = None
     # The same for a job of a sweep, by UUID of the GPU or MIG instance.
     daemons: Mapping[str, Path] = field(default_factory=dict)
-    host: Host = UNKNOWN_HOST  # What is left of memory, threads and open files.
+    host: HostLimits = UNKNOWN_HOST  # What is left of memory, threads and open files.
     # Why there are no GPUs although NVIDIA's driver is there; None where it works, there is none,
     # or the user hides all GPUs.
     gpu_problem: str | None = None

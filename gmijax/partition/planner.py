@@ -11,8 +11,13 @@ from gmijax.machine.host_limits import require_room
 from gmijax.machine.nvidia import Gpu
 from gmijax.machine.snapshot import Machine
 from gmijax.partition.backend_choice import choose_backend, choose_gpus, require_backend
-from gmijax.partition.hosts import Host, divided_between_nodes, hosts_of, on_nodes
 from gmijax.partition.layout import Layout
+from gmijax.partition.node_layouts import (
+    NodeLayout,
+    divided_between_nodes,
+    node_layouts,
+    on_nodes,
+)
 from gmijax.partition.plan import Plan, Slice
 from gmijax.partition.reduction import (
     is_one_per_gpu,
@@ -60,10 +65,10 @@ def make_plan(
     chosen = template if plan.template == "auto" else plan.template
     if nodes is not None:
         layout = on_nodes(layout, chosen, nodes, reasons)
-    hosts = hosts_of(layout, machine, nodes)
-    backend = _backend(plan, hosts, chosen in ("tcg", "tdg"), reasons)
+    of_nodes = node_layouts(layout, machine, nodes)
+    backend = _backend(plan, of_nodes, chosen in ("tcg", "tdg"), reasons)
     roles = roles_of(chosen, layout, trainers)
-    slices, gpus = _slices(plan, hosts, backend, roles, reasons)
+    slices, gpus = _slices(plan, of_nodes, backend, roles, reasons)
     if plan.template == "auto":
         reasons.append(f"template {chosen}: {DESCRIPTIONS[chosen]}")
     strategy, intra = _reduction(reduce, layout, roles, backend, reasons)
@@ -77,7 +82,7 @@ def make_plan(
         intra=intra,
         roles=roles,
         reasons=tuple(reasons),
-        self_check=_self_check(plan, slices, backend, hosts),
+        self_check=_self_check(plan, slices, backend, of_nodes),
         may_share=_may_share(plan, gpus, backend),
         nodes=tuple(nodes or ()),
     )
@@ -102,7 +107,7 @@ def num_gmis_of(plan: PlanConfig) -> tuple[int, str]:
 
 def _slices(
     plan: PlanConfig,
-    hosts: Sequence[Host],
+    of_nodes: Sequence[NodeLayout],
     backend: BackendName,
     roles: Sequence[str],
     reasons: list[str],
@@ -111,19 +116,19 @@ def _slices(
     slices: dict[int, Slice] = {}
     chosen: list[Gpu] = []
     num_gpus = 0
-    for place, host in enumerate(hosts):
-        here, gpus = host.layout, ()
+    for place, node in enumerate(of_nodes):
+        here, gpus = node.layout, ()
         said = [] if place else reasons  # What is said of all is said once.
-        with host.named():
-            if host.name is not None:
-                what = f"cluster.nodes={len(hosts)}"
-                require_host(here.num_gmis, what, plan, host.machine)
+        with node.named():
+            if node.name is not None:
+                what = f"cluster.nodes={len(of_nodes)}"
+                require_host(here.num_gmis, what, plan, node.machine)
             if backend != "cpu":
-                gpus = choose_gpus(plan, here, host.machine, backend, said)
-            theirs = [roles[gmi] for gmi in host.gmis]
-            shares = make_slices(plan, here, gpus, backend, host.machine, theirs, said)
+                gpus = choose_gpus(plan, here, node.machine, backend, said)
+            theirs = [roles[gmi] for gmi in node.gmis]
+            shares = make_slices(plan, here, gpus, backend, node.machine, theirs, said)
         for share in shares:
-            gmi, gpu = host.gmis[share.gmi], share.gpu + num_gpus
+            gmi, gpu = node.gmis[share.gmi], share.gpu + num_gpus
             slices[gmi] = dataclasses.replace(share, gmi=gmi, gpu=gpu)
         chosen += gpus
         num_gpus += here.num_gpus
@@ -147,19 +152,19 @@ def _layout(plan: PlanConfig) -> Layout:
 
 
 def _backend(
-    plan: PlanConfig, hosts: Sequence[Host], serves: bool, reasons: list[str]
+    plan: PlanConfig, of_nodes: Sequence[NodeLayout], serves: bool, reasons: list[str]
 ) -> BackendName:
     """The backend of all machines."""
     if plan.backend != "auto":
-        for host in hosts:
-            with host.named():
-                require_backend(plan.backend, host.machine)
+        for node in of_nodes:
+            with node.named():
+                require_backend(plan.backend, node.machine)
         return plan.backend
     found: dict[BackendName, tuple[str, str | None]] = {}
-    for host in hosts:
-        with host.named():
-            backend, why = choose_backend(plan, host.layout, host.machine, serves=serves)
-        found.setdefault(backend, (why, host.name))
+    for node in of_nodes:
+        with node.named():
+            backend, why = choose_backend(plan, node.layout, node.machine, serves=serves)
+        found.setdefault(backend, (why, node.name))
     if len(found) > 1 and found.keys() != {"mps", "share"}:
         differ = ", ".join(f"{backend} on {name}" for backend, (_, name) in found.items())
         raise ConfigError(f"plan.backend=auto: would be {differ}; give the one that all can have")
@@ -171,12 +176,12 @@ def _backend(
 
 
 def _self_check(
-    plan: PlanConfig, slices: Sequence[Slice], backend: BackendName, hosts: Sequence[Host]
+    plan: PlanConfig, slices: Sequence[Slice], backend: BackendName, of_nodes: Sequence[NodeLayout]
 ) -> bool:
     if plan.self_check != "auto":
         return plan.self_check == "on"
     # A daemon of somebody else may cap all its clients by default, and does not tell.
-    is_theirs = backend == "mps" and any(host.machine.operator_daemon for host in hosts)
+    is_theirs = backend == "mps" and any(node.machine.operator_daemon for node in of_nodes)
     return is_theirs or any((share.sm_percent or 100.0) < 100.0 for share in slices)
 
 

@@ -13,6 +13,7 @@ from gmijax.errors import (
     CollectiveTimeout,
     GmiFailed,
     GmijaxError,
+    NodeLost,
     PeerLost,
     PipeClosed,
     ReportedError,
@@ -35,6 +36,8 @@ def describe_exit(
     if exit_code == -signal.SIGKILL and not own:
         own = "not killed by gmijax; perhaps the machine ran out of memory"
     reason = f"{how}: {own}" if own else how
+    if error and error.type == NodeLost.__name__:
+        reason = own  # Nobody saw how it ended.
     return GmiFailed(gmi, reason, iteration=iteration, error=error, exit_code=exit_code)
 
 

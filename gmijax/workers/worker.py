@@ -131,20 +131,23 @@ def _run_asynchronous(
     sizes = num_weights(env.spec, config.algo), num_counts(env)
     registers = open_job_registers(required_fd(ENV_REGISTERS_FD), *sizes, len(agents.gmis))
     topology, (nodes, listener) = topology_of(plan), inherited_nodes()
-    if nodes is not None and listener is not None:
-        held.callback(listener.close)
+    if nodes is not None:
         addresses = {(agent, trainer): at for (trainer, agent), at in nodes.calls.items()}
         topology = replace(topology, addresses=addresses, secret=nodes.token)
         at_leader = agents.gmis, trainers.gmis[0], held
         registers = over_nodes(registers, sizes, nodes, link.gmi, *at_leader)
     channels = config.channel, topology, link.gmi, required_fd(ENV_CHANNELS_FD)
     if link.gmi in agents.gmis:
+        if listener is not None:
+            listener.close()  # It is for trainers.
         sender = open_sender(*channels)
         held.callback(sender.close)
         return Agent(config, env, place, trainers.gmis, registers, sender, link).run()
     receiver = open_receiver(*channels)
     held.callback(receiver.close)
     reducer = _trainers_reducer(config, plan, trainers, link, env, A3cLosses, nodes, listener)
+    if listener is not None:
+        listener.close()  # Trainers that are all on one node do not meet others.
     held.callback(reducer.close)
     trainer = Trainer(config, env, agents.gmis, registers, receiver, reducer, link)
     return trainer.run() | exchange_used(plan, reducer)

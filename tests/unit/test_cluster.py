@@ -7,6 +7,7 @@ import json
 import os
 import signal
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -81,6 +82,7 @@ def joined(node: RemoteNode, versions: dict[str, str | None] | None = None) -> l
         (("cluster.engine=ray", "plan.template=tdg_ex"), "template=tdg_ex: not with cluster"),
         (("cluster.engine=ray", "plan.gpus=[1]"), r"gpus=\[1\]: Ray chooses the GPUs of nodes"),
         (("cluster.engine=ray", "num_envs=auto"), "num_envs=auto: a search is for one machine"),
+        (("run.dir=gs://bucket/run",), "run.dir=gs://bucket/run: expected the path of a folder"),
         (("cluster.nodes=0",), "cluster.nodes=0: must be at least 1"),
     ],
 )
@@ -96,6 +98,7 @@ def test_without_ray_or_a_cluster_the_line_says_what_to_do(
 ) -> None:
     class Ray:
         is_initialized = staticmethod(lambda: False)
+        _private: Any = None
 
         @staticmethod
         def init(**_: Any) -> None:
@@ -108,6 +111,11 @@ def test_without_ray_or_a_cluster_the_line_says_what_to_do(
         RayCluster(ClusterConfig(address="127.0.0.1:1"), Node)
     with pytest.raises(ConfigError, match="expected auto, local or host:port"):
         RayCluster(ClusterConfig(address="somewhere"), Node)
+    Ray._private = SimpleNamespace(
+        services=SimpleNamespace(get_ray_address_from_environment=lambda *_: "127.0.0.1:1")
+    )
+    with pytest.raises(ConfigError, match=r"address=auto: nobody answers at 127\.0\.0\.1:1 \("):
+        RayCluster(ClusterConfig(), Node)
     monkeypatch.undo()
     real = builtins.__import__
 
@@ -160,8 +168,17 @@ def test_several_nodes_of_a_machine_have_names_of_their_own() -> None:
 
 def test_nodes_with_other_versions_are_refused() -> None:
     nodes = joined(a_node(), {**own_versions(), "jax": "0.1"})
-    with pytest.raises(ConfigError, match=r"node 10\.0\.0\.2 has jax 0\.1, this one has"):
+    with pytest.raises(ConfigError, match=r"in jax: .* on this machine; 0\.1 on 10\.0\.0\.2;"):
         require_alike(nodes)
+
+
+def test_a_node_with_another_gmijax_says_so_before_all_else(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    node = Node({}, str(tmp_path), None, "10.0.0.2")
+    assert "differ in gmijax: 9.9 on this machine; " in str(node.facts("9.9"))
+    assert isinstance(node.facts(str(own_versions()["gmijax"])), Facts)
 
 
 def test_packages_for_gpus_are_compared_between_nodes_that_have_some() -> None:
@@ -172,7 +189,7 @@ def test_packages_for_gpus_are_compared_between_nodes_that_have_some() -> None:
     ]
     nodes = [Joined(RemoteNode(a_node().call, 0, one.address), one) for one in facts]
     require_alike(nodes[:1])
-    with pytest.raises(ConfigError, match=r"node b has cuda-bindings 13\.1, node a has 13\.0"):
+    with pytest.raises(ConfigError, match=r"differ in cuda-bindings: 13\.0 on a; 13\.1 on b;"):
         require_alike(nodes)
     without = [Joined(one.remote, one.facts._replace(machine=machine(0))) for one in nodes]
     require_alike(without)
@@ -250,7 +267,7 @@ def test_a_lost_node_is_the_cause_that_its_gmis_give(tmp_path: Path) -> None:
     while gmi.poll() is None:
         pass
     failure = describe_exit(2, gmi.exit_code or 0, gmi.error, gmi.paths.stderr)
-    assert "NodeLost: node 1 (10.0.0.2) is gone: its node has died" in failure.reason
+    assert failure.reason == "NodeLost: node 1 (10.0.0.2) is gone: its node has died"
     assert not is_consequence(failure)
     assert gmi.request_stacks() is None
     gmi.kill()

@@ -12,14 +12,14 @@ from supervision import MPS, machine, planned
 import gmijax
 from gmijax.errors import ConfigError
 from gmijax.machine import host_limits
-from gmijax.machine.host_limits import CgroupLimits, Host, detect_host, usable_cores
+from gmijax.machine.host_limits import CgroupLimits, HostLimits, detect_host, usable_cores
 from gmijax.machine.snapshot import Machine, detect_machine
 from gmijax.supervise.kinds import training_plan
 
-SMALL = Host(memory_mib=24 * 1024, threads=30_000, open_files=20_000)
+SMALL = HostLimits(memory_mib=24 * 1024, threads=30_000, open_files=20_000)
 
 
-def two_cores(host: Host = SMALL) -> Machine:
+def two_cores(host: HostLimits = SMALL) -> Machine:
     return Machine((), (0, 1), host=host)
 
 
@@ -55,12 +55,12 @@ def test_too_many_agents_or_trainers_are_refused(side: str):
 @pytest.mark.parametrize(
     ("host", "needs", "most"),
     [
-        (Host(memory_mib=2048), "4.69 GiB of memory (there are 2 GiB)", 3),
-        (Host(threads=100), "192 threads (100 may still be started)", 4),
-        (Host(open_files=84), "96 open files (84 may still be opened, see ulimit -n)", 5),
+        (HostLimits(memory_mib=2048), "4.69 GiB of memory (there are 2 GiB)", 3),
+        (HostLimits(threads=100), "192 threads (100 may still be started)", 4),
+        (HostLimits(open_files=84), "96 open files (84 may still be opened, see ulimit -n)", 5),
     ],
 )
-def test_each_limit_is_told(host: Host, needs: str, most: int):
+def test_each_limit_is_told(host: HostLimits, needs: str, most: int):
     with pytest.raises(ConfigError) as error:
         planned(two_cores(host), gmis_per_gpu=8)
     assert str(error.value) == (
@@ -71,7 +71,7 @@ def test_each_limit_is_told(host: Host, needs: str, most: int):
 
 def test_what_there_is_room_for_is_planned_and_one_may_always_try():
     assert planned(two_cores(), gmis_per_gpu=32).layout.num_gmis == 32
-    tiny = two_cores(Host(memory_mib=128, threads=2, open_files=10))
+    tiny = two_cores(HostLimits(memory_mib=128, threads=2, open_files=10))
     assert planned(tiny).layout.num_gmis == 1
 
 
@@ -90,7 +90,7 @@ def test_roles_are_refused_too(monkeypatch: pytest.MonkeyPatch, tmp_path: Path):
     with pytest.raises(ConfigError, match=r"^plan\.gmis_per_gpu=1000: 1000 GMIs"):
         gmijax.plan(gmis_per_gpu=1000)
     monkeypatch.chdir(tmp_path)
-    tiny = two_cores(Host(memory_mib=700))
+    tiny = two_cores(HostLimits(memory_mib=700))
     monkeypatch.setattr("gmijax.roles.launch.detect_machine", lambda: tiny)
     with pytest.raises(ConfigError, match=r"^plan: 2 GMIs on this machine .* at most 1$"):
         gmijax.launch(fits, Idle())

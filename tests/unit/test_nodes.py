@@ -4,20 +4,24 @@ from __future__ import annotations
 
 import os
 import socket
+import sys
 import threading
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack
+from types import ModuleType
 from typing import Any
 
 import numpy as np
 import pytest
 
 from gmijax.collectives.build import Membership, SharedReducer, build_reducer
+from gmijax.collectives.host.host_links import HostLinks
 from gmijax.collectives.host.shared_block import MAX_GATHER_FLOATS, create_exchange
 from gmijax.collectives.nodes import meeting
 from gmijax.collectives.nodes.meeting import Nodes, connect, listen
 from gmijax.collectives.nodes.mesh import Mesh
+from gmijax.collectives.nodes.node_exchange import NodeExchange
 from gmijax.collectives.strategies import COSTS, Stage, nodes_s, predicted_s, stages
 from gmijax.errors import CollectiveError, CollectiveTimeout, ConfigError, PeerLost
 from gmijax.partition.layout import Layout
@@ -213,3 +217,25 @@ def test_the_stages_of_nodes_are_those_of_har_on_as_many_gpus() -> None:
     assert "in each node its rings go" in str(
         why_not_strategy("mrr", Layout.even(1, 2).on_nodes(2))
     )
+
+
+@pytest.mark.parametrize("rank", range(4))
+def test_only_leaders_copy_their_numbers_from_the_gpu_for_the_sum_of_nodes(
+    rank: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    node = Stage("sum", "nodes", ((0, 1), (2, 3)))
+    back = Stage("broadcast", "host", ((1, 0), (2,)))
+    assert [node.reads(rank), back.reads(rank)] == [rank in (0, 2), rank != 0]
+    assert Stage("sum", "host", ((0, 1, 2, 3),)).reads(rank)
+
+    did: list[str] = []
+    queue: Any = ModuleType("cuda_queue")
+    queue.pinned = lambda num_floats: np.zeros(num_floats, np.float32)
+    for name in ("fetch", "synchronize", "store"):
+        setattr(queue, name, lambda *_, name=name: did.append(name))
+    monkeypatch.setitem(sys.modules, "gmijax.collectives.device.cuda_queue", queue)
+    host = NodeExchange.__new__(NodeExchange)
+    host.rank = rank
+    monkeypatch.setattr(NodeExchange, "sum_of_nodes", lambda *_: did.append("sum"))
+    HostLinks(host, 8).reduce(node, 1, 0, 0, 0, 8)
+    assert did == ["fetch" if rank in (0, 2) else "synchronize", "sum", "store"]

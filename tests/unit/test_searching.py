@@ -23,7 +23,7 @@ from gmijax.autotune.workloads import PpoWorkload, Workload
 from gmijax.cli.compose import compose
 from gmijax.config import TrainConfig
 from gmijax.errors import ConfigError, JobInterrupted
-from gmijax.machine.host_limits import Host
+from gmijax.machine.host_limits import HostLimits
 from gmijax.machine.snapshot import Machine
 
 Answer = Callable[[Point, str], Measured | NotRunnable]
@@ -140,7 +140,7 @@ def test_what_cannot_run_is_told_and_remembered(profiles: Use):
 def test_points_for_which_the_host_is_too_small_are_told_and_not_started(
     profiles: Use,
 ):
-    few = machine(0, host=Host(memory_mib=1500))
+    few = machine(0, host=HostLimits(memory_mib=1500))
     asked = profiles(scaling)
     result, said = found(here=few)
     assert result.gmis_per_gpu == 2

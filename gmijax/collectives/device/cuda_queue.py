@@ -157,7 +157,7 @@ def fetch(stream: int, source: int, target: npt.NDArray[np.float32]) -> None:
     kind = runtime.cudaMemcpyKind.cudaMemcpyDeviceToHost
     copied = runtime.cudaMemcpyAsync(target.ctypes.data, source, target.nbytes, kind, stream)
     checked(copied, "copy from the GPU")
-    checked(runtime.cudaStreamSynchronize(stream), "copy from the GPU")
+    synchronize(stream)
 
 
 def store(stream: int, target: int, values: npt.NDArray[np.float32]) -> None:
@@ -165,4 +165,9 @@ def store(stream: int, target: int, values: npt.NDArray[np.float32]) -> None:
     kind = runtime.cudaMemcpyKind.cudaMemcpyHostToDevice
     copied = runtime.cudaMemcpyAsync(target, values.ctypes.data, values.nbytes, kind, stream)
     checked(copied, "copy to the GPU")
-    checked(runtime.cudaStreamSynchronize(stream), "copy to the GPU")
+    synchronize(stream)
+
+
+def synchronize(stream: int) -> None:
+    """Waits until the device has done what the stream was given."""
+    checked(runtime.cudaStreamSynchronize(stream), "wait for the GPU")

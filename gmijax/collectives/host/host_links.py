@@ -64,12 +64,17 @@ class HostLinks:
         started = time.monotonic()
         try:
             if stream:
-                from gmijax.collectives.device.cuda_queue import fetch, store
+                from gmijax.collectives.device.cuda_queue import fetch, store, synchronize
 
                 # Free again on return: `store` waits, and the host takes one exchange at a time.
                 values = self._buffer("source", num_floats)
                 result = self._buffer("target", rows * num_floats)
-                fetch(stream, source, values)
+                if stage.reads(self._host.rank):
+                    fetch(stream, source, values)
+                else:
+                    synchronize(
+                        stream
+                    )  # Who meets the others has computed, as with numbers to give.
                 self._reduce(stage, place, values, result)
                 store(stream, target, result)
             else:

@@ -10,12 +10,13 @@ from typing import NamedTuple
 from gmijax.config import TemplateName
 from gmijax.config.plan import MAX_GMIS
 from gmijax.errors import ConfigError
+from gmijax.machine.differences import differences_in_gpus
 from gmijax.machine.snapshot import Machine
 from gmijax.partition.layout import Layout
 from gmijax.partition.plan import Slice
 
 
-class Host(NamedTuple):
+class NodeLayout(NamedTuple):
     """A machine of a job, and which GMIs it has.
 
     Attributes:
@@ -41,14 +42,14 @@ class Host(NamedTuple):
             raise type(error)(f"node {self.name}: {error}") from None
 
 
-def hosts_of(
+def node_layouts(
     layout: Layout, machine: Machine, nodes: Mapping[str, Machine] | None
-) -> tuple[Host, ...]:
+) -> tuple[NodeLayout, ...]:
     """This machine, or the nodes, in order; `layout` is that of the whole job."""
     if nodes is None:
-        return (Host(None, machine, layout, tuple(layout.gmis)),)
+        return (NodeLayout(None, machine, layout, tuple(layout.gmis)),)
     return tuple(
-        Host(name, theirs, layout.of_node(place), layout.gmis_of_node[place])
+        NodeLayout(name, theirs, layout.of_node(place), layout.gmis_of_node[place])
         for place, (name, theirs) in enumerate(nodes.items())
     )
 
@@ -61,7 +62,12 @@ def on_nodes(
     Raises:
       ConfigError: more GMIs than are allowed, or GPUs that are too different.
     """
-    _compare_gpus(nodes, reasons)
+    problems, notes = differences_in_gpus(nodes)
+    if problems:
+        raise ConfigError(
+            f"cluster.engine=ray: {problems[0]}; GMIs that learn together need the same"
+        )
+    reasons += [f"warning: {note}" for note in notes]
     is_whole = template == "decoupled"
     if (num_gmis := layout.num_gmis * (1 if is_whole else len(nodes))) > MAX_GMIS:
         raise ConfigError(
@@ -88,25 +94,3 @@ def divided_between_nodes(slices: Sequence[Slice], reasons: list[str]) -> list[S
     if divided != list(slices):
         reasons.append("nodes of one machine have the same GPUs, and divide their memory")
     return divided
-
-
-def _compare_gpus(nodes: Mapping[str, Machine], reasons: list[str]) -> None:
-    """Refuses GPUs that would compute other bits, and says what else differs about them."""
-    (first, one), *others = nodes.items()
-    for name, other in others:
-        if one.capabilities != other.capabilities:
-            raise ConfigError(
-                f"cluster.engine=ray: node {name} has GPUs of compute capability "
-                f"{other.capabilities}, node {first} {one.capabilities}; GMIs that learn "
-                "together need the same"
-            )
-        for what, ours, theirs in (
-            ("GPUs", _names(one), _names(other)),
-            ("NVIDIA driver", one.driver_version, other.driver_version),
-        ):
-            if one.gpus and ours != theirs:
-                reasons.append(f"warning: node {name} has {what} {theirs}, node {first} {ours}")
-
-
-def _names(machine: Machine) -> str:
-    return ", ".join(sorted({gpu.name for gpu in machine.gpus}))
