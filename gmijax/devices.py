@@ -37,6 +37,11 @@ def host_sharding() -> Sharding | None:
     return SingleDeviceSharding(device, memory_kind="pinned_host")
 
 
+def memory_limit_bytes() -> int | None:
+    """What this process's device gives it at most; None where the device does not say."""
+    return (jax.local_devices()[0].memory_stats() or {}).get("bytes_limit")
+
+
 def describe_device() -> dict[str, Any]:
     """Platform, kind and peak memory of this process's device, for `summary.json`."""
     device = jax.local_devices()[0]

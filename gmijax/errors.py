@@ -64,7 +64,7 @@ class ReportedError(NamedTuple):
       type: its class.
       message: of the exception.
       traceback: with the message, as Python prints it.
-      missing: the ranks that it waited for in vain, of a `CollectiveTimeout`.
+      missing: ids of the GMIs that it waited for in vain, of a `CollectiveTimeout`.
     """
 
     type: str
@@ -114,7 +114,7 @@ class CollectiveError(GmijaxError):
 
 
 class PeerLost(CollectiveError):
-    """The process of another GMI, of rank `peer`, is gone."""
+    """The process of another GMI, of id `peer`, is gone."""
 
     def __init__(self, rank: int, peer: int, operation: str, step: int) -> None:
         super().__init__(f"rank {rank}: peer {peer} is gone during {operation}, step {step}")
@@ -122,7 +122,7 @@ class PeerLost(CollectiveError):
 
 
 class CollectiveTimeout(CollectiveError):
-    """Other GMIs, those of the ranks in `missing`, did not arrive in time."""
+    """Other GMIs, those of the ids in `missing`, did not arrive in time."""
 
     def __init__(
         self, rank: int, missing: tuple[int, ...], operation: str, step: int, timeout_s: float

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Sequence
 
 from gmijax.collectives.host.host_exchange import HostExchange
 from gmijax.collectives.host.shared_block import create_exchange
@@ -11,7 +12,10 @@ from gmijax.collectives.messages.pipe_block import PipeBlock, create_pipes
 
 
 def host_ranks(
-    *num_floats: int, timeout_s: float = 20.0, start_s: float | None = None, first_rank: int = 0
+    *num_floats: int,
+    timeout_s: float = 20.0,
+    start_s: float | None = None,
+    ids: Sequence[int] | None = None,
 ) -> list[HostExchange]:
     """A rank for each of `num_floats`, the length of its largest buffer."""
     fd = create_exchange()
@@ -20,7 +24,7 @@ def host_ranks(
             *(fd, rank, len(num_floats), size),
             timeout_s=timeout_s,
             rendezvous_timeout_s=start_s or timeout_s,
-            first_rank=first_rank,
+            ids=ids,
         )
         for rank, size in enumerate(num_floats)
     ]

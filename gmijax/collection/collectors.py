@@ -32,8 +32,9 @@ from gmijax.collectives.messages.pipe import Message, PipeReader, PipeWriter
 from gmijax.collectives.messages.pipe_block import PipeBlock
 from gmijax.config import ServeConfig
 from gmijax.errors import PipeClosed
+from gmijax.learning.start import begin_episodes
 from gmijax.learning.unroll import Counts, no_counts
-from gmijax.sim.wrappers import BatchedEnv, BatchState, env_keys
+from gmijax.sim.wrappers import BatchedEnv, BatchState
 from gmijax.supervise.child import ChildLink
 
 WARM_UP_STEPS = 10
@@ -72,8 +73,10 @@ class Share(NamedTuple):
         many unrolls were there before: a job that goes on makes other episodes, not the same.
         """
         key = jax.random.fold_in(jax.random.key(self.config.seed), self.first_unroll)
-        keys = env_keys(key, self.rank * self.config.envs_per_gmi, self.config.envs_per_gmi)
-        return jax.jit(self.env.init)(self.env.model, keys)
+        num_envs = self.config.envs_per_gmi
+        kept_steps = self.config.unroll_length if self.keep.steps else 0
+        first_env = self.rank * num_envs
+        return begin_episodes(self.env, key, first_env, num_envs, kept_steps=kept_steps)
 
     def record(self, unrolls: Iterable[tuple[Step | None, Counts]]) -> dict[str, Any]:
         """Takes unrolls until there are no more; returns the outcome for `result.json`."""

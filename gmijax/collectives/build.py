@@ -35,7 +35,7 @@ class Membership:
     """What is needed to build the reducer of one rank.
 
     Attributes:
-      layout: where all ranks live; the rank of a GMI is its id.
+      layout: where all ranks live.
       rank: this GMI's.
       num_floats: P, length of the largest buffer whose mean is taken.
       exchange_fd: descriptor of the shared block of this node, None where there is one rank.
@@ -46,6 +46,7 @@ class Membership:
         of GPUs cannot be shared.
       nodes: in a job on several nodes what its leaders know of each other.
       listener: the node's listening socket, in such a job; its leader's from here on.
+      gmis: ids in the job of all ranks' GMIs, by which errors name them; None: their ranks.
     """
 
     layout: Layout
@@ -58,6 +59,7 @@ class Membership:
     host_if_unavailable: bool = False
     nodes: Nodes | None = None
     listener: socket.socket | None = None
+    gmis: Sequence[int] | None = None
 
 
 def build_reducer(strategy: str, membership: Membership) -> Reducer:
@@ -162,14 +164,14 @@ class SoloReducer:
 def _lanes(membership: Membership) -> Sequence[_Lane]:
     assert membership.exchange_fd is not None
     layout, rank = membership.layout, membership.rank
-    here = layout.gmis_of_node[layout.node_of(rank)]
+    here, ids = layout.gmis_of_node[layout.node_of(rank)], _ids(membership)
     lanes = [
         HostExchange(
             *(membership.exchange_fd, here.index(rank), len(here), _room(membership)),
             timeout_s=membership.timeout_s,
             rendezvous_timeout_s=membership.rendezvous_timeout_s,
             lane=lane,
-            first_rank=here[0],
+            ids=[ids[other] for other in here],
         )
         for lane in range(LANES)
     ]
@@ -188,9 +190,10 @@ def _over_nodes(
         if rank != leader:
             return [NodeExchange(lane, layout, rank, None) for lane in lanes]
         sockets = connect(nodes, listener, len(lanes), membership.rendezvous_timeout_s)
+    leaders = [_ids(membership)[ranks[0]] for ranks in layout.gmis_of_node]
     meshes = [
         Mesh(
-            *(connections, nodes.node, [gmis[0] for gmis in layout.gmis_of_node]),
+            *(connections, nodes.node, leaders),
             timeout_s=membership.timeout_s,
             rendezvous_timeout_s=membership.rendezvous_timeout_s,
             on_wait=lane.beat,
@@ -200,6 +203,10 @@ def _over_nodes(
     return [
         NodeExchange(lane, layout, rank, mesh) for lane, mesh in zip(lanes, meshes, strict=True)
     ]
+
+
+def _ids(membership: Membership) -> Sequence[int]:
+    return membership.layout.gmis if membership.gmis is None else membership.gmis
 
 
 def _room(membership: Membership) -> int:

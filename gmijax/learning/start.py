@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 
 import jax
 import jax.numpy as jnp
 
 from gmijax.config import ServeConfig, TrainConfig
+from gmijax.devices import memory_limit_bytes
+from gmijax.errors import ConfigError
 from gmijax.learning.checkpoint import has_envs, restore_envs, restore_learner
 from gmijax.learning.learner import Learner, TrainState, init_learner
+from gmijax.machine.host_limits import detect_host
 from gmijax.runs.folder import RunPaths, read_json
 from gmijax.runs.resume import CheckpointMeta
 from gmijax.sim.interface import Env
@@ -79,6 +83,9 @@ def first_envs(
       place: number of this GMI among those that simulate.
       gmi: whose environments of a checkpoint to take, None for nobody's.
       num_gmis: only from a checkpoint of so many GMIs, None for any.
+
+    Raises:
+      ConfigError: more environments than memory can hold.
     """
     num_envs = config.envs_per_gmi
     key = _keys(config.seed)[1]
@@ -86,8 +93,9 @@ def first_envs(
     meta = None if resume is None else CheckpointMeta.read(resume)
     if meta is not None:  # Other environments than the first run's: never its starts again.
         key = jax.random.fold_in(key, meta.env_steps % 2**31)
-    keys = env_keys(key, place * num_envs, num_envs)
-    env_state = jax.jit(env.init)(env.model, keys)
+    env_state = begin_episodes(
+        env, key, place * num_envs, num_envs, kept_steps=config.algo.unroll_length
+    )
     if resume is None or meta is None or gmi is None or not has_envs(resume, gmi):
         return env_state
     if num_gmis not in (None, meta.num_gmis):
@@ -95,3 +103,39 @@ def first_envs(
     if (meta.num_envs, meta.impl) != (num_envs, config.physics.impl):
         return env_state
     return restore_envs(resume, gmi, env_state)
+
+
+def begin_episodes(
+    env: BatchedEnv, key: PRNGKey, first_env: int, num_envs: int, *, kept_steps: int
+) -> BatchState:
+    """Environments `first_env` to `first_env + num_envs - 1` of a job at their starts.
+
+    `kept_steps` are the steps of all of them whose experience is in memory at once.
+
+    Raises:
+      ConfigError: the state of so many environments, and their experience, which is the least
+        that a job needs, are more than the memory of the device (on a CPU, of the host).
+    """
+    init = jax.jit(env.init)
+    # Before anything of that size is made. It is traced once: the call below finds it.
+    keys = jax.ShapeDtypeStruct((num_envs,), key.dtype)
+    state = jax.tree.leaves(init.eval_shape(env.model, keys))
+    step_floats = env.spec.obs_size + env.spec.action_size + 1  # And the reward.
+    least_bytes = sum(math.prod(leaf.shape) * leaf.dtype.itemsize for leaf in state)
+    least_bytes += num_envs * kept_steps * step_floats * jnp.dtype(jnp.float32).itemsize
+    limit_bytes = _memory_bytes()
+    if limit_bytes is not None and least_bytes > limit_bytes:
+        raise ConfigError(
+            f"num_envs={num_envs}: a GMI would need more than {least_bytes / 2**30:.3g} GiB for "
+            f"them and {kept_steps} steps of each, and has {limit_bytes / 2**30:.3g} GiB; allowed "
+            f"are less than {int(limit_bytes * num_envs / least_bytes)}"
+        )
+    return init(env.model, env_keys(key, first_env, num_envs))
+
+
+def _memory_bytes() -> float | None:
+    """Memory that this process may use for arrays; None where that is unknown."""
+    if jax.local_devices()[0].platform != "cpu":
+        return memory_limit_bytes()
+    host_mib = detect_host().memory_mib
+    return None if host_mib is None else host_mib * 2**20

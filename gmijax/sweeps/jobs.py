@@ -21,6 +21,8 @@ from gmijax.sweeps.places import Place
 
 State: TypeAlias = Literal["waiting", "running", "completed", "failed", "pruned", "interrupted"]
 
+_RETURNS = ("return", "eval/return")
+
 DIGITS = 3
 """Of the number of a job in the names of its files; more jobs have more digits."""
 
@@ -208,6 +210,17 @@ def require_objective(jobs: Sequence[Job], sweep: SweepConfig) -> None:
             f"sweep.objective={sweep.objective}: needs eval.every, environment steps between "
             "evaluations"
         )
+
+
+def why_not_comparable(jobs: Sequence[Job], sweep: SweepConfig) -> str | None:
+    """A warning if jobs are ranked by returns of different rewards, else None."""
+    first, *others = (dict(job.config.env.rewards) for job in jobs)
+    if sweep.objective not in _RETURNS or all(other == first for other in others):
+        return None
+    return (
+        f"warning: sweep.objective={sweep.objective}: jobs differ in env.rewards, so their "
+        "returns cannot be compared; a metric of the task can (sweep.objective=metric/...)"
+    )
 
 
 def placed(

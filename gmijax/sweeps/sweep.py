@@ -30,6 +30,7 @@ from gmijax.sweeps.jobs import (
     require_objective,
     require_placeable,
     state_of,
+    why_not_comparable,
 )
 from gmijax.sweeps.nodes import Host, nodes_of
 from gmijax.sweeps.places import Places, Site, places_of
@@ -275,3 +276,5 @@ def _announce(
     )
     for reason in dict.fromkeys(reason for site in sites for reason in site.plan.reasons):
         console.print(f"  {reason}")
+    if (warning := why_not_comparable(request.jobs, settings)) is not None:
+        console.print(f"  {warning}")

@@ -188,6 +188,7 @@ def _trainers_reducer(
     membership = Membership(
         layout=trainers.layout,
         rank=trainers.gmis.index(link.gmi),
+        gmis=trainers.gmis,
         num_floats=exchange_size(env.spec, config.algo, losses),
         exchange_fd=link.exchange_fd,
         timeout_s=config.reduce.timeout_s,

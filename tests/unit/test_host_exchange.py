@@ -113,14 +113,14 @@ def test_ranks_with_different_lengths_name_both() -> None:
     ]
 
 
-def test_ranks_of_a_later_node_are_named_by_their_ranks_in_the_job() -> None:
-    assert told(host_ranks(10, 10, first_rank=4), 8, 9) == [
-        "step 1: rank 4 calls sum of 8 floats, rank 5 calls sum of 9 floats",
-        "step 1: rank 5 calls sum of 9 floats, rank 4 calls sum of 8 floats",
+def test_ranks_are_named_by_the_ids_of_their_gmis() -> None:
+    assert told(host_ranks(10, 10, ids=(4, 6)), 8, 9) == [
+        "step 1: rank 4 calls sum of 8 floats, rank 6 calls sum of 9 floats",
+        "step 1: rank 6 calls sum of 9 floats, rank 4 calls sum of 8 floats",
     ]
-    for said in told(host_ranks(10, 20, first_rank=4), 8, 8):
+    for said in told(host_ranks(10, 20, ids=(4, 6)), 8, 8):
         assert "rank 4" in said
-        assert "rank 5" in said
+        assert "rank 6" in said
 
 
 def test_a_rank_that_has_closed_is_lost_to_those_who_still_call() -> None:

@@ -32,6 +32,7 @@ from gmijax.sweeps.jobs import (
     require_objective,
     require_placeable,
     state_of,
+    why_not_comparable,
 )
 from gmijax.sweeps.places import Place, Places, Site, places_of
 from gmijax.sweeps.report import ranking, spread
@@ -163,6 +164,26 @@ def test_jobs_are_ranked_by_evaluations_if_they_make_some() -> None:
         job.progress.take({"env_steps": steps, "return": 9.0, **more}, sweep)
     assert job.progress.value == 2.0
     assert job.progress.curve == [(100, 2.0), (200, 1.0)]
+
+
+@pytest.mark.parametrize(
+    ("objective", "overrides", "warns"),
+    [
+        ("return", "env.rewards.energy=-0.02,-0.1", True),
+        ("eval/return", "env.rewards.energy=-0.02,-0.1", True),
+        ("metric/speed_m_per_s", "env.rewards.energy=-0.02,-0.1", False),
+        ("return", "env.rewards.energy=-0.1", False),
+        ("return", "seed=0,1", False),
+    ],
+)
+def test_returns_of_different_rewards_are_warned_of(
+    objective: str, overrides: str, warns: bool
+) -> None:
+    jobs = build_sweep(("env=ant", "eval.every=100", f"sweep.objective={objective}", overrides))
+    said = why_not_comparable(jobs.jobs, jobs.settings)
+    assert (said is not None) == warns
+    if said:
+        assert said.startswith(f"warning: sweep.objective={objective}: jobs differ in env.rewards")
 
 
 def gpu_places(gpus: int, jobs_per_gpu: int) -> Places:

@@ -120,12 +120,12 @@ class Barrier:
         # A peer may be one step ahead, not two: for the second it needs this rank in the first.
         # Two words by parity therefore suffice.
         words = self._block.lines["call"][:, self.step % 2]
-        own, first = words[self._block.rank], self._block.first_rank
+        own, ids = words[self._block.rank], self._block.ids
         for peer in self._peers:
             if words[peer] != own:
                 raise CollectiveError(
-                    f"step {self.step}: rank {first + self._block.rank} calls "
-                    f"{_describe(int(own))}, rank {first + peer} calls "
+                    f"step {self.step}: rank {ids[self._block.rank]} calls "
+                    f"{_describe(int(own))}, rank {ids[peer]} calls "
                     f"{_describe(int(words[peer]))}"
                 )
 
@@ -155,7 +155,7 @@ class Barrier:
         sizes, rank = self._block.lines["num_floats"], self._block.rank
         for peer in self._peers:
             if sizes[peer] != sizes[rank]:
-                own, other = (f"rank {self._block.first_rank + one}" for one in (rank, peer))
+                own, other = (f"rank {self._block.ids[one]}" for one in (rank, peer))
                 raise CollectiveError(
                     f"{own} and {other} do not fit together: num_floats is {sizes[rank]} for "
                     f"{own}, and {sizes[peer]} for {other}"

@@ -97,14 +97,11 @@ class FailureDetector:
 
     def _raise_lost(self, peer: int) -> NoReturn:
         self._block.lines["blamed"][self._block.rank] = peer + 1
-        first = self._block.first_rank
-        raise PeerLost(self._block.rank + first, peer + first, self._operation, self._step)
+        own, other = (self._block.ids[rank] for rank in (self._block.rank, peer))
+        raise PeerLost(own, other, self._operation, self._step)
 
     def _raise_timeout(self, missing: list[int]) -> NoReturn:
         self._block.lines["blamed"][self._block.rank] = missing[0] + 1
         waited_s = min(round(self._waited_s(), 2), self._timeout_s)
-        first = self._block.first_rank
-        ranks = tuple(peer + first for peer in missing)
-        raise CollectiveTimeout(
-            self._block.rank + first, ranks, self._operation, self._step, waited_s
-        )
+        own, *others = (self._block.ids[rank] for rank in (self._block.rank, *missing))
+        raise CollectiveTimeout(own, tuple(others), self._operation, self._step, waited_s)

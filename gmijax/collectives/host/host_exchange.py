@@ -40,7 +40,7 @@ class HostExchange:
       timeout_s: longest wait for other ranks.
       rendezvous_timeout_s: the same in the first call, when others may still start or compile.
       lane: of the block; those who use one thread of calls each take a lane each.
-      first_rank: see `SharedBlock`.
+      ids: see `SharedBlock`; None: those of the GMIs are their ranks.
 
     Raises:
       CollectiveError: no memory, not such a descriptor, or the rank is taken; and, from every
@@ -58,11 +58,11 @@ class HostExchange:
         timeout_s: float,
         rendezvous_timeout_s: float,
         lane: int = 0,
-        first_rank: int = 0,
+        ids: Sequence[int] | None = None,
     ) -> None:
         self.rank = rank
         self.world_size = world_size
-        block = attach(fd, rank, world_size, num_floats, lane)._replace(first_rank=first_rank)
+        block = attach(fd, rank, world_size, num_floats, lane, ids)
         self._block: SharedBlock | None = block
         self.barrier = Barrier(block, timeout_s, rendezvous_timeout_s)
 

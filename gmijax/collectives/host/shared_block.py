@@ -17,6 +17,7 @@ This file is the only one that knows the wire format (K ranks, P floats, native 
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -60,8 +61,8 @@ class SharedBlock(NamedTuple):
       flags: [whole pages, FLOATS_PER_LINE] uint32, of which [rank, 0] counts how often the device
         of a rank has written its slots; 1 says that the rank is through with slots in device
         memory, and 2 to 3 which exchanges it has come to (`device_links.Order`).
-      first_rank: rank in the job of this block's first one, for what is said of lost peers: with
-        several nodes each has a block.
+      ids: of the ranks' GMIs in the job, for what is said of lost peers: not all GMIs need have a
+        rank, and with several nodes each has a block.
     """
 
     rank: int
@@ -69,7 +70,7 @@ class SharedBlock(NamedTuple):
     gathered: npt.NDArray[np.float32]
     slots: npt.NDArray[np.float32]
     flags: npt.NDArray[np.uint32]
-    first_rank: int = 0
+    ids: tuple[int, ...]
 
 
 def create_exchange() -> int:
@@ -80,7 +81,14 @@ def create_exchange() -> int:
     return create_file("exchange")
 
 
-def attach(fd: int, rank: int, world_size: int, num_floats: int, lane: int = 0) -> SharedBlock:
+def attach(
+    fd: int,
+    rank: int,
+    world_size: int,
+    num_floats: int,
+    lane: int = 0,
+    ids: Sequence[int] | None = None,
+) -> SharedBlock:
     """Maps the block and makes this process known as `rank`.
 
     The block gets its size here, from whoever comes first; the caller keeps `fd` and may close
@@ -109,4 +117,5 @@ def attach(fd: int, rank: int, world_size: int, num_floats: int, lane: int = 0) 
         gathered=gathered.reshape(LANES, 2, world_size, MAX_GATHER_FLOATS)[lane],
         slots=slots.reshape(2, world_size, row_floats)[:, :, :num_floats],
         flags=np.frombuffer(mapping, np.uint32, -1, flags_at).reshape(-1, FLOATS_PER_LINE),
+        ids=tuple(range(world_size) if ids is None else ids),
     )

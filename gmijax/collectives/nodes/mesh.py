@@ -29,7 +29,7 @@ class Mesh:
     Args:
       sockets: with the other nodes; not blocking.
       node: position of this one.
-      ranks: of the leaders, in order of nodes, for messages.
+      ids: of the leaders, in order of nodes, for messages.
       timeout_s: longest wait for other nodes.
       rendezvous_timeout_s: the same in the first call, when others may still start or compile.
       on_wait: called five times a second while this waits.
@@ -43,13 +43,13 @@ class Mesh:
         self,
         sockets: Sockets,
         node: int,
-        ranks: Sequence[int],
+        ids: Sequence[int],
         *,
         timeout_s: float,
         rendezvous_timeout_s: float,
         on_wait: Callable[[], None],
     ) -> None:
-        self._sockets, self._node, self._ranks = sockets, node, ranks
+        self._sockets, self._node, self._ids = sockets, node, ids
         self._timeout_s, self._rendezvous_timeout_s = timeout_s, rendezvous_timeout_s
         self._on_wait = on_wait
         self._calls = 0
@@ -61,7 +61,7 @@ class Mesh:
 
     def gather(self, values: FloatBuffer) -> FloatBuffer:
         """Returns [N, n]: `values` [n] of every node, in order."""
-        rows = np.empty((len(self._ranks), values.size), np.float32)
+        rows = np.empty((len(self._ids), values.size), np.float32)
         rows[self._node] = values
         self._swap("all_gather", values.size, lambda _: values, lambda node: rows[node])
         return rows
@@ -73,7 +73,7 @@ class Mesh:
           values: of this node.
           place: which exchange of its program this is.
         """
-        num_nodes = len(self._ranks)
+        num_nodes = len(self._ids)
         parts = [chunk(values.size, node, num_nodes) for node in range(num_nodes)]
         own = parts[self._node]
         rows = np.empty((num_nodes, own.stop - own.start), np.float32)
@@ -110,13 +110,13 @@ class Mesh:
             self._wait(swap, operation)
             if different := swap.different():
                 raise CollectiveError(
-                    f"step {self._calls}: rank {self._ranks[self._node]} calls {operation}, rank "
-                    f"{self._ranks[different[0]]} something else, or of another size"
+                    f"step {self._calls}: rank {self._ids[self._node]} calls {operation}, rank "
+                    f"{self._ids[different[0]]} something else, or of another size"
                 )
         except ConnectionError:
-            peer = self._ranks[swap.at]
+            peer = self._ids[swap.at]
             raise PeerLost(
-                self._ranks[self._node], peer, f"{operation} between nodes", self._calls
+                self._ids[self._node], peer, f"{operation} between nodes", self._calls
             ) from None
         finally:
             swap.close()
@@ -131,9 +131,9 @@ class Mesh:
                 beat_s = now_s
                 self._on_wait()
             if now_s - started_s >= timeout_s:
-                late = tuple(self._ranks[node] for node in missing)
+                late = tuple(self._ids[node] for node in missing)
                 raise CollectiveTimeout(
-                    *(self._ranks[self._node], late, f"{operation} between nodes", self._calls),
+                    *(self._ids[self._node], late, f"{operation} between nodes", self._calls),
                     timeout_s,
                 )
 
