@@ -18,9 +18,9 @@ from gmijax.machine.mig_split import split_commands
 from gmijax.machine.snapshot import Machine, detect_machine
 from gmijax.version import __version__
 
-USAGE: Final = """usage: python -m gmijax.doctor [--json] [--help]
-       python -m gmijax.doctor mig=SIZES [gpu=INDEX]
-       python -m gmijax.doctor cluster=ADDRESS [--json]
+USAGE: Final = """usage: gmijax doctor [--json] [--help]
+       gmijax doctor mig=SIZES [gpu=INDEX]
+       gmijax doctor cluster=ADDRESS [--json]
 
 Without mig=, looks at GPUs, driver, MPS, MIG, versions, and at what jax sees; says which backends,
 reducers, physics and environments can be used, and why the others cannot.

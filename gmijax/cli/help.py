@@ -46,7 +46,7 @@ def print_help(
         allowed = f" ({'|'.join(key.allowed)})" if key.allowed else ""
         table.add_row(key.name, key.default, f"{key.meaning}{allowed}")
     console = Console(width=None if sys.stdout.isatty() else 140, highlight=False, markup=False)
-    console.print(f"usage: python -m gmijax.{name} [key=value ...] [--cfg job] [--help]")
+    console.print(f"usage: gmijax {name} [key=value ...] [--cfg job] [--help]")
     for group in ("env", "algo", "plan"):
         if group in {key.name.split(".")[0] for key in keys} and len(choices(group)) > 1:
             console.print(f"\n{group}= one of: {', '.join(choices(group))}")

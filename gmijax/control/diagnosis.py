@@ -173,7 +173,7 @@ def _problems(system: SystemInfo) -> Iterator[str]:
         if gpu.mig_enabled and not gpu.instances:
             yield (
                 f"GPU {gpu.index} is in MIG mode and has no instance, so nothing can use it "
-                "(python -m gmijax.doctor mig=3g,2g,1g,1g prints how to make some)"
+                "(gmijax doctor mig=3g,2g,1g,1g prints how to make some)"
             )
         if gpu.compute_mode == "prohibited":
             yield f"GPU {gpu.index} is in compute mode PROHIBITED (nvidia-smi -c 0)"

@@ -222,4 +222,7 @@ def _what_is_left(run: RunPaths) -> str:
         return f"training was complete: {run.root}"
     if any(run.checkpoints.glob("[0-9]*")):
         return f"continue with run.resume={run.root}"
-    return "there is no checkpoint yet"
+    return (
+        "there is no checkpoint yet (run.checkpoint_every; run.stop_timeout_s is the time that "
+        "GMIs get to save one at the end)"
+    )

@@ -161,7 +161,7 @@ def _why_mig(plan: PlanConfig, layout: Layout, machine: Machine, serves: bool) -
 def _why_no_mig(machine: Machine) -> str | None:
     if any(gpu.instances for gpu in machine.gpus):
         return None
-    advice = "python -m gmijax.doctor mig=3g,2g,1g,1g prints how to make them"
+    advice = "gmijax doctor mig=3g,2g,1g,1g prints how to make them"
     if any(gpu.mig_enabled for gpu in machine.gpus):
         return f"MIG mode is on, but there are no instances ({advice})"
     if any(gpu.mig_supported for gpu in machine.gpus):
@@ -196,7 +196,7 @@ def _why_not_gpu(gpu: Gpu, num_gmis: int, backend: BackendName, machine: Machine
         return "is in compute mode PROHIBITED, which lets nobody use it (nvidia-smi -c 0)"
     if backend == "mig":
         if not gpu.instances:
-            return "has no MIG instance; see python -m gmijax.doctor"
+            return "has no MIG instance; see gmijax doctor"
         if num_gmis > len(gpu.instances) and machine.mps_control is None:
             return (
                 f"has {len(gpu.instances)} MIG instances for {num_gmis} GMIs, and MPS, to share "

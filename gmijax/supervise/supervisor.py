@@ -71,12 +71,14 @@ class Supervisor:
 
     def status(self) -> tuple[GmiStatus, ...]:
         """Where every GMI stands, in order of id."""
-        return tuple(
-            self._started[gmi].status()
-            if gmi in self._started
-            else GmiStatus(gmi, "waiting", 0, None, None)
-            for gmi in self._launch.plan.layout.gmis
-        )
+        return tuple(self._status_of(gmi) for gmi in self._launch.plan.layout.gmis)
+
+    def _status_of(self, gmi: int) -> GmiStatus:
+        if gmi not in self._started:
+            return GmiStatus(gmi, "waiting", 0, None, None)
+        status = self._started[gmi].status()
+        is_stopping = self._stop_deadline_s is not None and status.state == "running"
+        return status._replace(state="stopping") if is_stopping else status
 
     def run(self, on_tick: Callable[[tuple[GmiStatus, ...]], None] | None = None) -> None:
         """Runs the job to its end; calls `on_tick` about 20 times a second.

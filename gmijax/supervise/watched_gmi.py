@@ -15,7 +15,9 @@ class GmiStatus(NamedTuple):
     """Where a GMI stands."""
 
     gmi: int  # Its id.
-    state: str  # `waiting` until it may compile, else what it says (see `heartbeat`).
+    # `waiting` until it may compile, `stopping` once a running one was told to end, else what it
+    # says (see `heartbeat`).
+    state: str
     iteration: int  # Training iterations done.
     pid: int | None  # Its process, None before the start.
     exit_code: int | None  # None while it runs; negative for the signal that ended it.

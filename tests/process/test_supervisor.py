@@ -53,7 +53,7 @@ def run_job(
 
 
 def all_iterate(ticks: Ticks) -> bool:
-    return all(status.state == "running" for status in ticks[-1])
+    return all(status.state in ("running", "stopping") for status in ticks[-1])
 
 
 def once_all_iterate(act: Callable[[Supervisor, Ticks], None]) -> Callable[..., None]:
@@ -179,9 +179,11 @@ def test_missing_program_half_way_ends_those_that_run(
 
 def test_a_stop_request_lets_gmis_save_and_names_those_that_are_late(run: RunPaths):
     stop = once_all_iterate(lambda supervisor, _: supervisor.request_stop())
+    supervisor = cpu_supervisor(run, ["train", "deaf"], stop=3.0)
     with pytest.raises(JobInterrupted, match=r"GMIs \[1\] did not finish within 3 s"):
-        run_job(cpu_supervisor(run, ["train", "deaf"], stop=3.0), stop)
+        run_job(supervisor, stop)
     assert (run.gmi(0).root / "saved").exists()
+    assert supervisor.status()[1].state == "stopping"
 
 
 def test_second_stop_request_ends_at_once(run: RunPaths):

@@ -30,7 +30,7 @@ def test_help_has_a_line_for_every_verb(argv: list[str], capsys: pytest.CaptureF
 @pytest.mark.parametrize("verb", VERBS)
 def test_every_verb_is_a_module_with_help(verb: str, capsys: pytest.CaptureFixture[str]):
     assert main([verb, "--help"]) == 0
-    assert f"{verb.replace('_', '-')}" in capsys.readouterr().out.splitlines()[0]
+    assert capsys.readouterr().out.startswith(f"usage: gmijax {verb}")
     assert callable(importlib.import_module(f"gmijax.{verb.replace('-', '_')}").main)
 
 
