@@ -10,7 +10,7 @@ from toy_env import walker
 
 from gmijax.errors import ConfigError
 from gmijax.learning import start
-from gmijax.machine.host_limits import Host
+from gmijax.machine.host_limits import HostLimits
 from gmijax.sim.wrappers import BatchState, env_keys, training_env
 
 KEY = jax.random.key(3)
@@ -38,7 +38,7 @@ def test_more_environments_than_memory_holds_are_refused_before_there_is_one(
 
 
 def test_what_fits_is_told_and_is_taken(monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr(start, "detect_host", lambda: Host(memory_mib=1))
+    monkeypatch.setattr(start, "detect_host", lambda: HostLimits(memory_mib=1))
     with pytest.raises(ConfigError, match="allowed are less than") as refused:
         begin(10**6)
     most = int(str(refused.value).rpartition(" ")[2])
@@ -47,7 +47,7 @@ def test_what_fits_is_told_and_is_taken(monkeypatch: pytest.MonkeyPatch):
         begin(most + 1)
     with pytest.raises(ConfigError, match="8 steps of each"):
         begin(most - 1, kept_steps=8)
-    monkeypatch.setattr(start, "detect_host", Host)  # Unknown.
+    monkeypatch.setattr(start, "detect_host", HostLimits)  # Unknown.
     begin(most + 1)
 
 
