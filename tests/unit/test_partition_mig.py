@@ -77,7 +77,7 @@ def test_gmis_that_share_instances_split_memory_and_need_mps(monkeypatch: pytest
     ("board", "why"),
     [
         (fake_nvml.H200_MIG_EMPTY, "MIG mode is on, but there are no instances"),
-        (fake_nvml.H200_MIG_OFF, r"no GPU is divided .*gmijax\.doctor mig="),
+        (fake_nvml.H200_MIG_OFF, r"no GPU is divided .*gmijax doctor mig="),
         (fake_nvml.V100, "the GPUs here have no MIG"),
     ],
 )
