@@ -18,7 +18,7 @@ from typing import Any
 from benchmarks.records import RESULTS, ResultsFile, device_name, file_name
 from gmijax.collectives.strategies import BYTES_PER_FLOAT, predicted_s
 from gmijax.config import PlanConfig, ReduceConfig
-from gmijax.control.selection import Probe, candidates, measure
+from gmijax.control.strategy_selection import Probe, candidates, measure
 from gmijax.errors import ConfigError
 from gmijax.machine.snapshot import Machine, detect_machine
 from gmijax.partition.layout import Layout

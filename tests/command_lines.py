@@ -17,7 +17,7 @@ import pytest
 from gmijax.autotune import tuner
 from gmijax.cli.command import command as run_command
 from gmijax.config import ExportConfig, PlayConfig, ServeConfig, TrainConfig
-from gmijax.control import decide, job, searching, selection, serving
+from gmijax.control import decide, job, searching, serving, strategy_selection
 from gmijax.deploy import exporting, playing
 from gmijax.machine.snapshot import Machine
 
@@ -80,7 +80,7 @@ def _nothing_starts(machine: Machine, cwd: Path) -> Iterator[None]:
         patch.setattr(Path, "mkdir", _mkdir)
         patch.setattr(tempfile, "mkstemp", _would_start)
         patch.setattr(tuner.Search, "result", _would_start)
-        patch.setattr(selection, "measure", _would_start)
+        patch.setattr(strategy_selection, "measure", _would_start)
         for owner, name in ((subprocess, "Popen"), (os, "fork"), (os, "posix_spawn")):
             patch.setattr(owner, name, _must_not_start)
         yield

@@ -16,7 +16,7 @@ from gmijax.partition.planner import make_plan
 from gmijax.runs.folder import META, RunPaths, write_json
 from gmijax.runs.resume import CheckpointMeta
 from gmijax.supervise.backends import open_backend
-from gmijax.supervise.kinds import JobKind
+from gmijax.supervise.job_kinds import JobKind
 from gmijax.supervise.launch import Launch
 from gmijax.supervise.supervisor import Supervisor
 

@@ -11,7 +11,7 @@ from gmijax.config import A3cConfig, TrainConfig
 from gmijax.partition.plan import Plan
 from gmijax.runs.folder import RunPaths
 from gmijax.runs.history import read_metrics
-from gmijax.supervise.kinds import groups_of
+from gmijax.supervise.job_kinds import groups_of
 from gmijax.supervise.watched_gmi import GmiStatus
 
 FEWEST_LINES: Final = 3

@@ -26,7 +26,7 @@ from gmijax.partition.placement import place, serving_and_training
 from gmijax.partition.plan import Plan
 from gmijax.runs.folder import RunPaths
 from gmijax.runs.history import read_metrics
-from gmijax.supervise.kinds import groups_of, training_kind, training_plan
+from gmijax.supervise.job_kinds import groups_of, training_kind, training_plan
 from gmijax.supervise.watched_gmi import GmiStatus
 
 _ENDLESS_STEPS: Final = 10**15

@@ -18,7 +18,7 @@ from gmijax.errors import ConfigError, GmijaxError, JobInterrupted
 from gmijax.machine.snapshot import Machine
 from gmijax.partition.plan import Plan
 from gmijax.runs.folder import RunPaths, write_json
-from gmijax.supervise.launcher import Launch, OnTick, run_gmis
+from gmijax.supervise.run_gmis import Launch, OnTick, run_gmis
 from gmijax.supervise.watched_gmi import GmiStatus
 
 

@@ -25,7 +25,7 @@ from gmijax.partition.plan import Plan
 from gmijax.partition.planner import make_plan
 from gmijax.runs.folder import RunPaths, read_json
 from gmijax.runs.history import read_metrics
-from gmijax.supervise.kinds import JobKind, serving_kind, training_kind
+from gmijax.supervise.job_kinds import JobKind, serving_kind, training_kind
 from gmijax.supervise.watched_gmi import GmiStatus
 from gmijax.version import __version__, versions_of
 

@@ -20,7 +20,7 @@ from gmijax.machine.snapshot import Machine
 from gmijax.partition.placement import most_gmis_of_a_node, on_fewer_nodes
 from gmijax.partition.planner import num_gmis_of
 from gmijax.supervise.backends.backend import Backend
-from gmijax.supervise.launcher import Launch, OnTick, StopSignals, taking_turns
+from gmijax.supervise.run_gmis import Launch, OnTick, StopSignals, taking_turns
 from gmijax.supervise.supervisor import Supervisor
 from gmijax.supervise.watched_gmi import WatchedGmi
 

@@ -10,14 +10,14 @@ from rich.console import Console
 
 from gmijax.autotune.tuner import with_auto_decided
 from gmijax.config import ReduceConfig, ServeConfig, TrainConfig
-from gmijax.control.selection import estimated_floats, with_measured
+from gmijax.control.strategy_selection import estimated_floats, with_measured
 from gmijax.machine.snapshot import Machine, detect_machine
 from gmijax.partition.plan import Plan
 from gmijax.partition.planner import make_plan
 from gmijax.sim import source
 from gmijax.sim.impl import choose_impl
 from gmijax.sim.registry import require_env
-from gmijax.supervise.kinds import training_plan
+from gmijax.supervise.job_kinds import training_plan
 
 C = TypeVar("C", TrainConfig, ServeConfig)
 

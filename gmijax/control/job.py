@@ -37,8 +37,8 @@ from gmijax.runs.git import record_git
 from gmijax.runs.history import MetricsReader, copy_history, draw_returns
 from gmijax.runs.resume import CheckpointMeta, saved_config
 from gmijax.sim import source
-from gmijax.supervise.kinds import training_kind
-from gmijax.supervise.launcher import Launch, recorded
+from gmijax.supervise.job_kinds import training_kind
+from gmijax.supervise.run_gmis import Launch, recorded
 
 
 class Result(NamedTuple):

@@ -24,8 +24,8 @@ from gmijax.partition.plan import Plan
 from gmijax.runs.folder import RunPaths, add_event, remove_temporary
 from gmijax.runs.history import copy_history
 from gmijax.runs.resume import CheckpointMeta, newest_checkpoint
-from gmijax.supervise.kinds import training_plan
-from gmijax.supervise.launcher import Launch, OnTick, StopSignals, run_gmis, stop_signals
+from gmijax.supervise.job_kinds import training_plan
+from gmijax.supervise.run_gmis import Launch, OnTick, StopSignals, run_gmis, stop_signals
 from gmijax.supervise.watched_gmi import GmiStatus
 
 _LASTING = ("NonFiniteError", "ParameterMismatch", "SelfCheckFailed")

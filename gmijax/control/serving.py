@@ -38,8 +38,8 @@ from gmijax.runs.folder import (
 )
 from gmijax.runs.history import MetricsReader
 from gmijax.runs.resume import CheckpointMeta, find_checkpoint, trained_config
-from gmijax.supervise.kinds import serving_kind
-from gmijax.supervise.launcher import Launch, recorded, run_gmis
+from gmijax.supervise.job_kinds import serving_kind
+from gmijax.supervise.run_gmis import Launch, recorded, run_gmis
 
 
 class Served(NamedTuple):

@@ -16,9 +16,9 @@ from gmijax.errors import ConfigError
 from gmijax.machine.snapshot import detect_machine
 from gmijax.partition.planner import make_plan
 from gmijax.runs.folder import ExportPaths, RunPaths
-from gmijax.supervise.kinds import JobKind
+from gmijax.supervise.job_kinds import JobKind
 from gmijax.supervise.launch import Timeouts
-from gmijax.supervise.launcher import Launch, run_gmis
+from gmijax.supervise.run_gmis import Launch, run_gmis
 
 _TIMEOUTS: Final = Timeouts(
     start_timeout_s=600.0, stall_timeout_s=600.0, stop_timeout_s=60.0, grace_s=10.0

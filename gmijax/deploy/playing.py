@@ -39,9 +39,9 @@ from gmijax.runs.resume import (
 )
 from gmijax.sim import source
 from gmijax.sim.registry import require_env
-from gmijax.supervise.kinds import JobKind
+from gmijax.supervise.job_kinds import JobKind
 from gmijax.supervise.launch import Timeouts
-from gmijax.supervise.launcher import Launch, run_gmis
+from gmijax.supervise.run_gmis import Launch, run_gmis
 
 C = TypeVar("C", PlayConfig, ExportConfig)
 

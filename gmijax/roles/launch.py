@@ -22,8 +22,8 @@ from gmijax.roles.manager import GMIManager
 from gmijax.roles.role import Role
 from gmijax.runs.folder import RunPaths, create_run, read_json, write_json
 from gmijax.supervise.child import ENV_GMI
-from gmijax.supervise.kinds import JobKind, pipes
-from gmijax.supervise.launcher import Launch, run_gmis
+from gmijax.supervise.job_kinds import JobKind, pipes
+from gmijax.supervise.run_gmis import Launch, run_gmis
 
 MAX_PIPE_MIB: Final = 2**14
 """Most shared memory for one pipe; larger messages travel in pieces anyway."""

@@ -16,7 +16,7 @@ from gmijax.runs.folder import RunPaths
 from gmijax.supervise.backends.backend import Backend
 from gmijax.supervise.environment import COMPILATION_CACHE, gmi_environment
 from gmijax.supervise.gmi_process import GmiProcess
-from gmijax.supervise.kinds import JobKind
+from gmijax.supervise.job_kinds import JobKind
 from gmijax.supervise.watched_gmi import GmiStatus, WatchedGmi
 
 

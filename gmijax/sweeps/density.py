@@ -23,7 +23,7 @@ from gmijax.config.sweep import SweepConfig
 from gmijax.errors import GmijaxError, JobInterrupted, NodeLost
 from gmijax.runs.cache import cache_folder
 from gmijax.runs.folder import read_json
-from gmijax.supervise.launcher import StopSignals
+from gmijax.supervise.run_gmis import StopSignals
 from gmijax.sweeps.jobs import Job, SweepPaths
 from gmijax.sweeps.nodes import Host
 from gmijax.sweeps.places import Places, Site, gmis_of_place, places_of

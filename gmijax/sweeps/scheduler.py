@@ -15,7 +15,7 @@ from gmijax.errors import JobInterrupted, NodeLost
 from gmijax.runs.folder import add_event, is_locked
 from gmijax.runs.history import MetricsReader
 from gmijax.supervise.failures import may_be_anothers
-from gmijax.supervise.launcher import StopSignals
+from gmijax.supervise.run_gmis import StopSignals
 from gmijax.sweeps.children import Seen
 from gmijax.sweeps.host import Start
 from gmijax.sweeps.hparams import write_hparams

@@ -20,7 +20,7 @@ from gmijax.control.decide import with_task
 from gmijax.errors import ConfigError, JobInterrupted, SweepFailed
 from gmijax.machine.snapshot import detect_machine
 from gmijax.runs.folder import RUNS, create_run, given_run, locked, read_json, write_json
-from gmijax.supervise.launcher import StopSignals, stop_signals
+from gmijax.supervise.run_gmis import StopSignals, stop_signals
 from gmijax.sweeps.density import with_density
 from gmijax.sweeps.host import LocalHost
 from gmijax.sweeps.jobs import (

@@ -1,7 +1,7 @@
 """Main of a GMI that does nothing but reduce: `python -m gmijax.workers.reduction_probe`.
 
 One process measures all strategies and sizes one after the other, because starting is most of
-what a measurement costs. `gmijax.control.selection` starts it.
+what a measurement costs. `gmijax.control.strategy_selection` starts it.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ import numpy as np
 
 from gmijax.collectives.build import Membership, build_reducer
 from gmijax.collectives.interface import Peers, Reducer
-from gmijax.control.selection import CHAIN, TIMEOUT_S, block_variable
+from gmijax.control.strategy_selection import CHAIN, TIMEOUT_S, block_variable
 from gmijax.errors import DeviceMemoryUnavailable
 from gmijax.partition.plan import Plan
 from gmijax.runs.folder import read_json

@@ -9,7 +9,7 @@ import sys
 from gmijax.cli.command import command
 from gmijax.config import TrainConfig
 from gmijax.control import job
-from gmijax.supervise.kinds import SYNCHRONOUS
+from gmijax.supervise.job_kinds import SYNCHRONOUS
 
 if __name__ == "__main__":
     # Whoever started this may ignore it (nohup), and then so would the job.

@@ -20,7 +20,7 @@ from fault_plan import KINDS, Fault
 from training_jobs import pids_of
 
 from gmijax.supervise.child import ChildLink
-from gmijax.workers import worker
+from gmijax.workers import training_worker
 
 SCRATCH = Path(os.environ["GMIJAX_FAULTS"])
 SLOW_S = 1.0
@@ -200,4 +200,4 @@ class _Recorded:
 
 if __name__ == "__main__":
     _inject(Faults())
-    sys.exit(worker.main())
+    sys.exit(training_worker.main())

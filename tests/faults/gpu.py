@@ -35,7 +35,7 @@ import dataclasses, sys
 from gmijax.cli.command import command
 from gmijax.config import TrainConfig
 from gmijax.control import job
-from gmijax.supervise.kinds import SYNCHRONOUS
+from gmijax.supervise.job_kinds import SYNCHRONOUS
 job.training_kind = lambda _: dataclasses.replace(SYNCHRONOUS, module="tests.faults.gpu_worker")
 sys.exit(command("train", TrainConfig, job.train, sys.argv[1:]))
 """

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from gmijax.supervise.child import ChildLink
-from gmijax.workers import worker
+from gmijax.workers import training_worker
 
 _beat = ChildLink.beat
 
@@ -34,4 +34,4 @@ def _beat_and_fail(link: ChildLink, state: Any, iteration: int) -> None:
 
 if __name__ == "__main__":
     setattr(ChildLink, "beat", _beat_and_fail)  # noqa: B010
-    sys.exit(worker.main())
+    sys.exit(training_worker.main())

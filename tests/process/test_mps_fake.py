@@ -28,8 +28,8 @@ from gmijax.machine.snapshot import Machine, detect_machine
 from gmijax.partition.plan import Plan
 from gmijax.runs.folder import RunPaths, read_json, write_json
 from gmijax.supervise.backends import open_backend
-from gmijax.supervise.kinds import JobKind
-from gmijax.supervise.launcher import Launch, run_gmis, taking_turns
+from gmijax.supervise.job_kinds import JobKind
+from gmijax.supervise.run_gmis import Launch, run_gmis, taking_turns
 from gmijax.supervise.supervisor import Supervisor
 from gmijax.supervise.watched_gmi import GmiStatus
 

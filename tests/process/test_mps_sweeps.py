@@ -17,7 +17,7 @@ from gmijax.machine.mps_control import PIPE_VARIABLE, MpsControl
 from gmijax.machine.snapshot import DAEMONS_VARIABLE, detect_machine
 from gmijax.runs.folder import RunPaths
 from gmijax.supervise.backends import open_backend
-from gmijax.supervise.launcher import StopSignals
+from gmijax.supervise.run_gmis import StopSignals
 from gmijax.sweeps.host import LocalHost, variables_of
 from gmijax.sweeps.jobs import SweepPaths, jobs_of
 from gmijax.sweeps.places import Places, Site, places_of

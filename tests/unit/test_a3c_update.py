@@ -28,7 +28,7 @@ from gmijax.learning.learner import (
     unpack_weights,
 )
 from gmijax.sim.wrappers import env_keys
-from gmijax.supervise.kinds import FLOAT_CHANNELS
+from gmijax.supervise.job_kinds import FLOAT_CHANNELS
 
 N, T = 12, 8
 ENV = point_mass()

@@ -23,7 +23,7 @@ from gmijax.cli.compose import compose
 from gmijax.config import TrainConfig
 from gmijax.errors import ConfigError
 from gmijax.runs.folder import RunPaths
-from gmijax.supervise.kinds import training_plan
+from gmijax.supervise.job_kinds import training_plan
 from gmijax.supervise.watched_gmi import GmiStatus
 
 GRID = (

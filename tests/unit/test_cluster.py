@@ -44,7 +44,7 @@ from gmijax.partition.planner import make_plan
 from gmijax.runs.folder import GmiPaths, RunPaths
 from gmijax.supervise.failures import describe_exit, first_cause, is_consequence
 from gmijax.supervise.heartbeat import Heartbeat
-from gmijax.supervise.kinds import JobKind
+from gmijax.supervise.job_kinds import JobKind
 
 
 class FakeAnswer:

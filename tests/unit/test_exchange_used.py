@@ -9,7 +9,7 @@ import pytest
 from supervision import machine
 from supervision import planned as make_plan
 
-from gmijax.workers.worker import exchange_used
+from gmijax.workers.training_worker import exchange_used
 
 
 @pytest.mark.parametrize(

@@ -14,7 +14,7 @@ from gmijax.errors import ConfigError
 from gmijax.machine import host_limits
 from gmijax.machine.host_limits import CgroupLimits, HostLimits, detect_host, usable_cores
 from gmijax.machine.snapshot import Machine, detect_machine
-from gmijax.supervise.kinds import training_plan
+from gmijax.supervise.job_kinds import training_plan
 
 SMALL = HostLimits(memory_mib=24 * 1024, threads=30_000, open_files=20_000)
 

@@ -17,7 +17,7 @@ from gmijax.partition.placement import place
 from gmijax.partition.plan import Plan
 from gmijax.partition.planner import make_plan
 from gmijax.partition.templates import AGENT, TRAINER, group_of, roles_of
-from gmijax.supervise.kinds import training_plan
+from gmijax.supervise.job_kinds import training_plan
 
 
 def planned(**changes):

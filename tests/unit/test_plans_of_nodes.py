@@ -22,7 +22,7 @@ from gmijax.errors import (
 from gmijax.partition.plan import Plan
 from gmijax.partition.planner import make_plan
 from gmijax.supervise.environment import gmi_environment
-from gmijax.supervise.kinds import calls_of, training_plan
+from gmijax.supervise.job_kinds import calls_of, training_plan
 
 
 def test_the_plan_of_nodes_has_each_nodes_shares_under_global_ids() -> None:

@@ -23,8 +23,8 @@ from gmijax.control.restarts import (
 from gmijax.errors import BackendUnavailable, ConfigError, GmiFailed, ReportedError
 from gmijax.partition import reduction
 from gmijax.runs.folder import META, RunPaths, read_json, write_json
-from gmijax.supervise.kinds import training_plan
-from gmijax.supervise.launcher import StopSignals
+from gmijax.supervise.job_kinds import training_plan
+from gmijax.supervise.run_gmis import StopSignals
 
 TRACE = 'Traceback:\n  File "task.py", line {line}, in step\n    x\nValueError: at 0x{address}\n'
 Act = Callable[[StopSignals], None]
@@ -194,7 +194,7 @@ def test_what_came_after_the_checkpoint_is_dropped(run: RunPaths):
 
 def test_only_the_same_signal_a_second_later_is_impatience(monkeypatch: pytest.MonkeyPatch):
     now_s = [100.0]
-    monkeypatch.setattr("gmijax.supervise.launcher.time.monotonic", lambda: now_s[0])
+    monkeypatch.setattr("gmijax.supervise.run_gmis.time.monotonic", lambda: now_s[0])
     asked: list[float] = []
     signals = StopSignals()
     signals.handle(signal.SIGUSR1)

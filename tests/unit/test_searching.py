@@ -41,7 +41,7 @@ class Profiles:
     def __call__(
         self, workload: Workload[Any], point: Point, mode: str, *_: Any, **__: Any
     ) -> Measured | NotRunnable:
-        assert workload.kind.module == "gmijax.workers.worker"
+        assert workload.kind.module == "gmijax.workers.training_worker"
         self.asked.append((point, mode))
         return self.answer(point, mode)
 

@@ -10,8 +10,8 @@ from typing import Any
 import pytest
 from supervision import MPS, machine, planned
 
-from gmijax.control import selection
-from gmijax.control.selection import Probe, candidates, estimated_floats, with_measured
+from gmijax.control import strategy_selection
+from gmijax.control.strategy_selection import Probe, candidates, estimated_floats, with_measured
 from gmijax.partition import reduction
 from gmijax.partition.plan import Plan
 
@@ -39,7 +39,7 @@ def measured(monkeypatch: pytest.MonkeyPatch) -> list[Sequence[Probe]]:
         calls.append(probes)
         return [{"chained_s": 1e-3 if k == 2 else 2e-3} for k in range(len(probes))]
 
-    monkeypatch.setattr(selection, "measure", measure)
+    monkeypatch.setattr(strategy_selection, "measure", measure)
     return calls
 
 
@@ -85,7 +85,7 @@ def test_a_way_that_does_not_work_here_is_not_taken(
     kept_in: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     rows = [{"chained_s": 2e-3}, {"chained_s": 1e-3}, {"why_not": "no such memory"}]
-    monkeypatch.setattr(selection, "measure", lambda *_: rows)
+    monkeypatch.setattr(strategy_selection, "measure", lambda *_: rows)
     for _ in ("measured", "kept"):
         chosen = with_measured(plan(gmis_per_gpu=2), MACHINE, 100)
         assert chosen.selection["measured"] == "har+host"

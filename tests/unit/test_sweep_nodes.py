@@ -23,7 +23,7 @@ from gmijax.config.sweep import SweepConfig
 from gmijax.errors import BackendUnavailable, ConfigError, NodeLost
 from gmijax.machine.snapshot import Machine
 from gmijax.runs.folder import RunPaths, read_json
-from gmijax.supervise.launcher import StopSignals
+from gmijax.supervise.run_gmis import StopSignals
 from gmijax.sweeps import density, scheduler
 from gmijax.sweeps.children import Seen
 from gmijax.sweeps.host import LocalHost, Order, Start, Started

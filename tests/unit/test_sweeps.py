@@ -18,7 +18,7 @@ from gmijax.control.console import open_console
 from gmijax.errors import ConfigError
 from gmijax.runs.folder import is_locked, locked, write_json
 from gmijax.supervise.failures import may_be_anothers
-from gmijax.supervise.launcher import StopSignals
+from gmijax.supervise.run_gmis import StopSignals
 from gmijax.sweeps import density
 from gmijax.sweeps.compiled import CompiledPrograms
 from gmijax.sweeps.density import with_density

@@ -18,8 +18,8 @@ from gmijax.ppo.ppo import PpoLosses
 from gmijax.runs.folder import RunPaths
 from gmijax.supervise.child import ChildLink
 from gmijax.supervise.failures import first_cause
-from gmijax.supervise.kinds import groups_of, training_plan
-from gmijax.workers.worker import _trainers_reducer
+from gmijax.supervise.job_kinds import groups_of, training_plan
+from gmijax.workers.training_worker import _trainers_reducer
 
 
 def test_a_trainer_that_does_not_come_is_known_by_its_id(tmp_path) -> None:

@@ -32,8 +32,8 @@ from gmijax.partition.reduction import (
 from gmijax.partition.templates import TRAINER, has_role
 from gmijax.runs.cache import cache_folder
 from gmijax.runs.folder import RunPaths, read_json, write_json
-from gmijax.supervise.kinds import JobKind
-from gmijax.supervise.launcher import Launch, run_gmis
+from gmijax.supervise.job_kinds import JobKind
+from gmijax.supervise.run_gmis import Launch, run_gmis
 from gmijax.version import versions_of
 
 CHAIN = 8

@@ -57,7 +57,7 @@ class JobKind:
     calls: Callable[[Plan], Sequence[tuple[int, int]]] = lambda _: ()
 
 
-SYNCHRONOUS: Final = JobKind("gmijax.workers.worker")
+SYNCHRONOUS: Final = JobKind("gmijax.workers.training_worker")
 """Training in which every GMI simulates, acts and trains (TCG_EX)."""
 
 

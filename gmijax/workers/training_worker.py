@@ -1,4 +1,4 @@
-"""Main of a GMI in training: `python -m gmijax.workers.worker`.
+"""Main of a GMI in training: `python -m gmijax.workers.training_worker`.
 
 Started by the supervisor and by nobody else. Reads the run folder, does what the plan gives to
 this GMI, and writes `result.json` or `error.json`.
@@ -23,7 +23,7 @@ from gmijax.partition.plan import Plan
 from gmijax.partition.templates import AGENT, TRAINER, Group, has_role, nodes_of
 from gmijax.runs.folder import read_json
 from gmijax.supervise.child import ENV_PIPES_FD, ChildLink, required_fd, run_gmi
-from gmijax.supervise.kinds import ENV_CHANNELS_FD, ENV_REGISTERS_FD, groups_of, topology_of
+from gmijax.supervise.job_kinds import ENV_CHANNELS_FD, ENV_REGISTERS_FD, groups_of, topology_of
 
 if TYPE_CHECKING:
     from gmijax.collectives.interface import Reducer
