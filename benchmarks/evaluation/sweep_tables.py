@@ -35,15 +35,13 @@ class SameTrainings(NamedTuple):
 
     def rates(self, key: str = "trainings_per_hour") -> dict[str, Figure]:
         """A figure of all sweeps, by way."""
-        return _figures(
-            {way: _of(key, own) for way, own in by_way.items()} for by_way in self.runs
-        )
+        return _figures(_by_way(key, runs) for runs in self.runs)
 
     def gains(self) -> dict[str, Figure]:
         """Trainings per hour over those of one after another, each ratio of one call."""
         ratios: list[dict[str, list[float]]] = []
-        for by_way in self.runs:
-            rates = SameTrainings([], [by_way]).rates()
+        for runs in self.runs:
+            rates = _figures([_by_way("trainings_per_hour", runs)])
             if one := rates.pop(ONE_AFTER_ANOTHER, None):
                 ratios.append({way: [rate.median / one.median] for way, rate in rates.items()})
         return _figures(ratios)
@@ -102,8 +100,11 @@ def _described(call: Call, tasks: list[str]) -> str:
     return f"{call.settings['jobs']} trainings{mix} with {overrides}; {compiled}."
 
 
-def _of(key: str, runs: Iterable[Run]) -> list[float]:
-    return [run[key] for run in runs if run[key] is not None]
+def _by_way(key: str, runs: Mapping[str, Iterable[Run]]) -> dict[str, list[float]]:
+    """A figure of the sweeps of a call, by way; without those that have none."""
+    return {
+        way: [run[key] for run in of_way if run[key] is not None] for way, of_way in runs.items()
+    }
 
 
 def _figures(found: Iterable[dict[str, list[float]]]) -> dict[str, Figure]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from pathlib import Path
 
 import jax
@@ -121,7 +120,7 @@ def begin_episodes(
     keys = jax.ShapeDtypeStruct((num_envs,), key.dtype)
     state = jax.tree.leaves(init.eval_shape(env.model, keys))
     step_floats = env.spec.obs_size + env.spec.action_size + 1  # And the reward.
-    least_bytes = sum(math.prod(leaf.shape) * leaf.dtype.itemsize for leaf in state)
+    least_bytes = sum(leaf.size * leaf.dtype.itemsize for leaf in state)
     least_bytes += num_envs * kept_steps * step_floats * jnp.dtype(jnp.float32).itemsize
     limit_bytes = _memory_bytes()
     if limit_bytes is not None and least_bytes > limit_bytes:

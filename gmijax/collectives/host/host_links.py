@@ -71,10 +71,8 @@ class HostLinks:
                 result = self._buffer("target", rows * num_floats)
                 if stage.reads(self._host.rank):
                     fetch(stream, source, values)
-                else:
-                    synchronize(
-                        stream
-                    )  # Who meets the others has computed, as with numbers to give.
+                else:  # Who meets the others has computed, as with numbers to give.
+                    synchronize(stream)
                 self._reduce(stage, place, values, result)
                 store(stream, target, result)
             else:
