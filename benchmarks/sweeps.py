@@ -135,12 +135,10 @@ def main() -> int:
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     arguments, machine = _arguments(), detect_machine()
     shared = arguments.shared if machine.gpus else []
-    ways = [Way(str(n), "auto", "") for n in arguments.at_once]
-    ways += [Way(str(n), "share", "") for n in shared]
-    if arguments.mix:
-        ways += [Way(str(n), "auto", arguments.mix) for n in arguments.at_once]
+    ways = [Way(str(n), "auto", arguments.mix) for n in arguments.at_once]
+    ways += [Way(str(n), "share", arguments.mix) for n in shared]
     if arguments.auto:
-        ways.append(Way("auto", "auto", ""))
+        ways.append(Way("auto", "auto", arguments.mix))
     benchmark = Benchmark(arguments, machine)
     code = 0
     try:
@@ -173,7 +171,7 @@ def _arguments() -> argparse.Namespace:
     parser.add_argument("--jobs", type=int, default=8, help="trainings of a sweep")
     parser.add_argument("--at-once", type=int, nargs="*", default=[1, 2, 4, 8])
     parser.add_argument("--shared", type=int, nargs="*", default=[4], help="without MPS")
-    parser.add_argument("--mix", default="", help="also a mix of these tasks, e.g. ant,humanoid")
+    parser.add_argument("--mix", default="", help="a mix of these tasks, e.g. ant,humanoid")
     parser.add_argument("--auto", action="store_true", help="also sweep.jobs_per_gpu=auto")
     parser.add_argument("--repeats", type=int, default=3)
     parser.add_argument("--deadline-s", type=float, help="seconds for all of it")
