@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from typing import Any, NamedTuple, TypeAlias
 
 from benchmarks.evaluation.figures import (
@@ -17,7 +17,10 @@ from benchmarks.records import RESULTS, Call, read_calls
 
 SWEEPS = RESULTS / "sweeps-nvidia-h200.json"
 ONE_AFTER_ANOTHER = "1 at once, auto"
-HEAD = "at once | sweeps: | trainings per hour: | over one after another: | steps/s in all:"
+HEAD = (
+    "at once | sweeps: | trainings per hour: | over one after another: | over plain sharing: | "
+    "steps/s in all:"
+)
 
 Run: TypeAlias = Mapping[str, Any]
 
@@ -39,11 +42,23 @@ class SameTrainings(NamedTuple):
 
     def gains(self) -> dict[str, Figure]:
         """Trainings per hour over those of one after another, each ratio of one call."""
+        return self._ratios(lambda way: ONE_AFTER_ANOTHER)
+
+    def gains_over_sharing(self) -> dict[str, Figure]:
+        """Trainings per hour over those of as many at once under plain sharing."""
+        return self._ratios(lambda way: way.replace(", auto", ", share"))
+
+    def _ratios(self, base: Callable[[str], str]) -> dict[str, Figure]:
         ratios: list[dict[str, list[float]]] = []
         for runs in self.runs:
             rates = _figures([_by_way("trainings_per_hour", runs)])
-            if one := rates.pop(ONE_AFTER_ANOTHER, None):
-                ratios.append({way: [rate.median / one.median] for way, rate in rates.items()})
+            ratios.append(
+                {
+                    way: [rate.median / rates[base(way)].median]
+                    for way, rate in rates.items()
+                    if base(way) in rates and base(way) != way
+                }
+            )
         return _figures(ratios)
 
 
@@ -54,7 +69,7 @@ def same_trainings() -> dict[str, SameTrainings]:
         here: dict[str, dict[str, list[Run]]] = {}
         for run in call.results["runs"]:
             at_once, backend, *tasks = run["way"].split(", ")
-            if run["code"] == 0:
+            if run["status"] == "completed":
                 by_way = here.setdefault(_described(call, tasks), {})
                 by_way.setdefault(f"{at_once}, {backend}", []).append(run)
         for what, by_way in here.items():
@@ -73,16 +88,18 @@ def sweeps() -> list[str]:
     """Trainings per hour, where they were measured."""
     lines: list[str] = []
     for what, same in same_trainings().items():
-        gains, steps = same.gains(), same.rates("steady_steps_per_s")
+        gains, sharing = same.gains(), same.gains_over_sharing()
+        steps = same.rates("steady_steps_per_s")
         rows = [
             [
                 way,
                 str(rate.repeats),
                 shown(rate, ".1f"),
-                "1" if way == ONE_AFTER_ANOTHER else shown(gains.get(way)),
+                "1" if way == ONE_AFTER_ANOTHER else shown(gains[way]) if way in gains else "-",
+                shown(sharing[way]) if way in sharing else "-",
                 shown(steps.get(way), ",.0f"),
             ]
-            for way, rate in same.rates().items()
+            for way, rate in sorted(same.rates().items(), key=lambda row: _order(row[0]))
         ]
         file = f"[`{SWEEPS.name}`](../benchmarks/results/{SWEEPS.name})"
         calls = [f"- {file}: {origin(call)}" for call in same.calls]
@@ -94,10 +111,15 @@ def sweeps() -> list[str]:
 
 def _described(call: Call, tasks: list[str]) -> str:
     assert call.settings is not None
-    overrides = ", ".join(f"`{one}`" for one in call.settings["overrides"])
+    overrides = ", ".join(f"`{one}`" for one in sorted(call.settings["overrides"]))
     mix = f" of {tasks[0].replace(',', ', ')}" if tasks else ""
     compiled = "programs compiled before" if call.settings["warm"] else "each sweep compiles"
     return f"{call.settings['jobs']} trainings{mix} with {overrides}; {compiled}."
+
+
+def _order(way: str) -> tuple[str, int]:
+    at_once, backend = way.split(" at once, ")
+    return backend, int(at_once) if at_once.isdigit() else 0
 
 
 def _by_way(key: str, runs: Mapping[str, Iterable[Run]]) -> dict[str, list[float]]:
