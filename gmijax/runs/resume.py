@@ -10,8 +10,8 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 
-from gmijax.config import ALGORITHMS, AlgoConfig, EnvConfig
-from gmijax.config.schema import from_dict, from_named
+from gmijax.config import ALGORITHMS, AlgoConfig, EnvConfig, TrainConfig
+from gmijax.config.schema import from_dict, from_named, known
 from gmijax.errors import ConfigError
 from gmijax.runs.folder import META, RunPaths, last_run, read_json
 
@@ -206,12 +206,29 @@ def saved_config(checkpoint: Path) -> dict[str, Any]:
 def trained_config(checkpoint: Path) -> tuple[EnvConfig, AlgoConfig]:
     """Task and algorithm of the run that a checkpoint lies in.
 
+    Keys that this version of gmijax does not know any more are left out.
+
     Raises:
       ConfigError: the checkpoint does not lie in the folder of a training run.
     """
     saved = saved_config(checkpoint)
-    algo = from_named(ALGORITHMS, saved["algo"], "algo.")
-    return from_dict(EnvConfig, saved["env"], "env."), algo
+    algo, _ = known(ALGORITHMS, saved["algo"], "algo.")
+    env, _ = known([EnvConfig], saved["env"], "env.")
+    return from_dict(EnvConfig, env, "env."), from_named(ALGORITHMS, algo, "algo.")
+
+
+def require_known_keys(saved: Mapping[str, Any], what: str) -> None:
+    """Raises ConfigError if a run's configuration has keys that this version does not know.
+
+    To train on without them would be another training. Policies act without, see `trained_config`.
+    """
+    _, unknown = known([TrainConfig], saved)
+    if unknown:
+        raise ConfigError(
+            f"{what}: its config.json has keys that this version does not know: "
+            f"{', '.join(unknown)}; take them out of that file to go on without them (the policy "
+            "can be played, exported and served as it is)"
+        )
 
 
 def _read_object(path: Path) -> dict[str, Any]:

@@ -11,11 +11,14 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+import optax
 import orbax.checkpoint as ocp
 import pytest
 
+from gmijax.cli.compose import compose
 from gmijax.errors import ConfigError
 from gmijax.learning.checkpoint import finish_checkpoint, restore_learner, save_learner
+from gmijax.learning.learner import init_learner, make_learner
 from gmijax.runs.folder import RunPaths
 from gmijax.runs.resume import (
     CheckpointMeta,
@@ -23,6 +26,7 @@ from gmijax.runs.resume import (
     best_evaluation,
     newest_checkpoint,
 )
+from gmijax.sim.interface import EnvSpec
 
 
 def restore_with(error: Exception, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -87,6 +91,33 @@ def test_a_checkpoint_from_before_a_field_fits_where_the_field_is_not_used(tmp_p
     assert restore_learner(new, like._replace(more=jnp.zeros(2))).more.tolist() == [7.0, 7.0]
     with pytest.raises(ConfigError, match="does not fit this job"):
         restore_learner(old, like._replace(more=jnp.zeros(2)))
+
+
+def test_moments_of_adam_by_parameter_become_the_vectors_of_today(tmp_path: Path):
+    spec = EnvSpec("point", 3, 2, 0.1, 10, (), actor_obs_size=3)
+    learner = make_learner(spec, compose("env=ant", "algo.policy_hidden_layer_sizes=[4]").algo)
+    state = init_learner(learner, spec.obs_size, jax.random.key(0))
+    # As it was until its moments were vectors.
+    older = optax.chain(
+        optax.clip_by_global_norm(learner.config.max_grad_norm), optax.scale_by_adam()
+    )
+    grads = jax.tree.map(
+        lambda leaf: 0.1 + jnp.arange(leaf.size).reshape(leaf.shape), state.params
+    )
+    _, by_parameter = older.update(grads, older.init(state.params))
+    _, vectors = learner.optimizer.update(grads, state.opt_state)
+    run = RunPaths(tmp_path)
+    save_learner(run, 1, state._replace(opt_state=by_parameter))
+    meta = CheckpointMeta("point", "ppo", 1, 1, 8, ((4,), (4,)), "jax")
+    found = restore_learner(finish_checkpoint(run, meta), state)
+    jax.tree.map(np.testing.assert_array_equal, found.opt_state, vectors)
+    jax.tree.map(np.testing.assert_array_equal, found.params, state.params)
+    wider = make_learner(spec, compose("env=ant", "algo.policy_hidden_layer_sizes=[5]").algo)
+    with pytest.raises(
+        ConfigError,
+        match=r"its opt_state.1.mu.policy.params.Dense_0.bias is \[4\], that of this job \[5\]$",
+    ):
+        restore_learner(run.checkpoint(1), init_learner(wider, 3, jax.random.key(0)))
 
 
 def save(
