@@ -12,7 +12,7 @@ import dataclasses
 import hashlib
 import os
 import shutil
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, TypeVar, cast
 
@@ -56,13 +56,18 @@ def checkpoint_meta(
     )
 
 
-def require_equal(reducer: Reducer, params: PyTree, env_steps: int) -> None:
-    """Raises `ParameterMismatch` if the trainers' parameters differ; collective."""
-    digests = reducer.all_gather(digest(params))
-    if different := [r for r in range(len(digests)) if (digests[r] != digests[0]).any()]:
+def require_equal(reducer: Reducer, gmi: int, params: PyTree, env_steps: int) -> None:
+    """Raises `ParameterMismatch` if the parameters of trainers differ; names them by their `gmi`.
+
+    Collective.
+    """
+    gathered = reducer.all_gather(np.append(digest(params), np.float32(gmi)))
+    digests, gmis = gathered[:, :-1], gathered[:, -1].astype(int).tolist()
+    different = [gmi for gmi, one in zip(gmis, digests, strict=True) if (one != digests[0]).any()]
+    if different:
         raise ParameterMismatch(
-            f"after {env_steps} env steps the parameters of trainers {different} differ from "
-            "those of trainer 0"
+            f"after {env_steps} env steps the parameters of GMIs {different} differ from "
+            f"those of GMI {gmis[0]}"
         )
 
 
@@ -200,7 +205,7 @@ def _saved_shapes(folder: Path) -> dict[str, tuple[int, ...]]:
     try:
         with ocp.StandardCheckpointer() as checkpointer:
             saved: Any = checkpointer.metadata(folder.resolve()).item_metadata
-        return {_name(path): leaf.shape for path, leaf in jax.tree.leaves_with_path(saved.tree)}
+        return _shapes(saved.tree)
     except (AttributeError, OSError, TypeError, ValueError):
         return {}
 
@@ -242,14 +247,18 @@ def _restore(folder: Path, template: T) -> T:
         # as a device without enough memory, does not say that the checkpoint is bad.
         if not isinstance(error, ValueError | KeyError | OSError) and type(error) is not Exception:
             raise
-        why = _difference(_saved_shapes(folder), plain) or lines_of(error)[0]
+        why = _difference(_saved_shapes(folder), _shapes(plain)) or lines_of(error)[0]
         raise ConfigError(f"checkpoint {folder} does not fit this job: {why}") from error
+    # Orbax gives arrays of other shapes than those that were asked for.
+    if why := _difference(_shapes(restored), _shapes(plain)):
+        raise ConfigError(f"checkpoint {folder} does not fit this job: {why}")
     return jax.tree.map(_restored, template, restored)
 
 
-def _difference(saved: Mapping[str, tuple[int, ...]], template: PyTree) -> str | None:
-    """The first array in which a checkpoint differs from a template; None if nothing is known."""
-    wanted = {_name(path): leaf.shape for path, leaf in jax.tree.leaves_with_path(template)}
+def _difference(
+    saved: Mapping[str, tuple[int, ...]], wanted: Mapping[str, tuple[int, ...]]
+) -> str | None:
+    """The first array in which a checkpoint differs; None if none does, or nothing is known."""
     for name in sorted(saved.keys() | wanted.keys()) if saved else ():
         if name not in wanted:
             return f"it has {name}, this job has not"
@@ -260,8 +269,12 @@ def _difference(saved: Mapping[str, tuple[int, ...]], template: PyTree) -> str |
     return None
 
 
-def _name(path: Sequence[Any]) -> str:
-    return jax.tree_util.keystr(tuple(path), simple=True, separator=".")
+def _shapes(tree: PyTree) -> dict[str, tuple[int, ...]]:
+    """Shapes of all arrays of a tree by their dotted names."""
+    return {
+        jax.tree_util.keystr(path, simple=True, separator="."): leaf.shape
+        for path, leaf in jax.tree.leaves_with_path(tree)
+    }
 
 
 def _present(state: Any) -> Any:

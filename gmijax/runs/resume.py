@@ -17,6 +17,9 @@ from gmijax.runs.folder import META, RunPaths, last_run, read_json
 
 _CHUNK_BYTES: Final = 1 << 20
 
+_MOST_NAMED: Final = 5
+"""Runs that one line names."""
+
 
 @dataclass(frozen=True)
 class CheckpointMeta:
@@ -151,7 +154,7 @@ def choose_checkpoint(wanted: str, key: str) -> tuple[Path, tuple[str, ...]]:
     found = newest_checkpoint(folder)
     if found.checkpoint is None:
         raise ConfigError(
-            "; ".join((f"{key}={wanted}: no checkpoint in this folder", *found.passed_over))
+            "; ".join((f"{key}={wanted}: {_no_checkpoint(folder)}", *found.passed_over))
         )
     return found.checkpoint, found.passed_over
 
@@ -167,7 +170,17 @@ def saved_config_of(wanted: str, key: str) -> dict[str, Any]:
     for meta in metas:
         if meta.is_file():
             return saved_config(meta.parent.resolve())
-    raise ConfigError(f"{key}={wanted}: no checkpoint in this folder")
+    raise ConfigError(f"{key}={wanted}: {_no_checkpoint(folder)}")
+
+
+def _no_checkpoint(folder: Path) -> str:
+    """Says that a folder has none, and where there are some if it is that of a sweep."""
+    jobs = sorted({meta.parents[2].name for meta in folder.glob(f"*/checkpoints/[0-9]*/{META}")})
+    if not jobs:
+        return "no checkpoint in this folder"
+    more = f" and {len(jobs) - _MOST_NAMED} more" if len(jobs) > _MOST_NAMED else ""
+    named = ", ".join(jobs[:_MOST_NAMED])
+    return f"no checkpoint in this folder; runs in it that have some: {named}{more}"
 
 
 def _named(wanted: str, key: str) -> Path:

@@ -120,6 +120,17 @@ def test_what_an_older_version_did_not_save_is_filled_in_for_the_runs_own_task(r
     assert config.num_envs == 8
 
 
+def test_a_folder_of_runs_names_those_that_have_checkpoints(tmp_path: Path):
+    for number in range(8):
+        make_run(tmp_path / f"{number:03d}", *([100] if number else []))
+    with pytest.raises(ConfigError) as error:
+        find_checkpoint(str(tmp_path), "run.dir")
+    assert str(error.value) == (
+        f"run.dir={tmp_path}: no checkpoint in this folder; runs in it that have some: "
+        "001, 002, 003, 004, 005 and 2 more"
+    )
+
+
 def test_keys_that_are_no_more_stop_a_training_and_no_policy(run: RunPaths):
     saved = read_json(run.config)
     known = trained_config(run.checkpoint(100))
