@@ -235,13 +235,22 @@ def require_known_keys(saved: Mapping[str, Any], what: str) -> None:
 
     To train on without them would be another training. Policies act without, see `trained_config`.
     """
-    _, unknown = known([TrainConfig], saved)
-    if unknown:
+    if unknown := _unknown_keys(saved):
         raise ConfigError(
-            f"{what}: its config.json has keys that this version does not know: "
-            f"{', '.join(unknown)}; take them out of that file to go on without them (the policy "
-            "can be played, exported and served as it is)"
+            f"{what}: its config.json has keys that this version does not know: {unknown}; take "
+            "them out of that file to go on without them (the policy can be played, exported and "
+            "served as it is)"
         )
+
+
+def left_out(checkpoint: Path) -> str | None:
+    """Says which keys `trained_config` leaves out of a run's configuration; None: none."""
+    unknown = _unknown_keys(saved_config(checkpoint))
+    return f"left out, because this version does not know them: {unknown}" if unknown else None
+
+
+def _unknown_keys(saved: Mapping[str, Any]) -> str:
+    return ", ".join(known([TrainConfig], saved)[1])
 
 
 def _read_object(path: Path) -> dict[str, Any]:

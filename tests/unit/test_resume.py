@@ -20,6 +20,7 @@ from gmijax.runs.resume import (
     CheckpointMeta,
     file_check,
     find_checkpoint,
+    left_out,
     newest_checkpoint,
     trained_config,
 )
@@ -144,6 +145,8 @@ def test_keys_that_are_no_more_stop_a_training_and_no_policy(run: RunPaths):
         "can be played, exported and served as it is)"
     )
     assert trained_config(run.checkpoint(100)) == known
+    said = "left out, because this version does not know them: env.gone, algo.gone, lost"
+    assert left_out(run.checkpoint(100)) == said
     assert compose(f"run.dir={run.root}", command="serve").env == known[0]
 
 
