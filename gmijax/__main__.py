@@ -44,7 +44,11 @@ def main(argv: Sequence[str] | None = None) -> int:
 
         sys.stderr.write(f"gmijax: unknown command {verb!r}{suggestion(verb, VERBS)}\n")
         return 2
-    return importlib.import_module(f"gmijax.{verb.replace('-', '_')}").main(rest)
+    try:
+        return importlib.import_module(f"gmijax.{verb.replace('-', '_')}").main(rest)
+    except KeyboardInterrupt:  # While its packages are imported.
+        sys.stderr.write(f"gmijax.{verb}: interrupted\n")
+        return 130
 
 
 def _usage() -> str:

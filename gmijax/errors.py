@@ -116,8 +116,8 @@ class CollectiveError(GmijaxError):
 class PeerLost(CollectiveError):
     """The process of another GMI, of id `peer`, is gone."""
 
-    def __init__(self, rank: int, peer: int, operation: str, step: int) -> None:
-        super().__init__(f"rank {rank}: peer {peer} is gone during {operation}, step {step}")
+    def __init__(self, gmi: int, peer: int, operation: str, step: int) -> None:
+        super().__init__(f"GMI {gmi}: GMI {peer} is gone during {operation}, step {step}")
         self.peer = peer
 
 
@@ -125,11 +125,11 @@ class CollectiveTimeout(CollectiveError):
     """Other GMIs, those of the ids in `missing`, did not arrive in time."""
 
     def __init__(
-        self, rank: int, missing: tuple[int, ...], operation: str, step: int, timeout_s: float
+        self, gmi: int, missing: tuple[int, ...], operation: str, step: int, timeout_s: float
     ) -> None:
         super().__init__(
-            f"rank {rank}: waited {timeout_s:g} s in {operation}, step {step}, "
-            f"for ranks {list(missing)}"
+            f"GMI {gmi}: waited {timeout_s:g} s in {operation}, step {step}, "
+            f"for GMIs {list(missing)}"
         )
         self.missing = missing
 
@@ -137,8 +137,8 @@ class CollectiveTimeout(CollectiveError):
 class PipeClosed(CollectiveError):
     """The other end of a pipe was closed on purpose: nothing more comes, or is wanted."""
 
-    def __init__(self, rank: int, peer: int, operation: str) -> None:
-        super().__init__(f"rank {rank}: peer {peer} has closed its pipe, in {operation}")
+    def __init__(self, gmi: int, peer: int, operation: str) -> None:
+        super().__init__(f"GMI {gmi}: GMI {peer} has closed its pipe, in {operation}")
 
 
 class CudaError(CollectiveError):

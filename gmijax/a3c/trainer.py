@@ -91,7 +91,7 @@ class Trainer:
         compile_s = time.monotonic() - started
         self.link.beat("ready", 0)
         # And so all trainers have compiled.
-        require_equal(self.reducer, state.params, self._env_steps)
+        require_equal(self.reducer, self.link.gmi, state.params, self._env_steps)
         if not leads:
             return {"status": self._loop(state, None), "updates": self._updates}
         leader = Leader(
@@ -134,7 +134,7 @@ class Trainer:
                 break
         if leader is not None:
             leader.end()
-        require_equal(self.reducer, state.params, self._env_steps)
+        require_equal(self.reducer, self.link.gmi, state.params, self._env_steps)
         # Agents that wait for room may go: the order to end is published by now.
         self.receiver.close()
         if leader is not None:

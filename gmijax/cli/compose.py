@@ -18,10 +18,10 @@ from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 import gmijax
-from gmijax.config import ServeConfig, TrainConfig
-from gmijax.config.schema import flatten, from_dict, suggestion
+from gmijax.config import EnvConfig, ServeConfig, TrainConfig
+from gmijax.config.schema import flatten, from_dict, known, suggestion
 from gmijax.errors import ConfigError
-from gmijax.runs.resume import saved_config_of
+from gmijax.runs.resume import require_known_keys, saved_config_of
 from gmijax.sim.registry import SUITES
 from gmijax.sim.source import reference
 
@@ -242,6 +242,7 @@ def _on_top_of_saved(
     What an older version did not save comes from the defaults for the run's own task.
     """
     saved = saved_config_of(resume, "run.resume")
+    require_known_keys(saved, f"run.resume={resume}")
     saved["run"].update(dir=None, name=None)
     suite = saved["env"].get("suite", "gmijax")
     merged = _merged(data, saved)
@@ -270,7 +271,7 @@ def _with_task_of_run(data: dict[str, Any], items: Sequence[Override]) -> dict[s
     run_dir = data["run"].get("dir") if isinstance(data["run"], dict) else None
     if run_dir is None or any(item.key_or_group == "env" for item in items):
         return data
-    saved = saved_config_of(str(run_dir), "run.dir")["env"]
+    saved, _ = known([EnvConfig], saved_config_of(str(run_dir), "run.dir")["env"])
     # A policy that has learnt needs no easy episodes, unless they are asked for.
     saved["curriculum"] = data["env"]["curriculum"]
     merged = {**data, "env": {**data["env"], **saved}}

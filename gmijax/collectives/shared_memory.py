@@ -43,14 +43,14 @@ def map_file(fd: int, num_bytes: int, who: str) -> mmap.mmap:
         ) from None
 
 
-def take_line(line: np.void, rank: int) -> None:
-    """Notes this process in the line that tells others of `rank`.
+def take_line(line: np.void, gmi: int) -> None:
+    """Notes this process in the line that tells others of GMI `gmi`.
 
     Raises:
-      CollectiveError: the rank is taken.
+      CollectiveError: it is taken.
     """
     if line["pid"]:
-        raise CollectiveError(f"rank {rank} is taken already by process {line['pid']}")
+        raise CollectiveError(f"GMI {gmi} is taken already by process {line['pid']}")
     process = own_process()
     line["start_ticks"] = process.start_ticks
     fence()  # A pid with another start would seem to be a process that is gone.

@@ -101,6 +101,10 @@ def from_named(classes: Sequence[type[T]], data: Mapping[str, Any], path: str = 
     Raises:
       ConfigError: none does, or as `from_dict`.
     """
+    return from_dict(_class_of(classes, data, path), data, path)
+
+
+def _class_of(classes: Sequence[type[T]], data: Mapping[str, Any], path: str) -> type[T]:
     by_name = {
         name: cls
         for cls in classes
@@ -110,7 +114,39 @@ def from_named(classes: Sequence[type[T]], data: Mapping[str, Any], path: str = 
         raise ConfigError(
             f"{path}name={_shown(data.get('name'))}: expected one of {', '.join(by_name)}"
         )
-    return from_dict(by_name[data["name"]], data, path)
+    return by_name[data["name"]]
+
+
+def known(
+    classes: Sequence[type[Any]], data: Mapping[str, Any], path: str = ""
+) -> tuple[dict[str, Any], tuple[str, ...]]:
+    """Plain data, perhaps of another version, without keys that `from_dict` would not know.
+
+    Args:
+      classes: one, or several that differ in their field `name`, see `from_named`.
+      data: not changed.
+      path: of the group, with a dot at its end.
+
+    Returns:
+      What is left, and the dotted names of all that was left out.
+
+    Raises:
+      ConfigError: as `from_named`.
+    """
+    cls = classes[0] if len(classes) == 1 else _class_of(classes, data, path)
+    hints = typing.get_type_hints(cls)
+    kept: dict[str, Any] = {}
+    unknown: tuple[str, ...] = ()
+    for key, value in data.items():
+        trees = [x for x in _options(hints.get(key)) if dataclasses.is_dataclass(x)]
+        if key not in hints:
+            unknown += (f"{path}{key}",)
+        elif trees and isinstance(value, Mapping):
+            kept[key], inner = known(typing.cast("Any", trees), value, f"{path}{key}.")
+            unknown += inner
+        else:
+            kept[key] = value
+    return kept, unknown
 
 
 def to_dict(config: Any) -> dict[str, Any]:

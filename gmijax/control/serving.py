@@ -37,7 +37,7 @@ from gmijax.runs.folder import (
     write_json,
 )
 from gmijax.runs.history import MetricsReader
-from gmijax.runs.resume import CheckpointMeta, find_checkpoint, trained_config
+from gmijax.runs.resume import CheckpointMeta, find_checkpoint, left_out, trained_config
 from gmijax.supervise.job_kinds import serving_kind
 from gmijax.supervise.run_gmis import Launch, recorded, run_gmis
 
@@ -128,6 +128,8 @@ def _prepared(config: ServeConfig, console: Console) -> _Job:
         config = dataclasses.replace(config, output=output)
     group = group_of(plan.layout, plan.roles, SIMULATOR)
     assert group is not None
+    if config.run.dir is not None and (unknown := left_out(Path(config.run.dir))):
+        reasons = (*reasons, unknown)
     return _Job(config, plan, machine, group.gmis, data, reasons)
 
 

@@ -35,6 +35,7 @@ from gmijax.runs.resume import (
     CheckpointMeta,
     best_checkpoint,
     find_checkpoint,
+    left_out,
     trained_config,
 )
 from gmijax.sim import source
@@ -108,8 +109,8 @@ def open_run(config: C) -> tuple[C, EnvConfig, str | None]:
     All before a process is started, which would find them bad too.
 
     Returns:
-      The configuration with what was found, the task, and how its file has changed (None if it
-      has not).
+      The configuration with what was found, the task, and what is not as the run had it (None if
+      nothing).
 
     Raises:
       ConfigError: no such run or checkpoint, or its task cannot be had.
@@ -122,7 +123,8 @@ def open_run(config: C) -> tuple[C, EnvConfig, str | None]:
     if env.suite == "custom":
         run = dataclasses.replace(run, env=env.name, env_sha256=env.source_sha256)
     config = dataclasses.replace(config, checkpoint=str(checkpoint), run=run)
-    return config, env, source.changes(env, dataclasses.asdict(saved))
+    changes = source.changes(env, dataclasses.asdict(saved)), left_out(checkpoint)
+    return config, env, "\n".join(filter(None, changes)) or None
 
 
 def _find(config: PlayConfig | ExportConfig) -> Path:

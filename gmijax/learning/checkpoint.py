@@ -12,6 +12,7 @@ import dataclasses
 import hashlib
 import os
 import shutil
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, TypeVar, cast
 
@@ -19,6 +20,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import orbax.checkpoint as ocp
+from jax.flatten_util import ravel_pytree
 
 from gmijax.collectives.interface import Reducer
 from gmijax.config import TrainConfig
@@ -54,13 +56,18 @@ def checkpoint_meta(
     )
 
 
-def require_equal(reducer: Reducer, params: PyTree, env_steps: int) -> None:
-    """Raises `ParameterMismatch` if the trainers' parameters differ; collective."""
-    digests = reducer.all_gather(digest(params))
-    if different := [r for r in range(len(digests)) if (digests[r] != digests[0]).any()]:
+def require_equal(reducer: Reducer, gmi: int, params: PyTree, env_steps: int) -> None:
+    """Raises `ParameterMismatch` if the parameters of trainers differ; names them by their `gmi`.
+
+    Collective.
+    """
+    gathered = reducer.all_gather(np.append(digest(params), np.float32(gmi)))
+    digests, gmis = gathered[:, :-1], gathered[:, -1].astype(int).tolist()
+    different = [gmi for gmi, one in zip(gmis, digests, strict=True) if (one != digests[0]).any()]
+    if different:
         raise ParameterMismatch(
-            f"after {env_steps} env steps the parameters of trainers {different} differ from "
-            "those of trainer 0"
+            f"after {env_steps} env steps the parameters of GMIs {different} differ from "
+            f"those of GMI {gmis[0]}"
         )
 
 
@@ -144,9 +151,32 @@ def restore_learner(checkpoint: Path, template: T) -> T:
     Raises:
       ConfigError: the checkpoint does not fit the template.
     """
-    fields = _present(template)
-    restored = _restore(checkpoint / LEARNER, fields)
+    fields, folder = _present(template), checkpoint / LEARNER
+    try:
+        restored = _restore(folder, fields)
+    except ConfigError:
+        if not _has_moments_by_parameter(folder):
+            raise
+        restored = _restore_moments_by_parameter(folder, fields)
     return restored if fields is template else cast("Any", template)._replace(**restored)
+
+
+def _has_moments_by_parameter(folder: Path) -> bool:
+    """Whether Adam's moments are trees like the parameters, as those of older checkpoints are."""
+    return any(name.startswith("opt_state.1.mu.") for name in _saved_shapes(folder))
+
+
+def _restore_moments_by_parameter(folder: Path, fields: dict[str, Any]) -> Any:
+    """As `_restore` from an older checkpoint; each moment becomes one vector of its leaves."""
+    wanted = fields["opt_state"]
+    older = jax.tree.map(lambda leaf: fields["params"] if leaf.ndim else leaf, wanted)
+    restored = _restore(folder, {**fields, "opt_state": older})
+    vectors = jax.tree.map(
+        lambda like, part: ravel_pytree(part)[0] if like.ndim else part,
+        wanted,
+        restored["opt_state"],
+    )
+    return {**restored, "opt_state": vectors}
 
 
 def learner_sizes(checkpoint: Path) -> tuple[int, int, int]:
@@ -159,16 +189,25 @@ def learner_sizes(checkpoint: Path) -> tuple[int, int, int]:
     Raises:
       ConfigError: the checkpoint holds no learner's state.
     """
-    folder = (checkpoint / LEARNER).resolve()
+    folder = checkpoint / LEARNER
+    shapes = _saved_shapes(folder)
     try:
-        with ocp.StandardCheckpointer() as checkpointer:
-            saved: Any = checkpointer.metadata(folder).item_metadata
-        (obs_size,) = saved["obs_moments"]["mean"].shape
-        (action_size,) = saved["params"]["log_std"].shape
-        actor_obs_size, _ = saved["params"]["policy"]["params"]["Dense_0"]["kernel"].shape
-    except (AttributeError, KeyError, OSError, TypeError, ValueError) as error:
+        (obs_size,) = shapes["obs_moments.mean"]
+        (action_size,) = shapes["params.log_std"]
+        actor_obs_size, _ = shapes["params.policy.params.Dense_0.kernel"]
+    except (KeyError, ValueError) as error:
         raise ConfigError(f"checkpoint {folder}: holds no policy") from error
     return obs_size, actor_obs_size, action_size
+
+
+def _saved_shapes(folder: Path) -> dict[str, tuple[int, ...]]:
+    """Shapes of all saved arrays by their dotted names; none if nothing can be read."""
+    try:
+        with ocp.StandardCheckpointer() as checkpointer:
+            saved: Any = checkpointer.metadata(folder.resolve()).item_metadata
+        return _shapes(saved.tree)
+    except (AttributeError, OSError, TypeError, ValueError):
+        return {}
 
 
 def restore_envs(checkpoint: Path, gmi: int, template: T) -> T:
@@ -208,10 +247,34 @@ def _restore(folder: Path, template: T) -> T:
         # as a device without enough memory, does not say that the checkpoint is bad.
         if not isinstance(error, ValueError | KeyError | OSError) and type(error) is not Exception:
             raise
-        raise ConfigError(
-            f"checkpoint {folder} does not fit this job: {lines_of(error)[0]}"
-        ) from error
+        why = _difference(_saved_shapes(folder), _shapes(plain)) or lines_of(error)[0]
+        raise ConfigError(f"checkpoint {folder} does not fit this job: {why}") from error
+    # Orbax gives arrays of other shapes than those that were asked for.
+    if why := _difference(_shapes(restored), _shapes(plain)):
+        raise ConfigError(f"checkpoint {folder} does not fit this job: {why}")
     return jax.tree.map(_restored, template, restored)
+
+
+def _difference(
+    saved: Mapping[str, tuple[int, ...]], wanted: Mapping[str, tuple[int, ...]]
+) -> str | None:
+    """The first array in which a checkpoint differs; None if none does, or nothing is known."""
+    for name in sorted(saved.keys() | wanted.keys()) if saved else ():
+        if name not in wanted:
+            return f"it has {name}, this job has not"
+        if name not in saved:
+            return f"it has no {name}, this job has"
+        if saved[name] != wanted[name]:
+            return f"its {name} is {list(saved[name])}, that of this job {list(wanted[name])}"
+    return None
+
+
+def _shapes(tree: PyTree) -> dict[str, tuple[int, ...]]:
+    """Shapes of all arrays of a tree by their dotted names."""
+    return {
+        jax.tree_util.keystr(path, simple=True, separator="."): leaf.shape
+        for path, leaf in jax.tree.leaves_with_path(tree)
+    }
 
 
 def _present(state: Any) -> Any:

@@ -254,7 +254,7 @@ class TrainingLoop:
         self._iteration.wait()
         thread.wait()  # A resumed run goes on from the lines up to its checkpoint.
         config, run, steps = self._config, self._link.run, self._env_steps
-        require_equal(self._reducer, state.params, steps)
+        require_equal(self._reducer, self._link.gmi, state.params, steps)
         require_finite(state.params, config.env.label, steps)
         if env_state is not None:
             save_envs(run, steps, self._link.gmi, env_state)

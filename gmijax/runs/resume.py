@@ -10,12 +10,15 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 
-from gmijax.config import ALGORITHMS, AlgoConfig, EnvConfig
-from gmijax.config.schema import from_dict, from_named
+from gmijax.config import ALGORITHMS, AlgoConfig, EnvConfig, TrainConfig
+from gmijax.config.schema import from_dict, from_named, known
 from gmijax.errors import ConfigError
 from gmijax.runs.folder import META, RunPaths, last_run, read_json
 
 _CHUNK_BYTES: Final = 1 << 20
+
+_MOST_NAMED: Final = 5
+"""Runs that one line names."""
 
 
 @dataclass(frozen=True)
@@ -151,7 +154,7 @@ def choose_checkpoint(wanted: str, key: str) -> tuple[Path, tuple[str, ...]]:
     found = newest_checkpoint(folder)
     if found.checkpoint is None:
         raise ConfigError(
-            "; ".join((f"{key}={wanted}: no checkpoint in this folder", *found.passed_over))
+            "; ".join((f"{key}={wanted}: {_no_checkpoint(folder)}", *found.passed_over))
         )
     return found.checkpoint, found.passed_over
 
@@ -167,7 +170,17 @@ def saved_config_of(wanted: str, key: str) -> dict[str, Any]:
     for meta in metas:
         if meta.is_file():
             return saved_config(meta.parent.resolve())
-    raise ConfigError(f"{key}={wanted}: no checkpoint in this folder")
+    raise ConfigError(f"{key}={wanted}: {_no_checkpoint(folder)}")
+
+
+def _no_checkpoint(folder: Path) -> str:
+    """Says that a folder has none, and where there are some if it is that of a sweep."""
+    jobs = sorted({meta.parents[2].name for meta in folder.glob(f"*/checkpoints/[0-9]*/{META}")})
+    if not jobs:
+        return "no checkpoint in this folder"
+    more = f" and {len(jobs) - _MOST_NAMED} more" if len(jobs) > _MOST_NAMED else ""
+    named = ", ".join(jobs[:_MOST_NAMED])
+    return f"no checkpoint in this folder; runs in it that have some: {named}{more}"
 
 
 def _named(wanted: str, key: str) -> Path:
@@ -206,12 +219,38 @@ def saved_config(checkpoint: Path) -> dict[str, Any]:
 def trained_config(checkpoint: Path) -> tuple[EnvConfig, AlgoConfig]:
     """Task and algorithm of the run that a checkpoint lies in.
 
+    Keys that this version of gmijax does not know any more are left out.
+
     Raises:
       ConfigError: the checkpoint does not lie in the folder of a training run.
     """
     saved = saved_config(checkpoint)
-    algo = from_named(ALGORITHMS, saved["algo"], "algo.")
-    return from_dict(EnvConfig, saved["env"], "env."), algo
+    algo, _ = known(ALGORITHMS, saved["algo"], "algo.")
+    env, _ = known([EnvConfig], saved["env"], "env.")
+    return from_dict(EnvConfig, env, "env."), from_named(ALGORITHMS, algo, "algo.")
+
+
+def require_known_keys(saved: Mapping[str, Any], what: str) -> None:
+    """Raises ConfigError if a run's configuration has keys that this version does not know.
+
+    To train on without them would be another training. Policies act without, see `trained_config`.
+    """
+    if unknown := _unknown_keys(saved):
+        raise ConfigError(
+            f"{what}: its config.json has keys that this version does not know: {unknown}; take "
+            "them out of that file to go on without them (the policy can be played, exported and "
+            "served as it is)"
+        )
+
+
+def left_out(checkpoint: Path) -> str | None:
+    """Says which keys `trained_config` leaves out of a run's configuration; None: none."""
+    unknown = _unknown_keys(saved_config(checkpoint))
+    return f"left out, because this version does not know them: {unknown}" if unknown else None
+
+
+def _unknown_keys(saved: Mapping[str, Any]) -> str:
+    return ", ".join(known([TrainConfig], saved)[1])
 
 
 def _read_object(path: Path) -> dict[str, Any]:

@@ -63,6 +63,7 @@ class Progress:
       started_s: when this command started it, by the monotonic clock.
       updated_s: when the first line of metrics came after that.
       ended_s: when it ended after that.
+      earlier_s: seconds that it took, where an earlier command has completed it.
       place: GPUs and places where it runs, in words.
       node: address of the node where it runs or ran last; None: this machine.
       error: why it failed, in one line.
@@ -76,6 +77,7 @@ class Progress:
     started_s: float | None = None
     updated_s: float | None = None
     ended_s: float | None = None
+    earlier_s: float = 0.0
     place: str = ""
     node: str | None = None
     error: str | None = None
@@ -85,7 +87,7 @@ class Progress:
     def wall_s(self) -> float:
         """Seconds from its start to its end, or until now."""
         if self.started_s is None:
-            return 0.0
+            return self.earlier_s
         return (self.ended_s or time.monotonic()) - self.started_s
 
     def take(self, line: Mapping[str, Any], sweep: SweepConfig) -> None:

@@ -5,7 +5,9 @@ from __future__ import annotations
 import csv
 import io
 import math
+import time
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from typing import Any
 
 import numpy as np
@@ -14,11 +16,38 @@ from rich.table import Table
 from gmijax.config.schema import to_dict
 from gmijax.config.sweep import SweepConfig
 from gmijax.runs.folder import write_json, write_text
-from gmijax.sweeps.jobs import Job, SweepPaths, label_of, trainings_per_hour
+from gmijax.sweeps.jobs import Job, State, SweepPaths, label_of, trainings_per_hour
 from gmijax.version import __version__
 
 CURVE_POINTS = 200
 _QUARTILES = (25, 75)
+
+
+class LiveReport:
+    """Keeps `sweep.json` and `sweep.csv` true while a sweep runs, so that a kill leaves them true.
+
+    Args:
+      jobs: those that are known; more may be added to the list.
+      sweep: settings.
+      paths: files of the sweep.
+      started_s: when the command began, by the monotonic clock.
+    """
+
+    def __init__(
+        self, jobs: Sequence[Job], sweep: SweepConfig, paths: SweepPaths, started_s: float
+    ) -> None:
+        self._jobs, self._sweep, self._paths, self._started_s = jobs, sweep, paths, started_s
+        self._states: list[State] = []
+
+    def update(self) -> None:
+        """Writes them if the state of a job has changed."""
+        states: list[State] = [job.progress.state for job in self._jobs]
+        if states == self._states:
+            return
+        self._states = states
+        with suppress(OSError):  # A full disk must not end the sweep.
+            wall_s = time.monotonic() - self._started_s
+            _write_tables("running", self._jobs, self._sweep, self._paths, wall_s)
 
 
 def write_report(
@@ -29,6 +58,14 @@ def write_report(
     wall_s: float,
 ) -> dict[str, Any]:
     """Writes the files; returns the content of `sweep.json`."""
+    data = _write_tables(status, jobs, sweep, paths, wall_s)
+    draw_curves(jobs, sweep, paths)
+    return data
+
+
+def _write_tables(
+    status: str, jobs: Sequence[Job], sweep: SweepConfig, paths: SweepPaths, wall_s: float
+) -> dict[str, Any]:
     first_s = min((job.progress.started_s or math.inf for job in jobs), default=math.inf)
     rows = [_row(job, paths, first_s) for job in jobs]
     data = {
@@ -42,7 +79,6 @@ def write_report(
     }
     write_json(paths.sweep, data)
     write_text(paths.table, _csv(rows))
-    draw_curves(jobs, sweep, paths)
     return data
 
 

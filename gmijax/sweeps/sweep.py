@@ -34,7 +34,7 @@ from gmijax.sweeps.jobs import (
 )
 from gmijax.sweeps.nodes import Host, nodes_of
 from gmijax.sweeps.places import Places, Site, places_of
-from gmijax.sweeps.report import ranking, write_report
+from gmijax.sweeps.report import LiveReport, ranking, write_report
 from gmijax.sweeps.scheduler import Scheduler
 from gmijax.sweeps.space import Space
 from gmijax.sweeps.study import MakeJob, OptunaStudy, Study
@@ -141,8 +141,13 @@ def _run(
                 held.callback(host.shut)
                 host.open(site.plan, paths.node(number) if host.name else paths)
             held.enter_context(view)
-            places = Places(sites)
-            Scheduler(jobs, study, settings, paths, places, hosts, view.update).run(signals)
+            live = LiveReport(jobs, settings, paths, started_s)
+
+            def tick() -> None:
+                live.update()
+                view.update()
+
+            Scheduler(jobs, study, settings, paths, Places(sites), hosts, tick).run(signals)
         failed = [job for job in jobs if job.progress.state == "failed"]
         status = "failed" if failed else "completed"
     except JobInterrupted as error:
@@ -248,6 +253,8 @@ def _beginning(request: Request, paths: SweepPaths) -> tuple[list[Job], Study]:
         job.progress.read(run, settings)
         if job.progress.state != "pruned":
             job.progress.state = state_of(run, job.config)
+        if job.progress.state == "completed":
+            job.progress.earlier_s = read_json(run.summary).get("wall_s", 0.0)
     write_json(paths.request, wanted)
     return jobs, study
 

@@ -103,7 +103,7 @@ def test_a_device_that_takes_no_copies_leaves_exchanges_to_the_host(tmp_path: Pa
     for rank, result in enumerate(results):
         assert result["error"] is None, result
         said = (tmp_path / f"stderr_{rank}").read_text()
-        assert "rank 1: INTERNAL: gmijax_exchange_0: CUDA_ERROR_INVALID_VALUE; so" in said
+        assert "GMI 1: INTERNAL: gmijax_exchange_0: CUDA_ERROR_INVALID_VALUE; so" in said
 
 
 def test_exchanges_in_different_orders_fail_and_do_not_mix(tmp_path: Path) -> None:
@@ -120,7 +120,7 @@ def test_ranks_that_come_to_different_exchanges_in_the_host_name_both(tmp_path: 
     with Ranks(tmp_path, 2, "step_in_different_orders", num_floats=64).start() as job:
         messages = [result["message"] for result in job.results()]
     mean, gather = "sum of 64 floats", "sum of 128 floats"
-    assert messages[0].startswith(f"step 1: rank 0 calls {mean}")
-    assert f"rank 1 calls {gather}" in messages[0]
-    assert messages[1].startswith(f"step 1: rank 1 calls {gather}")
-    assert f"rank 0 calls {mean}" in messages[1]
+    assert messages[0].startswith(f"step 1: GMI 0 calls {mean}")
+    assert f"GMI 1 calls {gather}" in messages[0]
+    assert messages[1].startswith(f"step 1: GMI 1 calls {gather}")
+    assert f"GMI 0 calls {mean}" in messages[1]

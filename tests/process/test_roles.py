@@ -81,8 +81,8 @@ def test_timeouts_lose_nothing_and_different_data_are_told() -> None:
     plan = gmijax.plan(gmis_per_gpu=2, backend="cpu")
     first, second = launch(plan, role_cases.Disagree())
     two, three = (f"the mean of {count} numbers of float32" for count in (2, 3))
-    assert first == f"rank 0 asks for {two}, rank 1 for {three}"
-    assert second == f"rank 1 asks for {three}, rank 0 for {two}"
+    assert first == f"GMI 0 asks for {two}, GMI 1 for {three}"
+    assert second == f"GMI 1 asks for {three}, GMI 0 for {two}"
 
 
 @pytest.mark.parametrize(
@@ -90,8 +90,8 @@ def test_timeouts_lose_nothing_and_different_data_are_told() -> None:
     [
         ("kill", "GMI 1 failed: ended by SIGKILL", ""),
         ("raise", "GMI 1 failed: exit code 1: ZeroDivisionError: the sum is off", ""),
-        ("return", "peer 1 is gone during recv", "PeerLost"),
-        ("sleep", r"for ranks \[1\]", "CollectiveTimeout"),
+        ("return", "GMI 1 is gone during recv", "PeerLost"),
+        ("sleep", r"for GMIs \[1\]", "CollectiveTimeout"),
     ],
 )
 def test_the_gmi_that_fails_is_named(ends: str, message: str, seen: str, tmp_path: Path) -> None:

@@ -31,13 +31,30 @@ def states(folder: Path) -> list[str]:
     return [job["state"] for job in report(folder)["jobs"]]
 
 
+def table_states(folder: Path) -> list[str]:
+    with (folder / "all" / "sweep.csv").open() as file:
+        return [row["state"] for row in csv.DictReader(file)]
+
+
 @pytest.mark.timeout(600)
 def test_a_sweep_that_is_killed_goes_on_and_a_job_fails_alone(tmp_path: Path) -> None:
     first = start(*SWEEP, cwd=tmp_path, command="sweep")
     whole = tmp_path / "all" / "000" / "summary.json"
-    wait_until(lambda: whole.exists() or first.poll() is not None, 250.0, "a job is through")
+
+    def is_through() -> bool:
+        told = tmp_path / "all" / "sweep.json"
+        return first.poll() is not None or (told.exists() and states(tmp_path)[0] == "completed")
+
+    wait_until(is_through, 250.0, "a job is through")
     first.send_signal(signal.SIGKILL)
     first.wait()
+    # What it has left is true, and only that what ran then runs no more cannot be in it.
+    killed = report(tmp_path)
+    assert killed["status"] == "running"
+    assert killed["jobs"][0]["env_steps"] == 40 * STEPS
+    assert killed["jobs"][0]["value"] is not None
+    assert states(tmp_path)[3] in ("waiting", "running")
+    assert table_states(tmp_path) == states(tmp_path)
     when = whole.stat().st_mtime_ns
 
     done = train(*SWEEP, cwd=tmp_path, command="sweep", timeout_s=400.0)
@@ -49,8 +66,8 @@ def test_a_sweep_that_is_killed_goes_on_and_a_job_fails_alone(tmp_path: Path) ->
     found = report(tmp_path)
     assert sorted(found["ranking"]) == [0, 2]
     assert found["jobs"][1]["overrides"] == {"seed": "0", "algo.entropy_cost": "1e+39"}
-    with (tmp_path / "all" / "sweep.csv").open() as file:
-        assert [row["state"] for row in csv.DictReader(file)] == states(tmp_path)
+    assert found["jobs"][0]["wall_s"] > 0.0
+    assert table_states(tmp_path) == states(tmp_path)
     assert (tmp_path / "all" / "sweep.png").stat().st_size > 10_000
 
     other = train(*SWEEP, "seed=0,2", cwd=tmp_path, command="sweep")

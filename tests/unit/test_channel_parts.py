@@ -77,7 +77,7 @@ def test_batches_slice_and_stack(make_pair: Any, design: str, batch: int) -> Non
     pair.sender.flush()
     got = [number for _ in range(6 * N // batch) for number in pair.numbers(batch)]
     assert got == list(range(6 * N))
-    with pytest.raises(CollectiveTimeout, match=r"rank 1: waited 0 s in receive.*ranks \[0\]"):
+    with pytest.raises(CollectiveTimeout, match=r"GMI 1: waited 0 s in receive.*GMIs \[0\]"):
         pair.receiver.receive(batch, 0.0)
 
 
@@ -90,7 +90,7 @@ def test_a_timeout_loses_nothing_and_the_batch_size_may_change(make_pair: Any) -
     assert pair.numbers(2) == [0, 1]
     assert pair.numbers(N - 2) == [2, 3, 4, 5]
     pair.sender.close()
-    with pytest.raises(PipeClosed, match="peer 0 has closed"):
+    with pytest.raises(PipeClosed, match="GMI 0 has closed"):
         pair.receiver.receive(1, 0.0)
 
 

@@ -67,7 +67,7 @@ def test_a_dead_trainer_is_named_before_one_that_has_left_because_of_it() -> Non
     left: Any = LostWriter(1, PipeClosed(0, 1, "send"))
     dead: Any = LostWriter(2, PeerLost(0, 2, "send", 5))
     migrator = Migrator([left, dead], ())
-    with pytest.raises(PeerLost, match="peer 2 is gone"):
+    with pytest.raises(PeerLost, match="GMI 2 is gone"):
         migrator.try_open([10])
     assert migrator.why_lost() is dead.error
     with pytest.raises(PipeClosed):

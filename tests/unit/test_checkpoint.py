@@ -11,11 +11,14 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+import optax
 import orbax.checkpoint as ocp
 import pytest
 
+from gmijax.cli.compose import compose
 from gmijax.errors import ConfigError
 from gmijax.learning.checkpoint import finish_checkpoint, restore_learner, save_learner
+from gmijax.learning.learner import TrainState, learner_shapes
 from gmijax.runs.folder import RunPaths
 from gmijax.runs.resume import (
     CheckpointMeta,
@@ -23,6 +26,7 @@ from gmijax.runs.resume import (
     best_evaluation,
     newest_checkpoint,
 )
+from gmijax.sim.interface import EnvSpec
 
 
 def restore_with(error: Exception, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -87,6 +91,40 @@ def test_a_checkpoint_from_before_a_field_fits_where_the_field_is_not_used(tmp_p
     assert restore_learner(new, like._replace(more=jnp.zeros(2))).more.tolist() == [7.0, 7.0]
     with pytest.raises(ConfigError, match="does not fit this job"):
         restore_learner(old, like._replace(more=jnp.zeros(2)))
+
+
+def zeros(width: int) -> TrainState:
+    """A state whose networks have one layer of so many units; nothing is computed."""
+    widths = (f"algo.{net}_hidden_layer_sizes=[{width}]" for net in ("policy", "value"))
+    spec = EnvSpec("point", 3, 2, 0.1, 10, (), actor_obs_size=3)
+    shapes = learner_shapes(spec, compose("env=ant", *widths).algo)
+    arrays = jax.tree.map(lambda leaf: np.zeros(leaf.shape, leaf.dtype), shapes._replace(key=()))
+    return arrays._replace(key=jax.random.key(0))
+
+
+def test_moments_of_adam_by_parameter_become_the_vectors_of_today(tmp_path: Path):
+    state, rng = zeros(4), np.random.default_rng(0)
+    params, mu, nu = (
+        jax.tree.map(lambda leaf: rng.normal(size=leaf.shape).astype(np.float32), state.params)
+        for _ in range(3)
+    )
+    older = optax.EmptyState(), optax.ScaleByAdamState(np.asarray(7, np.int32), mu, nu)
+    run = RunPaths(tmp_path)
+    save_learner(run, 1, state._replace(params=params, opt_state=older))
+    meta = CheckpointMeta("point", "ppo", 1, 1, 8, ((4,), (4,)), "jax")
+    found = restore_learner(finish_checkpoint(run, meta), state)
+    jax.tree.map(np.testing.assert_array_equal, found.params, params)
+    _, adam = found.opt_state
+    assert adam.count == 7
+    for vector, tree in ((adam.mu, mu), (adam.nu, nu)):
+        flat = np.concatenate([leaf.ravel() for leaf in jax.tree.leaves(tree)])
+        np.testing.assert_array_equal(vector, flat)
+    assert jax.tree.structure(found) == jax.tree.structure(state)
+    with pytest.raises(
+        ConfigError,
+        match=r"its opt_state.1.mu.policy.params.Dense_0.bias is \[4\], that of this job \[5\]$",
+    ):
+        restore_learner(run.checkpoint(1), zeros(5))
 
 
 def save(

@@ -34,6 +34,17 @@ def test_every_verb_is_a_module_with_help(verb: str, capsys: pytest.CaptureFixtu
     assert callable(importlib.import_module(f"gmijax.{verb.replace('-', '_')}").main)
 
 
+def test_an_interrupt_while_packages_are_imported_is_one_line(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+):
+    def interrupted(name: str) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(importlib, "import_module", interrupted)
+    assert main(["train"]) == 130
+    assert capsys.readouterr().err == "gmijax.train: interrupted\n"
+
+
 def test_arguments_and_exit_code_are_those_of_the_verb(capsys: pytest.CaptureFixture[str]):
     assert main(["train", "num_env=3"]) == 2
     assert "unknown key num_env: did you mean num_envs?" in capsys.readouterr().err

@@ -39,10 +39,10 @@ def test_who_waits_too_is_not_named(blocks: list[SharedBlock]) -> None:
     first, second, _ = barriers_of(blocks, 1.2, 3.0, 3.0)
     with ThreadPoolExecutor(1) as pool:
         other = pool.submit(second.watch, NEVER)
-        with pytest.raises(CollectiveTimeout, match=r"waited 1\.2 s .* for ranks \[2\]"):
+        with pytest.raises(CollectiveTimeout, match=r"waited 1\.2 s .* for GMIs \[2\]"):
             first.watch(NEVER)
         end(blocks, 0, blamed=2)
-        with pytest.raises(CollectiveTimeout, match=r"rank 1: .* for ranks \[2\]"):
+        with pytest.raises(CollectiveTimeout, match=r"GMI 1: .* for GMIs \[2\]"):
             other.result()
 
 
@@ -50,7 +50,7 @@ def test_a_call_that_only_this_rank_does_not_finish_times_out(blocks: list[Share
     first, *others = barriers_of(blocks, 0.3, 3.0, 3.0)
     for other in others:
         other._arrive()
-    with pytest.raises(CollectiveTimeout, match=r"for ranks \[1, 2\]"):
+    with pytest.raises(CollectiveTimeout, match=r"for GMIs \[1, 2\]"):
         first.watch(NEVER)
 
 
@@ -69,7 +69,7 @@ def test_the_dead_are_named_and_not_those_who_gave_up_for_them(
 def test_one_that_gave_up_for_a_stuck_rank_points_at_it(blocks: list[SharedBlock]) -> None:
     first = barriers_of(blocks, 3.0, 3.0, 3.0)[0]
     end(blocks, 1, blamed=2)
-    with pytest.raises(CollectiveTimeout, match=r"for ranks \[2\]"):
+    with pytest.raises(CollectiveTimeout, match=r"for GMIs \[2\]"):
         first.watch(NEVER)
 
 
@@ -108,7 +108,7 @@ def test_the_watch_of_a_step_names_the_silent(blocks: list[SharedBlock]) -> None
     done = threading.Event()
     with ThreadPoolExecutor(1) as pool:
         other = pool.submit(second.watch, done)
-        with pytest.raises(CollectiveTimeout, match=r"for ranks \[2\]"):
+        with pytest.raises(CollectiveTimeout, match=r"for GMIs \[2\]"):
             first.watch(NEVER)
         done.set()
         other.result()
@@ -128,7 +128,7 @@ def test_the_watch_of_a_step_looks_at_those_who_have_arrived_after_it(
             other.result()
     others[0]._arrive()
     end(blocks, 1)
-    with pytest.raises(PeerLost, match="peer 1 is gone"):
+    with pytest.raises(PeerLost, match="GMI 1 is gone"):
         first.watch(NEVER)
 
 

@@ -108,31 +108,31 @@ def told(ranks: Sequence[HostExchange], *sizes: int) -> list[str]:
 def test_ranks_with_different_lengths_name_both() -> None:
     fit = "do not fit together: num_floats is"
     assert told(host_ranks(5000, 200_000), 10, 10) == [
-        f"rank 0 and rank 1 {fit} 5000 for rank 0, and 200000 for rank 1",
-        f"rank 1 and rank 0 {fit} 200000 for rank 1, and 5000 for rank 0",
+        f"GMI 0 and GMI 1 {fit} 5000 for GMI 0, and 200000 for GMI 1",
+        f"GMI 1 and GMI 0 {fit} 200000 for GMI 1, and 5000 for GMI 0",
     ]
 
 
 def test_ranks_are_named_by_the_ids_of_their_gmis() -> None:
     assert told(host_ranks(10, 10, ids=(4, 6)), 8, 9) == [
-        "step 1: rank 4 calls sum of 8 floats, rank 6 calls sum of 9 floats",
-        "step 1: rank 6 calls sum of 9 floats, rank 4 calls sum of 8 floats",
+        "step 1: GMI 4 calls sum of 8 floats, GMI 6 calls sum of 9 floats",
+        "step 1: GMI 6 calls sum of 9 floats, GMI 4 calls sum of 8 floats",
     ]
     for said in told(host_ranks(10, 20, ids=(4, 6)), 8, 8):
-        assert "rank 4" in said
-        assert "rank 6" in said
+        assert "GMI 4" in said
+        assert "GMI 6" in said
 
 
 def test_a_rank_that_has_closed_is_lost_to_those_who_still_call() -> None:
     first, second = host_ranks(10, 10)
     second.close()
-    with pytest.raises(PeerLost, match="peer 1 is gone during sum, step 1"):
+    with pytest.raises(PeerLost, match="GMI 1 is gone during sum, step 1"):
         first.mean(np.zeros(10, np.float32))
 
 
 def test_no_call_follows_a_call_that_failed() -> None:
     rank = host_ranks(10, 10, timeout_s=0.05)[0]
-    with pytest.raises(CollectiveTimeout, match=r"0.05 s in sum, step 1, for ranks \[1\]"):
+    with pytest.raises(CollectiveTimeout, match=r"0.05 s in sum, step 1, for GMIs \[1\]"):
         rank.mean(np.zeros(10, np.float32))
     with pytest.raises(CollectiveError, match="after a call that did not finish"):
         rank.all_gather(np.zeros(1, np.float32))

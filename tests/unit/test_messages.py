@@ -76,7 +76,7 @@ def alone() -> Messenger:
 
 def test_who_does_not_take_what_was_sent_is_named(alone: Messenger) -> None:
     alone.send(np.ones(10**6), 1)  # Does not wait, although the pipe is too small.
-    with pytest.raises(CollectiveTimeout, match=r"in flush, step 0, for ranks \[1\]"):
+    with pytest.raises(CollectiveTimeout, match=r"in flush, step 0, for GMIs \[1\]"):
         alone.flush()
 
 
@@ -85,7 +85,7 @@ def test_messages_to_oneself(alone: Messenger) -> None:
     alone.send(data, 0)
     data[:] = 2
     assert alone.recv(0).sum() == 10**6
-    with pytest.raises(CollectiveTimeout, match=r"in recv, step 1, for ranks \[0\]"):
+    with pytest.raises(CollectiveTimeout, match=r"in recv, step 1, for GMIs \[0\]"):
         alone.recv(0)
 
 
@@ -158,7 +158,7 @@ def test_what_was_not_sent_for_want_of_room_is_not_waited_for(
     first, second = posts(2, timeout_s=0.1)
     second._timeout_s = 5.0
     first.send(np.ones(10**6), 1)
-    with pytest.raises(CollectiveTimeout, match=r"in send, step 2, for ranks \[1\]"):
+    with pytest.raises(CollectiveTimeout, match=r"in send, step 2, for GMIs \[1\]"):
         first.send(jnp.arange(5000.0), 1)
     assert second.recv(0).size == 10**6
     assert first.settle(1.0)

@@ -98,15 +98,15 @@ def test_a_leader_that_hangs_up_and_one_that_does_something_else_are_named(
     ones = np.ones(100, np.float32)
     different = at_once(lambda: meshes[0].sum(ones, 1), lambda: meshes[1].sum(ones[:50], 1))
     assert [type(error) for error in different] == [CollectiveError] * 2
-    assert "rank 0 calls sum, rank 10 something else" in str(different[0])
+    assert "GMI 0 calls sum, GMI 10 something else" in str(different[0])
     meshes[1].close()
-    with pytest.raises(PeerLost, match="peer 10 is gone during all_gather between nodes"):
+    with pytest.raises(PeerLost, match="GMI 10 is gone during all_gather between nodes"):
         meshes[0].gather(ones)
 
 
 @pytest.mark.parametrize("meshes", [(2, 0.3)], indirect=True)
 def test_a_leader_that_does_not_come_is_named_in_time(meshes: list[Mesh]) -> None:
-    with pytest.raises(CollectiveTimeout, match=r"0\.3 s in sum between nodes.*ranks \[10\]"):
+    with pytest.raises(CollectiveTimeout, match=r"0\.3 s in sum between nodes.*GMIs \[10\]"):
         meshes[0].sum(np.ones(3, np.float32), 1)
 
 

@@ -108,11 +108,11 @@ def test_arrays_of_any_strides_are_written_without_a_copy_of_theirs(ends: Ends) 
 
 
 def test_a_full_pipe_and_an_empty_one_wait_no_longer_than_told(ends: Ends) -> None:
-    with pytest.raises(CollectiveTimeout, match=r"rank 1: waited 0.01 s in get.* ranks \[0\]"):
+    with pytest.raises(CollectiveTimeout, match=r"GMI 1: waited 0.01 s in get.* GMIs \[0\]"):
         ends.reader.get(timeout_s=0.01)
     while ends.writer.try_put([raw(1000)]):
         pass
-    with pytest.raises(CollectiveTimeout, match=r"rank 0: waited 0.01 s in put.* ranks \[1\]"):
+    with pytest.raises(CollectiveTimeout, match=r"GMI 0: waited 0.01 s in put.* GMIs \[1\]"):
         ends.writer.put([raw(1000)], timeout_s=0.01)
     assert ends.blocks[0].outstanding_bytes(1) == ends.writer.outstanding_bytes > 6000
     held = ends.reader.try_get()
@@ -127,11 +127,11 @@ def test_what_is_closed_gives_what_is_in_it_and_then_says_so(ends: Ends, is_all:
     ends.writer.put([raw(4)], timeout_s=1.0)
     (ends.blocks[0] if is_all else ends.writer).close()
     assert ends.reader.get(timeout_s=1.0)[0].size == 4
-    with pytest.raises(PipeClosed, match="peer 0 has closed"):
+    with pytest.raises(PipeClosed, match="GMI 0 has closed"):
         ends.reader.get(timeout_s=5.0)
     ends.reader.close()
     if not is_all:
-        with pytest.raises(PipeClosed, match="peer 1 has closed"):
+        with pytest.raises(PipeClosed, match="GMI 1 has closed"):
             ends.writer.put([raw(4)], timeout_s=1.0)
 
 
@@ -139,18 +139,18 @@ def test_what_is_closed_gives_what_is_in_it_and_then_says_so(ends: Ends, is_all:
 def test_a_damaged_message_is_found(ends: Ends, offset: int) -> None:
     ends.writer.put([np.arange(128.0)], timeout_s=1.0)
     ends.blocks[0].pipe(0, 1).ring[offset] ^= 0x10
-    with pytest.raises(CollectiveError, match="message 0 from rank 0 is damaged"):
+    with pytest.raises(CollectiveError, match="message 0 from GMI 0 is damaged"):
         ends.reader.get(timeout_s=1.0)
 
 
 def test_a_rank_that_is_taken_and_other_memory_are_refused(ends: Ends) -> None:
     descriptors = len(os.listdir("/proc/self/fd"))
     for _ in range(3):
-        with pytest.raises(CollectiveError, match="rank 1 is taken already by process"):
+        with pytest.raises(CollectiveError, match="GMI 1 is taken already by process"):
             PipeBlock(ends.fd, 1)
     assert len(os.listdir("/proc/self/fd")) == descriptors
     empty = os.memfd_create("empty", os.MFD_CLOEXEC)
-    with pytest.raises(CollectiveError, match="rank 1: no pipes at descriptor"):
+    with pytest.raises(CollectiveError, match="GMI 1: no pipes at descriptor"):
         PipeBlock(empty, 1)
     os.close(empty)
 

@@ -16,7 +16,14 @@ from gmijax.cli.compose import compose
 from gmijax.config.schema import to_dict
 from gmijax.errors import ConfigError
 from gmijax.runs.folder import META, RunPaths, last_run, read_json, write_json
-from gmijax.runs.resume import CheckpointMeta, file_check, find_checkpoint, newest_checkpoint
+from gmijax.runs.resume import (
+    CheckpointMeta,
+    file_check,
+    find_checkpoint,
+    left_out,
+    newest_checkpoint,
+    trained_config,
+)
 
 
 def make_run(root: Path, *env_steps: int) -> RunPaths:
@@ -112,6 +119,35 @@ def test_what_an_older_version_did_not_save_is_filled_in_for_the_runs_own_task(r
     assert config.algo.reward_scaling != compose("env=ball_balance").algo.reward_scaling
     assert config.reduce == compose().reduce
     assert config.num_envs == 8
+
+
+def test_a_folder_of_runs_names_those_that_have_checkpoints(tmp_path: Path):
+    for number in range(8):
+        make_run(tmp_path / f"{number:03d}", *([100] if number else []))
+    with pytest.raises(ConfigError) as error:
+        find_checkpoint(str(tmp_path), "run.dir")
+    assert str(error.value) == (
+        f"run.dir={tmp_path}: no checkpoint in this folder; runs in it that have some: "
+        "001, 002, 003, 004, 005 and 2 more"
+    )
+
+
+def test_keys_that_are_no_more_stop_a_training_and_no_policy(run: RunPaths):
+    saved = read_json(run.config)
+    known = trained_config(run.checkpoint(100))
+    saved["env"]["gone"], saved["algo"]["gone"], saved["lost"] = 1, "x", {"inner": 2}
+    write_json(run.config, saved)
+    with pytest.raises(ConfigError) as error:
+        compose(f"run.resume={run.root}", "num_timesteps=5000")
+    assert str(error.value) == (
+        f"run.resume={run.root}: its config.json has keys that this version does not know: "
+        "env.gone, algo.gone, lost; take them out of that file to go on without them (the policy "
+        "can be played, exported and served as it is)"
+    )
+    assert trained_config(run.checkpoint(100)) == known
+    said = "left out, because this version does not know them: env.gone, algo.gone, lost"
+    assert left_out(run.checkpoint(100)) == said
+    assert compose(f"run.dir={run.root}", command="serve").env == known[0]
 
 
 def test_a_run_keeps_what_it_changed_about_its_task(run: RunPaths):

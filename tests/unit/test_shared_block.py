@@ -63,7 +63,7 @@ def test_a_smaller_rank_does_not_shrink_the_file(exchange_fd: int) -> None:
 
 def test_one_rank_number_is_given_once(exchange_fd: int) -> None:
     attach(exchange_fd, 1, 2, 10)
-    with pytest.raises(CollectiveError, match=f"rank 1 is taken already by process {os.getpid()}"):
+    with pytest.raises(CollectiveError, match=f"GMI 1 is taken already by process {os.getpid()}"):
         attach(exchange_fd, 1, 2, 10)
 
 

@@ -41,7 +41,7 @@ class Counted(FakeDeviceMemory):
 
 def test_what_was_made_before_a_failure_is_closed() -> None:
     (host,) = host_ranks(SIZE)
-    said = "wish: rank 0: no more memory"
+    said = "wish: GMI 0: no more memory"
     with pytest.raises(DeviceMemoryUnavailable, match=said):
         SharedSlots(host, SIZE, [0], [0, 0], Counted, "wish")
     assert Counted.num_open == 0

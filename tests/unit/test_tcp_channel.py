@@ -171,7 +171,7 @@ def test_an_agent_does_not_wait_for_a_trainer_that_is_not_there(
 
 
 def test_an_address_that_cannot_be_is_named() -> None:
-    with pytest.raises(CollectiveError, match=r"no connection with rank 0 at 127.0.0.1 "):
+    with pytest.raises(CollectiveError, match=r"no connection with GMI 0 at 127.0.0.1 "):
         RemoteReader("127.0.0.1", 1, 0, CAPACITY)
 
 
@@ -179,7 +179,7 @@ def test_what_is_no_message_of_a_channel_is_an_error(address: str) -> None:
     reader, writer = RemoteReader(address, 1, 0, CAPACITY), RemoteWriter(address, 0, 1, CAPACITY)
     for junk in (b"", b"junk", b"x" * tcp_channel._HEADER.size):
         writer._connection.send([junk])
-        with pytest.raises(CollectiveError, match="rank 1: no message of a channel from 0"):
+        with pytest.raises(CollectiveError, match="GMI 1: no message of a channel from GMI 0"):
             receive(reader, 1)
     send(writer, 7)
     assert receive(reader, 1) == [7]
@@ -197,7 +197,7 @@ def test_a_message_that_is_too_long_is_not_taken_and_what_follows_is_an_error(
     assert receive(reader, 1) == [1]
     writer._connection.send([FORGED[0], bytes(CAPACITY // 2 + tcp_channel.MAX_ANSWER_BYTES + 1)])
     writer._sequence += 1
-    with pytest.raises(CollectiveError, match="message 1 from rank 0 is lost, here is message"):
+    with pytest.raises(CollectiveError, match="message 1 from GMI 0 is lost, here is message"):
         exchange(writer, reader, 20)  # Those right behind it may go down with the connection.
     # An agent takes nothing but answers.
     limit = writer._connection._socket.getsockopt(zmq.MAXMSGSIZE)

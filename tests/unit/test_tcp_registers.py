@@ -90,7 +90,7 @@ def test_what_is_no_message_of_registers_is_an_error(
     [connection] = leader._connections.values()
     for junk in (b"", b"junk", b"x" * 200):
         connection.send([junk])
-        with pytest.raises(CollectiveError, match="rank 7: no message of registers from rank 0"):
+        with pytest.raises(CollectiveError, match="GMI 7: no message of registers from GMI 0"):
             wait(lambda: agent.of(0, 0).read(after=1))
 
 

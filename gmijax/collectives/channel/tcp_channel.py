@@ -69,7 +69,9 @@ class _End:
         head, *parts = frames
         if len(head) != _HEADER.size or (header := _HEADER.unpack(head))[0] != MAGIC:
             # Only who has the secret could send it.
-            raise CollectiveError(f"rank {self._rank}: no message of a channel from {self.peer}")
+            raise CollectiveError(
+                f"GMI {self._rank}: no message of a channel from GMI {self.peer}"
+            )
         _, kind, sequence = header
         received = _Received(kind, sequence, parts)
         self._has_left = self._has_left or received.kind == GOODBYE
@@ -107,7 +109,7 @@ class RemoteWriter(_End):
         length = message_bytes(sizes)
         if length > self.max_message_bytes:
             raise CollectiveError(
-                f"rank {self._rank}: a message of {length} bytes to rank {self.peer}, "
+                f"GMI {self._rank}: a message of {length} bytes to GMI {self.peer}, "
                 f"at most {self.max_message_bytes}"
             )
         if self._on_the_way + length > self._capacity_bytes:
@@ -187,7 +189,7 @@ class RemoteReader(_End):
             return None
         if received.sequence != self._sequence:
             raise CollectiveError(
-                f"rank {self._rank}: message {self._sequence} from rank {self.peer} is lost, "
+                f"GMI {self._rank}: message {self._sequence} from GMI {self.peer} is lost, "
                 f"here is message {received.sequence}"
             )
         if received.kind == GOODBYE:

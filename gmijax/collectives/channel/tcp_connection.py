@@ -110,7 +110,7 @@ class Connection:
         except (OSError, ValueError, OverflowError, zmq.ZMQError) as error:
             self.close()
             raise CollectiveError(
-                f"rank {rank}: no connection with rank {peer} at {address} ({error})"
+                f"GMI {rank}: no connection with GMI {peer} at {address} ({error})"
             ) from None
 
     def send(self, frames: Sequence[Any]) -> None:

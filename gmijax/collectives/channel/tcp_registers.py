@@ -127,7 +127,7 @@ class RemoteRegisters:
                     begin += length
         if len(found) < len(self._their_bytes) or begin != data.size:
             # Only who has the secret could send it.
-            raise CollectiveError(f"rank {self._rank}: no message of registers from rank {peer}")
+            raise CollectiveError(f"GMI {self._rank}: no message of registers from GMI {peer}")
         return found
 
 

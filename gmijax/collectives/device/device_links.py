@@ -204,10 +204,9 @@ class DeviceLinks(HostLinks):
         if self._queue is None or self._order is None:
             raise RuntimeError("the exchange is closed")
         if (peer := self._order.come_to(place, num_floats)) is not None:
-            rank = self._control.rank
-            other = peer - self._here.rank + rank
+            gmi, other = (self._here.ids[rank] for rank in (self._here.rank, peer))
             raise RuntimeError(
-                f"rank {rank} and rank {other} have come to their exchanges in different orders; "
+                f"GMI {gmi} and GMI {other} have come to their exchanges in different orders; "
                 f"here it is number {place} of its program, with {num_floats} floats"
             )
         self._queue.start_clock(stream)

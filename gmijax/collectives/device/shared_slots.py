@@ -189,12 +189,13 @@ def agreed(
         said = " ".join(str(error).split())
         note, has_failed = f"{said or type(error).__name__}".encode()[:NOTE_BYTES], True
     sent = np.zeros(1 + NOTE_BYTES, np.float32)  # One number a byte: no float has odd bits.
-    sent[0] = has_failed
+    sent[0] = 1 + host.local.ids[host.local.rank] if has_failed else 0
     sent[1 : 1 + len(note)] = np.frombuffer(note, np.uint8)
     everyone = host.introduce(sent)
     notes = everyone[:, 1:].astype(np.uint8)
     if failed := np.flatnonzero(everyone[:, 0]).tolist():
         why = notes[failed[0]].tobytes().rstrip(b"\0").decode(errors="replace")
-        raise DeviceMemoryUnavailable(f"{wish}: rank {failed[0]}: {why}")
+        gmi = int(everyone[failed[0], 0]) - 1
+        raise DeviceMemoryUnavailable(f"{wish}: GMI {gmi}: {why}")
     first = host.rank - host.local.rank
     return notes[first : first + host.local.world_size]

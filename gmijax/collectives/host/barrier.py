@@ -60,7 +60,8 @@ class Barrier:
         """
         rank = self._block.rank
         if self._is_open:
-            raise CollectiveError(f"rank {rank}: {operation} after a call that did not finish")
+            gmi = self._block.ids[rank]
+            raise CollectiveError(f"GMI {gmi}: {operation} after a call that did not finish")
         self._operation, self._is_open = operation, True
         self.step += 1
         if self.step == 1:
@@ -124,8 +125,8 @@ class Barrier:
         for peer in self._peers:
             if words[peer] != own:
                 raise CollectiveError(
-                    f"step {self.step}: rank {ids[self._block.rank]} calls "
-                    f"{_describe(int(own))}, rank {ids[peer]} calls "
+                    f"step {self.step}: GMI {ids[self._block.rank]} calls "
+                    f"{_describe(int(own))}, GMI {ids[peer]} calls "
                     f"{_describe(int(words[peer]))}"
                 )
 
@@ -155,7 +156,7 @@ class Barrier:
         sizes, rank = self._block.lines["num_floats"], self._block.rank
         for peer in self._peers:
             if sizes[peer] != sizes[rank]:
-                own, other = (f"rank {self._block.ids[one]}" for one in (rank, peer))
+                own, other = (f"GMI {self._block.ids[one]}" for one in (rank, peer))
                 raise CollectiveError(
                     f"{own} and {other} do not fit together: num_floats is {sizes[rank]} for "
                     f"{own}, and {sizes[peer]} for {other}"

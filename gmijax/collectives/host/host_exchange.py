@@ -63,6 +63,7 @@ class HostExchange:
         self.rank = rank
         self.world_size = world_size
         block = attach(fd, rank, world_size, num_floats, lane, ids)
+        self.ids = block.ids
         self._block: SharedBlock | None = block
         self.barrier = Barrier(block, timeout_s, rendezvous_timeout_s)
 
@@ -175,7 +176,7 @@ class HostExchange:
 
     def _open_block(self, operation: str) -> SharedBlock:
         if self._block is None:
-            raise CollectiveError(f"rank {self.rank}: {operation} after close")
+            raise CollectiveError(f"GMI {self.ids[self.rank]}: {operation} after close")
         return self._block
 
 

@@ -105,9 +105,10 @@ def attach(
     slots_at = whole_pages(gathered_at + 4 * num_gathered)
     flags_at = whole_pages(slots_at + 4 * 2 * world_size * row_floats)
     size = flags_at + whole_pages(world_size * LINE.itemsize)
-    mapping = map_file(fd, size, f"rank {rank}")
+    gmis = tuple(range(world_size) if ids is None else ids)
+    mapping = map_file(fd, size, f"GMI {gmis[rank]}")
     lines = np.frombuffer(mapping, LINE, LANES * world_size).reshape(LANES, -1)[lane]
-    take_line(lines[rank], rank)
+    take_line(lines[rank], gmis[rank])
     lines["num_floats"][rank] = num_floats
     gathered = np.frombuffer(mapping, np.float32, num_gathered, gathered_at)
     slots = np.frombuffer(mapping, np.float32, 2 * world_size * row_floats, slots_at)
@@ -117,5 +118,5 @@ def attach(
         gathered=gathered.reshape(LANES, 2, world_size, MAX_GATHER_FLOATS)[lane],
         slots=slots.reshape(2, world_size, row_floats)[:, :, :num_floats],
         flags=np.frombuffer(mapping, np.uint32, -1, flags_at).reshape(-1, FLOATS_PER_LINE),
-        ids=tuple(range(world_size) if ids is None else ids),
+        ids=gmis,
     )

@@ -86,7 +86,7 @@ class GroupReducer:
         if op not in get_args(Operation):
             raise ConfigError(f"op={op!r}: allowed are {', '.join(get_args(Operation))}")
         if rank not in members:
-            raise ConfigError(f"group={members}: rank {rank} takes part, and is not a member")
+            raise ConfigError(f"group={members}: GMI {rank} takes part, and is not a member")
         if members[0] < 0 or members[-1] >= world_size:
             raise ConfigError(f"group={members}: allowed are GMIs 0 to {world_size - 1}")
 
@@ -119,7 +119,7 @@ class GroupReducer:
         if not np.issubdtype(wide, np.inexact if op == "mean" else np.number):
             what = "real or complex numbers" if op == "mean" else "numbers"
             rank = self._messenger.rank
-            raise CollectiveError(f"rank {rank}: {op} of {flat.dtype}; it takes {what}")
+            raise CollectiveError(f"GMI {rank}: {op} of {flat.dtype}; it takes {what}")
         own = flat.astype(wide, copy=False)
         if own.nbytes <= AT_ONCE_BYTES:
             result = _sum(self._exchange(call, dict.fromkeys(members, own)))
@@ -145,7 +145,7 @@ class GroupReducer:
         # With the size of all: parts of data of different lengths may well be equally long.
         if (other := _Call(*theirs)) != call:
             rank = self._messenger.rank
-            raise CollectiveError(f"rank {rank} asks for {call}, rank {member} for {other}")
+            raise CollectiveError(f"GMI {rank} asks for {call}, GMI {member} for {other}")
         return part
 
     def _require_no_other(self, call: _Call) -> None:

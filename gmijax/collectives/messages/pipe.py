@@ -131,7 +131,7 @@ class PipeWriter:
         length, capacity = message_bytes(sizes), self._block.capacity_bytes
         if length > self.max_message_bytes:
             raise CollectiveError(
-                f"rank {self._block.rank}: a message of {length} bytes to rank {self.peer}, "
+                f"GMI {self._block.rank}: a message of {length} bytes to GMI {self.peer}, "
                 f"at most {self.max_message_bytes}"
             )
         if self._reader["closed"].item(0):
@@ -148,7 +148,7 @@ class PipeWriter:
     def commit(self) -> None:
         """Hands the reserved message to the reader."""
         if self._reserved is None:
-            raise CollectiveError(f"rank {self._block.rank}: commit without reserve")
+            raise CollectiveError(f"GMI {self._block.rank}: commit without reserve")
         (begin, gap, length, sizes), self._reserved = self._reserved, None
         if gap:
             start = self._position % self._block.capacity_bytes
@@ -220,7 +220,7 @@ class PipeReader:
             return self._read(self._position)
         except Damaged as error:
             raise CollectiveError(
-                f"rank {self._block.rank}: message {self.messages} from rank {self.peer} "
+                f"GMI {self._block.rank}: message {self.messages} from GMI {self.peer} "
                 f"is damaged: {error}"
             ) from None
 

@@ -86,7 +86,7 @@ class PipeBlock:
             size = _block_bytes(self.world_size, self.capacity_bytes)
             mapping = mmap.mmap(fd, size, flags=mmap.MAP_SHARED)
         except (OSError, ValueError, IndexError) as error:  # IndexError: an empty file.
-            raise CollectiveError(f"rank {rank}: no pipes at descriptor {fd} ({error})") from None
+            raise CollectiveError(f"GMI {rank}: no pipes at descriptor {fd} ({error})") from None
         self.rank = rank
         self._lines = np.frombuffer(mapping, LINE, self.world_size, LINE_BYTES)
         self._pipes: dict[tuple[int, int], PipeMemory] = {}
@@ -115,7 +115,7 @@ class PipeBlock:
     def pipe(self, src: int, dst: int) -> PipeMemory:
         """The pipe from `src` to `dst`; for `pipe.py`."""
         if self._mapping is None:
-            raise CollectiveError(f"rank {self.rank}: pipe after close")
+            raise CollectiveError(f"GMI {self.rank}: pipe after close")
         if (src, dst) not in self._pipes:
             offset = self._offset(src, dst)
             ends = np.frombuffer(self._mapping, END, 2, offset)
@@ -132,8 +132,8 @@ class PipeBlock:
             os.posix_fallocate(self._fd, self._offset(self.rank, dst), size)
         except OSError as error:
             raise CollectiveError(
-                f"rank {self.rank}: cannot have {size / 2**20:.1f} MiB of shared memory for a "
-                f"pipe to rank {dst} ({error.strerror})"
+                f"GMI {self.rank}: cannot have {size / 2**20:.1f} MiB of shared memory for a "
+                f"pipe to GMI {dst} ({error.strerror})"
             ) from None
 
     def close(self) -> None:

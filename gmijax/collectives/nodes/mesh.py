@@ -110,7 +110,7 @@ class Mesh:
             self._wait(swap, operation)
             if different := swap.different():
                 raise CollectiveError(
-                    f"step {self._calls}: rank {self._ids[self._node]} calls {operation}, rank "
+                    f"step {self._calls}: GMI {self._ids[self._node]} calls {operation}, GMI "
                     f"{self._ids[different[0]]} something else, or of another size"
                 )
         except ConnectionError:
