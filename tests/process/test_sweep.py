@@ -15,9 +15,8 @@ SWEEP = (
     *POINT,
     f"num_timesteps={40 * STEPS}",
     "run.checkpoint_every=10",
-    "seed=0,1",
-    # The larger one is infinite in float32, and so is the loss.
-    "algo.entropy_cost=1e-3,1e39",
+    # The largest one is infinite in float32, and so is the loss.
+    "algo.entropy_cost=1e-3,1e39,2e-3",
     "sweep.jobs_per_gpu=2",
     "run.dir=all",
 )
@@ -42,17 +41,17 @@ def test_a_sweep_that_is_killed_goes_on_and_a_job_fails_alone(tmp_path: Path) ->
 
     done = train(*SWEEP, cwd=tmp_path, command="sweep", timeout_s=400.0)
     assert done.returncode == 1
-    assert "2 of 4 jobs failed; job 1: " in done.stderr
+    assert "1 of 3 jobs failed; job 1: " in done.stderr
     assert len(done.stderr.splitlines()) == 1
-    assert states(tmp_path) == ["completed", "failed"] * 2
+    assert states(tmp_path) == ["completed", "failed", "completed"]
     assert whole.stat().st_mtime_ns == when  # It was not run again.
     found = report(tmp_path)
     assert sorted(found["ranking"]) == [0, 2]
-    assert found["jobs"][1]["overrides"] == {"seed": "0", "algo.entropy_cost": "1e+39"}
+    assert found["jobs"][1]["overrides"] == {"algo.entropy_cost": "1e+39"}
     with (tmp_path / "all" / "sweep.csv").open() as file:
         assert [row["state"] for row in csv.DictReader(file)] == states(tmp_path)
     assert (tmp_path / "all" / "sweep.png").stat().st_size > 10_000
 
-    other = train(*SWEEP, "seed=0,2", cwd=tmp_path, command="sweep")
+    other = train(*SWEEP, "seed=0,1", cwd=tmp_path, command="sweep")
     assert other.returncode == 2
     assert "holds another sweep; give the same lists, or another folder" in other.stderr
