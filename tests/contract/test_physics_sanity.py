@@ -7,13 +7,12 @@ from typing import Any
 import jax.numpy as jnp
 import mujoco
 import numpy as np
-from compiled_tasks import NUM_ENVS, CompiledTask, on_device
+from compiled_tasks import NUM_ENVS, NUM_STARTS, CompiledTask, on_device
 from task_cases import CASES
 
 from gmijax.sim import physics
 
 STEPS = 1000
-NUM_STARTS = 4
 
 
 def passive(model: Any) -> Any:
