@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import cached_property
-from typing import Any
+from typing import Any, TypeVar
 
 import jax
 import mujoco
@@ -14,10 +14,20 @@ from gmijax.sim import physics
 from gmijax.sim.registry import make_env
 from gmijax.sim.wrappers import BatchState, StepOutput, env_keys, training_env
 
+T = TypeVar("T")
+
 NUM_ENVS = 8
 EPISODE_LENGTH = 25
-MOST_WORLDS = 256
-"""Worlds that `converged_step` may be called with."""
+NUM_STARTS = 4
+"""Worlds that `converged_step` is called with: it is compiled once."""
+
+
+def on_device(state: T) -> T:
+    """Says where it is, as what a step returns does: or a second step would compile it again.
+
+    MJX puts a model on a device by name, which is handed on to whatever is computed with it.
+    """
+    return jax.device_put(state, jax.devices()[0])
 
 
 class CompiledTask:
@@ -38,7 +48,7 @@ class CompiledTask:
         return self.batch.step(model, state, actions)
 
     def start(self, seed: int = 0) -> BatchState:
-        return self.init(self.env.model, env_keys(jax.random.key(seed), 0, NUM_ENVS))
+        return on_device(self.init(self.env.model, env_keys(jax.random.key(seed), 0, NUM_ENVS)))
 
     def actions(self, seed: int) -> jax.Array:
         shape = (NUM_ENVS, self.env.spec.action_size)
@@ -52,13 +62,13 @@ class CompiledTask:
         """
         mj_model = physics.load(self.env.spec.name, impl="jax", substeps=1).mj_model
         mj_model.opt.iterations = mj_model.opt.ls_iterations = 50
-        return physics.from_mj_model(mj_model, impl=self.impl, substeps=1, max_envs=MOST_WORLDS)
+        return physics.from_mj_model(mj_model, impl=self.impl, substeps=1, max_envs=NUM_STARTS)
 
     @cached_property
     def converged_step(
         self,
     ) -> Callable[..., tuple[physics.PhysicsState, jax.Array]]:
-        """`(model, state [T], ctrl [T, nu]) -> (state, sensordata)` of `converged`."""
+        """`(model, state, ctrl) -> (state, sensordata)` of `converged`, of NUM_STARTS worlds."""
         step = jax.vmap(self.converged.step, in_axes=(None, 0, 0))
         return jax.jit(step, compiler_options=CPU_OPTIONS)
 

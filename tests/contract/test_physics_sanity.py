@@ -7,13 +7,12 @@ from typing import Any
 import jax.numpy as jnp
 import mujoco
 import numpy as np
-from compiled_tasks import NUM_ENVS, CompiledTask
+from compiled_tasks import NUM_ENVS, NUM_STARTS, CompiledTask, on_device
 from task_cases import CASES
 
 from gmijax.sim import physics
 
 STEPS = 1000
-NUM_STARTS = 4
 
 
 def passive(model: Any) -> Any:
@@ -32,7 +31,7 @@ def test_a_passive_robot_gains_no_energy(task: CompiledTask):
         np.random.default_rng(0).normal(0.0, 0.3, start.qvel.shape),
     )
     qvel = start.qvel[:NUM_STARTS] + jnp.asarray(push[:NUM_STARTS], jnp.float32)
-    state = physics.PhysicsState(qpos, qvel, jnp.zeros_like(qvel))
+    state = on_device(physics.PhysicsState(qpos, qvel, jnp.zeros_like(qvel)))
     ctrl = jnp.zeros((NUM_STARTS, task.mj_model.nu))
     energies = [energy(task.mj_model, state)]
     for _ in range(STEPS):
@@ -64,7 +63,7 @@ def energy(mj_model: mujoco.MjModel, state: physics.PhysicsState) -> np.ndarray:
 
 def test_bodies_do_not_sink_into_each_other(task: CompiledTask):
     state, deepest, rng = task.start(seed=3), 0.0, np.random.default_rng(0)
-    shape, first = (NUM_ENVS, task.env.spec.action_size), jnp.zeros_like(state.env.steps)
+    shape, first = (NUM_ENVS, task.env.spec.action_size), state.env.steps
     for _ in range(STEPS):
         actions = jnp.asarray(rng.uniform(-1, 1, shape), jnp.float32)
         state, _ = task.step(task.env.model, state, actions)

@@ -80,7 +80,7 @@ def test_what_takes_too_long_is_ended_and_not_runnable(tmp_path: Path):
 
 def test_an_asynchronous_job_gets_gmis_and_gpus_that_act_and_train(tmp_path: Path):
     job = (
-        *JOB, "algo=a3c", "algo.num_minibatches=2", "plan.gpus=3", "reduce.timeout_s=60",
+        *JOB, "algo=a3c", "algo.num_minibatches=2", "plan.gpus=2", "reduce.timeout_s=60",
         "search.gmis_per_gpu=[2]", "search.num_envs=[16]", "search.iterations=3",
     )  # fmt: skip
     report = search(*job, cwd=tmp_path)
@@ -93,7 +93,8 @@ def test_an_asynchronous_job_gets_gmis_and_gpus_that_act_and_train(tmp_path: Pat
         assert min(rates) <= gmis * one["env_steps_per_s"] <= max(rates)
         assert 100 < one["memory_mib"] < 10_000
     best = report["best"]
-    assert best["serving_gpus"] + best["training_gpus"] == 3
+    # How more GPUs are divided: tests/unit/test_async_search.py.
+    assert (best["serving_gpus"], best["training_gpus"]) == (1, 1)
     assert f"{best['serving_gpus']} GPU" in report["reason"]
     run = trained_with_auto(report, *job, "num_timesteps=640", cwd=tmp_path)
     plan = json.loads((run / "plan.json").read_text())

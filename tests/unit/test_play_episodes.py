@@ -22,8 +22,11 @@ TIME_LIMIT = CHUNK_STEPS + 20
 SPEC = EnvSpec("counter", 1, 1, 0.1, TIME_LIMIT, ("plus", "minus"))
 
 
-def counting_env(reward: float = 1.0) -> Env:
-    """A world that counts steps, earns `reward` and pays 0.25 a step, ends by chance."""
+def counting_env(reward: float = 1.0, per_action: float = 0.0) -> Env:
+    """A world that counts steps, earns `reward` and pays 0.25 a step, ends by chance.
+
+    It earns `per_action` times the action too.
+    """
 
     def reset(model: PyTree, key: PRNGKey) -> EnvState:
         key, draw = jax.random.split(key)
@@ -32,7 +35,7 @@ def counting_env(reward: float = 1.0) -> Env:
 
     def step(model: PyTree, state: EnvState, action: Array) -> EnvState:
         count = state.physics + 1.0
-        terms = {"plus": jnp.asarray(reward), "minus": jnp.asarray(-0.25)}
+        terms = {"plus": reward + per_action * action[0], "minus": jnp.asarray(-0.25)}
         total = sum(terms.values(), jnp.zeros(()))
         ended = count[0] >= state.task
         return episode.advance(state, count, state.task, count / 100, (total, terms), ended)
@@ -92,6 +95,13 @@ def test_environments_do_not_depend_on_how_many_there_are(algo: AlgoConfig):
     few = episodes_of(algo, counting_env(), num_envs=3, deterministic=False)
     many = episodes_of(algo, counting_env(), deterministic=False)
     np.testing.assert_array_equal(few.lengths, many.lengths[:3])
+
+
+def test_a_seed_decides_what_random_actions_do(algo: AlgoConfig):
+    env = counting_env(per_action=0.1)
+    first, again = (episodes_of(algo, env, deterministic=False).returns for _ in range(2))
+    np.testing.assert_array_equal(first, again)
+    assert not np.isclose(first, episodes_of(algo, env).returns).any()
 
 
 def test_a_world_with_a_bad_number_ends_without_reward(algo: AlgoConfig):
