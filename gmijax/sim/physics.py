@@ -137,8 +137,8 @@ class Physics:
         # (docs/decisions/sim-warp-readings.md). One traced physics step, though only the last
         # one's are wanted: a second copy takes half as long again to compile, and was not faster.
         nothing = self.blank()
-        bits = None if self.impl == "jax" else jnp.zeros_like(nothing._impl.overflow)
-        unread = jax.tree.map(jnp.zeros_like, read(nothing))
+        bits = None if self.impl == "jax" else nothing._impl.overflow
+        unread, bits = jax.tree.map(partial(_own_zeros, state.qpos), (read(nothing), bits))
         (moved, reading, bits), _ = jax.lax.scan(
             substep, (state._replace(overflow=None), unread, bits), length=self.substeps
         )
@@ -223,6 +223,17 @@ def from_mj_model(
     return Physics(chosen, mj_model, model, jax_model, blank, substeps, max_envs)
 
 
+def _own_zeros(qpos: Array, like: Array) -> Array:
+    """Zeros like `like`, which `jax.vmap` takes for the world's own as `qpos` is.
+
+    If a scan begins with what all worlds share and goes on with what is a world's own, `jax.vmap`
+    goes through its body twice: half of the time that it takes to trace a step of physics. XLA
+    drops the choice.
+    """
+    zeros = jnp.zeros_like(like)
+    return jax.lax.select(jnp.full(like.shape, qpos[0] > 0), zeros, zeros)
+
+
 def _put(mj_model: mujoco.MjModel, impl: Impl) -> mjx.Model:
     try:
         return mjx.put_model(mj_model, impl=impl)
@@ -254,8 +265,8 @@ def _warp_blank(
     # Zeros are made where they are used: as constants of the compiled program they would be
     # tens of megabytes.
     kept = [
-        # Looked at by numpy: jax would make a program for every shape.
-        jax.ShapeDtypeStruct(leaf.shape, leaf.dtype) if not np.any(leaf) else leaf
+        # Copied to the host first: `np.any` asks jax, which makes a program for every shape.
+        leaf if np.asarray(leaf).any() else jax.ShapeDtypeStruct(leaf.shape, leaf.dtype)
         for leaf in leaves
     ]
 

@@ -119,6 +119,29 @@ ARM_AND_FREE_BOX = """
 """
 
 
+def test_a_map_over_worlds_goes_through_the_physics_steps_once():
+    passes = []
+
+    @jax.custom_batching.custom_vmap
+    def reading(qpos: jax.Array) -> jax.Array:
+        return qpos
+
+    @reading.def_vmap
+    def _(size: int, is_batched: list[bool], qpos: jax.Array) -> tuple[jax.Array, bool]:
+        del size
+        passes.append(1)
+        return qpos, is_batched[0]
+
+    mj_model = mujoco.MjModel.from_xml_string(PENDULUM_OVER_FLOOR)
+    world = from_mj_model(mj_model, impl="jax", substeps=2)
+
+    def step(state: PhysicsState) -> jax.Array:
+        return world.step(world.model, state, jnp.zeros(1), lambda data: reading(data.qpos))[1]
+
+    jax.eval_shape(jax.vmap(step), PhysicsState(*jnp.zeros((3, 3, 1))))
+    assert len(passes) == 1
+
+
 @pytest.mark.parametrize("impl", ["jax", "warp"])
 def test_poses_are_those_of_mujoco_in_c(impl: str):
     if impl == "warp":
