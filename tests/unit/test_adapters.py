@@ -88,16 +88,36 @@ def test_the_policy_sees_the_entry_state_and_the_value_function_all_or_both_all_
     assert observation(obs).tolist() == [0.0, 1.0, 1.0, 8.0]
     env = adapt(Counter(), name="theirs", episode_length=9)
     assert (env.spec.obs_size, env.spec.actor_obs_size) == (8, 3)
-    networks = make_learner(env.spec, compose().algo).networks
-    params = jax.eval_shape(lambda: networks.init(jax.random.key(0), env.spec.obs_size))
-    sizes = [
-        tree["params"]["Dense_0"]["kernel"].shape[0] for tree in (params.policy, params.value)
-    ]
-    assert sizes == [3, 8]
     theirs = BraxEnv(env)
     assert theirs.observation_size == {"state": (3,), "privileged_state": (8,)}
     given: Any = theirs.reset(jax.random.key(0)).obs
     assert {name: part.shape for name, part in given.items()} == theirs.observation_size
+
+
+@pytest.mark.parametrize(
+    ("key", "sizes"), [("auto", [3, 8]), ("privileged_state", [3, 8]), ("state", [3, 3])]
+)
+def test_the_value_function_sees_what_value_obs_key_says(key: str, sizes: list[int]):
+    spec = adapt(Counter(), name="theirs", episode_length=9).spec
+    networks = make_learner(spec, compose(f"algo.value_obs_key={key}").algo).networks
+    params = networks.init(jax.random.key(0), spec.obs_size)
+    nets = (params.policy, params.value)
+    assert [net["params"]["Dense_0"]["kernel"].shape[0] for net in nets] == sizes
+    obs = jnp.arange(8.0)
+    hidden = obs.at[3:].set(0.0)
+    value, of_less = (networks.state_value(params, each) for each in (obs, hidden))
+    assert (value == of_less) == (key == "state")
+    np.testing.assert_array_equal(networks.output(params, obs), networks.output(params, hidden))
+
+
+def test_a_value_function_cannot_see_more_where_there_is_no_more():
+    spec = make_env("fast", suite="brax").spec
+    make_learner(spec, compose("algo.value_obs_key=state").algo)
+    message = (
+        r"^algo\.value_obs_key=privileged_state: brax/fast has no .* allowed are auto, state$"
+    )
+    with pytest.raises(ConfigError, match=message):
+        make_learner(spec, compose("algo.value_obs_key=privileged_state").algo)
 
 
 def test_rewards_actions_and_metrics_of_an_episode():
