@@ -66,6 +66,11 @@ class ActorCriticConfig(KeyGroup):
     obs_std_floor: float = doc(
         "smallest standard deviation that observations are divided by", default=1e-4, low=1e-4
     )
+    value_obs_key: Literal["auto", "state", "privileged_state"] = doc(
+        "the value function sees what the policy does (state), or also what the task has for it "
+        "alone (privileged_state); auto: that, where there is any",
+        default="auto",
+    )
     policy_hidden_layer_sizes: tuple[int, ...] = doc("widths of the policy network", low=1)
     value_hidden_layer_sizes: tuple[int, ...] = doc("widths of the value network", low=1)
     precision: Literal["float32", "bfloat16"] = doc(

@@ -15,6 +15,7 @@ import optax
 from jax.flatten_util import ravel_pytree
 
 from gmijax.config import ADAPTIVE_LEARNING_RATE_RANGE, AlgoConfig
+from gmijax.errors import ConfigError
 from gmijax.learning.distributions import DISTRIBUTIONS
 from gmijax.learning.normalize import Moments, from_units, no_samples, with_std_floor
 from gmijax.learning.policy import ActorCritic, ActorCriticParams, Mlp
@@ -59,7 +60,17 @@ class Learner(NamedTuple, Generic[C]):
 
 
 def make_learner(spec: EnvSpec, config: C) -> Learner[C]:
-    """The learner for an environment's sizes."""
+    """The learner for an environment's sizes.
+
+    Raises:
+      ConfigError: the value function shall see what this environment does not have.
+    """
+    seen = spec.actor_obs_size
+    if config.value_obs_key == "privileged_state" and seen is None:
+        raise ConfigError(
+            f"algo.value_obs_key=privileged_state: {spec.name} has no observations for the value "
+            "function alone; allowed are auto, state"
+        )
     make_distribution, precision = DISTRIBUTIONS[config.distribution_type], config.precision
     distribution = make_distribution(spec.action_size, config.state_dependent_std)
     # A small output layer makes the first policy's mean about zero wherever the robot is.
@@ -67,7 +78,12 @@ def make_learner(spec: EnvSpec, config: C) -> Learner[C]:
     value = Mlp(config.value_hidden_layer_sizes, 1, 1.0, precision)
     return Learner(
         networks=ActorCritic(
-            policy, value, config.init_noise_std, distribution, spec.actor_obs_size
+            policy,
+            value,
+            config.init_noise_std,
+            distribution,
+            actor_obs_size=seen,
+            value_obs_size=seen if config.value_obs_key == "state" else None,
         ),
         # The learning rate is in the state, because the adaptive schedule changes it. One vector
         # of all parameters: a kernel for each of them costs a tenth of an update on a GPU.

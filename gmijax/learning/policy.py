@@ -98,6 +98,7 @@ class ActorCritic(NamedTuple):
       init_noise_std: standard deviation of the first policy.
       distribution: of actions.
       actor_obs_size: `policy` sees the first so many numbers of an observation; None: all.
+      value_obs_size: the same of `value`.
     """
 
     policy: Mlp
@@ -105,6 +106,7 @@ class ActorCritic(NamedTuple):
     init_noise_std: float
     distribution: Normal
     actor_obs_size: int | None = None
+    value_obs_size: int | None = None
 
     def init(self, key: PRNGKey, obs_size: int) -> ActorCriticParams:
         """First weights; consumes `key`."""
@@ -112,7 +114,7 @@ class ActorCritic(NamedTuple):
         obs = jnp.zeros((1, obs_size))
         return ActorCriticParams(
             policy=self.policy.init(policy_key, obs[:, : self.actor_obs_size]),
-            value=self.value.init(value_key, obs),
+            value=self.value.init(value_key, obs[:, : self.value_obs_size]),
             log_std=jnp.full((self.distribution.action_size,), jnp.log(self.init_noise_std)),
         )
 
@@ -128,4 +130,6 @@ class ActorCritic(NamedTuple):
 
     def state_value(self, params: ActorCriticParams, obs: Array) -> Array:
         """Value estimates [...] for normalised observations [..., O]."""
+        if self.value_obs_size is not None:
+            obs = obs[..., : self.value_obs_size]
         return jnp.asarray(self.value.apply(params.value, obs))[..., 0]

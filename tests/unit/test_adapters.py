@@ -32,7 +32,8 @@ LENGTH = 5
 class Counter:
     """Theirs, in miniature: writes into its dicts and returns plain numbers, as theirs do.
 
-    It ends after `limit` steps, by truncation if `by_time`.
+    It ends after `limit` steps, by truncation if `by_time`, and counts those of all episodes in
+    `info`. An action below 0 breaks it.
     """
 
     action_size = 2
@@ -44,25 +45,34 @@ class Counter:
     def reset(self, rng: jax.Array) -> Any:
         rng, draw = jax.random.split(rng)
         assert rng.dtype == jnp.uint32
-        info = {"rng": rng, "count": jnp.zeros((), jnp.int32), "truncation": jnp.zeros(())}
+        info = {"rng": rng, "steps": jnp.zeros(()), "truncation": jnp.zeros(())}
         metrics = {"double": jnp.zeros(()), "pair": jnp.zeros(2)}
         obs = {"state": jax.random.uniform(draw, (3,)), "privileged_state": jnp.ones(5)}
-        return envs.State(None, obs, jnp.zeros(()), jnp.zeros(()), metrics, info)
+        count: Any = jnp.zeros((), jnp.int32)
+        return envs.State(count, obs, jnp.zeros(()), jnp.zeros(()), metrics, info)
 
     def step(self, state: Any, action: jax.Array) -> Any:
-        state.info["count"] += 1
-        ended = state.info["count"] >= self.limit
+        count = state.pipeline_state + 1
+        ended = count >= self.limit
+        state.info["steps"] += jnp.where(action[0] < 0, jnp.nan, 1.0)
         state.info["truncation"] = ended * 1 if self.by_time else 0
         state.metrics.update(double=2.0, pair=jnp.ones(2))
-        return state.replace(reward=jnp.sum(action), done=ended.astype(float))
+        obs = {
+            "state": state.obs["state"] + 1,
+            "privileged_state": jnp.ones(5) * state.info["steps"],
+        }
+        return state.replace(
+            pipeline_state=count, obs=obs, reward=jnp.sum(action), done=ended.astype(float)
+        )
 
 
-def unrolled(theirs: Counter, steps: int, action: float) -> list[Any]:
+def unrolled(theirs: Counter, *actions: float) -> list[Any]:
+    """States and outputs, the first state with None."""
     env = training_env(time_limit(adapt(theirs, name="theirs", episode_length=9), 9))
     state = jax.jit(env.init)(env.model, env_keys(jax.random.key(0), 0, NUM_ENVS))
     step = jax.jit(env.step)
-    outputs = []
-    for _ in range(steps):
+    outputs: list[Any] = [(state, None)]
+    for action in actions:
         state, out = step(env.model, state, jnp.full((NUM_ENVS, 2), action))
         outputs.append((state, out))
     return outputs
@@ -78,24 +88,44 @@ def test_the_policy_sees_the_entry_state_and_the_value_function_all_or_both_all_
     assert observation(obs).tolist() == [0.0, 1.0, 1.0, 8.0]
     env = adapt(Counter(), name="theirs", episode_length=9)
     assert (env.spec.obs_size, env.spec.actor_obs_size) == (8, 3)
-    networks = make_learner(env.spec, compose().algo).networks
-    params = jax.eval_shape(lambda: networks.init(jax.random.key(0), env.spec.obs_size))
-    sizes = [
-        tree["params"]["Dense_0"]["kernel"].shape[0] for tree in (params.policy, params.value)
-    ]
-    assert sizes == [3, 8]
     theirs = BraxEnv(env)
     assert theirs.observation_size == {"state": (3,), "privileged_state": (8,)}
     given: Any = theirs.reset(jax.random.key(0)).obs
     assert {name: part.shape for name, part in given.items()} == theirs.observation_size
 
 
+@pytest.mark.parametrize(
+    ("key", "sizes"), [("auto", [3, 8]), ("privileged_state", [3, 8]), ("state", [3, 3])]
+)
+def test_the_value_function_sees_what_value_obs_key_says(key: str, sizes: list[int]):
+    spec = adapt(Counter(), name="theirs", episode_length=9).spec
+    networks = make_learner(spec, compose(f"algo.value_obs_key={key}").algo).networks
+    params = networks.init(jax.random.key(0), spec.obs_size)
+    nets = (params.policy, params.value)
+    assert [net["params"]["Dense_0"]["kernel"].shape[0] for net in nets] == sizes
+    obs = jnp.arange(8.0)
+    hidden = obs.at[3:].set(0.0)
+    value, of_less = (networks.state_value(params, each) for each in (obs, hidden))
+    assert (value == of_less) == (key == "state")
+    np.testing.assert_array_equal(networks.output(params, obs), networks.output(params, hidden))
+
+
+def test_a_value_function_cannot_see_more_where_there_is_no_more():
+    spec = make_env("fast", suite="brax").spec
+    make_learner(spec, compose("algo.value_obs_key=state").algo)
+    message = (
+        r"^algo\.value_obs_key=privileged_state: brax/fast has no .* allowed are auto, state$"
+    )
+    with pytest.raises(ConfigError, match=message):
+        make_learner(spec, compose("algo.value_obs_key=privileged_state").algo)
+
+
 def test_rewards_actions_and_metrics_of_an_episode():
-    outputs = unrolled(Counter(), 4, action=3.0)
-    for _, out in outputs:
+    outputs = unrolled(Counter(), *[3.0] * 4)
+    for _, out in outputs[1:]:
         assert out.reward.tolist() == [2.0] * NUM_ENVS, "actions are clipped to 1"
-    assert not outputs[2][1].terminated.any()
-    last = outputs[3][1]
+    assert not outputs[3][1].terminated.any()
+    last = outputs[4][1]
     assert last.terminated.all()
     assert int(last.finished.count) == NUM_ENVS
     assert float(last.finished.return_sum) == NUM_ENVS * 8.0
@@ -103,17 +133,37 @@ def test_rewards_actions_and_metrics_of_an_episode():
     assert {k: float(v) for k, v in last.finished.metric_sums.items()} == {"double": 24.0}
 
 
-def test_all_of_their_state_starts_over_with_a_new_key():
-    outputs = unrolled(Counter(), 5, action=0.0)
-    before, after = (outputs[i][0].env.physics for i in (2, 3))
-    assert before.info["count"].tolist() == [3] * NUM_ENVS
-    assert after.info["count"].tolist() == [0] * NUM_ENVS
-    assert not np.isin(after.info["rng"], before.info["rng"]).any()
-    assert outputs[4][0].env.physics.info["count"].tolist() == [1] * NUM_ENVS
+def test_a_world_starts_over_where_it_began_and_keeps_their_info():
+    """As with the automatic resets of Brax and Playground."""
+    states = [state.env for state, _ in unrolled(Counter(), *[0.0] * 5)]
+    first, before, after, then = (states[i] for i in (0, 3, 4, 5))
+    assert len(np.unique(first.obs[:, 0])) == NUM_ENVS
+    assert before.physics.pipeline_state.tolist() == [3] * NUM_ENVS
+    assert after.physics.pipeline_state.tolist() == after.steps.tolist() == [0] * NUM_ENVS
+    np.testing.assert_array_equal(after.obs, first.obs)
+    np.testing.assert_array_equal(after.physics.obs["state"], first.physics.obs["state"])
+    assert then.physics.pipeline_state.tolist() == [1] * NUM_ENVS
+    assert then.task.info["steps"].tolist() == [5.0] * NUM_ENVS
+    np.testing.assert_array_equal(then.task.info["rng"], first.task.info["rng"])
+
+
+def test_a_world_that_diverged_keeps_their_info_of_one_step_earlier():
+    (state, _), (_, out), (last, _) = unrolled(Counter(), 0.0, -1.0, 0.0)[1:]
+    assert state.env.task.info["steps"].tolist() == [1.0] * NUM_ENVS
+    assert out.is_diverged.all()
+    assert last.env.task.info["steps"].tolist() == [2.0] * NUM_ENVS
+
+
+def test_no_step_computes_a_reset():
+    theirs = Counter()
+    env = training_env(adapt(theirs, name="theirs", episode_length=9))
+    state = jax.eval_shape(env.init, env.model, env_keys(jax.random.key(0), 0, NUM_ENVS))
+    theirs.reset = lambda rng: pytest.fail("a step called reset")
+    jax.eval_shape(env.step, env.model, state, jnp.zeros((NUM_ENVS, 2)))
 
 
 def test_their_own_time_limit_truncates():
-    out = unrolled(Counter(by_time=True), 4, action=0.0)[-1][1]
+    out = unrolled(Counter(by_time=True), *[0.0] * 4)[-1][1]
     assert out.truncated.all()
     assert not out.terminated.any()
 
@@ -122,7 +172,7 @@ def test_a_step_leaves_the_state_that_it_is_given_alone():
     env = adapt(Counter(), name="theirs", episode_length=9)
     state = env.reset(env.model, jax.random.key(0))
     env.step(env.model, state, jnp.zeros(2))
-    assert int(state.physics.info["count"]) == 0
+    assert float(state.task.info["steps"]) == 0.0
 
 
 class Seeing(Counter):
@@ -139,7 +189,7 @@ class Growing(Counter):
     ("theirs", "message"),
     [
         (Seeing, r"\['pixels'\] has shape \(4, 4, 3\); allowed are vectors"),
-        (Growing, r"physics\.info\.rng is uint32\[3\], not uint32\[2\]$"),
+        (Growing, r"task\.info\.rng is uint32\[3\], not uint32\[2\]$"),
     ],
 )
 def test_pictures_and_states_that_change_are_refused(theirs: type[Counter], message: str):

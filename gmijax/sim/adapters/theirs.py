@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping
 from functools import partial
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -27,6 +27,19 @@ the value function both."""
 
 REWARD = "reward"
 """The one term of the reward: theirs come as a sum."""
+
+
+class Carried(NamedTuple):
+    """What a world takes from one episode to the next.
+
+    Attributes:
+      first: their state at the world's first start, with an empty `info`.
+      info: of their state now: what Brax's and Playground's automatic resets leave alone, such as
+        the random key that new commands are drawn from.
+    """
+
+    first: Any
+    info: Any
 
 
 def adapt(
@@ -73,7 +86,9 @@ def adapt(
     def positions(state: EnvState) -> Array:
         return jnp.zeros(0) if qpos is None else qpos(state.physics)
 
-    env = Env(spec, (), partial(_reset, theirs, spec), partial(_step, theirs), mj_model, positions)
+    reset, step = partial(_reset, theirs, spec), partial(_step, theirs)
+    env = Env(spec, (), reset, step, mj_model, positions)
+    env = env._replace(next_episode=partial(_next_episode, spec))
     check_env(env, f"env.name={name}")
     return env
 
@@ -83,13 +98,15 @@ def _reset(theirs: Any, spec: EnvSpec, model: PyTree, key: PRNGKey) -> EnvState:
     key, draw = jax.random.split(key)
     # They were written for keys that are plain integers.
     state = jax.tree.map(jnp.asarray, theirs.reset(jax.random.key_data(draw)))
-    return episode.begin(spec, state, (), observation(state.obs), key)
+    first = state.replace(info={})
+    return episode.begin(spec, first, Carried(first, state.info), observation(state.obs), key)
 
 
 def _step(theirs: Any, model: PyTree, state: EnvState, action: Array) -> EnvState:
     del model
-    before = jax.tree.map(lambda leaf: leaf, state.physics)  # They write into their dicts.
-    after = _alike(state.physics, theirs.step(before, jnp.clip(action, -1.0, 1.0)))
+    before = state.physics.replace(info=state.task.info)
+    mine = jax.tree.map(lambda leaf: leaf, before)  # They write into their dicts.
+    after = _alike(before, theirs.step(mine, jnp.clip(action, -1.0, 1.0)))
     done = after.done > 0
     out_of_time = done & (jnp.asarray(after.info.get("truncation", 0)) > 0)
     reward = after.reward.astype(jnp.float32)
@@ -98,7 +115,15 @@ def _step(theirs: Any, model: PyTree, state: EnvState, action: Array) -> EnvStat
     }
     obs, terms = observation(after.obs), (reward, {REWARD: reward})
     terminated = done & ~out_of_time
-    return episode.advance(state, after, (), obs, terms, terminated, sums, out_of_time)
+    physics, task = after.replace(info={}), state.task._replace(info=after.info)
+    return episode.advance(state, physics, task, obs, terms, terminated, sums, out_of_time)
+
+
+def _next_episode(spec: EnvSpec, model: PyTree, ended: EnvState) -> EnvState:
+    """Back to the first start: a reset may cost as much as hundreds of steps."""
+    del model
+    first = ended.task.first
+    return episode.begin(spec, first, ended.task, observation(first.obs), ended.key)
 
 
 def require_jax(impl: str, suite: str) -> None:
