@@ -126,7 +126,7 @@ def test_end_without_an_error_file_is_described(
 
 def test_cause_goes_before_consequence_and_an_abort_after_other_causes(tmp_path: Path):
     log = tmp_path / "stderr.log"
-    late = CollectiveTimeout(rank=0, missing=(1,), operation="mean", step=3, timeout_s=5)
+    late = CollectiveTimeout(gmi=0, missing=(1,), operation="mean", step=3, timeout_s=5)
     victim = describe_exit(0, 1, ReportedError(type(late).__name__, str(late), ""), log)
     bad_input = describe_exit(2, 1, ReportedError("ConfigError", "num_envs=7: too odd", ""), log)
     aborted = describe_exit(1, -signal.SIGABRT, None, log)
