@@ -96,7 +96,7 @@ def lose_peer(link: ChildLink) -> None:
     peer = link.run.gmi(1).root / "helper.json"
     while not peer.exists() or identify(read_json(peer)["pid"]):
         link.beat("running", 1)
-    link.report_error(PeerLost(rank=link.gmi, peer=1, operation="mean", step=7))
+    link.report_error(PeerLost(gmi=link.gmi, peer=1, operation="mean", step=7))
     sys.exit(1)
 
 
