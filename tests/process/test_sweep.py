@@ -48,12 +48,11 @@ def test_a_sweep_that_is_killed_goes_on_and_a_job_fails_alone(tmp_path: Path) ->
     wait_until(is_through, 250.0, "a job is through")
     first.send_signal(signal.SIGKILL)
     first.wait()
-    # What it has left is true, and only that what ran then runs no more cannot be in it.
+    # What it has left is true; only of jobs that ran then it cannot know that they run no more.
     killed = report(tmp_path)
     assert killed["status"] == "running"
     assert killed["jobs"][0]["env_steps"] == 40 * STEPS
     assert killed["jobs"][0]["value"] is not None
-    assert states(tmp_path)[3] in ("waiting", "running")
     assert table_states(tmp_path) == states(tmp_path)
     when = whole.stat().st_mtime_ns
 

@@ -82,7 +82,7 @@ def test_a_gmi_that_hangs_in_the_program_of_all_is_named(tmp_path: Path) -> None
     os.kill(pid, signal.SIGSTOP)
     assert job.wait(timeout=90) == 1
     said = (tmp_path / "stderr.txt").read_text()
-    assert "ranks [1]" in said, said
+    assert "for GMIs [1]" in said, said
     wait_until(lambda: not pids_of(run), 60, "all GMIs gone")
 
 
