@@ -78,8 +78,8 @@ def with_density(
         kind = config.env.label, config.num_envs, config.algo.name, _size(job)
         kinds.setdefault(kind, job)
     bench = _Bench(hosts[0], scratch, signals)
-    counts = [_best(settings, job, bench, console) for job in kinds.values()]
     most = _most(settings, jobs, hosts)
+    counts = [_best(settings, job, most, bench, console) for job in kinds.values()]
     return dataclasses.replace(settings, jobs_per_gpu=max(1, min(*counts, most)))
 
 
@@ -106,14 +106,19 @@ class _Bench(NamedTuple):
     signals: StopSignals
 
 
-def _best(settings: SweepConfig, job: Job, bench: _Bench, console: Console) -> int:
-    """The number of such jobs at a time on the GPUs of one that makes the most steps."""
+def _best(settings: SweepConfig, job: Job, most: int, bench: _Bench, console: Console) -> int:
+    """The number of such jobs at a time on the GPUs of one that makes the most steps.
+
+    More than `most` are not profiled, but for the number that is next to it.
+    """
     config = job.config
     own = {"job": "sweep", "size": _size(job)}
     key = workload_of(config).store_key(bench.host.machine) | own
     store = ProfileStore(cache_folder() / "profiles", key, console.print)
     best, best_rate = 1, 0.0
     for count in COUNTS:
+        if best >= most:
+            break
         point = Point(count, config.envs_per_gmi, str(config.physics.impl))
         found = store.get("sweep", point)
         if found is None:

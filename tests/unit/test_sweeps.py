@@ -327,9 +327,16 @@ def test_a_gpu_goes_to_one_sweep_at_a_time(
         ((10.0, 19.0, 30.0, 31.0), 9, 4, [1, 2, 4, 8]),
         ((10.0, 9.0), 9, 1, [1, 2]),
         ((10.0, 19.0, None), 9, 2, [1, 2, 4]),
-        ((10.0, 20.0, 40.0, 41.0), 3, 3, [1, 2, 4, 8]),
+        ((10.0, 20.0, 40.0), 3, 3, [1, 2, 4]),
+        ((), 1, 1, []),
     ],
-    ids=["more gain nothing", "two are slower", "memory ends", "no more than there are"],
+    ids=[
+        "more gain nothing",
+        "two are slower",
+        "memory ends",
+        "no more than there are",
+        "one job",
+    ],
 )
 def test_jobs_at_a_time_by_profiling(
     rates: tuple[float | None, ...],
@@ -355,7 +362,7 @@ def test_jobs_at_a_time_by_profiling(
         assert found.jobs_per_gpu == best
     assert done == profiled
     done.clear()  # Larger jobs are others.
-    large = jobs_of([compose("plan.gmis_per_gpu=2")])
+    large = jobs_of([compose(f"seed={n}", "plan.gmis_per_gpu=2") for n in range(num_jobs)])
     with_density(SweepConfig(), large, hosts, open_console(show=False), StopSignals())
     assert done == profiled
 
