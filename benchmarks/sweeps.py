@@ -1,7 +1,7 @@
 """Trainings per hour of sweeps: `python -m benchmarks.sweeps`.
 
 The same trainings as sweeps with one at a time, several under MPS, several under plain sharing,
-a mix of tasks, and as many as `auto` takes. A sweep counts from the start of its first job to the
+several as one program, a mix of tasks, and as many as `auto` takes. A sweep counts from the start of its first job to the
 end of its last, start-up included; beside it stand the steps per second while all places train.
 Writes `benchmarks/results/sweeps-<device>.json` after every sweep. What is interrupted or meets
 the deadline keeps what is through; a sweep that would not end in time is not started.
@@ -32,11 +32,11 @@ class Way(NamedTuple):
     """How to run the trainings of a sweep."""
 
     at_once: str  # Jobs on the GPU, or `auto`.
-    backend: str
+    how: str  # `plan.backend`, or `vmap`: those that can be are one program.
     tasks: str  # Tasks of a mix, with commas; empty: that of the command line.
 
     def __str__(self) -> str:
-        return f"{self.at_once} at once, {self.backend}{', ' * bool(self.tasks)}{self.tasks}"
+        return f"{self.at_once} at once, {self.how}{', ' * bool(self.tasks)}{self.tasks}"
 
 
 class Benchmark:
@@ -102,7 +102,9 @@ class Benchmark:
                 *more,
             ]
             command += [f"seed=range({seeds})", f"sweep.jobs_per_gpu={way.at_once}"]
-            command += [f"plan.backend={way.backend}", "sweep.gpus=1", f"run.dir={folder}"]
+            together = way.how == "vmap"
+            command.append("sweep.pack=vmap" if together else f"plan.backend={way.how}")
+            command += ["sweep.gpus=1", f"run.dir={folder}"]
             started_s = time.monotonic()
             variables = {"JAX_COMPILATION_CACHE_DIR": str(cache or Path(scratch) / "xla")}
             code = run_command(command, self.deadline_s, variables)
@@ -137,6 +139,7 @@ def main() -> int:
     shared = arguments.shared if machine.gpus else []
     ways = [Way(str(n), "auto", arguments.mix) for n in arguments.at_once]
     ways += [Way(str(n), "share", arguments.mix) for n in shared]
+    ways += [Way(str(n), "vmap", arguments.mix) for n in arguments.packed]
     if arguments.auto:
         ways.append(Way("auto", "auto", arguments.mix))
     benchmark = Benchmark(arguments, machine)
@@ -171,6 +174,7 @@ def _arguments() -> argparse.Namespace:
     parser.add_argument("--jobs", type=int, default=8, help="trainings of a sweep")
     parser.add_argument("--at-once", type=int, nargs="*", default=[1, 2, 4, 8])
     parser.add_argument("--shared", type=int, nargs="*", default=[4], help="without MPS")
+    parser.add_argument("--packed", type=int, nargs="*", default=[], help="as one program")
     parser.add_argument("--mix", default="", help="a mix of these tasks, e.g. ant,humanoid")
     parser.add_argument("--auto", action="store_true", help="also sweep.jobs_per_gpu=auto")
     parser.add_argument("--repeats", type=int, default=3)

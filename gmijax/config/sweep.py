@@ -25,6 +25,11 @@ class SweepConfig(KeyGroup):
         default="auto",
         low=1,
     )
+    pack: Literal["gmi", "vmap"] = doc(
+        "how jobs share a GPU: each in processes of its own (gmi), or those that differ in seed "
+        "and learning rate alone as one program (vmap); vmap only with sampler=grid",
+        default="gmi",
+    )
     objective: str = doc(
         "what jobs are ranked by: a key of their metrics; its best value counts", default="return"
     )
@@ -58,3 +63,5 @@ class SweepConfig(KeyGroup):
             raise ConfigError(
                 f"sweep.pruner={self.pruner}: not with sweep.sampler=grid; allowed are random, tpe"
             )
+        if self.sampler != "grid" and self.pack != "gmi":
+            raise ConfigError(f"sweep.pack={self.pack}: only with sweep.sampler=grid; use gmi")

@@ -80,7 +80,7 @@ def train(config: TrainConfig, *, show: bool = False) -> Result:
         if config.cluster.engine is not None:
             cluster = held.enter_context(ClusterJob(config))
             nodes = cluster.join(beginning.root(config))
-        decided = decide(_from(config, beginning.checkpoint), console, nodes)
+        decided = decide(started_from(config, beginning.checkpoint), console, nodes)
         return _train(decided, beginning, console, cluster, opengl, started_s)
 
 
@@ -154,7 +154,7 @@ class _Job:
         with (
             followed(config, run, beginning.checkpoint, self._console.print),
             filmed(self._opengl, run, self._console.print),
-            recorded(run, partial(_what_is_left, run), record),
+            recorded(run, partial(what_is_left, run), record),
         ):
             self._prepare(beginning)
             with progress:
@@ -171,7 +171,7 @@ class _Job:
     def _launch_at(self, checkpoint: Path | None, attempt: int) -> Launch:
         if attempt:
             self._look_again()
-        config = _from(self._config, checkpoint)
+        config = started_from(self._config, checkpoint)
         write_json(self._run.config, to_dict(config))
         return Launch(
             plan=self._plan,
@@ -199,7 +199,7 @@ class _Job:
             self._console.print(note)
 
 
-def _from(config: TrainConfig, checkpoint: Path | None) -> TrainConfig:
+def started_from(config: TrainConfig, checkpoint: Path | None) -> TrainConfig:
     """The configuration with `run.resume` as the path of a checkpoint, or null."""
     resume = None if checkpoint is None else str(checkpoint)
     return dataclasses.replace(config, run=dataclasses.replace(config.run, resume=resume))
@@ -216,7 +216,7 @@ def _finished(config: TrainConfig, run: RunPaths, console: Console) -> Result:
     return Result(run.root, summary)
 
 
-def _what_is_left(run: RunPaths) -> str:
+def what_is_left(run: RunPaths) -> str:
     """Says how an interrupted job can be continued."""
     if run.gmi(0).result.exists() and read_json(run.gmi(0).result)["status"] == "completed":
         return f"training was complete: {run.root}"

@@ -57,6 +57,12 @@ class JobKind:
     calls: Callable[[Plan], Sequence[tuple[int, int]]] = lambda _: ()
 
 
+MEMBERS_VARIABLE: Final = "GMIJAX_MEMBERS"
+"""Run folders of trainings that are one program, as a JSON list."""
+
+PACKED: Final = JobKind("gmijax.workers.packed_worker")
+"""Several trainings in one program of one GMI."""
+
 SYNCHRONOUS: Final = JobKind("gmijax.workers.training_worker")
 """Training in which every GMI simulates, acts and trains (TCG_EX)."""
 

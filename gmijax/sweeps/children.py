@@ -7,7 +7,7 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -36,10 +36,10 @@ class Seen(NamedTuple):
 
 
 class Child:
-    """The process of a job.
+    """The process of a job, or of several that are trained together.
 
     Args:
-      config: of the training, with everything that its place decides.
+      configs: of the trainings, with everything that their place decides.
       cpus: its cores.
       order: file for what the process is told.
       log: file for what it prints; continued if it exists.
@@ -51,13 +51,13 @@ class Child:
 
     def __init__(
         self,
-        config: Mapping[str, Any],
+        configs: Sequence[Mapping[str, Any]],
         cpus: tuple[int, ...],
         order: Path,
         log: Path,
         variables: Mapping[str, str],
     ) -> None:
-        write_json(order, {"config": config, "cpus": list(cpus)})
+        write_json(order, {"configs": list(configs), "cpus": list(cpus)})
         self._log = log
         self._pipe = GuardPipe()
         self._ended_s: float | None = None

@@ -113,6 +113,8 @@ def _best(settings: SweepConfig, job: Job, most: int, bench: _Bench, console: Co
     """
     config = job.config
     own = {"job": "sweep", "size": _size(job)}
+    if settings.pack != "gmi":
+        own["pack"] = settings.pack
     key = workload_of(config).store_key(bench.host.machine) | own
     store = ProfileStore(cache_folder() / "profiles", key, console.print)
     best, best_rate = 1, 0.0

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from contextlib import ExitStack
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
@@ -24,10 +24,10 @@ Order = Literal["ask_to_stop", "kill", "close"]
 
 
 class Start(NamedTuple):
-    """A job to be started; see `Child` and `CompiledPrograms`."""
+    """Jobs to be started, together if they are several; see `Child` and `CompiledPrograms`."""
 
     place: Place
-    config: Mapping[str, Any]
+    configs: Sequence[Mapping[str, Any]]
     order: Path
     log: Path
     program: str
@@ -86,14 +86,14 @@ class LocalHost:
         self._backend = self._entered.enter_context(open_backend(plan, self.machine, run))
 
     def start(self, start: Start) -> Started:
-        """Starts a job.
+        """Starts jobs.
 
         Raises:
           GmijaxError: it cannot be started, or its daemon not be renewed.
         """
         assert self._backend is not None
         variables = variables_of(start.place, self._backend)
-        child = Child(start.config, start.place.cpus, start.order, start.log, variables)
+        child = Child(start.configs, start.place.cpus, start.order, start.log, variables)
         self._backend.started(child.pid)
         self._num_started += 1
         self._children[self._num_started] = child

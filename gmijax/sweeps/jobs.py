@@ -90,6 +90,11 @@ class Progress:
             return self.earlier_s
         return (self.ended_s or time.monotonic()) - self.started_s
 
+    def begin(self, place: str, node: str | None) -> None:
+        """Its process was started there."""
+        self.state, self.place, self.node, self.error = "running", place, node, None
+        self.started_s, self.updated_s, self.ended_s = time.monotonic(), None, None
+
     def take(self, line: Mapping[str, Any], sweep: SweepConfig) -> None:
         """Takes in a line of metrics."""
         self.env_steps = line["env_steps"]
@@ -241,6 +246,11 @@ def placed(
     wandb = job.config.wandb
     wandb = dataclasses.replace(wandb, group=wandb.group or run.root.parent.name)
     return dataclasses.replace(job.config, plan=plan, run=own, wandb=wandb)
+
+
+def status_of(run: RunPaths) -> str | None:
+    """How the last attempt at a job ended; None: it has not."""
+    return read_json(run.summary)["status"] if run.summary.exists() else None
 
 
 def state_of(run: RunPaths, config: TrainConfig) -> State:

@@ -23,6 +23,7 @@ class Place:
       label: in words, e.g. `GPU 0 place 1` by the index of nvidia-smi; without GPUs `place 1`, on
         a node after its address.
       kept_free: others of its GPUs, where nobody else runs meanwhile.
+      joined: others of its GPU, whose memory and cores it has too.
       site: index of its machine.
       backend: of that machine's places.
       is_whole_gpu: whether GPUs have one place each.
@@ -34,6 +35,12 @@ class Place:
     site: int
     backend: BackendName
     is_whole_gpu: bool
+    joined: tuple[Slice, ...] = ()
+
+    @property
+    def size(self) -> int:
+        """How many jobs it has room for."""
+        return 1 + len(self.joined)
 
     @property
     def devices(self) -> tuple[str, ...]:
@@ -43,14 +50,14 @@ class Place:
     @property
     def cpus(self) -> tuple[int, ...]:
         """Cores of its processes."""
-        return tuple(sorted({cpu for share in self.slices for cpu in share.cpus}))
+        return tuple(sorted({cpu for one in (*self.slices, *self.joined) for cpu in one.cpus}))
 
     def memory_fraction(self, config: TrainConfig) -> float | None:
         """For each GMI of a job that is put here; None where memory is not divided."""
         fraction = self.slices[0].memory_fraction
         if fraction is None:
             return None
-        return max(0.01, int(1e4 * fraction / gmis_of_place(config)) / 1e4)
+        return max(0.01, int(1e4 * self.size * fraction / gmis_of_place(config)) / 1e4)
 
 
 def gmis_of_place(config: TrainConfig) -> int:
@@ -116,12 +123,18 @@ class Places:
         return any(self._free)
 
     def take(
-        self, num_gpus: int, *, alone: bool = False, avoid: Collection[int] = ()
+        self,
+        num_gpus: int,
+        *,
+        alone: bool = False,
+        avoid: Collection[int] = (),
+        num_jobs: int = 1,
     ) -> Place | None:
         """A place on each of `num_gpus` GPUs of a machine, those with the most free ones.
 
         With `alone` they are GPUs on which nobody else runs, now or until it is given back. The
-        machines of `avoid` are left out. None: not now.
+        machines of `avoid` are left out. None: not now. On one GPU it has room for up to
+        `num_jobs` jobs.
         """
         found: list[tuple[int, list[list[Slice]]]] = []
         for site in sorted(self.left.difference(avoid)):
@@ -137,7 +150,12 @@ class Places:
         site, emptiest = max(found, key=lambda one: sum(map(len, one[1])))
         taken = tuple(free[0] for free in emptiest)
         others = tuple(share for free in emptiest for share in free[1:]) if alone else ()
-        gone = (*taken, *others)
+        device = taken[0].device
+        joined = (
+            [] if num_gpus > 1 or alone else [x for x in emptiest[0][1:] if x.device == device]
+        )
+        joined = joined[: num_jobs - 1]
+        gone = (*taken, *others, *joined)
         self._free[site] = [share for share in self._free[site] if share not in gone]
         label = ", ".join(self._labels[site][share.gmi] for share in taken)
         return Place(
@@ -147,12 +165,13 @@ class Places:
             site,
             self._sites[site].plan.backend,
             is_whole_gpu=all(len(here) == 1 for here in self._all[site].values()),
+            joined=tuple(joined),
         )
 
     def give_back(self, place: Place) -> None:
         """The job that was there has ended."""
         if place.site in self.left:
-            free = [*self._free[place.site], *place.slices, *place.kept_free]
+            free = [*self._free[place.site], *place.slices, *place.kept_free, *place.joined]
             self._free[place.site] = sorted(free, key=lambda share: share.gmi)
 
     def drop(self, site: int) -> None:

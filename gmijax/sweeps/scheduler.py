@@ -7,20 +7,22 @@ from collections import Counter
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
+from typing import Any
 
 from gmijax.config.schema import to_dict
 from gmijax.config.sweep import SweepConfig
 from gmijax.control.exit_codes import EXIT_INTERRUPTED
 from gmijax.errors import JobInterrupted, NodeLost
-from gmijax.runs.folder import add_event, is_locked
+from gmijax.runs.folder import RunPaths, add_event, is_locked
 from gmijax.runs.history import MetricsReader
 from gmijax.supervise.failures import may_be_anothers
 from gmijax.supervise.run_gmis import StopSignals
 from gmijax.sweeps.children import Seen
 from gmijax.sweeps.host import Start
 from gmijax.sweeps.hparams import write_hparams
-from gmijax.sweeps.jobs import Job, SweepPaths, placed
+from gmijax.sweeps.jobs import Job, SweepPaths, placed, status_of
 from gmijax.sweeps.nodes import Host
+from gmijax.sweeps.packs import may_share, of_one_step, program_of
 from gmijax.sweeps.places import Place, Places
 from gmijax.sweeps.study import Study
 
@@ -31,23 +33,23 @@ _KILL_AFTER_S = 15.0
 
 @dataclass
 class _Running:
-    """A job that runs.
+    """A process of jobs that runs: of one, or of several that are trained together.
 
     Attributes:
-      job: what it trains.
+      jobs: what it trains.
       place: where.
       host: the machine.
       child: its number there.
-      reader: of its metrics.
+      readers: of their metrics.
       is_pruned: whether it was asked to end because others are better.
       is_killed: whether it was ended by force, as the whole sweep is.
     """
 
-    job: Job
+    jobs: tuple[Job, ...]
     place: Place
     host: Host
     child: int
-    reader: MetricsReader
+    readers: tuple[MetricsReader, ...]
     is_pruned: bool = False
     is_killed: bool = False
 
@@ -64,10 +66,15 @@ class _Running:
         seen = self.look()
         return self.host.lost is not None or (seen is not None and seen.exit_code is not None)
 
-    def outcome(self) -> tuple[bool, str | None]:
-        """After its end: whether it was interrupted, and why it failed (None: it did not)."""
+    def outcome(self, run: RunPaths) -> tuple[bool, str | None]:
+        """After its end, of the job with this run folder.
+
+        Returns:
+          Whether it was interrupted, and why it failed (None: it did not).
+        """
         seen = self.look() or Seen(None)
-        if seen.exit_code == 0:
+        is_complete = len(self.jobs) > 1 and status_of(run) == "completed"
+        if seen.exit_code == 0 or is_complete:
             return False, None
         if seen.exit_code == EXIT_INTERRUPTED or self.is_killed:
             return True, None
@@ -139,9 +146,9 @@ class Scheduler:
             # A killed process of the job, or one of a machine that is gone, may still save.
             if is_locked(self._paths.job(job.number).lock):
                 continue
-            if self._start_if_it_fits(job):
-                self._queue.remove(job)
-            elif not self._compiling_sites(job):
+            if job.progress.state != "waiting" or self._start_if_it_fits(job):
+                continue
+            if not self._compiling_sites(job):
                 return  # In order, so that a large job is not passed by forever.
         while not self._queue and self._places.has_room() and (job := self._study.next()):
             self._jobs.append(job)
@@ -149,68 +156,99 @@ class Scheduler:
                 self._queue.append(job)
 
     def _start_if_it_fits(self, job: Job) -> bool:
+        if not self._places.has_room():
+            return False
         # Others compile the same there; when they have, it is found in the cache.
-        avoid = self._compiling_sites(job)
-        place = self._places.take(job.num_gpus, alone=job.number in self._alone, avoid=avoid)
+        avoid, together = self._compiling_sites(job), self._together(job)
+        place = self._places.take(
+            job.num_gpus,
+            alone=job.number in self._alone,
+            avoid=avoid,
+            num_jobs=len(together),
+        )
         if place is None:
             return False
         try:
-            self._start(job, place)
+            self._start(together[: place.size], place)
         except NodeLost:
             self._drop_lost()
             return False
         return True
 
+    def _together(self, job: Job) -> tuple[Job, ...]:
+        """The job, and those in the queue that can be trained in one program with it."""
+        if self._sweep.pack == "gmi" or job.number in self._alone:
+            return (job,)
+        others = [
+            other
+            for other in self._queue
+            if other.number not in (job.number, *self._alone) and may_share(job, other)
+        ]
+        free = [one for one in others if not is_locked(self._paths.job(one.number).lock)]
+        return (job, *of_one_step(job, free, self._paths))
+
     def _compiling_sites(self, job: Job) -> set[int]:
         """Machines where another job compiles the same programs."""
         return {site for site, program in self._compiling if program == job.program}
 
-    def _start(self, job: Job, place: Place) -> None:
-        run, host = self._paths.job(job.number), self._hosts[place.site]
+    def _start(self, jobs: tuple[Job, ...], place: Place) -> None:
+        host, first = self._hosts[place.site], jobs[0]
         # Alone on a GPU a job does as it would without a sweep.
-        config = placed(job, run, place, "auto" if place.is_whole_gpu else place.backend)
-        progress, reader = job.progress, MetricsReader(run.metrics)
-        progress.read(run, self._sweep)
-        reader.new()  # Those are an earlier attempt's.
-        files = self._paths.order(job.number), self._paths.log(job.number)
-        started = host.start(Start(place, to_dict(config), *files, job.program))
+        backend = "auto" if place.is_whole_gpu else place.backend
+        configs: list[dict[str, Any]] = []
+        readers: list[MetricsReader] = []
+        for job in jobs:
+            run = self._paths.job(job.number)
+            configs.append(to_dict(placed(job, run, place, backend)))
+            readers.append(MetricsReader(run.metrics))
+            job.progress.read(run, self._sweep)
+            readers[-1].new()  # Those are an earlier attempt's.
+        files = self._paths.order(first.number), self._paths.log(first.number)
+        started = host.start(Start(place, configs, *files, program_of(first, len(jobs))))
         if not started.has_programs:
-            self._compiling[place.site, job.program] = job.number
-        self._running[job.number] = _Running(job, place, host, started.child, reader)
-        progress.state, progress.place, progress.error = "running", place.label, None
-        progress.node = host.name
-        progress.started_s, progress.updated_s, progress.ended_s = time.monotonic(), None, None
+            self._compiling[place.site, first.program] = first.number
+        self._running[first.number] = _Running(jobs, place, host, started.child, tuple(readers))
+        for job in jobs:
+            job.progress.begin(place.label, host.name)
+        self._queue = [job for job in self._queue if job.progress.state == "waiting"]
 
     def _look(self) -> None:
         for running in list(self._running.values()):
-            job, progress = running.job, running.job.progress
             is_over = running.is_over()
-            for line in running.reader.new():
-                progress.take(line, self._sweep)
-                progress.updated_s = progress.updated_s or time.monotonic()
-                self._nobody_waits_for(running, has_compiled=True)
+            for job, reader in zip(running.jobs, running.readers, strict=True):
+                progress = job.progress
+                for line in reader.new():
+                    progress.take(line, self._sweep)
+                    progress.updated_s = progress.updated_s or time.monotonic()
+                    self._nobody_waits_for(running, has_compiled=True)
             if is_over:
                 self._finish(running)
-            elif not running.is_pruned and self._study.is_hopeless(job):
+            elif not running.is_pruned and self._study.is_hopeless(running.jobs[0]):
                 running.is_pruned = True
                 running.order_stop()
         self._drop_lost()
 
     def _finish(self, running: _Running) -> None:
-        job, progress, host = running.job, running.job.progress, running.host
-        del self._running[job.number]
-        is_interrupted, error = running.outcome()
-        is_lost = error is not None and error == host.lost
-        host.order(running.child, "close")
+        del self._running[running.jobs[0].number]
+        outcomes = [running.outcome(self._paths.job(job.number)) for job in running.jobs]
+        running.host.order(running.child, "close")
         self._places.give_back(running.place)
         self._nobody_waits_for(running, has_compiled=False)
-        run = self._paths.job(job.number)
+        for job, (is_interrupted, error) in zip(running.jobs, outcomes, strict=True):
+            self._end(running, job, error, is_interrupted=is_interrupted)
+
+    def _end(
+        self, running: _Running, job: Job, error: str | None, *, is_interrupted: bool
+    ) -> None:
+        """Notes how a job has ended, or puts it back into the queue."""
+        run, progress = self._paths.job(job.number), job.progress
+        is_lost = error is not None and error == running.host.lost
         progress.read(run, self._sweep)
         progress.place, progress.error, progress.ended_s = "", error, time.monotonic()
         progress.state = "failed" if error else "completed"
         if is_interrupted or (is_lost and running.is_pruned):
             progress.state = "pruned" if running.is_pruned else "interrupted"
-        elif error and (again := self._why_again(running, error, is_lost=is_lost)):
+        elif error and (again := self._why_again(running, job, error, is_lost=is_lost)):
             # It came before the others; one that waits for a whole GPU must not hold them up.
             self._queue.insert(0 if is_lost else len(self._queue), job)
             progress.state, progress.error = "waiting", again
@@ -220,9 +258,8 @@ class Scheduler:
             write_hparams(job, run, self._sweep.objective)
         self._study.tell(job)
 
-    def _why_again(self, running: _Running, error: str, *, is_lost: bool) -> str | None:
+    def _why_again(self, running: _Running, job: Job, error: str, *, is_lost: bool) -> str | None:
         """Why a job that failed runs once more, if that may help."""
-        job = running.job
         if is_lost:
             self._nodes_lost[job.number] += 1
             # It may be what ends them.
@@ -238,11 +275,12 @@ class Scheduler:
 
     def _nobody_waits_for(self, running: _Running, *, has_compiled: bool) -> None:
         """Its metrics are there, or it has ended, perhaps before it had compiled."""
-        job, key = running.job, (running.place.site, running.job.program)
-        if self._compiling.get(key) == job.number:
+        first, count = running.jobs[0], len(running.jobs)
+        key = running.place.site, first.program
+        if self._compiling.get(key) == first.number:
             del self._compiling[key]
             with suppress(NodeLost):
-                running.host.add_program(job.program, has_compiled)
+                running.host.add_program(program_of(first, count), has_compiled)
 
     def _drop_lost(self) -> None:
         for site in list(self._places.left):
@@ -253,7 +291,7 @@ class Scheduler:
         """Asks all jobs to save and end; the same signal again ends them at once."""
         for running in self._running.values():
             running.order_stop()
-        limits = [running.job.config.run for running in self._running.values()]
+        limits = [running.jobs[0].config.run for running in self._running.values()]
         longest_s = max((run.stop_timeout_s + run.grace_s for run in limits), default=0.0)
         deadline_s = time.monotonic() + longest_s + _KILL_AFTER_S
         while self._running and time.monotonic() < deadline_s and signals.requests < 2:

@@ -33,6 +33,7 @@ from gmijax.sweeps.jobs import (
     why_not_comparable,
 )
 from gmijax.sweeps.nodes import Host, nodes_of
+from gmijax.sweeps.packs import require_packable
 from gmijax.sweeps.places import Places, Site, places_of
 from gmijax.sweeps.report import LiveReport, ranking, write_report
 from gmijax.sweeps.scheduler import Scheduler
@@ -115,6 +116,7 @@ def run_request(request: Request, *, show: bool = False) -> SweepResult:
         sites = _sites(request.settings, request, hosts)
         require_placeable(request.jobs, min(site.plan.layout.num_gpus for site in sites))
         require_objective(request.jobs, request.settings)
+        require_packable(request.settings, request.jobs)
         paths = _open(request.jobs)
         with locked(paths.lock, f"run.dir={paths.root}"):
             return _run(request, hosts, paths, console, started_s)

@@ -1,4 +1,6 @@
-"""Main of a training job of a sweep: a controller of its own, `training_job.py ORDER FD`.
+"""Main of training jobs of a sweep: a controller of its own, `training_job.py ORDER FD`.
+
+It trains one job, or several that are one program.
 
 It ends, with a checkpoint, when the pipe FD ends: the sweep is gone then.
 """
@@ -15,6 +17,7 @@ from gmijax.config import TrainConfig
 from gmijax.config.schema import from_dict
 from gmijax.control.exit_codes import exit_code_of
 from gmijax.control.job import train
+from gmijax.control.packed import train_packed
 from gmijax.runs.folder import read_json
 
 
@@ -24,7 +27,10 @@ def main(order: Path, lifeline_fd: int) -> int:
     data = read_json(order)
     if data["cpus"]:
         os.sched_setaffinity(0, data["cpus"])
-    return exit_code_of("train", lambda: train(from_dict(TrainConfig, data["config"]), show=True))
+    configs = [from_dict(TrainConfig, config) for config in data["configs"]]
+    if len(configs) == 1:
+        return exit_code_of("train", lambda: train(configs[0], show=True))
+    return exit_code_of("train", lambda: train_packed(configs, show=True))
 
 
 def _end_with_the_sweep(fd: int) -> None:

@@ -49,7 +49,7 @@ def _run(link: ChildLink) -> dict[str, Any]:
     simulating, _ = groups_of(plan)
     # A trainer that steps no environment takes the sizes from those of the first GMI that does.
     place = simulating.gmis.index(link.gmi) if link.gmi in simulating.gmis else 0
-    env = _environments(config, place)
+    env = environments(config, place)
     with ExitStack() as held:
         if isinstance(config.algo, A3cConfig):
             return _run_asynchronous(config, plan, place, env, link, held)
@@ -153,7 +153,7 @@ def _run_asynchronous(
     return trainer.run() | exchange_used(plan, reducer)
 
 
-def _environments(config: TrainConfig, place: int) -> BatchedEnv:
+def environments(config: TrainConfig, place: int) -> BatchedEnv:
     """The environments of the GMI that is number `place` of those that simulate."""
     from gmijax.learning.start import worlds_of
     from gmijax.sim.wrappers import training_env

@@ -22,7 +22,7 @@ from gmijax.config import ClusterConfig
 from gmijax.config.sweep import SweepConfig
 from gmijax.errors import BackendUnavailable, ConfigError, NodeLost
 from gmijax.machine.snapshot import Machine
-from gmijax.runs.folder import RunPaths, read_json
+from gmijax.runs.folder import RunPaths, read_json, write_json
 from gmijax.supervise.run_gmis import StopSignals
 from gmijax.sweeps import density, scheduler
 from gmijax.sweeps.children import Seen
@@ -44,16 +44,19 @@ class FakeHost(LocalHost):
         self.running: dict[int, int] = {}  # Jobs by their children.
         self.seen: dict[int, Seen] = {}
         self.started: list[int] = []
+        self.together: list[list[str]] = []  # Run folders of the jobs of each start.
         self.programs: set[str] = set()
         self._numbers = itertools.count()
 
     def start(self, start: Start) -> Started:
         if self.lost is not None:
             raise NodeLost(self.lost)
-        Path(start.config["run"]["dir"]).mkdir(exist_ok=True)
+        for config in start.configs:
+            Path(config["run"]["dir"]).mkdir(exist_ok=True)
         child = next(self._numbers)
         self.running[child] = int(start.order.stem)
         self.started.append(self.running[child])
+        self.together.append([Path(config["run"]["dir"]).name for config in start.configs])
         return Started(child, start.program in self.programs)
 
     def look(self, child: int) -> Seen | None:
@@ -77,9 +80,9 @@ class FakeHost(LocalHost):
 class Sweep:
     """Jobs on two nodes, with two places each unless told otherwise."""
 
-    def __init__(self, folder: Path, jobs: Iterable[Job], jobs_per_gpu: int = 2) -> None:
+    def __init__(self, folder: Path, jobs: Iterable[Job], **settings: Any) -> None:
         self.jobs, self.paths = list(jobs), SweepPaths(folder)
-        self.settings = SweepConfig(jobs_per_gpu=jobs_per_gpu)
+        self.settings = SweepConfig(**{"jobs_per_gpu": 2} | settings)
         self.nodes = FakeHost("a"), FakeHost("b")
         plan = places_of(self.settings, machine(0), {"auto"})
         self.places = Places([Site(plan, node.machine, node.name) for node in self.nodes])
@@ -245,6 +248,31 @@ def test_equal_programs_compile_once_on_each_node(tmp_path: Path) -> None:
     assert starts[:3] == [(1, 1)] * 3
     assert starts[3] == (3, 1)  # The second node still compiles.
     assert sweep.states() == ["completed"] * 6
+
+
+def test_jobs_that_differ_in_numbers_are_started_together(tmp_path: Path) -> None:
+    overrides = [("seed=0",), ("num_envs=32",), ("seed=1",), ("algo.learning_rate=1e-3",)]
+    sweep = Sweep(tmp_path, jobs_of([compose(*own) for own in overrides]), pack="vmap")
+    sweep.run(sweep.end_all)
+    first, second = sweep.nodes
+    assert first.together == [["000", "002"]]
+    assert second.together == [["001"], ["003"]]
+    assert sweep.states() == ["completed"] * 4
+
+
+def test_of_jobs_of_one_program_those_fail_that_say_so(tmp_path: Path) -> None:
+    jobs = jobs_of([compose(f"seed={seed}", "plan.backend=cpu") for seed in range(2)])
+    sweep = Sweep(tmp_path, jobs, pack="vmap")
+
+    def end() -> None:
+        for number, status in enumerate(("completed", "failed")):
+            write_json(sweep.paths.job(number).summary, {"status": status})
+        sweep.nodes[0].end(exit_code=1)
+
+    sweep.run(end)
+    assert sweep.nodes[0].together == [["000", "001"]]
+    assert sweep.states() == ["completed", "failed"]
+    assert sweep.jobs[1].progress.error == "CUDA_ERROR_X"
 
 
 def test_what_a_node_refuses_is_raised_here_and_does_not_lose_it() -> None:

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import dataclasses
+import re
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from supervision import machine
+from supervision import gpu, machine
 
 from gmijax.autotune.grid import Measured, NotRunnable
 from gmijax.cli.compose import compose
@@ -34,6 +35,7 @@ from gmijax.sweeps.jobs import (
     state_of,
     why_not_comparable,
 )
+from gmijax.sweeps.packs import require_packable
 from gmijax.sweeps.places import Place, Places, Site, places_of
 from gmijax.sweeps.report import ranking, spread
 
@@ -94,6 +96,11 @@ def test_jobs_have_the_configuration_of_the_same_single_training() -> None:
         (("sweep.sampler=tpe", "seed=0,1"), "needs sweep.trials"),
         (("sweep.trials=3", "seed=0,1"), "sweep.sampler=grid runs all of them"),
         (("sweep.pruner=asha", "seed=0,1"), "not with sweep.sampler=grid"),
+        (("sweep.pack=mps", "seed=0,1"), "expected one of gmi, vmap"),
+        (
+            ("sweep.pack=vmap", "sweep.sampler=tpe", "sweep.trials=3", "seed=0,1"),
+            "only with sweep.sampler=grid",
+        ),
         (
             ("sweep.sampler=tpe", "sweep.trials=3", "algo.discounting=interval(0.9,2.5)"),
             "algo.discounting=2.5",
@@ -257,6 +264,42 @@ def test_jobs_divide_the_memory_of_a_gpu(
     assert config.plan.backend == "mps"
     assert (config.run.dir, config.run.resume) == (str(tmp_path / "007"), "auto")
     assert config.wandb.group == tmp_path.name
+
+
+def test_jobs_of_one_program_have_the_memory_and_cores_of_their_places() -> None:
+    places = gpu_places(2, 4)
+    (job,) = jobs_of([compose()])
+    three = places.take(1, num_jobs=3)
+    assert three is not None
+    assert (three.size, three.devices) == (3, (gpu(0).uuid,))
+    assert three.memory_fraction(job.config) == 0.6
+    assert len(three.cpus) == 3 * len(taken(places).cpus)
+    rest = [places.take(1, num_jobs=8) for _ in range(2)]
+    assert [place.size for place in rest if place is not None] == [3, 1]
+    assert not places.has_room()
+    places.give_back(three)
+    again = places.take(1, num_jobs=8)
+    assert again is not None
+    assert again.size == 3
+
+
+@pytest.mark.parametrize(
+    ("override", "said"),
+    [
+        ("algo=a3c", "algo=a3c"),
+        ("plan.gmis_per_gpu=2", "more than one GMI"),
+        ("eval.every=1000", "eval.every"),
+        ("num_envs=auto", "num_envs=auto"),
+        ("wandb.mode=offline", "wandb.mode=offline"),
+        ("env.randomize=on", "env.randomize=on"),
+    ],
+)
+def test_jobs_that_need_processes_of_their_own_are_not_packed(override: str, said: str) -> None:
+    jobs = jobs_of([compose("seed=0"), compose("seed=1", override)])
+    require_packable(SweepConfig(), jobs)
+    require_packable(SweepConfig(pack="vmap"), jobs[:1])
+    with pytest.raises(ConfigError, match=f"job 1 has {re.escape(said)}, .* allowed is gmi$"):
+        require_packable(SweepConfig(pack="vmap"), jobs)
 
 
 def test_too_many_jobs_for_the_machine_are_refused() -> None:

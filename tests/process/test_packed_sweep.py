@@ -1,0 +1,92 @@
+"""Jobs of a sweep as one program, with real processes on the CPU: a failure, a kill, going on."""
+
+from __future__ import annotations
+
+import json
+import math
+import signal
+from pathlib import Path
+from typing import Any
+
+import pytest
+from training_jobs import POINT, STEPS, gmi_pid, kill, start, train, wait_until
+
+from gmijax.runs.history import read_metrics
+from gmijax.runs.resume import newest_checkpoint
+
+SWEEP = (*POINT, "sweep.pack=vmap", "sweep.jobs_per_gpu=4", "run.dir=all")
+
+
+def states(folder: Path) -> list[str]:
+    report = json.loads((folder / "all" / "sweep.json").read_text())
+    return [job["state"] for job in report["jobs"]]
+
+
+def lines(run: Path) -> list[dict[str, Any]]:
+    return list(read_metrics(run / "metrics.jsonl"))
+
+
+@pytest.mark.timeout(400)
+def test_jobs_in_one_program_do_as_alone_and_fail_alone(tmp_path: Path) -> None:
+    common = (f"num_timesteps={6 * STEPS}", "algo.learning_rate_schedule=fixed")
+    alone = train(*POINT, *common, "seed=1", "run.dir=alone", cwd=tmp_path)
+    assert alone.returncode == 0, alone.stderr
+    # With such steps the parameters are soon no numbers.
+    rates = "algo.learning_rate=3e-4,1e30"
+    done = train(*SWEEP, *common, "seed=0,1", rates, cwd=tmp_path, command="sweep")
+    assert done.returncode == 1
+    assert "2 of 4 jobs failed; job 1: " in done.stderr
+    assert "NonFiniteError" in done.stderr
+    assert len(done.stderr.splitlines()) == 1
+    assert states(tmp_path) == ["completed", "failed"] * 2
+    runs = [tmp_path / "all" / f"{number:03d}" for number in range(4)]
+    assert [(run / "gmi_0" / "stdout.log").exists() for run in runs] == [True] + 3 * [False]
+
+    same, other = lines(tmp_path / "alone"), lines(runs[2])
+    assert len(same) == len(other) == 6
+    assert lines(runs[0])[0]["reward_per_step"] != other[0]["reward_per_step"]
+    for mine, packed in zip(same, other, strict=True):
+        assert mine.keys() == packed.keys()
+        for key in ("env_steps", "reward_per_step", "loss/value_loss", "policy/noise_std"):
+            assert math.isclose(mine[key], packed[key], rel_tol=1e-3), key
+    summaries = [
+        json.loads((run / "summary.json").read_text()) for run in (tmp_path / "alone", runs[2])
+    ]
+    assert summaries[0].keys() == summaries[1].keys()
+    assert summaries[1]["status"] == "completed"
+    watch = ("run.dir=all/002", "num_envs=2", "max_steps=20", "video=false")
+    played = train(*watch, cwd=tmp_path, command="play")
+    assert played.returncode == 0, played.stderr
+
+
+@pytest.mark.timeout(400)
+def test_after_a_kill_and_a_stop_all_jobs_of_a_program_go_on(tmp_path: Path) -> None:
+    command = (*SWEEP, "seed=0,1", f"num_timesteps={600 * STEPS}")
+    command = (*command, "run.checkpoint_every=20", "run.max_restarts=2")
+    runs = [tmp_path / "all" / name for name in ("000", "001")]
+    sweep = start(*command, cwd=tmp_path, command="sweep")
+
+    def steps_saved() -> int:
+        found = newest_checkpoint(runs[0]).checkpoint
+        return 0 if found is None else int(found.name)
+
+    wait_until(lambda: sweep.poll() is not None or steps_saved(), 200.0, "a checkpoint")
+    pid = gmi_pid(runs[0], 0)
+    assert pid is not None
+    kill(pid)
+    before = steps_saved()
+    wait_until(
+        lambda: sweep.poll() is not None or steps_saved() > before + 40 * STEPS, 200.0, "more"
+    )
+    sweep.send_signal(signal.SIGINT)
+    assert sweep.wait(timeout=120) == 130
+    assert states(tmp_path) == ["interrupted", "interrupted"]
+
+    done = train(*command, cwd=tmp_path, command="sweep")
+    assert done.returncode == 0, done.stderr
+    for run in runs:
+        summary = json.loads((run / "summary.json").read_text())
+        assert summary["status"] == "completed"
+        assert [line["env_steps"] for line in lines(run)] == [
+            STEPS * (number + 1) for number in range(600)
+        ]
