@@ -1,8 +1,9 @@
 """Trainings per hour of sweeps: `python -m benchmarks.sweeps`.
 
 The same trainings as sweeps with one at a time, several under MPS, several under plain sharing,
-several as one program, a mix of tasks, and as many as `auto` takes. A sweep counts from the start of its first job to the
-end of its last, start-up included; beside it stand the steps per second while all places train.
+several as one program, a mix of tasks, and as many as `auto` takes. A sweep counts from the start
+of its first job to the end of its last, start-up included; beside it stand the steps per second
+while all places train.
 Writes `benchmarks/results/sweeps-<device>.json` after every sweep. What is interrupted or meets
 the deadline keeps what is through; a sweep that would not end in time is not started.
 """
