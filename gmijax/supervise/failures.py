@@ -23,6 +23,9 @@ from gmijax.errors import (
 _GPU_FAULT = re.compile(r"CUDA_ERROR_(?!OUT_OF_MEMORY)|ended by SIGABRT|MPS daemon")
 """In what a job says that lost its GPU. XLA aborts where it cannot raise."""
 
+_NOTHING_FITS = "All configs failed during profiling"
+"""What XLA says where it has no memory to try kernels."""
+
 _TAIL_BYTES = 8192
 _MAX_LINE = 300
 
@@ -33,6 +36,8 @@ def describe_exit(
     """Puts together what the GMI left behind: its own error, else its last line on stderr."""
     own = f"{error.type}: {first_line(error.message)}" if error else last_line(stderr)
     how = f"exit code {exit_code}" if exit_code >= 0 else f"ended by {signal_name(-exit_code)}"
+    if _NOTHING_FITS in own:
+        own += " (perhaps there is too little GPU memory: fewer environments need less)"
     if exit_code == -signal.SIGKILL and not own:
         own = "not killed by gmijax; perhaps the machine ran out of memory"
     reason = f"{how}: {own}" if own else how

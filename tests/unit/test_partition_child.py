@@ -155,3 +155,10 @@ def test_only_the_end_of_a_long_log_is_read(tmp_path: Path):
     log.write_text("y" * 100_000)
     assert last_line(log) == "y" * 300
     assert last_line(tmp_path / "none") == ""
+
+
+def test_a_lack_of_memory_is_named_where_xla_hides_it(tmp_path: Path):
+    said = "NOT_FOUND: All configs failed during profiling or were excluded from selection."
+    error = ReportedError("JaxRuntimeError", said, said, ())
+    reason = describe_exit(0, 1, error, GmiPaths(tmp_path).stderr).reason
+    assert reason.startswith(f"exit code 1: JaxRuntimeError: {said} (perhaps there is too little")
