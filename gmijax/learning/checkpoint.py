@@ -230,11 +230,14 @@ def _partial(paths: RunPaths, env_steps: int) -> Path:
     return partial
 
 
+def on_host(tree: T) -> T:
+    """A copy in the host's memory, as it is saved: a checkpoint says nothing of devices."""
+    return jax.tree.map(np.array, _storable(tree))
+
+
 def _save(folder: Path, tree: PyTree) -> None:
-    # Of the host, so that a checkpoint says nothing of devices.
-    arrays = jax.tree.map(np.asarray, _storable(tree))
     with ocp.StandardCheckpointer() as checkpointer:
-        checkpointer.save(folder.resolve(), arrays)
+        checkpointer.save(folder.resolve(), on_host(tree))
 
 
 def _restore(folder: Path, template: T) -> T:
@@ -288,7 +291,7 @@ def _is_key(leaf: jax.Array) -> bool:
     return jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key)
 
 
-def _storable(tree: PyTree) -> PyTree:
+def _storable(tree: T) -> T:
     # Orbax takes neither typed random keys, whose bits are plain uint32 arrays, nor arrays
     # without elements, such as the activations of a model that has none.
     def plain(leaf: jax.Array) -> jax.Array:

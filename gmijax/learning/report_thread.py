@@ -37,6 +37,11 @@ class ReportThread:
         self._is_idle.clear()
         self._queue.put(arguments)
 
+    @property
+    def is_idle(self) -> bool:
+        """Whether all is reported, or a call has failed."""
+        return self._is_idle.is_set()
+
     def wait(self) -> None:
         """Returns when all is reported; raises the error of a call."""
         self._is_idle.wait()

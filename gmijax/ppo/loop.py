@@ -21,14 +21,8 @@ from gmijax.collectives.interface import Reducer, TracedStep
 from gmijax.config import PpoConfig, TrainConfig
 from gmijax.devices import describe_device
 from gmijax.errors import CollectiveError
-from gmijax.learning.checkpoint import (
-    checkpoint_meta,
-    finish_checkpoint,
-    require_equal,
-    require_finite,
-    save_envs,
-    save_learner,
-)
+from gmijax.learning.checkpoint import checkpoint_meta, require_equal, require_finite
+from gmijax.learning.checkpoint_saver import CheckpointSaver
 from gmijax.learning.evaluator import Evaluation, Evaluator, evaluation_worlds
 from gmijax.learning.learner import TrainState, make_learner
 from gmijax.learning.report_thread import ReportThread
@@ -91,6 +85,8 @@ class TrainingLoop:
         self._env_steps = 0
         self._iterations = 0
         self._checkpoint: Path | None = None
+        keep = config.run.keep_checkpoints
+        self._saver = CheckpointSaver(link.run, link.gmi, reducer, keep)
 
     def run(self) -> dict[str, Any]:
         """Trains until `num_timesteps` or until the controller asks for an end.
@@ -189,6 +185,7 @@ class TrainingLoop:
             raise
         finally:
             thread.stop()
+            self._saver.stop()
             log.close()
         if self._remote is not None:
             self._remote.close()
@@ -213,6 +210,7 @@ class TrainingLoop:
             if not is_last and (is_due or (evaluation is not None and evaluation.is_best)):
                 self._save(state, env_state, thread, log, evaluation)
         self._save(state, env_state, thread, log, evaluation)
+        self._checkpoint = self._saver.finish()
         return state, env_state, stop
 
     def _evaluate(self, state: TrainState) -> Evaluation | None:
@@ -240,8 +238,11 @@ class TrainingLoop:
 
     def _agree_to_stop(self) -> bool:
         # Only one GMI may have heard of it yet; all must leave after the same iteration.
-        mine = np.array([self._link.stop_requested], np.float32)
-        return bool(self._reducer.all_gather(mine).any())
+        mine = np.array([self._link.stop_requested, self._saver.is_written], np.float32)
+        stops, are_written = self._reducer.all_gather(mine).T
+        if are_written.all():
+            self._saver.name()
+        return bool(stops.any())
 
     def _save(
         self,
@@ -251,23 +252,16 @@ class TrainingLoop:
         log: TrainingLog,
         evaluation: Evaluation | None,
     ) -> None:
+        """Begins to write a checkpoint."""
         self._iteration.wait()
         thread.wait()  # A resumed run goes on from the lines up to its checkpoint.
-        config, run, steps = self._config, self._link.run, self._env_steps
+        config, steps = self._config, self._env_steps
         require_equal(self._reducer, self._link.gmi, state.params, steps)
         require_finite(state.params, config.env.label, steps)
-        if env_state is not None:
-            save_envs(run, steps, self._link.gmi, env_state)
-        if self._leader:
-            save_learner(run, steps, state)
-        self._meet()
-        if self._leader:
-            num_gmis, returns = self._reducer.world_size, log.last_return
-            evaluated = None if evaluation is None else evaluation.mean_return
-            meta = checkpoint_meta(config, steps, num_gmis, returns, evaluated)
-            finish_checkpoint(run, meta, config.run.keep_checkpoints)
-        self._meet()  # Nobody may look for the folder before it has its name.
-        self._checkpoint = run.checkpoint(steps)
+        num_gmis, returns = self._reducer.world_size, log.last_return
+        evaluated = None if evaluation is None else evaluation.mean_return
+        meta = checkpoint_meta(config, steps, num_gmis, returns, evaluated)
+        self._saver.begin(meta, state, env_state)
 
     def _meet(self) -> None:
         """Returns when all GMIs have called it."""

@@ -24,6 +24,7 @@ from gmijax.errors import NonFiniteError, ReportedError
 from gmijax.learning.checkpoint import (
     checkpoint_meta,
     finish_checkpoint,
+    on_host,
     require_finite,
     save_envs,
     save_learner,
@@ -222,7 +223,11 @@ class PackedLoop:
         self._iteration.wait()
         thread.wait()  # A resumed run goes on from the lines up to its checkpoint.
         returns = [member.log.last_return for member in self._members]
-        parts = _unstack((states, envs), len(self._members))
+        together = on_host((states, envs))
+        parts = [
+            jax.tree.map(lambda leaf, k=number: leaf[k], together)
+            for number in range(len(self._members))
+        ]
         self._saver.report(self._env_steps, returns, parts)
 
     def _save_all(self, env_steps: int, returns: Sequence[float | None], parts: Any) -> None:
@@ -251,9 +256,3 @@ def _iterate_all(
 def _stack(trees: list[Any]) -> Any:
     """One tree whose leaves have a leading axis."""
     return jax.tree.map(lambda *leaves: jnp.stack(leaves), *trees)
-
-
-@partial(jax.jit, static_argnums=1)
-def _unstack(tree: Any, count: int) -> list[Any]:
-    """Inverts `_stack`."""
-    return [jax.tree.map(lambda leaf, k=number: leaf[k], tree) for number in range(count)]

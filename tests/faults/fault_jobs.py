@@ -243,8 +243,9 @@ class _Job:
             self.lost.append(f"went on from {starts[0]['checkpoint']}, not {newest}")
         for fault, start in zip(faults, starts[1:], strict=False):
             begun = int(Path(start["checkpoint"]).name) if start["checkpoint"] else 0
-            # The metrics of an iteration are looked at while the next one runs.
-            if fault["iteration"] - begun // (2 * STEPS) > CHECKPOINT_EVERY + 1:
+            # The metrics of an iteration are looked at while the next one runs; a checkpoint is
+            # written while training goes on, and is there when the next one begins.
+            if fault["iteration"] - begun // (2 * STEPS) > 2 * CHECKPOINT_EVERY + 1:
                 self.lost.append(f"{fault} and then {start}")
 
     def _new_events(self) -> list[dict[str, Any]]:

@@ -54,7 +54,7 @@ def test_jobs_in_one_program_do_as_alone_and_fail_alone(tmp_path: Path) -> None:
     ]
     assert summaries[0].keys() == summaries[1].keys()
     assert summaries[1]["status"] == "completed"
-    watch = ("run.dir=all/002", "num_envs=2", "max_steps=20", "video=false")
+    watch = ("run.dir=all/002", "num_envs=2", "max_steps=20", "video=none")
     played = train(*watch, cwd=tmp_path, command="play")
     assert played.returncode == 0, played.stderr
 
