@@ -8,7 +8,6 @@ from typing import Any, TypeVar
 
 import jax
 import mujoco
-from compile_options import CPU_OPTIONS
 
 from gmijax.sim import physics
 from gmijax.sim.registry import make_env
@@ -40,7 +39,7 @@ class CompiledTask:
         self.traces: list[int] = []
         self.init: Callable[[Any, jax.Array], BatchState] = jax.jit(self.batch.init)
         self.step: Callable[[Any, BatchState, jax.Array], tuple[BatchState, StepOutput]] = jax.jit(
-            self._counted, compiler_options=CPU_OPTIONS
+            self._counted
         )
 
     def _counted(self, model: Any, state: BatchState, actions: jax.Array) -> Any:
@@ -69,8 +68,7 @@ class CompiledTask:
         self,
     ) -> Callable[..., tuple[physics.PhysicsState, jax.Array]]:
         """`(model, state, ctrl) -> (state, sensordata)` of `converged`, of NUM_STARTS worlds."""
-        step = jax.vmap(self.converged.step, in_axes=(None, 0, 0))
-        return jax.jit(step, compiler_options=CPU_OPTIONS)
+        return jax.jit(jax.vmap(self.converged.step, in_axes=(None, 0, 0)))
 
     @property
     def mj_model(self) -> mujoco.MjModel:

@@ -10,6 +10,8 @@ from pathlib import Path
 import pynvml
 import pytest
 
+from gmijax.supervise.environment import flags_on_cpu
+
 # Of XLA:CPU, read when jax starts, so it is set before any test module is imported.
 # A thread pool of exactly two threads, as on a machine with two cores, can hang.
 os.environ.setdefault("PJRT_NPROC", "4")
@@ -45,6 +47,8 @@ def _has_gpu() -> bool:
 # LLVM's -O0 compiles in a fifth of the time; most programs of tests run for less than that.
 if not _has_gpu():
     os.environ.setdefault("JAX_DISABLE_MOST_OPTIMIZATIONS", "1")
+    # As in GMIs. Programs compile in half the time with it.
+    os.environ["XLA_FLAGS"] = flags_on_cpu(os.environ.get("XLA_FLAGS", ""))
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:

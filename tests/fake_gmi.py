@@ -51,7 +51,7 @@ def deaf(link: ChildLink) -> None:
 def stubborn(link: ChildLink) -> None:
     """Is stopped, so that it can hear no order."""
     link.beat("running", 1)
-    (link.paths.root / "stopping").touch()
+    write_json(link.paths.root / "helper.json", {"pid": os.getpid()})
     os.kill(os.getpid(), signal.SIGSTOP)
 
 
@@ -76,6 +76,19 @@ def exit_3(link: ChildLink) -> None:
     """Fails without error.json."""
     sys.stderr.write("first line\nthe last line\n\n")
     sys.exit(3)
+
+
+def exit_beside_stopped(link: ChildLink) -> None:
+    """Fails once GMI 0 is stopped."""
+    other = link.run.gmi(0).root / "helper.json"
+    while not other.exists() or not has_stopped(read_json(other)["pid"]):
+        time.sleep(TICK_S)
+    sys.exit(3)
+
+
+def has_stopped(pid: int) -> bool:
+    """Whether SIGSTOP has come to a process: until then its other threads may still act."""
+    return b") T " in Path(f"/proc/{pid}/stat").read_bytes()
 
 
 def raise_value_error(link: ChildLink) -> None:
@@ -111,14 +124,22 @@ def wait_in_vain(link: ChildLink) -> None:
 
 
 def die_late(link: ChildLink) -> None:
-    """Names a helper as its process; that is gone a moment before this one."""
+    """Names a helper as its process; that is gone before this one, and GMI 0 fails for it."""
     helper = os.fork()
     if helper == 0:
         time.sleep(0.2)
         os._exit(0)
     write_json(link.paths.root / "helper.json", {"pid": helper})
     os.waitpid(helper, 0)
-    time.sleep(0.3)
+    while not link.run.gmi(0).error.exists():
+        time.sleep(TICK_S)
+    time.sleep(0.1)
+    os.kill(os.getpid(), signal.SIGSEGV)
+
+
+def die_soon(link: ChildLink) -> None:
+    """Fails in a moment."""
+    time.sleep(0.1)
     os.kill(os.getpid(), signal.SIGSEGV)
 
 
@@ -146,7 +167,8 @@ MODES: dict[str, Callable[[ChildLink], None]] = {
     mode.__name__: mode
     for mode in (
         *(clean, train, deaf, stubborn, busy, exit_3, raise_value_error, raise_config_error),
-        *(lose_peer, wait_in_vain, die_late, stall, silent, mps_client, linger),
+        *(lose_peer, wait_in_vain, die_late, die_soon, stall, silent, mps_client, linger),
+        exit_beside_stopped,
     )
 }
 
@@ -156,6 +178,8 @@ def main() -> None:
     mode = MODES[os.environ["FAKE_GMI_MODES"].split(",")[link.gmi]]
     if mode is not silent:
         link.beat("starting", 0)
+        while (link.run.root / "hold").exists():
+            time.sleep(TICK_S)
         link.begin_compiling()
         if mode is not mps_client:
             link.beat("ready", 0)

@@ -181,6 +181,11 @@ def shared_memory() -> set[str]:
     return set(os.listdir("/dev/shm"))
 
 
+def require_gone(names: Callable[[], set[str]], before: set[str]) -> None:
+    """Waits until `names` of a shared place are those of before: others' come and go."""
+    wait_until(lambda: names() <= before, 60, f"{names.__name__} as before: {sorted(before)}")
+
+
 def mps_directories() -> set[str]:
     """Pipe directories that a job might have left."""
     return {path.name for path in Path("/tmp").glob("gmijax*")}

@@ -88,11 +88,18 @@ def _cpu(share: Slice, users_flags: str) -> dict[str, str]:
     # get a larger one.
     pool = 1 if cores == 1 else max(_SMALLEST_POOL, cores)
     variables = {"JAX_PLATFORMS": "cpu", "CUDA_VISIBLE_DEVICES": "", "PJRT_NPROC": str(pool)}
+    if flags := flags_on_cpu(users_flags):
+        variables[_XLA_FLAGS] = flags
+    return variables
+
+
+def flags_on_cpu(users_flags: str) -> str:
+    """`XLA_FLAGS` for physics on a CPU: the user's, and what else this jaxlib needs."""
     # Read from the package's metadata: the controller must not import jax.
     jaxlib = numbers_of(versions_of(["jaxlib"])["jaxlib"])
     if () < jaxlib < _FIRST_JAXLIB_WITHOUT_FLAG and _FUSION_EMITTERS not in users_flags:
-        variables[_XLA_FLAGS] = f"{users_flags} {_FUSION_EMITTERS}=false".strip()
-    return variables
+        return f"{users_flags} {_FUSION_EMITTERS}=false".strip()
+    return users_flags
 
 
 def _gpu(share: Slice) -> dict[str, str]:

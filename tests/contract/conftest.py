@@ -10,6 +10,7 @@ import pytest
 from compiled_tasks import CompiledTask
 
 from gmijax.sim.registry import TASKS
+from gmijax.supervise.environment import flags_on_cpu
 
 CHEAPEST = "ball_balance"
 """The task that runs with MJX-Warp too, and through a thousand steps, where time is short."""
@@ -34,10 +35,10 @@ def _variants() -> list[object]:
 
 @pytest.fixture(scope="module", autouse=True)
 def all_optimizations() -> Iterator[None]:
-    """Without them a reset of franka_cabinet alone takes minutes."""
+    """Where a flag of XLA cannot help: a reset of franka_cabinet takes minutes without either."""
     name = "jax_disable_most_optimizations"
     before = jax.config.read(name)
-    jax.config.update(name, False)
+    jax.config.update(name, before and bool(flags_on_cpu("")))
     yield
     jax.config.update(name, before)
 

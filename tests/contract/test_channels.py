@@ -9,6 +9,7 @@ from typing import Any, get_args, get_type_hints
 
 import numpy as np
 import pytest
+from training_jobs import require_gone, shared_memory
 
 from gmijax.collectives.channel.build import ChannelTopology
 from gmijax.config.channel import ChannelConfig
@@ -97,7 +98,7 @@ def test_a_killed_process_is_named_and_leaves_nothing(
     transport: Any, victim: int, tmp_path: Path
 ) -> None:
     require_zmq(transport)
-    before = set(Path("/dev/shm").iterdir())
+    before = shared_memory()
     topology, task = TOPOLOGY, {"count": 10**7, "envs": 50, "pause_chance": 0.5, "timeout_s": 60.0}
     if transport == "device":
         topology = ChannelTopology(agents=(0, 1), trainers=(2,), gpu_of=(0, 0, 0))
@@ -110,7 +111,7 @@ def test_a_killed_process_is_named_and_leaves_nothing(
         for rank in others:
             result = job.result(rank)
             assert (result["error"], result["peers"]) == ("PeerLost", [victim])
-    assert set(Path("/dev/shm").iterdir()) <= before
+    require_gone(shared_memory, before)
 
 
 @pytest.mark.parametrize(("trainers", "batch"), [((2,), 25), ((2, 3), 100)])

@@ -22,6 +22,7 @@ from training_jobs import (
     kill,
     learner_arrays,
     pids_of,
+    require_gone,
     shared_memory,
     start,
     train,
@@ -29,6 +30,7 @@ from training_jobs import (
 )
 
 from gmijax.a3c.report import MAX_COUNTED
+from gmijax.runs.history import read_metrics
 from gmijax.runs.resume import find_checkpoint
 
 UPDATE = STEPS
@@ -137,6 +139,13 @@ def test_a_job_goes_on_from_its_checkpoint_until_an_agent_is_killed_and_named(
     wait_until(
         lambda: job.poll() is not None or list(run.glob("checkpoints/[0-9]*")), 120, "a checkpoint"
     )
+    # A line comes once in half a second, a checkpoint may come before it.
+    history = read_metrics(two_and_two / "metrics.jsonl")
+    wait_until(
+        lambda: job.poll() is not None or len(read_metrics(run / "metrics.jsonl")) > len(history),
+        120,
+        "a line of its own",
+    )
     assert job.poll() is None, (cwd / "stderr.txt").read_text()
     kill(gmi_pid(run, victim) or 0)
     assert job.wait(timeout=90) == 1
@@ -144,12 +153,13 @@ def test_a_job_goes_on_from_its_checkpoint_until_an_agent_is_killed_and_named(
     error = (cwd / "stderr.txt").read_text()
     assert f"GMI {victim} failed" in error
     assert "SIGKILL" in error
-    assert shared_memory() <= shm
+    require_gone(shared_memory, shm)
     old, new = learner_arrays(two_and_two), learner_arrays(run)
     assert [a.shape for a in old] == [a.shape for a in new]
     assert not all(np.array_equal(a, b) for a, b in zip(old, new, strict=True))
-    lines = [json.loads(text) for text in (run / "metrics.jsonl").read_text().splitlines()]
-    assert lines[0]["env_steps"] < before < lines[-1]["env_steps"]
+    lines = read_metrics(run / "metrics.jsonl")
+    assert lines[: len(history)] == history
+    assert all(line["env_steps"] > before for line in lines[len(history) :])
 
 
 @pytest.mark.timeout(300)

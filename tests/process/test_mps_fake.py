@@ -14,6 +14,7 @@ from contextlib import ExitStack, closing
 from pathlib import Path
 
 import pytest
+from fake_gmi import has_stopped
 from fake_mps import FakeMps
 from supervision import TESTS, gpu, machine, make_launch, planned
 from training_jobs import wait_until
@@ -122,7 +123,7 @@ def test_an_interrupted_end_leaves_the_daemons_to_the_janitor(
     [
         ("train", r"GMI 1 failed: its process \d+ is no client of .*plan\.backend=share$"),
         # Is no client either, and fails a moment later, while the daemon is asked for it.
-        ("die_late", "GMI 1 failed: ended by SIGSEGV"),
+        ("die_soon", "GMI 1 failed: ended by SIGSEGV"),
     ],
 )
 def test_gmi_that_is_no_client_is_refused_unless_it_fails_by_itself(
@@ -318,6 +319,8 @@ def test_janitor_cleans_up_after_a_killed_controller(mps: FakeMps, run: RunPaths
         daemon = identify(MpsControl(mps.program, directory).daemon_pid() or 0)
         assert daemon is not None
         os.kill(clients[0].pid, signal.SIGSTOP)
+        # Before, another thread of it could see that the controller is gone, and end it.
+        wait_until(lambda: has_stopped(clients[0].pid), 60, "a GMI is stopped")
     finally:
         controller.kill()
         controller.wait()

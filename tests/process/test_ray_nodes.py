@@ -23,6 +23,7 @@ from training_jobs import (
     kill,
     learner_arrays,
     pids_of,
+    require_gone,
     shared_memory,
     start,
     train,
@@ -130,7 +131,7 @@ def test_agents_teach_trainers_of_two_nodes_and_of_one_when_the_other_dies(
     names = {path.name for path in Path(summary["checkpoint"]).iterdir()}
     assert names == {"gmi_1", "learner", "meta.json"}
     assert not pids_of(run)
-    assert shared_memory() <= memory
+    require_gone(shared_memory, memory)
 
 
 def test_a_job_outlives_a_gmi_and_a_node_and_nothing_outlives_its_controller(
@@ -181,7 +182,7 @@ def test_a_job_outlives_a_gmi_and_a_node_and_nothing_outlives_its_controller(
         kill(controller.pid)
         controller.wait()
         wait_until(lambda: not any(p.is_running() for p in left), 60, "all processes gone")
-        assert shared_memory() <= memory
+        require_gone(shared_memory, memory)
     finally:
         kill(controller.pid)
         controller.wait()

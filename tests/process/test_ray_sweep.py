@@ -11,7 +11,16 @@ from pathlib import Path
 
 import pytest
 from ray_cluster import RAY, events, two_nodes
-from training_jobs import POINT, STEPS, kill, pids_of, shared_memory, start, wait_until
+from training_jobs import (
+    POINT,
+    STEPS,
+    kill,
+    pids_of,
+    require_gone,
+    shared_memory,
+    start,
+    wait_until,
+)
 
 from gmijax.runs.history import read_metrics
 
@@ -83,4 +92,4 @@ def test_a_sweep_over_two_nodes_finishes_on_one_when_the_other_is_killed(tmp_pat
         steps = [line["env_steps"] for line in read_metrics(run / "metrics.jsonl")]
         assert steps == sorted(set(steps))
     assert not any(pids_of(run) for run in runs)
-    assert shared_memory() <= memory
+    require_gone(shared_memory, memory)

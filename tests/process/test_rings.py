@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import signal
 import time
+from contextlib import ExitStack
 from pathlib import Path
 
 import pytest
@@ -21,14 +22,18 @@ def test_who_ends_while_all_run_a_step_is_named(
     # A kill is noticed at once, long before any time limit; a stop is not, but by one.
     limit_s, error = (60.0, "PeerLost") if number == signal.SIGKILL else (3.0, "CollectiveTimeout")
     way = {"strategy": strategy, "intra": intra, "layout": [[0], [1]], "timeout_s": limit_s}
-    for attempt in range(3):  # At another moment each.
-        folder = tmp_path / str(attempt)
-        folder.mkdir()
-        with Ranks(folder, 2, "step_forever", **way) as job:
+    with ExitStack() as held:
+        jobs = []
+        for attempt in range(3):  # At another moment each; one is started while others wait.
+            folder = tmp_path / str(attempt)
+            folder.mkdir()
+            job = held.enter_context(Ranks(folder, 2, "step_forever", **way))
             job.start().wait_for("running")
             time.sleep(attempt * 7e-3)
             job.signal(1, number)
+            jobs.append(job)
+        for job in jobs:
             (result,) = job.results(0)
-        assert result["error"] == error, result
-        assert result.get("peer", 1) == 1
-        assert result.get("missing", [1]) == [1]
+            assert result["error"] == error, result
+            assert result.get("peer", 1) == 1
+            assert result.get("missing", [1]) == [1]

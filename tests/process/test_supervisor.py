@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from fake_gmi import has_stopped
 from supervision import CHECKOUT, TESTS, cpu_supervisor, machine
 from training_jobs import heartbeat_of
 
@@ -69,9 +70,13 @@ def once_all_iterate(act: Callable[[Supervisor, Ticks], None]) -> Callable[..., 
 
 
 def test_the_first_compiles_alone_and_all_have_their_cores_and_what_they_share(run: RunPaths):
-    exchange = os.memfd_create("")
+    exchange, hold = os.memfd_create(""), run.root / "hold"
+    hold.touch()  # Until the first tick.
     try:
-        ticks = run_job(cpu_supervisor(run, ["clean", "clean"], {ENV_EXCHANGE_FD: exchange}))
+        ticks = run_job(
+            cpu_supervisor(run, ["clean", "clean"], {ENV_EXCHANGE_FD: exchange}),
+            lambda _, __: hold.unlink(missing_ok=True),
+        )
         assert os.pread(exchange, 10, 0) == b"xx"
     finally:
         os.close(exchange)
@@ -116,7 +121,7 @@ def test_the_first_compiles_alone_and_all_have_their_cores_and_what_they_share(r
             r"GMI 0 failed: did not start and compile within 0.5 s",
         ),
         # One that hears no order is killed after the grace time.
-        (["stubborn", "exit_3"], {"grace": 0.5}, "GMI 1 failed"),
+        (["stubborn", "exit_beside_stopped"], {"grace": 0.5}, "GMI 1 failed: exit code 3"),
     ],
 )
 def test_the_gmi_that_fails_is_named(
@@ -128,8 +133,6 @@ def test_the_gmi_that_fails_is_named(
         assert "in stall" in run.gmi(1).stderr.read_text()
     if "raise_value_error" in modes:
         assert "ValueError" in read_json(run.gmi(0).error)["traceback"]
-    if "stubborn" in modes:
-        assert (run.gmi(0).root / "stopping").exists()
 
 
 def test_bad_input_found_by_a_gmi_is_a_config_error(run: RunPaths):
@@ -264,6 +267,6 @@ def _running_gmi(run: RunPaths, gmi: int) -> ProcessId:
 
 def _stopped_gmi(run: RunPaths, gmi: int) -> ProcessId:
     process = _running_gmi(run, gmi)
-    while b") T " not in Path(f"/proc/{process.pid}/stat").read_bytes():
+    while not has_stopped(process.pid):
         time.sleep(0.02)
     return process

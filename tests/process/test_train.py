@@ -21,6 +21,7 @@ from training_jobs import (
     learner_arrays,
     mps_directories,
     pids_of,
+    require_gone,
     shared_memory,
     start,
     train,
@@ -168,5 +169,5 @@ def test_kills_at_any_moment_leave_nothing(plan: tuple[str, ...], tmp_path: Path
     shm, pipes = shared_memory(), mps_directories()
     for number in range(3):
         kill_somebody(*plan, cwd=tmp_path / str(number), draw=draw, within_s=(0.3, 7.0))
-    assert shared_memory() <= shm
-    assert mps_directories() <= pipes
+    require_gone(shared_memory, shm)
+    require_gone(mps_directories, pipes)

@@ -5,7 +5,6 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
-from compile_options import CPU_OPTIONS
 from mujoco import mjx
 
 from gmijax.errors import ConfigError
@@ -83,8 +82,8 @@ def test_the_small_state_forgets_nothing_and_substeps_are_steps_in_a_row():
     # rebuilt from the carried state: equal to the last bit, through contact and joint limit.
     model = mujoco.MjModel.from_xml_string(PENDULUM_OVER_FLOOR)
     world = from_mj_model(model, impl="jax", substeps=3)
-    step = jax.jit(lambda data: mjx.step(world.model, data), compiler_options=CPU_OPTIONS)
-    at_once = jax.jit(world.step, compiler_options=CPU_OPTIONS)
+    step = jax.jit(lambda data: mjx.step(world.model, data))
+    at_once = jax.jit(world.step)
     assert world.control_dt_s == pytest.approx(0.03)
     whole = small = world.blank()
     for ctrl in np.random.default_rng(0).uniform(-1, 1, (30, 1)).astype(np.float32):
@@ -148,7 +147,7 @@ def test_poses_are_those_of_mujoco_in_c(impl: str):
         pytest.importorskip("warp")
     mj_model = mujoco.MjModel.from_xml_string(ARM_AND_FREE_BOX)
     world = from_mj_model(mj_model, impl=impl, substeps=1, max_envs=1)
-    poses = jax.jit(world.poses, compiler_options=CPU_OPTIONS)
+    poses = jax.jit(world.poses)
     data, rng = mujoco.MjData(mj_model), np.random.default_rng(0)
     for _ in range(5):
         # Quaternions of any length: C normalises them too.

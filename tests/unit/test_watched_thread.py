@@ -18,7 +18,7 @@ def wait(done):
 WatchedThread("test").run(threading.Event().wait, wait)
 """
     done = subprocess.run(
-        [sys.executable, "-c", code], check=False, capture_output=True, text=True, timeout=20
+        [sys.executable, "-c", code], check=False, capture_output=True, text=True, timeout=120
     )
     assert done.returncode == 1
     assert "TimeoutError: nobody came" in done.stderr
