@@ -16,7 +16,7 @@ FAULT_AT, STEPS, ODD_ONES = 5, 10, 3
 
 
 def main() -> None:
-    config = json.loads(Path(sys.argv[1]).read_text())["config"]
+    (config,) = json.loads(Path(sys.argv[1]).read_text())["configs"]
     run, seed = Path(config["run"]["dir"]), config["seed"]
     run.mkdir(exist_ok=True)
     (pipe,) = map(Path, json.loads(os.environ[DAEMONS_VARIABLE]).values())

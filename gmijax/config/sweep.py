@@ -25,9 +25,10 @@ class SweepConfig(KeyGroup):
         default="auto",
         low=1,
     )
-    pack: Literal["gmi", "vmap"] = doc(
-        "how jobs share a GPU: each in processes of its own (gmi), or those that differ in seed "
-        "and learning rate alone as one program (vmap); vmap only with sampler=grid",
+    pack: Literal["gmi", "vmap", "auto"] = doc(
+        "how jobs share a GPU: each in processes of its own (gmi), those that differ in seed and "
+        "learning rate alone as one program (vmap; only with sampler=grid), or so where they can "
+        "(auto)",
         default="gmi",
     )
     objective: str = doc(
@@ -63,5 +64,5 @@ class SweepConfig(KeyGroup):
             raise ConfigError(
                 f"sweep.pruner={self.pruner}: not with sweep.sampler=grid; allowed are random, tpe"
             )
-        if self.sampler != "grid" and self.pack != "gmi":
-            raise ConfigError(f"sweep.pack={self.pack}: only with sweep.sampler=grid; use gmi")
+        if self.sampler != "grid" and self.pack == "vmap":
+            raise ConfigError("sweep.pack=vmap: only with sweep.sampler=grid; use gmi")

@@ -8,7 +8,8 @@ from __future__ import annotations
 
 import dataclasses
 import time
-from contextlib import ExitStack
+from collections.abc import Iterator, Sequence
+from contextlib import ExitStack, contextmanager
 from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -93,22 +94,33 @@ def _train(
     started_s: float,
 ) -> Result:
     config, plan = decided.config, decided.plan
-    changed = None
-    if beginning.checkpoint is not None:
-        changed = source.changes(config.env, saved_config(beginning.checkpoint)["env"])
-    run = beginning.open(config)
-    with locked(run.lock, f"run.dir={run.root}"):
-        record_git(run, Path.cwd())
+    with opened(config, beginning) as (run, notes):
         what = (
             f"{plan.num_envs_per_gmi} environments per GMI, template {plan.template}, reduction "
             f"{plan.strategy}"
         )
-        changes = () if changed is None else (changed,)
-        announce(console, run, plan, what, (*decided.reasons, *changes, *beginning.notes))
+        announce(console, run, plan, what, (*decided.reasons, *notes))
         _Job(decided, run, console, cluster, opengl).run_to_the_end(beginning, started_s)
     summary = read_json(run.summary)
     console.print(train_outcome(summary, run))
     return Result(run.root, summary)
+
+
+@contextmanager
+def opened(config: TrainConfig, beginning: StartPoint) -> Iterator[tuple[RunPaths, Sequence[str]]]:
+    """The run folder of a job, held while it is entered, and what the user should know of it.
+
+    Raises:
+      ConfigError: as `StartPoint.open` and `locked`.
+    """
+    notes = beginning.notes
+    if beginning.checkpoint is not None:
+        changed = source.changes(config.env, saved_config(beginning.checkpoint)["env"])
+        notes = notes if changed is None else (changed, *notes)
+    run = beginning.open(config)
+    with locked(run.lock, f"run.dir={run.root}"):
+        record_git(run, Path.cwd())
+        yield run, notes
 
 
 class _Job:
@@ -154,7 +166,7 @@ class _Job:
         with (
             followed(config, run, beginning.checkpoint, self._console.print),
             filmed(self._opengl, run, self._console.print),
-            recorded(run, partial(what_is_left, run), record),
+            recorded(run, partial(_what_is_left, run), record),
         ):
             self._prepare(beginning)
             with progress:
@@ -216,7 +228,7 @@ def _finished(config: TrainConfig, run: RunPaths, console: Console) -> Result:
     return Result(run.root, summary)
 
 
-def what_is_left(run: RunPaths) -> str:
+def _what_is_left(run: RunPaths) -> str:
     """Says how an interrupted job can be continued."""
     if run.gmi(0).result.exists() and read_json(run.gmi(0).result)["status"] == "completed":
         return f"training was complete: {run.root}"

@@ -231,13 +231,14 @@ def _partial(paths: RunPaths, env_steps: int) -> Path:
 
 
 def on_host(tree: T) -> T:
-    """A copy in the host's memory, as it is saved: a checkpoint says nothing of devices."""
-    return jax.tree.map(np.array, _storable(tree))
+    """A copy in the host's memory; random keys are plain arrays there."""
+    return jax.tree.map(lambda leaf: np.array(_without_key(leaf)), tree)
 
 
 def _save(folder: Path, tree: PyTree) -> None:
     with ocp.StandardCheckpointer() as checkpointer:
-        checkpointer.save(folder.resolve(), on_host(tree))
+        # A checkpoint says nothing of devices.
+        checkpointer.save(folder.resolve(), jax.tree.map(np.asarray, _storable(tree)))
 
 
 def _restore(folder: Path, template: T) -> T:
@@ -294,12 +295,14 @@ def _is_key(leaf: jax.Array) -> bool:
 def _storable(tree: T) -> T:
     # Orbax takes neither typed random keys, whose bits are plain uint32 arrays, nor arrays
     # without elements, such as the activations of a model that has none.
-    def plain(leaf: jax.Array) -> jax.Array:
-        if leaf.size == 0:
-            return jnp.zeros(1)
-        return jax.random.key_data(leaf) if _is_key(leaf) else leaf
+    def plain(leaf: jax.Array) -> Any:
+        return np.zeros(1, np.float32) if leaf.size == 0 else _without_key(leaf)
 
     return jax.tree.map(plain, tree)
+
+
+def _without_key(leaf: jax.Array) -> jax.Array:
+    return jax.random.key_data(leaf) if _is_key(leaf) else leaf
 
 
 def _restored(like: jax.Array, leaf: jax.Array) -> jax.Array:

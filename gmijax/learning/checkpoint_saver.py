@@ -41,12 +41,12 @@ class CheckpointSaver:
     def is_written(self) -> bool:
         """Whether this GMI's part of a checkpoint that has no name yet is on the disk.
 
-        Raises what has kept it from being written.
+        Raises what has kept it, or the checkpoint before, from being written.
         """
-        if self._unnamed is None or not self._thread.is_idle:
+        if not self._thread.is_idle:
             return False
         self._thread.wait()
-        return True
+        return self._unnamed is not None
 
     def begin(self, meta: CheckpointMeta, learner_state: PyTree, env_state: PyTree | None) -> None:
         """Begins to write a checkpoint; both states may be donated after it.

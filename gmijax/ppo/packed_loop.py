@@ -73,10 +73,8 @@ class Member:
         except NonFiniteError as error:
             self._fail(error)
 
-    def save(
-        self, env_steps: int, returns: float | None, state: TrainState, envs: BatchState
-    ) -> None:
-        """Writes a checkpoint; if its numbers are not finite, the training has failed."""
+    def save(self, env_steps: int, state: TrainState, envs: BatchState) -> None:
+        """Writes a checkpoint, without its name; if numbers are not finite, the training fails."""
         try:
             require_finite(state.params, self.config.env.label, env_steps)
         except NonFiniteError as error:
@@ -84,6 +82,9 @@ class Member:
             return
         save_envs(self.run, env_steps, 0, envs)
         save_learner(self.run, env_steps, state)
+
+    def name_checkpoint(self, env_steps: int, returns: float | None) -> None:
+        """After `save`, `returns` are those of the last episodes before it."""
         meta = checkpoint_meta(self.config, env_steps, 1, returns)
         self._checkpoint = finish_checkpoint(self.run, meta, self.config.run.keep_checkpoints)
 
@@ -231,12 +232,13 @@ class PackedLoop:
         self._saver.report(self._env_steps, returns, parts)
 
     def _save_all(self, env_steps: int, returns: Sequence[float | None], parts: Any) -> None:
-        # The first one last: what it has saved all have saved.
-        for member, last_return, part in reversed(
-            list(zip(self._members, returns, parts, strict=True))
-        ):
-            if member.error is None:
-                member.save(env_steps, last_return, *part)
+        going_on = [number for number, one in enumerate(self._members) if one.error is None]
+        for number in going_on:  # In turn: orbax can block when several threads use it.
+            self._members[number].save(env_steps, *parts[number])
+        # All at once, so that after a fault they go on from the same step.
+        for number in going_on:
+            if self._members[number].error is None:
+                self._members[number].name_checkpoint(env_steps, returns[number])
 
 
 def _iterate_all(

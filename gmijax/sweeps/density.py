@@ -26,6 +26,7 @@ from gmijax.runs.folder import read_json
 from gmijax.supervise.run_gmis import StopSignals
 from gmijax.sweeps.jobs import Job, SweepPaths
 from gmijax.sweeps.nodes import Host
+from gmijax.sweeps.packs import most_together
 from gmijax.sweeps.places import Places, Site, gmis_of_place, places_of
 from gmijax.sweeps.scheduler import Scheduler
 from gmijax.sweeps.study import Study
@@ -79,7 +80,10 @@ def with_density(
         kinds.setdefault(kind, job)
     bench = _Bench(hosts[0], scratch, signals)
     most = _most(settings, jobs, hosts)
-    counts = [_best(settings, job, most, bench, console) for job in kinds.values()]
+    counts = [
+        _best(settings, job, most, most_together(settings, job, jobs), bench, console)
+        for job in kinds.values()
+    ]
     return dataclasses.replace(settings, jobs_per_gpu=max(1, min(*counts, most)))
 
 
@@ -106,15 +110,16 @@ class _Bench(NamedTuple):
     signals: StopSignals
 
 
-def _best(settings: SweepConfig, job: Job, most: int, bench: _Bench, console: Console) -> int:
+def _best(
+    settings: SweepConfig, job: Job, most: int, together: int, bench: _Bench, console: Console
+) -> int:
     """The number of such jobs at a time on the GPUs of one that makes the most steps.
 
-    More than `most` are not profiled, but for the number that is next to it.
+    More than `most` are not profiled, but for the number that is next to it. Up to `together` of
+    them are one program.
     """
     config = job.config
     own = {"job": "sweep", "size": _size(job)}
-    if settings.pack != "gmi":
-        own["pack"] = settings.pack
     key = workload_of(config).store_key(bench.host.machine) | own
     store = ProfileStore(cache_folder() / "profiles", key, console.print)
     best, best_rate = 1, 0.0
@@ -122,11 +127,13 @@ def _best(settings: SweepConfig, job: Job, most: int, bench: _Bench, console: Co
         if best >= most:
             break
         point = Point(count, config.envs_per_gmi, str(config.physics.impl))
-        found = store.get("sweep", point)
+        packed = min(count, together)
+        mode = "sweep" if packed == 1 else f"sweep {packed} together"
+        found = store.get(mode, point)
         if found is None:
             started_s = time.monotonic()
-            found = _profile(settings, job, count, bench)
-            store.put("sweep", point, found, time.monotonic() - started_s)
+            found = _profile(settings, job, count, bench, together)
+            store.put(mode, point, found, time.monotonic() - started_s)
         if isinstance(found, NotRunnable):
             console.print(
                 f"  {config.env.label}: {count} jobs at a time cannot run: {found.reason}"
@@ -135,7 +142,7 @@ def _best(settings: SweepConfig, job: Job, most: int, bench: _Bench, console: Co
         rate = count * found.env_steps_per_s
         console.print(
             f"  {config.env.label}: {count} jobs at a time make {rate:,.0f} steps/s, "
-            f"{found.memory_mib:,.0f} MiB each"
+            f"{found.memory_mib:,.0f} MiB in each process"
         )
         if rate < best_rate * (1 + GAIN):
             break
@@ -144,7 +151,9 @@ def _best(settings: SweepConfig, job: Job, most: int, bench: _Bench, console: Co
     return best
 
 
-def _profile(settings: SweepConfig, job: Job, count: int, bench: _Bench) -> Measured | NotRunnable:
+def _profile(
+    settings: SweepConfig, job: Job, count: int, bench: _Bench, together: int = 1
+) -> Measured | NotRunnable:
     """Trains with `count` copies for a few seconds; what each of them did."""
     host, signals = bench.host, bench.signals
     gpus = settings.gpus if isinstance(settings.gpus, tuple) else None
@@ -155,7 +164,8 @@ def _profile(settings: SweepConfig, job: Job, count: int, bench: _Bench) -> Meas
     limit_s = job.config.search.profile_timeout_s
     with tempfile.TemporaryDirectory(prefix="gmijax-", dir=bench.scratch) as folder:
         paths = SweepPaths(Path(folder))
-        jobs = [_copy(job, seed) for seed in range(count)]
+        # Only those that have the same number of steps may be one program.
+        jobs = [_copy(job, seed, _FOREVER + seed // together) for seed in range(count)]
         inner = StopSignals()
         window = _Window(jobs, limit_s)
 
@@ -185,14 +195,14 @@ def _profile(settings: SweepConfig, job: Job, count: int, bench: _Bench) -> Meas
         return Measured(rate / count, _memory_mib(paths, jobs), window.iteration_s)
 
 
-def _copy(job: Job, seed: int) -> Job:
+def _copy(job: Job, seed: int, num_timesteps: int) -> Job:
     run = dataclasses.replace(
         job.config.run, checkpoint_every=0, measure_throughput=False, max_restarts=0
     )
     config = dataclasses.replace(
         job.config,
         seed=seed,
-        num_timesteps=_FOREVER,
+        num_timesteps=num_timesteps,
         run=run,
         eval=dataclasses.replace(job.config.eval, every=None, video=False),
         wandb=dataclasses.replace(job.config.wandb, mode="off"),

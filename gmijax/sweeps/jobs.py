@@ -242,15 +242,15 @@ def placed(
         # The daemon is the sweep's, and caps nobody.
         self_check="off" if wanted.self_check == "auto" else wanted.self_check,
     )
-    own = dataclasses.replace(job.config.run, dir=str(run.root), name=None, resume="auto")
     wandb = job.config.wandb
     wandb = dataclasses.replace(wandb, group=wandb.group or run.root.parent.name)
-    return dataclasses.replace(job.config, plan=plan, run=own, wandb=wandb)
+    return dataclasses.replace(started_in(job.config, run), plan=plan, wandb=wandb)
 
 
-def status_of(run: RunPaths) -> str | None:
-    """How the last attempt at a job ended; None: it has not."""
-    return read_json(run.summary)["status"] if run.summary.exists() else None
+def started_in(config: TrainConfig, run: RunPaths) -> TrainConfig:
+    """The configuration of a job in its run folder, where it goes on from what is there."""
+    own = dataclasses.replace(config.run, dir=str(run.root), name=None, resume="auto")
+    return dataclasses.replace(config, run=own)
 
 
 def state_of(run: RunPaths, config: TrainConfig) -> State:

@@ -1,16 +1,74 @@
-"""Jobs that one program can train together (`sweep.pack=vmap`): which may, and which do."""
+"""Jobs that one program can train together (`sweep.pack`): which may, and how each has ended."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import replace
+from typing import NamedTuple
 
 from gmijax.config.sweep import SweepConfig
+from gmijax.control.start_point import find_start_point
 from gmijax.errors import ConfigError
-from gmijax.runs.folder import RunPaths
-from gmijax.runs.resume import CheckpointMeta, newest_checkpoint
-from gmijax.sweeps.jobs import Job, SweepPaths
-from gmijax.sweeps.places import gmis_of_place
+from gmijax.runs.folder import RunPaths, is_locked, read_json
+from gmijax.runs.resume import CheckpointMeta
+from gmijax.sweeps.jobs import Job, SweepPaths, started_in, state_of
+
+
+class Packer:
+    """Finds jobs that are trained together.
+
+    Args:
+      settings: of the sweep.
+      paths: its files.
+    """
+
+    def __init__(self, settings: SweepConfig, paths: SweepPaths) -> None:
+        self._settings, self._paths = settings, paths
+        self._begins: dict[int, int | None] = {}
+
+    def together(self, job: Job, queue: Sequence[Job], alone: Collection[int]) -> tuple[Job, ...]:
+        """The job, and those in the queue that can be trained in one program with it.
+
+        Those of `alone`, numbers of jobs, are not put together with others.
+        """
+        if self._settings.pack == "gmi" or why_alone(job) is not None:
+            return (job,)
+        is_alone, begin = job.number in alone, self._begin(job)
+        if begin is None:
+            return (job,)
+        others = [
+            other
+            for other in queue
+            if other is not job
+            and (other.number in alone) == is_alone
+            and may_share(job, other)
+            and not is_locked(self._paths.job(other.number).lock)
+            and self._begin(other) == begin
+        ]
+        return (job, *others)
+
+    def forget(self, job: Job) -> None:
+        """It has run, and begins elsewhere the next time."""
+        self._begins.pop(job.number, None)
+
+    def _begin(self, job: Job) -> int | None:
+        """The step that a job goes on from; None: it has to say itself why it cannot, or need not.
+
+        Kept, because it takes reading whole checkpoints.
+        """
+        if job.number not in self._begins:
+            self._begins[job.number] = _begin_of(job, self._paths.job(job.number))
+        return self._begins[job.number]
+
+
+def _begin_of(job: Job, run: RunPaths) -> int | None:
+    try:
+        found = find_start_point(started_in(job.config, run))
+    except ConfigError:
+        return None
+    if found.is_complete:
+        return None
+    return 0 if found.checkpoint is None else CheckpointMeta.read(found.checkpoint).env_steps
 
 
 def why_alone(job: Job) -> str | None:
@@ -20,7 +78,8 @@ def why_alone(job: Job) -> str | None:
     for found, why in (
         (config.is_asynchronous or config.algo.name != "ppo", f"algo={config.algo.name}"),
         (config.num_envs == "auto", "num_envs=auto"),
-        (job.num_gpus > 1 or gmis_of_place(config) > 1, "more than one GMI"),
+        (plan.gpus != 1, f"plan.gpus={plan.gpus}"),
+        (plan.gmis_per_gpu != 1, f"plan.gmis_per_gpu={plan.gmis_per_gpu}"),
         (plan.template not in ("auto", "tcg_ex"), f"plan.template={plan.template}"),
         (config.env.randomize != "off", f"env.randomize={config.env.randomize}"),
         (config.eval.every is not None, "eval.every"),
@@ -37,13 +96,13 @@ def require_packable(settings: SweepConfig, jobs: Sequence[Job]) -> None:
     Raises:
       ConfigError: names the job and what stands in the way.
     """
-    if settings.pack == "gmi":
+    if settings.pack != "vmap":
         return
     for job in jobs:
         if (why := why_alone(job)) is not None:
             raise ConfigError(
                 f"sweep.pack=vmap: job {job.number} has {why}, which needs processes of its own; "
-                "allowed is gmi"
+                "allowed are auto, gmi"
             )
 
 
@@ -54,12 +113,11 @@ def may_share(one: Job, other: Job) -> bool:
     return (one.program, steps, own) == (other.program, other_steps, others)
 
 
-def of_one_step(job: Job, others: Sequence[Job], paths: SweepPaths) -> list[Job]:
-    """Those of `others` that go on from the same step as `job`."""
-    if not others:
-        return []
-    steps = _steps(paths.job(job.number))
-    return [other for other in others if _steps(paths.job(other.number)) == steps]
+def most_together(settings: SweepConfig, job: Job, jobs: Sequence[Job]) -> int:
+    """How many of the jobs of a sweep one program can train at most, of the kind of `job`."""
+    if settings.pack == "gmi" or why_alone(job) is not None:
+        return 1
+    return sum(may_share(job, other) for other in jobs)
 
 
 def program_of(job: Job, count: int) -> str:
@@ -67,7 +125,17 @@ def program_of(job: Job, count: int) -> str:
     return job.program if count == 1 else f"{count} x {job.program}"
 
 
-def _steps(run: RunPaths) -> int | None:
-    """Where a job goes on from."""
-    checkpoint = newest_checkpoint(run.root).checkpoint
-    return None if checkpoint is None else CheckpointMeta.read(checkpoint).env_steps
+class OwnEnd(NamedTuple):
+    """How a job has ended whatever became of others: complete, or failed by its `error`."""
+
+    error: str | None
+
+
+def own_end(job: Job, run: RunPaths) -> OwnEnd | None:
+    """The end of a job that was trained together with others; None: it is that of the process."""
+    if state_of(run, job.config) == "completed":
+        return OwnEnd(None)
+    if run.gmi(0).error.exists():
+        said = read_json(run.gmi(0).error)
+        return OwnEnd(f"{said['type']}: {said['message']}")
+    return None

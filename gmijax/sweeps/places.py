@@ -27,6 +27,7 @@ class Place:
       site: index of its machine.
       backend: of that machine's places.
       is_whole_gpu: whether GPUs have one place each.
+      is_alone: whether nobody else runs on its GPUs meanwhile.
     """
 
     slices: tuple[Slice, ...]
@@ -35,6 +36,7 @@ class Place:
     site: int
     backend: BackendName
     is_whole_gpu: bool
+    is_alone: bool
     joined: tuple[Slice, ...] = ()
 
     @property
@@ -118,9 +120,13 @@ class Places:
         self._labels = [_labels(site) for site in sites]
         self.left = set(range(len(sites)))
 
-    def has_room(self) -> bool:
-        """Whether any place is free."""
-        return any(self._free)
+    def has_room(self, avoid: Collection[int] = ()) -> bool:
+        """Whether any place is free on machines other than those of `avoid`."""
+        return self.num_gpus_with_room(avoid) > 0
+
+    def num_gpus_with_room(self, avoid: Collection[int] = ()) -> int:
+        """GPUs that have a free place, on machines other than those of `avoid`."""
+        return sum(len(_by_gpu(self._free[site])) for site in self.left.difference(avoid))
 
     def take(
         self,
@@ -149,23 +155,32 @@ class Places:
             return None
         site, emptiest = max(found, key=lambda one: sum(map(len, one[1])))
         taken = tuple(free[0] for free in emptiest)
-        others = tuple(share for free in emptiest for share in free[1:]) if alone else ()
-        device = taken[0].device
-        joined = (
-            [] if num_gpus > 1 or alone else [x for x in emptiest[0][1:] if x.device == device]
-        )
-        joined = joined[: num_jobs - 1]
-        gone = (*taken, *others, *joined)
+        # Of a GPU with MIG a job has one instance.
+        rest = [share for share in emptiest[0][1:] if share.device == taken[0].device]
+        joined = tuple(rest[: num_jobs - 1]) if num_gpus == 1 else ()
+        others = [share for free in emptiest for share in free[1:] if share not in joined]
+        return self._taken(site, taken, joined, tuple(others) if alone else ())
+
+    def _taken(
+        self,
+        site: int,
+        taken: tuple[Slice, ...],
+        joined: tuple[Slice, ...],
+        kept_free: tuple[Slice, ...],
+    ) -> Place:
+        gone, here = (*taken, *joined, *kept_free), self._all[site]
         self._free[site] = [share for share in self._free[site] if share not in gone]
+        is_alone = sum(len(here[share.gpu]) for share in taken) == len(gone)
         label = ", ".join(self._labels[site][share.gmi] for share in taken)
         return Place(
             taken,
-            f"{label} alone" if alone else label,
-            others,
+            f"{label} alone" if kept_free else label,
+            kept_free,
             site,
             self._sites[site].plan.backend,
-            is_whole_gpu=all(len(here) == 1 for here in self._all[site].values()),
-            joined=tuple(joined),
+            is_whole_gpu=all(len(slices) == 1 for slices in here.values()),
+            is_alone=is_alone,
+            joined=joined,
         )
 
     def give_back(self, place: Place) -> None:

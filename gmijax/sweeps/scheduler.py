@@ -6,24 +6,22 @@ import time
 from collections import Counter
 from collections.abc import Callable, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
 from typing import Any
 
 from gmijax.config.schema import to_dict
 from gmijax.config.sweep import SweepConfig
-from gmijax.control.exit_codes import EXIT_INTERRUPTED
 from gmijax.errors import JobInterrupted, NodeLost
-from gmijax.runs.folder import RunPaths, add_event, is_locked
+from gmijax.runs.folder import add_event, is_locked
 from gmijax.runs.history import MetricsReader
 from gmijax.supervise.failures import may_be_anothers
 from gmijax.supervise.run_gmis import StopSignals
-from gmijax.sweeps.children import Seen
 from gmijax.sweeps.host import Start
 from gmijax.sweeps.hparams import write_hparams
-from gmijax.sweeps.jobs import Job, SweepPaths, placed, status_of
+from gmijax.sweeps.jobs import Job, SweepPaths, placed
 from gmijax.sweeps.nodes import Host
-from gmijax.sweeps.packs import may_share, of_one_step, program_of
+from gmijax.sweeps.packs import Packer, program_of
 from gmijax.sweeps.places import Place, Places
+from gmijax.sweeps.running import Outcome, Running
 from gmijax.sweeps.study import Study
 
 _TICK_S = 0.1
@@ -31,64 +29,13 @@ _KILL_AFTER_S = 15.0
 """Beyond what a job gives its GMIs to save and end; for killed ones to be gone."""
 
 
-@dataclass
-class _Running:
-    """A process of jobs that runs: of one, or of several that are trained together.
-
-    Attributes:
-      jobs: what it trains.
-      place: where.
-      host: the machine.
-      child: its number there.
-      readers: of their metrics.
-      is_pruned: whether it was asked to end because others are better.
-      is_killed: whether it was ended by force, as the whole sweep is.
-    """
-
-    jobs: tuple[Job, ...]
-    place: Place
-    host: Host
-    child: int
-    readers: tuple[MetricsReader, ...]
-    is_pruned: bool = False
-    is_killed: bool = False
-
-    def look(self) -> Seen | None:
-        """How it is; None: that is not known."""
-        return self.host.look(self.child)
-
-    def order_stop(self) -> None:
-        """Asks it to save and end."""
-        self.host.order(self.child, "ask_to_stop")
-
-    def is_over(self) -> bool:
-        """Whether it has ended, or its machine is gone."""
-        seen = self.look()
-        return self.host.lost is not None or (seen is not None and seen.exit_code is not None)
-
-    def outcome(self, run: RunPaths) -> tuple[bool, str | None]:
-        """After its end, of the job with this run folder.
-
-        Returns:
-          Whether it was interrupted, and why it failed (None: it did not).
-        """
-        seen = self.look() or Seen(None)
-        is_complete = len(self.jobs) > 1 and status_of(run) == "completed"
-        if seen.exit_code == 0 or is_complete:
-            return False, None
-        if seen.exit_code == EXIT_INTERRUPTED or self.is_killed:
-            return True, None
-        if seen.exit_code is None:
-            return False, self.host.lost
-        return False, seen.said.removeprefix("gmijax.train: ") or f"exit code {seen.exit_code}"
-
-
 class Scheduler:
     """Starts jobs where there is room, reads how far they are, and ends them when told to.
 
     A job that fails ends alone. But where it shared an MPS daemon, and the fault may have been
     that of another client, it is run once more, from its last checkpoint and alone on its GPU.
-    Jobs of a machine that is gone run again on others, as often as `run.max_restarts` says.
+    Jobs of a machine that is gone, or of a process that they shared, run again, as often as
+    `run.max_restarts` says.
 
     Args:
       jobs: those that are known; those that are `waiting` are run. More come from the study.
@@ -114,9 +61,10 @@ class Scheduler:
         self._queue = [job for job in jobs if job.progress.state == "waiting"]
         self._sweep, self._paths = sweep, paths
         self._places, self._hosts, self._on_tick = places, hosts, on_tick
+        self._packer = Packer(sweep, paths)
         self._alone: set[int] = set()
-        self._nodes_lost: Counter[int] = Counter()
-        self._running: dict[int, _Running] = {}
+        self._faults: Counter[int] = Counter()
+        self._running: dict[int, Running] = {}
         self._compiling: dict[tuple[int, str], int] = {}
 
     def run(self, signals: StopSignals) -> None:
@@ -156,15 +104,16 @@ class Scheduler:
                 self._queue.append(job)
 
     def _start_if_it_fits(self, job: Job) -> bool:
-        if not self._places.has_room():
-            return False
+        avoid = self._compiling_sites(job)
         # Others compile the same there; when they have, it is found in the cache.
-        avoid, together = self._compiling_sites(job), self._together(job)
+        if not (num_gpus := self._places.num_gpus_with_room(avoid)):
+            return False
+        together = self._packer.together(job, self._queue, self._alone)
         place = self._places.take(
             job.num_gpus,
             alone=job.number in self._alone,
             avoid=avoid,
-            num_jobs=len(together),
+            num_jobs=-(-len(together) // num_gpus),  # So that every GPU gets its part of them.
         )
         if place is None:
             return False
@@ -174,18 +123,6 @@ class Scheduler:
             self._drop_lost()
             return False
         return True
-
-    def _together(self, job: Job) -> tuple[Job, ...]:
-        """The job, and those in the queue that can be trained in one program with it."""
-        if self._sweep.pack == "gmi" or job.number in self._alone:
-            return (job,)
-        others = [
-            other
-            for other in self._queue
-            if other.number not in (job.number, *self._alone) and may_share(job, other)
-        ]
-        free = [one for one in others if not is_locked(self._paths.job(one.number).lock)]
-        return (job, *of_one_step(job, free, self._paths))
 
     def _compiling_sites(self, job: Job) -> set[int]:
         """Machines where another job compiles the same programs."""
@@ -207,7 +144,7 @@ class Scheduler:
         started = host.start(Start(place, configs, *files, program_of(first, len(jobs))))
         if not started.has_programs:
             self._compiling[place.site, first.program] = first.number
-        self._running[first.number] = _Running(jobs, place, host, started.child, tuple(readers))
+        self._running[first.number] = Running(jobs, place, host, started.child, tuple(readers))
         for job in jobs:
             job.progress.begin(place.label, host.name)
         self._queue = [job for job in self._queue if job.progress.state == "waiting"]
@@ -228,52 +165,62 @@ class Scheduler:
                 running.order_stop()
         self._drop_lost()
 
-    def _finish(self, running: _Running) -> None:
+    def _finish(self, running: Running) -> None:
         del self._running[running.jobs[0].number]
-        outcomes = [running.outcome(self._paths.job(job.number)) for job in running.jobs]
+        ends = [running.outcome(job, self._paths.job(job.number)) for job in running.jobs]
         running.host.order(running.child, "close")
         self._places.give_back(running.place)
         self._nobody_waits_for(running, has_compiled=False)
-        for job, (is_interrupted, error) in zip(running.jobs, outcomes, strict=True):
-            self._end(running, job, error, is_interrupted=is_interrupted)
+        again = [
+            job
+            for job, end in zip(running.jobs, ends, strict=True)
+            if self._end(running, job, end)
+        ]
+        # They came before the others; one that waits for a whole GPU must not hold them up.
+        first = [job for job in again if job.number not in self._alone]
+        rest = [job for job in again if job.number in self._alone]
+        self._queue = [*first, *self._queue, *rest]
 
-    def _end(
-        self, running: _Running, job: Job, error: str | None, *, is_interrupted: bool
-    ) -> None:
-        """Notes how a job has ended, or puts it back into the queue."""
+    def _end(self, running: Running, job: Job, end: Outcome) -> bool:
+        """Notes how a job has ended; whether it is to run again."""
         run, progress = self._paths.job(job.number), job.progress
-        is_lost = error is not None and error == running.host.lost
+        self._packer.forget(job)
         progress.read(run, self._sweep)
-        progress.place, progress.error, progress.ended_s = "", error, time.monotonic()
-        progress.state = "failed" if error else "completed"
-        if is_interrupted or (is_lost and running.is_pruned):
+        progress.place, progress.error, progress.ended_s = "", end.error, time.monotonic()
+        progress.state = "failed" if end.error else "completed"
+        if end.is_interrupted or (end.is_fault and running.is_pruned):
             progress.state = "pruned" if running.is_pruned else "interrupted"
-        elif error and (again := self._why_again(running, job, error, is_lost=is_lost)):
-            # It came before the others; one that waits for a whole GPU must not hold them up.
-            self._queue.insert(0 if is_lost else len(self._queue), job)
+        elif end.error and (again := self._why_again(running, job, end)):
             progress.state, progress.error = "waiting", again
             add_event(run.events, "again", reason=again)
-            return
+            return True
         with suppress(OSError):  # A full disk must not end the sweep.
             write_hparams(job, run, self._sweep.objective)
         self._study.tell(job)
+        return False
 
-    def _why_again(self, running: _Running, job: Job, error: str, *, is_lost: bool) -> str | None:
+    def _why_again(self, running: Running, job: Job, end: Outcome) -> str | None:
         """Why a job that failed runs once more, if that may help."""
-        if is_lost:
-            self._nodes_lost[job.number] += 1
-            # It may be what ends them.
-            is_allowed = self._nodes_lost[job.number] <= job.config.run.max_restarts
-            return f"again, after {error}" if is_allowed else None
+        place, max_restarts = running.place, job.config.run.max_restarts
+        error = end.error or ""
         # The fault may be that of another client of its daemon.
-        has_daemon = running.place.backend in ("mps", "mig")
-        may_restart = job.config.run.max_restarts > 0 and job.number not in self._alone
-        if has_daemon and may_restart and may_be_anothers(error):
+        has_neighbours = place.backend in ("mps", "mig") and not place.is_alone
+        if (
+            has_neighbours
+            and max_restarts
+            and running.host.lost is None
+            and may_be_anothers(error)
+        ):
             self._alone.add(job.number)
             return f"again, alone on its GPU, after {error}"
+        if end.is_fault:
+            self._faults[job.number] += 1
+            # It may be what ends them.
+            if self._faults[job.number] <= max_restarts:
+                return f"again, after {error}"
         return None
 
-    def _nobody_waits_for(self, running: _Running, *, has_compiled: bool) -> None:
+    def _nobody_waits_for(self, running: Running, *, has_compiled: bool) -> None:
         """Its metrics are there, or it has ended, perhaps before it had compiled."""
         first, count = running.jobs[0], len(running.jobs)
         key = running.place.site, first.program

@@ -17,7 +17,14 @@ import pytest
 
 from gmijax.cli.compose import compose
 from gmijax.errors import ConfigError
-from gmijax.learning.checkpoint import finish_checkpoint, restore_learner, save_learner
+from gmijax.learning.checkpoint import (
+    finish_checkpoint,
+    on_host,
+    restore_envs,
+    restore_learner,
+    save_envs,
+    save_learner,
+)
 from gmijax.learning.learner import TrainState, learner_shapes
 from gmijax.runs.folder import RunPaths
 from gmijax.runs.resume import (
@@ -214,3 +221,21 @@ def test_a_broken_checkpoint_of_the_same_step_is_replaced(tmp_path: Path):
     assert newest_checkpoint(run.root).checkpoint is None
     save(run, 100, None, None)
     assert newest_checkpoint(run.root).checkpoint == run.checkpoint(100)
+
+
+def test_a_part_of_a_host_copy_is_saved_as_the_part_itself(tmp_path: Path):
+    def one(number: int) -> dict[str, jax.Array]:
+        key = jax.random.split(jax.random.key(number), 2)
+        return {"key": key, "empty": jnp.zeros((2, 0)), "x": jnp.full((2, 3), 1.0 + number)}
+
+    ones = [one(number) for number in range(3)]
+    copy = on_host(jax.tree.map(lambda *leaves: jnp.stack(leaves), *ones))
+    run = RunPaths(tmp_path)
+    save_envs(run, 8, 0, jax.tree.map(lambda leaf: leaf[1], copy))
+    (saved,) = run.checkpoints.iterdir()
+    restored = restore_envs(saved, 0, ones[0])
+    assert jax.tree.map(jnp.shape, restored) == jax.tree.map(jnp.shape, ones[1])
+    assert np.array_equal(restored["x"], ones[1]["x"])
+    assert np.array_equal(
+        jax.random.key_data(restored["key"]), jax.random.key_data(ones[1]["key"])
+    )

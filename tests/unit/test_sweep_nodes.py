@@ -44,20 +44,26 @@ class FakeHost(LocalHost):
         self.running: dict[int, int] = {}  # Jobs by their children.
         self.seen: dict[int, Seen] = {}
         self.started: list[int] = []
-        self.together: list[list[str]] = []  # Run folders of the jobs of each start.
+        self.folders: list[list[Path]] = []  # Of the jobs of each start.
         self.programs: set[str] = set()
         self._numbers = itertools.count()
 
     def start(self, start: Start) -> Started:
         if self.lost is not None:
             raise NodeLost(self.lost)
-        for config in start.configs:
-            Path(config["run"]["dir"]).mkdir(exist_ok=True)
+        folders = [Path(config["run"]["dir"]) for config in start.configs]
+        for folder in folders:
+            folder.mkdir(exist_ok=True)
         child = next(self._numbers)
         self.running[child] = int(start.order.stem)
         self.started.append(self.running[child])
-        self.together.append([Path(config["run"]["dir"]).name for config in start.configs])
+        self.folders.append(folders)
         return Started(child, start.program in self.programs)
+
+    @property
+    def together(self) -> list[list[str]]:
+        """Names of the jobs of each start."""
+        return [[folder.name for folder in folders] for folders in self.folders]
 
     def look(self, child: int) -> Seen | None:
         return self.seen.get(child)
@@ -73,7 +79,10 @@ class FakeHost(LocalHost):
         self.programs.add(program)
 
     def end(self, exit_code: int = 0) -> None:
-        """Ends all jobs that run there."""
+        """Ends all jobs that run there; they are complete if that is 0."""
+        for child in self.running if exit_code == 0 else ():
+            for run in self.folders[child]:
+                write_json(RunPaths(run).summary, {"status": "completed", "env_steps": 10**12})
         self.seen |= {child: Seen(exit_code, "CUDA_ERROR_X") for child in self.running}
 
 
@@ -251,28 +260,74 @@ def test_equal_programs_compile_once_on_each_node(tmp_path: Path) -> None:
 
 
 def test_jobs_that_differ_in_numbers_are_started_together(tmp_path: Path) -> None:
-    overrides = [("seed=0",), ("num_envs=32",), ("seed=1",), ("algo.learning_rate=1e-3",)]
-    sweep = Sweep(tmp_path, jobs_of([compose(*own) for own in overrides]), pack="vmap")
+    numbers = [("seed=0",), ("seed=1",), ("algo.learning_rate=1e-3",), ("seed=2",)]
+    sweep = Sweep(tmp_path, jobs_of([compose(*own) for own in [*numbers, ("num_envs=32",)]]))
+    sweep.settings = SweepConfig(jobs_per_gpu=2, pack="vmap")
     sweep.run(sweep.end_all)
     first, second = sweep.nodes
-    assert first.together == [["000", "002"]]
-    assert second.together == [["001"], ["003"]]
-    assert sweep.states() == ["completed"] * 4
+    # Half of them on each machine.
+    assert first.together == [["000", "001"], ["004"]]
+    assert second.together == [["002", "003"]]
+    assert sweep.states() == ["completed"] * 5
 
 
-def test_of_jobs_of_one_program_those_fail_that_say_so(tmp_path: Path) -> None:
-    jobs = jobs_of([compose(f"seed={seed}", "plan.backend=cpu") for seed in range(2)])
+def test_jobs_that_cannot_share_a_program_run_beside_those_that_do(tmp_path: Path) -> None:
+    own = ("seed=0",), ("eval.every=1000",), ("seed=1",), ("seed=2",)
+    sweep = Sweep(tmp_path, jobs_of([compose(*one) for one in own]), pack="auto")
+    sweep.run(sweep.end_all)
+    together = [*sweep.nodes[0].together, *sweep.nodes[1].together]
+    assert sorted(together) == [["000", "002"], ["001"], ["003"]]
+
+
+def test_a_job_whose_folder_is_none_of_a_run_is_left_to_itself(tmp_path: Path) -> None:
+    jobs = jobs_of([compose(f"seed={seed}") for seed in range(3)])
     sweep = Sweep(tmp_path, jobs, pack="vmap")
+    write_json(sweep.paths.job(1).root / "notes.json", {})
+    sweep.places.drop(1)
+    sweep.run(sweep.end_all)
+    assert sweep.nodes[0].together == [["000", "002"], ["001"]]
 
-    def end() -> None:
-        for number, status in enumerate(("completed", "failed")):
-            write_json(sweep.paths.job(number).summary, {"status": status})
-        sweep.nodes[0].end(exit_code=1)
 
-    sweep.run(end)
-    assert sweep.nodes[0].together == [["000", "001"]]
-    assert sweep.states() == ["completed", "failed"]
-    assert sweep.jobs[1].progress.error == "CUDA_ERROR_X"
+class EndsOfAProgram:
+    """Three jobs of one program; the second one fails, and the process is lost in its turn."""
+
+    def __init__(self, folder: Path, *overrides: str) -> None:
+        steps = "num_timesteps=1000"
+        jobs = jobs_of([compose(f"seed={seed}", steps, *overrides) for seed in range(3)])
+        self.sweep = Sweep(folder, jobs, pack="vmap", jobs_per_gpu=3)
+        self.sweep.places.drop(1)
+        self.runs = [self.sweep.paths.job(number) for number in range(3)]
+
+    def lose(self) -> None:
+        """The process is lost after the second job has failed, and the first one is complete."""
+        write_json(self.runs[0].summary, {"status": "completed", "env_steps": 1000})
+        write_json(self.runs[1].gmi(0).error, {"type": "NonFiniteError", "message": "nan"})
+        self.sweep.nodes[0].end(exit_code=1)
+
+    def end(self) -> None:
+        """All that runs is complete."""
+        self.sweep.nodes[0].end()
+
+
+def test_of_jobs_of_one_program_those_run_again_that_have_not_ended(tmp_path: Path) -> None:
+    ends = EndsOfAProgram(tmp_path)
+    ends.sweep.run(ends.lose, ends.end)
+    assert ends.sweep.nodes[0].together == [["000", "001", "002"], ["002"]]
+    assert ends.sweep.states() == ["completed", "failed", "completed"]
+    assert ends.sweep.jobs[1].progress.error == "NonFiniteError: nan"
+    events = [run.events.exists() and run.events.read_text() for run in ends.runs]
+    assert [bool(text) for text in events] == [False, False, True]
+    assert '"reason": "again, after CUDA_ERROR_X"' in str(events[2])
+
+
+def test_of_jobs_of_one_program_all_fail_that_may_not_run_again(tmp_path: Path) -> None:
+    ends = EndsOfAProgram(tmp_path, "run.max_restarts=0")
+    ends.sweep.run(ends.lose)
+    assert ends.sweep.states() == ["completed", "failed", "failed"]
+    assert [job.progress.error for job in ends.sweep.jobs[1:]] == [
+        "NonFiniteError: nan",
+        "CUDA_ERROR_X",
+    ]
 
 
 def test_what_a_node_refuses_is_raised_here_and_does_not_lose_it() -> None:

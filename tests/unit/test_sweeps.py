@@ -35,7 +35,7 @@ from gmijax.sweeps.jobs import (
     state_of,
     why_not_comparable,
 )
-from gmijax.sweeps.packs import require_packable
+from gmijax.sweeps.packs import most_together, require_packable
 from gmijax.sweeps.places import Place, Places, Site, places_of
 from gmijax.sweeps.report import ranking, spread
 
@@ -96,7 +96,7 @@ def test_jobs_have_the_configuration_of_the_same_single_training() -> None:
         (("sweep.sampler=tpe", "seed=0,1"), "needs sweep.trials"),
         (("sweep.trials=3", "seed=0,1"), "sweep.sampler=grid runs all of them"),
         (("sweep.pruner=asha", "seed=0,1"), "not with sweep.sampler=grid"),
-        (("sweep.pack=mps", "seed=0,1"), "expected one of gmi, vmap"),
+        (("sweep.pack=mps", "seed=0,1"), "expected one of gmi, vmap, auto"),
         (
             ("sweep.pack=vmap", "sweep.sampler=tpe", "sweep.trials=3", "seed=0,1"),
             "only with sweep.sampler=grid",
@@ -280,14 +280,24 @@ def test_jobs_of_one_program_have_the_memory_and_cores_of_their_places() -> None
     places.give_back(three)
     again = places.take(1, num_jobs=8)
     assert again is not None
-    assert again.size == 3
+    assert (again.size, again.is_alone) == (3, False)
+    places = gpu_places(1, 4)
+    alone = places.take(1, alone=True, num_jobs=3)
+    assert alone is not None
+    assert (alone.size, len(alone.kept_free), alone.is_alone) == (3, 1, True)
+    places.give_back(alone)
+    whole = places.take(1, num_jobs=4)
+    assert whole is not None
+    assert (whole.is_alone, whole.label) == (True, "GPU 0 place 0")
 
 
 @pytest.mark.parametrize(
     ("override", "said"),
     [
         ("algo=a3c", "algo=a3c"),
-        ("plan.gmis_per_gpu=2", "more than one GMI"),
+        ("plan.gmis_per_gpu=2", "plan.gmis_per_gpu=2"),
+        ("plan.gmis_per_gpu=auto", "plan.gmis_per_gpu=auto"),
+        ("plan.gpus=2", "plan.gpus=2"),
         ("eval.every=1000", "eval.every"),
         ("num_envs=auto", "num_envs=auto"),
         ("wandb.mode=offline", "wandb.mode=offline"),
@@ -297,8 +307,12 @@ def test_jobs_of_one_program_have_the_memory_and_cores_of_their_places() -> None
 def test_jobs_that_need_processes_of_their_own_are_not_packed(override: str, said: str) -> None:
     jobs = jobs_of([compose("seed=0"), compose("seed=1", override)])
     require_packable(SweepConfig(), jobs)
+    require_packable(SweepConfig(pack="auto"), jobs)
+    assert most_together(SweepConfig(pack="auto"), jobs[1], jobs) == 1
     require_packable(SweepConfig(pack="vmap"), jobs[:1])
-    with pytest.raises(ConfigError, match=f"job 1 has {re.escape(said)}, .* allowed is gmi$"):
+    with pytest.raises(
+        ConfigError, match=f"job 1 has {re.escape(said)}, .* allowed are auto, gmi$"
+    ):
         require_packable(SweepConfig(pack="vmap"), jobs)
 
 
@@ -432,7 +446,7 @@ def test_no_more_at_a_time_than_let_all_jobs_run(
 
 def test_a_profile_of_a_job_is_not_sent_anywhere() -> None:
     [job] = jobs_of([compose("wandb.mode=online", "eval.every=100")])
-    profiled = density._copy(job, 1).config
+    profiled = density._copy(job, 1, 10**12).config
     assert (profiled.wandb.mode, profiled.eval.every) == ("off", None)
 
 
