@@ -17,7 +17,7 @@ from gmijax.runs.folder import META, RunPaths, write_json
 from gmijax.runs.resume import CheckpointMeta
 from gmijax.supervise.backends import open_backend
 from gmijax.supervise.job_kinds import JobKind
-from gmijax.supervise.launch import Launch
+from gmijax.supervise.start_gmi import Launch
 from gmijax.supervise.supervisor import Supervisor
 
 CHECKOUT = Path(errors.__file__).parents[1]

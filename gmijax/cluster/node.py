@@ -37,8 +37,8 @@ from gmijax.machine.snapshot import Machine, detect_machine
 from gmijax.supervise.backends import open_backend
 from gmijax.supervise.gmi_process import GmiProcess
 from gmijax.supervise.heartbeat import Heartbeat
-from gmijax.supervise.launch import Launch, StartGmi, start_gmi
 from gmijax.supervise.run_gmis import drop_unreadable, shared_blocks
+from gmijax.supervise.start_gmi import Launch, StartGmi, start_gmi
 from gmijax.version import __version__, versions_of
 
 COMPARED: Final = ("jax", "jaxlib", "numpy", "mujoco", "mujoco-mjx", "flax", "optax", "pyzmq")

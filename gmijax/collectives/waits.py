@@ -1,9 +1,8 @@
-"""How a process waits for another one through shared memory: a fence, a pause, a watched wait."""
+"""How a process waits for another one: with pauses, and with an eye on whether that one lives."""
 
 from __future__ import annotations
 
 import os
-import threading
 import time
 from collections.abc import Callable
 from typing import TypeVar
@@ -20,28 +19,6 @@ Processes that do equal work arrive within microseconds of each other if every o
 
 MIN_SLEEP_S, MAX_SLEEP_S = 10e-6, 100e-6
 LIVENESS_PERIOD_S = 0.2
-
-
-class Fence:
-    """Keeps the processor from moving memory accesses across a call of it.
-
-    A release followed by an acquire of one lock does that on all processors of interest; the
-    lock is private and never contended, so that this costs 0.1 us.
-    """
-
-    def __init__(self) -> None:
-        self._lock = threading.Lock()
-        self._lock.acquire()
-
-    def __call__(self) -> None:
-        """All accesses before this one are done before those after it."""
-        self._lock.release()
-        self._lock.acquire()
-
-
-def fence() -> None:
-    """The same in one call, for threads that may come at once, where 0.4 us do not count."""
-    Fence()()
 
 
 def wait_until(

@@ -9,7 +9,7 @@ from __future__ import annotations
 import importlib.util
 from typing import Final
 
-from gmijax.config import ExportConfig, PlanConfig, ReduceConfig
+from gmijax.config import ExportConfig, PlanConfig, ReduceConfig, Timeouts
 from gmijax.control.console import doing, open_console
 from gmijax.deploy.playing import open_run, output_folder
 from gmijax.errors import ConfigError
@@ -17,7 +17,6 @@ from gmijax.machine.snapshot import detect_machine
 from gmijax.partition.planner import make_plan
 from gmijax.runs.folder import ExportPaths, RunPaths
 from gmijax.supervise.job_kinds import JobKind
-from gmijax.supervise.launch import Timeouts
 from gmijax.supervise.run_gmis import Launch, run_gmis
 
 _TIMEOUTS: Final = Timeouts(

@@ -15,7 +15,7 @@ from typing import Any, Final, TypeVar
 from rich.console import Console
 from rich.table import Table
 
-from gmijax.config import EnvConfig, ExportConfig, PlanConfig, PlayConfig, ReduceConfig
+from gmijax.config import EnvConfig, ExportConfig, PlanConfig, PlayConfig, ReduceConfig, Timeouts
 from gmijax.config.schema import to_dict
 from gmijax.control.console import doing, open_console
 from gmijax.deploy.pictures import film, has_brax, write_page
@@ -41,7 +41,6 @@ from gmijax.runs.resume import (
 from gmijax.sim import source
 from gmijax.sim.registry import require_env
 from gmijax.supervise.job_kinds import JobKind
-from gmijax.supervise.launch import Timeouts
 from gmijax.supervise.run_gmis import Launch, run_gmis
 
 C = TypeVar("C", PlayConfig, ExportConfig)

@@ -25,7 +25,7 @@ from gmijax.runs.folder import RunPaths, read_json, write_json
 from gmijax.supervise.backends import Backend, open_backend
 from gmijax.supervise.child import ENV_EXCHANGE_FD
 from gmijax.supervise.job_kinds import JobKind
-from gmijax.supervise.launch import Launch, program_cache
+from gmijax.supervise.start_gmi import Launch, program_cache
 from gmijax.supervise.supervisor import Supervisor
 from gmijax.supervise.watched_gmi import GmiStatus
 

@@ -20,7 +20,7 @@ from gmijax.supervise.failures import (
     first_line,
     is_consequence,
 )
-from gmijax.supervise.launch import Launch, StartGmi, start_gmi
+from gmijax.supervise.start_gmi import Launch, StartGmi, start_gmi
 from gmijax.supervise.watched_gmi import GmiStatus, WatchedGmi
 
 _POLL_S = 0.05

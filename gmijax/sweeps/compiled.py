@@ -6,7 +6,7 @@ import hashlib
 from contextlib import suppress
 from pathlib import Path
 
-from gmijax.supervise.launch import program_cache
+from gmijax.supervise.start_gmi import program_cache
 from gmijax.version import __version__, versions_of
 
 _PACKAGES = ("jax", "jaxlib", "mujoco", "mujoco-mjx")

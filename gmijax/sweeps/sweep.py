@@ -21,7 +21,6 @@ from gmijax.errors import ConfigError, JobInterrupted, SweepFailed
 from gmijax.machine.snapshot import detect_machine
 from gmijax.runs.folder import RUNS, create_run, given_run, locked, read_json, write_json
 from gmijax.supervise.run_gmis import StopSignals, stop_signals
-from gmijax.sweeps.density import with_density
 from gmijax.sweeps.host import LocalHost
 from gmijax.sweeps.jobs import (
     Job,
@@ -32,6 +31,7 @@ from gmijax.sweeps.jobs import (
     state_of,
     why_not_comparable,
 )
+from gmijax.sweeps.jobs_per_gpu import with_jobs_per_gpu
 from gmijax.sweeps.nodes import Host, nodes_of
 from gmijax.sweeps.packs import require_packable
 from gmijax.sweeps.places import Places, Site, places_of
@@ -136,7 +136,7 @@ def _run(
         with stop_signals() as signals, ExitStack() as held:
             _lease(hosts, _sites(settings, request, hosts), console, signals)
             scratch = paths.root if hosts[0].name else None
-            settings = with_density(settings, request.jobs, hosts, console, signals, scratch)
+            settings = with_jobs_per_gpu(settings, request.jobs, hosts, console, signals, scratch)
             sites = _sites(settings, request, hosts)
             _announce(console, sites, request, jobs)
             for number, (host, site) in enumerate(zip(hosts, sites, strict=True)):

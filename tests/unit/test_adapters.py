@@ -20,7 +20,7 @@ from training_jobs import POINT_TASK
 from gmijax.cli.compose import compose
 from gmijax.errors import ConfigError
 from gmijax.learning.learner import make_learner
-from gmijax.sim.adapters.theirs import adapt, observation
+from gmijax.sim.adapters.brax_interface import adapt, observation
 from gmijax.sim.adapters.to_brax import BraxEnv
 from gmijax.sim.registry import make_env
 from gmijax.sim.wrappers import env_keys, time_limit, training_env

@@ -26,7 +26,7 @@ from gmijax.machine.snapshot import Machine
 from gmijax.runs.folder import ExportPaths, RunPaths
 from gmijax.sim.physics import PhysicsState
 from gmijax.sim.tasks import ball_balance
-from gmijax.supervise.launch import environment_of
+from gmijax.supervise.start_gmi import environment_of
 from gmijax.workers.exporter import names_of
 
 EXAMPLE = Path(__file__).parents[2] / "examples" / "exported_policy.py"

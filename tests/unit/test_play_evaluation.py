@@ -18,7 +18,7 @@ from gmijax.machine.nvidia import Gpu
 from gmijax.machine.snapshot import Machine
 from gmijax.runs.folder import EXIT_NO_GL, META, PlayPaths, RunPaths, write_json
 from gmijax.runs.resume import CheckpointMeta
-from gmijax.supervise.launch import environment_of
+from gmijax.supervise.start_gmi import environment_of
 
 
 def config_of(*overrides: str) -> PlayConfig:

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from gmijax.collectives.messages.registers import create_registers, open_registers
-from gmijax.collectives.waits import Fence
+from gmijax.collectives.shared_memory import Fence
 
 
 @pytest.fixture

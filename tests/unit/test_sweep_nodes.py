@@ -24,7 +24,7 @@ from gmijax.errors import BackendUnavailable, ConfigError, NodeLost
 from gmijax.machine.snapshot import Machine
 from gmijax.runs.folder import RunPaths, read_json, write_json
 from gmijax.supervise.run_gmis import StopSignals
-from gmijax.sweeps import density, scheduler
+from gmijax.sweeps import jobs_per_gpu, scheduler
 from gmijax.sweeps.children import Seen
 from gmijax.sweeps.host import LocalHost, Order, Start, Started
 from gmijax.sweeps.jobs import Job, SweepPaths, jobs_of
@@ -230,13 +230,13 @@ def test_a_profile_of_a_job_with_two_gpus_has_both(
         def is_over(self) -> bool:
             return True
 
-    monkeypatch.setattr(density, "_Window", Window)
+    monkeypatch.setattr(jobs_per_gpu, "_Window", Window)
     monkeypatch.setattr(FakeHost, "open", lambda *_: None)
     host = FakeHost("a")
     host.machine = machine(2, mps_control=Path("/usr/bin/nvidia-cuda-mps-control"))
-    bench = density._Bench(host, tmp_path, StopSignals())
+    bench = jobs_per_gpu._Bench(host, tmp_path, StopSignals())
     for settings in (SweepConfig(), SweepConfig(gpus=(1, 0))):
-        found = density._profile(settings, jobs(1, "plan.gpus=2")[0], 1, bench)
+        found = jobs_per_gpu._profile(settings, jobs(1, "plan.gpus=2")[0], 1, bench)
         assert isinstance(found, Measured)
     assert host.started == [0, 0]
 

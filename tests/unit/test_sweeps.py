@@ -20,9 +20,8 @@ from gmijax.errors import ConfigError
 from gmijax.runs.folder import is_locked, locked, write_json
 from gmijax.supervise.failures import may_be_anothers
 from gmijax.supervise.run_gmis import StopSignals
-from gmijax.sweeps import density
+from gmijax.sweeps import jobs_per_gpu
 from gmijax.sweeps.compiled import CompiledPrograms
-from gmijax.sweeps.density import with_density
 from gmijax.sweeps.host import LocalHost
 from gmijax.sweeps.jobs import (
     Job,
@@ -35,6 +34,7 @@ from gmijax.sweeps.jobs import (
     state_of,
     why_not_comparable,
 )
+from gmijax.sweeps.jobs_per_gpu import with_jobs_per_gpu
 from gmijax.sweeps.packs import most_together, require_packable
 from gmijax.sweeps.places import Place, Places, Site, places_of
 from gmijax.sweeps.report import ranking, spread
@@ -411,16 +411,18 @@ def test_jobs_at_a_time_by_profiling(
         rate = rates[len(done) - 1]
         return NotRunnable("no memory") if rate is None else Measured(rate / count, 100.0, 0.1)
 
-    monkeypatch.setattr(density, "_profile", profile)
+    monkeypatch.setattr(jobs_per_gpu, "_profile", profile)
     jobs = jobs_of([compose(f"seed={seed}") for seed in range(num_jobs)])
     hosts = [LocalHost(machine(1, mps_control=Path("/usr/bin/nvidia-cuda-mps-control")))]
     for _ in range(2):  # The second time by the store.
-        found = with_density(SweepConfig(), jobs, hosts, open_console(show=False), StopSignals())
+        found = with_jobs_per_gpu(
+            SweepConfig(), jobs, hosts, open_console(show=False), StopSignals()
+        )
         assert found.jobs_per_gpu == best
     assert done == profiled
     done.clear()  # Larger jobs are others.
     large = jobs_of([compose(f"seed={n}", "plan.gmis_per_gpu=2") for n in range(num_jobs)])
-    with_density(SweepConfig(), large, hosts, open_console(show=False), StopSignals())
+    with_jobs_per_gpu(SweepConfig(), large, hosts, open_console(show=False), StopSignals())
     assert done == profiled
 
 
@@ -437,16 +439,16 @@ def test_jobs_at_a_time_by_profiling(
 def test_no_more_at_a_time_than_let_all_jobs_run(
     settings: dict[str, Any], override: str, expected: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(density, "_best", lambda *_: 32)
+    monkeypatch.setattr(jobs_per_gpu, "_best", lambda *_: 32)
     jobs = jobs_of([compose(f"seed={seed}", override) for seed in range(3)])
     hosts, quiet = [LocalHost(machine(2))], open_console(show=False)
-    found = with_density(SweepConfig(**settings), jobs, hosts, quiet, StopSignals())
+    found = with_jobs_per_gpu(SweepConfig(**settings), jobs, hosts, quiet, StopSignals())
     assert found.jobs_per_gpu == expected
 
 
 def test_a_profile_of_a_job_is_not_sent_anywhere() -> None:
     [job] = jobs_of([compose("wandb.mode=online", "eval.every=100")])
-    profiled = density._copy(job, 1, 10**12).config
+    profiled = jobs_per_gpu._copy(job, 1, 10**12).config
     assert (profiled.wandb.mode, profiled.eval.every) == ("off", None)
 
 
@@ -455,17 +457,17 @@ def test_without_a_gpu_a_job_has_two_cores() -> None:
     large = LocalHost(machine(0, cpu_cores=tuple(range(64))))
     quiet = open_console(show=False)
     for hosts in ([small], [large, small]):
-        found = with_density(SweepConfig(), jobs, hosts, quiet, StopSignals())
+        found = with_jobs_per_gpu(SweepConfig(), jobs, hosts, quiet, StopSignals())
         assert found.jobs_per_gpu == 4
     asked = SweepConfig(jobs_per_gpu=7)
-    assert with_density(asked, jobs, [small], quiet, StopSignals()) == asked
+    assert with_jobs_per_gpu(asked, jobs, [small], quiet, StopSignals()) == asked
 
 
 def test_a_profile_counts_while_all_jobs_train(monkeypatch: pytest.MonkeyPatch) -> None:
     now_s = 0.0
-    monkeypatch.setattr(density.time, "monotonic", lambda: now_s)
+    monkeypatch.setattr(jobs_per_gpu.time, "monotonic", lambda: now_s)
     jobs = jobs_of([compose(f"seed={seed}") for seed in range(2)])
-    window = density._Window(jobs, 60.0)
+    window = jobs_per_gpu._Window(jobs, 60.0)
     while not window.is_over():
         now_s += 0.5
         jobs[0].progress.env_steps += 50
@@ -474,7 +476,7 @@ def test_a_profile_counts_while_all_jobs_train(monkeypatch: pytest.MonkeyPatch) 
     assert window.steps_per_s == pytest.approx(200.0)
     assert window.iteration_s == pytest.approx(0.5)
     assert 14.0 < now_s < 18.0
-    late = density._Window(jobs, 5.0)
+    late = jobs_per_gpu._Window(jobs, 5.0)
     now_s += 6.0
     assert late.is_over()
     assert late.steps_per_s is None

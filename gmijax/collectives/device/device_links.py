@@ -24,8 +24,8 @@ from gmijax.collectives.host.host_exchange import HostExchange
 from gmijax.collectives.host.host_links import HostLinks
 from gmijax.collectives.nodes.node_exchange import NodeExchange
 from gmijax.collectives.program import Exchange, ProgramPeers
+from gmijax.collectives.shared_memory import Fence
 from gmijax.collectives.strategies import Groups, Stage
-from gmijax.collectives.waits import Fence
 from gmijax.partition.layout import Layout
 from gmijax.partition.reduction import leaders
 

@@ -13,7 +13,8 @@ import numpy.typing as npt
 from gmijax.collectives.device.device_memory import TICKET_BYTES, NewMemory
 from gmijax.collectives.host.host_exchange import HostExchange
 from gmijax.collectives.nodes.node_exchange import NodeExchange
-from gmijax.collectives.waits import fence, wait_until
+from gmijax.collectives.shared_memory import fence
+from gmijax.collectives.waits import wait_until
 from gmijax.errors import DeviceMemoryUnavailable, PeerLost
 
 if TYPE_CHECKING:

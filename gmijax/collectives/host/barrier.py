@@ -15,7 +15,8 @@ from contextlib import contextmanager
 
 from gmijax.collectives.host.failure_detector import FailureDetector
 from gmijax.collectives.host.shared_block import SharedBlock
-from gmijax.collectives.waits import LIVENESS_PERIOD_S, Fence, wait_until
+from gmijax.collectives.shared_memory import Fence
+from gmijax.collectives.waits import LIVENESS_PERIOD_S, wait_until
 from gmijax.errors import CollectiveError, CudaError
 
 OPERATIONS = ("sum", "gather", "broadcast", "all_gather", "step")

@@ -12,8 +12,7 @@ from collections.abc import Callable
 from typing import NoReturn
 
 from gmijax.collectives.host.shared_block import SharedBlock
-from gmijax.collectives.shared_memory import process_of
-from gmijax.collectives.waits import fence
+from gmijax.collectives.shared_memory import fence, process_of
 from gmijax.errors import CollectiveTimeout, PeerLost
 
 SILENCE_S = 0.7

@@ -38,7 +38,8 @@ from gmijax.collectives.messages.pipe_format import (
     seal_message,
     split_parts,
 )
-from gmijax.collectives.waits import Fence, wait_until
+from gmijax.collectives.shared_memory import Fence
+from gmijax.collectives.waits import wait_until
 from gmijax.errors import CollectiveError, CollectiveTimeout, GmijaxError, PipeClosed
 
 Message: TypeAlias = tuple[Bytes, ...]

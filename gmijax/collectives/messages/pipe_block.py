@@ -24,8 +24,7 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from gmijax.collectives.shared_memory import create_file, process_of, take_line, whole_pages
-from gmijax.collectives.waits import fence
+from gmijax.collectives.shared_memory import create_file, fence, process_of, take_line, whole_pages
 from gmijax.errors import CollectiveError, GmijaxError, PeerLost, PipeClosed
 
 LINE_BYTES = 64

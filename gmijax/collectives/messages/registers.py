@@ -2,7 +2,7 @@
 
 A register holds the newest value only. It is a seqlock with two places, written in turn: a reader
 that copies one is disturbed only if the writer begins to publish for the second time meanwhile,
-which a counter tells it. On the order of memory accesses: `gmijax.collectives.waits.Fence`.
+which a counter tells it. The order of memory accesses is kept by `Fence`.
 
     fd = create_registers()                             # the controller
     registers = open_registers(fd, [64, 4096])          # every process, with the same sizes
@@ -21,8 +21,7 @@ from typing import Any, NamedTuple, Protocol
 import numpy as np
 import numpy.typing as npt
 
-from gmijax.collectives.shared_memory import create_file, map_file, whole_pages
-from gmijax.collectives.waits import Fence
+from gmijax.collectives.shared_memory import Fence, create_file, map_file, whole_pages
 
 LINE = np.dtype(
     [

@@ -9,7 +9,7 @@ from brax.envs.base import Env as BraxEnv
 
 from gmijax.config.schema import suggestion
 from gmijax.errors import ConfigError
-from gmijax.sim.adapters.theirs import adapt, require_jax
+from gmijax.sim.adapters.brax_interface import adapt, require_jax
 from gmijax.sim.interface import Env
 
 EPISODE_LENGTH = 1000
@@ -37,7 +37,7 @@ def make(name: str, *, impl: str = "auto", max_envs: int | None = None) -> Env:
 
 
 def from_brax(theirs: BraxEnv, *, name: str, episode_length: int = EPISODE_LENGTH) -> Env:
-    """An environment of Brax, without its wrappers, as one of ours; see `theirs.adapt`."""
+    """An environment of Brax, without its wrappers, as one of ours; see `brax_interface.adapt`."""
     system: Any = getattr(theirs, "sys", None)
     return adapt(
         theirs,

@@ -12,8 +12,8 @@ import subprocess
 from typing import Any
 
 from gmijax.errors import ConfigError
+from gmijax.sim.adapters.brax_interface import adapt, require_jax
 from gmijax.sim.adapters.checks import attempt
-from gmijax.sim.adapters.theirs import adapt, require_jax
 from gmijax.sim.interface import Env
 
 
@@ -49,7 +49,7 @@ def _load(registry: Any, name: str, config: Any) -> Any:
 
 
 def from_playground(theirs: Any, *, name: str, episode_length: int = 1000) -> Env:
-    """An `MjxEnv`, without wrappers, as one of ours; see `theirs.adapt`."""
+    """An `MjxEnv`, without wrappers, as one of ours; see `brax_interface.adapt`."""
     return adapt(
         theirs,
         name=name,

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from brax.envs.base import Env, State
 
 from gmijax.sim import interface
-from gmijax.sim.adapters.theirs import POLICY_OBS, PRIVILEGED_OBS
+from gmijax.sim.adapters.brax_interface import POLICY_OBS, PRIVILEGED_OBS
 from gmijax.types import Array, PyTree
 
 _KEY = "gmijax_key"

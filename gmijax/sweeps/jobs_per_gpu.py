@@ -41,7 +41,7 @@ _CORES_OF_A_JOB = 2
 _FOREVER = 10**12
 
 
-def with_density(
+def with_jobs_per_gpu(
     settings: SweepConfig,
     jobs: Sequence[Job],
     hosts: Sequence[Host],
