@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from sweep_neighbours import Neighbours
 from training_jobs import POINT, STEPS, start, train, wait_until
 
 SWEEP = (
@@ -73,3 +74,13 @@ def test_a_sweep_that_is_killed_goes_on_and_a_job_fails_alone(tmp_path: Path) ->
     other = train(*SWEEP, "seed=0,2", cwd=tmp_path, command="sweep")
     assert other.returncode == 2
     assert "holds another sweep; give the same lists, or another folder" in other.stderr
+
+
+@pytest.mark.timeout(900)
+def test_jobs_do_as_alone_beside_one_that_is_killed(tmp_path: Path) -> None:
+    neighbours = Neighbours(tmp_path, *POINT, f"num_timesteps={400 * STEPS}")
+    alone = neighbours.alone()
+    assert len(alone) == 400
+    states, lines = neighbours.beside_a_killed_job()
+    assert states == ["completed", "completed", "failed", "completed"]
+    assert lines == alone
