@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from functools import partial
 from pathlib import Path
@@ -154,12 +154,9 @@ class _Job:
         progress = ConsoleProgress(self._console, new, config.num_timesteps)
 
         def record(status: str, plan: Plan) -> None:
-            add_event(run.events, status)
             wall_s = time.monotonic() - started_s
             restarts = [restart._asdict() for restart in self._attempts.restarts]
-            summary = train_summary(config, plan, run, status, wall_s, restarts)
-            write_json(run.summary, summary)
-            draw_returns(run.metrics, run.returns_png, f"{config.env.label}, {config.algo.name}")
+            record_end(config, plan, run, status, wall_s, restarts)
 
         write_json(run.plan, self._plan.to_dict())
         # Recorded first, so that the summary is sent too, and filmed before all is sent.
@@ -209,6 +206,20 @@ class _Job:
         for note in notes:
             add_event(self._run.events, "plan", what=note)
             self._console.print(note)
+
+
+def record_end(
+    config: TrainConfig,
+    plan: Plan,
+    run: RunPaths,
+    status: str,
+    wall_s: float,
+    restarts: Sequence[Mapping[str, Any]],
+) -> None:
+    """Leaves in the run folder how a training has ended; arguments as of `train_summary`."""
+    add_event(run.events, status)
+    write_json(run.summary, train_summary(config, plan, run, status, wall_s, restarts))
+    draw_returns(run.metrics, run.returns_png, f"{config.env.label}, {config.algo.name}")
 
 
 def started_from(config: TrainConfig, checkpoint: Path | None) -> TrainConfig:

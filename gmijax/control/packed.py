@@ -20,13 +20,13 @@ from gmijax.config import TrainConfig
 from gmijax.config.schema import to_dict
 from gmijax.control.console import ConsoleProgress, announce, open_console
 from gmijax.control.decide import decide
-from gmijax.control.job import opened, started_from
+from gmijax.control.job import opened, record_end, started_from
 from gmijax.control.restarts import clear_unfinished, keep_logs
 from gmijax.control.start_point import find_start_point
-from gmijax.control.summary import train_outcome, train_summary
+from gmijax.control.summary import train_outcome
 from gmijax.partition.plan import Plan
 from gmijax.runs.folder import RunPaths, add_event, read_json, write_json
-from gmijax.runs.history import MetricsReader, draw_returns
+from gmijax.runs.history import MetricsReader
 from gmijax.supervise.job_kinds import MEMBERS_VARIABLE, PACKED
 from gmijax.supervise.run_gmis import Launch, recorded, run_gmis
 
@@ -105,11 +105,8 @@ def _prepare(member: _Member, plan: Plan, gmis: RunPaths) -> None:
 def _record(members: Sequence[_Member], started_s: float, status: str, plan: Plan) -> None:
     wall_s = time.monotonic() - started_s
     for config, run in members:
-        own = _status_of(run, status)
-        add_event(run.events, own)
         write_json(run.plan, plan.to_dict())
-        write_json(run.summary, train_summary(config, plan, run, own, wall_s, []))
-        draw_returns(run.metrics, run.returns_png, f"{config.env.label}, {config.algo.name}")
+        record_end(config, plan, run, _status_of(run, status), wall_s, [])
 
 
 def _status_of(run: RunPaths, status: str) -> str:
