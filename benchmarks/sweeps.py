@@ -59,6 +59,8 @@ class Benchmark:
                 for tasks in dict.fromkeys(way.tasks for way in ways):
                     each = str(1 + tasks.count(","))  # Tasks compile beside each other.
                     self._sweep(Way(each, "auto", tasks), 0, cache, ("num_timesteps=1",))
+                for way in (way for way in ways if way.how == "vmap"):
+                    self._sweep(way, 0, cache, ("num_timesteps=1",))
             for repeat in range(self._arguments.repeats):
                 for way in ways:
                     if self._has_time(way):
@@ -93,7 +95,9 @@ class Benchmark:
     ) -> dict[str, Any]:
         """One sweep as a whole command."""
         tasks = way.tasks.split(",") if way.tasks else []
-        seeds = max(1, self._arguments.jobs // max(1, len(tasks))) if not more else 1
+        seeds = max(1, self._arguments.jobs // max(1, len(tasks)))
+        if more and way.how != "vmap":  # A program depends on how many jobs it is made for.
+            seeds = 1
         with tempfile.TemporaryDirectory() as scratch:
             folder = Path(scratch) / "sweep"
             command = [sys.executable, "-m", "gmijax.sweep", "run.measure_throughput=false"]
