@@ -99,7 +99,8 @@ class Benchmark:
         return [
             *(sys.executable, "-m", "gmijax.sweep", "run.measure_throughput=false"),
             *(*arguments.overrides, *row.overrides, f"seed=range({arguments.seeds})"),
-            *(f"sweep.jobs_per_gpu={arguments.at_once}", f"run.dir={folder}"),
+            *(f"sweep.jobs_per_gpu={arguments.at_once}", f"sweep.pack={arguments.pack}"),
+            f"run.dir={folder}",
         ]
 
     def _add(self, name: str, folder: Path, own: Mapping[str, Any]) -> None:
@@ -214,6 +215,9 @@ def _arguments() -> argparse.Namespace:
     )
     parser.add_argument("--seeds", type=int, default=20, help="trainings of a row")
     parser.add_argument("--at-once", default="8", help="trainings at once on every GPU, or auto")
+    parser.add_argument(
+        "--pack", default="gmi", choices=["gmi", "auto"], help="sweep.pack: auto is one program"
+    )
     parser.add_argument("--deadline-s", type=float, help="seconds for all of it")
     parser.add_argument(
         "--runs", type=Path, help="keep the sweeps here, and go on with those that are there"
