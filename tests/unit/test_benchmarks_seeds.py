@@ -19,6 +19,7 @@ from gmijax.errors import ConfigError
 def arguments(folder: Path, **changes: Any) -> argparse.Namespace:
     own: dict[str, Any] = {
         **{"overrides": ["env=ball_balance"], "row": [], "seeds": 4, "at_once": "2"},
+        "pack": "gmi",
         **{"deadline_s": None, "runs": folder / "runs", "analyse": [], "out": folder / "results"},
     }
     return argparse.Namespace(**{**own, **changes})
