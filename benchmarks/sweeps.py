@@ -36,6 +36,20 @@ class Way(NamedTuple):
     how: str  # `plan.backend`, or `vmap`: those that can be are one program.
     tasks: str  # Tasks of a mix, with commas; empty: that of the command line.
 
+    @property
+    def is_one_program(self) -> bool:
+        """Whether jobs share a program, which depends on how many they are."""
+        return self.how == "vmap"
+
+    @property
+    def compiling(self) -> Way:
+        """A way that compiles the same programs: a job of each task beside the others."""
+        return (
+            self
+            if self.is_one_program
+            else Way(str(1 + self.tasks.count(",")), "auto", self.tasks)
+        )
+
     def __str__(self) -> str:
         return f"{self.at_once} at once, {self.how}{', ' * bool(self.tasks)}{self.tasks}"
 
@@ -56,10 +70,7 @@ class Benchmark:
         with tempfile.TemporaryDirectory() as scratch:
             cache = Path(scratch) / "xla" if self._arguments.warm else None
             if cache is not None:
-                for tasks in dict.fromkeys(way.tasks for way in ways):
-                    each = str(1 + tasks.count(","))  # Tasks compile beside each other.
-                    self._sweep(Way(each, "auto", tasks), 0, cache, ("num_timesteps=1",))
-                for way in (way for way in ways if way.how == "vmap"):
+                for way in dict.fromkeys(way.compiling for way in ways):
                     self._sweep(way, 0, cache, ("num_timesteps=1",))
             for repeat in range(self._arguments.repeats):
                 for way in ways:
@@ -95,9 +106,8 @@ class Benchmark:
     ) -> dict[str, Any]:
         """One sweep as a whole command."""
         tasks = way.tasks.split(",") if way.tasks else []
-        seeds = max(1, self._arguments.jobs // max(1, len(tasks)))
-        if more and way.how != "vmap":  # A program depends on how many jobs it is made for.
-            seeds = 1
+        is_one_each = more and not way.is_one_program
+        seeds = 1 if is_one_each else max(1, self._arguments.jobs // max(1, len(tasks)))
         with tempfile.TemporaryDirectory() as scratch:
             folder = Path(scratch) / "sweep"
             command = [sys.executable, "-m", "gmijax.sweep", "run.measure_throughput=false"]
@@ -107,8 +117,7 @@ class Benchmark:
                 *more,
             ]
             command += [f"seed=range({seeds})", f"sweep.jobs_per_gpu={way.at_once}"]
-            together = way.how == "vmap"
-            command.append("sweep.pack=vmap" if together else f"plan.backend={way.how}")
+            command.append("sweep.pack=vmap" if way.is_one_program else f"plan.backend={way.how}")
             command += ["sweep.gpus=1", f"run.dir={folder}"]
             started_s = time.monotonic()
             variables = {"JAX_COMPILATION_CACHE_DIR": str(cache or Path(scratch) / "xla")}
