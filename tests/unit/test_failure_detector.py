@@ -4,24 +4,30 @@ from __future__ import annotations
 
 import os
 import threading
-from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 
 import pytest
 
 from gmijax.collectives.host.barrier import Barrier
-from gmijax.collectives.host.shared_block import SharedBlock, attach, create_exchange
+from gmijax.collectives.host.shared_block import LANES, SharedBlock, attach, create_exchange
 from gmijax.errors import CollectiveTimeout, CudaError, PeerLost
 
 NEVER = threading.Event()
 
 
 @pytest.fixture
-def blocks() -> Iterator[list[SharedBlock]]:
-    """The block as three ranks see it."""
+def blocks() -> list[SharedBlock]:
+    """The first lane of a block, as each of three ranks sees it."""
+    return lanes_of_three_ranks()[0]
+
+
+def lanes_of_three_ranks() -> list[list[SharedBlock]]:
+    """A block as each rank sees it, by lane."""
     fd = create_exchange()
-    yield [attach(fd, rank, 3, 10) for rank in range(3)]
-    os.close(fd)
+    try:
+        return [[attach(fd, rank, 3, 10, lane) for rank in range(3)] for lane in range(LANES)]
+    finally:
+        os.close(fd)
 
 
 def barriers_of(blocks: list[SharedBlock], *timeouts_s: float) -> list[Barrier]:
@@ -31,8 +37,8 @@ def barriers_of(blocks: list[SharedBlock], *timeouts_s: float) -> list[Barrier]:
 
 def end(blocks: list[SharedBlock], rank: int, blamed: int | None = None) -> None:
     """Makes `rank` look as if its process had ended, having given up for `blamed`."""
-    line = blocks[rank].lines[rank]
-    line["pid"], line["blamed"] = 0, 0 if blamed is None else blamed + 1
+    blocks[rank].lines["pid"][rank] = 0
+    blocks[rank].blamed[rank] = 0 if blamed is None else blamed + 1
 
 
 def test_who_waits_too_is_not_named(blocks: list[SharedBlock]) -> None:
@@ -63,7 +69,21 @@ def test_the_dead_are_named_and_not_those_who_gave_up_for_them(
     with pytest.raises(PeerLost) as lost:
         first.watch(NEVER)
     assert lost.value.peer == 2
-    assert blocks[0].lines["blamed"][0] == 3
+    assert blocks[0].blamed[0] == 3
+
+
+def test_who_gave_up_in_another_lane_is_not_named() -> None:
+    outside, inside = lanes_of_three_ranks()
+    first = barriers_of(outside, 3.0, 3.0, 3.0)[0]
+    second = barriers_of(inside, 3.0, 3.0, 3.0)[1]
+    for lane in (outside, inside):
+        lane[2].lines["pid"][2] = 0
+    with pytest.raises(PeerLost):
+        second.watch(NEVER)
+    outside[1].lines["pid"][1] = 0
+    with pytest.raises(PeerLost) as lost:
+        first.watch(NEVER)
+    assert lost.value.peer == 2
 
 
 def test_one_that_gave_up_for_a_stuck_rank_points_at_it(blocks: list[SharedBlock]) -> None:
@@ -88,7 +108,7 @@ def test_a_failed_transfer_is_blamed_on_the_dead(
     with pytest.raises(PeerLost) as lost, first.explained():
         raise error
     assert lost.value.peer == 2
-    end(blocks, 0, blamed=blocks[0].lines["blamed"][0] - 1)  # It ends for that reason.
+    end(blocks, 0, blamed=blocks[0].blamed[0] - 1)  # It ends for that reason.
     with pytest.raises(PeerLost) as lost:
         second.watch(NEVER)
     assert lost.value.peer == 2

@@ -2,7 +2,7 @@
 
 A rank that waits raises its `beats` now and then. So at a timeout a peer that only waits too is
 not mistaken for one that is stuck, wherever each of them waits. A rank that gives up notes whom
-it waited for, so that its own end is not taken for the cause.
+it waited for, so that its own end is not taken for the cause, also by those who wait elsewhere.
 """
 
 from __future__ import annotations
@@ -70,7 +70,7 @@ class FailureDetector:
         gone = [peer for peer in missing() if peer in gone]
         if not gone:
             return
-        blamed = self._block.lines["blamed"].item
+        blamed = self._block.blamed.item
         for peer in gone:
             if not blamed(peer):
                 self._raise_lost(peer)
@@ -95,12 +95,12 @@ class FailureDetector:
                 self._heard[peer] = beats, now_s
 
     def _raise_lost(self, peer: int) -> NoReturn:
-        self._block.lines["blamed"][self._block.rank] = peer + 1
+        self._block.blamed[self._block.rank] = peer + 1
         own, other = (self._block.ids[rank] for rank in (self._block.rank, peer))
         raise PeerLost(own, other, self._operation, self._step)
 
     def _raise_timeout(self, missing: list[int]) -> NoReturn:
-        self._block.lines["blamed"][self._block.rank] = missing[0] + 1
+        self._block.blamed[self._block.rank] = missing[0] + 1
         waited_s = min(round(self._waited_s(), 2), self._timeout_s)
         own, *others = (self._block.ids[rank] for rank in (self._block.rank, *missing))
         raise CollectiveTimeout(own, tuple(others), self._operation, self._step, waited_s)
