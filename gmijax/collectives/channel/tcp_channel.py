@@ -34,7 +34,7 @@ MAX_ANSWER_BYTES: Final = 4096
 """Longest part that an agent gets: a header, and what ZeroMQ's handshake takes."""
 
 _FAREWELL_S: Final = 5.0
-"""How long an agent that closes waits for its trainer to take what is on the way."""
+"""How long an agent that closes waits for a trainer that takes nothing of what is on the way."""
 
 
 def max_part_bytes(capacity_bytes: int) -> int:
@@ -150,9 +150,11 @@ class RemoteWriter(_End):
         self._tell(GOODBYE, self._sequence)
         # An answer to a socket that is closed resets the connection, and what the network has
         # not delivered by then is lost.
-        deadline_s = time.monotonic() + _FAREWELL_S
+        left, deadline_s = self._on_the_way, time.monotonic() + _FAREWELL_S
         while self.load_bytes() and not self._has_left and self._connection.is_up():
-            if time.monotonic() > deadline_s:
+            if self._on_the_way < left:
+                left, deadline_s = self._on_the_way, time.monotonic() + _FAREWELL_S
+            elif time.monotonic() > deadline_s:
                 break
             time.sleep(1e-3)
         self._connection.close()
