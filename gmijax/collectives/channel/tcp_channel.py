@@ -9,6 +9,7 @@ killed agent had not yet put on the wire is lost, and nothing else.
 
 from __future__ import annotations
 
+import math
 import struct
 import time
 from collections import deque
@@ -150,10 +151,10 @@ class RemoteWriter(_End):
         self._tell(GOODBYE, self._sequence)
         # An answer to a socket that is closed resets the connection, and what the network has
         # not delivered by then is lost.
-        left, deadline_s = self._on_the_way, time.monotonic() + _FAREWELL_S
-        while self.load_bytes() and not self._has_left and self._connection.is_up():
-            if self._on_the_way < left:
-                left, deadline_s = self._on_the_way, time.monotonic() + _FAREWELL_S
+        left = deadline_s = math.inf
+        while (load := self.load_bytes()) and not self._has_left and self._connection.is_up():
+            if load < left:
+                left, deadline_s = load, time.monotonic() + _FAREWELL_S
             elif time.monotonic() > deadline_s:
                 break
             time.sleep(1e-3)
