@@ -37,7 +37,7 @@ def pose(
 
 
 def view(
-    pose: task.FrankaCabinetPose, drawer_m: float = 0.0, scale_m: float = SETTINGS.distance_scale_m
+    pose: task.FrankaCabinetPose, drawer_m: float = 0.0, scale_m: float = 1.0
 ) -> task.FrankaCabinetView:
     action = jnp.zeros(task.ACTION_SIZE)
     return task.FrankaCabinetView(pose, jnp.array(drawer_m), action, SETTINGS.open_m, scale_m)

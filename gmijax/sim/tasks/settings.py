@@ -148,14 +148,14 @@ class FrankaCabinetSettings(TaskSettings):
     )
     distance_scale_m: float = doc(
         "distance from the handle at which `distance` is a quarter of the most, m",
-        default=1.0,
+        default=0.3,
         positive=True,
     )
     behind_reward: float = doc(
         "reward of a step with a finger through the drawer's front", default=-1.0
     )
     behind_keeps: float = doc(
-        "share of the other terms that such a step keeps", default=0.0, low=0, high=1
+        "share of the other terms that such a step keeps", default=1.0, low=0, high=1
     )
 
     def __post_init__(self) -> None:

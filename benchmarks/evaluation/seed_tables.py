@@ -1,0 +1,44 @@
+"""How many seeds of a setting succeed."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from types import MappingProxyType
+from typing import Any
+
+from benchmarks.evaluation.figures import markdown, origin, shown
+from benchmarks.records import RESULTS, read_calls
+
+PATTERN = "seeds-*-nvidia-h200.json"
+HEAD = (
+    "task | call: | changed | successes: | interval of 95 %: | p: | reward of a step in the end:"
+)
+
+
+def seeds() -> list[str]:
+    """Successes of every setting whose seeds all ran, by task and call."""
+    rows, calls = [], []
+    for path in sorted(RESULTS.glob(PATTERN)):
+        for number, call in enumerate(read_calls(path), start=1):
+            task = call.results["task"]
+            finished = [row for row in call.results["rows"] if not row["unfinished"]]
+            rows += [_cells(task, number, row) for row in finished]
+            link = f"[`{path.name}`](../benchmarks/results/{path.name})"
+            calls.append(f"- {link}, call {number}: {origin(call)}")
+    return [*markdown(HEAD, rows), "", *calls]
+
+
+def _cells(task: str, number: int, row: Mapping[str, Any]) -> list[str]:
+    changed = ", ".join(f"`{override}`" for override in row["overrides"]) or "nothing"
+    low, high = row["wilson"]
+    least, median, most = row["final"]
+    return [
+        *(f"`{task}`", str(number), changed, f"{row['successes']} of {row['seeds']}"),
+        f"{low:.0%} to {high:.0%}",
+        shown(row["p_successes"], ".2g") if "p_successes" in row else "",
+        f"{median:.2f} ({least:.2f} to {most:.2f})",
+    ]
+
+
+SEED_TABLES: MappingProxyType[str, Callable[[], list[str]]] = MappingProxyType({"seeds": seeds})
+"""By the name that documents use: `<!-- table: NAME -->`."""
