@@ -153,21 +153,45 @@ def test_an_agent_stays_until_its_trainer_has_taken_all(address: str) -> None:
     reader.close()
 
 
-@pytest.mark.parametrize("is_there", [True, False])
-def test_an_agent_does_not_wait_for_a_trainer_that_is_not_there(
-    is_there: bool, address: str, monkeypatch: pytest.MonkeyPatch
+def test_an_agent_that_closes_before_its_trainer_listens_loses_nothing(
+    address: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("gmijax.collectives.channel.tcp_connection._LINGER_MS", 0)
+    writer = RemoteWriter(address, 0, 1, CAPACITY)
+    send(writer, 1, 2, 3)
+    closing = threading.Thread(target=writer.close)
+    closing.start()
+    closing.join(0.3)
+    reader = RemoteReader(address, 1, 0, CAPACITY)
+    assert receive(reader, 3) == [1, 2, 3]
+    closing.join(60.0)
+    assert not closing.is_alive()
+    reader.close()
+
+
+def test_an_agent_does_not_wait_for_a_trainer_that_has_left(
+    address: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("gmijax.collectives.channel.tcp_channel._FAREWELL_S", 60.0)
-    reader = RemoteReader(address, 1, 0, CAPACITY) if is_there else None
-    writer = RemoteWriter(address, 0, 1, CAPACITY)
+    reader, writer = RemoteReader(address, 1, 0, CAPACITY), RemoteWriter(address, 0, 1, CAPACITY)
     send(writer, 1)
-    if reader is not None:
-        assert receive(reader, 1) == [1]
-        send(writer, 2)
-        reader.close()
+    assert receive(reader, 1) == [1]
+    send(writer, 2)
+    reader.close()
     started_s = time.monotonic()
     writer.close()
-    assert time.monotonic() - started_s < 30.0  # Less than for one that is.
+    assert time.monotonic() - started_s < 30.0  # Less than for one that is there.
+
+
+def test_an_agent_does_not_wait_for_ever_for_a_trainer_that_never_comes(
+    address: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("gmijax.collectives.channel.tcp_channel._FAREWELL_S", 0.1)
+    monkeypatch.setattr("gmijax.collectives.channel.tcp_connection._LINGER_MS", 0)
+    writer = RemoteWriter(address, 0, 1, CAPACITY)
+    send(writer, 1)
+    writer.close()
+    assert writer._connection.is_closed
 
 
 def test_an_address_that_cannot_be_is_named() -> None:

@@ -35,7 +35,7 @@ MAX_ANSWER_BYTES: Final = 4096
 """Longest part that an agent gets: a header, and what ZeroMQ's handshake takes."""
 
 _FAREWELL_S: Final = 5.0
-"""How long an agent that closes waits for a trainer that takes nothing of what is on the way."""
+"""How long an agent that closes waits for a trainer that is not there yet, or takes nothing."""
 
 
 def max_part_bytes(capacity_bytes: int) -> int:
@@ -150,9 +150,9 @@ class RemoteWriter(_End):
             return
         self._tell(GOODBYE, self._sequence)
         # An answer to a socket that is closed resets the connection, and what the network has
-        # not delivered by then is lost.
+        # not delivered by then is lost. A trainer that starts more slowly may still come.
         left = deadline_s = math.inf
-        while (load := self.load_bytes()) and not self._has_left and self._connection.is_up():
+        while (load := self.load_bytes()) and not self._has_left and not self._connection.is_cut():
             if load < left:
                 left, deadline_s = load, time.monotonic() + _FAREWELL_S
             elif time.monotonic() > deadline_s:
