@@ -8,6 +8,8 @@ once.
 from __future__ import annotations
 
 import dataclasses
+import errno
+import os
 import re
 import shutil
 import time
@@ -30,6 +32,9 @@ from gmijax.supervise.watched_gmi import GmiStatus
 
 _LASTING = ("NonFiniteError", "ParameterMismatch", "SelfCheckFailed")
 """Errors of a GMI that the next attempt would meet too."""
+
+_DISK_IS_FULL = os.strerror(errno.ENOSPC)
+"""In the message of whatever could not be written."""
 
 _FRAME = re.compile(r'^ +File "(.+)", line (\d+), in (.+)$', re.MULTILINE)
 
@@ -160,6 +165,8 @@ def why_not_again(error: GmiFailed, last: GmiFailed | None) -> str | None:
         return "the last attempt left something behind, or nothing can be started"
     if error.error is not None and error.error.type in _LASTING:
         return f"{error.error.type} would come again"
+    if error.error is not None and _DISK_IS_FULL in error.error.message:
+        return "the disk is full"
     if last is not None and error.error is not None and last.error is not None:
         same = (error.iteration, error.error.type, _frames(error.error.traceback))
         if same == (last.iteration, last.error.type, _frames(last.error.traceback)):

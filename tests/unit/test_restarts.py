@@ -151,6 +151,12 @@ def test_what_would_come_again_ends_the_job(job: Job, kind: str):
     assert not job.attempts.restarts
 
 
+def test_a_full_disk_ends_the_job(job: Job):
+    said = ReportedError("OSError", "[Errno 28] No space left on device: 'metrics.jsonl'", "")
+    full = GmiFailed(0, "exit code 1", iteration=3, error=said)
+    assert "the disk is full" in job.gives_up(job.dies(why=full), fine)
+
+
 def test_the_same_error_at_the_same_iteration_ends_the_job(job: Job):
     assert "same iteration (3) twice" in job.gives_up(*[job.dies(why=error())] * 2, fine)
     assert len(job.attempts.restarts) == 1
