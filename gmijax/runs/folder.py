@@ -177,7 +177,8 @@ def require_new_run(run_dir: str | None, name: str | None) -> None:
     root = given_run(run_dir, name)
     if root is not None and os.path.lexists(root):
         key = "run.dir" if run_dir else "run.name"
-        raise ConfigError(f"{key}={root}: the run folder exists already")
+        what = "the run folder exists already" if root.is_dir() else "not a folder"
+        raise ConfigError(f"{key}={root}: {what}")
 
 
 @contextmanager
