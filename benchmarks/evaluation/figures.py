@@ -114,7 +114,12 @@ def _source_of(file: str) -> str:
     call = call_of(file)
     if call is None:
         return f"- `{file}.json`: {NOT_MEASURED}"
-    return f"- [`{file}.json`](../benchmarks/results/{file}.json): {origin(call)}"
+    return f"- {link(f'{file}.json')}: {origin(call)}"
+
+
+def link(file_name: str) -> str:
+    """A file of results, as a page in `docs/` points at it."""
+    return f"[`{file_name}`](../benchmarks/results/{file_name})"
 
 
 def origin(call: Call) -> str:

@@ -10,7 +10,7 @@ from benchmarks.evaluation.figures import bounds, markdown, shown
 from benchmarks.evaluation.other_tables import OTHER_TABLES
 from benchmarks.evaluation.peer_tables import peers
 from benchmarks.evaluation.plots import mps_gains
-from benchmarks.evaluation.seed_tables import SEED_TABLES
+from benchmarks.evaluation.seed_tables import seeds
 from benchmarks.evaluation.sweep_tables import first_gains, sweeps
 from benchmarks.evaluation.tables import (
     TRAINING_TABLES,
@@ -60,9 +60,9 @@ TABLES: MappingProxyType[str, Callable[[], list[str]]] = MappingProxyType(
         "claims": claims,
         "peers": peers,
         "sweeps": sweeps,
+        "seeds": seeds,
         **TRAINING_TABLES,
         **OTHER_TABLES,
-        **SEED_TABLES,
     }
 )
 """By the name that documents use: `<!-- table: NAME -->`."""

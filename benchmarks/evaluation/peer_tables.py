@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from benchmarks.evaluation.figures import NOT_MEASURED, markdown, origin
+from benchmarks.evaluation.figures import NOT_MEASURED, link, markdown, origin
 from benchmarks.peers.comparisons import COMPARISONS
 from benchmarks.peers.table import HEAD, measured, row
 from benchmarks.records import RESULTS, read_calls
@@ -22,6 +22,6 @@ def peers() -> list[str]:
         rows.append(row(call.results if call else {}, name))
         if call:
             origins.setdefault(origin(call), []).append(name)
-    link = f"[`{path.name}`](../benchmarks/results/{path.name})"
-    lines = [f"- {link}, {'; '.join(names)}: {made}" for made, names in origins.items()]
+    file = link(path.name)
+    lines = [f"- {file}, {'; '.join(names)}: {made}" for made, names in origins.items()]
     return [*markdown(HEAD, rows), "", *lines]

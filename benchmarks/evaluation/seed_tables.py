@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from types import MappingProxyType
+from collections.abc import Mapping
 from typing import Any
 
-from benchmarks.evaluation.figures import markdown, origin, shown
+from benchmarks.evaluation.figures import link, markdown, origin, shown
 from benchmarks.records import RESULTS, read_calls
 
 PATTERN = "seeds-*-nvidia-h200.json"
@@ -23,8 +22,7 @@ def seeds() -> list[str]:
             task = call.results["task"]
             finished = [row for row in call.results["rows"] if not row["unfinished"]]
             rows += [_cells(task, number, row) for row in finished]
-            link = f"[`{path.name}`](../benchmarks/results/{path.name})"
-            calls.append(f"- {link}, call {number}: {origin(call)}")
+            calls.append(f"- {link(path.name)}, call {number}: {origin(call)}")
     return [*markdown(HEAD, rows), "", *calls]
 
 
@@ -38,7 +36,3 @@ def _cells(task: str, number: int, row: Mapping[str, Any]) -> list[str]:
         shown(row["p_successes"], ".2g") if "p_successes" in row else "",
         f"{median:.2f} ({least:.2f} to {most:.2f})",
     ]
-
-
-SEED_TABLES: MappingProxyType[str, Callable[[], list[str]]] = MappingProxyType({"seeds": seeds})
-"""By the name that documents use: `<!-- table: NAME -->`."""

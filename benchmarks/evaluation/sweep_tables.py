@@ -9,6 +9,7 @@ from benchmarks.evaluation.figures import (
     NOT_MEASURED,
     Figure,
     figure,
+    link,
     markdown,
     origin,
     shown,
@@ -101,8 +102,7 @@ def sweeps() -> list[str]:
             ]
             for way, rate in sorted(same.rates().items(), key=lambda row: _order(row[0]))
         ]
-        file = f"[`{SWEEPS.name}`](../benchmarks/results/{SWEEPS.name})"
-        calls = [f"- {file}: {origin(call)}" for call in same.calls]
+        calls = [f"- {link(SWEEPS.name)}: {origin(call)}" for call in same.calls]
         lines += [what, "", *markdown(HEAD, rows), "", *calls, ""]
     return lines[:-1] or [
         f"Trainings per hour of a sweep: {NOT_MEASURED} (`python -m benchmarks.sweeps`)."

@@ -163,12 +163,14 @@ def why_not_again(error: GmiFailed, last: GmiFailed | None) -> str | None:
     """Why a job that failed should not be tried again, None if it should."""
     if error.is_final:
         return "the last attempt left something behind, or nothing can be started"
-    if error.error is not None and error.error.type in _LASTING:
-        return f"{error.error.type} would come again"
-    if error.error is not None and _DISK_IS_FULL in error.error.message:
+    if (told := error.error) is None:
+        return None
+    if told.type in _LASTING:
+        return f"{told.type} would come again"
+    if _DISK_IS_FULL in told.message:
         return "the disk is full"
-    if last is not None and error.error is not None and last.error is not None:
-        same = (error.iteration, error.error.type, _frames(error.error.traceback))
+    if last is not None and last.error is not None:
+        same = (error.iteration, told.type, _frames(told.traceback))
         if same == (last.iteration, last.error.type, _frames(last.error.traceback)):
             return f"the same error at the same iteration ({error.iteration}) twice"
     return None
