@@ -1,7 +1,7 @@
 """The seam to MuJoCo: MJX in JAX or in Warp, behind one `load` and one `step`.
 
 What is carried between steps is small: only what MuJoCo needs to integrate on. A whole `mjx.Data`
-is rebuilt from it inside every step, so that an automatic reset selects between a few short
+is rebuilt from it inside every control step, so that an automatic reset selects between a few short
 vectors, checkpoints stay small, and XLA sees which intermediate results nobody reads.
 """
 
@@ -11,7 +11,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 from importlib import resources
-from typing import NamedTuple, TypeAlias, TypeVar
+from typing import NamedTuple, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -49,10 +49,6 @@ class PhysicsState(NamedTuple):
     qvel: Array
     qacc_warmstart: Array
     overflow: Array | None = None
-
-
-_Carried: TypeAlias = tuple[PhysicsState, T, Array | None]
-"""State, reading and overflows of a physics step."""
 
 
 @dataclass(frozen=True)
@@ -120,32 +116,25 @@ class Physics:
           integration, `qpos` and `qvel` to the moment after it.
         """
 
-        def substep(carried: _Carried[T], _: None) -> tuple[_Carried[T], None]:
-            state, bits = carried[0], carried[2]
-            data = self.blank().replace(
-                ctrl=ctrl,
-                qpos=state.qpos,
-                qvel=state.qvel,
-                qacc_warmstart=state.qacc_warmstart,
-            )
-            data = mjx.step(model, data)
-            bits = None if bits is None else bits | data._impl.overflow
-            state = PhysicsState(data.qpos, data.qvel, data.qacc_warmstart)
-            return (state, read(data), bits), None
+        def substep(data: mjx.Data, _: None) -> tuple[mjx.Data, None]:
+            return mjx.step(model, data), None
 
-        # Readings are carried, not stacked: of what Warp writes a GPU stacks nothing but zeros
-        # (docs/decisions/sim-warp-readings.md). One traced physics step, though only the last
-        # one's are wanted: a second copy takes half as long again to compile, and was not faster.
-        nothing = self.blank()
-        bits = None if self.impl == "jax" else nothing._impl.overflow
-        unread, bits = jax.tree.map(partial(_own_zeros, state.qpos), (read(nothing), bits))
-        (moved, reading, bits), _ = jax.lax.scan(
-            substep, (state._replace(overflow=None), unread, bits), length=self.substeps
+        # One traced physics step: a second copy takes half as long again to compile, and was not
+        # faster. All of its data is carried, not stacked: of what Warp writes a GPU stacks nothing
+        # but zeros (docs/decisions/sim-warp-readings.md).
+        data = self.blank().replace(
+            ctrl=ctrl,
+            qpos=state.qpos,
+            qvel=state.qvel,
+            qacc_warmstart=state.qacc_warmstart,
         )
-        if bits is not None:
+        data, _ = jax.lax.scan(substep, data, length=self.substeps)
+        overflow = None
+        if self.impl == "warp":
             masks = jnp.array([_CONTACT_BITS, _CONSTRAINT_BITS])
-            moved = moved._replace(overflow=(bits & masks) != 0)
-        return moved, reading
+            overflow = (data._impl.overflow & masks) != 0
+        moved = PhysicsState(data.qpos, data.qvel, data.qacc_warmstart, overflow)
+        return moved, read(data)
 
     def env(
         self,
@@ -221,17 +210,6 @@ def from_mj_model(
     max_envs = max_envs or WARP_MAX_ENVS
     blank = _warp_blank(mj_model, max_envs, warp_sizes or _jax_sizes(mj_model))
     return Physics(chosen, mj_model, model, jax_model, blank, substeps, max_envs)
-
-
-def _own_zeros(qpos: Array, like: Array) -> Array:
-    """Zeros like `like`, which `jax.vmap` takes for the world's own as `qpos` is.
-
-    If a scan begins with what all worlds share and goes on with what is a world's own, `jax.vmap`
-    goes through its body twice: half of the time that it takes to trace a step of physics. XLA
-    drops the choice.
-    """
-    zeros = jnp.zeros_like(like)
-    return jax.lax.select(jnp.full(like.shape, qpos[0] > 0), zeros, zeros)
 
 
 def _put(mj_model: mujoco.MjModel, impl: Impl) -> mjx.Model:
