@@ -7,16 +7,15 @@ vectors, checkpoints stay small, and XLA sees which intermediate results nobody 
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
-from functools import partial
 from importlib import resources
-from typing import NamedTuple, TypeVar
+from typing import TYPE_CHECKING, NamedTuple, TypeVar
 
 import jax
 import jax.numpy as jnp
 import mujoco
-import numpy as np
 from mujoco import mjx
 
 from gmijax.errors import ConfigError
@@ -24,7 +23,12 @@ from gmijax.sim.impl import ON_GPU, Impl, WarpSizes, choose_impl
 from gmijax.sim.interface import OVERFLOWS, Env, EnvSpec, EnvState
 from gmijax.types import Array, PRNGKey, PyTree
 
+if TYPE_CHECKING:
+    from gmijax.sim.warp_step import WarpStep
+
 T = TypeVar("T")
+
+_REMEMBERED = ("qpos", "qvel", "qacc_warmstart")
 
 WARP_MAX_ENVS = 16384
 """Environments that Warp's contact buffer has room for unless `make_env` is told a number."""
@@ -59,19 +63,17 @@ class Physics:
       impl: which MJX implementation runs.
       mj_model: the model as MuJoCo in C has it.
       model: the model on the device; pass it, or a randomised copy, to `step`.
-      jax_model: the same for MJX-JAX, whichever implementation runs; `poses` computes with it.
-      blank: builds the `mjx.Data` of one world at the model's reference position.
       substeps: physics steps per control step.
       max_envs: most worlds that may be stepped at once, None for no limit.
+      warp: the control step of MuJoCo Warp; None with MJX-JAX.
     """
 
     impl: Impl
     mj_model: mujoco.MjModel
     model: mjx.Model
-    jax_model: mjx.Model
-    blank: Callable[[], mjx.Data]
     substeps: int
     max_envs: int | None = None
+    warp: WarpStep | None = None
 
     @property
     def control_dt_s(self) -> float:
@@ -97,8 +99,8 @@ class Physics:
           Positions [nbody, 3] in metres and unit quaternions [nbody, 4], both in the world, as
           `xpos` and `xquat` of the data that `step` lets its caller read.
         """
-        data = mjx.make_data(self.jax_model).replace(qpos=qpos)
-        data = mjx.kinematics(self.jax_model, data)
+        data = mjx.make_data(self.model).replace(qpos=qpos)
+        data = mjx.kinematics(self.model, data)
         return data.xpos, data.xquat
 
     def step(
@@ -115,26 +117,26 @@ class Physics:
           `sensordata`, forces and body poses in it belong to the moment before that step's
           integration, `qpos` and `qvel` to the moment after it.
         """
+        if self.warp is not None:
+            before = {name: getattr(state, name) for name in _REMEMBERED}
+            after, reading = self.warp(model, before, ctrl, read)
+            masks = jnp.array([_CONTACT_BITS, _CONSTRAINT_BITS])
+            overflow = (after.pop("overflow") & masks) != 0
+            return PhysicsState(**after, overflow=overflow), reading
 
         def substep(data: mjx.Data, _: None) -> tuple[mjx.Data, None]:
             return mjx.step(model, data), None
 
         # One traced physics step: a second copy takes half as long again to compile, and was not
-        # faster. All of its data is carried, not stacked: of what Warp writes a GPU stacks nothing
-        # but zeros (docs/decisions/sim-warp-readings.md).
-        data = self.blank().replace(
+        # faster.
+        data = mjx.make_data(self.model).replace(
             ctrl=ctrl,
             qpos=state.qpos,
             qvel=state.qvel,
             qacc_warmstart=state.qacc_warmstart,
         )
         data, _ = jax.lax.scan(substep, data, length=self.substeps)
-        overflow = None
-        if self.impl == "warp":
-            masks = jnp.array([_CONTACT_BITS, _CONSTRAINT_BITS])
-            overflow = (data._impl.overflow & masks) != 0
-        moved = PhysicsState(data.qpos, data.qvel, data.qacc_warmstart, overflow)
-        return moved, read(data)
+        return PhysicsState(data.qpos, data.qvel, data.qacc_warmstart), read(data)
 
     def env(
         self,
@@ -199,22 +201,19 @@ def from_mj_model(
             "allowed are actuators without memory (motor, position, velocity)"
         )
     chosen, _ = choose_impl(impl, jax.default_backend())
-    jax_model = _put(mj_model, "jax")
+    with _refusing(mj_model, "jax"):
+        model = mjx.put_model(mj_model, impl="jax")
     if chosen == "jax":
-        blank = partial(mjx.make_data, jax_model)
-        return Physics(chosen, mj_model, jax_model, jax_model, blank, substeps)
-    model = _put(mj_model, chosen)
-    # Warp prints a line per world and step when the solver meets its iteration limit. Here it is
-    # meant to meet it, and printing that costs more time than simulating.
-    model = model.tree_replace({"opt._impl.warn_overflow": 0})
-    max_envs = max_envs or WARP_MAX_ENVS
-    blank = _warp_blank(mj_model, max_envs, warp_sizes or _jax_sizes(mj_model))
-    return Physics(chosen, mj_model, model, jax_model, blank, substeps, max_envs)
+        return Physics(chosen, mj_model, model, substeps)
+    with _refusing(mj_model, chosen):
+        warp = _warp_step(mj_model, substeps, warp_sizes or _jax_sizes(mj_model))
+    return Physics(chosen, mj_model, model, substeps, max_envs or WARP_MAX_ENVS, warp)
 
 
-def _put(mj_model: mujoco.MjModel, impl: Impl) -> mjx.Model:
+@contextmanager
+def _refusing(mj_model: mujoco.MjModel, impl: Impl) -> Iterator[None]:
     try:
-        return mjx.put_model(mj_model, impl=impl)
+        yield
     except (NotImplementedError, ValueError) as error:
         name = mj_model.names.split(b"\0")[0].decode()  # The model's own name comes first.
         raise ConfigError(
@@ -229,32 +228,7 @@ def _jax_sizes(mj_model: mujoco.MjModel) -> WarpSizes:
     return WarpSizes(bounds.ncon, bounds.nefc)
 
 
-def _warp_blank(
-    mj_model: mujoco.MjModel, max_envs: int, sizes: WarpSizes
-) -> Callable[[], mjx.Data]:
-    # Contacts are shared by all worlds, rows are per world.
-    template = mjx.make_data(
-        mj_model,
-        impl="warp",
-        naconmax=max(sizes.contacts_per_env, 1) * max_envs,
-        njmax=max(sizes.constraints_per_env, 1),
-    )
-    leaves, tree = jax.tree.flatten(template)
-    # Zeros are made where they are used: as constants of the compiled program they would be
-    # tens of megabytes.
-    kept = [
-        # Copied to the host first: `np.any` asks jax, which makes a program for every shape.
-        leaf if np.asarray(leaf).any() else jax.ShapeDtypeStruct(leaf.shape, leaf.dtype)
-        for leaf in leaves
-    ]
+def _warp_step(mj_model: mujoco.MjModel, substeps: int, sizes: WarpSizes) -> WarpStep:
+    from gmijax.sim.warp_step import WarpStep  # Only here is the package warp needed.
 
-    def blank() -> mjx.Data:
-        fresh = [
-            jnp.zeros(leaf.shape, leaf.dtype) if isinstance(leaf, jax.ShapeDtypeStruct) else leaf
-            for leaf in kept
-        ]
-        # Warp writes into these buffers. Without the barrier XLA takes zeros of one shape for
-        # one value, and on a GPU gives them one buffer (docs/decisions/sim-warp-blank-data.md).
-        return jax.tree.unflatten(tree, jax.lax.optimization_barrier(fresh))
-
-    return blank
+    return WarpStep.load(mj_model, substeps, sizes)
