@@ -4,7 +4,8 @@
 simulator and the whole iteration, each as a program of its own in this process, and traces some
 rounds of each. It says how long a round takes, how many kernels it has, how long none of them
 runs, which ones take longest, and how long the products of its matrices and its bytes would take
-at the rates that this device reaches by itself. Adds a call to
+at the rates that this device reaches by itself. With MJX-Warp it also says how long MuJoCo Warp
+takes for the simulator's physics without JAX. Adds a call to
 `benchmarks/results/profile-<task>-<device>.json`.
 """
 
@@ -22,6 +23,7 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax.profiler import ProfileData
 
 from benchmarks.records import RESULTS, ResultsFile, file_name
@@ -30,6 +32,8 @@ from gmijax import compose
 from gmijax.config import PpoConfig, TrainConfig
 from gmijax.learning.learner import learner_shapes
 from gmijax.sim.impl import choose_impl
+from gmijax.sim.physics import load
+from gmijax.sim.warp.worlds import OVERFLOW, STATE, Worlds, lay_out
 
 WARM_UP, TIMED, TRACED = 2, 10, 2
 """Rounds of a stage: first, then timed, then traced."""
@@ -92,6 +96,8 @@ def main() -> int:
     for stage in stages(config, impl):
         if stage.name in arguments.stages:
             row = profile(stage, rates, products(stage.name, config, stage))
+            if stage.name == "simulator" and impl == "warp":
+                row["warp_alone_ms"] = warp_alone_ms(config, stage)
             with file.changing() as results:
                 results["stages"][stage.name] = row
             _print(stage.name, row, arguments.top)
@@ -181,6 +187,38 @@ def profile(stage: Stage, rates: Rates, flop: float) -> dict[str, Any]:
     }
 
 
+def warp_alone_ms(config: TrainConfig, stage: Stage) -> float:
+    """The physics of a round by MuJoCo Warp alone: its kernels in a CUDA graph, over and over.
+
+    As its own speed test has it, no episode ends. Worlds begin as episodes do, with random
+    controls that stay.
+    """
+    import warp
+
+    assert isinstance(config.algo, PpoConfig)
+    name, count = str(config.env.name), config.envs_per_gmi
+    physics = load(name, impl="warp", substeps=1)
+    mj_model, first = physics.mj_model, stage.state.env.physics
+    assert physics.warp is not None
+    low, high = mj_model.actuator_ctrlrange.T
+    ctrl = np.random.default_rng(0).uniform(low, high, (count, mj_model.nu))
+    arrays = {"ctrl": ctrl, **{key: np.asarray(getattr(first, key)) for key in STATE}}
+    given = tuple((key, array.shape) for key, array in arrays.items())
+    layout = lay_out(given, (*given[1:], (OVERFLOW, (count,))))
+    substeps = round(stage.spec.control_dt_s / mj_model.opt.timestep)
+    worlds = Worlds(mj_model, substeps, physics.warp.sizes, layout)
+    parts = [np.pad(arrays[key].ravel(), (0, piece.gap)) for key, piece in layout.given.items()]
+    buffer = warp.array(np.concatenate(parts).astype(np.float32))
+    worlds.step(buffer, warp.zeros(layout.size - layout.first_taken))
+    for rounds in (WARM_UP, TIMED):
+        warp.synchronize()
+        started = time.perf_counter()
+        for _ in range(rounds * config.algo.unroll_length):
+            worlds.advance()
+        warp.synchronize()
+    return (time.perf_counter() - started) / TIMED * 1e3
+
+
 def read_kernels(folder: Path) -> Iterable[Kernel]:
     """All kernels in a trace; on a CPU the instructions that hold no others."""
     (path,) = folder.rglob("*.xplane.pb")
@@ -227,10 +265,11 @@ def by_time(kernels: Iterable[Kernel], names: dict[str, str]) -> list[dict[str, 
 
 
 def _print(name: str, row: dict[str, Any], top: int) -> None:
+    alone = f"; MuJoCo Warp alone {row['warp_alone_ms']:.3f} ms" if "warp_alone_ms" in row else ""
     sys.stdout.write(
         f"{name}: {row['round_ms']:.3f} ms a round, {row['kernels']:.0f} kernels, busy "
         f"{row['busy_ms']:.3f} ms; products alone {row['products_ms']:.3f} ms, in bfloat16 "
-        f"{row['products_bfloat16_ms']:.3f} ms\n"
+        f"{row['products_bfloat16_ms']:.3f} ms{alone}\n"
     )
     for kernel in row["longest"][:top]:
         sys.stdout.write(

@@ -86,8 +86,7 @@ class Env(NamedTuple):
       step: `(model, state, action [A]) -> EnvState`, one control step of one world.
       mj_model: the `mujoco.MjModel` behind `model`, for rendering and for the C oracle.
       qpos: `EnvState -> [nq]`, joint positions for rendering.
-      max_envs: most worlds that may be stepped at once, None for no limit. Worlds of MJX-Warp
-        share a contact buffer of fixed size, and lose contacts when it is full.
+      max_envs: most worlds that may be stepped at once, None for no limit.
       overflow: `EnvState -> [2]` bool, which of `OVERFLOWS` were too small in the last step; None
         if nothing can overflow.
       model_axes: `in_axes` of `model` for `vmap` over worlds: None if they share it, else a tree

@@ -1,8 +1,8 @@
 """The seam to MuJoCo: MJX in JAX or in Warp, behind one `load` and one `step`.
 
-What is carried between steps is small: only what MuJoCo needs to integrate on. A whole `mjx.Data`
-is rebuilt from it inside every control step, so that an automatic reset selects between a few short
-vectors, checkpoints stay small, and XLA sees which intermediate results nobody reads.
+What is carried between steps is small: only what MuJoCo needs to integrate on. MJX-JAX rebuilds a
+whole `mjx.Data` from it inside every control step, and MJX-Warp keeps its own, so an automatic
+reset selects between a few short vectors, and checkpoints stay small.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from importlib import resources
-from typing import TYPE_CHECKING, NamedTuple, TypeVar
+from typing import NamedTuple, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -21,17 +21,11 @@ from mujoco import mjx
 from gmijax.errors import ConfigError
 from gmijax.sim.impl import ON_GPU, Impl, WarpSizes, choose_impl
 from gmijax.sim.interface import OVERFLOWS, Env, EnvSpec, EnvState
+from gmijax.sim.warp.step import WarpStep
+from gmijax.sim.warp.worlds import OVERFLOW, STATE
 from gmijax.types import Array, PRNGKey, PyTree
 
-if TYPE_CHECKING:
-    from gmijax.sim.warp_step import WarpStep
-
 T = TypeVar("T")
-
-_REMEMBERED = ("qpos", "qvel", "qacc_warmstart")
-
-WARP_MAX_ENVS = 16384
-"""Environments that Warp's contact buffer has room for unless `make_env` is told a number."""
 
 # Bits of MJX-Warp's `overflow`: what did not fit, and limits of iterations, which are meant.
 _CONSTRAINT_BITS, _ITERATION_BITS, _ALL_BITS = 0x003, 0x600, 0xFFF
@@ -118,10 +112,10 @@ class Physics:
           integration, `qpos` and `qvel` to the moment after it.
         """
         if self.warp is not None:
-            before = {name: getattr(state, name) for name in _REMEMBERED}
+            before = {name: getattr(state, name) for name in STATE}
             after, reading = self.warp(model, before, ctrl, read)
             masks = jnp.array([_CONTACT_BITS, _CONSTRAINT_BITS])
-            overflow = (after.pop("overflow") & masks) != 0
+            overflow = (after.pop(OVERFLOW) & masks) != 0
             return PhysicsState(**after, overflow=overflow), reading
 
         def substep(data: mjx.Data, _: None) -> tuple[mjx.Data, None]:
@@ -164,8 +158,7 @@ def load(asset: str, *, impl: str, substeps: int, max_envs: int | None = None) -
       asset: name of the file without `.xml`.
       impl: `auto`, `jax` or `warp`.
       substeps: physics steps per control step.
-      max_envs: upper bound of worlds simulated at once; only Warp, whose contact buffer is
-        shared by all worlds, needs it. None: `WARP_MAX_ENVS`.
+      max_envs: upper bound of worlds simulated at once, None for no limit.
 
     Raises:
       ConfigError: `impl` cannot be had, or the model needs state that is not carried.
@@ -206,8 +199,8 @@ def from_mj_model(
     if chosen == "jax":
         return Physics(chosen, mj_model, model, substeps)
     with _refusing(mj_model, chosen):
-        warp = _warp_step(mj_model, substeps, warp_sizes or _jax_sizes(mj_model))
-    return Physics(chosen, mj_model, model, substeps, max_envs or WARP_MAX_ENVS, warp)
+        warp = WarpStep.load(mj_model, substeps, warp_sizes or _jax_sizes(mj_model))
+    return Physics(chosen, mj_model, model, substeps, max_envs, warp)
 
 
 @contextmanager
@@ -226,9 +219,3 @@ def _jax_sizes(mj_model: mujoco.MjModel) -> WarpSizes:
     """MJX-JAX's sizes: a row for every contact and constraint that can ever be."""
     bounds = mjx.make_data(mj_model, impl="jax")._impl
     return WarpSizes(bounds.ncon, bounds.nefc)
-
-
-def _warp_step(mj_model: mujoco.MjModel, substeps: int, sizes: WarpSizes) -> WarpStep:
-    from gmijax.sim.warp_step import WarpStep  # Only here is the package warp needed.
-
-    return WarpStep.load(mj_model, substeps, sizes)

@@ -145,8 +145,8 @@ def make_env(
       suite: whose task: `gmijax`, `brax`, `playground` or `custom`.
       impl: MJX implementation, `auto`, `jax` or `warp`.
       episode_length: steps after which an episode is truncated; None: the task's own.
-      max_envs: upper bound of environments stepped at once; only `warp` needs it, to size the
-        contact buffer that they share. None: `gmijax.sim.physics.WARP_MAX_ENVS`.
+      max_envs: upper bound of environments stepped at once, for tasks of users that need one;
+        None for no limit.
       source_sha256: digest of a custom task's file, which is not executed with another one.
       rewards: weights of terms of the reward by name, in place of the task's own.
       settings: numbers of the task by name (`gmijax.sim.tasks.settings`), as `rewards`.

@@ -220,3 +220,18 @@ def test_bits_of_overflow_are_those_of_warp():
     assert physics._CONSTRAINT_BITS == kinds.NEFC | kinds.NJMAX_NNZ
     assert physics._ITERATION_BITS == kinds.ITERATIONS | kinds.LS_ITERATIONS
     assert physics._ALL_BITS == kinds.ALL
+
+
+def test_worlds_of_several_jobs_move_as_those_of_one():
+    pytest.importorskip("warp")
+    mj_model = mujoco.MjModel.from_xml_string(PENDULUM_OVER_FLOOR)
+    world = from_mj_model(mj_model, impl="warp", substeps=2)
+    rng = np.random.default_rng(0)
+    qpos, qvel, ctrl = (jnp.array(rng.uniform(-1, 1, (2, 3, 1)), jnp.float32) for _ in range(3))
+    start = jax.vmap(jax.vmap(world.start))(qpos, qvel)
+    step = jax.vmap(world.step, in_axes=(None, 0, 0))
+    together = jax.jit(jax.vmap(step, in_axes=(None, 0, 0)))(world.model, start, ctrl)
+    for job in range(2):
+        alone = jax.jit(step)(world.model, jax.tree.map(lambda x, j=job: x[j], start), ctrl[job])
+        for own, all_of_them in zip(*map(jax.tree.leaves, (alone, together)), strict=True):
+            np.testing.assert_allclose(own, all_of_them[job], atol=1e-5)

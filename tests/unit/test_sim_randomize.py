@@ -19,6 +19,7 @@ from gmijax.errors import ConfigError
 from gmijax.sim import episode, physics, randomize, wrappers
 from gmijax.sim.interface import Env, EnvSpec, EnvState
 from gmijax.sim.randomize import make_worlds, randomized, randomized_by_episode
+from gmijax.sim.warp.worlds import MODEL_LEAVES
 from gmijax.sim.wrappers import env_keys, training_env
 
 NUM_ENVS = 4
@@ -97,6 +98,10 @@ def drawn(env: Env, seed: int = 0, first_env: int = 0, num_envs: int = NUM_ENVS,
 @pytest.fixture(scope="module")
 def env() -> Env:
     return sledge()
+
+
+def test_mujoco_warp_is_told_of_all_that_is_drawn(env: Env):
+    assert {leaf.removeprefix(".") for leaf in drawn(env)} <= set(MODEL_LEAVES)
 
 
 def test_only_what_is_drawn_and_the_constants_of_such_a_model_are_per_world(env: Env):

@@ -1,0 +1,178 @@
+"""A control step of MuJoCo Warp as one call of a JAX program.
+
+JAX hands over what drives the worlds and what they must remember, as one array, and gets back what
+has become of it and what the task reads. All else of MuJoCo's data stays with Warp
+(docs/decisions/sim-warp-step.md).
+"""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any, TypeAlias, TypeVar
+
+import jax
+import jax.numpy as jnp
+import mujoco
+from mujoco.mjx import warp as mjx_warp
+
+from gmijax.sim.impl import WarpSizes
+from gmijax.sim.warp.worlds import MODEL_LEAVES, OVERFLOW, STATE, Layout, Piece, Worlds, lay_out
+from gmijax.types import Array, PyTree
+
+T = TypeVar("T")
+
+Arrays: TypeAlias = dict[str, Array]
+
+
+@dataclass(frozen=True, eq=False)
+class WarpStep:
+    """Control steps of a model, for any number of worlds.
+
+    Attributes:
+      mj_model: the model.
+      substeps: physics steps of a control step.
+      sizes: of the buffers for contacts and constraints.
+      shapes: of the arrays that MuJoCo Warp's data have for each world, by name.
+    """
+
+    mj_model: mujoco.MjModel
+    substeps: int
+    sizes: WarpSizes
+    shapes: Mapping[str, tuple[int, ...]]
+
+    @classmethod
+    def load(cls, mj_model: mujoco.MjModel, substeps: int, sizes: WarpSizes) -> WarpStep:
+        """Raises NotImplementedError or ValueError for a model that MuJoCo Warp refuses."""
+        with mjx_warp.warp.ScopedDevice("cpu"):
+            mjx_warp.mujoco_warp.put_model(mj_model)
+            data = mjx_warp.mujoco_warp.make_data(mj_model, nworld=1)
+        shapes = {
+            name: (*array.shape[1:], *getattr(array.dtype, "_shape_", ()))
+            for name, array in vars(data).items()
+            if isinstance(array, mjx_warp.warp.array) and array.shape[:1] == (1,)
+        }
+        return cls(mj_model, substeps, sizes, shapes)
+
+    def __call__(
+        self, model: PyTree, state: Arrays, ctrl: Array, read: Callable[[Any], T]
+    ) -> tuple[Arrays, T]:
+        """Moves one world; under `jax.vmap` all of them, in one call.
+
+        Args:
+          model: an `mjx.Model`, of which `MODEL_LEAVES` count.
+          state: the arrays of `STATE`.
+          ctrl: [nu].
+          read: what the task wants of the data afterwards. They have the arrays of
+            `mujoco_warp.Data` that have float32 numbers for each world.
+
+        Returns:
+          The state with `OVERFLOW` [] int32, and what `read` returns.
+        """
+        wanted: list[str] = []
+        jax.eval_shape(lambda: read(Readings(functools.partial(self._noted, wanted))))
+        reads = tuple(dict.fromkeys(name for name in wanted if name not in STATE))
+        leaves = {name: getattr(model, name) for name in MODEL_LEAVES}
+        given = {"ctrl": ctrl, **{name: leaf for name, leaf in leaves.items() if leaf.size}}
+        alone = {name: array[None] for name, array in (given | state).items()}
+        out = {name: array[0] for name, array in self._of_worlds(reads)(alone).items()}
+        return {name: out[name] for name in (*STATE, OVERFLOW)}, read(Readings(out.__getitem__))
+
+    def _noted(self, wanted: list[str], name: str) -> Array:
+        if name not in self.shapes:
+            raise AttributeError(f"data.{name}: MuJoCo Warp has no such array for each world")
+        wanted.append(name)
+        return jnp.zeros(self.shapes[name])
+
+    def _of_worlds(self, reads: tuple[str, ...]) -> Callable[[Arrays], Arrays]:
+        """`launch` as a function over which `jax.vmap` makes one call of more worlds."""
+
+        @jax.custom_batching.custom_vmap
+        def worlds(given: Arrays) -> Arrays:
+            return self.launch(reads, given)
+
+        @worlds.def_vmap
+        def _(size: int, is_mapped: list[dict[str, bool]], given: Arrays) -> Any:
+            (mapped,) = is_mapped
+            count = given["qpos"].shape[int(mapped["qpos"])]
+            folded = {
+                name: _folded(name, array, (size, count), mapped[name])
+                for name, array in given.items()
+            }
+            out = {
+                name: x.reshape(size, count, *x.shape[1:]) for name, x in worlds(folded).items()
+            }
+            return out, dict.fromkeys(out, True)
+
+        return worlds
+
+    def launch(self, reads: tuple[str, ...], given: Arrays) -> Arrays:
+        """Steps N worlds.
+
+        Args:
+          reads: names of arrays of the data, beside `STATE`.
+          given: arrays with a leading axis [N]; leaves that worlds share have [1].
+        """
+        count = given["qpos"].shape[0]
+        first = [name for name in given if name not in STATE]
+        layout = lay_out(
+            tuple((name, given[name].shape) for name in (*first, *STATE)),
+            tuple((name, (count, *self.shapes[name])) for name in (*STATE, OVERFLOW, *reads)),
+        )
+        parts = [
+            jnp.pad(given[name].reshape(-1), (0, piece.gap))
+            for name, piece in layout.given.items()
+        ]
+        (out,) = _target(self, *(tuple(part.items()) for part in layout))(jnp.concatenate(parts))
+        found = {
+            name: out[piece.start - layout.first_taken :][: piece.size].reshape(piece.shape)
+            for name, piece in layout.taken.items()
+        }
+        return found | {OVERFLOW: jax.lax.bitcast_convert_type(found[OVERFLOW], jnp.int32)}
+
+
+class Readings:
+    """Stands for the data where a task reads them; every attribute is an array of one world."""
+
+    def __init__(self, array: Callable[[str], Array]) -> None:
+        self._array = array
+
+    def __getattr__(self, name: str) -> Array:
+        return self._array(name)
+
+
+def _folded(name: str, array: Array, shape: tuple[int, int], is_mapped: bool) -> Array:
+    """An array of K times N worlds, `shape`; the only row of a leaf that all share stays that."""
+    if not is_mapped:
+        if name in MODEL_LEAVES and array.shape[0] == 1:
+            return array
+        array = array[None]
+    rest = array.shape[2:]
+    return jnp.broadcast_to(array, (*shape, *rest)).reshape(shape[0] * shape[1], *rest)
+
+
+Pieces: TypeAlias = tuple[tuple[str, Piece], ...]
+
+
+@functools.cache
+def _target(source: WarpStep, given: Pieces, taken: Pieces) -> Callable[[Array], Any]:
+    """What a program calls: from the part of the buffer that goes in to the one that comes out."""
+    layout = Layout(dict(given), dict(taken))
+    made: list[Worlds] = []
+
+    def control_step(given: Any, taken: Any) -> None:
+        if not made:  # Only here Warp knows the device.
+            made.append(Worlds(source.mj_model, source.substeps, source.sizes, layout))
+        made[0].step(given, taken)
+
+    vector = mjx_warp.warp.array(dtype=float)
+    control_step.__annotations__ = {"given": vector, "taken": vector}
+    # The name is part of a program, and all GMIs of a job must have the same program.
+    model = source.mj_model.names.split(b"\0")[0].decode()
+    control_step.__qualname__ = f"control_step_{model}_{layout.given['qpos'].shape[0]}"
+    return mjx_warp.warp.jax_callable(
+        control_step,
+        graph_mode=mjx_warp.warp.JaxCallableGraphMode.NONE,  # `Worlds` has the graph.
+        output_dims={"taken": layout.size - layout.first_taken},
+    )

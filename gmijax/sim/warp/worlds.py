@@ -1,0 +1,180 @@
+"""Worlds of MuJoCo Warp, their data in Warp's memory, and the buffer through which JAX moves them.
+
+The package warp-lang is optional, and MJX has tried to import it: hence `mjx_warp.warp`.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any, NamedTuple, TypeAlias
+
+import mujoco
+from mujoco.mjx import warp as mjx_warp
+
+from gmijax.config.env import RANDOMIZED_LEAVES
+from gmijax.sim.impl import WarpSizes
+
+Shapes: TypeAlias = tuple[tuple[str, tuple[int, ...]], ...]
+"""Names of arrays and their shapes, in order."""
+
+STATE = ("qpos", "qvel", "qacc_warmstart")
+"""Arrays of the data that go in and come out."""
+
+OVERFLOW = "overflow"
+"""The array of the data with bits for buffers that were too small; it always comes out."""
+
+MODEL_LEAVES = (
+    *RANDOMIZED_LEAVES,
+    *("body_inertia", "body_subtreemass", "body_invweight0", "dof_invweight0"),
+    *("tendon_invweight0", "actuator_biasprm"),
+)
+"""Leaves of a model that may differ from the loaded one: what is drawn, and what follows from it.
+They go in; all others are read once."""
+
+_ALIGNED = 64
+"""Arrays begin at multiples of so many floats: tiles of Warp load several floats at once."""
+
+
+_UNASKED = 8
+"""Up to so many iterations of the solver are done without asking after each of them whether all
+worlds have an answer: a GPU waits for that, and of two to four, as in our tasks, it saves none."""
+
+
+class Piece(NamedTuple):
+    """An array in the buffer: its shape, worlds first, and where it begins, in floats."""
+
+    shape: tuple[int, ...]
+    start: int
+
+    @property
+    def size(self) -> int:
+        """Floats."""
+        return math.prod(self.shape)
+
+    @property
+    def gap(self) -> int:
+        """Floats between its end and the next array."""
+        return -self.size % _ALIGNED
+
+    @property
+    def end(self) -> int:
+        """Where the next array begins."""
+        return self.start + self.size + self.gap
+
+
+class Layout(NamedTuple):
+    """The buffer of N worlds: from its beginning on what goes in, to its end what comes out.
+
+    The two parts overlap in the state.
+
+    Attributes:
+      given: controls, leaves of the model, state.
+      taken: state, overflow, what the task reads.
+    """
+
+    given: dict[str, Piece]
+    taken: dict[str, Piece]
+
+    @property
+    def num_given(self) -> int:
+        """Floats that go in."""
+        return self.given[STATE[-1]].end
+
+    @property
+    def first_taken(self) -> int:
+        """Where the part that comes out begins."""
+        return self.taken[STATE[0]].start
+
+    @property
+    def size(self) -> int:
+        """Floats in all."""
+        return max(piece.end for piece in self.taken.values())
+
+
+def lay_out(given: Shapes, taken: Shapes) -> Layout:
+    """The layout of these arrays; the last ones `given` and the first ones `taken` are `STATE`."""
+    pieces: dict[str, Piece] = {}
+    end = 0
+    for name, shape in (*given, *taken[len(STATE) :]):
+        pieces[name] = Piece(shape, end)
+        end = pieces[name].end
+    return Layout(*({name: pieces[name] for name, _ in part} for part in (given, taken)))
+
+
+class Worlds:
+    """N worlds on Warp's current device.
+
+    Args:
+      mj_model: their model.
+      substeps: physics steps of a control step.
+      sizes: of the buffers for contacts and constraints.
+      layout: of the buffer.
+    """
+
+    def __init__(
+        self, mj_model: mujoco.MjModel, substeps: int, sizes: WarpSizes, layout: Layout
+    ) -> None:
+        mujoco_warp = mjx_warp.mujoco_warp
+        count = layout.given["qpos"].shape[0]
+        leaves = {name: layout.given[name] for name in MODEL_LEAVES if name in layout.given}
+        own = {name: count for name, piece in leaves.items() if piece.shape[0] == count > 1}
+        self._model: Any = mujoco_warp.put_model(mj_model, batch_sizes=own)
+        self._model.opt.graph_conditional = mj_model.opt.iterations > _UNASKED
+        # Reaching that limit is meant; Warp would print a line for each world and step.
+        self._model.opt.warn_overflow = 0
+        self._data: Any = mujoco_warp.make_data(
+            mj_model,
+            nworld=count,
+            naconmax=max(int(sizes.contacts_per_env), 1) * count,
+            njmax=max(int(sizes.constraints_per_env), 1),
+        )
+        self._substeps = substeps
+        self._buffer: Any = mjx_warp.warp.zeros(layout.size, dtype=float)
+        for name, piece in {**layout.given, **layout.taken}.items():
+            self._move(self._model if name in leaves else self._data, name, piece)
+        self._given: Any = self._buffer[: layout.num_given]
+        self._taken: Any = self._buffer[layout.first_taken :]
+        self._graph: Any = None
+
+    def _move(self, owner: Any, name: str, piece: Piece) -> None:
+        """Puts an array of the model or of the data into the buffer."""
+        if not piece.size:
+            return
+        old = getattr(owner, name)
+        new = mjx_warp.warp.array(
+            ptr=self._buffer.ptr + 4 * piece.start,
+            dtype=old.dtype,
+            shape=old.shape,
+            device=old.device,
+        )
+        mjx_warp.warp.copy(new, old)
+        setattr(owner, name, new)
+
+    def step(self, given: Any, taken: Any) -> None:
+        """One control step, from one array of Warp to another; on a GPU only queued."""
+        warp = mjx_warp.warp
+        warp.copy(self._given, given)
+        if self._graph is None and self._buffer.device.is_cuda:
+            self._capture()
+            warp.copy(self._given, given)
+        self.advance()
+        warp.copy(taken, self._taken)
+
+    def advance(self) -> None:
+        """One control step of what is in the buffer."""
+        if self._graph is None:
+            self._compute()
+        else:
+            mjx_warp.warp.capture_launch(self._graph)
+
+    def _capture(self) -> None:
+        self._compute()  # Loads all kernels.
+        with mjx_warp.warp.ScopedCapture() as capture:
+            self._compute()
+        self._graph = capture.graph
+
+    def _compute(self) -> None:
+        self._data.time.zero_()
+        self._data.overflow.zero_()
+        for _ in range(self._substeps):
+            mjx_warp.mujoco_warp.step(self._model, self._data)
