@@ -5,6 +5,7 @@ The package warp-lang is optional, and MJX has tried to import it: hence `mjx_wa
 
 from __future__ import annotations
 
+import functools
 import math
 from typing import Any, NamedTuple, TypeAlias
 
@@ -12,6 +13,7 @@ import mujoco
 from mujoco.mjx import warp as mjx_warp
 
 from gmijax.config.env import RANDOMIZED_LEAVES
+from gmijax.devices import PEAKS_BESIDE_JAX
 from gmijax.sim.impl import WarpSizes
 
 Shapes: TypeAlias = tuple[tuple[str, tuple[int, ...]], ...]
@@ -135,6 +137,8 @@ class Worlds:
         self._given: Any = self._buffer[: layout.num_given]
         self._taken: Any = self._buffer[layout.first_taken :]
         self._graph: Any = None
+        if self._buffer.device.is_mempool_supported:
+            _count_memory(self._buffer.device)
 
     def _move(self, owner: Any, name: str, piece: Piece) -> None:
         """Puts an array of the model or of the data into the buffer."""
@@ -178,3 +182,9 @@ class Worlds:
         self._data.overflow.zero_()
         for _ in range(self._substeps):
             mjx_warp.mujoco_warp.step(self._model, self._data)
+
+
+@functools.cache
+def _count_memory(device: Any) -> None:
+    """Adds Warp's memory to that of JAX, once for each device."""
+    PEAKS_BESIDE_JAX.append(functools.partial(mjx_warp.warp.get_mempool_used_mem_high, device))
