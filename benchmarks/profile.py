@@ -25,6 +25,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.profiler import ProfileData
+from mujoco.mjx import warp as mjx_warp
 
 from benchmarks.records import RESULTS, ResultsFile, file_name
 from benchmarks.stages import Stage, stages
@@ -193,10 +194,8 @@ def warp_alone_ms(config: TrainConfig, stage: Stage) -> float:
     As its own speed test has it, no episode ends. Worlds begin as episodes do, with random
     controls that stay.
     """
-    import warp
-
     assert isinstance(config.algo, PpoConfig)
-    name, count = str(config.env.name), config.envs_per_gmi
+    name, count, warp = str(config.env.name), config.envs_per_gmi, mjx_warp.warp
     physics = load(name, impl="warp", substeps=1)
     mj_model, first = physics.mj_model, stage.state.env.physics
     assert physics.warp is not None
