@@ -106,6 +106,10 @@ class Physics:
     ) -> tuple[PhysicsState, T]:
         """Moves one world by one control step under `ctrl` [nu].
 
+        With MJX-Warp `model` may differ from the loaded one in `MODEL_LEAVES` of
+        `gmijax.sim.warp.worlds` only, and `read` sees the arrays of the data that have float32
+        numbers for each world.
+
         Returns:
           The new state, and `read` of the data of the last physics step. As in MuJoCo, the
           `sensordata`, forces and body poses in it belong to the moment before that step's
@@ -192,6 +196,15 @@ def from_mj_model(
             f"model: {mj_model.na} activations, {mj_model.nplugin} plugins, "
             f"{mj_model.nhistory} delay samples: none of them are carried between steps; "
             "allowed are actuators without memory (motor, position, velocity)"
+        )
+    if mj_model.actuator_damping.any() or mj_model.actuator_dampingpoly.any():
+        raise ConfigError(
+            "model: damping of actuators, which MJX-JAX ignores; allowed is that of joints"
+        )
+    if mj_model.opt.enableflags & mujoco.mjtEnableBit.mjENBL_SLEEP:
+        raise ConfigError(
+            "model: sleep=enable: which bodies sleep is not carried between steps; allowed is "
+            "disable"
         )
     chosen, _ = choose_impl(impl, jax.default_backend())
     with _refusing(mj_model, "jax"):

@@ -68,12 +68,17 @@ def test_an_implementation_that_cannot_be_had(impl: str, message: str):
         choose_impl(impl, "gpu", warp_installed=False)
 
 
-def test_actuators_with_memory_are_refused():
-    text = PENDULUM_OVER_FLOOR.replace(
-        '<motor joint="hinge" gear="2"/>',
-        '<general joint="hinge" dyntype="integrator"/>',
-    )
-    with pytest.raises(ConfigError, match="1 activations"):
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ('motor joint="hinge" gear="2"', 'general joint="hinge" dyntype="integrator"', "1 activ"),
+        ('motor joint="hinge"', 'motor joint="hinge" damping="1"', "damping of actuators"),
+        ("<worldbody>", '<option><flag sleep="enable"/></option><worldbody>', "sleep=enable"),
+    ],
+)
+def test_what_would_not_be_carried_or_simulated_is_refused(old: str, new: str, message: str):
+    text = PENDULUM_OVER_FLOOR.replace(old, new)
+    with pytest.raises(ConfigError, match=message):
         from_mj_model(mujoco.MjModel.from_xml_string(text), impl="jax", substeps=1)
 
 

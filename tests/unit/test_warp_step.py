@@ -16,7 +16,7 @@ from gmijax.sim.warp.step import WarpStep
 from gmijax.sim.warp.worlds import MODEL_LEAVES, OVERFLOW, STATE, lay_out
 
 JOBS, WORLDS = 2, 3
-SHAPES = {"qpos": (2,), "qvel": (2,), "qacc_warmstart": (2,), OVERFLOW: (), "sensordata": (4,)}
+SHAPES = {**dict.fromkeys((*STATE, "ctrl"), (2,)), OVERFLOW: (), "sensordata": (4,)}
 
 
 def test_arrays_of_the_buffer_are_apart_and_what_goes_in_and_comes_out_is_in_a_row():
@@ -86,6 +86,13 @@ def test_a_map_over_jobs_and_worlds_is_one_call_of_all_worlds(
     assert moved[OVERFLOW].tolist() == [[0, 1, 2], [3, 4, 5]]
     np.testing.assert_array_equal(reading, state["qpos"])
     assert step.seen[-1] == (JOBS * WORLDS, {"body_mass": rows})
+
+
+def test_a_task_may_read_the_controls(step: Arithmetic):
+    state, ctrl = {name: jnp.zeros(2) for name in STATE}, jnp.array([1.0, 2.0])
+    moved, read = step(model_with(jnp.ones(2)), state, ctrl, lambda data: data.ctrl + data.qpos)
+    assert moved["qpos"].tolist() == [1.0, 2.0]
+    assert read.tolist() == [2.0, 4.0]
 
 
 def test_what_the_data_do_not_have_for_each_world_is_named(step: Arithmetic):

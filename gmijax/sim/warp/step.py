@@ -45,15 +45,18 @@ class WarpStep:
     @classmethod
     def load(cls, mj_model: mujoco.MjModel, substeps: int, sizes: WarpSizes) -> WarpStep:
         """Raises NotImplementedError or ValueError for a model that MuJoCo Warp refuses."""
-        with mjx_warp.warp.ScopedDevice("cpu"):
+        warp = mjx_warp.warp
+        with warp.ScopedDevice("cpu"):
             mjx_warp.mujoco_warp.put_model(mj_model)
             data = mjx_warp.mujoco_warp.make_data(mj_model, nworld=1)
         shapes = {
             name: (*array.shape[1:], *getattr(array.dtype, "_shape_", ()))
             for name, array in vars(data).items()
-            if isinstance(array, mjx_warp.warp.array) and array.shape[:1] == (1,)
+            if isinstance(array, warp.array)
+            and array.shape[:1] == (1,)
+            and getattr(array.dtype, "_wp_scalar_type_", array.dtype) is warp.float32
         }
-        return cls(mj_model, substeps, sizes, shapes)
+        return cls(mj_model, substeps, sizes, {**shapes, OVERFLOW: ()})
 
     def __call__(
         self, model: PyTree, state: Arrays, ctrl: Array, read: Callable[[Any], T]
@@ -72,15 +75,16 @@ class WarpStep:
         """
         wanted: list[str] = []
         jax.eval_shape(lambda: read(Readings(functools.partial(self._noted, wanted))))
-        reads = tuple(dict.fromkeys(name for name in wanted if name not in STATE))
+        reads = tuple(dict.fromkeys(name for name in wanted if name not in (*STATE, "ctrl")))
         leaves = {name: getattr(model, name) for name in MODEL_LEAVES}
         given = {"ctrl": ctrl, **{name: leaf for name, leaf in leaves.items() if leaf.size}}
         alone = {name: array[None] for name, array in (given | state).items()}
         out = {name: array[0] for name, array in self._of_worlds(reads)(alone).items()}
-        return {name: out[name] for name in (*STATE, OVERFLOW)}, read(Readings(out.__getitem__))
+        reading = read(Readings((out | {"ctrl": ctrl}).__getitem__))
+        return {name: out[name] for name in (*STATE, OVERFLOW)}, reading
 
     def _noted(self, wanted: list[str], name: str) -> Array:
-        if name not in self.shapes:
+        if name not in self.shapes or name == OVERFLOW:
             raise AttributeError(f"data.{name}: MuJoCo Warp has no such array for each world")
         wanted.append(name)
         return jnp.zeros(self.shapes[name])
@@ -159,12 +163,13 @@ Pieces: TypeAlias = tuple[tuple[str, Piece], ...]
 def _target(source: WarpStep, given: Pieces, taken: Pieces) -> Callable[[Array], Any]:
     """What a program calls: from the part of the buffer that goes in to the one that comes out."""
     layout = Layout(dict(given), dict(taken))
-    made: list[Worlds] = []
+    worlds: dict[str, Worlds] = {}
 
     def control_step(given: Any, taken: Any) -> None:
-        if not made:  # Only here Warp knows the device.
-            made.append(Worlds(source.mj_model, source.substeps, source.sizes, layout))
-        made[0].step(given, taken)
+        device = given.device.alias
+        if device not in worlds:
+            worlds[device] = Worlds(source.mj_model, source.substeps, source.sizes, layout)
+        worlds[device].step(given, taken)
 
     vector = mjx_warp.warp.array(dtype=float)
     control_step.__annotations__ = {"given": vector, "taken": vector}

@@ -138,13 +138,14 @@ class Worlds:
         self._taken: Any = self._buffer[layout.first_taken :]
         self._graph: Any = None
         if self._buffer.device.is_mempool_supported:
-            _count_memory(self._buffer.device)
+            _count_memory(self._buffer.device.alias)
 
     def _move(self, owner: Any, name: str, piece: Piece) -> None:
         """Puts an array of the model or of the data into the buffer."""
         if not piece.size:
             return
         old = getattr(owner, name)
+        assert old.size * mjx_warp.warp.types.type_size_in_bytes(old.dtype) == 4 * piece.size, name
         new = mjx_warp.warp.array(
             ptr=self._buffer.ptr + 4 * piece.start,
             dtype=old.dtype,
@@ -180,11 +181,13 @@ class Worlds:
     def _compute(self) -> None:
         self._data.time.zero_()
         self._data.overflow.zero_()
+        # Rows without a constraint are multiplied by zero, which does not help against infinity.
+        self._data.efc.J.zero_()
         for _ in range(self._substeps):
             mjx_warp.mujoco_warp.step(self._model, self._data)
 
 
 @functools.cache
-def _count_memory(device: Any) -> None:
+def _count_memory(device: str) -> None:
     """Adds Warp's memory to that of JAX, once for each device."""
     PEAKS_BESIDE_JAX.append(functools.partial(mjx_warp.warp.get_mempool_used_mem_high, device))
