@@ -76,8 +76,8 @@ class FakeWarp:
     def _view(self, *, ptr: int, dtype: Any, shape: tuple[int, ...], device: Any) -> FakeArray:
         assert device is DEVICE
         floats = int(np.prod(shape))
-        memory = (ctypes.c_float * floats).from_address(ptr)
-        return FakeArray(np.frombuffer(memory, dtype).reshape(shape))
+        memory = ctypes.cast(ptr, ctypes.POINTER(ctypes.c_float))
+        return FakeArray(np.ctypeslib.as_array(memory, (floats,)).reshape(shape))
 
     def _copy(self, dest: FakeArray, source: FakeArray) -> None:
         dest.values[...] = source.values
