@@ -45,7 +45,8 @@ class Outcome(NamedTuple):
       final_return: of the latest episodes.
       wall_s: seconds from the start of its processes to their end.
       diverged_steps: in all.
-      at_end: means over the last iterations of `HEALTH` and of the task's own metrics.
+      at_end: means over the last iterations of `HEALTH` and of the task's own metrics; of
+        evaluations, which act without noise, the last return and the highest.
     """
 
     seed: str
@@ -86,6 +87,7 @@ def outcome_of(task: str, lines: Lines, *, seed: str, completed: bool, wall_s: f
     """The outcome of a training; one that did not complete has not succeeded."""
     curve = smoothed(found) if (found := rewards(lines)) else None
     names = [*HEALTH, *(name for name in (lines[-1] if lines else {}) if "metric/" in name)]
+    evaluations = [line["eval/return"] for line in lines if line.get("eval/return") is not None]
     return Outcome(
         seed,
         completed and succeeded(task, lines),
@@ -94,7 +96,8 @@ def outcome_of(task: str, lines: Lines, *, seed: str, completed: bool, wall_s: f
         lines[-1].get("return") if lines else None,
         wall_s,
         sum(line.get("diverged_steps") or 0.0 for line in lines),
-        {name: value for name in names if (value := _late_mean(lines, name)) is not None},
+        {name: value for name in names if (value := _late_mean(lines, name)) is not None}
+        | ({"eval/last": evaluations[-1], "eval/peak": max(evaluations)} if evaluations else {}),
     )
 
 

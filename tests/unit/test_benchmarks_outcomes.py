@@ -63,6 +63,10 @@ def test_an_outcome_has_what_the_last_iterations_show() -> None:
     assert (one.final_return, one.diverged_steps) == (20.0, 60.0)
     assert (one.final, one.peak) == (pytest.approx(0.5), pytest.approx(1.0))
     assert one.at_end == {"policy/noise_std_min": pytest.approx(0.1)}
+    found[10] |= {"eval/return": 360.0}
+    found[20] |= {"eval/return": 150.0}
+    one = outcome_of("ball_balance", found, seed="3", completed=True, wall_s=9.0)
+    assert (one.at_end["eval/last"], one.at_end["eval/peak"]) == (150.0, 360.0)
     # What did not get to its end has not succeeded, however good it was.
     found = lines([1.0] * 20)
     assert outcome_of("ball_balance", found, seed="", completed=True, wall_s=0.0).succeeded
