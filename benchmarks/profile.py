@@ -34,6 +34,7 @@ from gmijax.config import PpoConfig, TrainConfig
 from gmijax.learning.learner import learner_shapes
 from gmijax.sim.impl import choose_impl
 from gmijax.sim.physics import load
+from gmijax.sim.warp.step import joined
 from gmijax.sim.warp.worlds import OVERFLOW, STATE, Worlds, lay_out
 
 WARM_UP, TIMED, TRACED = 2, 10, 2
@@ -200,15 +201,14 @@ def warp_alone_ms(config: TrainConfig, stage: Stage) -> float:
     mj_model, first = physics.mj_model, stage.state.env.physics
     assert physics.warp is not None
     low, high = mj_model.actuator_ctrlrange.T
-    ctrl = np.random.default_rng(0).uniform(low, high, (count, mj_model.nu))
-    arrays = {"ctrl": ctrl, **{key: np.asarray(getattr(first, key)) for key in STATE}}
+    ctrl = jax.random.uniform(jax.random.key(0), (count, mj_model.nu), minval=low, maxval=high)
+    arrays = {"ctrl": ctrl, **{key: getattr(first, key) for key in STATE}}
     given = tuple((key, array.shape) for key, array in arrays.items())
     layout = lay_out(given, (*given[1:], (OVERFLOW, (count,))))
     substeps = round(stage.spec.control_dt_s / mj_model.opt.timestep)
     worlds = Worlds(mj_model, substeps, physics.warp.sizes, layout)
-    parts = [np.pad(arrays[key].ravel(), (0, piece.gap)) for key, piece in layout.given.items()]
-    buffer = warp.array(np.concatenate(parts).astype(np.float32))
-    worlds.step(buffer, warp.zeros(layout.size - layout.first_taken))
+    given_once = warp.array(np.asarray(joined(layout, arrays)))
+    worlds.step(given_once, warp.zeros(layout.size - layout.first_taken))
     for rounds in (WARM_UP, TIMED):
         warp.synchronize()
         started = time.perf_counter()

@@ -22,7 +22,7 @@ from gmijax.errors import ConfigError
 from gmijax.sim.impl import ON_GPU, Impl, WarpSizes, choose_impl
 from gmijax.sim.interface import OVERFLOWS, Env, EnvSpec, EnvState
 from gmijax.sim.warp.step import WarpStep
-from gmijax.sim.warp.worlds import OVERFLOW, STATE
+from gmijax.sim.warp.worlds import OVERFLOW, STATE, name_of
 from gmijax.types import Array, PRNGKey, PyTree
 
 T = TypeVar("T")
@@ -221,9 +221,8 @@ def _refusing(mj_model: mujoco.MjModel, impl: Impl) -> Iterator[None]:
     try:
         yield
     except (NotImplementedError, ValueError) as error:
-        name = mj_model.names.split(b"\0")[0].decode()  # The model's own name comes first.
         raise ConfigError(
-            f"physics.impl={impl}: MJX cannot simulate the model {name} with it: "
+            f"physics.impl={impl}: MJX cannot simulate the model {name_of(mj_model)} with it: "
             f"{' '.join(str(error).split())}"
         ) from None
 

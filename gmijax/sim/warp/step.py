@@ -18,7 +18,16 @@ import mujoco
 from mujoco.mjx import warp as mjx_warp
 
 from gmijax.sim.impl import WarpSizes
-from gmijax.sim.warp.worlds import MODEL_LEAVES, OVERFLOW, STATE, Layout, Piece, Worlds, lay_out
+from gmijax.sim.warp.worlds import (
+    MODEL_LEAVES,
+    OVERFLOW,
+    STATE,
+    Layout,
+    Piece,
+    Worlds,
+    lay_out,
+    name_of,
+)
 from gmijax.types import Array, PyTree
 
 T = TypeVar("T")
@@ -124,11 +133,7 @@ class WarpStep:
             tuple((name, given[name].shape) for name in (*first, *STATE)),
             tuple((name, (count, *self.shapes[name])) for name in (*STATE, OVERFLOW, *reads)),
         )
-        parts = [
-            jnp.pad(given[name].reshape(-1), (0, piece.gap))
-            for name, piece in layout.given.items()
-        ]
-        (out,) = _target(self, *(tuple(part.items()) for part in layout))(jnp.concatenate(parts))
+        (out,) = _target(self, *(tuple(part.items()) for part in layout))(joined(layout, given))
         found = {
             name: out[piece.start - layout.first_taken :][: piece.size].reshape(piece.shape)
             for name, piece in layout.taken.items()
@@ -144,6 +149,13 @@ class Readings:
 
     def __getattr__(self, name: str) -> Array:
         return self._array(name)
+
+
+def joined(layout: Layout, given: Mapping[str, Array]) -> Array:
+    """The part of the buffer that goes in."""
+    return jnp.concatenate(
+        [jnp.pad(given[name].reshape(-1), (0, piece.gap)) for name, piece in layout.given.items()]
+    )
 
 
 def _folded(name: str, array: Array, shape: tuple[int, int], is_mapped: bool) -> Array:
@@ -174,8 +186,9 @@ def _target(source: WarpStep, given: Pieces, taken: Pieces) -> Callable[[Array],
     vector = mjx_warp.warp.array(dtype=float)
     control_step.__annotations__ = {"given": vector, "taken": vector}
     # The name is part of a program, and all GMIs of a job must have the same program.
-    model = source.mj_model.names.split(b"\0")[0].decode()
-    control_step.__qualname__ = f"control_step_{model}_{layout.given['qpos'].shape[0]}"
+    control_step.__qualname__ = (
+        f"control_step_{name_of(source.mj_model)}_{layout.given['qpos'].shape[0]}"
+    )
     return mjx_warp.warp.jax_callable(
         control_step,
         graph_mode=mjx_warp.warp.JaxCallableGraphMode.NONE,  # `Worlds` has the graph.

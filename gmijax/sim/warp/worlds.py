@@ -36,7 +36,6 @@ They go in; all others are read once."""
 _ALIGNED = 64
 """Arrays begin at multiples of so many floats: tiles of Warp load several floats at once."""
 
-
 _UNASKED = 8
 """Up to so many iterations of the solver are done without asking after each of them whether all
 worlds have an answer: a GPU waits for that, and of two to four, as in our tasks, it saves none."""
@@ -101,6 +100,11 @@ def lay_out(given: Shapes, taken: Shapes) -> Layout:
         pieces[name] = Piece(shape, end)
         end = pieces[name].end
     return Layout(*({name: pieces[name] for name, _ in part} for part in (given, taken)))
+
+
+def name_of(mj_model: mujoco.MjModel) -> str:
+    """The model's own name, which comes first of all names."""
+    return mj_model.names.split(b"\0")[0].decode()
 
 
 class Worlds:
