@@ -7,21 +7,26 @@ from benchmarks.peers.comparisons import COMPARISONS
 from benchmarks.peers.table import HEAD, measured, row
 from benchmarks.records import RESULTS, read_calls
 
-PEERS = "peers-nvidia-h200"
+PATTERN = "peers-nvidia-*.json"
 
 
 def peers() -> list[str]:
     """Every comparison from the newest call that measured both of its sides."""
-    path = RESULTS / f"{PEERS}.json"
-    if not path.exists():
+    calls = sorted(
+        ((call, path) for path in RESULTS.glob(PATTERN) for call in read_calls(path)),
+        key=lambda pair: str(pair[0].date),
+    )
+    if not calls:
         return [f"{'; '.join(COMPARISONS)}: {NOT_MEASURED} (`python -m benchmarks.peers`)."]
-    calls = read_calls(path)
-    rows, origins = [], {}
+    rows: list[list[str]] = []
+    origins: dict[str, list[str]] = {}
     for name in COMPARISONS:
-        call = next((one for one in reversed(calls) if measured(one.results, name)), None)
-        rows.append(row(call.results if call else {}, name))
-        if call:
-            origins.setdefault(origin(call), []).append(name)
-    file = link(path.name)
-    lines = [f"- {file}, {'; '.join(names)}: {made}" for made, names in origins.items()]
+        found = next((one for one in reversed(calls) if measured(one[0].results, name)), None)
+        rows.append(row(found[0].results if found else {}, name))
+        if found:
+            origins.setdefault(f"{link(found[1].name)}|{origin(found[0])}", []).append(name)
+    lines = [
+        f"- {file}, {'; '.join(names)}: {made}"
+        for (file, made), names in ((key.split("|"), names) for key, names in origins.items())
+    ]
     return [*markdown(HEAD, rows), "", *lines]

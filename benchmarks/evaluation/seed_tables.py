@@ -2,27 +2,32 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Mapping
 from typing import Any
 
 from benchmarks.evaluation.figures import link, markdown, origin, shown
 from benchmarks.records import RESULTS, read_calls
 
-PATTERN = "seeds-*-nvidia-h200.json"
+PATTERN = "seeds-*-nvidia-*.json"
 HEAD = (
     "task | call: | changed | successes: | interval of 95 %: | p: | reward of a step in the end:"
 )
 
 
 def seeds() -> list[str]:
-    """Successes of every setting whose seeds all ran, by task and call."""
-    rows, calls = [], []
-    for path in sorted(RESULTS.glob(PATTERN)):
-        for number, call in enumerate(read_calls(path), start=1):
-            task = call.results["task"]
-            finished = [row for row in call.results["rows"] if not row["unfinished"]]
-            rows += [_cells(task, number, row) for row in finished]
-            calls.append(f"- {link(path.name)}, call {number}: {origin(call)}")
+    """Successes of every setting whose seeds all ran, by task and call; calls in order of date."""
+    found = sorted(
+        ((call, path) for path in RESULTS.glob(PATTERN) for call in read_calls(path)),
+        key=lambda pair: (pair[0].results["task"], str(pair[0].date)),
+    )
+    rows, calls, number = [], [], Counter[str]()
+    for call, path in found:
+        task = call.results["task"]
+        number[task] += 1
+        finished = [row for row in call.results["rows"] if not row["unfinished"]]
+        rows += [_cells(task, number[task], row) for row in finished]
+        calls.append(f"- {link(path.name)}, call {number[task]}: {origin(call)}")
     return [*markdown(HEAD, rows), "", *calls]
 
 
@@ -34,5 +39,5 @@ def _cells(task: str, number: int, row: Mapping[str, Any]) -> list[str]:
         *(f"`{task}`", str(number), changed, f"{row['successes']} of {row['seeds']}"),
         f"{low:.0%} to {high:.0%}",
         shown(row["p_successes"], ".2g") if "p_successes" in row else "",
-        f"{median:.2f} ({least:.2f} to {most:.2f})",
+        f"{median:.3g} ({least:.3g} to {most:.3g})",
     ]

@@ -214,7 +214,7 @@ def test_the_table_takes_the_newest_call_that_measured_both_sides(
     benchmark(monkeypatch, tmp_path / "2", Fake("gmijax.train"), "ant, MJX-JAX", repeats=1)
     calls = [json.loads(made.file.path.read_text())["calls"][0]]
     calls += json.loads((tmp_path / "2" / made.file.path.name).read_text())["calls"]
-    path = tmp_path / f"{peer_tables.PEERS}.json"
+    path = tmp_path / "peers-nvidia-h200.json"
     path.write_text(json.dumps({"format": 2, "suite": "peers", "calls": calls}))
     table = peer_tables.peers()
     assert "| ant, MJX-JAX | Brax | 200 | 100 | 2.00 | 60.0 | 60.0 |" in table
