@@ -132,6 +132,12 @@ def read_calls(path: Path) -> list[Call]:
     return [_of_old_file(found)]
 
 
+def calls_by_date(folder: Path, pattern: str) -> list[tuple[Call, Path]]:
+    """The calls in all files of a folder that match, with their files, oldest first."""
+    found = [(call, path) for path in sorted(folder.glob(pattern)) for call in read_calls(path)]
+    return sorted(found, key=lambda one: str(one[0].date))
+
+
 def file_name(suite: str, device: str) -> str:
     """`serving-nvidia-h200.json`."""
     return f"{suite}-{device.replace(' ', '-').lower()}.json"

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from benchmarks.evaluation.figures import link, markdown, origin, shown
-from benchmarks.records import RESULTS, read_calls
+from benchmarks.records import RESULTS, calls_by_date
 
 PATTERN = "seeds-*-nvidia-*.json"
 HEAD = (
@@ -17,10 +17,7 @@ HEAD = (
 
 def seeds() -> list[str]:
     """Successes of every setting whose seeds all ran, by task and call; calls in order of date."""
-    found = sorted(
-        ((call, path) for path in RESULTS.glob(PATTERN) for call in read_calls(path)),
-        key=lambda pair: (pair[0].results["task"], str(pair[0].date)),
-    )
+    found = sorted(calls_by_date(RESULTS, PATTERN), key=lambda one: one[0].results["task"])
     rows, calls, number = [], [], Counter[str]()
     for call, path in found:
         task = call.results["task"]
