@@ -29,6 +29,7 @@ from typing import Any, NamedTuple
 import gmijax
 from benchmarks.command import run_command
 from benchmarks.outcomes import Outcome, against, outcome_of, summary
+from benchmarks.played import FILE
 from benchmarks.records import RESULTS, ResultsFile, device_name, file_name
 from gmijax.errors import ConfigError
 from gmijax.runs.folder import RunPaths, read_json
@@ -83,6 +84,8 @@ class Benchmark:
         started_s, code = time.monotonic(), 130
         try:
             code = run_command(self._command(row, folder), self._deadline_s)
+            if self._arguments.play:
+                run_command(self._play(folder), self._deadline_s)
         finally:
             seconds = round(time.monotonic() - started_s, 2)
             if (folder / "sweep.json").exists():
@@ -102,6 +105,10 @@ class Benchmark:
             *(f"sweep.jobs_per_gpu={arguments.at_once}", f"sweep.pack={arguments.pack}"),
             f"run.dir={folder}",
         ]
+
+    def _play(self, folder: Path) -> list[str]:
+        episodes = ("--episodes", str(self._arguments.play))
+        return [sys.executable, "-m", "benchmarks.played", str(folder), *episodes]
 
     def _add(self, name: str, folder: Path, own: Mapping[str, Any]) -> None:
         report = read_json(folder / "sweep.json")
@@ -132,6 +139,7 @@ def outcomes_of(task: str, folder: Path, report: Mapping[str, Any]) -> tuple[lis
       report: its `sweep.json`.
     """
     ended = [job for job in report["jobs"] if job["state"] in ("completed", "failed")]
+    played = read_json(folder / FILE) if (folder / FILE).exists() else {}
     outcomes = [
         outcome_of(
             task,
@@ -139,6 +147,7 @@ def outcomes_of(task: str, folder: Path, report: Mapping[str, Any]) -> tuple[lis
             seed=str(job["overrides"].get("seed")),
             completed=job["state"] == "completed",
             wall_s=job["wall_s"],
+            played=played.get(Path(job["run_dir"]).name, {}),
         )
         for job in ended
     ]
@@ -153,11 +162,18 @@ def told(row: Mapping[str, Any]) -> str:
     text = f"{row['row']}: {row['successes']} of {row['seeds']} ({low:.0%} to {high:.0%})"
     for name in ("final", "peak", "return"):
         if row[name]:
-            low, middle, high = row[name]
-            text += f", {name} {middle:.4g} ({low:.4g} to {high:.4g})"
+            text += f", {name} {_spread(row[name])}"
+    for name, quartiles in row["at_end"].items():
+        if name.startswith("played/"):
+            text += f", {name} {_spread(quartiles)}"
     if row.get("p_final") is not None:
         text += f"; p {row['p_successes']} for successes, {row['p_final']} for final rewards"
     return text
+
+
+def _spread(quartiles: Sequence[float]) -> str:
+    low, middle, high = quartiles
+    return f"{middle:.4g} ({low:.4g} to {high:.4g})"
 
 
 def main() -> int:
@@ -215,6 +231,14 @@ def _arguments() -> argparse.Namespace:
     )
     parser.add_argument("--seeds", type=int, default=20, help="trainings of a row")
     parser.add_argument("--at-once", default="8", help="trainings at once on every GPU, or auto")
+    parser.add_argument(
+        "--play",
+        type=int,
+        default=0,
+        metavar="EPISODES",
+        help="of the last and the best checkpoint of every training, without noise; see "
+        "run.checkpoint_every",
+    )
     parser.add_argument(
         "--pack", default="gmi", choices=["gmi", "auto"], help="sweep.pack: auto is one program"
     )

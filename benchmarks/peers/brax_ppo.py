@@ -24,6 +24,7 @@ from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from benchmarks.peers.comparisons import BraxTraining
 from gmijax.errors import ConfigError
 from gmijax.runs.folder import read_json, write_json
+from gmijax.sim.adapters.playground import without_warnings
 from gmijax.sim.registry import make_env
 from gmijax.types import PyTree
 
@@ -83,7 +84,9 @@ def environment(training: BraxTraining) -> tuple[Any, dict[str, Any]]:
         }
     if training.suite == "playground":
         playground = importlib.import_module("mujoco_playground")
-        env = playground.registry.load(training.env, config_overrides={"impl": "jax"})
+        env = playground.registry.load(training.env, config_overrides={"impl": training.impl})
+        if training.impl == "warp":
+            env = without_warnings(env)
         own = playground.registry.get_default_config(training.env).episode_length
         wrap = playground.wrapper.wrap_for_brax_training
         return env, {"episode_length": length or own, "wrap_env_fn": wrap}

@@ -94,7 +94,8 @@ COMPARISONS: Mapping[str, Comparison] = MappingProxyType(
         # Playground's own settings (mujoco_playground/config), version 0.2.0.
         "Playground's CartpoleBalance": Comparison(
             (
-                *("env=playground", "env.name=CartpoleBalance", *_LIKE_BRAX, *_BRAX_NETWORKS),
+                *("env=playground", "env.name=CartpoleBalance", "physics.impl=warp"),
+                *(*_LIKE_BRAX, *_BRAX_NETWORKS),
                 *("num_envs=2048", "algo.unroll_length=480", "algo.num_updates_per_batch=16"),
                 *("algo.entropy_cost=1e-2", "algo.reward_scaling=10", "algo.discounting=0.995"),
                 *("algo.learning_rate=1e-3", "num_timesteps=20000000"),
@@ -103,7 +104,8 @@ COMPARISONS: Mapping[str, Comparison] = MappingProxyType(
         ),
         "Playground's Go1JoystickFlatTerrain": Comparison(
             (
-                *("env=playground", "env.name=Go1JoystickFlatTerrain", *_LIKE_BRAX),
+                *("env=playground", "env.name=Go1JoystickFlatTerrain", "physics.impl=warp"),
+                *_LIKE_BRAX,
                 "algo.policy_hidden_layer_sizes=[512,256,128]",
                 "algo.value_hidden_layer_sizes=[512,256,128]",
                 *("num_envs=8192", "algo.unroll_length=20", "algo.num_updates_per_batch=4"),

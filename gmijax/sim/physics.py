@@ -32,6 +32,11 @@ _CONSTRAINT_BITS, _ITERATION_BITS, _ALL_BITS = 0x003, 0x600, 0xFFF
 _CONTACT_BITS = _ALL_BITS & ~(_CONSTRAINT_BITS | _ITERATION_BITS)
 
 
+def which_overflowed(bits: Array) -> Array:
+    """[2] bool, which of `OVERFLOWS` were too small, by a world's `overflow` [] of MJX-Warp."""
+    return (bits & jnp.array([_CONTACT_BITS, _CONSTRAINT_BITS])) != 0
+
+
 class PhysicsState(NamedTuple):
     """What one world must remember between steps.
 
@@ -118,8 +123,7 @@ class Physics:
         if self.warp is not None:
             before = {name: getattr(state, name) for name in STATE}
             after, reading = self.warp(model, before, ctrl, read)
-            masks = jnp.array([_CONTACT_BITS, _CONSTRAINT_BITS])
-            overflow = (after.pop(OVERFLOW) & masks) != 0
+            overflow = which_overflowed(after.pop(OVERFLOW))
             return PhysicsState(**after, overflow=overflow), reading
 
         def substep(data: mjx.Data, _: None) -> tuple[mjx.Data, None]:

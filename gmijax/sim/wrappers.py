@@ -140,9 +140,15 @@ def auto_reset(env: Env, model: PyTree, state: EnvState) -> EnvState:
 
 
 def select_worlds(chosen: Array, new: T, old: T) -> T:
-    """`new` in the `chosen` worlds [N], else `old`; every leaf has a leading axis [N]."""
+    """`new` in the `chosen` worlds [N], else `old`; leaves have a leading axis [N].
+
+    One that has not is shared by all worlds, as MJX-Warp's contacts are in states of MuJoCo
+    Playground: it stays as it is, for every step writes it anew.
+    """
 
     def select(a: Array, b: Array) -> Array:
+        if b.shape[:1] != chosen.shape:
+            return b
         return jnp.where(jnp.expand_dims(chosen, range(1, b.ndim)), a, b)
 
     return jax.tree.map(select, new, old)

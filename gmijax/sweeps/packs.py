@@ -81,6 +81,11 @@ def why_alone(job: Job) -> str | None:
         (plan.gpus != 1, f"plan.gpus={plan.gpus}"),
         (plan.gmis_per_gpu != 1, f"plan.gmis_per_gpu={plan.gmis_per_gpu}"),
         (plan.template not in ("auto", "tcg_ex"), f"plan.template={plan.template}"),
+        # Its states share buffers, for which a program has no axis of jobs.
+        (
+            config.env.suite == "playground" and config.physics.impl != "jax",
+            f"env=playground with physics.impl={config.physics.impl}",
+        ),
         (config.env.randomize != "off", f"env.randomize={config.env.randomize}"),
         (config.eval.every is not None, "eval.every"),
         (config.wandb.mode != "off", f"wandb.mode={config.wandb.mode}"),

@@ -11,17 +11,22 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import mujoco
 import numpy as np
 import pytest
 from brax import envs
 from brax.envs.wrappers import training
+from flax import struct
+from mujoco import mjx
 from training_jobs import POINT_TASK
 
 from gmijax.cli.compose import compose
 from gmijax.errors import ConfigError
 from gmijax.learning.learner import make_learner
 from gmijax.sim.adapters.brax_interface import adapt, observation
+from gmijax.sim.adapters.playground import from_playground
 from gmijax.sim.adapters.to_brax import BraxEnv
+from gmijax.sim.interface import OVERFLOWS
 from gmijax.sim.registry import make_env
 from gmijax.sim.wrappers import env_keys, time_limit, training_env
 
@@ -207,6 +212,74 @@ def test_an_environment_of_brax_without_a_model_still_trains():
         state, out = jax.jit(batch.step)(batch.model, state, jnp.ones((NUM_ENVS, 1)))
     assert out.truncated.all()
     assert float(out.reward[0]) > 0.0
+
+
+BALL_ABOVE_FLOOR = """
+<mujoco>
+  <worldbody>
+    <geom type="plane" size="0 0 1"/>
+    <body name="ball" pos="0 0 0.2"><freejoint/><geom size="0.1"/></body>
+  </worldbody>
+</mujoco>
+"""
+
+
+class WarpBall:
+    """Playground's interface with MJX-Warp: a ball falls, and the episode ends on the floor."""
+
+    action_size, dt = 1, 0.02
+
+    def __init__(self) -> None:
+        self.mj_model = mujoco.MjModel.from_xml_string(BALL_ABOVE_FLOOR)
+        self._mjx_model = mjx.put_model(self.mj_model, impl="warp")
+
+    @property
+    def mjx_model(self) -> Any:
+        return self._mjx_model
+
+    def reset(self, rng: jax.Array) -> Any:
+        data = mjx.make_data(self.mj_model, impl="warp", naconmax=4, njmax=8)
+        height = jax.random.uniform(rng, minval=0.11, maxval=0.3)
+        data = mjx.forward(self.mjx_model, data.replace(qpos=data.qpos.at[2].set(height)))
+        return State(data, data.qpos, jnp.zeros(()), jnp.zeros(()), {}, {})
+
+    def step(self, state: Any, action: jax.Array) -> Any:
+        data = mjx.step(self.mjx_model, state.data)
+        has_landed = (data.qpos[2] < 0.1).astype(jnp.float32)
+        return state.replace(data=data, obs=data.qpos, done=has_landed)
+
+
+@struct.dataclass
+class State:
+    """As Playground's."""
+
+    data: Any
+    obs: Any
+    reward: Any
+    done: Any
+    metrics: Any
+    info: Any
+
+
+def test_states_of_playground_in_warp_start_over_one_by_one():
+    pytest.importorskip("warp")
+    env = from_playground(WarpBall(), name="ball")
+    batch = training_env(env)
+    state = batch.init(batch.model, env_keys(jax.random.key(0), 0, NUM_ENVS))
+    assert state.env.physics.data._impl.contact__dist.shape == (4,), "all worlds share it"
+    first, step, landed = state.env.obs, jax.jit(batch.step), np.zeros(NUM_ENVS, int)
+    for _ in range(150):
+        before = state
+        state, out = step(batch.model, state, jnp.zeros((NUM_ENVS, 1)))
+        landed += np.asarray(out.terminated)
+        assert int(out.overflowed["contact"]) == 0
+        over = np.asarray(out.terminated)
+        np.testing.assert_array_equal(state.env.obs[over], first[over])
+        assert (state.env.obs[~over, 2] < before.env.obs[~over, 2]).all()
+        assert np.isfinite(out.next_obs).all()
+    assert landed.min() >= 1
+    assert len(set(landed.tolist())) > 1, "the lower ones land more often"
+    assert batch.overflows == OVERFLOWS
 
 
 def test_an_environment_of_brax_brings_its_model_and_length():

@@ -14,12 +14,13 @@ from benchmarks import seeds
 from benchmarks.records import read_calls
 from benchmarks.seeds import Benchmark, Row, checked, row_of
 from gmijax.errors import ConfigError
+from gmijax.runs.folder import write_json
 
 
 def arguments(folder: Path, **changes: Any) -> argparse.Namespace:
     own: dict[str, Any] = {
         **{"overrides": ["env=ball_balance"], "row": [], "seeds": 4, "at_once": "2"},
-        "pack": "gmi",
+        **{"pack": "gmi", "play": 0},
         **{"deadline_s": None, "runs": folder / "runs", "analyse": [], "out": folder / "results"},
     }
     return argparse.Namespace(**{**own, **changes})
@@ -116,3 +117,24 @@ def test_no_row_is_begun_that_would_not_end_in_time(
     found = Benchmark(arguments(tmp_path, deadline_s=150.0), "ball_balance")
     found.run([Row(name, ()) for name in "abc"])
     assert [row["row"] for row in found.rows] == ["a", "b"]
+
+
+def test_checkpoints_are_played_after_their_row_and_told(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def run(command: Sequence[str], _: float) -> int:
+        if "benchmarks.played" not in command:
+            write_sweep(Path(command[-1].partition("=")[2]), {"0": 1.0, "1": 1.0})
+            return 0
+        assert command[-2:] == ["--episodes", "64"]
+        one = {"env_steps": 10, "mean_return": 5.0, "whole": 0.5, "metrics": {}}
+        write_json(Path(command[3]) / "played.json", {"000": {"last": one}})
+        return 0
+
+    monkeypatch.setattr(seeds, "run_command", run)
+    found = Benchmark(arguments(tmp_path, play=64), "ball_balance")
+    found.run([Row("a", ())])
+    first, second = (one["at_end"] for one in found.rows[0]["each"])
+    assert first == {"played/last/mean_return": 5.0, "played/last/whole": 0.5}
+    assert not second
+    assert "played/last/whole 0.5 (0.5 to 0.5)" in capsys.readouterr().out

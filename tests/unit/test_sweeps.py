@@ -316,6 +316,16 @@ def test_jobs_that_need_processes_of_their_own_are_not_packed(override: str, sai
         require_packable(SweepConfig(pack="vmap"), jobs)
 
 
+def test_playground_in_warp_is_not_packed() -> None:
+    task = ("env=playground", "env.name=CartpoleBalance")
+    in_warp, in_jax = (
+        jobs_of([compose(*task, impl, f"seed={seed}") for seed in range(2)])
+        for impl in ("physics.impl=warp", "physics.impl=jax")
+    )
+    assert most_together(SweepConfig(pack="auto"), in_warp[0], in_warp) == 1
+    assert most_together(SweepConfig(pack="auto"), in_jax[0], in_jax) == 2
+
+
 def test_too_many_jobs_for_the_machine_are_refused() -> None:
     with pytest.raises(ConfigError, match=r"sweep\.jobs_per_gpu=2000"):
         gpu_places(1, 2000)

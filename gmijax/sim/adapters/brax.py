@@ -9,7 +9,7 @@ from brax.envs.base import Env as BraxEnv
 
 from gmijax.config.schema import suggestion
 from gmijax.errors import ConfigError
-from gmijax.sim.adapters.brax_interface import adapt, require_jax
+from gmijax.sim.adapters.brax_interface import adapt
 from gmijax.sim.interface import Env
 
 EPISODE_LENGTH = 1000
@@ -23,7 +23,8 @@ def make(name: str, *, impl: str = "auto", max_envs: int | None = None) -> Env:
       ConfigError: an unknown name, or MJX-Warp.
     """
     del max_envs  # MJX-JAX has no limit.
-    require_jax(impl, "Brax")
+    if impl == "warp":
+        raise ConfigError("physics.impl=warp: Brax's tasks run in JAX; allowed are auto, jax")
     names = list(envs._envs)
     if name not in names:
         raise ConfigError(

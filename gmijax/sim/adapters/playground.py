@@ -8,33 +8,53 @@ from __future__ import annotations
 
 import difflib
 import importlib
+import math
 import subprocess
 from typing import Any
 
+import jax
+
 from gmijax.errors import ConfigError
-from gmijax.sim.adapters.brax_interface import adapt, require_jax
+from gmijax.sim.adapters.brax_interface import adapt
 from gmijax.sim.adapters.checks import attempt
+from gmijax.sim.impl import choose_impl
 from gmijax.sim.interface import Env
+from gmijax.sim.physics import which_overflowed
+from gmijax.types import Array
 
 
 def make(name: str, *, impl: str = "auto", max_envs: int | None = None) -> Env:
-    """Makes one of Playground's environments with its default configuration, in MJX-JAX.
+    """Makes one of Playground's environments with its default configuration.
+
+    Args:
+      name: one of `mujoco_playground.registry.ALL_ENVS`.
+      impl: `auto`, `jax` or `warp`.
+      max_envs: most worlds at once; MJX-Warp's buffer of contacts is for so many.
 
     Raises:
-      ConfigError: an unknown name, MJX-Warp, models that could not be downloaded, or one that
+      ConfigError: an unknown name, models that could not be downloaded, or one that
         Playground cannot make with the installed version of MuJoCo.
     """
-    del max_envs  # MJX-JAX has no limit.
-    require_jax(impl, "Playground")
     # By name: it is not installed where gmijax is checked.
     registry = attempt("env=playground", importlib.import_module, "mujoco_playground").registry
     if name not in registry.ALL_ENVS:
         raise ConfigError(_unknown(name, registry.ALL_ENVS))
     config = registry.get_default_config(name)
     if "impl" in config:
-        config.impl = "jax"
+        config.impl, _ = choose_impl(impl, jax.default_backend(), f"playground/{name}")
+        config.naconmax = math.ceil(config.naconmax * _growth(registry, name, max_envs))
     theirs = attempt(f"env.name={name}", _load, registry, name, config)
     return from_playground(theirs, name=f"playground/{name}", episode_length=config.episode_length)
+
+
+def _growth(registry: Any, name: str, max_envs: int | None) -> float:
+    """How much larger a buffer for all worlds must be than theirs, which is for their training."""
+    suites = ("locomotion", "manipulation", "dm_control_suite")
+    suite = next((one for one in suites if name in getattr(registry, one).ALL_ENVS), None)
+    if max_envs is None or suite is None:
+        return 1.0
+    settings = importlib.import_module(f"mujoco_playground.config.{suite}_params")
+    return max(1.0, max_envs / settings.brax_ppo_config(name).num_envs)
 
 
 def _load(registry: Any, name: str, config: Any) -> Any:
@@ -49,14 +69,33 @@ def _load(registry: Any, name: str, config: Any) -> Any:
 
 
 def from_playground(theirs: Any, *, name: str, episode_length: int = 1000) -> Env:
-    """An `MjxEnv`, without wrappers, as one of ours; see `brax_interface.adapt`."""
+    """An `MjxEnv`, without wrappers, as one of ours; see `brax_interface.adapt`.
+
+    In MJX-Warp `theirs` is changed, see `without_warnings`.
+    """
+    is_warp = theirs.mjx_model.impl.value == "warp"
     return adapt(
-        theirs,
+        without_warnings(theirs) if is_warp else theirs,
         name=name,
         episode_length=episode_length,
         mj_model=theirs.mj_model,
         qpos=lambda state: state.data.qpos,
+        overflow=_overflow if is_warp else None,
     )
+
+
+def without_warnings(theirs: Any) -> Any:
+    """`theirs` in MJX-Warp, changed not to print.
+
+    Else there is a line for every world and step that reaches the limit of the solver's
+    iterations, which their models mean to reach.
+    """
+    theirs._mjx_model = theirs.mjx_model.tree_replace({"opt._impl.warn_overflow": 0})
+    return theirs
+
+
+def _overflow(state: Any) -> Array:
+    return which_overflowed(state.data._impl.overflow)
 
 
 def _menagerie_folder() -> str:
