@@ -14,9 +14,9 @@ from benchmarks.evaluation.figures import (
     origin,
     shown,
 )
-from benchmarks.records import RESULTS, Call, read_calls
+from benchmarks.records import RESULTS, Call, calls_by_date
 
-SWEEPS = RESULTS / "sweeps-nvidia-h200.json"
+PATTERN = "sweeps-nvidia-*.json"
 ONE_AFTER_ANOTHER = "1 at once, auto"
 HEAD = (
     "at once | sweeps: | trainings per hour: | over one after another: | over plain sharing: | "
@@ -27,14 +27,14 @@ Run: TypeAlias = Mapping[str, Any]
 
 
 class SameTrainings(NamedTuple):
-    """Sweeps of the same trainings; a call has time for one of each way or so.
+    """Sweeps of the same trainings on the same GPU; a call has time for one of each way or so.
 
     Attributes:
-      calls: that ran them.
+      calls: that ran them, as lines of Markdown.
       runs: of each of the calls, those that succeeded, by way.
     """
 
-    calls: list[Call]
+    calls: list[str]
     runs: list[dict[str, list[Run]]]
 
     def rates(self, key: str = "trainings_per_hour") -> dict[str, Figure]:
@@ -64,9 +64,9 @@ class SameTrainings(NamedTuple):
 
 
 def same_trainings() -> dict[str, SameTrainings]:
-    """By what the trainings are, in Markdown; first those of the file's first call."""
+    """By what the trainings are and where they ran, in Markdown; in the order of first calls."""
     found: dict[str, SameTrainings] = {}
-    for call in read_calls(SWEEPS) if SWEEPS.exists() else ():
+    for call, path in calls_by_date(RESULTS, PATTERN):
         here: dict[str, dict[str, list[Run]]] = {}
         for run in call.results["runs"]:
             at_once, backend, *tasks = run["way"].split(", ")
@@ -75,13 +75,13 @@ def same_trainings() -> dict[str, SameTrainings]:
                 by_way.setdefault(f"{at_once}, {backend}", []).append(run)
         for what, by_way in here.items():
             same = found.setdefault(what, SameTrainings([], []))
-            same.calls.append(call)
+            same.calls.append(f"- {link(path.name)}: {origin(call)}")
             same.runs.append(by_way)
     return found
 
 
 def first_gains() -> dict[str, Figure]:
-    """What the trainings of the file's first call gain at once, over one after another."""
+    """What the trainings of the first call gain at once, over one after another."""
     return next((same.gains() for same in same_trainings().values()), {})
 
 
@@ -102,8 +102,7 @@ def sweeps() -> list[str]:
             ]
             for way, rate in sorted(same.rates().items(), key=lambda row: _order(row[0]))
         ]
-        calls = [f"- {link(SWEEPS.name)}: {origin(call)}" for call in same.calls]
-        lines += [what, "", *markdown(HEAD, rows), "", *calls, ""]
+        lines += [what, "", *markdown(HEAD, rows), "", *same.calls, ""]
     return lines[:-1] or [
         f"Trainings per hour of a sweep: {NOT_MEASURED} (`python -m benchmarks.sweeps`)."
     ]
@@ -114,7 +113,7 @@ def _described(call: Call, tasks: list[str]) -> str:
     overrides = ", ".join(f"`{one}`" for one in sorted(call.settings["overrides"]))
     mix = f" of {tasks[0].replace(',', ', ')}" if tasks else ""
     compiled = "programs compiled before" if call.settings["warm"] else "each sweep compiles"
-    return f"{call.settings['jobs']} trainings{mix} with {overrides}; {compiled}."
+    return f"{call.settings['jobs']} trainings{mix} with {overrides}; {compiled}; {call.device}."
 
 
 def _order(way: str) -> tuple[str, int]:

@@ -91,25 +91,18 @@ COMPARISONS: Mapping[str, Comparison] = MappingProxyType(
             ),
             unrolls=16,
         ),
-        # Playground's own settings (mujoco_playground/config), version 0.2.0.
+        # Playground's own settings, but for the length.
         "Playground's CartpoleBalance": Comparison(
             (
                 *("env=playground", "env.name=CartpoleBalance", "physics.impl=warp"),
-                *(*_LIKE_BRAX, *_BRAX_NETWORKS),
-                *("num_envs=2048", "algo.unroll_length=480", "algo.num_updates_per_batch=16"),
-                *("algo.entropy_cost=1e-2", "algo.reward_scaling=10", "algo.discounting=0.995"),
-                *("algo.learning_rate=1e-3", "num_timesteps=20000000"),
+                *("tuned=dm_control_ppo", "num_timesteps=20000000"),
             ),
             unrolls=16,
         ),
         "Playground's Go1JoystickFlatTerrain": Comparison(
             (
                 *("env=playground", "env.name=Go1JoystickFlatTerrain", "physics.impl=warp"),
-                *_LIKE_BRAX,
-                "algo.policy_hidden_layer_sizes=[512,256,128]",
-                "algo.value_hidden_layer_sizes=[512,256,128]",
-                *("num_envs=8192", "algo.unroll_length=20", "algo.num_updates_per_batch=4"),
-                *("algo.entropy_cost=1e-2", "algo.max_grad_norm=1", "num_timesteps=5000000"),
+                *("tuned=locomotion_ppo", "num_timesteps=5000000"),
             )
         ),
         # The nearest that there is: walking to a commanded velocity on flat ground.

@@ -26,6 +26,7 @@ from gmijax.learning.learner import (
     TrainState,
     acting_moments,
     acting_weights,
+    finish_iteration,
     pack_weights,
     rate_figures,
 )
@@ -190,8 +191,8 @@ def update(
     """See `make_update`."""
     batch, weight = weighted
     targets = batch_targets(learner, state, batch, weight)
-    observed = without_outliers(acting_moments(learner, state), batch.state)
-    everyone = peers.gather((moments_of(observed, 2), *targets.fit))
+    obs = without_outliers(acting_moments(learner, state), batch.state)
+    everyone = peers.gather((moments_of(obs, 2), *targets.fit))
     seen, target, error = map(merge_all, everyone)
     if state.value_moments is not None:
         state = state._replace(value_moments=merge(state.value_moments, target))
@@ -201,9 +202,7 @@ def update(
         learner, peers, gradients, state, batch, targets, order, after=everyone
     )
     # Counts the batch, which makes a new version of the policy, and takes in its statistics.
-    state = state._replace(
-        obs_moments=merge(state.obs_moments, seen), iteration=state.iteration + 1
-    )
+    state = finish_iteration(learner, state, seen)
     weights = pack_weights(acting_weights(learner, state))
     means = jax.tree.map(jnp.mean, losses)
     explained = explained_variance(target, error)

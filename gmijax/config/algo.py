@@ -66,6 +66,11 @@ class ActorCriticConfig(KeyGroup):
     obs_std_floor: float = doc(
         "smallest standard deviation that observations are divided by", default=1e-4, low=1e-4
     )
+    preserve_outputs: bool = doc(
+        "when the statistics of observations change, the first layers of both networks change "
+        "with them, so that policy and values stay what they were",
+        default=False,
+    )
     value_obs_key: Literal["auto", "state", "privileged_state"] = doc(
         "the value function sees what the policy does (state), or also what the task has for it "
         "alone (privileged_state); auto: that, where there is any",

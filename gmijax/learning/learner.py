@@ -17,7 +17,14 @@ from jax.flatten_util import ravel_pytree
 from gmijax.config import ADAPTIVE_LEARNING_RATE_RANGE, AlgoConfig
 from gmijax.errors import ConfigError
 from gmijax.learning.distributions import DISTRIBUTIONS
-from gmijax.learning.normalize import Moments, from_units, no_samples, with_std_floor
+from gmijax.learning.normalize import (
+    Moments,
+    change_of_units,
+    from_units,
+    merge,
+    no_samples,
+    with_std_floor,
+)
 from gmijax.learning.policy import ActorCritic, ActorCriticParams, Mlp
 from gmijax.sim.interface import EnvSpec
 from gmijax.types import Array, PRNGKey, PyTree
@@ -114,6 +121,23 @@ def acting_moments(learner: Learner, state: TrainState) -> Moments:
     if learner.config.normalize_observations:
         return with_std_floor(state.obs_moments, learner.config.obs_std_floor)
     return no_samples(state.obs_moments.mean.shape)
+
+
+def finish_iteration(learner: Learner, state: TrainState, seen: Moments) -> TrainState:
+    """`state` after an iteration, with the statistics of what was `seen` in it.
+
+    Normalised observations change with the statistics, and with them what policy and value
+    function make of the same observation. With `preserve_outputs` their first layers make up for
+    it, as Pop-Art's last one does for targets (arXiv:1602.07714); but not for the clip of
+    normalised observations, nor where there were no statistics before.
+    """
+    after = state._replace(
+        obs_moments=merge(state.obs_moments, seen), iteration=state.iteration + 1
+    )
+    if not learner.config.preserve_outputs:
+        return after
+    units = change_of_units(acting_moments(learner, state), acting_moments(learner, after))
+    return after._replace(params=learner.networks.with_inputs(state.params, *units))
 
 
 class ActingWeights(NamedTuple):

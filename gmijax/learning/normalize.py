@@ -115,6 +115,15 @@ def from_units(moments: Moments, samples: Array) -> Array:
     return moments.mean + std_of(moments) * samples
 
 
+def change_of_units(old: Moments, new: Moments) -> tuple[Array, Array]:
+    """[S] each, `scale` and `shift`, with in_units(old, x) = scale * in_units(new, x) + shift.
+
+    1 and 0 where `old` are no samples: there was no unit.
+    """
+    scale, shift = std_of(new) / std_of(old), in_units(old, new.mean)
+    return jnp.where(old.count > 0, scale, 1.0), jnp.where(old.count > 0, shift, 0.0)
+
+
 def normalize(moments: Moments, samples: Array) -> Array:
     """`samples` [..., S] in standard deviations from the mean, clipped to +-OBS_CLIP.
 

@@ -118,6 +118,22 @@ class ActorCritic(NamedTuple):
             log_std=jnp.full((self.distribution.action_size,), jnp.log(self.init_noise_std)),
         )
 
+    def with_inputs(
+        self, params: ActorCriticParams, scale: Array, shift: Array
+    ) -> ActorCriticParams:
+        """Weights that make of x what `params` make of `scale` * x + `shift`, [O] each."""
+
+        def changed(network: PyTree) -> PyTree:
+            first = network["params"]["Dense_0"]
+            kernel, size = first["kernel"], first["kernel"].shape[0]
+            new = {
+                "kernel": scale[:size, None] * kernel,
+                "bias": first["bias"] + shift[:size] @ kernel,
+            }
+            return {**network, "params": {**network["params"], "Dense_0": new}}
+
+        return params._replace(policy=changed(params.policy), value=changed(params.value))
+
     def output(self, params: ActorCriticParams, obs: Array) -> Array:
         """What `distribution` takes [..., H], for normalised observations [..., O]."""
         if self.actor_obs_size is not None:

@@ -21,6 +21,7 @@ from gmijax.learning.learner import (
     Learner,
     TrainState,
     acting_weights,
+    finish_iteration,
     policy_figures,
     rate_figures,
     state_values,
@@ -191,9 +192,7 @@ def learn(
         learner, peers, gradients, state, samples, context, order, after=everyone
     )
     means = jax.tree.map(jnp.mean, losses)
-    state = state._replace(
-        obs_moments=merge(state.obs_moments, stats.obs), iteration=state.iteration + 1
-    )
+    state = finish_iteration(learner, state, stats.obs)
     figures = {
         **policy_figures(state),
         "value/explained_variance": explained_variance(stats.target, stats.advantage),

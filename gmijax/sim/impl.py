@@ -80,4 +80,6 @@ def choose_impl(
         return "jax", "warp-lang is not installed"
     if task in ON_GPU:
         return "warp", f"the faster one for {task} on a GPU"
+    if task is not None and task.startswith("playground/"):
+        return "warp", "what MuJoCo Playground itself chooses"
     return "jax", "not tuned for MJX-Warp; ask for it with physics.impl=warp"

@@ -25,10 +25,12 @@ from gmijax.learning.learner import (
     acting_weights,
     adapted_learning_rate,
     apply_gradients,
+    finish_iteration,
     init_learner,
     make_learner,
+    state_values,
 )
-from gmijax.learning.normalize import std_of
+from gmijax.learning.normalize import moments_of, normalize, std_of
 from gmijax.learning.updates import exchange_size, minibatch_order, run_updates
 from gmijax.partition.layout import Layout
 from gmijax.ppo.loop import warm_up
@@ -335,3 +337,33 @@ def _check_no_number_is_written_twice(iteration) -> None:
         source = {name: re.findall(r"%[\w.\-]+", made_by[name])[1] for name in copied}
         results = [source.get(name, name) for name in results]
     assert len(set(results)) == count
+
+
+@pytest.mark.parametrize("preserved", [True, False])
+def test_outputs_may_stay_what_they_were_when_the_statistics_change(
+    config, preserved: bool
+) -> None:
+    spec = ENV.spec._replace(obs_size=3, actor_obs_size=2)
+    mine = make_learner(spec, dataclasses.replace(config, preserve_outputs=preserved))
+    state = init_learner(mine, 3, jax.random.key(0))
+    samples = jax.random.normal(jax.random.key(1), (2, 64, 3))
+
+    def outputs(state, obs):
+        weights = acting_weights(mine, state)
+        seen = normalize(weights.moments, obs)
+        return mine.networks.output(weights.params, seen), state_values(
+            mine.networks, weights, seen
+        )
+
+    # A first iteration gives observations their unit: nothing is to be kept.
+    before = finish_iteration(mine, state, moments_of(samples[0], 1))
+    jax.tree.map(np.testing.assert_array_equal, before.params, state.params)
+    after = finish_iteration(mine, before, moments_of(5.0 + 3.0 * samples[1], 1))
+    assert int(after.iteration) == 2
+    assert float(after.obs_moments.count) == 128
+    old, new = outputs(before, samples[0]), outputs(after, samples[0])
+    if preserved:
+        _close(old, new, atol=1e-5)
+    else:
+        for one, other in zip(old, new, strict=True):
+            assert float(jnp.max(jnp.abs(one - other))) > 1e-3

@@ -39,6 +39,8 @@ PENDULUM_OVER_FLOOR = """
         ("auto", "cpu", "ant", "jax", "slow on cpu"),
         ("auto", "gpu", "ant", "warp", "the faster one for ant"),
         ("auto", "cuda", "theirs", "jax", "physics.impl=warp"),
+        ("auto", "cuda", "playground/CheetahRun", "warp", "Playground itself"),
+        ("auto", "cpu", "playground/CheetahRun", "jax", "slow on cpu"),
         ("auto", "gpu", None, "jax", "physics.impl=warp"),
         ("jax", "gpu", "ant", "jax", "asked for"),
         ("warp", "cpu", None, "warp", "asked for"),
