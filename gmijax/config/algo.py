@@ -47,11 +47,6 @@ class ActorCriticConfig(KeyGroup):
         default=ADAPTIVE_LEARNING_RATE_RANGE,
         positive=True,
     )
-    adapt_every: Literal["minibatch", "epoch"] = doc(
-        "when the adaptive schedule acts: with every minibatch, or with the last one of an epoch, "
-        "on the mean divergence over it",
-        default="minibatch",
-    )
     desired_kl: float = doc("target of the adaptive schedule", positive=True)
     max_grad_norm: float = doc("gradients are scaled down to this global norm", positive=True)
     reward_scaling: float = doc(
@@ -102,13 +97,6 @@ class ActorCriticConfig(KeyGroup):
         "their episodes in step; those episodes are not counted in returns",
         default=False,
     )
-    keep_random_ep_len: bool = doc(
-        "with init_at_random_ep_len: the time limits of a world stay an episode length apart, "
-        "however its episodes end, so that worlds do not come into step as they learn not to "
-        "fail; an episode that begins after a failure is cut at the next limit, and not counted "
-        "in returns",
-        default=False,
-    )
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -127,11 +115,6 @@ class ActorCriticConfig(KeyGroup):
             raise ConfigError(
                 f"algo.init_noise_std={self.init_noise_std!r}: must be at least "
                 f"algo.min_noise_std={self.min_noise_std!r}"
-            )
-        if self.keep_random_ep_len and not self.init_at_random_ep_len:
-            raise ConfigError(
-                "algo.keep_random_ep_len=true: has nothing to keep with "
-                "algo.init_at_random_ep_len=false"
             )
         low, high = limits
         if self.learning_rate_schedule == "adaptive_kl" and not low <= self.learning_rate <= high:

@@ -33,6 +33,9 @@ C = TypeVar("C", bound=AlgoConfig)
 
 _LEARNING_RATE_STEP = 1.5
 _UNMOVED_KL = 1e-6
+_MOVING = 10.0
+"""An input moves if its standard deviation is at least so many times `obs_std_floor`. Nothing was
+learnt with the weights of one that does not: when it begins to, they must not be preserved."""
 
 
 class TrainState(NamedTuple):
@@ -129,14 +132,19 @@ def finish_iteration(learner: Learner, state: TrainState, seen: Moments) -> Trai
     Normalised observations change with the statistics, and with them what policy and value
     function make of the same observation. With `preserve_outputs` their first layers make up for
     it, as Pop-Art's last one does for targets (arXiv:1602.07714); but not for the clip of
-    normalised observations, nor where there were no statistics before.
+    normalised observations, nor where there were no statistics before, nor for inputs that hardly
+    move (`_MOVING`).
     """
     after = state._replace(
         obs_moments=merge(state.obs_moments, seen), iteration=state.iteration + 1
     )
     if not learner.config.preserve_outputs:
         return after
-    units = change_of_units(acting_moments(learner, state), acting_moments(learner, after))
+    units = change_of_units(
+        acting_moments(learner, state),
+        acting_moments(learner, after),
+        _MOVING * learner.config.obs_std_floor,
+    )
     return after._replace(params=learner.networks.with_inputs(state.params, *units))
 
 

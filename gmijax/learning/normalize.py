@@ -115,13 +115,14 @@ def from_units(moments: Moments, samples: Array) -> Array:
     return moments.mean + std_of(moments) * samples
 
 
-def change_of_units(old: Moments, new: Moments) -> tuple[Array, Array]:
+def change_of_units(old: Moments, new: Moments, least_std: float) -> tuple[Array, Array]:
     """[S] each, `scale` and `shift`, with in_units(old, x) = scale * in_units(new, x) + shift.
 
-    1 and 0 where `old` are no samples: there was no unit.
+    1 and 0 where a standard deviation is below `least_std`, and where `old` are no samples.
     """
     scale, shift = std_of(new) / std_of(old), in_units(old, new.mean)
-    return jnp.where(old.count > 0, scale, 1.0), jnp.where(old.count > 0, shift, 0.0)
+    known = (old.count > 0) & (jnp.minimum(std_of(old), std_of(new)) >= least_std)
+    return jnp.where(known, scale, 1.0), jnp.where(known, shift, 0.0)
 
 
 def normalize(moments: Moments, samples: Array) -> Array:

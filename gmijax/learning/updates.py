@@ -63,32 +63,14 @@ def run_updates(
     Returns:
       The new state; losses and learning rates of all updates, with a leading axis.
     """
-    config = learner.config
-
-    def mean_gradient(state: TrainState, indices: Array) -> tuple[Any, Any]:
-        return peers.mean(gradients(learner, state.params, data, context, indices), after=after)
 
     def update(state: TrainState, indices: Array) -> tuple[TrainState, tuple[Any, Array]]:
-        grads, losses = mean_gradient(state, indices)
+        own = gradients(learner, state.params, data, context, indices)
+        grads, losses = peers.mean(own, after=after)
         state = apply_gradients(learner, state, grads, losses.steering_kl)
         return state, (losses, state.learning_rate)
 
-    def update_in_epoch(
-        before: tuple[TrainState, Array], step: tuple[Array, Array]
-    ) -> tuple[tuple[TrainState, Array], tuple[Any, Array]]:
-        (state, total), (indices, is_last) = before, step
-        grads, losses = mean_gradient(state, indices)
-        total += losses.steering_kl
-        kl = jnp.where(is_last, total / config.num_minibatches, 0.0)  # 0 steers nothing.
-        state = apply_gradients(learner, state, grads, kl)
-        return (state, jnp.where(is_last, 0.0, total)), (losses, state.learning_rate)
-
-    if config.adapt_every == "minibatch":
-        state, (losses, rates) = jax.lax.scan(update, state, order)
-    else:
-        is_last = (jnp.arange(len(order)) + 1) % config.num_minibatches == 0
-        begun = state, jnp.zeros(())
-        (state, _), (losses, rates) = jax.lax.scan(update_in_epoch, begun, (order, is_last))
+    state, (losses, rates) = jax.lax.scan(update, state, order)
     return state, losses, rates
 
 

@@ -51,7 +51,7 @@ class BatchState(NamedTuple):
       return_sum: [N] float32, return of the running episode so far.
       term_sums: [N] float32 each, what every term has added to it.
       head_start: [N] int32, steps by which the running episode of a world is shorter than its
-        time limit: the first one, and with `keep_random_ep_len` those after a failure; else 0.
+        time limit: the first one; else 0.
     """
 
     env: EnvState
@@ -195,9 +195,7 @@ def overflowed(env: Env, state: EnvState) -> dict[str, Array]:
     return dict(zip(OVERFLOWS, counts, strict=True))
 
 
-def training_env(
-    env: Env, *, random_ep_len: bool = False, keep_random_ep_len: bool = False
-) -> BatchedEnv:
+def training_env(env: Env, *, random_ep_len: bool = False) -> BatchedEnv:
     """N auto-resetting copies of `env`, with statistics of the episodes that end.
 
     Args:
@@ -205,9 +203,6 @@ def training_env(
       random_ep_len: the first episode of a world is as long as if it had begun before, by a
         random part of the time limit. Otherwise worlds that do not end by themselves all end in
         the same step, and all samples of an update are of the same moment of an episode.
-      keep_random_ep_len: an episode that ends by itself leaves the rest of its time to the next
-        one. Otherwise worlds that fail at first lose their random part, and all that learn not
-        to at about the same time are in step from then on.
 
     `init` raises ConfigError for more environments than `env.max_envs`.
     """
@@ -250,9 +245,6 @@ def training_env(
         )
         ended = stepped.terminated | stepped.truncated
         head_start = jnp.where(ended, 0, state.head_start)
-        if keep_random_ep_len:
-            used = state.head_start + stepped.steps
-            head_start = jnp.where(ended & (used < env.spec.episode_length), used, head_start)
         after = BatchState(auto_reset(batched, model, stepped), returns, terms, head_start)
         return after, output
 

@@ -158,12 +158,8 @@ def environments(config: TrainConfig, place: int) -> BatchedEnv:
     from gmijax.learning.start import worlds_of
     from gmijax.sim.wrappers import training_env
 
-    algo = config.algo
-    return training_env(
-        worlds_of(config, place),
-        random_ep_len=algo.init_at_random_ep_len,
-        keep_random_ep_len=algo.keep_random_ep_len,
-    )
+    random_ep_len = config.algo.init_at_random_ep_len
+    return training_env(worlds_of(config, place), random_ep_len=random_ep_len)
 
 
 def _trainers_reducer(

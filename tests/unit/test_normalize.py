@@ -5,6 +5,8 @@ import pytest
 
 from gmijax.learning.normalize import (
     OBS_CLIP,
+    change_of_units,
+    in_units,
     merge,
     merge_all,
     moments_of,
@@ -85,3 +87,17 @@ def test_observations_pass_unchanged_without_samples() -> None:
     # Without normalisation, and until there are statistics: their unit is not known.
     obs = jnp.array([1.0, -200.0, 3e4, 0.0])
     np.testing.assert_array_equal(normalize(no_samples((4,)), obs), obs)
+
+
+def test_a_change_of_units_keeps_what_moves_and_leaves_alone_what_does_not() -> None:
+    samples = jax.random.normal(jax.random.key(0), (2, 50, 3)) * jnp.array([1.0, 5.0, 1e-3])
+    old = moments_of(samples[0], 1)
+    new = merge(old, moments_of(2.0 + 3.0 * samples[1], 1))
+    scale, shift = change_of_units(old, new, least_std=0.01)
+    x = samples[1]
+    kept = scale * in_units(new, x) + shift
+    np.testing.assert_allclose(kept[:, :2], in_units(old, x)[:, :2], rtol=1e-4, atol=1e-4)
+    assert (float(scale[2]), float(shift[2])) == (1.0, 0.0)
+    scale, shift = change_of_units(no_samples((3,)), new, least_std=0.01)
+    assert scale.tolist() == [1.0] * 3
+    assert shift.tolist() == [0.0] * 3

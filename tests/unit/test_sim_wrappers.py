@@ -22,8 +22,8 @@ from gmijax.sim.wrappers import (
 PUSH = 0.5
 
 
-def compiled(env: Env, *, random_ep_len: bool = False, keep: bool = False) -> BatchedEnv:
-    batched = training_env(env, random_ep_len=random_ep_len, keep_random_ep_len=keep)
+def compiled(env: Env, *, random_ep_len: bool = False) -> BatchedEnv:
+    batched = training_env(env, random_ep_len=random_ep_len)
     return batched._replace(init=jax.jit(batched.init), step=jax.jit(batched.step))
 
 
@@ -137,25 +137,6 @@ def test_first_episodes_end_at_random_times_and_do_not_count():
         assert int(out.finished.count) == int(out.terminated.sum())
     assert not state.head_start.any()
     assert state.env.steps.tolist() == head_start.tolist()
-
-
-def test_kept_time_limits_stay_an_episode_length_apart_whatever_fails_between():
-    # It ends by itself after three steps, so that each five steps have a whole episode,
-    # which counts, and one of two steps, which does not.
-    env = compiled(walker(5), random_ep_len=True, keep=True)
-    state = start(env, 64)
-    first = np.asarray(state.head_start)
-    assert set(first.tolist()) == {0, 1, 2, 3, 4}
-    for number in range(1, 26):
-        state, out = step(env, state)
-        in_window = (first + number) % 5
-        # Where the third step is at the limit it has ended by itself.
-        at_limit = (in_window == 0) & ~((first == 2) & (number == 3))
-        np.testing.assert_array_equal(out.truncated, at_limit)
-        whole = (in_window == 3) & ((first == 0) | (first + number > 5))
-        assert int(out.finished.count) == whole.sum()
-        assert int(out.finished.length_sum) == 3 * whole.sum()
-        np.testing.assert_array_equal((state.env.steps + state.head_start) % 5, in_window)
 
 
 def test_worlds_with_bad_numbers_end_without_reward_and_start_over():
