@@ -5,12 +5,11 @@ Each takes one world and returns one, as `gmijax.sim.wrappers.time_limit` does.
 
 from __future__ import annotations
 
-from functools import partial
-
 import jax
 import jax.numpy as jnp
 
 from gmijax.sim.interface import Env, EnvState
+from gmijax.sim.wrappers import select_world
 from gmijax.types import Array, PRNGKey, PyTree
 
 
@@ -33,7 +32,7 @@ def action_repeat(env: Env, times: int) -> Env:
             terms = {name: before.reward_terms[name] + x for name, x in after.reward_terms.items()}
             after = after._replace(reward=before.reward + after.reward, reward_terms=terms)
             ended = before.terminated | before.truncated
-            return jax.tree.map(partial(jnp.where, ended), before, after), None
+            return select_world(ended, before, after), None
 
         zero, false = jnp.zeros(()), jnp.zeros((), bool)
         start = state._replace(

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import partial
-from typing import NamedTuple, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -139,19 +139,25 @@ def auto_reset(env: Env, model: PyTree, state: EnvState) -> EnvState:
     return select_worlds(ended, fresh, state)
 
 
-def select_worlds(chosen: Array, new: T, old: T) -> T:
-    """`new` in the `chosen` worlds [N], else `old`; leaves have a leading axis [N].
+def select_world(chosen: Array, new: T, old: T) -> T:
+    """`new` if the world is `chosen` [] bool, else `old`.
 
-    One that has not is shared by all worlds, as MJX-Warp's contacts are in states of MuJoCo
-    Playground: it stays as it is, for every step writes it anew.
+    What has a method `where` selects for itself: `mjx.Data` in states of MuJoCo Playground. In
+    MJX-Warp it holds contacts that all worlds share.
     """
 
-    def select(a: Array, b: Array) -> Array:
-        if b.shape[:1] != chosen.shape:
-            return b
-        return jnp.where(jnp.expand_dims(chosen, range(1, b.ndim)), a, b)
+    def select(a: Any, b: Any) -> Any:
+        return b.where(chosen, a) if _selects_itself(b) else jnp.where(chosen, a, b)
 
-    return jax.tree.map(select, new, old)
+    return jax.tree.map(select, new, old, is_leaf=_selects_itself)
+
+
+def _selects_itself(node: Any) -> bool:
+    return hasattr(type(node), "where")
+
+
+select_worlds = jax.vmap(select_world)
+"""`select_world` of N worlds."""
 
 
 def cut_first_episodes(spec: EnvSpec, before: BatchState, state: EnvState) -> EnvState:

@@ -26,6 +26,7 @@ from gmijax.learning.learner import make_learner
 from gmijax.sim.adapters.brax_interface import adapt, observation
 from gmijax.sim.adapters.playground import from_playground
 from gmijax.sim.adapters.to_brax import BraxEnv
+from gmijax.sim.interaction import action_repeat
 from gmijax.sim.interface import OVERFLOWS
 from gmijax.sim.registry import make_env
 from gmijax.sim.wrappers import env_keys, time_limit, training_env
@@ -261,14 +262,15 @@ class State:
     info: Any
 
 
-def test_states_of_playground_in_warp_start_over_one_by_one():
+@pytest.mark.parametrize("times", [1, 2])
+def test_states_of_playground_in_warp_start_over_one_by_one(times: int):
     pytest.importorskip("warp")
-    env = from_playground(WarpBall(), name="ball")
+    env = action_repeat(from_playground(WarpBall(), name="ball"), times)
     batch = training_env(env)
     state = batch.init(batch.model, env_keys(jax.random.key(0), 0, NUM_ENVS))
     assert state.env.physics.data._impl.contact__dist.shape == (4,), "all worlds share it"
     first, step, landed = state.env.obs, jax.jit(batch.step), np.zeros(NUM_ENVS, int)
-    for _ in range(150):
+    for _ in range(150 // times):
         before = state
         state, out = step(batch.model, state, jnp.zeros((NUM_ENVS, 1)))
         landed += np.asarray(out.terminated)

@@ -11,13 +11,7 @@ from toy_env import walker
 
 from gmijax.errors import ConfigError
 from gmijax.sim.interface import Env, EnvState
-from gmijax.sim.wrappers import (
-    BatchedEnv,
-    env_keys,
-    select_worlds,
-    split_keys,
-    training_env,
-)
+from gmijax.sim.wrappers import BatchedEnv, env_keys, split_keys, training_env
 
 PUSH = 0.5
 
@@ -58,15 +52,6 @@ def test_programs_with_the_same_environments_share_a_trace():
     for scale in (1.0, 2.0):
         jax.jit(lambda s, a, by=scale: env.step(None, s, by * a)).lower(state, actions)
     assert len(calls) == 1
-
-
-def test_what_all_worlds_share_is_not_selected():
-    new, old = (
-        {"own": jnp.full((3, 2), value), "shared": jnp.full((4,), value)} for value in (1.0, 0.0)
-    )
-    kept = select_worlds(jnp.array([True, False, True]), new, old)
-    assert kept["own"][:, 0].tolist() == [1.0, 0.0, 1.0]
-    assert not kept["shared"].any()
 
 
 def test_keys_of_environments_are_those_of_fold_in():
