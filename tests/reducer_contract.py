@@ -97,5 +97,5 @@ def check_contract(
             assert (result["error"], result.get("peer")) == ("PeerLost", case.victim), result
         else:
             assert result["error"] == "CollectiveTimeout", result
-            assert result["missing"] == [case.victim]
+            assert result["missing"] == [case.victim], result
         assert ", step" in result["message"]

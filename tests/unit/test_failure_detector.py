@@ -93,6 +93,13 @@ def test_one_that_gave_up_for_a_stuck_rank_points_at_it(blocks: list[SharedBlock
         first.watch(NEVER)
 
 
+def test_one_that_gave_up_and_still_runs_is_not_named(blocks: list[SharedBlock]) -> None:
+    first = barriers_of(blocks, 0.9, 3.0, 3.0)[0]
+    blocks[1].blamed[1] = 3
+    with pytest.raises(CollectiveTimeout, match=r"for GMIs \[2\]"):
+        first.watch(NEVER)
+
+
 @pytest.mark.parametrize(
     "error",
     [

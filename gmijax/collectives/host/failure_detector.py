@@ -56,8 +56,12 @@ class FailureDetector:
             self.give_up(left)
 
     def give_up(self, missing: list[int]) -> NoReturn:
-        """Raises CollectiveTimeout for those of `missing` who do not wait themselves."""
-        self._raise_timeout(self.silent(missing) or missing)
+        """Raises CollectiveTimeout for those of `missing` who do not wait themselves.
+
+        A rank that has given up and is still on its way out is silent too, and not the cause.
+        """
+        silent = self.silent(missing) or missing
+        self._raise_timeout([peer for peer in silent if not self._block.blamed[peer]] or silent)
 
     def silent(self, missing: list[int]) -> list[int]:
         """Those of `missing` who do not wait themselves, as far as this rank has heard."""
