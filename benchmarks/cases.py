@@ -54,6 +54,26 @@ def _throughput(task: str, impl: str, num_envs: int) -> Case:
     )
 
 
+PLANS = ((1, 65536), (4, 16384), (2, 32768), (1, 32768))
+"""GMIs on one GPU and environments in each, where it is near saturation."""
+
+
+def _plan(task: str, gmis: int, num_envs: int) -> Case:
+    return Case(
+        f"{task} {gmis} x {num_envs}",
+        (
+            f"env={task}",
+            "physics.impl=warp",
+            f"num_envs={num_envs}",
+            f"plan.gmis_per_gpu={gmis}",
+            # Eight iterations of the longest rollout.
+            f"num_timesteps={8 * 32 * gmis * num_envs}",
+            "run.measure_throughput=false",
+            "run.checkpoint_every=0",
+        ),
+    )
+
+
 def _templates(task: str, num_envs: int) -> tuple[Case, ...]:
     """The same environments in GMIs that do everything, and in GMIs that a third one trains."""
     # A dozen iterations of the longest rollout.
@@ -144,8 +164,50 @@ def _scaling(gpus: int, gmis: int, strategy: str) -> Case:
     )
 
 
+_LONG = ("env=ant", "physics.impl=warp", "num_timesteps=100e6", "run.measure_throughput=false")
+
+
+def _long(name: str, gpus: int, num_envs: int, *overrides: str) -> Case:
+    """100M steps of ant, with one agent on each GPU unless `overrides` say otherwise."""
+    return Case(name, (*_LONG, f"num_envs={num_envs}", *overrides), gpus)
+
+
+_GO1 = (
+    *("env=playground", "env.name=Go1JoystickFlatTerrain", "tuned=locomotion_ppo"),
+    *("num_timesteps=100e6", "eval.every=10e6", "seed={run}", "run.measure_throughput=false"),
+)
+_ASYNC_LONG = ("algo=a3c", "plan.backend=mps", "channel.capacity_mib=256")
+_ON_ONE = ("channel.transport=device", "plan.mps_priority=trainers_first")
+
 SUITES = MappingProxyType(
     {
+        # Every task: one process against several GMIs, each with as many environments as it takes.
+        "plans": tuple(_plan(task, *plan) for plan in PLANS for task in TASKS),
+        # Playground's own settings; Go1 for half of its steps, by both kinds of value function.
+        "playground": (
+            Case("Go1JoystickFlatTerrain", _GO1),
+            Case("Go1JoystickFlatTerrain, symmetric", (*_GO1, "algo.value_obs_key=state")),
+            Case(
+                "CartpoleBalance",
+                (
+                    *("env=playground", "env.name=CartpoleBalance", "tuned=dm_control_ppo"),
+                    *("eval.every=6e6", "seed={run}", "run.measure_throughput=false"),
+                ),
+            ),
+        ),
+        # Long enough that whole runs can be compared.
+        "async-long": (
+            _long("1 GPU, synchronous", 1, 8192),
+            _long(
+                *("1 GPU, 2 agents + 1 trainer", 1, 4096, *_ASYNC_LONG, *_ON_ONE),
+                "plan.serving_gmis_per_gpu=2",
+            ),
+            _long("2 GPUs, synchronous", 2, 8192, "plan.gpus=2"),
+            _long("1 + 1 GPUs, one process each", 2, 8192, *_ASYNC_LONG, *_on("1", "1", 1, 1)),
+            _long(
+                "1 + 1 GPUs, 4 agents + 2 trainers", 2, 2048, *_ASYNC_LONG, *_on("1", "1", 4, 2)
+            ),
+        ),
         # Acting and learning on one GPU, with the same 8192 environments as in one GMI.
         "async-1gpu": (
             Case("sync, 1 GMI x 8192", (*_THIRTY, "num_envs=8192")),

@@ -196,6 +196,11 @@ def outcome(folder: Path) -> dict[str, Any]:
         "config": read_json(RunPaths(folder).config),
         "summary": read_json(RunPaths(folder).summary),
         "curve": [[line["env_steps"], line["wall_s"], line["return"]] for line in kept],
+        "evaluations": [
+            [line["env_steps"], line["eval/return"]]
+            for line in lines
+            if line.get("eval/return") is not None
+        ],
         "metrics": {k: v for k, v in lines[-1].items() if k.startswith("metric/")},
         "diverged_steps": sum(line["diverged_steps"] for line in lines),
         "medians": {name: _median_of(lines, name) for name in names},

@@ -5,12 +5,13 @@ from __future__ import annotations
 from collections.abc import Callable
 from types import MappingProxyType
 
+from benchmarks.evaluation.async_tables import ASYNC_TABLES
 from benchmarks.evaluation.claims import claims
 from benchmarks.evaluation.figures import bounds, markdown, shown
 from benchmarks.evaluation.other_tables import OTHER_TABLES
 from benchmarks.evaluation.peer_tables import peers
 from benchmarks.evaluation.plots import mps_gains
-from benchmarks.evaluation.seed_tables import seeds
+from benchmarks.evaluation.seed_tables import playground, seeds
 from benchmarks.evaluation.sweep_tables import first_gains, sweeps
 from benchmarks.evaluation.tables import (
     TRAINING_TABLES,
@@ -61,7 +62,9 @@ TABLES: MappingProxyType[str, Callable[[], list[str]]] = MappingProxyType(
         "peers": peers,
         "sweeps": sweeps,
         "seeds": seeds,
+        "playground": playground,
         **TRAINING_TABLES,
+        **ASYNC_TABLES,
         **OTHER_TABLES,
     }
 )

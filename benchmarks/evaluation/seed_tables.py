@@ -6,7 +6,17 @@ from collections import Counter
 from collections.abc import Mapping
 from typing import Any
 
-from benchmarks.evaluation.figures import link, markdown, origin, shown
+from benchmarks.cases import SUITES
+from benchmarks.evaluation.figures import (
+    figure,
+    link,
+    markdown,
+    origin,
+    rate,
+    shown,
+    source,
+    summaries,
+)
 from benchmarks.records import RESULTS, calls_by_date
 
 PATTERN = "seeds-*-nvidia-*.json"
@@ -38,3 +48,17 @@ def _cells(task: str, number: int, row: Mapping[str, Any]) -> list[str]:
         shown(row["p_successes"], ".2g") if "p_successes" in row else "",
         f"{median:.3g} ({least:.3g} to {most:.3g})",
     ]
+
+
+def playground() -> list[str]:
+    """What tasks of Playground reach with its own settings, in evaluations without noise."""
+    rows, suite = [], "playground"
+    for case in SUITES[suite]:
+        found = summaries(suite, case.name)
+        steps = shown(figure([one["env_steps"] / 1e6 for one in found]), ",.0f")
+        seconds = shown(rate(suite, case.name, "train_wall_s"), ",.0f")
+        last = figure([one["eval"]["last"]["return"] for one in found])
+        cells = [shown(rate(suite, case.name), ",.0f"), seconds, shown(last, ",.4g")]
+        rows.append([case.name, steps, *cells])
+    head = "task | million steps: | steps/s: | seconds of training: | return at the end:"
+    return [*markdown(head, rows), *source(suite)]

@@ -1,12 +1,12 @@
-"""The tables of training, synchronous and asynchronous."""
+"""The tables of synchronous training."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from types import MappingProxyType
 
+from benchmarks.cases import PLANS, TASKS
 from benchmarks.evaluation.figures import (
-    WHOLE_RUN,
     Figure,
     figure,
     markdown,
@@ -17,7 +17,7 @@ from benchmarks.evaluation.figures import (
     source,
     summaries,
 )
-from benchmarks.evaluation.paper import CHANNELS, LGR, lgr_gain
+from benchmarks.evaluation.paper import LGR, lgr_gain
 
 LAYOUTS = {"2G2T": "2 GPUs x 2", "2G3T": "2 GPUs x 3", "4G4T": "4 GPUs x 4"}
 TWO_TREES = "exchange-in-program-h200"
@@ -96,6 +96,36 @@ def fixed_total() -> list[str]:
     head = "on each GPU | exchange | GMIs, steps/s: | one process, steps/s: | ratio: | file"
     files = dict.fromkeys(file for _, file, *_ in (*ONE_GPU, *OTHERS))
     return [*markdown(head, rows), *source(*files)]
+
+
+def fastest(task: str, *, several: bool) -> tuple[Figure, str] | None:
+    """Of the plans that were measured with a task, and how fast it is; one process or several."""
+    found = [
+        (value, f"{gmis} x {num_envs:,}")
+        for gmis, num_envs in PLANS
+        if (gmis > 1) == several and (value := rate("plans", f"{task} {gmis} x {num_envs}"))
+    ]
+    return max(found, default=None, key=lambda one: one[0].median)
+
+
+def best_plan_ratios() -> dict[str, float | None]:
+    """Of every task the fastest several GMIs on one GPU over the fastest one process."""
+    ratios = {}
+    for task in TASKS:
+        one, several = fastest(task, several=False), fastest(task, several=True)
+        ratios[task] = several[0].median / one[0].median if one and several else None
+    return ratios
+
+
+def best_plans() -> list[str]:
+    """Each side at its own peak."""
+    rows = []
+    for task, gain in best_plan_ratios().items():
+        best = [fastest(task, several=several) for several in (False, True)]
+        cells = [f"{made[1]}: {made[0].shown()}" if made else shown(None) for made in best]
+        rows.append([f"`{task}`", *cells, shown(gain)])
+    head = "task | one process x environments, steps/s: | several GMIs, steps/s: | ratio:"
+    return [*markdown(head, rows), *source("plans")]
 
 
 def training_backends() -> list[str]:
@@ -180,62 +210,6 @@ def _memory(file: str, name: str) -> str:
     return shown(figure(found), ",.0f")
 
 
-ASYNC = (
-    ("async-1gpu", "sync, 1 GMI x 8192", "sync, 1 GMI x 8192", ""),
-    ("async-1gpu", "1 agent x 8192 + 1 trainer", "sync, 1 GMI x 8192", ""),
-    ("async-1gpu", "2 agents x 4096 + 1 trainer", "sync, 1 GMI x 8192", ""),
-    ("async-1gpu", "4 agents x 2048 + 1 trainer", "sync, 1 GMI x 8192", ""),
-    *(
-        ("async-2gpu", name, "1 + 1 GPUs, one process each", "1.88 PPS, 1.65 TTOP")
-        for name in ("1 + 1 GPUs, one process each", "1 + 1 GPUs, 4 agents + 2 trainers")
-    ),
-    *(
-        ("async-4gpu", name, "3 + 1 GPUs, one process each", "1.88 PPS, 1.65 TTOP")
-        for name in (
-            *("3 + 1 GPUs, one process each", "3 + 1 GPUs, 4 agents + 2 trainers"),
-            "3 + 1 GPUs, 4 agents + 2 trainers, har, batches of 4 agents",
-        )
-    ),
-)
-"""File, case, what it is compared with, the paper's mean over two and four GPUs."""
-
-
-def asynchronous() -> list[str]:
-    """Agents and trainers: medians of report lines, and whole runs."""
-    rows = []
-    for file, case, base, paper in ASYNC:
-        name = case if case.startswith(("1 +", "3 +")) else f"1 GPU, {case}"
-        cells = [shown(rate(file, case, key), ",.0f") for key in ("pps", "ttop", WHOLE_RUN)]
-        gains = [shown(ratio(file, case, base, key)) for key in ("pps", "ttop", WHOLE_RUN)]
-        if case == base:
-            gains, paper = ["1"] * 3, "1" if paper else ""
-        if file == "async-1gpu":  # One process that does both has no PPS of its own.
-            gains = ["", shown(ratio(file, case, base)), gains[2]]
-            cells[1] = shown(rate(file, case), ",.0f")
-            cells[0] = "" if case == base else cells[0]
-        final = shown(rate(file, case, "final_return"), ",.0f")
-        rows.append([name, *cells, " / ".join(filter(None, gains)), paper, final])
-    head = (
-        "ant | PPS: | TTOP: | steps/s of the whole run: | ratios: | the paper's: "
-        "| return at the end:"
-    )
-    return [*markdown(head, rows), *source("async-1gpu", "async-2gpu", "async-4gpu")]
-
-
-def channels() -> list[str]:
-    """Channels against tensor by tensor, in jobs."""
-    rows = []
-    keys = ("pps", "ttop", WHOLE_RUN)
-    for task, gpus in (("ant", 2), ("humanoid", 2), *CHANNELS):
-        names = f"{task} multi", f"{task} uni"
-        found = [ratio("async-channels", *names, key) if gpus == 2 else None for key in keys]
-        pairs = CHANNELS.get((task, gpus))
-        paper = " / ".join(f"{multi / uni:.2f}" for uni, multi in pairs) if pairs else ""
-        rows.append([f"`{task}`", str(gpus), *map(shown, found), paper])
-    head = "task | GPUs: | PPS: | TTOP: | whole run: | the paper's PPS / TTOP:"
-    return [*markdown(head, rows), *source("async-channels")]
-
-
 SMALL = "search-ant-one_shot-h200"
 
 
@@ -262,13 +236,12 @@ def many_small() -> list[str]:
 TRAINING_TABLES: MappingProxyType[str, Callable[[], list[str]]] = MappingProxyType(
     {
         "fixed-total": fixed_total,
+        "best-plans": best_plans,
         "training-backends": training_backends,
         "weak-scaling": weak_scaling,
         "templates": templates,
         "lgr": lgr,
         "num-env": num_env,
-        "async": asynchronous,
-        "channels": channels,
         "many-small": many_small,
     }
 )

@@ -1,0 +1,84 @@
+"""The tables of asynchronous training."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from types import MappingProxyType
+
+from benchmarks.cases import SUITES
+from benchmarks.evaluation.figures import WHOLE_RUN, markdown, rate, ratio, shown, source
+from benchmarks.evaluation.paper import CHANNELS
+
+ASYNC = (
+    ("async-1gpu", "sync, 1 GMI x 8192", "sync, 1 GMI x 8192", ""),
+    ("async-1gpu", "1 agent x 8192 + 1 trainer", "sync, 1 GMI x 8192", ""),
+    ("async-1gpu", "2 agents x 4096 + 1 trainer", "sync, 1 GMI x 8192", ""),
+    ("async-1gpu", "4 agents x 2048 + 1 trainer", "sync, 1 GMI x 8192", ""),
+    *(
+        ("async-2gpu", name, "1 + 1 GPUs, one process each", "1.88 PPS, 1.65 TTOP")
+        for name in ("1 + 1 GPUs, one process each", "1 + 1 GPUs, 4 agents + 2 trainers")
+    ),
+    *(
+        ("async-4gpu", name, "3 + 1 GPUs, one process each", "1.88 PPS, 1.65 TTOP")
+        for name in (
+            *("3 + 1 GPUs, one process each", "3 + 1 GPUs, 4 agents + 2 trainers"),
+            "3 + 1 GPUs, 4 agents + 2 trainers, har, batches of 4 agents",
+        )
+    ),
+)
+"""File, case, what it is compared with, the paper's mean over two and four GPUs."""
+
+
+def asynchronous() -> list[str]:
+    """Agents and trainers: medians of report lines, and whole runs."""
+    rows = []
+    for file, case, base, paper in ASYNC:
+        name = case if case.startswith(("1 +", "3 +")) else f"1 GPU, {case}"
+        cells = [shown(rate(file, case, key), ",.0f") for key in ("pps", "ttop", WHOLE_RUN)]
+        gains = [shown(ratio(file, case, base, key)) for key in ("pps", "ttop", WHOLE_RUN)]
+        if case == base:
+            gains, paper = ["1"] * 3, "1" if paper else ""
+        if file == "async-1gpu":  # One process that does both has no PPS of its own.
+            gains = ["", shown(ratio(file, case, base)), gains[2]]
+            cells[1] = shown(rate(file, case), ",.0f")
+            cells[0] = "" if case == base else cells[0]
+        final = shown(rate(file, case, "final_return"), ",.0f")
+        rows.append([name, *cells, " / ".join(filter(None, gains)), paper, final])
+    head = (
+        "ant | PPS: | TTOP: | steps/s of the whole run: | ratios: | the paper's: "
+        "| return at the end:"
+    )
+    return [*markdown(head, rows), *source("async-1gpu", "async-2gpu", "async-4gpu")]
+
+
+def asynchronous_long() -> list[str]:
+    """Whole runs of 100M steps, against synchronous training on as many GPUs."""
+    rows, file = [], "async-long"
+    for case in SUITES[file]:
+        base = next(one.name for one in SUITES[file] if one.gpus == case.gpus)
+        cells = [shown(rate(file, case.name, key), ",.0f") for key in (WHOLE_RUN, "final_return")]
+        rows.append(
+            [case.name, cells[0], shown(ratio(file, case.name, base, WHOLE_RUN)), cells[1]]
+        )
+    head = "ant, 100M steps | steps/s of the whole run: | over synchronous: | return at the end:"
+    return [*markdown(head, rows), *source(file)]
+
+
+def channels() -> list[str]:
+    """Channels against tensor by tensor, in jobs."""
+    rows = []
+    keys = ("pps", "ttop", WHOLE_RUN)
+    for task, gpus in (("ant", 2), ("humanoid", 2), *CHANNELS):
+        names = f"{task} multi", f"{task} uni"
+        found = [ratio("async-channels", *names, key) if gpus == 2 else None for key in keys]
+        pairs = CHANNELS.get((task, gpus))
+        paper = " / ".join(f"{multi / uni:.2f}" for uni, multi in pairs) if pairs else ""
+        rows.append([f"`{task}`", str(gpus), *map(shown, found), paper])
+    head = "task | GPUs: | PPS: | TTOP: | whole run: | the paper's PPS / TTOP:"
+    return [*markdown(head, rows), *source("async-channels")]
+
+
+ASYNC_TABLES: MappingProxyType[str, Callable[[], list[str]]] = MappingProxyType(
+    {"async": asynchronous, "async-long": asynchronous_long, "channels": channels}
+)
+"""By the name that documents use: `<!-- table: NAME -->`."""
