@@ -22,6 +22,10 @@ TEST_ARGS ?=
 TEST_WORKERS ?= -n 2 --dist loadfile --no-loadscope-reorder
 SOAK_MINUTES ?= 60
 
+# Tests start hundreds of processes. Without bytecode each of them compiles what it imports again: seconds.
+unexport PYTHONDONTWRITEBYTECODE
+export PYTHONPYCACHEPREFIX ?= $(abspath $(VENV))/bytecode
+
 .DEFAULT_GOAL := help
 .PHONY: help venv train test test-all soak wheel-test docs docs-pages docs-serve lint types imports format check clean
 
