@@ -213,7 +213,7 @@ def _run_chunk(
             before.head_start,
         )
         running = _is_running(before.env, limit)
-        kept = select_worlds(running, after, before)
+        kept = select_worlds(~running, before, after)
         return kept, (_shown_qpos(env, kept.env, options.num_shown), running & bad)
 
     stopping: Any = training_env(env)._replace(model=model, step=step)

@@ -33,7 +33,7 @@ C = TypeVar("C", bound=AlgoConfig)
 
 _LEARNING_RATE_STEP = 1.5
 _UNMOVED_KL = 1e-6
-_MOVING = 10.0
+_LEAST_STD_IN_FLOORS = 10.0
 """An input moves if its standard deviation is at least so many times `obs_std_floor`. Nothing was
 learnt with the weights of one that does not: when it begins to, they must not be preserved."""
 
@@ -133,7 +133,7 @@ def finish_iteration(learner: Learner, state: TrainState, seen: Moments) -> Trai
     function make of the same observation. With `preserve_outputs` their first layers make up for
     it, as Pop-Art's last one does for targets (arXiv:1602.07714); but not for the clip of
     normalised observations, nor where there were no statistics before, nor for inputs that hardly
-    move (`_MOVING`).
+    move (`_LEAST_STD_IN_FLOORS`) or whose standard deviation doubles or halves at once.
     """
     after = state._replace(
         obs_moments=merge(state.obs_moments, seen), iteration=state.iteration + 1
@@ -143,7 +143,7 @@ def finish_iteration(learner: Learner, state: TrainState, seen: Moments) -> Trai
     units = change_of_units(
         acting_moments(learner, state),
         acting_moments(learner, after),
-        _MOVING * learner.config.obs_std_floor,
+        _LEAST_STD_IN_FLOORS * learner.config.obs_std_floor,
     )
     return after._replace(params=learner.networks.with_inputs(state.params, *units))
 

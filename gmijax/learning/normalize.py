@@ -118,10 +118,12 @@ def from_units(moments: Moments, samples: Array) -> Array:
 def change_of_units(old: Moments, new: Moments, least_std: float) -> tuple[Array, Array]:
     """[S] each, `scale` and `shift`, with in_units(old, x) = scale * in_units(new, x) + shift.
 
-    1 and 0 where a standard deviation is below `least_std`, and where `old` are no samples.
+    1 and 0 where a unit is not trusted: `old` are no samples, a standard deviation is below
+    `least_std`, or it more than doubles or halves.
     """
     scale, shift = std_of(new) / std_of(old), in_units(old, new.mean)
     known = (old.count > 0) & (jnp.minimum(std_of(old), std_of(new)) >= least_std)
+    known &= (scale >= 0.5) & (scale <= 2.0)
     return jnp.where(known, scale, 1.0), jnp.where(known, shift, 0.0)
 
 

@@ -128,7 +128,8 @@ class ActorCritic(NamedTuple):
             kernel, size = first["kernel"], first["kernel"].shape[0]
             new = {
                 "kernel": scale[:size, None] * kernel,
-                "bias": first["bias"] + shift[:size] @ kernel,
+                # No product of matrices: on a GPU those are rounded to TF32.
+                "bias": first["bias"] + jnp.sum(shift[:size, None] * kernel, axis=0),
             }
             return {**network, "params": {**network["params"], "Dense_0": new}}
 

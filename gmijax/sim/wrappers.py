@@ -153,7 +153,7 @@ def select_world(chosen: Array, new: T, old: T) -> T:
 
 
 def _selects_itself(node: Any) -> bool:
-    return hasattr(type(node), "where")
+    return callable(getattr(type(node), "where", None))
 
 
 select_worlds = jax.vmap(select_world)

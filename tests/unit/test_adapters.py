@@ -230,6 +230,8 @@ class WarpBall:
 
     action_size, dt = 1, 0.02
 
+    heights_m, naconmax = (0.11, 0.3), 4
+
     def __init__(self) -> None:
         self.mj_model = mujoco.MjModel.from_xml_string(BALL_ABOVE_FLOOR)
         self._mjx_model = mjx.put_model(self.mj_model, impl="warp")
@@ -239,8 +241,9 @@ class WarpBall:
         return self._mjx_model
 
     def reset(self, rng: jax.Array) -> Any:
-        data = mjx.make_data(self.mj_model, impl="warp", naconmax=4, njmax=8)
-        height = jax.random.uniform(rng, minval=0.11, maxval=0.3)
+        data = mjx.make_data(self.mj_model, impl="warp", naconmax=self.naconmax, njmax=8)
+        low, high = self.heights_m
+        height = jax.random.uniform(rng, minval=low, maxval=high)
         data = mjx.forward(self.mjx_model, data.replace(qpos=data.qpos.at[2].set(height)))
         return State(data, data.qpos, jnp.zeros(()), jnp.zeros(()), {}, {})
 
@@ -248,6 +251,18 @@ class WarpBall:
         data = mjx.step(self.mjx_model, state.data)
         has_landed = (data.qpos[2] < 0.1).astype(jnp.float32)
         return state.replace(data=data, obs=data.qpos, done=has_landed)
+
+
+class WarpBalls(WarpBall):
+    """All touch the floor in one step and are lifted; there is room for one contact."""
+
+    heights_m, naconmax = (0.15, 0.15), 1
+
+    def step(self, state: Any, action: jax.Array) -> Any:
+        data = mjx.step(self.mjx_model, state.data)
+        height = jnp.where(data.qpos[2] < 0.0999, 0.15, data.qpos[2])
+        data = data.replace(qpos=data.qpos.at[2].set(height))
+        return state.replace(data=data, obs=data.qpos)
 
 
 @struct.dataclass
@@ -282,6 +297,21 @@ def test_states_of_playground_in_warp_start_over_one_by_one(times: int):
     assert landed.min() >= 1
     assert len(set(landed.tolist())) > 1, "the lower ones land more often"
     assert batch.overflows == OVERFLOWS
+
+
+def test_an_overflow_of_playground_in_warp_is_told_in_its_own_step_alone():
+    pytest.importorskip("warp")
+    env = from_playground(WarpBalls(), name="balls")
+    batch = training_env(env)
+    state = batch.init(batch.model, env_keys(jax.random.key(0), 0, NUM_ENVS))
+    step, told, lifted = jax.jit(batch.step), [], []
+    for _ in range(60):
+        before = state.env.obs[:, 2]
+        state, out = step(batch.model, state, jnp.zeros((NUM_ENVS, 1)))
+        told.append(int(out.overflowed["contact"]) > 0)
+        lifted.append(bool((state.env.obs[:, 2] > before).any()))
+    assert sum(lifted) == 1
+    np.testing.assert_array_equal(told, lifted)
 
 
 def test_an_environment_of_brax_brings_its_model_and_length():

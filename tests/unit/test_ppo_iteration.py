@@ -355,7 +355,7 @@ def test_outputs_may_stay_what_they_were_when_the_statistics_change(
     # A first iteration gives observations their unit: nothing is to be kept.
     before = finish_iteration(mine, state, moments_of(samples[0], 1))
     jax.tree.map(np.testing.assert_array_equal, before.params, state.params)
-    after = finish_iteration(mine, before, moments_of(5.0 + 3.0 * samples[1], 1))
+    after = finish_iteration(mine, before, moments_of(1.0 + 1.5 * samples[1], 1))
     assert int(after.iteration) == 2
     assert float(after.obs_moments.count) == 128
     old, new = outputs(before, samples[0]), outputs(after, samples[0])
@@ -364,3 +364,16 @@ def test_outputs_may_stay_what_they_were_when_the_statistics_change(
     else:
         for one, other in zip(old, new, strict=True):
             assert float(jnp.max(jnp.abs(one - other))) > 1e-3
+
+
+def test_weights_of_an_input_that_hardly_moves_stay_as_they_are(config) -> None:
+    mine = make_learner(
+        ENV.spec, dataclasses.replace(config, preserve_outputs=True, obs_std_floor=1e-3)
+    )
+    stds = jnp.full(ENV.spec.obs_size, 2e-2).at[0].set(5e-3)
+    samples = stds * jax.random.normal(jax.random.key(1), (2, 64, ENV.spec.obs_size))
+    state = init_learner(mine, ENV.spec.obs_size, jax.random.key(0))
+    before = finish_iteration(mine, state, moments_of(samples[0], 1))
+    after = finish_iteration(mine, before, moments_of(1.5 * samples[1], 1))
+    old, new = (one.params.policy["params"]["Dense_0"]["kernel"] for one in (before, after))
+    np.testing.assert_array_equal((old == new).all(1), jnp.arange(ENV.spec.obs_size) == 0)

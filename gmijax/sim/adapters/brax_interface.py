@@ -49,7 +49,6 @@ def adapt(
     episode_length: int,
     mj_model: Any = None,
     qpos: Callable[[Any], Array] | None = None,
-    overflow: Callable[[Any], Array] | None = None,
 ) -> Env:
     """Makes an `Env` of theirs.
 
@@ -64,8 +63,6 @@ def adapt(
       episode_length: steps after which an episode is truncated.
       mj_model: the MuJoCo model to film it with, None for no films.
       qpos: their state -> [nq], joint positions of that model; None for no films.
-      overflow: their state -> [2] bool, which of `gmijax.sim.interface.OVERFLOWS` were too small;
-        None if nothing can overflow.
 
     Raises:
       ConfigError: observations that are no vectors, or a state that changes its shape.
@@ -92,8 +89,6 @@ def adapt(
     reset, step = partial(_reset, theirs, spec), partial(_step, theirs)
     env = Env(spec, (), reset, step, mj_model, positions)
     env = env._replace(next_episode=partial(_next_episode, spec))
-    if overflow is not None:
-        env = env._replace(overflow=lambda state: overflow(state.physics))
     check_env(env, f"env.name={name}")
     return env
 

@@ -13,14 +13,15 @@ import subprocess
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 
 from gmijax.errors import ConfigError
 from gmijax.sim.adapters.brax_interface import adapt
 from gmijax.sim.adapters.checks import attempt
 from gmijax.sim.impl import choose_impl
-from gmijax.sim.interface import Env
+from gmijax.sim.interface import Env, EnvState
 from gmijax.sim.physics import which_overflowed
-from gmijax.types import Array
+from gmijax.types import Array, PyTree
 
 
 def make(name: str, *, impl: str = "auto", max_envs: int | None = None) -> Env:
@@ -43,8 +44,11 @@ def make(name: str, *, impl: str = "auto", max_envs: int | None = None) -> Env:
     if "impl" in config:
         config.impl, _ = choose_impl(impl, jax.default_backend(), f"playground/{name}")
         config.naconmax = math.ceil(config.naconmax * _growth(registry, name, max_envs))
+    elif impl == "warp":
+        raise ConfigError(f"physics.impl=warp: {name} has MJX-JAX only; allowed are auto, jax")
     theirs = attempt(f"env.name={name}", _load, registry, name, config)
-    return from_playground(theirs, name=f"playground/{name}", episode_length=config.episode_length)
+    env = from_playground(theirs, name=f"playground/{name}", episode_length=config.episode_length)
+    return env._replace(max_envs=max_envs) if env.overflow is not None else env
 
 
 def _growth(registry: Any, name: str, max_envs: int | None) -> float:
@@ -74,14 +78,29 @@ def from_playground(theirs: Any, *, name: str, episode_length: int = 1000) -> En
     In MJX-Warp `theirs` is changed, see `without_warnings`.
     """
     is_warp = theirs.mjx_model.impl.value == "warp"
-    return adapt(
+    env = adapt(
         without_warnings(theirs) if is_warp else theirs,
         name=name,
         episode_length=episode_length,
         mj_model=theirs.mj_model,
         qpos=lambda state: state.data.qpos,
-        overflow=_overflow if is_warp else None,
     )
+    return _with_overflow(env) if is_warp else env
+
+
+def _with_overflow(env: Env) -> Env:
+    """`env` in MJX-Warp, which tells of buffers that were too small in the last step."""
+
+    def step(model: PyTree, state: EnvState, action: Array) -> EnvState:
+        # MJX-Warp only ever adds bits.
+        data = state.physics.data
+        cleared = data.tree_replace({"_impl.overflow": jnp.zeros_like(data._impl.overflow)})
+        return env.step(model, state._replace(physics=state.physics.replace(data=cleared)), action)
+
+    def overflow(state: EnvState) -> Array:
+        return which_overflowed(state.physics.data._impl.overflow)
+
+    return env._replace(step=step, overflow=overflow)
 
 
 def without_warnings(theirs: Any) -> Any:
@@ -92,10 +111,6 @@ def without_warnings(theirs: Any) -> Any:
     """
     theirs._mjx_model = theirs.mjx_model.tree_replace({"opt._impl.warn_overflow": 0})
     return theirs
-
-
-def _overflow(state: Any) -> Array:
-    return which_overflowed(state.data._impl.overflow)
 
 
 def _menagerie_folder() -> str:
