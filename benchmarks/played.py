@@ -9,6 +9,7 @@ task, with networks of one shape. `benchmarks.seeds --play` calls it.
 from __future__ import annotations
 
 import argparse
+import dataclasses
 import functools
 import sys
 from collections.abc import Iterator, Mapping
@@ -86,6 +87,8 @@ def _runner(checkpoint: Path, num_episodes: int) -> tuple[EpisodeRunner, TrainSt
     from gmijax.sim.randomize import make_worlds
 
     env_config, algo = trained_config(checkpoint)
+    # At its full range, as `gmijax.play` does.
+    env_config = dataclasses.replace(env_config, curriculum="off")
     impl = CheckpointMeta.read(checkpoint).impl
     env = make_worlds(env_config, impl, seed=SEED, first_env=0, num_envs=num_episodes)
     learner = make_learner(env.spec, algo)

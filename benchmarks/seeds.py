@@ -81,15 +81,16 @@ class Benchmark:
 
     def _sweep(self, row: Row, folder: Path) -> float:
         """Trains a row and writes it down, what is through too if it is interrupted; seconds."""
-        started_s, code = time.monotonic(), 130
+        started_s, code, own = time.monotonic(), 130, {}
         try:
             code = run_command(self._command(row, folder), self._deadline_s)
-            if self._arguments.play:
-                run_command(self._play(folder), self._deadline_s)
+            if self._arguments.play and code in (0, 1):  # 1: a job failed; the others are there.
+                (folder / FILE).unlink(missing_ok=True)  # Of an earlier call.
+                own["play_code"] = run_command(self._play(folder), self._deadline_s)
         finally:
             seconds = round(time.monotonic() - started_s, 2)
             if (folder / "sweep.json").exists():
-                own = {"overrides": row.overrides, "code": code, "command_s": seconds}
+                own |= {"overrides": row.overrides, "code": code, "command_s": seconds}
                 self._add(row.name, folder, own)
                 with self.file.changing() as results:
                     results.update(task=self._task, rows=self.rows)

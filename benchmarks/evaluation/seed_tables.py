@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 from benchmarks.cases import SUITES
@@ -21,7 +21,8 @@ from benchmarks.records import RESULTS, calls_by_date
 
 PATTERN = "seeds-*-nvidia-*.json"
 HEAD = (
-    "task | call: | changed | successes: | interval of 95 %: | p: | reward of a step in the end:"
+    "task | call: | steps: | precision | changed | successes: | interval of 95 %: | p: | "
+    "reward of a step in the end:"
 )
 
 
@@ -33,17 +34,25 @@ def seeds() -> list[str]:
         task = call.results["task"]
         number[task] += 1
         finished = [row for row in call.results["rows"] if not row["unfinished"]]
-        rows += [_cells(task, number[task], row) for row in finished]
+        common = _common((call.settings or {})["overrides"])
+        rows += [[f"`{task}`", str(number[task]), *common, *_cells(row)] for row in finished]
         calls.append(f"- {link(path.name)}, call {number[task]}: {origin(call)}")
     return [*markdown(HEAD, rows), "", *calls]
 
 
-def _cells(task: str, number: int, row: Mapping[str, Any]) -> list[str]:
+def _common(overrides: Sequence[str]) -> list[str]:
+    """How long all runs of a call were, and in what."""
+    changed = dict(override.split("=", 1) for override in overrides)
+    steps = float(changed["num_timesteps"]) / 1e6
+    return [f"{steps:.0f}M", changed.get("algo.precision", "float32")]
+
+
+def _cells(row: Mapping[str, Any]) -> list[str]:
     changed = ", ".join(f"`{override}`" for override in row["overrides"]) or "nothing"
     low, high = row["wilson"]
     least, median, most = row["final"]
     return [
-        *(f"`{task}`", str(number), changed, f"{row['successes']} of {row['seeds']}"),
+        *(changed, f"{row['successes']} of {row['seeds']}"),
         f"{low:.0%} to {high:.0%}",
         shown(row["p_successes"], ".2g") if "p_successes" in row else "",
         f"{median:.3g} ({least:.3g} to {most:.3g})",

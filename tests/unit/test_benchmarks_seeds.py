@@ -138,3 +138,24 @@ def test_checkpoints_are_played_after_their_row_and_told(
     assert first == {"played/last/mean_return": 5.0, "played/last/whole": 0.5}
     assert not second
     assert "played/last/whole 0.5 (0.5 to 0.5)" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(("code", "played"), [(0, True), (1, True), (130, False)])
+def test_only_checkpoints_of_a_sweep_that_came_to_its_end_are_played(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, code: int, played: bool
+) -> None:
+    folder = tmp_path / "a"
+    stale = folder / "played.json"
+
+    def run(command: Sequence[str], _: float) -> int:
+        if "benchmarks.played" in command:
+            assert not stale.exists()
+            return 3
+        write_sweep(folder, {"0": 1.0})
+        write_json(stale, {})
+        return code
+
+    monkeypatch.setattr(seeds, "run_command", run)
+    found = Benchmark(arguments(tmp_path, play=64, runs=tmp_path), "ball_balance")
+    found.run([Row("a", ())])
+    assert found.rows[0].get("play_code") == (3 if played else None)
