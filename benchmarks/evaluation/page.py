@@ -15,6 +15,7 @@ from benchmarks.evaluation.seed_tables import playground, seeds
 from benchmarks.evaluation.sweep_tables import first_gains, sweeps
 from benchmarks.evaluation.tables import (
     TRAINING_TABLES,
+    best_plan_ratios,
     fixed_total_ratios,
     over_one_gpu,
     small_gmis,
@@ -27,10 +28,11 @@ def advice() -> list[str]:
     tenfold = small[10] / small[1] if {1, 10} <= small.keys() else None
     eightfold = first_gains().get("8 at once, auto")
     fixed = bounds([*fixed_total_ratios().values()])
+    peak = bounds([*best_plan_ratios().values()])
     rows = [
         [
-            *("many small trainings on one GPU (seeds, a sweep)", "**yes**: `gmijax.sweep`"),
-            f"eight trainings at once: {shown(eightfold)} times the trainings per hour of one "
+            *("many small runs on one GPU (seeds, a sweep)", "**yes**: `gmijax.sweep`"),
+            f"eight runs at once: {shown(eightfold)} times the finished runs per hour of one "
             f"after another{'' if eightfold and eightfold.repeats > 1 else ' (1 sweep of each)'}; "
             f"ten GMIs: {shown(tenfold)} times the steps/s of one",
         ],
@@ -41,11 +43,12 @@ def advice() -> list[str]:
         ],
         [
             *("one large synchronous training on one GPU", "**no** (the default)"),
-            f"{fixed} times the steps/s of one process with as many environments",
+            f"{fixed} times the steps/s of one process with as many environments; each side "
+            f"at its best number of environments, six tasks on H100s: {peak}",
         ],
         [
             *("one training on several GPUs", "one GMI on each"),
-            f"four GPUs make {shown(over_one_gpu(4))} times the steps/s of one",
+            f"four GPUs reach {shown(over_one_gpu(4))} times the steps/s of one",
         ],
         [
             *("asynchronous training", "try synchronous training first"),
