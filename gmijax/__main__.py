@@ -16,11 +16,11 @@ VERBS: Final[Mapping[str, str]] = MappingProxyType(
         "play": "evaluates a checkpoint, and films it",
         "serve": "collects experience with a trained policy or random actions",
         "search": "finds environments per GMI and GMIs per GPU by profiling",
-        "sweep": "runs many trainings, several at a time on every GPU",
+        "sweep": "runs many training jobs, several at a time on every GPU",
         "export": "writes a policy as files for robots: ONNX, StableHLO",
         "doctor": "says what this machine can do for gmijax, what it cannot, and why",
         "list-envs": "lists the tasks",
-        "demo": "trains a small task shortly, and films it",
+        "demo": "trains a small task briefly, and films it",
     }
 )
 """Command -> what it does. `main(argv)` of the module of that name runs it, `-` read as `_`."""

@@ -1,4 +1,4 @@
-"""`gmijax demo`: trains ball_balance shortly, plays what it has learnt, and says what to look at.
+"""`gmijax demo`: trains ball_balance briefly, plays what it has learnt, and says what to look at.
 
 Nothing is downloaded.
 """
@@ -19,7 +19,7 @@ from gmijax.runs.folder import RunPaths
 
 USAGE: Final = """usage: gmijax demo [key=value ...]
 
-Trains env=ball_balance shortly in runs/, plays its last checkpoint and films it.
+Trains env=ball_balance briefly in runs/, plays its last checkpoint and films it.
 Takes the keys of `gmijax train`. Without num_timesteps: seconds of training on a GPU, minutes on
 two CPU cores.
 """

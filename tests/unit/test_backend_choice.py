@@ -45,7 +45,7 @@ SERVE = {"template": "tcg"}
         ((A100_SEVEN,), MPS, {}, "mig", "in MIG mode; MPS on a whole GPU would"),
         ((V100,), MPS, SERVE, "mps", "the daemon that runs here; compute capability 7.0 has"),
         ((P100,), MPS, {}, "share", "warning: MPS of a GPU of compute capability 6.0"),
-        ((H200_MIG_OFF,), None, {}, "share", "warning: .*not installed.* 2.0 to 2.9 times"),
+        ((H200_MIG_OFF,), None, {}, "share", "warning: .*not installed.* 1.45 to 4.73 times"),
         ((), None, SERVE, "cpu", "GPUs are virtual"),
     ],
 )
