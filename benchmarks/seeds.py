@@ -82,10 +82,11 @@ class Benchmark:
     def _sweep(self, row: Row, folder: Path) -> float:
         """Trains a row and writes it down, what is through too if it is interrupted; seconds."""
         started_s, code, own = time.monotonic(), 130, {}
+        if self._arguments.play:
+            (folder / FILE).unlink(missing_ok=True)  # Of an earlier call.
         try:
             code = run_command(self._command(row, folder), self._deadline_s)
             if self._arguments.play and code in (0, 1):  # 1: a job failed; the others are there.
-                (folder / FILE).unlink(missing_ok=True)  # Of an earlier call.
                 own["play_code"] = run_command(self._play(folder), self._deadline_s)
         finally:
             seconds = round(time.monotonic() - started_s, 2)

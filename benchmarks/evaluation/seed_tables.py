@@ -34,7 +34,8 @@ def seeds() -> list[str]:
         task = call.results["task"]
         number[task] += 1
         finished = [row for row in call.results["rows"] if not row["unfinished"]]
-        common = _common((call.settings or {})["overrides"])
+        assert call.settings is not None
+        common = _common(call.settings["overrides"])
         rows += [[f"`{task}`", str(number[task]), *common, *_cells(row)] for row in finished]
         calls.append(f"- {link(path.name)}, call {number[task]}: {origin(call)}")
     return [*markdown(HEAD, rows), "", *calls]

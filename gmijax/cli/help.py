@@ -52,14 +52,18 @@ def print_help(
             console.print(f"\n{group}= one of: {', '.join(choices(group))}")
             if group == "env":
                 console.print("or env=PATH.py:FUNCTION, a task of your own (docs/custom-task.md)")
-                task = next(key.default for key in keys if key.name == "env.name")
-                command = "train" if name == "sweep" else name
-                console.print(
-                    f"Defaults below are those of {task}; each task has its own: "
-                    f"gmijax {command} env=ant --cfg job prints those of ant"
-                )
+                console.print(_whose_defaults(name, keys))
     console.print()
     console.print(table)
+
+
+def _whose_defaults(command: str, keys: Sequence[Key]) -> str:
+    task = next(key.default for key in keys if key.name == "env.name")
+    one_job = "train" if command == "sweep" else command
+    return (
+        f"Defaults below are those of {task}; each task has its own: "
+        f"gmijax {one_job} env=ant --cfg job prints those of ant"
+    )
 
 
 def keys_of(

@@ -213,6 +213,7 @@ def _run_chunk(
             before.head_start,
         )
         running = _is_running(before.env, limit)
+        # In this order: contacts that all worlds share must be those after the step.
         kept = select_worlds(~running, before, after)
         return kept, (_shown_qpos(env, kept.env, options.num_shown), running & bad)
 

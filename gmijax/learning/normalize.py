@@ -121,8 +121,9 @@ def change_of_units(old: Moments, new: Moments, least_std: float) -> tuple[Array
     1 and 0 where a unit is not trusted: `old` are no samples, a standard deviation is below
     `least_std`, or it more than doubles or halves.
     """
-    scale, shift = std_of(new) / std_of(old), in_units(old, new.mean)
-    known = (old.count > 0) & (jnp.minimum(std_of(old), std_of(new)) >= least_std)
+    before, after = std_of(old), std_of(new)
+    scale, shift = after / before, in_units(old, new.mean)
+    known = (old.count > 0) & (jnp.minimum(before, after) >= least_std)
     known &= (scale >= 0.5) & (scale <= 2.0)
     return jnp.where(known, scale, 1.0), jnp.where(known, shift, 0.0)
 

@@ -152,10 +152,13 @@ def test_only_checkpoints_of_a_sweep_that_came_to_its_end_are_played(
             assert not stale.exists()
             return 3
         write_sweep(folder, {"0": 1.0})
-        write_json(stale, {})
         return code
 
     monkeypatch.setattr(seeds, "run_command", run)
     found = Benchmark(arguments(tmp_path, play=64, runs=tmp_path), "ball_balance")
+    folder.mkdir()
+    one = {"env_steps": 10, "mean_return": 5.0, "whole": 0.5, "metrics": {}}
+    write_json(stale, {"000": {"last": one}})
     found.run([Row("a", ())])
+    assert not found.rows[0]["each"][0]["at_end"]
     assert found.rows[0].get("play_code") == (3 if played else None)
