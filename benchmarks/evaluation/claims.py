@@ -25,9 +25,8 @@ from benchmarks.evaluation.other_tables import (
 from benchmarks.evaluation.paper import LGR, lgr_gain
 from benchmarks.evaluation.tables import LAYOUTS, best_plan_ratios, fixed_total_ratios
 
-BACKEND_LINK = "[backends](#backends)"
-TEMPLATE_LINK = "[templates](#one-gmi-for-all-tasks-or-one-for-each)"
-FIXED_LINK = "[fixed total](#one-training-in-several-gmis)"
+BACKEND_LINK = "[backends](evaluation/sharing.md#backends)"
+FIXED_LINK = "[fixed total](evaluation/one-gpu.md#one-training-run-in-several-gmis)"
 TEMPLATES = ("2 GMIs x 2048, tcg_ex", "2 + 1 GMIs x 2048, tdg_ex")
 
 
@@ -43,19 +42,25 @@ def _model() -> Iterator[list[str]]:
     yield [
         *("Fig. 1b", "utilisation of a GPU by one process", "below 50 %, mean 32 %"),
         f"{bounds(busy, '.0%')} of SMs busy in a stage; of a job: {NOT_MEASURED}",
-        "[stages](#what-a-stage-takes-of-a-gpu)",
+        "[stages](evaluation/roles.md#what-a-stage-takes-of-a-gpu)",
     ]
     yield ["Table 1", "MPS and MIG as backends", "", f"MPS; MIG {NOT_MEASURED}", BACKEND_LINK]
     yield [
         *("Table 2", "cost of MPR, MRR, HAR by bytes", "a formula"),
         f"measured over predicted: {model_fit()}",
-        "[reduction](#a-mean-alone)",
+        "[reduction](evaluation/several-gpus.md#a-mean-alone)",
     ]
     served = results_of(SERVING).get("cases", ())
     gains = [one["colocated"] / one["dedicated"] for one in served if "dedicated" in one]
-    yield ["Table 3", "TCG over TDG, serving", "2.5", bounds(gains), TEMPLATE_LINK]
+    yield [
+        *("Table 3", "TCG over TDG, serving", "2.5", bounds(gains)),
+        "[templates](evaluation/roles.md#one-gmi-for-all-tasks-or-one-for-each)",
+    ]
     trained = [ratio(f"templates-{task}", *TEMPLATES) for task in ("ant", "humanoid")]
-    yield ["Table 4", "TCG_EX over TDG_EX, training", "5", bounds(trained), TEMPLATE_LINK]
+    yield [
+        *("Table 4", "TCG_EX over TDG_EX, training", "5", bounds(trained)),
+        "[templates](evaluation/roles.md#trainers-among-their-simulators-or-apart)",
+    ]
     answers = [
         f"{best['gmis_per_gpu']} x {best['num_envs']:,} ({best['impl']})"
         for file in ("search-ant-jax-h200", "search-ant-one_shot-h200")
@@ -64,7 +69,7 @@ def _model() -> Iterator[list[str]]:
     yield [
         *("Algorithm 2", "GMIs and environments by profiling", ""),
         f"ant: {', '.join(answers) or NOT_MEASURED}; other tasks: {NOT_MEASURED}",
-        "[search](#the-search)",
+        "[search](evaluation/one-gpu.md#the-search)",
     ]
 
 
@@ -103,7 +108,7 @@ def _studies() -> Iterator[list[str]]:
             *("LGR", f"`{task}`, over MPR, three layouts"),
             " ".join(f"{lgr_gain(task, at):.2f}" for at in LAYOUTS),
             f"`one_shot` {' '.join(map(shown, ours))}; the paper's HAR {bounds(own)}",
-            "[LGR](#reduction-of-gradients-in-training)",
+            "[LGR](evaluation/several-gpus.md#reduction-of-gradients-in-training)",
         ]
     more = [
         ratio(f"tasks-{impl}", f"{task} {impl} 8192", f"{task} {impl} 2048")
@@ -113,12 +118,12 @@ def _studies() -> Iterator[list[str]]:
     yield [
         *("Fig. 9", "throughput from 512 to 8,192 environments", "grows ever less"),
         f"2,048 to 8,192: {bounds(more)} times; 512: {NOT_MEASURED}",
-        "[environments](#environments-of-one-gmi)",
+        "[environments](evaluation/one-gpu.md#environments-of-one-gmi)",
     ]
     yield [
         *("Fig. 10", "reward over time, AT, AY, HM, more GPUs", "GMIs ahead"),
         f"ant: no faster with GMIs; AY, HM with GMIs: {NOT_MEASURED}",
-        "[reward](#reward-over-time)",
+        "[reward](evaluation/learning.md#reward-over-time)",
     ]
 
 
@@ -141,15 +146,15 @@ def _asynchronous() -> Iterator[list[str]]:
         found = [f"{shown(ratio(*one, key))} on {gpus}" for gpus, one in several.items()]
         whole = [f"{shown(ratio(*one, WHOLE_RUN))} on {gpus}" for gpus, one in several.items()]
         here = f"{', '.join(found)}; by whole runs {', '.join(whole)}"
-        yield ["Fig. 11", what, paper, here, "[A3C](#asynchronous-training)"]
+        yield ["Fig. 11", what, paper, here, "[A3C](evaluation/roles.md#asynchronous-training)"]
     names = ("anymal multi", "anymal uni")
     found = [shown(ratio("async-channels", *names, key)) for key in ("pps", "ttop", WHOLE_RUN)]
     yield [
         *("MCC", "channels over UCC, two GPUs: AY", "1.06 PPS, 1.13 TTOP"),
         f"{found[0]}, {found[1]}; by whole runs {found[2]}",
-        "[channels](#channels)",
+        "[channels](evaluation/roles.md#channels)",
     ]
     yield [
         *("MCC", "FC; both on four GPUs", "1.04 to 1.08 PPS, 1.24 to 1.32 TTOP"),
-        *(NOT_MEASURED, "[channels](#channels)"),
+        *(NOT_MEASURED, "[channels](evaluation/roles.md#channels)"),
     ]

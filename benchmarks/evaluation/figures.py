@@ -118,8 +118,8 @@ def _source_of(file: str) -> str:
 
 
 def link(file_name: str) -> str:
-    """A file of results, as a page in `docs/` points at it."""
-    return f"[`{file_name}`](../benchmarks/results/{file_name})"
+    """A file of results, as a page in `docs/evaluation/` points at it."""
+    return f"[`{file_name}`](../../benchmarks/results/{file_name})"
 
 
 def origin(call: Call) -> str:

@@ -42,12 +42,12 @@ def advice() -> list[str]:
             "(serving ant and humanoid, 2 to 8 GMIs)",
         ],
         [
-            *("one large synchronous training on one GPU", "**no** (the default)"),
+            *("one large synchronous training run on one GPU", "**no** (the default)"),
             f"{fixed} times the steps/s of one process with as many environments; each side "
             f"at its best number of environments, six tasks on H100s: {peak}",
         ],
         [
-            *("one training on several GPUs", "one GMI on each"),
+            *("one training run on several GPUs", "one GMI on each"),
             f"four GPUs reach {shown(over_one_gpu(4))} times the steps/s of one",
         ],
         [

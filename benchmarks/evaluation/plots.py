@@ -1,4 +1,4 @@
-"""The pictures of the page, as SVG; each keeps its numbers, so that a stale one can be told."""
+"""The pictures of the evaluation, as SVG; each keeps its numbers, so a stale one can be told."""
 
 from __future__ import annotations
 
@@ -39,17 +39,17 @@ def summary() -> Groups:
     """What several GMIs on a GPU gain and lose, in the order of the advice."""
     small = small_gmis()
     return {
-        "small trainings at once, over one after another": {
+        "small training runs at once, over one after another": {
             way.removesuffix(", auto"): gain.median
             for way, gain in first_gains().items()
             if way.endswith(", auto")
         },
-        "GMIs of one small training, over one such GMI": {
+        "GMIs of one small training run, over one such GMI": {
             f"{gmis} GMIs": small[gmis] / small[1] if {1, gmis} <= small.keys() else None
             for gmis in (4, 10)
         },
         "serving under MPS, over plain sharing": mps_gains(),
-        "one large training in several GMIs, over one process": one_training(),
+        "one large training run in several GMIs, over one process": one_training(),
         "one GMI on each of several GPUs, over one GPU": {
             f"{gpus} GPUs": over_one_gpu(gpus) for gpus in (2, 4)
         },

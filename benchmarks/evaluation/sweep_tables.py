@@ -1,4 +1,4 @@
-"""Trainings per hour of sweeps."""
+"""Training runs per hour of sweeps."""
 
 from __future__ import annotations
 
@@ -19,15 +19,15 @@ from benchmarks.records import RESULTS, Call, calls_by_date
 PATTERN = "sweeps-nvidia-*.json"
 ONE_AFTER_ANOTHER = "1 at once, auto"
 HEAD = (
-    "at once | sweeps: | trainings per hour: | over one after another: | over plain sharing: | "
+    "at once | sweeps: | runs per hour: | over one after another: | over plain sharing: | "
     "steps/s in all:"
 )
 
 Run: TypeAlias = Mapping[str, Any]
 
 
-class SameTrainings(NamedTuple):
-    """Sweeps of the same trainings on the same GPU; a call has time for one of each way or so.
+class SameJobs(NamedTuple):
+    """Sweeps of the same jobs on the same GPU; a call has time for one of each way or so.
 
     Attributes:
       calls: that ran them, as lines of Markdown.
@@ -42,11 +42,11 @@ class SameTrainings(NamedTuple):
         return _figures(_by_way(key, runs) for runs in self.runs)
 
     def gains(self) -> dict[str, Figure]:
-        """Trainings per hour over those of one after another, each ratio of one call."""
+        """Jobs per hour over those of one after another, each ratio of one call."""
         return self._ratios(lambda way: ONE_AFTER_ANOTHER)
 
     def gains_over_sharing(self) -> dict[str, Figure]:
-        """Trainings per hour over those of as many at once under plain sharing."""
+        """Jobs per hour over those of as many at once under plain sharing."""
         return self._ratios(lambda way: way.replace(", auto", ", share"))
 
     def _ratios(self, base: Callable[[str], str]) -> dict[str, Figure]:
@@ -63,9 +63,9 @@ class SameTrainings(NamedTuple):
         return _figures(ratios)
 
 
-def same_trainings() -> dict[str, SameTrainings]:
-    """By what the trainings are and where they ran, in Markdown; in the order of first calls."""
-    found: dict[str, SameTrainings] = {}
+def same_jobs() -> dict[str, SameJobs]:
+    """By what the jobs are and where they ran, in Markdown; in the order of first calls."""
+    found: dict[str, SameJobs] = {}
     for call, path in calls_by_date(RESULTS, PATTERN):
         here: dict[str, dict[str, list[Run]]] = {}
         for run in call.results["runs"]:
@@ -74,21 +74,21 @@ def same_trainings() -> dict[str, SameTrainings]:
                 by_way = here.setdefault(_described(call, tasks), {})
                 by_way.setdefault(f"{at_once}, {backend}", []).append(run)
         for what, by_way in here.items():
-            same = found.setdefault(what, SameTrainings([], []))
+            same = found.setdefault(what, SameJobs([], []))
             same.calls.append(f"- {link(path.name)}: {origin(call)}")
             same.runs.append(by_way)
     return found
 
 
 def first_gains() -> dict[str, Figure]:
-    """What the trainings of the first call gain at once, over one after another."""
-    return next((same.gains() for same in same_trainings().values()), {})
+    """What the jobs of the first call gain at once, over one after another."""
+    return next((same.gains() for same in same_jobs().values()), {})
 
 
 def sweeps() -> list[str]:
-    """Trainings per hour, where they were measured."""
+    """Training runs per hour, where they were measured."""
     lines: list[str] = []
-    for what, same in same_trainings().items():
+    for what, same in same_jobs().items():
         gains, sharing = same.gains(), same.gains_over_sharing()
         steps = same.rates("steady_steps_per_s")
         rows = [
@@ -104,7 +104,7 @@ def sweeps() -> list[str]:
         ]
         lines += [what, "", *markdown(HEAD, rows), "", *same.calls, ""]
     return lines[:-1] or [
-        f"Trainings per hour of a sweep: {NOT_MEASURED} (`python -m benchmarks.sweeps`)."
+        f"Training runs per hour of a sweep: {NOT_MEASURED} (`python -m benchmarks.sweeps`)."
     ]
 
 
@@ -113,7 +113,8 @@ def _described(call: Call, tasks: list[str]) -> str:
     overrides = ", ".join(f"`{one}`" for one in sorted(call.settings["overrides"]))
     mix = f" of {tasks[0].replace(',', ', ')}" if tasks else ""
     compiled = "programs compiled before" if call.settings["warm"] else "each sweep compiles"
-    return f"{call.settings['jobs']} trainings{mix} with {overrides}; {compiled}; {call.device}."
+    runs = f"{call.settings['jobs']} training runs{mix} with {overrides}"
+    return f"{runs}; {compiled}; {call.device}."
 
 
 def _order(way: str) -> tuple[str, int]:

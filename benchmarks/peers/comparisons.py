@@ -107,7 +107,8 @@ COMPARISONS: Mapping[str, Comparison] = MappingProxyType(
         ),
         # The nearest that there is: walking to a commanded velocity on flat ground.
         "anymal, and mjlab's Go1": Comparison(
-            ("env=anymal", "physics.impl=warp", "num_timesteps=5000000"), peer=MJLAB
+            ("env=anymal", "physics.impl=warp", "num_envs=4096", "num_timesteps=10000000"),
+            peer=MJLAB,
         ),
     }
 )

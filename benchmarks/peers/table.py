@@ -10,7 +10,7 @@ from benchmarks.peers.comparisons import COMPARISONS, MJLAB
 
 OURS = "gmijax"
 HEAD = (
-    "training | beside | `gmijax.train`, steps/s: | the other, steps/s: | ratio: "
+    "training run | beside | `gmijax.train`, steps/s: | the other, steps/s: | ratio: "
     "| seconds of the command, `gmijax.train`: | the other:"
 )
 
