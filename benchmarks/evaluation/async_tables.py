@@ -5,9 +5,11 @@ from __future__ import annotations
 from collections.abc import Callable
 from types import MappingProxyType
 
-from benchmarks.cases import SUITES
-from benchmarks.evaluation.figures import WHOLE_RUN, markdown, rate, ratio, shown, source
+from benchmarks.cases import SUITES, Case
+from benchmarks.evaluation.figures import TRAINING, WHOLE_RUN, markdown, rate, ratio, shown, source
 from benchmarks.evaluation.paper import CHANNELS
+
+LONG = "async-long"
 
 ASYNC = (
     ("async-1gpu", "sync, 1 GMI x 8192", "sync, 1 GMI x 8192", ""),
@@ -52,16 +54,30 @@ def asynchronous() -> list[str]:
 
 
 def asynchronous_long() -> list[str]:
-    """Whole runs of 100M steps, against synchronous training on as many GPUs."""
-    rows, file = [], "async-long"
-    for case in SUITES[file]:
-        base = next(one.name for one in SUITES[file] if one.gpus == case.gpus)
-        cells = [shown(rate(file, case.name, key), ",.0f") for key in (WHOLE_RUN, "final_return")]
-        rows.append(
-            [case.name, cells[0], shown(ratio(file, case.name, base, WHOLE_RUN)), cells[1]]
-        )
-    head = "ant, 100M steps | steps/s of the whole run: | over synchronous: | return at the end:"
-    return [*markdown(head, rows), *source(file)]
+    """Runs of 100M steps, against synchronous training on as many GPUs."""
+    rows = []
+    for case in SUITES[LONG]:
+        keys = (TRAINING, WHOLE_RUN, "final_return")
+        cells = [shown(rate(LONG, case.name, key), ",.0f") for key in keys]
+        gains = [shown(over_synchronous(case, key)) for key in keys[:2]]
+        rows.append([case.name, cells[0], gains[0], cells[1], gains[1], cells[2]])
+    head = (
+        "ant, 100M steps | steps/s: | over synchronous: | steps/s of the whole run: "
+        "| over synchronous: | return at the end:"
+    )
+    return [*markdown(head, rows), *source(LONG)]
+
+
+def over_synchronous(case: Case, key: str = TRAINING) -> float | None:
+    """A case of `LONG` over synchronous training on as many GPUs."""
+    base = next(one.name for one in SUITES[LONG] if one.gpus == case.gpus)
+    return ratio(LONG, case.name, base, key)
+
+
+def asynchronous_gains(gpus: int) -> list[float | None]:
+    """Of every asynchronous case of `LONG` on so many GPUs."""
+    cases = [one for one in SUITES[LONG] if one.gpus == gpus and "synchronous" not in one.name]
+    return [over_synchronous(case) for case in cases]
 
 
 def channels() -> list[str]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
+from benchmarks.evaluation.async_tables import LONG
 from benchmarks.evaluation.figures import (
     NOT_MEASURED,
     WHOLE_RUN,
@@ -129,7 +130,7 @@ def _studies() -> Iterator[list[str]]:
 
 def _asynchronous() -> Iterator[list[str]]:
     several = {
-        "two": ("async-2gpu", "1 + 1 GPUs, 4 agents + 2 trainers", "1 + 1 GPUs, one process each"),
+        "two": (LONG, "1 + 1 GPUs, 4 agents + 2 trainers", "1 + 1 GPUs, one process each"),
         "four": (
             *("async-4gpu", "3 + 1 GPUs, 4 agents + 2 trainers, har, batches of 4 agents"),
             "3 + 1 GPUs, one process each",

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 from benchmarks.cases import SUITES
@@ -17,9 +18,10 @@ from benchmarks.evaluation.figures import (
     source,
     summaries,
 )
-from benchmarks.records import RESULTS, calls_by_date
+from benchmarks.records import RESULTS, Call, calls_by_date
 
 PATTERN = "seeds-*-nvidia-*.json"
+PLAYGROUND = "playground-"
 HEAD = (
     "task | call: | steps: | precision | changed | successes: | interval of 95 %: | p: | "
     "reward of a step in the end:"
@@ -28,7 +30,7 @@ HEAD = (
 
 def seeds() -> list[str]:
     """Successes of every setting whose seeds all ran, by task and call; calls in order of date."""
-    found = sorted(calls_by_date(RESULTS, PATTERN), key=lambda one: one[0].results["task"])
+    found = [one for one in _calls() if not one[0].results["task"].startswith(PLAYGROUND)]
     rows, calls, number = [], [], Counter[str]()
     for call, path in found:
         task = call.results["task"]
@@ -39,6 +41,26 @@ def seeds() -> list[str]:
         rows += [[f"`{task}`", str(number[task]), *common, *_cells(row)] for row in finished]
         calls.append(f"- {link(path.name)}, call {number[task]}: {origin(call)}")
     return [*markdown(HEAD, rows), "", *calls]
+
+
+def playground_seeds() -> list[str]:
+    """What tasks of Playground reach with Playground's settings, over seeds, as they train."""
+    rows, calls = [], []
+    for call, path in _calls():
+        task = call.results["task"].removeprefix(PLAYGROUND)
+        if task != call.results["task"]:
+            for row in call.results["rows"]:
+                low, median, high = row["return"]
+                spread = f"{median:.4g} ({low:.4g} to {high:.4g})"
+                rows.append([task, f"{row['successes']} of {row['seeds']}", spread])
+            calls.append(f"- {link(path.name)}: {origin(call)}")
+    head = "task | successes: | return in the end, quartiles:"
+    return [*markdown(head, rows), "", *calls]
+
+
+def _calls() -> list[tuple[Call, Path]]:
+    """By task, those of a task in order of date."""
+    return sorted(calls_by_date(RESULTS, PATTERN), key=lambda one: one[0].results["task"])
 
 
 def _common(overrides: Sequence[str]) -> list[str]:

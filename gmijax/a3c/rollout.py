@@ -15,7 +15,16 @@ from gmijax.devices import host_sharding
 from gmijax.learning.learner import ActingWeights, state_values
 from gmijax.learning.normalize import normalize
 from gmijax.learning.policy import ActorCritic
-from gmijax.learning.unroll import Counts, Outcome, act, count, no_counts, outcome_of, unroll
+from gmijax.learning.unroll import (
+    Counts,
+    Drawn,
+    Outcome,
+    act,
+    count,
+    no_counts,
+    outcome_of,
+    unroll,
+)
 from gmijax.sim.wrappers import BatchedEnv, BatchState, StepOutput
 from gmijax.types import Array, PyTree
 
@@ -31,14 +40,16 @@ def collect(
     """Runs steps with one version of the policy: an unroll, or a piece of one."""
 
     def keep(
-        before: BatchState, output: Array, action: Array, out: StepOutput
+        before: BatchState, drawn: Drawn, action: Array, out: StepOutput
     ) -> tuple[Unrolls, Array, Outcome]:
+        del action
+        output, raw = drawn
         kept = Unrolls(
             state=before.env.obs,
-            action=action,
+            action=raw,
             reward=out.reward,
             done=jnp.stack([out.terminated, out.truncated], axis=-1),
-            log_prob=networks.distribution.log_prob(output, weights.params.log_std, action),
+            log_prob=networks.distribution.log_prob(output, weights.params.log_std, raw),
             cut_value=jnp.zeros_like(out.reward),
             bootstrap=jnp.zeros(()),
         )

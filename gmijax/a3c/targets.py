@@ -25,7 +25,7 @@ class Unrolls(NamedTuple):
 
     Attributes:
       state: [T, B, O] raw observations.
-      action: [T, B, A], before clipping.
+      action: [T, B, A], raw, as the distribution drew it.
       reward: [T, B], unscaled.
       done: [T, B, 2] bool: the task has ended; time ran out.
       log_prob: [T, B], of the action under the policy that acted.

@@ -77,8 +77,8 @@ def _trained(
         output = networks.output(params, normalize(moments, obs))
         if deterministic:
             return distribution.mode(output), jnp.zeros(obs.shape[:1])
-        action = distribution.sample(output, params.log_std, keys)
-        return action, distribution.log_prob(output, params.log_std, action)
+        raw = distribution.sample(output, params.log_std, keys)
+        return distribution.action_of(raw), distribution.log_prob(output, params.log_std, raw)
 
     networks, distribution = learner.networks, learner.networks.distribution
     return choose

@@ -21,9 +21,6 @@ _HALF_LOG_2PI = 0.9189385332046727
 _LOG_STD_LIMITS = (-5.0, 2.0)
 """Of standard deviations that a network gives, which nothing else holds back."""
 
-_EDGE = 1.0 - 1e-6
-"""Actions beyond this are taken for this: a float32 cannot tell which one tanh came from."""
-
 _NODES, _WEIGHTS = np.polynomial.hermite_e.hermegauss(16)
 
 
@@ -33,7 +30,9 @@ class Normal:
 
     `output` [..., H] is what the network says of a state; `log_std` [A] are weights beside it
     that all states share. With `state_dependent_std` the output [..., 2 A] holds, behind the
-    means, what is added to `log_std`. Log densities, entropies and divergences are in nats.
+    means, what is added to `log_std`. What is drawn is a raw action: the environment gets
+    `action_of` it, learning keeps the raw one. Log densities, entropies and divergences are in
+    nats.
     """
 
     action_size: int
@@ -46,19 +45,23 @@ class Normal:
 
     def mode(self, output: Array) -> Array:
         """The action [..., A] without noise."""
-        return self._mean_and_log_std(output, jnp.zeros(()))[0]
+        return self.action_of(self._mean_and_log_std(output, jnp.zeros(()))[0])
+
+    def action_of(self, raw: Array) -> Array:
+        """The action [..., A] for the environment, of a raw one."""
+        return raw
 
     def sample(self, output: Array, log_std: Array, keys: PRNGKey) -> Array:
-        """Actions [N, A] for outputs [N, H]; each depends on its own one of `keys` [N] alone."""
+        """Raw actions [N, A] for outputs [N, H]; each depends on its own one of `keys` [N]."""
         mean, log_std = self._mean_and_log_std(output, log_std)
         # Each row from the key of its environment: how these are spread over GMIs changes nothing.
         noise = jax.vmap(lambda key: jax.random.normal(key, (self.action_size,)))(keys)
         return mean + jnp.exp(log_std) * noise
 
-    def log_prob(self, output: Array, log_std: Array, action: Array) -> Array:
-        """Log density [...] of `action` [..., A]."""
+    def log_prob(self, output: Array, log_std: Array, raw: Array) -> Array:
+        """Log density [...] of the action of `raw` [..., A]."""
         mean, log_std = self._mean_and_log_std(output, log_std)
-        z = (action - mean) * jnp.exp(-log_std)
+        z = (raw - mean) * jnp.exp(-log_std)
         return jnp.sum(-0.5 * z**2 - log_std - _HALF_LOG_2PI, axis=-1)
 
     def entropy(self, output: Array, log_std: Array) -> Array:
@@ -86,22 +89,17 @@ class Normal:
 class TanhNormal(Normal):
     """The tanh of a `Normal`: actions never leave [-1, 1].
 
-    Its divergence is that of the Gaussians, which is the same before and behind the tanh.
+    Its divergence is that of the Gaussians, which is the same before and behind the tanh. The
+    raw action cannot be told from the action: in float32, tanh is 1 of all that is above 9.
     """
 
-    def mode(self, output: Array) -> Array:
-        """See `Normal`; the tanh of the Gaussian's mean, as Brax has it."""
-        return jnp.tanh(super().mode(output))
+    def action_of(self, raw: Array) -> Array:
+        """See `Normal`. The action without noise is the tanh of the mean, as Brax has it."""
+        return jnp.tanh(raw)
 
-    def sample(self, output: Array, log_std: Array, keys: PRNGKey) -> Array:
+    def log_prob(self, output: Array, log_std: Array, raw: Array) -> Array:
         """See `Normal`."""
-        return jnp.tanh(super().sample(output, log_std, keys))
-
-    def log_prob(self, output: Array, log_std: Array, action: Array) -> Array:
-        """See `Normal`."""
-        before = jnp.arctanh(jnp.clip(action, -_EDGE, _EDGE))
-        slopes = jnp.sum(_log_slope_of_tanh(before), axis=-1)
-        return super().log_prob(output, log_std, before) - slopes
+        return super().log_prob(output, log_std, raw) - jnp.sum(_log_slope_of_tanh(raw), axis=-1)
 
     def entropy(self, output: Array, log_std: Array) -> Array:
         """See `Normal`; by Gauss-Hermite quadrature for every action."""

@@ -197,11 +197,11 @@ def _run_chunk(
     weights = acting_weights(learner, state)
     step_all = vectorise(env).step
 
-    def choose(before: BatchState) -> tuple[BatchState, Array, Array]:
-        drawn, output, action = act(learner.networks, weights, before)
+    def choose(before: BatchState) -> tuple[BatchState, Any, Array]:
+        after, drawn, action = act(learner.networks, weights, before)
         if options.deterministic:
-            action = learner.networks.distribution.mode(output)
-        return drawn, output, action
+            action = learner.networks.distribution.mode(drawn.output)
+        return after, drawn, action
 
     def step(model: PyTree, before: BatchState, action: Array) -> tuple[BatchState, Any]:
         moved = step_all(model, before.env, action)

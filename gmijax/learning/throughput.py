@@ -18,7 +18,7 @@ import numpy as np
 from gmijax.collectives.interface import Reducer
 from gmijax.config import TrainConfig
 from gmijax.learning.learner import Learner, TrainState, acting_weights
-from gmijax.learning.unroll import act, unroll
+from gmijax.learning.unroll import Drawn, act, unroll
 from gmijax.sim.wrappers import BatchedEnv, BatchState, split_keys
 from gmijax.types import Array, PyTree
 
@@ -98,7 +98,7 @@ class ThroughputMeter:
 
 def _moved(
     env: BatchedEnv,
-    choose: Callable[[TrainState, BatchState], tuple[BatchState, Array, Array]],
+    choose: Callable[[TrainState, BatchState], tuple[BatchState, Any, Array]],
     length: int,
     model: PyTree,
     state: TrainState,
@@ -116,5 +116,5 @@ def _random(env: BatchedEnv, _: TrainState, envs: BatchState) -> tuple[BatchStat
 
 def _policy(
     learner: Learner, state: TrainState, envs: BatchState
-) -> tuple[BatchState, Array, Array]:
+) -> tuple[BatchState, Drawn, Array]:
     return act(learner.networks, acting_weights(learner, state), envs)

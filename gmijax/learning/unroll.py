@@ -18,7 +18,7 @@ from gmijax.types import Array, PyTree
 
 K = TypeVar("K")
 
-Choose: TypeAlias = Callable[[BatchState], tuple[BatchState, Array, Array]]
+Choose: TypeAlias = Callable[[BatchState], tuple[BatchState, Any, Array]]
 """`(state) -> (state, what it knows of the action [N, ...], action [N, A])`; draws its keys from
 the environments'."""
 
@@ -42,21 +42,34 @@ class Counts(NamedTuple):
     overflowed: dict[str, Array]
 
 
+class Drawn(NamedTuple):
+    """What is known of the actions of N environments.
+
+    Attributes:
+      output: [N, H], of the policy's network.
+      raw: [N, A], what its distribution drew.
+    """
+
+    output: Array
+    raw: Array
+
+
 def act(
     networks: ActorCritic, weights: ActingWeights, state: BatchState
-) -> tuple[BatchState, Array, Array]:
-    """Draws one action per environment: `(state, output of the network [N, H], action [N, A])`."""
+) -> tuple[BatchState, Drawn, Array]:
+    """Draws one action per environment: `(state, what is known of it, action [N, A])`."""
     params = weights.params
     state, keys = split_keys(state)
     output = networks.output(params, normalize(weights.moments, state.env.obs))
-    return state, output, networks.distribution.sample(output, params.log_std, keys)
+    raw = networks.distribution.sample(output, params.log_std, keys)
+    return state, Drawn(output, raw), networks.distribution.action_of(raw)
 
 
 def unroll(
     env: BatchedEnv,
     choose: Choose,
     length: int,
-    keep: Callable[[BatchState, Array, Array, Any], K],
+    keep: Callable[[BatchState, Any, Array, Any], K],
     model: PyTree,
     state: BatchState,
 ) -> tuple[BatchState, K]:

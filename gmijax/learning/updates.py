@@ -21,6 +21,7 @@ Gradients: TypeAlias = Callable[[Learner, ActorCriticParams, Any, Any, Array], t
 the losses are a named tuple of [] float32, with a property `steering_kl`."""
 
 _ACTION_BOUND = 1.1
+_SATURATED = 0.999
 """Means beyond this are penalised; actions are clipped to 1, and a little room is harmless."""
 
 
@@ -89,8 +90,8 @@ def bound_loss(mean: Array) -> Array:
 
 
 def saturated_fraction(mean: Array) -> Array:
-    """Share [...] of action means [..., A] beyond [-1, 1], where the environment clips them."""
-    return jnp.mean((jnp.abs(mean) > 1.0).astype(jnp.float32), -1)
+    """Share [...] of action means [..., A] at the limits of [-1, 1], within 0.001, or beyond."""
+    return jnp.mean((jnp.abs(mean) > _SATURATED).astype(jnp.float32), -1)
 
 
 def mean_of_states(values: Array) -> Array:

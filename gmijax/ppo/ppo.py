@@ -28,7 +28,7 @@ from gmijax.learning.learner import (
 )
 from gmijax.learning.normalize import Moments, in_units, merge, moments_of, normalize, std_of
 from gmijax.learning.policy import ActorCritic, ActorCriticParams
-from gmijax.learning.unroll import Counts, act, count, outcome_of, unroll
+from gmijax.learning.unroll import Counts, Drawn, act, count, outcome_of, unroll
 from gmijax.learning.updates import (
     bound_loss,
     clipped_surrogate,
@@ -65,7 +65,7 @@ class Samples(NamedTuple):
 
     Attributes:
       obs: [..., O], normalised as the policy saw it, in the precision of its hidden layers.
-      action: [..., A], before clipping.
+      action: [..., A], raw, as the distribution drew it.
       log_prob: [...], of the action when it was drawn.
       output: [..., H], of the policy's network when the action was drawn.
       value: [...], estimate when the action was drawn.
@@ -90,10 +90,11 @@ def rollout(
     """Runs T steps; the environments' state, samples [T, N], and this GMI's statistics."""
     networks, config = learner.networks, learner.config
 
-    def keep(before: BatchState, output: Array, action: Array, out: StepOutput) -> Any:
-        return before.env.obs, output, action, out
+    def keep(before: BatchState, drawn: Drawn, action: Array, out: StepOutput) -> Any:
+        del action
+        return before.env.obs, drawn, out
 
-    env_state, (raw_obs, output, action, out) = unroll(
+    env_state, (raw_obs, (output, action), out) = unroll(
         env, partial(act, networks, weights), config.unroll_length, keep, model, env_state
     )
     obs = normalize(weights.moments, raw_obs)

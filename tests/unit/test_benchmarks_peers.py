@@ -74,7 +74,7 @@ def test_a_short_training_has_the_same_parts():
 def test_mjlab_gets_as_many_environments_and_steps_and_no_packages_of_ours(tmp_path: Path):
     name = "anymal, and mjlab's Go1"
     side = Side(name, MJLAB, ("num_envs=1024",), mjlab="/mjlab/bin/python")
-    assert (side.told["num_envs"], side.told["iterations"]) == (1024, round(5e6 / 1024 / 24))
+    assert (side.told["num_envs"], side.told["iterations"]) == (1024, round(10e6 / 1024 / 24))
     words = side.short_command(tmp_path, has_gpu=True)
     assert words[:3] == ["/mjlab/bin/python", "-m", "benchmarks.peers.mjlab_ppo"]
     assert json.loads(Path(words[3]).read_text())["iterations"] == 2

@@ -182,34 +182,40 @@ def test_a_distribution_is_what_it_says_of_its_samples(name: str, state_dependen
     added = [-0.2] * state_dependent_std
     old, new = jnp.array([0.3, *added]), jnp.array([0.5, *added])
     log_std = jnp.log(jnp.array([0.6]))
-    end = 0.9999 if name == "tanh_normal" else 6.0
-    grid = jnp.linspace(-end, end, 20_001)
-    width = grid[1] - grid[0]
-    logs, later = (distribution.log_prob(x, log_std, grid[:, None]) for x in (old, new))
+    raw = jnp.linspace(-5.0, 5.0, 20_001)
+    grid = distribution.action_of(raw)
+    width = jnp.gradient(grid)
+    logs, later = (distribution.log_prob(x, log_std, raw[:, None]) for x in (old, new))
     density = jnp.exp(logs)
-    np.testing.assert_allclose(jnp.sum(density) * width, 1.0, atol=2e-3)
+    np.testing.assert_allclose(jnp.sum(density * width), 1.0, atol=2e-3)
     entropy = jnp.mean(distribution.entropy(old, log_std))
-    np.testing.assert_allclose(entropy, -jnp.sum(density * logs) * width, atol=5e-3)
+    np.testing.assert_allclose(entropy, -jnp.sum(density * logs * width), atol=5e-3)
     divergence = distribution.kl_divergence(old, log_std, new, log_std)
-    np.testing.assert_allclose(divergence, jnp.sum(density * (logs - later)) * width, atol=5e-3)
+    np.testing.assert_allclose(divergence, jnp.sum(density * (logs - later) * width), atol=5e-3)
     outputs = jnp.broadcast_to(old, (4000, len(old)))
-    drawn = distribution.sample(outputs, log_std, jax.random.split(jax.random.key(0), 4000))
+    keys = jax.random.split(jax.random.key(0), 4000)
+    drawn = distribution.action_of(distribution.sample(outputs, log_std, keys))
     assert drawn.shape == distribution.mode(outputs).shape == (4000, 1)
-    mean = jnp.sum(density * grid) * width
+    mean = jnp.sum(density * grid * width)
     np.testing.assert_allclose(jnp.mean(drawn), mean, atol=0.04)
     # Half of them lie below the median, which the mode is of all of these.
     np.testing.assert_allclose(jnp.mean(drawn < distribution.mode(old)), 0.5, atol=0.03)
 
 
-def test_actions_at_the_edge_have_finite_densities_and_gradients() -> None:
-    squashed = DISTRIBUTIONS["tanh_normal"](1, False)
+def test_a_saturated_action_is_as_likely_as_the_noise_that_made_it() -> None:
+    """Its tanh is 1 in float32, whatever it was: with that alone, ratios would explode."""
+    squashed, log_std = DISTRIBUTIONS["tanh_normal"](1, False), jnp.zeros(1)
+    raw, old = jnp.array([20.5]), jnp.array([20.0])
+    assert squashed.action_of(raw) == 1.0
 
-    def log_density(mean):
-        return squashed.log_prob(mean, jnp.zeros(1), jnp.ones(1))
+    def log_ratio(mean):
+        logs = (squashed.log_prob(x, log_std, raw) for x in (mean, old))
+        return next(logs) - next(logs)
 
-    value, slope = jax.value_and_grad(log_density)(jnp.array([20.0]))
-    assert jnp.isfinite(value)
-    assert jnp.isfinite(slope).all()
+    value, slope = jax.value_and_grad(log_ratio)(jnp.array([21.0]))
+    # As of the Gaussians: (0.5^2 - 0.5^2) / 2, and back towards what was drawn.
+    np.testing.assert_allclose(value, 0.0, atol=1e-4)
+    np.testing.assert_allclose(slope, [-0.5], atol=1e-4)
 
 
 @pytest.mark.parametrize("lam", [0.0, 0.8, 1.0])
