@@ -1,6 +1,6 @@
-"""Whether a training succeeded, and how the seeds of one setting compare with those of another.
+"""Whether a run succeeded, and how the seeds of one setting compare with those of another.
 
-Pure functions on lines of `metrics.jsonl`. A training has succeeded if it did not lose what it had
+Pure functions on lines of `metrics.jsonl`. A run has succeeded if it did not lose what it had
 learnt, or, where the task says what is wanted, if it does that in the end.
 """
 
@@ -94,7 +94,7 @@ def outcome_of(
     wall_s: float,
     played: Mapping[str, Mapping[str, Any]] = MappingProxyType({}),
 ) -> Outcome:
-    """The outcome of a training; one that did not complete has not succeeded.
+    """The outcome of a run; one that did not complete has not succeeded.
 
     `played` are its checkpoints, as `benchmarks.played` writes them.
     """

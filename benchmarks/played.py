@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
 FILE = "played.json"
 SEED = 1_000_003
-"""Far from the seeds of trainings."""
+"""Far from the seeds of runs."""
 
 
 class Played(NamedTuple):

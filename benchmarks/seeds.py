@@ -8,7 +8,7 @@ Every row is a setting, trained with the same seeds as one sweep; the first row 
 What counts as success is in `benchmarks/outcomes.py`. After every row
 `benchmarks/results/seeds-<task>-<device>.json` is written: successes with Wilson's interval,
 quartiles over seeds, and p against the baseline. At the deadline the sweep that runs is stopped;
-its trainings that are through are kept.
+its runs that are through are kept.
 """
 
 from __future__ import annotations
@@ -223,7 +223,7 @@ def _arguments() -> argparse.Namespace:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("overrides", nargs="*", help="of all trainings, e.g. env=ant")
+    parser.add_argument("overrides", nargs="*", help="of all runs, e.g. env=ant")
     parser.add_argument(
         "--row",
         action="append",
@@ -231,14 +231,14 @@ def _arguments() -> argparse.Namespace:
         metavar="'NAME: OVERRIDE ...'",
         help="a setting; the first one is the baseline",
     )
-    parser.add_argument("--seeds", type=int, default=20, help="trainings of a row")
-    parser.add_argument("--at-once", default="8", help="trainings at once on every GPU, or auto")
+    parser.add_argument("--seeds", type=int, default=20, help="runs of a row")
+    parser.add_argument("--at-once", default="8", help="runs at once on every GPU, or auto")
     parser.add_argument(
         "--play",
         type=int,
         default=0,
         metavar="EPISODES",
-        help="of the last and the best checkpoint of every training, without noise; see "
+        help="of the last and the best checkpoint of every run, without noise; see "
         "run.checkpoint_every",
     )
     parser.add_argument(

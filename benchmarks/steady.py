@@ -1,4 +1,4 @@
-"""Steps per second of trainings that are under way: of one, or of several at the same time."""
+"""Steps per second of runs that are under way: of one, or of several at the same time."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def curve_of(row: Mapping[str, Any]) -> Curve | None:
 
 
 def settled_rate(curve: Sequence[tuple[float, int]]) -> float | None:
-    """Steps per second after the first fifth of one training, which holds compilation.
+    """Steps per second after the first fifth of one run, which holds compilation.
 
     Args:
       curve: seconds and environment steps by then, oldest first.

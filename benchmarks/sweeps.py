@@ -1,6 +1,6 @@
 """Trainings per hour of sweeps: `python -m benchmarks.sweeps`.
 
-The same trainings as sweeps with one at a time, several under MPS, several under plain sharing,
+The same runs as sweeps with one at a time, several under MPS, several under plain sharing,
 several as one program, a mix of tasks, and as many as `auto` takes. A sweep counts from the start
 of its first job to the end of its last, start-up included; beside it stand the steps per second
 while all places train.
@@ -30,7 +30,7 @@ from gmijax.runs.folder import read_json
 
 
 class Way(NamedTuple):
-    """How to run the trainings of a sweep."""
+    """How the runs of a sweep are started."""
 
     at_once: str  # Jobs on the GPU, or `auto`.
     how: str  # `plan.backend`, or `vmap`: those that can be are one program.
@@ -92,7 +92,7 @@ class Benchmark:
                 found[str(way)] = {
                     "sweeps": len(done),
                     "trainings_per_hour": statistics.median(rates),
-                    # Never, where trainings are too short to overlap.
+                    # Never, where runs are too short to overlap.
                     "steady_steps_per_s": statistics.median(steady) if steady else None,
                 }
         return found
@@ -167,11 +167,11 @@ def main() -> int:
         steady = row["steady_steps_per_s"]
         shown = "-" if steady is None else f"{steady:,.0f}"
         sys.stdout.write(
-            f"{way}: {row['trainings_per_hour']:.1f} trainings/h, {shown} steps/s while all "
+            f"{way}: {row['trainings_per_hour']:.1f} runs/h, {shown} steps/s while all "
             f"places train ({row['sweeps']} sweeps)\n"
         )
     if arguments.auto and (share := _auto_to_best(medians)) is not None:
-        sys.stdout.write(f"auto makes {share:.0%} of the trainings of the best of the others\n")
+        sys.stdout.write(f"auto makes {share:.0%} of the runs of the best of the others\n")
     return code or int(any(run["status"] == "failed" for run in benchmark.runs))
 
 
@@ -184,8 +184,8 @@ def _auto_to_best(medians: dict[str, dict[str, Any]]) -> float | None:
 
 def _arguments() -> argparse.Namespace:
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("overrides", nargs="*", help="of the trainings, e.g. env=ant")
-    parser.add_argument("--jobs", type=int, default=8, help="trainings of a sweep")
+    parser.add_argument("overrides", nargs="*", help="of the runs, e.g. env=ant")
+    parser.add_argument("--jobs", type=int, default=8, help="runs of a sweep")
     parser.add_argument("--at-once", type=int, nargs="*", default=[1, 2, 4, 8])
     parser.add_argument("--shared", type=int, nargs="*", default=[4], help="without MPS")
     parser.add_argument("--packed", type=int, nargs="*", default=[], help="as one program")

@@ -54,5 +54,5 @@ def make(*, impl="auto", max_envs=None, rewards=None) -> Env:
 
 
 if __name__ == "__main__":
-    settings = ("plan.gmis_per_gpu=2", "num_envs=64", "num_timesteps=400e3", *sys.argv[1:])
+    settings = ("num_envs=128", "num_timesteps=400e3", *sys.argv[1:])
     gmijax.train(gmijax.compose(*settings, env=make), show=True)

@@ -1,4 +1,4 @@
-"""`python -m gmijax.sweep`: many trainings, several at a time on every GPU."""
+"""`python -m gmijax.sweep`: many runs, several at a time on every GPU."""
 
 from __future__ import annotations
 

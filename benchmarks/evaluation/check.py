@@ -35,7 +35,7 @@ MEASUREMENTS = tuple(
         r"\b\d+\.\d+x\b",
         r"\b[\d.]+ ?% (?:of (?:a|the|one) (?:GPU|SMs|rate|time)|faster|slower|fewer)\b",
         r"\b(?:after|took|takes|in) [\d.]+ (?:s|ms|us|min|minutes|seconds|hours)\b",
-        r"\b[\d.]+ (?:GB/s|TFLOP/s|(?:trainings|runs)/h)",
+        r"\b[\d.]+ (?:GB/s|TFLOP/s|runs/h)",
         r"\breturns? of \d[\d,.]*\b(?! episodes)",
     )
 )

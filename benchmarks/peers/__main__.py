@@ -3,7 +3,7 @@
 The same training by `gmijax.train` and by Brax's PPO (mjlab: a task that is near), in turn, each
 alone on the GPU in processes of its own. Both count alike: steps per second from the first report
 behind a fifth of the steps to the last one, and seconds of the whole command. All programs are
-compiled before, in short trainings at the same time, so no command compiles. Adds a call to
+compiled before, in short runs at the same time, so no command compiles. Adds a call to
 `benchmarks/results/peers-<device>.json`, after every run. Overrides that are given change both
 sides, e.g. `num_envs=8192`. Comparisons that lack a package are left out.
 """
@@ -39,7 +39,7 @@ CURVE_POINTS = 60
 
 
 class Benchmark:
-    """The trainings of one call, in its file after each of them."""
+    """The runs of one call, in its file after each of them."""
 
     def __init__(
         self, arguments: argparse.Namespace, scratch: Path, sides: Sequence[Side]
@@ -58,7 +58,7 @@ class Benchmark:
 
     @property
     def has_failed(self) -> bool:
-        """Whether a training has failed."""
+        """Whether a run has failed."""
         return any("failed" in run for runs in self._runs.values() for run in runs)
 
     def run(self) -> None:
@@ -72,7 +72,7 @@ class Benchmark:
                     self._add(side, self._run(side, repeat))
 
     def _compile(self, sides: Sequence[Side]) -> None:
-        """Short trainings at the same time; a side that fails is not tried again."""
+        """Short runs at the same time; a side that fails is not tried again."""
         folders = [self._new_folder(side, "compile") for side in sides]
         with ExitStack() as logs:
             processes = []
@@ -130,7 +130,7 @@ class Benchmark:
 
 
 def main() -> int:
-    """Measures what the command line asks for; returns 1 if a training failed, 2 on bad input."""
+    """Measures what the command line asks for; returns 1 if a run failed, 2 on bad input."""
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     arguments = _arguments()
     try:
@@ -191,7 +191,7 @@ def _arguments() -> argparse.Namespace:
         "--mjlab", metavar="PYTHON", help="interpreter of an environment with mjlab"
     )
     parser.add_argument("--repeats", type=int, default=3)
-    parser.add_argument("--timeout-s", type=float, default=600.0, help="seconds for a training")
+    parser.add_argument("--timeout-s", type=float, default=600.0, help="seconds for a run")
     parser.add_argument("--deadline-s", type=float, help="seconds for all of it")
     parser.add_argument("--out", type=Path, default=RESULTS, help="folder of the JSON file")
     parser.add_argument("--runs", type=Path, help="keep the folders of runs, with logs, here")

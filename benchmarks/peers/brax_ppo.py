@@ -1,4 +1,4 @@
-"""A training by Brax's PPO in a process of its own: `python -m benchmarks.peers.brax_ppo IN OUT`.
+"""A run by Brax's PPO in a process of its own: `python -m benchmarks.peers.brax_ppo IN OUT`.
 
 IN is a JSON file with a `BraxTraining`; OUT gets the curve, seconds since the start and
 environment steps by then.

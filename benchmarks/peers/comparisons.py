@@ -1,4 +1,4 @@
-"""The trainings that are compared, as data: what both sides are told is made from one tuple."""
+"""The runs that are compared, as data: what both sides are told is made from one tuple."""
 
 from __future__ import annotations
 

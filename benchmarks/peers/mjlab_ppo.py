@@ -1,4 +1,4 @@
-"""A training by mjlab with rsl_rl: `python -m benchmarks.peers.mjlab_ppo IN OUT`.
+"""A run by mjlab with rsl_rl: `python -m benchmarks.peers.mjlab_ppo IN OUT`.
 
 IN is a JSON file with `task`, `num_envs`, `iterations` and `seed`; OUT gets the curve, seconds
 since the start and environment steps by then. It runs in an environment with mjlab, which pins

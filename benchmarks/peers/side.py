@@ -23,7 +23,7 @@ from gmijax.runs.history import read_metrics
 
 _ROOT = Path(__file__).parents[2]
 _MODULES: Mapping[str, str] = {BRAX: "brax_ppo", MJLAB: "mjlab_ppo"}
-_WARM_REPORTS = 2  # The second part of a training by Brax may be compiled once more.
+_WARM_REPORTS = 2  # The second part of a run by Brax may be compiled once more.
 _WARM_MEMORY = 0.05  # Of the GPU, for each of ours that compile at the same time.
 _SCRIPT_FLAGS: Mapping[str, str] = {
     "gmijax": "--xla_gpu_graph_min_graph_size=1",
@@ -87,7 +87,7 @@ class Side(NamedTuple):
         return variables
 
     def curve(self, folder: Path) -> list[tuple[float, int]]:
-        """Seconds and environment steps by then, of a training that has ended."""
+        """Seconds and environment steps by then, of a run that has ended."""
         if self.trainer == OURS:
             lines = read_metrics(RunPaths(folder / "run").metrics)
             return [(line["wall_s"], line["env_steps"]) for line in lines]

@@ -216,7 +216,7 @@ def record_end(
     wall_s: float,
     restarts: Sequence[Mapping[str, Any]],
 ) -> None:
-    """Leaves in the run folder how a training has ended; arguments as of `train_summary`."""
+    """Leaves in the run folder how a run has ended; arguments as of `train_summary`."""
     add_event(run.events, status)
     write_json(run.summary, train_summary(config, plan, run, status, wall_s, restarts))
     draw_returns(run.metrics, run.returns_png, f"{config.env.label}, {config.algo.name}")

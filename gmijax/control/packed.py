@@ -1,7 +1,7 @@
-"""The controller of several trainings that are one program of one GMI. No jax here.
+"""The controller of several runs that are one program of one GMI. No jax here.
 
 Each of them has a run folder as if it had been trained alone, but for the GMI's logs, which are in
-a folder of their own. There is one attempt: where the GMI is lost, the sweep starts the trainings
+a folder of their own. There is one attempt: where the GMI is lost, the sweep starts the runs
 again, together or not, as their checkpoints allow.
 """
 
@@ -32,7 +32,7 @@ from gmijax.supervise.run_gmis import Launch, recorded, run_gmis
 
 
 class _Member(NamedTuple):
-    """One of the trainings."""
+    """One of the runs."""
 
     config: TrainConfig
     run: RunPaths
@@ -41,7 +41,7 @@ class _Member(NamedTuple):
 def train_packed(configs: Sequence[TrainConfig], folder: Path, *, show: bool = False) -> None:
     """Trains with all configurations at once; returns when all have ended.
 
-    A training whose numbers are no longer finite ends before the others, and has an `error.json`
+    A run whose numbers are no longer finite ends before the others, and has an `error.json`
     then.
 
     Args:
@@ -51,7 +51,7 @@ def train_packed(configs: Sequence[TrainConfig], folder: Path, *, show: bool = F
 
     Raises:
       ConfigError: bad input, before anything was started.
-      GmiFailed: the GMI failed; the trainings are saved up to their last checkpoints.
+      GmiFailed: the GMI failed; the runs are saved up to their last checkpoints.
       JobInterrupted: a signal came.
     """
     started_s = time.monotonic()
@@ -69,7 +69,7 @@ def train_packed(configs: Sequence[TrainConfig], folder: Path, *, show: bool = F
             notes += changes
             if beginning.folder is not None:
                 clear_unfinished(run, beginning.checkpoint)
-        what = f"{len(members)} trainings of {plan.num_envs_per_gmi} environments in one program"
+        what = f"{len(members)} runs of {plan.num_envs_per_gmi} environments in one program"
         announce(console, gmis, plan, what, tuple(dict.fromkeys(notes)))
         keep_logs(gmis, len(list(gmis.root.glob("gmi_0/attempt_*"))))
         write_json(gmis.plan, plan.to_dict())
@@ -110,7 +110,7 @@ def _record(members: Sequence[_Member], started_s: float, status: str, plan: Pla
 
 
 def _status_of(run: RunPaths, status: str) -> str:
-    """How one of the trainings has ended, where all together have ended with `status`."""
+    """How one of the runs has ended, where all together have ended with `status`."""
     if run.gmi(0).error.exists():
         return "failed"
     if run.gmi(0).result.exists() and read_json(run.gmi(0).result)["status"] == "completed":

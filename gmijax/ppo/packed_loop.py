@@ -1,4 +1,4 @@
-"""The training loop of a GMI that makes several trainings in one program.
+"""The training loop of a GMI that makes several runs in one program.
 
 They differ in seed and learning rate alone. Their learners and environments are stacked along a
 leading axis [K], and `jax.vmap` makes one program of their K iterations, whose kernels are K times
@@ -42,7 +42,7 @@ from gmijax.types import PyTree
 
 
 class Member:
-    """One of the trainings.
+    """One of the runs.
 
     Attributes:
       config: of the training.
@@ -108,10 +108,10 @@ class Member:
 
 
 class PackedLoop:
-    """K trainings.
+    """K runs.
 
     Args:
-      members: the trainings, from the same step on.
+      members: the runs, from the same step on.
       env: the environments, made for all of them together.
       program: makes the program of a step; see `Reducer.program`.
       link: to the controller.
@@ -249,7 +249,7 @@ def _iterate_all(
     states: TrainState,
     envs: BatchState,
 ) -> tuple[TrainState, BatchState, IterationMetrics]:
-    """An iteration of all trainings; states and metrics have a leading axis [K]."""
+    """An iteration of all runs; states and metrics have a leading axis [K]."""
     one = partial(iterate, env, learner, peers, model)
     return jax.vmap(one)(states, envs)
 

@@ -58,10 +58,10 @@ class JobKind:
 
 
 MEMBERS_VARIABLE: Final = "GMIJAX_MEMBERS"
-"""Run folders of trainings that are one program, as a JSON list."""
+"""Run folders of the runs that are one program, as a JSON list."""
 
 PACKED: Final = JobKind("gmijax.workers.packed_worker")
-"""Several trainings in one program of one GMI."""
+"""Several runs in one program of one GMI."""
 
 SYNCHRONOUS: Final = JobKind("gmijax.workers.training_worker")
 """Training in which every GMI simulates, acts and trains (TCG_EX)."""

@@ -39,7 +39,7 @@ class Child:
     """The process of a job, or of several that are trained together.
 
     Args:
-      configs: of the trainings, with everything that their place decides.
+      configs: of the runs, with everything that their place decides.
       cpus: its cores.
       order: file for what the process is told.
       log: file for what it prints; continued if it exists.

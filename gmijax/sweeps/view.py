@@ -53,7 +53,7 @@ class SweepView:
         rate = sum(progress.env_steps_per_s for progress in running)
         per_hour = trainings_per_hour(self._jobs) or 0.0
         steps = f"{rate:,.0f} steps/s, " if rate else ""
-        return f"{counts}; {steps}{per_hour:,.1f} trainings/h"
+        return f"{counts}; {steps}{per_hour:,.1f} runs/h"
 
     def _show(self) -> Group | None:
         self._print_changes()

@@ -1,4 +1,4 @@
-"""Main of a GMI that makes several trainings in one program: `gmijax.workers.packed_worker`.
+"""Main of a GMI that makes several runs in one program: `gmijax.workers.packed_worker`.
 
 Started by the supervisor and by nobody else. `MEMBERS_VARIABLE` names their run folders.
 """

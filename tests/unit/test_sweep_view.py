@@ -77,7 +77,7 @@ def test_the_table_says_of_each_job_where_and_how_far_it_is() -> None:
     assert rows["1"].endswith("25% 2.5 9 0:00:15 running")
     assert rows["2"].endswith("100% 2.5 9 completed")
     assert "waiting: again, alone on its GPU, after CUDA_ERROR_[/x]" in rows["3"]
-    assert "2 running, 1 waiting, 1 completed; 100 steps/s, 2.0 trainings/h" in shown
+    assert "2 running, 1 waiting, 1 completed; 100 steps/s, 2.0 runs/h" in shown
 
 
 def test_without_a_terminal_every_change_is_a_line() -> None:
