@@ -8,7 +8,7 @@ from types import MappingProxyType
 from typing import Any, NamedTuple
 
 from gmijax.cli.compose import compose
-from gmijax.config import PpoConfig, TrainConfig
+from gmijax.config import ADAPTIVE_LEARNING_RATE_RANGE, PpoConfig, TrainConfig
 from gmijax.errors import ConfigError
 
 BRAX, MJLAB = "Brax", "mjlab"
@@ -204,7 +204,7 @@ def _losses(algo: PpoConfig) -> dict[str, Any]:
 
 
 def _learning_rate(algo: PpoConfig) -> dict[str, Any]:
-    low, high = algo.learning_rate_range
+    low, high = ADAPTIVE_LEARNING_RATE_RANGE
     return {
         "learning_rate": algo.learning_rate,
         "learning_rate_schedule": {"fixed": "NONE", "adaptive_kl": "ADAPTIVE_KL"}[

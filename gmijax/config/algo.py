@@ -9,7 +9,7 @@ from gmijax.config.schema import KeyGroup, doc
 from gmijax.errors import ConfigError
 
 ADAPTIVE_LEARNING_RATE_RANGE = (1e-5, 1e-2)
-"""Where the adaptive schedule keeps the learning rate unless told otherwise."""
+"""Where the adaptive schedule keeps the learning rate; as rl_games and rsl_rl have it."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -41,11 +41,6 @@ class ActorCriticConfig(KeyGroup):
     bound_cost: float = doc("weight of the penalty on action means outside [-1.1, 1.1]", low=0.0)
     learning_rate: float = doc(
         "step size of Adam (the first one, if the schedule is adaptive)", positive=True
-    )
-    learning_rate_range: tuple[float, ...] = doc(
-        "where the adaptive schedule keeps the learning rate: least and largest",
-        default=ADAPTIVE_LEARNING_RATE_RANGE,
-        positive=True,
     )
     desired_kl: float = doc("target of the adaptive schedule", positive=True)
     max_grad_norm: float = doc("gradients are scaled down to this global norm", positive=True)
@@ -89,9 +84,6 @@ class ActorCriticConfig(KeyGroup):
         default=False,
     )
     init_noise_std: float = doc("standard deviation of the first policy", positive=True)
-    min_noise_std: float = doc(
-        "the policy's standard deviation is kept at or above this", default=0.0, low=0.0
-    )
     init_at_random_ep_len: bool = doc(
         "cut the first episode of every world at a random time, so that worlds do not go through "
         "their episodes in step; those episodes are not counted in returns",
@@ -100,23 +92,7 @@ class ActorCriticConfig(KeyGroup):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        limits = self.learning_rate_range
-        if len(limits) != 2 or not limits[0] < limits[1]:
-            raise ConfigError(
-                f"algo.learning_rate_range={list(limits)}: expected two numbers, the smaller one "
-                "first"
-            )
-        if self.min_noise_std and self.state_dependent_std:
-            raise ConfigError(
-                f"algo.min_noise_std={self.min_noise_std!r}: must be 0 with "
-                "algo.state_dependent_std=true"
-            )
-        if self.init_noise_std < self.min_noise_std:
-            raise ConfigError(
-                f"algo.init_noise_std={self.init_noise_std!r}: must be at least "
-                f"algo.min_noise_std={self.min_noise_std!r}"
-            )
-        low, high = limits
+        low, high = ADAPTIVE_LEARNING_RATE_RANGE
         if self.learning_rate_schedule == "adaptive_kl" and not low <= self.learning_rate <= high:
             raise ConfigError(
                 f"algo.learning_rate={self.learning_rate!r}: must be between {low} and {high} "

@@ -20,7 +20,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import orbax.checkpoint as ocp
-from jax.flatten_util import ravel_pytree
 
 from gmijax.collectives.interface import Reducer
 from gmijax.config import TrainConfig
@@ -152,31 +151,8 @@ def restore_learner(checkpoint: Path, template: T) -> T:
       ConfigError: the checkpoint does not fit the template.
     """
     fields, folder = _present(template), checkpoint / LEARNER
-    try:
-        restored = _restore(folder, fields)
-    except ConfigError:
-        if not _has_moments_by_parameter(folder):
-            raise
-        restored = _restore_moments_by_parameter(folder, fields)
+    restored = _restore(folder, fields)
     return restored if fields is template else cast("Any", template)._replace(**restored)
-
-
-def _has_moments_by_parameter(folder: Path) -> bool:
-    """Whether Adam's moments are trees like the parameters, as those of older checkpoints are."""
-    return any(name.startswith("opt_state.1.mu.") for name in _saved_shapes(folder))
-
-
-def _restore_moments_by_parameter(folder: Path, fields: dict[str, Any]) -> Any:
-    """As `_restore` from an older checkpoint; each moment becomes one vector of its leaves."""
-    wanted = fields["opt_state"]
-    older = jax.tree.map(lambda leaf: fields["params"] if leaf.ndim else leaf, wanted)
-    restored = _restore(folder, {**fields, "opt_state": older})
-    vectors = jax.tree.map(
-        lambda like, part: ravel_pytree(part)[0] if like.ndim else part,
-        wanted,
-        restored["opt_state"],
-    )
-    return {**restored, "opt_state": vectors}
 
 
 def learner_sizes(checkpoint: Path) -> tuple[int, int, int]:

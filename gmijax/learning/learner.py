@@ -5,8 +5,6 @@ Checkpoints hold a `TrainState` whatever the algorithm, so that all can be playe
 
 from __future__ import annotations
 
-import math
-from collections.abc import Sequence
 from typing import Generic, NamedTuple, TypeVar
 
 import jax
@@ -207,12 +205,9 @@ def apply_gradients(
     """
     config, rate = learner.config, state.learning_rate
     if config.learning_rate_schedule == "adaptive_kl":
-        rate = adapted_learning_rate(rate, kl, config.desired_kl, config.learning_rate_range)
+        rate = adapted_learning_rate(rate, kl, config.desired_kl)
     updates, opt_state = learner.optimizer.update(grads, state.opt_state, state.params)
     params: ActorCriticParams = jax.tree.map(lambda p, u: p - rate * u, state.params, updates)
-    if config.min_noise_std > 0.0:  # A bound within the loss would have no gradient beyond it.
-        lowest = math.log(config.min_noise_std)
-        params = params._replace(log_std=jnp.maximum(params.log_std, lowest))
     return state._replace(params=params, opt_state=opt_state, learning_rate=rate)
 
 
@@ -234,19 +229,14 @@ def policy_figures(state: TrainState) -> dict[str, Array]:
     return figures if std.size == 1 else figures | {"policy/noise_std_min": jnp.min(std)}
 
 
-def adapted_learning_rate(
-    rate: Array,
-    kl: Array,
-    desired_kl: float,
-    limits: Sequence[float] = ADAPTIVE_LEARNING_RATE_RANGE,
-) -> Array:
+def adapted_learning_rate(rate: Array, kl: Array, desired_kl: float) -> Array:
     """Steers the rate to keep the KL divergence near `desired_kl`.
 
     Divided by 1.5 above twice the target, multiplied by 1.5 below half of it (the rule of
-    Isaac Gym's trainers), within `limits`. No change below 1e-6: that is the first update
-    on a rollout, where the policy has not moved yet and the rest is rounding.
+    Isaac Gym's trainers), within `ADAPTIVE_LEARNING_RATE_RANGE`. No change below 1e-6: that is
+    the first update on a rollout, where the policy has not moved yet and the rest is rounding.
     """
-    low, high = limits
+    low, high = ADAPTIVE_LEARNING_RATE_RANGE
     slower = jnp.maximum(rate / _LEARNING_RATE_STEP, low)
     faster = jnp.minimum(rate * _LEARNING_RATE_STEP, high)
     too_slow = (kl < 0.5 * desired_kl) & (kl > _UNMOVED_KL)

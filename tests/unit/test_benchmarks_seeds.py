@@ -44,8 +44,8 @@ def write_sweep(folder: Path, finals: Mapping[str, float], status: str = "comple
 
 def test_a_row_has_a_name_and_overrides() -> None:
     assert row_of("baseline") == Row("baseline", ())
-    told = "no clip: algo.clip_value_loss=false 'algo.learning_rate_range=[1e-6, 1e-2]'"
-    expected = ("algo.clip_value_loss=false", "algo.learning_rate_range=[1e-6, 1e-2]")
+    told = "no clip: algo.clip_value_loss=false 'algo.policy_hidden_layer_sizes=[64, 32]'"
+    expected = ("algo.clip_value_loss=false", "algo.policy_hidden_layer_sizes=[64, 32]")
     assert row_of(told) == Row("no clip", expected)
     assert Row("apart, no clip", ()).folder == "apart-no-clip"
 

@@ -11,7 +11,6 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-import optax
 import orbax.checkpoint as ocp
 import pytest
 
@@ -109,29 +108,13 @@ def zeros(width: int) -> TrainState:
     return arrays._replace(key=jax.random.key(0))
 
 
-def test_moments_of_adam_by_parameter_become_the_vectors_of_today(tmp_path: Path):
-    state, rng = zeros(4), np.random.default_rng(0)
-    params, mu, nu = (
-        jax.tree.map(lambda leaf: rng.normal(size=leaf.shape).astype(np.float32), state.params)
-        for _ in range(3)
-    )
-    older = optax.EmptyState(), optax.ScaleByAdamState(np.asarray(7, np.int32), mu, nu)
+def test_a_checkpoint_of_other_networks_says_what_does_not_fit(tmp_path: Path):
     run = RunPaths(tmp_path)
-    save_learner(run, 1, state._replace(params=params, opt_state=older))
+    save_learner(run, 1, zeros(4))
     meta = CheckpointMeta("point", "ppo", 1, 1, 8, ((4,), (4,)), "jax")
-    found = restore_learner(finish_checkpoint(run, meta), state)
-    jax.tree.map(np.testing.assert_array_equal, found.params, params)
-    _, adam = found.opt_state
-    assert adam.count == 7
-    for vector, tree in ((adam.mu, mu), (adam.nu, nu)):
-        flat = np.concatenate([leaf.ravel() for leaf in jax.tree.leaves(tree)])
-        np.testing.assert_array_equal(vector, flat)
-    assert jax.tree.structure(found) == jax.tree.structure(state)
-    with pytest.raises(
-        ConfigError,
-        match=r"its opt_state.1.mu.policy.params.Dense_0.bias is \[4\], that of this job \[5\]$",
-    ):
-        restore_learner(run.checkpoint(1), zeros(5))
+    saved = finish_checkpoint(run, meta)
+    with pytest.raises(ConfigError, match=r"its opt_state.1.mu is \[\d+\], that of this job \["):
+        restore_learner(saved, zeros(5))
 
 
 def save(

@@ -51,8 +51,6 @@ REFUSED: list[tuple[str, str, str]] = [
     ("train", "algo.learning_rate=1", "must be between 1e-05 and 0.01 with algo.learning_rate_s"),
     ("train", "run.max_restarts=-1", "run.max_restarts=-1: must be at least 0"),
     ("train", "run.keep_checkpoints=0", "run.keep_checkpoints=0: must be at least 1"),
-    ("train", "algo.learning_rate_range=[1e-3]", "range=[0.001]: expected two numbers, the small"),
-    ("train", "algo.learning_rate_range=[1e-3,1e-3]", "expected two numbers, the smaller one fir"),
     ("train", "eval.every=0", "eval.every=0: must be at least 1"),
     ("train", "eval.episodes=0", "eval.episodes=0: must be at least 1"),
     ("train", f"{A3C} eval.every=100", "eval.every=100: with algo=a3c agents act all the time,"),

@@ -39,11 +39,6 @@ def test_adaptive_learning_rate_begins_where_it_is_kept(rate: float):
     dataclasses.replace(algo, learning_rate=rate, learning_rate_schedule="fixed")
 
 
-def test_the_range_of_learning_rates_can_be_widened():
-    wide = compose("algo.learning_rate_range=[1e-6,1e-3]", "algo.learning_rate=2e-6").algo
-    assert wide.learning_rate_range == (1e-6, 1e-3)
-
-
 @pytest.mark.parametrize("end", [0, 1])
 def test_limits_are_those_of_the_learner(end: int):
     limit, kl = ADAPTIVE_LEARNING_RATE_RANGE[end], (1.0, 1e-9)[end]
