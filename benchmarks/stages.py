@@ -13,7 +13,8 @@ from gmijax.collectives.program import PeersOfOne
 from gmijax.config import PpoConfig, TrainConfig
 from gmijax.learning.learner import Learner, acting_weights, init_learner, make_learner
 from gmijax.learning.unroll import act
-from gmijax.ppo.ppo import Samples, iterate, learn
+from gmijax.ppo.ppo import iterate, learn
+from gmijax.ppo.rollout import Samples
 from gmijax.ppo.statistics import no_stats
 from gmijax.sim.interface import EnvSpec
 from gmijax.sim.randomize import make_worlds

@@ -8,7 +8,8 @@ import jax
 import jax.numpy as jnp
 
 from gmijax.learning.unroll import Counts
-from gmijax.ppo.ppo import IterationMetrics, PpoLosses
+from gmijax.ppo.loss import PpoLosses
+from gmijax.ppo.ppo import IterationMetrics
 from gmijax.sim import episode
 from gmijax.sim.interface import Env, EnvSpec, EnvState
 from gmijax.sim.wrappers import BatchedEnv, time_limit, training_env

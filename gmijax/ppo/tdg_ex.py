@@ -26,7 +26,8 @@ from gmijax.learning.learner import (
     init_learner,
     pack_weights,
 )
-from gmijax.ppo.ppo import IterationMetrics, PpoLearner, Samples, learn, rollout
+from gmijax.ppo.ppo import IterationMetrics, learn
+from gmijax.ppo.rollout import PpoLearner, Samples, rollout
 from gmijax.ppo.statistics import merge_stats, no_stats
 from gmijax.sim.wrappers import BatchedEnv, BatchState
 from gmijax.supervise.heartbeat import GmiState

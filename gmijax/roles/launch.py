@@ -84,8 +84,6 @@ def launch(
         len(machine.cpu_cores),
         on_cpu=plan.backend == "cpu",
     )
-    parcels = [_parcel(each, args) for each in roles]
-    run = create_run(run_dir, None, type(roles[0]).__name__.lower())
     config = {
         "roles": [type(each).__qualname__ for each in roles],
         "timeout_s": timeout_s,
@@ -94,11 +92,7 @@ def launch(
         "device_messages": device_messages,
         "script": shipping.own_script(),
     }
-    write_json(run.plan, plan.to_dict())
-    write_json(run.config, config)
-    for gmi, parcel in enumerate(parcels):
-        run.gmi(gmi).root.mkdir()
-        run.gmi(gmi).role.write_bytes(parcel)
+    run = _new_run(run_dir, plan, config, roles, args)
     timeouts = Timeouts(
         start_timeout_s=start_timeout_s,
         stall_timeout_s=math.inf if stall_timeout_s is None else stall_timeout_s,
@@ -112,6 +106,24 @@ def launch(
         _explain(error, run)
         raise
     return [shipping.load(output) for output in outputs]
+
+
+def _new_run(
+    run_dir: str | None,
+    plan: Plan,
+    config: dict[str, Any],
+    roles: Sequence[Role],
+    args: tuple[Any, ...],
+) -> RunPaths:
+    """The run folder, with what every GMI reads when it starts."""
+    parcels = [_parcel(each, args) for each in roles]  # Before there is a folder: it may fail.
+    run = create_run(run_dir, None, type(roles[0]).__name__.lower())
+    write_json(run.plan, plan.to_dict())
+    write_json(run.config, config)
+    for gmi, parcel in enumerate(parcels):
+        run.gmi(gmi).root.mkdir()
+        run.gmi(gmi).role.write_bytes(parcel)
+    return run
 
 
 def _require_no_gmi() -> None:

@@ -67,7 +67,7 @@ def _run_synchronous(
     from gmijax.collectives.messages.messenger import Messenger
     from gmijax.collectives.messages.pipe_block import PipeBlock
     from gmijax.ppo.loop import TrainingLoop
-    from gmijax.ppo.ppo import PpoLosses
+    from gmijax.ppo.loss import PpoLosses
     from gmijax.ppo.tdg_ex import RolloutWorkers
 
     trainers, workers = groups_of(plan)[1], None

@@ -15,7 +15,8 @@ from gmijax.learning.learner import ActingWeights, state_values
 from gmijax.learning.normalize import Moments, from_units, moments_of, no_samples
 from gmijax.learning.policy import ActorCritic, Mlp, elu
 from gmijax.learning.updates import explained_variance
-from gmijax.ppo.ppo import Samples, UpdateContext, gae, ppo_loss
+from gmijax.ppo.loss import UpdateContext, ppo_loss
+from gmijax.ppo.rollout import Samples, gae
 from gmijax.ppo.statistics import until_diverged
 
 B, O, A = 6, 3, 2

@@ -34,7 +34,9 @@ from gmijax.learning.normalize import moments_of, normalize, std_of
 from gmijax.learning.updates import exchange_size, minibatch_order, run_updates
 from gmijax.partition.layout import Layout
 from gmijax.ppo.loop import warm_up
-from gmijax.ppo.ppo import PpoLosses, gradients, iterate, rollout, update_context
+from gmijax.ppo.loss import PpoLosses
+from gmijax.ppo.ppo import gradients, iterate, update_context
+from gmijax.ppo.rollout import rollout
 from gmijax.ppo.statistics import merge_stats
 from gmijax.sim.wrappers import env_keys
 

@@ -14,7 +14,7 @@ from toy_env import point_mass
 from gmijax.cli.compose import compose
 from gmijax.collectives.host.shared_block import create_exchange
 from gmijax.errors import CollectiveTimeout, GmiFailed, ReportedError
-from gmijax.ppo.ppo import PpoLosses
+from gmijax.ppo.loss import PpoLosses
 from gmijax.runs.folder import RunPaths
 from gmijax.supervise.child import ChildLink
 from gmijax.supervise.failures import first_cause
