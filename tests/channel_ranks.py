@@ -81,7 +81,7 @@ def act(sender: Sender, task: Options) -> Options:
         if pauses.random() < task["pause_chance"]:
             time.sleep(pauses.random() * 2e-3)
     sender.close()
-    return {"dropped": sender.dropped}
+    return {}
 
 
 def learn(receiver: Batcher, task: Options) -> Options:

@@ -1,8 +1,8 @@
 """The role of a serving GMI: simulator and agent in one.
 
 It acts with the newest weights that were published, sends what came of it, and goes on. Trainers
-never make it wait, except for room where experience is not to be dropped. Newer weights are taken
-up within unrolls too: the less old what a policy learns from is, the fewer steps it takes.
+never make it wait, except for room. Newer weights are taken up within unrolls too: the less old
+what a policy learns from is, the fewer steps it takes.
 """
 
 from __future__ import annotations
@@ -110,7 +110,6 @@ class Agent:
             "wall_s": time.monotonic() - started,
             "send_s": self._report.send_s,
             "wait_s": self._wait_s,
-            "dropped": int(self._report.dropped),
             "compile_s": compile_s,
             "device": describe_device(),
         }
@@ -170,7 +169,6 @@ class Agent:
         self._report = self._report._replace(
             env_steps=self._report.env_steps + arrays["reward"].size,
             bytes_sent=float(sender.num_bytes),
-            dropped=float(sender.dropped),
             send_s=self._report.send_s + time.monotonic() - started,
             wait_s=self._wait_s,
             occupancy=occupancy,
@@ -219,11 +217,8 @@ class Agent:
 
         More of them in the channel would only make experience older.
         """
-        channel = self.config.channel
-        if channel.when_full != "block":
-            return False
         size = sum(array.nbytes for array in arrays.values())
-        most = (self._algo.max_ahead - 0.5) * size / channel.capacity_bytes
+        most = (self._algo.max_ahead - 0.5) * size / self.config.channel.capacity_bytes
         deadline_s = time.monotonic() + _SLICE_S
         while self.sender.least_occupancy() > most:
             costs, now_s = _is_idle(env_state), time.monotonic()

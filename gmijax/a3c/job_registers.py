@@ -45,7 +45,6 @@ class Report(NamedTuple):
       checkpoint: environment steps of the latest checkpoint that it has added to, or None.
       env_steps: environment steps acted upon: predictions.
       bytes_sent: of experience.
-      dropped: pieces of experience that were dropped because there was no room.
       send_s: seconds spent on sending, with waits for room.
       wait_s: those of them in which it waited for room and had nothing to compute.
       occupancy: fraction of the room for experience that was full, after the last send.
@@ -55,7 +54,6 @@ class Report(NamedTuple):
     checkpoint: int | None
     env_steps: float
     bytes_sent: float
-    dropped: float
     send_s: float
     wait_s: float
     occupancy: float
@@ -64,7 +62,7 @@ class Report(NamedTuple):
     @classmethod
     def of_nothing(cls, num_stats: int) -> Report:
         """That of an agent which has done nothing."""
-        return cls(None, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, np.zeros(num_stats))
+        return cls(None, 0.0, 0.0, 0.0, 0.0, 0.0, np.zeros(num_stats))
 
     def pack(self) -> npt.NDArray[np.float64]:
         """As numbers for the register; environment steps are exact up to 2^53."""

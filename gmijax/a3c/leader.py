@@ -129,7 +129,6 @@ class Leader:
             "ttop": ttop,
             "staleness": reporter.staleness(),
             "bytes_per_s": _median(reporter.bytes_per_s),
-            "dropped": reporter.dropped,
             "final_return": self._log.last_return,
             "overflow_steps": self._log.overflows.steps,
             "checkpoint": str(self._checkpoint) if self._checkpoint else None,

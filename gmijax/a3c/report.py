@@ -50,8 +50,7 @@ class BatchCounts(NamedTuple):
 class Reporter:
     """Turns updates into lines, a line for half a second of them, from `env_steps` on.
 
-    Of every line it keeps `pps`, `ttop` and the `bytes_per_s` of experience; `dropped` counts
-    pieces of experience that were dropped for lack of room.
+    Of every line it keeps `pps`, `ttop` and the `bytes_per_s` of experience.
     """
 
     def __init__(self, log: TrainingLog, env: BatchedEnv, env_steps: int) -> None:
@@ -59,7 +58,6 @@ class Reporter:
         self.pps: list[float] = []
         self.ttop: list[float] = []
         self.bytes_per_s: list[float] = []
-        self.dropped = 0
         zeros, unpack = ravel_pytree(no_counts(env.spec, env.overflows))
         self._unpack: Any = unpack
         self._before = Report.of_nothing(zeros.size)
@@ -120,7 +118,6 @@ class Reporter:
             simulated=predictions,
             now_s=now_s,
         )
-        self.dropped = int(sums.dropped)
         self._before, self._env_steps = sums, env_steps
         self._updates.clear()
         self._whole += self._recent
@@ -156,7 +153,6 @@ class Reporter:
             "async/staleness_p99": p99,
             "async/stale_unrolls": self._stale,
             "channel/occupancy": max((r.occupancy for r in reports), default=None),
-            "channel/dropped": sums.dropped - self._before.dropped,
             "time/send_s": sums.send_s - self._before.send_s,
             "time/wait_s": sums.wait_s - self._before.wait_s,
         }

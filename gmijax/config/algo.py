@@ -162,8 +162,7 @@ class A3cConfig(ActorCriticConfig):
         "unrolls of a policy that is more versions behind are dropped; null: none are", low=1
     )
     max_ahead: int = doc(
-        "unrolls of an agent that may wait for every trainer before the agent waits too "
-        "(channel.when_full=block)",
+        "unrolls of an agent that may wait for every trainer before the agent waits too",
         low=1,
     )
 

@@ -35,13 +35,6 @@ class ChannelConfig(KeyGroup):
         default=None,
         low=1,
     )
-    when_full: Literal["block", "drop_oldest"] = doc(
-        "what an agent does without room: wait, or queue and drop the oldest", default="block"
-    )
-    max_waiting: int = doc("most pieces in that queue (when_full=drop_oldest)", default=4, low=1)
-    float16: tuple[str, ...] = doc(
-        "channels that travel with half the bits, e.g. [state]; they lose precision", default=()
-    )
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -52,19 +45,11 @@ class ChannelConfig(KeyGroup):
             )
         if self.transport == "device" and (why := self.why_not_device()):
             raise ConfigError(f"channel.transport=device: {why}")
-        if self.design == "uni" and self.when_full != "block":
-            raise ConfigError(
-                "channel.when_full=drop_oldest: channel.design=uni allows only block"
-            )
 
     def why_not_device(self) -> str | None:
         """None if these settings go with `transport=device`, else the reason."""
         if self.design != "multi":
             return f"not with channel.design={self.design}; allowed is multi"
-        if self.when_full != "block":
-            return f"not with channel.when_full={self.when_full}; allowed is block"
-        if self.float16:
-            return "not with channel.float16: nothing is converted on the way"
         return None
 
     @property

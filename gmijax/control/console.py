@@ -189,5 +189,5 @@ def _rates(line: dict[str, Any]) -> str:
         f"PPS {line['async/pps']:,.0f}  TTOP {line['async/ttop']:,.0f}  "
         f"staleness {'-' if behind is None else format(behind, '.1f')}  "
         f"channels {'-' if filled is None else format(filled, '.0%')} full, "
-        f"{line['channel/bytes_per_s'] / 1e6:,.0f} MB/s, {line['channel/dropped']:,.0f} dropped"
+        f"{line['channel/bytes_per_s'] / 1e6:,.0f} MB/s"
     )

@@ -17,7 +17,7 @@ from gmijax.runs.history import read_metrics
 from gmijax.runs.resume import CheckpointMeta, best_checkpoint
 from gmijax.version import __version__, versions_of
 
-_ASYNCHRONOUS = ("pps", "ttop", "staleness", "bytes_per_s", "dropped")
+_ASYNCHRONOUS = ("pps", "ttop", "staleness", "bytes_per_s")
 """Figures that only asynchronous training has."""
 
 _RATES = (

@@ -32,9 +32,6 @@ ROLLOUT_PIPE_BYTES: Final = 16 << 20
 ENV_REGISTERS_FD: Final = "GMIJAX_REGISTERS_FD"
 ENV_CHANNELS_FD: Final = "GMIJAX_CHANNELS_FD"
 
-FLOAT_CHANNELS: Final = ("state", "action", "reward", "log_prob", "cut_value", "bootstrap")
-"""Channels of an unroll that could travel with half the bits; see `gmijax.a3c.targets.Unrolls`."""
-
 _ADVICE: Final = (
     "channels through host memory; channel.transport=device keeps experience on its GPU, which "
     "was faster on one H200 (docs/async.md)"
@@ -149,10 +146,6 @@ def _require_asynchronous(config: TrainConfig) -> None:
         raise ConfigError(
             "channel.transport=zmq: GMIs of one host use its memory, and those of different hosts "
             "TCP without being told; allowed are memory, device"
-        )
-    if unknown := [name for name in config.channel.float16 if name not in FLOAT_CHANNELS]:
-        raise ConfigError(
-            f"channel.float16={unknown}: allowed are some of {', '.join(FLOAT_CHANNELS)}"
         )
     if config.reduce.selection == "measured":
         raise ConfigError(

@@ -50,6 +50,5 @@ def test_a_job_trains_whichever_way_experience_goes(
     assert done.returncode == 0, done.stderr
     summary = json.loads((tmp_path / "run" / "summary.json").read_text())
     assert summary["env_steps"] >= STEPS
-    assert summary["dropped"] == 0
     lines = (tmp_path / "run" / "metrics.jsonl").read_text().splitlines()
     assert sum(json.loads(line)["diverged_steps"] for line in lines) == 0

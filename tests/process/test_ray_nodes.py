@@ -125,9 +125,8 @@ def test_agents_teach_trainers_of_two_nodes_and_of_one_when_the_other_dies(
     summary = json.loads((run / "summary.json").read_text())
     assert (summary["status"], summary["plan"]["layout"]) == ("interrupted", [[1], [0]])
     assert summary["env_steps"] > steps
-    # They act with what the trainer publishes, and send all of it.
+    # They act with what the trainer publishes.
     assert summary["staleness"]["mean"] < 50
-    assert summary["dropped"] == 0
     names = {path.name for path in Path(summary["checkpoint"]).iterdir()}
     assert names == {"gmi_1", "learner", "meta.json"}
     assert not pids_of(run)

@@ -43,7 +43,7 @@ class _NoRoom:
     def __init__(self) -> None:
         self.was_asked = threading.Event()
         self.waited_s = 0.0
-        self.num_bytes = self.dropped = 0
+        self.num_bytes = 0
 
     def send(self, experience, version, timeout_s) -> bool:
         self.was_asked.set()

@@ -28,7 +28,6 @@ from gmijax.learning.learner import (
     unpack_weights,
 )
 from gmijax.sim.wrappers import env_keys
-from gmijax.supervise.job_kinds import FLOAT_CHANNELS
 
 N, T = 12, 8
 ENV = point_mass()
@@ -148,10 +147,6 @@ def test_pieces_make_the_unroll_that_they_are_parts_of(start) -> None:
 def test_pieces_are_equal_and_not_longer_than_asked_for(config, length, every, pieces) -> None:
     changed = dataclasses.replace(config, unroll_length=length, weights_every=every)
     assert changed.pieces_per_unroll == pieces
-
-
-def test_the_channels_that_may_lose_precision_are_those_of_floats() -> None:
-    assert set(FLOAT_CHANNELS) == set(Unrolls._fields) - {"done"}
 
 
 def test_unrolls_without_weight_teach_nothing(start, batch, alone) -> None:

@@ -64,7 +64,7 @@ def test_a_display_that_fails_is_given_up(capsys: pytest.CaptureFixture[str]):
 SYNC = {"env_steps": 500, "env_steps_per_s": 1234.5, "return": 7.25}
 EXPERIENCE = {
     **{"async/pps": 2000.0, "async/ttop": 1500.0, "async/staleness_mean": 2.5},
-    **{"channel/occupancy": 0.25, "channel/bytes_per_s": 3e6, "channel/dropped": 4},
+    **{"channel/occupancy": 0.25, "channel/bytes_per_s": 3e6},
 }
 UNKNOWN = ("async/staleness_mean", "channel/occupancy")
 
@@ -73,7 +73,7 @@ UNKNOWN = ("async/staleness_mean", "channel/occupancy")
     ("more", "part"),
     [
         ({}, "50 %  500 steps  1,234 steps/s  return 7.25"),
-        (EXPERIENCE, "PPS 2,000  TTOP 1,500  staleness 2.5  channels 25% full, 3 MB/s, 4 dropped"),
+        (EXPERIENCE, "PPS 2,000  TTOP 1,500  staleness 2.5  channels 25% full, 3 MB/s"),
         (EXPERIENCE | dict.fromkeys(UNKNOWN), "staleness -  channels - full"),
     ],
 )

@@ -84,10 +84,10 @@ class Batcher:
             arrival = self._arrival(deadline_s, timeout_s)
             filled = self._stack.filled if self._stack is not None else 0
             if not filled and arrival.left >= batch_size:
-                batch = _unpacked(arrival.take(batch_size), arrival.spec)
+                batch = arrival.take(batch_size)
                 break
             if self._stack is None or not self._stack.fits(arrival.spec):
-                self._stack = self._new_stack(arrival.spec.unpacked(), batch_size)
+                self._stack = self._new_stack(arrival.spec, batch_size)
             self._stack.add(arrival.take(min(batch_size - filled, arrival.left)))
             if not arrival.left:
                 self._release()
@@ -174,14 +174,15 @@ class _Arrival:
         self.spec, self.left = self.transfer.spec, self.transfer.num_envs
 
     def take(self, count: int) -> Batch:
-        """The next unrolls, as they travelled."""
+        """The next unrolls, which a trainer may not write into."""
         low = self.transfer.num_envs - self.left
         high = low + count
         self.left -= count
         arrays = self.transfer.arrays
         if count < self.transfer.num_envs:  # A part of an array on a device is a copy.
             arrays = {name: array[:, low:high] for name, array in arrays.items()}
-        return Batch(arrays, self.transfer.versions[low:high], self.agents[low:high])
+        experience = {name: _read_only(array) for name, array in arrays.items()}
+        return Batch(experience, self.transfer.versions[low:high], self.agents[low:high])
 
 
 class Stack:
@@ -196,7 +197,7 @@ class Stack:
 
     def fits(self, spec: Spec) -> bool:
         """Whether unrolls of `spec` can be added; agents that differ cannot share a batch."""
-        fits = spec.unpacked() == self.spec
+        fits = spec == self.spec
         if self.filled and not fits:
             raise CollectiveError(f"agents send different experience: {spec} and {self.spec}")
         return fits
@@ -238,17 +239,10 @@ class Stack:
         return {name: _read_only(array[:, : self.filled]) for name, array in self._arrays.items()}
 
 
-def _unpacked(unrolls: Batch, spec: Spec) -> Batch:
-    """Unrolls as the trainer gets them, who may not write into them; nobody can on a device."""
-    experience = dict(unrolls.experience)
-    for channel in spec.channels:
-        array = experience[channel.name]
-        if isinstance(array, np.ndarray):
-            experience[channel.name] = _read_only(array.astype(channel.dtype, copy=False))
-    return unrolls._replace(experience=experience)
-
-
 def _read_only(array: Array) -> Array:
+    """A view that nobody can write into; of an array on a device nobody can anyway."""
+    if not isinstance(array, np.ndarray):
+        return array
     view = array.view()
     view.flags.writeable = False
     return view

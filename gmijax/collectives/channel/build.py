@@ -119,14 +119,7 @@ def open_sender(
     if config.design == "multi":
         fixed = None if config.transfer_kib is None else config.transfer_kib * 1024
         packer = Compressor(migrator, TransferSize(fixed, most), most)
-    return Sender(
-        Dispenser(most, config.float16),
-        packer,
-        migrator,
-        max_waiting=None if config.when_full == "block" else config.max_waiting,
-        on_device=False,
-        held=held,
-    )
+    return Sender(Dispenser(most), packer, migrator, on_device=False, held=held)
 
 
 def open_receiver(
@@ -171,7 +164,7 @@ def _device_sender(
     held.callback(packer.close)
     held.callback(migrator.close)
     dispenser = Dispenser(max_piece_bytes=None)
-    return Sender(dispenser, packer, migrator, max_waiting=None, on_device=True, held=held)
+    return Sender(dispenser, packer, migrator, on_device=True, held=held)
 
 
 def _open_block(rank: int, fd: int | None, held: ExitStack) -> PipeBlock:

@@ -23,7 +23,7 @@ import numpy.typing as npt
 
 from gmijax.collectives.channel.dispenser import Piece
 from gmijax.collectives.channel.migrator import Migrator
-from gmijax.collectives.channel.spec import Array, Spec, write_channel
+from gmijax.collectives.channel.spec import Array, Spec
 from gmijax.collectives.channel.transport import ChannelWriter
 from gmijax.collectives.messages.pipe import Message
 
@@ -144,7 +144,7 @@ class _OpenTransfer:
     def add(self, piece: Piece) -> None:
         low, high = self.filled, self.filled + piece.num_envs
         for name, array in piece.channels.items():
-            write_channel(self.arrays[name][:, low:high], array)
+            self.arrays[name][:, low:high] = array
         self.filled, self.pieces = high, self.pieces + 1
         self.table[self.pieces] = piece.num_envs, piece.version
 

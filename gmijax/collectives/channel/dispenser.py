@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
+from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -22,10 +22,6 @@ class Piece(NamedTuple):
     version: int
     channels: dict[str, Array]
 
-    def copy(self) -> Piece:
-        """The same with arrays of its own."""
-        return self._replace(channels={name: a.copy() for name, a in self.channels.items()})
-
 
 class Dispenser:
     """Splits what an agent sends into pieces with one array a channel.
@@ -33,12 +29,10 @@ class Dispenser:
     Args:
       max_piece_bytes: largest piece; a rollout beyond it is cut between environments. None: it
         stays whole, and its arrays where they are, on the host or the device.
-      float16: channels that travel as float16; the others as they are.
     """
 
-    def __init__(self, max_piece_bytes: int | None, float16: Collection[str] = ()) -> None:
+    def __init__(self, max_piece_bytes: int | None) -> None:
         self._max_piece_bytes = max_piece_bytes
-        self._float16 = frozenset(float16)
         self._spec: Spec | None = None
 
     def split(self, experience: Experience | Any, version: int) -> list[Piece]:
@@ -51,9 +45,8 @@ class Dispenser:
         channels = dict(by_channel)
         if self._max_piece_bytes is not None:
             channels = {name: np.asarray(values) for name, values in by_channel.items()}
-        spec, num_envs = spec_of(channels, self._float16)
+        spec, num_envs = spec_of(channels)
         if self._spec is None:
-            self._check_names(spec)
             self._spec = spec
         if spec != self._spec:
             raise ConfigError(f"experience: got {spec}, the first was {self._spec}")
@@ -73,9 +66,3 @@ class Dispenser:
             part = {name: array[:, low:high] for name, array in channels.items()}
             found.append(Piece(self._spec, high - low, version, part))
         return found
-
-    def _check_names(self, spec: Spec) -> None:
-        allowed = [channel.name for channel in spec.channels if channel.dtype == "float32"]
-        unknown = self._float16.difference(allowed)
-        if unknown:
-            raise ConfigError(f"channel.float16={sorted(unknown)}: expected some of {allowed}")

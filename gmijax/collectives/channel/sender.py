@@ -1,11 +1,10 @@
-"""An agent's end of the channels, with back-pressure: what it does without room."""
+"""An agent's end of the channels, with back-pressure: without room it waits."""
 
 from __future__ import annotations
 
 import contextlib
 import time
 from collections import deque
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -16,7 +15,7 @@ from gmijax.collectives.waits import wait_until
 from gmijax.errors import GmijaxError
 
 CLOSE_TIMEOUT_S = 5.0
-"""How long an agent that closes waits for room for what it has queued."""
+"""How long an agent that closes waits for room for what it has not sent yet."""
 
 
 class Packer(Protocol):
@@ -34,30 +33,22 @@ class Packer(Protocol):
 class Sender:
     """An agent's end of the channels; `held` is closed with it.
 
-    With `max_waiting=None`, `send` waits for room and nothing is ever dropped. Otherwise it never
-    waits: what finds no room is copied and queued, and a queue of more pieces than this loses
-    its oldest. What is in the channel already is a trainer's and stays.
-
     Attributes:
       on_device: whether it takes arrays of the device; otherwise numpy's.
-      num_bytes: sent, in all channels, as they travel.
-      dropped: pieces that nobody gets, with `max_waiting`; after `close` also those that still
-        waited.
+      num_bytes: sent, in all channels.
       waited_s: time spent waiting for room.
     """
 
     dispenser: Dispenser
     packer: Packer
     migrator: Migrator
-    max_waiting: int | None
     on_device: bool
     held: contextlib.ExitStack
 
     def __post_init__(self) -> None:
-        self.num_bytes = self.dropped = 0
+        self.num_bytes = 0
         self.waited_s = 0.0
         self._waiting: deque[Piece] = deque()
-        self._is_pending = False
         self._is_open = True
 
     def send(self, experience: Experience, version: int, timeout_s: float) -> bool:
@@ -66,7 +57,7 @@ class Sender:
         Args:
           experience: arrays by channel; names, S, dtypes and what follows N stay the same.
           version: of the policy that acted.
-          timeout_s: longest wait for room (`when_full=block`).
+          timeout_s: longest wait for room.
 
         Returns:
           False if no trainer made room in time. Then, and after an error, call it again with the
@@ -79,16 +70,9 @@ class Sender:
           CudaError: memory of the GPU cannot be shared.
         """
         self.migrator.check()
-        # If pending it is the same rollout as before, which is split already.
-        pieces = [] if self._is_pending else self.dispenser.split(experience, version)
-        self._is_pending = True  # Also after an error: some of it may have been sent.
-        if self.max_waiting is None:
-            self._waiting.extend(pieces)
-            self._is_pending = not self._drain(timeout_s)
-        else:
-            self._queue(pieces, self.max_waiting)
-            self._is_pending = False
-        return not self._is_pending
+        if not self._waiting:  # Else it is the same rollout as before, of which this is left.
+            self._waiting.extend(self.dispenser.split(experience, version))
+        return self._drain(timeout_s)
 
     def flush(self) -> None:
         """Hands over what waits for more to come; trainers cannot see it before."""
@@ -113,8 +97,6 @@ class Sender:
         self._is_open = False
         with contextlib.suppress(GmijaxError):  # Nothing to send to a trainer that is gone.
             self._drain(CLOSE_TIMEOUT_S)
-        self.dropped += len(self._waiting)
-        self._waiting.clear()
         self.packer.flush()  # Another one may.
         self.held.close()
 
@@ -144,15 +126,3 @@ class Sender:
         is_taken = self.packer.try_add(piece)
         self.num_bytes += is_taken * sum(piece.spec.sizes(piece.num_envs))
         return is_taken
-
-    def _queue(self, pieces: Sequence[Piece], max_waiting: int) -> None:
-        """Takes all pieces at once."""
-        for piece in pieces:
-            while self._waiting and self._try_add(self._waiting[0]):
-                self._waiting.popleft()
-            if not self._waiting and self._try_add(piece):
-                continue
-            self._waiting.append(piece.copy())
-            if len(self._waiting) > max_waiting:
-                self._waiting.popleft()
-                self.dropped += 1

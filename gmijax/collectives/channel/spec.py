@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from functools import lru_cache
 from typing import Any, NamedTuple, TypeAlias
 
@@ -29,24 +29,20 @@ DTYPES = ("float32", "bool")
 
 
 class Channel(NamedTuple):
-    """One kind of data, e.g. `state`: S steps, `shape` follows S and N.
-
-    `dtype`: `float32` or `bool`, on both sides; `wire_dtype`: `float16` where that was asked for.
-    """
+    """One kind of data, e.g. `state`: S steps, `shape` follows S and N, of one of `DTYPES`."""
 
     name: str
     steps: int
     shape: tuple[int, ...]
     dtype: str
-    wire_dtype: str
 
     def full_shape(self, num_envs: int) -> tuple[int, ...]:
         """[S, N, ...]."""
         return (self.steps, num_envs, *self.shape)
 
-    def wire_bytes(self, num_envs: int) -> int:
-        """Bytes of such an array on the way."""
-        return math.prod(self.full_shape(num_envs)) * np.dtype(self.wire_dtype).itemsize
+    def num_bytes(self, num_envs: int) -> int:
+        """Bytes of such an array."""
+        return math.prod(self.full_shape(num_envs)) * np.dtype(self.dtype).itemsize
 
 
 class Spec(NamedTuple):
@@ -55,17 +51,13 @@ class Spec(NamedTuple):
     channels: tuple[Channel, ...]
 
     def sizes(self, num_envs: int) -> list[int]:
-        """Bytes of every channel on the way."""
-        return [channel.wire_bytes(num_envs) for channel in self.channels]
-
-    def unpacked(self) -> Spec:
-        """The same as it is before and after the way."""
-        return Spec(tuple(c._replace(wire_dtype=c.dtype) for c in self.channels))
+        """Bytes of every channel."""
+        return [channel.num_bytes(num_envs) for channel in self.channels]
 
     def arrays_in(self, parts: Sequence[Bytes], num_envs: int) -> dict[str, Array]:
-        """Arrays by channel that lie in `parts`, bytes of every channel on the way."""
+        """Arrays by channel that lie in `parts`, the bytes of every channel."""
         return {
-            channel.name: part.view(channel.wire_dtype).reshape(channel.full_shape(num_envs))
+            channel.name: part.view(channel.dtype).reshape(channel.full_shape(num_envs))
             for channel, part in zip(self.channels, parts, strict=True)
         }
 
@@ -83,12 +75,12 @@ class Spec(NamedTuple):
 def _decode(text: bytes) -> Spec:
     (channels,) = json.loads(text)
     return Spec(
-        tuple(Channel(name, steps, tuple(shape), *rest) for name, steps, shape, *rest in channels)
+        tuple(Channel(name, steps, tuple(shape), dtype) for name, steps, shape, dtype in channels)
     )
 
 
-def spec_of(experience: Experience, float16: Collection[str]) -> tuple[Spec, int]:
-    """The spec of `experience`, of which `float16` travel so, and its number of environments.
+def spec_of(experience: Experience) -> tuple[Spec, int]:
+    """The spec of `experience`, and its number of environments.
 
     Raises:
       ConfigError: arrays that are not [S, N, ...] float32 or bool, or differ in N.
@@ -102,18 +94,7 @@ def spec_of(experience: Experience, float16: Collection[str]) -> tuple[Spec, int
                 f"experience.{name}: got {array.dtype} {list(array.shape)}, expected float32 or "
                 f"bool [S, {num_envs or 'N'}, ...]"
             )
-        dtype = array.dtype.name
-        wire_dtype = "float16" if name in float16 and dtype == "float32" else dtype
-        channels.append(Channel(name, array.shape[0], array.shape[2:], dtype, wire_dtype))
+        channels.append(Channel(name, array.shape[0], array.shape[2:], array.dtype.name))
     if not channels:
         raise ConfigError("experience: has no channels")
     return Spec(tuple(channels)), num_envs
-
-
-def write_channel(into: Array, values: Array) -> None:
-    """Copies values, to float16 where `into` is: then what is too large becomes the largest."""
-    if into.dtype == np.float16 and values.dtype != np.float16:
-        largest = float(np.finfo(np.float16).max)
-        np.clip(values, -largest, largest, out=into, casting="same_kind")
-    else:
-        into[...] = values

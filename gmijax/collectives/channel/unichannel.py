@@ -15,7 +15,7 @@ import numpy as np
 from gmijax.collectives.channel.compressor import Transfer
 from gmijax.collectives.channel.dispenser import Piece
 from gmijax.collectives.channel.migrator import Migrator
-from gmijax.collectives.channel.spec import Array, Spec, write_channel
+from gmijax.collectives.channel.spec import Array, Spec
 from gmijax.collectives.channel.transport import ChannelWriter
 from gmijax.collectives.messages.pipe import Message
 
@@ -45,7 +45,7 @@ class UniPacker:
     def _try_send(self, piece: Piece, step: int, place: int) -> bool:
         channel = piece.spec.channels[place]
         head = piece.spec.encode()
-        sizes = [head.size, 40, channel.wire_bytes(piece.num_envs) // channel.steps]
+        sizes = [head.size, 40, channel.num_bytes(piece.num_envs) // channel.steps]
         if self._writer is None:  # All of a rollout go to one trainer.
             opened = self._migrator.try_open(sizes)
         else:
@@ -57,8 +57,8 @@ class UniPacker:
         views[0][:] = head
         is_last = len(self._todo) == 1
         views[1].view(np.int64)[:] = step, place, piece.num_envs, piece.version, is_last
-        into = views[2].view(channel.wire_dtype).reshape(piece.num_envs, *channel.shape)
-        write_channel(into, piece.channels[channel.name][step])
+        into = views[2].view(channel.dtype).reshape(piece.num_envs, *channel.shape)
+        into[...] = piece.channels[channel.name][step]
         self._writer.commit()
         return True
 
@@ -81,12 +81,12 @@ class UniDecoder:
                 c.name: np.empty(c.full_shape(num_envs), c.dtype) for c in spec.channels
             }
         channel = spec.channels[place]
-        values = tensor.view(channel.wire_dtype).reshape(num_envs, *channel.shape)
+        values = tensor.view(channel.dtype).reshape(num_envs, *channel.shape)
         self._arrays[channel.name][step] = values
         if not is_last:
             return None
         versions = np.full(num_envs, version, np.int64)
-        return Transfer(spec.unpacked(), num_envs, versions, self._arrays)
+        return Transfer(spec, num_envs, versions, self._arrays)
 
 
 def _tensors(spec: Spec) -> list[tuple[int, int]]:
