@@ -56,8 +56,8 @@ class ChannelJob:
         self._held = ExitStack()
         self._folder = folder
         self._processes: dict[int, subprocess.Popen[bytes]] = {}
-        if config.transport == "zmq" or node_of is not None:
-            topology = self._with_addresses(topology, node_of or range(len(topology.gpu_of)))
+        if node_of is not None:
+            topology = self._with_addresses(topology, node_of)
         self.topology = topology
         self._fd = create_channels(config, topology)
         self._held.callback(os.close, self._fd)
@@ -127,14 +127,16 @@ class ChannelJob:
         return self._folder / f"rank_{rank}"
 
     def _plain(self) -> dict[str, Any]:
-        addresses = [[*pair, where] for pair, where in (self.topology.addresses or {}).items()]
-        return {**vars(self.topology), "addresses": addresses}
+        addresses = [[*pair, where] for pair, where in self.topology.addresses.items()]
+        secret = self.topology.secret.hex()
+        return {**vars(self.topology), "addresses": addresses, "secret": secret}
 
     def _with_addresses(
         self, topology: ChannelTopology, node_of: Sequence[int]
     ) -> ChannelTopology:
         return replace(
             topology,
+            secret=os.urandom(32),
             addresses={
                 (agent, trainer): self._held.enter_context(reserved_address("127.0.0.1"))
                 for agent in topology.agents

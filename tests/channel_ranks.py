@@ -112,6 +112,7 @@ def run(task: Options) -> Options:
     """Opens this rank's end and uses it."""
     given = dict(task["topology"])
     given["addresses"] = {(a, t): where for a, t, where in given["addresses"]}
+    given["secret"] = bytes.fromhex(given["secret"])
     for key in ("agents", "trainers", "gpu_of"):
         given[key] = tuple(given[key])
     if task["fake_device"]:

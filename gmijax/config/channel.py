@@ -19,10 +19,9 @@ class ChannelConfig(KeyGroup):
         "multi: transfers by channel; uni: every step's tensors alone, the paper's baseline",
         default="multi",
     )
-    transport: Literal["memory", "device", "zmq"] = doc(
+    transport: Literal["memory", "device"] = doc(
         "memory: shared memory of this host; device: memory of the GPU, where every agent has a "
-        "trainer on its own (CUDA IPC); zmq: TCP by pyzmq, for channels built by hand; train "
-        "refuses it and uses TCP between nodes by itself",
+        "trainer on its own (CUDA IPC). Between nodes it is TCP in any case",
         default="memory",
     )
     capacity_mib: int = doc(

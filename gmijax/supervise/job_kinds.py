@@ -142,11 +142,6 @@ def training_plan(
 
 def _require_asynchronous(config: TrainConfig) -> None:
     """Refuses settings that asynchronous jobs cannot have."""
-    if config.channel.transport == "zmq":
-        raise ConfigError(
-            "channel.transport=zmq: GMIs of one host use its memory, and those of different hosts "
-            "TCP without being told; allowed are memory, device"
-        )
     if config.reduce.selection == "measured":
         raise ConfigError(
             "reduce.selection=measured: for jobs in which every GMI trains; with algo=a3c allowed "

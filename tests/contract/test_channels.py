@@ -5,7 +5,7 @@ from __future__ import annotations
 import signal
 import time
 from pathlib import Path
-from typing import Any, get_args, get_type_hints
+from typing import Any
 
 import numpy as np
 import pytest
@@ -17,13 +17,12 @@ from tests.channel_job import ChannelJob
 
 pytestmark = pytest.mark.timeout(120)
 
-KINDS = get_type_hints(ChannelConfig)
-# Where experience stays on the device it needs agents and trainers on one: tests of its own.
-TRANSPORTS = [name for name in get_args(KINDS["transport"]) if name != "device"]
+# The node of every rank: memory, and TCP. Where experience stays on the device it needs agents and
+# trainers on one: tests of its own.
+TRANSPORTS = {"memory": None, "tcp": range(5)}
+BOTH = (0, 0, 1, 1, 0)  # Memory for agents 0 and 1 with trainer 4, and agent 2 with trainer 3.
 # A design goes through any transport alike, so each of both is here at least once.
-WAYS = [*(("multi", transport, None) for transport in TRANSPORTS), ("uni", "memory", None)]
-# And both transports at once: of agents 0 and 1 with trainer 4, and of agent 2 with trainer 3.
-WAYS += [("multi", "memory", (0, 0, 1, 1, 0))]
+WAYS = [("multi", None), ("multi", range(5)), ("uni", None), ("multi", BOTH)]
 HERE = str(Path(__file__).parents[1])
 TOPOLOGY = ChannelTopology(agents=(0, 1, 2), trainers=(3, 4), gpu_of=(0, 0, 1, 2, 3))
 
@@ -32,9 +31,11 @@ def config(**keys: Any) -> ChannelConfig:
     return ChannelConfig(**{"capacity_mib": 1, **keys})
 
 
-def require_zmq(transport: str) -> None:
-    if transport == "zmq":
+def nodes_of(transport: str) -> Any:
+    """The node of every rank for this transport; skips where TCP cannot be had."""
+    if transport == "tcp":
         pytest.importorskip("zmq")
+    return TRANSPORTS.get(transport)
 
 
 def require_all_once(job: ChannelJob, count: int) -> None:
@@ -46,15 +47,16 @@ def require_all_once(job: ChannelJob, count: int) -> None:
         np.testing.assert_array_equal(np.sort(np.concatenate(parts)), np.arange(count))
 
 
-@pytest.mark.parametrize(("design", "transport", "node_of"), WAYS)
+@pytest.mark.parametrize(("design", "node_of"), WAYS)
 def test_nothing_is_lost_doubled_torn_or_out_of_order(
-    design: Any, transport: Any, node_of: Any, tmp_path: Path
+    design: Any, node_of: Any, tmp_path: Path
 ) -> None:
     """10^5 unrolls with pauses; batches neither fit into transfers nor the other way round."""
-    require_zmq("zmq" if node_of else transport)
+    if node_of:
+        pytest.importorskip("zmq")
     count = 33_600
     task = {"count": count, "envs": 200, "batch": 77, "steps": 2, "pause_chance": 0.1}
-    settings = config(design=design, transport=transport)
+    settings = config(design=design)
     with ChannelJob(tmp_path, settings, TOPOLOGY, node_of, **task).start() as job:
         for rank in job.ranks:
             assert job.result(rank)["error"] is None, job.result(rank)
@@ -63,13 +65,12 @@ def test_nothing_is_lost_doubled_torn_or_out_of_order(
 
 
 @pytest.mark.parametrize("transport", TRANSPORTS)
-def test_the_trainer_with_less_to_do_gets_more(transport: Any, tmp_path: Path) -> None:
-    require_zmq(transport)
+def test_the_trainer_with_less_to_do_gets_more(transport: str, tmp_path: Path) -> None:
     topology = ChannelTopology(agents=(0,), trainers=(1, 2), gpu_of=(0, 1, 2))
     task = {"count": 20_000, "envs": 100, "batch": 100, "sizes": (50, 2), "pause_chance": 1.0}
     # Room for all of it, so that only the load can tell.
-    settings = config(transport=transport, capacity_mib=32)
-    with ChannelJob(tmp_path, settings, topology, **task) as job:
+    settings = config(capacity_mib=32)
+    with ChannelJob(tmp_path, settings, topology, nodes_of(transport), **task) as job:
         job.start(1, busy_s=0.1).start(2).wait_for("open")
         job.start(0)
         slow, quick = (job.result(rank)["unrolls"] for rank in (1, 2))
@@ -78,11 +79,10 @@ def test_the_trainer_with_less_to_do_gets_more(transport: Any, tmp_path: Path) -
 
 
 @pytest.mark.parametrize("transport", TRANSPORTS)
-def test_an_agent_that_finds_no_room_waits_as_told(transport: Any, tmp_path: Path) -> None:
-    require_zmq(transport)
+def test_an_agent_that_finds_no_room_waits_as_told(transport: str, tmp_path: Path) -> None:
     topology = ChannelTopology(agents=(0,), trainers=(1,), gpu_of=(0, 0))
     task = {"count": 10**6, "envs": 100, "batch": 100, "sizes": (50, 2), "timeout_s": 1.0}
-    with ChannelJob(tmp_path, config(transport=transport), topology, **task) as job:
+    with ChannelJob(tmp_path, config(), topology, nodes_of(transport), **task) as job:
         job.start(1, timeout_s=30.0).wait_for("open")
         job.signal(1, signal.SIGSTOP)
         job.start(0)
@@ -92,18 +92,18 @@ def test_an_agent_that_finds_no_room_waits_as_told(transport: Any, tmp_path: Pat
 
 
 @pytest.mark.parametrize(
-    ("transport", "victim"), [("memory", 0), ("zmq", 0), ("zmq", 4), ("device", 0)]
+    ("transport", "victim"), [("memory", 0), ("tcp", 0), ("tcp", 4), ("device", 0)]
 )
 def test_a_killed_process_is_named_and_leaves_nothing(
-    transport: Any, victim: int, tmp_path: Path
+    transport: str, victim: int, tmp_path: Path
 ) -> None:
-    require_zmq(transport)
-    before = shared_memory()
+    before, settings, node_of = shared_memory(), config(), nodes_of(transport)
     topology, task = TOPOLOGY, {"count": 10**7, "envs": 50, "pause_chance": 0.5, "timeout_s": 60.0}
     if transport == "device":
+        settings = config(transport="device")
         topology = ChannelTopology(agents=(0, 1), trainers=(2,), gpu_of=(0, 0, 0))
         task |= {"batch": 50, "fake_device": HERE}
-    with ChannelJob(tmp_path, config(transport=transport), topology, **task).start() as job:
+    with ChannelJob(tmp_path, settings, topology, node_of, **task).start() as job:
         job.wait_for("open")
         time.sleep(0.3)
         job.signal(victim, signal.SIGKILL)

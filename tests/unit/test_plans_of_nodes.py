@@ -148,7 +148,6 @@ def test_who_calls_whom_over_nodes() -> None:
             ("plan.gpus=2", "plan.serving_gpus=[0]", "plan.training_gpus=[1,2,3]"),
             "as many of them",
         ),
-        (("channel.transport=zmq",), "TCP without being told"),
         (("channel.transport=device",), "device: the job is on several nodes; use memory"),
         (("plan.layout=[[0]]",), "with the decoupled template give"),
     ],

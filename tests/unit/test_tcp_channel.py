@@ -8,12 +8,11 @@ import threading
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
-from pathlib import Path
 from typing import Any
 
 import pytest
 
-from gmijax.errors import CollectiveError, ConfigError, PeerLost, PipeClosed
+from gmijax.errors import CollectiveError, PeerLost, PipeClosed
 
 pytest.importorskip("zmq")
 
@@ -21,10 +20,10 @@ import zmq
 
 from gmijax.collectives.channel import tcp_channel
 from gmijax.collectives.channel.tcp_channel import RemoteReader, RemoteWriter
-from gmijax.collectives.channel.tcp_connection import ENV_KEY
 from gmijax.collectives.nodes.meeting import reserved_address
 
 CAPACITY = 2**20
+SECRET = os.urandom(32)
 # What ZeroMQ says first (https://rfc.zeromq.org/spec/23), with CURVE, as one that listens.
 GREETING = b"\xff" + bytes(8) + b"\x7f\x03\x00" + b"CURVE".ljust(20, b"\0") + b"\x01" + bytes(31)
 PLAIN = {
@@ -38,18 +37,17 @@ PLAIN = {
 FORGED = tcp_channel._HEADER.pack(tcp_channel.MAGIC, tcp_channel.DATA, 0), b""
 
 
-@pytest.fixture(autouse=True)
-def cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """The secret of this user, elsewhere; none is given."""
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    monkeypatch.delenv(ENV_KEY, raising=False)
-    return tmp_path / "gmijax"
-
-
 @pytest.fixture
 def address() -> Iterator[str]:
     with reserved_address("127.0.0.1") as reserved:
         yield reserved
+
+
+def ends(address: str) -> tuple[RemoteReader, RemoteWriter]:
+    return (
+        RemoteReader(address, 1, 0, CAPACITY, SECRET),
+        RemoteWriter(address, 0, 1, CAPACITY, SECRET),
+    )
 
 
 def send(writer: RemoteWriter, *values: int) -> None:
@@ -121,7 +119,7 @@ def stranger(kind: str, address: str) -> Iterator[None]:
 def test_a_stranger_delivers_nothing_and_is_not_the_end_of_the_agent(
     kind: str, address: str
 ) -> None:
-    reader, writer = RemoteReader(address, 1, 0, CAPACITY), RemoteWriter(address, 0, 1, CAPACITY)
+    reader, writer = ends(address)
     send(writer, 1)
     assert receive(reader, 1) == [1]
     with stranger(kind, address):
@@ -138,7 +136,7 @@ def test_a_stranger_delivers_nothing_and_is_not_the_end_of_the_agent(
 
 
 def test_an_agent_stays_until_its_trainer_has_taken_all(address: str) -> None:
-    reader, writer = RemoteReader(address, 1, 0, CAPACITY), RemoteWriter(address, 0, 1, CAPACITY)
+    reader, writer = ends(address)
     send(writer, 1, 2)
     assert receive(reader, 1) == [1]
     closing = threading.Thread(target=writer.close)
@@ -157,12 +155,12 @@ def test_an_agent_that_closes_before_its_trainer_listens_loses_nothing(
     address: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("gmijax.collectives.channel.tcp_connection._LINGER_MS", 0)
-    writer = RemoteWriter(address, 0, 1, CAPACITY)
+    writer = RemoteWriter(address, 0, 1, CAPACITY, SECRET)
     send(writer, 1, 2, 3)
     closing = threading.Thread(target=writer.close)
     closing.start()
     closing.join(0.3)
-    reader = RemoteReader(address, 1, 0, CAPACITY)
+    reader = RemoteReader(address, 1, 0, CAPACITY, SECRET)
     assert receive(reader, 3) == [1, 2, 3]
     closing.join(60.0)
     assert not closing.is_alive()
@@ -173,7 +171,7 @@ def test_an_agent_does_not_wait_for_a_trainer_that_has_left(
     address: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("gmijax.collectives.channel.tcp_channel._FAREWELL_S", 60.0)
-    reader, writer = RemoteReader(address, 1, 0, CAPACITY), RemoteWriter(address, 0, 1, CAPACITY)
+    reader, writer = ends(address)
     send(writer, 1)
     assert receive(reader, 1) == [1]
     send(writer, 2)
@@ -188,7 +186,7 @@ def test_an_agent_does_not_wait_for_ever_for_a_trainer_that_never_comes(
 ) -> None:
     monkeypatch.setattr("gmijax.collectives.channel.tcp_channel._FAREWELL_S", 0.1)
     monkeypatch.setattr("gmijax.collectives.channel.tcp_connection._LINGER_MS", 0)
-    writer = RemoteWriter(address, 0, 1, CAPACITY)
+    writer = RemoteWriter(address, 0, 1, CAPACITY, SECRET)
     send(writer, 1)
     writer.close()
     assert writer._connection.is_closed
@@ -196,11 +194,11 @@ def test_an_agent_does_not_wait_for_ever_for_a_trainer_that_never_comes(
 
 def test_an_address_that_cannot_be_is_named() -> None:
     with pytest.raises(CollectiveError, match=r"no connection with GMI 0 at 127.0.0.1 "):
-        RemoteReader("127.0.0.1", 1, 0, CAPACITY)
+        RemoteReader("127.0.0.1", 1, 0, CAPACITY, SECRET)
 
 
 def test_what_is_no_message_of_a_channel_is_an_error(address: str) -> None:
-    reader, writer = RemoteReader(address, 1, 0, CAPACITY), RemoteWriter(address, 0, 1, CAPACITY)
+    reader, writer = ends(address)
     for junk in (b"", b"junk", b"x" * tcp_channel._HEADER.size):
         writer._connection.send([junk])
         with pytest.raises(CollectiveError, match="GMI 1: no message of a channel from GMI 0"):
@@ -215,7 +213,7 @@ def test_a_message_that_is_too_long_is_not_taken_and_what_follows_is_an_error(
     address: str,
 ) -> None:
     """Also from one who has the secret: the connection ends, and the next one misses a message."""
-    reader, writer = RemoteReader(address, 1, 0, CAPACITY), RemoteWriter(address, 0, 1, CAPACITY)
+    reader, writer = ends(address)
     assert writer.max_message_bytes == CAPACITY // 2
     send(writer, 1)
     assert receive(reader, 1) == [1]
@@ -228,21 +226,3 @@ def test_a_message_that_is_too_long_is_not_taken_and_what_follows_is_an_error(
     assert limit == tcp_channel.MAX_ANSWER_BYTES
     for end in (writer, reader):
         end._connection.close()
-
-
-def test_a_network_needs_a_secret_that_is_given(
-    cache: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    with pytest.raises(ConfigError, match=rf"^channel\.transport=zmq: 0\.0\.0\.0:1 .* {ENV_KEY}"):
-        RemoteReader("0.0.0.0:1", 1, 0, CAPACITY)
-    monkeypatch.setenv(ENV_KEY, "short")
-    with pytest.raises(ConfigError, match="at least 16 characters"):
-        RemoteReader("127.0.0.1:1", 1, 0, CAPACITY)
-    assert not cache.exists()
-
-
-def test_the_secret_of_a_user_is_for_nobody_else(address: str, cache: Path) -> None:
-    RemoteReader(address, 1, 0, CAPACITY).close()
-    [key] = cache.iterdir()
-    assert key.stat().st_mode & 0o777 == 0o600
-    assert len(key.read_text()) == 64

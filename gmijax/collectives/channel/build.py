@@ -35,16 +35,16 @@ class ChannelTopology:
     """Ranks that send and ranks that receive, and the GPU of all K.
 
     Attributes:
-      addresses: where the trainer of a pair (agent, trainer) listens, as `host:port`: of all pairs
-        with `transport=zmq`; with `memory` of those on different nodes, which then use TCP too.
-      secret: by which both ends of such a pair know each other; None: see `tcp_connection.py`.
+      addresses: where the trainer of a pair (agent, trainer) listens, as `host:port`, of the pairs
+        on different nodes, which use TCP.
+      secret: by which both ends of such a pair know each other.
     """
 
     agents: tuple[int, ...]
     trainers: tuple[int, ...]
     gpu_of: tuple[int, ...]
-    addresses: Mapping[tuple[int, int], str] | None = None
-    secret: bytes | None = field(default=None, repr=False)
+    addresses: Mapping[tuple[int, int], str] = field(default_factory=dict)
+    secret: bytes = field(default=b"", repr=False)
 
     def __post_init__(self) -> None:
         if not self.agents or not self.trainers:
@@ -52,15 +52,8 @@ class ChannelTopology:
                 f"agents {list(self.agents)}, trainers {list(self.trainers)}: channels need at "
                 "least one of each"
             )
-
-    def address(self, agent: int, trainer: int, config: ChannelConfig) -> str | None:
-        """See above; None for a pair that uses memory."""
-        address = (self.addresses or {}).get((agent, trainer))
-        if address is None and config.transport == "zmq":
-            raise ConfigError(
-                f"channel.transport=zmq: needs an address for agent {agent} and trainer {trainer}"
-            )
-        return address
+        if self.addresses and not self.secret:
+            raise ConfigError("channels with addresses: TCP needs a secret")
 
 
 def require_memory(config: ChannelConfig, topology: ChannelTopology) -> None:
@@ -91,7 +84,7 @@ def create_channels(config: ChannelConfig, topology: ChannelTopology) -> int:
 def open_sender(
     config: ChannelConfig, topology: ChannelTopology, rank: int, fd: int | None
 ) -> Sender:
-    """The end of agent `rank`; `fd` is from `create_channels`, None with `transport=zmq`.
+    """The end of agent `rank`; `fd` is from `create_channels`, None if all its pairs use TCP.
 
     Raises:
       ConfigError: something is missing.
@@ -102,11 +95,10 @@ def open_sender(
     if config.transport == "device":
         return _device_sender(config, _open_block(rank, fd, held), near, held)
     writers: list[ChannelWriter] = []
-    addresses = {peer: topology.address(rank, peer, config) for peer in trainers}
-    far = {peer: at for peer, at in addresses.items() if at}
-    if len(far) < len(addresses):
+    far = {trainer: at for (agent, trainer), at in topology.addresses.items() if agent == rank}
+    if len(far) < len(trainers):
         block = _open_block(rank, fd, held)
-        writers += [PipeWriter(block, peer) for peer in addresses if peer not in far]
+        writers += [PipeWriter(block, peer) for peer in trainers if peer not in far]
     if far:
         from gmijax.collectives.channel.tcp_channel import RemoteWriter  # Needs pyzmq.
 
@@ -128,11 +120,10 @@ def open_receiver(
     """The end of trainer `rank`; arguments and errors as `open_sender`."""
     held = ExitStack()
     readers: list[ChannelReader] = []
-    addresses = {peer: topology.address(peer, rank, config) for peer in topology.agents}
-    far = {peer: at for peer, at in addresses.items() if at}
-    if len(far) < len(addresses):
+    far = {agent: at for (agent, trainer), at in topology.addresses.items() if trainer == rank}
+    if len(far) < len(topology.agents):
         block = _open_block(rank, fd, held)
-        readers += [PipeReader(block, peer) for peer in addresses if peer not in far]
+        readers += [PipeReader(block, peer) for peer in topology.agents if peer not in far]
     if far:
         from gmijax.collectives.channel.tcp_channel import RemoteReader  # Needs pyzmq.
 

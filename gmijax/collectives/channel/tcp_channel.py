@@ -91,7 +91,7 @@ class RemoteWriter(_End):
         rank: int,
         peer: int,
         capacity_bytes: int,
-        secret: bytes | None = None,
+        secret: bytes,
     ) -> None:
         super().__init__(
             Connection(address, rank, peer, MAX_ANSWER_BYTES, listens=False, secret=secret)
@@ -176,7 +176,7 @@ class RemoteReader(_End):
         rank: int,
         peer: int,
         capacity_bytes: int,
-        secret: bytes | None = None,
+        secret: bytes,
     ) -> None:
         longest = max_part_bytes(capacity_bytes) + MAX_ANSWER_BYTES
         super().__init__(Connection(address, rank, peer, longest, listens=True, secret=secret))

@@ -2,24 +2,18 @@
 
 ZeroMQ's CURVE encrypts and authenticates. Whoever listens has a pair of keys that follows from the
 secret, and its public half is told to nobody: without it no handshake succeeds. The GMIs of a job
-on several nodes are given the job's; in other processes it is in `GMIJAX_CHANNEL_KEY`, the same
-for all of them, and between processes of one user on one host a file that only this user can read
-takes its place.
+on several nodes are given the job's.
 """
 
 from __future__ import annotations
 
 import contextlib
 import hashlib
-import ipaddress
-import os
-import secrets
 import socket
 from collections.abc import Sequence
 from typing import Any, Final
 
 from gmijax.errors import CollectiveError, ConfigError
-from gmijax.runs.cache import cache_folder
 
 try:
     import zmq
@@ -27,14 +21,11 @@ try:
     from zmq.utils.monitor import recv_monitor_message
 except ImportError:
     raise ConfigError(
-        "channel.transport=zmq: pyzmq is not installed; the package extra zmq brings it"
+        "channels between nodes: pyzmq is not installed; the package extra zmq brings it"
     ) from None
 
 _LINGER_MS: Final = 2000
 """How long an end waits for what it has not yet put on the wire, at its close or exit."""
-
-ENV_KEY: Final = "GMIJAX_CHANNEL_KEY"
-_SHORTEST_KEY: Final = 16
 
 _OPTIONS: Final = {
     zmq.SNDHWM: 0,  # Acknowledgements bound what waits, not a number of messages.
@@ -61,13 +52,12 @@ class Connection:
       peer: that of the other one.
       max_frame_bytes: who sends a longer part of a message is cut off.
       listens: whether this is the end that listens.
-      secret: of the job; None: see the module.
+      secret: of the job.
       newest_only: of messages that wait, at either end, the last one takes the place of all
         others; they have one part.
 
     Raises:
       CollectiveError: an address that cannot be.
-      ConfigError: an address of a network, and no secret; or one that is too short.
     """
 
     def __init__(
@@ -78,7 +68,7 @@ class Connection:
         max_frame_bytes: int,
         *,
         listens: bool,
-        secret: bytes | None = None,
+        secret: bytes,
         newest_only: bool = False,
     ) -> None:
         self.rank, self.peer = rank, peer
@@ -87,7 +77,7 @@ class Connection:
         self._strangers: set[int] = set()
         self._handshakes = 0
         self._was_up = False
-        server_key = _server_key(address, secret)
+        server_key = _server_key(secret)
         self._context = zmq.Context()
         self._socket = self._context.socket(zmq.DEALER)
         for option, value in _OPTIONS.items():
@@ -171,46 +161,9 @@ class Connection:
             self._context.term()
 
 
-def _server_key(address: str, secret: bytes | None) -> bytes:
+def _server_key(secret: bytes) -> bytes:
     """The secret key of whoever listens, as ZeroMQ writes keys."""
-    given = secret or os.environ.get(ENV_KEY, "").encode()
-    if given and len(given) < _SHORTEST_KEY:
-        raise ConfigError(f"{ENV_KEY}: a secret must have at least {_SHORTEST_KEY} characters")
-    if not given and not _is_loopback(address.rpartition(":")[0]):
-        raise ConfigError(
-            f"channel.transport=zmq: {address} can be reached by others, so set {ENV_KEY} to the "
-            "same secret in all processes of the job"
-        )
-    return z85.encode(hashlib.sha256(b"gmijax channel " + (given or _key_of_user())).digest())
-
-
-def _is_loopback(host: str) -> bool:
-    try:
-        return ipaddress.ip_address(host).is_loopback
-    except ValueError:  # A name, or nothing.
-        return host in ("", "localhost")
-
-
-def _key_of_user() -> bytes:
-    """A secret that processes of this user share, made by the first of them."""
-    path = cache_folder() / "channel.key"
-    mine = path.with_name(f".{path.name}.{secrets.token_hex(4)}")
-    try:
-        if not path.exists():
-            path.parent.mkdir(parents=True, exist_ok=True)
-            made = os.open(mine, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600)
-            with os.fdopen(made, "w") as file:
-                file.write(secrets.token_hex(32))
-            # A link, because it is there as a whole or not at all, and the first one stays.
-            with contextlib.suppress(FileExistsError):
-                os.link(mine, path)
-            mine.unlink()
-        return path.read_bytes()
-    except OSError as error:
-        raise ConfigError(
-            f"channel.transport=zmq: {path} cannot be used ({error.strerror}); set {ENV_KEY} to "
-            "the same secret in all processes of the job"
-        ) from None
+    return z85.encode(hashlib.sha256(b"gmijax channel " + secret).digest())
 
 
 def _listening(address: str) -> int:
