@@ -45,6 +45,7 @@ from gmijax.learning.updates import (
     explained_variance,
     mean_of_states,
     minibatch_order,
+    probability_ratio,
     run_updates,
     saturated_fraction,
 )
@@ -129,7 +130,7 @@ def a3c_loss(
 def _policy_terms(logs: Array, targets: Targets, config: A3cConfig) -> Array:
     if config.clipping_epsilon is None:
         return -logs * targets.step_weight * targets.advantage
-    ratios = jnp.exp(logs - targets.log_prob)
+    ratios = probability_ratio(logs, targets.log_prob)
     gain = clipped_surrogate(ratios, targets.advantage, config.clipping_epsilon)
     return -targets.step_weight * gain
 

@@ -12,6 +12,7 @@ from gmijax.a3c.returns import Returns, n_step_returns, vtrace
 from gmijax.config import A3cConfig
 from gmijax.learning.learner import Learner, TrainState, acting_weights, state_values
 from gmijax.learning.normalize import Moments, moments_of_those, normalize
+from gmijax.learning.updates import probability_ratio
 from gmijax.types import Array
 
 A3cLearner: TypeAlias = Learner[A3cConfig]
@@ -89,7 +90,7 @@ def batch_targets(
     output = networks.output(params, obs[:-1])
     logs = networks.distribution.log_prob(output, params.log_std, batch.action)
     log_ratios = logs - batch.log_prob
-    ratios = jnp.exp(log_ratios)
+    ratios = probability_ratio(logs, batch.log_prob)
     values = state_values(networks, weights, obs)
     returns = returns_of(batch, values, ratios, config)
     fresh_moments = partial(moments_of_those, jnp.broadcast_to(weight > 0, ratios.shape))

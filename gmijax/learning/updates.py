@@ -22,6 +22,7 @@ the losses are a named tuple of [] float32, with a property `steering_kl`."""
 
 _ACTION_BOUND = 1.1
 _SATURATED = 0.999
+_LARGEST_LOG_RATIO = 20.0
 """Means beyond this are penalised; actions are clipped to 1, and a little room is harmless."""
 
 
@@ -73,6 +74,15 @@ def run_updates(
 
     state, (losses, rates) = jax.lax.scan(update, state, order)
     return state, losses, rates
+
+
+def probability_ratio(log_prob: Array, old_log_prob: Array) -> Array:
+    """How much likelier [...] actions have become, from log densities [...].
+
+    A float32 overflows at e^88, and one sample there, whatever its advantage, makes the gradient
+    of a whole minibatch not finite. Beyond `_LARGEST_LOG_RATIO` a sample has no gradient.
+    """
+    return jnp.exp(jnp.minimum(log_prob - old_log_prob, _LARGEST_LOG_RATIO))
 
 
 def clipped_surrogate(ratio: Array, advantage: Array, epsilon: float) -> Array:

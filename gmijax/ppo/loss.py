@@ -13,6 +13,7 @@ from gmijax.learning.updates import (
     bound_loss,
     clipped_surrogate,
     mean_of_states,
+    probability_ratio,
     saturated_fraction,
 )
 from gmijax.ppo.rollout import Samples
@@ -77,7 +78,7 @@ def ppo_loss(
     mode = distribution.mode(output)
     advantage = (samples.advantage - context.advantage_mean) / context.advantage_std
     logs = distribution.log_prob(output, params.log_std, samples.action)
-    ratio = jnp.exp(logs - samples.log_prob)
+    ratio = probability_ratio(logs, samples.log_prob)
     policy_loss = -jnp.mean(clipped_surrogate(ratio, advantage, config.clipping_epsilon))
     value = networks.state_value(params, samples.obs)
     old, target = samples.value, samples.value + samples.advantage

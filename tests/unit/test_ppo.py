@@ -73,6 +73,17 @@ def test_the_surrogate_is_clipped(params, advantage, ratio, surrogate) -> None:
     np.testing.assert_allclose(metrics.kl, 0.0, atol=1e-6)  # The policy has not moved.
 
 
+@pytest.mark.parametrize("advantage", [1.0, -1.0])
+def test_a_ratio_that_overflows_does_not_end_the_run(params, advantage: float) -> None:
+    samples = _samples(params, advantage)
+    samples = samples._replace(log_prob=samples.log_prob.at[0].add(-100.0))  # A ratio of e^100.
+    grads, losses = jax.jit(
+        lambda params: jax.grad(_loss, has_aux=True)(params, samples),
+    )(params)
+    for leaf in jax.tree.leaves((grads, losses)):
+        assert jnp.isfinite(leaf).all()
+
+
 def test_values_are_learnt_in_the_unit_of_their_targets(params) -> None:
     samples = _samples(params, 0.0)
     # Targets have the mean 50 and the standard deviation 10, and the network says v of that unit.
