@@ -1,4 +1,4 @@
-"""Trainings per hour of sweeps: `python -m benchmarks.sweeps`.
+"""Runs per hour of sweeps: `python -m benchmarks.sweeps`.
 
 The same runs as sweeps with one at a time, several under MPS, several under plain sharing,
 several as one program, a mix of tasks, and as many as `auto` takes. A sweep counts from the start

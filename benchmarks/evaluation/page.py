@@ -56,7 +56,8 @@ def advice() -> list[str]:
             f"GPU, {bounds(asynchronous_gains(2))} on two (H100s, 100M steps)",
         ],
     ]
-    return markdown("you have | several GMIs per GPU? | measured on NVIDIA H200s, ant", rows)
+    head = "you have | several GMIs per GPU? | measured (on H200s with ant, unless said)"
+    return markdown(head, rows)
 
 
 TABLES: MappingProxyType[str, Callable[[], list[str]]] = MappingProxyType(

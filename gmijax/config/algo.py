@@ -9,7 +9,7 @@ from gmijax.config.schema import KeyGroup, doc
 from gmijax.errors import ConfigError
 
 ADAPTIVE_LEARNING_RATE_RANGE = (1e-5, 1e-2)
-"""Where the adaptive schedule keeps the learning rate; as rl_games and rsl_rl have it."""
+"""Where the adaptive schedule keeps the learning rate; that of rsl_rl (rl_games goes to 1e-6)."""
 
 
 @dataclass(frozen=True, kw_only=True)

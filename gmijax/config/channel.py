@@ -20,8 +20,8 @@ class ChannelConfig(KeyGroup):
         default="multi",
     )
     transport: Literal["memory", "device"] = doc(
-        "memory: shared memory of this host; device: memory of the GPU, where every agent has a "
-        "trainer on its own (CUDA IPC). Between nodes it is TCP in any case",
+        "memory: shared memory of this host, and TCP between nodes; device: memory of the GPU, "
+        "where every agent has a trainer on its own (CUDA IPC), on one node",
         default="memory",
     )
     capacity_mib: int = doc(

@@ -21,9 +21,13 @@ Gradients: TypeAlias = Callable[[Learner, ActorCriticParams, Any, Any, Array], t
 the losses are a named tuple of [] float32, with a property `steering_kl`."""
 
 _ACTION_BOUND = 1.1
-_SATURATED = 0.999
-_LARGEST_LOG_RATIO = 20.0
 """Means beyond this are penalised; actions are clipped to 1, and a little room is harmless."""
+
+_SATURATED = 0.999
+"""Means beyond this count as saturated; a tanh only comes close to 1."""
+
+_LARGEST_LOG_RATIO = 20.0
+"""Of probabilities; see `probability_ratio`."""
 
 
 def minibatch_order(config: AlgoConfig, state: TrainState, rank: Array, size: int) -> Array:

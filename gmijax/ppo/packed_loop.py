@@ -2,7 +2,7 @@
 
 They differ in seed and learning rate alone. Their learners and environments are stacked along a
 leading axis [K], and `jax.vmap` makes one program of their K iterations, whose kernels are K times
-as large. Each training has its own run folder, with its metrics, checkpoints and result.
+as large. Each run has its own folder, with its metrics, checkpoints and result.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ class Member:
     """One of the runs.
 
     Attributes:
-      config: of the training.
+      config: of the run.
       run: its run folder.
       error: why it has ended before the others, None while it goes on.
     """
@@ -67,14 +67,14 @@ class Member:
         self._log = TrainingLog.open(self.config.env.label, self.run, env_steps)
 
     def report(self, env_steps: int, metrics: IterationMetrics) -> None:
-        """Writes a line; if its numbers are not finite, the training has failed."""
+        """Writes a line; if its numbers are not finite, the run has failed."""
         try:
             report(self.log, env_steps, metrics, {})
         except NonFiniteError as error:
             self._fail(error)
 
     def save(self, env_steps: int, state: TrainState, envs: BatchState) -> None:
-        """Writes a checkpoint, without its name; if numbers are not finite, the training fails."""
+        """Writes a checkpoint, without its name; if numbers are not finite, the run fails."""
         try:
             require_finite(state.params, self.config.env.label, env_steps)
         except NonFiniteError as error:
@@ -137,7 +137,7 @@ class PackedLoop:
     def run(self) -> None:
         """Trains until `num_timesteps` or until the controller asks for an end.
 
-        Trainings whose numbers are no longer finite end alone, with an `error.json`; others with
+        Runs whose numbers are no longer finite end alone, with an `error.json`; others with
         a `result.json`.
         """
         started_s = time.monotonic()

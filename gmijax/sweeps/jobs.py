@@ -119,12 +119,12 @@ class Progress:
 
 @dataclass(frozen=True)
 class Job:
-    """One training of a sweep.
+    """One run of a sweep.
 
     Attributes:
       number: from 0.
       overrides: what makes it different from the other jobs, e.g. `{"seed": "1"}`.
-      config: of the training.
+      config: of the run.
       progress: how far it is.
     """
 

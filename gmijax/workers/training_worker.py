@@ -132,7 +132,11 @@ def _run_asynchronous(
     registers = open_job_registers(required_fd(ENV_REGISTERS_FD), *sizes, len(agents.gmis))
     topology, (nodes, listener) = topology_of(plan), inherited_nodes()
     if nodes is not None:
-        addresses = {(agent, trainer): at for (trainer, agent), at in nodes.calls.items()}
+        addresses = {
+            (agent, trainer): at
+            for (trainer, agent), at in nodes.calls.items()
+            if trainer in trainers.gmis
+        }
         topology = replace(topology, addresses=addresses, secret=nodes.token)
         at_leader = agents.gmis, trainers.gmis[0], held
         registers = over_nodes(registers, sizes, nodes, link.gmi, *at_leader)

@@ -285,7 +285,6 @@ def test_it_learns_with_other_settings_and_updates_the_policy_that_acted(config)
     roll_out = jax.jit(functools.partial(rollout, ENV, mine))
     samples, stats = roll_out(ENV.model, acting_weights(mine, state), envs)[1:]
     assert samples.obs.dtype == jnp.bfloat16
-    assert float(jnp.max(jnp.abs(samples.action))) > 1.0  # What was drawn, not its tanh.
     context = update_context(mine, state, merge_stats(jax.tree.map(lambda x: x[None], stats)))
     first = jax.jit(functools.partial(gradients, mine))
     _, losses = first(state.params, _flat(samples), context, jnp.arange(5, 69))

@@ -12,7 +12,7 @@ from typing import Any
 
 import pytest
 
-from gmijax.errors import CollectiveError, PeerLost, PipeClosed
+from gmijax.errors import CollectiveError, ConfigError, PeerLost, PipeClosed
 
 pytest.importorskip("zmq")
 
@@ -226,3 +226,8 @@ def test_a_message_that_is_too_long_is_not_taken_and_what_follows_is_an_error(
     assert limit == tcp_channel.MAX_ANSWER_BYTES
     for end in (writer, reader):
         end._connection.close()
+
+
+def test_a_secret_that_can_be_guessed_is_refused(address: str) -> None:
+    with pytest.raises(ConfigError, match="a secret of 5 bytes: TCP needs 16 or more"):
+        RemoteReader(address, 1, 0, CAPACITY, b"short")

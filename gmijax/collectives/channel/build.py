@@ -52,8 +52,6 @@ class ChannelTopology:
                 f"agents {list(self.agents)}, trainers {list(self.trainers)}: channels need at "
                 "least one of each"
             )
-        if self.addresses and not self.secret:
-            raise ConfigError("channels with addresses: TCP needs a secret")
 
 
 def require_memory(config: ChannelConfig, topology: ChannelTopology) -> None:

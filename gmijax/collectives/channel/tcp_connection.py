@@ -21,11 +21,13 @@ try:
     from zmq.utils.monitor import recv_monitor_message
 except ImportError:
     raise ConfigError(
-        "channels between nodes: pyzmq is not installed; the package extra zmq brings it"
+        "channels between nodes: pyzmq is not installed; the package extra ray brings it"
     ) from None
 
 _LINGER_MS: Final = 2000
 """How long an end waits for what it has not yet put on the wire, at its close or exit."""
+
+_SHORTEST_SECRET: Final = 16
 
 _OPTIONS: Final = {
     zmq.SNDHWM: 0,  # Acknowledgements bound what waits, not a number of messages.
@@ -58,6 +60,7 @@ class Connection:
 
     Raises:
       CollectiveError: an address that cannot be.
+      ConfigError: a secret that is too short.
     """
 
     def __init__(
@@ -163,6 +166,8 @@ class Connection:
 
 def _server_key(secret: bytes) -> bytes:
     """The secret key of whoever listens, as ZeroMQ writes keys."""
+    if len(secret) < _SHORTEST_SECRET:
+        raise ConfigError(f"a secret of {len(secret)} bytes: TCP needs {_SHORTEST_SECRET} or more")
     return z85.encode(hashlib.sha256(b"gmijax channel " + secret).digest())
 
 

@@ -1,9 +1,8 @@
 """The ends of a channel as types: of a pipe in shared memory, or of a TCP connection.
 
 An agent sends what it has experienced in one rollout, a trainer receives batches of it. A
-*piece* is the unit in which agents count: the experience of one `send`, or a part of its
-environments where the whole is too large for the channel. A *transfer* is what travels: one or
-more pieces.
+*piece* is the experience of one `send`, or a part of its environments where the whole is too
+large for the channel. A *transfer* is what travels: one or more pieces.
 """
 
 from __future__ import annotations
