@@ -112,6 +112,11 @@ class PpoConfig(ActorCriticConfig):
     name: Literal["ppo"] = doc("training algorithm")
     clipping_epsilon: float = doc("clip range of the probability ratio", positive=True)
     clip_value_loss: bool = doc("clip the value loss with clipping_epsilon too")
+    recompute_advantages: bool = doc(
+        "compute values and advantages anew before every pass over the rollout, with the value "
+        "function as it is by then; false: once for all passes",
+        default=False,
+    )
     obs_outliers: Literal["clip", "diverged"] = doc(
         "what does not enter the statistics of observations as it is: what is more than 20 "
         "standard deviations off is clipped to that (clip), or worlds that diverge before the "

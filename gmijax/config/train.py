@@ -54,6 +54,11 @@ class TrainConfig(KeyGroup):
                 "reduce.selection=measured: for jobs in which every GMI trains; with "
                 "plan.template=tdg_ex allowed are paper, device"
             )
+        if self.plan.template == "tdg_ex" and getattr(self.algo, "recompute_advantages", False):
+            raise ConfigError(
+                "algo.recompute_advantages=true: for jobs in which every GMI trains; with "
+                "plan.template=tdg_ex allowed is false"
+            )
         if self.eval.every is not None and self.is_asynchronous:
             raise ConfigError(
                 f"eval.every={self.eval.every}: with algo=a3c agents act all the time, and nobody "

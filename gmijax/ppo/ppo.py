@@ -21,12 +21,12 @@ from gmijax.learning.learner import (
     policy_figures,
     rate_figures,
 )
-from gmijax.learning.normalize import merge, std_of
+from gmijax.learning.normalize import Moments, merge, merge_all, moments_of, std_of
 from gmijax.learning.policy import ActorCriticParams
 from gmijax.learning.unroll import Counts
 from gmijax.learning.updates import explained_variance, minibatch_order, run_updates
 from gmijax.ppo.loss import PpoLosses, UpdateContext, ppo_loss
-from gmijax.ppo.rollout import PpoLearner, Samples, rollout
+from gmijax.ppo.rollout import PpoLearner, Samples, Trajectory, rollout, valued_anew
 from gmijax.ppo.statistics import RolloutStats, merge_stats
 from gmijax.sim.wrappers import BatchedEnv, BatchState
 from gmijax.types import Array, PyTree
@@ -42,8 +42,10 @@ def iterate(
 ) -> tuple[TrainState, BatchState, IterationMetrics]:
     """One iteration, together with the GMIs `peers`."""
     weights = acting_weights(learner, state)
-    env_state, samples, stats = rollout(env, learner, model, weights, env_state)
-    state, metrics = learn(learner, peers, state, samples, stats)
+    env_state, samples, trajectory, stats = rollout(env, learner, model, weights, env_state)
+    if not learner.config.recompute_advantages:
+        trajectory = None
+    state, metrics = learn(learner, peers, state, samples, stats, trajectory)
     return state, env_state, metrics
 
 
@@ -72,22 +74,29 @@ def learn(
     state: TrainState,
     samples: Samples,
     stats: RolloutStats,
+    trajectory: Trajectory | None = None,
 ) -> tuple[TrainState, IterationMetrics]:
     """All updates of an iteration, on samples [T, N] and this GMI's statistics.
 
+    With `trajectory` advantages are computed anew before every pass (arXiv:2006.05990, 3.5).
     The statistics of observations change only after them: the policy that is updated then sees
     the observations exactly as the policy that acted did, and the first probability ratio is 1.
     """
-    samples = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), samples)
     everyone = peers.gather(stats)
     stats = merge_stats(everyone)
     if state.value_moments is not None:
         state = state._replace(value_moments=merge(state.value_moments, stats.target))
     context = update_context(learner, state, stats)
-    order = minibatch_order(learner.config, state, peers.rank(), samples.advantage.shape[0])
-    state, losses, rates = run_updates(
-        learner, peers, gradients, state, samples, context, order, after=everyone
-    )
+    order = minibatch_order(learner.config, state, peers.rank(), samples.advantage.size)
+    if trajectory is None:
+        state, losses, rates = run_updates(
+            learner, peers, gradients, state, flat(samples), context, order, after=everyone
+        )
+    else:
+        passes = order.reshape(learner.config.num_updates_per_batch, -1, order.shape[-1])
+        state, losses, rates = _updates_by_pass(
+            learner, peers, state, samples, trajectory, context, passes
+        )
     means = jax.tree.map(jnp.mean, losses)
     state = finish_iteration(learner, state, stats.obs)
     figures = {
@@ -99,11 +108,50 @@ def learn(
     )
 
 
+def flat(samples: Samples) -> Samples:
+    """Samples [T * N] of samples [T, N]."""
+    return jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), samples)
+
+
+def _updates_by_pass(
+    learner: PpoLearner,
+    peers: Peers,
+    state: TrainState,
+    samples: Samples,
+    trajectory: Trajectory,
+    context: UpdateContext,
+    passes: Array,
+) -> tuple[TrainState, PpoLosses, Array]:
+    """As `run_updates` with `passes` [epochs, minibatches, B], each over samples valued anew."""
+
+    def one_pass(state: TrainState, order: Array) -> tuple[TrainState, tuple[PpoLosses, Array]]:
+        renewed = valued_anew(learner, acting_weights(learner, state), samples, trajectory)
+        everyone = peers.gather(moments_of(renewed.advantage, 2))
+        mean, std = advantage_scale(learner, merge_all(everyone))
+        now = context._replace(advantage_mean=mean, advantage_std=std)
+        state, losses, rates = run_updates(
+            learner, peers, gradients, state, flat(renewed), now, order, after=everyone
+        )
+        return state, (losses, rates)
+
+    state, updates = jax.lax.scan(one_pass, state, passes)
+    losses, rates = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), updates)
+    return state, losses, rates
+
+
+def advantage_scale(learner: PpoLearner, advantage: Moments) -> tuple[Array, Array]:
+    """Mean and deviation, [] each, by which advantages are normalised; 0 and 1 where they are not.
+
+    `advantage` are the moments over all GMIs.
+    """
+    if not learner.config.normalize_advantage:
+        return jnp.zeros(()), jnp.ones(())
+    return advantage.mean, std_of(advantage)
+
+
 def update_context(learner: PpoLearner, state: TrainState, stats: RolloutStats) -> UpdateContext:
     """The constants of an iteration's updates; `stats` are those of all GMIs together."""
-    mean, std = stats.advantage.mean, std_of(stats.advantage)
-    if not learner.config.normalize_advantage:
-        mean, std = jnp.zeros(()), jnp.ones(())
+    mean, std = advantage_scale(learner, stats.advantage)
     return UpdateContext(mean, std, state.params.log_std, state.value_moments)
 
 

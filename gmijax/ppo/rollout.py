@@ -39,14 +39,36 @@ class Samples(NamedTuple):
     advantage: Array
 
 
+class Trajectory(NamedTuple):
+    """What, with values of the observations, advantages follow from.
+
+    Attributes:
+      reward: [T, N], scaled.
+      terminated, truncated: [T, N] bool, the task has ended; time ran out.
+      cut_value: [T, N], V(s_{t+1}) by the policy that acted, which counts where time ran out.
+      last_obs: [1, N, O], normalised, after the last step.
+    """
+
+    reward: Array
+    terminated: Array
+    truncated: Array
+    cut_value: Array
+    last_obs: Array
+
+
 def rollout(
     env: BatchedEnv,
     learner: PpoLearner,
     model: PyTree,
     weights: ActingWeights,
     env_state: BatchState,
-) -> tuple[BatchState, Samples, RolloutStats]:
-    """Runs T steps; the environments' state, samples [T, N], and this GMI's statistics."""
+) -> tuple[BatchState, Samples, Trajectory, RolloutStats]:
+    """Runs T steps.
+
+    Returns:
+      The environments' state, samples [T, N], what advantages can be computed anew from, and
+      this GMI's statistics.
+    """
     networks, config = learner.networks, learner.config
 
     def keep(before: BatchState, drawn: Drawn, action: Array, out: StepOutput) -> Any:
@@ -60,16 +82,11 @@ def rollout(
     values = state_values(networks, weights, obs)
     # V(s_{t+1}) is V of the next row, except where an episode ended and the next row is the
     # first observation of another one; a second pass over all rows is simple and cheap.
-    next_values = state_values(networks, weights, normalize(weights.moments, out.next_obs))
-    advantage = gae(
-        config.reward_scaling * out.reward,
-        values,
-        next_values,
-        out.terminated,
-        out.truncated,
-        discount=config.discounting,
-        lam=config.gae_lambda,
-    )
+    next_obs = normalize(weights.moments, out.next_obs)
+    next_values = state_values(networks, weights, next_obs)
+    rewards = config.reward_scaling * out.reward
+    trajectory = Trajectory(rewards, out.terminated, out.truncated, next_values, next_obs[-1:])
+    advantage = _advantages(config, trajectory, values, next_values)
     log_prob = networks.distribution.log_prob(output, weights.params.log_std, action)
     stats = RolloutStats(
         obs=obs_moments(config, weights.moments, raw_obs, out),
@@ -78,7 +95,33 @@ def rollout(
         counts=count(out.reward, outcome_of(out)),
     )
     obs = obs.astype(networks.policy.dtype)  # The first layer would: fewer bytes to shuffle.
-    return env_state, Samples(obs, action, log_prob, output, values, advantage), stats
+    samples = Samples(obs, action, log_prob, output, values, advantage)
+    return env_state, samples, trajectory, stats
+
+
+def valued_anew(
+    learner: PpoLearner, weights: ActingWeights, samples: Samples, trajectory: Trajectory
+) -> Samples:
+    """`samples` [T, N] with values and advantages by other weights than those that acted."""
+    rows = jnp.concatenate([samples.obs, trajectory.last_obs.astype(samples.obs.dtype)])
+    values = state_values(learner.networks, weights, rows)
+    # The row behind the end of an episode is of another one.
+    next_values = jnp.where(trajectory.truncated, trajectory.cut_value, values[1:])
+    advantage = _advantages(learner.config, trajectory, values[:-1], next_values)
+    return samples._replace(value=values[:-1], advantage=advantage)
+
+
+def _advantages(config: PpoConfig, steps: Trajectory, values: Array, next_values: Array) -> Array:
+    """[T, N]; see `gae`."""
+    return gae(
+        steps.reward,
+        values,
+        next_values,
+        steps.terminated,
+        steps.truncated,
+        discount=config.discounting,
+        lam=config.gae_lambda,
+    )
 
 
 def gae(

@@ -146,7 +146,7 @@ def _rollout(
     packed: Array,
     env_state: BatchState,
 ) -> tuple[BatchState, Samples, Array]:
-    env_state, samples, stats = rollout(env, learner, model, unpack(packed), env_state)
+    env_state, samples, _, stats = rollout(env, learner, model, unpack(packed), env_state)
     return env_state, samples, ravel_pytree(stats)[0]
 
 

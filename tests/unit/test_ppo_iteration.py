@@ -217,7 +217,7 @@ def test_shards_of_minibatches_give_the_update_of_the_whole(learner) -> None:
 
     def collected(num_envs: int, first: int):
         envs = _start(learner, num_envs, first)[1]
-        _, samples, stats = roll_out(ENV.model, acting_weights(learner, state), envs)
+        _, samples, _, stats = roll_out(ENV.model, acting_weights(learner, state), envs)
         return _flat(samples), stats
 
     shards, shard_stats = zip(collected(N, 0), collected(N, N), strict=True)
@@ -283,7 +283,7 @@ def test_it_learns_with_other_settings_and_updates_the_policy_that_acted(config)
     assert {leaf.dtype for leaf in learnt} == {jnp.dtype("float32")}
     # Learning computes what acting did, though its batches are others: nothing has moved yet.
     roll_out = jax.jit(functools.partial(rollout, ENV, mine))
-    samples, stats = roll_out(ENV.model, acting_weights(mine, state), envs)[1:]
+    samples, _, stats = roll_out(ENV.model, acting_weights(mine, state), envs)[1:]
     assert samples.obs.dtype == jnp.bfloat16
     context = update_context(mine, state, merge_stats(jax.tree.map(lambda x: x[None], stats)))
     first = jax.jit(functools.partial(gradients, mine))
