@@ -85,7 +85,7 @@ def _act(learner: Learner, state: Any, carry: Any) -> Any:
 
 
 def _train(learner: Learner, given: Any, state: Any) -> Any:
-    """All updates of an iteration."""
+    """All updates of an iteration, with advantages that are there."""
     samples, stats = given
     return learn(learner, PeersOfOne(), state, samples, stats)[0]
 

@@ -21,7 +21,7 @@ from gmijax.types import Array
 
 
 class UpdateContext(NamedTuple):
-    """Constants of all updates on one rollout.
+    """Constants of all updates on one rollout, or of one pass over it.
 
     Attributes:
       advantage_mean: [] over all samples of all GMIs (0 where not normalised).

@@ -79,7 +79,7 @@ def learn(
     """All updates of an iteration, on samples [T, N] and this GMI's statistics.
 
     With `trajectory` advantages are computed anew before every pass (arXiv:2006.05990, 3.5).
-    The statistics of observations change only after them: the policy that is updated then sees
+    The statistics of observations change only after all updates: the policy that is updated sees
     the observations exactly as the policy that acted did, and the first probability ratio is 1.
     """
     everyone = peers.gather(stats)
@@ -95,7 +95,7 @@ def learn(
     else:
         passes = order.reshape(learner.config.num_updates_per_batch, -1, order.shape[-1])
         state, losses, rates = _updates_by_pass(
-            learner, peers, state, samples, trajectory, context, passes
+            learner, peers, state, samples, trajectory, context, passes, everyone
         )
     means = jax.tree.map(jnp.mean, losses)
     state = finish_iteration(learner, state, stats.obs)
@@ -121,12 +121,13 @@ def _updates_by_pass(
     trajectory: Trajectory,
     context: UpdateContext,
     passes: Array,
+    after: RolloutStats,
 ) -> tuple[TrainState, PpoLosses, Array]:
     """As `run_updates` with `passes` [epochs, minibatches, B], each over samples valued anew."""
 
     def one_pass(state: TrainState, order: Array) -> tuple[TrainState, tuple[PpoLosses, Array]]:
         renewed = valued_anew(learner, acting_weights(learner, state), samples, trajectory)
-        everyone = peers.gather(moments_of(renewed.advantage, 2))
+        everyone = peers.gather(moments_of(renewed.advantage, 2), after=after)
         mean, std = advantage_scale(learner, merge_all(everyone))
         now = context._replace(advantage_mean=mean, advantage_std=std)
         state, losses, rates = run_updates(

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 
 from gmijax.config import PpoConfig
 from gmijax.learning.learner import ActingWeights, Learner, state_values
-from gmijax.learning.normalize import moments_of, normalize
+from gmijax.learning.normalize import from_units, moments_of, normalize
 from gmijax.learning.unroll import Drawn, act, count, outcome_of, unroll
 from gmijax.ppo.statistics import RolloutStats, obs_moments
 from gmijax.sim.wrappers import BatchedEnv, BatchState, StepOutput
@@ -27,7 +27,7 @@ class Samples(NamedTuple):
       action: [..., A], raw, as the distribution drew it.
       log_prob: [...], of the action when it was drawn.
       output: [..., H], of the policy's network when the action was drawn.
-      value: [...], estimate when the action was drawn.
+      value: [...], estimate when the action was drawn, or when the pass began.
       advantage: [...], not normalised.
     """
 
@@ -45,7 +45,8 @@ class Trajectory(NamedTuple):
     Attributes:
       reward: [T, N], scaled.
       terminated, truncated: [T, N] bool, the task has ended; time ran out.
-      cut_value: [T, N], V(s_{t+1}) by the policy that acted, which counts where time ran out.
+      cut_value: [T, N], V(s_{t+1}) by the value function of the rollout, in its own unit; it
+        counts where time ran out.
       last_obs: [1, N, O], normalised, after the last step.
     """
 
@@ -85,7 +86,8 @@ def rollout(
     next_obs = normalize(weights.moments, out.next_obs)
     next_values = state_values(networks, weights, next_obs)
     rewards = config.reward_scaling * out.reward
-    trajectory = Trajectory(rewards, out.terminated, out.truncated, next_values, next_obs[-1:])
+    cut_values = networks.state_value(weights.params, next_obs)
+    trajectory = Trajectory(rewards, out.terminated, out.truncated, cut_values, next_obs[-1:])
     advantage = _advantages(config, trajectory, values, next_values)
     log_prob = networks.distribution.log_prob(output, weights.params.log_std, action)
     stats = RolloutStats(
@@ -105,8 +107,11 @@ def valued_anew(
     """`samples` [T, N] with values and advantages by other weights than those that acted."""
     rows = jnp.concatenate([samples.obs, trajectory.last_obs.astype(samples.obs.dtype)])
     values = state_values(learner.networks, weights, rows)
+    cut_values = trajectory.cut_value
+    if weights.value_moments is not None:
+        cut_values = from_units(weights.value_moments, cut_values)
     # The row behind the end of an episode is of another one.
-    next_values = jnp.where(trajectory.truncated, trajectory.cut_value, values[1:])
+    next_values = jnp.where(trajectory.truncated, cut_values, values[1:])
     advantage = _advantages(learner.config, trajectory, values[:-1], next_values)
     return samples._replace(value=values[:-1], advantage=advantage)
 

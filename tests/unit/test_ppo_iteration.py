@@ -188,10 +188,14 @@ def _exchange(strategy: str, num_floats: int) -> Iterator[Exchange]:
     control.close()
 
 
-@pytest.mark.parametrize("strategy", ["mpr", "one_shot"])
+@pytest.mark.parametrize("strategy", ["mpr", "one_shot", "mpr, by pass"])
 def test_exchanges_in_the_program_change_nothing_but_its_place(
-    strategy: str, learner, size, alone
+    strategy: str, config, learner, size, alone
 ) -> None:
+    if strategy == "mpr, by pass":
+        strategy = "mpr"
+        learner = make_learner(ENV.spec, dataclasses.replace(config, recompute_advantages=True))
+        alone = _compiled(SoloReducer().program(functools.partial(iterate, ENV, learner)), learner)
     with _exchange(strategy, size) as exchange:
         step = exchange.program(functools.partial(iterate, ENV, learner))
         results = []
