@@ -30,15 +30,15 @@ HEAD = (
 
 def seeds() -> list[str]:
     """Successes of every setting whose seeds all ran, by task and call; calls in order of date."""
-    found = [one for one in _calls() if not one[0].results["task"].startswith(PLAYGROUND)]
     rows, calls, number = [], [], Counter[str]()
-    for call, path in found:
+    for call, path in _calls(of_playground=False):
         task = call.results["task"]
         number[task] += 1
-        finished = [row for row in call.results["rows"] if not row["unfinished"]]
         assert call.settings is not None
         common = _common(call.settings["overrides"])
-        rows += [[f"`{task}`", str(number[task]), *common, *_cells(row)] for row in finished]
+        rows += [
+            [f"`{task}`", str(number[task]), *common, *_cells(row)] for row in _finished(call)
+        ]
         calls.append(f"- {link(path.name)}, call {number[task]}: {origin(call)}")
     return [*markdown(HEAD, rows), "", *calls]
 
@@ -46,21 +46,26 @@ def seeds() -> list[str]:
 def playground_seeds() -> list[str]:
     """What tasks of Playground reach with Playground's settings, over seeds, as they train."""
     rows, calls = [], []
-    for call, path in _calls():
+    for call, path in _calls(of_playground=True):
         task = call.results["task"].removeprefix(PLAYGROUND)
-        if task != call.results["task"]:
-            for row in call.results["rows"]:
-                low, median, high = row["return"]
-                spread = f"{median:.4g} ({low:.4g} to {high:.4g})"
-                rows.append([task, f"{row['successes']} of {row['seeds']}", spread])
-            calls.append(f"- {link(path.name)}: {origin(call)}")
+        for row in _finished(call):
+            low, median, high = row["return"]
+            spread = f"{median:.4g} ({low:.4g} to {high:.4g})"
+            rows.append([task, f"{row['successes']} of {row['seeds']}", spread])
+        calls.append(f"- {link(path.name)}: {origin(call)}")
     head = "task | successes: | return in the end, quartiles:"
     return [*markdown(head, rows), "", *calls]
 
 
-def _calls() -> list[tuple[Call, Path]]:
-    """By task, those of a task in order of date."""
-    return sorted(calls_by_date(RESULTS, PATTERN), key=lambda one: one[0].results["task"])
+def _calls(*, of_playground: bool) -> list[tuple[Call, Path]]:
+    """With Playground's tasks or with the others, by task, those of a task in order of date."""
+    found = sorted(calls_by_date(RESULTS, PATTERN), key=lambda one: one[0].results["task"])
+    return [one for one in found if one[0].results["task"].startswith(PLAYGROUND) == of_playground]
+
+
+def _finished(call: Call) -> list[Mapping[str, Any]]:
+    """The rows whose seeds all ran."""
+    return [row for row in call.results["rows"] if not row["unfinished"]]
 
 
 def _common(overrides: Sequence[str]) -> list[str]:

@@ -10,7 +10,13 @@ import jax.numpy as jnp
 
 from gmijax.a3c.returns import Returns, n_step_returns, vtrace
 from gmijax.config import A3cConfig
-from gmijax.learning.learner import Learner, TrainState, acting_weights, state_values
+from gmijax.learning.learner import (
+    Learner,
+    TrainState,
+    acting_weights,
+    next_values,
+    state_values,
+)
 from gmijax.learning.normalize import Moments, moments_of_those, normalize
 from gmijax.learning.updates import probability_ratio
 from gmijax.types import Array
@@ -115,10 +121,10 @@ def batch_targets(
 def returns_of(batch: Unrolls, values: Array, ratios: Array, config: A3cConfig) -> Returns:
     """Targets [T, B] from `values` [T + 1, B] and `ratios` [T, B]; V-trace or plain."""
     terminated, truncated = jnp.moveaxis(batch.done.astype(jnp.float32), -1, 0)
-    next_values = jnp.where(truncated > 0, batch.cut_value, values[1:])
+    follows = next_values(values, truncated, batch.cut_value)
     steps = (
         config.reward_scaling * batch.reward,
-        *(values[:-1], next_values, terminated, truncated),
+        *(values[:-1], follows, terminated, truncated),
     )
     if not config.vtrace:
         return n_step_returns(*steps, discount=config.discounting)

@@ -54,7 +54,8 @@ class TrainConfig(KeyGroup):
                 "reduce.selection=measured: for jobs in which every GMI trains; with "
                 "plan.template=tdg_ex allowed are paper, device"
             )
-        if self.plan.template == "tdg_ex" and getattr(self.algo, "recompute_advantages", False):
+        renews = isinstance(self.algo, PpoConfig) and self.algo.recompute_advantages
+        if renews and self.plan.template == "tdg_ex":
             raise ConfigError(
                 "algo.recompute_advantages=true: for jobs in which every GMI trains; with "
                 "plan.template=tdg_ex allowed is false"

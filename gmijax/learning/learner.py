@@ -167,10 +167,23 @@ def acting_weights(learner: Learner, state: TrainState) -> ActingWeights:
 
 def state_values(networks: ActorCritic, weights: ActingWeights, obs: Array) -> Array:
     """Values [...] of normalised observations [..., O], in the unit of scaled rewards."""
-    values = networks.state_value(weights.params, obs)
+    return in_rewards(weights, networks.state_value(weights.params, obs))
+
+
+def in_rewards(weights: ActingWeights, outputs: Array) -> Array:
+    """Values [...] in the unit of scaled rewards, from what the value network put out."""
     if weights.value_moments is None:
-        return values
-    return from_units(weights.value_moments, values)
+        return outputs
+    return from_units(weights.value_moments, outputs)
+
+
+def next_values(values: Array, truncated: Array, cut_values: Array) -> Array:
+    """V(s_{t+1}) [T, N] of `values` [T + 1, N], the last ones of what follows step T.
+
+    Where time ran out the next row is of another episode; `cut_values` [T, N] count there. Where
+    the task ended nothing counts.
+    """
+    return jnp.where(truncated > 0, cut_values, values[1:])
 
 
 def pack_weights(weights: ActingWeights) -> Array:

@@ -43,9 +43,8 @@ def iterate(
     """One iteration, together with the GMIs `peers`."""
     weights = acting_weights(learner, state)
     env_state, samples, trajectory, stats = rollout(env, learner, model, weights, env_state)
-    if not learner.config.recompute_advantages:
-        trajectory = None
-    state, metrics = learn(learner, peers, state, samples, stats, trajectory)
+    again = trajectory if learner.config.recompute_advantages else None
+    state, metrics = learn(learner, peers, state, samples, stats, again)
     return state, env_state, metrics
 
 

@@ -9,8 +9,8 @@ import jax
 import jax.numpy as jnp
 
 from gmijax.config import PpoConfig
-from gmijax.learning.learner import ActingWeights, Learner, state_values
-from gmijax.learning.normalize import from_units, moments_of, normalize
+from gmijax.learning.learner import ActingWeights, Learner, in_rewards, next_values, state_values
+from gmijax.learning.normalize import moments_of, normalize
 from gmijax.learning.unroll import Drawn, act, count, outcome_of, unroll
 from gmijax.ppo.statistics import RolloutStats, obs_moments
 from gmijax.sim.wrappers import BatchedEnv, BatchState, StepOutput
@@ -45,15 +45,15 @@ class Trajectory(NamedTuple):
     Attributes:
       reward: [T, N], scaled.
       terminated, truncated: [T, N] bool, the task has ended; time ran out.
-      cut_value: [T, N], V(s_{t+1}) by the value function of the rollout, in its own unit; it
-        counts where time ran out.
+      cut_output: [T, N], of the value network of the rollout for s_{t+1}; it counts where time
+        ran out.
       last_obs: [1, N, O], normalised, after the last step.
     """
 
     reward: Array
     terminated: Array
     truncated: Array
-    cut_value: Array
+    cut_output: Array
     last_obs: Array
 
 
@@ -84,11 +84,10 @@ def rollout(
     # V(s_{t+1}) is V of the next row, except where an episode ended and the next row is the
     # first observation of another one; a second pass over all rows is simple and cheap.
     next_obs = normalize(weights.moments, out.next_obs)
-    next_values = state_values(networks, weights, next_obs)
+    next_outputs = networks.state_value(weights.params, next_obs)
     rewards = config.reward_scaling * out.reward
-    cut_values = networks.state_value(weights.params, next_obs)
-    trajectory = Trajectory(rewards, out.terminated, out.truncated, cut_values, next_obs[-1:])
-    advantage = _advantages(config, trajectory, values, next_values)
+    trajectory = Trajectory(rewards, out.terminated, out.truncated, next_outputs, next_obs[-1:])
+    advantage = _advantages(config, trajectory, values, in_rewards(weights, next_outputs))
     log_prob = networks.distribution.log_prob(output, weights.params.log_std, action)
     stats = RolloutStats(
         obs=obs_moments(config, weights.moments, raw_obs, out),
@@ -107,12 +106,9 @@ def valued_anew(
     """`samples` [T, N] with values and advantages by other weights than those that acted."""
     rows = jnp.concatenate([samples.obs, trajectory.last_obs.astype(samples.obs.dtype)])
     values = state_values(learner.networks, weights, rows)
-    cut_values = trajectory.cut_value
-    if weights.value_moments is not None:
-        cut_values = from_units(weights.value_moments, cut_values)
-    # The row behind the end of an episode is of another one.
-    next_values = jnp.where(trajectory.truncated, cut_values, values[1:])
-    advantage = _advantages(learner.config, trajectory, values[:-1], next_values)
+    cut_values = in_rewards(weights, trajectory.cut_output)
+    follows = next_values(values, trajectory.truncated, cut_values)
+    advantage = _advantages(learner.config, trajectory, values[:-1], follows)
     return samples._replace(value=values[:-1], advantage=advantage)
 
 

@@ -35,7 +35,7 @@ from gmijax.learning.updates import exchange_size, minibatch_order, run_updates
 from gmijax.partition.layout import Layout
 from gmijax.ppo.loop import warm_up
 from gmijax.ppo.loss import PpoLosses
-from gmijax.ppo.ppo import gradients, iterate, update_context
+from gmijax.ppo.ppo import flat, gradients, iterate, update_context
 from gmijax.ppo.rollout import rollout
 from gmijax.ppo.statistics import merge_stats
 from gmijax.sim.wrappers import env_keys
@@ -74,10 +74,6 @@ def _start(learner, num_envs: int = N, first: int = 0):
 
 def _close(a, b, atol=1e-6):
     jax.tree.map(lambda x, y: np.testing.assert_allclose(x, y, rtol=1e-4, atol=atol), a, b)
-
-
-def _flat(samples):
-    return jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), samples)
 
 
 def _compiled(iteration, learner):
@@ -222,7 +218,7 @@ def test_shards_of_minibatches_give_the_update_of_the_whole(learner) -> None:
     def collected(num_envs: int, first: int):
         envs = _start(learner, num_envs, first)[1]
         _, samples, _, stats = roll_out(ENV.model, acting_weights(learner, state), envs)
-        return _flat(samples), stats
+        return flat(samples), stats
 
     shards, shard_stats = zip(collected(N, 0), collected(N, N), strict=True)
     whole, whole_stats = collected(2 * N, 0)
@@ -291,7 +287,7 @@ def test_it_learns_with_other_settings_and_updates_the_policy_that_acted(config)
     assert samples.obs.dtype == jnp.bfloat16
     context = update_context(mine, state, merge_stats(jax.tree.map(lambda x: x[None], stats)))
     first = jax.jit(functools.partial(gradients, mine))
-    _, losses = first(state.params, _flat(samples), context, jnp.arange(5, 69))
+    _, losses = first(state.params, flat(samples), context, jnp.arange(5, 69))
     assert abs(float(losses.kl)) < 1e-6
     assert float(losses.clip_fraction) == float(losses.value_clip_fraction) == 0.0
 
