@@ -1,7 +1,7 @@
 """A run by Brax's PPO in a process of its own: `python -m benchmarks.peers.brax_ppo IN OUT`.
 
 IN is a JSON file with a `BraxTraining`; OUT gets the curve, seconds since the start and
-environment steps by then.
+environment steps by then, and the returns of its evaluations, if it has any.
 """
 
 from __future__ import annotations
@@ -28,23 +28,28 @@ from gmijax.sim.adapters.playground import without_warnings
 from gmijax.sim.registry import make_env
 from gmijax.types import PyTree
 
+EVALUATED = "eval/episode_reward"
+
 
 def main() -> int:
     """Trains, and writes the curve; returns 1 if the losses were not finite at the end."""
     started_s = time.monotonic()
     training = BraxTraining(**read_json(Path(sys.argv[1])))
     curve: list[tuple[float, int]] = []
+    returns: list[tuple[int, float]] = []
     last: dict[str, float] = {}
 
     def progress(steps: int, metrics: Mapping[str, Any]) -> None:
         curve.append((time.monotonic() - started_s, int(steps)))
         last.update({name: float(value) for name, value in metrics.items()})
+        if EVALUATED in metrics:
+            returns.append((int(steps), last[EVALUATED]))
 
     train(training, progress)
     if bad := [name for name, value in last.items() if not math.isfinite(value)]:
         sys.stderr.write(f"{bad[0]} is {last[bad[0]]} at the end of the training\n")
         return 1
-    write_json(Path(sys.argv[2]), {"curve": curve})
+    write_json(Path(sys.argv[2]), {"curve": curve, "returns": returns})
     return 0
 
 

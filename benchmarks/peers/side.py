@@ -79,10 +79,8 @@ class Side(NamedTuple):
             variables["PYTHONPATH"] = str(_ROOT)  # Not with the packages of this environment.
         if self.trainer == BRAX:
             suite = COMPARISONS[self.comparison].suite
-            flags = f"{os.environ.get('XLA_FLAGS', '')} {_SCRIPT_FLAGS[suite]}"
-            variables["XLA_FLAGS"] = flags.strip()
-            variables["JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS"] = "0"  # As our jobs do.
-            if is_short or suite == "playground":  # Playground's script never does.
+            variables |= variables_of_brax(suite)
+            if is_short:
                 variables["XLA_PYTHON_CLIENT_PREALLOCATE"] = "false"
         return variables
 
@@ -116,3 +114,15 @@ class Side(NamedTuple):
         files = (str(folder / name) for name in ("in.json", "out.json"))
         python = self.mjlab if self.trainer == MJLAB else sys.executable
         return [python, "-m", f"benchmarks.peers.{_MODULES[self.trainer]}", *files]
+
+
+def variables_of_brax(suite: str) -> dict[str, str]:
+    """Of the environment, for a run by Brax's PPO, as the training script of `suite` sets them."""
+    flags = f"{os.environ.get('XLA_FLAGS', '')} {_SCRIPT_FLAGS[suite]}"
+    variables = {
+        "XLA_FLAGS": flags.strip(),
+        "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0",  # As our jobs do.
+    }
+    if suite == "playground":
+        variables["XLA_PYTHON_CLIENT_PREALLOCATE"] = "false"
+    return variables

@@ -1,0 +1,99 @@
+"""What Brax's PPO learns on Playground's tasks: `python -m benchmarks.peers.returns CheetahRun`.
+
+Every task is trained with `tuned=dm_control_ppo`, as `benchmarks.seeds` trains it by gmijax, and
+evaluated without noise. All runs go on at once, so their speed says nothing. Adds a call to
+`benchmarks/results/brax-returns-<device>.json`.
+"""
+
+from __future__ import annotations
+
+import argparse
+import signal
+import sys
+import tempfile
+import time
+from contextlib import ExitStack
+from pathlib import Path
+from typing import Any
+
+from benchmarks.command import start, wait_until
+from benchmarks.peers.comparisons import Comparison, brax_training
+from benchmarks.peers.side import variables_of_brax
+from benchmarks.records import RESULTS, ResultsFile, device_name, file_name
+from gmijax.errors import ConfigError
+from gmijax.runs.folder import read_json, write_json
+from gmijax.supervise.failures import last_line
+
+SUITE = "brax-returns"
+_EVALUATED = {"run_evals": True, "deterministic_eval": True, "num_eval_envs": 128}
+
+
+def told(task: str, more: tuple[str, ...], seed: int) -> dict[str, Any]:
+    """What the process of a run is told.
+
+    Args:
+      task: of Playground.
+      more: overrides of the configuration that both libraries share.
+      seed: of Brax's random numbers.
+
+    Raises:
+      ConfigError: see `brax_training`.
+    """
+    settings = ("env=playground", f"env.name={task}", "tuned=dm_control_ppo", "physics.impl=warp")
+    training = brax_training(Comparison(settings, unrolls=16), more, seed=seed)
+    return training._replace(arguments={**training.arguments, **_EVALUATED})._asdict()
+
+
+def train(tasks: dict[str, dict[str, Any]], folder: Path, timeout_s: float) -> dict[str, Any]:
+    """Trains all at once; the returns by steps of each, or why it has none."""
+    with ExitStack() as logs:
+        processes = []
+        for name, training in tasks.items():
+            files = [folder / f"{name}.{part}" for part in ("in.json", "out.json", "log")]
+            write_json(files[0], training)
+            command = [sys.executable, "-m", "benchmarks.peers.brax_ppo", *map(str, files[:2])]
+            log = logs.enter_context(files[2].open("wb"))
+            processes.append(start(command, variables_of_brax(training["suite"]), log))
+        codes = wait_until(time.monotonic() + timeout_s, *processes)
+    return {
+        name: {"returns": read_json(folder / f"{name}.out.json")["returns"]}
+        if code == 0
+        else {"failed": last_line(folder / f"{name}.log") or f"exit code {code}"}
+        for name, code in zip(tasks, codes, strict=True)
+    }
+
+
+def main() -> int:
+    """Trains what the command line asks for; returns 1 if a run failed, 2 on bad input."""
+    signal.signal(signal.SIGTERM, signal.default_int_handler)
+    parser = argparse.ArgumentParser(
+        prog="python -m benchmarks.peers.returns", description=__doc__
+    )
+    parser.add_argument(
+        "tasks", nargs="+", metavar="TASK", help="of Playground's dm_control suite"
+    )
+    parser.add_argument("--seeds", type=int, default=1)
+    parser.add_argument("--override", action="append", default=[], help="e.g. num_timesteps=20e6")
+    parser.add_argument("--timeout-s", type=float, default=3600.0)
+    parser.add_argument("--out", type=Path, default=RESULTS, help="folder of the JSON file")
+    arguments = parser.parse_args()
+    more = tuple(arguments.override)
+    pairs = [(task, seed) for task in arguments.tasks for seed in range(arguments.seeds)]
+    try:
+        tasks = {f"{task}-{seed}": told(task, more, seed) for task, seed in pairs}
+    except ConfigError as error:
+        sys.stderr.write(f"{error}\n")
+        return 2
+    file = ResultsFile(arguments.out / file_name(SUITE, device_name()), SUITE, vars(arguments))
+    with tempfile.TemporaryDirectory() as scratch:
+        found = train(tasks, Path(scratch), arguments.timeout_s)
+    with file.changing() as results:
+        for task, seed in pairs:
+            results.setdefault(task, []).append({"seed": seed, **found[f"{task}-{seed}"]})
+    for name, run in found.items():
+        sys.stdout.write(f"{name}: {run.get('failed') or run['returns'][-1]}\n")
+    return int(any("failed" in run for run in found.values()))
+
+
+if __name__ == "__main__":
+    sys.exit(main())
