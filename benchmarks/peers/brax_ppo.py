@@ -1,7 +1,7 @@
 """A run by Brax's PPO in a process of its own: `python -m benchmarks.peers.brax_ppo IN OUT`.
 
 IN is a JSON file with a `BraxTraining`; OUT gets the curve, seconds since the start and
-environment steps by then, and the returns of its evaluations, if it has any.
+environment steps by then, and mean returns of the latest episodes, if it is told to log them.
 """
 
 from __future__ import annotations
@@ -28,7 +28,8 @@ from gmijax.sim.adapters.playground import without_warnings
 from gmijax.sim.registry import make_env
 from gmijax.types import PyTree
 
-EVALUATED = "eval/episode_reward"
+_RETURN = "episode/sum_reward"
+"""Of the latest 100 episodes that ended; it comes in reports of its own."""
 
 
 def main() -> int:
@@ -40,16 +41,18 @@ def main() -> int:
     last: dict[str, float] = {}
 
     def progress(steps: int, metrics: Mapping[str, Any]) -> None:
-        curve.append((time.monotonic() - started_s, int(steps)))
-        last.update({name: float(value) for name, value in metrics.items()})
-        if EVALUATED in metrics:
-            returns.append((int(steps), last[EVALUATED]))
+        if _RETURN in metrics:
+            returns.append((int(steps), float(metrics[_RETURN])))
+        else:
+            curve.append((time.monotonic() - started_s, int(steps)))
+            last.update({name: float(value) for name, value in metrics.items()})
+        # Now, for what reads it after a run that was stopped.
+        write_json(Path(sys.argv[2]), {"curve": curve, "returns": returns})
 
     train(training, progress)
     if bad := [name for name, value in last.items() if not math.isfinite(value)]:
         sys.stderr.write(f"{bad[0]} is {last[bad[0]]} at the end of the training\n")
         return 1
-    write_json(Path(sys.argv[2]), {"curve": curve, "returns": returns})
     return 0
 
 

@@ -1,8 +1,8 @@
 """What Brax's PPO learns on Playground's tasks: `python -m benchmarks.peers.returns CheetahRun`.
 
-Every task is trained with `tuned=dm_control_ppo`, as `benchmarks.seeds` trains it by gmijax, and
-evaluated without noise. All runs go on at once, so their speed says nothing. Adds a call to
-`benchmarks/results/brax-returns-<device>.json`.
+Every task is trained with `tuned=dm_control_ppo`, as `benchmarks.seeds` trains it by gmijax.
+Returns are those of the latest 100 episodes of the training, as ours are. All runs go on at once,
+so their speed says nothing. Adds a call to `benchmarks/results/brax-returns-<device>.json`.
 """
 
 from __future__ import annotations
@@ -25,7 +25,6 @@ from gmijax.runs.folder import read_json, write_json
 from gmijax.supervise.failures import last_line
 
 SUITE = "brax-returns"
-_EVALUATED = {"run_evals": True, "deterministic_eval": True, "num_eval_envs": 128}
 
 
 def told(task: str, more: tuple[str, ...], seed: int) -> dict[str, Any]:
@@ -41,7 +40,9 @@ def told(task: str, more: tuple[str, ...], seed: int) -> dict[str, Any]:
     """
     settings = ("env=playground", f"env.name={task}", "tuned=dm_control_ppo", "physics.impl=warp")
     training = brax_training(Comparison(settings, unrolls=16), more, seed=seed)
-    return training._replace(arguments={**training.arguments, **_EVALUATED})._asdict()
+    return training._replace(
+        arguments={**training.arguments, "log_training_metrics": True}
+    )._asdict()
 
 
 def train(tasks: dict[str, dict[str, Any]], folder: Path, timeout_s: float) -> dict[str, Any]:
@@ -55,12 +56,16 @@ def train(tasks: dict[str, dict[str, Any]], folder: Path, timeout_s: float) -> d
             log = logs.enter_context(files[2].open("wb"))
             processes.append(start(command, variables_of_brax(training["suite"]), log))
         codes = wait_until(time.monotonic() + timeout_s, *processes)
-    return {
-        name: {"returns": read_json(folder / f"{name}.out.json")["returns"]}
-        if code == 0
-        else {"failed": last_line(folder / f"{name}.log") or f"exit code {code}"}
-        for name, code in zip(tasks, codes, strict=True)
-    }
+    return {name: _run(folder, name, code) for name, code in zip(tasks, codes, strict=True)}
+
+
+def _run(folder: Path, name: str, code: int) -> dict[str, Any]:
+    """Its returns, up to where it failed."""
+    out = folder / f"{name}.out.json"
+    run = {"returns": read_json(out)["returns"] if out.exists() else []}
+    if code:
+        run["failed"] = last_line(folder / f"{name}.log") or f"exit code {code}"
+    return run
 
 
 def main() -> int:
@@ -91,7 +96,7 @@ def main() -> int:
         for task, seed in pairs:
             results.setdefault(task, []).append({"seed": seed, **found[f"{task}-{seed}"]})
     for name, run in found.items():
-        sys.stdout.write(f"{name}: {run.get('failed') or run['returns'][-1]}\n")
+        sys.stdout.write(f"{name}: {run['returns'][-1:]} {run.get('failed', '')}\n")
     return int(any("failed" in run for run in found.values()))
 
 
