@@ -11,7 +11,7 @@ from benchmarks.evaluation.figures import bounds, markdown, shown
 from benchmarks.evaluation.other_tables import OTHER_TABLES
 from benchmarks.evaluation.peer_tables import peers
 from benchmarks.evaluation.plots import mps_gains
-from benchmarks.evaluation.seed_tables import playground, playground_seeds, seeds
+from benchmarks.evaluation.seed_tables import brax_returns, playground, playground_seeds, seeds
 from benchmarks.evaluation.sweep_tables import first_gains, sweeps
 from benchmarks.evaluation.tables import (
     TRAINING_TABLES,
@@ -69,6 +69,7 @@ TABLES: MappingProxyType[str, Callable[[], list[str]]] = MappingProxyType(
         "seeds": seeds,
         "playground": playground,
         "playground-seeds": playground_seeds,
+        "brax-returns": brax_returns,
         **TRAINING_TABLES,
         **ASYNC_TABLES,
         **OTHER_TABLES,

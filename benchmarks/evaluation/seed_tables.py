@@ -44,17 +44,35 @@ def seeds() -> list[str]:
 
 
 def playground_seeds() -> list[str]:
-    """What tasks of Playground reach with Playground's settings, over seeds, as they train."""
-    rows, calls = [], []
-    for call, path in _calls(of_playground=True):
-        task = call.results["task"].removeprefix(PLAYGROUND)
-        for row in _finished(call):
-            low, median, high = row["return"]
-            spread = f"{median:.4g} ({low:.4g} to {high:.4g})"
-            rows.append([task, f"{row['successes']} of {row['seeds']}", spread])
-        calls.append(f"- {link(path.name)}: {origin(call)}")
-    head = "task | successes: | return in the end, quartiles:"
-    return [*markdown(head, rows), "", *calls]
+    """What tasks of Playground reach with Playground's settings, over seeds, as they train.
+
+    Of the newest call of a task whose seeds all ran.
+    """
+    newest = {
+        call.results["task"].removeprefix(PLAYGROUND): (call, path)
+        for call, path in _calls(of_playground=True)
+        if _finished(call)
+    }
+    rows = [
+        [task, _changed(row), f"{row['successes']} of {row['seeds']}", _spread(row["return"])]
+        for task, (call, _) in newest.items()
+        for row in _finished(call)
+    ]
+    head = "task | changed | successes: | return in the end, quartiles:"
+    files = [f"- {link(path.name)}: {origin(call)}" for call, path in newest.values()]
+    return [*markdown(head, rows), "", *files]
+
+
+def brax_returns() -> list[str]:
+    """What Brax's PPO reaches on tasks of Playground, in every run of the newest call."""
+    call, path = calls_by_date(RESULTS, "brax-returns-nvidia-*.json")[-1]
+    rows = []
+    for task, runs in call.results.items():
+        ends = [run["returns"][-1] for run in runs]
+        steps = f"{min(one[0] for one in ends) / 1e6:.0f}"
+        rows.append([task, steps, ", ".join(f"{one[1]:.4g}" for one in ends)])
+    head = "task | million steps: | return in the end of every run:"
+    return [*markdown(head, rows), "", f"- {link(path.name)}: {origin(call)}"]
 
 
 def _calls(*, of_playground: bool) -> list[tuple[Call, Path]]:
@@ -76,15 +94,22 @@ def _common(overrides: Sequence[str]) -> list[str]:
 
 
 def _cells(row: Mapping[str, Any]) -> list[str]:
-    changed = ", ".join(f"`{override}`" for override in row["overrides"]) or "nothing"
     low, high = row["wilson"]
-    least, median, most = row["final"]
     return [
-        *(changed, f"{row['successes']} of {row['seeds']}"),
+        *(_changed(row), f"{row['successes']} of {row['seeds']}"),
         f"{low:.0%} to {high:.0%}",
         shown(row["p_successes"], ".2g") if "p_successes" in row else "",
-        f"{median:.3g} ({least:.3g} to {most:.3g})",
+        _spread(row["final"], ".3g"),
     ]
+
+
+def _changed(row: Mapping[str, Any]) -> str:
+    return ", ".join(f"`{override}`" for override in row["overrides"]) or "nothing"
+
+
+def _spread(quartiles: Sequence[float], form: str = ".4g") -> str:
+    low, median, high = (format(one, form) for one in quartiles)
+    return f"{median} ({low} to {high})"
 
 
 def playground() -> list[str]:

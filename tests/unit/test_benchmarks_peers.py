@@ -6,6 +6,7 @@ import argparse
 import importlib.util
 import inspect
 import json
+import sys
 import time
 from collections.abc import Sequence
 from pathlib import Path
@@ -19,6 +20,7 @@ from brax.training.agents.ppo import networks, train
 from benchmarks import command
 from benchmarks.evaluation import peer_tables
 from benchmarks.peers import __main__ as peers
+from benchmarks.peers import returns
 from benchmarks.peers.brax_ppo import replicated
 from benchmarks.peers.comparisons import (
     BRAX,
@@ -127,6 +129,38 @@ def test_the_stand_in_makes_one_row_for_each_device():
     out: Any = jax.pmap(lambda one: jax.tree.map(lambda leaf: leaf + 1, one))(made)
     assert out["a"][0].tolist() == [1, 2, 3]
     assert out["b"][0].dtype == jnp.float32
+
+
+def test_returns_are_of_the_settings_that_ours_are_trained_with():
+    told = returns.told("CheetahRun", ("num_timesteps=20e6",), seed=3)
+    assert (told["suite"], told["env"], told["impl"]) == ("playground", "CheetahRun", "warp")
+    arguments = told["arguments"]
+    assert (arguments["seed"], arguments["log_training_metrics"]) == (3, True)
+    assert (arguments["num_updates_per_batch"], arguments["unroll_length"]) == (16, 30)
+    assert arguments["num_timesteps"] == pytest.approx(20e6, rel=0.05)
+    assert arguments.keys() <= inspect.signature(train.train).parameters.keys()
+
+
+def test_returns_are_kept_up_to_where_a_run_failed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    # A process that reports twice, and fails behind that where its seed is 1.
+    script = (
+        "import json, sys; seed = json.load(open(sys.argv[-2]))['arguments']['seed'];"
+        "json.dump({'curve': [], 'returns': [[100, 1.0], [200, 2.0]]}, open(sys.argv[-1], 'w'));"
+        "sys.exit('no room' if seed else 0)"
+    )
+
+    def started(told: Sequence[str], variables: dict[str, str], log: Any) -> Any:
+        return command.start([sys.executable, "-c", script, *told[-2:]], variables, log)
+
+    monkeypatch.setattr(returns, "start", started)
+    tasks = {f"a-{seed}": returns.told("PointMass", (), seed) for seed in (0, 1)}
+    curve = [[100, 1.0], [200, 2.0]]
+    assert returns.train(tasks, tmp_path, 60.0) == {
+        "a-0": {"returns": curve},
+        "a-1": {"returns": curve, "failed": "no room"},
+    }
 
 
 def test_a_command_is_asked_to_end_in_time():
