@@ -187,6 +187,32 @@ def learning() -> list[str]:
     return [*markdown(head, rows), *source(*files)]
 
 
+_MARKS = (
+    ("ant", 3000, "20 s", "async-long", "1 GPU, synchronous"),
+    ("humanoid", 5000, "under 240 s", "learn-humanoid", "humanoid"),
+)
+"""Task, return, what Isaac Gym publishes for it on an A100 (arXiv:2108.10470); file and case."""
+
+
+def marks() -> list[str]:
+    """Seconds from the first report of a run alone on its GPU to a return that others publish."""
+    rows = []
+    for task, mark, published, file, case in _MARKS:
+        runs = results_of(file).get("cases", {}).get(case, {}).get("runs", ())
+        alone = [run["curve"] for run in runs if "curve" in run and "together" not in run]
+        found = [_seconds_to(mark, curve) for curve in alone]
+        reached = figure([seconds for seconds in found if seconds is not None])
+        rows.append([task, f"{mark:,}", shown(reached, ".1f"), published, f"`{file}`"])
+    head = "task | return: | seconds, here: | Isaac Gym, on an A100: | file"
+    return markdown(head, rows)
+
+
+def _seconds_to(mark: float, curve: list[tuple[int, float, float | None]]) -> float | None:
+    """Of a curve [steps, seconds, return]."""
+    started_s = curve[0][1]
+    return next((s - started_s for _, s, found in curve if (found or 0.0) >= mark), None)
+
+
 def _learnt() -> Iterator[tuple[str, str, dict[str, Any]]]:
     for path in sorted([*RESULTS.glob("learn-*.json"), *RESULTS.glob("entropy-franka_c*.json")]):
         for name, case in results_of(path.stem)["cases"].items():
@@ -254,6 +280,7 @@ OTHER_TABLES: MappingProxyType[str, Callable[[], list[str]]] = MappingProxyType(
         "reduction": reduction,
         "node-scaling": node_scaling,
         "learning": learning,
+        "marks": marks,
         "throughput": throughput,
         "faults": faults,
         "sm-shares": sm_shares,
