@@ -201,10 +201,11 @@ def marks() -> list[str]:
         runs = results_of(file).get("cases", {}).get(case, {}).get("runs", ())
         alone = [run["curve"] for run in runs if "curve" in run and "together" not in run]
         found = [_seconds_to(mark, curve) for curve in alone]
-        reached = figure([seconds for seconds in found if seconds is not None])
-        rows.append([task, f"{mark:,}", shown(reached, ".1f"), published, f"`{file}`"])
-    head = "task | return: | seconds, here: | Isaac Gym, on an A100: | file"
-    return markdown(head, rows)
+        reached = [seconds for seconds in found if seconds is not None]
+        share = f"{len(reached)} of {len(found)}"
+        rows.append([task, f"{mark:,}", share, shown(figure(reached), ".1f"), published])
+    head = "task | return: | runs that reached it: | seconds, here: | Isaac Gym, on an A100:"
+    return [*markdown(head, rows), *source(*(file for *_, file, _ in _MARKS))]
 
 
 def _seconds_to(mark: float, curve: list[tuple[int, float, float | None]]) -> float | None:

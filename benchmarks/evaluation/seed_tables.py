@@ -54,25 +54,42 @@ def playground_seeds() -> list[str]:
         if _finished(call)
     }
     rows = [
-        [task, _changed(row), f"{row['successes']} of {row['seeds']}", _spread(row["return"])]
+        [task, _changed(row), f"{row['successes']} of {row['seeds']}", *_returns(row["each"])]
         for task, (call, _) in newest.items()
         for row in _finished(call)
     ]
-    head = "task | changed | successes: | return in the end, quartiles:"
+    head = "task | changed | successes: | return of every run: | without noise:"
     files = [f"- {link(path.name)}: {origin(call)}" for call, path in newest.values()]
     return [*markdown(head, rows), "", *files]
 
 
+def _returns(runs: Sequence[Mapping[str, Any]]) -> list[str]:
+    """Of the latest episodes of training, and of the last evaluation, in order of the seeds."""
+    of_training = [run["final_return"] for run in runs]
+    evaluated = [run["at_end"].get("eval/last") for run in runs]
+    return [", ".join(shown(one, ".0f") for one in ends) for ends in (of_training, evaluated)]
+
+
 def brax_returns() -> list[str]:
-    """What Brax's PPO reaches on tasks of Playground, in every run of the newest call."""
-    call, path = calls_by_date(RESULTS, "brax-returns-nvidia-*.json")[-1]
-    rows = []
-    for task, runs in call.results.items():
-        ends = [run["returns"][-1] for run in runs]
-        steps = f"{min(one[0] for one in ends) / 1e6:.0f}"
-        rows.append([task, steps, ", ".join(f"{one[1]:.4g}" for one in ends)])
-    head = "task | million steps: | return in the end of every run:"
-    return [*markdown(head, rows), "", f"- {link(path.name)}: {origin(call)}"]
+    """What Brax's PPO reaches on tasks of Playground, in every run of a task's newest call."""
+    newest = {
+        task: (runs, f"- {link(path.name)}: {origin(call)}")
+        for call, path in calls_by_date(RESULTS, "brax-returns-nvidia-*.json")
+        for task, runs in call.results.items()
+    }
+    rows = [[task, *map(", ".join, _ends(runs))] for task, (runs, _) in newest.items()]
+    head = "task | million steps: | return of every run:"
+    return [*markdown(head, rows), "", *dict.fromkeys(made for _, made in newest.values())]
+
+
+def _ends(runs: Sequence[Mapping[str, Any]]) -> tuple[list[str], list[str]]:
+    """Million steps and returns in the last report of every run, and which of them failed."""
+    steps, returns = [], []
+    for run in runs:
+        at, end = run["returns"][-1] if run["returns"] else (0, None)
+        steps.append(f"{at / 1e6:.0f}")
+        returns.append(shown(end, ".0f") + (" (failed)" if "failed" in run else ""))
+    return steps, returns
 
 
 def _calls(*, of_playground: bool) -> list[tuple[Call, Path]]:
