@@ -112,21 +112,17 @@ def _common(overrides: Sequence[str]) -> list[str]:
 
 def _cells(row: Mapping[str, Any]) -> list[str]:
     low, high = row["wilson"]
+    least, median, most = row["final"]
     return [
         *(_changed(row), f"{row['successes']} of {row['seeds']}"),
         f"{low:.0%} to {high:.0%}",
         shown(row["p_successes"], ".2g") if "p_successes" in row else "",
-        _spread(row["final"], ".3g"),
+        f"{median:.3g} ({least:.3g} to {most:.3g})",
     ]
 
 
 def _changed(row: Mapping[str, Any]) -> str:
     return ", ".join(f"`{override}`" for override in row["overrides"]) or "nothing"
-
-
-def _spread(quartiles: Sequence[float], form: str = ".4g") -> str:
-    low, median, high = (format(one, form) for one in quartiles)
-    return f"{median} ({low} to {high})"
 
 
 def playground() -> list[str]:
