@@ -17,7 +17,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from gmijax.runs.folder import read_json, write_json
-from gmijax.runs.resume import CheckpointMeta, best_checkpoint, newest_checkpoint, trained_config
+from gmijax.runs.resume import CheckpointMeta, best_checkpoint, newest_checkpoint
+from gmijax.runs.saved_config import trained_config
 
 if TYPE_CHECKING:
     from gmijax.learning.episodes import EpisodeRunner, Episodes

@@ -3,6 +3,7 @@
 GmijaxError
 ├── ConfigError              bad input; commands print one line and exit with code 2
 │   └── BackendUnavailable   the wanted backend cannot be had on this machine
+├── FolderLost               a folder was moved or removed while a job wrote into it
 ├── GmiFailed                a GMI ended with an error or a signal, or stopped making progress
 ├── NodeLost                 a machine of a job on several nodes is gone, or does not answer
 ├── CollectiveError          an exchange between GMIs failed
@@ -55,6 +56,10 @@ class ConfigError(GmijaxError):
 
 class BackendUnavailable(ConfigError):
     """The wanted backend cannot be had on this machine; the message says what is missing."""
+
+
+class FolderLost(GmijaxError):
+    """A folder was moved, removed or replaced while a job wrote into it; it has ended."""
 
 
 class ReportedError(NamedTuple):

@@ -82,7 +82,7 @@ class ProfileStore:
             for item in profiles.values():
                 _result(item)
             return dict(profiles)
-        except (OSError, ValueError, KeyError, TypeError, AttributeError, ConfigError) as error:
+        except (ValueError, KeyError, TypeError, AttributeError, ConfigError) as error:
             aside = _moved_aside(self.path)
             what = " ".join(str(error).split()) or type(error).__name__
             self._note(f"profile store {self.path} is broken ({what}): moved to {aside}")

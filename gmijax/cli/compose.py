@@ -19,9 +19,9 @@ from omegaconf.errors import OmegaConfBaseException
 
 import gmijax
 from gmijax.config import EnvConfig, ServeConfig, TrainConfig
-from gmijax.config.schema import flatten, from_dict, known, suggestion
+from gmijax.config.schema import flatten, from_dict, known, require_between, suggestion
 from gmijax.errors import ConfigError
-from gmijax.runs.resume import require_known_keys, saved_config_of
+from gmijax.runs.saved_config import require_known_keys, saved_config_of
 from gmijax.sim.registry import SUITES
 from gmijax.sim.source import reference
 
@@ -35,6 +35,8 @@ _COMPOSED: Mapping[str, type[Any]] = {
 
 _NAMED_BY_TASK = ("env.rewards.", "env.settings.")
 """Groups of keys whose names are the task's; those of a custom task only its file knows."""
+
+_MOST_STEPS = 900 * 10**9
 
 _NOT_TEXT = ("Cc", "Cs", "Zl", "Zp")
 """Unicode's categories of control characters, surrogates, and ends of lines and paragraphs."""
@@ -108,7 +110,11 @@ def build(name: str, cls: type[C], overrides: Sequence[str]) -> C:
     for key, value in flatten(data).items():  # What the environment has may be anything.
         if isinstance(value, str):
             _require_text(f"{key}={value}")
-    return from_dict(cls, data)
+    config = from_dict(cls, data)
+    if isinstance(config, TrainConfig):
+        # The last iteration may go beyond the wanted steps, and checkpoints have twelve digits.
+        require_between("num_timesteps", config.num_timesteps, 1, _MOST_STEPS)
+    return config
 
 
 def _choices_of_run(name: str, items: Sequence[Override]) -> list[str]:

@@ -21,7 +21,7 @@ from gmijax.learning.learner import Learner, acting_moments, init_learner, make_
 from gmijax.learning.normalize import normalize
 from gmijax.learning.unroll import Counts, Outcome, count, outcome_of
 from gmijax.learning.unroll import unroll as run_steps
-from gmijax.runs.resume import trained_config
+from gmijax.runs.saved_config import trained_config
 from gmijax.sim.interface import EnvSpec
 from gmijax.sim.wrappers import BatchedEnv, BatchState, StepOutput, split_keys
 from gmijax.types import Array, PRNGKey, PyTree

@@ -16,6 +16,7 @@ from gmijax.config import TrainConfig
 from gmijax.errors import ConfigError
 from gmijax.machine.opengl import environment_with, first_opengl, opengls, what_is_missing
 from gmijax.runs.folder import RunPaths
+from gmijax.runs.names import by_steps
 from gmijax.supervise.side_process import SideProcess
 
 LAST_FILM_TIMEOUT_S: Final = 120.0
@@ -86,4 +87,4 @@ def filmed(gl: str | None, run: RunPaths, say: Callable[[str], None]) -> Iterato
 
 def _waiting(run: RunPaths) -> list[Path]:
     """Trajectories that are to be filmed."""
-    return list(run.videos.glob("[0-9]*.npz"))
+    return by_steps(run.videos, suffix=".npz")

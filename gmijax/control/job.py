@@ -33,10 +33,12 @@ from gmijax.control.summary import train_outcome, train_summary
 from gmijax.control.wandb_link import followed, require_wandb
 from gmijax.machine.snapshot import detect_machine
 from gmijax.partition.plan import Plan
-from gmijax.runs.folder import RunPaths, add_event, locked, read_json, write_json
+from gmijax.runs.folder import RunPaths, add_event, read_json, write_json
 from gmijax.runs.git import record_git
+from gmijax.runs.held import locked
 from gmijax.runs.history import MetricsReader, copy_history, draw_returns
-from gmijax.runs.resume import CheckpointMeta, saved_config
+from gmijax.runs.resume import CheckpointMeta, checkpoints_of
+from gmijax.runs.saved_config import saved_config
 from gmijax.sim import source
 from gmijax.supervise.job_kinds import training_kind
 from gmijax.supervise.run_gmis import Launch, recorded
@@ -243,7 +245,7 @@ def _what_is_left(run: RunPaths) -> str:
     """Says how an interrupted job can be continued."""
     if run.gmi(0).result.exists() and read_json(run.gmi(0).result)["status"] == "completed":
         return f"training was complete: {run.root}"
-    if any(run.checkpoints.glob("[0-9]*")):
+    if checkpoints_of(run.root):
         return f"continue with run.resume={run.root}"
     return (
         "there is no checkpoint yet (run.checkpoint_every; run.stop_timeout_s is the time that "

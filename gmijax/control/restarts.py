@@ -25,7 +25,8 @@ from gmijax.machine.snapshot import Machine
 from gmijax.partition.plan import Plan
 from gmijax.runs.folder import RunPaths, add_event, remove_temporary
 from gmijax.runs.history import copy_history
-from gmijax.runs.resume import CheckpointMeta, newest_checkpoint
+from gmijax.runs.names import attempt_folders, gmi_folders
+from gmijax.runs.resume import CheckpointMeta, drop_unfinished, newest_checkpoint
 from gmijax.supervise.job_kinds import training_plan
 from gmijax.supervise.run_gmis import Launch, OnTick, StopSignals, run_gmis, stop_signals
 from gmijax.supervise.watched_gmi import GmiStatus
@@ -178,7 +179,7 @@ def why_not_again(error: GmiFailed, last: GmiFailed | None) -> str | None:
 
 def keep_logs(run: RunPaths, attempt: int) -> None:
     """Moves what the GMIs of a failed attempt have left out of the way of the next one's."""
-    for folder in run.root.glob("gmi_[0-9]*"):
+    for folder in gmi_folders(run.root):
         kept = folder / f"attempt_{attempt}"
         files = [path for path in folder.iterdir() if path.is_file()]
         kept.mkdir(exist_ok=True)
@@ -191,12 +192,13 @@ def clear_unfinished(run: RunPaths, checkpoint: Path | None) -> None:
 
     No half-written files, no later metrics, and no results of GMIs, which are to train again.
     """
-    for result in run.root.glob("gmi_[0-9]*/result.json"):
-        result.unlink()
-    for folder in (run.root, *run.root.glob("gmi_[0-9]*"), *run.root.glob("gmi_[0-9]*/attempt_*")):
+    gmis = gmi_folders(run.root)
+    for gmi in gmis:
+        (gmi / "result.json").unlink(missing_ok=True)
+    attempts = [attempt for gmi in gmis for attempt in attempt_folders(gmi)]
+    for folder in (run.root, *gmis, *attempts):
         remove_temporary(folder)
-    for hidden in run.checkpoints.glob(".*"):
-        shutil.rmtree(hidden, ignore_errors=True)
+    drop_unfinished(run)
     # Written anew from the metrics: event files cannot be cut.
     shutil.rmtree(run.tensorboard, ignore_errors=True)
     copy_history(run.metrics, run.metrics, max(0, _steps(checkpoint)))

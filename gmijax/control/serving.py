@@ -31,13 +31,14 @@ from gmijax.runs.dataset import DataPaths, open_dataset
 from gmijax.runs.folder import (
     RunPaths,
     create_run,
-    locked,
     read_json,
     require_new_run,
     write_json,
 )
+from gmijax.runs.held import locked
 from gmijax.runs.history import MetricsReader
-from gmijax.runs.resume import CheckpointMeta, find_checkpoint, left_out, trained_config
+from gmijax.runs.resume import CheckpointMeta, find_checkpoint
+from gmijax.runs.saved_config import left_out, trained_config
 from gmijax.supervise.job_kinds import serving_kind
 from gmijax.supervise.run_gmis import Launch, recorded, run_gmis
 

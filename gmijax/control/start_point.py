@@ -13,10 +13,10 @@ from gmijax.runs.folder import (
     RunPaths,
     create_run,
     given_run,
-    read_json,
     require_new_run,
 )
-from gmijax.runs.resume import CheckpointMeta, choose_checkpoint, newest_checkpoint, trained_config
+from gmijax.runs.resume import CheckpointMeta, choose_checkpoint, newest_checkpoint
+from gmijax.runs.saved_config import saved_config, trained_config
 
 
 class StartPoint(NamedTuple):
@@ -105,7 +105,7 @@ def _require_fit(config: TrainConfig, checkpoint: Path, wanted: str) -> Checkpoi
         if have != _memory_of(config.env)[key]:
             want = getattr(config.env, key)
             raise ConfigError(f"env.{key}={want}: a resumed run keeps its {have}")
-    seed = read_json(RunPaths(checkpoint.parent.parent).config)["seed"]
+    seed = saved_config(checkpoint).get("seed", config.seed)
     if config.seed != seed:
         raise ConfigError(f"seed={config.seed}: a resumed run keeps its seed {seed}")
     return meta

@@ -19,6 +19,7 @@ from typing import Any, NamedTuple
 
 from gmijax.collectives.host.shared_block import create_exchange
 from gmijax.config import Timeouts
+from gmijax.errors import ConfigError
 from gmijax.machine.snapshot import Machine
 from gmijax.partition.plan import Plan
 from gmijax.partition.reduction import (
@@ -202,7 +203,7 @@ def _kept(path: Path, probes: Sequence[Probe]) -> dict[str, dict[str, Any]]:
             row = found[probe.name]
             if "why_not" not in row:
                 float(row["chained_s"])
-    except (OSError, ValueError, KeyError, TypeError):
+    except (ValueError, KeyError, TypeError, ConfigError):
         return {}
     return found
 

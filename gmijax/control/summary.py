@@ -14,7 +14,8 @@ from gmijax.learning.physics_health import overflow_warnings
 from gmijax.partition.plan import Plan
 from gmijax.runs.folder import RunPaths, read_json
 from gmijax.runs.history import read_metrics
-from gmijax.runs.resume import CheckpointMeta, best_checkpoint
+from gmijax.runs.names import by_steps
+from gmijax.runs.resume import CheckpointMeta, best_checkpoint, checkpoints_of
 from gmijax.version import __version__, versions_of
 
 _ASYNCHRONOUS = ("pps", "ttop", "staleness", "bytes_per_s")
@@ -40,7 +41,7 @@ def train_summary(
 ) -> dict[str, Any]:
     """The content of `summary.json`, from what the leader left or, failing that, the metrics."""
     result = read_json(run.gmi(0).result) if run.gmi(0).result.exists() else _last_known(run)
-    checkpoints = sorted(run.checkpoints.glob("[0-9]*"))
+    checkpoints = checkpoints_of(run.root)
     return {
         "status": status,
         "env": config.env.label,
@@ -71,7 +72,7 @@ def _last_known(run: RunPaths) -> dict[str, Any]:
     lines = read_metrics(run.metrics)
     if not lines:
         return {}
-    return {"env_steps": lines[-1]["env_steps"], "final_return": lines[-1]["return"]}
+    return {"env_steps": lines[-1]["env_steps"], "final_return": lines[-1].get("return")}
 
 
 def _evaluations(run: RunPaths) -> dict[str, Any] | None:
@@ -123,8 +124,8 @@ def _of_evaluations(found: Data | None) -> str:
 
 def _of_videos(run: RunPaths) -> str:
     """A line, or nothing."""
-    newest = max(run.videos.glob("[0-9]*.mp4"), default=None)
-    return "" if newest is None else f"video: {newest}\n"
+    films = by_steps(run.videos, suffix=".mp4")
+    return f"video: {films[-1]}\n" if films else ""
 
 
 def serve_summary(
@@ -215,7 +216,7 @@ def _result(run: RunPaths, gmi: int) -> dict[str, Any]:
     lines = read_metrics(paths.metrics)
     if not lines:
         return {}
-    return {"env_steps": lines[-1]["env_steps"], "serve_wall_s": lines[-1]["wall_s"]}
+    return {"env_steps": lines[-1]["env_steps"], "serve_wall_s": lines[-1].get("wall_s")}
 
 
 def _of_gmi(gmi: int, plan: Plan, result: Data) -> dict[str, Any]:

@@ -24,20 +24,20 @@ from gmijax.machine.snapshot import Machine, detect_machine
 from gmijax.partition.planner import make_plan
 from gmijax.runs.folder import (
     META,
-    STEP_DIGITS,
     PlayPaths,
     RunPaths,
     read_json,
     remove_temporary,
     write_json,
 )
+from gmijax.runs.names import steps_name
 from gmijax.runs.resume import (
     CheckpointMeta,
     best_checkpoint,
+    checkpoints_of,
     find_checkpoint,
-    left_out,
-    trained_config,
 )
+from gmijax.runs.saved_config import left_out, trained_config
 from gmijax.sim import source
 from gmijax.sim.registry import require_env
 from gmijax.supervise.job_kinds import JobKind
@@ -151,8 +151,7 @@ def _find(config: PlayConfig | ExportConfig) -> Path:
 def _at_step(run: Path, env_steps: int) -> Path:
     checkpoint = RunPaths(run).checkpoint(env_steps)
     if not (checkpoint / META).is_file():
-        found = sorted(RunPaths(run).checkpoints.glob(f"[0-9]*/{META}"))
-        steps = ", ".join(str(int(meta.parent.name)) for meta in found)
+        steps = ", ".join(str(int(path.name)) for path in checkpoints_of(run))
         raise ConfigError(
             f"checkpoint={env_steps}: no such checkpoint in {run}; there are {steps}"
         )
@@ -176,7 +175,7 @@ def output_folder(
     """
     run = Path(str(config.run.dir))
     env_steps = CheckpointMeta.read(Path(str(config.checkpoint))).env_steps
-    root = run / name / f"{env_steps:0{STEP_DIGITS}d}"
+    root = run / name / steps_name(env_steps)
     try:
         write_json(RunPaths(root).config, to_dict(config))
         remove_temporary(root)

@@ -15,7 +15,8 @@ from gmijax.config import AlgoConfig
 from gmijax.learning.checkpoint import learner_sizes, restore_learner
 from gmijax.learning.learner import acting_weights, init_learner, make_learner
 from gmijax.learning.normalize import OBS_CLIP, Moments, normalize, std_of
-from gmijax.runs.resume import CheckpointMeta, trained_config
+from gmijax.runs.resume import CheckpointMeta
+from gmijax.runs.saved_config import trained_config
 from gmijax.sim.interface import EnvSpec
 from gmijax.types import Array
 from gmijax.version import __version__, versions_of

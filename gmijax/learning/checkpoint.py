@@ -12,7 +12,9 @@ import dataclasses
 import hashlib
 import os
 import shutil
-from collections.abc import Mapping
+import time
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, TypeVar, cast
 
@@ -23,9 +25,9 @@ import orbax.checkpoint as ocp
 
 from gmijax.collectives.interface import Reducer
 from gmijax.config import TrainConfig
-from gmijax.errors import ConfigError, NonFiniteError, ParameterMismatch, lines_of
+from gmijax.errors import ConfigError, GmijaxError, NonFiniteError, ParameterMismatch, lines_of
 from gmijax.runs.folder import META, RunPaths, write_json
-from gmijax.runs.resume import CheckpointMeta, file_check, rank_of
+from gmijax.runs.resume import CheckpointMeta, checkpoints_of, file_check, rank_of
 from gmijax.types import PyTree
 
 T = TypeVar("T")
@@ -52,6 +54,7 @@ def checkpoint_meta(
         impl=config.physics.impl,
         mean_return=mean_return,
         eval_return=eval_return,
+        learning_rate=algo.learning_rate,
     )
 
 
@@ -98,34 +101,36 @@ def finish_checkpoint(paths: RunPaths, meta: CheckpointMeta, keep: int | None = 
       keep: how many checkpoints stay, among them always the best one (see `rank_of`) and the
         last one; None: all.
     """
-    final, partial = paths.checkpoint(meta.env_steps), _partial(paths, meta.env_steps)
+    final, partial = paths.checkpoint(meta.env_steps), paths.unfinished(meta.env_steps)
     files = [path for path in sorted(partial.rglob("*")) if path.is_file()]
     checks = {path.relative_to(partial).as_posix(): file_check(path) for path in files}
     for path in (*files, *(path for path in partial.rglob("*") if path.is_dir())):
         _sync(path)
-    write_json(partial / META, dataclasses.replace(meta, files=checks).to_dict())
+    meta = dataclasses.replace(meta, files=checks, time_s=time.time())
+    write_json(partial / META, meta.to_dict())
     _sync(partial)
     if final.exists():  # A broken one, which a restart has passed over.
-        _remove(final)
+        _remove(paths, final)
     os.replace(partial, final)
     _sync(final.parent)
     if keep is not None:
-        _remove_old(paths, keep)
+        _remove_old(paths, keep, final)
     return final
 
 
-def _remove_old(paths: RunPaths, keep: int) -> None:
-    found = sorted(path.parent for path in paths.checkpoints.glob(f"[0-9]*/{META}"))
+def _remove_old(paths: RunPaths, keep: int, last: Path) -> None:
+    # Later ones, which a restart has passed over, are in nobody's place.
+    found = [path for path in checkpoints_of(paths.root) if path.name <= last.name]
     best = max(reversed(found), key=rank_of)
     others = [path for path in found if path != best]
-    num_others = max(keep - 1, int(best != found[-1]))
+    num_others = max(keep - 1, int(best != last))
     for path in others[: max(0, len(others) - num_others)]:
-        _remove(path)
+        _remove(paths, path)
 
 
-def _remove(checkpoint: Path) -> None:
+def _remove(paths: RunPaths, checkpoint: Path) -> None:
     # Under another name first: what has lost some of its files is no checkpoint.
-    hidden = checkpoint.with_name(f".{checkpoint.name}.removed")
+    hidden = paths.removed(int(checkpoint.name))
     shutil.rmtree(hidden, ignore_errors=True)
     os.replace(checkpoint, hidden)
     shutil.rmtree(hidden, ignore_errors=True)
@@ -179,8 +184,8 @@ def learner_sizes(checkpoint: Path) -> tuple[int, int, int]:
 def _saved_shapes(folder: Path) -> dict[str, tuple[int, ...]]:
     """Shapes of all saved arrays by their dotted names; none if nothing can be read."""
     try:
-        with ocp.StandardCheckpointer() as checkpointer:
-            saved: Any = checkpointer.metadata(folder.resolve()).item_metadata
+        with _plain_path(folder) as path, ocp.StandardCheckpointer() as checkpointer:
+            saved: Any = checkpointer.metadata(path).item_metadata
         return _shapes(saved.tree)
     except (AttributeError, OSError, TypeError, ValueError):
         return {}
@@ -200,9 +205,10 @@ def digest(tree: PyTree) -> np.ndarray:
 
 
 def _partial(paths: RunPaths, env_steps: int) -> Path:
-    final = paths.checkpoint(env_steps)
-    partial = final.with_name(f".{final.name}.partial")
-    partial.mkdir(parents=True, exist_ok=True)
+    partial = paths.unfinished(env_steps)
+    # Not the run folder: one that was moved away must not come back with half of its files.
+    paths.checkpoints.mkdir(exist_ok=True)
+    partial.mkdir(exist_ok=True)
     return partial
 
 
@@ -212,22 +218,40 @@ def on_host(tree: T) -> T:
 
 
 def _save(folder: Path, tree: PyTree) -> None:
-    with ocp.StandardCheckpointer() as checkpointer:
-        # A checkpoint says nothing of devices.
-        checkpointer.save(folder.resolve(), jax.tree.map(np.asarray, _storable(tree)))
+    # A checkpoint says nothing of devices.
+    plain = jax.tree.map(np.asarray, _storable(tree))
+    with _plain_path(folder) as path, ocp.StandardCheckpointer() as checkpointer:
+        checkpointer.save(path, plain)
+    if _difference(_saved_shapes(folder), _shapes(plain)) is not None:
+        raise GmijaxError(f"checkpoint {folder}: cannot be read again after it was written")
+
+
+@contextmanager
+def _plain_path(folder: Path) -> Iterator[Path]:
+    """A path of a folder, which need not be there yet, without any but plain characters.
+
+    Orbax looks for its own files by patterns that begin with the whole path, so brackets in it
+    hide them; TensorStore takes a backslash for a slash, and `gs:/` for a scheme.
+    """
+    parent = os.open(folder.parent, os.O_PATH | os.O_DIRECTORY | os.O_CLOEXEC)
+    try:
+        yield Path(f"/proc/self/fd/{parent}") / folder.name
+    finally:
+        os.close(parent)
 
 
 def _restore(folder: Path, template: T) -> T:
     plain = jax.tree.map(np.asarray, _storable(template))
     try:
-        with ocp.StandardCheckpointer() as checkpointer:
-            restored = checkpointer.restore(folder.resolve(), plain)
+        with _plain_path(folder) as path, ocp.StandardCheckpointer() as checkpointer:
+            restored = checkpointer.restore(path, plain)
     except Exception as error:
         # Orbax raises a plain `Exception` for an array that it cannot read. Anything else, such
         # as a device without enough memory, does not say that the checkpoint is bad.
         if not isinstance(error, ValueError | KeyError | OSError) and type(error) is not Exception:
             raise
-        why = _difference(_saved_shapes(folder), _shapes(plain)) or lines_of(error)[0]
+        saved = _saved_shapes(folder)
+        why = (_difference(saved, _shapes(plain)) if saved else None) or lines_of(error)[0]
         raise ConfigError(f"checkpoint {folder} does not fit this job: {why}") from error
     # Orbax gives arrays of other shapes than those that were asked for.
     if why := _difference(_shapes(restored), _shapes(plain)):
@@ -238,8 +262,8 @@ def _restore(folder: Path, template: T) -> T:
 def _difference(
     saved: Mapping[str, tuple[int, ...]], wanted: Mapping[str, tuple[int, ...]]
 ) -> str | None:
-    """The first array in which a checkpoint differs; None if none does, or nothing is known."""
-    for name in sorted(saved.keys() | wanted.keys()) if saved else ():
+    """The first array in which a checkpoint differs; None if none does."""
+    for name in sorted(saved.keys() | wanted.keys()):
         if name not in wanted:
             return f"it has {name}, this job has not"
         if name not in saved:

@@ -13,8 +13,8 @@ from gmijax.errors import ConfigError
 from gmijax.learning.checkpoint import has_envs, restore_envs, restore_learner
 from gmijax.learning.learner import Learner, TrainState, init_learner
 from gmijax.machine.host_limits import detect_host
-from gmijax.runs.folder import RunPaths, read_json
 from gmijax.runs.resume import CheckpointMeta
+from gmijax.runs.saved_config import saved_config
 from gmijax.sim.interface import Env
 from gmijax.sim.randomize import make_worlds
 from gmijax.sim.wrappers import BatchedEnv, BatchState, env_keys
@@ -50,10 +50,14 @@ def first_state(learner: Learner, obs_size: int, config: TrainConfig) -> tuple[T
     checkpoint = Path(config.run.resume)
     state = restore_learner(checkpoint, state)
     # The schedule's rate is part of the state, unless the user asks for another one now.
-    wanted = config.algo.learning_rate
-    if wanted != read_json(RunPaths(checkpoint.parent.parent).config)["algo"]["learning_rate"]:
+    wanted, meta = config.algo.learning_rate, CheckpointMeta.read(checkpoint)
+    # A run that goes on in its own folder has written its new configuration by now.
+    before = meta.learning_rate
+    if before is None:  # Written by an older version.
+        before = saved_config(checkpoint)["algo"].get("learning_rate", wanted)
+    if wanted != before:
         state = state._replace(learning_rate=jnp.asarray(wanted, jnp.float32))
-    return state, CheckpointMeta.read(checkpoint).env_steps
+    return state, meta.env_steps
 
 
 @jax.jit

@@ -157,7 +157,7 @@ class TrainingLog:
         board = TensorBoardSink(run.tensorboard)
         for line in history:
             board.write(line)
-        wall_s = history[-1]["wall_s"] if history else 0.0
+        wall_s = (history[-1].get("wall_s") or 0.0) if history else 0.0
         return cls(env_name, (JsonlSink(run.metrics), board), env_steps, wall_s)
 
     def write(

@@ -92,7 +92,18 @@ class Plan:
 
     @classmethod
     def from_dict(cls, data: Mapping[str, Any]) -> Plan:
-        """Inverts `to_dict`, after a round trip through JSON too."""
+        """Inverts `to_dict`, after a round trip through JSON too.
+
+        Raises:
+          ConfigError: it is not the data of a plan.
+        """
+        try:
+            return cls._from_dict(data)
+        except (AttributeError, KeyError, TypeError, ValueError) as error:
+            raise ConfigError(f"not a plan ({type(error).__name__}: {error})") from None
+
+    @classmethod
+    def _from_dict(cls, data: Mapping[str, Any]) -> Plan:
         fields = dict(data)
         nodes = tuple(node["address"] for node in data.get("nodes", ()))
         rows = tuple(tuple(gmis) for gmis in data["layout"])

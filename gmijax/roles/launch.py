@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 import os
 import warnings
@@ -210,6 +209,6 @@ def _explain(error: GmijaxError, run: RunPaths) -> None:
     for gmi in failed:
         try:
             error.add_note(f"in GMI {gmi}:\n{read_json(run.gmi(gmi).error)['traceback'].rstrip()}")
-        except (OSError, json.JSONDecodeError, KeyError):
+        except (ConfigError, KeyError, AttributeError):
             continue
     error.add_note(f"run folder: {run.root}")

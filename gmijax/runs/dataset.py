@@ -10,6 +10,7 @@ file, or of another size than it says, is unfinished and is made again.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -32,7 +33,7 @@ class ShardPaths:
         """Whether both files are there, and the arrays are as long as they were written."""
         try:
             return self.arrays.stat().st_size == read_json(self.about)["num_bytes"]
-        except (OSError, ValueError, KeyError):
+        except (OSError, KeyError, ConfigError):
             return False
 
 
@@ -70,12 +71,11 @@ class DataPaths:
 
     def finished(self) -> Iterator[ShardPaths]:
         """All finished shards, GMI by GMI."""
-        for folder in sorted(self.root.glob("gmi_[0-9]*")):
-            rank = folder.name.removeprefix("gmi_")
-            if not rank.isdecimal():  # A copy that somebody made, e.g. gmi_000.bak
-                continue
-            for index in range(self.num_finished(int(rank))):
-                yield self.shard(int(rank), index)
+        # Not a copy that somebody made, e.g. gmi_000.bak or gmi_0.
+        names = (re.fullmatch("gmi_([0-9]{3,})", path.name) for path in self.root.glob("gmi_*"))
+        for rank in sorted({int(name[1]) for name in names if name}):
+            for index in range(self.num_finished(rank)):
+                yield self.shard(rank, index)
 
 
 def open_dataset(paths: DataPaths, about: Mapping[str, Any]) -> None:
@@ -100,12 +100,7 @@ def open_dataset(paths: DataPaths, about: Mapping[str, Any]) -> None:
 
 
 def _check_same(paths: DataPaths, about: Mapping[str, Any]) -> None:
-    try:
-        found = read_json(paths.dataset)
-    except ValueError as error:
-        raise ConfigError(f"{paths.dataset}: broken ({error})") from None
-    if not isinstance(found, dict):
-        raise ConfigError(f"{paths.dataset}: broken (not a JSON object)")
+    found = read_json(paths.dataset)
     for key, wanted in about.items():
         if found.get(key) != wanted:
             raise ConfigError(

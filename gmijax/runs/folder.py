@@ -2,32 +2,39 @@
 
 from __future__ import annotations
 
-import fcntl
+import errno
 import json
 import os
 import re
+import stat
 import threading
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager, suppress
+import typing
+from collections.abc import Mapping
+from contextlib import suppress
 from datetime import datetime
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO, Final
 
 from gmijax.errors import ConfigError
+from gmijax.runs.names import steps_name
 
 RUNS = Path("runs")
 """Where run folders go unless `run.dir` names one; relative to the working directory."""
 
-STEP_DIGITS = 12
-
 META = "meta.json"
 """Written last into a checkpoint: a folder without it is not one."""
+
+UNFINISHED, REMOVED = ".partial", ".removed"
+"""Ends of the names of checkpoints that are written or removed, which begin with a dot."""
 
 EXIT_NO_GL = 3
 """Exit code of the renderer where the OpenGL that it was told to use cannot be had."""
 
 _TEMPORARY = re.compile(r"\..+\.\d+-\d+")
 """Names that files have while they are written."""
+
+_LARGEST_JSON_BYTES: Final = 1 << 28
+"""More than any file that gmijax writes, and little enough to be read by mistake."""
 
 
 class _Folder:
@@ -88,11 +95,19 @@ class RunPaths(_Folder):
 
     def checkpoint(self, env_steps: int) -> Path:
         """The checkpoint after `env_steps` environment steps."""
-        return self.checkpoints / f"{env_steps:0{STEP_DIGITS}d}"
+        return self.checkpoints / steps_name(env_steps)
+
+    def unfinished(self, env_steps: int) -> Path:
+        """The same checkpoint while it is written."""
+        return self.checkpoints / f".{steps_name(env_steps)}{UNFINISHED}"
+
+    def removed(self, env_steps: int) -> Path:
+        """The same checkpoint while it is removed."""
+        return self.checkpoints / f".{steps_name(env_steps)}{REMOVED}"
 
     def video(self, env_steps: int) -> Path:
         """The film of the evaluation after `env_steps` environment steps."""
-        return self.videos / f"{env_steps:0{STEP_DIGITS}d}.mp4"
+        return self.videos / f"{steps_name(env_steps)}.mp4"
 
     def to_film(self, env_steps: int) -> Path:
         """The trajectory of which that film is to be made; gone when it has been."""
@@ -181,56 +196,6 @@ def require_new_run(run_dir: str | None, name: str | None) -> None:
         raise ConfigError(f"{key}={root}: {what}")
 
 
-@contextmanager
-def locked(lock: Path, what: str) -> Iterator[None]:
-    """Holds a folder by a file in it, so that two jobs cannot write into it at once.
-
-    Raises:
-      ConfigError: another job holds it, or it cannot be locked.
-    """
-    try:
-        fd = try_lock(lock)
-    except OSError as error:
-        raise ConfigError(f"{what}: cannot be locked ({error.strerror})") from None
-    if fd is None:
-        raise ConfigError(f"{what}: another job writes into this folder now")
-    try:
-        yield
-    finally:
-        os.close(fd)
-
-
-def try_lock(lock: Path) -> int | None:
-    """A descriptor that holds a lock until it is closed; None: another process holds it.
-
-    Raises:
-      OSError: it cannot be locked.
-    """
-    # A file: network file systems lock no folders, and files only if they are open for writing.
-    fd = os.open(lock, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o644)
-    try:
-        fcntl.flock(fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except OSError as error:
-        os.close(fd)
-        if isinstance(error, BlockingIOError):
-            return None
-        raise
-    return fd
-
-
-def is_locked(lock: Path) -> bool:
-    """Whether a job holds a folder, see `locked`."""
-    if not lock.exists():
-        return False
-    try:
-        fd = try_lock(lock)
-    except OSError:
-        return False  # Whoever wants it is told why it cannot be had.
-    if fd is not None:
-        os.close(fd)
-    return fd is None
-
-
 def write_json(path: Path, data: Mapping[str, Any]) -> None:
     """Writes `data` as `write_text` does."""
     write_text(path, json.dumps(data, indent=2) + "\n")
@@ -267,8 +232,48 @@ def remove_temporary(folder: Path) -> None:
 
 
 def read_json(path: Path) -> dict[str, Any]:
-    """Reads what `write_json` wrote."""
-    return json.loads(path.read_text())
+    """Reads what `write_json` wrote.
+
+    Raises:
+      ConfigError: it cannot be read, or is no JSON object; the message has the path.
+    """
+    try:
+        with open_regular(path) as file:
+            content = file.read(_LARGEST_JSON_BYTES + 1)
+        if len(content) > _LARGEST_JSON_BYTES:
+            raise OSError(errno.EFBIG, f"larger than {_LARGEST_JSON_BYTES >> 20} MiB")
+        data: object = json.loads(content)
+    except OSError as error:
+        raise ConfigError(f"{path}: cannot be read ({error.strerror})") from None
+    except RecursionError:
+        raise ConfigError(f"{path}: broken (nested too deeply)") from None
+    except ValueError as error:  # Not JSON, or not even text.
+        raise ConfigError(f"{path}: broken (not JSON: {error})") from None
+    if not isinstance(data, dict):
+        raise ConfigError(f"{path}: broken (not a JSON object)")
+    return typing.cast("dict[str, Any]", data)
+
+
+def open_regular(path: Path) -> BinaryIO:
+    """Opens a file for reading that is nothing else, e.g. a pipe, which would wait for a writer.
+
+    Raises:
+      OSError: it is something else, or cannot be opened.
+    """
+    # Before it is opened: to open a device may do something.
+    _require_regular(path, os.stat(path))
+    fd = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
+    try:
+        _require_regular(path, os.fstat(fd))
+        return open(fd, "rb")
+    except BaseException:
+        os.close(fd)
+        raise
+
+
+def _require_regular(path: Path, found: os.stat_result) -> None:
+    if not stat.S_ISREG(found.st_mode):
+        raise OSError(errno.EINVAL, "not a regular file", str(path))
 
 
 def add_event(path: Path, event: str, **details: Any) -> None:
@@ -279,16 +284,3 @@ def add_event(path: Path, event: str, **details: Any) -> None:
         end = file.tell()
         if file.write(line) < len(line):
             file.truncate(end)  # The next event would stand behind half of this one.
-
-
-def last_run(key: str) -> Path:
-    """The run folder below `RUNS` with the newest checkpoint.
-
-    Raises:
-      ConfigError: there is none.
-    """
-    # Not the time of a folder: that changes with whatever is put into it later, e.g. films.
-    found = list(RUNS.glob(f"*/checkpoints/[0-9]*/{META}"))
-    if not found:
-        raise ConfigError(f"{key}=last: no run with a checkpoint in {RUNS}/")
-    return max(found, key=lambda meta: meta.stat().st_mtime).parents[2]

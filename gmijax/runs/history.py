@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import json
 import os
+import sys
 from collections.abc import Mapping
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
-from gmijax.runs.folder import write_text
+from gmijax.runs.folder import open_regular, write_text
 
 
 def read_metrics(path: Path) -> list[dict[str, Any]]:
@@ -38,9 +39,9 @@ class MetricsReader:
         return next(reversed(self.new()), None)
 
     def new(self) -> list[dict[str, Any]]:
-        """The complete lines that came since the last call."""
+        """The complete lines that came since the last call; what is no line of metrics is none."""
         try:
-            with self._path.open("rb") as file:
+            with open_regular(self._path) as file:
                 if os.fstat(file.fileno()).st_size < self._offset:
                     self._offset = 0  # A restart has cut it.
                 file.seek(self._offset)
@@ -50,11 +51,23 @@ class MetricsReader:
         complete = new[: new.rfind(b"\n") + 1]
         self._offset += len(complete)
         lines: list[dict[str, Any]] = []
-        for line in complete.splitlines():
+        for text in complete.splitlines():
             # A full disk may have cut off a line, with later ones right behind it.
-            with suppress(ValueError):
-                lines.append(json.loads(line))
+            with suppress(ValueError, RecursionError):
+                line = json.loads(text)
+                if _is_line(line):
+                    lines.append(line)
         return lines
+
+
+def _is_line(data: object) -> bool:
+    """Whether it is what a job writes: environment steps, and numbers or nothing by name."""
+    if not isinstance(data, dict):
+        return False
+    numbers = [value for value in data.values() if value is not None]
+    return type(data.get("env_steps")) is int and all(
+        type(value) in (int, float) and abs(value) <= sys.float_info.max for value in numbers
+    )
 
 
 def scalars(line: Mapping[str, float | int | None]) -> dict[str, float]:

@@ -2,20 +2,34 @@
 
 from __future__ import annotations
 
+import hashlib
+import json
 import math
 import os
+import shutil
 import zlib
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 
-from gmijax.config import ALGORITHMS, AlgoConfig, EnvConfig, TrainConfig
-from gmijax.config.schema import from_dict, from_named, known
+from gmijax.config.schema import from_dict
 from gmijax.errors import ConfigError
-from gmijax.runs.folder import META, RunPaths, last_run, read_json
+from gmijax.runs.folder import (
+    META,
+    REMOVED,
+    RUNS,
+    UNFINISHED,
+    RunPaths,
+    open_regular,
+    read_json,
+)
+from gmijax.runs.names import by_steps, steps_name, steps_of
 
 _CHUNK_BYTES: Final = 1 << 20
+
+_DIGEST: Final = "sha256"
+"""Key of `meta.json`."""
 
 _MOST_NAMED: Final = 5
 """Runs that one line names."""
@@ -37,13 +51,18 @@ class CheckpointMeta:
     mean_return: float | None = None
     # Of the evaluation at `env_steps`, None if there was none.
     eval_return: float | None = None
+    # As the run was told, that of the schedule is in the learner's state.
+    learning_rate: float | None = None
+    # When it was written, seconds since 1970: files get new times when a run is copied.
+    time_s: float | None = None
     # Size in bytes and CRC-32 of every other file, by its path in the checkpoint; empty in
     # those of older versions.
     files: Mapping[str, tuple[int, ...]] = field(default_factory=dict)
 
     def to_dict(self) -> dict[str, object]:
-        """Plain data for `meta.json`."""
-        return asdict(self)
+        """Plain data for `meta.json`, with a digest of all the rest."""
+        data = asdict(self)
+        return {**data, _DIGEST: _digest(data)}
 
     @classmethod
     def read(cls, checkpoint: Path) -> CheckpointMeta:
@@ -53,9 +72,19 @@ class CheckpointMeta:
           ConfigError: they are not those of a checkpoint.
         """
         try:
-            return from_dict(cls, _read_object(checkpoint / META))
+            data = read_json(checkpoint / META)
+            # Those of older versions have none.
+            noted = data.pop(_DIGEST, None)
+            if noted not in (None, _digest(data)):
+                raise ConfigError("not as it was written")
+            return from_dict(cls, data)
         except ConfigError as error:
-            raise ConfigError(f"checkpoint {checkpoint}: broken {META} ({error})") from None
+            why = str(error).removeprefix(f"{checkpoint / META}: ")
+            raise ConfigError(f"checkpoint {checkpoint}: broken {META} ({why})") from None
+
+
+def _digest(data: Mapping[str, Any]) -> str:
+    return hashlib.sha256(json.dumps(data, sort_keys=True).encode()).hexdigest()
 
 
 class Found(NamedTuple):
@@ -65,21 +94,36 @@ class Found(NamedTuple):
     passed_over: tuple[str, ...]  # Newer ones, each with what is wrong with it.
 
 
+def checkpoints_of(folder: Path) -> list[Path]:
+    """The checkpoints of a run folder, whole or not, the fewest steps first.
+
+    What has another name than gmijax gives is somebody's copy, and none of them.
+    """
+    found = by_steps(RunPaths(folder).checkpoints)
+    return [path for path in found if os.path.lexists(path / META)]
+
+
+def drop_unfinished(run: RunPaths) -> None:
+    """Removes what is left of checkpoints that were being written or removed."""
+    for suffix in (UNFINISHED, REMOVED):
+        for hidden in by_steps(run.checkpoints, prefix=".", suffix=suffix):
+            shutil.rmtree(hidden, ignore_errors=True)
+
+
 def newest_checkpoint(folder: Path) -> Found:
     """The newest checkpoint of a run folder whose files are as they were written."""
     passed_over: list[str] = []
-    for path in sorted(folder.glob(f"checkpoints/[0-9]*/{META}"), reverse=True):
-        wrong = what_is_broken(path.parent)
+    for checkpoint in reversed(checkpoints_of(folder)):
+        wrong = what_is_broken(checkpoint)
         if wrong is None:
-            return Found(path.parent.resolve(), tuple(passed_over))
-        passed_over.append(f"checkpoint {path.parent}: passed over, {wrong}")
+            return Found(checkpoint.resolve(), tuple(passed_over))
+        passed_over.append(f"checkpoint {checkpoint}: passed over, {wrong}")
     return Found(None, tuple(passed_over))
 
 
 def best_checkpoint(folder: Path) -> Path | None:
     """The best checkpoint of a run folder, by `rank_of`, whose files are as they were written."""
-    found = sorted(meta.parent for meta in folder.glob(f"checkpoints/[0-9]*/{META}"))
-    ranked = sorted(reversed(found), key=rank_of, reverse=True)
+    ranked = sorted(reversed(checkpoints_of(folder)), key=rank_of, reverse=True)
     return next((path.resolve() for path in ranked if what_is_broken(path) is None), None)
 
 
@@ -88,8 +132,7 @@ def best_evaluation(folder: Path, env_steps: int) -> float:
 
     Of those that have a checkpoint, and the best one always has.
     """
-    metas = folder.glob(f"checkpoints/[0-9]*/{META}")
-    found = (rank_of(meta.parent) for meta in metas if int(meta.parent.name) <= env_steps)
+    found = (rank_of(path) for path in checkpoints_of(folder) if int(path.name) <= env_steps)
     return max((mean for is_evaluated, mean in found if is_evaluated), default=-math.inf)
 
 
@@ -112,21 +155,31 @@ def what_is_broken(checkpoint: Path) -> str | None:
     try:
         meta = CheckpointMeta.read(checkpoint)
     except ConfigError as error:
-        return str(error).partition(": ")[2]
-    for name, wanted in meta.files.items():
-        try:
-            is_same = file_check(checkpoint / name) == tuple(wanted)
-        except OSError as error:
-            return f"{name}: {error.strerror}"
-        if not is_same:
-            return f"{name} is not as it was written"
-    return None
+        return str(error).removeprefix(f"checkpoint {checkpoint}: ")
+    if steps_of(checkpoint.name) not in (None, meta.env_steps):  # A copy under such a name.
+        return f"{META} is that of {steps_name(meta.env_steps)}"
+    return next(
+        filter(None, (_broken_file(checkpoint, *item) for item in meta.files.items())), None
+    )
+
+
+def _broken_file(checkpoint: Path, name: str, wanted: tuple[int, ...]) -> str | None:
+    try:
+        real = os.path.realpath(checkpoint / name)
+        if not Path(real).is_relative_to(os.path.realpath(checkpoint)):
+            return f"{name} is no file of it"
+        is_same = file_check(Path(real)) == tuple(wanted)
+    except OSError as error:
+        return f"{name}: {error.strerror}"
+    except ValueError as error:  # No name that a file can have.
+        return f"{name!r}: {error}"
+    return None if is_same else f"{name} is not as it was written"
 
 
 def file_check(path: Path) -> tuple[int, int]:
-    """Size in bytes and CRC-32 of a file."""
+    """Size in bytes and CRC-32 of a regular file; raises OSError for anything else."""
     size = crc = 0
-    with path.open("rb") as file:
+    with open_regular(path) as file:
         while chunk := file.read(_CHUNK_BYTES):
             size, crc = size + len(chunk), zlib.crc32(chunk, crc)
     return size, crc
@@ -147,7 +200,7 @@ def choose_checkpoint(wanted: str, key: str) -> tuple[Path, tuple[str, ...]]:
       ConfigError: there is none.
     """
     folder = _named(wanted, key)
-    if (folder / META).is_file():
+    if os.path.lexists(folder / META):
         if wrong := what_is_broken(folder):
             raise ConfigError(f"{key}={wanted}: {wrong}")
         return folder.resolve(), ()
@@ -159,23 +212,22 @@ def choose_checkpoint(wanted: str, key: str) -> tuple[Path, tuple[str, ...]]:
     return found.checkpoint, found.passed_over
 
 
-def saved_config_of(wanted: str, key: str) -> dict[str, Any]:
-    """The configuration of the run that `wanted` names, whole or not; see `find_checkpoint`.
+def any_checkpoint(wanted: str, key: str) -> Path:
+    """A checkpoint of the run that `wanted` names, whole or not; see `choose_checkpoint`.
 
     Raises:
-      ConfigError: there is no checkpoint, or it does not lie in the folder of a training run.
+      ConfigError: there is none.
     """
     folder = _named(wanted, key)
-    metas = (folder / META, *folder.glob(f"checkpoints/[0-9]*/{META}"))
-    for meta in metas:
-        if meta.is_file():
-            return saved_config(meta.parent.resolve())
-    raise ConfigError(f"{key}={wanted}: {_no_checkpoint(folder)}")
+    found = [folder] if os.path.lexists(folder / META) else checkpoints_of(folder)
+    if not found:
+        raise ConfigError(f"{key}={wanted}: {_no_checkpoint(folder)}")
+    return found[-1].resolve()
 
 
 def _no_checkpoint(folder: Path) -> str:
     """Says that a folder has none, and where there are some if it is that of a sweep."""
-    jobs = sorted({meta.parents[2].name for meta in folder.glob(f"*/checkpoints/[0-9]*/{META}")})
+    jobs = sorted(path.name for path in _folders_in(folder) if checkpoints_of(path))
     if not jobs:
         return "no checkpoint in this folder"
     more = f" and {len(jobs) - _MOST_NAMED} more" if len(jobs) > _MOST_NAMED else ""
@@ -190,76 +242,30 @@ def _named(wanted: str, key: str) -> Path:
     return folder
 
 
-def saved_config(checkpoint: Path) -> dict[str, Any]:
-    """The configuration of the run that a checkpoint lies in, as plain data.
-
-    Keys that its version of gmijax did not know are missing.
+def last_run(key: str) -> Path:
+    """The run folder below `RUNS` whose newest checkpoint was written last.
 
     Raises:
-      ConfigError: the checkpoint does not lie in the folder of a training run.
+      ConfigError: there is none.
     """
-    path = RunPaths(checkpoint.parent.parent).config
-    if not path.is_file():
-        raise ConfigError(
-            f"checkpoint {checkpoint}: no config.json in {path.parent}; "
-            "a checkpoint can only be used in its run folder"
-        )
+    found = {path: run for run in _folders_in(RUNS) for path in checkpoints_of(run)[-1:]}
+    if not found:
+        raise ConfigError(f"{key}=last: no run with a checkpoint in {RUNS}/")
+    return found[max(found, key=_written_s)]
+
+
+def _written_s(checkpoint: Path) -> tuple[float, float]:
+    """When a checkpoint was written; of a run and its copy, which have one time, the run is older.
+
+    Not the time of a folder: that changes with whatever is put into it later, e.g. films.
+    """
+    file_s = os.lstat(checkpoint / META).st_mtime
     try:
-        saved = _read_object(path)
-    except ConfigError as error:
-        raise ConfigError(f"{path}: broken ({error})") from None
-    if not all(isinstance(saved.get(group), dict) for group in ("env", "algo", "run")):
-        raise ConfigError(f"{path}: not the configuration of a training run")
-    if saved["env"].get("suite") == "custom":
-        # A file of which nothing is noted is none that can be recognised.
-        saved["env"]["source_sha256"] = saved["env"].get("source_sha256") or ""
-    return saved
+        noted_s = CheckpointMeta.read(checkpoint).time_s
+    except ConfigError:
+        noted_s = None
+    return (file_s if noted_s is None else noted_s), -file_s
 
 
-def trained_config(checkpoint: Path) -> tuple[EnvConfig, AlgoConfig]:
-    """Task and algorithm of the run that a checkpoint lies in.
-
-    Keys that this version of gmijax does not know any more are left out.
-
-    Raises:
-      ConfigError: the checkpoint does not lie in the folder of a training run.
-    """
-    saved = saved_config(checkpoint)
-    algo, _ = known(ALGORITHMS, saved["algo"], "algo.")
-    env, _ = known([EnvConfig], saved["env"], "env.")
-    return from_dict(EnvConfig, env, "env."), from_named(ALGORITHMS, algo, "algo.")
-
-
-def require_known_keys(saved: Mapping[str, Any], what: str) -> None:
-    """Raises ConfigError if a run's configuration has keys that this version does not know.
-
-    To train on without them would be another training. Policies act without, see `trained_config`.
-    """
-    if unknown := _unknown_keys(saved):
-        raise ConfigError(
-            f"{what}: its config.json has keys that this version does not know: {unknown}; take "
-            "them out of that file to go on without them (the policy can be played, exported and "
-            "served as it is)"
-        )
-
-
-def left_out(checkpoint: Path) -> str | None:
-    """Says which keys `trained_config` leaves out of a run's configuration; None: none."""
-    unknown = _unknown_keys(saved_config(checkpoint))
-    return f"left out, because this version does not know them: {unknown}" if unknown else None
-
-
-def _unknown_keys(saved: Mapping[str, Any]) -> str:
-    return ", ".join(known([TrainConfig], saved)[1])
-
-
-def _read_object(path: Path) -> dict[str, Any]:
-    try:
-        data: object = read_json(path)
-    except OSError as error:
-        raise ConfigError(f"cannot read it: {error.strerror}") from None
-    except ValueError as error:  # Not JSON, or not even text.
-        raise ConfigError(f"not JSON: {error}") from None
-    if not isinstance(data, dict):
-        raise ConfigError("not a JSON object")
-    return data
+def _folders_in(folder: Path) -> list[Path]:
+    return sorted(path for path in folder.iterdir() if path.is_dir()) if folder.is_dir() else []

@@ -13,7 +13,8 @@ from gmijax.machine.mps_control import PIPE_VARIABLE
 from gmijax.machine.snapshot import DAEMONS_VARIABLE, Machine
 from gmijax.partition.plan import Plan
 from gmijax.runs.cache import cache_folder
-from gmijax.runs.folder import RunPaths, try_lock
+from gmijax.runs.folder import RunPaths
+from gmijax.runs.held import try_lock
 from gmijax.supervise.backends import open_backend
 from gmijax.supervise.backends.backend import Backend
 from gmijax.sweeps.children import Child, Seen

@@ -258,5 +258,6 @@ def state_of(run: RunPaths, config: TrainConfig) -> State:
     if not run.summary.exists():
         return "waiting"
     summary = read_json(run.summary)
-    done = summary["status"] == "completed" and summary["env_steps"] >= config.num_timesteps
-    return "completed" if done else "waiting"
+    steps = summary.get("env_steps")
+    is_far = isinstance(steps, int | float) and steps >= config.num_timesteps
+    return "completed" if summary.get("status") == "completed" and is_far else "waiting"

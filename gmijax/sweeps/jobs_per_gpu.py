@@ -249,5 +249,5 @@ class _Window:
 def _memory_mib(paths: SweepPaths, jobs: Sequence[Job]) -> float:
     """Peak memory of the largest job, MiB."""
     found = [paths.job(job.number).gmi(0).result for job in jobs]
-    devices = [read_json(path)["device"] for path in found if path.exists()]
+    devices = [read_json(path).get("device") or {} for path in found if path.exists()]
     return max([device.get("peak_memory_mib") or 1.0 for device in devices], default=1.0)

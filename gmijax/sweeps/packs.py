@@ -9,7 +9,8 @@ from typing import NamedTuple
 from gmijax.config.sweep import SweepConfig
 from gmijax.control.start_point import find_start_point
 from gmijax.errors import ConfigError
-from gmijax.runs.folder import RunPaths, is_locked, read_json
+from gmijax.runs.folder import RunPaths, read_json
+from gmijax.runs.held import is_locked
 from gmijax.runs.resume import CheckpointMeta
 from gmijax.sweeps.jobs import Job, SweepPaths, started_in, state_of
 
@@ -142,5 +143,5 @@ def own_end(job: Job, run: RunPaths) -> OwnEnd | None:
         return OwnEnd(None)
     if run.gmi(0).error.exists():
         said = read_json(run.gmi(0).error)
-        return OwnEnd(f"{said['type']}: {said['message']}")
+        return OwnEnd(f"{said.get('type')}: {said.get('message')}")
     return None

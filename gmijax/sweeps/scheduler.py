@@ -11,7 +11,8 @@ from typing import Any
 from gmijax.config.schema import to_dict
 from gmijax.config.sweep import SweepConfig
 from gmijax.errors import JobInterrupted, NodeLost
-from gmijax.runs.folder import add_event, is_locked
+from gmijax.runs.folder import add_event
+from gmijax.runs.held import is_locked
 from gmijax.runs.history import MetricsReader
 from gmijax.supervise.failures import may_be_anothers
 from gmijax.supervise.run_gmis import StopSignals

@@ -19,7 +19,8 @@ from gmijax.control.console import open_console
 from gmijax.control.decide import with_task
 from gmijax.errors import ConfigError, JobInterrupted, SweepFailed
 from gmijax.machine.snapshot import detect_machine
-from gmijax.runs.folder import RUNS, create_run, given_run, locked, read_json, write_json
+from gmijax.runs.folder import RUNS, create_run, given_run, read_json, write_json
+from gmijax.runs.held import locked
 from gmijax.supervise.run_gmis import StopSignals, stop_signals
 from gmijax.sweeps.host import LocalHost
 from gmijax.sweeps.jobs import (
@@ -256,7 +257,8 @@ def _beginning(request: Request, paths: SweepPaths) -> tuple[list[Job], Study]:
         if job.progress.state != "pruned":
             job.progress.state = state_of(run, job.config)
         if job.progress.state == "completed":
-            job.progress.earlier_s = read_json(run.summary).get("wall_s", 0.0)
+            wall_s = read_json(run.summary).get("wall_s")
+            job.progress.earlier_s = wall_s if isinstance(wall_s, float) else 0.0
     write_json(paths.request, wanted)
     return jobs, study
 

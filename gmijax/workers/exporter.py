@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 from gmijax.config import ExportConfig
 from gmijax.config.schema import from_dict
 from gmijax.runs.folder import ExportPaths, read_json, write_bytes, write_json
-from gmijax.runs.resume import trained_config
+from gmijax.runs.saved_config import trained_config
 from gmijax.supervise.child import ChildLink, run_gmi
 
 if TYPE_CHECKING:

@@ -16,6 +16,7 @@ from typing import Final
 
 from gmijax.control.films import FINISH
 from gmijax.runs.folder import RunPaths
+from gmijax.runs.names import by_steps
 from gmijax.sim.trajectory import load_trajectory
 from gmijax.supervise.side_process import exit_code_beside
 from gmijax.workers.play_film import Stage, film
@@ -36,13 +37,13 @@ def main(root: Path) -> int:
 
 def follow(run: RunPaths, is_over: threading.Event) -> None:
     """Films trajectories as they come, until it is over and none is left."""
-    for unfinished in run.videos.glob(".[0-9]*.mp4"):
+    for unfinished in by_steps(run.videos, prefix=".", suffix=".mp4"):
         unfinished.unlink()
     stage: Stage | None = None
     while True:
         # Asked first: what was left before the end is seen then.
         is_last = is_over.is_set()
-        *passed_over, newest = (None, *sorted(run.videos.glob("[0-9]*.npz")))
+        *passed_over, newest = (None, *by_steps(run.videos, suffix=".npz"))
         for path in filter(None, passed_over):
             path.unlink()
         if newest is not None:

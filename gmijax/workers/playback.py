@@ -14,7 +14,8 @@ from gmijax.config import EnvConfig, PlayConfig
 from gmijax.config.schema import from_dict
 from gmijax.errors import ConfigError
 from gmijax.runs.folder import PlayPaths, read_json, write_json
-from gmijax.runs.resume import CheckpointMeta, trained_config
+from gmijax.runs.resume import CheckpointMeta
+from gmijax.runs.saved_config import trained_config
 from gmijax.supervise.child import ChildLink, run_gmi
 
 if TYPE_CHECKING:

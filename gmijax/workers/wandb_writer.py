@@ -17,6 +17,7 @@ from typing import Any
 
 from gmijax.runs.folder import RunPaths, read_json, write_json
 from gmijax.runs.history import MetricsReader, scalars
+from gmijax.runs.names import by_steps
 from gmijax.supervise.side_process import exit_code_beside
 
 _POLL_S = 2.0
@@ -49,7 +50,7 @@ def follow(run: RunPaths, config: Mapping[str, Any]) -> None:
         for line in new:
             last = line["env_steps"]
             board.log(scalars(line), step=last)
-        film = max(run.videos.glob("[0-9]*.mp4"), default=None)
+        film = next(reversed(by_steps(run.videos, suffix=".mp4")), None)
         is_new = film is not None and int(film.stem) > filmed and last >= 0
         if film is not None and is_new:
             filmed = int(film.stem)

@@ -35,12 +35,12 @@ from gmijax.runs.resume import (
 from gmijax.sim.interface import EnvSpec
 
 
-def restore_with(error: Exception, monkeypatch: pytest.MonkeyPatch) -> None:
+def restore_with(error: Exception, monkeypatch: pytest.MonkeyPatch, at: Path) -> None:
     def fail(*_: object) -> None:
         raise error
 
     monkeypatch.setattr(ocp.StandardCheckpointer, "restore", fail)
-    restore_learner(Path("x"), {"a": jnp.zeros(2)})
+    restore_learner(at, {"a": jnp.zeros(2)})
 
 
 @pytest.mark.parametrize(
@@ -55,17 +55,19 @@ def restore_with(error: Exception, monkeypatch: pytest.MonkeyPatch) -> None:
     ],
 )
 def test_checkpoint_that_does_not_fit_is_bad_input(
-    error: Exception, said: str, monkeypatch: pytest.MonkeyPatch
+    error: Exception, said: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ):
     with pytest.raises(
-        ConfigError, match=rf"^checkpoint x/learner does not fit this job: {said}$"
+        ConfigError, match=rf"^checkpoint {tmp_path}/learner does not fit this job: {said}$"
     ):
-        restore_with(error, monkeypatch)
+        restore_with(error, monkeypatch, tmp_path)
 
 
-def test_failure_of_the_device_is_not_the_checkpoints(monkeypatch: pytest.MonkeyPatch):
+def test_failure_of_the_device_is_not_the_checkpoints(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+):
     with pytest.raises(RuntimeError, match="RESOURCE_EXHAUSTED"):
-        restore_with(RuntimeError("RESOURCE_EXHAUSTED"), monkeypatch)
+        restore_with(RuntimeError("RESOURCE_EXHAUSTED"), monkeypatch, tmp_path)
 
 
 class Before(NamedTuple):

@@ -12,7 +12,8 @@ import pytest
 
 from gmijax.errors import ConfigError
 from gmijax.runs.dataset import DataPaths, open_dataset
-from gmijax.runs.folder import add_event, locked, read_json, write_json
+from gmijax.runs.folder import add_event, read_json, write_json
+from gmijax.runs.held import locked
 from gmijax.runs.history import MetricsReader, read_metrics
 
 

@@ -15,15 +15,15 @@ from supervision import save
 from gmijax.cli.compose import compose
 from gmijax.config.schema import to_dict
 from gmijax.errors import ConfigError
-from gmijax.runs.folder import META, RunPaths, last_run, read_json, write_json
+from gmijax.runs.folder import META, RunPaths, read_json, write_json
 from gmijax.runs.resume import (
     CheckpointMeta,
     file_check,
     find_checkpoint,
-    left_out,
+    last_run,
     newest_checkpoint,
-    trained_config,
 )
+from gmijax.runs.saved_config import left_out, trained_config
 
 
 def make_run(root: Path, *env_steps: int) -> RunPaths:

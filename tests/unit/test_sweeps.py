@@ -17,7 +17,8 @@ from gmijax.cli.grid import build_sweep
 from gmijax.config.sweep import SweepConfig
 from gmijax.control.console import open_console
 from gmijax.errors import ConfigError
-from gmijax.runs.folder import is_locked, locked, write_json
+from gmijax.runs.folder import write_json
+from gmijax.runs.held import is_locked, locked
 from gmijax.supervise.failures import may_be_anothers
 from gmijax.supervise.run_gmis import StopSignals
 from gmijax.sweeps import jobs_per_gpu

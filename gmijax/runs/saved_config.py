@@ -1,0 +1,83 @@
+"""The configuration that a run was trained with, as its folder has it. No jax here."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from gmijax.config import ALGORITHMS, AlgoConfig, EnvConfig, TrainConfig
+from gmijax.config.schema import from_dict, from_named, known
+from gmijax.errors import ConfigError
+from gmijax.runs.folder import RunPaths, read_json
+from gmijax.runs.resume import any_checkpoint
+
+
+def saved_config_of(wanted: str, key: str) -> dict[str, Any]:
+    """The configuration of the run that `wanted` names, whole or not; see `find_checkpoint`.
+
+    Raises:
+      ConfigError: there is no checkpoint, or it does not lie in the folder of a training run.
+    """
+    return saved_config(any_checkpoint(wanted, key))
+
+
+def saved_config(checkpoint: Path) -> dict[str, Any]:
+    """The configuration of the run that a checkpoint lies in, as plain data.
+
+    Keys that its version of gmijax did not know are missing.
+
+    Raises:
+      ConfigError: the checkpoint does not lie in the folder of a training run.
+    """
+    path = RunPaths(checkpoint.parent.parent).config
+    if not os.path.lexists(path):
+        raise ConfigError(
+            f"checkpoint {checkpoint}: no config.json in {path.parent}; "
+            "a checkpoint can only be used in its run folder"
+        )
+    saved = read_json(path)
+    if not all(isinstance(saved.get(group), dict) for group in ("env", "algo", "run")):
+        raise ConfigError(f"{path}: not the configuration of a training run")
+    if saved["env"].get("suite") == "custom":
+        # A file of which nothing is noted is none that can be recognised.
+        saved["env"]["source_sha256"] = saved["env"].get("source_sha256") or ""
+    return saved
+
+
+def trained_config(checkpoint: Path) -> tuple[EnvConfig, AlgoConfig]:
+    """Task and algorithm of the run that a checkpoint lies in.
+
+    Keys that this version of gmijax does not know any more are left out.
+
+    Raises:
+      ConfigError: the checkpoint does not lie in the folder of a training run.
+    """
+    saved = saved_config(checkpoint)
+    algo, _ = known(ALGORITHMS, saved["algo"], "algo.")
+    env, _ = known([EnvConfig], saved["env"], "env.")
+    return from_dict(EnvConfig, env, "env."), from_named(ALGORITHMS, algo, "algo.")
+
+
+def require_known_keys(saved: Mapping[str, Any], what: str) -> None:
+    """Raises ConfigError if a run's configuration has keys that this version does not know.
+
+    To train on without them would be another training. Policies act without, see `trained_config`.
+    """
+    if unknown := _unknown_keys(saved):
+        raise ConfigError(
+            f"{what}: its config.json has keys that this version does not know: {unknown}; take "
+            "them out of that file to go on without them (the policy can be played, exported and "
+            "served as it is)"
+        )
+
+
+def left_out(checkpoint: Path) -> str | None:
+    """Says which keys `trained_config` leaves out of a run's configuration; None: none."""
+    unknown = _unknown_keys(saved_config(checkpoint))
+    return f"left out, because this version does not know them: {unknown}" if unknown else None
+
+
+def _unknown_keys(saved: Mapping[str, Any]) -> str:
+    return ", ".join(known([TrainConfig], saved)[1])
