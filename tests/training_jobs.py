@@ -43,12 +43,16 @@ POINT = ("env=point.py:make", *TINY[1:])
 
 
 def train(
-    *overrides: str, cwd: Path, timeout_s: float = 240.0, command: str = "train"
+    *overrides: str,
+    cwd: Path,
+    timeout_s: float = 240.0,
+    command: str = "train",
+    safe: bool = False,
 ) -> subprocess.CompletedProcess[str]:
-    """Runs a command to its end."""
+    """Runs a command to its end; if `safe` without the working directory on its path."""
     _write_task(overrides, cwd)
     return subprocess.run(
-        [sys.executable, "-m", f"gmijax.{command}", *overrides],
+        [sys.executable, *(["-P"] if safe else []), "-m", f"gmijax.{command}", *overrides],
         cwd=cwd,
         env=child_environment(),
         capture_output=True,

@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import os
 import subprocess
-import sys
 import tempfile
 from collections.abc import Mapping
 from pathlib import Path
@@ -14,6 +13,7 @@ from typing import Final, NamedTuple
 
 from gmijax.config import PlanConfig, ReduceConfig
 from gmijax.errors import GmijaxError
+from gmijax.machine.interpreter import command
 from gmijax.machine.nvidia import Gpu, nvml_problem
 from gmijax.machine.snapshot import Machine, detect_machine
 from gmijax.partition.planner import make_plan
@@ -89,7 +89,7 @@ def ask_jax(machine: Machine) -> JaxView:
     }
     try:
         done = subprocess.run(
-            [sys.executable, "-m", "gmijax.workers.jax_probe"],
+            command("gmijax.workers.jax_probe"),
             env=environment,
             stdin=subprocess.DEVNULL,
             capture_output=True,

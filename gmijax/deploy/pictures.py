@@ -5,7 +5,6 @@ from __future__ import annotations
 import importlib.util
 import os
 import subprocess
-import sys
 from collections.abc import Mapping
 from pathlib import Path
 from typing import IO
@@ -15,6 +14,7 @@ from rich.console import Console
 from gmijax.config import PlayConfig
 from gmijax.control.console import doing
 from gmijax.errors import GmijaxError
+from gmijax.machine.interpreter import command
 from gmijax.machine.opengl import environment_with, is_missing, opengls, what_is_missing
 from gmijax.runs.folder import EXIT_NO_GL, PlayPaths
 from gmijax.supervise.failures import last_line, signal_name
@@ -78,7 +78,7 @@ def _render(gl: str, paths: PlayPaths) -> int:
 def _child(module: str, paths: PlayPaths, environment: Mapping[str, str], log: IO[bytes]) -> int:
     """Runs a module on the folder of a played checkpoint; returns its exit code."""
     return subprocess.run(
-        [sys.executable, "-m", module, str(paths.root)],
+        command(module, str(paths.root)),
         env=environment,
         stdin=subprocess.DEVNULL,
         stdout=log,

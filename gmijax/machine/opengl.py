@@ -8,11 +8,11 @@ from __future__ import annotations
 import os
 import signal
 import subprocess
-import sys
 from collections.abc import Sequence
 from typing import Final
 
 from gmijax.errors import printable
+from gmijax.machine.interpreter import command
 from gmijax.runs.folder import EXIT_NO_GL
 
 _GL: Final = "MUJOCO_GL"
@@ -36,7 +36,7 @@ def first_opengl(tried: Sequence[str]) -> tuple[str | None, str]:
     said = ""
     for gl in tried:
         done = subprocess.run(
-            [sys.executable, "-m", "gmijax.workers.play_film"],
+            command("gmijax.workers.play_film"),
             env=environment_with(gl),
             stdin=subprocess.DEVNULL,
             capture_output=True,

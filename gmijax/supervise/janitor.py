@@ -21,6 +21,7 @@ from pathlib import Path
 from typing import Any
 
 from gmijax.errors import BackendUnavailable
+from gmijax.machine.interpreter import command
 from gmijax.machine.mps_control import MpsControl
 from gmijax.machine.processes import GuardPipe, ProcessId, identify, wait_until_gone
 
@@ -43,7 +44,7 @@ class JanitorLink:
         try:
             with log.open("wb") as errors:
                 self._process = subprocess.Popen(
-                    [sys.executable, "-m", "gmijax.supervise.janitor"],
+                    command("gmijax.supervise.janitor"),
                     stdin=self._pipe.read_end,
                     stdout=errors,
                     stderr=errors,

@@ -10,6 +10,7 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Final
 
+from gmijax.machine.interpreter import command
 from gmijax.machine.processes import GuardPipe
 from gmijax.supervise.failures import last_line, signal_name
 
@@ -49,7 +50,7 @@ class SideProcess:
         try:
             with log.open("wb") as output:
                 self._process = subprocess.Popen(
-                    [sys.executable, "-m", module, str(folder)],
+                    command(module, str(folder)),
                     stdin=self._pipe.read_end,
                     stdout=output,
                     stderr=output,

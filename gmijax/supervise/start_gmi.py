@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import os
-import sys
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 
 from gmijax.config import Timeouts
+from gmijax.machine.interpreter import command
 from gmijax.machine.snapshot import Machine
 from gmijax.partition.plan import Plan
 from gmijax.runs.cache import compilation_cache_dir
@@ -62,7 +62,7 @@ def start_gmi(
     """Starts a GMI on this machine; see `GmiProcess`."""
     return GmiProcess(
         gmi,
-        [sys.executable, "-m", launch.kind.module],
+        command(launch.kind.module),
         environment_of(launch, gmi, backend.environment(gmi)),
         launch.run,
         inherited_fds,

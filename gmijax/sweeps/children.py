@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 import signal
 import subprocess
-import sys
 import time
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
@@ -13,6 +12,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from gmijax.errors import GmijaxError
+from gmijax.machine.interpreter import command
 from gmijax.machine.processes import GuardPipe, members_of
 from gmijax.runs.folder import write_json
 from gmijax.supervise.failures import last_line
@@ -64,7 +64,7 @@ class Child:
         try:
             with log.open("ab") as output:
                 self._process = subprocess.Popen(
-                    [sys.executable, "-m", MODULE, str(order), str(self._pipe.read_end)],
+                    command(MODULE, str(order), str(self._pipe.read_end)),
                     env={**os.environ, **variables},
                     stdin=subprocess.DEVNULL,
                     stdout=output,

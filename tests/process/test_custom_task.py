@@ -70,6 +70,21 @@ def test_a_task_of_ones_own_trains_in_two_gmis_and_resumes(tmp_path: Path):
     assert "in reward/near" in done.stderr
 
 
+def test_files_may_have_the_names_of_packages(tmp_path: Path):
+    """Beside the task and in the working directory; the neighbour is the one of the task."""
+    for name in ("random", "queue", "statistics", "optax", "flax/__init__", "gmijax/__init__"):
+        for folder in (tmp_path, tmp_path / "tasks"):
+            file = folder / f"{name}.py"
+            file.parent.mkdir(parents=True, exist_ok=True)
+            file.write_text("raise ImportError('not the package')")
+    (tmp_path / "utils.py").write_text("raise ImportError('of the working directory')")
+    (tmp_path / "tasks" / "utils.py").write_text("PACE = 0.1")
+    (tmp_path / "tasks" / "optax.py").write_text(f"from utils import PACE\n{TASK}")
+    # As the program `gmijax`, which has no working directory on its path.
+    done = train("env=tasks/optax.py:make", *SMALL, "num_timesteps=64", cwd=tmp_path, safe=True)
+    assert done.returncode == 0, done.stderr
+
+
 def test_an_environment_of_brax_trains(tmp_path: Path):
     done = train("env=brax", "env.name=fast", *SMALL, "num_timesteps=64", cwd=tmp_path)
     assert done.returncode == 0, done.stderr

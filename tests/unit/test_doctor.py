@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import subprocess
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -173,7 +174,7 @@ def test_a_jax_that_fails_or_hangs_is_told(monkeypatch: pytest.MonkeyPatch, tmp_
     program = tmp_path / "python"
     program.write_text("#!/bin/sh\necho 'RuntimeError: no cuda' >&2; exit 1\n")
     program.chmod(0o755)
-    monkeypatch.setattr(system_info.sys, "executable", str(program))
+    monkeypatch.setattr(sys, "executable", str(program))
     assert ask_jax(machine_of(monkeypatch)) == JaxView(None, error="RuntimeError: no cuda")
     program.write_text("#!/bin/sh\nexec sleep 60\n")
     monkeypatch.setattr(system_info, "PROBE_TIMEOUT_S", 0.2)

@@ -8,7 +8,7 @@ from __future__ import annotations
 import traceback
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 import jax
 import jax.numpy as jnp
@@ -17,6 +17,9 @@ import numpy as np
 from gmijax.errors import ConfigError
 from gmijax.sim.interface import Env, EnvSpec, EnvState
 from gmijax.types import PyTree
+
+_FOUND: Final = "found are files beside the task, installed packages, and folders of PYTHONPATH"
+"""Where a task's imports are looked for: the working directory is not among them."""
 
 
 def check_env(env: Any, what: str) -> None:
@@ -79,8 +82,9 @@ def attempt(what: str, function: Callable[..., Any], *arguments: Any, **named: A
         raise
     except (Exception, SystemExit) as error:
         lines = str(error).strip().splitlines() or [""]
+        found = f"; {_FOUND}" if isinstance(error, ModuleNotFoundError) else ""
         raise ConfigError(
-            f"{what} fails: {type(error).__name__}: {lines[0]}{_place(error)}"
+            f"{what} fails: {type(error).__name__}: {lines[0]}{_place(error)}{found}"
         ) from error
 
 

@@ -14,6 +14,7 @@ from typing import Any
 from gmijax.config.schema import suggestion
 from gmijax.errors import ConfigError
 from gmijax.sim.adapters.checks import attempt, check_env, check_start
+from gmijax.sim.adapters.neighbours import importable
 from gmijax.sim.interface import Env
 from gmijax.sim.source import split
 
@@ -38,19 +39,21 @@ def make(
         what it returns is no environment; one line, with the place.
     """
     path, function = split(name)
-    module = attempt(f"env={path}", _load, path, source_sha256)
-    found = getattr(module, function, None)
-    if not callable(found):
-        names = [key for key, value in vars(module).items() if inspect.isfunction(value)]
-        raise ConfigError(f"env={name}: no function {function} there{suggestion(function, names)}")
-    what = f"env={path.name}:{function}"
     changes = {"rewards": rewards, "settings": settings, "curriculum": curriculum}
     given = {key: value for key, value in changes.items() if value}
-    for group in given:
-        _require_argument(found, group, what)
-    env = attempt(what, found, impl=impl, max_envs=max_envs, **given)
-    check_env(env, what)
-    check_start(env, what)
+    what = f"env={path.name}:{function}"
+    with importable(path.parent):
+        module = attempt(f"env={path}", _load, path, source_sha256)
+        found = getattr(module, function, None)
+        if not callable(found):
+            names = [key for key, value in vars(module).items() if inspect.isfunction(value)]
+            near = suggestion(function, names)
+            raise ConfigError(f"env={name}: no function {function} there{near}")
+        for group in given:
+            _require_argument(found, group, what)
+        env = attempt(what, found, impl=impl, max_envs=max_envs, **given)
+        check_env(env, what)
+        check_start(env, what)
     return env
 
 
@@ -62,12 +65,10 @@ def _require_argument(function: Callable[..., Any], group: str, what: str) -> No
 
 
 def _load(path: Path, source_sha256: str | None) -> ModuleType:
-    """Runs the file as a module; it may import what lies beside it, as a script may."""
+    """Runs the file as a module."""
     text = path.read_bytes()
     if source_sha256 not in (None, hashlib.sha256(text).hexdigest()):
         raise ConfigError(f"env={path}: has changed since the job was started")
-    if str(path.parent) not in sys.path:
-        sys.path.append(str(path.parent))
     # A name of its own: a file called brax.py must not take the place of a package.
     name = f"gmijax_custom_{path.stem}"
     spec = importlib.util.spec_from_file_location(name, path)
