@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import os
+import re
+import secrets
 import signal
 import socket
 import threading
 import time
-from collections.abc import Callable
-from contextlib import suppress
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager, suppress
 from typing import Any, Final, NamedTuple
 
 from gmijax.cluster.node import Facts, Node
@@ -20,6 +22,9 @@ from gmijax.version import __version__
 
 PASSED_ON: Final = ("JAX_", "XLA_", "NCCL_", "OMP_", "OPENBLAS_", "MKL_", "MUJOCO_", "PYTHONPATH")
 """Beginnings of variables of the controller that GMIs on other nodes get; the rest is theirs."""
+
+_HOST_AND_PORT: Final = re.compile(r"([^/:\s]+):([0-9]{1,5})")
+_MAX_PORT: Final = 65535
 
 _POLL_S = 0.25
 _CONNECT_S = 5.0
@@ -48,12 +53,16 @@ class RayCluster:
 
     def __init__(self, config: ClusterConfig, kind: type[Node]) -> None:
         self._config, self._kind = config, kind
-        self._ray: Any = _import_ray()
         self._group: Any = None
         self._actors: list[Any] = []
-        self._is_own = not self._ray.is_initialized()
-        if self._is_own:
-            self._connect(config.address)
+        with ExitStack() as held:
+            if config.address == "local":
+                held.enter_context(_for_this_job_alone())
+            self._ray: Any = _import_ray()
+            if not self._ray.is_initialized():
+                self._connect(config.address)
+                held.callback(self._ray.shutdown)
+            self._held = held.pop_all()
 
     def join(
         self,
@@ -132,22 +141,23 @@ class RayCluster:
     def close(self) -> None:
         """Leaves the cluster. Idempotent."""
         self.leave()
-        if self._is_own:
-            self._ray.shutdown()
+        self._held.close()
 
     def _connect(self, address: str) -> None:
         found = self._found() if address == "auto" else address
-        host, _, port = found.rpartition(":")
+        parts = _HOST_AND_PORT.fullmatch(found)
         what = f"cluster.address={address}"
-        if port.isdigit() and "/" not in host:
+        if parts and 0 < int(parts[2]) <= _MAX_PORT:
             # Ray would try for minutes.
             try:
-                socket.create_connection((host, int(port)), _CONNECT_S).close()
-            except OSError as error:
+                socket.create_connection((parts[1], int(parts[2])), _CONNECT_S).close()
+            except (OSError, ValueError) as error:  # ValueError: a name that cannot be one.
                 where = "there" if found == address else f"at {found}"
                 raise ConfigError(f"{what}: nobody answers {where} ({error})") from None
         elif address not in ("auto", "local"):
-            raise ConfigError(f"{what}: expected auto, local or host:port")
+            raise ConfigError(
+                f"{what}: expected auto, local or host:port with a port from 1 to {_MAX_PORT}"
+            )
         options: dict[str, Any] = {"include_dashboard": False} if address == "local" else {}
         before = signal.getsignal(signal.SIGTERM)
         try:
@@ -257,6 +267,31 @@ class _NodeActor:
     def ask(self, method: str, *arguments: Any) -> Any:
         """Calls a method of the node."""
         return getattr(self._node, method)(*arguments)
+
+
+@contextmanager
+def _for_this_job_alone() -> Iterator[None]:
+    """Variables by which Ray starts a cluster that nobody but its own processes gets into.
+
+    It takes no connection but of this machine, and asks for a token that is in no file. Ray reads
+    them when it is imported.
+    """
+    own = {
+        "RAY_AUTH_MODE": "token",
+        "RAY_AUTH_TOKEN": secrets.token_hex(32),
+        # Where it may have no other nodes, Ray listens at 127.0.0.1 alone.
+        "RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER": "0",
+    }
+    before = {name: os.environ.get(name) for name in own}
+    os.environ |= own
+    try:
+        yield
+    finally:
+        for name, value in before.items():
+            if value is None:
+                del os.environ[name]
+            else:
+                os.environ[name] = value
 
 
 def _end_with(process: ProcessId) -> None:

@@ -47,10 +47,22 @@ def cluster(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Cluster]:
         yield nodes
 
 
-def children_of(parent: int) -> list[int]:
-    """Processes that a process has started."""
+def descendants_of(parent: int) -> list[int]:
+    """Processes that a process has started, and those that they have started."""
     tasks = Path(f"/proc/{parent}/task").glob("*/children")
-    return [int(pid) for task in tasks for pid in task.read_text().split()]
+    children = [int(pid) for task in tasks for pid in task.read_text().split()]
+    return children + [pid for child in children for pid in descendants_of(child)]
+
+
+def addresses_of_listeners(pids: list[int]) -> set[str]:
+    """Where these processes listen, as the kernel writes IP addresses."""
+    links = [link for pid in pids for link in Path(f"/proc/{pid}/fd").iterdir()]
+    inodes = {os.readlink(link) for link in links if link.is_symlink()}
+    tables = [Path("/proc/net", name).read_text().splitlines()[1:] for name in ("tcp", "tcp6")]
+    rows = [row.split() for table in tables for row in table]
+    # 0A: it listens.
+    found = [row[1] for row in rows if row[3] == "0A" and f"socket:[{row[9]}]" in inodes]
+    return {address.rpartition(":")[0] for address in found}
 
 
 def test_two_nodes_learn_the_bits_of_two_gpus_of_one_machine(
@@ -134,7 +146,7 @@ def test_agents_teach_trainers_of_two_nodes_and_of_one_when_the_other_dies(
 
 
 def test_a_job_outlives_a_gmi_and_a_node_and_nothing_outlives_its_controller(
-    cluster: Cluster, tmp_path: Path
+    cluster: Cluster, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     memory = shared_memory()
     run = tmp_path / "run"
@@ -172,10 +184,15 @@ def test_a_job_outlives_a_gmi_and_a_node_and_nothing_outlives_its_controller(
         summary = json.loads((run / "summary.json").read_text())
         assert (summary["status"], len(summary["restarts"])) == ("interrupted", 2)
 
-        # With a cluster of its own, which must end with it too.
+        # With a cluster of its own, which nobody else gets into, and which must end with it too.
+        monkeypatch.setenv("HOME", str(tmp_path))
         controller = start(*job, "cluster.address=local", cwd=tmp_path)
         wait(lambda: iteration_of(run, 1) > 0, "it goes on from its checkpoint")
-        started = [*pids_of(run), *children_of(controller.pid)]
+        started = [*pids_of(run), *descendants_of(controller.pid)]
+        # 127.0.0.1, also of sockets for both versions of IP.
+        loopback = {"0100007F", "0000000000000000FFFF00000100007F"}
+        assert addresses_of_listeners([controller.pid, *started]) == loopback
+        assert not (tmp_path / ".ray").exists()
         left = [process for pid in started if (process := identify(pid))]
         assert len(left) > 2
         kill(controller.pid)

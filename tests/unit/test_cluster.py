@@ -109,8 +109,6 @@ def test_without_ray_or_a_cluster_the_line_says_what_to_do(
         RayCluster(ClusterConfig(), Node)
     with pytest.raises(ConfigError, match=r"address=127\.0\.0\.1:1: nobody answers there"):
         RayCluster(ClusterConfig(address="127.0.0.1:1"), Node)
-    with pytest.raises(ConfigError, match="expected auto, local or host:port"):
-        RayCluster(ClusterConfig(address="somewhere"), Node)
     Ray._private = SimpleNamespace(
         services=SimpleNamespace(get_ray_address_from_environment=lambda *_: "127.0.0.1:1")
     )
@@ -127,6 +125,72 @@ def test_without_ray_or_a_cluster_the_line_says_what_to_do(
     monkeypatch.setattr(builtins, "__import__", no_ray)
     with pytest.raises(ConfigError, match=r"ray is not installed \(pip install 'gmijax\[ray\]'"):
         RayCluster(ClusterConfig(), Node)
+
+
+@pytest.mark.parametrize(
+    "address",
+    [
+        *("somewhere", "9" * 30, "head:" + "9" * 5000, "head:65536", "head:0", ":6379"),
+        *("head:\N{SUPERSCRIPT TWO}", "head:\N{ARABIC-INDIC DIGIT SIX}379", "head:6379\n"),
+    ],
+)
+def test_an_address_that_cannot_be_is_refused(
+    address: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    ray = SimpleNamespace(is_initialized=lambda: False)
+    monkeypatch.setattr(ray_nodes, "_import_ray", lambda: ray)
+    with pytest.raises(ConfigError, match=r"expected auto, local or host:port with a port from 1"):
+        RayCluster(ClusterConfig(address=address), Node)
+
+
+@pytest.mark.parametrize("host", ["a" * 100, "head\0", "..", "\udc80"])
+def test_a_name_of_a_host_that_cannot_be_is_one_nobody_answers_at(
+    host: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    ray = SimpleNamespace(is_initialized=lambda: False)
+    monkeypatch.setattr(ray_nodes, "_import_ray", lambda: ray)
+    with pytest.raises(ConfigError, match="nobody answers there"):
+        RayCluster(ClusterConfig(address=f"{host}:6379"), Node)
+
+
+def test_a_cluster_for_one_job_has_a_token_of_its_own_and_is_for_this_machine_alone(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    seen: list[dict[str, str]] = []
+
+    class Ray:
+        is_initialized = staticmethod(lambda: False)
+        shutdown = staticmethod(lambda: None)
+        nodes = staticmethod(list)
+
+        def __init__(self) -> None:
+            seen.append(dict(os.environ))  # Ray reads some when it is imported.
+
+        @staticmethod
+        def init(**options: Any) -> None:
+            seen.append(dict(os.environ))
+            if len(seen) > 4:
+                raise ConnectionError("no")
+
+    monkeypatch.setattr(ray_nodes, "_import_ray", Ray)
+    monkeypatch.setenv("RAY_AUTH_MODE", "disabled")
+    monkeypatch.setenv("RAY_AUTH_TOKEN", "of the user")
+    before = dict(os.environ)
+    for _ in range(2):
+        RayCluster(ClusterConfig(address="local"), Node).close()
+        assert dict(os.environ) == before
+    with pytest.raises(ConfigError):
+        RayCluster(ClusterConfig(address="local"), Node)
+    assert dict(os.environ) == before
+    assert {one["RAY_AUTH_MODE"] for one in seen} == {"token"}
+    assert {one["RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER"] for one in seen} == {"0"}
+    tokens = [one["RAY_AUTH_TOKEN"] for one in seen]
+    assert tokens[::2] == tokens[1::2]
+    assert len({*tokens, "of the user"}) == 4
+    assert min(map(len, tokens)) == 64
+    seen.clear()
+    RayCluster(ClusterConfig(), Node).close()
+    assert seen == [before, before]  # A cluster that others started has theirs.
 
 
 def test_fewer_nodes_than_asked_for_are_refused_once_the_wait_is_over(
