@@ -9,6 +9,7 @@ from __future__ import annotations
 from contextlib import ExitStack
 
 from gmijax.a3c.job_registers import JobRegisters, register_bytes
+from gmijax.collectives.channel.tcp_registers import RemoteRegisters
 from gmijax.collectives.nodes.meeting import Nodes
 
 
@@ -23,17 +24,12 @@ def over_nodes(
 ) -> JobRegisters:
     """The registers as `gmi` uses them; `local` are those of its node, `sizes` as it was told.
 
-    An agent on another node than the leader's stays, when `held` closes after a success, until the
-    leader has gone.
-
     Raises:
       CollectiveError, ConfigError: as `Connection`.
     """
     far = {agent: nodes.calls[agent, leader] for agent in agents if (agent, leader) in nodes.calls}
     if not far or (gmi != leader and gmi not in far):
         return local
-    from gmijax.collectives.channel.tcp_registers import RemoteRegisters  # Needs pyzmq.
-
     orders, weights, report = register_bytes(*sizes)
     if gmi == leader:
         mine = RemoteRegisters(
@@ -49,6 +45,5 @@ def over_nodes(
         gmi, {leader: far[gmi]}, [report], [orders, weights], listens=True, secret=nodes.token
     )
     held.callback(mine.close)
-    held.push(lambda failed, *_: None if failed else mine.wait_for_ends())
     # An agent writes none but its own.
     return JobRegisters(mine.of(leader, 0), mine.of(leader, 1), (mine.own(0),) * len(agents))

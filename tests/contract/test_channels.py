@@ -19,7 +19,7 @@ pytestmark = pytest.mark.timeout(120)
 
 # The node of every rank: memory, and TCP. Where experience stays on the device it needs agents and
 # trainers on one: tests of its own.
-TRANSPORTS = {"memory": None, "tcp": range(5)}
+TRANSPORTS: dict[str, Any] = {"memory": None, "tcp": range(5)}
 BOTH = (0, 0, 1, 1, 0)  # Memory for agents 0 and 1 with trainer 4, and agent 2 with trainer 3.
 # A design goes through any transport alike, so each of both is here at least once.
 WAYS = [("multi", None), ("multi", range(5)), ("uni", None), ("multi", BOTH)]
@@ -29,13 +29,6 @@ TOPOLOGY = ChannelTopology(agents=(0, 1, 2), trainers=(3, 4), gpu_of=(0, 0, 1, 2
 
 def config(**keys: Any) -> ChannelConfig:
     return ChannelConfig(**{"capacity_mib": 1, **keys})
-
-
-def nodes_of(transport: str) -> Any:
-    """The node of every rank for this transport; skips where TCP cannot be had."""
-    if transport == "tcp":
-        pytest.importorskip("zmq")
-    return TRANSPORTS.get(transport)
 
 
 def require_all_once(job: ChannelJob, count: int) -> None:
@@ -52,8 +45,6 @@ def test_nothing_is_lost_doubled_torn_or_out_of_order(
     design: Any, node_of: Any, tmp_path: Path
 ) -> None:
     """10^5 unrolls with pauses; batches neither fit into transfers nor the other way round."""
-    if node_of:
-        pytest.importorskip("zmq")
     count = 33_600
     task = {"count": count, "envs": 200, "batch": 77, "steps": 2, "pause_chance": 0.1}
     settings = config(design=design)
@@ -70,7 +61,7 @@ def test_the_trainer_with_less_to_do_gets_more(transport: str, tmp_path: Path) -
     task = {"count": 20_000, "envs": 100, "batch": 100, "sizes": (50, 2), "pause_chance": 1.0}
     # Room for all of it, so that only the load can tell.
     settings = config(capacity_mib=32)
-    with ChannelJob(tmp_path, settings, topology, nodes_of(transport), **task) as job:
+    with ChannelJob(tmp_path, settings, topology, TRANSPORTS[transport], **task) as job:
         job.start(1, busy_s=0.1).start(2).wait_for("open")
         job.start(0)
         slow, quick = (job.result(rank)["unrolls"] for rank in (1, 2))
@@ -82,7 +73,7 @@ def test_the_trainer_with_less_to_do_gets_more(transport: str, tmp_path: Path) -
 def test_an_agent_that_finds_no_room_waits_as_told(transport: str, tmp_path: Path) -> None:
     topology = ChannelTopology(agents=(0,), trainers=(1,), gpu_of=(0, 0))
     task = {"count": 10**6, "envs": 100, "batch": 100, "sizes": (50, 2), "timeout_s": 1.0}
-    with ChannelJob(tmp_path, config(), topology, nodes_of(transport), **task) as job:
+    with ChannelJob(tmp_path, config(), topology, TRANSPORTS[transport], **task) as job:
         job.start(1, timeout_s=30.0).wait_for("open")
         job.signal(1, signal.SIGSTOP)
         job.start(0)
@@ -97,7 +88,7 @@ def test_an_agent_that_finds_no_room_waits_as_told(transport: str, tmp_path: Pat
 def test_a_killed_process_is_named_and_leaves_nothing(
     transport: str, victim: int, tmp_path: Path
 ) -> None:
-    before, settings, node_of = shared_memory(), config(), nodes_of(transport)
+    before, settings, node_of = shared_memory(), config(), TRANSPORTS.get(transport)
     topology, task = TOPOLOGY, {"count": 10**7, "envs": 50, "pause_chance": 0.5, "timeout_s": 60.0}
     if transport == "device":
         settings = config(transport="device")

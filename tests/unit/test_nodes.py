@@ -18,7 +18,6 @@ import pytest
 from gmijax.collectives.build import Membership, SharedReducer, build_reducer
 from gmijax.collectives.host.host_links import HostLinks
 from gmijax.collectives.host.shared_block import MAX_GATHER_FLOATS, create_exchange
-from gmijax.collectives.nodes import meeting
 from gmijax.collectives.nodes.meeting import Nodes, connect, listen
 from gmijax.collectives.nodes.mesh import Mesh
 from gmijax.collectives.nodes.node_exchange import NodeExchange
@@ -110,11 +109,19 @@ def test_a_leader_that_does_not_come_is_named_in_time(meshes: list[Mesh]) -> Non
         meshes[0].sum(np.ones(3, np.float32), 1)
 
 
-def test_who_does_not_know_the_secret_stays_out(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(meeting, "_STRANGER_S", 0.5)
+def test_who_does_not_know_the_secret_stays_out() -> None:
     answers = meet([TOKEN, b"guess"], timeout_s=1.0)
     assert "leaders of other nodes did not come" in str(answers[0])
-    assert "node 1 cannot reach node 0 at 127.0.0.1" in str(answers[1])
+    assert "has a connection with node 0 at 127.0.0.1" in str(answers[1])
+    assert "cluster.interface" not in str(answers[1])
+
+
+def test_a_leader_that_cannot_be_reached_is_one_of_another_network() -> None:
+    with listen(HERE) as own, socket.socket() as nobody:
+        nobody.bind((HERE, 0))
+        nodes = Nodes(1, (nobody.getsockname(), own.getsockname()), TOKEN)
+        with pytest.raises(CollectiveError, match=r"cannot reach node 0 .*cluster\.interface"):
+            connect(nodes, own, 1, 10.0)
 
 
 def test_what_leaders_know_goes_through_a_file() -> None:

@@ -4,37 +4,24 @@ from __future__ import annotations
 
 import os
 import socket
+import struct
 import threading
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import ExitStack, contextmanager, suppress
 from typing import Any
 
 import pytest
 
-from gmijax.errors import CollectiveError, ConfigError, PeerLost, PipeClosed
-
-pytest.importorskip("zmq")
-
-import zmq
-
 from gmijax.collectives.channel import tcp_channel
 from gmijax.collectives.channel.tcp_channel import RemoteReader, RemoteWriter
+from gmijax.collectives.nodes.handshake import Key, call
 from gmijax.collectives.nodes.meeting import reserved_address
+from gmijax.errors import CollectiveError, ConfigError, PeerLost, PipeClosed
 
 CAPACITY = 2**20
 SECRET = os.urandom(32)
-# What ZeroMQ says first (https://rfc.zeromq.org/spec/23), with CURVE, as one that listens.
-GREETING = b"\xff" + bytes(8) + b"\x7f\x03\x00" + b"CURVE".ljust(20, b"\0") + b"\x01" + bytes(31)
-PLAIN = {
-    "silent": b"",
-    "http": b"GET / HTTP/1.0\r\n\r\n",
-    "noise": os.urandom(2**20),
-    "oversized": GREETING + b"\x06" + (2**40).to_bytes(8, "big"),
-}
-"""What strangers send who do not use ZeroMQ."""
-
-FORGED = tcp_channel._HEADER.pack(tcp_channel.MAGIC, tcp_channel.DATA, 0), b""
+SILENT_S = 0.3
 
 
 @pytest.fixture
@@ -72,66 +59,123 @@ def receive(reader: RemoteReader, count: int, longest_s: float | None = None) ->
     return got
 
 
-def exchange(writer: RemoteWriter, reader: RemoteReader, count: int) -> None:
-    """Sends values, and gives each a second to come."""
-    for value in range(count):
-        send(writer, value)
-        receive(reader, 1, longest_s=1.0)
+def why_lost(reader: RemoteReader, longest_s: float = 30.0) -> Any:
+    """Why nothing comes any more; None if something still may after so long."""
+    until_s = time.monotonic() + longest_s
+    while time.monotonic() < until_s:
+        assert reader.try_get() is None
+        if (error := reader.why_lost("receive", 0)) is not None:
+            return error
+        time.sleep(0.002)
+    return None
 
 
-def why_lost(reader: RemoteReader, looks: int) -> Any:
-    """What the last of some looks says, with all read in between."""
-    error = None
-    for _ in range(looks):
-        time.sleep(0.05)
-        error = reader.why_lost("receive", 0)
-        reader.try_get()
-    return error
+def at(address: str) -> tuple[str, int]:
+    host, _, port = address.rpartition(":")
+    return host, int(port)
 
 
 @contextmanager
-def stranger(kind: str, address: str) -> Iterator[None]:
-    """Somebody else at the port, who tries to deliver something."""
-    host, _, port = address.rpartition(":")
-    if kind == "zeromq":
-        with zmq.Context() as context, context.socket(zmq.DEALER) as end:
-            end.linger = 0
-            end.connect(f"tcp://{address}")
-            end.send_multipart(FORGED)
-            yield
-    elif kind == "other job":
-        writer = RemoteWriter(address, 0, 1, CAPACITY, os.urandom(32))
-        send(writer, 66)
-        yield
-        assert not writer._connection.is_up()
-        writer._connection.close()
-    else:
-        with socket.create_connection((host, int(port)), timeout=5.0) as plain:
-            with suppress(ConnectionError):
-                plain.sendall(PLAIN[kind])
-                # Others are hung up on after the greeting, and not only when they have given up.
-                while kind in ("noise", "oversized") and plain.recv(4096):
-                    pass
-            yield
+def agent(address: str, caller: tuple[int, int] = (0, 1)) -> Iterator[socket.socket]:
+    """A connection that has proved all, for one that then does not behave."""
+    key = Key(SECRET, "GMI 1")
+    until_s = time.monotonic() + 20.0
+    connection = call(at(address), key, caller, lambda: until_s - time.monotonic())
+    with connection:
+        connection.settimeout(20.0)
+        yield connection
 
 
-@pytest.mark.parametrize("kind", [*PLAIN, "zeromq", "other job"])
-def test_a_stranger_delivers_nothing_and_is_not_the_end_of_the_agent(
-    kind: str, address: str
+def message(*parts: bytes) -> bytes:
+    lengths = b"".join(struct.pack("<Q", len(part)) for part in parts)
+    return struct.pack("<I", len(parts)) + lengths + b"".join(parts)
+
+
+def data(sequence: int) -> bytes:
+    return message(tcp_channel._HEADER.pack(tcp_channel.DATA, sequence), bytes([66]))
+
+
+def test_nobody_listens_once_the_agent_is_there_and_its_death_is_seen_at_once(
+    address: str,
 ) -> None:
     reader, writer = ends(address)
     send(writer, 1)
     assert receive(reader, 1) == [1]
-    with stranger(kind, address):
-        assert why_lost(reader, 6) is None
-        assert reader._sequence == 1
+    for _ in range(100):
+        with pytest.raises(ConnectionRefusedError):
+            socket.create_connection(at(address), 5.0)
     send(writer, 2)
     assert receive(reader, 1) == [2]
-    writer._connection.close()  # As if it were killed.
-    error = None
-    while error is None:  # Until the test's own limit.
-        error = why_lost(reader, 1)
-    assert isinstance(error, PeerLost)
+    writer._connection.close()  # As if it were killed: no goodbye.
+    assert isinstance(why_lost(reader, 2.0), PeerLost)
+    reader.close()
+
+
+@pytest.mark.parametrize("kind", ["quick", "silent", "other job"])
+def test_strangers_before_the_agent_keep_it_out_and_deliver_nothing(
+    kind: str, address: str
+) -> None:
+    reader = RemoteReader(address, 1, 0, CAPACITY, SECRET)
+    with ExitStack() as held:
+        for _ in range(1000 if kind == "quick" else 0):
+            with suppress(OSError), socket.create_connection(at(address), 5.0) as stranger:
+                stranger.sendall(b"noise" * 600)
+        for _ in range(50 if kind == "silent" else 0):
+            held.enter_context(socket.create_connection(at(address), 5.0))
+        if kind == "other job":
+            other = RemoteWriter(address, 0, 1, CAPACITY, os.urandom(32))
+            held.callback(other._connection.close)
+            send(other, 66)
+        assert why_lost(reader, SILENT_S) is None
+        writer = RemoteWriter(address, 0, 1, CAPACITY, SECRET)
+        send(writer, 1)
+        assert receive(reader, 1) == [1]
+    writer.close()
+    reader.close()
+
+
+def test_another_gmi_of_the_job_is_not_the_agent(address: str) -> None:
+    reader = RemoteReader(address, 1, 0, CAPACITY, SECRET)
+    with agent(address, caller=(2, 1)) as other:
+        other.sendall(data(0))
+        assert why_lost(reader, SILENT_S) is None
+    reader.close()
+
+
+def test_an_agent_that_stalls_within_a_message_is_there_until_it_leaves(address: str) -> None:
+    reader = RemoteReader(address, 1, 0, CAPACITY, SECRET)
+    with agent(address) as connection:
+        connection.sendall(data(0) + data(1)[:-1])
+        assert receive(reader, 1) == [66]
+        assert why_lost(reader, SILENT_S) is None
+    assert isinstance(why_lost(reader), PeerLost)
+    reader.close()
+
+
+@pytest.mark.parametrize(
+    "lengths",
+    [[2**32 - 1], [1, CAPACITY], [1, 2**64 - 1], [3, 2**63, 2**63, 0], [CAPACITY // 8 + 1]],
+)
+def test_a_length_that_cannot_be_is_refused_before_memory_is_taken(
+    lengths: list[int], address: str
+) -> None:
+    """Also from one who has the secret. The first number is how many parts follow."""
+    reader = RemoteReader(address, 1, 0, CAPACITY, SECRET)
+    with agent(address) as connection:
+        connection.sendall(data(0))
+        connection.sendall(
+            struct.pack("<I", lengths[0]) + struct.pack("<3Q", *(*lengths[1:], 0, 0, 0)[:3])
+        )
+        assert receive(reader, 1) == [66]
+        with pytest.raises(
+            CollectiveError, match=r"GMI 1: GMI 0 sends a message of \d+ (parts|bytes)"
+        ):
+            why_lost(reader)
+        with pytest.raises(CollectiveError, match="GMI 0 sends a message of"):
+            reader.try_get()
+        with suppress(ConnectionError):
+            while connection.recv(4096):  # It is hung up on.
+                pass
     reader.close()
 
 
@@ -152,9 +196,8 @@ def test_an_agent_stays_until_its_trainer_has_taken_all(address: str) -> None:
 
 
 def test_an_agent_that_closes_before_its_trainer_listens_loses_nothing(
-    address: str, monkeypatch: pytest.MonkeyPatch
+    address: str,
 ) -> None:
-    monkeypatch.setattr("gmijax.collectives.channel.tcp_connection._LINGER_MS", 0)
     writer = RemoteWriter(address, 0, 1, CAPACITY, SECRET)
     send(writer, 1, 2, 3)
     closing = threading.Thread(target=writer.close)
@@ -185,7 +228,6 @@ def test_an_agent_does_not_wait_for_ever_for_a_trainer_that_never_comes(
     address: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("gmijax.collectives.channel.tcp_channel._FAREWELL_S", 0.1)
-    monkeypatch.setattr("gmijax.collectives.channel.tcp_connection._LINGER_MS", 0)
     writer = RemoteWriter(address, 0, 1, CAPACITY, SECRET)
     send(writer, 1)
     writer.close()
@@ -199,8 +241,8 @@ def test_an_address_that_cannot_be_is_named() -> None:
 
 def test_what_is_no_message_of_a_channel_is_an_error(address: str) -> None:
     reader, writer = ends(address)
-    for junk in (b"", b"junk", b"x" * tcp_channel._HEADER.size):
-        writer._connection.send([junk])
+    for junk in ([], [b""], [b"junk"], [b"x" * tcp_channel._HEADER.size]):
+        writer._connection.send(junk)
         with pytest.raises(CollectiveError, match="GMI 1: no message of a channel from GMI 0"):
             receive(reader, 1)
     send(writer, 7)
@@ -209,23 +251,42 @@ def test_what_is_no_message_of_a_channel_is_an_error(address: str) -> None:
     reader.close()
 
 
-def test_a_message_that_is_too_long_is_not_taken_and_what_follows_is_an_error(
-    address: str,
-) -> None:
-    """Also from one who has the secret: the connection ends, and the next one misses a message."""
+def test_a_message_is_missed_when_it_is_lost(address: str) -> None:
     reader, writer = ends(address)
-    assert writer.max_message_bytes == CAPACITY // 2
     send(writer, 1)
     assert receive(reader, 1) == [1]
-    writer._connection.send([FORGED[0], bytes(CAPACITY // 2 + tcp_channel.MAX_ANSWER_BYTES + 1)])
     writer._sequence += 1
-    with pytest.raises(CollectiveError, match="message 1 from GMI 0 is lost, here is message"):
-        exchange(writer, reader, 20)  # Those right behind it may go down with the connection.
-    # An agent takes nothing but answers.
-    limit = writer._connection._socket.getsockopt(zmq.MAXMSGSIZE)
-    assert limit == tcp_channel.MAX_ANSWER_BYTES
+    send(writer, 3)
+    with pytest.raises(CollectiveError, match="message 1 from GMI 0 is lost, here is message 2"):
+        receive(reader, 1)
     for end in (writer, reader):
         end._connection.close()
+
+
+def test_many_messages_of_many_sizes_arrive_in_order(address: str) -> None:
+    reader, writer = ends(address)
+    sizes = [0, 1, 7, 100_000, 400_000]
+    numbers = range(300)
+
+    def write() -> None:
+        for number in numbers:
+            while (views := writer.try_reserve([8, sizes[number % 5], 0, 3])) is None:
+                time.sleep(1e-4)
+            for view in views:
+                view[:] = number % 251
+            writer.commit()
+
+    thread = threading.Thread(target=write)
+    thread.start()
+    for number in numbers:
+        while (found := reader.try_get()) is None:
+            time.sleep(1e-4)
+        assert [part.size for part in found] == [8, sizes[number % 5], 0, 3]
+        assert all((part == number % 251).all() for part in found)
+    thread.join()
+    reader.release()
+    writer.close()
+    reader.close()
 
 
 def test_a_secret_that_can_be_guessed_is_refused(address: str) -> None:

@@ -3,20 +3,19 @@
 from __future__ import annotations
 
 import os
+import socket
 import time
 from collections.abc import Callable, Iterator
+from contextlib import ExitStack, suppress
 from typing import Any
 
 import numpy as np
 import pytest
 from training_jobs import wait_until
 
+from gmijax.collectives.channel.tcp_registers import RemoteRegisters
 from gmijax.collectives.nodes.meeting import reserved_address
 from gmijax.errors import CollectiveError
-
-pytest.importorskip("zmq")
-
-from gmijax.collectives.channel.tcp_registers import RemoteRegisters
 
 SECRET = os.urandom(32)
 ORDERS, WEIGHTS, REPORT = 16, 4096, 24
@@ -40,6 +39,11 @@ def pair() -> Iterator[tuple[RemoteRegisters, RemoteRegisters]]:
         yield both
         for end in both:
             end.close()
+
+
+def split(address: str) -> tuple[str, int]:
+    host, _, port = address.rpartition(":")
+    return host, int(port)
 
 
 def wait(read: Callable[[], Any]) -> Any:
@@ -106,15 +110,45 @@ def test_another_secret_gets_and_gives_nothing() -> None:
             end.close()
 
 
-def test_an_agent_that_is_done_waits_for_the_end_of_the_leader(
-    pair: tuple[RemoteRegisters, RemoteRegisters], monkeypatch: pytest.MonkeyPatch
+def test_what_was_published_last_arrives_though_its_process_has_left(
+    pair: tuple[RemoteRegisters, RemoteRegisters],
 ) -> None:
-    monkeypatch.setattr("gmijax.collectives.channel.tcp_registers._FAREWELL_S", 60.0)
     leader, agent = pair
-    agent.wait_for_ends()  # Nobody has come yet.
     leader.own(0).publish(np.array([1, 2]))
     wait(agent.of(0, 0).read)
-    leader.close()
-    started_s = time.monotonic()
-    agent.wait_for_ends()
-    assert time.monotonic() - started_s < 30.0
+    agent.own(0).publish(np.ones(3))
+    agent.close()
+    assert wait(leader.of(7, 0).read).values.view(np.float64).tolist() == [1, 1, 1]
+
+
+@pytest.mark.parametrize("comes", ["before", "after"])
+def test_strangers_change_nothing_of_what_is_published(comes: str) -> None:
+    """A thousand quick ones, before the leader is there or after."""
+    with reserved_address("127.0.0.1") as address, ExitStack() as held:
+        agent = RemoteRegisters(
+            7, {0: address}, [REPORT], [ORDERS, WEIGHTS], listens=True, secret=SECRET
+        )
+        held.callback(agent.close)
+
+        def lead() -> RemoteRegisters:
+            leader = RemoteRegisters(
+                0, {7: address}, [ORDERS, WEIGHTS], [REPORT], listens=False, secret=SECRET
+            )
+            held.callback(leader.close)
+            leader.own(0).publish(np.array([1, 2]))
+            wait(agent.of(0, 0).read)
+            return leader
+
+        leader = lead() if comes == "after" else None
+        for _ in range(1000):
+            with suppress(OSError), socket.create_connection(split(address), 5.0) as stranger:
+                stranger.sendall(b"noise" * 600)
+        leader = leader or lead()
+        for number in range(3, 6):
+            leader.own(0).publish(np.array([number, 2]))
+            agent.own(0).publish(np.full(3, number))
+            at = number - 1
+            orders = wait(lambda at=at: agent.of(0, 0).read(after=at - 1))
+            assert orders.values.view(np.int64).tolist() == [number, 2]
+            report = wait(lambda at=at: leader.of(7, 0).read(after=at - 2))
+            assert report.values.view(np.int64)[0] == number

@@ -12,6 +12,7 @@ from gmijax.collectives.channel.compressor import Compressor, TransferSize, read
 from gmijax.collectives.channel.dispenser import Dispenser
 from gmijax.collectives.channel.migrator import Migrator
 from gmijax.collectives.channel.sender import Packer, Sender
+from gmijax.collectives.channel.tcp_channel import RemoteReader, RemoteWriter
 from gmijax.collectives.channel.transport import ChannelReader, ChannelWriter
 from gmijax.collectives.channel.unichannel import UniDecoder, UniPacker
 from gmijax.collectives.device.device_memory import NewMemory, cuda_memory
@@ -98,8 +99,6 @@ def open_sender(
         block = _open_block(rank, fd, held)
         writers += [PipeWriter(block, peer) for peer in trainers if peer not in far]
     if far:
-        from gmijax.collectives.channel.tcp_channel import RemoteWriter  # Needs pyzmq.
-
         settings = config.capacity_bytes, topology.secret
         writers += [RemoteWriter(at, rank, peer, *settings) for peer, at in far.items()]
     migrator = Migrator(writers, near)
@@ -123,8 +122,6 @@ def open_receiver(
         block = _open_block(rank, fd, held)
         readers += [PipeReader(block, peer) for peer in topology.agents if peer not in far]
     if far:
-        from gmijax.collectives.channel.tcp_channel import RemoteReader  # Needs pyzmq.
-
         settings = config.capacity_bytes, topology.secret
         readers += [RemoteReader(at, rank, peer, *settings) for peer, at in far.items()]
     for reader in readers:

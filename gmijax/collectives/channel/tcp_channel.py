@@ -1,10 +1,9 @@
-"""Channels between hosts: one TCP connection for every pair of agent and trainer, by pyzmq.
+"""Channels between hosts: one TCP connection for every pair of agent and trainer.
 
-The trainer listens, the agent connects. Messages carry a sequence number; all is encrypted and
-authenticated (`tcp_connection.py`), so that no byte of it can change on the way. The trainer
-acknowledges what it has released, which bounds what is on the way. The end of a connection without
-a goodbye means that the peer is gone; so do ten seconds without ZeroMQ's own heartbeats. What a
-killed agent had not yet put on the wire is lost, and nothing else.
+The trainer listens, the agent connects (`tcp_connection.py`). Messages carry a sequence number.
+The trainer acknowledges what it has released, which bounds what is on the way. The end of a
+connection without a goodbye means that the peer is gone. What a killed agent had not yet put on
+the wire is lost, and nothing else.
 """
 
 from __future__ import annotations
@@ -14,7 +13,7 @@ import struct
 import time
 from collections import deque
 from collections.abc import Sequence
-from typing import Any, Final, NamedTuple
+from typing import Final, NamedTuple
 
 import numpy as np
 
@@ -23,30 +22,19 @@ from gmijax.collectives.messages.pipe import Bytes, Message
 from gmijax.collectives.messages.pipe_format import message_bytes
 from gmijax.errors import CollectiveError, GmijaxError, PeerLost, PipeClosed
 
-MAGIC: Final = 0x5A494D47  # "GMIZ" in memory on a little-endian machine
 DATA, GOODBYE, RELEASED = 1, 2, 3
 
-_HEADER: Final = struct.Struct("<IIQ")
-"""magic, kind, sequence."""
-
-_MAX_PART_BYTES: Final = 2**30
-
-MAX_ANSWER_BYTES: Final = 4096
-"""Longest part that an agent gets: a header, and what ZeroMQ's handshake takes."""
+_HEADER: Final = struct.Struct("<QQ")
+"""The first part of every message: its kind, and a sequence number."""
 
 _FAREWELL_S: Final = 5.0
 """How long an agent that closes waits for a trainer that is not there yet, or takes nothing."""
 
 
-def max_part_bytes(capacity_bytes: int) -> int:
-    """Longest part of a message with channels of such capacity: longer ones are cut off."""
-    return min(capacity_bytes // 2, _MAX_PART_BYTES)
-
-
 class _Received(NamedTuple):
     kind: int
     sequence: int
-    parts: list[Any]
+    parts: list[Bytes]
 
 
 class _End:
@@ -61,20 +49,27 @@ class _End:
 
     def _tell(self, kind: int, sequence: int) -> None:
         """Sends a message without parts, if there is somebody who could want it."""
-        self._connection.try_send([_HEADER.pack(MAGIC, kind, sequence)])
+        self._connection.send([_HEADER.pack(kind, sequence)])
+
+    def _why_ended(self, operation: str, step: int) -> GmijaxError | None:
+        """Why nothing comes any more; None as long as something may."""
+        if self._has_left:
+            return PipeClosed(self._rank, self.peer, operation)
+        is_cut = self._connection.is_cut()
+        return PeerLost(self._rank, self.peer, operation, step) if is_cut else None
 
     def _next(self) -> _Received | None:
         """The next message; None if there is none now."""
-        if (frames := self._connection.try_receive()) is None:
+        if (found := self._connection.try_receive()) is None:
             return None
-        head, *parts = frames
-        if len(head) != _HEADER.size or (header := _HEADER.unpack(head))[0] != MAGIC:
+        head = found[0].tobytes() if found else b""
+        kind, sequence = _HEADER.unpack(head) if len(head) == _HEADER.size else (0, 0)
+        if kind not in (DATA, GOODBYE, RELEASED):
             # Only who has the secret could send it.
             raise CollectiveError(
                 f"GMI {self._rank}: no message of a channel from GMI {self.peer}"
             )
-        _, kind, sequence = header
-        received = _Received(kind, sequence, parts)
+        received = _Received(kind, sequence, found[1:])
         self._has_left = self._has_left or received.kind == GOODBYE
         return received
 
@@ -94,9 +89,9 @@ class RemoteWriter(_End):
         secret: bytes,
     ) -> None:
         super().__init__(
-            Connection(address, rank, peer, MAX_ANSWER_BYTES, listens=False, secret=secret)
+            Connection(address, rank, peer, _HEADER.size, listens=False, secret=secret)
         )
-        self.max_message_bytes = max_part_bytes(capacity_bytes)
+        self.max_message_bytes = capacity_bytes // 2
         self._capacity_bytes = capacity_bytes
         self._released = self._on_the_way = 0
         self._lengths: deque[int] = deque()
@@ -115,14 +110,14 @@ class RemoteWriter(_End):
             )
         if self._on_the_way + length > self._capacity_bytes:
             return None
-        # ZeroMQ sends from this memory later, so it is not used again.
+        # It is sent from this memory later, so it is not used again.
         self._reserved = [np.empty(size, np.uint8) for size in sizes]
         return self._reserved
 
     def commit(self) -> None:
         """See `PipeWriter`."""
         parts, self._reserved = self._reserved, []
-        self._connection.send([_HEADER.pack(MAGIC, DATA, self._sequence), *parts])
+        self._connection.send([_HEADER.pack(DATA, self._sequence), *parts])
         self._lengths.append(message_bytes([part.size for part in parts]))
         self._on_the_way += self._lengths[-1]
         self._sequence += 1
@@ -138,11 +133,8 @@ class RemoteWriter(_End):
 
     def why_lost(self, operation: str, step: int) -> GmijaxError | None:
         """See `PipeWriter`."""
-        is_cut = self._connection.is_cut()
         self._read_answers()  # A goodbye came before the end.
-        if self._has_left:
-            return PipeClosed(self._rank, self.peer, operation)
-        return PeerLost(self._rank, self.peer, operation, step) if is_cut else None
+        return self._why_ended(operation, step)
 
     def close(self) -> None:
         """See `PipeWriter`."""
@@ -178,15 +170,14 @@ class RemoteReader(_End):
         capacity_bytes: int,
         secret: bytes,
     ) -> None:
-        longest = max_part_bytes(capacity_bytes) + MAX_ANSWER_BYTES
+        longest = capacity_bytes // 2 + _HEADER.size
         super().__init__(Connection(address, rank, peer, longest, listens=True, secret=secret))
-        self._is_held = self._is_cut = self._is_empty = False
+        self._is_held = False
 
     def try_get(self) -> Message | None:
         """See `PipeReader`."""
         self.release()
         if (received := self._next()) is None:
-            self._is_empty = True
             if self._has_left:
                 raise PipeClosed(self._rank, self.peer, "receive")
             return None
@@ -199,7 +190,7 @@ class RemoteReader(_End):
             return self.try_get()
         self._sequence += 1
         self._is_held = True
-        return tuple(np.frombuffer(part, np.uint8) for part in received.parts)
+        return tuple(received.parts)
 
     def release(self) -> None:
         """See `PipeReader`."""
@@ -209,16 +200,7 @@ class RemoteReader(_End):
 
     def why_lost(self, operation: str, step: int) -> GmijaxError | None:
         """See `PipeReader`."""
-        if self._has_left:
-            return PipeClosed(self._rank, self.peer, operation)
-        is_cut, was_cut = self._connection.is_cut(), self._is_cut
-        self._is_cut = is_cut
-        if not (was_cut and is_cut):
-            # Not before all has been read that came until the end, perhaps a goodbye.
-            self._is_empty = False
-        if is_cut and self._is_empty:
-            return PeerLost(self._rank, self.peer, operation, step)
-        return None
+        return self._why_ended(operation, step)
 
     def close(self) -> None:
         """See `PipeReader`."""

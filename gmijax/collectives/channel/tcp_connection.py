@@ -1,62 +1,49 @@
-"""One end of a TCP connection between two processes, by pyzmq, for those who share a secret.
+"""One end of a TCP connection between two processes of a job, with a thread that moves the bytes.
 
-ZeroMQ's CURVE encrypts and authenticates. Whoever listens has a pair of keys that follows from the
-secret, and its public half is told to nobody: without it no handshake succeeds. The GMIs of a job
-on several nodes are given the job's.
+One end listens, for this one peer and until it has come; the other calls until it is heard. Both
+prove that they know the job's secret (`gmijax/collectives/nodes/handshake.py`). A connection that
+has ended does not come back.
 """
 
 from __future__ import annotations
 
-import contextlib
-import hashlib
+import math
+import os
+import selectors
 import socket
+import threading
+import time
+from collections import deque
 from collections.abc import Sequence
+from contextlib import closing, suppress
+from itertools import islice, takewhile
 from typing import Any, Final
 
+from gmijax.collectives.channel.tcp_messages import Outgoing, messages
+from gmijax.collectives.messages.pipe_format import Bytes
+from gmijax.collectives.nodes.handshake import Key, accepted, call
 from gmijax.errors import CollectiveError, ConfigError
 
-try:
-    import zmq
-    from zmq.utils import z85
-    from zmq.utils.monitor import recv_monitor_message
-except ImportError:
-    raise ConfigError(
-        "channels between nodes: pyzmq is not installed; the package extra ray brings it"
-    ) from None
+_LINGER_S: Final = 2.0
+"""How long an end that closes waits for what it has not yet put on the wire, and for the other."""
 
-_LINGER_MS: Final = 2000
-"""How long an end waits for what it has not yet put on the wire, at its close or exit."""
-
+_CALL_AGAIN_S: Final = 0.1
+_MESSAGES_AT_ONCE: Final = 8
 _SHORTEST_SECRET: Final = 16
-
-_OPTIONS: Final = {
-    zmq.SNDHWM: 0,  # Acknowledgements bound what waits, not a number of messages.
-    zmq.RCVHWM: 0,
-    zmq.LINGER: _LINGER_MS,
-    zmq.HEARTBEAT_IVL: 2000,
-    zmq.HEARTBEAT_TIMEOUT: 10000,
-}
-
-_WATCHED: Final = (
-    zmq.EVENT_ACCEPTED
-    | zmq.EVENT_CONNECTED
-    | zmq.EVENT_HANDSHAKE_SUCCEEDED
-    | zmq.EVENT_DISCONNECTED
-)
 
 
 class Connection:
-    """One end of a connection: frames in and out, and whether the other end is there.
+    """One end of a connection: messages in and out, and whether the other end is there.
 
     Args:
       address: `host:port`, at which one of the two listens.
       rank: of this process, for messages.
       peer: that of the other one.
-      max_frame_bytes: who sends a longer part of a message is cut off.
+      max_message_bytes: who sends a longer one is cut off.
       listens: whether this is the end that listens.
       secret: of the job.
       newest_only: of messages that wait, at either end, the last one takes the place of all
-        others; they have one part.
+        others.
 
     Raises:
       CollectiveError: an address that cannot be.
@@ -68,115 +55,164 @@ class Connection:
         address: str,
         rank: int,
         peer: int,
-        max_frame_bytes: int,
+        max_message_bytes: int,
         *,
         listens: bool,
         secret: bytes,
         newest_only: bool = False,
     ) -> None:
+        if len(secret) < _SHORTEST_SECRET:
+            raise ConfigError(
+                f"a secret of {len(secret)} bytes: TCP needs {_SHORTEST_SECRET} or more"
+            )
         self.rank, self.peer = rank, peer
         self.is_closed = False
-        self._proved: set[int] = set()
-        self._strangers: set[int] = set()
-        self._handshakes = 0
-        self._was_up = False
-        server_key = _server_key(secret)
-        self._context = zmq.Context()
-        self._socket = self._context.socket(zmq.DEALER)
-        for option, value in _OPTIONS.items():
-            self._socket.setsockopt(option, value)
-        self._socket.setsockopt(zmq.MAXMSGSIZE, max_frame_bytes)
-        self._socket.setsockopt(zmq.CONFLATE, newest_only)
-        self._monitor = self._socket.get_monitor_socket(_WATCHED)
+        self._max_message_bytes = max_message_bytes
+        most = 1 if newest_only else None
+        self._incoming: deque[list[Bytes]] = deque(maxlen=most)
+        self._outgoing: deque[Sequence[Any]] = deque(maxlen=most)
+        self._error: CollectiveError | None = None
+        self._was_up = self._has_ended = False
+        self._key = Key(secret, f"GMI {rank if listens else peer}")
         try:
-            if listens:
-                self._socket.setsockopt(zmq.CURVE_SERVER, 1)
-                self._socket.setsockopt(zmq.CURVE_SECRETKEY, server_key)
-                self._socket.setsockopt(zmq.USE_FD, _listening(address))
-                self._socket.bind(f"tcp://{address}")
-            else:
-                own_public, own_secret = zmq.curve_keypair()
-                self._socket.setsockopt(zmq.CURVE_SERVERKEY, zmq.curve_public(server_key))
-                self._socket.setsockopt(zmq.CURVE_PUBLICKEY, own_public)
-                self._socket.setsockopt(zmq.CURVE_SECRETKEY, own_secret)
-                self._socket.connect(f"tcp://{address}")
-        except (OSError, ValueError, OverflowError, zmq.ZMQError) as error:
-            self.close()
+            host, _, port = address.rpartition(":")
+            self._address = host, int(port)
+            self._listener = _listening(self._address) if listens else None
+        except (OSError, ValueError, OverflowError) as error:
             raise CollectiveError(
                 f"GMI {rank}: no connection with GMI {peer} at {address} ({error})"
             ) from None
+        self._work, self._work_lock = os.eventfd(0, os.EFD_NONBLOCK), threading.Lock()
+        self._thread = threading.Thread(target=self._run, name=f"tcp-{peer}", daemon=True)
+        self._thread.start()
 
-    def send(self, frames: Sequence[Any]) -> None:
-        """Sends a message from memory that stays as it is."""
-        self._socket.send_multipart(frames, flags=zmq.NOBLOCK, copy=False)
+    def send(self, parts: Sequence[Any]) -> None:
+        """Sends a message from memory that stays as it is, unless the other end has left."""
+        if not (self.is_closed or self._has_ended):
+            self._outgoing.append(parts)
+            self._wake()
 
-    def try_send(self, frames: Sequence[Any]) -> None:
-        """Sends a message, if there is somebody who could want it."""
-        with contextlib.suppress(zmq.Again):
-            self.send(frames)
+    def try_receive(self) -> list[Bytes] | None:
+        """The next message; None if there is none.
 
-    def try_receive(self) -> list[Any] | None:
-        """The next message as buffers, without a copy; None if there is none."""
+        Raises:
+          CollectiveError: the other end has sent what is none.
+        """
         if self.is_closed:
             return None
-        try:
-            return [f.buffer for f in self._socket.recv_multipart(zmq.NOBLOCK, copy=False)]
-        except zmq.Again:
-            return None
+        with suppress(IndexError):
+            return self._incoming.popleft()
+        if self._error is not None:
+            raise self._error
+        return None
 
     def is_up(self) -> bool:
         """Whether there is a connection."""
-        return not self.is_cut() and self._was_up
+        return self._was_up and not self._has_ended
 
     def is_cut(self) -> bool:
-        """Whether there was a connection and is none now."""
-        while not self.is_closed and self._monitor.poll(0):
-            message = recv_monitor_message(self._monitor)
-            self._note(message["event"], message["value"])
-        return self._was_up and not (self._proved or self._handshakes)
-
-    def _note(self, event: int, descriptor: int) -> None:
-        """Tells connections of the peer from those of strangers, who end without a handshake.
-
-        ZeroMQ does not say whose handshake succeeded: it shows when the others have ended, which
-        ZeroMQ sees to within half a minute.
-        """
-        if event == zmq.EVENT_HANDSHAKE_SUCCEEDED:
-            self._handshakes += 1
-            self._was_up = True
-        elif event == zmq.EVENT_DISCONNECTED:
-            self._proved.discard(descriptor)
-            self._strangers.discard(descriptor)
-        else:
-            self._strangers.add(descriptor)
-        if self._handshakes and len(self._strangers) <= self._handshakes:
-            self._proved |= self._strangers
-            self._strangers, self._handshakes = set(), 0
+        """Whether there was a connection and is none now, and all has been received."""
+        return self._was_up and self._has_ended and not self._incoming
 
     def close(self) -> None:
         """Leaves at once, but for what is not on the wire. Idempotent."""
         if not self.is_closed:
-            linger_ms = 0 if self.is_cut() else _LINGER_MS
             self.is_closed = True
-            self._socket.disable_monitor()
-            self._monitor.close()
-            self._socket.close(linger_ms)
-            self._context.term()
+            self._wake()
+            if self._was_up:
+                self._thread.join(2 * _LINGER_S)
+
+    def _wake(self) -> None:
+        with self._work_lock:
+            if not self._has_ended:
+                os.eventfd_write(self._work, 1)
+
+    def _run(self) -> None:
+        try:
+            connection = self._heard() if self._listener else self._called()
+            if connection is not None:
+                with connection:
+                    self._was_up = True
+                    self._exchange(connection)
+        except OSError:
+            pass  # The other end is gone.
+        except CollectiveError as error:
+            self._error = CollectiveError(f"GMI {self.rank}: GMI {self.peer} sends {error}")
+        finally:
+            with self._work_lock:
+                self._has_ended = True
+                os.close(self._work)
+
+    def _time_left(self) -> float:
+        return 0.0 if self.is_closed else math.inf
+
+    def _heard(self) -> socket.socket | None:
+        """The connection of the peer, after which nobody listens; None if it did not come."""
+        assert self._listener is not None
+        with self._listener, closing(accepted(self._listener, self._key, self._time_left)) as all_:
+            for connection, caller in all_:
+                if caller == (self.peer, self.rank):
+                    return connection
+                connection.close()
+        return None
+
+    def _called(self) -> socket.socket | None:
+        """The connection with the peer, once it listens; None if it did not before the end."""
+        while not self.is_closed:
+            with suppress(OSError):
+                return call(self._address, self._key, (self.rank, self.peer), self._time_left)
+            time.sleep(_CALL_AGAIN_S)
+        return None
+
+    def _exchange(self, connection: socket.socket) -> None:
+        """Sends and receives until one of the two ends leaves."""
+        outgoing, incoming = Outgoing(), messages(connection, self._max_message_bytes)
+        with selectors.DefaultSelector() as selector:
+            selector.register(connection, selectors.EVENT_READ)
+            selector.register(self._work, selectors.EVENT_READ)
+            while not self.is_closed:
+                has_more = not self._send(connection, outgoing)
+                wanted = selectors.EVENT_READ | (selectors.EVENT_WRITE if has_more else 0)
+                selector.modify(connection, wanted)
+                for key, events in selector.select():
+                    if key.fileobj == self._work:
+                        os.eventfd_read(self._work)
+                    elif events & selectors.EVENT_READ:
+                        found = islice(incoming, _MESSAGES_AT_ONCE)
+                        self._incoming.extend(takewhile(lambda one: one is not None, found))
+        self._leave(connection, outgoing)
+
+    def _send(self, connection: socket.socket, outgoing: Outgoing) -> bool:
+        """Sends what the connection takes now; whether that was all."""
+        while outgoing.send(connection):
+            if not self._outgoing:
+                return True
+            while self._outgoing and outgoing.has_room:
+                outgoing.add(self._outgoing.popleft())
+        return False
+
+    def _leave(self, connection: socket.socket, outgoing: Outgoing) -> None:
+        """Sends what is left, and reads until the other end has left too.
+
+        Otherwise the other end would lose what it has not read yet.
+        """
+        until_s = time.monotonic() + _LINGER_S
+        connection.settimeout(_LINGER_S)
+        self._send(connection, outgoing)
+        connection.shutdown(socket.SHUT_WR)
+        while time.monotonic() < until_s and connection.recv(2**16):
+            pass
 
 
-def _server_key(secret: bytes) -> bytes:
-    """The secret key of whoever listens, as ZeroMQ writes keys."""
-    if len(secret) < _SHORTEST_SECRET:
-        raise ConfigError(f"a secret of {len(secret)} bytes: TCP needs {_SHORTEST_SECRET} or more")
-    return z85.encode(hashlib.sha256(b"gmijax channel " + secret).digest())
-
-
-def _listening(address: str) -> int:
+def _listening(address: tuple[str, int]) -> socket.socket:
     """A listening socket, which may share its port with who reserved it."""
-    host, _, port = address.rpartition(":")
-    with socket.socket(socket.AF_INET, socket.SOCK_STREAM) as listener:
+    listener = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
+    try:
         listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEPORT, 1)
         listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-        listener.bind((host, int(port)))
+        listener.bind(address)
         listener.listen()
-        return listener.detach()
+    except BaseException:
+        listener.close()
+        raise
+    return listener

@@ -5,7 +5,7 @@
     mine.of(7, 0).read(after=0)              # None if nothing is newer
 
 Whoever publishes sends the newest values of all its registers in one message. Of the messages
-that wait, at either end, ZeroMQ keeps the last one only: who reads seldom gets what is newest, and
+that wait, at either end, the last one alone is kept: who reads seldom gets what is newest, and
 takes no memory meanwhile. Connections are those of experience (`tcp_connection.py`).
 
 Wire format: for every register of the sender `_HEAD`, then their bytes.
@@ -14,23 +14,19 @@ Wire format: for every register of the sender `_HEAD`, then their bytes.
 from __future__ import annotations
 
 import struct
-import time
 from collections.abc import Mapping, Sequence
 from typing import Any, Final
 
 import numpy as np
 import numpy.typing as npt
 
-from gmijax.collectives.channel.tcp_channel import MAX_ANSWER_BYTES
 from gmijax.collectives.channel.tcp_connection import Connection
+from gmijax.collectives.messages.pipe_format import Bytes
 from gmijax.collectives.messages.registers import AnyRegister, Snapshot
 from gmijax.errors import CollectiveError
 
 _HEAD: Final = struct.Struct("<QqQ")
 """How often it was published, its tag, its length in bytes."""
-
-_FAREWELL_S: Final = 5.0
-_PAUSE_S: Final = 1e-3
 
 
 class RemoteRegisters:
@@ -59,8 +55,7 @@ class RemoteRegisters:
         secret: bytes,
     ) -> None:
         self._rank, self._their_bytes = rank, their_bytes
-        # What ZeroMQ's handshake takes may be longer than the values.
-        longest = _HEAD.size * len(their_bytes) + sum(their_bytes) + MAX_ANSWER_BYTES
+        longest = _HEAD.size * len(their_bytes) + sum(their_bytes)
         self._connections = {
             peer: Connection(
                 *(address, rank, peer, longest), listens=listens, secret=secret, newest_only=True
@@ -85,7 +80,7 @@ class RemoteRegisters:
         heads = [_HEAD.pack(one.count, one.tag, one.values.size) for one in self._own]
         message = b"".join([*heads, *(one.values.data for one in self._own)])
         for connection in self._connections.values():
-            connection.try_send([message])
+            connection.send([message])
 
     def read(self, peer: int, place: int, after: int) -> Snapshot | None:
         """See `Register`.
@@ -93,30 +88,19 @@ class RemoteRegisters:
         Raises:
           CollectiveError: what came is no message of such registers.
         """
-        while (frames := self._connections[peer].try_receive()) is not None:
-            self._theirs[peer] = self._unpacked(peer, frames)
+        while (found := self._connections[peer].try_receive()) is not None:
+            self._theirs[peer] = self._unpacked(peer, found)
         newest = self._theirs[peer][place]
         return newest if newest.count > after else None
 
-    def wait_for_ends(self) -> None:
-        """Waits until the others have gone, some seconds at most.
-
-        What was published last could be lost if this process went first.
-        """
-        deadline_s = time.monotonic() + _FAREWELL_S
-        while any(connection.is_up() for connection in self._connections.values()):
-            if time.monotonic() > deadline_s:
-                break
-            time.sleep(_PAUSE_S)
-
     def close(self) -> None:
-        """Leaves at once. Idempotent."""
+        """Leaves, once the others have what was published last. Idempotent."""
         for connection in self._connections.values():
             connection.close()
 
-    def _unpacked(self, peer: int, frames: Sequence[Any]) -> list[Snapshot]:
+    def _unpacked(self, peer: int, parts: Sequence[Bytes]) -> list[Snapshot]:
         """The values of a message, which stay in its memory."""
-        data = np.frombuffer(frames[0], np.uint8)
+        data = parts[0] if len(parts) == 1 else np.empty(0, np.uint8)
         begin = _HEAD.size * len(self._their_bytes)
         found: list[Snapshot] = []
         if data.size >= begin:

@@ -7,15 +7,13 @@ large for the channel. A *transfer* is what travels: one or more pieces.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, TypeAlias
+from typing import TypeAlias
 
+from gmijax.collectives.channel.tcp_channel import RemoteReader, RemoteWriter
 from gmijax.collectives.messages.pipe import PipeReader, PipeWriter
 
-if TYPE_CHECKING:  # It needs pyzmq.
-    from gmijax.collectives.channel.tcp_channel import RemoteReader, RemoteWriter
-
-ChannelWriter: TypeAlias = "PipeWriter | RemoteWriter"
+ChannelWriter: TypeAlias = PipeWriter | RemoteWriter
 """The way from this agent to trainer `peer`."""
 
-ChannelReader: TypeAlias = "PipeReader | RemoteReader"
+ChannelReader: TypeAlias = PipeReader | RemoteReader
 """The way from agent `peer` to this trainer."""

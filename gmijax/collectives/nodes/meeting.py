@@ -1,24 +1,22 @@
 """How the leaders of nodes find each other, and prove that they belong to one job.
 
 Before a GMI is started every node opens a listening socket, which its leader inherits; then all
-leaders are told all addresses, and a secret. Node i connects to the nodes before it. Each end of a
-connection sends a random number and answers that of the other with its HMAC under the secret:
-whoever does not know it is hung up on. What is sent afterwards is neither encrypted nor signed.
+leaders are told all addresses, and a secret. Node i connects to the nodes before it, and both ends
+prove that they know the secret (`handshake.py`). When all are there nobody listens any more.
 """
 
 from __future__ import annotations
 
-import hmac
 import json
 import os
 import socket
-import struct
 import time
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import closing, contextmanager
 from types import MappingProxyType
 from typing import Final, NamedTuple
 
+from gmijax.collectives.nodes.handshake import Key, Unreachable, accepted, call
 from gmijax.collectives.shared_memory import create_file
 from gmijax.errors import CollectiveError
 
@@ -27,11 +25,6 @@ ENV_NODES_FD: Final = "GMIJAX_NODES_FD"
 
 ENV_LISTENER_FD: Final = "GMIJAX_LISTENER_FD"
 """Names the descriptor of the node's listening socket."""
-
-_NONCE_BYTES = 32
-_HELLO: Final = struct.Struct("<II")
-_STRANGER_S = 5.0
-"""Longest wait for somebody who has connected to say who it is."""
 
 
 class Nodes(NamedTuple):
@@ -114,14 +107,9 @@ def connect(
     try:
         for lane, found in enumerate(lanes):
             for node in range(nodes.node):
-                found[node] = _call(nodes, node, lane, timeout_s)
-        num_missing = num_lanes * (len(nodes.addresses) - 1 - nodes.node)
-        while num_missing:
-            accepted = _accept(nodes, listener, deadline_s)
-            if accepted is not None:
-                connection, node, lane = accepted
-                lanes[lane][node] = connection
-                num_missing -= 1
+                found[node] = _call(nodes, node, lane, deadline_s)
+        if nodes.node + 1 < len(nodes.addresses):
+            _accept(nodes, listener, lanes, deadline_s)
     except BaseException:
         for found in lanes:
             for connection in found.values():
@@ -130,68 +118,47 @@ def connect(
     return list(lanes)
 
 
-def _call(nodes: Nodes, node: int, lane: int, timeout_s: float) -> socket.socket:
-    host, port = nodes.addresses[node]
-    connection = None
+def _call(nodes: Nodes, node: int, lane: int, deadline_s: float) -> socket.socket:
+    address = nodes.addresses[node]
+    where = f"node {node} at {address[0]}:{address[1]}"
+    key = Key(nodes.token, _name_of_listener(node))
     try:
-        connection = socket.create_connection((host, port), timeout_s)
-        _prove(connection, nodes.token, b"calls", b"called")
-        connection.sendall(_HELLO.pack(nodes.node, lane))
-    except OSError as error:
-        if connection is not None:
-            connection.close()
+        return call(address, key, (nodes.node, lane), lambda: deadline_s - time.monotonic())
+    except Unreachable as error:
         raise CollectiveError(
-            f"node {nodes.node} cannot reach node {node} at {host}:{port} "
-            f"({error.strerror or error}); cluster.interface says which network to use"
+            f"node {nodes.node} cannot reach {where} ({error}); cluster.interface says which "
+            "network to use"
         ) from None
-    return _ready(connection)
+    except OSError as error:
+        raise CollectiveError(
+            f"node {nodes.node} has a connection with {where}, but no answer of this job ({error})"
+        ) from None
 
 
 def _accept(
-    nodes: Nodes, listener: socket.socket, deadline_s: float
-) -> tuple[socket.socket, int, int] | None:
-    """A connection of a leader, its node and lane; None for a stranger's."""
-    listener.settimeout(max(0.01, deadline_s - time.monotonic()))
-    try:
-        connection, _ = listener.accept()
-    except TimeoutError:
-        raise CollectiveError(f"node {nodes.node}: leaders of other nodes did not come") from None
-    connection.settimeout(_STRANGER_S)
-    with suppress(OSError):
-        _prove(connection, nodes.token, b"called", b"calls")
-        node, lane = _HELLO.unpack(_read(connection, _HELLO.size))
-        return _ready(connection), node, lane
-    connection.close()
-    return None
+    nodes: Nodes,
+    listener: socket.socket,
+    lanes: Sequence[dict[int, socket.socket]],
+    deadline_s: float,
+) -> None:
+    """Fills in the connections of all nodes behind this one."""
+    expected = range(nodes.node + 1, len(nodes.addresses))
+    missing = {(node, lane) for node in expected for lane in range(len(lanes))}
+    key = Key(nodes.token, _name_of_listener(nodes.node))
+    with closing(accepted(listener, key, lambda: deadline_s - time.monotonic())) as callers:
+        for connection, (node, lane) in callers:
+            if lane >= len(lanes) or node not in expected:
+                connection.close()
+                continue
+            if node in lanes[lane]:  # The network has lost what it had.
+                lanes[lane][node].close()
+            lanes[lane][node] = connection
+            missing.discard((node, lane))
+            if not missing:
+                return
+    late = ", ".join(map(str, sorted({node for node, _ in missing})))
+    raise CollectiveError(f"node {nodes.node}: the leaders of other nodes did not come: {late}")
 
 
-def _prove(connection: socket.socket, token: bytes, own: bytes, other: bytes) -> None:
-    """Proves to the other end that this one knows the token, and has it prove the same.
-
-    Raises:
-      ConnectionError: it does not know it.
-    """
-    nonce = os.urandom(_NONCE_BYTES)
-    connection.sendall(nonce)
-    # With a role in it, so that nobody can send back what was sent.
-    connection.sendall(hmac.digest(token, own + _read(connection, _NONCE_BYTES), "sha256"))
-    expected = hmac.digest(token, other + nonce, "sha256")
-    if not hmac.compare_digest(_read(connection, len(expected)), expected):
-        raise ConnectionError("it is not of this job")
-
-
-def _read(connection: socket.socket, num_bytes: int) -> bytes:
-    received = b""
-    while len(received) < num_bytes:
-        part = connection.recv(num_bytes - len(received))
-        if not part:
-            raise ConnectionError("it has hung up")
-        received += part
-    return received
-
-
-def _ready(connection: socket.socket) -> socket.socket:
-    connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-    connection.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
-    connection.setblocking(False)
-    return connection
+def _name_of_listener(node: int) -> str:
+    return f"node {node}"

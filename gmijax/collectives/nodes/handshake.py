@@ -1,0 +1,247 @@
+"""How two processes of a job prove to each other over TCP that both know the job's token.
+
+A listener is open to everybody on the network, so strangers cost it little: all are heard at once,
+each has two seconds in all, and beyond a few the oldest is hung up on. Whoever is not let in calls
+again. What is sent after the handshake is neither encrypted nor signed.
+
+| step | caller sends | listener sends |
+|---|---|---|
+| 1 | 32 random bytes | 32 random bytes |
+| 2 | who it is (8 bytes), and an HMAC | |
+| 3 | | an HMAC, once that of the caller is right |
+
+The HMAC (SHA-256, under the token) is of the role, who calls, both random numbers, and which
+listener this is: what was sent once, elsewhere or by the other end proves nothing.
+"""
+
+from __future__ import annotations
+
+import hmac
+import os
+import selectors
+import socket
+import struct
+import time
+from collections.abc import Callable, Iterator
+from contextlib import suppress
+from typing import Final, NamedTuple, TypeAlias
+
+from gmijax.collectives.waits import LIVENESS_PERIOD_S
+
+STRANGER_S: Final = 2.0
+"""How long a caller has from its connection to its proof."""
+
+MAX_STRANGERS: Final = 16
+"""Callers without proof that a listener hears at once; each takes a descriptor."""
+
+_CONNECT_S: Final = 3.0
+_RETRY_S: Final = 0.1
+_PAUSE_S: Final = 0.01
+_ACCEPTED_AT_ONCE: Final = 4
+_CALLER: Final = struct.Struct("<II")
+_NONCE_BYTES = _PROOF_BYTES = 32
+_CALL_BYTES: Final = _NONCE_BYTES + _CALLER.size + _PROOF_BYTES
+_KEEP_ALIVE: Final = {socket.TCP_KEEPIDLE: 2, socket.TCP_KEEPINTVL: 2, socket.TCP_KEEPCNT: 4}
+"""A machine that is gone is noticed after some ten seconds, if nothing is on the way to it."""
+
+Caller: TypeAlias = tuple[int, int]
+"""Who calls: two numbers whose meaning is up to those who use this."""
+
+TimeLeft: TypeAlias = Callable[[], float]
+"""Seconds that may still be waited; asked five times a second."""
+
+
+class Unreachable(ConnectionError):
+    """There is no way to the address, or nobody listens there."""
+
+
+class Key(NamedTuple):
+    """What both ends must know.
+
+    Attributes:
+      token: the secret of the job.
+      listener: which of the job's listeners it is.
+    """
+
+    token: bytes
+    listener: str
+
+    def proof(self, role: bytes, caller: bytes, nonces: bytes) -> bytes:
+        """Proves that the end with this role, `calls` or `hears`, knows the key."""
+        message = role + caller + nonces + self.listener.encode()
+        return hmac.digest(self.token, message, "sha256")
+
+
+def call(address: tuple[str, int], key: Key, caller: Caller, time_left: TimeLeft) -> socket.socket:
+    """Connects with a listener that knows the key.
+
+    Raises:
+      Unreachable: there is no connection.
+      OSError: there is one, and the other end has not proved that it knows the key.
+    """
+    while True:
+        connection = _connected(address, time_left)
+        try:
+            _prove(connection, key, _CALLER.pack(*caller), time_left)
+            return _ready(connection)
+        except ConnectionError:
+            # It may have hung up because too many strangers call.
+            connection.close()
+            if time_left() <= _RETRY_S:
+                raise
+            time.sleep(_RETRY_S)
+        except BaseException:
+            connection.close()
+            raise
+
+
+def accepted(
+    listener: socket.socket, key: Key, time_left: TimeLeft
+) -> Iterator[tuple[socket.socket, Caller]]:
+    """Connections with those who know the key, as they come, until the time is up."""
+    strangers = _Strangers(listener, key)
+    try:
+        while (left_s := time_left()) > 0:
+            yield from strangers.hear(min(left_s, LIVENESS_PERIOD_S))
+    finally:
+        strangers.close()
+
+
+class _Strangers:
+    """Callers that have not proved anything yet, in the order in which they came."""
+
+    def __init__(self, listener: socket.socket, key: Key) -> None:
+        self._listener, self._key = listener, key
+        self._callers: dict[socket.socket, _Stranger] = {}
+        self._selector = selectors.DefaultSelector()
+        listener.setblocking(False)
+        self._selector.register(listener, selectors.EVENT_READ)
+
+    def hear(self, timeout_s: float) -> Iterator[tuple[socket.socket, Caller]]:
+        """Hears those who have sent something, drops the late ones, and accepts new ones."""
+        found = {key.fileobj for key, _ in self._selector.select(timeout_s)}
+        for connection in [one for one in self._callers if one in found]:
+            try:
+                caller = self._callers[connection].hear()
+            except OSError:
+                self._drop(connection)
+                continue
+            if caller is not None:
+                self._drop(connection, closes=False)
+                yield _ready(connection), caller
+        now_s = time.monotonic()
+        for connection in [c for c, one in self._callers.items() if now_s > one.until_s]:
+            self._drop(connection)
+        if self._listener in found:
+            self._accept()
+
+    def close(self) -> None:
+        """Hangs up on all of them; the listener stays open."""
+        for connection in list(self._callers):
+            self._drop(connection)
+        self._selector.close()
+
+    def _accept(self) -> None:
+        # Not all at once: those who are answering are heard in between.
+        for _ in range(_ACCEPTED_AT_ONCE):
+            if len(self._callers) >= MAX_STRANGERS:
+                self._drop(next(iter(self._callers)))
+            try:
+                connection, _ = self._listener.accept()
+            except BlockingIOError:
+                return
+            except OSError:  # Out of descriptors, or it has gone again.
+                if self._callers:
+                    self._drop(next(iter(self._callers)))
+                time.sleep(_PAUSE_S)
+                return
+            connection.setblocking(False)
+            self._callers[connection] = _Stranger(connection, self._key)
+            self._selector.register(connection, selectors.EVENT_READ)
+
+    def _drop(self, connection: socket.socket, *, closes: bool = True) -> None:
+        self._selector.unregister(connection)
+        del self._callers[connection]
+        if closes:
+            connection.close()
+
+
+class _Stranger:
+    """Somebody who has connected and not proved anything yet."""
+
+    def __init__(self, connection: socket.socket, key: Key) -> None:
+        self.until_s = time.monotonic() + STRANGER_S
+        self._connection, self._key = connection, key
+        self._nonce = os.urandom(_NONCE_BYTES)
+        self._received = b""
+        self._is_greeted = False
+
+    def hear(self) -> Caller | None:
+        """Who it is, once that is proved; None before. Raises OSError if it never will be."""
+        if not self._is_greeted:
+            self._connection.sendall(self._nonce)
+            self._is_greeted = True
+        try:
+            part = self._connection.recv(_CALL_BYTES - len(self._received))
+        except BlockingIOError:
+            return None
+        if not part:
+            raise ConnectionError("it has hung up")
+        self._received += part
+        if len(self._received) < _CALL_BYTES:
+            return None
+        nonce, rest = self._received[:_NONCE_BYTES], self._received[_NONCE_BYTES:]
+        caller, proof = rest[: _CALLER.size], rest[_CALLER.size :]
+        nonces = nonce + self._nonce
+        if not hmac.compare_digest(proof, self._key.proof(b"calls", caller, nonces)):
+            raise ConnectionError("it is not of this job")
+        self._connection.sendall(self._key.proof(b"hears", caller, nonces))
+        return _CALLER.unpack(caller)
+
+
+def _connected(address: tuple[str, int], time_left: TimeLeft) -> socket.socket:
+    """A connection with whoever listens there."""
+    while True:
+        left_s = max(time_left(), _PAUSE_S)
+        try:
+            return socket.create_connection(address, min(left_s, _CONNECT_S))
+        except TimeoutError:
+            # Strangers may have filled what waits to be accepted.
+            if time_left() <= 0:
+                raise Unreachable("timed out") from None
+        except OSError as error:
+            raise Unreachable(error.strerror or str(error)) from None
+
+
+def _prove(connection: socket.socket, key: Key, caller: bytes, time_left: TimeLeft) -> None:
+    """Proves to a listener that this process knows the key, and has it prove the same."""
+    nonce = os.urandom(_NONCE_BYTES)
+    connection.sendall(nonce)
+    nonces = nonce + _read(connection, _NONCE_BYTES, time_left)
+    connection.sendall(caller + key.proof(b"calls", caller, nonces))
+    expected = key.proof(b"hears", caller, nonces)
+    if not hmac.compare_digest(_read(connection, len(expected), time_left), expected):
+        raise ConnectionError("it is not of this job")
+
+
+def _read(connection: socket.socket, num_bytes: int, time_left: TimeLeft) -> bytes:
+    received = b""
+    while len(received) < num_bytes:
+        if (left_s := time_left()) <= 0:
+            raise TimeoutError("it does not answer")
+        connection.settimeout(min(left_s, LIVENESS_PERIOD_S))
+        with suppress(TimeoutError):
+            part = connection.recv(num_bytes - len(received))
+            if not part:
+                raise ConnectionError("it has hung up")
+            received += part
+    return received
+
+
+def _ready(connection: socket.socket) -> socket.socket:
+    connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+    connection.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
+    for option, value in _KEEP_ALIVE.items():
+        connection.setsockopt(socket.IPPROTO_TCP, option, value)
+    connection.setblocking(False)
+    return connection
