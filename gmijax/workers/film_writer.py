@@ -17,9 +17,10 @@ from typing import Final
 from gmijax.control.films import FINISH
 from gmijax.runs.folder import RunPaths
 from gmijax.runs.names import by_steps
+from gmijax.sim.stage import Stage
 from gmijax.sim.trajectory import load_trajectory
 from gmijax.supervise.side_process import exit_code_beside
-from gmijax.workers.play_film import Stage, film
+from gmijax.workers.play_film import film
 
 _SIZE: Final = (640, 480)
 _POLL_S: Final = 1.0

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from gmijax.sim.stage import choose_camera
 from gmijax.sim.trajectory import Trajectory, load_trajectory, save_trajectory
 from gmijax.workers import play_film
 
@@ -90,4 +91,4 @@ def test_a_tracking_camera_is_preferred(camera: str, wanted: str | None, index: 
     import mujoco
 
     model = mujoco.MjModel.from_xml_string(MODEL.format(camera=camera))
-    assert play_film.choose_camera(model, wanted) == index
+    assert choose_camera(model, wanted) == index

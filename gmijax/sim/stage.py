@@ -1,0 +1,73 @@
+"""Draws one world with MuJoCo, without a display. No jax here.
+
+MuJoCo chooses its OpenGL when it is imported, from MUJOCO_GL: see `gmijax.machine.opengl`.
+"""
+
+from __future__ import annotations
+
+import copy
+from pathlib import Path
+from typing import Any, TypeAlias
+
+import numpy as np
+import numpy.typing as npt
+
+Image: TypeAlias = npt.NDArray[np.uint8]
+
+
+class Stage:
+    """A model, a camera, and an off-screen OpenGL context.
+
+    Args:
+      model: a `mujoco.MjModel`, or its file in MuJoCo's binary format; None: an empty world.
+      size: width and height of a picture, pixels.
+      camera: see `choose_camera`.
+
+    Raises:
+      Exception: of any type, where OpenGL cannot be had.
+    """
+
+    def __init__(self, model: Any, size: tuple[int, int], camera: str | None) -> None:
+        import mujoco
+
+        self._mujoco = mujoco
+        if model is None:
+            self._model = mujoco.MjModel.from_xml_string("<mujoco/>")
+        elif isinstance(model, Path):
+            self._model = mujoco.MjModel.from_binary_path(str(model))
+        else:
+            # A copy, because its buffer is changed below.
+            self._model = copy.copy(model)
+        self._data = mujoco.MjData(self._model)
+        width, height = size
+        # The buffer of the model's author need not hold the picture that is wanted.
+        self._model.vis.global_.offwidth = max(self._model.vis.global_.offwidth, width)
+        self._model.vis.global_.offheight = max(self._model.vis.global_.offheight, height)
+        self._camera = choose_camera(self._model, camera)
+        self._renderer = mujoco.Renderer(self._model, height, width)
+        self.picture(self._model.qpos0)
+
+    def picture(self, qpos: npt.NDArray[Any]) -> Image:
+        """The picture [height, width, 3] of one world at `qpos` [nq]."""
+        self._data.qpos[:] = qpos
+        self._mujoco.mj_fwdPosition(self._model, self._data)
+        self._renderer.update_scene(self._data, self._camera)
+        return self._renderer.render()
+
+
+def choose_camera(model: Any, wanted: str | None) -> int:
+    """Index of the camera: `wanted`, else `track`, else one that follows a body, else any.
+
+    A model without cameras gives -1, MuJoCo's free camera.
+    """
+    import mujoco
+
+    names = [model.camera(i).name for i in range(model.ncam)]
+    if wanted is not None:
+        return names.index(wanted)
+    if "track" in names:
+        return names.index("track")
+    modes = mujoco.mjtCamLight
+    tracking = (int(modes.mjCAMLIGHT_TRACK), int(modes.mjCAMLIGHT_TRACKCOM))
+    following = [i for i in range(model.ncam) if int(model.cam_mode[i]) in tracking]
+    return next(iter(following), 0 if names else -1)
