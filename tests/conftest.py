@@ -10,7 +10,7 @@ from pathlib import Path
 import pynvml
 import pytest
 
-from gmijax.supervise.environment import flags_on_cpu
+from gmijax.machine.xla_on_cpu import flags_on_cpu
 
 # Of XLA:CPU, read when jax starts, so it is set before any test module is imported.
 # A thread pool of exactly two threads, as on a machine with two cores, can hang.

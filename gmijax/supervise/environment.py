@@ -9,29 +9,20 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Final
 
+from gmijax.machine.xla_on_cpu import POOL, XLA_FLAGS, flags_on_cpu, pool_on_cpu
 from gmijax.partition.plan import Plan, Slice
 from gmijax.supervise.child import ENV_CPUS, ENV_GMI, ENV_WAITS
-from gmijax.version import numbers_of, versions_of
 
 # The old and the new name of one JAX setting; JAX refuses to start when both are set.
 _MEMORY_FRACTION, _OLD_MEMORY_FRACTION = (
     "XLA_CLIENT_MEM_FRACTION",
     "XLA_PYTHON_CLIENT_MEM_FRACTION",
 )
-_XLA_FLAGS = "XLA_FLAGS"
 _SM_PERCENT = "CUDA_MPS_ACTIVE_THREAD_PERCENTAGE"
 _PRIORITY = "CUDA_MPS_CLIENT_PRIORITY"
 _PRIORITIES = {"normal": "0", "below_normal": "1"}
 COMPILATION_CACHE: Final = "JAX_COMPILATION_CACHE_DIR"
 _THREAD_LIMITS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
-
-_SMALLEST_POOL = 4
-
-_FUSION_EMITTERS = "--xla_cpu_use_fusion_emitters"
-"""Physics of long kinematic chains runs up to a thousand times slower with them."""
-
-_FIRST_JAXLIB_WITHOUT_FLAG = (0, 11, 1)
-"""From here on XLA ends the process when it meets the flag, as with any unknown one."""
 
 
 def gmi_environment(
@@ -62,7 +53,7 @@ def gmi_environment(
     for name in _THREAD_LIMITS:
         defaults[name] = str(len(share.cpus) or 1)
     if plan.backend == "cpu":
-        own = _cpu(share, inherited.get(_XLA_FLAGS, ""))
+        own = _cpu(share, inherited.get(XLA_FLAGS, ""))
     else:
         own = _gpu(share)
         # All GMIs are on this host, and NCCL's sockets are open to whoever reaches them.
@@ -83,23 +74,11 @@ def _common(share: Slice) -> dict[str, str]:
 
 
 def _cpu(share: Slice, users_flags: str) -> dict[str, str]:
-    cores = len(share.cpus)
-    # XLA's pool of exactly two threads can hang on batched physics, so two and three cores
-    # get a larger one.
-    pool = 1 if cores == 1 else max(_SMALLEST_POOL, cores)
-    variables = {"JAX_PLATFORMS": "cpu", "CUDA_VISIBLE_DEVICES": "", "PJRT_NPROC": str(pool)}
+    pool = pool_on_cpu(len(share.cpus))
+    variables = {"JAX_PLATFORMS": "cpu", "CUDA_VISIBLE_DEVICES": "", POOL: str(pool)}
     if flags := flags_on_cpu(users_flags):
-        variables[_XLA_FLAGS] = flags
+        variables[XLA_FLAGS] = flags
     return variables
-
-
-def flags_on_cpu(users_flags: str) -> str:
-    """`XLA_FLAGS` for physics on a CPU: the user's, and what else this jaxlib needs."""
-    # Read from the package's metadata: the controller must not import jax.
-    jaxlib = numbers_of(versions_of(["jaxlib"])["jaxlib"])
-    if () < jaxlib < _FIRST_JAXLIB_WITHOUT_FLAG and _FUSION_EMITTERS not in users_flags:
-        return f"{users_flags} {_FUSION_EMITTERS}=false".strip()
-    return users_flags
 
 
 def _gpu(share: Slice) -> dict[str, str]:

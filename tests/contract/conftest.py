@@ -9,8 +9,8 @@ import jax
 import pytest
 from compiled_tasks import CompiledTask
 
+from gmijax.machine.xla_on_cpu import flags_on_cpu
 from gmijax.sim.registry import TASKS
-from gmijax.supervise.environment import flags_on_cpu
 
 CHEAPEST = "ball_balance"
 """The task that runs with MJX-Warp too, and through a thousand steps, where time is short."""

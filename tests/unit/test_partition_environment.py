@@ -10,9 +10,9 @@ import pytest
 from supervision import MPS, gpu, machine
 from supervision import planned as plan_of
 
+from gmijax.machine import xla_on_cpu
 from gmijax.machine.nvidia import Gpu, MigInstance
 from gmijax.partition.plan import Plan
-from gmijax.supervise import environment as environment_module
 from gmijax.supervise.backends import BACKENDS
 from gmijax.supervise.environment import gmi_environment
 
@@ -94,7 +94,7 @@ def test_thread_pool_never_has_two_threads(num_cores: int, pool: str):
 def test_xla_flag_is_added_where_jaxlib_knows_it_and_the_user_has_not(
     jaxlib: str | None, users: str, flags: str | None, monkeypatch: pytest.MonkeyPatch
 ):
-    monkeypatch.setattr(environment_module, "versions_of", lambda _: {"jaxlib": jaxlib})
+    monkeypatch.setattr(xla_on_cpu, "versions_of", lambda _: {"jaxlib": jaxlib})
     inherited = {"XLA_FLAGS": users} if users else {}
     assert environment(planned("cpu"), **inherited).get("XLA_FLAGS") == flags
 
@@ -113,3 +113,23 @@ def test_a_priority_becomes_the_number_of_the_driver():
     found = environment(planned("mps", mps_priority=("normal", *["below_normal"] * 3)), 1)
     assert found["CUDA_MPS_CLIENT_PRIORITY"] == "1"
     assert "CUDA_MPS_CLIENT_PRIORITY" not in environment(planned("mps"))
+
+
+@pytest.mark.parametrize(
+    ("cores", "environment", "missing"),
+    [
+        (8, {}, {"XLA_FLAGS": NO_EMITTERS}),
+        (2, {"XLA_FLAGS": "--a=1"}, {"XLA_FLAGS": f"--a=1 {NO_EMITTERS}", "PJRT_NPROC": "4"}),
+        (3, {"XLA_FLAGS": NO_EMITTERS}, {"PJRT_NPROC": "4"}),
+        (2, {"XLA_FLAGS": NO_EMITTERS, "PJRT_NPROC": "2"}, {}),
+        (1, {"XLA_FLAGS": NO_EMITTERS}, {}),
+    ],
+)
+def test_what_a_users_own_process_lacks_for_physics_on_a_cpu(
+    cores: int,
+    environment: dict[str, str],
+    missing: dict[str, str],
+    monkeypatch: pytest.MonkeyPatch,
+):
+    monkeypatch.setattr(xla_on_cpu, "versions_of", lambda _: {"jaxlib": "0.10.2"})
+    assert xla_on_cpu.missing_on_cpu(environment, cores) == missing
