@@ -22,7 +22,8 @@ if TYPE_CHECKING:
     from gmijax.roles.launch import launch
     from gmijax.roles.manager import GMIManager, plan
     from gmijax.roles.role import Role
-    from gmijax.sim.registry import make_env, make_vector_env, task_names
+    from gmijax.sim.registry import make_env, task_names
+    from gmijax.sim.vector_envs import make_vector_env
     from gmijax.sweeps.sweep import SweepResult, sweep
 
 __all__ = [
@@ -55,7 +56,7 @@ _HOMES = {
     "launch": "gmijax.roles.launch",
     "load_policy": "gmijax.deploy.policy",
     "make_env": "gmijax.sim.registry",
-    "make_vector_env": "gmijax.sim.registry",
+    "make_vector_env": "gmijax.sim.vector_envs",
     "plan": "gmijax.roles.manager",
     "search": "gmijax.control.searching",
     "serve": "gmijax.control.serving",

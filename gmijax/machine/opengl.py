@@ -50,6 +50,21 @@ def first_opengl(tried: Sequence[str]) -> tuple[str | None, str]:
     return None, printable(said)
 
 
+def why_no_opengl() -> str | None:
+    """Chooses OpenGL for this process, if mujoco is not imported yet; None if it can draw."""
+    if "mujoco" in sys.modules:
+        if os.environ.get(_GL) or os.environ.get("DISPLAY"):
+            return None
+        return "mujoco was imported before; set MUJOCO_GL=egl (or osmesa) before Python starts"
+    tried = opengls("egl", "osmesa")
+    gl, said = first_opengl(tried)
+    if gl is None:
+        return f"{what_is_missing(tried)}; the last one: {said}"
+    os.environ[_GL] = gl
+    os.environ.pop("PYOPENGL_PLATFORM", None)
+    return None
+
+
 def is_missing(exit_code: int) -> bool:
     """Whether a child of `gmijax.workers.play_film` ended for want of its OpenGL."""
     # A broken driver may end the process with a signal instead of an error. These two come from

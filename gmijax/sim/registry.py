@@ -4,18 +4,20 @@ from __future__ import annotations
 
 import importlib
 import importlib.util
+import operator
+import os
+import warnings
 from collections.abc import Mapping
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, Literal, overload
 
 from gmijax.config import EnvConfig
 from gmijax.errors import ConfigError
+from gmijax.machine.xla_on_cpu import missing_on_cpu
 from gmijax.sim import source
 from gmijax.sim.tasks.settings import CURRICULA, SETTINGS, settings_from
 
 if TYPE_CHECKING:
-    from gymnasium.vector import VectorEnv
-
     from gmijax.sim.interface import Env
 
 TASKS: Mapping[str, str] = MappingProxyType(
@@ -163,8 +165,10 @@ def make_env(
         raise ConfigError(f"api={api}: allowed are gmijax, brax")
     if episode_length is not None and api == "brax":
         raise ConfigError("episode_length: give it to Brax's EpisodeWrapper with api=brax")
-    if episode_length is not None and episode_length < 1:
-        raise ConfigError(f"env.episode_length={episode_length}: must be at least 1")
+    if episode_length is not None:
+        episode_length = whole_number("env.episode_length", episode_length)
+    if max_envs is not None:
+        max_envs = whole_number("max_envs", max_envs)
     if api == "brax":
         require_task("", "brax")
     if suite == "gmijax" and ".py:" in name:
@@ -173,56 +177,41 @@ def make_env(
     noted = {"source_sha256": source_sha256} if suite == "custom" else {}
     env = _make(name, suite, changes, impl=impl, max_envs=max_envs, **noted)
     if api == "brax":
+        warn_on_cpu(env)
         return importlib.import_module("gmijax.sim.adapters.to_brax").BraxEnv(env)
     from gmijax.sim.wrappers import time_limit
 
     return time_limit(env, episode_length or env.spec.episode_length)
 
 
-def make_vector_env(
-    name: str,
-    num_envs: int,
-    *,
-    arrays: Literal["numpy", "torch", "jax"] = "numpy",
-    suite: str = "gmijax",
-    impl: str = "auto",
-    episode_length: int | None = None,
-) -> VectorEnv[Any, Any, Any]:
-    """Makes N environments with Gymnasium's interface, for training with another library.
+def warn_on_cpu(env: Env) -> None:
+    """Warns if this process steps MJX on a CPU with XLA as it comes; GMIs set what it needs."""
+    import jax
 
-    Examples:
-      >>> envs = make_vector_env("ant", 4096, arrays="torch")
-      >>> obs, info = envs.reset(seed=0)
+    if env.mj_model is None or jax.default_backend() != "cpu":
+        return
+    if missing := missing_on_cpu(os.environ, len(os.sched_getaffinity(0))):
+        wanted = " ".join(f"{name}='{value}'" for name, value in missing.items())
+        warnings.warn(
+            f"physics on this CPU is far slower, or stops, unless Python is started with {wanted} "
+            "in its environment",
+            stacklevel=3,
+        )
 
-    Args:
-      name: see `make_env`.
-      num_envs: N.
-      arrays: what goes in and comes out: of `torch` on the GPU of jax without a copy (DLPack),
-        where both use one.
-      suite: see `make_env`.
-      impl: see `make_env`.
-      episode_length: see `make_env`.
 
-    Returns:
-      A `gmijax.sim.adapters.to_gymnasium.GmijaxVectorEnv`, for other arrays than those of jax
-      in a wrapper of Gymnasium. It starts over in the step that ends an episode, and has the last
-      observation in `info["final_obs"]`.
+def whole_number(key: str, value: Any) -> int:
+    """`value` as an int of at least 1.
 
     Raises:
-      ConfigError: as `make_env`; `num_envs` below 1; a package that is not installed.
+      ConfigError: it is none.
     """
-    if arrays not in ("numpy", "torch", "jax"):
-        raise ConfigError(f"arrays={arrays}: allowed are numpy, torch, jax")
-    if num_envs < 1:
-        raise ConfigError(f"num_envs={num_envs}: must be at least 1")
-    if importlib.util.find_spec("gymnasium") is None:
-        raise ConfigError("make_vector_env: needs gymnasium (pip install 'gmijax[gymnasium]')")
-    if importlib.util.find_spec(arrays) is None:
-        raise ConfigError(f"arrays={arrays}: needs {arrays} (pip install {arrays})")
-    env = make_env(name, suite=suite, impl=impl, episode_length=episode_length, max_envs=num_envs)
-    return importlib.import_module("gmijax.sim.adapters.to_gymnasium").vector_env(
-        env, num_envs, arrays
-    )
+    try:
+        number = operator.index(value)
+    except TypeError:
+        raise ConfigError(f"{key}={value!r}: expected a whole number") from None
+    if number < 1:
+        raise ConfigError(f"{key}={number}: must be at least 1")
+    return number
 
 
 def _make(name: str, suite: str, changes: Mapping[str, Any], **options: Any) -> Env:

@@ -94,7 +94,9 @@ class BatchedEnv(NamedTuple):
       spec: sizes and names of one environment.
       model: the physics model; pass it, or a randomised copy, to the functions.
       init: `(model, keys [N]) -> BatchState`; `env_keys` makes the keys, which it consumes.
-      step: `(model, state, actions [N, A]) -> (BatchState, StepOutput)`.
+      step: `(model, state, actions [N, A]) -> (BatchState, StepOutput)`, `advance` and `restart`.
+      advance: as `step`, but worlds that ended stay at their end.
+      restart: `(model, state) -> BatchState`, with new episodes where one has ended.
       overflows: the names in `StepOutput.overflowed`.
     """
 
@@ -102,6 +104,8 @@ class BatchedEnv(NamedTuple):
     model: PyTree
     init: Callable[[PyTree, PRNGKey], BatchState]
     step: Callable[[PyTree, BatchState, Array], tuple[BatchState, StepOutput]]
+    advance: Callable[[PyTree, BatchState, Array], tuple[BatchState, StepOutput]]
+    restart: Callable[[PyTree, BatchState], BatchState]
     overflows: tuple[str, ...] = ()
 
 
@@ -229,7 +233,7 @@ def training_env(env: Env, *, random_ep_len: bool = False) -> BatchedEnv:
         terms = dict.fromkeys(env.spec.reward_terms, zero)
         return BatchState(batched.reset(model, keys), zero, terms, head_starts(keys))
 
-    def step(model: PyTree, state: BatchState, actions: Array) -> tuple[BatchState, StepOutput]:
+    def advance(model: PyTree, state: BatchState, actions: Array) -> tuple[BatchState, StepOutput]:
         stepped = batched.step(model, state.env, actions)
         if random_ep_len:  # Else it changes nothing, and costs MJX-JAX 4 % of ant's iteration.
             stepped = cut_first_episodes(env.spec, state, stepped)
@@ -251,12 +255,19 @@ def training_env(env: Env, *, random_ep_len: bool = False) -> BatchedEnv:
         )
         ended = stepped.terminated | stepped.truncated
         head_start = jnp.where(ended, 0, state.head_start)
-        after = BatchState(auto_reset(batched, model, stepped), returns, terms, head_start)
-        return after, output
+        return BatchState(stepped, returns, terms, head_start), output
+
+    def restart(model: PyTree, state: BatchState) -> BatchState:
+        return state._replace(env=auto_reset(batched, model, state.env))
+
+    def step(model: PyTree, state: BatchState, actions: Array) -> tuple[BatchState, StepOutput]:
+        after, output = advance(model, state, actions)
+        return restart(model, after), output
 
     overflows = () if env.overflow is None else OVERFLOWS
     # Traced once for all programs with it; what they are made of stays the same.
-    return BatchedEnv(env.spec, env.model, init, jax.jit(step, inline=True), overflows)
+    traced_once = jax.jit(step, inline=True)
+    return BatchedEnv(env.spec, env.model, init, traced_once, advance, restart, overflows)
 
 
 @partial(jax.jit, static_argnames="num_envs")
