@@ -97,7 +97,10 @@ def skrl(num_envs: int, num_steps: int) -> Sequence[float]:
         "value": deterministic_model(**spaces, output="ONE"),
     }
     settings = PPO_CFG(
-        rollouts=UNROLL, learning_epochs=4, mini_batches=4, learning_rate=3e-4,
+        rollouts=UNROLL,
+        learning_epochs=4,
+        mini_batches=4,
+        learning_rate=3e-4,
         time_limit_bootstrap=True,
     )
     agent = PPO(
