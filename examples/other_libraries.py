@@ -7,6 +7,8 @@ Prints the mean return of the first and of the last episodes. On a CPU see
 docs/other-libraries.md for what XLA needs in the environment.
 """
 
+# pyright: reportMissingImports=false
+
 from __future__ import annotations
 
 import argparse
@@ -122,7 +124,7 @@ def skrl(num_envs: int, num_steps: int) -> Sequence[float]:
 def main() -> None:
     """Trains with the library that the command line names."""
     libraries = {"sb3": sb3, "rsl_rl": rsl_rl, "skrl": skrl}
-    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
+    parser = argparse.ArgumentParser(description="PPO of another library")
     parser.add_argument("library", choices=libraries)
     parser.add_argument("--num-envs", type=int, default=128)
     parser.add_argument("--num-steps", type=int, default=300_000)

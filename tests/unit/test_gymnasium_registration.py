@@ -48,7 +48,7 @@ def test_every_task_is_registered_once_with_its_time_limit():
 
 
 def test_many_worlds_by_id():
-    envs = gym.make_vec(ID, num_envs=3, autoreset="next_step")
+    envs: Any = gym.make_vec(ID, num_envs=3, autoreset="next_step")
     assert envs.num_envs == 3
     assert envs.metadata["autoreset_mode"] is gym.vector.AutoresetMode.NEXT_STEP
     assert envs.unwrapped.spec is not None
