@@ -50,9 +50,9 @@ test: $(READY)  ## the tests that are not slow
 test-all: $(READY)  ## all tests, slow ones too
 	$(BIN)/python -m pytest $(TEST_WORKERS) -m '' $(TEST_ARGS)
 
-soak: $(READY)  ## faults from fresh seeds, then a long run's memory; SOAK_MINUTES in all
-	GMIJAX_FAULT_SEEDS=$$(seq -s, $$(date +%s) $$(($$(date +%s) + $(SOAK_MINUTES) / 30))) \
-	  $(BIN)/python -m pytest -m '' -n 0 tests/faults/test_faults.py
+soak: $(READY)  ## faults from a fresh seed, all kinds, then a long run's memory; SOAK_MINUTES in all
+	$(BIN)/python -m tests.faults.campaign --seed $$(date +%s) --faults 100000 \
+	  --minutes $$(($(SOAK_MINUTES) / 2)) --out build/faults.json
 	$(BIN)/python -m tests.faults.soak --minutes $$(($(SOAK_MINUTES) / 2))
 
 wheel-test: $(READY)  ## builds the wheel and tries it outside the checkout

@@ -38,6 +38,24 @@ def make(*, impl, max_envs):
 """
 """`toy_env` as the file of a task of one's own: no contacts, and it compiles in a second."""
 
+DRAWN_TASK = (
+    POINT_TASK.replace("def make(", "def toy(")
+    + """
+import mujoco
+
+MODEL = '''<mujoco><worldbody>
+  <light pos="0 0 3"/><geom type="plane" size="3 3 1" rgba="0 0.6 0.3 1"/>
+  <camera pos="0 -3 2" xyaxes="1 0 0 0 0.5 1"/>
+  <body pos="0 0 0.5"><joint type="slide" axis="1 0 0"/><geom size="0.3"/></body>
+</worldbody></mujoco>'''
+
+def make(*, impl, max_envs):
+    model = mujoco.MjModel.from_xml_string(MODEL)
+    return toy(impl=impl, max_envs=max_envs)._replace(mj_model=model)
+"""
+)
+"""The same with a model, which can be filmed."""
+
 POINT = ("env=point.py:make", *TINY[1:])
 """As TINY, with that task; `train` and `start` write its file where there is none."""
 

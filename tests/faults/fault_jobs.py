@@ -7,22 +7,26 @@ from __future__ import annotations
 
 import json
 import os
+import random
 import shutil
+import signal
 import subprocess
 import sys
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager, suppress
-from functools import cache
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import fault_checks
 import numpy as np
+from fault_checks import newest_whole
+from fault_damage import add_copies, copies_in, damage_checkpoint, damage_entries
+from fault_disks import disk_of
 from fault_plan import CHECKPOINT_EVERY, ITERATIONS, KINDS, Fault
+from fault_processes import MARKER, STALL, processes_of, send
+from fault_report import Came, Report
 from training_jobs import POINT, POINT_TASK, STEPS, child_environment, learner_arrays, wait_until
 
 from gmijax.runs.history import read_metrics
-from gmijax.runs.resume import newest_checkpoint
 
 LIMIT_S = 120.0
 """Of what is waited for after a command; on an idle machine it takes seconds."""
@@ -30,109 +34,43 @@ LIMIT_S = 120.0
 _COMMAND_S = 600.0
 """Of a command with all its restarts, each of a few seconds on an idle machine."""
 
-_DISK_MIB = 64
 _HERE = Path(__file__).resolve().parent
 _COMMAND = (
     *(*POINT[:-1], "plan.gpus=2", "plan.backend=cpu", "reduce.strategy=mpr"),
     *(f"num_timesteps={ITERATIONS * 2 * STEPS}", f"run.checkpoint_every={CHECKPOINT_EVERY}"),
     *("run.keep_checkpoints=3", "run.resume=auto"),
 )
-_SHORT = ("reduce.timeout_s=6", "run.stall_timeout_s=12")
+_HUNG = ("stop", "suspend")
+"""Kinds that begin so are for a job that takes what hangs for dead within seconds."""
 
-
-class Came(NamedTuple):
-    """A fault, and what became of it.
-
-    Attributes:
-      fault: of the plan.
-      outcome: what the job came to, `unexpected: ...` if it should not have.
-    """
-
-    fault: Fault
-    outcome: str
-
-
-class Report(NamedTuple):
-    """A job and its faults.
-
-    Attributes:
-      came: its faults.
-      leaks: what it left.
-      lost: checkpoints that it should have gone on from and did not.
-      is_equal: whether it learnt what the undisturbed run did, bit by bit.
-    """
-
-    came: list[Came]
-    leaks: list[str]
-    lost: list[str]
-    is_equal: bool
-
-    @property
-    def is_good(self) -> bool:
-        """Whether everything was as it must be."""
-        as_wanted = all(KINDS[x.fault.kind].outcome == x.outcome for x in self.came)
-        return as_wanted and not self.leaks and not self.lost and self.is_equal
-
-
-def undisturbed(cwd: Path) -> list[np.ndarray]:
-    """What the job learns without faults."""
-    report = _Job([], cwd).run([])
-    assert report == [], report
-    return learner_arrays(cwd / "disk" / "run")
+_MEASURED = ("kill_measuring", "kill_controller_measuring")
 
 
 def run_job(faults: Sequence[Fault], cwd: Path, expected: list[np.ndarray]) -> Report:
     """Runs a job with faults to its end in `cwd`, which is made; raises nothing."""
     job = _Job(faults, cwd)
     leaks = []
-    with _disk(cwd / "disk", any(fault.kind == "disk_full" for fault in faults)):
+    is_full = any(fault.kind == "disk_full" for fault in faults)
+    with disk_of("small" if is_full else "folder", cwd):
         try:
             leaks = job.run(expected)
         except Exception as error:
             leaks = [f"{type(error).__name__}: {error}"]
-            job.end()
+            send(processes_of(cwd), signal.SIGKILL)
         if leaks or job.wrong:
-            big = shutil.ignore_patterns("filler")
+            big = shutil.ignore_patterns("filler", "cache")
             shutil.copytree(cwd / "disk", cwd / "kept", ignore=big, dirs_exist_ok=True)
-    return Report(job.came(), leaks, job.lost, job.is_equal)
-
-
-@cache
-def can_mount() -> bool:
-    """Whether this process may mount a file system of its own, and have commands do it."""
-    if shutil.which("unshare") is None:
-        return False
-    tried = ["unshare", "-m", "mount", "-t", "tmpfs", "-o", "ro", "tmpfs", "/dev/shm"]
-    return subprocess.run(tried, capture_output=True, check=False).returncode == 0
-
-
-def kinds_here() -> list[str]:
-    """The kinds of faults that can be made on this machine."""
-    needs_mount = {"disk_full", "shm_unwritable"}
-    return [kind for kind in KINDS if can_mount() or kind not in needs_mount]
-
-
-@contextmanager
-def _disk(folder: Path, is_small: bool) -> Iterator[None]:
-    folder.mkdir(parents=True, exist_ok=True)
-    if not is_small:
-        yield
-        return
-    size = f"size={_DISK_MIB}m"
-    subprocess.run(["mount", "-t", "tmpfs", "-o", size, "tmpfs", str(folder)], check=True)
-    try:
-        yield
-    finally:
-        subprocess.run(["umount", "--lazy", str(folder)], check=True)
+    return Report(job.came(), leaks, job.lost)
 
 
 class _Job:
     def __init__(self, faults: Sequence[Fault], cwd: Path) -> None:
         self.commands = 0
-        self.is_equal = False
+        self._copies: set[str] = set()
         self.lost: list[str] = []
         self.wrong: dict[int, str] = {}
         self._faults = list(faults)
+        self._draw = random.Random(len(self._faults))
         self._kinds = {fault.kind for fault in faults}
         self._cwd = cwd
         self._run = cwd / "disk" / "run"
@@ -147,43 +85,43 @@ class _Job:
         before = fault_checks.before()
         while self._give_command():
             assert self.commands < len(self._faults) + 3, "it does not end"
-        left = fault_checks.what_is_left(before, self._run, self._cwd, LIMIT_S)
+        left = fault_checks.left_in_shared_places(before, self._cwd)
+        left += fault_checks.left_in_folder(self._run)
         wrong = fault_checks.what_is_wrong(self._run)
         found = learner_arrays(self._run)
-        self.is_equal = len(found) == len(expected) and all(map(np.array_equal, found, expected))
+        if expected and not (
+            len(found) == len(expected) and all(map(np.array_equal, found, expected))
+        ):
+            wrong.append("it has not learnt what the undisturbed job did, bit by bit")
+        copies = copies_in(self._run)
+        self.lost += [f"copy {name}" for name in self._copies if name not in copies]
         return [*left, *wrong]
 
     def came(self) -> list[Came]:
         """All faults with their outcomes."""
         fired, told = self._fired(), []
         for number, fault in enumerate(self._faults):
-            kind = KINDS[fault.kind]
-            outcome: str = kind.outcome
-            if number not in fired and kind.place != "command":
-                outcome = "unexpected: it did not come"
-            told.append(Came(fault, self.wrong.get(number, outcome)))
+            is_missing = number not in fired and KINDS[fault.kind].place != "command"
+            outcome = "it did not come" if is_missing else "as wanted"
+            told.append(Came(fault.kind, fault.iteration, self.wrong.get(number, outcome)))
         return told
-
-    def end(self) -> None:
-        """Ends what runs."""
-        for pid in fault_checks.processes_of(self._cwd):
-            with suppress(ProcessLookupError):
-                os.kill(pid, 9)
 
     def _give_command(self) -> bool:
         """Starts or resumes the job and waits for its end; returns whether it must be resumed."""
-        fired, newest = self._fired(), newest_checkpoint(self._run).checkpoint
+        fired, newest = self._fired(), newest_whole(self._run)
         code = self._command()
         self.commands += 1
         now = [number for number in sorted(self._fired()) if number not in fired]
-        wait_until(lambda: not fault_checks.processes_of(self._cwd), LIMIT_S, "all processes gone")
+        wait_until(lambda: not processes_of(self._cwd), LIMIT_S, "all processes gone")
         self._judge(now, code, newest)
         for number in now:
             self._repair_or_damage(self._faults[number].kind)
         return code != 0
 
     def _command(self) -> int:
-        overrides = (*_COMMAND, *(_SHORT if "stop" in self._kinds else ()))
+        overrides = (*_COMMAND, *(STALL if any(k.startswith(_HUNG) for k in self._kinds) else ()))
+        if self._kinds & set(_MEASURED):
+            overrides += ("run.measure_throughput=true",)
         command = [sys.executable, "-m", "faulty_controller", *overrides, "run.dir=disk/run"]
         if "shm_unwritable" in self._kinds:
             script = 'mount -t tmpfs -o ro tmpfs /dev/shm && exec "$@"'
@@ -211,8 +149,8 @@ class _Job:
                 job.kill()
 
     def _environment(self) -> dict[str, str]:
-        own = {"GMIJAX_FAULTS": str(self._cwd), "TMPDIR": str(self._cwd / "tmp")}
-        if "cache_truncated" in self._kinds:
+        own = {MARKER: str(self._cwd), "TMPDIR": str(self._cwd / "tmp")}
+        if self._kinds & {"cache_truncated", "cache_flipped"}:
             own["JAX_COMPILATION_CACHE_DIR"] = str(self._cwd / "cache")
         path = os.pathsep.join(map(str, (_HERE, _HERE.parent)))
         inherited = child_environment()
@@ -259,23 +197,9 @@ class _Job:
             (self._cwd / "nan").unlink()
         elif kind == "disk_full":
             (self._cwd / "disk" / "filler").unlink()
-        elif kind == "cache_truncated":
-            for entry in (self._cwd / "cache").glob("*-cache"):
-                os.truncate(entry, entry.stat().st_size // 2)
+        elif kind.startswith("cache_"):
+            damage_entries(self._cwd / "cache", kind, self._draw)
+        elif kind == "checkpoint_copies":
+            self._copies |= add_copies(self._run)
         elif kind.startswith("checkpoint_"):
-            _damage(newest_checkpoint(self._run).checkpoint, kind)
-
-
-def _damage(checkpoint: Path | None, kind: str) -> None:
-    assert checkpoint is not None, "there is none to damage"
-    meta = checkpoint / "meta.json"
-    files = [path for path in checkpoint.rglob("*") if path.is_file() and path != meta]
-    largest = max(files, key=lambda path: path.stat().st_size)
-    if kind == "checkpoint_meta":
-        os.truncate(meta, 0)
-    elif kind == "checkpoint_truncated":
-        os.truncate(largest, largest.stat().st_size // 2)
-    else:
-        data = bytearray(largest.read_bytes())
-        data[len(data) // 2] ^= 1
-        largest.write_bytes(data)
+            damage_checkpoint(newest_whole(self._run), kind)

@@ -38,6 +38,8 @@ class Kind(NamedTuple):
 
 
 KINDS: Final[dict[str, Kind]] = {
+    "kill_importing": Kind("kill", "importing", "restarted"),
+    "kill_controller_importing": Kind("kill_controller", "importing", "resumed", -9),
     "kill_compiling": Kind("kill", "compiling", "restarted"),
     "kill_beat": Kind("kill", "beat", "restarted"),
     "kill_mean": Kind("kill", "mean", "restarted"),
@@ -46,6 +48,15 @@ KINDS: Final[dict[str, Kind]] = {
     "kill_named": Kind("kill", "named", "restarted", place="leader"),
     "kill_removing": Kind("kill", "removing", "restarted", place="leader"),
     "stop": Kind("stop", "beat", "restarted"),
+    "suspend_job": Kind("suspend_job", "beat", "nothing happened"),
+    "suspend_job_compiling": Kind("suspend_job", "compiling", "nothing happened"),
+    "suspend_controller": Kind("suspend_controller", "beat", "nothing happened"),
+    "suspend_janitor": Kind("suspend_janitor", "beat", "nothing happened"),
+    "suspend_gmis": Kind("suspend_gmis", "beat", "restarted"),
+    "kill_measuring": Kind("kill", "measuring", "restarted"),
+    "kill_controller_measuring": Kind("kill_controller", "measuring", "resumed", -9),
+    "kill_result": Kind("kill", "result", "restarted"),
+    "kill_controller_result": Kind("kill_controller", "result", "resumed", -9),
     "raise_mean": Kind("raise", "mean", "restarted"),
     "raise_part": Kind("raise", "part", "restarted"),
     "raise_rename": Kind("raise", "rename", "restarted", place="leader"),
@@ -64,13 +75,20 @@ KINDS: Final[dict[str, Kind]] = {
     "checkpoint_truncated": Kind("kill_controller", "beat", "resumed", -9),
     "checkpoint_byte": Kind("kill_controller", "beat", "resumed", -9),
     "checkpoint_meta": Kind("kill_controller", "beat", "resumed", -9),
+    "checkpoint_copies": Kind("kill_controller", "beat", "resumed", -9),
+    "checkpoint_fifo": Kind("kill_controller", "beat", "resumed", -9),
+    "checkpoint_device": Kind("kill_controller", "beat", "resumed", -9),
     "cache_truncated": Kind("kill_controller", "beat", "resumed", -9),
+    "cache_flipped": Kind("kill_controller", "beat", "resumed", -9),
     "nan": Kind("nan", "beat", "ended at once", 1),
     "disk_full": Kind("fill_disk", "beat", "ended at once", 1),
     "shm_unwritable": Kind("shm_unwritable", "", "nothing happened", place="command"),
     "stdout_closed": Kind("stdout_closed", "", "nothing happened", place="command"),
     "stdout_gone": Kind("stdout_gone", "", "nothing happened", place="command"),
 }
+
+NEED_MOUNT: Final = frozenset({"disk_full", "shm_unwritable"})
+"""Kinds that need a file system of their own."""
 
 
 class Fault(NamedTuple):
@@ -125,4 +143,4 @@ def _may_meet(kind: str, other: str) -> bool:
 
 
 def _is_at_start(kind: str) -> bool:
-    return KINDS[kind].place == "command" or KINDS[kind].point == "compiling"
+    return KINDS[kind].place == "command" or KINDS[kind].point in ("importing", "compiling")

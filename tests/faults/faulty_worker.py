@@ -10,6 +10,7 @@ import json
 import os
 import resource
 import signal
+import subprocess
 import sys
 import time
 from collections.abc import Callable
@@ -17,8 +18,10 @@ from pathlib import Path
 from typing import Any
 
 from fault_plan import KINDS, Fault
+from fault_processes import SUSPENDED_S, gmis_of, processes_of
 from training_jobs import pids_of
 
+from gmijax.supervise import child
 from gmijax.supervise.child import ChildLink
 from gmijax.workers import training_worker
 
@@ -79,6 +82,10 @@ class Faults:
                 os.kill(own, signal.SIGSTOP),
             ),
             "kill_janitor": lambda: os.kill(_janitor_of(controller), signal.SIGKILL),
+            "suspend_job": lambda: _suspend([controller, *_gmis()]),
+            "suspend_controller": lambda: _suspend([controller]),
+            "suspend_janitor": lambda: _suspend([_janitor_of(controller)]),
+            "suspend_gmis": lambda: _suspend(_gmis()),
             "usr1": lambda: os.kill(controller, signal.SIGUSR1),
             "hup": lambda: os.kill(controller, signal.SIGHUP),
             "term_all": lambda: [
@@ -99,6 +106,25 @@ def _janitor_of(controller: int) -> int:
     raise LookupError("no janitor")
 
 
+def _gmis() -> list[int]:
+    return [process.pid for process in gmis_of(processes_of(SCRATCH))]
+
+
+def _suspend(pids: list[int]) -> None:
+    """Stops processes, this one perhaps too, and has them go on later: by one that is not."""
+    script = 'kill -STOP "$@"; sleep "$0"; kill -CONT "$@" 2>/dev/null'
+    others = {key: value for key, value in os.environ.items() if not key.startswith("GMIJAX_")}
+    subprocess.Popen(
+        ["sh", "-c", script, str(SUSPENDED_S), *map(str, pids)],
+        env=others,
+        stdin=subprocess.DEVNULL,
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.DEVNULL,
+        start_new_session=True,
+    )
+    time.sleep(2 * _PACE_S)
+
+
 def _raise() -> None:
     raise Injected("a fault of the plan")
 
@@ -113,7 +139,7 @@ def _fill(path: Path) -> None:
             continue
 
 
-def _before(owner: Any, name: str, act: Callable[..., None]) -> None:
+def _before(owner: Any, name: str, act: Callable[..., object]) -> None:
     """Has `act` called with the arguments of `owner.name`, before it."""
     inner = getattr(owner, name)
 
@@ -140,6 +166,12 @@ def _inject(faults: Faults) -> None:
 
     ChildLink.beat = beat
 
+    def written(path: Path, _: Any) -> None:
+        if path.name == "result.json":
+            faults.at("result")
+
+    _before(child, "write_json", written)
+
 
 def _inject_in_training(faults: Faults) -> None:
     import jax
@@ -148,6 +180,7 @@ def _inject_in_training(faults: Faults) -> None:
     from gmijax.collectives.host.host_exchange import HostExchange
     from gmijax.collectives.program import ProgramStep
     from gmijax.learning import checkpoint
+    from gmijax.learning.throughput import ThroughputMeter
     from gmijax.learning.training_log import TrainingLog
 
     def synced(path: Path) -> None:
@@ -180,6 +213,7 @@ def _inject_in_training(faults: Faults) -> None:
 
     _before(HostExchange, "sum", lambda *_: faults.at("mean"))
     _before(TrainingLog, "write", lambda *_: faults.at("report"))
+    _before(ThroughputMeter, "measure", lambda *_: faults.at("measuring"))
     _before(checkpoint, "_sync", synced)
     checkpoint._save = save_half
     checkpoint.shutil = _Recorded(checkpoint.shutil, removed)
@@ -199,5 +233,7 @@ class _Recorded:
 
 
 if __name__ == "__main__":
-    _inject(Faults())
+    faults = Faults()
+    _inject(faults)
+    faults.at("importing")
     sys.exit(training_worker.main())

@@ -6,26 +6,9 @@ from pathlib import Path
 
 import imageio_ffmpeg
 import pytest
-from training_jobs import POINT, POINT_TASK, STEPS, train
+from training_jobs import DRAWN_TASK, POINT, STEPS, train
 
 from gmijax.machine.opengl import first_opengl, opengls
-
-DRAWN_TASK = (
-    POINT_TASK.replace("def make(", "def toy(")
-    + """
-import mujoco
-
-MODEL = '''<mujoco><worldbody>
-  <light pos="0 0 3"/><geom type="plane" size="3 3 1" rgba="0 0.6 0.3 1"/>
-  <camera pos="0 -3 2" xyaxes="1 0 0 0 0.5 1"/>
-  <body pos="0 0 0.5"><joint type="slide" axis="1 0 0"/><geom size="0.3"/></body>
-</worldbody></mujoco>'''
-
-def make(*, impl, max_envs):
-    model = mujoco.MjModel.from_xml_string(MODEL)
-    return toy(impl=impl, max_envs=max_envs)._replace(mj_model=model)
-"""
-)
 
 
 @pytest.mark.timeout(300)
