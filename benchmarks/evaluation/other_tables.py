@@ -249,6 +249,23 @@ def faults() -> list[str]:
     return [*markdown("fault | seconds until all GMIs train again:", rows), *source("faults-h200")]
 
 
+def faults_on_a_cpu() -> list[str]:
+    """Faults of every command, and how many came to something else than they must."""
+    groups: dict[str, list[Mapping[str, Any]]] = {}
+    for row in results_of("faults-cpu").get("rows", ()):
+        groups.setdefault(row["group"], []).append(row)
+    rows = []
+    for group, found in sorted(groups.items()):
+        trials = {row["trial"]: row for row in found}.values()
+        unexpected = sum(row["outcome"] != "as wanted" for row in found)
+        sums = (sum(len(row[what]) for row in trials) for what in ("lost", "leaked"))
+        seconds = shown(figure([row["seconds"] for row in found]), ".0f")
+        kinds = len({row["kind"] for row in found})
+        rows.append([group, *map(str, (kinds, len(found), unexpected, *sums)), seconds])
+    head = "faults of | kinds: | faults: | unexpected: | lost: | leaked: | seconds a fault:"
+    return [*markdown(head, rows), *source("faults-cpu")]
+
+
 def sm_shares() -> list[str]:
     """At which caps on SMs half-precision products were right."""
     rows = []
@@ -284,6 +301,7 @@ OTHER_TABLES: MappingProxyType[str, Callable[[], list[str]]] = MappingProxyType(
         "marks": marks,
         "throughput": throughput,
         "faults": faults,
+        "faults-cpu": faults_on_a_cpu,
         "sm-shares": sm_shares,
         "stencil": stencil,
     }

@@ -20,7 +20,7 @@ _HERE = Path(__file__).resolve().parent
 sys.path[:0] = [str(_HERE), str(_HERE.parent)]
 
 import conftest  # noqa: F401, E402 - the environment of jax, as for tests
-from fault_deck import Trial, draw_trials, faults_of  # noqa: E402
+from fault_deck import Trial, draw_trials, faults_of, group_of  # noqa: E402
 from fault_trials import kinds_here, run_trial  # noqa: E402
 
 from benchmarks.records import RESULTS, ResultsFile  # noqa: E402
@@ -79,7 +79,9 @@ def _rows(number: int, trial: Trial, scratch: Path, fixtures: Path) -> list[dict
     began_s = time.monotonic()
     report = run_trial(trial, scratch, fixtures)
     seconds = (time.monotonic() - began_s) / len(faults_of(trial))
-    return report.rows(number, round(seconds, 1))
+    rest = {"trial": number, "seconds": round(seconds, 1)}
+    rest |= {"leaked": report.leaks, "lost": report.lost}
+    return [{"group": group_of(came.kind), **came._asdict(), **rest} for came in report.came]
 
 
 def _is_good(row: dict[str, Any]) -> bool:

@@ -41,7 +41,7 @@ def left_in_shared_places(start: tuple[set[str], set[str]], scratch: Path) -> li
 
 def left_in_folder(run: Path) -> list[str]:
     """Files that only lie there while something is written."""
-    hidden = (path for path in run.rglob(".*") if path != run / ".lock")
+    hidden = (path for path in run.rglob(".*") if path.name != ".lock")
     return [f"leaked: {path.relative_to(run)} in the run folder" for path in hidden]
 
 

@@ -165,3 +165,15 @@ def draw_trials(seed: int, num_faults: int, kinds: Sequence[str]) -> Iterator[Tr
 def faults_of(trial: Trial) -> list[str]:
     """The kinds of a trial."""
     return [trial.kind] if isinstance(trial, Case) else [fault.kind for fault in trial]
+
+
+_GROUPS: Final = {
+    **dict.fromkeys(("measured", "summary", "films", "cache", "tdg"), "train"),
+    "edit": "files that were edited",
+}
+
+
+def group_of(kind: str) -> str:
+    """What tables have a row for: faults from within, a command, or what else was harmed."""
+    first = kind.partition("_")[0]
+    return "training, from within" if kind in KINDS else _GROUPS.get(first, first)

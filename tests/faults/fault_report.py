@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 
 class Came(NamedTuple):
@@ -40,11 +40,6 @@ class Report(NamedTuple):
         lost = [text for text in wrong if text.startswith("lost: ")]
         others = [text for text in wrong if text not in leaks and text not in lost]
         return cls([Came(kind, seed, "; ".join(others) or "as wanted")], leaks, lost)
-
-    def rows(self, trial: int, seconds: float) -> list[dict[str, Any]]:
-        """Of a table: a row for each fault, which took that long on average."""
-        rest = {"trial": trial, "seconds": seconds, "leaked": self.leaks, "lost": self.lost}
-        return [came._asdict() | rest for came in self.came]
 
     @property
     def is_good(self) -> bool:
