@@ -6,6 +6,7 @@ MuJoCo chooses it when it is imported, from MUJOCO_GL.
 from __future__ import annotations
 
 import os
+import sys
 import signal
 import subprocess
 from collections.abc import Sequence
