@@ -6,9 +6,9 @@ MuJoCo chooses it when it is imported, from MUJOCO_GL.
 from __future__ import annotations
 
 import os
-import sys
 import signal
 import subprocess
+import sys
 from collections.abc import Sequence
 from typing import Final
 
