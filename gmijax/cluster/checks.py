@@ -31,31 +31,22 @@ def by_name(joined: Sequence[Joined]) -> dict[str, Joined]:
     return named
 
 
-def differences_in_versions(nodes: Mapping[str, Facts], unused: Sequence[str] = ()) -> list[str]:
+def differences_in_versions(nodes: Mapping[str, Facts]) -> list[str]:
     """In what versions they differ, in sentences; packages for GPUs count where there are some."""
     packages = dict.fromkeys(what for facts in nodes.values() for what in facts.versions)
     found: list[str] = []
-    for what in (package for package in packages if package not in unused):
+    for what in packages:
         asked = {n: f for n, f in nodes.items() if what not in ON_GPUS or f.machine.gpus}
         found += differences_in(what, {n: f.versions.get(what) for n, f in asked.items()})
     return found
 
 
-def require_alike(joined: Sequence[Joined], *, has_tcp: bool = False) -> None:
-    """Raises ConfigError if a node has other versions than this machine, or other ones for GPUs.
-
-    With `has_tcp` experience goes between nodes, for which pyzmq must be there too.
-    """
+def require_alike(joined: Sequence[Joined]) -> None:
+    """Raises ConfigError if nodes differ in versions from this machine, or for GPUs in between."""
     # This machine may have no GPUs: it does not use them.
     here = Facts("", Machine((), ()), own_versions())
-    if has_tcp and here.versions["pyzmq"] is None:
-        raise ConfigError(
-            "cluster.engine=ray: experience between nodes needs the package pyzmq "
-            "(pip install 'gmijax[ray]')"
-        )
     nodes = {name: node.facts for name, node in by_name(joined).items()}
-    unused = () if has_tcp else ("pyzmq",)
-    if problems := differences_in_versions({"this machine": here, **nodes}, unused):
+    if problems := differences_in_versions({"this machine": here, **nodes}):
         raise ConfigError(f"cluster.engine=ray: {problems[0]}; all nodes must have the same")
 
 

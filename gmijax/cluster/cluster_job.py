@@ -130,7 +130,7 @@ class ClusterJob:
 
     def _checked(self) -> Mapping[str, Machine]:
         """The machines of the nodes, by address, once these can take part."""
-        require_alike(self._joined, has_tcp=self._config.is_asynchronous)
+        require_alike(self._joined)
         require_shared(self._joined, self._run_root)
         return {name: node.facts.machine for name, node in by_name(self._joined).items()}
 

@@ -41,7 +41,7 @@ from gmijax.supervise.run_gmis import drop_unreadable, shared_blocks
 from gmijax.supervise.start_gmi import Launch, StartGmi, start_gmi
 from gmijax.version import __version__, versions_of
 
-COMPARED: Final = ("jax", "jaxlib", "numpy", "mujoco", "mujoco-mjx", "flax", "optax", "pyzmq")
+COMPARED: Final = ("jax", "jaxlib", "numpy", "mujoco", "mujoco-mjx", "flax", "optax")
 """Packages whose versions all nodes must have alike, beside Python and gmijax."""
 
 ON_GPUS: Final = (

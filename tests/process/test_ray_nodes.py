@@ -8,6 +8,7 @@ import os
 import re
 import signal
 from collections.abc import Iterator
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -56,8 +57,10 @@ def descendants_of(parent: int) -> list[int]:
 
 def addresses_of_listeners(pids: list[int]) -> set[str]:
     """Where these processes listen, as the kernel writes IP addresses."""
-    links = [link for pid in pids for link in Path(f"/proc/{pid}/fd").iterdir()]
-    inodes = {os.readlink(link) for link in links if link.is_symlink()}
+    inodes: set[str] = set()
+    for pid in pids:
+        with suppress(OSError):  # It has ended, or closed one of them meanwhile.
+            inodes |= {os.readlink(link) for link in Path(f"/proc/{pid}/fd").iterdir()}
     tables = [Path("/proc/net", name).read_text().splitlines()[1:] for name in ("tcp", "tcp6")]
     rows = [row.split() for table in tables for row in table]
     # 0A: it listens.

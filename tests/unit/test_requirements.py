@@ -27,7 +27,6 @@ DISTRIBUTIONS = {
     "nccl": "nccl4py",
     "orbax": "orbax-checkpoint",
     "pynvml": "nvidia-ml-py",
-    "zmq": "pyzmq",
 }
 # What a part of a library imports, and the library does not ask for.
 HIDDEN = {"jax.export": "flatbuffers"}

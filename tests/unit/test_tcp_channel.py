@@ -152,6 +152,21 @@ def test_an_agent_that_stalls_within_a_message_is_there_until_it_leaves(address:
     reader.close()
 
 
+def test_what_an_agent_sent_before_its_end_arrives_though_nothing_can_be_answered(
+    address: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def send(*_: Any) -> bool:
+        raise BrokenPipeError
+
+    monkeypatch.setattr("gmijax.collectives.channel.tcp_connection.Outgoing.send", send)
+    reader = RemoteReader(address, 1, 0, CAPACITY, SECRET)
+    with agent(address) as connection:
+        connection.sendall(data(0) + data(1))
+    assert receive(reader, 2) == [66, 66]
+    assert isinstance(why_lost(reader), PeerLost)
+    reader.close()
+
+
 @pytest.mark.parametrize(
     "lengths",
     [[2**32 - 1], [1, CAPACITY], [1, 2**64 - 1], [3, 2**63, 2**63, 0], [CAPACITY // 8 + 1]],

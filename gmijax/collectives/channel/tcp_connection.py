@@ -100,10 +100,11 @@ class Connection:
         """
         if self.is_closed:
             return None
+        error = self._error  # Before the look: what came before the error is still given out.
         with suppress(IndexError):
             return self._incoming.popleft()
-        if self._error is not None:
-            raise self._error
+        if error is not None:
+            raise error
         return None
 
     def is_up(self) -> bool:
@@ -184,11 +185,14 @@ class Connection:
 
     def _send(self, connection: socket.socket, outgoing: Outgoing) -> bool:
         """Sends what the connection takes now; whether that was all."""
-        while outgoing.send(connection):
-            if not self._outgoing:
-                return True
-            while self._outgoing and outgoing.has_room:
-                outgoing.add(self._outgoing.popleft())
+        try:
+            while outgoing.send(connection):
+                if not self._outgoing:
+                    return True
+                while self._outgoing and outgoing.has_room:
+                    outgoing.add(self._outgoing.popleft())
+        except ConnectionError:
+            return True  # The other end takes nothing more, but may have sent something before.
         return False
 
     def _leave(self, connection: socket.socket, outgoing: Outgoing) -> None:
