@@ -2,18 +2,20 @@
 
 from __future__ import annotations
 
+import importlib.metadata
 import json
 import os
 import subprocess
 import sys
-import sysconfig
 import tarfile
 import venv
 import zipfile
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path, PurePosixPath
 
 import pytest
+from packaging.requirements import Requirement
+from test_custom_task import SMALL, TASK
 from training_jobs import STEPS, TINY
 
 CHECKOUT = Path(__file__).resolve().parents[2]
@@ -55,18 +57,55 @@ def wheel(dist: Path) -> Path:
 
 @pytest.fixture(scope="module")
 def python(wheel: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The interpreter of an environment with the wheel and today's dependencies."""
+    """The interpreter of an environment with the wheel and what it declares, without extras.
+
+    Nothing is downloaded: its dependencies, theirs and so on are links to those of the tests.
+    GMIJAX_BARE_PYTHON names one in which the wheel was installed by pip.
+    """
+    if given := os.environ.get("GMIJAX_BARE_PYTHON"):
+        return Path(given).absolute()
     root = tmp_path_factory.mktemp("clean") / "env"
     venv.create(root, symlinks=True)
     interpreter = root / "bin" / "python"
     pip = [sys.executable, "-m", "pip", "--disable-pip-version-check", "--python", interpreter]
     run([*pip, "install", "--quiet", "--no-deps", "--no-index", wheel], root)
-    here = {sysconfig.get_path("purelib"), sysconfig.get_path("platlib")}
-    # A .pth file in a folder that a .pth file names is not read: the dependencies are shared,
-    # an editable install of the checkout is not.
     site = next(root.glob("lib/python*/site-packages"))
-    (site / "dependencies.pth").write_text("\n".join(sorted(here)) + "\n")
+    found = importlib.metadata.distributions(name="gmijax", path=[str(site)])
+    for entry in sorted(entries_below(needed_by(next(iter(found))))):
+        if not (site / entry.name).exists():
+            (site / entry.name).symlink_to(entry)
     return interpreter
+
+
+def needed_by(
+    distribution: importlib.metadata.Distribution, extras: frozenset[str] = frozenset()
+) -> dict[str, importlib.metadata.Distribution]:
+    """All distributions that pip would install with it, by name."""
+    found: dict[str, importlib.metadata.Distribution] = {}
+    seen: set[tuple[str, frozenset[str]]] = set()
+    left = [(distribution, extras)]
+    while left:
+        one, wanted = left.pop()
+        for line in one.requires or ():
+            needs = Requirement(line)
+            there = needs.marker is None or any(
+                needs.marker.evaluate({"extra": extra}) for extra in {"", *wanted}
+            )
+            key = needs.name.lower(), frozenset(needs.extras)
+            if there and key not in seen:
+                seen.add(key)
+                found[key[0]] = importlib.metadata.distribution(needs.name)
+                left.append((found[key[0]], key[1]))
+    return found
+
+
+def entries_below(
+    distributions: dict[str, importlib.metadata.Distribution],
+) -> Iterator[Path]:
+    """The files and folders of site-packages that hold these distributions."""
+    for one in distributions.values():
+        tops = {file.parts[0] for file in one.files or ()} - {"..", "__pycache__"}
+        yield from (Path(str(one.locate_file(top))) for top in tops)
 
 
 def files_below(folder: str, pattern: str = "*") -> set[str]:
@@ -124,3 +163,85 @@ def test_it_trains_outside_the_checkout(python: Path, tmp_path: Path):
     assert [line["env_steps"] for line in lines] == [STEPS, 2 * STEPS]
     assert all(line["diverged_steps"] == 0 for line in lines)
     assert (tmp_path / "run" / "checkpoints" / f"{2 * STEPS:012d}").is_dir()
+
+
+def gmijax(python: Path, *words: str, cwd: Path) -> str:
+    return run([python.parent / "gmijax", *words], cwd)
+
+
+@pytest.fixture(scope="module")
+def trained(python: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A working directory with a task of the user's own, and `runs/tiny`."""
+    home = tmp_path_factory.mktemp("home")
+    (home / "point.py").write_text(TASK)
+    job = ("env=point.py:make", *SMALL, "num_timesteps=64", "run.name=tiny")
+    gmijax(python, "train", *job, cwd=home)
+    return home
+
+
+def test_nothing_but_declared_dependencies_is_there(python: Path, tmp_path: Path):
+    absent = ["optuna", "onnxruntime", "brax", "wandb", "gymnasium", "ray", "pytest"]
+    code = f"import importlib.util; print([n for n in {absent} if importlib.util.find_spec(n)])"
+    assert run([python, "-c", code], tmp_path).strip() == "[]"
+    # Of the editable install of the checkout too.
+    assert str(CHECKOUT) not in run([python, "-c", "import sys; print(sys.path)"], tmp_path)
+
+
+def test_a_policy_is_exported_loaded_and_played(python: Path, trained: Path):
+    gmijax(python, "export", "run.dir=runs/tiny", "format=stablehlo", cwd=trained)
+    (exported,) = trained.glob("runs/tiny/export/*/policy.stablehlo")
+    code = f"""
+import gmijax, numpy, jax
+actions = [gmijax.load_policy(one)(numpy.zeros(1)) for one in ("runs/tiny", {str(exported)!r})]
+numpy.testing.assert_allclose(*actions, rtol=1e-6)
+program = jax.export.deserialize(bytearray(open({str(exported)!r}, "rb").read()))
+print(jax.jit(program.call)(numpy.zeros((2, 1), "float32")).shape)
+"""
+    assert run([python, "-c", code], trained).strip() == "(2, 1)"
+    said = gmijax(python, "play", "run.dir=runs/tiny", "video=none", "num_envs=2", cwd=trained)
+    assert "return" in said
+
+
+def test_what_an_extra_brings_is_named(python: Path, trained: Path):
+    for words, extra in (
+        (("export", "run.dir=runs/tiny", "format=onnx"), "export"),
+        (("train", "env=brax", "env.name=ant"), "brax"),
+        (("train", "env=ant", "wandb.mode=offline"), "wandb"),
+    ):
+        done = subprocess.run(
+            [python.parent / "gmijax", *words],
+            cwd=trained,
+            capture_output=True,
+            text=True,
+            check=False,
+        )
+        assert done.returncode == 2
+        assert f"pip install 'gmijax[{extra}]'" in done.stderr
+        assert len(done.stderr.strip().splitlines()) == 1
+
+
+def test_commands_without_a_job_say_what_they_know(python: Path, tmp_path: Path):
+    assert "ball_balance" in gmijax(python, "list-envs", cwd=tmp_path)
+    for verb in ("train", "search", "sweep", "serve", "play", "export"):
+        assert "run.dir" in gmijax(python, verb, "--help", cwd=tmp_path)
+
+
+@pytest.mark.slow
+def test_commands_with_jobs_of_their_own_work(python: Path, trained: Path):
+    job = ("env=point.py:make", *SMALL, "num_timesteps=64")
+    gmijax(python, "sweep", *job, "seed=1,2", "run.dir=s", cwd=trained)
+    assert json.loads((trained / "s" / "sweep.json").read_text())["jobs"]
+    gmijax(python, "serve", "run.dir=runs/tiny", "num_envs=16", "num_timesteps=64", cwd=trained)
+    grid = ("search.gmis_per_gpu=[1]", "search.num_envs=[16]", "search.iterations=2")
+    gmijax(python, "search", *job, *grid, "search.store=store", "run.dir=found", cwd=trained)
+    assert json.loads((trained / "found" / "search.json").read_text())["complete"]
+    # It says what the machine lacks: by its exit code too.
+    done = subprocess.run(
+        [python.parent / "gmijax", "doctor"],
+        cwd=trained,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode in (0, 1)
+    assert "Traceback" not in done.stdout + done.stderr
