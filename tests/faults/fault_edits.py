@@ -9,7 +9,7 @@ import subprocess
 import sys
 from pathlib import Path
 
-from fault_checks import checkpoints_of, events_of, is_whole, newest_whole, not_one_line
+from fault_checks import events_of, is_whole, newest_whole, not_one_line
 from fault_files import EDITS, READERS, EditKind, damage, drawn_file
 from fault_fixtures import COLLECT, RUN_STEPS, SEARCH, SWEEP, TRAIN, fixture, write_tasks
 from fault_processes import MARKER, processes_of, send
@@ -77,13 +77,14 @@ def _run(kind: EditKind, draw: random.Random, scratch: Path, fixtures: Path) -> 
         wrong.append(f"{what}: a traceback: {said[-600:]}")
     if code == 0 and kind.reader in ("auto", "resume"):
         wrong += _what_was_lost(run, scratch / "new", newest, kind)
-    kept = [path for path in checkpoints_of(run) if is_whole(path)]
-    gone = {path.parent for path in before if path.name == "meta.json"} - set(kept)
-    whole = {path for path in gone if file not in path.rglob("*") and file != path / "meta.json"}
-    return [*wrong, *(f"lost: {what}: checkpoint {path.name}" for path in sorted(whole))]
+    kept = (path.parent for path in before if path.name == "meta.json")
+    others = sorted(path for path in kept if path not in (file.parent, *file.parents))
+    return [*wrong, *(f"lost: {what}: {path}" for path in others if not is_whole(path))]
 
 
 def _what_was_lost(run: Path, new: Path, newest: Path | None, kind: EditKind) -> list[str]:
+    if kind.files == "events.jsonl":  # It says where training began, and is what was damaged.
+        return []
     trained = run if kind.reader == "auto" else new
     starts = events_of(trained, "start")
     if not starts or newest is None:
