@@ -61,12 +61,14 @@ def _run(kind: EditKind, draw: random.Random, scratch: Path, fixtures: Path) -> 
     way = damage(file, kind, draw)
     before = {path: path.read_bytes() for path in run.rglob("*") if _is_plain(path)}
     newest = newest_whole(run)
-    code, said = _read(kind, file, run, scratch)
+    code, said, shown = _read(kind, file, run, scratch)
     what = f"{file.relative_to(run)} damaged ({way}), {kind.reader}"
     if code is None:
         return [f"{what}: no end within {_LIMIT_S:.0f} s"]
     wrong = []
-    if code not in (0, 2):
+    if kind.says not in said + shown:
+        wrong.append(f"{what}: {kind.says} is not in {said[-300:]} {shown[-300:]}")
+    if code not in ((0, 2) if kind.code is None else (kind.code,)):
         wrong.append(f"{what}: exit code {code}: {said[-600:]}")
     elif code == 2:
         verb = READERS[kind.reader][0]
@@ -97,7 +99,8 @@ def _is_plain(path: Path) -> bool:
     return path.is_file() and not path.is_symlink() and path.name != ".lock"
 
 
-def _read(kind: EditKind, file: Path, run: Path, scratch: Path) -> tuple[int | None, str]:
+def _read(kind: EditKind, file: Path, run: Path, scratch: Path) -> tuple[int | None, str, str]:
+    """Exit code (None: no end), errors and output of the command that reads the file."""
     verb, *words = READERS[kind.reader]
     filled: list[str] = []
     for word in words:
@@ -116,5 +119,5 @@ def _read(kind: EditKind, file: Path, run: Path, scratch: Path) -> tuple[int | N
             check=False,
         )
     except subprocess.TimeoutExpired:
-        return None, ""
-    return done.returncode, done.stderr
+        return None, "", ""
+    return done.returncode, done.stderr, done.stdout

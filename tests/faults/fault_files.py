@@ -27,12 +27,18 @@ class EditKind(NamedTuple):
       files: a pattern in it; one of those that fit is drawn.
       reader: which command then reads it, a key of `READERS`.
       is_text: whether it holds JSON, in one line or many.
+      way: how, of `_VERSIONS`; empty: it is drawn.
+      code: exit code that the reader must end with; None: 0 or 2.
+      says: what the reader must print.
     """
 
     fixture: str
     files: str
     reader: str
     is_text: bool = True
+    way: str = ""
+    code: int | None = None
+    says: str = ""
 
 
 READERS: Mapping[str, tuple[str, ...]] = MappingProxyType(
@@ -69,6 +75,18 @@ EDITS: Mapping[str, EditKind] = MappingProxyType(
             )
             for reader in readers
         },
+        **{
+            f"edit_version_{name}_{reader}": EditKind(
+                "run", "config.json", reader, True, name, code, says
+            )
+            for name, code, says, readers in (
+                ("key", 2, "future_key", ("auto", "resume")),
+                ("group", 2, "future_group", ("auto", "resume")),
+                ("default", 0, "gae_lambda", ("auto", "resume")),
+                ("key", 0, "future_key", ("play", "export")),
+            )
+            for reader in readers
+        },
         "edit_sweep": EditKind("sweep", "sweep.json", "sweep"),
         "edit_request": EditKind("sweep", "request.json", "sweep"),
         "edit_job": EditKind("sweep", "00[01]/*.json*", "sweep"),
@@ -83,7 +101,10 @@ EDITS: Mapping[str, EditKind] = MappingProxyType(
 
 
 def damage(path: Path, kind: EditKind, draw: random.Random) -> str:
-    """Damages a file in a way that is drawn; returns its name."""
+    """Damages a file, or edits it; returns in which way."""
+    if kind.way:
+        _VERSIONS[kind.way](path)
+        return kind.way
     ways = _ANY | (_TEXT if kind.is_text else {})
     name = draw.choice(sorted(ways))
     ways[name](path, draw)
@@ -137,6 +158,21 @@ def _edit_value(path: Path, draw: random.Random) -> None:
     lines[number] = json.dumps(data)
     path.write_text("\n".join(lines) + "\n")
 
+
+def _as_of_another_version(group: str, key: str, value: object) -> Callable[[Path], None]:
+    def act(path: Path) -> None:
+        config = json.loads(path.read_text())
+        config.setdefault(group, {})[key] = value
+        path.write_text(json.dumps(config))
+
+    return act
+
+
+_VERSIONS: dict[str, Callable[[Path], None]] = {
+    "key": _as_of_another_version("algo", "future_key", 3),
+    "group": _as_of_another_version("future_group", "key", 3),
+    "default": _as_of_another_version("algo", "gae_lambda", 0.5),
+}
 
 _ANY: dict[str, Callable[[Path, random.Random], None]] = {
     "flipped": _flip,

@@ -131,9 +131,7 @@ def test_play_names_the_checkpoints_that_there_are(run: RunPaths):
         open_run(config)
 
 
-@pytest.mark.parametrize(
-    "name", ["12", "0" * 13, "00000000001x", " 00000000012", "\u0661" * 12]
-)
+@pytest.mark.parametrize("name", ["12", "0" * 13, "00000000001x", " 00000000012", "\u0661" * 12])
 def test_other_names_are_no_steps(name: str):
     assert steps_of(name) is None
     assert steps_of(steps_name(12)) == 12
