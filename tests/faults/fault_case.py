@@ -67,8 +67,7 @@ class FaultyCommand:
         write_tasks(self._home)
         for name in SHADOWS if self._is_shadowed else ():
             (scratch / "cwd" / f"{name}.py").write_text("raise SystemExit('of the folder')")
-        if self._about.needs is not None:
-            shutil.copytree(fixture(self._about.needs, fixtures), self.run)
+        self._fixtures = fixtures
 
     def progress(self) -> int:
         """What it has finished."""
@@ -100,6 +99,10 @@ class FaultyCommand:
     def _hit(self) -> subprocess.Popen[bytes]:
         """Starts it and hits it; again, if it was over before."""
         for longest_s in (4.0, 1.0, 0.0, 0.0):
+            for path in (self.run, self._home / "store"):
+                shutil.rmtree(path, ignore_errors=True)
+            if self._about.needs is not None:
+                shutil.copytree(fixture(self._about.needs, self._fixtures), self.run)
             job = self._start()
             moment = MOMENTS[self._kind.moment]
             wait_until(
@@ -107,15 +110,15 @@ class FaultyCommand:
                 LIMIT_S,
                 f"{self._kind.moment} of {self.command}",
             )
+            is_there = True
             if self._kind.moment == "any":
                 time.sleep(self.draw.uniform(0.0, longest_s))
-            if job.poll() is None:
+                is_there = moment(self)  # What is only about to exit is not hit.
+            if is_there and job.poll() is None:
                 self._saved_before = self.progress()
                 ACTS[self._kind.does](self, self._kind.whom)
                 return job
-            assert job.returncode == 0, "it ended by itself"
-            for path in (self.run, self._home / "store"):
-                shutil.rmtree(path, ignore_errors=True)
+            assert self._wait(job) == 0, "it ended by itself"
         raise AssertionError("it ends before it can be hit")
 
     def _restored(self) -> int:

@@ -82,7 +82,7 @@ EDITS: Mapping[str, EditKind] = MappingProxyType(
             for name, code, says, readers in (
                 ("key", 2, "future_key", ("auto", "resume")),
                 ("group", 2, "future_group", ("auto", "resume")),
-                ("default", 0, "gae_lambda", ("auto", "resume")),
+                ("default", 0, "gae_lambda", ("auto",)),
                 ("key", 0, "future_key", ("play", "export")),
             )
             for reader in readers
