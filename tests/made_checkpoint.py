@@ -11,6 +11,7 @@ import numpy as np
 import gmijax
 from gmijax.config.schema import to_dict
 from gmijax.learning.checkpoint import checkpoint_meta, finish_checkpoint, save_learner
+from gmijax.learning.episode_window import Standing
 from gmijax.learning.learner import learner_shapes
 from gmijax.learning.normalize import Moments
 from gmijax.runs.folder import RunPaths, write_json
@@ -48,5 +49,5 @@ def make_run(root: Path, *overrides: str, actor_obs_size: int | None = None) -> 
         key=jax.random.key(0),
     )
     save_learner(run, ENV_STEPS, state)
-    finish_checkpoint(run, checkpoint_meta(config, ENV_STEPS, 1, None))
+    finish_checkpoint(run, checkpoint_meta(config, ENV_STEPS, 1, Standing()))
     return run

@@ -21,11 +21,12 @@ from gmijax.learning.checkpoint import (
     checkpoint_meta,
     finish_checkpoint,
     require_finite,
+    save_episodes,
     save_learner,
 )
 from gmijax.learning.learner import TrainState, policy_figures
+from gmijax.learning.start import first_window
 from gmijax.learning.training_log import TrainingLog
-from gmijax.runs.resume import CheckpointMeta
 from gmijax.sim.wrappers import BatchedEnv
 from gmijax.supervise.child import ChildLink
 
@@ -46,9 +47,11 @@ class Leader:
     def __post_init__(self) -> None:
         self._seen = [0] * len(self.agents)
         self._reports: list[Report | None] = [None] * len(self.agents)
-        self._pending: CheckpointMeta | None = None
+        self._pending: int | None = None  # Environment steps of a checkpoint.
         self._checkpoint: Path | None = None
-        self._log = TrainingLog.open(self.config.env.label, self.link.run, self.env_steps)
+        limit_steps = self.env.spec.episode_length * self.config.envs_per_gmi * len(self.agents)
+        window = first_window(self.config, limit_steps, self.agents[0], None)
+        self._log = TrainingLog.open(self.config.env.label, self.link.run, self.env_steps, window)
         self._reporter = Reporter(self._log, self.env, self.env_steps)
         self._started = time.monotonic()
         self._first_steps = self.env_steps
@@ -99,6 +102,7 @@ class Leader:
         """Tells the agents to add to the last checkpoint and to end."""
         if self._pending is not None:  # It would be given up for this one: see it through.
             self._wait_for_agents()
+            self._finish_checkpoint()
         self._order(self.env_steps, is_ending=True)
 
     def finish(self, state: TrainState) -> None:
@@ -106,7 +110,8 @@ class Leader:
         self._wall_s = time.monotonic() - self._started
         self._begin_checkpoint(state)
         self._wait_for_agents()
-        self._write_line(state)
+        self._write_line(state)  # Its episodes go into the checkpoint.
+        self._finish_checkpoint()
 
     def close(self) -> None:
         """Flushes the metrics."""
@@ -153,19 +158,16 @@ class Leader:
 
     def _missing(self) -> list[int]:
         """Agents that have not added to the pending checkpoint."""
-        wanted = self._pending.env_steps if self._pending else None
         theirs = [None if report is None else report.checkpoint for report in self._reports]
-        return [gmi for gmi, has in zip(self.agents, theirs, strict=True) if has != wanted]
+        return [gmi for gmi, has in zip(self.agents, theirs, strict=True) if has != self._pending]
 
     def _begin_checkpoint(self, state: TrainState) -> None:
         require_finite(state.params, self.config.env.label, self.env_steps)
         save_learner(self.link.run, self.env_steps, state)
-        self._pending = checkpoint_meta(
-            self.config, self.env_steps, len(self.agents), self._log.last_return
-        )
+        self._pending = self.env_steps
 
     def _wait_for_agents(self) -> None:
-        """Finishes the pending checkpoint when all agents have added to it.
+        """Returns when all agents have added to the pending checkpoint.
 
         Raises:
           CollectiveTimeout: some did not; nothing gets the checkpoint's name.
@@ -181,13 +183,13 @@ class Leader:
             self.link.beat("running", self._updates)
             time.sleep(_PAUSE_S)
             self._hear()
-        self._finish_checkpoint()
 
     def _finish_checkpoint(self) -> None:
         assert self._pending is not None
-        self._checkpoint = finish_checkpoint(
-            self.link.run, self._pending, self.config.run.keep_checkpoints
-        )
+        run, log, config = self.link.run, self._log, self.config
+        save_episodes(run, self._pending, config, log.episodes())
+        meta = checkpoint_meta(config, self._pending, len(self.agents), log.standing())
+        self._checkpoint = finish_checkpoint(run, meta, config.run.keep_checkpoints)
         self._pending = None
 
 

@@ -13,8 +13,9 @@ import jax
 import numpy as np
 
 from gmijax.collection.programs import Step
+from gmijax.learning.episode_window import EpisodeWindow
 from gmijax.learning.physics_health import OverflowCount, check_diverged, overflow_line
-from gmijax.learning.training_log import EpisodeWindow, JsonlSink
+from gmijax.learning.training_log import JsonlSink
 from gmijax.learning.unroll import Counts
 from gmijax.runs.dataset import DataPaths
 from gmijax.runs.folder import remove_temporary, write_bytes, write_json

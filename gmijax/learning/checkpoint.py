@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import dataclasses
 import hashlib
+import json
 import os
 import shutil
 import time
@@ -25,8 +26,10 @@ import orbax.checkpoint as ocp
 
 from gmijax.collectives.interface import Reducer
 from gmijax.config import TrainConfig
+from gmijax.config.schema import to_dict
 from gmijax.errors import ConfigError, GmijaxError, NonFiniteError, ParameterMismatch, lines_of
-from gmijax.runs.folder import META, RunPaths, write_json
+from gmijax.learning.episode_window import Standing
+from gmijax.runs.folder import META, RunPaths, read_json, write_json
 from gmijax.runs.resume import CheckpointMeta, checkpoints_of, file_check, rank_of
 from gmijax.types import PyTree
 
@@ -34,12 +37,15 @@ T = TypeVar("T")
 
 LEARNER = "learner"
 
+EPISODES = "episodes.json"
+"""The latest episodes before a checkpoint, over which metrics go on after it."""
+
 
 def checkpoint_meta(
     config: TrainConfig,
     env_steps: int,
     num_gmis: int,
-    mean_return: float | None,
+    standing: Standing,
     eval_return: float | None = None,
 ) -> CheckpointMeta:
     """Content of `meta.json` for a checkpoint of this run by `num_gmis` GMIs."""
@@ -52,7 +58,8 @@ def checkpoint_meta(
         num_envs=config.envs_per_gmi,
         hidden=(algo.policy_hidden_layer_sizes, algo.value_hidden_layer_sizes),
         impl=config.physics.impl,
-        mean_return=mean_return,
+        mean_return=standing.mean_return,
+        window_full=standing.is_full,
         eval_return=eval_return,
         learning_rate=algo.learning_rate,
     )
@@ -90,6 +97,24 @@ def save_learner(paths: RunPaths, env_steps: int, learner_state: PyTree) -> None
 def save_envs(paths: RunPaths, env_steps: int, gmi: int, env_state: PyTree) -> None:
     """Writes the environments of one GMI, as `save_learner` does the shared part."""
     _save(_partial(paths, env_steps) / f"gmi_{gmi}", env_state)
+
+
+def save_episodes(
+    paths: RunPaths, env_steps: int, config: TrainConfig, window: Mapping[str, Any]
+) -> None:
+    """Writes what `EpisodeWindow.state` gave, as `save_learner` does the shared part."""
+    write_json(_partial(paths, env_steps) / EPISODES, {"task": _task(config), **window})
+
+
+def saved_episodes(checkpoint: Path, config: TrainConfig) -> dict[str, Any] | None:
+    """What `save_episodes` wrote; None without it, or where returns are of another task now."""
+    path = checkpoint / EPISODES
+    found = read_json(path) if path.exists() else {}
+    return found if found.get("task") == _task(config) else None
+
+
+def _task(config: TrainConfig) -> str:
+    return json.dumps(to_dict(config.env), sort_keys=True)
 
 
 def finish_checkpoint(paths: RunPaths, meta: CheckpointMeta, keep: int | None = None) -> Path:

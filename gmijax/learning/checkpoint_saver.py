@@ -48,13 +48,20 @@ class CheckpointSaver:
         self._thread.wait()
         return self._unnamed is not None
 
-    def begin(self, meta: CheckpointMeta, learner_state: PyTree, env_state: PyTree | None) -> None:
+    def begin(
+        self,
+        meta: CheckpointMeta,
+        learner_state: PyTree,
+        env_state: PyTree | None,
+        save_more: Callable[[], None] = lambda: None,
+    ) -> None:
         """Begins to write a checkpoint; both states may be donated after it.
 
         Args:
           meta: of the checkpoint.
           learner_state: the same on all GMIs; the leader writes it.
           env_state: this GMI's environments, None where it has none.
+          save_more: writes what else the leader has for it.
         """
         self.finish()
         leader_state = on_host(learner_state) if self._is_leader else None
@@ -65,6 +72,7 @@ class CheckpointSaver:
                 save_envs(self._run, meta.env_steps, self._gmi, own_envs)
             if leader_state is not None:
                 save_learner(self._run, meta.env_steps, leader_state)
+                save_more()
 
         self._unnamed = meta
         self._thread.report(write)

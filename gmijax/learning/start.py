@@ -10,7 +10,8 @@ import jax.numpy as jnp
 from gmijax.config import ServeConfig, TrainConfig
 from gmijax.devices import memory_limit_bytes
 from gmijax.errors import ConfigError
-from gmijax.learning.checkpoint import has_envs, restore_envs, restore_learner
+from gmijax.learning.checkpoint import has_envs, restore_envs, restore_learner, saved_episodes
+from gmijax.learning.episode_window import EpisodeWindow
 from gmijax.learning.learner import Learner, TrainState, init_learner
 from gmijax.machine.host_limits import detect_host
 from gmijax.runs.resume import CheckpointMeta
@@ -99,13 +100,37 @@ def first_envs(
     env_state = begin_episodes(
         env, key, place * num_envs, num_envs, kept_steps=config.algo.unroll_length
     )
-    if resume is None or meta is None or gmi is None or not has_envs(resume, gmi):
-        return env_state
-    if num_gmis not in (None, meta.num_gmis):
-        return env_state
-    if (meta.num_envs, meta.impl) != (num_envs, config.physics.impl):
+    if resume is None or gmi is None or not envs_go_on(config, gmi, num_gmis):
         return env_state
     return restore_envs(resume, gmi, env_state)
+
+
+def envs_go_on(config: TrainConfig, gmi: int, num_gmis: int | None) -> bool:
+    """Whether the environments of a GMI are those of its checkpoint; see `first_envs`."""
+    if config.run.resume is None or not has_envs(Path(config.run.resume), gmi):
+        return False
+    meta = CheckpointMeta.read(Path(config.run.resume))
+    own = config.envs_per_gmi, config.physics.impl
+    return num_gmis in (None, meta.num_gmis) and (meta.num_envs, meta.impl) == own
+
+
+def first_window(
+    config: TrainConfig, limit_steps: float, gmi: int, num_gmis: int | None
+) -> EpisodeWindow:
+    """The latest episodes of a job at its start, or those before its checkpoint.
+
+    Args:
+      config: of the run.
+      limit_steps: a time limit of all its worlds together, in environment steps.
+      gmi: one that simulates.
+      num_gmis: see `first_envs`.
+    """
+    window = EpisodeWindow(limit_steps)
+    if config.run.resume is not None:
+        saved = saved_episodes(Path(config.run.resume), config)
+        if saved is not None:
+            window.restore(saved, worlds_go_on=envs_go_on(config, gmi, num_gmis))
+    return window
 
 
 def begin_episodes(

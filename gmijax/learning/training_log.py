@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import math
 import time
-from collections import deque
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple, TypeAlias
@@ -13,6 +12,7 @@ from typing import Any, NamedTuple, TypeAlias
 from tensorboardX.event_file_writer import EventsWriter
 from tensorboardX.proto import event_pb2, summary_pb2
 
+from gmijax.learning.episode_window import EpisodeWindow, Standing
 from gmijax.learning.physics_health import (
     OverflowCount,
     check_diverged,
@@ -22,46 +22,7 @@ from gmijax.learning.physics_health import (
 from gmijax.runs.folder import RunPaths
 from gmijax.runs.history import read_metrics, scalars
 
-WINDOW_EPISODES = 100
-"""Means over episodes are taken over at least this many of the latest ones."""
-
 Line: TypeAlias = Mapping[str, float | int | None]
-
-
-class EpisodeWindow:
-    """Means over the latest episodes: the fewest iterations that hold WINDOW_EPISODES."""
-
-    def __init__(self) -> None:
-        self._latest: deque[Any] = deque()
-        self._count = 0.0
-
-    def add(self, episodes: Any) -> None:
-        """Takes in the `EpisodeSums` of one iteration, as numbers of the host."""
-        self._latest.append(episodes)
-        self._count += episodes.count
-        while self._count - self._latest[0].count >= WINDOW_EPISODES:
-            self._count -= self._latest.popleft().count
-
-    def means(self) -> dict[str, float | None]:
-        """`return`, `episode_length`, `reward/<term>` and `metric/<name>`.
-
-        The first two are None, and the others missing, while no episode has ended.
-        """
-        count = self._count
-        if not count:
-            return {"return": None, "episode_length": None}
-        return {
-            "return": sum(e.return_sum for e in self._latest) / count,
-            "episode_length": sum(e.length_sum for e in self._latest) / count,
-            **{
-                f"reward/{name}": sum(e.term_sums[name] for e in self._latest) / count
-                for name in self._latest[-1].term_sums
-            },
-            **{
-                f"metric/{name}": sum(e.metric_sums[name] for e in self._latest) / count
-                for name in self._latest[-1].metric_sums
-            },
-        }
 
 
 class JsonlSink:
@@ -137,28 +98,51 @@ class TrainingLog:
     """
 
     def __init__(
-        self, env_name: str, sinks: Iterable[Sink], env_steps: int, wall_s: float = 0.0
+        self,
+        env_name: str,
+        sinks: Iterable[Sink],
+        env_steps: int,
+        wall_s: float = 0.0,
+        window: EpisodeWindow | None = None,
     ) -> None:
-        """Starts at `env_steps` and `wall_s` of training, those of the resumed run if any."""
+        """Starts where the resumed run ended, if there is one.
+
+        Args:
+          env_name: for messages.
+          sinks: get the lines.
+          env_steps: environment steps that were learnt from before.
+          wall_s: seconds of training before.
+          window: the latest episodes before; None: none.
+        """
         self.line_s: list[float] = []
         self.last_return: float | None = None
         self.overflows = OverflowCount(env_name)
         self.last_s = time.monotonic()
         self._env_name = env_name
         self._sinks = tuple(sinks)
-        self._window = EpisodeWindow()
+        self._window = window or EpisodeWindow()
         self._env_steps = env_steps
         self._started_s = self.last_s - wall_s
 
     @classmethod
-    def open(cls, env_name: str, run: RunPaths, env_steps: int) -> TrainingLog:
+    def open(
+        cls, env_name: str, run: RunPaths, env_steps: int, window: EpisodeWindow
+    ) -> TrainingLog:
         """The log in a run folder; a resumed run starts with the lines of the one before."""
         history = read_metrics(run.metrics)
         board = TensorBoardSink(run.tensorboard)
         for line in history:
             board.write(line)
         wall_s = (history[-1].get("wall_s") or 0.0) if history else 0.0
-        return cls(env_name, (JsonlSink(run.metrics), board), env_steps, wall_s)
+        return cls(env_name, (JsonlSink(run.metrics), board), env_steps, wall_s, window)
+
+    def standing(self) -> Standing:
+        """How well the policy does, for a checkpoint."""
+        return self._window.standing()
+
+    def episodes(self) -> dict[str, Any]:
+        """The latest episodes, for a checkpoint; see `EpisodeWindow.state`."""
+        return self._window.state()
 
     def write(
         self,
@@ -192,8 +176,8 @@ class TrainingLog:
         check_diverged(where, counts.diverged, simulated)
         check_losses(where, learnt.losses)
         self.overflows.add(counts.overflowed)
-        self._window.add(counts.episodes)
-        means = self._window.means()
+        self._window.add(counts.episodes, simulated)
+        means = self._window.line()
         self.last_return = means["return"]
         self.line_s.append(line_s)
         line = {

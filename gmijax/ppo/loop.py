@@ -21,12 +21,17 @@ from gmijax.collectives.interface import Reducer, TracedStep
 from gmijax.config import PpoConfig, TrainConfig
 from gmijax.devices import describe_device
 from gmijax.errors import CollectiveError
-from gmijax.learning.checkpoint import checkpoint_meta, require_equal, require_finite
+from gmijax.learning.checkpoint import (
+    checkpoint_meta,
+    require_equal,
+    require_finite,
+    save_episodes,
+)
 from gmijax.learning.checkpoint_saver import CheckpointSaver
 from gmijax.learning.evaluator import Evaluation, Evaluator, evaluation_worlds
 from gmijax.learning.learner import TrainState, make_learner
 from gmijax.learning.report_thread import ReportThread
-from gmijax.learning.start import first_envs, first_state
+from gmijax.learning.start import first_envs, first_state, first_window
 from gmijax.learning.throughput import ThroughputMeter
 from gmijax.learning.training_log import Learnt, TrainingLog
 from gmijax.ppo.ppo import IterationMetrics, iterate
@@ -171,7 +176,14 @@ class TrainingLoop:
         name = self._config.env.label
         if not self._leader:
             return TrainingLog(name, (), self._env_steps)
-        return TrainingLog.open(name, self._link.run, self._env_steps)
+        steps_at_once = self._steps_per_iteration // self._config.algo.unroll_length
+        window = first_window(
+            self._config,
+            self._env.spec.episode_length * steps_at_once,
+            self._link.gmi,
+            self._reducer.world_size,
+        )
+        return TrainingLog.open(name, self._link.run, self._env_steps, window)
 
     def _train(
         self, state: TrainState, env_state: Any, log: TrainingLog
@@ -258,10 +270,11 @@ class TrainingLoop:
         config, steps = self._config, self._env_steps
         require_equal(self._reducer, self._link.gmi, state.params, steps)
         require_finite(state.params, config.env.label, steps)
-        num_gmis, returns = self._reducer.world_size, log.last_return
+        num_gmis, episodes = self._reducer.world_size, log.episodes()
         evaluated = None if evaluation is None else evaluation.mean_return
-        meta = checkpoint_meta(config, steps, num_gmis, returns, evaluated)
-        self._saver.begin(meta, state, env_state)
+        meta = checkpoint_meta(config, steps, num_gmis, log.standing(), evaluated)
+        save_more = partial(save_episodes, self._link.run, steps, config, episodes)
+        self._saver.begin(meta, state, env_state, save_more)
 
     def _meet(self) -> None:
         """Returns when all GMIs have called it."""

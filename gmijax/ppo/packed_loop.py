@@ -27,11 +27,13 @@ from gmijax.learning.checkpoint import (
     on_host,
     require_finite,
     save_envs,
+    save_episodes,
     save_learner,
 )
+from gmijax.learning.episode_window import Standing
 from gmijax.learning.learner import Learner, TrainState, make_learner
 from gmijax.learning.report_thread import ReportThread
-from gmijax.learning.start import first_envs, first_state
+from gmijax.learning.start import first_envs, first_state, first_window
 from gmijax.learning.training_log import TrainingLog
 from gmijax.ppo.loop import report, warm_up
 from gmijax.ppo.ppo import IterationMetrics, iterate
@@ -62,9 +64,11 @@ class Member:
         assert self._log is not None
         return self._log
 
-    def open_log(self, env_steps: int) -> None:
+    def open_log(self, env_steps: int, episode_length: int) -> None:
         """Before the first line."""
-        self._log = TrainingLog.open(self.config.env.label, self.run, env_steps)
+        config = self.config
+        window = first_window(config, episode_length * config.envs_per_gmi, 0, 1)
+        self._log = TrainingLog.open(config.env.label, self.run, env_steps, window)
 
     def report(self, env_steps: int, metrics: IterationMetrics) -> None:
         """Writes a line; if its numbers are not finite, the run has failed."""
@@ -73,7 +77,9 @@ class Member:
         except NonFiniteError as error:
             self._fail(error)
 
-    def save(self, env_steps: int, state: TrainState, envs: BatchState) -> None:
+    def save(
+        self, env_steps: int, state: TrainState, envs: BatchState, episodes: dict[str, Any]
+    ) -> None:
         """Writes a checkpoint, without its name; if numbers are not finite, the run fails."""
         try:
             require_finite(state.params, self.config.env.label, env_steps)
@@ -82,10 +88,11 @@ class Member:
             return
         save_envs(self.run, env_steps, 0, envs)
         save_learner(self.run, env_steps, state)
+        save_episodes(self.run, env_steps, self.config, episodes)
 
-    def name_checkpoint(self, env_steps: int, returns: float | None) -> None:
-        """After `save`, `returns` are those of the last episodes before it."""
-        meta = checkpoint_meta(self.config, env_steps, 1, returns)
+    def name_checkpoint(self, env_steps: int, standing: Standing) -> None:
+        """After `save`."""
+        meta = checkpoint_meta(self.config, env_steps, 1, standing)
         self._checkpoint = finish_checkpoint(self.run, meta, self.config.run.keep_checkpoints)
 
     def result(self, steps_per_iteration: int) -> dict[str, Any]:
@@ -153,7 +160,7 @@ class PackedLoop:
         if self._warms_up:
             states, envs = warm_up(self._iteration, states, envs)
         for member in self._members:
-            member.open_log(self._env_steps)
+            member.open_log(self._env_steps, self._env.spec.episode_length)
         first_steps, started_s = self._env_steps, time.monotonic()
         stopped = self._train(states, envs)
         wall_s = time.monotonic() - started_s
@@ -223,22 +230,23 @@ class PackedLoop:
         """Begins to save; training goes on meanwhile."""
         self._iteration.wait()
         thread.wait()  # A resumed run goes on from the lines up to its checkpoint.
-        returns = [member.log.last_return for member in self._members]
+        logs = [member.log for member in self._members]
+        episodes, standings = zip(*((log.episodes(), log.standing()) for log in logs), strict=True)
         together = on_host((states, envs))
         parts = [
-            jax.tree.map(lambda leaf, k=number: leaf[k], together)
-            for number in range(len(self._members))
+            (*jax.tree.map(lambda leaf, k=number: leaf[k], together), latest)
+            for number, latest in enumerate(episodes)
         ]
-        self._saver.report(self._env_steps, returns, parts)
+        self._saver.report(self._env_steps, standings, parts)
 
-    def _save_all(self, env_steps: int, returns: Sequence[float | None], parts: Any) -> None:
+    def _save_all(self, env_steps: int, standings: Sequence[Standing], parts: Any) -> None:
         going_on = [number for number, one in enumerate(self._members) if one.error is None]
         for number in going_on:  # In turn: orbax can block when several threads use it.
             self._members[number].save(env_steps, *parts[number])
         # All at once, so that after a fault they go on from the same step.
         for number in going_on:
             if self._members[number].error is None:
-                self._members[number].name_checkpoint(env_steps, returns[number])
+                self._members[number].name_checkpoint(env_steps, standings[number])
 
 
 def _iterate_all(

@@ -47,10 +47,12 @@ class CheckpointMeta:
     # Widths of the policy and of the value network.
     hidden: tuple[tuple[int, ...], tuple[int, ...]]
     impl: str  # Physics implementation; environment states of one cannot be used by the other.
-    # Of the latest episodes before it, None while none had ended.
+    # Of the latest episodes before it (`EpisodeWindow`), None while none had ended.
     mean_return: float | None = None
     # Of the evaluation at `env_steps`, None if there was none.
     eval_return: float | None = None
+    # Whether `mean_return` is over enough episodes; not known of older versions.
+    window_full: bool = False
     # As the run was told, that of the schedule is in the learner's state.
     learning_rate: float | None = None
     # When it was written, seconds since 1970: files get new times when a run is copied.
@@ -133,21 +135,32 @@ def best_evaluation(folder: Path, env_steps: int) -> float:
     Of those that have a checkpoint, and the best one always has.
     """
     found = (rank_of(path) for path in checkpoints_of(folder) if int(path.name) <= env_steps)
-    return max((mean for is_evaluated, mean in found if is_evaluated), default=-math.inf)
+    return max((rank.value for rank in found if rank.is_evaluated), default=-math.inf)
 
 
-def rank_of(checkpoint: Path) -> tuple[bool, float]:
-    """What checkpoints are ranked by, the best one has the largest.
+class Rank(NamedTuple):
+    """What checkpoints are ranked by; the best one has the largest.
 
-    Its evaluation; one without comes after all that have one, by its mean return in training.
+    One without an evaluation comes after all that have one. Its mean return in training counts
+    after all those of full windows where its own window is not: at the start of a run it is of
+    short episodes alone.
     """
+
+    is_evaluated: bool
+    is_full: bool
+    value: float
+
+
+def rank_of(checkpoint: Path) -> Rank:
+    """The rank of a checkpoint."""
     try:
         meta = CheckpointMeta.read(checkpoint)
     except ConfigError:
-        return False, -math.inf
+        return Rank(False, False, -math.inf)
     if meta.eval_return is not None:
-        return True, meta.eval_return
-    return False, -math.inf if meta.mean_return is None else meta.mean_return
+        return Rank(True, True, meta.eval_return)
+    mean = -math.inf if meta.mean_return is None else meta.mean_return
+    return Rank(False, meta.window_full, mean)
 
 
 def what_is_broken(checkpoint: Path) -> str | None:

@@ -30,6 +30,7 @@ from training_jobs import (
 )
 
 from gmijax.a3c.report import MAX_COUNTED
+from gmijax.learning.episode_window import WINDOW_EPISODES
 from gmijax.runs.history import read_metrics
 from gmijax.runs.resume import find_checkpoint
 
@@ -158,6 +159,10 @@ def test_a_job_goes_on_from_its_checkpoint_until_an_agent_is_killed_and_named(
     lines = read_metrics(run / "metrics.jsonl")
     assert lines[: len(history)] == history
     assert all(line["env_steps"] > before for line in lines[len(history) :])
+    (kept,) = (two_and_two / "checkpoints").glob("[0-9]*/episodes.json")
+    told = sum(one["count"] for one in _read(kept)["ended"])
+    assert told == history[-1]["window/episodes"]  # The last line is in the last checkpoint.
+    assert lines[len(history)]["window/episodes"] >= min(told, WINDOW_EPISODES)
 
 
 @pytest.mark.timeout(300)

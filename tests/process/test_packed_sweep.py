@@ -13,6 +13,7 @@ from typing import Any
 import pytest
 from training_jobs import POINT, STEPS, child_environment, gmi_pid, kill, start, train, wait_until
 
+from gmijax.learning.episode_window import WINDOW_EPISODES
 from gmijax.runs.history import read_metrics
 from gmijax.runs.resume import newest_checkpoint
 
@@ -97,6 +98,9 @@ def test_after_a_kill_and_a_stop_all_jobs_of_a_program_go_on(tmp_path: Path) -> 
     assert states(tmp_path) == ["failed", "completed"] * 2
     assert "NonFiniteError" in done.stderr
     for run in runs:
+        # Windows go on where jobs do: a hundred episodes of 20 steps are there from here on.
+        full = [line["window/episodes"] for line in lines(run) if line["env_steps"] > 60 * STEPS]
+        assert min(full) >= WINDOW_EPISODES
         summary = json.loads((run / "summary.json").read_text())
         assert summary["status"] == "completed"
         assert [line["env_steps"] for line in lines(run)] == [

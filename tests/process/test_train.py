@@ -28,7 +28,8 @@ from training_jobs import (
     wait_until,
 )
 
-from gmijax.runs.resume import find_checkpoint
+from gmijax.runs.history import read_metrics
+from gmijax.runs.resume import CheckpointMeta, find_checkpoint
 
 
 def _read(path: Path) -> dict[str, Any]:
@@ -115,6 +116,29 @@ def test_two_gmis_compute_what_one_process_with_all_environments_does(two_gmis: 
     for both, alone in zip(learner_arrays(two_gmis), one, strict=True):
         # Eighteen updates of Adam at 3e-4: a wrong gradient would move parameters by 5e-3.
         np.testing.assert_allclose(both, alone, rtol=2e-3, atol=2e-4)
+
+
+@pytest.mark.timeout(300)
+def test_a_resumed_run_logs_what_one_that_was_not_stopped_does(tmp_path: Path) -> None:
+    half, whole = f"num_timesteps={12 * STEPS}", f"num_timesteps={24 * STEPS}"
+    for command in ((whole, "run.dir=whole"), (half, "run.dir=parts"), (whole, "run.dir=parts")):
+        resume = ("run.resume=auto",) if "run.dir=parts" in command else ()
+        done = train(*POINT, *command, *resume, cwd=tmp_path)
+        assert done.returncode == 0, done.stderr
+    one, other = (read_metrics(tmp_path / name / "metrics.jsonl") for name in ("whole", "parts"))
+    assert len(one) == len(other) == 24
+    for mine, theirs in zip(one, other, strict=True):
+        for key in (
+            "return",
+            "window/return",
+            "window/episodes",
+            "reward/near",
+            "loss/value_loss",
+        ):
+            assert mine[key] == theirs[key], key
+    meta = CheckpointMeta.read(find_checkpoint(str(tmp_path / "parts"), "test"))
+    assert meta.mean_return == one[-1]["window/return"]
+    assert meta.window_full == bool(one[-1]["window/full"])
 
 
 @pytest.mark.timeout(300)

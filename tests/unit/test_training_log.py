@@ -13,11 +13,11 @@ import pytest
 from toy_env import metrics_from, point_mass
 
 from gmijax.errors import NonFiniteError
+from gmijax.learning.episode_window import EpisodeWindow
 from gmijax.learning.evaluator import Evaluation
 from gmijax.learning.physics_health import TOLERATED_STEPS
 from gmijax.learning.report_thread import ReportThread
 from gmijax.learning.training_log import (
-    EpisodeWindow,
     JsonlSink,
     TensorBoardSink,
     TrainingLog,
