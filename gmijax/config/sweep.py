@@ -32,7 +32,9 @@ class SweepConfig(KeyGroup):
         default="gmi",
     )
     objective: str = doc(
-        "what jobs are ranked by: a key of their metrics; its best value counts", default="return"
+        "what jobs are ranked by: a key of their metrics, of means over episodes at the end of a "
+        "job, of evaluations the best; auto: eval/return if all jobs have eval.every, else return",
+        default="auto",
     )
     direction: Literal["maximize", "minimize"] = doc(
         "whether a larger or a smaller objective is better", default="maximize"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import os
 import sys
 from collections.abc import Mapping
@@ -68,6 +69,12 @@ def _is_line(data: object) -> bool:
     return type(data.get("env_steps")) is int and all(
         type(value) in (int, float) and abs(value) <= sys.float_info.max for value in numbers
     )
+
+
+def number_in(line: Mapping[str, Any], key: str) -> float | None:
+    """A finite number of a line, None if it has none of this name."""
+    found = line.get(key)
+    return float(found) if isinstance(found, int | float) and math.isfinite(found) else None
 
 
 def scalars(line: Mapping[str, float | int | None]) -> dict[str, float]:

@@ -57,11 +57,11 @@ class Child:
         log: Path,
         variables: Mapping[str, str],
     ) -> None:
-        write_json(order, {"configs": list(configs), "cpus": list(cpus)})
         self._log = log
         self._pipe = GuardPipe()
         self._ended_s: float | None = None
         try:
+            write_json(order, {"configs": list(configs), "cpus": list(cpus)})
             with log.open("ab") as output:
                 self._process = subprocess.Popen(
                     command(MODULE, str(order), str(self._pipe.read_end)),
@@ -75,7 +75,7 @@ class Child:
                 )
         except OSError as error:
             self._pipe.close()
-            raise GmijaxError(f"{order.stem}: cannot be started ({error.strerror})") from None
+            raise GmijaxError(f"job {order.stem}: cannot be started ({error.strerror})") from None
         finally:
             os.close(self._pipe.read_end)
 

@@ -1,4 +1,4 @@
-"""What TensorBoard's HParams tab shows of a job: its overrides and its best objective."""
+"""What TensorBoard's HParams tab shows of a job: its overrides and its objective."""
 
 from __future__ import annotations
 
@@ -14,7 +14,8 @@ _SUFFIX = ".hparams"
 def write_hparams(job: Job, run: RunPaths, objective: str) -> None:
     """Adds to the TensorBoard folder of a job that has ended, if it has a value.
 
-    The objective is the scalar `hparam/<objective>`: the curves have tags of their own.
+    The objective is the scalar `hparam/<objective>`: the curves have tags of their own. One that
+    cannot be compared (`Found`) has a tag of its own too.
 
     Raises:
       OSError: it cannot be written.
@@ -28,7 +29,7 @@ def write_hparams(job: Job, run: RunPaths, objective: str) -> None:
     from tensorboardX.summary import hparams, scalar
 
     event: Any = vars(event_pb2)["Event"]  # Made by protobuf at run time.
-    tag = f"hparam/{objective}"
+    tag = f"hparam/{objective}{'' if job.progress.is_full else ' (window not full)'}"
     chosen = {key: _value(text) for key, text in job.overrides.items()}
     run.tensorboard.mkdir(parents=True, exist_ok=True)
     writer = EventsWriter(str(run.tensorboard / "events"), _SUFFIX)

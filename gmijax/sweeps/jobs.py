@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import math
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -16,12 +15,11 @@ from gmijax.config.schema import flatten, to_dict
 from gmijax.config.sweep import SweepConfig
 from gmijax.errors import ConfigError
 from gmijax.runs.folder import RunPaths, read_json
-from gmijax.runs.history import read_metrics
+from gmijax.runs.history import number_in, read_metrics
+from gmijax.sweeps.objective import find, value_of
 from gmijax.sweeps.places import Place
 
 State: TypeAlias = Literal["waiting", "running", "completed", "failed", "pruned", "interrupted"]
-
-_RETURNS = ("return", "eval/return")
 
 DIGITS = 3
 """Of the number of a job in the names of its files; more jobs have more digits."""
@@ -36,6 +34,8 @@ class SweepPaths(RunPaths):
         self.study = root / "study.log"  # Of Optuna.
         self.sweep = root / "sweep.json"  # Jobs, their states and results.
         self.table = root / "sweep.csv"  # One line a job.
+        self.settings = root / "settings.csv"  # One line for all seeds of a setting.
+        self.room = root / ".room"  # Of no use but its size: room for how the sweep ends.
         self.curves = root / "sweep.png"
 
     def job(self, number: int) -> RunPaths:
@@ -59,7 +59,10 @@ class Progress:
       state: see `State`.
       env_steps: environment steps so far.
       env_steps_per_s: of the last iteration; 0 while it does not run.
-      value: best value of the objective so far, None before there is one.
+      value: what it is ranked by (`value_of`), None before there is one.
+      is_full: whether the value can be compared, see `Found`.
+      episodes: how many the value is a mean over, where that is known.
+      latest: the objective in the latest line that has it, over the short window.
       started_s: when this command started it, by the monotonic clock.
       updated_s: when the first line of metrics came after that.
       ended_s: when it ended after that.
@@ -67,13 +70,17 @@ class Progress:
       place: GPUs and places where it runs, in words.
       node: address of the node where it runs or ran last; None: this machine.
       error: why it failed, in one line.
-      curve: environment steps and objective of every line of metrics that has one.
+      curve: environment steps and objective of the lines of metrics that can be compared, or,
+        while there are none, of the others.
     """
 
     state: State = "waiting"
     env_steps: int = 0
     env_steps_per_s: float = 0.0
     value: float | None = None
+    is_full: bool = True
+    episodes: int | None = None
+    latest: float | None = None
     started_s: float | None = None
     updated_s: float | None = None
     ended_s: float | None = None
@@ -99,19 +106,22 @@ class Progress:
         """Takes in a line of metrics."""
         self.env_steps = line["env_steps"]
         self.env_steps_per_s = line.get("env_steps_per_s") or 0.0
-        found = line.get(sweep.objective)
-        if found is None or not math.isfinite(found):
+        if (found := find(line, sweep.objective)) is None:
             return
-        self.curve.append((self.env_steps, found))
-        is_better = self.value is None or (
-            found > self.value if sweep.direction == "maximize" else found < self.value
-        )
-        if is_better:
-            self.value = found
+        latest = number_in(line, sweep.objective)
+        self.latest = found.number if latest is None else latest
+        if self.curve and self.is_full and not found.is_full:
+            return
+        if not self.is_full and found.is_full:
+            self.curve.clear()
+        self.is_full, self.episodes = found.is_full, found.episodes
+        self.curve.append((self.env_steps, found.number))
+        self.value = value_of(self.curve, sweep)
 
     def read(self, run: RunPaths, sweep: SweepConfig) -> None:
         """Takes in all metrics that a run folder has."""
-        self.value, self.curve = None, []
+        self.value, self.latest, self.curve = None, None, []
+        self.is_full, self.episodes = True, None
         for line in read_metrics(run.metrics):
             self.take(line, sweep)
         self.env_steps_per_s = 0.0
@@ -135,8 +145,8 @@ class Job:
 
     @property
     def label(self) -> str:
-        """The overrides in one line."""
-        return label_of(self.overrides) or "-"
+        """The overrides in one line; nothing if there are none."""
+        return label_of(self.overrides)
 
     @property
     def num_gpus(self) -> int:
@@ -208,26 +218,6 @@ def require_placeable(jobs: Sequence[Job], num_gpus: int) -> None:
                 f"run.resume={job.config.run.resume}: the jobs of a sweep start from nothing, or "
                 "go on where the same sweep was interrupted"
             )
-
-
-def require_objective(jobs: Sequence[Job], sweep: SweepConfig) -> None:
-    """Raises ConfigError if jobs are to be ranked by evaluations that they do not make."""
-    if sweep.objective.startswith("eval/") and any(job.config.eval.every is None for job in jobs):
-        raise ConfigError(
-            f"sweep.objective={sweep.objective}: needs eval.every, environment steps between "
-            "evaluations"
-        )
-
-
-def why_not_comparable(jobs: Sequence[Job], sweep: SweepConfig) -> str | None:
-    """A warning if jobs are ranked by returns of different rewards, else None."""
-    first, *others = (dict(job.config.env.rewards) for job in jobs)
-    if sweep.objective not in _RETURNS or all(other == first for other in others):
-        return None
-    return (
-        f"warning: sweep.objective={sweep.objective}: jobs differ in env.rewards, so their "
-        "returns cannot be compared; a metric of the task can (sweep.objective=metric/...)"
-    )
 
 
 def placed(

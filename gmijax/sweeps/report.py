@@ -1,10 +1,11 @@
-"""What a sweep leaves: `sweep.json`, `sweep.csv`, a ranking, and one picture of all curves."""
+"""What a sweep leaves: tables as JSON, as CSV and for people, and one picture of all curves."""
 
 from __future__ import annotations
 
 import csv
 import io
 import math
+import os
 import time
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
@@ -15,22 +16,29 @@ from rich.table import Table
 
 from gmijax.config.schema import to_dict
 from gmijax.config.sweep import SweepConfig
-from gmijax.runs.folder import write_json, write_text
+from gmijax.runs.folder import write_bytes, write_json, write_text
+from gmijax.sweeps.by_setting import Middle, Row, grouped, middle_of, place_of, settings_of
 from gmijax.sweeps.jobs import Job, State, SweepPaths, label_of, trainings_per_hour
 from gmijax.version import __version__
 
 CURVE_POINTS = 200
-_QUARTILES = (25, 75)
+_OF_JOB = ("state", "value", "window_full", "episodes", "env_steps", "wall_s", "run_dir", "error")
+_OF_SETTING = ("n", "interquartile_mean", "low", "high", "window_full")
+
+_ROOM_BYTES = 1 << 16
 
 
-class LiveReport:
-    """Keeps `sweep.json` and `sweep.csv` true while a sweep runs, so that a kill leaves them true.
+class Report:
+    """The files of a sweep, true also where it is killed or the disk gets full.
 
     Args:
       jobs: those that are known; more may be added to the list.
       sweep: settings.
       paths: files of the sweep.
       started_s: when the command began, by the monotonic clock.
+
+    Attributes:
+      data: the newest content of `sweep.json`.
     """
 
     def __init__(
@@ -38,85 +46,149 @@ class LiveReport:
     ) -> None:
         self._jobs, self._sweep, self._paths, self._started_s = jobs, sweep, paths, started_s
         self._states: list[State] = []
+        self.data: dict[str, Any] = {}
+
+    def begin(self) -> None:
+        """Says that the sweep runs, and keeps room for how it ends.
+
+        Raises:
+          OSError: there is none.
+        """
+        self._write("running")
+        draw_curves(self._jobs, self._sweep, self._paths)
+        size = _ROOM_BYTES + 2 * self._paths.sweep.stat().st_size
+        with self._paths.room.open("wb") as file:
+            os.posix_fallocate(file.fileno(), 0, size)
 
     def update(self) -> None:
-        """Writes them if the state of a job has changed."""
+        """Writes the tables if the state of a job has changed."""
         states: list[State] = [job.progress.state for job in self._jobs]
         if states == self._states:
             return
         self._states = states
         with suppress(OSError):  # A full disk must not end the sweep.
-            wall_s = time.monotonic() - self._started_s
-            _write_tables("running", self._jobs, self._sweep, self._paths, wall_s)
+            self._write("running")
+
+    def end(self, status: str) -> str | None:
+        """Says how the sweep has ended; why that cannot be written, if it cannot."""
+        wrong = None
+        with suppress(OSError):
+            self._paths.room.unlink(missing_ok=True)
+        for write in (
+            lambda: self._write(status),
+            lambda: draw_curves(self._jobs, self._sweep, self._paths),
+        ):
+            try:
+                write()
+            except OSError as error:
+                wrong = wrong or f"the report cannot be written ({error.strerror or error})"
+        return wrong
+
+    def _write(self, status: str) -> None:
+        wall_s = time.monotonic() - self._started_s
+        self.data = _content(status, self._jobs, self._sweep, self._paths, wall_s)
+        write_tables(self.data, self._paths)
 
 
-def write_report(
-    status: str,
-    jobs: Sequence[Job],
-    sweep: SweepConfig,
-    paths: SweepPaths,
-    wall_s: float,
-) -> dict[str, Any]:
-    """Writes the files; returns the content of `sweep.json`."""
-    data = _write_tables(status, jobs, sweep, paths, wall_s)
-    draw_curves(jobs, sweep, paths)
-    return data
-
-
-def _write_tables(
+def _content(
     status: str, jobs: Sequence[Job], sweep: SweepConfig, paths: SweepPaths, wall_s: float
 ) -> dict[str, Any]:
     first_s = min((job.progress.started_s or math.inf for job in jobs), default=math.inf)
     rows = [_row(job, paths, first_s) for job in jobs]
-    data = {
+    return {
         "status": status,
         "sweep": to_dict(sweep),
         "wall_s": round(wall_s, 3),
         "trainings_per_hour": trainings_per_hour(jobs),
+        "settings": settings_of(rows, sweep),
         "ranking": [row["job"] for row in ranked(rows, sweep)],
         "jobs": rows,
         "versions": {"gmijax": __version__},
     }
+
+
+def write_tables(data: Mapping[str, Any], paths: SweepPaths) -> None:
+    """Writes the content of `sweep.json`, and its tables as CSV."""
     write_json(paths.sweep, data)
-    write_text(paths.table, _csv(rows))
-    return data
+    write_text(paths.table, _csv(data["jobs"], "job", *_OF_JOB))
+    settings = [_flat(setting) for setting in data["settings"]]
+    write_text(paths.settings, _csv(settings, "jobs", *_OF_SETTING))
 
 
-def ranked(rows: Sequence[Mapping[str, Any]], sweep: SweepConfig) -> list[Mapping[str, Any]]:
-    """Rows that have a value, the best first."""
-    sign = -1.0 if sweep.direction == "maximize" else 1.0
-    return sorted(
-        (row for row in rows if row["value"] is not None), key=lambda row: sign * row["value"]
-    )
+def _flat(setting: Row) -> Row:
+    low, high = setting["quartiles"] or (None, None)
+    jobs = " ".join(map(str, setting["jobs"]))
+    return {**setting, "jobs": jobs, "low": low, "high": high}
 
 
-def ranking(rows: Sequence[Mapping[str, Any]], sweep: SweepConfig) -> Table:
-    """The ranking for people; below it jobs without a value, such as those that have failed."""
-    table = Table(box=None, pad_edge=False)
-    for heading in ("rank", "job", "overrides", f"best {sweep.objective}", "steps", "state"):
-        table.add_column(heading)
+def ranked(rows: Sequence[Row], sweep: SweepConfig) -> list[Row]:
+    """Rows that have a value, the best first; those without a full window come last."""
+    found = [row for row in rows if row["value"] is not None]
+    return sorted(found, key=lambda row: place_of(row, row["value"], sweep))
+
+
+def tables(report: Mapping[str, Any], sweep: SweepConfig) -> list[Table]:
+    """The ranking for people: of settings, where they have several seeds, and of jobs."""
+    jobs = _job_table(report["jobs"], sweep)
+    settings = report["settings"]
+    if all(len(setting["jobs"]) == 1 for setting in settings):
+        return [jobs]
+    return [_setting_table(settings, sweep), jobs]
+
+
+def _setting_table(settings: Sequence[Row], sweep: SweepConfig) -> Table:
+    mean = f"{sweep.objective}, interquartile mean"
+    table = _table("rank", "setting", mean, "quartiles", "n")
+    for rank, setting in enumerate(settings, 1):
+        label, of = label_of(setting["overrides"]) or "all seeds", len(setting["jobs"])
+        n = str(of) if setting["n"] == of else f"{setting['n']} of {of}"
+        if setting["quartiles"] is None:
+            table.add_row("-", label, "-", "-", n)
+            continue
+        low, high = setting["quartiles"]
+        note = "" if setting["window_full"] else " (windows not full)"
+        middle = f"{setting['interquartile_mean']:.4g}{note}"
+        table.add_row(str(rank), label, middle, f"{low:.4g} to {high:.4g}", n)
+    return table
+
+
+def _job_table(rows: Sequence[Row], sweep: SweepConfig) -> Table:
+    """Below the ranking are jobs without a value, such as those that have failed."""
+    table = _table("rank", "job", "overrides", sweep.objective, "steps", "state")
     listed = [(str(rank), row) for rank, row in enumerate(ranked(rows, sweep), 1)]
     listed += [("-", row) for row in rows if row["value"] is None]
     for rank, row in listed:
-        value = "-" if row["value"] is None else f"{row['value']:.4g}"
+        value = shown(row["value"], row["window_full"], row["episodes"])
         label, steps = label_of(row["overrides"]), f"{row['env_steps']:,}"
         table.add_row(rank, str(row["job"]), label, value, steps, row["state"])
+    return table
+
+
+def shown(value: float | None, is_full: bool, episodes: int | None) -> str:
+    """A value for people, who are told where it cannot be compared."""
+    if value is None:
+        return "-"
+    if is_full:
+        return f"{value:.4g}"
+    over = "" if episodes is None else f"{episodes:,} episodes, "
+    return f"{value:.4g} ({over}window not full)"
+
+
+def _table(*headings: str) -> Table:
+    table = Table(box=None, pad_edge=False)
+    for heading in headings:
+        table.add_column(heading)
     return table
 
 
 def draw_curves(jobs: Sequence[Job], sweep: SweepConfig, paths: SweepPaths) -> None:
     """Draws the objective over environment steps: one line for all seeds of the same settings.
 
-    The line is the interquartile mean over the seeds, the band the range between the quartiles
-    (as rliable draws them, arXiv 2108.13264). Without any value there is no picture.
+    The line is the interquartile mean over the seeds, the band the range between the quartiles.
+    Without any value there is no picture.
     """
-    groups: dict[str, list[list[tuple[int, float]]]] = {}
-    for job in jobs:
-        if curve := job.progress.curve:
-            own = {key: value for key, value in job.overrides.items() if key != "seed"}
-            label = label_of(own) or "all seeds"
-            groups.setdefault(label, []).append(curve)
-    if not groups:
+    drawn = grouped((job for job in jobs if job.progress.curve), lambda job: job.overrides)
+    if not drawn:
         return
     # Imported here: it costs half a second that no other use of this module should pay.
     from matplotlib.backends.backend_agg import FigureCanvasAgg
@@ -125,30 +197,25 @@ def draw_curves(jobs: Sequence[Job], sweep: SweepConfig, paths: SweepPaths) -> N
     figure = Figure(figsize=(8, 5), layout="constrained")
     FigureCanvasAgg(figure)
     axes = figure.add_subplot()
-    for label, curves in groups.items():
-        steps, middle, low, high = spread(curves)
-        axes.plot(steps, middle, label=f"{label} (n={len(curves)})")
-        if len(curves) > 1:
-            axes.fill_between(steps, low, high, alpha=0.2)
+    for label, own in drawn.items():
+        steps, middle = spread([job.progress.curve for job in own])
+        axes.plot(steps, middle.mean, label=f"{label} (n={len(own)})")
+        if len(own) > 1:
+            axes.fill_between(steps, middle.low, middle.high, alpha=0.2)
     axes.set(xlabel="environment steps", ylabel=sweep.objective)
     axes.grid(alpha=0.3)
     axes.legend(fontsize="small")
-    figure.savefig(paths.curves, dpi=120)
+    drawn_png = io.BytesIO()
+    figure.savefig(drawn_png, dpi=120)
+    write_bytes(paths.curves, drawn_png.getvalue())
 
 
-def spread(
-    curves: Sequence[Sequence[tuple[int, float]]],
-) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Steps [P], interquartile mean [P] and both quartiles [P] over curves, where all are."""
+def spread(curves: Sequence[Sequence[tuple[int, float]]]) -> tuple[np.ndarray, Middle]:
+    """Steps [P], and the middle of curves there, [P], where all curves are."""
     first = max(curve[0][0] for curve in curves)
     last = min(curve[-1][0] for curve in curves)
     steps = np.linspace(first, max(first, last), CURVE_POINTS)
-    values = np.stack([np.interp(steps, *np.array(curve).T) for curve in curves])
-    low, high = np.percentile(values, _QUARTILES, axis=0)
-    inside = (values >= low) & (values <= high)
-    # With two or three curves the quartiles lie between them, and nothing else does.
-    inside |= ~inside.any(axis=0)
-    return steps, (values * inside).sum(axis=0) / inside.sum(axis=0), low, high
+    return steps, middle_of(np.stack([np.interp(steps, *np.array(curve).T) for curve in curves]))
 
 
 def _row(job: Job, paths: SweepPaths, first_s: float) -> dict[str, Any]:
@@ -161,6 +228,8 @@ def _row(job: Job, paths: SweepPaths, first_s: float) -> dict[str, Any]:
         "state": progress.state,
         "node": progress.node,
         "value": progress.value,
+        "window_full": progress.is_full,
+        "episodes": progress.episodes,
         "env_steps": progress.env_steps,
         "start_s": None if start_s is None else round(start_s - first_s, 3),
         "first_update_s": None if not start_s or not update_s else round(update_s - start_s, 3),
@@ -169,13 +238,13 @@ def _row(job: Job, paths: SweepPaths, first_s: float) -> dict[str, Any]:
     }
 
 
-def _csv(rows: Sequence[Mapping[str, Any]]) -> str:
+def _csv(rows: Sequence[Row], first: str, *own: str) -> str:
+    """A table with the columns `first`, every override, and `own`."""
     keys = list(dict.fromkeys(key for row in rows for key in row["overrides"]))
     output = io.StringIO()
-    own = ("state", "value", "env_steps", "wall_s", "run_dir", "error")
     writer = csv.writer(output, lineterminator="\n")
-    writer.writerow(["job", *keys, *own])
+    writer.writerow([first, *keys, *own])
     for row in rows:
         values = [row["overrides"].get(key, "") for key in keys]
-        writer.writerow([row["job"], *values, *(row[name] for name in own)])
+        writer.writerow([row[first], *values, *(row[name] for name in own)])
     return output.getvalue()

@@ -8,6 +8,7 @@ from typing import NamedTuple
 from gmijax.control.exit_codes import EXIT_BAD_INPUT, EXIT_INTERRUPTED
 from gmijax.runs.folder import RunPaths
 from gmijax.runs.history import MetricsReader
+from gmijax.supervise.failures import signal_name
 from gmijax.sweeps.children import Seen
 from gmijax.sweeps.jobs import Job
 from gmijax.sweeps.nodes import Host
@@ -21,8 +22,9 @@ class Outcome(NamedTuple):
     Attributes:
       is_interrupted: whether it was asked to end.
       error: why it failed.
-      is_fault: whether it may be tried again: its machine is gone, or the process that it shared
-        with others. A job that has processes of its own tries again itself.
+      is_fault: whether it may be tried again: its machine is gone, its controller was killed, or
+        the process that it shared with others is. From other faults a job with processes of its
+        own goes on by itself.
     """
 
     is_interrupted: bool = False
@@ -40,7 +42,8 @@ class Running:
       host: the machine.
       child: its number there.
       readers: of their metrics.
-      is_pruned: whether it was asked to end because others are better.
+      is_asked: whether it was asked to end.
+      is_pruned: whether that was because others are better.
       is_killed: whether it was ended by force, as the whole sweep is.
     """
 
@@ -49,6 +52,7 @@ class Running:
     host: Host
     child: int
     readers: tuple[MetricsReader, ...]
+    is_asked: bool = False
     is_pruned: bool = False
     is_killed: bool = False
 
@@ -58,6 +62,7 @@ class Running:
 
     def order_stop(self) -> None:
         """Asks it to save and end."""
+        self.is_asked = True
         self.host.order(self.child, "ask_to_stop")
 
     def is_over(self) -> bool:
@@ -72,9 +77,14 @@ class Running:
             return Outcome(error=own.error)
         if seen.exit_code == 0 and not are_several:
             return Outcome()
-        if seen.exit_code == EXIT_INTERRUPTED or self.is_killed:
+        if self.is_killed or (seen.exit_code == EXIT_INTERRUPTED and self.is_asked):
             return Outcome(is_interrupted=True)
         if seen.exit_code is None:
             return Outcome(error=self.host.lost, is_fault=True)
+        if seen.exit_code == EXIT_INTERRUPTED:
+            return Outcome(error="interrupted by a signal from elsewhere", is_fault=True)
+        if seen.exit_code < 0:
+            killed_by = signal_name(-seen.exit_code)
+            return Outcome(error=f"its controller was killed by {killed_by}", is_fault=True)
         error = seen.said.removeprefix("gmijax.train: ") or f"exit code {seen.exit_code}"
         return Outcome(error=error, is_fault=are_several and seen.exit_code != EXIT_BAD_INPUT)

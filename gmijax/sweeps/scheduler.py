@@ -10,7 +10,7 @@ from typing import Any
 
 from gmijax.config.schema import to_dict
 from gmijax.config.sweep import SweepConfig
-from gmijax.errors import JobInterrupted, NodeLost
+from gmijax.errors import GmijaxError, JobInterrupted, NodeLost
 from gmijax.runs.folder import add_event
 from gmijax.runs.held import is_locked
 from gmijax.runs.history import MetricsReader
@@ -35,8 +35,8 @@ class Scheduler:
 
     A job that fails ends alone. But where it shared an MPS daemon, and the fault may have been
     that of another client, it is run once more, from its last checkpoint and alone on its GPU.
-    Jobs of a machine that is gone, or of a process that they shared, run again, as often as
-    `run.max_restarts` says.
+    Jobs whose controller was killed, or of a machine that is gone, or of a process that they
+    shared, run again, as often as `run.max_restarts` says.
 
     Args:
       jobs: those that are known; those that are `waiting` are run. More come from the study.
@@ -67,6 +67,7 @@ class Scheduler:
         self._faults: Counter[int] = Counter()
         self._running: dict[int, Running] = {}
         self._compiling: dict[tuple[int, str], int] = {}
+        self._unwritten: OSError | None = None
 
     def run(self, signals: StopSignals) -> None:
         """Returns when all jobs have ended.
@@ -74,21 +75,29 @@ class Scheduler:
         Raises:
           JobInterrupted: a signal came; all jobs have saved and ended.
           NodeLost: no machine is left.
+          GmijaxError, OSError: a job cannot be started, or the study not be written; all jobs have
+            saved and ended.
         """
         try:
             self._start_what_fits()
             while self._queue or self._running:
                 if signals.have_come:
-                    self._stop(signals)
                     raise JobInterrupted("interrupted")
                 self._look()
+                if self._unwritten is not None:
+                    raise self._unwritten
                 if not self._places.left:
                     raise NodeLost(f"no node is left: {self._hosts[-1].lost}")
                 self._start_what_fits()
                 self._on_tick()
                 time.sleep(_TICK_S)
+        except (GmijaxError, OSError):
+            self._stop(signals)
+            raise
         finally:
             self._kill_all()
+            for job in self._queue:
+                self._tell(job)
 
     def _start_what_fits(self) -> None:
         for job in list(self._queue):
@@ -161,7 +170,7 @@ class Scheduler:
                     self._nobody_waits_for(running, has_compiled=True)
             if is_over:
                 self._finish(running)
-            elif not running.is_pruned and self._study.is_hopeless(running.jobs[0]):
+            elif not running.is_asked and self._is_hopeless(running.jobs[0]):
                 running.is_pruned = True
                 running.order_stop()
         self._drop_lost()
@@ -197,8 +206,22 @@ class Scheduler:
             return True
         with suppress(OSError):  # A full disk must not end the sweep.
             write_hparams(job, run, self._sweep.objective)
-        self._study.tell(job)
+        self._tell(job)
         return False
+
+    def _is_hopeless(self, job: Job) -> bool:
+        try:
+            return self._study.is_hopeless(job)
+        except OSError as error:
+            self._unwritten = self._unwritten or error
+            return False
+
+    def _tell(self, job: Job) -> None:
+        # Whatever becomes of the study, running jobs are to save and end.
+        try:
+            self._study.tell(job)
+        except OSError as error:
+            self._unwritten = self._unwritten or error
 
     def _why_again(self, running: Running, job: Job, end: Outcome) -> str | None:
         """Why a job that failed runs once more, if that may help."""

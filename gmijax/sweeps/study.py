@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib
+import os
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
@@ -15,6 +16,9 @@ from gmijax.sweeps.space import Interval, Space, as_text
 MakeJob = Callable[[int, Mapping[str, str]], Job]
 _REPORTS = 100
 """Values that a pruner gets of a whole job."""
+
+_FULL = "window_full"
+"""Attribute of a trial: whether its value can be compared."""
 
 _MOST_RANDOM = 10
 """Trials before TPE begins, with many of them: Optuna's default. With few, a quarter of them."""
@@ -39,8 +43,8 @@ class Study:
 class OptunaStudy(Study):
     """Jobs as the trials of an Optuna study, which a file keeps.
 
-    Trials that a killed sweep left running, and failed ones, which stay open in the study, are
-    handed out again first, with their numbers.
+    Trials of jobs that failed or were interrupted wait in the study, and so do those that a killed
+    sweep left running: they are handed out again first, with their numbers.
 
     Args:
       settings: sampler, pruner and number of trials.
@@ -53,12 +57,14 @@ class OptunaStudy(Study):
         self, settings: SweepConfig, space: Space, make_job: MakeJob, journal: Path
     ) -> None:
         self._settings, self._space, self._make_job = settings, space, make_job
-        self._optuna = optuna = _optuna()
+        self._optuna = optuna = optuna_package()
         optuna.logging.set_verbosity(optuna.logging.WARNING)
+        _cut_half_a_line(journal)
         backend = optuna.storages.journal.JournalFileBackend(str(journal))
+        self._storage = optuna.storages.JournalStorage(backend)
         self._study = study = optuna.create_study(
             study_name="sweep",
-            storage=optuna.storages.JournalStorage(backend),
+            storage=self._storage,
             load_if_exists=True,
             direction=settings.direction,
             pruner=_pruner(optuna, settings),
@@ -67,6 +73,10 @@ class OptunaStudy(Study):
         study.sampler = _sampler(optuna, settings, settings.seed + len(study.trials))
         self._distributions = {key: _distribution(optuna, v) for key, v in space.items()}
         self._left = [trial for trial in study.trials if not trial.state.is_finished()]
+        for trial in self._left:
+            self._wait(trial)
+        # A full disk may have kept some of its parameters from being written.
+        self._left = [trial for trial in self._left if trial.params.keys() >= space.keys()]
         self._trials: dict[int, Any] = {}
         self._reported = {t.number: max(t.intermediate_values, default=0) for t in self._left}
 
@@ -74,9 +84,9 @@ class OptunaStudy(Study):
         """The jobs of trials that have ended, the pruned ones marked as such."""
         jobs = []
         for trial in self._study.trials:
-            if trial.state.is_finished():
+            if trial.state.is_finished() and trial.params.keys() >= self._space.keys():
                 jobs.append(self._make_job(trial.number, self._chosen(trial.params)))
-                if trial.state == self._optuna.trial.TrialState.PRUNED:
+                if trial.state == self._states.PRUNED:
                     jobs[-1].progress.state = "pruned"
         return jobs
 
@@ -84,8 +94,9 @@ class OptunaStudy(Study):
         """See `Study`."""
         if self._left:
             found = self._left.pop(0)
+            self._storage.set_trial_state_values(found._trial_id, self._states.RUNNING)
             trial = self._optuna.trial.Trial(self._study, found._trial_id)
-        elif self._settings.trials is None or len(self._study.trials) >= self._settings.trials:
+        elif self._settings.trials is None or self._num_begun() >= self._settings.trials:
             return None
         else:
             trial = self._study.ask(self._distributions)
@@ -100,21 +111,50 @@ class OptunaStudy(Study):
         place = _REPORTS * progress.env_steps // job.config.num_timesteps
         if progress.value is None or place <= self._reported.get(job.number, 0):
             return False
+        if not progress.is_full:
+            return False  # It cannot be compared yet.
         self._reported[job.number] = place
         trial.report(progress.value, place)
         return trial.should_prune()
 
     def tell(self, job: Job) -> None:
         """See `Study`."""
-        states, progress = self._optuna.trial.TrialState, job.progress
+        progress, trial = job.progress, self._trials.get(job.number)
         value, state = progress.value, None
         if progress.state == "pruned":
-            value, state = None, states.PRUNED
+            value, state = None, self._states.PRUNED
         elif progress.state != "completed":
-            return  # The same sweep, run again, goes on with it.
-        elif value is None:
-            state = states.FAIL
+            if trial is not None:
+                self._wait(trial)  # The same sweep, run again, goes on with it.
+            return
+        elif value is None or not self._is_comparable(job):
+            value, state = None, self._states.FAIL
         self._study.tell(job.number, value, state=state, skip_if_finished=True)
+
+    def _is_comparable(self, job: Job) -> bool:
+        """Whether the value of a job may stand beside those of the study.
+
+        That of a window that is not full may as long as no other one is full.
+        """
+        if trial := self._trials.get(job.number):
+            trial.set_user_attr(_FULL, job.progress.is_full)
+        return job.progress.is_full or not any(
+            trial.user_attrs.get(_FULL) for trial in self._study.trials
+        )
+
+    def _wait(self, trial: Any) -> None:
+        if trial.params.keys() >= self._space.keys():
+            self._storage.set_trial_state_values(trial._trial_id, self._states.WAITING)
+        else:
+            self._study.tell(trial.number, state=self._states.FAIL)
+
+    def _num_begun(self) -> int:
+        """Trials with parameters."""
+        return sum(trial.params.keys() >= self._space.keys() for trial in self._study.trials)
+
+    @property
+    def _states(self) -> Any:
+        return self._optuna.trial.TrialState
 
     def _chosen(self, params: Mapping[str, Any]) -> dict[str, str]:
         chosen: dict[str, str] = {}
@@ -124,7 +164,12 @@ class OptunaStudy(Study):
         return chosen
 
 
-def _optuna() -> Any:
+def optuna_package() -> Any:
+    """The package.
+
+    Raises:
+      ConfigError: it is not installed.
+    """
     try:
         # By name, because it is not installed everywhere.
         return importlib.import_module("optuna")
@@ -132,6 +177,14 @@ def _optuna() -> Any:
         raise ConfigError(
             "sweep.sampler, sweep.pruner: need the package optuna (pip install 'gmijax[sweep]')"
         ) from None
+
+
+def _cut_half_a_line(journal: Path) -> None:
+    """Removes what a full disk has left of a line: Optuna reads no further than that."""
+    if journal.exists():
+        whole = journal.read_bytes()
+        if (length := whole.rfind(b"\n") + 1) < len(whole):
+            os.truncate(journal, length)
 
 
 def _distribution(optuna: Any, values: Any) -> Any:

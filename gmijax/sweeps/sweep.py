@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, closing, contextmanager
@@ -19,28 +18,29 @@ from gmijax.control.console import open_console
 from gmijax.control.decide import with_task
 from gmijax.errors import ConfigError, JobInterrupted, SweepFailed
 from gmijax.machine.snapshot import detect_machine
-from gmijax.runs.folder import RUNS, create_run, given_run, read_json, write_json
+from gmijax.runs.folder import RUNS, given_run, read_json, write_json
 from gmijax.runs.held import locked
 from gmijax.supervise.run_gmis import StopSignals, stop_signals
+from gmijax.sweeps.folder import errors_of_files, opened_folder
 from gmijax.sweeps.host import LocalHost
 from gmijax.sweeps.jobs import (
     Job,
     SweepPaths,
     jobs_of,
-    require_objective,
     require_placeable,
     state_of,
-    why_not_comparable,
 )
 from gmijax.sweeps.jobs_per_gpu import with_jobs_per_gpu
 from gmijax.sweeps.nodes import Host, nodes_of
+from gmijax.sweeps.objective import with_objective
 from gmijax.sweeps.packs import require_packable
 from gmijax.sweeps.places import Places, Site, places_of
-from gmijax.sweeps.report import LiveReport, ranking, write_report
+from gmijax.sweeps.report import Report
 from gmijax.sweeps.scheduler import Scheduler
 from gmijax.sweeps.space import Space
-from gmijax.sweeps.study import MakeJob, OptunaStudy, Study
+from gmijax.sweeps.study import MakeJob, OptunaStudy, Study, optuna_package
 from gmijax.sweeps.view import SweepView
+from gmijax.sweeps.words import announce, print_outcome
 
 _LEASE_POLL_S = 0.2
 
@@ -116,10 +116,11 @@ def run_request(request: Request, *, show: bool = False) -> SweepResult:
         # Before anything is started: whether there are such GPUs, and room for so many jobs.
         sites = _sites(request.settings, request, hosts)
         require_placeable(request.jobs, min(site.plan.layout.num_gpus for site in sites))
-        require_objective(request.jobs, request.settings)
+        request = request._replace(settings=with_objective(request.settings, request.jobs))
         require_packable(request.settings, request.jobs)
-        paths = _open(request.jobs)
-        with locked(paths.lock, f"run.dir={paths.root}"):
+        if request.settings.sampler != "grid":
+            optuna_package()
+        with opened_folder(request.jobs) as paths, locked(paths.lock, f"run.dir={paths.root}"):
             return _run(request, hosts, paths, console, started_s)
 
 
@@ -128,45 +129,63 @@ def _run(
 ) -> SweepResult:
     """Runs the sweep of a folder that is locked, on machines where nothing is started yet."""
     settings = request.settings
-    jobs, study = _beginning(request, paths)
-    write_report("running", jobs, settings, paths, 0.0)
+    with errors_of_files(paths):
+        jobs, study = _beginning(request, paths)
+        report = Report(jobs, settings, paths, started_s)
+        report.begin()
     console.print(f"sweep folder: {paths.root}")
     view = SweepView(console, jobs, settings)
-    status = "failed"
     try:
-        with stop_signals() as signals, ExitStack() as held:
-            _lease(hosts, _sites(settings, request, hosts), console, signals)
-            scratch = paths.root if hosts[0].name else None
-            settings = with_jobs_per_gpu(settings, request.jobs, hosts, console, signals, scratch)
-            sites = _sites(settings, request, hosts)
-            _announce(console, sites, request, jobs)
-            for number, (host, site) in enumerate(zip(hosts, sites, strict=True)):
-                held.callback(host.shut)
-                host.open(site.plan, paths.node(number) if host.name else paths)
-            held.enter_context(view)
-            live = LiveReport(jobs, settings, paths, started_s)
-
-            def tick() -> None:
-                live.update()
-                view.update()
-
-            Scheduler(jobs, study, settings, paths, Places(sites), hosts, tick).run(signals)
-        failed = [job for job in jobs if job.progress.state == "failed"]
-        status = "failed" if failed else "completed"
-    except JobInterrupted as error:
-        status = "interrupted"
-        error.add_note(f"the same command with run.dir={paths.root} goes on")
+        with errors_of_files(paths):
+            _train(request, hosts, paths, console, study, report, view, jobs)
+    except BaseException as error:
+        status = "interrupted" if isinstance(error, JobInterrupted) else "failed"
+        if (wrong := report.end(status)) is not None:
+            error.add_note(wrong)
+        if isinstance(error, JobInterrupted | SweepFailed):
+            error.add_note(f"the same command with run.dir={paths.root} goes on")
         raise
-    finally:
-        report = write_report(status, jobs, settings, paths, time.monotonic() - started_s)
-    console.print(ranking(report["jobs"], settings))
-    console.print(f"{view.line()}\nsummary: {paths.sweep}")
+    failed = [job for job in jobs if job.progress.state == "failed"]
+    wrong = report.end("failed" if failed else "completed")
+    print_outcome(console, report.data, settings, paths, view.line())
     if failed:
-        raise SweepFailed(
-            f"{len(failed)} of {len(jobs)} jobs failed; job {failed[0].number}: "
-            f"{failed[0].progress.error}"
-        )
-    return SweepResult(paths.root, report)
+        first = failed[0]
+        text = f"{len(failed)} of {len(jobs)} jobs failed; job {first.number}: "
+        wrong = f"{text}{first.progress.error}{'' if wrong is None else f'; {wrong}'}"
+    if wrong is not None:
+        raise SweepFailed(wrong)
+    return SweepResult(paths.root, report.data)
+
+
+def _train(
+    request: Request,
+    hosts: Sequence[Host],
+    paths: SweepPaths,
+    console: Console,
+    study: Study,
+    report: Report,
+    view: SweepView,
+    jobs: list[Job],
+) -> None:
+    """Runs the jobs; returns when all have ended."""
+    settings = request.settings
+    with stop_signals() as signals, ExitStack() as held:
+        _lease(hosts, _sites(settings, request, hosts), console, signals)
+        scratch = paths.root if hosts[0].name else None
+        settings = with_jobs_per_gpu(settings, request.jobs, hosts, console, signals, scratch)
+        sites = _sites(settings, request, hosts)
+        num_complete = sum(job.progress.state == "completed" for job in jobs)
+        announce(console, sites, request.jobs, settings, num_complete)
+        for number, (host, site) in enumerate(zip(hosts, sites, strict=True)):
+            held.callback(host.shut)
+            host.open(site.plan, paths.node(number) if host.name else paths)
+        held.enter_context(view)
+
+        def tick() -> None:
+            report.update()
+            view.update()
+
+        Scheduler(jobs, study, settings, paths, Places(sites), hosts, tick).run(signals)
 
 
 @contextmanager
@@ -221,20 +240,6 @@ def _with_tasks(request: Request) -> Request:
     )
 
 
-def _open(jobs: Sequence[Job]) -> SweepPaths:
-    """The folder of the sweep, made if it is not there."""
-    run = jobs[0].config.run
-    folder = given_run(run.dir, run.name)
-    if folder is None or not os.path.lexists(folder):
-        return SweepPaths(create_run(run.dir, run.name, "sweep").root)
-    if not folder.is_dir():
-        raise ConfigError(f"run.dir={folder}: is no folder")
-    paths = SweepPaths(folder.resolve())
-    if not paths.request.exists() and any(path != paths.lock for path in folder.iterdir()):
-        raise ConfigError(f"run.dir={folder}: is no folder of a sweep, and not empty")
-    return paths
-
-
 def _beginning(request: Request, paths: SweepPaths) -> tuple[list[Job], Study]:
     """The jobs that are known, as far as an earlier command has come, and where more come from.
 
@@ -269,23 +274,3 @@ def _described(request: Request) -> dict[str, Any]:
         return {"jobs": [dict(job.overrides) for job in request.jobs]}
     sampler = {"sampler": request.settings.sampler, "seed": request.settings.seed}
     return sampler | {"space": {key: list(values) for key, values in request.space.items()}}
-
-
-def _announce(
-    console: Console, sites: Sequence[Site], request: Request, jobs: Sequence[Job]
-) -> None:
-    settings = request.settings
-    total = len(request.jobs) if settings.sampler == "grid" else settings.trials
-    done = sum(job.progress.state == "completed" for job in jobs)
-    more = f", {done} of them complete already" if done else ""
-    places = sum(len(site.plan.slices) for site in sites)
-    gpus = sum(site.plan.layout.num_gpus for site in sites)
-    nodes = f" of nodes {', '.join(site.name for site in sites if site.name)}"
-    console.print(
-        f"{total} jobs{more}, {places} at a time on {gpus} GPUs{nodes if sites[0].name else ''}, "
-        f"backend {sites[0].plan.backend}"
-    )
-    for reason in dict.fromkeys(reason for site in sites for reason in site.plan.reasons):
-        console.print(f"  {reason}")
-    if (warning := why_not_comparable(request.jobs, settings)) is not None:
-        console.print(f"  {warning}")

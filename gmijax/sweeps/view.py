@@ -12,8 +12,9 @@ from rich.text import Text
 from gmijax.config.sweep import SweepConfig
 from gmijax.control.display import LiveDisplay, bar, clock
 from gmijax.sweeps.jobs import Job, Progress, trainings_per_hour
+from gmijax.sweeps.report import shown
 
-_HEADINGS = ("job", "overrides", "GPU and place", "progress", "{}", "best", "ETA", "state")
+_HEADINGS = ("job", "overrides", "GPU and place", "progress", "{}", "ranked by", "ETA", "state")
 _MOST_ROWS = 30
 _BAR_WIDTH = 10
 _ORDER = ("running", "failed", "interrupted", "waiting", "pruned", "completed")
@@ -68,14 +69,14 @@ class SweepView:
                 self._console.print(self._change(job, job.progress))
 
     def _change(self, job: Job, progress: Progress) -> str:
-        what = f"job {job.number} {job.label}: {progress.state}"
+        what = f"{' '.join(filter(None, ('job', str(job.number), job.label)))}: {progress.state}"
         if progress.state == "running":
             return f"{what} on {progress.place}"
         if progress.error:
             return f"{what}: {progress.error}"
-        best = "-" if progress.value is None else f"{progress.value:.4g}"
+        value = shown(progress.value, progress.is_full, progress.episodes)
         name = self._sweep.objective
-        return f"{what} after {progress.wall_s:.0f} s, best {name} {best}; {self.line()}"
+        return f"{what} after {progress.wall_s:.0f} s, {name} {value}; {self.line()}"
 
     def _table(self) -> Table:
         table = Table(box=None, pad_edge=False)
@@ -90,6 +91,12 @@ class SweepView:
         return table
 
 
+def _ranked(progress: Progress) -> str:
+    if progress.value is None:
+        return ""
+    return f"{progress.value:.4g}{'' if progress.is_full else ' (early)'}"
+
+
 def _row(job: Job, progress: Progress) -> tuple[str | Text, ...]:
     total, rate = job.config.num_timesteps, progress.env_steps_per_s
     part = min(progress.env_steps / total, 1.0)
@@ -100,8 +107,8 @@ def _row(job: Job, progress: Progress) -> tuple[str | Text, ...]:
         Text(job.label),
         progress.place,
         Text.assemble(bar(part, _BAR_WIDTH), f" {part:.0%}"),
-        f"{progress.curve[-1][1]:.4g}" if progress.curve else "",
-        "" if progress.value is None else f"{progress.value:.4g}",
+        "" if progress.latest is None else f"{progress.latest:.4g}",
+        _ranked(progress),
         "" if left_s is None else clock(left_s),
         Text(f"{progress.state}: {progress.error}" if progress.error else progress.state),
     )

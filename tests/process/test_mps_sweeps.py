@@ -41,7 +41,7 @@ def test_a_fatal_fault_ends_one_job_of_a_sweep_and_its_neighbours_go_on(
     here = machine(2, mps_control=mps.program)
     # Of programs of their own, so that none waits for another one to compile.
     jobs = list(jobs_of([compose(f"seed={n}", f"num_envs={n + 1}") for n in range(6)]))
-    settings, paths = SweepConfig(jobs_per_gpu=3), SweepPaths(tmp_path)
+    settings, paths = SweepConfig(jobs_per_gpu=3, objective="return"), SweepPaths(tmp_path)
     plan = places_of(settings, here, {"auto"})
     with closing(LocalHost(here)) as host:
         host.open(plan, paths)

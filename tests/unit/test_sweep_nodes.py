@@ -30,7 +30,7 @@ from gmijax.sweeps.host import LocalHost, Order, Start, Started
 from gmijax.sweeps.jobs import Job, SweepPaths, jobs_of
 from gmijax.sweeps.nodes import RemoteHost, SweepNode, nodes_of, num_cpus_of
 from gmijax.sweeps.places import Places, Site, places_of
-from gmijax.sweeps.report import write_report
+from gmijax.sweeps.report import Report
 from gmijax.sweeps.scheduler import Scheduler
 from gmijax.sweeps.study import Study
 
@@ -184,7 +184,9 @@ def test_jobs_of_a_node_that_is_lost_run_again_on_the_other(tmp_path: Path) -> N
     assert {job.progress.node for job in sweep.jobs} == {"a"}
     events = (sweep.paths.job(1).events).read_text()
     assert "no power" in events
-    rows = write_report("completed", sweep.jobs, sweep.settings, sweep.paths, 1.0)["jobs"]
+    report = Report(sweep.jobs, sweep.settings, sweep.paths, 1.0)
+    assert report.end("completed") is None
+    rows = report.data["jobs"]
     assert [row["node"] for row in rows] == ["a"] * 6
     assert read_json(sweep.paths.sweep)["jobs"] == rows
 

@@ -21,8 +21,10 @@ from gmijax.errors import printable
 from gmijax.runs.folder import RunPaths
 from gmijax.sweeps.hparams import write_hparams
 from gmijax.sweeps.jobs import Job, SweepPaths, jobs_of
-from gmijax.sweeps.report import write_report
+from gmijax.sweeps.report import Report
 from gmijax.sweeps.view import SweepView
+
+SWEEP = SweepConfig(objective="return")
 
 
 def running_jobs() -> list[Job]:
@@ -30,9 +32,10 @@ def running_jobs() -> list[Job]:
     now_s = time.monotonic()
     for job, steps in zip(jobs, (500, 250, 1000, 0), strict=True):
         progress = job.progress
-        for at, value in ((100, 9.0), (steps, 2.5)) if steps else ():
+        for at, value, full in ((100, 9.0, 0), (steps, 2.5, 1)) if steps else ():
             line = {"env_steps": at, "env_steps_per_s": 50.0, "return": value}
-            progress.take(line, SweepConfig())
+            line |= {"window/return": value + 1.0, "window/episodes": at, "window/full": full}
+            progress.take(line, SWEEP)
             progress.updated_s = now_s - 1790.0
         if steps:
             progress.state, progress.started_s = "running", now_s - 1800.0
@@ -61,7 +64,7 @@ def view_on(stream: Any, jobs: list[Job]) -> SweepView:
     console = Console(
         file=stream, force_terminal=stream.isatty(), width=160, markup=False, color_system=None
     )
-    return SweepView(console, jobs, SweepConfig())
+    return SweepView(console, jobs, SWEEP)
 
 
 def test_the_table_says_of_each_job_where_and_how_far_it_is() -> None:
@@ -71,11 +74,11 @@ def test_the_table_says_of_each_job_where_and_how_far_it_is() -> None:
         shown = terminal.getvalue()
     lines = [printable(line).split() for line in shown.splitlines()]
     rows = {words[0]: " ".join(words) for words in reversed(lines) if words}
-    assert "overrides GPU and place progress return best ETA state" in rows["job"]
-    assert rows["0"].endswith("50% 2.5 9 0:00:10 running")
+    assert "overrides GPU and place progress return ranked by ETA state" in rows["job"]
+    assert rows["0"].endswith("50% 2.5 3.5 0:00:10 running")
     assert "seed=0 GPU 3 place 0" in rows["0"]
-    assert rows["1"].endswith("25% 2.5 9 0:00:15 running")
-    assert rows["2"].endswith("100% 2.5 9 completed")
+    assert rows["1"].endswith("25% 2.5 3.5 0:00:15 running")
+    assert rows["2"].endswith("100% 2.5 3.5 completed")
     assert "waiting: again, alone on its GPU, after CUDA_ERROR_[/x]" in rows["3"]
     assert "2 running, 1 waiting, 1 completed; 100 steps/s, 2.0 runs/h" in shown
 
@@ -88,8 +91,25 @@ def test_without_a_terminal_every_change_is_a_line() -> None:
         jobs[0].progress.state, jobs[0].progress.error = "failed", "GMI 0 failed: NonFiniteError"
     lines = said.getvalue().splitlines()
     assert lines[:2] == [f"job {n} seed={n}: running on GPU 3 place {n}" for n in range(2)]
-    assert lines[2].startswith("job 2 seed=2: completed after 1800 s, best return 9; 2 running")
+    assert lines[2].startswith("job 2 seed=2: completed after 1800 s, return 3.5; 2 running")
     assert lines[3:] == ["job 0 seed=0: failed: GMI 0 failed: NonFiniteError"]
+
+
+def test_a_value_of_a_window_that_is_not_full_is_marked_where_it_is_shown() -> None:
+    said, (job,) = io.StringIO(), jobs_of([compose()])
+    early = {"return": 9.0, "window/return": 8.0, "window/episodes": 12, "window/full": 0}
+    job.progress.take({"env_steps": 100, **early}, SWEEP)
+    terminal = Terminal()
+    with view_on(terminal, [job]) as view:
+        job.progress.state = "running"
+        view.update()
+    assert "9 8 (early) " in " ".join(terminal.getvalue().split())
+    job.progress.state = "completed"
+    with view_on(said, [job]) as view:
+        view.update()
+    # Nothing is overridden: there is nothing to say of it.
+    assert said.getvalue().startswith("job 0: completed after ")
+    assert "s, return 8 (12 episodes, window not full); " in said.getvalue()
 
 
 @pytest.mark.parametrize("what", ["a terminal that is closed", "a row that cannot be made"])
@@ -99,7 +119,7 @@ def test_an_error_of_the_view_ends_the_view_alone(
     monkeypatch.setattr(display, "_REFRESH_S", 0.0)
     terminal, jobs = Terminal(), running_jobs()
     monkeypatch.setattr(sys, "stdout", terminal)
-    with SweepView(open_console(show=True), jobs, SweepConfig()) as view:
+    with SweepView(open_console(show=True), jobs, SWEEP) as view:
         view.update()
         if what == "a terminal that is closed":
             terminal.is_closed_by_user = True
@@ -151,7 +171,9 @@ def test_throughput_is_of_the_jobs_that_a_command_has_run(tmp_path: Path) -> Non
     jobs[3].progress.state, jobs[3].progress.error = "completed", None  # By an earlier command.
     for job in jobs[:2]:
         job.progress.state, job.progress.ended_s = "completed", jobs[2].progress.ended_s
-    report = write_report("completed", jobs, SweepConfig(), SweepPaths(tmp_path), 9999.0)
+    whole = Report(jobs, SWEEP, SweepPaths(tmp_path), 0.0)
+    assert whole.end("completed") is None
+    report = whole.data
     assert report["trainings_per_hour"] == pytest.approx(3 * 2.0, rel=1e-3)
     rows = report["jobs"]
     assert [row["first_update_s"] for row in rows] == [10.0, 10.0, 10.0, None]

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import csv
 import dataclasses
 import re
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +19,7 @@ from gmijax.cli.grid import build_sweep
 from gmijax.config.sweep import SweepConfig
 from gmijax.control.console import open_console
 from gmijax.errors import ConfigError
-from gmijax.runs.folder import write_json
+from gmijax.runs.folder import read_json, write_json
 from gmijax.runs.held import is_locked, locked
 from gmijax.supervise.failures import may_be_anothers
 from gmijax.supervise.run_gmis import StopSignals
@@ -30,15 +32,14 @@ from gmijax.sweeps.jobs import (
     SweepPaths,
     jobs_of,
     placed,
-    require_objective,
     require_placeable,
     state_of,
-    why_not_comparable,
 )
 from gmijax.sweeps.jobs_per_gpu import with_jobs_per_gpu
+from gmijax.sweeps.objective import why_not_comparable, with_objective
 from gmijax.sweeps.packs import most_together, require_packable
 from gmijax.sweeps.places import Place, Places, Site, places_of
-from gmijax.sweeps.report import ranking, spread
+from gmijax.sweeps.report import Report, spread, tables
 
 
 @pytest.mark.parametrize(
@@ -158,19 +159,24 @@ def test_jobs_that_place_themselves_are_refused(override: str, said: str) -> Non
 
 
 def test_jobs_are_ranked_by_evaluations_if_they_make_some() -> None:
-    sweep = SweepConfig(objective="eval/return")
+    asked = SweepConfig(objective="eval/return")
     with pytest.raises(ConfigError, match=r"^sweep\.objective=eval/return: needs eval\.every"):
-        require_objective(jobs_of([compose()]), sweep)
-    [job] = jobs_of([compose("eval.every=100")])
-    require_objective([job], sweep)
+        with_objective(asked, jobs_of([compose()]))
+    some = jobs_of([compose("eval.every=100"), compose()])
+    assert with_objective(SweepConfig(), some).objective == "return"
+    [job] = some[:1]
+    assert with_objective(SweepConfig(objective="window/return"), [job]).objective == "return"
+    sweep = with_objective(SweepConfig(), [job])
+    assert sweep == with_objective(asked, [job]) == asked
     for steps, more in (
         (50, {}),
         (100, {"eval/return": 2.0}),
         (150, {}),
         (200, {"eval/return": 1.0}),
     ):
-        job.progress.take({"env_steps": steps, "return": 9.0, **more}, sweep)
-    assert job.progress.value == 2.0
+        full = {"return": 9.0, "window/return": 9.0, "window/full": 1, "window/episodes": 500}
+        job.progress.take({"env_steps": steps, **full, **more}, sweep)
+    assert (job.progress.value, job.progress.latest) == (2.0, 1.0)
     assert job.progress.curve == [(100, 2.0), (200, 1.0)]
 
 
@@ -332,15 +338,64 @@ def test_too_many_jobs_for_the_machine_are_refused() -> None:
         gpu_places(1, 2000)
 
 
-def test_progress_keeps_the_best_value() -> None:
-    lines = [(10, None), (20, 3.0), (30, float("nan")), (40, 1.0)]
-    highest, lowest = Progress(), Progress()
-    for steps, value in lines:
-        line = {"env_steps": steps, "env_steps_per_s": 5.0, "return": value}
-        highest.take(line, SweepConfig())
-        lowest.take(line, SweepConfig(direction="minimize"))
-    assert (highest.value, lowest.value, highest.env_steps) == (3.0, 1.0, 40)
-    assert highest.curve == [(20, 3.0), (40, 1.0)]
+def lines_of(
+    *windows: tuple[float | None, int, bool], key: str = "return"
+) -> list[dict[str, Any]]:
+    """Lines of metrics with the mean of the long window, its episodes, and whether it is full."""
+    return [
+        {
+            "env_steps": 100 * (number + 1),
+            "env_steps_per_s": 5.0,
+            key: None if mean is None else -1.0,
+            f"window/{key}": mean,
+            "window/episodes": episodes,
+            "window/full": int(is_full),
+        }
+        for number, (mean, episodes, is_full) in enumerate(windows)
+    ]
+
+
+PENALTY = ((None, 0, False), (-6.3, 80, False), (-121.0, 130, False), (-137.0, 170, True))
+
+
+@pytest.mark.parametrize("key", ["return", "metric/energy", "reward/near", "episode_length"])
+@pytest.mark.parametrize("direction", ["maximize", "minimize"])
+def test_a_job_is_ranked_by_its_last_full_window(key: str, direction: Any) -> None:
+    progress, sweep = Progress(), SweepConfig(objective=key, direction=direction)
+    seen = []
+    for line in lines_of(*PENALTY, (-140.0, 175, True), key=key):
+        progress.take(line, sweep)
+        seen.append((progress.value, progress.is_full, progress.episodes))
+    assert seen == [
+        (None, True, None),
+        (-6.3, False, 80),
+        (-121.0, False, 130),
+        (-137.0, True, 170),
+        (-140.0, True, 175),
+    ]
+    assert progress.curve == [(400, -137.0), (500, -140.0)]
+    # Worlds that begin anew after a restart: what was measured before is better.
+    progress.take(lines_of((-9.0, 120, False), key=key)[0], sweep)
+    assert (progress.value, progress.is_full) == (-140.0, True)
+
+
+def test_what_has_no_window_is_averaged_over_the_last_tenth() -> None:
+    progress, sweep = Progress(), SweepConfig(objective="env_steps_per_s")
+    for steps in range(1, 101):
+        line = {"env_steps": steps, "env_steps_per_s": 1e6 if steps == 3 else float(steps)}
+        progress.take(line | {"window/full": 0, "window/episodes": 0}, sweep)
+    assert progress.is_full
+    assert progress.value == np.mean(range(90, 101))
+    nothing = Progress()
+    for bad in (None, float("nan"), float("inf"), "1"):
+        nothing.take({"env_steps": 1, "env_steps_per_s": bad}, sweep)
+    assert nothing.value is None
+
+
+def test_lines_of_older_versions_do_not_say_that_they_can_be_compared() -> None:
+    progress = Progress()
+    progress.take({"env_steps": 10, "return": 3.0}, SweepConfig(objective="return"))
+    assert (progress.value, progress.is_full, progress.episodes) == (3.0, False, None)
 
 
 def test_only_a_run_with_all_its_steps_is_complete(tmp_path: Path) -> None:
@@ -352,28 +407,83 @@ def test_only_a_run_with_all_its_steps_is_complete(tmp_path: Path) -> None:
     assert state_of(run, dataclasses.replace(config, num_timesteps=200)) == "waiting"
 
 
-@pytest.mark.parametrize(("direction", "order"), [("maximize", "201"), ("minimize", "021")])
-def test_the_ranking_has_the_best_first_and_jobs_without_a_value_below(
-    direction: Any, order: str
+def shown_tables(folder: Path, jobs: Sequence[Job], sweep: SweepConfig) -> list[list[list[str]]]:
+    """The rows of the tables for people."""
+    report = Report(jobs, sweep, SweepPaths(folder), 0.0)
+    assert report.end("completed") is None
+    columns = [table.columns for table in tables(report.data, sweep)]
+    return [
+        [list(map(str, row)) for row in zip(*(c.cells for c in own), strict=True)]
+        for own in columns
+    ]
+
+
+def ended(
+    overrides: Sequence[str], windows: Sequence[tuple[float | None, int, bool]]
+) -> list[Job]:
+    """Jobs of a sweep, each with a line of metrics, or none if the mean is None."""
+    sweep = build_sweep(("env=ant", "sweep.objective=return", *overrides))
+    for job, window in zip(sweep.jobs, windows, strict=True):
+        job.progress.state = "completed"
+        if window[0] is not None:
+            job.progress.take(*lines_of(window), sweep.settings)
+    return list(sweep.jobs)
+
+
+@pytest.mark.parametrize(("direction", "order"), [("maximize", "20413"), ("minimize", "02143")])
+def test_the_ranking_has_full_windows_first_and_jobs_without_a_value_below(
+    direction: Any, order: str, tmp_path: Path
 ) -> None:
-    more = {"overrides": {}, "env_steps": 10, "state": "completed"}
-    rows = [{"job": n, "value": value, **more} for n, value in enumerate((1.0, None, 3.0))]
-    rank, job, _, value, *_ = ranking(rows, SweepConfig(direction=direction)).columns
-    assert list(rank.cells) == ["1", "2", "-"]
-    assert "".join(map(str, job.cells)) == order
-    assert list(value.cells)[-1] == "-"
+    windows = [(1.0, 200, True), (-5.0, 12, False), (3.0, 200, True), (None, 0, False)]
+    windows.append((9.0, 99, False))
+    jobs = ended(("algo.entropy_cost=1,2,3,4,5",), windows)
+    sweep = SweepConfig(objective="return", direction=direction)
+    [rows] = shown_tables(tmp_path, jobs, sweep)  # One table: no setting has several seeds.
+    assert "".join(row[1] for row in rows) == order
+    assert [row[0] for row in rows] == ["1", "2", "3", "4", "-"]
+    found = {row[1]: row[3] for row in rows}
+    assert found["1"] == "-5 (12 episodes, window not full)"
+    assert (found["2"], found["3"]) == ("3", "-")
+    report = read_json(tmp_path / "sweep.json")
+    assert report["ranking"] == [int(number) for number in order[:4]]
+    assert [job["window_full"] for job in report["jobs"][:3]] == [True, False, True]
+
+
+def test_settings_come_first_with_the_interquartile_mean_of_their_seeds(tmp_path: Path) -> None:
+    values = (10.0, 11.0, 12.0, 90.0), (20.0, 21.0, 22.0, 23.0), (50.0, 50.0, None, 50.0)
+    windows = [(v, 200, own != values[2] or seed) for own in values for seed, v in enumerate(own)]
+    rates = "algo.learning_rate=1e-4,2e-4,3e-4"
+    jobs = ended((rates, "seed=0,1,2,3"), [(v, n, bool(full)) for v, n, full in windows])
+    settings, rows = shown_tables(tmp_path, jobs, SweepConfig(objective="return"))
+    assert len(rows) == 12
+    assert [row[1:] for row in settings] == [
+        ["algo.learning_rate=0.0002", "21.5", "20.75 to 22.25", "4"],
+        ["algo.learning_rate=0.0001", "11.5", "10.75 to 31.5", "4"],
+        ["algo.learning_rate=0.0003", "50 (windows not full)", "50 to 50", "3 of 4"],
+    ]
+    first = read_json(tmp_path / "sweep.json")["settings"][0]
+    assert first["overrides"] == {"algo.learning_rate": "0.0002"}
+    assert (first["jobs"], first["n"], first["interquartile_mean"]) == ([4, 5, 6, 7], 4, 21.5)
+    with (tmp_path / "settings.csv").open() as file:
+        table = list(csv.DictReader(file))
+    assert table[0]["algo.learning_rate"] == "0.0002"
+    assert (table[1]["interquartile_mean"], table[1]["low"], table[1]["jobs"]) == (
+        "11.5",
+        "10.75",
+        "0 1 2 3",
+    )
 
 
 def test_the_middle_of_curves_leaves_out_the_outer_quarters() -> None:
     curves = [[(0, float(k)), (100, float(k))] for k in (0, 1, 2, 3, 100)]
-    steps, middle, low, high = spread(curves)
+    steps, middle = spread(curves)
     assert (steps[0], steps[-1]) == (0, 100)
-    np.testing.assert_allclose(middle, 2.0)
-    np.testing.assert_allclose((low[0], high[0]), (1.0, 3.0))
-    _, alone, _, _ = spread([[(0, 1.0), (10, 3.0)]])
-    np.testing.assert_allclose(alone, np.linspace(1.0, 3.0, len(alone)))
-    _, two, _, _ = spread([[(0, 1.0), (10, 1.0)], [(0, 3.0), (10, 3.0)]])
-    np.testing.assert_allclose(two, 2.0)
+    np.testing.assert_allclose(middle.mean, 2.0)
+    np.testing.assert_allclose((middle.low[0], middle.high[0]), (1.0, 3.0))
+    _, alone = spread([[(0, 1.0), (10, 3.0)]])
+    np.testing.assert_allclose(alone.mean, np.linspace(1.0, 3.0, len(alone.mean)))
+    _, two = spread([[(0, 1.0), (10, 1.0)], [(0, 3.0), (10, 3.0)]])
+    np.testing.assert_allclose(two.mean, 2.0)
 
 
 def test_a_gpu_goes_to_one_sweep_at_a_time(

@@ -1,0 +1,55 @@
+"""The folder of a sweep: how it is opened, what is left of it, errors of the disk."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, suppress
+from pathlib import Path
+
+from gmijax.errors import ConfigError, SweepFailed
+from gmijax.runs.folder import create_run, given_run, is_locked
+from gmijax.sweeps.jobs import Job, SweepPaths
+
+
+@contextmanager
+def opened_folder(jobs: Sequence[Job]) -> Iterator[SweepPaths]:
+    """The folder of the sweep, made if it is not there; gone again if nothing was begun in it."""
+    run = jobs[0].config.run
+    folder = given_run(run.dir, run.name)
+    is_new = folder is None or not os.path.lexists(folder)
+    if folder is None or is_new:
+        root = create_run(run.dir, run.name, "sweep").root
+    else:
+        root = _found(folder)
+    paths = SweepPaths(root)
+    is_anothers = is_locked(paths.lock)
+    try:
+        yield paths
+    except BaseException:
+        if not is_anothers and not paths.request.exists():
+            with suppress(OSError):
+                for path in (paths.study, paths.lock):
+                    path.unlink(missing_ok=True)
+                if is_new:
+                    paths.root.rmdir()
+        raise
+
+
+def _found(folder: Path) -> Path:
+    if not folder.is_dir():
+        raise ConfigError(f"run.dir={folder}: is no folder")
+    paths = SweepPaths(folder.resolve())
+    if not paths.request.exists() and any(path != paths.lock for path in folder.iterdir()):
+        raise ConfigError(f"run.dir={folder}: is no folder of a sweep, and not empty")
+    return paths.root
+
+
+@contextmanager
+def errors_of_files(paths: SweepPaths) -> Iterator[None]:
+    """Turns an error of a file, such as a full disk, into one line."""
+    try:
+        yield
+    except OSError as error:
+        where = error.filename or paths.root
+        raise SweepFailed(f"{where}: {error.strerror or error}") from error

@@ -1,0 +1,71 @@
+"""What a sweep says before its first job and after its last one."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from rich.console import Console
+
+from gmijax.config.sweep import SweepConfig
+from gmijax.sweeps.jobs import Job, SweepPaths
+from gmijax.sweeps.objective import why_not_comparable
+from gmijax.sweeps.places import Site
+from gmijax.sweeps.report import tables
+
+
+def announce(
+    console: Console,
+    sites: Sequence[Site],
+    jobs: Sequence[Job],
+    settings: SweepConfig,
+    num_complete: int,
+) -> None:
+    """Says how many jobs there are, of which some are complete, and where they run.
+
+    Args:
+      console: where it is said.
+      sites: machines and their places.
+      jobs: all of a grid, some of another sampler.
+      settings: of the sweep.
+      num_complete: jobs that an earlier command has completed.
+    """
+    total = len(jobs) if settings.sampler == "grid" else settings.trials or 0
+    more = f", {num_complete} of them complete already" if num_complete else ""
+    places = sum(len(site.plan.slices) for site in sites)
+    console.print(f"{_counted(total, 'job')}{more}, {places} at a time {_where(sites)}")
+    for reason in dict.fromkeys(reason for site in sites for reason in site.plan.reasons):
+        console.print(f"  {reason}")
+    if (warning := why_not_comparable(jobs, settings)) is not None:
+        console.print(f"  {warning}")
+
+
+def print_outcome(
+    console: Console,
+    report: Mapping[str, Any],
+    settings: SweepConfig,
+    paths: SweepPaths,
+    line: str,
+) -> None:
+    """Prints the tables of a `sweep.json`, a line about all jobs, and the files."""
+    for table in tables(report, settings):
+        console.print(table)
+        console.print()
+    console.print(f"{line}\nsummary: {paths.sweep}\ntables: {paths.settings}, {paths.table}")
+    if paths.curves.exists():
+        console.print(f"curves: {paths.curves}")
+
+
+def _where(sites: Sequence[Site]) -> str:
+    """Where jobs run, in words."""
+    names = [site.name for site in sites if site.name]
+    nodes = f" of {_counted(len(names), 'node')} ({', '.join(names)})" if names else ""
+    backend = sites[0].plan.backend
+    if backend == "cpu":
+        return f"on the CPU{nodes}"
+    num_gpus = sum(site.plan.layout.num_gpus for site in sites)
+    return f"on {_counted(num_gpus, 'GPU')}{nodes}, backend {backend}"
+
+
+def _counted(count: int, what: str) -> str:
+    return f"{count:,} {what}{'' if count == 1 else 's'}"
