@@ -8,7 +8,8 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from gmijax.errors import ConfigError, SweepFailed
-from gmijax.runs.folder import create_run, given_run, is_locked
+from gmijax.runs.folder import create_run, given_run
+from gmijax.runs.held import is_locked
 from gmijax.sweeps.jobs import Job, SweepPaths
 
 

@@ -426,7 +426,7 @@ def ended(
     for job, window in zip(sweep.jobs, windows, strict=True):
         job.progress.state = "completed"
         if window[0] is not None:
-            job.progress.take(*lines_of(window), sweep.settings)
+            job.progress.take(lines_of(window)[0], sweep.settings)
     return list(sweep.jobs)
 
 

@@ -16,7 +16,7 @@ import time
 from collections import deque
 from collections.abc import Sequence
 from contextlib import closing, suppress
-from itertools import islice, takewhile
+from itertools import islice
 from typing import Any, Final
 
 from gmijax.collectives.channel.tcp_messages import Outgoing, messages
@@ -179,8 +179,10 @@ class Connection:
                     if key.fileobj == self._work:
                         os.eventfd_read(self._work)
                     elif events & selectors.EVENT_READ:
-                        found = islice(incoming, _MESSAGES_AT_ONCE)
-                        self._incoming.extend(takewhile(lambda one: one is not None, found))
+                        for found in islice(incoming, _MESSAGES_AT_ONCE):
+                            if found is None:  # The rest of it is still to come.
+                                break
+                            self._incoming.append(found)
         self._leave(connection, outgoing)
 
     def _send(self, connection: socket.socket, outgoing: Outgoing) -> bool:

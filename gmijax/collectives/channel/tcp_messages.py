@@ -10,7 +10,7 @@ import socket
 from collections import deque
 from collections.abc import Generator, Sequence
 from itertools import islice
-from typing import Any, Final
+from typing import Any, Final, cast
 
 import numpy as np
 
@@ -89,7 +89,7 @@ def messages(
 
 def _filled(connection: socket.socket, array: np.ndarray) -> Generator[None, None, None]:
     """Fills an array with what comes; yields each time that it must wait."""
-    view = memoryview(array.view(np.uint8)) if array.size else memoryview(b"")
+    view = memoryview(cast("Any", array.view(np.uint8))) if array.size else memoryview(b"")
     while view:
         try:
             count = connection.recv_into(view)

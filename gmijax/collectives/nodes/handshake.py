@@ -22,7 +22,7 @@ import selectors
 import socket
 import struct
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Generator, Iterator
 from contextlib import suppress
 from typing import Final, NamedTuple, TypeAlias
 
@@ -97,7 +97,7 @@ def call(address: tuple[str, int], key: Key, caller: Caller, time_left: TimeLeft
 
 def accepted(
     listener: socket.socket, key: Key, time_left: TimeLeft
-) -> Iterator[tuple[socket.socket, Caller]]:
+) -> Generator[tuple[socket.socket, Caller], None, None]:
     """Connections with those who know the key, as they come, until the time is up."""
     strangers = _Strangers(listener, key)
     try:
