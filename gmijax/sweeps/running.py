@@ -82,7 +82,7 @@ class Running:
         if seen.exit_code is None:
             return Outcome(error=self.host.lost, is_fault=True)
         if seen.exit_code == EXIT_INTERRUPTED:
-            return Outcome(error="interrupted by a signal from elsewhere", is_fault=True)
+            return Outcome(error="a signal from elsewhere interrupted it", is_fault=True)
         if seen.exit_code < 0:
             killed_by = signal_name(-seen.exit_code)
             return Outcome(error=f"its controller was killed by {killed_by}", is_fault=True)

@@ -4,13 +4,18 @@ from __future__ import annotations
 
 import csv
 import json
+import os
 import signal
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
 import pytest
+from small_disk import can_mount, small_disk
 from sweep_neighbours import Neighbours
-from training_jobs import POINT, STEPS, start, train, wait_until
+from training_jobs import FOREVER, POINT, STEPS, start, train, wait_until
+
+from gmijax.runs.resume import newest_checkpoint
 
 SWEEP = (
     *POINT,
@@ -74,6 +79,91 @@ def test_a_sweep_that_is_killed_goes_on_and_a_job_fails_alone(tmp_path: Path) ->
     other = train(*SWEEP, "seed=0,2", cwd=tmp_path, command="sweep")
     assert other.returncode == 2
     assert "holds another sweep; give the same lists, or another folder" in other.stderr
+
+
+@pytest.mark.timeout(400)
+def test_a_job_whose_controller_is_killed_goes_on_from_its_checkpoint(tmp_path: Path) -> None:
+    # The second one is interrupted as if by somebody who takes it for a run of its own.
+    signals = (signal.SIGKILL, signal.SIGTERM)
+    command = (*POINT, f"num_timesteps={2000 * STEPS}", "run.checkpoint_every=20", "seed=0,1")
+    sweep = start(
+        *command,
+        *("run.max_restarts=2", "sweep.jobs_per_gpu=2", "run.dir=all"),
+        cwd=tmp_path,
+        command="sweep",
+    )
+    runs = [tmp_path / "all" / name for name in ("000", "001")]
+
+    def are_saved() -> bool:
+        return sweep.poll() is not None or all(newest_checkpoint(run).checkpoint for run in runs)
+
+    wait_until(are_saved, 200.0, "a checkpoint of each")
+    for number, sent in enumerate(signals):
+        os.kill(controller_of(tmp_path / "all" / "jobs" / f"{number:03d}.json"), sent)
+    assert sweep.wait(timeout=300) == 0, (tmp_path / "stderr.txt").read_text()
+    assert states(tmp_path) == ["completed"] * 2
+    said = "its controller was killed by SIGKILL", "a signal from elsewhere interrupted it"
+    for run, why in zip(runs, said, strict=True):
+        events = [json.loads(line) for line in (run / "events.jsonl").read_text().splitlines()]
+        assert [e["reason"] for e in events if e["event"] == "again"] == [f"again, after {why}"]
+        assert [e["checkpoint"] is not None for e in events if e["event"] == "start"][-1]
+    out = (tmp_path / "stdout.txt").read_text()
+    assert "2 jobs, 2 at a time on the CPU" in out
+    # Both seeds are one setting, and it comes first.
+    assert out.index("interquartile mean") < out.index("overrides")
+    for name in ("sweep.json", "settings.csv", "sweep.csv", "sweep.png"):
+        assert str(tmp_path / "all" / name) in "".join(out.split("\n")[-6:])
+
+
+def controller_of(order: Path) -> int:
+    """The process of a job of a sweep."""
+    for folder in Path("/proc").glob("[0-9]*"):
+        with suppress(OSError):
+            if str(order).encode() in (folder / "cmdline").read_bytes().split(b"\0"):
+                return int(folder.name)
+    raise AssertionError(f"no process has {order}")
+
+
+@pytest.mark.timeout(400)
+@pytest.mark.skipif(not can_mount(), reason="may not mount a small disk")
+def test_a_full_disk_ends_a_sweep_in_one_line_and_its_report_says_so(tmp_path: Path) -> None:
+    (tmp_path / "all").mkdir()
+    command = (*POINT, FOREVER, "seed=0,1", "run.checkpoint_every=50", "run.keep_checkpoints=1")
+    command = (*command, "sweep.jobs_per_gpu=2", "run.dir=all")
+    with small_disk(tmp_path / "all"):
+        sweep = start(*command, cwd=tmp_path, command="sweep")
+        runs = [tmp_path / "all" / name for name in ("000", "001")]
+
+        def are_saved() -> bool:
+            return sweep.poll() is not None or all(
+                newest_checkpoint(run).checkpoint for run in runs
+            )
+
+        wait_until(are_saved, 200.0, "a checkpoint of each")
+        with suppress(OSError), (tmp_path / "all" / "filler").open("wb", buffering=0) as filler:
+            while True:
+                filler.write(bytes(1024))
+        assert sweep.wait(timeout=200) == 1
+        (line,) = (tmp_path / "stderr.txt").read_text().splitlines()
+        assert "No space left on device" in line or "disk is full" in line
+        assert report(tmp_path)["status"] == "failed"
+        assert states(tmp_path) == ["failed"] * 2
+        assert table_states(tmp_path) == ["failed"] * 2
+        (tmp_path / "all" / "filler").unlink()
+        # The same command goes on.
+        again = start(*command, cwd=tmp_path, command="sweep")
+        saved = [newest_checkpoint(run).checkpoint for run in runs]
+
+        def has_gone_on() -> bool:
+            newest = [newest_checkpoint(run).checkpoint for run in runs]
+            return again.poll() is not None or all(
+                one != old for one, old in zip(newest, saved, strict=True)
+            )
+
+        wait_until(has_gone_on, 200.0, "another checkpoint of each")
+        again.send_signal(signal.SIGINT)
+        assert again.wait(timeout=100) == 130
+        assert states(tmp_path) == ["interrupted"] * 2
 
 
 @pytest.mark.timeout(900)

@@ -6,6 +6,7 @@ import sys
 from pathlib import Path
 
 import numpy as np
+import optuna
 import pytest
 
 from gmijax.cli.compose import compose
@@ -53,7 +54,10 @@ def test_a_study_goes_on_with_what_was_running_and_what_failed(tmp_path: Path) -
     first.tell(end(jobs[1], "failed", 0.5))
     first.tell(end(jobs[2], "interrupted"))
     first.tell(end(jobs[3], "pruned", 0.1))
+    assert trial_states(tmp_path) == ["COMPLETE", "WAITING", "WAITING", "PRUNED", "RUNNING"]
     second = study(tmp_path, *TOY)
+    # A killed sweep has left the last one.
+    assert trial_states(tmp_path) == ["COMPLETE", "WAITING", "WAITING", "PRUNED", "WAITING"]
     earlier = [(job.number, job.progress.state) for job in second.earlier()]
     assert earlier == [(0, "waiting"), (3, "pruned")]
     again = [second.next() for _ in range(4)]
@@ -66,6 +70,56 @@ def test_a_study_goes_on_with_what_was_running_and_what_failed(tmp_path: Path) -
     (job, _) = second.earlier()
     assert not second.is_hopeless(job)
     second.tell(end(job, "completed", 2.0))
+
+
+def trial_states(folder: Path) -> list[str]:
+    """What a dashboard shows."""
+    backend = optuna.storages.journal.JournalFileBackend(str(folder / "study.log"))
+    storage = optuna.storages.JournalStorage(backend)
+    return [
+        one.state.name for one in optuna.load_study(study_name="sweep", storage=storage).trials
+    ]
+
+
+def test_trials_of_half_written_lines_do_not_keep_a_study_from_going_on(tmp_path: Path) -> None:
+    first = study(tmp_path, *TOY, "algo.entropy_cost=interval(0,1e-2)")
+    kept = first.next()
+    assert kept is not None
+    journal = tmp_path / "study.log"
+    before = journal.stat().st_size
+    assert first.next() is not None
+    lines = journal.read_bytes()[before:].splitlines(keepends=True)
+    # The disk got full within the second of its parameters.
+    whole = journal.read_bytes()[:before] + b"".join(lines[:-2])
+    journal.write_bytes(whole + lines[-1][: len(lines[-1]) // 2])
+    again = study(tmp_path, *TOY, "algo.entropy_cost=interval(0,1e-2)")
+    found = []
+    while job := again.next():
+        found.append(job.number)
+        again.tell(end(job, "completed", 1.0))
+    assert found == [0, *range(2, 9)]  # Still eight jobs.
+    assert set(trial_states(tmp_path)) == {"COMPLETE", "FAIL"}
+
+
+def test_values_of_windows_that_are_not_full_are_told_only_beside_their_like(
+    tmp_path: Path,
+) -> None:
+    def told(*ends: tuple[float, bool], folder: Path) -> list[str]:
+        folder.mkdir()
+        trials = study(folder, *TOY, "sweep.pruner=median", "num_timesteps=100")
+        for value, is_full in ends:
+            job = trials.next()
+            assert job is not None
+            job.progress.is_full, job.progress.env_steps = is_full, 50
+            job.progress.value = value
+            assert not trials.is_hopeless(job)
+            trials.tell(end(job, "completed", value))
+        return trial_states(folder)
+
+    early = [(-6.3, False), (-7.0, False)]
+    assert told(*early, folder=tmp_path / "a") == ["COMPLETE", "COMPLETE"]
+    mixed = [(-137.0, True), (-6.3, False), (-120.0, True)]
+    assert told(*mixed, folder=tmp_path / "b") == ["COMPLETE", "FAIL", "COMPLETE"]
 
 
 @pytest.mark.parametrize("pruner", ["asha", "median"])

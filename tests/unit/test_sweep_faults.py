@@ -1,0 +1,182 @@
+"""Faults of a sweep without processes: killed controllers, a full disk, refused commands."""
+
+from __future__ import annotations
+
+import errno
+import json
+import os
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+from test_sweep_nodes import Sweep, jobs
+
+from gmijax.cli.command import sweep_command
+from gmijax.cli.compose import compose
+from gmijax.config.sweep import SweepConfig
+from gmijax.errors import GmijaxError
+from gmijax.runs.folder import locked, read_json
+from gmijax.sweeps import report, scheduler
+from gmijax.sweeps.children import Child
+from gmijax.sweeps.jobs import Job, SweepPaths, jobs_of
+from gmijax.sweeps.report import Report
+from gmijax.sweeps.study import Study
+
+
+@pytest.fixture(autouse=True)
+def no_waiting(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(scheduler, "_TICK_S", 0.0)
+
+
+@pytest.mark.parametrize(
+    ("exit_code", "said"),
+    [
+        (-9, "its controller was killed by SIGKILL"),
+        (-11, "its controller was killed by SIGSEGV"),
+        (130, "a signal from elsewhere interrupted it"),  # By a SIGTERM to this job alone.
+    ],
+)
+def test_a_job_whose_controller_is_killed_runs_again(
+    exit_code: int, said: str, tmp_path: Path
+) -> None:
+    sweep = Sweep(tmp_path, jobs(2))
+    sweep.run(lambda: sweep.nodes[0].end(exit_code), sweep.end_all)
+    assert sweep.states() == ["completed"] * 2
+    (event,) = map(json.loads, sweep.paths.job(0).events.read_text().splitlines())
+    assert event["reason"] == f"again, after {said}"
+    once = Sweep(tmp_path / "once", jobs(1, "run.max_restarts=1"))
+    once.run(lambda: once.nodes[0].end(exit_code), lambda: once.nodes[0].end(exit_code))
+    assert (once.states(), once.jobs[0].progress.error) == (["failed"], said)
+
+
+def full(*_: Any, **__: Any) -> None:
+    raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), "some/file")
+
+
+class FullStudy(Study):
+    """Cannot be written when it is told of a job, or asked about one."""
+
+    tell = full
+    is_hopeless = full
+
+
+@pytest.mark.parametrize("what", ["a job that cannot start", "a study that cannot be written"])
+def test_a_sweep_that_cannot_write_asks_running_jobs_to_save(
+    what: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    sweep = Sweep(tmp_path, jobs(6))
+    orders: list[str] = []
+    for node in sweep.nodes:
+        order = node.order
+        monkeypatch.setattr(
+            node, "order", lambda child, do, order=order: (orders.append(do), order(child, do))
+        )
+
+    def fill() -> None:
+        sweep.nodes[1].end()
+        for node in sweep.nodes:
+            monkeypatch.setattr(node, "start", full)
+
+    if "study" in what:
+        monkeypatch.setattr("test_sweep_nodes.Study", FullStudy)
+    with pytest.raises(OSError, match="No space left"):
+        sweep.run(fill)
+    assert "ask_to_stop" in orders
+    assert "kill" not in orders
+    states = sweep.states()
+    assert "running" not in states
+    assert "interrupted" in states
+
+
+def test_an_order_that_cannot_be_written_is_named(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("gmijax.sweeps.children.write_json", full)
+    before = len(os.listdir("/proc/self/fd"))
+    with pytest.raises(GmijaxError, match=r"^job 003: cannot be started \(No space left"):
+        Child([], (), tmp_path / "003.json", tmp_path / "003.log", {})
+    assert len(os.listdir("/proc/self/fd")) == before
+
+
+def ended_job() -> list[Job]:
+    (job,) = jobs_of([compose()])
+    job.progress.take({"env_steps": 9, "return": 1.0}, SweepConfig(objective="return"))
+    return [job]
+
+
+def test_room_is_kept_for_the_end_of_a_sweep(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    paths = SweepPaths(tmp_path)
+    files = Report(ended_job(), SweepConfig(), paths, 0.0)
+    files.begin()
+    assert read_json(paths.sweep)["status"] == "running"
+    assert paths.room.stat().st_blocks * 512 >= 2 * paths.sweep.stat().st_size
+
+    def while_there_is_room(write: Callable[..., None]) -> Callable[..., None]:
+        return lambda *args: full() if paths.room.exists() else write(*args)
+
+    for name in ("write_json", "write_text"):
+        monkeypatch.setattr(report, name, while_there_is_room(getattr(report, name)))
+    monkeypatch.setattr(report, "write_bytes", full)
+    files._states.clear()
+    files.update()  # Ends nothing.
+    assert read_json(paths.sweep)["status"] == "running"
+    before = paths.curves.read_bytes()
+    assert files.end("failed") == "the report cannot be written (No space left on device)"
+    assert read_json(paths.sweep)["status"] == "failed"
+    assert paths.table.exists()
+    assert paths.curves.read_bytes() == before  # The old picture is whole.
+    assert not paths.room.exists()
+
+
+def run(*overrides: str) -> int:
+    return sweep_command(["env=ant", "seed=0,1", *overrides])
+
+
+TPE = ("sweep.sampler=tpe", "sweep.trials=3")
+
+
+@pytest.mark.parametrize("given", [(), ("run.dir=mine",), ("run.dir=there",)])
+def test_a_refused_sweep_leaves_nothing(
+    given: tuple[str, ...],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setitem(sys.modules, "optuna", None)
+    (tmp_path / "there").mkdir()
+    assert run(*TPE, *given) == 2
+    assert "pip install 'gmijax[sweep]'" in capsys.readouterr().err
+    assert [path.name for path in tmp_path.iterdir() if path.name != "runs"] == ["there"]
+    assert list((tmp_path / "there").iterdir()) == []
+    assert not list(tmp_path.glob("runs/*"))
+
+
+def test_a_disk_that_is_full_at_the_start_leaves_nothing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("gmijax.sweeps.sweep.write_json", full)
+    for sampler in ((), (*TPE, "algo.learning_rate=interval(1e-5,1e-3)")):
+        assert run("run.dir=all", *sampler) == 1
+        assert capsys.readouterr().err == "gmijax.sweep: some/file: No space left on device\n"
+        assert not (tmp_path / "all").exists()
+
+
+def test_the_folder_of_another_sweep_is_left_alone(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    paths = SweepPaths(tmp_path / "all")
+    paths.root.mkdir()
+    with locked(paths.lock, "here"):  # One that has not written anything yet.
+        assert run("run.dir=all") == 2
+        assert paths.lock.exists()
+    paths.request.write_text(json.dumps({"jobs": []}))
+    assert run("run.dir=all") == 2
+    assert "holds another sweep" in capsys.readouterr().err
+    assert paths.request.exists()
