@@ -46,6 +46,7 @@ def test_a_job_whose_controller_is_killed_runs_again(
     assert sweep.states() == ["completed"] * 2
     (event,) = map(json.loads, sweep.paths.job(0).events.read_text().splitlines())
     assert event["reason"] == f"again, after {said}"
+    (tmp_path / "once").mkdir()
     once = Sweep(tmp_path / "once", jobs(1, "run.max_restarts=1"))
     once.run(lambda: once.nodes[0].end(exit_code), lambda: once.nodes[0].end(exit_code))
     assert (once.states(), once.jobs[0].progress.error) == (["failed"], said)
