@@ -156,11 +156,11 @@ class Search:
             "versions": installed_versions(),
         }
         self._console.print(table(outcome, self._isolated))
+        self._console.print(reason)  # Before the files, for which there may be no room.
         if self.run is not None:
             write_json(self.run.search_report, report)
             draw(outcome, self.run.search_png, f"{label}, {device}")
             self._console.print(f"report: {self.run.search_report}")
-        self._console.print(reason)
         run_dir = None if self.run is None else self.run.root
         gmis_per_gpu, num_envs, impl, trainers = best.point
         return SearchResult(run_dir, gmis_per_gpu, num_envs, impl, reason, report, trainers, split)

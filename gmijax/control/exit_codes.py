@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import sys
 from collections.abc import Callable
 from typing import Final
@@ -12,6 +13,9 @@ EXIT_OK: Final = 0
 EXIT_FAILED: Final = 1
 EXIT_BAD_INPUT: Final = 2
 EXIT_INTERRUPTED: Final = 130
+
+_OF_DISKS: Final = (errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EIO)
+"""Errors of a file that no command can help."""
 
 
 def exit_code_of(name: str, run: Callable[[], object]) -> int:
@@ -27,6 +31,11 @@ def exit_code_of(name: str, run: Callable[[], object]) -> int:
         return EXIT_INTERRUPTED
     except GmijaxError as error:
         _complain(name, error)
+        return EXIT_FAILED
+    except OSError as error:
+        if error.errno not in _OF_DISKS:
+            raise  # It may be a fault of gmijax.
+        _complain(name, f"{error.filename or 'a file'}: {error.strerror}")
         return EXIT_FAILED
 
 

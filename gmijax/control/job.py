@@ -9,7 +9,7 @@ from __future__ import annotations
 import dataclasses
 import time
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -221,7 +221,8 @@ def record_end(
     """Leaves in the run folder how a run has ended; arguments as of `train_summary`."""
     add_event(run.events, status)
     write_json(run.summary, train_summary(config, plan, run, status, wall_s, restarts))
-    draw_returns(run.metrics, run.returns_png, f"{config.env.label}, {config.algo.name}")
+    with suppress(OSError):  # What counts is written.
+        draw_returns(run.metrics, run.returns_png, f"{config.env.label}, {config.algo.name}")
 
 
 def started_from(config: TrainConfig, checkpoint: Path | None) -> TrainConfig:

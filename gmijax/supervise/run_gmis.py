@@ -12,7 +12,7 @@ import signal
 import threading
 import time
 from collections.abc import Callable, Iterable, Iterator
-from contextlib import ExitStack, contextmanager, suppress
+from contextlib import ExitStack, contextmanager
 from types import FrameType
 from typing import Final
 
@@ -96,6 +96,9 @@ def recorded(
       run: the run folder.
       what_is_left: in words, for a job that was interrupted.
       record: gets `completed`, `interrupted` or `failed`, and the plan as it was run.
+
+    Raises:
+      GmijaxError: the job is complete, and the record cannot be written.
     """
     status = "failed"
     try:
@@ -109,9 +112,13 @@ def recorded(
         error.add_note(f"run folder: {run.root}")
         raise
     finally:
-        # A full disk must not hide why the job failed.
-        with suppress(OSError):
+        try:
             record(status, Plan.from_dict(read_json(run.plan)))  # Its backend may be another.
+        except OSError as error:
+            # A full disk must not hide why a job failed; nor may what is not written be read.
+            if status == "completed":
+                why = error.strerror or error
+                raise GmijaxError(f"the outcome cannot be written to {run.root} ({why})") from None
 
 
 def _enter_backend(held: ExitStack, launch: Launch) -> tuple[Launch, Backend]:

@@ -53,7 +53,7 @@ def test_a_job_whose_controller_is_killed_runs_again(
     assert (once.states(), once.jobs[0].progress.error) == (["failed"], said)
 
 
-def full(*_: Any, **__: Any) -> None:
+def full(*_: Any, **__: Any) -> Any:
     raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), "some/file")
 
 

@@ -1,0 +1,58 @@
+"""What commands say where a disk is full or cannot be written: one line."""
+
+from __future__ import annotations
+
+import errno
+import os
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+from supervision import machine, planned
+
+from gmijax.control.exit_codes import exit_code_of
+from gmijax.errors import GmiFailed, GmijaxError, JobInterrupted
+from gmijax.runs.folder import RunPaths, write_json
+from gmijax.supervise.run_gmis import recorded
+
+
+def failing(number: int) -> Callable[..., None]:
+    def write(*_: object) -> None:
+        raise OSError(number, os.strerror(number), "runs/x/search.json")
+
+    return write
+
+
+@pytest.mark.parametrize("number", [errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EIO])
+@pytest.mark.parametrize("verb", ["train", "search", "serve", "play", "export", "sweep"])
+def test_an_error_of_the_disk_is_one_line(
+    verb: str, number: int, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert exit_code_of(verb, failing(number)) == 1
+    said = f"gmijax.{verb}: runs/x/search.json: {os.strerror(number)}\n"
+    assert capsys.readouterr().err == said
+
+
+def test_other_errors_of_files_are_not_hidden() -> None:
+    for number in (errno.EMFILE, errno.EBADF):
+        with pytest.raises(OSError, match=r"search\.json"):
+            exit_code_of("train", failing(number))
+
+
+@pytest.mark.parametrize("number", [errno.ENOSPC, errno.ENOENT])
+def test_what_a_complete_job_cannot_write_is_not_read(number: int, tmp_path: Path) -> None:
+    run = RunPaths(tmp_path)
+    write_json(run.plan, planned(machine(0)).to_dict())
+    with (
+        pytest.raises(GmijaxError, match=f"outcome cannot be written to .*{os.strerror(number)}"),
+        recorded(run, str, failing(number)),
+    ):
+        pass
+
+
+def test_a_full_disk_does_not_hide_why_a_job_ended(tmp_path: Path) -> None:
+    run = RunPaths(tmp_path)
+    write_json(run.plan, planned(machine(0)).to_dict())
+    for error in (GmiFailed(0, "exit code 1"), JobInterrupted("interrupted")):
+        with pytest.raises(type(error)), recorded(run, str, failing(errno.ENOSPC)):
+            raise error
