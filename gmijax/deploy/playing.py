@@ -36,6 +36,7 @@ from gmijax.runs.resume import (
     best_checkpoint,
     checkpoints_of,
     find_checkpoint,
+    rank_of,
 )
 from gmijax.runs.saved_config import left_out, trained_config
 from gmijax.sim import source
@@ -115,6 +116,11 @@ def open_run(config: C) -> tuple[C, EnvConfig, str | None]:
       ConfigError: no such run or checkpoint, or its task cannot be had.
     """
     checkpoint = _find(config)
+    early = None
+    if config.checkpoint == "best" and not rank_of(checkpoint).is_full:
+        early = (
+            "checkpoint=best: none has an evaluation or a full window of episodes to compare by"
+        )
     saved, _ = trained_config(checkpoint)
     env = source.opened(saved, config.run.env)
     require_env(env)
@@ -122,7 +128,7 @@ def open_run(config: C) -> tuple[C, EnvConfig, str | None]:
     if env.suite == "custom":
         run = dataclasses.replace(run, env=env.name, env_sha256=env.source_sha256)
     config = dataclasses.replace(config, checkpoint=str(checkpoint), run=run)
-    changes = source.changes(env, dataclasses.asdict(saved)), left_out(checkpoint)
+    changes = source.changes(env, dataclasses.asdict(saved)), left_out(checkpoint), early
     return config, env, "\n".join(filter(None, changes)) or None
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import errno
 import io
 import math
 import os
@@ -58,7 +59,11 @@ class Report:
         draw_curves(self._jobs, self._sweep, self._paths)
         size = _ROOM_BYTES + 2 * self._paths.sweep.stat().st_size
         with self._paths.room.open("wb") as file:
-            os.posix_fallocate(file.fileno(), 0, size)
+            try:
+                os.posix_fallocate(file.fileno(), 0, size)
+            except OSError as error:
+                if error.errno in (errno.ENOSPC, errno.EDQUOT):
+                    raise  # Others: not every file system can keep room.
 
     def update(self) -> None:
         """Writes the tables if the state of a job has changed."""

@@ -159,8 +159,8 @@ def test_a_job_goes_on_from_its_checkpoint_until_an_agent_is_killed_and_named(
     lines = read_metrics(run / "metrics.jsonl")
     assert lines[: len(history)] == history
     assert all(line["env_steps"] > before for line in lines[len(history) :])
-    (kept,) = (two_and_two / "checkpoints").glob("[0-9]*/episodes.json")
-    told = sum(one["count"] for one in _read(kept)["ended"])
+    kept = _read(find_checkpoint(str(two_and_two), "test") / "episodes.json")
+    told = sum(one["count"] for one in kept["ended"])
     assert told == history[-1]["window/episodes"]  # The last line is in the last checkpoint.
     assert lines[len(history)]["window/episodes"] >= min(told, WINDOW_EPISODES)
 

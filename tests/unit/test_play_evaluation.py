@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import shutil
 from pathlib import Path
+from typing import Any
 
 import pytest
 from rich.console import Console
@@ -57,6 +58,27 @@ def test_the_latest_checkpoint_is_played_unless_one_is_named(
         (("checkpoint=best",), best),
     ):
         assert playing._find(config_of(*overrides)) == expected
+
+
+@pytest.mark.parametrize(
+    ("compared", "is_told"),
+    [({}, True), ({"eval_return": -1.0}, False), ({"window_full": True}, False)],
+)
+def test_a_best_checkpoint_that_nothing_was_compared_by_is_told(
+    compared: dict[str, Any], is_told: bool, run: RunPaths, monkeypatch: pytest.MonkeyPatch
+):
+    env = EnvConfig(name="ant", episode_length=None)
+    monkeypatch.setattr(playing, "trained_config", lambda checkpoint: (env, None))
+    monkeypatch.setattr(playing, "left_out", lambda checkpoint: None)
+    first = run.checkpoint(100)
+    meta = dataclasses.replace(CheckpointMeta.read(first), mean_return=-6.3, **compared)
+    write_json(first / META, meta.to_dict())
+    for wanted in ("best", str(first)):
+        config, _, changed = playing.open_run(
+            config_of(f"run.dir={run.root}", f"checkpoint={wanted}")
+        )
+        assert config.checkpoint == str(first.resolve())
+        assert (changed is not None) == (is_told and wanted == "best")
 
 
 def test_a_checkpoint_outside_of_its_run_is_bad_input(run: RunPaths, tmp_path: Path):

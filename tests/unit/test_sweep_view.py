@@ -156,6 +156,16 @@ def test_overrides_and_value_of_a_job_are_there_for_the_hparams_tab(tmp_path: Pa
     assert plugin_data.FromString(said["session_end_info"]).HasField("session_end_info")
 
 
+def test_a_value_that_cannot_be_compared_has_a_tag_of_its_own(tmp_path: Path) -> None:
+    job, run = Job(0, {"seed": "0"}, compose()), RunPaths(tmp_path)
+    job.progress.value, job.progress.is_full = -6.3, False
+    write_hparams(job, run, "return")
+    (path,) = run.tensorboard.iterdir()
+    tags = {value.tag for event in events(path) for value in event.summary.value}
+    assert "hparam/return (window not full)" in tags
+    assert "hparam/return" not in tags
+
+
 def events(path: Path) -> list[Any]:
     """The events of a file of records: length, its checksum, content, its checksum."""
     data, found = path.read_bytes(), []
