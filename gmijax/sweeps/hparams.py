@@ -29,7 +29,7 @@ def write_hparams(job: Job, run: RunPaths, objective: str) -> None:
     from tensorboardX.summary import hparams, scalar
 
     event: Any = vars(event_pb2)["Event"]  # Made by protobuf at run time.
-    tag = f"hparam/{objective}{'' if job.progress.is_full else ' (window not full)'}"
+    tag = f"hparam/{objective}{'' if job.progress.is_full else '_window_not_full'}"
     chosen = {key: _value(text) for key, text in job.overrides.items()}
     run.tensorboard.mkdir(parents=True, exist_ok=True)
     writer = EventsWriter(str(run.tensorboard / "events"), _SUFFIX)

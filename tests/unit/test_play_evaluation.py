@@ -46,7 +46,8 @@ def test_the_latest_checkpoint_is_played_unless_one_is_named(
     first, latest, best = (run.checkpoint(steps) for steps in (100, 2000, 300))
     meta = CheckpointMeta.read(latest)
     write_json(latest / META, dataclasses.replace(meta, eval_return=-2.0).to_dict())
-    write_json(best / META, dataclasses.replace(meta, eval_return=-1.0).to_dict())
+    meta = dataclasses.replace(meta, env_steps=300, eval_return=-1.0)
+    write_json(best / META, meta.to_dict())
     for overrides, expected in (
         ((), latest),
         (("run.dir=last",), latest),

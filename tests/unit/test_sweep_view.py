@@ -162,7 +162,7 @@ def test_a_value_that_cannot_be_compared_has_a_tag_of_its_own(tmp_path: Path) ->
     write_hparams(job, run, "return")
     (path,) = run.tensorboard.iterdir()
     tags = {value.tag for event in events(path) for value in event.summary.value}
-    assert "hparam/return (window not full)" in tags
+    assert "hparam/return_window_not_full" in tags
     assert "hparam/return" not in tags
 
 
