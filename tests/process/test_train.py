@@ -135,7 +135,8 @@ def test_a_resumed_run_logs_what_one_that_was_not_stopped_does(tmp_path: Path) -
             "reward/near",
             "loss/value_loss",
         ):
-            assert mine[key] == theirs[key], key
+            assert mine.get(key) == theirs.get(key), key
+    assert one[11]["return"] is not None  # There is something to go on with.
     meta = CheckpointMeta.read(find_checkpoint(str(tmp_path / "parts"), "test"))
     assert meta.mean_return == one[-1]["window/return"]
     assert meta.window_full == bool(one[-1]["window/full"])
