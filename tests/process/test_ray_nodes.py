@@ -124,6 +124,7 @@ def test_agents_teach_trainers_of_two_nodes_and_of_one_when_the_other_dies(
         before = json.loads((run / "plan.json").read_text())
         assert [node["gmis"] for node in before["nodes"]] == [[0, 2], [1, 3]]
         assert before["strategy"] == "mpr"
+        assert addresses_of_listeners(pids_of(run)) == set()  # All have met.
 
         os.kill(cluster.second_raylet, signal.SIGKILL)
         wait(lambda: len(events(run, "recovered")) == 1, "it goes on without the second node")
@@ -167,6 +168,7 @@ def test_a_job_outlives_a_gmi_and_a_node_and_nothing_outlives_its_controller(
             )
 
         wait(lambda: iteration_of(run, 3) > 6, "the job trains")
+        assert addresses_of_listeners(pids_of(run)) == set()  # All have met.
         kill(gmi_pid(run, 3) or 0)
         wait(lambda: len(events(run, "recovered")) == 1, "it goes on without GMI 3")
         [fault] = events(run, "fault")

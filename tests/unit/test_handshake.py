@@ -147,15 +147,14 @@ def test_what_was_sent_once_proves_nothing_later(listener: socket.socket) -> Non
 
 
 def test_what_the_listener_sends_proves_nothing_to_itself(listener: socket.socket) -> None:
-    hearing = threading.Thread(target=first, args=(listener, 1.0))
-    hearing.start()
-    with stranger(listener, bytes(32)) as other:
+    with ThreadPoolExecutor(1) as pool, stranger(listener, bytes(32)) as other:
+        heard = pool.submit(first, listener, 0.5)
         nonce = other.recv(32, socket.MSG_WAITALL)
         caller = struct.pack("<II", *CALLER)
         # The proof that the listener itself would send.
         other.sendall(caller + KEY.proof(b"hears", caller, bytes(32) + nonce))
+        assert heard.result() is None
         assert is_hung_up_on(other)
-    hearing.join()
 
 
 @pytest.mark.parametrize("key", [Key(os.urandom(32), "node 0"), Key(KEY.token, "node 1")])
@@ -246,8 +245,10 @@ def knocking(listener: socket.socket, kind: str) -> Iterator[None]:
     def knock() -> None:
         while not over.is_set():
             with suppress(OSError), stranger(listener, SENT.get(kind, b"")) as other:
-                while kind != "noise" and not over.wait(0.05):
+                while not over.wait(0.005 if kind == "noise" else 0.05):
                     other.sendall(b"x" if kind == "drip" else b"")
+                    if kind == "noise":
+                        break
 
     threads = [threading.Thread(target=knock) for _ in range(5)]
     for thread in threads:

@@ -41,8 +41,8 @@ _ACCEPTED_AT_ONCE: Final = 4
 _CALLER: Final = struct.Struct("<II")
 _NONCE_BYTES = _PROOF_BYTES = 32
 _CALL_BYTES: Final = _NONCE_BYTES + _CALLER.size + _PROOF_BYTES
-_KEEP_ALIVE: Final = {socket.TCP_KEEPIDLE: 2, socket.TCP_KEEPINTVL: 2, socket.TCP_KEEPCNT: 4}
-"""A machine that is gone is noticed after some ten seconds, if nothing is on the way to it."""
+_KEEP_ALIVE: Final = {socket.TCP_KEEPIDLE: 10, socket.TCP_KEEPINTVL: 5, socket.TCP_KEEPCNT: 6}
+"""A machine that is gone is noticed after some forty seconds, if nothing is on the way to it."""
 
 Caller: TypeAlias = tuple[int, int]
 """Who calls: two numbers whose meaning is up to those who use this."""
@@ -144,20 +144,23 @@ class _Strangers:
     def _accept(self) -> None:
         # Not all at once: those who are answering are heard in between.
         for _ in range(_ACCEPTED_AT_ONCE):
-            if len(self._callers) >= MAX_STRANGERS:
-                self._drop(next(iter(self._callers)))
             try:
                 connection, _ = self._listener.accept()
             except BlockingIOError:
                 return
             except OSError:  # Out of descriptors, or it has gone again.
-                if self._callers:
-                    self._drop(next(iter(self._callers)))
+                self._drop_oldest()
                 time.sleep(_PAUSE_S)
                 return
             connection.setblocking(False)
             self._callers[connection] = _Stranger(connection, self._key)
             self._selector.register(connection, selectors.EVENT_READ)
+            if len(self._callers) > MAX_STRANGERS:
+                self._drop_oldest()
+
+    def _drop_oldest(self) -> None:
+        if self._callers:
+            self._drop(next(iter(self._callers)))
 
     def _drop(self, connection: socket.socket, *, closes: bool = True) -> None:
         self._selector.unregister(connection)
