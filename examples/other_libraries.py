@@ -26,8 +26,9 @@ UNROLL = 16
 def sb3(num_envs: int, num_steps: int) -> Sequence[float]:
     """Returns of all episodes while Stable-Baselines3 trains."""
     from stable_baselines3 import PPO
+    from stable_baselines3.common.vec_env import VecNormalize
 
-    envs = gmijax.make_vector_env(TASK, num_envs, api="sb3")
+    envs = VecNormalize(gmijax.make_vector_env(TASK, num_envs, api="sb3"))
     model = PPO(
         "MlpPolicy",
         envs,
