@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import fcntl
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -63,6 +64,9 @@ def _make(name: str, home: Path) -> None:
         _make("run", home)
         (home / "run.made").touch()
     write_tasks(home)
+    for left in (name, "found"):
+        if name != "export":  # Of a time when it could not be made.
+            shutil.rmtree(home / left, ignore_errors=True)
     verb, overrides = _MADE_BY[name]
     done = subprocess.run(
         [sys.executable, "-m", f"gmijax.{verb}", *overrides],
