@@ -115,9 +115,10 @@ def _wrong_play(run: Path) -> Iterator[str]:
 
 
 def _wrong_export(run: Path) -> Iterator[str]:
-    for name in ("policy.json", "policy.stablehlo", "policy.onnx"):
-        if _files(run, f"export/*/{name}") != 1:
-            yield f"no {name}"
+    if _files(run, "export/*/policy.json") != 1:
+        yield "no policy.json"
+    if not _files(run, "export/*/policy.stablehlo", "export/*/policy.onnx"):
+        yield "no policy"
 
 
 def _not_an_object(path: Path) -> Iterator[str]:
@@ -173,9 +174,12 @@ COMMANDS: Final[dict[str, Command]] = {
         "play", ("run.dir={run}", "num_envs=4", "html=off"), False, "run",
         lambda run: _files(run, "play/*/returns.json"), _wrong_play,
     ),
-    "export": Command(
-        "export", ("run.dir={run}",), False, "run",
-        lambda run: _files(run, "export/*/policy.json"), _wrong_export,
-    ),
+    **{
+        form: Command(
+            "export", ("run.dir={run}", f"format={form}"), False, "run",
+            lambda run: _files(run, "export/*/policy.json"), _wrong_export,
+        )
+        for form in ("stablehlo", "onnx")
+    },
 }  # fmt: skip
 """By the name that kinds of faults use."""

@@ -77,7 +77,8 @@ def _kills(command: str, whom: str = "gmi", outcome: Outcome = "fails") -> dict[
 _PROCESSES: Final[dict[str, OuterKind]] = {
     **_kills("serve"),
     **_kills("play"),
-    **_kills("export"),
+    **_kills("stablehlo"),
+    **_kills("onnx"),
     **_kills("search", outcome="goes on"),
     **_kills("sweep", outcome="goes on"),
     **_kills("tdg", outcome="restarted"),
@@ -122,7 +123,7 @@ _DISKS: Final[dict[str, OuterKind]] = {
     f"{command}_{disk}": OuterKind(command, moment, "fill", "run", "fails", disk=disk)
     for command, moment in {
         "train": "saved", "a3c": "saved", "sweep": "saved", "serve": "saved", "search": "begun",
-        "play": "begun", "export": "begun",
+        "play": "begun", "stablehlo": "begun", "onnx": "begun",
     }.items()
     for disk in ("small", "few_inodes")
 } | {
@@ -136,10 +137,10 @@ _NAMES: Final[dict[str, OuterKind]] = {
     "train_odd_path": OuterKind("train", "saved", "kill", "controller", "killed"),
     "a3c_odd_path": OuterKind("a3c", "saved", "kill", "controller", "killed"),
     "sweep_odd_path": OuterKind("sweep", "saved", "kill", "controller", "killed"),
-    "export_odd_path": OuterKind("export", "any", "kill", "controller", "killed"),
+    "stablehlo_odd_path": OuterKind("stablehlo", "any", "kill", "controller", "killed"),
 } | {
     f"{command}_shadowed": OuterKind(command, "saved", "nothing", "run", "goes on")
-    for command in ("train", "sweep", "serve", "play", "search", "export")
+    for command in ("train", "sweep", "serve", "play", "search", "stablehlo")
 }
 
 OUTER_KINDS: Final[dict[str, OuterKind]] = _PROCESSES | _FOLDERS | _DISKS | _NAMES
@@ -168,6 +169,7 @@ def faults_of(trial: Trial) -> list[str]:
 
 
 _GROUPS: Final = {
+    **dict.fromkeys(("stablehlo", "onnx"), "export"),
     **dict.fromkeys(("measured", "summary", "films", "cache", "tdg"), "train"),
     "edit": "files that were edited",
 }
