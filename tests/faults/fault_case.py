@@ -23,6 +23,9 @@ from training_jobs import child_environment, wait_until
 LIMIT_S = 150.0
 """Of what is waited for; on an idle machine it takes seconds."""
 
+_LOOK_S = 0.1
+"""From one look to the next: to look through all processes costs as much as a start does."""
+
 ODD_NAMES = (
     "a[b]c", "hidden=[16,16]", "back\\slash", "with space", "ünï-文", "*?", "{a,b}", "50%d",
     "it's", "a$HOME", "[", "]x[",
@@ -109,6 +112,7 @@ class FaultyCommand:
                 lambda job=job, moment=moment: job.poll() is not None or moment(self),
                 LIMIT_S,
                 f"{self._kind.moment} of {self.command}",
+                _LOOK_S,
             )
             is_there = True
             if self._kind.moment == "any":
@@ -144,7 +148,10 @@ class FaultyCommand:
     def _end_well(self, job: subprocess.Popen[bytes], wanted: int) -> None:
         if self._about.is_endless:
             wait_until(
-                lambda: job.poll() is not None or self._has_gone_on(wanted), LIMIT_S, "it goes on"
+                lambda: job.poll() is not None or self._has_gone_on(wanted),
+                LIMIT_S,
+                "it goes on",
+                _LOOK_S,
             )
             send([Process(job.pid, "controller", "", None)], signal.SIGTERM)
         code = self._wait(job)

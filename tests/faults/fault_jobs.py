@@ -112,7 +112,7 @@ class _Job:
         code = self._command()
         self.commands += 1
         now = [number for number in sorted(self._fired()) if number not in fired]
-        wait_until(lambda: not processes_of(self._cwd), LIMIT_S, "all processes gone")
+        wait_until(lambda: not processes_of(self._cwd), LIMIT_S, "all processes gone", 0.1)
         self._judge(now, code, newest)
         for number in now:
             self._repair_or_damage(self._faults[number].kind)
