@@ -200,7 +200,7 @@ class FaultyCommand:
         for name, path in names.items():
             value = value.replace(f"{{{name}}}", path)
         is_path = str(self._home) in value
-        quoted = value.replace("\\", "\\\\").replace("'", "\\'")
+        quoted = value.replace("'", "\\'")
         return f"{key}='{quoted}'" if is_path else f"{key}={value}"
 
     def _wait(self, job: subprocess.Popen[bytes]) -> int:
