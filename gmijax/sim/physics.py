@@ -19,9 +19,18 @@ import mujoco
 from mujoco import mjx
 
 from gmijax.errors import ConfigError
+from gmijax.sim import carried
 from gmijax.sim.impl import ON_GPU, Impl, WarpSizes, choose_impl
 from gmijax.sim.interface import OVERFLOWS, Env, EnvSpec, EnvState
-from gmijax.sim.warp.step import WarpStep
+from gmijax.sim.kinematic_model import kinematic_model
+from gmijax.sim.many_contacts import warn_of_many
+from gmijax.sim.unsimulated import (
+    FULL_NAMES,
+    refuse_idle_sensors,
+    refuse_parts,
+    without_idle_flags,
+)
+from gmijax.sim.warp.step import WarpStep, moving
 from gmijax.sim.warp.worlds import OVERFLOW, STATE, name_of
 from gmijax.types import Array, PRNGKey, PyTree
 
@@ -46,12 +55,36 @@ class PhysicsState(NamedTuple):
       qacc_warmstart: [nv] float32, the last acceleration, where the solver starts from.
       overflow: [2] bool, which buffers of `OVERFLOWS` were too small in the last control step;
         None with MJX-JAX, whose buffers hold all that can ever be.
+
+    The others are `gmijax.sim.carried.NAMES`, as in MuJoCo's data; None where a world does not
+    carry them. `_replace` drives them: a push, the path of a mocap body.
+
+    Attributes:
+      act: [na] float32, activations; carried if the model has any.
+      time: [] float32, seconds; carried if a sensor shows it.
+      mocap_pos: [nmocap, 3] float32, in metres.
+      mocap_quat: [nmocap, 4] float32.
+      eq_active: [neq] bool, which equality constraints hold.
+      qfrc_applied: [nv] float32, forces on joints.
+      xfrc_applied: [nbody, 6] float32, forces and torques on bodies, in the world.
     """
 
     qpos: Array
     qvel: Array
     qacc_warmstart: Array
     overflow: Array | None = None
+    act: Array | None = None
+    time: Array | None = None
+    mocap_pos: Array | None = None
+    mocap_quat: Array | None = None
+    eq_active: Array | None = None
+    qfrc_applied: Array | None = None
+    xfrc_applied: Array | None = None
+
+    def carried(self) -> dict[str, Array]:
+        """What this world carries of `gmijax.sim.carried.NAMES`, by name."""
+        values = {name: getattr(self, name) for name in carried.NAMES}
+        return {name: value for name, value in values.items() if value is not None}
 
 
 @dataclass(frozen=True)
@@ -79,14 +112,21 @@ class Physics:
         """Seconds of simulated time per control step."""
         return self.mj_model.opt.timestep * self.substeps
 
-    def start(self, qpos: Array, qvel: Array) -> PhysicsState:
+    def start(self, qpos: Array, qvel: Array, **given: Array) -> PhysicsState:
         """The state of a world at `qpos` [nq], `qvel` [nv] with no history.
 
         What only a physics step knows, such as sensors, is not computed: an automatic reset
         happens, under `where`, in every step of every world.
+
+        `given` is what the world carries beside that, by the names of `PhysicsState`. What is not
+        given stays as the model has it, but for activations, which begin at zero.
+
+        Raises:
+          ConfigError: a name or a shape that the model does not have.
         """
         overflow = None if self.impl == "jax" else jnp.zeros(len(OVERFLOWS), bool)
-        return PhysicsState(qpos, qvel, jnp.zeros_like(qvel), overflow)
+        rest = carried.at_start(self.mj_model, given)
+        return PhysicsState(qpos, qvel, jnp.zeros_like(qvel), overflow, **rest)
 
     def poses(self, qpos: Array) -> tuple[Array, Array]:
         """Where all bodies are at `qpos` [nq]: for resets, which run no physics.
@@ -120,25 +160,22 @@ class Physics:
           `sensordata`, forces and body poses in it belong to the moment before that step's
           integration, `qpos` and `qvel` to the moment after it.
         """
+        before = {**{name: getattr(state, name) for name in STATE}, **state.carried()}
+        if self.mj_model.na and "act" not in before:
+            raise ConfigError("world.step: the model has activations, and the state does not")
         if self.warp is not None:
-            before = {name: getattr(state, name) for name in STATE}
             after, reading = self.warp(model, before, ctrl, read)
             overflow = which_overflowed(after.pop(OVERFLOW))
-            return PhysicsState(**after, overflow=overflow), reading
+            return state._replace(**after, overflow=overflow), reading
 
         def substep(data: mjx.Data, _: None) -> tuple[mjx.Data, None]:
             return mjx.step(model, data), None
 
         # One traced physics step: a second copy takes half as long again to compile, and was not
         # faster.
-        data = mjx.make_data(self.model).replace(
-            ctrl=ctrl,
-            qpos=state.qpos,
-            qvel=state.qvel,
-            qacc_warmstart=state.qacc_warmstart,
-        )
+        data = mjx.make_data(self.model).replace(ctrl=ctrl, **before)
         data, _ = jax.lax.scan(substep, data, length=self.substeps)
-        return PhysicsState(data.qpos, data.qvel, data.qacc_warmstart), read(data)
+        return state._replace(**{name: getattr(data, name) for name in moving(before)}), read(data)
 
     def env(
         self,
@@ -193,31 +230,25 @@ def from_mj_model(
 ) -> Physics:
     """Like `load`, for a model that is already in memory.
 
-    Without `warp_sizes` Warp's buffers are as large as those of MJX-JAX.
+    Without `warp_sizes` Warp's buffers hold what the model's geoms can make, up to a number of
+    contacts (`gmijax.sim.warp.sizes`).
     """
-    if mj_model.na or mj_model.nplugin or mj_model.nhistory:
-        raise ConfigError(
-            f"model: {mj_model.na} activations, {mj_model.nplugin} plugins, "
-            f"{mj_model.nhistory} delay samples: none of them are carried between steps; "
-            "allowed are actuators without memory (motor, position, velocity)"
-        )
-    if mj_model.actuator_damping.any() or mj_model.actuator_dampingpoly.any():
-        raise ConfigError(
-            "model: damping of actuators, which MJX-JAX ignores; allowed is that of joints"
-        )
-    if mj_model.opt.enableflags & mujoco.mjtEnableBit.mjENBL_SLEEP:
-        raise ConfigError(
-            "model: sleep=enable: which bodies sleep is not carried between steps; allowed is "
-            "disable"
-        )
     chosen, _ = choose_impl(impl, jax.default_backend())
-    with _refusing(mj_model, "jax"):
-        model = mjx.put_model(mj_model, impl="jax")
-    if chosen == "jax":
-        return Physics(chosen, mj_model, model, substeps)
+    refuse_parts(mj_model, chosen)
+    mj_model, name = without_idle_flags(mj_model), name_of(mj_model)
     with _refusing(mj_model, chosen):
-        warp = WarpStep.load(mj_model, substeps, warp_sizes or _jax_sizes(mj_model))
-    return Physics(chosen, mj_model, model, substeps, max_envs, warp)
+        if chosen == "warp":
+            warp = WarpStep.load(mj_model, substeps, warp_sizes)
+            model = kinematic_model(mj_model)
+            if warp_sizes is None and warp.bounds is not None:
+                warn_of_many(name, chosen, *warp.bounds[:2], warp.sizes)
+            return Physics(chosen, mj_model, model, substeps, max_envs, warp)
+        model = mjx.put_model(mj_model, impl="jax")
+        # It finds what `put_model` does not.
+        data = jax.eval_shape(lambda: mjx.make_data(model))
+    refuse_idle_sensors(mj_model, data._impl.nefc)
+    warn_of_many(name, chosen, data._impl.ncon, data._impl.nefc)
+    return Physics(chosen, mj_model, model, substeps)
 
 
 @contextmanager
@@ -226,12 +257,6 @@ def _refusing(mj_model: mujoco.MjModel, impl: Impl) -> Iterator[None]:
         yield
     except (NotImplementedError, ValueError) as error:
         raise ConfigError(
-            f"physics.impl={impl}: MJX cannot simulate the model {name_of(mj_model)} with it: "
-            f"{' '.join(str(error).split())}"
+            f"physics.impl={impl}: {FULL_NAMES[impl]} cannot simulate the model "
+            f"{name_of(mj_model)}: {' '.join(str(error).split())}"
         ) from None
-
-
-def _jax_sizes(mj_model: mujoco.MjModel) -> WarpSizes:
-    """MJX-JAX's sizes: a row for every contact and constraint that can ever be."""
-    bounds = mjx.make_data(mj_model, impl="jax")._impl
-    return WarpSizes(bounds.ncon, bounds.nefc)

@@ -20,9 +20,9 @@ SHAPES = {**dict.fromkeys((*STATE, "ctrl"), (2,)), OVERFLOW: (), "sensordata": (
 
 
 def test_arrays_of_the_buffer_are_apart_and_what_goes_in_and_comes_out_is_in_a_row():
-    given = (("ctrl", (3, 1)), ("body_mass", (1, 5)), *((name, (3, 70)) for name in STATE))
-    taken = (*given[-3:], (OVERFLOW, (3,)), ("xpos", (3, 5, 3)))
-    layout = lay_out(given, taken)
+    given = (("ctrl", (3, 1)), ("body_mass", (1, 5)))
+    state = tuple((name, (3, 70)) for name in STATE)
+    layout = lay_out(given, state, ((OVERFLOW, (3,)), ("xpos", (3, 5, 3))))
     pieces = {**layout.given, **layout.taken}
     assert list(pieces) == ["ctrl", "body_mass", *STATE, OVERFLOW, "xpos"]
     assert [piece.start % 64 for piece in pieces.values()] == [0] * 7

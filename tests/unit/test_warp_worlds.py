@@ -18,8 +18,8 @@ COUNT, SUBSTEPS = 3, 2
 def layout_with(mass_rows: int) -> Layout:
     each = (COUNT, 2)
     state = tuple((name, each) for name in STATE)
-    given = (("ctrl", each), ("body_mass", (mass_rows, 2)), *state)
-    return lay_out(given, (*state, (OVERFLOW, (COUNT,)), ("sensordata", each)))
+    given = (("ctrl", each), ("body_mass", (mass_rows, 2)))
+    return lay_out(given, state, ((OVERFLOW, (COUNT,)), ("sensordata", each)))
 
 
 @pytest.mark.parametrize("mass_rows", [1, COUNT])

@@ -18,8 +18,10 @@ import mujoco
 from mujoco.mjx import warp as mjx_warp
 
 from gmijax.sim.impl import WarpSizes
+from gmijax.sim.warp.sizes import Bounds, bounds_of
 from gmijax.sim.warp.worlds import (
     MODEL_LEAVES,
+    MOVED,
     OVERFLOW,
     STATE,
     Layout,
@@ -44,19 +46,27 @@ class WarpStep:
       substeps: physics steps of a control step.
       sizes: of the buffers for contacts and constraints.
       shapes: of the arrays that MuJoCo Warp's data have for each world, by name.
+      bounds: what no state of a world can exceed; None if nobody asked.
     """
 
     mj_model: mujoco.MjModel
     substeps: int
     sizes: WarpSizes
     shapes: Mapping[str, tuple[int, ...]]
+    bounds: Bounds | None = None
 
     @classmethod
-    def load(cls, mj_model: mujoco.MjModel, substeps: int, sizes: WarpSizes) -> WarpStep:
-        """Raises NotImplementedError or ValueError for a model that MuJoCo Warp refuses."""
+    def load(
+        cls, mj_model: mujoco.MjModel, substeps: int, sizes: WarpSizes | None = None
+    ) -> WarpStep:
+        """The control step of a model; without `sizes` the buffers are as large as it needs.
+
+        Raises:
+          NotImplementedError, ValueError: MuJoCo Warp refuses the model.
+        """
         warp = mjx_warp.warp
         with warp.ScopedDevice("cpu"):
-            mjx_warp.mujoco_warp.put_model(mj_model)
+            bounds = bounds_of(mj_model, mjx_warp.mujoco_warp.put_model(mj_model))
             data = mjx_warp.mujoco_warp.make_data(mj_model, nworld=1)
         shapes = {
             name: (*array.shape[1:], *getattr(array.dtype, "_shape_", ()))
@@ -65,7 +75,7 @@ class WarpStep:
             and array.shape[:1] == (1,)
             and getattr(array.dtype, "_wp_scalar_type_", array.dtype) is warp.float32
         }
-        return cls(mj_model, substeps, sizes, {**shapes, OVERFLOW: ()})
+        return cls(mj_model, substeps, sizes or bounds.sizes, {**shapes, OVERFLOW: ()}, bounds)
 
     def __call__(
         self, model: PyTree, state: Arrays, ctrl: Array, read: Callable[[Any], T]
@@ -74,23 +84,25 @@ class WarpStep:
 
         Args:
           model: an `mjx.Model`, of which `MODEL_LEAVES` count.
-          state: the arrays of `STATE`.
+          state: the arrays of `STATE`, and what else is carried, by name.
           ctrl: [nu].
           read: what the task wants of the data afterwards. They have the arrays of
             `mujoco_warp.Data` that have float32 numbers for each world.
 
         Returns:
-          The state with `OVERFLOW` [] int32, and what `read` returns.
+          The arrays of `STATE` and `MOVED` that it was given, `OVERFLOW` [] int32, and what `read`
+          returns.
         """
         wanted: list[str] = []
         jax.eval_shape(lambda: read(Readings(functools.partial(self._noted, wanted))))
-        reads = tuple(dict.fromkeys(name for name in wanted if name not in (*STATE, "ctrl")))
+        drives = {"ctrl": ctrl, **state}
+        reads = tuple(dict.fromkeys(name for name in wanted if name not in drives))
         leaves = {name: getattr(model, name) for name in MODEL_LEAVES}
-        given = {"ctrl": ctrl, **{name: leaf for name, leaf in leaves.items() if leaf.size}}
-        alone = {name: array[None] for name, array in (given | state).items()}
+        given = {"ctrl": ctrl, **{n: leaf for n, leaf in leaves.items() if leaf.size}, **state}
+        alone = {name: array[None] for name, array in given.items()}
         out = {name: array[0] for name, array in self._of_worlds(reads)(alone).items()}
-        reading = read(Readings((out | {"ctrl": ctrl}).__getitem__))
-        return {name: out[name] for name in (*STATE, OVERFLOW)}, reading
+        reading = read(Readings((drives | out).__getitem__))
+        return {name: out[name] for name in (*moving(state), OVERFLOW)}, reading
 
     def _noted(self, wanted: list[str], name: str) -> Array:
         if name not in self.shapes or name == OVERFLOW:
@@ -124,14 +136,15 @@ class WarpStep:
         """Steps N worlds.
 
         Args:
-          reads: names of arrays of the data, beside `STATE`.
+          reads: names of arrays of the data, beside those that it is given.
           given: arrays with a leading axis [N]; leaves that worlds share have [1].
         """
         count = given["qpos"].shape[0]
-        first = [name for name in given if name not in STATE]
+        state = moving(given)
         layout = lay_out(
-            tuple((name, given[name].shape) for name in (*first, *STATE)),
-            tuple((name, (count, *self.shapes[name])) for name in (*STATE, OVERFLOW, *reads)),
+            tuple((name, array.shape) for name, array in given.items() if name not in state),
+            tuple((name, given[name].shape) for name in state),
+            tuple((name, (count, *self.shapes[name])) for name in (OVERFLOW, *reads)),
         )
         (out,) = _target(self, *(tuple(part.items()) for part in layout))(joined(layout, given))
         found = {
@@ -151,10 +164,18 @@ class Readings:
         return self._array(name)
 
 
+def moving(given: Mapping[str, Array]) -> tuple[str, ...]:
+    """Names of what goes in and comes out, of what is `given`."""
+    return tuple(name for name in (*STATE, *MOVED) if name in given)
+
+
 def joined(layout: Layout, given: Mapping[str, Array]) -> Array:
     """The part of the buffer that goes in."""
     return jnp.concatenate(
-        [jnp.pad(given[name].reshape(-1), (0, piece.gap)) for name, piece in layout.given.items()]
+        [
+            jnp.pad(given[name].reshape(-1).astype(jnp.float32), (0, piece.gap))
+            for name, piece in layout.given.items()
+        ]
     )
 
 

@@ -20,7 +20,13 @@ Shapes: TypeAlias = tuple[tuple[str, tuple[int, ...]], ...]
 """Names of arrays and their shapes, in order."""
 
 STATE = ("qpos", "qvel", "qacc_warmstart")
-"""Arrays of the data that go in and come out."""
+"""Arrays of the data that every model has; they go in and come out."""
+
+MOVED = ("act", "time")
+"""Those that go in and come out where they are carried (see `gmijax.sim.carried`)."""
+
+SWITCHES = "eq_active"
+"""The array of the data that is bool: what goes in as floats is copied into it."""
 
 OVERFLOW = "overflow"
 """The array of the data with bits for buffers that were too small; it always comes out."""
@@ -69,7 +75,7 @@ class Layout(NamedTuple):
     The two parts overlap in the state.
 
     Attributes:
-      given: controls, leaves of the model, state.
+      given: controls, leaves of the model, what drives the worlds, state.
       taken: state, overflow, what the task reads.
     """
 
@@ -79,7 +85,7 @@ class Layout(NamedTuple):
     @property
     def num_given(self) -> int:
         """Floats that go in."""
-        return self.given[STATE[-1]].end
+        return max(piece.end for piece in self.given.values())
 
     @property
     def first_taken(self) -> int:
@@ -92,14 +98,15 @@ class Layout(NamedTuple):
         return max(piece.end for piece in self.taken.values())
 
 
-def lay_out(given: Shapes, taken: Shapes) -> Layout:
-    """The layout of these arrays; the last ones `given` and the first ones `taken` are `STATE`."""
+def lay_out(given: Shapes, state: Shapes, taken: Shapes) -> Layout:
+    """The layout of what goes in, of what goes in and comes out, and of what comes out."""
     pieces: dict[str, Piece] = {}
     end = 0
-    for name, shape in (*given, *taken[len(STATE) :]):
+    for name, shape in (*given, *state, *taken):
         pieces[name] = Piece(shape, end)
         end = pieces[name].end
-    return Layout(*({name: pieces[name] for name, _ in part} for part in (given, taken)))
+    parts = ((*given, *state), (*state, *taken))
+    return Layout(*({name: pieces[name] for name, _ in part} for part in parts))
 
 
 def name_of(mj_model: mujoco.MjModel) -> str:
@@ -136,8 +143,14 @@ class Worlds:
         )
         self._substeps = substeps
         self._buffer: Any = mjx_warp.warp.zeros(layout.size, dtype=float)
+        self._switches: Any = None
+        self._keeps_time = "time" in layout.given
         for name, piece in {**layout.given, **layout.taken}.items():
-            self._move(self._model if name in leaves else self._data, name, piece)
+            if name == SWITCHES:
+                part = self._buffer[piece.start : piece.start + piece.size]
+                self._switches = part.reshape(piece.shape)
+            else:
+                self._move(self._model if name in leaves else self._data, name, piece)
         self._given: Any = self._buffer[: layout.num_given]
         self._taken: Any = self._buffer[layout.first_taken :]
         self._graph: Any = None
@@ -183,7 +196,10 @@ class Worlds:
         self._graph = capture.graph
 
     def _compute(self) -> None:
-        self._data.time.zero_()
+        if not self._keeps_time:
+            self._data.time.zero_()
+        if self._switches is not None:
+            mjx_warp.warp.utils.array_cast(self._switches, self._data.eq_active)
         self._data.overflow.zero_()
         # Rows without a constraint are multiplied by zero, which does not help against infinity.
         self._data.efc.J.zero_()

@@ -1,0 +1,60 @@
+"""What may be carried between control steps beside positions, velocities and the warm start.
+
+MuJoCo's data have more that outlives a step. A world carries what its model cannot do without, and
+what a task sets at a start; all else costs nothing.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import jax.numpy as jnp
+import mujoco
+
+from gmijax.errors import ConfigError
+from gmijax.types import Array
+
+NAMES = ("act", "time", "mocap_pos", "mocap_quat", "eq_active", "qfrc_applied", "xfrc_applied")
+"""Names as in MuJoCo's data. Physics moves the first two, a task all others."""
+
+
+def at_start(mj_model: mujoco.MjModel, given: Mapping[str, Array]) -> dict[str, Array]:
+    """What a world carries that starts with what is `given`.
+
+    Raises:
+      ConfigError: a name or a shape that the model does not have.
+    """
+    shapes = _shapes(mj_model)
+    for name, value in given.items():
+        if name not in shapes:
+            known = ", ".join(shapes)
+            raise ConfigError(f"world.start: no {name} can be carried; allowed are {known}")
+        if jnp.shape(value) != shapes[name]:
+            raise ConfigError(
+                f"world.start: {name} has shape {jnp.shape(value)}, not {shapes[name]}"
+            )
+    needed = {name: jnp.zeros(shapes[name]) for name in _needed(mj_model)}
+    return {name: _typed(name, value) for name, value in (needed | dict(given)).items()}
+
+
+def _typed(name: str, value: Array) -> Array:
+    return jnp.asarray(value, bool if name == "eq_active" else jnp.float32)
+
+
+def _needed(mj_model: mujoco.MjModel) -> tuple[str, ...]:
+    """What no task could do without: activations, and the time if a sensor shows it."""
+    has_clock = (mj_model.sensor_type == mujoco.mjtSensor.mjSENS_CLOCK).any()
+    return (*(("act",) if mj_model.na else ()), *(("time",) if has_clock else ()))
+
+
+def _shapes(mj_model: mujoco.MjModel) -> dict[str, tuple[int, ...]]:
+    shapes = (
+        (mj_model.na,),
+        (),
+        (mj_model.nmocap, 3),
+        (mj_model.nmocap, 4),
+        (mj_model.neq,),
+        (mj_model.nv,),
+        (mj_model.nbody, 6),
+    )
+    return dict(zip(NAMES, shapes, strict=True))

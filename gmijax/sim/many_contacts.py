@@ -1,0 +1,42 @@
+"""Says how many contacts a model can have, before minutes go into compiling for all of them."""
+
+from __future__ import annotations
+
+import warnings
+
+from gmijax.sim.impl import Impl, WarpSizes
+
+MANY = 128
+"""Contacts of a world beyond which it is said, and up to which MuJoCo Warp has room for all."""
+
+
+def warn_of_many(
+    name: str, impl: Impl, contacts: int, rows: int, room: WarpSizes | None = None
+) -> None:
+    """Warns of a model that can have more contacts than `MANY`, or than there is room for.
+
+    Args:
+      name: the model's.
+      impl: which implementation.
+      contacts: all that a world can have at once.
+      rows: of constraints, with all of these.
+      room: the sizes of MuJoCo Warp's buffers.
+    """
+    least = MANY if room is None else room.contacts_per_env
+    if contacts <= least:
+        return
+    if impl == "jax" or room is None:
+        what = "MJX-JAX computes all of them in every step, and may take many minutes to compile"
+    else:
+        what = (
+            f"MuJoCo Warp's buffers hold {room.contacts_per_env:,} contacts and "
+            f"{room.constraints_per_env:,} rows; what does not fit is left out and counted, and "
+            "warp_sizes makes them larger"
+        )
+    warnings.warn(
+        f"{name}: its geoms can make {contacts:,} contacts ({rows:,} rows of constraints) in a "
+        f"world. {what}. Most robots have a variant for MJX (an _mjx file); else let primitives "
+        "collide instead of meshes",
+        RuntimeWarning,
+        stacklevel=4,
+    )

@@ -1,0 +1,234 @@
+"""Parts of a model that an implementation of MJX reads over, or carries nothing for, by name.
+
+MJX refuses what it does not have, mostly. What it copies and never reads, it simulates as if it
+were not there. `PARTS` has these, and those that MJX refuses in words of C.
+"""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Callable
+from typing import Any, NamedTuple, TypeAlias
+
+import mujoco
+import numpy as np
+
+from gmijax.errors import ConfigError
+from gmijax.sim.impl import Impl
+
+Model: TypeAlias = mujoco.MjModel
+
+_BOTH: tuple[Impl, ...] = ("jax", "warp")
+_JAX: tuple[Impl, ...] = ("jax",)
+_ENABLE, _DISABLE = mujoco.mjtEnableBit, mujoco.mjtDisableBit
+_SENSOR, _GEOM = mujoco.mjtSensor, mujoco.mjtGeom
+
+WITHOUT_EFFECT = (
+    (
+        "enableflags",
+        _ENABLE.mjENBL_ENERGY | _ENABLE.mjENBL_FWDINV | _ENABLE.mjENBL_INVDISCRETE,
+    ),
+    ("disableflags", _DISABLE.mjDSBL_MIDPHASE | _DISABLE.mjDSBL_AUTORESET),
+)
+"""Flags that change nothing in a step of MJX, and that it may refuse."""
+
+
+class Part(NamedTuple):
+    """A part of a model.
+
+    Attributes:
+      impls: implementations that do not simulate it.
+      name: in the words of the model's XML.
+      is_in: whether a model has it and it matters there.
+      instead: what is allowed.
+    """
+
+    impls: tuple[Impl, ...]
+    name: str
+    is_in: Callable[[Model], Any]
+    instead: str
+
+
+def refuse_parts(mj_model: Model, impl: Impl) -> None:
+    """Raises ConfigError with the first of `PARTS` that is in the model."""
+    for part in PARTS:
+        if impl in part.impls and part.is_in(mj_model):
+            raise ConfigError(
+                f"model: {part.name}, which {FULL_NAMES[impl]} (physics.impl={impl}) does not "
+                f"simulate; allowed is {part.instead}"
+            )
+
+
+def refuse_idle_sensors(mj_model: Model, rows: int) -> None:
+    """Raises ConfigError for sensors that MJX-JAX leaves at zero for want of any `rows`."""
+    needs = mj_model.sensor_needstage == mujoco.mjtStage.mjSTAGE_ACC
+    if not rows and needs.any():
+        first = mj_model.sensor(int(np.flatnonzero(needs)[0]))
+        kind = mujoco.mjtSensor(int(first.type[0])).name.removeprefix("mjSENS_").lower()
+        raise ConfigError(
+            f"model: sensors of forces and accelerations (the first is {first.name or kind}) in a "
+            "model without limits, contacts, friction and equalities, which MJX-JAX "
+            "(physics.impl=jax) leaves at zero; allowed is at least one of these, such as a wide "
+            "range of a joint"
+        )
+
+
+def without_idle_flags(mj_model: Model) -> Model:
+    """The same model without the flags of `WITHOUT_EFFECT`; itself where it has none."""
+    if not any(getattr(mj_model.opt, name) & bits for name, bits in WITHOUT_EFFECT):
+        return mj_model
+    plain = copy.copy(mj_model)
+    for name, bits in WITHOUT_EFFECT:
+        setattr(plain.opt, name, getattr(plain.opt, name) & ~bits)
+    return plain
+
+
+FULL_NAMES: dict[Impl, str] = {"jax": "MJX-JAX", "warp": "MuJoCo Warp"}
+
+
+def _enables(bit: mujoco.mjtEnableBit) -> Callable[[Model], bool]:
+    return lambda m: bool(m.opt.enableflags & bit)
+
+
+def _senses(*types: mujoco.mjtSensor) -> Callable[[Model], Any]:
+    return lambda m: np.isin(m.sensor_type, types).any()
+
+
+def _any(*names: str) -> Callable[[Model], bool]:
+    return lambda m: any(bool(np.any(getattr(m, name))) for name in names)
+
+
+def _disabled_actuators(m: Model) -> Any:
+    groups = m.actuator_group
+    in_range = (groups >= 0) & (groups < 31)
+    return (in_range & (m.opt.disableactuator >> np.clip(groups, 0, 30) & 1)).any()
+
+
+def _ellipsoid_fluid(m: Model) -> Any:
+    has_medium = m.opt.density > 0 or m.opt.viscosity > 0
+    return has_medium and (m.geom_fluid.reshape(m.ngeom, -1)[:, 0] > 0).any()
+
+
+def _one_of_spring_and_damper(m: Model) -> Any:
+    """Without either MJX-JAX has no passive forces at all, without both MuJoCo has none."""
+    bits = m.opt.disableflags & (_DISABLE.mjDSBL_SPRING | _DISABLE.mjDSBL_DAMPER)
+    others = m.ngravcomp or m.opt.density > 0 or m.opt.viscosity > 0
+    if bits == _DISABLE.mjDSBL_SPRING:
+        return others or _any("dof_damping", "tendon_damping")(m)
+    return bits == _DISABLE.mjDSBL_DAMPER and (
+        others or _any("jnt_stiffness", "tendon_stiffness")(m)
+    )
+
+
+def _sensors_of(m: Model, kind: mujoco.mjtSensor) -> Any:
+    return np.flatnonzero(m.sensor_type == kind)
+
+
+def _ranges_from_cameras(m: Model) -> Any:
+    found = _sensors_of(m, _SENSOR.mjSENS_RANGEFINDER)
+    site = m.sensor_objtype[found] == mujoco.mjtObj.mjOBJ_SITE
+    return (~site | (m.sensor_dim[found] != 1)).any()
+
+
+def _ranges_of_unseen_geoms(m: Model) -> Any:
+    unseen = (_GEOM.mjGEOM_CYLINDER, _GEOM.mjGEOM_HFIELD, _GEOM.mjGEOM_SDF)
+    return len(_sensors_of(m, _SENSOR.mjSENS_RANGEFINDER)) and np.isin(m.geom_type, unseen).any()
+
+
+def _ranges_without_materials(m: Model) -> Any:
+    return len(_sensors_of(m, _SENSOR.mjSENS_RANGEFINDER)) and not m.nmat
+
+
+def _touch_in_cylinders(m: Model) -> Any:
+    sites = m.sensor_objid[_sensors_of(m, _SENSOR.mjSENS_TOUCH)]
+    return (m.site_type[sites] == _GEOM.mjGEOM_CYLINDER).any()
+
+
+PARTS: tuple[Part, ...] = (
+    Part(_BOTH, "plugins", lambda m: m.nplugin, "none"),
+    Part(_BOTH, "delay of actuators or sensors", lambda m: m.nhistory, "none"),
+    Part(_BOTH, 'flag sleep="enable"', _enables(_ENABLE.mjENBL_SLEEP), "disable"),
+    Part(_BOTH, 'flag override="enable"', _enables(_ENABLE.mjENBL_OVERRIDE), "disable"),
+    Part(_BOTH, 'flag diagexact="enable"', _enables(_ENABLE.mjENBL_DIAGEXACT), "disable"),
+    Part(
+        _BOTH,
+        'solver="PGS"',
+        lambda m: m.opt.solver == mujoco.mjtSolver.mjSOL_PGS,
+        'solver="Newton" or "CG"',
+    ),
+    Part(
+        _BOTH,
+        "damping of actuators",
+        _any("actuator_damping", "actuator_dampingpoly"),
+        "that of joints and tendons: damping times gear squared",
+    ),
+    Part(
+        _BOTH,
+        "armature of actuators",
+        _any("actuator_armature"),
+        "that of joints and tendons: armature times gear squared",
+    ),
+    Part(
+        _BOTH,
+        "actuatorgroupdisable of actuators that are there",
+        _disabled_actuators,
+        "to leave these actuators out",
+    ),
+    Part(_BOTH, "rangefinders with a camera or data of their own", _ranges_from_cameras, "a site"),
+    Part(
+        _JAX,
+        'integrator="implicit" or "discrete"',
+        lambda m: (
+            m.opt.integrator
+            in (mujoco.mjtIntegrator.mjINT_IMPLICIT, mujoco.mjtIntegrator.mjINT_DISCRETE)
+        ),
+        'integrator="implicitfast", "Euler" or "RK4"',
+    ),
+    Part(
+        _JAX,
+        "noslip_iterations",
+        lambda m: m.opt.noslip_iterations > 0,
+        'noslip_iterations="0" (a larger impratio with cone="elliptic" slips less too)',
+    ),
+    Part(
+        _JAX,
+        'fluidshape="ellipsoid" in a medium',
+        _ellipsoid_fluid,
+        'fluidshape="none", or density="0" viscosity="0"',
+    ),
+    Part(
+        _JAX,
+        'only one of the flags spring="disable" and damper="disable"',
+        _one_of_spring_and_damper,
+        "both or none",
+    ),
+    Part(
+        _JAX,
+        "polynomials of stiffness or damping",
+        _any("jnt_stiffnesspoly", "dof_dampingpoly", "tendon_stiffnesspoly", "tendon_dampingpoly"),
+        "one number",
+    ),
+    Part(
+        _JAX,
+        'actearly="true"',
+        lambda m: (m.actuator_actearly & (m.actuator_actnum > 0)).any(),
+        'actearly="false"',
+    ),
+    Part(_JAX, "adhesion of geoms or pairs", _any("geom_adhesion", "pair_adhesion"), "0"),
+    Part(_JAX, "surfacevel of geoms", _any("geom_surfacevel"), "0"),
+    Part(_JAX, "tactile sensors", _senses(_SENSOR.mjSENS_TACTILE), "touch or contact"),
+    Part(
+        _JAX,
+        "rangefinders beside cylinders, height fields or SDFs, which they do not see",
+        _ranges_of_unseen_geoms,
+        "planes, spheres, capsules, ellipsoids, boxes and meshes",
+    ),
+    Part(
+        _JAX,
+        "rangefinders in a model without any material",
+        _ranges_without_materials,
+        "to give a geom a material",
+    ),
+    Part(_JAX, "touch sensors in a cylinder", _touch_in_cylinders, "a site of another type"),
+)
+"""What is refused. A unit test shows for each that MuJoCo in C moves otherwise."""
