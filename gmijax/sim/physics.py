@@ -36,9 +36,10 @@ from gmijax.types import Array, PRNGKey, PyTree
 
 T = TypeVar("T")
 
-# Bits of MJX-Warp's `overflow`: what did not fit, and limits of iterations, which are meant.
-_CONSTRAINT_BITS, _ITERATION_BITS, _ALL_BITS = 0x003, 0x600, 0xFFF
-_CONTACT_BITS = _ALL_BITS & ~(_CONSTRAINT_BITS | _ITERATION_BITS)
+# Bits of MJX-Warp's `overflow`: what did not fit, and limits that are meant: of iterations, and of
+# triangles of a height field below one geom, which MuJoCo in C has too.
+_CONSTRAINT_BITS, _LIMIT_BITS, _ALL_BITS = 0x003, 0x620, 0xFFF
+_CONTACT_BITS = _ALL_BITS & ~(_CONSTRAINT_BITS | _LIMIT_BITS)
 
 
 def which_overflowed(bits: Array) -> Array:

@@ -212,7 +212,7 @@ def test_bits_of_overflow_are_those_of_warp():
     pytest.importorskip("warp")
     kinds = importlib.import_module("mujoco.mjx.third_party.mujoco_warp._src.types").OverflowType
     assert physics._CONSTRAINT_BITS == kinds.NEFC | kinds.NJMAX_NNZ
-    assert physics._ITERATION_BITS == kinds.ITERATIONS | kinds.LS_ITERATIONS
+    assert physics._LIMIT_BITS == kinds.ITERATIONS | kinds.LS_ITERATIONS | kinds.HFIELD
     assert physics._ALL_BITS == kinds.ALL
 
 

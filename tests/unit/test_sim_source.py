@@ -62,6 +62,20 @@ def test_a_task_in_a_file_is_made_with_its_own_length(tmp_path: Path):
     assert make_env(written(tmp_path, TASK), episode_length=7).spec.episode_length == 7
 
 
+def test_sizes_may_be_integers_of_numpy(tmp_path: Path):
+    # As `mj_model.sensor_dim.sum()` is.
+    sizes = 'SPEC = EnvSpec("point", np.int64(2), np.int32(1), 0.1, np.int64(20), ("near",)'
+    text = TASK.replace('SPEC = EnvSpec("point", 2, 1, 0.1, 20, ("near",)', sizes)
+    spec = make_env(written(tmp_path, f"import numpy as np\n{text}")).spec
+    sizes_of = (spec.obs_size, spec.action_size, spec.episode_length)
+    assert [*map(type, sizes_of)] == [int] * 3
+    assert sizes_of == (2, 1, 20)
+    seen = text.replace('("near",))', '("near",), actor_obs_size=np.int64(1))')
+    assert make_env(written(tmp_path, f"import numpy as np\n{seen}")).spec.actor_obs_size == 1
+    with pytest.raises(ConfigError, match=r"spec\.obs_size=2\.0: must be an integer"):
+        make_env(written(tmp_path, TASK.replace('"point", 2', '"point", 2.0')))
+
+
 def test_a_task_gets_the_weights_and_settings_that_it_takes(tmp_path: Path):
     name = written(tmp_path, TASK.replace("impl, max_envs", "impl, max_envs, settings"))
     with pytest.raises(ConfigError, match=r"^env\.rewards: .*no argument `rewards` to take it$"):

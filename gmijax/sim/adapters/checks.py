@@ -5,6 +5,7 @@ Reset and step are traced, not run: that takes a second or two, and tells shapes
 
 from __future__ import annotations
 
+import operator
 import traceback
 from collections.abc import Callable
 from pathlib import Path
@@ -22,23 +23,18 @@ _FOUND: Final = "found are files beside the task, installed packages, and folder
 """Where a task's imports are looked for: the working directory is not among them."""
 
 
-def check_env(env: Any, what: str) -> None:
-    """Raises ConfigError with one line if `env` is none; `what` says which, for the line."""
+def check_env(env: Any, what: str) -> Env:
+    """The environment, with sizes that are Python's integers, as files and programs want them.
+
+    Raises:
+      ConfigError: `env` is none; one line, in which `what` says which.
+    """
     if not isinstance(env, Env):
         raise ConfigError(f"{what}: expected a gmijax.sim.interface.Env, got {_kind(env)}")
+    if not isinstance(env.spec, EnvSpec):
+        raise ConfigError(f"{what}: spec: expected an EnvSpec, got {_kind(env.spec)}")
+    env = env._replace(spec=_with_plain_sizes(env.spec, what))
     spec = env.spec
-    if not isinstance(spec, EnvSpec):
-        raise ConfigError(f"{what}: spec: expected an EnvSpec, got {_kind(spec)}")
-    for name in ("obs_size", "action_size", "episode_length"):
-        size = getattr(spec, name)
-        if not isinstance(size, int) or size < 1:
-            raise ConfigError(f"{what}: spec.{name}={size!r}: must be an integer of at least 1")
-    seen = spec.actor_obs_size
-    if seen is not None and not (isinstance(seen, int) and 1 <= seen <= spec.obs_size):
-        raise ConfigError(
-            f"{what}: spec.actor_obs_size={seen!r}: must be an integer from 1 to "
-            f"spec.obs_size={spec.obs_size}, or None"
-        )
     key = jax.eval_shape(lambda: jax.random.key(0))
     action = jax.ShapeDtypeStruct((spec.action_size,), jnp.float32)
     state = attempt(f"{what}: reset", jax.eval_shape, env.reset, env.model, key)
@@ -54,6 +50,32 @@ def check_env(env: Any, what: str) -> None:
         if change := _change(state, again):
             raise ConfigError(f"{what}: next_episode must give what reset does, but {change}")
     _check_qpos(env, state, what)
+    return env
+
+
+def _with_plain_sizes(spec: EnvSpec, what: str) -> EnvSpec:
+    """Numpy's integers are welcome: `mj_model.sensor_dim.sum()` is one."""
+    for name in ("obs_size", "action_size", "episode_length"):
+        size = _integer(getattr(spec, name))
+        if size is None or size < 1:
+            raise ConfigError(
+                f"{what}: spec.{name}={getattr(spec, name)!r}: must be an integer of at least 1"
+            )
+        spec = spec._replace(**{name: size})
+    seen = None if spec.actor_obs_size is None else _integer(spec.actor_obs_size)
+    if spec.actor_obs_size is not None and (seen is None or not 1 <= seen <= spec.obs_size):
+        raise ConfigError(
+            f"{what}: spec.actor_obs_size={spec.actor_obs_size!r}: must be an integer from 1 to "
+            f"spec.obs_size={spec.obs_size}, or None"
+        )
+    return spec._replace(actor_obs_size=seen)
+
+
+def _integer(value: Any) -> int | None:
+    try:
+        return operator.index(value)
+    except TypeError:
+        return None
 
 
 def check_start(env: Env, what: str) -> None:

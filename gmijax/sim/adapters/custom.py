@@ -52,7 +52,7 @@ def make(
         for group in given:
             _require_argument(found, group, what)
         env = attempt(what, found, impl=impl, max_envs=max_envs, **given)
-        check_env(env, what)
+        env = check_env(env, what)
         check_start(env, what)
     return env
 
