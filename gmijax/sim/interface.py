@@ -85,7 +85,8 @@ class Env(NamedTuple):
       reset: `(model, key) -> EnvState`, a fresh episode of one world; consumes `key`.
       step: `(model, state, action [A]) -> EnvState`, one control step of one world.
       mj_model: the `mujoco.MjModel` behind `model`, for rendering and for the C oracle.
-      qpos: `EnvState -> [nq]`, joint positions for rendering.
+      qpos: `EnvState -> [nq]`, joint positions for rendering; after them, where mocap bodies
+        move, their positions and their quaternions.
       max_envs: most worlds that may be stepped at once, None for no limit.
       overflow: `EnvState -> [2]` bool, which of `OVERFLOWS` were too small in the last step; None
         if nothing can overflow.

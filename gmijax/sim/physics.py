@@ -16,7 +16,9 @@ from typing import NamedTuple, TypeVar
 import jax
 import jax.numpy as jnp
 import mujoco
+import numpy as np
 from mujoco import mjx
+from numpy.typing import NDArray
 
 from gmijax.errors import ConfigError
 from gmijax.sim import carried
@@ -143,6 +145,15 @@ class Physics:
         data = mjx.kinematics(self.model, data)
         return data.xpos, data.xquat
 
+    def shown(self, state: PhysicsState) -> Array:
+        """[nq], or [nq + 7 nmocap] where mocap bodies move: what a picture of a world needs."""
+        if state.mocap_pos is None and state.mocap_quat is None:
+            return state.qpos
+        there, turned = mocap_poses(self.mj_model)
+        pos = jnp.asarray(there, jnp.float32) if state.mocap_pos is None else state.mocap_pos
+        quat = jnp.asarray(turned, jnp.float32) if state.mocap_quat is None else state.mocap_quat
+        return jnp.concatenate([state.qpos, pos.reshape(-1), quat.reshape(-1)])
+
     def step(
         self,
         model: PyTree,
@@ -191,10 +202,16 @@ class Physics:
             reset=reset,
             step=step,
             mj_model=self.mj_model,
-            qpos=lambda state: state.physics.qpos,
+            qpos=lambda state: self.shown(state.physics),
             max_envs=self.max_envs,
             overflow=None if self.impl == "jax" else lambda state: state.physics.overflow,
         )
+
+
+def mocap_poses(mj_model: mujoco.MjModel) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Positions [nmocap, 3] and quaternions [nmocap, 4] of mocap bodies as the model has them."""
+    data = mujoco.MjData(mj_model)
+    return data.mocap_pos.copy(), data.mocap_quat.copy()
 
 
 def load(asset: str, *, impl: str, substeps: int, max_envs: int | None = None) -> Physics:

@@ -48,11 +48,21 @@ class Stage:
         self.picture(self._model.qpos0)
 
     def picture(self, qpos: npt.NDArray[Any]) -> Image:
-        """The picture [height, width, 3] of one world at `qpos` [nq]."""
-        self._data.qpos[:] = qpos
+        """The picture [height, width, 3] of one world at `qpos`, as `Env.qpos` gives it."""
+        put(self._data, qpos)
         self._mujoco.mj_fwdPosition(self._model, self._data)
         self._renderer.update_scene(self._data, self._camera)
         return self._renderer.render()
+
+
+def put(data: Any, qpos: npt.NDArray[Any]) -> None:
+    """Moves the joints of a `mujoco.MjData`, and its mocap bodies if `qpos` has their poses."""
+    joints, rest = np.split(np.asarray(qpos), [data.qpos.size])
+    data.qpos[:] = joints
+    if rest.size:
+        pos, quat = np.split(rest, [data.mocap_pos.size])
+        data.mocap_pos[:] = pos.reshape(-1, 3)
+        data.mocap_quat[:] = quat.reshape(-1, 4)
 
 
 def choose_camera(model: Any, wanted: str | None) -> int:

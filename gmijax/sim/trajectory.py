@@ -16,7 +16,7 @@ class Trajectory(NamedTuple):
     """Episodes of some worlds, side by side.
 
     Attributes:
-      qpos: [L + 1, E, nq].
+      qpos: [L + 1, E, nq], or longer where mocap bodies move: see `Env.qpos`.
       lengths: [E] steps of every episode.
       control_dt_s: seconds per step.
     """

@@ -18,6 +18,7 @@ import numpy as np
 import numpy.typing as npt
 
 from gmijax.runs.folder import PlayPaths
+from gmijax.sim.stage import put
 from gmijax.sim.trajectory import Trajectory, load_trajectory
 from gmijax.workers.play_film import real_time
 
@@ -79,9 +80,9 @@ def page(model: mujoco.MjModel, trajectory: Trajectory) -> str:
 
 
 def poses_of(model: mujoco.MjModel, qpos: npt.NDArray[Any]) -> tuple[Floats, Floats]:
-    """Positions [B, 3] and quaternions [B, 4] of all bodies but the world at `qpos` [nq]."""
+    """Positions [B, 3] and quaternions [B, 4] of all bodies but the world, by `Env.qpos`."""
     data = mujoco.MjData(model)
-    data.qpos[:] = qpos
+    put(data, qpos)
     mujoco.mj_kinematics(model, data)
     return data.xpos[1:].astype(np.float32), data.xquat[1:].astype(np.float32)
 

@@ -12,6 +12,7 @@ from gmijax.errors import ConfigError
 from gmijax.sim import episode
 from gmijax.sim.interface import EnvSpec
 from gmijax.sim.physics import Physics, PhysicsState, from_mj_model
+from gmijax.sim.stage import put
 from gmijax.sim.wrappers import auto_reset, vectorise
 
 ALL_OF_IT = """
@@ -136,6 +137,22 @@ def test_a_state_without_the_activations_of_its_model_is_refused():
     forgetful = PhysicsState(*jnp.zeros((3, 1)))
     with pytest.raises(ConfigError, match="the model has activations, and the state does not"):
         jax.eval_shape(world.step, world.model, forgetful, jnp.zeros(1))
+
+
+@pytest.mark.parametrize("given", [("mocap_pos",), ("mocap_quat",), ("mocap_pos", "mocap_quat")])
+def test_a_picture_shows_where_mocap_bodies_have_moved(given: tuple[str, ...]):
+    text = ARM.format("").replace("<body mocap", '<body pos="0 1 0" mocap')
+    world = from_mj_model(mujoco.MjModel.from_xml_string(text), impl="jax", substeps=1)
+    at = jnp.full(1, 0.5), jnp.zeros(1)
+    assert world.shown(world.start(*at)).tolist() == [0.5]
+    moved = {"mocap_pos": [[1.0, 2.0, 3.0]], "mocap_quat": [[0.0, 1.0, 0.0, 0.0]]}
+    start = world.start(*at, **{name: jnp.array(moved[name]) for name in given})
+    data = mujoco.MjData(world.mj_model)
+    still = {"mocap_pos": [[0.0, 1.0, 0.0]], "mocap_quat": [[1.0, 0.0, 0.0, 0.0]]}
+    put(data, np.asarray(world.shown(start)))
+    assert data.qpos.tolist() == [0.5]
+    for name in moved:
+        assert getattr(data, name).tolist() == (moved if name in given else still)[name]
 
 
 def test_an_automatic_reset_begins_with_what_a_start_carries():

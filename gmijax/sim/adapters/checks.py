@@ -143,10 +143,12 @@ def _check_state(env: Env, state: Any, key: jax.ShapeDtypeStruct, what: str) -> 
 
 
 def _check_qpos(env: Env, state: EnvState, what: str) -> None:
-    qpos = attempt(f"{what}: qpos", jax.eval_shape, env.qpos, state)
-    if len(qpos.shape) != 1 or (env.mj_model is not None and qpos.shape != (env.mj_model.nq,)):
-        wanted = "a vector" if env.mj_model is None else f"({env.mj_model.nq},)"
-        raise ConfigError(f"{what}: qpos has shape {qpos.shape}, not {wanted}")
+    shape = attempt(f"{what}: qpos", jax.eval_shape, env.qpos, state).shape
+    model = env.mj_model
+    known = () if model is None else ((model.nq,), (model.nq + 7 * model.nmocap,))
+    if len(shape) != 1 or (known and shape not in known):
+        wanted = f"({model.nq},)" if known else "a vector"
+        raise ConfigError(f"{what}: qpos has shape {shape}, not {wanted}")
 
 
 def _change(before: PyTree, after: PyTree) -> str:
