@@ -56,7 +56,7 @@ def roles_of(
     """The roles of every GMI, in order of id; in `decoupled` the `trainers` train.
 
     Raises:
-      ConfigError: a template that this layout is too small for.
+      ConfigError: a template that this layout is too small or too uneven for.
     """
     if template == "tcg":
         return (SERVING,) * layout.num_gmis
@@ -69,9 +69,20 @@ def roles_of(
             f"plan.template={template}: GPU {small[0]} of layout {layout} has one GMI; "
             f"{DESCRIPTIONS[template]}, so every GPU needs at least 2 GMIs (plan.gmis_per_gpu=2)"
         )
+    if template == "tdg_ex" and len(counts := {len(gmis) for gmis in layout.gmis_of_gpu}) > 1:
+        raise ConfigError(
+            f"plan.template={template}: the GPUs of layout {layout} have {_listed(counts)} GMIs; "
+            "every trainer learns from the GMIs of its GPU, and all trainers from as many steps, "
+            "so every GPU needs as many GMIs"
+        )
     firsts = {min(gmis) for gmis in layout.gmis_of_gpu}
     first, others = (AGENT, SIMULATOR) if template == "tdg" else (TRAINER, SERVING)
     return tuple(first if gmi in firsts else others for gmi in layout.gmis)
+
+
+def _listed(counts: Iterable[int]) -> str:
+    *others, last = map(str, sorted(counts))
+    return f"{', '.join(others)} and {last}"
 
 
 def has_role(roles: str, role: str) -> bool:

@@ -107,7 +107,6 @@ UNEVEN = Layout(((3, 1), (0, 2, 4)))
         ("tcg", (), ("simulator+agent",) * 5),
         ("tcg_ex", (), ("simulator+agent+trainer",) * 5),
         ("tdg", (), ("agent", "agent", "simulator", "simulator", "simulator")),
-        ("tdg_ex", (), ("trainer", "trainer", *("simulator+agent",) * 3)),
         (
             "decoupled",
             (2, 4),
@@ -117,6 +116,16 @@ UNEVEN = Layout(((3, 1), (0, 2, 4)))
 )
 def test_roles_by_template(template, trainers, roles):
     assert roles_of(template, UNEVEN, trainers) == roles
+
+
+def test_dedicated_trainers_need_as_many_gmis_on_every_gpu():
+    even = Layout(((3, 1), (0, 2)))
+    assert roles_of("tdg_ex", even) == ("trainer", "trainer", *("simulator+agent",) * 2)
+    message = r"^plan\.template=tdg_ex: the GPUs of layout .* have 2 and 3 GMIs; every trainer"
+    with pytest.raises(ConfigError, match=message):
+        roles_of("tdg_ex", UNEVEN)
+    with pytest.raises(ConfigError, match="have 2, 3 and 4 GMIs"):
+        roles_of("tdg_ex", Layout(((0, 1), (2, 3, 4), (5, 6, 7, 8))))
 
 
 @pytest.mark.parametrize("template", ["tdg", "tdg_ex"])
