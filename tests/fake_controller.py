@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import sys
 from pathlib import Path
 
@@ -19,7 +20,8 @@ def main() -> None:
     here = machine(num_gpus, mps_control=find_mps_control())
     plan = planned(here, gmis_per_gpu=len(modes), backend=backend_name)
     with open_backend(plan, here, run) as backend:
-        Supervisor(make_launch(run, modes, plan), backend).run()
+        stall_s = float(os.environ.get("FAKE_STALL_S", "90"))
+        Supervisor(make_launch(run, modes, plan, stall=stall_s), backend).run()
 
 
 if __name__ == "__main__":

@@ -19,6 +19,7 @@ import numpy.typing as npt
 from gmijax.a3c.job_registers import JobRegisters, Orders, Report
 from gmijax.a3c.rollout import UnrollPrograms, num_counts
 from gmijax.a3c.targets import Unrolls
+from gmijax.clock import running_s
 from gmijax.collectives.channel.sender import Sender
 from gmijax.config import A3cConfig, TrainConfig
 from gmijax.devices import describe_device
@@ -117,9 +118,9 @@ class Agent:
     def _wait_for_start(self) -> None:
         """Returns when the leading trainer has written its first orders and weights."""
         limit_s = self.config.run.start_timeout_s
-        started = time.monotonic()
+        started = running_s()
         while not self._look():
-            if time.monotonic() - started > limit_s:
+            if running_s() - started > limit_s:
                 raise self._late("the start", limit_s)
             time.sleep(_PAUSE_S)
 
@@ -160,7 +161,7 @@ class Agent:
             arrays = {name: np.asarray(values) for name, values in arrays.items()}
         stats = np.asarray(unroll.stats, np.float64)
         started = time.monotonic()
-        if not self._hand_over(arrays, unroll.version, env_state, started):
+        if not self._hand_over(arrays, unroll.version, env_state):
             return
         sender, occupancy = self.sender, self.sender.occupancy()
         if not sender.least_occupancy():  # A trainer has nothing to do: it need not wait for more.
@@ -182,16 +183,15 @@ class Agent:
         arrays: dict[str, npt.NDArray[Any]],
         version: int,
         env_state: BatchState,
-        started: float,
     ) -> bool:
         """Sends an unroll; False if the job ends and nobody wants it any more."""
-        limit_s = self.config.reduce.timeout_s
+        limit_s, started = self.config.reduce.timeout_s, running_s()
         try:
             while not self._offer(arrays, version, env_state):
                 # Trainers that wait for a checkpoint make no room until it is complete.
                 if self._obey(env_state):
                     return False
-                if time.monotonic() - started > limit_s:
+                if running_s() - started > limit_s:
                     raise self._late("send", limit_s)
                 self.link.beat("running", self._unrolls)
         except PipeClosed:

@@ -14,6 +14,7 @@ import numpy.typing as npt
 from gmijax.a3c.a3c import Updated
 from gmijax.a3c.job_registers import JobRegisters, Orders, Report
 from gmijax.a3c.report import BatchCounts, Reporter
+from gmijax.clock import running_s
 from gmijax.config import TrainConfig
 from gmijax.devices import describe_device
 from gmijax.errors import CollectiveTimeout
@@ -173,10 +174,10 @@ class Leader:
           CollectiveTimeout: some did not; nothing gets the checkpoint's name.
         """
         limit_s = self.config.reduce.timeout_s
-        started = time.monotonic()
+        started = running_s()
         self._hear()
         while missing := self._missing():
-            if time.monotonic() - started > limit_s:
+            if running_s() - started > limit_s:
                 raise CollectiveTimeout(
                     self.link.gmi, tuple(missing), "checkpoint", self._updates, limit_s
                 )

@@ -20,6 +20,7 @@ from gmijax.a3c.job_registers import JobRegisters
 from gmijax.a3c.leader import Leader
 from gmijax.a3c.report import MAX_COUNTED, BatchCounts, histogram_of
 from gmijax.a3c.targets import Unrolls
+from gmijax.clock import running_s
 from gmijax.collectives.channel.batcher import Batch, Batcher
 from gmijax.collectives.interface import Reducer
 from gmijax.config import A3cConfig, TrainConfig
@@ -143,7 +144,7 @@ class Trainer:
 
     def _receive(self) -> tuple[Batch, float]:
         """The next batch with at least one unroll that is fresh enough, and the wait for it."""
-        started = since = time.monotonic()
+        started, since = time.monotonic(), running_s()
         # At first the agents may still compile.
         times = self.config
         limit_s = times.reduce.timeout_s if self._updates else times.run.start_timeout_s
@@ -151,7 +152,7 @@ class Trainer:
             try:
                 batch = self.receiver.receive(self._batch_size, _SLICE_S)
             except CollectiveTimeout as error:
-                waited_s = time.monotonic() - since
+                waited_s = running_s() - since
                 if waited_s > limit_s:
                     raise CollectiveTimeout(
                         self.link.gmi, error.missing, "receive", self._updates, limit_s
@@ -160,7 +161,7 @@ class Trainer:
                 if self._weights_of(batch).any():
                     return batch, time.monotonic() - started
                 self._passed_over += histogram_of(self._version - batch.versions)
-                since = time.monotonic()
+                since = running_s()
             if self._updates:
                 self.link.beat("running", self._updates)
 

@@ -6,12 +6,12 @@ Whatever goes wrong in the job is an answer, not an error.
 from __future__ import annotations
 
 import shutil
-import time
 from collections.abc import Callable
 from typing import Any
 
 from gmijax.autotune.grid import Measured, NotRunnable, Point
 from gmijax.autotune.workloads import Mode, Workload
+from gmijax.clock import running_s
 from gmijax.config import Timeouts
 from gmijax.config.schema import to_dict
 from gmijax.errors import ConfigError, GmijaxError, JobInterrupted
@@ -89,11 +89,11 @@ def _launch(
 
 def _until(limit_s: float, on_tick: OnTick) -> OnTick:
     """`on_tick`, which raises ProfileLate once `limit_s` is over."""
-    deadline_s = time.monotonic() + limit_s
+    deadline_s = running_s() + limit_s
 
     def watch(gmis: tuple[GmiStatus, ...]) -> None:
         on_tick(gmis)
-        if time.monotonic() > deadline_s:
+        if running_s() > deadline_s:
             states = ", ".join(f"GMI {gmi.gmi} {gmi.state}" for gmi in gmis)
             raise ProfileLate(f"no end within {limit_s:.0f} s ({states})")
 

@@ -29,6 +29,7 @@ from gmijax.autotune.workloads import (
     Workload,
     installed_versions,
 )
+from gmijax.clock import running_s
 from gmijax.config import AUTO, ServeConfig, TrainConfig
 from gmijax.config.schema import to_dict
 from gmijax.errors import ConfigError, GmijaxError, JobInterrupted
@@ -135,7 +136,7 @@ class Search:
           JobInterrupted: a signal came; the profiles so far are kept.
         """
         started_s = time.monotonic()
-        self._deadline_s = started_s + self._settings.budget_s
+        self._deadline_s = running_s() + self._settings.budget_s
         with self._display:
             outcome = self._outcome()
         best = self._require_best(outcome)
@@ -207,7 +208,7 @@ class Search:
         return result
 
     def _measured(self, point: Point, mode: Mode, what: str) -> Measured | NotRunnable:
-        left_s = self._deadline_s - time.monotonic()
+        left_s = self._deadline_s - running_s()
         if left_s <= 0:
             raise OutOfBudget
         limit_s = min(left_s, self._settings.profile_timeout_s)

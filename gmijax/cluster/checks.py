@@ -10,6 +10,7 @@ from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
 
+from gmijax.clock import running_s
 from gmijax.cluster.node import ON_GPUS, Facts, own_versions
 from gmijax.cluster.ray_nodes import Joined
 from gmijax.errors import ConfigError
@@ -63,10 +64,10 @@ def require_shared(joined: Sequence[Joined], run_root: Path) -> None:
     try:
         with os.fdopen(fd, "w") as file:
             file.write(content)
-        deadline_s = time.monotonic() + _SHOWS_S
+        deadline_s = running_s() + _SHOWS_S
         blind = [node for node, _ in joined]
         while blind := [node for node in blind if not node.call("sees", name, content)]:
-            if time.monotonic() > deadline_s or any(node.lost for node in blind):
+            if running_s() > deadline_s or any(node.lost for node in blind):
                 raise ConfigError(
                     f"run.dir={run_root}: node {blind[0].address} does not see {folder} or "
                     "cannot write to it; the run folder must be on a file system that all "

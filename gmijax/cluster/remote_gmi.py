@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import signal
-import time
 from collections.abc import Callable
 from contextlib import suppress
 from typing import Any, Final, Protocol
 
+from gmijax.clock import running_s
 from gmijax.cluster.node import Seen
 from gmijax.errors import GmiFailed, ReportedError, lines_of
 from gmijax.runs.folder import GmiPaths
@@ -91,7 +91,7 @@ class RemoteNode:
 
     def look(self, child: int) -> Any:
         """The newest that its `poll` told of a child; None before the first answer."""
-        now_s = time.monotonic()
+        now_s = running_s()
         if self.lost is None and self._asked is not None and self._asked.is_there():
             try:
                 self._seen = self._asked.get()

@@ -7,6 +7,7 @@ import time
 from collections.abc import Callable
 from typing import TypeVar
 
+from gmijax.clock import running_s
 from gmijax.errors import GmijaxError
 
 T = TypeVar("T")
@@ -32,7 +33,7 @@ def wait_until(
         unless `ready` has something after all (a process may deliver and end meanwhile).
       timeout_s: longest wait; the first question is asked however short it is.
     """
-    start_s = now_s = time.monotonic()
+    start_s = now_s = running_s()
     next_look_s, pause_s = start_s + LIVENESS_PERIOD_S, MIN_SLEEP_S
     while (found := ready()) is None:
         is_late = now_s - start_s >= timeout_s
@@ -49,5 +50,5 @@ def wait_until(
         else:
             time.sleep(pause_s)
             pause_s = min(2 * pause_s, MAX_SLEEP_S)
-        now_s = time.monotonic()
+        now_s = running_s()
     return found

@@ -7,6 +7,8 @@ from collections.abc import Callable
 from queue import SimpleQueue
 from typing import Any
 
+from gmijax.clock import wait_for
+
 _LAST_LINE_S = 2.0
 """Longest wait for a report when training ends, however it ends."""
 
@@ -54,7 +56,7 @@ class ReportThread:
 
     def stop(self) -> None:
         """Ends the thread, which may finish a call. Idempotent."""
-        self._is_idle.wait(_LAST_LINE_S)
+        wait_for(self._is_idle.wait, _LAST_LINE_S)
         self._queue.put(None)
 
     def _run(self) -> None:

@@ -7,11 +7,15 @@ See `gmijax.machine.interpreter`.
 
 from __future__ import annotations
 
+import ctypes
 import importlib.util
 import os
 import runpy
+import signal
 import sys
 from pathlib import Path
+
+_PR_SET_PDEATHSIG = 1
 
 
 def _main(version: str, added: str, module: str, *arguments: str) -> None:
@@ -25,6 +29,7 @@ def _main(version: str, added: str, module: str, *arguments: str) -> None:
             f"{version}: start the command again"
         )
     sys.path.extend(entry for entry in added.split(os.pathsep) if entry not in ("", *sys.path))
+    _go_on_without_parent()
     sys.argv[1:] = arguments
     runpy.run_module(module, run_name="__main__", alter_sys=True)
 
@@ -36,6 +41,15 @@ def _load(package: Path) -> None:
     assert spec.loader is not None
     sys.modules[package.name] = module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
+
+
+def _go_on_without_parent() -> None:
+    """Lets a stopped child see that its parent is gone, and end.
+
+    The kernel sends the signal when the thread dies that has started the child. To a child that
+    runs it means nothing, so that a thread of a parent that lives may end.
+    """
+    ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGCONT)
 
 
 if __name__ == "__main__":

@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import os
+import subprocess
 import time
 from collections.abc import Iterable
 from contextlib import suppress
 from pathlib import Path
-from typing import ClassVar, NamedTuple
+from typing import Any, ClassVar, NamedTuple
+
+from gmijax.clock import running_s, wait_for
 
 _POLL_S = 0.02
 _ENDED = (b"Z", b"X")
@@ -92,12 +95,25 @@ def members_of(group: int) -> tuple[ProcessId, ...]:
 
 def wait_until_gone(processes: Iterable[ProcessId], timeout_s: float) -> tuple[ProcessId, ...]:
     """Waits until all have ended; returns those that still run after `timeout_s`."""
-    deadline_s = time.monotonic() + timeout_s
+    deadline_s = running_s() + timeout_s
     left = tuple(process for process in processes if process.is_running())
-    while left and time.monotonic() < deadline_s:
+    while left and running_s() < deadline_s:
         time.sleep(_POLL_S)
         left = tuple(process for process in left if process.is_running())
     return left
+
+
+def has_ended(process: subprocess.Popen[Any], timeout_s: float) -> bool:
+    """Waits until a child has ended; whether it has in time."""
+
+    def wait(seconds: float) -> bool:
+        try:
+            process.wait(seconds)
+        except subprocess.TimeoutExpired:
+            return False
+        return True
+
+    return wait_for(wait, timeout_s)
 
 
 def _parse(stat: bytes) -> tuple[ProcessId, bytes, int]:

@@ -1,7 +1,7 @@
 """Cleans up after a controller that was killed: `python -m gmijax.supervise.janitor`.
 
-A killed controller runs no clean-up. GMIs end by themselves then, but one that is stopped
-(SIGSTOP) cannot, and an MPS daemon outlives whoever started it. So a janitor is started before
+A killed controller runs no clean-up. GMIs end by themselves then, but one that hangs in a driver
+cannot, and an MPS daemon outlives whoever started it. So a janitor is started before
 them, in a session of its own, and reads from a pipe what there is to clean, one JSON object a line
 (see `JanitorLink`). The pipe's end without the word `clean` means that the controller is gone.
 """
@@ -20,10 +20,11 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
+from gmijax.clock import running_s
 from gmijax.errors import BackendUnavailable
 from gmijax.machine.interpreter import command
 from gmijax.machine.mps_control import MpsControl
-from gmijax.machine.processes import GuardPipe, ProcessId, identify, wait_until_gone
+from gmijax.machine.processes import GuardPipe, ProcessId, has_ended, identify, wait_until_gone
 
 _GMIS_END_THEMSELVES_S = 8.0
 _DAEMON_ENDS_S = 10.0
@@ -69,9 +70,7 @@ class JanitorLink:
         """Says that everything is clean and waits for the janitor to end."""
         self._tell({"clean": True})
         self._pipe.close()
-        try:
-            self._process.wait(_DAEMON_ENDS_S)
-        except subprocess.TimeoutExpired:
+        if not has_ended(self._process, _DAEMON_ENDS_S):
             self._process.kill()
             self._process.wait()
         with suppress(OSError):
@@ -125,8 +124,8 @@ def main() -> int:
         _kill(left, daemons)
     for control in daemons:
         # The controller may have been killed while it was starting this one.
-        deadline_s = time.monotonic() + _LATE_DAEMON_S
-        while not control.is_answering() and time.monotonic() < deadline_s:
+        deadline_s = running_s() + _LATE_DAEMON_S
+        while not control.is_answering() and running_s() < deadline_s:
             time.sleep(_LATE_DAEMON_S / 10)
         quit_daemon(control)
     return 0

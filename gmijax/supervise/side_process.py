@@ -10,6 +10,7 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Final
 
+from gmijax.clock import wait_for
 from gmijax.machine.interpreter import command
 from gmijax.machine.processes import GuardPipe
 from gmijax.supervise.failures import last_line, signal_name
@@ -78,13 +79,17 @@ class SideProcess:
         self._pipe.close()
         if self._watcher is None:
             return True
-        self._watcher.join(timeout_s)
-        is_late = self._watcher.is_alive()
+        is_late = not wait_for(self._has_ended, timeout_s)
         if is_late:
             self._say = _nothing
             self._process.kill()
             self._watcher.join(_KILLED_S)
         return not is_late
+
+    def _has_ended(self, wait_s: float) -> bool:
+        assert self._watcher is not None
+        self._watcher.join(wait_s)
+        return not self._watcher.is_alive()
 
     def _watch(self) -> None:
         exit_code = self._process.wait()

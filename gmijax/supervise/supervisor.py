@@ -11,6 +11,7 @@ from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from functools import partial
 
+from gmijax.clock import running_s
 from gmijax.errors import CollectiveTimeout, ConfigError, GmiFailed, JobInterrupted
 from gmijax.supervise.backends.backend import Backend
 from gmijax.supervise.failures import (
@@ -98,7 +99,7 @@ class Supervisor:
                 self._handle_stop()
                 if self._all_ready_s is None and all(p.is_ready for p in self._started.values()):
                     # Once, when every GMI holds its share.
-                    self._all_ready_s = time.monotonic()
+                    self._all_ready_s = running_s()
                     self._verify_shares()
                 self._check_progress()
                 if on_tick is not None:
@@ -139,10 +140,10 @@ class Supervisor:
         if not failures:
             return
         # A GMI that lost its peer can be quicker to end than that peer is to be seen dead.
-        deadline_s = time.monotonic() + _SETTLE_S
+        deadline_s = running_s() + _SETTLE_S
         # Nor is a node that is lost known to be so at once.
         while is_consequence(first_cause(failures)) and (
-            time.monotonic() < deadline_s or any(p.is_silent for p in self._started.values())
+            running_s() < deadline_s or any(p.is_silent for p in self._started.values())
         ):
             time.sleep(_POLL_S)
             failures = self._poll_failures()
@@ -181,7 +182,7 @@ class Supervisor:
             raise JobInterrupted("stopped at once on a second request; the last work is not saved")
         if not all(p.is_ready for p in self._started.values()):
             raise JobInterrupted("stopped before training began")
-        now_s = time.monotonic()
+        now_s = running_s()
         if self._stop_deadline_s is None:
             self._stop_deadline_s = now_s + self._launch.timeouts.stop_timeout_s
             for process in self._alive():
@@ -207,7 +208,7 @@ class Supervisor:
             self._verify_shares()
 
     def _check_progress(self) -> None:
-        now_s = time.monotonic()
+        now_s = running_s()
         for process in self._alive():
             state = process.beat.state
             if process.waits:
@@ -238,8 +239,8 @@ class Supervisor:
         """Has all that still run write where their threads are to their logs."""
         sizes = {process: process.request_stacks() for process in self._alive()}
         waiting = {process: size for process, size in sizes.items() if size is not None}
-        deadline_s = time.monotonic() + _STACKS_S
-        while waiting and time.monotonic() < deadline_s:
+        deadline_s = running_s() + _STACKS_S
+        while waiting and running_s() < deadline_s:
             time.sleep(_POLL_S)
             now = {process: process.log_bytes for process in waiting}
             # Written once a log has grown and grows no more.
@@ -273,9 +274,9 @@ class Supervisor:
 
 def _wait_for_end(processes: Sequence[WatchedGmi], timeout_s: float) -> list[WatchedGmi]:
     """Waits until all have ended; returns those that have not."""
-    deadline_s = time.monotonic() + timeout_s
+    deadline_s = running_s() + timeout_s
     alive = [process for process in processes if process.poll() is None]
-    while alive and time.monotonic() < deadline_s:
+    while alive and running_s() < deadline_s:
         time.sleep(_POLL_S)
         alive = [process for process in alive if process.poll() is None]
     return alive

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import time
 from abc import ABC, abstractmethod
 from typing import NamedTuple
 
+from gmijax.clock import running_s
 from gmijax.errors import ReportedError
 from gmijax.runs.folder import GmiPaths
 from gmijax.supervise.heartbeat import Heartbeat
@@ -35,7 +35,7 @@ class WatchedGmi(ABC):
       beats: how many of them there were.
       paths: files of this GMI.
       progress_s: when it was started, let go, or its heartbeat last seen to be a new one;
-        `time.monotonic`.
+        by `running_s`.
       is_silent: whether its machine does not answer, so that nothing new is known of it.
     """
 
@@ -48,7 +48,7 @@ class WatchedGmi(ABC):
         self.exit_code: int | None = None
         self.beat = Heartbeat("starting", 0, pid)
         self.beats = 0
-        self.progress_s = time.monotonic()
+        self.progress_s = running_s()
         self.pid = pid
         self._was_ready = False
 
@@ -66,7 +66,7 @@ class WatchedGmi(ABC):
     def let_go(self) -> None:
         """Lets a GMI compile that was started to wait."""
         self.waits = False
-        self.progress_s = time.monotonic()
+        self.progress_s = running_s()
         self._tell_to_go()
 
     @property
@@ -119,4 +119,4 @@ class WatchedGmi(ABC):
         if beats != self.beats and beat is not None:
             self.beat, self.beats = beat, beats
             self._was_ready |= beat.is_ready
-            self.progress_s = time.monotonic()
+            self.progress_s = running_s()

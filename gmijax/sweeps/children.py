@@ -5,12 +5,12 @@ from __future__ import annotations
 import os
 import signal
 import subprocess
-import time
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from gmijax.clock import running_s
 from gmijax.errors import GmijaxError
 from gmijax.machine.interpreter import command
 from gmijax.machine.processes import GuardPipe, members_of
@@ -89,8 +89,8 @@ class Child:
         code = self._process.poll()
         if code is None:
             return Seen(None)
-        self._ended_s = self._ended_s or time.monotonic()
-        if members_of(self.pid) and time.monotonic() - self._ended_s < _STAY_S:
+        self._ended_s = self._ended_s or running_s()
+        if members_of(self.pid) and running_s() - self._ended_s < _STAY_S:
             return Seen(None)
         return Seen(code, last_line(self._log))
 

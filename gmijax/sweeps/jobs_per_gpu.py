@@ -19,6 +19,7 @@ from rich.console import Console
 from gmijax.autotune.grid import Measured, NotRunnable, Point
 from gmijax.autotune.store import ProfileStore
 from gmijax.autotune.tuner import workload_of
+from gmijax.clock import running_s
 from gmijax.config.sweep import SweepConfig
 from gmijax.errors import GmijaxError, JobInterrupted, NodeLost
 from gmijax.runs.cache import cache_folder
@@ -220,7 +221,7 @@ class _Window:
 
     def __init__(self, jobs: Sequence[Job], limit_s: float) -> None:
         self._jobs = jobs
-        self._deadline_s = time.monotonic() + limit_s
+        self._deadline_s = running_s() + limit_s
         self._seen = [{0} for _ in jobs]
         self._start: tuple[float, list[int]] | None = None
         self.steps_per_s: float | None = None
@@ -228,7 +229,7 @@ class _Window:
 
     def is_over(self) -> bool:
         """Looks at the jobs; whether enough was seen, or one has failed, or it takes too long."""
-        now_s = time.monotonic()
+        now_s = running_s()
         steps = [job.progress.env_steps for job in self._jobs]
         for seen, own in zip(self._seen, steps, strict=True):
             seen.add(own)

@@ -8,6 +8,7 @@ from collections.abc import Callable, Sequence
 from contextlib import suppress
 from typing import Any
 
+from gmijax.clock import running_s
 from gmijax.config.schema import to_dict
 from gmijax.config.sweep import SweepConfig
 from gmijax.errors import GmijaxError, JobInterrupted, NodeLost
@@ -264,8 +265,8 @@ class Scheduler:
             running.order_stop()
         limits = [running.jobs[0].config.run for running in self._running.values()]
         longest_s = max((run.stop_timeout_s + run.grace_s for run in limits), default=0.0)
-        deadline_s = time.monotonic() + longest_s + _KILL_AFTER_S
-        while self._running and time.monotonic() < deadline_s and signals.requests < 2:
+        deadline_s = running_s() + longest_s + _KILL_AFTER_S
+        while self._running and running_s() < deadline_s and signals.requests < 2:
             self._look()
             self._on_tick()
             time.sleep(_TICK_S)
@@ -275,8 +276,8 @@ class Scheduler:
         for running in left:
             running.is_killed = True
             running.host.order(running.child, "kill")
-        deadline_s = time.monotonic() + 2 * _KILL_AFTER_S
+        deadline_s = running_s() + 2 * _KILL_AFTER_S
         for running in left:
-            while not running.is_over() and time.monotonic() < deadline_s:
+            while not running.is_over() and running_s() < deadline_s:
                 time.sleep(_TICK_S)
             self._finish(running)

@@ -8,6 +8,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -212,7 +213,10 @@ def test_exception_of_the_callback_ends_all(run: RunPaths):
     assert identify(read_json(run.gmi(1).root / "helper.json")["pid"]) is None
 
 
-def test_killed_controller_leaves_no_process_and_no_helper_of_a_gmi(run: RunPaths, tmp_path: Path):
+@pytest.mark.parametrize("is_janitor_stopped", [False, True])
+def test_killed_controller_leaves_no_process_and_no_helper_of_a_gmi(
+    run: RunPaths, tmp_path: Path, is_janitor_stopped: bool
+):
     modes = ["train", "busy", "stubborn"]
     with (tmp_path / "controller.log").open("wb") as log:
         controller = subprocess.Popen(
@@ -225,6 +229,10 @@ def test_killed_controller_leaves_no_process_and_no_helper_of_a_gmi(run: RunPath
         processes.append(_stopped_gmi(run, 2))
         helper = identify(read_json(run.gmi(1).root / "helper.json")["pid"])
         assert helper is not None
+        if is_janitor_stopped:
+            janitor = _janitor_of(controller.pid)
+            os.kill(janitor.pid, signal.SIGSTOP)
+            processes.append(janitor)
     finally:
         controller.kill()
         controller.wait()
@@ -254,6 +262,45 @@ def test_a_fork_of_the_controller_does_not_keep_gmis(run: RunPaths):
                 assert pipe.read() == b""  # Would wait for the fork, if that held it open.
             finally:
                 os.killpg(holder.pid, signal.SIGKILL)
+
+
+def test_a_job_that_is_suspended_as_a_whole_goes_on(run: RunPaths, tmp_path: Path):
+    """As by `scontrol suspend`, for longer than GMIs may be silent; the controller comes first."""
+    with (tmp_path / "controller.log").open("wb") as log:
+        controller = subprocess.Popen(
+            [sys.executable, str(TESTS / "fake_controller.py"), str(tmp_path), "cpu", "train"],
+            env={**os.environ, "PYTHONPATH": str(CHECKOUT), "FAKE_STALL_S": "4"},
+            stderr=log,
+        )
+    try:
+        gmi = _running_gmi(run, 0)
+        everybody = [controller.pid, gmi.pid, _janitor_of(controller.pid).pid]
+        for pid in everybody:
+            os.kill(pid, signal.SIGSTOP)
+        time.sleep(8)
+        for pid in everybody:
+            os.kill(pid, signal.SIGCONT)
+            time.sleep(0.5)
+        beat = heartbeat_of(run.root, 0)
+        assert beat is not None
+        while (now := heartbeat_of(run.root, 0)) is None or now.iteration < beat.iteration + 100:
+            assert controller.poll() is None, (tmp_path / "controller.log").read_text()
+            time.sleep(0.05)
+    finally:
+        controller.kill()
+        controller.wait()
+    assert not wait_until_gone([gmi], timeout_s=90)
+
+
+def _janitor_of(controller: int) -> ProcessId:
+    for entry in Path("/proc").glob("[0-9]*"):
+        with suppress(OSError):
+            is_child = f"PPid:\t{controller}\n" in (entry / "status").read_text()
+            if is_child and b"gmijax.supervise.janitor" in (entry / "cmdline").read_bytes():
+                found = identify(int(entry.name))
+                assert found is not None
+                return found
+    raise AssertionError("no janitor")
 
 
 def _running_gmi(run: RunPaths, gmi: int) -> ProcessId:

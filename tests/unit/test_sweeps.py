@@ -586,7 +586,7 @@ def test_without_a_gpu_a_job_has_two_cores() -> None:
 
 def test_a_profile_counts_while_all_jobs_train(monkeypatch: pytest.MonkeyPatch) -> None:
     now_s = 0.0
-    monkeypatch.setattr(jobs_per_gpu.time, "monotonic", lambda: now_s)
+    monkeypatch.setattr(jobs_per_gpu, "running_s", lambda: now_s)
     jobs = jobs_of([compose(f"seed={seed}") for seed in range(2)])
     window = jobs_per_gpu._Window(jobs, 60.0)
     while not window.is_over():

@@ -11,6 +11,7 @@ from typing import NamedTuple, TypeAlias
 import numpy as np
 import numpy.typing as npt
 
+from gmijax.clock import running_s
 from gmijax.collectives.channel.compressor import Transfer
 from gmijax.collectives.channel.spec import Array, Spec
 from gmijax.collectives.channel.transport import ChannelReader
@@ -79,7 +80,7 @@ class Batcher:
         if time.monotonic() >= self._next_look_s and (error := self._why_lost()) is not None:
             raise error
         self._resize(batch_size)
-        deadline_s = time.monotonic() + timeout_s
+        deadline_s = running_s() + timeout_s
         while True:
             arrival = self._arrival(deadline_s, timeout_s)
             filled = self._stack.filled if self._stack is not None else 0
@@ -106,7 +107,7 @@ class Batcher:
         if self._current is not None and self._current.left:
             return self._current
         self._release()
-        arrival = wait_until(self._next, self._why_lost, deadline_s - time.monotonic())
+        arrival = wait_until(self._next, self._why_lost, deadline_s - running_s())
         if arrival is None:
             peers = tuple(reader.peer for reader, _ in self._sources)
             raise CollectiveTimeout(self._rank, peers, "receive", self.batches, timeout_s)

@@ -8,6 +8,7 @@ from collections import deque
 from dataclasses import dataclass
 from typing import Protocol
 
+from gmijax.clock import running_s
 from gmijax.collectives.channel.dispenser import Dispenser, Piece
 from gmijax.collectives.channel.migrator import Migrator
 from gmijax.collectives.channel.spec import Experience
@@ -102,7 +103,7 @@ class Sender:
 
     def _drain(self, timeout_s: float) -> bool:
         """Whether all that waits was taken in time."""
-        deadline_s = time.monotonic() + timeout_s
+        deadline_s = running_s() + timeout_s
         while self._waiting:
             if not self._try_add(self._waiting[0]) and not self._wait(deadline_s):
                 return False
@@ -116,7 +117,7 @@ class Sender:
             took = wait_until(
                 lambda: self._try_add(piece) or None,
                 self.migrator.why_lost,
-                deadline_s - started_s,
+                deadline_s - running_s(),
             )
         finally:
             self.waited_s += time.monotonic() - started_s

@@ -13,6 +13,7 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 
+from gmijax.clock import running_s
 from gmijax.collectives.host.failure_detector import FailureDetector
 from gmijax.collectives.host.shared_block import SharedBlock
 from gmijax.collectives.shared_memory import Fence
@@ -141,8 +142,8 @@ class Barrier:
 
     def _look_for_a_cause(self) -> None:
         detector = self._detector()
-        deadline_s = time.monotonic() + SETTLE_S
-        while time.monotonic() < deadline_s:
+        deadline_s = running_s() + SETTLE_S
+        while running_s() < deadline_s:
             detector.look(lambda: self._peers)
             time.sleep(0.02)
         if silent := detector.silent(self._peers):

@@ -7,10 +7,10 @@ it waited for, so that its own end is not taken for the cause, also by those who
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable
 from typing import NoReturn
 
+from gmijax.clock import running_s
 from gmijax.collectives.host.shared_block import SharedBlock
 from gmijax.collectives.shared_memory import fence, process_of
 from gmijax.errors import CollectiveTimeout, PeerLost
@@ -27,7 +27,7 @@ class FailureDetector:
         self._operation = operation
         self._step = step
         self._timeout_s = timeout_s
-        self._start_s = self._clock_s = time.monotonic()
+        self._start_s = self._clock_s = running_s()
         self._heard: dict[int, tuple[int, float]] = {}
 
     @property
@@ -51,7 +51,7 @@ class FailureDetector:
         self._listen()
         left = missing()
         if is_patient and left and not self.silent(left):
-            self._clock_s = time.monotonic()
+            self._clock_s = running_s()
         elif left and self.is_late:
             self.give_up(left)
 
@@ -65,7 +65,7 @@ class FailureDetector:
 
     def silent(self, missing: list[int]) -> list[int]:
         """Those of `missing` who do not wait themselves, as far as this rank has heard."""
-        since_s, never = time.monotonic() - SILENCE_S, (0, self._start_s)
+        since_s, never = running_s() - SILENCE_S, (0, self._start_s)
         return [peer for peer in missing if self._heard.get(peer, never)[1] < since_s]
 
     def _check_alive(self, missing: Callable[[], list[int]]) -> None:
@@ -84,7 +84,7 @@ class FailureDetector:
         self._raise_timeout([cause])
 
     def _waited_s(self) -> float:
-        return time.monotonic() - self._clock_s
+        return running_s() - self._clock_s
 
     def _is_gone(self, peer: int) -> bool:
         # A rank that has not attached cannot be told from one that is still starting.
@@ -93,7 +93,7 @@ class FailureDetector:
         return bool(attached) and not process_of(self._block.lines[peer]).is_running()
 
     def _listen(self) -> None:
-        now_s = time.monotonic()
+        now_s = running_s()
         for peer, beats in enumerate(self._block.lines["beats"].tolist()):
             if self._heard.get(peer, (None,))[0] != beats:
                 self._heard[peer] = beats, now_s

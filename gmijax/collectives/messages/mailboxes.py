@@ -16,6 +16,7 @@ from typing import Any, Final, TypeAlias
 
 import numpy as np
 
+from gmijax.clock import wait_for
 from gmijax.collectives.messages.pipe import Bytes, PipeWriter
 from gmijax.collectives.messages.trees import as_bytes, flatten, unflatten
 from gmijax.errors import CollectiveError, CollectiveTimeout
@@ -90,7 +91,7 @@ class Outbox:
             # A frame that the thread is busy with is still among those that wait.
             while left and not self._frames and self._writer.try_put(left[0]):
                 left.popleft()
-            if left and not self._changed.wait_for(self._has_room, timeout_s):
+            if left and not self._wait_for(self._has_room, timeout_s):
                 peers = (self._writer.peer,)
                 raise CollectiveTimeout(self._rank, peers, "send", self._posts, timeout_s)
             self._raise_error()
@@ -106,9 +107,13 @@ class Outbox:
     def wait_until_empty(self, timeout_s: float) -> bool:
         """Whether all frames got into the pipe; raises what the thread met."""
         with self._changed:
-            self._changed.wait_for(lambda: not self._frames or self._error, max(0.0, timeout_s))
+            self._wait_for(lambda: not self._frames or self._error is not None, timeout_s)
             self._raise_error()
             return not self._frames
+
+    def _wait_for(self, is_so: Callable[[], bool], timeout_s: float) -> bool:
+        """Waits for a change that makes it so; whether it came in time."""
+        return wait_for(lambda seconds: self._changed.wait_for(is_so, seconds), timeout_s)
 
     def _has_room(self) -> bool:
         return self._waiting_bytes < MAX_WAITING_BYTES or self._error is not None

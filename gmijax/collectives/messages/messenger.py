@@ -8,12 +8,12 @@ other, however large the messages. Receiving waits, with a timeout.
 from __future__ import annotations
 
 import contextlib
-import time
 from functools import partial
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
+from gmijax.clock import running_s
 from gmijax.collectives.messages.mailboxes import DATA, Inbox, Outbox, frames_of
 from gmijax.collectives.messages.pipe import PipeReader, PipeWriter
 from gmijax.collectives.messages.pipe_block import PipeBlock
@@ -108,11 +108,11 @@ class Messenger:
           PeerLost: a receiver is gone, and has not taken all.
           CollectiveTimeout: receivers have not made room in time; names them.
         """
-        deadline_s = time.monotonic() + self._timeout_s
+        deadline_s = running_s() + self._timeout_s
         late = [
             dst
             for dst, outbox in self._outboxes.items()
-            if not outbox.wait_until_empty(deadline_s - time.monotonic())
+            if not outbox.wait_until_empty(deadline_s - running_s())
         ]
         if late:
             raise CollectiveTimeout(self.rank, tuple(late), "flush", 0, self._timeout_s)

@@ -5,12 +5,12 @@ from __future__ import annotations
 import selectors
 import socket
 import struct
-import time
 from collections.abc import Callable, Sequence
 from typing import Final
 
 import numpy as np
 
+from gmijax.clock import running_s
 from gmijax.collectives.host.host_exchange import chunk
 from gmijax.collectives.interface import FloatBuffer
 from gmijax.collectives.nodes.meeting import Sockets
@@ -122,11 +122,11 @@ class Mesh:
             swap.close()
 
     def _wait(self, swap: _Swap, operation: str) -> None:
-        started_s = beat_s = time.monotonic()
+        started_s = beat_s = running_s()
         is_first = self._calls <= self._first_call
         timeout_s = self._rendezvous_timeout_s if is_first else self._timeout_s
         while missing := swap.step():
-            now_s = time.monotonic()
+            now_s = running_s()
             if now_s - beat_s >= LIVENESS_PERIOD_S:
                 beat_s = now_s
                 self._on_wait()

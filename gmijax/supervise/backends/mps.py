@@ -16,6 +16,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any, Self
 
+from gmijax.clock import running_s
 from gmijax.errors import BackendUnavailable, GmiFailed
 from gmijax.machine.mps_control import PIPE_VARIABLE, MpsControl
 from gmijax.machine.snapshot import Machine
@@ -81,10 +82,10 @@ class MpsBackend(Backend):
 
     def __exit__(self, *exc: Any) -> None:
         """Quits the own daemons once their clients have left."""
-        deadline_s = time.monotonic() + _CLIENTS_LEAVE_S
+        deadline_s = running_s() + _CLIENTS_LEAVE_S
         for control in self._own.values():
             with suppress(BackendUnavailable):
-                while control.all_client_pids() and time.monotonic() < deadline_s:
+                while control.all_client_pids() and running_s() < deadline_s:
                     time.sleep(_POLL_S)
         self._quit_all()
         super().__exit__(*exc)
@@ -119,9 +120,9 @@ class MpsBackend(Backend):
 
         CUDA falls back to taking turns, silently, when it does not reach the daemon.
         """
-        deadline_s = time.monotonic() + _CLIENTS_APPEAR_S
+        deadline_s = running_s() + _CLIENTS_APPEAR_S
         while strangers := self._strangers(pids):
-            if time.monotonic() > deadline_s:
+            if running_s() > deadline_s:
                 gmi, pid = next(iter(strangers.items()))
                 raise GmiFailed(
                     gmi,
@@ -159,9 +160,9 @@ class MpsBackend(Backend):
         if self._janitor is not None:
             self._janitor.watch_daemon(control)
         control.start(device, log_directory)
-        deadline_s = time.monotonic() + _ANSWER_S
+        deadline_s = running_s() + _ANSWER_S
         while not control.is_answering():
-            if time.monotonic() > deadline_s:
+            if running_s() > deadline_s:
                 raise BackendUnavailable(
                     f"plan.backend={self.plan.backend}: the daemon of {device} does not answer "
                     f"within {_ANSWER_S:g} s; see {log_directory}"
