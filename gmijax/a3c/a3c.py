@@ -43,7 +43,6 @@ from gmijax.learning.updates import (
     bound_loss,
     clipped_surrogate,
     explained_variance,
-    mean_of_states,
     minibatch_order,
     probability_ratio,
     run_updates,
@@ -108,11 +107,11 @@ def a3c_loss(
         target = in_units(targets.value_moments, target)
     value_loss = 0.5 * weighted_mean((values - target) ** 2, weight)
     entropy = distribution.entropy(output, params.log_std)
-    bonus = mean_of_states(entropy)
+    bonus = weighted_mean(entropy, weight)  # Also of one [] that all states share.
     loss = (
         policy_loss
         + config.value_cost * value_loss
-        - config.entropy_cost * bonus * jnp.mean(weight)
+        - config.entropy_cost * bonus
         + config.bound_cost * weighted_mean(bound_loss(mode), weight)
     )
     moved = distribution.kl_divergence(targets.output, targets.log_std, output, params.log_std)

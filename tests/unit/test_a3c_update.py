@@ -159,6 +159,33 @@ def test_unrolls_without_weight_teach_nothing(start, batch, alone) -> None:
     assert int(first.iteration) == 1
 
 
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"distribution_type": "tanh_normal"},
+        {"state_dependent_std": True},
+        {"distribution_type": "tanh_normal", "state_dependent_std": True},
+    ],
+)
+def test_the_entropy_of_stale_unrolls_teaches_nothing(config, changes) -> None:
+    learner, state, envs = _start(dataclasses.replace(config, entropy_cost=1.0, **changes))
+    batch = _unrolled(learner, state, envs)[1]
+    stale = N // 2
+    weight = jnp.asarray([2.0] * (N - stale) + [0.0] * stale)
+    targets = batch_targets(learner, state, batch, weight)
+
+    def learnt(batch):
+        return gradients(learner, state.params, batch, targets, jnp.arange(N))
+
+    moved = batch._replace(state=batch.state.at[:, -stale:].add(1.0))
+    (first, losses), (second, others) = learnt(batch), learnt(moved)
+    jax.tree.map(np.testing.assert_array_equal, first, second)
+    assert losses.entropy == others.entropy
+    # What is fresh counts as it would alone.
+    fresh = gradients(learner, state.params, batch, targets, jnp.arange(N - stale))[1]
+    np.testing.assert_allclose(fresh.entropy, 2.0 * losses.entropy, rtol=1e-5)
+
+
 def _together(learner, state, both, weight):
     """The update of two trainers that have half of the batch each."""
     halves = jax.tree.map(lambda x: jnp.stack(jnp.split(x, 2, axis=1)), both)

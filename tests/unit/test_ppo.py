@@ -214,6 +214,19 @@ def test_a_distribution_is_what_it_says_of_its_samples(name: str, state_dependen
     np.testing.assert_allclose(jnp.mean(drawn < distribution.mode(old)), 0.5, atol=0.03)
 
 
+@pytest.mark.parametrize("log_std", [-5.0, -1.0, 0.0, 1.0, 2.0])
+@pytest.mark.parametrize("mean", [0.0, -0.4, 3.0, 9.0])
+def test_the_entropy_behind_a_tanh_is_exact_for_every_deviation(mean: float, log_std: float):
+    z = np.linspace(-10.0, 10.0, 100_001)
+    x = mean + np.exp(log_std) * z
+    shares = np.exp(-0.5 * z**2) / np.exp(-0.5 * z**2).sum()
+    slopes = 2.0 * (np.log(2.0) - x - np.logaddexp(0.0, -2.0 * x))
+    expected = log_std + 0.5 * np.log(2.0 * np.pi * np.e) + np.sum(shares * slopes)
+    tanh_normal = DISTRIBUTIONS["tanh_normal"](1)
+    found = tanh_normal.entropy(jnp.asarray([mean]), jnp.asarray([log_std]))
+    np.testing.assert_allclose(found, expected, atol=2e-5)
+
+
 def test_a_saturated_action_is_as_likely_as_the_noise_that_made_it() -> None:
     """Its tanh is 1 in float32, whatever it was: with that alone, ratios would explode."""
     squashed, log_std = DISTRIBUTIONS["tanh_normal"](1, False), jnp.zeros(1)
