@@ -147,7 +147,7 @@ def _check_qpos(env: Env, state: EnvState, what: str) -> None:
     model = env.mj_model
     known = () if model is None else ((model.nq,), (model.nq + 7 * model.nmocap,))
     if len(shape) != 1 or (known and shape not in known):
-        wanted = f"({model.nq},)" if known else "a vector"
+        wanted = f"({model.nq},)" if model is not None else "a vector"
         raise ConfigError(f"{what}: qpos has shape {shape}, not {wanted}")
 
 

@@ -2,21 +2,38 @@
 
 from __future__ import annotations
 
+import functools
 import hashlib
 import importlib.util
 import inspect
 import sys
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from types import ModuleType
+from types import MappingProxyType, ModuleType
 from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
 
 from gmijax.config.schema import suggestion
 from gmijax.errors import ConfigError
 from gmijax.sim.adapters.checks import attempt, check_env, check_start
 from gmijax.sim.adapters.neighbours import importable
-from gmijax.sim.interface import Env
+from gmijax.sim.interface import Env, EnvState
 from gmijax.sim.source import split
+
+_DTYPES: Mapping[str, Any] = MappingProxyType(
+    {
+        "reward": jnp.float32,
+        "reward_terms": jnp.float32,
+        "metrics": jnp.float32,
+        "terminated": jnp.bool_,
+        "truncated": jnp.bool_,
+        "steps": jnp.int32,
+    }
+)
+"""Of the numbers of an `EnvState`."""
 
 
 def make(
@@ -52,9 +69,40 @@ def make(
         for group in given:
             _require_argument(found, group, what)
         env = attempt(what, found, impl=impl, max_envs=max_envs, **given)
+        if isinstance(env, Env):
+            env = _with_arrays(env)
         env = check_env(env, what)
         check_start(env, what)
     return env
+
+
+def _with_arrays(env: Env) -> Env:
+    """The environment with arrays wherever its functions give numbers of Python or numpy.
+
+    `~False` is -1 and `True + True` is 2, so what wraps an environment needs arrays.
+    """
+    again = env.next_episode and _arrays_of(env.next_episode)
+    return env._replace(reset=_arrays_of(env.reset), step=_arrays_of(env.step), next_episode=again)
+
+
+def _arrays_of(function: Callable[..., Any]) -> Callable[..., Any]:
+    @functools.wraps(function)
+    def call(*arguments: Any) -> Any:
+        state = function(*arguments)
+        if not isinstance(state, EnvState):
+            return state
+        for name, dtype in _DTYPES.items():
+            convert = functools.partial(_array, dtype=dtype)
+            state = state._replace(**{name: jax.tree.map(convert, getattr(state, name))})
+        return jax.tree.map(_array, state)
+
+    return call
+
+
+def _array(leaf: Any, dtype: Any = None) -> Any:
+    if not isinstance(leaf, bool | int | float | np.generic):
+        return leaf
+    return jnp.asarray(leaf, dtype or jnp.asarray(leaf).dtype)
 
 
 def _require_argument(function: Callable[..., Any], group: str, what: str) -> None:
