@@ -30,6 +30,9 @@ With cluster=auto (or host:port), shows the nodes of a Ray cluster, and in what 
 Exit codes: 0 healthy, 1 something is broken that should work, 2 bad input.
 """
 
+_MOST_DIGITS: Final = 9
+"""Of a GPU's index; Python reads no number with thousands of them."""
+
 
 class Options(NamedTuple):
     """Options of the command line."""
@@ -75,7 +78,7 @@ def parse(argv: Sequence[str]) -> Options:
             options = options._replace(as_json=True)
         elif key == "mig" and value:
             options = options._replace(mig=value)
-        elif key == "gpu" and value.isdecimal():
+        elif key == "gpu" and value.isdecimal() and len(value) <= _MOST_DIGITS:
             options = options._replace(gpu=int(value))
         elif key == "cluster" and value:
             options = options._replace(cluster=value)

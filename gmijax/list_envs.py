@@ -12,6 +12,7 @@ from typing import Final, NamedTuple
 from rich.console import Console
 from rich.table import Table
 
+from gmijax.control.exit_codes import EXIT_OK, exit_code_of
 from gmijax.errors import ConfigError
 from gmijax.sim.registry import SUITES, TASKS, require_task
 
@@ -33,12 +34,15 @@ class Task(NamedTuple):
 
 def main(argv: Sequence[str]) -> int:
     """Runs the command; returns the exit code."""
+    if "--help" in argv or "-h" in argv:
+        sys.stdout.write(USAGE)
+        return EXIT_OK
+    return exit_code_of("list_envs", lambda: _list(argv))
+
+
+def _list(argv: Sequence[str]) -> None:
     if argv:
-        if argv[0] in ("-h", "--help"):
-            sys.stdout.write(USAGE)
-            return 0
-        sys.stderr.write(f"gmijax.list_envs: {argv[0]}: allowed is --help\n")
-        return 2
+        raise ConfigError(f"{argv[0]}: allowed is --help")
     table = Table(box=None, pad_edge=False)
     table.add_column("env", no_wrap=True)
     for heading in ("observations", "actions", "steps"):
@@ -53,7 +57,6 @@ def main(argv: Sequence[str]) -> int:
     console.print()
     for line in suite_lines():
         console.print(line)
-    return 0
 
 
 def task_of(name: str) -> Task:

@@ -5,8 +5,11 @@ from __future__ import annotations
 import errno
 import io
 import os
+import socket
 import subprocess
+import sys
 import tempfile
+import types
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, redirect_stderr, redirect_stdout
 from pathlib import Path
@@ -14,30 +17,28 @@ from typing import Any, NamedTuple
 
 import pytest
 
+from gmijax import demo, doctor
+from gmijax.__main__ import main
 from gmijax.autotune import tuner
-from gmijax.cli.command import command as run_command
+from gmijax.cli.grid import SweepHelp
 from gmijax.config import ExportConfig, PlayConfig, ServeConfig, TrainConfig
-from gmijax.control import decide, job, searching, serving, strategy_selection
+from gmijax.control import decide, searching, strategy_selection
 from gmijax.deploy import exporting, playing
 from gmijax.machine.snapshot import Machine
+from gmijax.sweeps import sweep
 
-COMMANDS: Mapping[str, type[Any]] = {
-    "train": TrainConfig,
-    "serve": ServeConfig,
-    "search": TrainConfig,
-    "play": PlayConfig,
-    "export": ExportConfig,
+COMMANDS: Mapping[str, tuple[type[Any], ...]] = {
+    "train": (TrainConfig,),
+    "play": (PlayConfig,),
+    "serve": (ServeConfig,),
+    "search": (TrainConfig,),
+    "sweep": (SweepHelp,),
+    "export": (ExportConfig,),
+    "doctor": (),
+    "list-envs": (),
+    "demo": (TrainConfig,),
 }
-"""The commands with their configurations."""
-
-BODIES: Mapping[str, Any] = {
-    "train": job.train,
-    "serve": serving.serve,
-    "search": searching.search,
-    "play": playing.play,
-    "export": exporting.export,
-}
-"""What they run."""
+"""The commands with the configurations whose keys they take."""
 
 CPU = Machine(gpus=(), cpu_cores=(0, 1, 2, 3))
 """A machine without a GPU."""
@@ -64,7 +65,7 @@ def run(command: str, *argv: str, cwd: Path, machine: Machine = CPU) -> Done:
     out, err = _stream("strict"), _stream("backslashreplace")
     with _nothing_starts(machine, cwd), redirect_stdout(out), redirect_stderr(err):
         try:
-            code = run_command(command, COMMANDS[command], BODIES[command], argv)
+            code = main([command, *argv])
         except WouldStart:
             code = None
     return Done(code, _text(out), _text(err))
@@ -75,8 +76,12 @@ def _nothing_starts(machine: Machine, cwd: Path) -> Iterator[None]:
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(cwd)
         patch.setenv("XDG_CACHE_HOME", str(cwd / "cache"))
-        for module in (decide, searching, playing, exporting):
+        for module in (decide, searching, playing, exporting, sweep, demo, doctor):
             patch.setattr(module, "detect_machine", lambda: machine)
+        patch.setattr(doctor, "inspect_system", _would_start)
+        for name in ("ray", "ray.util", "ray.util.scheduling_strategies"):
+            patch.setitem(sys.modules, name, _Ray(name))
+        patch.setattr(socket, "create_connection", _would_start)
         patch.setattr(Path, "mkdir", _mkdir)
         patch.setattr(tempfile, "mkstemp", _would_start)
         patch.setattr(tuner.Search, "result", _would_start)
@@ -84,6 +89,20 @@ def _nothing_starts(machine: Machine, cwd: Path) -> Iterator[None]:
         for owner, name in ((subprocess, "Popen"), (os, "fork"), (os, "posix_spawn")):
             patch.setattr(owner, name, _must_not_start)
         yield
+
+
+def _would_start(*_: Any, **__: Any) -> Any:
+    raise WouldStart
+
+
+class _Ray(types.ModuleType):
+    """Ray takes seconds to import, and would start processes of its own."""
+
+    init = staticmethod(_would_start)
+
+    @staticmethod
+    def is_initialized() -> bool:
+        return False
 
 
 def _stream(errors: str) -> io.TextIOWrapper:
@@ -105,10 +124,6 @@ def _mkdir(path: Path, mode: int = 0o777, parents: bool = False, exist_ok: bool 
     if exist_ok and path.is_dir():
         return
     raise FileExistsError(errno.EEXIST, os.strerror(errno.EEXIST), str(path))
-
-
-def _would_start(*_: Any, **__: Any) -> Any:
-    raise WouldStart
 
 
 def _must_not_start(*args: Any, **__: Any) -> Any:

@@ -35,7 +35,7 @@ class SearchDisplay:
             TextColumn(f"of at most {budget_s:.0f} s"),
             console=console,
             transient=True,
-            disable=not console.is_terminal,
+            disable=not console.is_interactive,
         )
         self._task = self._bar.add_task("search", total=budget_s)
 

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import difflib
+import os
 import re
+import shlex
 import typing
 import unicodedata
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -12,7 +15,7 @@ from typing import Any, Literal, TypeVar, overload
 from hydra import compose as hydra_compose
 from hydra import initialize_config_dir
 from hydra.core.override_parser.overrides_parser import OverridesParser
-from hydra.core.override_parser.types import Override
+from hydra.core.override_parser.types import Override, Quote, QuotedString
 from hydra.errors import HydraException
 from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
@@ -37,6 +40,9 @@ _NAMED_BY_TASK = ("env.rewards.", "env.settings.")
 """Groups of keys whose names are the task's; those of a custom task only its file knows."""
 
 _MOST_STEPS = 900 * 10**9
+
+_MOST_VALUES = 2000
+"""In one argument."""
 
 _NOT_TEXT = ("Cc", "Cs", "Zl", "Zp")
 """Unicode's categories of control characters, surrogates, and ends of lines and paragraphs."""
@@ -95,8 +101,11 @@ def choices(group: str) -> list[str]:
 
 def build(name: str, cls: type[C], overrides: Sequence[str]) -> C:
     """The configuration of a command; raises as `compose`."""
-    overrides = [part for text in overrides for part in with_custom_task(name, text)]
+    overrides = readable(name, overrides)
     items = parse(overrides)
+    if cls is ServeConfig and not _names_policy(items):
+        overrides = [*overrides, "run.dir=last"]
+        items = parse(overrides)
     data = compose_dict(name, [*_choices_of_run(name, items), *overrides])
     if cls is ServeConfig:
         _check_task_key(items)
@@ -115,6 +124,15 @@ def build(name: str, cls: type[C], overrides: Sequence[str]) -> C:
         # The last iteration may go beyond the wanted steps, and checkpoints have twelve digits.
         require_between("num_timesteps", config.num_timesteps, 1, _MOST_STEPS)
     return config
+
+
+def _names_policy(items: Sequence[Override]) -> bool:
+    """Whether a command line of `serve` says which run's policy acts, or that none does."""
+    return any(
+        item.key_or_group == "run.dir"
+        or (item.key_or_group == "policy" and item.value() != "trained")
+        for item in items
+    )
 
 
 def _choices_of_run(name: str, items: Sequence[Override]) -> list[str]:
@@ -150,9 +168,9 @@ def compose_dict(name: str, overrides: Sequence[str]) -> dict[str, Any]:
         with initialize_config_dir(str(config_dir()), version_base=None):
             config = hydra_compose(name, overrides=list(overrides))
         data = OmegaConf.to_container(config, resolve=True, throw_on_missing=True)
-    except (HydraException, OmegaConfBaseException) as error:
+    except (ValueError, HydraException, OmegaConfBaseException) as error:
         groups = [f"{key}={value}" for key, value in chosen.items() if value in choices(key)]
-        raise ConfigError(_one_line(name, error, groups)) from None
+        raise _refused(name, error, items, groups) from None
     except OSError as error:  # Hydra looks for a file with the name of the key.
         raise ConfigError(f"{max(overrides, key=len, default=name)}: {error.strerror}") from None
     return typing.cast("dict[str, Any]", data)
@@ -180,15 +198,34 @@ def _check_override(name: str, item: Override) -> None:
         )
 
 
-def with_custom_task(name: str, override: str) -> tuple[str, ...]:
-    """`env=path/to/file.py:make` in words that hydra knows; anything else as it is."""
-    key, _, value = override.partition("=")
-    if key != "env" or not re.search(r"\.py(:|$)", value):
+def readable(name: str, overrides: Sequence[str]) -> list[str]:
+    """The overrides of a command in words that hydra knows."""
+    return [part for text in overrides for part in _with_custom_task(name, _at_home(text))]
+
+
+def _at_home(override: str) -> str:
+    """`key=~/x` with the home folder: a shell writes it only where a word begins with `~`."""
+    match = re.fullmatch(r"([^=]+)=(['\"]?)(~[^'\"]*)\2", override)
+    if match is None:
+        return override
+    path = os.path.expanduser(match[3])
+    return override if path == match[3] else f"{match[1]}={_quoted(path)}"
+
+
+def _with_custom_task(name: str, override: str) -> tuple[str, ...]:
+    """`env=path/to/file.py:make` for hydra; anything else as it is."""
+    match = re.fullmatch(r"env=(['\"]?)(.*\.py(:.*)?)\1", override)
+    if match is None:
         return (override,)
-    quoted = value.replace("\\", "\\\\").replace("'", "\\'")
+    value = override.removeprefix("env=") if match[1] else _quoted(match[2])
     if name in ("play", "export"):  # Which task it is the run says.
-        return (f"run.env='{quoted}'",)
-    return "env=custom", f"env.name='{quoted}'"
+        return (f"run.env={value}",)
+    return "env=custom", f"env.name={value}"
+
+
+def _quoted(value: str) -> str:
+    """A value that hydra takes as text, whatever is in it."""
+    return QuotedString(value, Quote.single).with_quotes()
 
 
 def _check_task_key(items: Sequence[Override]) -> None:
@@ -228,6 +265,11 @@ def _require_text(text: str) -> None:
 
 def _parsed(text: str) -> Override:
     _require_text(text)
+    if text.count(",") >= _MOST_VALUES:  # Hydra takes the square of their number.
+        raise ConfigError(
+            f"{text.partition('=')[0]}: {text.count(',') + 1} values; at most {_MOST_VALUES} are "
+            "allowed"
+        )
     try:
         return OverridesParser.create().parse_overrides([text])[0]
     except RecursionError:
@@ -236,8 +278,31 @@ def _parsed(text: str) -> Override:
         raise ConfigError(f"{text}: a number has too many digits") from None
     except HydraException as error:
         if "=" not in text:
-            raise ConfigError(f"{text}: expected key=value") from None
-        raise ConfigError(" ".join(str(error).split())) from None
+            raise ConfigError(f"{text}: expected key=value{_meant(text)}") from None
+        raise _unreadable(text, error) from None
+
+
+def _meant(word: str) -> str:
+    """The key that a word alone, e.g. `ant`, may be a value of."""
+    if re.search(r"\.py(:|$)", word):
+        return f"; did you mean env={word}?"
+    if word == "last" or "/" in word:
+        return f"; did you mean run.dir={word}?"
+    groups = {name: group for group in ("env", "algo") for name in choices(group)}
+    close = difflib.get_close_matches(word, groups, n=1)
+    return f"; did you mean {groups[close[0]]}={close[0]}?" if close else ""
+
+
+def _unreadable(text: str, error: HydraException) -> ConfigError:
+    """Hydra's own messages name rules of its grammar, and often not even the argument."""
+    key, _, value = text.partition("=")
+    if not value or not re.fullmatch(r"[\w.+~/@:$-]+", key, re.ASCII):
+        return ConfigError(f"{text}: expected key=value")
+    if function := re.search(r"while evaluating .*", str(error)):
+        return ConfigError(f"{text}: {function[0]}")
+    quoted = f"{key}={_quoted(value)}"
+    shell = shlex.quote(quoted) if set(quoted) & set('"\\$`!') else f'"{quoted}"'
+    return ConfigError(f"{text}: not a value; text with such characters needs quotes: {shell}")
 
 
 def _on_top_of_saved(
@@ -308,15 +373,22 @@ def _copy_key(key: str, source: dict[str, Any], target: dict[str, Any]) -> bool:
     return last in source
 
 
-def _one_line(name: str, error: Exception, groups: Sequence[str]) -> str:
+def _refused(
+    name: str, error: Exception, items: Sequence[Override], groups: Sequence[str]
+) -> ConfigError:
     text = " ".join(str(error).split())
     if match := re.search(r"Key '([^']+)' is not in struct full_key: (\S+)", text):
-        return str(_unknown_key(match[2], defaults(name, groups)))
+        return _unknown_key(match[2], defaults(name, groups))
     if match := re.search(r"Could not override '([^']+)'", text):
         # It may be one of the groups: without it, or this would be asked again and again.
         others = [group for group in groups if group.partition("=")[0] != match[1]]
-        return str(_unknown_key(match[1], defaults(name, others)))
-    return text
+        return _unknown_key(match[1], defaults(name, others))
+    known = defaults(name, groups)
+    for item in items:  # A word or a number below a list or a value.
+        key = item.key_or_group
+        if any(key.startswith(f"{one}.") for one in known):
+            return _unknown_key(key, known)
+    return ConfigError(text)
 
 
 def defaults(name: str, overrides: Sequence[str]) -> dict[str, Any]:

@@ -4,19 +4,21 @@ from __future__ import annotations
 
 import copy
 import fnmatch
+import itertools
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from hydra.core.override_parser.types import Glob, IntervalSweep, Override
+from hydra.core.override_parser.types import Glob, IntervalSweep, Override, RangeSweep
+from hydra.errors import HydraException
 
-from gmijax.cli.compose import build, choices, compose_dict, parse, with_custom_task
+from gmijax.cli.compose import build, choices, compose_dict, parse, readable
 from gmijax.config import ClusterConfig, TrainConfig
 from gmijax.config.schema import from_dict, to_dict
 from gmijax.config.sweep import SweepConfig
 from gmijax.errors import ConfigError
 from gmijax.sweeps.jobs import Job
-from gmijax.sweeps.space import Choices, Interval, corners, grid
+from gmijax.sweeps.space import MAX_JOBS, Choices, Interval, corners, grid
 from gmijax.sweeps.sweep import Request
 
 
@@ -37,7 +39,7 @@ def build_sweep(overrides: Sequence[str]) -> Request:
     Raises:
       ConfigError: as `compose`; an empty list; what a sampler cannot do.
     """
-    overrides = [part for text in overrides for part in with_custom_task("train", text)]
+    overrides = readable("train", overrides)
     given = list(zip(overrides, parse(overrides), strict=True))
     whole = ("run.", "sweep.", "cluster.")
     for text, item in given:
@@ -111,6 +113,13 @@ def _values(item: Override) -> Choices | Interval:
             raise ConfigError(f"{item.input_line}: an empty interval")
         is_integer = isinstance(value.start, int) and isinstance(value.end, int)
         return Interval(value.start, value.end, "log" in value.tags, is_integer)
+    if isinstance(value, RangeSweep):  # A shuffled one is made whole.
+        try:
+            numbers = list(itertools.islice(value.range(), MAX_JOBS + 1))
+        except (ValueError, HydraException):
+            raise ConfigError(f"{item.input_line}: the step must not be 0") from None
+        if len(numbers) > MAX_JOBS:
+            raise _too_many(item)
     if isinstance(value, Glob):
         found = [
             name
@@ -119,9 +128,15 @@ def _values(item: Override) -> Choices | Interval:
             and not any(fnmatch.fnmatch(name, pattern) for pattern in value.exclude)
         ]
     else:
-        found = list(item.sweep_string_iterator())
+        found = list(itertools.islice(item.sweep_string_iterator(), MAX_JOBS + 1))
     if not found:
         raise ConfigError(f"{item.input_line}: an empty list")
+    if len(found) > MAX_JOBS:
+        raise _too_many(item)
     if len(set(found)) < len(found):
         raise ConfigError(f"{item.input_line}: a value that comes twice")
     return Choices(tuple(found))
+
+
+def _too_many(item: Override) -> ConfigError:
+    return ConfigError(f"{item.input_line}: at most {MAX_JOBS:,} values are allowed")

@@ -8,6 +8,8 @@ from __future__ import annotations
 
 import dataclasses
 import difflib
+import functools
+import re
 import sys
 import types
 import typing
@@ -77,6 +79,12 @@ def require_between(key: str, value: float, low: float, high: float) -> None:
         raise ConfigError(f"{key}={value!r}: must be between {low} and {high}")
 
 
+@functools.cache
+def _hints(cls: type[Any]) -> dict[str, Any]:
+    """Types of the fields; half of the time of a large sweep if they are evaluated each time."""
+    return typing.get_type_hints(cls)
+
+
 def from_dict(cls: type[T], data: Mapping[str, Any], path: str = "") -> T:
     """Builds a frozen config tree from plain data, checking names and types.
 
@@ -85,7 +93,7 @@ def from_dict(cls: type[T], data: Mapping[str, Any], path: str = "") -> T:
     Raises:
       ConfigError: an unknown or missing key, a wrong type, or a value out of range.
     """
-    hints = typing.get_type_hints(cls)
+    hints = _hints(cls)
     for key in data:
         if key not in hints:
             raise ConfigError(f"unknown key {path}{key}{suggestion(key, hints)}")
@@ -105,16 +113,11 @@ def from_named(classes: Sequence[type[T]], data: Mapping[str, Any], path: str = 
 
 
 def _class_of(classes: Sequence[type[T]], data: Mapping[str, Any], path: str) -> type[T]:
-    by_name = {
-        name: cls
-        for cls in classes
-        for name in typing.get_args(typing.get_type_hints(cls)["name"])
-    }
-    if data.get("name") not in by_name:
-        raise ConfigError(
-            f"{path}name={_shown(data.get('name'))}: expected one of {', '.join(by_name)}"
-        )
-    return by_name[data["name"]]
+    by_name = {name: cls for cls in classes for name in typing.get_args(_hints(cls)["name"])}
+    name = data.get("name")
+    if not isinstance(name, str) or name not in by_name:
+        raise ConfigError(f"{path}name={_shown(name)}: expected one of {', '.join(by_name)}")
+    return by_name[name]
 
 
 def known(
@@ -134,7 +137,7 @@ def known(
       ConfigError: as `from_named`.
     """
     cls = classes[0] if len(classes) == 1 else _class_of(classes, data, path)
-    hints = typing.get_type_hints(cls)
+    hints = _hints(cls)
     kept: dict[str, Any] = {}
     unknown: tuple[str, ...] = ()
     for key, value in data.items():
@@ -189,8 +192,20 @@ def _convert(kind: Any, value: Any, key: str) -> Any:
         converted = _accept(option, value, key)
         if converted is not _REJECTED:
             return converted
-    raise ConfigError(f"{key}={_shown(value)}: expected {_describe(kind)}")
+    raise ConfigError(
+        f"{key}={_shown(value)}: expected {_describe(kind)}{_in_digits(kind, value)}"
+    )
 
+
+def _in_digits(kind: Any, value: Any) -> str:
+    """`30M` as a number, where one is expected."""
+    match = re.fullmatch(r"([\d.]+)([kKmMgGbB])", value) if isinstance(value, str) else None
+    if match is None or not {int, float} & set(_options(kind)):
+        return ""
+    return f"; did you mean {match[1]}e{_POWERS[match[2].lower()]}?"
+
+
+_POWERS = types.MappingProxyType({"k": 3, "m": 6, "g": 9, "b": 9})
 
 _REJECTED = object()
 

@@ -21,7 +21,8 @@ class ServeRunConfig(Timeouts):
     """Where the policy comes from, and the life of the job."""
 
     dir: str | None = doc(
-        "trained run whose policy acts: its folder, one of its checkpoints, or `last`"
+        "trained run whose policy acts: its folder, one of its checkpoints, or `last`; without it "
+        "and without policy=random: `last`"
     )
     name: str | None = doc(
         "name of the job's own folder below runs/; null: <env>-serve-<date>-<time>"

@@ -66,13 +66,22 @@ def open_console(*, show: bool) -> Console:
     # Without a standard output (`>&-`) it is None.
     stream: Any = _BestEffortStream(sys.stdout if show else None)
     # Paths, tasks and errors may look like markup.
-    return Console(file=stream, quiet=not show, soft_wrap=True, highlight=False, markup=False)
+    is_shown_live = stream.isatty() and os.environ.get("TERM") != "dumb"
+    return Console(
+        file=stream,
+        quiet=not show,
+        soft_wrap=True,
+        highlight=False,
+        markup=False,
+        # FORCE_COLOR makes anything a terminal to Rich, e.g. the pipe of a notebook.
+        force_interactive=is_shown_live,
+    )
 
 
 @contextmanager
 def doing(console: Console, what: str) -> Iterator[None]:
     """Says what is done, on a terminal for as long as it takes, elsewhere in a line."""
-    if console.is_terminal:
+    if console.is_interactive:
         with console.status(what):
             yield
     else:

@@ -30,7 +30,7 @@ class LiveDisplay:
 
     def __init__(self, console: Console) -> None:
         self._console = console
-        self.has_panel = console.is_terminal and not console.quiet
+        self.has_panel = console.is_interactive and not console.quiet
         self._is_off = console.quiet
         self._drawn_s = 0.0
         self._live = Live(console=console, auto_refresh=False, transient=True)

@@ -36,7 +36,7 @@ from gmijax.partition.plan import Plan
 from gmijax.runs.folder import RunPaths, add_event, read_json, write_json
 from gmijax.runs.git import record_git
 from gmijax.runs.held import locked
-from gmijax.runs.history import MetricsReader, copy_history, draw_returns
+from gmijax.runs.history import MetricsReader, copy_history, draw_returns, read_metrics
 from gmijax.runs.resume import CheckpointMeta, checkpoints_of
 from gmijax.runs.saved_config import saved_config
 from gmijax.sim import source
@@ -248,7 +248,6 @@ def _what_is_left(run: RunPaths) -> str:
         return f"training was complete: {run.root}"
     if checkpoints_of(run.root):
         return f"continue with run.resume={run.root}"
-    return (
-        "there is no checkpoint yet (run.checkpoint_every; run.stop_timeout_s is the time that "
-        "GMIs get to save one at the end)"
-    )
+    if not read_metrics(run.metrics):
+        return "training had not begun, so there is no checkpoint"
+    return "there is no checkpoint: run.stop_timeout_s is the time that GMIs get to save one"

@@ -105,7 +105,7 @@ def serve(config: ServeConfig, *, show: bool = False) -> Served:
         if kept and kept == job.wanted_unrolls:
             raise ConfigError(
                 f"num_timesteps={job.config.num_timesteps}: output.dir={job.config.output.dir} "
-                f"has {kept * job.steps_per_unroll} steps already; give more in all"
+                f"has {kept * job.steps_per_unroll} steps already; set num_timesteps above that"
             )
         env = job.config.env
         run = create_run(None, job.config.run.name, f"{env.slug}-serve")

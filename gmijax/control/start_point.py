@@ -56,8 +56,8 @@ def find_start_point(config: TrainConfig) -> StartPoint:
     meta = _require_fit(config, checkpoint, config.run.resume)
     if meta.env_steps >= config.num_timesteps:
         raise ConfigError(
-            f"num_timesteps={config.num_timesteps}: the checkpoint has {meta.env_steps} "
-            "steps already; give more in all"
+            f"num_timesteps={config.num_timesteps}: already trained for {meta.env_steps} steps; "
+            "set num_timesteps above that"
         )
     return StartPoint(checkpoint=checkpoint, notes=notes)
 

@@ -220,7 +220,7 @@ def _strategy(
     if reduce.strategy != "auto":
         require_strategy(reduce.strategy, layout, backend)
     if layout.num_gmis == 1:
-        reasons.append("strategy none: one GMI has nobody to average gradients with")
+        reasons.append("strategy none: no gradient reduction (one GMI)")
         return "none"
     if reduce.strategy != "auto":
         return reduce.strategy

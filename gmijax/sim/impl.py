@@ -42,6 +42,9 @@ None: the sizes of MJX-JAX, which hold all that can ever be unless the model lim
 """
 
 
+_GIVEN = "set on the command line or by the run"
+
+
 def choose_impl(
     impl: str,
     device_platform: str,
@@ -65,7 +68,7 @@ def choose_impl(
     if warp_installed is None:
         warp_installed = importlib.util.find_spec("warp") is not None
     if impl == "jax":
-        return "jax", "asked for"
+        return "jax", _GIVEN
     is_gpu = device_platform in ("gpu", "cuda")
     if impl == "warp":
         if not warp_installed:
@@ -73,7 +76,7 @@ def choose_impl(
                 "physics.impl=warp: needs the package warp-lang (pip install 'gmijax[warp]'); "
                 "allowed without it are auto, jax"
             )
-        return "warp", "asked for"
+        return "warp", _GIVEN
     if not is_gpu:
         return "jax", f"MJX-Warp is slow on {device_platform}"
     if not warp_installed:

@@ -40,7 +40,7 @@ def test_a_task_trains_and_no_buffer_is_too_small(
         timeout_s=1100.0,
     )
     assert done.returncode == 0, done.stderr
-    assert "physics.impl warp: asked for" in done.stdout
+    assert "physics.impl warp: set" in done.stdout
     summary = json.loads((tmp_path / "run" / "summary.json").read_text())
     assert summary["impl"] == "warp"
     assert summary["env_steps"] == steps

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import shlex
 from pathlib import Path
 
 import pytest
@@ -27,19 +28,39 @@ REFUSED: list[tuple[str, str, str]] = [
     ("train", "+foo.bar=1", "unknown key foo"),
     ("train", "hydra.run.dir=x", "unknown key hydra.run.dir: did you mean run.dir?"),
     ("train", "--verbose", "unknown option --verbose"),
-    ("train", "ant", "ant: expected key=value"),
+    ("train", "ant", "ant: expected key=value; did you mean env=ant?"),
+    ("train", "humanod", "humanod: expected key=value; did you mean env=humanoid?"),
+    ("train", "a3c", "a3c: expected key=value; did you mean algo=a3c?"),
+    ("train", "mine.py:make", "did you mean env=mine.py:make?"),
+    ("play", "last", "last: expected key=value; did you mean run.dir=last?"),
+    ("train", "nothing-like-it", "nothing-like-it: expected key=value\n"),
+    # Below a list, a value, a group.
+    ("train", "algo.policy_hidden_layer_sizes.first=64", "unknown key algo.policy_hidden_layer_"),
+    ("train", "algo.policy_hidden_layer_sizes.9=64", "_sizes.9: did you mean algo.policy_hidden"),
+    ("train", "env.randomization.body_mass.range.x=1", "unknown key env.randomization.body_mass"),
+    ("serve", "policy=random plan.layout.a.b=1", "unknown key plan.layout.a.b: did you mean"),
+    ("train", "seed.x=1", "unknown key seed.x: did you mean seed?"),
+    ("train", "algo.name=[a]", "algo.name=['a']: expected one of ppo, a3c"),
+    ("train", "algo.name={a:1}", "algo.name={'a': 1}: expected one of ppo, a3c"),
     ("train", "~plan=nan", "~plan=nan: expected ~plan"),
     ("train", "~env", "~env: a job needs one; choose it with env=NAME"),
     ("train", "~env=ant", "~env=ant: a job needs one; choose it with env=NAME"),
     ("train", "~algo", "~algo: a job needs one; choose it with algo=NAME"),
     ("serve", "policy=random output.shards=1", "unknown key output.shards"),
-    ("serve", "cluster.engine=ray", "cluster.engine: this command is for one machine"),
+    (
+        "serve",
+        "policy=random cluster.engine=ray",
+        "cluster.engine: this command is for one machine",
+    ),
     ("play", "vidoe=gif", "unknown key vidoe: did you mean video?"),
     ("play", "env.name=ant", "unknown key env"),
     ("play", "env=ant", "unknown key env: did you mean run.env?"),
     ("export", "run.dir=x tuned=ant_ppo", "unknown key tuned: allowed are checkpoint"),
     # Values of a wrong type, or out of range.
     ("train", "num_envs=many", "num_envs=many: expected an integer"),
+    ("train", "num_timesteps=30M", "num_timesteps=30M: expected an integer; did you mean 30e6?"),
+    ("train", "num_envs=2k", "num_envs=2k: expected an integer or one of auto; did you mean 2e3?"),
+    ("train", "run.grace_s=1k", "run.grace_s=1k: expected a finite number; did you mean 1e3?"),
     ("train", "num_envs=0", "num_envs=0: must be at least 1"),
     ("train", "num_envs=3 algo.unroll_length=1", "do not divide into algo.num_minibatches=4"),
     ("train", "seed=range(1,3)", "seed=range(1,3): expected one value"),
@@ -111,7 +132,8 @@ REFUSED: list[tuple[str, str, str]] = [
     ("train", "run.resume=last", "no run with a checkpoint"),
     ("train", "run.resume=auto", "run.resume=auto: needs run.dir or run.name, the folder to go"),
     ("serve", "run.dir=nowhere", "run.dir=nowhere: no such folder"),
-    ("serve", "", "policy=trained: needs run.dir=RUN"),
+    ("serve", "", "run.dir=last: no run with a checkpoint in runs/"),
+    ("serve", "run.dir=null", "policy=trained: needs run.dir=RUN"),
     ("serve", "policy=random deterministic=true", "random actions have no mean"),
     ("play", "run.dir=nowhere", "run.dir=nowhere: no such folder"),
     ("export", "run.dir=nowhere", "run.dir=nowhere: no such folder"),
@@ -143,6 +165,22 @@ REFUSED: list[tuple[str, str, str]] = [
     # What is hardly a command line.
     ("train", "-env=\n", "unknown option -env=\\n: allowed"),
     ("train", "\r", r"'\r': expected text without control characters"),
+    ("train", "run.name=lr=3e-4", "run.name=lr=3e-4: not a value; text with such characters"),
+    ("train", "run.dir=runs/(v2)", """needs quotes: "run.dir='runs/(v2)'\""""),
+    ("play", "run.dir=a[b", """needs quotes: "run.dir='a[b'\""""),
+    (
+        "train",
+        "run.name=ünder",
+        """run.name=ünder: not a value; text with such characters needs""",
+    ),
+    ("train", "run.name=int([)", "run.name=int([): not a value"),
+    ("train", "seed=int(x)", "seed=int(x): while evaluating 'int(x)': invalid literal"),
+    ("train", "é=1", "é=1: expected key=value"),
+    (
+        "train",
+        f"search.num_envs=[{','.join('1' * 3000)}]",
+        "search.num_envs: 3000 values; at most",
+    ),
     ("train", "run.name=a\nb", "expected text without control characters"),
     ("train", "run.dir=a\0b", "expected text without control characters"),
     ("train", "run.dir=\udcff", r"'run.dir=\udcff': expected text without control"),
@@ -169,6 +207,21 @@ def test_bad_input_is_one_line_and_starts_nothing(
     assert len(done.stderr.splitlines()) == 1
     assert done.stdout == ""
     assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("text", ["run.dir=~/x", "run.dir='~/x'", 'run.dir="~/x"'])
+def test_the_home_folder_is_no_folder_of_that_name(text: str, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setenv("HOME", "/home/it's (one)")
+    assert compose(text).run.dir == "/home/it's (one)/x"
+    assert compose("env=~/task.py:make").env.name == "/home/it's (one)/task.py:make"
+
+
+@pytest.mark.parametrize("value", ["lr=3e-4,h=64", "runs/(v2)", "ünder", "it's", "a\\'b", "[1"])
+def test_text_in_quotes_is_taken_as_the_message_says(value: str):
+    with pytest.raises(ConfigError, match="needs quotes: ") as refused:
+        compose(f"run.name={value}")
+    (quoted,) = shlex.split(str(refused.value).partition("needs quotes: ")[2])
+    assert compose(quoted).run.name == value
 
 
 @pytest.mark.parametrize("value", ["a\nb", os.fsdecode(b"a\xffb")])

@@ -34,6 +34,16 @@ def test_every_verb_is_a_module_with_help(verb: str, capsys: pytest.CaptureFixtu
     assert callable(importlib.import_module(f"gmijax.{verb.replace('-', '_')}").main)
 
 
+@pytest.mark.parametrize("line", [["help", "list-envs"], ["list_envs", "--help"]])
+def test_help_and_the_name_of_the_module_are_understood(
+    line: list[str], capsys: pytest.CaptureFixture[str]
+):
+    assert main(line) == main(["help"]) == 0
+    assert "usage: gmijax list-envs" in capsys.readouterr().out
+    assert main(["help", "trian"]) == 2
+    assert capsys.readouterr().err == "gmijax: unknown command 'trian': did you mean train?\n"
+
+
 def test_an_interrupt_while_packages_are_imported_is_one_line(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ):
@@ -48,7 +58,7 @@ def test_an_interrupt_while_packages_are_imported_is_one_line(
 def test_arguments_and_exit_code_are_those_of_the_verb(capsys: pytest.CaptureFixture[str]):
     assert main(["train", "num_env=3"]) == 2
     assert "unknown key num_env: did you mean num_envs?" in capsys.readouterr().err
-    assert main(["list-envs", "ant"]) == 2
+    assert main(["list_envs", "ant"]) == 2
     assert main(["demo", "num_timesteps=0"]) == 2
 
 

@@ -11,9 +11,11 @@ from typing import Any
 
 import pytest
 from rich.console import Console
+from rich.text import Text
 from supervision import CHECKOUT
 
-from gmijax.control.console import ConsoleProgress, open_console
+from gmijax.control.console import ConsoleProgress, doing, open_console
+from gmijax.control.display import LiveDisplay
 from gmijax.control.summary import train_outcome
 from gmijax.deploy import playing
 from gmijax.errors import printable
@@ -49,6 +51,19 @@ def test_a_reader_that_is_gone_does_not_end_the_job(tmp_path: Path, shell: str):
 def test_names_in_brackets_are_printed_as_they_are(capsys: pytest.CaptureFixture[str]):
     open_console(show=True).print("runs/[lr=0.1] a[/b]")
     assert capsys.readouterr().out == "runs/[lr=0.1] a[/b]\n"
+
+
+@pytest.mark.parametrize("variable", ["FORCE_COLOR", "TTY_COMPATIBLE", "TTY_INTERACTIVE"])
+def test_nothing_moves_where_there_is_no_terminal(
+    variable: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+):
+    """Notebooks set FORCE_COLOR for what they run, and show every frame of a spinner."""
+    monkeypatch.setenv(variable, "1")
+    console = open_console(show=True)
+    with doing(console, "playing"), LiveDisplay(console) as display:
+        display.show(lambda: Text("a panel"))
+    assert not display.has_panel
+    assert capsys.readouterr().out == "playing\n"
 
 
 def test_a_display_that_fails_is_given_up(capsys: pytest.CaptureFixture[str]):

@@ -42,8 +42,8 @@ PENDULUM_OVER_FLOOR = """
         ("auto", "cuda", "playground/CheetahRun", "warp", "Playground itself"),
         ("auto", "cpu", "playground/CheetahRun", "jax", "slow on cpu"),
         ("auto", "gpu", None, "jax", "physics.impl=warp"),
-        ("jax", "gpu", "ant", "jax", "asked for"),
-        ("warp", "cpu", None, "warp", "asked for"),
+        ("jax", "gpu", "ant", "jax", "set on the command line or by the run"),
+        ("warp", "cpu", None, "warp", "set on the command line or by the run"),
     ],
 )
 def test_choice_of_implementation(
