@@ -10,8 +10,9 @@ from typing import Any
 
 from omegaconf import OmegaConf
 
-from gmijax.cli.compose import build, choices, defaults
+from gmijax.cli.compose import build, defaults
 from gmijax.cli.grid import SweepHelp, build_sweep
+from gmijax.cli.groups import choices
 from gmijax.cli.help import print_help
 from gmijax.config.schema import to_dict
 from gmijax.control.exit_codes import exit_code_of

@@ -9,7 +9,7 @@ from collections.abc import Iterable, Sequence
 from hydra import initialize_config_dir
 from hydra.core.global_hydra import GlobalHydra
 
-from gmijax.cli.compose import config_dir
+from gmijax.cli.groups import config_dir
 from gmijax.control.exit_codes import exit_code_of
 from gmijax.errors import ConfigError
 

@@ -2,25 +2,20 @@
 
 from __future__ import annotations
 
-import difflib
-import os
 import re
-import shlex
 import typing
-import unicodedata
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from pathlib import Path
 from typing import Any, Literal, TypeVar, overload
 
 from hydra import compose as hydra_compose
 from hydra import initialize_config_dir
-from hydra.core.override_parser.overrides_parser import OverridesParser
-from hydra.core.override_parser.types import Override, Quote, QuotedString
+from hydra.core.override_parser.types import Override
 from hydra.errors import HydraException
 from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-import gmijax
+from gmijax.cli.arguments import parse, readable, require_text
+from gmijax.cli.groups import choices, config_dir
 from gmijax.config import EnvConfig, ServeConfig, TrainConfig
 from gmijax.config.schema import flatten, from_dict, known, require_between, suggestion
 from gmijax.errors import ConfigError
@@ -40,12 +35,6 @@ _NAMED_BY_TASK = ("env.rewards.", "env.settings.")
 """Groups of keys whose names are the task's; those of a custom task only its file knows."""
 
 _MOST_STEPS = 900 * 10**9
-
-_MOST_VALUES = 2000
-"""In one argument."""
-
-_NOT_TEXT = ("Cc", "Cs", "Zl", "Zp")
-"""Unicode's categories of control characters, surrogates, and ends of lines and paragraphs."""
 
 
 @overload
@@ -85,20 +74,6 @@ def compose(*overrides: str, command: str = "train", env: Callable[..., Any] | N
     return build(command, _COMPOSED[command], (*chosen, *overrides))
 
 
-def config_dir() -> Path:
-    """The folder of YAML files: inside an installed package, or beside it in a checkout."""
-    package = Path(gmijax.__file__).resolve().parent
-    installed = package / "configs"
-    return installed if installed.is_dir() else package.parent / "configs"
-
-
-def choices(group: str) -> list[str]:
-    """Names of the YAML files of a group, e.g. the tasks for `env`."""
-    # No path of the user's making: it could lead anywhere, or be too long for a file system.
-    folders = [path for path in config_dir().iterdir() if path.name == group]
-    return sorted(path.stem for folder in folders for path in folder.glob("*.yaml"))
-
-
 def build(name: str, cls: type[C], overrides: Sequence[str]) -> C:
     """The configuration of a command; raises as `compose`."""
     overrides = readable(name, overrides)
@@ -118,7 +93,7 @@ def build(name: str, cls: type[C], overrides: Sequence[str]) -> C:
             data = _on_top_of_saved(data, items, str(resume))
     for key, value in flatten(data).items():  # What the environment has may be anything.
         if isinstance(value, str):
-            _require_text(f"{key}={value}")
+            require_text(f"{key}={value}")
     config = from_dict(cls, data)
     if isinstance(config, TrainConfig):
         # The last iteration may go beyond the wanted steps, and checkpoints have twelve digits.
@@ -198,36 +173,6 @@ def _check_override(name: str, item: Override) -> None:
         )
 
 
-def readable(name: str, overrides: Sequence[str]) -> list[str]:
-    """The overrides of a command in words that hydra knows."""
-    return [part for text in overrides for part in _with_custom_task(name, _at_home(text))]
-
-
-def _at_home(override: str) -> str:
-    """`key=~/x` with the home folder: a shell writes it only where a word begins with `~`."""
-    match = re.fullmatch(r"([^=]+)=(['\"]?)(~[^'\"]*)\2", override)
-    if match is None:
-        return override
-    path = os.path.expanduser(match[3])
-    return override if path == match[3] else f"{match[1]}={_quoted(path)}"
-
-
-def _with_custom_task(name: str, override: str) -> tuple[str, ...]:
-    """`env=path/to/file.py:make` for hydra; anything else as it is."""
-    match = re.fullmatch(r"env=(['\"]?)(.*\.py(:.*)?)\1", override)
-    if match is None:
-        return (override,)
-    value = override.removeprefix("env=") if match[1] else _quoted(match[2])
-    if name in ("play", "export"):  # Which task it is the run says.
-        return (f"run.env={value}",)
-    return "env=custom", f"env.name={value}"
-
-
-def _quoted(value: str) -> str:
-    """A value that hydra takes as text, whatever is in it."""
-    return QuotedString(value, Quote.single).with_quotes()
-
-
 def _check_task_key(items: Sequence[Override]) -> None:
     """Refuses `env.name` alone: it would run a task with the settings tuned for another one."""
     groups = {str(item.value()) for item in items if item.key_or_group == "env"}
@@ -250,59 +195,6 @@ def _unknown_key(key: str, known: Iterable[str]) -> ConfigError:
             f"{key}: this command is for one machine; gmijax.train and gmijax.sweep take several"
         )
     return ConfigError(f"unknown key {key}{suggestion(key, known)}")
-
-
-def parse(overrides: Sequence[str]) -> list[Override]:
-    """Overrides by Hydra's grammar; raises ConfigError."""
-    return [_parsed(text) for text in overrides]
-
-
-def _require_text(text: str) -> None:
-    # A surrogate stands for a byte that is no text, which nothing can print.
-    if any(unicodedata.category(letter) in _NOT_TEXT for letter in text):
-        raise ConfigError(f"{text!r}: expected text without control characters")
-
-
-def _parsed(text: str) -> Override:
-    _require_text(text)
-    if text.count(",") >= _MOST_VALUES:  # Hydra takes the square of their number.
-        raise ConfigError(
-            f"{text.partition('=')[0]}: {text.count(',') + 1} values; at most {_MOST_VALUES} are "
-            "allowed"
-        )
-    try:
-        return OverridesParser.create().parse_overrides([text])[0]
-    except RecursionError:
-        raise ConfigError(f"{text}: nested too deeply") from None
-    except ValueError:  # Python's own limit.
-        raise ConfigError(f"{text}: a number has too many digits") from None
-    except HydraException as error:
-        if "=" not in text:
-            raise ConfigError(f"{text}: expected key=value{_meant(text)}") from None
-        raise _unreadable(text, error) from None
-
-
-def _meant(word: str) -> str:
-    """The key that a word alone, e.g. `ant`, may be a value of."""
-    if re.search(r"\.py(:|$)", word):
-        return f"; did you mean env={word}?"
-    if word == "last" or "/" in word:
-        return f"; did you mean run.dir={word}?"
-    groups = {name: group for group in ("env", "algo") for name in choices(group)}
-    close = difflib.get_close_matches(word, groups, n=1)
-    return f"; did you mean {groups[close[0]]}={close[0]}?" if close else ""
-
-
-def _unreadable(text: str, error: HydraException) -> ConfigError:
-    """Hydra's own messages name rules of its grammar, and often not even the argument."""
-    key, _, value = text.partition("=")
-    if not value or not re.fullmatch(r"[\w.+~/@:$-]+", key, re.ASCII):
-        return ConfigError(f"{text}: expected key=value")
-    if function := re.search(r"while evaluating .*", str(error)):
-        return ConfigError(f"{text}: {function[0]}")
-    quoted = f"{key}={_quoted(value)}"
-    shell = shlex.quote(quoted) if set(quoted) & set('"\\$`!') else f'"{quoted}"'
-    return ConfigError(f"{text}: not a value; text with such characters needs quotes: {shell}")
 
 
 def _on_top_of_saved(

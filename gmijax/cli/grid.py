@@ -12,7 +12,9 @@ from typing import Any
 from hydra.core.override_parser.types import Glob, IntervalSweep, Override, RangeSweep
 from hydra.errors import HydraException
 
-from gmijax.cli.compose import build, choices, compose_dict, parse, readable
+from gmijax.cli.arguments import parse, readable
+from gmijax.cli.compose import build, compose_dict
+from gmijax.cli.groups import choices
 from gmijax.config import ClusterConfig, TrainConfig
 from gmijax.config.schema import from_dict, to_dict
 from gmijax.config.sweep import SweepConfig

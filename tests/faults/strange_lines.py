@@ -11,7 +11,8 @@ from typing import Any, Literal
 from command_lines import COMMANDS
 from hypothesis import strategies as st
 
-from gmijax.cli.compose import choices, defaults
+from gmijax.cli.compose import defaults
+from gmijax.cli.groups import choices
 
 _GROUPS = ("env", "algo", "plan", "search", "tuned", "run", "physics", "reduce", "channel")
 
