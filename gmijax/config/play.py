@@ -60,7 +60,10 @@ class PlayConfig(KeyGroup):
     )
     width: int = doc("width of the picture in pixels", low=64, high=4096)
     height: int = doc("height of the picture in pixels", low=64, high=4096)
-    camera: str | None = doc("name of a camera of the model; null: one that tracks the robot")
+    camera: str | None = doc(
+        "name of a camera of the model; null: `track`, else one that follows a body, else a view "
+        "that follows a robot that moves freely, else one that stands still"
+    )
 
     def __post_init__(self) -> None:
         super().__post_init__()

@@ -42,8 +42,11 @@ def has_brax() -> bool:
     return importlib.util.find_spec("brax") is not None
 
 
-def film(config: PlayConfig, paths: PlayPaths, console: Console) -> None:
-    """Films with the first OpenGL that works; each is tried in a fresh interpreter."""
+def film(config: PlayConfig, paths: PlayPaths, camera: str, console: Console) -> None:
+    """Films with the first OpenGL that works; each is tried in a fresh interpreter.
+
+    `camera` is what to say of the camera.
+    """
     tried = opengls("egl", "osmesa")
     exit_code = EXIT_NO_GL
     for gl in tried:
@@ -52,6 +55,7 @@ def film(config: PlayConfig, paths: PlayPaths, console: Console) -> None:
         if exit_code == 0:
             for video in filter(Path.exists, (paths.mp4, paths.gif)):
                 console.print(f"video: {video}")
+            console.print(f"filmed by {camera}")
             return
         if not is_missing(exit_code):
             raise GmijaxError(f"no video: {_why(exit_code, paths)}; the returns were evaluated")

@@ -84,10 +84,14 @@ def play(config: PlayConfig, *, show: bool = False) -> None:
     if not paths.model.exists():
         _accept_nothing_to_see(config, returns["env"], console)
         return
-    if config.html != "off":
-        write_page(config, paths, console)
-    if config.video != "none":
-        film(config, paths, console)
+    try:
+        if config.html != "off":
+            write_page(config, paths, console)
+        if config.video != "none":
+            film(config, paths, returns["camera"], console)
+    finally:
+        # With its textures a robot takes 100 MB, for every checkpoint that is played.
+        paths.model.unlink(missing_ok=True)
 
 
 def _opened(config: PlayConfig) -> tuple[PlayConfig, str | None]:

@@ -134,7 +134,7 @@ class PlayPaths(_Folder):
         self.returns = root / "returns.json"  # Of every episode, and statistics over them.
         # `qpos` [L + 1, E, nq] of the shown environments, `lengths` [E], `control_dt_s`.
         self.trajectory = root / "trajectory.npz"
-        self.model = root / "model.mjb"  # Of the trajectory, in MuJoCo's binary format.
+        self.model = root / "model.mjb"  # In MuJoCo's binary format, until all is drawn.
         self.mp4 = root / "video.mp4"
         self.gif = root / "video.gif"
         self.html = root / "view.html"

@@ -12,6 +12,8 @@ from typing import Any, TypeAlias
 import numpy as np
 import numpy.typing as npt
 
+from gmijax.sim.camera import choose_camera
+
 Image: TypeAlias = npt.NDArray[np.uint8]
 
 
@@ -21,7 +23,7 @@ class Stage:
     Args:
       model: a `mujoco.MjModel`, or its file in MuJoCo's binary format; None: an empty world.
       size: width and height of a picture, pixels.
-      camera: see `choose_camera`.
+      camera: see `gmijax.sim.camera.choose_camera`.
 
     Raises:
       Exception: of any type, where OpenGL cannot be had.
@@ -43,7 +45,7 @@ class Stage:
         # The buffer of the model's author need not hold the picture that is wanted.
         self._model.vis.global_.offwidth = max(self._model.vis.global_.offwidth, width)
         self._model.vis.global_.offheight = max(self._model.vis.global_.offheight, height)
-        self._camera = choose_camera(self._model, camera)
+        self._view = choose_camera(self._model, camera).view
         self._renderer = mujoco.Renderer(self._model, height, width)
         self.picture(self._model.qpos0)
 
@@ -51,7 +53,7 @@ class Stage:
         """The picture [height, width, 3] of one world at `qpos`, as `Env.qpos` gives it."""
         put(self._data, qpos)
         self._mujoco.mj_fwdPosition(self._model, self._data)
-        self._renderer.update_scene(self._data, self._camera)
+        self._renderer.update_scene(self._data, self._view)
         return self._renderer.render()
 
 
@@ -63,21 +65,3 @@ def put(data: Any, qpos: npt.NDArray[Any]) -> None:
         pos, quat = np.split(rest, [data.mocap_pos.size])
         data.mocap_pos[:] = pos.reshape(-1, 3)
         data.mocap_quat[:] = quat.reshape(-1, 4)
-
-
-def choose_camera(model: Any, wanted: str | None) -> int:
-    """Index of the camera: `wanted`, else `track`, else one that follows a body, else any.
-
-    A model without cameras gives -1, MuJoCo's free camera.
-    """
-    import mujoco
-
-    names = [model.camera(i).name for i in range(model.ncam)]
-    if wanted is not None:
-        return names.index(wanted)
-    if "track" in names:
-        return names.index("track")
-    modes = mujoco.mjtCamLight
-    tracking = (int(modes.mjCAMLIGHT_TRACK), int(modes.mjCAMLIGHT_TRACKCOM))
-    following = [i for i in range(model.ncam) if int(model.cam_mode[i]) in tracking]
-    return next(iter(following), 0 if names else -1)

@@ -37,6 +37,7 @@ def _run(link: ChildLink) -> None:
     from gmijax.learning.checkpoint import restore_learner
     from gmijax.learning.episodes import Options, run_episodes
     from gmijax.learning.learner import init_learner, make_learner
+    from gmijax.sim.camera import choose_camera
     from gmijax.sim.randomize import make_worlds
 
     impl = _impl(config, checkpoint, env_config)
@@ -64,7 +65,12 @@ def _run(link: ChildLink) -> None:
     paths = PlayPaths(link.run.root)
     _write_trajectory(paths, env, episodes, config.video_envs)
     device = jax.local_devices()[0]
-    about = {"impl": impl, "device": f"{device.platform}: {device.device_kind}"}
+    camera = None if env.mj_model is None else choose_camera(env.mj_model, config.camera).name
+    about = {
+        "impl": impl,
+        "device": f"{device.platform}: {device.device_kind}",
+        "camera": camera,
+    }
     # Written last: whoever sees it finds the trajectory complete.
     write_json(paths.returns, {**summarise(config, env.spec.name, episodes), **about})
 

@@ -40,6 +40,8 @@ def test_films_have_the_wanted_size_and_play_in_real_time(home: Path):
     assert "brax-viewer" in (folder / "view.html").read_text()
     for name, fps in (("video.mp4", 25.0), ("video.gif", 12.5)):
         check_film(folder / name, fps, longest, done.stdout)
+    assert "filmed by camera track" in done.stdout
+    assert not (folder / "model.mjb").exists()
 
 
 def check_film(film: Path, fps: float, num_steps: int, said: str) -> None:

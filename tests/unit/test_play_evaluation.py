@@ -151,7 +151,7 @@ def test_every_opengl_is_tried_the_users_first(
         return {"glfw": EXIT_NO_GL, "egl": -11, "osmesa": 0}[gl]
 
     monkeypatch.setattr(pictures, "_render", render)
-    pictures.film(config_of(), PlayPaths(tmp_path), quiet)
+    pictures.film(config_of(), PlayPaths(tmp_path), "camera track", quiet)
     assert tried == ["glfw", "egl", "osmesa"]
 
 
@@ -170,7 +170,7 @@ def test_a_renderer_that_fails_for_another_reason_says_why(
     paths.render_log.write_text("Traceback\nOSError: disk full\n")
     monkeypatch.setattr(pictures, "_render", lambda *_: exit_code)
     with pytest.raises(GmijaxError, match=f"no video: {why}.*log: "):
-        pictures.film(config_of("video=auto"), paths, quiet)
+        pictures.film(config_of("video=auto"), paths, "camera track", quiet)
 
 
 def test_without_opengl_only_a_film_that_was_asked_for_is_an_error(
@@ -180,9 +180,9 @@ def test_without_opengl_only_a_film_that_was_asked_for_is_an_error(
     monkeypatch.setattr(pictures, "_render", lambda *_: EXIT_NO_GL)
     paths = PlayPaths(tmp_path)
     paths.render_log.write_text("Traceback\nImportError: no library\n")
-    pictures.film(config_of("video=auto"), paths, quiet)
+    pictures.film(config_of("video=auto"), paths, "camera track", quiet)
     with pytest.raises(GmijaxError, match=r"egl, osmesa.*libegl1.*libosmesa6.*no library.*log: "):
-        pictures.film(config_of("video=gif"), paths, quiet)
+        pictures.film(config_of("video=gif"), paths, "camera track", quiet)
 
 
 def test_a_film_that_was_asked_for_of_a_task_without_a_model_is_an_error(quiet: Console):

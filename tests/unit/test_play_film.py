@@ -7,7 +7,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from gmijax.sim.stage import choose_camera
 from gmijax.sim.trajectory import Trajectory, load_trajectory, save_trajectory
 from gmijax.workers import play_film
 
@@ -71,24 +70,3 @@ def test_trajectory_is_read_back(tmp_path: Path):
     np.testing.assert_array_equal(trajectory.qpos, qpos)
     assert trajectory.lengths.tolist() == [2, 1]
     assert trajectory.control_dt_s == 0.02
-
-
-MODEL = """<mujoco><worldbody>
-  <camera name="still"/>{camera}<body><geom size="1"/></body>
-</worldbody></mujoco>"""
-
-
-@pytest.mark.parametrize(
-    ("camera", "wanted", "index"),
-    [
-        ("", None, 0),
-        ('<camera name="behind" mode="trackcom"/>', None, 1),
-        ('<camera name="behind" mode="trackcom"/><camera name="track"/>', None, 2),
-        ('<camera name="behind" mode="trackcom"/>', "still", 0),
-    ],
-)
-def test_a_tracking_camera_is_preferred(camera: str, wanted: str | None, index: int):
-    import mujoco
-
-    model = mujoco.MjModel.from_xml_string(MODEL.format(camera=camera))
-    assert choose_camera(model, wanted) == index
