@@ -20,8 +20,8 @@ from typing import Any, Final, Literal
 import gmijax
 from gmijax import demo, doctor, list_envs
 from gmijax.cli.compose import defaults
-from gmijax.cli.groups import choices
 from gmijax.cli.grid import SweepHelp
+from gmijax.cli.groups import choices
 from gmijax.cli.help import Key, keys_of
 from gmijax.config import ExportConfig, PlayConfig, ServeConfig, TrainConfig
 
