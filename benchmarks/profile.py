@@ -204,7 +204,7 @@ def warp_alone_ms(config: TrainConfig, stage: Stage) -> float:
     ctrl = jax.random.uniform(jax.random.key(0), (count, mj_model.nu), minval=low, maxval=high)
     arrays = {"ctrl": ctrl, **{key: getattr(first, key) for key in STATE}}
     given = tuple((key, array.shape) for key, array in arrays.items())
-    layout = lay_out(given, (*given[1:], (OVERFLOW, (count,))))
+    layout = lay_out(given[:1], given[1:], ((OVERFLOW, (count,)),))
     substeps = round(stage.spec.control_dt_s / mj_model.opt.timestep)
     worlds = Worlds(mj_model, substeps, physics.warp.sizes, layout)
     given_once = warp.array(np.asarray(joined(layout, arrays)))

@@ -95,10 +95,14 @@ def build(name: str, cls: type[C], overrides: Sequence[str]) -> C:
         if isinstance(value, str):
             require_text(f"{key}={value}")
     config = from_dict(cls, data)
+    _require_steps(config)
+    return config
+
+
+def _require_steps(config: object) -> None:
     if isinstance(config, TrainConfig):
         # The last iteration may go beyond the wanted steps, and checkpoints have twelve digits.
         require_between("num_timesteps", config.num_timesteps, 1, _MOST_STEPS)
-    return config
 
 
 def _names_policy(items: Sequence[Override]) -> bool:

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import optuna
+from optuna.storages.journal import JournalFileBackend
 import pytest
 
 from gmijax.cli.compose import compose
@@ -74,7 +75,7 @@ def test_a_study_goes_on_with_what_was_running_and_what_failed(tmp_path: Path) -
 
 def trial_states(folder: Path) -> list[str]:
     """What a dashboard shows."""
-    backend = optuna.storages.journal.JournalFileBackend(str(folder / "study.log"))
+    backend = JournalFileBackend(str(folder / "study.log"))
     storage = optuna.storages.JournalStorage(backend)
     return [
         one.state.name for one in optuna.load_study(study_name="sweep", storage=storage).trials
