@@ -9,6 +9,7 @@ from typing import Any, Final
 import jax
 import jax.numpy as jnp
 
+from gmijax.deploy.sealed import sealed
 from gmijax.deploy.trained import TrainedPolicy
 
 _OPSET: Final = 17
@@ -42,8 +43,11 @@ def onnx_content(policy: TrainedPolicy, metadata: Mapping[str, Any]) -> bytes:
 
 
 def stablehlo_content(policy: TrainedPolicy) -> bytes:
-    """The policy as `jax.export` serialises it: [N, O] to [N, A], N is free, for CPUs and CUDA."""
+    """The policy as `jax.export` serialises it: [N, O] to [N, A], N is free, for CPUs and CUDA.
+
+    With a digest at its end, see `gmijax.deploy.sealed`.
+    """
     (num_worlds,) = jax.export.symbolic_shape("N")
     obs = jax.ShapeDtypeStruct((num_worlds, policy.obs_size), jnp.float32)
     exported = jax.export.export(jax.jit(policy.act), platforms=_PLATFORMS)(obs)
-    return bytes(exported.serialize())
+    return sealed(bytes(exported.serialize()))

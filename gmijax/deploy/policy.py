@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from gmijax.deploy.sealed import unsealed
 from gmijax.errors import ConfigError, lines_of
 from gmijax.runs.folder import read_json
 from gmijax.runs.resume import find_checkpoint
@@ -55,12 +56,16 @@ class Policy:
                 f"obs: shape {list(given.shape)}, expected [{self.obs_size}] or "
                 f"[N, {self.obs_size}]"
             )
+        if given.shape[0] == 0:  # Not every program takes none.
+            return np.zeros((0, self.action_size), np.float32)
         actions = np.asarray(self._act(np.atleast_2d(given)))
         return actions[0] if given.ndim == 1 else actions
 
 
 def load_policy(path: str | os.PathLike[str]) -> Policy:
     """Loads a trained policy.
+
+    A file is a program that is run: load only those of people whom you trust.
 
     Args:
       path: a run folder (its newest checkpoint), a checkpoint folder, `last`, or a file that
@@ -106,20 +111,39 @@ def _from_onnx(path: Path) -> Policy:
     texts = session.get_modelmeta().custom_metadata_map
     if "gmijax_version" not in texts:
         raise ConfigError(f"path={path}: not written by gmijax.export")
-    metadata = {name: json.loads(text) for name, text in texts.items()}
-    inputs, outputs = session.get_inputs(), session.get_outputs()
+    try:
+        metadata = {name: json.loads(text) for name, text in texts.items()}
+    except (ValueError, RecursionError) as error:
+        raise ConfigError(f"path={path}: its metadata are broken ({error})") from None
+    sizes = _sizes(path, metadata, session)
+    names = session.get_inputs()[0].name, session.get_outputs()[0].name
 
     def act(obs: _Actions) -> npt.ArrayLike:
-        return np.asarray(session.run([outputs[0].name], {inputs[0].name: obs})[0])
+        return np.asarray(session.run([names[1]], {names[0]: obs})[0])
 
-    return Policy(act, metadata["obs_size"], metadata["action_size"], metadata)
+    return Policy(act, *sizes, metadata)
+
+
+def _sizes(path: Path, metadata: Mapping[str, Any], session: Any) -> tuple[int, int]:
+    """O and A of an ONNX model; raises ConfigError if it takes or gives anything else."""
+    sizes: list[int] = []
+    ends = {"obs_size": session.get_inputs(), "action_size": session.get_outputs()}
+    for key, found in ends.items():
+        size, kinds = metadata.get(key), [(node.type, node.shape[1:]) for node in found]
+        if type(size) is not int or kinds != [("tensor(float)", [size])]:
+            raise ConfigError(
+                f"path={path}: not a policy: {kinds} where float32 [N, {key}={size!r}] is expected"
+            )
+        sizes.append(size)
+    return sizes[0], sizes[1]
 
 
 def _from_stablehlo(path: Path) -> Policy:
     import jax
 
     try:
-        exported = jax.export.deserialize(bytearray(path.read_bytes()))
+        # Before anything of it is looked at: a program that is damaged ends this process.
+        exported = jax.export.deserialize(bytearray(unsealed(path.read_bytes())))
         (obs,), (actions,) = exported.in_avals, exported.out_avals
         (_, obs_size), (_, action_size) = obs.shape, actions.shape
     except Exception as error:  # Bytes of anything else fail in any way.
@@ -127,5 +151,5 @@ def _from_stablehlo(path: Path) -> Policy:
             f"path={path}: not a policy of gmijax.export ({lines_of(error)[0]})"
         ) from error
     beside = path.with_suffix(".json")
-    metadata = read_json(beside) if beside.is_file() else {}
+    metadata = read_json(beside) if os.path.lexists(beside) else {}
     return Policy(jax.jit(exported.call), int(obs_size), int(action_size), metadata)
