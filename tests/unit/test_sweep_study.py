@@ -7,8 +7,8 @@ from pathlib import Path
 
 import numpy as np
 import optuna
-from optuna.storages.journal import JournalFileBackend
 import pytest
+from optuna.storages.journal import JournalFileBackend
 
 from gmijax.cli.compose import compose
 from gmijax.cli.grid import build_sweep
