@@ -17,6 +17,7 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
+from gmijax.clock import running_s
 from gmijax.collectives.channel.tcp_connection import Connection
 from gmijax.collectives.messages.pipe import Bytes, Message
 from gmijax.collectives.messages.pipe_format import message_bytes
@@ -146,8 +147,8 @@ class RemoteWriter(_End):
         left = deadline_s = math.inf
         while (load := self.load_bytes()) and not self._has_left and not self._connection.is_cut():
             if load < left:
-                left, deadline_s = load, time.monotonic() + _FAREWELL_S
-            elif time.monotonic() > deadline_s:
+                left, deadline_s = load, running_s() + _FAREWELL_S
+            elif running_s() > deadline_s:
                 break
             time.sleep(1e-3)
         self._connection.close()

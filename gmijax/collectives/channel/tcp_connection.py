@@ -19,6 +19,7 @@ from contextlib import closing, suppress
 from itertools import islice
 from typing import Any, Final
 
+from gmijax.clock import running_s
 from gmijax.collectives.channel.tcp_messages import Outgoing, messages
 from gmijax.collectives.messages.pipe_format import Bytes
 from gmijax.collectives.nodes.handshake import Key, accepted, call
@@ -202,11 +203,11 @@ class Connection:
 
         Otherwise the other end would lose what it has not read yet.
         """
-        until_s = time.monotonic() + _LINGER_S
+        until_s = running_s() + _LINGER_S
         connection.settimeout(_LINGER_S)
         self._send(connection, outgoing)
         connection.shutdown(socket.SHUT_WR)
-        while time.monotonic() < until_s and connection.recv(2**16):
+        while running_s() < until_s and connection.recv(2**16):
             pass
 
 

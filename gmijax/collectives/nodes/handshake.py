@@ -26,6 +26,7 @@ from collections.abc import Callable, Generator, Iterator
 from contextlib import suppress
 from typing import Final, NamedTuple, TypeAlias
 
+from gmijax.clock import running_s
 from gmijax.collectives.waits import LIVENESS_PERIOD_S
 
 STRANGER_S: Final = 2.0
@@ -34,7 +35,7 @@ STRANGER_S: Final = 2.0
 MAX_STRANGERS: Final = 16
 """Callers without proof that a listener hears at once; each takes a descriptor."""
 
-_CONNECT_S: Final = 3.0
+_CONNECT_S: Final = 1.0  # No longer, or the clock stands still.
 _RETRY_S: Final = 0.1
 _PAUSE_S: Final = 0.01
 _ACCEPTED_AT_ONCE: Final = 4
@@ -129,7 +130,7 @@ class _Strangers:
             if caller is not None:
                 self._drop(connection, closes=False)
                 yield _ready(connection), caller
-        now_s = time.monotonic()
+        now_s = running_s()
         for connection in [c for c, one in self._callers.items() if now_s > one.until_s]:
             self._drop(connection)
         if self._listener in found:
@@ -173,7 +174,7 @@ class _Stranger:
     """Somebody who has connected and not proved anything yet."""
 
     def __init__(self, connection: socket.socket, key: Key) -> None:
-        self.until_s = time.monotonic() + STRANGER_S
+        self.until_s = running_s() + STRANGER_S
         self._connection, self._key = connection, key
         self._nonce = os.urandom(_NONCE_BYTES)
         self._received = b""

@@ -10,12 +10,12 @@ from __future__ import annotations
 import json
 import os
 import socket
-import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager
 from types import MappingProxyType
 from typing import Final, NamedTuple
 
+from gmijax.clock import running_s
 from gmijax.collectives.nodes.handshake import Key, Unreachable, accepted, call
 from gmijax.collectives.shared_memory import create_file
 from gmijax.errors import CollectiveError
@@ -102,7 +102,7 @@ def connect(
     Raises:
       CollectiveError: a node cannot be reached, or does not come in time.
     """
-    deadline_s = time.monotonic() + timeout_s
+    deadline_s = running_s() + timeout_s
     lanes: list[dict[int, socket.socket]] = [{} for _ in range(num_lanes)]
     try:
         for lane, found in enumerate(lanes):
@@ -123,7 +123,7 @@ def _call(nodes: Nodes, node: int, lane: int, deadline_s: float) -> socket.socke
     where = f"node {node} at {address[0]}:{address[1]}"
     key = Key(nodes.token, _name_of_listener(node))
     try:
-        return call(address, key, (nodes.node, lane), lambda: deadline_s - time.monotonic())
+        return call(address, key, (nodes.node, lane), lambda: deadline_s - running_s())
     except Unreachable as error:
         raise CollectiveError(
             f"node {nodes.node} cannot reach {where} ({error}); cluster.interface says which "
@@ -145,7 +145,7 @@ def _accept(
     expected = range(nodes.node + 1, len(nodes.addresses))
     missing = {(node, lane) for node in expected for lane in range(len(lanes))}
     key = Key(nodes.token, _name_of_listener(nodes.node))
-    with closing(accepted(listener, key, lambda: deadline_s - time.monotonic())) as callers:
+    with closing(accepted(listener, key, lambda: deadline_s - running_s())) as callers:
         for connection, (node, lane) in callers:
             if lane >= len(lanes) or node not in expected:
                 connection.close()
