@@ -274,7 +274,8 @@ def _refusing(mj_model: mujoco.MjModel, impl: Impl) -> Iterator[None]:
     try:
         yield
     except (NotImplementedError, ValueError) as error:
+        others = "; physics.impl=warp may: MuJoCo Warp simulates more" if impl == "jax" else ""
         raise ConfigError(
             f"physics.impl={impl}: {FULL_NAMES[impl]} cannot simulate the model "
-            f"{name_of(mj_model)}: {' '.join(str(error).split())}"
+            f"{name_of(mj_model)}: {' '.join(str(error).split())}{others}"
         ) from None

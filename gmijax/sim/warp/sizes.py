@@ -16,7 +16,16 @@ from gmijax.sim.impl import WarpSizes
 from gmijax.sim.many_contacts import MANY
 
 Ints = npt.NDArray[np.int64]
-_TYPE = mujoco.mjtGeom
+_PLANE, _HFIELD, _SPHERE, _CAPSULE, _ELLIPSOID, _, _BOX, _, _SDF = range(9)
+"""Types of geoms, as `mujoco.mjtGeom` numbers them."""
+
+_EQUALITY_ROWS = {
+    int(mujoco.mjtEq.mjEQ_CONNECT): 3,
+    int(mujoco.mjtEq.mjEQ_WELD): 6,
+    int(mujoco.mjtEq.mjEQ_JOINT): 1,
+    int(mujoco.mjtEq.mjEQ_TENDON): 1,
+}
+"""Rows of an equality constraint; those of a flex have as many as MuJoCo says."""
 
 
 class Bounds(NamedTuple):
@@ -50,7 +59,9 @@ def bounds_of(mj_model: mujoco.MjModel, warp_model: Any) -> Bounds:
 
 
 def _rows_without_contacts(mj_model: mujoco.MjModel) -> int:
-    rows = int(mj_model.nemax)  # Equality constraints.
+    kinds = mj_model.eq_type
+    known = all(kind in _EQUALITY_ROWS for kind in kinds)
+    rows = sum(_EQUALITY_ROWS[kind] for kind in kinds) if known else int(mj_model.nemax)
     rows += int(np.count_nonzero(mj_model.dof_frictionloss))
     rows += int(np.count_nonzero(mj_model.tendon_frictionloss))
     return rows + int(mj_model.jnt_limited.sum()) + int(mj_model.tendon_limited.sum())
@@ -64,7 +75,8 @@ def _of_pairs(mj_model: mujoco.MjModel, warp_model: Any) -> tuple[Ints, Ints]:
     off = mujoco.mjtDisableBit.mjDSBL_CONTACT | mujoco.mjtDisableBit.mjDSBL_CONSTRAINT
     if mj_model.opt.disableflags & off or not len(pairs):
         return np.zeros(1, int), np.ones(1, int)
-    dims = np.where(numbers >= 0, mj_model.pair_dim[numbers], _mixed_dims(mj_model, pairs))
+    dims = _mixed_dims(mj_model, pairs)
+    dims[numbers >= 0] = mj_model.pair_dim[numbers[numbers >= 0]]
     per_contact = dims if mj_model.opt.cone == mujoco.mjtCone.mjCONE_ELLIPTIC else 2 * (dims - 1)
     rows = np.where(dims == 1, 1, per_contact)
     types = np.sort(mj_model.geom_type[pairs], axis=1)
@@ -80,19 +92,14 @@ def _mixed_dims(mj_model: mujoco.MjModel, pairs: Ints) -> Ints:
 
 def _most_contacts(first: int, second: int, mj_model: mujoco.MjModel) -> int:
     """Contacts that Warp makes of two geoms of these types, the lower type first."""
-    if second == _TYPE.mjGEOM_SDF:
+    if second == _SDF:
         return int(mj_model.opt.sdf_initpoints)
-    if first in (_TYPE.mjGEOM_PLANE, _TYPE.mjGEOM_HFIELD) and second <= _TYPE.mjGEOM_HFIELD:
+    if second in (_PLANE, _HFIELD):
         return 0
-    if first == _TYPE.mjGEOM_HFIELD:
+    if first == _HFIELD:
         return 4
-    if {first, second} & {_TYPE.mjGEOM_SPHERE, _TYPE.mjGEOM_ELLIPSOID}:
+    if _SPHERE in (first, second) or _ELLIPSOID in (first, second):
         return 1
-    if first == second == _TYPE.mjGEOM_BOX:
+    if first == second == _BOX:
         return 8
-    if second == _TYPE.mjGEOM_CAPSULE or (first, second) == (
-        _TYPE.mjGEOM_CAPSULE,
-        _TYPE.mjGEOM_BOX,
-    ):
-        return 2
-    return 4
+    return 2 if second == _CAPSULE or (first, second) == (_CAPSULE, _BOX) else 4
