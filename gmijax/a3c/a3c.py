@@ -29,10 +29,10 @@ from gmijax.learning.learner import (
     finish_iteration,
     pack_weights,
     rate_figures,
+    with_targets,
 )
 from gmijax.learning.normalize import (
     in_units,
-    merge,
     merge_all,
     moments_of,
     normalize,
@@ -194,9 +194,8 @@ def update(
     obs = without_outliers(acting_moments(learner, state), batch.state)
     everyone = peers.gather((moments_of(obs, 2), *targets.fit))
     seen, target, error = map(merge_all, everyone)
-    if state.value_moments is not None:
-        state = state._replace(value_moments=merge(state.value_moments, target))
-        targets = targets._replace(value_moments=state.value_moments)
+    state = with_targets(learner, state, target)
+    targets = targets._replace(value_moments=state.value_moments)
     order = minibatch_order(learner.config, state, peers.rank(), batch.reward.shape[1])
     state, losses, rates = run_updates(
         learner, peers, gradients, state, batch, targets, order, after=everyone

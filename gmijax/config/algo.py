@@ -50,7 +50,8 @@ class ActorCriticConfig(KeyGroup):
     normalize_observations: bool = doc("normalise observations with running statistics")
     normalize_values: bool = doc(
         "the value function learns its targets in standard deviations from their running mean; "
-        "value_cost, and with PPO the clip of the value loss, count in this unit",
+        "value_cost, and with PPO the clip of the value loss, count in this unit. When it moves, "
+        "the last layer moves with it, so that values stay what they were",
         default=False,
     )
     obs_std_floor: float = doc(

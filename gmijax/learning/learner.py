@@ -19,8 +19,10 @@ from gmijax.learning.normalize import (
     Moments,
     change_of_units,
     from_units,
+    in_units,
     merge,
     no_samples,
+    std_of,
     with_std_floor,
 )
 from gmijax.learning.policy import ActorCritic, ActorCriticParams, Mlp
@@ -122,6 +124,24 @@ def acting_moments(learner: Learner, state: TrainState) -> Moments:
     if learner.config.normalize_observations:
         return with_std_floor(state.obs_moments, learner.config.obs_std_floor)
     return no_samples(state.obs_moments.mean.shape)
+
+
+def with_targets(learner: Learner, state: TrainState, target: Moments) -> TrainState:
+    """`state` with the statistics of more targets of the value function, if it keeps any.
+
+    Its unit moves with them, and its last layer so that all values stay what they are (Pop-Art,
+    arXiv:1602.07714). Where there were no statistics before nothing was learnt in a unit.
+    """
+    before = state.value_moments
+    if before is None:
+        return state
+    after = merge(before, target)
+    scale, shift = std_of(before) / std_of(after), in_units(after, before.mean)
+    known = before.count > 0
+    params = learner.networks.with_values(
+        state.params, jnp.where(known, scale, 1.0), jnp.where(known, shift, 0.0)
+    )
+    return state._replace(value_moments=after, params=params)
 
 
 def finish_iteration(learner: Learner, state: TrainState, seen: Moments) -> TrainState:

@@ -135,6 +135,18 @@ class ActorCritic(NamedTuple):
 
         return params._replace(policy=changed(params.policy), value=changed(params.value))
 
+    def with_values(
+        self, params: ActorCriticParams, scale: Array, shift: Array
+    ) -> ActorCriticParams:
+        """Weights that make `scale` * v + `shift`, [] each, of what `params` make v."""
+        layers = params.value["params"]
+        last = f"Dense_{len(self.value.hidden)}"
+        new = {
+            "kernel": scale * layers[last]["kernel"],
+            "bias": scale * layers[last]["bias"] + shift,
+        }
+        return params._replace(value={**params.value, "params": {**layers, last: new}})
+
     def output(self, params: ActorCriticParams, obs: Array) -> Array:
         """What `distribution` takes [..., H], for normalised observations [..., O]."""
         if self.actor_obs_size is not None:

@@ -20,8 +20,9 @@ from gmijax.learning.learner import (
     finish_iteration,
     policy_figures,
     rate_figures,
+    with_targets,
 )
-from gmijax.learning.normalize import Moments, merge, merge_all, moments_of, std_of
+from gmijax.learning.normalize import Moments, merge_all, moments_of, std_of
 from gmijax.learning.policy import ActorCriticParams
 from gmijax.learning.unroll import Counts
 from gmijax.learning.updates import explained_variance, minibatch_order, run_updates
@@ -83,8 +84,7 @@ def learn(
     """
     everyone = peers.gather(stats)
     stats = merge_stats(everyone)
-    if state.value_moments is not None:
-        state = state._replace(value_moments=merge(state.value_moments, stats.target))
+    state = with_targets(learner, state, stats.target)
     context = update_context(learner, state, stats)
     order = minibatch_order(learner.config, state, peers.rank(), samples.advantage.size)
     if trajectory is None:

@@ -29,8 +29,9 @@ from gmijax.learning.learner import (
     init_learner,
     make_learner,
     state_values,
+    with_targets,
 )
-from gmijax.learning.normalize import moments_of, normalize, std_of
+from gmijax.learning.normalize import Moments, moments_of, no_samples, normalize, std_of
 from gmijax.learning.updates import exchange_size, minibatch_order, run_updates
 from gmijax.partition.layout import Layout
 from gmijax.ppo.loop import warm_up
@@ -281,15 +282,21 @@ def test_it_learns_with_other_settings_and_updates_the_policy_that_acted(config)
     assert float(metrics.figures["value/explained_variance"]) > 0.3
     learnt = jax.tree.leaves((state.params, state.opt_state[1].mu))
     assert {leaf.dtype for leaf in learnt} == {jnp.dtype("float32")}
-    # Learning computes what acting did, though its batches are others: nothing has moved yet.
+    # Learning computes what acting did, though its batches are others: nothing has moved yet,
+    # also where the unit of the values moves with what was seen.
     roll_out = jax.jit(functools.partial(rollout, ENV, mine))
     samples, _, stats = roll_out(ENV.model, acting_weights(mine, state), envs)[1:]
     assert samples.obs.dtype == jnp.bfloat16
     context = update_context(mine, state, merge_stats(jax.tree.map(lambda x: x[None], stats)))
     first = jax.jit(functools.partial(gradients, mine))
-    _, losses = first(state.params, flat(samples), context, jnp.arange(5, 69))
-    assert abs(float(losses.kl)) < 1e-6
-    assert float(losses.clip_fraction) == float(losses.value_clip_fraction) == 0.0
+    more = Moments(jnp.float32(4000.0), jnp.float32(50.0), jnp.float32(4000.0 * 5000.0**2))
+    moved = with_targets(mine, state, more)
+    assert float(std_of(moved.value_moments)) > 1.5 * float(std_of(state.value_moments))
+    for now in (state, moved):
+        now_in = context._replace(value_moments=now.value_moments)
+        _, losses = first(now.params, flat(samples), now_in, jnp.arange(5, 69))
+        assert abs(float(losses.kl)) < 1e-6
+        assert float(losses.clip_fraction) == float(losses.value_clip_fraction) == 0.0
 
 
 def test_a_warm_up_fills_the_statistics_and_nothing_else(learner, alone) -> None:
@@ -332,6 +339,35 @@ def _check_no_number_is_written_twice(iteration) -> None:
         source = {name: re.findall(r"%[\w.\-]+", made_by[name])[1] for name in copied}
         results = [source.get(name, name) for name in results]
     assert len(set(results)) == count
+
+
+@pytest.mark.parametrize("hidden", [(16, 16), ()])
+@pytest.mark.parametrize(("mean", "std"), [(5.0, 3.0), (-2e3, 900.0), (0.0, 1e-3)])
+def test_values_stay_when_their_unit_moves(config, hidden, mean: float, std: float) -> None:
+    changes = {"normalize_values": True, "value_hidden_layer_sizes": hidden}
+    mine = make_learner(ENV.spec, dataclasses.replace(config, **changes))
+    state, _ = _start(mine)
+    obs = jax.random.normal(jax.random.key(1), (50, ENV.spec.obs_size))
+
+    def values(state):
+        return state_values(mine.networks, acting_weights(mine, state), obs)
+
+    def targets(key: int, mean: float, std: float) -> Moments:
+        return moments_of(mean + std * jax.random.normal(jax.random.key(key), (400,)), 1)
+
+    # The first unit is one for a network that has learnt nothing.
+    first = with_targets(mine, state, targets(2, 0.4, 2.0))
+    jax.tree.map(np.testing.assert_array_equal, first.params, state.params)
+    later = with_targets(mine, first, targets(3, mean, std))
+    assert abs(float(std_of(later.value_moments) / std_of(first.value_moments)) - 1.0) > 0.2
+    tolerance = 1e-6 * max(1.0, abs(mean))
+    np.testing.assert_allclose(values(later), values(first), rtol=1e-5, atol=tolerance)
+    jax.tree.map(np.testing.assert_array_equal, later.params.policy, state.params.policy)
+
+
+def test_without_the_key_there_is_no_unit_to_move(learner) -> None:
+    state, _ = _start(learner)
+    assert with_targets(learner, state, no_samples(())) is state
 
 
 @pytest.mark.parametrize("preserved", [True, False])
