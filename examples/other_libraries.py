@@ -116,7 +116,9 @@ def skrl(num_envs: int, num_steps: int) -> Sequence[float]:
     )
     torch.manual_seed(0)
     trainer = SequentialTrainer(
-        env=envs, agents=agent, cfg=SequentialTrainerCfg(timesteps=num_steps // num_envs)
+        env=envs,
+        agents=agent,
+        cfg=SequentialTrainerCfg(timesteps=num_steps // num_envs, headless=True),
     )
     trainer.train()
     return [float(value) for value in counted.return_queue]

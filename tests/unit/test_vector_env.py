@@ -320,8 +320,6 @@ def test_misuse_is_told(envs: GmijaxVectorEnv):
         envs.step(np.zeros((NUM_ENVS, 2), np.float32))
     with pytest.raises(gym.error.Error, match="3 seeds: expected one for each of 4"):
         envs.reset(seed=[1, 2, 3])
-    with pytest.raises(gym.error.Error, match="without a render_mode"):
-        envs.render()
 
 
 @pytest.mark.parametrize(
@@ -414,13 +412,20 @@ class PaintedStage:
         return self._image
 
 
+def test_skrl_asks_every_world(envs: GmijaxVectorEnv):
+    assert envs.call("render") is None
+    assert envs.call("episode_length") == (LENGTH,) * NUM_ENVS
+    with pytest.raises(AttributeError, match="jump"):
+        envs.call("jump")
+
+
 def test_every_world_has_its_picture(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(pictures, "Stage", PaintedStage)
     env = point_mass_env(LENGTH)._replace(mj_model="a model")
     envs = GmijaxVectorEnv(env, NUM_ENVS, autoreset="next_step", render_mode="rgb_array")
     obs, _ = envs.reset(seed=0)
     for _ in range(LENGTH + 1):
-        shown = envs.render()
+        shown = envs.call("render")
         assert isinstance(shown, tuple)
         assert [image.max() for image in shown] == [round(10 * abs(float(x))) for x in obs[:, 0]]
         obs = envs.step(STILL)[0]

@@ -132,11 +132,17 @@ class GmijaxVectorEnv(VectorEnv[Any, Any, Any]):
             info |= self._final(out)
         return out.obs, out.reward, out.terminated, out.truncated, info
 
-    def render(self) -> tuple[Image, ...]:
-        """A picture [height, width, 3] of every world as it is now."""
-        if self._pictures is None:
-            raise gym.error.Error("render(): the environments were made without a render_mode")
-        return self._pictures.of(self._running().env)
+    def render(self) -> tuple[Image, ...] | None:
+        """A picture [height, width, 3] of every world as it is now; None without a render_mode."""
+        return None if self._pictures is None else self._pictures.of(self._running().env)
+
+    def call(self, name: str, *args: Any, **kwargs: Any) -> tuple[Any, ...] | None:
+        """An attribute of every world, or what its method returns, as of `SyncVectorEnv`.
+
+        skrl draws by it after every step, whether or not there is a render_mode.
+        """
+        found = getattr(self, name)
+        return found(*args, **kwargs) if callable(found) else (found,) * self.num_envs
 
     def _final(self, out: Outcome) -> dict[str, Any]:
         """What Gymnasium says of episodes that ended; as arrays, not as objects."""

@@ -40,6 +40,7 @@ class GmijaxEnv(gym.Env[np.ndarray, np.ndarray]):
         info = {"is_diverged": bool(info["is_diverged"][0])}
         return obs[0], float(reward[0]), bool(terminated[0]), bool(truncated[0]), info
 
-    def render(self) -> Image:
-        """A picture [height, width, 3] of the world."""
-        return self._envs.render()[0]
+    def render(self) -> Image | None:
+        """A picture [height, width, 3] of the world; None without a render_mode."""
+        pictures = self._envs.render()
+        return None if pictures is None else pictures[0]

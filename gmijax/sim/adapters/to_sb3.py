@@ -61,7 +61,7 @@ class Sb3VecEnv(VecEnv):
 
     def get_images(self) -> Sequence[np.ndarray]:
         """A picture of every world."""
-        return self.envs.render()
+        return self.envs.render() or ()
 
     def get_attr(self, attr_name: str, indices: Any = None) -> list[Any]:
         """An attribute of the environments, once for each of `indices`."""
