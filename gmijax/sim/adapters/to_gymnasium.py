@@ -141,7 +141,7 @@ class GmijaxVectorEnv(VectorEnv[Any, Any, Any]):
 
         skrl draws by it after every step, whether or not there is a render_mode.
         """
-        found = getattr(self, name)
+        found: Any = getattr(self, name)
         return found(*args, **kwargs) if callable(found) else (found,) * self.num_envs
 
     def _final(self, out: Outcome) -> dict[str, Any]:
