@@ -49,6 +49,10 @@ class Stage:
         self._renderer = mujoco.Renderer(self._model, height, width)
         self.picture(self._model.qpos0)
 
+    def close(self) -> None:
+        """Frees the context."""
+        self._renderer.close()
+
     def picture(self, qpos: npt.NDArray[Any]) -> Image:
         """The picture [height, width, 3] of one world at `qpos`, as `Env.qpos` gives it."""
         put(self._data, qpos)

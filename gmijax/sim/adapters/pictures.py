@@ -32,6 +32,10 @@ class Pictures:
             ) from error
         self._qpos = jax.jit(jax.vmap(env.qpos))
 
+    def close(self) -> None:
+        """Frees OpenGL; to be called while Python still runs."""
+        self._stage.close()
+
     def of(self, state: EnvState) -> tuple[Image, ...]:
         """A picture of each of N worlds."""
         # The next picture is drawn into the same memory.

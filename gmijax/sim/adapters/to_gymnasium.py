@@ -136,12 +136,12 @@ class GmijaxVectorEnv(VectorEnv[Any, Any, Any]):
         """A picture [height, width, 3] of every world as it is now; None without a render_mode."""
         return None if self._pictures is None else self._pictures.of(self._running().env)
 
-    def call(self, name: str, *args: Any, **kwargs: Any) -> tuple[Any, ...] | None:
+    def call(self, name: str, *args: Any, **kwargs: Any) -> Any:
         """An attribute of every world, or what its method returns, as of `SyncVectorEnv`.
 
         skrl draws by it after every step, whether or not there is a render_mode.
         """
-        found: Any = getattr(self, name)
+        found = getattr(self, name)
         return found(*args, **kwargs) if callable(found) else (found,) * self.num_envs
 
     def _final(self, out: Outcome) -> dict[str, Any]:
@@ -160,6 +160,11 @@ class GmijaxVectorEnv(VectorEnv[Any, Any, Any]):
             "final_info": final_info,
             "_final_info": ended,
         }
+
+    def close_extras(self, **_: Any) -> None:
+        """Gives OpenGL back."""
+        if self._pictures is not None:
+            self._pictures.close()
 
     @property
     def state(self) -> BatchState:
