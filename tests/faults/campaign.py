@@ -20,7 +20,7 @@ _HERE = Path(__file__).resolve().parent
 sys.path[:0] = [str(_HERE), str(_HERE.parent)]
 
 import conftest  # noqa: F401, E402 - the environment of jax, as for tests
-from fault_deck import Trial, draw_trials, faults_of, group_of  # noqa: E402
+from fault_deck import ALL_KINDS, Trial, draw_trials, faults_of, group_of  # noqa: E402
 from fault_trials import kinds_here, run_trial  # noqa: E402
 
 from benchmarks.records import RESULTS, ResultsFile  # noqa: E402
@@ -31,6 +31,8 @@ def main() -> int:
     given = _options()
     end_s = time.monotonic() + 60 * given.minutes
     kinds = [kind for kind in given.kinds.split(",") if kind] or kinds_here()
+    if unknown := set(kinds) - set(ALL_KINDS):
+        sys.exit(f"--kinds={','.join(sorted(unknown))}: allowed are {', '.join(ALL_KINDS)}")
     trials = list(draw_trials(given.seed, given.faults, kinds))
     settings = {"seed": given.seed, "faults": given.faults, "kinds": given.kinds}
     file = ResultsFile(given.out, "faults", settings, resume=given.resume, device="cpu")

@@ -161,6 +161,10 @@ class FaultyCommand:
             self.wrong.append(f"a traceback: {self.said()[-600:]}")
         if self.progress() < wanted:
             self.wrong.append(f"lost: {wanted} was there, and at the end {self.progress()}")
+        if self._kind.does == "suspend":
+            runs = [path.parent for path in self.run.rglob("events.jsonl")]
+            faults = [event for run in runs for event in fault_checks.events_of(run, "fault")]
+            self.wrong += [f"taken for a fault: {event}" for event in faults]
         starts = fault_checks.events_of(self.run, "start")
         if self._kind.outcome == "restarted" and len(starts) < 2:
             self.wrong.append(f"it was not started again: {starts}")

@@ -13,7 +13,7 @@ from training_jobs import FOREVER, POINT, STEPS
 from gmijax.runs.dataset import DataPaths
 
 CHECKPOINT_EVERY: Final = 40
-SWEEP_STEPS: Final = 1500 * STEPS
+SWEEP_STEPS: Final = 600 * STEPS
 _TRAIN = (*POINT[:-1], "plan.backend=cpu", f"run.checkpoint_every={CHECKPOINT_EVERY}")
 _GOES_ON = (*_TRAIN, FOREVER, "run.keep_checkpoints=3", "run.dir={run}", "run.resume=auto")
 _PROFILES = (
