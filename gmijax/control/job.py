@@ -78,6 +78,8 @@ def train(config: TrainConfig, *, show: bool = False) -> Result:
     console = open_console(show=show)
     if beginning.is_complete and beginning.folder is not None:
         return _finished(config, beginning.folder, console)
+    if beginning.checkpoint is not None and (notice := source.executed(config.env)):
+        console.print(notice)
     with ExitStack() as held:
         cluster, nodes = None, None
         if config.cluster.engine is not None:

@@ -39,6 +39,7 @@ from gmijax.runs.held import locked
 from gmijax.runs.history import MetricsReader
 from gmijax.runs.resume import CheckpointMeta, find_checkpoint
 from gmijax.runs.saved_config import left_out, trained_config
+from gmijax.sim import source
 from gmijax.supervise.job_kinds import serving_kind
 from gmijax.supervise.run_gmis import Launch, recorded, run_gmis
 
@@ -121,6 +122,8 @@ def _prepared(config: ServeConfig, console: Console) -> _Job:
     """Everything that can be checked and decided without starting anything."""
     config = with_task(config)
     require_new_run(None, config.run.name)  # Before a search, which takes minutes.
+    if config.run.dir is not None and (notice := source.executed(config.env)):
+        console.print(notice)
     config, plan, machine, reasons = decide(_with_checkpoint(config), console)
     data = None
     if config.output.dir is not None:

@@ -113,8 +113,8 @@ def open_run(config: C) -> tuple[C, EnvConfig, str | None]:
     All before a process is started, which would find them bad too.
 
     Returns:
-      The configuration with what was found, the task, and what is not as the run had it (None if
-      nothing).
+      The configuration with what was found, the task, and what the user should know before it is
+      executed, also what is not as the run had it (None if nothing).
 
     Raises:
       ConfigError: no such run or checkpoint, or its task cannot be had.
@@ -132,8 +132,13 @@ def open_run(config: C) -> tuple[C, EnvConfig, str | None]:
     if env.suite == "custom":
         run = dataclasses.replace(run, env=env.name, env_sha256=env.source_sha256)
     config = dataclasses.replace(config, checkpoint=str(checkpoint), run=run)
-    changes = source.changes(env, dataclasses.asdict(saved)), left_out(checkpoint), early
-    return config, env, "\n".join(filter(None, changes)) or None
+    notes = (
+        source.executed(env),
+        source.changes(env, dataclasses.asdict(saved)),
+        left_out(checkpoint),
+        early,
+    )
+    return config, env, "\n".join(filter(None, notes)) or None
 
 
 def _find(config: PlayConfig | ExportConfig) -> Path:

@@ -94,6 +94,13 @@ def opened(env: EnvConfig, name: str | None) -> EnvConfig:
     return pinned(named)
 
 
+def executed(env: EnvConfig) -> str | None:
+    """Names the file that opening a saved run executes, None where its task has none."""
+    if env.suite != "custom":
+        return None
+    return f"custom task: this executes {env.name}, the file of the run's task"
+
+
 def changes(env: EnvConfig, saved: Mapping[str, Any]) -> str | None:
     """Says that the file of a pinned custom task is another one than that of a saved run.
 

@@ -58,17 +58,19 @@ def starts(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def opened(kind: str, *overrides: str) -> Any:
     if kind == "play":
-        return playing.play(build("play", PlayConfig, ("run.dir=theirs", *overrides)))
+        return playing.play(build("play", PlayConfig, ("run.dir=theirs", *overrides)), show=True)
     if kind == "export":
-        return exporting.export(build("export", ExportConfig, ("run.dir=theirs", *overrides)))
+        config = build("export", ExportConfig, ("run.dir=theirs", *overrides))
+        return exporting.export(config, show=True)
     if kind == "serve":
-        return serving.serve(gmijax.compose("run.dir=theirs", *overrides, command="serve"))
-    return job.train(gmijax.compose("run.resume=theirs", *overrides))
+        config = gmijax.compose("run.dir=theirs", *overrides, command="serve")
+        return serving.serve(config, show=True)
+    return job.train(gmijax.compose("run.resume=theirs", *overrides), show=True)
 
 
 @pytest.mark.parametrize("kind", ["play", "export", "serve", "resume"])
 def test_only_the_noted_file_or_one_that_is_named_is_executed(
-    kind: str, run: RunPaths, starts: None
+    kind: str, run: RunPaths, starts: None, capsys: pytest.CaptureFixture[str]
 ):
     with pytest.raises(ConfigError) as error:
         opened(kind)
@@ -82,6 +84,9 @@ def test_only_the_noted_file_or_one_that_is_named_is_executed(
     Path("point.py").write_text("def make(): ...\n")
     with pytest.raises(StartedError):
         opened(kind)
+    # What is executed is named before it is.
+    notice = f"custom task: this executes {file}:make, the file of the run's task"
+    assert capsys.readouterr().out.replace("\n", "").count(notice.replace("\n", "")) == 2
     saved = read_json(run.config)
     del saved["env"]["source_sha256"]  # Nothing is noted.
     write_json(run.config, saved)
