@@ -11,6 +11,8 @@ from typing import Any
 import jax
 from jax.sharding import Sharding, SingleDeviceSharding
 
+from gmijax.errors import ConfigError
+
 PEAKS_BESIDE_JAX: list[Callable[[], int]] = []
 """Each tells how many bytes of this process's GPU somebody had at most beside JAX."""
 
@@ -27,6 +29,15 @@ def start_device() -> None:
             jax.local_devices()
 
     threading.Thread(target=start, name="device", daemon=True).start()
+
+
+def require_32_bit(who: str) -> None:
+    """Raises ConfigError, which names `who` did it, if numbers of jax have 64 bit here."""
+    if jax.config.read("jax_enable_x64"):
+        raise ConfigError(
+            f"jax_enable_x64: turned on by {who}; tasks and policies compute with 32 bit, so turn "
+            'it off: jax.config.update("jax_enable_x64", False), or no JAX_ENABLE_X64'
+        )
 
 
 def host_sharding() -> Sharding | None:

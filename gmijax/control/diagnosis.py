@@ -163,6 +163,8 @@ def _suite(suite: str) -> Ability:
 
 
 def _problems(system: SystemInfo) -> Iterator[str]:
+    if system.machine.selection_problem:
+        yield system.machine.selection_problem
     if system.nvml_error:
         yield f"NVML is installed and does not work: {system.nvml_error}"
     for name in REQUIRED:

@@ -14,6 +14,7 @@ from typing import Final, NamedTuple
 from gmijax.config import PlanConfig, ReduceConfig
 from gmijax.errors import GmijaxError
 from gmijax.machine.interpreter import command
+from gmijax.machine.jax_settings import without_breaking
 from gmijax.machine.nvidia import Gpu, nvml_problem
 from gmijax.machine.snapshot import Machine, detect_machine
 from gmijax.partition.planner import make_plan
@@ -82,7 +83,8 @@ def ask_jax(machine: Machine) -> JaxView:
     devices = [device for gpu in machine.gpus if (device := device_of(gpu))]
     # CUDA shows one MIG instance to a process, and no whole GPU beside it.
     seen = devices[:1] if any(device.startswith("MIG-") for device in devices) else devices
-    environment = {k: v for k, v in os.environ.items() if k not in _CUDA_VARIABLES} | {
+    own = without_breaking(os.environ)
+    environment = {k: v for k, v in own.items() if k not in _CUDA_VARIABLES} | {
         "CUDA_VISIBLE_DEVICES": ",".join(seen),
         "JAX_PLATFORMS": "cuda" if seen else "cpu",
         "XLA_PYTHON_CLIENT_PREALLOCATE": "false",

@@ -15,6 +15,7 @@ from gmijax.config import PlayConfig
 from gmijax.control.console import doing
 from gmijax.errors import GmijaxError
 from gmijax.machine.interpreter import command
+from gmijax.machine.jax_settings import without_breaking
 from gmijax.machine.opengl import environment_with, is_missing, opengls, what_is_missing
 from gmijax.runs.folder import EXIT_NO_GL, PlayPaths
 from gmijax.supervise.failures import last_line, signal_name
@@ -25,7 +26,11 @@ def write_page(config: PlayConfig, paths: PlayPaths, console: Console) -> None:
     if not has_brax():
         return
     # A page is quickly made, and the GPU may be training.
-    environment = {"PJRT_NPROC": "4", **os.environ, "JAX_PLATFORMS": "cpu"}
+    environment = {
+        "PJRT_NPROC": "4",
+        **without_breaking(os.environ),
+        "JAX_PLATFORMS": "cpu",
+    }
     with doing(console, "writing the page"), paths.page_log.open("wb") as log:
         exit_code = _child("gmijax.workers.page_writer", paths, environment, log)
     if exit_code == 0:

@@ -16,6 +16,7 @@ from gmijax.machine.host_limits import (
     detect_host,
     usable_cores,
 )
+from gmijax.machine.jax_settings import breaking
 from gmijax.machine.mps_control import (
     DEFAULT_PIPE_DIRECTORY,
     PIPE_VARIABLE,
@@ -53,6 +54,8 @@ class Machine:
     # Why there are no GPUs although NVIDIA's driver is there; None where it works, there is none,
     # or the user hides all GPUs.
     gpu_problem: str | None = None
+    # What in `CUDA_VISIBLE_DEVICES` names no GPU of this machine; None where all of it does.
+    selection_problem: str | None = None
     warnings: tuple[str, ...] = ()  # What is here and is not used or cannot be, one sentence each.
 
     def daemon_of(self, device: str) -> Path | None:
@@ -94,9 +97,10 @@ def detect_machine() -> Machine:
         daemons=_daemons_of_sweep(mps_control) if mps_control else {},
         host=detect_host(),
         gpu_problem=None if listed or is_hidden else gpu_problem(),
+        selection_problem=_selection_problem(listed, selection),
         warnings=(
             *(() if gpus else _other_accelerators()),
-            *filter(None, (stranger, why_temporary())),
+            *filter(None, (stranger, why_temporary(), _left_out_of_gmis())),
         ),
     )
 
@@ -112,8 +116,8 @@ def visible_gpus(gpus: tuple[Gpu, ...], selection: str | None) -> tuple[Gpu, ...
     if selection is None:
         return gpus
     chosen: dict[int, Gpu] = {}
-    for entry in selection.replace(" ", "").split(","):
-        fits = [part for gpu in gpus if (part := _named_part(gpu, entry))]
+    for entry in _entries(selection):
+        fits = _named_parts(gpus, entry)
         if len(fits) != 1:
             break
         [part] = fits
@@ -122,6 +126,31 @@ def visible_gpus(gpus: tuple[Gpu, ...], selection: str | None) -> tuple[Gpu, ...
             break
         chosen[part.index] = part._replace(instances=(*before, *part.instances))
     return tuple(chosen.values())
+
+
+def _selection_problem(gpus: tuple[Gpu, ...], selection: str | None) -> str | None:
+    """Why a selection is none of these GPUs, as CUDA does not say; None where there are none."""
+    if selection is None or not gpus:
+        return None
+    for entry in _entries(selection):
+        if entry in _HIDES_ALL:
+            break  # All that comes after it is hidden on purpose.
+        if len(fits := _named_parts(gpus, entry)) != 1:
+            here = ", ".join(
+                f"{gpu.index} ({', '.join((gpu.uuid, *(one.uuid for one in gpu.instances)))})"
+                for gpu in gpus
+            )
+            what = "names several GPUs" if fits else "names no GPU"
+            return f"CUDA_VISIBLE_DEVICES={selection}: {entry} {what}; GPUs here are {here}"
+    return None
+
+
+def _entries(selection: str) -> list[str]:
+    return selection.replace(" ", "").split(",")
+
+
+def _named_parts(gpus: tuple[Gpu, ...], entry: str) -> list[Gpu]:
+    return [part for gpu in gpus if (part := _named_part(gpu, entry))]
 
 
 def _named_part(gpu: Gpu, entry: str) -> Gpu | None:
@@ -155,6 +184,12 @@ def _daemons_of_sweep(program: Path) -> dict[str, Path]:
     told = json.loads(os.environ.get(DAEMONS_VARIABLE, "{}"))
     found = {device: Path(directory) for device, directory in told.items()}
     return {key: path for key, path in found.items() if MpsControl(program, path).is_answering()}
+
+
+def _left_out_of_gmis() -> str | None:
+    """What a user has set for other programs that use jax."""
+    found = ", ".join(f"{key}={value}" for key, value in breaking(os.environ).items())
+    return f"warning: GMIs start without {found}, with which tasks do not work" if found else None
 
 
 def _strange_owner(directory: Path) -> int | None:

@@ -29,9 +29,10 @@ def choose_backend(
     """The backend for `plan.backend=auto`, and why, in words; `serves`: nobody trains.
 
     Raises:
-      BackendUnavailable: the driver is broken. Who has GPUs does not want to go on without them
-        unless that is said.
+      BackendUnavailable: the driver is broken, or GPUs are named that are not here. Who has GPUs
+        does not want to go on without them unless that is said.
     """
+    _require_named_gpus(machine)
     if machine.gpu_problem is not None:
         raise BackendUnavailable(
             f"plan.backend=auto: the NVIDIA driver does not work: {machine.gpu_problem}; "
@@ -67,7 +68,10 @@ def choose_backend(
 
 def require_backend(backend: BackendName, machine: Machine) -> None:
     """Raises BackendUnavailable, with what can be had, unless the machine has `backend`."""
-    if backend == "cpu" or why_not_backend(backend, machine) is None:
+    if backend == "cpu":
+        return
+    _require_named_gpus(machine)
+    if why_not_backend(backend, machine) is None:
         return
     names: tuple[BackendName, ...] = ("share", "mps", "mig")
     possible = [name for name in names if why_not_backend(name, machine) is None]
@@ -75,6 +79,14 @@ def require_backend(backend: BackendName, machine: Machine) -> None:
         f"plan.backend={backend}: {why_not_backend(backend, machine)}; available here: "
         f"{', '.join(['auto', 'cpu', *possible])}"
     )
+
+
+def _require_named_gpus(machine: Machine) -> None:
+    if machine.selection_problem is not None:
+        raise BackendUnavailable(
+            f"{machine.selection_problem}; plan.backend=cpu (or CUDA_VISIBLE_DEVICES=-1) goes on "
+            "without GPUs"
+        )
 
 
 def why_not_backend(backend: BackendName, machine: Machine) -> str | None:

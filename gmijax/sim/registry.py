@@ -159,7 +159,7 @@ def make_env(
     Raises:
       ConfigError: an unknown name of a task, a term or a setting, a package or implementation
         that cannot be had, a length below 1, or a length for `brax`, whose `EpisodeWrapper`
-        takes it.
+        takes it; or `jax_enable_x64` is on.
     """
     if api not in ("gmijax", "brax"):
         raise ConfigError(f"api={api}: allowed are gmijax, brax")
@@ -174,6 +174,9 @@ def make_env(
     if suite == "gmijax" and ".py:" in name:
         suite = "custom"
     changes: dict[str, Any] = {"rewards": rewards, "settings": settings, "curriculum": curriculum}
+    from gmijax.devices import require_32_bit
+
+    require_32_bit("this process")
     noted = {"source_sha256": source_sha256} if suite == "custom" else {}
     env = _make(name, suite, changes, impl=impl, max_envs=max_envs, **noted)
     if api == "brax":

@@ -9,6 +9,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Final
 
+from gmijax.machine.jax_settings import without_breaking
 from gmijax.machine.xla_on_cpu import POOL, XLA_FLAGS, flags_on_cpu, pool_on_cpu
 from gmijax.partition.plan import Plan, Slice
 from gmijax.supervise.child import ENV_CPUS, ENV_GMI, ENV_WAITS
@@ -35,7 +36,8 @@ def gmi_environment(
     """All environment variables of one GMI.
 
     The user's `XLA_FLAGS`, compilation cache and thread limits are kept; what defines the GMI's
-    share (devices, memory fraction, SM cap) is overwritten.
+    share (devices, memory fraction, SM cap) is overwritten. Settings of jax with which nothing
+    works are left out.
 
     Args:
       plan: the plan.
@@ -46,7 +48,7 @@ def gmi_environment(
     """
     share = plan.slices[gmi]
     dropped = (_OLD_MEMORY_FRACTION, _MEMORY_FRACTION, _SM_PERCENT, ENV_WAITS)
-    kept = {name: value for name, value in inherited.items() if name not in dropped}
+    kept = {k: value for k, value in without_breaking(inherited).items() if k not in dropped}
     # One thread beside a GPU: there the host only moves small arrays, and the GMIs of all GPUs
     # share the cores.
     defaults: dict[str, str] = {COMPILATION_CACHE: str(cache_dir)}

@@ -7,7 +7,7 @@ import re
 import subprocess
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -38,7 +38,7 @@ Stop = Callable[[], None]
 
 
 @pytest.fixture
-def stop(monkeypatch: pytest.MonkeyPatch) -> Stop:
+def stop(monkeypatch: pytest.MonkeyPatch) -> Iterator[Stop]:
     """Stops this process for a while, as far as any clock can tell."""
     real, stopped = time.monotonic, [0.0]
     monkeypatch.setattr(time, "monotonic", lambda: real() + stopped[0])
@@ -123,7 +123,6 @@ class ScriptedGmi(WatchedGmi):
     """A GMI of a supervisor, without a process, which ends well at its tenth poll."""
 
     error: ReportedError | None = None
-    log_bytes = 0
     is_ended = False
 
     def __init__(self, gmi: int, run: RunPaths, state: Any) -> None:
@@ -140,6 +139,10 @@ class ScriptedGmi(WatchedGmi):
 
     def end_as_done(self) -> None:
         self.is_ended, self.exit_code = True, 0
+
+    @property
+    def log_bytes(self) -> int:
+        return 0
 
     def request_stacks(self) -> int | None:
         return None
@@ -221,11 +224,12 @@ def test_a_profile_is_not_late(stop: Stop) -> None:
 
 def test_jobs_of_a_sweep_are_not_late(stop: Stop, monkeypatch: pytest.MonkeyPatch) -> None:
     window = jobs_per_gpu._Window([], LIMIT_S)
-    window._jobs = [SimpleNamespace(progress=SimpleNamespace(env_steps=0, state="running"))]
+    job: Any = SimpleNamespace(progress=SimpleNamespace(env_steps=0, state="running"))
+    window._jobs = [job]
     window._seen = [{0}]
     stop()
     assert not window.is_over()
-    child = object.__new__(children.Child)
+    child: Any = object.__new__(children.Child)
     child._process = SimpleNamespace(poll=lambda: 0, pid=1)
     child._ended_s, child._log = None, Path("nowhere")
     monkeypatch.setattr(children, "members_of", lambda _: (1,))

@@ -7,10 +7,12 @@ import sys
 from collections.abc import Iterator
 from pathlib import Path
 
+import jax
 import pytest
 
 from gmijax.errors import ConfigError
 from gmijax.sim.adapters import custom, neighbours
+from gmijax.sim.registry import make_env
 
 
 @pytest.fixture
@@ -72,3 +74,21 @@ def test_a_module_that_is_not_found_says_where_it_may_be(folder: Path):
         f"env={task} fails: ModuleNotFoundError: No module named 'rewards_of_mine' ({task}:1); "
         "found are files beside the task, installed packages, and folders of PYTHONPATH"
     )
+
+
+def test_numbers_of_64_bit_are_refused_by_who_turned_them_on(folder: Path):
+    task = write(
+        folder / "task.py",
+        "import jax\n\ndef make(*, impl, max_envs):\n"
+        "    jax.config.update('jax_enable_x64', True)\n",
+    )
+    off = "tasks and policies compute with 32 bit, so turn it off"
+    try:
+        with pytest.raises(ConfigError, match=rf"turned on by env=task\.py:make; {off}"):
+            make_env(f"{task}:make")
+        assert jax.config.read("jax_enable_x64")
+        for name in ("ant", f"{task}:make"):
+            with pytest.raises(ConfigError, match=f"turned on by this process; {off}"):
+                make_env(name)
+    finally:
+        jax.config.update("jax_enable_x64", False)

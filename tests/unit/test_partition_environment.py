@@ -27,6 +27,9 @@ INHERITED = {
     "GMIJAX_WAITS": "1",
     "XLA_CLIENT_MEM_FRACTION": "0.9",
     "XLA_PYTHON_CLIENT_MEM_FRACTION": "0.5",
+    # What other programs of the user compute with.
+    "JAX_ENABLE_X64": "1",
+    "JAX_NUMPY_DTYPE_PROMOTION": "strict",
 }
 FROM_BACKEND = {
     "cpu": {},

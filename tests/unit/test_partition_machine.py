@@ -43,6 +43,48 @@ def test_cuda_visible_devices_is_read_as_cuda_reads_it(selection: str | None, in
     assert [gpu.index for gpu in visible_gpus(THREE, selection)] == indices
 
 
+@pytest.mark.parametrize(
+    ("selection", "entry"),
+    [
+        ("7", "7 names no GPU"),
+        ("all", "all names no GPU"),
+        ("GPU-of-a-card-that-was-replaced", "GPU-of-a-card-that-was-replaced names no GPU"),
+        # CUDA would go on with the first one alone.
+        ("0, 7", "7 names no GPU"),
+        ("2,none", "none names no GPU"),
+        ("GPU-", "GPU- names several GPUs"),
+        ("MIG-123", "MIG-123 names no GPU"),
+        ("cuda:0", "cuda:0 names no GPU"),
+    ],
+)
+def test_gpus_that_are_named_and_are_not_here_are_refused(
+    selection: str, entry: str, monkeypatch: pytest.MonkeyPatch
+):
+    monkeypatch.setattr(machine_module, "list_gpus", lambda: THREE)
+    monkeypatch.setenv("CUDA_VISIBLE_DEVICES", selection)
+    here = detect_machine()
+    for backend in ("auto", "share"):
+        with pytest.raises(BackendUnavailable) as error:
+            planned(here, backend=backend)
+        assert str(error.value) == (
+            f"CUDA_VISIBLE_DEVICES={selection}: {entry}; GPUs here are 0 (GPU-00-uuid), 1 "
+            "(GPU-11-uuid), 2 (GPU-22-uuid); plan.backend=cpu (or CUDA_VISIBLE_DEVICES=-1) goes "
+            "on without GPUs"
+        )
+    assert planned(here, backend="cpu").backend == "cpu"
+
+
+@pytest.mark.parametrize("selection", ["", "-1", "NoDevFiles", "1,-1,0", "0,", "1,1", " 2 , 0 "])
+def test_what_cuda_takes_as_a_list_is_not_refused(selection: str, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(machine_module, "list_gpus", lambda: THREE)
+    monkeypatch.setenv("CUDA_VISIBLE_DEVICES", selection)
+    assert detect_machine().selection_problem is None
+    # A machine without GPUs has none that could be meant, as where NVIDIA_VISIBLE_DEVICES=none.
+    monkeypatch.setattr(machine_module, "list_gpus", lambda: ())
+    monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "7")
+    assert planned(detect_machine()).backend == "cpu"
+
+
 def failing(code: int) -> Callable[..., NoReturn]:
     def fail(*_: object) -> NoReturn:
         raise pynvml.NVMLError(code)
@@ -204,6 +246,30 @@ def test_a_plan_says_what_else_could_compute_here(
     (no_devices / device).touch()
     said = f"warning: {no_devices / device} looks like {what}, which gmijax does not use"
     assert planned(detect_machine()).reasons[0] == said
+
+
+@pytest.mark.parametrize(
+    ("variable", "value", "is_named"),
+    [
+        ("JAX_ENABLE_X64", "1", True),
+        ("JAX_ENABLE_X64", "True", True),
+        ("JAX_ENABLE_X64", "0", False),
+        ("JAX_DISABLE_JIT", "on", True),
+        ("JAX_NUMPY_DTYPE_PROMOTION", "strict", True),
+        ("JAX_NUMPY_DTYPE_PROMOTION", "standard", False),
+        ("JAX_NUMPY_RANK_PROMOTION", "raise", True),
+        ("JAX_PLATFORM_NAME", "gpu", True),
+        ("JAX_TRANSFER_GUARD", "disallow", True),
+        ("JAX_TRANSFER_GUARD", "log", False),
+        ("JAX_DEBUG_NANS", "1", False),
+    ],
+)
+def test_a_plan_says_with_which_settings_of_jax_gmis_do_not_compute(
+    variable: str, value: str, is_named: bool, monkeypatch: pytest.MonkeyPatch
+):
+    monkeypatch.setenv(variable, value)
+    said = f"warning: GMIs start without {variable}={value}, with which tasks do not work"
+    assert (said in planned(detect_machine()).reasons) == is_named
 
 
 @pytest.mark.parametrize(

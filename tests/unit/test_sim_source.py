@@ -105,7 +105,11 @@ def test_a_task_may_import_what_lies_beside_it(tmp_path: Path, monkeypatch: pyte
     [
         ("def make(", "def mak(", r"no function make there: did you mean mak\?$"),
         ("def make(", "def make(:", r"point\.py fails: SyntaxError: .*line 8\)$"),
-        ("import jax.", "import jaxx.", r"ModuleNotFoundError: .*'jaxx'.*point\.py:2\)$"),
+        (
+            "import jax.",
+            "import jaxx.",
+            r"ModuleNotFoundError: .*'jaxx'.*point\.py:2\); found are files beside",
+        ),
         ("impl, max_envs", "impl", r"TypeError: .*unexpected keyword argument 'max_envs'$"),
         ("return Env(SPEC", "return Env(None", r"spec: expected an EnvSpec, got NoneType"),
         ("return Env(", "return (", r"expected a gmijax\.sim\.interface\.Env, got tuple$"),

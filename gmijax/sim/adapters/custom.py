@@ -17,6 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from gmijax.config.schema import suggestion
+from gmijax.devices import require_32_bit
 from gmijax.errors import ConfigError
 from gmijax.sim.adapters.checks import attempt, check_env, check_start
 from gmijax.sim.adapters.neighbours import importable
@@ -69,6 +70,7 @@ def make(
         for group in given:
             _require_argument(found, group, what)
         env = attempt(what, found, impl=impl, max_envs=max_envs, **given)
+        require_32_bit(what)
         if isinstance(env, Env):
             env = _with_arrays(env)
         env = check_env(env, what)
