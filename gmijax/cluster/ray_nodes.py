@@ -13,6 +13,7 @@ from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager, suppress
 from typing import Any, Final, NamedTuple
 
+from gmijax.clock import running_s
 from gmijax.cluster.node import Facts, Node
 from gmijax.cluster.remote_gmi import LOST_S, RemoteNode
 from gmijax.config import ClusterConfig
@@ -91,12 +92,12 @@ class RayCluster:
           JobInterrupted: it is unwanted.
         """
         self.leave()
-        deadline_s = time.monotonic() + self._config.wait_s
+        deadline_s = running_s() + self._config.wait_s
         least = max(1, least or wanted or 1)
         while True:
             gpus = self._gpus_of_nodes(num_cpus, least_gpus, most_gpus)
             found = len(gpus)
-            is_over = time.monotonic() >= deadline_s
+            is_over = running_s() >= deadline_s
             if found >= (wanted or 1) or (is_over and found >= least):
                 break
             if is_over:
@@ -193,7 +194,7 @@ class RayCluster:
         ray = self._ray
         self._group = ray.util.placement_group([bundle] * num_nodes, strategy="STRICT_SPREAD")
         # Ray needs a moment also where there is room.
-        if not self._group.wait(max(_PLACE_S, deadline_s - time.monotonic())):
+        if not self._group.wait(max(_PLACE_S, deadline_s - running_s())):
             self.leave()
             room = ", ".join(f"{count} {name}s" for name, count in bundle.items())
             raise ConfigError(
