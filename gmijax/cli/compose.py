@@ -16,6 +16,7 @@ from omegaconf.errors import OmegaConfBaseException
 
 from gmijax.cli.arguments import parse, readable, require_text
 from gmijax.cli.groups import choices, config_dir
+from gmijax.cli.saved import as_the_run_was, copy_key, with_saved
 from gmijax.config import EnvConfig, ServeConfig, TrainConfig
 from gmijax.config.schema import flatten, from_dict, known, require_between, suggestion
 from gmijax.errors import ConfigError
@@ -87,9 +88,10 @@ def build(name: str, cls: type[C], overrides: Sequence[str]) -> C:
         data = _with_task_of_run(data, items)
     if cls is TrainConfig:
         _check_task_key(items)
-        # With `auto` the command that started the run is given again, whole.
         resume = data["run"].get("resume") if isinstance(data["run"], dict) else None
-        if resume not in (None, "auto"):
+        if resume == "auto":
+            data = as_the_run_was(data, items, _chosen_only(name, overrides, items))
+        elif resume is not None:
             data = _on_top_of_saved(data, items, str(resume))
     for key, value in flatten(data).items():  # What the environment has may be anything.
         if isinstance(value, str):
@@ -112,6 +114,16 @@ def _names_policy(items: Sequence[Override]) -> bool:
         or (item.key_or_group == "policy" and item.value() != "trained")
         for item in items
     )
+
+
+def _chosen_only(
+    name: str, overrides: Sequence[str], items: Sequence[Override]
+) -> Callable[[], dict[str, Any]]:
+    """Makes what the command would be with its task and algorithm, and without other overrides."""
+    choosing = ("env", "env.name", "algo")
+    pairs = zip(overrides, items, strict=True)
+    kept = [text for text, item in pairs if item.key_or_group in choosing]
+    return lambda: compose_dict(name, kept)
 
 
 def _choices_of_run(name: str, items: Sequence[Override]) -> list[str]:
@@ -212,16 +224,14 @@ def _on_top_of_saved(
     require_known_keys(saved, f"run.resume={resume}")
     saved["run"].update(dir=None, name=None)
     suite = saved["env"].get("suite", "gmijax")
-    merged = _merged(data, saved)
-    if "randomization" in saved["env"]:  # A leaf that the run left out stays out.
-        merged["env"]["randomization"] = saved["env"]["randomization"]
+    merged = with_saved(data, saved)
     for item in items:
         key = item.key_or_group
         if key == "env.name":  # Whatever the file holds by now is meant.
             merged["env"]["source_sha256"] = None
         if (key, item.value()) == ("env", "custom") and suite == "custom":
             continue  # The file may have moved; `env.name` says where to.
-        if _copy_key(key, data, merged):
+        if copy_key(key, data, merged):
             continue
         if item.is_delete() or choices(key):
             raise ConfigError(
@@ -244,29 +254,8 @@ def _with_task_of_run(data: dict[str, Any], items: Sequence[Override]) -> dict[s
     merged = {**data, "env": {**data["env"], **saved}}
     for item in items:
         if item.key_or_group.startswith("env."):
-            _copy_key(item.key_or_group, data, merged)
+            copy_key(item.key_or_group, data, merged)
     return merged
-
-
-def _merged(base: Mapping[str, Any], top: Mapping[str, Any]) -> dict[str, Any]:
-    """`base` with the values of `top`, group by group."""
-    merged = {**base, **top}
-    for key in base.keys() & top.keys():
-        if isinstance(base[key], Mapping) and isinstance(top[key], Mapping):
-            merged[key] = _merged(base[key], top[key])
-    return merged
-
-
-def _copy_key(key: str, source: dict[str, Any], target: dict[str, Any]) -> bool:
-    """Copies the value or group of a dotted key; returns whether `source` has it."""
-    *groups, last = key.split(".")
-    for group in groups:
-        source, target = source.get(group, {}), target.get(group, {})
-        if not (isinstance(source, dict) and isinstance(target, dict)):
-            return False
-    if last in source:
-        target[last] = source[last]
-    return last in source
 
 
 def _refused(

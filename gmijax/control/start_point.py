@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from gmijax.config import EnvConfig, TrainConfig
+from gmijax.config.schema import to_dict
 from gmijax.errors import ConfigError
 from gmijax.runs.folder import (
     RUNS,
@@ -16,7 +17,12 @@ from gmijax.runs.folder import (
     require_new_run,
 )
 from gmijax.runs.resume import CheckpointMeta, choose_checkpoint, newest_checkpoint
-from gmijax.runs.saved_config import saved_config, trained_config
+from gmijax.runs.saved_config import (
+    differences,
+    require_known_keys,
+    saved_config,
+    trained_config,
+)
 
 
 class StartPoint(NamedTuple):
@@ -82,12 +88,16 @@ def _go_on_or_start(config: TrainConfig) -> StartPoint:
         raise ConfigError(
             f"{shown} holds a run of {' with '.join(saved)}, not {' with '.join(wanted)}"
         )
+    was = saved_config(run.checkpoint(0))
+    require_known_keys(was, shown)
     found = newest_checkpoint(folder)
+    changes = differences(was, to_dict(config))
+    notes = (*found.passed_over, *(f"changed since the run: {text}" for text in changes))
     if found.checkpoint is None:
-        return StartPoint(run, notes=found.passed_over)
+        return StartPoint(run, notes=notes)
     meta = _require_fit(config, found.checkpoint, "auto")
     is_complete = meta.env_steps >= config.num_timesteps
-    return StartPoint(run, found.checkpoint, is_complete, found.passed_over)
+    return StartPoint(run, found.checkpoint, is_complete, notes)
 
 
 def _require_fit(config: TrainConfig, checkpoint: Path, wanted: str) -> CheckpointMeta:

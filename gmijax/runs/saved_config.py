@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
+import json
 import os
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 from gmijax.config import ALGORITHMS, AlgoConfig, EnvConfig, TrainConfig
-from gmijax.config.schema import from_dict, from_named, known
+from gmijax.config.schema import flatten, from_dict, from_named, known
 from gmijax.errors import ConfigError
 from gmijax.runs.folder import RunPaths, read_json
 from gmijax.runs.resume import any_checkpoint
+
+_OWN_KEYS: Final = ("run.dir", "run.name", "run.resume", "env.source_sha256")
+"""Keys that every job has for itself, or of which something else is said."""
 
 
 def saved_config_of(wanted: str, key: str) -> dict[str, Any]:
@@ -71,6 +75,25 @@ def require_known_keys(saved: Mapping[str, Any], what: str) -> None:
             "them out of that file to go on without them (the policy can be played, exported and "
             "served as it is)"
         )
+
+
+def differences(saved: Mapping[str, Any], config: Mapping[str, Any]) -> list[str]:
+    """What a job that goes on in a run's folder does otherwise, a sentence for each key.
+
+    Args:
+      saved: the run's configuration.
+      config: that of the job.
+    """
+    # As both are after a round trip through JSON.
+    before, now = flatten(saved), flatten(json.loads(json.dumps(config)))
+    return [
+        f"{key} is {now.get(key)!r}, was {before.get(key)!r}"
+        for key in dict.fromkeys((*now, *before))
+        if now.get(key) != before.get(key)
+        # What was decided in its place is no other wish.
+        and key not in _OWN_KEYS
+        and now.get(key) != "auto"
+    ]
 
 
 def left_out(checkpoint: Path) -> str | None:

@@ -11,11 +11,11 @@ from supervision import save
 import gmijax
 from gmijax.cli.compose import compose
 from gmijax.config import TrainConfig
-from gmijax.config.schema import to_dict
+from gmijax.config.schema import flatten, to_dict
 from gmijax.control import decide, serving
 from gmijax.control.start_point import find_start_point
 from gmijax.errors import ConfigError
-from gmijax.runs.folder import META, RunPaths, write_json
+from gmijax.runs.folder import META, RunPaths, read_json, write_json
 
 
 def config_of(folder: Path, *overrides: str) -> TrainConfig:
@@ -119,3 +119,76 @@ def test_serve_refuses_a_name_that_is_taken_before_it_searches(
     config = compose(*overrides, command="serve")
     with pytest.raises(ConfigError, match=r"^run\.name=runs/mine: the run folder exists already$"):
         serving.serve(config)
+
+
+def as_saved_by_another_version(run: RunPaths, key: str, value: object) -> None:
+    saved = read_json(run.config)
+    *groups, last = key.split(".")
+    place = saved
+    for group in groups:
+        place = place[group]
+    place[last] = value
+    write_json(run.config, saved)
+
+
+@pytest.mark.parametrize(
+    ("key", "value"),
+    [("algo.gae_lambda", 0.5), ("env.rewards.energy", -0.5), ("eval.episodes", 7), ("seed", 3)],
+)
+def test_auto_keeps_what_the_run_has_where_the_command_says_nothing(
+    run: RunPaths, key: str, value: object
+):
+    as_saved_by_another_version(run, key, value)
+    save(run, 100)
+    config = config_of(run.root)
+    assert flatten(to_dict(config))[key] == value
+    assert find_start_point(config).notes == ()
+
+
+def test_auto_takes_what_the_command_says_and_names_it(run: RunPaths):
+    as_saved_by_another_version(run, "algo.gae_lambda", 0.5)
+    save(run, 100)
+    for override in ("algo.gae_lambda=0.95", "num_timesteps=100", "plan.gmis_per_gpu=2"):
+        config = config_of(run.root, override)
+        key, _, value = override.partition("=")
+        assert str(flatten(to_dict(config))[key]) == value
+        [note] = find_start_point(config).notes
+        assert note.startswith(f"changed since the run: {key} is {value}, was ")
+    # A file of settings that is chosen is said, too.
+    tuned = config_of(run.root, "tuned=humanoid_ppo")
+    notes = find_start_point(tuned).notes
+    assert any("algo.gae_lambda" not in note for note in notes)
+    assert notes
+
+
+def test_auto_takes_the_machine_from_the_command(run: RunPaths):
+    # As a restart with fewer GPUs has left it.
+    as_saved_by_another_version(run, "plan.gpus", 3)
+    assert config_of(run.root).plan.gpus == 1
+
+
+@pytest.mark.parametrize("key", ["algo.future_key", "new_group", "env.future"])
+def test_auto_refuses_keys_that_it_does_not_know(run: RunPaths, key: str):
+    config = config_of(run.root)
+    as_saved_by_another_version(run, key, 3)
+    message = rf"^run\.resume=auto: .*its config\.json has keys that .* not know: {key};"
+    with pytest.raises(ConfigError, match=message):
+        config_of(run.root)
+    # Also where the configuration comes from elsewhere, as that of a job of a sweep does.
+    with pytest.raises(ConfigError, match=message):
+        find_start_point(config)
+
+
+def test_auto_fills_in_what_an_older_version_did_not_save(run: RunPaths):
+    saved = read_json(run.config)
+    del saved["algo"]["clipping_epsilon"], saved["eval"]
+    write_json(run.config, saved)
+    config, wanted = config_of(run.root), compose("env=ant")
+    assert config.algo.clipping_epsilon == wanted.algo.clipping_epsilon
+    assert config.eval == wanted.eval
+
+
+def test_auto_names_a_broken_configuration(run: RunPaths):
+    run.config.write_text("{")
+    with pytest.raises(ConfigError, match=rf"^{run.config}: broken \(not JSON: "):
+        config_of(run.root)
