@@ -28,6 +28,7 @@ def make_run(root: Path, *overrides: str, actor_obs_size: int | None = None) -> 
     """A run folder with one checkpoint, at ENV_STEPS; some of its actions are beyond +-1."""
     config = gmijax.compose(*TINY, *overrides)
     run = RunPaths(root)
+    run.root.mkdir(parents=True, exist_ok=True)
     write_json(run.config, to_dict(config))
     # Nothing is computed by jax: that would be compiled, leaf by leaf.
     spec = EnvSpec("x", OBS_SIZE, ACTION_SIZE, 0.0, 0, (), actor_obs_size=actor_obs_size)

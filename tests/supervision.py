@@ -72,8 +72,14 @@ def plan_on(nodes: dict[str, Machine], **settings: Any) -> Plan:
 def save(run: RunPaths, env_steps: int) -> Path:
     """A checkpoint of `ant` that holds nothing but its meta data."""
     meta = CheckpointMeta("ant", "ppo", env_steps, 1, 8, ((8,), (8, 4)), "jax")
-    write_json(run.checkpoint(env_steps) / META, meta.to_dict())
-    return run.checkpoint(env_steps)
+    return save_meta(run, meta)
+
+
+def save_meta(run: RunPaths, meta: CheckpointMeta) -> Path:
+    """A checkpoint of nothing else."""
+    run.checkpoint(meta.env_steps).mkdir(parents=True, exist_ok=True)
+    write_json(run.checkpoint(meta.env_steps) / META, meta.to_dict())
+    return run.checkpoint(meta.env_steps)
 
 
 def make_launch(

@@ -48,6 +48,7 @@ def profile(
         config = workload.config_at(point, plan.layout.num_gmis)
     except ConfigError as error:
         return NotRunnable(str(error))
+    run.root.mkdir(parents=True, exist_ok=True)
     write_json(run.config, to_dict(config))
     write_json(run.plan, plan.to_dict())
     launch = _launch(workload, plan, machine, run, limit_s, on_warning)

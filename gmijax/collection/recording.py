@@ -40,7 +40,7 @@ class ShardWriter:
         self._save: Callable[..., None] = np.savez_compressed if compress else np.savez
         self._pool = ThreadPoolExecutor(1, "shards")
         self._pending: Future[int] | None = None
-        paths.folder(rank).mkdir(parents=True, exist_ok=True)
+        paths.folder(rank).mkdir(exist_ok=True)
         remove_temporary(paths.folder(rank))
 
     def write(self, steps: Step) -> None:

@@ -7,6 +7,7 @@ enters the backend, runs the GMIs, and writes the summary however the job ends.
 from __future__ import annotations
 
 import dataclasses
+import os
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager, suppress
@@ -31,17 +32,19 @@ from gmijax.control.restarts import (
 from gmijax.control.start_point import StartPoint, find_start_point
 from gmijax.control.summary import train_outcome, train_summary
 from gmijax.control.wandb_link import followed, require_wandb
+from gmijax.errors import ConfigError
 from gmijax.machine.snapshot import detect_machine
 from gmijax.partition.plan import Plan
 from gmijax.runs.folder import RunPaths, add_event, read_json, write_json
 from gmijax.runs.git import record_git
-from gmijax.runs.held import locked
+from gmijax.runs.held import OpenFolder, locked
 from gmijax.runs.history import MetricsReader, copy_history, draw_returns, read_metrics
-from gmijax.runs.resume import CheckpointMeta, checkpoints_of
+from gmijax.runs.resume import CheckpointMeta, checkpoints_of, drop_unfinished
 from gmijax.runs.saved_config import saved_config
 from gmijax.sim import source
 from gmijax.supervise.job_kinds import training_kind
 from gmijax.supervise.run_gmis import Launch, recorded
+from gmijax.supervise.watched_gmi import GmiStatus
 
 
 class Result(NamedTuple):
@@ -98,21 +101,33 @@ def _train(
     started_s: float,
 ) -> Result:
     config, plan = decided.config, decided.plan
-    with opened(config, beginning) as (run, notes):
+    with opened(config, beginning) as (run, notes, folder):
         what = (
             f"{plan.num_envs_per_gmi} environments per GMI, template {plan.template}, reduction "
             f"{plan.strategy}"
         )
         announce(console, run, plan, what, (*decided.reasons, *notes))
-        _Job(decided, run, console, cluster, opengl).run_to_the_end(beginning, started_s)
+        job = _Job(decided, run, folder, console, cluster, opengl)
+        try:
+            job.run_to_the_end(beginning, started_s)
+        finally:
+            folder.require()  # Whatever else went wrong without it comes from that.
     summary = read_json(run.summary)
     console.print(train_outcome(summary, run))
     return Result(run.root, summary)
 
 
+class Opened(NamedTuple):
+    """A run folder that a job holds."""
+
+    run: RunPaths
+    notes: Sequence[str]  # What the user should know of it.
+    folder: OpenFolder  # To see whether it is still there.
+
+
 @contextmanager
-def opened(config: TrainConfig, beginning: StartPoint) -> Iterator[tuple[RunPaths, Sequence[str]]]:
-    """The run folder of a job, held while it is entered, and what the user should know of it.
+def opened(config: TrainConfig, beginning: StartPoint) -> Iterator[Opened]:
+    """The run folder of a job, held while it is entered.
 
     Raises:
       ConfigError: as `StartPoint.open` and `locked`.
@@ -122,9 +137,9 @@ def opened(config: TrainConfig, beginning: StartPoint) -> Iterator[tuple[RunPath
         changed = source.changes(config.env, saved_config(beginning.checkpoint)["env"])
         notes = notes if changed is None else (changed, *notes)
     run = beginning.open(config)
-    with locked(run.lock, f"run.dir={run.root}"):
+    with locked(run.lock, f"run.dir={run.root}") as folder:
         record_git(run, Path.cwd())
-        yield run, notes
+        yield Opened(run, notes, folder)
 
 
 class _Job:
@@ -134,12 +149,13 @@ class _Job:
         self,
         decided: Decided[TrainConfig],
         run: RunPaths,
+        folder: OpenFolder,
         console: Console,
         cluster: ClusterJob | None,
         opengl: str | None,
     ) -> None:
         self._config, self._plan, self._machine, _ = decided
-        self._run = run
+        self._run, self._folder = run, folder
         self._console = console
         self._cluster = cluster
         self._opengl = opengl
@@ -149,6 +165,7 @@ class _Job:
             self._launch_at,
             console.print,
             cluster.run if cluster is not None else None,
+            folder.require,
         )
 
     def run_to_the_end(self, beginning: StartPoint, started_s: float) -> None:
@@ -158,9 +175,15 @@ class _Job:
         progress = ConsoleProgress(self._console, new, config.num_timesteps)
 
         def record(status: str, plan: Plan) -> None:
+            if not self._folder.is_there():
+                return
             wall_s = time.monotonic() - started_s
             restarts = [restart._asdict() for restart in self._attempts.restarts]
             record_end(config, plan, run, status, wall_s, restarts)
+
+        def on_tick(gmis: tuple[GmiStatus, ...]) -> None:
+            self._folder.look()
+            progress.update(gmis)
 
         write_json(run.plan, self._plan.to_dict())
         # Recorded first, so that the summary is sent too, and filmed before all is sent.
@@ -171,7 +194,7 @@ class _Job:
         ):
             self._prepare(beginning)
             with progress:
-                self._attempts.run_to_the_end(beginning.checkpoint, progress.update)
+                self._attempts.run_to_the_end(beginning.checkpoint, on_tick)
 
     def _prepare(self, beginning: StartPoint) -> None:
         checkpoint = beginning.checkpoint
@@ -222,6 +245,7 @@ def record_end(
 ) -> None:
     """Leaves in the run folder how a run has ended; arguments as of `train_summary`."""
     add_event(run.events, status)
+    drop_unfinished(run)  # On a full disk they stand in the way of the summary.
     write_json(run.summary, train_summary(config, plan, run, status, wall_s, restarts))
     with suppress(OSError):  # What counts is written.
         draw_returns(run.metrics, run.returns_png, f"{config.env.label}, {config.algo.name}")
@@ -235,9 +259,12 @@ def started_from(config: TrainConfig, checkpoint: Path | None) -> TrainConfig:
 
 def _finished(config: TrainConfig, run: RunPaths, console: Console) -> Result:
     """Result of a run that is complete; writes the summary if it is missing."""
-    summary = read_json(run.summary) if run.summary.exists() else {}
+    summary = read_json(run.summary) if os.path.lexists(run.summary) else {}
     if summary.get("status") != "completed":
-        plan = Plan.from_dict(read_json(run.plan))
+        try:
+            plan = Plan.from_dict(read_json(run.plan))
+        except ConfigError as error:
+            raise ConfigError(f"{run.plan}: {error}") from None
         summary = train_summary(config, plan, run, "completed", 0.0, [])
         write_json(run.summary, summary)
     console.print(f"nothing is left to do: {run.root}")

@@ -26,9 +26,11 @@ from gmijax.control.start_point import find_start_point
 from gmijax.control.summary import train_outcome
 from gmijax.partition.plan import Plan
 from gmijax.runs.folder import RunPaths, add_event, read_json, write_json
+from gmijax.runs.held import OpenFolder
 from gmijax.runs.history import MetricsReader
 from gmijax.supervise.job_kinds import MEMBERS_VARIABLE, PACKED
 from gmijax.supervise.run_gmis import Launch, recorded, run_gmis
+from gmijax.supervise.watched_gmi import GmiStatus
 
 
 class _Member(NamedTuple):
@@ -61,9 +63,11 @@ def train_packed(configs: Sequence[TrainConfig], folder: Path, *, show: bool = F
     gmis = RunPaths(folder)
     with ExitStack() as held:
         members: list[_Member] = []
+        folders: list[OpenFolder] = []
         notes = list(reasons)
         for own, beginning in zip(configs, beginnings, strict=True):
-            run, changes = held.enter_context(opened(own, beginning))
+            run, changes, folder = held.enter_context(opened(own, beginning))
+            folders.append(folder)
             own = dataclasses.replace(own, physics=config.physics)
             members.append(_Member(started_from(own, beginning.checkpoint), run))
             notes += changes
@@ -86,9 +90,15 @@ def train_packed(configs: Sequence[TrainConfig], folder: Path, *, show: bool = F
         )
         new = MetricsReader(members[0].run.metrics).new
         progress = ConsoleProgress(console, new, config.num_timesteps)
+
+        def on_tick(status: tuple[GmiStatus, ...]) -> None:
+            for folder in folders:
+                folder.look()
+            progress.update(status)
+
         record = partial(_record, members, started_s)
         with recorded(gmis, lambda: "continue with the same sweep", record), progress:
-            run_gmis(launch, progress.update)
+            run_gmis(launch, on_tick)
         for _, run in members:
             console.print(train_outcome(read_json(run.summary), run))
 
@@ -105,6 +115,8 @@ def _prepare(member: _Member, plan: Plan, gmis: RunPaths) -> None:
 def _record(members: Sequence[_Member], started_s: float, status: str, plan: Plan) -> None:
     wall_s = time.monotonic() - started_s
     for config, run in members:
+        if not run.config.exists():
+            continue  # Its folder is gone.
         write_json(run.plan, plan.to_dict())
         record_end(config, plan, run, _status_of(run, status), wall_s, [])
 

@@ -62,6 +62,8 @@ class Attempts:
     say: Callable[[str], None]  # Takes a line for the user.
     # Runs an attempt to its end; see `run_gmis`.
     run_attempt: Callable[[Launch, OnTick, StopSignals], None] | None = None
+    # Raises what comes before any fault of a GMI: that its folder is gone.
+    require_folder: Callable[[], None] = lambda: None
     restarts: list[Restart] = field(default_factory=list)
     _seen_s: float = 0.0
 
@@ -77,6 +79,7 @@ class Attempts:
                     self._attempt(checkpoint, on_tick, signals)
                     return
                 except GmiFailed as error:
+                    self.require_folder()
                     reason = why_not_again(error, last)
                     newest = self._newest() or origin
                     if _steps(newest) > reached:

@@ -35,13 +35,14 @@ from gmijax.runs.folder import (
     require_new_run,
     write_json,
 )
-from gmijax.runs.held import locked
+from gmijax.runs.held import OpenFolder, locked
 from gmijax.runs.history import MetricsReader
 from gmijax.runs.resume import CheckpointMeta, find_checkpoint
 from gmijax.runs.saved_config import left_out, trained_config
 from gmijax.sim import source
 from gmijax.supervise.job_kinds import serving_kind
 from gmijax.supervise.run_gmis import Launch, recorded, run_gmis
+from gmijax.supervise.watched_gmi import GmiStatus
 
 
 class Served(NamedTuple):
@@ -98,10 +99,12 @@ def serve(config: ServeConfig, *, show: bool = False) -> Served:
     """
     console = open_console(show=show)
     job = _prepared(config, console)
+    folders: list[OpenFolder] = []
     with ExitStack() as held:
         if job.data is not None:
             open_dataset(job.data, _about(job))
-            held.enter_context(locked(job.data.lock, f"output.dir={job.data.root}"))
+            what = f"output.dir={job.data.root}"
+            folders.append(held.enter_context(locked(job.data.lock, what)))
         kept = job.finished_unrolls()
         if kept and kept == job.wanted_unrolls:
             raise ConfigError(
@@ -110,10 +113,15 @@ def serve(config: ServeConfig, *, show: bool = False) -> Served:
             )
         env = job.config.env
         run = create_run(None, job.config.run.name, f"{env.slug}-serve")
+        folders.append(held.enter_context(OpenFolder(run.root, f"run.dir={run.root}")))
         write_json(run.config, to_dict(job.config))
         write_json(run.plan, job.plan.to_dict())
         _announce(console, job, kept, run)
-        summary = _run(job, kept, run, console)
+        try:
+            summary = _run(job, kept, run, folders, console)
+        finally:
+            for folder in folders:
+                folder.require()  # Whatever else went wrong without it comes from that.
     console.print(serve_outcome(summary, run))
     return Served(run.root, summary, None if job.data is None else job.data.root)
 
@@ -214,12 +222,22 @@ class _CollectedLines:
         return [line]
 
 
-def _run(job: _Job, kept: int, run: RunPaths, console: Console) -> dict[str, Any]:
-    """Runs the GMIs; returns the summary, which is written however they end."""
+def _run(
+    job: _Job, kept: int, run: RunPaths, folders: Sequence[OpenFolder], console: Console
+) -> dict[str, Any]:
+    """Runs the GMIs; returns the summary, which is written however they end.
+
+    Raises FolderLost if one of `folders`, which they write into, is no longer there.
+    """
     started_s = time.monotonic()
     lines = _CollectedLines(run, job.simulators, kept * job.steps_per_unroll)
     total = job.wanted_unrolls * job.steps_per_unroll
     progress = ConsoleProgress(console, lines.new, total)
+
+    def on_tick(gmis: tuple[GmiStatus, ...]) -> None:
+        for folder in folders:
+            folder.look()
+        progress.update(gmis)
 
     def record(status: str, plan: Plan) -> None:
         wall_s = time.monotonic() - started_s
@@ -235,7 +253,7 @@ def _run(job: _Job, kept: int, run: RunPaths, console: Console) -> dict[str, Any
         on_warning=console.print,
     )
     with recorded(run, partial(_what_is_left, job), record), progress:
-        run_gmis(launch, progress.update)
+        run_gmis(launch, on_tick)
     return read_json(run.summary)
 
 

@@ -192,6 +192,7 @@ def output_folder(
     env_steps = CheckpointMeta.read(Path(str(config.checkpoint))).env_steps
     root = run / name / steps_name(env_steps)
     try:
+        root.mkdir(parents=True, exist_ok=True)
         write_json(RunPaths(root).config, to_dict(config))
         remove_temporary(root)
         for path in stale(root):

@@ -94,6 +94,7 @@ def open_dataset(paths: DataPaths, about: Mapping[str, Any]) -> None:
                 f"({paths.dataset.name} is missing)"
             )
         else:
+            paths.root.mkdir(parents=True, exist_ok=True)
             write_json(paths.dataset, about)
     except OSError as error:
         raise ConfigError(f"output.dir={paths.root}: {error.strerror}") from None

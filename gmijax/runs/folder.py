@@ -211,7 +211,8 @@ def write_bytes(path: Path, content: bytes) -> None:
 
     Also after a loss of power: its content is on the disk before its name is.
     """
-    path.parent.mkdir(parents=True, exist_ok=True)
+    # Not the folders above: one that was moved away must not come back with half of its files.
+    path.parent.mkdir(exist_ok=True)
     temporary = path.with_name(f".{path.name}.{os.getpid()}-{threading.get_ident()}")
     try:
         with temporary.open("wb") as file:

@@ -17,7 +17,7 @@ from types import FrameType
 from typing import Final
 
 from gmijax.collectives.host.shared_block import create_exchange
-from gmijax.errors import BackendUnavailable, GmijaxError, JobInterrupted
+from gmijax.errors import BackendUnavailable, ConfigError, FolderLost, GmijaxError, JobInterrupted
 from gmijax.partition.backend_choice import WHAT_SHARE_LOSES
 from gmijax.partition.plan import Plan
 from gmijax.runs.cache import drop_broken_programs
@@ -108,16 +108,18 @@ def recorded(
         status = "interrupted"
         error.add_note(what_is_left())
         raise
+    except FolderLost:
+        raise
     except GmijaxError as error:
         error.add_note(f"run folder: {run.root}")
         raise
     finally:
         try:
             record(status, Plan.from_dict(read_json(run.plan)))  # Its backend may be another.
-        except OSError as error:
+        except (OSError, ConfigError) as error:
             # A full disk must not hide why a job failed; nor may what is not written be read.
             if status == "completed":
-                why = error.strerror or error
+                why = getattr(error, "strerror", None) or error
                 raise GmijaxError(f"the outcome cannot be written to {run.root} ({why})") from None
 
 

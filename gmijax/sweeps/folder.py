@@ -7,7 +7,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
-from gmijax.errors import ConfigError, SweepFailed
+from gmijax.errors import ConfigError, FolderLost, SweepFailed
 from gmijax.runs.folder import create_run, given_run
 from gmijax.runs.held import is_locked
 from gmijax.sweeps.jobs import Job, SweepPaths
@@ -27,6 +27,8 @@ def opened_folder(jobs: Sequence[Job]) -> Iterator[SweepPaths]:
     is_anothers = is_locked(paths.lock)
     try:
         yield paths
+    except FolderLost:
+        raise
     except BaseException:
         if not is_anothers and not paths.request.exists():
             with suppress(OSError):

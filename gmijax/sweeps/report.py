@@ -18,6 +18,7 @@ from rich.table import Table
 from gmijax.config.schema import to_dict
 from gmijax.config.sweep import SweepConfig
 from gmijax.runs.folder import write_bytes, write_json, write_text
+from gmijax.runs.held import OpenFolder
 from gmijax.sweeps.by_setting import Middle, Row, grouped, middle_of, place_of, settings_of
 from gmijax.sweeps.jobs import Job, State, SweepPaths, label_of, trainings_per_hour
 from gmijax.version import __version__
@@ -36,6 +37,7 @@ class Report:
       jobs: those that are known; more may be added to the list.
       sweep: settings.
       paths: files of the sweep.
+      folder: that of the sweep, to see whether it is still there.
       started_s: when the command began, by the monotonic clock.
 
     Attributes:
@@ -43,9 +45,15 @@ class Report:
     """
 
     def __init__(
-        self, jobs: Sequence[Job], sweep: SweepConfig, paths: SweepPaths, started_s: float
+        self,
+        jobs: Sequence[Job],
+        sweep: SweepConfig,
+        paths: SweepPaths,
+        folder: OpenFolder,
+        started_s: float,
     ) -> None:
         self._jobs, self._sweep, self._paths, self._started_s = jobs, sweep, paths, started_s
+        self._folder = folder
         self._states: list[State] = []
         self.data: dict[str, Any] = {}
 
@@ -66,7 +74,12 @@ class Report:
                     raise  # Others: not every file system can keep room.
 
     def update(self) -> None:
-        """Writes the tables if the state of a job has changed."""
+        """Writes the tables if the state of a job has changed.
+
+        Raises:
+          FolderLost: the sweep's folder is no longer there.
+        """
+        self._folder.look()
         states: list[State] = [job.progress.state for job in self._jobs]
         if states == self._states:
             return
@@ -75,7 +88,12 @@ class Report:
             self._write("running")
 
     def end(self, status: str) -> str | None:
-        """Says how the sweep has ended; why that cannot be written, if it cannot."""
+        """Says how the sweep has ended; why that cannot be written, if it cannot.
+
+        Raises:
+          FolderLost: the sweep's folder is no longer there.
+        """
+        self._folder.require()
         wrong = None
         with suppress(OSError):
             self._paths.room.unlink(missing_ok=True)

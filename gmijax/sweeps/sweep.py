@@ -19,7 +19,7 @@ from gmijax.control.decide import with_task
 from gmijax.errors import ConfigError, JobInterrupted, SweepFailed
 from gmijax.machine.snapshot import detect_machine
 from gmijax.runs.folder import RUNS, given_run, read_json, write_json
-from gmijax.runs.held import locked
+from gmijax.runs.held import OpenFolder, locked
 from gmijax.supervise.run_gmis import StopSignals, stop_signals
 from gmijax.sweeps.folder import errors_of_files, opened_folder
 from gmijax.sweeps.host import LocalHost
@@ -120,18 +120,26 @@ def run_request(request: Request, *, show: bool = False) -> SweepResult:
         require_packable(request.settings, request.jobs)
         if request.settings.sampler != "grid":
             optuna_package()
-        with opened_folder(request.jobs) as paths, locked(paths.lock, f"run.dir={paths.root}"):
-            return _run(request, hosts, paths, console, started_s)
+        with (
+            opened_folder(request.jobs) as paths,
+            locked(paths.lock, f"run.dir={paths.root}") as folder,
+        ):
+            return _run(request, hosts, paths, folder, console, started_s)
 
 
 def _run(
-    request: Request, hosts: Sequence[Host], paths: SweepPaths, console: Console, started_s: float
+    request: Request,
+    hosts: Sequence[Host],
+    paths: SweepPaths,
+    folder: OpenFolder,
+    console: Console,
+    started_s: float,
 ) -> SweepResult:
     """Runs the sweep of a folder that is locked, on machines where nothing is started yet."""
     settings = request.settings
     with errors_of_files(paths):
         jobs, study = _beginning(request, paths)
-        report = Report(jobs, settings, paths, started_s)
+        report = Report(jobs, settings, paths, folder, started_s)
         report.begin()
     console.print(f"sweep folder: {paths.root}")
     view = SweepView(console, jobs, settings)

@@ -7,7 +7,7 @@ import shutil
 from pathlib import Path
 
 import pytest
-from supervision import save
+from supervision import save, save_meta
 
 from gmijax.cli.compose import build, compose
 from gmijax.config import PlayConfig
@@ -174,7 +174,7 @@ def test_the_last_run_is_the_one_that_was_written_last_whatever_its_files_say(
     runs = {name: RunPaths(Path("runs") / name) for name in ("a", "b")}
     for written_s, run in zip((2000.0, 1000.0), runs.values(), strict=True):
         meta = CheckpointMeta("ant", "ppo", 100, 1, 8, ((8,), (8,)), "jax", time_s=written_s)
-        write_json(run.checkpoint(100) / META, meta.to_dict())
+        save_meta(run, meta)
         os.utime(run.checkpoint(100) / META, (written_s, written_s))
     # As `cp -r` does it: copies of files are newer than whatever they are copies of.
     shutil.copytree("runs/b", "runs/copy of b")

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from supervision import save_meta
 
 import gmijax
 from gmijax.cli.compose import build
@@ -18,7 +19,7 @@ from gmijax.config.schema import to_dict
 from gmijax.control import job, restarts, serving
 from gmijax.deploy import exporting, playing
 from gmijax.errors import ConfigError
-from gmijax.runs.folder import META, RunPaths, read_json, write_json
+from gmijax.runs.folder import RunPaths, read_json, write_json
 from gmijax.runs.resume import CheckpointMeta
 from gmijax.sim import source
 from gmijax.sim.adapters import custom
@@ -38,7 +39,7 @@ def run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> RunPaths:
     write_json(paths.config, saved)
     hidden = config.algo.hidden_layer_sizes
     meta = CheckpointMeta("point.py:make", "ppo", 100, 1, 8, hidden, "jax")
-    write_json(paths.checkpoint(100) / META, meta.to_dict())
+    save_meta(paths, meta)
     (tmp_path / "point.py").write_text(TRAP)
     return paths
 

@@ -9,6 +9,7 @@ from typing import Any
 
 import pytest
 from rich.console import Console
+from supervision import save_meta
 
 from gmijax.cli.command import command
 from gmijax.config import EnvConfig, PlayConfig
@@ -32,10 +33,11 @@ def config_of(*overrides: str) -> PlayConfig:
 def run(tmp_path: Path) -> RunPaths:
     """A run folder with two checkpoints that hold nothing."""
     paths = RunPaths(tmp_path / "runs" / "x")
+    paths.root.mkdir(parents=True)
     write_json(paths.config, {})
     for env_steps in (100, 2000):
         meta = CheckpointMeta("ant", "ppo", env_steps, 1, 4, ((8,), (8,)), "jax")
-        write_json(paths.checkpoint(env_steps) / META, meta.to_dict())
+        save_meta(paths, meta)
     return paths
 
 

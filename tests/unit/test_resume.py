@@ -29,6 +29,7 @@ from gmijax.runs.saved_config import left_out, trained_config
 def make_run(root: Path, *env_steps: int) -> RunPaths:
     """A run of `ant` with other settings than the defaults, and checkpoints that hold nothing."""
     paths = RunPaths(root)
+    paths.root.mkdir(parents=True)
     write_json(paths.config, to_dict(compose("env=ant", "num_envs=8", "seed=5", "run.name=x")))
     for steps in env_steps:
         save(paths, steps)

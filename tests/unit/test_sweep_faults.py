@@ -112,7 +112,7 @@ def test_room_is_kept_for_the_end_of_a_sweep(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     paths = SweepPaths(tmp_path)
-    files = Report(ended_job(), SweepConfig(), paths, 0.0)
+    files = Report(ended_job(), SweepConfig(), paths, OpenFolder(paths.root, "x"), 0.0)
     files.begin()
     assert read_json(paths.sweep)["status"] == "running"
     assert paths.room.stat().st_blocks * 512 >= 2 * paths.sweep.stat().st_size

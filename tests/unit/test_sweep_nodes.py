@@ -23,6 +23,7 @@ from gmijax.config.sweep import SweepConfig
 from gmijax.errors import BackendUnavailable, ConfigError, NodeLost
 from gmijax.machine.snapshot import Machine
 from gmijax.runs.folder import RunPaths, read_json, write_json
+from gmijax.runs.held import OpenFolder
 from gmijax.supervise.run_gmis import StopSignals
 from gmijax.sweeps import jobs_per_gpu, scheduler
 from gmijax.sweeps.children import Seen
@@ -184,7 +185,9 @@ def test_jobs_of_a_node_that_is_lost_run_again_on_the_other(tmp_path: Path) -> N
     assert {job.progress.node for job in sweep.jobs} == {"a"}
     events = (sweep.paths.job(1).events).read_text()
     assert "no power" in events
-    report = Report(sweep.jobs, sweep.settings, sweep.paths, 1.0)
+    report = Report(
+        sweep.jobs, sweep.settings, sweep.paths, OpenFolder(sweep.paths.root, "x"), 1.0
+    )
     assert report.end("completed") is None
     rows = report.data["jobs"]
     assert [row["node"] for row in rows] == ["a"] * 6

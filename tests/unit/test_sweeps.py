@@ -20,7 +20,7 @@ from gmijax.config.sweep import SweepConfig
 from gmijax.control.console import open_console
 from gmijax.errors import ConfigError
 from gmijax.runs.folder import read_json, write_json
-from gmijax.runs.held import is_locked, locked
+from gmijax.runs.held import OpenFolder, is_locked, locked
 from gmijax.supervise.failures import may_be_anothers
 from gmijax.supervise.run_gmis import StopSignals
 from gmijax.sweeps import jobs_per_gpu
@@ -409,7 +409,7 @@ def test_only_a_run_with_all_its_steps_is_complete(tmp_path: Path) -> None:
 
 def shown_tables(folder: Path, jobs: Sequence[Job], sweep: SweepConfig) -> list[list[list[str]]]:
     """The rows of the tables for people."""
-    report = Report(jobs, sweep, SweepPaths(folder), 0.0)
+    report = Report(jobs, sweep, SweepPaths(folder), OpenFolder(folder, "x"), 0.0)
     assert report.end("completed") is None
     columns = [table.columns for table in tables(report.data, sweep)]
     return [

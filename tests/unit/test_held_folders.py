@@ -1,0 +1,96 @@
+"""A folder that is moved, removed or replaced under the job that writes into it."""
+
+from __future__ import annotations
+
+import errno
+import os
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from gmijax.errors import ConfigError, FolderLost
+from gmijax.learning.checkpoint import save_learner
+from gmijax.runs.folder import RunPaths, add_event, write_json
+from gmijax.runs.held import OpenFolder, locked
+
+
+def replaced(folder: Path) -> None:
+    shutil.rmtree(folder)
+    folder.mkdir()
+
+
+@pytest.mark.parametrize(
+    ("harm", "said"),
+    [
+        (
+            lambda folder: folder.rename(folder.with_name("b")),
+            "was moved to {}/x/b while",
+        ),
+        (
+            lambda folder: folder.parent.rename(folder.parents[1] / "y"),
+            "was moved to {}/y/a while",
+        ),
+        (shutil.rmtree, "was removed or replaced while"),
+        (replaced, "was removed or replaced while"),
+        (lambda folder: (shutil.rmtree(folder), folder.touch()), "was removed or replaced while"),
+    ],
+)
+def test_a_folder_that_is_gone_is_noticed(
+    tmp_path: Path, harm: Callable[[Path], object], said: str
+):
+    folder = tmp_path / "x" / "a"
+    folder.mkdir(parents=True)
+    with locked(folder / ".lock", "run.dir=a") as held:
+        held.require()
+        harm(folder)
+        with pytest.raises(FolderLost, match=f"^run.dir=a: the folder {said.format(tmp_path)}"):
+            held.look()
+
+
+def test_a_folder_that_is_there_is_not_lost(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    folder = tmp_path / "a"
+    folder.mkdir()
+    with OpenFolder(folder, "x") as held:
+        (folder / "file").touch()
+        folder.chmod(0o500)
+        # Moved away and back; and a link to where it is now serves as well.
+        folder.rename(tmp_path / "b")
+        assert not held.is_there()
+        folder.symlink_to("b")
+        held.require()
+
+        def stat(*_: object) -> None:
+            raise OSError(errno.EIO, "the network is gone")
+
+        monkeypatch.setattr(os, "stat", stat)
+        held.require()
+
+
+def test_nothing_makes_a_run_folder_anew_that_is_gone(tmp_path: Path):
+    run = RunPaths(tmp_path / "x" / "run")
+    for write in (
+        lambda: save_learner(run, 7, {"w": np.zeros(3)}),
+        lambda: write_json(run.gmi(0).result, {}),
+        lambda: write_json(run.summary, {}),
+    ):
+        with pytest.raises(FileNotFoundError):
+            write()
+    add_event(run.events, "x")
+    assert not (tmp_path / "x").exists()
+
+
+def test_a_folder_that_cannot_be_written_is_bad_input(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    def refuse(*_: object) -> int:
+        raise OSError(errno.EROFS, "Read-only file system")
+
+    monkeypatch.setattr(os, "open", refuse)
+    with (
+        pytest.raises(ConfigError, match=r"^x: cannot be locked \(Read-only file system\)$"),
+        locked(tmp_path / ".lock", "x"),
+    ):
+        pass
