@@ -1,14 +1,16 @@
-"""A run folder that is moved or removed while a real job writes into it."""
+"""A folder that is moved or removed while a real job writes into it."""
 
 from __future__ import annotations
 
 import shutil
+import subprocess
 from collections.abc import Callable
 from pathlib import Path
 
 import pytest
-from training_jobs import FOREVER, POINT, STEPS, pids_of, start, train, wait_until
+from training_jobs import FOREVER, POINT, POINT_TASK, STEPS, pids_of, start, train, wait_until
 
+from gmijax.runs.dataset import DataPaths
 from gmijax.runs.resume import checkpoints_of
 
 
@@ -17,7 +19,7 @@ def moved(run: Path) -> None:
 
 
 @pytest.mark.timeout(300)
-@pytest.mark.parametrize(("harm", "where"), [(moved, "was moved to"), (shutil.rmtree, "removed")])
+@pytest.mark.parametrize(("harm", "where"), [(moved, "moved to"), (shutil.rmtree, "removed")])
 def test_the_job_ends_and_makes_nothing_anew(
     tmp_path: Path, harm: Callable[[Path], object], where: str
 ) -> None:
@@ -25,11 +27,7 @@ def test_the_job_ends_and_makes_nothing_anew(
     job = start(*POINT, FOREVER, "run.dir='a [1]'", "run.checkpoint_every=20", cwd=tmp_path)
     wait_until(lambda: checkpoints_of(run) or job.poll() is not None, 120, "a checkpoint")
     harm(run)
-    assert job.wait(60) == 1
-    said = (tmp_path / "stderr.txt").read_text()
-    assert len(said.splitlines()) == 1, said
-    assert said.startswith(f"gmijax.train: run.dir={run}: the folder was ")
-    assert where in said
+    require_end(job, tmp_path, f"gmijax.train: run.dir={run}: the folder was {where}")
     assert not run.exists()
     wait_until(lambda: not pids_of(run), 60, "all GMIs gone")
     if harm is moved:  # What was there can be used.
@@ -38,3 +36,39 @@ def test_the_job_ends_and_makes_nothing_anew(
         again = ("run.resume=moved", "run.dir=b", f"num_timesteps={steps}")
         done = train(*again, cwd=tmp_path)
         assert done.returncode == 0, done.stderr
+
+
+@pytest.mark.timeout(300)
+def test_serving_ends_without_its_output_folder(tmp_path: Path) -> None:
+    (tmp_path / "point.py").write_text(POINT_TASK)
+    output = tmp_path / "out"
+    job = start(
+        *("env=point.py:make", "policy=random", "num_envs=16", "unroll_length=4"),
+        *("latency_steps=20", "run.name=x", "output.dir=out", FOREVER),
+        cwd=tmp_path,
+        command="serve",
+    )
+    data = DataPaths(output)
+    wait_until(lambda: data.num_finished(0) or job.poll() is not None, 120, "a shard")
+    output.rename(tmp_path / "moved")
+    require_end(job, tmp_path, f"gmijax.serve: output.dir={output}: the folder was moved to")
+    assert not output.exists()
+
+
+@pytest.mark.timeout(300)
+def test_a_sweep_ends_without_its_folder(tmp_path: Path) -> None:
+    folder = tmp_path / "all"
+    job = start(
+        *POINT, FOREVER, "run.checkpoint_every=20", "seed=0,1", "run.dir=all",
+        cwd=tmp_path, command="sweep",
+    )  # fmt: skip
+    wait_until(lambda: checkpoints_of(folder / "000") or job.poll() is not None, 200, "a job")
+    moved(folder)
+    require_end(job, tmp_path, f"gmijax.sweep: run.dir={folder}: the folder was moved to")
+    assert not folder.exists()
+
+
+def require_end(job: subprocess.Popen[bytes], cwd: Path, said: str) -> None:
+    assert job.wait(90) == 1
+    [line] = (cwd / "stderr.txt").read_text().splitlines()
+    assert line.startswith(said)
