@@ -18,7 +18,7 @@ from gmijax.cli.compose import compose
 from gmijax.config.sweep import SweepConfig
 from gmijax.errors import GmijaxError
 from gmijax.runs.folder import read_json
-from gmijax.runs.held import locked
+from gmijax.runs.held import OpenFolder, locked
 from gmijax.sweeps import report, scheduler
 from gmijax.sweeps.children import Child
 from gmijax.sweeps.jobs import Job, SweepPaths, jobs_of
