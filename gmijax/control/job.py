@@ -182,7 +182,7 @@ class _Job:
             record_end(config, plan, run, status, wall_s, restarts)
 
         def on_tick(gmis: tuple[GmiStatus, ...]) -> None:
-            self._folder.look()
+            self._folder.require()
             progress.update(gmis)
 
         write_json(run.plan, self._plan.to_dict())

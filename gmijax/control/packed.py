@@ -66,8 +66,8 @@ def train_packed(configs: Sequence[TrainConfig], folder: Path, *, show: bool = F
         folders: list[OpenFolder] = []
         notes = list(reasons)
         for own, beginning in zip(configs, beginnings, strict=True):
-            run, changes, folder = held.enter_context(opened(own, beginning))
-            folders.append(folder)
+            run, changes, its_folder = held.enter_context(opened(own, beginning))
+            folders.append(its_folder)
             own = dataclasses.replace(own, physics=config.physics)
             members.append(_Member(started_from(own, beginning.checkpoint), run))
             notes += changes
@@ -92,8 +92,8 @@ def train_packed(configs: Sequence[TrainConfig], folder: Path, *, show: bool = F
         progress = ConsoleProgress(console, new, config.num_timesteps)
 
         def on_tick(status: tuple[GmiStatus, ...]) -> None:
-            for folder in folders:
-                folder.look()
+            for one in folders:
+                one.require()
             progress.update(status)
 
         record = partial(_record, members, started_s)

@@ -236,7 +236,7 @@ def _run(
 
     def on_tick(gmis: tuple[GmiStatus, ...]) -> None:
         for folder in folders:
-            folder.look()
+            folder.require()
         progress.update(gmis)
 
     def record(status: str, plan: Plan) -> None:

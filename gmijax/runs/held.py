@@ -8,7 +8,6 @@ from __future__ import annotations
 import errno
 import fcntl
 import os
-import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -18,9 +17,6 @@ from gmijax.errors import ConfigError, FolderLost
 
 _GONE: Final = (errno.ENOENT, errno.ENOTDIR, errno.ESTALE)
 """Errors of a path that leads nowhere; others, of a network for one, say nothing."""
-
-
-_LOOK_S: Final = 1.0
 
 
 class OpenFolder:
@@ -35,7 +31,7 @@ class OpenFolder:
     """
 
     def __init__(self, root: Path, what: str) -> None:
-        self._root, self._what, self._next_s = root, what, 0.0
+        self._root, self._what = root, what
         # Open, so that no other folder can get its number.
         self._fd = os.open(root, os.O_PATH | os.O_DIRECTORY | os.O_CLOEXEC)
 
@@ -51,13 +47,6 @@ class OpenFolder:
             return os.path.samestat(os.stat(self._root), os.fstat(self._fd))
         except OSError as error:
             return error.errno not in _GONE
-
-    def look(self) -> None:
-        """As `require`, but at most once a second: for whoever asks all the time."""
-        now_s = time.monotonic()
-        if now_s >= self._next_s:
-            self._next_s = now_s + _LOOK_S
-            self.require()
 
     def require(self) -> None:
         """Raises FolderLost, which says where it is now, if its path does not lead to it."""

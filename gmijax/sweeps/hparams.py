@@ -31,7 +31,7 @@ def write_hparams(job: Job, run: RunPaths, objective: str) -> None:
     event: Any = vars(event_pb2)["Event"]  # Made by protobuf at run time.
     tag = f"hparam/{objective}{'' if job.progress.is_full else '_window_not_full'}"
     chosen = {key: _value(text) for key, text in job.overrides.items()}
-    run.tensorboard.mkdir(parents=True, exist_ok=True)
+    run.tensorboard.mkdir(exist_ok=True)
     writer = EventsWriter(str(run.tensorboard / "events"), _SUFFIX)
     for summary in (*hparams(chosen, {tag: value}), scalar(tag, value)):
         writer.write_event(event(wall_time=time.time(), step=steps, summary=summary))

@@ -79,7 +79,7 @@ class Report:
         Raises:
           FolderLost: the sweep's folder is no longer there.
         """
-        self._folder.look()
+        self._folder.require()
         states: list[State] = [job.progress.state for job in self._jobs]
         if states == self._states:
             return

@@ -47,7 +47,7 @@ def test_a_folder_that_is_gone_is_noticed(
         held.require()
         harm(folder)
         with pytest.raises(FolderLost, match=f"^run.dir=a: the folder {said.format(tmp_path)}"):
-            held.look()
+            held.require()
 
 
 def test_a_folder_that_is_there_is_not_lost(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
