@@ -37,7 +37,8 @@ def take_in(given: Any) -> Array:
     if hasattr(given, "detach"):
         given = given.detach().float().contiguous()
         if given.device.type != "cpu":
-            return jnp.from_dlpack(given, copy=True)
+            # Copied by torch, in the order of its own work; jax refuses to copy here.
+            return jnp.from_dlpack(given.clone())
         given = given.numpy()
     return jnp.array(np.asarray(given, np.float32), copy=True)
 
