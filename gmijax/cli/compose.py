@@ -79,7 +79,7 @@ def build(name: str, cls: type[C], overrides: Sequence[str]) -> C:
     """The configuration of a command; raises as `compose`."""
     overrides = readable(name, overrides)
     items = parse(overrides)
-    if cls is ServeConfig and not _names_policy(items):
+    if name == "serve" and not _names_policy(items):
         overrides = [*overrides, "run.dir=last"]
         items = parse(overrides)
     data = compose_dict(name, [*_choices_of_run(name, items), *overrides])
