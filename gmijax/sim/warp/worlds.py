@@ -147,8 +147,8 @@ class Worlds:
         self._keeps_time = "time" in layout.given
         for name, piece in {**layout.given, **layout.taken}.items():
             if name == SWITCHES:
-                part = self._buffer[piece.start : piece.start + piece.size]
-                self._switches = part.reshape(piece.shape)
+                floats = self._buffer[piece.start : piece.start + piece.size]
+                self._switches = floats, self._data.eq_active.flatten()
             else:
                 self._move(self._model if name in leaves else self._data, name, piece)
         self._given: Any = self._buffer[: layout.num_given]
@@ -199,7 +199,7 @@ class Worlds:
         if not self._keeps_time:
             self._data.time.zero_()
         if self._switches is not None:
-            mjx_warp.warp.utils.array_cast(self._switches, self._data.eq_active)
+            mjx_warp.warp.utils.array_cast(*self._switches)
         self._data.overflow.zero_()
         # Rows without a constraint are multiplied by zero, which does not help against infinity.
         self._data.efc.J.zero_()
