@@ -83,10 +83,10 @@ def build(name: str, cls: type[C], overrides: Sequence[str]) -> C:
         overrides = [*overrides, "run.dir=last"]
         items = parse(overrides)
     data = compose_dict(name, [*_choices_of_run(name, items), *overrides])
-    if cls is ServeConfig:
+    if name == "serve":
         _check_task_key(items)
         data = _with_task_of_run(data, items)
-    if cls is TrainConfig:
+    if _COMPOSED.get(name) is TrainConfig:
         _check_task_key(items)
         resume = data["run"].get("resume") if isinstance(data["run"], dict) else None
         if resume == "auto":
