@@ -18,13 +18,22 @@ def moved(run: Path) -> None:
     run.rename(run.with_name("moved"))
 
 
+def removed(run: Path) -> None:
+    while run.exists():  # The job may write into it until all is gone.
+        shutil.rmtree(run, ignore_errors=True)
+
+
 @pytest.mark.timeout(300)
-@pytest.mark.parametrize(("harm", "where"), [(moved, "moved to"), (shutil.rmtree, "removed")])
+@pytest.mark.parametrize(("harm", "where"), [(moved, "moved to"), (removed, "removed")])
 def test_the_job_ends_and_makes_nothing_anew(
-    tmp_path: Path, harm: Callable[[Path], object], where: str
+    tmp_path: Path,
+    harm: Callable[[Path], object],
+    where: str,
+    request: pytest.FixtureRequest,
 ) -> None:
     run = tmp_path / "a [1]"
     job = start(*POINT, FOREVER, "run.dir='a [1]'", "run.checkpoint_every=20", cwd=tmp_path)
+    request.addfinalizer(job.kill)
     wait_until(lambda: checkpoints_of(run) or job.poll() is not None, 120, "a checkpoint")
     harm(run)
     require_end(job, tmp_path, f"gmijax.train: run.dir={run}: the folder was {where}")

@@ -191,7 +191,7 @@ def test_what_is_no_line_of_metrics_is_passed_over(run: RunPaths, tmp_path: Path
     assert (tmp_path / "copy.jsonl").read_text() == good + "\n"
     progress = Progress()
     progress.read(run, SweepConfig())
-    assert progress.value == 1.5
+    assert progress.env_steps == 10
     run.metrics.unlink()
     os.mkfifo(run.metrics)
     assert read_metrics(run.metrics) == []
