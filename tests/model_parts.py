@@ -71,13 +71,6 @@ CASES = (
         "",
     ),
     Case(
-        "armature of actuators",
-        _arm(_MOTOR.format('armature=".02"')),
-        'armature=".02"',
-        "",
-    ),
-    Case("damping of actuators", _arm(_MOTOR.format('damping=".2"')), 'damping=".2"', ""),
-    Case(
         "rangefinders with a camera",
         _looking_down("<geom type='plane' size='5 5 .1'/>", "site='eye' data='dist point'"),
         "data='dist point'",

@@ -14,8 +14,11 @@ import mujoco
 from gmijax.errors import ConfigError
 from gmijax.types import Array
 
-NAMES = ("act", "time", "mocap_pos", "mocap_quat", "eq_active", "qfrc_applied", "xfrc_applied")
-"""Names as in MuJoCo's data. Physics moves the first two, a task all others."""
+NAMES = (
+    *("act", "time", "history"),
+    *("mocap_pos", "mocap_quat", "eq_active", "qfrc_applied", "xfrc_applied"),
+)
+"""Names as in MuJoCo's data. Physics moves the first three, a task all others."""
 
 
 def at_start(mj_model: mujoco.MjModel, given: Mapping[str, Array]) -> dict[str, Array]:
@@ -33,24 +36,28 @@ def at_start(mj_model: mujoco.MjModel, given: Mapping[str, Array]) -> dict[str, 
             raise ConfigError(
                 f"world.start: {name} has shape {jnp.shape(value)}, not {shapes[name]}"
             )
-    needed = {name: jnp.zeros(shapes[name]) for name in _needed(mj_model)}
-    return {name: _typed(name, value) for name, value in (needed | dict(given)).items()}
+    fresh = mujoco.MjData(mj_model)
+    first = {name: getattr(fresh, name) for name in needed(mj_model)}
+    return {name: _typed(name, value) for name, value in (first | dict(given)).items()}
 
 
 def _typed(name: str, value: Array) -> Array:
     return jnp.asarray(value, bool if name == "eq_active" else jnp.float32)
 
 
-def _needed(mj_model: mujoco.MjModel) -> tuple[str, ...]:
-    """What no task could do without: activations, and the time if a sensor shows it."""
+def needed(mj_model: mujoco.MjModel) -> tuple[str, ...]:
+    """What no task could do without: activations, delayed samples, and the time if it is seen."""
     has_clock = (mj_model.sensor_type == mujoco.mjtSensor.mjSENS_CLOCK).any()
-    return (*(("act",) if mj_model.na else ()), *(("time",) if has_clock else ()))
+    has_history = mj_model.nhistory > 0
+    wanted = {"act": mj_model.na > 0, "time": has_clock or has_history, "history": has_history}
+    return tuple(name for name, is_wanted in wanted.items() if is_wanted)
 
 
 def _shapes(mj_model: mujoco.MjModel) -> dict[str, tuple[int, ...]]:
     shapes = (
         (mj_model.na,),
         (),
+        (mj_model.nhistory,),
         (mj_model.nmocap, 3),
         (mj_model.nmocap, 4),
         (mj_model.neq,),

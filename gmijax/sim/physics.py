@@ -28,9 +28,9 @@ from gmijax.sim.kinematic_model import kinematic_model
 from gmijax.sim.many_contacts import warn_of_many
 from gmijax.sim.unsimulated import (
     FULL_NAMES,
+    plain,
     refuse_idle_sensors,
     refuse_parts,
-    without_idle_flags,
 )
 from gmijax.sim.warp.step import WarpStep, moving
 from gmijax.sim.warp.worlds import OVERFLOW, STATE, name_of
@@ -64,7 +64,8 @@ class PhysicsState(NamedTuple):
 
     Attributes:
       act: [na] float32, activations; carried if the model has any.
-      time: [] float32, seconds; carried if a sensor shows it.
+      time: [] float32, seconds; carried if a sensor shows it, or with `history`.
+      history: [nhistory] float32, samples of delayed actuators and sensors; carried if any are.
       mocap_pos: [nmocap, 3] float32, in metres.
       mocap_quat: [nmocap, 4] float32.
       eq_active: [neq] bool, which equality constraints hold.
@@ -78,6 +79,7 @@ class PhysicsState(NamedTuple):
     overflow: Array | None = None
     act: Array | None = None
     time: Array | None = None
+    history: Array | None = None
     mocap_pos: Array | None = None
     mocap_quat: Array | None = None
     eq_active: Array | None = None
@@ -173,8 +175,10 @@ class Physics:
           integration, `qpos` and `qvel` to the moment after it.
         """
         before = {**{name: getattr(state, name) for name in STATE}, **state.carried()}
-        if self.mj_model.na and "act" not in before:
-            raise ConfigError("world.step: the model has activations, and the state does not")
+        if missing := [name for name in carried.needed(self.mj_model) if name not in before]:
+            raise ConfigError(
+                f"world.step: the state has no {missing[0]}, which world.start gives"
+            )
         if self.warp is not None:
             after, reading = self.warp(model, before, ctrl, read)
             overflow = which_overflowed(after.pop(OVERFLOW))
@@ -252,8 +256,8 @@ def from_mj_model(
     contacts (`gmijax.sim.warp.sizes`).
     """
     chosen, _ = choose_impl(impl, jax.default_backend())
+    mj_model, name = plain(mj_model), name_of(mj_model)
     refuse_parts(mj_model, chosen)
-    mj_model, name = without_idle_flags(mj_model), name_of(mj_model)
     with _refusing(mj_model, chosen):
         if chosen == "warp":
             warp = WarpStep.load(mj_model, substeps, warp_sizes)

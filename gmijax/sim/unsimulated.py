@@ -21,6 +21,8 @@ Model: TypeAlias = mujoco.MjModel
 _BOTH: tuple[Impl, ...] = ("jax", "warp")
 _JAX: tuple[Impl, ...] = ("jax",)
 _ENABLE, _DISABLE = mujoco.mjtEnableBit, mujoco.mjtDisableBit
+_OF_JOINTS = (mujoco.mjtTrn.mjTRN_JOINT, mujoco.mjtTrn.mjTRN_JOINTINPARENT)
+_SCALAR = (mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE)
 _SENSOR, _GEOM = mujoco.mjtSensor, mujoco.mjtGeom
 
 WITHOUT_EFFECT = (
@@ -73,14 +75,29 @@ def refuse_idle_sensors(mj_model: Model, rows: int) -> None:
         )
 
 
-def without_idle_flags(mj_model: Model) -> Model:
-    """The same model without the flags of `WITHOUT_EFFECT`; itself where it has none."""
-    if not any(getattr(mj_model.opt, name) & bits for name, bits in WITHOUT_EFFECT):
+def plain(mj_model: Model) -> Model:
+    """An equal model in words that MJX understands; itself where there is nothing to say anew.
+
+    Flags of `WITHOUT_EFFECT` are cleared. Damping and armature of actuators become those of the
+    joints and tendons that they move, times their gears squared.
+    """
+    flags = any(getattr(mj_model.opt, name) & bits for name, bits in WITHOUT_EFFECT)
+    resisting = np.flatnonzero(_resistance(mj_model))
+    if not flags and not len(resisting):
         return mj_model
-    plain = copy.copy(mj_model)
+    same, targets = copy.copy(mj_model), _targets(mj_model)
     for name, bits in WITHOUT_EFFECT:
-        setattr(plain.opt, name, getattr(plain.opt, name) & ~bits)
-    return plain
+        setattr(same.opt, name, getattr(same.opt, name) & ~bits)
+    for k in resisting:
+        gear = same.actuator_gear[same.actuator_outadr[k], 0]
+        of = "dof" if targets[k] < same.nv else "tendon"
+        place = targets[k] - (0 if of == "dof" else same.nv)
+        for kind in ("damping", "dampingpoly", "armature"):
+            own = getattr(same, f"actuator_{kind}")
+            if targets[k] >= 0:  # MuJoCo has none of balls and free bodies.
+                getattr(same, f"{of}_{kind}")[place] += own[k] * gear**2
+            own[k] = 0.0
+    return same
 
 
 FULL_NAMES: dict[Impl, str] = {"jax": "MJX-JAX", "warp": "MuJoCo Warp"}
@@ -96,6 +113,23 @@ def _senses(*types: mujoco.mjtSensor) -> Callable[[Model], Any]:
 
 def _any(*names: str) -> Callable[[Model], bool]:
     return lambda m: any(bool(np.any(getattr(m, name))) for name in names)
+
+
+def _resistance(m: Model) -> Any:
+    """[nactuator] bool: whether an actuator has damping or armature of its own."""
+    polynomials = (m.actuator_dampingpoly != 0).any(axis=1)
+    return (m.actuator_damping != 0) | polynomials | (m.actuator_armature != 0)
+
+
+def _targets(m: Model) -> Any:
+    """[nactuator] what actuators move by their gears: a dof, nv plus a tendon, -1 for others."""
+    numbers = m.actuator_trnid[:, 0]
+    if not m.njnt:
+        return np.full(m.nactuator, -1)
+    joints = np.clip(numbers, 0, m.njnt - 1)
+    of_joint = np.isin(m.actuator_trntype, _OF_JOINTS) & np.isin(m.jnt_type[joints], _SCALAR)
+    of_tendon = m.actuator_trntype == mujoco.mjtTrn.mjTRN_TENDON
+    return np.where(of_joint, m.jnt_dofadr[joints], np.where(of_tendon, m.nv + numbers, -1))
 
 
 def _disabled_actuators(m: Model) -> Any:
@@ -146,7 +180,7 @@ def _touch_in_cylinders(m: Model) -> Any:
 
 PARTS: tuple[Part, ...] = (
     Part(_BOTH, "plugins", lambda m: m.nplugin, "none"),
-    Part(_BOTH, "delay of actuators or sensors", lambda m: m.nhistory, "none"),
+    Part(_JAX, "delay of actuators or sensors", lambda m: m.nhistory, "none"),
     Part(_BOTH, 'flag sleep="enable"', _enables(_ENABLE.mjENBL_SLEEP), "disable"),
     Part(_BOTH, 'flag override="enable"', _enables(_ENABLE.mjENBL_OVERRIDE), "disable"),
     Part(_BOTH, 'flag diagexact="enable"', _enables(_ENABLE.mjENBL_DIAGEXACT), "disable"),
@@ -158,23 +192,11 @@ PARTS: tuple[Part, ...] = (
     ),
     Part(
         _BOTH,
-        "damping of actuators",
-        _any("actuator_damping", "actuator_dampingpoly"),
-        "that of joints and tendons: damping times gear squared",
-    ),
-    Part(
-        _BOTH,
-        "armature of actuators",
-        _any("actuator_armature"),
-        "that of joints and tendons: armature times gear squared",
-    ),
-    Part(
-        _BOTH,
         "actuatorgroupdisable of actuators that are there",
         _disabled_actuators,
         "to leave these actuators out",
     ),
-    Part(_BOTH, "rangefinders with a camera or data of their own", _ranges_from_cameras, "a site"),
+    Part(_JAX, "rangefinders with a camera or data of their own", _ranges_from_cameras, "a site"),
     Part(
         _JAX,
         'integrator="implicit" or "discrete"',

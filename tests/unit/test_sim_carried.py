@@ -135,7 +135,7 @@ def test_a_start_knows_names_and_shapes_of_what_is_carried():
 def test_a_state_without_the_activations_of_its_model_is_refused():
     world = world_with('<general joint="a" dyntype="filter" dynprm="0.1"/>')
     forgetful = PhysicsState(*jnp.zeros((3, 1)))
-    with pytest.raises(ConfigError, match="the model has activations, and the state does not"):
+    with pytest.raises(ConfigError, match="the state has no act, which world"):
         jax.eval_shape(world.step, world.model, forgetful, jnp.zeros(1))
 
 

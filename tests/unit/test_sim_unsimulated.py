@@ -12,7 +12,7 @@ from mujoco import mjx
 
 from gmijax.errors import ConfigError
 from gmijax.sim.physics import from_mj_model
-from gmijax.sim.unsimulated import PARTS, WITHOUT_EFFECT, refuse_parts, without_idle_flags
+from gmijax.sim.unsimulated import PARTS, WITHOUT_EFFECT, plain, refuse_parts
 
 _BY_NAME = {case.part: case for case in CASES}
 
@@ -50,10 +50,10 @@ def test_a_part_that_matters_is_refused_by_name(case: Case):
 
 
 def test_what_every_model_has_is_not_refused():
-    plain = mujoco.MjModel.from_xml_string("<mujoco/>")
+    nothing = mujoco.MjModel.from_xml_string("<mujoco/>")
     for impl in ("jax", "warp"):
-        refuse_parts(plain, impl)
-    assert without_idle_flags(plain) is plain
+        refuse_parts(nothing, impl)
+    assert plain(nothing) is nothing
 
 
 _IDLE = (
@@ -73,11 +73,43 @@ def test_flags_that_change_no_step_are_taken(flag: str, value: str):
     )
     asked = mujoco.MjModel.from_xml_string(text)
     world = from_mj_model(asked, impl="jax", substeps=1)
-    plain = world.mj_model
+    taken = world.mj_model
     for name, bits in WITHOUT_EFFECT:
-        assert not getattr(plain.opt, name) & bits
+        assert not getattr(taken.opt, name) & bits
     assert (asked.opt.enableflags, asked.opt.disableflags) != (0, 0)
-    np.testing.assert_array_equal(moved_in_c(asked, "qpos"), moved_in_c(plain, "qpos"))
+    np.testing.assert_array_equal(moved_in_c(asked, "qpos"), moved_in_c(taken, "qpos"))
+
+
+RESISTING = """<mujoco><option integrator="{}"/><worldbody><body><joint name="a" axis="0 1 0"
+damping=".1" armature=".01"/><geom type="capsule" fromto="0 0 0 .5 0 0" size=".03" mass="1"
+contype="0"/><body pos=".5 0 0"><joint name="b" axis="0 1 0"/><geom type="capsule"
+fromto="0 0 0 .5 0 0" size=".03" mass="1" contype="0"/></body></body></worldbody>
+<tendon><fixed name="t"><joint joint="a" coef="1"/><joint joint="b" coef="-2"/></fixed></tendon>
+<actuator><motor joint="a" gear="3" {}/><motor {} gear="2" damping=".05"/></actuator></mujoco>"""
+
+
+@pytest.mark.parametrize("integrator", ["Euler", "implicitfast", "RK4"])
+@pytest.mark.parametrize("more", ['damping=".2"', 'armature=".02"', 'damping=".1" armature=".1"'])
+@pytest.mark.parametrize("other", ['joint="b"', 'tendon="t"', 'jointinparent="b"'])
+def test_damping_and_armature_of_actuators_become_those_of_joints_and_tendons(
+    integrator: str, more: str, other: str
+):
+    asked = mujoco.MjModel.from_xml_string(RESISTING.format(integrator, more, other))
+    taken = plain(asked)
+    assert not taken.actuator_damping.any()
+    assert not taken.actuator_armature.any()
+    for impl in ("jax", "warp"):
+        refuse_parts(taken, impl)
+    # Of tendons MuJoCo integrates damping implicitly, of actuators on tendons too or not.
+    np.testing.assert_allclose(moved_in_c(asked, "qpos"), moved_in_c(taken, "qpos"), atol=1e-9)
+
+
+def test_a_polynomial_of_an_actuators_damping_is_still_one():
+    text = RESISTING.format("Euler", 'damping="1 2"', 'joint="b"')
+    taken = plain(mujoco.MjModel.from_xml_string(text))
+    refuse_parts(taken, "warp")
+    with pytest.raises(ConfigError, match="polynomials of stiffness or damping"):
+        refuse_parts(taken, "jax")
 
 
 def test_a_sensor_that_nothing_would_fill_is_refused():

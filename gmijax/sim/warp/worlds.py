@@ -22,7 +22,7 @@ Shapes: TypeAlias = tuple[tuple[str, tuple[int, ...]], ...]
 STATE = ("qpos", "qvel", "qacc_warmstart")
 """Arrays of the data that every model has; they go in and come out."""
 
-MOVED = ("act", "time")
+MOVED = ("act", "time", "history")
 """Those that go in and come out where they are carried (see `gmijax.sim.carried`)."""
 
 SWITCHES = "eq_active"
