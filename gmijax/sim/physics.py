@@ -26,9 +26,9 @@ from gmijax.sim.impl import ON_GPU, Impl, WarpSizes, choose_impl
 from gmijax.sim.interface import OVERFLOWS, Env, EnvSpec, EnvState
 from gmijax.sim.kinematic_model import kinematic_model
 from gmijax.sim.many_contacts import warn_of_many
+from gmijax.sim.plain_model import plain
 from gmijax.sim.unsimulated import (
     FULL_NAMES,
-    plain,
     refuse_idle_sensors,
     refuse_parts,
 )

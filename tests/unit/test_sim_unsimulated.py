@@ -12,7 +12,8 @@ from mujoco import mjx
 
 from gmijax.errors import ConfigError
 from gmijax.sim.physics import from_mj_model
-from gmijax.sim.unsimulated import PARTS, WITHOUT_EFFECT, plain, refuse_parts
+from gmijax.sim.plain_model import WITHOUT_EFFECT, plain
+from gmijax.sim.unsimulated import PARTS, refuse_parts
 
 _BY_NAME = {case.part: case for case in CASES}
 
