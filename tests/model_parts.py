@@ -78,6 +78,13 @@ CASES = (
         "sensordata",
         is_ignored=False,
     ),
+    Case(
+        "no joint",
+        "<mujoco><worldbody><body><geom size='.1'/></body></worldbody></mujoco>",
+        "<body>",
+        "<body><joint/>",
+        is_ignored=False,
+    ),
     Case("noslip_iterations", _block('noslip_iterations="20"'), 'noslip_iterations="20"', ""),
     Case(
         'fluidshape="ellipsoid"',

@@ -268,7 +268,7 @@ def from_mj_model(
         model = mjx.put_model(mj_model, impl="jax")
         # It finds what `put_model` does not.
         data = jax.eval_shape(lambda: mjx.make_data(model))
-    refuse_idle_sensors(mj_model, data._impl.nefc)
+    refuse_idle_sensors(mj_model, data._impl.ncon, data._impl.nefc)
     warn_of_many(name, chosen, data._impl.ncon, data._impl.nefc)
     return Physics(chosen, mj_model, model, substeps)
 

@@ -49,18 +49,31 @@ def refuse_parts(mj_model: Model, impl: Impl) -> None:
             )
 
 
-def refuse_idle_sensors(mj_model: Model, rows: int) -> None:
-    """Raises ConfigError for sensors that MJX-JAX leaves at zero for want of any `rows`."""
+def refuse_idle_sensors(mj_model: Model, contacts: int, rows: int) -> None:
+    """Raises ConfigError for sensors that MJX-JAX cannot fill.
+
+    Args:
+      mj_model: the model.
+      contacts: all that MJX-JAX can make; without any it fails over sensors of them.
+      rows: of constraints; without any it leaves sensors of forces at zero.
+    """
+    touches = np.isin(mj_model.sensor_type, (_SENSOR.mjSENS_TOUCH, _SENSOR.mjSENS_CONTACT))
     needs = mj_model.sensor_needstage == mujoco.mjtStage.mjSTAGE_ACC
-    if not rows and needs.any():
-        first = mj_model.sensor(int(np.flatnonzero(needs)[0]))
-        kind = mujoco.mjtSensor(int(first.type[0])).name.removeprefix("mjSENS_").lower()
-        raise ConfigError(
-            f"model: sensors of forces and accelerations (the first is {first.name or kind}) in a "
-            "model without limits, contacts, friction and equalities, which MJX-JAX "
-            "(physics.impl=jax) leaves at zero; allowed is at least one of these, such as a wide "
-            "range of a joint"
-        )
+    for idle, lack, instead in (
+        (touches & (contacts == 0), "geoms that may collide", "at least one pair of them"),
+        (
+            needs & (rows == 0),
+            "limits, contacts, friction and equalities",
+            "one of these, such as a wide range of a joint",
+        ),
+    ):
+        if idle.any():
+            first = mj_model.sensor(int(np.flatnonzero(idle)[0]))
+            kind = mujoco.mjtSensor(int(first.type[0])).name.removeprefix("mjSENS_").lower()
+            raise ConfigError(
+                f"model: a sensor of forces ({first.name or kind}) in a model without {lack}, "
+                f"which MJX-JAX (physics.impl=jax) cannot fill; allowed is {instead}"
+            )
 
 
 FULL_NAMES: dict[Impl, str] = {"jax": "MJX-JAX", "warp": "MuJoCo Warp"}
@@ -143,6 +156,7 @@ PARTS: tuple[Part, ...] = (
         "to leave these actuators out",
     ),
     Part(_JAX, "rangefinders with a camera or data of their own", _ranges_from_cameras, "a site"),
+    Part(_JAX, "no joint", lambda m: not m.nv, "at least one"),
     Part(
         _JAX,
         'integrator="implicit" or "discrete"',

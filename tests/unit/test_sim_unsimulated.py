@@ -51,7 +51,8 @@ def test_a_part_that_matters_is_refused_by_name(case: Case):
 
 
 def test_what_every_model_has_is_not_refused():
-    nothing = mujoco.MjModel.from_xml_string("<mujoco/>")
+    text = "<mujoco><worldbody><body><joint/><geom size='.1'/></body></worldbody></mujoco>"
+    nothing = mujoco.MjModel.from_xml_string(text)
     for impl in ("jax", "warp"):
         refuse_parts(nothing, impl)
     assert plain(nothing) is nothing
@@ -119,10 +120,21 @@ def test_a_sensor_that_nothing_would_fill_is_refused():
         '</worldbody><actuator><motor name="m" joint="a"/></actuator><sensor><actuatorpos '
         'actuator="m"/><actuatorfrc name="pull" actuator="m"/></sensor></mujoco>'
     )
-    with pytest.raises(ConfigError, match=r"the first is pull\) in a model without limits"):
+    with pytest.raises(ConfigError, match=r"sensor of forces \(pull\) in a model without limits"):
         from_mj_model(mujoco.MjModel.from_xml_string(text.format("")), impl="jax", substeps=1)
     limited = mujoco.MjModel.from_xml_string(text.format('range="-180 180"'))
     from_mj_model(limited, impl="jax", substeps=1)
+
+
+def test_a_sensor_of_contacts_where_nothing_collides_is_refused():
+    text = (
+        '<mujoco><worldbody><geom type="plane" size="1 1 1" contype="{0}"/><body><joint range="0 9'
+        '"/><geom size=".1" contype="0"/><site name="s"/></body></worldbody><sensor><touch '
+        'site="s"/></sensor></mujoco>'
+    )
+    with pytest.raises(ConfigError, match=r"\(touch\) in a model without geoms that may collide"):
+        from_mj_model(mujoco.MjModel.from_xml_string(text.format(0)), impl="jax", substeps=1)
+    from_mj_model(mujoco.MjModel.from_xml_string(text.format(1)), impl="jax", substeps=1)
 
 
 def moved_by_mjx(mj_model: mujoco.MjModel, reads: str) -> np.ndarray:
