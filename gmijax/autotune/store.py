@@ -20,7 +20,7 @@ from typing import Any
 
 from gmijax.autotune.grid import Measured, NotRunnable, Point
 from gmijax.config.schema import require_positive
-from gmijax.errors import ConfigError
+from gmijax.errors import ConfigError, GmijaxError
 from gmijax.runs.folder import read_json, write_json
 
 _DIGEST_LENGTH = 10
@@ -58,7 +58,11 @@ class ProfileStore:
         return _result(record) if record else None
 
     def put(self, mode: str, point: Point, result: Measured | NotRunnable, wall_s: float) -> None:
-        """Keeps what a point did, in the file too; raises ConfigError if that cannot be."""
+        """Keeps what a point did, in the file too.
+
+        Raises:
+          GmijaxError: the file cannot be written, e.g. because the disk is full by now.
+        """
         if isinstance(result, NotRunnable):
             said = {"not_runnable": result.reason, "limit_s": result.limit_s, "wall_s": wall_s}
         else:
@@ -70,7 +74,7 @@ class ProfileStore:
                 self._records = {**self._records, **self._load(), _name(mode, point): record}
                 write_json(self.path, {"key": self._key, "profiles": self._records})
         except OSError as error:
-            raise ConfigError(
+            raise GmijaxError(
                 f"search.store={self.path.parent}: cannot be written ({error.strerror})"
             ) from None
 

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import errno
 import json
+import os
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
@@ -10,7 +12,7 @@ import pytest
 
 from gmijax.autotune.grid import Measured, NotRunnable, Point
 from gmijax.autotune.store import ProfileStore
-from gmijax.errors import ConfigError
+from gmijax.errors import ConfigError, GmijaxError
 
 KEY = {"device": "NVIDIA H200, 143771 MiB", "task": "ant", "versions": {"jax": "0.11.2"}}
 POINT = Point(4, 2048, "jax")
@@ -84,6 +86,21 @@ def test_a_folder_that_cannot_be_used_is_bad_input(tmp_path: Path):
     (tmp_path / "file").write_text("")
     with pytest.raises(ConfigError, match=r"search\.store=.*file/x: cannot be used"):
         store(tmp_path / "file" / "x")
+
+
+@pytest.mark.parametrize("number", [errno.ENOSPC, errno.EROFS])
+def test_a_disk_that_gets_full_while_a_search_runs_is_no_bad_input(
+    number: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    found, _ = store(tmp_path)
+
+    def write(*_: object) -> None:
+        raise OSError(number, os.strerror(number))
+
+    monkeypatch.setattr("gmijax.autotune.store.write_json", write)
+    with pytest.raises(GmijaxError, match=os.strerror(number)) as raised:
+        found.put("corun", POINT, MEASURED, 1.0)
+    assert not isinstance(raised.value, ConfigError)
 
 
 def test_files_of_versions_without_trainers_can_be_read(tmp_path: Path):
