@@ -124,8 +124,12 @@ def _ranges_from_cameras(m: Model) -> Any:
 
 
 def _ranges_of_unseen_geoms(m: Model) -> Any:
-    unseen = (_GEOM.mjGEOM_CYLINDER, _GEOM.mjGEOM_HFIELD, _GEOM.mjGEOM_SDF)
-    return len(_sensors_of(m, _SENSOR.mjSENS_RANGEFINDER)) and np.isin(m.geom_type, unseen).any()
+    """A range finder sees no geoms of its own body."""
+    unseen = np.isin(m.geom_type, (_GEOM.mjGEOM_CYLINDER, _GEOM.mjGEOM_HFIELD, _GEOM.mjGEOM_SDF))
+    found = _sensors_of(m, _SENSOR.mjSENS_RANGEFINDER)
+    sites = found[m.sensor_objtype[found] == mujoco.mjtObj.mjOBJ_SITE]
+    own = m.site_bodyid[m.sensor_objid[sites]]
+    return (m.geom_bodyid[unseen][:, None] != own).any()
 
 
 def _ranges_without_materials(m: Model) -> Any:

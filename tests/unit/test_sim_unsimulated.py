@@ -126,6 +126,14 @@ def test_a_sensor_that_nothing_would_fill_is_refused():
     from_mj_model(limited, impl="jax", substeps=1)
 
 
+def test_a_rangefinder_may_be_on_a_body_with_a_cylinder():
+    (case,) = (case for case in CASES if case.part == "rangefinders beside cylinders")
+    own = case.with_it.replace(case.old, "").replace(
+        "<site name='eye'", "<geom type='cylinder' size='.1 .1' contype='0'/><site name='eye'"
+    )
+    refuse_parts(mujoco.MjModel.from_xml_string(own), "jax")
+
+
 def test_a_sensor_of_contacts_where_nothing_collides_is_refused():
     text = (
         '<mujoco><worldbody><geom type="plane" size="1 1 1" contype="{0}"/><body><joint range="0 9'
