@@ -36,8 +36,9 @@ def at_start(mj_model: mujoco.MjModel, given: Mapping[str, Array]) -> dict[str, 
             raise ConfigError(
                 f"world.start: {name} has shape {jnp.shape(value)}, not {shapes[name]}"
             )
-    fresh = mujoco.MjData(mj_model)
-    first = {name: getattr(fresh, name) for name in needed(mj_model)}
+    missing = [name for name in needed(mj_model) if name not in given]
+    fresh = mujoco.MjData(mj_model) if missing else None
+    first = {name: getattr(fresh, name) for name in missing}
     return {name: _typed(name, value) for name, value in (first | dict(given)).items()}
 
 
