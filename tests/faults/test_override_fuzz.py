@@ -34,8 +34,8 @@ _SEED = int(os.environ.get("GMIJAX_FUZZ_SEED", random.randrange(2**32) if _MORE 
 _ADDRESS_SPACE_BYTES = 4 * 2**30
 """Beside what the test process has: a line that takes more memory fails, and hurts nobody."""
 
-_FEW = {"sweep": 10, "doctor": 60, "list-envs": 60}
-"""Lines without GMIJAX_FUZZ_EXAMPLES where they are not 25: hydra takes long for a sweep."""
+_FEW = {"sweep": 8, "play": 30, "export": 30, "doctor": 60, "list-envs": 60}
+"""Lines without GMIJAX_FUZZ_EXAMPLES where they are not 16: hydra takes long for a sweep."""
 
 _MACHINES = (
     CPU,
@@ -79,7 +79,7 @@ def test_any_line_is_taken_or_refused_in_one_line(command: str, folder: Path) ->
 
     @seed(_SEED)
     @settings(
-        max_examples=int(_MORE) if _MORE else _FEW.get(command, 25),
+        max_examples=int(_MORE) if _MORE else _FEW.get(command, 16),
         deadline=None,
         database=None,
         suppress_health_check=list(HealthCheck),
