@@ -252,11 +252,11 @@ def faults() -> list[str]:
 def faults_on_a_cpu() -> list[str]:
     """Faults of every command, and how many came to something else than they must."""
     groups: dict[str, list[Mapping[str, Any]]] = {}
-    for row in results_of("faults-cpu").get("rows", ()):
+    for row in _rows_of_faults():
         groups.setdefault(row["group"], []).append(row)
     rows = []
     for group, found in sorted(groups.items()):
-        trials = {row["trial"]: row for row in found}.values()
+        trials = {row["trial"]: row for row in found}.values()  # One may have several faults.
         unexpected = sum(row["outcome"] != "as wanted" for row in found)
         sums = (sum(len(row[what]) for row in trials) for what in ("lost", "leaked"))
         seconds = shown(figure([row["seconds"] for row in found]), ".0f")
@@ -264,6 +264,15 @@ def faults_on_a_cpu() -> list[str]:
         rows.append([group, *map(str, (kinds, len(found), unexpected, *sums)), seconds])
     head = "faults of | kinds: | faults: | unexpected: | lost: | leaked: | seconds a fault:"
     return [*markdown(head, rows), *source("faults-cpu")]
+
+
+def _rows_of_faults() -> Iterator[Mapping[str, Any]]:
+    """Of all calls of the newest commit, each with seeds of its own."""
+    path = RESULTS / "faults-cpu.json"
+    calls = read_calls(path) if path.exists() else []
+    for call in (one for one in calls if one.commit == calls[-1].commit):
+        for row in call.results.get("rows", ()):
+            yield {**row, "trial": (call.date, row["trial"])}
 
 
 def sm_shares() -> list[str]:
