@@ -76,14 +76,14 @@ def _sum(path: Path) -> tuple[int, int]:
     return len(data), zlib.crc32(data)
 
 
-def events_of(run: Path, event: str) -> list[dict[str, Any]]:
-    """Events of a run; what is half written is none."""
+def events_of(run: Path, event: str | None = None) -> list[dict[str, Any]]:
+    """Events of a run, of one kind or all; what is half written is none."""
     found: list[dict[str, Any]] = []
     with suppress(OSError):
         for line in (run / "events.jsonl").read_text().splitlines():
             with suppress(ValueError):
                 found.append(json.loads(line))
-    return [line for line in found if line.get("event") == event]
+    return [line for line in found if event is None or line.get("event") == event]
 
 
 def not_one_line(said: str, verb: str) -> list[str]:

@@ -18,7 +18,7 @@ from typing import Any
 
 import fault_checks
 import numpy as np
-from fault_checks import newest_whole
+from fault_checks import events_of, newest_whole
 from fault_damage import add_copies, copies_in, damage_checkpoint, damage_entries
 from fault_disks import disk_of
 from fault_plan import CHECKPOINT_EVERY, ITERATIONS, KINDS, Fault
@@ -26,7 +26,6 @@ from fault_processes import MARKER, STALL, processes_of, send
 from fault_report import Came, Report
 from training_jobs import POINT, POINT_TASK, STEPS, child_environment, learner_arrays, wait_until
 
-from gmijax.runs.history import read_metrics
 
 LIMIT_S = 120.0
 """Of what is waited for after a command; on an idle machine it takes seconds."""
@@ -187,7 +186,7 @@ class _Job:
                 self.lost.append(f"{fault} and then {start}")
 
     def _new_events(self) -> list[dict[str, Any]]:
-        events = read_metrics(self._run / "events.jsonl")  # What is half written: `fault_checks`.
+        events = events_of(self._run)
         new, self._events_seen = events[self._events_seen :], len(events)
         return new
 

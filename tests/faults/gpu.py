@@ -20,7 +20,6 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from gmijax.runs.history import read_metrics
 from tests.training_jobs import heartbeat_of, pids_of, wait_until
 
 OVERRIDES = (
@@ -57,8 +56,7 @@ class Job:
 
     def events(self, event: str) -> list[dict[str, Any]]:
         """Those of a kind so far."""
-        found = read_metrics(self.run / "events.jsonl")
-        return [line for line in found if line["event"] == event]
+        return [line for line in _events(self.run) if line["event"] == event]
 
     def wait(self, condition: Callable[[], Any], what: str) -> Any:
         """As `wait_until`, while the job runs."""
@@ -135,6 +133,11 @@ def harm(job: Job, name: str, act: Callable[[Job, int], None], gmi: int) -> dict
     return row
 
 
+def _events(run: Path) -> list[dict[str, Any]]:
+    lines = (run / "events.jsonl").read_text().splitlines()
+    return [json.loads(line) for line in lines]
+
+
 def _stacks(run: Path) -> str:
     logs = [path.read_text() for path in run.glob("gmi_*/attempt_*/stderr.log")]
     return "".join(text[-1500:] for text in logs if "most recent call first" in text)
@@ -167,7 +170,7 @@ def main() -> int:
                 "exit_code": code,
                 "plan": json.loads((job.run / "plan.json").read_text())["reasons"],
                 "left": pids_of(job.run),
-                "events": read_metrics(job.run / "events.jsonl")[-400:],
+                "events": _events(job.run)[-400:],
                 "log": (Path(folder) / "job.log").read_text()[-3000:],
                 "stacks": _stacks(job.run)[:4000],
             }
