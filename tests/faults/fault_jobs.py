@@ -26,7 +26,6 @@ from fault_processes import MARKER, STALL, processes_of, send
 from fault_report import Came, Report
 from training_jobs import POINT, POINT_TASK, STEPS, child_environment, learner_arrays, wait_until
 
-
 LIMIT_S = 120.0
 """Of what is waited for after a command; on an idle machine it takes seconds."""
 

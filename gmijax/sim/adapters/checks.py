@@ -144,10 +144,10 @@ def _check_state(env: Env, state: Any, key: jax.ShapeDtypeStruct, what: str) -> 
 
 def _check_qpos(env: Env, state: EnvState, what: str) -> None:
     shape = attempt(f"{what}: qpos", jax.eval_shape, env.qpos, state).shape
-    size = None if env.mj_model is None else env.mj_model.nq
-    known = [] if size is None else [(size,), (size + 7 * env.mj_model.nmocap,)]
+    model = env.mj_model
+    known = [] if model is None else [(model.nq,), (model.nq + 7 * model.nmocap,)]
     if len(shape) != 1 or (known and shape not in known):
-        wanted = "a vector" if size is None else f"({size},)"
+        wanted = f"{known[0]}" if known else "a vector"
         raise ConfigError(f"{what}: qpos has shape {shape}, not {wanted}")
 
 
