@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ctypes
 import os
 import signal
 import sys
@@ -163,12 +164,20 @@ def mps_client(link: ChildLink) -> None:
     train(link)
 
 
+def mps_client_in_a_call(link: ChildLink) -> None:
+    """A client of the fake MPS daemon that a call of C holds, with all threads of Python."""
+    client = Path(os.environ[PIPE_VARIABLE]) / "clients" / str(os.getpid())
+    link.beat("ready", 0)
+    client.touch()
+    ctypes.PyDLL(None).sleep(600)
+
+
 MODES: dict[str, Callable[[ChildLink], None]] = {
     mode.__name__: mode
     for mode in (
         *(clean, train, deaf, stubborn, busy, exit_3, raise_value_error, raise_config_error),
         *(lose_peer, wait_in_vain, die_late, die_soon, stall, silent, mps_client, linger),
-        exit_beside_stopped,
+        *(exit_beside_stopped, mps_client_in_a_call),
     )
 }
 

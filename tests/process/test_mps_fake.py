@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 import os
 import pickle
-import signal
 import subprocess
 import sys
 import time
@@ -14,7 +13,6 @@ from contextlib import ExitStack, closing
 from pathlib import Path
 
 import pytest
-from fake_gmi import has_stopped
 from fake_mps import FakeMps
 from supervision import TESTS, gpu, machine, make_launch, planned
 from training_jobs import wait_until
@@ -309,27 +307,29 @@ def test_janitor_cleans_up_after_a_killed_controller(mps: FakeMps, run: RunPaths
         controller = subprocess.Popen(
             [
                 *(sys.executable, str(TESTS / "fake_controller.py"), str(run.root), "mps"),
-                *("mps_client", "mps_client"),
+                *("mps_client_in_a_call", "mps_client"),
             ],
             stderr=log,
         )
     try:
         clients = _wait_for_clients(mps, 2)
+        [held] = [client.pid for client in clients if b"GMIJAX_GMI=0" in _environment_of(client)]
         [directory] = mps.pipe_directories()
         daemon = identify(MpsControl(mps.program, directory).daemon_pid() or 0)
         assert daemon is not None
-        os.kill(clients[0].pid, signal.SIGSTOP)
-        # Before, another thread of it could see that the controller is gone, and end it.
-        wait_until(lambda: has_stopped(clients[0].pid), 60, "a GMI is stopped")
     finally:
         controller.kill()
         controller.wait()
-    # The stopped GMI gets 8 s to end by itself before the janitor kills it.
+    # The held GMI gets 8 s to end by itself before the janitor kills it.
     assert not wait_until_gone([*clients, daemon], timeout_s=90)
     wait_until(lambda: not directory.exists(), 60, "its folder is gone")
     assert len(mps.told("quit")) == 1
     # The other one has ended by itself.
-    assert [int(client) for _, client in mps.told("terminate_client")] == [clients[0].pid]
+    assert [int(client) for _, client in mps.told("terminate_client")] == [held]
+
+
+def _environment_of(process: ProcessId) -> list[bytes]:
+    return Path(f"/proc/{process.pid}/environ").read_bytes().split(b"\0")
 
 
 def _wait_for_clients(mps: FakeMps, number: int) -> list[ProcessId]:
