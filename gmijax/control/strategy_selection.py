@@ -84,6 +84,7 @@ def with_measured(plan: Plan, machine: Machine, num_floats: int, intra: str = "a
         found = {probe.name: row for probe, row in zip(probes, rows, strict=True)}
         source = "measured now"
         with suppress(OSError):  # Without a place to keep them, the next job measures again.
+            kept.parent.mkdir(parents=True, exist_ok=True)
             write_json(kept, found)
     return _with_fastest(plan, probes, found, source)
 

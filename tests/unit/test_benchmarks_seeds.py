@@ -33,7 +33,8 @@ def write_sweep(folder: Path, finals: Mapping[str, float], status: str = "comple
         run = folder / f"{number:03d}"
         run.mkdir(parents=True)
         rewards = [1.0] * 20 + [final] * 20
-        text = "".join(json.dumps({"reward_per_step": value}) + "\n" for value in rewards)
+        lines = [{"env_steps": k, "reward_per_step": reward} for k, reward in enumerate(rewards)]
+        text = "".join(json.dumps(line) + "\n" for line in lines)
         (run / "metrics.jsonl").write_text(text)
         job = {"overrides": {"seed": seed}, "wall_s": 5.0, "state": "completed"}
         jobs.append({**job, "run_dir": f"/elsewhere/{run.name}"})
