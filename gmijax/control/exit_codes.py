@@ -3,11 +3,16 @@
 from __future__ import annotations
 
 import errno
+import signal
 import sys
-from collections.abc import Callable
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from types import FrameType
 from typing import Final
 
 from gmijax.errors import ConfigError, GmijaxError, JobInterrupted
+from gmijax.supervise.run_gmis import STOP_SIGNALS
 
 EXIT_OK: Final = 0
 EXIT_FAILED: Final = 1
@@ -21,7 +26,8 @@ _OF_DISKS: Final = (errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EIO)
 def exit_code_of(name: str, run: Callable[[], object]) -> int:
     """Runs the command `name` and turns every error into its exit code."""
     try:
-        run()
+        with _interrupted_by_signals():
+            run()
         return EXIT_OK
     except ConfigError as error:
         _complain(name, error)
@@ -37,6 +43,29 @@ def exit_code_of(name: str, run: Callable[[], object]) -> int:
             raise  # It may be a fault of gmijax.
         _complain(name, f"{error.filename or 'a file'}: {error.strerror}")
         return EXIT_FAILED
+
+
+@contextmanager
+def _interrupted_by_signals() -> Iterator[None]:
+    """Has all signals that ask for an end do what Ctrl-C does, until a job hears them itself.
+
+    What is ignored stays ignored, as by `nohup`.
+    """
+    default = {
+        number: signal.signal(number, _interrupt)
+        for number in STOP_SIGNALS
+        if threading.current_thread() is threading.main_thread()
+        and signal.getsignal(number) is signal.SIG_DFL
+    }
+    try:
+        yield
+    finally:
+        for number, handler in default.items():
+            signal.signal(number, handler)
+
+
+def _interrupt(_number: int, _frame: FrameType | None) -> None:
+    raise KeyboardInterrupt
 
 
 def _complain(name: str, what: object) -> None:

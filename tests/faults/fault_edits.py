@@ -68,6 +68,8 @@ def _run(kind: EditKind, draw: random.Random, scratch: Path, fixtures: Path) -> 
     wrong = []
     if kind.says not in said + shown:
         wrong.append(f"{what}: {kind.says} is not in {said[-300:]} {shown[-300:]}")
+    if kind.holds and kind.holds not in file.read_text():
+        wrong.append(f"{what}: {kind.holds} is not kept")
     if code not in ((0, 2) if kind.code is None else (kind.code,)):
         wrong.append(f"{what}: exit code {code}: {said[-600:]}")
     elif code == 2:
@@ -77,7 +79,7 @@ def _run(kind: EditKind, draw: random.Random, scratch: Path, fixtures: Path) -> 
         wrong += [f"lost: {what}: refused, but {path} is not as it was" for path in changed]
     elif "Traceback" in said:
         wrong.append(f"{what}: a traceback: {said[-600:]}")
-    if code == 0 and kind.reader in ("auto", "resume"):
+    if code == 0 and kind.reader in ("auto", "given", "resume"):
         wrong += _what_was_lost(run, scratch / "new", newest, kind)
     kept = (path.parent for path in before if path.name == "meta.json")
     others = sorted(path for path in kept if path not in (file.parent, *file.parents))
@@ -87,7 +89,7 @@ def _run(kind: EditKind, draw: random.Random, scratch: Path, fixtures: Path) -> 
 def _what_was_lost(run: Path, new: Path, newest: Path | None, kind: EditKind) -> list[str]:
     if kind.files == "events.jsonl":  # It says where training began, and is what was damaged.
         return []
-    trained = run if kind.reader == "auto" else new
+    trained = new if kind.reader == "resume" else run
     starts = events_of(trained, "start")
     if not starts or newest is None:
         return [f"lost: there was {newest}, and {len(starts)} starts are noted"]

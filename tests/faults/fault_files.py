@@ -30,6 +30,7 @@ class EditKind(NamedTuple):
       way: how, of `_VERSIONS`; empty: it is drawn.
       code: exit code that the reader must end with; None: 0 or 2.
       says: what the reader must print.
+      holds: what the file must still hold after it.
     """
 
     fixture: str
@@ -39,11 +40,13 @@ class EditKind(NamedTuple):
     way: str = ""
     code: int | None = None
     says: str = ""
+    holds: str = ""
 
 
 READERS: Mapping[str, tuple[str, ...]] = MappingProxyType(
     {
         "auto": ("train", "run.dir={run}", "run.resume=auto", "{more}"),
+        "given": ("train", "run.dir={run}", "run.resume=auto", "algo.gae_lambda=0.9", "{more}"),
         "resume": ("train", "run.resume={run}", "run.dir={home}/new", "{more}"),
         "again": ("train", "run.dir={run}", "run.resume=auto", "{same}"),
         "play": ("play", "run.dir={run}", "num_envs=2", "html=off"),
@@ -82,11 +85,17 @@ EDITS: Mapping[str, EditKind] = MappingProxyType(
             for name, code, says, readers in (
                 ("key", 2, "future_key", ("auto", "resume")),
                 ("group", 2, "future_group", ("auto", "resume")),
-                ("default", 0, "gae_lambda", ("auto",)),
                 ("key", 0, "future_key", ("play", "export")),
             )
             for reader in readers
         },
+        # A default that has changed since is not taken; what is given is, with a line.
+        "edit_version_default": EditKind(
+            "run", "config.json", "auto", way="default", code=0, holds='"gae_lambda": 0.5'
+        ),
+        "edit_version_given": EditKind(
+            "run", "config.json", "given", way="default", code=0, says="gae_lambda"
+        ),
         "edit_sweep": EditKind("sweep", "sweep.json", "sweep"),
         "edit_request": EditKind("sweep", "request.json", "sweep"),
         "edit_job": EditKind("sweep", "00[01]/*.json*", "sweep"),

@@ -1,0 +1,45 @@
+"""Signals that reach a command where no job hears them."""
+
+from __future__ import annotations
+
+import signal
+from collections.abc import Iterator
+
+import pytest
+
+from gmijax.control.exit_codes import exit_code_of
+from gmijax.supervise.run_gmis import STOP_SIGNALS
+
+
+@pytest.fixture(autouse=True)
+def default_signals() -> Iterator[None]:
+    """Those of a command that a shell starts."""
+    before = {number: signal.signal(number, signal.SIG_DFL) for number in STOP_SIGNALS}
+    yield
+    for number, handler in before.items():
+        signal.signal(number, handler)
+
+
+@pytest.mark.parametrize("number", STOP_SIGNALS)
+def test_a_signal_interrupts_a_command(
+    number: signal.Signals, capsys: pytest.CaptureFixture[str]
+) -> None:
+    ended: list[str] = []
+
+    def run() -> None:
+        try:
+            signal.raise_signal(number)
+        finally:
+            ended.append("cleaned up")
+
+    assert exit_code_of("play", run) == 130
+    assert capsys.readouterr().err == "gmijax.play: interrupted\n"
+    assert ended
+    assert signal.getsignal(number) is signal.SIG_DFL
+
+
+@pytest.mark.parametrize("handler", [signal.SIG_IGN, lambda *_: None])
+def test_signals_that_somebody_ignores_or_hears_are_left_alone(handler: signal.Handlers) -> None:
+    signal.signal(signal.SIGHUP, handler)
+    assert exit_code_of("play", lambda: signal.raise_signal(signal.SIGHUP)) == 0
+    assert signal.getsignal(signal.SIGHUP) is handler
