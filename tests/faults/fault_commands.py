@@ -73,7 +73,8 @@ def _wrong_training(run: Path) -> Iterator[str]:
     for path in checkpoints_of(run):
         if not is_whole(path):
             yield f"checkpoint {path.name} is not whole"
-    steps = [json.loads(line)["env_steps"] for line in (run / "metrics.jsonl").open()]
+    lines = (run / "metrics.jsonl").read_text().splitlines()
+    steps = [json.loads(line)["env_steps"] for line in lines]
     if steps != sorted(set(steps)):
         yield "metrics.jsonl has steps twice or in another order"
 
