@@ -22,7 +22,8 @@ from gmijax import demo, doctor, list_envs
 from gmijax.cli.compose import defaults
 from gmijax.cli.grid import SweepHelp
 from gmijax.cli.groups import choices
-from gmijax.cli.help import Key, keys_of
+from gmijax.cli.help import Key, keys_of, usage_of
+from gmijax.cli.pack import PackKeys
 from gmijax.config import ExportConfig, PlayConfig, ServeConfig, TrainConfig
 
 ROOT: Final = Path(__file__).resolve().parents[1]
@@ -33,6 +34,7 @@ COMMANDS: Final[Mapping[str, type[Any]]] = {
     "train": TrainConfig,
     "search": TrainConfig,
     "sweep": SweepHelp,
+    "pack": PackKeys,
     "serve": ServeConfig,
     "play": PlayConfig,
     "export": ExportConfig,
@@ -107,7 +109,7 @@ def command_page(name: str) -> str:
     lines = [
         f"# gmijax {name}",
         "",
-        f"`gmijax {name} [key=value ...] [--cfg job] [--help]`",
+        f"`{usage_of(name)}`",
     ]
     if name in LIKE_TRAIN:
         trains = set(keys_of(COMMANDS["train"], partial(defaults, "train")))

@@ -19,12 +19,14 @@ if TYPE_CHECKING:
     from gmijax.control.searching import search
     from gmijax.control.serving import Served, serve
     from gmijax.deploy.policy import load_policy
+    from gmijax.packs.pack import pack
     from gmijax.roles.launch import launch
     from gmijax.roles.manager import GMIManager, plan
     from gmijax.roles.role import Role
     from gmijax.sim.registry import make_env, task_names
     from gmijax.sim.vector_envs import make_vector_env
-    from gmijax.sweeps.sweep import SweepResult, sweep
+    from gmijax.sweeps.runner import SweepResult
+    from gmijax.sweeps.sweep import sweep
 
 __all__ = [
     "GMIManager",
@@ -38,6 +40,7 @@ __all__ = [
     "load_policy",
     "make_env",
     "make_vector_env",
+    "pack",
     "plan",
     "search",
     "serve",
@@ -51,12 +54,13 @@ _HOMES = {
     "Result": "gmijax.control.job",
     "Role": "gmijax.roles.role",
     "Served": "gmijax.control.serving",
-    "SweepResult": "gmijax.sweeps.sweep",
+    "SweepResult": "gmijax.sweeps.runner",
     "compose": "gmijax.cli.compose",
     "launch": "gmijax.roles.launch",
     "load_policy": "gmijax.deploy.policy",
     "make_env": "gmijax.sim.registry",
     "make_vector_env": "gmijax.sim.vector_envs",
+    "pack": "gmijax.packs.pack",
     "plan": "gmijax.roles.manager",
     "search": "gmijax.control.searching",
     "serve": "gmijax.control.serving",

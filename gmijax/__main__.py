@@ -17,6 +17,7 @@ VERBS: Final[Mapping[str, str]] = MappingProxyType(
         "serve": "collects experience with a trained policy or random actions",
         "search": "finds environments per GMI and GMIs per GPU by profiling",
         "sweep": "runs many training jobs, several at a time on every GPU",
+        "pack": "runs any training command, several at a time on every GPU",
         "export": "writes a policy as files for robots: ONNX, StableHLO",
         "doctor": "says what this machine can do for gmijax, what it cannot, and why",
         "list-envs": "lists the tasks",

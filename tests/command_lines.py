@@ -21,11 +21,12 @@ from gmijax import demo, doctor
 from gmijax.__main__ import main
 from gmijax.autotune import tuner
 from gmijax.cli.grid import SweepHelp
+from gmijax.cli.pack import PackKeys
 from gmijax.config import ExportConfig, PlayConfig, ServeConfig, TrainConfig
 from gmijax.control import decide, searching, strategy_selection
 from gmijax.deploy import exporting, playing
 from gmijax.machine.snapshot import Machine
-from gmijax.sweeps import sweep
+from gmijax.sweeps import runner
 
 COMMANDS: Mapping[str, tuple[type[Any], ...]] = {
     "train": (TrainConfig,),
@@ -33,6 +34,7 @@ COMMANDS: Mapping[str, tuple[type[Any], ...]] = {
     "serve": (ServeConfig,),
     "search": (TrainConfig,),
     "sweep": (SweepHelp,),
+    "pack": (PackKeys,),
     "export": (ExportConfig,),
     "doctor": (),
     "list-envs": (),
@@ -76,7 +78,7 @@ def _nothing_starts(machine: Machine, cwd: Path) -> Iterator[None]:
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(cwd)
         patch.setenv("XDG_CACHE_HOME", str(cwd / "cache"))
-        for module in (decide, searching, playing, exporting, sweep, demo, doctor):
+        for module in (decide, searching, playing, exporting, runner, demo, doctor):
             patch.setattr(module, "detect_machine", lambda: machine)
         patch.setattr(doctor, "inspect_system", _would_start)
         for name in ("ray", "ray.util", "ray.util.scheduling_strategies"):

@@ -34,7 +34,7 @@ def _at_home(override: str) -> str:
     if match is None:
         return override
     path = os.path.expanduser(match[3])
-    return override if path == match[3] else f"{match[1]}={_quoted(path)}"
+    return override if path == match[3] else f"{match[1]}={quoted(path)}"
 
 
 def _with_custom_task(name: str, override: str) -> tuple[str, ...]:
@@ -42,13 +42,13 @@ def _with_custom_task(name: str, override: str) -> tuple[str, ...]:
     match = re.fullmatch(r"env=(['\"]?)(.*\.py(:.*)?)\1", override)
     if match is None:
         return (override,)
-    value = override.removeprefix("env=") if match[1] else _quoted(match[2])
+    value = override.removeprefix("env=") if match[1] else quoted(match[2])
     if name in ("play", "export"):  # Which task it is the run says.
         return (f"run.env={value}",)
     return "env=custom", f"env.name={value}"
 
 
-def _quoted(value: str) -> str:
+def quoted(value: str) -> str:
     """A value that hydra takes as text, whatever is in it."""
     return QuotedString(value, Quote.single).with_quotes()
 
@@ -102,6 +102,7 @@ def _unreadable(text: str, error: HydraException) -> ConfigError:
         return ConfigError(f"{text}: expected key=value")
     if function := re.search(r"while evaluating .*", str(error)):
         return ConfigError(f"{text}: {function[0]}")
-    quoted = f"{key}={_quoted(value)}"
-    shell = shlex.quote(quoted) if set(quoted) & set('"\\$`!') else f'"{quoted}"'
+    text_of_it = f"{key}={quoted(value)}"
+    special = set(text_of_it) & set('"\\$`!')
+    shell = shlex.quote(text_of_it) if special else f'"{text_of_it}"'
     return ConfigError(f"{text}: not a value; text with such characters needs quotes: {shell}")

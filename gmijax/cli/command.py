@@ -17,7 +17,7 @@ from gmijax.cli.help import print_help
 from gmijax.config.schema import to_dict
 from gmijax.control.exit_codes import exit_code_of
 from gmijax.errors import ConfigError
-from gmijax.sweeps.sweep import Request, run_request
+from gmijax.sweeps.sweep import SweepWork, run_sweep
 
 
 def command(
@@ -56,13 +56,13 @@ def command(
 
 def sweep_command(argv: Sequence[str]) -> int:
     """Runs `gmijax.sweep`, or `gmijax.train -m`; returns its exit code."""
-    return command("sweep", SweepHelp, run_request, argv, make=build_sweep, shown=_shown_sweep)
+    return command("sweep", SweepHelp, run_sweep, argv, make=build_sweep, shown=_shown_sweep)
 
 
-def _shown_sweep(request: Request) -> dict[str, Any]:
-    jobs = [dict(job.overrides) for job in request.jobs]
-    nodes = {"cluster": to_dict(request.cluster)} if request.cluster.engine else {}
-    return {"sweep": to_dict(request.settings), **nodes, "jobs": jobs}
+def _shown_sweep(work: SweepWork) -> dict[str, Any]:
+    jobs = [dict(job.overrides) for job in work.jobs]
+    nodes = {"cluster": to_dict(work.cluster)} if work.cluster.engine else {}
+    return {"sweep": to_dict(work.settings), **nodes, "jobs": jobs}
 
 
 def _split_options(argv: Sequence[str]) -> tuple[list[str], bool]:

@@ -21,7 +21,7 @@ from gmijax.config.sweep import SweepConfig
 from gmijax.errors import ConfigError
 from gmijax.sweeps.jobs import Job
 from gmijax.sweeps.space import MAX_JOBS, Choices, Interval, corners, grid
-from gmijax.sweeps.sweep import Request
+from gmijax.sweeps.sweep import SweepWork, sweep_of
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -31,7 +31,7 @@ class SweepHelp(TrainConfig):
     sweep: SweepConfig
 
 
-def build_sweep(overrides: Sequence[str]) -> Request:
+def build_sweep(overrides: Sequence[str]) -> SweepWork:
     """The sweep of a command line, with all that can be checked of it.
 
     Args:
@@ -58,7 +58,7 @@ def build_sweep(overrides: Sequence[str]) -> Request:
     settings = from_dict(SweepConfig, compose_dict("sweep", own)["sweep"])
     # Nodes are the sweep's; each job is a training on one machine.
     cluster = from_dict(ClusterConfig, compose_dict("train", nodes)["cluster"])
-    space = {item.key_or_group: _values(item) for _, item in given if item.is_sweep_override()}
+    space = {item.key_or_group: values_of(item) for _, item in given if item.is_sweep_override()}
 
     config_of = _Composer(fixed, [key for key in space if choices(key)])
 
@@ -67,7 +67,7 @@ def build_sweep(overrides: Sequence[str]) -> Request:
 
     points = grid(space) if settings.sampler == "grid" else corners(space)
     jobs = [make_job(number, chosen) for number, chosen in enumerate(points)]
-    return Request(settings, space, make_job, tuple(jobs), cluster)
+    return sweep_of(settings, space, make_job, jobs, cluster)
 
 
 class _Composer:
@@ -108,7 +108,12 @@ def _set(data: dict[str, Any], dotted: str, value: Any) -> bool:
     return True
 
 
-def _values(item: Override) -> Choices | Interval:
+def values_of(item: Override) -> Choices | Interval:
+    """The values of a key on a command line.
+
+    Raises:
+      ConfigError: there are none, too many, or one comes twice.
+    """
     key, value = item.key_or_group, item.value()
     if isinstance(value, IntervalSweep):
         if value.start is None or value.end is None or not value.start < value.end:

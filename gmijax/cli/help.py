@@ -46,7 +46,7 @@ def print_help(
         allowed = f" ({'|'.join(key.allowed)})" if key.allowed else ""
         table.add_row(key.name, key.default, f"{key.meaning}{allowed}")
     console = Console(width=None if sys.stdout.isatty() else 140, highlight=False, markup=False)
-    console.print(f"usage: gmijax {name} [key=value ...] [--cfg job] [--help]")
+    console.print(f"usage: {usage_of(name)}")
     for group in ("env", "algo", "plan"):
         if group in {key.name.split(".")[0] for key in keys} and len(choices(group)) > 1:
             console.print(f"\n{group}= one of: {', '.join(choices(group))}")
@@ -64,6 +64,13 @@ def _whose_defaults(command: str, keys: Sequence[Key]) -> str:
         f"Defaults below are those of {task}; each task has its own: "
         f"gmijax {one_job} env=ant --cfg job prints those of ant"
     )
+
+
+def usage_of(command: str) -> str:
+    """The form of its command line."""
+    if command == "pack":
+        return "gmijax pack [NAME=VALUE,VALUE ...] [key=value ...] [--cfg job] -- COMMAND ..."
+    return f"gmijax {command} [key=value ...] [--cfg job] [--help]"
 
 
 def keys_of(

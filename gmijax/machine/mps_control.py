@@ -17,6 +17,9 @@ from gmijax.errors import BackendUnavailable
 
 PIPE_VARIABLE = "CUDA_MPS_PIPE_DIRECTORY"
 LOG_VARIABLE = "CUDA_MPS_LOG_DIRECTORY"
+MEMORY_LIMIT_VARIABLE = "CUDA_MPS_PINNED_DEVICE_MEM_LIMIT"
+"""Device memory that a client may take, whatever its framework: `0=20480M`."""
+
 DEFAULT_PIPE_DIRECTORY = Path("/tmp/nvidia-mps")
 """Where CUDA looks for a daemon when `CUDA_MPS_PIPE_DIRECTORY` is not set."""
 

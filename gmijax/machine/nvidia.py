@@ -39,6 +39,19 @@ class Gpu(NamedTuple):
     compute_mode: str = "default"
 
 
+class GpuLoad(NamedTuple):
+    """What a GPU does at the moment, whoever uses it.
+
+    Attributes:
+      used_mib, total_mib: memory.
+      busy: part of the time in which some kernel runs, 0 to 1.
+    """
+
+    used_mib: float
+    total_mib: float
+    busy: float
+
+
 @contextmanager
 def nvml_session() -> Iterator[None]:
     """NVML while it is entered; raises NVMLError without a driver."""
@@ -60,6 +73,16 @@ def list_gpus() -> tuple[Gpu, ...]:
             with suppress(pynvml.NVMLError):
                 gpus.append(_describe(index))
     return tuple(gpus)
+
+
+def load_of(device: str) -> GpuLoad | None:
+    """Of the GPU or MIG instance with this UUID; None: NVML does not say."""
+    with suppress(pynvml.NVMLError), nvml_session():
+        handle = pynvml.nvmlDeviceGetHandleByUUID(device)
+        memory = pynvml.nvmlDeviceGetMemoryInfo(handle)
+        busy = pynvml.nvmlDeviceGetUtilizationRates(handle).gpu / 100
+        return GpuLoad(int(memory.used) / _MIB, int(memory.total) / _MIB, busy)
+    return None
 
 
 def nvml_problem() -> str | None:

@@ -8,8 +8,8 @@ from typing import Any, NamedTuple, TypeVar
 import numpy as np
 import numpy.typing as npt
 
-from gmijax.config.sweep import SweepConfig
-from gmijax.sweeps.jobs import label_of
+from gmijax.config.sweep import Ranking
+from gmijax.sweeps.kind import label_of
 
 T = TypeVar("T")
 Row = Mapping[str, Any]
@@ -51,14 +51,14 @@ def grouped(
     return found
 
 
-def settings_of(rows: Sequence[Row], sweep: SweepConfig) -> list[dict[str, Any]]:
+def settings_of(rows: Sequence[Row], ranking: Ranking) -> list[dict[str, Any]]:
     """Settings of the jobs with these rows, the best first.
 
     Those of which a seed has no full window come after all others, those without any value last.
     """
     found = [_setting(own) for own in grouped(rows, lambda row: row["overrides"]).values()]
     return sorted(
-        found, key=lambda setting: place_of(setting, setting["interquartile_mean"], sweep)
+        found, key=lambda setting: place_of(setting, setting["interquartile_mean"], ranking)
     )
 
 
@@ -75,7 +75,7 @@ def _setting(rows: Sequence[Row]) -> dict[str, Any]:
     }
 
 
-def place_of(row: Row, value: float | None, sweep: SweepConfig) -> tuple[bool, bool, float]:
+def place_of(row: Row, value: float | None, ranking: Ranking) -> tuple[bool, bool, float]:
     """What rows are sorted by: the best one has the smallest."""
-    sign = -1.0 if sweep.direction == "maximize" else 1.0
+    sign = -1.0 if ranking.direction == "maximize" else 1.0
     return value is None, not row["window_full"], sign * (value or 0.0)

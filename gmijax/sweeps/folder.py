@@ -3,27 +3,28 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from gmijax.errors import ConfigError, FolderLost, SweepFailed
 from gmijax.runs.folder import create_run, given_run
 from gmijax.runs.held import is_locked
-from gmijax.sweeps.jobs import Job, SweepPaths
+from gmijax.sweeps.kind import J
+from gmijax.sweeps.paths import SweepPaths
+from gmijax.sweeps.work import Work
 
 
 @contextmanager
-def opened_folder(jobs: Sequence[Job]) -> Iterator[SweepPaths]:
-    """The folder of the sweep, made if it is not there; gone again if nothing was begun in it."""
-    run = jobs[0].config.run
-    folder = given_run(run.dir, run.name)
+def opened_folder(work: Work[J]) -> Iterator[SweepPaths]:
+    """The folder of the jobs, made if it is not there; gone again if nothing was begun in it."""
+    folder = given_run(*work.folder)
     is_new = folder is None or not os.path.lexists(folder)
     if folder is None or is_new:
-        root = create_run(run.dir, run.name, "sweep").root
+        root = create_run(*work.folder, work.name).root
     else:
-        root = _found(folder)
-    paths = SweepPaths(root)
+        root = _found(folder, work)
+    paths = work.paths(root)
     is_anothers = is_locked(paths.lock)
     try:
         yield paths
@@ -39,12 +40,12 @@ def opened_folder(jobs: Sequence[Job]) -> Iterator[SweepPaths]:
         raise
 
 
-def _found(folder: Path) -> Path:
+def _found(folder: Path, work: Work[J]) -> Path:
     if not folder.is_dir():
         raise ConfigError(f"run.dir={folder}: is no folder")
-    paths = SweepPaths(folder.resolve())
+    paths = work.paths(folder.resolve())
     if not paths.request.exists() and any(path != paths.lock for path in folder.iterdir()):
-        raise ConfigError(f"run.dir={folder}: is no folder of a sweep, and not empty")
+        raise ConfigError(f"run.dir={folder}: is no folder of a {work.name}, and not empty")
     return paths.root
 
 

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable
 from contextlib import ExitStack
-from pathlib import Path
-from typing import Any, Literal, NamedTuple
+from typing import Literal, NamedTuple
 
-from gmijax.machine.mps_control import PIPE_VARIABLE
+from gmijax.machine.mps_control import MEMORY_LIMIT_VARIABLE, PIPE_VARIABLE
+from gmijax.machine.nvidia import GpuLoad, load_of
+from gmijax.machine.processes import members_of
 from gmijax.machine.snapshot import DAEMONS_VARIABLE, Machine
 from gmijax.partition.plan import Plan
 from gmijax.runs.cache import cache_folder
@@ -17,7 +18,7 @@ from gmijax.runs.folder import RunPaths
 from gmijax.runs.held import try_lock
 from gmijax.supervise.backends import open_backend
 from gmijax.supervise.backends.backend import Backend
-from gmijax.sweeps.children import Child, Seen
+from gmijax.sweeps.children import Child, Process, Seen
 from gmijax.sweeps.compiled import CompiledPrograms
 from gmijax.sweeps.places import Place
 
@@ -25,12 +26,10 @@ Order = Literal["ask_to_stop", "kill", "close"]
 
 
 class Start(NamedTuple):
-    """Jobs to be started, together if they are several; see `Child` and `CompiledPrograms`."""
+    """What is to be started where; see `Process` and `CompiledPrograms`."""
 
     place: Place
-    configs: Sequence[Mapping[str, Any]]
-    order: Path
-    log: Path
+    process: Process
     program: str
 
 
@@ -64,6 +63,7 @@ class LocalHost:
         self._backend: Backend | None = None
         self._compiled = CompiledPrograms()
         self._children: dict[int, Child] = {}
+        self._clients: dict[int, int] = {}
         self._num_started = 0
 
     def lease(self, devices: Iterable[str]) -> str | None:
@@ -93,11 +93,17 @@ class LocalHost:
           GmijaxError: it cannot be started, or its daemon not be renewed.
         """
         assert self._backend is not None
-        variables = variables_of(start.place, self._backend)
-        child = Child(start.configs, start.place.cpus, start.order, start.log, variables)
+        variables = (
+            client_variables(start.place, start.process, self._backend, self.machine)
+            if start.process.is_client
+            else variables_of(start.place, self._backend)
+        )
+        child = Child(start.process, variables)
         self._backend.started(child.pid)
         self._num_started += 1
         self._children[self._num_started] = child
+        if start.process.is_client:
+            self._clients[self._num_started] = start.place.slices[0].gmi
         return Started(self._num_started, self._compiled.holds(start.program))
 
     def look(self, child: int) -> Seen | None:
@@ -110,13 +116,33 @@ class LocalHost:
 
     def order(self, child: int, order: Order) -> None:
         """Calls a method of a child."""
+        if order == "kill" and self._backend is not None and child in self._clients:
+            # Killing a client that is busy can harm its neighbours.
+            for process in members_of(self._children[child].pid):
+                self._backend.terminate(self._clients[child], process.pid)
         getattr(self._children[child], order)()
         if order == "close":
             del self._children[child]
+            self._clients.pop(child, None)
+
+    def why_no_client(self, child: int) -> str | None:
+        """Why a child has no share of its GPU, though its daemon should give it one; None: it has.
+
+        Asked of those that use the GPU themselves, once they do.
+        """
+        if self._backend is None or child not in self._clients:
+            return None
+        return self._backend.why_no_client(
+            self._clients[child], [one.pid for one in members_of(self._children[child].pid)]
+        )
 
     def add_program(self, program: str, is_lasting: bool) -> None:
         """See `CompiledPrograms`."""
         self._compiled.add(program, is_lasting=is_lasting)
+
+    def load_of(self, device: str) -> GpuLoad | None:
+        """What a GPU does at the moment."""
+        return load_of(device)
 
     def shut(self) -> None:
         """Leaves the backend; all children have ended."""
@@ -143,3 +169,25 @@ def variables_of(place: Place, backend: Backend) -> dict[str, str]:
             daemons[share.device] = pipe
     devices = ",".join(place.devices)
     return {"CUDA_VISIBLE_DEVICES": devices, DAEMONS_VARIABLE: json.dumps(daemons)}
+
+
+def client_variables(
+    place: Place, process: Process, backend: Backend, machine: Machine
+) -> dict[str, str]:
+    """What tells a program of any kind its GPU, and its share of it; a dead daemon is renewed."""
+    if not place.devices:
+        return {}
+    share, device = place.slices[0], place.devices[0]
+    backend.renew(share.gmi)
+    variables = dict(backend.environment(share.gmi))
+    # Many programs take numbers alone. Of a daemon of our own, which has one GPU, it is the first.
+    index = {gpu.uuid: str(gpu.index) for gpu in machine.gpus}
+    if place.backend == "mps" and device in backend.daemons and machine.daemon_of(device) is None:
+        variables["CUDA_VISIBLE_DEVICES"] = "0"
+    else:
+        variables["CUDA_DEVICE_ORDER"] = "PCI_BUS_ID"
+        variables["CUDA_VISIBLE_DEVICES"] = index.get(device, device)
+    memory_mib = {gpu.uuid: gpu.memory_mib for gpu in machine.gpus}.get(device)
+    if place.backend == "mps" and process.memory_fraction is not None and memory_mib is not None:
+        variables[MEMORY_LIMIT_VARIABLE] = f"0={int(process.memory_fraction * memory_mib)}M"
+    return variables

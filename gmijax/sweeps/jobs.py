@@ -1,130 +1,20 @@
-"""The jobs of a sweep: what they are, where their files are, how far they are."""
+"""The jobs of a sweep: what they are, and where they run."""
 
 from __future__ import annotations
 
 import dataclasses
-import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
-from pathlib import Path
-from typing import Any, Literal, TypeAlias
+from typing import Literal
 
 from gmijax.config import BackendName, TrainConfig
 from gmijax.config.schema import flatten, to_dict
-from gmijax.config.sweep import SweepConfig
 from gmijax.errors import ConfigError
 from gmijax.runs.folder import RunPaths, read_json
-from gmijax.runs.history import number_in, read_metrics
-from gmijax.sweeps.objective import find, value_of
+from gmijax.sweeps.kind import label_of
 from gmijax.sweeps.places import Place
-
-State: TypeAlias = Literal["waiting", "running", "completed", "failed", "pruned", "interrupted"]
-
-DIGITS = 3
-"""Of the number of a job in the names of its files; more jobs have more digits."""
-
-
-class SweepPaths(RunPaths):
-    """Files of a sweep; each job has a run folder of its own in it."""
-
-    def __init__(self, root: Path) -> None:
-        super().__init__(root)
-        self.request = root / "request.json"  # What was asked: a command that goes on asks it too.
-        self.study = root / "study.log"  # Of Optuna.
-        self.sweep = root / "sweep.json"  # Jobs, their states and results.
-        self.table = root / "sweep.csv"  # One line a job.
-        self.settings = root / "settings.csv"  # One line for all seeds of a setting.
-        self.room = root / ".room"  # Of no use but its size: room for how the sweep ends.
-        self.curves = root / "sweep.png"
-
-    def job(self, number: int) -> RunPaths:
-        """The run folder of a job."""
-        return RunPaths(self.root / f"{number:0{DIGITS}d}")
-
-    def order(self, number: int) -> Path:
-        """What the process of a job is told."""
-        return self.root / "jobs" / f"{number:0{DIGITS}d}.json"
-
-    def log(self, number: int) -> Path:
-        """What the process of a job prints."""
-        return self.root / "jobs" / f"{number:0{DIGITS}d}.log"
-
-
-@dataclass
-class Progress:
-    """How far a job is.
-
-    Attributes:
-      state: see `State`.
-      env_steps: environment steps so far.
-      env_steps_per_s: of the last iteration; 0 while it does not run.
-      value: what it is ranked by (`value_of`), None before there is one.
-      is_full: whether the value can be compared, see `Found`.
-      episodes: how many the value is a mean over, where that is known.
-      latest: the objective in the latest line that has it, over the short window.
-      started_s: when this command started it, by the monotonic clock.
-      updated_s: when the first line of metrics came after that.
-      ended_s: when it ended after that.
-      earlier_s: seconds that it took, where an earlier command has completed it.
-      place: GPUs and places where it runs, in words.
-      node: address of the node where it runs or ran last; None: this machine.
-      error: why it failed, in one line.
-      curve: environment steps and objective of the lines of metrics that can be compared, or,
-        while there are none, of the others.
-    """
-
-    state: State = "waiting"
-    env_steps: int = 0
-    env_steps_per_s: float = 0.0
-    value: float | None = None
-    is_full: bool = True
-    episodes: int | None = None
-    latest: float | None = None
-    started_s: float | None = None
-    updated_s: float | None = None
-    ended_s: float | None = None
-    earlier_s: float = 0.0
-    place: str = ""
-    node: str | None = None
-    error: str | None = None
-    curve: list[tuple[int, float]] = field(default_factory=list)
-
-    @property
-    def wall_s(self) -> float:
-        """Seconds from its start to its end, or until now."""
-        if self.started_s is None:
-            return self.earlier_s
-        return (self.ended_s or time.monotonic()) - self.started_s
-
-    def begin(self, place: str, node: str | None) -> None:
-        """Its process was started there."""
-        self.state, self.place, self.node, self.error = "running", place, node, None
-        self.started_s, self.updated_s, self.ended_s = time.monotonic(), None, None
-
-    def take(self, line: Mapping[str, Any], sweep: SweepConfig) -> None:
-        """Takes in a line of metrics."""
-        self.env_steps = line["env_steps"]
-        self.env_steps_per_s = line.get("env_steps_per_s") or 0.0
-        if (found := find(line, sweep.objective)) is None:
-            return
-        latest = number_in(line, sweep.objective)
-        self.latest = found.number if latest is None else latest
-        if self.curve and self.is_full and not found.is_full:
-            return
-        if not self.is_full and found.is_full:
-            self.curve.clear()
-        self.is_full, self.episodes = found.is_full, found.episodes
-        self.curve.append((self.env_steps, found.number))
-        self.value = value_of(self.curve, sweep)
-
-    def read(self, run: RunPaths, sweep: SweepConfig) -> None:
-        """Takes in all metrics that a run folder has."""
-        self.value, self.latest, self.curve = None, None, []
-        self.is_full, self.episodes = True, None
-        for line in read_metrics(run.metrics):
-            self.take(line, sweep)
-        self.env_steps_per_s = 0.0
+from gmijax.sweeps.progress import Progress, State
 
 
 @dataclass(frozen=True)
@@ -153,20 +43,24 @@ class Job:
         """How many GPUs it takes a place on."""
         return self.config.plan.num_gpus
 
-    @cached_property
+    @property
+    def num_timesteps(self) -> int:
+        """Environment steps at its end."""
+        return self.config.num_timesteps
+
+    @property
     def program(self) -> str:
         """The same for jobs that compile the same programs."""
+        return self._program
+
+    @cached_property
+    def _program(self) -> str:
         data = to_dict(self.config)
         for key in ("run", "seed", "num_timesteps", "search", "wandb"):
             del data[key]
         data["plan"].pop("memory_fraction")
         data["algo"].pop("learning_rate")  # It is in the learner's state.
         return repr(data)
-
-
-def label_of(overrides: Mapping[str, str]) -> str:
-    """Overrides in one line."""
-    return " ".join(f"{key}={value}" for key, value in overrides.items())
 
 
 def jobs_of(configs: Sequence[TrainConfig]) -> tuple[Job, ...]:
@@ -178,19 +72,6 @@ def jobs_of(configs: Sequence[TrainConfig]) -> tuple[Job, ...]:
         Job(number, {key: str(one[key]) for key in differing if key in one}, config)
         for number, (one, config) in enumerate(zip(flat, configs, strict=True))
     )
-
-
-def trainings_per_hour(jobs: Sequence[Job]) -> float | None:
-    """Of the jobs that this command has run, from the first start to the last end, or until now.
-
-    None: it has not started any.
-    """
-    run = [job.progress for job in jobs if job.progress.started_s is not None]
-    if not run:
-        return None
-    first_s = min(progress.started_s or 0.0 for progress in run)
-    last_s = max(progress.ended_s or time.monotonic() for progress in run)
-    return 3600 * sum(progress.state == "completed" for progress in run) / (last_s - first_s)
 
 
 def require_placeable(jobs: Sequence[Job], num_gpus: int) -> None:

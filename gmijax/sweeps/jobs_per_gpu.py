@@ -25,17 +25,17 @@ from gmijax.errors import GmijaxError, JobInterrupted, NodeLost
 from gmijax.runs.cache import cache_folder
 from gmijax.runs.folder import read_json
 from gmijax.supervise.run_gmis import StopSignals
-from gmijax.sweeps.jobs import Job, SweepPaths
+from gmijax.sweeps.density import GAIN
+from gmijax.sweeps.jobs import Job
 from gmijax.sweeps.nodes import Host
 from gmijax.sweeps.packs import most_together
+from gmijax.sweeps.paths import SweepPaths
 from gmijax.sweeps.places import Places, Site, gmis_of_place, places_of
 from gmijax.sweeps.scheduler import Scheduler
 from gmijax.sweeps.study import Study
+from gmijax.sweeps.training import TrainingKind
 
 COUNTS = (1, 2, 4, 8, 16, 32)
-GAIN = 0.05
-"""Twice as many jobs must make so many more steps together; each makes half of them then."""
-
 _WINDOW_S = 4.0
 _LEAST_ITERATIONS = 6
 _CORES_OF_A_JOB = 2
@@ -180,7 +180,10 @@ def _profile(
             places = Places([Site(plan, host.machine)])
             try:
                 host.open(plan, paths)
-                Scheduler(jobs, Study(), settings, paths, places, [host], tick).run(inner)
+                kind = TrainingKind(settings, paths)
+                Scheduler(jobs, Study[Job](), kind, settings, paths, places, [host], tick).run(
+                    inner
+                )
             finally:
                 host.shut()
         except NodeLost:

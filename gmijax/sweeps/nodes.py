@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any, TypeAlias
@@ -11,15 +11,14 @@ from gmijax.cluster.checks import by_name, require_alike, require_shared
 from gmijax.cluster.node import Node
 from gmijax.cluster.ray_nodes import Joined, RayCluster
 from gmijax.config import ClusterConfig
-from gmijax.config.sweep import SweepConfig
+from gmijax.config.sweep import JobsConfig
 from gmijax.errors import ConfigError, GmijaxError, NodeLost
+from gmijax.machine.nvidia import GpuLoad
 from gmijax.machine.snapshot import detect_machine
 from gmijax.partition.plan import Plan
 from gmijax.runs.folder import RunPaths
 from gmijax.sweeps.children import Seen
 from gmijax.sweeps.host import LocalHost, Order, Start, Started
-from gmijax.sweeps.jobs import Job
-from gmijax.sweeps.places import gmis_of_place
 
 
 class SweepNode(Node):
@@ -93,6 +92,14 @@ class RemoteHost:
         """See `LocalHost`."""
         self._do("add_program", program, is_lasting)
 
+    def why_no_client(self, child: int) -> str | None:
+        """See `LocalHost`."""
+        return self._do("why_no_client", child)
+
+    def load_of(self, device: str) -> GpuLoad | None:
+        """See `LocalHost`."""
+        return self._do("load_of", device)
+
     def shut(self) -> None:
         """See `LocalHost`."""
         with suppress(NodeLost):
@@ -116,30 +123,30 @@ Host: TypeAlias = LocalHost | RemoteHost
 
 @contextmanager
 def nodes_of(
-    cluster: ClusterConfig, settings: SweepConfig, jobs: Sequence[Job], root: Path
+    cluster: ClusterConfig, settings: JobsConfig, on_cpu: bool, processes: int, root: Path
 ) -> Iterator[list[RemoteHost]]:
     """The nodes of a sweep while it is entered.
 
     Args:
       cluster: where they are.
-      settings: of the sweep.
-      jobs: for which there must be CPUs.
-      root: the sweep's folder, which may not be there yet.
+      settings: of the jobs.
+      on_cpu: whether no job wants a GPU.
+      processes: of the largest job at each of its places, for which there must be CPUs.
+      root: their folder, which may not be there yet.
 
     Raises:
       ConfigError: as `RayCluster` and `RayCluster.join`; a node that cannot take part.
     """
     if isinstance(settings.gpus, tuple):
         raise ConfigError(
-            f"sweep.gpus={list(settings.gpus)}: Ray chooses the GPUs of nodes; expected a number, "
-            "of each node, or null"
+            f"{settings.prefix}gpus={list(settings.gpus)}: Ray chooses the GPUs of nodes; "
+            "expected a number, of each node, or null"
         )
-    on_cpu = all(job.config.plan.backend == "cpu" for job in jobs)
     wanted = None if cluster.nodes == "auto" else cluster.nodes
     ray = RayCluster(cluster, SweepNode)
     try:
         joined = ray.join(
-            num_cpus_of(settings, jobs), wanted, most_gpus=0 if on_cpu else settings.gpus
+            num_cpus_of(settings, processes), wanted, most_gpus=0 if on_cpu else settings.gpus
         )
         require_alike(joined)
         require_shared(joined, root)
@@ -148,8 +155,8 @@ def nodes_of(
         ray.close()
 
 
-def num_cpus_of(settings: SweepConfig, jobs: Sequence[Job]) -> int:
+def num_cpus_of(settings: JobsConfig, processes: int) -> int:
     """CPUs of each node that Ray is asked for: one for every GMI that the settings tell of."""
     each = 1 if settings.jobs_per_gpu == "auto" else settings.jobs_per_gpu
     gpus = settings.gpus if isinstance(settings.gpus, int) else 1
-    return gpus * each * max((gmis_of_place(job.config) for job in jobs), default=1)
+    return gpus * each * processes

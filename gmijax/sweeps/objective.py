@@ -6,7 +6,7 @@ import dataclasses
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from gmijax.config.sweep import SweepConfig
+from gmijax.config.sweep import Ranking, SweepConfig
 from gmijax.errors import ConfigError
 from gmijax.runs.history import number_in
 
@@ -49,16 +49,16 @@ def find(line: Mapping[str, Any], objective: str) -> Found | None:
     return Found(number, is_full=not objective.startswith(_OF_EPISODES))
 
 
-def value_of(curve: Sequence[tuple[int, float]], sweep: SweepConfig) -> float:
+def value_of(curve: Sequence[tuple[int, float]], ranking: Ranking) -> float:
     """What a job is ranked by after these steps, by environment steps and objective.
 
     The best evaluation: it has a checkpoint. Of means over episodes the last one, which is over a
     whole window. Of anything else the mean of the last tenth of the steps.
     """
-    if sweep.objective.startswith(_EVALUATIONS):
-        best = max if sweep.direction == "maximize" else min
+    if ranking.objective.startswith(_EVALUATIONS):
+        best = max if ranking.direction == "maximize" else min
         return best(number for _, number in curve)
-    if sweep.objective.startswith(_OF_EPISODES):
+    if ranking.objective.startswith(_OF_EPISODES):
         return curve[-1][1]
     first = curve[-1][0] * (1.0 - _LAST_PART)
     last = [number for steps, number in curve if steps >= first]

@@ -12,7 +12,8 @@ from gmijax.errors import ConfigError
 from gmijax.runs.folder import RunPaths, read_json
 from gmijax.runs.held import is_locked
 from gmijax.runs.resume import CheckpointMeta
-from gmijax.sweeps.jobs import Job, SweepPaths, started_in, state_of
+from gmijax.sweeps.jobs import Job, started_in, state_of
+from gmijax.sweeps.paths import SweepPaths
 
 
 class Packer:

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 from gmijax.config import BackendName, PlanConfig, ReduceConfig, TrainConfig
-from gmijax.config.sweep import SweepConfig
+from gmijax.config.sweep import JobsConfig
 from gmijax.errors import ConfigError
 from gmijax.machine.snapshot import Machine
 from gmijax.partition.plan import Plan, Slice
@@ -70,7 +70,7 @@ def gmis_of_place(config: TrainConfig) -> int:
     return 1 if plan.gmis_per_gpu == "auto" else plan.gmis_per_gpu
 
 
-def places_of(settings: SweepConfig, machine: Machine, backends: Collection[str]) -> Plan:
+def places_of(settings: JobsConfig, machine: Machine, backends: Collection[str]) -> Plan:
     """A plan whose slices are the places: of GMIs that have nothing to do with each other.
 
     Args:
@@ -88,8 +88,8 @@ def places_of(settings: SweepConfig, machine: Machine, backends: Collection[str]
         config = PlanConfig(gpus=gpus, gmis_per_gpu=count, backend=wanted, template="tcg")
         return make_plan(config, ReduceConfig(), 1, machine, template="tcg")
     except ConfigError as error:
-        said = str(error).replace("plan.gmis_per_gpu", "sweep.jobs_per_gpu")
-        raise ConfigError(said.replace("plan.gpus", "sweep.gpus")) from None
+        said = str(error).replace("plan.gmis_per_gpu", f"{settings.prefix}jobs_per_gpu")
+        raise ConfigError(said.replace("plan.gpus", f"{settings.prefix}gpus")) from None
 
 
 class Site(NamedTuple):
@@ -118,6 +118,7 @@ class Places:
         self._free = [list(site.plan.slices) for site in sites]
         self._all = [_by_gpu(site.plan.slices) for site in sites]
         self._labels = [_labels(site) for site in sites]
+        self._limits: dict[tuple[int, int], int] = {}
         self.left = set(range(len(sites)))
 
     def has_room(self, avoid: Collection[int] = ()) -> bool:
@@ -126,7 +127,21 @@ class Places:
 
     def num_gpus_with_room(self, avoid: Collection[int] = ()) -> int:
         """GPUs that have a free place, on machines other than those of `avoid`."""
-        return sum(len(_by_gpu(self._free[site])) for site in self.left.difference(avoid))
+        return sum(len(self._open(site)) for site in self.left.difference(avoid))
+
+    def limit(self, site: int, gpu: int, count: int) -> None:
+        """From now on so many places of a GPU may be taken; those that are taken stay so."""
+        self._limits[site, gpu] = count
+
+    def _open(self, site: int) -> dict[int, list[Slice]]:
+        """Free places by GPU, no more than its limit allows to be taken."""
+        found: dict[int, list[Slice]] = {}
+        for gpu, free in _by_gpu(self._free[site]).items():
+            all_of_it = len(self._all[site][gpu])
+            limit = self._limits.get((site, gpu), all_of_it)
+            if (room := limit - (all_of_it - len(free))) > 0:
+                found[gpu] = free[:room]
+        return found
 
     def take(
         self,
@@ -144,10 +159,10 @@ class Places:
         """
         found: list[tuple[int, list[list[Slice]]]] = []
         for site in sorted(self.left.difference(avoid)):
-            by_gpu = _by_gpu(self._free[site])
+            by_gpu = self._open(site)
             if alone:
-                here = self._all[site]
-                by_gpu = {gpu: free for gpu, free in by_gpu.items() if free == here[gpu]}
+                here, free = self._all[site], _by_gpu(self._free[site])
+                by_gpu = {gpu: free[gpu] for gpu in by_gpu if free[gpu] == here[gpu]}
             emptiest = sorted(by_gpu.values(), key=len, reverse=True)[:num_gpus]
             if len(emptiest) == num_gpus:
                 found.append((site, emptiest))

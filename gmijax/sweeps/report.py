@@ -8,23 +8,27 @@ import io
 import math
 import os
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from typing import Any
 
 import numpy as np
 from rich.table import Table
 
-from gmijax.config.schema import to_dict
-from gmijax.config.sweep import SweepConfig
+from gmijax.config.sweep import Ranking
 from gmijax.runs.folder import write_bytes, write_json, write_text
 from gmijax.runs.held import OpenFolder
 from gmijax.sweeps.by_setting import Middle, Row, grouped, middle_of, place_of, settings_of
-from gmijax.sweeps.jobs import Job, State, SweepPaths, label_of, trainings_per_hour
+from gmijax.sweeps.kind import AnyJob, label_of, trainings_per_hour
+from gmijax.sweeps.paths import SweepPaths
+from gmijax.sweeps.progress import State
 from gmijax.version import __version__
 
 CURVE_POINTS = 200
-_OF_JOB = ("state", "value", "window_full", "episodes", "env_steps", "wall_s", "run_dir", "error")
+_OF_JOB = (
+    *("state", "value", "window_full", "episodes", "env_steps", "env_steps_per_s", "wall_s"),
+    *("exit_code", "run_dir", "error"),
+)
 _OF_SETTING = ("n", "interquartile_mean", "low", "high", "window_full")
 
 _ROOM_BYTES = 1 << 16
@@ -35,7 +39,8 @@ class Report:
 
     Args:
       jobs: those that are known; more may be added to the list.
-      sweep: settings.
+      ranking: what jobs are compared by.
+      described: what else the report has: the settings by the name of their group, and so on.
       paths: files of the sweep.
       folder: that of the sweep, to see whether it is still there.
       started_s: when the command began, by the monotonic clock.
@@ -46,14 +51,15 @@ class Report:
 
     def __init__(
         self,
-        jobs: Sequence[Job],
-        sweep: SweepConfig,
+        jobs: Sequence[AnyJob],
+        ranking: Ranking,
+        described: Callable[[], Mapping[str, Any]],
         paths: SweepPaths,
         folder: OpenFolder,
         started_s: float,
     ) -> None:
-        self._jobs, self._sweep, self._paths, self._started_s = jobs, sweep, paths, started_s
-        self._folder = folder
+        self._jobs, self._ranking, self._paths, self._started_s = jobs, ranking, paths, started_s
+        self._described, self._folder = described, folder
         self._states: list[State] = []
         self.data: dict[str, Any] = {}
 
@@ -64,7 +70,7 @@ class Report:
           OSError: there is none.
         """
         self._write("running")
-        draw_curves(self._jobs, self._sweep, self._paths)
+        draw_curves(self._jobs, self._ranking, self._paths)
         size = _ROOM_BYTES + 2 * self._paths.sweep.stat().st_size
         with self._paths.room.open("wb") as file:
             try:
@@ -99,7 +105,7 @@ class Report:
             self._paths.room.unlink(missing_ok=True)
         for write in (
             lambda: self._write(status),
-            lambda: draw_curves(self._jobs, self._sweep, self._paths),
+            lambda: draw_curves(self._jobs, self._ranking, self._paths),
         ):
             try:
                 write()
@@ -109,22 +115,22 @@ class Report:
 
     def _write(self, status: str) -> None:
         wall_s = time.monotonic() - self._started_s
-        self.data = _content(status, self._jobs, self._sweep, self._paths, wall_s)
+        found = _content(status, self._jobs, self._ranking, self._paths, wall_s)
+        self.data = {**found, **self._described()}
         write_tables(self.data, self._paths)
 
 
 def _content(
-    status: str, jobs: Sequence[Job], sweep: SweepConfig, paths: SweepPaths, wall_s: float
+    status: str, jobs: Sequence[AnyJob], ranking: Ranking, paths: SweepPaths, wall_s: float
 ) -> dict[str, Any]:
     first_s = min((job.progress.started_s or math.inf for job in jobs), default=math.inf)
     rows = [_row(job, paths, first_s) for job in jobs]
     return {
         "status": status,
-        "sweep": to_dict(sweep),
         "wall_s": round(wall_s, 3),
         "trainings_per_hour": trainings_per_hour(jobs),
-        "settings": settings_of(rows, sweep),
-        "ranking": [row["job"] for row in ranked(rows, sweep)],
+        "settings": settings_of(rows, ranking),
+        "ranking": [row["job"] for row in ranked(rows, ranking)],
         "jobs": rows,
         "versions": {"gmijax": __version__},
     }
@@ -144,23 +150,23 @@ def _flat(setting: Row) -> Row:
     return {**setting, "jobs": jobs, "low": low, "high": high}
 
 
-def ranked(rows: Sequence[Row], sweep: SweepConfig) -> list[Row]:
+def ranked(rows: Sequence[Row], ranking: Ranking) -> list[Row]:
     """Rows that have a value, the best first; those without a full window come last."""
     found = [row for row in rows if row["value"] is not None]
-    return sorted(found, key=lambda row: place_of(row, row["value"], sweep))
+    return sorted(found, key=lambda row: place_of(row, row["value"], ranking))
 
 
-def tables(report: Mapping[str, Any], sweep: SweepConfig) -> list[Table]:
+def tables(report: Mapping[str, Any], ranking: Ranking) -> list[Table]:
     """The ranking for people: of settings, where they have several seeds, and of jobs."""
-    jobs = _job_table(report["jobs"], sweep)
+    jobs = _job_table(report["jobs"], ranking)
     settings = report["settings"]
     if all(len(setting["jobs"]) == 1 for setting in settings):
         return [jobs]
-    return [_setting_table(settings, sweep), jobs]
+    return [_setting_table(settings, ranking), jobs]
 
 
-def _setting_table(settings: Sequence[Row], sweep: SweepConfig) -> Table:
-    mean = f"{sweep.objective}, interquartile mean"
+def _setting_table(settings: Sequence[Row], ranking: Ranking) -> Table:
+    mean = f"{ranking.objective}, interquartile mean"
     table = _table("rank", "setting", mean, "quartiles", "n")
     for rank, setting in enumerate(settings, 1):
         label, of = label_of(setting["overrides"]) or "all seeds", len(setting["jobs"])
@@ -175,10 +181,10 @@ def _setting_table(settings: Sequence[Row], sweep: SweepConfig) -> Table:
     return table
 
 
-def _job_table(rows: Sequence[Row], sweep: SweepConfig) -> Table:
+def _job_table(rows: Sequence[Row], ranking: Ranking) -> Table:
     """Below the ranking are jobs without a value, such as those that have failed."""
-    table = _table("rank", "job", "overrides", sweep.objective, "steps", "state")
-    listed = [(str(rank), row) for rank, row in enumerate(ranked(rows, sweep), 1)]
+    table = _table("rank", "job", "overrides", ranking.objective, "steps", "state")
+    listed = [(str(rank), row) for rank, row in enumerate(ranked(rows, ranking), 1)]
     listed += [("-", row) for row in rows if row["value"] is None]
     for rank, row in listed:
         value = shown(row["value"], row["window_full"], row["episodes"])
@@ -204,7 +210,7 @@ def _table(*headings: str) -> Table:
     return table
 
 
-def draw_curves(jobs: Sequence[Job], sweep: SweepConfig, paths: SweepPaths) -> None:
+def draw_curves(jobs: Sequence[AnyJob], ranking: Ranking, paths: SweepPaths) -> None:
     """Draws the objective over environment steps: one line for all seeds of the same settings.
 
     The line is the interquartile mean over the seeds, the band the range between the quartiles.
@@ -225,7 +231,7 @@ def draw_curves(jobs: Sequence[Job], sweep: SweepConfig, paths: SweepPaths) -> N
         axes.plot(steps, middle.mean, label=f"{label} (n={len(own)})")
         if len(own) > 1:
             axes.fill_between(steps, middle.low, middle.high, alpha=0.2)
-    axes.set(xlabel="environment steps", ylabel=sweep.objective)
+    axes.set(xlabel="environment steps", ylabel=ranking.objective)
     axes.grid(alpha=0.3)
     axes.legend(fontsize="small")
     drawn_png = io.BytesIO()
@@ -241,7 +247,7 @@ def spread(curves: Sequence[Sequence[tuple[int, float]]]) -> tuple[np.ndarray, M
     return steps, middle_of(np.stack([np.interp(steps, *np.array(curve).T) for curve in curves]))
 
 
-def _row(job: Job, paths: SweepPaths, first_s: float) -> dict[str, Any]:
+def _row(job: AnyJob, paths: SweepPaths, first_s: float) -> dict[str, Any]:
     progress = job.progress
     start_s, update_s = progress.started_s, progress.updated_s
     return {
@@ -254,9 +260,12 @@ def _row(job: Job, paths: SweepPaths, first_s: float) -> dict[str, Any]:
         "window_full": progress.is_full,
         "episodes": progress.episodes,
         "env_steps": progress.env_steps,
+        "env_steps_per_s": progress.mean_steps_per_s,
         "start_s": None if start_s is None else round(start_s - first_s, 3),
         "first_update_s": None if not start_s or not update_s else round(update_s - start_s, 3),
         "wall_s": round(progress.wall_s, 3),
+        "exit_code": progress.exit_code,
+        "log": str(paths.log(job.number)),
         "error": progress.error,
     }
 

@@ -1,19 +1,19 @@
-"""A process of a sweep that runs, with the jobs that it trains."""
+"""A process that runs, with its jobs, and how it has ended."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import NamedTuple
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Generic, NamedTuple, TypeVar
 
-from gmijax.control.exit_codes import EXIT_BAD_INPUT, EXIT_INTERRUPTED
-from gmijax.runs.folder import RunPaths
-from gmijax.runs.history import MetricsReader
-from gmijax.supervise.failures import signal_name
+from gmijax.clock import running_s
 from gmijax.sweeps.children import Seen
-from gmijax.sweeps.jobs import Job
 from gmijax.sweeps.nodes import Host
-from gmijax.sweeps.packs import own_end
 from gmijax.sweeps.places import Place
+
+if TYPE_CHECKING:
+    from gmijax.sweeps.kind import AnyJob, Reader
+
+J = TypeVar("J", bound="AnyJob")
 
 
 class Outcome(NamedTuple):
@@ -25,66 +25,67 @@ class Outcome(NamedTuple):
       is_fault: whether it may be tried again: its machine is gone, its controller was killed, or
         the process that it shared with others is. From other faults a job with processes of its
         own goes on by itself.
+      may_be_anothers: whether a neighbour on its GPU may have caused it.
+      is_out_of_memory: whether it found no memory on its GPU.
     """
 
     is_interrupted: bool = False
     error: str | None = None
     is_fault: bool = False
+    may_be_anothers: bool = False
+    is_out_of_memory: bool = False
 
 
 @dataclass
-class Running:
+class Running(Generic[J]):
     """A process of jobs that runs: of one, or of several that are trained together.
 
     Attributes:
-      jobs: what it trains.
+      jobs: what it runs.
       place: where.
       host: the machine.
       child: its number there.
       readers: of their metrics.
-      is_asked: whether it was asked to end.
-      is_pruned: whether that was because others are better.
+      started_s: when, by the clock of this process.
+      kill_at_s: when it is ended by force, by the clock of this process; None: it may go on.
+      is_pruned: whether it was asked to end because others are better.
+      is_retracted: whether that was because fewer are to run at once.
+      hung: why it was ended although nobody wanted that; None: it was not.
       is_killed: whether it was ended by force, as the whole sweep is.
     """
 
-    jobs: tuple[Job, ...]
+    jobs: tuple[J, ...]
     place: Place
     host: Host
     child: int
-    readers: tuple[MetricsReader, ...]
-    is_asked: bool = False
+    readers: tuple[Reader, ...]
+    started_s: float = field(default_factory=running_s)
+    kill_at_s: float | None = None
     is_pruned: bool = False
+    is_retracted: bool = False
+    hung: str | None = None
     is_killed: bool = False
+
+    @property
+    def is_asked(self) -> bool:
+        """Whether it was asked to end."""
+        return self.kill_at_s is not None
 
     def look(self) -> Seen | None:
         """How it is; None: that is not known."""
         return self.host.look(self.child)
 
-    def order_stop(self) -> None:
-        """Asks it to save and end."""
-        self.is_asked = True
+    def order_stop(self, limit_s: float) -> None:
+        """Asks it to save and end within so many seconds."""
+        self.kill_at_s = self.kill_at_s or running_s() + limit_s
         self.host.order(self.child, "ask_to_stop")
+
+    def kill_if_late(self) -> None:
+        """Ends it if it was asked and has not ended in time."""
+        if self.kill_at_s is not None and running_s() > self.kill_at_s:
+            self.host.order(self.child, "kill")
 
     def is_over(self) -> bool:
         """Whether it has ended, or its machine is gone."""
         seen = self.look()
         return self.host.lost is not None or (seen is not None and seen.exit_code is not None)
-
-    def outcome(self, job: Job, run: RunPaths) -> Outcome:
-        """After its end: of one of its jobs, which has this run folder."""
-        seen, are_several = self.look() or Seen(None), len(self.jobs) > 1
-        if are_several and (own := own_end(job, run)) is not None:
-            return Outcome(error=own.error)
-        if seen.exit_code == 0 and not are_several:
-            return Outcome()
-        if self.is_killed or (seen.exit_code == EXIT_INTERRUPTED and self.is_asked):
-            return Outcome(is_interrupted=True)
-        if seen.exit_code is None:
-            return Outcome(error=self.host.lost, is_fault=True)
-        if seen.exit_code == EXIT_INTERRUPTED:
-            return Outcome(error="a signal from elsewhere interrupted it", is_fault=True)
-        if seen.exit_code < 0:
-            killed_by = signal_name(-seen.exit_code)
-            return Outcome(error=f"its controller was killed by {killed_by}", is_fault=True)
-        error = seen.said.removeprefix("gmijax.train: ") or f"exit code {seen.exit_code}"
-        return Outcome(error=error, is_fault=are_several and seen.exit_code != EXIT_BAD_INPUT)

@@ -1,4 +1,4 @@
-"""Runs the jobs of a sweep, as many at a time as there are places."""
+"""Runs jobs of any kind, as many at a time as there are places."""
 
 from __future__ import annotations
 
@@ -6,68 +6,70 @@ import time
 from collections import Counter
 from collections.abc import Callable, Sequence
 from contextlib import suppress
-from typing import Any
+from typing import Generic
 
 from gmijax.clock import running_s
-from gmijax.config.schema import to_dict
-from gmijax.config.sweep import SweepConfig
+from gmijax.config.sweep import Ranking
 from gmijax.errors import GmijaxError, JobInterrupted, NodeLost
 from gmijax.runs.folder import add_event
 from gmijax.runs.held import is_locked
-from gmijax.runs.history import MetricsReader
-from gmijax.supervise.failures import may_be_anothers
 from gmijax.supervise.run_gmis import StopSignals
+from gmijax.sweeps.children import Seen
 from gmijax.sweeps.host import Start
-from gmijax.sweeps.hparams import write_hparams
-from gmijax.sweeps.jobs import Job, SweepPaths, placed
+from gmijax.sweeps.kind import J, Kind, Limiter
 from gmijax.sweeps.nodes import Host
-from gmijax.sweeps.packs import Packer, program_of
+from gmijax.sweeps.paths import SweepPaths
 from gmijax.sweeps.places import Place, Places
 from gmijax.sweeps.running import Outcome, Running
 from gmijax.sweeps.study import Study
 
 _TICK_S = 0.1
-_KILL_AFTER_S = 15.0
-"""Beyond what a job gives its GMIs to save and end; for killed ones to be gone."""
+_KILLED_S = 15.0
+"""For killed ones to be gone."""
 
 
-class Scheduler:
+class Scheduler(Generic[J]):
     """Starts jobs where there is room, reads how far they are, and ends them when told to.
 
     A job that fails ends alone. But where it shared an MPS daemon, and the fault may have been
     that of another client, it is run once more, from its last checkpoint and alone on its GPU.
-    Jobs whose controller was killed, or of a machine that is gone, or of a process that they
-    shared, run again, as often as `run.max_restarts` says.
+    Jobs with other faults that may pass, such as a machine that is gone, run again, as often as
+    their kind says.
 
     Args:
       jobs: those that are known; those that are `waiting` are run. More come from the study.
       study: see above; is told how jobs do.
-      sweep: settings.
-      paths: files of the sweep.
+      kind: of all jobs.
+      ranking: what they are compared by.
+      paths: their files.
       places: of the jobs.
       hosts: machines of the places, in that order; opened.
       on_tick: called ten times a second.
+      limiter: changes how many run at once; None: as many as there are places.
     """
 
     def __init__(
         self,
-        jobs: list[Job],
-        study: Study,
-        sweep: SweepConfig,
+        jobs: list[J],
+        study: Study[J],
+        kind: Kind[J],
+        ranking: Ranking,
         paths: SweepPaths,
         places: Places,
         hosts: Sequence[Host],
         on_tick: Callable[[], None],
+        limiter: Limiter[J] | None = None,
     ) -> None:
         self._jobs, self._study = jobs, study
         self._queue = [job for job in jobs if job.progress.state == "waiting"]
-        self._sweep, self._paths = sweep, paths
+        self._kind, self._ranking, self._paths = kind, ranking, paths
         self._places, self._hosts, self._on_tick = places, hosts, on_tick
-        self._packer = Packer(sweep, paths)
+        self._limiter = limiter
         self._alone: set[int] = set()
         self._faults: Counter[int] = Counter()
-        self._running: dict[int, Running] = {}
+        self._running: dict[int, Running[J]] = {}
         self._compiling: dict[tuple[int, str], int] = {}
+        self._programs: dict[int, str] = {}
         self._unwritten: OSError | None = None
 
     def run(self, signals: StopSignals) -> None:
@@ -87,6 +89,7 @@ class Scheduler:
                 self._look()
                 if self._unwritten is not None:
                     raise self._unwritten
+                self._retract()
                 if not self._places.left:
                     raise NodeLost(f"no node is left: {self._hosts[-1].lost}")
                 self._start_what_fits()
@@ -114,12 +117,12 @@ class Scheduler:
             if not self._start_if_it_fits(job):
                 self._queue.append(job)
 
-    def _start_if_it_fits(self, job: Job) -> bool:
+    def _start_if_it_fits(self, job: J) -> bool:
         avoid = self._compiling_sites(job)
         # Others compile the same there; when they have, it is found in the cache.
         if not (num_gpus := self._places.num_gpus_with_room(avoid)):
             return False
-        together = self._packer.together(job, self._queue, self._alone)
+        together = self._kind.together(job, self._queue, self._alone)
         place = self._places.take(
             job.num_gpus,
             alone=job.number in self._alone,
@@ -135,27 +138,20 @@ class Scheduler:
             return False
         return True
 
-    def _compiling_sites(self, job: Job) -> set[int]:
+    def _compiling_sites(self, job: J) -> set[int]:
         """Machines where another job compiles the same programs."""
         return {site for site, program in self._compiling if program == job.program}
 
-    def _start(self, jobs: tuple[Job, ...], place: Place) -> None:
+    def _start(self, jobs: tuple[J, ...], place: Place) -> None:
         host, first = self._hosts[place.site], jobs[0]
-        # Alone on a GPU a job does as it would without a sweep.
-        backend = "auto" if place.is_whole_gpu else place.backend
-        configs: list[dict[str, Any]] = []
-        readers: list[MetricsReader] = []
         for job in jobs:
-            run = self._paths.job(job.number)
-            configs.append(to_dict(placed(job, run, place, backend)))
-            readers.append(MetricsReader(run.metrics))
-            job.progress.read(run, self._sweep)
-            readers[-1].new()  # Those are an earlier attempt's.
-        files = self._paths.order(first.number), self._paths.log(first.number)
-        started = host.start(Start(place, configs, *files, program_of(first, len(jobs))))
+            job.progress.read(self._paths.job(job.number), self._ranking)
+        start = self._kind.start(jobs, place)
+        started = host.start(Start(place, start.process, start.program))
         if not started.has_programs:
             self._compiling[place.site, first.program] = first.number
-        self._running[first.number] = Running(jobs, place, host, started.child, tuple(readers))
+        self._running[first.number] = Running(jobs, place, host, started.child, start.readers)
+        self._programs[first.number] = start.program
         for job in jobs:
             job.progress.begin(place.label, host.name)
         self._queue = [job for job in self._queue if job.progress.state == "waiting"]
@@ -164,41 +160,59 @@ class Scheduler:
         for running in list(self._running.values()):
             is_over = running.is_over()
             for job, reader in zip(running.jobs, running.readers, strict=True):
-                progress = job.progress
                 for line in reader.new():
-                    progress.take(line, self._sweep)
-                    progress.updated_s = progress.updated_s or time.monotonic()
+                    job.progress.report(line, self._ranking)
                     self._nobody_waits_for(running, has_compiled=True)
+            if running_s() > running.started_s + self._kind.longest_compile_s:
+                self._nobody_waits_for(running, has_compiled=True)
             if is_over:
                 self._finish(running)
-            elif not running.is_asked and self._is_hopeless(running.jobs[0]):
+            elif running.is_asked:
+                running.kill_if_late()
+            elif self._is_hopeless(running.jobs[0]):
                 running.is_pruned = True
-                running.order_stop()
+                self._order_stop(running)
+            elif (hung := self._kind.why_hung(running)) is not None:
+                running.hung = hung
+                running.host.order(running.child, "kill")
         self._drop_lost()
 
-    def _finish(self, running: Running) -> None:
+    def _retract(self) -> None:
+        if self._limiter is not None:
+            for running in self._limiter.look(list(self._running.values())):
+                running.is_retracted = True
+                self._order_stop(running)
+
+    def _order_stop(self, running: Running[J]) -> None:
+        running.order_stop(max(map(self._kind.stop_s, running.jobs)))
+
+    def _finish(self, running: Running[J]) -> None:
         del self._running[running.jobs[0].number]
-        ends = [running.outcome(job, self._paths.job(job.number)) for job in running.jobs]
+        ends = [self._kind.outcome(running, job) for job in running.jobs]
+        exit_code = (running.look() or Seen(None)).exit_code
         running.host.order(running.child, "close")
         self._places.give_back(running.place)
         self._nobody_waits_for(running, has_compiled=False)
         again = [
             job
             for job, end in zip(running.jobs, ends, strict=True)
-            if self._end(running, job, end)
+            if self._end(running, job, end, exit_code)
         ]
         # They came before the others; one that waits for a whole GPU must not hold them up.
         first = [job for job in again if job.number not in self._alone]
         rest = [job for job in again if job.number in self._alone]
         self._queue = [*first, *self._queue, *rest]
 
-    def _end(self, running: Running, job: Job, end: Outcome) -> bool:
+    def _end(self, running: Running[J], job: J, end: Outcome, exit_code: int | None) -> bool:
         """Notes how a job has ended; whether it is to run again."""
         run, progress = self._paths.job(job.number), job.progress
-        self._packer.forget(job)
-        progress.read(run, self._sweep)
+        progress.read(run, self._ranking)
         progress.place, progress.error, progress.ended_s = "", end.error, time.monotonic()
+        progress.exit_code = exit_code
         progress.state = "failed" if end.error else "completed"
+        if running.is_retracted and (end.is_interrupted or end.error) and not running.is_killed:
+            progress.state, progress.error = "waiting", None
+            return True
         if end.is_interrupted or (end.is_fault and running.is_pruned):
             progress.state = "pruned" if running.is_pruned else "interrupted"
         elif end.error and (again := self._why_again(running, job, end)):
@@ -206,53 +220,48 @@ class Scheduler:
             add_event(run.events, "again", reason=again)
             return True
         with suppress(OSError):  # A full disk must not end the sweep.
-            write_hparams(job, run, self._sweep.objective)
+            self._kind.ended(job, run)
         self._tell(job)
         return False
 
-    def _is_hopeless(self, job: Job) -> bool:
+    def _is_hopeless(self, job: J) -> bool:
         try:
             return self._study.is_hopeless(job)
         except OSError as error:
             self._unwritten = self._unwritten or error
             return False
 
-    def _tell(self, job: Job) -> None:
+    def _tell(self, job: J) -> None:
         # Whatever becomes of the study, running jobs are to save and end.
         try:
             self._study.tell(job)
         except OSError as error:
             self._unwritten = self._unwritten or error
 
-    def _why_again(self, running: Running, job: Job, end: Outcome) -> str | None:
+    def _why_again(self, running: Running[J], job: J, end: Outcome) -> str | None:
         """Why a job that failed runs once more, if that may help."""
-        place, max_restarts = running.place, job.config.run.max_restarts
-        error = end.error or ""
+        error, is_shared = end.error or "", not running.place.is_alone
+        if end.is_out_of_memory and self._limiter and self._limiter.forbid(running, error):
+            return f"again, beside fewer others, after {error}"
         # The fault may be that of another client of its daemon.
-        has_neighbours = place.backend in ("mps", "mig") and not place.is_alone
-        if (
-            has_neighbours
-            and max_restarts
-            and running.host.lost is None
-            and may_be_anothers(error)
-        ):
+        if end.may_be_anothers and is_shared and running.host.lost is None:
             self._alone.add(job.number)
             return f"again, alone on its GPU, after {error}"
         if end.is_fault:
             self._faults[job.number] += 1
             # It may be what ends them.
-            if self._faults[job.number] <= max_restarts:
+            if self._faults[job.number] <= self._kind.max_restarts(job):
                 return f"again, after {error}"
         return None
 
-    def _nobody_waits_for(self, running: Running, *, has_compiled: bool) -> None:
+    def _nobody_waits_for(self, running: Running[J], *, has_compiled: bool) -> None:
         """Its metrics are there, or it has ended, perhaps before it had compiled."""
-        first, count = running.jobs[0], len(running.jobs)
+        first = running.jobs[0]
         key = running.place.site, first.program
         if self._compiling.get(key) == first.number:
             del self._compiling[key]
             with suppress(NodeLost):
-                running.host.add_program(program_of(first, count), has_compiled)
+                running.host.add_program(self._programs[first.number], has_compiled)
 
     def _drop_lost(self) -> None:
         for site in list(self._places.left):
@@ -262,10 +271,9 @@ class Scheduler:
     def _stop(self, signals: StopSignals) -> None:
         """Asks all jobs to save and end; the same signal again ends them at once."""
         for running in self._running.values():
-            running.order_stop()
-        limits = [running.jobs[0].config.run for running in self._running.values()]
-        longest_s = max((run.stop_timeout_s + run.grace_s for run in limits), default=0.0)
-        deadline_s = running_s() + longest_s + _KILL_AFTER_S
+            self._order_stop(running)
+        jobs = [job for running in self._running.values() for job in running.jobs]
+        deadline_s = running_s() + max(map(self._kind.stop_s, jobs), default=0.0)
         while self._running and running_s() < deadline_s and signals.requests < 2:
             self._look()
             self._on_tick()
@@ -276,7 +284,7 @@ class Scheduler:
         for running in left:
             running.is_killed = True
             running.host.order(running.child, "kill")
-        deadline_s = running_s() + 2 * _KILL_AFTER_S
+        deadline_s = running_s() + 2 * _KILLED_S
         for running in left:
             while not running.is_over() and running_s() < deadline_s:
                 time.sleep(_TICK_S)

@@ -37,7 +37,7 @@ class Interval(NamedTuple):
 Space: TypeAlias = Mapping[str, Choices | Interval]
 
 
-def grid(space: Space) -> list[dict[str, str]]:
+def grid(space: Space, command: str = "sweep") -> list[dict[str, str]]:
     """Every combination of values, the last key changing fastest.
 
     Raises:
@@ -47,8 +47,8 @@ def grid(space: Space) -> list[dict[str, str]]:
     for key, values in space.items():
         if isinstance(values, Interval):
             raise ConfigError(
-                f"{key}: an interval has no list of values; use sweep.sampler=random or tpe, or "
-                "give values"
+                f"{key}: an interval has no list of values; use {command}.sampler=random or tpe, "
+                "or give values"
             )
         lists[key] = values.values
     if (count := math.prod(map(len, lists.values()))) > MAX_JOBS:

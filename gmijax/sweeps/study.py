@@ -6,14 +6,14 @@ import importlib
 import os
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, Generic
 
-from gmijax.config.sweep import SweepConfig
+from gmijax.config.sweep import JobsConfig
 from gmijax.errors import ConfigError
-from gmijax.sweeps.jobs import Job
+from gmijax.sweeps.kind import J
 from gmijax.sweeps.space import Interval, Space, as_text
 
-MakeJob = Callable[[int, Mapping[str, str]], Job]
+MakeJob = Callable[[int, Mapping[str, str]], J]
 _REPORTS = 100
 """Values that a pruner gets of a whole job."""
 
@@ -24,23 +24,23 @@ _MOST_RANDOM = 10
 """Trials before TPE begins, with many of them: Optuna's default. With few, a quarter of them."""
 
 
-class Study:
+class Study(Generic[J]):
     """Hands out jobs, and is told what became of them; this one has none but those of the list."""
 
-    def next(self) -> Job | None:
+    def next(self) -> J | None:
         """Another job; None: there is none, now or any more."""
         return None
 
-    def is_hopeless(self, job: Job) -> bool:
+    def is_hopeless(self, job: J) -> bool:
         """Whether a job that runs should give its place to another one."""
         del job
         return False
 
-    def tell(self, job: Job) -> None:
+    def tell(self, job: J) -> None:
         """A job has ended."""
 
 
-class OptunaStudy(Study):
+class OptunaStudy(Study[J]):
     """Jobs as the trials of an Optuna study, which a file keeps.
 
     Trials of jobs that failed or were interrupted wait in the study, and so do those that a killed
@@ -54,7 +54,7 @@ class OptunaStudy(Study):
     """
 
     def __init__(
-        self, settings: SweepConfig, space: Space, make_job: MakeJob, journal: Path
+        self, settings: JobsConfig, space: Space, make_job: MakeJob[J], journal: Path
     ) -> None:
         self._settings, self._space, self._make_job = settings, space, make_job
         self._optuna = optuna = optuna_package()
@@ -80,7 +80,7 @@ class OptunaStudy(Study):
         self._trials: dict[int, Any] = {}
         self._reported = {t.number: max(t.intermediate_values, default=0) for t in self._left}
 
-    def earlier(self) -> list[Job]:
+    def earlier(self) -> list[J]:
         """The jobs of trials that have ended, the pruned ones marked as such."""
         jobs = []
         for trial in self._study.trials:
@@ -90,7 +90,7 @@ class OptunaStudy(Study):
                     jobs[-1].progress.state = "pruned"
         return jobs
 
-    def next(self) -> Job | None:
+    def next(self) -> J | None:
         """See `Study`."""
         if self._left:
             found = self._left.pop(0)
@@ -103,12 +103,14 @@ class OptunaStudy(Study):
         self._trials[trial.number] = trial
         return self._make_job(trial.number, self._chosen(trial.params))
 
-    def is_hopeless(self, job: Job) -> bool:
+    def is_hopeless(self, job: J) -> bool:
         """See `Study`."""
         trial, progress = self._trials.get(job.number), job.progress
         if trial is None:
             return False  # It has ended before, and goes on for more steps.
-        place = _REPORTS * progress.env_steps // job.config.num_timesteps
+        if not job.num_timesteps:
+            return False  # Nobody knows how far it is.
+        place = _REPORTS * progress.env_steps // job.num_timesteps
         if progress.value is None or place <= self._reported.get(job.number, 0):
             return False
         if not progress.is_full:
@@ -117,7 +119,7 @@ class OptunaStudy(Study):
         trial.report(progress.value, place)
         return trial.should_prune()
 
-    def tell(self, job: Job) -> None:
+    def tell(self, job: J) -> None:
         """See `Study`."""
         progress, trial = job.progress, self._trials.get(job.number)
         value, state = progress.value, None
@@ -131,7 +133,7 @@ class OptunaStudy(Study):
             value, state = None, self._states.FAIL
         self._study.tell(job.number, value, state=state, skip_if_finished=True)
 
-    def _is_comparable(self, job: Job) -> bool:
+    def _is_comparable(self, job: J) -> bool:
         """Whether the value of a job may stand beside those of the study.
 
         That of a window that is not full may as long as no other one is full.
@@ -175,7 +177,7 @@ def optuna_package() -> Any:
         return importlib.import_module("optuna")
     except ImportError:
         raise ConfigError(
-            "sweep.sampler, sweep.pruner: need the package optuna (pip install 'gmijax[sweep]')"
+            "samplers and pruners need the package optuna (pip install 'gmijax[sweep]')"
         ) from None
 
 
@@ -195,7 +197,7 @@ def _distribution(optuna: Any, values: Any) -> Any:
     return kind(values.low, values.high, log=values.is_log)
 
 
-def _sampler(optuna: Any, settings: SweepConfig, seed: int) -> Any:
+def _sampler(optuna: Any, settings: JobsConfig, seed: int) -> Any:
     samplers = optuna.samplers
     if settings.sampler == "tpe":
         random = min(_MOST_RANDOM, max(1, (settings.trials or 0) // 4))
@@ -204,7 +206,7 @@ def _sampler(optuna: Any, settings: SweepConfig, seed: int) -> Any:
     return samplers.RandomSampler(seed=seed)
 
 
-def _pruner(optuna: Any, settings: SweepConfig) -> Any:
+def _pruner(optuna: Any, settings: JobsConfig) -> Any:
     pruners = optuna.pruners
     if settings.pruner == "asha":
         return pruners.SuccessiveHalvingPruner()

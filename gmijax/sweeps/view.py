@@ -9,12 +9,16 @@ from rich.console import Console, Group
 from rich.table import Table
 from rich.text import Text
 
-from gmijax.config.sweep import SweepConfig
+from gmijax.config.sweep import Ranking
 from gmijax.control.display import LiveDisplay, bar, clock
-from gmijax.sweeps.jobs import Job, Progress, trainings_per_hour
+from gmijax.sweeps.kind import AnyJob, trainings_per_hour
+from gmijax.sweeps.progress import Progress
 from gmijax.sweeps.report import shown
 
-_HEADINGS = ("job", "overrides", "GPU and place", "progress", "{}", "ranked by", "ETA", "state")
+_HEADINGS = (
+    *("job", "overrides", "GPU and place", "progress", "steps/s", "{}", "ranked by"),
+    *("ETA", "state"),
+)
 _MOST_ROWS = 30
 _BAR_WIDTH = 10
 _ORDER = ("running", "failed", "interrupted", "waiting", "pruned", "completed")
@@ -26,11 +30,11 @@ class SweepView:
     Args:
       console: nothing is shown on a quiet one.
       jobs: those that are known; more may be added to the list.
-      sweep: settings.
+      ranking: what they are compared by.
     """
 
-    def __init__(self, console: Console, jobs: Sequence[Job], sweep: SweepConfig) -> None:
-        self._console, self._jobs, self._sweep = console, jobs, sweep
+    def __init__(self, console: Console, jobs: Sequence[AnyJob], ranking: Ranking) -> None:
+        self._console, self._jobs, self._ranking = console, jobs, ranking
         self._states: dict[int, str] = {}
         self._display = LiveDisplay(console)
 
@@ -68,21 +72,22 @@ class SweepView:
             if before != now and (now == "failed" or not self._display.has_panel):
                 self._console.print(self._change(job, job.progress))
 
-    def _change(self, job: Job, progress: Progress) -> str:
+    def _change(self, job: AnyJob, progress: Progress) -> str:
         what = f"{' '.join(filter(None, ('job', str(job.number), job.label)))}: {progress.state}"
         if progress.state == "running":
             return f"{what} on {progress.place}"
         if progress.error:
             return f"{what}: {progress.error}"
         value = shown(progress.value, progress.is_full, progress.episodes)
-        name = self._sweep.objective
+        name = self._ranking.objective
         return f"{what} after {progress.wall_s:.0f} s, {name} {value}; {self.line()}"
 
     def _table(self) -> Table:
         table = Table(box=None, pad_edge=False)
         for heading in _HEADINGS:
-            name = heading.format(self._sweep.objective)
-            table.add_column(name, no_wrap=heading not in ("overrides", "state"))
+            name = heading.format(self._ranking.objective)
+            is_long = heading in ("overrides", "state")
+            table.add_column(name, no_wrap=not is_long, min_width=8 if is_long else None)
         rows = sorted(self._jobs, key=lambda job: _ORDER.index(job.progress.state))
         for job in rows[:_MOST_ROWS]:
             table.add_row(*_row(job, job.progress))
@@ -97,18 +102,21 @@ def _ranked(progress: Progress) -> str:
     return f"{progress.value:.4g}{'' if progress.is_full else ' (early)'}"
 
 
-def _row(job: Job, progress: Progress) -> tuple[str | Text, ...]:
-    total, rate = job.config.num_timesteps, progress.env_steps_per_s
-    part = min(progress.env_steps / total, 1.0)
-    left_s = max(0.0, total - progress.env_steps) / rate if rate else None
+def _row(job: AnyJob, progress: Progress) -> tuple[str | Text, ...]:
+    total, rate = job.num_timesteps, progress.env_steps_per_s
+    part = min(progress.env_steps / total, 1.0) if total else None
+    left_s = max(0.0, total - progress.env_steps) / rate if rate and total else None
+    done = f" {progress.env_steps:,}" if part is None else f" {part:.0%}"
+    words = filter(None, (progress.error, progress.note))
     return (
         str(job.number),
         # As text: overrides and errors may look like markup.
         Text(job.label),
         progress.place,
-        Text.assemble(bar(part, _BAR_WIDTH), f" {part:.0%}"),
+        Text(done.strip()) if part is None else Text.assemble(bar(part, _BAR_WIDTH), done),
+        f"{rate:,.0f}" if rate else "",
         "" if progress.latest is None else f"{progress.latest:.4g}",
         _ranked(progress),
         "" if left_s is None else clock(left_s),
-        Text(f"{progress.state}: {progress.error}" if progress.error else progress.state),
+        Text(": ".join((progress.state, *words))),
     )

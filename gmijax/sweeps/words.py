@@ -7,18 +7,18 @@ from typing import Any
 
 from rich.console import Console
 
-from gmijax.config.sweep import SweepConfig
-from gmijax.sweeps.jobs import Job, SweepPaths
-from gmijax.sweeps.objective import why_not_comparable
+from gmijax.config.sweep import Ranking
+from gmijax.sweeps.kind import J
+from gmijax.sweeps.paths import SweepPaths
 from gmijax.sweeps.places import Site
 from gmijax.sweeps.report import tables
+from gmijax.sweeps.work import Work
 
 
 def announce(
     console: Console,
     sites: Sequence[Site],
-    jobs: Sequence[Job],
-    settings: SweepConfig,
+    work: Work[J],
     num_complete: int,
 ) -> None:
     """Says how many jobs there are, of which some are complete, and where they run.
@@ -26,29 +26,29 @@ def announce(
     Args:
       console: where it is said.
       sites: machines and their places.
-      jobs: all of a grid, some of another sampler.
-      settings: of the sweep.
+      work: the jobs, and where they come from.
       num_complete: jobs that an earlier command has completed.
     """
-    total = len(jobs) if settings.sampler == "grid" else settings.trials or 0
+    settings = work.settings
+    total = len(work.jobs) if settings.sampler == "grid" else settings.trials or 0
     more = f", {num_complete} of them complete already" if num_complete else ""
     places = sum(len(site.plan.slices) for site in sites)
     console.print(f"{_counted(total, 'job')}{more}, {places} at a time {_where(sites)}")
     for reason in dict.fromkeys(reason for site in sites for reason in site.plan.reasons):
         console.print(f"  {reason}")
-    if (warning := why_not_comparable(jobs, settings)) is not None:
+    for warning in work.warnings():
         console.print(f"  {warning}")
 
 
 def print_outcome(
     console: Console,
     report: Mapping[str, Any],
-    settings: SweepConfig,
+    ranking: Ranking,
     paths: SweepPaths,
     line: str,
 ) -> None:
     """Prints the tables of a `sweep.json`, a line about all jobs, and the files."""
-    for table in tables(report, settings):
+    for table in tables(report, ranking):
         console.print(table)
         console.print()
     console.print(f"{line}\nsummary: {paths.sweep}\ntables: {paths.settings}, {paths.table}")

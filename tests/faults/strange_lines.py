@@ -189,6 +189,21 @@ _SWEPT = (
 )
 
 
+_COMMAND_WORDS = (
+    *(
+        "true",
+        "python3",
+        "/bin/sh",
+        "nothing-of-that-name",
+        "{seed}",
+        "{run_dir}",
+        "{job}",
+        "{sed}",
+    ),
+    *("{{seed}}", "{", "}", "{}", '{"a": 1}', "${HOME}", "{x.y}", "{0..3}", "--", "-c", ""),
+)
+
+
 @st.composite
 def command_lines(draw: st.DrawFn, command: str) -> list[str]:
     """At most two strange arguments among good ones, so that all checks are reached."""
@@ -204,4 +219,7 @@ def command_lines(draw: st.DrawFn, command: str) -> list[str]:
         argv.append(draw(st.sampled_from(["seed=0,1", "seed=range(0,3)", *_SWEPT])))
     if argv and draw(st.integers(0, 5)) == 0:
         argv.append(draw(st.sampled_from(argv)))
+    if command == "pack":
+        words = draw(st.lists(st.sampled_from(_COMMAND_WORDS) | _ANY_TEXT, max_size=3))
+        return [*argv, *draw(st.sampled_from([["seed=0,1"], ["x.y=1e-4,2"], []])), "--", *words]
     return draw(st.permutations(argv)) if draw(st.booleans()) else argv

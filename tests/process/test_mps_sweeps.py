@@ -19,10 +19,12 @@ from gmijax.runs.folder import RunPaths
 from gmijax.supervise.backends import open_backend
 from gmijax.supervise.run_gmis import StopSignals
 from gmijax.sweeps.host import LocalHost, variables_of
-from gmijax.sweeps.jobs import SweepPaths, jobs_of
+from gmijax.sweeps.jobs import Job, jobs_of
+from gmijax.sweeps.paths import SweepPaths
 from gmijax.sweeps.places import Places, Site, places_of
 from gmijax.sweeps.scheduler import Scheduler
 from gmijax.sweeps.study import Study
+from gmijax.sweeps.training import TrainingKind
 
 pytestmark = pytest.mark.timeout(180)
 
@@ -35,7 +37,7 @@ def mps(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> FakeMps:
 def test_a_fatal_fault_ends_one_job_of_a_sweep_and_its_neighbours_go_on(
     mps: FakeMps, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
-    monkeypatch.setattr("gmijax.sweeps.children.MODULE", "fake_training_job")
+    monkeypatch.setattr("gmijax.sweeps.training.MODULE", "fake_training_job")
     monkeypatch.setenv("JAX_COMPILATION_CACHE_DIR", str(tmp_path))
     monkeypatch.setenv("PYTHONPATH", f"{CHECKOUT}{os.pathsep}{TESTS}")
     here = machine(2, mps_control=mps.program)
@@ -46,7 +48,10 @@ def test_a_fatal_fault_ends_one_job_of_a_sweep_and_its_neighbours_go_on(
     with closing(LocalHost(here)) as host:
         host.open(plan, paths)
         places = Places([Site(plan, here)])
-        scheduler = Scheduler(jobs, Study(), settings, paths, places, [host], lambda: None)
+        kind = TrainingKind(settings, paths)
+        scheduler = Scheduler(
+            jobs, Study[Job](), kind, settings, paths, places, [host], lambda: None
+        )
         scheduler.run(StopSignals())
     states = [job.progress.state for job in jobs]
     assert states == ["completed", "failed", *["completed"] * 4]

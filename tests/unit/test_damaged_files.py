@@ -24,7 +24,8 @@ from gmijax.runs import folder
 from gmijax.runs.folder import META, RunPaths, open_regular, read_json, write_json
 from gmijax.runs.history import copy_history, read_metrics
 from gmijax.runs.resume import CheckpointMeta, file_check, newest_checkpoint, what_is_broken
-from gmijax.sweeps.jobs import Progress, state_of
+from gmijax.sweeps.jobs import state_of
+from gmijax.sweeps.progress import Progress
 
 DEVICE = Path("/dev/zero")
 

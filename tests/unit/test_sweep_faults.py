@@ -20,8 +20,9 @@ from gmijax.errors import GmijaxError
 from gmijax.runs.folder import read_json
 from gmijax.runs.held import OpenFolder, locked
 from gmijax.sweeps import report, scheduler
-from gmijax.sweeps.children import Child
-from gmijax.sweeps.jobs import Job, SweepPaths, jobs_of
+from gmijax.sweeps.children import Child, Process
+from gmijax.sweeps.jobs import Job, jobs_of
+from gmijax.sweeps.paths import SweepPaths
 from gmijax.sweeps.report import Report
 from gmijax.sweeps.study import Study
 
@@ -57,7 +58,7 @@ def full(*_: Any, **__: Any) -> Any:
     raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), "some/file")
 
 
-class FullStudy(Study):
+class FullStudy(Study[Job]):
     """Cannot be written when it is told of a job, or asked about one."""
 
     tell = full
@@ -97,8 +98,10 @@ def test_an_order_that_cannot_be_written_is_named(
 ) -> None:
     monkeypatch.setattr("gmijax.sweeps.children.write_json", full)
     before = len(os.listdir("/proc/self/fd"))
+    order = tmp_path / "003.json", {}
+    process = Process("job 003", ("true",), tmp_path / "003.log", order=order)
     with pytest.raises(GmijaxError, match=r"^job 003: cannot be started \(No space left"):
-        Child([], (), tmp_path / "003.json", tmp_path / "003.log", {})
+        Child(process, {})
     assert len(os.listdir("/proc/self/fd")) == before
 
 
@@ -112,7 +115,7 @@ def test_room_is_kept_for_the_end_of_a_sweep(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     paths = SweepPaths(tmp_path)
-    files = Report(ended_job(), SweepConfig(), paths, OpenFolder(paths.root, "x"), 0.0)
+    files = Report(ended_job(), SweepConfig(), dict, paths, OpenFolder(paths.root, "x"), 0.0)
     files.begin()
     assert read_json(paths.sweep)["status"] == "running"
     assert paths.room.stat().st_blocks * 512 >= 2 * paths.sweep.stat().st_size
@@ -162,7 +165,7 @@ def test_a_disk_that_is_full_at_the_start_leaves_nothing(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr("gmijax.sweeps.sweep.write_json", full)
+    monkeypatch.setattr("gmijax.sweeps.runner.write_json", full)
     for sampler in ((), (*TPE, "algo.learning_rate=interval(1e-5,1e-3)")):
         assert run("run.dir=all", *sampler) == 1
         assert capsys.readouterr().err == "gmijax.sweep: some/file: No space left on device\n"

@@ -28,12 +28,15 @@ from gmijax.supervise.run_gmis import StopSignals
 from gmijax.sweeps import jobs_per_gpu, scheduler
 from gmijax.sweeps.children import Seen
 from gmijax.sweeps.host import LocalHost, Order, Start, Started
-from gmijax.sweeps.jobs import Job, SweepPaths, jobs_of
+from gmijax.sweeps.jobs import Job, jobs_of
 from gmijax.sweeps.nodes import RemoteHost, SweepNode, nodes_of, num_cpus_of
+from gmijax.sweeps.paths import SweepPaths
 from gmijax.sweeps.places import Places, Site, places_of
 from gmijax.sweeps.report import Report
 from gmijax.sweeps.scheduler import Scheduler
 from gmijax.sweeps.study import Study
+from gmijax.sweeps.sweep import sweep_of
+from gmijax.sweeps.training import TrainingKind
 
 
 class FakeHost(LocalHost):
@@ -52,11 +55,13 @@ class FakeHost(LocalHost):
     def start(self, start: Start) -> Started:
         if self.lost is not None:
             raise NodeLost(self.lost)
-        folders = [Path(config["run"]["dir"]) for config in start.configs]
+        assert start.process.order is not None
+        order, told = start.process.order
+        folders = [Path(config["run"]["dir"]) for config in told["configs"]]
         for folder in folders:
             folder.mkdir(exist_ok=True)
         child = next(self._numbers)
-        self.running[child] = int(start.order.stem)
+        self.running[child] = int(order.stem)
         self.started.append(self.running[child])
         self.folders.append(folders)
         return Started(child, start.program in self.programs)
@@ -104,8 +109,9 @@ class Sweep:
         def tick() -> None:
             (left.pop(0) if len(left) > 1 else left[0])()
 
-        args = self.jobs, Study(), self.settings, self.paths, self.places, self.nodes, tick
-        Scheduler(*args).run(StopSignals())
+        kind, ranking = TrainingKind(self.settings, self.paths), self.settings
+        args = kind, ranking, self.paths, self.places, self.nodes, tick
+        Scheduler(self.jobs, Study(), *args).run(StopSignals())
 
     def states(self) -> list[str]:
         return [job.progress.state for job in self.jobs]
@@ -186,7 +192,7 @@ def test_jobs_of_a_node_that_is_lost_run_again_on_the_other(tmp_path: Path) -> N
     events = (sweep.paths.job(1).events).read_text()
     assert "no power" in events
     report = Report(
-        sweep.jobs, sweep.settings, sweep.paths, OpenFolder(sweep.paths.root, "x"), 1.0
+        sweep.jobs, sweep.settings, dict, sweep.paths, OpenFolder(sweep.paths.root, "x"), 1.0
     )
     assert report.end("completed") is None
     rows = report.data["jobs"]
@@ -385,13 +391,14 @@ def test_the_nodes_are_the_sweeps_and_each_job_is_on_one_machine() -> None:
 def test_ray_is_asked_for_a_cpu_for_every_gmi(
     settings: dict[str, Any], overrides: tuple[str, ...], num_cpus: int
 ) -> None:
-    assert num_cpus_of(SweepConfig(**settings), jobs(2, *overrides)) == num_cpus
+    work = sweep_of(SweepConfig(), {}, lambda n, _: jobs(1)[n], jobs(2, *overrides))
+    assert num_cpus_of(SweepConfig(**settings), work.processes) == num_cpus
 
 
 def test_indices_of_gpus_are_refused_on_nodes(tmp_path: Path) -> None:
     with (
         pytest.raises(ConfigError, match=r"sweep\.gpus=\[0, 1\]: Ray chooses the GPUs"),
-        nodes_of(ClusterConfig(engine="ray"), SweepConfig(gpus=(0, 1)), jobs(1), tmp_path),
+        nodes_of(ClusterConfig(engine="ray"), SweepConfig(gpus=(0, 1)), False, 1, tmp_path),
     ):
         pass
 

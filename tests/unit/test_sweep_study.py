@@ -13,7 +13,8 @@ from optuna.storages.journal import JournalFileBackend
 from gmijax.cli.compose import compose
 from gmijax.cli.grid import build_sweep
 from gmijax.errors import ConfigError
-from gmijax.sweeps.jobs import Job, State, jobs_of
+from gmijax.sweeps.jobs import Job, jobs_of
+from gmijax.sweeps.progress import State
 from gmijax.sweeps.study import OptunaStudy
 
 

@@ -21,7 +21,8 @@ from gmijax.errors import printable
 from gmijax.runs.folder import RunPaths
 from gmijax.runs.held import OpenFolder
 from gmijax.sweeps.hparams import write_hparams
-from gmijax.sweeps.jobs import Job, SweepPaths, jobs_of
+from gmijax.sweeps.jobs import Job, jobs_of
+from gmijax.sweeps.paths import SweepPaths
 from gmijax.sweeps.report import Report
 from gmijax.sweeps.view import SweepView
 
@@ -75,10 +76,10 @@ def test_the_table_says_of_each_job_where_and_how_far_it_is() -> None:
         shown = terminal.getvalue()
     lines = [printable(line).split() for line in shown.splitlines()]
     rows = {words[0]: " ".join(words) for words in reversed(lines) if words}
-    assert "overrides GPU and place progress return ranked by ETA state" in rows["job"]
-    assert rows["0"].endswith("50% 2.5 3.5 0:00:10 running")
+    assert "overrides GPU and place progress steps/s return ranked by ETA state" in rows["job"]
+    assert rows["0"].endswith("50% 50 2.5 3.5 0:00:10 running")
     assert "seed=0 GPU 3 place 0" in rows["0"]
-    assert rows["1"].endswith("25% 2.5 3.5 0:00:15 running")
+    assert rows["1"].endswith("25% 50 2.5 3.5 0:00:15 running")
     assert rows["2"].endswith("100% 2.5 3.5 completed")
     assert "waiting: again, alone on its GPU, after CUDA_ERROR_[/x]" in rows["3"]
     assert "2 running, 1 waiting, 1 completed; 100 steps/s, 2.0 runs/h" in shown
@@ -182,7 +183,7 @@ def test_throughput_is_of_the_jobs_that_a_command_has_run(tmp_path: Path) -> Non
     jobs[3].progress.state, jobs[3].progress.error = "completed", None  # By an earlier command.
     for job in jobs[:2]:
         job.progress.state, job.progress.ended_s = "completed", jobs[2].progress.ended_s
-    whole = Report(jobs, SWEEP, SweepPaths(tmp_path), OpenFolder(tmp_path, "x"), 0.0)
+    whole = Report(jobs, SWEEP, dict, SweepPaths(tmp_path), OpenFolder(tmp_path, "x"), 0.0)
     assert whole.end("completed") is None
     report = whole.data
     assert report["trainings_per_hour"] == pytest.approx(3 * 2.0, rel=1e-3)

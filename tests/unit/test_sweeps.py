@@ -26,19 +26,13 @@ from gmijax.supervise.run_gmis import StopSignals
 from gmijax.sweeps import jobs_per_gpu
 from gmijax.sweeps.compiled import CompiledPrograms
 from gmijax.sweeps.host import LocalHost
-from gmijax.sweeps.jobs import (
-    Job,
-    Progress,
-    SweepPaths,
-    jobs_of,
-    placed,
-    require_placeable,
-    state_of,
-)
+from gmijax.sweeps.jobs import Job, jobs_of, placed, require_placeable, state_of
 from gmijax.sweeps.jobs_per_gpu import with_jobs_per_gpu
 from gmijax.sweeps.objective import why_not_comparable, with_objective
 from gmijax.sweeps.packs import most_together, require_packable
+from gmijax.sweeps.paths import SweepPaths
 from gmijax.sweeps.places import Place, Places, Site, places_of
+from gmijax.sweeps.progress import Progress
 from gmijax.sweeps.report import Report, spread, tables
 
 
@@ -409,7 +403,7 @@ def test_only_a_run_with_all_its_steps_is_complete(tmp_path: Path) -> None:
 
 def shown_tables(folder: Path, jobs: Sequence[Job], sweep: SweepConfig) -> list[list[list[str]]]:
     """The rows of the tables for people."""
-    report = Report(jobs, sweep, SweepPaths(folder), OpenFolder(folder, "x"), 0.0)
+    report = Report(jobs, sweep, dict, SweepPaths(folder), OpenFolder(folder, "x"), 0.0)
     assert report.end("completed") is None
     columns = [table.columns for table in tables(report.data, sweep)]
     return [

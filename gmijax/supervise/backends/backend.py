@@ -72,3 +72,8 @@ class Backend:
 
     def terminate(self, gmi: int, pid: int) -> None:
         """Detaches a GMI from its GPU before it is killed; best effort, returns in seconds."""
+
+    def why_no_client(self, gmi: int, pids: Collection[int]) -> str | None:
+        """Why none of these processes has the share of a GMI; None: one has, or needs none."""
+        del gmi, pids
+        return None

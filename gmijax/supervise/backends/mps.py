@@ -145,6 +145,18 @@ class MpsBackend(Backend):
             # Each attempt could cost a time limit; the other GMIs are killed without it.
             self._unresponsive.add(device)
 
+    def why_no_client(self, gmi: int, pids: Collection[int]) -> str | None:
+        """See `Backend`."""
+        if gmi not in self._devices:
+            return None
+        try:
+            if set(pids) & self._control_of(gmi).all_client_pids().keys():
+                return None
+        except BackendUnavailable as error:
+            return str(error)
+        pipe = self._control_of(gmi).pipe_directory
+        return f"no process of it is a client of the MPS daemon in {pipe}; {self._advice(gmi)}"
+
     def _control_of(self, gmi: int) -> MpsControl:
         device = self._devices[gmi]
         return self._own.get(device) or self._theirs[device]

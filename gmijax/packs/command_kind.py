@@ -1,0 +1,241 @@
+"""Jobs of a pack for the scheduler: any commands."""
+
+from __future__ import annotations
+
+import json
+import os
+import shlex
+import signal
+from collections.abc import Callable, Collection, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final
+
+from gmijax.clock import running_s
+from gmijax.config.pack import PackConfig
+from gmijax.packs.command_job import CommandJob
+from gmijax.packs.failure import failure_of
+from gmijax.packs.output import OutputReader
+from gmijax.packs.progress import ProgressReader, own_family
+from gmijax.packs.template import fill
+from gmijax.runs.folder import RunPaths, write_json
+from gmijax.runs.history import copy_history
+from gmijax.sweeps.children import Process, Seen
+from gmijax.sweeps.kind import Start
+from gmijax.sweeps.paths import SweepPaths
+from gmijax.sweeps.places import Place
+from gmijax.sweeps.running import Outcome, Running
+
+_COMPILES_S: Final = 120.0
+"""Longest wait for the first report of the job that compiles first."""
+
+_CLIENT_AFTER_S: Final = 30.0
+"""When a job that reports nothing has taken its GPU."""
+
+_KILLED_S: Final = 5.0
+
+_THREADS: Final = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS")
+"""Variables by which libraries choose the number of their threads: by default one a core."""
+
+_GROWING: Final = {"XLA_PYTHON_CLIENT_PREALLOCATE": "false", "TF_FORCE_GPU_ALLOW_GROWTH": "true"}
+"""JAX and TensorFlow would take most of the GPU's memory at their start."""
+
+
+class PackPaths(SweepPaths):
+    """Files of a pack."""
+
+    def log(self, number: int) -> Path:
+        """What a job prints."""
+        return self.job(number).root / "output.log"
+
+
+class CommandKind:
+    """Any commands, each a process of its own.
+
+    Args:
+      settings: of the pack.
+      paths: its files.
+      cores: CPU cores that all jobs share, by site.
+      at_once: number of jobs that share a GPU and the cores at a place.
+    """
+
+    def __init__(
+        self,
+        settings: PackConfig,
+        paths: PackPaths,
+        cores: Sequence[int],
+        at_once: Callable[[Place], int],
+    ) -> None:
+        self._settings, self._paths = settings, paths
+        self._cores, self._at_once = cores, at_once
+        self._own = own_family(settings.rate, settings.steps, settings.metric)
+        self.longest_compile_s = _COMPILES_S
+        self._silent: dict[int, _Silence] = {}
+        self._asked: set[int] = set()
+
+    def together(
+        self, job: CommandJob, queue: Sequence[CommandJob], alone: Collection[int]
+    ) -> tuple[CommandJob, ...]:
+        """See `Kind`."""
+        del queue, alone
+        return (job,)
+
+    def start(self, jobs: tuple[CommandJob, ...], place: Place) -> Start:
+        """See `Kind`."""
+        (job,) = jobs
+        run, log = self._paths.job(job.number), self._paths.log(job.number)
+        run.root.mkdir(exist_ok=True)
+        again = log.exists()
+        resume = self._settings.resume if again else None
+        if again and resume is None:
+            run.metrics.unlink(missing_ok=True)  # It starts from nothing.
+        arguments = job.arguments(run.root, shlex.split(resume or ""))
+        with log.open("a") as file:
+            file.write(f"$ {shlex.join(arguments)}\n")
+        at_once = self._at_once(place)
+        fraction = None if at_once == 1 else 1.0 / at_once
+        process = Process(
+            f"job {run.root.name}",
+            arguments,
+            log,
+            self._variables(job, run.root, self._cores[place.site] // at_once),
+            cwd=self._folder(job, run.root),
+            is_client=True,
+            memory_fraction=fraction,
+            stop_signal=signal.Signals[f"SIG{self._settings.stop_signal}"],
+        )
+        output = OutputReader(log, log.stat().st_size)
+        reader = _Recorder(ProgressReader(output, self._own, running_s(), running_s), run.metrics)
+        # On CPU cores alone nothing is compiled that others could use.
+        program = job.program if place.devices else ""
+        self._silent[job.number] = _Silence(log)
+        self._asked.discard(job.number)
+        return Start(process, program, (reader,))
+
+    def _variables(self, job: CommandJob, run_dir: Path, cores: int) -> dict[str, str]:
+        values = job.values(run_dir)
+        threads = dict.fromkeys(_THREADS, str(max(1, cores)))
+        defaults = {**threads, **_GROWING}
+        for key in os.environ.keys() & defaults.keys():
+            del defaults[key]
+        given = {key: fill([str(text)], values)[0] for key, text in self._settings.env.items()}
+        return {
+            **defaults,
+            # Lines come when they are printed: a rate can be read, and a hang be seen.
+            "PYTHONUNBUFFERED": "1",
+            "GMIJAX_PACK_DIR": str(self._paths.root),
+            "GMIJAX_JOB": values["job"],
+            "GMIJAX_RUN_DIR": values["run_dir"],
+            **given,
+        }
+
+    def _folder(self, job: CommandJob, run_dir: Path) -> str | None:
+        if self._settings.cwd is None:
+            return None
+        return fill([self._settings.cwd], job.values(run_dir))[0]
+
+    def why_hung(self, running: Running[CommandJob]) -> str | None:
+        """See `Kind`."""
+        (job,) = running.jobs
+        silence, limit_s = self._silent[job.number], self._settings.stall_s
+        silent_s = silence.seconds()
+        self._look_at_client(running, job)
+        if limit_s is None or silent_s <= limit_s:
+            return None
+        return f"printed nothing for {limit_s:g} s (pack.stall_s)"
+
+    def _look_at_client(self, running: Running[CommandJob], job: CommandJob) -> None:
+        """Notes it where a job has no share of its GPU; once, when it uses that."""
+        is_late = running_s() - running.started_s > _CLIENT_AFTER_S
+        if job.number in self._asked or not (job.progress.reports or is_late):
+            return
+        self._asked.add(job.number)
+        if running.place.backend == "mps":
+            job.progress.note = running.host.why_no_client(running.child)
+
+    def outcome(self, running: Running[CommandJob], job: CommandJob) -> Outcome:
+        """See `Kind`."""
+        seen = running.look() or Seen(None)
+        if running.hung is not None:
+            return Outcome(error=running.hung, is_fault=True)
+        # One that was asked may save and end as if it were complete.
+        if running.is_killed or running.is_asked:
+            return Outcome(is_interrupted=True)
+        if seen.exit_code is None:
+            return Outcome(error=running.host.lost, is_fault=True)
+        if seen.exit_code == 0:
+            return Outcome()
+        why = failure_of(seen.exit_code, self._paths.log(job.number))
+        is_anothers = why.is_gpu_fault and running.place.backend == "mps"
+        return Outcome(
+            error=why.error,
+            is_fault=True,
+            may_be_anothers=is_anothers or why.is_out_of_memory,
+            is_out_of_memory=why.is_out_of_memory,
+        )
+
+    def max_restarts(self, job: CommandJob) -> int:
+        """See `Kind`."""
+        del job
+        return self._settings.max_restarts
+
+    def stop_s(self, job: CommandJob) -> float:
+        """See `Kind`."""
+        del job
+        return self._settings.stop_timeout_s + _KILLED_S
+
+    def ended(self, job: CommandJob, run: RunPaths) -> None:
+        """See `Kind`."""
+        progress = job.progress
+        found = {"status": progress.state, "exit_code": progress.exit_code}
+        more = {
+            "wall_s": progress.wall_s,
+            "env_steps": progress.env_steps,
+            "env_steps_per_s": progress.mean_steps_per_s,
+        }
+        write_json(run.summary, {**found, **more, "error": progress.error})
+
+
+class _Recorder:
+    """Keeps the lines of metrics of a command in its folder, as a training run does."""
+
+    def __init__(self, reader: ProgressReader, metrics: Path) -> None:
+        self._reader, self._metrics = reader, metrics
+        self._is_first = True
+
+    def new(self) -> list[dict[str, Any]]:
+        """See `Reader`."""
+        lines = self._reader.new()
+        if not lines:
+            return lines
+        with suppress(OSError):  # A full disk must not end the pack.
+            if self._is_first and self._metrics.exists():
+                # An attempt that goes on from a checkpoint repeats some steps, or counts anew.
+                copy_history(self._metrics, self._metrics, lines[0]["env_steps"] - 1)
+            self._is_first = False
+            with self._metrics.open("a") as file:
+                file.writelines(json.dumps(_finite(line)) + "\n" for line in lines)
+        return lines
+
+
+def _finite(line: Mapping[str, Any]) -> dict[str, Any]:
+    return {key: value for key, value in line.items() if value is not None}
+
+
+@dataclass
+class _Silence:
+    """How long a log has not grown."""
+
+    log: Path
+    size: int = -1
+    since_s: float = 0.0
+
+    def seconds(self) -> float:
+        """Since the last look that saw it grow."""
+        now_s, size = running_s(), 0
+        with suppress(OSError):
+            size = self.log.stat().st_size
+        if size != self.size:
+            self.size, self.since_s = size, now_s
+        return now_s - self.since_s

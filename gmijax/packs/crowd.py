@@ -1,0 +1,180 @@
+"""`pack.jobs_per_gpu=auto`: how many commands run at once on each GPU, found while they run."""
+
+from __future__ import annotations
+
+import statistics
+from collections import defaultdict
+from collections.abc import Sequence
+from typing import Any, Final
+
+from rich.console import Console
+
+from gmijax.clock import running_s
+from gmijax.machine.nvidia import GpuLoad
+from gmijax.packs.command_job import CommandJob
+from gmijax.sweeps.density import Decision, Density, Seen
+from gmijax.sweeps.nodes import Host
+from gmijax.sweeps.places import Place, Places, Site
+from gmijax.sweeps.running import Running
+
+MOST_CLIENTS: Final = 48
+"""Contexts of an MPS daemon on one GPU before driver 590
+(https://docs.nvidia.com/deploy/mps/, "Client contexts")."""
+
+_LOOK_S: Final = 1.0
+_ROOM: Final = 0.95
+"""Part of a GPU's memory that jobs may have."""
+
+_GROWTH: Final = 1.15
+"""A job may come to need so much more memory than it took until its third report."""
+
+_WARM_REPORTS: Final = 3
+_SILENT_S: Final = 180.0
+"""How long a first job may run without a report until it counts as one that makes none."""
+
+_IDLE: Final = 0.6
+"""A GPU that is busy less often has room for a second job that reports nothing."""
+
+
+class Crowd:
+    """Limits the places of each GPU to what its rule decides.
+
+    Attributes:
+      decisions: all changes so far, as the report has them.
+
+    Args:
+      places: of the jobs.
+      sites: machines, in the order of `places`.
+      hosts: the same.
+      console: where changes are printed.
+    """
+
+    def __init__(
+        self, places: Places, sites: Sequence[Site], hosts: Sequence[Host], console: Console
+    ) -> None:
+        self._places, self._hosts, self._console = places, hosts, console
+        self._looked_s = self._began_s = running_s()
+        self._gpus: dict[tuple[int, int], _Gpu] = {}
+        self.decisions: list[dict[str, Any]] = []
+        for number, (site, host) in enumerate(zip(sites, hosts, strict=True)):
+            by_gpu: dict[int, list[str]] = defaultdict(list)
+            for share in site.plan.slices:
+                by_gpu[share.gpu].append(share.device)
+            for gpu, devices in by_gpu.items():
+                self._gpus[number, gpu] = _Gpu(devices[0], len(devices), host)
+                places.limit(number, gpu, 1)
+
+    def at_once(self, place: Place) -> int:
+        """Jobs that are to share the GPU of a place."""
+        return self._gpus[place.site, place.slices[0].gpu].rule.target
+
+    def look(self, running: Sequence[Running[CommandJob]]) -> list[Running[CommandJob]]:
+        """See `Limiter`."""
+        now_s = running_s()
+        if now_s - self._looked_s < _LOOK_S:
+            return []
+        self._looked_s = now_s
+        ended: list[Running[CommandJob]] = []
+        for key, gpu in self._gpus.items():
+            here = [one for one in running if (one.place.site, one.place.slices[0].gpu) == key]
+            if here and not any(one.is_asked for one in here):
+                ended += self._apply(key, gpu.look(now_s, here), here)
+        return ended
+
+    def forbid(self, running: Running[CommandJob], why: str) -> bool:
+        """See `Limiter`."""
+        key = running.place.site, running.place.slices[0].gpu
+        gpu = self._gpus[key]
+        decision = gpu.rule.forbid(gpu.rule.target, why)
+        self._apply(key, decision, [])
+        return decision is not None
+
+    def _apply(
+        self,
+        key: tuple[int, int],
+        decision: Decision | None,
+        here: Sequence[Running[CommandJob]],
+    ) -> list[Running[CommandJob]]:
+        if decision is None:
+            return []
+        gpu = self._gpus[key]
+        self._places.limit(*key, decision.target)
+        self._console.print(f"  {decision.target} at once on {gpu.device}: {decision.why}")
+        measured = {str(count): found.per_s for count, found in gpu.rule.measured.items()}
+        self.decisions.append(
+            {
+                "time_s": round(running_s() - self._began_s, 1),
+                "device": gpu.device,
+                "at_once": decision.target,
+                "steps_per_s": measured,
+                "why": decision.why,
+            }
+        )
+        newest = sorted(here, key=lambda one: one.started_s, reverse=True)
+        return newest[: max(0, len(here) - decision.target)]
+
+
+class _Gpu:
+    """One GPU: its rule, and the memory that its jobs take."""
+
+    def __init__(self, device: str, places: int, host: Host) -> None:
+        self.device, self._host = device, host
+        self.rule = Density(places)
+        found = host.load_of(device)
+        self._before_mib = found.used_mib if found else 0.0
+        self._peak_mib = 0.0
+        self._busy: list[float] = []
+        self._has_doubled = False
+        self.latest: Sequence[Running[CommandJob]] = ()
+
+    def look(self, now_s: float, here: Sequence[Running[CommandJob]]) -> Decision | None:
+        """What to change."""
+        before, self.latest = self.latest, here
+        has_completed = any(one.jobs[0].progress.state == "completed" for one in before)
+        if has_completed and (decision := self.rule.ended_early()):
+            return decision
+        load = self._host.load_of(self.device)
+        reports = [one.jobs[0].progress.reports for one in here]
+        if load is not None:
+            self._busy = [*self._busy[-29:], load.busy]
+            if decision := self._by_memory(load, len(here), min(reports) >= _WARM_REPORTS):
+                return decision
+        oldest_s = min(one.started_s for one in here)
+        if not any(reports) and now_s - oldest_s > _SILENT_S:
+            return self._without_rate()
+        return self.rule.look(now_s, _seen(here))
+
+    def _by_memory(self, load: GpuLoad, count: int, are_warm: bool) -> Decision | None:
+        each_mib = max(0.0, load.used_mib - self._before_mib) / count
+        if are_warm:
+            self._peak_mib = max(self._peak_mib, each_mib)
+        if not self._peak_mib:
+            return None
+        room_mib = _ROOM * (load.total_mib - self._before_mib)
+        most = int(room_mib / (_GROWTH * self._peak_mib))
+        if most >= self.rule.most:
+            return None
+        why = f"each takes {self._peak_mib:,.0f} of {room_mib:,.0f} MiB"
+        return self.rule.forbid(most + 1, why)
+
+    def _without_rate(self) -> Decision | None:
+        """Nothing is reported: two at once if one leaves the GPU idle."""
+        if self._has_doubled or self.rule.most < 2:
+            return None
+        self._has_doubled = True
+        busy = statistics.fmean(self._busy) if self._busy else 1.0
+        seen = f"no rate is found (pack.rate, pack.steps); the GPU is busy {busy:.0%} of the time"
+        return self.rule.settle(2 if busy < _IDLE else 1, seen)
+
+
+def _seen(here: Sequence[Running[CommandJob]]) -> dict[int, Seen]:
+    """Part of the whole that each has done, where that is known of all; else steps."""
+    jobs = [one.jobs[0] for one in here]
+    are_known = all(job.num_timesteps for job in jobs)
+    return {
+        job.number: Seen(
+            job.progress.env_steps / ((job.num_timesteps or 1) if are_known else 1),
+            job.progress.reports,
+        )
+        for job in jobs
+    }

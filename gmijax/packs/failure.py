@@ -1,0 +1,68 @@
+"""Why a command has failed, from its exit code and the end of what it printed."""
+
+from __future__ import annotations
+
+import os
+import re
+from pathlib import Path
+from typing import Final, NamedTuple
+
+from gmijax.errors import printable
+from gmijax.supervise.failures import last_line, may_be_anothers, signal_name
+
+_TAIL_BYTES: Final = 1 << 16
+_TAIL_LINES: Final = 200
+_LONGEST: Final = 300
+
+_OUT_OF_MEMORY: Final = re.compile(
+    r"CUDA out of memory|CUDA error: out of memory|OutOfMemoryError|CUBLAS_STATUS_ALLOC_FAILED"
+    r"|RESOURCE_EXHAUSTED|CUDA_ERROR_OUT_OF_MEMORY|Failed to allocate \d+ bytes on device 'cuda"
+    r"|Warp CUDA error 2\b|OOM when allocating tensor|CUDA_ERROR_MPS_MAX_CLIENTS_REACHED"
+)
+"""What PyTorch, cuBLAS, XLA, Warp, TensorFlow, CuPy and MPS say. Only read after a failure: XLA
+says it in healthy runs too, where it can do with less."""
+
+_GPU_FAULT: Final = re.compile(
+    r"unspecified launch failure|illegal memory access|misaligned address|CUDA_ERROR_MPS_"
+    r"|Warp CUDA error (?!2\b)\d+|CUDA error: (?!out of memory)"
+)
+"""A fatal fault of one MPS client is reported to all, and CUDA does not say whose it was."""
+
+
+class Failure(NamedTuple):
+    """Why a command failed.
+
+    Attributes:
+      error: in one line.
+      is_out_of_memory: it found no memory on its GPU.
+      is_gpu_fault: its GPU failed, perhaps because of another client of the MPS daemon.
+    """
+
+    error: str
+    is_out_of_memory: bool = False
+    is_gpu_fault: bool = False
+
+
+def failure_of(exit_code: int, log: Path) -> Failure:
+    """Of a command that has ended with an exit code; negative for the signal that ended it."""
+    lines = _last_lines(log)
+    how = f"exit code {exit_code}" if exit_code >= 0 else f"ended by {signal_name(-exit_code)}"
+    for pattern in (_OUT_OF_MEMORY, _GPU_FAULT):
+        found = next((line for line in reversed(lines) if pattern.search(line)), None)
+        if found is not None:
+            text = f"{how}: {found.strip()[:_LONGEST]}"
+            is_memory = pattern is _OUT_OF_MEMORY
+            return Failure(text, is_memory, not is_memory)
+    last = last_line(log)
+    text = f"{how}: {last}" if last else how
+    return Failure(text, is_gpu_fault=may_be_anothers(text))
+
+
+def _last_lines(log: Path) -> list[str]:
+    try:
+        with log.open("rb") as file:
+            file.seek(max(0, os.fstat(file.fileno()).st_size - _TAIL_BYTES))
+            text = file.read().decode(errors="replace")
+    except OSError:
+        return []
+    return [printable(line) for line in text.splitlines()[-_TAIL_LINES:]]

@@ -1,0 +1,225 @@
+"""Packs: any commands, several at a time on every GPU. No jax here."""
+
+from __future__ import annotations
+
+import shlex
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any, Self, cast
+
+from rich.console import Console
+
+from gmijax.config import ClusterConfig
+from gmijax.config.pack import PackConfig
+from gmijax.config.schema import from_dict, to_dict
+from gmijax.errors import ConfigError
+from gmijax.packs.command_job import (
+    CommandJob,
+    jobs_of_file,
+    require_programs,
+    templates_of,
+)
+from gmijax.packs.command_kind import CommandKind, PackPaths
+from gmijax.packs.crowd import MOST_CLIENTS, Crowd
+from gmijax.packs.progress import own_family
+from gmijax.packs.template import require_names
+from gmijax.runs.folder import RUNS, RunPaths, given_run, read_json
+from gmijax.supervise.run_gmis import StopSignals
+from gmijax.sweeps.kind import Kind, Limiter
+from gmijax.sweeps.nodes import Host
+from gmijax.sweeps.paths import SweepPaths
+from gmijax.sweeps.places import Place, Places, Site, places_of
+from gmijax.sweeps.progress import State
+from gmijax.sweeps.runner import SweepResult, run_work
+from gmijax.sweeps.space import Choices, Space, corners, grid
+from gmijax.sweeps.work import Folder, Work
+
+_CORES_OF_A_JOB = 2
+"""On a machine without GPUs."""
+
+
+@dataclass(frozen=True)
+class PackWork(Work[CommandJob]):
+    """Commands; see `Work`."""
+
+    name = "pack"
+    sameness = "command and lists"
+    crowds: list[Crowd] = field(default_factory=list[Crowd], compare=False)
+
+    @property
+    def ranking(self) -> PackConfig:
+        """See `Work`."""
+        return cast("PackConfig", self.settings)
+
+    @property
+    def on_cpu(self) -> bool:
+        """See `Work`."""
+        return False
+
+    @property
+    def processes(self) -> int:
+        """See `Work`."""
+        return 1
+
+    def paths(self, root: Path) -> PackPaths:
+        """See `Work`."""
+        return PackPaths(root, self.name)
+
+    def paths_shown(self, number: int) -> Path:
+        """The folder of a job, where it is not made yet."""
+        root = given_run(*self.folder) or RUNS / f"{self.name}-DATE"
+        return self.paths(root).job(number).root
+
+    def sites(self, hosts: Sequence[Host]) -> list[Site]:
+        """See `Work`."""
+        sites = []
+        for host in hosts:
+            settings = replace(self.ranking, jobs_per_gpu=self._most(host))
+            plan = places_of(settings, host.machine, {self.ranking.backend})
+            sites.append(Site(plan, host.machine, host.name))
+        return sites
+
+    def _most(self, host: Host) -> int:
+        """Places on each GPU: all that may be used at once."""
+        settings, cores = self.ranking, len(host.machine.cpu_cores)
+        if settings.jobs_per_gpu != "auto":
+            return settings.jobs_per_gpu
+        if not host.machine.gpus:
+            return max(1, cores // _CORES_OF_A_JOB)
+        gpus = settings.gpus or len(host.machine.gpus)
+        num_gpus = len(gpus) if isinstance(gpus, tuple) else gpus
+        num_jobs = settings.trials or len(self.jobs)
+        return max(1, min(cores // num_gpus, -(-num_jobs // num_gpus), MOST_CLIENTS))
+
+    def require_runnable(self, sites: Sequence[Site]) -> None:
+        """See `Work`."""
+        require_programs(self.jobs, self.ranking)
+
+    def decided(
+        self, hosts: Sequence[Host], console: Console, signals: StopSignals, scratch: Path | None
+    ) -> Self:
+        """See `Work`; the number at once is measured with the jobs themselves."""
+        del hosts, console, signals, scratch
+        return self
+
+    def kind(self, paths: SweepPaths, sites: Sequence[Site]) -> Kind[CommandJob]:
+        """See `Work`."""
+        cores = [len(site.machine.cpu_cores) for site in sites]
+        most = [max(1, len(site.plan.slices)) for site in sites]
+
+        def at_once(place: Place) -> int:
+            if self.crowds and place.devices:
+                return self.crowds[-1].at_once(place)
+            gpus = sites[place.site].plan.layout.num_gpus
+            return most[place.site] // gpus if place.devices else most[place.site]
+
+        return CommandKind(self.ranking, cast("PackPaths", paths), cores, at_once)
+
+    def limiter(
+        self, places: Places, sites: Sequence[Site], hosts: Sequence[Host], console: Console
+    ) -> Limiter[CommandJob] | None:
+        """See `Work`."""
+        if self.ranking.jobs_per_gpu != "auto" or not sites[0].machine.gpus:
+            return None
+        self.crowds.append(Crowd(places, sites, hosts, console))
+        return self.crowds[-1]
+
+    def warnings(self) -> Sequence[str]:
+        """See `Work`."""
+        if self.ranking.jobs_per_gpu != "auto":
+            return ()
+        return (
+            "pack.jobs_per_gpu=auto: on a GPU one job first, then more while they gain; at most "
+            "one for each core",
+        )
+
+    def state_of(self, run: RunPaths, job: CommandJob) -> State:
+        """See `Work`."""
+        del job
+        if not run.summary.exists():
+            return "waiting"
+        return "completed" if read_json(run.summary).get("status") == "completed" else "waiting"
+
+    def described(self) -> dict[str, Any]:
+        """See `Work`."""
+        pack = to_dict(self.settings)
+        pack["env"] = sorted(pack["env"])  # Names alone: values may be secret.
+        crowd = self.crowds[-1].decisions if self.crowds else []
+        commands = {shlex.join(job.command): None for job in self.jobs}
+        return {"pack": pack, "commands": list(commands), "at_once": crowd}
+
+    def identity(self) -> dict[str, Any]:
+        """See `Work`."""
+        return {"commands": [list(job.command) for job in self.jobs], **self.grid_identity()}
+
+
+def pack_of(
+    settings: PackConfig,
+    space: Space,
+    command: Sequence[str],
+    folder: Folder,
+    cluster: ClusterConfig | None = None,
+) -> PackWork:
+    """The work of a pack.
+
+    Args:
+      settings: of the pack.
+      space: values of the names that are placeholders in the command.
+      command: arguments of the program; empty with `pack.commands`.
+      folder: of the pack.
+      cluster: the nodes that jobs run on.
+
+    Raises:
+      ConfigError: names and placeholders do not fit, or there is no command.
+    """
+    own_family(settings.rate, settings.steps, settings.metric)
+
+    def make_job(number: int, chosen: Mapping[str, str]) -> CommandJob:
+        return CommandJob(number, dict(chosen), tuple(command), settings.total_steps)
+
+    nodes = cluster or ClusterConfig()
+    if settings.commands is not None:
+        if command or space:
+            raise ConfigError("pack.commands: not with a grid or a command after --")
+        jobs = jobs_of_file(settings)
+        return PackWork(settings, {}, make_job, jobs, nodes, folder)
+    if not command:
+        raise ConfigError("no command: expected gmijax pack [NAME=VALUE,VALUE ...] -- COMMAND ...")
+    if settings.copies is not None and space:
+        raise ConfigError("pack.copies: not with a grid; leave out one of them")
+    require_names([*command, *templates_of(settings)], list(space))
+    points = grid(space, "pack") if settings.sampler == "grid" else corners(space)
+    if settings.copies is not None:
+        points = [{}] * settings.copies
+    jobs = tuple(make_job(number, point) for number, point in enumerate(points))
+    return PackWork(settings, space, make_job, jobs, nodes, folder)
+
+
+def pack(
+    command: Sequence[str],
+    grid: Mapping[str, Sequence[object]] | None = None,
+    *,
+    run_dir: str | None = None,
+    show: bool = False,
+    **settings: Any,
+) -> SweepResult:
+    """Runs a command with every combination of values, several at a time on every GPU.
+
+    Examples:
+      >>> pack(["python", "train.py", "--seed", "{seed}"], {"seed": range(4)}, jobs_per_gpu=2)
+
+    Args:
+      command: arguments of the program, with placeholders: names of the grid, `{job}` and
+        `{run_dir}`. No shell reads it.
+      grid: values of each name.
+      run_dir: folder of the pack; None: `runs/pack-<date>-<time>`.
+      show: print live progress and the ranking.
+      settings: keys of `pack.*`.
+
+    Raises:
+      ConfigError, SweepFailed, JobInterrupted: as `run_work`.
+    """
+    space = {key: Choices(tuple(map(str, values))) for key, values in (grid or {}).items()}
+    own = from_dict(PackConfig, settings)
+    return run_work(pack_of(own, space, command, Folder(run_dir, None)), show=show)

@@ -1,0 +1,173 @@
+"""From what a program prints to lines of metrics, as a run of gmijax writes them.
+
+Rates are not taken from the printed text where it names steps: a printed rate is often the mean
+since the start, which hides what a neighbour on the GPU costs. Steps are compared with the own
+clock instead.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+import time
+from collections import deque
+from collections.abc import Callable, Sequence
+from typing import Any, Final
+
+from gmijax.errors import ConfigError
+from gmijax.packs.output import OutputReader
+from gmijax.packs.trainers import FAMILIES, Family, Report
+
+METRIC: Final = "metric"
+"""Key of what jobs are compared by, in lines of metrics."""
+
+_REPORTS: Final = 5
+"""A rate is that over so many reports: the first update of a trainer can take 15 times longer."""
+
+
+def own_family(rate: str | None, steps: str | None, metric: str | None) -> Family | None:
+    """The family of a user's regular expressions (`pack.rate` and so on); None without any.
+
+    Raises:
+      ConfigError: one cannot be compiled, or has not one group.
+    """
+    given = {"rate": rate, "steps": steps, "metric": metric}
+    patterns = [_own_pattern(key, text) for key, text in given.items() if text is not None]
+    return Family("pack.rate, pack.steps, pack.metric", tuple(patterns)) if patterns else None
+
+
+def _own_pattern(key: str, text: str) -> re.Pattern[str]:
+    try:
+        pattern = re.compile(text)
+    except re.error as error:
+        raise ConfigError(f"pack.{key}={text}: no regular expression: {error}") from None
+    if pattern.groups != 1:
+        raise ConfigError(
+            f"pack.{key}={text}: has {pattern.groups} groups; expected one, around the number"
+        )
+    # The group gets the name by which reports know it, wherever it stands.
+    start = next(m.start() for m in re.finditer(r"(?<!\\)\((?!\?(?!P<))", text))
+    rest = re.sub(r"^\(\?P<\w+>", "(", text[start:])
+    return re.compile(f"{text[:start]}(?P<{key}>{rest[1:]}")
+
+
+class ProgressReader:
+    """Follows the output of one job; a line of metrics for every report of steps, or of a rate.
+
+    Attributes:
+      family: how it prints; None until two lines of one family have come.
+
+    Args:
+      output: its lines.
+      own: the user's expressions; they are read beside a known family, and win over it.
+      started_s: when the process started, by the same clock.
+      clock: seconds.
+    """
+
+    def __init__(
+        self,
+        output: OutputReader,
+        own: Family | None,
+        started_s: float,
+        clock: Callable[[], float] = time.monotonic,
+    ) -> None:
+        self._output, self._own = output, own
+        self._started_s, self._clock = started_s, clock
+        self.family: Family | None = None
+        self._hits = dict.fromkeys(FAMILIES, 0)
+        self._early: list[str] = []
+        self._steps = _Steps()
+        self._metric: float | None = None
+        self._total: float | None = None
+
+    def new(self) -> list[dict[str, Any]]:
+        """Lines of metrics that came since the last call."""
+        now_s = self._clock()
+        reports = (report for text in self._output.new() for report in self._reports(text))
+        taken = (self._take(report, now_s) for report in reports)
+        return [line for line in taken if line is not None]
+
+    def _reports(self, text: str) -> Sequence[Report]:
+        if self._own is not None and (own := self._own.read(text)) is not None:
+            return (own,)
+        if self.family is not None:
+            found = self.family.read(text)
+            return () if found is None else (found,)
+        return self._choose(text)
+
+    def _choose(self, text: str) -> Sequence[Report]:
+        """Counts which families know a line; the first with two hits is taken, and its lines."""
+        hits = [family for family in FAMILIES if family.read(text) is not None]
+        if not hits:
+            return ()
+        self._early.append(text)
+        for family in hits:
+            report = family.read(text)
+            if report is None or (report.steps is None and report.rate is None):
+                continue
+            self._hits[family] += 1
+            if self._hits[family] == 2:
+                self.family = family
+                return [found for line in self._early if (found := family.read(line)) is not None]
+        return ()
+
+    def _take(self, report: Report, now_s: float) -> dict[str, Any] | None:
+        if report.metric is not None and math.isfinite(report.metric):
+            self._metric = report.metric
+        self._total = report.total or self._total
+        family = self._own if self.family is None else self.family
+        is_average = family is not None and family.is_average
+        if report.steps is not None:
+            self._steps.count(report.steps, now_s)
+        elif report.rate is not None and not self._steps.are_counted:
+            self._steps.add(report.rate, now_s, self._started_s if is_average else None)
+        else:
+            return None
+        line = {"env_steps": round(self._steps.now), "env_steps_per_s": self._steps.per_s}
+        if self._metric is not None:
+            line[METRIC] = self._metric
+        if self._total is not None:
+            line["num_timesteps"] = round(self._total)
+        return line
+
+
+class _Steps:
+    """Steps of a job by reports of steps, or else of rates."""
+
+    def __init__(self) -> None:
+        self.now = 0.0
+        self.are_counted = False
+        self._before = 0.0  # Of runs that the same job has made before, as W&B's agents do.
+        self._own = 0.0
+        self._seen: deque[tuple[float, float]] = deque(maxlen=_REPORTS)
+
+    def count(self, steps: float, now_s: float) -> None:
+        """A report of steps so far."""
+        if not self.are_counted:
+            self._seen.clear()
+        elif steps < self._own:
+            self._before += self._own
+        self.are_counted, self._own = True, steps
+        self._note(self._before + steps, now_s)
+
+    def add(self, rate: float, now_s: float, since_s: float | None) -> None:
+        """A report of a rate: of the moment, or the mean since `since_s`."""
+        if since_s is not None:
+            self._note(max(self.now, rate * (now_s - since_s)), now_s)
+            return
+        last_s = self._seen[-1][0] if self._seen else now_s
+        self._note(self.now + rate * (now_s - last_s), now_s)
+
+    @property
+    def per_s(self) -> float:
+        """Over the latest reports; 0 before there are two."""
+        if len(self._seen) < 2:
+            return 0.0
+        (first_s, first), (last_s, last) = self._seen[0], self._seen[-1]
+        return (last - first) / (last_s - first_s)
+
+    def _note(self, steps: float, now_s: float) -> None:
+        self.now = steps
+        if self._seen and self._seen[-1][0] == now_s:  # Read in one look.
+            self._seen.pop()
+        self._seen.append((now_s, steps))

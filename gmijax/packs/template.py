@@ -1,0 +1,65 @@
+"""Placeholders in the command of a pack: `{seed}` stands for the value that a job has of `seed`.
+
+The command is a list of arguments, which no shell reads. Braces that are no placeholder stay as
+they are: JSON and `${VARIABLE}` pass unharmed. `{{` and `}}` stand for single braces.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Collection, Mapping, Sequence
+from typing import Final
+
+from gmijax.config.schema import suggestion
+from gmijax.errors import ConfigError
+
+OWN_NAMES: Final = ("job", "run_dir")
+"""Placeholders that every job has: its number (three digits or more), and its folder."""
+
+_PARTS: Final = re.compile(r"\{\{|\}\}|(?<!\$)\{([A-Za-z_][\w.]*)\}")
+
+
+def placeholders(arguments: Sequence[str]) -> list[str]:
+    """Names of all placeholders, each once, in order."""
+    found = (match[1] for text in arguments for match in _PARTS.finditer(text) if match[1])
+    return list(dict.fromkeys(found))
+
+
+def fill(arguments: Sequence[str], values: Mapping[str, str]) -> list[str]:
+    """The arguments with a value for every placeholder.
+
+    Raises:
+      KeyError: a placeholder has no value; `require_names` finds it before anything is started.
+    """
+
+    def value_of(match: re.Match[str]) -> str:
+        return values[match[1]] if match[1] else match[0][0]
+
+    return [_PARTS.sub(value_of, text) for text in arguments]
+
+
+def require_names(arguments: Sequence[str], names: Collection[str]) -> None:
+    """Refuses placeholders that nothing fills, and names of the grid that no placeholder uses.
+
+    Args:
+      arguments: all that may hold placeholders.
+      names: of the grid.
+
+    Raises:
+      ConfigError: names the first.
+    """
+    found = placeholders(arguments)
+    for name in names:
+        if name in OWN_NAMES:
+            raise ConfigError(f"{name}=: every job has {{{name}}} of its own; give another name")
+        if name not in found:
+            raise ConfigError(
+                f"{name}=: the command has no {{{name}}}, so all jobs would be equal"
+            )
+    for name in found:
+        if name not in names and name not in OWN_NAMES:
+            allowed = (*names, *OWN_NAMES)
+            raise ConfigError(
+                f"{{{name}}}: no such placeholder{suggestion(name, allowed)} "
+                f"({{{{{name}}}}} stands for the text {{{name}}})"
+            )

@@ -1,0 +1,178 @@
+"""How many jobs at once make the most of a GPU, found with the jobs that have to be run anyway.
+
+One, two, four and so on, while a doubling raises the sum of their rates; a step too far is taken
+back at once by ending the newest jobs, which have done little. Gandiva (OSDI 2018) packs on trial
+and undoes it in the same way.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Final, NamedTuple
+
+GAIN: Final = 0.05
+"""What more jobs must add to the sum of rates, or fewer are as good."""
+
+_WARM_REPORTS: Final = 3
+"""Reports of a job that are not measured: compiling and the first updates are in them."""
+
+_LEAST_REPORTS: Final = 6
+_LEAST_WINDOW_S: Final = 20.0
+_LONGEST_WINDOW_S: Final = 120.0
+
+
+class Seen(NamedTuple):
+    """How far a job is that runs.
+
+    Attributes:
+      done: steps, or the part of the whole that is done: what is summed over jobs.
+      reports: how often it has said so since it was started.
+    """
+
+    done: float
+    reports: int
+
+
+class Measured(NamedTuple):
+    """Sum of the rates of some jobs at once.
+
+    Attributes:
+      per_s: their sum.
+      error: its standard error, from the two halves of the window.
+    """
+
+    per_s: float
+    error: float
+
+
+class Decision(NamedTuple):
+    """A change of the number at once.
+
+    Attributes:
+      target: jobs at once from now on; where more run, the newest are ended.
+      why: in one line.
+    """
+
+    target: int
+    why: str
+
+
+class Density:
+    """Chooses the number of jobs at once on one GPU.
+
+    Attributes:
+      target: the number now.
+      is_settled: whether it stays so.
+      measured: what was measured, by number at once.
+
+    Args:
+      most: what memory, cores and the limit of clients allow; it may sink later.
+    """
+
+    def __init__(self, most: int) -> None:
+        self.most = max(1, most)
+        self.target = 1
+        self.is_settled = self.most == 1
+        self.measured: dict[int, Measured] = {}
+        self._window: _Window | None = None
+
+    def look(self, now_s: float, jobs: Mapping[int, Seen]) -> Decision | None:
+        """Takes in how far all jobs of the GPU are; returns what to change, if anything.
+
+        Args:
+          now_s: by a clock that only goes on.
+          jobs: those that run, by number.
+        """
+        if self.target > self.most:
+            return self.settle(self.most, f"no room for more than {self.most}")
+        if self.is_settled or len(jobs) != self.target:
+            self._window = None  # Some are still to be started, or too few are left.
+            return None
+        if self._window is None or self._window.jobs != set(jobs):
+            is_warm = all(seen.reports >= _WARM_REPORTS for seen in jobs.values())
+            self._window = _Window(now_s, jobs) if is_warm else None
+            return None
+        found = self._window.look(now_s, jobs)
+        before = self._smaller()
+        if found is None or (before is not None and self._is_unclear(found, before, now_s)):
+            return None
+        self._window = None
+        self.measured[self.target] = found
+        return self._next(found, before)
+
+    def ended_early(self) -> Decision | None:
+        """A job has completed before so many at once could be measured: jobs are short."""
+        if self.is_settled or self.target in self.measured or self.target == self.most:
+            return None
+        return self._go_to(min(2 * self.target, self.most), "jobs end before a rate is measured")
+
+    def forbid(self, count: int, why: str) -> Decision | None:
+        """So many at once cannot run, e.g. because one of them ran out of memory."""
+        self.most = max(1, min(self.most, count - 1))
+        return self.settle(self.most, why) if self.target > self.most else None
+
+    def _next(self, found: Measured, before: Measured | None) -> Decision | None:
+        count = self.target
+        if before is not None and found.per_s < (1 + GAIN) * before.per_s:
+            fewer = max(k for k in self.measured if k < count)
+            middle = (fewer + count) // 2
+            gain = f"{count} at once make {found.per_s / before.per_s:.2f} of {fewer}"
+            if middle > fewer and middle not in self.measured and 2 * fewer == count:
+                return self._go_to(middle, gain)
+            return self.settle(fewer, gain)
+        if any(k > count for k in self.measured) or count == self.most:
+            return self.settle(count, f"{count} at once make the most")
+        return self._go_to(min(2 * count, self.most), f"{count} at once gain; trying more")
+
+    def _smaller(self) -> Measured | None:
+        fewer = [k for k in self.measured if k < self.target]
+        return self.measured[max(fewer)] if fewer else None
+
+    def _is_unclear(self, found: Measured, before: Measured, now_s: float) -> bool:
+        """Whether a longer window may decide otherwise."""
+        assert self._window is not None
+        limit = (1 + GAIN) * before.per_s
+        error = 2 * (found.error**2 + before.error**2) ** 0.5
+        is_close = abs(found.per_s - limit) < error
+        return is_close and now_s - self._window.started_s < _LONGEST_WINDOW_S
+
+    def _go_to(self, count: int, why: str) -> Decision:
+        self.target, self._window = count, None
+        return Decision(count, why)
+
+    def settle(self, count: int, why: str) -> Decision | None:
+        """So many at once from now on; returns what that changes, if anything."""
+        self.is_settled, before = True, self.target
+        decision = self._go_to(count, why)
+        return decision if count != before else None
+
+
+class _Window:
+    """Rates of the same jobs over some time: of each between two of its reports."""
+
+    def __init__(self, now_s: float, jobs: Mapping[int, Seen]) -> None:
+        self.started_s = now_s
+        self.jobs = set(jobs)
+        self._latest = dict(jobs)
+        self._points: dict[int, list[tuple[float, float]]] = {number: [] for number in jobs}
+
+    def look(self, now_s: float, jobs: Mapping[int, Seen]) -> Measured | None:
+        """The sum of rates; None: not enough was seen."""
+        for number, seen in jobs.items():
+            if seen.reports > self._latest[number].reports:
+                self._points[number].append((now_s, seen.done))
+        self._latest = dict(jobs)
+        least = min(map(len, self._points.values()))
+        if now_s - self.started_s < _LEAST_WINDOW_S or least <= _LEAST_REPORTS:
+            return None
+        halves = [
+            (points[: len(points) // 2 + 1], points[len(points) // 2 :])
+            for points in self._points.values()
+        ]
+        variance = sum((_rate(first) - _rate(last)) ** 2 / 4 for first, last in halves)
+        return Measured(sum(map(_rate, self._points.values())), variance**0.5)
+
+
+def _rate(points: Sequence[tuple[float, float]]) -> float:
+    (start_s, first), (end_s, last) = points[0], points[-1]
+    return (last - first) / max(1e-9, end_s - start_s)

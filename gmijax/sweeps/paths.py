@@ -1,0 +1,41 @@
+"""Files of a sweep or a pack."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from gmijax.runs.folder import RunPaths
+
+DIGITS = 3
+"""Of the number of a job in the names of its files; more jobs have more digits."""
+
+
+class SweepPaths(RunPaths):
+    """Files of a sweep or a pack; each job has a run folder of its own in it.
+
+    Args:
+      root: its folder.
+      name: of the command: its report is called so.
+    """
+
+    def __init__(self, root: Path, name: str = "sweep") -> None:
+        super().__init__(root)
+        self.request = root / "request.json"  # What was asked: a command that goes on asks it too.
+        self.study = root / "study.log"  # Of Optuna.
+        self.sweep = root / f"{name}.json"  # Jobs, their states and results.
+        self.table = root / f"{name}.csv"  # One line a job.
+        self.settings = root / "settings.csv"  # One line for all seeds of a setting.
+        self.room = root / ".room"  # Of no use but its size: room for how the sweep ends.
+        self.curves = root / f"{name}.png"
+
+    def job(self, number: int) -> RunPaths:
+        """The run folder of a job."""
+        return RunPaths(self.root / f"{number:0{DIGITS}d}")
+
+    def order(self, number: int) -> Path:
+        """What the process of a job is told."""
+        return self.root / "jobs" / f"{number:0{DIGITS}d}.json"
+
+    def log(self, number: int) -> Path:
+        """What the process of a job prints."""
+        return self.root / "jobs" / f"{number:0{DIGITS}d}.log"

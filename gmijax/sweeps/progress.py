@@ -1,0 +1,128 @@
+"""How far a job is, and by its lines of metrics how good."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any, Literal, TypeAlias
+
+from gmijax.config.sweep import Ranking
+from gmijax.runs.folder import RunPaths
+from gmijax.runs.history import number_in, read_metrics
+from gmijax.sweeps.objective import find, value_of
+
+State: TypeAlias = Literal["waiting", "running", "completed", "failed", "pruned", "interrupted"]
+
+
+@dataclass
+class Progress:
+    """How far a job is.
+
+    Attributes:
+      state: see `State`.
+      env_steps: environment steps so far.
+      env_steps_per_s: of the last iteration; 0 while it does not run.
+      reports: lines of metrics since it was started.
+      num_timesteps: steps at its end, where its lines say them.
+      value: what it is ranked by (`value_of`), None before there is one.
+      is_full: whether the value can be compared, see `Found`.
+      episodes: how many the value is a mean over, where that is known.
+      latest: the objective in the latest line that has it, over the short window.
+      started_s: when this command started it, by the monotonic clock.
+      updated_s: when the first line of metrics came after that.
+      reported_s: when the latest line of metrics came.
+      ended_s: when it ended after that.
+      earlier_s: seconds that it took, where an earlier command has completed it.
+      earlier_steps_per_s: its mean rate then, where that is known.
+      place: GPUs and places where it runs, in words.
+      node: address of the node where it runs or ran last; None: this machine.
+      exit_code: of its process, once that has ended; negative for the signal that ended it.
+      note: what is to be known of it, in one line, although it goes on.
+      error: why it failed, in one line.
+      curve: environment steps and objective of the lines of metrics that can be compared, or,
+        while there are none, of the others.
+    """
+
+    state: State = "waiting"
+    env_steps: int = 0
+    env_steps_per_s: float = 0.0
+    reports: int = 0
+    num_timesteps: int | None = None
+    value: float | None = None
+    is_full: bool = True
+    episodes: int | None = None
+    latest: float | None = None
+    started_s: float | None = None
+    updated_s: float | None = None
+    reported_s: float | None = None
+    ended_s: float | None = None
+    earlier_s: float = 0.0
+    earlier_steps_per_s: float | None = None
+    place: str = ""
+    node: str | None = None
+    exit_code: int | None = None
+    note: str | None = None
+    error: str | None = None
+    curve: list[tuple[int, float]] = field(default_factory=list)
+    _first_steps: int = 0
+
+    @property
+    def wall_s(self) -> float:
+        """Seconds from its start to its end, or until now."""
+        if self.started_s is None:
+            return self.earlier_s
+        return (self.ended_s or time.monotonic()) - self.started_s
+
+    @property
+    def mean_steps_per_s(self) -> float | None:
+        """From the first line of metrics after its latest start on; None before there are two."""
+        if self.updated_s is None or self.reported_s is None or self.reports < 2:
+            return self.earlier_steps_per_s if self.started_s is None else None
+        return (self.env_steps - self._first_steps) / max(1e-9, self.reported_s - self.updated_s)
+
+    def report(self, line: Mapping[str, Any], ranking: Ranking) -> None:
+        """Takes in a line of metrics that has just come."""
+        self.take(line, ranking)
+        self.reports += 1
+        self.reported_s = time.monotonic()
+        if self.updated_s is None:
+            self.updated_s, self._first_steps = self.reported_s, self.env_steps
+
+    def take_summary(self, summary: Mapping[str, Any]) -> None:
+        """Takes in how an earlier command has completed it."""
+        wall_s, rate = summary.get("wall_s"), summary.get("env_steps_per_s")
+        self.earlier_s = wall_s if isinstance(wall_s, float) else 0.0
+        self.earlier_steps_per_s = rate if isinstance(rate, float) else None
+        self.exit_code = 0
+
+    def begin(self, place: str, node: str | None) -> None:
+        """Its process was started there."""
+        self.state, self.place, self.node, self.error = "running", place, node, None
+        self.started_s, self.updated_s, self.ended_s = time.monotonic(), None, None
+        self.reports, self.reported_s, self.exit_code, self.note = 0, None, None, None
+
+    def take(self, line: Mapping[str, Any], ranking: Ranking) -> None:
+        """Takes in a line of metrics."""
+        self.env_steps = line["env_steps"]
+        self.env_steps_per_s = line.get("env_steps_per_s") or 0.0
+        self.num_timesteps = line.get("num_timesteps") or self.num_timesteps
+        if (found := find(line, ranking.objective)) is None:
+            return
+        latest = number_in(line, ranking.objective)
+        self.latest = found.number if latest is None else latest
+        if self.curve and self.is_full and not found.is_full:
+            return
+        if not self.is_full and found.is_full:
+            self.curve.clear()
+        self.is_full, self.episodes = found.is_full, found.episodes
+        self.curve.append((self.env_steps, found.number))
+        self.value = value_of(self.curve, ranking)
+
+    def read(self, run: RunPaths, ranking: Ranking) -> None:
+        """Takes in all metrics that a run folder has."""
+        self.value, self.latest, self.curve = None, None, []
+        self.is_full, self.episodes = True, None
+        for line in read_metrics(run.metrics):
+            self.take(line, ranking)
+        self.env_steps_per_s = 0.0

@@ -1,0 +1,211 @@
+"""The controller of a sweep or a pack: from jobs to a ranking. No jax here."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import ExitStack, closing, contextmanager
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from rich.console import Console
+
+from gmijax.control.console import open_console
+from gmijax.errors import ConfigError, JobInterrupted, SweepFailed
+from gmijax.machine.snapshot import detect_machine
+from gmijax.runs.folder import RUNS, given_run, read_json, write_json
+from gmijax.runs.held import OpenFolder, locked
+from gmijax.supervise.run_gmis import StopSignals, stop_signals
+from gmijax.sweeps.folder import errors_of_files, opened_folder
+from gmijax.sweeps.host import LocalHost
+from gmijax.sweeps.kind import J
+from gmijax.sweeps.nodes import Host, nodes_of
+from gmijax.sweeps.paths import SweepPaths
+from gmijax.sweeps.places import Places, Site
+from gmijax.sweeps.report import Report
+from gmijax.sweeps.scheduler import Scheduler
+from gmijax.sweeps.study import OptunaStudy, Study, optuna_package
+from gmijax.sweeps.view import SweepView
+from gmijax.sweeps.words import announce, print_outcome
+from gmijax.sweeps.work import Work
+
+_LEASE_POLL_S = 0.2
+
+
+class SweepResult(NamedTuple):
+    """Result of a sweep or a pack.
+
+    Attributes:
+      root: its folder.
+      report: the content of its `sweep.json` or `pack.json`.
+    """
+
+    root: Path
+    report: dict[str, Any]
+
+
+def run_work(work: Work[J], *, show: bool = False) -> SweepResult:
+    """Runs all jobs, as many at a time as the settings say, and compares them.
+
+    Called again with the same work and folder, it runs those that are not complete.
+
+    Raises:
+      ConfigError: bad input, before anything was started.
+      SweepFailed: a job failed; all others have run.
+      JobInterrupted: SIGINT, SIGTERM, SIGHUP or SIGUSR1 came, and all jobs have saved and ended.
+    """
+    started_s = time.monotonic()
+    console = open_console(show=show)
+    with _hosts_of(work) as hosts:
+        # Before anything is started: whether there are such GPUs, and room for so many jobs.
+        work.require_runnable(work.sites(hosts))
+        if work.settings.sampler != "grid":
+            optuna_package()
+        with (
+            opened_folder(work) as paths,
+            locked(paths.lock, f"run.dir={paths.root}") as folder,
+        ):
+            return _run(work, hosts, paths, folder, console, started_s)
+
+
+def _run(
+    work: Work[J],
+    hosts: Sequence[Host],
+    paths: SweepPaths,
+    folder: OpenFolder,
+    console: Console,
+    started_s: float,
+) -> SweepResult:
+    """Runs the jobs in a folder that is locked, on machines where nothing is started yet."""
+    with errors_of_files(paths):
+        jobs, study = _beginning(work, paths)
+        report = Report(jobs, work.ranking, work.described, paths, folder, started_s)
+        report.begin()
+    console.print(f"{work.name} folder: {paths.root}")
+    view = SweepView(console, jobs, work.ranking)
+    try:
+        with errors_of_files(paths):
+            _train(work, hosts, paths, console, study, report, view, jobs)
+    except BaseException as error:
+        status = "interrupted" if isinstance(error, JobInterrupted) else "failed"
+        if (wrong := report.end(status)) is not None:
+            error.add_note(wrong)
+        if isinstance(error, JobInterrupted | SweepFailed):
+            error.add_note(f"the same command with run.dir={paths.root} goes on")
+        raise
+    failed = [job for job in jobs if job.progress.state == "failed"]
+    wrong = report.end("failed" if failed else "completed")
+    print_outcome(console, report.data, work.ranking, paths, view.line())
+    if failed:
+        first = failed[0]
+        text = f"{len(failed)} of {len(jobs)} jobs failed; job {first.number}: "
+        wrong = f"{text}{first.progress.error}{'' if wrong is None else f'; {wrong}'}"
+    if wrong is not None:
+        raise SweepFailed(wrong)
+    return SweepResult(paths.root, report.data)
+
+
+def _train(
+    work: Work[J],
+    hosts: Sequence[Host],
+    paths: SweepPaths,
+    console: Console,
+    study: Study[J],
+    report: Report,
+    view: SweepView,
+    jobs: list[J],
+) -> None:
+    """Runs the jobs; returns when all have ended."""
+    with stop_signals() as signals, ExitStack() as held:
+        _lease(work, hosts, work.sites(hosts), console, signals)
+        work = work.decided(hosts, console, signals, paths.root if hosts[0].name else None)
+        sites = work.sites(hosts)
+        num_complete = sum(job.progress.state == "completed" for job in jobs)
+        announce(console, sites, work, num_complete)
+        for number, (host, site) in enumerate(zip(hosts, sites, strict=True)):
+            held.callback(host.shut)
+            host.open(site.plan, paths.node(number) if host.name else paths)
+        held.enter_context(view)
+        places = Places(sites)
+        limiter = work.limiter(places, sites, hosts, console)
+
+        def tick() -> None:
+            report.update()
+            view.update()
+
+        Scheduler(
+            jobs,
+            study,
+            work.kind(paths, sites),
+            work.ranking,
+            paths,
+            places,
+            hosts,
+            tick,
+            limiter,
+        ).run(signals)
+
+
+@contextmanager
+def _hosts_of(work: Work[J]) -> Iterator[Sequence[Host]]:
+    """The machines of the jobs while it is entered: nodes of their cluster, or this one."""
+    if work.cluster.engine is not None:
+        root = given_run(*work.folder) or RUNS
+        with nodes_of(work.cluster, work.settings, work.on_cpu, work.processes, root) as nodes:
+            yield nodes
+        return
+    with closing(LocalHost(detect_machine())) as host:
+        yield [host]
+
+
+def _lease(
+    work: Work[J],
+    hosts: Sequence[Host],
+    sites: Sequence[Site],
+    console: Console,
+    signals: StopSignals,
+) -> None:
+    """Holds the GPUs of all places; waits for those that another sweep has.
+
+    Raises:
+      JobInterrupted: a signal came.
+    """
+    # In one order, so that two sweeps do not wait for each other.
+    for host, site in sorted(zip(hosts, sites, strict=True), key=lambda both: both[0].name or ""):
+        devices = {share.device for share in site.plan.slices} - {"cpu"}
+        told = None
+        while (other := host.lease(devices)) is not None:
+            if other != told:
+                console.print(f"another {work.name} has {other}: waiting until it ends")
+            if signals.have_come:
+                raise JobInterrupted("interrupted")
+            told = other
+            time.sleep(_LEASE_POLL_S)
+
+
+def _beginning(work: Work[J], paths: SweepPaths) -> tuple[list[J], Study[J]]:
+    """The jobs that are known, as far as an earlier command has come, and where more come from.
+
+    Raises:
+      ConfigError: the folder holds others, or a package is missing.
+    """
+    settings, wanted = work.settings, work.identity()
+    if paths.request.exists() and read_json(paths.request) != wanted:
+        raise ConfigError(
+            f"run.dir={paths.root}: holds another {work.name}; give the same {work.sameness}, or "
+            "another folder"
+        )
+    study = Study[J]()
+    jobs = list(work.jobs)
+    if settings.sampler != "grid":
+        study = OptunaStudy(settings, work.space, work.make_job, paths.study)
+        jobs = study.earlier()
+    for job in jobs:
+        run = paths.job(job.number)
+        job.progress.read(run, work.ranking)
+        if job.progress.state != "pruned":
+            job.progress.state = work.state_of(run, job)
+        if job.progress.state == "completed":
+            job.progress.take_summary(read_json(run.summary))
+    write_json(paths.request, wanted)
+    return jobs, study

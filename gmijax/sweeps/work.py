@@ -1,0 +1,136 @@
+"""What a command that runs many jobs brings: a sweep its trainings, a pack its commands."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, ClassVar, Generic, NamedTuple, Self
+
+from rich.console import Console
+
+from gmijax.config import ClusterConfig
+from gmijax.config.sweep import JobsConfig, Ranking
+from gmijax.runs.folder import RunPaths
+from gmijax.supervise.run_gmis import StopSignals
+from gmijax.sweeps.kind import J, Kind, Limiter
+from gmijax.sweeps.nodes import Host
+from gmijax.sweeps.paths import SweepPaths
+from gmijax.sweeps.places import Places, Site
+from gmijax.sweeps.progress import State
+from gmijax.sweeps.space import Space
+from gmijax.sweeps.study import MakeJob
+
+
+class Folder(NamedTuple):
+    """The folder of a command as the user names it: `run.dir`, `run.name`."""
+
+    dir: str | None
+    name: str | None
+
+
+@dataclass(frozen=True)
+class Work(ABC, Generic[J]):
+    """Jobs, and how they are run; subclasses know their kind.
+
+    Attributes:
+      settings: how jobs share the GPUs, and where they come from.
+      space: what the keys of jobs may be.
+      make_job: a job with values of the space.
+      jobs: all of a grid; of another sampler some that stand for all, to be checked.
+      cluster: the nodes that they run on; without an engine it is this machine.
+      folder: of the command.
+    """
+
+    settings: JobsConfig
+    space: Space
+    make_job: MakeJob[J]
+    jobs: tuple[J, ...]
+    cluster: ClusterConfig
+    folder: Folder
+
+    name: ClassVar[str]
+    """Of the command, and of its report."""
+
+    sameness: ClassVar[str]
+    """In words, what must be the same where a command goes on."""
+
+    @property
+    @abstractmethod
+    def ranking(self) -> Ranking:
+        """What jobs are compared by."""
+
+    @property
+    @abstractmethod
+    def on_cpu(self) -> bool:
+        """Whether no job wants a GPU."""
+
+    @property
+    @abstractmethod
+    def processes(self) -> int:
+        """Of the largest job at each of its places."""
+
+    @abstractmethod
+    def paths(self, root: Path) -> SweepPaths:
+        """Files in its folder."""
+
+    @abstractmethod
+    def sites(self, hosts: Sequence[Host]) -> list[Site]:
+        """Places for the jobs.
+
+        Raises:
+          ConfigError: there are no such GPUs, or no room for so many jobs.
+        """
+
+    @abstractmethod
+    def require_runnable(self, sites: Sequence[Site]) -> None:
+        """Refuses what can be seen before anything is started.
+
+        Raises:
+          ConfigError: names the key.
+        """
+
+    @abstractmethod
+    def decided(
+        self, hosts: Sequence[Host], console: Console, signals: StopSignals, scratch: Path | None
+    ) -> Self:
+        """The same with everything decided that has to be measured first; the GPUs are held."""
+
+    @abstractmethod
+    def kind(self, paths: SweepPaths, sites: Sequence[Site]) -> Kind[J]:
+        """What the scheduler asks."""
+
+    def limiter(
+        self, places: Places, sites: Sequence[Site], hosts: Sequence[Host], console: Console
+    ) -> Limiter[J] | None:
+        """What changes the number of jobs at once; None: nothing does."""
+        del places, sites, hosts, console
+        return None
+
+    @abstractmethod
+    def state_of(self, run: RunPaths, job: J) -> State:
+        """Whether an earlier command has completed a job."""
+
+    @abstractmethod
+    def described(self) -> dict[str, Any]:
+        """Its settings, and what else its report has."""
+
+    @abstractmethod
+    def identity(self) -> dict[str, Any]:
+        """What must be the same where a command goes on."""
+
+    def warnings(self) -> Sequence[str]:
+        """What is to be said before the first job."""
+        return ()
+
+    def grid_identity(self) -> dict[str, Any]:
+        """What must be the same of the jobs' values."""
+        if self.settings.sampler == "grid":
+            return {"jobs": [dict(job.overrides) for job in self.jobs]}
+        sampler = {"sampler": self.settings.sampler, "seed": self.settings.seed}
+        return sampler | {"space": {key: list(values) for key, values in self.space.items()}}
+
+    def with_settings(self, settings: JobsConfig) -> Self:
+        """The same with other settings."""
+        return replace(self, settings=settings)

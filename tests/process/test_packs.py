@@ -1,0 +1,162 @@
+"""Packs with real processes on the CPU: commands of another environment, which fail and hang."""
+
+from __future__ import annotations
+
+import csv
+import json
+import os
+import signal
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+from training_jobs import start, train, wait_until
+
+from gmijax.packs.pack import pack
+
+TRAINER = """
+import argparse, importlib.util, signal, sys, time
+
+given = argparse.ArgumentParser()
+given.add_argument("--seed", type=int)
+given.add_argument("--lr", type=float)
+given.add_argument("--dir")
+given.add_argument("--resume", action="store_true")
+given = given.parse_args()
+assert importlib.util.find_spec("gmijax") is None, "not of this environment"
+with open(f"{given.dir}/starts", "a") as starts:
+    print("again" if given.resume else "first", file=starts)
+if given.seed == 3:
+    sys.exit("ValueError: no such seed")
+for step in range(1, 31):
+    if given.seed == 2 and step == 5:
+        time.sleep(1000)
+    # As Stable-Baselines3 prints.
+    print(f"|    ep_rew_mean     | {given.lr * step + given.seed:.3g} |")
+    print(f"|    total_timesteps | {step * 512} |")
+    time.sleep(0.05)
+"""
+
+
+@pytest.fixture(scope="module")
+def python(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The interpreter of an environment without gmijax or anything else."""
+    folder = tmp_path_factory.mktemp("their") / "venv"
+    subprocess.run([sys.executable, "-m", "venv", "--without-pip", folder], check=True)
+    return folder / "bin" / "python"
+
+
+@pytest.fixture
+def home(tmp_path: Path) -> Path:
+    """A working folder with the script of a trainer."""
+    (tmp_path / "trainer.py").write_text(TRAINER)
+    return tmp_path
+
+
+def report(folder: Path) -> dict[str, Any]:
+    return json.loads((folder / "pack.json").read_text())
+
+
+def running_in(folder: Path) -> list[str]:
+    """Commands of processes that name the folder."""
+    found = []
+    for path in Path("/proc").glob("[0-9]*/cmdline"):
+        try:
+            words = path.read_bytes().decode(errors="replace")
+        except OSError:
+            continue
+        if str(folder) in words and "trainer.py" in words:
+            found.append(words.replace("\0", " "))
+    return found
+
+
+def commands_of(python: Path, *words: str) -> tuple[str, ...]:
+    trainer = ("trainer.py", "--seed", "{seed}", "--lr", "{lr}", "--dir", "{run_dir}")
+    apart = "pack.env.PYTHONPATH=''"  # This process may have found gmijax by that.
+    return (*words, apart, "pack.jobs_per_gpu=2", "--", str(python), *trainer)
+
+
+@pytest.mark.timeout(300)
+def test_one_fails_one_hangs_and_a_killed_pack_goes_on(home: Path, python: Path) -> None:
+    folder = home / "all"
+    line = commands_of(
+        python,
+        *("seed=0,1,2,3", "lr=0.1,1", "run.dir=all", "pack.stall_s=3"),
+        "pack.resume=--resume",
+    )
+    first = start(*line, cwd=home, command="pack")
+
+    def is_through() -> bool:
+        if first.poll() is not None:
+            return True
+        return (folder / "000" / "summary.json").exists()
+
+    wait_until(is_through, 120.0, "a job is through")
+    first.send_signal(signal.SIGKILL)
+    first.wait()
+    wait_until(lambda: not running_in(folder), 60.0, "the jobs of a killed pack have ended")
+    whole = (folder / "000" / "summary.json").stat().st_mtime_ns
+
+    done = train(*line, cwd=home, command="pack")
+    assert done.returncode == 1, done.stderr
+    assert "4 of 8 jobs failed; job 4: printed nothing for 3 s (pack.stall_s)" in done.stderr
+    assert len(done.stderr.splitlines()) == 1
+    found = report(folder)
+    assert [job["state"] for job in found["jobs"]] == ["completed"] * 4 + ["failed"] * 4
+    assert [job["exit_code"] for job in found["jobs"]] == [0] * 4 + [-9, -9, 1, 1]
+    assert found["jobs"][6]["error"] == "exit code 1: ValueError: no such seed"
+    assert (folder / "000" / "summary.json").stat().st_mtime_ns == whole  # It did not run again.
+    assert (folder / "000" / "starts").read_text() == "first\n"
+    # What the kill has ended went on by its own words.
+    starts = [(folder / f"{n:03d}" / "starts").read_text().split() for n in range(1, 4)]
+    assert ["first", "again"] in starts
+    rates = [job["env_steps_per_s"] for job in found["jobs"][1:4]]
+    assert all(1_000 < rate < 20_000 for rate in rates)
+    settings = csv.DictReader((folder / "settings.csv").read_text().splitlines())
+    assert [row["lr"] for row in settings] == ["1", "0.1"]
+    best = found["settings"][0]
+    assert (best["overrides"], best["n"]) == ({"lr": "1"}, 3)  # One of them until it hung.
+    assert (folder / "pack.png").stat().st_size > 10_000
+    assert running_in(folder) == []
+
+    other = train(*line[:-1], "elsewhere", cwd=home, command="pack")
+    assert other.returncode == 2
+    assert "holds another pack" in other.stderr
+
+
+@pytest.mark.timeout(120)
+def test_sigterm_asks_the_jobs_and_waits_for_them(home: Path) -> None:
+    (home / "trainer.py").write_text(
+        "import signal, sys, time\n"
+        "def save(*_):\n    print('saved', flush=True)\n    sys.exit(0)\n"
+        "signal.signal(signal.SIGUSR1, save)\nprint('runs', flush=True)\ntime.sleep(1000)\n"
+    )
+    folder = home / "all"
+    words = ("pack.copies=2", "pack.jobs_per_gpu=2", "pack.stop_signal=USR1", "run.dir=all")
+    job = start(*words, "--", sys.executable, "trainer.py", "{run_dir}", cwd=home, command="pack")
+    logs = [folder / f"{n:03d}" / "output.log" for n in range(2)]
+    wait_until(
+        lambda: all(log.exists() and "runs" in log.read_text() for log in logs), 60.0, "both run"
+    )
+    job.send_signal(signal.SIGTERM)
+    assert job.wait(60) == 130
+    assert all(log.read_text().endswith("saved\n") for log in logs)
+    assert [row["state"] for row in report(folder)["jobs"]] == ["interrupted"] * 2
+    assert running_in(folder) == []
+
+
+def test_a_pack_from_python(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    print_steps = "for k in range({n}): print(f'at {{k}} of'); import time; time.sleep(.02)"
+    found = pack(
+        [sys.executable, "-c", print_steps],
+        {"n": (5, 9)},
+        run_dir="all",
+        steps=r"at (\d+) of",
+        max_restarts=1,
+    )
+    assert found.root == tmp_path / "all"
+    assert [job["env_steps"] for job in found.report["jobs"]] == [4, 8]
+    assert os.listdir(tmp_path) == ["all"]

@@ -1,0 +1,327 @@
+"""What `gmijax pack` takes and refuses, and what its jobs get."""
+
+from __future__ import annotations
+
+import signal
+from collections.abc import Iterator, Sequence
+from contextlib import closing
+from pathlib import Path
+from typing import Any
+
+import pytest
+from command_lines import run
+from supervision import machine
+
+from gmijax.cli.pack import build_pack
+from gmijax.config.pack import PackConfig
+from gmijax.control.console import open_console
+from gmijax.errors import ConfigError
+from gmijax.machine.mps_control import MEMORY_LIMIT_VARIABLE, PIPE_VARIABLE
+from gmijax.machine.nvidia import GpuLoad
+from gmijax.packs import crowd as crowds
+from gmijax.packs.command_job import CommandJob
+from gmijax.packs.command_kind import CommandKind, PackPaths
+from gmijax.packs.crowd import Crowd
+from gmijax.packs.failure import failure_of
+from gmijax.packs.pack import PackWork
+from gmijax.supervise.backends.backend import Backend
+from gmijax.sweeps.children import Process
+from gmijax.sweeps.host import LocalHost, client_variables
+from gmijax.sweeps.places import Place, Places
+from gmijax.sweeps.running import Running
+from gmijax.sweeps.work import Folder
+
+COMMAND = ("true", "--seed", "{seed}")
+GPU = machine(1, cpu_cores=tuple(range(16)), mps_control=Path("/usr/bin/nvidia-cuda-mps-control"))
+
+
+def commands(work: PackWork) -> list[tuple[str, ...]]:
+    return [job.arguments(Path("/f")) for job in work.jobs]
+
+
+def test_every_combination_of_values_is_a_job_and_values_stay_as_they_were_typed() -> None:
+    work = build_pack(["seed=0,1", "lr=1e-4,003"], ["true", "--lr={lr}", "{seed}", "{run_dir}"])
+    assert commands(work) == [
+        ("true", f"--lr={lr}", seed, "/f") for seed in "01" for lr in ("1e-4", "003")
+    ]
+    assert [job.label for job in work.jobs][:2] == ["seed=0 lr=1e-4", "seed=0 lr=003"]
+
+
+@pytest.mark.parametrize(
+    ("words", "values"),
+    [
+        (["x='a,b',c"], ["a,b", "c"]),
+        (["x=[64,64],[128]"], ["[64,64]", "[128]"]),
+        (["x=range(0,3)"], ["0", "1", "2"]),
+        (["x=7"], ["7"]),
+        (["x=a b,c"], ["a b", "c"]),
+    ],
+)
+def test_values_by_the_grammar_of_sweeps(words: list[str], values: list[str]) -> None:
+    assert [one[1] for one in commands(build_pack(words, ["true", "{x}"]))] == values
+
+
+def test_copies_and_a_file_of_commands(tmp_path: Path) -> None:
+    work = build_pack(["pack.copies=3"], ["true", "{job}"])
+    assert [words[1] for words in commands(work)] == ["000", "001", "002"]
+    file = tmp_path / "commands"
+    file.write_text("# all of them\ntrue --name 'a b'\n\ntrue {run_dir}  # where it writes\n")
+    assert commands(build_pack([f"pack.commands={file}"], [])) == [
+        ("true", "--name", "a b"),
+        ("true", "/f"),
+    ]
+
+
+def test_keys_that_hold_text_need_no_quotes_of_hydra() -> None:
+    resume = "--agent.resume True --agent.load-run .*_pack{job}$"
+    words = [f"pack.resume={resume}", "pack.env.NAME=job-{job}", r"pack.metric=^R: (-?[\d.]+), x$"]
+    settings = build_pack([*words, "pack.copies=2"], ["true"]).ranking
+    assert settings.resume == resume
+    assert settings.env == {"NAME": "job-{job}"}
+    assert settings.metric == r"^R: (-?[\d.]+), x$"
+
+
+@pytest.mark.parametrize(
+    ("words", "command", "said"),
+    [
+        ((), (), r"no command: expected gmijax pack"),
+        (("seed=0,1",), ("true",), r"seed=: the command has no \{seed\}"),
+        ((), ("true", "{seed}"), r"\{seed\}: no such placeholder"),
+        (("seed=0,1",), ("true", "{sed}", "{seed}"), r"\{sed\}: no such placeholder.*seed"),
+        (("job=0,1",), ("true", "{job}"), r"job=: every job has \{job\} of its own"),
+        (("seed=0,0",), COMMAND, "a value that comes twice"),
+        (("seed=0", "seed=1"), COMMAND, "comes twice"),
+        (("pack.rate=fps",), ("true",), "pack.rate=fps: has 0 groups"),
+        (("pack.rate=(",), ("true",), r"pack.rate=\(: no regular expression"),
+        (("pack.copies=2", "seed=0,1"), COMMAND, "pack.copies: not with a grid"),
+        (("pack.commands=/nothing",), (), "pack.commands=/nothing: cannot be read"),
+        (("pack.commands=/nothing", "seed=1"), (), "pack.commands: not with a grid"),
+        (("pack.resume=--load {name}",), ("true",), r"\{name\}: no such placeholder"),
+        (("pack.jobs_per_gpu=0",), ("true",), "pack.jobs_per_gpu=0: must be at least 1"),
+        (("pack.jobs_per_gpu=1,2",), ("true",), "expected one value"),
+        (("pack.sampler=tpe", "seed=0,1"), COMMAND, "pack.sampler=tpe: needs pack.trials"),
+        (("seed=interval(0,1)",), COMMAND, "use pack.sampler=random or tpe"),
+    ],
+)
+def test_bad_input_is_refused(words: Sequence[str], command: Sequence[str], said: str) -> None:
+    with pytest.raises(ConfigError, match=said):
+        build_pack(words, command)
+
+
+@pytest.mark.parametrize(
+    ("argv", "said"),
+    [
+        (("--", "no-such-program"), "no-such-program: no such program"),
+        (("pack.gpus=3", "--", "true"), "pack.gpus=3"),
+        (("pack.stall_s=0", "--", "true"), "pack.stall_s=0"),
+        (("pack.x=1", "--", "true"), "unknown key pack.x"),
+    ],
+)
+def test_nothing_is_started_for_bad_input(argv: Sequence[str], said: str, tmp_path: Path) -> None:
+    done = run("pack", *argv, cwd=tmp_path, machine=GPU)
+    assert (done.code, done.stdout) == (2, "")
+    assert said in done.stderr
+    assert len(done.stderr.splitlines()) == 1
+
+
+def test_jobs_share_a_program_up_to_their_first_option() -> None:
+    jobs = build_pack(["s=0,1"], ["true", "train", "Task-{s}", "--lr", "1"]).jobs
+    assert jobs[0].program == jobs[1].program
+    other = build_pack(["s=0,1"], ["true", "play", "Task-{s}"]).jobs[0]
+    assert other.program != jobs[0].program
+
+
+class Placed(Backend):
+    """A backend with a daemon of its own, or without one."""
+
+    def __init__(self, pipe: Path | None) -> None:
+        self._pipe = pipe
+
+    @property
+    def daemons(self) -> dict[str, Path]:
+        return {} if self._pipe is None else {GPU.gpus[0].uuid: self._pipe}
+
+    def environment(self, gmi: int) -> dict[str, str]:
+        del gmi
+        return {PIPE_VARIABLE: str(self._pipe or "/none")}
+
+
+def place_of(*words: str) -> tuple[PackWork, Place]:
+    work = build_pack(["pack.copies=2", "pack.jobs_per_gpu=2", *words], ["true"])
+    with closing(LocalHost(GPU)) as host:
+        (site,) = work.sites([host])
+    place = Places([site]).take(1)
+    assert place is not None
+    return work, place
+
+
+def test_a_client_of_the_own_daemon_gets_the_first_gpu_and_its_part_of_the_memory() -> None:
+    _, place = place_of()
+    process = Process("job", ("true",), Path("log"), is_client=True, memory_fraction=0.5)
+    found = client_variables(place, process, Placed(Path("/pipe")), GPU)
+    assert found[PIPE_VARIABLE] == "/pipe"
+    # Of the daemon's one GPU; programs that take numbers alone do not know its UUID.
+    assert found["CUDA_VISIBLE_DEVICES"] == "0"
+    assert found[MEMORY_LIMIT_VARIABLE] == f"0={GPU.gpus[0].memory_mib // 2}M"
+
+
+def test_jobs_that_take_turns_get_the_index_of_their_gpu() -> None:
+    _, place = place_of("pack.backend=share")
+    process = Process("job", ("true",), Path("log"), is_client=True, memory_fraction=0.5)
+    found = client_variables(place, process, Placed(None), GPU)
+    assert found["CUDA_VISIBLE_DEVICES"] == str(GPU.gpus[0].index)
+    assert found["CUDA_DEVICE_ORDER"] == "PCI_BUS_ID"
+    assert MEMORY_LIMIT_VARIABLE not in found
+
+
+@pytest.fixture
+def kind(tmp_path: Path) -> CommandKind:
+    text = {"resume": "--resume {run_dir}/last", "cwd": "{run_dir}", "stop_signal": "INT"}
+    settings = PackConfig(**text, env={"NAME": "pack{job}"})
+    return CommandKind(settings, PackPaths(tmp_path, "pack"), [8], lambda _: 2)
+
+
+def test_a_job_that_is_started_again_gets_the_words_to_resume(
+    kind: CommandKind, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("MKL_NUM_THREADS", "7")
+    _, place = place_of()
+    job = CommandJob(3, {}, ("true", "{job}"))
+    first = kind.start((job,), place).process
+    assert first.arguments == ("true", "003")
+    assert first.cwd == str(tmp_path / "003")
+    assert first.stop_signal == signal.SIGINT
+    assert first.variables["NAME"] == "pack003"
+    assert first.variables["OMP_NUM_THREADS"] == "4"
+    assert "MKL_NUM_THREADS" not in first.variables  # The user has said it.
+    again = kind.start((job,), place).process
+    assert again.arguments == ("true", "003", "--resume", f"{tmp_path}/003/last")
+    assert (tmp_path / "003" / "output.log").read_text().splitlines() == [
+        "$ true 003",
+        f"$ true 003 --resume {tmp_path}/003/last",
+    ]
+
+
+@pytest.mark.parametrize(
+    ("text", "is_memory", "is_gpu"),
+    [
+        ("torch.OutOfMemoryError: CUDA out of memory. Tried to allocate 2 GiB", True, False),
+        ("jaxlib.XlaRuntimeError: RESOURCE_EXHAUSTED: Out of memory while", True, False),
+        ("Warp CUDA error 2: out of memory", True, False),
+        ("RuntimeError: CUDA error: unspecified launch failure", False, True),
+        ("Warp CUDA error 700: an illegal memory access was encountered", False, True),
+        ("train.py: error: unrecognized arguments: --sed", False, False),
+    ],
+)
+def test_why_a_command_failed(text: str, is_memory: bool, is_gpu: bool, tmp_path: Path) -> None:
+    log = tmp_path / "log"
+    log.write_text(f"step 1\n{text}\n  at the end\n" if is_memory or is_gpu else f"{text}\n")
+    found = failure_of(1, log)
+    assert (found.is_out_of_memory, found.is_gpu_fault) == (is_memory, is_gpu)
+    assert found.error == f"exit code 1: {text}"
+
+
+def test_a_command_that_a_signal_ended_says_so(tmp_path: Path) -> None:
+    assert failure_of(-9, tmp_path / "nothing").error == "ended by SIGKILL"
+
+
+class Gpu(LocalHost):
+    """A machine whose GPU has as much memory in use as is said."""
+
+    def __init__(self) -> None:
+        super().__init__(GPU)
+        self.used_mib, self.busy = 1000.0, 0.4
+
+    def load_of(self, device: str) -> GpuLoad:
+        assert device == GPU.gpus[0].uuid
+        return GpuLoad(self.used_mib, 81_000.0, self.busy)
+
+
+class Clock:
+    now_s = 0.0
+
+    def __call__(self) -> float:
+        return self.now_s
+
+
+class Packed:
+    """Jobs on one GPU whose rates depend on how many run; they never end by themselves."""
+
+    def __init__(self, clock: Clock, rates: Sequence[float], memory_mib: float) -> None:
+        self.clock, self.rates, self.memory_mib = clock, rates, memory_mib
+        work = build_pack(["pack.copies=16"], ["true"])
+        self.host = Gpu()
+        sites = work.sites([self.host])
+        self.places = Places(sites)
+        self.crowd = Crowd(self.places, sites, [self.host], open_console(show=False))
+        self.queue = list(work.jobs)
+        self.running: list[Running[CommandJob]] = []
+
+    def go_on(self, seconds: int) -> None:
+        for _ in range(seconds):
+            self.clock.now_s += 1.0
+            while (place := self.places.take(1)) is not None:
+                job = self.queue.pop(0)
+                one = Running((job,), place, self.host, 0, (), started_s=self.clock.now_s)
+                self.running.append(one)
+            self.host.used_mib = 1000.0 + self.memory_mib * len(self.running)
+            rate = self.rates[min(len(self.running), len(self.rates)) - 1] / len(self.running)
+            for one in self.running:
+                one.jobs[0].progress.env_steps += round(rate)
+                one.jobs[0].progress.reports += 1 if rate else 0
+            for one in self.crowd.look(self.running):
+                self.running.remove(one)
+                self.places.give_back(one.place)
+                self.queue.insert(0, one.jobs[0])
+
+
+@pytest.fixture
+def clock(monkeypatch: pytest.MonkeyPatch) -> Iterator[Clock]:
+    clock = Clock()
+    monkeypatch.setattr(crowds, "running_s", clock)
+    return clock
+
+
+def test_jobs_are_added_while_they_gain_and_taken_back_when_they_do_not(clock: Clock) -> None:
+    curve = [1000.0, 1900.0, 2500.0, 3100.0, 2900.0, 2700.0, 2500.0, 2300.0]
+    packed = Packed(clock, curve, memory_mib=100.0)
+    packed.go_on(600)
+    assert len(packed.running) == 4
+    assert [change["at_once"] for change in packed.crowd.decisions] == [2, 4, 8, 6, 4]
+    assert "6 at once make" in packed.crowd.decisions[-1]["why"]
+    newest = max(one.started_s for one in packed.running)
+    assert newest < 200.0  # The oldest went on.
+
+
+def test_memory_of_the_first_job_bounds_their_number(clock: Clock) -> None:
+    packed = Packed(clock, [1000.0 * k for k in range(1, 17)], memory_mib=20_000.0)
+    packed.go_on(400)
+    assert len(packed.running) == 3  # Of 20,000 MiB and 15 % each in 95 % of 80,000.
+
+
+def test_without_a_rate_an_idle_gpu_gets_a_second_job(clock: Clock) -> None:
+    packed = Packed(clock, [0.0], memory_mib=100.0)
+    packed.go_on(400)
+    assert len(packed.running) == 2
+    assert "no rate is found" in packed.crowd.decisions[0]["why"]
+    busy = Packed(clock, [0.0], memory_mib=100.0)
+    busy.host.busy = 0.9
+    busy.go_on(400)
+    assert len(busy.running) == 1
+
+
+def test_what_finds_no_memory_runs_again_beside_fewer(clock: Clock) -> None:
+    packed = Packed(clock, [1000.0, 1900.0, 2800.0, 3700.0], memory_mib=100.0)
+    packed.go_on(40)
+    assert len(packed.running) == 2
+    assert packed.crowd.forbid(packed.running[1], "exit code 1: out of memory")
+    assert packed.crowd.decisions[-1]["at_once"] == 1
+    assert not packed.crowd.forbid(packed.running[0], "again")  # Fewer than one cannot run.
+
+
+def test_the_report_has_names_of_variables_and_not_their_values() -> None:
+    work = build_pack(["pack.env.WANDB_API_KEY=secret", "pack.copies=2"], ["true"])
+    shown: dict[str, Any] = work.described()
+    assert shown["pack"]["env"] == ["WANDB_API_KEY"]
+    assert "secret" not in repr(work.described()) + repr(work.identity())
+    assert work.folder == Folder(None, None)

@@ -1,0 +1,181 @@
+"""What trainers print, read as lines of metrics."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from gmijax.errors import ConfigError
+from gmijax.packs.output import LONGEST_LINE, OutputReader
+from gmijax.packs.progress import ProgressReader, own_family
+from gmijax.packs.trainers import FAMILIES, Family
+
+SAMPLES = {
+    "rsl_rl, Isaac Lab, mjlab": (
+        "\x1b[1m          Learning iteration 3/100          \x1b[0m",
+        "                        Total steps: 6400 ",
+        "                   Steps per second: 98269 ",
+        "                        Mean reward: 12.50 ",
+    ),
+    "rsl_rl": (
+        "               Computation: 98269 steps/s (collection: 0.8s, learning 0.2s)",
+        "               Mean reward: 12.50",
+        "               Total timesteps: 6400",
+    ),
+    "Stable-Baselines3": (
+        "|    ep_rew_mean          | 12.5         |",
+        "|    fps                  | 98269        |",
+        "|    total_timesteps      | 6400         |",
+    ),
+    "CleanRL": ("global_step=6400, episodic_return=[12.5]", "SPS: 98269"),
+    "rl_games": (
+        "fps step: 120000 fps step and policy inference: 110000 fps total: 98269 epoch: 3/100 "
+        "frames: 6400/20000",
+        "saving next best rewards:  [12.5]",
+    ),
+    "MuJoCo Playground's train_jax_ppo.py": ("6400: reward=12.500",),
+    "skrl (tqdm)": (" 32%|###       | 6400/20000 [00:01<00:02, 98269.00it/s]",),
+}
+
+
+class Clock:
+    """Seconds that a test moves on."""
+
+    now_s = 0.0
+
+    def __call__(self) -> float:
+        return self.now_s
+
+
+@pytest.fixture
+def log(tmp_path: Path) -> Path:
+    return tmp_path / "log"
+
+
+def append(log: Path, *lines: str) -> None:
+    with log.open("a") as file:
+        file.writelines(f"{line}\n" for line in lines)
+
+
+def reader_of(log: Path, clock: Clock, own: Family | None = None) -> ProgressReader:
+    return ProgressReader(OutputReader(log), own, 0.0, clock)
+
+
+@pytest.mark.parametrize("family", FAMILIES, ids=lambda family: family.name)
+def test_every_family_finds_itself_in_its_sample(family: Family, log: Path):
+    clock = Clock()
+    reader = reader_of(log, clock)
+    append(log, *SAMPLES[family.name])
+    append(log, *SAMPLES[family.name])
+    lines = reader.new()
+    assert reader.family is family
+    assert lines[-1]["env_steps"] == 6400
+    if family.name != "skrl (tqdm)":  # Prints no return.
+        assert lines[-1]["metric"] == 12.5
+
+
+@pytest.mark.parametrize("family", FAMILIES, ids=lambda family: family.name)
+def test_rates_are_steps_by_the_own_clock(family: Family, log: Path):
+    clock = Clock()
+    reader = reader_of(log, clock)
+    for number in range(8):
+        clock.now_s = 10.0 * number
+        append(log, *(text.replace("6400", str(6400 * number)) for text in SAMPLES[family.name]))
+        lines = reader.new()
+    assert lines[-1]["env_steps_per_s"] == pytest.approx(640.0)
+
+
+def test_rates_alone_are_added_up(log: Path):
+    clock = Clock()
+    reader = reader_of(log, clock, own_family(r"speed (\d+)", None, None))
+    for number in range(4):
+        clock.now_s = 2.0 * number
+        append(log, "speed 100")
+        lines = reader.new()
+    assert lines[-1] == {"env_steps": 600, "env_steps_per_s": 100.0}
+
+
+def test_a_mean_since_the_start_is_not_taken_for_the_rate_of_the_moment(log: Path):
+    clock = Clock()
+    reader = reader_of(log, clock)
+    # 1,000 steps/s for ten seconds, then 100: CleanRL goes on printing several hundred.
+    steps = 0
+    for second in range(1, 41):
+        steps += 1000 if second <= 10 else 100
+        clock.now_s = float(second)
+        append(log, f"SPS: {steps // second}")
+        lines = reader.new()
+    assert lines[-1]["env_steps_per_s"] == pytest.approx(100, abs=15)
+
+
+def test_steps_that_fall_are_those_of_another_run_of_the_same_job(log: Path):
+    clock = Clock()
+    reader = reader_of(log, clock, own_family(None, r"steps=(\d+)", None))
+    found = []
+    for steps in (100, 200, 50, 150):
+        clock.now_s += 1
+        append(log, f"steps={steps}")
+        found.append(reader.new()[-1]["env_steps"])
+    assert found == [100, 200, 250, 350]
+
+
+def test_a_metric_that_is_no_number_is_left_out(log: Path):
+    clock = Clock()
+    reader = reader_of(log, clock, own_family(None, r"steps=(\d+)", r"reward=(\S+)"))
+    append(log, "reward=nan", "steps=1")
+    assert "metric" not in reader.new()[-1]
+
+
+def test_own_expressions_are_read_beside_a_known_family(log: Path):
+    reader = reader_of(log, Clock(), own_family(None, None, r"success (\d\.\d)"))
+    append(log, "success 0.5", "SPS: 100", "SPS: 100")
+    assert reader.new()[-1]["metric"] == 0.5
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("fps", "has 0 groups; expected one"),
+        ("(a)(b)", "has 2 groups"),
+        ("(", "no regular expression"),
+    ],
+)
+def test_an_expression_needs_one_group(text: str, message: str):
+    with pytest.raises(ConfigError, match=f"pack.rate=.*{message}"):
+        own_family(text, None, None)
+
+
+@pytest.mark.parametrize(
+    "text", [r"\(fps\) (\d+)", r"(?:speed|fps) (\d+)", r"fps (?P<x>\d+)", r"(?i)FPS (\d+)"]
+)
+def test_the_group_is_found_wherever_it_stands(text: str):
+    family = own_family(text, None, None)
+    assert family is not None
+    report = family.read("(fps) 12") or family.read("fps 12")
+    assert report is not None
+    assert report.rate == 12
+
+
+def test_output_is_split_at_carriage_returns_and_freed_of_escape_codes(log: Path):
+    log.write_bytes(b"\x1b[1mbold\x1b[0m\r\x1b]0;title\x07 10%\r\xff\xfe\n\nrest")
+    reader = OutputReader(log)
+    assert reader.new() == ["bold", " 10%", "\ufffd\ufffd"]
+    with log.open("ab") as file:
+        file.write(b" of it\n")
+    assert reader.new() == ["rest of it"]
+
+
+def test_long_lines_are_cut_and_fast_output_is_skipped(log: Path):
+    log.write_bytes(b"x" * 100_000 + b"\n" + b"y" * (3 << 20) + b"\nlast\n")
+    lines = OutputReader(log).new()
+    assert lines[-1] == "last"
+    assert max(map(len, lines)) <= LONGEST_LINE
+
+
+def test_a_log_that_was_cut_is_read_from_its_start(log: Path):
+    reader = OutputReader(log)
+    log.write_text("one\ntwo\n")
+    assert reader.new() == ["one", "two"]
+    log.write_text("new\n")
+    assert reader.new() == ["new"]

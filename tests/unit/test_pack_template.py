@@ -1,0 +1,50 @@
+"""Placeholders of a pack's command: what is filled, what stays, what is refused."""
+
+from __future__ import annotations
+
+import pytest
+
+from gmijax.errors import ConfigError
+from gmijax.packs.template import fill, placeholders, require_names
+
+
+@pytest.mark.parametrize(
+    ("argument", "filled"),
+    [
+        ("--seed={seed}", "--seed=3"),
+        ("{seed}{job}", "3007"),
+        ("{agent.lr}", "1e-4"),
+        ("{{seed}}", "{seed}"),
+        ('{{"seed": {seed}}}', '{"seed": 3}'),
+        ('{"a": 1}', '{"a": 1}'),
+        ("${HOME}", "${HOME}"),
+        ("{}", "{}"),
+        ("{0..3}", "{0..3}"),
+        ("two words and 'quotes'", "two words and 'quotes'"),
+    ],
+)
+def test_what_is_no_placeholder_passes_unharmed(argument: str, filled: str):
+    values = {"seed": "3", "job": "007", "agent.lr": "1e-4"}
+    assert fill([argument], values) == [filled]
+
+
+def test_placeholders_are_named_once_in_order():
+    assert placeholders(["{b}", "{a}{b}", "{{c}}"]) == ["b", "a"]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "names", "message"),
+    [
+        (["{sed}"], ["seed"], r"seed=: the command has no \{seed\}"),
+        (["{seed}", "{sead}"], ["seed"], r"\{sead\}: no such placeholder: did you mean seed\?"),
+        (["{nothing}"], [], r"\{nothing\}: no such placeholder: allowed are job, run_dir"),
+        (["{job}"], ["job"], r"job=: every job has \{job\} of its own"),
+    ],
+)
+def test_names_and_placeholders_must_fit(arguments: list[str], names: list[str], message: str):
+    with pytest.raises(ConfigError, match=message):
+        require_names(arguments, names)
+
+
+def test_own_names_need_not_be_used():
+    require_names(["train.py", "--seed", "{seed}"], ["seed"])
