@@ -80,7 +80,7 @@ def load_of(device: str) -> GpuLoad | None:
     with suppress(pynvml.NVMLError), nvml_session():
         handle = pynvml.nvmlDeviceGetHandleByUUID(device)
         memory = pynvml.nvmlDeviceGetMemoryInfo(handle)
-        busy = pynvml.nvmlDeviceGetUtilizationRates(handle).gpu / 100
+        busy = int(pynvml.nvmlDeviceGetUtilizationRates(handle).gpu) / 100
         return GpuLoad(int(memory.used) / _MIB, int(memory.total) / _MIB, busy)
     return None
 
