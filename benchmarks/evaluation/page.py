@@ -9,6 +9,7 @@ from benchmarks.evaluation.async_tables import ASYNC_TABLES, asynchronous_gains
 from benchmarks.evaluation.claims import claims
 from benchmarks.evaluation.figures import bounds, markdown, shown
 from benchmarks.evaluation.other_tables import OTHER_TABLES
+from benchmarks.evaluation.pack_tables import packs
 from benchmarks.evaluation.peer_tables import peers
 from benchmarks.evaluation.plots import mps_gains
 from benchmarks.evaluation.seed_tables import brax_returns, playground, playground_seeds, seeds
@@ -64,6 +65,7 @@ TABLES: MappingProxyType[str, Callable[[], list[str]]] = MappingProxyType(
     {
         "advice": advice,
         "claims": claims,
+        "packs": packs,
         "peers": peers,
         "sweeps": sweeps,
         "seeds": seeds,

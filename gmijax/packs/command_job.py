@@ -27,6 +27,7 @@ class CommandJob:
       overrides: its values of the grid, as they were typed.
       command: arguments, with placeholders.
       total_steps: steps at its end (`pack.total_steps`); None: its output may have them.
+      title: what it is called in tables where it has no values.
       progress: how far it is.
     """
 
@@ -34,14 +35,15 @@ class CommandJob:
     overrides: Mapping[str, str]
     command: tuple[str, ...]
     total_steps: int | None = None
+    title: str = ""
     progress: Progress = field(default_factory=Progress)
 
     num_gpus = 1
 
     @property
     def label(self) -> str:
-        """What it is called in tables: its values, else its command."""
-        return label_of(self.overrides) or shlex.join(self.command)
+        """What it is called in tables."""
+        return label_of(self.overrides) or self.title
 
     @property
     def program(self) -> str:
@@ -87,7 +89,8 @@ def jobs_of_file(settings: PackConfig) -> tuple[CommandJob, ...]:
         except (ValueError, ConfigError) as error:
             raise ConfigError(f"pack.commands={path}: line {number}: {error}") from None
         if words:
-            jobs.append(CommandJob(len(jobs), {}, tuple(words), settings.total_steps))
+            title = shlex.join(words)
+            jobs.append(CommandJob(len(jobs), {}, tuple(words), settings.total_steps, title))
     if not jobs:
         raise ConfigError(f"pack.commands={path}: holds no command")
     return tuple(jobs)

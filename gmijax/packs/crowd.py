@@ -57,11 +57,15 @@ class Crowd:
         self._gpus: dict[tuple[int, int], _Gpu] = {}
         self.decisions: list[dict[str, Any]] = []
         for number, (site, host) in enumerate(zip(sites, hosts, strict=True)):
+            titles = {gpu.uuid: f"GPU {gpu.index}" for gpu in site.machine.gpus}
+            node = f"{site.name} " if site.name else ""
             by_gpu: dict[int, list[str]] = defaultdict(list)
             for share in site.plan.slices:
                 by_gpu[share.gpu].append(share.device)
             for gpu, devices in by_gpu.items():
-                self._gpus[number, gpu] = _Gpu(devices[0], len(devices), host)
+                device = devices[0]
+                title = f"{node}{titles.get(device, device)}"
+                self._gpus[number, gpu] = _Gpu(device, title, len(devices), host)
                 places.limit(number, gpu, 1)
 
     def at_once(self, place: Place) -> int:
@@ -99,14 +103,15 @@ class Crowd:
             return []
         gpu = self._gpus[key]
         self._places.limit(*key, decision.target)
-        self._console.print(f"  {decision.target} at once on {gpu.device}: {decision.why}")
+        gpu.since_s = running_s()
+        self._console.print(f"  {gpu.title}: {decision.target} at once; {decision.why}")
         measured = {str(count): found.per_s for count, found in gpu.rule.measured.items()}
         self.decisions.append(
             {
                 "time_s": round(running_s() - self._began_s, 1),
-                "device": gpu.device,
+                "gpu": gpu.title,
                 "at_once": decision.target,
-                "steps_per_s": measured,
+                "rate_per_s": measured,
                 "why": decision.why,
             }
         )
@@ -117,8 +122,9 @@ class Crowd:
 class _Gpu:
     """One GPU: its rule, and the memory that its jobs take."""
 
-    def __init__(self, device: str, places: int, host: Host) -> None:
-        self.device, self._host = device, host
+    def __init__(self, device: str, title: str, places: int, host: Host) -> None:
+        self.device, self.title, self._host = device, title, host
+        self.since_s = 0.0
         self.rule = Density(places)
         found = host.load_of(device)
         self._before_mib = found.used_mib if found else 0.0
@@ -130,8 +136,12 @@ class _Gpu:
     def look(self, now_s: float, here: Sequence[Running[CommandJob]]) -> Decision | None:
         """What to change."""
         before, self.latest = self.latest, here
-        has_completed = any(one.jobs[0].progress.state == "completed" for one in before)
-        if has_completed and (decision := self.rule.ended_early()):
+        # Those that ran from start to end beside so many: a rate can never be measured.
+        are_short = any(
+            one.jobs[0].progress.state == "completed" and one.started_s >= self.since_s
+            for one in before
+        )
+        if are_short and (decision := self.rule.ended_early()):
             return decision
         load = self._host.load_of(self.device)
         reports = [one.jobs[0].progress.reports for one in here]

@@ -53,6 +53,11 @@ class PackWork(Work[CommandJob]):
         return cast("PackConfig", self.settings)
 
     @property
+    def is_adaptive(self) -> bool:
+        """See `Work`."""
+        return self.ranking.jobs_per_gpu == "auto"
+
+    @property
     def on_cpu(self) -> bool:
         """See `Work`."""
         return False
@@ -76,7 +81,10 @@ class PackWork(Work[CommandJob]):
         sites = []
         for host in hosts:
             settings = replace(self.ranking, jobs_per_gpu=self._most(host))
-            plan = places_of(settings, host.machine, {self.ranking.backend})
+            try:
+                plan = places_of(settings, host.machine, {self.ranking.backend})
+            except ConfigError as error:
+                raise ConfigError(str(error).replace("plan.backend", "pack.backend")) from None
             sites.append(Site(plan, host.machine, host.name))
         return sites
 
@@ -120,14 +128,14 @@ class PackWork(Work[CommandJob]):
         self, places: Places, sites: Sequence[Site], hosts: Sequence[Host], console: Console
     ) -> Limiter[CommandJob] | None:
         """See `Work`."""
-        if self.ranking.jobs_per_gpu != "auto" or not sites[0].machine.gpus:
+        if not self.is_adaptive or not sites[0].machine.gpus:
             return None
         self.crowds.append(Crowd(places, sites, hosts, console))
         return self.crowds[-1]
 
     def warnings(self) -> Sequence[str]:
         """See `Work`."""
-        if self.ranking.jobs_per_gpu != "auto":
+        if not self.is_adaptive:
             return ()
         return (
             "pack.jobs_per_gpu=auto: on a GPU one job first, then more while they gain; at most "

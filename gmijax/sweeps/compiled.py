@@ -33,6 +33,7 @@ class CompiledPrograms:
         self._own.add(program)
         if is_lasting:
             with suppress(OSError):  # A full disk must not end the sweep.
+                self._folder.mkdir(parents=True, exist_ok=True)
                 self._file(program).touch()
 
     def _file(self, program: str) -> Path:

@@ -116,13 +116,22 @@ class Density:
         if before is not None and found.per_s < (1 + GAIN) * before.per_s:
             fewer = max(k for k in self.measured if k < count)
             middle = (fewer + count) // 2
-            gain = f"{count} at once make {found.per_s / before.per_s:.2f} of {fewer}"
+            gain = (
+                f"{count} at once make {found.per_s / before.per_s:.2f} times the rate of {fewer}"
+            )
             if middle > fewer and middle not in self.measured and 2 * fewer == count:
                 return self._go_to(middle, gain)
             return self.settle(fewer, gain)
         if any(k > count for k in self.measured) or count == self.most:
             return self.settle(count, f"{count} at once make the most")
-        return self._go_to(min(2 * count, self.most), f"{count} at once gain; trying more")
+        return self._go_to(min(2 * count, self.most), self._gain(count))
+
+    def _gain(self, count: int) -> str:
+        """What so many at once were found to make."""
+        if count == 1 or 1 not in self.measured:
+            return f"{self.measured[count].per_s:,.4g} a second with {count}"
+        gain = self.measured[count].per_s / self.measured[1].per_s
+        return f"{count} at once make {gain:.2f} times the rate of one"
 
     def _smaller(self) -> Measured | None:
         fewer = [k for k in self.measured if k < self.target]
@@ -141,10 +150,11 @@ class Density:
         return Decision(count, why)
 
     def settle(self, count: int, why: str) -> Decision | None:
-        """So many at once from now on; returns what that changes, if anything."""
-        self.is_settled, before = True, self.target
+        """So many at once from now on; None: it was so before."""
+        was_settled, before = self.is_settled, self.target
+        self.is_settled = True
         decision = self._go_to(count, why)
-        return decision if count != before else None
+        return decision if count != before or not was_settled else None
 
 
 class _Window:

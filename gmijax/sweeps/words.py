@@ -33,7 +33,8 @@ def announce(
     total = len(work.jobs) if settings.sampler == "grid" else settings.trials or 0
     more = f", {num_complete} of them complete already" if num_complete else ""
     places = sum(len(site.plan.slices) for site in sites)
-    console.print(f"{_counted(total, 'job')}{more}, {places} at a time {_where(sites)}")
+    at_once = f"at most {places}" if work.is_adaptive and sites[0].machine.gpus else str(places)
+    console.print(f"{_counted(total, 'job')}{more}, {at_once} at a time {_where(sites)}")
     for reason in dict.fromkeys(reason for site in sites for reason in site.plan.reasons):
         console.print(f"  {reason}")
     for warning in work.warnings():

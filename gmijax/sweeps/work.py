@@ -62,6 +62,11 @@ class Work(ABC, Generic[J]):
         """What jobs are compared by."""
 
     @property
+    def is_adaptive(self) -> bool:
+        """Whether the number at once changes while jobs run."""
+        return False
+
+    @property
     @abstractmethod
     def on_cpu(self) -> bool:
         """Whether no job wants a GPU."""

@@ -113,6 +113,7 @@ def test_bad_input_is_refused(words: Sequence[str], command: Sequence[str], said
     [
         (("--", "no-such-program"), "no-such-program: no such program"),
         (("pack.gpus=3", "--", "true"), "pack.gpus=3"),
+        (("pack.backend=x", "--", "true"), "pack.backend='x'"),
         (("pack.stall_s=0", "--", "true"), "pack.stall_s=0"),
         (("pack.x=1", "--", "true"), "unknown key pack.x"),
     ],
@@ -288,7 +289,8 @@ def test_jobs_are_added_while_they_gain_and_taken_back_when_they_do_not(clock: C
     packed.go_on(600)
     assert len(packed.running) == 4
     assert [change["at_once"] for change in packed.crowd.decisions] == [2, 4, 8, 6, 4]
-    assert "6 at once make" in packed.crowd.decisions[-1]["why"]
+    assert packed.crowd.decisions[1]["why"] == "2 at once make 1.90 times the rate of one"
+    assert packed.crowd.decisions[-1]["why"] == "6 at once make 0.87 times the rate of 4"
     newest = max(one.started_s for one in packed.running)
     assert newest < 200.0  # The oldest went on.
 
@@ -308,6 +310,19 @@ def test_without_a_rate_an_idle_gpu_gets_a_second_job(clock: Clock) -> None:
     busy.host.busy = 0.9
     busy.go_on(400)
     assert len(busy.running) == 1
+
+
+def test_short_jobs_are_doubled_without_a_measurement(clock: Clock) -> None:
+    packed = Packed(clock, [1000.0] * 16, memory_mib=100.0)
+    for _ in range(4):
+        packed.go_on(15)
+        done = packed.running.pop(0)
+        done.jobs[0].progress.state = "completed"
+        packed.places.give_back(done.place)
+    packed.go_on(2)
+    # The second that completed had begun beside one other; the first had been alone.
+    assert [change["at_once"] for change in packed.crowd.decisions][:2] == [2, 4]
+    assert packed.crowd.decisions[0]["why"] == "jobs end before a rate is measured"
 
 
 def test_what_finds_no_memory_runs_again_beside_fewer(clock: Clock) -> None:
