@@ -113,7 +113,7 @@ def test_bad_input_is_refused(words: Sequence[str], command: Sequence[str], said
     [
         (("--", "no-such-program"), "no-such-program: no such program"),
         (("pack.gpus=3", "--", "true"), "pack.gpus=3"),
-        (("pack.backend=x", "--", "true"), "pack.backend='x'"),
+        (("pack.backend=x", "--", "true"), "pack.backend=x: expected one of auto, mps, share"),
         (("pack.stall_s=0", "--", "true"), "pack.stall_s=0"),
         (("pack.x=1", "--", "true"), "unknown key pack.x"),
     ],
