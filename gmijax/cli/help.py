@@ -69,7 +69,9 @@ def _whose_defaults(command: str, keys: Sequence[Key]) -> str:
 def usage_of(command: str) -> str:
     """The form of its command line."""
     if command == "pack":
-        return "gmijax pack [NAME=VALUE,VALUE ...] [key=value ...] [--cfg job] -- COMMAND ..."
+        return (
+            "gmijax pack [NAME=VALUE,VALUE ...] [key=value ...] [--cfg job|--json] -- COMMAND ..."
+        )
     return f"gmijax {command} [key=value ...] [--cfg job] [--help]"
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -49,12 +50,19 @@ class PackKeys:
 def pack_command(argv: Sequence[str]) -> int:
     """Runs `gmijax.pack`; returns its exit code."""
     at = list(argv).index("--") if "--" in argv else len(argv)
-    words, program = argv[:at], argv[at + 1 :]
+    words, program = list(argv[:at]), argv[at + 1 :]
+    events = None
+    if "--json" in words:
+        words.remove("--json")
+        events = sys.stdout
 
     def make(words: Sequence[str]) -> PackWork:
         return build_pack(words, program)
 
-    return command("pack", PackKeys, run_work, words, make=make, shown=_shown)
+    def run(work: PackWork, *, show: bool) -> None:
+        run_work(work, show=show and events is None, events=events)
+
+    return command("pack", PackKeys, run, words, make=make, shown=_shown)
 
 
 def build_pack(words: Sequence[str], program: Sequence[str]) -> PackWork:

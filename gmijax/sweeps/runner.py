@@ -6,7 +6,7 @@ import time
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, closing, contextmanager
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TextIO
 
 from rich.console import Console
 
@@ -16,6 +16,7 @@ from gmijax.machine.snapshot import detect_machine
 from gmijax.runs.folder import RUNS, given_run, read_json, write_json
 from gmijax.runs.held import OpenFolder, locked
 from gmijax.supervise.run_gmis import StopSignals, stop_signals
+from gmijax.sweeps.events import JobEvents
 from gmijax.sweeps.folder import errors_of_files, opened_folder
 from gmijax.sweeps.host import LocalHost
 from gmijax.sweeps.kind import J
@@ -44,8 +45,13 @@ class SweepResult(NamedTuple):
     report: dict[str, Any]
 
 
-def run_work(work: Work[J], *, show: bool = False) -> SweepResult:
+def run_work(work: Work[J], *, show: bool = False, events: TextIO | None = None) -> SweepResult:
     """Runs all jobs, as many at a time as the settings say, and compares them.
+
+    Args:
+      work: the jobs.
+      show: print live progress and the ranking.
+      events: gets a JSON object a line for each event, see `JobEvents`.
 
     Called again with the same work and folder, it runs those that are not complete.
 
@@ -65,7 +71,7 @@ def run_work(work: Work[J], *, show: bool = False) -> SweepResult:
             opened_folder(work) as paths,
             locked(paths.lock, f"run.dir={paths.root}") as folder,
         ):
-            return _run(work, hosts, paths, folder, console, started_s)
+            return _run(work, hosts, paths, folder, console, started_s, events)
 
 
 def _run(
@@ -75,6 +81,7 @@ def _run(
     folder: OpenFolder,
     console: Console,
     started_s: float,
+    events: TextIO | None,
 ) -> SweepResult:
     """Runs the jobs in a folder that is locked, on machines where nothing is started yet."""
     with errors_of_files(paths):
@@ -83,18 +90,23 @@ def _run(
         report.begin()
     console.print(f"{work.name} folder: {paths.root}")
     view = SweepView(console, jobs, work.ranking)
+    told = None if events is None else JobEvents(events, work.name, jobs, paths)
     try:
         with errors_of_files(paths):
-            _train(work, hosts, paths, console, study, report, view, jobs)
+            _train(work, hosts, paths, console, study, report, view, jobs, told)
     except BaseException as error:
         status = "interrupted" if isinstance(error, JobInterrupted) else "failed"
         if (wrong := report.end(status)) is not None:
             error.add_note(wrong)
+        if told is not None:
+            told.end(report.data)
         if isinstance(error, JobInterrupted | SweepFailed):
             error.add_note(f"the same command with run.dir={paths.root} goes on")
         raise
     failed = [job for job in jobs if job.progress.state == "failed"]
     wrong = report.end("failed" if failed else "completed")
+    if told is not None:
+        told.end(report.data)
     print_outcome(console, report.data, work.ranking, paths, view.line())
     if failed:
         first = failed[0]
@@ -114,6 +126,7 @@ def _train(
     report: Report,
     view: SweepView,
     jobs: list[J],
+    told: JobEvents | None,
 ) -> None:
     """Runs the jobs; returns when all have ended."""
     with stop_signals() as signals, ExitStack() as held:
@@ -132,6 +145,8 @@ def _train(
         def tick() -> None:
             report.update()
             view.update()
+            if told is not None:
+                told.update()
 
         Scheduler(
             jobs,

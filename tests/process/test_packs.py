@@ -147,6 +147,25 @@ def test_sigterm_asks_the_jobs_and_waits_for_them(home: Path) -> None:
     assert running_in(folder) == []
 
 
+def test_events_for_programs(home: Path, python: Path) -> None:
+    line = commands_of(python, "--json", "seed=0,3", "lr=1", "run.dir=all")
+    done = train(*line, cwd=home, command="pack")
+    assert done.returncode == 1
+    events = [json.loads(text) for text in done.stdout.splitlines()]
+    kinds = [event["event"] for event in events]
+    assert kinds[0] == "pack_started"
+    assert kinds[-1] == "pack_ended"
+    assert events[-1]["status"] == "failed"
+    started = [event["job"] for event in events if event["event"] == "job_started"]
+    assert sorted(started) == [0, 1]
+    ended = {event["job"]: event for event in events if event["event"] == "job_ended"}
+    assert ended[0]["state"] == "completed"
+    assert ended[0]["env_steps"] == 30 * 512
+    assert ended[1]["exit_code"] == 1
+    assert "no such seed" in Path(ended[1]["log"]).read_text()
+    assert all(event["env_steps"] > 0 for event in events if event["event"] == "progress")
+
+
 def test_a_pack_from_python(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     print_steps = "for k in range({n}): print(f'at {{k}} of'); import time; time.sleep(.02)"

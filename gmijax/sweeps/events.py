@@ -1,0 +1,95 @@
+"""What programs read of jobs that run: one JSON object a line."""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Mapping, Sequence
+from typing import Any, Final, TextIO
+
+from gmijax.sweeps.kind import AnyJob
+from gmijax.sweeps.paths import SweepPaths
+from gmijax.sweeps.progress import Progress
+
+_PROGRESS_S: Final = 1.0
+_ENDS: Final = ("completed", "failed", "pruned", "interrupted")
+
+
+class JobEvents:
+    """Prints events of jobs: `job_started`, `progress`, `job_ended`, and one at the end.
+
+    Keys are only ever added. A number that is not known is null.
+
+    Args:
+      stream: a line is written for each event, until nobody reads it any more.
+      name: of the command, e.g. `pack`.
+      jobs: those that are known; more may be added to the list.
+      paths: their files.
+    """
+
+    def __init__(
+        self, stream: TextIO, name: str, jobs: Sequence[AnyJob], paths: SweepPaths
+    ) -> None:
+        self._stream: TextIO | None = stream
+        self._name = name
+        self._jobs, self._paths = jobs, paths
+        self._states = {job.number: job.progress.state for job in jobs}
+        self._reported_s = 0.0
+        self._reports: dict[int, int] = {}
+        self._write(f"{name}_started", run_dir=str(paths.root), jobs=len(jobs))
+
+    def update(self) -> None:
+        """Called about ten times a second."""
+        now_s = time.monotonic()
+        is_due = now_s - self._reported_s >= _PROGRESS_S
+        for job in self._jobs:
+            state, before = job.progress.state, self._states.get(job.number, "waiting")
+            self._states[job.number] = state
+            if state != before:
+                self._changed(job, state)
+            elif is_due and state == "running":
+                self._progress(job)
+        if is_due:
+            self._reported_s = now_s
+
+    def end(self, report: Mapping[str, Any]) -> None:
+        """After the last job."""
+        self.update()
+        found = {key: report.get(key) for key in ("status", "ranking", "settings", "wall_s")}
+        self._write(f"{self._name}_ended", **found)
+
+    def _changed(self, job: AnyJob, state: str) -> None:
+        progress = job.progress
+        if state == "running":
+            place = progress.place or None
+            self._write("job_started", job, overrides=dict(job.overrides), place=place)
+            return
+        event = "job_ended" if state in _ENDS else "job_waits"
+        error, log = progress.error, str(self._paths.log(job.number))
+        ends = {"exit_code": progress.exit_code, "error": error, "log": log}
+        self._write(event, job, state=state, **ends, **_figures(progress))
+
+    def _progress(self, job: AnyJob) -> None:
+        if self._reports.get(job.number) != job.progress.reports:
+            self._reports[job.number] = job.progress.reports
+            total = job.num_timesteps
+            self._write("progress", job, num_timesteps=total, **_figures(job.progress))
+
+    def _write(self, event: str, job: AnyJob | None = None, **more: Any) -> None:
+        number = {} if job is None else {"job": job.number}
+        line = json.dumps({"event": event, "time_s": round(time.time(), 3), **number, **more})
+        if self._stream is None:
+            return
+        try:
+            self._stream.write(f"{line}\n")
+            self._stream.flush()
+        except (OSError, ValueError):  # Nobody reads; the jobs go on.
+            self._stream = None
+
+
+def _figures(progress: Progress) -> dict[str, Any]:
+    return {
+        "env_steps": progress.env_steps,
+        "env_steps_per_s": progress.env_steps_per_s or progress.mean_steps_per_s,
+        "value": progress.value,
+    }
