@@ -75,13 +75,14 @@ def build_pack(words: Sequence[str], program: Sequence[str]) -> PackWork:
     Raises:
       ConfigError: bad input.
     """
-    words = [_as_text(word) for word in readable("pack", words)]
+    words = [_as_text(word) for word in words]
     given = list(zip(words, parse(words), strict=True))
     own = [text for text, item in given if item.key_or_group.startswith(_OWN)]
+    at_home = {text: at_home for text in own for at_home in readable("pack", [text])}
     for text, item in given:
         if text in own and item.is_sweep_override():
             raise ConfigError(f"{text}: expected one value (a list stands in brackets)")
-    keys = from_dict(PackKeys, compose_dict("pack", own))
+    keys = from_dict(PackKeys, compose_dict("pack", list(at_home.values())))
     space = {item.key_or_group: _values(item) for text, item in given if text not in own}
     if len(space) < len(given) - len(own):
         raise ConfigError("a name of the grid comes twice")
@@ -93,9 +94,11 @@ def _as_text(word: str) -> str:
     """Keys that hold commands, expressions and paths need no quotes of Hydra's."""
     key, equals, value = word.partition("=")
     is_text = key in _TEXTS or key.startswith("pack.env.")
-    is_plain = not value or value == "null" or value[0] in "'\""
+    is_quoted = len(value) > 1 and value[0] == value[-1] and value[0] in "'\""
+    is_plain = not value or value == "null" or is_quoted
     if is_text and equals and not is_plain:
-        word = f"{key}={quoted(value)}"
+        # A shell's variables are the job's, not ours.
+        word = f"{key}={quoted(value)}".replace("${", "\\${")
     return f"++{word}" if key.startswith("pack.env.") else word  # Its names are the user's.
 
 

@@ -10,6 +10,7 @@ import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
+from pathlib import Path
 from typing import Any, TextIO
 
 from rich.console import Console
@@ -22,6 +23,11 @@ from gmijax.runs.folder import RunPaths
 from gmijax.supervise.watched_gmi import GmiStatus
 
 _LINE_EVERY_S = 5.0
+
+_OF_SEVERAL = ("template ", "strategy ", "backend cpu: no usable NVIDIA GPU here")
+"""Beginnings of reasons that mean nothing where there is one GMI."""
+
+_COMPILING = "compiling: once for each task and size, usually 1 to 3 minutes"
 
 
 class _BestEffortStream:
@@ -90,12 +96,28 @@ def doing(console: Console, what: str) -> Iterator[None]:
 
 
 def announce(console: Console, run: RunPaths, plan: Plan, what: str, lines: Sequence[str]) -> None:
-    """Prints where a job is, its plan (`what`: the end of that line), and why it is so."""
-    layout = [list(gmis) for gmis in plan.layout.gmis_of_gpu]
-    console.print(f"run folder: {run.root}")
-    console.print(f"plan: layout {layout}, backend {plan.backend}, {what}")
-    for line in (*plan.reasons, *lines):
+    """Prints where a job is, its plan (`what`: the end of that line), and why it is so.
+
+    Of one GMI alone nothing is said that only several differ in; `plan.json` has it.
+    """
+    console.print(f"run folder: {nearby(run.root)}")
+    reasons = plan.reasons
+    if plan.layout.num_gmis == 1:
+        where = "the CPU" if plan.backend == "cpu" else "one GPU"
+        console.print(f"one process on {where}, {plan.num_envs_per_gmi:,} environments")
+        reasons = tuple(text for text in reasons if not text.startswith(_OF_SEVERAL))
+    else:
+        layout = [list(gmis) for gmis in plan.layout.gmis_of_gpu]
+        console.print(f"plan: layout {layout}, backend {plan.backend}, {what}")
+    for line in (*reasons, *lines):
         console.print(f"  {line}")
+
+
+def nearby(path: Path) -> str:
+    """A path as it is typed from the working directory, if that is shorter."""
+    with suppress(ValueError, OSError):
+        return str(path.relative_to(Path.cwd()))
+    return str(path)
 
 
 class ConsoleProgress:
@@ -121,6 +143,7 @@ class ConsoleProgress:
         self._first: tuple[float, int] | None = None
         self._shown: tuple[str, int | None] = ("", None)
         self._shown_s = 0.0
+        self._began_s = time.monotonic()
         self._display = LiveDisplay(console)
 
     def __enter__(self) -> ConsoleProgress:
@@ -154,17 +177,25 @@ class ConsoleProgress:
         waited = now - self._shown_s > _LINE_EVERY_S
         if states != self._shown[0] or (steps != self._shown[1] and waited):
             text = f"{self._text()}  " if self._line else ""
+            if not self._line and _are_compiling(gmis):
+                text = f"{_COMPILING}  "
             self._console.print(f"{text}[{states}]")
             self._shown, self._shown_s = (states, steps), now
 
     def _panel(self, gmis: Sequence[GmiStatus]) -> Table:
         grid = Table.grid()
         done = min(self._line.get("env_steps", 0) / self._num_timesteps, 1.0)
-        text = self._text() if self._line else "starting"
+        text = self._text() if self._line else self._waiting(gmis)
         grid.add_row(Text.assemble(bar(done), f" {text}"))
         for gmi in gmis:
-            grid.add_row(Text(f"GMI {gmi.gmi}: {gmi.state}, iteration {gmi.iteration}", "dim"))
+            done_so_far = f", iteration {gmi.iteration}" if gmi.iteration else ""
+            grid.add_row(Text(f"GMI {gmi.gmi}: {gmi.state}{done_so_far}", "dim"))
         return grid
+
+    def _waiting(self, gmis: Sequence[GmiStatus]) -> str:
+        """What is done before the first iteration, and for how long."""
+        what = _COMPILING if _are_compiling(gmis) else "starting"
+        return f"{what}  {clock(time.monotonic() - self._began_s)}"
 
     def _text(self) -> str:
         line = self._line
@@ -183,6 +214,10 @@ class ConsoleProgress:
         since_s, steps = self._first
         rate = (self._line["env_steps"] - steps) / (time.monotonic() - since_s)
         return clock(max(0.0, (self._num_timesteps - self._line["env_steps"]) / rate))
+
+
+def _are_compiling(gmis: Sequence[GmiStatus]) -> bool:
+    return any(gmi.state == "compiling" for gmi in gmis)
 
 
 def _states(gmis: Sequence[GmiStatus]) -> str:

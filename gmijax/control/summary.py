@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -10,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from gmijax.config import ServeConfig, TrainConfig
+from gmijax.control.console import nearby
 from gmijax.learning.physics_health import overflow_warnings
 from gmijax.partition.plan import Plan
 from gmijax.runs.folder import RunPaths, read_json
@@ -92,15 +94,30 @@ def _evaluations(run: RunPaths) -> dict[str, Any] | None:
 def train_outcome(summary: Data, run: RunPaths) -> str:
     """The summary in a few lines for people."""
     times, mean = len(summary["restarts"]), summary["final_return"]
-    learnt = "no episode has ended" if mean is None else f"final return {mean:.2f}"
+    learnt = "no episode has ended"
+    if mean is not None:
+        learnt = f"final return {mean:.2f} (mean of the latest episodes, with exploration noise)"
+    checkpoint = summary["checkpoint"]
+    where = "none" if checkpoint is None else nearby(Path(checkpoint))
     return (
         f"{summary['status']}: {summary['env_steps']:,} env steps in {summary['wall_s']:.0f} s, "
         f"{learnt}{f', started again {times} times' if times else ''}\n"
         f"{_of_rates(summary)}"
         f"{_of_evaluations(summary.get('eval'))}"
         f"{_of_videos(run)}"
-        f"checkpoint: {summary['checkpoint']}\nsummary: {run.summary}"
-    ) + overflow_warnings(summary["overflow_steps"])
+        f"checkpoint: {where}\nsummary: {nearby(run.summary)}"
+        f"{overflow_warnings(summary['overflow_steps'])}"
+        f"{'' if checkpoint is None else _next(run)}"
+    )
+
+
+def _next(run: RunPaths) -> str:
+    """What people do with a trained policy."""
+    folder = shlex.quote(nearby(run.root))
+    return (
+        f"\nnext: gmijax play run.dir={folder}  (returns without exploration noise, and a film)"
+        f"\n      tensorboard --logdir {folder}  (curves; or open {nearby(run.returns_png)})"
+    )
 
 
 def _of_rates(summary: Data) -> str:

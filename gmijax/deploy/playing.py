@@ -17,7 +17,7 @@ from rich.table import Table
 
 from gmijax.config import EnvConfig, ExportConfig, PlanConfig, PlayConfig, ReduceConfig, Timeouts
 from gmijax.config.schema import to_dict
-from gmijax.control.console import doing, open_console
+from gmijax.control.console import doing, nearby, open_console
 from gmijax.deploy.pictures import film, has_brax, write_page
 from gmijax.errors import ConfigError, GmijaxError
 from gmijax.machine.snapshot import Machine, detect_machine
@@ -73,14 +73,14 @@ def play(config: PlayConfig, *, show: bool = False) -> None:
     # A film of an earlier evaluation must not lie beside the returns of this one.
     paths = PlayPaths(output_folder(config, "play", lambda root: PlayPaths(root).results()))
     console = open_console(show=show)
-    console.print(f"checkpoint: {config.checkpoint}")
+    console.print(f"checkpoint: {nearby(Path(str(config.checkpoint)))}")
     if changed:
         console.print(changed)
     with doing(console, f"playing {config.num_envs} episodes"):
         run_gmis(_launch(config, paths, detect_machine()))
     returns = read_json(paths.returns)
     console.print(_table(returns))
-    console.print(f"returns: {paths.returns}")
+    console.print(f"returns: {nearby(paths.returns)}")
     if not paths.model.exists():
         _accept_nothing_to_see(config, returns["env"], console)
         return
@@ -226,7 +226,7 @@ def _accept_nothing_to_see(config: PlayConfig, env: str, console: Console) -> No
 
 
 def _table(returns: Mapping[str, Any]) -> Table:
-    how = "mean actions" if returns["deterministic"] else "sampled actions"
+    how = "without exploration noise" if returns["deterministic"] else "with exploration noise"
     diverged = returns["num_diverged"]
     table = Table(
         title=f"{returns['env']} after {returns['env_steps']:,} env steps, {how}",

@@ -44,7 +44,7 @@ class GpuLoad(NamedTuple):
 
     Attributes:
       used_mib, total_mib: memory.
-      busy: part of the time in which some kernel runs, 0 to 1.
+      busy: part of the time in which some kernel runs, 0 to 1; 1 where that is not known.
     """
 
     used_mib: float
@@ -80,7 +80,9 @@ def load_of(device: str) -> GpuLoad | None:
     with suppress(pynvml.NVMLError), nvml_session():
         handle = pynvml.nvmlDeviceGetHandleByUUID(device)
         memory = pynvml.nvmlDeviceGetMemoryInfo(handle)
-        busy = int(pynvml.nvmlDeviceGetUtilizationRates(handle).gpu) / 100
+        busy = 1.0
+        with suppress(pynvml.NVMLError):  # NVML does not say it of MIG instances.
+            busy = int(pynvml.nvmlDeviceGetUtilizationRates(handle).gpu) / 100
         return GpuLoad(int(memory.used) / _MIB, int(memory.total) / _MIB, busy)
     return None
 

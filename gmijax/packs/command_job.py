@@ -24,10 +24,9 @@ class CommandJob:
 
     Attributes:
       number: from 0.
-      overrides: its values of the grid, as they were typed.
+      overrides: its values of the grid, as they were typed; of a line of a file the line.
       command: arguments, with placeholders.
       total_steps: steps at its end (`pack.total_steps`); None: its output may have them.
-      title: what it is called in tables where it has no values.
       progress: how far it is.
     """
 
@@ -35,7 +34,6 @@ class CommandJob:
     overrides: Mapping[str, str]
     command: tuple[str, ...]
     total_steps: int | None = None
-    title: str = ""
     progress: Progress = field(default_factory=Progress)
 
     num_gpus = 1
@@ -43,7 +41,7 @@ class CommandJob:
     @property
     def label(self) -> str:
         """What it is called in tables."""
-        return label_of(self.overrides) or self.title
+        return label_of(self.overrides)
 
     @property
     def program(self) -> str:
@@ -63,6 +61,10 @@ class CommandJob:
     def values(self, run_dir: Path) -> dict[str, str]:
         """What its placeholders stand for."""
         return {**self.overrides, "job": f"{self.number:0{DIGITS}d}", "run_dir": str(run_dir)}
+
+    def folder(self, run_dir: Path, cwd: str) -> str:
+        """Its working folder by `pack.cwd`."""
+        return fill([cwd], self.values(run_dir))[0]
 
     def arguments(self, run_dir: Path, more: Sequence[str] = ()) -> tuple[str, ...]:
         """The command in a folder, with more words that may hold placeholders."""
@@ -89,8 +91,9 @@ def jobs_of_file(settings: PackConfig) -> tuple[CommandJob, ...]:
         except (ValueError, ConfigError) as error:
             raise ConfigError(f"pack.commands={path}: line {number}: {error}") from None
         if words:
-            title = shlex.join(words)
-            jobs.append(CommandJob(len(jobs), {}, tuple(words), settings.total_steps, title))
+            name = {"command": shlex.join(words)}
+            words[0] = absolute(words[0])
+            jobs.append(CommandJob(len(jobs), name, tuple(words), settings.total_steps))
     if not jobs:
         raise ConfigError(f"pack.commands={path}: holds no command")
     return tuple(jobs)
@@ -102,17 +105,26 @@ def templates_of(settings: PackConfig) -> list[str]:
     return [*given, *map(str, settings.env.values())]
 
 
+def absolute(program: str) -> str:
+    """The program of a command for any working folder: a relative path is one from here."""
+    is_relative = os.sep in program and not program.startswith(("/", "{", "~"))
+    return os.path.abspath(program) if is_relative else program
+
+
 def require_programs(jobs: Sequence[CommandJob], settings: PackConfig) -> None:
-    """Refuses commands whose program is not there.
+    """Refuses jobs whose program or working folder is not there.
 
     Raises:
-      ConfigError: names the program.
+      ConfigError: names it.
     """
-    own_path = settings.env.get("PATH")
-    for name in dict.fromkeys(job.command[0] for job in jobs):
-        # With a working folder of its own a job may find another file there.
-        is_elsewhere = settings.cwd is not None and os.sep in name and not os.path.isabs(name)
-        if "{" in name or is_elsewhere:
+    path = settings.env.get("PATH")
+    for name in dict.fromkeys(job.arguments(Path("{run_dir}"))[0] for job in jobs):
+        if "{run_dir}" in name:
             continue
-        if shutil.which(name, path=None if own_path is None else str(own_path)) is None:
+        if shutil.which(name, path=None if path is None else str(path)) is None:
             raise ConfigError(f"{name}: no such program, or it cannot be executed")
+    if settings.cwd is None:
+        return
+    for folder in dict.fromkeys(job.folder(Path("{run_dir}"), settings.cwd) for job in jobs):
+        if not folder.startswith("{run_dir}") and not os.path.isdir(folder):
+            raise ConfigError(f"pack.cwd={folder}: no such folder")

@@ -17,7 +17,7 @@ from gmijax.config.pack import PackConfig
 from gmijax.packs.command_job import CommandJob
 from gmijax.packs.failure import failure_of
 from gmijax.packs.output import OutputReader
-from gmijax.packs.progress import ProgressReader, own_family
+from gmijax.packs.progress import ProgressReader, own_patterns
 from gmijax.packs.template import fill
 from gmijax.runs.folder import RunPaths, write_json
 from gmijax.runs.history import copy_history
@@ -33,8 +33,6 @@ _COMPILES_S: Final = 120.0
 _CLIENT_AFTER_S: Final = 30.0
 """When a job that reports nothing has taken its GPU."""
 
-_KILLED_S: Final = 5.0
-
 _THREADS: Final = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS")
 """Variables by which libraries choose the number of their threads: by default one a core."""
 
@@ -43,7 +41,15 @@ _GROWING: Final = {"XLA_PYTHON_CLIENT_PREALLOCATE": "false", "TF_FORCE_GPU_ALLOW
 
 
 class PackPaths(SweepPaths):
-    """Files of a pack."""
+    """Files of a pack: those of a job apart from what the job itself writes."""
+
+    def run_dir(self, number: int) -> Path:
+        """The folder of a job for what it writes itself."""
+        return super().job(number).root
+
+    def job(self, number: int) -> RunPaths:
+        """What the pack keeps of a job."""
+        return RunPaths(self.run_dir(number) / "pack")
 
     def log(self, number: int) -> Path:
         """What a job prints."""
@@ -56,7 +62,7 @@ class CommandKind:
     Args:
       settings: of the pack.
       paths: its files.
-      cores: CPU cores that all jobs share, by site.
+      cores: CPU cores that the jobs of a GPU share, by site.
       at_once: number of jobs that share a GPU and the cores at a place.
     """
 
@@ -69,10 +75,10 @@ class CommandKind:
     ) -> None:
         self._settings, self._paths = settings, paths
         self._cores, self._at_once = cores, at_once
-        self._own = own_family(settings.rate, settings.steps, settings.metric)
+        self._own = own_patterns(settings.rate, settings.steps, settings.metric)
         self.longest_compile_s = _COMPILES_S
-        self._silent: dict[int, _Silence] = {}
-        self._asked: set[int] = set()
+        self._attempts: dict[int, _Attempt] = {}
+        self._from_nothing: set[int] = set()
 
     def together(
         self, job: CommandJob, queue: Sequence[CommandJob], alone: Collection[int]
@@ -84,33 +90,36 @@ class CommandKind:
     def start(self, jobs: tuple[CommandJob, ...], place: Place) -> Start:
         """See `Kind`."""
         (job,) = jobs
-        run, log = self._paths.job(job.number), self._paths.log(job.number)
-        run.root.mkdir(exist_ok=True)
-        again = log.exists()
-        resume = self._settings.resume if again else None
-        if again and resume is None:
-            run.metrics.unlink(missing_ok=True)  # It starts from nothing.
-        arguments = job.arguments(run.root, shlex.split(resume or ""))
+        number, settings = job.number, self._settings
+        run, log, run_dir = self._paths.job(number), self._paths.log(number), self.run_dir(job)
+        run.root.mkdir(parents=True, exist_ok=True)
+        # Before its first report it has saved nothing that it could go on from.
+        resumes = settings.resume is not None and run.metrics.exists()
+        if number in self._from_nothing or not resumes:
+            resumes = False
+            run.metrics.unlink(missing_ok=True)
+        more = shlex.split(settings.resume or "") if resumes else []
+        arguments = job.arguments(run_dir, more)
         with log.open("a") as file:
             file.write(f"$ {shlex.join(arguments)}\n")
-        at_once = self._at_once(place)
-        fraction = None if at_once == 1 else 1.0 / at_once
+        at_once = 1 if place.is_alone else self._at_once(place)
         process = Process(
-            f"job {run.root.name}",
+            f"job {run_dir.name}",
             arguments,
             log,
-            self._variables(job, run.root, self._cores[place.site] // at_once),
-            cwd=self._folder(job, run.root),
+            self._variables(job, run_dir, self._cores[place.site] // at_once),
+            cwd=None if settings.cwd is None else job.folder(run_dir, settings.cwd),
             is_client=True,
-            memory_fraction=fraction,
-            stop_signal=signal.Signals[f"SIG{self._settings.stop_signal}"],
+            memory_fraction=None if at_once == 1 else 1.0 / at_once,
+            stop_signal=signal.Signals[f"SIG{settings.stop_signal}"],
+            lock=run.lock,
         )
-        output = OutputReader(log, log.stat().st_size)
+        begins = log.stat().st_size
+        self._attempts[number] = _Attempt(_Silence(log), begins, resumes)
+        output = OutputReader(log, begins)
         reader = _Recorder(ProgressReader(output, self._own, running_s(), running_s), run.metrics)
         # On CPU cores alone nothing is compiled that others could use.
         program = job.program if place.devices else ""
-        self._silent[job.number] = _Silence(log)
-        self._asked.discard(job.number)
         return Start(process, program, (reader,))
 
     def _variables(self, job: CommandJob, run_dir: Path, cores: int) -> dict[str, str]:
@@ -119,7 +128,11 @@ class CommandKind:
         defaults = {**threads, **_GROWING}
         for key in os.environ.keys() & defaults.keys():
             del defaults[key]
-        given = {key: fill([str(text)], values)[0] for key, text in self._settings.env.items()}
+        given = {
+            key: fill([str(text)], values)[0]
+            for key, text in self._settings.env.items()
+            if text is not None
+        }
         return {
             **defaults,
             # Lines come when they are printed: a rate can be read, and a hang be seen.
@@ -130,29 +143,32 @@ class CommandKind:
             **given,
         }
 
-    def _folder(self, job: CommandJob, run_dir: Path) -> str | None:
-        if self._settings.cwd is None:
-            return None
-        return fill([self._settings.cwd], job.values(run_dir))[0]
+    def run_dir(self, job: CommandJob) -> Path:
+        """The folder that `{run_dir}` stands for."""
+        return self._paths.run_dir(job.number)
 
     def why_hung(self, running: Running[CommandJob]) -> str | None:
         """See `Kind`."""
         (job,) = running.jobs
-        silence, limit_s = self._silent[job.number], self._settings.stall_s
-        silent_s = silence.seconds()
-        self._look_at_client(running, job)
+        attempt, limit_s = self._attempts[job.number], self._settings.stall_s
+        silent_s = attempt.silence.seconds()
+        self._look_at_client(running, job, attempt)
         if limit_s is None or silent_s <= limit_s:
             return None
         return f"printed nothing for {limit_s:g} s (pack.stall_s)"
 
-    def _look_at_client(self, running: Running[CommandJob], job: CommandJob) -> None:
-        """Notes it where a job has no share of its GPU; once, when it uses that."""
-        is_late = running_s() - running.started_s > _CLIENT_AFTER_S
-        if job.number in self._asked or not (job.progress.reports or is_late):
+    def _look_at_client(
+        self, running: Running[CommandJob], job: CommandJob, attempt: _Attempt
+    ) -> None:
+        """Notes it where a job has no share of its GPU; until it has."""
+        is_due = job.progress.reports > 0 and attempt.client_asked_s is None
+        latest_s = attempt.client_asked_s or running.started_s
+        if attempt.is_client or not (is_due or running_s() - latest_s > _CLIENT_AFTER_S):
             return
-        self._asked.add(job.number)
+        attempt.client_asked_s = running_s()
         if running.place.backend == "mps":
             job.progress.note = running.host.why_no_client(running.child)
+        attempt.is_client = job.progress.note is None
 
     def outcome(self, running: Running[CommandJob], job: CommandJob) -> Outcome:
         """See `Kind`."""
@@ -166,11 +182,17 @@ class CommandKind:
             return Outcome(error=running.host.lost, is_fault=True)
         if seen.exit_code == 0:
             return Outcome()
-        why = failure_of(seen.exit_code, self._paths.log(job.number))
-        is_anothers = why.is_gpu_fault and running.place.backend == "mps"
+        attempt = self._attempts[job.number]
+        why = failure_of(seen.exit_code, self._paths.log(job.number), attempt.begins)
+        is_anothers = why.is_gpu_fault and running.place.backend in ("mps", "mig")
+        # It had saved nothing yet: there is nothing to go on from.
+        found_nothing = attempt.resumes and not job.progress.reports
+        if found_nothing:
+            self._from_nothing.add(job.number)
         return Outcome(
             error=why.error,
             is_fault=True,
+            is_free=found_nothing and not why.is_out_of_memory,
             may_be_anothers=is_anothers or why.is_out_of_memory,
             is_out_of_memory=why.is_out_of_memory,
         )
@@ -183,7 +205,7 @@ class CommandKind:
     def stop_s(self, job: CommandJob) -> float:
         """See `Kind`."""
         del job
-        return self._settings.stop_timeout_s + _KILLED_S
+        return self._settings.stop_timeout_s
 
     def ended(self, job: CommandJob, run: RunPaths) -> None:
         """See `Kind`."""
@@ -221,6 +243,25 @@ class _Recorder:
 
 def _finite(line: Mapping[str, Any]) -> dict[str, Any]:
     return {key: value for key, value in line.items() if value is not None}
+
+
+@dataclass
+class _Attempt:
+    """A start of a job.
+
+    Attributes:
+      silence: of its log.
+      begins: byte of its log where what it prints begins.
+      resumes: whether it was told to go on from a checkpoint of its own.
+      is_client: whether it was seen to have its share of the GPU.
+      client_asked_s: when that was asked; None: not yet.
+    """
+
+    silence: _Silence
+    begins: int
+    resumes: bool
+    is_client: bool = False
+    client_asked_s: float | None = None
 
 
 @dataclass

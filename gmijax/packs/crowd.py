@@ -26,9 +26,8 @@ _ROOM: Final = 0.95
 """Part of a GPU's memory that jobs may have."""
 
 _GROWTH: Final = 1.15
-"""A job may come to need so much more memory than it took until its third report."""
+"""A job may come to need so much more memory than it took so far."""
 
-_WARM_REPORTS: Final = 3
 _SILENT_S: Final = 180.0
 """How long a first job may run without a report until it counts as one that makes none."""
 
@@ -131,11 +130,17 @@ class _Gpu:
         self._peak_mib = 0.0
         self._busy: list[float] = []
         self._has_doubled = False
-        self.latest: Sequence[Running[CommandJob]] = ()
+        self._latest: Sequence[Running[CommandJob]] = ()
+        self._are_known: bool | None = None
 
     def look(self, now_s: float, here: Sequence[Running[CommandJob]]) -> Decision | None:
         """What to change."""
-        before, self.latest = self.latest, here
+        before, self._latest = self._latest, here
+        load = self._host.load_of(self.device)
+        if load is not None:
+            self._busy = [*self._busy[-29:], load.busy]
+            if decision := self._by_memory(load, len(here)):
+                return decision
         # Those that ran from start to end beside so many: a rate can never be measured.
         are_short = any(
             one.jobs[0].progress.state == "completed" and one.started_s >= self.since_s
@@ -143,21 +148,18 @@ class _Gpu:
         )
         if are_short and (decision := self.rule.ended_early()):
             return decision
-        load = self._host.load_of(self.device)
         reports = [one.jobs[0].progress.reports for one in here]
-        if load is not None:
-            self._busy = [*self._busy[-29:], load.busy]
-            if decision := self._by_memory(load, len(here), min(reports) >= _WARM_REPORTS):
-                return decision
-        oldest_s = min(one.started_s for one in here)
-        if not any(reports) and now_s - oldest_s > _SILENT_S:
+        if not any(reports) and now_s - min(one.started_s for one in here) > _SILENT_S:
             return self._without_rate()
-        return self.rule.look(now_s, _seen(here))
+        are_known = all(one.jobs[0].num_timesteps for one in here)
+        if any(reports) and are_known != self._are_known:
+            self._are_known = are_known
+            self.rule.forget()
+        return self.rule.look(now_s, _seen(here, are_known))
 
-    def _by_memory(self, load: GpuLoad, count: int, are_warm: bool) -> Decision | None:
+    def _by_memory(self, load: GpuLoad, count: int) -> Decision | None:
         each_mib = max(0.0, load.used_mib - self._before_mib) / count
-        if are_warm:
-            self._peak_mib = max(self._peak_mib, each_mib)
+        self._peak_mib = max(self._peak_mib, each_mib)
         if not self._peak_mib:
             return None
         room_mib = _ROOM * (load.total_mib - self._before_mib)
@@ -174,17 +176,15 @@ class _Gpu:
         self._has_doubled = True
         busy = statistics.fmean(self._busy) if self._busy else 1.0
         seen = f"no rate is found (pack.rate, pack.steps); the GPU is busy {busy:.0%} of the time"
-        return self.rule.settle(2 if busy < _IDLE else 1, seen)
+        return self.rule.assume(2 if busy < _IDLE else 1, seen)
 
 
-def _seen(here: Sequence[Running[CommandJob]]) -> dict[int, Seen]:
+def _seen(here: Sequence[Running[CommandJob]], are_known: bool) -> dict[int, Seen]:
     """Part of the whole that each has done, where that is known of all; else steps."""
-    jobs = [one.jobs[0] for one in here]
-    are_known = all(job.num_timesteps for job in jobs)
     return {
         job.number: Seen(
             job.progress.env_steps / ((job.num_timesteps or 1) if are_known else 1),
             job.progress.reports,
         )
-        for job in jobs
+        for job in (one.jobs[0] for one in here)
     }

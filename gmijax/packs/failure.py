@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Final, NamedTuple
 
 from gmijax.errors import printable
-from gmijax.supervise.failures import last_line, may_be_anothers, signal_name
+from gmijax.supervise.failures import may_be_anothers, signal_name
 
 _TAIL_BYTES: Final = 1 << 16
 _TAIL_LINES: Final = 200
@@ -43,9 +43,15 @@ class Failure(NamedTuple):
     is_gpu_fault: bool = False
 
 
-def failure_of(exit_code: int, log: Path) -> Failure:
-    """Of a command that has ended with an exit code; negative for the signal that ended it."""
-    lines = _last_lines(log)
+def failure_of(exit_code: int, log: Path, begins: int = 0) -> Failure:
+    """Why a command has failed.
+
+    Args:
+      exit_code: negative for the signal that ended it.
+      log: what it printed.
+      begins: byte of the log where that begins.
+    """
+    lines = _last_lines(log, begins)
     how = f"exit code {exit_code}" if exit_code >= 0 else f"ended by {signal_name(-exit_code)}"
     for pattern in (_OUT_OF_MEMORY, _GPU_FAULT):
         found = next((line for line in reversed(lines) if pattern.search(line)), None)
@@ -53,15 +59,16 @@ def failure_of(exit_code: int, log: Path) -> Failure:
             text = f"{how}: {found.strip()[:_LONGEST]}"
             is_memory = pattern is _OUT_OF_MEMORY
             return Failure(text, is_memory, not is_memory)
-    last = last_line(log)
+    said = (line.strip() for line in reversed(lines))
+    last = next(filter(None, said), "")[:_LONGEST]
     text = f"{how}: {last}" if last else how
     return Failure(text, is_gpu_fault=may_be_anothers(text))
 
 
-def _last_lines(log: Path) -> list[str]:
+def _last_lines(log: Path, begins: int) -> list[str]:
     try:
         with log.open("rb") as file:
-            file.seek(max(0, os.fstat(file.fileno()).st_size - _TAIL_BYTES))
+            file.seek(max(begins, os.fstat(file.fileno()).st_size - _TAIL_BYTES))
             text = file.read().decode(errors="replace")
     except OSError:
         return []

@@ -16,13 +16,14 @@ from gmijax.config.schema import from_dict, to_dict
 from gmijax.errors import ConfigError
 from gmijax.packs.command_job import (
     CommandJob,
+    absolute,
     jobs_of_file,
     require_programs,
     templates_of,
 )
 from gmijax.packs.command_kind import CommandKind, PackPaths
 from gmijax.packs.crowd import MOST_CLIENTS, Crowd
-from gmijax.packs.progress import own_family
+from gmijax.packs.progress import own_patterns
 from gmijax.packs.template import require_names
 from gmijax.runs.folder import RUNS, RunPaths, given_run, read_json
 from gmijax.supervise.run_gmis import StopSignals
@@ -74,7 +75,7 @@ class PackWork(Work[CommandJob]):
     def paths_shown(self, number: int) -> Path:
         """The folder of a job, where it is not made yet."""
         root = given_run(*self.folder) or RUNS / f"{self.name}-DATE"
-        return self.paths(root).job(number).root
+        return self.paths(root).run_dir(number)
 
     def sites(self, hosts: Sequence[Host]) -> list[Site]:
         """See `Work`."""
@@ -113,7 +114,10 @@ class PackWork(Work[CommandJob]):
 
     def kind(self, paths: SweepPaths, sites: Sequence[Site]) -> Kind[CommandJob]:
         """See `Work`."""
-        cores = [len(site.machine.cpu_cores) for site in sites]
+        cores = [
+            len(site.machine.cpu_cores) // max(1, len({one.gpu for one in site.plan.slices}))
+            for site in sites
+        ]
         most = [max(1, len(site.plan.slices)) for site in sites]
 
         def at_once(place: Place) -> int:
@@ -159,7 +163,8 @@ class PackWork(Work[CommandJob]):
 
     def identity(self) -> dict[str, Any]:
         """See `Work`."""
-        return {"commands": [list(job.command) for job in self.jobs], **self.grid_identity()}
+        commands = list(dict.fromkeys(job.command for job in self.jobs))
+        return {"commands": [list(command) for command in commands], **self.grid_identity()}
 
 
 def pack_of(
@@ -181,7 +186,13 @@ def pack_of(
     Raises:
       ConfigError: names and placeholders do not fit, or there is no command.
     """
-    own_family(settings.rate, settings.steps, settings.metric)
+    own_patterns(settings.rate, settings.steps, settings.metric)
+    try:
+        shlex.split(settings.resume or "")
+    except ValueError as error:
+        raise ConfigError(f"pack.resume={settings.resume}: {error}") from None
+    if command:
+        command = [absolute(command[0]), *command[1:]]
 
     def make_job(number: int, chosen: Mapping[str, str]) -> CommandJob:
         return CommandJob(number, dict(chosen), tuple(command), settings.total_steps)

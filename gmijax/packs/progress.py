@@ -11,12 +11,12 @@ import math
 import re
 import time
 from collections import deque
-from collections.abc import Callable, Sequence
-from typing import Any, Final
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, Final, NamedTuple
 
 from gmijax.errors import ConfigError
 from gmijax.packs.output import OutputReader
-from gmijax.packs.trainers import FAMILIES, Family, Report
+from gmijax.packs.trainers import FAMILIES, Family, Report, report_of
 
 METRIC: Final = "metric"
 """Key of what jobs are compared by, in lines of metrics."""
@@ -25,18 +25,33 @@ _REPORTS: Final = 5
 """A rate is that over so many reports: the first update of a trainer can take 15 times longer."""
 
 
-def own_family(rate: str | None, steps: str | None, metric: str | None) -> Family | None:
-    """The family of a user's regular expressions (`pack.rate` and so on); None without any.
+class OwnPatterns(NamedTuple):
+    """Regular expressions of the user, each with one group, by what they find.
+
+    Attributes:
+      patterns: by the name of a field of `Report`.
+    """
+
+    patterns: Mapping[str, re.Pattern[str]]
+
+    def read(self, line: str) -> Report | None:
+        """What a line says; None: nothing."""
+        found = {key: pattern.search(line) for key, pattern in self.patterns.items()}
+        return report_of({key: match[1] for key, match in found.items() if match})
+
+
+def own_patterns(rate: str | None, steps: str | None, metric: str | None) -> OwnPatterns | None:
+    """The user's regular expressions (`pack.rate` and so on); None without any.
 
     Raises:
       ConfigError: one cannot be compiled, or has not one group.
     """
     given = {"rate": rate, "steps": steps, "metric": metric}
-    patterns = [_own_pattern(key, text) for key, text in given.items() if text is not None]
-    return Family("pack.rate, pack.steps, pack.metric", tuple(patterns)) if patterns else None
+    found = {key: _compiled(key, text) for key, text in given.items() if text is not None}
+    return OwnPatterns(found) if found else None
 
 
-def _own_pattern(key: str, text: str) -> re.Pattern[str]:
+def _compiled(key: str, text: str) -> re.Pattern[str]:
     try:
         pattern = re.compile(text)
     except re.error as error:
@@ -45,10 +60,7 @@ def _own_pattern(key: str, text: str) -> re.Pattern[str]:
         raise ConfigError(
             f"pack.{key}={text}: has {pattern.groups} groups; expected one, around the number"
         )
-    # The group gets the name by which reports know it, wherever it stands.
-    start = next(m.start() for m in re.finditer(r"(?<!\\)\((?!\?(?!P<))", text))
-    rest = re.sub(r"^\(\?P<\w+>", "(", text[start:])
-    return re.compile(f"{text[:start]}(?P<{key}>{rest[1:]}")
+    return pattern
 
 
 class ProgressReader:
@@ -67,7 +79,7 @@ class ProgressReader:
     def __init__(
         self,
         output: OutputReader,
-        own: Family | None,
+        own: OwnPatterns | None,
         started_s: float,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
@@ -88,16 +100,33 @@ class ProgressReader:
         return [line for line in taken if line is not None]
 
     def _reports(self, text: str) -> Sequence[Report]:
-        if self._own is not None and (own := self._own.read(text)) is not None:
-            return (own,)
-        if self.family is not None:
-            found = self.family.read(text)
-            return () if found is None else (found,)
-        return self._choose(text)
+        reports = self._of_family(text)
+        own = None if self._own is None else self._own.read(text)
+        if own is None:
+            return reports
+        # What the user has named wins; the rest of the line counts too.
+        other = reports[-1] if reports else Report()
+        both = (
+            mine if mine is not None else theirs for mine, theirs in zip(own, other, strict=True)
+        )
+        return (*reports[:-1], Report(*both))
+
+    def _of_family(self, text: str) -> Sequence[Report]:
+        if self.family is None:
+            return self._choose(text)
+        if self.family.is_weak and (reports := self._choose(text)):
+            self._steps, self._total = _Steps(), None
+            return reports
+        found = self.family.read(text)
+        return () if found is None else (found,)
 
     def _choose(self, text: str) -> Sequence[Report]:
         """Counts which families know a line; the first with two hits is taken, and its lines."""
-        hits = [family for family in FAMILIES if family.read(text) is not None]
+        hits = [
+            family
+            for family in FAMILIES
+            if family is not self.family and family.read(text) is not None
+        ]
         if not hits:
             return ()
         self._early.append(text)
@@ -114,9 +143,11 @@ class ProgressReader:
     def _take(self, report: Report, now_s: float) -> dict[str, Any] | None:
         if report.metric is not None and math.isfinite(report.metric):
             self._metric = report.metric
-        self._total = report.total or self._total
-        family = self._own if self.family is None else self.family
-        is_average = family is not None and family.is_average
+        if report.total is not None and math.isfinite(report.total):
+            self._total = report.total
+        is_average = self.family is not None and self.family.is_average
+        if any(math.isinf(x) or math.isnan(x) for x in (report.steps or 0, report.rate or 0)):
+            return None
         if report.steps is not None:
             self._steps.count(report.steps, now_s)
         elif report.rate is not None and not self._steps.are_counted:

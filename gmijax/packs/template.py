@@ -31,11 +31,24 @@ def fill(arguments: Sequence[str], values: Mapping[str, str]) -> list[str]:
     Raises:
       KeyError: a placeholder has no value; `require_names` finds it before anything is started.
     """
+    return [_filled(text, values) for text in arguments]
+
+
+def _filled(text: str, values: Mapping[str, str]) -> str:
+    num_open = 0
 
     def value_of(match: re.Match[str]) -> str:
-        return values[match[1]] if match[1] else match[0][0]
+        nonlocal num_open
+        if match[1]:
+            return values[match[1]]
+        # Braces that close what no doubled ones have opened are those of JSON.
+        is_opening = match[0] == "{{"
+        if not is_opening and not num_open:
+            return match[0]
+        num_open += 1 if is_opening else -1
+        return match[0][0]
 
-    return [_PARTS.sub(value_of, text) for text in arguments]
+    return _PARTS.sub(value_of, text)
 
 
 def require_names(arguments: Sequence[str], names: Collection[str]) -> None:

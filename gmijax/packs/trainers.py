@@ -6,6 +6,8 @@ Each was tried on output of the named version, or written from the format string
 from __future__ import annotations
 
 import re
+from collections.abc import Mapping
+from contextlib import suppress
 from typing import Final, NamedTuple
 
 _NUMBER: Final = r"(-?(?:\d[\d.]*(?:e[+-]?\d+)?|nan|inf))"
@@ -34,23 +36,34 @@ class Family(NamedTuple):
       name: of the trainer.
       patterns: regular expressions with groups `steps`, `total`, `rate` and `metric`.
       is_average: whether the printed rate is that since the start, not that of the moment.
+      is_weak: whether programs that are no trainers print so too; another family that fits
+        later takes its place.
     """
 
     name: str
     patterns: tuple[re.Pattern[str], ...]
     is_average: bool = False
+    is_weak: bool = False
 
     def read(self, line: str) -> Report | None:
         """What a line says; None: nothing."""
         for pattern in self.patterns:
             if match := pattern.search(line):
-                found = {key: float(text) for key, text in match.groupdict().items() if text}
-                return Report(**found)
+                return report_of(match.groupdict())
         return None
 
 
-def _family(name: str, *patterns: str, is_average: bool = False) -> Family:
-    return Family(name, tuple(re.compile(pattern) for pattern in patterns), is_average)
+def report_of(found: Mapping[str, str | None]) -> Report | None:
+    """What texts say that should be numbers; None: nothing."""
+    numbers: dict[str, float] = {}
+    for key, text in found.items():
+        with suppress(ValueError):  # `12.5.` at the end of a sentence, or `n/a`.
+            numbers[key] = float((text or "").replace(",", "").rstrip("."))
+    return Report(**numbers) if numbers else None
+
+
+def _family(name: str, *patterns: str, is_average: bool = False, is_weak: bool = False) -> Family:
+    return Family(name, tuple(map(re.compile, patterns)), is_average, is_weak)
 
 
 FAMILIES: Final = (
@@ -92,6 +105,7 @@ FAMILIES: Final = (
     _family(
         "skrl (tqdm)",
         r"\s(?P<steps>\d+)/(?P<total>\d+) \[[\d:]+<[\d:?]+,\s*(?:(?P<rate>[\d.]+)it/s)?",
+        is_weak=True,
     ),
 )
 """The first that fits is taken, so the stricter ones come first."""

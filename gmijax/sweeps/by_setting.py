@@ -37,7 +37,7 @@ def middle_of(values: Values) -> Middle:
 
 def without_seed(overrides: Mapping[str, str]) -> dict[str, str]:
     """What makes the setting of a job."""
-    return {key: value for key, value in overrides.items() if key != "seed"}
+    return {key: value for key, value in overrides.items() if key.rpartition(".")[2] != "seed"}
 
 
 def grouped(

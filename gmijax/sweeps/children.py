@@ -14,6 +14,7 @@ from gmijax.clock import running_s
 from gmijax.errors import GmijaxError
 from gmijax.machine.processes import GuardPipe, members_of
 from gmijax.runs.folder import write_json
+from gmijax.runs.held import try_lock
 from gmijax.supervise.failures import last_line
 
 _STAY_S = 15.0
@@ -47,6 +48,7 @@ class Process(NamedTuple):
       is_client: whether the process itself uses its GPU, and starts nothing that has a share.
       memory_fraction: part of the GPU's memory that it may have then; None: not limited.
       stop_signal: asks it to save and end.
+      lock: a file that is locked while the process or one that it has started runs.
     """
 
     name: str
@@ -59,6 +61,7 @@ class Process(NamedTuple):
     is_client: bool = False
     memory_fraction: float | None = None
     stop_signal: int = signal.SIGTERM
+    lock: Path | None = None
 
 
 class Child:
@@ -74,10 +77,14 @@ class Child:
 
     def __init__(self, process: Process, variables: Mapping[str, str]) -> None:
         self._log, self._stop_signal = process.log, process.stop_signal
+        self._is_client, self._is_asked = process.is_client, False
         self._pipe = GuardPipe()
         self._ended_s: float | None = None
         lifeline = (self._pipe.read_end,) if process.has_lifeline else ()
+        held: tuple[int, ...] = ()
         try:
+            if process.lock is not None:
+                held = (_locked(process.lock, process.name),)
             if process.order is not None:
                 write_json(*process.order)
             with process.log.open("ab") as output:
@@ -88,7 +95,7 @@ class Child:
                     stdin=subprocess.DEVNULL,
                     stdout=output,
                     stderr=output,
-                    pass_fds=lifeline,
+                    pass_fds=(*lifeline, *held),
                     # Ctrl-C is for the scheduler, which asks its jobs.
                     start_new_session=True,
                 )
@@ -97,6 +104,8 @@ class Child:
             raise GmijaxError(f"{process.name}: cannot be started ({error.strerror})") from None
         finally:
             os.close(self._pipe.read_end)
+            for fd in held:  # The process has its own.
+                os.close(fd)
 
     @property
     def pid(self) -> int:
@@ -109,14 +118,23 @@ class Child:
         if code is None:
             return Seen(None)
         self._ended_s = self._ended_s or running_s()
-        if members_of(self.pid) and running_s() - self._ended_s < _STAY_S:
+        is_late = running_s() - self._ended_s >= _STAY_S
+        if members_of(self.pid) and (self._is_asked or not is_late):
             return Seen(None)
         return Seen(code, last_line(self._log))
 
     def ask_to_stop(self) -> None:
-        """Asks it to save and end."""
+        """Asks it to save and end.
+
+        A controller asks its GMIs. A command may be a shell, which does not pass a signal on: it
+        comes to all of its process group, as Ctrl-C does.
+        """
         with suppress(ProcessLookupError):
-            self._process.send_signal(self._stop_signal)
+            if not self._is_client:
+                self._process.send_signal(self._stop_signal)
+            else:
+                self._is_asked = True
+                os.killpg(self.pid, self._stop_signal)
 
     def kill(self) -> None:
         """Ends it now, and its process group; GMIs end with their controller."""
@@ -128,3 +146,15 @@ class Child:
         self.kill()
         self._pipe.close()
         self._process.wait()
+
+
+def _locked(path: Path, name: str) -> int:
+    """A descriptor of the file, which is locked by it.
+
+    Raises:
+      GmijaxError: a process of the job still runs.
+    """
+    fd = try_lock(path)
+    if fd is None:
+        raise GmijaxError(f"{name}: a process of an earlier command still runs ({path})")
+    return fd

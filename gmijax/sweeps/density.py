@@ -88,7 +88,7 @@ class Density:
         if self.is_settled or len(jobs) != self.target:
             self._window = None  # Some are still to be started, or too few are left.
             return None
-        if self._window is None or self._window.jobs != set(jobs):
+        if self._window is None or not self._window.goes_on(jobs):
             is_warm = all(seen.reports >= _WARM_REPORTS for seen in jobs.values())
             self._window = _Window(now_s, jobs) if is_warm else None
             return None
@@ -99,6 +99,14 @@ class Density:
         self._window = None
         self.measured[self.target] = found
         return self._next(found, before)
+
+    def assume(self, count: int, why: str) -> Decision:
+        """So many at once until rates are there."""
+        return self._go_to(min(count, self.most), why)
+
+    def forget(self) -> None:
+        """What was measured cannot be compared with what comes."""
+        self.measured, self._window, self.is_settled = {}, None, self.most == 1
 
     def ended_early(self) -> Decision | None:
         """A job has completed before so many at once could be measured: jobs are short."""
@@ -165,6 +173,12 @@ class _Window:
         self.jobs = set(jobs)
         self._latest = dict(jobs)
         self._points: dict[int, list[tuple[float, float]]] = {number: [] for number in jobs}
+
+    def goes_on(self, jobs: Mapping[int, Seen]) -> bool:
+        """Whether they are the same jobs, and none was started again."""
+        return self.jobs == set(jobs) and all(
+            seen.reports >= self._latest[number].reports for number, seen in jobs.items()
+        )
 
     def look(self, now_s: float, jobs: Mapping[int, Seen]) -> Measured | None:
         """The sum of rates; None: not enough was seen."""

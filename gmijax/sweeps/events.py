@@ -33,7 +33,7 @@ class JobEvents:
         self._stream: TextIO | None = stream
         self._name = name
         self._jobs, self._paths = jobs, paths
-        self._states = {job.number: job.progress.state for job in jobs}
+        self._states = {job.number: (job.progress.state, 0) for job in jobs}
         self._reported_s = 0.0
         self._reports: dict[int, int] = {}
         self._write(f"{name}_started", run_dir=str(paths.root), jobs=len(jobs))
@@ -43,9 +43,10 @@ class JobEvents:
         now_s = time.monotonic()
         is_due = now_s - self._reported_s >= _PROGRESS_S
         for job in self._jobs:
-            state, before = job.progress.state, self._states.get(job.number, "waiting")
-            self._states[job.number] = state
-            if state != before:
+            state, attempts = job.progress.state, job.progress.attempts
+            before = self._states.get(job.number, ("waiting", 0))
+            self._states[job.number] = state, attempts
+            if (state, attempts) != before:
                 self._changed(job, state)
             elif is_due and state == "running":
                 self._progress(job)
@@ -62,7 +63,8 @@ class JobEvents:
         progress = job.progress
         if state == "running":
             place = progress.place or None
-            self._write("job_started", job, overrides=dict(job.overrides), place=place)
+            more = {"attempt": progress.attempts, "note": progress.note}
+            self._write("job_started", job, overrides=dict(job.overrides), place=place, **more)
             return
         event = "job_ended" if state in _ENDS else "job_waits"
         error, log = progress.error, str(self._paths.log(job.number))

@@ -104,7 +104,8 @@ class LocalHost:
         self._children[self._num_started] = child
         if start.process.is_client:
             self._clients[self._num_started] = start.place.slices[0].gmi
-        return Started(self._num_started, self._compiled.holds(start.program))
+        has_programs = not start.program or self._compiled.holds(start.program)
+        return Started(self._num_started, has_programs)
 
     def look(self, child: int) -> Seen | None:
         """The newest that is known of a child, None before anything is."""
@@ -116,8 +117,9 @@ class LocalHost:
 
     def order(self, child: int, order: Order) -> None:
         """Calls a method of a child."""
-        if order == "kill" and self._backend is not None and child in self._clients:
-            # Killing a client that is busy can harm its neighbours.
+        # Killing a client that is busy can harm its neighbours.
+        is_killing = order == "kill" or (order == "close" and child in self._clients)
+        if is_killing and self._backend is not None and child in self._clients:
             for process in members_of(self._children[child].pid):
                 self._backend.terminate(self._clients[child], process.pid)
         getattr(self._children[child], order)()

@@ -94,11 +94,15 @@ class RemoteHost:
 
     def why_no_client(self, child: int) -> str | None:
         """See `LocalHost`."""
-        return self._do("why_no_client", child)
+        with suppress(NodeLost):
+            return self._do("why_no_client", child)
+        return None
 
     def load_of(self, device: str) -> GpuLoad | None:
         """See `LocalHost`."""
-        return self._do("load_of", device)
+        with suppress(NodeLost):
+            return self._do("load_of", device)
+        return None
 
     def shut(self) -> None:
         """See `LocalHost`."""

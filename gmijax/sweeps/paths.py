@@ -32,6 +32,10 @@ class SweepPaths(RunPaths):
         """The run folder of a job."""
         return RunPaths(self.root / f"{number:0{DIGITS}d}")
 
+    def run_dir(self, number: int) -> Path:
+        """The folder of a job for what it writes itself."""
+        return self.job(number).root
+
     def order(self, number: int) -> Path:
         """What the process of a job is told."""
         return self.root / "jobs" / f"{number:0{DIGITS}d}.json"

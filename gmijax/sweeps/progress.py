@@ -37,6 +37,7 @@ class Progress:
       earlier_steps_per_s: its mean rate then, where that is known.
       place: GPUs and places where it runs, in words.
       node: address of the node where it runs or ran last; None: this machine.
+      attempts: how often this command has started it.
       exit_code: of its process, once that has ended; negative for the signal that ended it.
       note: what is to be known of it, in one line, although it goes on.
       error: why it failed, in one line.
@@ -61,6 +62,7 @@ class Progress:
     earlier_steps_per_s: float | None = None
     place: str = ""
     node: str | None = None
+    attempts: int = 0
     exit_code: int | None = None
     note: str | None = None
     error: str | None = None
@@ -98,9 +100,11 @@ class Progress:
 
     def begin(self, place: str, node: str | None) -> None:
         """Its process was started there."""
-        self.state, self.place, self.node, self.error = "running", place, node, None
+        self.note, self.error = self.error, None  # Why it runs again, if it does.
+        self.state, self.place, self.node = "running", place, node
+        self.attempts += 1
         self.started_s, self.updated_s, self.ended_s = time.monotonic(), None, None
-        self.reports, self.reported_s, self.exit_code, self.note = 0, None, None, None
+        self.reports, self.reported_s, self.exit_code = 0, None, None
 
     def take(self, line: Mapping[str, Any], ranking: Ranking) -> None:
         """Takes in a line of metrics."""
@@ -121,7 +125,7 @@ class Progress:
 
     def read(self, run: RunPaths, ranking: Ranking) -> None:
         """Takes in all metrics that a run folder has."""
-        self.value, self.latest, self.curve = None, None, []
+        self.value, self.latest, self.curve, self.env_steps = None, None, [], 0
         self.is_full, self.episodes = True, None
         for line in read_metrics(run.metrics):
             self.take(line, ranking)

@@ -60,7 +60,7 @@ class Report:
     ) -> None:
         self._jobs, self._ranking, self._paths, self._started_s = jobs, ranking, paths, started_s
         self._described, self._folder = described, folder
-        self._states: list[State] = []
+        self._states: list[tuple[State, int]] = []
         self.data: dict[str, Any] = {}
 
     def begin(self) -> None:
@@ -86,7 +86,7 @@ class Report:
           FolderLost: the sweep's folder is no longer there.
         """
         self._folder.require()
-        states: list[State] = [job.progress.state for job in self._jobs]
+        states = [(job.progress.state, job.progress.attempts) for job in self._jobs]
         if states == self._states:
             return
         self._states = states
@@ -253,7 +253,7 @@ def _row(job: AnyJob, paths: SweepPaths, first_s: float) -> dict[str, Any]:
     return {
         "job": job.number,
         "overrides": dict(job.overrides),
-        "run_dir": str(paths.job(job.number).root),
+        "run_dir": str(paths.run_dir(job.number)),
         "state": progress.state,
         "node": progress.node,
         "value": progress.value,
@@ -264,7 +264,9 @@ def _row(job: AnyJob, paths: SweepPaths, first_s: float) -> dict[str, Any]:
         "start_s": None if start_s is None else round(start_s - first_s, 3),
         "first_update_s": None if not start_s or not update_s else round(update_s - start_s, 3),
         "wall_s": round(progress.wall_s, 3),
+        "attempts": progress.attempts,
         "exit_code": progress.exit_code,
+        "note": progress.note,
         "log": str(paths.log(job.number)),
         "error": progress.error,
     }

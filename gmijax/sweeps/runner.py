@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, closing, contextmanager
@@ -204,7 +205,7 @@ def _beginning(work: Work[J], paths: SweepPaths) -> tuple[list[J], Study[J]]:
     Raises:
       ConfigError: the folder holds others, or a package is missing.
     """
-    settings, wanted = work.settings, work.identity()
+    settings, wanted = work.settings, json.loads(json.dumps(work.identity()))
     if paths.request.exists() and read_json(paths.request) != wanted:
         raise ConfigError(
             f"run.dir={paths.root}: holds another {work.name}; give the same {work.sameness}, or "

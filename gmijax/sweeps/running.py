@@ -27,6 +27,7 @@ class Outcome(NamedTuple):
         own goes on by itself.
       may_be_anothers: whether a neighbour on its GPU may have caused it.
       is_out_of_memory: whether it found no memory on its GPU.
+      is_free: whether it is to be tried again without being counted.
     """
 
     is_interrupted: bool = False
@@ -34,6 +35,7 @@ class Outcome(NamedTuple):
     is_fault: bool = False
     may_be_anothers: bool = False
     is_out_of_memory: bool = False
+    is_free: bool = False
 
 
 @dataclass
@@ -51,7 +53,8 @@ class Running(Generic[J]):
       is_pruned: whether it was asked to end because others are better.
       is_retracted: whether that was because fewer are to run at once.
       hung: why it was ended although nobody wanted that; None: it was not.
-      is_killed: whether it was ended by force, as the whole sweep is.
+      was_killed: whether it was ended by force.
+      is_killed: whether all are, because the sweep ends.
     """
 
     jobs: tuple[J, ...]
@@ -64,6 +67,7 @@ class Running(Generic[J]):
     is_pruned: bool = False
     is_retracted: bool = False
     hung: str | None = None
+    was_killed: bool = False
     is_killed: bool = False
 
     @property
@@ -80,10 +84,16 @@ class Running(Generic[J]):
         self.kill_at_s = self.kill_at_s or running_s() + limit_s
         self.host.order(self.child, "ask_to_stop")
 
+    def kill(self) -> None:
+        """Ends it; once."""
+        if not self.was_killed:
+            self.was_killed = True
+            self.host.order(self.child, "kill")
+
     def kill_if_late(self) -> None:
         """Ends it if it was asked and has not ended in time."""
         if self.kill_at_s is not None and running_s() > self.kill_at_s:
-            self.host.order(self.child, "kill")
+            self.kill()
 
     def is_over(self) -> bool:
         """Whether it has ended, or its machine is gone."""

@@ -144,9 +144,9 @@ class Scheduler(Generic[J]):
 
     def _start(self, jobs: tuple[J, ...], place: Place) -> None:
         host, first = self._hosts[place.site], jobs[0]
+        start = self._kind.start(jobs, place)
         for job in jobs:
             job.progress.read(self._paths.job(job.number), self._ranking)
-        start = self._kind.start(jobs, place)
         started = host.start(Start(place, start.process, start.program))
         if not started.has_programs:
             self._compiling[place.site, first.program] = first.number
@@ -164,7 +164,7 @@ class Scheduler(Generic[J]):
                     job.progress.report(line, self._ranking)
                     self._nobody_waits_for(running, has_compiled=True)
             if running_s() > running.started_s + self._kind.longest_compile_s:
-                self._nobody_waits_for(running, has_compiled=True)
+                self._nobody_waits_for(running, has_compiled=False)
             if is_over:
                 self._finish(running)
             elif running.is_asked:
@@ -174,7 +174,7 @@ class Scheduler(Generic[J]):
                 self._order_stop(running)
             elif (hung := self._kind.why_hung(running)) is not None:
                 running.hung = hung
-                running.host.order(running.child, "kill")
+                running.kill()
         self._drop_lost()
 
     def _retract(self) -> None:
@@ -247,6 +247,8 @@ class Scheduler(Generic[J]):
         if end.may_be_anothers and is_shared and running.host.lost is None:
             self._alone.add(job.number)
             return f"again, alone on its GPU, after {error}"
+        if end.is_free:
+            return f"again, from its beginning, after {error}"
         if end.is_fault:
             self._faults[job.number] += 1
             # It may be what ends them.
@@ -283,7 +285,7 @@ class Scheduler(Generic[J]):
         left = list(self._running.values())
         for running in left:
             running.is_killed = True
-            running.host.order(running.child, "kill")
+            running.kill()
         deadline_s = running_s() + 2 * _KILLED_S
         for running in left:
             while not running.is_over() and running_s() < deadline_s:

@@ -84,7 +84,8 @@ class TrainingKind:
             return self._failed(running, job, own.error) if own.error else Outcome()
         if seen.exit_code == 0 and not are_several:
             return Outcome()
-        if running.is_killed or (seen.exit_code == EXIT_INTERRUPTED and running.is_asked):
+        was_asked = seen.exit_code == EXIT_INTERRUPTED and running.is_asked
+        if running.is_killed or was_asked or (running.was_killed and running.is_asked):
             return Outcome(is_interrupted=True)
         if seen.exit_code is None:
             return Outcome(error=running.host.lost, is_fault=True)

@@ -35,7 +35,7 @@ class SweepView:
 
     def __init__(self, console: Console, jobs: Sequence[AnyJob], ranking: Ranking) -> None:
         self._console, self._jobs, self._ranking = console, jobs, ranking
-        self._states: dict[int, str] = {}
+        self._states: dict[int, tuple[str, int]] = {}
         self._display = LiveDisplay(console)
 
     def __enter__(self) -> Self:
@@ -67,15 +67,17 @@ class SweepView:
     def _print_changes(self) -> None:
         """States of jobs that are new; those that the table shows only if one has failed."""
         for job in self._jobs:
-            before, now = self._states.get(job.number, "waiting"), job.progress.state
-            self._states[job.number] = now
-            if before != now and (now == "failed" or not self._display.has_panel):
+            before = self._states.get(job.number, ("waiting", 0))
+            now = job.progress.state
+            self._states[job.number] = now, job.progress.attempts
+            is_new = self._states[job.number] != before
+            if is_new and (now == "failed" or not self._display.has_panel):
                 self._console.print(self._change(job, job.progress))
 
     def _change(self, job: AnyJob, progress: Progress) -> str:
         what = f"{' '.join(filter(None, ('job', str(job.number), job.label)))}: {progress.state}"
         if progress.state == "running":
-            return f"{what} on {progress.place}"
+            return f"{what} on {progress.place}{f' ({progress.note})' if progress.note else ''}"
         if progress.error:
             return f"{what}: {progress.error}"
         value = shown(progress.value, progress.is_full, progress.episodes)

@@ -91,13 +91,13 @@ def test_one_fails_one_hangs_and_a_killed_pack_goes_on(home: Path, python: Path)
     def is_through() -> bool:
         if first.poll() is not None:
             return True
-        return (folder / "000" / "summary.json").exists()
+        return (folder / "000" / "pack" / "summary.json").exists()
 
     wait_until(is_through, 120.0, "a job is through")
     first.send_signal(signal.SIGKILL)
     first.wait()
     wait_until(lambda: not running_in(folder), 60.0, "the jobs of a killed pack have ended")
-    whole = (folder / "000" / "summary.json").stat().st_mtime_ns
+    whole = (folder / "000" / "pack" / "summary.json").stat().st_mtime_ns
 
     done = train(*line, cwd=home, command="pack")
     assert done.returncode == 1, done.stderr
@@ -107,7 +107,9 @@ def test_one_fails_one_hangs_and_a_killed_pack_goes_on(home: Path, python: Path)
     assert [job["state"] for job in found["jobs"]] == ["completed"] * 4 + ["failed"] * 4
     assert [job["exit_code"] for job in found["jobs"]] == [0] * 4 + [-9, -9, 1, 1]
     assert found["jobs"][6]["error"] == "exit code 1: ValueError: no such seed"
-    assert (folder / "000" / "summary.json").stat().st_mtime_ns == whole  # It did not run again.
+    assert (
+        folder / "000" / "pack" / "summary.json"
+    ).stat().st_mtime_ns == whole  # It did not run again.
     assert (folder / "000" / "starts").read_text() == "first\n"
     # What the kill has ended went on by its own words.
     starts = [(folder / f"{n:03d}" / "starts").read_text().split() for n in range(1, 4)]
@@ -136,7 +138,7 @@ def test_sigterm_asks_the_jobs_and_waits_for_them(home: Path) -> None:
     folder = home / "all"
     words = ("pack.copies=2", "pack.jobs_per_gpu=2", "pack.stop_signal=USR1", "run.dir=all")
     job = start(*words, "--", sys.executable, "trainer.py", "{run_dir}", cwd=home, command="pack")
-    logs = [folder / f"{n:03d}" / "output.log" for n in range(2)]
+    logs = [folder / f"{n:03d}" / "pack" / "output.log" for n in range(2)]
     wait_until(
         lambda: all(log.exists() and "runs" in log.read_text() for log in logs), 60.0, "both run"
     )

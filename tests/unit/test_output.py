@@ -12,13 +12,15 @@ from typing import Any
 import pytest
 from rich.console import Console
 from rich.text import Text
-from supervision import CHECKOUT
+from supervision import CHECKOUT, machine
 
-from gmijax.control.console import ConsoleProgress, doing, open_console
+from gmijax.config import PlanConfig, ReduceConfig
+from gmijax.control.console import ConsoleProgress, announce, doing, nearby, open_console
 from gmijax.control.display import LiveDisplay
 from gmijax.control.summary import train_outcome
 from gmijax.deploy import playing
 from gmijax.errors import printable
+from gmijax.partition.planner import make_plan
 from gmijax.runs.folder import RunPaths
 from gmijax.supervise.failures import last_line
 from gmijax.supervise.watched_gmi import GmiStatus
@@ -151,6 +153,55 @@ def test_the_panel_of_a_job_shows_what_a_gmi_says():
     shown = ConsoleProgress(Console(file=said), list, 10)
     Console(file=said).print(shown._panel([GmiStatus(0, "[/odd]", 3, None, None)]))
     assert "GMI 0: [/odd], iteration 3" in said.getvalue()
+
+
+def test_while_it_compiles_a_job_says_why_and_for_how_long():
+    shown = ConsoleProgress(Console(file=io.StringIO()), list, 10)
+    said = io.StringIO()
+    Console(file=said, width=120).print(shown._panel([GmiStatus(0, "compiling", 0, None, None)]))
+    assert "compiling: once for each task and size, usually 1 to 3 minutes  0:00:0" in (
+        said.getvalue()
+    )
+    assert "iteration" not in said.getvalue()
+    plain = io.StringIO()
+    with ConsoleProgress(Console(file=plain, width=200), list, 10) as progress:
+        for state in ("starting", "compiling", "compiling"):
+            progress.update((GmiStatus(0, state, 0, None, None),))
+    assert plain.getvalue().splitlines() == [
+        "[GMI 0 starting]",
+        "compiling: once for each task and size, usually 1 to 3 minutes  [GMI 0 compiling]",
+    ]
+
+
+@pytest.mark.parametrize("gmis", [1, 2])
+def test_one_process_needs_no_words_of_several(gmis: int, tmp_path: Path) -> None:
+    here = machine(0)
+    plan = make_plan(PlanConfig(gmis_per_gpu=gmis), ReduceConfig(), 64, here)
+    said = io.StringIO()
+    announce(Console(file=said, width=300), RunPaths(tmp_path), plan, "template x", ["note"])
+    text = said.getvalue()
+    assert ("one process on the CPU, 64 environments" in text) == (gmis == 1)
+    for word in ("template", "strategy", "layout", "virtual"):
+        assert (word in text) == (gmis > 1)
+    assert "  note" in text
+
+
+def test_a_run_ends_with_what_to_do_next(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    run = RunPaths(tmp_path / "runs" / "a b")
+    rates = dict.fromkeys(("step_per_s_sim", "step_per_s_inference", "step_per_s_train"))
+    summary = {
+        **{"status": "completed", "env_steps": 10, "wall_s": 1.0, "restarts": [], "eval": None},
+        **{"final_return": 58.8, "checkpoint": str(run.checkpoint(10)), "overflow_steps": {}},
+        **rates,
+    }
+    told = train_outcome(summary, run)
+    assert "final return 58.80 (mean of the latest episodes, with exploration noise)" in told
+    assert "checkpoint: runs/a b/checkpoints/000000000010\n" in told
+    assert "next: gmijax play run.dir='runs/a b'" in told
+    assert "next" not in train_outcome({**summary, "checkpoint": None}, run)
+    monkeypatch.chdir("/")
+    assert nearby(run.root) == str(run.root).removeprefix("/")
 
 
 @pytest.mark.parametrize(

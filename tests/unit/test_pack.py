@@ -75,9 +75,12 @@ def test_copies_and_a_file_of_commands(tmp_path: Path) -> None:
 def test_keys_that_hold_text_need_no_quotes_of_hydra() -> None:
     resume = "--agent.resume True --agent.load-run .*_pack{job}$"
     words = [f"pack.resume={resume}", "pack.env.NAME=job-{job}", r"pack.metric=^R: (-?[\d.]+), x$"]
-    settings = build_pack([*words, "pack.copies=2"], ["true"]).ranking
+    more = ("pack.cwd=${HOME}", r'pack.steps="step": (\d+)', "pack.env.NONE=null")
+    settings = build_pack([*words, *more, "pack.copies=2"], ["true"]).ranking
     assert settings.resume == resume
-    assert settings.env == {"NAME": "job-{job}"}
+    assert settings.cwd == "${HOME}"
+    assert settings.steps == r'"step": (\d+)'
+    assert settings.env == {"NAME": "job-{job}", "NONE": None}
     assert settings.metric == r"^R: (-?[\d.]+), x$"
 
 
@@ -87,6 +90,7 @@ def test_keys_that_hold_text_need_no_quotes_of_hydra() -> None:
         ((), (), r"no command: expected gmijax pack"),
         (("seed=0,1",), ("true",), r"seed=: the command has no \{seed\}"),
         ((), ("true", "{seed}"), r"\{seed\}: no such placeholder"),
+        (("pack.resume=--x 'a",), ("true",), "pack.resume=--x 'a: No closing quotation"),
         (("seed=0,1",), ("true", "{sed}", "{seed}"), r"\{sed\}: no such placeholder.*seed"),
         (("job=0,1",), ("true", "{job}"), r"job=: every job has \{job\} of its own"),
         (("seed=0,0",), COMMAND, "a value that comes twice"),
@@ -112,6 +116,8 @@ def test_bad_input_is_refused(words: Sequence[str], command: Sequence[str], said
     ("argv", "said"),
     [
         (("--", "no-such-program"), "no-such-program: no such program"),
+        (("py=true,no-such", "--", "{py}"), "no-such: no such program"),
+        (("pack.cwd=/nothing", "--", "true"), "pack.cwd=/nothing: no such folder"),
         (("pack.gpus=3", "--", "true"), "pack.gpus=3"),
         (("pack.backend=x", "--", "true"), "pack.backend=x: expected one of auto, mps, share"),
         (("pack.stall_s=0", "--", "true"), "pack.stall_s=0"),
@@ -189,6 +195,9 @@ def test_a_job_that_is_started_again_gets_the_words_to_resume(
     _, place = place_of()
     job = CommandJob(3, {}, ("true", "{job}"))
     first = kind.start((job,), place).process
+    before = kind.start((job,), place).process
+    assert before.arguments == ("true", "003")  # It has not reported: nothing can be saved.
+    (tmp_path / "003" / "pack" / "metrics.jsonl").write_text('{"env_steps": 1}\n')
     assert first.arguments == ("true", "003")
     assert first.cwd == str(tmp_path / "003")
     assert first.stop_signal == signal.SIGINT
@@ -197,7 +206,8 @@ def test_a_job_that_is_started_again_gets_the_words_to_resume(
     assert "MKL_NUM_THREADS" not in first.variables  # The user has said it.
     again = kind.start((job,), place).process
     assert again.arguments == ("true", "003", "--resume", f"{tmp_path}/003/last")
-    assert (tmp_path / "003" / "output.log").read_text().splitlines() == [
+    assert (tmp_path / "003" / "pack" / "output.log").read_text().splitlines() == [
+        "$ true 003",
         "$ true 003",
         f"$ true 003 --resume {tmp_path}/003/last",
     ]
@@ -323,6 +333,37 @@ def test_short_jobs_are_doubled_without_a_measurement(clock: Clock) -> None:
     # The second that completed had begun beside one other; the first had been alone.
     assert [change["at_once"] for change in packed.crowd.decisions][:2] == [2, 4]
     assert packed.crowd.decisions[0]["why"] == "jobs end before a rate is measured"
+
+
+def test_a_job_alone_on_its_gpu_may_have_all_of_it(kind: CommandKind) -> None:
+    work, place = place_of()
+    job = CommandJob(0, {}, ("true",))
+    assert kind.start((job,), place).process.memory_fraction == 0.5
+    with closing(LocalHost(GPU)) as host:
+        alone = Places(work.sites([host])).take(1, alone=True)
+    assert alone is not None
+    process = kind.start((job,), alone).process
+    assert process.memory_fraction is None
+    assert process.variables["OMP_NUM_THREADS"] == "8"
+
+
+def test_a_rate_that_comes_late_is_measured(clock: Clock) -> None:
+    packed = Packed(clock, [0.0], memory_mib=100.0)
+    packed.go_on(300)
+    assert len(packed.running) == 2
+    packed.rates = [1000.0, 2000.0, 3000.0, 4000.0]
+    packed.go_on(120)
+    assert len(packed.running) >= 4
+
+
+def test_a_job_that_starts_again_does_not_spoil_the_measurement(clock: Clock) -> None:
+    packed = Packed(clock, [1000.0, 1900.0, 2800.0, 3700.0], memory_mib=100.0)
+    packed.go_on(30)
+    progress = packed.running[-1].jobs[0].progress
+    progress.env_steps = progress.reports = 0
+    packed.go_on(200)
+    assert all(rate > 0 for one in packed.crowd.decisions for rate in one["rate_per_s"].values())
+    assert len(packed.running) >= 4
 
 
 def test_what_finds_no_memory_runs_again_beside_fewer(clock: Clock) -> None:

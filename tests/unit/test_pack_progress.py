@@ -8,7 +8,7 @@ import pytest
 
 from gmijax.errors import ConfigError
 from gmijax.packs.output import LONGEST_LINE, OutputReader
-from gmijax.packs.progress import ProgressReader, own_family
+from gmijax.packs.progress import ProgressReader, own_patterns
 from gmijax.packs.trainers import FAMILIES, Family
 
 SAMPLES = {
@@ -88,7 +88,7 @@ def test_rates_are_steps_by_the_own_clock(family: Family, log: Path):
 
 def test_rates_alone_are_added_up(log: Path):
     clock = Clock()
-    reader = reader_of(log, clock, own_family(r"speed (\d+)", None, None))
+    reader = reader_of(log, clock, own_patterns(r"speed (\d+)", None, None))
     for number in range(4):
         clock.now_s = 2.0 * number
         append(log, "speed 100")
@@ -111,7 +111,7 @@ def test_a_mean_since_the_start_is_not_taken_for_the_rate_of_the_moment(log: Pat
 
 def test_steps_that_fall_are_those_of_another_run_of_the_same_job(log: Path):
     clock = Clock()
-    reader = reader_of(log, clock, own_family(None, r"steps=(\d+)", None))
+    reader = reader_of(log, clock, own_patterns(None, r"steps=(\d+)", None))
     found = []
     for steps in (100, 200, 50, 150):
         clock.now_s += 1
@@ -122,13 +122,13 @@ def test_steps_that_fall_are_those_of_another_run_of_the_same_job(log: Path):
 
 def test_a_metric_that_is_no_number_is_left_out(log: Path):
     clock = Clock()
-    reader = reader_of(log, clock, own_family(None, r"steps=(\d+)", r"reward=(\S+)"))
+    reader = reader_of(log, clock, own_patterns(None, r"steps=(\d+)", r"reward=(\S+)"))
     append(log, "reward=nan", "steps=1")
     assert "metric" not in reader.new()[-1]
 
 
-def test_own_expressions_are_read_beside_a_known_family(log: Path):
-    reader = reader_of(log, Clock(), own_family(None, None, r"success (\d\.\d)"))
+def test_own_expressions_are_read_beside_a_known_patterns(log: Path):
+    reader = reader_of(log, Clock(), own_patterns(None, None, r"success (\d\.\d)"))
     append(log, "success 0.5", "SPS: 100", "SPS: 100")
     assert reader.new()[-1]["metric"] == 0.5
 
@@ -143,14 +143,14 @@ def test_own_expressions_are_read_beside_a_known_family(log: Path):
 )
 def test_an_expression_needs_one_group(text: str, message: str):
     with pytest.raises(ConfigError, match=f"pack.rate=.*{message}"):
-        own_family(text, None, None)
+        own_patterns(text, None, None)
 
 
 @pytest.mark.parametrize(
     "text", [r"\(fps\) (\d+)", r"(?:speed|fps) (\d+)", r"fps (?P<x>\d+)", r"(?i)FPS (\d+)"]
 )
 def test_the_group_is_found_wherever_it_stands(text: str):
-    family = own_family(text, None, None)
+    family = own_patterns(text, None, None)
     assert family is not None
     report = family.read("(fps) 12") or family.read("fps 12")
     assert report is not None
@@ -179,3 +179,32 @@ def test_a_log_that_was_cut_is_read_from_its_start(log: Path):
     assert reader.new() == ["one", "two"]
     log.write_text("new\n")
     assert reader.new() == ["new"]
+
+
+def test_a_text_that_is_no_number_says_nothing(log: Path) -> None:
+    own = own_patterns(None, r"step (\S+)", r"reward: (-?[\d.]+)")
+    reader = reader_of(log, Clock(), own)
+    log.write_text("step n/a\nstep nan\nstep 1,000 reward: ...\nstep 2000 reward: 3.5.\n")
+    lines = reader.new()
+    assert [line["env_steps"] for line in lines] == [1000, 2000]
+    assert lines[-1]["metric"] == 3.5
+
+
+def test_all_own_expressions_and_the_family_read_the_same_line(log: Path) -> None:
+    reader = reader_of(log, Clock(), own_patterns(None, r"step (\d+)", r"reward: (\S+)"))
+    log.write_text("step 100 reward: 3.2\n")
+    assert reader.new()[0]["metric"] == 3.2
+    reader = reader_of(log, Clock(), own_patterns(None, None, r"episodic_return=(\S+)"))
+    log.write_text("global_step=64, episodic_return=1.5\nglobal_step=128, episodic_return=2.5\n")
+    assert [(one["env_steps"], one["metric"]) for one in reader.new()][-1] == (128, 2.5)
+
+
+def test_a_bar_of_something_else_does_not_hide_a_trainer(log: Path) -> None:
+    reader = reader_of(log, Clock())
+    bar = "load: 3/10 [00:00<00:01, 5.12it/s]\n"
+    log.write_text(bar * 3)
+    reader.new()
+    table = "|    total_timesteps | {} |\n"
+    log.write_text(bar * 3 + "".join(table.format(512 * k) for k in range(1, 4)))
+    steps = [line["env_steps"] for line in reader.new()]
+    assert steps[-1] == 3 * 512

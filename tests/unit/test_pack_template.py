@@ -48,3 +48,16 @@ def test_names_and_placeholders_must_fit(arguments: list[str], names: list[str],
 
 def test_own_names_need_not_be_used():
     require_names(["train.py", "--seed", "{seed}"], ["seed"])
+
+
+@pytest.mark.parametrize(
+    ("text", "filled"),
+    [
+        ('{"a": {"b": 1}}', '{"a": {"b": 1}}'),
+        ('{{"seed": {seed}}}', '{"seed": 7}'),
+        ("{{seed}}", "{seed}"),
+        ("{}}", "{}}"),
+    ],
+)
+def test_braces_of_json_stay(text: str, filled: str) -> None:
+    assert fill([text], {"seed": "7"}) == [filled]
