@@ -35,7 +35,8 @@ CURVE_POINTS = 60
 
 def main() -> int:
     """Runs what the command line asks for; returns 1 if a run failed, else 0."""
-    parser = argparse.ArgumentParser(description=__doc__)
+    suites = f"suites: {', '.join(sorted(SUITES))}"
+    parser = argparse.ArgumentParser(description=__doc__, epilog=suites)
     parser.add_argument("suites", nargs="+", choices=sorted(SUITES), metavar="SUITE")
     parser.add_argument(
         "--only", default="", metavar="TEXT", help="cases with TEXT in their names"

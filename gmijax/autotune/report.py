@@ -91,7 +91,7 @@ def verdict(outcome: Outcome, grid: Grid, num_gpus: int, split: Split | None = N
 def table(outcome: Outcome, isolated: Results) -> Table:
     """One row per point, best marked; with the isolated profile beside it where there is one."""
     shown = Table(title="environment steps per second")
-    for heading in ("GMIs", "envs", "MJX", "one GMI", "whole job", "MiB", "Sat"):
+    for heading in ("GMIs", "envs", "MJX", "one GMI", "whole job", "MiB", "saturation"):
         shown.add_column(heading, justify="right", overflow="fold")
     has_trainers = any(one.point.trainers for one in outcome.visited)
     if has_trainers:
@@ -99,7 +99,7 @@ def table(outcome: Outcome, isolated: Results) -> Table:
             shown.add_column(heading, justify="right", overflow="fold")
     if isolated:
         shown.add_column("corun/isolated", justify="right")
-    shown.add_column("")
+    shown.add_column("choice")
     for one in sorted(outcome.visited, key=lambda one: one.point):
         point, result = one.point, one.result
         cells = [point.gmis, str(point.num_envs), point.impl]
@@ -184,7 +184,11 @@ def draw(outcome: Outcome, picture: Path, title: str) -> None:
         left.plot(sizes, [gmis * one.env_steps_per_s for _, one in ran], **style)
         right.plot(sizes, [one.memory_mib for _, one in ran], **style)
     for axes, what in ((left, "env steps/s of one GPU"), (right, "peak memory of a GMI, MiB")):
-        axes.set(xlabel="environments per GMI", ylabel=what, xscale="log", ylim=(0, None))
+        axes.set(xlabel="environments per GMI", ylabel=what, xscale="log")
+        axes.set_ylim(0, 1.05 * axes.get_ylim()[1])
+        ticks = sorted({size for line in axes.lines for size in line.get_xdata()})
+        axes.set_xticks(ticks, labels=[f"{size:,.0f}" for size in ticks])
+        axes.minorticks_off()
         axes.grid(alpha=0.3)
     left.legend(title="GMIs per GPU", fontsize="small")
     figure.suptitle(title, parse_math=False)

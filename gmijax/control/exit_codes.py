@@ -22,6 +22,9 @@ EXIT_INTERRUPTED: Final = 130
 _OF_DISKS: Final = (errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EIO)
 """Errors of a file that no command can help."""
 
+_OF_KINDS: Final = (errno.EISDIR, errno.ENOTDIR, errno.EEXIST)
+"""A folder stands where a command writes a file, or a file where it makes a folder."""
+
 
 def exit_code_of(name: str, run: Callable[[], object]) -> int:
     """Runs the command `name` and turns every error into its exit code."""
@@ -39,10 +42,10 @@ def exit_code_of(name: str, run: Callable[[], object]) -> int:
         _complain(name, error)
         return EXIT_FAILED
     except OSError as error:
-        if error.errno not in _OF_DISKS:
+        if error.errno not in (*_OF_DISKS, *_OF_KINDS):
             raise  # It may be a fault of gmijax.
-        _complain(name, f"{error.filename or 'a file'}: {error.strerror}")
-        return EXIT_FAILED
+        _complain(name, f"{error.filename2 or error.filename or 'a file'}: {error.strerror}")
+        return EXIT_BAD_INPUT if error.errno in _OF_KINDS else EXIT_FAILED
 
 
 @contextmanager

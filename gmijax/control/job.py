@@ -26,6 +26,7 @@ from gmijax.control.films import filmed, find_opengl
 from gmijax.control.restarts import (
     Attempts,
     clear_unfinished,
+    drop_half_written,
     with_gpus_left,
     with_nodes_left,
 )
@@ -37,7 +38,7 @@ from gmijax.machine.snapshot import detect_machine
 from gmijax.partition.plan import Plan
 from gmijax.runs.folder import RunPaths, add_event, read_json, write_json
 from gmijax.runs.git import record_git
-from gmijax.runs.held import OpenFolder, locked
+from gmijax.runs.held import OpenFolder, is_locked, locked
 from gmijax.runs.history import MetricsReader, copy_history, draw_returns, read_metrics
 from gmijax.runs.resume import CheckpointMeta, checkpoints_of, drop_unfinished
 from gmijax.runs.saved_config import saved_config
@@ -259,6 +260,8 @@ def started_from(config: TrainConfig, checkpoint: Path | None) -> TrainConfig:
 
 def _finished(config: TrainConfig, run: RunPaths, console: Console) -> Result:
     """Result of a run that is complete; writes the summary if it is missing."""
+    if not is_locked(run.lock):
+        drop_half_written(run)  # The controller may have been killed at the very end.
     summary = read_json(run.summary) if os.path.lexists(run.summary) else {}
     if summary.get("status") != "completed":
         try:

@@ -190,18 +190,23 @@ def keep_logs(run: RunPaths, attempt: int) -> None:
             path.rename(kept / path.name)
 
 
+def drop_half_written(run: RunPaths) -> None:
+    """Removes what a killed process has left of files and checkpoints that it was writing."""
+    gmis = gmi_folders(run.root)
+    attempts = [attempt for gmi in gmis for attempt in attempt_folders(gmi)]
+    for folder in (run.root, *gmis, *attempts):
+        remove_temporary(folder)
+    drop_unfinished(run)
+
+
 def clear_unfinished(run: RunPaths, checkpoint: Path | None) -> None:
     """Leaves of a run what belongs to a checkpoint.
 
     No half-written files, no later metrics, and no results of GMIs, which are to train again.
     """
-    gmis = gmi_folders(run.root)
-    for gmi in gmis:
+    for gmi in gmi_folders(run.root):
         (gmi / "result.json").unlink(missing_ok=True)
-    attempts = [attempt for gmi in gmis for attempt in attempt_folders(gmi)]
-    for folder in (run.root, *gmis, *attempts):
-        remove_temporary(folder)
-    drop_unfinished(run)
+    drop_half_written(run)
     # Written anew from the metrics: event files cannot be cut.
     shutil.rmtree(run.tensorboard, ignore_errors=True)
     copy_history(run.metrics, run.metrics, max(0, _steps(checkpoint)))

@@ -37,8 +37,8 @@ ON_GPU: Mapping[str, WarpSizes | None] = MappingProxyType(
 )
 """Tasks for which `physics.impl=auto` chooses MJX-Warp on a GPU, and the sizes of its buffers.
 
-None: the sizes of MJX-JAX, which hold all that can ever be unless the model limits them
-(`max_contact_points`, `max_geom_pairs`). A task that is not here runs in JAX, with those sizes.
+None: sizes by the pairs of geoms that may touch (`gmijax/sim/warp/sizes.py`). A task that is not
+here runs in JAX.
 """
 
 

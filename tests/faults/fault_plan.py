@@ -138,6 +138,8 @@ def place_faults(kinds: Sequence[str], draw: random.Random) -> list[Fault]:
 
 def _may_meet(kind: str, other: str) -> bool:
     """Whether one job may have both: a command is started in one way, and has one janitor."""
+    if {kind, other} == {"kill_result", "kill_controller_result"}:
+        return False  # With the results there the job is complete: the other never comes.
     needs_janitor = {kind, other} == {"kill_janitor", "kill_controller_and_stop"}
     return not needs_janitor and not (_is_at_start(kind) and _is_at_start(other))
 

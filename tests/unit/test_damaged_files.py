@@ -6,6 +6,7 @@ import json
 import os
 import random
 from collections.abc import Callable
+from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +23,7 @@ from gmijax.control.summary import train_summary
 from gmijax.errors import ConfigError
 from gmijax.runs import folder
 from gmijax.runs.folder import META, RunPaths, open_regular, read_json, write_json
+from gmijax.runs.held import locked
 from gmijax.runs.history import copy_history, read_metrics
 from gmijax.runs.resume import CheckpointMeta, file_check, newest_checkpoint, what_is_broken
 from gmijax.sweeps.jobs import state_of
@@ -148,6 +150,18 @@ def test_the_files_of_a_checkpoint_are_regular_and_inside_of_it(run: RunPaths, n
 def test_bad_meta_data_hide_no_other_checkpoint(run: RunPaths, content: bytes):
     (save_meta(run, META_OF_200) / META).write_bytes(content)
     assert find_start_point(config_of(run)).checkpoint == run.checkpoint(100)
+
+
+@pytest.mark.parametrize("is_held", [False, True])
+def test_what_a_killed_writer_left_of_a_complete_run_is_removed(run: RunPaths, is_held: bool):
+    """As a controller that is killed while a GMI writes its result leaves it."""
+    left = run.gmi(1).root / ".result.json.14079-140246432381824"
+    left.parent.mkdir()
+    left.write_text("{")
+    write_json(run.summary, {"status": "completed"})
+    with locked(run.lock, "run") if is_held else nullcontext():
+        _finished(config_of(run), run, open_console(show=False))
+    assert left.exists() == is_held  # Somebody still writes there.
 
 
 def test_a_complete_run_with_damaged_files_is_one_line(run: RunPaths):

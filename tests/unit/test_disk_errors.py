@@ -33,6 +33,25 @@ def test_an_error_of_the_disk_is_one_line(
     assert capsys.readouterr().err == said
 
 
+@pytest.mark.parametrize("number", [errno.EISDIR, errno.ENOTDIR, errno.EEXIST])
+def test_a_folder_in_place_of_a_file_is_bad_input(
+    number: int, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert exit_code_of("train", failing(number)) == 2
+    said = f"gmijax.train: runs/x/search.json: {os.strerror(number)}\n"
+    assert capsys.readouterr().err == said
+
+
+def test_the_file_that_was_to_be_written_is_named(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder = tmp_path / "metrics.jsonl"
+    folder.mkdir()
+    assert exit_code_of("train", lambda: write_json(folder, {})) == 2
+    assert capsys.readouterr().err == f"gmijax.train: {folder}: Is a directory\n"
+    assert list(tmp_path.iterdir()) == [folder]
+
+
 def test_other_errors_of_files_are_not_hidden() -> None:
     for number in (errno.EMFILE, errno.EBADF):
         with pytest.raises(OSError, match=r"search\.json"):
