@@ -86,7 +86,9 @@ class Report:
           FolderLost: the sweep's folder is no longer there.
         """
         self._folder.require()
-        states = [(job.progress.state, job.progress.attempts) for job in self._jobs]
+        states: list[tuple[State, int]] = [
+            (job.progress.state, job.progress.attempts) for job in self._jobs
+        ]
         if states == self._states:
             return
         self._states = states
