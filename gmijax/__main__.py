@@ -31,7 +31,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Runs a command; returns its exit code. Only that command's packages are imported."""
     verb, *rest = (sys.argv[1:] if argv is None else argv) or ("--help",)
     if verb == "help":
-        verb, rest = (rest[0], ["--help"]) if rest else ("--help", [])
+        verb, rest = (rest[0], ["--help", *rest[1:]]) if rest else ("--help", [])
     verb = verb.replace("_", "-")  # As the module is called.
     if verb in ("-h", "--help"):
         sys.stdout.write(_usage())

@@ -30,6 +30,22 @@ def packs() -> list[str]:
     return [*markdown(_HEAD, rows), "", *(calls or [f"- `packs-*.json`: {NOT_MEASURED}"])]
 
 
+def packed_gains() -> str:
+    """In words, what the training with the most at once gains."""
+    calls = calls_by_date(RESULTS, "packs-nvidia-*.json")
+    rows = calls[-1][0].results.get("rows", ()) if calls else ()
+    found = {row["way"]: row for row in rows if row.get("exit_code") == 0}
+    eight, alone = found.get("8 at once, mps"), found.get(_ALONE)
+    if eight is None or alone is None:
+        return NOT_MEASURED
+    ratios = (eight[key] / alone[key] for key in ("steps_per_s", "trainings_per_hour"))
+    steps, finished = (f"{ratio:.2f}" for ratio in ratios)
+    return (
+        f"eight at once of {eight['name'].split(',')[0]}: {steps} times the steps/s of one, "
+        f"{finished} times the trainings per hour (n=1)"
+    )
+
+
 def _of_training(name: str, call: Call) -> list[list[str]]:
     by_way: dict[str, list[Mapping[str, Any]]] = {}
     for row in call.results.get("rows", ()):

@@ -41,18 +41,18 @@ class SameJobs(NamedTuple):
         """A figure of all sweeps, by way."""
         return _figures(_by_way(key, runs) for runs in self.runs)
 
-    def gains(self) -> dict[str, Figure]:
-        """Jobs per hour over those of one after another, each ratio of one call."""
-        return self._ratios(lambda way: ONE_AFTER_ANOTHER)
+    def gains(self, key: str = "trainings_per_hour") -> dict[str, Figure]:
+        """A figure over that of one after another, each ratio of one call."""
+        return self._ratios(lambda way: ONE_AFTER_ANOTHER, key)
 
     def gains_over_sharing(self) -> dict[str, Figure]:
         """Jobs per hour over those of as many at once under plain sharing."""
-        return self._ratios(lambda way: way.replace(", auto", ", share"))
+        return self._ratios(lambda way: way.replace(", auto", ", share"), "trainings_per_hour")
 
-    def _ratios(self, base: Callable[[str], str]) -> dict[str, Figure]:
+    def _ratios(self, base: Callable[[str], str], key: str) -> dict[str, Figure]:
         ratios: list[dict[str, list[float]]] = []
         for runs in self.runs:
-            rates = _figures([_by_way("trainings_per_hour", runs)])
+            rates = _figures([_by_way(key, runs)])
             ratios.append(
                 {
                     way: [rate.median / rates[base(way)].median]
@@ -80,9 +80,9 @@ def same_jobs() -> dict[str, SameJobs]:
     return found
 
 
-def first_gains() -> dict[str, Figure]:
+def first_gains(key: str = "trainings_per_hour") -> dict[str, Figure]:
     """What the jobs of the first call gain at once, over one after another."""
-    return next((same.gains() for same in same_jobs().values()), {})
+    return next((same.gains(key) for same in same_jobs().values()), {})
 
 
 def sweeps() -> list[str]:

@@ -41,8 +41,9 @@ def command(
     """
 
     def whole() -> None:
-        if "--help" in argv or "-h" in argv:
-            print_help(name, cls, partial(defaults, name), choices)
+        if asked := [at for at, word in enumerate(argv) if word in ("--help", "-h")]:
+            topic = next(iter(argv[asked[0] + 1 : asked[0] + 2]), None)
+            print_help(name, cls, partial(defaults, name), choices, topic)
             return
         overrides, show = _split_options(argv)
         made = build(name, cls, overrides) if make is None else make(overrides)

@@ -8,10 +8,27 @@ import sys
 import types
 import typing
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import Any, Final, NamedTuple
 
 from rich.console import Console
 from rich.table import Table
+
+from gmijax.config.schema import suggestion
+from gmijax.errors import ConfigError
+
+MANY: Final = 60
+"""A command with more keys shows the usual ones unless a topic is named."""
+
+USUAL: Final = (
+    *("num_envs", "num_timesteps", "seed", "unroll_length", "policy"),
+    *("env.randomize", "env.episode_length", "physics.impl"),
+    *("algo.learning_rate", "algo.entropy_cost"),
+    *("plan.gpus", "plan.gmis_per_gpu", "plan.backend", "cluster.engine"),
+    *("run.dir", "run.name", "run.resume", "run.checkpoint_every", "run.max_restarts"),
+    *("output.dir", "eval.every", "eval.video", "wandb.mode", "search.budget_s"),
+    *("sweep.jobs_per_gpu", "sweep.objective", "sweep.sampler", "sweep.trials"),
+)
+"""What most people set."""
 
 
 class Key(NamedTuple):
@@ -32,14 +49,27 @@ def print_help(
     cls: type[Any],
     defaults_of: Callable[[Sequence[str]], Mapping[str, Any]],
     choices: Callable[[str], Sequence[str]],
+    topic: str | None = None,
 ) -> None:
-    """Prints how a command is used, and every key with its default and meaning."""
+    """Prints how a command is used, and keys with their defaults and meanings.
+
+    Args:
+      name: of the command.
+      cls: its keys.
+      defaults_of: as of `keys_of`.
+      choices: names of a group's files.
+      topic: a group of keys, or `all`; None: the usual ones, where there are many.
+
+    Raises:
+      ConfigError: there is no such topic.
+    """
     table = Table(box=None, pad_edge=False)
     for heading in ("key", "default", "meaning"):
         table.add_column(heading, overflow="fold", no_wrap=heading == "key")
     # Those without a group, such as num_timesteps, are looked for most.
     keys, last = sorted(keys_of(cls, defaults_of), key=lambda key: "." in key.name), ""
-    for key in keys:
+    shown = _of_topic(keys, topic)
+    for key in shown:
         if key.choice != last:
             table.add_row(f"with {key.choice}:" if key.choice else "")
         last = key.choice
@@ -55,6 +85,27 @@ def print_help(
                 console.print(_whose_defaults(name, keys))
     console.print()
     console.print(table)
+    if len(shown) < len(keys):
+        topics = ", ".join(_topics(keys))
+        console.print(f"\nmore keys: gmijax {name} --help TOPIC, of {topics}, all")
+
+
+def _topics(keys: Sequence[Key]) -> list[str]:
+    return sorted({key.name.partition(".")[0] for key in keys if "." in key.name})
+
+
+def _of_topic(keys: Sequence[Key], topic: str | None) -> list[Key]:
+    if topic == "all" or (topic is None and len(keys) <= MANY):
+        return list(keys)
+    if topic is None:
+        usual = {key.name: key for key in reversed(keys) if key.name in USUAL}
+        return [usual[name]._replace(choice="") for name in USUAL if name in usual]
+    found = [key for key in keys if key.name.partition(".")[0] == topic]
+    if not found:
+        allowed = (*_topics(keys), "all")
+        close = suggestion(topic, allowed)
+        raise ConfigError(f"--help {topic}: no such topic{close or f'; there are {allowed}'}")
+    return found
 
 
 def _whose_defaults(command: str, keys: Sequence[Key]) -> str:
@@ -72,7 +123,7 @@ def usage_of(command: str) -> str:
         return (
             "gmijax pack [NAME=VALUE,VALUE ...] [key=value ...] [--cfg job|--json] -- COMMAND ..."
         )
-    return f"gmijax {command} [key=value ...] [--cfg job] [--help]"
+    return f"gmijax {command} [key=value ...] [--cfg job] [--help [TOPIC]]"
 
 
 def keys_of(

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import os
+import re
 import shlex
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -11,8 +13,10 @@ from command_lines import run
 
 import gmijax
 from gmijax.cli.command import command
-from gmijax.cli.compose import compose
-from gmijax.config import PlayConfig, TrainConfig
+from gmijax.cli.compose import compose, defaults
+from gmijax.cli.grid import SweepHelp
+from gmijax.cli.help import USUAL, keys_of
+from gmijax.config import PlayConfig, ServeConfig, TrainConfig
 from gmijax.errors import ConfigError
 
 LONG = "a" * 300
@@ -237,12 +241,36 @@ def test_a_task_may_be_named_twice_and_a_plan_may_have_1024_gmis():
 
 
 def test_help_lists_every_key(capsys: pytest.CaptureFixture[str]):
-    assert command("train", TrainConfig, gmijax.train, ["--help"]) == 0
+    assert command("train", TrainConfig, gmijax.train, ["--help", "all"]) == 0
     said = capsys.readouterr().out
+    assert "more keys" not in said
     for key in ("num_envs", "plan.gmis_per_gpu", "algo.learning_rate", "run.resume", "seed"):
         assert f"\n{key} " in said
     assert said.index("\nnum_envs ") < said.index("\nenv.name ")
     assert command("play", PlayConfig, gmijax.train, ["num_envs=4", "-h"]) == 0
+
+
+def test_help_shows_the_usual_keys_or_those_of_a_topic(capsys: pytest.CaptureFixture[str]):
+    assert command("train", TrainConfig, gmijax.train, ["--help"]) == 0
+    said = capsys.readouterr().out
+    assert len([line for line in said.splitlines() if re.match(r"[a-z_]+(\.|  )", line)]) < 30
+    for key in ("num_envs", "algo.learning_rate", "run.resume", "eval.every"):
+        assert f"\n{key} " in said
+    assert "more keys: gmijax train --help TOPIC, of algo," in said
+    assert command("train", TrainConfig, gmijax.train, ["--help", "plan"]) == 0
+    said = capsys.readouterr().out
+    assert "\nplan.template " in said
+    assert "\nrun.dir " not in said
+    assert command("train", TrainConfig, gmijax.train, ["--help", "plam"]) == 2
+    assert "--help plam: no such topic: did you mean plan?" in capsys.readouterr().err
+
+
+def test_every_usual_key_is_one_of_a_command():
+    commands = {"train": TrainConfig, "serve": ServeConfig, "sweep": SweepHelp}
+    named = {
+        key.name for name, cls in commands.items() for key in keys_of(cls, partial(defaults, name))
+    }
+    assert set(USUAL) <= named
 
 
 def test_cfg_job_prints_the_composed_configuration(capsys: pytest.CaptureFixture[str]):
