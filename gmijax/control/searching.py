@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import shlex
+
 from gmijax.autotune.tuner import Search, SearchResult, is_auto, workload_of
 from gmijax.config import TrainConfig
 from gmijax.config.schema import to_dict
-from gmijax.control.console import open_console
+from gmijax.control.console import nearby, open_console
 from gmijax.control.decide import with_task
 from gmijax.errors import ConfigError
 from gmijax.machine.snapshot import detect_machine
@@ -40,5 +42,21 @@ def search(config: TrainConfig, *, show: bool = False) -> SearchResult:
     # After everything else was checked: nothing is left of a search that was refused.
     started.run = create_run(config.run.dir, config.run.name, f"{config.env.slug}-search")
     write_json(started.run.config, to_dict(config))
-    console.print(f"run folder: {started.run.root}")
-    return started.result()
+    console.print(f"run folder: {nearby(started.run.root)}")
+    result = started.result()
+    if not result.trainers and result.split is None:
+        console.print(f"next: {_training(config, result)}")
+    return result
+
+
+def _training(config: TrainConfig, result: SearchResult) -> str:
+    """The command that trains with what was found, beside what else was given."""
+    env = config.env
+    task = f"env={shlex.quote(str(env.name if env.suite == 'gmijax' else env.label))}"
+    if env.suite in ("brax", "playground"):
+        task = f"env={env.suite} env.name={env.name}"
+    gpus = "" if config.plan.gpus == 1 else f" plan.gpus={config.plan.num_gpus}"
+    return (
+        f"gmijax train {task} num_envs={result.num_envs} "
+        f"plan.gmis_per_gpu={result.gmis_per_gpu} physics.impl={result.impl}{gpus}"
+    )

@@ -22,6 +22,7 @@ from gmijax.autotune.tuner import Search, SearchResult, with_auto_decided
 from gmijax.autotune.workloads import PpoWorkload, Workload
 from gmijax.cli.compose import compose
 from gmijax.config import TrainConfig
+from gmijax.control import searching
 from gmijax.errors import ConfigError, JobInterrupted
 from gmijax.machine.host_limits import HostLimits
 from gmijax.machine.snapshot import Machine
@@ -248,3 +249,23 @@ def test_isolated_is_one_gmi_of_those_that_corun():
     assert together.layout.num_gpus == 1
     assert [one.sm_percent for one in together.slices] == [None] * 4
     assert (share.sm_percent, share.memory_fraction) == (25.0, 0.2)
+
+
+@pytest.mark.parametrize(
+    ("overrides", "line"),
+    [
+        (
+            ("env=ant", "plan.gpus=2"),
+            "gmijax train env=ant num_envs=64 plan.gmis_per_gpu=4 physics.impl=warp plan.gpus=2",
+        ),
+        (
+            ("env=brax", "env.name=ant"),
+            "gmijax train env=brax env.name=ant num_envs=64 plan.gmis_per_gpu=4 physics.impl=warp",
+        ),
+    ],
+)
+def test_a_search_ends_with_the_training_that_follows(
+    overrides: tuple[str, ...], line: str
+) -> None:
+    config = compose(*overrides, "num_envs=auto", command="search")
+    assert searching._training(config, SearchResult(None, 4, 64, "warp", "", {})) == line
