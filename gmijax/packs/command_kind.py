@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import json
+import math
 import os
 import shlex
 import signal
+from collections import Counter
 from collections.abc import Callable, Collection, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
@@ -32,6 +34,12 @@ _COMPILES_S: Final = 120.0
 
 _CLIENT_AFTER_S: Final = 30.0
 """When a job that reports nothing has taken its GPU."""
+
+_SAME_FAULT_S: Final = 30.0
+"""Jobs of a GPU that end within such a time of its fault were ended by the same one."""
+
+_OFTEN: Final = 2
+"""A job that was ended by more faults of its GPU runs alone, whoever ended first."""
 
 _THREADS: Final = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS")
 """Variables by which libraries choose the number of their threads: by default one a core."""
@@ -79,6 +87,8 @@ class CommandKind:
         self.longest_compile_s = _COMPILES_S
         self._attempts: dict[int, _Attempt] = {}
         self._from_nothing: set[int] = set()
+        self._gpu_faults: Counter[int] = Counter()
+        self._faulted_s: dict[tuple[int, int], float] = {}
 
     def together(
         self, job: CommandJob, queue: Sequence[CommandJob], alone: Collection[int]
@@ -97,6 +107,7 @@ class CommandKind:
         resumes = settings.resume is not None and run.metrics.exists()
         if number in self._from_nothing or not resumes:
             resumes = False
+            self._from_nothing.discard(number)
             run.metrics.unlink(missing_ok=True)
         more = shlex.split(settings.resume or "") if resumes else []
         arguments = job.arguments(run_dir, more)
@@ -184,18 +195,35 @@ class CommandKind:
             return Outcome()
         attempt = self._attempts[job.number]
         why = failure_of(seen.exit_code, self._paths.log(job.number), attempt.begins)
-        is_anothers = why.is_gpu_fault and running.place.backend in ("mps", "mig")
-        # It had saved nothing yet: there is nothing to go on from.
-        found_nothing = attempt.resumes and not job.progress.reports
-        if found_nothing:
+        is_shared = running.place.backend in ("mps", "mig") and not running.place.is_alone
+        alone, again = why.is_out_of_memory, None
+        if why.is_gpu_fault and is_shared:
+            alone = self._is_suspect(running, job)
+            again = None if alone else "beside others: the fault may be that of another one"
+        elif attempt.resumes and not job.progress.reports and not alone:
+            # It had saved nothing yet: there is nothing to go on from.
             self._from_nothing.add(job.number)
+            again = "from its beginning"
         return Outcome(
             error=why.error,
             is_fault=True,
-            is_free=found_nothing and not why.is_out_of_memory,
-            may_be_anothers=is_anothers or why.is_out_of_memory,
+            may_be_anothers=alone,
+            again=again,
             is_out_of_memory=why.is_out_of_memory,
         )
+
+    def _is_suspect(self, running: Running[CommandJob], job: CommandJob) -> bool:
+        """Whether a job may have caused the fault of its GPU that ended it.
+
+        CUDA tells all clients and does not say whose fault it was: the first to end is the
+        suspect, and who has often been near.
+        """
+        gpu, now_s = (running.place.site, running.place.slices[0].gpu), running_s()
+        is_first = now_s - self._faulted_s.get(gpu, -math.inf) > _SAME_FAULT_S
+        if is_first:
+            self._faulted_s[gpu] = now_s
+        self._gpu_faults[job.number] += 1
+        return is_first or self._gpu_faults[job.number] > _OFTEN
 
     def max_restarts(self, job: CommandJob) -> int:
         """See `Kind`."""

@@ -27,7 +27,7 @@ class Outcome(NamedTuple):
         own goes on by itself.
       may_be_anothers: whether a neighbour on its GPU may have caused it.
       is_out_of_memory: whether it found no memory on its GPU.
-      is_free: whether it is to be tried again without being counted.
+      again: why it is to be tried again without being counted; None: it is not.
     """
 
     is_interrupted: bool = False
@@ -35,7 +35,7 @@ class Outcome(NamedTuple):
     is_fault: bool = False
     may_be_anothers: bool = False
     is_out_of_memory: bool = False
-    is_free: bool = False
+    again: str | None = None
 
 
 @dataclass

@@ -247,8 +247,8 @@ class Scheduler(Generic[J]):
         if end.may_be_anothers and is_shared and running.host.lost is None:
             self._alone.add(job.number)
             return f"again, alone on its GPU, after {error}"
-        if end.is_free:
-            return f"again, from its beginning, after {error}"
+        if end.again is not None:
+            return f"again, {end.again}, after {error}"
         if end.is_fault:
             self._faults[job.number] += 1
             # It may be what ends them.

@@ -25,10 +25,10 @@ from gmijax.packs.crowd import Crowd
 from gmijax.packs.failure import failure_of
 from gmijax.packs.pack import PackWork
 from gmijax.supervise.backends.backend import Backend
-from gmijax.sweeps.children import Process
+from gmijax.sweeps.children import Process, Seen
 from gmijax.sweeps.host import LocalHost, client_variables
 from gmijax.sweeps.places import Place, Places
-from gmijax.sweeps.running import Running
+from gmijax.sweeps.running import Outcome, Running
 from gmijax.sweeps.work import Folder
 
 COMMAND = ("true", "--seed", "{seed}")
@@ -211,6 +211,51 @@ def test_a_job_that_is_started_again_gets_the_words_to_resume(
         "$ true 003",
         f"$ true 003 --resume {tmp_path}/003/last",
     ]
+
+
+class Ended(LocalHost):
+    """A machine whose jobs have all ended with exit code 1."""
+
+    def __init__(self) -> None:
+        super().__init__(GPU)
+
+    def look(self, child: int) -> Seen:
+        del child
+        return Seen(1)
+
+
+def test_of_jobs_that_a_gpu_fault_ended_the_first_runs_alone(kind: CommandKind) -> None:
+    work = build_pack(["pack.copies=4", "pack.jobs_per_gpu=4"], ["true"])
+    host = Ended()
+    places = Places(work.sites([host]))
+
+    def fail(job: CommandJob) -> Outcome:
+        place = places.take(1)
+        assert place is not None
+        log = kind.start((job,), place).process.log
+        with log.open("a") as file:
+            file.write("RuntimeError: CUDA error: an illegal memory access was encountered\n")
+        places.give_back(place)
+        return kind.outcome(Running((job,), place, host, 0, ()), job)
+
+    ends = [fail(job) for job in work.jobs[:3]]
+    assert [end.may_be_anothers for end in ends] == [True, False, False]
+    assert [end.again is None for end in ends] == [True, False, False]
+    assert not fail(work.jobs[2]).may_be_anothers
+    assert fail(work.jobs[2]).may_be_anothers  # It has been near too often.
+
+
+def test_a_job_that_finds_no_checkpoint_starts_from_its_beginning(
+    kind: CommandKind, tmp_path: Path
+) -> None:
+    _, place = place_of()
+    job, host = CommandJob(0, {}, ("true",)), Ended()
+    kind.start((job,), place)
+    (tmp_path / "000" / "pack" / "metrics.jsonl").write_text('{"env_steps": 1}\n')
+    assert "--resume" in kind.start((job,), place).process.arguments
+    end = kind.outcome(Running((job,), place, host, 0, ()), job)
+    assert end.again == "from its beginning"
+    assert "--resume" not in kind.start((job,), place).process.arguments
 
 
 @pytest.mark.parametrize(
