@@ -102,7 +102,7 @@ def test_its_checkpoint_plays(two_and_two: Path) -> None:
     )
     assert done.returncode == 0, done.stderr
     returns = _read(folder / "returns.json")
-    assert str(folder / "returns.json") in done.stdout
+    assert f"returns: {(folder / 'returns.json').relative_to(two_and_two.parent)}" in done.stdout
     assert "effort" in done.stdout
     assert "point_mass has no model that could be filmed" in done.stdout
     assert returns["env_steps"] == int(folder.name)
