@@ -83,17 +83,22 @@ def test_one_fails_one_hangs_and_a_killed_pack_goes_on(home: Path, python: Path)
     folder = home / "all"
     line = commands_of(
         python,
-        *("seed=0,1,2,3", "lr=0.1,1", "run.dir=all", "pack.stall_s=3"),
+        *("seed=0,1,2,3", "lr=0.1,1", "run.dir=all", "pack.stall_s=6"),
         "pack.resume=--resume",
     )
     first = start(*line, cwd=home, command="pack")
 
-    def is_through() -> bool:
-        if first.poll() is not None:
-            return True
-        return (folder / "000" / "pack" / "summary.json").exists()
+    def files_of(number: int) -> Path:
+        return folder / f"{number:03d}" / "pack"
 
-    wait_until(is_through, 120.0, "a job is through")
+    def that_has_begun() -> int | None:
+        """A job that has reported and is not through, once the first one is."""
+        assert first.poll() is None
+        running = [n for n in range(1, 4) if not (files_of(n) / "summary.json").exists()]
+        begun = [n for n in running if (files_of(n) / "metrics.jsonl").exists()]
+        return begun[0] if begun and (files_of(0) / "summary.json").exists() else None
+
+    begun = wait_until(that_has_begun, 120.0, "a job is through, and another has begun")
     first.send_signal(signal.SIGKILL)
     first.wait()
     wait_until(lambda: not running_in(folder), 60.0, "the jobs of a killed pack have ended")
@@ -101,7 +106,7 @@ def test_one_fails_one_hangs_and_a_killed_pack_goes_on(home: Path, python: Path)
 
     done = train(*line, cwd=home, command="pack")
     assert done.returncode == 1, done.stderr
-    assert "4 of 8 jobs failed; job 4: printed nothing for 3 s (pack.stall_s)" in done.stderr
+    assert "4 of 8 jobs failed; job 4: printed nothing for 6 s (pack.stall_s)" in done.stderr
     assert len(done.stderr.splitlines()) == 1
     found = report(folder)
     assert [job["state"] for job in found["jobs"]] == ["completed"] * 4 + ["failed"] * 4
@@ -112,10 +117,9 @@ def test_one_fails_one_hangs_and_a_killed_pack_goes_on(home: Path, python: Path)
     ).stat().st_mtime_ns == whole  # It did not run again.
     assert (folder / "000" / "starts").read_text() == "first\n"
     # What the kill has ended went on by its own words.
-    starts = [(folder / f"{n:03d}" / "starts").read_text().split() for n in range(1, 4)]
-    assert ["first", "again"] in starts
+    assert (folder / f"{begun:03d}" / "starts").read_text().split() == ["first", "again"]
     rates = [job["env_steps_per_s"] for job in found["jobs"][1:4]]
-    assert all(1_000 < rate < 20_000 for rate in rates)
+    assert all(100 < rate < 20_000 for rate in rates)
     settings = csv.DictReader((folder / "settings.csv").read_text().splitlines())
     assert [row["lr"] for row in settings] == ["1", "0.1"]
     best = found["settings"][0]

@@ -231,7 +231,7 @@ def test_jobs_of_a_sweep_are_not_late(stop: Stop, monkeypatch: pytest.MonkeyPatc
     assert not window.is_over()
     child: Any = object.__new__(children.Child)
     child._process = SimpleNamespace(poll=lambda: 0, pid=1)
-    child._ended_s, child._log = None, Path("nowhere")
+    child._ended_s, child._log, child._is_asked = None, Path("nowhere"), False
     monkeypatch.setattr(children, "members_of", lambda _: (1,))
     assert child.look().exit_code is None
     stop()
