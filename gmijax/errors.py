@@ -26,7 +26,7 @@ import time
 import unicodedata
 from typing import NamedTuple
 
-_TERMINAL_COMMAND = re.compile(r"\x1b(?:\[[0-?]*[ -/]*[@-~]|\][^\x07\x1b]*(?:\x07|\x1b\\)?|[ -~])")
+TERMINAL_COMMAND = re.compile(r"\x1b(?:\[[0-?]*[ -/]*[@-~]|\][^\x07\x1b]*(?:\x07|\x1b\\)?|[ -~])")
 """What a terminal obeys and does not show: colours, the cursor, its title."""
 
 
@@ -36,7 +36,7 @@ def printable(text: str) -> str:
     Commands of terminals and control characters go, among them those that turn the direction of
     writing; tabs become blanks.
     """
-    shown = _TERMINAL_COMMAND.sub("", text).replace("\t", " ")
+    shown = TERMINAL_COMMAND.sub("", text).replace("\t", " ")
     return "".join(c for c in shown if unicodedata.category(c) not in ("Cc", "Cf"))
 
 

@@ -78,11 +78,10 @@ def build_pack(words: Sequence[str], program: Sequence[str]) -> PackWork:
     words = [_as_text(word) for word in words]
     given = list(zip(words, parse(words), strict=True))
     own = [text for text, item in given if item.key_or_group.startswith(_OWN)]
-    at_home = {text: at_home for text in own for at_home in readable("pack", [text])}
     for text, item in given:
         if text in own and item.is_sweep_override():
             raise ConfigError(f"{text}: expected one value (a list stands in brackets)")
-    keys = from_dict(PackKeys, compose_dict("pack", list(at_home.values())))
+    keys = from_dict(PackKeys, compose_dict("pack", readable("pack", own)))
     space = {item.key_or_group: _values(item) for text, item in given if text not in own}
     if len(space) < len(given) - len(own):
         raise ConfigError("a name of the grid comes twice")

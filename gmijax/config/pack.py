@@ -4,11 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Literal
+from typing import Final, Literal
 
 from gmijax.config.schema import doc
 from gmijax.config.sweep import JobsConfig
 from gmijax.errors import ConfigError
+
+METRIC: Final = "metric"
+"""Key of what jobs are compared by, in lines of metrics."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -77,7 +80,7 @@ class PackConfig(JobsConfig):
     @property
     def objective(self) -> str:
         """Key of what jobs are ranked by, in their lines of metrics."""
-        return "metric"
+        return METRIC
 
     def __post_init__(self) -> None:
         super().__post_init__()

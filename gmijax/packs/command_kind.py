@@ -8,7 +8,7 @@ import os
 import shlex
 import signal
 from collections import Counter
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -101,12 +101,13 @@ class CommandKind:
         """See `Kind`."""
         (job,) = jobs
         number, settings = job.number, self._settings
-        run, log, run_dir = self._paths.job(number), self._paths.log(number), self.run_dir(job)
+        run, log = self._paths.job(number), self._paths.log(number)
+        run_dir = self._paths.run_dir(number)
         run.root.mkdir(parents=True, exist_ok=True)
         # Before its first report it has saved nothing that it could go on from.
-        resumes = settings.resume is not None and run.metrics.exists()
-        if number in self._from_nothing or not resumes:
-            resumes = False
+        may_resume = settings.resume is not None and run.metrics.exists()
+        resumes = may_resume and number not in self._from_nothing
+        if not resumes:
             self._from_nothing.discard(number)
             run.metrics.unlink(missing_ok=True)
         more = shlex.split(settings.resume or "") if resumes else []
@@ -153,10 +154,6 @@ class CommandKind:
             "GMIJAX_RUN_DIR": values["run_dir"],
             **given,
         }
-
-    def run_dir(self, job: CommandJob) -> Path:
-        """The folder that `{run_dir}` stands for."""
-        return self._paths.run_dir(job.number)
 
     def why_hung(self, running: Running[CommandJob]) -> str | None:
         """See `Kind`."""
@@ -265,12 +262,8 @@ class _Recorder:
                 copy_history(self._metrics, self._metrics, lines[0]["env_steps"] - 1)
             self._is_first = False
             with self._metrics.open("a") as file:
-                file.writelines(json.dumps(_finite(line)) + "\n" for line in lines)
+                file.writelines(json.dumps(line) + "\n" for line in lines)
         return lines
-
-
-def _finite(line: Mapping[str, Any]) -> dict[str, Any]:
-    return {key: value for key, value in line.items() if value is not None}
 
 
 @dataclass

@@ -2,17 +2,14 @@
 
 from __future__ import annotations
 
-import os
 import re
 from pathlib import Path
 from typing import Final, NamedTuple
 
-from gmijax.errors import printable
-from gmijax.supervise.failures import may_be_anothers, signal_name
+from gmijax.supervise.failures import last_lines, last_of, may_be_anothers, signal_name
 
 _TAIL_BYTES: Final = 1 << 16
 _TAIL_LINES: Final = 200
-_LONGEST: Final = 300
 
 _OUT_OF_MEMORY: Final = re.compile(
     r"CUDA out of memory|CUDA error: out of memory|OutOfMemoryError|CUBLAS_STATUS_ALLOC_FAILED"
@@ -51,25 +48,14 @@ def failure_of(exit_code: int, log: Path, begins: int = 0) -> Failure:
       log: what it printed.
       begins: byte of the log where that begins.
     """
-    lines = _last_lines(log, begins)
+    lines = last_lines(log, _TAIL_BYTES, begins)[-_TAIL_LINES:]
     how = f"exit code {exit_code}" if exit_code >= 0 else f"ended by {signal_name(-exit_code)}"
     for pattern in (_OUT_OF_MEMORY, _GPU_FAULT):
         found = next((line for line in reversed(lines) if pattern.search(line)), None)
         if found is not None:
-            text = f"{how}: {found.strip()[:_LONGEST]}"
+            text = f"{how}: {last_of([found])}"
             is_memory = pattern is _OUT_OF_MEMORY
             return Failure(text, is_memory, not is_memory)
-    said = (line.strip() for line in reversed(lines))
-    last = next(filter(None, said), "")[:_LONGEST]
+    last = last_of(lines)
     text = f"{how}: {last}" if last else how
     return Failure(text, is_gpu_fault=may_be_anothers(text))
-
-
-def _last_lines(log: Path, begins: int) -> list[str]:
-    try:
-        with log.open("rb") as file:
-            file.seek(max(begins, os.fstat(file.fileno()).st_size - _TAIL_BYTES))
-            text = file.read().decode(errors="replace")
-    except OSError:
-        return []
-    return [printable(line) for line in text.splitlines()[-_TAIL_LINES:]]

@@ -7,9 +7,8 @@ import re
 from pathlib import Path
 from typing import Final
 
-_ESCAPES: Final = re.compile(
-    r"\x1b(?:\[[0-9;?]*[ -/]*[@-~]|\][^\x07\x1b]*(?:\x07|\x1b\\)|[@-Z\\^_])"
-)
+from gmijax.errors import TERMINAL_COMMAND
+
 _ENDS: Final = re.compile(rb"[\r\n]+")
 
 LONGEST_LINE: Final = 4096
@@ -54,4 +53,5 @@ class OutputReader:
 
 def _text_of(line: bytes) -> str:
     # Escape codes are dropped before the cut: a bold title must not lose its end.
-    return _ESCAPES.sub("", line[: 4 * LONGEST_LINE].decode("utf-8", "replace"))[:LONGEST_LINE]
+    text = line[: 4 * LONGEST_LINE].decode("utf-8", "replace")
+    return TERMINAL_COMMAND.sub("", text)[:LONGEST_LINE]

@@ -27,6 +27,7 @@ from gmijax.packs.progress import own_patterns
 from gmijax.packs.template import require_names
 from gmijax.runs.folder import RUNS, RunPaths, given_run, read_json
 from gmijax.supervise.run_gmis import StopSignals
+from gmijax.sweeps.jobs_per_gpu import CORES_OF_A_JOB
 from gmijax.sweeps.kind import Kind, Limiter
 from gmijax.sweeps.nodes import Host
 from gmijax.sweeps.paths import SweepPaths
@@ -35,9 +36,6 @@ from gmijax.sweeps.progress import State
 from gmijax.sweeps.runner import SweepResult, run_work
 from gmijax.sweeps.space import Choices, Space, corners, grid
 from gmijax.sweeps.work import Folder, Work
-
-_CORES_OF_A_JOB = 2
-"""On a machine without GPUs."""
 
 
 @dataclass(frozen=True)
@@ -95,7 +93,7 @@ class PackWork(Work[CommandJob]):
         if settings.jobs_per_gpu != "auto":
             return settings.jobs_per_gpu
         if not host.machine.gpus:
-            return max(1, cores // _CORES_OF_A_JOB)
+            return max(1, cores // CORES_OF_A_JOB)
         gpus = settings.gpus or len(host.machine.gpus)
         num_gpus = len(gpus) if isinstance(gpus, tuple) else gpus
         num_jobs = settings.trials or len(self.jobs)

@@ -14,12 +14,10 @@ from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Final, NamedTuple
 
+from gmijax.config.pack import METRIC
 from gmijax.errors import ConfigError
 from gmijax.packs.output import OutputReader
 from gmijax.packs.trainers import FAMILIES, Family, Report, report_of
-
-METRIC: Final = "metric"
-"""Key of what jobs are compared by, in lines of metrics."""
 
 _REPORTS: Final = 5
 """A rate is that over so many reports: the first update of a trainer can take 15 times longer."""
@@ -146,7 +144,7 @@ class ProgressReader:
         if report.total is not None and math.isfinite(report.total):
             self._total = report.total
         is_average = self.family is not None and self.family.is_average
-        if any(math.isinf(x) or math.isnan(x) for x in (report.steps or 0, report.rate or 0)):
+        if not all(map(math.isfinite, (report.steps or 0.0, report.rate or 0.0))):
             return None
         if report.steps is not None:
             self._steps.count(report.steps, now_s)

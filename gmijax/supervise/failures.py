@@ -100,14 +100,29 @@ def signal_name(number: int) -> str:
 
 def last_line(path: Path) -> str:
     """The last non-empty line of a text file, shortened; empty where there is none."""
+    return last_of(last_lines(path))
+
+
+def last_of(lines: Sequence[str]) -> str:
+    """The last of some lines that is not empty, shortened; empty where there is none."""
+    return next(filter(None, map(str.strip, reversed(lines))), "")[:_MAX_LINE]
+
+
+def last_lines(path: Path, num_bytes: int = _TAIL_BYTES, begins: int = 0) -> list[str]:
+    """The last lines of a text file, as they may be shown; none without the file.
+
+    Args:
+      path: of the file.
+      num_bytes: at its end that are read; the first line may be half a one.
+      begins: byte before which nothing is read.
+    """
     try:
         with path.open("rb") as file:
-            file.seek(max(0, os.fstat(file.fileno()).st_size - _TAIL_BYTES))
-            lines = file.read().decode(errors="replace").splitlines()
+            file.seek(max(begins, os.fstat(file.fileno()).st_size - num_bytes))
+            text = file.read().decode(errors="replace")
     except OSError:
-        return ""
-    shown = (printable(line).strip() for line in reversed(lines))
-    return next(filter(None, shown), "")[:_MAX_LINE]
+        return []
+    return [printable(line) for line in text.splitlines()]
 
 
 def first_line(text: str) -> str:

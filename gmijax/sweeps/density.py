@@ -83,8 +83,6 @@ class Density:
           now_s: by a clock that only goes on.
           jobs: those that run, by number.
         """
-        if self.target > self.most:
-            return self.settle(self.most, f"no room for more than {self.most}")
         if self.is_settled or len(jobs) != self.target:
             self._window = None  # Some are still to be started, or too few are left.
             return None

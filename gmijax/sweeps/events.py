@@ -21,17 +21,16 @@ class JobEvents:
     Keys are only ever added. A number that is not known is null.
 
     Args:
-      stream: a line is written for each event, until nobody reads it any more.
+      stream: a line is written for each event, until nobody reads it any more; None: nobody does.
       name: of the command, e.g. `pack`.
       jobs: those that are known; more may be added to the list.
       paths: their files.
     """
 
     def __init__(
-        self, stream: TextIO, name: str, jobs: Sequence[AnyJob], paths: SweepPaths
+        self, stream: TextIO | None, name: str, jobs: Sequence[AnyJob], paths: SweepPaths
     ) -> None:
-        self._stream: TextIO | None = stream
-        self._name = name
+        self._stream, self._name = stream, name
         self._jobs, self._paths = jobs, paths
         self._states = {job.number: (job.progress.state, 0) for job in jobs}
         self._reported_s = 0.0
@@ -40,6 +39,8 @@ class JobEvents:
 
     def update(self) -> None:
         """Called about ten times a second."""
+        if self._stream is None:
+            return
         now_s = time.monotonic()
         is_due = now_s - self._reported_s >= _PROGRESS_S
         for job in self._jobs:

@@ -183,13 +183,12 @@ def client_variables(
     backend.renew(share.gmi)
     variables = dict(backend.environment(share.gmi))
     # Many programs take numbers alone. Of a daemon of our own, which has one GPU, it is the first.
-    index = {gpu.uuid: str(gpu.index) for gpu in machine.gpus}
+    gpu = next((gpu for gpu in machine.gpus if gpu.uuid == device), None)
     if place.backend == "mps" and device in backend.daemons and machine.daemon_of(device) is None:
         variables["CUDA_VISIBLE_DEVICES"] = "0"
     else:
         variables["CUDA_DEVICE_ORDER"] = "PCI_BUS_ID"
-        variables["CUDA_VISIBLE_DEVICES"] = index.get(device, device)
-    memory_mib = {gpu.uuid: gpu.memory_mib for gpu in machine.gpus}.get(device)
-    if place.backend == "mps" and process.memory_fraction is not None and memory_mib is not None:
-        variables[MEMORY_LIMIT_VARIABLE] = f"0={int(process.memory_fraction * memory_mib)}M"
+        variables["CUDA_VISIBLE_DEVICES"] = device if gpu is None else str(gpu.index)
+    if place.backend == "mps" and process.memory_fraction is not None and gpu is not None:
+        variables[MEMORY_LIMIT_VARIABLE] = f"0={int(process.memory_fraction * gpu.memory_mib)}M"
     return variables

@@ -38,7 +38,9 @@ from gmijax.sweeps.training import TrainingKind
 COUNTS = (1, 2, 4, 8, 16, 32)
 _WINDOW_S = 4.0
 _LEAST_ITERATIONS = 6
-_CORES_OF_A_JOB = 2
+CORES_OF_A_JOB = 2
+"""On a machine without GPUs."""
+
 _FOREVER = 10**12
 
 
@@ -71,8 +73,8 @@ def with_jobs_per_gpu(
         return settings
     if not hosts[0].machine.gpus:
         fewest = min(len(host.machine.cpu_cores) for host in hosts)
-        count = max(1, fewest // _CORES_OF_A_JOB)
-        console.print(f"sweep.jobs_per_gpu={count}: {_CORES_OF_A_JOB} cores for each job")
+        count = max(1, fewest // CORES_OF_A_JOB)
+        console.print(f"sweep.jobs_per_gpu={count}: {CORES_OF_A_JOB} cores for each job")
         return dataclasses.replace(settings, jobs_per_gpu=count)
     kinds: dict[object, Job] = {}
     for job in jobs:

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import time
 from collections.abc import Collection, Mapping, Sequence
-from typing import Any, NamedTuple, Protocol, TypeVar
+from typing import Any, NamedTuple, Protocol
 
 from gmijax.runs.folder import RunPaths
 from gmijax.sweeps.children import Process
 from gmijax.sweeps.places import Place
 from gmijax.sweeps.progress import Progress
-from gmijax.sweeps.running import Outcome, Running
+from gmijax.sweeps.running import J, Outcome, Running
 
 
 class AnyJob(Protocol):
@@ -50,9 +50,6 @@ class AnyJob(Protocol):
     def num_timesteps(self) -> int | None:
         """Environment steps at its end; None: not known."""
         ...
-
-
-J = TypeVar("J", bound=AnyJob)
 
 
 class Reader(Protocol):

@@ -49,12 +49,12 @@ class SweepResult(NamedTuple):
 def run_work(work: Work[J], *, show: bool = False, events: TextIO | None = None) -> SweepResult:
     """Runs all jobs, as many at a time as the settings say, and compares them.
 
+    Called again with the same work and folder, it runs those that are not complete.
+
     Args:
       work: the jobs.
       show: print live progress and the ranking.
       events: gets a JSON object a line for each event, see `JobEvents`.
-
-    Called again with the same work and folder, it runs those that are not complete.
 
     Raises:
       ConfigError: bad input, before anything was started.
@@ -91,7 +91,7 @@ def _run(
         report.begin()
     console.print(f"{work.name} folder: {paths.root}")
     view = SweepView(console, jobs, work.ranking)
-    told = None if events is None else JobEvents(events, work.name, jobs, paths)
+    told = JobEvents(events, work.name, jobs, paths)
     try:
         with errors_of_files(paths):
             _train(work, hosts, paths, console, study, report, view, jobs, told)
@@ -99,15 +99,13 @@ def _run(
         status = "interrupted" if isinstance(error, JobInterrupted) else "failed"
         if (wrong := report.end(status)) is not None:
             error.add_note(wrong)
-        if told is not None:
-            told.end(report.data)
+        told.end(report.data)
         if isinstance(error, JobInterrupted | SweepFailed):
             error.add_note(f"the same command with run.dir={paths.root} goes on")
         raise
     failed = [job for job in jobs if job.progress.state == "failed"]
     wrong = report.end("failed" if failed else "completed")
-    if told is not None:
-        told.end(report.data)
+    told.end(report.data)
     print_outcome(console, report.data, work.ranking, paths, view.line())
     if failed:
         first = failed[0]
@@ -127,7 +125,7 @@ def _train(
     report: Report,
     view: SweepView,
     jobs: list[J],
-    told: JobEvents | None,
+    told: JobEvents,
 ) -> None:
     """Runs the jobs; returns when all have ended."""
     with stop_signals() as signals, ExitStack() as held:
@@ -146,8 +144,7 @@ def _train(
         def tick() -> None:
             report.update()
             view.update()
-            if told is not None:
-                told.update()
+            told.update()
 
         Scheduler(
             jobs,

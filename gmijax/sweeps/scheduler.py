@@ -69,7 +69,6 @@ class Scheduler(Generic[J]):
         self._faults: Counter[int] = Counter()
         self._running: dict[int, Running[J]] = {}
         self._compiling: dict[tuple[int, str], int] = {}
-        self._programs: dict[int, str] = {}
         self._unwritten: OSError | None = None
 
     def run(self, signals: StopSignals) -> None:
@@ -150,8 +149,9 @@ class Scheduler(Generic[J]):
         started = host.start(Start(place, start.process, start.program))
         if not started.has_programs:
             self._compiling[place.site, first.program] = first.number
-        self._running[first.number] = Running(jobs, place, host, started.child, start.readers)
-        self._programs[first.number] = start.program
+        self._running[first.number] = Running(
+            jobs, place, host, started.child, start.readers, start.program
+        )
         for job in jobs:
             job.progress.begin(place.label, host.name)
         self._queue = [job for job in self._queue if job.progress.state == "waiting"]
@@ -263,7 +263,7 @@ class Scheduler(Generic[J]):
         if self._compiling.get(key) == first.number:
             del self._compiling[key]
             with suppress(NodeLost):
-                running.host.add_program(self._programs[first.number], has_compiled)
+                running.host.add_program(running.program, has_compiled)
 
     def _drop_lost(self) -> None:
         for site in list(self._places.left):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar, Generic, NamedTuple, Self
 
@@ -135,7 +135,3 @@ class Work(ABC, Generic[J]):
             return {"jobs": [dict(job.overrides) for job in self.jobs]}
         sampler = {"sampler": self.settings.sampler, "seed": self.settings.seed}
         return sampler | {"space": {key: list(values) for key, values in self.space.items()}}
-
-    def with_settings(self, settings: JobsConfig) -> Self:
-        """The same with other settings."""
-        return replace(self, settings=settings)
