@@ -3,7 +3,8 @@
 The same command as `gmijax pack` runs it: with one at a time, several under MPS, several by turns,
 and as many as `auto` takes. Beside the trainings per hour, start-up included, stand the steps per
 second while jobs report: the sum over jobs of the mean from their first report to their last.
-Writes `benchmarks/results/packs-<device>.json` after every pack.
+Writes `benchmarks/results/packs-<device>.json` after every pack. With `--gpus` repeats run at the
+same time, each on a GPU of its own with its part of the cores.
 """
 
 from __future__ import annotations
@@ -14,8 +15,10 @@ import math
 import sys
 import tempfile
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
+from queue import Queue
 from typing import Any, NamedTuple
 
 from benchmarks.command import STOP_S, run_command
@@ -34,41 +37,83 @@ class Way(NamedTuple):
     copies: int
 
     def __str__(self) -> str:
-        return f"{self.at_once} at once, {self.backend}"
+        of = f" of {self.copies}" if self.at_once != str(self.copies) else ""
+        return f"{self.at_once}{of} at once, {self.backend}"
+
+
+class Site(NamedTuple):
+    """Where the packs of a repeat run."""
+
+    prefix: tuple[str, ...]  # Words before the command, which keep it to some cores.
+    variables: Mapping[str, str]
 
 
 def main() -> int:
     """See the module."""
     given = _options()
     machine = detect_machine()
-    device = machine.gpus[0].name if machine.gpus else "cpu"
+    gpus = machine.gpus[: given.gpus]
+    device = machine.gpus[0].name if gpus else "cpu"
     settings = {**vars(given), "command": list(given.command)}
-    file = ResultsFile(given.out / file_name("packs", device), "packs", settings)
+    # Each row is of one GPU, however many work at the same time.
+    path, of_one = given.out / file_name("packs", device), f"1 x {device}" if gpus else None
+    file = ResultsFile(path, "packs", settings, device=of_one)
+    ways = _ways(given, "mps" if gpus else "auto")
+    free: Queue[Site] = Queue()
+    for site in _sites(machine.cpu_cores, [gpu.index for gpu in gpus]):
+        free.put(site)
     end_s = time.monotonic() + (given.deadline_s or math.inf)
-    mps = "mps" if machine.gpus else "auto"
-    ways = [
+
+    def repeat(number: int) -> bool:
+        site = free.get()
+        try:
+            return all(_measure(given, way, number, site, file, end_s) for way in ways)
+        finally:
+            free.put(site)
+
+    with ThreadPoolExecutor(free.qsize()) as pool:
+        return 0 if all([*pool.map(repeat, range(given.repeats))]) else 1
+
+
+def _ways(given: argparse.Namespace, mps: str) -> list[Way]:
+    return [
         *(Way(str(count), mps, count) for count in given.at_once),
         *(Way(str(count), "share", count) for count in given.share),
         *(Way("auto", "auto", count) for count in given.auto),
+        *(Way(str(count), mps, copies) for count, copies in given.many),
     ]
-    for repeat in range(given.repeats):
-        for way in ways:
-            if time.monotonic() > end_s - STOP_S:
-                return 1
-            row = {
-                "name": given.name,
-                "way": str(way),
-                "repeat": repeat,
-                **_run(given, way, end_s),
-            }
-            with file.changing() as results:
-                results["rows"] = [*results.get("rows", []), row]
-            sys.stdout.write(f"{json.dumps(row)}\n")
-            sys.stdout.flush()
-    return 0
 
 
-def _run(given: argparse.Namespace, way: Way, end_s: float) -> dict[str, Any]:
+def _sites(cpus: Sequence[int], gpus: Sequence[int]) -> list[Site]:
+    """A GPU each with its part of the cores; all of the machine without several."""
+    if len(gpus) < 2:
+        return [Site((), {})]
+    each = len(cpus) // len(gpus)
+    return [
+        Site(
+            ("taskset", "--cpu-list", ",".join(map(str, cpus[at * each : (at + 1) * each]))),
+            {"CUDA_VISIBLE_DEVICES": str(gpu), "CUDA_DEVICE_ORDER": "PCI_BUS_ID"},
+        )
+        for at, gpu in enumerate(gpus)
+    ]
+
+
+def _measure(
+    given: argparse.Namespace, way: Way, repeat: int, site: Site, file: ResultsFile, end_s: float
+) -> bool:
+    """Adds a row to the file; False where no time was left for it."""
+    if time.monotonic() > end_s - STOP_S:
+        return False
+    found = _run(given, way, site, end_s)
+    row = {"name": given.name, "way": str(way), "repeat": repeat, **found}
+    with file.changing() as results:
+        results["rows"] = [*results.get("rows", []), row]
+    sys.stdout.write(f"{json.dumps(row)}\n")
+    sys.stdout.flush()
+    return True
+
+
+def _run(given: argparse.Namespace, way: Way, site: Site, end_s: float) -> dict[str, Any]:
     with tempfile.TemporaryDirectory() as folder:
         root = Path(folder) / "pack"
         keys = (
@@ -78,8 +123,8 @@ def _run(given: argparse.Namespace, way: Way, end_s: float) -> dict[str, Any]:
             f"pack.backend={way.backend}",
             *given.keys,
         )
-        line = [sys.executable, "-m", "gmijax.pack", *keys, "--", *given.command]
-        code = run_command(line, end_s)
+        line = [*site.prefix, sys.executable, "-m", "gmijax.pack", *keys, "--", *given.command]
+        code = run_command(line, end_s, site.variables)
         if not (root / "pack.json").exists():
             return {"exit_code": code}
         report = read_json(root / "pack.json")
@@ -100,7 +145,7 @@ def _curves(root: Path, jobs: Sequence[dict[str, Any]]) -> list[list[list[float]
     """Steps and metric of the reports of each job."""
     curves = []
     for job in jobs:
-        lines = (Path(job["run_dir"]) / "metrics.jsonl").read_text().splitlines()
+        lines = (Path(job["run_dir"]) / "pack" / "metrics.jsonl").read_text().splitlines()
         found = [json.loads(line) for line in lines]
         curves.append([[one["env_steps"], one["metric"]] for one in found if "metric" in one])
     return curves
@@ -112,6 +157,10 @@ def _options() -> argparse.Namespace:
     parser.add_argument("--at-once", type=int, nargs="*", default=[1, 2, 4, 8])
     parser.add_argument("--share", type=int, nargs="*", default=[4], help="without MPS")
     parser.add_argument("--auto", type=int, nargs="*", default=[], help="copies with auto")
+    parser.add_argument(
+        "--many", type=_pair, nargs="*", default=[], help="so many at once of more, as 8/16"
+    )
+    parser.add_argument("--gpus", type=int, default=1, help="for repeats at the same time")
     parser.add_argument("--keys", nargs="*", default=[], help="of gmijax pack, as key=value")
     parser.add_argument("--repeats", type=int, default=3)
     parser.add_argument("--curves", action="store_true", help="keep the metric of every job")
@@ -123,6 +172,11 @@ def _options() -> argparse.Namespace:
     if not given.command:
         parser.error("no command: expected -- COMMAND ...")
     return given
+
+
+def _pair(text: str) -> tuple[int, int]:
+    count, copies = map(int, text.split("/"))
+    return count, copies
 
 
 if __name__ == "__main__":
