@@ -1,8 +1,8 @@
 """How many jobs at once make the most of a GPU, found with the jobs that have to be run anyway.
 
-One, two, four and so on, while a doubling raises the sum of their rates; a step too far is taken
-back at once by ending the newest jobs, which have done little. Gandiva (OSDI 2018) packs on trial
-and undoes it in the same way.
+One, four, eight and so on, while more raise the sum of their rates; a step too far is taken back
+at once by ending the newest jobs, which have done little. Gandiva (OSDI 2018) packs on trial and
+undoes it in the same way.
 """
 
 from __future__ import annotations
@@ -12,6 +12,9 @@ from typing import Final, NamedTuple
 
 GAIN: Final = 0.05
 """What more jobs must add to the sum of rates, or fewer are as good."""
+
+_FIRST_STEP: Final = 4
+"""After one. A window with two at once would cost most GPUs half of their rate."""
 
 _WARM_REPORTS: Final = 3
 """Reports of a job that are not measured: compiling and the first updates are in them."""
@@ -110,7 +113,7 @@ class Density:
         """A job has completed before so many at once could be measured: jobs are short."""
         if self.is_settled or self.target in self.measured or self.target == self.most:
             return None
-        return self._go_to(min(2 * self.target, self.most), "jobs end before a rate is measured")
+        return self._go_to(self._after(self.target), "jobs end before a rate is measured")
 
     def forbid(self, count: int, why: str) -> Decision | None:
         """So many at once cannot run, e.g. because one of them ran out of memory."""
@@ -118,19 +121,30 @@ class Density:
         return self.settle(self.most, why) if self.target > self.most else None
 
     def _next(self, found: Measured, before: Measured | None) -> Decision | None:
-        count = self.target
-        if before is not None and found.per_s < (1 + GAIN) * before.per_s:
-            fewer = max(k for k in self.measured if k < count)
-            middle = (fewer + count) // 2
+        count, fewer = self.target, max((k for k in self.measured if k < self.target), default=0)
+        middle = (fewer + count) // 2
+        is_new = before is not None and middle > fewer and middle not in self.measured
+        if before is not None and not _gains(found, before):
             gain = (
                 f"{count} at once make {found.per_s / before.per_s:.2f} times the rate of {fewer}"
             )
-            if middle > fewer and middle not in self.measured and 2 * fewer == count:
+            # Between a middle and what is below it nothing is tried.
+            if is_new and count == self._after(fewer):
                 return self._go_to(middle, gain)
             return self.settle(fewer, gain)
-        if any(k > count for k in self.measured) or count == self.most:
+        # Two at once make at most twice the rate of one, so four that make more are better.
+        if before is not None and is_new and fewer == 1 and found.per_s < middle * before.per_s:
+            return self._go_to(middle, self._gain(count))
+        larger = min((k for k in self.measured if k > count), default=0)
+        if larger and not _gains(self.measured[larger], found):
             return self.settle(count, f"{count} at once make the most")
-        return self._go_to(min(2 * count, self.most), self._gain(count))
+        best = larger or count
+        if best == self.most:
+            return self.settle(best, f"{best} at once make the most")
+        return self._go_to(self._after(best), self._gain(best))
+
+    def _after(self, count: int) -> int:
+        return min(_FIRST_STEP if count == 1 else 2 * count, self.most)
 
     def _gain(self, count: int) -> str:
         """What so many at once were found to make."""
@@ -193,6 +207,10 @@ class _Window:
         ]
         variance = sum((_rate(first) - _rate(last)) ** 2 / 4 for first, last in halves)
         return Measured(sum(map(_rate, self._points.values())), variance**0.5)
+
+
+def _gains(found: Measured, before: Measured) -> bool:
+    return found.per_s >= (1 + GAIN) * before.per_s
 
 
 def _rate(points: Sequence[tuple[float, float]]) -> float:
