@@ -3,15 +3,45 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Any, Final, NamedTuple
 
-from benchmarks.evaluation.figures import NOT_MEASURED, figure, link, markdown, origin, shown
+from benchmarks.evaluation.figures import (
+    NOT_MEASURED,
+    Figure,
+    figure,
+    link,
+    markdown,
+    origin,
+    shown,
+)
 from benchmarks.records import RESULTS, Call, calls_by_date
 
-_ALONE = "1 at once, mps"
 _HEAD = (
     "training | at once | steps/s while all report: | over one: | trainings per hour: | over one:"
 )
+_STEPS, _FINISHED = "steps_per_s", "trainings_per_hour"
+_IN_README: Final = (
+    ("mjlab Go1, 4096 environments, 30 iterations", "mjlab Go1"),
+    ("CleanRL PPO, gmijax ant, 2048 environments", "CleanRL's PPO"),
+)
+
+
+class _Training(NamedTuple):
+    """The packs of one training in one call, by number at once."""
+
+    call: Call
+    file: str
+    ways: Mapping[str, Sequence[Mapping[str, Any]]]
+
+    def rate(self, way: str, key: str) -> Figure | None:
+        """A rate over the repeats of a way."""
+        return figure([row[key] for row in self.ways.get(way, ()) if row.get(key) is not None])
+
+    def over_one(self, way: str, key: str) -> float | None:
+        """A rate over that of one at a time."""
+        alone = next((one for one in self.ways if one.startswith("1 ")), "")
+        rate, base = self.rate(way, key), self.rate(alone, key)
+        return rate.median / base.median if rate and base else None
 
 
 def packs() -> list[str]:
@@ -19,49 +49,47 @@ def packs() -> list[str]:
 
     The newest call of each training counts; a ratio is of one call.
     """
-    newest: dict[str, Call] = {}
-    files: dict[str, str] = {}
-    for call, path in calls_by_date(RESULTS, "packs-*.json"):
-        for row in call.results.get("rows", ()):
-            newest[row["name"]], files[row["name"]] = call, path.name
-    rows = [cells for name, call in newest.items() for cells in _of_training(name, call)]
-    found = {(files[name], call.date): call for name, call in newest.items()}
-    calls = [f"- {link(file)}: {origin(call)}" for (file, _), call in found.items()]
-    return [*markdown(_HEAD, rows), "", *(calls or [f"- `packs-*.json`: {NOT_MEASURED}"])]
+    found = _trainings()
+    rows = [cells for name, training in found.items() for cells in _rows(name, training)]
+    calls = {(one.file, one.call.date): one.call for one in found.values()}
+    lines = [f"- {link(file)}: {origin(call)}" for (file, _), call in calls.items()]
+    return [*markdown(_HEAD, rows), "", *(lines or [f"- `packs-*.json`: {NOT_MEASURED}"])]
 
 
 def packed_gains() -> str:
-    """In words, what the training with the most at once gains."""
-    calls = calls_by_date(RESULTS, "packs-nvidia-*.json")
-    rows = calls[-1][0].results.get("rows", ()) if calls else ()
-    found = {row["way"]: row for row in rows if row.get("exit_code") == 0}
-    eight, alone = found.get("8 at once, mps"), found.get(_ALONE)
-    if eight is None or alone is None:
+    """In words, what eight at once gain."""
+    found = _trainings()
+    parts = []
+    for name, title in _IN_README:
+        training, way = found.get(name), "8 at once, mps"
+        if training is None or training.over_one(way, _FINISHED) is None:
+            continue
+        steps, finished = (f"{training.over_one(way, key):.2f}" for key in (_STEPS, _FINISHED))
+        repeats = len(training.ways[way])
+        parts.append(f"{title} {steps} and {finished} (n={repeats})")
+    if not parts:
         return NOT_MEASURED
-    ratios = (eight[key] / alone[key] for key in ("steps_per_s", "trainings_per_hour"))
-    steps, finished = (f"{ratio:.2f}" for ratio in ratios)
-    return (
-        f"eight at once of {eight['name'].split(',')[0]}: {steps} times the steps/s of one, "
-        f"{finished} times the trainings per hour (n=1)"
-    )
+    return f"eight at once over one, in steps/s and in trainings per hour: {', '.join(parts)}"
 
 
-def _of_training(name: str, call: Call) -> list[list[str]]:
-    by_way: dict[str, list[Mapping[str, Any]]] = {}
-    for row in call.results.get("rows", ()):
-        if row["name"] == name and row.get("exit_code") == 0:
-            by_way.setdefault(row["way"], []).append(row)
-    alone = by_way.get(_ALONE, [])
+def _trainings() -> dict[str, _Training]:
+    found: dict[str, _Training] = {}
+    for call, path in calls_by_date(RESULTS, "packs-nvidia-*.json"):
+        rows = [row for row in call.results.get("rows", ()) if row.get("exit_code") == 0]
+        for name in dict.fromkeys(row["name"] for row in rows):
+            ways: dict[str, list[Mapping[str, Any]]] = {}
+            for row in rows:
+                if row["name"] == name:
+                    ways.setdefault(row["way"], []).append(row)
+            found[name] = _Training(call, path.name, ways)
+    return found
+
+
+def _rows(name: str, training: _Training) -> list[list[str]]:
     rows = []
-    for way, own in by_way.items():
+    for way in training.ways:
         cells = [name if not rows else "", way]
-        for key, form in (("steps_per_s", ",.0f"), ("trainings_per_hour", ",.1f")):
-            rate, base = figure(_values(own, key)), figure(_values(alone, key))
-            over = rate.median / base.median if rate and base else None
-            cells += [shown(rate, form), shown(over)]
+        for key, form in ((_STEPS, ",.0f"), (_FINISHED, ",.1f")):
+            cells += [shown(training.rate(way, key), form), shown(training.over_one(way, key))]
         rows.append(cells)
     return rows
-
-
-def _values(rows: Sequence[Mapping[str, Any]], key: str) -> list[float]:
-    return [row[key] for row in rows if row.get(key) is not None]
