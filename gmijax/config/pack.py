@@ -54,6 +54,11 @@ class PackConfig(JobsConfig):
         "well-known trainers print",
         default=None,
     )
+    tag: str | None = doc(
+        "TensorBoard tag of what jobs are ranked by, in place of a metric; read from event files "
+        "below the job's {run_dir}",
+        default=None,
+    )
     total_steps: int | None = doc(
         "steps of a job at its end, where its output does not have them; for ETA and pruner",
         default=None,
@@ -86,3 +91,5 @@ class PackConfig(JobsConfig):
         super().__post_init__()
         if self.copies is not None and self.commands is not None:
             raise ConfigError("pack.copies, pack.commands: give one of them")
+        if self.metric is not None and self.tag is not None:
+            raise ConfigError("pack.metric, pack.tag: give one of them")

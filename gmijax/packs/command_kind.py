@@ -7,6 +7,7 @@ import math
 import os
 import shlex
 import signal
+import time
 from collections import Counter
 from collections.abc import Callable, Collection, Sequence
 from contextlib import suppress
@@ -17,6 +18,7 @@ from typing import Any, Final
 from gmijax.clock import running_s
 from gmijax.config.pack import PackConfig
 from gmijax.packs.command_job import CommandJob
+from gmijax.packs.event_files import EventReader
 from gmijax.packs.failure import failure_of
 from gmijax.packs.output import OutputReader
 from gmijax.packs.progress import ProgressReader, own_patterns
@@ -129,7 +131,11 @@ class CommandKind:
         begins = log.stat().st_size
         self._attempts[number] = _Attempt(_Silence(log), begins, resumes)
         output = OutputReader(log, begins)
-        reader = _Recorder(ProgressReader(output, self._own, running_s(), running_s), run.metrics)
+        events = None
+        if settings.tag is not None:
+            events = EventReader(run_dir, settings.tag, time.time(), running_s)
+        progress = ProgressReader(output, self._own, running_s(), running_s, events)
+        reader = _Recorder(progress, run.metrics)
         # On CPU cores alone nothing is compiled that others could use.
         program = job.program if place.devices else ""
         return Start(process, program, (reader,))

@@ -124,7 +124,9 @@ class _Gpu:
     def __init__(self, device: str, title: str, places: int, host: Host) -> None:
         self.device, self.title, self._host = device, title, host
         self.since_s = 0.0
+        self._places = places
         self.rule = Density(places)
+        self._measured: set[tuple[str, ...]] = set()
         found = host.load_of(device)
         self._before_mib = found.used_mib if found else 0.0
         self._peak_mib = 0.0
@@ -136,6 +138,7 @@ class _Gpu:
     def look(self, now_s: float, here: Sequence[Running[CommandJob]]) -> Decision | None:
         """What to change."""
         before, self._latest = self._latest, here
+        self._begin_anew(here)
         load = self._host.load_of(self.device)
         if load is not None:
             self._busy = [*self._busy[-29:], load.busy]
@@ -156,6 +159,15 @@ class _Gpu:
             self._are_known = are_known
             self.rule.forget()
         return self.rule.look(now_s, _seen(here, are_known))
+
+    def _begin_anew(self, here: Sequence[Running[CommandJob]]) -> None:
+        """Measures again from the number now, once only jobs of other commands run."""
+        commands = {one.jobs[0].command for one in here}
+        if not self.rule.is_settled:
+            self._measured |= commands
+        elif self._measured and self._measured.isdisjoint(commands):
+            self.rule = Density(self._places, self.rule.target)
+            self._measured, self._peak_mib, self._has_doubled = commands, 0.0, False
 
     def _by_memory(self, load: GpuLoad, count: int) -> Decision | None:
         each_mib = max(0.0, load.used_mib - self._before_mib) / count

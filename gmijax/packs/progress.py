@@ -16,6 +16,7 @@ from typing import Any, Final, NamedTuple
 
 from gmijax.config.pack import METRIC
 from gmijax.errors import ConfigError
+from gmijax.packs.event_files import EventReader
 from gmijax.packs.output import OutputReader
 from gmijax.packs.trainers import FAMILIES, Family, Report, report_of
 
@@ -72,6 +73,8 @@ class ProgressReader:
       own: the user's expressions; they are read beside a known family, and win over it.
       started_s: when the process started, by the same clock.
       clock: seconds.
+      events: its TensorBoard files. Their values are the metric; their steps count where the
+        output names none.
     """
 
     def __init__(
@@ -80,8 +83,9 @@ class ProgressReader:
         own: OwnPatterns | None,
         started_s: float,
         clock: Callable[[], float] = time.monotonic,
+        events: EventReader | None = None,
     ) -> None:
-        self._output, self._own = output, own
+        self._output, self._own, self._events = output, own, events
         self._started_s, self._clock = started_s, clock
         self.family: Family | None = None
         self._hits = dict.fromkeys(FAMILIES, 0)
@@ -93,9 +97,16 @@ class ProgressReader:
     def new(self) -> list[dict[str, Any]]:
         """Lines of metrics that came since the last call."""
         now_s = self._clock()
-        reports = (report for text in self._output.new() for report in self._reports(text))
+        reports = [report for text in self._output.new() for report in self._reports(text)]
+        if self._events is not None:
+            reports = [report._replace(metric=None) for report in reports]
+            reports += map(self._of_event, self._events.new())
         taken = (self._take(report, now_s) for report in reports)
         return [line for line in taken if line is not None]
+
+    def _of_event(self, report: Report) -> Report:
+        has_steps = self._own is not None or self.family is not None
+        return report._replace(steps=None) if has_steps else report
 
     def _reports(self, text: str) -> Sequence[Report]:
         reports = self._of_family(text)
@@ -134,6 +145,8 @@ class ProgressReader:
                 continue
             self._hits[family] += 1
             if self._hits[family] == 2:
+                if self.family is None and self._events is not None:
+                    self._steps = _Steps()  # Those of events may be iterations.
                 self.family = family
                 return [found for line in self._early if (found := family.read(line)) is not None]
         return ()

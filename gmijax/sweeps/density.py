@@ -70,11 +70,12 @@ class Density:
 
     Args:
       most: what memory, cores and the limit of clients allow; it may sink later.
+      start: the number at once that is measured first.
     """
 
-    def __init__(self, most: int) -> None:
+    def __init__(self, most: int, start: int = 1) -> None:
         self.most = max(1, most)
-        self.target = 1
+        self.target = start
         self.is_settled = self.most == 1
         self.measured: dict[int, Measured] = {}
         self._window: _Window | None = None

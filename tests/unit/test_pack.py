@@ -5,6 +5,7 @@ from __future__ import annotations
 import signal
 from collections.abc import Sequence
 from contextlib import closing
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -316,7 +317,7 @@ class Packed:
     def go_on(self, seconds: int) -> None:
         for _ in range(seconds):
             self.clock.now_s += 1.0
-            while (place := self.places.take(1)) is not None:
+            while self.queue and (place := self.places.take(1)) is not None:
                 job = self.queue.pop(0)
                 one = Running((job,), place, self.host, 0, (), started_s=self.clock.now_s)
                 self.running.append(one)
@@ -348,6 +349,20 @@ def test_jobs_are_added_while_they_gain_and_taken_back_when_they_do_not(clock: C
     assert packed.crowd.decisions[-1]["why"] == "6 at once make 0.87 times the rate of 4"
     newest = max(one.started_s for one in packed.running)
     assert newest < 200.0  # The oldest went on.
+
+
+def test_jobs_of_another_command_are_measured_anew(clock: Clock) -> None:
+    packed = Packed(clock, [1000.0, 1010.0], memory_mib=100.0)
+    packed.go_on(400)
+    assert [len(packed.running), packed.crowd.decisions[-1]["at_once"]] == [1, 1]
+    packed.go_on(400)
+    assert packed.crowd.decisions[-1]["time_s"] < 400.0  # Of the same command: nothing new.
+    packed.queue = [replace(job, command=("other",)) for job in packed.queue]
+    packed.rates = [1000.0 * k for k in range(1, 17)]
+    done = packed.running.pop()
+    packed.places.give_back(done.place)
+    packed.go_on(400)
+    assert packed.crowd.decisions[-1]["at_once"] > 4
 
 
 def test_memory_of_the_first_job_bounds_their_number(clock: Clock) -> None:
