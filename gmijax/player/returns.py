@@ -62,13 +62,8 @@ def _episode(env: PlainEnv, policy: PlainPolicy) -> Played:
             return Played(np.stack(qpos), total, terms, env.metrics, step.terminated)
 
 
-def returns_of(policy: PlainPolicy, *, num_episodes: int, seed: int) -> dict[str, Any]:
-    """Statistics over episodes, as plain data: means, the deviation of returns, their quantiles."""
-    return statistics(list(play(policy, num_episodes, seed)))
-
-
 def statistics(episodes: Sequence[Played]) -> dict[str, Any]:
-    """See `returns_of`."""
+    """Statistics over episodes as plain data: means, and the spread of returns."""
     returns = np.array([one.return_ for one in episodes])
     names = episodes[0].metrics
     return {
