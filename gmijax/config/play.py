@@ -62,7 +62,7 @@ class PlayConfig(KeyGroup):
         "returns; null: 4, or all if there are fewer"
     )
     html: Literal["auto", "on", "off"] = doc(
-        "write a page with the median environment in 3D, with Brax's viewer, which a browser loads "
+        "write a page with the median environment in 3D, by Brax's viewer, which a browser loads "
         "from the internet; auto: where brax is installed and knows the model's shapes"
     )
     width: int = doc("width of the picture in pixels", low=64, high=4096)
