@@ -9,6 +9,9 @@ from typing import Literal
 from gmijax.config.env import EnvConfig, PhysicsConfig
 from gmijax.config.schema import KeyGroup, doc, require_between
 
+FILMED = 4
+"""Environments that a film shows."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class PlayRunConfig:
@@ -16,8 +19,8 @@ class PlayRunConfig:
 
     dir: str | None = doc("run folder, or `last`; null: the run of `checkpoint`, else `last`")
     env: str | None = doc(
-        "the run's custom task, PATH.py:FUNCTION, where its file has changed or moved since; "
-        "env=PATH.py:FUNCTION is short for it; null: as the run noted it",
+        "the run's custom task, PATH.py:FUNCTION, where its file has changed or moved since; with "
+        "checkpoint=shipped the task; env= is short for it; null: as the run noted it",
         default=None,
     )
     # Digest of that file: the controller notes it for its child.
@@ -38,7 +41,8 @@ class PlayConfig(KeyGroup):
     physics: PhysicsConfig
     checkpoint: str | None = doc(
         "folder of a checkpoint, its env steps, or `best`: the one with the best return, in an "
-        "evaluation if there are any; null: the latest"
+        "evaluation if there are any; null: the latest. `shipped`, with env=TASK: the policy that "
+        "comes with gmijax, in MuJoCo in C"
     )
     num_envs: int = doc("N, environments, one episode each", low=1)
     seed: int = doc("seed of the episodes' starts and of sampled actions", low=0, high=2**31 - 1)
@@ -53,9 +57,12 @@ class PlayConfig(KeyGroup):
     video: Literal["auto", "mp4", "gif", "both", "none"] = doc(
         "what to film; auto: mp4, or nothing where there is no headless OpenGL"
     )
-    video_envs: int = doc("how many of the environments are shown, in a grid")
+    video_envs: int | None = doc(
+        "how many of the environments are shown, in a grid: evenly spread over the order of their "
+        "returns; null: 4, or all if there are fewer"
+    )
     html: Literal["auto", "on", "off"] = doc(
-        "write a page with the first environment in 3D, with Brax's viewer, which a browser loads "
+        "write a page with the median environment in 3D, by Brax's viewer, which a browser loads "
         "from the internet; auto: where brax is installed and knows the model's shapes"
     )
     width: int = doc("width of the picture in pixels", low=64, high=4096)
@@ -67,7 +74,13 @@ class PlayConfig(KeyGroup):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        require_between("video_envs", self.video_envs, 1, self.num_envs)
+        if self.video_envs is not None:
+            require_between("video_envs", self.video_envs, 1, self.num_envs)
+
+    @property
+    def num_filmed(self) -> int:
+        """How many environments are shown."""
+        return min(FILMED, self.num_envs) if self.video_envs is None else self.video_envs
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -18,7 +18,9 @@ from rich.table import Table
 from gmijax.config import EnvConfig, ExportConfig, PlanConfig, PlayConfig, ReduceConfig, Timeouts
 from gmijax.config.schema import to_dict
 from gmijax.control.console import doing, nearby, open_console
+from gmijax.deploy import shipped
 from gmijax.deploy.pictures import film, has_brax, write_page
+from gmijax.deploy.shipped import SHIPPED
 from gmijax.errors import ConfigError, GmijaxError
 from gmijax.machine.snapshot import Machine, detect_machine
 from gmijax.partition.planner import make_plan
@@ -69,15 +71,27 @@ def play(config: PlayConfig, *, show: bool = False) -> None:
       GmiFailed: the evaluation failed.
       GmijaxError: a film was asked for and could not be made; the returns are there.
     """
-    config, changed = _opened(config)
-    # A film of an earlier evaluation must not lie beside the returns of this one.
-    paths = PlayPaths(output_folder(config, "play", lambda root: PlayPaths(root).results()))
+    _require_page(config)
     console = open_console(show=show)
-    console.print(f"checkpoint: {nearby(Path(str(config.checkpoint)))}")
-    if changed:
-        console.print(changed)
-    with doing(console, f"playing {config.num_envs} episodes"):
-        run_gmis(_launch(config, paths, detect_machine()))
+    if config.checkpoint == SHIPPED:
+        config = shipped.checked(config)
+        paths = shipped.folder_of(config)
+        with doing(console, f"playing {config.num_envs} episodes"):
+            shipped.play(paths)
+    else:
+        config, changed = _opened(config)
+        # A film of an earlier evaluation must not lie beside the returns of this one.
+        paths = PlayPaths(output_folder(config, "play", lambda root: PlayPaths(root).results()))
+        console.print(f"checkpoint: {nearby(Path(str(config.checkpoint)))}")
+        if changed:
+            console.print(changed)
+        with doing(console, f"playing {config.num_envs} episodes"):
+            run_gmis(_launch(config, paths, detect_machine()))
+    _show(config, paths, console)
+
+
+def _show(config: PlayConfig, paths: PlayPaths, console: Console) -> None:
+    """Prints the returns, and makes the pictures."""
     returns = read_json(paths.returns)
     console.print(_table(returns))
     console.print(f"returns: {nearby(paths.returns)}")
@@ -94,12 +108,20 @@ def play(config: PlayConfig, *, show: bool = False) -> None:
         paths.model.unlink(missing_ok=True)
 
 
-def _opened(config: PlayConfig) -> tuple[PlayConfig, str | None]:
-    """As `open_run`, with what only playing asks for checked too."""
+def _require_page(config: PlayConfig) -> None:
     if config.html == "on" and not has_brax():
         raise ConfigError(
             "html=on: needs the package brax (pip install 'gmijax[brax]'); "
             "allowed without it are auto, off"
+        )
+
+
+def _opened(config: PlayConfig) -> tuple[PlayConfig, str | None]:
+    """As `open_run`, with what only playing asks for checked too."""
+    if config.run.env is not None and ".py" not in config.run.env:
+        raise ConfigError(
+            f"env={config.run.env}: a run knows its task; add checkpoint=shipped for the policy "
+            "that comes with gmijax"
         )
     config, env, changed = open_run(config)
     if config.randomize == "on" and not env.randomization:

@@ -1,6 +1,6 @@
 """Main of the page-writing child of `gmijax.play`, `page_writer.py PLAY_FOLDER`.
 
-Turns the trajectory of the first world into a page that shows it in 3D in a browser, with the
+Turns the trajectory of the median world into a page that shows it in 3D in a browser, with the
 viewer of `brax.io.html`. The page holds the geometry and the motion; the viewer itself comes from
 the internet (jsdelivr.net, unpkg.com) when the page is opened.
 """
@@ -54,7 +54,7 @@ def main() -> int:
 
 
 def page(model: mujoco.MjModel, trajectory: Trajectory) -> str:
-    """The page of the first world of `trajectory`, in real time.
+    """The page of the median world of `trajectory`, in real time.
 
     Raises:
       Exception: of any type, for a model that Brax cannot represent.
@@ -65,7 +65,8 @@ def page(model: mujoco.MjModel, trajectory: Trajectory) -> str:
 
     _check_shapes(model)
     timing = real_time(trajectory.control_dt_s, MAX_FPS)
-    qpos = trajectory.qpos[: trajectory.lengths[0] + 1 : timing.stride, 0]
+    world = len(trajectory.lengths) // 2  # Of those by the order of their returns.
+    qpos = trajectory.qpos[: trajectory.lengths[world] + 1 : timing.stride, world]
     frames: list[Any] = []
     for row in qpos:
         pos, rot = poses_of(model, row)

@@ -29,10 +29,10 @@ def model_of(asset: str) -> mujoco.MjModel:
 
 
 def falling(model: mujoco.MjModel) -> Trajectory:
-    """Two worlds of which the first ends early; a free joint moves up by a metre a step."""
+    """Two worlds of which the second ends early; its free joint moves up by a metre a step."""
     qpos = np.tile(model.qpos0, (NUM_STEPS + 1, 2, 1)).astype(np.float32)
-    qpos[:, 0, 2] += np.arange(NUM_STEPS + 1)
-    return Trajectory(qpos, np.array([NUM_STEPS - 2, NUM_STEPS]), CONTROL_DT_S)
+    qpos[:, 1, 2] += np.arange(NUM_STEPS + 1)
+    return Trajectory(qpos, np.array([NUM_STEPS, NUM_STEPS - 2]), CONTROL_DT_S)
 
 
 def read(text: str) -> dict[str, Any]:
@@ -55,7 +55,7 @@ def test_every_visible_geom_hangs_on_a_body_that_has_a_pose_in_every_frame(asset
     for frame in frames:
         assert np.shape(frame["pos"]) == (model.nbody - 1, 3)
         assert np.shape(frame["rot"]) == (model.nbody - 1, 4)
-    # 100 steps a second: every second one, up to the end of the first world's episode.
+    # 100 steps a second: every second one, up to the end of the median world's episode.
     assert len(frames) == NUM_STEPS // 2
     assert data["opt"]["timestep"] == pytest.approx(0.02)
 
@@ -65,7 +65,7 @@ def test_bodies_are_where_mujoco_has_them():
     trajectory = falling(model)
     frames = read(page(model, trajectory))["states"]["x"]
     data = mujoco.MjData(model)
-    data.qpos[:] = trajectory.qpos[8, 0]
+    data.qpos[:] = trajectory.qpos[8, 1]
     mujoco.mj_kinematics(model, data)
     np.testing.assert_allclose(frames[4]["pos"], data.xpos[1:], atol=1e-5)
     np.testing.assert_allclose(frames[4]["rot"], data.xquat[1:], atol=1e-5)
