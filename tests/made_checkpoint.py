@@ -14,6 +14,7 @@ from gmijax.learning.checkpoint import checkpoint_meta, finish_checkpoint, save_
 from gmijax.learning.episode_window import Standing
 from gmijax.learning.learner import learner_shapes
 from gmijax.learning.normalize import Moments
+from gmijax.learning.policy_file import save_policy
 from gmijax.runs.folder import RunPaths, write_json
 from gmijax.sim.interface import EnvSpec
 
@@ -50,5 +51,6 @@ def make_run(root: Path, *overrides: str, actor_obs_size: int | None = None) -> 
         key=jax.random.key(0),
     )
     save_learner(run, ENV_STEPS, state)
+    save_policy(run, ENV_STEPS, config.env, config.algo, state)
     finish_checkpoint(run, checkpoint_meta(config, ENV_STEPS, 1, Standing()))
     return run

@@ -191,7 +191,7 @@ def update(
     """See `make_update`."""
     batch, weight = weighted
     targets = batch_targets(learner, state, batch, weight)
-    obs = without_outliers(acting_moments(learner, state), batch.state)
+    obs = without_outliers(acting_moments(learner.config, state), batch.state)
     everyone = peers.gather((moments_of(obs, 2), *targets.fit))
     seen, target, error = map(merge_all, everyone)
     state = with_targets(learner, state, target)

@@ -26,6 +26,7 @@ from gmijax.learning.checkpoint import (
     save_learner,
 )
 from gmijax.learning.learner import TrainState, policy_figures
+from gmijax.learning.policy_file import save_policy
 from gmijax.learning.start import first_window
 from gmijax.learning.training_log import TrainingLog
 from gmijax.sim.wrappers import BatchedEnv
@@ -165,6 +166,7 @@ class Leader:
     def _begin_checkpoint(self, state: TrainState) -> None:
         require_finite(state.params, self.config.env.label, self.env_steps)
         save_learner(self.link.run, self.env_steps, state)
+        save_policy(self.link.run, self.env_steps, self.config.env, self.config.algo, state)
         self._pending = self.env_steps
 
     def _wait_for_agents(self) -> None:

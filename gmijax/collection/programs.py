@@ -64,7 +64,7 @@ def trained_policy(checkpoint: Path, spec: EnvSpec, *, deterministic: bool) -> A
     learner = make_learner(spec, trained_config(checkpoint)[1])
     start = jax.jit(lambda key: init_learner(learner, spec.obs_size, key))(jax.random.key(0))
     state = restore_learner(checkpoint, start)
-    weights = state.params, acting_moments(learner, state)
+    weights = state.params, acting_moments(learner.config, state)
     sha = digest(weights).astype("uint16").tobytes().hex()
     return ActingPolicy(_trained(learner, deterministic), weights, sha)
 

@@ -53,7 +53,7 @@ class CheckpointSaver:
         meta: CheckpointMeta,
         learner_state: PyTree,
         env_state: PyTree | None,
-        save_more: Callable[[], None] = lambda: None,
+        save_more: Callable[[Any], None] = lambda _: None,
     ) -> None:
         """Begins to write a checkpoint; both states may be donated after it.
 
@@ -61,7 +61,7 @@ class CheckpointSaver:
           meta: of the checkpoint.
           learner_state: the same on all GMIs; the leader writes it.
           env_state: this GMI's environments, None where it has none.
-          save_more: writes what else the leader has for it.
+          save_more: writes what else the leader has for it, given its state on the host.
         """
         self.finish()
         leader_state = on_host(learner_state) if self._is_leader else None
@@ -72,7 +72,7 @@ class CheckpointSaver:
                 save_envs(self._run, meta.env_steps, self._gmi, own_envs)
             if leader_state is not None:
                 save_learner(self._run, meta.env_steps, leader_state)
-                save_more()
+                save_more(leader_state)
 
         self._unnamed = meta
         self._thread.report(write)

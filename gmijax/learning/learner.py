@@ -119,10 +119,10 @@ def init_learner(learner: Learner, obs_size: int, key: PRNGKey) -> TrainState:
     )
 
 
-def acting_moments(learner: Learner, state: TrainState) -> Moments:
+def acting_moments(config: AlgoConfig, state: TrainState) -> Moments:
     """The statistics that observations are normalised with (none if switched off)."""
-    if learner.config.normalize_observations:
-        return with_std_floor(state.obs_moments, learner.config.obs_std_floor)
+    if config.normalize_observations:
+        return with_std_floor(state.obs_moments, config.obs_std_floor)
     return no_samples(state.obs_moments.mean.shape)
 
 
@@ -159,8 +159,8 @@ def finish_iteration(learner: Learner, state: TrainState, seen: Moments) -> Trai
     if not learner.config.preserve_outputs:
         return after
     units = change_of_units(
-        acting_moments(learner, state),
-        acting_moments(learner, after),
+        acting_moments(learner.config, state),
+        acting_moments(learner.config, after),
         _LEAST_STD_IN_FLOORS * learner.config.obs_std_floor,
     )
     return after._replace(params=learner.networks.with_inputs(state.params, *units))
@@ -182,7 +182,7 @@ class ActingWeights(NamedTuple):
 
 def acting_weights(learner: Learner, state: TrainState) -> ActingWeights:
     """The weights to act with when the learner has `state`."""
-    return ActingWeights(state.params, acting_moments(learner, state), state.value_moments)
+    return ActingWeights(state.params, acting_moments(learner.config, state), state.value_moments)
 
 
 def state_values(networks: ActorCritic, weights: ActingWeights, obs: Array) -> Array:

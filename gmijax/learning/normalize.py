@@ -2,7 +2,8 @@
 
 `Moments` of any split of the samples merge to the moments of all of them (Chan et al. 1979,
 "Updating formulae and a pairwise algorithm for computing sample variances"), so several GMIs
-can share them: each sends the moments of its own rollout.
+can share them: each sends the moments of its own rollout. `with_std_floor` and `std_of` also take
+moments in numpy, of which files of policies are written.
 """
 
 from __future__ import annotations
@@ -14,6 +15,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
+from gmijax.arrays import array_module
 from gmijax.types import Array
 
 OBS_CLIP = 10.0
@@ -60,7 +62,8 @@ def with_std_floor(moments: Moments, floor: float) -> Moments:
     """`moments` with no standard deviation below `floor`; no samples stay none."""
     if floor <= MIN_STD:  # `std_of` sees to that.
         return moments
-    return moments._replace(m2=jnp.maximum(moments.m2, floor**2 * moments.count))
+    xp = array_module(moments.m2)
+    return moments._replace(m2=xp.maximum(moments.m2, floor**2 * moments.count))
 
 
 def moments_of_those(chosen: Array, samples: Array) -> Moments:
@@ -101,8 +104,9 @@ def merge_all(stacked: Moments) -> Moments:
 
 def std_of(moments: Moments) -> Array:
     """Standard deviation, 1 while there are no samples; never below 1e-4."""
-    variance = moments.m2 / jnp.maximum(moments.count, 1.0)
-    return jnp.where(moments.count > 0, jnp.maximum(jnp.sqrt(variance), MIN_STD), 1.0)
+    xp = array_module(moments.m2)
+    variance = moments.m2 / xp.maximum(moments.count, 1.0)
+    return xp.where(moments.count > 0, xp.maximum(xp.sqrt(variance), MIN_STD), 1.0)
 
 
 def in_units(moments: Moments, samples: Array) -> Array:

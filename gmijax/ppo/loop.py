@@ -30,6 +30,7 @@ from gmijax.learning.checkpoint import (
 from gmijax.learning.checkpoint_saver import CheckpointSaver
 from gmijax.learning.evaluator import Evaluation, Evaluator, evaluation_worlds
 from gmijax.learning.learner import TrainState, make_learner
+from gmijax.learning.policy_file import save_policy
 from gmijax.learning.report_thread import ReportThread
 from gmijax.learning.start import first_envs, first_state, first_window
 from gmijax.learning.throughput import ThroughputMeter
@@ -273,7 +274,11 @@ class TrainingLoop:
         num_gmis, episodes = self._reducer.world_size, log.episodes()
         evaluated = None if evaluation is None else evaluation.mean_return
         meta = checkpoint_meta(config, steps, num_gmis, log.standing(), evaluated)
-        save_more = partial(save_episodes, self._link.run, steps, config, episodes)
+
+        def save_more(host_state: TrainState) -> None:
+            save_policy(self._link.run, steps, config.env, config.algo, host_state)
+            save_episodes(self._link.run, steps, config, episodes)
+
         self._saver.begin(meta, state, env_state, save_more)
 
     def _meet(self) -> None:

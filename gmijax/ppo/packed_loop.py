@@ -32,6 +32,7 @@ from gmijax.learning.checkpoint import (
 )
 from gmijax.learning.episode_window import Standing
 from gmijax.learning.learner import Learner, TrainState, make_learner
+from gmijax.learning.policy_file import save_policy
 from gmijax.learning.report_thread import ReportThread
 from gmijax.learning.start import first_envs, first_state, first_window
 from gmijax.learning.training_log import TrainingLog
@@ -88,6 +89,7 @@ class Member:
             return
         save_envs(self.run, env_steps, 0, envs)
         save_learner(self.run, env_steps, state)
+        save_policy(self.run, env_steps, self.config.env, self.config.algo, state)
         save_episodes(self.run, env_steps, self.config, episodes)
 
     def name_checkpoint(self, env_steps: int, standing: Standing) -> None:

@@ -24,6 +24,9 @@ RUNS = Path("runs")
 META = "meta.json"
 """Written last into a checkpoint: a folder without it is not one."""
 
+POLICY = "policy.npz"
+"""The policy of a checkpoint, for who has no jax; those of older versions have none."""
+
 UNFINISHED, REMOVED = ".partial", ".removed"
 """Ends of the names of checkpoints that are written or removed, which begin with a dot."""
 

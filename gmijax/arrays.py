@@ -1,0 +1,21 @@
+"""The same lines of code for numpy and for JAX; imports no jax.
+
+A function that begins with `xp = array_module(x)` runs on whichever of the two its arguments are
+of, as the Python array API standard has it. So a task that is trained in JAX is played without.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+_OF_NUMPY = (np.ndarray, np.generic, bool, int, float)
+
+
+def array_module(*values: Any) -> Any:
+    """`jax.numpy` if any of the values is an array of JAX, traced ones included, else `numpy`."""
+    for value in values:
+        if not isinstance(value, _OF_NUMPY):
+            return value.__array_namespace__()
+    return np

@@ -1,0 +1,1 @@
+"""Plays policies in plain MuJoCo with numpy alone: no jax, and nothing is compiled."""

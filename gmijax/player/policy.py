@@ -1,0 +1,146 @@
+"""`policy.npz`: a policy as a small file, read and run by numpy alone.
+
+The learner writes one into every checkpoint (`gmijax.learning.policy_file`). It holds the weights
+of the policy's network, the statistics that observations are normalised with, and the task.
+"""
+
+from __future__ import annotations
+
+import io
+import json
+import zipfile
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final, TypeAlias
+
+import numpy as np
+import numpy.typing as npt
+
+from gmijax.errors import ConfigError
+from gmijax.runs.folder import open_regular, write_bytes
+
+Floats: TypeAlias = npt.NDArray[np.float32]
+
+FORMAT: Final = 1
+
+_HEADS: Final = ("normal", "tanh_normal")
+"""Names of `gmijax.learning.distributions`: the action is the mean, or the tanh of it."""
+
+
+@dataclass(frozen=True)
+class PlainPolicy:
+    """A policy that acts without noise: `policy(obs) -> actions`.
+
+    Attributes:
+      kernels: weights [in, out] of every layer, ELU between them, float32.
+      biases: [out] of every layer.
+      obs_mean: [O] that is subtracted from observations.
+      obs_std: [O] that they are divided by then.
+      obs_clip: normalised observations are clipped to +- this; None: they are not.
+      head: what the network's output is, `normal` or `tanh_normal`.
+      action_size: A; the network may give more, which is noise.
+      about: what the policy is, as plain data: `env` (the keys of its task), `env_steps` and
+        `gmijax_version`, and what else its writer noted.
+    """
+
+    kernels: Sequence[Floats]
+    biases: Sequence[Floats]
+    obs_mean: Floats
+    obs_std: Floats
+    obs_clip: float | None
+    head: str
+    action_size: int
+    about: Mapping[str, Any]
+
+    @property
+    def obs_size(self) -> int:
+        """O, how many numbers of an observation the policy sees."""
+        return len(self.obs_mean)
+
+    def __call__(self, obs: npt.ArrayLike) -> Floats:
+        """Actions [..., A] in [-1, 1] for raw observations [..., O], or longer ones.
+
+        Of longer ones the first O numbers are seen: the others are for a value function.
+        """
+        seen = np.asarray(obs, np.float32)[..., : self.obs_size]
+        x = (seen - self.obs_mean) / self.obs_std
+        if self.obs_clip is not None:
+            x = np.clip(x, -self.obs_clip, self.obs_clip)
+        for kernel, bias in zip(self.kernels[:-1], self.biases[:-1], strict=True):
+            x = x @ kernel + bias
+            x = np.where(x > 0, x, np.expm1(np.minimum(x, 0)))
+        mean = (x @ self.kernels[-1] + self.biases[-1])[..., : self.action_size]
+        return np.clip(np.tanh(mean) if self.head == "tanh_normal" else mean, -1.0, 1.0)
+
+
+def write_policy(path: Path, policy: PlainPolicy, *, half: bool = False) -> None:
+    """Writes `policy.npz`, as a whole or not at all; with `half` its weights are float16."""
+    layers = zip(policy.kernels, policy.biases, strict=True)
+    arrays: dict[str, npt.NDArray[Any]] = {"obs_mean": policy.obs_mean, "obs_std": policy.obs_std}
+    for number, (kernel, bias) in enumerate(layers):
+        arrays[f"kernel_{number}"] = kernel.astype(np.float16) if half else kernel
+        arrays[f"bias_{number}"] = bias
+    head = {
+        "format": FORMAT,
+        "num_layers": len(policy.kernels),
+        "obs_clip": policy.obs_clip,
+        "head": policy.head,
+        "action_size": policy.action_size,
+        "about": dict(policy.about),
+    }
+    content = io.BytesIO()
+    np.savez(content, header=np.array(json.dumps(head)), **arrays)
+    write_bytes(path, content.getvalue())
+
+
+def read_policy(path: Path) -> PlainPolicy:
+    """Reads what `write_policy` wrote.
+
+    Raises:
+      ConfigError: there is no such file, or it holds no policy.
+    """
+    try:
+        with open_regular(path) as file, np.load(file, allow_pickle=False) as data:
+            return _policy_of(data)
+    except OSError as error:
+        raise ConfigError(f"{path}: cannot be read ({error.strerror or error})") from None
+    except (EOFError, KeyError, TypeError, ValueError, zipfile.BadZipFile) as error:
+        raise ConfigError(f"{path}: not a policy ({' '.join(str(error).split())})") from None
+
+
+def _policy_of(data: Mapping[str, Any]) -> PlainPolicy:
+    head = json.loads(str(data["header"]))
+    if head["format"] != FORMAT or head["head"] not in _HEADS:
+        raise ValueError("written by another version of gmijax")
+    kernels, biases = (
+        [_floats(data[f"{kind}_{number}"]) for number in range(head["num_layers"])]
+        for kind in ("kernel", "bias")
+    )
+    policy = PlainPolicy(
+        kernels,
+        biases,
+        _floats(data["obs_mean"]),
+        _floats(data["obs_std"]),
+        head["obs_clip"],
+        head["head"],
+        head["action_size"],
+        head["about"],
+    )
+    _require_sizes(policy)
+    return policy
+
+
+def _floats(array: npt.NDArray[Any]) -> Floats:
+    return np.asarray(array, np.float32)
+
+
+def _require_sizes(policy: PlainPolicy) -> None:
+    """Raises ValueError where the layers do not fit each other, or are none."""
+    widths = [policy.obs_size, *(len(bias) for bias in policy.biases)]
+    shapes = [kernel.shape for kernel in policy.kernels]
+    fits = shapes == list(zip(widths[:-1], widths[1:], strict=True))
+    if not (shapes and fits and policy.obs_std.shape == policy.obs_mean.shape):
+        raise ValueError("sizes of its layers do not fit")
+    if not 0 < policy.action_size <= widths[-1]:
+        raise ValueError("it has fewer outputs than actions")
