@@ -189,9 +189,9 @@ class Scene:
 
     def _set_light(self) -> None:
         scene = self._server.scene
-        scene.configure_environment_map("studio", environment_intensity=0.55)
+        scene.configure_environment_map("studio", environment_intensity=0.35)
         scene.configure_default_lights(enabled=False)
-        scene.add_light_directional("/light", intensity=1.8, cast_shadow=True, position=_LIGHT)
+        scene.add_light_directional("/light", intensity=2.0, cast_shadow=True, position=_LIGHT)
 
     def _set_camera(self, low: Floats, high: Floats) -> None:
         across = float(np.ptp(self._offsets, axis=0).max())
