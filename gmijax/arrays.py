@@ -19,3 +19,21 @@ def array_module(*values: Any) -> Any:
         if not isinstance(value, _OF_NUMPY):
             return value.__array_namespace__()
     return np
+
+
+def replaced(array: Any, where: Any, values: Any) -> Any:
+    """A copy of an array with `values` at the indices `where`, or from `where` on if it is an int.
+
+    `array` may be of numpy where `values` are of JAX: so is then what is returned.
+    """
+    xp = array_module(array, values)
+    if xp is np:
+        changed = np.array(array)
+        changed[slice(where, where + len(values)) if isinstance(where, int) else where] = values
+        return changed
+    array = xp.asarray(array)
+    if isinstance(where, int):
+        import jax
+
+        return jax.lax.dynamic_update_slice(array, values, (where,))
+    return array.at[where].set(values)

@@ -8,14 +8,16 @@ of one batch.  [] is a scalar.
 
 from __future__ import annotations
 
-from typing import Any, TypeAlias
+from typing import TYPE_CHECKING, Any, TypeAlias
 
-import jax
+if TYPE_CHECKING:
+    import jax
 
-Array: TypeAlias = jax.Array
+# As texts, so that who names types need not load jax.
+Array: TypeAlias = "jax.Array"
 """One array on a device."""
 
-PRNGKey: TypeAlias = jax.Array
+PRNGKey: TypeAlias = "jax.Array"
 """A typed JAX random key (`jax.random.key`), one use only."""
 
 PyTree: TypeAlias = Any

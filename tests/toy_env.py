@@ -11,8 +11,9 @@ from gmijax.learning.unroll import Counts
 from gmijax.ppo.loss import PpoLosses
 from gmijax.ppo.ppo import IterationMetrics
 from gmijax.sim import episode
+from gmijax.sim.interaction import time_limit
 from gmijax.sim.interface import Env, EnvSpec, EnvState
-from gmijax.sim.wrappers import BatchedEnv, time_limit, training_env
+from gmijax.sim.wrappers import BatchedEnv, training_env
 
 
 def point_mass(episode_length: int = 20) -> BatchedEnv:

@@ -5,7 +5,6 @@ Its weights act in float32, whatever the run's `algo.precision`, as those of exp
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -30,9 +29,7 @@ def save_policy(
     write_policy(path, plain_policy(env, algo, state, env_steps=env_steps))
 
 
-def plain_policy(
-    env: EnvConfig, algo: AlgoConfig, state: TrainState, **about: Any
-) -> PlainPolicy:
+def plain_policy(env: EnvConfig, algo: AlgoConfig, state: TrainState, **about: Any) -> PlainPolicy:
     """The policy to act with when the learner has `state`; `about` is noted in it."""
     layers = state.params.policy["params"]
     names = [f"Dense_{number}" for number in range(len(layers))]

@@ -8,8 +8,8 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-import jax.numpy as jnp
 import mujoco
+import numpy as np
 
 from gmijax.errors import ConfigError
 from gmijax.types import Array
@@ -32,9 +32,9 @@ def at_start(mj_model: mujoco.MjModel, given: Mapping[str, Array]) -> dict[str, 
         if name not in shapes:
             known = ", ".join(shapes)
             raise ConfigError(f"world.start: no {name} can be carried; allowed are {known}")
-        if jnp.shape(value) != shapes[name]:
+        if np.shape(value) != shapes[name]:
             raise ConfigError(
-                f"world.start: {name} has shape {jnp.shape(value)}, not {shapes[name]}"
+                f"world.start: {name} has shape {np.shape(value)}, not {shapes[name]}"
             )
     missing = [name for name in needed(mj_model) if name not in given]
     fresh = mujoco.MjData(mj_model) if missing else None
@@ -43,6 +43,8 @@ def at_start(mj_model: mujoco.MjModel, given: Mapping[str, Array]) -> dict[str, 
 
 
 def _typed(name: str, value: Array) -> Array:
+    import jax.numpy as jnp
+
     return jnp.asarray(value, bool if name == "eq_active" else jnp.float32)
 
 

@@ -9,11 +9,12 @@ them by mistake is not mistaken for a rare failure of the solver.
 
 from __future__ import annotations
 
+import operator
 from functools import reduce
 
-import jax
-import jax.numpy as jnp
+import numpy as np
 
+from gmijax.arrays import array_module
 from gmijax.sim.interface import Env, EnvState
 from gmijax.types import Array
 
@@ -27,31 +28,41 @@ def sources(term_names: tuple[str, ...]) -> tuple[str, ...]:
 
 
 def diverged_by_source(env: Env, state: EnvState) -> dict[str, Array]:
-    """For worlds [N]: which of `sources` hold bad numbers, [N] bool each."""
+    """For worlds [N], or one in numpy: which of `sources` hold bad numbers, [N] or [] bool each."""
+    xp = array_module(state.obs)
 
     def within(values: Array, bound: float) -> Array:
-        return jnp.all(jnp.abs(values) < bound, axis=-1)
+        return (abs(values) < bound).all(axis=-1)
 
     bad = {
-        "physics": ~within(jax.vmap(env.qpos)(state), MAX_POSITION),
+        "physics": ~within(_positions(env, state), MAX_POSITION),
         "observation": ~within(state.obs, env.spec.max_abs_obs),
     }
-    bad |= {f"reward/{name}": ~jnp.isfinite(value) for name, value in state.reward_terms.items()}
-    return bad | {"any": reduce(jnp.logical_or, bad.values())}
+    bad |= {f"reward/{name}": ~xp.isfinite(value) for name, value in state.reward_terms.items()}
+    return bad | {"any": reduce(operator.or_, bad.values())}
+
+
+def _positions(env: Env, state: EnvState) -> Array:
+    if array_module(state.obs) is np:
+        return env.qpos(state)
+    import jax
+
+    return jax.vmap(env.qpos)(state)
 
 
 def end_diverged(before: EnvState, state: EnvState, diverged: Array) -> EnvState:
-    """Ends the worlds [N] that `diverged`, with numbers that others can compute with."""
+    """Ends the worlds [N], or [], that `diverged`, with numbers that others can compute with."""
+    xp = array_module(state.obs)
 
     def zero(values: Array) -> Array:
-        return jnp.where(diverged, 0.0, values)
+        return xp.where(diverged, 0.0, values)
 
     return state._replace(
-        obs=jnp.where(diverged[:, None], before.obs, state.obs),
+        obs=xp.where(diverged[..., None], before.obs, state.obs),
         reward=zero(state.reward),
         reward_terms={name: zero(value) for name, value in state.reward_terms.items()},
         metrics={
-            name: jnp.where(diverged, before.metrics[name], value)
+            name: xp.where(diverged, before.metrics[name], value)
             for name, value in state.metrics.items()
         },
         terminated=state.terminated | diverged,

@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
-import jax.numpy as jnp
+import numpy as np
 
+from gmijax.arrays import array_module
 from gmijax.sim.interface import EnvSpec, EnvState
 from gmijax.types import Array, PRNGKey, PyTree
 
 
 def begin(spec: EnvSpec, physics: PyTree, task: PyTree, obs: Array, key: PRNGKey) -> EnvState:
     """The state after a reset: nothing earned, nothing ended, no steps."""
-    zero, false = jnp.zeros(()), jnp.zeros((), bool)
+    xp = array_module(obs)
+    zero, false = xp.zeros((), np.float32), xp.zeros((), bool)
     return EnvState(
         physics=physics,
         task=task,
@@ -20,7 +22,7 @@ def begin(spec: EnvSpec, physics: PyTree, task: PyTree, obs: Array, key: PRNGKey
         metrics=dict.fromkeys(spec.metrics, zero),
         terminated=false,
         truncated=false,
-        steps=jnp.zeros((), jnp.int32),
+        steps=xp.zeros((), np.int32),
         key=key,
     )
 
@@ -44,8 +46,8 @@ def advance(
         reward_terms=reward[1],
         metrics=metrics or {},
         terminated=terminated,
-        # Time is the business of `wrappers.time_limit`.
-        truncated=jnp.zeros((), bool) if truncated is None else truncated,
+        # Time is the business of `interaction.time_limit`.
+        truncated=array_module(obs).zeros((), bool) if truncated is None else truncated,
         steps=before.steps + 1,
         key=before.key,
     )

@@ -1,16 +1,30 @@
-"""What the configuration puts between a task and the policy: repeated actions, past observations.
+"""What the configuration puts around a task: a time limit, repeated actions, past observations.
 
-Each takes one world and returns one, as `gmijax.sim.wrappers.time_limit` does.
+Each takes one world and returns one, on numpy as on JAX (`gmijax.arrays`).
 """
 
 from __future__ import annotations
 
-import jax
-import jax.numpy as jnp
+from collections.abc import Callable
 
+import numpy as np
+
+from gmijax.arrays import array_module
 from gmijax.sim.interface import Env, EnvState
-from gmijax.sim.wrappers import select_world
 from gmijax.types import Array, PRNGKey, PyTree
+
+
+def time_limit(env: Env, episode_length: int) -> Env:
+    """Truncates episodes after `episode_length` steps; an episode that ends by itself is not."""
+
+    def step(model: PyTree, state: EnvState, action: Array) -> EnvState:
+        state = env.step(model, state, action)
+        out_of_time = state.steps >= episode_length
+        return state._replace(
+            truncated=(state.truncated | out_of_time) & ~state.terminated,
+        )
+
+    return env._replace(step=step, spec=env.spec._replace(episode_length=episode_length))
 
 
 def action_repeat(env: Env, times: int) -> Env:
@@ -27,14 +41,14 @@ def action_repeat(env: Env, times: int) -> Env:
         return env
 
     def step(model: PyTree, state: EnvState, action: Array) -> EnvState:
-        def once(before: EnvState, _: None) -> tuple[EnvState, None]:
+        def once(before: EnvState) -> EnvState:
             after = env.step(model, before, action)
             terms = {name: before.reward_terms[name] + x for name, x in after.reward_terms.items()}
             after = after._replace(reward=before.reward + after.reward, reward_terms=terms)
-            ended = before.terminated | before.truncated
-            return select_world(ended, before, after), None
+            return after
 
-        zero, false = jnp.zeros(()), jnp.zeros((), bool)
+        xp = array_module(state.obs)
+        zero, false = xp.zeros((), np.float32), xp.zeros((), bool)
         start = state._replace(
             reward=zero,
             reward_terms=dict.fromkeys(state.reward_terms, zero),
@@ -43,14 +57,30 @@ def action_repeat(env: Env, times: int) -> Env:
             # All actions before this one took all of their steps.
             steps=state.steps * times,
         )
-        last, _ = jax.lax.scan(once, start, length=times)
-        return last._replace(steps=state.steps + 1)
+        return _until_the_end(once, start, times)._replace(steps=state.steps + 1)
 
     spec = env.spec._replace(
         control_dt_s=env.spec.control_dt_s * times,
         episode_length=-(-env.spec.episode_length // times),
     )
     return env._replace(spec=spec, step=step)
+
+
+def _until_the_end(once: Callable[[EnvState], EnvState], state: EnvState, times: int) -> EnvState:
+    """The state after `times` of `once`, or after the one that ended the episode."""
+    if array_module(state.obs) is np:
+        for _ in range(times):
+            state = state if state.terminated or state.truncated else once(state)
+        return state
+    import jax
+
+    from gmijax.sim.wrappers import select_world
+
+    def unless_ended(before: EnvState, _: None) -> tuple[EnvState, None]:
+        ended = before.terminated | before.truncated
+        return select_world(ended, before, once(before)), None
+
+    return jax.lax.scan(unless_ended, state, length=times)[0]
 
 
 def observation_history(env: Env, length: int) -> Env:
@@ -70,8 +100,9 @@ def observation_history(env: Env, length: int) -> Env:
     past = (length - 1) * seen
 
     def fill(state: EnvState) -> EnvState:
-        earlier = jnp.tile(state.obs[:seen], length - 1)
-        return state._replace(obs=jnp.concatenate([earlier, state.obs]))
+        xp = array_module(state.obs)
+        earlier = xp.tile(state.obs[:seen], length - 1)
+        return state._replace(obs=xp.concatenate([earlier, state.obs]))
 
     def newest(state: EnvState) -> EnvState:
         return state._replace(obs=state.obs[past:])
@@ -82,7 +113,7 @@ def observation_history(env: Env, length: int) -> Env:
     def step(model: PyTree, state: EnvState, action: Array) -> EnvState:
         after = env.step(model, newest(state), action)
         earlier = state.obs[seen : seen + past]
-        return after._replace(obs=jnp.concatenate([earlier, after.obs]))
+        return after._replace(obs=array_module(after.obs).concatenate([earlier, after.obs]))
 
     again = env.next_episode
 

@@ -10,8 +10,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
-from importlib import resources
-from typing import NamedTuple, TypeVar
+from typing import TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -26,7 +25,9 @@ from gmijax.sim.impl import ON_GPU, Impl, WarpSizes, choose_impl
 from gmijax.sim.interface import OVERFLOWS, Env, EnvSpec, EnvState
 from gmijax.sim.kinematic_model import kinematic_model
 from gmijax.sim.many_contacts import warn_of_many
+from gmijax.sim.physics_state import PhysicsState
 from gmijax.sim.plain_model import plain
+from gmijax.sim.simulators import load_model
 from gmijax.sim.unsimulated import (
     FULL_NAMES,
     refuse_idle_sensors,
@@ -47,49 +48,6 @@ _CONTACT_BITS = _ALL_BITS & ~(_CONSTRAINT_BITS | _LIMIT_BITS)
 def which_overflowed(bits: Array) -> Array:
     """[2] bool, which of `OVERFLOWS` were too small, by a world's `overflow` [] of MJX-Warp."""
     return (bits & jnp.array([_CONTACT_BITS, _CONSTRAINT_BITS])) != 0
-
-
-class PhysicsState(NamedTuple):
-    """What one world must remember between steps.
-
-    Attributes:
-      qpos: [nq] float32, joint positions.
-      qvel: [nv] float32, joint velocities.
-      qacc_warmstart: [nv] float32, the last acceleration, where the solver starts from.
-      overflow: [2] bool, which buffers of `OVERFLOWS` were too small in the last control step;
-        None with MJX-JAX, whose buffers hold all that can ever be.
-
-    The others are `gmijax.sim.carried.NAMES`, as in MuJoCo's data; None where a world does not
-    carry them. `_replace` drives them: a push, the path of a mocap body.
-
-    Attributes:
-      act: [na] float32, activations; carried if the model has any.
-      time: [] float32, seconds; carried if a sensor shows it, or with `history`.
-      history: [nhistory] float32, samples of delayed actuators and sensors; carried if any are.
-      mocap_pos: [nmocap, 3] float32, in metres.
-      mocap_quat: [nmocap, 4] float32.
-      eq_active: [neq] bool, which equality constraints hold.
-      qfrc_applied: [nv] float32, forces on joints.
-      xfrc_applied: [nbody, 6] float32, forces and torques on bodies, in the world.
-    """
-
-    qpos: Array
-    qvel: Array
-    qacc_warmstart: Array
-    overflow: Array | None = None
-    act: Array | None = None
-    time: Array | None = None
-    history: Array | None = None
-    mocap_pos: Array | None = None
-    mocap_quat: Array | None = None
-    eq_active: Array | None = None
-    qfrc_applied: Array | None = None
-    xfrc_applied: Array | None = None
-
-    def carried(self) -> dict[str, Array]:
-        """What this world carries of `gmijax.sim.carried.NAMES`, by name."""
-        values = {name: getattr(self, name) for name in carried.NAMES}
-        return {name: value for name, value in values.items() if value is not None}
 
 
 @dataclass(frozen=True)
@@ -230,8 +188,7 @@ def load(asset: str, *, impl: str, substeps: int, max_envs: int | None = None) -
     Raises:
       ConfigError: `impl` cannot be had, or the model needs state that is not carried.
     """
-    text = resources.files("gmijax.sim").joinpath("assets", f"{asset}.xml").read_text()
-    mj_model = mujoco.MjModel.from_xml_string(text)
+    mj_model = load_model(asset)
     chosen, _ = choose_impl(impl, jax.default_backend(), asset)
     return from_mj_model(
         mj_model,

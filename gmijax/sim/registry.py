@@ -182,7 +182,7 @@ def make_env(
     if api == "brax":
         warn_on_cpu(env)
         return importlib.import_module("gmijax.sim.adapters.to_brax").BraxEnv(env)
-    from gmijax.sim.wrappers import time_limit
+    from gmijax.sim.interaction import time_limit
 
     return time_limit(env, episode_length or env.spec.episode_length)
 

@@ -9,8 +9,9 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from typing import Generic, NamedTuple, TypeVar
 
-import jax.numpy as jnp
+import numpy as np
 
+from gmijax.arrays import array_module
 from gmijax.config.schema import suggestion
 from gmijax.errors import ConfigError
 from gmijax.types import Array
@@ -23,7 +24,7 @@ class RewardTerm(NamedTuple, Generic[View]):
     """One addend of a reward.
 
     Attributes:
-      fn: `view -> [] float32`, without the weight.
+      fn: `view -> []`, without the weight: float32 in JAX; a number where it is always the same.
       weight: factor; its sign makes the term a reward or a cost.
     """
 
@@ -73,18 +74,21 @@ def total_reward(
       view: what they read.
       replacement: takes the place of all terms where it applies.
     """
-    values = {
-        name: jnp.zeros(()) if term.weight == 0.0 else term.weight * term.fn(view)
+    found = {
+        name: 0.0 if term.weight == 0.0 else term.weight * term.fn(view)
         for name, term in terms.items()
     }
+    when = () if replacement is None else (replacement.when,)
+    xp = array_module(*found.values(), *when)
+    values = {name: xp.asarray(value, np.float32) for name, value in found.items()}
     if replacement is not None:
-        keeps, when = replacement.keeps, replacement.when
+        keeps = replacement.keeps
         values = {
-            name: jnp.where(when, keeps * value if keeps else 0.0, value)
+            name: xp.where(replacement.when, keeps * value if keeps else 0.0, value)
             for name, value in values.items()
         }
-        values[replacement.name] = jnp.where(replacement.when, replacement.value, 0.0)
-    return sum(values.values(), jnp.zeros(())), values
+        values[replacement.name] = xp.where(replacement.when, xp.float32(replacement.value), 0.0)
+    return sum(values.values(), xp.zeros((), np.float32)), values
 
 
 def term_names(

@@ -1,4 +1,4 @@
-"""What stands between a task and the training loop: time limit, batch, auto-reset, statistics.
+"""What stands between a task and the training loop: batch, auto-reset, statistics.
 
 `training_env` puts them together. Results of environment j depend on its own random key only, so
 k processes with n environments each see the samples of one process with k x n, given the keys of
@@ -107,19 +107,6 @@ class BatchedEnv(NamedTuple):
     advance: Callable[[PyTree, BatchState, Array], tuple[BatchState, StepOutput]]
     restart: Callable[[PyTree, BatchState], BatchState]
     overflows: tuple[str, ...] = ()
-
-
-def time_limit(env: Env, episode_length: int) -> Env:
-    """Truncates episodes after `episode_length` steps; an episode that ends by itself is not."""
-
-    def step(model: PyTree, state: EnvState, action: Array) -> EnvState:
-        state = env.step(model, state, action)
-        out_of_time = state.steps >= episode_length
-        return state._replace(
-            truncated=(state.truncated | out_of_time) & ~state.terminated,
-        )
-
-    return env._replace(step=step, spec=env.spec._replace(episode_length=episode_length))
 
 
 def vectorise(env: Env) -> Env:

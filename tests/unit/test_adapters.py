@@ -26,10 +26,10 @@ from gmijax.learning.learner import make_learner
 from gmijax.sim.adapters.brax_interface import adapt, observation
 from gmijax.sim.adapters.playground import from_playground
 from gmijax.sim.adapters.to_brax import BraxEnv
-from gmijax.sim.interaction import action_repeat
+from gmijax.sim.interaction import action_repeat, time_limit
 from gmijax.sim.interface import OVERFLOWS
 from gmijax.sim.registry import make_env
-from gmijax.sim.wrappers import env_keys, time_limit, training_env
+from gmijax.sim.wrappers import env_keys, training_env
 
 NUM_ENVS = 3
 LENGTH = 5

@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 
 from gmijax.errors import ConfigError
-from gmijax.sim.interaction import action_repeat, observation_history
+from gmijax.sim.interaction import action_repeat, observation_history, time_limit
 from gmijax.sim.registry import make_env
-from gmijax.sim.wrappers import env_keys, time_limit, training_env
+from gmijax.sim.wrappers import env_keys, training_env
 
 TASK = """
 import jax, jax.numpy as jnp, numpy as np

@@ -14,8 +14,8 @@ from gymnasium.utils.env_checker import check_env
 from toy_env import point_mass_env
 
 from gmijax.sim import vector_envs
+from gmijax.sim.interaction import time_limit
 from gmijax.sim.registry import TASKS
-from gmijax.sim.wrappers import time_limit
 
 ID = "gmijax.gymnasium:gmijax/ball_balance"
 

@@ -14,8 +14,8 @@ from gmijax.config import AlgoConfig
 from gmijax.learning.episodes import CHUNK_STEPS, Episodes, Options, run_episodes
 from gmijax.learning.learner import init_learner, make_learner
 from gmijax.sim import episode
+from gmijax.sim.interaction import time_limit
 from gmijax.sim.interface import Env, EnvSpec, EnvState
-from gmijax.sim.wrappers import time_limit
 from gmijax.types import Array, PRNGKey, PyTree
 
 TIME_LIMIT = CHUNK_STEPS + 20

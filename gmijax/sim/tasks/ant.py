@@ -11,10 +11,10 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import NamedTuple
 
-import jax
-import jax.numpy as jnp
+import numpy as np
 
-from gmijax.sim import episode, physics
+from gmijax.arrays import array_module
+from gmijax.sim import draws, episode, simulators
 from gmijax.sim.interface import Env, EnvSpec, EnvState
 from gmijax.sim.rewards import Replacement, RewardTerm, term_names, total_reward, with_weights
 from gmijax.sim.tasks import runner
@@ -52,16 +52,16 @@ class AntView(NamedTuple):
 
 TERMS = {
     "progress": RewardTerm[AntView](lambda v: v.speed_m_per_s, 1.0),
-    "alive": RewardTerm[AntView](lambda v: jnp.ones(()), 0.5),
+    "alive": RewardTerm[AntView](lambda v: 1.0, 0.5),
     "upright": RewardTerm[AntView](lambda v: runner.upright_bonus(v.pose), 0.1),
     "heading": RewardTerm[AntView](lambda v: runner.heading_bonus(v.pose), 0.5),
-    "action": RewardTerm[AntView](lambda v: jnp.sum(v.action**2), -0.005),
+    "action": RewardTerm[AntView](lambda v: (v.action**2).sum(), -0.005),
     "energy": RewardTerm[AntView](
-        lambda v: jnp.sum(jnp.abs(v.action * (JOINT_VELOCITY_SCALE * v.pose.joint_velocities))),
+        lambda v: abs(v.action * (JOINT_VELOCITY_SCALE * v.pose.joint_velocities)).sum(),
         -0.05,
     ),
     "joint_limits": RewardTerm[AntView](
-        lambda v: jnp.sum(v.pose.joints > 0.99, dtype=jnp.float32), -0.1
+        lambda v: (v.pose.joints > 0.99).sum(dtype=np.float32), -0.1
     ),
 }
 DEATH = "death"
@@ -76,7 +76,7 @@ def make(
 ) -> Env:
     """Makes the task without its time limit; see `gmijax.sim.registry.make_env`."""
     terms, chosen = with_weights(TERMS, rewards), settings_from(AntSettings, settings)
-    world = physics.load("ant", impl=impl, substeps=SUBSTEPS, max_envs=max_envs)
+    world = simulators.load("ant", impl=impl, substeps=SUBSTEPS, max_envs=max_envs)
     ids = runner.look_up(world.mj_model, JOINTS, SENSORS)
     spec = EnvSpec(
         name="ant",
@@ -91,14 +91,14 @@ def make(
     )
 
     def reset(model: PyTree, key: PRNGKey) -> EnvState:
-        key, draw = jax.random.split(key)
+        key, draw = draws.split(key)
         start = world.start(*runner.draw_start(ids, world.mj_model, draw, chosen))
         # Sensors read zero: a reset runs no physics, see `Physics.start`.
-        zeros = jnp.zeros(len(ids.sensors)), jnp.zeros(ACTION_SIZE)
+        zeros = np.zeros(len(ids.sensors), np.float32), np.zeros(ACTION_SIZE, np.float32)
         return episode.begin(spec, start, (), observe(runner.pose_of(ids, start), *zeros), key)
 
     def step(model: PyTree, state: EnvState, action: Array) -> EnvState:
-        action = jnp.clip(action, -1.0, 1.0)
+        action = action.clip(-1.0, 1.0)
         moved, sensordata = world.step(model, state.physics, action)
         pose = runner.pose_of(ids, moved)
         speed = runner.speed_to_target(state.physics, moved, world.control_dt_s)
@@ -114,12 +114,13 @@ def make(
 
 def observe(pose: RunnerPose, foot_sensors: Array, action: Array) -> Array:
     """The observation [60] from the pose, raw foot sensors [24] and the last action [8]."""
-    return jnp.concatenate(
+    xp = array_module(pose.position)
+    return xp.concatenate(
         [
             pose.position[2:],
             pose.velocity,
             pose.angular_velocity,
-            jnp.stack([pose.yaw, pose.roll, pose.angle_to_target, pose.upright, pose.heading]),
+            xp.stack([pose.yaw, pose.roll, pose.angle_to_target, pose.upright, pose.heading]),
             pose.joints,
             JOINT_VELOCITY_SCALE * pose.joint_velocities,
             FOOT_SENSOR_SCALE * foot_sensors,

@@ -13,14 +13,14 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import NamedTuple
 
-import jax
-import jax.numpy as jnp
 import mujoco
 import numpy as np
 import numpy.typing as npt
 
-from gmijax.sim import episode, physics, rotations
+from gmijax.arrays import array_module, replaced
+from gmijax.sim import draws, episode, rotations, simulators
 from gmijax.sim.interface import Env, EnvSpec, EnvState
+from gmijax.sim.physics_state import PhysicsState
 from gmijax.sim.rewards import RewardTerm, term_names, total_reward, with_weights
 from gmijax.sim.tasks import lookup
 from gmijax.sim.tasks.settings import AnymalSettings, settings_from
@@ -45,7 +45,11 @@ VELOCITY_SCALE = 2.0
 ANGULAR_VELOCITY_SCALE = 0.25
 JOINT_VELOCITY_SCALE = 0.05
 KNEE_RADIUS_M = 0.065
-BASE_HALF_SIZE_M = (0.525, 0.16, 0.09)
+BASE_HALF_SIZE_M = np.array([0.525, 0.16, 0.09], np.float32)
+DOWN = np.array([0.0, 0.0, -1.0], np.float32)
+COMMAND_SCALES = np.array([VELOCITY_SCALE, VELOCITY_SCALE, ANGULAR_VELOCITY_SCALE], np.float32)
+
+COMMAND_NAMES = ("forward_m_per_s", "left_m_per_s", "yaw_rad_per_s")
 
 LEGS = ("LF", "LH", "RF", "RH")
 JOINTS = tuple(f"{leg}_{joint}" for leg in LEGS for joint in ("HAA", "HFE", "KFE"))
@@ -98,11 +102,16 @@ class AnymalView(NamedTuple):
     torques: Array
 
 
+def closeness(error: Array) -> Array:
+    """1 without an error, less with one."""
+    return array_module(error).exp(-(error**2) / 0.25)
+
+
 # The figures' source has weights of 1, 0.5 and 0.000025 per second; a step takes 0.02 s.
 TERMS = {
-    "velocity": RewardTerm[AnymalView](lambda v: jnp.exp(-(v.velocity_error**2) / 0.25), 0.02),
-    "yaw_rate": RewardTerm[AnymalView](lambda v: jnp.exp(-(v.yaw_rate_error**2) / 0.25), 0.01),
-    "torque": RewardTerm[AnymalView](lambda v: jnp.sum(v.torques**2), -0.0000005),
+    "velocity": RewardTerm[AnymalView](lambda v: closeness(v.velocity_error), 0.02),
+    "yaw_rate": RewardTerm[AnymalView](lambda v: closeness(v.yaw_rate_error), 0.01),
+    "torque": RewardTerm[AnymalView](lambda v: (v.torques**2).sum(), -0.0000005),
 }
 FLOOR = "floor"
 METRICS: tuple[str, ...] = ("velocity_error_m_per_s", "yaw_rate_error_rad_per_s")
@@ -127,7 +136,7 @@ def make(
     every episode that succeeds.
     """
     terms, chosen = with_weights(TERMS, rewards), settings_from(AnymalSettings, settings)
-    world = physics.load("anymal", impl=impl, substeps=SUBSTEPS, max_envs=max_envs)
+    world = simulators.load("anymal", impl=impl, substeps=SUBSTEPS, max_envs=max_envs)
     ids = look_up(world.mj_model)
     # A number that is not finite outlives the clipping of observations or shows in `qpos`, so
     # `max_abs_obs` need not be told.
@@ -143,25 +152,26 @@ def make(
     )
 
     def begin(key: PRNGKey, share: Array | None) -> EnvState:
-        key, start_key, command_key = jax.random.split(key, 3)
+        key, start_key, command_key = draws.split(key, 3)
         start = world.start(*draw_start(ids, world.mj_model, start_key, chosen))
         command = draw_command(command_key, chosen, share)
-        task = AnymalTask(command, jnp.zeros(()), jnp.zeros(()), share)
-        obs = observe(ids, start, task.command, jnp.zeros(ACTION_SIZE))
+        zero = array_module(command).zeros((), np.float32)
+        task = AnymalTask(command, zero, zero, share)
+        obs = observe(ids, start, task.command, np.zeros(ACTION_SIZE, np.float32))
         return episode.begin(spec, start, task, obs, key)
 
     def reset(model: PyTree, key: PRNGKey) -> EnvState:
-        return begin(key, jnp.float32(chosen.curriculum_start) if curriculum else None)
+        return begin(key, np.float32(chosen.curriculum_start) if curriculum else None)
 
     def next_episode(model: PyTree, ended: EnvState) -> EnvState:
         return begin(ended.key, next_share(ended, chosen.curriculum_growth))
 
     def step(model: PyTree, state: EnvState, action: Array) -> EnvState:
-        action = jnp.clip(action, -1.0, 1.0)
+        action = action.clip(-1.0, 1.0)
         moved, (torques, knees) = world.step(
             model,
             state.physics,
-            jnp.asarray(ids.standing) + chosen.action_scale_rad * action,
+            ids.standing + chosen.action_scale_rad * action,
             lambda data: (data.qfrc_actuator[ids.joints.qvel], data.xpos[ids.shanks]),
         )
         view = AnymalView(*errors(moved, state.task.command), torques)
@@ -189,50 +199,57 @@ def draw_start(
     ids: AnymalIds, mj_model: mujoco.MjModel, key: PRNGKey, settings: AnymalSettings
 ) -> tuple[Array, Array]:
     """Random `qpos` [19] and `qvel` [18]: the base in its place, the legs near standing."""
-    position_key, velocity_key = jax.random.split(key)
+    position_key, velocity_key = draws.split(key)
     shape, noise = (ACTION_SIZE,), settings.joint_velocity_noise_rad_per_s
     least, most = settings.start_factor_min, settings.start_factor_max
-    factors = jax.random.uniform(position_key, shape, minval=least, maxval=most)
-    velocities = jax.random.uniform(velocity_key, shape, minval=-noise, maxval=noise)
-    qpos = jnp.array(mj_model.key("stand").qpos, jnp.float32)
+    factors = draws.uniform(position_key, shape, minval=least, maxval=most)
+    velocities = draws.uniform(velocity_key, shape, minval=-noise, maxval=noise)
+    qpos = mj_model.key("stand").qpos.astype(np.float32)
     return (
-        qpos.at[ids.joints.qpos].set(factors * ids.standing),
-        jnp.zeros(mj_model.nv).at[ids.joints.qvel].set(velocities),
+        replaced(qpos, ids.joints.qpos, factors * ids.standing),
+        replaced(np.zeros(mj_model.nv, np.float32), ids.joints.qvel, velocities),
+    )
+
+
+def command_limits(settings: AnymalSettings) -> npt.NDArray[np.float32]:
+    """The fastest command [3] forwards and to the left, m/s, and of yaw, rad/s; either way."""
+    return np.array(
+        (
+            settings.command_forward_m_per_s,
+            settings.command_left_m_per_s,
+            settings.command_yaw_rad_per_s,
+        ),
+        np.float32,
     )
 
 
 def draw_command(key: PRNGKey, settings: AnymalSettings, share: Array | None = None) -> Array:
     """Wanted speed forwards and to the left, m/s, and of yaw, rad/s [3], from a `share` of all."""
-    limits = jnp.array(
-        (
-            settings.command_forward_m_per_s,
-            settings.command_left_m_per_s,
-            settings.command_yaw_rad_per_s,
-        )
-    )
+    limits = command_limits(settings)
     limits = limits if share is None else share * limits
-    return jax.random.uniform(key, (3,), minval=-limits, maxval=limits)
+    return draws.uniform(key, (3,), minval=-limits, maxval=limits)
 
 
 def next_share(ended: EnvState, growth: float) -> Array:
     """The share [] of the commands' ranges after an episode: more if it lasted and followed."""
     succeeded = ended.truncated & (ended.metrics[METRICS[0]] <= SUCCESS_M_PER_S)
-    return jnp.minimum(ended.task.share + jnp.where(succeeded, growth, 0.0), 1.0)
+    return (ended.task.share + growth * succeeded).clip(max=1.0)
 
 
-def gravity_direction(state: physics.PhysicsState) -> Array:
+def gravity_direction(state: PhysicsState) -> Array:
     """Unit vector [3] of gravity in the base's frame, (0, 0, -1) when level.
 
     The figures' source turns the vector the other way round, from the base's frame to the world,
     which swaps the signs of its horizontal components, and more once the robot has yawed.
     """
-    return rotations.rotate_back(state.qpos[3:7], jnp.array([0.0, 0.0, -1.0]))
+    return rotations.rotate_back(state.qpos[3:7], DOWN)
 
 
-def errors(state: physics.PhysicsState, command: Array) -> tuple[Array, Array]:
+def errors(state: PhysicsState, command: Array) -> tuple[Array, Array]:
     """Distances from `command` [3]: of the horizontal velocity, m/s, and of yaw's, rad/s."""
     velocity = rotations.rotate_back(state.qpos[3:7], state.qvel[:3])
-    return jnp.linalg.norm(command[:2] - velocity[:2]), jnp.abs(command[2] - state.qvel[5])
+    xp = array_module(velocity)
+    return xp.linalg.norm(command[:2] - velocity[:2]), abs(command[2] - state.qvel[5])
 
 
 def add_errors(before: EnvState, view: AnymalView) -> tuple[AnymalTask, dict[str, Array]]:
@@ -243,7 +260,8 @@ def add_errors(before: EnvState, view: AnymalView) -> tuple[AnymalTask, dict[str
         before.task.yaw_rate_error_sum + view.yaw_rate_error,
         before.task.share,
     )
-    means = jnp.stack([task.velocity_error_sum, task.yaw_rate_error_sum]) / (before.steps + 1)
+    sums = task.velocity_error_sum, task.yaw_rate_error_sum
+    means = [total / (before.steps + 1) for total in sums]
     metrics = dict(zip(METRICS, means, strict=True))
     return task, metrics if task.share is None else metrics | {SHARE: task.share}
 
@@ -251,11 +269,11 @@ def add_errors(before: EnvState, view: AnymalView) -> tuple[AnymalTask, dict[str
 def not_below_zero(reward: tuple[Array, dict[str, Array]]) -> tuple[Array, dict[str, Array]]:
     """Lifts a negative reward to 0 by one more term, so that the terms still sum to it."""
     total, terms = reward
-    lift = jnp.maximum(-total, 0.0)
+    lift = (-total).clip(0.0)
     return total + lift, terms | {FLOOR: lift}
 
 
-def has_fallen(state: physics.PhysicsState, knees: Array) -> Array:
+def has_fallen(state: PhysicsState, knees: Array) -> Array:
     """Whether a knee or the base touches the floor, or the robot lies on its back.
 
     Args:
@@ -264,21 +282,22 @@ def has_fallen(state: physics.PhysicsState, knees: Array) -> Array:
         which at 1 m/s is 5 mm.
     """
     down = gravity_direction(state)
-    lowest = state.qpos[2] - jnp.abs(down) @ jnp.array(BASE_HALF_SIZE_M)
-    return jnp.any(knees[:, 2] < KNEE_RADIUS_M) | (lowest < 0.0) | (down[2] > 0.0)
+    lowest = state.qpos[2] - abs(down) @ BASE_HALF_SIZE_M
+    return (knees[:, 2] < KNEE_RADIUS_M).any() | (lowest < 0.0) | (down[2] > 0.0)
 
 
-def observe(ids: AnymalIds, state: physics.PhysicsState, command: Array, action: Array) -> Array:
+def observe(ids: AnymalIds, state: PhysicsState, command: Array, action: Array) -> Array:
     """The observation [48] from the state, the command [3] and the last action [12]."""
-    values = jnp.concatenate(
+    xp = array_module(state.qpos)
+    values = xp.concatenate(
         [
             VELOCITY_SCALE * rotations.rotate_back(state.qpos[3:7], state.qvel[:3]),
             ANGULAR_VELOCITY_SCALE * state.qvel[3:6],
             gravity_direction(state),
-            command * jnp.array([VELOCITY_SCALE, VELOCITY_SCALE, ANGULAR_VELOCITY_SCALE]),
+            command * COMMAND_SCALES,
             state.qpos[ids.joints.qpos] - ids.standing,
             JOINT_VELOCITY_SCALE * state.qvel[ids.joints.qvel],
             action,
         ]
     )
-    return jnp.clip(values, -OBS_LIMIT, OBS_LIMIT)
+    return values.clip(-OBS_LIMIT, OBS_LIMIT)

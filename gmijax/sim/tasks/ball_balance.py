@@ -12,13 +12,13 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import NamedTuple
 
-import jax
-import jax.numpy as jnp
 import mujoco
 import numpy as np
 
-from gmijax.sim import episode, physics
+from gmijax.arrays import array_module, replaced
+from gmijax.sim import draws, episode, simulators
 from gmijax.sim.interface import Env, EnvSpec, EnvState
+from gmijax.sim.physics_state import PhysicsState
 from gmijax.sim.rewards import RewardTerm, term_names, total_reward, with_weights
 from gmijax.sim.tasks import lookup
 from gmijax.sim.tasks.settings import BallBalanceSettings, settings_from
@@ -83,8 +83,8 @@ class BallBalanceView(NamedTuple):
 
 def balance(view: BallBalanceView) -> Array:
     """1 for a ball at rest in the goal, less with distance and with speed."""
-    distance = jnp.linalg.norm(view.ball - view.goal)
-    return 1.0 / (1.0 + distance) / (1.0 + jnp.linalg.norm(view.ball_velocity))
+    norm = array_module(view.ball).linalg.norm
+    return 1.0 / (1.0 + norm(view.ball - view.goal)) / (1.0 + norm(view.ball_velocity))
 
 
 TERMS = {"balance": RewardTerm[BallBalanceView](balance, 1.0)}
@@ -99,7 +99,7 @@ def make(
 ) -> Env:
     """Makes the task without its time limit; see `gmijax.sim.registry.make_env`."""
     terms, chosen = with_weights(TERMS, rewards), settings_from(BallBalanceSettings, settings)
-    world = physics.load("ball_balance", impl=impl, substeps=SUBSTEPS, max_envs=max_envs)
+    world = simulators.load("ball_balance", impl=impl, substeps=SUBSTEPS, max_envs=max_envs)
     ids = look_up(world.mj_model)
     spec = EnvSpec(
         name="ball_balance",
@@ -113,18 +113,19 @@ def make(
     )
 
     def reset(model: PyTree, key: PRNGKey) -> EnvState:
-        key, draw = jax.random.split(key)
+        key, draw = draws.split(key)
         start = world.start(*draw_start(ids, world.mj_model, draw, chosen))
         # Sensors read zero: a reset runs no physics, see `Physics.start`.
-        obs = observe(ids, start, jnp.zeros(len(ids.sensors)))
-        return episode.begin(spec, start, BallBalanceTask(jnp.zeros(ACTION_SIZE)), obs, key)
+        obs = observe(ids, start, np.zeros(len(ids.sensors), np.float32))
+        targets = array_module(obs).zeros(ACTION_SIZE, np.float32)
+        return episode.begin(spec, start, BallBalanceTask(targets), obs, key)
 
     def step(model: PyTree, state: EnvState, action: Array) -> EnvState:
-        change = chosen.action_speed_rad_per_s * world.control_dt_s * jnp.clip(action, -1.0, 1.0)
-        targets = jnp.clip(state.task.targets + change, ids.knees.lower, ids.knees.upper)
+        change = chosen.action_speed_rad_per_s * world.control_dt_s * action.clip(-1.0, 1.0)
+        targets = (state.task.targets + change).clip(ids.knees.lower, ids.knees.upper)
         moved, sensordata = world.step(model, state.physics, targets)
         ball, ball_velocity = ball_of(ids, moved)
-        goal = jnp.array((0.0, 0.0, chosen.goal_height_m))
+        goal = np.array((0.0, 0.0, chosen.goal_height_m), np.float32)
         reward = total_reward(terms, BallBalanceView(ball, ball_velocity, goal))
         obs = observe(ids, moved, sensordata[ids.sensors])
         fallen = ball[2] < chosen.fallen_height_m
@@ -150,25 +151,26 @@ def draw_start(
     ids: BallBalanceIds, mj_model: mujoco.MjModel, key: PRNGKey, settings: BallBalanceSettings
 ) -> tuple[Array, Array]:
     """Random `qpos` [20] and `qvel` [18]: the tray at rest, the ball above it, falling inwards."""
-    direction_key, distance_key, height_key, speed_key = jax.random.split(key, 4)
-    direction = jax.random.uniform(direction_key, maxval=2.0 * jnp.pi)
-    outwards = jnp.stack([jnp.cos(direction), jnp.sin(direction)])
+    direction_key, distance_key, height_key, speed_key = draws.split(key, 4)
+    direction = draws.uniform(direction_key, maxval=2.0 * np.pi)
+    xp = array_module(direction)
+    outwards = xp.stack([xp.cos(direction), xp.sin(direction)])
     nearest, farthest = START_DISTANCE_MIN_M, settings.start_distance_max_m
-    distance = jax.random.uniform(distance_key, minval=nearest, maxval=farthest)
+    distance = draws.uniform(distance_key, minval=nearest, maxval=farthest)
     lowest, highest = settings.start_height_min_m, settings.start_height_max_m
-    height = jax.random.uniform(height_key, minval=lowest, maxval=highest)
+    height = draws.uniform(height_key, minval=lowest, maxval=highest)
     # The farther out, the faster inwards, so that a ball crosses the tray but seldom misses it.
-    speed = jax.random.uniform(speed_key, maxval=settings.start_speed_m_per_s)
+    speed = draws.uniform(speed_key, maxval=settings.start_speed_m_per_s)
     speed = speed * (distance - nearest) / (farthest - nearest)
-    ball = jnp.append(distance * outwards, height)
-    velocity = jnp.append(-speed * outwards, -settings.start_speed_m_per_s)
-    qpos = jax.lax.dynamic_update_slice(
-        jnp.array(mj_model.qpos0, jnp.float32), ball, (ids.ball_qpos,)
+    ball = xp.append(distance * outwards, height)
+    velocity = xp.append(-speed * outwards, -settings.start_speed_m_per_s)
+    return (
+        replaced(mj_model.qpos0.astype(np.float32), ids.ball_qpos, ball),
+        replaced(np.zeros(mj_model.nv, np.float32), ids.ball_qvel, velocity),
     )
-    return qpos, jax.lax.dynamic_update_slice(jnp.zeros(mj_model.nv), velocity, (ids.ball_qvel,))
 
 
-def ball_of(ids: BallBalanceIds, state: physics.PhysicsState) -> tuple[Array, Array]:
+def ball_of(ids: BallBalanceIds, state: PhysicsState) -> tuple[Array, Array]:
     """The ball's position [3] in metres and velocity [3] in m/s, in the world."""
     return (
         state.qpos[ids.ball_qpos : ids.ball_qpos + 3],
@@ -176,9 +178,10 @@ def ball_of(ids: BallBalanceIds, state: physics.PhysicsState) -> tuple[Array, Ar
     )
 
 
-def observe(ids: BallBalanceIds, state: physics.PhysicsState, hip_sensors: Array) -> Array:
+def observe(ids: BallBalanceIds, state: PhysicsState, hip_sensors: Array) -> Array:
     """The observation [24] from the state and raw hip sensors [12]."""
-    values = jnp.concatenate(
+    xp = array_module(state.qpos)
+    values = xp.concatenate(
         [
             state.qpos[ids.knees.qpos],
             state.qvel[ids.knees.qvel],
@@ -186,4 +189,4 @@ def observe(ids: BallBalanceIds, state: physics.PhysicsState, hip_sensors: Array
             SENSOR_SCALE * hip_sensors,
         ]
     )
-    return jnp.clip(values, -OBS_LIMIT, OBS_LIMIT)
+    return values.clip(-OBS_LIMIT, OBS_LIMIT)

@@ -12,14 +12,14 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import NamedTuple
 
-import jax
-import jax.numpy as jnp
 import mujoco
 import numpy as np
 import numpy.typing as npt
 
-from gmijax.sim import episode, physics, rotations
+from gmijax.arrays import array_module, replaced
+from gmijax.sim import draws, episode, rotations, simulators
 from gmijax.sim.interface import Env, EnvSpec, EnvState
+from gmijax.sim.physics_state import PhysicsState
 from gmijax.sim.rewards import Replacement, RewardTerm, term_names, total_reward, with_weights
 from gmijax.sim.tasks import lookup
 from gmijax.sim.tasks.settings import FrankaCabinetSettings, settings_from
@@ -40,10 +40,11 @@ OBS_LIMIT = 5.0
 JOINT_VELOCITY_SCALE = 0.1
 # Between the fingers' pads. The figures' source has a point where the fingers begin, and 0.04 m
 # askew from there; a gripper that holds the handle is 0.06 m away from it.
-GRASP_IN_HAND_M = (0.0, 0.0, 0.0584 + 0.045)
+GRASP_IN_HAND_M = np.array([0.0, 0.0, 0.0584 + 0.045], np.float32)
 # In a finger's frame: the inner face of its pad, near the tip. The source takes the root.
-PAD_IN_FINGER_M = (0.0, 0.0, 0.045)
-HANDLE_IN_DRAWER_M = (0.3, 0.01, 0.0)
+PAD_IN_FINGER_M = np.array([0.0, 0.0, 0.045], np.float32)
+HANDLE_IN_DRAWER_M = np.array([0.3, 0.01, 0.0], np.float32)
+Y_AXIS, Z_AXIS = np.array([[0.0, 1.0, 0.0], [0.0, 0.0, 1.0]], np.float32)
 NEAR_M = 0.02
 FINGER_REACH_M = 0.04
 BEHIND_M = 0.04
@@ -121,13 +122,13 @@ def closeness(view: FrankaCabinetView) -> Array:
     way = view.pose.handle - view.pose.grasp
     squared = way @ way
     shape = (1.0 + squared / view.distance_scale_m**2) ** -2
-    return shape * jnp.where(squared <= NEAR_M**2, 2.0, 1.0)
+    return shape * array_module(squared).where(squared <= NEAR_M**2, 2.0, 1.0)
 
 
 def alignment(view: FrankaCabinetView) -> Array:
     """1 for a gripper that points into the cabinet with one finger above the other, else less."""
     inward, up = -view.pose.forward[0], view.pose.up[2]
-    return 0.5 * (inward * jnp.abs(inward) + up * jnp.abs(up))
+    return 0.5 * (inward * abs(inward) + up * abs(up))
 
 
 def finger_heights(view: FrankaCabinetView) -> Array:
@@ -138,18 +139,18 @@ def finger_heights(view: FrankaCabinetView) -> Array:
 def around(view: FrankaCabinetView) -> Array:
     """0.5 with the left finger above the handle and the right one below it, else 0."""
     left, right = finger_heights(view)
-    return jnp.where((left > 0.0) & (right < 0.0), 0.5, 0.0)
+    return 0.5 * ((left > 0.0) & (right < 0.0))
 
 
 def pinch(view: FrankaCabinetView) -> Array:
     """Metres by which fingers around the handle are nearer to its height than fully open."""
-    reach = jnp.sum(FINGER_REACH_M - jnp.abs(finger_heights(view)))
-    return jnp.where(around(view) > 0.0, reach, 0.0)
+    reach = (FINGER_REACH_M - abs(finger_heights(view))).sum()
+    return array_module(reach).where(around(view) > 0.0, reach, 0.0)
 
 
 def beyond(opening_m: float, view: FrankaCabinetView) -> Array:
     """1 when the drawer is open by more than `opening_m`, else 0."""
-    return (view.drawer_m > opening_m).astype(jnp.float32)
+    return (view.drawer_m > opening_m).astype(np.float32)
 
 
 TERMS = {
@@ -158,7 +159,7 @@ TERMS = {
     "around": RewardTerm[FrankaCabinetView](around, 0.25),
     "pinch": RewardTerm[FrankaCabinetView](pinch, 5.0),
     "opening": RewardTerm[FrankaCabinetView](lambda v: v.drawer_m * (1.0 + around(v)), 7.5),
-    "action": RewardTerm[FrankaCabinetView](lambda v: jnp.sum(v.action**2), -0.01),
+    "action": RewardTerm[FrankaCabinetView](lambda v: (v.action**2).sum(), -0.01),
     "ajar": RewardTerm[FrankaCabinetView](lambda v: beyond(0.01, v), 0.5),
     "half_open": RewardTerm[FrankaCabinetView](lambda v: beyond(0.2, v) * around(v), 1.0),
     "open": RewardTerm[FrankaCabinetView](lambda v: beyond(v.open_m, v) * around(v), 2.0),
@@ -175,7 +176,7 @@ def make(
 ) -> Env:
     """Makes the task without its time limit; see `gmijax.sim.registry.make_env`."""
     terms, chosen = with_weights(TERMS, rewards), settings_from(FrankaCabinetSettings, settings)
-    world = physics.load("franka_cabinet", impl=impl, substeps=SUBSTEPS, max_envs=max_envs)
+    world = simulators.load("franka_cabinet", impl=impl, substeps=SUBSTEPS, max_envs=max_envs)
     ids, speeds = look_up(world.mj_model), action_speeds(chosen)
     spec = EnvSpec(
         name="franka_cabinet",
@@ -189,18 +190,17 @@ def make(
     )
 
     def reset(model: PyTree, key: PRNGKey) -> EnvState:
-        key, draw = jax.random.split(key)
-        start = world.start(
-            draw_start(ids, world.mj_model, draw, chosen), jnp.zeros(world.mj_model.nv)
-        )
+        key, draw = draws.split(key)
+        qpos = draw_start(ids, world.mj_model, draw, chosen)
+        start = world.start(qpos, array_module(qpos).zeros(world.mj_model.nv, np.float32))
         obs = observe(ids, start, pose_of(ids, *world.poses(start.qpos)))
         task = FrankaCabinetTask(start.qpos[ids.joints.qpos])
         return episode.begin(spec, start, task, obs, key)
 
     def step(model: PyTree, state: EnvState, action: Array) -> EnvState:
-        action = jnp.clip(action, -1.0, 1.0)
+        action = action.clip(-1.0, 1.0)
         change = speeds * world.control_dt_s * action
-        targets = jnp.clip(state.task.targets + change, ids.joints.lower, ids.joints.upper)
+        targets = (state.task.targets + change).clip(ids.joints.lower, ids.joints.upper)
         moved, poses = world.step(
             model, state.physics, targets, lambda data: (data.xpos, data.xquat)
         )
@@ -211,7 +211,7 @@ def make(
             FrankaCabinetView(pose, drawer_m, action, chosen.open_m, chosen.distance_scale_m),
             Replacement(BEHIND, is_behind(pose), chosen.behind_reward, chosen.behind_keeps),
         )
-        metrics = {"drawer_m": drawer_m, "opened": opened.astype(jnp.float32)}
+        metrics = {"drawer_m": drawer_m, "opened": opened.astype(np.float32)}
         task, obs = FrankaCabinetTask(targets), observe(ids, moved, pose)
         terminated, truncated = ends(opened, chosen)
         return episode.advance(state, moved, task, obs, reward, terminated, metrics, truncated)
@@ -225,7 +225,7 @@ def ends(opened: Array, settings: FrankaCabinetSettings) -> tuple[Array, Array]:
     Nothing is lost by a truncation: a termination costs all that could still be earned, unless
     the term `open` pays for it, and policies learn to stop just short of it.
     """
-    never = jnp.zeros((), bool)
+    never = array_module(opened).zeros((), bool)
     return (opened, never) if settings.open_terminates else (never, opened)
 
 
@@ -253,32 +253,33 @@ def draw_start(
     start = np.asarray(mj_model.key("start").qpos, np.float32)
     # The fingers' too: by 0.125 m, so that most start wide open or closed.
     most = settings.joint_noise
-    noise = jax.random.uniform(key, (ACTION_SIZE,), minval=-most, maxval=most)
-    joints = jnp.clip(start[ids.joints.qpos] + noise, ids.joints.lower, ids.joints.upper)
-    return jnp.array(start).at[ids.joints.qpos].set(joints)
+    noise = draws.uniform(key, (ACTION_SIZE,), minval=-most, maxval=most)
+    joints = (start[ids.joints.qpos] + noise).clip(ids.joints.lower, ids.joints.upper)
+    return replaced(start, ids.joints.qpos, joints)
 
 
 def pose_of(ids: FrankaCabinetIds, xpos: Array, xquat: Array) -> FrankaCabinetPose:
     """Gripper and handle from all bodies' positions [nbody, 3] and quaternions [nbody, 4]."""
     hand = xquat[ids.hand]
-    handle = rotations.rotate(xquat[ids.drawer], jnp.array(HANDLE_IN_DRAWER_M))
+    handle = rotations.rotate(xquat[ids.drawer], HANDLE_IN_DRAWER_M)
     return FrankaCabinetPose(
-        grasp=xpos[ids.hand] + rotations.rotate(hand, jnp.array(GRASP_IN_HAND_M)),
+        grasp=xpos[ids.hand] + rotations.rotate(hand, GRASP_IN_HAND_M),
         handle=xpos[ids.drawer] + handle,
-        forward=rotations.rotate(hand, jnp.array([0.0, 0.0, 1.0])),
-        up=rotations.rotate(hand, jnp.array([0.0, 1.0, 0.0])),
-        fingers=xpos[ids.fingers] + rotations.rotate(hand, jnp.array(PAD_IN_FINGER_M)),
+        forward=rotations.rotate(hand, Z_AXIS),
+        up=rotations.rotate(hand, Y_AXIS),
+        fingers=xpos[ids.fingers] + rotations.rotate(hand, PAD_IN_FINGER_M),
     )
 
 
 def is_behind(pose: FrankaCabinetPose) -> Array:
     """Whether a finger went through the drawer's front instead of taking the handle."""
-    return jnp.any(pose.fingers[:, 0] < pose.handle[0] - BEHIND_M)
+    return (pose.fingers[:, 0] < pose.handle[0] - BEHIND_M).any()
 
 
-def observe(ids: FrankaCabinetIds, state: physics.PhysicsState, pose: FrankaCabinetPose) -> Array:
+def observe(ids: FrankaCabinetIds, state: PhysicsState, pose: FrankaCabinetPose) -> Array:
     """The observation [23] from the state and the poses."""
-    values = jnp.concatenate(
+    xp = array_module(state.qpos)
+    values = xp.concatenate(
         [
             ids.joints.scaled(state.qpos[ids.joints.qpos]),
             JOINT_VELOCITY_SCALE * state.qvel[ids.joints.qvel],
@@ -287,4 +288,4 @@ def observe(ids: FrankaCabinetIds, state: physics.PhysicsState, pose: FrankaCabi
             state.qvel[ids.drawer_joint.qvel],
         ]
     )
-    return jnp.clip(values, -OBS_LIMIT, OBS_LIMIT)
+    return values.clip(-OBS_LIMIT, OBS_LIMIT)

@@ -12,13 +12,12 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import NamedTuple
 
-import jax
-import jax.numpy as jnp
 import mujoco
 import numpy as np
 import numpy.typing as npt
 
-from gmijax.sim import episode, physics
+from gmijax.arrays import array_module
+from gmijax.sim import draws, episode, simulators
 from gmijax.sim.interface import Env, EnvSpec, EnvState
 from gmijax.sim.rewards import Replacement, RewardTerm, term_names, total_reward, with_weights
 from gmijax.sim.tasks import runner
@@ -74,21 +73,21 @@ class HumanoidView(NamedTuple):
 def energy(view: HumanoidView) -> Array:
     """Sum over the joints of what their motors do, in units of the strongest motor."""
     velocities = JOINT_VELOCITY_SCALE * view.pose.joint_velocities
-    return jnp.sum(jnp.abs(view.action * velocities) * view.strength)
+    return (abs(view.action * velocities) * view.strength).sum()
 
 
 def joint_limits(view: HumanoidView) -> Array:
     """Sum over the joints of how deep they are in the last 2 % before a limit, 1 at the limit."""
-    depth = jnp.maximum(jnp.abs(view.pose.joints) - NEAR_LIMIT, 0.0) / (1.0 - NEAR_LIMIT)
-    return jnp.sum(depth * view.strength)
+    depth = (abs(view.pose.joints) - NEAR_LIMIT).clip(0.0) / (1.0 - NEAR_LIMIT)
+    return (depth * view.strength).sum()
 
 
 TERMS = {
     "progress": RewardTerm[HumanoidView](lambda v: v.speed_m_per_s, 1.0),
-    "alive": RewardTerm[HumanoidView](lambda v: jnp.ones(()), 2.0),
+    "alive": RewardTerm[HumanoidView](lambda v: 1.0, 2.0),
     "upright": RewardTerm[HumanoidView](lambda v: runner.upright_bonus(v.pose), 0.1),
     "heading": RewardTerm[HumanoidView](lambda v: runner.heading_bonus(v.pose), 0.5),
-    "action": RewardTerm[HumanoidView](lambda v: jnp.sum(v.action**2), -0.01),
+    "action": RewardTerm[HumanoidView](lambda v: (v.action**2).sum(), -0.01),
     "energy": RewardTerm[HumanoidView](energy, -0.05),
     "joint_limits": RewardTerm[HumanoidView](joint_limits, -0.25),
 }
@@ -104,7 +103,7 @@ def make(
 ) -> Env:
     """Makes the task without its time limit; see `gmijax.sim.registry.make_env`."""
     terms, chosen = with_weights(TERMS, rewards), settings_from(HumanoidSettings, settings)
-    world = physics.load("humanoid", impl=impl, substeps=SUBSTEPS, max_envs=max_envs)
+    world = simulators.load("humanoid", impl=impl, substeps=SUBSTEPS, max_envs=max_envs)
     ids = runner.look_up(world.mj_model, JOINTS, SENSORS)
     strength = motor_strength(world.mj_model)
     spec = EnvSpec(
@@ -120,15 +119,16 @@ def make(
     )
 
     def reset(model: PyTree, key: PRNGKey) -> EnvState:
-        key, draw = jax.random.split(key)
+        key, draw = draws.split(key)
         start = world.start(*runner.draw_start(ids, world.mj_model, draw, chosen))
         # Forces read zero: a reset runs no physics, see `Physics.start`.
-        forces, sensors = jnp.zeros(ACTION_SIZE), jnp.zeros(len(ids.sensors))
-        obs = observe(runner.pose_of(ids, start), forces, sensors, jnp.zeros(ACTION_SIZE))
+        zeros = np.zeros(ACTION_SIZE, np.float32)
+        sensors = np.zeros(len(ids.sensors), np.float32)
+        obs = observe(runner.pose_of(ids, start), zeros, sensors, zeros)
         return episode.begin(spec, start, (), obs, key)
 
     def step(model: PyTree, state: EnvState, action: Array) -> EnvState:
-        action = jnp.clip(action, -1.0, 1.0)
+        action = action.clip(-1.0, 1.0)
         moved, (forces, sensors) = world.step(
             model,
             state.physics,
@@ -137,7 +137,7 @@ def make(
         )
         pose = runner.pose_of(ids, moved)
         speed = runner.speed_to_target(state.physics, moved, world.control_dt_s)
-        view = HumanoidView(pose, action, speed, jnp.asarray(strength))
+        view = HumanoidView(pose, action, speed, strength)
         dead = pose.position[2] < chosen.death_height_m
         reward = total_reward(terms, view, Replacement(DEATH, dead, chosen.death_reward))
         obs = observe(pose, forces, sensors, action)
@@ -162,12 +162,13 @@ def observe(pose: RunnerPose, joint_forces: Array, foot_sensors: Array, action: 
       foot_sensors: [12] force and torque at either foot, N and N m.
       action: [21] the last action.
     """
-    return jnp.concatenate(
+    xp = array_module(pose.position)
+    return xp.concatenate(
         [
             pose.position[2:],
             pose.velocity,
             ANGULAR_VELOCITY_SCALE * pose.angular_velocity,
-            jnp.stack([pose.yaw, pose.roll, pose.angle_to_target, pose.upright, pose.heading]),
+            xp.stack([pose.yaw, pose.roll, pose.angle_to_target, pose.upright, pose.heading]),
             pose.joints,
             JOINT_VELOCITY_SCALE * pose.joint_velocities,
             FORCE_SCALE * joint_forces,

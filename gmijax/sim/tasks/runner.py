@@ -9,17 +9,18 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
-import jax
-import jax.numpy as jnp
 import mujoco
 import numpy as np
 
-from gmijax.sim import physics, rotations
+from gmijax.arrays import array_module, replaced
+from gmijax.sim import draws, rotations
+from gmijax.sim.physics_state import PhysicsState
 from gmijax.sim.tasks import lookup
 from gmijax.sim.tasks.settings import RunnerSettings
 from gmijax.types import Array, PRNGKey
 
-TARGET_M = (1000.0, 0.0)
+TARGET_M = np.array([1000.0, 0.0], np.float32)
+X_AXIS = np.array([1.0, 0.0, 0.0], np.float32)
 UPRIGHT = 0.93
 AHEAD = 0.8
 SPEED = "speed_m_per_s"
@@ -90,27 +91,30 @@ def draw_start(
     ids: RunnerIds, mj_model: mujoco.MjModel, key: PRNGKey, settings: RunnerSettings
 ) -> tuple[Array, Array]:
     """Random `qpos` [nq] and `qvel` [nv]: the torso in its place, noise on the joints only."""
-    position_key, velocity_key = jax.random.split(key)
+    position_key, velocity_key = draws.split(key)
     lower, upper = ids.joints.lower, ids.joints.upper
     shape, noise = lower.shape, settings.joint_noise_rad
     rest = np.clip(np.zeros(shape, np.float32), lower, upper)
-    joints = rest + jax.random.uniform(position_key, shape, minval=-noise, maxval=noise)
+    joints = rest + draws.uniform(position_key, shape, minval=-noise, maxval=noise)
     noise = settings.joint_velocity_noise_rad_per_s
-    velocities = jax.random.uniform(velocity_key, shape, minval=-noise, maxval=noise)
-    qpos = jnp.array(mj_model.qpos0, jnp.float32)
-    qpos = qpos.at[ids.joints.qpos].set(jnp.clip(joints, lower, upper))
-    return qpos, jnp.zeros(mj_model.nv).at[ids.joints.qvel].set(velocities)
+    velocities = draws.uniform(velocity_key, shape, minval=-noise, maxval=noise)
+    joints = joints.clip(lower, upper)
+    return (
+        replaced(mj_model.qpos0.astype(np.float32), ids.joints.qpos, joints),
+        replaced(np.zeros(mj_model.nv, np.float32), ids.joints.qvel, velocities),
+    )
 
 
-def pose_of(ids: RunnerIds, state: physics.PhysicsState) -> RunnerPose:
+def pose_of(ids: RunnerIds, state: PhysicsState) -> RunnerPose:
     """Derives the pose from positions and velocities alone."""
+    xp = array_module(state.qpos)
     position, quat = state.qpos[:3], state.qpos[3:7]
     roll, yaw = rotations.roll_and_yaw(quat)
-    to_target = jnp.array(TARGET_M) - position[:2]
+    to_target = TARGET_M - position[:2]
     # The figures' source takes the target's height for its y here. That makes the angle blind
     # to drifting sideways, which can only be an oversight.
-    angle = jnp.arctan2(to_target[1], to_target[0]) - yaw
-    forward = rotations.rotate(quat, jnp.array([1.0, 0.0, 0.0]))
+    angle = xp.arctan2(to_target[1], to_target[0]) - yaw
+    forward = rotations.rotate(quat, X_AXIS)
     joints = state.qpos[ids.joints.qpos]
     return RunnerPose(
         position=position,
@@ -120,21 +124,20 @@ def pose_of(ids: RunnerIds, state: physics.PhysicsState) -> RunnerPose:
         roll=roll,
         angle_to_target=rotations.wrap(angle),
         upright=1.0 - 2.0 * (quat[1] ** 2 + quat[2] ** 2),
-        heading=forward[:2] @ to_target / jnp.linalg.norm(to_target),
+        heading=forward[:2] @ to_target / xp.linalg.norm(to_target),
         joints=ids.joints.scaled(joints),
         joint_velocities=state.qvel[ids.joints.qvel],
     )
 
 
-def speed_to_target(
-    before: physics.PhysicsState, after: physics.PhysicsState, dt_s: float
-) -> Array:
+def speed_to_target(before: PhysicsState, after: PhysicsState, dt_s: float) -> Array:
     """Decrease of the distance to the target per second, m/s."""
-    old, new = (jnp.array(TARGET_M) - state.qpos[:2] for state in (before, after))
+    xp = array_module(after.qpos)
+    old, new = (TARGET_M - state.qpos[:2] for state in (before, after))
     moved = after.qpos[:2] - before.qpos[:2]
     # |old| - |new| as a quotient: in float32 the difference of two numbers near 1000 m is off by
     # 0.1 mm, which is 7 mm/s here.
-    return moved @ (old + new) / (jnp.linalg.norm(old) + jnp.linalg.norm(new)) / dt_s
+    return moved @ (old + new) / (xp.linalg.norm(old) + xp.linalg.norm(new)) / dt_s
 
 
 def mean_speed(pose: RunnerPose, steps: Array, dt_s: float) -> Array:
@@ -144,9 +147,9 @@ def mean_speed(pose: RunnerPose, steps: Array, dt_s: float) -> Array:
 
 def upright_bonus(pose: RunnerPose) -> Array:
     """1 while the torso is nearly upright, else 0."""
-    return (pose.upright > UPRIGHT).astype(jnp.float32)
+    return (pose.upright > UPRIGHT).astype(np.float32)
 
 
 def heading_bonus(pose: RunnerPose) -> Array:
     """1 while the torso looks at the target or nearly so, less and below 0 as it turns away."""
-    return jnp.minimum(pose.heading / AHEAD, 1.0)
+    return array_module(pose.heading).minimum(pose.heading / AHEAD, 1.0)

@@ -13,21 +13,23 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
-import jax
-import jax.numpy as jnp
 import mujoco
 import numpy as np
 import numpy.typing as npt
-from mujoco import mjx
 
-from gmijax.sim import episode, physics, rotations
+from gmijax.arrays import array_module, replaced
+from gmijax.sim import draws, episode, rotations, simulators
 from gmijax.sim.interface import Env, EnvSpec, EnvState
+from gmijax.sim.physics_state import PhysicsState
 from gmijax.sim.rewards import RewardTerm, term_names, total_reward, with_weights
 from gmijax.sim.tasks import lookup
 from gmijax.sim.tasks.settings import ShadowHandSettings, settings_from
 from gmijax.types import Array, PRNGKey, PyTree
+
+if TYPE_CHECKING:
+    from mujoco import mjx
 
 DEFAULT_EPISODE_LENGTH = 600
 SUBSTEPS = 2
@@ -50,7 +52,8 @@ OBS_LIMIT = 5.0
 VELOCITY_SCALE = 0.2
 JOINT_TORQUE_SCALE = 10.0
 TIP_SENSOR_SCALE = 10.0
-GOAL_M = (0.0, -0.39, 0.56)
+GOAL_M = np.array([0.0, -0.39, 0.56], np.float32)
+X_AXIS, Y_AXIS = np.array([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0]], np.float32)
 
 JOINTS = (
     *("WRJ1", "WRJ0"),
@@ -144,8 +147,8 @@ class ShadowHandView(NamedTuple):
 TERMS = {
     "distance": RewardTerm[ShadowHandView](lambda v: v.distance_m, -10.0),
     "rotation": RewardTerm[ShadowHandView](lambda v: 1.0 / (v.error_rad + 0.1), 1.0),
-    "action": RewardTerm[ShadowHandView](lambda v: jnp.sum(v.action**2), -0.0002),
-    "success": RewardTerm[ShadowHandView](lambda v: v.reached.astype(jnp.float32), 250.0),
+    "action": RewardTerm[ShadowHandView](lambda v: (v.action**2).sum(), -0.0002),
+    "success": RewardTerm[ShadowHandView](lambda v: v.reached.astype(np.float32), 250.0),
 }
 
 
@@ -158,7 +161,7 @@ def make(
 ) -> Env:
     """Makes the task without its time limit; see `gmijax.sim.registry.make_env`."""
     terms, chosen = with_weights(TERMS, rewards), settings_from(ShadowHandSettings, settings)
-    world = physics.load("shadow_hand", impl=impl, substeps=SUBSTEPS, max_envs=max_envs)
+    world = simulators.load("shadow_hand", impl=impl, substeps=SUBSTEPS, max_envs=max_envs)
     ids = look_up(world.mj_model)
     spec = EnvSpec(
         name="shadow_hand",
@@ -172,16 +175,17 @@ def make(
     )
 
     def reset(model: PyTree, key: PRNGKey) -> EnvState:
-        key, start_key, goal_key = jax.random.split(key, 3)
+        key, start_key, goal_key = draws.split(key, 3)
         qpos = draw_start(ids, world.mj_model, start_key, chosen)
-        start = world.start(qpos, jnp.zeros(world.mj_model.nv))
-        task = ShadowHandTask(draw_rotation(goal_key), jnp.zeros(()))
+        xp = array_module(qpos)
+        start = world.start(qpos, xp.zeros(world.mj_model.nv, np.float32))
+        task = ShadowHandTask(draw_rotation(goal_key), xp.zeros((), np.float32))
         touch = touch_at_rest(ids, *world.poses(qpos))
-        obs = observe(ids, start, touch, task.goal, jnp.zeros(ACTION_SIZE))
+        obs = observe(ids, start, touch, task.goal, np.zeros(ACTION_SIZE, np.float32))
         return episode.begin(spec, start, task, obs, key)
 
     def step(model: PyTree, state: EnvState, action: Array) -> EnvState:
-        action = jnp.clip(action, -1.0, 1.0)
+        action = action.clip(-1.0, 1.0)
         targets = targets_of(ids, action)
         moved, touch = world.step(model, state.physics, targets, lambda data: touch_of(ids, data))
         view = view_of(ids, moved, state.task.goal, action, chosen.reached_rad)
@@ -210,33 +214,33 @@ def look_up(mj_model: mujoco.MjModel) -> ShadowHandIds:
 
 def draw_rotation(key: PRNGKey) -> Array:
     """A random quaternion [4]: a turn about y, then one about x, each uniform over a circle."""
-    about_x, about_y = jax.random.uniform(key, (2,), minval=-jnp.pi, maxval=jnp.pi)
-    x, y = jnp.array([1.0, 0.0, 0.0]), jnp.array([0.0, 1.0, 0.0])
-    return rotations.product(rotations.turn(x, about_x), rotations.turn(y, about_y))
+    about_x, about_y = draws.uniform(key, (2,), minval=-np.pi, maxval=np.pi)
+    return rotations.product(rotations.turn(X_AXIS, about_x), rotations.turn(Y_AXIS, about_y))
 
 
 def draw_start(
     ids: ShadowHandIds, mj_model: mujoco.MjModel, key: PRNGKey, settings: ShadowHandSettings
 ) -> Array:
     """Random `qpos` [31]: a hand nearly flat, the cube above it in any rotation."""
-    joint_key, position_key, rotation_key = jax.random.split(key, 3)
+    joint_key, position_key, rotation_key = draws.split(key, 3)
     share, most = settings.joint_noise, settings.cube_noise_m
     lower, upper = share * ids.joints.lower, share * ids.joints.upper
-    joints = jax.random.uniform(joint_key, lower.shape, minval=lower, maxval=upper)
+    joints = draws.uniform(joint_key, lower.shape, minval=lower, maxval=upper)
     # Drawn apart from each other, two coupled joints would snap together in the first step.
-    joints = joints.at[FOLLOWERS].set(joints[FOLLOWERS - 1])
-    qpos = jnp.array(mj_model.qpos0, jnp.float32).at[ids.joints.qpos].set(joints)
-    noise = jax.random.uniform(position_key, (3,), minval=-most, maxval=most)
+    joints = replaced(joints, FOLLOWERS, joints[FOLLOWERS - 1])
+    qpos = replaced(mj_model.qpos0.astype(np.float32), ids.joints.qpos, joints)
+    noise = draws.uniform(position_key, (3,), minval=-most, maxval=most)
     position = qpos[ids.cube_qpos : ids.cube_qpos + 3] + noise
-    cube = jnp.concatenate([position, draw_rotation(rotation_key)])
-    return jax.lax.dynamic_update_slice(qpos, cube, (ids.cube_qpos,))
+    cube = array_module(qpos).concatenate([position, draw_rotation(rotation_key)])
+    return replaced(qpos, ids.cube_qpos, cube)
 
 
 def next_goal(task: ShadowHandTask, reached: Array, key: PRNGKey) -> tuple[ShadowHandTask, Array]:
     """Another goal where the last one is reached; only then the world's key moves on."""
-    moved_on, draw = jax.random.split(key)
-    goal = jnp.where(reached, draw_rotation(draw), task.goal)
-    return ShadowHandTask(goal, task.successes + reached), jnp.where(reached, moved_on, key)
+    moved_on, draw = draws.split(key)
+    goal = array_module(reached).where(reached, draw_rotation(draw), task.goal)
+    task = ShadowHandTask(goal, task.successes + reached)
+    return task, draws.next_key(reached, moved_on, key)
 
 
 def targets_of(ids: ShadowHandIds, action: Array) -> Array:
@@ -248,8 +252,10 @@ def targets_of(ids: ShadowHandIds, action: Array) -> Array:
 def tips_of(ids: ShadowHandIds, xpos: Array, xquat: Array, velocities: Array) -> Array:
     """Fingertips [5, 13] from all bodies' poses [nbody, 3], [nbody, 4] and velocities [5, 6]."""
     quats = xquat[ids.tip_bodies]
-    offsets = jax.vmap(rotations.rotate)(quats, jnp.array(ids.tip_offsets))
-    return jnp.concatenate([xpos[ids.tip_bodies] + offsets, quats, velocities], axis=1)
+    offsets = rotations.rotate(quats, ids.tip_offsets)
+    return array_module(quats).concatenate(
+        [xpos[ids.tip_bodies] + offsets, quats, velocities], axis=1
+    )
 
 
 def touch_at_rest(ids: ShadowHandIds, xpos: Array, xquat: Array) -> Touch:
@@ -257,8 +263,8 @@ def touch_at_rest(ids: ShadowHandIds, xpos: Array, xquat: Array) -> Touch:
 
     The tips' sensors read zero: a reset runs no physics, see `Physics.start`.
     """
-    zeros = jnp.zeros((NUM_TIPS, 6))
-    return Touch(jnp.zeros(len(JOINTS)), tips_of(ids, xpos, xquat, zeros), zeros)
+    zeros = np.zeros((NUM_TIPS, 6), np.float32)
+    return Touch(np.zeros(len(JOINTS), np.float32), tips_of(ids, xpos, xquat, zeros), zeros)
 
 
 def touch_of(ids: ShadowHandIds, data: mjx.Data) -> Touch:
@@ -268,7 +274,7 @@ def touch_of(ids: ShadowHandIds, data: mjx.Data) -> Touch:
     return Touch(torques, tips_of(ids, data.xpos, data.xquat, velocities), forces)
 
 
-def cube_of(ids: ShadowHandIds, state: physics.PhysicsState) -> CubePose:
+def cube_of(ids: ShadowHandIds, state: PhysicsState) -> CubePose:
     """The cube's pose and velocities, all seen from the world."""
     pose = state.qpos[ids.cube_qpos : ids.cube_qpos + 7]
     velocity = state.qvel[ids.cube_qvel : ids.cube_qvel + 6]
@@ -278,7 +284,7 @@ def cube_of(ids: ShadowHandIds, state: physics.PhysicsState) -> CubePose:
 
 def view_of(
     ids: ShadowHandIds,
-    state: physics.PhysicsState,
+    state: PhysicsState,
     goal: Array,
     action: Array,
     reached_rad: float,
@@ -286,26 +292,27 @@ def view_of(
     """What the reward of a step reads, with the goal [4] that the step was to reach."""
     cube = cube_of(ids, state)
     error = rotations.angle(rotations.product(cube.quat, rotations.conjugate(goal)))
-    distance = jnp.linalg.norm(cube.position - jnp.array(GOAL_M))
+    distance = array_module(goal, cube.position).linalg.norm(cube.position - GOAL_M)
     return ShadowHandView(distance, error, error <= reached_rad, action)
 
 
 def observe(
-    ids: ShadowHandIds, state: physics.PhysicsState, touch: Touch, goal: Array, action: Array
+    ids: ShadowHandIds, state: PhysicsState, touch: Touch, goal: Array, action: Array
 ) -> Array:
     """The observation [211] from the state, the goal [4] and the last action [20]."""
     joints, cube = state.qpos[ids.joints.qpos], cube_of(ids, state)
     to_cube = rotations.product(cube.quat, rotations.conjugate(goal))
-    values = jnp.concatenate(
+    xp = array_module(joints)
+    values = xp.concatenate(
         [
             ids.joints.scaled(joints),
             VELOCITY_SCALE * state.qvel[ids.joints.qvel],
             JOINT_TORQUE_SCALE * touch.joint_torques,
             *(cube.position, cube.quat, cube.velocity, VELOCITY_SCALE * cube.angular_velocity),
-            *(jnp.array(GOAL_M), goal, to_cube),
+            *(GOAL_M, goal, to_cube),
             touch.tips.ravel(),
             TIP_SENSOR_SCALE * touch.tip_forces.ravel(),
             action,
         ]
     )
-    return jnp.clip(values, -OBS_LIMIT, OBS_LIMIT)
+    return values.clip(-OBS_LIMIT, OBS_LIMIT)

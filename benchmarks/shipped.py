@@ -1,0 +1,190 @@
+r"""Trains the policies that gmijax ships: `python -m benchmarks.shipped`.
+
+All tasks are trained at the same time on one GPU, each with its tuned settings but for those of
+`RECIPES`. The checkpoint with the best evaluation becomes `gmijax/player/policies/<task>.npz`,
+its weights in float16. `benchmarks/results/shipped-<device>.json` says what it was made with and
+what it returns: in MJX, as evaluated while it was trained (128 episodes with float32 weights), and
+in plain MuJoCo, as the file is.
+
+    python -m benchmarks.shipped --deadline-s 470
+
+`--only-evaluate` leaves the policies as they are and plays them in plain MuJoCo again.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import tempfile
+import time
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from benchmarks.command import start, wait_until
+from benchmarks.records import RESULTS, ResultsFile, device_name, file_name
+from gmijax.machine.mps_control import DEFAULT_PIPE_DIRECTORY, MpsControl
+from gmijax.machine.snapshot import Machine, detect_machine
+from gmijax.player.policy import read_policy, write_policy
+from gmijax.player.shipped import POLICIES
+from gmijax.runs.folder import POLICY, RunPaths, read_json
+from gmijax.runs.history import read_metrics
+from gmijax.runs.resume import CheckpointMeta, best_checkpoint
+
+SEED = 0
+EVALUATIONS = 5
+"""Of a training; the best one's checkpoint is shipped."""
+
+
+class Recipe(NamedTuple):
+    """How a policy is trained: environment steps, and what is not as it is tuned."""
+
+    steps: int
+    overrides: Sequence[str] = ()
+
+
+RECIPES: Mapping[str, Recipe] = {
+    "ant": Recipe(40_000_000),
+    "anymal": Recipe(40_000_000),
+    "ball_balance": Recipe(12_000_000, ("num_envs=4096",)),
+    "franka_cabinet": Recipe(30_000_000),
+    "humanoid": Recipe(60_000_000),
+    # A file of the tuned network would be six times as large.
+    "shadow_hand": Recipe(100_000_000, ("algo.policy_hidden_layer_sizes=[256,256,128]",)),
+}
+
+
+def main() -> int:
+    """Trains and evaluates; returns 1 if a training failed."""
+    given = _arguments()
+    path = given.out / file_name("shipped", device_name())
+    file = ResultsFile(path, "shipped", vars(given))
+    code = 0
+    if not given.only_evaluate:
+        with tempfile.TemporaryDirectory() as scratch:
+            code = train(given, given.runs or Path(scratch), file)
+    for task in given.tasks:
+        evaluate(task, given, file)
+    return code
+
+
+def train(given: argparse.Namespace, runs: Path, file: ResultsFile) -> int:
+    """Trains all at once, and keeps the policies of those that are through."""
+    deadline_s = time.monotonic() + given.deadline_s
+    runs.mkdir(parents=True, exist_ok=True)
+    with _shared_gpu(detect_machine(), runs) as own:
+        started = []
+        for task in given.tasks:
+            with (runs / f"{task}.log").open("wb") as log:
+                started.append(start(command(task, given, runs, own), {}, log))
+        codes = wait_until(deadline_s, *started)
+    for task, code in zip(given.tasks, codes, strict=True):
+        if code in (0, 130):  # 130: it was stopped at the deadline, and has saved.
+            keep(task, code, runs / task, given, file)
+        else:
+            sys.stdout.write(f"{task}: failed (exit code {code}), see {runs / task}.log\n")
+            sys.stdout.write((runs / f"{task}.log").read_text(errors="replace")[-2000:])
+    return int(any(codes))
+
+
+def command(task: str, given: argparse.Namespace, runs: Path, own: Sequence[str]) -> Sequence[str]:
+    """The training of a task."""
+    recipe = RECIPES[task]
+    steps = max(1, int(recipe.steps * given.scale))
+    return [
+        *(sys.executable, "-m", "gmijax.train", f"env={task}", f"num_timesteps={steps}"),
+        *(f"seed={SEED}", f"run.dir={runs / task}", "run.measure_throughput=false"),
+        *(f"eval.every={-(-steps // EVALUATIONS)}", "run.checkpoint_every=0"),
+        *(*recipe.overrides, *own, *given.overrides),
+    ]
+
+
+@contextmanager
+def _shared_gpu(machine: Machine, runs: Path) -> Iterator[Sequence[str]]:
+    """Keys for trainings that share a GPU, under one MPS daemon where there is one to start."""
+    if not machine.gpus:
+        yield []
+        return
+    share = [f"plan.memory_fraction={0.8 / len(RECIPES):.2f}"]
+    gpu = machine.gpus[0]
+    if machine.mps_control is None or machine.daemon_of(gpu.uuid) is not None:
+        yield share
+        return
+    daemon = MpsControl(machine.mps_control, DEFAULT_PIPE_DIRECTORY)
+    daemon.start(gpu.uuid, runs / "mps")
+    try:
+        yield [*share, "plan.backend=mps"]
+    finally:
+        daemon.quit()
+
+
+def keep(
+    task: str, code: int, run_dir: Path, given: argparse.Namespace, file: ResultsFile
+) -> None:
+    """Ships the best checkpoint of a run, and writes down where it is from."""
+    best = best_checkpoint(run_dir)
+    if best is None:
+        sys.stdout.write(f"{task}: no checkpoint\n")
+        return
+    steps = CheckpointMeta.read(best).env_steps
+    policy = read_policy(best / POLICY)
+    given.policies.mkdir(parents=True, exist_ok=True)
+    write_policy(given.policies / f"{task}.npz", policy, half=True)
+    evaluations = [
+        {"env_steps": line["env_steps"], "return": line["eval/return"], **_of(line)}
+        for line in read_metrics(RunPaths(run_dir).metrics)
+        if "eval/return" in line
+    ]
+    summary = read_json(RunPaths(run_dir).summary)
+    with file.changing() as results:
+        results[task] = {
+            "overrides": list(command(task, given, Path("runs"), ())[3:]),
+            "code": code,
+            "env_steps": steps,
+            "seconds": summary.get("wall_s"),
+            "bytes": (given.policies / f"{task}.npz").stat().st_size,
+            "mjx": next((one for one in evaluations if one["env_steps"] == steps), None),
+            "evaluations": evaluations,
+            "summary": summary,
+        }
+    sys.stdout.write(f"{task}: {steps} steps, {results[task]['mjx']}\n")
+
+
+def _of(line: Mapping[str, Any]) -> dict[str, Any]:
+    """The rest of an evaluation."""
+    names = [name for name in line if name.startswith("eval/") and name != "eval/return"]
+    return {name.removeprefix("eval/"): line[name] for name in names}
+
+
+def evaluate(task: str, given: argparse.Namespace, file: ResultsFile) -> None:
+    """Plays a shipped policy in plain MuJoCo."""
+    from gmijax.player.returns import returns_of
+
+    path = given.policies / f"{task}.npz"
+    if not path.exists():
+        return
+    found = returns_of(read_policy(path), num_episodes=given.episodes, seed=SEED + 1)
+    with file.changing() as results:
+        results.setdefault(task, {})["mujoco"] = found
+    sys.stdout.write(f"{task}: in plain MuJoCo {found}\n")
+
+
+def _arguments() -> argparse.Namespace:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("overrides", nargs="*", help="of all trainings, e.g. physics.impl=jax")
+    parser.add_argument("--tasks", nargs="+", default=list(RECIPES), choices=list(RECIPES))
+    parser.add_argument("--scale", type=float, default=1.0, help="factor on all steps")
+    parser.add_argument("--episodes", type=int, default=128, help="in plain MuJoCo")
+    parser.add_argument("--deadline-s", type=float, default=3600.0, help="for the trainings")
+    parser.add_argument("--only-evaluate", action="store_true", help="train nothing")
+    parser.add_argument("--runs", type=Path, help="keep the run folders here")
+    parser.add_argument("--policies", type=Path, default=POLICIES, help="where policies go")
+    parser.add_argument("--out", type=Path, default=RESULTS, help="folder of the JSON file")
+    return parser.parse_intermixed_args()
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,29 @@
+"""The trained policies that are shipped, one for every task; `benchmarks/shipped.py` makes them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Final
+
+from gmijax.errors import ConfigError
+from gmijax.player.policy import PlainPolicy, read_policy
+
+POLICIES: Final = Path(__file__).parent / "policies"
+
+
+def shipped_tasks() -> tuple[str, ...]:
+    """Tasks of which a policy is shipped."""
+    return tuple(sorted(path.stem for path in POLICIES.glob("*.npz")))
+
+
+def shipped_policy(task: str) -> PlainPolicy:
+    """The shipped policy of a task.
+
+    Raises:
+      ConfigError: there is none.
+    """
+    if task not in shipped_tasks():
+        raise ConfigError(
+            f"env={task}: no policy of it is shipped; allowed are {', '.join(shipped_tasks())}"
+        )
+    return read_policy(POLICIES / f"{task}.npz")

@@ -1,0 +1,42 @@
+"""A shipped model with what moves it: MJX, or MuJoCo in C. Imports jax for MJX only."""
+
+from __future__ import annotations
+
+from importlib import resources
+from typing import TYPE_CHECKING, Any, Final
+
+import mujoco
+
+if TYPE_CHECKING:
+    from gmijax.sim.physics import Physics
+
+C: Final = "c"
+"""The implementation that is MuJoCo in C: one world in numpy, for the player."""
+
+
+def load_model(asset: str) -> mujoco.MjModel:
+    """The model `asset` that is shipped in `gmijax/sim/assets`: its file without `.xml`."""
+    text = resources.files("gmijax.sim").joinpath("assets", f"{asset}.xml").read_text()
+    return mujoco.MjModel.from_xml_string(text)
+
+
+def load(asset: str, *, impl: str, substeps: int, max_envs: int | None = None) -> Physics:
+    """A shipped model with its simulator, of which tasks use what all of them have.
+
+    Args:
+      asset: see `load_model`.
+      impl: `auto`, `jax` or `warp`, see `gmijax.sim.physics.load`; `c`: `gmijax.sim.c_physics`.
+      substeps: physics steps per control step.
+      max_envs: upper bound of worlds simulated at once, None for no limit.
+
+    Raises:
+      ConfigError: `impl` cannot be had, or the model needs state that is not carried.
+    """
+    if impl == C:
+        from gmijax.sim.c_physics import CPhysics
+
+        world: Any = CPhysics(load_model(asset), substeps)
+        return world
+    from gmijax.sim import physics
+
+    return physics.load(asset, impl=impl, substeps=substeps, max_envs=max_envs)
