@@ -43,7 +43,7 @@ def _with_custom_task(name: str, override: str) -> tuple[str, ...]:
     if match is None:
         return (override,)
     value = override.removeprefix("env=") if match[1] else quoted(match[2])
-    if name in ("play", "export"):  # Which task it is the run says.
+    if name in ("play", "export", "view"):  # Which task it is the run says.
         return (f"run.env={value}",)
     return "env=custom", f"env.name={value}"
 

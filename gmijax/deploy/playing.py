@@ -15,7 +15,15 @@ from typing import Any, Final, TypeVar
 from rich.console import Console
 from rich.table import Table
 
-from gmijax.config import EnvConfig, ExportConfig, PlanConfig, PlayConfig, ReduceConfig, Timeouts
+from gmijax.config import (
+    EnvConfig,
+    ExportConfig,
+    PlanConfig,
+    PlayConfig,
+    ReduceConfig,
+    Timeouts,
+    ViewConfig,
+)
 from gmijax.config.schema import to_dict
 from gmijax.control.console import doing, nearby, open_console
 from gmijax.deploy.pictures import film, has_brax, write_page
@@ -44,7 +52,7 @@ from gmijax.sim.registry import require_env
 from gmijax.supervise.job_kinds import JobKind
 from gmijax.supervise.run_gmis import Launch, run_gmis
 
-C = TypeVar("C", PlayConfig, ExportConfig)
+C = TypeVar("C", PlayConfig, ExportConfig, ViewConfig)
 
 MEMORY_FRACTION: Final = 0.1
 """Most of a GPU's memory that playing takes: beside a training job that reserves 0.8."""
@@ -141,7 +149,7 @@ def open_run(config: C) -> tuple[C, EnvConfig, str | None]:
     return config, env, "\n".join(filter(None, notes)) or None
 
 
-def _find(config: PlayConfig | ExportConfig) -> Path:
+def _find(config: PlayConfig | ExportConfig | ViewConfig) -> Path:
     """The checkpoint that the configuration names."""
     wanted, run_dir = config.checkpoint, config.run.dir
     if wanted in (None, "best") or (wanted.isdecimal() and len(wanted) <= _MOST_DIGITS):

@@ -1,4 +1,4 @@
-"""Which requests the viewer's server answers. Nothing but the standard library here.
+"""Which requests the viewer's server answers. No jax here.
 
 A page of any website may open a websocket to this machine, and a name that its owner points here
 passes for our own (DNS rebinding). So three things are checked of every request: that its `Host`
@@ -16,7 +16,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from urllib.parse import urlsplit
 
-from gmijax.errors import ConfigError
+from gmijax.config.view import origin_of
 
 _TOKEN_BYTES = 24
 
@@ -34,28 +34,6 @@ def _address(host: str) -> ipaddress.IPv4Address | ipaddress.IPv6Address | None:
         return ipaddress.ip_address(host.strip("[]"))
     except ValueError:
         return None
-
-
-def require_origins(key: str, origins: Sequence[str]) -> None:
-    """Raises ConfigError unless all are origins of web pages, e.g. `https://hub.example.org`."""
-    for origin in origins:
-        if _origin(origin) != origin:
-            raise ConfigError(
-                f"{key}: {origin!r} is no origin; expected e.g. https://hub.example.org"
-            )
-
-
-def _origin(url: str) -> str | None:
-    """The origin of a URL as browsers write it; None where it has none."""
-    try:
-        parts = urlsplit(url)
-        port = f":{parts.port}" if parts.port is not None else ""
-    except ValueError:
-        return None
-    if parts.scheme not in ("http", "https") or not parts.hostname or "@" in parts.netloc:
-        return None
-    host = f"[{parts.hostname}]" if ":" in parts.hostname else parts.hostname
-    return f"{parts.scheme}://{host}{port}"
 
 
 @dataclass(frozen=True)
@@ -92,7 +70,7 @@ class Guard:
 
     def _is_ours(self, netloc: str) -> bool:
         # Any port: `ssh -L` may give the page another one than the server has.
-        host = urlsplit(f"//{netloc}").hostname if _origin(f"http://{netloc}") else None
+        host = urlsplit(f"//{netloc}").hostname if origin_of(f"http://{netloc}") else None
         if host is None:
             return False
         if is_loopback(host) or host in {urlsplit(url).hostname for url in self.allowed_origins}:

@@ -110,7 +110,7 @@ class Panel:
             "Push", color="orange", hint="or pull a body: ctrl and the left mouse button"
         )
         strength = self._gui.add_slider(
-            "Push by m/s", min=0.1, max=3.0, step=0.1, initial_value=PUSH_M_PER_S
+            "Push (m/s)", min=0.1, max=3.0, step=0.1, initial_value=PUSH_M_PER_S
         )
 
         @button.on_click
@@ -119,10 +119,10 @@ class Panel:
 
     def _add_command(self, limits: Mapping[str, float]) -> None:
         with self._gui.add_folder("Command"):
-            drawn = self._gui.add_checkbox("as the task draws it", initial_value=True)
+            drawn = self._gui.add_checkbox("Random", initial_value=True)
             sliders = [
                 self._gui.add_slider(
-                    name.replace("_", " "), min=-limit, max=limit, step=limit / 20, initial_value=0.0
+                    _with_unit(name), min=-limit, max=limit, step=limit / 20, initial_value=0.0
                 )
                 for name, limit in limits.items()
                 if limit > 0.0
@@ -144,7 +144,7 @@ class Panel:
 
     def _add_policy(self) -> None:
         with self._gui.add_folder("Policy"):
-            self._follow = self._gui.add_checkbox("follow the training", initial_value=False)
+            self._follow = self._gui.add_checkbox("Follow the training", initial_value=False)
             self._checkpoint = self._gui.add_dropdown("Checkpoint", ("-",))
 
         @self._follow.on_update
@@ -185,11 +185,23 @@ class Panel:
                 self._put(requests.FollowRobot(event.target.value))
 
 
+def _with_unit(name: str) -> str:
+    """The name of a number for people.
+
+    Examples:
+      >>> _with_unit("yaw_rad_per_s")
+      'yaw (rad/s)'
+    """
+    for written, unit in (("_rad_per_s", "rad/s"), ("_m_per_s", "m/s")):
+        if name.endswith(written):
+            return f"{name.removesuffix(written).replace('_', ' ')} ({unit})"
+    return name.replace("_", " ")
+
+
 def state_html(view: View) -> str:
     """A line on how it goes."""
-    parts = ["paused" if view.paused else f"{view.rate:.2g} x real time"]
-    if view.is_late and not view.paused:
-        parts.append("as fast as this machine can")
+    late = ", as fast as this machine can" if view.is_late else ""
+    parts = ["paused" if view.paused else f"{view.rate:.2g} x real time{late}"]
     if view.checkpoint is not None:
         age = "" if view.checkpoint_age_s is None else f", {_age(view.checkpoint_age_s)} old"
         how = "following, " if view.follow_training else ""
@@ -212,8 +224,10 @@ def bars_html(episode: Episode) -> str:
     last = "" if episode.last_return is None else f", the one before {episode.last_return:.1f}"
     head = f"episode {episode.number}, step {episode.steps}: return {total:.1f}{last}"
     longest = max((abs(value) for value in episode.now.values()), default=0.0) or 1.0
-    rows = [_row(name, value, value / longest, episode.sums[name]) for name, value in
-            (*episode.now.items(),)]
+    rows = [
+        _row(name, value, value / longest, episode.sums[name])
+        for name, value in episode.now.items()
+    ]
     rows.append(_row("sum", now, None, total))
     return (
         f'<div style="font-size:0.85em;padding:0 0.5em 0.5em"><div>{html.escape(head)}</div>'

@@ -9,7 +9,10 @@ from __future__ import annotations
 from pathlib import Path
 from typing import NamedTuple, TypeAlias
 
-from gmijax.viewer.scene import Drag as Drag
+import numpy as np
+import numpy.typing as npt
+
+Point: TypeAlias = npt.NDArray[np.floating]
 
 
 class Pause(NamedTuple):
@@ -36,6 +39,22 @@ class Push(NamedTuple):
     """Change the velocity of the robot in the selected environment at once, m/s."""
 
     speed_m_per_s: float
+
+
+class Drag(NamedTuple):
+    """The mouse pulls at a body.
+
+    Attributes:
+      env: number of the environment.
+      body: of the model.
+      grabbed: [3] the point that was taken hold of, where it is now, m, in that environment.
+      pointer: [3] where it is pulled to; None: the mouse has let go.
+    """
+
+    env: int
+    body: int
+    grabbed: Point
+    pointer: Point | None
 
 
 class SetCommand(NamedTuple):

@@ -7,7 +7,7 @@ model once where it stands still, and all environments at the origin.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping
 from typing import Any, Final, NamedTuple, TypeAlias
 
 import mujoco
@@ -19,8 +19,12 @@ from mjviser.conversions import group_geoms_by_visual_compat, merge_geoms
 
 from gmijax.sim.camera import free_robot
 from gmijax.viewer.floor import Floor, set_haze
+from gmijax.viewer.requests import Drag
 
 Floats: TypeAlias = npt.NDArray[np.floating]
+
+Color: TypeAlias = tuple[int, int, int]
+Arrow: TypeAlias = tuple[Floats, Floats]
 
 _LAST_VISIBLE_GROUP: Final = 2
 """MuJoCo's own viewers draw geoms of groups 0 to 2, unless they are told otherwise."""
@@ -33,24 +37,8 @@ _FROM: Final = np.array([-0.55, -0.75, 0.38])
 """Direction from what is looked at to the camera."""
 
 _UP: Final = (0.0, 0.0, 1.0)
-_ORANGE: Final = (235, 140, 40)
-_BLUE: Final = (60, 130, 200)
-
-
-class Drag(NamedTuple):
-    """The mouse pulls at a body.
-
-    Attributes:
-      env: number of the environment.
-      body: of the model.
-      grabbed: [3] the point that was taken hold of, where it is now, m, in that environment.
-      pointer: [3] where it is pulled to; None: the mouse has let go.
-    """
-
-    env: int
-    body: int
-    grabbed: Floats
-    pointer: Floats | None
+ORANGE: Final = (235, 140, 40)
+BLUE: Final = (60, 130, 200)
 
 
 class _Part(NamedTuple):
@@ -83,12 +71,18 @@ class Scene:
         self._fixed = server.scene.add_frame("/fixed", show_axes=False)
         self._parts = self._add_bodies()
         self._ring = self._add_ring()
+        self._arrows: dict[str, Any] = {}
         self._set_camera(low, high)
 
     @property
-    def follows(self) -> bool:
-        """Whether the model has a robot that leaves, which the view can follow."""
+    def has_robot(self) -> bool:
+        """Whether the model has a robot that moves freely, which the view can follow."""
         return self._robot is not None
+
+    @property
+    def width_m(self) -> float:
+        """Of the model at the start."""
+        return self._width
 
     def show(self, xpos: Floats, xquat: Floats, selected: int, *, follow: bool) -> None:
         """Draws poses.
@@ -114,23 +108,29 @@ class Scene:
                 part.handle.batched_wxyzs = xquat[:, part.bodies].reshape(-1, 4)
         self._server.flush()
 
-    def show_arrows(self, name: str, arrows: Sequence[tuple[int, Floats, Floats]]) -> None:
-        """Draws arrows (environment, from [3], to [3]) in place of those of that name."""
-        points = [
-            [start + self._offsets[env] - self._shift, end + self._offsets[env] - self._shift]
-            for env, start, end in arrows
-        ]
-        color = _ORANGE if name == "push" else _BLUE
-        size = 0.02 * self._width
-        self._server.scene.add_arrows(
-            f"/arrows/{name}",
-            np.array(points or np.zeros((1, 2, 3)), np.float32),
-            color,
-            shaft_radius=size,
-            head_radius=2.5 * size,
-            head_length=5.0 * size,
-            visible=bool(points),
-        )
+    def show_arrows(self, name: str, color: Color, arrows: Mapping[int, Arrow]) -> None:
+        """Draws arrows (from [3], to [3]) of environments in place of those of that name."""
+        handle = self._arrows.get(name)
+        if not arrows:
+            if handle is not None and handle.visible:
+                handle.visible = False
+            return
+        moved = {env: self._offsets[env] - self._shift for env in arrows}
+        points = np.array([np.add(ends, moved[env]) for env, ends in arrows.items()], np.float32)
+        if handle is None:
+            size = 0.02 * self._width
+            self._arrows[name] = self._server.scene.add_arrows(
+                f"/arrows/{name}",
+                points,
+                color,
+                shaft_radius=size,
+                head_radius=2.5 * size,
+                head_length=5.0 * size,
+            )
+            return
+        handle.points = points
+        if not handle.visible:
+            handle.visible = True
 
     def on_drag(self, callback: Callable[[Drag], None]) -> None:
         """Has `callback` called while a body is pulled with ctrl and the left button."""
@@ -177,7 +177,7 @@ class Scene:
             "/ring",
             ring.vertices,
             ring.faces,
-            color=_BLUE,
+            color=BLUE,
             cast_shadow=False,
             visible=len(self._offsets) > 1,
         )

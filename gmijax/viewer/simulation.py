@@ -53,9 +53,10 @@ class Simulation:
         self._told: Floats | None = None
         self._pulls: dict[int, Pull] = {}
         self._pushes: dict[int, Floats] = {}
-        self._rng = np.random.default_rng(seed)
+        self._pushed_lately: dict[int, tuple[int, Floats]] = {}
+        self._rng, self._steps = np.random.default_rng(seed), 0
         self._shown = mujoco.MjData(self.model)
-        self._pushed = pushed_body(self.model)
+        self.pushed = pushed_body(self.model)
         self.reset()
 
     @property
@@ -76,6 +77,7 @@ class Simulation:
     def step(self) -> None:
         """One control step of all environments; episodes that end are followed by others."""
         actions = self.policy(np.stack([env.obs for env in self.envs]))
+        self._steps += 1
         for number, (env, action) in enumerate(zip(self.envs, actions, strict=True)):
             forces = env.data.xfrc_applied
             forces[:] = 0.0
@@ -83,8 +85,9 @@ class Simulation:
                 pull.apply()
             if (push := self._pushes.pop(number, None)) is not None:
                 # The whole change within one control step.
-                mass = self.model.body_subtreemass[self._pushed]
-                forces[self._pushed, :3] += mass * push / self.control_dt_s
+                mass = self.model.body_subtreemass[self.pushed]
+                forces[self.pushed, :3] += mass * push / self.control_dt_s
+                self._pushed_lately[number] = (self._steps, push)
             done = env.step(action)
             forces[:] = 0.0
             self._count(number, done.terms)
@@ -113,9 +116,11 @@ class Simulation:
         self._told = None if command is None else np.array(command, np.float32)
         self._tell()
 
-    def pulls(self) -> list[tuple[int, Floats, Floats]]:
-        """What is pulled: environment, the point [3] of the body, and to where [3]."""
-        return [(env, pull.grabbed, pull.pointer) for env, pull in self._pulls.items()]
+    def pushed_lately(self) -> dict[int, Floats]:
+        """Changes of velocity [3] by pushes of the last half of a second, m/s, by environment."""
+        steps = int(0.5 / self.control_dt_s)
+        lately = self._pushed_lately.items()
+        return {env: push for env, (at, push) in lately if self._steps - at < steps}
 
     def poses(self) -> tuple[Floats, Floats]:
         """Positions [E, B, 3], m, and orientations [E, B, 4] of all bodies."""
@@ -132,6 +137,7 @@ class Simulation:
         before = self.episodes[number]
         self._pulls.pop(number, None)
         self._pushes.pop(number, None)
+        self._pushed_lately.pop(number, None)
         self.envs[number].reset()
         ended = sum(before.sums.values()) if before.steps else before.last_return
         self.episodes[number] = self._first(before.number + bool(before.steps), ended)
