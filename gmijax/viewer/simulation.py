@@ -54,7 +54,7 @@ class Simulation:
         self._pulls: dict[int, Pull] = {}
         self._pushes: dict[int, Floats] = {}
         self._pushed_lately: dict[int, tuple[int, Floats]] = {}
-        self._rng, self._steps = np.random.default_rng(seed), 0
+        self._rng, self.steps = np.random.default_rng(seed), 0
         self._shown = mujoco.MjData(self.model)
         self.pushed = pushed_body(self.model)
         self.reset()
@@ -77,7 +77,7 @@ class Simulation:
     def step(self) -> None:
         """One control step of all environments; episodes that end are followed by others."""
         actions = self.policy(np.stack([env.obs for env in self.envs]))
-        self._steps += 1
+        self.steps += 1
         for number, (env, action) in enumerate(zip(self.envs, actions, strict=True)):
             forces = env.data.xfrc_applied
             forces[:] = 0.0
@@ -87,7 +87,7 @@ class Simulation:
                 # The whole change within one control step.
                 mass = self.model.body_subtreemass[self.pushed]
                 forces[self.pushed, :3] += mass * push / self.control_dt_s
-                self._pushed_lately[number] = (self._steps, push)
+                self._pushed_lately[number] = (self.steps, push)
             done = env.step(action)
             forces[:] = 0.0
             self._count(number, done.terms)
@@ -120,7 +120,7 @@ class Simulation:
         """Changes of velocity [3] by pushes of the last half of a second, m/s, by environment."""
         steps = int(0.5 / self.control_dt_s)
         lately = self._pushed_lately.items()
-        return {env: push for env, (at, push) in lately if self._steps - at < steps}
+        return {env: push for env, (at, push) in lately if self.steps - at < steps}
 
     def poses(self) -> tuple[Floats, Floats]:
         """Positions [E, B, 3], m, and orientations [E, B, 4] of all bodies."""
