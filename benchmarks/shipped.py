@@ -14,10 +14,13 @@ in plain MuJoCo, as the file is.
 from __future__ import annotations
 
 import argparse
+import dataclasses
+import multiprocessing
 import sys
 import tempfile
 import time
 from collections.abc import Iterator, Mapping, Sequence
+from concurrent.futures import ProcessPoolExecutor
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -27,12 +30,24 @@ from benchmarks.records import RESULTS, ResultsFile, device_name, file_name
 from gmijax.machine.mps_control import DEFAULT_PIPE_DIRECTORY, MpsControl
 from gmijax.machine.snapshot import Machine, detect_machine
 from gmijax.player.policy import read_policy, write_policy
+from gmijax.player.returns import Played, play, statistics
 from gmijax.player.shipped import POLICIES
 from gmijax.runs.folder import POLICY, RunPaths, read_json
 from gmijax.runs.history import read_metrics
 from gmijax.runs.resume import CheckpointMeta, best_checkpoint
 
 SEED = 0
+MEMORY = 0.65
+"""Of the GPU's, which trainings reserve together; MJX-Warp takes more beside it."""
+
+AT_ONCE = 8
+"""Episodes in plain MuJoCo that a process plays one after the other."""
+
+OF_SUMMARY = ("status", "wall_s", "train_wall_s", "compile_s", "env_steps_per_s", "impl", "device")
+
+THROUGH = (0, 130)
+"""Exit codes of trainings that have saved, the last one at the deadline."""
+
 EVALUATIONS = 5
 """Of a training; the best one's checkpoint is shipped."""
 
@@ -64,8 +79,9 @@ def main() -> int:
     if not given.only_evaluate:
         with tempfile.TemporaryDirectory() as scratch:
             code = train(given, given.runs or Path(scratch), file)
-    for task in given.tasks:
-        evaluate(task, given, file)
+    with ProcessPoolExecutor(mp_context=multiprocessing.get_context("spawn")) as pool:
+        for task in given.tasks:
+            evaluate(task, given, file, pool)
     return code
 
 
@@ -80,12 +96,12 @@ def train(given: argparse.Namespace, runs: Path, file: ResultsFile) -> int:
                 started.append(start(command(task, given, runs, own), {}, log))
         codes = wait_until(deadline_s, *started)
     for task, code in zip(given.tasks, codes, strict=True):
-        if code in (0, 130):  # 130: it was stopped at the deadline, and has saved.
+        if code in THROUGH:
             keep(task, code, runs / task, given, file)
         else:
             sys.stdout.write(f"{task}: failed (exit code {code}), see {runs / task}.log\n")
             sys.stdout.write((runs / f"{task}.log").read_text(errors="replace")[-2000:])
-    return int(any(codes))
+    return int(any(code not in THROUGH for code in codes))
 
 
 def command(task: str, given: argparse.Namespace, runs: Path, own: Sequence[str]) -> Sequence[str]:
@@ -106,15 +122,18 @@ def _shared_gpu(machine: Machine, runs: Path) -> Iterator[Sequence[str]]:
     if not machine.gpus:
         yield []
         return
-    share = [f"plan.memory_fraction={0.8 / len(RECIPES):.2f}"]
+    share = f"plan.memory_fraction={MEMORY / len(RECIPES):.2f}"
     gpu = machine.gpus[0]
-    if machine.mps_control is None or machine.daemon_of(gpu.uuid) is not None:
-        yield share
+    if machine.mps_control is None:
+        yield [share, "plan.backend=share"]
+        return
+    if machine.daemon_of(gpu.uuid) is not None:
+        yield [share, "plan.backend=mps"]
         return
     daemon = MpsControl(machine.mps_control, DEFAULT_PIPE_DIRECTORY)
     daemon.start(gpu.uuid, runs / "mps")
     try:
-        yield [*share, "plan.backend=mps"]
+        yield [share, "plan.backend=mps"]
     finally:
         daemon.quit()
 
@@ -128,25 +147,26 @@ def keep(
         sys.stdout.write(f"{task}: no checkpoint\n")
         return
     steps = CheckpointMeta.read(best).env_steps
-    policy = read_policy(best / POLICY)
-    given.policies.mkdir(parents=True, exist_ok=True)
-    write_policy(given.policies / f"{task}.npz", policy, half=True)
     evaluations = [
         {"env_steps": line["env_steps"], "return": line["eval/return"], **_of(line)}
         for line in read_metrics(RunPaths(run_dir).metrics)
         if "eval/return" in line
     ]
     summary = read_json(RunPaths(run_dir).summary)
+    policy = read_policy(best / POLICY)
+    about = {**policy.about, "device": device_name(), "train_wall_s": summary.get("train_wall_s")}
+    given.policies.mkdir(parents=True, exist_ok=True)
+    path = given.policies / f"{task}.npz"
+    write_policy(path, dataclasses.replace(policy, about=about), half=True)
     with file.changing() as results:
         results[task] = {
             "overrides": list(command(task, given, Path("runs"), ())[3:]),
             "code": code,
             "env_steps": steps,
-            "seconds": summary.get("wall_s"),
-            "bytes": (given.policies / f"{task}.npz").stat().st_size,
+            **{name: summary.get(name) for name in OF_SUMMARY},
+            "bytes": path.stat().st_size,
             "mjx": next((one for one in evaluations if one["env_steps"] == steps), None),
             "evaluations": evaluations,
-            "summary": summary,
         }
     sys.stdout.write(f"{task}: {steps} steps, {results[task]['mjx']}\n")
 
@@ -157,17 +177,22 @@ def _of(line: Mapping[str, Any]) -> dict[str, Any]:
     return {name.removeprefix("eval/"): line[name] for name in names}
 
 
-def evaluate(task: str, given: argparse.Namespace, file: ResultsFile) -> None:
+def evaluate(
+    task: str, given: argparse.Namespace, file: ResultsFile, pool: ProcessPoolExecutor
+) -> None:
     """Plays a shipped policy in plain MuJoCo."""
-    from gmijax.player.returns import returns_of
-
     path = given.policies / f"{task}.npz"
     if not path.exists():
         return
-    found = returns_of(read_policy(path), num_episodes=given.episodes, seed=SEED + 1)
+    parts = [pool.submit(_play, path, seed) for seed in range(1, 1 + given.episodes // AT_ONCE)]
+    found = statistics([episode for part in parts for episode in part.result()])
     with file.changing() as results:
         results.setdefault(task, {})["mujoco"] = found
     sys.stdout.write(f"{task}: in plain MuJoCo {found}\n")
+
+
+def _play(path: Path, seed: int) -> list[Played]:
+    return list(play(read_policy(path), AT_ONCE, seed))
 
 
 def _arguments() -> argparse.Namespace:

@@ -9,6 +9,9 @@ from typing import Literal
 from gmijax.config.env import EnvConfig, PhysicsConfig
 from gmijax.config.schema import KeyGroup, doc, require_between
 
+FILMED = 4
+"""Environments that a film shows."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class PlayRunConfig:
@@ -53,7 +56,10 @@ class PlayConfig(KeyGroup):
     video: Literal["auto", "mp4", "gif", "both", "none"] = doc(
         "what to film; auto: mp4, or nothing where there is no headless OpenGL"
     )
-    video_envs: int = doc("how many of the environments are shown, in a grid")
+    video_envs: int | None = doc(
+        "how many of the environments are shown, in a grid: evenly spread over the order of their "
+        "returns; null: 4, or all if there are fewer"
+    )
     html: Literal["auto", "on", "off"] = doc(
         "write a page with the first environment in 3D, with Brax's viewer, which a browser loads "
         "from the internet; auto: where brax is installed and knows the model's shapes"
@@ -67,7 +73,13 @@ class PlayConfig(KeyGroup):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        require_between("video_envs", self.video_envs, 1, self.num_envs)
+        if self.video_envs is not None:
+            require_between("video_envs", self.video_envs, 1, self.num_envs)
+
+    @property
+    def num_filmed(self) -> int:
+        """How many environments are shown."""
+        return min(FILMED, self.num_envs) if self.video_envs is None else self.video_envs
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -5,15 +5,16 @@ from __future__ import annotations
 import sys
 
 from gmijax.config import TrainConfig
+from gmijax.config.play import FILMED
 from gmijax.errors import ConfigError
 from gmijax.learning.episodes import Episodes
 from gmijax.runs.folder import RunPaths
 from gmijax.sim.interface import Env
-from gmijax.sim.trajectory import Trajectory, save_model, save_trajectory
+from gmijax.sim.trajectory import chosen, save_model, save_trajectory
 
 
 class EpisodeFilms:
-    """Leaves the first episode of evaluations in the run folder (see `gmijax.control.films`).
+    """Leaves episodes of evaluations in the run folder (see `gmijax.control.films`).
 
     Args:
       config: of the run.
@@ -34,16 +35,26 @@ class EpisodeFilms:
         self._every = int(config.eval.video) * config.eval.every
         self._end = config.num_timesteps
         self._last_steps = 0
-        self._control_dt_s, self._run = env.spec.control_dt_s, run
+        self._spec, self._run = env.spec, run
+        self._command = f"gmijax train env={config.env.label} seed={config.seed}"
         save_model(run.filmed_model, env.mj_model)
 
     def take(self, env_steps: int, episodes: Episodes) -> None:
-        """Leaves the first of `episodes`, evaluated after `env_steps`, if it is to be filmed."""
+        """Leaves some of `episodes`, evaluated after `env_steps`, if it is to be filmed."""
         is_due = env_steps // self._every > self._last_steps // self._every
         if not (is_due or env_steps >= self._end):
             return
         self._last_steps = env_steps
-        trajectory = Trajectory(episodes.qpos, episodes.lengths[:1], self._control_dt_s)
+        num_recorded = episodes.qpos.shape[1]
+        trajectory = chosen(
+            episodes.qpos,
+            episodes.lengths[:num_recorded],
+            episodes.returns[:num_recorded],
+            self._spec.control_dt_s,
+            count=min(FILMED, num_recorded),
+            title=f"{self._spec.name} after {env_steps:,} env steps",
+            command=self._command,
+        )
         try:
             save_trajectory(self._run.to_film(env_steps), trajectory)
         except OSError as error:

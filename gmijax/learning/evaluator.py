@@ -24,6 +24,7 @@ from gmijax.learning.learner import Learner, TrainState
 from gmijax.runs.folder import RunPaths
 from gmijax.sim.interface import Env
 from gmijax.sim.randomize import make_worlds
+from gmijax.sim.trajectory import MOST_RECORDED
 
 FIRST_WORLD = 2**30
 """Number of the first world of an evaluation: no training has as many."""
@@ -95,7 +96,7 @@ class Evaluator:
         self._num_own = min(max(0, self._num_episodes - first), num_envs)
         options = Options(
             num_envs=num_envs,
-            num_shown=1,
+            num_shown=self._num_recorded(config),
             seed=config.seed,
             deterministic=config.eval.deterministic,
             max_steps=None,
@@ -107,6 +108,12 @@ class Evaluator:
             self._films = EpisodeFilms(config, env, run)
         self.best = -math.inf
         self.wall_s = 0.0
+
+    def _num_recorded(self, config: TrainConfig) -> int:
+        """Of how many episodes the positions are kept."""
+        if not config.eval.video or self._reducer.rank > 0:
+            return 1  # The least that a runner keeps.
+        return max(1, min(self._num_own, MOST_RECORDED))
 
     def trace(self, state: TrainState) -> None:
         """Traces the programs; `state` has the shapes of those that will be evaluated."""

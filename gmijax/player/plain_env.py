@@ -1,7 +1,7 @@
 """A shipped task in plain MuJoCo: one world, with nothing compiled and no jax.
 
-The task's own functions run here, on numpy (`gmijax.arrays`), so observations, rewards and ends are
-those of training.
+The task's own functions run here, on numpy (`gmijax.arrays`), so observations, rewards and ends
+are those of training.
 """
 
 from __future__ import annotations

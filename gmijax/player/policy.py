@@ -7,6 +7,7 @@ of the policy's network, the statistics that observations are normalised with, a
 from __future__ import annotations
 
 import io
+import itertools
 import json
 import zipfile
 from collections.abc import Mapping, Sequence
@@ -139,7 +140,7 @@ def _require_sizes(policy: PlainPolicy) -> None:
     """Raises ValueError where the layers do not fit each other, or are none."""
     widths = [policy.obs_size, *(len(bias) for bias in policy.biases)]
     shapes = [kernel.shape for kernel in policy.kernels]
-    fits = shapes == list(zip(widths[:-1], widths[1:], strict=True))
+    fits = shapes == list(itertools.pairwise(widths))
     if not (shapes and fits and policy.obs_std.shape == policy.obs_mean.shape):
         raise ValueError("sizes of its layers do not fit")
     if not 0 < policy.action_size <= widths[-1]:

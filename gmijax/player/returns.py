@@ -62,32 +62,17 @@ def _episode(env: PlainEnv, policy: PlainPolicy) -> Played:
             return Played(np.stack(qpos), total, terms, env.metrics, step.terminated)
 
 
-def returns_of(policy: PlainPolicy, *, num_episodes: int, seed: int) -> dict[str, Any]:
-    """Statistics over episodes, as plain data: means, the deviation of returns, their quantiles."""
-    return statistics(list(play(policy, num_episodes, seed)))
-
-
 def statistics(episodes: Sequence[Played]) -> dict[str, Any]:
-    """See `returns_of`."""
+    """Statistics over episodes as plain data: means, and the spread of returns."""
     returns = np.array([one.return_ for one in episodes])
     names = episodes[0].metrics
     return {
         "episodes": len(episodes),
         "return": float(returns.mean()),
         "return_std": float(returns.std()),
-        "return_quantiles": [float(x) for x in np.quantile(returns, QUANTILES)],
+        "return_median": float(np.median(returns)),
+        "return_quartiles": [float(x) for x in np.quantile(returns, (0.25, 0.75))],
         "length": float(np.mean([one.length for one in episodes])),
         "terminated": sum(one.terminated for one in episodes),
         **{name: float(np.mean([one.metrics[name] for one in episodes])) for name in names},
     }
-
-
-QUANTILES = (1 / 8, 3 / 8, 5 / 8, 7 / 8)
-"""Of the returns whose episodes a film shows."""
-
-
-def shown(returns: Sequence[float], count: int) -> list[int]:
-    """Which of the episodes a film shows, the worst first: as many quantiles as it has tiles."""
-    order = np.argsort(returns, kind="stable")
-    at = (np.arange(count) + 0.5) / count * len(order)
-    return [int(order[min(int(x), len(order) - 1)]) for x in at]

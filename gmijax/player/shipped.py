@@ -1,4 +1,4 @@
-"""The trained policies that are shipped, one for every task; `benchmarks/shipped.py` makes them."""
+"""The trained policies that are shipped, one for a task; `benchmarks/shipped.py` makes them."""
 
 from __future__ import annotations
 

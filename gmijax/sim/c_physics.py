@@ -68,7 +68,7 @@ class CPhysics:
         ctrl: Floats,
         read: Callable[[mujoco.MjData], T] = lambda data: data.sensordata,
     ) -> tuple[PhysicsState, T]:
-        """See `Physics.step`; what `read` returns may be views of the data, until the next step."""
+        """See `Physics.step`; what `read` returns may be views of the data."""
         data: Any = model.data
         data.qpos[:], data.qvel[:] = state.qpos, state.qvel
         data.qacc_warmstart[:] = state.qacc_warmstart

@@ -28,7 +28,7 @@ def sources(term_names: tuple[str, ...]) -> tuple[str, ...]:
 
 
 def diverged_by_source(env: Env, state: EnvState) -> dict[str, Array]:
-    """For worlds [N], or one in numpy: which of `sources` hold bad numbers, [N] or [] bool each."""
+    """Which of `sources` hold bad numbers in worlds [N], or in one of numpy: [N] or [] bool."""
     xp = array_module(state.obs)
 
     def within(values: Array, bound: float) -> Array:

@@ -20,7 +20,7 @@ from gmijax.runs.names import by_steps
 from gmijax.sim.stage import Stage
 from gmijax.sim.trajectory import load_trajectory
 from gmijax.supervise.side_process import exit_code_beside
-from gmijax.workers.play_film import film
+from gmijax.workers.play_film import film, grid_of, tile_size
 
 _SIZE: Final = (640, 480)
 _POLL_S: Final = 1.0
@@ -48,8 +48,10 @@ def follow(run: RunPaths, is_over: threading.Event) -> None:
         for path in filter(None, passed_over):
             path.unlink()
         if newest is not None:
-            stage = stage or Stage(run.filmed_model, _SIZE, None)
-            film((newest.with_suffix(".mp4"),), load_trajectory(newest), stage, (1, 1))
+            trajectory = load_trajectory(newest)
+            grid = grid_of(len(trajectory.lengths))
+            stage = stage or Stage(run.filmed_model, tile_size(*_SIZE, grid), None)
+            film((newest.with_suffix(".mp4"),), trajectory, stage, grid)
             newest.unlink()
         elif is_last:
             break

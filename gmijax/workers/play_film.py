@@ -25,6 +25,7 @@ import numpy as np
 from gmijax.config import PlayConfig
 from gmijax.config.schema import from_dict
 from gmijax.runs.folder import EXIT_NO_GL, PlayPaths, RunPaths, read_json
+from gmijax.sim.captions import Captions
 from gmijax.sim.stage import Image, Stage
 from gmijax.sim.trajectory import Trajectory, load_trajectory
 
@@ -76,7 +77,7 @@ def main(arguments: Sequence[str]) -> int:
     folder = Path(arguments[0])
     config = from_dict(PlayConfig, read_json(RunPaths(folder).config))
     paths = PlayPaths(folder)
-    grid = grid_of(config.video_envs)
+    grid = grid_of(config.num_filmed)
     stage = _stage(paths.model, tile_size(config.width, config.height, grid), config.camera)
     if stage is None:
         return EXIT_NO_GL
@@ -132,19 +133,21 @@ def frames(
     trajectory: Trajectory, stage: Stage, grid: tuple[int, int], stride: int
 ) -> Iterator[Image]:
     """Every `stride`-th step as a picture; a world whose episode is over is dimmed."""
-    last: dict[int, Image] = {}
+    captions, last = Captions(trajectory.labels, trajectory.lines), dict[int, Image]()
     for step in range(0, len(trajectory.qpos), stride):
         tiles: list[Image] = []
         for world, length in enumerate(trajectory.lengths):
             if world not in last:
-                picture = stage.picture(trajectory.qpos[step, world])
+                picture = stage.picture(trajectory.qpos[min(step, length), world])
                 if step > length:
                     picture = (picture * _ENDED_BRIGHTNESS).astype(np.uint8)
+                picture = captions.label(world, picture)
+                if step > length:
                     last[world] = picture
                 tiles.append(picture)
             else:
                 tiles.append(last[world])
-        yield compose(tiles, grid)
+        yield captions.below(compose(tiles, grid), step * trajectory.control_dt_s)
 
 
 def film(

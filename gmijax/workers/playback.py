@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 from gmijax.config import EnvConfig, PlayConfig
 from gmijax.config.schema import from_dict
+from gmijax.control.console import nearby
 from gmijax.errors import ConfigError
 from gmijax.runs.folder import PlayPaths, read_json, write_json
 from gmijax.runs.resume import CheckpointMeta
@@ -39,6 +40,7 @@ def _run(link: ChildLink) -> None:
     from gmijax.learning.learner import init_learner, make_learner
     from gmijax.sim.camera import choose_camera
     from gmijax.sim.randomize import make_worlds
+    from gmijax.sim.trajectory import MOST_RECORDED
 
     impl = _impl(config, checkpoint, env_config)
     # At its full range: what was learnt in the end is what counts.
@@ -55,7 +57,7 @@ def _run(link: ChildLink) -> None:
         state,
         Options(
             num_envs=config.num_envs,
-            num_shown=config.video_envs,
+            num_shown=min(config.num_envs, max(config.num_filmed, MOST_RECORDED)),
             seed=config.seed,
             deterministic=config.deterministic,
             max_steps=config.max_steps,
@@ -63,7 +65,7 @@ def _run(link: ChildLink) -> None:
         lambda chunks: link.beat("running", chunks),
     )
     paths = PlayPaths(link.run.root)
-    _write_trajectory(paths, env, episodes, config.video_envs)
+    _write_trajectory(paths, env, episodes, config)
     device = jax.local_devices()[0]
     camera = None if env.mj_model is None else choose_camera(env.mj_model, config.camera).name
     about = {
@@ -146,14 +148,24 @@ def _check_camera(camera: str | None, env: Env) -> None:
         )
 
 
-def _write_trajectory(paths: PlayPaths, env: Env, episodes: Episodes, num_shown: int) -> None:
-    from gmijax.sim.trajectory import Trajectory, save_model, save_trajectory
+def _write_trajectory(paths: PlayPaths, env: Env, episodes: Episodes, config: PlayConfig) -> None:
+    from gmijax.sim.trajectory import chosen, save_model, save_trajectory
 
     if env.mj_model is None:  # The controller sees that there is nothing to film.
         return
     save_model(paths.model, env.mj_model)
-    lengths = episodes.lengths[:num_shown]
-    save_trajectory(paths.trajectory, Trajectory(episodes.qpos, lengths, env.spec.control_dt_s))
+    num_recorded, checkpoint = episodes.qpos.shape[1], Path(str(config.checkpoint))
+    env_steps = CheckpointMeta.read(checkpoint).env_steps
+    trajectory = chosen(
+        episodes.qpos,
+        episodes.lengths[:num_recorded],
+        episodes.returns[:num_recorded],
+        env.spec.control_dt_s,
+        count=config.num_filmed,
+        title=f"{env.spec.name} after {env_steps:,} env steps",
+        command=f"gmijax play run.dir={nearby(checkpoint.parents[1])} checkpoint={env_steps}",
+    )
+    save_trajectory(paths.trajectory, trajectory)
 
 
 if __name__ == "__main__":

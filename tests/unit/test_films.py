@@ -37,7 +37,8 @@ def env_with_model() -> Env:
 def episodes(height: float = 0.0) -> Episodes:
     nothing = dict.fromkeys(Episodes._fields)
     qpos, lengths = np.full((3, 1, 1), height, np.float32), np.array([2, 1], np.int32)
-    return Episodes(**nothing | {"qpos": qpos, "lengths": lengths})
+    returns = np.array([7.0, 5.0], np.float32)
+    return Episodes(**nothing | {"qpos": qpos, "lengths": lengths, "returns": returns})
 
 
 @pytest.fixture
@@ -106,6 +107,7 @@ def test_every_nth_evaluation_is_filmed_and_the_last(
     trajectory = load_trajectory(left[-1])
     assert (trajectory.qpos == 1024).all()
     assert trajectory.lengths.tolist() == [2]
+    assert trajectory.labels == ("return 7 (rank 1 of 1)",)
     assert trajectory.control_dt_s == pytest.approx(0.1)
     assert mujoco.MjModel.from_binary_path(str(run.filmed_model)).nq == 0
 

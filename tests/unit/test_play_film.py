@@ -7,7 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from gmijax.sim.trajectory import Trajectory, load_trajectory, save_trajectory
+from gmijax.sim.captions import Captions
+from gmijax.sim.trajectory import Trajectory, chosen, load_trajectory, save_trajectory
 from gmijax.workers import play_film
 
 
@@ -65,8 +66,41 @@ def test_worlds_whose_episode_is_over_stand_still_and_dim():
 
 def test_trajectory_is_read_back(tmp_path: Path):
     qpos = np.arange(12, dtype=np.float32).reshape(3, 2, 2)
-    save_trajectory(tmp_path / "t.npz", Trajectory(qpos, np.array([2, 1], np.int32), 0.02))
+    lengths, texts = np.array([2, 1], np.int32), (("a", "b"), ("title", "$ c"))
+    save_trajectory(tmp_path / "t.npz", Trajectory(qpos, lengths, 0.02, *texts))
     trajectory = load_trajectory(tmp_path / "t.npz")
     np.testing.assert_array_equal(trajectory.qpos, qpos)
     assert trajectory.lengths.tolist() == [2, 1]
     assert trajectory.control_dt_s == 0.02
+    assert (trajectory.labels, trajectory.lines) == texts
+
+
+def test_a_film_shows_quantiles_of_the_returns_and_names_the_median():
+    returns = np.array([40.0, 10.0, 80.0, 30.0, 70.0, 20.0, 60.0, 50.0])
+    lengths = np.array([4, 1, 8, 3, 7, 2, 6, 5], np.int32)
+    qpos = np.broadcast_to(returns[:, None], (9, 8, 1)).astype(np.float32)
+    shown = chosen(qpos, lengths, returns, 0.1, count=4, title="task", command="gmijax play")
+    assert shown.qpos.shape == (9, 4, 1)
+    assert shown.qpos[0, :, 0].tolist() == [20.0, 40.0, 60.0, 80.0]
+    assert shown.lengths.tolist() == [2, 4, 6, 8]
+    assert shown.labels[0] == "return 20 (rank 7 of 8)"
+    assert shown.labels[-1] == "return 80 (rank 1 of 8)"
+    assert shown.lines == ("task: median return 45 of 8 episodes", "$ gmijax play")
+    [median] = chosen(qpos, lengths, returns, 0.1, count=1, title="t", command="c").qpos[0, :, 0]
+    assert median in (40.0, 50.0)
+
+
+def test_captions_lie_in_the_corner_and_below():
+    captions = Captions(["return 1"], ["title", "$ command"])
+    tile = np.full((240, 320, 3), 200, np.uint8)
+    labelled = captions.label(0, tile)
+    assert labelled.shape == tile.shape
+    assert labelled[:18].min() < 100 < 200 == labelled[18:].min()
+    assert tile.min() == 200
+    below = captions.below(tile, 1.5)
+    assert below.shape == (280, 320, 3)
+    assert (captions.below(tile, 2.5) != below).any()
+    assert captions.label(1, tile) is tile  # A world of which nothing is known.
+    small = tile[:60, :80]
+    assert captions.label(0, small) is small
+    assert captions.below(small, 0.0) is small

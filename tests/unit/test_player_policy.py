@@ -1,4 +1,4 @@
-"""`policy.npz`: what it does is what the checkpoint beside it does; what is no policy is refused."""
+"""`policy.npz` does what the checkpoint beside it does; what is no policy is refused."""
 
 from __future__ import annotations
 
@@ -81,7 +81,7 @@ def test_what_does_not_fit_is_refused(tmp_path: Path, change: dict[str, object])
 def test_what_is_no_file_of_ours_is_refused(tmp_path: Path, content: bytes):
     path = tmp_path / POLICY
     path.write_bytes(content)
-    with pytest.raises(ConfigError, match="policy.npz: not a policy"):
+    with pytest.raises(ConfigError, match=r"policy\.npz: not a policy"):
         read_policy(path)
     with pytest.raises(ConfigError, match="cannot be read"):
         read_policy(tmp_path / "none.npz")
