@@ -61,8 +61,8 @@ class PlayConfig(KeyGroup):
         "returns; null: 4, or all if there are fewer"
     )
     html: Literal["auto", "on", "off"] = doc(
-        "write a page with the first environment in 3D, with Brax's viewer, which a browser loads "
-        "from the internet; auto: where brax is installed and knows the model's shapes"
+        "write a page that shows the filmed environments in 3D in a browser; auto: where the extra "
+        "`view` is installed"
     )
     width: int = doc("width of the picture in pixels", low=64, high=4096)
     height: int = doc("height of the picture in pixels", low=64, high=4096)

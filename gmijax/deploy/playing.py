@@ -26,7 +26,7 @@ from gmijax.config import (
 )
 from gmijax.config.schema import to_dict
 from gmijax.control.console import doing, nearby, open_console
-from gmijax.deploy.pictures import film, has_brax, write_page
+from gmijax.deploy.pictures import film, write_page
 from gmijax.errors import ConfigError, GmijaxError
 from gmijax.machine.snapshot import Machine, detect_machine
 from gmijax.partition.planner import make_plan
@@ -51,6 +51,7 @@ from gmijax.sim import source
 from gmijax.sim.registry import require_env
 from gmijax.supervise.job_kinds import JobKind
 from gmijax.supervise.run_gmis import Launch, run_gmis
+from gmijax.viewer.installed import INSTALL, missing
 
 C = TypeVar("C", PlayConfig, ExportConfig, ViewConfig)
 
@@ -104,10 +105,9 @@ def play(config: PlayConfig, *, show: bool = False) -> None:
 
 def _opened(config: PlayConfig) -> tuple[PlayConfig, str | None]:
     """As `open_run`, with what only playing asks for checked too."""
-    if config.html == "on" and not has_brax():
+    if config.html == "on" and (absent := missing()):
         raise ConfigError(
-            "html=on: needs the package brax (pip install 'gmijax[brax]'); "
-            "allowed without it are auto, off"
+            f"html=on: needs {' and '.join(absent)} ({INSTALL}); allowed without are auto, off"
         )
     config, env, changed = open_run(config)
     if config.randomize == "on" and not env.randomization:

@@ -5,7 +5,6 @@ All in this process: beside a training it takes a fraction of a core, and nothin
 
 from __future__ import annotations
 
-import importlib.util
 import os
 import queue
 from pathlib import Path
@@ -21,11 +20,9 @@ from gmijax.player.policy import PlainPolicy, read_policy
 from gmijax.runs.folder import POLICY
 from gmijax.viewer.checkpoints import Checkpoints
 from gmijax.viewer.guard import Guard, is_loopback
+from gmijax.viewer.installed import INSTALL, missing
 from gmijax.viewer.requests import Request
 from gmijax.viewer.simulation import Simulation
-
-_PACKAGES = ("viser", "mjviser")
-
 
 def view(config: ViewConfig, *, show: bool = False) -> None:
     """Shows a policy in the browser until the process is interrupted.
@@ -70,10 +67,8 @@ def _require_fit(policy: PlainPolicy, env: PlainEnv, checkpoint: Path) -> None:
 
 
 def _require_packages() -> None:
-    if missing := [name for name in _PACKAGES if importlib.util.find_spec(name) is None]:
-        raise ConfigError(
-            f"gmijax view needs {' and '.join(missing)} (pip install 'gmijax[view]')"
-        )
+    if absent := missing():
+        raise ConfigError(f"gmijax view needs {' and '.join(absent)} ({INSTALL})")
 
 
 def _serve(

@@ -7,7 +7,7 @@ model once where it stands still, and all environments at the origin.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Final, NamedTuple, TypeAlias
 
 import mujoco
@@ -57,11 +57,12 @@ class Scene:
 
     def __init__(self, server: viser.ViserServer, model: Any, num_envs: int) -> None:
         self._server, self._model = server, model
-        self._robot = free_robot(model)
+        self._robot = moving_robot(model)
         self._start = mujoco.MjData(model)
         mujoco.mj_kinematics(model, self._start)
         low, high = bounds(model, self._start)
         self._width = float(max(high[0] - low[0], high[1] - low[1], 0.2))
+        self._top = float(high[2])
         self._offsets = offsets(num_envs, _GAP * self._width)
         self._shift = np.zeros(3)
         server.scene.reset()
@@ -131,6 +132,14 @@ class Scene:
         handle.points = points
         if not handle.visible:
             handle.visible = True
+
+    def label(self, texts: Sequence[str]) -> None:
+        """Writes a text above each of the first environments."""
+        above = np.array([0.0, 0.0, 0.3 * self._width + self._top])
+        for number, text in enumerate(texts):
+            self._server.scene.add_label(
+                f"/fixed/label/{number}", text, position=self._offsets[number] + above
+            )
 
     def on_drag(self, callback: Callable[[Drag], None]) -> None:
         """Has `callback` called while a body is pulled with ctrl and the left button."""
@@ -246,6 +255,15 @@ def with_linear_colors(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
 def is_fixed(model: Any, body: int) -> bool:
     """Whether a body never moves."""
     return model.body_weldid[body] == 0 and model.body_mocapid[model.body_rootid[body]] < 0
+
+
+def moving_robot(model: Any) -> int | None:
+    """The robot that may leave its place; None: there is none, or it is tied to the ground."""
+    robot = free_robot(model)
+    kinds = (int(mujoco.mjtEq.mjEQ_CONNECT), int(mujoco.mjtEq.mjEQ_WELD))
+    ties = [one for one in range(model.neq) if model.eq_type[one] in kinds]
+    tied = any(0 in (model.eq_obj1id[one], model.eq_obj2id[one]) for one in ties)
+    return None if tied else robot
 
 
 def bounds(model: Any, data: Any) -> tuple[Floats, Floats]:

@@ -159,9 +159,8 @@ class Simulation:
 
 
 def pushed_body(model: Any) -> int:
-    """What a push is given to: the robot, else the thing that is free, else the last body."""
+    """What a push is given to: a thing that lies free, else the robot, else the last body."""
     robot = free_robot(model)
-    if robot is not None:
-        return robot
-    free = model.jnt_bodyid[model.jnt_type == int(mujoco.mjtJoint.mjJNT_FREE)]
-    return int(free[0]) if len(free) else model.nbody - 1
+    free = model.jnt_bodyid[model.jnt_type == int(mujoco.mjtJoint.mjJNT_FREE)].tolist()
+    things = [body for body in free if body != robot]
+    return next(iter(things), model.nbody - 1 if robot is None else robot)
