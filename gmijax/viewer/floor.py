@@ -56,7 +56,16 @@ def set_haze(server: viser.ViserServer, distance_m: float) -> None:
     """Draws a sky of one colour, and fog of the same that begins well behind `distance_m`."""
     server.scene.set_background_image(np.full((2, 2, 3), _HAZE, np.uint8), "png")
     near, far = 4.0 * distance_m, 12.0 * distance_m
-    server.scene.configure_fog(min(near, 0.4 * _REACH_M), min(far, _REACH_M), color=_HAZE)
+    server.scene.configure_fog(
+        min(near, 0.4 * _REACH_M), min(far, _REACH_M), color=linear(np.array(_HAZE))
+    )
+
+
+def linear(colors: npt.NDArray[Any]) -> npt.NDArray[np.uint8]:
+    """Colours as the page takes those of fog and of vertices: sRGB without its gamma."""
+    shade = colors / 255.0
+    light = np.where(shade <= 0.04045, shade / 12.92, ((shade + 0.055) / 1.055) ** 2.4)
+    return np.round(255.0 * light).astype(np.uint8)
 
 
 def _quad(picture: Image.Image, period_m: float) -> trimesh.Trimesh:

@@ -18,7 +18,7 @@ import viser
 from mjviser.conversions import group_geoms_by_visual_compat, merge_geoms
 
 from gmijax.sim.camera import free_robot
-from gmijax.viewer.floor import Floor, set_haze
+from gmijax.viewer.floor import Floor, linear, set_haze
 from gmijax.viewer.requests import Drag
 
 Floats: TypeAlias = npt.NDArray[np.floating]
@@ -214,9 +214,11 @@ class Scene:
 
         @self._server.on_client_connect
         async def _(client: viser.ClientHandle) -> None:
-            if client.camera.aspect < 1.0:  # A phone: the sides would be cut off.
-                client.camera.position = middle + way / client.camera.aspect
-                client.camera.look_at = middle  # It has moved too.
+            if client.camera.aspect < 1.0:  # A phone: the panel covers the lower half.
+                farther = 0.75 / client.camera.aspect
+                below = middle - (0.0, 0.0, 0.25 * farther * distance)
+                client.camera.position = below + farther * way
+                client.camera.look_at = below  # It has moved too.
 
 
 def offsets(num_envs: int, spacing_m: float) -> Floats:
@@ -242,12 +244,10 @@ def visible_geoms(model: Any) -> dict[int, list[int]]:
 
 
 def with_linear_colors(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
-    """The mesh with the colours of its vertices as its format means them, brighter otherwise."""
+    """The mesh with the colours of its vertices as its format means them; else they are pale."""
     if isinstance(mesh.visual, trimesh.visual.ColorVisuals):
         colors = np.array(mesh.visual.vertex_colors)
-        shade = colors[:, :3] / 255.0
-        linear = np.where(shade <= 0.04045, shade / 12.92, ((shade + 0.055) / 1.055) ** 2.4)
-        colors[:, :3] = np.round(255.0 * linear)
+        colors[:, :3] = linear(colors[:, :3])
         mesh.visual = trimesh.visual.ColorVisuals(mesh, vertex_colors=colors)
     return mesh
 
