@@ -25,12 +25,14 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import numpy as np
+
 from benchmarks.command import start, wait_until
 from benchmarks.records import RESULTS, ResultsFile, device_name, file_name
 from gmijax.machine.mps_control import DEFAULT_PIPE_DIRECTORY, MpsControl
 from gmijax.machine.snapshot import Machine, detect_machine
 from gmijax.player.policy import read_policy, write_policy
-from gmijax.player.returns import Played, play, statistics
+from gmijax.player.returns import Played, play
 from gmijax.player.shipped import POLICIES
 from gmijax.runs.folder import POLICY, RunPaths, read_json
 from gmijax.runs.history import read_metrics
@@ -189,6 +191,21 @@ def evaluate(
     with file.changing() as results:
         results.setdefault(task, {})["mujoco"] = found
     sys.stdout.write(f"{task}: in plain MuJoCo {found}\n")
+
+
+def statistics(episodes: Sequence[Played]) -> dict[str, Any]:
+    """Means over episodes, and the spread of their returns."""
+    returns = np.array([one.return_ for one in episodes])
+    names = episodes[0].metrics
+    return {
+        "episodes": len(episodes),
+        "return": float(returns.mean()),
+        "return_std": float(returns.std()),
+        "return_quartiles": [float(x) for x in np.quantile(returns, (0.25, 0.5, 0.75))],
+        "length": float(np.mean([one.length for one in episodes])),
+        "terminated": sum(one.terminated for one in episodes),
+        **{name: float(np.mean([one.metrics[name] for one in episodes])) for name in names},
+    }
 
 
 def _play(path: Path, seed: int) -> list[Played]:

@@ -22,7 +22,7 @@ VERBS: Final[Mapping[str, str]] = MappingProxyType(
         "export": "writes a policy as files for robots: ONNX, StableHLO",
         "doctor": "says what this machine can do for gmijax, what it cannot, and why",
         "list-envs": "lists the tasks",
-        "demo": "trains a small task briefly, and films it",
+        "demo": "plays and films a trained policy, within seconds",
     }
 )
 """Command -> what it does. `main(argv)` of the module of that name runs it, `-` read as `_`."""

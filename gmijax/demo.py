@@ -1,31 +1,42 @@
-"""`gmijax demo`: trains ball_balance briefly, plays what it has learnt, and says what to look at.
+"""`gmijax demo`: plays a policy that comes with gmijax, films it, and trains one if asked to.
 
-Nothing is downloaded.
+Until the film is there no more is imported than it needs; nothing is downloaded or compiled.
 """
 
 from __future__ import annotations
 
+import re
 import sys
 from collections.abc import Sequence
-from typing import Final
+from typing import Any, Final
 
-from gmijax.cli.compose import build, compose
+from rich.console import Console
+
 from gmijax.config import PlayConfig
-from gmijax.control import job
+from gmijax.config.env import PhysicsConfig
+from gmijax.config.play import FILMED, PlayRunConfig
+from gmijax.control.console import nearby, open_console
 from gmijax.control.exit_codes import exit_code_of
-from gmijax.deploy import playing
+from gmijax.deploy import shipped
+from gmijax.deploy.pictures import film
 from gmijax.machine.snapshot import detect_machine
-from gmijax.runs.folder import RunPaths
+from gmijax.player.shipped import shipped_tasks
+from gmijax.runs.folder import RunPaths, read_json
 
-USAGE: Final = """usage: gmijax demo [key=value ...]
+USAGE: Final = """usage: gmijax demo [env=TASK] [key=value ...]
 
-Trains env=ball_balance briefly in runs/, plays its last checkpoint and films it.
-Takes the keys of `gmijax train`. Without num_timesteps: seconds of training on a GPU, minutes on
-two CPU cores.
+Plays the policy that comes with gmijax for a task, ball_balance if none is named, and films it in
+runs/shipped/TASK. Then it asks whether to train ball_balance here: seconds on a GPU, minutes on
+two CPU cores. With keys of `gmijax train` it trains that task with them, without asking.
 """
 
+TASK: Final = "ball_balance"
 CPU_STEPS: Final = 300_000
 GPU_STEPS: Final = 3_000_000
+PLAY_S, FILM_S = 2.0, 7.0
+"""About so long it plays and draws."""
+
+_EPISODES: Final = 16
 
 
 def main(argv: Sequence[str]) -> int:
@@ -37,25 +48,122 @@ def main(argv: Sequence[str]) -> int:
 
 
 def demo(overrides: Sequence[str]) -> None:
-    """Trains with `overrides` of a short training, and plays.
+    """Plays and films; then trains with `overrides`, or if the user says so.
 
     Raises:
       ConfigError: bad input, before anything was started.
       GmiFailed: a process failed.
     """
+    names = [match[1] for text in overrides if (match := re.fullmatch(r"env=(\w+)", text))]
+    task, has_keys = names[-1] if names else TASK, len(names) < len(overrides)
+    config = _training(overrides, task) if has_keys else None
+    console = open_console(show=True)
+    if config is None or task in shipped_tasks():
+        show_shipped(task, console)
+    if config is None and _is_wanted():
+        config = _training((), TASK)
+    if config is None:
+        console.print(f"train it yourself:\n  gmijax train env={task}")
+    else:
+        _train(config)
+
+
+def show_shipped(task: str, console: Console) -> None:
+    """Plays the policy that is shipped for a task, and films it.
+
+    Raises:
+      ConfigError: there is none.
+      GmijaxError: playing failed.
+    """
+    config = shipped.checked(_play_config(task))
+    paths = shipped.folder_of(config)
+    shipped.play(paths, PLAY_S)
+    returns = read_json(paths.returns)
+    for line in _told(task, returns):
+        console.print(line)
+    try:
+        film(config, paths, returns["camera"], console, FILM_S)
+    finally:
+        paths.model.unlink(missing_ok=True)
+    again = f"gmijax play env={task} checkpoint=shipped"
+    others = [f"gmijax demo env={name}" for name in shipped_tasks() if name != task]
+    console.print(f"all of the episodes: {again}")
+    if others:
+        console.print(f"other tasks: {', '.join(others)}")
+
+
+def _play_config(task: str) -> PlayConfig:
+    # Not by Hydra, which takes half a second.
+    return PlayConfig(
+        run=PlayRunConfig(dir=None, env=task),
+        physics=PhysicsConfig(impl="auto"),
+        checkpoint=shipped.SHIPPED,
+        num_envs=_EPISODES,
+        seed=0,
+        deterministic=True,
+        max_steps=None,
+        video="auto",
+        video_envs=FILMED,
+        html="off",
+        width=640,
+        height=480,
+        camera=None,
+    )
+
+
+def _told(task: str, returns: dict[str, Any]) -> list[str]:
+    """What it is and what it returns."""
+    about, mean = returns["policy"], returns["return"]
+    where = ""
+    if about.get("train_wall_s") and about.get("device"):
+        where = f" in {about['train_wall_s']:.0f} s on one {about['device']}, beside others"
+    metrics = [f"{name} {values['mean']:.2f}" for name, values in returns["metrics"].items()]
+    return [
+        f"{task}: a policy that gmijax trained for {returns['env_steps']:,} env steps{where}",
+        f"{returns['num_envs']} episodes in MuJoCo: return {mean['mean']:.1f} "
+        f"({mean['min']:.1f} to {mean['max']:.1f}), length {returns['length']['mean']:.0f} steps"
+        + "".join(f", {text}" for text in metrics),
+    ]
+
+
+def _is_wanted() -> bool:
+    """Whether the user at the terminal wants a training; nobody is asked without one."""
+    if not (sys.stdin.isatty() and sys.stdout.isatty()):
+        return False
+    how_long = "seconds on this GPU" if detect_machine().gpus else "minutes on this CPU"
+    try:
+        answer = input(f"train {TASK} here now, some {how_long}? [y/N] ")
+    except EOFError:
+        return False
+    return answer.strip().lower() in ("y", "yes")
+
+
+def _training(overrides: Sequence[str], task: str) -> Any:
+    """The configuration of a short training; raises ConfigError."""
+    from gmijax.cli.compose import compose
+
     steps = GPU_STEPS if detect_machine().gpus else CPU_STEPS
-    own = {"env": "ball_balance", "num_timesteps": steps, "run.measure_throughput": "false"}
+    own = {"env": task, "num_timesteps": steps, "run.measure_throughput": "false"}
     given = {text.partition("=")[0] for text in overrides}
     short = [f"{key}={value}" for key, value in own.items() if key not in given]
-    config = compose(*short, *overrides)
+    return compose(*short, *overrides)
+
+
+def _train(config: Any) -> None:
+    """Trains, plays the last checkpoint and films it."""
+    from gmijax.cli.compose import build
+    from gmijax.control import job
+    from gmijax.deploy import playing
+
     result = job.train(config, show=True)
     playing.play(build("play", PlayConfig, [f"run.dir={result.run_dir}"]), show=True)
     curve = RunPaths(result.run_dir).returns_png
     films = sorted(result.run_dir.glob("play/*/*.mp4"))
+    has_curve = "none, no episode has ended"
     sys.stdout.write(
-        f"\nreturn while it learnt: {curve if curve.exists() else 'none, no episode has ended'}\n"
-        f"film: {films[-1] if films else 'none, see above'}\n"
-        f"more training: gmijax train env={config.env.label}\n"
+        f"\nreturn while it learnt: {nearby(curve) if curve.exists() else has_curve}\n"
+        f"film: {nearby(films[-1]) if films else 'none, see above'}\n"
+        f"more training:\n  gmijax train env={config.env.label}\n"
     )
 
 

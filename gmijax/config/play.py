@@ -19,8 +19,8 @@ class PlayRunConfig:
 
     dir: str | None = doc("run folder, or `last`; null: the run of `checkpoint`, else `last`")
     env: str | None = doc(
-        "the run's custom task, PATH.py:FUNCTION, where its file has changed or moved since; "
-        "env=PATH.py:FUNCTION is short for it; null: as the run noted it",
+        "the run's custom task, PATH.py:FUNCTION, where its file has changed or moved since; with "
+        "checkpoint=shipped the task; env= is short for it; null: as the run noted it",
         default=None,
     )
     # Digest of that file: the controller notes it for its child.
@@ -41,7 +41,8 @@ class PlayConfig(KeyGroup):
     physics: PhysicsConfig
     checkpoint: str | None = doc(
         "folder of a checkpoint, its env steps, or `best`: the one with the best return, in an "
-        "evaluation if there are any; null: the latest"
+        "evaluation if there are any; null: the latest. `shipped`, with env=TASK: the policy that "
+        "comes with gmijax, in MuJoCo in C"
     )
     num_envs: int = doc("N, environments, one episode each", low=1)
     seed: int = doc("seed of the episodes' starts and of sampled actions", low=0, high=2**31 - 1)

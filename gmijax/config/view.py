@@ -44,7 +44,7 @@ class ViewConfig(KeyGroup):
     view: PageConfig
     checkpoint: str | None = doc(
         "folder of a checkpoint, its env steps, or `best`; null: the latest, and every newer one "
-        "while the run is trained"
+        "while the run is trained. `shipped`, with env=TASK: the policy that comes with gmijax"
     )
     num_envs: int = doc("environments side by side", low=1, high=64)
     seed: int = doc("seed of the episodes' starts and of pushes", low=0, high=2**31 - 1)

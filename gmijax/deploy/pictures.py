@@ -11,7 +11,7 @@ from typing import IO
 from rich.console import Console
 
 from gmijax.config import PlayConfig
-from gmijax.control.console import doing
+from gmijax.control.console import doing, nearby
 from gmijax.errors import GmijaxError
 from gmijax.machine.interpreter import command
 from gmijax.machine.opengl import environment_with, is_missing, opengls, what_is_missing
@@ -25,7 +25,7 @@ def write_page(config: PlayConfig, paths: PlayPaths, console: Console) -> None:
     if missing():
         return
     with doing(console, "writing the page"), paths.page_log.open("wb") as log:
-        exit_code = _child("gmijax.workers.page_writer", paths, os.environ, log)
+        exit_code = run_child("gmijax.workers.page_writer", paths, os.environ, log)
     if exit_code == 0:
         console.print(f"page: {paths.html}")
         return
@@ -35,19 +35,33 @@ def write_page(config: PlayConfig, paths: PlayPaths, console: Console) -> None:
     console.print(reason)
 
 
-def film(config: PlayConfig, paths: PlayPaths, camera: str, console: Console) -> None:
+def film(
+    config: PlayConfig,
+    paths: PlayPaths,
+    camera: str,
+    console: Console,
+    seconds: float | None = None,
+) -> None:
     """Films with the first OpenGL that works; each is tried in a fresh interpreter.
 
-    `camera` is what to say of the camera.
+    Args:
+      config: what is filmed.
+      paths: where the trajectory is, and the film goes.
+      camera: what to say of the camera.
+      console: for the user.
+      seconds: a brief film, which takes about so long to draw; None: all of it.
+
+    Raises:
+      GmijaxError: there is no film, and `config` asks for one.
     """
     tried = opengls("egl", "osmesa")
     exit_code = EXIT_NO_GL
     for gl in tried:
         with doing(console, f"filming with {gl}"):
-            exit_code = _render(gl, paths)
+            exit_code = _render(gl, paths, seconds)
         if exit_code == 0:
             for video in filter(Path.exists, (paths.mp4, paths.gif)):
-                console.print(f"video: {video}")
+                console.print(f"video: {nearby(video)}")
             console.print(f"filmed by {camera}")
             return
         if not is_missing(exit_code):
@@ -67,15 +81,22 @@ def _why(exit_code: int, paths: PlayPaths) -> str:
     return f"{': '.join(filter(None, (ended, said)))} (log: {paths.render_log})"
 
 
-def _render(gl: str, paths: PlayPaths) -> int:
+def _render(gl: str, paths: PlayPaths, seconds: float | None = None) -> int:
+    own = () if seconds is None else (str(seconds),)
     with paths.render_log.open("ab") as log:
-        return _child("gmijax.workers.play_film", paths, environment_with(gl), log)
+        return run_child("gmijax.workers.play_film", paths, environment_with(gl), log, *own)
 
 
-def _child(module: str, paths: PlayPaths, environment: Mapping[str, str], log: IO[bytes]) -> int:
+def run_child(
+    module: str,
+    paths: PlayPaths,
+    environment: Mapping[str, str],
+    log: IO[bytes],
+    *arguments: str,
+) -> int:
     """Runs a module on the folder of a played checkpoint; returns its exit code."""
     return subprocess.run(
-        command(module, str(paths.root)),
+        command(module, str(paths.root), *arguments),
         env=environment,
         stdin=subprocess.DEVNULL,
         stdout=log,

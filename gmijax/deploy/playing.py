@@ -26,7 +26,9 @@ from gmijax.config import (
 )
 from gmijax.config.schema import to_dict
 from gmijax.control.console import doing, nearby, open_console
+from gmijax.deploy import shipped
 from gmijax.deploy.pictures import film, write_page
+from gmijax.deploy.shipped import SHIPPED
 from gmijax.errors import ConfigError, GmijaxError
 from gmijax.machine.snapshot import Machine, detect_machine
 from gmijax.partition.planner import make_plan
@@ -78,15 +80,27 @@ def play(config: PlayConfig, *, show: bool = False) -> None:
       GmiFailed: the evaluation failed.
       GmijaxError: a film was asked for and could not be made; the returns are there.
     """
-    config, changed = _opened(config)
-    # A film of an earlier evaluation must not lie beside the returns of this one.
-    paths = PlayPaths(output_folder(config, "play", lambda root: PlayPaths(root).results()))
+    _require_page(config)
     console = open_console(show=show)
-    console.print(f"checkpoint: {nearby(Path(str(config.checkpoint)))}")
-    if changed:
-        console.print(changed)
-    with doing(console, f"playing {config.num_envs} episodes"):
-        run_gmis(_launch(config, paths, detect_machine()))
+    if config.checkpoint == SHIPPED:
+        config = shipped.checked(config)
+        paths = shipped.folder_of(config)
+        with doing(console, f"playing {config.num_envs} episodes"):
+            shipped.play(paths)
+    else:
+        config, changed = _opened(config)
+        # A film of an earlier evaluation must not lie beside the returns of this one.
+        paths = PlayPaths(output_folder(config, "play", lambda root: PlayPaths(root).results()))
+        console.print(f"checkpoint: {nearby(Path(str(config.checkpoint)))}")
+        if changed:
+            console.print(changed)
+        with doing(console, f"playing {config.num_envs} episodes"):
+            run_gmis(_launch(config, paths, detect_machine()))
+    _show(config, paths, console)
+
+
+def _show(config: PlayConfig, paths: PlayPaths, console: Console) -> None:
+    """Prints the returns, and makes the pictures."""
     returns = read_json(paths.returns)
     console.print(_table(returns))
     console.print(f"returns: {nearby(paths.returns)}")
@@ -103,12 +117,15 @@ def play(config: PlayConfig, *, show: bool = False) -> None:
         paths.model.unlink(missing_ok=True)
 
 
-def _opened(config: PlayConfig) -> tuple[PlayConfig, str | None]:
-    """As `open_run`, with what only playing asks for checked too."""
+def _require_page(config: PlayConfig) -> None:
     if config.html == "on" and (absent := missing()):
         raise ConfigError(
             f"html=on: needs {' and '.join(absent)} ({INSTALL}); allowed without are auto, off"
         )
+
+
+def _opened(config: PlayConfig) -> tuple[PlayConfig, str | None]:
+    """As `open_run`, with what only playing asks for checked too."""
     config, env, changed = open_run(config)
     if config.randomize == "on" and not env.randomization:
         raise ConfigError("randomize=on: env.randomization of the run names nothing to draw")
@@ -127,6 +144,11 @@ def open_run(config: C) -> tuple[C, EnvConfig, str | None]:
     Raises:
       ConfigError: no such run or checkpoint, or its task cannot be had.
     """
+    if config.run.env is not None and ".py" not in config.run.env:
+        raise ConfigError(
+            f"env={config.run.env}: a run knows its task; add checkpoint=shipped for the policy "
+            "that comes with gmijax"
+        )
     checkpoint = _find(config)
     early = None
     if config.checkpoint == "best" and not rank_of(checkpoint).is_full:

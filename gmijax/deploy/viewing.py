@@ -8,15 +8,18 @@ from __future__ import annotations
 import os
 import queue
 from pathlib import Path
+from typing import NamedTuple
 
 from rich.console import Console
 
-from gmijax.config import ViewConfig
+from gmijax.config import EnvConfig, ViewConfig
 from gmijax.control.console import nearby, open_console
 from gmijax.deploy.playing import open_run
+from gmijax.deploy.shipped import SHIPPED, require_shipped
 from gmijax.errors import ConfigError
-from gmijax.player.plain_env import PlainEnv
+from gmijax.player.plain_env import PlainEnv, task_of
 from gmijax.player.policy import PlainPolicy, read_policy
+from gmijax.player.shipped import shipped_policy
 from gmijax.runs.folder import POLICY
 from gmijax.viewer.checkpoints import Checkpoints
 from gmijax.viewer.guard import Guard, is_loopback
@@ -34,18 +37,39 @@ def view(config: ViewConfig, *, show: bool = False) -> None:
     Raises:
       ConfigError: bad input, e.g. no such checkpoint, or a package that is not installed.
     """
+    console = open_console(show=show)
+    shown = _shipped(config) if config.checkpoint == SHIPPED else _of_run(config, console)
+    envs = [PlainEnv(shown.env, seed=config.seed + number) for number in range(config.num_envs)]
+    _require_fit(shown.policy, envs[0])
+    _require_packages()
+    _serve(config, Simulation(envs, shown.policy, config.seed), shown, console)
+
+
+class _Shown(NamedTuple):
+    env: EnvConfig
+    policy: PlainPolicy
+    checkpoint: Path | None  # None: of no run.
+    follow: bool
+
+
+def _shipped(config: ViewConfig) -> _Shown:
+    """The policy that comes with gmijax."""
+    task, run_dir = require_shipped(config.run.env), config.run.dir
+    if run_dir is not None:
+        raise ConfigError(f"run.dir={run_dir}: allowed with checkpoint=shipped is null")
+    policy = shipped_policy(task)
+    return _Shown(task_of(policy), policy, None, follow=False)
+
+
+def _of_run(config: ViewConfig, console: Console) -> _Shown:
+    """The policy of a checkpoint of a run."""
     follow = config.checkpoint is None
     config, env, changed = open_run(config)
     checkpoint = Path(str(config.checkpoint))
-    policy = _policy(checkpoint)
-    envs = [PlainEnv(env, seed=config.seed + number) for number in range(config.num_envs)]
-    _require_fit(policy, envs[0], checkpoint)
-    console = open_console(show=show)
     console.print(f"checkpoint: {nearby(checkpoint)}")
     if changed:
         console.print(changed)
-    _require_packages()
-    _serve(config, Simulation(envs, policy, config.seed), env.label, checkpoint, follow, console)
+    return _Shown(env, _policy(checkpoint), checkpoint, follow)
 
 
 def _policy(checkpoint: Path) -> PlainPolicy:
@@ -57,12 +81,11 @@ def _policy(checkpoint: Path) -> PlainPolicy:
     return read_policy(checkpoint / POLICY)
 
 
-def _require_fit(policy: PlainPolicy, env: PlainEnv, checkpoint: Path) -> None:
+def _require_fit(policy: PlainPolicy, env: PlainEnv) -> None:
     sizes = policy.obs_size, policy.action_size
     if sizes != (env.spec.actor_obs_size or env.spec.obs_size, env.spec.action_size):
         raise ConfigError(
-            f"checkpoint {checkpoint}: its policy takes {sizes[0]} numbers and gives {sizes[1]}; "
-            f"{env.spec.name} has {env.spec.obs_size} and {env.spec.action_size}"
+            f"the policy takes {sizes[0]} numbers and gives {sizes[1]}; {env.spec.name} has {env.spec.obs_size} and {env.spec.action_size}"
         )
 
 
@@ -71,33 +94,27 @@ def _require_packages() -> None:
         raise ConfigError(f"gmijax view needs {' and '.join(absent)} ({INSTALL})")
 
 
-def _serve(
-    config: ViewConfig,
-    simulation: Simulation,
-    title: str,
-    checkpoint: Path,
-    follow: bool,
-    console: Console,
-) -> None:
+def _serve(config: ViewConfig, simulation: Simulation, shown: _Shown, console: Console) -> None:
     from gmijax.viewer.browser_page import BrowserPage
     from gmijax.viewer.loop import Loop
     from gmijax.viewer.server import close_server, open_server
 
+    run = None if shown.checkpoint is None else Checkpoints(shown.checkpoint.parents[1])
     server = open_server(Guard(config.view.host, config.view.allow_origin), config.view.port)
     try:
         asked: queue.SimpleQueue[Request] = queue.SimpleQueue()
-        page = BrowserPage(server, asked, title, simulation, has_run=True)
-        loop = Loop(
+        title = shown.env.label
+        page = BrowserPage(server, asked, title, simulation, has_run=run is not None)
+        for line in _about(config, server.url, server.get_port()):
+            console.print(line)
+        Loop(
             simulation,
             page,
             asked,
-            run=Checkpoints(checkpoint.parents[1]),
-            checkpoint=checkpoint,
-            follow_training=follow,
-        )
-        for line in _about(config, server.url, server.get_port()):
-            console.print(line)
-        loop.run()
+            run=run,
+            checkpoint=shown.checkpoint,
+            follow_training=shown.follow,
+        ).run()
     finally:
         close_server(server)
 

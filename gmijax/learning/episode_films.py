@@ -45,13 +45,12 @@ class EpisodeFilms:
         if not (is_due or env_steps >= self._end):
             return
         self._last_steps = env_steps
-        num_recorded = episodes.qpos.shape[1]
         trajectory = chosen(
             episodes.qpos,
-            episodes.lengths[:num_recorded],
-            episodes.returns[:num_recorded],
+            episodes.lengths,
+            episodes.returns,
             self._spec.control_dt_s,
-            count=min(FILMED, num_recorded),
+            count=min(FILMED, episodes.qpos.shape[1]),
             title=f"{self._spec.name} after {env_steps:,} env steps",
             command=self._command,
         )

@@ -14,10 +14,10 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-import numpy.typing as npt
 
 from gmijax.learning.learner import Learner, TrainState, acting_weights
 from gmijax.learning.unroll import act, unroll
+from gmijax.player.outcome import Episodes
 from gmijax.sim.divergence import diverged_by_source, end_diverged
 from gmijax.sim.interface import Env, EnvState
 from gmijax.sim.wrappers import BatchState, env_keys, select_worlds, training_env, vectorise
@@ -45,35 +45,6 @@ class Options(NamedTuple):
     deterministic: bool
     max_steps: int | None
     first_env: int = 0
-
-
-class Episodes(NamedTuple):
-    """Outcome of N episodes.
-
-    Attributes:
-      returns: [N] undiscounted returns.
-      lengths: [N] steps.
-      terminated: [N] bool, ended by the task.
-      truncated: [N] bool, ended by the time limit; neither means cut off.
-      diverged: [N] bool, terminated because of a bad number (see `gmijax.sim.divergence`).
-      terms: [N] each, what every reward term added to the returns.
-      metrics: [N] each, the task's metrics at the end.
-      qpos: [L + 1, E, nq] positions of the first E worlds, from the start to the end of the
-        longest of their episodes; L is that episode's length.
-      compile_s: seconds that tracing and compiling took.
-      run_s: seconds of simulation.
-    """
-
-    returns: npt.NDArray[np.float32]
-    lengths: npt.NDArray[np.int32]
-    terminated: npt.NDArray[np.bool_]
-    truncated: npt.NDArray[np.bool_]
-    diverged: npt.NDArray[np.bool_]
-    terms: dict[str, npt.NDArray[np.float32]]
-    metrics: dict[str, npt.NDArray[np.float32]]
-    qpos: npt.NDArray[np.float32]
-    compile_s: float
-    run_s: float
 
 
 class EpisodeRunner:

@@ -66,6 +66,7 @@ class PlainEnv:
         self._task, self._settings = str(config.name), config.settings
         self._rng = np.random.default_rng(seed)
         self._state: EnvState
+        self._diverged = False
         self.reset()
 
     @property
@@ -97,6 +98,11 @@ class PlainEnv:
     def steps(self) -> int:
         """Control steps since the last reset."""
         return int(self._state.steps)
+
+    @property
+    def diverged(self) -> bool:
+        """Whether the last step led to a bad number, by which the episode ended."""
+        return self._diverged
 
     @property
     def metrics(self) -> dict[str, float]:
@@ -133,7 +139,7 @@ class PlainEnv:
         """Starts the next episode, or with a `seed` the first one of that seed; returns [O]."""
         if seed is not None:
             self._rng = np.random.default_rng(seed)
-        self._state = self._env.reset(self._world, self._rng)
+        self._state, self._diverged = self._env.reset(self._world, self._rng), False
         return self.obs
 
     def step(self, action: npt.ArrayLike) -> Step:
@@ -144,6 +150,7 @@ class PlainEnv:
         before, given = self._state, np.asarray(action, np.float32)
         after = self._env.step(self._world, before, given)
         diverged = diverged_by_source(self._env, after)["any"]
+        self._diverged = bool(diverged)
         self._state = state = end_diverged(before, after, diverged)
         return Step(
             obs=self.obs,

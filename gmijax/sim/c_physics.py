@@ -40,6 +40,8 @@ class CPhysics:
         self.mj_model = copy.copy(mj_model)
         # MuJoCo would start a world anew by itself that diverges; see `gmijax.sim.divergence`.
         self.mj_model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_AUTORESET)
+        # A world that diverges ends; MuJoCo would also add a line to a file where the user stands.
+        mujoco.set_mju_user_warning(lambda message: None)
         self.data = mujoco.MjData(self.mj_model)
         self.substeps = substeps
 

@@ -6,6 +6,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from gmijax.errors import ConfigError
+
 _DISTANCE = 3.0
 """Of a camera of ours from a robot, in radii of that robot."""
 
@@ -20,6 +22,18 @@ class Camera(NamedTuple):
 
     view: Any
     name: str
+
+
+def check_camera(model: Any, wanted: str | None, task: str) -> None:
+    """Raises ConfigError unless the `model` of a task, None for none, has the camera `wanted`."""
+    if wanted is None:
+        return
+    if model is None:
+        raise ConfigError(f"camera={wanted}: {task} has no model that could be filmed")
+    names = [model.camera(i).name for i in range(model.ncam)]
+    if wanted not in names:
+        allowed = ", ".join(["null", *filter(None, names)])
+        raise ConfigError(f"camera={wanted}: unknown camera of {task}; allowed: {allowed}")
 
 
 def choose_camera(model: Any, wanted: str | None) -> Camera:

@@ -54,13 +54,15 @@ def chosen(
 
     Args:
       qpos: [L + 1, N, nq], or longer.
-      lengths: [N].
-      returns: [N].
+      lengths: [N], or those of more episodes, which were not recorded.
+      returns: the same.
       control_dt_s: seconds per step.
       count: how many are shown.
       title: what is filmed, for the line that names the median.
       command: what the user may type to see it.
     """
+    num_recorded = qpos.shape[1]
+    lengths, returns = lengths[:num_recorded], returns[:num_recorded]
     order = np.argsort(returns, kind="stable")
     at = (np.arange(count) + 0.5) / count * len(order)
     worlds = order[at.astype(int)]

@@ -1,7 +1,7 @@
 """Draws films. Main of the filming child of `gmijax.play`. No jax here.
 
-`play_film.py PLAY_FOLDER` films a played checkpoint; without a folder it tells by
-its exit code whether it could.
+`play_film.py PLAY_FOLDER [S]` films a played checkpoint, briefly if it is to take S seconds;
+without a folder it tells by its exit code whether it could.
 
 Draws a trajectory with MuJoCo, without a display, through the OpenGL that MUJOCO_GL names. That
 choice is made when mujoco is imported and cannot be changed after, hence a child of its own.
@@ -12,6 +12,7 @@ from __future__ import annotations
 import math
 import os
 import sys
+import time
 from collections.abc import Generator, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from itertools import chain
@@ -30,6 +31,12 @@ from gmijax.sim.stage import Image, Stage
 from gmijax.sim.trajectory import Trajectory, load_trajectory
 
 MP4_MAX_FPS, GIF_MAX_FPS = 30.0, 15.0
+BRIEF_S, BRIEF_LEAST_S = 6.0, 4.0
+BRIEF_FPS, BRIEF_LEAST_FPS = 15.0, 8.0
+"""Of a brief film: its length and its frames a second, and the least of both."""
+
+_TRIED = 3
+"""Pictures that tell how long one takes: somebody else may use the machine meanwhile."""
 
 _H264_CRF = "20"
 _GIF_MAX_WIDTH = 480
@@ -74,7 +81,7 @@ def main(arguments: Sequence[str]) -> int:
     """Films the folder's trajectory; returns the exit code."""
     if not arguments:
         return EXIT_NO_GL if _stage(None, (64, 64), None) is None else 0
-    folder = Path(arguments[0])
+    folder, *limit = Path(arguments[0]), *map(float, arguments[1:])
     config = from_dict(PlayConfig, read_json(RunPaths(folder).config))
     paths = PlayPaths(folder)
     grid = grid_of(config.num_filmed)
@@ -82,7 +89,11 @@ def main(arguments: Sequence[str]) -> int:
     if stage is None:
         return EXIT_NO_GL
     made = {"gif": (paths.gif,), "both": (paths.mp4, paths.gif)}.get(config.video, (paths.mp4,))
-    film(made, load_trajectory(paths.trajectory), stage, grid)
+    trajectory = load_trajectory(paths.trajectory)
+    max_fps = MP4_MAX_FPS
+    if limit:
+        trajectory, max_fps = brief(trajectory, stage, limit[0])
+    film(made, trajectory, stage, grid, max_fps)
     return 0
 
 
@@ -150,12 +161,35 @@ def frames(
         yield captions.below(compose(tiles, grid), step * trajectory.control_dt_s)
 
 
+def brief(trajectory: Trajectory, stage: Stage, seconds: float) -> tuple[Trajectory, float]:
+    """The beginning of the episodes, and at most how many frames of it a second.
+
+    So many that they are drawn in about `seconds`, if that is enough for something to see.
+    """
+    picture_s = min(_picture_s(trajectory, stage) for _ in range(_TRIED))
+    frames = seconds / (picture_s * len(trajectory.lengths))
+    max_fps = min(BRIEF_FPS, max(BRIEF_LEAST_FPS, frames / BRIEF_S))
+    length_s = min(BRIEF_S, max(BRIEF_LEAST_S, frames / max_fps))
+    steps = int(length_s / trajectory.control_dt_s)
+    return trajectory._replace(qpos=trajectory.qpos[: steps + 1]), max_fps
+
+
+def _picture_s(trajectory: Trajectory, stage: Stage) -> float:
+    started_s = time.perf_counter()
+    stage.picture(trajectory.qpos[0, 0])
+    return time.perf_counter() - started_s
+
+
 def film(
-    made: Sequence[Path], trajectory: Trajectory, stage: Stage, grid: tuple[int, int]
+    made: Sequence[Path],
+    trajectory: Trajectory,
+    stage: Stage,
+    grid: tuple[int, int],
+    max_fps: float = MP4_MAX_FPS,
 ) -> None:
     """Writes the film to each of `made`, .mp4 or .gif; every picture is drawn once."""
     mp4 = any(path.suffix == ".mp4" for path in made)
-    timing = real_time(trajectory.control_dt_s, MP4_MAX_FPS if mp4 else GIF_MAX_FPS)
+    timing = real_time(trajectory.control_dt_s, min(max_fps, MP4_MAX_FPS if mp4 else GIF_MAX_FPS))
     slower = real_time(1.0 / timing.fps, GIF_MAX_FPS)
     drawn = frames(trajectory, stage, grid, timing.stride)
     first = next(drawn)

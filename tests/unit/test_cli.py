@@ -58,7 +58,9 @@ REFUSED: list[tuple[str, str, str]] = [
     ),
     ("play", "vidoe=gif", "unknown key vidoe: did you mean video?"),
     ("play", "env.name=ant", "unknown key env"),
-    ("play", "env=ant", "unknown key env: did you mean run.env?"),
+    ("play", "env=ant", "env=ant: a run knows its task; add checkpoint=shipped"),
+    ("play", "env=antt checkpoint=shipped", "env=antt: no policy of it is shipped"),
+    ("export", "env=ant", "unknown key env: did you mean run.env?"),
     ("export", "run.dir=x tuned=ant_ppo", "unknown key tuned: allowed are checkpoint"),
     # Values of a wrong type, or out of range.
     ("train", "num_envs=many", "num_envs=many: expected an integer"),

@@ -12,7 +12,9 @@ import pytest
 from gmijax import demo
 from gmijax.__main__ import VERBS, main
 from gmijax.config import PlayConfig, TrainConfig
+from gmijax.control import job
 from gmijax.control.job import Result
+from gmijax.deploy import playing
 from gmijax.list_envs import task_of
 from gmijax.runs.folder import PlayPaths, RunPaths
 from gmijax.sim.registry import TASKS
@@ -62,7 +64,7 @@ def test_arguments_and_exit_code_are_those_of_the_verb(capsys: pytest.CaptureFix
     assert main(["demo", "num_timesteps=0"]) == 2
 
 
-def test_a_demo_trains_plays_and_says_what_to_look_at(
+def test_a_demo_with_keys_trains_plays_and_says_what_to_look_at(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ):
     run, played = RunPaths(tmp_path), PlayPaths(tmp_path / "play" / "000000000042")
@@ -77,8 +79,9 @@ def test_a_demo_trains_plays_and_says_what_to_look_at(
         played.root.mkdir(parents=True)
         played.mp4.touch()
 
-    monkeypatch.setattr(demo.job, "train", train)
-    monkeypatch.setattr(demo.playing, "play", play)
+    monkeypatch.setattr(job, "train", train)
+    monkeypatch.setattr(playing, "play", play)
+    monkeypatch.setattr(demo, "show_shipped", lambda *_: None)
     assert main(["demo", "num_timesteps=42", "seed=3"]) == 0
     said = capsys.readouterr().out
     assert f"return while it learnt: {run.returns_png}\n" in said

@@ -147,7 +147,7 @@ def test_every_opengl_is_tried_the_users_first(
     tried: list[str] = []
     monkeypatch.setenv("MUJOCO_GL", "glfw")
 
-    def render(gl: str, paths: PlayPaths) -> int:
+    def render(gl: str, *_: Any) -> int:
         tried.append(gl)
         # -11: a driver that crashes is no reason to give up either.
         return {"glfw": EXIT_NO_GL, "egl": -11, "osmesa": 0}[gl]

@@ -1,0 +1,86 @@
+"""Plays a policy that comes with gmijax, in plain MuJoCo: no run, no jax, nothing is compiled.
+
+A child does it, `gmijax.workers.plain_playback`. No jax and no mujoco here.
+"""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import Final
+
+from gmijax.config import PlayConfig
+from gmijax.config.schema import to_dict
+from gmijax.deploy.pictures import run_child
+from gmijax.errors import ConfigError, GmijaxError
+from gmijax.player.shipped import shipped_tasks
+from gmijax.runs.folder import RUNS, PlayPaths, RunPaths, remove_temporary, write_json
+from gmijax.supervise.failures import last_line
+
+SHIPPED: Final = "shipped"
+"""Value of `checkpoint`."""
+
+
+def checked(config: PlayConfig) -> PlayConfig:
+    """The configuration.
+
+    Raises:
+      ConfigError: no policy of this task is shipped, or it cannot be played so.
+    """
+    require_shipped(config.run.env)
+    for key, value, allowed in (
+        ("run.dir", config.run.dir, None),
+        ("deterministic", config.deterministic, True),
+        ("randomize", config.randomize, "off"),
+        ("physics.impl", config.physics.impl, "auto"),
+    ):
+        if value != allowed:
+            shown = "null" if allowed is None else str(allowed).lower()
+            raise ConfigError(f"{key}={value}: allowed with checkpoint=shipped is {shown}")
+    return config
+
+
+def require_shipped(task: str | None) -> str:
+    """The task; raises ConfigError if no policy of it is shipped."""
+    tasks = ", ".join(shipped_tasks())
+    if task is None:
+        raise ConfigError(f"checkpoint=shipped: of which task? Add env=TASK; there are {tasks}")
+    if task not in shipped_tasks():
+        raise ConfigError(f"env={task}: no policy of it is shipped; allowed are {tasks}")
+    return task
+
+
+def folder_of(config: PlayConfig) -> PlayPaths:
+    """`runs/shipped/<task>`, with the configuration and nothing of an earlier call.
+
+    Raises:
+      ConfigError: it cannot be written.
+    """
+    paths = PlayPaths(RUNS / SHIPPED / str(config.run.env))
+    try:
+        paths.root.mkdir(parents=True, exist_ok=True)
+        write_json(RunPaths(paths.root).config, to_dict(config))
+        remove_temporary(paths.root)
+        for path in paths.results():
+            path.unlink(missing_ok=True)
+    except OSError as error:
+        raise ConfigError(f"cannot write to {paths.root} ({error.strerror})") from None
+    return PlayPaths(Path(paths.root).resolve())
+
+
+def play(paths: PlayPaths, seconds: float | None = None) -> None:
+    """Plays; with `seconds` only about so long, but as many episodes as a film shows.
+
+    Raises:
+      ConfigError: the configuration asks for what the task does not have.
+      GmijaxError: it failed.
+    """
+    own = () if seconds is None else (str(seconds),)
+    log = paths.root / "stderr.log"
+    with log.open("wb") as output:
+        code = run_child("gmijax.workers.plain_playback", paths, os.environ, output, *own)
+    if code == 2:
+        raise ConfigError(last_line(log))
+    if code:
+        raise GmijaxError(f"playing failed (exit code {code}): {last_line(log)} (log: {log})")
+    log.unlink()
