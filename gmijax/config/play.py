@@ -62,7 +62,7 @@ class PlayConfig(KeyGroup):
         "returns; null: 4, or all if there are fewer"
     )
     html: Literal["auto", "on", "off"] = doc(
-        "write a page that shows the filmed environments in 3D in a browser; auto: where the extra "
+        "write a page with the filmed environments in 3D, for a browser; auto: where the extra "
         "`view` is installed"
     )
     width: int = doc("width of the picture in pixels", low=64, high=4096)

@@ -27,6 +27,7 @@ from gmijax.viewer.installed import INSTALL, missing
 from gmijax.viewer.requests import Request
 from gmijax.viewer.simulation import Simulation
 
+
 def view(config: ViewConfig, *, show: bool = False) -> None:
     """Shows a policy in the browser until the process is interrupted.
 
@@ -82,10 +83,12 @@ def _policy(checkpoint: Path) -> PlainPolicy:
 
 
 def _require_fit(policy: PlainPolicy, env: PlainEnv) -> None:
-    sizes = policy.obs_size, policy.action_size
-    if sizes != (env.spec.actor_obs_size or env.spec.obs_size, env.spec.action_size):
+    spec = env.spec
+    wanted = spec.actor_obs_size or spec.obs_size, spec.action_size
+    if (policy.obs_size, policy.action_size) != wanted:
         raise ConfigError(
-            f"the policy takes {sizes[0]} numbers and gives {sizes[1]}; {env.spec.name} has {env.spec.obs_size} and {env.spec.action_size}"
+            f"the policy takes {policy.obs_size} numbers and gives {policy.action_size}; "
+            f"{spec.name} has {wanted[0]} and {wanted[1]}"
         )
 
 

@@ -79,21 +79,21 @@ class BrowserPage:
         """Shows numbers."""
         self._panel.write(simulation, view)
 
-    def _commands(
-        self, simulation: Simulation, xpos: Floats, xquat: Floats
-    ) -> dict[int, Arrow]:
+    def _commands(self, simulation: Simulation, xpos: Floats, xquat: Floats) -> dict[int, Arrow]:
         """Commanded velocities in the plane, above the robots."""
         names = list(simulation.envs[0].command_limits or ())
         if not {_FORWARD, _LEFT} <= set(names):
             return {}
+        width = self._scene.width_m
+        above = np.array([0.0, 0.0, 0.4 * width])
         arrows: dict[int, Arrow] = {}
         for number, env in enumerate(simulation.envs):
-            told, quat = dict(zip(names, env.command, strict=True)), xquat[number, simulation.pushed]
-            forward, left = told[_FORWARD], told[_LEFT]
-            w, x, y, z = quat
+            told = dict(zip(names, np.asarray(env.command), strict=True))
+            w, x, y, z = xquat[number, simulation.pushed]
             yaw = np.arctan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))
-            cos, sin = np.cos(yaw), np.sin(yaw)
-            way = np.array([cos * forward - sin * left, sin * forward + cos * left, 0.0])
-            start = xpos[number, simulation.pushed] + np.array([0.0, 0.0, 0.4 * self._scene.width_m])
-            arrows[number] = (start, start + _ARROW * self._scene.width_m * way)
+            ahead = np.array([np.cos(yaw), np.sin(yaw), 0.0])
+            aside = np.array([-np.sin(yaw), np.cos(yaw), 0.0])
+            start = xpos[number, simulation.pushed] + above
+            way = told[_FORWARD] * ahead + told[_LEFT] * aside
+            arrows[number] = (start, start + _ARROW * width * way)
         return arrows

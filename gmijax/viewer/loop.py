@@ -101,7 +101,6 @@ class Loop:
         self._next_step = self._next_picture = self._next_text = self._next_look = now
         self._seen_client = now
         self._rate_since, self._rate_steps = now, 0
-        self._age_at = now
         self.view = View(
             paused=False,
             is_late=False,
@@ -189,20 +188,9 @@ class Loop:
         match request:
             case requests.Pause(paused):
                 self._pause(paused)
-            case requests.Step():
-                self._pause(True)
-                self._simulation.step()
-            case requests.Reset():
-                self._simulation.reset()
             case requests.SetSpeed(speed):
                 self._speed = speed
                 self._restart_clock()
-            case requests.Push(speed_m_per_s):
-                self._simulation.push(self.view.selected, speed_m_per_s)
-            case requests.Drag():
-                self._simulation.drag(request)
-            case requests.SetCommand(command):
-                self._simulation.tell(command)
             case requests.Select(env):
                 self._change(selected=min(max(env, 0), len(self._simulation.envs) - 1))
             case requests.FollowRobot(on):
@@ -216,6 +204,29 @@ class Loop:
             case requests.Wake():
                 self._seen_client = self._clock()
                 self._restart_clock()
+            case _:
+                self._do_in_simulation(request)
+
+    def _do_in_simulation(
+        self,
+        request: requests.Step
+        | requests.Reset
+        | requests.Push
+        | requests.Drag
+        | requests.SetCommand,
+    ) -> None:
+        match request:
+            case requests.Step():
+                self._pause(True)
+                self._simulation.step()
+            case requests.Reset():
+                self._simulation.reset()
+            case requests.Push(speed_m_per_s):
+                self._simulation.push(self.view.selected, speed_m_per_s)
+            case requests.Drag():
+                self._simulation.drag(request)
+            case requests.SetCommand(command):
+                self._simulation.tell(command)
 
     def _pause(self, paused: bool) -> None:
         self._change(paused=paused)

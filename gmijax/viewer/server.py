@@ -81,13 +81,13 @@ def _listen(host: str, port: int) -> socket.socket:
     error: OSError | None = None
     for candidate in range(port, min(port + _PORTS_TRIED, 65536)) if port else (0,):
         try:
-            family, kind, _, _, address = socket.getaddrinfo(
+            family, _, _, _, address = socket.getaddrinfo(
                 host, candidate, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE
             )[0]
             if family == socket.AF_INET6:
                 return socket.create_server(address[:2], family=family)
             return socket.create_server(address[:2])
-        except (OSError, UnicodeError) as failed:
+        except (OSError, ValueError) as failed:
             error = failed if isinstance(failed, OSError) else OSError(0, str(failed))
     reason = getattr(error, "strerror", None) or error
     raise ConfigError(f"view.host={host} view.port={port}: cannot listen there ({reason})")
@@ -128,6 +128,3 @@ def _check(guard: Guard, request: Request) -> Response | None:
     path = urlsplit(request.path).path
     request.path = path.replace(f"/{guard.token}", "", 1) or "/"
     return None
-
-
-

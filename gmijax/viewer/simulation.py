@@ -145,7 +145,9 @@ class Simulation:
 
     def _first(self, number: int, last_return: float | None) -> Episode:
         names = self.envs[0].spec.reward_terms
-        return Episode(0, dict.fromkeys(names, 0.0), dict.fromkeys(names, 0.0), number, last_return)
+        return Episode(
+            0, dict.fromkeys(names, 0.0), dict.fromkeys(names, 0.0), number, last_return
+        )
 
     def _count(self, number: int, terms: dict[str, float]) -> None:
         before = self.episodes[number]

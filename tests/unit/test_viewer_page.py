@@ -9,7 +9,7 @@ import sys
 import threading
 import urllib.error
 import urllib.request
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
@@ -223,7 +223,9 @@ def test_a_taken_port_is_not_waited_for(shown: Shown) -> None:
         close_server(other)
 
 
-@pytest.mark.parametrize("host", ["256.1.1.1", "no.such.host.invalid", "\0", "é" * 300, "", "8.8.8.8"])
+@pytest.mark.parametrize(
+    "host", ["256.1.1.1", "no.such.host.invalid", "\0", "é" * 300, "", "8.8.8.8"]
+)
 def test_where_nothing_can_listen_is_said(host: str) -> None:
     with pytest.raises(ConfigError, match=r"view\.host="):
         open_server(Guard(host), 0)
