@@ -65,7 +65,7 @@ class Client:
             if _is(message, kind, props):
                 return message
         while True:
-            for message in self._receive():
+            for message in self.receive():
                 self.seen.append(message)
             for message in self.seen:
                 if _is(message, kind, props):
@@ -81,7 +81,8 @@ class Client:
         uuid = self.wait_for(kind, label=label)["uuid"]
         self.send("GuiUpdateMessage", uuid=uuid, updates={"value": value})
 
-    def _receive(self) -> list[dict[str, Any]]:
+    def receive(self) -> list[dict[str, Any]]:
+        """The messages that come next."""
         raw = self._socket.recv(timeout=WAIT_S)
         assert isinstance(raw, bytes)
         size = int.from_bytes(raw[8:16], "little")

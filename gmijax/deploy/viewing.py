@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import os
 import queue
+import socket
 from pathlib import Path
 from typing import NamedTuple
 
@@ -38,19 +39,20 @@ def view(config: ViewConfig, *, show: bool = False) -> None:
     Raises:
       ConfigError: bad input, e.g. no such checkpoint, or a package that is not installed.
     """
-    console = open_console(show=show)
-    shown = _shipped(config) if config.checkpoint == SHIPPED else _of_run(config, console)
+    shown = _shipped(config) if config.checkpoint == SHIPPED else _of_run(config)
     envs = [PlainEnv(shown.env, seed=config.seed + number) for number in range(config.num_envs)]
     _require_fit(shown.policy, envs[0])
     _require_packages()
-    _serve(config, Simulation(envs, shown.policy, config.seed), shown, console)
+    simulation = Simulation(envs, shown.policy, config.seed)
+    _serve(config, simulation, shown, open_console(show=show))
 
 
 class _Shown(NamedTuple):
     env: EnvConfig
     policy: PlainPolicy
     checkpoint: Path | None  # None: of no run.
-    follow: bool
+    follow: bool  # Whether newer checkpoints are taken.
+    lines: tuple[str, ...]  # What the user should know.
 
 
 def _shipped(config: ViewConfig) -> _Shown:
@@ -59,18 +61,17 @@ def _shipped(config: ViewConfig) -> _Shown:
     if run_dir is not None:
         raise ConfigError(f"run.dir={run_dir}: allowed with checkpoint=shipped is null")
     policy = shipped_policy(task)
-    return _Shown(task_of(policy), policy, None, follow=False)
+    lines = (f"the policy of {task} that comes with gmijax",)
+    return _Shown(task_of(policy), policy, None, False, lines)
 
 
-def _of_run(config: ViewConfig, console: Console) -> _Shown:
+def _of_run(config: ViewConfig) -> _Shown:
     """The policy of a checkpoint of a run."""
     follow = config.checkpoint is None
     config, env, changed = open_run(config)
     checkpoint = Path(str(config.checkpoint))
-    console.print(f"checkpoint: {nearby(checkpoint)}")
-    if changed:
-        console.print(changed)
-    return _Shown(env, _policy(checkpoint), checkpoint, follow)
+    lines = (f"checkpoint: {nearby(checkpoint)}", *filter(None, (changed,)))
+    return _Shown(env, _policy(checkpoint), checkpoint, follow, lines)
 
 
 def _policy(checkpoint: Path) -> PlainPolicy:
@@ -108,7 +109,7 @@ def _serve(config: ViewConfig, simulation: Simulation, shown: _Shown, console: C
         asked: queue.SimpleQueue[Request] = queue.SimpleQueue()
         title = shown.env.label
         page = BrowserPage(server, asked, title, simulation, has_run=run is not None)
-        for line in _about(config, server.url, server.get_port()):
+        for line in (*shown.lines, *_about(config, server.url, server.get_port())):
             console.print(line)
         Loop(
             simulation,
@@ -124,11 +125,11 @@ def _serve(config: ViewConfig, simulation: Simulation, shown: _Shown, console: C
 
 def _about(config: ViewConfig, url: str, port: int) -> list[str]:
     """Where the page is, and how to reach it from elsewhere."""
-    lines = []
-    if config.view.port not in (0, port):
-        lines.append(f"view.port={config.view.port} is taken; this is {port}")
+    taken = config.view.port not in (0, port)
+    lines = [f"view.port={config.view.port} is taken; this is {port}"] if taken else []
     if is_loopback(config.view.host):
-        lines.append(f"from another machine: ssh -L {port}:localhost:{port} this machine, then")
+        here = socket.gethostname()
+        hint = f"from another machine: ssh -L {port}:127.0.0.1:{port} {here}, then the same address"
     else:
-        lines.append("anybody who has this address can open the page:")
-    return [*lines, url, "Ctrl-C ends it"]
+        hint = "whoever has this address can open the page and press its buttons"
+    return [*lines, url, f"{hint}; Ctrl-C ends it"]

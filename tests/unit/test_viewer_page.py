@@ -200,7 +200,7 @@ def test_numbers_and_pictures_are_sent(shown: Shown, client: Client) -> None:
         return str(message.get("updates", {}).get("content", ""))
 
     while "yaw_rate" not in "".join(map(texts, client.seen)):
-        client.seen += client._receive()
+        client.seen += client.receive()
 
 
 def test_names_are_no_markup() -> None:
