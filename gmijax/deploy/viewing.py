@@ -5,7 +5,6 @@ All in this process: beside a training it takes a fraction of a core, and nothin
 
 from __future__ import annotations
 
-import os
 import queue
 import socket
 from pathlib import Path
@@ -19,9 +18,8 @@ from gmijax.deploy.playing import open_run
 from gmijax.deploy.shipped import SHIPPED, require_shipped
 from gmijax.errors import ConfigError
 from gmijax.player.plain_env import PlainEnv, task_of
-from gmijax.player.policy import PlainPolicy, read_policy
+from gmijax.player.policy import PlainPolicy, checkpoint_policy
 from gmijax.player.shipped import shipped_policy
-from gmijax.runs.folder import POLICY
 from gmijax.viewer.checkpoints import Checkpoints
 from gmijax.viewer.guard import Guard, is_loopback
 from gmijax.viewer.installed import INSTALL, missing
@@ -71,16 +69,7 @@ def _of_run(config: ViewConfig) -> _Shown:
     config, env, changed = open_run(config)
     checkpoint = Path(str(config.checkpoint))
     lines = (f"checkpoint: {nearby(checkpoint)}", *filter(None, (changed,)))
-    return _Shown(env, _policy(checkpoint), checkpoint, follow, lines)
-
-
-def _policy(checkpoint: Path) -> PlainPolicy:
-    if not os.path.lexists(checkpoint / POLICY):
-        raise ConfigError(
-            f"checkpoint {checkpoint}: has no {POLICY}, an older version of gmijax wrote it; "
-            "gmijax play can play it"
-        )
-    return read_policy(checkpoint / POLICY)
+    return _Shown(env, checkpoint_policy(checkpoint), checkpoint, follow, lines)
 
 
 def _require_fit(policy: PlainPolicy, env: PlainEnv) -> None:

@@ -19,7 +19,7 @@ import numpy as np
 import numpy.typing as npt
 
 from gmijax.errors import ConfigError
-from gmijax.runs.folder import open_regular, write_bytes
+from gmijax.runs.folder import POLICY, open_regular, write_bytes
 
 Floats: TypeAlias = npt.NDArray[np.float32]
 
@@ -108,6 +108,21 @@ def read_policy(path: Path) -> PlainPolicy:
         raise ConfigError(f"{path}: cannot be read ({error.strerror or error})") from None
     except (EOFError, KeyError, TypeError, ValueError, zipfile.BadZipFile) as error:
         raise ConfigError(f"{path}: not a policy ({' '.join(str(error).split())})") from None
+
+
+def checkpoint_policy(checkpoint: Path) -> PlainPolicy:
+    """The policy of a checkpoint folder.
+
+    Raises:
+      ConfigError: it has no `policy.npz`, as those of older versions, or a broken one.
+    """
+    path = checkpoint / POLICY
+    if not path.exists():
+        raise ConfigError(
+            f"checkpoint {checkpoint}: has no {POLICY}, which this version writes into every "
+            "checkpoint; `gmijax play` plays it without"
+        )
+    return read_policy(path)
 
 
 def _policy_of(data: Mapping[str, Any]) -> PlainPolicy:

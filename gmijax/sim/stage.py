@@ -57,7 +57,7 @@ class Stage:
         # All of the buffer is resolved, not only the picture.
         visual.global_.offwidth, visual.global_.offheight = width, height
         visual.quality.shadowsize = min(visual.quality.shadowsize, _SHADOW_MAP)
-        visual.quality.offsamples = min(visual.quality.offsamples, 1)
+        visual.quality.offsamples = 0  # One sample, in a buffer that knows nothing of several.
 
     def close(self) -> None:
         """Frees the context."""

@@ -11,7 +11,7 @@ import time
 from pathlib import Path
 
 from gmijax.errors import ConfigError
-from gmijax.player.policy import PlainPolicy, read_policy
+from gmijax.player.policy import PlainPolicy, checkpoint_policy
 from gmijax.runs.folder import META, POLICY
 from gmijax.runs.resume import CheckpointMeta, checkpoints_of
 
@@ -37,7 +37,7 @@ class Checkpoints:
 def read(checkpoint: Path) -> PlainPolicy | None:
     """The policy of a checkpoint; None: it is gone, or no policy."""
     try:
-        return read_policy(checkpoint / POLICY)
+        return checkpoint_policy(checkpoint)
     except ConfigError:
         return None
 

@@ -30,6 +30,6 @@ def test_the_last_evaluation_is_filmed_and_nothing_is_left_to_film(tmp_path: Pat
     num_frames, _ = imageio_ffmpeg.count_frames_and_secs(film)
     assert num_frames in range(2, 22)  # A frame for each step of 0.1 s, the start included.
     reader = imageio_ffmpeg.read_frames(film)
-    assert next(reader)["size"] == (640, 480)
+    assert next(reader)["size"] == (640, 520)  # With two lines below the picture.
     assert len(set(next(reader))) > 20, "the picture must not be blank"
     reader.close()

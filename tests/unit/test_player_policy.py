@@ -11,7 +11,7 @@ from made_checkpoint import ACTION_SIZE, ENV_STEPS, OBS_SIZE, make_run
 
 from gmijax.deploy.policy import load_policy
 from gmijax.errors import ConfigError
-from gmijax.player.policy import PlainPolicy, read_policy, write_policy
+from gmijax.player.policy import PlainPolicy, checkpoint_policy, read_policy, write_policy
 from gmijax.runs.folder import POLICY
 
 
@@ -26,7 +26,7 @@ from gmijax.runs.folder import POLICY
 )
 def test_it_acts_as_the_checkpoint_does(tmp_path: Path, overrides: tuple[str, ...]):
     run = make_run(tmp_path / "run", *overrides)
-    plain = read_policy(run.checkpoint(ENV_STEPS) / POLICY)
+    plain = checkpoint_policy(run.checkpoint(ENV_STEPS))
     obs = 3.0 * np.random.default_rng(0).normal(size=(64, OBS_SIZE)).astype(np.float32)
     wanted = load_policy(run.root)(obs)
     assert np.abs(wanted).max() > 0.5
@@ -34,6 +34,13 @@ def test_it_acts_as_the_checkpoint_does(tmp_path: Path, overrides: tuple[str, ..
     np.testing.assert_allclose(plain(obs[0]), wanted[0], atol=1e-5)
     assert plain.about["env"]["name"] == "ball_balance"
     assert plain.about["env_steps"] == ENV_STEPS
+
+
+def test_a_checkpoint_of_an_older_version_is_one_line(tmp_path: Path):
+    run = make_run(tmp_path / "run")
+    (run.checkpoint(ENV_STEPS) / POLICY).unlink()
+    with pytest.raises(ConfigError, match=r"has no policy\.npz.* plays it without$"):
+        checkpoint_policy(run.checkpoint(ENV_STEPS))
 
 
 def test_it_sees_what_the_policy_saw(tmp_path: Path):
