@@ -118,7 +118,9 @@ def _about(config: ViewConfig, url: str, port: int) -> list[str]:
     lines = [f"view.port={config.view.port} is taken; this is {port}"] if taken else []
     if is_loopback(config.view.host):
         here = socket.gethostname()
-        hint = f"from another machine: ssh -L {port}:127.0.0.1:{port} {here}, then the same address"
+        hint = (
+            f"from another machine: ssh -L {port}:127.0.0.1:{port} {here}, then the same address"
+        )
     else:
         hint = "whoever has this address can open the page and press its buttons"
     return [*lines, url, f"{hint}; Ctrl-C ends it"]
