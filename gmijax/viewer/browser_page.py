@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import queue
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 
@@ -14,7 +14,7 @@ from gmijax.viewer.scene import BLUE, ORANGE, Arrow, Scene
 from gmijax.viewer.server import Server
 from gmijax.viewer.simulation import Floats, Simulation
 
-_ARROW: float = 0.5
+_ARROW: Final = 0.3
 """Length for 1 m/s, in widths of the model."""
 
 _FORWARD, _LEFT = "forward_m_per_s", "left_m_per_s"

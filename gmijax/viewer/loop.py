@@ -162,15 +162,12 @@ class Loop:
 
     def _step(self, now: float) -> None:
         dt = self._simulation.control_dt_s / self._speed
-        late = now - self._next_step > _LATE_S
-        if late:  # Rather slow than in a hurry.
+        if now - self._next_step > _LATE_S:  # Rather slow than in a hurry.
             self._next_step = now
         if now >= self._next_step:
             self._simulation.step()
             self._rate_steps += 1
             self._next_step += dt
-        if late:
-            self._change(is_late=True)
 
     def _measure(self, now: float) -> None:
         passed = now - self._rate_since
