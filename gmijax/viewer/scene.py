@@ -215,7 +215,7 @@ class Scene:
         @self._server.on_client_connect
         async def _(client: viser.ClientHandle) -> None:
             if client.camera.aspect < 1.0:  # A phone: the panel covers the lower half.
-                farther = 0.75 / client.camera.aspect
+                farther = 0.9 / client.camera.aspect
                 below = middle - (0.0, 0.0, 0.25 * farther * distance)
                 client.camera.position = below + farther * way
                 client.camera.look_at = below  # It has moved too.
