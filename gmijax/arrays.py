@@ -21,6 +21,11 @@ def array_module(*values: Any) -> Any:
     return np
 
 
+def constant(values: Any) -> Any:
+    """Numbers as float32 of numpy, which JAX takes as they are."""
+    return np.asarray(values, np.float32)
+
+
 def replaced(array: Any, where: Any, values: Any) -> Any:
     """A copy of an array with `values` at the indices `where`, or from `where` on if it is an int.
 

@@ -12,6 +12,7 @@ from typing import Any, NamedTuple, TypeAlias
 import numpy as np
 import numpy.typing as npt
 
+from gmijax.arrays import constant
 from gmijax.config import EnvConfig
 from gmijax.config.schema import from_dict, known
 from gmijax.errors import ConfigError
@@ -64,7 +65,7 @@ class PlainEnv:
         self._env = _plain_task(config)
         self._world: CPhysics = self._env.model
         self._task, self._settings = str(config.name), config.settings
-        self._rng = np.random.default_rng(seed)
+        self._rng: Any = np.random.default_rng(seed)  # In the place of a key.
         self._state: EnvState
         self._diverged = False
         self.reset()
@@ -147,7 +148,7 @@ class PlainEnv:
 
         A world whose numbers leave every bound ends with reward 0 (`gmijax.sim.divergence`).
         """
-        before, given = self._state, np.asarray(action, np.float32)
+        before, given = self._state, constant(action)
         after = self._env.step(self._world, before, given)
         diverged = diverged_by_source(self._env, after)["any"]
         self._diverged = bool(diverged)

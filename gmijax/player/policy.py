@@ -91,7 +91,7 @@ def write_policy(path: Path, policy: PlainPolicy, *, half: bool = False) -> None
         "about": dict(policy.about),
     }
     content = io.BytesIO()
-    np.savez(content, header=np.array(json.dumps(head)), **arrays)
+    np.savez(content, allow_pickle=False, header=np.array(json.dumps(head)), **arrays)
     write_bytes(path, content.getvalue())
 
 

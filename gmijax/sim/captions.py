@@ -43,7 +43,7 @@ class Captions:
         ground = Pillow.fromarray((corner * _VEIL).astype(np.uint8))
         ImageDraw.Draw(ground).text((_MARGIN, 1), text, _INK, self._font)
         labelled = tile.copy()
-        labelled[:_LINE, :width] = ground
+        labelled[:_LINE, :width] = np.asarray(ground)
         return labelled
 
     def below(self, picture: Image, time_s: float) -> Image:

@@ -12,7 +12,8 @@ from gmijax.types import Array, PRNGKey, PyTree
 def begin(spec: EnvSpec, physics: PyTree, task: PyTree, obs: Array, key: PRNGKey) -> EnvState:
     """The state after a reset: nothing earned, nothing ended, no steps."""
     xp = array_module(obs)
-    zero, false = xp.zeros((), np.float32), xp.zeros((), bool)
+    zero: Array = xp.zeros((), np.float32)
+    false: Array = xp.zeros((), bool)
     return EnvState(
         physics=physics,
         task=task,

@@ -7,7 +7,7 @@ weights. A weight of zero costs nothing. The logged addends always sum to the re
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from typing import Generic, NamedTuple, TypeVar
+from typing import Any, Generic, NamedTuple, TypeVar
 
 import numpy as np
 
@@ -28,7 +28,7 @@ class RewardTerm(NamedTuple, Generic[View]):
       weight: factor; its sign makes the term a reward or a cost.
     """
 
-    fn: Callable[[View], Array]
+    fn: Callable[[View], Array | float]
     weight: float
 
 
@@ -88,7 +88,8 @@ def total_reward(
             for name, value in values.items()
         }
         values[replacement.name] = xp.where(replacement.when, xp.float32(replacement.value), 0.0)
-    return sum(values.values(), xp.zeros((), np.float32)), values
+    total: Any = sum(values.values(), xp.zeros((), np.float32))
+    return total, values
 
 
 def term_names(

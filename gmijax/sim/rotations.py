@@ -9,11 +9,11 @@ import math
 
 import numpy as np
 
-from gmijax.arrays import array_module
+from gmijax.arrays import array_module, constant
 from gmijax.types import Array
 
 _NEXT, _LAST = [1, 2, 0], [2, 0, 1]
-_CONJUGATE = np.array([1.0, -1.0, -1.0, -1.0], np.float32)
+_CONJUGATE = constant([1.0, -1.0, -1.0, -1.0])
 
 
 def _cross(a: Array, b: Array) -> Array:

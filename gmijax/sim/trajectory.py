@@ -67,7 +67,7 @@ def chosen(
     at = (np.arange(count) + 0.5) / count * len(order)
     worlds = order[at.astype(int)]
     labels = [
-        f"return {rounded(returns[world])} (rank {len(order) - int(place)} of {len(order)})"
+        f"return {rounded(float(returns[world]))} (rank {len(order) - int(place)} of {len(order)})"
         for place, world in zip(at, worlds, strict=True)
     ]
     median = f"median return {rounded(float(np.median(returns)))} of {len(order)} episodes"

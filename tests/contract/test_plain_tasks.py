@@ -26,7 +26,7 @@ from gmijax.sim.registry import TASKS, task_names
 
 STEPS = 40
 READ = ("qfrc_actuator", "sensordata", "xpos", "xquat")
-TOLERANCE = {"rtol": 2e-4, "atol": 2e-4}
+TOLERANCE = 2e-4
 
 
 class Recorded(CPhysics):
@@ -44,6 +44,10 @@ class Recorded(CPhysics):
     def step(self, model: Any, state: Any, ctrl: Any, read: Any = lambda data: data.sensordata):
         after = PhysicsState(model["qpos"], model["qvel"], state.qacc_warmstart)
         return after, (ctrl, read(SimpleNamespace(**{name: model[name] for name in READ})))
+
+
+def assert_close(ours: Any, theirs: Any) -> None:
+    np.testing.assert_allclose(ours, theirs, rtol=TOLERANCE, atol=TOLERANCE)
 
 
 def floats(values: Any) -> jax.Array:
@@ -88,9 +92,9 @@ def test_starts_are_the_same(task: str, monkeypatch: pytest.MonkeyPatch):
         same_draws(monkeypatch, seed, in_jax=True)
         state = env.reset(env.model, jax.random.key(seed))
         assert isinstance(state.obs, jax.Array)
-        np.testing.assert_allclose(plain.obs, state.obs, **TOLERANCE)
-        np.testing.assert_allclose(plain._state.physics.qvel, state.physics.qvel, **TOLERANCE)
-        np.testing.assert_allclose(plain.qpos, state.physics.qpos, **TOLERANCE)
+        assert_close(plain.obs, state.obs)
+        assert_close(plain._state.physics.qvel, state.physics.qvel)
+        assert_close(plain.qpos, state.physics.qpos)
         assert_trees_equal(plain._state.task, state.task)
 
 
@@ -121,16 +125,14 @@ def test_steps_are_the_same(task: str, monkeypatch: pytest.MonkeyPatch):
             truncated=jnp.zeros((), bool),
         )
         after, ctrl = step(data, start, floats(action))
-        np.testing.assert_allclose(plain.data.ctrl, ctrl, **TOLERANCE)
+        assert_close(plain.data.ctrl, ctrl)
         ours = plain._state
-        np.testing.assert_allclose(ours.obs, after.obs, **TOLERANCE)
-        np.testing.assert_allclose(ours.reward, after.reward, **TOLERANCE)
+        assert_close(ours.obs, after.obs)
+        assert_close(ours.reward, after.reward)
         assert ours.reward_terms.keys() == after.reward_terms.keys() == set(env.spec.reward_terms)
         assert ours.metrics.keys() == after.metrics.keys()
         for name, value in {**ours.reward_terms, **ours.metrics}.items():
-            np.testing.assert_allclose(
-                value, {**after.reward_terms, **after.metrics}[name], **TOLERANCE, err_msg=name
-            )
+            assert_close(value, {**after.reward_terms, **after.metrics}[name])
         assert bool(ours.terminated) == bool(after.terminated)
         assert bool(ours.truncated) == bool(after.truncated)
         assert int(ours.steps) == int(after.steps)
@@ -145,7 +147,7 @@ def test_steps_are_the_same(task: str, monkeypatch: pytest.MonkeyPatch):
 def assert_trees_equal(ours: Any, theirs: Any) -> None:
     assert jax.tree.structure(ours) == jax.tree.structure(theirs)
     for mine, other in zip(jax.tree.leaves(ours), jax.tree.leaves(theirs), strict=True):
-        np.testing.assert_allclose(mine, other, **TOLERANCE)
+        assert_close(mine, other)
 
 
 def test_the_player_imports_neither_jax_nor_hydra():

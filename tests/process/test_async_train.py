@@ -87,7 +87,7 @@ def test_what_a_job_leaves_has_the_figures_of_the_paper(two_and_two: Path) -> No
     checkpoint = find_checkpoint(str(two_and_two), "test")
     assert str(checkpoint) == summary["checkpoint"]
     names = sorted(path.name for path in checkpoint.iterdir())
-    assert names == ["episodes.json", "gmi_2", "gmi_3", "learner", "meta.json"]
+    assert names == ["episodes.json", "gmi_2", "gmi_3", "learner", "meta.json", "policy.npz"]
 
 
 @pytest.mark.timeout(300)

@@ -148,7 +148,7 @@ def test_agents_teach_trainers_of_two_nodes_and_of_one_when_the_other_dies(
     # They act with what the trainer publishes.
     assert summary["staleness"]["mean"] < 50
     names = {path.name for path in Path(summary["checkpoint"]).iterdir()}
-    assert names == {"episodes.json", "gmi_1", "learner", "meta.json"}
+    assert names == {"episodes.json", "gmi_1", "learner", "meta.json", "policy.npz"}
     assert not pids_of(run)
     require_gone(shared_memory, memory)
 

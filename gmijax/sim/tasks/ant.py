@@ -13,7 +13,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from gmijax.arrays import array_module
+from gmijax.arrays import array_module, constant
 from gmijax.sim import draws, episode, simulators
 from gmijax.sim.interface import Env, EnvSpec, EnvState
 from gmijax.sim.rewards import Replacement, RewardTerm, term_names, total_reward, with_weights
@@ -94,7 +94,7 @@ def make(
         key, draw = draws.split(key)
         start = world.start(*runner.draw_start(ids, world.mj_model, draw, chosen))
         # Sensors read zero: a reset runs no physics, see `Physics.start`.
-        zeros = np.zeros(len(ids.sensors), np.float32), np.zeros(ACTION_SIZE, np.float32)
+        zeros = constant(np.zeros(len(ids.sensors))), constant(np.zeros(ACTION_SIZE))
         return episode.begin(spec, start, (), observe(runner.pose_of(ids, start), *zeros), key)
 
     def step(model: PyTree, state: EnvState, action: Array) -> EnvState:

@@ -17,7 +17,7 @@ import mujoco
 import numpy as np
 import numpy.typing as npt
 
-from gmijax.arrays import array_module, replaced
+from gmijax.arrays import array_module, constant, replaced
 from gmijax.sim import draws, episode, rotations, simulators
 from gmijax.sim.interface import Env, EnvSpec, EnvState
 from gmijax.sim.physics_state import PhysicsState
@@ -45,9 +45,9 @@ VELOCITY_SCALE = 2.0
 ANGULAR_VELOCITY_SCALE = 0.25
 JOINT_VELOCITY_SCALE = 0.05
 KNEE_RADIUS_M = 0.065
-BASE_HALF_SIZE_M = np.array([0.525, 0.16, 0.09], np.float32)
-DOWN = np.array([0.0, 0.0, -1.0], np.float32)
-COMMAND_SCALES = np.array([VELOCITY_SCALE, VELOCITY_SCALE, ANGULAR_VELOCITY_SCALE], np.float32)
+BASE_HALF_SIZE_M = constant([0.525, 0.16, 0.09])
+DOWN = constant([0.0, 0.0, -1.0])
+COMMAND_SCALES = constant([VELOCITY_SCALE, VELOCITY_SCALE, ANGULAR_VELOCITY_SCALE])
 
 COMMAND_NAMES = ("forward_m_per_s", "left_m_per_s", "yaw_rad_per_s")
 
@@ -157,11 +157,11 @@ def make(
         command = draw_command(command_key, chosen, share)
         zero = array_module(command).zeros((), np.float32)
         task = AnymalTask(command, zero, zero, share)
-        obs = observe(ids, start, task.command, np.zeros(ACTION_SIZE, np.float32))
+        obs = observe(ids, start, task.command, constant(np.zeros(ACTION_SIZE)))
         return episode.begin(spec, start, task, obs, key)
 
     def reset(model: PyTree, key: PRNGKey) -> EnvState:
-        return begin(key, np.float32(chosen.curriculum_start) if curriculum else None)
+        return begin(key, constant(chosen.curriculum_start) if curriculum else None)
 
     def next_episode(model: PyTree, ended: EnvState) -> EnvState:
         return begin(ended.key, next_share(ended, chosen.curriculum_growth))
@@ -171,7 +171,7 @@ def make(
         moved, (torques, knees) = world.step(
             model,
             state.physics,
-            ids.standing + chosen.action_scale_rad * action,
+            constant(ids.standing) + chosen.action_scale_rad * action,
             lambda data: (data.qfrc_actuator[ids.joints.qvel], data.xpos[ids.shanks]),
         )
         view = AnymalView(*errors(moved, state.task.command), torques)

@@ -15,7 +15,7 @@ from typing import NamedTuple
 import mujoco
 import numpy as np
 
-from gmijax.arrays import array_module, replaced
+from gmijax.arrays import array_module, constant, replaced
 from gmijax.sim import draws, episode, simulators
 from gmijax.sim.interface import Env, EnvSpec, EnvState
 from gmijax.sim.physics_state import PhysicsState
@@ -116,7 +116,7 @@ def make(
         key, draw = draws.split(key)
         start = world.start(*draw_start(ids, world.mj_model, draw, chosen))
         # Sensors read zero: a reset runs no physics, see `Physics.start`.
-        obs = observe(ids, start, np.zeros(len(ids.sensors), np.float32))
+        obs = observe(ids, start, constant(np.zeros(len(ids.sensors))))
         targets = array_module(obs).zeros(ACTION_SIZE, np.float32)
         return episode.begin(spec, start, BallBalanceTask(targets), obs, key)
 
@@ -125,7 +125,7 @@ def make(
         targets = (state.task.targets + change).clip(ids.knees.lower, ids.knees.upper)
         moved, sensordata = world.step(model, state.physics, targets)
         ball, ball_velocity = ball_of(ids, moved)
-        goal = np.array((0.0, 0.0, chosen.goal_height_m), np.float32)
+        goal = constant((0.0, 0.0, chosen.goal_height_m))
         reward = total_reward(terms, BallBalanceView(ball, ball_velocity, goal))
         obs = observe(ids, moved, sensordata[ids.sensors])
         fallen = ball[2] < chosen.fallen_height_m

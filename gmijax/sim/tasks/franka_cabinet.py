@@ -16,7 +16,7 @@ import mujoco
 import numpy as np
 import numpy.typing as npt
 
-from gmijax.arrays import array_module, replaced
+from gmijax.arrays import array_module, constant, replaced
 from gmijax.sim import draws, episode, rotations, simulators
 from gmijax.sim.interface import Env, EnvSpec, EnvState
 from gmijax.sim.physics_state import PhysicsState
@@ -40,11 +40,11 @@ OBS_LIMIT = 5.0
 JOINT_VELOCITY_SCALE = 0.1
 # Between the fingers' pads. The figures' source has a point where the fingers begin, and 0.04 m
 # askew from there; a gripper that holds the handle is 0.06 m away from it.
-GRASP_IN_HAND_M = np.array([0.0, 0.0, 0.0584 + 0.045], np.float32)
+GRASP_IN_HAND_M = constant([0.0, 0.0, 0.0584 + 0.045])
 # In a finger's frame: the inner face of its pad, near the tip. The source takes the root.
-PAD_IN_FINGER_M = np.array([0.0, 0.0, 0.045], np.float32)
-HANDLE_IN_DRAWER_M = np.array([0.3, 0.01, 0.0], np.float32)
-Y_AXIS, Z_AXIS = np.array([[0.0, 1.0, 0.0], [0.0, 0.0, 1.0]], np.float32)
+PAD_IN_FINGER_M = constant([0.0, 0.0, 0.045])
+HANDLE_IN_DRAWER_M = constant([0.3, 0.01, 0.0])
+Y_AXIS, Z_AXIS = constant([[0.0, 1.0, 0.0], [0.0, 0.0, 1.0]])
 NEAR_M = 0.02
 FINGER_REACH_M = 0.04
 BEHIND_M = 0.04

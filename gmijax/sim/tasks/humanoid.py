@@ -16,7 +16,7 @@ import mujoco
 import numpy as np
 import numpy.typing as npt
 
-from gmijax.arrays import array_module
+from gmijax.arrays import array_module, constant
 from gmijax.sim import draws, episode, simulators
 from gmijax.sim.interface import Env, EnvSpec, EnvState
 from gmijax.sim.rewards import Replacement, RewardTerm, term_names, total_reward, with_weights
@@ -122,8 +122,8 @@ def make(
         key, draw = draws.split(key)
         start = world.start(*runner.draw_start(ids, world.mj_model, draw, chosen))
         # Forces read zero: a reset runs no physics, see `Physics.start`.
-        zeros = np.zeros(ACTION_SIZE, np.float32)
-        sensors = np.zeros(len(ids.sensors), np.float32)
+        zeros = constant(np.zeros(ACTION_SIZE))
+        sensors = constant(np.zeros(len(ids.sensors)))
         obs = observe(runner.pose_of(ids, start), zeros, sensors, zeros)
         return episode.begin(spec, start, (), obs, key)
 
@@ -137,7 +137,7 @@ def make(
         )
         pose = runner.pose_of(ids, moved)
         speed = runner.speed_to_target(state.physics, moved, world.control_dt_s)
-        view = HumanoidView(pose, action, speed, strength)
+        view = HumanoidView(pose, action, speed, constant(strength))
         dead = pose.position[2] < chosen.death_height_m
         reward = total_reward(terms, view, Replacement(DEATH, dead, chosen.death_reward))
         obs = observe(pose, forces, sensors, action)

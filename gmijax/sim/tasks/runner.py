@@ -12,15 +12,15 @@ from typing import NamedTuple
 import mujoco
 import numpy as np
 
-from gmijax.arrays import array_module, replaced
+from gmijax.arrays import array_module, constant, replaced
 from gmijax.sim import draws, rotations
 from gmijax.sim.physics_state import PhysicsState
 from gmijax.sim.tasks import lookup
 from gmijax.sim.tasks.settings import RunnerSettings
 from gmijax.types import Array, PRNGKey
 
-TARGET_M = np.array([1000.0, 0.0], np.float32)
-X_AXIS = np.array([1.0, 0.0, 0.0], np.float32)
+TARGET_M = constant([1000.0, 0.0])
+X_AXIS = constant([1.0, 0.0, 0.0])
 UPRIGHT = 0.93
 AHEAD = 0.8
 SPEED = "speed_m_per_s"

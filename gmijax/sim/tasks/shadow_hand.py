@@ -19,7 +19,7 @@ import mujoco
 import numpy as np
 import numpy.typing as npt
 
-from gmijax.arrays import array_module, replaced
+from gmijax.arrays import array_module, constant, replaced
 from gmijax.sim import draws, episode, rotations, simulators
 from gmijax.sim.interface import Env, EnvSpec, EnvState
 from gmijax.sim.physics_state import PhysicsState
@@ -52,8 +52,8 @@ OBS_LIMIT = 5.0
 VELOCITY_SCALE = 0.2
 JOINT_TORQUE_SCALE = 10.0
 TIP_SENSOR_SCALE = 10.0
-GOAL_M = np.array([0.0, -0.39, 0.56], np.float32)
-X_AXIS, Y_AXIS = np.array([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0]], np.float32)
+GOAL_M = constant([0.0, -0.39, 0.56])
+X_AXIS, Y_AXIS = constant([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
 
 JOINTS = (
     *("WRJ1", "WRJ0"),
@@ -181,7 +181,7 @@ def make(
         start = world.start(qpos, xp.zeros(world.mj_model.nv, np.float32))
         task = ShadowHandTask(draw_rotation(goal_key), xp.zeros((), np.float32))
         touch = touch_at_rest(ids, *world.poses(qpos))
-        obs = observe(ids, start, touch, task.goal, np.zeros(ACTION_SIZE, np.float32))
+        obs = observe(ids, start, touch, task.goal, constant(np.zeros(ACTION_SIZE)))
         return episode.begin(spec, start, task, obs, key)
 
     def step(model: PyTree, state: EnvState, action: Array) -> EnvState:
@@ -252,7 +252,7 @@ def targets_of(ids: ShadowHandIds, action: Array) -> Array:
 def tips_of(ids: ShadowHandIds, xpos: Array, xquat: Array, velocities: Array) -> Array:
     """Fingertips [5, 13] from all bodies' poses [nbody, 3], [nbody, 4] and velocities [5, 6]."""
     quats = xquat[ids.tip_bodies]
-    offsets = rotations.rotate(quats, ids.tip_offsets)
+    offsets = rotations.rotate(quats, constant(ids.tip_offsets))
     return array_module(quats).concatenate(
         [xpos[ids.tip_bodies] + offsets, quats, velocities], axis=1
     )
@@ -263,8 +263,8 @@ def touch_at_rest(ids: ShadowHandIds, xpos: Array, xquat: Array) -> Touch:
 
     The tips' sensors read zero: a reset runs no physics, see `Physics.start`.
     """
-    zeros = np.zeros((NUM_TIPS, 6), np.float32)
-    return Touch(np.zeros(len(JOINTS), np.float32), tips_of(ids, xpos, xquat, zeros), zeros)
+    zeros = constant(np.zeros((NUM_TIPS, 6)))
+    return Touch(constant(np.zeros(len(JOINTS))), tips_of(ids, xpos, xquat, zeros), zeros)
 
 
 def touch_of(ids: ShadowHandIds, data: mjx.Data) -> Touch:
