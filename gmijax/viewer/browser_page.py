@@ -42,7 +42,8 @@ class BrowserPage:
         has_run: bool,
     ) -> None:
         self._server = server
-        self._scene = Scene(server, simulation.model, len(simulation.envs))
+        num_envs = len(simulation.envs)
+        self._scene = Scene(server, simulation.model, num_envs, has_ring=num_envs > 1)
         self._panel = Panel(
             server,
             asked,

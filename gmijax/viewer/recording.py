@@ -29,7 +29,7 @@ def page(model: Any, trajectory: Trajectory) -> str:
     # viser records what a server shows; nobody asks this one for anything.
     server = open_server(Guard("127.0.0.1"), 0)
     try:
-        scene = Scene(server, model, num_worlds)
+        scene = Scene(server, model, num_worlds, has_ring=False)
         scene.label(trajectory.labels)
         recording = server.get_scene_serializer()
         data = mujoco.MjData(model)

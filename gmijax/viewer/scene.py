@@ -53,9 +53,12 @@ class Scene:
       server: viser's; what it has been showing goes.
       model: a `mujoco.MjModel`, of which nothing is changed.
       num_envs: E.
+      has_ring: whether the selected environment has a ring around it.
     """
 
-    def __init__(self, server: viser.ViserServer, model: Any, num_envs: int) -> None:
+    def __init__(
+        self, server: viser.ViserServer, model: Any, num_envs: int, *, has_ring: bool
+    ) -> None:
         self._server, self._model = server, model
         self._robot = moving_robot(model)
         self._start = mujoco.MjData(model)
@@ -71,7 +74,7 @@ class Scene:
         self._floor = Floor(server, model)
         self._fixed = server.scene.add_frame("/fixed", show_axes=False)
         self._parts = self._add_bodies()
-        self._ring = self._add_ring()
+        self._ring = self._add_ring(has_ring)
         self._arrows: dict[str, Any] = {}
         self._set_camera(low, high)
 
@@ -179,7 +182,7 @@ class Scene:
                     parts.append(_Part(handle, np.array([body])))
         return parts
 
-    def _add_ring(self) -> Any:
+    def _add_ring(self, visible: bool) -> Any:
         radius = 0.55 * self._width
         ring = trimesh.creation.annulus(0.98 * radius, radius, 0.01 * radius, sections=96)
         return self._server.scene.add_mesh_simple(
@@ -188,7 +191,7 @@ class Scene:
             ring.faces,
             color=BLUE,
             cast_shadow=False,
-            visible=len(self._offsets) > 1,
+            visible=visible,
         )
 
     def _ring_position(self, placed: Floats, selected: int) -> Floats:
