@@ -24,7 +24,7 @@ from gmijax.cli.grid import SweepHelp
 from gmijax.cli.groups import choices
 from gmijax.cli.help import Key, keys_of, usage_of
 from gmijax.cli.pack import PackKeys
-from gmijax.config import ExportConfig, PlayConfig, ServeConfig, TrainConfig
+from gmijax.config import ExportConfig, PlayConfig, ServeConfig, TrainConfig, ViewConfig
 
 ROOT: Final = Path(__file__).resolve().parents[1]
 PAGES: Final = ROOT / "build" / "docs" / "pages"
@@ -37,6 +37,7 @@ COMMANDS: Final[Mapping[str, type[Any]]] = {
     "pack": PackKeys,
     "serve": ServeConfig,
     "play": PlayConfig,
+    "view": ViewConfig,
     "export": ExportConfig,
 }
 """The commands that take keys, and the dataclass of each."""

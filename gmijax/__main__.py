@@ -14,6 +14,7 @@ VERBS: Final[Mapping[str, str]] = MappingProxyType(
     {
         "train": "trains a policy in one or several GMIs",
         "play": "evaluates a checkpoint, and films it",
+        "view": "shows a policy live in the browser, also while it is trained",
         "serve": "collects experience with a trained policy or random actions",
         "search": "finds environments per GMI and GMIs per GPU by profiling",
         "sweep": "runs many training jobs, several at a time on every GPU",

@@ -22,15 +22,16 @@ from gmijax.__main__ import main
 from gmijax.autotune import tuner
 from gmijax.cli.grid import SweepHelp
 from gmijax.cli.pack import PackKeys
-from gmijax.config import ExportConfig, PlayConfig, ServeConfig, TrainConfig
+from gmijax.config import ExportConfig, PlayConfig, ServeConfig, TrainConfig, ViewConfig
 from gmijax.control import decide, searching, strategy_selection
-from gmijax.deploy import exporting, playing
+from gmijax.deploy import exporting, playing, viewing
 from gmijax.machine.snapshot import Machine
 from gmijax.sweeps import runner
 
 COMMANDS: Mapping[str, tuple[type[Any], ...]] = {
     "train": (TrainConfig,),
     "play": (PlayConfig,),
+    "view": (ViewConfig,),
     "serve": (ServeConfig,),
     "search": (TrainConfig,),
     "sweep": (SweepHelp,),
@@ -81,6 +82,8 @@ def _nothing_starts(machine: Machine, cwd: Path) -> Iterator[None]:
         for module in (decide, searching, playing, exporting, runner, demo, doctor):
             patch.setattr(module, "detect_machine", lambda: machine)
         patch.setattr(doctor, "inspect_system", _would_start)
+        # A page needs no folder.
+        patch.setattr(viewing, "_require_packages", _would_start)
         for name in ("ray", "ray.util", "ray.util.scheduling_strategies"):
             patch.setitem(sys.modules, name, _Ray(name))
         patch.setattr(socket, "create_connection", _would_start)

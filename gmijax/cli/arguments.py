@@ -41,10 +41,11 @@ def _with_custom_task(name: str, override: str) -> tuple[str, ...]:
     """`env=path/to/file.py:make` for hydra; anything else as it is."""
     match = re.fullmatch(r"env=(['\"]?)(.*\.py(:.*)?)\1", override)
     if match is None:
-        is_shipped = name == "play" and override.startswith("env=")  # It has no run, and no file.
+        # Such a task has no run, and no file.
+        is_shipped = name in ("play", "view") and override.startswith("env=")
         return (f"run.{override}" if is_shipped else override,)
     value = override.removeprefix("env=") if match[1] else quoted(match[2])
-    if name in ("play", "export"):  # Which task it is the run says.
+    if name in ("play", "export", "view"):  # Which task it is the run says.
         return (f"run.env={value}",)
     return "env=custom", f"env.name={value}"
 

@@ -35,3 +35,5 @@ from gmijax.config.serve import ServeRunConfig as ServeRunConfig
 from gmijax.config.train import ALGORITHMS as ALGORITHMS
 from gmijax.config.train import AlgoConfig as AlgoConfig
 from gmijax.config.train import TrainConfig as TrainConfig
+from gmijax.config.view import PageConfig as PageConfig
+from gmijax.config.view import ViewConfig as ViewConfig

@@ -62,8 +62,8 @@ class PlayConfig(KeyGroup):
         "returns; null: 4, or all if there are fewer"
     )
     html: Literal["auto", "on", "off"] = doc(
-        "write a page with the median environment in 3D, by Brax's viewer, which a browser loads "
-        "from the internet; auto: where brax is installed and knows the model's shapes"
+        "write a page with the filmed environments in 3D, for a browser; auto: where the extra "
+        "`view` is installed"
     )
     width: int = doc("width of the picture in pixels", low=64, high=4096)
     height: int = doc("height of the picture in pixels", low=64, high=4096)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib.util
 import os
 import subprocess
 from collections.abc import Mapping
@@ -15,24 +14,18 @@ from gmijax.config import PlayConfig
 from gmijax.control.console import doing, nearby
 from gmijax.errors import GmijaxError
 from gmijax.machine.interpreter import command
-from gmijax.machine.jax_settings import without_breaking
 from gmijax.machine.opengl import environment_with, is_missing, opengls, what_is_missing
 from gmijax.runs.folder import EXIT_NO_GL, PlayPaths
 from gmijax.supervise.failures import last_line, signal_name
+from gmijax.viewer.installed import missing
 
 
 def write_page(config: PlayConfig, paths: PlayPaths, console: Console) -> None:
-    """Writes the page in a child of its own: Brax's libraries may fail as they like."""
-    if not has_brax():
+    """Writes the page in a child of its own."""
+    if missing():
         return
-    # A page is quickly made, and the GPU may be training.
-    environment = {
-        "PJRT_NPROC": "4",
-        **without_breaking(os.environ),
-        "JAX_PLATFORMS": "cpu",
-    }
     with doing(console, "writing the page"), paths.page_log.open("wb") as log:
-        exit_code = run_child("gmijax.workers.page_writer", paths, environment, log)
+        exit_code = run_child("gmijax.workers.page_writer", paths, os.environ, log)
     if exit_code == 0:
         console.print(f"page: {paths.html}")
         return
@@ -40,11 +33,6 @@ def write_page(config: PlayConfig, paths: PlayPaths, console: Console) -> None:
     if config.html == "on":
         raise GmijaxError(f"{reason}; the returns were evaluated")
     console.print(reason)
-
-
-def has_brax() -> bool:
-    """Whether a page can be written."""
-    return importlib.util.find_spec("brax") is not None
 
 
 def film(

@@ -15,11 +15,19 @@ from typing import Any, Final, TypeVar
 from rich.console import Console
 from rich.table import Table
 
-from gmijax.config import EnvConfig, ExportConfig, PlanConfig, PlayConfig, ReduceConfig, Timeouts
+from gmijax.config import (
+    EnvConfig,
+    ExportConfig,
+    PlanConfig,
+    PlayConfig,
+    ReduceConfig,
+    Timeouts,
+    ViewConfig,
+)
 from gmijax.config.schema import to_dict
 from gmijax.control.console import doing, nearby, open_console
 from gmijax.deploy import shipped
-from gmijax.deploy.pictures import film, has_brax, write_page
+from gmijax.deploy.pictures import film, write_page
 from gmijax.deploy.shipped import SHIPPED
 from gmijax.errors import ConfigError, GmijaxError
 from gmijax.machine.snapshot import Machine, detect_machine
@@ -45,8 +53,9 @@ from gmijax.sim import source
 from gmijax.sim.registry import require_env
 from gmijax.supervise.job_kinds import JobKind
 from gmijax.supervise.run_gmis import Launch, run_gmis
+from gmijax.viewer.installed import INSTALL, missing
 
-C = TypeVar("C", PlayConfig, ExportConfig)
+C = TypeVar("C", PlayConfig, ExportConfig, ViewConfig)
 
 MEMORY_FRACTION: Final = 0.1
 """Most of a GPU's memory that playing takes: beside a training job that reserves 0.8."""
@@ -109,20 +118,14 @@ def _show(config: PlayConfig, paths: PlayPaths, console: Console) -> None:
 
 
 def _require_page(config: PlayConfig) -> None:
-    if config.html == "on" and not has_brax():
+    if config.html == "on" and (absent := missing()):
         raise ConfigError(
-            "html=on: needs the package brax (pip install 'gmijax[brax]'); "
-            "allowed without it are auto, off"
+            f"html=on: needs {' and '.join(absent)} ({INSTALL}); allowed without are auto, off"
         )
 
 
 def _opened(config: PlayConfig) -> tuple[PlayConfig, str | None]:
     """As `open_run`, with what only playing asks for checked too."""
-    if config.run.env is not None and ".py" not in config.run.env:
-        raise ConfigError(
-            f"env={config.run.env}: a run knows its task; add checkpoint=shipped for the policy "
-            "that comes with gmijax"
-        )
     config, env, changed = open_run(config)
     if config.randomize == "on" and not env.randomization:
         raise ConfigError("randomize=on: env.randomization of the run names nothing to draw")
@@ -141,6 +144,11 @@ def open_run(config: C) -> tuple[C, EnvConfig, str | None]:
     Raises:
       ConfigError: no such run or checkpoint, or its task cannot be had.
     """
+    if config.run.env is not None and ".py" not in config.run.env:
+        raise ConfigError(
+            f"env={config.run.env}: a run knows its task; add checkpoint=shipped for the policy "
+            "that comes with gmijax"
+        )
     checkpoint = _find(config)
     early = None
     if config.checkpoint == "best" and not rank_of(checkpoint).is_full:
@@ -163,7 +171,7 @@ def open_run(config: C) -> tuple[C, EnvConfig, str | None]:
     return config, env, "\n".join(filter(None, notes)) or None
 
 
-def _find(config: PlayConfig | ExportConfig) -> Path:
+def _find(config: PlayConfig | ExportConfig | ViewConfig) -> Path:
     """The checkpoint that the configuration names."""
     wanted, run_dir = config.checkpoint, config.run.dir
     if wanted in (None, "best") or (wanted.isdecimal() and len(wanted) <= _MOST_DIGITS):

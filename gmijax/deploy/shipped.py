@@ -27,11 +27,7 @@ def checked(config: PlayConfig) -> PlayConfig:
     Raises:
       ConfigError: no policy of this task is shipped, or it cannot be played so.
     """
-    tasks = ", ".join(shipped_tasks())
-    if config.run.env is None:
-        raise ConfigError(f"checkpoint=shipped: of which task? Add env=TASK; there are {tasks}")
-    if config.run.env not in shipped_tasks():
-        raise ConfigError(f"env={config.run.env}: no policy of it is shipped; allowed are {tasks}")
+    require_shipped(config.run.env)
     for key, value, allowed in (
         ("run.dir", config.run.dir, None),
         ("deterministic", config.deterministic, True),
@@ -42,6 +38,16 @@ def checked(config: PlayConfig) -> PlayConfig:
             shown = "null" if allowed is None else str(allowed).lower()
             raise ConfigError(f"{key}={value}: allowed with checkpoint=shipped is {shown}")
     return config
+
+
+def require_shipped(task: str | None) -> str:
+    """The task; raises ConfigError if no policy of it is shipped."""
+    tasks = ", ".join(shipped_tasks())
+    if task is None:
+        raise ConfigError(f"checkpoint=shipped: of which task? Add env=TASK; there are {tasks}")
+    if task not in shipped_tasks():
+        raise ConfigError(f"env={task}: no policy of it is shipped; allowed are {tasks}")
+    return task
 
 
 def folder_of(config: PlayConfig) -> PlayPaths:

@@ -20,13 +20,16 @@ import pytest
 from command_lines import COMMANDS, CPU, run
 from hypothesis import HealthCheck, given, seed, settings
 from hypothesis import strategies as st
+from plain_run import constant_policy
 from strange_lines import command_lines
 from supervision import machine
 
 from gmijax.cli.compose import compose
 from gmijax.config import ALGORITHMS
 from gmijax.config.schema import to_dict
-from gmijax.runs.folder import META, RunPaths, write_json
+from gmijax.player.plain_env import PlainEnv
+from gmijax.player.policy import write_policy
+from gmijax.runs.folder import META, POLICY, RunPaths, write_json
 from gmijax.runs.resume import CheckpointMeta
 
 _MORE = os.environ.get("GMIJAX_FUZZ_EXAMPLES")
@@ -34,7 +37,7 @@ _SEED = int(os.environ.get("GMIJAX_FUZZ_SEED", random.randrange(2**32) if _MORE 
 _ADDRESS_SPACE_BYTES = 4 * 2**30
 """Beside what the test process has: a line that takes more memory fails, and hurts nobody."""
 
-_FEW = {"sweep": 8, "play": 30, "export": 30, "doctor": 60, "list-envs": 60}
+_FEW = {"sweep": 8, "play": 30, "view": 30, "export": 30, "doctor": 60, "list-envs": 60}
 """Lines without GMIJAX_FUZZ_EXAMPLES where they are not 16: hydra takes long for a sweep."""
 
 _MACHINES = (
@@ -59,6 +62,8 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
     meta = CheckpointMeta("ant", "ppo", 1000, 1, 64, hidden, "jax")
     done.checkpoint(1000).mkdir(parents=True, exist_ok=True)
     write_json(done.checkpoint(1000) / META, meta.to_dict())
+    policy = constant_policy(PlainEnv(config.env), 0.0)
+    write_policy(done.checkpoint(1000) / POLICY, policy)
     soft, hard = resource.getrlimit(resource.RLIMIT_AS)
     pages = int(Path("/proc/self/statm").read_text().split()[0])
     resource.setrlimit(

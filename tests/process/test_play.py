@@ -37,7 +37,7 @@ def test_films_have_the_wanted_size_and_play_in_real_time(home: Path):
     returns = json.loads((folder / "returns.json").read_text())
     longest = max(item["length"] for item in returns["episodes"])
     assert f"page: {folder / 'view.html'}" in done.stdout
-    assert "brax-viewer" in (folder / "view.html").read_text()
+    assert "__VISER_EMBED_DATA__" in (folder / "view.html").read_text()
     for name, fps in (("video.mp4", 25.0), ("video.gif", 12.5)):
         check_film(folder / name, fps, longest, done.stdout)
     assert "filmed by camera track" in done.stdout

@@ -1,0 +1,126 @@
+"""What `gmijax.view` does: from a checkpoint to a page that shows its policy live. No jax here.
+
+All in this process: beside a training it takes a fraction of a core, and nothing of a GPU.
+"""
+
+from __future__ import annotations
+
+import queue
+import socket
+from pathlib import Path
+from typing import NamedTuple
+
+from rich.console import Console
+
+from gmijax.config import EnvConfig, ViewConfig
+from gmijax.control.console import nearby, open_console
+from gmijax.deploy.playing import open_run
+from gmijax.deploy.shipped import SHIPPED, require_shipped
+from gmijax.errors import ConfigError
+from gmijax.player.plain_env import PlainEnv, task_of
+from gmijax.player.policy import PlainPolicy, checkpoint_policy
+from gmijax.player.shipped import shipped_policy
+from gmijax.viewer.checkpoints import Checkpoints
+from gmijax.viewer.guard import Guard, is_loopback
+from gmijax.viewer.installed import INSTALL, missing
+from gmijax.viewer.requests import Request
+from gmijax.viewer.simulation import Simulation
+
+
+def view(config: ViewConfig, *, show: bool = False) -> None:
+    """Shows a policy in the browser until the process is interrupted.
+
+    Args:
+      config: what to show; see `python -m gmijax.view --help`.
+      show: print the address of the page.
+
+    Raises:
+      ConfigError: bad input, e.g. no such checkpoint, or a package that is not installed.
+    """
+    shown = _shipped(config) if config.checkpoint == SHIPPED else _of_run(config)
+    envs = [PlainEnv(shown.env, seed=config.seed + number) for number in range(config.num_envs)]
+    _require_fit(shown.policy, envs[0])
+    _require_packages()
+    simulation = Simulation(envs, shown.policy, config.seed)
+    _serve(config, simulation, shown, open_console(show=show))
+
+
+class _Shown(NamedTuple):
+    env: EnvConfig
+    policy: PlainPolicy
+    checkpoint: Path | None  # None: of no run.
+    follow: bool  # Whether newer checkpoints are taken.
+    lines: tuple[str, ...]  # What the user should know.
+
+
+def _shipped(config: ViewConfig) -> _Shown:
+    """The policy that comes with gmijax."""
+    task, run_dir = require_shipped(config.run.env), config.run.dir
+    if run_dir is not None:
+        raise ConfigError(f"run.dir={run_dir}: allowed with checkpoint=shipped is null")
+    policy = shipped_policy(task)
+    lines = (f"the policy of {task} that comes with gmijax",)
+    return _Shown(task_of(policy), policy, None, False, lines)
+
+
+def _of_run(config: ViewConfig) -> _Shown:
+    """The policy of a checkpoint of a run."""
+    follow = config.checkpoint is None
+    config, env, changed = open_run(config)
+    checkpoint = Path(str(config.checkpoint))
+    lines = (f"checkpoint: {nearby(checkpoint)}", *filter(None, (changed,)))
+    return _Shown(env, checkpoint_policy(checkpoint), checkpoint, follow, lines)
+
+
+def _require_fit(policy: PlainPolicy, env: PlainEnv) -> None:
+    spec = env.spec
+    wanted = spec.actor_obs_size or spec.obs_size, spec.action_size
+    if (policy.obs_size, policy.action_size) != wanted:
+        raise ConfigError(
+            f"the policy takes {policy.obs_size} numbers and gives {policy.action_size}; "
+            f"{spec.name} has {wanted[0]} and {wanted[1]}"
+        )
+
+
+def _require_packages() -> None:
+    if absent := missing():
+        raise ConfigError(f"gmijax view needs {' and '.join(absent)} ({INSTALL})")
+
+
+def _serve(config: ViewConfig, simulation: Simulation, shown: _Shown, console: Console) -> None:
+    from gmijax.viewer.browser_page import BrowserPage
+    from gmijax.viewer.loop import Loop
+    from gmijax.viewer.server import close_server, open_server
+
+    run = None if shown.checkpoint is None else Checkpoints(shown.checkpoint.parents[1])
+    server = open_server(Guard(config.view.host, config.view.allow_origin), config.view.port)
+    try:
+        asked: queue.SimpleQueue[Request] = queue.SimpleQueue()
+        title = shown.env.label
+        page = BrowserPage(server, asked, title, simulation, has_run=run is not None)
+        for line in (*shown.lines, *_about(config, server.url, server.get_port())):
+            console.print(line)
+        Loop(
+            simulation,
+            page,
+            asked,
+            run=run,
+            checkpoint=shown.checkpoint,
+            follow_training=shown.follow,
+        ).run()
+    finally:
+        close_server(server)
+
+
+def _about(config: ViewConfig, url: str, port: int) -> list[str]:
+    """Where the page is, and how to reach it from elsewhere."""
+    taken = config.view.port not in (0, port)
+    lines = [f"view.port={config.view.port} is taken; this is {port}"] if taken else []
+    if is_loopback(config.view.host):
+        here = socket.gethostname()
+        hint = (
+            f"from another machine: ssh -L {port}:127.0.0.1:{port} {here}, then the same address"
+        )
+    else:
+        hint = "whoever has this address can open the page and press its buttons"
+    return [*lines, url, f"{hint}; Ctrl-C ends it"]
