@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass
 from typing import Literal
 
@@ -56,6 +57,11 @@ class RunConfig(Timeouts):
     measure_throughput: bool = doc(
         "after training, also measure simulation alone and simulation with inference"
     )
+    profile: str | None = doc(
+        "trace these iterations for a profile, e.g. 20:25 with both included, counted from 1 when "
+        "the command starts (docs/speed.md); null: none",
+        default=None,
+    )
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -65,6 +71,20 @@ class RunConfig(Timeouts):
             )
         if self.resume == "auto" and self.dir is None and self.name is None:
             raise ConfigError("run.resume=auto: needs run.dir or run.name, the folder to go on in")
+        _ = self.profiled
+
+    @property
+    def profiled(self) -> tuple[int, int] | None:
+        """The first and the last iteration of `profile`; raises ConfigError if it is none."""
+        if self.profile is None:
+            return None
+        match = re.fullmatch(r"([1-9]\d{0,8}):([1-9]\d{0,8})", self.profile, re.ASCII)
+        if match is None or int(match[1]) > int(match[2]):
+            raise ConfigError(
+                f"run.profile={self.profile}: expected FIRST:LAST, two iterations from 1 on, "
+                "e.g. 20:25"
+            )
+        return int(match[1]), int(match[2])
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -13,6 +13,7 @@ from rich.console import Console
 from gmijax.config import ClusterConfig
 from gmijax.config.pack import PackConfig
 from gmijax.config.schema import from_dict, to_dict
+from gmijax.control.console import Show, nearby
 from gmijax.errors import ConfigError
 from gmijax.packs.command_job import (
     CommandJob,
@@ -109,6 +110,10 @@ class PackWork(Work[CommandJob]):
         """See `Work`; the number at once is measured with the jobs themselves."""
         del hosts, console, signals, scratch
         return self
+
+    def next_step(self, paths: SweepPaths, best: int) -> tuple[str, str]:
+        """See `Work`."""
+        return "read what the best job printed", f"less {shlex.quote(nearby(paths.log(best)))}"
 
     def kind(self, paths: SweepPaths, sites: Sequence[Site]) -> Kind[CommandJob]:
         """See `Work`."""
@@ -218,7 +223,7 @@ def pack(
     grid: Mapping[str, Sequence[object]] | None = None,
     *,
     run_dir: str | None = None,
-    show: bool = False,
+    show: Show = False,
     **settings: Any,
 ) -> SweepResult:
     """Runs a command with every combination of values, several at a time on every GPU.

@@ -203,7 +203,7 @@ def _profile(
 
 def _copy(job: Job, seed: int, num_timesteps: int) -> Job:
     run = dataclasses.replace(
-        job.config.run, checkpoint_every=0, measure_throughput=False, max_restarts=0
+        job.config.run, checkpoint_every=0, measure_throughput=False, max_restarts=0, profile=None
     )
     config = dataclasses.replace(
         job.config,

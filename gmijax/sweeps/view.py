@@ -15,10 +15,8 @@ from gmijax.sweeps.kind import AnyJob, trainings_per_hour
 from gmijax.sweeps.progress import Progress
 from gmijax.sweeps.report import shown
 
-_HEADINGS = (
-    *("job", "overrides", "GPU and place", "progress", "steps/s", "{}", "ranked by"),
-    *("ETA", "state"),
-)
+_WHERE = "GPU and place"
+_HEADINGS = ("job", "overrides", _WHERE, "progress", "steps/s", "{}", "ranked by", "ETA", "state")
 _MOST_ROWS = 30
 _BAR_WIDTH = 10
 _ORDER = ("running", "failed", "interrupted", "waiting", "pruned", "completed")
@@ -77,7 +75,8 @@ class SweepView:
     def _change(self, job: AnyJob, progress: Progress) -> str:
         what = f"{' '.join(filter(None, ('job', str(job.number), job.label)))}: {progress.state}"
         if progress.state == "running":
-            return f"{what} on {progress.place}{f' ({progress.note})' if progress.note else ''}"
+            where = f" on {progress.place}" if progress.place else ""
+            return f"{what}{where}{f' ({progress.note})' if progress.note else ''}"
         if progress.error:
             return f"{what}: {progress.error}"
         value = shown(progress.value, progress.is_full, progress.episodes)
@@ -86,13 +85,16 @@ class SweepView:
 
     def _table(self) -> Table:
         table = Table(box=None, pad_edge=False)
-        for heading in _HEADINGS:
+        headings = list(_HEADINGS)
+        if not (has_places := any(job.progress.place for job in self._jobs)):
+            headings.remove(_WHERE)  # On one machine without GPUs.
+        for heading in headings:
             name = heading.format(self._ranking.objective)
             is_long = heading in ("overrides", "state")
             table.add_column(name, no_wrap=not is_long, min_width=8 if is_long else None)
         rows = sorted(self._jobs, key=lambda job: _ORDER.index(job.progress.state))
         for job in rows[:_MOST_ROWS]:
-            table.add_row(*_row(job, job.progress))
+            table.add_row(*_row(job, job.progress, has_places=has_places))
         if len(rows) > _MOST_ROWS:
             table.add_row("", f"and {len(rows) - _MOST_ROWS} more")
         return table
@@ -104,7 +106,7 @@ def _ranked(progress: Progress) -> str:
     return f"{progress.value:.4g}{'' if progress.is_full else ' (early)'}"
 
 
-def _row(job: AnyJob, progress: Progress) -> tuple[str | Text, ...]:
+def _row(job: AnyJob, progress: Progress, *, has_places: bool) -> tuple[str | Text, ...]:
     total, rate = job.num_timesteps, progress.env_steps_per_s
     part = min(progress.env_steps / total, 1.0) if total else None
     left_s = max(0.0, total - progress.env_steps) / rate if rate and total else None
@@ -114,7 +116,7 @@ def _row(job: AnyJob, progress: Progress) -> tuple[str | Text, ...]:
         str(job.number),
         # As text: overrides and errors may look like markup.
         Text(job.label),
-        progress.place,
+        *((progress.place,) if has_places else ()),
         Text(done.strip()) if part is None else Text.assemble(bar(part, _BAR_WIDTH), done),
         f"{rate:,.0f}" if rate else "",
         "" if progress.latest is None else f"{progress.latest:.4g}",

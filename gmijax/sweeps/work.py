@@ -103,6 +103,10 @@ class Work(ABC, Generic[J]):
         """The same with everything decided that has to be measured first; the GPUs are held."""
 
     @abstractmethod
+    def next_step(self, paths: SweepPaths, best: int) -> tuple[str, str]:
+        """What to type after it, and what for; `best` is the number of the best job."""
+
+    @abstractmethod
     def kind(self, paths: SweepPaths, sites: Sequence[Site]) -> Kind[J]:
         """What the scheduler asks."""
 

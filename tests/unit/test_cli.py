@@ -31,7 +31,11 @@ REFUSED: list[tuple[str, str, str]] = [
     ("train", "algo.gamma=0.9", "unknown key algo.gamma"),
     ("train", "+foo.bar=1", "unknown key foo"),
     ("train", "hydra.run.dir=x", "unknown key hydra.run.dir: did you mean run.dir?"),
-    ("train", "--verbose", "unknown option --verbose"),
+    (
+        "train",
+        "--quiet",
+        "unknown option --quiet: allowed are --help, --verbose, --cfg job, key=value",
+    ),
     ("train", "ant", "ant: expected key=value; did you mean env=ant?"),
     ("train", "humanod", "humanod: expected key=value; did you mean env=humanoid?"),
     ("train", "a3c", "a3c: expected key=value; did you mean algo=a3c?"),

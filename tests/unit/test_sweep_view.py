@@ -77,9 +77,9 @@ def test_the_table_says_of_each_job_where_and_how_far_it_is() -> None:
     lines = [printable(line).split() for line in shown.splitlines()]
     rows = {words[0]: " ".join(words) for words in reversed(lines) if words}
     assert "overrides GPU and place progress steps/s return ranked by ETA state" in rows["job"]
-    assert rows["0"].endswith("50% 50 2.5 3.5 0:00:10 running")
+    assert rows["0"].endswith("50% 50 2.5 3.5 0:10 running")
     assert "seed=0 GPU 3 place 0" in rows["0"]
-    assert rows["1"].endswith("25% 50 2.5 3.5 0:00:15 running")
+    assert rows["1"].endswith("25% 50 2.5 3.5 0:15 running")
     assert rows["2"].endswith("100% 2.5 3.5 completed")
     assert "waiting: again, alone on its GPU, after CUDA_ERROR_[/x]" in rows["3"]
     assert "2 running, 1 waiting, 1 completed; 100 steps/s, 2.0 runs/h" in shown
