@@ -15,11 +15,18 @@ import gmijax
 from gmijax.cli.command import command
 from gmijax.cli.compose import compose, defaults
 from gmijax.cli.grid import SweepHelp
-from gmijax.cli.help import USUAL, keys_of
-from gmijax.config import PlayConfig, ServeConfig, TrainConfig
+from gmijax.cli.groups import choices
+from gmijax.cli.help import USUAL, keys_of, print_help, topics_of
+from gmijax.cli.pack import PackKeys
+from gmijax.config import ExportConfig, PlayConfig, ServeConfig, TrainConfig
 from gmijax.errors import ConfigError
 
 LONG = "a" * 300
+COMMANDS = {
+    **dict.fromkeys(("train", "search"), TrainConfig),
+    **{"serve": ServeConfig, "sweep": SweepHelp, "pack": PackKeys},
+    **{"play": PlayConfig, "export": ExportConfig},
+}
 A3C = "algo=a3c"
 APART = "plan.serving_gpus, plan.training_gpus: GPUs [1] both act and train and others"
 
@@ -267,6 +274,27 @@ def test_help_shows_the_usual_keys_or_those_of_a_topic(capsys: pytest.CaptureFix
     assert "\nrun.dir " not in said
     assert command("train", TrainConfig, gmijax.train, ["--help", "plam"]) == 2
     assert "--help plam: no such topic: did you mean plan?" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+@pytest.mark.parametrize("topic", [None, "all"])
+def test_help_fits_eighty_columns(
+    name: str,
+    topic: str | None,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+):
+    monkeypatch.setenv("COLUMNS", "80")
+    print_help(name, COMMANDS[name], partial(defaults, name), choices, topic)
+    assert max(map(len, capsys.readouterr().out.splitlines())) <= 80
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+def test_every_topic_of_every_command_has_help(name: str, capsys: pytest.CaptureFixture[str]):
+    for topic in topics_of(COMMANDS[name]):
+        print_help(name, COMMANDS[name], partial(defaults, name), choices, topic)
+        said = capsys.readouterr().out
+        assert topic == "all" or f"\n{topic}." in said
 
 
 def test_every_usual_key_is_one_of_a_command():
