@@ -122,11 +122,15 @@ def announce(console: Console, run: RunPaths, plan: Plan, what: str, lines: Sequ
     print_reasons(console, (*plan.reasons, *lines))
 
 
+def is_verbose(console: Console) -> bool:
+    """Whether the reasons of decisions are printed."""
+    return isinstance(console, UserConsole) and console.is_verbose
+
+
 def print_reasons(console: Console, reasons: Sequence[str]) -> None:
     """Prints sentences about a plan; those of mere decisions only where they are asked for."""
-    is_verbose = isinstance(console, UserConsole) and console.is_verbose
     for reason in dict.fromkeys(reasons):
-        if is_verbose or "warning: " in reason or not reason.startswith(_DECISIONS):
+        if is_verbose(console) or "warning: " in reason or not reason.startswith(_DECISIONS):
             console.print(f"  {reason}")
 
 

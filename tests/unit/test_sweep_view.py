@@ -178,6 +178,26 @@ def events(path: Path) -> list[Any]:
     return found
 
 
+def test_the_table_hides_nothing_of_an_override() -> None:
+    """Without GPUs it has no column of places, and names the keys without their groups."""
+    overrides = ("algo.learning_rate=0.00012345", "env.settings.goal_height_m=0.75")
+    jobs = list(jobs_of([compose("num_timesteps=1000", *overrides), compose()]))
+    jobs[0].progress.state = "running"
+    view = SweepView(open_console(show=False), jobs, SWEEP)
+    text = {}
+    for width in (80, 120):
+        said = io.StringIO()
+        Console(file=said, width=width).print(view._table())
+        text[width] = said.getvalue()
+    assert "…" not in text[80]
+    assert "place" not in text[80]
+    assert "starting" in text[80]
+    for part in ("learning_rate=0.00012345", "goal_height_m=0.75"):
+        assert part in text[120]
+    assert "algo." not in text[120]
+    assert view.line() == "1 running, 1 waiting"
+
+
 def test_throughput_is_of_the_jobs_that_a_command_has_run(tmp_path: Path) -> None:
     jobs = running_jobs()
     jobs[3].progress.state, jobs[3].progress.error = "completed", None  # By an earlier command.
