@@ -80,12 +80,14 @@ def print_help(
         table.add_row(key.name, key.default, f"{key.meaning}{allowed}")
     console = Console(highlight=False, markup=False)
     console.print(f"usage: {usage_of(name)}")
-    for group in ("env", "algo", "plan"):
+    for group in ("env", "algo", "plan") if topic in (None, "all") else (topic,):
         if group in {key.name.split(".")[0] for key in keys} and len(choices(group)) > 1:
             console.print(f"\n{group}= one of: {', '.join(choices(group))}")
             if group == "env":
                 console.print("or env=PATH.py:FUNCTION, a task of your own (docs/custom-task.md)")
                 console.print(_whose_defaults(name, keys))
+    if any("GMI" in key.meaning for key in shown):
+        console.print("\nA GMI is one process on a share of a GPU, or on CPU cores.")
     console.print()
     console.print(table)
     if len(shown) < len(keys):

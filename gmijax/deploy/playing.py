@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 import os
+import shlex
 from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import Any, Final, TypeVar
@@ -17,7 +18,8 @@ from rich.table import Table
 
 from gmijax.config import EnvConfig, ExportConfig, PlanConfig, PlayConfig, ReduceConfig, Timeouts
 from gmijax.config.schema import to_dict
-from gmijax.control.console import doing, nearby, open_console
+from gmijax.control.console import Show, doing, nearby, open_console, print_next
+from gmijax.control.summary import EXPLORING
 from gmijax.deploy.pictures import film, has_brax, write_page
 from gmijax.errors import ConfigError, GmijaxError
 from gmijax.machine.snapshot import Machine, detect_machine
@@ -57,7 +59,7 @@ _MOST_DIGITS: Final = 18
 """Of env steps; a longer number is no file name."""
 
 
-def play(config: PlayConfig, *, show: bool = False) -> None:
+def play(config: PlayConfig, *, show: Show = False) -> None:
     """Runs one episode per environment with the policy of a checkpoint, and films some of them.
 
     Args:
@@ -80,9 +82,12 @@ def play(config: PlayConfig, *, show: bool = False) -> None:
         run_gmis(_launch(config, paths, detect_machine()))
     returns = read_json(paths.returns)
     console.print(_table(returns))
+    if note := _return_while_training(config, returns):
+        console.print(note)
     console.print(f"returns: {nearby(paths.returns)}")
     if not paths.model.exists():
         _accept_nothing_to_see(config, returns["env"], console)
+        print_next(console, *_next_steps(config))
         return
     try:
         if config.html != "off":
@@ -92,6 +97,20 @@ def play(config: PlayConfig, *, show: bool = False) -> None:
     finally:
         # With its textures a robot takes 100 MB, for every checkpoint that is played.
         paths.model.unlink(missing_ok=True)
+    print_next(console, *_next_steps(config))
+
+
+def _return_while_training(config: PlayConfig, returns: Mapping[str, Any]) -> str | None:
+    """A line that says why training printed another return; None where it did not."""
+    trained = CheckpointMeta.read(Path(str(config.checkpoint))).mean_return
+    if trained is None or not returns["deterministic"]:
+        return None
+    return f"while training the return was {trained:.2f} {EXPLORING}"
+
+
+def _next_steps(config: PlayConfig) -> tuple[tuple[str, str], ...]:
+    folder = shlex.quote(nearby(Path(str(config.run.dir))))
+    return (("write the policy as files for a robot", f"gmijax export run.dir={folder}"),)
 
 
 def _opened(config: PlayConfig) -> tuple[PlayConfig, str | None]:

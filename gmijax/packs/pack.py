@@ -140,9 +140,9 @@ class PackWork(Work[CommandJob]):
         self.crowds.append(Crowd(places, sites, hosts, console))
         return self.crowds[-1]
 
-    def warnings(self) -> Sequence[str]:
+    def warnings(self, sites: Sequence[Site]) -> Sequence[str]:
         """See `Work`."""
-        if not self.is_adaptive:
+        if not (self.is_adaptive and sites[0].machine.gpus):
             return ()
         return (
             "pack.jobs_per_gpu=auto: on a GPU one job first, then more while they gain; at most "

@@ -102,8 +102,9 @@ class SweepWork(Work[Job]):
         """See `Work`."""
         return self.grid_identity()
 
-    def warnings(self) -> Sequence[str]:
+    def warnings(self, sites: Sequence[Site]) -> Sequence[str]:
         """See `Work`."""
+        del sites
         warning = why_not_comparable(self.jobs, self.ranking)
         return () if warning is None else (warning,)
 

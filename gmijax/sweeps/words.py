@@ -37,7 +37,7 @@ def announce(
     at_once = f"at most {places}" if work.is_adaptive and sites[0].machine.gpus else str(places)
     console.print(f"{_counted(total, 'job')}{more}, {at_once} at a time {_where(sites)}")
     print_reasons(console, [reason for site in sites for reason in site.plan.reasons])
-    for warning in work.warnings():
+    for warning in work.warnings(sites):
         console.print(f"  {warning}")
 
 

@@ -129,7 +129,7 @@ class Work(ABC, Generic[J]):
     def identity(self) -> dict[str, Any]:
         """What must be the same where a command goes on."""
 
-    def warnings(self) -> Sequence[str]:
+    def warnings(self, sites: Sequence[Site]) -> Sequence[str]:
         """What is to be said before the first job."""
         return ()
 
