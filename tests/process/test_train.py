@@ -50,7 +50,7 @@ def two_gmis(tmp_path_factory: pytest.TempPathFactory) -> Path:
         patch.setenv("XDG_CACHE_HOME", str(cwd / "cache"))
         done = train(
             *POINT, *SAME, "plan.gmis_per_gpu=2", "reduce.selection=measured", "run.dir=run",
-            "run.measure_throughput=true", "run.checkpoint_every=3", cwd=cwd,
+            "run.measure_throughput=true", "run.checkpoint_every=3", "-v", cwd=cwd,
         )  # fmt: skip
     assert done.returncode == 0, done.stderr
     assert "Algorithm 1 says mpr" in done.stdout
@@ -110,7 +110,7 @@ def test_the_strategy_is_the_fastest_of_those_that_were_measured(two_gmis: Path)
 
 @pytest.mark.timeout(300)
 def test_two_gmis_compute_what_one_process_with_all_environments_does(two_gmis: Path) -> None:
-    done = train(*POINT, *SAME, "num_envs=32", "run.dir=one", cwd=two_gmis.parent)
+    done = train(*POINT, *SAME, "num_envs=32", "run.dir=one", "-v", cwd=two_gmis.parent)
     assert done.returncode == 0, done.stderr
     assert "Algorithm 1 says mpr" not in done.stdout
     one = learner_arrays(two_gmis.parent / "one")
