@@ -112,6 +112,8 @@ class ConsoleProgress:
             grid.add_row(Text(f"GMI {gmi.gmi}: {gmi.state}{done_so_far}", "dim"))
         if self._phase == "stopping":
             grid.add_row(Text("stopping: saving a checkpoint", "dim"))
+        elif self._has_figures and self._part() == 1:
+            grid.add_row(Text("finishing: saving a checkpoint, measuring the rates", "dim"))
         return grid
 
     @property

@@ -105,10 +105,10 @@ def train_outcome(summary: Data, run: RunPaths) -> str:
     where = "none" if checkpoint is None else nearby(Path(checkpoint))
     curves = f"curves: {nearby(run.returns_png)}\n" if run.returns_png.exists() else ""
     return (
-        f"{summary['status']}: {summary['env_steps']:,} env steps in {clock(summary['wall_s'])}, "
-        f"{f'started again {times} times, ' if times else ''}{learnt}\n"
+        f"{summary['status']}: {summary['env_steps']:,} env steps in {clock(summary['wall_s'])}"
+        f"{f', started again {times} times' if times else ''}\n{learnt}\n"
         f"{_of_rates(summary)}"
-        f"{_of_evaluations(summary.get('eval'))}"
+        f"{_of_evaluations(summary.get('eval'), run)}"
         f"{_of_videos(run)}"
         f"{_of_profile(summary.get('profile'))}"
         f"checkpoint: {where}\n{curves}summary: {nearby(run.summary)}"
@@ -146,15 +146,19 @@ def _of_rates(summary: Data) -> str:
     return f"env steps/s: {', '.join(found)}\n" if found else ""
 
 
-def _of_evaluations(found: Data | None) -> str:
-    """A line, or nothing."""
+def _of_evaluations(found: Data | None, run: RunPaths) -> str:
+    """Lines, or nothing."""
     if not found:
         return ""
+    how = "without" if read_json(run.config)["eval"]["deterministic"] else "with"
     last, best = found["last"], found["best"]
-    where = f", best {best['return']:.2f}: {nearby(Path(best['checkpoint']))}" if best else ""
-    return (
-        f"evaluation: return {last['return']:.2f} after {last['env_steps']:,} env steps{where}\n"
+    text = (
+        f"evaluation: return {last['return']:.2f} {how} exploration noise, after "
+        f"{last['env_steps']:,} env steps\n"
     )
+    if best:
+        text += f"  best {best['return']:.2f}: {nearby(Path(best['checkpoint']))}\n"
+    return text
 
 
 def _of_videos(run: RunPaths) -> str:

@@ -25,7 +25,7 @@ from gmijax.deploy import playing
 from gmijax.errors import printable
 from gmijax.partition.planner import make_plan
 from gmijax.runs.compile_times import CompileTime
-from gmijax.runs.folder import RunPaths
+from gmijax.runs.folder import RunPaths, write_json
 from gmijax.supervise.failures import last_line
 from gmijax.supervise.watched_gmi import GmiStatus
 
@@ -126,7 +126,7 @@ def test_a_summary_has_the_rates_that_were_measured(
     summary = {**SUMMARY, "final_return": None, **dict(zip(RATES, rates, strict=True))}
     told = train_outcome(summary, RunPaths(tmp_path)).splitlines()
     assert [text for text in told if "steps/s" in text] == [f"env steps/s: {line}"] * bool(line)
-    assert told[0].endswith("in 0:01, no episode has ended")
+    assert told[:2] == ["completed: 10 env steps in 0:01", "no episode has ended"]
 
 
 def _told(lines: list[dict[str, Any]]) -> str:
@@ -303,6 +303,19 @@ SUMMARY = {
     **{"final_return": 58.8, "checkpoint": None, "overflow_steps": {}},
     **dict.fromkeys(RATES),
 }
+
+
+@pytest.mark.parametrize(("deterministic", "how"), [(True, "without"), (False, "with")])
+def test_an_evaluation_says_whether_it_was_with_noise(
+    deterministic: bool, how: str, tmp_path: Path
+):
+    run = RunPaths(tmp_path)
+    write_json(run.config, {"eval": {"deterministic": deterministic}})
+    best = {"env_steps": 5, "return": 8.0, "checkpoint": str(run.checkpoint(5))}
+    found = {"last": {"env_steps": 9, "return": 7.5}, "best": best}
+    told = train_outcome({**SUMMARY, "eval": found}, run).splitlines()
+    assert f"evaluation: return 7.50 {how} exploration noise, after 9 env steps" in told
+    assert any(line.startswith("  best 8.00: ") for line in told)
 
 
 @pytest.mark.parametrize(
