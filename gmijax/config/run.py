@@ -4,10 +4,13 @@ from __future__ import annotations
 
 import re
 from dataclasses import dataclass
-from typing import Literal
+from typing import Final, Literal
 
 from gmijax.config.schema import KeyGroup, doc
 from gmijax.errors import ConfigError
+
+
+_MOST_TRACED: Final = 50
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -84,7 +87,13 @@ class RunConfig(Timeouts):
                 f"run.profile={self.profile}: expected FIRST:LAST, two iterations from 1 on, "
                 "e.g. 20:25"
             )
-        return int(match[1]), int(match[2])
+        first, last = int(match[1]), int(match[2])
+        if last - first >= _MOST_TRACED:
+            raise ConfigError(
+                f"run.profile={self.profile}: {last - first + 1} iterations; at most "
+                f"{_MOST_TRACED}, because a trace is kept in memory until its end"
+            )
+        return first, last
 
 
 @dataclass(frozen=True, kw_only=True)

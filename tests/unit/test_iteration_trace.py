@@ -88,6 +88,12 @@ def test_other_ranges_are_refused(wanted: str):
         run_config(wanted)
 
 
+def test_a_trace_that_memory_may_not_hold_is_refused():
+    assert run_config("11:60").profiled == (11, 60)
+    with pytest.raises(ConfigError, match="run.profile=11:61: 51 iterations; at most 50"):
+        run_config("11:61")
+
+
 def test_one_iteration_is_a_range():
     assert run_config("7:7").profiled == (7, 7)
 
