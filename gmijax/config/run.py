@@ -9,7 +9,6 @@ from typing import Final, Literal
 from gmijax.config.schema import KeyGroup, doc
 from gmijax.errors import ConfigError
 
-
 _MOST_TRACED: Final = 50
 
 

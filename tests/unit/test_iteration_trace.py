@@ -90,7 +90,7 @@ def test_other_ranges_are_refused(wanted: str):
 
 def test_a_trace_that_memory_may_not_hold_is_refused():
     assert run_config("11:60").profiled == (11, 60)
-    with pytest.raises(ConfigError, match="run.profile=11:61: 51 iterations; at most 50"):
+    with pytest.raises(ConfigError, match=r"11:61: 51 iterations; at most 50"):
         run_config("11:61")
 
 
