@@ -138,7 +138,6 @@ class Trainer:
             self.link.beat("running", self._updates)
             if is_last:
                 break
-        self._trace.close(self._update.wait)
         if leader is not None:
             leader.end()
         require_equal(self.reducer, self.link.gmi, state.params, self._env_steps)
@@ -146,6 +145,7 @@ class Trainer:
         self.receiver.close()
         if leader is not None:
             leader.finish(state)
+        self._trace.close()  # Last: a job that is told to end has little time to save.
         return "stopped" if is_stopped else "completed"
 
     def _receive(self) -> tuple[Batch, float]:

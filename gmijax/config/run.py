@@ -9,7 +9,7 @@ from typing import Final, Literal
 from gmijax.config.schema import KeyGroup, doc
 from gmijax.errors import ConfigError
 
-_MOST_TRACED: Final = 50
+_MOST_TRACED: Final = 20
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -90,7 +90,7 @@ class RunConfig(Timeouts):
         if last - first >= _MOST_TRACED:
             raise ConfigError(
                 f"run.profile={self.profile}: {last - first + 1} iterations; at most "
-                f"{_MOST_TRACED}, because a trace is kept in memory until its end"
+                f"{_MOST_TRACED}, because memory holds a trace until it is written"
             )
         return first, last
 

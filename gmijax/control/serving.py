@@ -126,7 +126,7 @@ def serve(config: ServeConfig, *, show: Show = False) -> Served:
                 folder.require()  # Whatever else went wrong without it comes from that.
     console.print(serve_outcome(summary, run))
     if shards := [] if job.data is None else list(job.data.finished()):
-        path = repr(nearby(shards[0].arrays))
+        path = json.dumps(nearby(shards[0].arrays))
         look = f"import numpy; print({{k: v.shape for k, v in numpy.load({path}).items()}})"
         print_next(console, ("look into the first shard", f"python -c {shlex.quote(look)}"))
     elif job.data is None:

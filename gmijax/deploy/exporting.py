@@ -7,6 +7,7 @@ CPU: nothing is simulated, and GPUs may be training.
 from __future__ import annotations
 
 import importlib.util
+import json
 import shlex
 from pathlib import Path
 from typing import Final
@@ -53,7 +54,7 @@ def export(config: ExportConfig, *, show: Show = False) -> ExportPaths:
     console.print(f"metadata: {nearby(paths.metadata)}")
     path = paths.stablehlo if config.format == "stablehlo" else paths.onnx
     act = (
-        f"import gmijax, numpy; policy = gmijax.load_policy({nearby(path)!r}); "
+        f"import gmijax, numpy; policy = gmijax.load_policy({json.dumps(nearby(path))}); "
         "print(policy(numpy.zeros(policy.obs_size)))"
     )
     print_next(console, ("act with it in Python", f"python -c {shlex.quote(act)}"))

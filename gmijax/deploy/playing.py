@@ -32,6 +32,7 @@ from gmijax.runs.folder import (
     remove_temporary,
     write_json,
 )
+from gmijax.runs.history import read_metrics
 from gmijax.runs.names import steps_name
 from gmijax.runs.resume import (
     CheckpointMeta,
@@ -102,10 +103,11 @@ def play(config: PlayConfig, *, show: Show = False) -> None:
 
 def _return_while_training(config: PlayConfig, returns: Mapping[str, Any]) -> str | None:
     """A line that says why training printed another return; None where it did not."""
-    trained = CheckpointMeta.read(Path(str(config.checkpoint))).mean_return
-    if trained is None or not returns["deterministic"]:
+    lines = read_metrics(RunPaths(Path(str(config.run.dir))).metrics)
+    at_it = [line.get("return") for line in lines if line["env_steps"] == returns["env_steps"]]
+    if not at_it or at_it[-1] is None or not returns["deterministic"]:
         return None
-    return f"while training the return was {trained:.2f} {EXPLORING}"
+    return f"while training: {at_it[-1]:.2f} {EXPLORING}"
 
 
 def _next_steps(config: PlayConfig) -> tuple[tuple[str, str], ...]:

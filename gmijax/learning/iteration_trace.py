@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from contextlib import ExitStack
 from pathlib import Path
+from threading import Thread
 from typing import Any
 
 import jax
@@ -24,6 +25,7 @@ class IterationTrace:
         self._is_open = False
         self._error: str | None = None
         self._step = ExitStack()
+        self._writing: Thread | None = None
 
     def begin(self, iteration: int, wait: Callable[[], None]) -> None:
         """Before an iteration; `wait` returns when the device has nothing left to do."""
@@ -42,16 +44,24 @@ class IterationTrace:
     def end(self, iteration: int, wait: Callable[[], None]) -> None:
         """After an iteration has been started; arguments as of `begin`."""
         if self._wanted is not None and iteration == self._wanted[1]:
-            self.close(wait)
+            wait()  # The device may still compute it.
+            self._step.close()
+            self._write()
         self._step.close()
 
-    def close(self, wait: Callable[[], None]) -> None:
-        """Writes what was traced so far, if a trace is open; `wait` as of `begin`. Idempotent."""
+    def close(self) -> None:
+        """Returns when all that was traced is written; the device must have nothing left to do."""
+        self._step.close()
+        self._write()
+        if self._writing is not None:
+            self._writing.join()
+
+    def _write(self) -> None:
+        """Ends the trace if it is open. Not in this thread: to write it may take a minute."""
         if self._is_open:
-            wait()  # The device may still compute the last iteration.
-            self._step.close()
             self._is_open = False
-            self._try(jax.profiler.stop_trace)
+            self._writing = Thread(target=self._try, args=(jax.profiler.stop_trace,), daemon=True)
+            self._writing.start()
 
     def outcome(self) -> dict[str, Any]:
         """For `result.json`: `profile` with first and last iteration, folder and error.
@@ -64,9 +74,8 @@ class IterationTrace:
         return {"profile": found}
 
     def _open(self) -> None:
-        self._folder.mkdir(
-            exist_ok=True
-        )  # Before the start: JAX ends no trace that it cannot write.
+        # First: JAX does not end a trace that it cannot write.
+        self._folder.mkdir(exist_ok=True)
         options = jax.profiler.ProfileOptions()
         # Calls of Python are many, slow the iteration down, and say little about it.
         options.python_tracer_level = 0

@@ -227,9 +227,9 @@ class TrainingLoop:
             is_due = every and self._iterations % every == 0
             if not is_last and (is_due or (evaluation is not None and evaluation.is_best)):
                 self._save(state, env_state, thread, log, evaluation)
-        self._trace.close(self._iteration.wait)
         self._save(state, env_state, thread, log, evaluation)
         self._checkpoint = self._saver.finish()
+        self._trace.close()  # Last: a job that is told to end has little time to save.
         return state, env_state, stop
 
     def _evaluate(self, state: TrainState) -> Evaluation | None:
