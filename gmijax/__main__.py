@@ -12,11 +12,11 @@ from gmijax.version import __version__
 
 VERBS: Final[Mapping[str, str]] = MappingProxyType(
     {
-        "train": "trains a policy in one or several GMIs",
+        "train": "trains a policy, in one process or in several",
         "play": "evaluates a checkpoint, and films it",
         "view": "shows a policy live in the browser, also while it is trained",
         "serve": "collects experience with a trained policy or random actions",
-        "search": "finds environments per GMI and GMIs per GPU by profiling",
+        "search": "finds the fastest number of environments and of processes on a GPU",
         "sweep": "runs many training jobs, several at a time on every GPU",
         "pack": "runs any training command, several at a time on every GPU",
         "export": "writes a policy as files for robots: ONNX, StableHLO",
@@ -63,8 +63,10 @@ def _usage() -> str:
             "usage: gmijax COMMAND [key=value ...] [--help]",
             "       gmijax --version\n",
             *lines,
-            "\nEvery command has its own --help. Completion of commands, keys and values in bash:",
-            '  eval "$(gmijax -sc install=bash)"\n',
+            "\nEvery command has its own --help. -v also prints why it decided what it did.",
+            "Completion of commands, keys and values in bash:",
+            '  eval "$(gmijax -sc install=bash)"',
+            "\nStart with:\n  gmijax demo\n",
         )
     )
 

@@ -7,9 +7,9 @@ import sys
 from collections.abc import Sequence
 from typing import Final, NamedTuple
 
-from rich.console import Console
 from rich.table import Table
 
+from gmijax.control.console import UserConsole, open_console, print_next
 from gmijax.control.diagnosis import Diagnosis, diagnose
 from gmijax.control.exit_codes import EXIT_FAILED, EXIT_OK, exit_code_of
 from gmijax.control.system_info import inspect_system
@@ -18,12 +18,13 @@ from gmijax.machine.mig_split import split_commands
 from gmijax.machine.snapshot import Machine, detect_machine
 from gmijax.version import __version__
 
-USAGE: Final = """usage: gmijax doctor [--json] [--help]
+USAGE: Final = """usage: gmijax doctor [--json] [--verbose] [--help]
        gmijax doctor mig=SIZES [gpu=INDEX]
        gmijax doctor cluster=ADDRESS [--json]
 
-Without mig=, looks at GPUs, driver, MPS, MIG, versions, and at what jax sees; says which backends,
-reducers, physics and environments can be used, and why the others cannot.
+Without mig=, looks at GPUs, driver, MPS, MIG and versions, asks jax what it sees, and draws a
+picture; says which backends, reducers, physics, environments and extras can be used, and what
+mends the others. Without a GPU, what only GPUs have is shown with --verbose.
 With mig=3g,2g,1g,1g, prints the commands with which an administrator would divide a GPU so
 (gpu=INDEX as nvidia-smi lists it; else the first that can be divided). It runs none of them.
 With cluster=auto (or host:port), shows the nodes of a Ray cluster, and in what they differ.
@@ -38,6 +39,7 @@ class Options(NamedTuple):
     """Options of the command line."""
 
     as_json: bool = False
+    verbose: bool = False
     mig: str | None = None
     gpu: int | None = None
     cluster: str | None = None
@@ -64,8 +66,10 @@ def _answer(options: Options) -> Sequence[str]:
     if options.as_json:
         sys.stdout.write(json.dumps(found.to_dict(), indent=2) + "\n")
     else:
-        width = None if sys.stdout.isatty() else 140
-        show(found, Console(highlight=False, soft_wrap=True, markup=False, width=width))
+        console = open_console(show="verbose" if options.verbose else True)
+        show(found, console)
+        if not found.problems:
+            print_next(console, ("see a trained policy, then train one", "gmijax demo"))
     return found.problems
 
 
@@ -76,6 +80,8 @@ def parse(argv: Sequence[str]) -> Options:
         key, _, value = text.partition("=")
         if text == "--json":
             options = options._replace(as_json=True)
+        elif text in ("-v", "--verbose"):
+            options = options._replace(verbose=True)
         elif key == "mig" and value:
             options = options._replace(mig=value)
         elif key == "gpu" and value.isdecimal() and len(value) <= _MOST_DIGITS:
@@ -84,8 +90,8 @@ def parse(argv: Sequence[str]) -> Options:
             options = options._replace(cluster=value)
         else:
             raise ConfigError(
-                f"{text}: allowed are --json, mig=SIZES (e.g. mig=3g,2g,1g,1g), gpu=INDEX, "
-                "cluster=ADDRESS, --help"
+                f"{text}: allowed are --json, --verbose, mig=SIZES (e.g. mig=3g,2g,1g,1g), "
+                "gpu=INDEX, cluster=ADDRESS, --help"
             )
     if options.mig is None and options.gpu is not None:
         raise ConfigError(f"gpu={options.gpu}: only together with mig=SIZES")
@@ -142,13 +148,14 @@ def show_nodes(address: str, *, as_json: bool) -> Sequence[str]:
     return problems
 
 
-def show(found: Diagnosis, console: Console) -> None:
+def show(found: Diagnosis, console: UserConsole) -> None:
     """Prints the diagnosis for people."""
     system = found.system
     machine = system.machine
+    driver = machine.driver_version
     console.print(
         f"gmijax {__version__}, Python {sys.version.split()[0]}, {len(machine.cpu_cores)} CPU "
-        f"cores, NVIDIA driver {machine.driver_version or 'none'}"
+        f"cores, {f'NVIDIA driver {driver}' if driver else 'no NVIDIA driver'}"
     )
     for gpu in machine.gpus:
         mig = "on" if gpu.mig_enabled else "off" if gpu.mig_supported else "none"
@@ -161,8 +168,8 @@ def show(found: Diagnosis, console: Console) -> None:
             console.print(f"  {one.profile}: {one.num_sms} SMs, {one.memory_mib} MiB, {one.uuid}")
     console.print(f"jax sees: {', '.join(system.jax.devices) or system.jax.error}")
     installed = [f"{name} {number}" for name, number in system.versions.items() if number]
-    console.print(f"packages: {', '.join(installed)}\n")
-    console.print(_table(found))
+    console.print(f"packages: {', '.join(installed)}\n", soft_wrap=False)
+    console.print(_table(found, whole=bool(machine.gpus) or console.is_verbose), soft_wrap=False)
     for note in found.notes:
         console.print(f"note: {note}")
     for problem in found.problems:
@@ -171,11 +178,17 @@ def show(found: Diagnosis, console: Console) -> None:
         console.print("nothing is broken")
 
 
-def _table(found: Diagnosis) -> Table:
+_OF_GPUS: Final = ("backend", "reducer", "intra")
+"""Kinds that mean little without a GPU."""
+
+
+def _table(found: Diagnosis, *, whole: bool) -> Table:
     table = Table(box=None, pad_edge=False)
     for heading in ("kind", "name", "usable", "why"):
         table.add_column(heading, overflow="fold", no_wrap=heading != "why")
     for ability in found.abilities:
+        if not whole and ability.kind in _OF_GPUS:
+            continue
         table.add_row(ability.kind, ability.name, "yes" if ability.usable else "no", ability.why)
     return table
 

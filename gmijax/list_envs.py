@@ -9,9 +9,9 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Final, NamedTuple
 
-from rich.console import Console
 from rich.table import Table
 
+from gmijax.control.console import open_console, print_next
 from gmijax.control.exit_codes import EXIT_OK, exit_code_of
 from gmijax.errors import ConfigError
 from gmijax.sim.registry import SUITES, TASKS, require_task
@@ -51,12 +51,12 @@ def _list(argv: Sequence[str]) -> None:
     for task in map(task_of, sorted(TASKS)):
         sizes = (task.obs_size, task.action_size, task.episode_length)
         table.add_row(task.name, *("-" if x is None else str(x) for x in sizes), task.description)
-    width = None if sys.stdout.isatty() else 140
-    console = Console(highlight=False, markup=False, soft_wrap=True, width=width)
-    console.print(table)
+    console = open_console(show=True)
+    console.print(table, soft_wrap=False)
     console.print()
     for line in suite_lines():
         console.print(line)
+    print_next(console, ("train on one of them", "gmijax train env=ant"))
 
 
 def task_of(name: str) -> Task:

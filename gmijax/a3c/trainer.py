@@ -26,6 +26,7 @@ from gmijax.collectives.interface import Reducer
 from gmijax.config import A3cConfig, TrainConfig
 from gmijax.errors import CollectiveTimeout
 from gmijax.learning.checkpoint import require_equal
+from gmijax.learning.iteration_trace import IterationTrace
 from gmijax.learning.learner import TrainState, acting_weights, make_learner, pack_weights
 from gmijax.learning.physics_health import check_losses
 from gmijax.learning.start import first_state
@@ -59,6 +60,8 @@ class Trainer:
         self._update = make_update(self._learner, self.reducer)
         self._env_steps = 0
         self._updates = 0
+        traced = self.config.run.profiled if self.reducer.rank == 0 else None
+        self._trace = IterationTrace(traced, self.link.run.profile)
         self._version = 0
         self._passed_over = np.zeros(MAX_COUNTED + 1, np.float32)
 
@@ -103,11 +106,12 @@ class Trainer:
             status = self._loop(state, leader)
         finally:
             leader.close()
-        return leader.outcome(status, compile_s)
+        return leader.outcome(status, compile_s) | self._trace.outcome()
 
     def _loop(self, state: TrainState, leader: Leader | None) -> str:
         """Returns the status for the outcome."""
         while True:
+            self._trace.begin(self._updates + 1, self._update.wait)
             batch, waited_s = self._receive()
             counts = self._meet(batch, waited_s)
             started = time.monotonic()
@@ -130,6 +134,7 @@ class Trainer:
                 leader.record(self._env_steps, self._updates, counts, updated, update_s, state)
                 if not is_last:
                     leader.checkpoint_now_and_then(state)
+            self._trace.end(self._updates, self._update.wait)
             self.link.beat("running", self._updates)
             if is_last:
                 break
@@ -140,6 +145,7 @@ class Trainer:
         self.receiver.close()
         if leader is not None:
             leader.finish(state)
+        self._trace.close()  # Last: a job that is told to end has little time to save.
         return "stopped" if is_stopped else "completed"
 
     def _receive(self) -> tuple[Batch, float]:

@@ -84,7 +84,7 @@ class A3cWorkload(Workload[TrainConfig]):
     def config_at(self, point: Point, num_gmis: int) -> TrainConfig:
         """See `Workload`."""
         del num_gmis
-        run = dataclasses.replace(self.config.run, resume=None, checkpoint_every=0)
+        run = dataclasses.replace(self.config.run, resume=None, checkpoint_every=0, profile=None)
         # It ends when there is enough to read.
         return self.with_point(point, num_timesteps=_ENDLESS_STEPS, run=run)
 

@@ -38,6 +38,7 @@ from gmijax.partition.backend_choice import candidates, require_num_gpus
 from gmijax.partition.layout import Layout
 from gmijax.runs.cache import cache_folder
 from gmijax.runs.folder import RunPaths, create_run, write_json
+from gmijax.runs.names import nearby
 from gmijax.sim.impl import choose_impl
 
 
@@ -161,7 +162,7 @@ class Search:
         if self.run is not None:
             write_json(self.run.search_report, report)
             draw(outcome, self.run.search_png, f"{label}, {device}")
-            self._console.print(f"report: {self.run.search_report}")
+            self._console.print(f"report: {nearby(self.run.search_report)}")
         run_dir = None if self.run is None else self.run.root
         gmis_per_gpu, num_envs, impl, trainers = best.point
         return SearchResult(run_dir, gmis_per_gpu, num_envs, impl, reason, report, trainers, split)
@@ -220,7 +221,7 @@ class Search:
                 point,
                 mode,
                 self._machine,
-                self.run.profile(f"{mode}-{point.gmis_key}x{point.num_envs}-{point.impl}"),
+                self.run.search_profile(f"{mode}-{point.gmis_key}x{point.num_envs}-{point.impl}"),
                 limit_s=limit_s,
                 on_tick=lambda gmis: self._display.watch(what, gmis),
                 on_warning=self._console.print,

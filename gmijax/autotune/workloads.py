@@ -204,7 +204,7 @@ class PpoWorkload(Workload[TrainConfig]):
         config = self.config
         steps = point.num_envs * config.algo.unroll_length * num_gmis
         run = dataclasses.replace(
-            config.run, resume=None, checkpoint_every=0, measure_throughput=False
+            config.run, resume=None, checkpoint_every=0, measure_throughput=False, profile=None
         )
         no_eval = dataclasses.replace(config.eval, every=None, video=False)
         steps = config.search.iterations * steps

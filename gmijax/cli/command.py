@@ -6,7 +6,7 @@ import re
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
-from typing import Any
+from typing import Any, Final
 
 from omegaconf import OmegaConf
 
@@ -18,6 +18,8 @@ from gmijax.config.schema import to_dict
 from gmijax.control.exit_codes import exit_code_of
 from gmijax.errors import ConfigError
 from gmijax.sweeps.sweep import SweepWork, run_sweep
+
+_VERBOSE: Final = ("-v", "--verbose")
 
 
 def command(
@@ -45,12 +47,12 @@ def command(
             topic = next(iter(argv[asked[0] + 1 : asked[0] + 2]), None)
             print_help(name, cls, partial(defaults, name), choices, topic)
             return
-        overrides, show = _split_options(argv)
+        overrides, show, verbose = _split_options(argv)
         made = build(name, cls, overrides) if make is None else make(overrides)
         if show:
             sys.stdout.write(OmegaConf.to_yaml(OmegaConf.create(dict(shown(made)))))
         else:
-            run(made, show=True)
+            run(made, show="verbose" if verbose else True)
 
     return exit_code_of(name, whole)
 
@@ -66,9 +68,11 @@ def _shown_sweep(work: SweepWork) -> dict[str, Any]:
     return {"sweep": to_dict(work.settings), **nodes, "jobs": jobs}
 
 
-def _split_options(argv: Sequence[str]) -> tuple[list[str], bool]:
-    arguments = [part for text in argv for part in re.split(r"^(--cfg)=", text) if part]
-    show = False
+def _split_options(argv: Sequence[str]) -> tuple[list[str], bool, bool]:
+    """The overrides; whether only the configuration is to be shown; whether reasons are, too."""
+    parts = [part for text in argv for part in re.split(r"^(--cfg)=", text) if part]
+    arguments = [text for text in parts if text not in _VERBOSE]
+    show, verbose = False, len(arguments) < len(parts)
     if "--cfg" in arguments:
         at = arguments.index("--cfg")
         if arguments[at + 1 : at + 2] != ["job"]:
@@ -77,5 +81,7 @@ def _split_options(argv: Sequence[str]) -> tuple[list[str], bool]:
         show = True
     for text in arguments:
         if text.startswith("-"):
-            raise ConfigError(f"unknown option {text}: allowed are --help, --cfg job, key=value")
-    return arguments, show
+            raise ConfigError(
+                f"unknown option {text}: allowed are --help, --verbose, --cfg job, key=value"
+            )
+    return arguments, show, verbose

@@ -1,4 +1,4 @@
-"""Completion of commands, keys and values in a shell, by Hydra's own plugins (bash, fish, zsh)."""
+"""Completion in a shell: of keys by Hydra's plugins (bash, fish, zsh), of values by our own."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ from collections.abc import Iterable, Sequence
 from hydra import initialize_config_dir
 from hydra.core.global_hydra import GlobalHydra
 
+from gmijax.cli.answers import own_answers
 from gmijax.cli.groups import config_dir
 from gmijax.control.exit_codes import exit_code_of
 from gmijax.errors import ConfigError
@@ -36,6 +37,10 @@ def _complete(argv: Sequence[str], verbs: Iterable[str]) -> None:
             return
         if not (config_dir() / f"{name}.yaml").is_file():
             return  # It takes no keys.
+        words = line.split()[1:] + [""] * line.endswith(" ")
+        if (own := own_answers(name, words)) is not None:
+            sys.stdout.write("\n".join(own) + "\n")
+            return
         os.environ["COMP_LINE"] = line
     with initialize_config_dir(str(config_dir()), version_base=None):
         hydra = GlobalHydra.instance().hydra

@@ -222,7 +222,7 @@ def _on_top_of_saved(
     """
     saved = saved_config_of(resume, "run.resume")
     require_known_keys(saved, f"run.resume={resume}")
-    saved["run"].update(dir=None, name=None)
+    saved["run"].update(dir=None, name=None, profile=None)
     suite = saved["env"].get("suite", "gmijax")
     merged = with_saved(data, saved)
     for item in items:

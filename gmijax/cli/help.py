@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import itertools
-import sys
 import types
 import typing
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -18,6 +17,9 @@ from gmijax.errors import ConfigError
 
 MANY: Final = 60
 """A command with more keys shows the usual ones unless a topic is named."""
+
+_DEFAULT_WIDTH: Final = 16
+"""Of a column that must leave room for meanings in 80 columns."""
 
 USUAL: Final = (
     *("num_envs", "num_timesteps", "seed", "unroll_length", "policy"),
@@ -64,37 +66,60 @@ def print_help(
       ConfigError: there is no such topic.
     """
     table = Table(box=None, pad_edge=False)
-    for heading in ("key", "default", "meaning"):
-        table.add_column(heading, overflow="fold", no_wrap=heading == "key")
+    table.add_column("key", no_wrap=True)
+    table.add_column("default", overflow="fold", max_width=_DEFAULT_WIDTH)
+    table.add_column("meaning", overflow="fold")
     # Those without a group, such as num_timesteps, are looked for most.
     keys, last = sorted(keys_of(cls, defaults_of), key=lambda key: "." in key.name), ""
-    shown = _of_topic(keys, topic)
+    shown = _of_topic(keys, topic, topics_of(cls))
     for key in shown:
         if key.choice != last:
             table.add_row(f"with {key.choice}:" if key.choice else "")
         last = key.choice
         allowed = f" ({'|'.join(key.allowed)})" if key.allowed else ""
         table.add_row(key.name, key.default, f"{key.meaning}{allowed}")
-    console = Console(width=None if sys.stdout.isatty() else 140, highlight=False, markup=False)
+    console = Console(highlight=False, markup=False)
     console.print(f"usage: {usage_of(name)}")
-    for group in ("env", "algo", "plan"):
+    for group in ("env", "algo", "plan") if topic in (None, "all") else (topic,):
         if group in {key.name.split(".")[0] for key in keys} and len(choices(group)) > 1:
             console.print(f"\n{group}= one of: {', '.join(choices(group))}")
             if group == "env":
                 console.print("or env=PATH.py:FUNCTION, a task of your own (docs/custom-task.md)")
                 console.print(_whose_defaults(name, keys))
+    if any("GMI" in key.meaning for key in shown):
+        console.print("\nA GMI is one process on a share of a GPU, or on CPU cores.")
     console.print()
     console.print(table)
     if len(shown) < len(keys):
-        topics = ", ".join(_topics(keys))
-        console.print(f"\nmore keys: gmijax {name} --help TOPIC, of {topics}, all")
+        topics = ", ".join(topics_of(cls))
+        console.print(f"\nmore keys: gmijax {name} --help TOPIC, of {topics}")
 
 
-def _topics(keys: Sequence[Key]) -> list[str]:
-    return sorted({key.name.partition(".")[0] for key in keys if "." in key.name})
+def topics_of(cls: type[Any]) -> list[str]:
+    """What may stand after `--help`."""
+    return [
+        *sorted({name.partition(".")[0] for _, name, *_ in _documented(cls) if "." in name}),
+        "all",
+    ]
 
 
-def _of_topic(keys: Sequence[Key], topic: str | None) -> list[Key]:
+def allowed_values(cls: type[Any], key: str) -> list[str]:
+    """The values that a key may have, where they are few; of other keys none."""
+    kinds = [kind for _, name, kind, _ in _documented(cls) if name == key]
+    return list(dict.fromkeys(value for kind in kinds for value in _values_of(kind)))
+
+
+def _values_of(kind: Any) -> Iterator[str]:
+    if isinstance(kind, types.UnionType) or typing.get_origin(kind) is typing.Union:
+        for option in typing.get_args(kind):
+            yield from _values_of(option)
+    elif typing.get_origin(kind) is typing.Literal:
+        yield from map(str, typing.get_args(kind))
+    elif kind is bool:
+        yield from ("true", "false")
+
+
+def _of_topic(keys: Sequence[Key], topic: str | None, topics: Sequence[str]) -> list[Key]:
     if topic == "all" or (topic is None and len(keys) <= MANY):
         return list(keys)
     if topic is None:
@@ -102,9 +127,7 @@ def _of_topic(keys: Sequence[Key], topic: str | None) -> list[Key]:
         return [usual[name]._replace(choice="") for name in USUAL if name in usual]
     found = [key for key in keys if key.name.partition(".")[0] == topic]
     if not found:
-        allowed = (*_topics(keys), "all")
-        close = suggestion(topic, allowed)
-        raise ConfigError(f"--help {topic}: no such topic{close or f'; there are {allowed}'}")
+        raise ConfigError(f"--help {topic}: no such topic{suggestion(topic, topics)}")
     return found
 
 
@@ -120,10 +143,8 @@ def _whose_defaults(command: str, keys: Sequence[Key]) -> str:
 def usage_of(command: str) -> str:
     """The form of its command line."""
     if command == "pack":
-        return (
-            "gmijax pack [NAME=VALUE,VALUE ...] [key=value ...] [--cfg job|--json] -- COMMAND ..."
-        )
-    return f"gmijax {command} [key=value ...] [--cfg job] [--help [TOPIC]]"
+        return "gmijax pack [NAME=VALUE,VALUE ...] [key=value ...] [--json] [-v] -- COMMAND ..."
+    return f"gmijax {command} [key=value ...] [-v] [--cfg job] [--help [TOPIC]]"
 
 
 def keys_of(

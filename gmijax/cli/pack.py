@@ -16,6 +16,7 @@ from gmijax.cli.grid import values_of
 from gmijax.config import ClusterConfig
 from gmijax.config.pack import PackConfig
 from gmijax.config.schema import KeyGroup, doc, from_dict, to_dict
+from gmijax.control.console import Show
 from gmijax.errors import ConfigError
 from gmijax.packs.pack import PackWork, pack_of
 from gmijax.sweeps.runner import run_work
@@ -59,8 +60,8 @@ def pack_command(argv: Sequence[str]) -> int:
     def make(words: Sequence[str]) -> PackWork:
         return build_pack(words, program)
 
-    def run(work: PackWork, *, show: bool) -> None:
-        run_work(work, show=show and events is None, events=events)
+    def run(work: PackWork, *, show: Show) -> None:
+        run_work(work, show=show if events is None else False, events=events)
 
     return command("pack", PackKeys, run, words, make=make, shown=_shown)
 

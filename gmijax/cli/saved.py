@@ -14,7 +14,7 @@ from gmijax.runs.folder import RunPaths, given_run
 from gmijax.runs.saved_config import require_known_keys, saved_config
 
 _OF_THE_COMMAND: Final = (
-    *("run.dir", "run.name", "run.resume"),
+    *("run.dir", "run.name", "run.resume", "run.profile"),
     *("env.suite", "env.name", "env.source_sha256", "algo.name"),
 )
 """Keys that are not taken from a run: where it goes on, and of which task and algorithm it is."""

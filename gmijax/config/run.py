@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass
-from typing import Literal
+from typing import Final, Literal
 
 from gmijax.config.schema import KeyGroup, doc
 from gmijax.errors import ConfigError
+
+_MOST_TRACED: Final = 20
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -56,6 +59,11 @@ class RunConfig(Timeouts):
     measure_throughput: bool = doc(
         "after training, also measure simulation alone and simulation with inference"
     )
+    profile: str | None = doc(
+        "trace these iterations for a profile, e.g. 20:25 with both included, counted from 1 when "
+        "the command starts (docs/speed.md); null: none",
+        default=None,
+    )
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -65,6 +73,26 @@ class RunConfig(Timeouts):
             )
         if self.resume == "auto" and self.dir is None and self.name is None:
             raise ConfigError("run.resume=auto: needs run.dir or run.name, the folder to go on in")
+        _ = self.profiled
+
+    @property
+    def profiled(self) -> tuple[int, int] | None:
+        """The first and the last iteration of `profile`; raises ConfigError if it is none."""
+        if self.profile is None:
+            return None
+        match = re.fullmatch(r"([1-9]\d{0,8}):([1-9]\d{0,8})", self.profile, re.ASCII)
+        if match is None or int(match[1]) > int(match[2]):
+            raise ConfigError(
+                f"run.profile={self.profile}: expected FIRST:LAST, two iterations from 1 on, "
+                "e.g. 20:25"
+            )
+        first, last = int(match[1]), int(match[2])
+        if last - first >= _MOST_TRACED:
+            raise ConfigError(
+                f"run.profile={self.profile}: {last - first + 1} iterations; at most "
+                f"{_MOST_TRACED}, because memory holds a trace until it is written"
+            )
+        return first, last
 
 
 @dataclass(frozen=True, kw_only=True)

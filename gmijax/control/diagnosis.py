@@ -10,6 +10,7 @@ from types import MappingProxyType
 from typing import Any, Final, NamedTuple
 
 from gmijax.config import BackendName, StrategyName
+from gmijax.control.features import features
 from gmijax.control.system_info import REQUIRED, SystemInfo, device_of
 from gmijax.errors import ConfigError
 from gmijax.machine.mps_control import PIPE_VARIABLE
@@ -39,7 +40,7 @@ BINDINGS: Final[Mapping[int, str]] = MappingProxyType(
 class Ability(NamedTuple):
     """Something that gmijax has, and whether it can be used here."""
 
-    kind: str  # `backend`, `reducer`, `intra`, `physics` or `env`.
+    kind: str  # `backend`, `reducer`, `intra`, `physics`, `env` or `extra`.
     name: str  # As the configuration has it.
     usable: bool  # Whether it can be used.
     why: str  # The reason, or what to know about it.
@@ -111,6 +112,8 @@ def _abilities(system: SystemInfo) -> Iterator[Ability]:
     yield Ability("env", "gmijax", True, ", ".join(task_names()))
     for suite in SUITES:
         yield _suite(suite)
+    for feature in features(system.versions, system.opengl):
+        yield Ability("extra", *feature)
 
 
 def _about_backend(name: str, machine: Machine) -> str:

@@ -78,6 +78,7 @@ def bar(part: float, width: int = _BAR_WIDTH) -> Text:
 
 
 def clock(seconds: float) -> str:
-    """Seconds as `h:mm:ss`."""
+    """Seconds as `m:ss`, or `h:mm:ss`."""
     minutes, rest = divmod(round(seconds), 60)
-    return f"{minutes // 60}:{minutes % 60:02d}:{rest:02d}"
+    hours = f"{minutes // 60}:{minutes % 60:02d}" if minutes >= 60 else str(minutes)
+    return f"{hours}:{rest:02d}"

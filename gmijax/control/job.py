@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 import os
+import shlex
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager, suppress
@@ -20,9 +21,10 @@ from rich.console import Console
 from gmijax.cluster.cluster_job import ClusterJob
 from gmijax.config import TrainConfig
 from gmijax.config.schema import to_dict
-from gmijax.control.console import ConsoleProgress, announce, open_console
+from gmijax.control.console import Show, announce, nearby, open_console, print_next
 from gmijax.control.decide import Decided, decide, with_task
 from gmijax.control.films import filmed, find_opengl
+from gmijax.control.progress import ConsoleProgress
 from gmijax.control.restarts import (
     Attempts,
     clear_unfinished,
@@ -31,11 +33,12 @@ from gmijax.control.restarts import (
     with_nodes_left,
 )
 from gmijax.control.start_point import StartPoint, find_start_point
-from gmijax.control.summary import train_outcome, train_summary
+from gmijax.control.summary import next_steps, train_outcome, train_summary
 from gmijax.control.wandb_link import followed, require_wandb
 from gmijax.errors import ConfigError
-from gmijax.machine.snapshot import detect_machine
+from gmijax.machine.snapshot import Machine, detect_machine
 from gmijax.partition.plan import Plan
+from gmijax.runs.compile_times import CompileTime
 from gmijax.runs.folder import RunPaths, add_event, read_json, write_json
 from gmijax.runs.git import record_git
 from gmijax.runs.held import OpenFolder, is_locked, locked
@@ -46,6 +49,7 @@ from gmijax.sim import source
 from gmijax.supervise.job_kinds import training_kind
 from gmijax.supervise.run_gmis import Launch, recorded
 from gmijax.supervise.watched_gmi import GmiStatus
+from gmijax.version import versions_of
 
 
 class Result(NamedTuple):
@@ -60,12 +64,12 @@ class Result(NamedTuple):
     summary: dict[str, Any]
 
 
-def train(config: TrainConfig, *, show: bool = False) -> Result:
+def train(config: TrainConfig, *, show: Show = False) -> Result:
     """Trains a policy in the GMIs of a plan, and returns when all have ended.
 
     Args:
       config: see `gmijax.compose`.
-      show: print the plan, live progress and the outcome.
+      show: print the plan, live progress and the outcome; `verbose`: also why the plan is so.
 
     Raises:
       ConfigError: bad input, before anything was started.
@@ -115,6 +119,8 @@ def _train(
             folder.require()  # Whatever else went wrong without it comes from that.
     summary = read_json(run.summary)
     console.print(train_outcome(summary, run))
+    if summary["checkpoint"] is not None:
+        print_next(console, *next_steps(run))
     return Result(run.root, summary)
 
 
@@ -173,7 +179,8 @@ class _Job:
         """Runs it, with restarts; writes the summary however it ends."""
         config, run = self._config, self._run
         new = MetricsReader(run.metrics).new
-        progress = ConsoleProgress(self._console, new, config.num_timesteps)
+        compile_time = CompileTime(_programs_of(config, self._plan, self._machine))
+        progress = ConsoleProgress(self._console, new, config.num_timesteps, compile_time)
 
         def record(status: str, plan: Plan) -> None:
             if not self._folder.is_there():
@@ -236,6 +243,21 @@ class _Job:
             self._console.print(note)
 
 
+def _programs_of(config: TrainConfig, plan: Plan, machine: Machine) -> dict[str, Any]:
+    """What the time to compile a job's programs depends on."""
+    parts = {name: to_dict(getattr(config, name)) for name in ("env", "algo", "physics")}
+    return {
+        **parts,
+        "num_envs": config.num_envs,
+        "throughput": config.run.measure_throughput,
+        "eval": config.eval.every is not None,
+        "layout": plan.layout.gmis_of_gpu,
+        "template": plan.template,
+        "device": plan.backend if plan.backend == "cpu" else machine.gpus[0].name,
+        "versions": versions_of(("gmijax", "jax", "jaxlib", "mujoco-mjx")),
+    }
+
+
 def record_end(
     config: TrainConfig,
     plan: Plan,
@@ -270,16 +292,17 @@ def _finished(config: TrainConfig, run: RunPaths, console: Console) -> Result:
             raise ConfigError(f"{run.plan}: {error}") from None
         summary = train_summary(config, plan, run, "completed", 0.0, [])
         write_json(run.summary, summary)
-    console.print(f"nothing is left to do: {run.root}")
+    console.print(f"nothing is left to do: {nearby(run.root)}")
+    print_next(console, *next_steps(run))
     return Result(run.root, summary)
 
 
 def _what_is_left(run: RunPaths) -> str:
     """Says how an interrupted job can be continued."""
     if run.gmi(0).result.exists() and read_json(run.gmi(0).result)["status"] == "completed":
-        return f"training was complete: {run.root}"
+        return f"training was complete: {nearby(run.root)}"
     if checkpoints_of(run.root):
-        return f"continue with run.resume={run.root}"
+        return f"continue with run.resume={shlex.quote(nearby(run.root))}"
     if not read_metrics(run.metrics):
         return "training had not begun, so there is no checkpoint"
     return "there is no checkpoint: run.stop_timeout_s is the time that GMIs get to save one"

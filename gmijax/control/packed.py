@@ -18,9 +18,10 @@ from typing import NamedTuple
 
 from gmijax.config import TrainConfig
 from gmijax.config.schema import to_dict
-from gmijax.control.console import ConsoleProgress, announce, open_console
+from gmijax.control.console import announce, open_console
 from gmijax.control.decide import decide
 from gmijax.control.job import opened, record_end, started_from
+from gmijax.control.progress import ConsoleProgress
 from gmijax.control.restarts import clear_unfinished, keep_logs
 from gmijax.control.start_point import find_start_point
 from gmijax.control.summary import train_outcome

@@ -7,14 +7,14 @@ import shlex
 from gmijax.autotune.tuner import Search, SearchResult, is_auto, workload_of
 from gmijax.config import TrainConfig
 from gmijax.config.schema import to_dict
-from gmijax.control.console import nearby, open_console
+from gmijax.control.console import Show, nearby, open_console, print_next
 from gmijax.control.decide import with_task
 from gmijax.errors import ConfigError
 from gmijax.machine.snapshot import detect_machine
 from gmijax.runs.folder import create_run, write_json
 
 
-def search(config: TrainConfig, *, show: bool = False) -> SearchResult:
+def search(config: TrainConfig, *, show: Show = False) -> SearchResult:
     """Finds environments per GMI and GMIs per GPU for a training job, where they are `auto`.
 
     Args:
@@ -45,7 +45,7 @@ def search(config: TrainConfig, *, show: bool = False) -> SearchResult:
     console.print(f"run folder: {nearby(started.run.root)}")
     result = started.result()
     if not result.trainers and result.split is None:
-        console.print(f"next: {_training(config, result)}")
+        print_next(console, ("train with these numbers", _training(config, result)))
     return result
 
 

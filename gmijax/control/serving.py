@@ -9,6 +9,7 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 import json
+import shlex
 import time
 from collections.abc import Sequence
 from contextlib import ExitStack
@@ -20,8 +21,9 @@ from rich.console import Console
 
 from gmijax.config import ServeConfig
 from gmijax.config.schema import to_dict
-from gmijax.control.console import ConsoleProgress, announce, open_console
+from gmijax.control.console import Show, announce, nearby, open_console, print_next
 from gmijax.control.decide import decide, with_task
+from gmijax.control.progress import ConsoleProgress
 from gmijax.control.summary import serve_outcome, serve_summary
 from gmijax.errors import ConfigError
 from gmijax.machine.snapshot import Machine
@@ -85,12 +87,12 @@ class _Job(NamedTuple):
         return sum(min(self.data.num_finished(r), each) for r in range(len(self.simulators)))
 
 
-def serve(config: ServeConfig, *, show: bool = False) -> Served:
+def serve(config: ServeConfig, *, show: Show = False) -> Served:
     """Collects experience in the GMIs of a plan, and returns when all have ended.
 
     Args:
       config: see `gmijax.compose(..., command="serve")`.
-      show: print the plan, live progress and the outcome.
+      show: print the plan, live progress and the outcome; `verbose`: also why the plan is so.
 
     Raises:
       ConfigError: bad input, before anything was started.
@@ -123,6 +125,14 @@ def serve(config: ServeConfig, *, show: bool = False) -> Served:
             for folder in folders:
                 folder.require()  # Whatever else went wrong without it comes from that.
     console.print(serve_outcome(summary, run))
+    if shards := [] if job.data is None else list(job.data.finished()):
+        path = json.dumps(nearby(shards[0].arrays))
+        look = f"import numpy; print({{k: v.shape for k, v in numpy.load({path}).items()}})"
+        print_next(console, ("look into the first shard", f"python -c {shlex.quote(look)}"))
+    elif job.data is None:
+        policy = "policy=random" if config.run.dir is None else f"run.dir={config.run.dir}"
+        command = f"gmijax serve {policy} output.dir=data"
+        print_next(console, ("write such experience to files", command))
     return Served(run.root, summary, None if job.data is None else job.data.root)
 
 
@@ -289,8 +299,8 @@ def _announce(console: Console, job: _Job, kept: int, run: RunPaths) -> None:
     )
     announce(console, run, plan, what, job.reasons)
     if job.config.run.dir is not None:
-        console.print(f"policy: {job.config.run.dir}")
+        console.print(f"policy: {nearby(Path(job.config.run.dir))}")
     if kept and job.data is not None:
         console.print(
-            f"continuing {job.data.root}: {kept} of {job.wanted_unrolls} shards are there",
+            f"continuing {nearby(job.data.root)}: {kept} of {job.wanted_unrolls} shards are there",
         )

@@ -12,6 +12,7 @@ import numpy as np
 
 from gmijax.config import ServeConfig, TrainConfig
 from gmijax.control.console import nearby
+from gmijax.control.display import clock
 from gmijax.learning.physics_health import overflow_warnings
 from gmijax.partition.plan import Plan
 from gmijax.runs.folder import RunPaths, read_json
@@ -29,6 +30,9 @@ _RATES = (
 )
 
 _VERSIONS = ("jax", "jaxlib", "mujoco-mjx", "flax", "optax", "orbax-checkpoint")
+
+EXPLORING = "(with exploration noise, mean of the latest episodes)"
+"""What the return is that a job prints while it trains."""
 
 Data = Mapping[str, Any]
 
@@ -57,7 +61,7 @@ def train_summary(
         "env_steps": result.get("env_steps"),
         "wall_s": wall_s,
         **{key: result.get(key) for key in _RATES},
-        **{key: result[key] for key in (*_ASYNCHRONOUS, "start_s") if key in result},
+        **{key: result[key] for key in (*_ASYNCHRONOUS, "start_s", "profile") if key in result},
         "final_return": result.get("final_return"),
         "eval": _evaluations(run),
         "overflow_steps": result.get("overflow_steps") or {},
@@ -96,27 +100,41 @@ def train_outcome(summary: Data, run: RunPaths) -> str:
     times, mean = len(summary["restarts"]), summary["final_return"]
     learnt = "no episode has ended"
     if mean is not None:
-        learnt = f"final return {mean:.2f} (mean of the latest episodes, with exploration noise)"
+        learnt = f"final return {mean:.2f} {EXPLORING}"
     checkpoint = summary["checkpoint"]
     where = "none" if checkpoint is None else nearby(Path(checkpoint))
+    curves = f"curves: {nearby(run.returns_png)}\n" if run.returns_png.exists() else ""
     return (
-        f"{summary['status']}: {summary['env_steps']:,} env steps in {summary['wall_s']:.0f} s, "
-        f"{learnt}{f', started again {times} times' if times else ''}\n"
+        f"{summary['status']}: {summary['env_steps']:,} env steps in {clock(summary['wall_s'])}"
+        f"{f', started again {times} times' if times else ''}\n{learnt}\n"
         f"{_of_rates(summary)}"
-        f"{_of_evaluations(summary.get('eval'))}"
+        f"{_of_evaluations(summary.get('eval'), run)}"
         f"{_of_videos(run)}"
-        f"checkpoint: {where}\nsummary: {nearby(run.summary)}"
+        f"{_of_profile(summary.get('profile'))}"
+        f"checkpoint: {where}\n{curves}summary: {nearby(run.summary)}"
         f"{overflow_warnings(summary['overflow_steps'])}"
-        f"{'' if checkpoint is None else _next(run)}"
     )
 
 
-def _next(run: RunPaths) -> str:
-    """What people do with a trained policy."""
+def next_steps(run: RunPaths) -> tuple[tuple[str, str], ...]:
+    """What people do with a trained policy, see `print_next`."""
     folder = shlex.quote(nearby(run.root))
+    return (("play it without exploration noise, and film it", f"gmijax play run.dir={folder}"),)
+
+
+def _of_profile(found: Data | None) -> str:
+    """Lines about the trace that `run.profile` asked for, or nothing."""
+    if found is None:
+        return ""
+    if found["error"] is not None:
+        return f"profile: the trace could not be written: {found['error']}\n"
+    if found["iterations"] is None:
+        return "profile: none, the command ended before the first iteration of run.profile\n"
+    first, last = found["iterations"]
+    folder = nearby(Path(found["dir"]))
     return (
-        f"\nnext: gmijax play run.dir={folder}  (returns without exploration noise, and a film)"
-        f"\n      tensorboard --logdir {folder}  (curves; or open {nearby(run.returns_png)})"
+        f"profile of the iterations {first} to {last}: {folder}\n"
+        "  open perfetto_trace.json.gz in it at https://ui.perfetto.dev (docs/speed.md)\n"
     )
 
 
@@ -128,21 +146,25 @@ def _of_rates(summary: Data) -> str:
     return f"env steps/s: {', '.join(found)}\n" if found else ""
 
 
-def _of_evaluations(found: Data | None) -> str:
-    """A line, or nothing."""
+def _of_evaluations(found: Data | None, run: RunPaths) -> str:
+    """Lines, or nothing."""
     if not found:
         return ""
+    how = "without" if read_json(run.config)["eval"]["deterministic"] else "with"
     last, best = found["last"], found["best"]
-    where = f", best {best['return']:.2f}: {best['checkpoint']}" if best else ""
-    return (
-        f"evaluation: return {last['return']:.2f} after {last['env_steps']:,} env steps{where}\n"
+    text = (
+        f"evaluation: return {last['return']:.2f} {how} exploration noise, after "
+        f"{last['env_steps']:,} env steps\n"
     )
+    if best:
+        text += f"  best {best['return']:.2f}: {nearby(Path(best['checkpoint']))}\n"
+    return text
 
 
 def _of_videos(run: RunPaths) -> str:
     """A line, or nothing."""
     films = by_steps(run.videos, suffix=".mp4")
-    return f"video: {films[-1]}\n" if films else ""
+    return f"video: {nearby(films[-1])}\n" if films else ""
 
 
 def serve_summary(
@@ -183,16 +205,17 @@ def serve_summary(
 
 def serve_outcome(summary: Data, run: RunPaths) -> str:
     """The summary in a few lines for people."""
+    of_all = " with all GMIs" if len(summary["gmis"]) > 1 else ""
     lines = [
-        f"{summary['status']}: {summary['env_steps']:,} env steps in {summary['wall_s']:.0f} s, "
-        f"{_shown(summary['env_steps_per_s'], ',.0f')} env steps/s with all GMIs "
+        f"{summary['status']}: {summary['env_steps']:,} env steps in {clock(summary['wall_s'])}, "
+        f"{_shown(summary['env_steps_per_s'], ',.0f')} env steps/s{of_all} "
         f"({_shown(summary['step_per_s_inference'], ',.0f')} in the median unroll)",
         f"episodes: {summary['episodes']:,}, mean return {_shown(summary['mean_return'], '.2f')}, "
         f"mean length {_shown(summary['mean_length'], '.0f')}",
     ]
     lines += [
         f"GMI {gmi['gmi']} ({gmi['roles']}): {_shown(gmi['env_steps_per_s'], ',.0f')} env steps/s"
-        for gmi in summary["gmis"]
+        for gmi in (summary["gmis"] if of_all else ())
     ]
     if latency := summary["latency_ms"]:
         lines.append(
@@ -205,10 +228,10 @@ def serve_outcome(summary: Data, run: RunPaths) -> str:
     if output := summary["output"]:
         lines.append(
             f"experience: {output['shards']} shards, {output['env_steps']:,} env steps, "
-            f"{output['bytes'] / 1e6:,.1f} MB in {output['dir']}"
+            f"{output['bytes'] / 1e6:,.1f} MB in {nearby(Path(output['dir']))}"
         )
     warnings = overflow_warnings(summary["overflow_steps"])
-    return "\n".join((*lines, f"summary: {run.summary}")) + warnings
+    return "\n".join((*lines, f"summary: {nearby(run.summary)}")) + warnings
 
 
 def _sums(counts: Sequence[Mapping[str, float]]) -> dict[str, float]:

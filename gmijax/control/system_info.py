@@ -7,11 +7,13 @@ import os
 import subprocess
 import tempfile
 from collections.abc import Mapping
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from types import MappingProxyType
 from typing import Final, NamedTuple
 
 from gmijax.config import PlanConfig, ReduceConfig
+from gmijax.control.features import EXTRAS, OpenGl, find_opengl_here
 from gmijax.errors import GmijaxError
 from gmijax.machine.interpreter import command
 from gmijax.machine.jax_settings import without_breaking
@@ -53,15 +55,21 @@ class SystemInfo(NamedTuple):
     mps_error: str | None = None
     # The one warp-lang that mujoco-mjx was made for, None where it names none.
     wanted_warp: str | None = None
+    opengl: OpenGl | None = None  # What draws films; None: not tried.
 
 
 def inspect_system() -> SystemInfo:
-    """Looks at this machine: asks NVML, jax (in a child), and tries to start an MPS daemon."""
+    """Looks at this machine: asks NVML, jax and OpenGL (in children), tries to start MPS."""
     machine = detect_machine()
+    extras = [package for extra in EXTRAS.values() for package in extra.packages]
+    with ThreadPoolExecutor() as beside:
+        opengl = beside.submit(find_opengl_here)
+        seen = ask_jax(machine)
     return SystemInfo(
         machine=machine,
-        jax=ask_jax(machine),
-        versions=versions_of((*REQUIRED, *_OPTIONAL)),
+        jax=seen,
+        opengl=opengl.result(),
+        versions=versions_of((*REQUIRED, *_OPTIONAL, *extras)),
         variables=dict(os.environ),
         nvml_error=nvml_problem(),
         mps_error=try_mps(machine),

@@ -7,10 +7,13 @@ CPU: nothing is simulated, and GPUs may be training.
 from __future__ import annotations
 
 import importlib.util
+import json
+import shlex
+from pathlib import Path
 from typing import Final
 
 from gmijax.config import ExportConfig, PlanConfig, ReduceConfig, Timeouts
-from gmijax.control.console import doing, open_console
+from gmijax.control.console import Show, doing, nearby, open_console, print_next
 from gmijax.deploy.playing import open_run, output_folder
 from gmijax.errors import ConfigError
 from gmijax.machine.snapshot import detect_machine
@@ -24,7 +27,7 @@ _TIMEOUTS: Final = Timeouts(
 )
 
 
-def export(config: ExportConfig, *, show: bool = False) -> ExportPaths:
+def export(config: ExportConfig, *, show: Show = False) -> ExportPaths:
     """Writes the policy of a checkpoint as files; returns where they are.
 
     Args:
@@ -39,16 +42,22 @@ def export(config: ExportConfig, *, show: bool = False) -> ExportPaths:
     config, _, changed = open_run(config)
     paths = ExportPaths(output_folder(config, "export"))
     console = open_console(show=show)
-    console.print(f"checkpoint: {config.checkpoint}")
+    console.print(f"checkpoint: {nearby(Path(str(config.checkpoint)))}")
     if changed:
         console.print(changed)
     with doing(console, "exporting the policy"):
         run_gmis(_launch(paths))
     if config.format in ("onnx", "all"):
-        console.print(f"ONNX: {paths.onnx}")
+        console.print(f"ONNX: {nearby(paths.onnx)}")
     if config.format in ("stablehlo", "all"):
-        console.print(f"StableHLO: {paths.stablehlo}")
-    console.print(f"metadata: {paths.metadata}")
+        console.print(f"StableHLO: {nearby(paths.stablehlo)}")
+    console.print(f"metadata: {nearby(paths.metadata)}")
+    path = paths.stablehlo if config.format == "stablehlo" else paths.onnx
+    act = (
+        f"import gmijax, numpy; policy = gmijax.load_policy({json.dumps(nearby(path))}); "
+        "print(policy(numpy.zeros(policy.obs_size)))"
+    )
+    print_next(console, ("act with it in Python", f"python -c {shlex.quote(act)}"))
     return paths
 
 

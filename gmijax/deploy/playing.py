@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 import os
+import shlex
 from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import Any, Final, TypeVar
@@ -25,7 +26,8 @@ from gmijax.config import (
     ViewConfig,
 )
 from gmijax.config.schema import to_dict
-from gmijax.control.console import doing, nearby, open_console
+from gmijax.control.console import Show, doing, nearby, open_console, print_next
+from gmijax.control.summary import EXPLORING
 from gmijax.deploy import shipped
 from gmijax.deploy.pictures import film, write_page
 from gmijax.deploy.shipped import SHIPPED
@@ -40,6 +42,7 @@ from gmijax.runs.folder import (
     remove_temporary,
     write_json,
 )
+from gmijax.runs.history import read_metrics
 from gmijax.runs.names import steps_name
 from gmijax.runs.resume import (
     CheckpointMeta,
@@ -68,7 +71,7 @@ _MOST_DIGITS: Final = 18
 """Of env steps; a longer number is no file name."""
 
 
-def play(config: PlayConfig, *, show: bool = False) -> None:
+def play(config: PlayConfig, *, show: Show = False) -> None:
     """Runs one episode per environment with the policy of a checkpoint, and films some of them.
 
     Args:
@@ -103,9 +106,12 @@ def _show(config: PlayConfig, paths: PlayPaths, console: Console) -> None:
     """Prints the returns, and makes the pictures."""
     returns = read_json(paths.returns)
     console.print(_table(returns))
+    if config.checkpoint != SHIPPED and (note := _return_while_training(config, returns)):
+        console.print(note)
     console.print(f"returns: {nearby(paths.returns)}")
     if not paths.model.exists():
         _accept_nothing_to_see(config, returns["env"], console)
+        print_next(console, *_next_steps(config))
         return
     try:
         if config.html != "off":
@@ -115,6 +121,30 @@ def _show(config: PlayConfig, paths: PlayPaths, console: Console) -> None:
     finally:
         # With its textures a robot takes 100 MB, for every checkpoint that is played.
         paths.model.unlink(missing_ok=True)
+    print_next(console, *_next_steps(config))
+
+
+def _return_while_training(config: PlayConfig, returns: Mapping[str, Any]) -> str | None:
+    """A line that says why training printed another return; None where it did not."""
+    lines = read_metrics(RunPaths(Path(str(config.run.dir))).metrics)
+    at_it = [line.get("return") for line in lines if line["env_steps"] == returns["env_steps"]]
+    if not at_it or at_it[-1] is None or not returns["deterministic"]:
+        return None
+    return f"while training: {at_it[-1]:.2f} {EXPLORING}"
+
+
+def _next_steps(config: PlayConfig) -> tuple[tuple[str, str], ...]:
+    if config.checkpoint == SHIPPED:
+        task = config.run.env
+        return (
+            ("watch it in the browser", f"gmijax view env={task} checkpoint={SHIPPED}"),
+            ("train it yourself", f"gmijax train env={task}"),
+        )
+    folder = shlex.quote(nearby(Path(str(config.run.dir))))
+    return (
+        ("watch it in the browser", f"gmijax view run.dir={folder}"),
+        ("write the policy as files for a robot", f"gmijax export run.dir={folder}"),
+    )
 
 
 def _require_page(config: PlayConfig) -> None:

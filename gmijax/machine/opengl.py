@@ -32,19 +32,27 @@ def environment_with(gl: str) -> dict[str, str]:
     return environment
 
 
-def first_opengl(tried: Sequence[str]) -> tuple[str | None, str]:
-    """The first of `tried` that draws here, None for none; and what the last one said."""
+def first_opengl(tried: Sequence[str], timeout_s: float | None = None) -> tuple[str | None, str]:
+    """The first of `tried` that draws here, None for none; and what the last one said.
+
+    One that takes longer than `timeout_s` for a picture does not draw.
+    """
     said = ""
     for gl in tried:
-        done = subprocess.run(
-            command("gmijax.workers.play_film"),
-            env=environment_with(gl),
-            stdin=subprocess.DEVNULL,
-            capture_output=True,
-            text=True,
-            errors="replace",
-            check=False,
-        )
+        try:
+            done = subprocess.run(
+                command("gmijax.workers.play_film"),
+                env=environment_with(gl),
+                stdin=subprocess.DEVNULL,
+                capture_output=True,
+                text=True,
+                errors="replace",
+                timeout=timeout_s,
+                check=False,
+            )
+        except subprocess.TimeoutExpired:
+            said = f"no picture within {timeout_s:g} s"
+            continue
         if done.returncode == 0:
             return gl, ""
         said = next(iter(done.stderr.strip().splitlines()), f"exit code {done.returncode}")

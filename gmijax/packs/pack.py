@@ -13,6 +13,7 @@ from rich.console import Console
 from gmijax.config import ClusterConfig
 from gmijax.config.pack import PackConfig
 from gmijax.config.schema import from_dict, to_dict
+from gmijax.control.console import Show, nearby
 from gmijax.errors import ConfigError
 from gmijax.packs.command_job import (
     CommandJob,
@@ -110,6 +111,10 @@ class PackWork(Work[CommandJob]):
         del hosts, console, signals, scratch
         return self
 
+    def next_step(self, paths: SweepPaths, best: int) -> tuple[str, str]:
+        """See `Work`."""
+        return "read what the best job printed", f"less {shlex.quote(nearby(paths.log(best)))}"
+
     def kind(self, paths: SweepPaths, sites: Sequence[Site]) -> Kind[CommandJob]:
         """See `Work`."""
         cores = [
@@ -135,9 +140,9 @@ class PackWork(Work[CommandJob]):
         self.crowds.append(Crowd(places, sites, hosts, console))
         return self.crowds[-1]
 
-    def warnings(self) -> Sequence[str]:
+    def warnings(self, sites: Sequence[Site]) -> Sequence[str]:
         """See `Work`."""
-        if not self.is_adaptive:
+        if not (self.is_adaptive and sites[0].machine.gpus):
             return ()
         return (
             "pack.jobs_per_gpu=auto: on a GPU one job first, then more while they gain; at most "
@@ -218,7 +223,7 @@ def pack(
     grid: Mapping[str, Sequence[object]] | None = None,
     *,
     run_dir: str | None = None,
-    show: bool = False,
+    show: Show = False,
     **settings: Any,
 ) -> SweepResult:
     """Runs a command with every combination of values, several at a time on every GPU.

@@ -29,6 +29,7 @@ from gmijax.learning.checkpoint import (
 )
 from gmijax.learning.checkpoint_saver import CheckpointSaver
 from gmijax.learning.evaluator import Evaluation, Evaluator, evaluation_worlds
+from gmijax.learning.iteration_trace import IterationTrace
 from gmijax.learning.learner import TrainState, make_learner
 from gmijax.learning.policy_file import save_policy
 from gmijax.learning.report_thread import ReportThread
@@ -93,6 +94,8 @@ class TrainingLoop:
         self._checkpoint: Path | None = None
         keep = config.run.keep_checkpoints
         self._saver = CheckpointSaver(link.run, link.gmi, reducer, keep)
+        traced = config.run.profiled if self._leader else None
+        self._trace = IterationTrace(traced, link.run.profile)
 
     def run(self) -> dict[str, Any]:
         """Trains until `num_timesteps` or until the controller asks for an end.
@@ -136,6 +139,7 @@ class TrainingLoop:
             "overflow_steps": log.overflows.steps,
             "checkpoint": str(self._checkpoint) if self._checkpoint else None,
             "device": describe_device(),
+            **self._trace.outcome(),
         }
         if self._meter is not None and not stopped:
             # Written before: whatever happens to the measurement, the training is done.
@@ -210,9 +214,11 @@ class TrainingLoop:
         every = self._config.run.checkpoint_every
         stop, evaluation = False, None
         while self._env_steps < self._config.num_timesteps and not stop:
-            state, env_state, metrics = self._iteration(state, env_state)
-            self._env_steps += self._steps_per_iteration
             self._iterations += 1
+            self._trace.begin(self._iterations, self._iteration.wait)
+            state, env_state, metrics = self._iteration(state, env_state)
+            self._trace.end(self._iterations, self._iteration.wait)
+            self._env_steps += self._steps_per_iteration
             evaluation = self._evaluate(state)
             thread.report(self._env_steps, metrics, self._times(), evaluation)
             # Counted from the run's start, so that it says the same after a restart.
@@ -224,6 +230,7 @@ class TrainingLoop:
                 self._save(state, env_state, thread, log, evaluation)
         self._save(state, env_state, thread, log, evaluation)
         self._checkpoint = self._saver.finish()
+        self._trace.close()  # Last: a job that is told to end has little time to save.
         return state, env_state, stop
 
     def _evaluate(self, state: TrainState) -> Evaluation | None:

@@ -83,6 +83,7 @@ class RunPaths(_Folder):
         self.returns_png = root / "returns.png"
         self.checkpoints = root / "checkpoints"
         self.videos = root / "videos"
+        self.profile = root / "profile"  # The trace of some iterations.
         self.filmed_model = self.videos / "model.mjb"  # While there is something left to film.
         self.mps = root / "mps"  # Logs of MPS daemons that the job starts.
         self.janitor_log = root / "janitor.log"  # Errors of the janitor; gone without any.
@@ -116,7 +117,7 @@ class RunPaths(_Folder):
         """The trajectory of which that film is to be made; gone when it has been."""
         return self.video(env_steps).with_suffix(".npz")
 
-    def profile(self, name: str) -> RunPaths:
+    def search_profile(self, name: str) -> RunPaths:
         """The run folder of a profile of a search; it keeps no checkpoints."""
         return RunPaths(self.root / "profiles" / name)
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import os
 import re
+from contextlib import suppress
 from pathlib import Path
 from typing import Final
 
@@ -61,3 +62,10 @@ def _named(folder: Path, form: str) -> list[Path]:
     except OSError as error:
         raise ConfigError(f"{folder}: cannot be read ({error.strerror})") from None
     return [folder / name for name in names if re.fullmatch(form, name)]
+
+
+def nearby(path: Path) -> str:
+    """A path as it is typed from the working directory, if that is shorter."""
+    with suppress(ValueError, OSError):
+        return str(path.relative_to(Path.cwd()))
+    return str(path)

@@ -79,10 +79,12 @@ def choose_impl(
         return "warp", _GIVEN
     if not is_gpu:
         return "jax", f"MJX-Warp is slow on {device_platform}"
-    if not warp_installed:
-        return "jax", "warp-lang is not installed"
     if task in ON_GPU:
-        return "warp", f"the faster one for {task} on a GPU"
-    if task is not None and task.startswith("playground/"):
-        return "warp", "what MuJoCo Playground itself chooses"
-    return "jax", "not tuned for MJX-Warp; ask for it with physics.impl=warp"
+        why = f"the faster one for {task} on a GPU"
+    elif task is not None and task.startswith("playground/"):
+        why = "what MuJoCo Playground itself chooses"
+    else:
+        return "jax", "not tuned for MJX-Warp; ask for it with physics.impl=warp"
+    if warp_installed:
+        return "warp", why
+    return "jax", f"warning: warp, {why}, needs warp-lang (pip install 'gmijax[warp]')"

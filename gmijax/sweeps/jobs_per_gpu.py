@@ -21,6 +21,7 @@ from gmijax.autotune.store import ProfileStore
 from gmijax.autotune.tuner import workload_of
 from gmijax.clock import running_s
 from gmijax.config.sweep import SweepConfig
+from gmijax.control.console import is_verbose
 from gmijax.errors import GmijaxError, JobInterrupted, NodeLost
 from gmijax.runs.cache import cache_folder
 from gmijax.runs.folder import read_json
@@ -74,7 +75,8 @@ def with_jobs_per_gpu(
     if not hosts[0].machine.gpus:
         fewest = min(len(host.machine.cpu_cores) for host in hosts)
         count = max(1, fewest // CORES_OF_A_JOB)
-        console.print(f"sweep.jobs_per_gpu={count}: {CORES_OF_A_JOB} cores for each job")
+        if is_verbose(console):
+            console.print(f"sweep.jobs_per_gpu={count}: {CORES_OF_A_JOB} cores for each job")
         return dataclasses.replace(settings, jobs_per_gpu=count)
     kinds: dict[object, Job] = {}
     for job in jobs:
@@ -203,7 +205,7 @@ def _profile(
 
 def _copy(job: Job, seed: int, num_timesteps: int) -> Job:
     run = dataclasses.replace(
-        job.config.run, checkpoint_every=0, measure_throughput=False, max_restarts=0
+        job.config.run, checkpoint_every=0, measure_throughput=False, max_restarts=0, profile=None
     )
     config = dataclasses.replace(
         job.config,

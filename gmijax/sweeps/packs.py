@@ -91,6 +91,7 @@ def why_alone(job: Job) -> str | None:
         (config.env.randomize != "off", f"env.randomize={config.env.randomize}"),
         (config.eval.every is not None, "eval.every"),
         (config.wandb.mode != "off", f"wandb.mode={config.wandb.mode}"),
+        (config.run.profile is not None, "run.profile"),
     ):
         if found:
             return why

@@ -20,8 +20,8 @@ class Place:
 
     Attributes:
       slices: one of each of its GPUs.
-      label: in words, e.g. `GPU 0 place 1` by the index of nvidia-smi; without GPUs `place 1`, on
-        a node after its address.
+      label: in words, e.g. `GPU 0 place 1` by the index of nvidia-smi, on a node after its
+        address; without GPUs the address alone, or nothing.
       kept_free: others of its GPUs, where nobody else runs meanwhile.
       joined: others of its GPU, whose memory and cores it has too.
       site: index of its machine.
@@ -225,6 +225,7 @@ def _labels(site: Site) -> dict[int, str]:
     labels: dict[int, str] = {}
     for here in _by_gpu(site.plan.slices).values():
         for place, share in enumerate(here):
-            gpu = f"GPU {index_of[share.device]} " if share.device in index_of else ""
-            labels[share.gmi] = f"{node}{gpu}place {place}"
+            is_gpu = share.device in index_of
+            gpu = f"GPU {index_of[share.device]} place {place}" if is_gpu else ""
+            labels[share.gmi] = f"{node}{gpu}".rstrip()
     return labels

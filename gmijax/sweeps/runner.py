@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shlex
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, closing, contextmanager
@@ -11,7 +12,7 @@ from typing import Any, NamedTuple, TextIO
 
 from rich.console import Console
 
-from gmijax.control.console import open_console
+from gmijax.control.console import Show, nearby, open_console, print_next
 from gmijax.errors import ConfigError, JobInterrupted, SweepFailed
 from gmijax.machine.snapshot import detect_machine
 from gmijax.runs.folder import RUNS, given_run, read_json, write_json
@@ -46,7 +47,7 @@ class SweepResult(NamedTuple):
     report: dict[str, Any]
 
 
-def run_work(work: Work[J], *, show: bool = False, events: TextIO | None = None) -> SweepResult:
+def run_work(work: Work[J], *, show: Show = False, events: TextIO | None = None) -> SweepResult:
     """Runs all jobs, as many at a time as the settings say, and compares them.
 
     Called again with the same work and folder, it runs those that are not complete.
@@ -89,7 +90,7 @@ def _run(
         jobs, study = _beginning(work, paths)
         report = Report(jobs, work.ranking, work.described, paths, folder, started_s)
         report.begin()
-    console.print(f"{work.name} folder: {paths.root}")
+    console.print(f"{work.name} folder: {nearby(paths.root)}")
     view = SweepView(console, jobs, work.ranking)
     told = JobEvents(events, work.name, jobs, paths)
     try:
@@ -101,7 +102,9 @@ def _run(
             error.add_note(wrong)
         told.end(report.data)
         if isinstance(error, JobInterrupted | SweepFailed):
-            error.add_note(f"the same command with run.dir={paths.root} goes on")
+            error.add_note(
+                f"the same command with run.dir={shlex.quote(nearby(paths.root))} goes on"
+            )
         raise
     failed = [job for job in jobs if job.progress.state == "failed"]
     wrong = report.end("failed" if failed else "completed")
@@ -113,6 +116,8 @@ def _run(
         wrong = f"{text}{first.progress.error}{'' if wrong is None else f'; {wrong}'}"
     if wrong is not None:
         raise SweepFailed(wrong)
+    if report.data["ranking"]:
+        print_next(console, work.next_step(paths, report.data["ranking"][0]))
     return SweepResult(paths.root, report.data)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -12,6 +13,7 @@ from rich.console import Console
 from gmijax.config import ClusterConfig, TrainConfig
 from gmijax.config.schema import from_dict, to_dict
 from gmijax.config.sweep import SweepConfig
+from gmijax.control.console import Show, nearby
 from gmijax.control.decide import with_task
 from gmijax.errors import ConfigError
 from gmijax.runs.folder import RunPaths
@@ -78,6 +80,11 @@ class SweepWork(Work[Job]):
         settings = with_jobs_per_gpu(self.ranking, self.jobs, hosts, console, signals, scratch)
         return replace(self, settings=settings)
 
+    def next_step(self, paths: SweepPaths, best: int) -> tuple[str, str]:
+        """See `Work`."""
+        folder = shlex.quote(nearby(paths.run_dir(best)))
+        return "play the best one, and film it", f"gmijax play run.dir={folder}"
+
     def kind(self, paths: SweepPaths, sites: Sequence[Site]) -> Kind[Job]:
         """See `Work`."""
         del sites
@@ -95,8 +102,9 @@ class SweepWork(Work[Job]):
         """See `Work`."""
         return self.grid_identity()
 
-    def warnings(self) -> Sequence[str]:
+    def warnings(self, sites: Sequence[Site]) -> Sequence[str]:
         """See `Work`."""
+        del sites
         warning = why_not_comparable(self.jobs, self.ranking)
         return () if warning is None else (warning,)
 
@@ -114,7 +122,7 @@ def sweep_of(
     return SweepWork(settings, space, make_job, tuple(jobs), cluster or ClusterConfig(), folder)
 
 
-def sweep(configs: Sequence[TrainConfig], *, show: bool = False, **settings: Any) -> SweepResult:
+def sweep(configs: Sequence[TrainConfig], *, show: Show = False, **settings: Any) -> SweepResult:
     """Trains with every configuration, several at a time on every GPU, and compares them.
 
     Examples:
@@ -138,7 +146,7 @@ def sweep(configs: Sequence[TrainConfig], *, show: bool = False, **settings: Any
     return run_sweep(work, show=show)
 
 
-def run_sweep(work: SweepWork, *, show: bool = False) -> SweepResult:
+def run_sweep(work: SweepWork, *, show: Show = False) -> SweepResult:
     """Trains all jobs; see `run_work`."""
 
     def pinned(job: Job) -> Job:

@@ -11,16 +11,14 @@ from rich.text import Text
 
 from gmijax.config.sweep import Ranking
 from gmijax.control.display import LiveDisplay, bar, clock
-from gmijax.sweeps.kind import AnyJob, trainings_per_hour
+from gmijax.sweeps.kind import AnyJob, label_of, trainings_per_hour
 from gmijax.sweeps.progress import Progress
 from gmijax.sweeps.report import shown
 
-_HEADINGS = (
-    *("job", "overrides", "GPU and place", "progress", "steps/s", "{}", "ranked by"),
-    *("ETA", "state"),
-)
+_WHERE = "GPU and place"
+_HEADINGS = ("job", "overrides", _WHERE, "progress", "steps/s", "{}", "ranked by", "ETA", "state")
 _MOST_ROWS = 30
-_BAR_WIDTH = 10
+_BAR_WIDTH = 6
 _ORDER = ("running", "failed", "interrupted", "waiting", "pruned", "completed")
 
 
@@ -56,9 +54,10 @@ class SweepView:
         counts = ", ".join(f"{states.count(state)} {state}" for state in _ORDER if state in states)
         running = [job.progress for job in self._jobs if job.progress.state == "running"]
         rate = sum(progress.env_steps_per_s for progress in running)
-        per_hour = trainings_per_hour(self._jobs) or 0.0
-        steps = f"{rate:,.0f} steps/s, " if rate else ""
-        return f"{counts}; {steps}{per_hour:,.1f} runs/h"
+        per_hour = trainings_per_hour(self._jobs)
+        parts = [f"{rate:,.0f} steps/s"] if rate else []
+        parts += [f"{per_hour:,.1f} runs/h"] if per_hour else []
+        return "; ".join(filter(None, (counts, ", ".join(parts))))
 
     def _show(self) -> Group | None:
         self._print_changes()
@@ -77,7 +76,8 @@ class SweepView:
     def _change(self, job: AnyJob, progress: Progress) -> str:
         what = f"{' '.join(filter(None, ('job', str(job.number), job.label)))}: {progress.state}"
         if progress.state == "running":
-            return f"{what} on {progress.place}{f' ({progress.note})' if progress.note else ''}"
+            where = f" on {progress.place}" if progress.place else ""
+            return f"{what}{where}{f' ({progress.note})' if progress.note else ''}"
         if progress.error:
             return f"{what}: {progress.error}"
         value = shown(progress.value, progress.is_full, progress.episodes)
@@ -86,13 +86,19 @@ class SweepView:
 
     def _table(self) -> Table:
         table = Table(box=None, pad_edge=False)
-        for heading in _HEADINGS:
+        headings = list(_HEADINGS)
+        if not (has_places := any(job.progress.place for job in self._jobs)):
+            headings.remove(_WHERE)  # On one machine without GPUs.
+        for heading in headings:
             name = heading.format(self._ranking.objective)
             is_long = heading in ("overrides", "state")
-            table.add_column(name, no_wrap=not is_long, min_width=8 if is_long else None)
+            width = 8 if is_long else None
+            table.add_column(name, no_wrap=not is_long, min_width=width, overflow="fold")
         rows = sorted(self._jobs, key=lambda job: _ORDER.index(job.progress.state))
+        names = _short_names(self._jobs)
         for job in rows[:_MOST_ROWS]:
-            table.add_row(*_row(job, job.progress))
+            label = label_of({names[key]: value for key, value in job.overrides.items()})
+            table.add_row(*_row(job, job.progress, label, has_places=has_places))
         if len(rows) > _MOST_ROWS:
             table.add_row("", f"and {len(rows) - _MOST_ROWS} more")
         return table
@@ -104,21 +110,32 @@ def _ranked(progress: Progress) -> str:
     return f"{progress.value:.4g}{'' if progress.is_full else ' (early)'}"
 
 
-def _row(job: AnyJob, progress: Progress) -> tuple[str | Text, ...]:
+def _short_names(jobs: Sequence[AnyJob]) -> dict[str, str]:
+    """Keys without their groups, where that names one key: `learning_rate`."""
+    keys = {key: key.rpartition(".")[2] for job in jobs for key in job.overrides}
+    last = list(keys.values())
+    return {key: name if last.count(name) == 1 else key for key, name in keys.items()}
+
+
+def _row(
+    job: AnyJob, progress: Progress, label: str, *, has_places: bool
+) -> tuple[str | Text, ...]:
     total, rate = job.num_timesteps, progress.env_steps_per_s
     part = min(progress.env_steps / total, 1.0) if total else None
     left_s = max(0.0, total - progress.env_steps) / rate if rate and total else None
     done = f" {progress.env_steps:,}" if part is None else f" {part:.0%}"
     words = filter(None, (progress.error, progress.note))
+    is_silent = progress.state == "running" and total and not progress.env_steps
+    state = "starting" if is_silent else progress.state
     return (
         str(job.number),
         # As text: overrides and errors may look like markup.
-        Text(job.label),
-        progress.place,
+        Text(label),
+        *((progress.place,) if has_places else ()),
         Text(done.strip()) if part is None else Text.assemble(bar(part, _BAR_WIDTH), done),
         f"{rate:,.0f}" if rate else "",
         "" if progress.latest is None else f"{progress.latest:.4g}",
         _ranked(progress),
         "" if left_s is None else clock(left_s),
-        Text(": ".join((progress.state, *words))),
+        Text(": ".join((state, *words))),
     )

@@ -8,6 +8,7 @@ from typing import Any
 from rich.console import Console
 
 from gmijax.config.sweep import Ranking
+from gmijax.control.console import nearby, print_reasons
 from gmijax.sweeps.kind import J
 from gmijax.sweeps.paths import SweepPaths
 from gmijax.sweeps.places import Site
@@ -35,9 +36,8 @@ def announce(
     places = sum(len(site.plan.slices) for site in sites)
     at_once = f"at most {places}" if work.is_adaptive and sites[0].machine.gpus else str(places)
     console.print(f"{_counted(total, 'job')}{more}, {at_once} at a time {_where(sites)}")
-    for reason in dict.fromkeys(reason for site in sites for reason in site.plan.reasons):
-        console.print(f"  {reason}")
-    for warning in work.warnings():
+    print_reasons(console, [reason for site in sites for reason in site.plan.reasons])
+    for warning in work.warnings(sites):
         console.print(f"  {warning}")
 
 
@@ -52,9 +52,10 @@ def print_outcome(
     for table in tables(report, ranking):
         console.print(table)
         console.print()
-    console.print(f"{line}\nsummary: {paths.sweep}\ntables: {paths.settings}, {paths.table}")
+    console.print(f"{line}\nsummary: {nearby(paths.sweep)}")
+    console.print(f"tables: {nearby(paths.settings)}, {nearby(paths.table)}")
     if paths.curves.exists():
-        console.print(f"curves: {paths.curves}")
+        console.print(f"curves: {nearby(paths.curves)}")
 
 
 def _where(sites: Sequence[Site]) -> str:

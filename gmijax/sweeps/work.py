@@ -103,6 +103,10 @@ class Work(ABC, Generic[J]):
         """The same with everything decided that has to be measured first; the GPUs are held."""
 
     @abstractmethod
+    def next_step(self, paths: SweepPaths, best: int) -> tuple[str, str]:
+        """What to type after it, and what for; `best` is the number of the best job."""
+
+    @abstractmethod
     def kind(self, paths: SweepPaths, sites: Sequence[Site]) -> Kind[J]:
         """What the scheduler asks."""
 
@@ -125,7 +129,7 @@ class Work(ABC, Generic[J]):
     def identity(self) -> dict[str, Any]:
         """What must be the same where a command goes on."""
 
-    def warnings(self) -> Sequence[str]:
+    def warnings(self, sites: Sequence[Site]) -> Sequence[str]:
         """What is to be said before the first job."""
         return ()
 

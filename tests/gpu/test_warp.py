@@ -36,6 +36,7 @@ def test_a_task_trains_and_no_buffer_is_too_small(
         f"env={task}",
         f"env.randomize={randomize}",
         f"num_timesteps={steps}",
+        "--verbose",
         cwd=tmp_path,
         timeout_s=1100.0,
     )

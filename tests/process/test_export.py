@@ -30,7 +30,8 @@ def exported(tmp_path_factory: pytest.TempPathFactory) -> ExportPaths:
     assert done.returncode == 0, done.stderr
     paths = ExportPaths(run.root / "export" / f"{ENV_STEPS:012d}")
     for path in (paths.onnx, paths.stablehlo, paths.metadata):
-        assert str(path) in done.stdout
+        assert f": {path.relative_to(home)}\n" in done.stdout
+    assert done.stdout.splitlines()[-1].startswith("  python -c 'import gmijax")
     assert not list(paths.root.glob(".policy*")), "nothing half written"
     return paths
 

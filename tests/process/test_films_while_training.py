@@ -23,7 +23,7 @@ def test_the_last_evaluation_is_filmed_and_nothing_is_left_to_film(tmp_path: Pat
     names = [f"{k * STEPS:012d}.mp4" for k in (2, 3)]
     # The first one may have been waiting yet when the second came.
     assert sorted(path.name for path in (run / "videos").iterdir()) in (names, names[1:])
-    assert f"video: {run / 'videos' / names[1]}\n" in done.stdout
+    assert f"video: run/videos/{names[1]}\n" in done.stdout
     assert not (run / "film.log").exists()
 
     film = str(run / "videos" / names[1])

@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import json
 import os
+import re
 import signal
 from contextlib import suppress
 from pathlib import Path
@@ -112,7 +113,8 @@ def test_a_job_whose_controller_is_killed_goes_on_from_its_checkpoint(tmp_path: 
     # Both seeds are one setting, and it comes first.
     assert out.index("interquartile mean") < out.index("overrides")
     for name in ("sweep.json", "settings.csv", "sweep.csv", "sweep.png"):
-        assert str(tmp_path / "all" / name) in "".join(out.split("\n")[-6:])
+        assert f" all/{name}" in "".join(out.split("\n")[-9:])
+    assert re.search(r"\n  gmijax play run\.dir=all/00[01]\n$", out)
 
 
 def controller_of(order: Path) -> int:

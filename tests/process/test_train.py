@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gzip
 import json
 import random
 import signal
@@ -49,7 +50,7 @@ def two_gmis(tmp_path_factory: pytest.TempPathFactory) -> Path:
         patch.setenv("XDG_CACHE_HOME", str(cwd / "cache"))
         done = train(
             *POINT, *SAME, "plan.gmis_per_gpu=2", "reduce.selection=measured", "run.dir=run",
-            "run.measure_throughput=true", "run.checkpoint_every=3", cwd=cwd,
+            "run.measure_throughput=true", "run.checkpoint_every=3", "-v", cwd=cwd,
         )  # fmt: skip
     assert done.returncode == 0, done.stderr
     assert "Algorithm 1 says mpr" in done.stdout
@@ -109,7 +110,7 @@ def test_the_strategy_is_the_fastest_of_those_that_were_measured(two_gmis: Path)
 
 @pytest.mark.timeout(300)
 def test_two_gmis_compute_what_one_process_with_all_environments_does(two_gmis: Path) -> None:
-    done = train(*POINT, *SAME, "num_envs=32", "run.dir=one", cwd=two_gmis.parent)
+    done = train(*POINT, *SAME, "num_envs=32", "run.dir=one", "-v", cwd=two_gmis.parent)
     assert done.returncode == 0, done.stderr
     assert "Algorithm 1 says mpr" not in done.stdout
     one = learner_arrays(two_gmis.parent / "one")
@@ -196,3 +197,18 @@ def test_kills_at_any_moment_leave_nothing(plan: tuple[str, ...], tmp_path: Path
         kill_somebody(*plan, cwd=tmp_path / str(number), draw=draw, within_s=(0.3, 7.0))
     require_gone(shared_memory, shm)
     require_gone(mps_directories, pipes)
+
+
+@pytest.mark.timeout(300)
+@pytest.mark.parametrize("how", ["plan.gmis_per_gpu=2", "algo=a3c"])
+def test_iterations_of_the_leader_are_traced_for_a_profile(how: str, tmp_path: Path) -> None:
+    steps = f"num_timesteps={12 * 2 * STEPS}"
+    done = train(*POINT, how, steps, "run.profile=2:3", "run.dir=run", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    run = tmp_path / "run"
+    [path] = run.glob("profile/plugins/profile/*/perfetto_trace.json.gz")
+    events = json.loads(gzip.decompress(path.read_bytes()))["traceEvents"]
+    found = {e["args"]["step_num"] for e in events if e.get("name") == "iteration"}
+    assert found == {"2", "3"}
+    assert _read(run / "summary.json")["profile"]["iterations"] == [2, 3]
+    assert "profile of the iterations 2 to 3: run/profile\n" in done.stdout

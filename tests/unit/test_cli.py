@@ -15,11 +15,18 @@ import gmijax
 from gmijax.cli.command import command
 from gmijax.cli.compose import compose, defaults
 from gmijax.cli.grid import SweepHelp
-from gmijax.cli.help import USUAL, keys_of
-from gmijax.config import PlayConfig, ServeConfig, TrainConfig
+from gmijax.cli.groups import choices
+from gmijax.cli.help import USUAL, keys_of, print_help, topics_of
+from gmijax.cli.pack import PackKeys
+from gmijax.config import ExportConfig, PlayConfig, ServeConfig, TrainConfig
 from gmijax.errors import ConfigError
 
 LONG = "a" * 300
+COMMANDS = {
+    **dict.fromkeys(("train", "search"), TrainConfig),
+    **{"serve": ServeConfig, "sweep": SweepHelp, "pack": PackKeys},
+    **{"play": PlayConfig, "export": ExportConfig},
+}
 A3C = "algo=a3c"
 APART = "plan.serving_gpus, plan.training_gpus: GPUs [1] both act and train and others"
 
@@ -31,7 +38,11 @@ REFUSED: list[tuple[str, str, str]] = [
     ("train", "algo.gamma=0.9", "unknown key algo.gamma"),
     ("train", "+foo.bar=1", "unknown key foo"),
     ("train", "hydra.run.dir=x", "unknown key hydra.run.dir: did you mean run.dir?"),
-    ("train", "--verbose", "unknown option --verbose"),
+    (
+        "train",
+        "--quiet",
+        "unknown option --quiet: allowed are --help, --verbose, --cfg job, key=value",
+    ),
     ("train", "ant", "ant: expected key=value; did you mean env=ant?"),
     ("train", "humanod", "humanod: expected key=value; did you mean env=humanoid?"),
     ("train", "a3c", "a3c: expected key=value; did you mean algo=a3c?"),
@@ -272,6 +283,27 @@ def test_help_shows_the_usual_keys_or_those_of_a_topic(capsys: pytest.CaptureFix
     assert "\nrun.dir " not in said
     assert command("train", TrainConfig, gmijax.train, ["--help", "plam"]) == 2
     assert "--help plam: no such topic: did you mean plan?" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+@pytest.mark.parametrize("topic", [None, "all"])
+def test_help_fits_eighty_columns(
+    name: str,
+    topic: str | None,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+):
+    monkeypatch.setenv("COLUMNS", "80")
+    print_help(name, COMMANDS[name], partial(defaults, name), choices, topic)
+    assert max(map(len, capsys.readouterr().out.splitlines())) <= 80
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+def test_every_topic_of_every_command_has_help(name: str, capsys: pytest.CaptureFixture[str]):
+    for topic in topics_of(COMMANDS[name]):
+        print_help(name, COMMANDS[name], partial(defaults, name), choices, topic)
+        said = capsys.readouterr().out
+        assert topic == "all" or f"\n{topic}." in said
 
 
 def test_every_usual_key_is_one_of_a_command():

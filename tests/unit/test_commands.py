@@ -133,6 +133,8 @@ def test_list_envs_names_tasks_and_suites(capsys: pytest.CaptureFixture[str]):
         ("gmijax train env=an", ["env=ant", "env=anymal"]),
         ("gmijax train env=ant plan.gm", ["plan.gmis_per_gpu="]),
         ("gmijax play vid", ["video=", "video_envs="]),
+        ("gmijax train plan.template=tdg", ["plan.template=tdg", "plan.template=tdg_ex"]),
+        ("gmijax train --help ev", ["eval"]),
         ("gmijax doctor ", []),
     ],
 )

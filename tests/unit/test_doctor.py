@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import json
+import re
 import subprocess
 import sys
+import tomllib
 from pathlib import Path
 from typing import Any
 
@@ -12,13 +14,15 @@ import fake_nvml
 import pynvml
 import pytest
 from fake_nvml import A100_SEVEN, H200_MIG_EMPTY, H200_MIG_OFF, Board, machine_of
-from rich.console import Console
-from supervision import MPS
+from supervision import CHECKOUT, MPS
 
 from gmijax import doctor
 from gmijax.control import system_info
+from gmijax.control.console import UserConsole
 from gmijax.control.diagnosis import Diagnosis, diagnose
+from gmijax.control.features import EXTRAS, OpenGl, features
 from gmijax.control.system_info import REQUIRED, JaxView, SystemInfo, ask_jax, try_mps
+from gmijax.machine import opengl
 
 PLUGINS = ("jax-cuda12-plugin", "jax-cuda13-plugin")
 INSTALLED = dict.fromkeys((*REQUIRED, *PLUGINS, "warp-lang"), "1.0")
@@ -193,7 +197,7 @@ def test_the_report_names_everything(
     found = diagnose(system(monkeypatch, (A100_SEVEN, H200_MIG_EMPTY)))
     plain = json.loads(json.dumps(found.to_dict()))
     assert plain["gpus"][0]["instances"][6]["num_sms"] == 14
-    doctor.show(found, Console(markup=False, width=140, soft_wrap=True))
+    doctor.show(found, UserConsole(markup=False, width=140, soft_wrap=True))
     said = capsys.readouterr().out
     for part in ("1g.10gb: 14 SMs", "MIG on", "[[0],[1]]", "problem: GPU 1", "NVIDIA H200"):
         assert part in said
@@ -212,7 +216,7 @@ def test_exit_code_says_whether_something_is_broken(
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [
-        (["--jsn"], "--jsn: allowed are --json, mig=SIZES"),
+        (["--jsn"], "--jsn: allowed are --json, --verbose, mig=SIZES"),
         (["gpu=1"], "gpu=1: only together with mig="),
         (["mig=3g", "--json"], "--json: not together with mig="),
         (["mig=3g", "cluster=auto"], "cluster=auto: not together with mig="),
@@ -242,3 +246,59 @@ def test_commands_for_a_split_are_printed(
     assert doctor.main(["mig=3g,2g,1g,1g"]) == 0
     said = capsys.readouterr().out
     assert "sudo nvidia-smi mig -i 1 -cgi 3g.71gb:4,2g.35gb:2,1g.18gb:1,1g.18gb:0 -C\n" in said
+
+
+@pytest.mark.parametrize(
+    ("name", "versions", "usable", "why"),
+    [
+        ("ONNX", {"jax2onnx": "1", "onnx": "1", "onnxruntime": "1"}, True, "gmijax export"),
+        ("ONNX", {"onnx": "1"}, False, "pip install 'gmijax[export]'"),
+        ("Optuna", {}, False, "pip install 'gmijax[sweep]'"),
+        ("TensorBoard", {"tensorboard": "2.20"}, True, "tensorboard --logdir"),
+        ("viewer", {"viser": None}, False, "pip install 'gmijax[view]'"),
+    ],
+)
+def test_an_extra_works_or_has_the_line_that_mends_it(
+    name: str, versions: dict[str, str | None], usable: bool, why: str
+):
+    [found] = [feature for feature in features(versions, None) if feature.name == name]
+    assert found.usable == usable
+    assert why in found.why
+
+
+def test_films_say_with_what_they_are_drawn_or_what_is_missing():
+    drawn, not_drawn = (next(features({}, gl)) for gl in (OpenGl("egl"), OpenGl(None, "no EGL")))
+    assert drawn == ("films", True, "a picture was drawn with egl")
+    assert not_drawn == ("films", False, "no EGL")
+
+
+def test_an_opengl_that_hangs_does_not_draw(monkeypatch: pytest.MonkeyPatch):
+    asleep = [sys.executable, "-c", "import time; time.sleep(60)"]
+    monkeypatch.setattr(opengl, "command", lambda _: asleep)
+    assert opengl.first_opengl(("egl",), 0.2) == (None, "no picture within 0.2 s")
+
+
+def test_the_packages_of_extras_are_those_that_pip_installs():
+    with (CHECKOUT / "pyproject.toml").open("rb") as file:
+        brought = tomllib.load(file)["project"]["optional-dependencies"]
+    for extra in EXTRAS.values():
+        name = extra.install.strip("'").removeprefix("gmijax[").removesuffix("]")
+        if name in brought:
+            packages = {re.split(r"[>=~<;\[]", line)[0] for line in brought[name]}
+            assert set(extra.packages) <= packages
+
+
+def test_without_a_gpu_the_table_has_what_only_gpus_have_for_those_who_ask(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+):
+    console = UserConsole(markup=False, width=80, soft_wrap=True)
+    for boards, verbose, shown in (
+        ((), False, False),
+        ((), True, True),
+        ((H200_MIG_OFF,), False, True),
+    ):
+        console.is_verbose = verbose
+        doctor.show(diagnose(system(monkeypatch, boards, jax=CPU)), console)
+        said = capsys.readouterr().out
+        assert ("\nreducer" in said) == ("\nbackend" in said) == shown
+        assert "\nphysics" in said

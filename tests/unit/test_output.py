@@ -6,6 +6,7 @@ import io
 import os
 import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -15,13 +16,16 @@ from rich.text import Text
 from supervision import CHECKOUT, machine
 
 from gmijax.config import PlanConfig, ReduceConfig
-from gmijax.control.console import ConsoleProgress, announce, doing, nearby, open_console
+from gmijax.control import progress
+from gmijax.control.console import Show, announce, doing, nearby, open_console, print_next
 from gmijax.control.display import LiveDisplay
-from gmijax.control.summary import train_outcome
+from gmijax.control.progress import ConsoleProgress
+from gmijax.control.summary import next_steps, train_outcome
 from gmijax.deploy import playing
 from gmijax.errors import printable
 from gmijax.partition.planner import make_plan
-from gmijax.runs.folder import RunPaths
+from gmijax.runs.compile_times import CompileTime
+from gmijax.runs.folder import RunPaths, write_json
 from gmijax.supervise.failures import last_line
 from gmijax.supervise.watched_gmi import GmiStatus
 
@@ -119,15 +123,10 @@ def test_without_a_terminal_a_line_is_printed_once():
 def test_a_summary_has_the_rates_that_were_measured(
     tmp_path: Path, rates: tuple[float | None, ...], line: str
 ):
-    names = ("step_per_s_sim", "step_per_s_inference", "step_per_s_train")
-    summary = {
-        **{"status": "completed", "env_steps": 10, "wall_s": 1.0, "restarts": [], "eval": None},
-        **{"final_return": None, "checkpoint": None, "overflow_steps": {}},
-        **dict(zip(names, rates, strict=True)),
-    }
+    summary = {**SUMMARY, "final_return": None, **dict(zip(RATES, rates, strict=True))}
     told = train_outcome(summary, RunPaths(tmp_path)).splitlines()
     assert [text for text in told if "steps/s" in text] == [f"env steps/s: {line}"] * bool(line)
-    assert told[0].endswith("in 1 s, no episode has ended")
+    assert told[:2] == ["completed: 10 env steps in 0:01", "no episode has ended"]
 
 
 def _told(lines: list[dict[str, Any]]) -> str:
@@ -148,60 +147,196 @@ def _lines(lines: list[dict[str, Any]]) -> list[str]:
     return said.getvalue().splitlines()
 
 
-def test_the_panel_of_a_job_shows_what_a_gmi_says():
+def test_the_panel_of_a_job_shows_what_several_gmis_say():
     said = io.StringIO()
     shown = ConsoleProgress(Console(file=said), list, 10)
-    Console(file=said).print(shown._panel([GmiStatus(0, "[/odd]", 3, None, None)]))
+    gmis = [GmiStatus(gmi, "[/odd]", 3, None, None) for gmi in range(2)]
+    Console(file=said).print(shown._panel(gmis))
     assert "GMI 0: [/odd], iteration 3" in said.getvalue()
+    one = io.StringIO()
+    Console(file=one).print(shown._panel(gmis[:1]))
+    assert "GMI" not in one.getvalue()
 
 
-def test_while_it_compiles_a_job_says_why_and_for_how_long():
-    shown = ConsoleProgress(Console(file=io.StringIO()), list, 10)
+def _status(*states: str) -> tuple[GmiStatus, ...]:
+    return tuple(GmiStatus(gmi, state, 0, None, None) for gmi, state in enumerate(states))
+
+
+WHY = "compiling: once for each task and size, "
+
+
+class Clock:
+    """Stands still unless it is told to go on."""
+
+    now_s = 1000.0
+
+    def monotonic(self) -> float:
+        return self.now_s
+
+
+@pytest.fixture
+def clock(monkeypatch: pytest.MonkeyPatch) -> Clock:
+    stopped = Clock()
+    monkeypatch.setattr(progress, "time", stopped)
+    return stopped
+
+
+@pytest.fixture
+def compile_time(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Callable[[], CompileTime]:
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    return lambda: CompileTime({"env": "ant", "num_envs": 64})
+
+
+def test_while_it_compiles_a_job_says_why_and_for_how_long(
+    clock: Clock, compile_time: Callable[[], CompileTime]
+):
     said = io.StringIO()
-    Console(file=said, width=120).print(shown._panel([GmiStatus(0, "compiling", 0, None, None)]))
-    assert "compiling: once for each task and size, usually 1 to 3 minutes  0:00:0" in (
-        said.getvalue()
-    )
-    assert "iteration" not in said.getvalue()
-    plain = io.StringIO()
-    with ConsoleProgress(Console(file=plain, width=200), list, 10) as progress:
-        for state in ("starting", "compiling", "compiling"):
-            progress.update((GmiStatus(0, state, 0, None, None),))
-    assert plain.getvalue().splitlines() == [
-        "[GMI 0 starting]",
-        "compiling: once for each task and size, usually 1 to 3 minutes  [GMI 0 compiling]",
+    with ConsoleProgress(Console(file=said, width=80), list, 10, compile_time()) as shown:
+        for states, seconds in (
+            (("starting",), 0),
+            (("compiling",), 5),
+            (("compiling",), 29),
+            (("compiling",), 2),
+            (("running",), 11),
+        ):
+            clock.now_s += seconds
+            shown.update(_status(*states))
+    assert said.getvalue().splitlines() == [
+        "starting: loading JAX, building the environments  0:00",
+        f"{WHY}usually 1 to 3 minutes  0:00",
+        f"{WHY}usually 1 to 3 minutes  0:31",
+        "compiled in 0:42",
     ]
+    assert compile_time().last_s == 42
+
+
+def test_the_next_time_a_job_knows_how_long_it_compiles(
+    clock: Clock, compile_time: Callable[[], CompileTime]
+):
+    compile_time().note(42.0)
+    shown = ConsoleProgress(Console(file=io.StringIO()), list, 10, compile_time())
+    shown.update(_status("compiling"))
+    assert shown._waiting() == f"{WHY}last time 0:42  0:00"
+    clock.now_s += 100
+    assert shown._waiting() == f"{WHY}last time 0:42, longer now  1:40"
+    assert CompileTime({"env": "ant", "num_envs": 128}).last_s is None
+
+
+def test_broken_notes_of_compile_times_are_no_error(
+    compile_time: Callable[[], CompileTime], tmp_path: Path
+):
+    path = tmp_path / "gmijax" / "compile_times.json"
+    path.parent.mkdir()
+    path.write_text("{")
+    assert compile_time().last_s is None
+    compile_time().note(2.0)
+    assert compile_time().last_s == 2
+
+
+@pytest.mark.parametrize(
+    ("states", "phase"),
+    [
+        (("starting", "waiting"), "starting"),
+        (("ready", "starting"), "compiling"),
+        (("compiling", "waiting"), "compiling"),
+        (("ready", "running"), "running"),
+        (("running", "stopping"), "stopping"),
+        ((), "running"),
+    ],
+)
+def test_the_phase_of_several_gmis_never_goes_back(states: tuple[str, ...], phase: str):
+    assert progress._phase_of(_status(*states)) == phase
+
+
+def test_figures_of_before_a_restart_are_not_shown_while_it_compiles_again():
+    shown = ConsoleProgress(Console(file=io.StringIO()), lambda: [SYNC], 1000)
+    for states, has_figures in ((("running",), True), (("compiling",), False)):
+        shown.update(_status(*states))
+        text = io.StringIO()
+        Console(file=text, width=80).print(shown._panel(_status(*states)))
+        assert ("steps/s" in text.getvalue()) == has_figures
+
+
+def test_the_panel_fits_eighty_columns():
+    line = {**SYNC, "env_steps": 12_345_678, "env_steps_per_s": 1_234_567.0, "return": -12345.67}
+    shown = ConsoleProgress(Console(file=io.StringIO()), lambda: [line], 10**9)
+    shown.update(_status("running"))
+    text = io.StringIO()
+    Console(file=text, width=80).print(shown._panel(_status("running")))
+    assert len(text.getvalue().splitlines()) == 2
 
 
 @pytest.mark.parametrize("gmis", [1, 2])
-def test_one_process_needs_no_words_of_several(gmis: int, tmp_path: Path) -> None:
-    here = machine(0)
-    plan = make_plan(PlanConfig(gmis_per_gpu=gmis), ReduceConfig(), 64, here)
-    said = io.StringIO()
-    announce(Console(file=said, width=300), RunPaths(tmp_path), plan, "template x", ["note"])
-    text = said.getvalue()
+@pytest.mark.parametrize("show", [True, "verbose"])
+def test_reasons_are_for_those_who_ask(
+    gmis: int, show: Show, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    plan = make_plan(PlanConfig(gmis_per_gpu=gmis), ReduceConfig(), 64, machine(0))
+    lines = ["a note", "backend share: warning: slow", "physics.impl jax: x"]
+    announce(open_console(show=show), RunPaths(tmp_path), plan, "template x", lines)
+    text = capsys.readouterr().out
     assert ("one process on the CPU, 64 environments" in text) == (gmis == 1)
-    for word in ("template", "strategy", "layout", "virtual"):
-        assert (word in text) == (gmis > 1)
-    assert "  note" in text
+    assert ("layout [[0, 1]]" in text) == (gmis == 2)
+    assert "  a note" in text
+    assert "warning: slow" in text
+    for reason in ("backend cpu: ", "strategy ", "physics.impl "):
+        assert (reason in text) == (show == "verbose")
 
 
-def test_a_run_ends_with_what_to_do_next(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_run_ends_with_what_to_do_next(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
     monkeypatch.chdir(tmp_path)
     run = RunPaths(tmp_path / "runs" / "a b")
-    rates = dict.fromkeys(("step_per_s_sim", "step_per_s_inference", "step_per_s_train"))
-    summary = {
-        **{"status": "completed", "env_steps": 10, "wall_s": 1.0, "restarts": [], "eval": None},
-        **{"final_return": 58.8, "checkpoint": str(run.checkpoint(10)), "overflow_steps": {}},
-        **rates,
-    }
-    told = train_outcome(summary, run)
-    assert "final return 58.80 (mean of the latest episodes, with exploration noise)" in told
+    told = train_outcome({**SUMMARY, "checkpoint": str(run.checkpoint(10))}, run)
+    assert "final return 58.80 (with exploration noise, mean of the latest episodes)" in told
     assert "checkpoint: runs/a b/checkpoints/000000000010\n" in told
-    assert "next: gmijax play run.dir='runs/a b'" in told
-    assert "next" not in train_outcome({**summary, "checkpoint": None}, run)
+    print_next(open_console(show=True), *next_steps(run))
+    assert capsys.readouterr().out.splitlines()[-1] == "  gmijax play run.dir='runs/a b'"
     monkeypatch.chdir("/")
     assert nearby(run.root) == str(run.root).removeprefix("/")
+
+
+RATES = ("step_per_s_sim", "step_per_s_inference", "step_per_s_train")
+SUMMARY = {
+    **{"status": "completed", "env_steps": 10, "wall_s": 1.0, "restarts": [], "eval": None},
+    **{"final_return": 58.8, "checkpoint": None, "overflow_steps": {}},
+    **dict.fromkeys(RATES),
+}
+
+
+@pytest.mark.parametrize(("deterministic", "how"), [(True, "without"), (False, "with")])
+def test_an_evaluation_says_whether_it_was_with_noise(
+    deterministic: bool, how: str, tmp_path: Path
+):
+    run = RunPaths(tmp_path)
+    write_json(run.config, {"eval": {"deterministic": deterministic}})
+    best = {"env_steps": 5, "return": 8.0, "checkpoint": str(run.checkpoint(5))}
+    found = {"last": {"env_steps": 9, "return": 7.5}, "best": best}
+    told = train_outcome({**SUMMARY, "eval": found}, run).splitlines()
+    assert f"evaluation: return 7.50 {how} exploration noise, after 9 env steps" in told
+    assert any(line.startswith("  best 8.00: ") for line in told)
+
+
+@pytest.mark.parametrize(
+    ("iterations", "error", "line"),
+    [
+        ((20, 25), None, "profile of the iterations 20 to 25: profile"),
+        (None, None, "profile: none, the command ended before the first iteration of run.profile"),
+        ((20, 22), "disk full", "profile: the trace could not be written: disk full"),
+    ],
+)
+def test_a_run_says_what_became_of_its_profile(
+    iterations: tuple[int, int] | None,
+    error: str | None,
+    line: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+):
+    monkeypatch.chdir(tmp_path)
+    run = RunPaths(tmp_path)
+    profile = {"iterations": iterations, "dir": str(run.profile), "error": error}
+    assert line in train_outcome({**SUMMARY, "profile": profile}, run).splitlines()
 
 
 @pytest.mark.parametrize(

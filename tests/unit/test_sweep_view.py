@@ -77,9 +77,9 @@ def test_the_table_says_of_each_job_where_and_how_far_it_is() -> None:
     lines = [printable(line).split() for line in shown.splitlines()]
     rows = {words[0]: " ".join(words) for words in reversed(lines) if words}
     assert "overrides GPU and place progress steps/s return ranked by ETA state" in rows["job"]
-    assert rows["0"].endswith("50% 50 2.5 3.5 0:00:10 running")
+    assert rows["0"].endswith("50% 50 2.5 3.5 0:10 running")
     assert "seed=0 GPU 3 place 0" in rows["0"]
-    assert rows["1"].endswith("25% 50 2.5 3.5 0:00:15 running")
+    assert rows["1"].endswith("25% 50 2.5 3.5 0:15 running")
     assert rows["2"].endswith("100% 2.5 3.5 completed")
     assert "waiting: again, alone on its GPU, after CUDA_ERROR_[/x]" in rows["3"]
     assert "2 running, 1 waiting, 1 completed; 100 steps/s, 2.0 runs/h" in shown
@@ -176,6 +176,26 @@ def events(path: Path) -> list[Any]:
         found.append(vars(event_pb2)["Event"].FromString(data[12 : 12 + length]))
         data = data[16 + length :]
     return found
+
+
+def test_the_table_hides_nothing_of_an_override() -> None:
+    """Without GPUs it has no column of places, and names the keys without their groups."""
+    overrides = ("algo.learning_rate=0.00012345", "env.settings.goal_height_m=0.75")
+    jobs = list(jobs_of([compose("num_timesteps=1000", *overrides), compose()]))
+    jobs[0].progress.state = "running"
+    view = SweepView(open_console(show=False), jobs, SWEEP)
+    text = {}
+    for width in (80, 120):
+        said = io.StringIO()
+        Console(file=said, width=width).print(view._table())
+        text[width] = said.getvalue()
+    assert "…" not in text[80]
+    assert "place" not in text[80]
+    assert "starting" in text[80]
+    for part in ("learning_rate=0.00012345", "goal_height_m=0.75"):
+        assert part in text[120]
+    assert "algo." not in text[120]
+    assert view.line() == "1 running, 1 waiting"
 
 
 def test_throughput_is_of_the_jobs_that_a_command_has_run(tmp_path: Path) -> None:

@@ -1,0 +1,96 @@
+"""What works beside training: films, export, sweeps, curves; and what mends them. No jax here."""
+
+from __future__ import annotations
+
+import importlib.util
+import shutil
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from types import MappingProxyType
+from typing import Final, NamedTuple
+
+from gmijax.machine.opengl import first_opengl, opengls, what_is_missing
+
+OPENGL_TIMEOUT_S: Final = 60.0
+"""Longest wait for a picture."""
+
+
+class Extra(NamedTuple):
+    """Something that needs packages which not everybody has."""
+
+    packages: tuple[str, ...]
+    brings: str  # What it is good for.
+    install: str  # What brings the packages.
+
+
+EXTRAS: Final[Mapping[str, Extra]] = MappingProxyType(
+    {
+        "ONNX": Extra(
+            ("jax2onnx", "onnx", "onnxruntime"), "gmijax export as ONNX", "'gmijax[export]'"
+        ),
+        "Optuna": Extra(("optuna",), "sweep.sampler, sweep.pruner", "'gmijax[sweep]'"),
+        "TensorBoard": Extra(("tensorboard",), "tensorboard --logdir RUN", "tensorboard"),
+        "W&B": Extra(("wandb",), "wandb.mode", "'gmijax[wandb]'"),
+        "Ray": Extra(("ray",), "several machines, cluster.engine=ray", "'gmijax[ray]'"),
+        "viewer": Extra(("viser",), "gmijax view", "'gmijax[view]'"),
+    }
+)
+
+
+class Feature(NamedTuple):
+    """One of them here."""
+
+    name: str
+    usable: bool
+    why: str  # What it is good for, or the line that mends it.
+
+
+class OpenGl(NamedTuple):
+    """What draws films here."""
+
+    name: str | None  # None: nothing does.
+    why_not: str = ""  # In one line, with what helps.
+
+
+def find_opengl_here() -> OpenGl:
+    """Draws a small picture with each OpenGL until one can, each in a process of its own."""
+    tried = opengls("egl", "osmesa")
+    gl, said = first_opengl(tried, OPENGL_TIMEOUT_S)
+    if gl is not None:
+        return OpenGl(gl)
+    return OpenGl(None, f"{what_is_missing(tried)}; the last one: {said}")
+
+
+def menagerie() -> Path | None:
+    """Where Playground keeps its robot models; None without Playground."""
+    spec = importlib.util.find_spec("mujoco_playground")
+    if spec is None or spec.origin is None:
+        return None
+    return Path(spec.origin).parent / "external_deps" / "mujoco_menagerie"
+
+
+def features(versions: Mapping[str, str | None], opengl: OpenGl | None) -> Iterator[Feature]:
+    """What works here.
+
+    Args:
+      versions: of the packages of `EXTRAS`, None or nothing for what is not installed.
+      opengl: None: not tried.
+    """
+    if opengl is not None:
+        why = f"a picture was drawn with {opengl.name}" if opengl.name else opengl.why_not
+        yield Feature("films", opengl.name is not None, why)
+    for name, extra in EXTRAS.items():
+        missing = [package for package in extra.packages if not versions.get(package)]
+        why = f"{extra.brings}: pip install {extra.install}" if missing else extra.brings
+        yield Feature(name, not missing, why)
+    if (folder := menagerie()) is not None:
+        yield _robot_models(folder)
+
+
+def _robot_models(folder: Path) -> Feature:
+    """Those of Playground, which it clones when a task first needs them."""
+    if folder.is_dir():
+        return Feature("robot models", True, "of env=playground, downloaded")
+    if shutil.which("git") is None:
+        return Feature("robot models", False, "env=playground downloads them: apt-get install git")
+    return Feature("robot models", True, "of env=playground, downloaded when first needed")

@@ -1,0 +1,92 @@
+"""The trace of some iterations by `jax.profiler`, as `run.profile` asks for it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from contextlib import ExitStack
+from pathlib import Path
+from threading import Thread
+from typing import Any
+
+import jax
+
+
+class IterationTrace:
+    """Traces this process, its device included, from one iteration to another one.
+
+    Args:
+      wanted: the first and the last iteration, counted from 1; None: nothing is traced.
+      folder: where the trace is written, in the layout of TensorBoard's profile plugin.
+    """
+
+    def __init__(self, wanted: tuple[int, int] | None, folder: Path) -> None:
+        self._wanted, self._folder = wanted, folder
+        self._traced: tuple[int, int] | None = None
+        self._is_open = False
+        self._error: str | None = None
+        self._step = ExitStack()
+        self._writing: Thread | None = None
+
+    def begin(self, iteration: int, wait: Callable[[], None]) -> None:
+        """Before an iteration; `wait` returns when the device has nothing left to do."""
+        if self._wanted is None:
+            return
+        if iteration == self._wanted[0]:
+            wait()  # Or the trace would begin with what is left of the iteration before.
+            self._try(self._open)
+        if self._is_open:
+            self._traced = self._wanted[0], iteration
+            # By this name and number the viewers find the steps.
+            self._step.enter_context(
+                jax.profiler.StepTraceAnnotation("iteration", step_num=iteration)
+            )
+
+    def end(self, iteration: int, wait: Callable[[], None]) -> None:
+        """After an iteration has been started; arguments as of `begin`."""
+        if self._wanted is not None and iteration == self._wanted[1]:
+            wait()  # The device may still compute it.
+            self._step.close()
+            self._write()
+        self._step.close()
+
+    def close(self) -> None:
+        """Returns when all that was traced is written; the device must have nothing left to do."""
+        self._step.close()
+        self._write()
+        if self._writing is not None:
+            self._writing.join()
+
+    def _write(self) -> None:
+        """Ends the trace if it is open. Not in this thread: to write it may take a minute."""
+        if self._is_open:
+            self._is_open = False
+            self._writing = Thread(target=self._try, args=(jax.profiler.stop_trace,), daemon=True)
+            self._writing.start()
+
+    def outcome(self) -> dict[str, Any]:
+        """For `result.json`: `profile` with first and last iteration, folder and error.
+
+        Empty where nothing was asked for. The iterations are None where the run never came there.
+        """
+        if self._wanted is None:
+            return {}
+        found = {"iterations": self._traced, "dir": str(self._folder), "error": self._error}
+        return {"profile": found}
+
+    def _open(self) -> None:
+        # First: JAX does not end a trace that it cannot write.
+        self._folder.mkdir(exist_ok=True)
+        options = jax.profiler.ProfileOptions()
+        # Calls of Python are many, slow the iteration down, and say little about it.
+        options.python_tracer_level = 0
+        jax.profiler.start_trace(
+            self._folder, create_perfetto_trace=True, profiler_options=options
+        )
+        self._is_open = True
+
+    def _try(self, act: Callable[[], None]) -> None:
+        """A trace that cannot be made, as on a full disk, does not end the training."""
+        try:
+            act()
+        except Exception as error:
+            self._error = str(error) or type(error).__name__

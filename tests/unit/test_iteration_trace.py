@@ -1,0 +1,105 @@
+"""`run.profile`: which iterations are traced, and what is written of them."""
+
+from __future__ import annotations
+
+import gzip
+import json
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import pytest
+
+from gmijax.config import RunConfig
+from gmijax.errors import ConfigError
+from gmijax.learning.iteration_trace import IterationTrace
+
+
+@jax.jit
+def toy_iteration(x: jax.Array) -> jax.Array:
+    return jnp.sin(x) @ x
+
+
+def _trained(trace: IterationTrace, num_iterations: int) -> dict[str, Any]:
+    """Iterations that the device computes while the host goes on; what the run notes of them."""
+    x = jnp.ones((64, 64))
+
+    def wait() -> None:
+        x.block_until_ready()
+
+    for iteration in range(1, num_iterations + 1):
+        trace.begin(iteration, wait)
+        x = toy_iteration(x)
+        trace.end(iteration, wait)
+    wait()
+    trace.close()
+    return trace.outcome()
+
+
+def _events(folder: Path) -> list[dict[str, Any]]:
+    [path] = folder.glob("plugins/profile/*/perfetto_trace.json.gz")
+    return json.loads(gzip.decompress(path.read_bytes()))["traceEvents"]
+
+
+def _steps(folder: Path) -> list[int]:
+    steps = [event for event in _events(folder) if event.get("name") == "iteration"]
+    return sorted(int(event["args"]["step_num"]) for event in steps)
+
+
+def test_the_asked_iterations_are_traced_and_no_others(tmp_path: Path):
+    outcome = _trained(IterationTrace((2, 4), tmp_path), 6)
+    found = {"iterations": (2, 4), "dir": str(tmp_path), "error": None}
+    assert outcome == {"profile": found}
+    assert _steps(tmp_path) == [2, 3, 4]
+    calls = [e for e in _events(tmp_path) if e.get("name") == "PjitFunction(toy_iteration)"]
+    assert len({call["ts"] for call in calls}) >= 3
+    [xplane] = tmp_path.glob("plugins/profile/*/*.xplane.pb")  # What TensorBoard's plugin reads.
+    assert xplane.stat().st_size > 0
+
+
+def test_a_run_that_ends_on_the_way_keeps_what_was_traced(tmp_path: Path):
+    outcome = _trained(IterationTrace((2, 9), tmp_path), 3)
+    assert outcome["profile"]["iterations"] == (2, 3)
+    assert _steps(tmp_path) == [2, 3]
+
+
+def test_a_run_that_never_comes_there_says_so(tmp_path: Path):
+    outcome = _trained(IterationTrace((5, 9), tmp_path / "profile"), 3)
+    assert outcome["profile"]["iterations"] is None
+    assert not (tmp_path / "profile").exists()
+
+
+def test_without_the_key_nothing_is_noted(tmp_path: Path):
+    assert _trained(IterationTrace(None, tmp_path), 2) == {}
+
+
+def test_a_trace_that_cannot_be_written_ends_no_training(tmp_path: Path):
+    (tmp_path / "file").touch()
+    outcome = _trained(IterationTrace((1, 1), tmp_path / "file"), 3)
+    assert outcome["profile"]["error"]
+    assert _trained(IterationTrace((1, 1), tmp_path), 1)["profile"]["error"] is None
+
+
+@pytest.mark.parametrize(
+    "wanted", ["5", "0:3", "5:4", "a:b", "3:", ":3", "1:2:3", "1:99999999999"]
+)
+def test_other_ranges_are_refused(wanted: str):
+    with pytest.raises(ConfigError, match=f"run.profile={wanted}: expected FIRST:LAST"):
+        run_config(wanted)
+
+
+def test_a_trace_that_memory_may_not_hold_is_refused():
+    assert run_config("11:30").profiled == (11, 30)
+    with pytest.raises(ConfigError, match=r"11:31: 21 iterations; at most 20"):
+        run_config("11:31")
+
+
+def test_one_iteration_is_a_range():
+    assert run_config("7:7").profiled == (7, 7)
+
+
+def run_config(profile: str) -> RunConfig:
+    from gmijax.cli.compose import compose
+
+    return compose(f"run.profile='{profile}'").run
