@@ -27,7 +27,7 @@ def checked(config: PlayConfig) -> PlayConfig:
     Raises:
       ConfigError: no policy of this task is shipped, or it cannot be played so.
     """
-    tasks = ", ".join(shipped_tasks())
+    tasks = ", ".join(shipped_tasks()) or "none (python -m benchmarks.shipped makes them)"
     if config.run.env is None:
         raise ConfigError(f"checkpoint=shipped: of which task? Add env=TASK; there are {tasks}")
     if config.run.env not in shipped_tasks():
