@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 from benchmarks.evaluation.figures import NOT_MEASURED, figure, link, markdown, origin, shown
 from benchmarks.records import RESULTS, Call, calls_by_date
@@ -30,19 +30,40 @@ def packs() -> list[str]:
     return [*markdown(_HEAD, rows), "", *(calls or [f"- `packs-*.json`: {NOT_MEASURED}"])]
 
 
-def packed_gains() -> str:
-    """In words, what the training with the most at once gains."""
+class Packed(NamedTuple):
+    """Eight trainings of another library at once, over one alone.
+
+    Attributes:
+      name: of the training.
+      steps_per_s: ratio of steps per second.
+      trainings_per_hour: ratio of finished trainings per hour, start-up included.
+    """
+
+    name: str
+    steps_per_s: float
+    trainings_per_hour: float
+
+
+def packed() -> Packed | None:
+    """Of the newest call; None without one."""
     calls = calls_by_date(RESULTS, "packs-nvidia-*.json")
     rows = calls[-1][0].results.get("rows", ()) if calls else ()
     found = {row["way"]: row for row in rows if row.get("exit_code") == 0}
     eight, alone = found.get("8 at once, mps"), found.get(_ALONE)
     if eight is None or alone is None:
-        return NOT_MEASURED
+        return None
     ratios = (eight[key] / alone[key] for key in ("steps_per_s", "trainings_per_hour"))
-    steps, finished = (f"{ratio:.2f}" for ratio in ratios)
+    return Packed(eight["name"].split(",")[0], *ratios)
+
+
+def packed_gains() -> str:
+    """In words, what the training with the most at once gains."""
+    found = packed()
+    if found is None:
+        return NOT_MEASURED
     return (
-        f"eight at once of {eight['name'].split(',')[0]}: {steps} times the steps/s of one, "
-        f"{finished} times the trainings per hour (n=1)"
+        f"eight at once of {found.name}: {found.steps_per_s:.2f} times the steps/s of one, "
+        f"{found.trainings_per_hour:.2f} times the trainings per hour (n=1)"
     )
 
 
