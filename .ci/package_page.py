@@ -19,6 +19,7 @@ class PackagePage(MetadataHookInterface):
     """Adds `urls` and `readme` to the metadata."""
 
     def update(self, metadata: dict[str, Any]) -> None:
+        """Called with what pyproject.toml says, and the version."""
         repository, version = self.config["repository"], metadata["version"]
         owner, name = repository.split("/")[-2:]
         metadata["urls"] = {

@@ -155,12 +155,12 @@ PYTHON_EXAMPLE: Final = """\
 import gmijax
 
 config = gmijax.compose("env=ball_balance", "num_timesteps=300e3")
-result = gmijax.train(config, show=True)  # starts the processes, returns when they have ended
+result = gmijax.train(config, show=True)  # returns when training has ended
 policy = gmijax.load_policy(str(result.run_dir))
 ```
 
-Below `if __name__ == "__main__":` nothing more is needed: `import gmijax` loads neither jax nor
-MuJoCo, and the processes that train are started anew.
+`import gmijax` loads neither JAX nor MuJoCo. A script that trains only plans and watches; the
+processes that it starts do the work.
 """
 
 

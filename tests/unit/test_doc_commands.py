@@ -57,6 +57,7 @@ def test_commands_of_a_document_are_taken(
     capsys: pytest.CaptureFixture[str],
 ):
     monkeypatch.chdir(tmp_path)
+    (tmp_path / "commands.txt").write_text("echo 1\n")  # Which a document names.
     found = [refused(one, capsys) for one in commands_of(document.read_text())]
     assert [line for line in found if line] == []
 
