@@ -209,8 +209,10 @@ def marks() -> list[str]:
 
 def seconds_to_mark(task: str) -> Figure | None:
     """Seconds of training until a task reaches the return that Isaac Gym's authors give."""
-    mark, _, file, case = next(rest for name, *rest in _MARKS if name == task)
-    return figure([seconds for seconds in _times_to(mark, file, case) if seconds is not None])
+    for name, mark, _, file, case in _MARKS:
+        if name == task:
+            return figure([s for s in _times_to(mark, file, case) if s is not None])
+    return None
 
 
 def _times_to(mark: float, file: str, case: str) -> list[float | None]:
