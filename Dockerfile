@@ -15,6 +15,7 @@ RUN apt-get update \
 
 WORKDIR /opt/gmijax
 COPY pyproject.toml README.md LICENSE ./
+COPY .ci/package_page.py .ci/
 COPY gmijax gmijax
 COPY configs configs
 RUN pip install --no-cache-dir ".[${EXTRAS}]"

@@ -6,6 +6,7 @@ PYTHON ?= python3
 VENV ?= .venv
 BIN := $(VENV)/bin
 READY := $(VENV)/.ready
+DOCS_VENV ?= $(VENV)-docs
 
 # The major version of CUDA that the driver offers names the extra: cuda12, cuda13; or nothing.
 CUDA ?= $(shell nvidia-smi 2>/dev/null | sed -nE 's/.*CUDA[^:]*Version: *([0-9]+).*/cuda\1/p' | head -n 1)
@@ -58,18 +59,21 @@ soak: $(READY)  ## faults from a fresh seed, all kinds, then a long run's memory
 wheel-test: $(READY)  ## builds the wheel and tries it outside the checkout
 	$(BIN)/python -m pytest tests/process/test_wheel.py $(TEST_ARGS)
 
-$(VENV)/.docs-ready: $(READY)
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check -e '.[docs]'
+# An environment of its own: the site needs neither jax nor MuJoCo. Before 25.1 pip knows no groups.
+$(DOCS_VENV)/.ready: pyproject.toml
+	$(PYTHON) -m venv $(DOCS_VENV)
+	$(DOCS_VENV)/bin/python -m pip install --quiet --disable-pip-version-check 'pip>=25.1'
+	$(DOCS_VENV)/bin/python -m pip install --quiet --group docs
 	@touch $@
 
-docs-pages: $(VENV)/.docs-ready
-	$(BIN)/python -m docs.pages
+docs-pages: $(DOCS_VENV)/.ready
+	$(DOCS_VENV)/bin/python -m docs.pages
 
 docs: docs-pages  ## the documentation as a site in build/docs/site; fails on a dead link
-	$(BIN)/zensical build --clean --strict
+	$(DOCS_VENV)/bin/zensical build --clean --strict --config-file build/docs/zensical.toml
 
 docs-serve: docs-pages  ## the same at http://localhost:8000, built again when a document changes
-	$(BIN)/zensical serve
+	$(DOCS_VENV)/bin/zensical serve --config-file build/docs/zensical.toml
 
 lint: $(READY)  ## ruff: rules and format
 	$(BIN)/ruff check .
@@ -88,5 +92,5 @@ format: $(READY)  ## rewrites the sources: order of imports, layout
 check: lint types imports  ## everything but the tests
 
 clean:  ## removes the environment, caches and build artefacts; keeps runs/
-	rm -rf $(VENV) .cache build dist .pytest_cache .ruff_cache .import_linter_cache .hypothesis
+	rm -rf $(VENV) $(DOCS_VENV) .cache build dist .pytest_cache .ruff_cache .import_linter_cache .hypothesis
 	find . -name __pycache__ -type d -not -path './.git/*' -prune -exec rm -rf {} +

@@ -10,43 +10,16 @@ from __future__ import annotations
 import re
 import shutil
 import sys
-import types
-import typing
-from collections.abc import Iterator, Mapping, Sequence
-from functools import partial
+import tomllib
 from pathlib import Path
-from typing import Any, Final, Literal
+from typing import Final
 
-import gmijax
-from gmijax import demo, doctor, list_envs
-from gmijax.cli.compose import defaults
-from gmijax.cli.grid import SweepHelp
-from gmijax.cli.groups import choices
-from gmijax.cli.help import Key, keys_of, usage_of
-from gmijax.cli.pack import PackKeys
-from gmijax.config import ExportConfig, PlayConfig, ServeConfig, TrainConfig, ViewConfig
+from docs.reference import COMMANDS, command_page, python_page, usages_page
 
 ROOT: Final = Path(__file__).resolve().parents[1]
 PAGES: Final = ROOT / "build" / "docs" / "pages"
 STYLE: Final = ROOT / "docs" / "site.css"
-
-COMMANDS: Final[Mapping[str, type[Any]]] = {
-    "train": TrainConfig,
-    "search": TrainConfig,
-    "sweep": SweepHelp,
-    "pack": PackKeys,
-    "serve": ServeConfig,
-    "play": PlayConfig,
-    "view": ViewConfig,
-    "export": ExportConfig,
-}
-"""The commands that take keys, and the dataclass of each."""
-
-LIKE_TRAIN: Final = ("search", "sweep")
-"""Commands with the keys of `train`; their pages show only what differs."""
-
-USAGES: Final = {"doctor": doctor.USAGE, "list-envs": list_envs.USAGE, "demo": demo.USAGE}
-"""What the commands without a configuration print on `--help`."""
+SITE: Final = ROOT / "docs" / "zensical.toml"
 
 LINK: Final = re.compile(r"!?\[[^\]]*\]\(([^)\s]+)\)")
 
@@ -62,7 +35,25 @@ def main() -> int:
         (folder / f"{name}.md").write_text(command_page(name))
     (folder / "other-commands.md").write_text(usages_page())
     (folder / "python.md").write_text(python_page())
+    (PAGES.parent / SITE.name).write_text(SITE.read_text().replace("[project]\n", _project(), 1))
     return 0
+
+
+def _project() -> str:
+    """The head of the site's configuration, with the URLs that follow from the repository's."""
+    hooks = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["hatch"]["metadata"]
+    repository = hooks["hooks"]["custom"]["repository"]
+    owner, name = repository.split("/")[-2:]
+    if owner == "OWNER":  # There is no repository yet: no link to one.
+        return "[project]\n"
+    site = f"https://{owner}.github.io/{name}/"
+    return f'[project]\nsite_url = "{site}"\nrepo_url = "{repository}"\n'
+
+
+def documents() -> list[Path]:
+    """The documents of the repository, apart from the changelog."""
+    alone = [ROOT / name for name in ("README.md", "CONTRIBUTING.md", "CODE_OF_CONDUCT.md")]
+    return [*alone, *sorted((ROOT / "docs").rglob("*.md"))]
 
 
 def linked_paths(text: str) -> list[str]:
@@ -102,113 +93,6 @@ def link_documents(pages: Path) -> None:
         if path.suffix == ".md":
             links = linked_paths(path.read_text())
             waiting += [(path.parent / link).resolve() for link in links]
-
-
-def command_page(name: str) -> str:
-    """The keys of a command: values, default, meaning; in groups, as Markdown."""
-    keys = list(keys_of(COMMANDS[name], partial(defaults, name)))
-    lines = [
-        f"# gmijax {name}",
-        "",
-        f"`{usage_of(name)}`",
-    ]
-    if name in LIKE_TRAIN:
-        trains = set(keys_of(COMMANDS["train"], partial(defaults, "train")))
-        keys = [key for key in keys if key not in trains]
-        added = "What is added, or has another default:"
-        lines += ["", f"Takes every key of [`gmijax train`](train.md). {added}"]
-    else:
-        lines += _choices_of(name, keys)
-    return "\n".join([*lines, *_tables(keys), ""])
-
-
-def _choices_of(name: str, keys: Sequence[Key]) -> Iterator[str]:
-    for group in dict.fromkeys(key.name.partition(".")[0] for key in keys):
-        names = choices(group)
-        if len(names) > 1:
-            own = "; or `PATH.py:FUNCTION`, [a task of your own](../docs/custom-task.md)"
-            listed = ", ".join(f"`{choice}`" for choice in names)
-            yield from ("", f"`{group}=` is one of {listed}{own if group == 'env' else ''}.")
-        if group == "env":
-            task = f"Defaults below are those of `env={defaults(name, ())['env.name']}`."
-            ask = f"`gmijax {name} env=ant --cfg job` prints those of another task."
-            yield from ("", f"{task} {ask}")
-
-
-def _tables(keys: Sequence[Key]) -> Iterator[str]:
-    general = "Top level"
-    groups: dict[str, list[Key]] = {general: []}
-    for key in keys:
-        group = f"`{key.name.partition('.')[0]}`" if "." in key.name else general
-        heading = f"{group} with `{key.choice}`" if key.choice else group
-        groups.setdefault(heading, []).append(key)
-    for heading, members in groups.items():
-        if not members:
-            continue
-        yield from (
-            "",
-            f"## {heading}",
-            "",
-            "| key | values | default | meaning |",
-            "|---|---|---|---|",
-        )
-        for key in members:
-            anchor = "-".join(filter(None, (key.name, key.choice.replace("=", "-"))))
-            values = _cell(f"{_values(key.kind)}{_limits(key)}")
-            name = f"`{key.name}`{{ #{anchor} }}"
-            yield f"| {name} | {values} | `{key.default}` | {_cell(key.meaning)} |"
-
-
-def _values(kind: Any) -> str:
-    """What a key may be set to, e.g. "int or `auto`"."""
-    inner = typing.get_args(kind)
-    origin = typing.get_origin(kind)
-    if origin is Literal:
-        return ", ".join(f"`{value}`" for value in inner)
-    if origin in (typing.Union, types.UnionType):
-        return " or ".join(map(_values, inner))
-    if origin is tuple:
-        return f"list of {_values(inner[0])}"
-    if origin is not None:
-        return "group of named values"
-    return "`null`" if kind is type(None) else kind.__name__
-
-
-def _limits(key: Key) -> str:
-    low, high, positive = key.limits
-    if positive:
-        return ", greater than 0"
-    if low is not None and high is not None:
-        return f", {low:.10g} to {high:.10g}"
-    return "" if low is None else f", at least {low:.10g}"
-
-
-def _cell(text: str) -> str:
-    """Plain text as Markdown in a table; paths of documents become links."""
-    prose_and_code = text.replace("|", r"\|").split("`")
-    for at in range(0, len(prose_and_code), 2):
-        prose = prose_and_code[at].replace("<", "&lt;").replace("*", r"\*")
-        prose_and_code[at] = re.sub(r"docs/([\w-]+\.md)", r"[\1](../docs/\1)", prose)
-    return "`".join(prose_and_code)
-
-
-def usages_page() -> str:
-    """What the commands without a configuration say of themselves."""
-    parts = [f"## gmijax {name}\n\n```text\n{usage}```\n" for name, usage in USAGES.items()]
-    return "\n".join(["# Other commands\n", *parts])
-
-
-def python_page() -> str:
-    """The public names, each with a directive that mkdocstrings replaces by its docstring."""
-    # A function may have the name of a module (`gmijax.train`), so each is named by its home.
-    names = [name for name in gmijax.__all__ if not name.startswith("__")]
-    homes = [f"{getattr(gmijax, name).__module__}.{name}" for name in names]
-    parts = [
-        f"::: {home}\n    options:\n      heading: gmijax.{name}\n      toc_label: {name}\n"
-        for name, home in zip(names, homes, strict=True)
-    ]
-    errors = "## Exceptions\n\n::: gmijax.errors\n    options:\n      show_root_heading: false\n"
-    return "\n".join(["# Python\n", "## Names of `gmijax`\n", *parts, errors])
 
 
 if __name__ == "__main__":

@@ -58,9 +58,11 @@ def demo(overrides: Sequence[str]) -> None:
     task, has_keys = names[-1] if names else TASK, len(names) < len(overrides)
     config = _training(overrides, task) if has_keys else None
     console = open_console(show=True)
-    if config is None or task in shipped_tasks():
+    is_shown = task in shipped_tasks() or (config is None and (bool(names) or bool(shipped_tasks())))
+    if is_shown:
         show_shipped(task, console)
-    if config is None and _is_wanted():
+    # A checkout may have no policies yet: then there is only training to show.
+    if config is None and (not is_shown or _is_wanted()):
         config = _training((), TASK)
     if config is None:
         console.print(f"train it yourself:\n  gmijax train env={task}")

@@ -119,7 +119,7 @@ def split_text(wanted: str, index: int | None, machine: Machine) -> str:
             raise ConfigError(f"gpu={index}: no such GPU; usable are {indices}")
         gpu = found[0]
     lines = [
-        f"# Divides GPU {gpu.index} ({gpu.name}); nobody may use it meanwhile.",
+        f"# Divides GPU {gpu.index} ({gpu.name}); no process may use it meanwhile.",
         "# If a name is refused, nvidia-smi mig -lgip lists those of this GPU.",
         *split_commands(gpu, wanted),
     ]

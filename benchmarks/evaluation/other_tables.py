@@ -10,6 +10,7 @@ from benchmarks import node_scaling as scaling
 from benchmarks.cases import TASKS
 from benchmarks.evaluation.figures import (
     NOT_MEASURED,
+    Figure,
     bounds,
     figure,
     markdown,
@@ -198,14 +199,27 @@ def marks() -> list[str]:
     """Seconds from the first report of a run alone on its GPU to a return that others publish."""
     rows = []
     for task, mark, published, file, case in _MARKS:
-        runs = results_of(file).get("cases", {}).get(case, {}).get("runs", ())
-        alone = [run["curve"] for run in runs if "curve" in run and "together" not in run]
-        found = [_seconds_to(mark, curve) for curve in alone]
+        found = _times_to(mark, file, case)
         reached = [seconds for seconds in found if seconds is not None]
         share = f"{len(reached)} of {len(found)}"
         rows.append([task, f"{mark:,}", share, shown(figure(reached), ".1f"), published])
     head = "task | return: | runs that reached it: | seconds, here: | Isaac Gym, on an A100:"
     return [*markdown(head, rows), *source(*(file for *_, file, _ in _MARKS))]
+
+
+def seconds_to_mark(task: str) -> Figure | None:
+    """Seconds of training until a task reaches the return that Isaac Gym's authors give."""
+    for name, mark, _, file, case in _MARKS:
+        if name == task:
+            return figure([s for s in _times_to(mark, file, case) if s is not None])
+    return None
+
+
+def _times_to(mark: float, file: str, case: str) -> list[float | None]:
+    """Of every run that was alone on its GPU; None of one that did not get there."""
+    runs = results_of(file).get("cases", {}).get(case, {}).get("runs", ())
+    alone = [run["curve"] for run in runs if "curve" in run and "together" not in run]
+    return [_seconds_to(mark, curve) for curve in alone]
 
 
 def _seconds_to(mark: float, curve: list[tuple[int, float, float | None]]) -> float | None:
@@ -242,11 +256,16 @@ def throughput() -> list[str]:
 
 def faults() -> list[str]:
     """Seconds from a fault until all GMIs train again."""
+    rows = [[kind, shown(found, ".0f")] for kind, found in seconds_to_recover().items()]
+    return [*markdown("fault | seconds until all GMIs train again:", rows), *source("faults-h200")]
+
+
+def seconds_to_recover() -> dict[str, Figure | None]:
+    """By kind of fault."""
     kinds: dict[str, list[float]] = {}
     for row in results_of("faults-h200").get("rows", ()):
         kinds.setdefault(row["fault"], []).append(row["seconds"])
-    rows = [[kind, shown(figure(seconds), ".0f")] for kind, seconds in kinds.items()]
-    return [*markdown("fault | seconds until all GMIs train again:", rows), *source("faults-h200")]
+    return {kind: figure(seconds) for kind, seconds in kinds.items()}
 
 
 def faults_on_a_cpu() -> list[str]:

@@ -56,17 +56,42 @@ def packs() -> list[str]:
     return [*markdown(_HEAD, rows), "", *(lines or [f"- `packs-*.json`: {NOT_MEASURED}"])]
 
 
+class Packed(NamedTuple):
+    """Eight trainings of another library at once, over one alone.
+
+    Attributes:
+      name: of the training.
+      steps_per_s: ratio of steps per second.
+      trainings_per_hour: ratio of finished trainings per hour, start-up included.
+      repeats: of both.
+    """
+
+    name: str
+    steps_per_s: float
+    trainings_per_hour: float
+    repeats: int
+
+
+def packed() -> list[Packed]:
+    """Of the newest calls; nothing without one."""
+    found, way = _trainings(), "8 at once, mps"
+    gains = []
+    for name, title in _IN_README:
+        training = found.get(name)
+        if training is None:
+            continue
+        steps, finished = (training.over_one(way, key) for key in (_STEPS, _FINISHED))
+        if steps is not None and finished is not None:
+            gains.append(Packed(title, steps, finished, len(training.ways[way])))
+    return gains
+
+
 def packed_gains() -> str:
     """In words, what eight at once gain."""
-    found = _trainings()
-    parts = []
-    for name, title in _IN_README:
-        training, way = found.get(name), "8 at once, mps"
-        if training is None or training.over_one(way, _FINISHED) is None:
-            continue
-        steps, finished = (f"{training.over_one(way, key):.2f}" for key in (_STEPS, _FINISHED))
-        repeats = len(training.ways[way])
-        parts.append(f"{title} {steps} and {finished} (n={repeats})")
+    parts = [
+        f"{one.name} {one.steps_per_s:.2f} and {one.trainings_per_hour:.2f} (n={one.repeats})"
+        for one in packed()
+    ]
     if not parts:
         return NOT_MEASURED
     return f"eight at once over one, in steps/s and in trainings per hour: {', '.join(parts)}"

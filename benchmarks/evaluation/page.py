@@ -8,12 +8,13 @@ from types import MappingProxyType
 from benchmarks.evaluation.async_tables import ASYNC_TABLES, asynchronous_gains
 from benchmarks.evaluation.claims import claims
 from benchmarks.evaluation.figures import bounds, markdown, shown
+from benchmarks.evaluation.front import front
 from benchmarks.evaluation.other_tables import OTHER_TABLES
 from benchmarks.evaluation.pack_tables import packed_gains, packs
 from benchmarks.evaluation.peer_tables import peers
 from benchmarks.evaluation.plots import mps_gains
 from benchmarks.evaluation.seed_tables import brax_returns, playground, playground_seeds, seeds
-from benchmarks.evaluation.sweep_tables import first_gains, sweeps
+from benchmarks.evaluation.sweep_tables import first_gains, program_over_processes, sweeps
 from benchmarks.evaluation.tables import (
     TRAINING_TABLES,
     best_plan_ratios,
@@ -26,6 +27,9 @@ def advice() -> list[str]:
     """Who gains from GMIs, and who does not."""
     eightfold = first_gains().get("8 at once, auto")
     throughput = first_gains("steady_steps_per_s").get("8 at once, auto")
+    program = [
+        shown(program_over_processes(key)) for key in ("steady_steps_per_s", "trainings_per_hour")
+    ]
     fixed = bounds([*fixed_total_ratios().values()])
     peak = bounds([*best_plan_ratios().values()])
     rows = [
@@ -33,6 +37,11 @@ def advice() -> list[str]:
             *("many small runs on one GPU (seeds, a sweep)", "**yes**: `gmijax sweep`"),
             f"eight runs at once: {shown(throughput)} times the steps/s of one; with start-up, "
             f"which overlaps, {shown(eightfold)} times as many runs of half a minute per hour",
+        ],
+        [
+            *("many runs that differ only in seed and learning rate", "**no**: one program"),
+            f"eight runs in one process (`gmijax sweep ... sweep.pack=auto`): {program[0]} times "
+            f"the steps/s of eight processes, {program[1]} times the runs per hour (n=1)",
         ],
         [
             *("several trainings of another library on one GPU", "**yes**: `gmijax pack`"),
@@ -65,6 +74,7 @@ def advice() -> list[str]:
 TABLES: MappingProxyType[str, Callable[[], list[str]]] = MappingProxyType(
     {
         "advice": advice,
+        "front": front,
         "claims": claims,
         "packs": packs,
         "peers": peers,

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 from benchmarks.evaluation.figures import NOT_MEASURED, link, markdown, origin
-from benchmarks.peers.comparisons import COMPARISONS
-from benchmarks.peers.table import HEAD, measured, row
-from benchmarks.records import RESULTS, calls_by_date
+from benchmarks.peers.comparisons import BRAX, COMPARISONS
+from benchmarks.peers.table import HEAD, measured, ratio, row
+from benchmarks.records import RESULTS, Call, calls_by_date
 
 PATTERN = "peers-nvidia-*.json"
 
@@ -18,10 +20,21 @@ def peers() -> list[str]:
     rows: list[list[str]] = []
     origins: dict[tuple[str, str], list[str]] = {}
     for name in COMPARISONS:
-        newest = (one for one in reversed(calls) if measured(one[0].results, name))
-        call, path = next(newest, (None, None))
+        call, path = _newest(name) or (None, None)
         rows.append(row(call.results if call else {}, name))
         if call and path:
             origins.setdefault((link(path.name), origin(call)), []).append(name)
     lines = [f"- {file}, {'; '.join(names)}: {made}" for (file, made), names in origins.items()]
     return [*markdown(HEAD, rows), "", *lines]
+
+
+def over_brax() -> list[float | None]:
+    """Steps per second over those of Brax's PPO, of every comparison."""
+    names = [name for name, one in COMPARISONS.items() if one.peer == BRAX]
+    return [ratio(found[0].results, name) for name in names if (found := _newest(name))]
+
+
+def _newest(comparison: str) -> tuple[Call, Path] | None:
+    """The newest call that measured both sides."""
+    calls = reversed(calls_by_date(RESULTS, PATTERN))
+    return next((one for one in calls if measured(one[0].results, comparison)), None)

@@ -85,6 +85,13 @@ def first_gains(key: str = "trainings_per_hour") -> dict[str, Figure]:
     return next((same.gains(key) for same in same_jobs().values()), {})
 
 
+def program_over_processes(key: str) -> float | None:
+    """Eight jobs as one program, over the same jobs in eight processes."""
+    rates = next((same.rates(key) for same in same_jobs().values()), {})
+    program, processes = rates.get("8 at once, vmap"), rates.get("8 at once, auto")
+    return program.median / processes.median if program and processes else None
+
+
 def sweeps() -> list[str]:
     """Training runs per hour, where they were measured."""
     lines: list[str] = []

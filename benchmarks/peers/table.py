@@ -26,6 +26,13 @@ def measured(results: Mapping[str, Any], comparison: str) -> bool:
     return all(_figure(results, comparison, trainer, "steps_per_s") for trainer in trainers)
 
 
+def ratio(results: Mapping[str, Any], comparison: str) -> float | None:
+    """Steps per second of `gmijax.train` over those of the other side."""
+    trainers = (OURS, COMPARISONS[comparison].peer)
+    ours, theirs = (_figure(results, comparison, one, "steps_per_s") for one in trainers)
+    return ours.median / theirs.median if ours and theirs else None
+
+
 def row(results: Mapping[str, Any], comparison: str) -> list[str]:
     """Cells of a comparison, medians of what was measured."""
     peer = COMPARISONS[comparison].peer
@@ -33,10 +40,8 @@ def row(results: Mapping[str, Any], comparison: str) -> list[str]:
         [_figure(results, comparison, trainer, key) for trainer in (OURS, peer)]
         for key in ("steps_per_s", "command_s")
     )
-    ours, theirs = rates
-    ratio = shown(ours.median / theirs.median if ours and theirs else None)
     cells = [shown(value, ",.0f") for value in rates]
-    cells.append("another task" if peer == MJLAB else ratio)
+    cells.append("another task" if peer == MJLAB else shown(ratio(results, comparison)))
     return [comparison, peer, *cells, *(shown(value, ".1f") for value in seconds)]
 
 

@@ -154,7 +154,7 @@ class RayCluster:
                 socket.create_connection((parts[1], int(parts[2])), _CONNECT_S).close()
             except (OSError, ValueError) as error:  # ValueError: a name that cannot be one.
                 where = "there" if found == address else f"at {found}"
-                raise ConfigError(f"{what}: nobody answers {where} ({error})") from None
+                raise ConfigError(f"{what}: nothing answers {where} ({error})") from None
         elif address not in ("auto", "local"):
             raise ConfigError(
                 f"{what}: expected auto, local or host:port with a port from 1 to {_MAX_PORT}"

@@ -86,8 +86,8 @@ class ActorCriticConfig(KeyGroup):
     )
     init_noise_std: float = doc("standard deviation of the first policy", positive=True)
     init_at_random_ep_len: bool = doc(
-        "cut the first episode of every world at a random time, so that worlds do not go through "
-        "their episodes in step; those episodes are not counted in returns",
+        "cut the first episode of every environment at a random time, so that they do not go "
+        "through their episodes in step; those episodes are not counted in returns",
         default=False,
     )
 
@@ -120,8 +120,8 @@ class PpoConfig(ActorCriticConfig):
     )
     obs_outliers: Literal["clip", "diverged"] = doc(
         "what does not enter the statistics of observations as it is: what is more than 20 "
-        "standard deviations off is clipped to that (clip), or worlds that diverge before the "
-        "rollout or their episode ends are left out (diverged)",
+        "standard deviations off is clipped to that (clip), or environments that diverge before "
+        "the rollout or their episode ends are left out (diverged)",
         default="clip",
     )
     warmup_unroll: bool = doc(

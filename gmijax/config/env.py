@@ -96,11 +96,11 @@ class EnvConfig(KeyGroup):
         metadata={"doc": "numbers of the task, such as the height of a fall (docs/tasks.md)"},
     )
     curriculum: Literal["off", "on"] = doc(
-        "make a world's episodes harder as they succeed, in tasks that can (docs/tasks.md)",
+        "make an environment's episodes harder as they succeed, in tasks that can (docs/tasks.md)",
         default="off",
     )
     randomize: Literal["off", "on", "episode"] = doc(
-        "give every world its own physics model, drawn from env.randomization: once (on), or for "
+        "give every environment its own model, drawn from env.randomization: once (on), or for "
         "every episode",
         default="off",
     )

@@ -48,7 +48,7 @@ class PlayConfig(KeyGroup):
     seed: int = doc("seed of the episodes' starts and of sampled actions", low=0, high=2**31 - 1)
     deterministic: bool = doc("act with the policy's mean; false: sample actions")
     randomize: Literal["off", "on"] = doc(
-        "play in worlds drawn from the run's env.randomization; off: in the model as it is",
+        "play with models drawn from the run's env.randomization; off: with the model as it is",
         default="off",
     )
     max_steps: int | None = doc(

@@ -118,7 +118,7 @@ def _abilities(system: SystemInfo) -> Iterator[Ability]:
 
 def _about_backend(name: str, machine: Machine) -> str:
     if name == "mps":
-        return f"daemon: {machine.operator_daemon or 'an own one for each GPU'}"
+        return f"daemon: {machine.operator_daemon or 'one of its own for each GPU'}"
     if name == "mig":
         return "; ".join(
             f"GPU {gpu.index}: {', '.join(one.profile for one in gpu.instances)}"
@@ -152,7 +152,7 @@ def _physics(name: str, platform: str, has_warp: bool) -> Ability:
         for task in task_names()
         if choose_impl("auto", platform, task, warp_installed=has_warp)[0] == name
     ]
-    return Ability("physics", name, True, f"auto takes it for {', '.join(tasks) or 'no task'}")
+    return Ability("physics", name, True, f"auto chooses it for {', '.join(tasks) or 'no task'}")
 
 
 def _suite(suite: str) -> Ability:

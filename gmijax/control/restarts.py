@@ -170,7 +170,7 @@ def why_not_again(error: GmiFailed, last: GmiFailed | None) -> str | None:
     if (told := error.error) is None:
         return None
     if told.type in _LASTING:
-        return f"{told.type} would come again"
+        return f"{told.type} would happen again"
     if _DISK_IS_FULL in told.message:
         return "the disk is full"
     if last is not None and last.error is not None:
@@ -239,8 +239,8 @@ def with_gpus_left(
     config = dataclasses.replace(config, plan=_without(config, plan, machine, lost))
     shrunk = training_plan(config, machine)
     note = (
-        f"{gone}: going on with {num_left}, layout {shrunk.layout}, reduction {shrunk.strategy}; "
-        f"{shrunk.num_envs_per_gmi} environments per GMI as before"
+        f"{gone}: continuing with {num_left}, layout {shrunk.layout}, "
+        f"reduction {shrunk.strategy}; {shrunk.num_envs_per_gmi} environments per GMI as before"
     )
     return config, dataclasses.replace(shrunk, reasons=(*shrunk.reasons, note)), (note,)
 
@@ -254,7 +254,7 @@ def with_nodes_left(
     if not num_lost:
         return again, ()
     note = (
-        f"{num_lost} nodes of the job are gone: going on with {len(nodes)}, layout "
+        f"{num_lost} nodes of the job are gone: continuing with {len(nodes)}, layout "
         f"{again.layout}; {again.num_envs_per_gmi} environments per GMI as before"
     )
     return dataclasses.replace(again, reasons=(*again.reasons, note)), (note,)

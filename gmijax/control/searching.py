@@ -28,7 +28,7 @@ def search(config: TrainConfig, *, show: Show = False) -> SearchResult:
     """
     if config.run.resume is not None:
         raise ConfigError(
-            f"run.resume={config.run.resume}: not for a search, which goes on by itself from "
+            f"run.resume={config.run.resume}: not for a search, which continues by itself from "
             "what search.store has"
         )
     if not is_auto(config):

@@ -74,12 +74,12 @@ def _go_on_or_start(config: TrainConfig) -> StartPoint:
     shown = f"run.resume=auto: {folder}"
     if not os.path.isdir(folder):  # Unlike `Path.is_dir` it takes any text.
         if os.path.lexists(folder):
-            raise ConfigError(f"{shown} is no folder")
+            raise ConfigError(f"{shown} is not a folder")
         return StartPoint()
     run = RunPaths(folder.resolve())
     if not run.config.exists():
         if any(path != run.lock for path in folder.iterdir()):
-            raise ConfigError(f"{shown} is no run folder, and not empty")
+            raise ConfigError(f"{shown} is neither a run folder nor empty")
         return StartPoint(run)
     # The folder of a checkpoint that may not be there yet.
     env, algo = trained_config(run.checkpoint(0))

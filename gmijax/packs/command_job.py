@@ -81,7 +81,7 @@ def jobs_of_file(settings: PackConfig) -> tuple[CommandJob, ...]:
     try:
         text = sys.stdin.read() if path == "-" else Path(path).expanduser().read_text()
     except (OSError, UnicodeDecodeError) as error:
-        why = error.strerror if isinstance(error, OSError) else "is no text"
+        why = error.strerror if isinstance(error, OSError) else "is not text"
         raise ConfigError(f"pack.commands={path}: cannot be read ({why})") from None
     jobs: list[CommandJob] = []
     for number, line in enumerate(text.splitlines(), 1):

@@ -205,7 +205,7 @@ def _first_gpus(
 
 def _why_not_gpu(gpu: Gpu, num_gmis: int, backend: BackendName, machine: Machine) -> str | None:
     if gpu.compute_mode == "prohibited":
-        return "is in compute mode PROHIBITED, which lets nobody use it (nvidia-smi -c 0)"
+        return "is in compute mode PROHIBITED, which lets no process use it (nvidia-smi -c 0)"
     if backend == "mig":
         if not gpu.instances:
             return "has no MIG instance; see gmijax doctor"

@@ -187,7 +187,7 @@ def _parcel(role: Role, args: tuple[Any, ...]) -> bytes:
         raise ConfigError(
             f"role={type(role).__qualname__}: cannot be sent to a GMI: "
             f"{str(error).splitlines()[0] if str(error) else type(error).__name__}; it is pickled "
-            "when the job starts, so make what is no plain data in run"
+            "when the job starts, so make what is not plain data in run"
         ) from error
 
 

@@ -180,7 +180,7 @@ def _broken_file(checkpoint: Path, name: str, wanted: tuple[int, ...]) -> str | 
     try:
         real = os.path.realpath(checkpoint / name)
         if not Path(real).is_relative_to(os.path.realpath(checkpoint)):
-            return f"{name} is no file of it"
+            return f"{name} is not a file of it"
         is_same = file_check(Path(real)) == tuple(wanted)
     except OSError as error:
         return f"{name}: {error.strerror}"

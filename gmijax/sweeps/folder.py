@@ -42,10 +42,10 @@ def opened_folder(work: Work[J]) -> Iterator[SweepPaths]:
 
 def _found(folder: Path, work: Work[J]) -> Path:
     if not folder.is_dir():
-        raise ConfigError(f"run.dir={folder}: is no folder")
+        raise ConfigError(f"run.dir={folder}: is not a folder")
     paths = work.paths(folder.resolve())
     if not paths.request.exists() and any(path != paths.lock for path in folder.iterdir()):
-        raise ConfigError(f"run.dir={folder}: is no folder of a {work.name}, and not empty")
+        raise ConfigError(f"run.dir={folder}: is neither a folder of a {work.name} nor empty")
     return paths.root
 
 

@@ -119,7 +119,7 @@ def test_an_interrupted_end_leaves_the_daemons_to_the_janitor(
 @pytest.mark.parametrize(
     ("mode", "message"),
     [
-        ("train", r"GMI 1 failed: its process \d+ is no client of .*plan\.backend=share$"),
+        ("train", r"GMI 1 failed: its process \d+ is not a client of .*plan\.backend=share$"),
         # Is no client either, and fails a moment later, while the daemon is asked for it.
         ("die_soon", "GMI 1 failed: ended by SIGSEGV"),
     ],
@@ -273,7 +273,7 @@ def test_two_nodes_of_one_machine_use_the_daemon_of_the_first(
         failed = nodes[1].verify({1: os.getpid()})
         assert failed is not None
         assert failed[0] == 1
-        assert "is no client of the MPS daemon" in failed[1]
+        assert "is not a client of the MPS daemon" in failed[1]
         nodes[1].terminate(1, pid)
         assert [int(client) for _, client in mps.told("terminate_client")] == [pid]
         for gmi, node in enumerate(nodes):

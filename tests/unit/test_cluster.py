@@ -107,12 +107,12 @@ def test_without_ray_or_a_cluster_the_line_says_what_to_do(
     monkeypatch.setattr(ray_nodes, "_import_ray", Ray)
     with pytest.raises(ConfigError, match=r"address=auto: no cluster .*`ray start --head`"):
         RayCluster(ClusterConfig(), Node)
-    with pytest.raises(ConfigError, match=r"address=127\.0\.0\.1:1: nobody answers there"):
+    with pytest.raises(ConfigError, match=r"address=127\.0\.0\.1:1: nothing answers there"):
         RayCluster(ClusterConfig(address="127.0.0.1:1"), Node)
     Ray._private = SimpleNamespace(
         services=SimpleNamespace(get_ray_address_from_environment=lambda *_: "127.0.0.1:1")
     )
-    with pytest.raises(ConfigError, match=r"address=auto: nobody answers at 127\.0\.0\.1:1 \("):
+    with pytest.raises(ConfigError, match=r"address=auto: nothing answers at 127\.0\.0\.1:1 \("):
         RayCluster(ClusterConfig(), Node)
     monkeypatch.undo()
     real = builtins.__import__
@@ -149,7 +149,7 @@ def test_a_name_of_a_host_that_cannot_be_is_one_nobody_answers_at(
 ) -> None:
     ray = SimpleNamespace(is_initialized=lambda: False)
     monkeypatch.setattr(ray_nodes, "_import_ray", lambda: ray)
-    with pytest.raises(ConfigError, match="nobody answers there"):
+    with pytest.raises(ConfigError, match="nothing answers there"):
         RayCluster(ClusterConfig(address=f"{host}:6379"), Node)
 
 

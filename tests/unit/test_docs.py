@@ -8,14 +8,18 @@ import importlib
 import re
 import tomllib
 from collections.abc import Iterator, Mapping
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import pytest
 
 import gmijax
-from docs.pages import COMMANDS, USAGES, command_page, link_documents, linked_paths, python_page
+from docs.pages import documents, link_documents, linked_paths
+from docs.reference import COMMANDS, TOPICS, USAGES, command_page, python_page
 from gmijax.__main__ import VERBS
+from gmijax.cli.compose import defaults
+from gmijax.cli.help import keys_of
 from gmijax.sim.registry import TASKS
 from gmijax.sim.tasks.settings import SETTINGS
 
@@ -31,11 +35,6 @@ OBS_ROW = re.compile(r"^\| (\d+)(?:-(\d+))? \|", re.MULTILINE)
 FENCE = re.compile(r"^```.*?^```", re.DOTALL | re.MULTILINE)
 ANCHOR_LINK = re.compile(r"\]\(([\w./-]*)#([^)\s]+)\)")
 NUMBER_ROW = re.compile(r"^\| `(\w+)` \| (.*) \| (-?[\d.]+) \|$", re.MULTILINE)
-
-
-def documents() -> list[Path]:
-    alone = [path for name in ("README.md", "CONTRIBUTING.md") if (path := ROOT / name).is_file()]
-    return [*alone, *sorted((ROOT / "docs").rglob("*.md"))]
 
 
 def pages_of(navigation: list[dict[str, Any]]) -> Iterator[str]:
@@ -113,13 +112,21 @@ def test_links_into_documents_name_a_heading(document: Path):
     assert [f"{path}#{name}" for path, name in targets if name not in anchors_of(path)] == []
 
 
+@pytest.mark.parametrize("document", documents(), ids=lambda path: path.stem)
+def test_links_are_titled_by_what_they_lead_to(document: Path):
+    # A file of results is its own title; a document has a heading.
+    titles = re.findall(r"(?<!!)\[([^\]]*)\]\(", FENCE.sub("", document.read_text()))
+    assert [title for title in titles if re.search(r"\.md\b", title)] == []
+
+
 def test_only_relative_links_outside_of_code_are_looked_at():
     text = "[a](b.md#c) ![d](img/e.png) [f](https://g.org) [h](#i)\n```\n[j](k.md)\n```"
     assert linked_paths(text) == ["b.md", "img/e.png"]
 
 
 def test_every_document_is_in_the_navigation_of_the_site(tmp_path: Path):
-    named = set(pages_of(tomllib.loads((ROOT / "zensical.toml").read_text())["project"]["nav"]))
+    site = tomllib.loads((ROOT / "docs" / "zensical.toml").read_text())
+    named = set(pages_of(site["project"]["nav"]))
     decisions = ROOT / "docs" / "decisions"
     pages = [path for path in (ROOT / "docs").rglob("*.md") if path.parent != decisions]
     assert sorted({path.relative_to(ROOT).as_posix() for path in pages} - named) == []
@@ -142,7 +149,7 @@ def test_the_site_has_every_decision_and_result_that_is_linked(tmp_path: Path):
 def test_every_command_and_public_name_has_a_place_in_the_reference():
     assert {*COMMANDS, *USAGES} == set(VERBS)
     named = re.findall(r"heading: gmijax\.(\w+)", python_page())
-    assert named == [name for name in gmijax.__all__ if name != "__version__"]
+    assert sorted(named) == sorted(name for name in gmijax.__all__ if name != "__version__")
 
 
 def test_a_page_of_keys_shows_values_limits_default_and_meaning():
@@ -150,6 +157,14 @@ def test_a_page_of_keys_shows_values_limits_default_and_meaning():
     seed = next(row for row in rows if row.startswith("| `seed`"))
     assert "| int, 0 to 2147483647 | `0` | seed of the episodes' starts" in seed
     assert any("| `auto`, `mp4`, `gif`, `both`, `none` | `auto` |" in row for row in rows)
+
+
+def test_keys_stand_by_topic_with_the_usual_ones_first():
+    headings = re.findall(r"^## (.*)$", command_page("train"), flags=re.MULTILINE)
+    assert headings == [topic.title for topic in TOPICS.values() if topic.title in headings]
+    assert headings[0] == TOPICS[""].title
+    keys = re.findall(r"^\| `([\w.]+)`", command_page("train"), flags=re.MULTILINE)
+    assert len(keys) == len(list(keys_of(COMMANDS["train"], partial(defaults, "train"))))
 
 
 def test_a_page_of_a_command_like_train_shows_what_differs_alone():

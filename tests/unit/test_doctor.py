@@ -51,7 +51,7 @@ def ability(found: Diagnosis, kind: str, name: str) -> tuple[bool, str]:
 @pytest.mark.parametrize(
     ("boards", "changes", "what", "usable", "why"),
     [
-        ((H200_MIG_OFF,), {}, "backend mps", True, "daemon: an own one for each GPU"),
+        ((H200_MIG_OFF,), {}, "backend mps", True, "daemon: one of its own for each GPU"),
         ((H200_MIG_OFF,), {"mps_error": "not permitted"}, "backend mps", False, "not permitted"),
         ((H200_MIG_OFF,), {}, "backend mig", False, "no GPU is divided into MIG instances"),
         ((H200_MIG_OFF,), {}, "reducer mpr", True, "e.g. with layout [[0,1]]"),

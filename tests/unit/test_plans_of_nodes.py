@@ -184,7 +184,7 @@ def test_agents_and_trainers_go_on_with_the_nodes_that_are_left(
     else:
         again, [note] = with_nodes_left(config, plan, nodes)
         assert [node["gmis"] for node in again.nodes_data()] == of_nodes
-        assert note.startswith(f"{3 - left} nodes of the job are gone: going on with {left}")
+        assert note.startswith(f"{3 - left} nodes of the job are gone: continuing with {left}")
 
 
 def test_nodes_know_the_calls_and_count_leaders_among_those_that_train() -> None:
@@ -201,5 +201,5 @@ def test_a_job_goes_on_with_the_nodes_that_are_left() -> None:
     assert with_nodes_left(config, plan, {"c": machine(0), "b": machine(0)})[1] == ()
     left, [note] = with_nodes_left(config, plan, {"b": machine(0)})
     assert (left.nodes, left.layout.num_gmis, left.strategy) == (("b",), 1, "none")
-    assert "1 nodes of the job are gone: going on with 1, layout [[0]]" in note
+    assert "1 nodes of the job are gone: continuing with 1, layout [[0]]" in note
     assert left.reasons[-1] == note

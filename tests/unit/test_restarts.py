@@ -268,7 +268,7 @@ def test_a_lost_gpu_shrinks_the_plan(
     assert [share.device for share in shrunk.slices] == [gpu(index).uuid for index in devices]
     assert (plan.strategy, shrunk.strategy) == strategies
     assert (str(shrunk.layout), shrunk.num_envs_per_gmi) == (layout, 64)
-    assert notes[0].startswith("GPUs [1] of the job are gone: going on with ")
+    assert notes[0].startswith("GPUs [1] of the job are gone: continuing with ")
 
 
 @pytest.mark.parametrize(

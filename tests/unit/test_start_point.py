@@ -85,15 +85,15 @@ def test_auto_refuses_other_networks_and_another_seed(run: RunPaths):
 
 def test_auto_leaves_a_folder_with_something_else_alone(tmp_path: Path):
     (tmp_path / "thesis.tex").touch()
-    with pytest.raises(ConfigError, match="is no run folder, and not empty"):
+    with pytest.raises(ConfigError, match="is neither a run folder nor empty"):
         find_start_point(config_of(tmp_path))
-    with pytest.raises(ConfigError, match="is no folder"):
+    with pytest.raises(ConfigError, match="is not a folder"):
         find_start_point(config_of(tmp_path / "thesis.tex"))
 
 
 @pytest.mark.parametrize(
     ("name", "said"),
-    [("thesis.tex", "thesis.tex: is no folder$"), ("a" * 300, r"\(File name too long\)$")],
+    [("thesis.tex", "thesis.tex: is not a folder$"), ("a" * 300, r"\(File name too long\)$")],
 )
 def test_a_sweep_goes_on_in_a_folder_only(tmp_path: Path, name: str, said: str):
     (tmp_path / "thesis.tex").touch()

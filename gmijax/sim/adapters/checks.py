@@ -88,7 +88,7 @@ def check_start(env: Env, what: str) -> None:
     if largest >= env.spec.max_abs_obs:
         raise ConfigError(
             f"{what}: reset gives an observation of {largest:g}, and spec.max_abs_obs="
-            f"{env.spec.max_abs_obs:g} would end the world"
+            f"{env.spec.max_abs_obs:g} would end the environment"
         )
 
 

@@ -69,13 +69,17 @@ class Sb3VecEnv(VecEnv):
 
     def set_attr(self, attr_name: str, value: Any, indices: Any = None) -> None:
         """Refused: worlds have no attributes of their own."""
-        raise AttributeError(f"{attr_name}: worlds are stepped together, and have no attributes")
+        raise AttributeError(
+            f"{attr_name}: environments share one program, and have no attributes"
+        )
 
     def env_method(
         self, method_name: str, *method_args: Any, indices: Any = None, **method_kwargs: Any
     ) -> list[Any]:
         """Refused: worlds have no methods of their own."""
-        raise AttributeError(f"{method_name}(): worlds are stepped together, and have no methods")
+        raise AttributeError(
+            f"{method_name}(): environments share one program, and have no methods"
+        )
 
     def env_is_wrapped(self, wrapper_class: type[Any], indices: Any = None) -> list[bool]:
         """True for `Monitor`, whose entry in `infos` is there."""

@@ -85,7 +85,7 @@ class AnymalSettings(TaskSettings):
     )
 
     curriculum_start: float = doc(
-        "env.curriculum=on: share of the commands' ranges that a world begins with",
+        "env.curriculum=on: share of the commands' ranges that an environment begins with",
         default=0.25,
         low=0,
         high=1,

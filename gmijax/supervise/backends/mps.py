@@ -126,7 +126,7 @@ class MpsBackend(Backend):
                 gmi, pid = next(iter(strangers.items()))
                 raise GmiFailed(
                     gmi,
-                    f"its process {pid} is no client of the MPS daemon in "
+                    f"its process {pid} is not a client of the MPS daemon in "
                     f"{self._control_of(gmi).pipe_directory}; {self._advice(gmi)}",
                 )
             time.sleep(_POLL_S)
