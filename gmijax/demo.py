@@ -58,7 +58,9 @@ def demo(overrides: Sequence[str]) -> None:
     task, has_keys = names[-1] if names else TASK, len(names) < len(overrides)
     config = _training(overrides, task) if has_keys else None
     console = open_console(show=True)
-    is_shown = task in shipped_tasks() or (config is None and (bool(names) or bool(shipped_tasks())))
+    is_shown = task in shipped_tasks() or (
+        config is None and (bool(names) or bool(shipped_tasks()))
+    )
     if is_shown:
         show_shipped(task, console)
     # A checkout may have no policies yet: then there is only training to show.

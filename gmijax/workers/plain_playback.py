@@ -12,6 +12,7 @@ import time
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
+from gmijax.clock import running_s
 from gmijax.config import PlayConfig
 from gmijax.config.schema import from_dict
 from gmijax.errors import ConfigError
@@ -67,11 +68,11 @@ def _run(folder: Path, seconds: float) -> None:
 
 
 def _in_time(policy: PlainPolicy, config: PlayConfig, seconds: float) -> Iterator[Played]:
-    end_s = time.monotonic() + seconds
+    end_s = running_s() + seconds
     episodes = play(policy, config.num_envs, config.seed, config.max_steps)
     for number, episode in enumerate(episodes, 1):
         yield episode
-        if number >= config.num_filmed and time.monotonic() > end_s:
+        if number >= config.num_filmed and running_s() > end_s:
             return
 
 

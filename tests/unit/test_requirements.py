@@ -26,14 +26,16 @@ DISTRIBUTIONS = {
     "mujoco_playground": "playground",
     "nccl": "nccl4py",
     "orbax": "orbax-checkpoint",
+    "PIL": "pillow",
     "pynvml": "nvidia-ml-py",
 }
 # What a part of a library imports, and the library does not ask for.
 HIDDEN = {"jax.export": "flatbuffers"}
 # Who trains with one of these libraries has it, and what it needs.
 USERS_OWN = {"rsl_rl", "stable_baselines3", "tensordict", "torch"}
-# jax and its jaxlib, mujoco-mjx and the warp-lang of its kernels are one thing each.
-BROUGHT = {"jaxlib": "jax", "warp": "mujoco-mjx"}
+# jax and its jaxlib, mujoco-mjx and the warp-lang of its kernels, tensorboardX and the protobuf of
+# its events are one thing each.
+BROUGHT = {"jaxlib": "jax", "warp": "mujoco-mjx", "google": "tensorboardX"}
 
 
 def requirements(*extras: str) -> dict[str, Requirement]:
