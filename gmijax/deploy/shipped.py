@@ -42,7 +42,7 @@ def checked(config: PlayConfig) -> PlayConfig:
 
 def require_shipped(task: str | None) -> str:
     """The task; raises ConfigError if no policy of it is shipped."""
-    tasks = ", ".join(shipped_tasks())
+    tasks = ", ".join(shipped_tasks()) or "none (python -m benchmarks.shipped makes them)"
     if task is None:
         raise ConfigError(f"checkpoint=shipped: of which task? Add env=TASK; there are {tasks}")
     if task not in shipped_tasks():
