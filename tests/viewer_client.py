@@ -27,9 +27,9 @@ class Client:
         origin = headers.pop("Origin", "/".join(url.split("/")[:3]))
         self._socket = connect(
             url.replace("http", "ws", 1).rstrip("/"),
-            origin=origin,  # type: ignore[arg-type]
+            origin=origin,
             additional_headers=headers,
-            subprotocols=[f"viser-v{viser.__version__}"],  # type: ignore[list-item]
+            subprotocols=[f"viser-v{viser.__version__}"],
             max_size=None,
         )
         self.seen: list[dict[str, Any]] = []

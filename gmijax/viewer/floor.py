@@ -10,6 +10,8 @@ import numpy.typing as npt
 import trimesh
 import viser
 from PIL import Image
+from trimesh.visual import TextureVisuals
+from trimesh.visual.material import PBRMaterial
 
 _REACH_M: Final = 60.0
 """From the middle of a floor without end to its edge, which fog hides."""
@@ -35,7 +37,7 @@ class Floor:
         planes = np.flatnonzero(model.geom_type == mujoco.mjtGeom.mjGEOM_PLANE)
         data = mujoco.MjData(model)
         mujoco.mj_kinematics(model, data)
-        for plane in planes:
+        for plane in map(int, planes):
             picture, self._period_m = _tiles(model, plane)
             quat = np.zeros(4)
             mujoco.mju_mat2Quat(quat, data.geom_xmat[plane])
@@ -72,13 +74,11 @@ def _quad(picture: Image.Image, period_m: float) -> trimesh.Trimesh:
     """A square of `_REACH_M` around its middle, whose tiles repeat."""
     corners = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]], float)
     repeats = _REACH_M / period_m
-    material = trimesh.visual.material.PBRMaterial(
-        baseColorTexture=picture, metallicFactor=0.0, roughnessFactor=0.9
-    )
+    material = PBRMaterial(baseColorTexture=picture, metallicFactor=0.0, roughnessFactor=0.9)
     return trimesh.Trimesh(
         np.pad(_REACH_M * corners, ((0, 0), (0, 1))),
         [[0, 1, 2], [0, 2, 3]],
-        visual=trimesh.visual.TextureVisuals(uv=repeats * corners, material=material),
+        visual=TextureVisuals(uv=repeats * corners, material=material),
         process=False,
     )
 

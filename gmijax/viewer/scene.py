@@ -16,6 +16,7 @@ import numpy.typing as npt
 import trimesh
 import viser
 from mjviser.conversions import group_geoms_by_visual_compat, merge_geoms
+from trimesh.visual import ColorVisuals
 
 from gmijax.sim.camera import free_robot
 from gmijax.viewer.floor import Floor, linear, set_haze
@@ -248,10 +249,11 @@ def visible_geoms(model: Any) -> dict[int, list[int]]:
 
 def with_linear_colors(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
     """The mesh with the colours of its vertices as its format means them; else they are pale."""
-    if isinstance(mesh.visual, trimesh.visual.ColorVisuals):
-        colors = np.array(mesh.visual.vertex_colors)
+    visual: Any = mesh.visual
+    if isinstance(visual, ColorVisuals):
+        colors = np.array(visual.vertex_colors)
         colors[:, :3] = linear(colors[:, :3])
-        mesh.visual = trimesh.visual.ColorVisuals(mesh, vertex_colors=colors)
+        mesh.visual = ColorVisuals(mesh, vertex_colors=colors)
     return mesh
 
 

@@ -110,11 +110,11 @@ def _guarded(guard: Guard, listening: socket.socket) -> Iterator[list[bool]]:
 
         return real(handler, sock=listening, process_request=checked, **others)
 
-    websockets.asyncio.server.serve = serve  # type: ignore[assignment]
+    websockets.asyncio.server.serve = serve
     try:
         yield used
     finally:
-        websockets.asyncio.server.serve = real  # type: ignore[misc]
+        websockets.asyncio.server.serve = real
 
 
 def _check(guard: Guard, request: Request) -> Response | None:

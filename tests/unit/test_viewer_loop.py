@@ -153,7 +153,7 @@ def test_a_command_is_told_to_all_until_it_is_drawn_again() -> None:
     stand.loop.do(requests.SetCommand((1.0, 0.0, -0.5)))
     stand.loop.do(requests.Reset())
     for env in stand.simulation.envs:
-        np.testing.assert_allclose(env.command, (1.0, 0.0, -0.5))
+        np.testing.assert_allclose(np.asarray(env.command), (1.0, 0.0, -0.5))
     stand.loop.do(requests.SetCommand(None))
     stand.loop.do(requests.Reset())
     assert not np.allclose(stand.simulation.envs[0].command, (1.0, 0.0, -0.5))
