@@ -10,7 +10,7 @@ from typing import Any, Final
 from gmijax.cli.grid import SweepHelp
 from gmijax.cli.help import allowed_values, topics_of
 from gmijax.cli.pack import PackKeys
-from gmijax.config import ExportConfig, PlayConfig, ServeConfig, TrainConfig
+from gmijax.config import ExportConfig, PlayConfig, ServeConfig, TrainConfig, ViewConfig
 from gmijax.errors import GmijaxError
 from gmijax.runs.folder import RUNS
 from gmijax.runs.resume import checkpoints_of, find_checkpoint
@@ -22,6 +22,7 @@ _KEYS: Final[dict[str, type[Any]]] = {
     "sweep": SweepHelp,
     "pack": PackKeys,
     "play": PlayConfig,
+    "view": ViewConfig,
     "export": ExportConfig,
 }
 
@@ -55,10 +56,11 @@ def own_answers(command: str, words: Sequence[str]) -> list[str] | None:
 def _values(command: str, key: str, before: Sequence[str]) -> list[str]:
     if key == "run.resume" and command in ("train", "sweep"):
         return ["last", "auto", *_runs()]
-    if key == "run.dir" and command in ("play", "export", "serve"):
+    if key == "run.dir" and command in ("play", "view", "export", "serve"):
         return ["last", *_runs()]
-    if key == "checkpoint" and command in ("play", "export"):
-        return ["best", *_checkpoints(before)]
+    if key == "checkpoint" and command in ("play", "view", "export"):
+        shipped = [] if command == "export" else ["shipped"]
+        return ["best", *shipped, *_checkpoints(before)]
     return allowed_values(_KEYS[command], key)
 
 

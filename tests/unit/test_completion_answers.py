@@ -10,6 +10,8 @@ from made_checkpoint import ENV_STEPS, make_run
 
 from gmijax.cli.answers import own_answers
 
+ROOT = Path(__file__).parents[2]
+
 
 @pytest.mark.parametrize(
     ("line", "answers"),
@@ -53,4 +55,13 @@ def test_run_folders_and_checkpoints_are_offered_the_newest_first(
     steps = ["checkpoint=best", f"checkpoint={ENV_STEPS}"]
     assert own_answers("export", ["run.dir=runs/old", "checkpoint="]) == steps
     assert own_answers("play", ["checkpoint=2"]) == steps[1:]
-    assert own_answers("play", ["run.dir=nowhere", "checkpoint="]) == steps[:1]
+    shipped = [steps[0], "checkpoint=shipped"]
+    assert own_answers("view", ["run.dir=nowhere", "checkpoint="]) == shipped
+    assert own_answers("export", ["run.dir=nowhere", "checkpoint="]) == steps[:1]
+
+
+@pytest.mark.parametrize(
+    "path", sorted((ROOT / "configs").glob("*.yaml")), ids=lambda path: path.stem
+)
+def test_every_command_with_keys_has_answers(path: Path):
+    assert "--help" in (own_answers(path.stem, ["--"]) or ())
