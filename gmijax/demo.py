@@ -26,8 +26,8 @@ from gmijax.runs.folder import RunPaths, read_json
 USAGE: Final = """usage: gmijax demo [env=TASK] [key=value ...]
 
 Plays the policy that comes with gmijax for a task, ball_balance if none is named, and films it in
-runs/shipped/TASK. Then it asks whether to train ball_balance here: seconds on a GPU, minutes on
-two CPU cores. With keys of `gmijax train` it trains that task with them, without asking.
+runs/shipped/TASK. Then it asks whether to train ball_balance here: about a minute on a GPU, a few
+on two CPU cores. If you add keys of `gmijax train`, it trains that task with them without asking.
 """
 
 TASK: Final = "ball_balance"
@@ -134,9 +134,11 @@ def _is_wanted() -> bool:
     """Whether the user at the terminal wants a training; nobody is asked without one."""
     if not (sys.stdin.isatty() and sys.stdout.isatty()):
         return False
-    how_long = "seconds on this GPU" if detect_machine().gpus else "minutes on this CPU"
+    how_long = (
+        "about a minute on this GPU" if detect_machine().gpus else "a few minutes on this CPU"
+    )
     try:
-        answer = input(f"train {TASK} here now, some {how_long}? [y/N] ")
+        answer = input(f"Train {TASK} here now? It takes {how_long}. [y/N] ")
     except EOFError:
         return False
     return answer.strip().lower() in ("y", "yes")

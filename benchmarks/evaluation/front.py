@@ -20,16 +20,21 @@ def front() -> list[str]:
     marks, sharing = "learning.md#seconds-to-published-returns", "sharing.md"
     ant, humanoid = (seconds_to_mark(task) for task in ("ant", "humanoid"))
     rows = [
-        _row("`ant` runs (return 3,000)", *_of(ant, ".1f", _SECONDS), "H100", marks),
-        _row("`humanoid` runs (return 5,000)", *_of(humanoid, ".1f", _SECONDS), "H200", marks),
+        _row("`ant` learns to run (return 3,000)", *_of(ant, ".1f", _SECONDS), "H100", marks),
         _row(
-            "eight trainings of `ant` at once, over one",
+            "`humanoid` learns to run (return 5,000)",
+            *_of(humanoid, ".1f", _SECONDS),
+            "H200",
+            marks,
+        ),
+        _row(
+            "eight `ant` trainings at once, compared with one",
             *_of(eight, ".2f", _TIMES),
             *("H200", f"{sharing}#many-small-training-runs"),
         ),
         *(
             _row(
-                f"eight trainings of {one.name} (PyTorch) at once, over one",
+                f"eight trainings of {one.name} (PyTorch) at once, compared with one",
                 *(f"{one.steps_per_s:.2f} {_TIMES}", f"{one.repeats} runs"),
                 *("H200", f"{sharing}#other-libraries"),
             )
@@ -41,7 +46,7 @@ def front() -> list[str]:
             *("H100", "speed.md#beside-other-libraries"),
         ),
         _row(
-            "`kill -9` of one of four processes, until all train again",
+            "recovery after `kill -9` of one of four processes",
             *_of(recovered, ".0f", "s"),
             *("H200", "speed.md#recovery-from-faults"),
         ),
