@@ -17,7 +17,8 @@ class PageConfig(KeyGroup):
     prefix = "view."
 
     host: str = doc(
-        "address to listen at; 0.0.0.0: at all of this machine's, for who has the token of the URL"
+        "address to listen at; 0.0.0.0: all addresses of this machine; the token in the URL is "
+        "still needed"
     )
     port: int = doc(
         "port to listen at; the next free one if it is taken; 0: any", low=0, high=65535

@@ -264,7 +264,8 @@ def last_run(key: str) -> Path:
     found = {path: run for run in _folders_in(RUNS) for path in checkpoints_of(run)[-1:]}
     if not found:
         raise ConfigError(
-            f"{key}=last: no run with a checkpoint in {RUNS}/; train one: gmijax train env=ball_balance"
+            f"{key}=last: no run with a checkpoint in {RUNS}/; train one: "
+            "gmijax train env=ball_balance"
         )
     return found[max(found, key=_written_s)]
 

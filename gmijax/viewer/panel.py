@@ -106,9 +106,7 @@ class Panel:
             self._put(requests.SetSpeed(SPEEDS[event.target.value]))
 
     def _add_push(self) -> None:
-        button = self._gui.add_button(
-            "Push", color="orange", hint="or pull a body: ctrl and the left mouse button"
-        )
+        button = self._gui.add_button("Push", color="orange", hint="or pull a body: Ctrl and drag")
         strength = self._gui.add_slider(
             "Push (m/s)", min=0.1, max=3.0, step=0.1, initial_value=PUSH_M_PER_S
         )
@@ -221,7 +219,7 @@ def _age(seconds: float) -> str:
 def bars_html(episode: Episode) -> str:
     """The terms of the reward as bars with a sign: of the last step, and summed."""
     total, now = sum(episode.sums.values()), sum(episode.now.values())
-    last = "" if episode.last_return is None else f", the one before {episode.last_return:.1f}"
+    last = "" if episode.last_return is None else f", previous {episode.last_return:.1f}"
     head = f"episode {episode.number}, step {episode.steps}: return {total:.1f}{last}"
     longest = max((abs(value) for value in episode.now.values()), default=0.0) or 1.0
     rows = [

@@ -47,7 +47,9 @@ def test_last_is_the_run_with_the_newest_checkpoint(
     monkeypatch.chdir(tmp_path)
     runs = Path("runs")
     make_run(runs / "none")
-    with pytest.raises(ConfigError, match=r"^run\.dir=last: no run with a checkpoint in runs/$"):
+    with pytest.raises(
+        ConfigError, match=r"^run\.dir=last: no run with a checkpoint in runs/; train one: "
+    ):
         last_run("run.dir")
     old, new = make_run(runs / "b", 900), make_run(runs / "a", 100)
     (runs / "file").touch()
