@@ -118,9 +118,8 @@ def _about(config: ViewConfig, url: str, port: int) -> list[str]:
     lines = [f"view.port={config.view.port} is taken; this is {port}"] if taken else []
     if is_loopback(config.view.host):
         here = socket.gethostname()
-        hint = (
-            f"from another machine: ssh -L {port}:127.0.0.1:{port} {here}, then the same address"
-        )
+        there = f"[{config.view.host}]" if ":" in config.view.host else "127.0.0.1"
+        hint = f"from another machine: ssh -L {port}:{there}:{port} {here}, then the same address"
     else:
         hint = "whoever has this address can open the page and press its buttons"
     return [*lines, url, f"{hint}; Ctrl-C ends it"]

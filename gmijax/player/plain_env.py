@@ -149,10 +149,14 @@ class PlainEnv:
         A world whose numbers leave every bound ends with reward 0 (`gmijax.sim.divergence`).
         """
         before, given = self._state, constant(action)
-        after = self._env.step(self._world, before, given)
-        diverged = diverged_by_source(self._env, after)["any"]
+        with np.errstate(over="ignore", invalid="ignore"):
+            after = self._env.step(self._world, before, given)
+            diverged = diverged_by_source(self._env, after)["any"]
+            state = end_diverged(before, after, diverged)
         self._diverged = bool(diverged)
-        self._state = state = end_diverged(before, after, diverged)
+        if self._diverged:  # It may be filmed.
+            state = state._replace(physics=before.physics)
+        self._state = state
         return Step(
             obs=self.obs,
             reward=float(state.reward),

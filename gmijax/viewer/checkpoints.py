@@ -13,6 +13,7 @@ from pathlib import Path
 from gmijax.errors import ConfigError
 from gmijax.player.policy import PlainPolicy, checkpoint_policy
 from gmijax.runs.folder import META, POLICY
+from gmijax.runs.names import steps_of
 from gmijax.runs.resume import CheckpointMeta, checkpoints_of
 
 
@@ -44,7 +45,8 @@ def read(checkpoint: Path) -> PlainPolicy | None:
 
 def label(checkpoint: Path) -> str:
     """What a checkpoint is called for people."""
-    return f"{int(checkpoint.name):,} steps"
+    steps = steps_of(checkpoint.name)
+    return checkpoint.name if steps is None else f"{steps:,} steps"
 
 
 def age_s(checkpoint: Path) -> float | None:

@@ -8,6 +8,7 @@ that only the printed URL has.
 
 from __future__ import annotations
 
+import functools
 import hmac
 import ipaddress
 import secrets
@@ -60,11 +61,11 @@ class Guard:
           origins: its headers `Origin`; programs other than browsers send none.
         """
         if len(hosts) != 1 or not self._is_ours(hosts[0]):
-            return "unknown host"
+            return f"unknown host; if it is yours: view.allow_origin=[http://{_text(hosts)}]"
         if origins and (len(origins) != 1 or not self._may_ask(origins[0], hosts[0])):
-            return "unknown origin"
+            return f"unknown origin; if it is yours: view.allow_origin=[{_text(origins)}]"
         first = path.partition("?")[0].lstrip("/").partition("/")[0]
-        if not hmac.compare_digest(first.encode(), self.token.encode()):
+        if not hmac.compare_digest(first.encode(errors="surrogateescape"), self.token.encode()):
             return "the address needs its token; open the one that gmijax view printed"
         return None
 
@@ -77,11 +78,18 @@ class Guard:
             return True
         # An address is no name that somebody else could have pointed here.
         beyond = not is_loopback(self.host)
-        return beyond and (_address(host) is not None or host in _own_names(self.host))
+        return beyond and (_address(host) is not None or host in own_names(self.host))
 
     def _may_ask(self, origin: str, host: str) -> bool:
         return origin in self.allowed_origins or origin in (f"http://{host}", f"https://{host}")
 
 
-def _own_names(host: str) -> set[str]:
+def _text(values: Sequence[str]) -> str:
+    """A header for people; it may be anything."""
+    return values[0][:80] if len(values) == 1 and values[0].isprintable() else "..."
+
+
+@functools.cache
+def own_names(host: str) -> set[str]:
+    """Names of this machine, where the server listens at `host`."""
     return {name.lower() for name in (host, socket.gethostname(), socket.getfqdn())}

@@ -196,8 +196,8 @@ class Loop:
                 self._change(follow_training=on and self._run is not None)
                 self._look()
             case requests.UseCheckpoint(checkpoint):
-                self._change(follow_training=False)
-                self._use(checkpoint)
+                if self._use(checkpoint):
+                    self._change(follow_training=False)
             case requests.Wake():
                 self._seen_client = self._clock()
                 self._restart_clock()
@@ -242,13 +242,17 @@ class Loop:
         self._change(checkpoints=found)
         if self.view.follow_training and found and found[-1] != self.view.checkpoint:
             self._use(found[-1])
+        elif self.view.problem:
+            self._change(problem="")
         if self.view.checkpoint is not None:
             self._change(checkpoint_age_s=checkpoints.age_s(self.view.checkpoint))
 
-    def _use(self, checkpoint: Path) -> None:
+    def _use(self, checkpoint: Path) -> bool:
+        """Acts by the policy of a checkpoint; False where it has none."""
         policy: Policy | None = checkpoints.read(checkpoint)
         if policy is None:  # The next look finds others.
             self._change(problem=f"{checkpoints.label(checkpoint)}: gone, or no policy")
-            return
+            return False
         self._simulation.policy = policy
         self._change(checkpoint=checkpoint, problem="")
+        return True

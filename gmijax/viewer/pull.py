@@ -14,19 +14,23 @@ class Pull:
 
     Args:
       model: a `mujoco.MjModel`.
-      data: its `mujoco.MjData`.
+      data: the `mujoco.MjData` that is stepped.
+      now: another one after `mj_fwdPosition` of the pose in which the body was grabbed; `data` has
+        no inertias at the start of an episode.
       body: that is pulled.
       grabbed: [3] the point that was taken hold of, in the world, m.
     """
 
-    def __init__(self, model: Any, data: Any, body: int, grabbed: npt.NDArray[Any]) -> None:
+    def __init__(
+        self, model: Any, data: Any, now: Any, body: int, grabbed: npt.NDArray[Any]
+    ) -> None:
         self._model, self._data = model, data
         self._spring = mujoco.MjvPerturb()
         self._spring.select = body
         self._spring.active = int(mujoco.mjtPertBit.mjPERT_TRANSLATE)
         self._spring.scale = 1.0
-        self._spring.localpos = data.xmat[body].reshape(3, 3).T @ (grabbed - data.xpos[body])
-        self._spring.localmass = _mass_at(model, data, body, grabbed)
+        self._spring.localpos = now.xmat[body].reshape(3, 3).T @ (grabbed - now.xpos[body])
+        self._spring.localmass = _mass_at(model, now, body, grabbed)
         self.pointer = grabbed
 
     @property

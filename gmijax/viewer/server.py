@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import http
 import io
 import socket
@@ -16,7 +17,7 @@ from websockets.datastructures import Headers
 from websockets.http11 import Request, Response
 
 from gmijax.errors import ConfigError, GmijaxError
-from gmijax.viewer.guard import Guard
+from gmijax.viewer.guard import Guard, own_names
 
 _PORTS_TRIED: Final = 20
 """From the wanted one upwards: several viewers may run on one machine."""
@@ -55,6 +56,7 @@ def open_server(guard: Guard, port: int) -> Server:
       ConfigError: it cannot listen there.
     """
     listening = _listen(guard.host, port)
+    own_names(guard.host)  # Which may ask a name server: not while others are served.
     try:
         with _guarded(guard, listening) as used, redirect_stdout(io.StringIO()):
             server = Server(host=guard.host, port=listening.getsockname()[1], verbose=False)
@@ -78,19 +80,27 @@ def close_server(server: viser.ViserServer) -> None:
 
 def _listen(host: str, port: int) -> socket.socket:
     """A listening socket. Of our own, because viser takes the port for one of a thousand."""
-    error: OSError | None = None
-    for candidate in range(port, min(port + _PORTS_TRIED, 65536)) if port else (0,):
-        try:
-            family, _, _, _, address = socket.getaddrinfo(
-                host, candidate, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE
-            )[0]
-            if family == socket.AF_INET6:
-                return socket.create_server(address[:2], family=family)
-            return socket.create_server(address[:2])
-        except (OSError, ValueError) as failed:
-            error = failed if isinstance(failed, OSError) else OSError(0, str(failed))
-    reason = getattr(error, "strerror", None) or error
+    try:
+        found = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE)
+        # For `localhost` that of IPv4, which `ssh -L` is told.
+        family, *_, address = min(found, key=lambda one: one[0] != socket.AF_INET)
+        for candidate in range(port, min(port + _PORTS_TRIED, 65536)) if port else (0,):
+            with _unless_in_use():
+                return socket.create_server((address[0], candidate), family=family)
+        reason = "no port is free"
+    except (OSError, ValueError) as failed:
+        reason = getattr(failed, "strerror", None) or str(failed)
     raise ConfigError(f"view.host={host} view.port={port}: cannot listen there ({reason})")
+
+
+@contextmanager
+def _unless_in_use() -> Iterator[None]:
+    """Goes on if an address is in use."""
+    try:
+        yield
+    except OSError as failed:
+        if failed.errno != errno.EADDRINUSE:
+            raise
 
 
 @contextmanager

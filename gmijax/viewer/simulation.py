@@ -52,6 +52,7 @@ class Simulation:
         self.episodes = [self._first(1, None) for _ in envs]
         self._told: Floats | None = None
         self._pulls: dict[int, Pull] = {}
+        self._torn_off: set[int] = set()
         self._pushes: dict[int, Floats] = {}
         self._pushed_lately: dict[int, tuple[int, Floats]] = {}
         self._rng, self.steps = np.random.default_rng(seed), 0
@@ -103,11 +104,16 @@ class Simulation:
         """Pulls at a body, or lets go."""
         if drag.pointer is None:
             self._pulls.pop(drag.env, None)
+            self._torn_off.discard(drag.env)
+            return
+        if drag.env in self._torn_off:
             return
         pull = self._pulls.get(drag.env)
         if pull is None or pull.body != drag.body:
-            world = self.envs[drag.env]
-            pull = Pull(self.model, world.data, drag.body, drag.grabbed)
+            env = self.envs[drag.env]
+            put(self._shown, env.qpos)
+            mujoco.mj_fwdPosition(self.model, self._shown)
+            pull = Pull(self.model, env.data, self._shown, drag.body, drag.grabbed)
             self._pulls[drag.env] = pull
         pull.pointer = drag.pointer
 
@@ -135,7 +141,8 @@ class Simulation:
 
     def _begin(self, number: int) -> None:
         before = self.episodes[number]
-        self._pulls.pop(number, None)
+        if self._pulls.pop(number, None) is not None:
+            self._torn_off.add(number)  # Until the mouse lets go: the body is elsewhere now.
         self._pushes.pop(number, None)
         self._pushed_lately.pop(number, None)
         self.envs[number].reset()

@@ -12,7 +12,6 @@ import time
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
-from gmijax.clock import running_s
 from gmijax.config import PlayConfig
 from gmijax.config.schema import from_dict
 from gmijax.errors import ConfigError
@@ -68,11 +67,12 @@ def _run(folder: Path, seconds: float) -> None:
 
 
 def _in_time(policy: PlainPolicy, config: PlayConfig, seconds: float) -> Iterator[Played]:
-    end_s = running_s() + seconds
+    started_s = time.monotonic()
     episodes = play(policy, config.num_envs, config.seed, config.max_steps)
     for number, episode in enumerate(episodes, 1):
         yield episode
-        if number >= config.num_filmed and running_s() > end_s:
+        played_s = time.monotonic() - started_s
+        if number >= config.num_filmed and played_s > seconds:
             return
 
 

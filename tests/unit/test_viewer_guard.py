@@ -33,19 +33,19 @@ def test_this_machine_may_ask(host: str) -> None:
     ],
 )
 def test_another_host_may_not(host: str) -> None:
-    assert refusal(GUARD, host) == "unknown host"
+    assert (refusal(GUARD, host) or "").startswith("unknown host")
 
 
 def test_one_host_is_needed() -> None:
-    assert GUARD.refusal("/secret/", [], []) == "unknown host"
-    assert GUARD.refusal("/secret/", [HERE, HERE], []) == "unknown host"
+    assert (GUARD.refusal("/secret/", [], []) or "").startswith("unknown host")
+    assert (GUARD.refusal("/secret/", [HERE, HERE], []) or "").startswith("unknown host")
 
 
 @pytest.mark.parametrize(
     "origin", ["http://evil.example", "http://127.0.0.1:8081", "http://localhost:8080", "null", ""]
 )
 def test_the_page_of_somebody_else_may_not(origin: str) -> None:
-    assert refusal(GUARD, HERE, origin) == "unknown origin"
+    assert (refusal(GUARD, HERE, origin) or "").startswith("unknown origin")
 
 
 @pytest.mark.parametrize("path", ["/", "", "/secre/", "/secret2/", "/x/secret", "/?token=secret"])
@@ -65,7 +65,7 @@ def test_two_servers_have_two_tokens() -> None:
 
 def test_beyond_loopback_addresses_pass_and_names_do_not() -> None:
     assert refusal(PUBLIC, "10.0.0.1:8080", "http://10.0.0.1:8080") is None
-    assert refusal(PUBLIC, "evil.example") == "unknown host"
+    assert (refusal(PUBLIC, "evil.example") or "").startswith("unknown host")
     assert "token" in str(refusal(PUBLIC, "10.0.0.1", path="/"))
 
 
@@ -73,7 +73,9 @@ def test_an_allowed_origin_passes_under_its_own_host_and_ours() -> None:
     allowed = "https://hub.example.org"
     assert refusal(PUBLIC, "hub.example.org", allowed) is None
     assert refusal(PUBLIC, HERE, allowed) is None
-    assert refusal(PUBLIC, HERE, "https://hub.example.org.evil.example") == "unknown origin"
+    assert (refusal(PUBLIC, HERE, "https://hub.example.org.evil.example") or "").startswith(
+        "unknown origin"
+    )
 
 
 @pytest.mark.parametrize("origin", ["hub.example.org", "https://hub/x", "ftp://hub", "*", ""])

@@ -132,6 +132,36 @@ def test_a_push_moves_the_selected_robot_alone() -> None:
     assert not pushed.simulation.envs[1].data.xfrc_applied.any()
 
 
+@pytest.mark.parametrize("task", ["ant", "ball_balance"])
+def test_a_body_that_is_pulled_right_after_a_reset_stays_whole(task: str) -> None:
+    stand = Stand(task, num_envs=1)
+    stand.loop.do(requests.Reset())
+    body = stand.simulation.pushed
+    at = stand.simulation.poses()[0][0, body]
+    stand.loop.do(requests.Drag(0, body, at, at + np.array([0.0, 0.0, 0.3])))
+    stand.loop.do(requests.Step())
+    assert stand.simulation.episodes[0].steps == 1
+    assert np.abs(stand.qvel()).max() < 50.0
+
+
+def test_a_pull_ends_with_its_episode_until_the_mouse_lets_go() -> None:
+    stand, alone = Stand("ant", num_envs=1), Stand("ant", num_envs=1)
+    body = stand.simulation.pushed
+    at = stand.simulation.poses()[0][0, body]
+    far = requests.Drag(0, body, at, at + 5.0)
+    for asked in (far, requests.Reset(), far):  # Of one movement of the mouse.
+        stand.loop.do(asked)
+    alone.loop.do(requests.Reset())
+    for one in (stand, alone):
+        one.loop.do(requests.Step())
+    np.testing.assert_array_equal(stand.qvel(), alone.qvel())
+
+
+def test_a_checkpoint_under_another_name_is_called_by_it() -> None:
+    assert checkpoints.label(Path("runs/a/checkpoints/mine")) == "mine"
+    assert checkpoints.label(Path("runs/a/checkpoints/000000001000")) == "1,000 steps"
+
+
 def test_the_mouse_pulls_a_body_until_it_lets_go() -> None:
     stand = Stand("anymal", num_envs=1)
     base = stand.simulation.model.body("base").id
