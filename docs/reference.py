@@ -59,6 +59,9 @@ gmijax pack pack.copies=8 -- wandb agent ENTITY/PROJECT/ID""",
     "serve": """\
 gmijax serve run.dir=last num_envs=8192 num_timesteps=50e6 output.dir=data/ant
 gmijax serve env=ant policy=random""",
+    "view": """\
+gmijax view run.dir=last
+gmijax view run.dir=runs/ant checkpoint=best num_envs=9""",
     "play": """\
 gmijax play                                  # the last run
 gmijax play run.dir=runs/ant checkpoint=best video_envs=4""",
@@ -90,6 +93,7 @@ TOPICS: Final[Mapping[str, Topic]] = {
         "Size, length and seed", "", "gmijax train env=ant num_envs=4096 num_timesteps=30e6"
     ),
     "output": Topic("What is kept", "serving.md"),
+    "view": Topic("The page and who may open it", "view.md"),
     "env": Topic("Task", "tasks.md", "gmijax train env=ant env.rewards.energy=-0.1"),
     "physics": Topic("Physics", "warp.md", "gmijax train env=ant physics.impl=jax"),
     "algo=ppo": Topic(

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from docs.pages import documents
-from docs.reference import COMMANDS, EXAMPLES, TOPICS
+from docs.reference import COMMANDS, EXAMPLES, TOPICS, command_page
 from gmijax.__main__ import VERBS, main
 
 BLOCK = re.compile(r"^( *)```(?:bash)?\n(.*?)^\1```", re.MULTILINE | re.DOTALL)
@@ -70,6 +70,11 @@ def test_examples_of_the_reference_are_taken(
     commands = commands_of(f"```\n{examples}\n```\n")
     assert len(commands) >= len(EXAMPLES)
     assert [line for one in commands if (line := refused(one, capsys))] == []
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_every_command_has_a_page(command: str):
+    assert command_page(command).startswith(f"# gmijax {command}\n")
 
 
 def test_a_wrong_key_is_found(capsys: pytest.CaptureFixture[str]):
