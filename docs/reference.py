@@ -15,26 +15,12 @@ from typing import Any, Final, Literal, NamedTuple
 
 import gmijax
 from gmijax import demo, doctor, list_envs
+from gmijax.cli.answers import COMMANDS
 from gmijax.cli.compose import defaults
-from gmijax.cli.grid import SweepHelp
 from gmijax.cli.groups import choices
 from gmijax.cli.help import Key, keys_of, usage_of
-from gmijax.cli.pack import PackKeys
-from gmijax.config import ExportConfig, PlayConfig, ServeConfig, TrainConfig, ViewConfig
 
 DOCS: Final = Path(__file__).parent
-
-COMMANDS: Final[Mapping[str, type[Any]]] = {
-    "train": TrainConfig,
-    "search": TrainConfig,
-    "sweep": SweepHelp,
-    "pack": PackKeys,
-    "serve": ServeConfig,
-    "play": PlayConfig,
-    "view": ViewConfig,
-    "export": ExportConfig,
-}
-"""The commands that take keys, and the dataclass of each."""
 
 LIKE_TRAIN: Final = ("search", "sweep")
 """Commands with the keys of `train`; their pages show only what differs."""

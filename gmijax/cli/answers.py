@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import Any, Final
@@ -15,7 +15,7 @@ from gmijax.errors import GmijaxError
 from gmijax.runs.folder import RUNS
 from gmijax.runs.resume import checkpoints_of, find_checkpoint
 
-_KEYS: Final[dict[str, type[Any]]] = {
+COMMANDS: Final[Mapping[str, type[Any]]] = {
     "train": TrainConfig,
     "search": TrainConfig,
     "serve": ServeConfig,
@@ -25,6 +25,7 @@ _KEYS: Final[dict[str, type[Any]]] = {
     "view": ViewConfig,
     "export": ExportConfig,
 }
+"""The commands that take keys, and the dataclass of each."""
 
 _OPTIONS: Final = ("--help", "--verbose", "--cfg")
 _MOST_RUNS: Final = 30
@@ -39,7 +40,7 @@ def own_answers(command: str, words: Sequence[str]) -> list[str] | None:
     """
     *before, word = words or [""]
     if before and before[-1] in ("--help", "-h"):
-        found = topics_of(_KEYS[command])
+        found = topics_of(COMMANDS[command])
     elif before and before[-1] == "--cfg":
         found = ["job"]
     elif word.startswith("-"):
@@ -61,7 +62,7 @@ def _values(command: str, key: str, before: Sequence[str]) -> list[str]:
     if key == "checkpoint" and command in ("play", "view", "export"):
         shipped = [] if command == "export" else ["shipped"]
         return ["best", *shipped, *_checkpoints(before)]
-    return allowed_values(_KEYS[command], key)
+    return allowed_values(COMMANDS[command], key)
 
 
 def _runs() -> list[str]:
