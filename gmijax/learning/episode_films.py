@@ -10,7 +10,7 @@ from gmijax.errors import ConfigError
 from gmijax.learning.episodes import Episodes
 from gmijax.runs.folder import RunPaths
 from gmijax.sim.interface import Env
-from gmijax.sim.trajectory import chosen, save_model, save_trajectory
+from gmijax.sim.trajectory import save_model, save_trajectory
 
 
 class EpisodeFilms:
@@ -45,10 +45,7 @@ class EpisodeFilms:
         if not (is_due or env_steps >= self._end):
             return
         self._last_steps = env_steps
-        trajectory = chosen(
-            episodes.qpos,
-            episodes.lengths,
-            episodes.returns,
+        trajectory = episodes.filmed(
             self._spec.control_dt_s,
             count=min(FILMED, episodes.qpos.shape[1]),
             title=f"{self._spec.name} after {env_steps:,} env steps",

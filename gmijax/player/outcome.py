@@ -8,6 +8,7 @@ import numpy as np
 import numpy.typing as npt
 
 from gmijax.config import PlayConfig
+from gmijax.sim.trajectory import Trajectory, chosen
 
 
 class Episodes(NamedTuple):
@@ -37,6 +38,18 @@ class Episodes(NamedTuple):
     qpos: npt.NDArray[np.float32]
     compile_s: float
     run_s: float
+
+    def filmed(self, control_dt_s: float, *, count: int, title: str, command: str) -> Trajectory:
+        """Those that a film shows; see `gmijax.sim.trajectory.chosen`."""
+        return chosen(
+            self.qpos,
+            self.lengths,
+            self.returns,
+            control_dt_s,
+            count=count,
+            title=title,
+            command=command,
+        )
 
 
 def summarise(

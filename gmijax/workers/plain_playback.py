@@ -22,7 +22,7 @@ from gmijax.player.returns import Played, play, together
 from gmijax.player.shipped import shipped_policy
 from gmijax.runs.folder import PlayPaths, RunPaths, read_json, write_json
 from gmijax.sim.camera import check_camera, choose_camera
-from gmijax.sim.trajectory import chosen, save_model, save_trajectory
+from gmijax.sim.trajectory import save_model, save_trajectory
 
 
 def main(arguments: Sequence[str]) -> int:
@@ -45,10 +45,7 @@ def _run(folder: Path, seconds: float) -> None:
     started_s = time.monotonic()
     episodes = together(list(_in_time(policy, config, seconds)), time.monotonic() - started_s)
     env_steps = policy.about.get("env_steps")
-    trajectory = chosen(
-        episodes.qpos,
-        episodes.lengths,
-        episodes.returns,
+    trajectory = episodes.filmed(
         env.spec.control_dt_s,
         count=config.num_filmed,
         title=f"{task}, trained for {env_steps:,} env steps",

@@ -61,7 +61,8 @@ def _run(link: ChildLink) -> None:
         lambda chunks: link.beat("running", chunks),
     )
     paths = PlayPaths(link.run.root)
-    _write_trajectory(paths, env, episodes, config)
+    env_steps = CheckpointMeta.read(checkpoint).env_steps
+    _write_trajectory(paths, env, episodes, config, env_steps)
     device = jax.local_devices()[0]
     camera = None if env.mj_model is None else choose_camera(env.mj_model, config.camera).name
     about = {
@@ -70,12 +71,8 @@ def _run(link: ChildLink) -> None:
         "camera": camera,
     }
     # Written last: whoever sees it finds the trajectory complete.
-    outcome = summarise(config, env.spec.name, _env_steps(config), episodes)
+    outcome = summarise(config, env.spec.name, env_steps, episodes)
     write_json(paths.returns, {**outcome, **about})
-
-
-def _env_steps(config: PlayConfig) -> int:
-    return CheckpointMeta.read(Path(str(config.checkpoint))).env_steps
 
 
 def _impl(config: PlayConfig, checkpoint: Path, env_config: EnvConfig) -> str:
@@ -93,17 +90,15 @@ def _impl(config: PlayConfig, checkpoint: Path, env_config: EnvConfig) -> str:
     return impl
 
 
-def _write_trajectory(paths: PlayPaths, env: Env, episodes: Episodes, config: PlayConfig) -> None:
-    from gmijax.sim.trajectory import chosen, save_model, save_trajectory
+def _write_trajectory(
+    paths: PlayPaths, env: Env, episodes: Episodes, config: PlayConfig, env_steps: int
+) -> None:
+    from gmijax.sim.trajectory import save_model, save_trajectory
 
     if env.mj_model is None:  # The controller sees that there is nothing to film.
         return
     save_model(paths.model, env.mj_model)
-    env_steps = _env_steps(config)
-    trajectory = chosen(
-        episodes.qpos,
-        episodes.lengths,
-        episodes.returns,
+    trajectory = episodes.filmed(
         env.spec.control_dt_s,
         count=config.num_filmed,
         title=f"{env.spec.name} after {env_steps:,} env steps",
