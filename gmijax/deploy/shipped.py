@@ -13,7 +13,7 @@ from gmijax.config.schema import to_dict
 from gmijax.deploy.pictures import run_child
 from gmijax.errors import ConfigError, GmijaxError
 from gmijax.machine.opengl import environment_with
-from gmijax.player.shipped import shipped_tasks
+from gmijax.player.shipped import require_shipped
 from gmijax.runs.folder import RUNS, PlayPaths, RunPaths, remove_temporary, write_json
 from gmijax.supervise.failures import last_line
 
@@ -38,16 +38,6 @@ def checked(config: PlayConfig) -> PlayConfig:
             shown = "null" if allowed is None else str(allowed).lower()
             raise ConfigError(f"{key}={value}: allowed with checkpoint=shipped is {shown}")
     return config
-
-
-def require_shipped(task: str | None) -> str:
-    """The task; raises ConfigError if no policy of it is shipped."""
-    tasks = ", ".join(shipped_tasks()) or "none (python -m benchmarks.shipped makes them)"
-    if task is None:
-        raise ConfigError(f"checkpoint=shipped: of which task? Add env=TASK; there are {tasks}")
-    if task not in shipped_tasks():
-        raise ConfigError(f"env={task}: no policy of it is shipped; allowed are {tasks}")
-    return task
 
 
 def folder_of(config: PlayConfig) -> PlayPaths:

@@ -15,11 +15,11 @@ from rich.console import Console
 from gmijax.config import EnvConfig, ViewConfig
 from gmijax.control.console import nearby, open_console
 from gmijax.deploy.playing import open_run
-from gmijax.deploy.shipped import SHIPPED, require_shipped
+from gmijax.deploy.shipped import SHIPPED
 from gmijax.errors import ConfigError
 from gmijax.player.plain_env import PlainEnv, task_of
 from gmijax.player.policy import PlainPolicy, checkpoint_policy
-from gmijax.player.shipped import shipped_policy
+from gmijax.player.shipped import require_shipped, shipped_policy
 from gmijax.viewer.checkpoints import Checkpoints
 from gmijax.viewer.guard import Guard, is_loopback
 from gmijax.viewer.installed import INSTALL, missing

@@ -16,14 +16,20 @@ def shipped_tasks() -> tuple[str, ...]:
     return tuple(sorted(path.stem for path in POLICIES.glob("*.npz")))
 
 
+def require_shipped(task: str | None) -> str:
+    """The task; raises ConfigError if no policy of it is shipped."""
+    tasks = ", ".join(shipped_tasks()) or "none (python -m benchmarks.shipped makes them)"
+    if task is None:
+        raise ConfigError(f"checkpoint=shipped: of which task? Add env=TASK; there are {tasks}")
+    if task not in shipped_tasks():
+        raise ConfigError(f"env={task}: no policy of it is shipped; allowed are {tasks}")
+    return task
+
+
 def shipped_policy(task: str) -> PlainPolicy:
     """The shipped policy of a task.
 
     Raises:
       ConfigError: there is none.
     """
-    if task not in shipped_tasks():
-        raise ConfigError(
-            f"env={task}: no policy of it is shipped; allowed are {', '.join(shipped_tasks())}"
-        )
-    return read_policy(POLICIES / f"{task}.npz")
+    return read_policy(POLICIES / f"{require_shipped(task)}.npz")
