@@ -71,6 +71,17 @@ class Stage:
         return self._renderer.render()
 
 
+def body_poses(
+    model: Any, data: Any, qpos: npt.NDArray[Any]
+) -> tuple[npt.NDArray[Any], npt.NDArray[Any]]:
+    """Positions [nbody, 3], m, and quaternions [nbody, 4] of all bodies, computed in `data`."""
+    import mujoco
+
+    put(data, qpos)
+    mujoco.mj_kinematics(model, data)
+    return data.xpos.copy(), data.xquat.copy()
+
+
 def put(data: Any, qpos: npt.NDArray[Any]) -> None:
     """Moves the joints of a `mujoco.MjData`, and its mocap bodies if `qpos` has their poses."""
     joints, rest = np.split(np.asarray(qpos), [data.qpos.size])

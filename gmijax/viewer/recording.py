@@ -7,7 +7,7 @@ from typing import Any, Final
 import mujoco
 import numpy as np
 
-from gmijax.sim.stage import put
+from gmijax.sim.stage import body_poses
 from gmijax.sim.trajectory import Trajectory
 from gmijax.viewer.guard import Guard
 from gmijax.viewer.scene import Scene
@@ -35,7 +35,7 @@ def page(model: Any, trajectory: Trajectory) -> str:
         data = mujoco.MjData(model)
         for step in range(0, num_steps, stride):
             poses = [
-                _poses(model, data, trajectory.qpos[min(step, int(length)), world])
+                body_poses(model, data, trajectory.qpos[min(step, int(length)), world])
                 for world, length in enumerate(trajectory.lengths)
             ]
             xpos, xquat = (np.stack(found) for found in zip(*poses, strict=True))
@@ -44,9 +44,3 @@ def page(model: Any, trajectory: Trajectory) -> str:
         return recording.as_html()
     finally:
         close_server(server)
-
-
-def _poses(model: Any, data: Any, qpos: Any) -> tuple[Any, Any]:
-    put(data, qpos)
-    mujoco.mj_kinematics(model, data)
-    return data.xpos.copy(), data.xquat.copy()

@@ -43,8 +43,8 @@ BLUE: Final = (60, 130, 200)
 
 
 class _Part(NamedTuple):
-    handle: Any
-    bodies: npt.NDArray[np.intp]  # [K]; an instance for each of them in each environment.
+    handle: Any  # Of an instance in each environment.
+    body: int
 
 
 class Scene:
@@ -109,8 +109,8 @@ class Scene:
             self._fixed.position = -shift
             self._ring.position = self._ring_position(placed, selected)
             for part in self._parts:
-                part.handle.batched_positions = placed[:, part.bodies].reshape(-1, 3)
-                part.handle.batched_wxyzs = xquat[:, part.bodies].reshape(-1, 4)
+                part.handle.batched_positions = placed[:, part.body]
+                part.handle.batched_wxyzs = xquat[:, part.body]
         self._server.flush()
 
     def show_arrows(self, name: str, color: Color, arrows: Mapping[int, Arrow]) -> None:
@@ -149,22 +149,22 @@ class Scene:
         """Has `callback` called while a body is pulled with ctrl and the left button."""
         for part in self._parts:
             # A function of its own for each part. Async ones are called in the order of events.
-            async def pulled(event: Any, bodies: npt.NDArray[np.intp] = part.bodies) -> None:
-                env, at = divmod(event.instance_index or 0, len(bodies))
+            async def pulled(event: Any, body: int = part.body) -> None:
+                env = event.instance_index or 0
                 back = self._shift - self._offsets[env]
                 pointer = None if event.phase == "end" else np.array(event.end_position) + back
                 grabbed = np.array(event.start_position) + back
-                callback(Drag(env, int(bodies[at]), grabbed, pointer))
+                callback(Drag(env, body, grabbed, pointer))
 
             part.handle.on_drag("left", modifier="cmd/ctrl")(pulled)
 
     def on_select(self, callback: Callable[[int], None]) -> None:
         """Has `callback` called with the environment of a body that is clicked."""
+
+        async def clicked(event: Any) -> None:
+            callback(event.instance_index or 0)
+
         for part in self._parts:
-
-            async def clicked(event: Any, bodies: npt.NDArray[np.intp] = part.bodies) -> None:
-                callback((event.instance_index or 0) // len(bodies))
-
             part.handle.on_click(clicked)
 
     def _add_bodies(self) -> list[_Part]:
@@ -180,7 +180,7 @@ class Scene:
                     lod="off",
                 )
                 if not fixed:
-                    parts.append(_Part(handle, np.array([body])))
+                    parts.append(_Part(handle, body))
         return parts
 
     def _add_ring(self, visible: bool) -> Any:

@@ -85,22 +85,15 @@ def _listen(host: str, port: int) -> socket.socket:
         # For `localhost` that of IPv4, which `ssh -L` is told.
         family, *_, address = min(found, key=lambda one: one[0] != socket.AF_INET)
         for candidate in range(port, min(port + _PORTS_TRIED, 65536)) if port else (0,):
-            with _unless_in_use():
+            try:
                 return socket.create_server((address[0], candidate), family=family)
+            except OSError as failed:
+                if failed.errno != errno.EADDRINUSE:
+                    raise
         reason = "no port is free"
     except (OSError, ValueError) as failed:
         reason = getattr(failed, "strerror", None) or str(failed)
     raise ConfigError(f"view.host={host} view.port={port}: cannot listen there ({reason})")
-
-
-@contextmanager
-def _unless_in_use() -> Iterator[None]:
-    """Goes on if an address is in use."""
-    try:
-        yield
-    except OSError as failed:
-        if failed.errno != errno.EADDRINUSE:
-            raise
 
 
 @contextmanager

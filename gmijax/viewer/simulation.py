@@ -11,7 +11,7 @@ import numpy.typing as npt
 
 from gmijax.player.plain_env import PlainEnv
 from gmijax.sim.camera import free_robot
-from gmijax.sim.stage import put
+from gmijax.sim.stage import body_poses, put
 from gmijax.viewer.pull import Pull
 from gmijax.viewer.requests import Drag
 
@@ -120,7 +120,8 @@ class Simulation:
     def tell(self, command: Sequence[float] | None) -> None:
         """Tells all robots what to do; None: what the task draws, from the next episode on."""
         self._told = None if command is None else np.array(command, np.float32)
-        self._tell()
+        for env in self.envs:
+            self._tell(env)
 
     def pushed_lately(self) -> dict[int, Floats]:
         """Changes of velocity [3] by pushes of the last half of a second, m/s, by environment."""
@@ -130,14 +131,9 @@ class Simulation:
 
     def poses(self) -> tuple[Floats, Floats]:
         """Positions [E, B, 3], m, and orientations [E, B, 4] of all bodies."""
-        found = [self._poses(env) for env in self.envs]
-        return np.stack([xpos for xpos, _ in found]), np.stack([xquat for _, xquat in found])
-
-    def _poses(self, env: PlainEnv) -> tuple[Floats, Floats]:
         # Those of `env.data` are of before the last physics step.
-        put(self._shown, env.qpos)
-        mujoco.mj_kinematics(self.model, self._shown)
-        return self._shown.xpos.copy(), self._shown.xquat.copy()
+        found = [body_poses(self.model, self._shown, env.qpos) for env in self.envs]
+        return np.stack([xpos for xpos, _ in found]), np.stack([xquat for _, xquat in found])
 
     def _begin(self, number: int) -> None:
         before = self.episodes[number]
@@ -148,7 +144,7 @@ class Simulation:
         self.envs[number].reset()
         ended = sum(before.sums.values()) if before.steps else before.last_return
         self.episodes[number] = self._first(before.number + bool(before.steps), ended)
-        self._tell()
+        self._tell(self.envs[number])
 
     def _first(self, number: int, last_return: float | None) -> Episode:
         names = self.envs[0].spec.reward_terms
@@ -161,10 +157,9 @@ class Simulation:
         sums = {name: before.sums[name] + value for name, value in terms.items()}
         self.episodes[number] = before._replace(steps=before.steps + 1, sums=sums, now=terms)
 
-    def _tell(self) -> None:
+    def _tell(self, env: PlainEnv) -> None:
         if self._told is not None:
-            for env in self.envs:
-                env.command = self._told
+            env.command = self._told
 
 
 def pushed_body(model: Any) -> int:
