@@ -46,9 +46,10 @@ class EventReader:
         now_s = self._clock()
         if self._searched_s is None or now_s - self._searched_s >= _LOOK_S:
             self._searched_s = now_s
-            for path in sorted(self._folder.rglob(_FILES)):
-                if path not in self._offsets and path.stat().st_mtime >= self._since_s:
-                    self._offsets[path] = 0
+            with suppress(OSError):  # The job may remove what is listed.
+                for path in sorted(self._folder.rglob(_FILES)):
+                    if path not in self._offsets and path.stat().st_mtime >= self._since_s:
+                        self._offsets[path] = 0
         return [report for path in self._offsets for report in self._of_file(path)]
 
     def _of_file(self, path: Path) -> Iterator[Report]:

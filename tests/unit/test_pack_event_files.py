@@ -82,6 +82,11 @@ def test_files_of_an_earlier_attempt_are_left_alone(tmp_path: Path, writer: Even
     assert EventReader(tmp_path, TAG, since_s=file.stat().st_mtime + 1.0).new() == []
 
 
+def test_a_file_that_goes_while_the_folder_is_searched_is_nothing(tmp_path: Path) -> None:
+    (tmp_path / "events.out.tfevents.1").symlink_to(tmp_path / "gone")
+    assert EventReader(tmp_path, TAG, since_s=0.0).new() == []
+
+
 def test_what_is_no_event_file_is_nothing(tmp_path: Path) -> None:
     (tmp_path / "events.out.tfevents.1").write_bytes(b"\xff" * 100)
     (tmp_path / "events.out.tfevents.2").write_bytes(struct.pack("<Q", 4) + b"nothing here")
