@@ -9,6 +9,7 @@ the controller decides what becomes of it.
 
 from __future__ import annotations
 
+import atexit
 import faulthandler
 import gc
 import os
@@ -190,6 +191,9 @@ def run_gmi(routine: Callable[[ChildLink], Mapping[str, Any] | None]) -> int:
     What the routine returns is the content of `result.json`; None writes none.
     """
     link = ChildLink.from_environment()  # Pins the cores, so it comes before jax.
+    exit_codes = [1]
+    # What is registered first runs last, after what jax and others have to do at the end.
+    atexit.register(_exit_without_teardown, exit_codes)
     link.beat("starting", 0)
     try:
         result = routine(link)
@@ -197,9 +201,25 @@ def run_gmi(routine: Callable[[ChildLink], Mapping[str, Any] | None]) -> int:
             write_json(link.paths.result, result)
     except BaseException as error:  # The controller must learn of every way to fail.
         link.report_error(error)
+        if isinstance(error, SystemExit) and isinstance(error.code, int):
+            exit_codes[:] = [error.code]
         raise
     link.beat("done", 0)
+    exit_codes[:] = [0]
     return 0
+
+
+def _exit_without_teardown(exit_codes: list[int]) -> None:
+    """Ends this process before Python takes itself apart.
+
+    Until Python 3.13 a thread of a library that asks for the interpreter meanwhile is ended
+    inside the library's C++, which aborts the process (https://github.com/python/cpython/issues/87135):
+    a GMI that has done all would count as failed.
+    """
+    for stream in (sys.stdout, sys.stderr):
+        with suppress(OSError, ValueError, AttributeError):  # Closed, or the disk is full.
+            stream.flush()
+    os._exit(exit_codes[0])
 
 
 def _leave_signals_to_controller() -> None:

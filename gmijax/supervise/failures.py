@@ -26,7 +26,13 @@ _GPU_FAULT = re.compile(r"CUDA_ERROR_(?!OUT_OF_MEMORY)|ended by SIGABRT|MPS daem
 _NOTHING_FITS = "All configs failed during profiling"
 """What XLA says where it has no memory to try kernels."""
 
-_TAIL_BYTES = 8192
+_FATAL = "Fatal Python error: "
+_STACKS = re.compile(
+    r"(Current t|T)hread |  (File \"|<|Garbage|Binary file|\.\.\.)|Extension modules: |<truncated"
+)
+"""How the lines begin that `faulthandler` writes when a signal ends the process."""
+
+_TAIL_BYTES = 2**16
 _MAX_LINE = 300
 
 
@@ -104,8 +110,14 @@ def last_line(path: Path) -> str:
 
 
 def last_of(lines: Sequence[str]) -> str:
-    """The last of some lines that is not empty, shortened; empty where there is none."""
-    return next(filter(None, map(str.strip, reversed(lines))), "")[:_MAX_LINE]
+    """The last of some lines that is not empty, shortened; empty where there is none.
+
+    What Python's `faulthandler` writes after them, stacks and a list of modules, is no reason.
+    """
+    own = [line.strip() for line in lines if line.strip() and not _STACKS.match(line)]
+    if len(own) > 1 and own[-1].startswith(_FATAL):
+        own.pop()
+    return own[-1][:_MAX_LINE] if own else ""
 
 
 def last_lines(path: Path, num_bytes: int = _TAIL_BYTES, begins: int = 0) -> list[str]:

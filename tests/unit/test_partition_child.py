@@ -106,6 +106,20 @@ def test_an_error_of_any_length_fits(block: tuple[int, HeartbeatBlock]):
     assert error.missing == tuple(range(10_000, 10_200))
 
 
+_STACKS = """Fatal Python error: Aborted
+
+Current thread 0x00007f8a5b7fe640 (most recent call first):
+  File "/lib/threading.py", line 629 in wait
+  ...
+
+Thread 0x00007f608c7d2b80 (most recent call first):
+  <no Python frame>
+
+Extension modules: uvloop.loop, yaml._yaml (total: 2)
+"""
+"""What `faulthandler` writes."""
+
+
 @pytest.mark.parametrize(
     ("exit_code", "stderr", "reason"),
     [
@@ -114,6 +128,9 @@ def test_an_error_of_any_length_fits(block: tuple[int, HeartbeatBlock]):
         (-11, "", "ended by SIGSEGV"),
         (-9, "", "ended by SIGKILL: not killed by gmijax; perhaps the machine ran out of memory"),
         (-99, "", "ended by signal 99"),
+        (-6, "F0 Check failed: x\n" + _STACKS, "ended by SIGABRT: F0 Check failed: x"),
+        (-11, _STACKS, "ended by SIGSEGV: Fatal Python error: Aborted"),
+        (1, _STACKS + "RuntimeError: a worker died\n", "exit code 1: RuntimeError: a worker died"),
     ],
 )
 def test_end_without_an_error_file_is_described(
