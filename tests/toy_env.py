@@ -7,9 +7,9 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
+from gmijax.learning.algorithm import IterationMetrics
 from gmijax.learning.unroll import Counts
 from gmijax.ppo.loss import PpoLosses
-from gmijax.ppo.ppo import IterationMetrics
 from gmijax.sim import episode
 from gmijax.sim.interaction import time_limit
 from gmijax.sim.interface import Env, EnvSpec, EnvState

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import statistics
 import time
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -29,6 +30,7 @@ from gmijax.learning.learner import TrainState, policy_figures
 from gmijax.learning.policy_file import save_policy
 from gmijax.learning.start import first_window
 from gmijax.learning.training_log import TrainingLog
+from gmijax.runs.result import TrainResult
 from gmijax.sim.wrappers import BatchedEnv
 from gmijax.supervise.child import ChildLink
 
@@ -119,28 +121,31 @@ class Leader:
         """Flushes the metrics."""
         self._log.close()
 
-    def outcome(self, status: str, compile_s: float) -> dict[str, Any]:
-        """The outcome of the job for `result.json`."""
+    def outcome(
+        self, status: str, compile_s: float, profile: Mapping[str, Any] | None
+    ) -> TrainResult:
+        """The outcome of the job; `profile` is that of the trace."""
         reporter = self._reporter
         pps, ttop = (_median(rates) for rates in (reporter.pps, reporter.ttop))
-        return {
-            "status": status,
-            "env_steps": self.env_steps,
-            "iterations": self._updates,
-            "train_wall_s": self._wall_s,
-            "compile_s": compile_s,
-            "env_steps_per_s": (self.env_steps - self._first_steps) / self._wall_s,
-            "step_per_s_inference": pps,
-            "step_per_s_train": ttop,
-            "pps": pps,
-            "ttop": ttop,
-            "staleness": reporter.staleness(),
-            "bytes_per_s": _median(reporter.bytes_per_s),
-            "final_return": self._log.last_return,
-            "overflow_steps": self._log.overflows.steps,
-            "checkpoint": str(self._checkpoint) if self._checkpoint else None,
-            "device": describe_device(),
-        }
+        return TrainResult(
+            status=status,
+            env_steps=self.env_steps,
+            iterations=self._updates,
+            train_wall_s=self._wall_s,
+            compile_s=compile_s,
+            env_steps_per_s=(self.env_steps - self._first_steps) / self._wall_s,
+            step_per_s_inference=pps,
+            step_per_s_train=ttop,
+            pps=pps,
+            ttop=ttop,
+            staleness=reporter.staleness(),
+            bytes_per_s=_median(reporter.bytes_per_s),
+            final_return=self._log.last_return,
+            overflow_steps=self._log.overflows.steps,
+            checkpoint=str(self._checkpoint) if self._checkpoint else None,
+            device=describe_device(),
+            profile=profile,
+        )
 
     def _write_line(self, state: TrainState) -> None:
         self._reporter.write(

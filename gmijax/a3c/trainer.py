@@ -27,7 +27,13 @@ from gmijax.config import A3cConfig, TrainConfig
 from gmijax.errors import CollectiveTimeout
 from gmijax.learning.checkpoint import require_equal
 from gmijax.learning.iteration_trace import IterationTrace
-from gmijax.learning.learner import TrainState, acting_weights, make_learner, pack_weights
+from gmijax.learning.learner import (
+    TrainState,
+    acting_weights,
+    init_learner,
+    make_learner,
+    pack_weights,
+)
 from gmijax.learning.physics_health import check_losses
 from gmijax.learning.start import first_state
 from gmijax.sim.wrappers import BatchedEnv
@@ -84,7 +90,9 @@ class Trainer:
             # each of them would tune could differ in the last bit.
             self.reducer.all_gather(np.zeros(1, np.float32))
         # The same key as synchronous training uses: the same first policy.
-        state, self._env_steps = first_state(self._learner, self.env.spec.obs_size, self.config)
+        state, self._env_steps = first_state(
+            init_learner, self._learner, self.env.spec.obs_size, self.config
+        )
         self._version = int(state.iteration)
         self._update.trace((), state, self._example())
         self._update.compile()
@@ -106,7 +114,7 @@ class Trainer:
             status = self._loop(state, leader)
         finally:
             leader.close()
-        return leader.outcome(status, compile_s) | self._trace.outcome()
+        return leader.outcome(status, compile_s, self._trace.outcome()).to_dict()
 
     def _loop(self, state: TrainState, leader: Leader | None) -> str:
         """Returns the status for the outcome."""

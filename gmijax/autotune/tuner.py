@@ -75,7 +75,7 @@ def workload_of(config: TrainConfig | ServeConfig) -> Workload[Any]:
     """A job as a workload; raises ConfigError for one that cannot be profiled."""
     if isinstance(config, ServeConfig):
         return ServeWorkload(config)
-    return A3cWorkload(config) if config.is_asynchronous else PpoWorkload(config)
+    return A3cWorkload(config) if config.is_decoupled else PpoWorkload(config)
 
 
 def is_auto(config: TrainConfig | ServeConfig) -> bool:

@@ -25,6 +25,7 @@ from gmijax.partition.plan import Plan
 from gmijax.partition.planner import make_plan
 from gmijax.runs.folder import RunPaths, read_json
 from gmijax.runs.history import read_metrics
+from gmijax.runs.result import TrainResult
 from gmijax.supervise.job_kinds import JobKind, serving_kind, training_kind
 from gmijax.supervise.watched_gmi import GmiStatus
 from gmijax.version import __version__, versions_of
@@ -212,14 +213,16 @@ class PpoWorkload(Workload[TrainConfig]):
 
     def read(self, plan: Plan, run: RunPaths) -> Measured:
         """See `Workload`."""
-        results = results_of(plan, run)
-        all_steps_per_s = results[0]["step_per_s_train"]  # The median, of all GMIs together.
-        steps = results[0]["env_steps"] / results[0]["iterations"]
+        result = TrainResult.read(run.gmi(0).result)
+        if result is None or result.step_per_s_train is None:
+            raise ValueError("the leader measured no rate")
+        all_steps_per_s = result.step_per_s_train  # The median, of all GMIs together.
+        steps = result.env_steps / result.iterations
         # The first iteration fills caches and pools.
         lines = read_metrics(run.metrics)[1:]
         return Measured(
             env_steps_per_s=all_steps_per_s / plan.layout.num_gmis,
-            memory_mib=peak_memory_mib(results),
+            memory_mib=peak_memory_mib(results_of(plan, run)),
             iteration_s=steps / all_steps_per_s,
             reduce_s=statistics.median(line.get("time/reduce_s", 0.0) for line in lines),
         )

@@ -156,7 +156,7 @@ class BackendOfNodes(Backend):
 
 def _cpus_of_a_node(config: TrainConfig) -> int:
     """CPUs that every node must have: one for each of its GMIs, however many nodes are left."""
-    if not config.is_asynchronous:
+    if not config.is_decoupled:
         return num_gmis_of(config.plan)[0]
     wanted = config.cluster.nodes
     assert wanted != "auto"

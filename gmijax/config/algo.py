@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import ClassVar, Literal
 
 from gmijax.config.schema import KeyGroup, doc
 from gmijax.errors import ConfigError
@@ -17,6 +17,11 @@ class ActorCriticConfig(KeyGroup):
     """Keys that PPO and A3C share."""
 
     prefix = "algo."
+    implementation: ClassVar[str] = ""
+    """`module:name` of the `gmijax.learning.algorithm.Algorithm`, where every GMI simulates, acts
+    and trains; jax is imported with it."""
+    templates: ClassVar[tuple[Literal["tcg_ex", "tdg_ex", "decoupled"], ...]] = ("tcg_ex",)
+    """Which GMIs have which role (`gmijax.partition.templates`), the first one by default."""
 
     unroll_length: int = doc(
         "T, environment steps per environment and iteration (a3c: and unroll)", low=1
@@ -101,6 +106,25 @@ class ActorCriticConfig(KeyGroup):
             )
 
     @property
+    def warms_up(self) -> bool:
+        """Whether a run begins with an iteration that only fills the statistics."""
+        return False
+
+    def check_job(self, num_envs: int | None, template: str) -> None:
+        """Checks what depends on other keys too; `num_envs` is None where it is not decided yet.
+
+        Raises:
+          ConfigError: environments per GMI do not divide into minibatches, or the like.
+        """
+        del template
+        samples = (num_envs or 0) * self.unroll_length
+        if samples % self.num_minibatches:
+            raise ConfigError(
+                f"num_envs={num_envs}: num_envs x algo.unroll_length = {samples} samples "
+                f"do not divide into algo.num_minibatches={self.num_minibatches} minibatches"
+            )
+
+    @property
     def hidden_layer_sizes(self) -> tuple[tuple[int, ...], tuple[int, ...]]:
         """Of the policy and of the value network."""
         return self.policy_hidden_layer_sizes, self.value_hidden_layer_sizes
@@ -109,6 +133,9 @@ class ActorCriticConfig(KeyGroup):
 @dataclass(frozen=True, kw_only=True)
 class PpoConfig(ActorCriticConfig):
     """Hyper-parameters of PPO, with Brax's names."""
+
+    implementation = "gmijax.ppo.ppo:PPO"
+    templates = ("tcg_ex", "tdg_ex")
 
     name: Literal["ppo"] = doc("training algorithm")
     clipping_epsilon: float = doc("clip range of the probability ratio", positive=True)
@@ -138,10 +165,26 @@ class PpoConfig(ActorCriticConfig):
                 "algo.normalize_observations=false"
             )
 
+    @property
+    def warms_up(self) -> bool:
+        """See `ActorCriticConfig`."""
+        return self.warmup_unroll
+
+    def check_job(self, num_envs: int | None, template: str) -> None:
+        """See `ActorCriticConfig`."""
+        if self.recompute_advantages and template == "tdg_ex":
+            raise ConfigError(
+                "algo.recompute_advantages=true: for jobs in which every GMI trains; with "
+                "plan.template=tdg_ex allowed is false"
+            )
+        super().check_job(num_envs, template)
+
 
 @dataclass(frozen=True, kw_only=True)
 class A3cConfig(ActorCriticConfig):
     """Hyper-parameters of asynchronous actor-critic training, with Brax's names."""
+
+    templates = ("decoupled",)
 
     name: Literal["a3c"] = doc("training algorithm")
     weights_every: int | None = doc(
@@ -171,6 +214,12 @@ class A3cConfig(ActorCriticConfig):
         "unrolls of an agent that may wait for every trainer before the agent waits too",
         low=1,
     )
+
+    def check_job(self, num_envs: int | None, template: str) -> None:
+        """See `ActorCriticConfig`."""
+        del template
+        if num_envs is not None:
+            self.batch_of(num_envs)
 
     @property
     def pieces_per_unroll(self) -> int:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Literal, TypeAlias
+from typing import Literal, TypeAlias, get_args
 
 from gmijax.config.algo import A3cConfig, PpoConfig
 from gmijax.config.channel import ChannelConfig
@@ -19,7 +19,7 @@ from gmijax.errors import ConfigError
 AlgoConfig: TypeAlias = PpoConfig | A3cConfig
 """The training algorithms; `algo.name` says which."""
 
-ALGORITHMS: tuple[type[AlgoConfig], ...] = (PpoConfig, A3cConfig)
+ALGORITHMS: tuple[type[AlgoConfig], ...] = get_args(AlgoConfig)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -45,35 +45,26 @@ class TrainConfig(KeyGroup):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        self.plan.require_template(
-            ("decoupled",) if isinstance(self.algo, A3cConfig) else ("tcg_ex", "tdg_ex"),
-            f"gmijax.train with algo={self.algo.name}",
-        )
+        self.plan.require_template(self.algo.templates, f"gmijax.train with algo={self.algo.name}")
         if self.plan.template == "tdg_ex" and self.reduce.selection == "measured":
             raise ConfigError(
                 "reduce.selection=measured: for jobs in which every GMI trains; with "
                 "plan.template=tdg_ex allowed are paper, device"
             )
-        renews = isinstance(self.algo, PpoConfig) and self.algo.recompute_advantages
-        if renews and self.plan.template == "tdg_ex":
+        if self.eval.every is not None and self.is_decoupled:
             raise ConfigError(
-                "algo.recompute_advantages=true: for jobs in which every GMI trains; with "
-                "plan.template=tdg_ex allowed is false"
+                f"eval.every={self.eval.every}: with algo={self.algo.name} agents act all the "
+                "time, and nobody evaluates; allowed is null (gmijax.play evaluates a checkpoint)"
             )
-        if self.eval.every is not None and self.is_asynchronous:
-            raise ConfigError(
-                f"eval.every={self.eval.every}: with algo=a3c agents act all the time, and nobody "
-                "evaluates; allowed is null (gmijax.play evaluates a checkpoint)"
-            )
-        if self.num_envs != "auto":
-            self._check_num_envs(self.num_envs)
+        num_envs = None if self.num_envs == "auto" else self.num_envs
+        self.algo.check_job(num_envs, self.plan.template)
         if self.cluster.engine is not None:
             self._check_on_nodes()
 
     @property
-    def is_asynchronous(self) -> bool:
-        """Whether some GMIs act and others train."""
-        return isinstance(self.algo, A3cConfig)
+    def is_decoupled(self) -> bool:
+        """Whether some GMIs act and others train, each at its own pace."""
+        return self.algo.templates[0] == "decoupled"
 
     @property
     def envs_per_gmi(self) -> int:
@@ -107,19 +98,8 @@ class TrainConfig(KeyGroup):
                 f"plan.gpus={list(self.plan.gpus)}: Ray chooses the GPUs of nodes; expected a "
                 "number, of each node"
             )
-        if self.is_asynchronous and self.cluster.nodes == "auto":
+        if self.is_decoupled and self.cluster.nodes == "auto":
             raise ConfigError(
-                "cluster.nodes=auto: with algo=a3c give a number, because the GPUs of all nodes "
-                "together are divided into those that act and those that train"
-            )
-
-    def _check_num_envs(self, num_envs: int) -> None:
-        if isinstance(self.algo, A3cConfig):
-            self.algo.batch_of(num_envs)
-            return
-        samples = num_envs * self.algo.unroll_length
-        if samples % self.algo.num_minibatches:
-            raise ConfigError(
-                f"num_envs={num_envs}: num_envs x algo.unroll_length = {samples} samples "
-                f"do not divide into algo.num_minibatches={self.algo.num_minibatches} minibatches"
+                f"cluster.nodes=auto: with algo={self.algo.name} give a number, because the "
+                "GPUs of all nodes together are divided into those that act and those that train"
             )

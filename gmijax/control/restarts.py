@@ -234,7 +234,7 @@ def with_gpus_left(
         raise ConfigError(f"{gone}; run.elastic=true would go on with the {num_left} left")
     if num_left == 0:
         raise ConfigError(f"{gone}, and no other one is left")
-    if config.is_asynchronous and config.plan.serving_gpus is not None:
+    if config.is_decoupled and config.plan.serving_gpus is not None:
         raise ConfigError(f"{gone}; plan.serving_gpus and plan.training_gpus name them")
     config = dataclasses.replace(config, plan=_without(config, plan, machine, lost))
     shrunk = training_plan(config, machine)

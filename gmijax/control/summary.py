@@ -18,16 +18,9 @@ from gmijax.partition.plan import Plan
 from gmijax.runs.folder import RunPaths, read_json
 from gmijax.runs.history import read_metrics
 from gmijax.runs.names import by_steps
+from gmijax.runs.result import TrainResult
 from gmijax.runs.resume import CheckpointMeta, best_checkpoint, checkpoints_of
 from gmijax.version import __version__, versions_of
-
-_ASYNCHRONOUS = ("pps", "ttop", "staleness", "bytes_per_s")
-"""Figures that only asynchronous training has."""
-
-_RATES = (
-    *("train_wall_s", "compile_s", "env_steps_per_s"),
-    *("step_per_s_sim", "step_per_s_inference", "step_per_s_train"),
-)
 
 _VERSIONS = ("jax", "jaxlib", "mujoco-mjx", "flax", "optax", "orbax-checkpoint")
 
@@ -46,7 +39,8 @@ def train_summary(
     restarts: Sequence[Data],
 ) -> dict[str, Any]:
     """The content of `summary.json`, from what the leader left or, failing that, the metrics."""
-    result = read_json(run.gmi(0).result) if run.gmi(0).result.exists() else _last_known(run)
+    result = TrainResult.read(run.gmi(0).result)
+    env_steps, final_return = _last_known(run, result)
     checkpoints = checkpoints_of(run.root)
     return {
         "status": status,
@@ -54,31 +48,56 @@ def train_summary(
         "algo": config.algo.name,
         "plan": {
             **_of_plan(plan),
-            "strategy": result.get("strategy", plan.strategy),
-            "intra": result.get("intra", plan.intra),
+            "strategy": (result and result.strategy) or plan.strategy,
+            "intra": (result and result.intra) or plan.intra,
             "selection": dict(plan.selection),
         },
-        "env_steps": result.get("env_steps"),
+        "env_steps": env_steps,
         "wall_s": wall_s,
-        **{key: result.get(key) for key in _RATES},
-        **{key: result[key] for key in (*_ASYNCHRONOUS, "start_s", "profile") if key in result},
-        "final_return": result.get("final_return"),
+        **_rates(result),
+        **({} if result is None else _where_known(result, is_decoupled=config.is_decoupled)),
+        "final_return": final_return,
         "eval": _evaluations(run),
-        "overflow_steps": result.get("overflow_steps") or {},
+        "overflow_steps": {} if result is None else dict(result.overflow_steps),
         "checkpoint": str(checkpoints[-1]) if checkpoints else None,
         "restarts": list(restarts),
         "versions": _own_versions() | versions_of(_VERSIONS),
-        "device": result.get("device"),
+        "device": None if result is None else dict(result.device),
         "impl": config.physics.impl,
     }
 
 
-def _last_known(run: RunPaths) -> dict[str, Any]:
-    """Last metrics of a job that did not end by itself."""
+def _rates(result: TrainResult | None) -> dict[str, float | None]:
+    """Times and rates; None where the job did not end by itself."""
+    return {
+        "train_wall_s": result and result.train_wall_s,
+        "compile_s": result and result.compile_s,
+        "env_steps_per_s": result and result.env_steps_per_s,
+        "step_per_s_sim": result and result.step_per_s_sim,
+        "step_per_s_inference": result and result.step_per_s_inference,
+        "step_per_s_train": result and result.step_per_s_train,
+    }
+
+
+def _where_known(result: TrainResult, *, is_decoupled: bool) -> dict[str, Any]:
+    """What only some jobs have."""
+    experience = {
+        "pps": result.pps,
+        "ttop": result.ttop,
+        "staleness": result.staleness,
+        "bytes_per_s": result.bytes_per_s,
+    }
+    others = {"start_s": result.start_s, "profile": result.profile}
+    known = {key: value for key, value in others.items() if value is not None}
+    return {**experience, **known} if is_decoupled else known
+
+
+def _last_known(run: RunPaths, result: TrainResult | None) -> tuple[int | None, float | None]:
+    """Environment steps and return, by the last metrics where the job did not end by itself."""
+    if result is not None:
+        return result.env_steps, result.final_return
     lines = read_metrics(run.metrics)
-    if not lines:
-        return {}
-    return {"env_steps": lines[-1]["env_steps"], "final_return": lines[-1].get("return")}
+    return (lines[-1]["env_steps"], lines[-1].get("return")) if lines else (None, None)
 
 
 def _evaluations(run: RunPaths) -> dict[str, Any] | None:

@@ -1,4 +1,4 @@
-"""Writes checkpoints beside the training of one or several GMIs.
+"""Writes checkpoints beside the training of one or several GMIs, of one or several runs.
 
 A checkpoint takes some tenths of a second, most of it in the file system. So every GMI copies its
 part to the host and trains on, while a thread writes it. The leader gives the checkpoint its name
@@ -7,35 +7,54 @@ when all parts are there.
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from pathlib import Path
-from typing import Any
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from gmijax.collectives.interface import Reducer
-from gmijax.learning.checkpoint import finish_checkpoint, on_host, save_envs, save_learner
+from gmijax.learning.checkpoint import finish_checkpoint, save_envs, save_learner
 from gmijax.learning.report_thread import ReportThread
 from gmijax.runs.folder import RunPaths
 from gmijax.runs.resume import CheckpointMeta
 from gmijax.types import PyTree
 
 
+class Part(NamedTuple):
+    """What this GMI has for the checkpoint of a run, on the host.
+
+    Attributes:
+      run: the run folder.
+      meta: of the checkpoint.
+      learner_state: the same on all GMIs; None but for the leader, who writes it.
+      env_state: this GMI's environments, None where it has none.
+      save_more: writes what else the leader has for it, given the learner's state.
+    """
+
+    run: RunPaths
+    meta: CheckpointMeta
+    learner_state: PyTree | None
+    env_state: PyTree | None
+    save_more: Callable[[Any], None] = lambda _: None
+
+
 class CheckpointSaver:
     """The checkpoints of a GMI that trains; all of them make the same calls.
 
     Args:
-      run: the run folder.
       gmi: whose environments these are.
       reducer: among the GMIs that train.
       keep: as of `finish_checkpoint`.
+
+    Attributes:
+      last_steps: environment steps of the newest checkpoint with a name, None before the first.
     """
 
-    def __init__(self, run: RunPaths, gmi: int, reducer: Reducer, keep: int | None) -> None:
-        self._run, self._gmi, self._reducer, self._keep = run, gmi, reducer, keep
+    def __init__(self, gmi: int, reducer: Reducer, keep: int | None) -> None:
+        self._gmi, self._reducer, self._keep = gmi, reducer, keep
         self._thread = ReportThread(_call)
-        self._unnamed: CheckpointMeta | None = None
-        self._last: Path | None = None
+        self._unnamed: Sequence[Part] = ()
+        self.last_steps: int | None = None
 
     @property
     def is_written(self) -> bool:
@@ -46,68 +65,50 @@ class CheckpointSaver:
         if not self._thread.is_idle:
             return False
         self._thread.wait()
-        return self._unnamed is not None
+        return bool(self._unnamed)
 
-    def begin(
-        self,
-        meta: CheckpointMeta,
-        learner_state: PyTree,
-        env_state: PyTree | None,
-        save_more: Callable[[Any], None] = lambda _: None,
-    ) -> None:
-        """Begins to write a checkpoint; both states may be donated after it.
-
-        Args:
-          meta: of the checkpoint.
-          learner_state: the same on all GMIs; the leader writes it.
-          env_state: this GMI's environments, None where it has none.
-          save_more: writes what else the leader has for it, given its state on the host.
-        """
+    def begin(self, parts: Sequence[Part]) -> None:
+        """Begins to write a checkpoint of every run."""
         self.finish()
-        leader_state = on_host(learner_state) if self._is_leader else None
-        own_envs = None if env_state is None else on_host(env_state)
 
         def write() -> None:
-            if own_envs is not None:
-                save_envs(self._run, meta.env_steps, self._gmi, own_envs)
-            if leader_state is not None:
-                save_learner(self._run, meta.env_steps, leader_state)
-                save_more(leader_state)
+            for part in parts:  # In turn: orbax can block when several threads use it.
+                run, meta, learner_state, env_state, save_more = part
+                if env_state is not None:
+                    save_envs(run, meta.env_steps, self._gmi, env_state)
+                if learner_state is not None:
+                    save_learner(run, meta.env_steps, learner_state)
+                    save_more(learner_state)
 
-        self._unnamed = meta
+        self._unnamed = parts
         self._thread.report(write)
 
     def name(self) -> None:
-        """Gives the checkpoint its name soon: all GMIs have said that their parts are written."""
-        meta, self._unnamed = self._unnamed, None
-        assert meta is not None
-        self._last = self._run.checkpoint(meta.env_steps)
-        if self._is_leader:
-            self._thread.report(lambda: finish_checkpoint(self._run, meta, self._keep))
+        """Gives the checkpoints their names soon: all GMIs have said that theirs are written.
 
-    def finish(self) -> Path | None:
-        """Returns the last checkpoint's folder when it is there, None before the first one.
-
-        Collective.
+        All at once, so that runs that share a program go on from the same step after a fault.
         """
+        parts, self._unnamed = self._unnamed, ()
+        self.last_steps = parts[0].meta.env_steps
+        if self._reducer.rank == 0:
+            self._thread.report(
+                lambda: [finish_checkpoint(run, meta, self._keep) for run, meta, *_ in parts]
+            )
+
+    def finish(self) -> None:
+        """Returns when the last checkpoint has its name. Collective."""
         self._thread.wait()
-        if self._unnamed is not None:
-            self._meet()
+        if self._unnamed:
+            self._barrier()
             self.name()
             self._thread.wait()
-            self._meet()  # Nobody may look for the folder before it has its name.
-        return self._last
+            self._barrier()  # Nobody may look for the folder before it has its name.
 
     def stop(self) -> None:
         """Ends the thread, which may finish what it does. Idempotent."""
         self._thread.stop()
 
-    @property
-    def _is_leader(self) -> bool:
-        return self._reducer.rank == 0
-
-    def _meet(self) -> None:
-        """Returns when all GMIs have called it."""
+    def _barrier(self) -> None:
         self._reducer.all_gather(np.zeros(1, np.float32))
 
 

@@ -63,15 +63,14 @@ class IterationTrace:
             self._writing = Thread(target=self._try, args=(jax.profiler.stop_trace,), daemon=True)
             self._writing.start()
 
-    def outcome(self) -> dict[str, Any]:
-        """For `result.json`: `profile` with first and last iteration, folder and error.
+    def outcome(self) -> dict[str, Any] | None:
+        """First and last iteration, folder and error; None where nothing was asked for.
 
-        Empty where nothing was asked for. The iterations are None where the run never came there.
+        The iterations are None where the run never came there.
         """
         if self._wanted is None:
-            return {}
-        found = {"iterations": self._traced, "dir": str(self._folder), "error": self._error}
-        return {"profile": found}
+            return None
+        return {"iterations": self._traced, "dir": str(self._folder), "error": self._error}
 
     def _open(self) -> None:
         # First: JAX does not end a trace that it cannot write.

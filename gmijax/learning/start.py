@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -12,7 +14,7 @@ from gmijax.devices import memory_limit_bytes
 from gmijax.errors import ConfigError
 from gmijax.learning.checkpoint import has_envs, restore_envs, restore_learner, saved_episodes
 from gmijax.learning.episode_window import EpisodeWindow
-from gmijax.learning.learner import Learner, TrainState, init_learner
+from gmijax.learning.learner import Learner, TrainState
 from gmijax.machine.host_limits import detect_host
 from gmijax.runs.resume import CheckpointMeta
 from gmijax.runs.saved_config import saved_config
@@ -33,8 +35,15 @@ def worlds_of(config: TrainConfig | ServeConfig, place: int) -> Env:
     )
 
 
-def first_state(learner: Learner, obs_size: int, config: TrainConfig) -> tuple[TrainState, int]:
+def first_state(
+    init: Callable[[Learner[Any], int, PRNGKey], TrainState],
+    learner: Learner[Any],
+    obs_size: int,
+    config: TrainConfig,
+) -> tuple[TrainState, int]:
     """The learner's state, and the environment steps that it has learnt from.
+
+    `init` makes the state of a new run, see `Algorithm`.
 
     Raises:
       ConfigError: the checkpoint to go on from does not fit.
@@ -42,7 +51,7 @@ def first_state(learner: Learner, obs_size: int, config: TrainConfig) -> tuple[T
     key = _keys(config.seed)[0]
 
     def start(key: PRNGKey, rate: Array) -> TrainState:
-        return init_learner(learner, obs_size, key)._replace(learning_rate=rate)
+        return init(learner, obs_size, key)._replace(learning_rate=rate)
 
     # An argument: jobs that differ in it alone have the same programs.
     state = jax.jit(start)(key, jnp.asarray(config.algo.learning_rate, jnp.float32))

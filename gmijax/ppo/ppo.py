@@ -8,24 +8,26 @@ minibatches in `gmijax.learning.updates`, networks and optimiser in `gmijax.lear
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from functools import partial
 
 import jax
 import jax.numpy as jnp
 
 from gmijax.collectives.interface import Peers
+from gmijax.learning.algorithm import Algorithm, IterationMetrics
 from gmijax.learning.learner import (
     TrainState,
     acting_weights,
     finish_iteration,
+    init_learner,
+    make_learner,
     policy_figures,
     rate_figures,
     with_targets,
 )
 from gmijax.learning.normalize import Moments, merge_all, moments_of, std_of
 from gmijax.learning.policy import ActorCriticParams
-from gmijax.learning.unroll import Counts
-from gmijax.learning.updates import explained_variance, minibatch_order, run_updates
+from gmijax.learning.updates import exchange_size, explained_variance, minibatch_order, run_updates
 from gmijax.ppo.loss import PpoLosses, UpdateContext, ppo_loss
 from gmijax.ppo.rollout import PpoLearner, Samples, Trajectory, rollout, valued_anew
 from gmijax.ppo.statistics import RolloutStats, merge_stats
@@ -47,25 +49,6 @@ def iterate(
     again = trajectory if learner.config.recompute_advantages else None
     state, metrics = learn(learner, peers, state, samples, stats, again)
     return state, env_state, metrics
-
-
-class IterationMetrics(NamedTuple):
-    """Figures of one iteration, over all GMIs; leaves are scalars.
-
-    No two of them may be the same number by definition: a GPU's program writes one of these to
-    the host and copies it there to the other, for which the host waits until all else is done.
-
-    Attributes:
-      counts: sums over all steps.
-      losses: means over all minibatches of the iteration.
-      figures: others by the names that they are logged under.
-      rates: of the learning rates of all updates, see `rate_figures`.
-    """
-
-    counts: Counts
-    losses: PpoLosses
-    figures: dict[str, Array]
-    rates: dict[str, Array]
 
 
 def learn(
@@ -167,3 +150,11 @@ def gradients(
     return jax.grad(ppo_loss, has_aux=True)(
         params, minibatch, context, learner.networks, learner.config
     )
+
+
+PPO = Algorithm(
+    make_learner=make_learner,
+    init=init_learner,
+    iterate=iterate,
+    num_averaged=partial(exchange_size, losses=PpoLosses),
+)

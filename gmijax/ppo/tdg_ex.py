@@ -19,6 +19,7 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 
 from gmijax.collectives.interface import FloatBuffer, Peers, Reducer
+from gmijax.learning.algorithm import IterationMetrics
 from gmijax.learning.learner import (
     ActingWeights,
     TrainState,
@@ -26,7 +27,7 @@ from gmijax.learning.learner import (
     init_learner,
     pack_weights,
 )
-from gmijax.ppo.ppo import IterationMetrics, learn
+from gmijax.ppo.ppo import learn
 from gmijax.ppo.rollout import PpoLearner, Samples, rollout
 from gmijax.ppo.statistics import merge_stats, no_stats
 from gmijax.sim.wrappers import BatchedEnv, BatchState
@@ -66,6 +67,10 @@ class RemoteIteration:
         self._first: _Answers | None = None
         self._timeout_s: float | None = workers.start_timeout_s
         self.rollout_s = 0.0
+
+    def times(self) -> dict[str, float]:
+        """Seconds of the last rollout and of the wait for it, as they are logged."""
+        return {"time/rollout_s": self.rollout_s}
 
     @property
     def exchange_s(self) -> float | None:

@@ -66,7 +66,7 @@ SYNCHRONOUS: Final = JobKind("gmijax.workers.training_worker")
 
 def training_kind(config: TrainConfig) -> JobKind:
     """The kind of a training job."""
-    if config.is_asynchronous:
+    if config.is_decoupled:
         shared = partial(_registers_and_channels, config)
         return JobKind(SYNCHRONOUS.module, compile_once=False, shared=shared, calls=calls_of)
     if config.plan.template == "tdg_ex":
@@ -108,7 +108,7 @@ def training_plan(
       BackendUnavailable: the wanted backend cannot be had on this machine.
     """
     num_envs = num_envs or config.envs_per_gmi
-    if not config.is_asynchronous:
+    if not config.is_decoupled:
         return make_plan(config.plan, config.reduce, num_envs, machine, nodes=nodes)
     _require_asynchronous(config)
     if config.plan.layout is None and nodes is None:

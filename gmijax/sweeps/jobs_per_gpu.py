@@ -24,7 +24,7 @@ from gmijax.config.sweep import SweepConfig
 from gmijax.control.console import is_verbose
 from gmijax.errors import GmijaxError, JobInterrupted, NodeLost
 from gmijax.runs.cache import cache_folder
-from gmijax.runs.folder import read_json
+from gmijax.runs.result import TrainResult
 from gmijax.supervise.run_gmis import StopSignals
 from gmijax.sweeps.density import GAIN
 from gmijax.sweeps.jobs import Job
@@ -256,6 +256,5 @@ class _Window:
 
 def _memory_mib(paths: SweepPaths, jobs: Sequence[Job]) -> float:
     """Peak memory of the largest job, MiB."""
-    found = [paths.job(job.number).gmi(0).result for job in jobs]
-    devices = [read_json(path).get("device") or {} for path in found if path.exists()]
-    return max([device.get("peak_memory_mib") or 1.0 for device in devices], default=1.0)
+    results = [TrainResult.read(paths.job(job.number).gmi(0).result) for job in jobs]
+    return max([one.peak_memory_mib or 1.0 for one in results if one is not None], default=1.0)

@@ -65,7 +65,7 @@ class Place:
 def gmis_of_place(config: TrainConfig) -> int:
     """How many GMIs a job has at each of its places."""
     plan = config.plan
-    if config.is_asynchronous:
+    if config.is_decoupled:
         return plan.serving_gmis_per_gpu + plan.training_gmis_per_gpu
     return 1 if plan.gmis_per_gpu == "auto" else plan.gmis_per_gpu
 

@@ -9,6 +9,7 @@ import json
 import os
 import sys
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 from gmijax.config import TrainConfig
@@ -31,7 +32,9 @@ def _run(link: ChildLink) -> None:
     # jax starts here, in the environment that the plan prepared.
     from gmijax.collectives.build import SoloReducer
     from gmijax.devices import start_device
-    from gmijax.ppo.packed_loop import Member, PackedLoop
+    from gmijax.learning.algorithm import iterate_all, load_algorithm
+    from gmijax.learning.loop import TrainingLoop
+    from gmijax.learning.member import Member, Members
     from gmijax.selfcheck import check_share
     from gmijax.workers.training_worker import environments
 
@@ -39,8 +42,12 @@ def _run(link: ChildLink) -> None:
     check_share(Plan.from_dict(read_json(link.run.plan)), link.gmi)
     first = configs[0]
     env = environments(replace(first, num_envs=len(runs) * first.num_envs), 0)
-    members = [Member(config, run) for config, run in zip(configs, runs, strict=True)]
-    PackedLoop(members, env, SoloReducer().program, link).run()
+    pairs = zip(configs, runs, strict=True)
+    members = Members([Member(config, run) for config, run in pairs], link.gmi)
+    algorithm, reducer = load_algorithm(first.algo), SoloReducer()
+    learner = algorithm.make_learner(env.spec, first.algo)
+    iteration = reducer.program(partial(iterate_all, algorithm.iterate, env, learner))
+    TrainingLoop(members, algorithm, learner, env, iteration, reducer, link).run()
 
 
 if __name__ == "__main__":

@@ -13,11 +13,12 @@ from __future__ import annotations
 import sys
 from contextlib import ExitStack
 from dataclasses import replace
+from functools import partial
 from socket import socket
 from typing import TYPE_CHECKING, Any
 
 from gmijax.collectives.nodes.meeting import Nodes, inherited_nodes
-from gmijax.config import A3cConfig, TrainConfig
+from gmijax.config import TrainConfig
 from gmijax.config.schema import from_dict
 from gmijax.partition.plan import Plan
 from gmijax.partition.templates import AGENT, TRAINER, Group, has_role, nodes_of
@@ -27,7 +28,8 @@ from gmijax.supervise.job_kinds import ENV_CHANNELS_FD, ENV_REGISTERS_FD, groups
 
 if TYPE_CHECKING:
     from gmijax.collectives.interface import Reducer
-    from gmijax.collectives.messages.pipe_block import PipeBlock
+    from gmijax.learning.learner import Learner
+    from gmijax.ppo.tdg_ex import RemoteIteration
     from gmijax.sim.wrappers import BatchedEnv
 
 
@@ -36,7 +38,7 @@ def main() -> int:
     return run_gmi(_run)
 
 
-def _run(link: ChildLink) -> dict[str, Any]:
+def _run(link: ChildLink) -> dict[str, Any] | None:
     link.keep_garbage()
     config = from_dict(TrainConfig, read_json(link.run.config))
     plan = Plan.from_dict(read_json(link.run.plan))
@@ -51,7 +53,7 @@ def _run(link: ChildLink) -> dict[str, Any]:
     place = simulating.gmis.index(link.gmi) if link.gmi in simulating.gmis else 0
     env = environments(config, place)
     with ExitStack() as held:
-        if isinstance(config.algo, A3cConfig):
+        if config.is_decoupled:
             return _run_asynchronous(config, plan, place, env, link, held)
         return _run_synchronous(config, plan, place, env, link, held)
 
@@ -63,25 +65,54 @@ def _run_synchronous(
     env: BatchedEnv,
     link: ChildLink,
     held: ExitStack,
-) -> dict[str, Any]:
+) -> dict[str, Any] | None:
+    from gmijax.learning.algorithm import load_algorithm
+    from gmijax.learning.loop import TrainingLoop
+    from gmijax.learning.member import Member, Members
+
+    trainers = groups_of(plan)[1]
+    is_apart = plan.template == "tdg_ex"
+    if is_apart and link.gmi not in trainers.gmis:
+        return _serve_rollouts(config, plan, place, env, link, held)
+    algorithm = load_algorithm(config.algo)
+    learner = algorithm.make_learner(env.spec, config.algo)
+    num_averaged = algorithm.num_averaged(env.spec, config.algo)
+    reducer = _trainers_reducer(config, plan, trainers, link, num_averaged, *inherited_nodes())
+    held.callback(reducer.close)
+    members = Members([Member(config, link.run)], link.gmi)
+    loop = partial(TrainingLoop, members, algorithm, learner, env)
+    exchange = exchange_used(plan, reducer)
+    if not is_apart:
+        iteration = reducer.program(partial(algorithm.iterate, env, learner))
+        loop(iteration, reducer, link, exchange=exchange).run()
+        return None
+    remote, num_workers = _remote_iteration(config, plan, env, learner, reducer, link, held)
+    times = remote.times
+    loop(remote, reducer, link, remote=num_workers, times=times, exchange=exchange).run()
+    remote.close()
+    return None
+
+
+def _remote_iteration(
+    config: TrainConfig,
+    plan: Plan,
+    env: BatchedEnv,
+    learner: Learner,
+    reducer: Reducer,
+    link: ChildLink,
+    held: ExitStack,
+) -> tuple[RemoteIteration, int]:
+    """An iteration on rollouts of other GMIs, and how many these are."""
     from gmijax.collectives.messages.messenger import Messenger
     from gmijax.collectives.messages.pipe_block import PipeBlock
-    from gmijax.ppo.loop import TrainingLoop
-    from gmijax.ppo.loss import PpoLosses
-    from gmijax.ppo.tdg_ex import RolloutWorkers
+    from gmijax.ppo.tdg_ex import RemoteIteration, RolloutWorkers
 
-    trainers, workers = groups_of(plan)[1], None
-    if plan.template == "tdg_ex":
-        block = PipeBlock(required_fd(ENV_PIPES_FD), link.gmi)
-        held.callback(block.close)
-        if link.gmi not in trainers.gmis:
-            return _serve_rollouts(config, plan, place, env, block, link)
-        mail = Messenger(block, config.reduce.timeout_s)
-        here = _neighbours(plan, link.gmi, AGENT)
-        workers = RolloutWorkers(mail, here, config.run.start_timeout_s)
-    reducer = _trainers_reducer(config, plan, trainers, link, env, PpoLosses, *inherited_nodes())
-    held.callback(reducer.close)
-    return TrainingLoop(config, env, reducer, link, workers).run() | exchange_used(plan, reducer)
+    block = PipeBlock(required_fd(ENV_PIPES_FD), link.gmi)
+    held.callback(block.close)
+    mail = Messenger(block, config.reduce.timeout_s)
+    here = _neighbours(plan, link.gmi, AGENT)
+    workers = RolloutWorkers(mail, here, config.run.start_timeout_s)
+    return RemoteIteration(env, learner, reducer, workers), len(here)
 
 
 def _serve_rollouts(
@@ -89,17 +120,20 @@ def _serve_rollouts(
     plan: Plan,
     place: int,
     env: BatchedEnv,
-    block: PipeBlock,
     link: ChildLink,
+    held: ExitStack,
 ) -> dict[str, Any]:
     """Makes rollouts for the trainer on the same GPU."""
     from gmijax.collectives.messages.messenger import Messenger
+    from gmijax.collectives.messages.pipe_block import PipeBlock
     from gmijax.config import PpoConfig
     from gmijax.learning.learner import make_learner
     from gmijax.learning.start import first_envs
     from gmijax.ppo.tdg_ex import serve_rollouts
 
     assert isinstance(config.algo, PpoConfig)
+    block = PipeBlock(required_fd(ENV_PIPES_FD), link.gmi)
+    held.callback(block.close)
     [trainer] = _neighbours(plan, link.gmi, TRAINER)
     # The first weights come when the trainer is there, which may still start.
     mail = Messenger(block, max(config.reduce.timeout_s, config.run.start_timeout_s))
@@ -125,6 +159,7 @@ def _run_asynchronous(
     from gmijax.a3c.trainer import Trainer
     from gmijax.collectives.channel.build import open_receiver, open_sender
     from gmijax.learning.learner import num_weights
+    from gmijax.learning.updates import exchange_size
     from gmijax.workers.node_registers import over_nodes
 
     agents, trainers = groups_of(plan)
@@ -149,7 +184,8 @@ def _run_asynchronous(
         return Agent(config, env, place, trainers.gmis, registers, sender, link).run()
     receiver = open_receiver(*channels)
     held.callback(receiver.close)
-    reducer = _trainers_reducer(config, plan, trainers, link, env, A3cLosses, nodes, listener)
+    num_averaged = exchange_size(env.spec, config.algo, A3cLosses)
+    reducer = _trainers_reducer(config, plan, trainers, link, num_averaged, nodes, listener)
     if listener is not None:
         listener.close()  # Trainers that are all on one node do not meet others.
     held.callback(reducer.close)
@@ -171,17 +207,15 @@ def _trainers_reducer(
     plan: Plan,
     trainers: Group,
     link: ChildLink,
-    env: BatchedEnv,
-    losses: Any,
+    num_averaged: int,
     nodes: Nodes | None,
     listener: socket | None,
 ) -> Reducer:
     """The reducer among the trainers, whose ranks are their places in the group.
 
-    It averages a gradient and the parts of the loss, the named tuple `losses`.
+    It averages `num_averaged` float32 in every update: a gradient and the parts of the loss.
     """
     from gmijax.collectives.build import Membership, build_reducer
-    from gmijax.learning.updates import exchange_size
 
     if nodes is not None:
         nodes = nodes.among(nodes_of(plan.layout, trainers.gmis))
@@ -189,7 +223,7 @@ def _trainers_reducer(
         layout=trainers.layout,
         rank=trainers.gmis.index(link.gmi),
         gmis=trainers.gmis,
-        num_floats=exchange_size(env.spec, config.algo, losses),
+        num_floats=num_averaged,
         exchange_fd=link.exchange_fd,
         timeout_s=config.reduce.timeout_s,
         rendezvous_timeout_s=config.run.start_timeout_s,

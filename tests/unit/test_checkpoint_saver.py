@@ -13,18 +13,19 @@ from training_jobs import wait_until
 from gmijax.collectives.build import SoloReducer
 from gmijax.learning import checkpoint_saver
 from gmijax.learning.checkpoint import restore_envs
-from gmijax.learning.checkpoint_saver import CheckpointSaver
+from gmijax.learning.checkpoint_saver import CheckpointSaver, Part
 from gmijax.runs.folder import RunPaths
 from gmijax.runs.resume import CheckpointMeta, newest_checkpoint
 
 
-def meta(env_steps: int) -> CheckpointMeta:
-    return CheckpointMeta("ant", "ppo", env_steps, 1, 8, ((8,), (8,)), "jax")
+def part(folder: Path, env_steps: int, envs: Any = None) -> Part:
+    meta = CheckpointMeta("ant", "ppo", env_steps, 1, 8, ((8,), (8,)), "jax")
+    return Part(RunPaths(folder), meta, {"w": np.ones(2)}, envs)
 
 
 @pytest.fixture
-def saver(tmp_path: Path) -> CheckpointSaver:
-    return CheckpointSaver(RunPaths(tmp_path), 0, SoloReducer(), None)
+def saver() -> CheckpointSaver:
+    return CheckpointSaver(0, SoloReducer(), None)
 
 
 def test_training_goes_on_while_a_checkpoint_is_written(
@@ -37,9 +38,7 @@ def test_training_goes_on_while_a_checkpoint_is_written(
         save(*arguments)
 
     monkeypatch.setattr(checkpoint_saver, "save_envs", wait_and_save)
-    envs = {"x": np.arange(3.0)}
-    saver.begin(meta(10), {"w": np.ones(2)}, envs)
-    envs["x"] += 1.0  # As training does with donated memory.
+    saver.begin([part(tmp_path, 10, {"x": np.arange(3.0)})])
     assert not saver.is_written
     assert newest_checkpoint(tmp_path).checkpoint is None
     may_write.set()
@@ -47,8 +46,9 @@ def test_training_goes_on_while_a_checkpoint_is_written(
     assert newest_checkpoint(tmp_path).checkpoint is None
     saver.name()
     assert not saver.is_written
-    found = saver.finish()
-    assert found == newest_checkpoint(tmp_path).checkpoint
+    saver.finish()
+    assert saver.last_steps == 10
+    found = newest_checkpoint(tmp_path).checkpoint
     assert found is not None
     assert restore_envs(found, 0, {"x": np.zeros(3)})["x"].tolist() == [0.0, 1.0, 2.0]
 
@@ -56,23 +56,36 @@ def test_training_goes_on_while_a_checkpoint_is_written(
 def test_the_next_checkpoint_waits_for_the_one_before(
     saver: CheckpointSaver, tmp_path: Path
 ) -> None:
-    assert saver.finish() is None
+    saver.finish()
+    assert saver.last_steps is None
     for env_steps in (10, 20, 30):
-        saver.begin(meta(env_steps), {"w": np.ones(2)}, None)
-    assert saver.finish() == RunPaths(tmp_path).checkpoint(30)
+        saver.begin([part(tmp_path, env_steps)])
+    saver.finish()
+    assert saver.last_steps == 30
     names = sorted(path.name for path in RunPaths(tmp_path).checkpoints.iterdir())
     assert [int(name) for name in names] == [10, 20, 30]
 
 
 def test_what_keeps_a_checkpoint_from_being_written_is_raised(
-    saver: CheckpointSaver, monkeypatch: pytest.MonkeyPatch
+    saver: CheckpointSaver, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def fail(*_: object) -> None:
         raise OSError(28, "No space left on device")
 
     monkeypatch.setattr(checkpoint_saver, "save_learner", fail)
-    saver.begin(meta(10), {"w": np.ones(2)}, None)
+    saver.begin([part(tmp_path, 10)])
     with pytest.raises(OSError, match="No space left"):
         saver.finish()
     with pytest.raises(OSError, match="No space left"):
         assert saver.is_written
+
+
+def test_several_runs_get_their_checkpoints_together(
+    saver: CheckpointSaver, tmp_path: Path
+) -> None:
+    folders = [tmp_path / name for name in "ab"]
+    for folder in folders:
+        folder.mkdir()
+    saver.begin([part(folder, 10) for folder in folders])
+    saver.finish()
+    assert all(newest_checkpoint(folder).checkpoint is not None for folder in folders)

@@ -34,7 +34,7 @@ def _trained(trace: IterationTrace, num_iterations: int) -> dict[str, Any]:
         trace.end(iteration, wait)
     wait()
     trace.close()
-    return trace.outcome()
+    return trace.outcome() or {}
 
 
 def _events(folder: Path) -> list[dict[str, Any]]:
@@ -60,13 +60,13 @@ def test_the_asked_iterations_are_traced_and_no_others(tmp_path: Path):
 
 def test_a_run_that_ends_on_the_way_keeps_what_was_traced(tmp_path: Path):
     outcome = _trained(IterationTrace((2, 9), tmp_path), 3)
-    assert outcome["profile"]["iterations"] == (2, 3)
+    assert outcome["iterations"] == (2, 3)
     assert _steps(tmp_path) == [2, 3]
 
 
 def test_a_run_that_never_comes_there_says_so(tmp_path: Path):
     outcome = _trained(IterationTrace((5, 9), tmp_path / "profile"), 3)
-    assert outcome["profile"]["iterations"] is None
+    assert outcome["iterations"] is None
     assert not (tmp_path / "profile").exists()
 
 
@@ -77,8 +77,8 @@ def test_without_the_key_nothing_is_noted(tmp_path: Path):
 def test_a_trace_that_cannot_be_written_ends_no_training(tmp_path: Path):
     (tmp_path / "file").touch()
     outcome = _trained(IterationTrace((1, 1), tmp_path / "file"), 3)
-    assert outcome["profile"]["error"]
-    assert _trained(IterationTrace((1, 1), tmp_path), 1)["profile"]["error"] is None
+    assert outcome["error"]
+    assert _trained(IterationTrace((1, 1), tmp_path), 1)["error"] is None
 
 
 @pytest.mark.parametrize(

@@ -31,10 +31,10 @@ from gmijax.learning.learner import (
     state_values,
     with_targets,
 )
+from gmijax.learning.loop import warm_up
 from gmijax.learning.normalize import Moments, moments_of, no_samples, normalize, std_of
 from gmijax.learning.updates import exchange_size, minibatch_order, run_updates
 from gmijax.partition.layout import Layout
-from gmijax.ppo.loop import warm_up
 from gmijax.ppo.loss import PpoLosses
 from gmijax.ppo.ppo import flat, gradients, iterate, update_context
 from gmijax.ppo.rollout import rollout

@@ -9,12 +9,10 @@ from typing import Any
 import numpy as np
 import pytest
 from supervision import machine
-from toy_env import point_mass
 
 from gmijax.cli.compose import compose
 from gmijax.collectives.host.shared_block import create_exchange
 from gmijax.errors import CollectiveTimeout, GmiFailed, ReportedError
-from gmijax.ppo.loss import PpoLosses
 from gmijax.runs.folder import RunPaths
 from gmijax.supervise.child import ChildLink
 from gmijax.supervise.failures import first_cause
@@ -33,8 +31,7 @@ def test_a_trainer_that_does_not_come_is_known_by_its_id(tmp_path) -> None:
     fd = create_exchange()
     assert trainers == (0, 2)  # Of the ranks 0 and 1.
     waiting = ChildLink(trainers[0], RunPaths(tmp_path), None, fd)
-    env = point_mass()
-    reducer = _trainers_reducer(config, plan, of_trainers, waiting, env, PpoLosses, None, None)
+    reducer = _trainers_reducer(config, plan, of_trainers, waiting, 1, None, None)
     os.close(fd)
     with closing(reducer), pytest.raises(CollectiveTimeout) as late:
         reducer.all_gather(np.zeros(1, np.float32))

@@ -7,6 +7,7 @@ import multiprocessing
 import threading
 import time
 from pathlib import Path
+from typing import cast
 
 import jax.numpy as jnp
 import pytest
@@ -15,6 +16,7 @@ from toy_env import metrics_from, point_mass
 from gmijax.errors import NonFiniteError
 from gmijax.learning.episode_window import EpisodeWindow
 from gmijax.learning.evaluator import Evaluation
+from gmijax.learning.member import report
 from gmijax.learning.physics_health import TOLERATED_STEPS
 from gmijax.learning.report_thread import ReportThread
 from gmijax.learning.training_log import (
@@ -23,7 +25,7 @@ from gmijax.learning.training_log import (
     TrainingLog,
 )
 from gmijax.learning.unroll import Counts, no_counts
-from gmijax.ppo.loop import report
+from gmijax.ppo.loss import PpoLosses
 from gmijax.sim.interface import OVERFLOWS
 from gmijax.sim.wrappers import EpisodeSums
 
@@ -48,7 +50,9 @@ def test_few_bad_steps_are_tolerated_and_many_are_named() -> None:
 
 def test_a_loss_that_is_not_finite_is_named() -> None:
     metrics = metrics_from(_counts())
-    spoilt = metrics._replace(losses=metrics.losses._replace(value_loss=jnp.asarray(jnp.nan)))
+    spoilt = metrics._replace(
+        losses=cast("PpoLosses", metrics.losses)._replace(value_loss=jnp.asarray(jnp.nan))
+    )
     with pytest.raises(NonFiniteError, match="value_loss of the update is not finite"):
         report(TrainingLog("point_mass", (), 0), 64, spoilt, {})
 

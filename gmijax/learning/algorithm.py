@@ -1,0 +1,98 @@
+"""What an algorithm is to the training loop (`gmijax.learning.loop`).
+
+In a job all GMIs of which simulate, act and train, an algorithm is one function: an iteration. The
+loop compiles it and has all else: clock, metrics, evaluations, checkpoints, the end. `docs/
+architecture.md` has the steps that add one.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from importlib import import_module
+from typing import Any, NamedTuple, Protocol, TypeAlias
+
+import jax
+
+from gmijax.collectives.interface import Peers
+from gmijax.config import AlgoConfig
+from gmijax.learning.learner import Learner, TrainState
+from gmijax.learning.unroll import Counts
+from gmijax.sim.interface import EnvSpec
+from gmijax.sim.wrappers import BatchedEnv, BatchState
+from gmijax.types import Array, PRNGKey, PyTree
+
+
+class Losses(Protocol):
+    """Parts of a loss, means over a minibatch: a named tuple of [] float32."""
+
+    @property
+    def steering_kl(self) -> Array:
+        """The divergence that the adaptive learning rate follows."""
+        ...
+
+    def _asdict(self) -> dict[str, Any]: ...
+
+
+class IterationMetrics(NamedTuple):
+    """Figures of one iteration, over all GMIs; leaves are scalars.
+
+    No two of them may be the same number by definition: a GPU's program writes one of these to
+    the host and copies it there to the other, for which the host waits until all else is done.
+
+    Attributes:
+      counts: sums over all steps.
+      losses: means over all minibatches of the iteration.
+      figures: others by the names that they are logged under.
+      rates: of the learning rates of all updates, see `rate_figures`.
+    """
+
+    counts: Counts
+    losses: Losses
+    figures: dict[str, Array]
+    rates: dict[str, Array]
+
+
+Iterate: TypeAlias = Callable[
+    [BatchedEnv, Any, Peers, PyTree, TrainState, BatchState],
+    tuple[TrainState, BatchState, IterationMetrics],
+]
+"""`(env, learner, peers, model, state, env_state) -> (state, env_state, metrics)`: a rollout and
+its updates, a pure function. State and environments are donated. `state` comes out equal on all
+GMIs, since what goes into it passes through `peers`."""
+
+
+@dataclass(frozen=True)
+class Algorithm:
+    """An algorithm for jobs in which every GMI simulates, acts and trains.
+
+    Attributes:
+      make_learner: networks, optimiser and hyper-parameters for the sizes of an environment.
+      init: `(learner, obs_size, key)` to the first state.
+      iterate: see `Iterate`.
+      num_averaged: how many float32 GMIs average in one update: gradient and parts of the loss.
+    """
+
+    make_learner: Callable[[EnvSpec, Any], Learner[Any]]
+    init: Callable[[Learner[Any], int, PRNGKey], TrainState]
+    iterate: Iterate
+    num_averaged: Callable[[EnvSpec, Any], int]
+
+
+def load_algorithm(config: AlgoConfig) -> Algorithm:
+    """The algorithm that a configuration is of; see `ActorCriticConfig.implementation`."""
+    module, name = config.implementation.split(":")
+    return getattr(import_module(module), name)
+
+
+def iterate_all(
+    iterate: Iterate,
+    env: BatchedEnv,
+    learner: Learner[Any],
+    peers: Peers,
+    model: PyTree,
+    states: TrainState,
+    envs: BatchState,
+) -> tuple[TrainState, BatchState, IterationMetrics]:
+    """An iteration of several runs; states and metrics have a leading axis [K]."""
+    return jax.vmap(lambda *own: iterate(env, learner, peers, model, *own))(states, envs)
