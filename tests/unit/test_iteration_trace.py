@@ -50,7 +50,7 @@ def _steps(folder: Path) -> list[int]:
 def test_the_asked_iterations_are_traced_and_no_others(tmp_path: Path):
     outcome = _trained(IterationTrace((2, 4), tmp_path), 6)
     found = {"iterations": (2, 4), "dir": str(tmp_path), "error": None}
-    assert outcome == {"profile": found}
+    assert outcome == found
     assert _steps(tmp_path) == [2, 3, 4]
     calls = [e for e in _events(tmp_path) if e.get("name") == "PjitFunction(toy_iteration)"]
     assert len({call["ts"] for call in calls}) >= 3
