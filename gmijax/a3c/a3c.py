@@ -20,7 +20,7 @@ from gmijax.a3c.targets import (
     batch_targets,
     weighted_mean,
 )
-from gmijax.collectives.interface import Peers, Reducer, TracedStep
+from gmijax.collectives.interface import Communicator, Peers, TracedStep
 from gmijax.config import A3cConfig
 from gmijax.learning.learner import (
     TrainState,
@@ -172,13 +172,13 @@ class Updated(NamedTuple):
     explained_variance: Array
 
 
-def make_update(learner: A3cLearner, reducer: Reducer) -> TracedStep:
+def make_update(learner: A3cLearner, comm: Communicator) -> TracedStep:
     """The update as a program: `(state, (batch, weight)) -> (state, (), Updated)`.
 
     The batch has unrolls [T, B]. The weight [B] is 0 for unrolls that are too old to learn from;
     the others weigh alike on all trainers, and the mean over all of them is 1.
     """
-    return reducer.program(partial(update, learner), donates_own=False)
+    return comm.program(partial(update, learner), donates_own=False)
 
 
 def update(

@@ -81,8 +81,8 @@ class TracedStep(Protocol):
     def __call__(self, shared: Any, own: Any) -> tuple[Any, Any, Any]:
         """`(shared, own, metrics)`, the first two on this trainer's device, the last on the host.
 
-        The arguments are donated, `own` only if it is returned alike (`Reducer.program`). All of
-        it may still be computed, but for the metrics of the call before.
+        The arguments are donated, `own` only if it is returned alike (`Communicator.program`). All
+        of it may still be computed, but for the metrics of the call before.
 
         Raises:
           PeerLost: the process of another trainer is gone.
@@ -99,7 +99,7 @@ class TracedStep(Protocol):
         ...
 
 
-class Reducer(Protocol):
+class Communicator(Protocol):
     """Exchanges numbers among the trainers of a job.
 
     Attributes:
@@ -135,5 +135,5 @@ class Reducer(Protocol):
         ...
 
     def close(self) -> None:
-        """Releases what the reducer holds. Idempotent."""
+        """Releases what the communicator holds. Idempotent."""
         ...

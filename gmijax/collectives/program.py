@@ -58,7 +58,7 @@ class Exchange:
         return total
 
     def program(self, step: Step, *, donates_own: bool = True) -> ProgramStep:
-        """See `Reducer`."""
+        """See `Communicator`."""
         assert self._links is not None
         return ProgramStep(self, self._links, step, donates_own=donates_own)
 

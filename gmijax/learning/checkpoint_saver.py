@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from gmijax.collectives.interface import Reducer
+from gmijax.collectives.interface import Communicator
 from gmijax.learning.checkpoint import finish_checkpoint, on_host, save_envs, save_learner
 from gmijax.learning.report_thread import ReportThread
 from gmijax.runs.folder import RunPaths
@@ -27,12 +27,12 @@ class CheckpointSaver:
     Args:
       run: the run folder.
       gmi: whose environments these are.
-      reducer: among the GMIs that train.
+      comm: among the GMIs that train.
       keep: as of `finish_checkpoint`.
     """
 
-    def __init__(self, run: RunPaths, gmi: int, reducer: Reducer, keep: int | None) -> None:
-        self._run, self._gmi, self._reducer, self._keep = run, gmi, reducer, keep
+    def __init__(self, run: RunPaths, gmi: int, comm: Communicator, keep: int | None) -> None:
+        self._run, self._gmi, self._comm, self._keep = run, gmi, comm, keep
         self._thread = ReportThread(_call)
         self._unnamed: CheckpointMeta | None = None
         self._last: Path | None = None
@@ -104,11 +104,11 @@ class CheckpointSaver:
 
     @property
     def _is_leader(self) -> bool:
-        return self._reducer.rank == 0
+        return self._comm.rank == 0
 
     def _meet(self) -> None:
         """Returns when all GMIs have called it."""
-        self._reducer.all_gather(np.zeros(1, np.float32))
+        self._comm.all_gather(np.zeros(1, np.float32))
 
 
 def _call(work: Callable[[], Any]) -> None:

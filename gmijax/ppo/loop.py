@@ -1,6 +1,6 @@
 """The training loop of a GMI in synchronous training: checkpoints, metrics, agreement to stop.
 
-Every GMI that trains runs this same routine; the reducer keeps them in step and makes their
+Every GMI that trains runs this same routine; the communicator keeps them in step and makes their
 learner states equal. The leader (rank 0) alone writes metrics and the shared part of checkpoints.
 """
 
@@ -17,7 +17,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from gmijax.collectives.interface import Reducer, TracedStep
+from gmijax.collectives.interface import Communicator, TracedStep
 from gmijax.config import PpoConfig, TrainConfig
 from gmijax.devices import describe_device
 from gmijax.errors import CollectiveError
@@ -50,7 +50,7 @@ class TrainingLoop:
     Args:
       config: of the run.
       env: the environments; where others make the rollouts, like theirs.
-      reducer: among the GMIs that train.
+      comm: among the GMIs that train.
       link: to the controller.
       workers: the GMIs that make this one's rollouts, None where it does so itself.
     """
@@ -59,24 +59,24 @@ class TrainingLoop:
         self,
         config: TrainConfig,
         env: BatchedEnv,
-        reducer: Reducer,
+        comm: Communicator,
         link: ChildLink,
         workers: RolloutWorkers | None = None,
     ) -> None:
         assert isinstance(config.algo, PpoConfig)
         self._config = config
         self._env = env
-        self._reducer = reducer
+        self._comm = comm
         self._link = link
-        self._leader = reducer.rank == 0
+        self._leader = comm.rank == 0
         self._warms_up = config.algo.warmup_unroll and config.run.resume is None
         self._learner = make_learner(env.spec, config.algo)
         self._remote: RemoteIteration | None = None
-        num_simulating = reducer.world_size
+        num_simulating = comm.world_size
         if workers is None:
-            self._iteration = reducer.program(partial(iterate, env, self._learner))
+            self._iteration = comm.program(partial(iterate, env, self._learner))
         else:
-            self._iteration = self._remote = RemoteIteration(env, self._learner, reducer, workers)
+            self._iteration = self._remote = RemoteIteration(env, self._learner, comm, workers)
             num_simulating *= len(workers.gmis)
         self._steps_per_iteration = (
             config.envs_per_gmi * config.algo.unroll_length * num_simulating
@@ -84,16 +84,16 @@ class TrainingLoop:
         self._meter: ThroughputMeter | None = None
         # Who has no environments cannot measure how fast they are.
         if config.run.measure_throughput and self._remote is None:
-            self._meter = ThroughputMeter(env, self._learner, config, reducer)
+            self._meter = ThroughputMeter(env, self._learner, config, comm)
         self._evaluator: Evaluator | None = None
         if config.eval.every is not None:
-            worlds = evaluation_worlds(config, reducer.rank, reducer.world_size)
-            self._evaluator = Evaluator(worlds, self._learner, config, reducer, link.run)
+            worlds = evaluation_worlds(config, comm.rank, comm.world_size)
+            self._evaluator = Evaluator(worlds, self._learner, config, comm, link.run)
         self._env_steps = 0
         self._iterations = 0
         self._checkpoint: Path | None = None
         keep = config.run.keep_checkpoints
-        self._saver = CheckpointSaver(link.run, link.gmi, reducer, keep)
+        self._saver = CheckpointSaver(link.run, link.gmi, comm, keep)
         traced = config.run.profiled if self._leader else None
         self._trace = IterationTrace(traced, link.run.profile)
 
@@ -155,9 +155,9 @@ class TrainingLoop:
         return first_envs(
             self._env,
             self._config,
-            self._reducer.rank,
+            self._comm.rank,
             gmi=self._link.gmi,
-            num_gmis=self._reducer.world_size,
+            num_gmis=self._comm.world_size,
         )
 
     def _compile(self, state: TrainState, env_state: Any) -> float:
@@ -186,7 +186,7 @@ class TrainingLoop:
             self._config,
             self._env.spec.episode_length * steps_at_once,
             self._link.gmi,
-            self._reducer.world_size,
+            self._comm.world_size,
         )
         return TrainingLog.open(name, self._link.run, self._env_steps, window)
 
@@ -259,7 +259,7 @@ class TrainingLoop:
     def _agree_to_stop(self) -> bool:
         # Only one GMI may have heard of it yet; all must leave after the same iteration.
         mine = np.array([self._link.stop_requested, self._saver.is_written], np.float32)
-        stops, are_written = self._reducer.all_gather(mine).T
+        stops, are_written = self._comm.all_gather(mine).T
         if are_written.all():
             self._saver.name()
         return bool(stops.any())
@@ -276,9 +276,9 @@ class TrainingLoop:
         self._iteration.wait()
         thread.wait()  # A resumed run goes on from the lines up to its checkpoint.
         config, steps = self._config, self._env_steps
-        require_equal(self._reducer, self._link.gmi, state.params, steps)
+        require_equal(self._comm, self._link.gmi, state.params, steps)
         require_finite(state.params, config.env.label, steps)
-        num_gmis, episodes = self._reducer.world_size, log.episodes()
+        num_gmis, episodes = self._comm.world_size, log.episodes()
         evaluated = None if evaluation is None else evaluation.mean_return
         meta = checkpoint_meta(config, steps, num_gmis, log.standing(), evaluated)
 
@@ -290,7 +290,7 @@ class TrainingLoop:
 
     def _meet(self) -> None:
         """Returns when all GMIs have called it."""
-        self._reducer.all_gather(np.zeros(1, np.float32))
+        self._comm.all_gather(np.zeros(1, np.float32))
 
     def _median_rate(self, iteration_s: list[float]) -> float | None:
         # The first iteration fills caches and pools, and its metrics come late.

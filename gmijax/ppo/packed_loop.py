@@ -122,7 +122,7 @@ class PackedLoop:
     Args:
       members: the runs, from the same step on.
       env: the environments, made for all of them together.
-      program: makes the program of a step; see `Reducer.program`.
+      program: makes the program of a step; see `Communicator.program`.
       link: to the controller.
     """
 

@@ -18,7 +18,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
 
-from gmijax.collectives.interface import FloatBuffer, Peers, Reducer
+from gmijax.collectives.interface import Communicator, FloatBuffer, Peers
 from gmijax.learning.learner import (
     ActingWeights,
     TrainState,
@@ -58,10 +58,10 @@ class RemoteIteration:
     """An iteration on rollouts that other GMIs make: `TracedStep`; here are no environments."""
 
     def __init__(
-        self, env: BatchedEnv, learner: PpoLearner, reducer: Reducer, workers: RolloutWorkers
+        self, env: BatchedEnv, learner: PpoLearner, comm: Communicator, workers: RolloutWorkers
     ) -> None:
         self._workers = workers
-        self._step = reducer.program(partial(_learn_from, env, learner), donates_own=False)
+        self._step = comm.program(partial(_learn_from, env, learner), donates_own=False)
         self._pack: Any = jax.jit(lambda state: pack_weights(acting_weights(learner, state)))
         self._first: _Answers | None = None
         self._timeout_s: float | None = workers.start_timeout_s

@@ -29,7 +29,7 @@ def _run(link: ChildLink) -> None:
     runs = [RunPaths(Path(root)) for root in json.loads(os.environ[MEMBERS_VARIABLE])]
     configs = [from_dict(TrainConfig, read_json(run.config)) for run in runs]
     # jax starts here, in the environment that the plan prepared.
-    from gmijax.collectives.build import SoloReducer
+    from gmijax.collectives.communicator import SingleRankCommunicator
     from gmijax.devices import start_device
     from gmijax.ppo.packed_loop import Member, PackedLoop
     from gmijax.selfcheck import check_share
@@ -40,7 +40,7 @@ def _run(link: ChildLink) -> None:
     first = configs[0]
     env = environments(replace(first, num_envs=len(runs) * first.num_envs), 0)
     members = [Member(config, run) for config, run in zip(configs, runs, strict=True)]
-    PackedLoop(members, env, SoloReducer().program, link).run()
+    PackedLoop(members, env, SingleRankCommunicator().program, link).run()
 
 
 if __name__ == "__main__":

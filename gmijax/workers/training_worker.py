@@ -26,7 +26,7 @@ from gmijax.supervise.child import ENV_PIPES_FD, ChildLink, required_fd, run_gmi
 from gmijax.supervise.job_kinds import ENV_CHANNELS_FD, ENV_REGISTERS_FD, groups_of, topology_of
 
 if TYPE_CHECKING:
-    from gmijax.collectives.interface import Reducer
+    from gmijax.collectives.interface import Communicator
     from gmijax.collectives.messages.pipe_block import PipeBlock
     from gmijax.sim.wrappers import BatchedEnv
 
@@ -79,9 +79,9 @@ def _run_synchronous(
         mail = Messenger(block, config.reduce.timeout_s)
         here = _neighbours(plan, link.gmi, AGENT)
         workers = RolloutWorkers(mail, here, config.run.start_timeout_s)
-    reducer = _trainers_reducer(config, plan, trainers, link, env, PpoLosses, *inherited_nodes())
-    held.callback(reducer.close)
-    return TrainingLoop(config, env, reducer, link, workers).run() | exchange_used(plan, reducer)
+    comm = _trainers_communicator(config, plan, trainers, link, env, PpoLosses, *inherited_nodes())
+    held.callback(comm.close)
+    return TrainingLoop(config, env, comm, link, workers).run() | exchange_used(plan, comm)
 
 
 def _serve_rollouts(
@@ -149,12 +149,12 @@ def _run_asynchronous(
         return Agent(config, env, place, trainers.gmis, registers, sender, link).run()
     receiver = open_receiver(*channels)
     held.callback(receiver.close)
-    reducer = _trainers_reducer(config, plan, trainers, link, env, A3cLosses, nodes, listener)
+    comm = _trainers_communicator(config, plan, trainers, link, env, A3cLosses, nodes, listener)
     if listener is not None:
         listener.close()  # Trainers that are all on one node do not meet others.
-    held.callback(reducer.close)
-    trainer = Trainer(config, env, agents.gmis, registers, receiver, reducer, link)
-    return trainer.run() | exchange_used(plan, reducer)
+    held.callback(comm.close)
+    trainer = Trainer(config, env, agents.gmis, registers, receiver, comm, link)
+    return trainer.run() | exchange_used(plan, comm)
 
 
 def environments(config: TrainConfig, place: int) -> BatchedEnv:
@@ -166,7 +166,7 @@ def environments(config: TrainConfig, place: int) -> BatchedEnv:
     return training_env(worlds_of(config, place), random_ep_len=random_ep_len)
 
 
-def _trainers_reducer(
+def _trainers_communicator(
     config: TrainConfig,
     plan: Plan,
     trainers: Group,
@@ -175,12 +175,12 @@ def _trainers_reducer(
     losses: Any,
     nodes: Nodes | None,
     listener: socket | None,
-) -> Reducer:
-    """The reducer among the trainers, whose ranks are their places in the group.
+) -> Communicator:
+    """The communicator among the trainers, whose ranks are their places in the group.
 
     It averages a gradient and the parts of the loss, the named tuple `losses`.
     """
-    from gmijax.collectives.build import Membership, build_reducer
+    from gmijax.collectives.communicator import Membership, make_communicator
     from gmijax.learning.updates import exchange_size
 
     if nodes is not None:
@@ -199,14 +199,14 @@ def _trainers_reducer(
         nodes=nodes,
         listener=listener,
     )
-    return build_reducer(plan.strategy, membership)
+    return make_communicator(plan.strategy, membership)
 
 
-def exchange_used(plan: Plan, reducer: Reducer) -> dict[str, str]:
+def exchange_used(plan: Plan, comm: Communicator) -> dict[str, str]:
     """For the summary: the exchange in use, where it may differ from the plan's strategy."""
-    if reducer.strategy != plan.strategy:
-        return {"strategy": reducer.strategy, "intra": "host"}
-    return {"intra": reducer.intra} if plan.strategy == "har" else {}
+    if comm.strategy != plan.strategy:
+        return {"strategy": comm.strategy, "intra": "host"}
+    return {"intra": comm.intra} if plan.strategy == "har" else {}
 
 
 def _neighbours(plan: Plan, gmi: int, role: str) -> tuple[int, ...]:

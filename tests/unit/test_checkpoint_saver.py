@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from training_jobs import wait_until
 
-from gmijax.collectives.build import SoloReducer
+from gmijax.collectives.communicator import SingleRankCommunicator
 from gmijax.learning import checkpoint_saver
 from gmijax.learning.checkpoint import restore_envs
 from gmijax.learning.checkpoint_saver import CheckpointSaver
@@ -24,7 +24,7 @@ def meta(env_steps: int) -> CheckpointMeta:
 
 @pytest.fixture
 def saver(tmp_path: Path) -> CheckpointSaver:
-    return CheckpointSaver(RunPaths(tmp_path), 0, SoloReducer(), None)
+    return CheckpointSaver(RunPaths(tmp_path), 0, SingleRankCommunicator(), None)
 
 
 def test_training_goes_on_while_a_checkpoint_is_written(

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from gmijax.collectives.build import Membership, SharedReducer, build_reducer
+from gmijax.collectives.communicator import Membership, MultiRankCommunicator, make_communicator
 from gmijax.collectives.host.host_links import HostLinks
 from gmijax.collectives.host.shared_block import MAX_GATHER_FLOATS, create_exchange
 from gmijax.collectives.nodes.meeting import Nodes, connect, listen
@@ -154,18 +154,18 @@ def test_small_things_go_over_nodes_in_order_of_rank() -> None:
                 nodes=Nodes(node, addresses, TOKEN),
                 listener=socket.socket(fileno=os.dup(listeners[node].fileno())),
             )
-            reducer = build_reducer("mpr", membership)
-            assert isinstance(reducer, SharedReducer)
+            comm = make_communicator("mpr", membership)
+            assert isinstance(comm, MultiRankCommunicator)
             try:
                 # Of all together the last is more than goes through memory at once.
                 sizes = (2, 2, MAX_GATHER_FLOATS // 2)
                 return [
-                    reducer.all_gather(np.full(size, rank + k, np.float32))
+                    comm.all_gather(np.full(size, rank + k, np.float32))
                     for k, size in enumerate(sizes)
                 ]
             finally:
                 met.wait()
-                reducer.close()
+                comm.close()
 
         met = threading.Barrier(4)
         for rows in at_once(*(lambda rank=rank: gather(rank) for rank in range(4))):

@@ -14,7 +14,7 @@ from fake_device_memory import FAKES
 from toy_env import point_mass
 
 from gmijax.cli.compose import compose
-from gmijax.collectives.build import SoloReducer
+from gmijax.collectives.communicator import SingleRankCommunicator
 from gmijax.collectives.device.device_links import DeviceLinks
 from gmijax.collectives.host.host_exchange import HostExchange
 from gmijax.collectives.host.host_links import HostLinks
@@ -161,7 +161,9 @@ def size(config) -> int:
 @pytest.fixture(scope="module")
 def alone(learner):
     """The iteration of a job with one GMI, compiled."""
-    return _compiled(SoloReducer().program(functools.partial(iterate, ENV, learner)), learner)
+    return _compiled(
+        SingleRankCommunicator().program(functools.partial(iterate, ENV, learner)), learner
+    )
 
 
 @contextmanager
@@ -192,7 +194,9 @@ def test_exchanges_in_the_program_change_nothing_but_its_place(
     if strategy == "mpr, by pass":
         strategy = "mpr"
         learner = make_learner(ENV.spec, dataclasses.replace(config, recompute_advantages=True))
-        alone = _compiled(SoloReducer().program(functools.partial(iterate, ENV, learner)), learner)
+        alone = _compiled(
+            SingleRankCommunicator().program(functools.partial(iterate, ENV, learner)), learner
+        )
     with _exchange(strategy, size) as exchange:
         step = exchange.program(functools.partial(iterate, ENV, learner))
         results = []
@@ -274,7 +278,7 @@ def test_it_learns_with_other_settings_and_updates_the_policy_that_acted(config)
             state_dependent_std=True,
         ),
     )
-    step = _compiled(SoloReducer().program(functools.partial(iterate, ENV, mine)), mine)
+    step = _compiled(SingleRankCommunicator().program(functools.partial(iterate, ENV, mine)), mine)
     state, envs, metrics = _learnt(step, *warm_up(step, *_start(mine)))
     assert state.value_moments is not None
     assert float(state.obs_moments.count) == float(state.value_moments.count) == 61 * T * N
@@ -317,7 +321,7 @@ def test_no_learning_rate_is_lost_and_no_number_is_written_twice(config, alone) 
         config, num_updates_per_batch=1, learning_rate_schedule="adaptive_kl", desired_kl=1e-7
     )
     mine = make_learner(ENV.spec, adaptive)
-    step = SoloReducer().program(functools.partial(iterate, ENV, mine))
+    step = SingleRankCommunicator().program(functools.partial(iterate, ENV, mine))
     # The first update has not moved yet, the others each lower the rate.
     rates = [1e-3 / 1.5**k for k in range(4)]
     _, _, told = _compiled(step, mine)(*_start(mine))

@@ -103,7 +103,7 @@ class DeviceLinks(HostLinks):
 
     Raises:
       DeviceMemoryUnavailable: it does not work here; on all ranks alike.
-      PeerLost, CollectiveTimeout: as in the first call of a reducer.
+      PeerLost, CollectiveTimeout: as in the first call of a communicator.
     """
 
     def __init__(

@@ -50,7 +50,7 @@ class SharedSlots:
 
     Raises:
       DeviceMemoryUnavailable: there is no such memory here; on all ranks alike.
-      PeerLost, CollectiveTimeout: as in the first call of a reducer.
+      PeerLost, CollectiveTimeout: as in the first call of a communicator.
     """
 
     def __init__(

@@ -106,7 +106,7 @@ class HostLinks:
         return seconds
 
     def close(self) -> None:
-        """Releases what the links hold beside the shared block, which is the reducer's."""
+        """Releases what the links hold beside the shared block, which is the communicator's."""
         self._pinned = {}
 
     def _buffer(self, use: str, num_floats: int) -> FloatBuffer:

@@ -38,7 +38,7 @@ LANES = 2
 
 LINE = np.dtype(
     [
-        ("pid", np.uint64),  # 0 once the rank has closed its reducer
+        ("pid", np.uint64),  # 0 once the rank has closed its communicator
         ("start_ticks", np.uint64),
         ("num_floats", np.uint64),
         ("call", np.uint64, (2,)),  # what the rank is calling, by parity of the step

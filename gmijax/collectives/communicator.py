@@ -1,4 +1,4 @@
-"""Makes the reducer of one rank: links by what its strategy's stages need."""
+"""Makes the communicator of one rank: links by what its strategy's stages need."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from gmijax.collectives.device.device_links import Device, DeviceLinks
 from gmijax.collectives.host.host_exchange import HostExchange
 from gmijax.collectives.host.host_links import HostLinks
 from gmijax.collectives.host.shared_block import LANES
-from gmijax.collectives.interface import FloatBuffer, Reducer, Step, TracedStep
+from gmijax.collectives.interface import Communicator, FloatBuffer, Step, TracedStep
 from gmijax.collectives.nodes.meeting import Nodes, connect
 from gmijax.collectives.nodes.mesh import Mesh
 from gmijax.collectives.nodes.node_exchange import NodeExchange
@@ -32,7 +32,7 @@ GATHERED_FLOATS = 1024
 
 @dataclass(frozen=True, kw_only=True)
 class Membership:
-    """What is needed to build the reducer of one rank.
+    """What is needed to build the communicator of one rank.
 
     Attributes:
       layout: where all ranks live.
@@ -62,8 +62,8 @@ class Membership:
     gmis: Sequence[int] | None = None
 
 
-def build_reducer(strategy: str, membership: Membership) -> Reducer:
-    """Makes the reducer of one rank.
+def make_communicator(strategy: str, membership: Membership) -> Communicator:
+    """Makes the communicator of one rank.
 
     Strategies that leave the host wait here until all ranks have come.
 
@@ -73,7 +73,7 @@ def build_reducer(strategy: str, membership: Membership) -> Reducer:
     """
     require_strategy(strategy, membership.layout)
     if membership.layout.num_gmis == 1:
-        return SoloReducer(strategy)
+        return SingleRankCommunicator(strategy)
     control, host = _lanes(membership)
     try:
         return _built(strategy, membership, control, host)
@@ -86,7 +86,7 @@ def build_reducer(strategy: str, membership: Membership) -> Reducer:
         return _built(instead, replace(membership, intra="host"), control, host)
 
 
-def _built(strategy: str, membership: Membership, control: _Lane, host: _Lane) -> Reducer:
+def _built(strategy: str, membership: Membership, control: _Lane, host: _Lane) -> Communicator:
     layout, num_floats = membership.layout, _room(membership)
     parts = stages(strategy, layout, membership.intra)
     device, links = DEVICE(), None
@@ -108,11 +108,11 @@ def _built(strategy: str, membership: Membership, control: _Lane, host: _Lane) -
             host.close()
             control.close()
         raise
-    return SharedReducer(strategy, membership.intra, control, host, exchange)
+    return MultiRankCommunicator(strategy, membership.intra, control, host, exchange)
 
 
-class SharedReducer:
-    """The `Reducer` of one of several ranks."""
+class MultiRankCommunicator:
+    """The `Communicator` of one of several ranks."""
 
     def __init__(
         self,
@@ -127,22 +127,22 @@ class SharedReducer:
         self._control, self._host, self._exchange = control, host, exchange
 
     def all_gather(self, values: FloatBuffer) -> FloatBuffer:
-        """See `Reducer`."""
+        """See `Communicator`."""
         return self._control.all_gather(values)
 
     def program(self, step: Step, *, donates_own: bool = True) -> TracedStep:
-        """See `Reducer`."""
+        """See `Communicator`."""
         return self._exchange.program(step, donates_own=donates_own)
 
     def close(self) -> None:
-        """See `Reducer`."""
+        """See `Communicator`."""
         self._exchange.close()
         self._host.close()
         self._control.close()
 
 
-class SoloReducer:
-    """The `Reducer` of a job with one trainer."""
+class SingleRankCommunicator:
+    """The `Communicator` of a job with one trainer."""
 
     rank, world_size, intra = 0, 1, "host"
 
@@ -150,11 +150,11 @@ class SoloReducer:
         self.strategy = strategy
 
     def all_gather(self, values: FloatBuffer) -> FloatBuffer:
-        """See `Reducer`."""
+        """See `Communicator`."""
         return values[None].copy()
 
     def program(self, step: Step, *, donates_own: bool = True) -> TracedStep:
-        """See `Reducer`."""
+        """See `Communicator`."""
         return ProgramStep(None, None, step, donates_own=donates_own)
 
     def close(self) -> None:
