@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from gmijax.collectives.interface import Communicator, FloatBuffer, Peers, TracedStep
+from gmijax.collectives.interface import Collectives, Communicator, FloatBuffer, TracedStep
 from gmijax.errors import CollectiveError
 from gmijax.types import Array
 
@@ -24,8 +24,10 @@ def mean_of(comm: Communicator, size: int) -> Callable[[FloatBuffer], FloatBuffe
     """A function that takes the mean of buffers [size] in a program, compiled once."""
     import jax
 
-    def step(peers: Peers, _: Any, shared: Array, own: Array) -> tuple[Array, Array, Any]:
-        return peers.mean(own), own, ()
+    def step(
+        collectives: Collectives, _: Any, shared: Array, own: Array
+    ) -> tuple[Array, Array, Any]:
+        return collectives.mean(own), own, ()
 
     program = comm.program(step)
     zeros = jax.numpy.zeros(size)
@@ -68,11 +70,13 @@ def several_means(comm: Communicator, size: int) -> TracedStep:
     import jax
     import jax.numpy as jnp
 
-    def step(peers: Peers, _: Any, shared: Array, own: Array) -> tuple[Array, Array, Array]:
-        ranks = peers.gather(peers.rank()[None].astype(jnp.float32))[:, 0]
+    def step(
+        collectives: Collectives, _: Any, shared: Array, own: Array
+    ) -> tuple[Array, Array, Array]:
+        ranks = collectives.gather(collectives.rank()[None].astype(jnp.float32))[:, 0]
 
         def add_mean_rank(_: int, total: Array) -> Array:
-            return peers.mean(total + peers.rank(), after=ranks)
+            return collectives.mean(total + collectives.rank(), after=ranks)
 
         return jax.lax.fori_loop(0, 5, add_mean_rank, shared), own + 1.0, ranks
 
@@ -106,13 +110,15 @@ def step_in_different_orders(comm: Communicator, options: Options) -> Options:
     import jax
     import jax.numpy as jnp
 
-    def step(peers: Peers, _: Any, shared: Array, own: Array) -> tuple[Array, Array, Array]:
+    def step(
+        collectives: Collectives, _: Any, shared: Array, own: Array
+    ) -> tuple[Array, Array, Array]:
         if comm.rank < comm.world_size - 1:
-            mean = peers.mean(own)
-            gathered = peers.gather(own + 0 * mean[0])
+            mean = collectives.mean(own)
+            gathered = collectives.gather(own + 0 * mean[0])
         else:
-            gathered = peers.gather(own)
-            mean = peers.mean(own + 0 * gathered[0, 0])
+            gathered = collectives.gather(own)
+            mean = collectives.mean(own + 0 * gathered[0, 0])
         return shared + mean, own + gathered[0], mean[0]
 
     program = comm.program(step)
@@ -166,10 +172,12 @@ def step_forever(comm: Communicator, options: Options) -> Options:
     import jax
     import jax.numpy as jnp
 
-    def step(peers: Peers, _: Any, shared: Array, own: Array) -> tuple[Array, Array, Array]:
+    def step(
+        collectives: Collectives, _: Any, shared: Array, own: Array
+    ) -> tuple[Array, Array, Array]:
         # A millisecond or two of work, so that ends come while a device is at it.
         own = jax.lax.fori_loop(0, 300, lambda _, x: jnp.cos(x @ x), own)
-        return shared + peers.mean(own[0]), own, jnp.sum(shared)
+        return shared + collectives.mean(own[0]), own, jnp.sum(shared)
 
     program = comm.program(step)
     shared, own = jnp.zeros(64), jnp.eye(64)

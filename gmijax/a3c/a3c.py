@@ -20,7 +20,7 @@ from gmijax.a3c.targets import (
     batch_targets,
     weighted_mean,
 )
-from gmijax.collectives.interface import Communicator, Peers, TracedStep
+from gmijax.collectives.interface import Collectives, Communicator, TracedStep
 from gmijax.config import A3cConfig
 from gmijax.learning.learner import (
     TrainState,
@@ -183,7 +183,7 @@ def make_update(learner: A3cLearner, comm: Communicator) -> TracedStep:
 
 def update(
     learner: A3cLearner,
-    peers: Peers,
+    collectives: Collectives,
     _: Any,
     state: TrainState,
     weighted: tuple[Unrolls, Array],
@@ -192,13 +192,13 @@ def update(
     batch, weight = weighted
     targets = batch_targets(learner, state, batch, weight)
     obs = without_outliers(acting_moments(learner.config, state), batch.state)
-    everyone = peers.gather((moments_of(obs, 2), *targets.fit))
+    everyone = collectives.gather((moments_of(obs, 2), *targets.fit))
     seen, target, error = map(merge_all, everyone)
     state = with_targets(learner, state, target)
     targets = targets._replace(value_moments=state.value_moments)
-    order = minibatch_order(learner.config, state, peers.rank(), batch.reward.shape[1])
+    order = minibatch_order(learner.config, state, collectives.rank(), batch.reward.shape[1])
     state, losses, rates = run_updates(
-        learner, peers, gradients, state, batch, targets, order, after=everyone
+        learner, collectives, gradients, state, batch, targets, order, after=everyone
     )
     # Counts the batch, which makes a new version of the policy, and takes in its statistics.
     state = finish_iteration(learner, state, seen)

@@ -16,7 +16,7 @@ FloatBuffer = npt.NDArray[np.float32]
 T = TypeVar("T")
 
 
-class Peers(Protocol):
+class Collectives(Protocol):
     """The trainers of a job, from within a program that all of them run.
 
     XLA may start exchanges that do not need each other in any order, and trainers that come to
@@ -51,8 +51,8 @@ class Peers(Protocol):
         ...
 
 
-Step: TypeAlias = Callable[[Peers, Any, Any, Any], tuple[Any, Any, Any]]
-"""`(peers, constants, shared, own) -> (shared, own, metrics)`, trees of arrays.
+Step: TypeAlias = Callable[[Collectives, Any, Any, Any], tuple[Any, Any, Any]]
+"""`(collectives, constants, shared, own) -> (shared, own, metrics)`, trees of arrays.
 
 `shared` and `metrics` are equal on all trainers if they were before; `constants` and `own` are a
 trainer's own.

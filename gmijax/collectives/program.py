@@ -97,8 +97,8 @@ class Exchange:
         self._links.reduce(self._stages[number], *where)
 
 
-class ProgramPeers:
-    """The ranks of an exchange as a program sees them: `Peers`.
+class TracedCollectives:
+    """The ranks of an exchange as a program sees them: `Collectives`.
 
     `rank` [] int32 is an argument of the program, so that all ranks have the same one.
     """
@@ -109,11 +109,11 @@ class ProgramPeers:
         self._places = itertools.count(1)
 
     def rank(self) -> jax.Array:
-        """See `Peers`."""
+        """See `Collectives`."""
         return self._rank
 
     def gather(self, tree: T, after: Any = None) -> T:
-        """See `Peers`."""
+        """See `Collectives`."""
         packed, unpack = ravel_pytree(tree)  # One message, not one for each leaf.
         # A sum of which each rank gives one row is exact in any order.
         is_own = jnp.arange(self._exchange.world_size)[:, None] == self._rank
@@ -121,7 +121,7 @@ class ProgramPeers:
         return jax.vmap(unpack)(rows.reshape(-1, packed.size))
 
     def mean(self, tree: T, after: Any = None) -> T:
-        """See `Peers`."""
+        """See `Collectives`."""
         packed, unpack = ravel_pytree(tree)
         return unpack(self._sum(packed, after) * np.float32(1.0 / self._exchange.world_size))
 
@@ -131,20 +131,20 @@ class ProgramPeers:
         return self._exchange.sum(buffer, next(self._places), before)
 
 
-class PeersOfOne:
-    """`Peers` of a job with one trainer."""
+class LocalCollectives:
+    """`Collectives` of a job with one trainer."""
 
     def rank(self) -> jax.Array:
-        """See `Peers`."""
+        """See `Collectives`."""
         return jnp.zeros((), jnp.int32)
 
     def gather(self, tree: T, after: Any = None) -> T:
-        """See `Peers`."""
+        """See `Collectives`."""
         del after
         return jax.tree.map(lambda leaf: leaf[None], tree)
 
     def mean(self, tree: T, after: Any = None) -> T:
-        """See `Peers`."""
+        """See `Collectives`."""
         del after
         return tree
 
@@ -178,8 +178,9 @@ class ProgramStep:
         """See `TracedStep`."""
 
         def whole(rank: jax.Array, constants: Any, shared: Any, own: Any) -> tuple[Any, Any, Any]:
-            peers = PeersOfOne() if self._exchange is None else ProgramPeers(self._exchange, rank)
-            return self._step(peers, constants, shared, own)
+            exchange = self._exchange
+            ranks = LocalCollectives() if exchange is None else TracedCollectives(exchange, rank)
+            return self._step(ranks, constants, shared, own)
 
         # Metrics lie where the host reads them at once: a copy from the device could only be made
         # after the next step, which has been started by then.

@@ -17,7 +17,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from gmijax.collectives.interface import Peers, Step, TracedStep
+from gmijax.collectives.interface import Collectives, Step, TracedStep
 from gmijax.config import PpoConfig, TrainConfig
 from gmijax.devices import describe_device
 from gmijax.errors import NonFiniteError, ReportedError
@@ -254,13 +254,13 @@ class PackedLoop:
 def _iterate_all(
     env: BatchedEnv,
     learner: Learner[PpoConfig],
-    peers: Peers,
+    collectives: Collectives,
     model: PyTree,
     states: TrainState,
     envs: BatchState,
 ) -> tuple[TrainState, BatchState, IterationMetrics]:
     """An iteration of all runs; states and metrics have a leading axis [K]."""
-    one = partial(iterate, env, learner, peers, model)
+    one = partial(iterate, env, learner, collectives, model)
     return jax.vmap(one)(states, envs)
 
 

@@ -18,7 +18,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
 
-from gmijax.collectives.interface import Communicator, FloatBuffer, Peers
+from gmijax.collectives.interface import Collectives, Communicator, FloatBuffer
 from gmijax.learning.learner import (
     ActingWeights,
     TrainState,
@@ -153,7 +153,7 @@ def _rollout(
 def _learn_from(
     env: BatchedEnv,
     learner: PpoLearner,
-    peers: Peers,
+    collectives: Collectives,
     _: Any,
     state: TrainState,
     answers: _Answers,
@@ -163,5 +163,5 @@ def _learn_from(
     joined = jax.tree.map(lambda *parts: jnp.concatenate(parts, axis=1), *samples)
     unpack = ravel_pytree(no_stats(env.spec, env.overflows))[1]
     stats = merge_stats(jax.vmap(unpack)(jnp.stack(packed)))
-    state, metrics = learn(learner, peers, state, joined, stats)
+    state, metrics = learn(learner, collectives, state, joined, stats)
     return state, (), metrics

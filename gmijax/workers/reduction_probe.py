@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from gmijax.collectives.communicator import Membership, make_communicator
-from gmijax.collectives.interface import Communicator, Peers
+from gmijax.collectives.interface import Collectives, Communicator
 from gmijax.control.strategy_selection import CHAIN, TIMEOUT_S, block_variable
 from gmijax.errors import DeviceMemoryUnavailable
 from gmijax.partition.plan import Plan
@@ -81,8 +81,10 @@ def _means(comm: Communicator, num_floats: int, length: int, steps: int) -> Call
     import jax
     import jax.numpy as jnp
 
-    def step(peers: Peers, _: Any, buffer: jax.Array, own: Any) -> tuple[jax.Array, Any, Any]:
-        return jax.lax.fori_loop(0, length, lambda _, b: peers.mean(b), buffer), own, ()
+    def step(
+        collectives: Collectives, _: Any, buffer: jax.Array, own: Any
+    ) -> tuple[jax.Array, Any, Any]:
+        return jax.lax.fori_loop(0, length, lambda _, b: collectives.mean(b), buffer), own, ()
 
     program = comm.program(step)
     carried = [(jnp.ones(num_floats), ())]

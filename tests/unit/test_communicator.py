@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from gmijax.collectives.communicator import SingleRankCommunicator
-from gmijax.collectives.interface import Peers
+from gmijax.collectives.interface import Collectives
 from gmijax.collectives.strategies import COSTS
 from gmijax.partition.layout import Layout
 from gmijax.partition.reduction import why_not_strategy
@@ -35,8 +35,10 @@ def test_one_gmi_keeps_its_own_numbers() -> None:
     comm = SingleRankCommunicator()
     values = np.array([1.0, np.nan, -0.0, np.inf], np.float32)
 
-    def step(peers: Peers, _: Any, shared: Array, own: Array) -> tuple[Array, Array, Array]:
-        return peers.mean(shared), own, peers.gather(own)[peers.rank()]
+    def step(
+        collectives: Collectives, _: Any, shared: Array, own: Array
+    ) -> tuple[Array, Array, Array]:
+        return collectives.mean(shared), own, collectives.gather(own)[collectives.rank()]
 
     program = comm.program(step)
     program.trace((), jnp.zeros(4), jnp.zeros(2))

@@ -19,7 +19,7 @@ from gmijax.collectives.device.device_links import DeviceLinks
 from gmijax.collectives.host.host_exchange import HostExchange
 from gmijax.collectives.host.host_links import HostLinks
 from gmijax.collectives.host.shared_block import LANES, create_exchange
-from gmijax.collectives.program import Exchange, PeersOfOne
+from gmijax.collectives.program import Exchange, LocalCollectives
 from gmijax.collectives.strategies import stages
 from gmijax.learning.learner import (
     acting_weights,
@@ -106,7 +106,7 @@ def test_learning_rates_share_a_program(config, schedule: str) -> None:
             config, learning_rate=rate, learning_rate_schedule=schedule, num_updates_per_batch=1
         )
         learner = make_learner(ENV.spec, changed)
-        step = functools.partial(iterate, ENV, learner, PeersOfOne())
+        step = functools.partial(iterate, ENV, learner, LocalCollectives())
         programs.add(jax.jit(step).lower(ENV.model, *_start(learner)).as_text())
     assert len(programs) == 1
 
@@ -148,7 +148,9 @@ def test_the_schedule_acts_on_every_minibatch(config) -> None:
 
     order = jnp.arange(4)[:, None]
     _, _, rates = jax.jit(
-        lambda state: run_updates(mine, PeersOfOne(), gradients_of, state, kls, None, order, None)
+        lambda state: run_updates(
+            mine, LocalCollectives(), gradients_of, state, kls, None, order, None
+        )
     )(state)
     np.testing.assert_allclose(rates, [1e-3 / 1.5, 1e-3, 1e-3, 1e-3 / 1.5], rtol=1e-5)
 

@@ -23,7 +23,7 @@ from gmijax.collectives.device.shared_slots import SharedSlots, agreed
 from gmijax.collectives.host.host_exchange import HostExchange
 from gmijax.collectives.host.host_links import HostLinks
 from gmijax.collectives.nodes.node_exchange import NodeExchange
-from gmijax.collectives.program import Exchange, ProgramPeers
+from gmijax.collectives.program import Exchange, TracedCollectives
 from gmijax.collectives.shared_memory import Fence
 from gmijax.collectives.strategies import Groups, Stage
 from gmijax.partition.layout import Layout
@@ -224,9 +224,9 @@ class DeviceLinks(HostLinks):
         rank, world_size = self._here.rank, self._here.world_size
 
         def trial(values: jax.Array) -> tuple[jax.Array, jax.Array]:
-            peers = ProgramPeers(exchange, jnp.asarray(rank))
-            gathered = peers.gather(values[:1])[:, 0]
-            return gathered, peers.mean(values, after=gathered)
+            collectives = TracedCollectives(exchange, jnp.asarray(rank))
+            gathered = collectives.gather(values[:1])[:, 0]
+            return gathered, collectives.mean(values, after=gathered)
 
         try:
             gathered, mean = jax.jit(trial)(jnp.full(self.room, rank + 1, jnp.float32))

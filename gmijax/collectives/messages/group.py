@@ -128,7 +128,8 @@ class GroupReducer:
             part = _sum(self._exchange(call, parts))
             result = np.concatenate(self._exchange(call, dict.fromkeys(members, part)))
         if op == "mean":
-            result *= np.finfo(wide).dtype.type(1.0 / len(members))  # As `Peers.mean` has it.
+            # As `Collectives.mean` has it.
+            result *= np.finfo(wide).dtype.type(1.0 / len(members))
         return result.astype(flat.dtype, copy=False)
 
     def _exchange(self, call: _Call, parts: dict[int, npt.NDArray[Any]]) -> list[npt.NDArray[Any]]:
