@@ -22,7 +22,7 @@ class AxisCollectives:
     def rank(self) -> jax.Array:
         return jax.lax.axis_index(_AXIS).astype("int32")
 
-    def gather(self, tree: T, after: Any = None) -> T:
+    def all_gather(self, tree: T, after: Any = None) -> T:
         del after
         return jax.tree.map(lambda leaf: jax.lax.all_gather(leaf, _AXIS), tree)
 

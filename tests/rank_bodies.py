@@ -73,7 +73,7 @@ def several_means(comm: Communicator, size: int) -> TracedStep:
     def step(
         collectives: Collectives, _: Any, shared: Array, own: Array
     ) -> tuple[Array, Array, Array]:
-        ranks = collectives.gather(collectives.rank()[None].astype(jnp.float32))[:, 0]
+        ranks = collectives.all_gather(collectives.rank()[None].astype(jnp.float32))[:, 0]
 
         def add_mean_rank(_: int, total: Array) -> Array:
             return collectives.mean(total + collectives.rank(), after=ranks)
@@ -115,9 +115,9 @@ def step_in_different_orders(comm: Communicator, options: Options) -> Options:
     ) -> tuple[Array, Array, Array]:
         if comm.rank < comm.world_size - 1:
             mean = collectives.mean(own)
-            gathered = collectives.gather(own + 0 * mean[0])
+            gathered = collectives.all_gather(own + 0 * mean[0])
         else:
-            gathered = collectives.gather(own)
+            gathered = collectives.all_gather(own)
             mean = collectives.mean(own + 0 * gathered[0, 0])
         return shared + mean, own + gathered[0], mean[0]
 

@@ -192,7 +192,7 @@ def update(
     batch, weight = weighted
     targets = batch_targets(learner, state, batch, weight)
     obs = without_outliers(acting_moments(learner.config, state), batch.state)
-    everyone = collectives.gather((moments_of(obs, 2), *targets.fit))
+    everyone = collectives.all_gather((moments_of(obs, 2), *targets.fit))
     seen, target, error = map(merge_all, everyone)
     state = with_targets(learner, state, target)
     targets = targets._replace(value_moments=state.value_moments)

@@ -27,7 +27,7 @@ class Collectives(Protocol):
         """[] int32: the trainer on whose device this is computed."""
         ...
 
-    def gather(self, tree: T, after: Any = None) -> T:
+    def all_gather(self, tree: T, after: Any = None) -> T:
         """`tree` of every trainer, float32; leaves [...] become [K, ...], in order of rank.
 
         For at most P / K numbers, or 1024.

@@ -47,7 +47,7 @@ class Exchange:
         """The sum over ranks of `buffer` [n] float32; in a program, where it is number `place`."""
         total = buffer
         for number, stage in enumerate(self._stages):
-            if stage.kind == "gather":
+            if stage.kind == "all_gather":
                 # The largest group's size: the program must be the same on all ranks.
                 most = max(len(group) for group in stage.groups)
                 rows = self._traced(total, (most, buffer.size), number, place, after)
@@ -112,7 +112,7 @@ class TracedCollectives:
         """See `Collectives`."""
         return self._rank
 
-    def gather(self, tree: T, after: Any = None) -> T:
+    def all_gather(self, tree: T, after: Any = None) -> T:
         """See `Collectives`."""
         packed, unpack = ravel_pytree(tree)  # One message, not one for each leaf.
         # A sum of which each rank gives one row is exact in any order.
@@ -138,7 +138,7 @@ class LocalCollectives:
         """See `Collectives`."""
         return jnp.zeros((), jnp.int32)
 
-    def gather(self, tree: T, after: Any = None) -> T:
+    def all_gather(self, tree: T, after: Any = None) -> T:
         """See `Collectives`."""
         del after
         return jax.tree.map(lambda leaf: leaf[None], tree)

@@ -82,7 +82,7 @@ def learn(
     The statistics of observations change only after all updates: the policy that is updated sees
     the observations exactly as the policy that acted did, and the first probability ratio is 1.
     """
-    everyone = collectives.gather(stats)
+    everyone = collectives.all_gather(stats)
     stats = merge_stats(everyone)
     state = with_targets(learner, state, stats.target)
     context = update_context(learner, state, stats)
@@ -126,7 +126,7 @@ def _updates_by_pass(
 
     def one_pass(state: TrainState, order: Array) -> tuple[TrainState, tuple[PpoLosses, Array]]:
         renewed = valued_anew(learner, acting_weights(learner, state), samples, trajectory)
-        everyone = collectives.gather(moments_of(renewed.advantage, 2), after=after)
+        everyone = collectives.all_gather(moments_of(renewed.advantage, 2), after=after)
         mean, std = advantage_scale(learner, merge_all(everyone))
         now = context._replace(advantage_mean=mean, advantage_std=std)
         state, losses, rates = run_updates(

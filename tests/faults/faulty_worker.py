@@ -211,7 +211,7 @@ def _inject_in_training(faults: Faults) -> None:
             own = jax.tree.map(nan, own)
         return iterate(self, shared, own)
 
-    _before(HostExchange, "sum", lambda *_: faults.at("mean"))
+    _before(HostExchange, "all_reduce", lambda *_: faults.at("mean"))
     _before(TrainingLog, "write", lambda *_: faults.at("report"))
     _before(ThroughputMeter, "measure", lambda *_: faults.at("measuring"))
     _before(checkpoint, "_sync", synced)

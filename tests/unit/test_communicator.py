@@ -38,7 +38,7 @@ def test_one_gmi_keeps_its_own_numbers() -> None:
     def step(
         collectives: Collectives, _: Any, shared: Array, own: Array
     ) -> tuple[Array, Array, Array]:
-        return collectives.mean(shared), own, collectives.gather(own)[collectives.rank()]
+        return collectives.mean(shared), own, collectives.all_gather(own)[collectives.rank()]
 
     program = comm.program(step)
     program.trace((), jnp.zeros(4), jnp.zeros(2))

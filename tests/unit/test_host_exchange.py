@@ -69,7 +69,7 @@ def test_groups_sum_by_themselves_and_ranks_in_none_keep_what_they_have() -> Non
     def call(rank: HostExchange) -> FloatBuffer:
         own, found = np.full(100, 2.0**rank.rank, np.float32), np.empty((3, 100), np.float32)
         for row in found[:2]:  # Twice: slots take turns.
-            rank.sum(own, row, groups)
+            rank.all_reduce(own, row, groups)
         rank.broadcast(own, found[2], groups)
         return found
 

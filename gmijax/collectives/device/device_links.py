@@ -162,8 +162,8 @@ class DeviceLinks(HostLinks):
         most = max(len(group) for group in stage.groups)
         if stage.link == "slots" and self._slots is not None:
             with self._exchanging(stream, place, num_floats) as queue:
-                if stage.kind == "gather":
-                    self._slots.gather(queue, stream, source, target, num_floats, rows=most)
+                if stage.kind == "all_gather":
+                    self._slots.all_gather(queue, stream, source, target, num_floats, rows=most)
                 else:
                     assert stage.kind == "broadcast"  # Slots add nothing up.
                     self._slots.broadcast(queue, stream, source, target, num_floats)
@@ -225,7 +225,7 @@ class DeviceLinks(HostLinks):
 
         def trial(values: jax.Array) -> tuple[jax.Array, jax.Array]:
             collectives = TracedCollectives(exchange, jnp.asarray(rank))
-            gathered = collectives.gather(values[:1])[:, 0]
+            gathered = collectives.all_gather(values[:1])[:, 0]
             return gathered, collectives.mean(values, after=gathered)
 
         try:

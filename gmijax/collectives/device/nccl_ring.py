@@ -23,11 +23,11 @@ class NcclRing:
         self._nccl, self._comm = nccl, comm
         self._float, self._sum = int(nccl.DataType.Float32), int(nccl.RedOp.Sum)
 
-    def gather(self, stream: int, source: int, target: int, num_floats: int) -> None:
+    def all_gather(self, stream: int, source: int, target: int, num_floats: int) -> None:
         """`target` [m, n] becomes what all members have."""
         self._nccl.all_gather(source, target, num_floats, self._float, self._comm, stream)
 
-    def sum(self, stream: int, source: int, target: int, num_floats: int) -> None:
+    def all_reduce(self, stream: int, source: int, target: int, num_floats: int) -> None:
         """`target` [n] becomes the sum over the members."""
         kind = self._float, self._sum
         self._nccl.all_reduce(source, target, num_floats, *kind, self._comm, stream)

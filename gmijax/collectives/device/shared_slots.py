@@ -77,7 +77,7 @@ class SharedSlots:
             self.close()
             raise
 
-    def gather(
+    def all_gather(
         self,
         queue: CudaQueue,
         stream: int,
@@ -100,7 +100,7 @@ class SharedSlots:
     def broadcast(
         self, queue: CudaQueue, stream: int, source: int, target: int, num_floats: int
     ) -> None:
-        """Queues a copy of what the first member has; as `gather`, but `target` has [n]."""
+        """Queues a copy of what the first member has; as `all_gather`, but `target` has [n]."""
         num_bytes = 4 * num_floats
         self._write(queue, stream, source, num_bytes)
         queue.copy(stream, target, self._slot(0), num_bytes)

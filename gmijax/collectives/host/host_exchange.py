@@ -1,4 +1,4 @@
-"""Gather, sum and broadcast between the ranks of one host, through its shared block."""
+"""All-gather, all-reduce and broadcast between the ranks of one host, through its shared block."""
 
 from __future__ import annotations
 
@@ -67,7 +67,7 @@ class HostExchange:
         self._block: SharedBlock | None = block
         self.barrier = Barrier(block, timeout_s, rendezvous_timeout_s)
 
-    def sum(
+    def all_reduce(
         self, source: FloatBuffer, target: FloatBuffer, groups: Groups, place: int = 0
     ) -> None:
         """Writes the sum over the rank's group of `source` [n] into `target` [n], n <= P.
@@ -93,7 +93,7 @@ class HostExchange:
         target[:] = slots[group[0] if group else self.rank]
         self.barrier.end()
 
-    def gather(
+    def all_gather_into(
         self, source: FloatBuffer, target: FloatBuffer, groups: Groups, place: int = 0
     ) -> None:
         """Writes what all of the rank's group have as `source` [n] into `target` [m, n]."""
@@ -121,7 +121,7 @@ class HostExchange:
     def mean(self, buffer: FloatBuffer) -> FloatBuffer:
         """Returns the mean over all ranks of `buffer` [P] float32: the sum times 1 / K."""
         total = np.empty_like(buffer)
-        self.sum(buffer, total, (tuple(range(self.world_size)),))
+        self.all_reduce(buffer, total, (tuple(range(self.world_size)),))
         total *= np.float32(1.0 / self.world_size)
         return total
 

@@ -60,7 +60,7 @@ class HostLinks:
           target: address of the result, [n], or [m, n] if the stage gathers.
           num_floats: n.
         """
-        rows = max(map(len, stage.groups)) if stage.kind == "gather" else 1
+        rows = max(map(len, stage.groups)) if stage.kind == "all_gather" else 1
         started = time.monotonic()
         try:
             if stream:
@@ -120,11 +120,14 @@ class HostLinks:
     def _reduce(self, stage: Stage, place: int, values: FloatBuffer, result: FloatBuffer) -> None:
         if stage.link == "nodes":
             assert isinstance(self._host, NodeExchange)
-            self._host.sum_of_nodes(values, result, stage.groups, place)
-            return
-        if stage.kind == "gather":
-            result = result.reshape(-1, values.size)
-        getattr(self._host, stage.kind)(values, result, stage.groups, place)
+            self._host.all_reduce_nodes(values, result, stage.groups, place)
+        elif stage.kind == "all_gather":
+            rows = result.reshape(-1, values.size)
+            self._host.all_gather_into(values, rows, stage.groups, place)
+        elif stage.kind == "all_reduce":
+            self._host.all_reduce(values, result, stage.groups, place)
+        else:
+            self._host.broadcast(values, result, stage.groups, place)
 
 
 def _at(address: int, num_floats: int) -> FloatBuffer:

@@ -15,7 +15,7 @@ from gmijax.partition.layout import Layout
 class NodeExchange:
     """`HostExchange` of a job on several nodes, with a sum between nodes.
 
-    Groups are of ranks of the whole job; those of a sum, a gather or a broadcast lie in one node.
+    Groups are of ranks of the whole job; those of a collective lie in one node.
 
     Attributes:
       local: the use of the block of the node, by ranks in the node.
@@ -32,11 +32,11 @@ class NodeExchange:
         self.local, self._mesh = local, mesh
         self._here = layout.gmis_of_node[layout.node_of(rank)]
 
-    def sum(
+    def all_reduce(
         self, source: FloatBuffer, target: FloatBuffer, groups: Groups, place: int = 0
     ) -> None:
         """See `HostExchange`."""
-        self.local.sum(source, target, self.of_node(groups), place)
+        self.local.all_reduce(source, target, self.of_node(groups), place)
 
     def broadcast(
         self, source: FloatBuffer, target: FloatBuffer, groups: Groups, place: int = 0
@@ -44,17 +44,17 @@ class NodeExchange:
         """See `HostExchange`."""
         self.local.broadcast(source, target, self.of_node(groups), place)
 
-    def gather(
+    def all_gather_into(
         self, source: FloatBuffer, target: FloatBuffer, groups: Groups, place: int = 0
     ) -> None:
         """See `HostExchange`."""
-        self.local.gather(source, target, self.of_node(groups), place)
+        self.local.all_gather_into(source, target, self.of_node(groups), place)
 
-    def sum_of_nodes(
+    def all_reduce_nodes(
         self, source: FloatBuffer, target: FloatBuffer, groups: Groups, place: int
     ) -> None:
         """Writes the sum over nodes into `target` [n], of what their leaders have as `source`."""
-        total = source if self._mesh is None else self._mesh.sum(source, place)
+        total = source if self._mesh is None else self._mesh.all_reduce(source, place)
         if self.local.world_size > 1:
             self.broadcast(total, target, groups, place)
         else:
@@ -65,7 +65,7 @@ class NodeExchange:
         here = self.local.all_gather(values)
         everywhere = np.zeros(self.world_size * values.size, np.float32)
         if self._mesh is not None:
-            everywhere[:] = self._mesh.gather(here.ravel()).ravel()
+            everywhere[:] = self._mesh.all_gather(here.ravel()).ravel()
         for start in range(0, everywhere.size, MAX_GATHER_FLOATS):
             piece = everywhere[start : start + MAX_GATHER_FLOATS]
             piece[:] = self.local.all_gather(piece)[0]  # The leader is the first of its node.
