@@ -23,7 +23,7 @@ from typing import Any
 
 import pytest
 
-from gmijax.collectives.communicator import Membership, make_communicator
+from gmijax.collectives.communicator import CommunicatorConfig, make_communicator
 from gmijax.collectives.host.shared_block import create_exchange
 from gmijax.collectives.interface import Communicator
 from gmijax.collectives.nodes.meeting import (
@@ -262,7 +262,7 @@ def communicator_of(options: Options) -> Communicator:
         use_fake_device_memory(options["special"] if is_special else "fake")
     return make_communicator(
         strategy,
-        Membership(
+        CommunicatorConfig(
             layout=layout,
             rank=rank,
             num_floats=options["num_floats"],

@@ -31,7 +31,7 @@ GATHERED_FLOATS = 1024
 
 
 @dataclass(frozen=True, kw_only=True)
-class Membership:
+class CommunicatorConfig:
     """What is needed to build the communicator of one rank.
 
     Attributes:
@@ -62,7 +62,7 @@ class Membership:
     gmis: Sequence[int] | None = None
 
 
-def make_communicator(strategy: str, membership: Membership) -> Communicator:
+def make_communicator(strategy: str, config: CommunicatorConfig) -> Communicator:
     """Makes the communicator of one rank.
 
     Strategies that leave the host wait here until all ranks have come.
@@ -71,24 +71,24 @@ def make_communicator(strategy: str, membership: Membership) -> Communicator:
       ConfigError: no such strategy, or it does not work for this layout, or lacks something.
       CollectiveError: the shared memory cannot be had, or another rank is gone or does not come.
     """
-    require_strategy(strategy, membership.layout)
-    if membership.layout.num_gmis == 1:
+    require_strategy(strategy, config.layout)
+    if config.layout.num_gmis == 1:
         return SingleRankCommunicator(strategy)
-    control, host = _lanes(membership)
+    control, host = _lanes(config)
     try:
-        return _built(strategy, membership, control, host)
+        return _built(strategy, config, control, host)
     except DeviceMemoryUnavailable as error:
-        if not membership.host_if_unavailable:
+        if not config.host_if_unavailable:
             raise
         instead = "mpr" if strategy == "one_shot" else strategy
         what = f"reduce.strategy={instead} through host memory"
         warnings.warn(f"{error}; so {what}", RuntimeWarning, stacklevel=2)
-        return _built(instead, replace(membership, intra="host"), control, host)
+        return _built(instead, replace(config, intra="host"), control, host)
 
 
-def _built(strategy: str, membership: Membership, control: _Lane, host: _Lane) -> Communicator:
-    layout, num_floats = membership.layout, _room(membership)
-    parts = stages(strategy, layout, membership.intra)
+def _built(strategy: str, config: CommunicatorConfig, control: _Lane, host: _Lane) -> Communicator:
+    layout, num_floats = config.layout, _room(config)
+    parts = stages(strategy, layout, config.intra)
     device, links = DEVICE(), None
     try:
         if device is None or all(stage.link in ("host", "nodes") for stage in parts):
@@ -108,7 +108,7 @@ def _built(strategy: str, membership: Membership, control: _Lane, host: _Lane) -
             host.close()
             control.close()
         raise
-    return MultiRankCommunicator(strategy, membership.intra, control, host, exchange)
+    return MultiRankCommunicator(strategy, config.intra, control, host, exchange)
 
 
 class MultiRankCommunicator:
@@ -161,41 +161,41 @@ class SingleRankCommunicator:
         """Does nothing: there is nothing to release."""
 
 
-def _lanes(membership: Membership) -> Sequence[_Lane]:
-    assert membership.exchange_fd is not None
-    layout, rank = membership.layout, membership.rank
-    here, ids = layout.gmis_of_node[layout.node_of(rank)], _ids(membership)
+def _lanes(config: CommunicatorConfig) -> Sequence[_Lane]:
+    assert config.exchange_fd is not None
+    layout, rank = config.layout, config.rank
+    here, ids = layout.gmis_of_node[layout.node_of(rank)], _ids(config)
     lanes = [
         HostExchange(
-            *(membership.exchange_fd, here.index(rank), len(here), _room(membership)),
-            timeout_s=membership.timeout_s,
-            rendezvous_timeout_s=membership.rendezvous_timeout_s,
+            *(config.exchange_fd, here.index(rank), len(here), _room(config)),
+            timeout_s=config.timeout_s,
+            rendezvous_timeout_s=config.rendezvous_timeout_s,
             lane=lane,
             ids=[ids[other] for other in here],
         )
         for lane in range(LANES)
     ]
-    return lanes if layout.num_nodes == 1 else _over_nodes(membership, lanes, leader=here[0])
+    return lanes if layout.num_nodes == 1 else _over_nodes(config, lanes, leader=here[0])
 
 
 def _over_nodes(
-    membership: Membership, lanes: Sequence[HostExchange], leader: int
+    config: CommunicatorConfig, lanes: Sequence[HostExchange], leader: int
 ) -> Sequence[NodeExchange]:
     """The lanes with what goes on between nodes; leaders wait here for each other."""
-    layout, rank = membership.layout, membership.rank
-    nodes, listener = membership.nodes, membership.listener
+    layout, rank = config.layout, config.rank
+    nodes, listener = config.nodes, config.listener
     if nodes is None or listener is None:
         raise ConfigError(f"layout {layout} on {layout.num_nodes} nodes: needs their addresses")
     with listener:
         if rank != leader:
             return [NodeExchange(lane, layout, rank, None) for lane in lanes]
-        sockets = connect(nodes, listener, len(lanes), membership.rendezvous_timeout_s)
-    leaders = [_ids(membership)[ranks[0]] for ranks in layout.gmis_of_node]
+        sockets = connect(nodes, listener, len(lanes), config.rendezvous_timeout_s)
+    leaders = [_ids(config)[ranks[0]] for ranks in layout.gmis_of_node]
     meshes = [
         Mesh(
             *(connections, nodes.node, leaders),
-            timeout_s=membership.timeout_s,
-            rendezvous_timeout_s=membership.rendezvous_timeout_s,
+            timeout_s=config.timeout_s,
+            rendezvous_timeout_s=config.rendezvous_timeout_s,
             on_wait=lane.beat,
         )
         for connections, lane in zip(sockets, lanes, strict=True)
@@ -205,13 +205,13 @@ def _over_nodes(
     ]
 
 
-def _ids(membership: Membership) -> Sequence[int]:
-    return membership.layout.gmis if membership.gmis is None else membership.gmis
+def _ids(config: CommunicatorConfig) -> Sequence[int]:
+    return config.layout.gmis if config.gmis is None else config.gmis
 
 
-def _room(membership: Membership) -> int:
+def _room(config: CommunicatorConfig) -> int:
     """Length of the largest buffer whose sum is taken; what is gathered is one of all ranks."""
-    return max(membership.num_floats, GATHERED_FLOATS * membership.layout.num_gmis)
+    return max(config.num_floats, GATHERED_FLOATS * config.layout.num_gmis)
 
 
 def _device() -> Device | None:

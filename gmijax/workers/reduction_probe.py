@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from gmijax.collectives.communicator import Membership, make_communicator
+from gmijax.collectives.communicator import CommunicatorConfig, make_communicator
 from gmijax.collectives.interface import Collectives, Communicator
 from gmijax.control.strategy_selection import CHAIN, TIMEOUT_S, block_variable
 from gmijax.errors import DeviceMemoryUnavailable
@@ -51,7 +51,7 @@ def _communicator(plan: Plan, gmi: int, number: int, probe: Mapping[str, Any]) -
     """The communicator of one probe, with a shared block of its own."""
     return make_communicator(
         probe["strategy"],
-        Membership(
+        CommunicatorConfig(
             layout=plan.layout,
             rank=gmi,
             num_floats=probe["num_floats"],

@@ -126,11 +126,11 @@ def _writer(config: ServeConfig, rank: int, first: int, policy: ActingPolicy) ->
 
 def _communicator(config: ServeConfig, plan: Plan, link: ChildLink) -> Communicator:
     """Serves as a barrier of all GMIs; it needs no gradients."""
-    from gmijax.collectives.communicator import Membership, make_communicator
+    from gmijax.collectives.communicator import CommunicatorConfig, make_communicator
 
     return make_communicator(
         "mpr" if plan.layout.num_gmis > 1 else "none",
-        Membership(
+        CommunicatorConfig(
             layout=plan.layout,
             rank=link.gmi,
             num_floats=1,

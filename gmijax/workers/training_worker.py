@@ -180,12 +180,12 @@ def _trainers_communicator(
 
     It averages a gradient and the parts of the loss, the named tuple `losses`.
     """
-    from gmijax.collectives.communicator import Membership, make_communicator
+    from gmijax.collectives.communicator import CommunicatorConfig, make_communicator
     from gmijax.learning.updates import exchange_size
 
     if nodes is not None:
         nodes = nodes.among(nodes_of(plan.layout, trainers.gmis))
-    membership = Membership(
+    comm_config = CommunicatorConfig(
         layout=trainers.layout,
         rank=trainers.gmis.index(link.gmi),
         gmis=trainers.gmis,
@@ -199,7 +199,7 @@ def _trainers_communicator(
         nodes=nodes,
         listener=listener,
     )
-    return make_communicator(plan.strategy, membership)
+    return make_communicator(plan.strategy, comm_config)
 
 
 def exchange_used(plan: Plan, comm: Communicator) -> dict[str, str]:

@@ -15,7 +15,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from gmijax.collectives.communicator import Membership, MultiRankCommunicator, make_communicator
+from gmijax.collectives.communicator import (
+    CommunicatorConfig,
+    MultiRankCommunicator,
+    make_communicator,
+)
 from gmijax.collectives.host.host_links import HostLinks
 from gmijax.collectives.host.shared_block import MAX_GATHER_FLOATS, create_exchange
 from gmijax.collectives.nodes.meeting import Nodes, connect, listen
@@ -148,7 +152,7 @@ def test_small_things_go_over_nodes_in_order_of_rank() -> None:
 
         def gather(rank: int) -> Any:
             node = layout.node_of(rank)
-            membership = Membership(
+            config = CommunicatorConfig(
                 layout=layout,
                 rank=rank,
                 num_floats=10,
@@ -158,7 +162,7 @@ def test_small_things_go_over_nodes_in_order_of_rank() -> None:
                 nodes=Nodes(node, addresses, TOKEN),
                 listener=socket.socket(fileno=os.dup(listeners[node].fileno())),
             )
-            comm = make_communicator("mpr", membership)
+            comm = make_communicator("mpr", config)
             assert isinstance(comm, MultiRankCommunicator)
             try:
                 # Of all together the last is more than goes through memory at once.
