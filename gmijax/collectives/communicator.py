@@ -11,20 +11,20 @@ from typing import TypeAlias
 import jax
 
 from gmijax.collectives.device.device_links import Device, DeviceLinks
-from gmijax.collectives.host.host_exchange import HostExchange
 from gmijax.collectives.host.host_links import HostLinks
 from gmijax.collectives.host.shared_block import LANES
+from gmijax.collectives.host.shared_memory_group import SharedMemoryGroup
 from gmijax.collectives.interface import Communicator, FloatBuffer, Step, TracedStep
 from gmijax.collectives.nodes.meeting import Nodes, connect
 from gmijax.collectives.nodes.mesh import Mesh
-from gmijax.collectives.nodes.node_exchange import NodeExchange
-from gmijax.collectives.program import Exchange, ProgramStep
+from gmijax.collectives.nodes.multi_node_group import MultiNodeGroup
+from gmijax.collectives.program import ProgramStep, StagedAllReduce
 from gmijax.collectives.strategies import stages
 from gmijax.errors import ConfigError, DeviceMemoryUnavailable
 from gmijax.partition.layout import Layout
 from gmijax.partition.reduction import require_strategy, why_no_bindings
 
-_Lane: TypeAlias = HostExchange | NodeExchange
+_Lane: TypeAlias = SharedMemoryGroup | MultiNodeGroup
 
 GATHERED_FLOATS = 1024
 """Of each rank; more where P leaves room for them."""
@@ -95,11 +95,11 @@ def _built(strategy: str, config: CommunicatorConfig, control: _Lane, host: _Lan
             links = HostLinks(host, num_floats)
         else:
             links = DeviceLinks(control, host, layout, num_floats, parts, device)
-        exchange = trial = Exchange(links, parts, host.rank, host.world_size)
+        all_reduce = trial = StagedAllReduce(links, parts, host.rank, host.world_size)
         inside = [stage for stage in parts if stage.link != "nodes"]
         if len(inside) < len(parts):
             # Who finds that it does not work must not leave other nodes waiting for a sum.
-            trial = Exchange(links, inside, host.local.rank, host.local.world_size)
+            trial = StagedAllReduce(links, inside, host.local.rank, host.local.world_size)
         links.start(trial)
     except BaseException as error:
         if links is not None:
@@ -108,7 +108,7 @@ def _built(strategy: str, config: CommunicatorConfig, control: _Lane, host: _Lan
             host.close()
             control.close()
         raise
-    return MultiRankCommunicator(strategy, config.intra, control, host, exchange)
+    return MultiRankCommunicator(strategy, config.intra, control, host, all_reduce)
 
 
 class MultiRankCommunicator:
@@ -120,11 +120,11 @@ class MultiRankCommunicator:
         intra: str,
         control: _Lane,
         host: _Lane,
-        exchange: Exchange,
+        all_reduce: StagedAllReduce,
     ) -> None:
         self.rank, self.world_size = host.rank, host.world_size
         self.strategy, self.intra = strategy, intra
-        self._control, self._host, self._exchange = control, host, exchange
+        self._control, self._host, self._all_reduce = control, host, all_reduce
 
     def all_gather(self, values: FloatBuffer) -> FloatBuffer:
         """See `Communicator`."""
@@ -132,11 +132,11 @@ class MultiRankCommunicator:
 
     def program(self, step: Step, *, donates_own: bool = True) -> TracedStep:
         """See `Communicator`."""
-        return self._exchange.program(step, donates_own=donates_own)
+        return self._all_reduce.program(step, donates_own=donates_own)
 
     def close(self) -> None:
         """See `Communicator`."""
-        self._exchange.close()
+        self._all_reduce.close()
         self._host.close()
         self._control.close()
 
@@ -166,7 +166,7 @@ def _lanes(config: CommunicatorConfig) -> Sequence[_Lane]:
     layout, rank = config.layout, config.rank
     here, ids = layout.gmis_of_node[layout.node_of(rank)], _ids(config)
     lanes = [
-        HostExchange(
+        SharedMemoryGroup(
             *(config.exchange_fd, here.index(rank), len(here), _room(config)),
             timeout_s=config.timeout_s,
             rendezvous_timeout_s=config.rendezvous_timeout_s,
@@ -179,8 +179,8 @@ def _lanes(config: CommunicatorConfig) -> Sequence[_Lane]:
 
 
 def _over_nodes(
-    config: CommunicatorConfig, lanes: Sequence[HostExchange], leader: int
-) -> Sequence[NodeExchange]:
+    config: CommunicatorConfig, lanes: Sequence[SharedMemoryGroup], leader: int
+) -> Sequence[MultiNodeGroup]:
     """The lanes with what goes on between nodes; leaders wait here for each other."""
     layout, rank = config.layout, config.rank
     nodes, listener = config.nodes, config.listener
@@ -188,7 +188,7 @@ def _over_nodes(
         raise ConfigError(f"layout {layout} on {layout.num_nodes} nodes: needs their addresses")
     with listener:
         if rank != leader:
-            return [NodeExchange(lane, layout, rank, None) for lane in lanes]
+            return [MultiNodeGroup(lane, layout, rank, None) for lane in lanes]
         sockets = connect(nodes, listener, len(lanes), config.rendezvous_timeout_s)
     leaders = [_ids(config)[ranks[0]] for ranks in layout.gmis_of_node]
     meshes = [
@@ -201,7 +201,7 @@ def _over_nodes(
         for connections, lane in zip(sockets, lanes, strict=True)
     ]
     return [
-        NodeExchange(lane, layout, rank, mesh) for lane, mesh in zip(lanes, meshes, strict=True)
+        MultiNodeGroup(lane, layout, rank, mesh) for lane, mesh in zip(lanes, meshes, strict=True)
     ]
 
 

@@ -30,8 +30,8 @@ T = TypeVar("T")
 _serial = itertools.count()
 
 
-class Exchange:
-    """One rank's exchanges in programs, by a strategy's stages."""
+class StagedAllReduce:
+    """One rank's all-reduces in programs, by a strategy's stages."""
 
     def __init__(
         self, links: HostLinks, stages: Sequence[Stage], rank: int, world_size: int
@@ -103,8 +103,8 @@ class TracedCollectives:
     `rank` [] int32 is an argument of the program, so that all ranks have the same one.
     """
 
-    def __init__(self, exchange: Exchange, rank: jax.Array) -> None:
-        self._exchange = exchange
+    def __init__(self, all_reduce: StagedAllReduce, rank: jax.Array) -> None:
+        self._all_reduce = all_reduce
         self._rank = rank
         self._places = itertools.count(1)
 
@@ -116,19 +116,19 @@ class TracedCollectives:
         """See `Collectives`."""
         packed, unpack = ravel_pytree(tree)  # One message, not one for each leaf.
         # A sum of which each rank gives one row is exact in any order.
-        is_own = jnp.arange(self._exchange.world_size)[:, None] == self._rank
+        is_own = jnp.arange(self._all_reduce.world_size)[:, None] == self._rank
         rows = self._sum(jnp.where(is_own, packed, 0.0).ravel(), after)
         return jax.vmap(unpack)(rows.reshape(-1, packed.size))
 
     def mean(self, tree: T, after: Any = None) -> T:
         """See `Collectives`."""
         packed, unpack = ravel_pytree(tree)
-        return unpack(self._sum(packed, after) * np.float32(1.0 / self._exchange.world_size))
+        return unpack(self._sum(packed, after) * np.float32(1.0 / self._all_reduce.world_size))
 
     def _sum(self, buffer: jax.Array, after: Any) -> jax.Array:
         # What has to come before is an argument that is not looked at; one leaf of it does.
         before = next(iter(jax.tree.leaves(after)), None)
-        return self._exchange.sum(buffer, next(self._places), before)
+        return self._all_reduce.sum(buffer, next(self._places), before)
 
 
 class LocalCollectives:
@@ -153,21 +153,21 @@ class ProgramStep:
     """A step as one program of each rank: `TracedStep`.
 
     A call returns when the device has been given all of it, and the call before is computed.
-    In a job with one rank there are no `exchange` and no `links`.
+    In a job with one rank there are no `all_reduce` and no `links`.
     """
 
     def __init__(
         self,
-        exchange: Exchange | None,
+        all_reduce: StagedAllReduce | None,
         links: HostLinks | None,
         step: Step,
         *,
         donates_own: bool = True,
     ) -> None:
-        self._exchange, self._links = exchange, links
+        self._all_reduce, self._links = all_reduce, links
         self._donated = (2, 3) if donates_own else (2,)
         self._step = step
-        self._rank = jnp.asarray(0 if exchange is None else exchange.rank, jnp.int32)
+        self._rank = jnp.asarray(0 if all_reduce is None else all_reduce.rank, jnp.int32)
         self._program: Any = None
         self._constants: Any = None
         self._last: Any = None
@@ -178,8 +178,8 @@ class ProgramStep:
         """See `TracedStep`."""
 
         def whole(rank: jax.Array, constants: Any, shared: Any, own: Any) -> tuple[Any, Any, Any]:
-            exchange = self._exchange
-            ranks = LocalCollectives() if exchange is None else TracedCollectives(exchange, rank)
+            several = self._all_reduce
+            ranks = LocalCollectives() if several is None else TracedCollectives(several, rank)
             return self._step(ranks, constants, shared, own)
 
         # Metrics lie where the host reads them at once: a copy from the device could only be made

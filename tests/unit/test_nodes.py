@@ -24,7 +24,7 @@ from gmijax.collectives.host.host_links import HostLinks
 from gmijax.collectives.host.shared_block import MAX_GATHER_FLOATS, create_exchange
 from gmijax.collectives.nodes.meeting import Nodes, connect, listen
 from gmijax.collectives.nodes.mesh import Mesh
-from gmijax.collectives.nodes.node_exchange import NodeExchange
+from gmijax.collectives.nodes.multi_node_group import MultiNodeGroup
 from gmijax.collectives.strategies import COSTS, Stage, nodes_s, predicted_s, stages
 from gmijax.errors import CollectiveError, CollectiveTimeout, ConfigError, PeerLost
 from gmijax.partition.layout import Layout
@@ -249,8 +249,8 @@ def test_only_leaders_copy_their_numbers_from_the_gpu_for_the_sum_of_nodes(
     for name in ("fetch", "synchronize", "store"):
         setattr(queue, name, lambda *_, name=name: did.append(name))
     monkeypatch.setitem(sys.modules, "gmijax.collectives.device.cuda_queue", queue)
-    host = NodeExchange.__new__(NodeExchange)
+    host = MultiNodeGroup.__new__(MultiNodeGroup)
     host.rank = rank
-    monkeypatch.setattr(NodeExchange, "all_reduce_nodes", lambda *_: did.append("sum"))
+    monkeypatch.setattr(MultiNodeGroup, "all_reduce_nodes", lambda *_: did.append("sum"))
     HostLinks(host, 8).reduce(node, 1, 0, 0, 0, 8)
     assert did == ["fetch" if rank in (0, 2) else "synchronize", "sum", "store"]

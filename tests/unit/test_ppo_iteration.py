@@ -16,10 +16,10 @@ from toy_env import point_mass
 from gmijax.cli.compose import compose
 from gmijax.collectives.communicator import SingleRankCommunicator
 from gmijax.collectives.device.device_links import DeviceLinks
-from gmijax.collectives.host.host_exchange import HostExchange
 from gmijax.collectives.host.host_links import HostLinks
 from gmijax.collectives.host.shared_block import LANES, create_exchange
-from gmijax.collectives.program import Exchange, LocalCollectives
+from gmijax.collectives.host.shared_memory_group import SharedMemoryGroup
+from gmijax.collectives.program import LocalCollectives, StagedAllReduce
 from gmijax.collectives.strategies import stages
 from gmijax.learning.learner import (
     acting_weights,
@@ -169,11 +169,11 @@ def alone(learner):
 
 
 @contextmanager
-def _exchange(strategy: str, num_floats: int) -> Iterator[Exchange]:
+def _all_reduce(strategy: str, num_floats: int) -> Iterator[StagedAllReduce]:
     """Exchanges of a job with one rank, which is this process, as one of several would have."""
     fd, layout = create_exchange(), Layout.even(1, 1)
     control, host = (
-        HostExchange(fd, 0, 1, num_floats, timeout_s=5.0, rendezvous_timeout_s=5.0, lane=lane)
+        SharedMemoryGroup(fd, 0, 1, num_floats, timeout_s=5.0, rendezvous_timeout_s=5.0, lane=lane)
         for lane in range(LANES)
     )
     os.close(fd)
@@ -181,10 +181,10 @@ def _exchange(strategy: str, num_floats: int) -> Iterator[Exchange]:
     links = HostLinks(host, num_floats)
     if strategy == "one_shot":
         links = DeviceLinks(control, host, layout, num_floats, parts, FAKES["fake"])
-    exchange = Exchange(links, parts, 0, 1)
-    links.start(exchange)
-    yield exchange
-    exchange.close()
+    all_reduce = StagedAllReduce(links, parts, 0, 1)
+    links.start(all_reduce)
+    yield all_reduce
+    all_reduce.close()
     host.close()
     control.close()
 
@@ -199,8 +199,8 @@ def test_exchanges_in_the_program_change_nothing_but_its_place(
         alone = _compiled(
             SingleRankCommunicator().program(functools.partial(iterate, ENV, learner)), learner
         )
-    with _exchange(strategy, size) as exchange:
-        step = exchange.program(functools.partial(iterate, ENV, learner))
+    with _all_reduce(strategy, size) as all_reduce:
+        step = all_reduce.program(functools.partial(iterate, ENV, learner))
         results = []
         told_s = 0.0
         for iteration in (alone, _compiled(step, learner)):

@@ -20,10 +20,10 @@ from gmijax.collectives.device.device_memory import NewMemory
 from gmijax.collectives.device.lockstep import LockstepRunner
 from gmijax.collectives.device.nccl_ring import NcclRing
 from gmijax.collectives.device.shared_slots import SharedSlots, agreed
-from gmijax.collectives.host.host_exchange import HostExchange
 from gmijax.collectives.host.host_links import HostLinks
-from gmijax.collectives.nodes.node_exchange import NodeExchange
-from gmijax.collectives.program import Exchange, TracedCollectives
+from gmijax.collectives.host.shared_memory_group import SharedMemoryGroup
+from gmijax.collectives.nodes.multi_node_group import MultiNodeGroup
+from gmijax.collectives.program import StagedAllReduce, TracedCollectives
 from gmijax.collectives.shared_memory import Fence
 from gmijax.collectives.strategies import Groups, Stage
 from gmijax.partition.layout import Layout
@@ -84,7 +84,7 @@ class Device(NamedTuple):
 
     new_memory: NewMemory
     new_queue: Callable[[npt.NDArray[np.uint32]], CudaQueue]
-    new_ring: Callable[[HostExchange | NodeExchange, Groups], NcclRing | None] | None
+    new_ring: Callable[[SharedMemoryGroup | MultiNodeGroup, Groups], NcclRing | None] | None
 
 
 class DeviceLinks(HostLinks):
@@ -108,8 +108,8 @@ class DeviceLinks(HostLinks):
 
     def __init__(
         self,
-        control: HostExchange | NodeExchange,
-        host: HostExchange | NodeExchange,
+        control: SharedMemoryGroup | MultiNodeGroup,
+        host: SharedMemoryGroup | MultiNodeGroup,
         layout: Layout,
         num_floats: int,
         stages: Sequence[Stage],
@@ -148,7 +148,7 @@ class DeviceLinks(HostLinks):
             owners = first[near:] + first[:near]
         return SharedSlots(self._control, self.room, group, owners, new_memory, _WISH)
 
-    def start(self, trial: Exchange) -> None:
+    def start(self, trial: StagedAllReduce) -> None:
         """See `HostLinks`."""
         agreed(self._control, _WISH, self._open)
         failure = self._runner.settle(lambda: self._try(trial))
@@ -219,12 +219,12 @@ class DeviceLinks(HostLinks):
         self._order = Order(here.flags, here.rank, here.world_size)
         return b""
 
-    def _try(self, exchange: Exchange) -> Exception | None:
+    def _try(self, all_reduce: StagedAllReduce) -> Exception | None:
         """First exchanges of known numbers in this node; what went wrong with them."""
         rank, world_size = self._here.rank, self._here.world_size
 
         def trial(values: jax.Array) -> tuple[jax.Array, jax.Array]:
-            collectives = TracedCollectives(exchange, jnp.asarray(rank))
+            collectives = TracedCollectives(all_reduce, jnp.asarray(rank))
             gathered = collectives.all_gather(values[:1])[:, 0]
             return gathered, collectives.mean(values, after=gathered)
 

@@ -6,8 +6,8 @@ import importlib
 from typing import Any
 
 from gmijax.collectives.device.shared_slots import agreed
-from gmijax.collectives.host.host_exchange import HostExchange
-from gmijax.collectives.nodes.node_exchange import NodeExchange
+from gmijax.collectives.host.shared_memory_group import SharedMemoryGroup
+from gmijax.collectives.nodes.multi_node_group import MultiNodeGroup
 from gmijax.collectives.strategies import Groups
 
 _WISH = "rings between GPUs"
@@ -44,7 +44,7 @@ class NcclRing:
         self._comm = None
 
 
-def nccl_ring(host: HostExchange | NodeExchange, groups: Groups) -> NcclRing | None:
+def nccl_ring(host: SharedMemoryGroup | MultiNodeGroup, groups: Groups) -> NcclRing | None:
     """Meets the other members of this rank's group; all ranks of the job call it.
 
     On several nodes rings are in each of them, and `groups` are of ranks in the node.

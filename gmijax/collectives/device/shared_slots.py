@@ -11,8 +11,8 @@ import numpy as np
 import numpy.typing as npt
 
 from gmijax.collectives.device.device_memory import TICKET_BYTES, NewMemory
-from gmijax.collectives.host.host_exchange import HostExchange
-from gmijax.collectives.nodes.node_exchange import NodeExchange
+from gmijax.collectives.host.shared_memory_group import SharedMemoryGroup
+from gmijax.collectives.nodes.multi_node_group import MultiNodeGroup
 from gmijax.collectives.shared_memory import fence
 from gmijax.collectives.waits import wait_until
 from gmijax.errors import DeviceMemoryUnavailable, PeerLost
@@ -55,7 +55,7 @@ class SharedSlots:
 
     def __init__(
         self,
-        host: HostExchange | NodeExchange,
+        host: SharedMemoryGroup | MultiNodeGroup,
         num_floats: int,
         members: Sequence[int],
         owners: Sequence[int],
@@ -68,7 +68,7 @@ class SharedSlots:
         self._owners, self._is_owner = tuple(owners), here.rank == owners[0]
         self._memories: list[CudaMemory] = []
         self._num_writes = 0
-        self._host: HostExchange | None = here
+        self._host: SharedMemoryGroup | None = here
         here.flags[here.rank, 1] = 0
         try:
             tickets = agreed(host, wish, lambda: self._make(new_memory))
@@ -141,7 +141,7 @@ class SharedSlots:
         row = self._num_writes % 2 * len(self._members) + place
         return self._memories[0].address + row * self._row_bytes
 
-    def _wait_for_members(self, host: HostExchange) -> None:
+    def _wait_for_members(self, host: SharedMemoryGroup) -> None:
         def late() -> list[int]:
             return [member for member in self._members if not host.flags[member, 1]]
 
@@ -166,7 +166,7 @@ class SharedSlots:
 
 
 def agreed(
-    host: HostExchange | NodeExchange, wish: str, step: Callable[[], bytes]
+    host: SharedMemoryGroup | MultiNodeGroup, wish: str, step: Callable[[], bytes]
 ) -> npt.NDArray[np.uint8]:
     """Does a step of the start; returns what it returned on the ranks of this node.
 

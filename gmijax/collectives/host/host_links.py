@@ -10,14 +10,14 @@ from typing import TYPE_CHECKING, TypeVar
 import jax
 import numpy as np
 
-from gmijax.collectives.host.host_exchange import HostExchange
+from gmijax.collectives.host.shared_memory_group import SharedMemoryGroup
 from gmijax.collectives.interface import FloatBuffer
-from gmijax.collectives.nodes.node_exchange import NodeExchange
+from gmijax.collectives.nodes.multi_node_group import MultiNodeGroup
 from gmijax.collectives.strategies import Stage
 from gmijax.errors import GmijaxError
 
 if TYPE_CHECKING:
-    from gmijax.collectives.program import Exchange
+    from gmijax.collectives.program import StagedAllReduce
 
 T = TypeVar("T")
 
@@ -33,14 +33,14 @@ class HostLinks:
       num_floats: P, length of the largest buffer; the attribute `room`.
     """
 
-    def __init__(self, host: HostExchange | NodeExchange, num_floats: int) -> None:
+    def __init__(self, host: SharedMemoryGroup | MultiNodeGroup, num_floats: int) -> None:
         self.room = num_floats
         self._host = host
         self._failure: GmijaxError | None = None
         self._exchange_s = 0.0
         self._pinned: dict[str, FloatBuffer] = {}  # On a GPU: what exchanges go through.
 
-    def start(self, trial: Exchange) -> None:
+    def start(self, trial: StagedAllReduce) -> None:
         """Tries the links by exchanges in the node, together with all other ranks.
 
         Raises:
@@ -119,7 +119,7 @@ class HostLinks:
 
     def _reduce(self, stage: Stage, place: int, values: FloatBuffer, result: FloatBuffer) -> None:
         if stage.link == "nodes":
-            assert isinstance(self._host, NodeExchange)
+            assert isinstance(self._host, MultiNodeGroup)
             self._host.all_reduce_nodes(values, result, stage.groups, place)
         elif stage.kind == "all_gather":
             rows = result.reshape(-1, values.size)

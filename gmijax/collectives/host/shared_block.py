@@ -95,7 +95,7 @@ def attach(
 
     The block gets its size here, from whoever comes first; the caller keeps `fd` and may close
     it at once. Ranks that attach with other numbers are found out in their first call. For the
-    arguments see `HostExchange`.
+    arguments see `SharedMemoryGroup`.
 
     Raises:
       CollectiveError: no memory, not such a descriptor, or the rank is taken.

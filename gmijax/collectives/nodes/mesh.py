@@ -11,7 +11,7 @@ from typing import Final
 import numpy as np
 
 from gmijax.clock import running_s
-from gmijax.collectives.host.host_exchange import chunk
+from gmijax.collectives.host.shared_memory_group import chunk
 from gmijax.collectives.interface import FloatBuffer
 from gmijax.collectives.nodes.meeting import Sockets
 from gmijax.collectives.waits import LIVENESS_PERIOD_S

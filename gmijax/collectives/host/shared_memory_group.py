@@ -23,7 +23,7 @@ PIECE_FLOATS = 32768
 """Floats summed at a time: 128 KiB of sums stay in the second-level cache over all ranks."""
 
 
-class HostExchange:
+class SharedMemoryGroup:
     """One rank's use of the shared block, from `attach` to `close`.
 
     All calls are collective: every rank of the job makes the same ones in the same order, also
@@ -137,12 +137,12 @@ class HostExchange:
         return self._open_block("flags").flags
 
     @property
-    def local(self) -> HostExchange:
-        """This one: all ranks are of its host. See `NodeExchange`."""
+    def local(self) -> SharedMemoryGroup:
+        """This one: all ranks are of its host. See `MultiNodeGroup`."""
         return self
 
     def of_node(self, groups: Groups) -> Groups:
-        """The groups: all ranks are of this host. See `NodeExchange`."""
+        """The groups: all ranks are of this host. See `MultiNodeGroup`."""
         return groups
 
     def is_gone(self, peer: int) -> bool:

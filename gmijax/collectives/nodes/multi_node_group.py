@@ -4,16 +4,16 @@ from __future__ import annotations
 
 import numpy as np
 
-from gmijax.collectives.host.host_exchange import HostExchange
 from gmijax.collectives.host.shared_block import MAX_GATHER_FLOATS
+from gmijax.collectives.host.shared_memory_group import SharedMemoryGroup
 from gmijax.collectives.interface import FloatBuffer
 from gmijax.collectives.nodes.mesh import Mesh
 from gmijax.collectives.strategies import Groups
 from gmijax.partition.layout import Layout
 
 
-class NodeExchange:
-    """`HostExchange` of a job on several nodes, with a sum between nodes.
+class MultiNodeGroup:
+    """`SharedMemoryGroup` of a job on several nodes, with a sum between nodes.
 
     Groups are of ranks of the whole job; those of a collective lie in one node.
 
@@ -27,7 +27,9 @@ class NodeExchange:
       mesh: with the leaders of other nodes, None for ranks that do not lead.
     """
 
-    def __init__(self, local: HostExchange, layout: Layout, rank: int, mesh: Mesh | None) -> None:
+    def __init__(
+        self, local: SharedMemoryGroup, layout: Layout, rank: int, mesh: Mesh | None
+    ) -> None:
         self.rank, self.world_size = rank, layout.num_gmis
         self.local, self._mesh = local, mesh
         self._here = layout.gmis_of_node[layout.node_of(rank)]
@@ -35,19 +37,19 @@ class NodeExchange:
     def all_reduce(
         self, source: FloatBuffer, target: FloatBuffer, groups: Groups, place: int = 0
     ) -> None:
-        """See `HostExchange`."""
+        """See `SharedMemoryGroup`."""
         self.local.all_reduce(source, target, self.of_node(groups), place)
 
     def broadcast(
         self, source: FloatBuffer, target: FloatBuffer, groups: Groups, place: int = 0
     ) -> None:
-        """See `HostExchange`."""
+        """See `SharedMemoryGroup`."""
         self.local.broadcast(source, target, self.of_node(groups), place)
 
     def all_gather_into(
         self, source: FloatBuffer, target: FloatBuffer, groups: Groups, place: int = 0
     ) -> None:
-        """See `HostExchange`."""
+        """See `SharedMemoryGroup`."""
         self.local.all_gather_into(source, target, self.of_node(groups), place)
 
     def all_reduce_nodes(
@@ -72,7 +74,7 @@ class NodeExchange:
         return everywhere.reshape(self.world_size, -1)
 
     def introduce(self, values: FloatBuffer) -> FloatBuffer:
-        """See `HostExchange`."""
+        """See `SharedMemoryGroup`."""
         gathered = self.all_gather(values)
         self.local.barrier.restart()
         if self._mesh is not None:
