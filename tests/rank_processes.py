@@ -26,7 +26,7 @@ import pytest
 from gmijax.collectives.communicator import CommunicatorConfig, make_communicator
 from gmijax.collectives.host.shared_block import create_exchange
 from gmijax.collectives.interface import Communicator
-from gmijax.collectives.nodes.meeting import (
+from gmijax.collectives.nodes.rendezvous import (
     ENV_LISTENER_FD,
     ENV_NODES_FD,
     Nodes,

@@ -13,7 +13,7 @@ from typing import Any, Self
 from gmijax.cluster.checks import by_name, require_alike, require_shared
 from gmijax.cluster.node import Opened, TrainingNode
 from gmijax.cluster.ray_nodes import Joined, RayCluster
-from gmijax.collectives.nodes.meeting import Nodes
+from gmijax.collectives.nodes.rendezvous import Nodes
 from gmijax.config import TrainConfig
 from gmijax.errors import BackendUnavailable, ConfigError, GmiFailed
 from gmijax.machine.snapshot import Machine

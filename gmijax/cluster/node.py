@@ -18,7 +18,7 @@ from contextlib import ExitStack, suppress
 from pathlib import Path
 from typing import Any, Final, Literal, NamedTuple
 
-from gmijax.collectives.nodes.meeting import (
+from gmijax.collectives.nodes.rendezvous import (
     ENV_LISTENER_FD,
     ENV_NODES_FD,
     Nodes,

@@ -1,4 +1,4 @@
-"""Makes the communicator of one rank: links by what its strategy's stages need."""
+"""Makes the communicator of one rank, with the transport that its strategy's stages need."""
 
 from __future__ import annotations
 
@@ -10,14 +10,14 @@ from typing import TypeAlias
 
 import jax
 
-from gmijax.collectives.device.device_links import Device, DeviceLinks
-from gmijax.collectives.host.host_links import HostLinks
+from gmijax.collectives.device.device_transport import Device, DeviceTransport
+from gmijax.collectives.host.host_transport import HostTransport
 from gmijax.collectives.host.shared_block import LANES
 from gmijax.collectives.host.shared_memory_group import SharedMemoryGroup
 from gmijax.collectives.interface import Communicator, FloatBuffer, Step, TracedStep
-from gmijax.collectives.nodes.meeting import Nodes, connect
 from gmijax.collectives.nodes.mesh import Mesh
 from gmijax.collectives.nodes.multi_node_group import MultiNodeGroup
+from gmijax.collectives.nodes.rendezvous import Nodes, connect
 from gmijax.collectives.program import ProgramStep, StagedAllReduce
 from gmijax.collectives.strategies import stages
 from gmijax.errors import ConfigError, DeviceMemoryUnavailable
@@ -89,21 +89,21 @@ def make_communicator(strategy: str, config: CommunicatorConfig) -> Communicator
 def _built(strategy: str, config: CommunicatorConfig, control: _Lane, host: _Lane) -> Communicator:
     layout, num_floats = config.layout, _room(config)
     parts = stages(strategy, layout, config.intra)
-    device, links = DEVICE(), None
+    device, transport = DEVICE(), None
     try:
-        if device is None or all(stage.link in ("host", "nodes") for stage in parts):
-            links = HostLinks(host, num_floats)
+        if device is None or all(stage.transport in ("host", "nodes") for stage in parts):
+            transport = HostTransport(host, num_floats)
         else:
-            links = DeviceLinks(control, host, layout, num_floats, parts, device)
-        all_reduce = trial = StagedAllReduce(links, parts, host.rank, host.world_size)
-        inside = [stage for stage in parts if stage.link != "nodes"]
+            transport = DeviceTransport(control, host, layout, num_floats, parts, device)
+        all_reduce = trial = StagedAllReduce(transport, parts, host.rank, host.world_size)
+        inside = [stage for stage in parts if stage.transport != "nodes"]
         if len(inside) < len(parts):
             # Who finds that it does not work must not leave other nodes waiting for a sum.
-            trial = StagedAllReduce(links, inside, host.local.rank, host.local.world_size)
-        links.start(trial)
+            trial = StagedAllReduce(transport, inside, host.local.rank, host.local.world_size)
+        transport.start(trial)
     except BaseException as error:
-        if links is not None:
-            links.close()
+        if transport is not None:
+            transport.close()
         if not isinstance(error, DeviceMemoryUnavailable):
             host.close()
             control.close()
@@ -215,7 +215,7 @@ def _room(config: CommunicatorConfig) -> int:
 
 
 def _device() -> Device | None:
-    """What links of this process's GPU are made of; None on a CPU."""
+    """What the transport of this process's GPU is made of; None on a CPU."""
     if jax.local_devices()[0].platform != "gpu":
         return None
     if reason := why_no_bindings():

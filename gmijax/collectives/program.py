@@ -18,7 +18,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
 
-from gmijax.collectives.host.host_links import HostLinks
+from gmijax.collectives.host.host_transport import HostTransport
 from gmijax.collectives.interface import Step
 from gmijax.collectives.strategies import Stage
 from gmijax.collectives.xla_call import Buffer, register
@@ -34,10 +34,10 @@ class StagedAllReduce:
     """One rank's all-reduces in programs, by a strategy's stages."""
 
     def __init__(
-        self, links: HostLinks, stages: Sequence[Stage], rank: int, world_size: int
+        self, transport: HostTransport, stages: Sequence[Stage], rank: int, world_size: int
     ) -> None:
         self.rank, self.world_size = rank, world_size
-        self._links: HostLinks | None = links
+        self._transport: HostTransport | None = transport
         self._stages = stages
         # The same on all ranks, which make as many: it is part of their programs.
         self._name = f"gmijax_exchange_{next(_serial)}"
@@ -59,14 +59,14 @@ class StagedAllReduce:
 
     def program(self, step: Step, *, donates_own: bool = True) -> ProgramStep:
         """See `Communicator`."""
-        assert self._links is not None
-        return ProgramStep(self, self._links, step, donates_own=donates_own)
+        assert self._transport is not None
+        return ProgramStep(self, self._transport, step, donates_own=donates_own)
 
     def close(self) -> None:
-        """Releases the links. Idempotent."""
-        if self._links is not None:
-            self._links.close()
-        self._links = None  # XLA keeps the call forever, and with it this object.
+        """Releases the transport. Idempotent."""
+        if self._transport is not None:
+            self._transport.close()
+        self._transport = None  # XLA keeps the call forever, and with it this object.
 
     def _traced(
         self,
@@ -76,11 +76,11 @@ class StagedAllReduce:
         place: int,
         after: jax.Array | None,
     ) -> jax.Array:
-        if self._links is None:
+        if self._transport is None:
             raise CollectiveError(f"rank {self.rank}: exchange after close")
         if values.dtype != jnp.float32:
             raise CollectiveError(f"rank {self.rank}: exchanges float32, not {values.dtype}")
-        if values.size > (room := self._links.room):
+        if values.size > (room := self._transport.room):
             raise CollectiveError(f"rank {self.rank}: {values.size} floats, room is for {room}")
         result = jax.ShapeDtypeStruct(shape, jnp.float32)
         call: Any = jax.ffi.ffi_call(self._name, result, has_side_effect=True)
@@ -90,11 +90,11 @@ class StagedAllReduce:
     def _call(
         self, stream: int, arguments: list[Buffer], results: list[Buffer], attributes: list[int]
     ) -> None:
-        if self._links is None:
+        if self._transport is None:
             raise RuntimeError("the exchange is closed")
         (values, *_), (result,), (number, place) = arguments, results, attributes
         where = (stream, place, values.address, result.address, values.shape[0])
-        self._links.reduce(self._stages[number], *where)
+        self._transport.reduce(self._stages[number], *where)
 
 
 class TracedCollectives:
@@ -153,18 +153,18 @@ class ProgramStep:
     """A step as one program of each rank: `TracedStep`.
 
     A call returns when the device has been given all of it, and the call before is computed.
-    In a job with one rank there are no `all_reduce` and no `links`.
+    In a job with one rank there are no `all_reduce` and no `transport`.
     """
 
     def __init__(
         self,
         all_reduce: StagedAllReduce | None,
-        links: HostLinks | None,
+        transport: HostTransport | None,
         step: Step,
         *,
         donates_own: bool = True,
     ) -> None:
-        self._all_reduce, self._links = all_reduce, links
+        self._all_reduce, self._transport = all_reduce, transport
         self._donated = (2, 3) if donates_own else (2,)
         self._step = step
         self._rank = jnp.asarray(0 if all_reduce is None else all_reduce.rank, jnp.int32)
@@ -207,10 +207,11 @@ class ProgramStep:
         self._last = self._program(self._rank, self._constants, shared, own)
         if self._metrics is not None:
             jax.block_until_ready(self._metrics)
-            if self._links is not None:
-                self.exchange_s = self._links.exchange_s()
+            if self._transport is not None:
+                self.exchange_s = self._transport.exchange_s()
         self._metrics = self._last[2]
         return self._last
 
     def _run(self, program: Callable[[], T], *, is_last: bool) -> T:
-        return program() if self._links is None else self._links.run(program, is_last=is_last)
+        transport = self._transport
+        return program() if transport is None else transport.run(program, is_last=is_last)

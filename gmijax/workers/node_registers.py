@@ -10,7 +10,7 @@ from contextlib import ExitStack
 
 from gmijax.a3c.job_registers import JobRegisters, register_bytes
 from gmijax.collectives.channel.tcp_registers import RemoteRegisters
-from gmijax.collectives.nodes.meeting import Nodes
+from gmijax.collectives.nodes.rendezvous import Nodes
 
 
 def over_nodes(

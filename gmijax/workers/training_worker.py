@@ -16,7 +16,7 @@ from dataclasses import replace
 from socket import socket
 from typing import TYPE_CHECKING, Any
 
-from gmijax.collectives.nodes.meeting import Nodes, inherited_nodes
+from gmijax.collectives.nodes.rendezvous import Nodes, inherited_nodes
 from gmijax.config import A3cConfig, TrainConfig
 from gmijax.config.schema import from_dict
 from gmijax.partition.plan import Plan

@@ -18,7 +18,7 @@ from supervision import TESTS, gpu, machine, make_launch, planned
 from training_jobs import wait_until
 
 from gmijax.cluster.node import TrainingNode
-from gmijax.collectives.nodes.meeting import Nodes
+from gmijax.collectives.nodes.rendezvous import Nodes
 from gmijax.errors import BackendUnavailable, GmiFailed, JobInterrupted
 from gmijax.machine.mps_control import PIPE_VARIABLE, MpsControl
 from gmijax.machine.nvidia import MigInstance

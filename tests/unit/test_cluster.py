@@ -30,7 +30,7 @@ from gmijax.cluster.node import (
 from gmijax.cluster.ray_nodes import Joined, RayCluster
 from gmijax.cluster.remote_gmi import RemoteNode
 from gmijax.cluster.survey import Surveyed, differences, lines_of_nodes, nodes_as_data
-from gmijax.collectives.nodes.meeting import Nodes
+from gmijax.collectives.nodes.rendezvous import Nodes
 from gmijax.config import ClusterConfig, PlanConfig, ReduceConfig
 from gmijax.errors import (
     BackendUnavailable,

@@ -18,7 +18,7 @@ import pytest
 
 from gmijax.collectives.nodes import handshake
 from gmijax.collectives.nodes.handshake import Key, Unreachable, accepted, call
-from gmijax.collectives.nodes.meeting import Nodes, connect, listen
+from gmijax.collectives.nodes.rendezvous import Nodes, connect, listen
 from gmijax.errors import CollectiveError
 
 HERE = "127.0.0.1"

@@ -20,11 +20,11 @@ from gmijax.collectives.communicator import (
     MultiRankCommunicator,
     make_communicator,
 )
-from gmijax.collectives.host.host_links import HostLinks
+from gmijax.collectives.host.host_transport import HostTransport
 from gmijax.collectives.host.shared_block import MAX_GATHER_FLOATS, create_exchange
-from gmijax.collectives.nodes.meeting import Nodes, connect, listen
 from gmijax.collectives.nodes.mesh import Mesh
 from gmijax.collectives.nodes.multi_node_group import MultiNodeGroup
+from gmijax.collectives.nodes.rendezvous import Nodes, connect, listen
 from gmijax.collectives.strategies import COSTS, Stage, nodes_s, predicted_s, stages
 from gmijax.errors import CollectiveError, CollectiveTimeout, ConfigError, PeerLost
 from gmijax.partition.layout import Layout
@@ -252,5 +252,5 @@ def test_only_leaders_copy_their_numbers_from_the_gpu_for_the_sum_of_nodes(
     host = MultiNodeGroup.__new__(MultiNodeGroup)
     host.rank = rank
     monkeypatch.setattr(MultiNodeGroup, "all_reduce_nodes", lambda *_: did.append("sum"))
-    HostLinks(host, 8).reduce(node, 1, 0, 0, 0, 8)
+    HostTransport(host, 8).reduce(node, 1, 0, 0, 0, 8)
     assert did == ["fetch" if rank in (0, 2) else "synchronize", "sum", "store"]

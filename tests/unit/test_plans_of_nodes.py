@@ -11,7 +11,7 @@ import pytest
 from supervision import gpus_of_nodes, machine, plan_on
 
 from gmijax import compose
-from gmijax.collectives.nodes.meeting import Nodes
+from gmijax.collectives.nodes.rendezvous import Nodes
 from gmijax.collectives.strategies import stages
 from gmijax.config import PlanConfig, ReduceConfig, TrainConfig
 from gmijax.control.restarts import with_nodes_left
@@ -64,7 +64,7 @@ def test_nodes_with_gpus_do_inside_what_one_machine_does(
     monkeypatch.setattr("gmijax.partition.reduction._is_installed", lambda *_: True)
     plan = plan_on(gpus_of_nodes(gpus, gpus), gpus=gpus, gmis_per_gpu=gmis)
     assert plan.strategy == strategy
-    assert [stage.link for stage in stages(strategy, plan.layout)][-1] == "nodes"
+    assert [stage.transport for stage in stages(strategy, plan.layout)][-1] == "nodes"
 
 
 def test_a_gpu_of_two_nodes_of_one_machine_has_half_of_its_memory_for_each() -> None:

@@ -15,8 +15,8 @@ from toy_env import point_mass
 
 from gmijax.cli.compose import compose
 from gmijax.collectives.communicator import SingleRankCommunicator
-from gmijax.collectives.device.device_links import DeviceLinks
-from gmijax.collectives.host.host_links import HostLinks
+from gmijax.collectives.device.device_transport import DeviceTransport
+from gmijax.collectives.host.host_transport import HostTransport
 from gmijax.collectives.host.shared_block import LANES, create_exchange
 from gmijax.collectives.host.shared_memory_group import SharedMemoryGroup
 from gmijax.collectives.program import LocalCollectives, StagedAllReduce
@@ -178,11 +178,11 @@ def _all_reduce(strategy: str, num_floats: int) -> Iterator[StagedAllReduce]:
     )
     os.close(fd)
     parts = stages(strategy, layout)
-    links = HostLinks(host, num_floats)
+    transport = HostTransport(host, num_floats)
     if strategy == "one_shot":
-        links = DeviceLinks(control, host, layout, num_floats, parts, FAKES["fake"])
-    all_reduce = StagedAllReduce(links, parts, 0, 1)
-    links.start(all_reduce)
+        transport = DeviceTransport(control, host, layout, num_floats, parts, FAKES["fake"])
+    all_reduce = StagedAllReduce(transport, parts, 0, 1)
+    transport.start(all_reduce)
     yield all_reduce
     all_reduce.close()
     host.close()

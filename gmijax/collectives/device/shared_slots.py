@@ -34,8 +34,8 @@ FLOATS_PER_ROW_UNIT = 64
 class SharedSlots:
     """One rank's use of blocks of device memory with two slots for each member.
 
-    The two slots are used in turn, so that one meeting of the members suffices for an exchange:
-    a rank that writes a slot again has seen the flags of the exchange in between, which come
+    The two slots are used in turn, so that members wait for each other once an exchange: a
+    rank that writes a slot again has seen the flags of the exchange in between, which come
     after all that had been read of the one before.
 
     All ranks of the job make theirs together; on several nodes ranks are those in the node.

@@ -13,7 +13,7 @@ import numpy as np
 from gmijax.clock import running_s
 from gmijax.collectives.host.shared_memory_group import chunk
 from gmijax.collectives.interface import FloatBuffer
-from gmijax.collectives.nodes.meeting import Sockets
+from gmijax.collectives.nodes.rendezvous import Sockets
 from gmijax.collectives.waits import LIVENESS_PERIOD_S
 from gmijax.errors import CollectiveError, CollectiveTimeout, PeerLost
 

@@ -22,8 +22,8 @@ if TYPE_CHECKING:
 T = TypeVar("T")
 
 
-class HostLinks:
-    """How the exchanges of one rank move numbers: here all of them through the host.
+class HostTransport:
+    """Moves the numbers of one rank's collectives, here all of them through the host.
 
     So it is with all strategies on a CPU, and on a GPU with those that do not leave the host. A
     program waits in its exchanges for the other ranks, so calls return when it is computed.
@@ -41,7 +41,7 @@ class HostLinks:
         self._pinned: dict[str, FloatBuffer] = {}  # On a GPU: what exchanges go through.
 
     def start(self, trial: StagedAllReduce) -> None:
-        """Tries the links by exchanges in the node, together with all other ranks.
+        """Tries the transport by exchanges in the node, together with all other ranks.
 
         Raises:
           DeviceMemoryUnavailable: they do not work; on all ranks alike.
@@ -106,7 +106,7 @@ class HostLinks:
         return seconds
 
     def close(self) -> None:
-        """Releases what the links hold beside the shared block, which is the communicator's."""
+        """Releases what it holds beside the shared block, which is the communicator's."""
         self._pinned = {}
 
     def _buffer(self, use: str, num_floats: int) -> FloatBuffer:
@@ -118,7 +118,7 @@ class HostLinks:
         return self._pinned[use][:num_floats]
 
     def _reduce(self, stage: Stage, place: int, values: FloatBuffer, result: FloatBuffer) -> None:
-        if stage.link == "nodes":
+        if stage.transport == "nodes":
             assert isinstance(self._host, MultiNodeGroup)
             self._host.all_reduce_nodes(values, result, stage.groups, place)
         elif stage.kind == "all_gather":
