@@ -29,7 +29,7 @@ from gmijax.collectives.interface import Communicator
 from gmijax.collectives.nodes.rendezvous import (
     ENV_LISTENER_FD,
     ENV_NODES_FD,
-    Nodes,
+    NodeAddresses,
     inherited_nodes,
     listen,
 )
@@ -149,7 +149,7 @@ class Ranks:
         for node, listener in enumerate(listeners):
             own = {ENV_EXCHANGE_FD: create_exchange()}
             if num_nodes > 1:
-                own[ENV_NODES_FD] = Nodes(node, addresses, b"secret").to_file()
+                own[ENV_NODES_FD] = NodeAddresses(node, addresses, b"secret").to_file()
             for fd in own.values():
                 self._held.callback(os.close, fd)
             found.append(own | ({ENV_LISTENER_FD: listener.fileno()} if num_nodes > 1 else {}))

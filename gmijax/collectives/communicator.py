@@ -17,7 +17,7 @@ from gmijax.collectives.host.shared_memory_group import SharedMemoryGroup
 from gmijax.collectives.interface import Communicator, FloatBuffer, Step, TracedStep
 from gmijax.collectives.nodes.mesh import Mesh
 from gmijax.collectives.nodes.multi_node_group import MultiNodeGroup
-from gmijax.collectives.nodes.rendezvous import Nodes, connect
+from gmijax.collectives.nodes.rendezvous import NodeAddresses, connect
 from gmijax.collectives.program import ProgramStep, StagedAllReduce
 from gmijax.collectives.strategies import stages
 from gmijax.errors import ConfigError, DeviceMemoryUnavailable
@@ -57,7 +57,7 @@ class CommunicatorConfig:
     rendezvous_timeout_s: float
     intra: str = "host"
     host_if_unavailable: bool = False
-    nodes: Nodes | None = None
+    nodes: NodeAddresses | None = None
     listener: socket.socket | None = None
     gmis: Sequence[int] | None = None
 

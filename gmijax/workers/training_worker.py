@@ -16,7 +16,7 @@ from dataclasses import replace
 from socket import socket
 from typing import TYPE_CHECKING, Any
 
-from gmijax.collectives.nodes.rendezvous import Nodes, inherited_nodes
+from gmijax.collectives.nodes.rendezvous import NodeAddresses, inherited_nodes
 from gmijax.config import A3cConfig, TrainConfig
 from gmijax.config.schema import from_dict
 from gmijax.partition.plan import Plan
@@ -173,7 +173,7 @@ def _trainers_communicator(
     link: ChildLink,
     env: BatchedEnv,
     losses: Any,
-    nodes: Nodes | None,
+    nodes: NodeAddresses | None,
     listener: socket | None,
 ) -> Communicator:
     """The communicator among the trainers, whose ranks are their places in the group.

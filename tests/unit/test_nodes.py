@@ -24,7 +24,7 @@ from gmijax.collectives.host.host_transport import HostTransport
 from gmijax.collectives.host.shared_block import MAX_GATHER_FLOATS, create_exchange
 from gmijax.collectives.nodes.mesh import Mesh
 from gmijax.collectives.nodes.multi_node_group import MultiNodeGroup
-from gmijax.collectives.nodes.rendezvous import Nodes, connect, listen
+from gmijax.collectives.nodes.rendezvous import NodeAddresses, connect, listen
 from gmijax.collectives.strategies import COSTS, Stage, nodes_s, predicted_s, stages
 from gmijax.errors import CollectiveError, CollectiveTimeout, ConfigError, PeerLost
 from gmijax.partition.layout import Layout
@@ -42,7 +42,7 @@ def meet(tokens: Sequence[bytes], timeout_s: float = 10.0) -> list[Any]:
 
         def come(node: int) -> Any:
             try:
-                nodes = Nodes(node, addresses, tokens[node])
+                nodes = NodeAddresses(node, addresses, tokens[node])
                 return connect(nodes, listeners[node], 1, timeout_s)[0]
             except CollectiveError as error:
                 return error
@@ -127,16 +127,16 @@ def test_who_does_not_know_the_secret_stays_out() -> None:
 def test_a_leader_that_cannot_be_reached_is_one_of_another_network() -> None:
     with listen(HERE) as own, socket.socket() as nobody:
         nobody.bind((HERE, 0))
-        nodes = Nodes(1, (nobody.getsockname(), own.getsockname()), TOKEN)
+        nodes = NodeAddresses(1, (nobody.getsockname(), own.getsockname()), TOKEN)
         with pytest.raises(CollectiveError, match=r"cannot reach node 0 .*cluster\.interface"):
             connect(nodes, own, 1, 10.0)
 
 
 def test_what_leaders_know_goes_through_a_file() -> None:
-    nodes = Nodes(1, ((HERE, 1234), ("10.0.0.2", 99)), os.urandom(32))
+    nodes = NodeAddresses(1, ((HERE, 1234), ("10.0.0.2", 99)), os.urandom(32))
     fd = nodes.to_file()
     try:
-        assert Nodes.from_file(fd) == nodes
+        assert NodeAddresses.from_file(fd) == nodes
     finally:
         os.close(fd)
 
@@ -159,7 +159,7 @@ def test_small_things_go_over_nodes_in_order_of_rank() -> None:
                 exchange_fd=blocks[node],
                 timeout_s=10,
                 rendezvous_timeout_s=10,
-                nodes=Nodes(node, addresses, TOKEN),
+                nodes=NodeAddresses(node, addresses, TOKEN),
                 listener=socket.socket(fileno=os.dup(listeners[node].fileno())),
             )
             comm = make_communicator("mpr", config)

@@ -11,7 +11,7 @@ import pytest
 from supervision import gpus_of_nodes, machine, plan_on
 
 from gmijax import compose
-from gmijax.collectives.nodes.rendezvous import Nodes
+from gmijax.collectives.nodes.rendezvous import NodeAddresses
 from gmijax.collectives.strategies import stages
 from gmijax.config import PlanConfig, ReduceConfig, TrainConfig
 from gmijax.control.restarts import with_nodes_left
@@ -188,9 +188,9 @@ def test_agents_and_trainers_go_on_with_the_nodes_that_are_left(
 
 
 def test_nodes_know_the_calls_and_count_leaders_among_those_that_train() -> None:
-    nodes = Nodes(2, (("a", 1), ("b", 2), ("c", 3)), b"secret", {(0, 3): "a:4"})
+    nodes = NodeAddresses(2, (("a", 1), ("b", 2), ("c", 3)), b"secret", {(0, 3): "a:4"})
     fd = nodes.to_file()
-    assert Nodes.from_file(fd) == nodes
+    assert NodeAddresses.from_file(fd) == nodes
     os.close(fd)
     assert nodes.among((1, 2))[:2] == (1, (("b", 2), ("c", 3)))
 
