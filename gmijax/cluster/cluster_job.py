@@ -97,7 +97,7 @@ class ClusterJob:
             calls |= one.calls
         token = secrets.token_bytes(32)
         for place, (node, _) in enumerate(self._joined):
-            node.call("introduce", NodeAddresses(place, addresses, token, calls))
+            node.call("set_addresses", NodeAddresses(place, addresses, token, calls))
         first = [gmis[0] for gmis in launch.plan.layout.gmis_of_node]
         for gmi, (node, _) in zip(first, self._joined, strict=True):
             if node.lost is not None:

@@ -191,7 +191,7 @@ class TrainingNode(Node):
         }
         return Opened((address, self._listener.getsockname()[1]), calls, found)
 
-    def introduce(self, nodes: NodeAddresses) -> None:
+    def set_addresses(self, nodes: NodeAddresses) -> None:
         """Takes the addresses of all leaders; GMIs can be started from here on."""
         assert self._launch is not None
         if self._listener is not None:

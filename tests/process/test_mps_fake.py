@@ -264,7 +264,7 @@ def test_two_nodes_of_one_machine_use_the_daemon_of_the_first(
         assert daemons.keys() == {gpu(0).uuid}
         assert len(mps.told("start")) == 1
         for gmi, node in enumerate(nodes):
-            node.introduce(NodeAddresses(gmi, tuple(leaders), b"token"))
+            node.set_addresses(NodeAddresses(gmi, tuple(leaders), b"token"))
             pid = node.start(gmi, False)
             assert isinstance(pid, int)
             deadline_s = time.monotonic() + 30

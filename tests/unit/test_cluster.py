@@ -383,7 +383,7 @@ def test_a_node_starts_polls_and_ends_gmis(
     opened = node.open(launch, 0, "127.0.0.1", {})
     assert not isinstance(opened, BackendUnavailable)
     assert (opened.calls, opened.daemons) == ({}, {})
-    node.introduce(NodeAddresses(0, (opened.leader,), b"token"))
+    node.set_addresses(NodeAddresses(0, (opened.leader,), b"token"))
     pid = node.start(0, False)
     assert isinstance(pid, int)
     node.order(0, "kill")

@@ -155,13 +155,15 @@ def test_the_call_after_an_introduction_is_the_first_and_may_take_longer() -> No
     ranks = host_ranks(4, 4, timeout_s=LATE_S / 4, start_s=20 * LATE_S)
 
     def gather_late() -> None:
-        ranks[1].introduce(np.ones(3, np.float32))
+        ranks[1].bootstrap_all_gather(np.ones(3, np.float32))
         time.sleep(LATE_S)
         ranks[1].all_gather(np.ones(1, np.float32))
 
     late = threading.Thread(target=gather_late)
     late.start()
-    np.testing.assert_array_equal(ranks[0].introduce(np.zeros(3, np.float32)).sum(1), [0, 3])
+    np.testing.assert_array_equal(
+        ranks[0].bootstrap_all_gather(np.zeros(3, np.float32)).sum(1), [0, 3]
+    )
     assert ranks[0].all_gather(np.zeros(1, np.float32)).shape == (2, 1)
     late.join()
     with pytest.raises(CollectiveTimeout, match="step 3"):

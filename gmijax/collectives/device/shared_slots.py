@@ -192,7 +192,7 @@ def agreed(
     sent = np.zeros(1 + NOTE_BYTES, np.float32)  # One number a byte: no float has odd bits.
     sent[0] = 1 + host.local.ids[host.local.rank] if has_failed else 0
     sent[1 : 1 + len(note)] = np.frombuffer(note, np.uint8)
-    everyone = host.introduce(sent)
+    everyone = host.bootstrap_all_gather(sent)
     notes = everyone[:, 1:].astype(np.uint8)
     if failed := np.flatnonzero(everyone[:, 0]).tolist():
         why = notes[failed[0]].tobytes().rstrip(b"\0").decode(errors="replace")

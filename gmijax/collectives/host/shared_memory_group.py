@@ -125,7 +125,7 @@ class SharedMemoryGroup:
         total *= np.float32(1.0 / self.world_size)
         return total
 
-    def introduce(self, values: FloatBuffer) -> FloatBuffer:
+    def bootstrap_all_gather(self, values: FloatBuffer) -> FloatBuffer:
         """`all_gather` as part of the start: others may still compile in the call after it."""
         gathered = self.all_gather(values)
         self.barrier.restart()

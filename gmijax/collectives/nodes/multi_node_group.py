@@ -73,7 +73,7 @@ class MultiNodeGroup:
             piece[:] = self.local.all_gather(piece)[0]  # The leader is the first of its node.
         return everywhere.reshape(self.world_size, -1)
 
-    def introduce(self, values: FloatBuffer) -> FloatBuffer:
+    def bootstrap_all_gather(self, values: FloatBuffer) -> FloatBuffer:
         """See `SharedMemoryGroup`."""
         gathered = self.all_gather(values)
         self.local.barrier.restart()
