@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from gmijax.collectives.program import PeersOfOne
+from gmijax.collectives.program import LocalCollectives
 from gmijax.config import PpoConfig, TrainConfig
 from gmijax.learning.learner import Learner, acting_weights, init_learner, make_learner
 from gmijax.learning.unroll import act
@@ -87,12 +87,12 @@ def _act(learner: Learner, state: Any, carry: Any) -> Any:
 def _train(learner: Learner, given: Any, state: Any) -> Any:
     """All updates of an iteration, with advantages that are there."""
     samples, stats = given
-    return learn(learner, PeersOfOne(), state, samples, stats)[0]
+    return learn(learner, LocalCollectives(), state, samples, stats)[0]
 
 
 def _iterate(env: BatchedEnv, learner: Learner, model: Any, carry: Any) -> Any:
     """A whole iteration of one GMI."""
-    return iterate(env, learner, PeersOfOne(), model, *carry)[:2]
+    return iterate(env, learner, LocalCollectives(), model, *carry)[:2]
 
 
 def _samples(count: int, spec: EnvSpec, key: jax.Array) -> Samples:

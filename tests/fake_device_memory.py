@@ -14,8 +14,8 @@ import time
 import jax
 import numpy as np
 
-from gmijax.collectives.device.device_links import Device
 from gmijax.collectives.device.device_memory import TICKET_BYTES
+from gmijax.collectives.device.device_transport import Device
 
 
 class FakeDeviceMemory:

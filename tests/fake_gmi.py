@@ -106,7 +106,7 @@ def raise_config_error(link: ChildLink) -> None:
 
 
 def lose_peer(link: ChildLink) -> None:
-    """Fails like a reducer does, at once when GMI 1 is gone."""
+    """Fails like a communicator does, at once when GMI 1 is gone."""
     peer = link.run.gmi(1).root / "helper.json"
     while not peer.exists() or identify(read_json(peer)["pid"]):
         link.beat("running", 1)
@@ -115,7 +115,7 @@ def lose_peer(link: ChildLink) -> None:
 
 
 def wait_in_vain(link: ChildLink) -> None:
-    """Fails like a reducer does when GMI 1 does not come."""
+    """Fails like a communicator does when GMI 1 does not come."""
     while not (link.run.gmi(1).root / "stalling").exists():
         link.beat("running", 1)
         time.sleep(TICK_S)

@@ -1,4 +1,4 @@
-"""What the ranks of a test do, each in a process of its own, with the reducer that they share."""
+"""What the ranks of a test do with their communicators, each in a process of its own."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from gmijax.collectives.interface import FloatBuffer, Peers, Reducer, TracedStep
+from gmijax.collectives.interface import Collectives, Communicator, FloatBuffer, TracedStep
 from gmijax.errors import CollectiveError
 from gmijax.types import Array
 
@@ -20,14 +20,16 @@ Options = dict[str, Any]
 
 
 @functools.cache
-def mean_of(reducer: Reducer, size: int) -> Callable[[FloatBuffer], FloatBuffer]:
+def mean_of(comm: Communicator, size: int) -> Callable[[FloatBuffer], FloatBuffer]:
     """A function that takes the mean of buffers [size] in a program, compiled once."""
     import jax
 
-    def step(peers: Peers, _: Any, shared: Array, own: Array) -> tuple[Array, Array, Any]:
-        return peers.mean(own), own, ()
+    def step(
+        collectives: Collectives, _: Any, shared: Array, own: Array
+    ) -> tuple[Array, Array, Any]:
+        return collectives.mean(own), own, ()
 
-    program = reducer.program(step)
+    program = comm.program(step)
     zeros = jax.numpy.zeros(size)
     program.trace((), zeros, zeros)
     program.compile()
@@ -40,83 +42,87 @@ def mean_of(reducer: Reducer, size: int) -> Callable[[FloatBuffer], FloatBuffer]
     return call
 
 
-def check_means(reducer: Reducer, options: Options) -> Options:
+def check_means(comm: Communicator, options: Options) -> Options:
     """Compares `mean` and `all_gather` with numpy on buffers that every rank can compute."""
     digest = hashlib.sha256()
-    take_mean = mean_of(reducer, options["num_floats"])
+    take_mean = mean_of(comm, options["num_floats"])
     for call in range(options["num_calls"]):
         buffers = [
             np.random.default_rng([call, rank])
             .normal(scale=10.0**call, size=options["num_floats"])
             .astype(np.float32)
-            for rank in range(reducer.world_size)
+            for rank in range(comm.world_size)
         ]
         buffers[0][0] = np.nan
         buffers[-1][-1] = np.inf
-        mean = take_mean(buffers[reducer.rank])
+        mean = take_mean(buffers[comm.rank])
         digest.update(mean.tobytes())
         expected = np.asarray(np.mean(buffers, axis=0, dtype=np.float64))
         np.testing.assert_allclose(mean, expected, rtol=1e-5, atol=1e-6 * 10.0**call)
         heads = [buffer[:5] for buffer in buffers]
-        np.testing.assert_array_equal(reducer.all_gather(heads[reducer.rank]), heads)
+        np.testing.assert_array_equal(comm.all_gather(heads[comm.rank]), heads)
     return {"digest": digest.hexdigest()}
 
 
 @functools.cache
-def several_means(reducer: Reducer, size: int) -> TracedStep:
+def several_means(comm: Communicator, size: int) -> TracedStep:
     """A program with means of [size] in a loop, and values of all ranks, compiled once."""
     import jax
     import jax.numpy as jnp
 
-    def step(peers: Peers, _: Any, shared: Array, own: Array) -> tuple[Array, Array, Array]:
-        ranks = peers.gather(peers.rank()[None].astype(jnp.float32))[:, 0]
+    def step(
+        collectives: Collectives, _: Any, shared: Array, own: Array
+    ) -> tuple[Array, Array, Array]:
+        ranks = collectives.all_gather(collectives.rank()[None].astype(jnp.float32))[:, 0]
 
         def add_mean_rank(_: int, total: Array) -> Array:
-            return peers.mean(total + peers.rank(), after=ranks)
+            return collectives.mean(total + collectives.rank(), after=ranks)
 
         return jax.lax.fori_loop(0, 5, add_mean_rank, shared), own + 1.0, ranks
 
-    program = reducer.program(step)
+    program = comm.program(step)
     program.trace((), jnp.zeros(size), jnp.zeros(3))
     program.compile()
     return program
 
 
-def check_steps(reducer: Reducer, options: Options) -> Options:
+def check_steps(comm: Communicator, options: Options) -> Options:
     """Means and values of all ranks from within a program, between calls from outside it."""
     import jax.numpy as jnp
 
-    size, middle = options["num_floats"], (reducer.world_size - 1) / 2
-    program = several_means(reducer, size)
+    size, middle = options["num_floats"], (comm.world_size - 1) / 2
+    program = several_means(comm, size)
     shared, own = jnp.zeros(size), jnp.zeros(3)
     for call in range(1, 21):
         shared, own, ranks = program(shared, own)
         if call % 4 == 0:
             program.wait()
             np.testing.assert_allclose(shared, np.full(size, 5 * call * middle), rtol=1e-4)
-            np.testing.assert_array_equal(ranks, np.arange(reducer.world_size))
-            values = np.full(3, reducer.rank + call, np.float32)
-            np.testing.assert_array_equal(reducer.all_gather(values)[:, 1] - call, ranks)
+            np.testing.assert_array_equal(ranks, np.arange(comm.world_size))
+            values = np.full(3, comm.rank + call, np.float32)
+            np.testing.assert_array_equal(comm.all_gather(values)[:, 1] - call, ranks)
     program.wait()
     return {"steps_digest": hashlib.sha256(np.asarray(shared).tobytes()).hexdigest()}
 
 
-def step_in_different_orders(reducer: Reducer, options: Options) -> Options:
+def step_in_different_orders(comm: Communicator, options: Options) -> Options:
     """The last rank comes to the two exchanges of a step in the opposite order."""
     import jax
     import jax.numpy as jnp
 
-    def step(peers: Peers, _: Any, shared: Array, own: Array) -> tuple[Array, Array, Array]:
-        if reducer.rank < reducer.world_size - 1:
-            mean = peers.mean(own)
-            gathered = peers.gather(own + 0 * mean[0])
+    def step(
+        collectives: Collectives, _: Any, shared: Array, own: Array
+    ) -> tuple[Array, Array, Array]:
+        if comm.rank < comm.world_size - 1:
+            mean = collectives.mean(own)
+            gathered = collectives.all_gather(own + 0 * mean[0])
         else:
-            gathered = peers.gather(own)
-            mean = peers.mean(own + 0 * gathered[0, 0])
+            gathered = collectives.all_gather(own)
+            mean = collectives.mean(own + 0 * gathered[0, 0])
         return shared + mean, own + gathered[0], mean[0]
 
-    program = reducer.program(step)
-    shared, own = (jnp.full(options["num_floats"], 1.0 + reducer.rank) for _ in range(2))
+    program = comm.program(step)
+    shared, own = (jnp.full(options["num_floats"], 1.0 + comm.rank) for _ in range(2))
     program.trace((), shared, own)
     program.compile()
     try:
@@ -128,32 +134,32 @@ def step_in_different_orders(reducer: Reducer, options: Options) -> Options:
     return {"mean": float(shared[0])}
 
 
-def check_order(reducer: Reducer, options: Options) -> Options:
+def check_order(comm: Communicator, options: Options) -> Options:
     """Makes many calls of both kinds with random pauses; every value tells its step."""
     kinds = np.random.default_rng(0).random(options["num_ordered_calls"])
-    pauses = np.random.default_rng([1, reducer.rank])
-    ranks, take_mean = np.arange(reducer.world_size), mean_of(reducer, options["num_floats"])
+    pauses = np.random.default_rng([1, comm.rank])
+    ranks, take_mean = np.arange(comm.world_size), mean_of(comm, options["num_floats"])
     for step, kind in enumerate(kinds):
         if pauses.random() < 0.1:
             time.sleep(pauses.random() * 2e-3)
         if kind < 0.5:
-            buffer = np.full(options["num_floats"], 8 * step + reducer.rank, np.float32)
+            buffer = np.full(options["num_floats"], 8 * step + comm.rank, np.float32)
             mean = take_mean(buffer)
             if pauses.random() < 0.1:
                 time.sleep(pauses.random() * 2e-3)
             # Of another step it would be wrong by 8 or more; by rounding it is wrong by 1e-4.
             assert np.abs(mean - (8 * step + ranks.mean())).max() < 0.1, step
         else:
-            values = np.full(1 + step % 7, 8 * step + reducer.rank, np.float32)
-            gathered = reducer.all_gather(values)
+            values = np.full(1 + step % 7, 8 * step + comm.rank, np.float32)
+            gathered = comm.all_gather(values)
             assert (gathered == (8 * step + ranks)[:, None]).all(), step
     return {}
 
 
-def call_forever(reducer: Reducer, options: Options) -> Options:
+def call_forever(comm: Communicator, options: Options) -> Options:
     """Calls `mean` until something happens; marks `running` after the first calls."""
     buffer = np.ones(options["num_floats"], np.float32)
-    take_mean = mean_of(reducer, buffer.size)
+    take_mean = mean_of(comm, buffer.size)
     for step in range(10**9):
         take_mean(buffer)
         if step == 3:
@@ -161,25 +167,27 @@ def call_forever(reducer: Reducer, options: Options) -> Options:
     return {}
 
 
-def step_forever(reducer: Reducer, options: Options) -> Options:
+def step_forever(comm: Communicator, options: Options) -> Options:
     """Runs a program of all ranks until something happens, as training does; with pauses."""
     import jax
     import jax.numpy as jnp
 
-    def step(peers: Peers, _: Any, shared: Array, own: Array) -> tuple[Array, Array, Array]:
+    def step(
+        collectives: Collectives, _: Any, shared: Array, own: Array
+    ) -> tuple[Array, Array, Array]:
         # A millisecond or two of work, so that ends come while a device is at it.
         own = jax.lax.fori_loop(0, 300, lambda _, x: jnp.cos(x @ x), own)
-        return shared + peers.mean(own[0]), own, jnp.sum(shared)
+        return shared + collectives.mean(own[0]), own, jnp.sum(shared)
 
-    program = reducer.program(step)
+    program = comm.program(step)
     shared, own = jnp.zeros(64), jnp.eye(64)
     program.trace((), shared, own)
     program.compile()
-    pauses = np.random.default_rng(reducer.rank)
+    pauses = np.random.default_rng(comm.rank)
     for call in range(10**9):
         shared, own, _ = program(shared, own)
         time.sleep(pauses.random() * 5e-3)
-        reducer.all_gather(np.zeros(1, np.float32))
+        comm.all_gather(np.zeros(1, np.float32))
         if call % 7 == 6:
             program.wait()
         if call == 10:
@@ -187,27 +195,27 @@ def step_forever(reducer: Reducer, options: Options) -> Options:
     return {}
 
 
-def check_all(reducer: Reducer, options: Options) -> Options:
+def check_all(comm: Communicator, options: Options) -> Options:
     """Everything that can be checked while all ranks live; then calls until something happens."""
     # Before the first exchange, whose time limit alone is meant for what ranks compile.
-    mean_of(reducer, options["num_floats"])
-    several_means(reducer, options["num_floats"])
-    found = check_means(reducer, options) | check_order(reducer, options)
-    found |= check_steps(reducer, options)
+    mean_of(comm, options["num_floats"])
+    several_means(comm, options["num_floats"])
+    found = check_means(comm, options) | check_order(comm, options)
+    found |= check_steps(comm, options)
     if options["goes_on"]:
         path = Path(options["folder"]) / f"checked_{options['rank']}"
         path.with_suffix(".part").write_text(json.dumps(found))
         path.with_suffix(".part").rename(path)
-        call_forever(reducer, options)
+        call_forever(comm, options)
     return found
 
 
-def call_once(reducer: Reducer, options: Options) -> Options:
+def call_once(comm: Communicator, options: Options) -> Options:
     """One `mean` of ones times rank + 1, after a pause."""
     leave_mark("attached", options)
     time.sleep(options.get("pause_s", 0.0))
-    take_mean = mean_of(reducer, options["num_floats"])
-    mean = take_mean(np.full(options["num_floats"], reducer.rank + 1, np.float32))
+    take_mean = mean_of(comm, options["num_floats"])
+    mean = take_mean(np.full(options["num_floats"], comm.rank + 1, np.float32))
     return {"mean": float(mean[0])}
 
 

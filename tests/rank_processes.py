@@ -1,8 +1,8 @@
-"""Runs small bodies of code in several real processes that share one reducer.
+"""Runs small bodies of code in several real processes that share one communicator.
 
 This file is a script too: a server that has loaded jax, which is most of what a rank costs, and
-forks for every rank that `Ranks` starts. A rank builds its reducer, runs the body named in its
-options and writes what the body returns, or how it failed, to a JSON file.
+forks for every rank that `Ranks` starts. A rank makes its communicator, runs the body named in
+its options and writes what the body returns, or how it failed, to a JSON file.
 """
 
 from __future__ import annotations
@@ -23,13 +23,13 @@ from typing import Any
 
 import pytest
 
-from gmijax.collectives.build import Membership, build_reducer
+from gmijax.collectives.communicator import CommunicatorConfig, make_communicator
 from gmijax.collectives.host.shared_block import create_exchange
-from gmijax.collectives.interface import Reducer
-from gmijax.collectives.nodes.meeting import (
+from gmijax.collectives.interface import Communicator
+from gmijax.collectives.nodes.rendezvous import (
     ENV_LISTENER_FD,
     ENV_NODES_FD,
-    Nodes,
+    NodeAddresses,
     inherited_nodes,
     listen,
 )
@@ -149,7 +149,7 @@ class Ranks:
         for node, listener in enumerate(listeners):
             own = {ENV_EXCHANGE_FD: create_exchange()}
             if num_nodes > 1:
-                own[ENV_NODES_FD] = Nodes(node, addresses, b"secret").to_file()
+                own[ENV_NODES_FD] = NodeAddresses(node, addresses, b"secret").to_file()
             for fd in own.values():
                 self._held.callback(os.close, fd)
             found.append(own | ({ENV_LISTENER_FD: listener.fileno()} if num_nodes > 1 else {}))
@@ -248,21 +248,21 @@ def use_fake_device_memory(kind: str) -> None:
     """Lets `intra=ipc` run on the CPU: the real exchange over memory that is not a GPU's."""
     import fake_device_memory
 
-    from gmijax.collectives import build
+    from gmijax.collectives import communicator
 
-    build.DEVICE = lambda: fake_device_memory.FAKES[kind]
+    communicator.DEVICE = lambda: fake_device_memory.FAKES[kind]
 
 
-def make_reducer(options: Options) -> Reducer:
-    """The reducer of one rank."""
+def communicator_of(options: Options) -> Communicator:
+    """The communicator of one rank."""
     strategy, rank, layout = options["strategy"], options["rank"], layout_of(options)
     nodes, listener = inherited_nodes()
     if options["intra"] == "ipc" and not options["gpus"]:
         is_special = rank == options.get("special_rank")
         use_fake_device_memory(options["special"] if is_special else "fake")
-    return build_reducer(
+    return make_communicator(
         strategy,
-        Membership(
+        CommunicatorConfig(
             layout=layout,
             rank=rank,
             num_floats=options["num_floats"],
@@ -278,17 +278,17 @@ def make_reducer(options: Options) -> Reducer:
 
 
 def main(options: Options) -> None:
-    """One rank: builds its reducer, runs the body, writes the result."""
+    """One rank: builds its communicator, runs the body, writes the result."""
     faulthandler.register(signal.SIGUSR1, all_threads=True)
     result: Options = {"error": None}
     failure: GmijaxError | None = None
     try:
-        reducer = make_reducer(options)
+        comm = communicator_of(options)
         try:
-            result |= getattr(rank_bodies, options["body"])(reducer, options)
+            result |= getattr(rank_bodies, options["body"])(comm, options)
         finally:
-            reducer.close()
-            reducer.close()
+            comm.close()
+            comm.close()
     except GmijaxError as error:
         failure = error
         result |= {"error": type(error).__name__, "message": str(error)}

@@ -5,8 +5,8 @@ from __future__ import annotations
 import os
 from collections.abc import Sequence
 
-from gmijax.collectives.host.host_exchange import HostExchange
 from gmijax.collectives.host.shared_block import create_exchange
+from gmijax.collectives.host.shared_memory_group import SharedMemoryGroup
 from gmijax.collectives.messages.messenger import MIN_CAPACITY_BYTES
 from gmijax.collectives.messages.pipe_block import PipeBlock, create_pipes
 
@@ -16,11 +16,11 @@ def host_ranks(
     timeout_s: float = 20.0,
     start_s: float | None = None,
     ids: Sequence[int] | None = None,
-) -> list[HostExchange]:
+) -> list[SharedMemoryGroup]:
     """A rank for each of `num_floats`, the length of its largest buffer."""
     fd = create_exchange()
     ranks = [
-        HostExchange(
+        SharedMemoryGroup(
             *(fd, rank, len(num_floats), size),
             timeout_s=timeout_s,
             rendezvous_timeout_s=start_s or timeout_s,

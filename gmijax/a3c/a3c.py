@@ -20,7 +20,7 @@ from gmijax.a3c.targets import (
     batch_targets,
     weighted_mean,
 )
-from gmijax.collectives.interface import Peers, Reducer, TracedStep
+from gmijax.collectives.interface import Collectives, Communicator, TracedStep
 from gmijax.config import A3cConfig
 from gmijax.learning.learner import (
     TrainState,
@@ -172,18 +172,18 @@ class Updated(NamedTuple):
     explained_variance: Array
 
 
-def make_update(learner: A3cLearner, reducer: Reducer) -> TracedStep:
+def make_update(learner: A3cLearner, comm: Communicator) -> TracedStep:
     """The update as a program: `(state, (batch, weight)) -> (state, (), Updated)`.
 
     The batch has unrolls [T, B]. The weight [B] is 0 for unrolls that are too old to learn from;
     the others weigh alike on all trainers, and the mean over all of them is 1.
     """
-    return reducer.program(partial(update, learner), donates_own=False)
+    return comm.program(partial(update, learner), donates_own=False)
 
 
 def update(
     learner: A3cLearner,
-    peers: Peers,
+    collectives: Collectives,
     _: Any,
     state: TrainState,
     weighted: tuple[Unrolls, Array],
@@ -192,13 +192,13 @@ def update(
     batch, weight = weighted
     targets = batch_targets(learner, state, batch, weight)
     obs = without_outliers(acting_moments(learner.config, state), batch.state)
-    everyone = peers.gather((moments_of(obs, 2), *targets.fit))
+    everyone = collectives.all_gather((moments_of(obs, 2), *targets.fit))
     seen, target, error = map(merge_all, everyone)
     state = with_targets(learner, state, target)
     targets = targets._replace(value_moments=state.value_moments)
-    order = minibatch_order(learner.config, state, peers.rank(), batch.reward.shape[1])
+    order = minibatch_order(learner.config, state, collectives.rank(), batch.reward.shape[1])
     state, losses, rates = run_updates(
-        learner, peers, gradients, state, batch, targets, order, after=everyone
+        learner, collectives, gradients, state, batch, targets, order, after=everyone
     )
     # Counts the batch, which makes a new version of the policy, and takes in its statistics.
     state = finish_iteration(learner, state, seen)

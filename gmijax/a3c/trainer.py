@@ -22,7 +22,7 @@ from gmijax.a3c.report import MAX_COUNTED, BatchCounts, histogram_of
 from gmijax.a3c.targets import Unrolls
 from gmijax.clock import running_s
 from gmijax.collectives.channel.batcher import Batch, Batcher
-from gmijax.collectives.interface import Reducer
+from gmijax.collectives.interface import Communicator
 from gmijax.config import A3cConfig, TrainConfig
 from gmijax.errors import CollectiveTimeout
 from gmijax.learning.checkpoint import require_equal
@@ -47,7 +47,7 @@ _SLICE_S = 0.5
 class Trainer:
     """One training GMI; `env` is not stepped, it is there for its sizes.
 
-    `receiver` gives it the experience of `agents`, and `reducer` is among the trainers.
+    `receiver` gives it the experience of `agents`, and `comm` is among the trainers.
     """
 
     config: TrainConfig
@@ -55,7 +55,7 @@ class Trainer:
     agents: tuple[int, ...]
     registers: JobRegisters
     receiver: Batcher
-    reducer: Reducer
+    comm: Communicator
     link: ChildLink
 
     def __post_init__(self) -> None:
@@ -63,10 +63,10 @@ class Trainer:
         self._algo = self.config.algo
         self._batch_size = self._algo.batch_of(self.config.envs_per_gmi)
         self._learner = make_learner(self.env.spec, self._algo)
-        self._update = make_update(self._learner, self.reducer)
+        self._update = make_update(self._learner, self.comm)
         self._env_steps = 0
         self._updates = 0
-        traced = self.config.run.profiled if self.reducer.rank == 0 else None
+        traced = self.config.run.profiled if self.comm.rank == 0 else None
         self._trace = IterationTrace(traced, self.link.run.profile)
         self._version = 0
         self._passed_over = np.zeros(MAX_COUNTED + 1, np.float32)
@@ -84,11 +84,11 @@ class Trainer:
         """
         self.link.beat("compiling", 0)
         started = time.monotonic()
-        leads = self.reducer.rank == 0
+        leads = self.comm.rank == 0
         if not leads:
             # The leader compiles first, the others take its programs from the cache: those that
             # each of them would tune could differ in the last bit.
-            self.reducer.all_gather(np.zeros(1, np.float32))
+            self.comm.all_gather(np.zeros(1, np.float32))
         # The same key as synchronous training uses: the same first policy.
         state, self._env_steps = first_state(
             init_learner, self._learner, self.env.spec.obs_size, self.config
@@ -97,13 +97,13 @@ class Trainer:
         self._update.trace((), state, self._example())
         self._update.compile()
         if leads:
-            self.reducer.all_gather(np.zeros(1, np.float32))
+            self.comm.all_gather(np.zeros(1, np.float32))
         pack = jax.jit(lambda state: pack_weights(acting_weights(self._learner, state)))
         first = np.asarray(pack(state))
         compile_s = time.monotonic() - started
         self.link.beat("ready", 0)
         # And so all trainers have compiled.
-        require_equal(self.reducer, self.link.gmi, state.params, self._env_steps)
+        require_equal(self.comm, self.link.gmi, state.params, self._env_steps)
         if not leads:
             return {"status": self._loop(state, None), "updates": self._updates}
         leader = Leader(
@@ -148,7 +148,7 @@ class Trainer:
                 break
         if leader is not None:
             leader.end()
-        require_equal(self.reducer, self.link.gmi, state.params, self._env_steps)
+        require_equal(self.comm, self.link.gmi, state.params, self._env_steps)
         # Agents that wait for room may go: the order to end is published by now.
         self.receiver.close()
         if leader is not None:
@@ -188,7 +188,7 @@ class Trainer:
 
     def _scale(self, counts: BatchCounts) -> np.float32:
         """Weight of a fresh unroll, equal to that of any other of the job."""
-        return np.float32(self.reducer.world_size * self._batch_size / counts.fresh)
+        return np.float32(self.comm.world_size * self._batch_size / counts.fresh)
 
     def _meet(self, batch: Batch, waited_s: float) -> BatchCounts:
         """Tells the other trainers of this batch, and hears of theirs."""
@@ -197,7 +197,7 @@ class Trainer:
         self._passed_over[:] = 0.0
         head = [self.link.stop_requested, fresh, float(behind.sum()) - fresh, waited_s]
         mine = np.concatenate([head, behind])
-        gathered = self.reducer.all_gather(mine.astype(np.float32))
+        gathered = self.comm.all_gather(mine.astype(np.float32))
         stop, fresh, stale, _ = (float(x) for x in gathered[:, :4].sum(axis=0))
         return BatchCounts(
             stop, fresh, stale, float(gathered[:, 3].max()), gathered[:, 4:].sum(axis=0)

@@ -13,7 +13,7 @@ from typing import Any, Self
 from gmijax.cluster.checks import by_name, require_alike, require_shared
 from gmijax.cluster.node import Opened, TrainingNode
 from gmijax.cluster.ray_nodes import Joined, RayCluster
-from gmijax.collectives.nodes.meeting import Nodes
+from gmijax.collectives.nodes.rendezvous import NodeAddresses
 from gmijax.config import TrainConfig
 from gmijax.errors import BackendUnavailable, ConfigError, GmiFailed
 from gmijax.machine.snapshot import Machine
@@ -97,7 +97,7 @@ class ClusterJob:
             calls |= one.calls
         token = secrets.token_bytes(32)
         for place, (node, _) in enumerate(self._joined):
-            node.call("introduce", Nodes(place, addresses, token, calls))
+            node.call("set_addresses", NodeAddresses(place, addresses, token, calls))
         first = [gmis[0] for gmis in launch.plan.layout.gmis_of_node]
         for gmi, (node, _) in zip(first, self._joined, strict=True):
             if node.lost is not None:

@@ -18,10 +18,10 @@ from contextlib import ExitStack, suppress
 from pathlib import Path
 from typing import Any, Final, Literal, NamedTuple
 
-from gmijax.collectives.nodes.meeting import (
+from gmijax.collectives.nodes.rendezvous import (
     ENV_LISTENER_FD,
     ENV_NODES_FD,
-    Nodes,
+    NodeAddresses,
     listen,
     reserved_address,
 )
@@ -68,7 +68,7 @@ class Opened(NamedTuple):
     """What a node has for its GMIs: where they will listen, and daemons of its GPUs."""
 
     leader: tuple[str, int]
-    calls: dict[tuple[int, int], str]  # See `Nodes`.
+    calls: dict[tuple[int, int], str]  # See `NodeAddresses`.
     daemons: dict[str, Path]  # See `Machine`.
 
 
@@ -191,7 +191,7 @@ class TrainingNode(Node):
         }
         return Opened((address, self._listener.getsockname()[1]), calls, found)
 
-    def introduce(self, nodes: Nodes) -> None:
+    def set_addresses(self, nodes: NodeAddresses) -> None:
         """Takes the addresses of all leaders; GMIs can be started from here on."""
         assert self._launch is not None
         if self._listener is not None:

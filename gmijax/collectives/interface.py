@@ -16,7 +16,7 @@ FloatBuffer = npt.NDArray[np.float32]
 T = TypeVar("T")
 
 
-class Peers(Protocol):
+class Collectives(Protocol):
     """The trainers of a job, from within a program that all of them run.
 
     XLA may start exchanges that do not need each other in any order, and trainers that come to
@@ -27,7 +27,7 @@ class Peers(Protocol):
         """[] int32: the trainer on whose device this is computed."""
         ...
 
-    def gather(self, tree: T, after: Any = None) -> T:
+    def all_gather(self, tree: T, after: Any = None) -> T:
         """`tree` of every trainer, float32; leaves [...] become [K, ...], in order of rank.
 
         For at most P / K numbers, or 1024.
@@ -51,8 +51,8 @@ class Peers(Protocol):
         ...
 
 
-Step: TypeAlias = Callable[[Peers, Any, Any, Any], tuple[Any, Any, Any]]
-"""`(peers, constants, shared, own) -> (shared, own, metrics)`, trees of arrays.
+Step: TypeAlias = Callable[[Collectives, Any, Any, Any], tuple[Any, Any, Any]]
+"""`(collectives, constants, shared, own) -> (shared, own, metrics)`, trees of arrays.
 
 `shared` and `metrics` are equal on all trainers if they were before; `constants` and `own` are a
 trainer's own.
@@ -81,8 +81,8 @@ class TracedStep(Protocol):
     def __call__(self, shared: Any, own: Any) -> tuple[Any, Any, Any]:
         """`(shared, own, metrics)`, the first two on this trainer's device, the last on the host.
 
-        The arguments are donated, `own` only if it is returned alike (`Reducer.program`). All of
-        it may still be computed, but for the metrics of the call before.
+        The arguments are donated, `own` only if it is returned alike (`Communicator.program`). All
+        of it may still be computed, but for the metrics of the call before.
 
         Raises:
           PeerLost: the process of another trainer is gone.
@@ -99,7 +99,7 @@ class TracedStep(Protocol):
         ...
 
 
-class Reducer(Protocol):
+class Communicator(Protocol):
     """Exchanges numbers among the trainers of a job.
 
     Attributes:
@@ -135,5 +135,5 @@ class Reducer(Protocol):
         ...
 
     def close(self) -> None:
-        """Releases what the reducer holds. Idempotent."""
+        """Releases what the communicator holds. Idempotent."""
         ...

@@ -18,7 +18,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
 
-from gmijax.collectives.host.host_links import HostLinks
+from gmijax.collectives.host.host_transport import HostTransport
 from gmijax.collectives.interface import Step
 from gmijax.collectives.strategies import Stage
 from gmijax.collectives.xla_call import Buffer, register
@@ -30,14 +30,14 @@ T = TypeVar("T")
 _serial = itertools.count()
 
 
-class Exchange:
-    """One rank's exchanges in programs, by a strategy's stages."""
+class StagedAllReduce:
+    """One rank's all-reduces in programs, by a strategy's stages."""
 
     def __init__(
-        self, links: HostLinks, stages: Sequence[Stage], rank: int, world_size: int
+        self, transport: HostTransport, stages: Sequence[Stage], rank: int, world_size: int
     ) -> None:
         self.rank, self.world_size = rank, world_size
-        self._links: HostLinks | None = links
+        self._transport: HostTransport | None = transport
         self._stages = stages
         # The same on all ranks, which make as many: it is part of their programs.
         self._name = f"gmijax_exchange_{next(_serial)}"
@@ -47,7 +47,7 @@ class Exchange:
         """The sum over ranks of `buffer` [n] float32; in a program, where it is number `place`."""
         total = buffer
         for number, stage in enumerate(self._stages):
-            if stage.kind == "gather":
+            if stage.kind == "all_gather":
                 # The largest group's size: the program must be the same on all ranks.
                 most = max(len(group) for group in stage.groups)
                 rows = self._traced(total, (most, buffer.size), number, place, after)
@@ -58,15 +58,15 @@ class Exchange:
         return total
 
     def program(self, step: Step, *, donates_own: bool = True) -> ProgramStep:
-        """See `Reducer`."""
-        assert self._links is not None
-        return ProgramStep(self, self._links, step, donates_own=donates_own)
+        """See `Communicator`."""
+        assert self._transport is not None
+        return ProgramStep(self, self._transport, step, donates_own=donates_own)
 
     def close(self) -> None:
-        """Releases the links. Idempotent."""
-        if self._links is not None:
-            self._links.close()
-        self._links = None  # XLA keeps the call forever, and with it this object.
+        """Releases the transport. Idempotent."""
+        if self._transport is not None:
+            self._transport.close()
+        self._transport = None  # XLA keeps the call forever, and with it this object.
 
     def _traced(
         self,
@@ -76,11 +76,11 @@ class Exchange:
         place: int,
         after: jax.Array | None,
     ) -> jax.Array:
-        if self._links is None:
+        if self._transport is None:
             raise CollectiveError(f"rank {self.rank}: exchange after close")
         if values.dtype != jnp.float32:
             raise CollectiveError(f"rank {self.rank}: exchanges float32, not {values.dtype}")
-        if values.size > (room := self._links.room):
+        if values.size > (room := self._transport.room):
             raise CollectiveError(f"rank {self.rank}: {values.size} floats, room is for {room}")
         result = jax.ShapeDtypeStruct(shape, jnp.float32)
         call: Any = jax.ffi.ffi_call(self._name, result, has_side_effect=True)
@@ -90,61 +90,61 @@ class Exchange:
     def _call(
         self, stream: int, arguments: list[Buffer], results: list[Buffer], attributes: list[int]
     ) -> None:
-        if self._links is None:
+        if self._transport is None:
             raise RuntimeError("the exchange is closed")
         (values, *_), (result,), (number, place) = arguments, results, attributes
         where = (stream, place, values.address, result.address, values.shape[0])
-        self._links.reduce(self._stages[number], *where)
+        self._transport.reduce(self._stages[number], *where)
 
 
-class ProgramPeers:
-    """The ranks of an exchange as a program sees them: `Peers`.
+class TracedCollectives:
+    """The ranks of an exchange as a program sees them: `Collectives`.
 
     `rank` [] int32 is an argument of the program, so that all ranks have the same one.
     """
 
-    def __init__(self, exchange: Exchange, rank: jax.Array) -> None:
-        self._exchange = exchange
+    def __init__(self, all_reduce: StagedAllReduce, rank: jax.Array) -> None:
+        self._all_reduce = all_reduce
         self._rank = rank
         self._places = itertools.count(1)
 
     def rank(self) -> jax.Array:
-        """See `Peers`."""
+        """See `Collectives`."""
         return self._rank
 
-    def gather(self, tree: T, after: Any = None) -> T:
-        """See `Peers`."""
+    def all_gather(self, tree: T, after: Any = None) -> T:
+        """See `Collectives`."""
         packed, unpack = ravel_pytree(tree)  # One message, not one for each leaf.
         # A sum of which each rank gives one row is exact in any order.
-        is_own = jnp.arange(self._exchange.world_size)[:, None] == self._rank
+        is_own = jnp.arange(self._all_reduce.world_size)[:, None] == self._rank
         rows = self._sum(jnp.where(is_own, packed, 0.0).ravel(), after)
         return jax.vmap(unpack)(rows.reshape(-1, packed.size))
 
     def mean(self, tree: T, after: Any = None) -> T:
-        """See `Peers`."""
+        """See `Collectives`."""
         packed, unpack = ravel_pytree(tree)
-        return unpack(self._sum(packed, after) * np.float32(1.0 / self._exchange.world_size))
+        return unpack(self._sum(packed, after) * np.float32(1.0 / self._all_reduce.world_size))
 
     def _sum(self, buffer: jax.Array, after: Any) -> jax.Array:
         # What has to come before is an argument that is not looked at; one leaf of it does.
         before = next(iter(jax.tree.leaves(after)), None)
-        return self._exchange.sum(buffer, next(self._places), before)
+        return self._all_reduce.sum(buffer, next(self._places), before)
 
 
-class PeersOfOne:
-    """`Peers` of a job with one trainer."""
+class LocalCollectives:
+    """`Collectives` of a job with one trainer."""
 
     def rank(self) -> jax.Array:
-        """See `Peers`."""
+        """See `Collectives`."""
         return jnp.zeros((), jnp.int32)
 
-    def gather(self, tree: T, after: Any = None) -> T:
-        """See `Peers`."""
+    def all_gather(self, tree: T, after: Any = None) -> T:
+        """See `Collectives`."""
         del after
         return jax.tree.map(lambda leaf: leaf[None], tree)
 
     def mean(self, tree: T, after: Any = None) -> T:
-        """See `Peers`."""
+        """See `Collectives`."""
         del after
         return tree
 
@@ -153,21 +153,21 @@ class ProgramStep:
     """A step as one program of each rank: `TracedStep`.
 
     A call returns when the device has been given all of it, and the call before is computed.
-    In a job with one rank there are no `exchange` and no `links`.
+    In a job with one rank there are no `all_reduce` and no `transport`.
     """
 
     def __init__(
         self,
-        exchange: Exchange | None,
-        links: HostLinks | None,
+        all_reduce: StagedAllReduce | None,
+        transport: HostTransport | None,
         step: Step,
         *,
         donates_own: bool = True,
     ) -> None:
-        self._exchange, self._links = exchange, links
+        self._all_reduce, self._transport = all_reduce, transport
         self._donated = (2, 3) if donates_own else (2,)
         self._step = step
-        self._rank = jnp.asarray(0 if exchange is None else exchange.rank, jnp.int32)
+        self._rank = jnp.asarray(0 if all_reduce is None else all_reduce.rank, jnp.int32)
         self._program: Any = None
         self._constants: Any = None
         self._last: Any = None
@@ -178,8 +178,9 @@ class ProgramStep:
         """See `TracedStep`."""
 
         def whole(rank: jax.Array, constants: Any, shared: Any, own: Any) -> tuple[Any, Any, Any]:
-            peers = PeersOfOne() if self._exchange is None else ProgramPeers(self._exchange, rank)
-            return self._step(peers, constants, shared, own)
+            several = self._all_reduce
+            ranks = LocalCollectives() if several is None else TracedCollectives(several, rank)
+            return self._step(ranks, constants, shared, own)
 
         # Metrics lie where the host reads them at once: a copy from the device could only be made
         # after the next step, which has been started by then.
@@ -206,10 +207,11 @@ class ProgramStep:
         self._last = self._program(self._rank, self._constants, shared, own)
         if self._metrics is not None:
             jax.block_until_ready(self._metrics)
-            if self._links is not None:
-                self.exchange_s = self._links.exchange_s()
+            if self._transport is not None:
+                self.exchange_s = self._transport.exchange_s()
         self._metrics = self._last[2]
         return self._last
 
     def _run(self, program: Callable[[], T], *, is_last: bool) -> T:
-        return program() if self._links is None else self._links.run(program, is_last=is_last)
+        transport = self._transport
+        return program() if transport is None else transport.run(program, is_last=is_last)

@@ -13,8 +13,8 @@ from gmijax.errors import ConfigError
 from gmijax.partition.layout import Layout
 from gmijax.partition.reduction import is_even, leaders
 
-Kind: TypeAlias = Literal["sum", "gather", "broadcast"]
-Link: TypeAlias = Literal["host", "slots", "ring", "nodes"]
+Kind: TypeAlias = Literal["all_reduce", "all_gather", "broadcast"]
+TransportName: TypeAlias = Literal["host", "slots", "ring", "nodes"]
 """Through shared memory of the host, memory of the GPUs that all map, NCCL between GPUs, sockets
 between nodes and memory of the host in each."""
 
@@ -28,19 +28,19 @@ class Stage(NamedTuple):
     Attributes:
       kind: all members of a group get their sum, or what each of them has, which the program
         sums in the order of the group, or what its first member has.
-      link: how the numbers move; slots gather and broadcast only.
+      transport: how the numbers move; slots all-gather and broadcast only.
       groups: ranks; those that are in none keep what they have. Stages through slots all have the
         same ones, with every rank in one of them. Between nodes these are the groups: what is
         summed is what their first ranks have, and all ranks get it.
     """
 
     kind: Kind
-    link: Link
+    transport: TransportName
     groups: Groups
 
     def reads(self, rank: int) -> bool:
         """Whether somebody gets what this rank has; else it is only given something."""
-        if self.kind == "broadcast" or self.link == "nodes":
+        if self.kind == "broadcast" or self.transport == "nodes":
             return not any(rank in group[1:] for group in self.groups)
         return True
 
@@ -65,38 +65,39 @@ def stages(strategy: str, layout: Layout, intra: str = "host") -> Sequence[Stage
     Args:
       strategy: a key of `COSTS`.
       layout: where the ranks live; the strategy must be allowed there.
-      intra: `host` or `ipc`, the link inside a GPU for `har`.
+      intra: `host` or `ipc`, the transport inside a GPU for `har`.
     """
     if layout.num_nodes > 1:
         return _over_nodes(stages(strategy, layout.of_node(0), intra), layout.gmis_of_node)
     gpus, everyone = layout.gmis_of_gpu, (tuple(layout.gmis),)
     if strategy == "mpr":
-        return [Stage("sum", "host", everyone)]
+        return [Stage("all_reduce", "host", everyone)]
     if strategy == "flat":
-        return [Stage("sum", "ring", everyone)]
+        return [Stage("all_reduce", "ring", everyone)]
     if strategy == "one_shot":
-        return [Stage("gather", "slots", everyone)]
+        return [Stage("all_gather", "slots", everyone)]
     rings = tuple(zip(*gpus, strict=True)) if is_even(layout) else ()
     if strategy == "mrr":
         if len(rings) == 1:
-            return [Stage("sum", "ring", rings)]
+            return [Stage("all_reduce", "ring", rings)]
         # The ring of place k ends on GPU k: the ends are on different GPUs, as NCCL asks.
         ends = tuple(ring[place] for place, ring in enumerate(rings))
         back = tuple(_first(end, ring) for end, ring in zip(ends, rings, strict=True))
         return [
-            Stage("sum", "ring", rings),
-            Stage("sum", "ring", (ends,)),
+            Stage("all_reduce", "ring", rings),
+            Stage("all_reduce", "ring", (ends,)),
             Stage("broadcast", "ring", back),
         ]
-    link: Link = "slots" if intra == "ipc" else "host"
+    inner: TransportName = "slots" if intra == "ipc" else "host"
     led = tuple(_first(leader, gpu) for leader, gpu in zip(leaders(layout), gpus, strict=True))
-    inside = Stage("gather" if link == "slots" else "sum", link, led)
+    inside = Stage("all_gather" if inner == "slots" else "all_reduce", inner, led)
     if len(gpus) == 1:
         return [inside]
-    if link == "slots" and rings:
+    if inner == "slots" and rings:
         # Not a sum of NCCL's: its order may differ from ring to ring.
-        return [inside, Stage("gather", "ring", rings)]
-    return [inside, Stage("sum", "ring", (leaders(layout),)), Stage("broadcast", link, led)]
+        return [inside, Stage("all_gather", "ring", rings)]
+    between = Stage("all_reduce", "ring", (leaders(layout),))
+    return [inside, between, Stage("broadcast", inner, led)]
 
 
 def _over_nodes(inside: Sequence[Stage], nodes: Groups) -> Sequence[Stage]:
@@ -111,7 +112,7 @@ def _over_nodes(inside: Sequence[Stage], nodes: Groups) -> Sequence[Stage]:
         )
         for stage in inside
     ]
-    return [*everywhere, Stage("sum", "nodes", nodes)]
+    return [*everywhere, Stage("all_reduce", "nodes", nodes)]
 
 
 def _first(leader: int, group: Sequence[int]) -> tuple[int, ...]:

@@ -14,7 +14,7 @@ from typing import Any, NamedTuple, Protocol, TypeAlias
 
 import jax
 
-from gmijax.collectives.interface import Peers
+from gmijax.collectives.interface import Collectives
 from gmijax.config import AlgoConfig
 from gmijax.learning.learner import Learner, TrainState
 from gmijax.learning.unroll import Counts
@@ -54,12 +54,12 @@ class IterationMetrics(NamedTuple):
 
 
 Iterate: TypeAlias = Callable[
-    [BatchedEnv, Any, Peers, PyTree, TrainState, BatchState],
+    [BatchedEnv, Any, Collectives, PyTree, TrainState, BatchState],
     tuple[TrainState, BatchState, IterationMetrics],
 ]
-"""`(env, learner, peers, model, state, env_state) -> (state, env_state, metrics)`: a rollout and
-its updates, a pure function. State and environments are donated. `state` comes out equal on all
-GMIs, since what goes into it passes through `peers`."""
+"""`(env, learner, collectives, model, state, env_state) -> (state, env_state, metrics)`: a rollout
+and its updates, a pure function. State and environments are donated. `state` comes out equal on all
+GMIs, since what goes into it passes through `collectives`."""
 
 
 @dataclass(frozen=True)
@@ -89,10 +89,10 @@ def iterate_all(
     iterate: Iterate,
     env: BatchedEnv,
     learner: Learner[Any],
-    peers: Peers,
+    collectives: Collectives,
     model: PyTree,
     states: TrainState,
     envs: BatchState,
 ) -> tuple[TrainState, BatchState, IterationMetrics]:
     """An iteration of several runs; states and metrics have a leading axis [K]."""
-    return jax.vmap(lambda *own: iterate(env, learner, peers, model, *own))(states, envs)
+    return jax.vmap(lambda *own: iterate(env, learner, collectives, model, *own))(states, envs)

@@ -24,7 +24,7 @@ import jax.numpy as jnp
 import numpy as np
 import orbax.checkpoint as ocp
 
-from gmijax.collectives.interface import Reducer
+from gmijax.collectives.interface import Communicator
 from gmijax.config import TrainConfig
 from gmijax.config.schema import to_dict
 from gmijax.errors import ConfigError, GmijaxError, NonFiniteError, ParameterMismatch, lines_of
@@ -65,12 +65,12 @@ def checkpoint_meta(
     )
 
 
-def require_equal(reducer: Reducer, gmi: int, params: PyTree, env_steps: int) -> None:
+def require_equal(comm: Communicator, gmi: int, params: PyTree, env_steps: int) -> None:
     """Raises `ParameterMismatch` if the parameters of trainers differ; names them by their `gmi`.
 
     Collective.
     """
-    gathered = reducer.all_gather(np.append(digest(params), np.float32(gmi)))
+    gathered = comm.all_gather(np.append(digest(params), np.float32(gmi)))
     digests, gmis = gathered[:, :-1], gathered[:, -1].astype(int).tolist()
     different = [gmi for gmi, one in zip(gmis, digests, strict=True) if (one != digests[0]).any()]
     if different:

@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from gmijax.collectives.interface import Reducer
+from gmijax.collectives.interface import Communicator
 from gmijax.learning.checkpoint import finish_checkpoint, save_envs, save_learner
 from gmijax.learning.report_thread import ReportThread
 from gmijax.runs.folder import RunPaths
@@ -43,15 +43,15 @@ class CheckpointSaver:
 
     Args:
       gmi: whose environments these are.
-      reducer: among the GMIs that train.
+      comm: among the GMIs that train.
       keep: as of `finish_checkpoint`.
 
     Attributes:
       last_steps: environment steps of the newest checkpoint with a name, None before the first.
     """
 
-    def __init__(self, gmi: int, reducer: Reducer, keep: int | None) -> None:
-        self._gmi, self._reducer, self._keep = gmi, reducer, keep
+    def __init__(self, gmi: int, comm: Communicator, keep: int | None) -> None:
+        self._gmi, self._comm, self._keep = gmi, comm, keep
         self._thread = ReportThread(_call)
         self._unnamed: Sequence[Part] = ()
         self.last_steps: int | None = None
@@ -90,7 +90,7 @@ class CheckpointSaver:
         """
         parts, self._unnamed = self._unnamed, ()
         self.last_steps = parts[0].meta.env_steps
-        if self._reducer.rank == 0:
+        if self._comm.rank == 0:
             self._thread.report(
                 lambda: [finish_checkpoint(run, meta, self._keep) for run, meta, *_ in parts]
             )
@@ -109,7 +109,7 @@ class CheckpointSaver:
         self._thread.stop()
 
     def _barrier(self) -> None:
-        self._reducer.all_gather(np.zeros(1, np.float32))
+        self._comm.all_gather(np.zeros(1, np.float32))
 
 
 def _call(work: Callable[[], Any]) -> None:

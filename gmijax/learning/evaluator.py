@@ -16,7 +16,7 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from gmijax.collectives.interface import Reducer
+from gmijax.collectives.interface import Communicator
 from gmijax.config import TrainConfig
 from gmijax.learning.episode_films import EpisodeFilms
 from gmijax.learning.episodes import EpisodeRunner, Episodes, Options
@@ -74,7 +74,7 @@ class Evaluator:
       env: see `evaluation_worlds`.
       learner: the networks.
       config: of the run.
-      reducer: among the GMIs that train.
+      comm: among the GMIs that train.
       run: the run folder, in which the leader leaves what is to be filmed.
 
     Attributes:
@@ -86,13 +86,13 @@ class Evaluator:
     """
 
     def __init__(
-        self, env: Env, learner: Learner, config: TrainConfig, reducer: Reducer, run: RunPaths
+        self, env: Env, learner: Learner, config: TrainConfig, comm: Communicator, run: RunPaths
     ) -> None:
         assert config.eval.every is not None
         self._every, self._num_episodes = config.eval.every, config.eval.episodes
-        self._reducer = reducer
-        num_envs = -(-self._num_episodes // reducer.world_size)
-        first = reducer.rank * num_envs
+        self._comm = comm
+        num_envs = -(-self._num_episodes // comm.world_size)
+        first = comm.rank * num_envs
         self._num_own = min(max(0, self._num_episodes - first), num_envs)
         options = Options(
             num_envs=num_envs,
@@ -104,14 +104,14 @@ class Evaluator:
         )
         self._runner = EpisodeRunner(env, learner, options)
         self._films: EpisodeFilms | None = None
-        if config.eval.video and reducer.rank == 0:
+        if config.eval.video and comm.rank == 0:
             self._films = EpisodeFilms(config, env, run)
         self.best = -math.inf
         self.wall_s = 0.0
 
     def _num_recorded(self, config: TrainConfig) -> int:
         """Of how many episodes the positions are kept."""
-        if not config.eval.video or self._reducer.rank > 0:
+        if not config.eval.video or self._comm.rank > 0:
             return 1  # The least that a runner keeps.
         return max(1, min(self._num_own, MOST_RECORDED))
 
@@ -143,7 +143,7 @@ class Evaluator:
           must_stop: whether the job is to end; if so on any GMI, the evaluation is given up.
 
         Raises:
-          PeerLost, CollectiveTimeout: see `Reducer.all_gather`.
+          PeerLost, CollectiveTimeout: see `Communicator.all_gather`.
         """
         started = time.monotonic()
         is_given_up = False
@@ -153,7 +153,7 @@ class Evaluator:
             nonlocal is_given_up
             beat()
             mine = np.array([running, must_stop()], np.float32)
-            some_run, some_stop = self._reducer.all_gather(mine).sum(axis=0)
+            some_run, some_stop = self._comm.all_gather(mine).sum(axis=0)
             is_given_up = bool(some_stop)
             return bool(some_run) and not is_given_up
 
@@ -184,5 +184,5 @@ class Evaluator:
     def _means(self, columns: list[npt.NDArray[np.generic]]) -> list[float]:
         """The mean over all episodes of each column [N]."""
         own = [values[: self._num_own].sum(dtype=np.float64) for values in columns]
-        sums = self._reducer.all_gather(np.array(own, np.float32))
+        sums = self._comm.all_gather(np.array(own, np.float32))
         return [float(total) / self._num_episodes for total in sums.sum(axis=0, dtype=np.float64)]

@@ -1,6 +1,6 @@
 """The training loop of a GMI, whatever the algorithm: start, metrics, evaluations, checkpoints.
 
-Every GMI that trains runs this same routine; the reducer keeps them in step and makes their
+Every GMI that trains runs this same routine; the communicator keeps them in step and makes their
 learner states equal. The leader (rank 0) alone writes metrics and the shared part of checkpoints.
 """
 
@@ -16,7 +16,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from gmijax.collectives.interface import Reducer, TracedStep
+from gmijax.collectives.interface import Communicator, TracedStep
 from gmijax.devices import describe_device
 from gmijax.errors import CollectiveError
 from gmijax.learning.algorithm import Algorithm
@@ -45,7 +45,7 @@ class TrainingLoop:
       learner: its networks, optimiser and hyper-parameters.
       env: the environments of all members; where others make the rollouts, like theirs.
       iteration: the program of an iteration, of all members.
-      reducer: among the GMIs that train.
+      comm: among the GMIs that train.
       link: to the controller.
       remote: how many other GMIs simulate for this one, which then has no environments.
       times: seconds of other parts of the last iteration, by the names that they are logged under.
@@ -59,7 +59,7 @@ class TrainingLoop:
         learner: Learner,
         env: BatchedEnv,
         iteration: TracedStep,
-        reducer: Reducer,
+        comm: Communicator,
         link: ChildLink,
         *,
         remote: int = 0,
@@ -67,23 +67,23 @@ class TrainingLoop:
         exchange: Mapping[str, str] = MappingProxyType({}),
     ) -> None:
         self._members, self._algorithm, self._learner = members, algorithm, learner
-        self._env, self._iteration, self._reducer, self._link = env, iteration, reducer, link
+        self._env, self._iteration, self._comm, self._link = env, iteration, comm, link
         self._config = config = members.first.config
         self._remote, self._other_times, self._exchange = remote, times, exchange
-        self._is_leader = reducer.rank == 0
+        self._is_leader = comm.rank == 0
         self._steps_per_iteration = (
-            config.envs_per_gmi * config.algo.unroll_length * reducer.world_size * (remote or 1)
+            config.envs_per_gmi * config.algo.unroll_length * comm.world_size * (remote or 1)
         )
         self._meter: ThroughputMeter | None = None
         # A GMI without environments cannot measure how fast they are.
         if config.run.measure_throughput and members.is_one and not remote:
-            self._meter = ThroughputMeter(env, learner, config, reducer)
+            self._meter = ThroughputMeter(env, learner, config, comm)
         self._evaluator: Evaluator | None = None
         if config.eval.every is not None:
-            envs = evaluation_worlds(config, reducer.rank, reducer.world_size)
-            self._evaluator = Evaluator(envs, learner, config, reducer, members.first.run)
+            envs = evaluation_worlds(config, comm.rank, comm.world_size)
+            self._evaluator = Evaluator(envs, learner, config, comm, members.first.run)
         self._env_steps = self._iterations = 0
-        self._saver = CheckpointSaver(link.gmi, reducer, config.run.keep_checkpoints)
+        self._saver = CheckpointSaver(link.gmi, comm, config.run.keep_checkpoints)
         traced = config.run.profiled if self._is_leader and members.is_one else None
         self._trace = IterationTrace(traced, members.first.run.profile)
 
@@ -105,7 +105,7 @@ class TrainingLoop:
         waited_s = self._compile(state, env_state)
         compile_s = time.monotonic() - started_s - waited_s
         self._link.beat("ready", 0)
-        self._reducer.all_gather(np.zeros(1, np.float32))  # All have compiled: the clock starts.
+        self._comm.all_gather(np.zeros(1, np.float32))  # All have compiled: the clock starts.
         config = self._config
         if config.algo.warms_up and config.run.resume is None:
             state, env_state = warm_up(self._iteration, state, env_state)
@@ -143,7 +143,7 @@ class TrainingLoop:
         return state
 
     def _first_envs(self, member: Member) -> Any:
-        ranks = self._reducer
+        ranks = self._comm
         return first_envs(
             self._env, member.config, ranks.rank, gmi=self._link.gmi, num_gmis=ranks.world_size
         )
@@ -170,7 +170,7 @@ class TrainingLoop:
                 self._env_steps,
                 self._env.spec.episode_length * steps_at_once,
                 self._link.gmi,
-                self._reducer.world_size,
+                self._comm.world_size,
                 is_leader=self._is_leader,
             )
 
@@ -236,7 +236,7 @@ class TrainingLoop:
     def _agree_to_stop(self) -> bool:
         # Only one GMI may have heard of it yet; all must leave after the same iteration.
         mine = np.array([self._link.stop_requested, self._saver.is_written], np.float32)
-        stops, are_written = self._reducer.all_gather(mine).T
+        stops, are_written = self._comm.all_gather(mine).T
         if are_written.all():
             self._saver.name()
         return bool(stops.any())
@@ -251,10 +251,10 @@ class TrainingLoop:
         """Begins to write a checkpoint of every run; training goes on meanwhile."""
         self._iteration.wait()
         thread.wait()  # A resumed run goes on from the lines up to its checkpoint.
-        require_equal(self._reducer, self._link.gmi, state.params, self._env_steps)
+        require_equal(self._comm, self._link.gmi, state.params, self._env_steps)
         parts = self._members.parts(
             self._env_steps,
-            self._reducer.world_size,
+            self._comm.world_size,
             state,
             env_state,
             evaluation,

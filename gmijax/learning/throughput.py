@@ -15,7 +15,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from gmijax.collectives.interface import Reducer
+from gmijax.collectives.interface import Communicator
 from gmijax.config import TrainConfig
 from gmijax.learning.learner import Learner, TrainState, acting_weights
 from gmijax.learning.unroll import Drawn, act, unroll
@@ -30,12 +30,12 @@ class ThroughputMeter:
     """Measures both rates; every GMI of the job must use it in the same way."""
 
     def __init__(
-        self, env: BatchedEnv, learner: Learner, config: TrainConfig, reducer: Reducer
+        self, env: BatchedEnv, learner: Learner, config: TrainConfig, comm: Communicator
     ) -> None:
         self._model = env.model
         self._num_envs = config.envs_per_gmi
         self._steps = config.algo.unroll_length
-        self._reducer = reducer
+        self._comm = comm
         self._programs: dict[str, Any] = {
             name: jax.jit(partial(_moved, env, choose, self._steps), donate_argnums=(2,))
             for name, choose in (
@@ -74,7 +74,7 @@ class ThroughputMeter:
         beat: Callable[[], None],
     ) -> tuple[float, BatchState]:
         def timed(repeats: int, envs: BatchState) -> tuple[float, BatchState]:
-            self._reducer.all_gather(np.zeros(1, np.float32))
+            self._comm.all_gather(np.zeros(1, np.float32))
             started = time.monotonic()
             for _ in range(repeats):
                 envs = move(envs)
@@ -85,7 +85,7 @@ class ThroughputMeter:
 
         _, env_state = timed(1, env_state)
         once_s, env_state = timed(1, env_state)
-        slowest_s = float(self._reducer.all_gather(np.array([once_s], np.float32)).max())
+        slowest_s = float(self._comm.all_gather(np.array([once_s], np.float32)).max())
         repeats = max(1, min(1000, round(_BLOCK_S / slowest_s)))
         seconds = []
         for _ in range(_BLOCKS):
@@ -93,7 +93,7 @@ class ThroughputMeter:
             seconds.append(block_s)
         steps = self._num_envs * self._steps * repeats
         mine = np.array([steps / statistics.median(seconds)], np.float32)
-        return float(self._reducer.all_gather(mine).sum()), env_state
+        return float(self._comm.all_gather(mine).sum()), env_state
 
 
 def _moved(

@@ -8,7 +8,7 @@ from typing import Any, TypeAlias
 import jax
 import jax.numpy as jnp
 
-from gmijax.collectives.interface import Peers
+from gmijax.collectives.interface import Collectives
 from gmijax.config import AlgoConfig
 from gmijax.learning.learner import Learner, TrainState, apply_gradients, learner_shapes
 from gmijax.learning.normalize import Moments
@@ -46,7 +46,7 @@ def exchange_size(spec: EnvSpec, config: AlgoConfig, losses: Any) -> int:
 
 def run_updates(
     learner: Learner,
-    peers: Peers,
+    collectives: Collectives,
     gradients: Gradients,
     state: TrainState,
     data: PyTree,
@@ -58,13 +58,13 @@ def run_updates(
 
     Args:
       learner: of this trainer.
-      peers: the trainers.
+      collectives: the trainers.
       gradients: see `Gradients`.
       state: of the learner.
       data: of this trainer.
       context: what stays the same in all updates.
       order: indices into `data` [minibatches, B].
-      after: result of the exchange before, see `Peers`.
+      after: result of the exchange before, see `Collectives`.
 
     Returns:
       The new state; losses and learning rates of all updates, with a leading axis.
@@ -72,7 +72,7 @@ def run_updates(
 
     def update(state: TrainState, indices: Array) -> tuple[TrainState, tuple[Any, Array]]:
         own = gradients(learner, state.params, data, context, indices)
-        grads, losses = peers.mean(own, after=after)
+        grads, losses = collectives.mean(own, after=after)
         state = apply_gradients(learner, state, grads, losses.steering_kl)
         return state, (losses, state.learning_rate)
 

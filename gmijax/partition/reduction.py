@@ -1,7 +1,7 @@
 """Which reduction strategies a layout allows, and which one it gets: rules, no jax.
 
-The controller checks a plan with them before it starts anything, and `gmijax.collectives.build`
-refuses by the same rules in a GMI.
+The controller checks a plan with them before it starts anything, and
+`gmijax.collectives.communicator` refuses by the same rules in a GMI.
 """
 
 from __future__ import annotations

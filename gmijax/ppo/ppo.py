@@ -13,7 +13,7 @@ from functools import partial
 import jax
 import jax.numpy as jnp
 
-from gmijax.collectives.interface import Peers
+from gmijax.collectives.interface import Collectives
 from gmijax.learning.algorithm import Algorithm, IterationMetrics
 from gmijax.learning.learner import (
     TrainState,
@@ -38,22 +38,22 @@ from gmijax.types import Array, PyTree
 def iterate(
     env: BatchedEnv,
     learner: PpoLearner,
-    peers: Peers,
+    collectives: Collectives,
     model: PyTree,
     state: TrainState,
     env_state: BatchState,
 ) -> tuple[TrainState, BatchState, IterationMetrics]:
-    """One iteration, together with the GMIs `peers`."""
+    """One iteration, together with the GMIs of `collectives`."""
     weights = acting_weights(learner, state)
     env_state, samples, trajectory, stats = rollout(env, learner, model, weights, env_state)
     again = trajectory if learner.config.recompute_advantages else None
-    state, metrics = learn(learner, peers, state, samples, stats, again)
+    state, metrics = learn(learner, collectives, state, samples, stats, again)
     return state, env_state, metrics
 
 
 def learn(
     learner: PpoLearner,
-    peers: Peers,
+    collectives: Collectives,
     state: TrainState,
     samples: Samples,
     stats: RolloutStats,
@@ -65,19 +65,19 @@ def learn(
     The statistics of observations change only after all updates: the policy that is updated sees
     the observations exactly as the policy that acted did, and the first probability ratio is 1.
     """
-    everyone = peers.gather(stats)
+    everyone = collectives.all_gather(stats)
     stats = merge_stats(everyone)
     state = with_targets(learner, state, stats.target)
     context = update_context(learner, state, stats)
-    order = minibatch_order(learner.config, state, peers.rank(), samples.advantage.size)
+    order = minibatch_order(learner.config, state, collectives.rank(), samples.advantage.size)
     if trajectory is None:
         state, losses, rates = run_updates(
-            learner, peers, gradients, state, flat(samples), context, order, after=everyone
+            learner, collectives, gradients, state, flat(samples), context, order, after=everyone
         )
     else:
         passes = order.reshape(learner.config.num_updates_per_batch, -1, order.shape[-1])
         state, losses, rates = _updates_by_pass(
-            learner, peers, state, samples, trajectory, context, passes, everyone
+            learner, collectives, state, samples, trajectory, context, passes, everyone
         )
     means = jax.tree.map(jnp.mean, losses)
     state = finish_iteration(learner, state, stats.obs)
@@ -97,7 +97,7 @@ def flat(samples: Samples) -> Samples:
 
 def _updates_by_pass(
     learner: PpoLearner,
-    peers: Peers,
+    collectives: Collectives,
     state: TrainState,
     samples: Samples,
     trajectory: Trajectory,
@@ -109,11 +109,11 @@ def _updates_by_pass(
 
     def one_pass(state: TrainState, order: Array) -> tuple[TrainState, tuple[PpoLosses, Array]]:
         renewed = valued_anew(learner, acting_weights(learner, state), samples, trajectory)
-        everyone = peers.gather(moments_of(renewed.advantage, 2), after=after)
+        everyone = collectives.all_gather(moments_of(renewed.advantage, 2), after=after)
         mean, std = advantage_scale(learner, merge_all(everyone))
         now = context._replace(advantage_mean=mean, advantage_std=std)
         state, losses, rates = run_updates(
-            learner, peers, gradients, state, flat(renewed), now, order, after=everyone
+            learner, collectives, gradients, state, flat(renewed), now, order, after=everyone
         )
         return state, (losses, rates)
 

@@ -18,7 +18,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
 
-from gmijax.collectives.interface import FloatBuffer, Peers, Reducer
+from gmijax.collectives.interface import Collectives, Communicator, FloatBuffer
 from gmijax.learning.algorithm import IterationMetrics
 from gmijax.learning.learner import (
     ActingWeights,
@@ -59,10 +59,10 @@ class RemoteIteration:
     """An iteration on rollouts that other GMIs make: `TracedStep`; here are no environments."""
 
     def __init__(
-        self, env: BatchedEnv, learner: PpoLearner, reducer: Reducer, workers: RolloutWorkers
+        self, env: BatchedEnv, learner: PpoLearner, comm: Communicator, workers: RolloutWorkers
     ) -> None:
         self._workers = workers
-        self._step = reducer.program(partial(_learn_from, env, learner), donates_own=False)
+        self._step = comm.program(partial(_learn_from, env, learner), donates_own=False)
         self._pack: Any = jax.jit(lambda state: pack_weights(acting_weights(learner, state)))
         self._first: _Answers | None = None
         self._timeout_s: float | None = workers.start_timeout_s
@@ -158,7 +158,7 @@ def _rollout(
 def _learn_from(
     env: BatchedEnv,
     learner: PpoLearner,
-    peers: Peers,
+    collectives: Collectives,
     _: Any,
     state: TrainState,
     answers: _Answers,
@@ -168,5 +168,5 @@ def _learn_from(
     joined = jax.tree.map(lambda *parts: jnp.concatenate(parts, axis=1), *samples)
     unpack = ravel_pytree(no_stats(env.spec, env.overflows))[1]
     stats = merge_stats(jax.vmap(unpack)(jnp.stack(packed)))
-    state, metrics = learn(learner, peers, state, joined, stats)
+    state, metrics = learn(learner, collectives, state, joined, stats)
     return state, (), metrics

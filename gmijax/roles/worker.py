@@ -5,7 +5,7 @@ from __future__ import annotations
 import sys
 from typing import TYPE_CHECKING, Any
 
-from gmijax.collectives.host.host_exchange import HostExchange
+from gmijax.collectives.host.shared_memory_group import SharedMemoryGroup
 from gmijax.collectives.messages.group import GroupReducer
 from gmijax.collectives.messages.messenger import Messenger
 from gmijax.collectives.messages.pipe_block import PipeBlock
@@ -35,9 +35,9 @@ def _run(link: ChildLink) -> dict[str, Any]:
     sys.path[:] = config["script"]["sys_path"]  # As where the job was started.
     role, args = shipping.load(link.paths.role.read_bytes(), config["script"])
 
-    def build(num_floats: int) -> HostExchange:
+    def build(num_floats: int) -> SharedMemoryGroup:
         timeout_s = config["timeout_s"]
-        return HostExchange(
+        return SharedMemoryGroup(
             *(required_fd(ENV_EXCHANGE_FD), link.gmi, plan.layout.num_gmis, num_floats),
             timeout_s=timeout_s,
             rendezvous_timeout_s=timeout_s,

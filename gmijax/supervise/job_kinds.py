@@ -48,7 +48,7 @@ class JobKind:
     module: str  # Main of every GMI, started by name.
     # Whether all GMIs run the same programs, so that one compiles them for all.
     compile_once: bool = True
-    # The memory that the GMIs of a plan share, beside that of the reducer.
+    # The memory that the GMIs of a plan share, beside that of the communicator.
     shared: Callable[[Plan], SharedBlocks] = lambda _: MappingProxyType({})
     # Between GMIs of different nodes, which connect by TCP: who listens, and who calls.
     calls: Callable[[Plan], Sequence[tuple[int, int]]] = lambda _: ()

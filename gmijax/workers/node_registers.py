@@ -10,13 +10,13 @@ from contextlib import ExitStack
 
 from gmijax.a3c.job_registers import JobRegisters, register_bytes
 from gmijax.collectives.channel.tcp_registers import RemoteRegisters
-from gmijax.collectives.nodes.meeting import Nodes
+from gmijax.collectives.nodes.rendezvous import NodeAddresses
 
 
 def over_nodes(
     local: JobRegisters,
     sizes: tuple[int, int],
-    nodes: Nodes,
+    nodes: NodeAddresses,
     gmi: int,
     agents: tuple[int, ...],
     leader: int,

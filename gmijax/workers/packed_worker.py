@@ -30,7 +30,7 @@ def _run(link: ChildLink) -> None:
     runs = [RunPaths(Path(root)) for root in json.loads(os.environ[MEMBERS_VARIABLE])]
     configs = [from_dict(TrainConfig, read_json(run.config)) for run in runs]
     # jax starts here, in the environment that the plan prepared.
-    from gmijax.collectives.build import SoloReducer
+    from gmijax.collectives.communicator import SingleRankCommunicator
     from gmijax.devices import start_device
     from gmijax.learning.algorithm import iterate_all, load_algorithm
     from gmijax.learning.loop import TrainingLoop
@@ -44,10 +44,10 @@ def _run(link: ChildLink) -> None:
     env = environments(replace(first, num_envs=len(runs) * first.num_envs), 0)
     pairs = zip(configs, runs, strict=True)
     members = Members([Member(config, run) for config, run in pairs], link.gmi)
-    algorithm, reducer = load_algorithm(first.algo), SoloReducer()
+    algorithm, comm = load_algorithm(first.algo), SingleRankCommunicator()
     learner = algorithm.make_learner(env.spec, first.algo)
-    iteration = reducer.program(partial(iterate_all, algorithm.iterate, env, learner))
-    TrainingLoop(members, algorithm, learner, env, iteration, reducer, link).run()
+    iteration = comm.program(partial(iterate_all, algorithm.iterate, env, learner))
+    TrainingLoop(members, algorithm, learner, env, iteration, comm, link).run()
 
 
 if __name__ == "__main__":

@@ -13,8 +13,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from gmijax.collectives.build import Membership, build_reducer
-from gmijax.collectives.interface import Peers, Reducer
+from gmijax.collectives.communicator import CommunicatorConfig, make_communicator
+from gmijax.collectives.interface import Collectives, Communicator
 from gmijax.control.strategy_selection import CHAIN, TIMEOUT_S, block_variable
 from gmijax.errors import DeviceMemoryUnavailable
 from gmijax.partition.plan import Plan
@@ -35,23 +35,23 @@ def _measure(link: ChildLink) -> dict[str, Any]:
     rows: list[dict[str, Any]] = []
     for number, probe in enumerate(task["probes"]):
         try:
-            reducer = _reducer(plan, link.gmi, number, probe)
+            comm = _communicator(plan, link.gmi, number, probe)
         except DeviceMemoryUnavailable as error:  # On all ranks alike, so all go on.
             rows.append({"why_not": str(error)})
         else:
-            rows.append(_times(reducer, probe["num_floats"], task["calls"]))
-            reducer.close()
+            rows.append(_times(comm, probe["num_floats"], task["calls"]))
+            comm.close()
         link.beat("running", number)
     import jax
 
     return {"rows": rows, "device": jax.local_devices()[0].device_kind}
 
 
-def _reducer(plan: Plan, gmi: int, number: int, probe: Mapping[str, Any]) -> Reducer:
-    """The reducer of one probe, with a shared block of its own."""
-    return build_reducer(
+def _communicator(plan: Plan, gmi: int, number: int, probe: Mapping[str, Any]) -> Communicator:
+    """The communicator of one probe, with a shared block of its own."""
+    return make_communicator(
         probe["strategy"],
-        Membership(
+        CommunicatorConfig(
             layout=plan.layout,
             rank=gmi,
             num_floats=probe["num_floats"],
@@ -63,9 +63,9 @@ def _reducer(plan: Plan, gmi: int, number: int, probe: Mapping[str, Any]) -> Red
     )
 
 
-def _times(reducer: Reducer, num_floats: int, calls: int) -> dict[str, float]:
+def _times(comm: Communicator, num_floats: int, calls: int) -> dict[str, float]:
     """Seconds of a mean alone, and of one of many that need each other, as in training."""
-    alone, chain = _means(reducer, num_floats, 1, 1), _means(reducer, num_floats, CHAIN, STEPS)
+    alone, chain = _means(comm, num_floats, 1, 1), _means(comm, num_floats, CHAIN, STEPS)
     for _ in range(WARM_UP_CALLS):
         alone()
         chain()
@@ -76,15 +76,17 @@ def _times(reducer: Reducer, num_floats: int, calls: int) -> dict[str, float]:
     return {"median_s": middle, "p10_s": low, "p90_s": high, "chained_s": chained}
 
 
-def _means(reducer: Reducer, num_floats: int, length: int, steps: int) -> Callable[[], None]:
+def _means(comm: Communicator, num_floats: int, length: int, steps: int) -> Callable[[], None]:
     """`steps` steps of `length` means each, queued as whole steps of training are."""
     import jax
     import jax.numpy as jnp
 
-    def step(peers: Peers, _: Any, buffer: jax.Array, own: Any) -> tuple[jax.Array, Any, Any]:
-        return jax.lax.fori_loop(0, length, lambda _, b: peers.mean(b), buffer), own, ()
+    def step(
+        collectives: Collectives, _: Any, buffer: jax.Array, own: Any
+    ) -> tuple[jax.Array, Any, Any]:
+        return jax.lax.fori_loop(0, length, lambda _, b: collectives.mean(b), buffer), own, ()
 
-    program = reducer.program(step)
+    program = comm.program(step)
     carried = [(jnp.ones(num_floats), ())]
     program.trace((), *carried[0])
     program.compile()

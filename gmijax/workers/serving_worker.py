@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from gmijax.collection.collectors import Share
     from gmijax.collection.programs import ActingPolicy
     from gmijax.collection.recording import ShardWriter
-    from gmijax.collectives.interface import Reducer
+    from gmijax.collectives.interface import Communicator
     from gmijax.sim.interface import EnvSpec
 
 
@@ -50,15 +50,15 @@ def _run(link: ChildLink) -> dict[str, Any]:
     policy = _policy(config, env.spec)
     first, num_unrolls = _unrolls(config, rank, len(group.gmis)) if own == SIMULATOR else (0, 0)
     with ExitStack() as held:
-        reducer = _reducer(config, plan, link)
-        held.callback(reducer.close)
+        comm = _communicator(config, plan, link)
+        held.callback(comm.close)
         writer = None
         if own == SIMULATOR and config.output.dir is not None:
             writer = _writer(config, rank, first, policy)
             held.callback(writer.close)
         share = Share(
             *(config, link, env, policy, rank, first, num_unrolls, writer),
-            barrier=lambda: reducer.all_gather(np.zeros(1, np.float32)),
+            barrier=lambda: comm.all_gather(np.zeros(1, np.float32)),
         )
         result = _work(share, plan, held)
     written = {} if writer is None else {"shards": writer.num_written, "bytes": writer.num_bytes}
@@ -124,13 +124,13 @@ def _writer(config: ServeConfig, rank: int, first: int, policy: ActingPolicy) ->
     return ShardWriter(paths, rank, first, about, compress=config.output.compress)
 
 
-def _reducer(config: ServeConfig, plan: Plan, link: ChildLink) -> Reducer:
+def _communicator(config: ServeConfig, plan: Plan, link: ChildLink) -> Communicator:
     """Serves as a barrier of all GMIs; it needs no gradients."""
-    from gmijax.collectives.build import Membership, build_reducer
+    from gmijax.collectives.communicator import CommunicatorConfig, make_communicator
 
-    return build_reducer(
+    return make_communicator(
         "mpr" if plan.layout.num_gmis > 1 else "none",
-        Membership(
+        CommunicatorConfig(
             layout=plan.layout,
             rank=link.gmi,
             num_floats=1,

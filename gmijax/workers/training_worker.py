@@ -17,7 +17,7 @@ from functools import partial
 from socket import socket
 from typing import TYPE_CHECKING, Any
 
-from gmijax.collectives.nodes.meeting import Nodes, inherited_nodes
+from gmijax.collectives.nodes.rendezvous import NodeAddresses, inherited_nodes
 from gmijax.config import TrainConfig
 from gmijax.config.schema import from_dict
 from gmijax.partition.plan import Plan
@@ -27,7 +27,7 @@ from gmijax.supervise.child import ENV_PIPES_FD, ChildLink, required_fd, run_gmi
 from gmijax.supervise.job_kinds import ENV_CHANNELS_FD, ENV_REGISTERS_FD, groups_of, topology_of
 
 if TYPE_CHECKING:
-    from gmijax.collectives.interface import Reducer
+    from gmijax.collectives.interface import Communicator
     from gmijax.learning.learner import Learner
     from gmijax.ppo.tdg_ex import RemoteIteration
     from gmijax.sim.wrappers import BatchedEnv
@@ -77,18 +77,18 @@ def _run_synchronous(
     algorithm = load_algorithm(config.algo)
     learner = algorithm.make_learner(env.spec, config.algo)
     num_averaged = algorithm.num_averaged(env.spec, config.algo)
-    reducer = _trainers_reducer(config, plan, trainers, link, num_averaged, *inherited_nodes())
-    held.callback(reducer.close)
+    comm = _trainers_communicator(config, plan, trainers, link, num_averaged, *inherited_nodes())
+    held.callback(comm.close)
     members = Members([Member(config, link.run)], link.gmi)
     loop = partial(TrainingLoop, members, algorithm, learner, env)
-    exchange = exchange_used(plan, reducer)
+    exchange = exchange_used(plan, comm)
     if not is_apart:
-        iteration = reducer.program(partial(algorithm.iterate, env, learner))
-        loop(iteration, reducer, link, exchange=exchange).run()
+        iteration = comm.program(partial(algorithm.iterate, env, learner))
+        loop(iteration, comm, link, exchange=exchange).run()
         return None
-    remote, num_workers = _remote_iteration(config, plan, env, learner, reducer, link, held)
+    remote, num_workers = _remote_iteration(config, plan, env, learner, comm, link, held)
     times = remote.times
-    loop(remote, reducer, link, remote=num_workers, times=times, exchange=exchange).run()
+    loop(remote, comm, link, remote=num_workers, times=times, exchange=exchange).run()
     remote.close()
     return None
 
@@ -98,7 +98,7 @@ def _remote_iteration(
     plan: Plan,
     env: BatchedEnv,
     learner: Learner,
-    reducer: Reducer,
+    comm: Communicator,
     link: ChildLink,
     held: ExitStack,
 ) -> tuple[RemoteIteration, int]:
@@ -112,7 +112,7 @@ def _remote_iteration(
     mail = Messenger(block, config.reduce.timeout_s)
     here = _neighbours(plan, link.gmi, AGENT)
     workers = RolloutWorkers(mail, here, config.run.start_timeout_s)
-    return RemoteIteration(env, learner, reducer, workers), len(here)
+    return RemoteIteration(env, learner, comm, workers), len(here)
 
 
 def _serve_rollouts(
@@ -185,12 +185,12 @@ def _run_asynchronous(
     receiver = open_receiver(*channels)
     held.callback(receiver.close)
     num_averaged = exchange_size(env.spec, config.algo, A3cLosses)
-    reducer = _trainers_reducer(config, plan, trainers, link, num_averaged, nodes, listener)
+    comm = _trainers_communicator(config, plan, trainers, link, num_averaged, nodes, listener)
     if listener is not None:
         listener.close()  # Trainers that are all on one node do not meet others.
-    held.callback(reducer.close)
-    trainer = Trainer(config, env, agents.gmis, registers, receiver, reducer, link)
-    return trainer.run() | exchange_used(plan, reducer)
+    held.callback(comm.close)
+    trainer = Trainer(config, env, agents.gmis, registers, receiver, comm, link)
+    return trainer.run() | exchange_used(plan, comm)
 
 
 def environments(config: TrainConfig, place: int) -> BatchedEnv:
@@ -202,24 +202,24 @@ def environments(config: TrainConfig, place: int) -> BatchedEnv:
     return training_env(worlds_of(config, place), random_ep_len=random_ep_len)
 
 
-def _trainers_reducer(
+def _trainers_communicator(
     config: TrainConfig,
     plan: Plan,
     trainers: Group,
     link: ChildLink,
     num_averaged: int,
-    nodes: Nodes | None,
+    nodes: NodeAddresses | None,
     listener: socket | None,
-) -> Reducer:
-    """The reducer among the trainers, whose ranks are their places in the group.
+) -> Communicator:
+    """The communicator among the trainers, whose ranks are their places in the group.
 
     It averages `num_averaged` float32 in every update: a gradient and the parts of the loss.
     """
-    from gmijax.collectives.build import Membership, build_reducer
+    from gmijax.collectives.communicator import CommunicatorConfig, make_communicator
 
     if nodes is not None:
         nodes = nodes.among(nodes_of(plan.layout, trainers.gmis))
-    membership = Membership(
+    comm_config = CommunicatorConfig(
         layout=trainers.layout,
         rank=trainers.gmis.index(link.gmi),
         gmis=trainers.gmis,
@@ -233,14 +233,14 @@ def _trainers_reducer(
         nodes=nodes,
         listener=listener,
     )
-    return build_reducer(plan.strategy, membership)
+    return make_communicator(plan.strategy, comm_config)
 
 
-def exchange_used(plan: Plan, reducer: Reducer) -> dict[str, str]:
+def exchange_used(plan: Plan, comm: Communicator) -> dict[str, str]:
     """For the summary: the exchange in use, where it may differ from the plan's strategy."""
-    if reducer.strategy != plan.strategy:
-        return {"strategy": reducer.strategy, "intra": "host"}
-    return {"intra": reducer.intra} if plan.strategy == "har" else {}
+    if comm.strategy != plan.strategy:
+        return {"strategy": comm.strategy, "intra": "host"}
+    return {"intra": comm.intra} if plan.strategy == "har" else {}
 
 
 def _neighbours(plan: Plan, gmi: int, role: str) -> tuple[int, ...]:

@@ -177,7 +177,7 @@ def _inject_in_training(faults: Faults) -> None:
     import jax
     import jax.numpy as jnp
 
-    from gmijax.collectives.host.host_exchange import HostExchange
+    from gmijax.collectives.host.shared_memory_group import SharedMemoryGroup
     from gmijax.collectives.program import ProgramStep
     from gmijax.learning import checkpoint
     from gmijax.learning.throughput import ThroughputMeter
@@ -211,7 +211,7 @@ def _inject_in_training(faults: Faults) -> None:
             own = jax.tree.map(nan, own)
         return iterate(self, shared, own)
 
-    _before(HostExchange, "sum", lambda *_: faults.at("mean"))
+    _before(SharedMemoryGroup, "all_reduce", lambda *_: faults.at("mean"))
     _before(TrainingLog, "write", lambda *_: faults.at("report"))
     _before(ThroughputMeter, "measure", lambda *_: faults.at("measuring"))
     _before(checkpoint, "_sync", synced)

@@ -18,7 +18,7 @@ from supervision import TESTS, gpu, machine, make_launch, planned
 from training_jobs import wait_until
 
 from gmijax.cluster.node import TrainingNode
-from gmijax.collectives.nodes.meeting import Nodes
+from gmijax.collectives.nodes.rendezvous import NodeAddresses
 from gmijax.errors import BackendUnavailable, GmiFailed, JobInterrupted
 from gmijax.machine.mps_control import PIPE_VARIABLE, MpsControl
 from gmijax.machine.nvidia import MigInstance
@@ -264,7 +264,7 @@ def test_two_nodes_of_one_machine_use_the_daemon_of_the_first(
         assert daemons.keys() == {gpu(0).uuid}
         assert len(mps.told("start")) == 1
         for gmi, node in enumerate(nodes):
-            node.introduce(Nodes(gmi, tuple(leaders), b"token"))
+            node.set_addresses(NodeAddresses(gmi, tuple(leaders), b"token"))
             pid = node.start(gmi, False)
             assert isinstance(pid, int)
             deadline_s = time.monotonic() + 30

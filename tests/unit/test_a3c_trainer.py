@@ -9,8 +9,8 @@ from toy_env import point_mass
 from gmijax.a3c.job_registers import JobRegisters
 from gmijax.a3c.trainer import Trainer
 from gmijax.cli.compose import compose
-from gmijax.collectives.build import SoloReducer
 from gmijax.collectives.channel.batcher import Batch
+from gmijax.collectives.communicator import SingleRankCommunicator
 from gmijax.runs.folder import RunPaths
 from gmijax.supervise.child import ChildLink
 
@@ -35,7 +35,7 @@ def _trainer(tmp_path, *versions: list[int]) -> Trainer:
         (1,),
         JobRegisters(None, None, ()),
         _Arrivals(*versions),
-        SoloReducer(),
+        SingleRankCommunicator(),
         ChildLink(0, RunPaths(tmp_path), None, None),
     )
     trainer._version = 10
@@ -56,5 +56,5 @@ def test_fresh_unrolls_weigh_as_much_as_those_of_all_trainers(tmp_path) -> None:
     mine = trainer._meet(batch, waited_s)
     assert (trainer._weights_of(batch) * trainer._scale(mine)).tolist() == [4, 0, 0, 0]
     # With another trainer that has four of four.
-    trainer.reducer.world_size = 2
+    trainer.comm.world_size = 2
     assert float(trainer._scale(mine._replace(fresh=5.0))) == pytest.approx(8 / 5)

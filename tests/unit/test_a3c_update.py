@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from axis_peers import run_together
+from axis_collectives import run_together
 from jax.flatten_util import ravel_pytree
 from toy_env import point_mass
 
@@ -18,7 +18,7 @@ from gmijax.a3c.report import histogram_of, mean_and_p99
 from gmijax.a3c.rollout import UnrollPrograms, collect
 from gmijax.a3c.targets import Unrolls, batch_targets
 from gmijax.cli.compose import compose
-from gmijax.collectives.program import PeersOfOne
+from gmijax.collectives.program import LocalCollectives
 from gmijax.learning.learner import (
     acting_weights,
     init_learner,
@@ -58,7 +58,7 @@ def _start(config, num_envs: int = N):
 
 def _alone(learner):
     """The update of a job with one trainer, compiled: `(state, batch, weight) -> state, told`."""
-    program = jax.jit(partial(update, learner, PeersOfOne(), ()))
+    program = jax.jit(partial(update, learner, LocalCollectives(), ()))
 
     def call(state, batch, weight):
         state, _, told = program(state, (batch, weight))

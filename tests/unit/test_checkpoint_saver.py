@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from training_jobs import wait_until
 
-from gmijax.collectives.build import SoloReducer
+from gmijax.collectives.communicator import SingleRankCommunicator
 from gmijax.learning import checkpoint_saver
 from gmijax.learning.checkpoint import restore_envs
 from gmijax.learning.checkpoint_saver import CheckpointSaver, Part
@@ -25,7 +25,7 @@ def part(folder: Path, env_steps: int, envs: Any = None) -> Part:
 
 @pytest.fixture
 def saver() -> CheckpointSaver:
-    return CheckpointSaver(0, SoloReducer(), None)
+    return CheckpointSaver(0, SingleRankCommunicator(), None)
 
 
 def test_training_goes_on_while_a_checkpoint_is_written(

@@ -30,7 +30,7 @@ from gmijax.cluster.node import (
 from gmijax.cluster.ray_nodes import Joined, RayCluster
 from gmijax.cluster.remote_gmi import RemoteNode
 from gmijax.cluster.survey import Surveyed, differences, lines_of_nodes, nodes_as_data
-from gmijax.collectives.nodes.meeting import Nodes
+from gmijax.collectives.nodes.rendezvous import NodeAddresses
 from gmijax.config import ClusterConfig, PlanConfig, ReduceConfig
 from gmijax.errors import (
     BackendUnavailable,
@@ -383,7 +383,7 @@ def test_a_node_starts_polls_and_ends_gmis(
     opened = node.open(launch, 0, "127.0.0.1", {})
     assert not isinstance(opened, BackendUnavailable)
     assert (opened.calls, opened.daemons) == ({}, {})
-    node.introduce(Nodes(0, (opened.leader,), b"token"))
+    node.set_addresses(NodeAddresses(0, (opened.leader,), b"token"))
     pid = node.start(0, False)
     assert isinstance(pid, int)
     node.order(0, "kill")

@@ -14,7 +14,7 @@ import pytest
 from toy_env import point_mass_env
 
 from gmijax.cli.compose import compose
-from gmijax.collectives.build import SoloReducer
+from gmijax.collectives.communicator import SingleRankCommunicator
 from gmijax.config import TrainConfig
 from gmijax.learning.episodes import CHUNK_STEPS
 from gmijax.learning.evaluator import Evaluation, Evaluator
@@ -28,7 +28,7 @@ ENV = point_mass_env(episode_length=2 * CHUNK_STEPS + 10)
 
 
 class Gathering:
-    """`Reducer.all_gather` among threads of this process."""
+    """`Communicator.all_gather` among threads of this process."""
 
     def __init__(self, world_size: int) -> None:
         self.world_size = world_size
@@ -70,8 +70,8 @@ def evaluate(
     beats = [0] * num_gmis
 
     def run(rank: int) -> None:
-        reducer = SoloReducer() if num_gmis == 1 else gathering.of(rank)
-        evaluator = Evaluator(ENV, learner, config, reducer, NOWHERE)
+        comm = SingleRankCommunicator() if num_gmis == 1 else gathering.of(rank)
+        evaluator = Evaluator(ENV, learner, config, comm, NOWHERE)
         evaluator.trace(state)
         evaluator.compile()
 
@@ -118,7 +118,7 @@ def test_all_give_up_when_one_has_heard_that_the_job_is_to_end(config: TrainConf
 
 def test_an_evaluation_is_the_best_if_none_before_was_as_good(config: TrainConfig) -> None:
     learner = make_learner(ENV.spec, config.algo)
-    evaluator = Evaluator(ENV, learner, config, SoloReducer(), NOWHERE)
+    evaluator = Evaluator(ENV, learner, config, SingleRankCommunicator(), NOWHERE)
     states = [init_learner(learner, ENV.spec.obs_size, jax.random.key(k)) for k in (1, 2, 3)]
     evaluator.trace(states[0])
     evaluator.compile()
@@ -135,7 +135,7 @@ def test_an_evaluation_is_the_best_if_none_before_was_as_good(config: TrainConfi
 
 def test_evaluations_come_whenever_so_many_steps_are_done(config: TrainConfig) -> None:
     learner = make_learner(ENV.spec, config.algo)
-    evaluator = Evaluator(ENV, learner, config, SoloReducer(), NOWHERE)
+    evaluator = Evaluator(ENV, learner, config, SingleRankCommunicator(), NOWHERE)
     steps = range(0, 500, 64)
     due = [end for start, end in itertools.pairwise(steps) if evaluator.is_due(end, start)]
     assert due == [128, 256, 320, 448]

@@ -31,5 +31,5 @@ def test_a_fall_back_to_host_memory_is_told(
 ) -> None:
     monkeypatch.setattr("gmijax.partition.reduction._is_installed", lambda *_: True)
     plan = make_plan(machine(1), {"strategy": planned}, gmis_per_gpu=2, backend="share")
-    reducer: Any = SimpleNamespace(strategy=strategy, intra=intra)
-    assert exchange_used(plan, reducer) == said
+    comm: Any = SimpleNamespace(strategy=strategy, intra=intra)
+    assert exchange_used(plan, comm) == said

@@ -18,7 +18,7 @@ import pytest
 
 from gmijax.collectives.nodes import handshake
 from gmijax.collectives.nodes.handshake import Key, Unreachable, accepted, call
-from gmijax.collectives.nodes.meeting import Nodes, connect, listen
+from gmijax.collectives.nodes.rendezvous import NodeAddresses, connect, listen
 from gmijax.errors import CollectiveError
 
 HERE = "127.0.0.1"
@@ -270,7 +270,7 @@ def test_leaders_meet_or_give_up_in_time_whoever_else_knocks(kind: str) -> None:
 
         def meet(node: int) -> str:
             with pytest.raises(CollectiveError) as caught:
-                connect(Nodes(node, addresses, KEY.token), listeners[node], 2, 1.0)
+                connect(NodeAddresses(node, addresses, KEY.token), listeners[node], 2, 1.0)
             return str(caught.value)
 
         started_s = time.monotonic()

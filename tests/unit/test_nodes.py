@@ -15,12 +15,16 @@ from typing import Any
 import numpy as np
 import pytest
 
-from gmijax.collectives.build import Membership, SharedReducer, build_reducer
-from gmijax.collectives.host.host_links import HostLinks
+from gmijax.collectives.communicator import (
+    CommunicatorConfig,
+    MultiRankCommunicator,
+    make_communicator,
+)
+from gmijax.collectives.host.host_transport import HostTransport
 from gmijax.collectives.host.shared_block import MAX_GATHER_FLOATS, create_exchange
-from gmijax.collectives.nodes.meeting import Nodes, connect, listen
 from gmijax.collectives.nodes.mesh import Mesh
-from gmijax.collectives.nodes.node_exchange import NodeExchange
+from gmijax.collectives.nodes.multi_node_group import MultiNodeGroup
+from gmijax.collectives.nodes.rendezvous import NodeAddresses, connect, listen
 from gmijax.collectives.strategies import COSTS, Stage, nodes_s, predicted_s, stages
 from gmijax.errors import CollectiveError, CollectiveTimeout, ConfigError, PeerLost
 from gmijax.partition.layout import Layout
@@ -38,7 +42,7 @@ def meet(tokens: Sequence[bytes], timeout_s: float = 10.0) -> list[Any]:
 
         def come(node: int) -> Any:
             try:
-                nodes = Nodes(node, addresses, tokens[node])
+                nodes = NodeAddresses(node, addresses, tokens[node])
                 return connect(nodes, listeners[node], 1, timeout_s)[0]
             except CollectiveError as error:
                 return error
@@ -80,13 +84,15 @@ def test_a_sum_is_in_the_order_of_nodes_with_the_same_bits_on_all(
     meshes: list[Mesh], num_floats: int
 ) -> None:
     values = np.random.default_rng(0).normal(size=(3, num_floats)).astype(np.float32) * 1e3
-    sums = at_once(*(lambda k=k: meshes[k].sum(values[k], 1) for k in range(3)))
+    sums = at_once(*(lambda k=k: meshes[k].all_reduce(values[k], 1) for k in range(3)))
     for total in sums:
         np.testing.assert_array_equal(total, (values[0] + values[1]) + values[2])
 
 
 def test_a_gather_is_in_the_order_of_nodes(meshes: list[Mesh]) -> None:
-    rows = at_once(*(lambda k=k: meshes[k].gather(np.full(2, k, np.float32)) for k in range(3)))
+    rows = at_once(
+        *(lambda k=k: meshes[k].all_gather(np.full(2, k, np.float32)) for k in range(3))
+    )
     assert all(row.tolist() == [[0, 0], [1, 1], [2, 2]] for row in rows)
 
 
@@ -95,18 +101,20 @@ def test_a_leader_that_hangs_up_and_one_that_does_something_else_are_named(
     meshes: list[Mesh],
 ) -> None:
     ones = np.ones(100, np.float32)
-    different = at_once(lambda: meshes[0].sum(ones, 1), lambda: meshes[1].sum(ones[:50], 1))
+    different = at_once(
+        lambda: meshes[0].all_reduce(ones, 1), lambda: meshes[1].all_reduce(ones[:50], 1)
+    )
     assert [type(error) for error in different] == [CollectiveError] * 2
     assert "GMI 0 calls sum, GMI 10 something else" in str(different[0])
     meshes[1].close()
     with pytest.raises(PeerLost, match="GMI 10 is gone during all_gather between nodes"):
-        meshes[0].gather(ones)
+        meshes[0].all_gather(ones)
 
 
 @pytest.mark.parametrize("meshes", [(2, 0.3)], indirect=True)
 def test_a_leader_that_does_not_come_is_named_in_time(meshes: list[Mesh]) -> None:
     with pytest.raises(CollectiveTimeout, match=r"0\.3 s in sum between nodes.*GMIs \[10\]"):
-        meshes[0].sum(np.ones(3, np.float32), 1)
+        meshes[0].all_reduce(np.ones(3, np.float32), 1)
 
 
 def test_who_does_not_know_the_secret_stays_out() -> None:
@@ -119,16 +127,16 @@ def test_who_does_not_know_the_secret_stays_out() -> None:
 def test_a_leader_that_cannot_be_reached_is_one_of_another_network() -> None:
     with listen(HERE) as own, socket.socket() as nobody:
         nobody.bind((HERE, 0))
-        nodes = Nodes(1, (nobody.getsockname(), own.getsockname()), TOKEN)
+        nodes = NodeAddresses(1, (nobody.getsockname(), own.getsockname()), TOKEN)
         with pytest.raises(CollectiveError, match=r"cannot reach node 0 .*cluster\.interface"):
             connect(nodes, own, 1, 10.0)
 
 
 def test_what_leaders_know_goes_through_a_file() -> None:
-    nodes = Nodes(1, ((HERE, 1234), ("10.0.0.2", 99)), os.urandom(32))
+    nodes = NodeAddresses(1, ((HERE, 1234), ("10.0.0.2", 99)), os.urandom(32))
     fd = nodes.to_file()
     try:
-        assert Nodes.from_file(fd) == nodes
+        assert NodeAddresses.from_file(fd) == nodes
     finally:
         os.close(fd)
 
@@ -144,28 +152,28 @@ def test_small_things_go_over_nodes_in_order_of_rank() -> None:
 
         def gather(rank: int) -> Any:
             node = layout.node_of(rank)
-            membership = Membership(
+            config = CommunicatorConfig(
                 layout=layout,
                 rank=rank,
                 num_floats=10,
                 exchange_fd=blocks[node],
                 timeout_s=10,
                 rendezvous_timeout_s=10,
-                nodes=Nodes(node, addresses, TOKEN),
+                nodes=NodeAddresses(node, addresses, TOKEN),
                 listener=socket.socket(fileno=os.dup(listeners[node].fileno())),
             )
-            reducer = build_reducer("mpr", membership)
-            assert isinstance(reducer, SharedReducer)
+            comm = make_communicator("mpr", config)
+            assert isinstance(comm, MultiRankCommunicator)
             try:
                 # Of all together the last is more than goes through memory at once.
                 sizes = (2, 2, MAX_GATHER_FLOATS // 2)
                 return [
-                    reducer.all_gather(np.full(size, rank + k, np.float32))
+                    comm.all_gather(np.full(size, rank + k, np.float32))
                     for k, size in enumerate(sizes)
                 ]
             finally:
                 met.wait()
-                reducer.close()
+                comm.close()
 
         met = threading.Barrier(4)
         for rows in at_once(*(lambda rank=rank: gather(rank) for rank in range(4))):
@@ -209,16 +217,16 @@ def test_a_layout_on_nodes_has_global_ids_and_ranks_in_nodes() -> None:
 
 def test_the_stages_of_nodes_are_those_of_har_on_as_many_gpus() -> None:
     assert stages("mpr", Layout.even(1, 2).on_nodes(2)) == [
-        Stage("sum", "host", ((0, 1), (2, 3))),
-        Stage("sum", "nodes", ((0, 1), (2, 3))),
+        Stage("all_reduce", "host", ((0, 1), (2, 3))),
+        Stage("all_reduce", "nodes", ((0, 1), (2, 3))),
     ]
     assert stages("mpr", Layout.even(1, 1).on_nodes(3)) == [
-        Stage("sum", "nodes", ((0,), (1,), (2,)))
+        Stage("all_reduce", "nodes", ((0,), (1,), (2,)))
     ]
     assert stages("har", Layout.even(2, 1).on_nodes(2), "ipc") == [
-        Stage("gather", "slots", ((0,), (1,), (2,), (3,))),
-        Stage("gather", "ring", ((0, 1), (2, 3))),
-        Stage("sum", "nodes", ((0, 1), (2, 3))),
+        Stage("all_gather", "slots", ((0,), (1,), (2,), (3,))),
+        Stage("all_gather", "ring", ((0, 1), (2, 3))),
+        Stage("all_reduce", "nodes", ((0, 1), (2, 3))),
     ]
     assert why_not_strategy("har", Layout.even(1, 2).on_nodes(2)) is None
     assert "in each node its rings go" in str(
@@ -230,10 +238,10 @@ def test_the_stages_of_nodes_are_those_of_har_on_as_many_gpus() -> None:
 def test_only_leaders_copy_their_numbers_from_the_gpu_for_the_sum_of_nodes(
     rank: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    node = Stage("sum", "nodes", ((0, 1), (2, 3)))
+    node = Stage("all_reduce", "nodes", ((0, 1), (2, 3)))
     back = Stage("broadcast", "host", ((1, 0), (2,)))
     assert [node.reads(rank), back.reads(rank)] == [rank in (0, 2), rank != 0]
-    assert Stage("sum", "host", ((0, 1, 2, 3),)).reads(rank)
+    assert Stage("all_reduce", "host", ((0, 1, 2, 3),)).reads(rank)
 
     did: list[str] = []
     queue: Any = ModuleType("cuda_queue")
@@ -241,8 +249,8 @@ def test_only_leaders_copy_their_numbers_from_the_gpu_for_the_sum_of_nodes(
     for name in ("fetch", "synchronize", "store"):
         setattr(queue, name, lambda *_, name=name: did.append(name))
     monkeypatch.setitem(sys.modules, "gmijax.collectives.device.cuda_queue", queue)
-    host = NodeExchange.__new__(NodeExchange)
+    host = MultiNodeGroup.__new__(MultiNodeGroup)
     host.rank = rank
-    monkeypatch.setattr(NodeExchange, "sum_of_nodes", lambda *_: did.append("sum"))
-    HostLinks(host, 8).reduce(node, 1, 0, 0, 0, 8)
+    monkeypatch.setattr(MultiNodeGroup, "all_reduce_nodes", lambda *_: did.append("sum"))
+    HostTransport(host, 8).reduce(node, 1, 0, 0, 0, 8)
     assert did == ["fetch" if rank in (0, 2) else "synchronize", "sum", "store"]

@@ -11,7 +11,7 @@ import pytest
 from supervision import gpus_of_nodes, machine, plan_on
 
 from gmijax import compose
-from gmijax.collectives.nodes.meeting import Nodes
+from gmijax.collectives.nodes.rendezvous import NodeAddresses
 from gmijax.collectives.strategies import stages
 from gmijax.config import PlanConfig, ReduceConfig, TrainConfig
 from gmijax.control.restarts import with_nodes_left
@@ -64,7 +64,7 @@ def test_nodes_with_gpus_do_inside_what_one_machine_does(
     monkeypatch.setattr("gmijax.partition.reduction._is_installed", lambda *_: True)
     plan = plan_on(gpus_of_nodes(gpus, gpus), gpus=gpus, gmis_per_gpu=gmis)
     assert plan.strategy == strategy
-    assert [stage.link for stage in stages(strategy, plan.layout)][-1] == "nodes"
+    assert [stage.transport for stage in stages(strategy, plan.layout)][-1] == "nodes"
 
 
 def test_a_gpu_of_two_nodes_of_one_machine_has_half_of_its_memory_for_each() -> None:
@@ -188,9 +188,9 @@ def test_agents_and_trainers_go_on_with_the_nodes_that_are_left(
 
 
 def test_nodes_know_the_calls_and_count_leaders_among_those_that_train() -> None:
-    nodes = Nodes(2, (("a", 1), ("b", 2), ("c", 3)), b"secret", {(0, 3): "a:4"})
+    nodes = NodeAddresses(2, (("a", 1), ("b", 2), ("c", 3)), b"secret", {(0, 3): "a:4"})
     fd = nodes.to_file()
-    assert Nodes.from_file(fd) == nodes
+    assert NodeAddresses.from_file(fd) == nodes
     os.close(fd)
     assert nodes.among((1, 2))[:2] == (1, (("b", 2), ("c", 3)))
 

@@ -14,12 +14,12 @@ from fake_device_memory import FAKES
 from toy_env import point_mass
 
 from gmijax.cli.compose import compose
-from gmijax.collectives.build import SoloReducer
-from gmijax.collectives.device.device_links import DeviceLinks
-from gmijax.collectives.host.host_exchange import HostExchange
-from gmijax.collectives.host.host_links import HostLinks
+from gmijax.collectives.communicator import SingleRankCommunicator
+from gmijax.collectives.device.device_transport import DeviceTransport
+from gmijax.collectives.host.host_transport import HostTransport
 from gmijax.collectives.host.shared_block import LANES, create_exchange
-from gmijax.collectives.program import Exchange, PeersOfOne
+from gmijax.collectives.host.shared_memory_group import SharedMemoryGroup
+from gmijax.collectives.program import LocalCollectives, StagedAllReduce
 from gmijax.collectives.strategies import stages
 from gmijax.learning.learner import (
     acting_weights,
@@ -106,7 +106,7 @@ def test_learning_rates_share_a_program(config, schedule: str) -> None:
             config, learning_rate=rate, learning_rate_schedule=schedule, num_updates_per_batch=1
         )
         learner = make_learner(ENV.spec, changed)
-        step = functools.partial(iterate, ENV, learner, PeersOfOne())
+        step = functools.partial(iterate, ENV, learner, LocalCollectives())
         programs.add(jax.jit(step).lower(ENV.model, *_start(learner)).as_text())
     assert len(programs) == 1
 
@@ -148,7 +148,9 @@ def test_the_schedule_acts_on_every_minibatch(config) -> None:
 
     order = jnp.arange(4)[:, None]
     _, _, rates = jax.jit(
-        lambda state: run_updates(mine, PeersOfOne(), gradients_of, state, kls, None, order, None)
+        lambda state: run_updates(
+            mine, LocalCollectives(), gradients_of, state, kls, None, order, None
+        )
     )(state)
     np.testing.assert_allclose(rates, [1e-3 / 1.5, 1e-3, 1e-3, 1e-3 / 1.5], rtol=1e-5)
 
@@ -161,26 +163,28 @@ def size(config) -> int:
 @pytest.fixture(scope="module")
 def alone(learner):
     """The iteration of a job with one GMI, compiled."""
-    return _compiled(SoloReducer().program(functools.partial(iterate, ENV, learner)), learner)
+    return _compiled(
+        SingleRankCommunicator().program(functools.partial(iterate, ENV, learner)), learner
+    )
 
 
 @contextmanager
-def _exchange(strategy: str, num_floats: int) -> Iterator[Exchange]:
+def _all_reduce(strategy: str, num_floats: int) -> Iterator[StagedAllReduce]:
     """Exchanges of a job with one rank, which is this process, as one of several would have."""
     fd, layout = create_exchange(), Layout.even(1, 1)
     control, host = (
-        HostExchange(fd, 0, 1, num_floats, timeout_s=5.0, rendezvous_timeout_s=5.0, lane=lane)
+        SharedMemoryGroup(fd, 0, 1, num_floats, timeout_s=5.0, rendezvous_timeout_s=5.0, lane=lane)
         for lane in range(LANES)
     )
     os.close(fd)
     parts = stages(strategy, layout)
-    links = HostLinks(host, num_floats)
+    transport = HostTransport(host, num_floats)
     if strategy == "one_shot":
-        links = DeviceLinks(control, host, layout, num_floats, parts, FAKES["fake"])
-    exchange = Exchange(links, parts, 0, 1)
-    links.start(exchange)
-    yield exchange
-    exchange.close()
+        transport = DeviceTransport(control, host, layout, num_floats, parts, FAKES["fake"])
+    all_reduce = StagedAllReduce(transport, parts, 0, 1)
+    transport.start(all_reduce)
+    yield all_reduce
+    all_reduce.close()
     host.close()
     control.close()
 
@@ -192,9 +196,11 @@ def test_exchanges_in_the_program_change_nothing_but_its_place(
     if strategy == "mpr, by pass":
         strategy = "mpr"
         learner = make_learner(ENV.spec, dataclasses.replace(config, recompute_advantages=True))
-        alone = _compiled(SoloReducer().program(functools.partial(iterate, ENV, learner)), learner)
-    with _exchange(strategy, size) as exchange:
-        step = exchange.program(functools.partial(iterate, ENV, learner))
+        alone = _compiled(
+            SingleRankCommunicator().program(functools.partial(iterate, ENV, learner)), learner
+        )
+    with _all_reduce(strategy, size) as all_reduce:
+        step = all_reduce.program(functools.partial(iterate, ENV, learner))
         results = []
         told_s = 0.0
         for iteration in (alone, _compiled(step, learner)):
@@ -274,7 +280,7 @@ def test_it_learns_with_other_settings_and_updates_the_policy_that_acted(config)
             state_dependent_std=True,
         ),
     )
-    step = _compiled(SoloReducer().program(functools.partial(iterate, ENV, mine)), mine)
+    step = _compiled(SingleRankCommunicator().program(functools.partial(iterate, ENV, mine)), mine)
     state, envs, metrics = _learnt(step, *warm_up(step, *_start(mine)))
     assert state.value_moments is not None
     assert float(state.obs_moments.count) == float(state.value_moments.count) == 61 * T * N
@@ -317,7 +323,7 @@ def test_no_learning_rate_is_lost_and_no_number_is_written_twice(config, alone) 
         config, num_updates_per_batch=1, learning_rate_schedule="adaptive_kl", desired_kl=1e-7
     )
     mine = make_learner(ENV.spec, adaptive)
-    step = SoloReducer().program(functools.partial(iterate, ENV, mine))
+    step = SingleRankCommunicator().program(functools.partial(iterate, ENV, mine))
     # The first update has not moved yet, the others each lower the rate.
     rates = [1e-3 / 1.5**k for k in range(4)]
     _, _, told = _compiled(step, mine)(*_start(mine))

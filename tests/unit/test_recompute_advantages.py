@@ -10,11 +10,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from axis_peers import run_together
+from axis_collectives import run_together
 from toy_env import point_mass
 
 from gmijax.cli.compose import compose
-from gmijax.collectives.program import PeersOfOne
+from gmijax.collectives.program import LocalCollectives
 from gmijax.errors import ConfigError
 from gmijax.learning.learner import acting_weights, init_learner, make_learner
 from gmijax.learning.normalize import moments_of
@@ -63,7 +63,7 @@ def rolled(state) -> Any:
 def learnt(learner: Any, state: Any, rolled: Any, *, recompute: bool = True) -> Any:
     samples, trajectory, stats = rolled
     steps = trajectory if recompute else None
-    return jax.jit(lambda: learn(learner, PeersOfOne(), state, samples, stats, steps)[0])()
+    return jax.jit(lambda: learn(learner, LocalCollectives(), state, samples, stats, steps)[0])()
 
 
 def test_by_the_policy_that_acted_nothing_is_new(state, rolled) -> None:
@@ -98,7 +98,7 @@ def test_what_the_values_have_learnt_counts_in_the_second_pass(state, rolled) ->
         context = update_context(learner, state, anew)
         by_hand, _, _ = jax.jit(
             lambda now, data, context, part: run_updates(
-                learner, PeersOfOne(), gradients, now, data, context, part, None
+                learner, LocalCollectives(), gradients, now, data, context, part, None
             )
         )(by_hand, flat(renewed), context, part)
     found = learnt(learner, state, rolled[2])
@@ -113,9 +113,9 @@ def test_two_trainers_learn_what_one_does(state, rolled) -> None:
     """Also how advantages are normalised in every pass is the same."""
     learner = learner_of(4)
 
-    def step(peers: Any, _: Any, state: Any, own: Any) -> Any:
+    def step(collectives: Any, _: Any, state: Any, own: Any) -> Any:
         samples, trajectory, stats = own
-        state, metrics = learn(learner, peers, state, samples, stats, trajectory)
+        state, metrics = learn(learner, collectives, state, samples, stats, trajectory)
         return state, None, metrics
 
     halves = jax.tree.map(lambda *x: jnp.stack(x), *rolled[:2])

@@ -13,14 +13,14 @@ from hypothesis import given
 from hypothesis import strategies as st
 from shared_ranks import host_ranks
 
-from gmijax.collectives.device.device_links import Order
+from gmijax.collectives.device.device_transport import Order
 from gmijax.collectives.device.shared_slots import SharedSlots
-from gmijax.collectives.host.host_exchange import HostExchange
+from gmijax.collectives.host.shared_memory_group import SharedMemoryGroup
 from gmijax.errors import DeviceMemoryUnavailable
 
 SIZE = 5
 
-Pair: TypeAlias = tuple[list[HostExchange], list[SharedSlots], list[str]]
+Pair: TypeAlias = tuple[list[SharedMemoryGroup], list[SharedSlots], list[str]]
 
 
 class Counted(FakeDeviceMemory):

@@ -14,34 +14,39 @@ GPUS, RINGS = ((0, 1), (2, 3)), ((0, 2), (1, 3))
 @pytest.mark.parametrize(
     ("strategy", "intra", "layout", "expected"),
     [
-        ("mpr", "host", GPUS, [Stage("sum", "host", ALL)]),
-        ("one_shot", "ipc", GPUS, [Stage("gather", "slots", ALL)]),
-        ("flat", "host", ((0,), (1,)), [Stage("sum", "ring", ((0, 1),))]),
-        ("mrr", "host", ((0,), (1,)), [Stage("sum", "ring", ((0, 1),))]),
+        ("mpr", "host", GPUS, [Stage("all_reduce", "host", ALL)]),
+        ("one_shot", "ipc", GPUS, [Stage("all_gather", "slots", ALL)]),
+        ("flat", "host", ((0,), (1,)), [Stage("all_reduce", "ring", ((0, 1),))]),
+        ("mrr", "host", ((0,), (1,)), [Stage("all_reduce", "ring", ((0, 1),))]),
         (
             *("mrr", "host", GPUS),
             [
-                Stage("sum", "ring", RINGS),
-                Stage("sum", "ring", ((0, 3),)),
+                Stage("all_reduce", "ring", RINGS),
+                Stage("all_reduce", "ring", ((0, 3),)),
                 Stage("broadcast", "ring", ((0, 2), (3, 1))),
             ],
         ),
-        ("har", "host", ALL, [Stage("sum", "host", ALL)]),
-        ("har", "ipc", ALL, [Stage("gather", "slots", ALL)]),
-        ("har", "ipc", GPUS, [Stage("gather", "slots", GPUS), Stage("gather", "ring", RINGS)]),
+        ("har", "host", ALL, [Stage("all_reduce", "host", ALL)]),
+        ("har", "ipc", ALL, [Stage("all_gather", "slots", ALL)]),
+        (
+            "har",
+            "ipc",
+            GPUS,
+            [Stage("all_gather", "slots", GPUS), Stage("all_gather", "ring", RINGS)],
+        ),
         (
             *("har", "host", GPUS),
             [
-                Stage("sum", "host", GPUS),
-                Stage("sum", "ring", ((0, 2),)),
+                Stage("all_reduce", "host", GPUS),
+                Stage("all_reduce", "ring", ((0, 2),)),
                 Stage("broadcast", "host", GPUS),
             ],
         ),
         (
             *("har", "ipc", ((0, 1), (2,))),
             [
-                Stage("gather", "slots", ((0, 1), (2,))),
-                Stage("sum", "ring", ((0, 2),)),
+                Stage("all_gather", "slots", ((0, 1), (2,))),
+                Stage("all_reduce", "ring", ((0, 2),)),
                 Stage("broadcast", "slots", ((0, 1), (2,))),
             ],
         ),

@@ -16,7 +16,7 @@ import pytest
 from gmijax.collectives.channel import tcp_channel
 from gmijax.collectives.channel.tcp_channel import RemoteReader, RemoteWriter
 from gmijax.collectives.nodes.handshake import Key, call
-from gmijax.collectives.nodes.meeting import reserved_address
+from gmijax.collectives.nodes.rendezvous import reserved_address
 from gmijax.errors import CollectiveError, ConfigError, PeerLost, PipeClosed
 
 CAPACITY = 2**20

@@ -14,7 +14,7 @@ import pytest
 from training_jobs import wait_until
 
 from gmijax.collectives.channel.tcp_registers import RemoteRegisters
-from gmijax.collectives.nodes.meeting import reserved_address
+from gmijax.collectives.nodes.rendezvous import reserved_address
 from gmijax.errors import CollectiveError
 
 SECRET = os.urandom(32)

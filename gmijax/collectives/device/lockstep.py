@@ -7,7 +7,7 @@ from collections.abc import Callable
 from typing import TypeVar
 
 from gmijax.collectives.device.watched_thread import WatchedThread, end_at_once
-from gmijax.collectives.host.host_exchange import HostExchange
+from gmijax.collectives.host.shared_memory_group import SharedMemoryGroup
 
 T = TypeVar("T")
 
@@ -15,7 +15,7 @@ T = TypeVar("T")
 class LockstepRunner:
     """One rank's part in steps of all ranks, which must agree on `num_floats`."""
 
-    def __init__(self, host: HostExchange, num_floats: int) -> None:
+    def __init__(self, host: SharedMemoryGroup, num_floats: int) -> None:
         self._barrier = host.barrier
         self._num_floats = num_floats
         self._thread = WatchedThread("step")

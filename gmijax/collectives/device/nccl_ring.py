@@ -6,8 +6,8 @@ import importlib
 from typing import Any
 
 from gmijax.collectives.device.shared_slots import agreed
-from gmijax.collectives.host.host_exchange import HostExchange
-from gmijax.collectives.nodes.node_exchange import NodeExchange
+from gmijax.collectives.host.shared_memory_group import SharedMemoryGroup
+from gmijax.collectives.nodes.multi_node_group import MultiNodeGroup
 from gmijax.collectives.strategies import Groups
 
 _WISH = "rings between GPUs"
@@ -23,11 +23,11 @@ class NcclRing:
         self._nccl, self._comm = nccl, comm
         self._float, self._sum = int(nccl.DataType.Float32), int(nccl.RedOp.Sum)
 
-    def gather(self, stream: int, source: int, target: int, num_floats: int) -> None:
+    def all_gather(self, stream: int, source: int, target: int, num_floats: int) -> None:
         """`target` [m, n] becomes what all members have."""
         self._nccl.all_gather(source, target, num_floats, self._float, self._comm, stream)
 
-    def sum(self, stream: int, source: int, target: int, num_floats: int) -> None:
+    def all_reduce(self, stream: int, source: int, target: int, num_floats: int) -> None:
         """`target` [n] becomes the sum over the members."""
         kind = self._float, self._sum
         self._nccl.all_reduce(source, target, num_floats, *kind, self._comm, stream)
@@ -44,7 +44,7 @@ class NcclRing:
         self._comm = None
 
 
-def nccl_ring(host: HostExchange | NodeExchange, groups: Groups) -> NcclRing | None:
+def nccl_ring(host: SharedMemoryGroup | MultiNodeGroup, groups: Groups) -> NcclRing | None:
     """Meets the other members of this rank's group; all ranks of the job call it.
 
     On several nodes rings are in each of them, and `groups` are of ranks in the node.

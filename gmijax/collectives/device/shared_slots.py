@@ -11,8 +11,8 @@ import numpy as np
 import numpy.typing as npt
 
 from gmijax.collectives.device.device_memory import TICKET_BYTES, NewMemory
-from gmijax.collectives.host.host_exchange import HostExchange
-from gmijax.collectives.nodes.node_exchange import NodeExchange
+from gmijax.collectives.host.shared_memory_group import SharedMemoryGroup
+from gmijax.collectives.nodes.multi_node_group import MultiNodeGroup
 from gmijax.collectives.shared_memory import fence
 from gmijax.collectives.waits import wait_until
 from gmijax.errors import DeviceMemoryUnavailable, PeerLost
@@ -34,8 +34,8 @@ FLOATS_PER_ROW_UNIT = 64
 class SharedSlots:
     """One rank's use of blocks of device memory with two slots for each member.
 
-    The two slots are used in turn, so that one meeting of the members suffices for an exchange:
-    a rank that writes a slot again has seen the flags of the exchange in between, which come
+    The two slots are used in turn, so that members wait for each other once an exchange: a
+    rank that writes a slot again has seen the flags of the exchange in between, which come
     after all that had been read of the one before.
 
     All ranks of the job make theirs together; on several nodes ranks are those in the node.
@@ -50,12 +50,12 @@ class SharedSlots:
 
     Raises:
       DeviceMemoryUnavailable: there is no such memory here; on all ranks alike.
-      PeerLost, CollectiveTimeout: as in the first call of a reducer.
+      PeerLost, CollectiveTimeout: as in the first call of a communicator.
     """
 
     def __init__(
         self,
-        host: HostExchange | NodeExchange,
+        host: SharedMemoryGroup | MultiNodeGroup,
         num_floats: int,
         members: Sequence[int],
         owners: Sequence[int],
@@ -68,7 +68,7 @@ class SharedSlots:
         self._owners, self._is_owner = tuple(owners), here.rank == owners[0]
         self._memories: list[CudaMemory] = []
         self._num_writes = 0
-        self._host: HostExchange | None = here
+        self._host: SharedMemoryGroup | None = here
         here.flags[here.rank, 1] = 0
         try:
             tickets = agreed(host, wish, lambda: self._make(new_memory))
@@ -77,7 +77,7 @@ class SharedSlots:
             self.close()
             raise
 
-    def gather(
+    def all_gather(
         self,
         queue: CudaQueue,
         stream: int,
@@ -100,7 +100,7 @@ class SharedSlots:
     def broadcast(
         self, queue: CudaQueue, stream: int, source: int, target: int, num_floats: int
     ) -> None:
-        """Queues a copy of what the first member has; as `gather`, but `target` has [n]."""
+        """Queues a copy of what the first member has; as `all_gather`, but `target` has [n]."""
         num_bytes = 4 * num_floats
         self._write(queue, stream, source, num_bytes)
         queue.copy(stream, target, self._slot(0), num_bytes)
@@ -141,7 +141,7 @@ class SharedSlots:
         row = self._num_writes % 2 * len(self._members) + place
         return self._memories[0].address + row * self._row_bytes
 
-    def _wait_for_members(self, host: HostExchange) -> None:
+    def _wait_for_members(self, host: SharedMemoryGroup) -> None:
         def late() -> list[int]:
             return [member for member in self._members if not host.flags[member, 1]]
 
@@ -166,7 +166,7 @@ class SharedSlots:
 
 
 def agreed(
-    host: HostExchange | NodeExchange, wish: str, step: Callable[[], bytes]
+    host: SharedMemoryGroup | MultiNodeGroup, wish: str, step: Callable[[], bytes]
 ) -> npt.NDArray[np.uint8]:
     """Does a step of the start; returns what it returned on the ranks of this node.
 
@@ -192,7 +192,7 @@ def agreed(
     sent = np.zeros(1 + NOTE_BYTES, np.float32)  # One number a byte: no float has odd bits.
     sent[0] = 1 + host.local.ids[host.local.rank] if has_failed else 0
     sent[1 : 1 + len(note)] = np.frombuffer(note, np.uint8)
-    everyone = host.introduce(sent)
+    everyone = host.bootstrap_all_gather(sent)
     notes = everyone[:, 1:].astype(np.uint8)
     if failed := np.flatnonzero(everyone[:, 0]).tolist():
         why = notes[failed[0]].tobytes().rstrip(b"\0").decode(errors="replace")

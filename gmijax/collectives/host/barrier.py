@@ -31,7 +31,7 @@ SETTLE_S = 2.0
 
 
 class Barrier:
-    """One rank's side of the waiting; for the times see `HostExchange`."""
+    """One rank's side of the waiting; for the times see `SharedMemoryGroup`."""
 
     def __init__(self, block: SharedBlock, timeout_s: float, rendezvous_timeout_s: float) -> None:
         self.step = 0

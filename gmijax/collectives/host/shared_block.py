@@ -38,7 +38,7 @@ LANES = 2
 
 LINE = np.dtype(
     [
-        ("pid", np.uint64),  # 0 once the rank has closed its reducer
+        ("pid", np.uint64),  # 0 once the rank has closed its communicator
         ("start_ticks", np.uint64),
         ("num_floats", np.uint64),
         ("call", np.uint64, (2,)),  # what the rank is calling, by parity of the step
@@ -61,7 +61,7 @@ class SharedBlock(NamedTuple):
       slots: [2, K, P] float32, used in turn.
       flags: [whole pages, FLOATS_PER_LINE] uint32, of which [rank, 0] counts how often the device
         of a rank has written its slots; 1 says that the rank is through with slots in device
-        memory, and 2 to 3 which exchanges it has come to (`device_links.Order`).
+        memory, and 2 to 3 which exchanges it has come to (`device_transport.Order`).
       ids: of the ranks' GMIs in the job, for what is said of lost peers: not all GMIs need have a
         rank, and with several nodes each has a block.
     """
@@ -95,7 +95,7 @@ def attach(
 
     The block gets its size here, from whoever comes first; the caller keeps `fd` and may close
     it at once. Ranks that attach with other numbers are found out in their first call. For the
-    arguments see `HostExchange`.
+    arguments see `SharedMemoryGroup`.
 
     Raises:
       CollectiveError: no memory, not such a descriptor, or the rank is taken.

@@ -15,7 +15,7 @@ from typing import Any, Final, Literal, NamedTuple, get_args
 import numpy as np
 import numpy.typing as npt
 
-from gmijax.collectives.host.host_exchange import HostExchange
+from gmijax.collectives.host.shared_memory_group import SharedMemoryGroup
 from gmijax.collectives.interface import FloatBuffer
 from gmijax.collectives.messages.mailboxes import COLLECTIVE
 from gmijax.collectives.messages.messenger import Messenger
@@ -46,10 +46,10 @@ class GroupReducer:
     all ranks in the same call.
     """
 
-    def __init__(self, messenger: Messenger, build: Callable[[int], HostExchange]) -> None:
+    def __init__(self, messenger: Messenger, build: Callable[[int], SharedMemoryGroup]) -> None:
         self._messenger = messenger
         self._build = build
-        self._reducer: HostExchange | None = None
+        self._reducer: SharedMemoryGroup | None = None
         self._num_floats = 0
 
     def reduce(self, members: Iterable[int], tree: Any, op: Operation) -> Any:
@@ -128,7 +128,8 @@ class GroupReducer:
             part = _sum(self._exchange(call, parts))
             result = np.concatenate(self._exchange(call, dict.fromkeys(members, part)))
         if op == "mean":
-            result *= np.finfo(wide).dtype.type(1.0 / len(members))  # As `Peers.mean` has it.
+            # As `Collectives.mean` has it.
+            result *= np.finfo(wide).dtype.type(1.0 / len(members))
         return result.astype(flat.dtype, copy=False)
 
     def _exchange(self, call: _Call, parts: dict[int, npt.NDArray[Any]]) -> list[npt.NDArray[Any]]:

@@ -1,4 +1,4 @@
-"""Gather and sum between the leaders of nodes, through TCP, in the order of nodes."""
+"""All-gather and all-reduce between the leaders of nodes, through TCP, in the order of nodes."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ from typing import Final
 import numpy as np
 
 from gmijax.clock import running_s
-from gmijax.collectives.host.host_exchange import chunk
+from gmijax.collectives.host.shared_memory_group import chunk
 from gmijax.collectives.interface import FloatBuffer
-from gmijax.collectives.nodes.meeting import Sockets
+from gmijax.collectives.nodes.rendezvous import Sockets
 from gmijax.collectives.waits import LIVENESS_PERIOD_S
 from gmijax.errors import CollectiveError, CollectiveTimeout, PeerLost
 
@@ -59,14 +59,14 @@ class Mesh:
         """Says that the calls so far belong to the start: the next one is the first."""
         self._first_call = self._calls + 1
 
-    def gather(self, values: FloatBuffer) -> FloatBuffer:
+    def all_gather(self, values: FloatBuffer) -> FloatBuffer:
         """Returns [N, n]: `values` [n] of every node, in order."""
         rows = np.empty((len(self._ids), values.size), np.float32)
         rows[self._node] = values
         self._swap("all_gather", values.size, lambda _: values, lambda node: rows[node])
         return rows
 
-    def sum(self, values: FloatBuffer, place: int) -> FloatBuffer:
+    def all_reduce(self, values: FloatBuffer, place: int) -> FloatBuffer:
         """Returns the sum over nodes, in their order, of `values` [n]; the same bits on all.
 
         Args:

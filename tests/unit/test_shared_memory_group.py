@@ -13,7 +13,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from shared_ranks import host_ranks
 
-from gmijax.collectives.host.host_exchange import HostExchange, chunk
+from gmijax.collectives.host.shared_memory_group import SharedMemoryGroup, chunk
 from gmijax.collectives.interface import FloatBuffer
 from gmijax.errors import CollectiveError, CollectiveTimeout, PeerLost
 
@@ -21,14 +21,14 @@ LATE_S = 0.5
 
 
 def on_all_ranks(
-    ranks: Sequence[HostExchange], call: Callable[[HostExchange], FloatBuffer]
+    ranks: Sequence[SharedMemoryGroup], call: Callable[[SharedMemoryGroup], FloatBuffer]
 ) -> list[FloatBuffer]:
     with ThreadPoolExecutor(len(ranks)) as pool:
         return list(pool.map(call, ranks))
 
 
 @pytest.fixture
-def alone() -> Iterator[HostExchange]:
+def alone() -> Iterator[SharedMemoryGroup]:
     (rank,) = host_ranks(10)
     yield rank
     rank.close()
@@ -66,10 +66,10 @@ def test_the_mean_is_the_sum_in_order_of_rank_times_one_over_k(
 def test_groups_sum_by_themselves_and_ranks_in_none_keep_what_they_have() -> None:
     groups = ((1, 0), (3, 4))
 
-    def call(rank: HostExchange) -> FloatBuffer:
+    def call(rank: SharedMemoryGroup) -> FloatBuffer:
         own, found = np.full(100, 2.0**rank.rank, np.float32), np.empty((3, 100), np.float32)
         for row in found[:2]:  # Twice: slots take turns.
-            rank.sum(own, row, groups)
+            rank.all_reduce(own, row, groups)
         rank.broadcast(own, found[2], groups)
         return found
 
@@ -85,7 +85,7 @@ def test_values_that_are_not_finite_stay_so_without_a_warning() -> None:
         np.testing.assert_array_equal(mean, [np.nan, np.inf, np.nan, np.inf])
 
 
-def test_a_gathered_result_belongs_to_the_caller(alone: HostExchange) -> None:
+def test_a_gathered_result_belongs_to_the_caller(alone: SharedMemoryGroup) -> None:
     gathered = alone.all_gather(np.ones(3, np.float32))
     for value in (5.0, 6.0):
         alone.all_gather(np.full(3, value, np.float32))
@@ -93,10 +93,10 @@ def test_a_gathered_result_belongs_to_the_caller(alone: HostExchange) -> None:
     np.testing.assert_array_equal(gathered, np.full((1, 3), 2.0))
 
 
-def told(ranks: Sequence[HostExchange], *sizes: int) -> list[str]:
+def told(ranks: Sequence[SharedMemoryGroup], *sizes: int) -> list[str]:
     """What ranks say that take means of different sizes."""
 
-    def mean(rank: HostExchange, size: int) -> str:
+    def mean(rank: SharedMemoryGroup, size: int) -> str:
         with pytest.raises(CollectiveError) as caught:
             rank.mean(np.zeros(size, np.float32))
         return str(caught.value)
@@ -138,13 +138,13 @@ def test_no_call_follows_a_call_that_failed() -> None:
         rank.all_gather(np.zeros(1, np.float32))
 
 
-def test_more_than_64_kib_a_rank_cannot_be_gathered(alone: HostExchange) -> None:
+def test_more_than_64_kib_a_rank_cannot_be_gathered(alone: SharedMemoryGroup) -> None:
     alone.all_gather(np.zeros(16384, np.float32))
     with pytest.raises(CollectiveError, match=r"all_gather of float32 \[16385\]"):
         alone.all_gather(np.zeros(16385, np.float32))
 
 
-def test_closing_twice_is_fine_calling_after_it_is_not(alone: HostExchange) -> None:
+def test_closing_twice_is_fine_calling_after_it_is_not(alone: SharedMemoryGroup) -> None:
     alone.close()
     alone.close()
     with pytest.raises(CollectiveError, match="sum after close"):
@@ -155,13 +155,15 @@ def test_the_call_after_an_introduction_is_the_first_and_may_take_longer() -> No
     ranks = host_ranks(4, 4, timeout_s=LATE_S / 4, start_s=20 * LATE_S)
 
     def gather_late() -> None:
-        ranks[1].introduce(np.ones(3, np.float32))
+        ranks[1].bootstrap_all_gather(np.ones(3, np.float32))
         time.sleep(LATE_S)
         ranks[1].all_gather(np.ones(1, np.float32))
 
     late = threading.Thread(target=gather_late)
     late.start()
-    np.testing.assert_array_equal(ranks[0].introduce(np.zeros(3, np.float32)).sum(1), [0, 3])
+    np.testing.assert_array_equal(
+        ranks[0].bootstrap_all_gather(np.zeros(3, np.float32)).sum(1), [0, 3]
+    )
     assert ranks[0].all_gather(np.zeros(1, np.float32)).shape == (2, 1)
     late.join()
     with pytest.raises(CollectiveTimeout, match="step 3"):

@@ -4,18 +4,18 @@ from __future__ import annotations
 
 import numpy as np
 
-from gmijax.collectives.host.host_exchange import HostExchange
 from gmijax.collectives.host.shared_block import MAX_GATHER_FLOATS
+from gmijax.collectives.host.shared_memory_group import SharedMemoryGroup
 from gmijax.collectives.interface import FloatBuffer
 from gmijax.collectives.nodes.mesh import Mesh
 from gmijax.collectives.strategies import Groups
 from gmijax.partition.layout import Layout
 
 
-class NodeExchange:
-    """`HostExchange` of a job on several nodes, with a sum between nodes.
+class MultiNodeGroup:
+    """`SharedMemoryGroup` of a job on several nodes, with a sum between nodes.
 
-    Groups are of ranks of the whole job; those of a sum, a gather or a broadcast lie in one node.
+    Groups are of ranks of the whole job; those of a collective lie in one node.
 
     Attributes:
       local: the use of the block of the node, by ranks in the node.
@@ -27,34 +27,36 @@ class NodeExchange:
       mesh: with the leaders of other nodes, None for ranks that do not lead.
     """
 
-    def __init__(self, local: HostExchange, layout: Layout, rank: int, mesh: Mesh | None) -> None:
+    def __init__(
+        self, local: SharedMemoryGroup, layout: Layout, rank: int, mesh: Mesh | None
+    ) -> None:
         self.rank, self.world_size = rank, layout.num_gmis
         self.local, self._mesh = local, mesh
         self._here = layout.gmis_of_node[layout.node_of(rank)]
 
-    def sum(
+    def all_reduce(
         self, source: FloatBuffer, target: FloatBuffer, groups: Groups, place: int = 0
     ) -> None:
-        """See `HostExchange`."""
-        self.local.sum(source, target, self.of_node(groups), place)
+        """See `SharedMemoryGroup`."""
+        self.local.all_reduce(source, target, self.of_node(groups), place)
 
     def broadcast(
         self, source: FloatBuffer, target: FloatBuffer, groups: Groups, place: int = 0
     ) -> None:
-        """See `HostExchange`."""
+        """See `SharedMemoryGroup`."""
         self.local.broadcast(source, target, self.of_node(groups), place)
 
-    def gather(
+    def all_gather_into(
         self, source: FloatBuffer, target: FloatBuffer, groups: Groups, place: int = 0
     ) -> None:
-        """See `HostExchange`."""
-        self.local.gather(source, target, self.of_node(groups), place)
+        """See `SharedMemoryGroup`."""
+        self.local.all_gather_into(source, target, self.of_node(groups), place)
 
-    def sum_of_nodes(
+    def all_reduce_nodes(
         self, source: FloatBuffer, target: FloatBuffer, groups: Groups, place: int
     ) -> None:
         """Writes the sum over nodes into `target` [n], of what their leaders have as `source`."""
-        total = source if self._mesh is None else self._mesh.sum(source, place)
+        total = source if self._mesh is None else self._mesh.all_reduce(source, place)
         if self.local.world_size > 1:
             self.broadcast(total, target, groups, place)
         else:
@@ -65,14 +67,14 @@ class NodeExchange:
         here = self.local.all_gather(values)
         everywhere = np.zeros(self.world_size * values.size, np.float32)
         if self._mesh is not None:
-            everywhere[:] = self._mesh.gather(here.ravel()).ravel()
+            everywhere[:] = self._mesh.all_gather(here.ravel()).ravel()
         for start in range(0, everywhere.size, MAX_GATHER_FLOATS):
             piece = everywhere[start : start + MAX_GATHER_FLOATS]
             piece[:] = self.local.all_gather(piece)[0]  # The leader is the first of its node.
         return everywhere.reshape(self.world_size, -1)
 
-    def introduce(self, values: FloatBuffer) -> FloatBuffer:
-        """See `HostExchange`."""
+    def bootstrap_all_gather(self, values: FloatBuffer) -> FloatBuffer:
+        """See `SharedMemoryGroup`."""
         gathered = self.all_gather(values)
         self.local.barrier.restart()
         if self._mesh is not None:

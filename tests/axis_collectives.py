@@ -13,8 +13,8 @@ T = TypeVar("T")
 _AXIS = "trainers"
 
 
-class AxisPeers:
-    """`Peers` along an axis of `jax.vmap`."""
+class AxisCollectives:
+    """`Collectives` along an axis of `jax.vmap`."""
 
     def __init__(self, world_size: int) -> None:
         self._world_size = world_size
@@ -22,7 +22,7 @@ class AxisPeers:
     def rank(self) -> jax.Array:
         return jax.lax.axis_index(_AXIS).astype("int32")
 
-    def gather(self, tree: T, after: Any = None) -> T:
+    def all_gather(self, tree: T, after: Any = None) -> T:
         del after
         return jax.tree.map(lambda leaf: jax.lax.all_gather(leaf, _AXIS), tree)
 
@@ -37,6 +37,6 @@ def run_together(step: Step, constants: Any, shared: Any, own: Any) -> tuple[Any
     world_size = jax.tree.leaves(own)[0].shape[0]
 
     def one(own: Any) -> tuple[Any, Any, Any]:
-        return step(AxisPeers(world_size), constants, shared, own)
+        return step(AxisCollectives(world_size), constants, shared, own)
 
     return jax.jit(jax.vmap(one, axis_name=_AXIS))(own)

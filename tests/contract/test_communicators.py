@@ -8,8 +8,8 @@ from pathlib import Path
 import pytest
 
 from gmijax.collectives.strategies import COSTS
+from tests.communicator_contract import PAIRS, Case, check_contract
 from tests.rank_processes import Ranks
-from tests.reducer_contract import PAIRS, Case, check_contract
 
 pytestmark = pytest.mark.timeout(200)
 

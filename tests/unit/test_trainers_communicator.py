@@ -1,4 +1,4 @@
-"""The reducer of jobs in which only some GMIs train."""
+"""The communicator of jobs in which only some GMIs train."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from gmijax.runs.folder import RunPaths
 from gmijax.supervise.child import ChildLink
 from gmijax.supervise.failures import first_cause
 from gmijax.supervise.job_kinds import groups_of, training_plan
-from gmijax.workers.training_worker import _trainers_reducer
+from gmijax.workers.training_worker import _trainers_communicator
 
 
 def test_a_trainer_that_does_not_come_is_known_by_its_id(tmp_path) -> None:
@@ -31,10 +31,10 @@ def test_a_trainer_that_does_not_come_is_known_by_its_id(tmp_path) -> None:
     fd = create_exchange()
     assert trainers == (0, 2)  # Of the ranks 0 and 1.
     waiting = ChildLink(trainers[0], RunPaths(tmp_path), None, fd)
-    reducer = _trainers_reducer(config, plan, of_trainers, waiting, 1, None, None)
+    comm = _trainers_communicator(config, plan, of_trainers, waiting, 1, None, None)
     os.close(fd)
-    with closing(reducer), pytest.raises(CollectiveTimeout) as late:
-        reducer.all_gather(np.zeros(1, np.float32))
+    with closing(comm), pytest.raises(CollectiveTimeout) as late:
+        comm.all_gather(np.zeros(1, np.float32))
     assert late.value.missing == trainers[1:]
 
     # The agent waited for the first trainer, and that one for the second, which hangs.

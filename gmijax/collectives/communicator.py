@@ -1,4 +1,4 @@
-"""Makes the reducer of one rank: links by what its strategy's stages need."""
+"""Makes the communicator of one rank, with the transport that its strategy's stages need."""
 
 from __future__ import annotations
 
@@ -10,29 +10,29 @@ from typing import TypeAlias
 
 import jax
 
-from gmijax.collectives.device.device_links import Device, DeviceLinks
-from gmijax.collectives.host.host_exchange import HostExchange
-from gmijax.collectives.host.host_links import HostLinks
+from gmijax.collectives.device.device_transport import Device, DeviceTransport
+from gmijax.collectives.host.host_transport import HostTransport
 from gmijax.collectives.host.shared_block import LANES
-from gmijax.collectives.interface import FloatBuffer, Reducer, Step, TracedStep
-from gmijax.collectives.nodes.meeting import Nodes, connect
+from gmijax.collectives.host.shared_memory_group import SharedMemoryGroup
+from gmijax.collectives.interface import Communicator, FloatBuffer, Step, TracedStep
 from gmijax.collectives.nodes.mesh import Mesh
-from gmijax.collectives.nodes.node_exchange import NodeExchange
-from gmijax.collectives.program import Exchange, ProgramStep
+from gmijax.collectives.nodes.multi_node_group import MultiNodeGroup
+from gmijax.collectives.nodes.rendezvous import NodeAddresses, connect
+from gmijax.collectives.program import ProgramStep, StagedAllReduce
 from gmijax.collectives.strategies import stages
 from gmijax.errors import ConfigError, DeviceMemoryUnavailable
 from gmijax.partition.layout import Layout
 from gmijax.partition.reduction import require_strategy, why_no_bindings
 
-_Lane: TypeAlias = HostExchange | NodeExchange
+_Lane: TypeAlias = SharedMemoryGroup | MultiNodeGroup
 
 GATHERED_FLOATS = 1024
 """Of each rank; more where P leaves room for them."""
 
 
 @dataclass(frozen=True, kw_only=True)
-class Membership:
-    """What is needed to build the reducer of one rank.
+class CommunicatorConfig:
+    """What is needed to build the communicator of one rank.
 
     Attributes:
       layout: where all ranks live.
@@ -57,13 +57,13 @@ class Membership:
     rendezvous_timeout_s: float
     intra: str = "host"
     host_if_unavailable: bool = False
-    nodes: Nodes | None = None
+    nodes: NodeAddresses | None = None
     listener: socket.socket | None = None
     gmis: Sequence[int] | None = None
 
 
-def build_reducer(strategy: str, membership: Membership) -> Reducer:
-    """Makes the reducer of one rank.
+def make_communicator(strategy: str, config: CommunicatorConfig) -> Communicator:
+    """Makes the communicator of one rank.
 
     Strategies that leave the host wait here until all ranks have come.
 
@@ -71,48 +71,48 @@ def build_reducer(strategy: str, membership: Membership) -> Reducer:
       ConfigError: no such strategy, or it does not work for this layout, or lacks something.
       CollectiveError: the shared memory cannot be had, or another rank is gone or does not come.
     """
-    require_strategy(strategy, membership.layout)
-    if membership.layout.num_gmis == 1:
-        return SoloReducer(strategy)
-    control, host = _lanes(membership)
+    require_strategy(strategy, config.layout)
+    if config.layout.num_gmis == 1:
+        return SingleRankCommunicator(strategy)
+    control, host = _lanes(config)
     try:
-        return _built(strategy, membership, control, host)
+        return _built(strategy, config, control, host)
     except DeviceMemoryUnavailable as error:
-        if not membership.host_if_unavailable:
+        if not config.host_if_unavailable:
             raise
         instead = "mpr" if strategy == "one_shot" else strategy
         what = f"reduce.strategy={instead} through host memory"
         warnings.warn(f"{error}; so {what}", RuntimeWarning, stacklevel=2)
-        return _built(instead, replace(membership, intra="host"), control, host)
+        return _built(instead, replace(config, intra="host"), control, host)
 
 
-def _built(strategy: str, membership: Membership, control: _Lane, host: _Lane) -> Reducer:
-    layout, num_floats = membership.layout, _room(membership)
-    parts = stages(strategy, layout, membership.intra)
-    device, links = DEVICE(), None
+def _built(strategy: str, config: CommunicatorConfig, control: _Lane, host: _Lane) -> Communicator:
+    layout, num_floats = config.layout, _room(config)
+    parts = stages(strategy, layout, config.intra)
+    device, transport = DEVICE(), None
     try:
-        if device is None or all(stage.link in ("host", "nodes") for stage in parts):
-            links = HostLinks(host, num_floats)
+        if device is None or all(stage.transport in ("host", "nodes") for stage in parts):
+            transport = HostTransport(host, num_floats)
         else:
-            links = DeviceLinks(control, host, layout, num_floats, parts, device)
-        exchange = trial = Exchange(links, parts, host.rank, host.world_size)
-        inside = [stage for stage in parts if stage.link != "nodes"]
+            transport = DeviceTransport(control, host, layout, num_floats, parts, device)
+        all_reduce = trial = StagedAllReduce(transport, parts, host.rank, host.world_size)
+        inside = [stage for stage in parts if stage.transport != "nodes"]
         if len(inside) < len(parts):
             # Who finds that it does not work must not leave other nodes waiting for a sum.
-            trial = Exchange(links, inside, host.local.rank, host.local.world_size)
-        links.start(trial)
+            trial = StagedAllReduce(transport, inside, host.local.rank, host.local.world_size)
+        transport.start(trial)
     except BaseException as error:
-        if links is not None:
-            links.close()
+        if transport is not None:
+            transport.close()
         if not isinstance(error, DeviceMemoryUnavailable):
             host.close()
             control.close()
         raise
-    return SharedReducer(strategy, membership.intra, control, host, exchange)
+    return MultiRankCommunicator(strategy, config.intra, control, host, all_reduce)
 
 
-class SharedReducer:
-    """The `Reducer` of one of several ranks."""
+class MultiRankCommunicator:
+    """The `Communicator` of one of several ranks."""
 
     def __init__(
         self,
@@ -120,29 +120,29 @@ class SharedReducer:
         intra: str,
         control: _Lane,
         host: _Lane,
-        exchange: Exchange,
+        all_reduce: StagedAllReduce,
     ) -> None:
         self.rank, self.world_size = host.rank, host.world_size
         self.strategy, self.intra = strategy, intra
-        self._control, self._host, self._exchange = control, host, exchange
+        self._control, self._host, self._all_reduce = control, host, all_reduce
 
     def all_gather(self, values: FloatBuffer) -> FloatBuffer:
-        """See `Reducer`."""
+        """See `Communicator`."""
         return self._control.all_gather(values)
 
     def program(self, step: Step, *, donates_own: bool = True) -> TracedStep:
-        """See `Reducer`."""
-        return self._exchange.program(step, donates_own=donates_own)
+        """See `Communicator`."""
+        return self._all_reduce.program(step, donates_own=donates_own)
 
     def close(self) -> None:
-        """See `Reducer`."""
-        self._exchange.close()
+        """See `Communicator`."""
+        self._all_reduce.close()
         self._host.close()
         self._control.close()
 
 
-class SoloReducer:
-    """The `Reducer` of a job with one trainer."""
+class SingleRankCommunicator:
+    """The `Communicator` of a job with one trainer."""
 
     rank, world_size, intra = 0, 1, "host"
 
@@ -150,72 +150,72 @@ class SoloReducer:
         self.strategy = strategy
 
     def all_gather(self, values: FloatBuffer) -> FloatBuffer:
-        """See `Reducer`."""
+        """See `Communicator`."""
         return values[None].copy()
 
     def program(self, step: Step, *, donates_own: bool = True) -> TracedStep:
-        """See `Reducer`."""
+        """See `Communicator`."""
         return ProgramStep(None, None, step, donates_own=donates_own)
 
     def close(self) -> None:
         """Does nothing: there is nothing to release."""
 
 
-def _lanes(membership: Membership) -> Sequence[_Lane]:
-    assert membership.exchange_fd is not None
-    layout, rank = membership.layout, membership.rank
-    here, ids = layout.gmis_of_node[layout.node_of(rank)], _ids(membership)
+def _lanes(config: CommunicatorConfig) -> Sequence[_Lane]:
+    assert config.exchange_fd is not None
+    layout, rank = config.layout, config.rank
+    here, ids = layout.gmis_of_node[layout.node_of(rank)], _ids(config)
     lanes = [
-        HostExchange(
-            *(membership.exchange_fd, here.index(rank), len(here), _room(membership)),
-            timeout_s=membership.timeout_s,
-            rendezvous_timeout_s=membership.rendezvous_timeout_s,
+        SharedMemoryGroup(
+            *(config.exchange_fd, here.index(rank), len(here), _room(config)),
+            timeout_s=config.timeout_s,
+            rendezvous_timeout_s=config.rendezvous_timeout_s,
             lane=lane,
             ids=[ids[other] for other in here],
         )
         for lane in range(LANES)
     ]
-    return lanes if layout.num_nodes == 1 else _over_nodes(membership, lanes, leader=here[0])
+    return lanes if layout.num_nodes == 1 else _over_nodes(config, lanes, leader=here[0])
 
 
 def _over_nodes(
-    membership: Membership, lanes: Sequence[HostExchange], leader: int
-) -> Sequence[NodeExchange]:
+    config: CommunicatorConfig, lanes: Sequence[SharedMemoryGroup], leader: int
+) -> Sequence[MultiNodeGroup]:
     """The lanes with what goes on between nodes; leaders wait here for each other."""
-    layout, rank = membership.layout, membership.rank
-    nodes, listener = membership.nodes, membership.listener
+    layout, rank = config.layout, config.rank
+    nodes, listener = config.nodes, config.listener
     if nodes is None or listener is None:
         raise ConfigError(f"layout {layout} on {layout.num_nodes} nodes: needs their addresses")
     with listener:
         if rank != leader:
-            return [NodeExchange(lane, layout, rank, None) for lane in lanes]
-        sockets = connect(nodes, listener, len(lanes), membership.rendezvous_timeout_s)
-    leaders = [_ids(membership)[ranks[0]] for ranks in layout.gmis_of_node]
+            return [MultiNodeGroup(lane, layout, rank, None) for lane in lanes]
+        sockets = connect(nodes, listener, len(lanes), config.rendezvous_timeout_s)
+    leaders = [_ids(config)[ranks[0]] for ranks in layout.gmis_of_node]
     meshes = [
         Mesh(
             *(connections, nodes.node, leaders),
-            timeout_s=membership.timeout_s,
-            rendezvous_timeout_s=membership.rendezvous_timeout_s,
+            timeout_s=config.timeout_s,
+            rendezvous_timeout_s=config.rendezvous_timeout_s,
             on_wait=lane.beat,
         )
         for connections, lane in zip(sockets, lanes, strict=True)
     ]
     return [
-        NodeExchange(lane, layout, rank, mesh) for lane, mesh in zip(lanes, meshes, strict=True)
+        MultiNodeGroup(lane, layout, rank, mesh) for lane, mesh in zip(lanes, meshes, strict=True)
     ]
 
 
-def _ids(membership: Membership) -> Sequence[int]:
-    return membership.layout.gmis if membership.gmis is None else membership.gmis
+def _ids(config: CommunicatorConfig) -> Sequence[int]:
+    return config.layout.gmis if config.gmis is None else config.gmis
 
 
-def _room(membership: Membership) -> int:
+def _room(config: CommunicatorConfig) -> int:
     """Length of the largest buffer whose sum is taken; what is gathered is one of all ranks."""
-    return max(membership.num_floats, GATHERED_FLOATS * membership.layout.num_gmis)
+    return max(config.num_floats, GATHERED_FLOATS * config.layout.num_gmis)
 
 
 def _device() -> Device | None:
-    """What links of this process's GPU are made of; None on a CPU."""
+    """What the transport of this process's GPU is made of; None on a CPU."""
     if jax.local_devices()[0].platform != "gpu":
         return None
     if reason := why_no_bindings():

@@ -20,10 +20,10 @@ from gmijax.collectives.device.device_memory import NewMemory
 from gmijax.collectives.device.lockstep import LockstepRunner
 from gmijax.collectives.device.nccl_ring import NcclRing
 from gmijax.collectives.device.shared_slots import SharedSlots, agreed
-from gmijax.collectives.host.host_exchange import HostExchange
-from gmijax.collectives.host.host_links import HostLinks
-from gmijax.collectives.nodes.node_exchange import NodeExchange
-from gmijax.collectives.program import Exchange, ProgramPeers
+from gmijax.collectives.host.host_transport import HostTransport
+from gmijax.collectives.host.shared_memory_group import SharedMemoryGroup
+from gmijax.collectives.nodes.multi_node_group import MultiNodeGroup
+from gmijax.collectives.program import StagedAllReduce, TracedCollectives
 from gmijax.collectives.shared_memory import Fence
 from gmijax.collectives.strategies import Groups, Stage
 from gmijax.partition.layout import Layout
@@ -72,7 +72,7 @@ class Order:
 
 
 class Device(NamedTuple):
-    """What links of a device are made of.
+    """What the transport of a device is made of.
 
     Attributes:
       new_memory: makes or opens memory that processes share.
@@ -84,13 +84,13 @@ class Device(NamedTuple):
 
     new_memory: NewMemory
     new_queue: Callable[[npt.NDArray[np.uint32]], CudaQueue]
-    new_ring: Callable[[HostExchange | NodeExchange, Groups], NcclRing | None] | None
+    new_ring: Callable[[SharedMemoryGroup | MultiNodeGroup, Groups], NcclRing | None] | None
 
 
-class DeviceLinks(HostLinks):
-    """Links of strategies that leave the host; all ranks of the job make theirs together.
+class DeviceTransport(HostTransport):
+    """Moves numbers on the device's stream; all ranks of the job make theirs together.
 
-    Stages through the host and between nodes go the way of `HostLinks`, and so do rings on a CPU.
+    Stages through the host and between nodes go the way of `HostTransport`, as do rings on a CPU.
     What lies on a device's stream is of one node, by ranks in the node.
 
     Args:
@@ -103,13 +103,13 @@ class DeviceLinks(HostLinks):
 
     Raises:
       DeviceMemoryUnavailable: it does not work here; on all ranks alike.
-      PeerLost, CollectiveTimeout: as in the first call of a reducer.
+      PeerLost, CollectiveTimeout: as in the first call of a communicator.
     """
 
     def __init__(
         self,
-        control: HostExchange | NodeExchange,
-        host: HostExchange | NodeExchange,
+        control: SharedMemoryGroup | MultiNodeGroup,
+        host: SharedMemoryGroup | MultiNodeGroup,
         layout: Layout,
         num_floats: int,
         stages: Sequence[Stage],
@@ -124,10 +124,10 @@ class DeviceLinks(HostLinks):
         self._slots: SharedSlots | None = None
         self._rings: dict[Groups, NcclRing | None] = {}
         try:
-            if any(stage.link == "slots" for stage in stages):
+            if any(stage.transport == "slots" for stage in stages):
                 self._slots = self._new_slots(layout, stages, device.new_memory)
             if (new_ring := device.new_ring) is not None:
-                rings = {stage.groups for stage in stages if stage.link == "ring"}
+                rings = {stage.groups for stage in stages if stage.transport == "ring"}
                 self._rings = {
                     groups: new_ring(control, control.of_node(groups)) for groups in sorted(rings)
                 }
@@ -139,7 +139,7 @@ class DeviceLinks(HostLinks):
         self, layout: Layout, stages: Sequence[Stage], new_memory: NewMemory
     ) -> SharedSlots:
         rank, layout = self._here.rank, layout.of_node(0)
-        groups = next(stage.groups for stage in stages if stage.link == "slots")
+        groups = next(stage.groups for stage in stages if stage.transport == "slots")
         group = next(group for group in self._control.of_node(groups) if rank in group)
         owners = group[:1]
         if len(group) == layout.num_gmis:
@@ -148,8 +148,8 @@ class DeviceLinks(HostLinks):
             owners = first[near:] + first[:near]
         return SharedSlots(self._control, self.room, group, owners, new_memory, _WISH)
 
-    def start(self, trial: Exchange) -> None:
-        """See `HostLinks`."""
+    def start(self, trial: StagedAllReduce) -> None:
+        """See `HostTransport`."""
         agreed(self._control, _WISH, self._open)
         failure = self._runner.settle(lambda: self._try(trial))
         agreed(self._control, _WISH, lambda: _raise(failure))
@@ -158,16 +158,16 @@ class DeviceLinks(HostLinks):
     def reduce(
         self, stage: Stage, stream: int, place: int, source: int, target: int, num_floats: int
     ) -> None:
-        """See `HostLinks`."""
+        """See `HostTransport`."""
         most = max(len(group) for group in stage.groups)
-        if stage.link == "slots" and self._slots is not None:
+        if stage.transport == "slots" and self._slots is not None:
             with self._exchanging(stream, place, num_floats) as queue:
-                if stage.kind == "gather":
-                    self._slots.gather(queue, stream, source, target, num_floats, rows=most)
+                if stage.kind == "all_gather":
+                    self._slots.all_gather(queue, stream, source, target, num_floats, rows=most)
                 else:
                     assert stage.kind == "broadcast"  # Slots add nothing up.
                     self._slots.broadcast(queue, stream, source, target, num_floats)
-        elif stage.link == "ring" and stage.groups in self._rings:
+        elif stage.transport == "ring" and stage.groups in self._rings:
             with self._exchanging(stream, place, num_floats) as queue:
                 ring = self._rings[stage.groups]
                 if ring is None:
@@ -178,17 +178,17 @@ class DeviceLinks(HostLinks):
             super().reduce(stage, stream, place, source, target, num_floats)
 
     def run(self, program: Callable[[], T], *, is_last: bool) -> T:
-        """See `HostLinks`."""
+        """See `HostTransport`."""
         run = self._runner.settle if is_last else self._runner.step
         return run(lambda: self._explained(program))
 
     def exchange_s(self) -> float:
-        """See `HostLinks`: each from the time that this rank's numbers were there."""
+        """See `HostTransport`: each from the time that this rank's numbers were there."""
         on_device_s = 0.0 if self._queue is None else self._queue.clocked_s()
         return super().exchange_s() + on_device_s
 
     def close(self) -> None:
-        """See `HostLinks`; what a device may still be at stays until the process ends."""
+        """See `HostTransport`; what a device may still be at stays until the process ends."""
         if self._runner.is_caught:
             return
         self._runner.close()
@@ -219,14 +219,14 @@ class DeviceLinks(HostLinks):
         self._order = Order(here.flags, here.rank, here.world_size)
         return b""
 
-    def _try(self, exchange: Exchange) -> Exception | None:
+    def _try(self, all_reduce: StagedAllReduce) -> Exception | None:
         """First exchanges of known numbers in this node; what went wrong with them."""
         rank, world_size = self._here.rank, self._here.world_size
 
         def trial(values: jax.Array) -> tuple[jax.Array, jax.Array]:
-            peers = ProgramPeers(exchange, jnp.asarray(rank))
-            gathered = peers.gather(values[:1])[:, 0]
-            return gathered, peers.mean(values, after=gathered)
+            collectives = TracedCollectives(all_reduce, jnp.asarray(rank))
+            gathered = collectives.all_gather(values[:1])[:, 0]
+            return gathered, collectives.mean(values, after=gathered)
 
         try:
             gathered, mean = jax.jit(trial)(jnp.full(self.room, rank + 1, jnp.float32))

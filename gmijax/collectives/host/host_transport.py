@@ -10,20 +10,20 @@ from typing import TYPE_CHECKING, TypeVar
 import jax
 import numpy as np
 
-from gmijax.collectives.host.host_exchange import HostExchange
+from gmijax.collectives.host.shared_memory_group import SharedMemoryGroup
 from gmijax.collectives.interface import FloatBuffer
-from gmijax.collectives.nodes.node_exchange import NodeExchange
+from gmijax.collectives.nodes.multi_node_group import MultiNodeGroup
 from gmijax.collectives.strategies import Stage
 from gmijax.errors import GmijaxError
 
 if TYPE_CHECKING:
-    from gmijax.collectives.program import Exchange
+    from gmijax.collectives.program import StagedAllReduce
 
 T = TypeVar("T")
 
 
-class HostLinks:
-    """How the exchanges of one rank move numbers: here all of them through the host.
+class HostTransport:
+    """Moves the numbers of one rank's collectives, here all of them through the host.
 
     So it is with all strategies on a CPU, and on a GPU with those that do not leave the host. A
     program waits in its exchanges for the other ranks, so calls return when it is computed.
@@ -33,15 +33,15 @@ class HostLinks:
       num_floats: P, length of the largest buffer; the attribute `room`.
     """
 
-    def __init__(self, host: HostExchange | NodeExchange, num_floats: int) -> None:
+    def __init__(self, host: SharedMemoryGroup | MultiNodeGroup, num_floats: int) -> None:
         self.room = num_floats
         self._host = host
         self._failure: GmijaxError | None = None
         self._exchange_s = 0.0
         self._pinned: dict[str, FloatBuffer] = {}  # On a GPU: what exchanges go through.
 
-    def start(self, trial: Exchange) -> None:
-        """Tries the links by exchanges in the node, together with all other ranks.
+    def start(self, trial: StagedAllReduce) -> None:
+        """Tries the transport by exchanges in the node, together with all other ranks.
 
         Raises:
           DeviceMemoryUnavailable: they do not work; on all ranks alike.
@@ -60,7 +60,7 @@ class HostLinks:
           target: address of the result, [n], or [m, n] if the stage gathers.
           num_floats: n.
         """
-        rows = max(map(len, stage.groups)) if stage.kind == "gather" else 1
+        rows = max(map(len, stage.groups)) if stage.kind == "all_gather" else 1
         started = time.monotonic()
         try:
             if stream:
@@ -106,7 +106,7 @@ class HostLinks:
         return seconds
 
     def close(self) -> None:
-        """Releases what the links hold beside the shared block, which is the reducer's."""
+        """Releases what it holds beside the shared block, which is the communicator's."""
         self._pinned = {}
 
     def _buffer(self, use: str, num_floats: int) -> FloatBuffer:
@@ -118,13 +118,16 @@ class HostLinks:
         return self._pinned[use][:num_floats]
 
     def _reduce(self, stage: Stage, place: int, values: FloatBuffer, result: FloatBuffer) -> None:
-        if stage.link == "nodes":
-            assert isinstance(self._host, NodeExchange)
-            self._host.sum_of_nodes(values, result, stage.groups, place)
-            return
-        if stage.kind == "gather":
-            result = result.reshape(-1, values.size)
-        getattr(self._host, stage.kind)(values, result, stage.groups, place)
+        if stage.transport == "nodes":
+            assert isinstance(self._host, MultiNodeGroup)
+            self._host.all_reduce_nodes(values, result, stage.groups, place)
+        elif stage.kind == "all_gather":
+            rows = result.reshape(-1, values.size)
+            self._host.all_gather_into(values, rows, stage.groups, place)
+        elif stage.kind == "all_reduce":
+            self._host.all_reduce(values, result, stage.groups, place)
+        else:
+            self._host.broadcast(values, result, stage.groups, place)
 
 
 def _at(address: int, num_floats: int) -> FloatBuffer:

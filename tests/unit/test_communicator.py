@@ -8,8 +8,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from gmijax.collectives.build import SoloReducer
-from gmijax.collectives.interface import Peers
+from gmijax.collectives.communicator import SingleRankCommunicator
+from gmijax.collectives.interface import Collectives
 from gmijax.collectives.strategies import COSTS
 from gmijax.partition.layout import Layout
 from gmijax.partition.reduction import why_not_strategy
@@ -32,13 +32,15 @@ def test_which_strategies_a_layout_allows(layout: Layout, usable: set[str]) -> N
 
 
 def test_one_gmi_keeps_its_own_numbers() -> None:
-    reducer = SoloReducer()
+    comm = SingleRankCommunicator()
     values = np.array([1.0, np.nan, -0.0, np.inf], np.float32)
 
-    def step(peers: Peers, _: Any, shared: Array, own: Array) -> tuple[Array, Array, Array]:
-        return peers.mean(shared), own, peers.gather(own)[peers.rank()]
+    def step(
+        collectives: Collectives, _: Any, shared: Array, own: Array
+    ) -> tuple[Array, Array, Array]:
+        return collectives.mean(shared), own, collectives.all_gather(own)[collectives.rank()]
 
-    program = reducer.program(step)
+    program = comm.program(step)
     program.trace((), jnp.zeros(4), jnp.zeros(2))
     program.compile()
     mean, _, gathered = program(jnp.asarray(values), jnp.ones(2))
@@ -46,6 +48,6 @@ def test_one_gmi_keeps_its_own_numbers() -> None:
     assert np.asarray(mean).tobytes() == values.tobytes()
     np.testing.assert_array_equal(gathered, np.ones(2))
     assert program.exchange_s is None
-    np.testing.assert_array_equal(reducer.all_gather(values[2:]), [values[2:]])
-    reducer.close()
-    reducer.close()
+    np.testing.assert_array_equal(comm.all_gather(values[2:]), [values[2:]])
+    comm.close()
+    comm.close()

@@ -21,13 +21,13 @@ from gmijax.collectives.shared_memory import create_file
 from gmijax.errors import CollectiveError
 
 ENV_NODES_FD: Final = "GMIJAX_NODES_FD"
-"""Names the descriptor of a file of `Nodes`."""
+"""Names the descriptor of a file of `NodeAddresses`."""
 
 ENV_LISTENER_FD: Final = "GMIJAX_LISTENER_FD"
 """Names the descriptor of the node's listening socket."""
 
 
-class Nodes(NamedTuple):
+class NodeAddresses(NamedTuple):
     """What the GMIs of a job know of those of other nodes.
 
     Attributes:
@@ -51,26 +51,26 @@ class Nodes(NamedTuple):
         return fd
 
     @classmethod
-    def from_file(cls, fd: int) -> Nodes:
+    def from_file(cls, fd: int) -> NodeAddresses:
         """Inverts `to_file`."""
         node, found, token, calls = json.loads(os.pread(fd, os.fstat(fd).st_size, 0))
         addresses = tuple((host, port) for host, port in found)
         pairs = {(listener, caller): address for listener, caller, address in calls}
         return cls(node, addresses, bytes.fromhex(token), pairs)
 
-    def among(self, nodes: Sequence[int]) -> Nodes:
+    def among(self, nodes: Sequence[int]) -> NodeAddresses:
         """The leaders of these nodes alone, this one among them."""
         addresses = tuple(self.addresses[node] for node in nodes)
         return self._replace(node=nodes.index(self.node), addresses=addresses)
 
 
-def inherited_nodes() -> tuple[Nodes | None, socket.socket | None]:
+def inherited_nodes() -> tuple[NodeAddresses | None, socket.socket | None]:
     """What this process inherited of the two above; neither in a job on one machine."""
     if ENV_NODES_FD not in os.environ:
         return None, None
     nodes_fd, listener_fd = int(os.environ[ENV_NODES_FD]), int(os.environ[ENV_LISTENER_FD])
     os.set_inheritable(listener_fd, False)
-    nodes = Nodes.from_file(nodes_fd)
+    nodes = NodeAddresses.from_file(nodes_fd)
     os.close(nodes_fd)
     return nodes, socket.socket(fileno=listener_fd)
 
@@ -95,7 +95,7 @@ def reserved_address(host: str) -> Iterator[str]:
 
 
 def connect(
-    nodes: Nodes, listener: socket.socket, num_lanes: int, timeout_s: float
+    nodes: NodeAddresses, listener: socket.socket, num_lanes: int, timeout_s: float
 ) -> list[Sockets]:
     """Connects this node's leader with those of all others, once for each lane.
 
@@ -118,7 +118,7 @@ def connect(
     return list(lanes)
 
 
-def _call(nodes: Nodes, node: int, lane: int, deadline_s: float) -> socket.socket:
+def _call(nodes: NodeAddresses, node: int, lane: int, deadline_s: float) -> socket.socket:
     address = nodes.addresses[node]
     where = f"node {node} at {address[0]}:{address[1]}"
     key = Key(nodes.token, _name_of_listener(node))
@@ -136,7 +136,7 @@ def _call(nodes: Nodes, node: int, lane: int, deadline_s: float) -> socket.socke
 
 
 def _accept(
-    nodes: Nodes,
+    nodes: NodeAddresses,
     listener: socket.socket,
     lanes: Sequence[dict[int, socket.socket]],
     deadline_s: float,

@@ -1,4 +1,4 @@
-"""Every reduction strategy on real GPUs. Run with `pytest -m gpu tests/gpu/test_reducers_gpu.py`.
+"""Every reduction strategy on real GPUs. Run `pytest -m gpu tests/gpu/test_communicators_gpu.py`.
 
 With pytest-xdist (`-n 4`) the cases of the contract run at the same time, from another GPU on in
 each worker. Learning (`-k learning`) wants the GPUs for itself: a job takes most of their memory.
@@ -18,7 +18,7 @@ from training_jobs import POINT_TASK, STEPS, TINY, learner_arrays, train
 from gmijax.machine.nvidia import list_gpus
 from gmijax.partition.layout import Layout
 from gmijax.partition.reduction import why_not_intra
-from tests.reducer_contract import PAIRS, Case, check_contract
+from tests.communicator_contract import PAIRS, Case, check_contract
 
 pytestmark = [pytest.mark.gpu, pytest.mark.timeout(200)]
 

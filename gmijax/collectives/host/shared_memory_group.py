@@ -1,4 +1,4 @@
-"""Gather, sum and broadcast between the ranks of one host, through its shared block."""
+"""All-gather, all-reduce and broadcast between the ranks of one host, through its shared block."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ PIECE_FLOATS = 32768
 """Floats summed at a time: 128 KiB of sums stay in the second-level cache over all ranks."""
 
 
-class HostExchange:
+class SharedMemoryGroup:
     """One rank's use of the shared block, from `attach` to `close`.
 
     All calls are collective: every rank of the job makes the same ones in the same order, also
@@ -67,7 +67,7 @@ class HostExchange:
         self._block: SharedBlock | None = block
         self.barrier = Barrier(block, timeout_s, rendezvous_timeout_s)
 
-    def sum(
+    def all_reduce(
         self, source: FloatBuffer, target: FloatBuffer, groups: Groups, place: int = 0
     ) -> None:
         """Writes the sum over the rank's group of `source` [n] into `target` [n], n <= P.
@@ -93,7 +93,7 @@ class HostExchange:
         target[:] = slots[group[0] if group else self.rank]
         self.barrier.end()
 
-    def gather(
+    def all_gather_into(
         self, source: FloatBuffer, target: FloatBuffer, groups: Groups, place: int = 0
     ) -> None:
         """Writes what all of the rank's group have as `source` [n] into `target` [m, n]."""
@@ -121,11 +121,11 @@ class HostExchange:
     def mean(self, buffer: FloatBuffer) -> FloatBuffer:
         """Returns the mean over all ranks of `buffer` [P] float32: the sum times 1 / K."""
         total = np.empty_like(buffer)
-        self.sum(buffer, total, (tuple(range(self.world_size)),))
+        self.all_reduce(buffer, total, (tuple(range(self.world_size)),))
         total *= np.float32(1.0 / self.world_size)
         return total
 
-    def introduce(self, values: FloatBuffer) -> FloatBuffer:
+    def bootstrap_all_gather(self, values: FloatBuffer) -> FloatBuffer:
         """`all_gather` as part of the start: others may still compile in the call after it."""
         gathered = self.all_gather(values)
         self.barrier.restart()
@@ -137,12 +137,12 @@ class HostExchange:
         return self._open_block("flags").flags
 
     @property
-    def local(self) -> HostExchange:
-        """This one: all ranks are of its host. See `NodeExchange`."""
+    def local(self) -> SharedMemoryGroup:
+        """This one: all ranks are of its host. See `MultiNodeGroup`."""
         return self
 
     def of_node(self, groups: Groups) -> Groups:
-        """The groups: all ranks are of this host. See `NodeExchange`."""
+        """The groups: all ranks are of this host. See `MultiNodeGroup`."""
         return groups
 
     def is_gone(self, peer: int) -> bool:
