@@ -107,6 +107,11 @@ TOPICS: Final[Mapping[str, Topic]] = {
     "algo=a3c": Topic(
         "Learning, with `algo=a3c` (asynchronous)", "async.md", "gmijax train env=ant algo=a3c"
     ),
+    "algo=distill": Topic(
+        "Learning, with `algo=distill` (a student of a trained policy)",
+        "learning.md",
+        "gmijax train env=ant algo=distill algo.teacher=runs/ant",
+    ),
     "channel": Topic("Experience channels, with `algo=a3c`", "channels.md"),
 }
 """Headings of keys by their group, or by what they belong to, in the order of the pages."""
@@ -122,7 +127,8 @@ LEARNING: Final[Mapping[str, tuple[str, ...]]] = {
         *("recompute_advantages",),
     ),
     "Networks and exploration": (
-        *("policy_hidden_layer_sizes", "value_hidden_layer_sizes", "value_obs_key", "precision"),
+        *("policy_hidden_layer_sizes", "value_hidden_layer_sizes", "precision"),
+        *("policy_obs_key", "value_obs_key"),
         *("distribution_type", "init_noise_std", "state_dependent_std", "init_at_random_ep_len"),
     ),
     "Normalisation": (

@@ -25,14 +25,20 @@ ACTION_SIZE = 3
 TINY = ("env=ball_balance", "algo.policy_hidden_layer_sizes=[16,8]", "num_envs=16")
 
 
-def make_run(root: Path, *overrides: str, actor_obs_size: int | None = None) -> RunPaths:
+def make_run(
+    root: Path,
+    *overrides: str,
+    obs_size: int = OBS_SIZE,
+    action_size: int = ACTION_SIZE,
+    actor_obs_size: int | None = None,
+) -> RunPaths:
     """A run folder with one checkpoint, at ENV_STEPS; some of its actions are beyond +-1."""
     config = gmijax.compose(*TINY, *overrides)
     run = RunPaths(root)
     run.root.mkdir(parents=True, exist_ok=True)
     write_json(run.config, to_dict(config))
     # Nothing is computed by jax: that would be compiled, leaf by leaf.
-    spec = EnvSpec("x", OBS_SIZE, ACTION_SIZE, 0.0, 0, (), actor_obs_size=actor_obs_size)
+    spec = EnvSpec("x", obs_size, action_size, 0.0, 0, (), actor_obs_size=actor_obs_size)
     shapes, rng = learner_shapes(spec, config.algo), np.random.default_rng(0)
 
     def weights(leaf: Any) -> np.ndarray:
@@ -45,8 +51,8 @@ def make_run(root: Path, *overrides: str, actor_obs_size: int | None = None) -> 
         params=jax.tree.map(weights, shapes.params),
         obs_moments=Moments(
             np.asarray(1e3, np.float32),
-            np.linspace(-2.0, 2.0, OBS_SIZE, dtype=np.float32),
-            1e3 * np.linspace(0.1, 9.0, OBS_SIZE, dtype=np.float32),
+            np.linspace(-2.0, 2.0, obs_size, dtype=np.float32),
+            1e3 * np.linspace(0.1, 9.0, obs_size, dtype=np.float32),
         ),
         key=jax.random.key(0),
     )

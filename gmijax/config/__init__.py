@@ -9,6 +9,7 @@ from __future__ import annotations
 from gmijax.config.algo import ADAPTIVE_LEARNING_RATE_RANGE as ADAPTIVE_LEARNING_RATE_RANGE
 from gmijax.config.algo import A3cConfig as A3cConfig
 from gmijax.config.algo import ActorCriticConfig as ActorCriticConfig
+from gmijax.config.algo import DistillConfig as DistillConfig
 from gmijax.config.algo import PpoConfig as PpoConfig
 from gmijax.config.channel import ChannelConfig as ChannelConfig
 from gmijax.config.cluster import ClusterConfig as ClusterConfig

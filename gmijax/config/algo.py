@@ -1,9 +1,9 @@
-"""Hyper-parameters of PPO and A3C, with Brax's names."""
+"""Hyper-parameters of the algorithms, with Brax's names."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import ClassVar, Literal
+from typing import ClassVar, Literal, NamedTuple
 
 from gmijax.config.schema import KeyGroup, doc
 from gmijax.errors import ConfigError
@@ -12,9 +12,23 @@ ADAPTIVE_LEARNING_RATE_RANGE = (1e-5, 1e-2)
 """Where the adaptive schedule keeps the learning rate; that of rsl_rl (rl_games goes to 1e-6)."""
 
 
+class ValueNetwork(NamedTuple):
+    """The value function of an algorithm that has one.
+
+    Attributes:
+      hidden_layer_sizes: widths of its network.
+      obs_key: see `ActorCriticConfig.value_obs_key`.
+      is_normalized: see `ActorCriticConfig.normalize_values`.
+    """
+
+    hidden_layer_sizes: tuple[int, ...]
+    obs_key: str
+    is_normalized: bool
+
+
 @dataclass(frozen=True, kw_only=True)
-class ActorCriticConfig(KeyGroup):
-    """Keys that PPO and A3C share."""
+class PolicyConfig(KeyGroup):
+    """Keys of all algorithms: rollouts, passes over them, the policy, its optimiser."""
 
     prefix = "algo."
     implementation: ClassVar[str] = ""
@@ -28,37 +42,11 @@ class ActorCriticConfig(KeyGroup):
     )
     num_minibatches: int = doc("minibatches per pass over the rollout (a3c: a batch)", low=1)
     num_updates_per_batch: int = doc("passes over the rollout (a3c: a batch), epochs", low=1)
-    gae_lambda: float = doc(
-        "lambda of generalised advantage estimation (a3c: of V-trace's returns), 0 to 1",
-        low=0.0,
-        high=1.0,
-    )
-    normalize_advantage: bool = doc(
-        "normalise advantages over all samples of all GMIs (a3c: over every batch)"
-    )
-    learning_rate_schedule: Literal["fixed", "adaptive_kl"] = doc(
-        "fixed, or steered to keep the policy's KL divergence since the rollout (a3c: per batch) "
-        "near desired_kl"
-    )
-    discounting: float = doc("discount factor per step, 0 to 1", low=0.0, high=1.0)
-    value_cost: float = doc("weight of the value loss", low=0.0)
-    entropy_cost: float = doc("weight of the entropy bonus", low=0.0)
-    bound_cost: float = doc("weight of the penalty on action means outside [-1.1, 1.1]", low=0.0)
     learning_rate: float = doc(
         "step size of Adam (the first one, if the schedule is adaptive)", positive=True
     )
-    desired_kl: float = doc("target of the adaptive schedule", positive=True)
     max_grad_norm: float = doc("gradients are scaled down to this global norm", positive=True)
-    reward_scaling: float = doc(
-        "factor on rewards before learning (logged returns are unscaled)", positive=True
-    )
     normalize_observations: bool = doc("normalise observations with running statistics")
-    normalize_values: bool = doc(
-        "the value function learns its targets in standard deviations from their running mean; "
-        "value_cost, and with PPO the clip of the value loss, count in this unit. When it moves, "
-        "the last layer moves with it, so that values stay what they were",
-        default=False,
-    )
     obs_std_floor: float = doc(
         "smallest standard deviation that observations are divided by", default=1e-4, low=1e-4
     )
@@ -67,13 +55,12 @@ class ActorCriticConfig(KeyGroup):
         "with them, so that policy and values stay what they were",
         default=False,
     )
-    value_obs_key: Literal["auto", "state", "privileged_state"] = doc(
-        "the value function sees what the policy does (state), or also what the task has for it "
-        "alone (privileged_state); auto: that, where there is any",
+    policy_hidden_layer_sizes: tuple[int, ...] = doc("widths of the policy network", low=1)
+    policy_obs_key: Literal["auto", "state", "privileged_state"] = doc(
+        "the policy sees what the task has for it (state), or also what the task has for the "
+        "value function alone (privileged_state), as a teacher of algo=distill may; auto: state",
         default="auto",
     )
-    policy_hidden_layer_sizes: tuple[int, ...] = doc("widths of the policy network", low=1)
-    value_hidden_layer_sizes: tuple[int, ...] = doc("widths of the value network", low=1)
     precision: Literal["float32", "bfloat16"] = doc(
         "what the hidden layers of both networks compute in, for acting and learning; weights, "
         "output layers, losses and optimizer are float32",
@@ -96,19 +83,26 @@ class ActorCriticConfig(KeyGroup):
         default=False,
     )
 
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        low, high = ADAPTIVE_LEARNING_RATE_RANGE
-        if self.learning_rate_schedule == "adaptive_kl" and not low <= self.learning_rate <= high:
-            raise ConfigError(
-                f"algo.learning_rate={self.learning_rate!r}: must be between {low} and {high} "
-                "with algo.learning_rate_schedule=adaptive_kl"
-            )
-
     @property
     def warms_up(self) -> bool:
         """Whether a run begins with an iteration that only fills the statistics."""
         return False
+
+    @property
+    def adaptive_kl(self) -> float | None:
+        """The divergence that the learning rate is steered to; None where the rate is fixed."""
+        return None
+
+    @property
+    def value_network(self) -> ValueNetwork | None:
+        """The value function, if there is one."""
+        return None
+
+    @property
+    def hidden_layer_sizes(self) -> tuple[tuple[int, ...], tuple[int, ...]]:
+        """Of the policy and of the value network; empty where there is none."""
+        value = self.value_network
+        return self.policy_hidden_layer_sizes, value.hidden_layer_sizes if value else ()
 
     def check_job(self, num_envs: int | None, template: str) -> None:
         """Checks what depends on other keys too; `num_envs` is None where it is not decided yet.
@@ -124,10 +118,63 @@ class ActorCriticConfig(KeyGroup):
                 f"do not divide into algo.num_minibatches={self.num_minibatches} minibatches"
             )
 
+
+@dataclass(frozen=True, kw_only=True)
+class ActorCriticConfig(PolicyConfig):
+    """Keys that PPO and A3C share."""
+
+    gae_lambda: float = doc(
+        "lambda of generalised advantage estimation (a3c: of V-trace's returns), 0 to 1",
+        low=0.0,
+        high=1.0,
+    )
+    normalize_advantage: bool = doc(
+        "normalise advantages over all samples of all GMIs (a3c: over every batch)"
+    )
+    learning_rate_schedule: Literal["fixed", "adaptive_kl"] = doc(
+        "fixed, or steered to keep the policy's KL divergence since the rollout (a3c: per batch) "
+        "near desired_kl"
+    )
+    discounting: float = doc("discount factor per step, 0 to 1", low=0.0, high=1.0)
+    value_cost: float = doc("weight of the value loss", low=0.0)
+    entropy_cost: float = doc("weight of the entropy bonus", low=0.0)
+    bound_cost: float = doc("weight of the penalty on action means outside [-1.1, 1.1]", low=0.0)
+    desired_kl: float = doc("target of the adaptive schedule", positive=True)
+    reward_scaling: float = doc(
+        "factor on rewards before learning (logged returns are unscaled)", positive=True
+    )
+    normalize_values: bool = doc(
+        "the value function learns its targets in standard deviations from their running mean; "
+        "value_cost, and with PPO the clip of the value loss, count in this unit. When it moves, "
+        "the last layer moves with it, so that values stay what they were",
+        default=False,
+    )
+    value_obs_key: Literal["auto", "state", "privileged_state"] = doc(
+        "the value function sees what the policy does (state), or also what the task has for it "
+        "alone (privileged_state); auto: that, where there is any",
+        default="auto",
+    )
+    value_hidden_layer_sizes: tuple[int, ...] = doc("widths of the value network", low=1)
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        low, high = ADAPTIVE_LEARNING_RATE_RANGE
+        if self.adaptive_kl is not None and not low <= self.learning_rate <= high:
+            raise ConfigError(
+                f"algo.learning_rate={self.learning_rate!r}: must be between {low} and {high} "
+                "with algo.learning_rate_schedule=adaptive_kl"
+            )
+
     @property
-    def hidden_layer_sizes(self) -> tuple[tuple[int, ...], tuple[int, ...]]:
-        """Of the policy and of the value network."""
-        return self.policy_hidden_layer_sizes, self.value_hidden_layer_sizes
+    def adaptive_kl(self) -> float | None:
+        """See `PolicyConfig`."""
+        return self.desired_kl if self.learning_rate_schedule == "adaptive_kl" else None
+
+    @property
+    def value_network(self) -> ValueNetwork:
+        """See `PolicyConfig`."""
+        sizes = self.value_hidden_layer_sizes
+        return ValueNetwork(sizes, self.value_obs_key, self.normalize_values)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -167,11 +214,11 @@ class PpoConfig(ActorCriticConfig):
 
     @property
     def warms_up(self) -> bool:
-        """See `ActorCriticConfig`."""
+        """See `PolicyConfig`."""
         return self.warmup_unroll
 
     def check_job(self, num_envs: int | None, template: str) -> None:
-        """See `ActorCriticConfig`."""
+        """See `PolicyConfig`."""
         if self.recompute_advantages and template == "tdg_ex":
             raise ConfigError(
                 "algo.recompute_advantages=true: for jobs in which every GMI trains; with "
@@ -216,7 +263,7 @@ class A3cConfig(ActorCriticConfig):
     )
 
     def check_job(self, num_envs: int | None, template: str) -> None:
-        """See `ActorCriticConfig`."""
+        """See `PolicyConfig`."""
         del template
         if num_envs is not None:
             self.batch_of(num_envs)
@@ -249,3 +296,25 @@ class A3cConfig(ActorCriticConfig):
                 "of a batch (algo.batch_size, or num_envs if that is null)"
             )
         return batch
+
+
+@dataclass(frozen=True, kw_only=True)
+class DistillConfig(PolicyConfig):
+    """Hyper-parameters of distillation: a student learns to act as a trained policy does."""
+
+    implementation = "gmijax.distill.distill:DISTILL"
+
+    name: Literal["distill"] = doc("training algorithm")
+    teacher: str | None = doc(
+        "run folder or checkpoint of the policy that the student learns from, trained on a task "
+        "with the same observations and actions; last: the newest run"
+    )
+
+    def check_job(self, num_envs: int | None, template: str) -> None:
+        """See `PolicyConfig`."""
+        if self.teacher is None:
+            raise ConfigError(
+                "algo.teacher=null: algo=distill learns from a trained policy; expected its run "
+                "folder or checkpoint"
+            )
+        super().check_job(num_envs, template)

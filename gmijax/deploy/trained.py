@@ -69,7 +69,7 @@ def trained_policy(checkpoint: Path) -> TrainedPolicy:
         "action_size": action_size,
         "algo": algo.name,
         "policy_hidden_layer_sizes": list(algo.policy_hidden_layer_sizes),
-        "value_hidden_layer_sizes": list(algo.value_hidden_layer_sizes),
+        "value_hidden_layer_sizes": list(algo.hidden_layer_sizes[1]),
         **_normalizer(algo, moments),
         "gmijax_version": __version__,
         "jax_version": versions_of(["jax"])["jax"],

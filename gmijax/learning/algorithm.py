@@ -58,8 +58,8 @@ Iterate: TypeAlias = Callable[
     tuple[TrainState, BatchState, IterationMetrics],
 ]
 """`(env, learner, collectives, model, state, env_state) -> (state, env_state, metrics)`: a rollout
-and its updates, a pure function. State and environments are donated. `state` comes out equal on all
-GMIs, since what goes into it passes through `collectives`."""
+and its updates, a pure function. State and environments are donated. `state` comes out equal on
+all GMIs, since what goes into it passes through `collectives`."""
 
 
 @dataclass(frozen=True)

@@ -56,7 +56,7 @@ def checkpoint_meta(
         env_steps=env_steps,
         num_gmis=num_gmis,
         num_envs=config.envs_per_gmi,
-        hidden=(algo.policy_hidden_layer_sizes, algo.value_hidden_layer_sizes),
+        hidden=algo.hidden_layer_sizes,
         impl=config.physics.impl,
         mean_return=standing.mean_return,
         window_full=standing.is_full,

@@ -5,7 +5,7 @@ Checkpoints hold a `TrainState` whatever the algorithm, so that all can be playe
 
 from __future__ import annotations
 
-from typing import Generic, NamedTuple, TypeVar
+from typing import Any, Generic, NamedTuple, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -62,38 +62,47 @@ class TrainState(NamedTuple):
 
 
 class Learner(NamedTuple, Generic[C]):
-    """Networks, optimiser and hyper-parameters: what the update functions need, no arrays."""
+    """Networks, optimiser and hyper-parameters: what the update functions need.
+
+    Attributes:
+      networks: of the policy and, where there is one, of the value function.
+      optimizer: without the learning rate, which is in the state.
+      config: hyper-parameters.
+      extra: what else the algorithm needs, such as a teacher.
+    """
 
     networks: ActorCritic
     optimizer: optax.GradientTransformation
     config: C
+    extra: Any = None
 
 
 def make_learner(spec: EnvSpec, config: C) -> Learner[C]:
     """The learner for an environment's sizes.
 
     Raises:
-      ConfigError: the value function shall see what this environment does not have.
+      ConfigError: a network shall see what this environment does not have.
     """
-    seen = spec.actor_obs_size
-    if config.value_obs_key == "privileged_state" and seen is None:
-        raise ConfigError(
-            f"algo.value_obs_key=privileged_state: {spec.name} has no observations for the value "
-            "function alone; allowed are auto, state"
-        )
+    seen, value = spec.actor_obs_size, config.value_network
+    keys = {"policy_obs_key": config.policy_obs_key, "value_obs_key": value and value.obs_key}
+    for key, wanted in keys.items():
+        if wanted == "privileged_state" and seen is None:
+            raise ConfigError(
+                f"algo.{key}=privileged_state: {spec.name} has no observations for the value "
+                "function alone; allowed are auto, state"
+            )
     make_distribution, precision = DISTRIBUTIONS[config.distribution_type], config.precision
     distribution = make_distribution(spec.action_size, config.state_dependent_std)
     # A small output layer makes the first policy's mean about zero wherever the robot is.
     policy = Mlp(config.policy_hidden_layer_sizes, distribution.output_size, 0.01, precision)
-    value = Mlp(config.value_hidden_layer_sizes, 1, 1.0, precision)
     return Learner(
         networks=ActorCritic(
             policy,
-            value,
+            Mlp(value.hidden_layer_sizes, 1, 1.0, precision) if value else None,
             config.init_noise_std,
             distribution,
-            actor_obs_size=seen,
-            value_obs_size=seen if config.value_obs_key == "state" else None,
+            actor_obs_size=None if config.policy_obs_key == "privileged_state" else seen,
+            value_obs_size=seen if value and value.obs_key == "state" else None,
         ),
         # The learning rate is in the state, because the adaptive schedule changes it. One vector
         # of all parameters: a kernel for each of them costs a tenth of an update on a GPU.
@@ -107,6 +116,7 @@ def make_learner(spec: EnvSpec, config: C) -> Learner[C]:
 def init_learner(learner: Learner, obs_size: int, key: PRNGKey) -> TrainState:
     """The first state; consumes `key`."""
     params_key, shuffle_key = jax.random.split(key)
+    value = learner.config.value_network
     params = learner.networks.init(params_key, obs_size)
     return TrainState(
         params=params,
@@ -115,7 +125,7 @@ def init_learner(learner: Learner, obs_size: int, key: PRNGKey) -> TrainState:
         learning_rate=jnp.asarray(learner.config.learning_rate, jnp.float32),
         iteration=jnp.zeros((), jnp.int32),
         key=shuffle_key,
-        value_moments=no_samples(()) if learner.config.normalize_values else None,
+        value_moments=no_samples(()) if value and value.is_normalized else None,
     )
 
 
@@ -237,8 +247,8 @@ def apply_gradients(
     `kl` [] is the divergence that the adaptive schedule looks at; see `adapted_learning_rate`.
     """
     config, rate = learner.config, state.learning_rate
-    if config.learning_rate_schedule == "adaptive_kl":
-        rate = adapted_learning_rate(rate, kl, config.desired_kl)
+    if config.adaptive_kl is not None:
+        rate = adapted_learning_rate(rate, kl, config.adaptive_kl)
     updates, opt_state = learner.optimizer.update(grads, state.opt_state, state.params)
     params: ActorCriticParams = jax.tree.map(lambda p, u: p - rate * u, state.params, updates)
     return state._replace(params=params, opt_state=opt_state, learning_rate=rate)
@@ -246,7 +256,7 @@ def apply_gradients(
 
 def rate_figures(config: AlgoConfig, rates: Array) -> dict[str, Array]:
     """Mean, least and largest of the learning rates of updates; none if they cannot differ."""
-    if config.learning_rate_schedule == "fixed" or rates.size == 1:
+    if config.adaptive_kl is None or rates.size == 1:
         return {}
     return {"mean": jnp.mean(rates), "min": jnp.min(rates), "max": jnp.max(rates)}
 

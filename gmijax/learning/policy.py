@@ -79,7 +79,7 @@ class ActorCriticParams(NamedTuple):
 
     Attributes:
       policy: weights of the network whose output the distribution takes.
-      value: weights of the value network.
+      value: weights of the value network, empty where there is none.
       log_std: [A] logarithm of the policy's standard deviation, or of the part of it that all
         states share.
     """
@@ -94,7 +94,7 @@ class ActorCritic(NamedTuple):
 
     Attributes:
       policy: the network whose output the distribution takes.
-      value: the value function.
+      value: the value function, None for algorithms without one.
       init_noise_std: standard deviation of the first policy.
       distribution: of actions.
       actor_obs_size: `policy` sees the first so many numbers of an observation; None: all.
@@ -102,7 +102,7 @@ class ActorCritic(NamedTuple):
     """
 
     policy: Mlp
-    value: Mlp
+    value: Mlp | None
     init_noise_std: float
     distribution: Normal
     actor_obs_size: int | None = None
@@ -114,7 +114,7 @@ class ActorCritic(NamedTuple):
         obs = jnp.zeros((1, obs_size))
         return ActorCriticParams(
             policy=self.policy.init(policy_key, obs[:, : self.actor_obs_size]),
-            value=self.value.init(value_key, obs[:, : self.value_obs_size]),
+            value=self.value.init(value_key, obs[:, : self.value_obs_size]) if self.value else {},
             log_std=jnp.full((self.distribution.action_size,), jnp.log(self.init_noise_std)),
         )
 
@@ -133,12 +133,14 @@ class ActorCritic(NamedTuple):
             }
             return {**network, "params": {**network["params"], "Dense_0": new}}
 
-        return params._replace(policy=changed(params.policy), value=changed(params.value))
+        value = changed(params.value) if self.value else params.value
+        return params._replace(policy=changed(params.policy), value=value)
 
     def with_values(
         self, params: ActorCriticParams, scale: Array, shift: Array
     ) -> ActorCriticParams:
         """Weights that make `scale` * v + `shift`, [] each, of what `params` make v."""
+        assert self.value is not None
         layers = params.value["params"]
         last = f"Dense_{len(self.value.hidden)}"
         new = {
@@ -159,6 +161,7 @@ class ActorCritic(NamedTuple):
 
     def state_value(self, params: ActorCriticParams, obs: Array) -> Array:
         """Value estimates [...] for normalised observations [..., O]."""
+        assert self.value is not None
         if self.value_obs_size is not None:
             obs = obs[..., : self.value_obs_size]
         return jnp.asarray(self.value.apply(params.value, obs))[..., 0]

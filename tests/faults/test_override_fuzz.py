@@ -56,7 +56,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
     done = RunPaths(root / "runs" / "done")
     config = compose("env=ant", "num_envs=64")
     assert isinstance(config.algo, ALGORITHMS)
-    hidden = (config.algo.policy_hidden_layer_sizes, config.algo.value_hidden_layer_sizes)
+    hidden = config.algo.hidden_layer_sizes
     done.root.mkdir(parents=True, exist_ok=True)
     write_json(done.config, to_dict(config))
     meta = CheckpointMeta("ant", "ppo", 1000, 1, 64, hidden, "jax")

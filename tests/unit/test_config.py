@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import pytest
 
 from gmijax.cli.compose import compose
-from gmijax.config import ADAPTIVE_LEARNING_RATE_RANGE, TrainConfig
+from gmijax.config import ADAPTIVE_LEARNING_RATE_RANGE, ActorCriticConfig, TrainConfig
 from gmijax.config.schema import from_dict, to_dict
 from gmijax.errors import ConfigError
 from gmijax.learning.learner import adapted_learning_rate
@@ -77,9 +77,9 @@ WIDTHS = {"humanoid": (200, 400, 100), "shadow_hand": (512, 512, 512, 256)}
 def test_every_task_has_the_papers_networks_and_one_scale_of_rewards(task: str):
     settings = [compose(f"env={task}", f"algo={algo}").algo for algo in ("ppo", "a3c")]
     wanted = WIDTHS.get(task, (256, 128, 64))
-    assert all(algo.policy_hidden_layer_sizes == wanted for algo in settings)
-    assert all(algo.value_hidden_layer_sizes == wanted for algo in settings)
-    assert len({algo.reward_scaling for algo in settings}) == 1
+    assert all(algo.hidden_layer_sizes == (wanted, wanted) for algo in settings)
+    scales = {algo.reward_scaling for algo in settings if isinstance(algo, ActorCriticConfig)}
+    assert len(scales) == 1
 
 
 def test_steps_of_serving_are_split_over_the_gmis_that_simulate():

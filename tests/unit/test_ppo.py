@@ -128,7 +128,8 @@ def test_the_derivative_of_elu_comes_from_its_output_and_is_the_same() -> None:
 
 
 def test_hidden_layers_compute_in_bfloat16_and_all_else_in_float32(params) -> None:
-    policy, value = (net.clone(dtype="bfloat16") for net in NETWORKS[:2])
+    assert NETWORKS.value is not None
+    policy, value = (net.clone(dtype="bfloat16") for net in (NETWORKS.policy, NETWORKS.value))
     half = NETWORKS._replace(policy=policy, value=value)
     obs = jax.random.normal(jax.random.key(1), (20_000, O))  # Gradients are sums of many.
 

@@ -184,7 +184,7 @@ def test_auto_fills_in_what_an_older_version_did_not_save(run: RunPaths):
     del saved["algo"]["clipping_epsilon"], saved["eval"]
     write_json(run.config, saved)
     config, wanted = config_of(run.root), compose("env=ant")
-    assert config.algo.clipping_epsilon == wanted.algo.clipping_epsilon
+    assert config.algo == wanted.algo
     assert config.eval == wanted.eval
 
 

@@ -12,6 +12,7 @@ from optuna.storages.journal import JournalFileBackend
 
 from gmijax.cli.compose import compose
 from gmijax.cli.grid import build_sweep
+from gmijax.config import PpoConfig
 from gmijax.errors import ConfigError
 from gmijax.sweeps.jobs import Job, jobs_of
 from gmijax.sweeps.progress import State
@@ -30,6 +31,7 @@ TOY = ("sweep.sampler=tpe", "algo.learning_rate=tag(log,interval(1e-5,1e-2))", "
 def toy_objective(job: Job) -> float:
     """Best at a learning rate of 4e-3 and an entropy cost of 2e-3."""
     algo = job.config.algo
+    assert isinstance(algo, PpoConfig)
     far = abs(np.log(algo.learning_rate) - np.log(4e-3))
     return -far - 300.0 * abs(algo.entropy_cost - 2e-3)
 

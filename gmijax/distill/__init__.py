@@ -1,0 +1,1 @@
+"""Distillation: a student learns to act as a trained policy does."""
