@@ -10,14 +10,16 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Final, NamedTuple
 
 import jax
 import jax.numpy as jnp
 
+from gmijax.learning.algorithm import init_of
 from gmijax.learning.checkpoint import digest, restore_learner
-from gmijax.learning.learner import Learner, acting_moments, init_learner, make_learner
+from gmijax.learning.learner import Learner, acting_moments, make_learner
 from gmijax.learning.normalize import normalize
 from gmijax.learning.unroll import Counts, Outcome, count, outcome_of
 from gmijax.learning.unroll import unroll as run_steps
@@ -61,8 +63,9 @@ def trained_policy(checkpoint: Path, spec: EnvSpec, *, deterministic: bool) -> A
     Raises:
       ConfigError: the checkpoint is broken, or of an environment with other sizes.
     """
-    learner = make_learner(spec, trained_config(checkpoint)[1])
-    start = jax.jit(lambda key: init_learner(learner, spec.obs_size, key))(jax.random.key(0))
+    algo = trained_config(checkpoint)[1]
+    learner = make_learner(spec, algo)
+    start = jax.jit(partial(init_of(algo), learner, spec.obs_size))(jax.random.key(0))
     state = restore_learner(checkpoint, start)
     weights = state.params, acting_moments(learner.config, state)
     sha = digest(weights).astype("uint16").tobytes().hex()

@@ -28,7 +28,7 @@ class ValueNetwork(NamedTuple):
 
 @dataclass(frozen=True, kw_only=True)
 class PolicyConfig(KeyGroup):
-    """Keys of all algorithms: rollouts, passes over them, the policy, its optimiser."""
+    """Keys of all algorithms: the length of rollouts, the policy, its optimiser."""
 
     prefix = "algo."
     implementation: ClassVar[str] = ""
@@ -40,8 +40,6 @@ class PolicyConfig(KeyGroup):
     unroll_length: int = doc(
         "T, environment steps per environment and iteration (a3c: and unroll)", low=1
     )
-    num_minibatches: int = doc("minibatches per pass over the rollout (a3c: a batch)", low=1)
-    num_updates_per_batch: int = doc("passes over the rollout (a3c: a batch), epochs", low=1)
     learning_rate: float = doc(
         "step size of Adam (the first one, if the schedule is adaptive)", positive=True
     )
@@ -104,12 +102,29 @@ class PolicyConfig(KeyGroup):
         value = self.value_network
         return self.policy_hidden_layer_sizes, value.hidden_layer_sizes if value else ()
 
+    @property
+    def kept_steps(self) -> int:
+        """Steps of every environment whose experience is in memory at once."""
+        return self.unroll_length
+
     def check_job(self, num_envs: int | None, template: str) -> None:
         """Checks what depends on other keys too; `num_envs` is None where it is not decided yet.
 
         Raises:
           ConfigError: environments per GMI do not divide into minibatches, or the like.
         """
+        del num_envs, template
+
+
+@dataclass(frozen=True, kw_only=True)
+class RolloutConfig(PolicyConfig):
+    """Keys of algorithms that learn from every rollout in passes over it, and never again."""
+
+    num_minibatches: int = doc("minibatches per pass over the rollout (a3c: a batch)", low=1)
+    num_updates_per_batch: int = doc("passes over the rollout (a3c: a batch), epochs", low=1)
+
+    def check_job(self, num_envs: int | None, template: str) -> None:
+        """See `PolicyConfig`."""
         del template
         samples = (num_envs or 0) * self.unroll_length
         if samples % self.num_minibatches:
@@ -120,7 +135,7 @@ class PolicyConfig(KeyGroup):
 
 
 @dataclass(frozen=True, kw_only=True)
-class ActorCriticConfig(PolicyConfig):
+class ActorCriticConfig(RolloutConfig):
     """Keys that PPO and A3C share."""
 
     gae_lambda: float = doc(
@@ -299,7 +314,7 @@ class A3cConfig(ActorCriticConfig):
 
 
 @dataclass(frozen=True, kw_only=True)
-class DistillConfig(PolicyConfig):
+class DistillConfig(RolloutConfig):
     """Hyper-parameters of distillation: a student learns to act as a trained policy does."""
 
     implementation = "gmijax.distill.distill:DISTILL"
@@ -318,3 +333,83 @@ class DistillConfig(PolicyConfig):
                 "folder or checkpoint"
             )
         super().check_job(num_envs, template)
+
+
+_WIDEST_STD = 0.48
+"""Entropy behind a tanh is at most 0.684 nats an action, that of a Gaussian this wide."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class SacConfig(PolicyConfig):
+    """Hyper-parameters of SAC with many environments and large batches (arXiv:2512.01996)."""
+
+    implementation = "gmijax.sac.sac:SAC"
+
+    name: Literal["sac"] = doc("training algorithm")
+    discounting: float = doc("discount factor per step, 0 to 1", low=0.0, high=1.0)
+    reward_scaling: float = doc(
+        "factor on rewards before learning (logged returns are unscaled)", positive=True
+    )
+    batch_size: int = doc("transitions in one update of one GMI, drawn from its replay", low=1)
+    updates_per_step: int = doc("updates of the critics for every step of all environments", low=1)
+    policy_every: int = doc("updates of the critics for every one of the policy", low=1)
+    replay_steps: int = doc(
+        "steps of every environment that the replay holds, a multiple of unroll_length", low=2
+    )
+    learning_starts: int = doc(
+        "steps of every environment before the first update, also after a resume", low=2
+    )
+    critic_hidden_layer_sizes: tuple[int, ...] = doc("widths of each of the two critics", low=1)
+    num_atoms: int = doc("atoms of the distribution of returns", low=2)
+    value_range: float = doc(
+        "discounted sums of scaled rewards that the critics know reach from minus this to this",
+        positive=True,
+    )
+    target_rate: float = doc(
+        "share of the way that target critics go to the critics with every update", positive=True
+    )
+    target_std: float = doc(
+        "the temperature is steered to the entropy of a Gaussian with this standard deviation of "
+        "every action in [-1, 1]",
+        positive=True,
+    )
+    init_temperature: float = doc("weight of the entropy at first", positive=True)
+
+    @property
+    def kept_steps(self) -> int:
+        """See `PolicyConfig`."""
+        return self.replay_steps
+
+    def check_job(self, num_envs: int | None, template: str) -> None:
+        """See `PolicyConfig`."""
+        fewest = (num_envs or self.batch_size) * self.learning_starts
+        for key, value, wrong, allowed in (
+            (
+                *("replay_steps", self.replay_steps),
+                self.replay_steps % self.unroll_length,
+                f"a multiple of algo.unroll_length={self.unroll_length}",
+            ),
+            (
+                *("learning_starts", self.learning_starts),
+                self.learning_starts > self.replay_steps,
+                f"at most algo.replay_steps={self.replay_steps}",
+            ),
+            (
+                *("target_std", self.target_std),
+                self.target_std > _WIDEST_STD,
+                f"at most {_WIDEST_STD}: a distribution of actions in [-1, 1] has no more entropy",
+            ),
+            (
+                *("distribution_type", self.distribution_type),
+                self.distribution_type != "tanh_normal",
+                "tanh_normal",
+            ),
+            ("preserve_outputs", self.preserve_outputs, self.preserve_outputs, "false"),
+            (
+                *("batch_size", self.batch_size),
+                self.batch_size > fewest,
+                f"at most num_envs x algo.learning_starts = {fewest}",
+            ),
+        ):
+            if wrong:
+                raise ConfigError(f"algo.{key}={value}: with algo=sac must be {allowed}")

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Literal, TypeAlias, get_args
 
-from gmijax.config.algo import A3cConfig, DistillConfig, PpoConfig
+from gmijax.config.algo import A3cConfig, DistillConfig, PpoConfig, SacConfig
 from gmijax.config.channel import ChannelConfig
 from gmijax.config.cluster import ClusterConfig
 from gmijax.config.env import EnvConfig, PhysicsConfig
@@ -16,7 +16,7 @@ from gmijax.config.schema import KeyGroup, doc
 from gmijax.config.search import SearchConfig
 from gmijax.errors import ConfigError
 
-AlgoConfig: TypeAlias = PpoConfig | A3cConfig | DistillConfig
+AlgoConfig: TypeAlias = PpoConfig | A3cConfig | DistillConfig | SacConfig
 """The training algorithms; `algo.name` says which."""
 
 ALGORITHMS: tuple[type[AlgoConfig], ...] = get_args(AlgoConfig)

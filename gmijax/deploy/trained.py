@@ -12,8 +12,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from gmijax.config import AlgoConfig
+from gmijax.learning.algorithm import init_of
 from gmijax.learning.checkpoint import learner_sizes, restore_learner
-from gmijax.learning.learner import acting_weights, init_learner, make_learner
+from gmijax.learning.learner import acting_weights, make_learner
 from gmijax.learning.normalize import OBS_CLIP, Moments, normalize, std_of
 from gmijax.runs.resume import CheckpointMeta
 from gmijax.runs.saved_config import trained_config
@@ -51,7 +52,7 @@ def trained_policy(checkpoint: Path) -> TrainedPolicy:
     spec = EnvSpec(env.label, full_size, action_size, 0.0, 0, (), actor_obs_size=obs_size)
     # Weights are float32, and not every runtime has another format.
     learner = make_learner(spec, replace(algo, precision="float32"))
-    state = jax.jit(lambda key: init_learner(learner, full_size, key))(jax.random.key(0))
+    state = jax.jit(lambda key: init_of(algo)(learner, full_size, key))(jax.random.key(0))
     weights = acting_weights(learner, restore_learner(checkpoint, state))
     count, mean, m2 = weights.moments
     moments = Moments(count, mean[:obs_size], m2[:obs_size])

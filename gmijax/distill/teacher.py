@@ -8,8 +8,9 @@ import jax
 import jax.numpy as jnp
 
 from gmijax.errors import ConfigError
+from gmijax.learning.algorithm import init_of
 from gmijax.learning.checkpoint import learner_sizes, restore_learner
-from gmijax.learning.learner import ActingWeights, acting_weights, init_learner, make_learner
+from gmijax.learning.learner import ActingWeights, acting_weights, make_learner
 from gmijax.learning.normalize import normalize
 from gmijax.learning.policy import ActorCritic
 from gmijax.runs.resume import find_checkpoint
@@ -51,6 +52,6 @@ def load_teacher(named: str, spec: EnvSpec) -> Teacher:
             f"{action_size} actions; {spec.name} has {spec.obs_size} and {spec.action_size}"
         )
     learner = make_learner(spec, algo)
-    state = jax.jit(lambda key: init_learner(learner, obs_size, key))(jax.random.key(0))
+    state = jax.jit(lambda key: init_of(algo)(learner, obs_size, key))(jax.random.key(0))
     weights = acting_weights(learner, restore_learner(checkpoint, state))
     return Teacher(learner.networks, weights)

@@ -16,7 +16,7 @@ import jax
 
 from gmijax.collectives.interface import Collectives
 from gmijax.config import AlgoConfig
-from gmijax.learning.learner import Learner, TrainState
+from gmijax.learning.learner import Learner, init_learner
 from gmijax.learning.unroll import Counts
 from gmijax.sim.interface import EnvSpec
 from gmijax.sim.wrappers import BatchedEnv, BatchState
@@ -54,12 +54,21 @@ class IterationMetrics(NamedTuple):
 
 
 Iterate: TypeAlias = Callable[
-    [BatchedEnv, Any, Collectives, PyTree, TrainState, BatchState],
-    tuple[TrainState, BatchState, IterationMetrics],
+    [BatchedEnv, Any, Collectives, PyTree, Any, Any], tuple[Any, Any, IterationMetrics]
 ]
-"""`(env, learner, collectives, model, state, env_state) -> (state, env_state, metrics)`: a rollout
-and its updates, a pure function. State and environments are donated. `state` comes out equal on
-all GMIs, since what goes into it passes through `collectives`."""
+"""`(env, learner, collectives, model, state, memory) -> (state, memory, metrics)`: a rollout and
+its updates, a pure function. State and memory are donated. `state` is a named tuple with at least
+the fields of a `TrainState` that acting needs, and comes out equal on all GMIs, since what goes
+into it passes through `collectives`. `memory` is a GMI's own."""
+
+
+def _environments(learner: Learner[Any], env: BatchedEnv, envs: BatchState) -> BatchState:
+    del learner, env
+    return envs
+
+
+def _itself(memory: Any) -> BatchState:
+    return memory
 
 
 @dataclass(frozen=True)
@@ -71,12 +80,17 @@ class Algorithm:
       init: `(learner, obs_size, key)` to the first state.
       iterate: see `Iterate`.
       num_averaged: how many float32 GMIs average in one update: gradient and parts of the loss.
+      begin: `(learner, env, environments at their starts)` to the first memory of a GMI; by
+        default the environments.
+      envs: the environments in a memory, which checkpoints hold.
     """
 
     make_learner: Callable[[EnvSpec, Any], Learner[Any]]
-    init: Callable[[Learner[Any], int, PRNGKey], TrainState]
+    init: Callable[[Learner[Any], int, PRNGKey], Any]
     iterate: Iterate
     num_averaged: Callable[[EnvSpec, Any], int]
+    begin: Callable[[Learner[Any], BatchedEnv, BatchState], Any] = _environments
+    envs: Callable[[Any], BatchState] = _itself
 
 
 def load_algorithm(config: AlgoConfig) -> Algorithm:
@@ -85,14 +99,19 @@ def load_algorithm(config: AlgoConfig) -> Algorithm:
     return getattr(import_module(module), name)
 
 
+def init_of(config: AlgoConfig) -> Callable[[Learner[Any], int, PRNGKey], Any]:
+    """`(learner, obs_size, key)` to a state as checkpoints of such a run hold it."""
+    return load_algorithm(config).init if config.implementation else init_learner
+
+
 def iterate_all(
     iterate: Iterate,
     env: BatchedEnv,
     learner: Learner[Any],
     collectives: Collectives,
     model: PyTree,
-    states: TrainState,
-    envs: BatchState,
-) -> tuple[TrainState, BatchState, IterationMetrics]:
-    """An iteration of several runs; states and metrics have a leading axis [K]."""
-    return jax.vmap(lambda *own: iterate(env, learner, collectives, model, *own))(states, envs)
+    states: Any,
+    memories: Any,
+) -> tuple[Any, Any, IterationMetrics]:
+    """An iteration of several runs; states, memories and metrics have a leading axis [K]."""
+    return jax.vmap(lambda *own: iterate(env, learner, collectives, model, *own))(states, memories)

@@ -100,18 +100,18 @@ class TrainingLoop:
         """
         started_s = time.monotonic()
         self._link.end_part("environments")
-        state, env_state = self._first()
+        state, memory = self._first()
         self._link.end_part("states")
-        waited_s = self._compile(state, env_state)
+        waited_s = self._compile(state, memory)
         compile_s = time.monotonic() - started_s - waited_s
         self._link.beat("ready", 0)
         self._comm.all_gather(np.zeros(1, np.float32))  # All have compiled: the clock starts.
         config = self._config
         if config.algo.warms_up and config.run.resume is None:
-            state, env_state = warm_up(self._iteration, state, env_state)
+            state, memory = warm_up(self._iteration, state, memory)
         self._open_logs()
         first_steps, started_s = self._env_steps, time.monotonic()
-        state, env_state, is_stopped = self._train(state, env_state)
+        state, memory, is_stopped = self._train(state, memory)
         eval_s = 0.0 if self._evaluator is None else self._evaluator.wall_s
         train_s = time.monotonic() - started_s - eval_s, compile_s
         results = [
@@ -122,19 +122,20 @@ class TrainingLoop:
             self._write(run, result)
         if self._meter is not None and not is_stopped:
             # Written before: whatever happens to the measurement, the training is done.
+            envs = self._algorithm.envs(memory)
             rates = self._meter.measure(
-                state, env_state, lambda: self._link.beat("running", self._iterations)
+                state, envs, lambda: self._link.beat("running", self._iterations)
             )
             [(run, result)] = results
             self._write(run, dataclasses.replace(result, **rates))
 
     def _first(self) -> tuple[TrainState, Any]:
-        """States of learner and environments, with an axis of members if there are several."""
+        """State of the learner and this GMI's memory, with an axis of members if several."""
         state = self._members.stacked(self._first_state)
-        env_state = None if self._remote else self._members.stacked(self._first_envs)
+        memory = None if self._remote else self._members.stacked(self._first_memory)
         if self._evaluator is not None:
             self._evaluator.best = best_evaluation(self._members.first.run.root, self._env_steps)
-        return state, env_state
+        return state, memory
 
     def _first_state(self, member: Member) -> TrainState:
         state, self._env_steps = first_state(
@@ -142,18 +143,19 @@ class TrainingLoop:
         )
         return state
 
-    def _first_envs(self, member: Member) -> Any:
+    def _first_memory(self, member: Member) -> Any:
         ranks = self._comm
-        return first_envs(
+        envs = first_envs(
             self._env, member.config, ranks.rank, gmi=self._link.gmi, num_gmis=ranks.world_size
         )
+        return self._algorithm.begin(self._learner, self._env, envs)
 
-    def _compile(self, state: TrainState, env_state: Any) -> float:
+    def _compile(self, state: TrainState, memory: Any) -> float:
         """Makes all programs; returns the seconds for which it was not this GMI's turn."""
         # Every GMI does that itself, at the same time.
-        self._iteration.trace(self._env.model, state, env_state)
+        self._iteration.trace(self._env.model, state, memory)
         if self._meter is not None:
-            self._meter.trace(state, env_state)
+            self._meter.trace(state, self._algorithm.envs(memory))
         if self._evaluator is not None:
             self._evaluator.trace(state)
         waited_s = self._link.begin_compiling()
@@ -174,11 +176,11 @@ class TrainingLoop:
                 is_leader=self._is_leader,
             )
 
-    def _train(self, state: TrainState, env_state: Any) -> tuple[TrainState, Any, bool]:
+    def _train(self, state: TrainState, memory: Any) -> tuple[TrainState, Any, bool]:
         """Trains to the end; returns also whether it was asked to stop."""
         thread = ReportThread(self._members.report)
         try:
-            return self._loop(state, env_state, thread)
+            return self._loop(state, memory, thread)
         except CollectiveError:
             thread.give_up()  # It may wait for a device that waits for a GMI that is gone.
             raise
@@ -188,14 +190,14 @@ class TrainingLoop:
             self._members.close()
 
     def _loop(
-        self, state: TrainState, env_state: Any, thread: ReportThread
+        self, state: TrainState, memory: Any, thread: ReportThread
     ) -> tuple[TrainState, Any, bool]:
         num_timesteps, every = self._config.num_timesteps, self._config.run.checkpoint_every
         stop, evaluation = False, None
         while self._env_steps < num_timesteps and not stop and self._members.going_on:
             self._iterations += 1
             self._trace.begin(self._iterations, self._iteration.wait)
-            state, env_state, metrics = self._iteration(state, env_state)
+            state, memory, metrics = self._iteration(state, memory)
             self._trace.end(self._iterations, self._iteration.wait)
             self._env_steps += self._steps_per_iteration
             evaluation = self._evaluate(state)
@@ -206,11 +208,11 @@ class TrainingLoop:
             is_last = stop or self._env_steps >= num_timesteps
             is_due = every and self._iterations % every == 0
             if not is_last and (is_due or (evaluation is not None and evaluation.is_best)):
-                self._save(state, env_state, thread, evaluation)
-        self._save(state, env_state, thread, evaluation)
+                self._save(state, memory, thread, evaluation)
+        self._save(state, memory, thread, evaluation)
         self._saver.finish()
         self._trace.close()  # Last: a job that is told to end has little time to save.
-        return state, env_state, stop
+        return state, memory, stop
 
     def _evaluate(self, state: TrainState) -> Evaluation | None:
         """Evaluates if it is time to, in the same iteration on all GMIs."""
@@ -244,7 +246,7 @@ class TrainingLoop:
     def _save(
         self,
         state: TrainState,
-        env_state: Any,
+        memory: Any,
         thread: ReportThread,
         evaluation: Evaluation | None,
     ) -> None:
@@ -256,7 +258,7 @@ class TrainingLoop:
             self._env_steps,
             self._comm.world_size,
             state,
-            env_state,
+            None if self._remote else self._algorithm.envs(memory),
             evaluation,
             is_leader=self._is_leader,
         )
@@ -295,16 +297,16 @@ class TrainingLoop:
         write_json(run.gmi(self._link.gmi).result, result.to_dict())
 
 
-def warm_up(iteration: TracedStep, state: TrainState, env_state: Any) -> tuple[TrainState, Any]:
+def warm_up(iteration: TracedStep, state: TrainState, memory: Any) -> tuple[TrainState, Any]:
     """Makes an iteration of which only the statistics of observations and targets are kept.
 
     Both arguments are donated.
 
     Returns:
-      `state` with these statistics, and the environments where the iteration has left them.
+      `state` with these statistics, and the memory as the iteration has left it.
     """
     first = jax.tree.map(jnp.copy, state)
-    after, env_state, _ = iteration(state, env_state)
+    after, memory, _ = iteration(state, memory)
     iteration.wait()
     warm = first._replace(obs_moments=after.obs_moments, value_moments=after.value_moments)
-    return warm, env_state
+    return warm, memory

@@ -107,7 +107,7 @@ def first_envs(
     if meta is not None:  # Other environments than the first run's: never its starts again.
         key = jax.random.fold_in(key, meta.env_steps % 2**31)
     env_state = begin_episodes(
-        env, key, place * num_envs, num_envs, kept_steps=config.algo.unroll_length
+        env, key, place * num_envs, num_envs, kept_steps=config.algo.kept_steps
     )
     if resume is None or gmi is None or not envs_go_on(config, gmi, num_gmis):
         return env_state

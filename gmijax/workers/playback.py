@@ -6,6 +6,7 @@ Restores a policy, runs episodes with it, and writes their returns and a traject
 from __future__ import annotations
 
 import dataclasses
+import functools
 import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -31,9 +32,10 @@ def _run(link: ChildLink) -> None:
     # jax starts here, in the environment that the plan prepared.
     import jax
 
+    from gmijax.learning.algorithm import init_of
     from gmijax.learning.checkpoint import restore_learner
     from gmijax.learning.episodes import Options, run_episodes
-    from gmijax.learning.learner import init_learner, make_learner
+    from gmijax.learning.learner import make_learner
     from gmijax.sim.camera import check_camera, choose_camera
     from gmijax.sim.randomize import make_worlds
     from gmijax.sim.trajectory import MOST_RECORDED
@@ -44,7 +46,8 @@ def _run(link: ChildLink) -> None:
     env = make_worlds(played, impl, seed=config.seed, first_env=0, num_envs=config.num_envs)
     check_camera(env.mj_model, config.camera, env.spec.name)
     learner = make_learner(env.spec, algo)
-    state = jax.jit(lambda key: init_learner(learner, env.spec.obs_size, key))(jax.random.key(0))
+    init = functools.partial(init_of(algo), learner, env.spec.obs_size)
+    state = jax.jit(init)(jax.random.key(0))
     state = restore_learner(checkpoint, state)
     link.beat("compiling", 0)
     episodes = run_episodes(

@@ -36,7 +36,14 @@ from gmijax.runs.folder import RunPaths, write_json
 
 NUM_ENVS, LENGTH = 8, 4
 
-ROWS: dict[str, tuple[str, ...]] = {"ppo": (), "distill": ("algo.teacher={teacher}",)}
+ROWS: dict[str, tuple[str, ...]] = {
+    "ppo": ("algo.num_minibatches=2",),
+    "distill": ("algo.num_minibatches=2", "algo.teacher={teacher}"),
+    "sac": (
+        *("algo.batch_size=16", "algo.critic_hidden_layer_sizes=[16]", "algo.num_atoms=11"),
+        *("algo.replay_steps=8", "algo.learning_starts=4", "algo.updates_per_step=1"),
+    ),
+}
 """What each algorithm needs beside its defaults."""
 
 ENV = point_mass()
@@ -53,6 +60,10 @@ class Case(NamedTuple):
         make = partial(self.algorithm.init, self.learner, ENV.spec.obs_size)
         return jax.jit(make)(jax.random.key(seed))
 
+    def memory(self, seed: int = 0) -> Any:
+        envs = begin_episodes(ENV, jax.random.key(seed), 0, NUM_ENVS, kept_steps=LENGTH)
+        return self.algorithm.begin(self.learner, ENV, envs)
+
 
 @pytest.fixture(scope="module", params=ROWS)
 def case(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Case:
@@ -60,16 +71,12 @@ def case(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactor
     make_run(teacher, obs_size=ENV.spec.obs_size, action_size=ENV.spec.action_size)
     config = gmijax.compose(
         *("env=ball_balance", f"algo={request.param}", f"num_envs={NUM_ENVS}"),
-        *(f"algo.unroll_length={LENGTH}", "algo.num_minibatches=2"),
+        f"algo.unroll_length={LENGTH}",
         "algo.policy_hidden_layer_sizes=[16,8]",
         *(row.format(teacher=teacher) for row in ROWS[request.param]),
     )
     algorithm = load_algorithm(config.algo)
     return Case(config, algorithm, algorithm.make_learner(ENV.spec, config.algo))
-
-
-def start(seed: int = 0) -> Any:
-    return begin_episodes(ENV, jax.random.key(seed), 0, NUM_ENVS, kept_steps=LENGTH)
 
 
 def test_every_algorithm_has_a_row() -> None:
@@ -81,7 +88,7 @@ def test_every_algorithm_has_a_row() -> None:
 
 def test_iterations_change_weights_and_keep_shapes(case: Case) -> None:
     program = SingleRankCommunicator().program(partial(case.algorithm.iterate, ENV, case.learner))
-    state, envs = case.first(0), start()
+    state, envs = case.first(0), case.memory()
     first = jax.tree.map(jnp.copy, state)
     program.trace(ENV.model, state, envs)
     program.compile()
@@ -109,12 +116,12 @@ def test_it_averages_what_it_says(case: Case) -> None:
             return super().mean(tree, after)
 
     iterate = partial(case.algorithm.iterate, ENV, case.learner, Counting(), ENV.model)
-    jax.eval_shape(iterate, case.first(0), start())
+    jax.eval_shape(iterate, case.first(0), case.memory())
     assert set(sizes) == {case.algorithm.num_averaged(ENV.spec, case.config.algo)}
 
 
 def test_runs_that_share_a_program_learn_what_they_do_alone(case: Case) -> None:
-    states, envs = [case.first(seed) for seed in (1, 2)], [start(seed) for seed in (1, 2)]
+    states, envs = [case.first(seed) for seed in (1, 2)], [case.memory(seed) for seed in (1, 2)]
     alone = jax.jit(
         partial(case.algorithm.iterate, ENV, case.learner, LocalCollectives(), ENV.model)
     )

@@ -1,0 +1,80 @@
+"""Two critics that give distributions of returns (arXiv:1707.06887), and their targets."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from flax import linen as nn
+from jax.typing import DTypeLike
+
+from gmijax.config import SacConfig
+from gmijax.types import Array, PRNGKey, PyTree
+
+NUM_CRITICS = 2
+
+_LEAST_LOG_PROB = -30.0
+"""Below it a probability counts as this: 0 x -inf is not a number."""
+
+
+class _Critic(nn.Module):
+    """Layer norm and SiLU behind every hidden layer, as FastSAC has them."""
+
+    hidden: tuple[int, ...]
+    num_atoms: int
+    dtype: DTypeLike
+
+    @nn.compact
+    def __call__(self, x: Array) -> Array:
+        """Maps [..., O + A] to logits [..., Z] float32."""
+        for width in self.hidden:
+            x = nn.Dense(width, dtype=self.dtype)(x)
+            x = nn.silu(nn.LayerNorm(dtype=self.dtype)(x))
+        return nn.Dense(self.num_atoms)(x.astype(jnp.float32))
+
+
+class Critics(NamedTuple):
+    """Both critics; weights are passed in, with a leading axis [2].
+
+    Attributes:
+      network: of one of them.
+      atoms: [Z], the returns that their probabilities are of.
+    """
+
+    network: nn.Module
+    atoms: Array
+
+    def init(self, key: PRNGKey, obs_size: int, action_size: int) -> PyTree:
+        """First weights, of each its own; consumes `key`."""
+        inputs = jnp.zeros((1, obs_size + action_size))
+        return jax.vmap(lambda k: self.network.init(k, inputs))(jax.random.split(key, NUM_CRITICS))
+
+    def log_probs(self, params: PyTree, obs: Array, action: Array) -> Array:
+        """Logarithms of probabilities [2, B, Z] of the atoms."""
+        inputs = jnp.concatenate([obs, action], axis=-1)
+        logits: Any = jax.vmap(self.network.apply, in_axes=(0, None))(params, inputs)
+        return jnp.maximum(jax.nn.log_softmax(logits), _LEAST_LOG_PROB)
+
+    def values(self, params: PyTree, obs: Array, action: Array) -> Array:
+        """Mean returns [2, B]."""
+        return jnp.exp(self.log_probs(params, obs, action)) @ self.atoms
+
+
+def critics_of(config: SacConfig) -> Critics:
+    """The critics of a configuration."""
+    atoms = jnp.linspace(-config.value_range, config.value_range, config.num_atoms)
+    sizes = config.critic_hidden_layer_sizes
+    return Critics(_Critic(sizes, config.num_atoms, config.precision), atoms)
+
+
+def projected(atoms: Array, values: Array, probs: Array) -> Array:
+    """Probabilities [..., Z] of `atoms` [Z] that stand for those [..., Z] of `values` [..., Z].
+
+    A value between two atoms is shared between them by its distance, one beyond the ends counts
+    as the end. The mean stays, but for that.
+    """
+    step = atoms[1] - atoms[0]
+    values = jnp.clip(values, atoms[0], atoms[-1])
+    near = jnp.maximum(0.0, 1.0 - jnp.abs(values[..., None] - atoms) / step)
+    return jnp.sum(probs[..., None] * near, axis=-2)

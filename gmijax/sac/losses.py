@@ -1,0 +1,95 @@
+"""The losses of SAC (arXiv:1812.05905) with distributions of returns, as FastSAC has them."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from gmijax.config import SacConfig
+from gmijax.learning.learner import Learner
+from gmijax.learning.policy import ActorCriticParams
+from gmijax.sac.critics import Critics, projected
+from gmijax.sac.replay import CUT, GOES_ON
+from gmijax.types import Array, PRNGKey, PyTree
+
+
+class Batch(NamedTuple):
+    """Transitions [B] as the losses take them.
+
+    Attributes:
+      obs: [B, O], normalised.
+      action: [B, A].
+      reward: [B], scaled.
+      kind: [B], see `gmijax.sac.replay`.
+      next_obs: [B, O], normalised.
+    """
+
+    obs: Array
+    action: Array
+    reward: Array
+    kind: Array
+    next_obs: Array
+
+
+def sampled_action(
+    learner: Learner[SacConfig], params: ActorCriticParams, obs: Array, key: PRNGKey
+) -> tuple[Array, Array]:
+    """Actions [B, A] of the policy and their log densities [B]; differentiable; consumes `key`."""
+    distribution = learner.networks.distribution
+    output = learner.networks.output(params, obs)
+    raw = distribution.sample(output, params.log_std, jax.random.split(key, len(obs)))
+    return distribution.action_of(raw), distribution.log_prob(output, params.log_std, raw)
+
+
+def target_probs(
+    critics: Critics,
+    targets: PyTree,
+    config: SacConfig,
+    batch: Batch,
+    next_action: Array,
+    next_log_prob: Array,
+    temperature: Array,
+) -> Array:
+    """What each critic shall say [2, B, Z]: its own target critic's returns one step on."""
+    goes_on = config.discounting * (batch.kind == GOES_ON)[:, None]
+    after = critics.atoms - temperature * next_log_prob[:, None]
+    values = batch.reward[:, None] + goes_on * after
+    probs = jnp.exp(critics.log_probs(targets, batch.next_obs, next_action))
+    return jax.lax.stop_gradient(projected(critics.atoms, values, probs))
+
+
+def critic_loss(
+    params: PyTree, critics: Critics, batch: Batch, wanted: Array
+) -> tuple[Array, Array]:
+    """Cross-entropy with `wanted` [2, B, Z], summed over critics, and the mass at both ends [].
+
+    Each is a mean over transitions that are not cut.
+    """
+    counts = (batch.kind != CUT).astype(jnp.float32)
+    weight = counts / jnp.maximum(jnp.sum(counts), 1.0)
+    log_probs = critics.log_probs(params, batch.obs, batch.action)
+    loss = -jnp.sum(jnp.sum(wanted * log_probs, axis=-1) * weight)
+    at_ends = jnp.sum(jnp.mean(wanted[..., 0] + wanted[..., -1], axis=0) * weight)
+    return loss, at_ends
+
+
+def policy_loss(
+    params: ActorCriticParams,
+    learner: Learner[SacConfig],
+    critics: Critics,
+    critic_params: PyTree,
+    obs: Array,
+    temperature: Array,
+    key: PRNGKey,
+) -> Array:
+    """Weighted log density minus the mean of both critics' values, mean over a batch."""
+    action, log_prob = sampled_action(learner, params, obs, key)
+    values = jnp.mean(critics.values(critic_params, obs, action), axis=0)
+    return jnp.mean(temperature * log_prob - values)
+
+
+def temperature_loss(log_temperature: Array, log_prob: Array, target_entropy: float) -> Array:
+    """Falls with the temperature where the entropy, minus the mean `log_prob`, is too high."""
+    return jnp.exp(log_temperature) * jax.lax.stop_gradient(-jnp.mean(log_prob) - target_entropy)
