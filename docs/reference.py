@@ -112,6 +112,9 @@ TOPICS: Final[Mapping[str, Topic]] = {
         "learning.md",
         "gmijax train env=ant algo=distill algo.teacher=runs/ant",
     ),
+    "algo=sac": Topic(
+        "Learning, with `algo=sac` (off-policy)", "learning.md", "gmijax train env=ant algo=sac"
+    ),
     "channel": Topic("Experience channels, with `algo=a3c`", "channels.md"),
 }
 """Headings of keys by their group, or by what they belong to, in the order of the pages."""

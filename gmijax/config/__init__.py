@@ -11,6 +11,7 @@ from gmijax.config.algo import A3cConfig as A3cConfig
 from gmijax.config.algo import ActorCriticConfig as ActorCriticConfig
 from gmijax.config.algo import DistillConfig as DistillConfig
 from gmijax.config.algo import PpoConfig as PpoConfig
+from gmijax.config.algo import RolloutConfig as RolloutConfig
 from gmijax.config.algo import SacConfig as SacConfig
 from gmijax.config.channel import ChannelConfig as ChannelConfig
 from gmijax.config.cluster import ClusterConfig as ClusterConfig

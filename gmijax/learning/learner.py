@@ -5,7 +5,7 @@ Checkpoints hold a `TrainState` whatever the algorithm, so that all can be playe
 
 from __future__ import annotations
 
-from typing import Any, Generic, NamedTuple, TypeVar
+from typing import Any, Generic, NamedTuple, Protocol, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -59,6 +59,40 @@ class TrainState(NamedTuple):
     iteration: Array
     key: PRNGKey
     value_moments: Moments | None = None
+
+
+class LearnerState(Protocol):
+    """What the states of all algorithms have, named tuples; see `TrainState`."""
+
+    @property
+    def params(self) -> ActorCriticParams:
+        """Weights of the policy, and of the value function if there is one."""
+        ...
+
+    @property
+    def obs_moments(self) -> Moments:
+        """Statistics of all observations before this iteration."""
+        ...
+
+    @property
+    def learning_rate(self) -> Array:
+        """[] float32."""
+        ...
+
+    @property
+    def iteration(self) -> Array:
+        """[] int32, finished iterations."""
+        ...
+
+    @property
+    def value_moments(self) -> Moments | None:
+        """Statistics of the targets of the value function, if they are kept."""
+        ...
+
+    def _replace(self, **fields: Any) -> Any: ...
+
+
+S = TypeVar("S", bound=LearnerState)
 
 
 class Learner(NamedTuple, Generic[C]):
@@ -129,7 +163,7 @@ def init_learner(learner: Learner, obs_size: int, key: PRNGKey) -> TrainState:
     )
 
 
-def acting_moments(config: AlgoConfig, state: TrainState) -> Moments:
+def acting_moments(config: AlgoConfig, state: LearnerState) -> Moments:
     """The statistics that observations are normalised with (none if switched off)."""
     if config.normalize_observations:
         return with_std_floor(state.obs_moments, config.obs_std_floor)
@@ -154,7 +188,7 @@ def with_targets(learner: Learner, state: TrainState, target: Moments) -> TrainS
     return state._replace(value_moments=after, params=params)
 
 
-def finish_iteration(learner: Learner, state: TrainState, seen: Moments) -> TrainState:
+def finish_iteration(learner: Learner, state: S, seen: Moments) -> S:
     """`state` after an iteration, with the statistics of what was `seen` in it.
 
     Normalised observations change with the statistics, and with them what policy and value
@@ -190,7 +224,7 @@ class ActingWeights(NamedTuple):
     value_moments: Moments | None = None
 
 
-def acting_weights(learner: Learner, state: TrainState) -> ActingWeights:
+def acting_weights(learner: Learner, state: LearnerState) -> ActingWeights:
     """The weights to act with when the learner has `state`."""
     return ActingWeights(state.params, acting_moments(learner.config, state), state.value_moments)
 
@@ -261,7 +295,7 @@ def rate_figures(config: AlgoConfig, rates: Array) -> dict[str, Array]:
     return {"mean": jnp.mean(rates), "min": jnp.min(rates), "max": jnp.max(rates)}
 
 
-def policy_figures(state: TrainState) -> dict[str, Array]:
+def policy_figures(state: LearnerState) -> dict[str, Array]:
     """Figures of the policy as it is, [] each, by the names that they are logged under.
 
     The learning rate, and of the standard deviations of its actions the mean and, of several,

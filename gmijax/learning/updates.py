@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 
 from gmijax.collectives.interface import Collectives
-from gmijax.config import AlgoConfig
+from gmijax.config import AlgoConfig, RolloutConfig
 from gmijax.learning.learner import Learner, TrainState, apply_gradients, learner_shapes
 from gmijax.learning.normalize import Moments
 from gmijax.learning.policy import ActorCriticParams
@@ -30,7 +30,7 @@ _LARGEST_LOG_RATIO = 20.0
 """Of probabilities; see `probability_ratio`."""
 
 
-def minibatch_order(config: AlgoConfig, state: TrainState, rank: Array, size: int) -> Array:
+def minibatch_order(config: RolloutConfig, state: TrainState, rank: Array, size: int) -> Array:
     """Indices [epochs * minibatches, B] into data of length `size`: each once per epoch."""
     key = jax.random.fold_in(jax.random.fold_in(state.key, state.iteration), rank)
     keys = jax.random.split(key, config.num_updates_per_batch)

@@ -33,7 +33,7 @@ APART = "plan.serving_gpus, plan.training_gpus: GPUs [1] both act and train and 
 REFUSED: list[tuple[str, str, str]] = [
     # Keys and options that are not there.
     ("train", "env=antt", "env=antt: unknown: did you mean ant?"),
-    ("train", "algo=sac", "algo=sac: unknown: allowed are a3c, distill, ppo"),
+    ("train", "algo=td3", "algo=td3: unknown: allowed are a3c, distill, ppo, sac"),
     ("train", "num_env=3", "unknown key num_env: did you mean num_envs?"),
     ("train", "algo.gamma=0.9", "unknown key algo.gamma"),
     ("train", "+foo.bar=1", "unknown key foo"),
