@@ -17,11 +17,11 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from gmijax.collectives.channel import build
-from gmijax.collectives.channel.batcher import Batch, Batcher
-from gmijax.collectives.channel.build import ChannelTopology, open_receiver, open_sender
-from gmijax.collectives.channel.sender import Sender
-from gmijax.collectives.channel.spec import Array
+from gmijax.channels import build
+from gmijax.channels.batcher import Batch, Batcher
+from gmijax.channels.build import ChannelTopology, open_receiver, open_sender
+from gmijax.channels.sender import Sender
+from gmijax.channels.spec import Array
 from gmijax.config.channel import ChannelConfig
 from gmijax.config.schema import from_dict
 from gmijax.errors import CollectiveTimeout, GmijaxError, PeerLost, PipeClosed

@@ -20,8 +20,8 @@ from gmijax.a3c.job_registers import JobRegisters
 from gmijax.a3c.leader import Leader
 from gmijax.a3c.report import MAX_COUNTED, BatchCounts, histogram_of
 from gmijax.a3c.targets import Unrolls
+from gmijax.channels.batcher import Batch, Batcher
 from gmijax.clock import running_s
-from gmijax.collectives.channel.batcher import Batch, Batcher
 from gmijax.collectives.interface import Communicator
 from gmijax.config import A3cConfig, TrainConfig
 from gmijax.errors import CollectiveTimeout

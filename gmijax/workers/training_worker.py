@@ -26,8 +26,8 @@ from gmijax.supervise.child import ENV_PIPES_FD, ChildLink, required_fd, run_gmi
 from gmijax.supervise.job_kinds import ENV_CHANNELS_FD, ENV_REGISTERS_FD, groups_of, topology_of
 
 if TYPE_CHECKING:
+    from gmijax.channels.pipe_block import PipeBlock
     from gmijax.collectives.interface import Communicator
-    from gmijax.collectives.messages.pipe_block import PipeBlock
     from gmijax.sim.wrappers import BatchedEnv
 
 
@@ -64,8 +64,8 @@ def _run_synchronous(
     link: ChildLink,
     held: ExitStack,
 ) -> dict[str, Any]:
-    from gmijax.collectives.messages.messenger import Messenger
-    from gmijax.collectives.messages.pipe_block import PipeBlock
+    from gmijax.channels.messenger import Messenger
+    from gmijax.channels.pipe_block import PipeBlock
     from gmijax.ppo.loop import TrainingLoop
     from gmijax.ppo.loss import PpoLosses
     from gmijax.ppo.tdg_ex import RolloutWorkers
@@ -93,7 +93,7 @@ def _serve_rollouts(
     link: ChildLink,
 ) -> dict[str, Any]:
     """Makes rollouts for the trainer on the same GPU."""
-    from gmijax.collectives.messages.messenger import Messenger
+    from gmijax.channels.messenger import Messenger
     from gmijax.config import PpoConfig
     from gmijax.learning.learner import make_learner
     from gmijax.learning.start import first_envs
@@ -123,7 +123,7 @@ def _run_asynchronous(
     from gmijax.a3c.job_registers import open_job_registers
     from gmijax.a3c.rollout import num_counts
     from gmijax.a3c.trainer import Trainer
-    from gmijax.collectives.channel.build import open_receiver, open_sender
+    from gmijax.channels.build import open_receiver, open_sender
     from gmijax.learning.learner import num_weights
     from gmijax.workers.node_registers import over_nodes
 

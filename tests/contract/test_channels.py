@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from training_jobs import require_gone, shared_memory
 
-from gmijax.collectives.channel.build import ChannelTopology
+from gmijax.channels.build import ChannelTopology
 from gmijax.config.channel import ChannelConfig
 from tests.channel_job import ChannelJob
 

@@ -8,8 +8,8 @@ from toy_env import point_mass
 
 from gmijax.a3c.job_registers import JobRegisters
 from gmijax.a3c.trainer import Trainer
+from gmijax.channels.batcher import Batch
 from gmijax.cli.compose import compose
-from gmijax.collectives.channel.batcher import Batch
 from gmijax.collectives.communicator import SingleRankCommunicator
 from gmijax.runs.folder import RunPaths
 from gmijax.supervise.child import ChildLink

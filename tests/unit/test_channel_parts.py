@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from gmijax.collectives.channel.batcher import Batcher
-from gmijax.collectives.channel.build import (
+from gmijax.channels.batcher import Batcher
+from gmijax.channels.build import (
     ChannelTopology,
     create_channels,
     max_piece_bytes,
@@ -19,8 +19,8 @@ from gmijax.collectives.channel.build import (
     open_sender,
     require_memory,
 )
-from gmijax.collectives.channel.dispenser import Dispenser
-from gmijax.collectives.channel.sender import CLOSE_TIMEOUT_S, Sender
+from gmijax.channels.dispenser import Dispenser
+from gmijax.channels.sender import CLOSE_TIMEOUT_S, Sender
 from gmijax.config.channel import ChannelConfig
 from gmijax.errors import CollectiveTimeout, ConfigError, PeerLost, PipeClosed
 

@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from gmijax.collectives.channel.compressor import SAMPLES, START_BYTES, TransferSize
-from gmijax.collectives.channel.migrator import Migrator
+from gmijax.channels.compressor import SAMPLES, START_BYTES, TransferSize
+from gmijax.channels.migrator import Migrator
 from gmijax.errors import GmijaxError, PeerLost, PipeClosed
 
 

@@ -11,11 +11,11 @@ import pytest
 from fake_device_memory import FakeDeviceMemory
 from shared_ranks import pipe_blocks
 
-from gmijax.collectives.messages.device_buffers import DeviceBuffers
-from gmijax.collectives.messages.mailboxes import COLLECTIVE, DATA, MAX_PARTS, Inbox, frames_of
-from gmijax.collectives.messages.messenger import MIN_CAPACITY_BYTES, Messenger
-from gmijax.collectives.messages.pipe import message_bytes
-from gmijax.collectives.messages.trees import as_bytes, flatten, unflatten
+from gmijax.channels.device_buffers import DeviceBuffers
+from gmijax.channels.mailboxes import COLLECTIVE, DATA, MAX_PARTS, Inbox, frames_of
+from gmijax.channels.messenger import MIN_CAPACITY_BYTES, Messenger
+from gmijax.channels.pipe import message_bytes
+from gmijax.channels.trees import as_bytes, flatten, unflatten
 from gmijax.errors import CollectiveTimeout, ConfigError
 from tests.role_cases import nested, same
 
@@ -154,7 +154,7 @@ def test_a_rank_may_end_when_what_it_left_on_the_device_is_received() -> None:
 def test_what_was_not_sent_for_want_of_room_is_not_waited_for(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr("gmijax.collectives.messages.mailboxes.MAX_WAITING_BYTES", 1)
+    monkeypatch.setattr("gmijax.channels.mailboxes.MAX_WAITING_BYTES", 1)
     first, second = posts(2, timeout_s=0.1)
     second._timeout_s = 30.0
     first.send(np.ones(10**6), 1)

@@ -12,8 +12,8 @@ import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
 
-from gmijax.collectives.messages.pipe import PipeReader, PipeWriter
-from gmijax.collectives.messages.pipe_block import (
+from gmijax.channels.pipe import PipeReader, PipeWriter
+from gmijax.channels.pipe_block import (
     END,
     HEAD,
     LINE,
@@ -21,7 +21,7 @@ from gmijax.collectives.messages.pipe_block import (
     PipeBlock,
     create_pipes,
 )
-from gmijax.collectives.messages.pipe_format import message_bytes
+from gmijax.channels.pipe_format import message_bytes
 from gmijax.collectives.shared_memory import process_of, take_line
 from gmijax.errors import CollectiveError, CollectiveTimeout, PipeClosed
 

@@ -11,11 +11,11 @@ from typing import NamedTuple, TypeAlias
 import numpy as np
 import numpy.typing as npt
 
+from gmijax.channels.compressor import Transfer
+from gmijax.channels.pipe import Message
+from gmijax.channels.spec import Array, Spec
+from gmijax.channels.transport import ChannelReader
 from gmijax.clock import running_s
-from gmijax.collectives.channel.compressor import Transfer
-from gmijax.collectives.channel.spec import Array, Spec
-from gmijax.collectives.channel.transport import ChannelReader
-from gmijax.collectives.messages.pipe import Message
 from gmijax.collectives.waits import LIVENESS_PERIOD_S, wait_until
 from gmijax.errors import CollectiveError, CollectiveTimeout, GmijaxError, PipeClosed
 

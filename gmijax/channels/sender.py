@@ -8,10 +8,10 @@ from collections import deque
 from dataclasses import dataclass
 from typing import Protocol
 
+from gmijax.channels.dispenser import Dispenser, Piece
+from gmijax.channels.migrator import Migrator
+from gmijax.channels.spec import Experience
 from gmijax.clock import running_s
-from gmijax.collectives.channel.dispenser import Dispenser, Piece
-from gmijax.collectives.channel.migrator import Migrator
-from gmijax.collectives.channel.spec import Experience
 from gmijax.collectives.waits import wait_until
 from gmijax.errors import GmijaxError
 

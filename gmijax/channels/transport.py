@@ -9,8 +9,8 @@ from __future__ import annotations
 
 from typing import TypeAlias
 
-from gmijax.collectives.channel.tcp_channel import RemoteReader, RemoteWriter
-from gmijax.collectives.messages.pipe import PipeReader, PipeWriter
+from gmijax.channels.pipe import PipeReader, PipeWriter
+from gmijax.channels.tcp_channel import RemoteReader, RemoteWriter
 
 ChannelWriter: TypeAlias = PipeWriter | RemoteWriter
 """The way from this agent to trainer `peer`."""

@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from gmijax.collectives.channel.spec import Array, Experience, Spec, spec_of
+from gmijax.channels.spec import Array, Experience, Spec, spec_of
 from gmijax.errors import ConfigError
 
 

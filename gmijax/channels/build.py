@@ -7,17 +7,17 @@ from contextlib import ExitStack
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from gmijax.collectives.channel.batcher import Batcher, Stack
-from gmijax.collectives.channel.compressor import Compressor, TransferSize, read_transfer
-from gmijax.collectives.channel.dispenser import Dispenser
-from gmijax.collectives.channel.migrator import Migrator
-from gmijax.collectives.channel.sender import Packer, Sender
-from gmijax.collectives.channel.tcp_channel import RemoteReader, RemoteWriter
-from gmijax.collectives.channel.transport import ChannelReader, ChannelWriter
-from gmijax.collectives.channel.unichannel import UniDecoder, UniPacker
+from gmijax.channels.batcher import Batcher, Stack
+from gmijax.channels.compressor import Compressor, TransferSize, read_transfer
+from gmijax.channels.dispenser import Dispenser
+from gmijax.channels.migrator import Migrator
+from gmijax.channels.pipe import PipeReader, PipeWriter
+from gmijax.channels.pipe_block import PipeBlock, create_pipes
+from gmijax.channels.sender import Packer, Sender
+from gmijax.channels.tcp_channel import RemoteReader, RemoteWriter
+from gmijax.channels.transport import ChannelReader, ChannelWriter
+from gmijax.channels.unichannel import UniDecoder, UniPacker
 from gmijax.collectives.device.device_memory import NewMemory, cuda_memory
-from gmijax.collectives.messages.pipe import PipeReader, PipeWriter
-from gmijax.collectives.messages.pipe_block import PipeBlock, create_pipes
 from gmijax.config.channel import ChannelConfig
 from gmijax.errors import ConfigError
 
@@ -128,7 +128,7 @@ def open_receiver(
         held.callback(reader.close)
     if config.transport == "device":
         # jax and CUDA, which channels through the host do without.
-        from gmijax.collectives.channel.device_channel import DeviceStack, ResidentDecoder
+        from gmijax.channels.device_channel import DeviceStack, ResidentDecoder
 
         decoders = [ResidentDecoder(DEVICE_MEMORY) for _ in readers]
         for decoder in decoders:
@@ -143,7 +143,7 @@ def _device_sender(
     config: ChannelConfig, block: PipeBlock, near: list[int], held: ExitStack
 ) -> Sender:
     """The end of an agent that leaves its experience on the GPU, for the trainers there."""
-    from gmijax.collectives.channel.device_channel import ResidentPacker, SlotWriter
+    from gmijax.channels.device_channel import ResidentPacker, SlotWriter
 
     migrator = Migrator([SlotWriter(block, peer, config.capacity_bytes) for peer in near], near)
     packer = ResidentPacker(migrator, config.capacity_bytes, DEVICE_MEMORY)

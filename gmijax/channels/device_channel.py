@@ -18,15 +18,15 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from gmijax.collectives.channel.batcher import Stack
-from gmijax.collectives.channel.compressor import Transfer
-from gmijax.collectives.channel.dispenser import Piece
-from gmijax.collectives.channel.migrator import Migrator
-from gmijax.collectives.channel.sender import CLOSE_TIMEOUT_S
-from gmijax.collectives.channel.spec import Spec
+from gmijax.channels.batcher import Stack
+from gmijax.channels.compressor import Transfer
+from gmijax.channels.dispenser import Piece
+from gmijax.channels.migrator import Migrator
+from gmijax.channels.pipe import Bytes, Message, PipeWriter
+from gmijax.channels.pipe_block import PipeBlock
+from gmijax.channels.sender import CLOSE_TIMEOUT_S
+from gmijax.channels.spec import Spec
 from gmijax.collectives.device.device_memory import TICKET_BYTES, NewMemory
-from gmijax.collectives.messages.pipe import Bytes, Message, PipeWriter
-from gmijax.collectives.messages.pipe_block import PipeBlock
 from gmijax.collectives.shared_memory import round_up
 from gmijax.collectives.waits import wait_until
 from gmijax.errors import ConfigError, GmijaxError

@@ -12,12 +12,12 @@ from __future__ import annotations
 
 import numpy as np
 
-from gmijax.collectives.channel.compressor import Transfer
-from gmijax.collectives.channel.dispenser import Piece
-from gmijax.collectives.channel.migrator import Migrator
-from gmijax.collectives.channel.spec import Array, Spec
-from gmijax.collectives.channel.transport import ChannelWriter
-from gmijax.collectives.messages.pipe import Message
+from gmijax.channels.compressor import Transfer
+from gmijax.channels.dispenser import Piece
+from gmijax.channels.migrator import Migrator
+from gmijax.channels.pipe import Message
+from gmijax.channels.spec import Array, Spec
+from gmijax.channels.transport import ChannelWriter
 
 
 class UniPacker:

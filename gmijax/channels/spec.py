@@ -14,7 +14,7 @@ from typing import Any, NamedTuple, TypeAlias
 import numpy as np
 import numpy.typing as npt
 
-from gmijax.collectives.messages.pipe import Bytes
+from gmijax.channels.pipe import Bytes
 from gmijax.errors import ConfigError
 
 Array: TypeAlias = npt.NDArray[Any]

@@ -20,9 +20,9 @@ from typing import Any, Final
 import numpy as np
 import numpy.typing as npt
 
-from gmijax.collectives.channel.tcp_connection import Connection
-from gmijax.collectives.messages.pipe_format import Bytes
-from gmijax.collectives.messages.registers import AnyRegister, Snapshot
+from gmijax.channels.pipe_format import Bytes
+from gmijax.channels.registers import AnyRegister, Snapshot
+from gmijax.channels.tcp_connection import Connection
 from gmijax.errors import CollectiveError
 
 _HEAD: Final = struct.Struct("<QqQ")

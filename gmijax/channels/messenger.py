@@ -13,15 +13,15 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
+from gmijax.channels.mailboxes import DATA, Inbox, Outbox, frames_of
+from gmijax.channels.pipe import PipeReader, PipeWriter
+from gmijax.channels.pipe_block import PipeBlock
 from gmijax.clock import running_s
-from gmijax.collectives.messages.mailboxes import DATA, Inbox, Outbox, frames_of
-from gmijax.collectives.messages.pipe import PipeReader, PipeWriter
-from gmijax.collectives.messages.pipe_block import PipeBlock
 from gmijax.collectives.waits import wait_until
 from gmijax.errors import CollectiveTimeout, ConfigError, PipeClosed
 
 if TYPE_CHECKING:
-    from gmijax.collectives.messages.device_buffers import DeviceBuffers
+    from gmijax.channels.device_buffers import DeviceBuffers
 
 MIN_CAPACITY_BYTES: Final = 1 << 18
 """Least capacity of the pipes, so that a frame fits."""

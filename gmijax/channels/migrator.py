@@ -10,8 +10,8 @@ import time
 from collections.abc import Sequence
 from typing import Generic, TypeVar
 
-from gmijax.collectives.channel.transport import ChannelWriter
-from gmijax.collectives.messages.pipe import Bytes
+from gmijax.channels.pipe import Bytes
+from gmijax.channels.transport import ChannelWriter
 from gmijax.collectives.waits import LIVENESS_PERIOD_S
 from gmijax.errors import GmijaxError, PeerLost, PipeClosed
 

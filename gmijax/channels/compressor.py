@@ -21,11 +21,11 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from gmijax.collectives.channel.dispenser import Piece
-from gmijax.collectives.channel.migrator import Migrator
-from gmijax.collectives.channel.spec import Array, Spec
-from gmijax.collectives.channel.transport import ChannelWriter
-from gmijax.collectives.messages.pipe import Message
+from gmijax.channels.dispenser import Piece
+from gmijax.channels.migrator import Migrator
+from gmijax.channels.pipe import Message
+from gmijax.channels.spec import Array, Spec
+from gmijax.channels.transport import ChannelWriter
 
 ROW_BYTES = 16
 
