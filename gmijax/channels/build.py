@@ -7,15 +7,13 @@ from contextlib import ExitStack
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from gmijax.channels.batcher import Batcher, Stack
+from gmijax.channels.batcher import Batcher, ChannelReader, Stack
 from gmijax.channels.compressor import Compressor, TransferSize, read_transfer
-from gmijax.channels.dispenser import Dispenser
-from gmijax.channels.migrator import Migrator
+from gmijax.channels.migrator import ChannelWriter, Migrator
 from gmijax.channels.pipe import PipeReader, PipeWriter
 from gmijax.channels.pipe_block import PipeBlock, create_pipes
-from gmijax.channels.sender import Packer, Sender
+from gmijax.channels.sender import Dispenser, Packer, Sender
 from gmijax.channels.tcp_channel import RemoteReader, RemoteWriter
-from gmijax.channels.transport import ChannelReader, ChannelWriter
 from gmijax.channels.unichannel import UniDecoder, UniPacker
 from gmijax.collectives.device.device_memory import NewMemory, cuda_memory
 from gmijax.config.channel import ChannelConfig
@@ -108,7 +106,7 @@ def open_sender(
     if config.design == "multi":
         fixed = None if config.transfer_kib is None else config.transfer_kib * 1024
         packer = Compressor(migrator, TransferSize(fixed, most), most)
-    return Sender(Dispenser(most), packer, migrator, on_device=False, held=held)
+    return Sender(Dispenser(rank, most), packer, migrator, on_device=False, held=held)
 
 
 def open_receiver(
@@ -149,7 +147,7 @@ def _device_sender(
     packer = ResidentPacker(migrator, config.capacity_bytes, DEVICE_MEMORY)
     held.callback(packer.close)
     held.callback(migrator.close)
-    dispenser = Dispenser(max_piece_bytes=None)
+    dispenser = Dispenser(block.rank, max_piece_bytes=None)
     return Sender(dispenser, packer, migrator, on_device=True, held=held)
 
 

@@ -7,27 +7,24 @@ so that a piece is copied once, from the agent's arrays to where the trainer rea
 All channels of a piece travel in one transfer: a trainer can use none without the others, and a
 process that is killed leaves the whole of a transfer or nothing of it.
 
-The table is [1 + k, 2] int64: (room in environments, number of pieces), then for every piece
-(its environments, its policy version).
+The table is [2 + room] int64: room for so many environments, how many there are, and the policy
+version of each.
 """
 
 from __future__ import annotations
 
 import statistics
 import time
-from dataclasses import dataclass
-from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
-from gmijax.channels.dispenser import Piece
-from gmijax.channels.migrator import Migrator
+from gmijax.channels.experience import VERSION_BYTES, Array, Rollouts, Spec
+from gmijax.channels.migrator import ChannelWriter, Migrator
 from gmijax.channels.pipe import Message
-from gmijax.channels.spec import Array, Spec
-from gmijax.channels.transport import ChannelWriter
 
-ROW_BYTES = 16
+TABLE_HEAD = 2
+"""Numbers of the table before the versions."""
 
 START_BYTES = 64 * 1024
 SAMPLES = 9
@@ -70,106 +67,81 @@ class TransferSize:
 class Compressor:
     """Fills transfers with pieces, one transfer at a time; a `Packer`.
 
-    `max_transfer_bytes` bounds the sum of all channels and the table's rows for pieces.
+    `max_transfer_bytes` bounds the sum of all channels and versions.
     """
 
     def __init__(self, migrator: Migrator, size: TransferSize, max_transfer_bytes: int) -> None:
         self._migrator = migrator
         self._size = size
         self._max_transfer_bytes = max_transfer_bytes
-        self._open: _OpenTransfer | None = None
+        # The transfer that is being filled: the way it goes (None: there is none), its memory.
+        self._writer: ChannelWriter | None = None
+        self._spec = Spec(())
+        self._table: npt.NDArray[np.int64] = np.zeros(TABLE_HEAD, np.int64)
+        self._arrays: dict[str, Array] = {}
+        self._spent_s = 0.0
 
-    def try_add(self, piece: Piece) -> bool:
+    def try_add(self, piece: Rollouts) -> bool:
         """Puts `piece` into a transfer, if there is room; hands the transfer over when full."""
-        if self._open is not None and not self._open.takes(piece):
+        if self._writer is not None and not self._takes(piece):
             self.flush()
-        if self._open is None:
-            self._open = self._begin(piece)
-        if self._open is None:
+        if self._writer is None and not self._begin(piece):
             return False
         started_s = time.perf_counter()
-        self._open.add(piece)
-        self._open.spent_s += time.perf_counter() - started_s
-        if self._open.is_full:
+        room, low = self._table[:TABLE_HEAD].tolist()
+        high = low + piece.num_envs
+        for name, array in piece.experience.items():
+            self._arrays[name][:, low:high] = array
+        self._table[TABLE_HEAD + low : TABLE_HEAD + high] = piece.versions
+        self._table[1] = high
+        self._spent_s += time.perf_counter() - started_s
+        if high == room:
             self.flush()
         return True
 
     def flush(self) -> None:
         """Hands over what there is."""
-        if self._open is None:
+        if self._writer is None:
             return
-        transfer, self._open = self._open, None
+        writer, self._writer = self._writer, None
+        num_bytes = sum(self._spec.sizes(self._table.item(1)))
         started_s = time.perf_counter()
-        num_bytes = transfer.commit()
-        self._size.record(num_bytes, transfer.spent_s + time.perf_counter() - started_s)
+        writer.commit()
+        self._size.record(num_bytes, self._spent_s + time.perf_counter() - started_s)
 
-    def _begin(self, piece: Piece) -> _OpenTransfer | None:
-        # With its row of the table, which may be larger than a small piece.
-        piece_bytes = sum(piece.spec.sizes(piece.num_envs)) + ROW_BYTES
+    def _takes(self, piece: Rollouts) -> bool:
+        room, filled = self._table[:TABLE_HEAD].tolist()
+        return piece.spec == self._spec and filled + piece.num_envs <= room
+
+    def _begin(self, piece: Rollouts) -> bool:
+        """Opens a transfer for pieces of this size; False if no trainer has room."""
+        piece_bytes = piece.num_bytes + VERSION_BYTES * piece.num_envs
         wanted = min(self._size.num_bytes, self._max_transfer_bytes)
-        pieces = max(1, wanted // piece_bytes)
-        room, head = pieces * piece.num_envs, piece.spec.encode()
-        sizes = [head.size, ROW_BYTES * (1 + pieces), *piece.spec.sizes(room)]
+        room = piece.num_envs * max(1, wanted // piece_bytes)
+        head = piece.spec.encode()
+        sizes = [head.size, 8 * TABLE_HEAD + VERSION_BYTES * room, *piece.spec.sizes(room)]
         opened = self._migrator.try_open(sizes)
         if opened is None:
-            return None
-        writer, views = opened
+            return False
+        self._writer, views = opened
         views[0][:] = head
-        table = views[1].view(np.int64).reshape(-1, 2)
-        table[:] = 0
-        arrays = piece.spec.arrays_in(views[2:], room)
-        return _OpenTransfer(writer, piece.spec, table, arrays, room)
+        self._table = views[1].view(np.int64)
+        self._table[:] = 0
+        self._table[0] = room
+        self._spec, self._arrays = piece.spec, piece.spec.arrays_in(views[2:], room)
+        self._spent_s = 0.0
+        return True
 
 
-@dataclass
-class _OpenTransfer:
-    """A transfer that is being filled, with `room` for environments."""
-
-    writer: ChannelWriter
-    spec: Spec
-    table: npt.NDArray[np.int64]
-    arrays: dict[str, Array]
-    room: int
-    filled: int = 0
-    pieces: int = 0
-    spent_s: float = 0.0
-
-    @property
-    def is_full(self) -> bool:
-        return self.filled == self.room or self.pieces == len(self.table) - 1
-
-    def takes(self, piece: Piece) -> bool:
-        return piece.spec == self.spec and self.filled + piece.num_envs <= self.room
-
-    def add(self, piece: Piece) -> None:
-        low, high = self.filled, self.filled + piece.num_envs
-        for name, array in piece.channels.items():
-            self.arrays[name][:, low:high] = array
-        self.filled, self.pieces = high, self.pieces + 1
-        self.table[self.pieces] = piece.num_envs, piece.version
-
-    def commit(self) -> int:
-        self.table[0] = self.room, self.pieces
-        self.writer.commit()
-        return sum(self.spec.sizes(self.filled))
-
-
-class Transfer(NamedTuple):
-    """A transfer as the trainer reads it: versions [N] int64, and views [S, N, ...] by channel."""
-
-    spec: Spec
-    num_envs: int
-    versions: npt.NDArray[np.int64]
-    arrays: dict[str, Array]
-
-
-def read_transfer(message: Message) -> Transfer:
-    """What a `Compressor` made; a `Decode`."""
+def read_transfer(message: Message, agent: int) -> Rollouts:
+    """What a `Compressor` of this agent made; a `Decode`. Its arrays are views of the message."""
     head, table, *parts = message
-    spec, table = Spec.decode(head), table.view(np.int64).reshape(-1, 2)
-    room, pieces = table[0].tolist()
-    counts, versions = table[1 : 1 + pieces].T
-    num_envs = int(counts.sum())
+    spec, table = Spec.decode(head), table.view(np.int64)
+    room, filled = table[:TABLE_HEAD].tolist()
     arrays = spec.arrays_in(parts, room)
-    filled = {name: array[:, :num_envs] for name, array in arrays.items()}
-    return Transfer(spec, num_envs, np.repeat(versions, counts), filled)
+    return Rollouts(
+        spec,
+        {name: array[:, :filled] for name, array in arrays.items()},
+        table[TABLE_HEAD : TABLE_HEAD + filled].copy(),
+        np.full(filled, agent, np.int64),
+    )

@@ -19,13 +19,11 @@ import jax.numpy as jnp
 import numpy as np
 
 from gmijax.channels.batcher import Stack
-from gmijax.channels.compressor import Transfer
-from gmijax.channels.dispenser import Piece
+from gmijax.channels.experience import Rollouts, Spec
 from gmijax.channels.migrator import Migrator
 from gmijax.channels.pipe import Bytes, Message, PipeWriter
 from gmijax.channels.pipe_block import PipeBlock
 from gmijax.channels.sender import CLOSE_TIMEOUT_S
-from gmijax.channels.spec import Spec
 from gmijax.collectives.device.device_memory import TICKET_BYTES, NewMemory
 from gmijax.collectives.shared_memory import round_up
 from gmijax.collectives.waits import wait_until
@@ -90,7 +88,7 @@ class ResidentPacker:
         self._offsets: list[int] = []
         self._slot_bytes = 0
 
-    def try_add(self, piece: Piece) -> bool:
+    def try_add(self, piece: Rollouts) -> bool:
         """Copies a rollout into a slot, if one is free; its arrays are jax's.
 
         Raises:
@@ -106,10 +104,10 @@ class ResidentPacker:
         place = self.migrator.writers.index(writer) * writer.num_slots + slot
         offset = place * self._slot_bytes
         for begin, channel in zip(self._offsets, piece.spec.channels, strict=True):
-            memory.write(offset + begin, piece.channels[channel.name])  # pyright: ignore[reportArgumentType]
+            memory.write(offset + begin, piece.experience[channel.name])  # pyright: ignore[reportArgumentType]
         views[0][:] = self._head
         views[1][:] = np.frombuffer(self._ticket, np.uint8)
-        views[2].view(NOTE)[0] = (offset, piece.num_envs, piece.version)
+        views[2].view(NOTE)[0] = (offset, piece.num_envs, piece.versions[0])
         writer.commit()
         return True
 
@@ -126,7 +124,7 @@ class ResidentPacker:
     def _is_read(self) -> bool | None:
         return not any(writer.outstanding_messages for writer in self.migrator.writers) or None
 
-    def _prepare(self, piece: Piece) -> CudaMemory:
+    def _prepare(self, piece: Rollouts) -> CudaMemory:
         """The memory; its slots are made when the first rollout shows how large they are."""
         if self._memory is not None:
             if piece.num_envs != self._num_envs:
@@ -159,7 +157,7 @@ class ResidentDecoder:
         self._memory: CudaMemory | None = None
         self._views: dict[int, dict[str, jax.Array]] = {}
 
-    def __call__(self, message: Message) -> Transfer:
+    def __call__(self, message: Message, agent: int) -> Rollouts:
         """The rollout that a note tells of.
 
         Raises:
@@ -181,7 +179,8 @@ class ResidentDecoder:
                 )
             }
         arrays: dict[str, Any] = dict(self._views[offset])
-        return Transfer(spec, num_envs, np.full(num_envs, version, np.int64), arrays)
+        versions, agents = (np.full(num_envs, one, np.int64) for one in (version, agent))
+        return Rollouts(spec, arrays, versions, agents)
 
     def close(self) -> None:
         """Gives the mapping back."""

@@ -12,12 +12,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from gmijax.channels.compressor import Transfer
-from gmijax.channels.dispenser import Piece
-from gmijax.channels.migrator import Migrator
+from gmijax.channels.experience import Array, Rollouts, Spec
+from gmijax.channels.migrator import ChannelWriter, Migrator
 from gmijax.channels.pipe import Message
-from gmijax.channels.spec import Array, Spec
-from gmijax.channels.transport import ChannelWriter
 
 
 class UniPacker:
@@ -28,7 +25,7 @@ class UniPacker:
         self._writer: ChannelWriter | None = None
         self._todo: list[tuple[int, int]] = []
 
-    def try_add(self, piece: Piece) -> bool:
+    def try_add(self, piece: Rollouts) -> bool:
         """Sends what there is room for; False: call it again with the same piece."""
         if not self._todo:
             self._writer = None
@@ -42,7 +39,7 @@ class UniPacker:
     def flush(self) -> None:
         """Nothing is ever held back."""
 
-    def _try_send(self, piece: Piece, step: int, place: int) -> bool:
+    def _try_send(self, piece: Rollouts, step: int, place: int) -> bool:
         channel = piece.spec.channels[place]
         head = piece.spec.encode()
         sizes = [head.size, 40, channel.num_bytes(piece.num_envs) // channel.steps]
@@ -56,9 +53,9 @@ class UniPacker:
         self._writer, views = opened
         views[0][:] = head
         is_last = len(self._todo) == 1
-        views[1].view(np.int64)[:] = step, place, piece.num_envs, piece.version, is_last
+        views[1].view(np.int64)[:] = step, place, piece.num_envs, piece.versions[0], is_last
         into = views[2].view(channel.dtype).reshape(piece.num_envs, *channel.shape)
-        into[...] = piece.channels[channel.name][step]
+        into[...] = piece.experience[channel.name][step]
         self._writer.commit()
         return True
 
@@ -70,7 +67,7 @@ class UniDecoder:
         self._arrays: dict[str, Array] = {}
         self._shape: tuple[Spec, int] | None = None
 
-    def __call__(self, message: Message) -> Transfer | None:
+    def __call__(self, message: Message, agent: int) -> Rollouts | None:
         """The rollout of which `message` is the last tensor; None before."""
         head, table, tensor = message
         spec = Spec.decode(head)
@@ -85,8 +82,8 @@ class UniDecoder:
         self._arrays[channel.name][step] = values
         if not is_last:
             return None
-        versions = np.full(num_envs, version, np.int64)
-        return Transfer(spec, num_envs, versions, self._arrays)
+        versions, agents = (np.full(num_envs, one, np.int64) for one in (version, agent))
+        return Rollouts(spec, self._arrays, versions, agents)
 
 
 def _tensors(spec: Spec) -> list[tuple[int, int]]:
