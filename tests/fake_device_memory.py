@@ -15,7 +15,7 @@ import jax
 import numpy as np
 
 from gmijax.collectives.device.device_memory import TICKET_BYTES
-from gmijax.collectives.device.device_transport import Device
+from gmijax.collectives.device_transport import Device
 
 
 class FakeDeviceMemory:

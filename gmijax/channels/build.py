@@ -15,7 +15,7 @@ from gmijax.channels.pipe_block import PipeBlock, create_pipes
 from gmijax.channels.sender import Dispenser, Packer, Sender
 from gmijax.channels.tcp_channel import RemoteReader, RemoteWriter
 from gmijax.channels.unichannel import UniDecoder, UniPacker
-from gmijax.collectives.device.device_memory import NewMemory, cuda_memory
+from gmijax.collectives.device.device_memory import DeviceMemory, NewMemory
 from gmijax.config.channel import ChannelConfig
 from gmijax.errors import ConfigError
 
@@ -25,7 +25,15 @@ NOTES_BYTES = 2**20
 OVERHEAD_BYTES = 16 * 1024
 """More than header, spec and alignment of a message take."""
 
-DEVICE_MEMORY: NewMemory = cuda_memory
+
+def _cuda_memory() -> DeviceMemory:
+    # jax and CUDA, which channels through the host do without.
+    from gmijax.collectives.device.cuda_memory import CudaMemory
+
+    return CudaMemory()
+
+
+DEVICE_MEMORY: NewMemory = _cuda_memory
 """Makes the memory by which agents and trainers of `transport=device` share their GPU."""
 
 
@@ -125,7 +133,6 @@ def open_receiver(
     for reader in readers:
         held.callback(reader.close)
     if config.transport == "device":
-        # jax and CUDA, which channels through the host do without.
         from gmijax.channels.device_channel import DeviceStack, ResidentDecoder
 
         decoders = [ResidentDecoder(DEVICE_MEMORY) for _ in readers]

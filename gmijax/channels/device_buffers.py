@@ -9,17 +9,14 @@ place, and for arrays that are small or of other types, messages travel through 
 from __future__ import annotations
 
 from collections.abc import Collection
-from typing import TYPE_CHECKING, Any, Final, NamedTuple
+from typing import Any, Final, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from gmijax.collectives.device.device_memory import NewMemory
+from gmijax.collectives.device.device_memory import DeviceMemory, NewMemory
 from gmijax.collectives.shared_memory import round_up
-
-if TYPE_CHECKING:
-    from gmijax.collectives.device.cuda_memory import CudaMemory
 
 LEAST_BYTES: Final = 4096
 """Smaller arrays are through the host as soon as through the device."""
@@ -62,10 +59,10 @@ class DeviceBuffers:
         self._part_bytes = part_bytes
         self._new_memory = new_memory
         self._held: dict[int, list[_Held]] = {peer: [] for peer in self._parts}
-        self._own: CudaMemory | None = None
+        self._own: DeviceMemory | None = None
         self._ticket = b""
         self._is_usable = True
-        self._theirs: dict[bytes, CudaMemory] = {}
+        self._theirs: dict[bytes, DeviceMemory] = {}
         self._views: dict[BufferedArray, jax.Array] = {}
 
     def put(self, array: Any, dst: int, released_frames: int) -> BufferedArray | None:

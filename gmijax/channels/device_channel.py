@@ -12,7 +12,7 @@ from __future__ import annotations
 import contextlib
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -24,13 +24,10 @@ from gmijax.channels.migrator import Migrator
 from gmijax.channels.pipe import Bytes, Message, PipeWriter
 from gmijax.channels.pipe_block import PipeBlock
 from gmijax.channels.sender import CLOSE_TIMEOUT_S
-from gmijax.collectives.device.device_memory import TICKET_BYTES, NewMemory
+from gmijax.collectives.device.device_memory import TICKET_BYTES, DeviceMemory, NewMemory
 from gmijax.collectives.shared_memory import round_up
 from gmijax.collectives.waits import wait_until
 from gmijax.errors import ConfigError, GmijaxError
-
-if TYPE_CHECKING:
-    from gmijax.collectives.device.cuda_memory import CudaMemory
 
 _ALIGNMENT = 256
 _LEAST_SLOTS = 2
@@ -81,7 +78,7 @@ class ResidentPacker:
     new_memory: NewMemory
 
     def __post_init__(self) -> None:
-        self._memory: CudaMemory | None = None
+        self._memory: DeviceMemory | None = None
         self._ticket = b""
         self._head = np.zeros(0, np.uint8)
         self._num_envs = 0
@@ -124,7 +121,7 @@ class ResidentPacker:
     def _is_read(self) -> bool | None:
         return not any(writer.outstanding_messages for writer in self.migrator.writers) or None
 
-    def _prepare(self, piece: Rollouts) -> CudaMemory:
+    def _prepare(self, piece: Rollouts) -> DeviceMemory:
         """The memory; its slots are made when the first rollout shows how large they are."""
         if self._memory is not None:
             if piece.num_envs != self._num_envs:
@@ -154,7 +151,7 @@ class ResidentDecoder:
 
     def __init__(self, new_memory: NewMemory) -> None:
         self._new_memory = new_memory
-        self._memory: CudaMemory | None = None
+        self._memory: DeviceMemory | None = None
         self._views: dict[int, dict[str, jax.Array]] = {}
 
     def __call__(self, message: Message, agent: int) -> Rollouts:

@@ -10,10 +10,10 @@ from typing import TypeAlias
 
 import jax
 
-from gmijax.collectives.device.device_transport import Device, DeviceTransport
-from gmijax.collectives.host.host_transport import HostTransport
+from gmijax.collectives.device_transport import Device, DeviceTransport
 from gmijax.collectives.host.shared_block import LANES
 from gmijax.collectives.host.shared_memory_group import SharedMemoryGroup
+from gmijax.collectives.host_transport import HostTransport
 from gmijax.collectives.interface import Communicator, FloatBuffer, Step, TracedStep
 from gmijax.collectives.nodes.mesh import Mesh
 from gmijax.collectives.nodes.multi_node_group import MultiNodeGroup
@@ -100,7 +100,7 @@ def _built(strategy: str, config: CommunicatorConfig, control: _Lane, host: _Lan
         if len(inside) < len(parts):
             # Who finds that it does not work must not leave other nodes waiting for a sum.
             trial = StagedAllReduce(transport, inside, host.local.rank, host.local.world_size)
-        transport.start(trial)
+        transport.start(trial.is_right)
     except BaseException as error:
         if transport is not None:
             transport.close()

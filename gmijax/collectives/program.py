@@ -18,7 +18,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
 
-from gmijax.collectives.host.host_transport import HostTransport
+from gmijax.collectives.host_transport import HostTransport
 from gmijax.collectives.interface import Step
 from gmijax.collectives.strategies import Stage
 from gmijax.collectives.xla_call import Buffer, register
@@ -56,6 +56,26 @@ class StagedAllReduce:
             else:
                 total = self._traced(total, buffer.shape, number, place, after)
         return total
+
+    def is_right(self) -> bool:
+        """Whether the first collectives of these ranks, of known numbers, give what they should.
+
+        All of the ranks call it at the same time.
+        """
+        assert self._transport is not None
+        world_size = self.world_size
+
+        def trial(values: jax.Array) -> tuple[jax.Array, jax.Array]:
+            collectives = TracedCollectives(self, jnp.asarray(self.rank))
+            gathered = collectives.all_gather(values[:1])[:, 0]
+            return gathered, collectives.mean(values, after=gathered)
+
+        values = jnp.full(self._transport.room, self.rank + 1, jnp.float32)
+        gathered, mean = jax.jit(trial)(values)
+        # Both are read: an error of the device comes with what is read last.
+        is_right = np.array_equal(gathered, np.arange(1, world_size + 1))
+        is_right &= np.allclose(mean, (world_size + 1) / 2, rtol=1e-5)
+        return bool(is_right)
 
     def program(self, step: Step, *, donates_own: bool = True) -> ProgramStep:
         """See `Communicator`."""

@@ -74,9 +74,9 @@ def _device_buffers(plan: Plan, gmi: int) -> DeviceBuffers | None:
     if not neighbours or why_not_intra("ipc", plan.backend):
         return None
     from gmijax.channels.device_buffers import DeviceBuffers
-    from gmijax.collectives.device.device_memory import cuda_memory
+    from gmijax.collectives.device.cuda_memory import CudaMemory
 
-    return DeviceBuffers(neighbours, cuda_memory)
+    return DeviceBuffers(neighbours, CudaMemory)
 
 
 if __name__ == "__main__":

@@ -20,8 +20,8 @@ from gmijax.collectives.communicator import (
     MultiRankCommunicator,
     make_communicator,
 )
-from gmijax.collectives.host.host_transport import HostTransport
 from gmijax.collectives.host.shared_block import MAX_GATHER_FLOATS, create_exchange
+from gmijax.collectives.host_transport import HostTransport
 from gmijax.collectives.nodes.mesh import Mesh
 from gmijax.collectives.nodes.multi_node_group import MultiNodeGroup
 from gmijax.collectives.nodes.rendezvous import NodeAddresses, connect, listen

@@ -13,8 +13,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from shared_ranks import host_ranks
 
-from gmijax.collectives.device.device_transport import Order
 from gmijax.collectives.device.shared_slots import SharedSlots
+from gmijax.collectives.device_transport import Order
 from gmijax.collectives.host.shared_memory_group import SharedMemoryGroup
 from gmijax.errors import DeviceMemoryUnavailable
 

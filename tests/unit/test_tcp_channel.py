@@ -278,32 +278,6 @@ def test_a_message_is_missed_when_it_is_lost(address: str) -> None:
         end._connection.close()
 
 
-def test_many_messages_of_many_sizes_arrive_in_order(address: str) -> None:
-    reader, writer = ends(address)
-    sizes = [0, 1, 7, 100_000, 400_000]
-    numbers = range(300)
-
-    def write() -> None:
-        for number in numbers:
-            while (views := writer.try_reserve([8, sizes[number % 5], 0, 3])) is None:
-                time.sleep(1e-4)
-            for view in views:
-                view[:] = number % 251
-            writer.commit()
-
-    thread = threading.Thread(target=write)
-    thread.start()
-    for number in numbers:
-        while (found := reader.try_get()) is None:
-            time.sleep(1e-4)
-        assert [part.size for part in found] == [8, sizes[number % 5], 0, 3]
-        assert all((part == number % 251).all() for part in found)
-    thread.join()
-    reader.release()
-    writer.close()
-    reader.close()
-
-
 def test_a_secret_that_can_be_guessed_is_refused(address: str) -> None:
     with pytest.raises(ConfigError, match="a secret of 5 bytes: TCP needs 16 or more"):
         RemoteReader(address, 1, 0, CAPACITY, b"short")

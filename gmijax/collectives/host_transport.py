@@ -5,7 +5,7 @@ from __future__ import annotations
 import ctypes
 import time
 from collections.abc import Callable
-from typing import TYPE_CHECKING, TypeVar
+from typing import TypeVar
 
 import jax
 import numpy as np
@@ -15,9 +15,6 @@ from gmijax.collectives.interface import FloatBuffer
 from gmijax.collectives.nodes.multi_node_group import MultiNodeGroup
 from gmijax.collectives.strategies import Stage
 from gmijax.errors import GmijaxError
-
-if TYPE_CHECKING:
-    from gmijax.collectives.program import StagedAllReduce
 
 T = TypeVar("T")
 
@@ -40,8 +37,11 @@ class HostTransport:
         self._exchange_s = 0.0
         self._pinned: dict[str, FloatBuffer] = {}  # On a GPU: what exchanges go through.
 
-    def start(self, trial: StagedAllReduce) -> None:
-        """Tries the transport by exchanges in the node, together with all other ranks.
+    def start(self, trial: Callable[[], bool]) -> None:
+        """Makes sure that it works, together with all other ranks.
+
+        Args:
+          trial: collectives in the node; whether their results are right.
 
         Raises:
           DeviceMemoryUnavailable: they do not work; on all ranks alike.
