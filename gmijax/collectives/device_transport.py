@@ -53,10 +53,10 @@ class Order:
         self._count = self._checksum = 0
         self._words[rank] = 0
 
-    def come_to(self, place: int, num_floats: int) -> int | None:
+    def come_to(self, call_index: int, num_floats: int) -> int | None:
         """Comes to the next exchange; a rank that has come to another one instead, if any."""
         self._count += 1
-        which = place.to_bytes(8, "little") + num_floats.to_bytes(8, "little")
+        which = call_index.to_bytes(8, "little") + num_floats.to_bytes(8, "little")
         self._checksum = zlib.crc32(which, self._checksum)
         own = (self._count & 0xFFFFFFFF) << 32 | self._checksum
         self._words[self._rank] = own
@@ -152,26 +152,26 @@ class DeviceTransport(HostTransport):
         self.exchange_s()  # Not a part of the first step.
 
     def reduce(
-        self, stage: Stage, stream: int, place: int, source: int, target: int, num_floats: int
+        self, stage: Stage, stream: int, call_index: int, source: int, target: int, num_floats: int
     ) -> None:
         """See `HostTransport`."""
         most = max(len(group) for group in stage.groups)
         if stage.transport == "slots" and self._slots is not None:
-            with self._exchanging(stream, place, num_floats) as queue:
+            with self._exchanging(stream, call_index, num_floats) as queue:
                 if stage.kind == "all_gather":
                     self._slots.all_gather(queue, stream, source, target, num_floats, rows=most)
                 else:
                     assert stage.kind == "broadcast"  # Slots add nothing up.
                     self._slots.broadcast(queue, stream, source, target, num_floats)
         elif stage.transport == "ring" and stage.groups in self._rings:
-            with self._exchanging(stream, place, num_floats) as queue:
+            with self._exchanging(stream, call_index, num_floats) as queue:
                 ring = self._rings[stage.groups]
                 if ring is None:
                     queue.copy(stream, target, source, 4 * num_floats)
                 else:
                     getattr(ring, stage.kind)(stream, source, target, num_floats)
         else:
-            super().reduce(stage, stream, place, source, target, num_floats)
+            super().reduce(stage, stream, call_index, source, target, num_floats)
 
     def run(self, program: Callable[[], T], *, is_last: bool) -> T:
         """See `HostTransport`."""
@@ -195,15 +195,15 @@ class DeviceTransport(HostTransport):
         super().close()
 
     @contextmanager
-    def _exchanging(self, stream: int, place: int, num_floats: int) -> Iterator[CudaQueue]:
+    def _exchanging(self, stream: int, call_index: int, num_floats: int) -> Iterator[CudaQueue]:
         """Counts the time, and makes sure that other ranks come to the same exchange."""
         if self._queue is None or self._order is None:
             raise RuntimeError("the exchange is closed")
-        if (peer := self._order.come_to(place, num_floats)) is not None:
+        if (peer := self._order.come_to(call_index, num_floats)) is not None:
             gmi, other = (self._here.ids[rank] for rank in (self._here.rank, peer))
             raise RuntimeError(
                 f"GMI {gmi} and GMI {other} have come to their exchanges in different orders; "
-                f"here it is number {place} of its program, with {num_floats} floats"
+                f"here it is number {call_index} of its program, with {num_floats} floats"
             )
         self._queue.start_clock(stream)
         yield self._queue

@@ -48,14 +48,14 @@ class HostTransport:
         """
 
     def reduce(
-        self, stage: Stage, stream: int, place: int, source: int, target: int, num_floats: int
+        self, stage: Stage, stream: int, call_index: int, source: int, target: int, num_floats: int
     ) -> None:
         """`target` becomes what the stage makes of `source`.
 
         Args:
           stage: of the strategy.
           stream: of the device, 0 on a CPU.
-          place: which exchange of its program it is.
+          call_index: which exchange of its program it is.
           source: address on the device of [n] float32.
           target: address of the result, [n], or [m, n] if the stage gathers.
           num_floats: n.
@@ -73,11 +73,11 @@ class HostTransport:
                     fetch(stream, source, values)
                 else:  # Who meets the others has computed, as with numbers to give.
                     synchronize(stream)
-                self._reduce(stage, place, values, result)
+                self._reduce(stage, call_index, values, result)
                 store(stream, target, result)
             else:
                 values, result = _at(source, num_floats), _at(target, rows * num_floats)
-                self._reduce(stage, place, values, result)
+                self._reduce(stage, call_index, values, result)
         except GmijaxError as error:
             self._failure = error
             raise
@@ -117,17 +117,19 @@ class HostTransport:
             self._pinned[use] = pinned(num_floats)
         return self._pinned[use][:num_floats]
 
-    def _reduce(self, stage: Stage, place: int, values: FloatBuffer, result: FloatBuffer) -> None:
+    def _reduce(
+        self, stage: Stage, call_index: int, values: FloatBuffer, result: FloatBuffer
+    ) -> None:
         if stage.transport == "nodes":
             assert isinstance(self._host, MultiNodeGroup)
-            self._host.all_reduce_nodes(values, result, stage.groups, place)
+            self._host.all_reduce_nodes(values, result, stage.groups, call_index)
         elif stage.kind == "all_gather":
             rows = result.reshape(-1, values.size)
-            self._host.all_gather_into(values, rows, stage.groups, place)
+            self._host.all_gather_into(values, rows, stage.groups, call_index)
         elif stage.kind == "all_reduce":
-            self._host.all_reduce(values, result, stage.groups, place)
+            self._host.all_reduce(values, result, stage.groups, call_index)
         else:
-            self._host.broadcast(values, result, stage.groups, place)
+            self._host.broadcast(values, result, stage.groups, call_index)
 
 
 def _at(address: int, num_floats: int) -> FloatBuffer:

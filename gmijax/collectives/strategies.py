@@ -50,11 +50,11 @@ def stages(strategy: str, layout: Layout, intra: str = "host") -> Sequence[Stage
 
     - `mpr`, multi-process reduction: all through the host.
     - `flat`: one ring over all, plain data parallelism.
-    - `mrr`, multi-ring reduction: one ring for every place on a GPU; then one member of each
+    - `mrr`, multi-ring reduction: one ring for every index on a GPU; then one member of each
       ring, each on another GPU, in a last ring; then back to the members of its first ring.
     - `har`, hierarchical reduction: inside every GPU, a ring between the GPUs, and back. Where
       each GPU has as many GMIs and all of them have their GPU's sum, there is a ring for every
-      place, and no way back.
+      index, and no way back.
     - `one_shot`: every rank writes to every GPU, and sums what is there. Not in the paper. What
       travels is K - t buffers to each GPU, for a ring of K it would be two: it is made for
       networks whose messages cost more than their bytes.
@@ -80,8 +80,8 @@ def stages(strategy: str, layout: Layout, intra: str = "host") -> Sequence[Stage
     if strategy == "mrr":
         if len(rings) == 1:
             return [Stage("all_reduce", "ring", rings)]
-        # The ring of place k ends on GPU k: the ends are on different GPUs, as NCCL asks.
-        ends = tuple(ring[place] for place, ring in enumerate(rings))
+        # Ring k ends on GPU k: the ends are on different GPUs, as NCCL asks.
+        ends = tuple(ring[index] for index, ring in enumerate(rings))
         back = tuple(_first(end, ring) for end, ring in zip(ends, rings, strict=True))
         return [
             Stage("all_reduce", "ring", rings),

@@ -132,9 +132,9 @@ class SharedSlots:
             if member != self._rank:
                 queue.wait_for_flag(stream, member, count)
 
-    def _slot(self, place: int) -> int:
-        """Address of the slot in use of the member at `place`, on the own GPU."""
-        row = self._num_writes % 2 * len(self._members) + place
+    def _slot(self, index: int) -> int:
+        """Address of the slot in use of the member at `index`, on the own GPU."""
+        row = self._num_writes % 2 * len(self._members) + index
         return self._memories[0].address + row * self._row_bytes
 
     def _wait_for_members(self, host: SharedMemoryGroup) -> None:
