@@ -34,8 +34,8 @@ _FREE = 2**30
 _WISH = "exchange on the device's stream"
 
 
-class Order:
-    """Whether ranks come to the same exchanges in the same order; without waiting.
+class DesyncDetector:
+    """Detects ranks that call different collectives, or in another order, without waiting.
 
     Flags only count. Each rank keeps a word beside its own: how many exchanges it has come to,
     and a checksum of which ones these were, in their order. It looks at the words of those that
@@ -53,7 +53,7 @@ class Order:
         self._count = self._checksum = 0
         self._words[rank] = 0
 
-    def come_to(self, call_index: int, num_floats: int) -> int | None:
+    def record(self, call_index: int, num_floats: int) -> int | None:
         """Comes to the next exchange; a rank that has come to another one instead, if any."""
         self._count += 1
         which = call_index.to_bytes(8, "little") + num_floats.to_bytes(8, "little")
@@ -116,7 +116,7 @@ class DeviceTransport(HostTransport):
         self._device = device
         self._runner = LockstepRunner(self._here, num_floats)
         self._queue: CudaQueue | None = None
-        self._order: Order | None = None
+        self._desync: DesyncDetector | None = None
         self._slots: SharedSlots | None = None
         self._rings: dict[Groups, NcclRing | None] = {}
         try:
@@ -191,15 +191,15 @@ class DeviceTransport(HostTransport):
         for held in (self._queue, *self._rings.values(), self._slots):
             if held is not None:
                 held.close()
-        self._queue, self._order, self._slots, self._rings = None, None, None, {}
+        self._queue, self._desync, self._slots, self._rings = None, None, None, {}
         super().close()
 
     @contextmanager
     def _exchanging(self, stream: int, call_index: int, num_floats: int) -> Iterator[CudaQueue]:
         """Counts the time, and makes sure that other ranks come to the same exchange."""
-        if self._queue is None or self._order is None:
+        if self._queue is None or self._desync is None:
             raise RuntimeError("the exchange is closed")
-        if (peer := self._order.come_to(call_index, num_floats)) is not None:
+        if (peer := self._desync.record(call_index, num_floats)) is not None:
             gmi, other = (self._here.ids[rank] for rank in (self._here.rank, peer))
             raise RuntimeError(
                 f"GMI {gmi} and GMI {other} have come to their exchanges in different orders; "
@@ -212,7 +212,7 @@ class DeviceTransport(HostTransport):
     def _open(self) -> bytes:
         here = self._here
         self._queue = self._device.new_queue(here.flags)
-        self._order = Order(here.flags, here.rank, here.world_size)
+        self._desync = DesyncDetector(here.flags, here.rank, here.world_size)
         return b""
 
     def _try(self, trial: Callable[[], bool]) -> Exception | None:

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from shared_ranks import host_ranks
 
 from gmijax.collectives.device.shared_slots import SharedSlots
-from gmijax.collectives.device_transport import Order
+from gmijax.collectives.device_transport import DesyncDetector
 from gmijax.collectives.host.shared_memory_group import SharedMemoryGroup
 from gmijax.errors import DeviceMemoryUnavailable
 
@@ -113,15 +113,15 @@ def test_one_of_two_ranks_sees_that_they_come_in_different_orders(
 ) -> None:
     """Whoever is ahead, by the end of the step; and neither if the order is the same."""
     flags = np.zeros((64, 16), np.uint32)
-    ranks = [Order(flags, rank, 2) for rank in (0, 1)]
+    ranks = [DesyncDetector(flags, rank, 2) for rank in (0, 1)]
     for _ in range(steps_before):
-        assert [rank.come_to(5, 9) for rank in ranks] == [None, None]
+        assert [rank.record(5, 9) for rank in ranks] == [None, None]
     other = [kinds[place] for place in order if place < len(kinds)]
     todo = [list(kinds), list(other)]
     seen = []
     for first in (*is_first, *[True] * 8, *[False] * 8):
         rank = 0 if first else 1
         if todo[rank]:
-            seen.append(ranks[rank].come_to(todo[rank].pop(0), 9))
+            seen.append(ranks[rank].record(todo[rank].pop(0), 9))
     assert any(peer is not None for peer in seen) == (other != kinds)
     assert not flags[:2, 0].any()  # These are the devices'.

@@ -61,7 +61,7 @@ class SharedBlock(NamedTuple):
       slots: [2, K, P] float32, used in turn.
       flags: [whole pages, FLOATS_PER_LINE] uint32, of which [rank, 0] counts how often the device
         of a rank has written its slots; 1 says that the rank is through with slots in device
-        memory, and 2 to 3 which exchanges it has come to (`device_transport.Order`).
+        memory, and 2 to 3 which exchanges it has come to (`device_transport.DesyncDetector`).
       ids: of the ranks' GMIs in the job, for what is said of lost peers: not all GMIs need have a
         rank, and with several nodes each has a block.
     """
