@@ -42,7 +42,7 @@ class LockstepRunner:
         barrier.begin("step", self._num_floats)
         barrier.wait()
         barrier.check_same_call()
-        with barrier.explained():
+        with barrier.raise_peer_failure():
             result = self._thread.run(program, barrier.watch)
         barrier.wait(is_patient=True)  # Some have given it to their devices a step before others.
         barrier.end()

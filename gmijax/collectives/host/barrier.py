@@ -105,7 +105,7 @@ class Barrier:
                 detector.give_up(self._peers)
 
     @contextmanager
-    def explained(self) -> Iterator[None]:
+    def raise_peer_failure(self) -> Iterator[None]:
         """If a step fails because a peer has ended or is silent, says so.
 
         Raises:

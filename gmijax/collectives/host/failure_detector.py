@@ -61,7 +61,7 @@ class FailureDetector:
         A rank that has given up and is still on its way out is silent too, and not the cause.
         """
         silent = self.silent(missing) or missing
-        self._raise_timeout([peer for peer in silent if not self._block.blamed[peer]] or silent)
+        self._raise_timeout([peer for peer in silent if not self._block.suspect[peer]] or silent)
 
     def silent(self, missing: list[int]) -> list[int]:
         """Those of `missing` who do not wait themselves, as far as this rank has heard."""
@@ -74,11 +74,11 @@ class FailureDetector:
         gone = [peer for peer in missing() if peer in gone]
         if not gone:
             return
-        blamed = self._block.blamed.item
+        suspect = self._block.suspect.item
         for peer in gone:
-            if not blamed(peer):
+            if not suspect(peer):
                 self._raise_lost(peer)
-        cause = blamed(gone[0]) - 1
+        cause = suspect(gone[0]) - 1
         if cause in (self._block.rank, *gone) or self._is_gone(cause):
             self._raise_lost(gone[0] if cause == self._block.rank else cause)
         self._raise_timeout([cause])
@@ -99,12 +99,12 @@ class FailureDetector:
                 self._heard[peer] = beats, now_s
 
     def _raise_lost(self, peer: int) -> NoReturn:
-        self._block.blamed[self._block.rank] = peer + 1
+        self._block.suspect[self._block.rank] = peer + 1
         own, other = (self._block.ids[rank] for rank in (self._block.rank, peer))
         raise PeerLost(own, other, self._operation, self._step)
 
     def _raise_timeout(self, missing: list[int]) -> NoReturn:
-        self._block.blamed[self._block.rank] = missing[0] + 1
+        self._block.suspect[self._block.rank] = missing[0] + 1
         waited_s = min(round(self._waited_s(), 2), self._timeout_s)
         own, *others = (self._block.ids[rank] for rank in (self._block.rank, *missing))
         raise CollectiveTimeout(own, tuple(others), self._operation, self._step, waited_s)
