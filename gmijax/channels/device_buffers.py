@@ -29,9 +29,9 @@ _MAX_VIEWS = 256
 
 
 class BufferedArray(NamedTuple):
-    """Where an array lies (bytes in the block of `ticket`); it travels in its place."""
+    """Where an array lies (bytes in the block of `ipc_handle`); it travels in its place."""
 
-    ticket: bytes
+    ipc_handle: bytes
     offset: int
     shape: tuple[int, ...]
     dtype: str
@@ -60,7 +60,7 @@ class DeviceBuffers:
         self._new_memory = new_memory
         self._held: dict[int, list[_Held]] = {peer: [] for peer in self._parts}
         self._own: DeviceMemory | None = None
-        self._ticket = b""
+        self._ipc_handle = b""
         self._is_usable = True
         self._theirs: dict[bytes, DeviceMemory] = {}
         self._views: dict[BufferedArray, jax.Array] = {}
@@ -84,7 +84,7 @@ class DeviceBuffers:
         offset = self._parts[dst] + begin
         assert self._own is not None
         self._own.write(offset, array)
-        return BufferedArray(self._ticket, offset, array.shape, array.dtype.name)
+        return BufferedArray(self._ipc_handle, offset, array.shape, array.dtype.name)
 
     def mark_sent(self, dst: int, frames: int) -> None:
         """What was put for `dst` is in use until it has released `frames` frames in all."""
@@ -108,10 +108,10 @@ class DeviceBuffers:
         if buffered not in self._views:
             if len(self._views) >= _MAX_VIEWS:
                 self._views.clear()
-            memory = self._theirs.get(buffered.ticket)
+            memory = self._theirs.get(buffered.ipc_handle)
             if memory is None:
-                memory = self._theirs[buffered.ticket] = self._new_memory()
-                memory.open(buffered.ticket)
+                memory = self._theirs[buffered.ipc_handle] = self._new_memory()
+                memory.open(buffered.ipc_handle)
             dtype = np.dtype(buffered.dtype)
             self._views[buffered] = memory.view(buffered.offset, buffered.shape, dtype)
         return jnp.copy(self._views[buffered]).block_until_ready()
@@ -121,7 +121,7 @@ class DeviceBuffers:
         if self._own is None and self._is_usable:
             try:
                 self._own = self._new_memory()
-                self._ticket = self._own.create(len(self._parts) * self._part_bytes)
+                self._ipc_handle = self._own.create(len(self._parts) * self._part_bytes)
             # Whatever it is, of CUDA or of jax: there is another way, through the host.
             except Exception:
                 self._own, self._is_usable = None, False

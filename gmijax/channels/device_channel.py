@@ -24,7 +24,7 @@ from gmijax.channels.migrator import Migrator
 from gmijax.channels.pipe import Bytes, Message, PipeWriter
 from gmijax.channels.pipe_block import PipeBlock
 from gmijax.channels.sender import CLOSE_TIMEOUT_S
-from gmijax.collectives.device.device_memory import TICKET_BYTES, DeviceMemory, NewMemory
+from gmijax.collectives.device.device_memory import IPC_HANDLE_BYTES, DeviceMemory, NewMemory
 from gmijax.collectives.shared_memory import round_up
 from gmijax.collectives.waits import wait_until
 from gmijax.errors import ConfigError, GmijaxError
@@ -79,7 +79,7 @@ class ResidentPacker:
 
     def __post_init__(self) -> None:
         self._memory: DeviceMemory | None = None
-        self._ticket = b""
+        self._ipc_handle = b""
         self._head = np.zeros(0, np.uint8)
         self._num_envs = 0
         self._offsets: list[int] = []
@@ -93,7 +93,7 @@ class ResidentPacker:
           CudaError: memory of the GPU cannot be shared.
         """
         memory = self._prepare(piece)
-        opened = self.migrator.try_open([self._head.size, TICKET_BYTES, NOTE.itemsize])
+        opened = self.migrator.try_open([self._head.size, IPC_HANDLE_BYTES, NOTE.itemsize])
         if opened is None:
             return False
         writer, views = opened
@@ -103,7 +103,7 @@ class ResidentPacker:
         for begin, channel in zip(self._offsets, piece.spec.channels, strict=True):
             memory.write(offset + begin, piece.experience[channel.name])  # pyright: ignore[reportArgumentType]
         views[0][:] = self._head
-        views[1][:] = np.frombuffer(self._ticket, np.uint8)
+        views[1][:] = np.frombuffer(self._ipc_handle, np.uint8)
         views[2].view(NOTE)[0] = (offset, piece.num_envs, piece.versions[0])
         writer.commit()
         return True
@@ -139,7 +139,7 @@ class ResidentPacker:
                 f"rollouts of {self._slot_bytes} bytes"
             )
         memory = self.new_memory()
-        self._ticket = memory.create(len(self.migrator.writers) * num_slots * self._slot_bytes)
+        self._ipc_handle = memory.create(len(self.migrator.writers) * num_slots * self._slot_bytes)
         self._memory = memory
         for writer in self.migrator.writers:
             writer.num_slots, writer.slot_bytes = num_slots, self._slot_bytes
@@ -160,12 +160,12 @@ class ResidentDecoder:
         Raises:
           CudaError: the agent's memory cannot be read here.
         """
-        head, ticket, note = message
+        head, ipc_handle, note = message
         spec = Spec.decode(head)
         offset, num_envs, version = note.view(NOTE)[0].tolist()
         if self._memory is None:
             self._memory = self._new_memory()
-            self._memory.open(ticket.tobytes())
+            self._memory.open(ipc_handle.tobytes())
         if offset not in self._views:
             self._views[offset] = {
                 channel.name: self._memory.view(

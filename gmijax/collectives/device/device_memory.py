@@ -11,7 +11,7 @@ import numpy.typing as npt
 if TYPE_CHECKING:
     import jax
 
-TICKET_BYTES = 64
+IPC_HANDLE_BYTES = 64
 """What another process needs to open a block."""
 
 
@@ -27,7 +27,7 @@ class DeviceMemory(Protocol):
         """Makes the block; returns what another process needs to open it."""
         ...
 
-    def open(self, ticket: bytes) -> None:
+    def open(self, ipc_handle: bytes) -> None:
         """Maps the block that another process has made."""
         ...
 

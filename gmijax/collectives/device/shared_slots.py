@@ -11,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from gmijax.collectives.all_or_none import Group, all_or_none
-from gmijax.collectives.device.device_memory import TICKET_BYTES, DeviceMemory, NewMemory
+from gmijax.collectives.device.device_memory import IPC_HANDLE_BYTES, DeviceMemory, NewMemory
 from gmijax.collectives.host.shared_memory_group import SharedMemoryGroup
 from gmijax.collectives.shared_memory import fence
 from gmijax.collectives.waits import wait_until
@@ -67,8 +67,8 @@ class SharedSlots:
         self._host: SharedMemoryGroup | None = here
         here.flags[here.rank, 1] = 0
         try:
-            tickets = all_or_none(host, wish, lambda: self._make(new_memory))
-            all_or_none(host, wish, lambda: self._map(tickets))
+            ipc_handles = all_or_none(host, wish, lambda: self._make(new_memory))
+            all_or_none(host, wish, lambda: self._map(ipc_handles))
         except BaseException:
             self.close()
             raise
@@ -154,8 +154,8 @@ class SharedSlots:
         size = 2 * len(self._members) * self._row_bytes
         return self._memories[0].create(size) if self._is_owner else b""
 
-    def _map(self, tickets: npt.NDArray[np.uint8]) -> bytes:
+    def _map(self, ipc_handles: npt.NDArray[np.uint8]) -> bytes:
         for owner, memory in zip(self._owners, self._memories, strict=True):
             if not (self._is_owner and owner == self._owners[0]):
-                memory.open(tickets[owner][:TICKET_BYTES].tobytes())
+                memory.open(ipc_handles[owner][:IPC_HANDLE_BYTES].tobytes())
         return b""
