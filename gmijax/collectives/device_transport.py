@@ -1,4 +1,4 @@
-"""Runs the stages of a reduction on a GPU's stream: by shared slots, NCCL rings or the host.
+"""Runs the stages of a reduction on a GPU's stream: by shared GPU memory, NCCL rings or the host.
 
 Slots and rings do not stop the host: copies, a flag for the others, waits for their flags and a
 copy of what they wrote are queued on the program's stream, between its other work.
@@ -16,9 +16,9 @@ import numpy.typing as npt
 
 from gmijax.collectives.all_or_none import Group, all_or_none
 from gmijax.collectives.device.device_memory import NewMemory
+from gmijax.collectives.device.ipc_buffers import IpcBuffers
 from gmijax.collectives.device.lockstep import LockstepRunner
 from gmijax.collectives.device.nccl_ring import NcclRing
-from gmijax.collectives.device.shared_slots import SharedSlots
 from gmijax.collectives.host_transport import HostTransport
 from gmijax.collectives.shared_memory import Fence
 from gmijax.collectives.strategies import Groups, Stage
@@ -117,11 +117,11 @@ class DeviceTransport(HostTransport):
         self._runner = LockstepRunner(self._here, num_floats)
         self._queue: CudaQueue | None = None
         self._desync: DesyncDetector | None = None
-        self._slots: SharedSlots | None = None
+        self._ipc: IpcBuffers | None = None
         self._rings: dict[Groups, NcclRing | None] = {}
         try:
-            if any(stage.transport == "slots" for stage in stages):
-                self._slots = self._new_slots(layout, stages, device.new_memory)
+            if any(stage.transport == "ipc" for stage in stages):
+                self._ipc = self._new_ipc(layout, stages, device.new_memory)
             if (new_ring := device.new_ring) is not None:
                 rings = {stage.groups for stage in stages if stage.transport == "ring"}
                 self._rings = {
@@ -131,18 +131,18 @@ class DeviceTransport(HostTransport):
             self.close()
             raise
 
-    def _new_slots(
+    def _new_ipc(
         self, layout: Layout, stages: Sequence[Stage], new_memory: NewMemory
-    ) -> SharedSlots:
+    ) -> IpcBuffers:
         rank, layout = self._here.rank, layout.of_node(0)
-        groups = next(stage.groups for stage in stages if stage.transport == "slots")
+        groups = next(stage.groups for stage in stages if stage.transport == "ipc")
         group = next(group for group in self._control.of_node(groups) if rank in group)
         owners = group[:1]
         if len(group) == layout.num_gmis:
             # On every GPU: the own first, then the following ones, so that not all write to one.
             first, near = leaders(layout), layout.gpu_of(rank)
             owners = first[near:] + first[:near]
-        return SharedSlots(self._control, self.room, group, owners, new_memory, _WISH)
+        return IpcBuffers(self._control, self.room, group, owners, new_memory, _WISH)
 
     def start(self, trial: Callable[[], bool]) -> None:
         """See `HostTransport`."""
@@ -156,13 +156,13 @@ class DeviceTransport(HostTransport):
     ) -> None:
         """See `HostTransport`."""
         most = max(len(group) for group in stage.groups)
-        if stage.transport == "slots" and self._slots is not None:
+        if stage.transport == "ipc" and self._ipc is not None:
             with self._exchanging(stream, call_index, num_floats) as queue:
                 if stage.kind == "all_gather":
-                    self._slots.all_gather(queue, stream, source, target, num_floats, rows=most)
+                    self._ipc.all_gather(queue, stream, source, target, num_floats, rows=most)
                 else:
                     assert stage.kind == "broadcast"  # Slots add nothing up.
-                    self._slots.broadcast(queue, stream, source, target, num_floats)
+                    self._ipc.broadcast(queue, stream, source, target, num_floats)
         elif stage.transport == "ring" and stage.groups in self._rings:
             with self._exchanging(stream, call_index, num_floats) as queue:
                 ring = self._rings[stage.groups]
@@ -188,10 +188,10 @@ class DeviceTransport(HostTransport):
         if self._runner.is_caught:
             return
         self._runner.close()
-        for held in (self._queue, *self._rings.values(), self._slots):
+        for held in (self._queue, *self._rings.values(), self._ipc):
             if held is not None:
                 held.close()
-        self._queue, self._desync, self._slots, self._rings = None, None, None, {}
+        self._queue, self._desync, self._ipc, self._rings = None, None, None, {}
         super().close()
 
     @contextmanager

@@ -27,7 +27,7 @@ FLOATS_PER_ROW_UNIT = 64
 """Slots begin at multiples of 256 bytes, as allocations of jax do."""
 
 
-class SharedSlots:
+class IpcBuffers:
     """One rank's use of blocks of device memory with two slots for each member.
 
     The two slots are used in turn, so that members wait for each other once an exchange: a
