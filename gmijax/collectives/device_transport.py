@@ -142,7 +142,7 @@ class DeviceTransport(HostTransport):
             # On every GPU: the own first, then the following ones, so that not all write to one.
             first, near = leaders(layout), layout.gpu_of(rank)
             owners = first[near:] + first[:near]
-        return IpcBuffers(self._control, self.room, group, owners, new_memory, _WISH)
+        return IpcBuffers(self._control, self.capacity, group, owners, new_memory, _WISH)
 
     def start(self, trial: Callable[[], bool]) -> None:
         """See `HostTransport`."""

@@ -27,11 +27,11 @@ class HostTransport:
 
     Args:
       host: this rank's use of the shared block, and of the connections between nodes.
-      num_floats: P, length of the largest buffer; the attribute `room`.
+      num_floats: P, length of the largest buffer; the attribute `capacity`.
     """
 
     def __init__(self, host: SharedMemoryGroup | MultiNodeGroup, num_floats: int) -> None:
-        self.room = num_floats
+        self.capacity = num_floats
         self._host = host
         self._failure: GmijaxError | None = None
         self._exchange_s = 0.0

@@ -70,7 +70,7 @@ class StagedAllReduce:
             gathered = collectives.all_gather(values[:1])[:, 0]
             return gathered, collectives.mean(values, after=gathered)
 
-        values = jnp.full(self._transport.room, self.rank + 1, jnp.float32)
+        values = jnp.full(self._transport.capacity, self.rank + 1, jnp.float32)
         gathered, mean = jax.jit(trial)(values)
         # Both are read: an error of the device comes with what is read last.
         is_right = np.array_equal(gathered, np.arange(1, world_size + 1))
@@ -100,8 +100,10 @@ class StagedAllReduce:
             raise CollectiveError(f"rank {self.rank}: exchange after close")
         if values.dtype != jnp.float32:
             raise CollectiveError(f"rank {self.rank}: exchanges float32, not {values.dtype}")
-        if values.size > (room := self._transport.room):
-            raise CollectiveError(f"rank {self.rank}: {values.size} floats, room is for {room}")
+        if values.size > (capacity := self._transport.capacity):
+            raise CollectiveError(
+                f"rank {self.rank}: {values.size} floats, room is for {capacity}"
+            )
         result = jax.ShapeDtypeStruct(shape, jnp.float32)
         call: Any = jax.ffi.ffi_call(self._name, result, has_side_effect=True)
         arguments = (values,) if after is None else (values, after)

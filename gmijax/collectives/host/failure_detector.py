@@ -1,8 +1,8 @@
 """Finds which peer is dead or stuck when a rank has waited too long.
 
-A rank that waits raises its `beats` now and then. So at a timeout a peer that only waits too is
-not mistaken for one that is stuck, wherever each of them waits. A rank that gives up notes whom
-it waited for, so that its own end is not taken for the cause, also by those who wait elsewhere.
+A rank that waits raises its `heartbeats` now and then. So at a timeout a peer that only waits too
+is not mistaken for one that is stuck, wherever each of them waits. A rank that gives up notes whom
+it waited for, its `suspect`, so that its own end is not taken for the cause.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from gmijax.collectives.shared_memory import fence, process_of
 from gmijax.errors import CollectiveTimeout, PeerLost
 
 SILENCE_S = 0.7
-"""A rank without a beat for this long is not waiting: three beats are missing."""
+"""A rank without a heartbeat for this long is not waiting: three heartbeats are missing."""
 
 
 class FailureDetector:
@@ -46,7 +46,7 @@ class FailureDetector:
           PeerLost: the process of one of them is gone.
           CollectiveTimeout: the time is up.
         """
-        self._block.lines["beats"][self._block.rank] += 1
+        self._block.lines["heartbeats"][self._block.rank] += 1
         self._check_alive(missing)
         self._listen()
         left = missing()
@@ -94,9 +94,9 @@ class FailureDetector:
 
     def _listen(self) -> None:
         now_s = running_s()
-        for peer, beats in enumerate(self._block.lines["beats"].tolist()):
-            if self._heard.get(peer, (None,))[0] != beats:
-                self._heard[peer] = beats, now_s
+        for peer, heartbeats in enumerate(self._block.lines["heartbeats"].tolist()):
+            if self._heard.get(peer, (None,))[0] != heartbeats:
+                self._heard[peer] = heartbeats, now_s
 
     def _raise_lost(self, peer: int) -> NoReturn:
         self._block.suspect[self._block.rank] = peer + 1

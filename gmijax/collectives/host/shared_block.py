@@ -43,7 +43,7 @@ LINE = np.dtype(
         ("num_floats", np.uint64),
         ("call", np.uint64, (2,)),  # what the rank is calling, by parity of the step
         ("sequence", np.uint64),  # 0: not attached; 1: attached; then one up per arrival
-        ("beats", np.uint64),  # goes up while the rank waits for others
+        ("heartbeats", np.uint64),  # goes up while the rank waits for others
         ("suspect", np.uint64),  # of the first lane alone, see `SharedBlock`
     ]
 )

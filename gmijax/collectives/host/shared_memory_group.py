@@ -149,9 +149,9 @@ class SharedMemoryGroup:
         """Whether an attached peer has closed its exchange, or its process has ended."""
         return not process_of(self._open_block("is_gone").lines[peer]).is_running()
 
-    def beat(self) -> None:
+    def heartbeat(self) -> None:
         """Tells the others that this rank waits, for somebody who is not in this block."""
-        self._open_block("beat").lines["beats"][self.rank] += 1
+        self._open_block("heartbeat").lines["heartbeats"][self.rank] += 1
 
     def close(self) -> None:
         """Gives the memory back. Idempotent."""
