@@ -148,10 +148,12 @@ def _device_sender(
     config: ChannelConfig, block: PipeBlock, near: list[int], held: ExitStack
 ) -> Sender:
     """The end of an agent that leaves its experience on the GPU, for the trainers there."""
-    from gmijax.channels.device_channel import ResidentPacker, SlotWriter
+    from gmijax.channels.device_arrays import SentArrays
+    from gmijax.channels.device_channel import DeviceWriter, ResidentPacker
 
-    migrator = Migrator([SlotWriter(block, peer, config.capacity_bytes) for peer in near], near)
-    packer = ResidentPacker(migrator, config.capacity_bytes, DEVICE_MEMORY)
+    sent = SentArrays(near, DEVICE_MEMORY, config.capacity_bytes)
+    migrator = Migrator([DeviceWriter(block, peer, sent) for peer in near], near)
+    packer = ResidentPacker(migrator, sent)
     held.callback(packer.close)
     held.callback(migrator.close)
     dispenser = Dispenser(block.rank, max_piece_bytes=None)

@@ -1,10 +1,10 @@
-"""Experience that stays on the GPU: agents and trainers of one GPU share a block of its memory.
+"""Experience that stays on the GPU which agents and trainers share (`device_arrays.py`).
 
-Every agent makes a block with slots for each trainer; a slot holds one rollout, an array a
-channel. What travels through the pipe of shared memory is a note of where it lies, with sequence
-number and checksum as any message. The trainer reads it in place, and the slot is free again when
-it has released the note. So order, back-pressure and the discovery of the dead are the pipe's, and
-no experience passes through the host. What lies in the slots has no checksum.
+What travels through the pipe of shared memory is a note of where a rollout lies, with sequence
+number and checksum as any message. The trainer reads it in place.
+
+The parts of a message are the spec, the handle of the agent's block, and the number of
+environments, the policy version and the offset of every channel, int64.
 """
 
 from __future__ import annotations
@@ -19,93 +19,75 @@ import jax.numpy as jnp
 import numpy as np
 
 from gmijax.channels.batcher import Stack
+from gmijax.channels.device_arrays import BufferedArray, ReceivedArrays, SentArrays, region_bytes
 from gmijax.channels.experience import Rollouts, Spec
 from gmijax.channels.migrator import Migrator
 from gmijax.channels.pipe import Bytes, Message, PipeWriter
 from gmijax.channels.pipe_block import PipeBlock
 from gmijax.channels.sender import CLOSE_TIMEOUT_S
-from gmijax.collectives.device.device_memory import IPC_HANDLE_BYTES, DeviceMemory, NewMemory
-from gmijax.collectives.shared_memory import round_up
+from gmijax.collectives.device.device_memory import IPC_HANDLE_BYTES, NewMemory
 from gmijax.collectives.waits import wait_until
 from gmijax.errors import ConfigError, GmijaxError
 
-_ALIGNMENT = 256
-_LEAST_SLOTS = 2
-
-NOTE = np.dtype([("offset", np.int64), ("num_envs", np.int64), ("version", np.int64)])
-"""What travels: where a rollout lies, of how many environments it is, and of which policy."""
+_LEAST_ROLLOUTS = 2
 
 
-def slot_offsets(spec: Spec, num_envs: int) -> tuple[list[int], int]:
-    """Where the arrays of a rollout lie, bytes from the beginning of its slot, and its size."""
-    ends = np.cumsum([0, *(round_up(size, _ALIGNMENT) for size in spec.sizes(num_envs))]).tolist()
-    return ends[:-1], ends[-1]
+class DeviceWriter(PipeWriter):
+    """The way to one trainer: notes through a pipe, and rollouts in this agent's block.
 
-
-class SlotWriter(PipeWriter):
-    """The way to one trainer: notes through a pipe, and slots that are used in turn.
-
-    The first rollout shows how large `num_slots` and `slot_bytes` are.
+    The first rollout shows how large `rollout_bytes` is.
     """
 
-    def __init__(self, block: PipeBlock, peer: int, capacity_bytes: int) -> None:
+    def __init__(self, block: PipeBlock, peer: int, sent: SentArrays) -> None:
         super().__init__(block, peer)
-        self.num_slots = self.slot_bytes = 0
-        self._capacity_bytes = capacity_bytes
-
-    @property
-    def outstanding_messages(self) -> int:
-        """Slots in use: of notes that the trainer has not released."""
-        return self.messages - self.released_messages
+        self.rollout_bytes = 0
+        self._sent = sent
 
     def try_reserve(self, sizes: Sequence[int]) -> list[Bytes] | None:
-        """See `PipeWriter`; None, too, while no slot is free."""
-        if self.outstanding_messages >= self.num_slots:
+        """See `PipeWriter`; None, too, while the block has no room for a rollout."""
+        if not self._sent.has_room(self.peer, self.rollout_bytes, self.released_messages):
             return None
         return super().try_reserve(sizes)
 
     def occupancy(self) -> float:
         """How much of the GPU memory is in use, 0 to 1."""
-        return self.outstanding_messages * self.slot_bytes / self._capacity_bytes
+        outstanding = self.messages - self.released_messages
+        return outstanding * self.rollout_bytes / self._sent.part_bytes
 
 
 @dataclass
 class ResidentPacker:
-    """Leaves rollouts on the device, in `capacity_bytes` for each trainer; a `Packer`."""
+    """Leaves rollouts on the device; a `Packer`."""
 
-    migrator: Migrator[SlotWriter]
-    capacity_bytes: int
-    new_memory: NewMemory
+    migrator: Migrator[DeviceWriter]
+    sent: SentArrays
 
     def __post_init__(self) -> None:
-        self._memory: DeviceMemory | None = None
-        self._ipc_handle = b""
         self._head = np.zeros(0, np.uint8)
         self._num_envs = 0
-        self._offsets: list[int] = []
-        self._slot_bytes = 0
 
     def try_add(self, piece: Rollouts) -> bool:
-        """Copies a rollout into a slot, if one is free; its arrays are jax's.
+        """Copies a rollout into the block, if there is room; its arrays are jax's.
 
         Raises:
           ConfigError: too little memory for two rollouts, or one of another size.
           CudaError: memory of the GPU cannot be shared.
         """
-        memory = self._prepare(piece)
-        opened = self.migrator.try_open([self._head.size, IPC_HANDLE_BYTES, NOTE.itemsize])
+        self._check(piece)
+        arrays = [piece.experience[channel.name] for channel in piece.spec.channels]
+        note_bytes = 8 * (2 + len(arrays))
+        opened = self.migrator.try_open([self._head.size, IPC_HANDLE_BYTES, note_bytes])
         if opened is None:
             return False
         writer, views = opened
-        slot = writer.messages % writer.num_slots
-        place = self.migrator.writers.index(writer) * writer.num_slots + slot
-        offset = place * self._slot_bytes
-        for begin, channel in zip(self._offsets, piece.spec.channels, strict=True):
-            memory.write(offset + begin, piece.experience[channel.name])  # pyright: ignore[reportArgumentType]
+        placed = self.sent.put(arrays, writer.peer, writer.released_messages)
+        assert placed is not None  # `DeviceWriter.try_reserve` has looked.
+        offsets = (array.offset for array in placed)
         views[0][:] = self._head
-        views[1][:] = np.frombuffer(self._ipc_handle, np.uint8)
-        views[2].view(NOTE)[0] = (offset, piece.num_envs, piece.versions[0])
+        views[1][:] = np.frombuffer(placed[0].ipc_handle, np.uint8)
+        views[2].view(np.int64)[:] = piece.num_envs, piece.versions[0], *offsets
         writer.commit()
+        self.sent.mark_sent(writer.peer, writer.messages)
         return True
 
     def flush(self) -> None:
@@ -115,44 +97,37 @@ class ResidentPacker:
         """Frees the memory when the trainers have read all, or some time has passed."""
         with contextlib.suppress(GmijaxError):  # A trainer that is gone wants nothing.
             wait_until(self._is_read, self.migrator.why_lost, CLOSE_TIMEOUT_S)
-        if self._memory is not None:
-            self._memory.close()
+        self.sent.close()
 
     def _is_read(self) -> bool | None:
-        return not any(writer.outstanding_messages for writer in self.migrator.writers) or None
+        writers = self.migrator.writers
+        return not any(self.sent.holds(w.peer, w.released_messages) for w in writers) or None
 
-    def _prepare(self, piece: Rollouts) -> DeviceMemory:
-        """The memory; its slots are made when the first rollout shows how large they are."""
-        if self._memory is not None:
+    def _check(self, piece: Rollouts) -> None:
+        """Takes the size of the first rollout; all others must have the same."""
+        if self._num_envs:
             if piece.num_envs != self._num_envs:
                 raise ConfigError(
                     f"experience: got {piece.num_envs} environments, the first had "
                     f"{self._num_envs}"
                 )
-            return self._memory
-        self._head, self._num_envs = piece.spec.encode(), piece.num_envs
-        self._offsets, self._slot_bytes = slot_offsets(piece.spec, piece.num_envs)
-        num_slots = self.capacity_bytes // self._slot_bytes
-        if num_slots < _LEAST_SLOTS:
+            return
+        rollout_bytes = region_bytes(piece.spec.sizes(piece.num_envs))
+        if self.sent.part_bytes < _LEAST_ROLLOUTS * rollout_bytes:
             raise ConfigError(
-                f"channel.capacity_mib={self.capacity_bytes >> 20}: must hold {_LEAST_SLOTS} "
-                f"rollouts of {self._slot_bytes} bytes"
+                f"channel.capacity_mib={self.sent.part_bytes >> 20}: must hold {_LEAST_ROLLOUTS} "
+                f"rollouts of {rollout_bytes} bytes"
             )
-        memory = self.new_memory()
-        self._ipc_handle = memory.create(len(self.migrator.writers) * num_slots * self._slot_bytes)
-        self._memory = memory
+        self._head, self._num_envs = piece.spec.encode(), piece.num_envs
         for writer in self.migrator.writers:
-            writer.num_slots, writer.slot_bytes = num_slots, self._slot_bytes
-        return memory
+            writer.rollout_bytes = rollout_bytes
 
 
 class ResidentDecoder:
     """Reads in place what one agent has left on the device; a `Decode`."""
 
     def __init__(self, new_memory: NewMemory) -> None:
-        self._new_memory = new_memory
-        self._memory: DeviceMemory | None = None
-        self._views: dict[int, dict[str, jax.Array]] = {}
+        self._received = ReceivedArrays(new_memory)
 
     def __call__(self, message: Message, agent: int) -> Rollouts:
         """The rollout that a note tells of.
@@ -161,34 +136,24 @@ class ResidentDecoder:
           CudaError: the agent's memory cannot be read here.
         """
         head, ipc_handle, note = message
-        spec = Spec.decode(head)
-        offset, num_envs, version = note.view(NOTE)[0].tolist()
-        if self._memory is None:
-            self._memory = self._new_memory()
-            self._memory.open(ipc_handle.tobytes())
-        if offset not in self._views:
-            self._views[offset] = {
-                channel.name: self._memory.view(
-                    offset + begin, channel.full_shape(num_envs), np.dtype(channel.dtype)
-                )
-                for begin, channel in zip(
-                    slot_offsets(spec, num_envs)[0], spec.channels, strict=True
-                )
-            }
-        arrays: dict[str, Any] = dict(self._views[offset])
+        spec, block = Spec.decode(head), ipc_handle.tobytes()
+        num_envs, version, *offsets = note.view(np.int64).tolist()
+        arrays: dict[str, Any] = {
+            channel.name: self._received.view(
+                BufferedArray(block, offset, channel.full_shape(num_envs), channel.dtype)
+            )
+            for channel, offset in zip(spec.channels, offsets, strict=True)
+        }
         versions, agents = (np.full(num_envs, one, np.int64) for one in (version, agent))
         return Rollouts(spec, arrays, versions, agents)
 
     def close(self) -> None:
         """Gives the mapping back."""
-        self._views.clear()
-        if self._memory is not None:
-            self._memory.close()
-            self._memory = None
+        self._received.close()
 
 
 class DeviceStack(Stack):
-    """A batch that is put together on the device; parts are copied, for their slots get reused."""
+    """A batch put together on the device; parts are copied, for their memory gets reused."""
 
     def _begin(self) -> None:
         self._parts: dict[str, list[jax.Array]] = {c.name: [] for c in self.spec.channels}

@@ -21,7 +21,7 @@ from gmijax.collectives.waits import wait_until
 from gmijax.errors import CollectiveTimeout, ConfigError, PipeClosed
 
 if TYPE_CHECKING:
-    from gmijax.channels.device_buffers import DeviceBuffers
+    from gmijax.channels.device_arrays import DeviceBuffers
 
 MIN_CAPACITY_BYTES: Final = 1 << 18
 """Least capacity of the pipes, so that a frame fits."""
@@ -67,7 +67,7 @@ class Messenger:
         if device is None:
             outbox.post(frames_of(tree, tag, self._frame_bytes), self._timeout_s)
             return
-        put = partial(device.put, dst=dst, released_frames=outbox.released_frames)
+        put = partial(device.try_put, dst=dst, released=outbox.released_frames)
         outbox.post(frames_of(tree, tag, self._frame_bytes, put), self._timeout_s)
         device.mark_sent(dst, outbox.frames)
 

@@ -17,7 +17,7 @@ from gmijax.runs.folder import read_json
 from gmijax.supervise.child import ENV_EXCHANGE_FD, ENV_PIPES_FD, ChildLink, required_fd, run_gmi
 
 if TYPE_CHECKING:
-    from gmijax.channels.device_buffers import DeviceBuffers
+    from gmijax.channels.device_arrays import DeviceBuffers
 
 
 _SETTLE_S = 1.0
@@ -73,7 +73,7 @@ def _device_buffers(plan: Plan, gmi: int) -> DeviceBuffers | None:
     neighbours = [peer for peer in plan.layout.neighbours_of(gmi) if peer != gmi]
     if not neighbours or why_not_intra("ipc", plan.backend):
         return None
-    from gmijax.channels.device_buffers import DeviceBuffers
+    from gmijax.channels.device_arrays import DeviceBuffers
     from gmijax.collectives.device.cuda_memory import CudaMemory
 
     return DeviceBuffers(neighbours, CudaMemory)

@@ -11,7 +11,7 @@ import pytest
 from fake_device_memory import FakeDeviceMemory
 from shared_ranks import pipe_blocks
 
-from gmijax.channels.device_buffers import DeviceBuffers
+from gmijax.channels.device_arrays import DeviceBuffers
 from gmijax.channels.mailboxes import COLLECTIVE, DATA, MAX_PARTS, Inbox, frames_of
 from gmijax.channels.messenger import MIN_CAPACITY_BYTES, Messenger
 from gmijax.channels.pipe import message_bytes
