@@ -18,6 +18,7 @@ from gmijax.channels.unichannel import UniDecoder, UniPacker
 from gmijax.collectives.device.device_memory import DeviceMemory, NewMemory
 from gmijax.config.channel import ChannelConfig
 from gmijax.errors import ConfigError
+from gmijax.machine.host_limits import CgroupLimits
 
 NOTES_BYTES = 2**20
 """Of a pipe of `transport=device`, which holds only where experience lies."""
@@ -64,11 +65,11 @@ class ChannelTopology:
 def require_memory(config: ChannelConfig, topology: ChannelTopology) -> None:
     """Raises ConfigError unless there is memory for the channels; before a process is started."""
     pairs = len(topology.agents) * len(topology.trainers)
-    available = _available_bytes()
-    if config.transport == "memory" and pairs * config.capacity_bytes > available:
+    available = _available_mib()
+    if config.transport == "memory" and pairs * config.capacity_mib > available:
         raise ConfigError(
             f"channel.capacity_mib={config.capacity_mib}: {pairs} pairs of agent and trainer "
-            f"take {pairs * config.capacity_mib} MiB, available are {available // 2**20} MiB"
+            f"take {pairs * config.capacity_mib} MiB, available are {available} MiB"
         )
 
 
@@ -168,17 +169,9 @@ def _open_block(rank: int, fd: int | None, held: ExitStack) -> PipeBlock:
     return block
 
 
-def _available_bytes() -> int:
+def _available_mib() -> int:
     """Memory that this process and its children can still have."""
     lines = Path("/proc/meminfo").read_text().splitlines()
-    free = next(int(line.split()[1]) for line in lines if line.startswith("MemAvailable")) * 1024
-    group = Path("/sys/fs/cgroup")
-    try:
-        limit = int((group / "memory.max").read_text())
-        used = int((group / "memory.current").read_text())
-        counts = dict(line.split() for line in (group / "memory.stat").read_text().splitlines())
-    except (OSError, ValueError):  # No such group, or no limit ("max").
-        return free
-    # Cached files count as used, but make way.
-    cached = sum(int(counts.get(key, 0)) for key in ("active_file", "inactive_file"))
-    return min(free, max(0, limit - used + cached))
+    free = next(int(line.split()[1]) for line in lines if line.startswith("MemAvailable")) // 1024
+    group = CgroupLimits().available_memory_mib()
+    return free if group is None else min(free, int(group))
