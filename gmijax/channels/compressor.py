@@ -41,14 +41,14 @@ class TransferSize:
 
     def __init__(self, fixed_bytes: int | None, max_bytes: int) -> None:
         self.num_bytes = min(fixed_bytes or START_BYTES, max_bytes)
-        self.is_settled = fixed_bytes is not None
+        self.is_tuned = fixed_bytes is not None
         self._max_bytes = max_bytes
         self._samples: list[float] = []
         self._best: tuple[float, int] | None = None
 
     def record(self, num_bytes: int, seconds: float) -> None:
         """Takes note of what one transfer cost, without the time it waited for room."""
-        if self.is_settled or not num_bytes:
+        if self.is_tuned or not num_bytes:
             return
         self._samples.append(seconds / num_bytes)
         if len(self._samples) < SAMPLES:
@@ -61,7 +61,7 @@ class TransferSize:
             if larger <= self._max_bytes:
                 self.num_bytes = larger
                 return
-        self.num_bytes, self.is_settled = self._best[1], True
+        self.num_bytes, self.is_tuned = self._best[1], True
 
 
 class Compressor:

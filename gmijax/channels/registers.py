@@ -1,6 +1,6 @@
 """Registers in shared memory: one writer each, any number of readers, nobody ever waits.
 
-A register holds the newest value only. It is a seqlock with two places, written in turn: a reader
+A register holds the newest value only. It is a seqlock with two buffers, written in turn: a reader
 that copies one is disturbed only if the writer begins to publish for the second time meanwhile,
 which a counter tells it. The order of memory accesses is kept by `Fence`.
 
@@ -10,7 +10,7 @@ which a counter tells it. The order of memory accesses is kept by `Fence`.
     registers[1].read(after=0)                          # anybody: None if nothing is newer
 
 Wire format (native byte order): a line of 64 bytes (`LINE`) for every register, then for every
-register two places of its size, each on pages of its own.
+register two buffers of its size, each on pages of its own.
 """
 
 from __future__ import annotations
@@ -62,21 +62,21 @@ class AnyRegister(Protocol):
 class Register:
     """One register; see the module."""
 
-    def __init__(self, line: npt.NDArray[np.void], places: npt.NDArray[np.uint8]) -> None:
+    def __init__(self, line: npt.NDArray[np.void], buffers: npt.NDArray[np.uint8]) -> None:
         self._line = line
-        self._places = places
+        self._buffers = buffers
         self._fence = Fence()
 
     def publish(self, values: npt.NDArray[Any], tag: int = 0) -> None:
         """Replaces the value; one process only may do so. Costs a copy."""
         data = np.ascontiguousarray(values).reshape(-1).view(np.uint8)
         count = int(self._line["count"][0]) + 1
-        place = count % 2
+        buffer = count % 2
         self._line["begun"][0] = count
         self._fence()  # Who sees anything of what follows sees that it was begun.
-        self._places[place, : data.size] = data
-        self._line["tag"][0, place] = tag
-        self._line["length"][0, place] = data.size
+        self._buffers[buffer, : data.size] = data
+        self._line["tag"][0, buffer] = tag
+        self._line["length"][0, buffer] = data.size
         self._fence()
         self._line["count"][0] = count
 
@@ -90,12 +90,12 @@ class Register:
             if count <= after:
                 return None
             self._fence()
-            place = count % 2
-            length = int(self._line["length"][0, place])
-            tag = int(self._line["tag"][0, place])
-            values = self._places[place, :length].copy()
+            buffer = count % 2
+            length = int(self._line["length"][0, buffer])
+            tag = int(self._line["tag"][0, buffer])
+            values = self._buffers[buffer, :length].copy()
             self._fence()
-            # The next publication goes into the other place.
+            # The next publication goes into the other buffer.
             if int(self._line["begun"][0]) - count < 2:
                 return Snapshot(count, tag, values)
         return None
@@ -112,13 +112,13 @@ def open_registers(fd: int, sizes_bytes: Sequence[int]) -> list[Register]:
     Raises:
       CollectiveError: no memory.
     """
-    rooms = [whole_pages(size) for size in sizes_bytes]
-    offset = whole_pages(len(rooms) * LINE.itemsize)
-    mapping = map_file(fd, offset + 2 * sum(rooms), "registers")
-    lines = np.frombuffer(mapping, LINE, len(rooms))
+    sizes = [whole_pages(size) for size in sizes_bytes]
+    offset = whole_pages(len(sizes) * LINE.itemsize)
+    mapping = map_file(fd, offset + 2 * sum(sizes), "registers")
+    lines = np.frombuffer(mapping, LINE, len(sizes))
     registers = []
-    for index, (size, room) in enumerate(zip(sizes_bytes, rooms, strict=True)):
-        places = np.frombuffer(mapping, np.uint8, 2 * room, offset).reshape(2, room)
-        registers.append(Register(lines[index : index + 1], places[:, :size]))
+    for index, (size, room) in enumerate(zip(sizes_bytes, sizes, strict=True)):
+        buffers = np.frombuffer(mapping, np.uint8, 2 * room, offset).reshape(2, room)
+        registers.append(Register(lines[index : index + 1], buffers[:, :size]))
         offset += 2 * room
     return registers

@@ -65,24 +65,24 @@ class RemoteRegisters:
         self._own = [_nothing() for _ in own_bytes]
         self._theirs = {peer: [_nothing() for _ in their_bytes] for peer in addresses}
 
-    def own(self, place: int, local: AnyRegister | None = None) -> RemoteRegister:
+    def own(self, index: int, local: AnyRegister | None = None) -> RemoteRegister:
         """A register of this process; `local` is for readers of its node."""
-        return RemoteRegister(self, place, None, local)
+        return RemoteRegister(self, index, None, local)
 
-    def of(self, peer: int, place: int) -> RemoteRegister:
+    def of(self, peer: int, index: int) -> RemoteRegister:
         """A register of `peer`."""
-        return RemoteRegister(self, place, peer, None)
+        return RemoteRegister(self, index, peer, None)
 
-    def publish(self, place: int, values: npt.NDArray[Any], tag: int) -> None:
+    def publish(self, index: int, values: npt.NDArray[Any], tag: int) -> None:
         """See `Register`; those that are not there yet get it with the next one."""
         data = np.ascontiguousarray(values).reshape(-1).view(np.uint8)
-        self._own[place] = Snapshot(self._own[place].count + 1, tag, data.copy())
+        self._own[index] = Snapshot(self._own[index].count + 1, tag, data.copy())
         heads = [_HEAD.pack(one.count, one.tag, one.values.size) for one in self._own]
         message = b"".join([*heads, *(one.values.data for one in self._own)])
         for connection in self._connections.values():
             connection.send([message])
 
-    def read(self, peer: int, place: int, after: int) -> Snapshot | None:
+    def read(self, peer: int, index: int, after: int) -> Snapshot | None:
         """See `Register`.
 
         Raises:
@@ -90,7 +90,7 @@ class RemoteRegisters:
         """
         while (found := self._connections[peer].try_receive()) is not None:
             self._theirs[peer] = self._unpacked(peer, found)
-        newest = self._theirs[peer][place]
+        newest = self._theirs[peer][index]
         return newest if newest.count > after else None
 
     def close(self) -> None:
@@ -119,21 +119,21 @@ class RemoteRegister:
     """One of `RemoteRegisters`, as a `Register`: one end writes it, the other reads."""
 
     def __init__(
-        self, registers: RemoteRegisters, place: int, peer: int | None, local: AnyRegister | None
+        self, registers: RemoteRegisters, index: int, peer: int | None, local: AnyRegister | None
     ) -> None:
-        self._registers, self._place = registers, place
+        self._registers, self._index = registers, index
         self._peer, self._local = peer, local
 
     def publish(self, values: npt.NDArray[Any], tag: int = 0) -> None:
         """See `Register`."""
         if self._local is not None:
             self._local.publish(values, tag)
-        self._registers.publish(self._place, values, tag)
+        self._registers.publish(self._index, values, tag)
 
     def read(self, after: int = 0) -> Snapshot | None:
         """See `Register`."""
         assert self._peer is not None
-        return self._registers.read(self._peer, self._place, after)
+        return self._registers.read(self._peer, self._index, after)
 
 
 def _nothing() -> Snapshot:

@@ -39,8 +39,8 @@ class UniPacker:
     def flush(self) -> None:
         """Nothing is ever held back."""
 
-    def _try_send(self, piece: Rollouts, step: int, place: int) -> bool:
-        channel = piece.spec.channels[place]
+    def _try_send(self, piece: Rollouts, step: int, index: int) -> bool:
+        channel = piece.spec.channels[index]
         head = piece.spec.encode()
         sizes = [head.size, 40, channel.num_bytes(piece.num_envs) // channel.steps]
         if self._writer is None:  # All of a rollout go to one trainer.
@@ -53,7 +53,7 @@ class UniPacker:
         self._writer, views = opened
         views[0][:] = head
         is_last = len(self._todo) == 1
-        views[1].view(np.int64)[:] = step, place, piece.num_envs, piece.versions[0], is_last
+        views[1].view(np.int64)[:] = step, index, piece.num_envs, piece.versions[0], is_last
         into = views[2].view(channel.dtype).reshape(piece.num_envs, *channel.shape)
         into[...] = piece.experience[channel.name][step]
         self._writer.commit()
@@ -71,13 +71,13 @@ class UniDecoder:
         """The rollout of which `message` is the last tensor; None before."""
         head, table, tensor = message
         spec = Spec.decode(head)
-        step, place, num_envs, version, is_last = table.view(np.int64).tolist()
+        step, index, num_envs, version, is_last = table.view(np.int64).tolist()
         if self._shape != (spec, num_envs):
             self._shape = spec, num_envs
             self._arrays = {
                 c.name: np.empty(c.full_shape(num_envs), c.dtype) for c in spec.channels
             }
-        channel = spec.channels[place]
+        channel = spec.channels[index]
         values = tensor.view(channel.dtype).reshape(num_envs, *channel.shape)
         self._arrays[channel.name][step] = values
         if not is_last:
@@ -87,12 +87,12 @@ class UniDecoder:
 
 
 def _tensors(spec: Spec) -> list[tuple[int, int]]:
-    """(step, place of the channel) of all tensors of a rollout; the last one is sent first."""
+    """(step, index of the channel) of all tensors of a rollout; the last one is sent first."""
     longest = max(channel.steps for channel in spec.channels)
     order = [
-        (step - longest + channel.steps, place)
+        (step - longest + channel.steps, index)
         for step in range(longest)
-        for place, channel in enumerate(spec.channels)
+        for index, channel in enumerate(spec.channels)
         if step >= longest - channel.steps
     ]
     return order[::-1]

@@ -147,7 +147,7 @@ class DeviceTransport(HostTransport):
     def start(self, trial: Callable[[], bool]) -> None:
         """See `HostTransport`."""
         all_or_none(self._control, _WISH, self._open)
-        failure = self._runner.settle(lambda: self._try(trial))
+        failure = self._runner.finish(lambda: self._try(trial))
         all_or_none(self._control, _WISH, lambda: _raise(failure))
         self.exchange_s()  # Not a part of the first step.
 
@@ -175,7 +175,7 @@ class DeviceTransport(HostTransport):
 
     def run(self, program: Callable[[], T], *, is_last: bool) -> T:
         """See `HostTransport`."""
-        run = self._runner.settle if is_last else self._runner.step
+        run = self._runner.finish if is_last else self._runner.step
         return run(lambda: self._explained(program))
 
     def exchange_s(self) -> float:

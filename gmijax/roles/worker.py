@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from gmijax.channels.device_arrays import DeviceBuffers
 
 
-_SETTLE_S = 1.0
+_DRAIN_S = 1.0
 """After so long a GMI that only waits for others to receive says that it is alive."""
 
 
@@ -49,7 +49,7 @@ def _run(link: ChildLink) -> dict[str, Any]:
     output = shipping.dump(role.run(*args))
     # What was sent must be in shared memory before this process is gone, or have been received.
     messenger.flush()
-    while not messenger.settle(_SETTLE_S):
+    while not messenger.drain(_DRAIN_S):
         link.beat("running", 0)
     reducer.close()
     link.paths.output.write_bytes(output)

@@ -29,7 +29,7 @@ class LockstepRunner:
     def step(self, program: Callable[[], T]) -> T:
         """Runs a program that queues a step of all.
 
-        From the first one until `settle` the device may be at it, and wait for a peer that is
+        From the first one until `finish` the device may be at it, and wait for a peer that is
         gone: what ends this process meanwhile, wherever it is found, ends it at once.
 
         Raises:
@@ -48,7 +48,7 @@ class LockstepRunner:
         barrier.end()
         return result
 
-    def settle(self, program: Callable[[], T]) -> T:
+    def finish(self, program: Callable[[], T]) -> T:
         """Runs a program that returns when all steps are computed; raises as `step`."""
         result = self.step(program)
         self._is_running = False
