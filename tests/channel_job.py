@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from gmijax.collectives.channel.build import ChannelTopology, create_channels
+from gmijax.channels.build import ChannelTopology, create_channels
 from gmijax.collectives.nodes.rendezvous import reserved_address
 from gmijax.config.channel import ChannelConfig
 from tests.channel_ranks import ENV_FD, Options

@@ -17,11 +17,11 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from gmijax.collectives.channel import build
-from gmijax.collectives.channel.batcher import Batch, Batcher
-from gmijax.collectives.channel.build import ChannelTopology, open_receiver, open_sender
-from gmijax.collectives.channel.sender import Sender
-from gmijax.collectives.channel.spec import Array
+from gmijax.channels import build
+from gmijax.channels.batcher import Batcher
+from gmijax.channels.build import ChannelTopology, open_receiver, open_sender
+from gmijax.channels.experience import Array, Rollouts
+from gmijax.channels.sender import Sender
 from gmijax.config.channel import ChannelConfig
 from gmijax.config.schema import from_dict
 from gmijax.errors import CollectiveTimeout, GmijaxError, PeerLost, PipeClosed
@@ -50,7 +50,7 @@ def numbered(agent: int, first: int, task: Options) -> dict[str, Array]:
     }
 
 
-def numbers_of(batch: Batch) -> npt.NDArray[np.int64]:
+def numbers_of(batch: Rollouts) -> npt.NDArray[np.int64]:
     """The numbers of the unrolls in a batch; AssertionError if one is torn or mixed up."""
     got = {name: np.asarray(values) for name, values in batch.experience.items()}
     number, steps = got["bootstrap"][0], len(got["reward"])

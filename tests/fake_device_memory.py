@@ -14,8 +14,8 @@ import time
 import jax
 import numpy as np
 
-from gmijax.collectives.device.device_memory import TICKET_BYTES
-from gmijax.collectives.device.device_transport import Device
+from gmijax.collectives.device.device_memory import IPC_HANDLE_BYTES
+from gmijax.collectives.device_transport import Device
 
 
 class FakeDeviceMemory:
@@ -28,10 +28,10 @@ class FakeDeviceMemory:
         fd = os.memfd_create("fake-device-memory", os.MFD_CLOEXEC)
         os.ftruncate(fd, num_bytes)
         self._mapping = mmap.mmap(fd, num_bytes)
-        return struct.pack("=qqq", os.getpid(), fd, num_bytes).ljust(TICKET_BYTES, b"\xff")
+        return struct.pack("=qqq", os.getpid(), fd, num_bytes).ljust(IPC_HANDLE_BYTES, b"\xff")
 
-    def open(self, ticket: bytes) -> None:
-        pid, fd, num_bytes = struct.unpack_from("=qqq", ticket)
+    def open(self, ipc_handle: bytes) -> None:
+        pid, fd, num_bytes = struct.unpack_from("=qqq", ipc_handle)
         opened = os.open(f"/proc/{pid}/fd/{fd}", os.O_RDWR)
         self._mapping = mmap.mmap(opened, num_bytes)
         os.close(opened)

@@ -5,10 +5,10 @@ from __future__ import annotations
 import os
 from collections.abc import Sequence
 
+from gmijax.channels.messenger import MIN_CAPACITY_BYTES
+from gmijax.channels.pipe_block import PipeBlock, create_pipes
 from gmijax.collectives.host.shared_block import create_exchange
 from gmijax.collectives.host.shared_memory_group import SharedMemoryGroup
-from gmijax.collectives.messages.messenger import MIN_CAPACITY_BYTES
-from gmijax.collectives.messages.pipe_block import PipeBlock, create_pipes
 
 
 def host_ranks(

@@ -19,8 +19,8 @@ import numpy.typing as npt
 from gmijax.a3c.job_registers import JobRegisters, Orders, Report
 from gmijax.a3c.rollout import UnrollPrograms, num_counts
 from gmijax.a3c.targets import Unrolls
+from gmijax.channels.sender import Sender
 from gmijax.clock import running_s
-from gmijax.collectives.channel.sender import Sender
 from gmijax.config import A3cConfig, TrainConfig
 from gmijax.devices import describe_device
 from gmijax.errors import CollectiveTimeout, PipeClosed

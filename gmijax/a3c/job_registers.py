@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from gmijax.collectives.messages.registers import AnyRegister, open_registers
+from gmijax.channels.registers import AnyRegister, open_registers
 
 _NO_CHECKPOINT = -1
 

@@ -20,8 +20,9 @@ from gmijax.a3c.job_registers import JobRegisters
 from gmijax.a3c.leader import Leader
 from gmijax.a3c.report import MAX_COUNTED, BatchCounts, histogram_of
 from gmijax.a3c.targets import Unrolls
+from gmijax.channels.batcher import Batcher
+from gmijax.channels.experience import Rollouts
 from gmijax.clock import running_s
-from gmijax.collectives.channel.batcher import Batch, Batcher
 from gmijax.collectives.interface import Communicator
 from gmijax.config import A3cConfig, TrainConfig
 from gmijax.errors import CollectiveTimeout
@@ -156,7 +157,7 @@ class Trainer:
         self._trace.close()  # Last: a job that is told to end has little time to save.
         return "stopped" if is_stopped else "completed"
 
-    def _receive(self) -> tuple[Batch, float]:
+    def _receive(self) -> tuple[Rollouts, float]:
         """The next batch with at least one unroll that is fresh enough, and the wait for it."""
         started, since = time.monotonic(), running_s()
         # At first the agents may still compile.
@@ -179,7 +180,7 @@ class Trainer:
             if self._updates:
                 self.link.beat("running", self._updates)
 
-    def _weights_of(self, batch: Batch) -> npt.NDArray[np.float32]:
+    def _weights_of(self, batch: Rollouts) -> npt.NDArray[np.float32]:
         """[B]: 1 for unrolls within the bound of staleness, 0 for others."""
         if self._algo.max_staleness is None:
             return np.ones(self._batch_size, np.float32)
@@ -190,7 +191,7 @@ class Trainer:
         """Weight of a fresh unroll, equal to that of any other of the job."""
         return np.float32(self.comm.world_size * self._batch_size / counts.fresh)
 
-    def _meet(self, batch: Batch, waited_s: float) -> BatchCounts:
+    def _meet(self, batch: Rollouts, waited_s: float) -> BatchCounts:
         """Tells the other trainers of this batch, and hears of theirs."""
         fresh = float(self._weights_of(batch).sum())
         behind = histogram_of(self._version - batch.versions) + self._passed_over

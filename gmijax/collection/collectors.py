@@ -18,6 +18,8 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
+from gmijax.channels.pipe import Message, PipeReader, PipeWriter
+from gmijax.channels.pipe_block import PipeBlock
 from gmijax.collection.programs import (
     ActingPolicy,
     Keep,
@@ -28,8 +30,6 @@ from gmijax.collection.programs import (
     unroll,
 )
 from gmijax.collection.recording import CollectionStats, ShardWriter
-from gmijax.collectives.messages.pipe import Message, PipeReader, PipeWriter
-from gmijax.collectives.messages.pipe_block import PipeBlock
 from gmijax.config import ServeConfig
 from gmijax.errors import PipeClosed
 from gmijax.learning.start import begin_episodes

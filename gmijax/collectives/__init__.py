@@ -1,1 +1,1 @@
-"""Exchange of numbers between GMIs."""
+"""Collectives between GMIs: means of gradients and the like."""

@@ -10,10 +10,10 @@ from typing import TypeAlias
 
 import jax
 
-from gmijax.collectives.device.device_transport import Device, DeviceTransport
-from gmijax.collectives.host.host_transport import HostTransport
+from gmijax.collectives.device_transport import Device, DeviceTransport
 from gmijax.collectives.host.shared_block import LANES
 from gmijax.collectives.host.shared_memory_group import SharedMemoryGroup
+from gmijax.collectives.host_transport import HostTransport
 from gmijax.collectives.interface import Communicator, FloatBuffer, Step, TracedStep
 from gmijax.collectives.nodes.mesh import Mesh
 from gmijax.collectives.nodes.multi_node_group import MultiNodeGroup
@@ -87,7 +87,7 @@ def make_communicator(strategy: str, config: CommunicatorConfig) -> Communicator
 
 
 def _built(strategy: str, config: CommunicatorConfig, control: _Lane, host: _Lane) -> Communicator:
-    layout, num_floats = config.layout, _room(config)
+    layout, num_floats = config.layout, _capacity(config)
     parts = stages(strategy, layout, config.intra)
     device, transport = DEVICE(), None
     try:
@@ -100,7 +100,7 @@ def _built(strategy: str, config: CommunicatorConfig, control: _Lane, host: _Lan
         if len(inside) < len(parts):
             # Who finds that it does not work must not leave other nodes waiting for a sum.
             trial = StagedAllReduce(transport, inside, host.local.rank, host.local.world_size)
-        transport.start(trial)
+        transport.start(trial.is_right)
     except BaseException as error:
         if transport is not None:
             transport.close()
@@ -167,7 +167,7 @@ def _lanes(config: CommunicatorConfig) -> Sequence[_Lane]:
     here, ids = layout.gmis_of_node[layout.node_of(rank)], _ids(config)
     lanes = [
         SharedMemoryGroup(
-            *(config.exchange_fd, here.index(rank), len(here), _room(config)),
+            *(config.exchange_fd, here.index(rank), len(here), _capacity(config)),
             timeout_s=config.timeout_s,
             rendezvous_timeout_s=config.rendezvous_timeout_s,
             lane=lane,
@@ -196,7 +196,7 @@ def _over_nodes(
             *(connections, nodes.node, leaders),
             timeout_s=config.timeout_s,
             rendezvous_timeout_s=config.rendezvous_timeout_s,
-            on_wait=lane.beat,
+            on_wait=lane.heartbeat,
         )
         for connections, lane in zip(sockets, lanes, strict=True)
     ]
@@ -209,7 +209,7 @@ def _ids(config: CommunicatorConfig) -> Sequence[int]:
     return config.layout.gmis if config.gmis is None else config.gmis
 
 
-def _room(config: CommunicatorConfig) -> int:
+def _capacity(config: CommunicatorConfig) -> int:
     """Length of the largest buffer whose sum is taken; what is gathered is one of all ranks."""
     return max(config.num_floats, GATHERED_FLOATS * config.layout.num_gmis)
 

@@ -103,7 +103,7 @@ class Communicator(Protocol):
     """Exchanges numbers among the trainers of a job.
 
     Attributes:
-      rank: this trainer's place, 0 to `world_size - 1`.
+      rank: this trainer's number, 0 to `world_size - 1`.
       world_size: K, number of trainers.
       strategy: which one it is, also where the wanted one was not to be had.
       intra: how the GMIs of one GPU exchange numbers in `har`, `host` or `ipc`.

@@ -18,7 +18,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
 
-from gmijax.collectives.host.host_transport import HostTransport
+from gmijax.collectives.host_transport import HostTransport
 from gmijax.collectives.interface import Step
 from gmijax.collectives.strategies import Stage
 from gmijax.collectives.xla_call import Buffer, register
@@ -43,19 +43,39 @@ class StagedAllReduce:
         self._name = f"gmijax_exchange_{next(_serial)}"
         register(self._name, self._call)
 
-    def sum(self, buffer: jax.Array, place: int, after: jax.Array | None = None) -> jax.Array:
-        """The sum over ranks of `buffer` [n] float32; in a program, where it is number `place`."""
+    def sum(self, buffer: jax.Array, call_index: int, after: jax.Array | None = None) -> jax.Array:
+        """The sum over ranks of `buffer` [n] float32; `call_index` counts those of a program."""
         total = buffer
         for number, stage in enumerate(self._stages):
             if stage.kind == "all_gather":
                 # The largest group's size: the program must be the same on all ranks.
                 most = max(len(group) for group in stage.groups)
-                rows = self._traced(total, (most, buffer.size), number, place, after)
+                rows = self._traced(total, (most, buffer.size), number, call_index, after)
                 # Written out, so that it is one pass in the order of ranks, the same on all.
                 total = functools.reduce(jnp.add, list(rows))
             else:
-                total = self._traced(total, buffer.shape, number, place, after)
+                total = self._traced(total, buffer.shape, number, call_index, after)
         return total
+
+    def is_right(self) -> bool:
+        """Whether the first collectives of these ranks, of known numbers, give what they should.
+
+        All of the ranks call it at the same time.
+        """
+        assert self._transport is not None
+        world_size = self.world_size
+
+        def trial(values: jax.Array) -> tuple[jax.Array, jax.Array]:
+            collectives = TracedCollectives(self, jnp.asarray(self.rank))
+            gathered = collectives.all_gather(values[:1])[:, 0]
+            return gathered, collectives.mean(values, after=gathered)
+
+        values = jnp.full(self._transport.capacity, self.rank + 1, jnp.float32)
+        gathered, mean = jax.jit(trial)(values)
+        # Both are read: an error of the device comes with what is read last.
+        is_right = np.array_equal(gathered, np.arange(1, world_size + 1))
+        is_right &= np.allclose(mean, (world_size + 1) / 2, rtol=1e-5)
+        return bool(is_right)
 
     def program(self, step: Step, *, donates_own: bool = True) -> ProgramStep:
         """See `Communicator`."""
@@ -72,29 +92,32 @@ class StagedAllReduce:
         self,
         values: jax.Array,
         shape: tuple[int, ...],
-        number: int,
-        place: int,
+        stage: int,
+        call_index: int,
         after: jax.Array | None,
     ) -> jax.Array:
         if self._transport is None:
             raise CollectiveError(f"rank {self.rank}: exchange after close")
         if values.dtype != jnp.float32:
             raise CollectiveError(f"rank {self.rank}: exchanges float32, not {values.dtype}")
-        if values.size > (room := self._transport.room):
-            raise CollectiveError(f"rank {self.rank}: {values.size} floats, room is for {room}")
+        if values.size > (capacity := self._transport.capacity):
+            raise CollectiveError(
+                f"rank {self.rank}: {values.size} floats, room is for {capacity}"
+            )
         result = jax.ShapeDtypeStruct(shape, jnp.float32)
         call: Any = jax.ffi.ffi_call(self._name, result, has_side_effect=True)
         arguments = (values,) if after is None else (values, after)
-        return call(*arguments, number=np.int64(number), place=np.int64(place))
+        # `_call` gets them in the order of their names.
+        return call(*arguments, call_index=np.int64(call_index), stage=np.int64(stage))
 
     def _call(
         self, stream: int, arguments: list[Buffer], results: list[Buffer], attributes: list[int]
     ) -> None:
         if self._transport is None:
             raise RuntimeError("the exchange is closed")
-        (values, *_), (result,), (number, place) = arguments, results, attributes
-        where = (stream, place, values.address, result.address, values.shape[0])
-        self._transport.reduce(self._stages[number], *where)
+        (values, *_), (result,), (call_index, stage) = arguments, results, attributes
+        where = (stream, call_index, values.address, result.address, values.shape[0])
+        self._transport.reduce(self._stages[stage], *where)
 
 
 class TracedCollectives:

@@ -14,7 +14,7 @@ from gmijax.partition.layout import Layout
 from gmijax.partition.reduction import is_even, leaders
 
 Kind: TypeAlias = Literal["all_reduce", "all_gather", "broadcast"]
-TransportName: TypeAlias = Literal["host", "slots", "ring", "nodes"]
+TransportName: TypeAlias = Literal["host", "ipc", "ring", "nodes"]
 """Through shared memory of the host, memory of the GPUs that all map, NCCL between GPUs, sockets
 between nodes and memory of the host in each."""
 
@@ -28,8 +28,8 @@ class Stage(NamedTuple):
     Attributes:
       kind: all members of a group get their sum, or what each of them has, which the program
         sums in the order of the group, or what its first member has.
-      transport: how the numbers move; slots all-gather and broadcast only.
-      groups: ranks; those that are in none keep what they have. Stages through slots all have the
+      transport: how the numbers move; ipc all-gathers and broadcasts only.
+      groups: ranks; those that are in none keep what they have. Stages through ipc all have the
         same ones, with every rank in one of them. Between nodes these are the groups: what is
         summed is what their first ranks have, and all ranks get it.
     """
@@ -50,11 +50,11 @@ def stages(strategy: str, layout: Layout, intra: str = "host") -> Sequence[Stage
 
     - `mpr`, multi-process reduction: all through the host.
     - `flat`: one ring over all, plain data parallelism.
-    - `mrr`, multi-ring reduction: one ring for every place on a GPU; then one member of each
+    - `mrr`, multi-ring reduction: one ring for every index on a GPU; then one member of each
       ring, each on another GPU, in a last ring; then back to the members of its first ring.
     - `har`, hierarchical reduction: inside every GPU, a ring between the GPUs, and back. Where
       each GPU has as many GMIs and all of them have their GPU's sum, there is a ring for every
-      place, and no way back.
+      index, and no way back.
     - `one_shot`: every rank writes to every GPU, and sums what is there. Not in the paper. What
       travels is K - t buffers to each GPU, for a ring of K it would be two: it is made for
       networks whose messages cost more than their bytes.
@@ -75,25 +75,25 @@ def stages(strategy: str, layout: Layout, intra: str = "host") -> Sequence[Stage
     if strategy == "flat":
         return [Stage("all_reduce", "ring", everyone)]
     if strategy == "one_shot":
-        return [Stage("all_gather", "slots", everyone)]
+        return [Stage("all_gather", "ipc", everyone)]
     rings = tuple(zip(*gpus, strict=True)) if is_even(layout) else ()
     if strategy == "mrr":
         if len(rings) == 1:
             return [Stage("all_reduce", "ring", rings)]
-        # The ring of place k ends on GPU k: the ends are on different GPUs, as NCCL asks.
-        ends = tuple(ring[place] for place, ring in enumerate(rings))
+        # Ring k ends on GPU k: the ends are on different GPUs, as NCCL asks.
+        ends = tuple(ring[index] for index, ring in enumerate(rings))
         back = tuple(_first(end, ring) for end, ring in zip(ends, rings, strict=True))
         return [
             Stage("all_reduce", "ring", rings),
             Stage("all_reduce", "ring", (ends,)),
             Stage("broadcast", "ring", back),
         ]
-    inner: TransportName = "slots" if intra == "ipc" else "host"
+    inner: TransportName = "ipc" if intra == "ipc" else "host"
     led = tuple(_first(leader, gpu) for leader, gpu in zip(leaders(layout), gpus, strict=True))
-    inside = Stage("all_gather" if inner == "slots" else "all_reduce", inner, led)
+    inside = Stage("all_gather" if inner == "ipc" else "all_reduce", inner, led)
     if len(gpus) == 1:
         return [inside]
-    if inner == "slots" and rings:
+    if inner == "ipc" and rings:
         # Not a sum of NCCL's: its order may differ from ring to ring.
         return [inside, Stage("all_gather", "ring", rings)]
     between = Stage("all_reduce", "ring", (leaders(layout),))

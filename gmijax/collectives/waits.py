@@ -23,13 +23,13 @@ LIVENESS_PERIOD_S = 0.2
 
 
 def wait_until(
-    ready: Callable[[], T | None], blame: Callable[[], GmijaxError | None], timeout_s: float
+    ready: Callable[[], T | None], check: Callable[[], GmijaxError | None], timeout_s: float
 ) -> T | None:
     """Returns what `ready` returns once it is not None; None when the time is up.
 
     Args:
       ready: cheap; asked again and again.
-      blame: asked five times a second, and at the end, who will never come; its error is raised
+      check: called five times a second, and at the end; an error of a lost peer, which is raised
         unless `ready` has something after all (a process may deliver and end meanwhile).
       timeout_s: longest wait; the first question is asked however short it is.
     """
@@ -39,7 +39,7 @@ def wait_until(
         is_late = now_s - start_s >= timeout_s
         if is_late or now_s >= next_look_s:
             next_look_s = now_s + LIVENESS_PERIOD_S
-            if (error := blame()) is not None:
+            if (error := check()) is not None:
                 if (found := ready()) is None:
                     raise error
                 return found

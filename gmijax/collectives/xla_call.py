@@ -142,18 +142,18 @@ def _describe(frame: Any) -> None:
 
 def _buffers(values: Any) -> list[Buffer]:
     found = []
-    for place in range(values.size):
-        buffer = values.values[place].contents
+    for index in range(values.size):
+        buffer = values.values[index].contents
         found.append(Buffer(buffer.data or 0, tuple(buffer.dims[: buffer.rank])))
     return found
 
 
 def _integers(attributes: Any) -> list[int]:
     found = []
-    for place in range(attributes.size):
-        value = attributes.values[place].contents
-        if attributes.types[place] != _SCALAR or value.dtype != _INT64:
-            raise TypeError(f"attribute {place} is no int64")
+    for index in range(attributes.size):
+        value = attributes.values[index].contents
+        if attributes.types[index] != _SCALAR or value.dtype != _INT64:
+            raise TypeError(f"attribute {index} is no int64")
         found.append(value.value[0])
     return found
 

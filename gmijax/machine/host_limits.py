@@ -121,6 +121,16 @@ class CgroupLimits:
         limits = (_number(folder, names) for folder in self._folders("memory"))
         return _least(*(limit / 2**20 for limit in limits if limit is not None))
 
+    def available_memory_mib(self) -> float | None:
+        """Memory that processes of the group can still have, MiB."""
+        left: list[float] = []
+        for folder in self._folders("memory"):
+            limit = _number(folder, ("memory.max", "memory.limit_in_bytes"))
+            used = _number(folder, ("memory.current", "memory.usage_in_bytes"))
+            if limit is not None and used is not None:
+                left.append(max(0, limit - used + _cached_bytes(folder)) / 2**20)
+        return _least(*left)
+
     def threads(self) -> int | None:
         """Threads that may still be started."""
         left: list[int] = []
@@ -210,6 +220,17 @@ def _threads_of_machine() -> int | None:
         running = int(Path("/proc/loadavg").read_text().split()[3].partition("/")[2])
         return min(limits) - running
     return None
+
+
+def _cached_bytes(folder: Path) -> int:
+    """Cached files of a control group, which count as used, but make way."""
+    with suppress(OSError, ValueError):
+        lines = (folder / "memory.stat").read_text().splitlines()
+        counts = {name: int(value) for name, value in (line.split() for line in lines)}
+        # In version 1 those of the groups below are counted apart.
+        prefix = "total_" if "total_active_file" in counts else ""
+        return counts[f"{prefix}active_file"] + counts[f"{prefix}inactive_file"]
+    return 0
 
 
 def _number(folder: Path, names: Sequence[str]) -> int | None:

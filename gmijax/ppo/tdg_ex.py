@@ -35,7 +35,7 @@ from gmijax.supervise.heartbeat import GmiState
 from gmijax.types import Array, PyTree
 
 if TYPE_CHECKING:
-    from gmijax.collectives.messages.messenger import Messenger
+    from gmijax.channels.messenger import Messenger
 
 _Answers: TypeAlias = tuple[list[Samples], list[FloatBuffer]]
 """Of every worker: samples [T, N] and packed statistics."""

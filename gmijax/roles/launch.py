@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from functools import partial
 from typing import Any, Final
 
-from gmijax.collectives.messages.messenger import MIN_CAPACITY_BYTES
+from gmijax.channels.messenger import MIN_CAPACITY_BYTES
 from gmijax.config import Timeouts
 from gmijax.config.schema import require_between, require_positive
 from gmijax.errors import ConfigError, GmiFailed, GmijaxError

@@ -6,7 +6,6 @@ import dataclasses
 from collections.abc import Hashable, Iterable, Sequence
 from typing import Any, Literal, TypeAlias
 
-from gmijax.collectives.messages.group import Operation
 from gmijax.config import BackendName, PlanConfig, ReduceConfig
 from gmijax.config.schema import from_dict
 from gmijax.errors import ConfigError
@@ -14,6 +13,7 @@ from gmijax.machine.snapshot import detect_machine
 from gmijax.partition.layout import Layout
 from gmijax.partition.plan import Plan
 from gmijax.partition.planner import make_plan
+from gmijax.roles.group import Operation
 from gmijax.roles.role import here
 
 BackendChoice: TypeAlias = Literal["auto", BackendName]

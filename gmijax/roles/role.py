@@ -7,10 +7,10 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Any
 
-from gmijax.collectives.messages.group import GroupReducer, Operation
-from gmijax.collectives.messages.messenger import Messenger
+from gmijax.channels.messenger import Messenger
 from gmijax.errors import ConfigError
 from gmijax.partition.layout import Layout
+from gmijax.roles.group import GroupReducer, Operation
 from gmijax.supervise.child import ChildLink
 
 

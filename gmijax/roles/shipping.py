@@ -18,7 +18,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any, Final
 
-from gmijax.collectives.messages.trees import on_host
+from gmijax.channels.trees import on_host
 from gmijax.errors import ConfigError
 
 MAIN: Final = "__main__"

@@ -5,22 +5,22 @@ from __future__ import annotations
 import sys
 from typing import TYPE_CHECKING, Any
 
+from gmijax.channels.messenger import Messenger
+from gmijax.channels.pipe_block import PipeBlock
 from gmijax.collectives.host.shared_memory_group import SharedMemoryGroup
-from gmijax.collectives.messages.group import GroupReducer
-from gmijax.collectives.messages.messenger import Messenger
-from gmijax.collectives.messages.pipe_block import PipeBlock
 from gmijax.partition.plan import Plan
 from gmijax.partition.reduction import why_not_intra
 from gmijax.roles import shipping
+from gmijax.roles.group import GroupReducer
 from gmijax.roles.role import Gmi, enter
 from gmijax.runs.folder import read_json
 from gmijax.supervise.child import ENV_EXCHANGE_FD, ENV_PIPES_FD, ChildLink, required_fd, run_gmi
 
 if TYPE_CHECKING:
-    from gmijax.collectives.messages.device_buffers import DeviceBuffers
+    from gmijax.channels.device_arrays import DeviceBuffers
 
 
-_SETTLE_S = 1.0
+_DRAIN_S = 1.0
 """After so long a GMI that only waits for others to receive says that it is alive."""
 
 
@@ -49,7 +49,7 @@ def _run(link: ChildLink) -> dict[str, Any]:
     output = shipping.dump(role.run(*args))
     # What was sent must be in shared memory before this process is gone, or have been received.
     messenger.flush()
-    while not messenger.settle(_SETTLE_S):
+    while not messenger.drain(_DRAIN_S):
         link.beat("running", 0)
     reducer.close()
     link.paths.output.write_bytes(output)
@@ -73,10 +73,10 @@ def _device_buffers(plan: Plan, gmi: int) -> DeviceBuffers | None:
     neighbours = [peer for peer in plan.layout.neighbours_of(gmi) if peer != gmi]
     if not neighbours or why_not_intra("ipc", plan.backend):
         return None
-    from gmijax.collectives.device.device_memory import cuda_memory
-    from gmijax.collectives.messages.device_buffers import DeviceBuffers
+    from gmijax.channels.device_arrays import DeviceBuffers
+    from gmijax.collectives.device.cuda_memory import CudaMemory
 
-    return DeviceBuffers(neighbours, cuda_memory)
+    return DeviceBuffers(neighbours, CudaMemory)
 
 
 if __name__ == "__main__":

@@ -13,9 +13,9 @@ from functools import partial
 from types import MappingProxyType
 from typing import Final
 
-from gmijax.collectives.channel.build import ChannelTopology, create_channels, require_memory
-from gmijax.collectives.messages.pipe_block import create_pipes
-from gmijax.collectives.messages.registers import create_registers
+from gmijax.channels.build import ChannelTopology, create_channels, require_memory
+from gmijax.channels.pipe_block import create_pipes
+from gmijax.channels.registers import create_registers
 from gmijax.config import ServeConfig, TrainConfig
 from gmijax.errors import ConfigError
 from gmijax.machine.snapshot import Machine

@@ -9,7 +9,7 @@ from __future__ import annotations
 from contextlib import ExitStack
 
 from gmijax.a3c.job_registers import JobRegisters, register_bytes
-from gmijax.collectives.channel.tcp_registers import RemoteRegisters
+from gmijax.channels.registers import RemoteRegisters
 from gmijax.collectives.nodes.rendezvous import NodeAddresses
 
 

@@ -71,8 +71,8 @@ def _run(link: ChildLink) -> dict[str, Any]:
 
 def _work(share: Share, plan: Plan, held: ExitStack) -> dict[str, Any]:
     """Does the part that the template gives to this GMI."""
+    from gmijax.channels.pipe_block import PipeBlock
     from gmijax.collection import collectors
-    from gmijax.collectives.messages.pipe_block import PipeBlock
 
     gmi, layout = share.link.gmi, plan.layout
     simulates, acts = (has_role(plan.roles[gmi], role) for role in (SIMULATOR, AGENT))

@@ -103,8 +103,8 @@ def _remote_iteration(
     held: ExitStack,
 ) -> tuple[RemoteIteration, int]:
     """An iteration on rollouts of other GMIs, and how many these are."""
-    from gmijax.collectives.messages.messenger import Messenger
-    from gmijax.collectives.messages.pipe_block import PipeBlock
+    from gmijax.channels.messenger import Messenger
+    from gmijax.channels.pipe_block import PipeBlock
     from gmijax.ppo.tdg_ex import RemoteIteration, RolloutWorkers
 
     block = PipeBlock(required_fd(ENV_PIPES_FD), link.gmi)
@@ -124,8 +124,8 @@ def _serve_rollouts(
     held: ExitStack,
 ) -> dict[str, Any]:
     """Makes rollouts for the trainer on the same GPU."""
-    from gmijax.collectives.messages.messenger import Messenger
-    from gmijax.collectives.messages.pipe_block import PipeBlock
+    from gmijax.channels.messenger import Messenger
+    from gmijax.channels.pipe_block import PipeBlock
     from gmijax.config import PpoConfig
     from gmijax.learning.learner import make_learner
     from gmijax.learning.start import first_envs
@@ -157,7 +157,7 @@ def _run_asynchronous(
     from gmijax.a3c.job_registers import open_job_registers
     from gmijax.a3c.rollout import num_counts
     from gmijax.a3c.trainer import Trainer
-    from gmijax.collectives.channel.build import open_receiver, open_sender
+    from gmijax.channels.build import open_receiver, open_sender
     from gmijax.learning.learner import num_weights
     from gmijax.learning.updates import exchange_size
     from gmijax.workers.node_registers import over_nodes

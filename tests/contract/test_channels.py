@@ -1,18 +1,32 @@
-"""What the experience channels promise, checked with real processes; no jax in them."""
+"""What every way of a channel and the channels promise: both ends here, then real processes.
+
+No jax is in them.
+"""
 
 from __future__ import annotations
 
+import os
 import signal
+import threading
 import time
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, closing
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import pytest
 from training_jobs import require_gone, shared_memory
 
-from gmijax.collectives.channel.build import ChannelTopology
+from gmijax.channels.batcher import ChannelReader
+from gmijax.channels.build import ChannelTopology
+from gmijax.channels.migrator import ChannelWriter
+from gmijax.channels.pipe import Message, PipeReader, PipeWriter
+from gmijax.channels.pipe_block import PipeBlock, create_pipes
+from gmijax.channels.tcp_channel import RemoteReader, RemoteWriter
+from gmijax.collectives.nodes.rendezvous import reserved_address
 from gmijax.config.channel import ChannelConfig
+from gmijax.errors import CollectiveError, PipeClosed
 from tests.channel_job import ChannelJob
 
 pytestmark = pytest.mark.timeout(120)
@@ -25,6 +39,115 @@ BOTH = (0, 0, 1, 1, 0)  # Memory for agents 0 and 1 with trainer 4, and agent 2 
 WAYS = [("multi", None), ("multi", range(5)), ("uni", None), ("multi", BOTH)]
 HERE = str(Path(__file__).parents[1])
 TOPOLOGY = ChannelTopology(agents=(0, 1, 2), trainers=(3, 4), gpu_of=(0, 0, 1, 2, 3))
+
+CAPACITY = 2**16
+
+
+class Way(NamedTuple):
+    """Both ends of the way from rank 0 to rank 1, in one process."""
+
+    writer: ChannelWriter
+    reader: ChannelReader
+
+    def send(self, *parts: bytes) -> None:
+        """Sends a message when there is room."""
+        sizes = [len(part) for part in parts]
+        views = until(lambda: self.writer.try_reserve(sizes))
+        for view, part in zip(views, parts, strict=True):
+            view[:] = np.frombuffer(part, np.uint8)
+        self.writer.commit()
+
+    def get(self) -> list[bytes]:
+        """The next message, once it is there."""
+        message: Message = until(self.reader.try_get)
+        return [part.tobytes() for part in message]
+
+
+def until(ready: Callable[[], Any], longest_s: float = 30.0) -> Any:
+    """What `ready` returns once it is neither None nor False."""
+    deadline_s = time.monotonic() + longest_s
+    while (result := ready()) is None or result is False:
+        assert time.monotonic() < deadline_s
+        time.sleep(1e-4)
+    return result
+
+
+@pytest.fixture(params=TRANSPORTS)
+def way(request: pytest.FixtureRequest) -> Iterator[Way]:
+    with ExitStack() as held:
+        if request.param == "memory":
+            fd = create_pipes(2, CAPACITY)
+            held.callback(os.close, fd)
+            blocks = [held.enter_context(closing(PipeBlock(fd, rank))) for rank in (0, 1)]
+            ends = Way(PipeWriter(blocks[0], 1), PipeReader(blocks[1], 0))
+        else:
+            address = held.enter_context(reserved_address("127.0.0.1"))
+            settings = CAPACITY, os.urandom(32)
+            reader = RemoteReader(address, 1, 0, *settings)
+            ends = Way(RemoteWriter(address, 0, 1, *settings), reader)
+        yield ends
+        ends.reader.close()
+        ends.writer.close()
+
+
+def test_messages_of_all_sizes_arrive_whole_and_in_order(way: Way) -> None:
+    sizes = [0, 1, 7, 5000, 20_000]
+
+    def parts_of(number: int) -> list[bytes]:
+        size = sizes[number % len(sizes)]
+        return [bytes([number % 251]) * count for count in (8, size, 0, 3)]
+
+    def write() -> None:
+        for number in range(300):
+            way.send(*parts_of(number))
+
+    writing = threading.Thread(target=write)
+    writing.start()
+    for number in range(300):
+        assert way.get() == parts_of(number)
+    writing.join()
+
+
+def test_what_the_reader_holds_is_room_that_the_writer_has_not(way: Way) -> None:
+    part = bytes(CAPACITY // 8)
+    sent = 0
+    while (views := way.writer.try_reserve([len(part)])) is not None:
+        views[0][:] = 1
+        way.writer.commit()
+        sent += 1
+    assert 4 <= sent <= 8
+    assert way.writer.occupancy() > 0.5
+    assert way.writer.load_bytes() >= sent * len(part)
+    held = until(way.reader.try_get)
+    assert way.writer.try_reserve([len(part)]) is None, "views of the reader are overwritten"
+    assert (held[0] == 1).all()
+    way.reader.release()
+    assert until(lambda: way.writer.try_reserve([len(part)])) is not None
+
+
+def test_a_message_that_never_fits_is_refused(way: Way) -> None:
+    largest = way.writer.max_message_bytes
+    with pytest.raises(CollectiveError, match=rf"GMI 0: a message of \d+ bytes .*most {largest}"):
+        way.writer.try_reserve([largest])
+
+
+def test_what_was_sent_before_the_end_arrives_and_then_the_end_is_said(way: Way) -> None:
+    way.send(b"first")
+    way.send(b"last")
+    closing_end = threading.Thread(target=way.writer.close)
+    closing_end.start()
+    assert [way.get(), way.get()] == [[b"first"], [b"last"]]
+    with pytest.raises(PipeClosed, match="GMI 0 has closed"):
+        until(way.reader.try_get)
+    closing_end.join()
+
+
+def test_a_writer_finds_out_that_its_reader_has_left(way: Way) -> None:
+    way.send(b"taken")
+    assert way.get() == [b"taken"]
+    way.reader.close()
+    with pytest.raises(PipeClosed, match="GMI 1 has closed"):
+        until(lambda: way.writer.try_reserve([1]) is None)
 
 
 def config(**keys: Any) -> ChannelConfig:

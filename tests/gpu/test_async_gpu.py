@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from training_jobs import train
 
-from gmijax.collectives.channel.build import ChannelTopology
+from gmijax.channels.build import ChannelTopology
 from gmijax.config.channel import ChannelConfig
 from tests.channel_job import ChannelJob
 

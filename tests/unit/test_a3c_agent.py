@@ -15,8 +15,8 @@ from training_jobs import wait_until
 from gmijax.a3c.agent import Agent
 from gmijax.a3c.job_registers import JobRegisters, Orders, Report, open_job_registers
 from gmijax.a3c.rollout import num_counts
+from gmijax.channels.registers import create_registers
 from gmijax.cli.compose import compose
-from gmijax.collectives.messages.registers import create_registers
 from gmijax.learning.learner import (
     acting_weights,
     init_learner,

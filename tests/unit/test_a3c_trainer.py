@@ -8,8 +8,8 @@ from toy_env import point_mass
 
 from gmijax.a3c.job_registers import JobRegisters
 from gmijax.a3c.trainer import Trainer
+from gmijax.channels.experience import Rollouts, Spec
 from gmijax.cli.compose import compose
-from gmijax.collectives.channel.batcher import Batch
 from gmijax.collectives.communicator import SingleRankCommunicator
 from gmijax.runs.folder import RunPaths
 from gmijax.supervise.child import ChildLink
@@ -20,10 +20,11 @@ class _Arrivals:
 
     def __init__(self, *versions: list[int]) -> None:
         self._batches = [
-            Batch({}, np.array(one, np.int64), np.ones(len(one), np.int64)) for one in versions
+            Rollouts(Spec(()), {}, np.array(one, np.int64), np.ones(len(one), np.int64))
+            for one in versions
         ]
 
-    def receive(self, batch_size: int, timeout_s: float) -> Batch:
+    def receive(self, batch_size: int, timeout_s: float) -> Rollouts:
         return self._batches.pop(0)
 
 

@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from gmijax.collectives.channel.batcher import Batcher
-from gmijax.collectives.channel.build import (
+from gmijax.channels.batcher import Batcher
+from gmijax.channels.build import (
     ChannelTopology,
     create_channels,
     max_piece_bytes,
@@ -19,8 +19,7 @@ from gmijax.collectives.channel.build import (
     open_sender,
     require_memory,
 )
-from gmijax.collectives.channel.dispenser import Dispenser
-from gmijax.collectives.channel.sender import CLOSE_TIMEOUT_S, Sender
+from gmijax.channels.sender import CLOSE_TIMEOUT_S, Dispenser, Sender
 from gmijax.config.channel import ChannelConfig
 from gmijax.errors import CollectiveTimeout, ConfigError, PeerLost, PipeClosed
 
@@ -174,7 +173,7 @@ def test_many_tiny_pieces_fit_with_their_versions_and_agents(make_pair: Any) -> 
     ],
 )
 def test_other_experience_is_refused(change: dict[str, Any], message: str) -> None:
-    dispenser = Dispenser(10_000)
+    dispenser = Dispenser(0, 10_000)
     assert len(dispenser.split(rollout(), 0)) == 1
     with pytest.raises(ConfigError, match=message):
         dispenser.split({**rollout(), **change}, 0)
@@ -182,7 +181,7 @@ def test_other_experience_is_refused(change: dict[str, Any], message: str) -> No
 
 def test_an_unroll_that_never_fits_is_refused() -> None:
     with pytest.raises(ConfigError, match=r"bytes for one environment, at most 10; channel\."):
-        Dispenser(10).split(rollout(), 0)
+        Dispenser(0, 10).split(rollout(), 0)
 
 
 def test_what_cannot_be_had_is_refused_before_a_process_starts() -> None:

@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from gmijax.collectives.channel.compressor import SAMPLES, START_BYTES, TransferSize
-from gmijax.collectives.channel.migrator import Migrator
+from gmijax.channels.compressor import SAMPLES, START_BYTES, TransferSize
+from gmijax.channels.migrator import Migrator
 from gmijax.errors import GmijaxError, PeerLost, PipeClosed
 
 
@@ -77,7 +77,7 @@ def test_a_dead_trainer_is_named_before_one_that_has_left_because_of_it() -> Non
 def test_the_size_of_transfers_grows_while_a_byte_gets_cheaper() -> None:
     size = TransferSize(None, 2**24)
     tried = set()
-    while not size.is_settled:
+    while not size.is_tuned:
         tried.add(size.num_bytes)
         size.record(size.num_bytes, 20e-6 + size.num_bytes / 5e9)
     # 20 us are 5 % of the time of 2 MB at 5 GB/s, so that doubling gains less than that there.

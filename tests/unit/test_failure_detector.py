@@ -35,10 +35,10 @@ def barriers_of(blocks: list[SharedBlock], *timeouts_s: float) -> list[Barrier]:
     return [Barrier(block, t, t) for block, t in zip(blocks, timeouts_s, strict=True)]
 
 
-def end(blocks: list[SharedBlock], rank: int, blamed: int | None = None) -> None:
-    """Makes `rank` look as if its process had ended, having given up for `blamed`."""
+def end(blocks: list[SharedBlock], rank: int, suspect: int | None = None) -> None:
+    """Makes `rank` look as if its process had ended, having given up for `suspect`."""
     blocks[rank].lines["pid"][rank] = 0
-    blocks[rank].blamed[rank] = 0 if blamed is None else blamed + 1
+    blocks[rank].suspect[rank] = 0 if suspect is None else suspect + 1
 
 
 def test_who_waits_too_is_not_named(blocks: list[SharedBlock]) -> None:
@@ -47,7 +47,7 @@ def test_who_waits_too_is_not_named(blocks: list[SharedBlock]) -> None:
         other = pool.submit(second.watch, NEVER)
         with pytest.raises(CollectiveTimeout, match=r"waited 1\.2 s .* for GMIs \[2\]"):
             first.watch(NEVER)
-        end(blocks, 0, blamed=2)
+        end(blocks, 0, suspect=2)
         with pytest.raises(CollectiveTimeout, match=r"GMI 1: .* for GMIs \[2\]"):
             other.result()
 
@@ -64,12 +64,12 @@ def test_the_dead_are_named_and_not_those_who_gave_up_for_them(
     blocks: list[SharedBlock],
 ) -> None:
     first = barriers_of(blocks, 3.0, 3.0, 3.0)[0]
-    end(blocks, 1, blamed=2)
+    end(blocks, 1, suspect=2)
     end(blocks, 2)
     with pytest.raises(PeerLost) as lost:
         first.watch(NEVER)
     assert lost.value.peer == 2
-    assert blocks[0].blamed[0] == 3
+    assert blocks[0].suspect[0] == 3
 
 
 def test_who_gave_up_in_another_lane_is_not_named() -> None:
@@ -88,14 +88,14 @@ def test_who_gave_up_in_another_lane_is_not_named() -> None:
 
 def test_one_that_gave_up_for_a_stuck_rank_points_at_it(blocks: list[SharedBlock]) -> None:
     first = barriers_of(blocks, 3.0, 3.0, 3.0)[0]
-    end(blocks, 1, blamed=2)
+    end(blocks, 1, suspect=2)
     with pytest.raises(CollectiveTimeout, match=r"for GMIs \[2\]"):
         first.watch(NEVER)
 
 
 def test_one_that_gave_up_and_still_runs_is_not_named(blocks: list[SharedBlock]) -> None:
     first = barriers_of(blocks, 0.9, 3.0, 3.0)[0]
-    blocks[1].blamed[1] = 3
+    blocks[1].suspect[1] = 3
     with pytest.raises(CollectiveTimeout, match=r"for GMIs \[2\]"):
         first.watch(NEVER)
 
@@ -112,10 +112,10 @@ def test_a_failed_transfer_is_blamed_on_the_dead(
 ) -> None:
     first, second, _ = barriers_of(blocks, 30, 30, 30)
     threading.Timer(0.4, end, (blocks, 2)).start()  # The error comes before the death.
-    with pytest.raises(PeerLost) as lost, first.explained():
+    with pytest.raises(PeerLost) as lost, first.raise_peer_failure():
         raise error
     assert lost.value.peer == 2
-    end(blocks, 0, blamed=blocks[0].blamed[0] - 1)  # It ends for that reason.
+    end(blocks, 0, suspect=blocks[0].suspect[0] - 1)  # It ends for that reason.
     with pytest.raises(PeerLost) as lost:
         second.watch(NEVER)
     assert lost.value.peer == 2
@@ -164,7 +164,7 @@ def test_an_error_of_ones_own_stays_what_it_is(
 ) -> None:
     monkeypatch.setattr("gmijax.collectives.host.barrier.SETTLE_S", 0.1)
     first, *_ = barriers_of(blocks, 5.0, 5.0, 5.0)
-    with pytest.raises(RuntimeError, match="out of memory"), first.explained():
+    with pytest.raises(RuntimeError, match="out of memory"), first.raise_peer_failure():
         raise RuntimeError("out of memory")
-    with pytest.raises(CudaError, match="cannot copy"), first.explained():
+    with pytest.raises(CudaError, match="cannot copy"), first.raise_peer_failure():
         raise CudaError("cannot copy")

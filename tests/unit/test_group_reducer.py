@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 from shared_ranks import host_ranks, pipe_blocks
 
+from gmijax.channels.messenger import Messenger
 from gmijax.collectives.interface import FloatBuffer
-from gmijax.collectives.messages.group import AT_ONCE_BYTES, GroupReducer
-from gmijax.collectives.messages.messenger import Messenger
 from gmijax.errors import CollectiveError
+from gmijax.roles.group import AT_ONCE_BYTES, GroupReducer
 
 RANKS = 3
 SMALL = AT_ONCE_BYTES // 4

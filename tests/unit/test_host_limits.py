@@ -136,6 +136,10 @@ def test_limits_of_control_groups_of_version_2(tmp_path: Path):
     group(root / "slice/job", memory__max="max", cpu__max="150000 100000", pids__max="max")
     found = CgroupLimits(tmp_path / "own", root)
     assert (found.memory_mib(), found.threads(), found.cpu_quota()) == (8192.0, 60, 1.5)
+    assert found.available_memory_mib() is None
+    stat = f"anon 7\nactive_file {2**20}\ninactive_file {2**21}"
+    group(root / "slice", memory__current=str(6 * 2**30), memory__stat=stat)
+    assert found.available_memory_mib() == 2048 + 3
     group(root / "slice", cpu__max="max 100000")
     group(root / "slice/job", cpu__max="max 100000")
     assert found.cpu_quota() is None
@@ -151,6 +155,9 @@ def test_limits_of_control_groups_of_version_1(tmp_path: Path):
     group(root / "pids", pids__max="30", pids__current="10")
     found = CgroupLimits(tmp_path / "own", root)
     assert (found.memory_mib(), found.threads(), found.cpu_quota()) == (1024.0, 20, 0.5)
+    stat = f"active_file 1\ninactive_file 1\ntotal_active_file {2**20}\ntotal_inactive_file 0"
+    group(root / "memory/a", memory__usage_in_bytes=str(2**29), memory__stat=stat)
+    assert found.available_memory_mib() == 512 + 1
     found = CgroupLimits(tmp_path / "none", root)
     assert (found.memory_mib(), found.threads(), found.cpu_quota()) == (None, None, None)
 

@@ -11,11 +11,11 @@ import pytest
 from fake_device_memory import FakeDeviceMemory
 from shared_ranks import pipe_blocks
 
-from gmijax.collectives.messages.device_buffers import DeviceBuffers
-from gmijax.collectives.messages.mailboxes import COLLECTIVE, DATA, MAX_PARTS, Inbox, frames_of
-from gmijax.collectives.messages.messenger import MIN_CAPACITY_BYTES, Messenger
-from gmijax.collectives.messages.pipe import message_bytes
-from gmijax.collectives.messages.trees import as_bytes, flatten, unflatten
+from gmijax.channels.device_arrays import DeviceBuffers
+from gmijax.channels.mailboxes import COLLECTIVE, DATA, MAX_PARTS, Inbox, frames_of
+from gmijax.channels.messenger import MIN_CAPACITY_BYTES, Messenger
+from gmijax.channels.pipe import message_bytes
+from gmijax.channels.trees import as_bytes, flatten, unflatten
 from gmijax.errors import CollectiveTimeout, ConfigError
 from tests.role_cases import nested, same
 
@@ -140,32 +140,32 @@ def test_places_on_the_device_are_used_again_and_never_too_early() -> None:
 def test_a_rank_may_end_when_what_it_left_on_the_device_is_received() -> None:
     first, second = posts(2)
     first.send(np.arange(5000.0), 1)
-    assert first.settle(0.01)  # In shared memory it outlives its sender.
+    assert first.drain(0.01)  # In shared memory it outlives its sender.
     second.recv(0)
     for sender, receiver in ((first, 1), (second, 0)):
         sender.send(jnp.arange(5000.0), receiver)
     first.flush()
-    assert not first.settle(0.01)  # It has taken what came, so the other one may end.
-    assert second.settle(0.01)
-    assert first.settle(0.01)
+    assert not first.drain(0.01)  # It has taken what came, so the other one may end.
+    assert second.drain(0.01)
+    assert first.drain(0.01)
     np.testing.assert_array_equal(first.recv(1), np.arange(5000.0))  # It is not lost by that.
 
 
 def test_what_was_not_sent_for_want_of_room_is_not_waited_for(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr("gmijax.collectives.messages.mailboxes.MAX_WAITING_BYTES", 1)
+    monkeypatch.setattr("gmijax.channels.mailboxes.MAX_WAITING_BYTES", 1)
     first, second = posts(2, timeout_s=0.1)
     second._timeout_s = 30.0
     first.send(np.ones(10**6), 1)
     with pytest.raises(CollectiveTimeout, match=r"in send, step 2, for GMIs \[1\]"):
         first.send(jnp.arange(5000.0), 1)
     assert second.recv(0).size == 10**6
-    assert first.settle(30.0)
+    assert first.drain(30.0)
     first.send(jnp.arange(5000.0), 1)
-    assert not first.settle(0.01)
+    assert not first.drain(0.01)
     np.testing.assert_array_equal(second.recv(0), np.arange(5000.0))
-    assert first.settle(30.0)
+    assert first.drain(30.0)
 
 
 def test_without_shared_memory_of_a_device_all_go_through_the_host() -> None:

@@ -20,8 +20,8 @@ from gmijax.collectives.communicator import (
     MultiRankCommunicator,
     make_communicator,
 )
-from gmijax.collectives.host.host_transport import HostTransport
 from gmijax.collectives.host.shared_block import MAX_GATHER_FLOATS, create_exchange
+from gmijax.collectives.host_transport import HostTransport
 from gmijax.collectives.nodes.mesh import Mesh
 from gmijax.collectives.nodes.multi_node_group import MultiNodeGroup
 from gmijax.collectives.nodes.rendezvous import NodeAddresses, connect, listen
@@ -224,7 +224,7 @@ def test_the_stages_of_nodes_are_those_of_har_on_as_many_gpus() -> None:
         Stage("all_reduce", "nodes", ((0,), (1,), (2,)))
     ]
     assert stages("har", Layout.even(2, 1).on_nodes(2), "ipc") == [
-        Stage("all_gather", "slots", ((0,), (1,), (2,), (3,))),
+        Stage("all_gather", "ipc", ((0,), (1,), (2,), (3,))),
         Stage("all_gather", "ring", ((0, 1), (2, 3))),
         Stage("all_reduce", "nodes", ((0, 1), (2, 3))),
     ]

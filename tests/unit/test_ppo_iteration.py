@@ -15,10 +15,10 @@ from toy_env import point_mass
 
 from gmijax.cli.compose import compose
 from gmijax.collectives.communicator import SingleRankCommunicator
-from gmijax.collectives.device.device_transport import DeviceTransport
-from gmijax.collectives.host.host_transport import HostTransport
+from gmijax.collectives.device_transport import DeviceTransport
 from gmijax.collectives.host.shared_block import LANES, create_exchange
 from gmijax.collectives.host.shared_memory_group import SharedMemoryGroup
+from gmijax.collectives.host_transport import HostTransport
 from gmijax.collectives.program import LocalCollectives, StagedAllReduce
 from gmijax.collectives.strategies import stages
 from gmijax.learning.learner import (
@@ -182,7 +182,7 @@ def _all_reduce(strategy: str, num_floats: int) -> Iterator[StagedAllReduce]:
     if strategy == "one_shot":
         transport = DeviceTransport(control, host, layout, num_floats, parts, FAKES["fake"])
     all_reduce = StagedAllReduce(transport, parts, 0, 1)
-    transport.start(all_reduce)
+    transport.start(all_reduce.is_right)
     yield all_reduce
     all_reduce.close()
     host.close()

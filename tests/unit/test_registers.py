@@ -11,7 +11,7 @@ from functools import partial
 import numpy as np
 import pytest
 
-from gmijax.collectives.messages.registers import create_registers, open_registers
+from gmijax.channels.registers import create_registers, open_registers
 from gmijax.collectives.shared_memory import Fence
 
 
@@ -96,7 +96,7 @@ def test_a_reader_gives_up_on_a_writer_that_is_always_faster(fd) -> None:
 WRITER = """
 import sys
 import numpy as np
-from gmijax.collectives.messages.registers import open_registers
+from gmijax.channels.registers import open_registers
 
 register, number = open_registers(int(sys.argv[1]), [int(sys.argv[2])])[0], 0
 print("ready", flush=True)

@@ -24,7 +24,12 @@ def test_parts_of_the_block_do_not_overlap_and_begin_at_cache_lines(
     world_size: int, num_floats: int, exchange_fd: int
 ) -> None:
     first, second = (attach(exchange_fd, 0, world_size, num_floats, lane) for lane in range(LANES))
-    parts = [first.lines["beats"], second.lines["beats"], first.gathered, second.gathered]
+    parts = [
+        first.lines["heartbeats"],
+        second.lines["heartbeats"],
+        first.gathered,
+        second.gathered,
+    ]
     parts += [first.slots, first.flags]
     for number, part in enumerate(parts):
         part[...] = number

@@ -15,7 +15,7 @@ GPUS, RINGS = ((0, 1), (2, 3)), ((0, 2), (1, 3))
     ("strategy", "intra", "layout", "expected"),
     [
         ("mpr", "host", GPUS, [Stage("all_reduce", "host", ALL)]),
-        ("one_shot", "ipc", GPUS, [Stage("all_gather", "slots", ALL)]),
+        ("one_shot", "ipc", GPUS, [Stage("all_gather", "ipc", ALL)]),
         ("flat", "host", ((0,), (1,)), [Stage("all_reduce", "ring", ((0, 1),))]),
         ("mrr", "host", ((0,), (1,)), [Stage("all_reduce", "ring", ((0, 1),))]),
         (
@@ -27,12 +27,12 @@ GPUS, RINGS = ((0, 1), (2, 3)), ((0, 2), (1, 3))
             ],
         ),
         ("har", "host", ALL, [Stage("all_reduce", "host", ALL)]),
-        ("har", "ipc", ALL, [Stage("all_gather", "slots", ALL)]),
+        ("har", "ipc", ALL, [Stage("all_gather", "ipc", ALL)]),
         (
             "har",
             "ipc",
             GPUS,
-            [Stage("all_gather", "slots", GPUS), Stage("all_gather", "ring", RINGS)],
+            [Stage("all_gather", "ipc", GPUS), Stage("all_gather", "ring", RINGS)],
         ),
         (
             *("har", "host", GPUS),
@@ -45,9 +45,9 @@ GPUS, RINGS = ((0, 1), (2, 3)), ((0, 2), (1, 3))
         (
             *("har", "ipc", ((0, 1), (2,))),
             [
-                Stage("all_gather", "slots", ((0, 1), (2,))),
+                Stage("all_gather", "ipc", ((0, 1), (2,))),
                 Stage("all_reduce", "ring", ((0, 2),)),
-                Stage("broadcast", "slots", ((0, 1), (2,))),
+                Stage("broadcast", "ipc", ((0, 1), (2,))),
             ],
         ),
     ],

@@ -13,8 +13,8 @@ from typing import Any
 
 import pytest
 
-from gmijax.collectives.channel import tcp_channel
-from gmijax.collectives.channel.tcp_channel import RemoteReader, RemoteWriter
+from gmijax.channels import tcp_channel
+from gmijax.channels.tcp_channel import RemoteReader, RemoteWriter
 from gmijax.collectives.nodes.handshake import Key, call
 from gmijax.collectives.nodes.rendezvous import reserved_address
 from gmijax.errors import CollectiveError, ConfigError, PeerLost, PipeClosed
@@ -158,7 +158,7 @@ def test_what_an_agent_sent_before_its_end_arrives_though_nothing_can_be_answere
     def send(*_: Any) -> bool:
         raise BrokenPipeError
 
-    monkeypatch.setattr("gmijax.collectives.channel.tcp_connection.Outgoing.send", send)
+    monkeypatch.setattr("gmijax.channels.tcp_connection.Outgoing.send", send)
     reader = RemoteReader(address, 1, 0, CAPACITY, SECRET)
     with agent(address) as connection:
         connection.sendall(data(0) + data(1))
@@ -228,7 +228,7 @@ def test_an_agent_that_closes_before_its_trainer_listens_loses_nothing(
 def test_an_agent_does_not_wait_for_a_trainer_that_has_left(
     address: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("gmijax.collectives.channel.tcp_channel._FAREWELL_S", 60.0)
+    monkeypatch.setattr("gmijax.channels.tcp_channel._FAREWELL_S", 60.0)
     reader, writer = ends(address)
     send(writer, 1)
     assert receive(reader, 1) == [1]
@@ -242,7 +242,7 @@ def test_an_agent_does_not_wait_for_a_trainer_that_has_left(
 def test_an_agent_does_not_wait_for_ever_for_a_trainer_that_never_comes(
     address: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("gmijax.collectives.channel.tcp_channel._FAREWELL_S", 0.1)
+    monkeypatch.setattr("gmijax.channels.tcp_channel._FAREWELL_S", 0.1)
     writer = RemoteWriter(address, 0, 1, CAPACITY, SECRET)
     send(writer, 1)
     writer.close()
@@ -276,32 +276,6 @@ def test_a_message_is_missed_when_it_is_lost(address: str) -> None:
         receive(reader, 1)
     for end in (writer, reader):
         end._connection.close()
-
-
-def test_many_messages_of_many_sizes_arrive_in_order(address: str) -> None:
-    reader, writer = ends(address)
-    sizes = [0, 1, 7, 100_000, 400_000]
-    numbers = range(300)
-
-    def write() -> None:
-        for number in numbers:
-            while (views := writer.try_reserve([8, sizes[number % 5], 0, 3])) is None:
-                time.sleep(1e-4)
-            for view in views:
-                view[:] = number % 251
-            writer.commit()
-
-    thread = threading.Thread(target=write)
-    thread.start()
-    for number in numbers:
-        while (found := reader.try_get()) is None:
-            time.sleep(1e-4)
-        assert [part.size for part in found] == [8, sizes[number % 5], 0, 3]
-        assert all((part == number % 251).all() for part in found)
-    thread.join()
-    reader.release()
-    writer.close()
-    reader.close()
 
 
 def test_a_secret_that_can_be_guessed_is_refused(address: str) -> None:

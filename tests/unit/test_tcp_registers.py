@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from training_jobs import wait_until
 
-from gmijax.collectives.channel.tcp_registers import RemoteRegisters
+from gmijax.channels.registers import RemoteRegisters
 from gmijax.collectives.nodes.rendezvous import reserved_address
 from gmijax.errors import CollectiveError
 

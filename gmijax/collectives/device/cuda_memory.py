@@ -11,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from gmijax.collectives.device.cuda_queue import checked, runtime
-from gmijax.collectives.device.device_memory import TICKET_BYTES
+from gmijax.collectives.device.device_memory import IPC_HANDLE_BYTES
 from gmijax.collectives.shared_memory import round_up
 from gmijax.errors import CudaError
 
@@ -56,12 +56,12 @@ class CudaMemory:
             runtime.cudaFree(self.address)
             self.address = 0
         (handle,) = checked(result, "share GPU memory with other processes")
-        return ctypes.string_at(int(handle.getPtr()), TICKET_BYTES)
+        return ctypes.string_at(int(handle.getPtr()), IPC_HANDLE_BYTES)
 
-    def open(self, ticket: bytes) -> None:
+    def open(self, ipc_handle: bytes) -> None:
         """Maps the block that another process has made."""
         handle = runtime.cudaIpcMemHandle_t()
-        ctypes.memmove(int(handle.getPtr()), ticket, TICKET_BYTES)
+        ctypes.memmove(int(handle.getPtr()), ipc_handle, IPC_HANDLE_BYTES)
         (pointer,) = checked(
             runtime.cudaIpcOpenMemHandle(handle, runtime.cudaIpcMemLazyEnablePeerAccess),
             "map GPU memory of another process",

@@ -3,20 +3,48 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import TYPE_CHECKING, TypeAlias
+from typing import TYPE_CHECKING, Protocol, TypeAlias
+
+import numpy as np
+import numpy.typing as npt
 
 if TYPE_CHECKING:
-    from gmijax.collectives.device.cuda_memory import CudaMemory
+    import jax
 
-TICKET_BYTES = 64
+IPC_HANDLE_BYTES = 64
 """What another process needs to open a block."""
 
-NewMemory: TypeAlias = "Callable[[], CudaMemory]"
-"""How processes share a block: `cuda_memory`, or what a test puts in its place."""
+
+class DeviceMemory(Protocol):
+    """A block of memory: `CudaMemory`, or what a test puts in its place."""
+
+    @property
+    def address(self) -> int:
+        """Of its first byte on this process's device."""
+        ...
+
+    def create(self, num_bytes: int) -> bytes:
+        """Makes the block; returns what another process needs to open it."""
+        ...
+
+    def open(self, ipc_handle: bytes) -> None:
+        """Maps the block that another process has made."""
+        ...
+
+    def write(self, offset: int, values: jax.Array) -> None:
+        """Copies `values` to `offset` bytes; on return they are there for all processes."""
+        ...
+
+    def view(
+        self, offset: int, shape: tuple[int, ...], dtype: npt.DTypeLike = np.float32
+    ) -> jax.Array:
+        """The array at `offset` bytes in place: a program reads what is there when it runs."""
+        ...
+
+    def close(self) -> None:
+        """Gives the mapping back; no view may be in use."""
+        ...
 
 
-def cuda_memory() -> CudaMemory:
-    """A block on the GPU that this process sees; needs cuda-bindings, and imports jax."""
-    from gmijax.collectives.device.cuda_memory import CudaMemory
-
-    return CudaMemory()
+NewMemory: TypeAlias = Callable[[], DeviceMemory]
+"""How processes share a block."""

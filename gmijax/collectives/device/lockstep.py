@@ -29,7 +29,7 @@ class LockstepRunner:
     def step(self, program: Callable[[], T]) -> T:
         """Runs a program that queues a step of all.
 
-        From the first one until `settle` the device may be at it, and wait for a peer that is
+        From the first one until `finish` the device may be at it, and wait for a peer that is
         gone: what ends this process meanwhile, wherever it is found, ends it at once.
 
         Raises:
@@ -42,13 +42,13 @@ class LockstepRunner:
         barrier.begin("step", self._num_floats)
         barrier.wait()
         barrier.check_same_call()
-        with barrier.explained():
+        with barrier.raise_peer_failure():
             result = self._thread.run(program, barrier.watch)
         barrier.wait(is_patient=True)  # Some have given it to their devices a step before others.
         barrier.end()
         return result
 
-    def settle(self, program: Callable[[], T]) -> T:
+    def finish(self, program: Callable[[], T]) -> T:
         """Runs a program that returns when all steps are computed; raises as `step`."""
         result = self.step(program)
         self._is_running = False

@@ -5,9 +5,7 @@ from __future__ import annotations
 import importlib
 from typing import Any
 
-from gmijax.collectives.device.shared_slots import agreed
-from gmijax.collectives.host.shared_memory_group import SharedMemoryGroup
-from gmijax.collectives.nodes.multi_node_group import MultiNodeGroup
+from gmijax.collectives.all_or_none import Group, all_or_none
 from gmijax.collectives.strategies import Groups
 
 _WISH = "rings between GPUs"
@@ -44,34 +42,34 @@ class NcclRing:
         self._comm = None
 
 
-def nccl_ring(host: SharedMemoryGroup | MultiNodeGroup, groups: Groups) -> NcclRing | None:
-    """Meets the other members of this rank's group; all ranks of the job call it.
+def nccl_ring(group: Group, rings: Groups) -> NcclRing | None:
+    """Joins the ring that this rank is in, None if it is in none; all ranks of the job call it.
 
-    On several nodes rings are in each of them, and `groups` are of ranks in the node.
+    On several nodes rings are in each of them, and `rings` are of ranks in the node.
 
     Raises:
       DeviceMemoryUnavailable: NCCL is not to be had, or refuses; on all ranks alike.
     """
-    found: list[NcclRing] = []
-    rank = host.local.rank
-    group = next((group for group in groups if rank in group), ())
+    joined: list[NcclRing] = []
+    rank = group.local.rank
+    members = next((ring for ring in rings if rank in ring), ())
 
     def make_id() -> bytes:
-        if not group or group[0] != rank:
+        if not members or members[0] != rank:
             return b""
         return bytes(_nccl().get_unique_id())
 
     def join() -> bytes:
-        if group:
+        if members:
             nccl = _nccl()
-            unique = nccl.UniqueId.from_buffer(ids[group[0]][:_ID_BYTES].tobytes())
-            place = group.index(rank)
-            found.append(NcclRing(nccl, nccl.comm_init_rank(len(group), unique, place)))
+            unique = nccl.UniqueId.from_buffer(ids[members[0]][:_ID_BYTES].tobytes())
+            comm = nccl.comm_init_rank(len(members), unique, members.index(rank))
+            joined.append(NcclRing(nccl, comm))
         return b""
 
-    ids = agreed(host, _WISH, make_id)
-    agreed(host, _WISH, join)
-    return found[0] if found else None
+    ids = all_or_none(group, _WISH, make_id)
+    all_or_none(group, _WISH, join)
+    return joined[0] if joined else None
 
 
 _ID_BYTES = 128

@@ -2,7 +2,7 @@
 
 Every rank owns a counter that only goes up. A rank arrives by adding one to its counter, and
 waits until the counters of all others have come as far. A call is one or two arrivals, and
-all ranks make the same calls in the same order, so equal counters mean the same place.
+all ranks make the same calls in the same order, so equal counters mean the same call.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from gmijax.errors import CollectiveError, CudaError
 OPERATIONS = ("sum", "gather", "broadcast", "all_gather", "step")
 """What a rank can be calling; the wire format holds the position in this tuple."""
 
-COUNT_SHIFT, PLACE_SHIFT = 8, 48
+COUNT_SHIFT, CALL_INDEX_SHIFT = 8, 48
 """Bits of a call word: operation, number of floats, which of its program's exchanges it is."""
 
 SETTLE_S = 2.0
@@ -50,10 +50,10 @@ class Barrier:
         """Says that the calls so far belong to the start: the next one is the first."""
         self._first_step = self.step + 1
 
-    def begin(self, operation: str, count: int, place: int = 0) -> None:
+    def begin(self, operation: str, count: int, call_index: int = 0) -> None:
         """Opens a call of `operation` (see `OPERATIONS`) with `count` floats; `end` closes it.
 
-        `place` says which exchange of its program it is.
+        `call_index` says which exchange of its program it is.
 
         Raises:
           CollectiveError: an earlier call failed, or (first call only) ranks attached with
@@ -68,7 +68,8 @@ class Barrier:
         self.step += 1
         if self.step == 1:
             self._wait_for_all()
-        word = OPERATIONS.index(operation) | count << COUNT_SHIFT | (place & 0xFFFF) << PLACE_SHIFT
+        word = OPERATIONS.index(operation) | count << COUNT_SHIFT
+        word |= (call_index & 0xFFFF) << CALL_INDEX_SHIFT
         self._block.lines["call"][rank, self.step % 2] = word
 
     def wait(self, *, is_patient: bool = False) -> None:
@@ -104,7 +105,7 @@ class Barrier:
                 detector.give_up(self._peers)
 
     @contextmanager
-    def explained(self) -> Iterator[None]:
+    def raise_peer_failure(self) -> Iterator[None]:
         """If a step fails because a peer has ended or is silent, says so.
 
         Raises:
@@ -191,6 +192,7 @@ class Barrier:
 
 def _describe(word: int) -> str:
     operation = OPERATIONS[word & (1 << COUNT_SHIFT) - 1]
-    count = word >> COUNT_SHIFT & (1 << PLACE_SHIFT - COUNT_SHIFT) - 1
-    place = word >> PLACE_SHIFT
-    return f"{operation} of {count} floats" + (f" ({place:04x} of its program)" if place else "")
+    count = word >> COUNT_SHIFT & (1 << CALL_INDEX_SHIFT - COUNT_SHIFT) - 1
+    call_index = word >> CALL_INDEX_SHIFT
+    which = f" ({call_index:04x} of its program)" if call_index else ""
+    return f"{operation} of {count} floats{which}"

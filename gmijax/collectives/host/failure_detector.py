@@ -1,8 +1,8 @@
 """Finds which peer is dead or stuck when a rank has waited too long.
 
-A rank that waits raises its `beats` now and then. So at a timeout a peer that only waits too is
-not mistaken for one that is stuck, wherever each of them waits. A rank that gives up notes whom
-it waited for, so that its own end is not taken for the cause, also by those who wait elsewhere.
+A rank that waits raises its `heartbeats` now and then. So at a timeout a peer that only waits too
+is not mistaken for one that is stuck, wherever each of them waits. A rank that gives up notes whom
+it waited for, its `suspect`, so that its own end is not taken for the cause.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from gmijax.collectives.shared_memory import fence, process_of
 from gmijax.errors import CollectiveTimeout, PeerLost
 
 SILENCE_S = 0.7
-"""A rank without a beat for this long is not waiting: three beats are missing."""
+"""A rank without a heartbeat for this long is not waiting: three heartbeats are missing."""
 
 
 class FailureDetector:
@@ -46,7 +46,7 @@ class FailureDetector:
           PeerLost: the process of one of them is gone.
           CollectiveTimeout: the time is up.
         """
-        self._block.lines["beats"][self._block.rank] += 1
+        self._block.lines["heartbeats"][self._block.rank] += 1
         self._check_alive(missing)
         self._listen()
         left = missing()
@@ -61,7 +61,7 @@ class FailureDetector:
         A rank that has given up and is still on its way out is silent too, and not the cause.
         """
         silent = self.silent(missing) or missing
-        self._raise_timeout([peer for peer in silent if not self._block.blamed[peer]] or silent)
+        self._raise_timeout([peer for peer in silent if not self._block.suspect[peer]] or silent)
 
     def silent(self, missing: list[int]) -> list[int]:
         """Those of `missing` who do not wait themselves, as far as this rank has heard."""
@@ -74,11 +74,11 @@ class FailureDetector:
         gone = [peer for peer in missing() if peer in gone]
         if not gone:
             return
-        blamed = self._block.blamed.item
+        suspect = self._block.suspect.item
         for peer in gone:
-            if not blamed(peer):
+            if not suspect(peer):
                 self._raise_lost(peer)
-        cause = blamed(gone[0]) - 1
+        cause = suspect(gone[0]) - 1
         if cause in (self._block.rank, *gone) or self._is_gone(cause):
             self._raise_lost(gone[0] if cause == self._block.rank else cause)
         self._raise_timeout([cause])
@@ -94,17 +94,17 @@ class FailureDetector:
 
     def _listen(self) -> None:
         now_s = running_s()
-        for peer, beats in enumerate(self._block.lines["beats"].tolist()):
-            if self._heard.get(peer, (None,))[0] != beats:
-                self._heard[peer] = beats, now_s
+        for peer, heartbeats in enumerate(self._block.lines["heartbeats"].tolist()):
+            if self._heard.get(peer, (None,))[0] != heartbeats:
+                self._heard[peer] = heartbeats, now_s
 
     def _raise_lost(self, peer: int) -> NoReturn:
-        self._block.blamed[self._block.rank] = peer + 1
+        self._block.suspect[self._block.rank] = peer + 1
         own, other = (self._block.ids[rank] for rank in (self._block.rank, peer))
         raise PeerLost(own, other, self._operation, self._step)
 
     def _raise_timeout(self, missing: list[int]) -> NoReturn:
-        self._block.blamed[self._block.rank] = missing[0] + 1
+        self._block.suspect[self._block.rank] = missing[0] + 1
         waited_s = min(round(self._waited_s(), 2), self._timeout_s)
         own, *others = (self._block.ids[rank] for rank in (self._block.rank, *missing))
         raise CollectiveTimeout(own, tuple(others), self._operation, self._step, waited_s)

@@ -43,8 +43,8 @@ LINE = np.dtype(
         ("num_floats", np.uint64),
         ("call", np.uint64, (2,)),  # what the rank is calling, by parity of the step
         ("sequence", np.uint64),  # 0: not attached; 1: attached; then one up per arrival
-        ("beats", np.uint64),  # goes up while the rank waits for others
-        ("blamed", np.uint64),  # of the first lane alone, see `SharedBlock`
+        ("heartbeats", np.uint64),  # goes up while the rank waits for others
+        ("suspect", np.uint64),  # of the first lane alone, see `SharedBlock`
     ]
 )
 """What one rank tells the others; exactly one cache line, so that ranks do not share any."""
@@ -56,19 +56,19 @@ class SharedBlock(NamedTuple):
     Attributes:
       rank: whose view this is.
       lines: [K] of `LINE`, of one lane.
-      blamed: [K] uint64, 1 + the rank for which each has given up, in any lane; 0: it has not.
+      suspect: [K] uint64, 1 + the rank for which each has given up, in any lane; 0: it has not.
       gathered: [2, K, MAX_GATHER_FLOATS] float32, of the same.
       slots: [2, K, P] float32, used in turn.
       flags: [whole pages, FLOATS_PER_LINE] uint32, of which [rank, 0] counts how often the device
         of a rank has written its slots; 1 says that the rank is through with slots in device
-        memory, and 2 to 3 which exchanges it has come to (`device_transport.Order`).
+        memory, and 2 to 3 which exchanges it has come to (`device_transport.DesyncDetector`).
       ids: of the ranks' GMIs in the job, for what is said of lost peers: not all GMIs need have a
         rank, and with several nodes each has a block.
     """
 
     rank: int
     lines: npt.NDArray[np.void]
-    blamed: npt.NDArray[np.uint64]
+    suspect: npt.NDArray[np.uint64]
     gathered: npt.NDArray[np.float32]
     slots: npt.NDArray[np.float32]
     flags: npt.NDArray[np.uint32]
@@ -118,7 +118,7 @@ def attach(
     return SharedBlock(
         rank=rank,
         lines=lines,
-        blamed=lines_of[0]["blamed"],
+        suspect=lines_of[0]["suspect"],
         gathered=gathered.reshape(LANES, 2, world_size, MAX_GATHER_FLOATS)[lane],
         slots=slots.reshape(2, world_size, row_floats)[:, :, :num_floats],
         flags=np.frombuffer(mapping, np.uint32, -1, flags_at).reshape(-1, FLOATS_PER_LINE),

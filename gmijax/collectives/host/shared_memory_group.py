@@ -68,15 +68,15 @@ class SharedMemoryGroup:
         self.barrier = Barrier(block, timeout_s, rendezvous_timeout_s)
 
     def all_reduce(
-        self, source: FloatBuffer, target: FloatBuffer, groups: Groups, place: int = 0
+        self, source: FloatBuffer, target: FloatBuffer, groups: Groups, call_index: int = 0
     ) -> None:
         """Writes the sum over the rank's group of `source` [n] into `target` [n], n <= P.
 
         Every member sums a part of it in the order of the group, so each number is computed once.
-        For a rank in no group the target gets the source, which may be the target. For `place`
-        see `Barrier.begin`.
+        For a rank in no group the target gets the source, which may be the target. For
+        `call_index` see `Barrier.begin`.
         """
-        slots, group = self._shared("sum", source, groups, place)
+        slots, group = self._shared("sum", source, groups, call_index)
         if group:
             part = chunk(source.size, group.index(self.rank), len(group))
             # In place: nobody else reads this part of the first member's slot.
@@ -86,18 +86,18 @@ class SharedMemoryGroup:
         self.barrier.end()
 
     def broadcast(
-        self, source: FloatBuffer, target: FloatBuffer, groups: Groups, place: int = 0
+        self, source: FloatBuffer, target: FloatBuffer, groups: Groups, call_index: int = 0
     ) -> None:
         """Writes what the first of the rank's group has as `source` [n] into `target` [n]."""
-        slots, group = self._shared("broadcast", source, groups, place)
+        slots, group = self._shared("broadcast", source, groups, call_index)
         target[:] = slots[group[0] if group else self.rank]
         self.barrier.end()
 
     def all_gather_into(
-        self, source: FloatBuffer, target: FloatBuffer, groups: Groups, place: int = 0
+        self, source: FloatBuffer, target: FloatBuffer, groups: Groups, call_index: int = 0
     ) -> None:
         """Writes what all of the rank's group have as `source` [n] into `target` [m, n]."""
-        slots, group = self._shared("gather", source, groups, place)
+        slots, group = self._shared("gather", source, groups, call_index)
         for row, member in zip(target, group or (self.rank,), strict=False):
             row[:] = slots[member]
         self.barrier.end()
@@ -149,9 +149,9 @@ class SharedMemoryGroup:
         """Whether an attached peer has closed its exchange, or its process has ended."""
         return not process_of(self._open_block("is_gone").lines[peer]).is_running()
 
-    def beat(self) -> None:
+    def heartbeat(self) -> None:
         """Tells the others that this rank waits, for somebody who is not in this block."""
-        self._open_block("beat").lines["beats"][self.rank] += 1
+        self._open_block("heartbeat").lines["heartbeats"][self.rank] += 1
 
     def close(self) -> None:
         """Gives the memory back. Idempotent."""
@@ -160,11 +160,11 @@ class SharedMemoryGroup:
             self._block = None
 
     def _shared(
-        self, operation: str, source: FloatBuffer, groups: Groups, place: int
+        self, operation: str, source: FloatBuffer, groups: Groups, call_index: int
     ) -> tuple[FloatBuffer, Sequence[int]]:
         """Opens a call; what all ranks have as `source` [K, n], and the members of the group."""
         block = self._open_block(operation)
-        self.barrier.begin(operation, source.size, place)
+        self.barrier.begin(operation, source.size, call_index)
         slots = block.slots[self.barrier.step % 2, :, : source.size]
         slots[self.rank] = source
         self._meet()
@@ -180,14 +180,14 @@ class SharedMemoryGroup:
         return self._block
 
 
-def chunk(num_floats: int, place: int, num_places: int) -> slice:
-    """The part of a buffer [P] that the member at `place` reduces.
+def chunk(num_floats: int, index: int, num_members: int) -> slice:
+    """The part of a buffer [P] that the member at `index` reduces.
 
     The chunks of all members are disjoint, in order, and cover the buffer. They begin at whole
     cache lines, so that no two ranks write to one line; trailing chunks may be empty.
     """
     num_lines = -(-num_floats // FLOATS_PER_LINE)
-    low, high = (num_lines * p // num_places * FLOATS_PER_LINE for p in (place, place + 1))
+    low, high = (num_lines * p // num_members * FLOATS_PER_LINE for p in (index, index + 1))
     return slice(min(low, num_floats), min(high, num_floats))
 
 

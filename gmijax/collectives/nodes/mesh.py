@@ -66,19 +66,19 @@ class Mesh:
         self._swap("all_gather", values.size, lambda _: values, lambda node: rows[node])
         return rows
 
-    def all_reduce(self, values: FloatBuffer, place: int) -> FloatBuffer:
+    def all_reduce(self, values: FloatBuffer, call_index: int) -> FloatBuffer:
         """Returns the sum over nodes, in their order, of `values` [n]; the same bits on all.
 
         Args:
           values: of this node.
-          place: which exchange of its program this is.
+          call_index: which exchange of its program this is.
         """
         num_nodes = len(self._ids)
         parts = [chunk(values.size, node, num_nodes) for node in range(num_nodes)]
         own = parts[self._node]
         rows = np.empty((num_nodes, own.stop - own.start), np.float32)
         rows[self._node] = values[own]
-        word = values.size << 16 | (place & 0xFFFF)
+        word = values.size << 16 | (call_index & 0xFFFF)
         self._swap("sum", word, lambda node: values[parts[node]], lambda node: rows[node])
         total = np.empty_like(values)
         # Overflow and NaN are for the caller to judge, not worth a warning here.

@@ -35,30 +35,30 @@ class MultiNodeGroup:
         self._here = layout.gmis_of_node[layout.node_of(rank)]
 
     def all_reduce(
-        self, source: FloatBuffer, target: FloatBuffer, groups: Groups, place: int = 0
+        self, source: FloatBuffer, target: FloatBuffer, groups: Groups, call_index: int = 0
     ) -> None:
         """See `SharedMemoryGroup`."""
-        self.local.all_reduce(source, target, self.of_node(groups), place)
+        self.local.all_reduce(source, target, self.of_node(groups), call_index)
 
     def broadcast(
-        self, source: FloatBuffer, target: FloatBuffer, groups: Groups, place: int = 0
+        self, source: FloatBuffer, target: FloatBuffer, groups: Groups, call_index: int = 0
     ) -> None:
         """See `SharedMemoryGroup`."""
-        self.local.broadcast(source, target, self.of_node(groups), place)
+        self.local.broadcast(source, target, self.of_node(groups), call_index)
 
     def all_gather_into(
-        self, source: FloatBuffer, target: FloatBuffer, groups: Groups, place: int = 0
+        self, source: FloatBuffer, target: FloatBuffer, groups: Groups, call_index: int = 0
     ) -> None:
         """See `SharedMemoryGroup`."""
-        self.local.all_gather_into(source, target, self.of_node(groups), place)
+        self.local.all_gather_into(source, target, self.of_node(groups), call_index)
 
     def all_reduce_nodes(
-        self, source: FloatBuffer, target: FloatBuffer, groups: Groups, place: int
+        self, source: FloatBuffer, target: FloatBuffer, groups: Groups, call_index: int
     ) -> None:
         """Writes the sum over nodes into `target` [n], of what their leaders have as `source`."""
-        total = source if self._mesh is None else self._mesh.all_reduce(source, place)
+        total = source if self._mesh is None else self._mesh.all_reduce(source, call_index)
         if self.local.world_size > 1:
-            self.broadcast(total, target, groups, place)
+            self.broadcast(total, target, groups, call_index)
         else:
             target[:] = total
 

@@ -145,8 +145,8 @@ class PipeBlock:
             self._mapping = None  # Unmapped with the last array on it.
 
     def _offset(self, src: int, dst: int) -> int:
-        place = src * self.world_size + dst
-        return _lines_end(self.world_size) + place * (self.capacity_bytes + mmap.PAGESIZE)
+        index = src * self.world_size + dst
+        return _lines_end(self.world_size) + index * (self.capacity_bytes + mmap.PAGESIZE)
 
 
 def _lines_end(world_size: int) -> int:

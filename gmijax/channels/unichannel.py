@@ -12,12 +12,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from gmijax.collectives.channel.compressor import Transfer
-from gmijax.collectives.channel.dispenser import Piece
-from gmijax.collectives.channel.migrator import Migrator
-from gmijax.collectives.channel.spec import Array, Spec
-from gmijax.collectives.channel.transport import ChannelWriter
-from gmijax.collectives.messages.pipe import Message
+from gmijax.channels.experience import Array, Rollouts, Spec
+from gmijax.channels.migrator import ChannelWriter, Migrator
+from gmijax.channels.pipe import Message
 
 
 class UniPacker:
@@ -28,7 +25,7 @@ class UniPacker:
         self._writer: ChannelWriter | None = None
         self._todo: list[tuple[int, int]] = []
 
-    def try_add(self, piece: Piece) -> bool:
+    def try_add(self, piece: Rollouts) -> bool:
         """Sends what there is room for; False: call it again with the same piece."""
         if not self._todo:
             self._writer = None
@@ -42,8 +39,8 @@ class UniPacker:
     def flush(self) -> None:
         """Nothing is ever held back."""
 
-    def _try_send(self, piece: Piece, step: int, place: int) -> bool:
-        channel = piece.spec.channels[place]
+    def _try_send(self, piece: Rollouts, step: int, index: int) -> bool:
+        channel = piece.spec.channels[index]
         head = piece.spec.encode()
         sizes = [head.size, 40, channel.num_bytes(piece.num_envs) // channel.steps]
         if self._writer is None:  # All of a rollout go to one trainer.
@@ -56,9 +53,9 @@ class UniPacker:
         self._writer, views = opened
         views[0][:] = head
         is_last = len(self._todo) == 1
-        views[1].view(np.int64)[:] = step, place, piece.num_envs, piece.version, is_last
+        views[1].view(np.int64)[:] = step, index, piece.num_envs, piece.versions[0], is_last
         into = views[2].view(channel.dtype).reshape(piece.num_envs, *channel.shape)
-        into[...] = piece.channels[channel.name][step]
+        into[...] = piece.experience[channel.name][step]
         self._writer.commit()
         return True
 
@@ -70,32 +67,32 @@ class UniDecoder:
         self._arrays: dict[str, Array] = {}
         self._shape: tuple[Spec, int] | None = None
 
-    def __call__(self, message: Message) -> Transfer | None:
+    def __call__(self, message: Message, agent: int) -> Rollouts | None:
         """The rollout of which `message` is the last tensor; None before."""
         head, table, tensor = message
         spec = Spec.decode(head)
-        step, place, num_envs, version, is_last = table.view(np.int64).tolist()
+        step, index, num_envs, version, is_last = table.view(np.int64).tolist()
         if self._shape != (spec, num_envs):
             self._shape = spec, num_envs
             self._arrays = {
                 c.name: np.empty(c.full_shape(num_envs), c.dtype) for c in spec.channels
             }
-        channel = spec.channels[place]
+        channel = spec.channels[index]
         values = tensor.view(channel.dtype).reshape(num_envs, *channel.shape)
         self._arrays[channel.name][step] = values
         if not is_last:
             return None
-        versions = np.full(num_envs, version, np.int64)
-        return Transfer(spec, num_envs, versions, self._arrays)
+        versions, agents = (np.full(num_envs, one, np.int64) for one in (version, agent))
+        return Rollouts(spec, self._arrays, versions, agents)
 
 
 def _tensors(spec: Spec) -> list[tuple[int, int]]:
-    """(step, place of the channel) of all tensors of a rollout; the last one is sent first."""
+    """(step, index of the channel) of all tensors of a rollout; the last one is sent first."""
     longest = max(channel.steps for channel in spec.channels)
     order = [
-        (step - longest + channel.steps, place)
+        (step - longest + channel.steps, index)
         for step in range(longest)
-        for place, channel in enumerate(spec.channels)
+        for index, channel in enumerate(spec.channels)
         if step >= longest - channel.steps
     ]
     return order[::-1]

@@ -5,7 +5,7 @@ from __future__ import annotations
 import ctypes
 import time
 from collections.abc import Callable
-from typing import TYPE_CHECKING, TypeVar
+from typing import TypeVar
 
 import jax
 import numpy as np
@@ -15,9 +15,6 @@ from gmijax.collectives.interface import FloatBuffer
 from gmijax.collectives.nodes.multi_node_group import MultiNodeGroup
 from gmijax.collectives.strategies import Stage
 from gmijax.errors import GmijaxError
-
-if TYPE_CHECKING:
-    from gmijax.collectives.program import StagedAllReduce
 
 T = TypeVar("T")
 
@@ -30,32 +27,35 @@ class HostTransport:
 
     Args:
       host: this rank's use of the shared block, and of the connections between nodes.
-      num_floats: P, length of the largest buffer; the attribute `room`.
+      num_floats: P, length of the largest buffer; the attribute `capacity`.
     """
 
     def __init__(self, host: SharedMemoryGroup | MultiNodeGroup, num_floats: int) -> None:
-        self.room = num_floats
+        self.capacity = num_floats
         self._host = host
         self._failure: GmijaxError | None = None
         self._exchange_s = 0.0
         self._pinned: dict[str, FloatBuffer] = {}  # On a GPU: what exchanges go through.
 
-    def start(self, trial: StagedAllReduce) -> None:
-        """Tries the transport by exchanges in the node, together with all other ranks.
+    def start(self, trial: Callable[[], bool]) -> None:
+        """Makes sure that it works, together with all other ranks.
+
+        Args:
+          trial: collectives in the node; whether their results are right.
 
         Raises:
           DeviceMemoryUnavailable: they do not work; on all ranks alike.
         """
 
     def reduce(
-        self, stage: Stage, stream: int, place: int, source: int, target: int, num_floats: int
+        self, stage: Stage, stream: int, call_index: int, source: int, target: int, num_floats: int
     ) -> None:
         """`target` becomes what the stage makes of `source`.
 
         Args:
           stage: of the strategy.
           stream: of the device, 0 on a CPU.
-          place: which exchange of its program it is.
+          call_index: which exchange of its program it is.
           source: address on the device of [n] float32.
           target: address of the result, [n], or [m, n] if the stage gathers.
           num_floats: n.
@@ -73,11 +73,11 @@ class HostTransport:
                     fetch(stream, source, values)
                 else:  # Who meets the others has computed, as with numbers to give.
                     synchronize(stream)
-                self._reduce(stage, place, values, result)
+                self._reduce(stage, call_index, values, result)
                 store(stream, target, result)
             else:
                 values, result = _at(source, num_floats), _at(target, rows * num_floats)
-                self._reduce(stage, place, values, result)
+                self._reduce(stage, call_index, values, result)
         except GmijaxError as error:
             self._failure = error
             raise
@@ -117,17 +117,19 @@ class HostTransport:
             self._pinned[use] = pinned(num_floats)
         return self._pinned[use][:num_floats]
 
-    def _reduce(self, stage: Stage, place: int, values: FloatBuffer, result: FloatBuffer) -> None:
+    def _reduce(
+        self, stage: Stage, call_index: int, values: FloatBuffer, result: FloatBuffer
+    ) -> None:
         if stage.transport == "nodes":
             assert isinstance(self._host, MultiNodeGroup)
-            self._host.all_reduce_nodes(values, result, stage.groups, place)
+            self._host.all_reduce_nodes(values, result, stage.groups, call_index)
         elif stage.kind == "all_gather":
             rows = result.reshape(-1, values.size)
-            self._host.all_gather_into(values, rows, stage.groups, place)
+            self._host.all_gather_into(values, rows, stage.groups, call_index)
         elif stage.kind == "all_reduce":
-            self._host.all_reduce(values, result, stage.groups, place)
+            self._host.all_reduce(values, result, stage.groups, call_index)
         else:
-            self._host.broadcast(values, result, stage.groups, place)
+            self._host.broadcast(values, result, stage.groups, call_index)
 
 
 def _at(address: int, num_floats: int) -> FloatBuffer:

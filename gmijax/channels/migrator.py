@@ -8,12 +8,15 @@ from __future__ import annotations
 
 import time
 from collections.abc import Sequence
-from typing import Generic, TypeVar
+from typing import Generic, TypeAlias, TypeVar
 
-from gmijax.collectives.channel.transport import ChannelWriter
-from gmijax.collectives.messages.pipe import Bytes
+from gmijax.channels.pipe import Bytes, PipeWriter
+from gmijax.channels.tcp_channel import RemoteWriter
 from gmijax.collectives.waits import LIVENESS_PERIOD_S
 from gmijax.errors import GmijaxError, PeerLost, PipeClosed
+
+ChannelWriter: TypeAlias = PipeWriter | RemoteWriter
+"""The way from this agent to trainer `peer`: in shared memory, or over TCP."""
 
 W = TypeVar("W", bound=ChannelWriter)
 

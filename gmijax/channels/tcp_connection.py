@@ -19,9 +19,9 @@ from contextlib import closing, suppress
 from itertools import islice
 from typing import Any, Final
 
+from gmijax.channels.pipe_format import Bytes
+from gmijax.channels.tcp_messages import Outgoing, messages
 from gmijax.clock import running_s
-from gmijax.collectives.channel.tcp_messages import Outgoing, messages
-from gmijax.collectives.messages.pipe_format import Bytes
 from gmijax.collectives.nodes.handshake import Key, accepted, call
 from gmijax.errors import CollectiveError, ConfigError
 

@@ -1,4 +1,4 @@
-"""Runs the stages of a reduction on a GPU's stream: by shared slots, NCCL rings or the host.
+"""Runs the stages of a reduction on a GPU's stream: by shared GPU memory, NCCL rings or the host.
 
 Slots and rings do not stop the host: copies, a flag for the others, waits for their flags and a
 copy of what they wrote are queued on the program's stream, between its other work.
@@ -11,19 +11,15 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, NamedTuple, TypeVar
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 import numpy.typing as npt
 
+from gmijax.collectives.all_or_none import Group, all_or_none
 from gmijax.collectives.device.device_memory import NewMemory
+from gmijax.collectives.device.ipc_buffers import IpcBuffers
 from gmijax.collectives.device.lockstep import LockstepRunner
 from gmijax.collectives.device.nccl_ring import NcclRing
-from gmijax.collectives.device.shared_slots import SharedSlots, agreed
-from gmijax.collectives.host.host_transport import HostTransport
-from gmijax.collectives.host.shared_memory_group import SharedMemoryGroup
-from gmijax.collectives.nodes.multi_node_group import MultiNodeGroup
-from gmijax.collectives.program import StagedAllReduce, TracedCollectives
+from gmijax.collectives.host_transport import HostTransport
 from gmijax.collectives.shared_memory import Fence
 from gmijax.collectives.strategies import Groups, Stage
 from gmijax.partition.layout import Layout
@@ -38,8 +34,8 @@ _FREE = 2**30
 _WISH = "exchange on the device's stream"
 
 
-class Order:
-    """Whether ranks come to the same exchanges in the same order; without waiting.
+class DesyncDetector:
+    """Detects ranks that call different collectives, or in another order, without waiting.
 
     Flags only count. Each rank keeps a word beside its own: how many exchanges it has come to,
     and a checksum of which ones these were, in their order. It looks at the words of those that
@@ -57,10 +53,10 @@ class Order:
         self._count = self._checksum = 0
         self._words[rank] = 0
 
-    def come_to(self, place: int, num_floats: int) -> int | None:
+    def record(self, call_index: int, num_floats: int) -> int | None:
         """Comes to the next exchange; a rank that has come to another one instead, if any."""
         self._count += 1
-        which = place.to_bytes(8, "little") + num_floats.to_bytes(8, "little")
+        which = call_index.to_bytes(8, "little") + num_floats.to_bytes(8, "little")
         self._checksum = zlib.crc32(which, self._checksum)
         own = (self._count & 0xFFFFFFFF) << 32 | self._checksum
         self._words[self._rank] = own
@@ -84,7 +80,7 @@ class Device(NamedTuple):
 
     new_memory: NewMemory
     new_queue: Callable[[npt.NDArray[np.uint32]], CudaQueue]
-    new_ring: Callable[[SharedMemoryGroup | MultiNodeGroup, Groups], NcclRing | None] | None
+    new_ring: Callable[[Group, Groups], NcclRing | None] | None
 
 
 class DeviceTransport(HostTransport):
@@ -108,8 +104,8 @@ class DeviceTransport(HostTransport):
 
     def __init__(
         self,
-        control: SharedMemoryGroup | MultiNodeGroup,
-        host: SharedMemoryGroup | MultiNodeGroup,
+        control: Group,
+        host: Group,
         layout: Layout,
         num_floats: int,
         stages: Sequence[Stage],
@@ -120,12 +116,12 @@ class DeviceTransport(HostTransport):
         self._device = device
         self._runner = LockstepRunner(self._here, num_floats)
         self._queue: CudaQueue | None = None
-        self._order: Order | None = None
-        self._slots: SharedSlots | None = None
+        self._desync: DesyncDetector | None = None
+        self._ipc: IpcBuffers | None = None
         self._rings: dict[Groups, NcclRing | None] = {}
         try:
-            if any(stage.transport == "slots" for stage in stages):
-                self._slots = self._new_slots(layout, stages, device.new_memory)
+            if any(stage.transport == "ipc" for stage in stages):
+                self._ipc = self._new_ipc(layout, stages, device.new_memory)
             if (new_ring := device.new_ring) is not None:
                 rings = {stage.groups for stage in stages if stage.transport == "ring"}
                 self._rings = {
@@ -135,51 +131,51 @@ class DeviceTransport(HostTransport):
             self.close()
             raise
 
-    def _new_slots(
+    def _new_ipc(
         self, layout: Layout, stages: Sequence[Stage], new_memory: NewMemory
-    ) -> SharedSlots:
+    ) -> IpcBuffers:
         rank, layout = self._here.rank, layout.of_node(0)
-        groups = next(stage.groups for stage in stages if stage.transport == "slots")
+        groups = next(stage.groups for stage in stages if stage.transport == "ipc")
         group = next(group for group in self._control.of_node(groups) if rank in group)
         owners = group[:1]
         if len(group) == layout.num_gmis:
             # On every GPU: the own first, then the following ones, so that not all write to one.
             first, near = leaders(layout), layout.gpu_of(rank)
             owners = first[near:] + first[:near]
-        return SharedSlots(self._control, self.room, group, owners, new_memory, _WISH)
+        return IpcBuffers(self._control, self.capacity, group, owners, new_memory, _WISH)
 
-    def start(self, trial: StagedAllReduce) -> None:
+    def start(self, trial: Callable[[], bool]) -> None:
         """See `HostTransport`."""
-        agreed(self._control, _WISH, self._open)
-        failure = self._runner.settle(lambda: self._try(trial))
-        agreed(self._control, _WISH, lambda: _raise(failure))
+        all_or_none(self._control, _WISH, self._open)
+        failure = self._runner.finish(lambda: self._try(trial))
+        all_or_none(self._control, _WISH, lambda: _raise(failure))
         self.exchange_s()  # Not a part of the first step.
 
     def reduce(
-        self, stage: Stage, stream: int, place: int, source: int, target: int, num_floats: int
+        self, stage: Stage, stream: int, call_index: int, source: int, target: int, num_floats: int
     ) -> None:
         """See `HostTransport`."""
         most = max(len(group) for group in stage.groups)
-        if stage.transport == "slots" and self._slots is not None:
-            with self._exchanging(stream, place, num_floats) as queue:
+        if stage.transport == "ipc" and self._ipc is not None:
+            with self._exchanging(stream, call_index, num_floats) as queue:
                 if stage.kind == "all_gather":
-                    self._slots.all_gather(queue, stream, source, target, num_floats, rows=most)
+                    self._ipc.all_gather(queue, stream, source, target, num_floats, rows=most)
                 else:
                     assert stage.kind == "broadcast"  # Slots add nothing up.
-                    self._slots.broadcast(queue, stream, source, target, num_floats)
+                    self._ipc.broadcast(queue, stream, source, target, num_floats)
         elif stage.transport == "ring" and stage.groups in self._rings:
-            with self._exchanging(stream, place, num_floats) as queue:
+            with self._exchanging(stream, call_index, num_floats) as queue:
                 ring = self._rings[stage.groups]
                 if ring is None:
                     queue.copy(stream, target, source, 4 * num_floats)
                 else:
                     getattr(ring, stage.kind)(stream, source, target, num_floats)
         else:
-            super().reduce(stage, stream, place, source, target, num_floats)
+            super().reduce(stage, stream, call_index, source, target, num_floats)
 
     def run(self, program: Callable[[], T], *, is_last: bool) -> T:
         """See `HostTransport`."""
-        run = self._runner.settle if is_last else self._runner.step
+        run = self._runner.finish if is_last else self._runner.step
         return run(lambda: self._explained(program))
 
     def exchange_s(self) -> float:
@@ -192,22 +188,22 @@ class DeviceTransport(HostTransport):
         if self._runner.is_caught:
             return
         self._runner.close()
-        for held in (self._queue, *self._rings.values(), self._slots):
+        for held in (self._queue, *self._rings.values(), self._ipc):
             if held is not None:
                 held.close()
-        self._queue, self._order, self._slots, self._rings = None, None, None, {}
+        self._queue, self._desync, self._ipc, self._rings = None, None, None, {}
         super().close()
 
     @contextmanager
-    def _exchanging(self, stream: int, place: int, num_floats: int) -> Iterator[CudaQueue]:
+    def _exchanging(self, stream: int, call_index: int, num_floats: int) -> Iterator[CudaQueue]:
         """Counts the time, and makes sure that other ranks come to the same exchange."""
-        if self._queue is None or self._order is None:
+        if self._queue is None or self._desync is None:
             raise RuntimeError("the exchange is closed")
-        if (peer := self._order.come_to(place, num_floats)) is not None:
+        if (peer := self._desync.record(call_index, num_floats)) is not None:
             gmi, other = (self._here.ids[rank] for rank in (self._here.rank, peer))
             raise RuntimeError(
                 f"GMI {gmi} and GMI {other} have come to their exchanges in different orders; "
-                f"here it is number {place} of its program, with {num_floats} floats"
+                f"here it is number {call_index} of its program, with {num_floats} floats"
             )
         self._queue.start_clock(stream)
         yield self._queue
@@ -216,26 +212,17 @@ class DeviceTransport(HostTransport):
     def _open(self) -> bytes:
         here = self._here
         self._queue = self._device.new_queue(here.flags)
-        self._order = Order(here.flags, here.rank, here.world_size)
+        self._desync = DesyncDetector(here.flags, here.rank, here.world_size)
         return b""
 
-    def _try(self, all_reduce: StagedAllReduce) -> Exception | None:
-        """First exchanges of known numbers in this node; what went wrong with them."""
-        rank, world_size = self._here.rank, self._here.world_size
-
-        def trial(values: jax.Array) -> tuple[jax.Array, jax.Array]:
-            collectives = TracedCollectives(all_reduce, jnp.asarray(rank))
-            gathered = collectives.all_gather(values[:1])[:, 0]
-            return gathered, collectives.mean(values, after=gathered)
-
+    def _try(self, trial: Callable[[], bool]) -> Exception | None:
+        """Runs the trial; what went wrong with it."""
+        flags = self._here.flags
         try:
-            gathered, mean = jax.jit(trial)(jnp.full(self.room, rank + 1, jnp.float32))
-            is_right = np.array_equal(gathered, np.arange(1, world_size + 1))
-            is_right &= np.allclose(mean, (world_size + 1) / 2, rtol=1e-5)
-            if not is_right and not (self._here.flags[:, 0] == _FREE).any():
+            if not trial() and not (flags[:, 0] == _FREE).any():
                 raise RuntimeError("shared GPU memory does not hold what was written into it")
         except Exception as error:  # Whatever it is, the host can take part instead.
-            self._here.flags[rank, 0] = _FREE  # The others' devices wait for it.
+            flags[self._here.rank, 0] = _FREE  # The others' devices wait for it.
             return error
         return None
 

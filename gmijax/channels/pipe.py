@@ -25,8 +25,8 @@ from typing import Any, TypeAlias
 
 import numpy.typing as npt
 
-from gmijax.collectives.messages.pipe_block import PipeBlock
-from gmijax.collectives.messages.pipe_format import (
+from gmijax.channels.pipe_block import PipeBlock
+from gmijax.channels.pipe_format import (
     ALIGNMENT,
     GAP,
     Bytes,

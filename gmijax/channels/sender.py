@@ -1,19 +1,21 @@
-"""An agent's end of the channels, with back-pressure: without room it waits."""
+"""An agent's end of the channels: the dispenser, and back-pressure, which waits for room."""
 
 from __future__ import annotations
 
 import contextlib
 import time
 from collections import deque
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Any, Protocol
 
+import numpy as np
+
+from gmijax.channels.experience import VERSION_BYTES, Experience, Rollouts, Spec, spec_of
+from gmijax.channels.migrator import Migrator
 from gmijax.clock import running_s
-from gmijax.collectives.channel.dispenser import Dispenser, Piece
-from gmijax.collectives.channel.migrator import Migrator
-from gmijax.collectives.channel.spec import Experience
 from gmijax.collectives.waits import wait_until
-from gmijax.errors import GmijaxError
+from gmijax.errors import ConfigError, GmijaxError
 
 CLOSE_TIMEOUT_S = 5.0
 """How long an agent that closes waits for room for what it has not sent yet."""
@@ -22,12 +24,57 @@ CLOSE_TIMEOUT_S = 5.0
 class Packer(Protocol):
     """What makes messages of pieces: a `Compressor`, a `UniPacker` or a `ResidentPacker`."""
 
-    def try_add(self, piece: Piece) -> bool:
+    def try_add(self, piece: Rollouts) -> bool:
         """Takes `piece`, or says that there is no room; then the same piece must come again."""
         ...
 
     def flush(self) -> None:
         """Hands over what waits for more to come."""
+
+
+class Dispenser:
+    """Categorises what an agent sends: pieces with one array a channel (DP, section 4.2).
+
+    Args:
+      rank: of the agent.
+      max_piece_bytes: largest piece; a rollout beyond it is cut between environments. None: it
+        stays whole, and its arrays where they are, on the host or the device.
+    """
+
+    def __init__(self, rank: int, max_piece_bytes: int | None) -> None:
+        self._rank = rank
+        self._max_piece_bytes = max_piece_bytes
+        self._spec: Spec | None = None
+
+    def split(self, experience: Experience | Any, version: int) -> list[Rollouts]:
+        """The pieces of one rollout (a mapping or a NamedTuple), in order of environment.
+
+        Raises:
+          ConfigError: not such arrays, others than the first time, or too large ones.
+        """
+        by_channel = experience if isinstance(experience, Mapping) else experience._asdict()
+        channels = dict(by_channel)
+        if self._max_piece_bytes is not None:
+            channels = {name: np.asarray(values) for name, values in by_channel.items()}
+        spec, num_envs = spec_of(channels)
+        if self._spec is None:
+            self._spec = spec
+        if spec != self._spec:
+            raise ConfigError(f"experience: got {spec}, the first was {self._spec}")
+        versions = np.full(num_envs, version, np.int64)
+        whole = Rollouts(spec, channels, versions, np.full(num_envs, self._rank, np.int64))
+        if self._max_piece_bytes is None:
+            return [whole]
+        one, most = sum(spec.sizes(1)), self._max_piece_bytes
+        if one > most:
+            raise ConfigError(
+                f"experience: {one} bytes for one environment, at most {most}; "
+                "channel.capacity_mib must be larger, or the unroll shorter"
+            )
+        pieces = -(-num_envs // max(1, most // (one + VERSION_BYTES)))
+        step = -(-num_envs // pieces)  # As equal as can be.
+        starts = range(0, num_envs, step)
+        return [whole.part(low, min(low + step, num_envs)) for low in starts]
 
 
 @dataclass
@@ -49,7 +96,7 @@ class Sender:
     def __post_init__(self) -> None:
         self.num_bytes = 0
         self.waited_s = 0.0
-        self._waiting: deque[Piece] = deque()
+        self._waiting: deque[Rollouts] = deque()
         self._is_open = True
 
     def send(self, experience: Experience, version: int, timeout_s: float) -> bool:
@@ -123,7 +170,7 @@ class Sender:
             self.waited_s += time.monotonic() - started_s
         return took is not None
 
-    def _try_add(self, piece: Piece) -> bool:
+    def _try_add(self, piece: Rollouts) -> bool:
         is_taken = self.packer.try_add(piece)
-        self.num_bytes += is_taken * sum(piece.spec.sizes(piece.num_envs))
+        self.num_bytes += is_taken * piece.num_bytes
         return is_taken

@@ -3,26 +3,22 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from contextlib import suppress
 from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
 
-from gmijax.collectives.device.device_memory import TICKET_BYTES, NewMemory
+from gmijax.collectives.all_or_none import Group, all_or_none
+from gmijax.collectives.device.device_memory import IPC_HANDLE_BYTES, DeviceMemory, NewMemory
 from gmijax.collectives.host.shared_memory_group import SharedMemoryGroup
-from gmijax.collectives.nodes.multi_node_group import MultiNodeGroup
 from gmijax.collectives.shared_memory import fence
 from gmijax.collectives.waits import wait_until
-from gmijax.errors import DeviceMemoryUnavailable, PeerLost
+from gmijax.errors import PeerLost
 
 if TYPE_CHECKING:
-    from gmijax.collectives.device.cuda_memory import CudaMemory
     from gmijax.collectives.device.cuda_queue import CudaQueue
-
-NOTE_BYTES = 240
-"""What a rank tells the others at each step of the start: a ticket, or why it failed."""
 
 CLOSE_S = 10.0
 """How long an owner waits for others that still use its memory; longer than a last step takes."""
@@ -31,7 +27,7 @@ FLOATS_PER_ROW_UNIT = 64
 """Slots begin at multiples of 256 bytes, as allocations of jax do."""
 
 
-class SharedSlots:
+class IpcBuffers:
     """One rank's use of blocks of device memory with two slots for each member.
 
     The two slots are used in turn, so that members wait for each other once an exchange: a
@@ -55,7 +51,7 @@ class SharedSlots:
 
     def __init__(
         self,
-        host: SharedMemoryGroup | MultiNodeGroup,
+        host: Group,
         num_floats: int,
         members: Sequence[int],
         owners: Sequence[int],
@@ -66,13 +62,13 @@ class SharedSlots:
         here = host.local
         self._members, self._rank = tuple(members), here.rank
         self._owners, self._is_owner = tuple(owners), here.rank == owners[0]
-        self._memories: list[CudaMemory] = []
+        self._memories: list[DeviceMemory] = []
         self._num_writes = 0
         self._host: SharedMemoryGroup | None = here
         here.flags[here.rank, 1] = 0
         try:
-            tickets = agreed(host, wish, lambda: self._make(new_memory))
-            agreed(host, wish, lambda: self._map(tickets))
+            ipc_handles = all_or_none(host, wish, lambda: self._make(new_memory))
+            all_or_none(host, wish, lambda: self._map(ipc_handles))
         except BaseException:
             self.close()
             raise
@@ -136,9 +132,9 @@ class SharedSlots:
             if member != self._rank:
                 queue.wait_for_flag(stream, member, count)
 
-    def _slot(self, place: int) -> int:
-        """Address of the slot in use of the member at `place`, on the own GPU."""
-        row = self._num_writes % 2 * len(self._members) + place
+    def _slot(self, index: int) -> int:
+        """Address of the slot in use of the member at `index`, on the own GPU."""
+        row = self._num_writes % 2 * len(self._members) + index
         return self._memories[0].address + row * self._row_bytes
 
     def _wait_for_members(self, host: SharedMemoryGroup) -> None:
@@ -158,45 +154,8 @@ class SharedSlots:
         size = 2 * len(self._members) * self._row_bytes
         return self._memories[0].create(size) if self._is_owner else b""
 
-    def _map(self, tickets: npt.NDArray[np.uint8]) -> bytes:
+    def _map(self, ipc_handles: npt.NDArray[np.uint8]) -> bytes:
         for owner, memory in zip(self._owners, self._memories, strict=True):
             if not (self._is_owner and owner == self._owners[0]):
-                memory.open(tickets[owner][:TICKET_BYTES].tobytes())
+                memory.open(ipc_handles[owner][:IPC_HANDLE_BYTES].tobytes())
         return b""
-
-
-def agreed(
-    host: SharedMemoryGroup | MultiNodeGroup, wish: str, step: Callable[[], bytes]
-) -> npt.NDArray[np.uint8]:
-    """Does a step of the start; returns what it returned on the ranks of this node.
-
-    All ranks of the job call this, and they go on together or not at all.
-
-    Args:
-      host: this rank's use of the shared block.
-      wish: what cannot be had if the step fails, for the message.
-      step: returns at most NOTE_BYTES.
-
-    Returns:
-      [k, NOTE_BYTES], by rank in the node.
-
-    Raises:
-      DeviceMemoryUnavailable: it failed on one of them, and why it did there.
-    """
-    try:
-        note, has_failed = step(), False
-    # Whatever it is, of CUDA, of jax or of an import: there is another way, through the host.
-    except Exception as error:
-        said = " ".join(str(error).split())
-        note, has_failed = f"{said or type(error).__name__}".encode()[:NOTE_BYTES], True
-    sent = np.zeros(1 + NOTE_BYTES, np.float32)  # One number a byte: no float has odd bits.
-    sent[0] = 1 + host.local.ids[host.local.rank] if has_failed else 0
-    sent[1 : 1 + len(note)] = np.frombuffer(note, np.uint8)
-    everyone = host.bootstrap_all_gather(sent)
-    notes = everyone[:, 1:].astype(np.uint8)
-    if failed := np.flatnonzero(everyone[:, 0]).tolist():
-        why = notes[failed[0]].tobytes().rstrip(b"\0").decode(errors="replace")
-        gmi = int(everyone[failed[0], 0]) - 1
-        raise DeviceMemoryUnavailable(f"{wish}: GMI {gmi}: {why}")
-    first = host.rank - host.local.rank
-    return notes[first : first + host.local.world_size]

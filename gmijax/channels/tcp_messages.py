@@ -14,7 +14,7 @@ from typing import Any, Final, cast
 
 import numpy as np
 
-from gmijax.collectives.messages.pipe_format import Bytes
+from gmijax.channels.pipe_format import Bytes
 from gmijax.errors import CollectiveError
 
 _COUNT: Final = np.dtype("<u4")

@@ -13,15 +13,15 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
+from gmijax.channels.mailboxes import DATA, Inbox, Outbox, frames_of
+from gmijax.channels.pipe import PipeReader, PipeWriter
+from gmijax.channels.pipe_block import PipeBlock
 from gmijax.clock import running_s
-from gmijax.collectives.messages.mailboxes import DATA, Inbox, Outbox, frames_of
-from gmijax.collectives.messages.pipe import PipeReader, PipeWriter
-from gmijax.collectives.messages.pipe_block import PipeBlock
 from gmijax.collectives.waits import wait_until
 from gmijax.errors import CollectiveTimeout, ConfigError, PipeClosed
 
 if TYPE_CHECKING:
-    from gmijax.collectives.messages.device_buffers import DeviceBuffers
+    from gmijax.channels.device_arrays import DeviceBuffers
 
 MIN_CAPACITY_BYTES: Final = 1 << 18
 """Least capacity of the pipes, so that a frame fits."""
@@ -67,7 +67,7 @@ class Messenger:
         if device is None:
             outbox.post(frames_of(tree, tag, self._frame_bytes), self._timeout_s)
             return
-        put = partial(device.put, dst=dst, released_frames=outbox.released_frames)
+        put = partial(device.try_put, dst=dst, released=outbox.released_frames)
         outbox.post(frames_of(tree, tag, self._frame_bytes, put), self._timeout_s)
         device.mark_sent(dst, outbox.frames)
 
@@ -102,7 +102,7 @@ class Messenger:
     def flush(self) -> None:
         """Waits until all that was sent lies in shared memory, where it outlives this process.
 
-        What stays on the GPU does not: see `settle`.
+        What stays on the GPU does not: see `drain`.
 
         Raises:
           PeerLost: a receiver is gone, and has not taken all.
@@ -117,14 +117,14 @@ class Messenger:
         if late:
             raise CollectiveTimeout(self.rank, tuple(late), "flush", 0, self._timeout_s)
 
-    def settle(self, timeout_s: float) -> bool:
+    def drain(self, timeout_s: float) -> bool:
         """Whether all that stays on the GPU, and goes with this process, was received in time.
 
         What others have sent is taken meanwhile, so that two that end do not wait for each other.
         """
-        return wait_until(lambda: self._is_settled() or None, lambda: None, timeout_s) is not None
+        return wait_until(lambda: self._is_drained() or None, lambda: None, timeout_s) is not None
 
-    def _is_settled(self) -> bool:
+    def _is_drained(self) -> bool:
         if self._device is None:
             return True
         for peer in self._device.peers:
@@ -135,7 +135,7 @@ class Messenger:
             for peer, outbox in self._outboxes.items()
             if self._device.holds(peer, outbox.released_frames)
         )
-        return all(self._block.why_lost(peer, "settle", 0) is not None for peer in waiting)
+        return all(self._block.why_lost(peer, "drain", 0) is not None for peer in waiting)
 
     def _read(self, src: int, tag: int | None = None) -> bool:
         """Takes what rank `src` has sent, up to a message with `tag`; whether there is one."""

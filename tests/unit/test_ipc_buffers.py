@@ -13,14 +13,14 @@ from hypothesis import given
 from hypothesis import strategies as st
 from shared_ranks import host_ranks
 
-from gmijax.collectives.device.device_transport import Order
-from gmijax.collectives.device.shared_slots import SharedSlots
+from gmijax.collectives.device.ipc_buffers import IpcBuffers
+from gmijax.collectives.device_transport import DesyncDetector
 from gmijax.collectives.host.shared_memory_group import SharedMemoryGroup
 from gmijax.errors import DeviceMemoryUnavailable
 
 SIZE = 5
 
-Pair: TypeAlias = tuple[list[SharedMemoryGroup], list[SharedSlots], list[str]]
+Pair: TypeAlias = tuple[list[SharedMemoryGroup], list[IpcBuffers], list[str]]
 
 
 class Counted(FakeDeviceMemory):
@@ -43,7 +43,7 @@ def test_what_was_made_before_a_failure_is_closed() -> None:
     (host,) = host_ranks(SIZE)
     said = "wish: GMI 0: no more memory"
     with pytest.raises(DeviceMemoryUnavailable, match=said):
-        SharedSlots(host, SIZE, [0], [0, 0], Counted, "wish")
+        IpcBuffers(host, SIZE, [0], [0, 0], Counted, "wish")
     assert Counted.num_open == 0
 
 
@@ -60,7 +60,7 @@ def pair() -> Iterator[Pair]:
     hosts = host_ranks(SIZE, SIZE)
     with ThreadPoolExecutor(2) as pool:
         making = [
-            pool.submit(SharedSlots, host, SIZE, [0, 1], [0], Noted, "wish") for host in hosts
+            pool.submit(IpcBuffers, host, SIZE, [0, 1], [0], Noted, "wish") for host in hosts
         ]
         slots = [one.result() for one in making]
     yield hosts, slots, closed
@@ -84,7 +84,7 @@ def test_memory_stays_until_all_are_through_with_it(pair: Pair) -> None:
 
 @pytest.mark.timeout(20)
 def test_who_is_gone_is_not_waited_for(pair: Pair, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("gmijax.collectives.device.shared_slots.CLOSE_S", 1e9)
+    monkeypatch.setattr("gmijax.collectives.device.ipc_buffers.CLOSE_S", 1e9)
     hosts, (owner, _), closed = pair
     hosts[1].barrier.leave()
     owner.close()
@@ -93,7 +93,7 @@ def test_who_is_gone_is_not_waited_for(pair: Pair, monkeypatch: pytest.MonkeyPat
 
 @pytest.mark.timeout(20)
 def test_who_failed_does_not_wait_to_close(pair: Pair, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("gmijax.collectives.device.shared_slots.CLOSE_S", 1e9)
+    monkeypatch.setattr("gmijax.collectives.device.ipc_buffers.CLOSE_S", 1e9)
     _, (owner, _), closed = pair
     try:
         raise ZeroDivisionError
@@ -113,15 +113,15 @@ def test_one_of_two_ranks_sees_that_they_come_in_different_orders(
 ) -> None:
     """Whoever is ahead, by the end of the step; and neither if the order is the same."""
     flags = np.zeros((64, 16), np.uint32)
-    ranks = [Order(flags, rank, 2) for rank in (0, 1)]
+    ranks = [DesyncDetector(flags, rank, 2) for rank in (0, 1)]
     for _ in range(steps_before):
-        assert [rank.come_to(5, 9) for rank in ranks] == [None, None]
+        assert [rank.record(5, 9) for rank in ranks] == [None, None]
     other = [kinds[place] for place in order if place < len(kinds)]
     todo = [list(kinds), list(other)]
     seen = []
     for first in (*is_first, *[True] * 8, *[False] * 8):
         rank = 0 if first else 1
         if todo[rank]:
-            seen.append(ranks[rank].come_to(todo[rank].pop(0), 9))
+            seen.append(ranks[rank].record(todo[rank].pop(0), 9))
     assert any(peer is not None for peer in seen) == (other != kinds)
     assert not flags[:2, 0].any()  # These are the devices'.

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from gmijax.collectives.messages.pipe import Bytes
+from gmijax.channels.pipe import Bytes
 
 _ON_DEVICE = "on device"
 

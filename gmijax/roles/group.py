@@ -15,11 +15,11 @@ from typing import Any, Final, Literal, NamedTuple, get_args
 import numpy as np
 import numpy.typing as npt
 
+from gmijax.channels.mailboxes import COLLECTIVE
+from gmijax.channels.messenger import Messenger
+from gmijax.channels.trees import as_bytes, flatten, unflatten
 from gmijax.collectives.host.shared_memory_group import SharedMemoryGroup
 from gmijax.collectives.interface import FloatBuffer
-from gmijax.collectives.messages.mailboxes import COLLECTIVE
-from gmijax.collectives.messages.messenger import Messenger
-from gmijax.collectives.messages.trees import as_bytes, flatten, unflatten
 from gmijax.errors import CollectiveError, CollectiveTimeout, ConfigError
 
 Operation = Literal["mean", "sum"]

@@ -17,10 +17,10 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
+from gmijax.channels.pipe import Bytes, Message
+from gmijax.channels.pipe_format import message_bytes
+from gmijax.channels.tcp_connection import Connection
 from gmijax.clock import running_s
-from gmijax.collectives.channel.tcp_connection import Connection
-from gmijax.collectives.messages.pipe import Bytes, Message
-from gmijax.collectives.messages.pipe_format import message_bytes
 from gmijax.errors import CollectiveError, GmijaxError, PeerLost, PipeClosed
 
 DATA, GOODBYE, RELEASED = 1, 2, 3

@@ -16,9 +16,9 @@ from typing import Any, Final, TypeAlias
 
 import numpy as np
 
+from gmijax.channels.pipe import Bytes, PipeWriter
+from gmijax.channels.trees import as_bytes, flatten, unflatten
 from gmijax.clock import wait_for
-from gmijax.collectives.messages.pipe import Bytes, PipeWriter
-from gmijax.collectives.messages.trees import as_bytes, flatten, unflatten
 from gmijax.errors import CollectiveError, CollectiveTimeout
 
 DATA, COLLECTIVE = 0, 1

@@ -7,19 +7,18 @@ from contextlib import ExitStack
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from gmijax.collectives.channel.batcher import Batcher, Stack
-from gmijax.collectives.channel.compressor import Compressor, TransferSize, read_transfer
-from gmijax.collectives.channel.dispenser import Dispenser
-from gmijax.collectives.channel.migrator import Migrator
-from gmijax.collectives.channel.sender import Packer, Sender
-from gmijax.collectives.channel.tcp_channel import RemoteReader, RemoteWriter
-from gmijax.collectives.channel.transport import ChannelReader, ChannelWriter
-from gmijax.collectives.channel.unichannel import UniDecoder, UniPacker
-from gmijax.collectives.device.device_memory import NewMemory, cuda_memory
-from gmijax.collectives.messages.pipe import PipeReader, PipeWriter
-from gmijax.collectives.messages.pipe_block import PipeBlock, create_pipes
+from gmijax.channels.batcher import Batcher, ChannelReader, Stack
+from gmijax.channels.compressor import Compressor, TransferSize, read_transfer
+from gmijax.channels.migrator import ChannelWriter, Migrator
+from gmijax.channels.pipe import PipeReader, PipeWriter
+from gmijax.channels.pipe_block import PipeBlock, create_pipes
+from gmijax.channels.sender import Dispenser, Packer, Sender
+from gmijax.channels.tcp_channel import RemoteReader, RemoteWriter
+from gmijax.channels.unichannel import UniDecoder, UniPacker
+from gmijax.collectives.device.device_memory import DeviceMemory, NewMemory
 from gmijax.config.channel import ChannelConfig
 from gmijax.errors import ConfigError
+from gmijax.machine.host_limits import CgroupLimits
 
 NOTES_BYTES = 2**20
 """Of a pipe of `transport=device`, which holds only where experience lies."""
@@ -27,7 +26,15 @@ NOTES_BYTES = 2**20
 OVERHEAD_BYTES = 16 * 1024
 """More than header, spec and alignment of a message take."""
 
-DEVICE_MEMORY: NewMemory = cuda_memory
+
+def _cuda_memory() -> DeviceMemory:
+    # jax and CUDA, which channels through the host do without.
+    from gmijax.collectives.device.cuda_memory import CudaMemory
+
+    return CudaMemory()
+
+
+DEVICE_MEMORY: NewMemory = _cuda_memory
 """Makes the memory by which agents and trainers of `transport=device` share their GPU."""
 
 
@@ -58,11 +65,11 @@ class ChannelTopology:
 def require_memory(config: ChannelConfig, topology: ChannelTopology) -> None:
     """Raises ConfigError unless there is memory for the channels; before a process is started."""
     pairs = len(topology.agents) * len(topology.trainers)
-    available = _available_bytes()
-    if config.transport == "memory" and pairs * config.capacity_bytes > available:
+    available = _available_mib()
+    if config.transport == "memory" and pairs * config.capacity_mib > available:
         raise ConfigError(
             f"channel.capacity_mib={config.capacity_mib}: {pairs} pairs of agent and trainer "
-            f"take {pairs * config.capacity_mib} MiB, available are {available // 2**20} MiB"
+            f"take {pairs * config.capacity_mib} MiB, available are {available} MiB"
         )
 
 
@@ -108,7 +115,7 @@ def open_sender(
     if config.design == "multi":
         fixed = None if config.transfer_kib is None else config.transfer_kib * 1024
         packer = Compressor(migrator, TransferSize(fixed, most), most)
-    return Sender(Dispenser(most), packer, migrator, on_device=False, held=held)
+    return Sender(Dispenser(rank, most), packer, migrator, on_device=False, held=held)
 
 
 def open_receiver(
@@ -127,8 +134,7 @@ def open_receiver(
     for reader in readers:
         held.callback(reader.close)
     if config.transport == "device":
-        # jax and CUDA, which channels through the host do without.
-        from gmijax.collectives.channel.device_channel import DeviceStack, ResidentDecoder
+        from gmijax.channels.device_channel import DeviceStack, ResidentDecoder
 
         decoders = [ResidentDecoder(DEVICE_MEMORY) for _ in readers]
         for decoder in decoders:
@@ -143,13 +149,15 @@ def _device_sender(
     config: ChannelConfig, block: PipeBlock, near: list[int], held: ExitStack
 ) -> Sender:
     """The end of an agent that leaves its experience on the GPU, for the trainers there."""
-    from gmijax.collectives.channel.device_channel import ResidentPacker, SlotWriter
+    from gmijax.channels.device_arrays import SentArrays
+    from gmijax.channels.device_channel import DeviceWriter, ResidentPacker
 
-    migrator = Migrator([SlotWriter(block, peer, config.capacity_bytes) for peer in near], near)
-    packer = ResidentPacker(migrator, config.capacity_bytes, DEVICE_MEMORY)
+    sent = SentArrays(near, DEVICE_MEMORY, config.capacity_bytes)
+    migrator = Migrator([DeviceWriter(block, peer, sent) for peer in near], near)
+    packer = ResidentPacker(migrator, sent)
     held.callback(packer.close)
     held.callback(migrator.close)
-    dispenser = Dispenser(max_piece_bytes=None)
+    dispenser = Dispenser(block.rank, max_piece_bytes=None)
     return Sender(dispenser, packer, migrator, on_device=True, held=held)
 
 
@@ -161,17 +169,9 @@ def _open_block(rank: int, fd: int | None, held: ExitStack) -> PipeBlock:
     return block
 
 
-def _available_bytes() -> int:
+def _available_mib() -> int:
     """Memory that this process and its children can still have."""
     lines = Path("/proc/meminfo").read_text().splitlines()
-    free = next(int(line.split()[1]) for line in lines if line.startswith("MemAvailable")) * 1024
-    group = Path("/sys/fs/cgroup")
-    try:
-        limit = int((group / "memory.max").read_text())
-        used = int((group / "memory.current").read_text())
-        counts = dict(line.split() for line in (group / "memory.stat").read_text().splitlines())
-    except (OSError, ValueError):  # No such group, or no limit ("max").
-        return free
-    # Cached files count as used, but make way.
-    cached = sum(int(counts.get(key, 0)) for key in ("active_file", "inactive_file"))
-    return min(free, max(0, limit - used + cached))
+    free = next(int(line.split()[1]) for line in lines if line.startswith("MemAvailable")) // 1024
+    group = CgroupLimits().available_memory_mib()
+    return free if group is None else min(free, int(group))

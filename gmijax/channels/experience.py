@@ -1,6 +1,10 @@
-"""What all experience of one agent has in common: channels, numbers of steps, shapes, dtypes.
+"""Experience by channel: what agents send and trainers get.
 
-It travels with every message, so that trainers need not be told before.
+All experience of one agent has the same spec: channels, numbers of steps, shapes, dtypes. It
+travels with every message, so that trainers need not be told before.
+
+A *piece* is the experience of one `send`, or a part of its environments where the whole is too
+large for the channel. A *transfer* is what travels: one or more pieces.
 """
 
 from __future__ import annotations
@@ -14,7 +18,7 @@ from typing import Any, NamedTuple, TypeAlias
 import numpy as np
 import numpy.typing as npt
 
-from gmijax.collectives.messages.pipe import Bytes
+from gmijax.channels.pipe import Bytes
 from gmijax.errors import ConfigError
 
 Array: TypeAlias = npt.NDArray[Any]
@@ -26,6 +30,9 @@ differ in it.
 """
 
 DTYPES = ("float32", "bool")
+
+VERSION_BYTES = 8
+"""Of the policy version that goes with every rollout."""
 
 
 class Channel(NamedTuple):
@@ -69,6 +76,39 @@ class Spec(NamedTuple):
     def decode(data: Bytes) -> Spec:
         """The spec that `encode` wrote."""
         return _decode(data.tobytes())
+
+
+class Rollouts(NamedTuple):
+    """Rollouts of N environments: a piece, a transfer as it arrives, and a trainer's batch.
+
+    Attributes:
+      spec: their channels.
+      experience: arrays by channel, [S, N, ...]; of host memory or of the device's.
+      versions: [N] int64, the policy version that every rollout was made with.
+      agents: [N] int64, ranks of the agents that made them.
+    """
+
+    spec: Spec
+    experience: dict[str, Array]
+    versions: npt.NDArray[np.int64]
+    agents: npt.NDArray[np.int64]
+
+    @property
+    def num_envs(self) -> int:
+        """N."""
+        return len(self.versions)
+
+    @property
+    def num_bytes(self) -> int:
+        """Bytes of all channels."""
+        return sum(self.spec.sizes(self.num_envs))
+
+    def part(self, low: int, high: int) -> Rollouts:
+        """Those of environments `low` to `high`; in host memory views of these arrays."""
+        if high - low == self.num_envs:  # A part of an array on a device is a copy.
+            return self
+        arrays = {name: array[:, low:high] for name, array in self.experience.items()}
+        return Rollouts(self.spec, arrays, self.versions[low:high], self.agents[low:high])
 
 
 @lru_cache(maxsize=64)

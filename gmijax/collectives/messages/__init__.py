@@ -1,1 +1,0 @@
-"""Messages between processes of a host: pipes, registers, mailboxes, group reductions."""
