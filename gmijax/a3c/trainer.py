@@ -79,17 +79,11 @@ class Trainer:
         self.link.beat("compiling", 0)
         started = time.monotonic()
         leads = self.reducer.rank == 0
-        if not leads:
-            # The leader compiles first, the others take its programs from the cache: those that
-            # each of them would tune could differ in the last bit.
-            self.reducer.all_gather(np.zeros(1, np.float32))
         # The same key as synchronous training uses: the same first policy.
         state, self._env_steps = first_state(self._learner, self.env.spec.obs_size, self.config)
         self._version = int(state.iteration)
         self._update.trace((), state, self._example())
         self._update.compile()
-        if leads:
-            self.reducer.all_gather(np.zeros(1, np.float32))
         pack = jax.jit(lambda state: pack_weights(acting_weights(self._learner, state)))
         first = np.asarray(pack(state))
         compile_s = time.monotonic() - started

@@ -15,6 +15,7 @@ import socket
 import struct
 from collections.abc import Mapping
 from contextlib import ExitStack, suppress
+from functools import partial
 from pathlib import Path
 from typing import Any, Final, Literal, NamedTuple
 
@@ -50,7 +51,7 @@ ON_GPUS: Final = (
 )
 """The same for nodes whose GPUs are used; the controller may be on a machine without any."""
 
-Order = Literal["let_go", "ask_to_stop", "order_end", "end_as_done", "kill"]
+Order = Literal["ask_to_stop", "order_end", "end_as_done", "kill"]
 """Methods of a `GmiProcess` that the controller may call."""
 
 _SIOCGIFADDR: Final = 0x8915
@@ -198,14 +199,13 @@ class TrainingNode(Node):
             self._blocks[ENV_NODES_FD] = nodes.to_file()
             self._held.callback(os.close, self._blocks[ENV_NODES_FD])
         self._num_gmis = len(self._launch.plan.layout.gmis_of_node[nodes.node])
-        launch, backend, blocks = self._launch, self._backend, self._blocks
-        self._start = lambda gmi, waits: start_gmi(launch, backend, blocks, gmi, waits)
+        self._start = partial(start_gmi, self._launch, self._backend, self._blocks)
 
-    def start(self, gmi: int, waits: bool) -> int | str:
+    def start(self, gmi: int) -> int | str:
         """Starts a GMI; its process, or why there is none."""
         assert self._start is not None
         try:
-            process = self._start(gmi, waits)
+            process = self._start(gmi)
         except GmiFailed as error:
             return error.reason
         assert isinstance(process, GmiProcess)

@@ -58,16 +58,16 @@ class RemoteNode:
         self._asked: Answer | None = None
         self._asked_s = 0.0
 
-    def start(self, gmi: int, waits: bool, paths: GmiPaths) -> RemoteGmi:
+    def start(self, gmi: int, paths: GmiPaths) -> RemoteGmi:
         """Starts a GMI there.
 
         Raises:
           GmiFailed: it cannot be started, or the node is gone.
         """
-        started = self.call("start", gmi, waits)
+        started = self.call("start", gmi)
         if not isinstance(started, int):
             raise GmiFailed(gmi, started or self.lost or "its node does not answer")
-        return RemoteGmi(self, gmi, paths, started, waits=waits)
+        return RemoteGmi(self, gmi, paths, started)
 
     def call(self, method: str, *arguments: Any) -> Any:
         """What a method returns; None if the node is gone, or while it is being lost."""
@@ -114,10 +114,8 @@ class RemoteNode:
 class RemoteGmi(WatchedGmi):
     """A GMI on another node."""
 
-    def __init__(
-        self, node: RemoteNode, gmi: int, paths: GmiPaths, pid: int, *, waits: bool
-    ) -> None:
-        super().__init__(gmi, paths, pid, waits=waits)
+    def __init__(self, node: RemoteNode, gmi: int, paths: GmiPaths, pid: int) -> None:
+        super().__init__(gmi, paths, pid)
         self._node = node
         self._error: ReportedError | None = None
         self._log_bytes = 0
@@ -171,6 +169,3 @@ class RemoteGmi(WatchedGmi):
 
     def close(self) -> None:
         """Does nothing: the node drops all lifelines when the job is over."""
-
-    def _tell_to_go(self) -> None:
-        self._node.order(self.gmi, "let_go")

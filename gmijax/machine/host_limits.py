@@ -121,6 +121,16 @@ class CgroupLimits:
         limits = (_number(folder, names) for folder in self._folders("memory"))
         return _least(*(limit / 2**20 for limit in limits if limit is not None))
 
+    def free_memory_bytes(self) -> int | None:
+        """Memory that the group may still have, with that of cached files, which make way."""
+        left: list[int] = []
+        for folder in self._folders("memory"):
+            limit = _number(folder, ("memory.max", "memory.limit_in_bytes"))
+            used = _number(folder, ("memory.current", "memory.usage_in_bytes"))
+            if limit is not None and used is not None:
+                left.append(max(0, limit - used + _cached_bytes(folder)))
+        return _least(*left)
+
     def threads(self) -> int | None:
         """Threads that may still be started."""
         left: list[int] = []
@@ -218,6 +228,15 @@ def _number(folder: Path, names: Sequence[str]) -> int | None:
         with suppress(OSError, ValueError):
             return int((folder / name).read_text())
     return None
+
+
+def _cached_bytes(folder: Path) -> int:
+    """Cached files of a group and those in it; version 1 counts these as `total_`."""
+    with suppress(OSError, ValueError):
+        counts = dict(line.split() for line in (folder / "memory.stat").read_text().splitlines())
+        names = ("active_file", "inactive_file")
+        return sum(int(counts.get(f"total_{name}", counts.get(name, 0))) for name in names)
+    return 0
 
 
 def _least(*values: N | None) -> N | None:

@@ -161,21 +161,21 @@ class TrainingLoop:
         )
 
     def _compile(self, state: TrainState, env_state: Any) -> float:
-        """Makes all programs; returns the seconds for which it was not this GMI's turn."""
+        """Makes all programs; returns the seconds for which others compiled."""
         # Every GMI does that itself, at the same time.
         self._iteration.trace(self._env.model, state, env_state)
         if self._meter is not None:
             self._meter.trace(state, env_state)
         if self._evaluator is not None:
             self._evaluator.trace(state)
-        waited_s = self._link.begin_compiling()
+        self._link.begin_compiling()
         self._iteration.compile()
         if self._meter is not None:
             self._meter.compile()
         if self._evaluator is not None:
             self._evaluator.compile()
         self._link.end_part("compiling")
-        return waited_s
+        return self._link.start_s["waiting"]
 
     def _open_log(self) -> TrainingLog:
         name = self._config.env.label

@@ -154,10 +154,10 @@ class PackedLoop:
         states, envs = self._first()
         self._link.end_part("states")
         self._iteration.trace(self._env.model, states, envs)
-        waited_s = self._link.begin_compiling()
+        self._link.begin_compiling()
         self._iteration.compile()
         self._link.end_part("compiling")
-        compile_s = time.monotonic() - started_s - waited_s
+        compile_s = time.monotonic() - started_s - self._link.start_s["waiting"]
         self._link.beat("ready", 0)
         if self._warms_up:
             states, envs = warm_up(self._iteration, states, envs)

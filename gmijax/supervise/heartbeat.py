@@ -14,10 +14,10 @@ from typing import Any, Final, Literal, NamedTuple, get_args
 
 from gmijax.errors import ReportedError
 
-GmiState = Literal["starting", "compiling", "ready", "running", "done"]
+GmiState = Literal["starting", "waiting", "compiling", "ready", "running", "done"]
 
 STATES: tuple[str, ...] = get_args(GmiState)
-"""The states of a GMI in the order in which it reaches them."""
+"""The states of a GMI in the order in which it reaches them; `waiting` for another to compile."""
 
 _BEATS, _STATE, _ITERATION, _PID, _ERROR_BYTES = range(5)
 _HEADER_BYTES: Final = 64

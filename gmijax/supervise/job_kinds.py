@@ -46,8 +46,6 @@ class JobKind:
     """Main of the GMIs of a job, and the memory that they share."""
 
     module: str  # Main of every GMI, started by name.
-    # Whether all GMIs run the same programs, so that one compiles them for all.
-    compile_once: bool = True
     # The memory that the GMIs of a plan share, beside that of the reducer.
     shared: Callable[[Plan], SharedBlocks] = lambda _: MappingProxyType({})
     # Between GMIs of different nodes, which connect by TCP: who listens, and who calls.
@@ -68,10 +66,10 @@ def training_kind(config: TrainConfig) -> JobKind:
     """The kind of a training job."""
     if config.is_asynchronous:
         shared = partial(_registers_and_channels, config)
-        return JobKind(SYNCHRONOUS.module, compile_once=False, shared=shared, calls=calls_of)
+        return JobKind(SYNCHRONOUS.module, shared=shared, calls=calls_of)
     if config.plan.template == "tdg_ex":
         shared = partial(pipes, ROLLOUT_PIPE_BYTES)
-        return JobKind(SYNCHRONOUS.module, compile_once=False, shared=shared)
+        return JobKind(SYNCHRONOUS.module, shared=shared)
     return SYNCHRONOUS
 
 

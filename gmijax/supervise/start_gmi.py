@@ -53,11 +53,11 @@ def environment_of(launch: Launch, gmi: int, added: Mapping[str, str]) -> dict[s
     return {**variables, **launch.variables}
 
 
-StartGmi = Callable[[int, bool], WatchedGmi]
+StartGmi = Callable[[int], WatchedGmi]
 
 
 def start_gmi(
-    launch: Launch, backend: Backend, inherited_fds: Mapping[str, int], gmi: int, waits: bool
+    launch: Launch, backend: Backend, inherited_fds: Mapping[str, int], gmi: int
 ) -> GmiProcess:
     """Starts a GMI on this machine; see `GmiProcess`."""
     return GmiProcess(
@@ -66,5 +66,4 @@ def start_gmi(
         environment_of(launch, gmi, backend.environment(gmi)),
         launch.run,
         inherited_fds,
-        waits=waits,
     )

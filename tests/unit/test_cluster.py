@@ -322,7 +322,7 @@ def test_a_lost_node_is_the_cause_that_its_gmis_give(tmp_path: Path) -> None:
     answers: dict[str, Any] = {"start": 99, "poll": seen}
     node = a_node()
     node._ask = lambda method, *_: FakeAnswer(answers[method])
-    gmi = node.start(2, False, GmiPaths(tmp_path))
+    gmi = node.start(2, GmiPaths(tmp_path))
     gmi.poll()  # Asks.
     assert gmi.poll() is None
     assert gmi.beat.iteration == 7
@@ -384,7 +384,7 @@ def test_a_node_starts_polls_and_ends_gmis(
     assert not isinstance(opened, BackendUnavailable)
     assert (opened.calls, opened.daemons) == ({}, {})
     node.introduce(Nodes(0, (opened.leader,), b"token"))
-    pid = node.start(0, False)
+    pid = node.start(0)
     assert isinstance(pid, int)
     node.order(0, "kill")
     while (seen := node.poll()[0]).exit_code is None:

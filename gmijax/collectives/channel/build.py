@@ -20,6 +20,7 @@ from gmijax.collectives.messages.pipe import PipeReader, PipeWriter
 from gmijax.collectives.messages.pipe_block import PipeBlock, create_pipes
 from gmijax.config.channel import ChannelConfig
 from gmijax.errors import ConfigError
+from gmijax.machine.host_limits import CgroupLimits
 
 NOTES_BYTES = 2**20
 """Of a pipe of `transport=device`, which holds only where experience lies."""
@@ -165,13 +166,5 @@ def _available_bytes() -> int:
     """Memory that this process and its children can still have."""
     lines = Path("/proc/meminfo").read_text().splitlines()
     free = next(int(line.split()[1]) for line in lines if line.startswith("MemAvailable")) * 1024
-    group = Path("/sys/fs/cgroup")
-    try:
-        limit = int((group / "memory.max").read_text())
-        used = int((group / "memory.current").read_text())
-        counts = dict(line.split() for line in (group / "memory.stat").read_text().splitlines())
-    except (OSError, ValueError):  # No such group, or no limit ("max").
-        return free
-    # Cached files count as used, but make way.
-    cached = sum(int(counts.get(key, 0)) for key in ("active_file", "inactive_file"))
-    return min(free, max(0, limit - used + cached))
+    of_group = CgroupLimits().free_memory_bytes()
+    return free if of_group is None else min(free, of_group)
