@@ -58,19 +58,31 @@ _SIOCGIFADDR: Final = 0x8915
 
 
 class Facts(NamedTuple):
-    """What a node is."""
+    """What a node is.
 
-    address: str  # IP address for the exchange with other nodes.
+    Attributes:
+      address: IP address for the exchange with other nodes.
+      machine: what it has.
+      versions: of all that computes, by package; see `own_versions`.
+    """
+
+    address: str
     machine: Machine
     versions: dict[str, str | None]
 
 
 class Opened(NamedTuple):
-    """What a node has for its GMIs: where they will listen, and daemons of its GPUs."""
+    """What a node has for its GMIs: where they will listen, and daemons of its GPUs.
+
+    Attributes:
+      leader: address and port of its leading GMI.
+      calls: see `Nodes`.
+      daemons: see `Machine`.
+    """
 
     leader: tuple[str, int]
-    calls: dict[tuple[int, int], str]  # See `Nodes`.
-    daemons: dict[str, Path]  # See `Machine`.
+    calls: dict[tuple[int, int], str]
+    daemons: dict[str, Path]
 
 
 class Seen(NamedTuple):

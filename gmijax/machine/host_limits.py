@@ -40,12 +40,17 @@ for its core longer than it computes, and twice as many would compile at a time.
 
 
 class HostLimits(NamedTuple):
-    """Free resources for the GMIs of a job, None where unknown or unlimited."""
+    """Free resources for the GMIs of a job, None where unknown or unlimited.
 
-    # Of the machine, or of the control group that this process is in.
+    Attributes:
+      memory_mib: of the machine, or of the control group that this process is in.
+      threads: that may still be started.
+      open_files: that this process may still open.
+    """
+
     memory_mib: float | None = None
-    threads: int | None = None  # That may still be started.
-    open_files: int | None = None  # That this process may still open.
+    threads: int | None = None
+    open_files: int | None = None
 
 
 UNKNOWN_HOST: Final = HostLimits()

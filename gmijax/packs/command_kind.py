@@ -261,7 +261,6 @@ class _Recorder:
         self._is_first = True
 
     def new(self) -> list[dict[str, Any]]:
-        """See `Reader`."""
         lines = self._reader.new()
         if not lines:
             return lines

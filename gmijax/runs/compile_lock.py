@@ -20,8 +20,8 @@ T = TypeVar("T")
 ON_WAIT: Final[list[Callable[[], AbstractContextManager[None]]]] = []
 """Entered by this process while it waits for another one."""
 
-_NO_NEW_ENTRY: Final = "."
-"""Stands for the cache itself: an entry of before gmijax had these files, or none at all."""
+_NO_ENTRY: Final = "."
+"""Stands for the cache itself: the program is one of those that cannot be kept."""
 
 
 def compile_alone(cache: Path, name: str, key: str, compile_program: Callable[[], T]) -> T:
@@ -42,9 +42,10 @@ def compile_alone(cache: Path, name: str, key: str, compile_program: Callable[[]
             return compile_program()
         before = _entries(cache, name)
         program = compile_program()
-        new = _entries(cache, name) - before
+        # Without a new one it was in the cache before there was this file: one of those there.
+        entries = _entries(cache, name) - before or before
         with suppress(OSError):  # A full disk: the next one takes the lock too.
-            file.write_text(" ".join(new) or _NO_NEW_ENTRY)
+            file.write_text(" ".join(entries) or _NO_ENTRY)
         return program
 
 

@@ -27,11 +27,17 @@ _MAX_MESSAGE, _MAX_TRACEBACK, _MAX_MISSING = 2000, 8000, 200
 
 
 class Heartbeat(NamedTuple):
-    """Last report of a GMI."""
+    """Last report of a GMI.
 
-    state: GmiState  # How far it is.
-    iteration: int  # Training iterations done.
-    pid: int  # The process that uses the GPU; not the started one where that is a wrapper.
+    Attributes:
+      state: how far it is.
+      iteration: training iterations done.
+      pid: the process that uses the GPU; not the started one where that is a wrapper.
+    """
+
+    state: GmiState
+    iteration: int
+    pid: int
 
     @property
     def is_ready(self) -> bool:

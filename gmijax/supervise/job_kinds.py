@@ -43,12 +43,16 @@ SharedBlocks = Mapping[str, Callable[[], int]]
 
 @dataclass(frozen=True)
 class JobKind:
-    """Main of the GMIs of a job, and the memory that they share."""
+    """Main of the GMIs of a job, and the memory that they share.
 
-    module: str  # Main of every GMI, started by name.
-    # The memory that the GMIs of a plan share, beside that of the reducer.
+    Attributes:
+      module: main of every GMI, started by name.
+      shared: the memory that the GMIs of a plan share, beside that of the reducer.
+      calls: between GMIs of different nodes, which connect by TCP: who listens, and who calls.
+    """
+
+    module: str
     shared: Callable[[Plan], SharedBlocks] = lambda _: MappingProxyType({})
-    # Between GMIs of different nodes, which connect by TCP: who listens, and who calls.
     calls: Callable[[Plan], Sequence[tuple[int, int]]] = lambda _: ()
 
 

@@ -12,14 +12,21 @@ from gmijax.supervise.heartbeat import Heartbeat
 
 
 class GmiStatus(NamedTuple):
-    """Where a GMI stands."""
+    """Where a GMI stands.
 
-    gmi: int  # Its id.
-    # `stopping` once a running one was told to end, else what it says (see `heartbeat`).
+    Attributes:
+      gmi: its id.
+      state: `stopping` once a running one was told to end, else what it says (see `heartbeat`).
+      iteration: training iterations done.
+      pid: its process, None before the start.
+      exit_code: None while it runs; negative for the signal that ended it.
+    """
+
+    gmi: int
     state: str
-    iteration: int  # Training iterations done.
-    pid: int | None  # Its process, None before the start.
-    exit_code: int | None  # None while it runs; negative for the signal that ended it.
+    iteration: int
+    pid: int | None
+    exit_code: int | None
 
 
 class WatchedGmi(ABC):
