@@ -135,10 +135,10 @@ class CommandKind:
         if settings.tag is not None:
             events = EventReader(run_dir, settings.tag, time.time(), running_s)
         progress = ProgressReader(output, self._own, running_s(), running_s, events)
-        mark = _mark_of(job, self._names[place.site])
-        reader = _Recorder(progress, run.metrics, mark)
         # On CPU cores alone nothing is compiled that others could use.
-        return Start(process, (reader,), is_awaited=bool(place.devices) and not mark.exists())
+        mark = _mark_of(job, self._names[place.site]) if place.devices else None
+        reader = _Recorder(progress, run.metrics, mark)
+        return Start(process, (reader,), is_awaited=mark is not None and not mark.exists())
 
     def _variables(self, job: CommandJob, run_dir: Path, cores: int) -> dict[str, str]:
         values = job.values(run_dir)
@@ -253,10 +253,10 @@ class CommandKind:
 class _Recorder:
     """Keeps the lines of metrics of a command in its folder, as a training run does.
 
-    With the first one it makes the file `mark`: what the command compiles is in its caches.
+    With the first one it makes the file `mark`, if any: what is compiled is in its caches then.
     """
 
-    def __init__(self, reader: ProgressReader, metrics: Path, mark: Path) -> None:
+    def __init__(self, reader: ProgressReader, metrics: Path, mark: Path | None) -> None:
         self._reader, self._metrics, self._mark = reader, metrics, mark
         self._is_first = True
 
@@ -271,7 +271,7 @@ class _Recorder:
                 copy_history(self._metrics, self._metrics, lines[0]["env_steps"] - 1)
             with self._metrics.open("a") as file:
                 file.writelines(json.dumps(line) + "\n" for line in lines)
-            if is_first:
+            if is_first and self._mark is not None:
                 self._mark.parent.mkdir(parents=True, exist_ok=True)
                 self._mark.touch()
         return lines
