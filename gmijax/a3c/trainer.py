@@ -86,7 +86,7 @@ class Trainer:
         self._update.compile()
         pack = jax.jit(lambda state: pack_weights(acting_weights(self._learner, state)))
         first = np.asarray(pack(state))
-        compile_s = time.monotonic() - started
+        compile_s = time.monotonic() - started - self.link.start_s["waiting"]
         self.link.beat("ready", 0)
         # And so all trainers have compiled.
         require_equal(self.reducer, self.link.gmi, state.params, self._env_steps)
